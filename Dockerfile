@@ -14,7 +14,7 @@ FROM system AS code
 RUN python -m venv /opt/venv
 COPY . .
 
-# without torch, which brings gigabytes of CUDA: the main job, videos and surveys need none
+# without torch, which installs gigabytes of CUDA: reconstruction, videos and surveys don't need it
 FROM code AS cpu-environment
 RUN pip install --no-cache-dir -c constraints.txt -e '.[slam,ray,s3]'
 

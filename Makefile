@@ -1,18 +1,18 @@
-# Two commands are all the set-up there is: `make demo` and `make test`.
+# `make demo` and `make test` set up everything that they need.
 PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || command -v python3)
-NO_PYTHON = There is no Python here. Install 3.11, 3.12 or 3.13, or say where it is: make PYTHON=/path/to/python3.11
+NO_PYTHON = No Python found. Install 3.11, 3.12 or 3.13, or give its path: make PYTHON=/path/to/python3.11
 BIN := .venv/bin
-# more options for `make test`, e.g. PYTEST="-k texture"
+# additional pytest options for `make test`, for example PYTEST="-k texture"
 PYTEST ?=
 TILE ?= data_samples/tile
 OUT ?= demo-out
 
-.PHONY: demo test test-all lint bench gate sample-tile
+.PHONY: demo test test-all lint docs bench gate sample-tile
 
 demo: .venv/.installed
 	$(BIN)/scan2sim run $(TILE) --out $(OUT) --hold-out 8 --set segment.overwrite=true
 
-# in their order: else the longest files, which hold few tests, come last
+# without reordering, as the longest files, which have few tests, would run last
 test: .venv/.installed-dev .venv-ros
 	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile --no-loadscope-reorder $(PYTEST)
 
@@ -24,22 +24,26 @@ lint: .venv/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# builds the documentation into site/; broken links are errors
+docs: .venv/.installed-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
 bench: .venv/.installed-dev
 	$(BIN)/python -m bench.tile
 
-# exports through those who use them: GATE="--worlds demo" for the committed tile alone
+# acceptance gate: runs exports in the programs that use them; GATE="--worlds demo" for the demo tile only
 gate: .venv/.installed-dev
 	$(BIN)/python -m bench.gate $(GATE)
 
 sample-tile: .venv/.installed
 	$(BIN)/python -m scan2sim.data_samples.make_tile
 
-# both install what the system lacks, where they may: see deploy/install.py
+# both targets install missing system packages if permitted, see deploy/install.py
 .venv/.installed: pyproject.toml constraints.txt
 	@$(or $(PYTHON),$(error $(NO_PYTHON))) deploy/install.py
 	@touch $@
 
-# rclpy, in an environment of its own; tests that want it are skipped where there are no wheels for this Python
+# rclpy in a separate environment; its tests are skipped if there are no wheels for this Python
 .venv-ros: tests/services/ros-requirements.txt
 	@$(PYTHON) -m venv $@ && $@/bin/python -m pip install --quiet --disable-pip-version-check -r $< \
 	  || echo "No rclpy for this Python: tests between it and cyclonedds are skipped."

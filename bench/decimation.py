@@ -1,13 +1,13 @@
-"""Libraries that decimate, side by side, on the meshes of a world that was made.
+"""Compare decimation libraries on the meshes of a finished world.
 
-`python -m bench.decimation OUT [--classes terrain building] [--shares 0.5 0.15] [--only pyfqmr ...]`: OUT is what
-`scan2sim run` wrote (`make demo`: demo-out, of the synthetic street). What `decimate` reads there, the result of
-`islands`, is brought to shares of its triangles by every library that can run here, borders kept where it can.
+`python -m bench.decimation OUT [--classes terrain building] [--shares 0.5 0.15] [--only pyfqmr ...]`: OUT is the output
+of `scan2sim run` (`make demo`: demo-out, the synthetic street). The input of `decimate`, which is the result of
+`islands`, is reduced to shares of its triangles by every available library, keeping borders where supported.
 
-- seconds: of the collapse alone, the best of two.
-- away: metres from 100,000 places of the mesh as it was to the new one; mean, 95 % are nearer, farthest.
-- border: share of the edges of one face alone that are still there, to the bit.
-- turned: share of the new mesh's area that looks away (by more than a right angle) from the nearest face there was.
+- seconds: time of the edge collapse alone, the better of two runs.
+- away: distances in metres from 100,000 points of the original mesh to the new one: mean, 95 %, maximum.
+- border: share of the boundary edges that are preserved exactly.
+- turned: share of the new mesh's area facing away (more than a right angle) from the nearest original face.
 
 Ends with `RESULT {json}`.
 """
@@ -30,20 +30,20 @@ from scan2sim.pipeline.tiling.borders.boundary_curve import curve
 
 
 def read(out: Path, group: str) -> Mesh:
-    """What `decimate` read of a class."""
+    """Input of `decimate` for a class."""
     found = max((out / "steps" / f"islands.{group}").glob("*/mesh.npz"), key=lambda path: path.stat().st_mtime)
     mesh = Mesh.load(found)
     return Mesh(mesh.frame, mesh.vertices, mesh.faces)
 
 
 def border(mesh: Mesh) -> set[frozenset[tuple[float, ...]]]:
-    """The edges of one face alone, by their places."""
+    """Boundary edges (of one face only), by the coordinates of their ends."""
     edges = curve(mesh.faces, np.ones(len(mesh.vertices), bool)).edges
     return {frozenset(map(tuple, ends)) for ends in mesh.vertices[edges].tolist()}
 
 
-def turned(small: Mesh, whole: Mesh) -> float:
-    """Share of an area that looks away from the nearest face of `whole`."""
+def share_facing_away(small: Mesh, whole: Mesh) -> float:
+    """Share of the area facing away from the nearest face of `whole`."""
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
@@ -55,8 +55,8 @@ def turned(small: Mesh, whole: Mesh) -> float:
     return float(small.face_area[away].sum() / small.face_area.sum())
 
 
-def figures(whole: Mesh, name: str, target: int) -> dict[str, Any]:
-    """Of one library."""
+def metrics(whole: Mesh, name: str, target: int) -> dict[str, Any]:
+    """Metrics of one library."""
     keeps = plugins.module(decimation.__name__, name).KEEPS_BORDER
     took = []
     for _ in range(2):
@@ -69,12 +69,12 @@ def figures(whole: Mesh, name: str, target: int) -> dict[str, Any]:
         "seconds": round(min(took), 2),
         "away_m": deviation(whole, small, 0),
         "border": round(len(edges & border(small)) / max(len(edges), 1), 4),
-        "turned": round(turned(small, whole), 6),
+        "turned": round(share_facing_away(small, whole), 6),
     }
 
 
 def main() -> None:
-    """Print the table."""
+    """Run the benchmark and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--classes", nargs="*", default=["terrain", "building"])
@@ -87,11 +87,11 @@ def main() -> None:
         for share in given.shares:
             print(f"{group}, {len(whole):,} triangles to {share:.0%}")
             for name in given.only:
-                lacking = plugins.missing(decimation.__name__, name)
-                if lacking:
-                    print(f"  {name:20s} needs {lacking}")
+                missing = plugins.missing(decimation.__name__, name)
+                if missing:
+                    print(f"  {name:20s} needs {missing}")
                     continue
-                one = figures(whole, name, round(share * len(whole)))
+                one = metrics(whole, name, round(share * len(whole)))
                 result.setdefault(name, {})[f"{group} {share:g}"] = one
                 print(f"  {name:20s}", json.dumps(one), flush=True)
     print("RESULT", json.dumps(result))

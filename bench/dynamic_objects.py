@@ -1,10 +1,10 @@
-"""What carving drops: of the synthetic street, whose every point is known to stand or to move, and of scanned tiles.
+"""Dynamic object removal: on the synthetic street, where static and moving points are known, and on scanned tiles.
 
     python -m bench.dynamic_objects [--length 100 --points 9e6] [--tiles TILE ...] [--peer]
 
-Of the street: the share of static points lost, by class, the share of the moving car found, and the seconds that the
-step takes. Of tiles (folders of a `tile.toml` with a trajectory): shares dropped, and what lies where the vehicle has
-driven afterwards. `--peer` asks DUFOMap (PyPI: dufomap 1.1.1) the same, where it is installed.
+Street: share of static points lost, by class, share of the moving car removed, and seconds of the step. Tiles (folders
+with a `tile.toml` and a trajectory): shares removed, and points remaining where the vehicle has driven. `--peer` runs
+DUFOMap (PyPI: dufomap 1.1.1) for comparison, if installed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from scan2sim.pipeline.core.classes import CODE, name_of
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import PointCloud, Trajectory
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.steps.carve import CARVE, WINDOW
+from scan2sim.pipeline.steps.carve import CARVE, SCAN_WINDOW_S
 from scan2sim.pipeline.steps.ingest import INGEST
 from scan2sim.pipeline.steps.path import PATH
 
@@ -34,7 +34,7 @@ Bools = np.ndarray
 
 
 def street(length: float, points: float, seed: int) -> tuple[PointCloud, Trajectory, Bools]:
-    """A scan of the street, the scanner's path, and (N,) which points are of the car that drives."""
+    """A scan of the street, the scanner's path, and mask (N,) of points on the moving car."""
     scene = Scene(lay_out(length, seed))
     drive = plan_drive(scene.layout, points)
     cloud = scan(scene, drive, points)
@@ -47,8 +47,8 @@ def street(length: float, points: float, seed: int) -> tuple[PointCloud, Traject
     )
 
 
-def carved(cloud: PointCloud, path: Trajectory) -> tuple[Bools, float, dict[str, Any]]:
-    """(N,) which points the step drops, its seconds, and its facts."""
+def remove_dynamic(cloud: PointCloud, path: Trajectory) -> tuple[Bools, float, dict[str, Any]]:
+    """Mask (N,) of the points removed by the step, its seconds, and its metrics."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
         cloud.save(out / "in.npz")
@@ -61,13 +61,13 @@ def carved(cloud: PointCloud, path: Trajectory) -> tuple[Bools, float, dict[str,
 
 
 def dufomap(cloud: PointCloud, path: Trajectory) -> tuple[Bools, float]:
-    """The same of DUFOMap, with its authors' settings, from the scanner's place in the middle of each window."""
+    """The same with DUFOMap and its authors' settings, from the scanner's position in the middle of each window."""
     from dufomap import dufomap as peer
 
     assert cloud.time is not None
     begin = time.perf_counter()
     order = np.argsort(cloud.time, kind="stable")
-    window = np.floor((cloud.time[order] - cloud.time.min()) / WINDOW + 0.5)
+    window = np.floor((cloud.time[order] - cloud.time.min()) / SCAN_WINDOW_S + 0.5)
     sweeps = np.split(order, np.flatnonzero(np.diff(window)) + 1)
     poses = []
     found = peer(0.1, 0.2, 1)
@@ -77,29 +77,29 @@ def dufomap(cloud: PointCloud, path: Trajectory) -> tuple[Bools, float]:
         poses.append(pose)
         found.run(cloud.xyz[index], pose, cloud_transform=False)
     found.oncePropagateCluster(if_propagate=True, if_cluster=False)
-    gone = np.zeros(len(cloud), bool)
+    removed = np.zeros(len(cloud), bool)
     for index, pose in zip(sweeps, poses, strict=True):
-        gone[index] = np.asarray(found.segment(cloud.xyz[index], pose, cloud_transform=False)) > 0
-    return gone, time.perf_counter() - begin
+        removed[index] = np.asarray(found.segment(cloud.xyz[index], pose, cloud_transform=False)) > 0
+    return removed, time.perf_counter() - begin
 
 
-def figures(cloud: PointCloud, moves: Bools, gone: Bools, seconds: float) -> dict[str, Any]:
-    """Shares lost and found."""
+def metrics(cloud: PointCloud, moves: Bools, removed: Bools, seconds: float) -> dict[str, Any]:
+    """Shares of static points lost and of moving points found."""
     assert cloud.classification is not None
     lost = {
-        name_of(int(code)): round(float(gone[(cloud.classification == code) & ~moves].mean()), 5)
+        name_of(int(code)): round(float(removed[(cloud.classification == code) & ~moves].mean()), 5)
         for code in np.unique(cloud.classification[~moves])
     }
     return {
-        "static_lost": round(float(gone[~moves].mean()), 5),
-        "moving_found": round(float(gone[moves].mean()), 4) if moves.any() else None,
+        "static_lost": round(float(removed[~moves].mean()), 5),
+        "moving_found": round(float(removed[moves].mean()), 4) if moves.any() else None,
         "seconds": round(seconds, 1),
         "lost": lost,
     }
 
 
 def tile_of(folder: Path) -> tuple[PointCloud, Trajectory]:
-    """The cloud of a tile, as ingested, and the scanner's path."""
+    """The ingested cloud of a tile, and the scanner's path."""
     tile = read_tile(folder)
     with tempfile.TemporaryDirectory() as temporary:
         out = Path(temporary)
@@ -111,17 +111,17 @@ def tile_of(folder: Path) -> tuple[PointCloud, Trajectory]:
 
 
 def driven(cloud: PointCloud, path: Trajectory) -> Bools:
-    """(N,) which points lie where the vehicle has driven: 1.3 m to each side, above the road, below its roof."""
+    """Mask (N,) of points where the vehicle has driven: 1.3 m to each side, above the road, below its roof."""
     from scipy.spatial import cKDTree
 
-    places = path.at(np.linspace(path.times[0], path.times[-1], 1000))
-    distance, at = cKDTree(places[:, :2]).query(cloud.xyz[:, :2], distance_upper_bound=1.3, workers=-1)
-    above = cloud.xyz[:, 2] - np.append(places[:, 2], np.nan)[at]
+    positions = path.at(np.linspace(path.times[0], path.times[-1], 1000))
+    distance, at = cKDTree(positions[:, :2]).query(cloud.xyz[:, :2], distance_upper_bound=1.3, workers=-1)
+    above = cloud.xyz[:, 2] - np.append(positions[:, 2], np.nan)[at]
     return np.isfinite(distance) & (above > -1.45) & (above < 1.0)
 
 
 def main() -> None:
-    """Time it as the command line asks."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--length", type=float, default=40.0)
     parser.add_argument("--points", type=float, default=1.6e6)
@@ -130,28 +130,28 @@ def main() -> None:
     parser.add_argument("--peer", action="store_true")
     given = parser.parse_args()
     result: dict[str, Any] = {}
-    carved(*street(8.0, 20_000, 0)[:2])  # compiles
+    remove_dynamic(*street(8.0, 20_000, 0)[:2])  # warm up: compile kernels
     for seed in given.seeds:
         cloud, path, moves = street(given.length, given.points, seed)
-        gone, seconds, _ = carved(cloud, path)
-        result[f"street {seed}"] = figures(cloud, moves, gone, seconds)
+        removed, seconds, _ = remove_dynamic(cloud, path)
+        result[f"street {seed}"] = metrics(cloud, moves, removed, seconds)
         if given.peer:
-            result[f"street {seed} by DUFOMap"] = figures(cloud, moves, *dufomap(cloud, path))
+            result[f"street {seed} by DUFOMap"] = metrics(cloud, moves, *dufomap(cloud, path))
     for folder in given.tiles:
         cloud, path = tile_of(folder)
-        gone, seconds, facts = carved(cloud, path)
+        removed, seconds, facts = remove_dynamic(cloud, path)
         where = driven(cloud, path)
         result[folder.name] = {
-            "dropped": round(float(gone.mean()), 5),
-            "driven_through_left": int((where & ~gone).sum()),
+            "dropped": round(float(removed.mean()), 5),
+            "driven_through_left": int((where & ~removed).sum()),
             "driven_through": int(where.sum()),
             "seconds": round(seconds, 1),
         } | {key: facts[key] for key in ("moved", "own_volume")}
         if given.peer:
-            gone, seconds = dufomap(cloud, path)
+            removed, seconds = dufomap(cloud, path)
             result[f"{folder.name} by DUFOMap"] = {
-                "dropped": round(float(gone.mean()), 5),
-                "driven_through_left": int((where & ~gone).sum()),
+                "dropped": round(float(removed.mean()), 5),
+                "driven_through_left": int((where & ~removed).sum()),
                 "seconds": round(seconds, 1),
             }
     for name, one in result.items():

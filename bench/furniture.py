@@ -1,12 +1,12 @@
-"""Street furniture and sky against the synthetic streets' truth.
+"""Street furniture and sky removal compared with the truth of synthetic streets.
 
 `python -m bench.furniture [--seeds 0 1 2] [--length 100 --points 4e6] [--parts shape sky] [--out bench-out/furniture]`
-- shape: streets are scanned, and the steps `finds` and `furniture` run on their clouds as they stand. `pole_recall`:
-  share of lamps and signs within 20 cm of whose true place one is told of, no trunk; `trunk_recall` of trees;
-  `pole_precision`: share of all things told of that stand within 30 cm of a lamp, sign or tree. `sign_plate_cm`,
-  `pole_cm`: mean distance of true surface samples of plates, and of poles below them, to the meshes.
-- sky: the small street's world with `agreement.sky` off and on: `sky_share`: share of the surface of crowns and
-  buildings that is bluer and brighter than the truth by far; `truth_db`: likeness to the true colours there.
+- shape: streets are scanned, and the steps `finds` and `furniture` run on their labelled clouds. `pole_recall`: share
+  of lamps and signs with a detection other than a trunk within 20 cm; `trunk_recall` of trees; `pole_precision`: share
+  of detections within 30 cm of a lamp, sign or tree. `sign_plate_cm`, `pole_cm`: mean distance from true surface
+  samples of sign panels, and of poles below them, to the meshes.
+- sky: world of the small street with `agreement.sky` off and on: `sky_share`: share of the surface of crowns and
+  buildings that is far bluer and brighter than the truth; `truth_db`: PSNR of the true colours there.
 
 Ends with `RESULT {json}`.
 """
@@ -34,18 +34,18 @@ from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.finds import FINDS, FindsParams
 from scan2sim.pipeline.steps.furniture import FURNITURE, FurnitureParams
-from scan2sim.pipeline.steps.geometry import distances, spread
+from scan2sim.pipeline.steps.geometry import distances, sample_surface
 
-PLACE, CLOSE = 0.2, 0.3
-"""Metres within which a thing is found, and told of rightly."""
-BLUER, BRIGHTER = 30.0, 20.0
-"""Grey levels of blue less red, and of luminance, beyond the truth's from which on a texel shows sky."""
-REACH = 0.15
-"""Metres within which a true sample tells a texel's colour."""
+RECALL_DISTANCE_M, PRECISION_DISTANCE_M = 0.2, 0.3
+"""Maximum distance of a detection from the truth for recall of poles, and for precision and trunks."""
+MIN_BLUER, MIN_BRIGHTER = 30.0, 20.0
+"""Excess of blue minus red and of luminance over the truth, in grey levels, at which a texel shows sky."""
+COLOUR_RADIUS_M = 0.15
+"""Maximum distance of the true sample that gives a texel's true colour."""
 
 
 def main() -> None:
-    """Run the parts asked for."""
+    """Run the parts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--length", type=float, default=100.0)
@@ -84,7 +84,7 @@ def shape(out: Path, seeds: list[int], length: float, points: float) -> dict[str
 
 
 def _street(street: Path, seed: int, length: float) -> dict[str, list[Any]]:
-    """What is found of one street's things."""
+    """Evaluate the detections of one street."""
     tile = read_tile(street / "tile.toml")
     assert tile.trajectory is not None and tile.truth_mesh is not None
     with tempfile.TemporaryDirectory() as name:
@@ -103,39 +103,39 @@ def _street(street: Path, seed: int, length: float) -> dict[str, list[Any]]:
     posts = np.array([layout.axis.place(p.s, p.t)[0] for p in layout.posts]) + shift
     trees = np.array([layout.axis.place(t.s, t.t)[0] for t in layout.trees if not t.bush]) + shift
 
-    def apart(a: Any, b: Any) -> Any:
+    def nearest_distance(a: Any, b: Any) -> Any:
         return np.linalg.norm(a[:, None] - b[None], axis=2).min(axis=1, initial=np.inf)
 
     truth = Mesh.load(tile.truth_mesh).moved_to(mesh.frame)
     assert truth.classification is not None
-    plates = spread(truth.keep(truth.classification == CODE["road_sign"]), 20_000)
-    shafts = spread(truth.keep(truth.classification == CODE["pole"]), 20_000)
+    plates = sample_surface(truth.keep(truth.classification == CODE["road_sign"]), 20_000)
+    shafts = sample_surface(truth.keep(truth.classification == CODE["pole"]), 20_000)
     ground = layout.height(*layout.axis.locate(shafts[:, :2] - shift))
     above = shafts[:, 2] - ground
     shafts = shafts[(above > 0.3) & (above < 2.0)]
     return {
-        "pole": (apart(posts, at[~trunk]) < PLACE).tolist(),
-        "trunk": (apart(trees, at[trunk]) < CLOSE).tolist(),
-        "right": (apart(at, np.concatenate([posts, trees])) < CLOSE).tolist(),
+        "pole": (nearest_distance(posts, at[~trunk]) < RECALL_DISTANCE_M).tolist(),
+        "trunk": (nearest_distance(trees, at[trunk]) < PRECISION_DISTANCE_M).tolist(),
+        "right": (nearest_distance(at, np.concatenate([posts, trees])) < PRECISION_DISTANCE_M).tolist(),
         "plate": distances(plates, mesh).tolist(),
         "shaft": distances(shafts, mesh).tolist(),
     }
 
 
 def sky(out: Path, on: bool) -> dict[str, float]:
-    """The small street's world: sky on crowns and buildings, and how like the truth they are."""
+    """Share of sky on crowns and buildings in the small street's world, and PSNR of their colours."""
     scan2sim = str(Path(sys.executable).parent / "scan2sim")
     command = [scan2sim, "run", str(SMALL), "--out", str(out), "--set", f"agreement.sky={str(on).lower()}"]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     folders = {g: out / "steps" / f"texture.{g}" for g in ("building", "vegetation")}
     made = {g: max(f.glob("*/textured"), key=lambda p: p.stat().st_mtime) for g, f in folders.items()}
-    figures = {f"{group}_{k}": v for group, folder in made.items() for k, v in on_surface(folder).items()}
-    return figures | {"coverage": report["texture"]["coverage"]}
+    metrics = {f"{group}_{k}": v for group, folder in made.items() for k, v in on_surface(folder).items()}
+    return metrics | {"coverage": report["texture"]["coverage"]}
 
 
 def on_surface(folder: Path) -> dict[str, float]:
-    """Of what photos painted: share that shows sky, and PSNR against the true colours, from places on the surface."""
+    """Share of the textured surface that shows sky, and PSNR of its colours, from samples on the surface."""
     from scipy.spatial import cKDTree
 
     body = textured(folder)
@@ -143,15 +143,15 @@ def on_surface(folder: Path) -> dict[str, float]:
     assert tile.truth_points is not None
     truth = las.read(tile.truth_points, body.mesh.frame)
     assert truth.rgb is not None
-    places = spread(body.mesh, 200_000)
-    rgb, seen, _ = Renderer([body]).nearest(places)
-    distance, near = cKDTree(truth.xyz).query(places, distance_upper_bound=REACH, workers=-1)
+    samples = sample_surface(body.mesh, 200_000)
+    rgb, seen, _ = Renderer([body]).nearest(samples)
+    distance, near = cKDTree(truth.xyz).query(samples, distance_upper_bound=COLOUR_RADIUS_M, workers=-1)
     held = np.isfinite(distance) & (seen == 255)
     shown, true = rgb[held].astype(np.float32), truth.rgb[near[held]].astype(np.float32)
     blue, light = _blue(shown) - _blue(true), shown.mean(axis=1) - true.mean(axis=1)
     error = float(np.mean((shown - true) ** 2))
     return {
-        "sky_share": round(float(((blue > BLUER) & (light > BRIGHTER)).mean()), 5),
+        "sky_share": round(float(((blue > MIN_BLUER) & (light > MIN_BRIGHTER)).mean()), 5),
         "truth_db": round(10 * float(np.log10(255**2 / error)), 2),
         "painted": round(float((seen == 255).mean()), 4),
     }

@@ -1,9 +1,9 @@
-"""How large GLBs are, by how they are packed, and what telling where colours are from costs.
+"""Size of GLBs by kind of compression, and the cost of provenance attributes.
 
-`python -m bench.glb [--world OUT]`, OUT the folder that `run` or `survey` was given (default: the gate's demo tile).
-Each way writes the world's GLBs anew. Ways that need a package or program that isn't there are skipped, and said.
+`python -m bench.glb [--world OUT]`: OUT is the output folder of `run` or `survey` (default: the gate's demo tile). The
+world's GLBs are written once for each variant. Variants that need a missing package or program are skipped.
 
-Ends with `RESULT {"ways": {way: {"mb", "geometry_mb", "textures_mb", "seconds"}}, "skipped": [...]}`.
+Ends with `RESULT {"ways": {variant: {"mb", "geometry_mb", "textures_mb", "seconds"}}, "skipped": [...]}`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.scene import Scene, read_scene
 
-WAYS: dict[str, dict[str, Any]] = {
+VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "without provenance": {"glb_bare": True},
     "lit, without provenance": {"glb_bare": True, "glb_lit": True},
@@ -36,7 +36,7 @@ WAYS: dict[str, dict[str, Any]] = {
 
 
 def measure(scene: Scene, params: dict[str, Any]) -> dict[str, float]:
-    """Megabytes of a world's GLBs, and of what is in them; seconds that writing takes."""
+    """Megabytes of a world's GLBs and of their parts; seconds to write them."""
     with tempfile.TemporaryDirectory() as place:
         begun = time.perf_counter()
         world_formats.write(scene, ["glb"], Path(place), SceneParams(**params), silent)
@@ -48,7 +48,7 @@ def measure(scene: Scene, params: dict[str, Any]) -> dict[str, float]:
 
 
 def _textures(path: Path) -> int:
-    """Bytes of a GLB's pictures."""
+    """Bytes of a GLB's textures."""
     data = path.read_bytes()
     (length,) = struct.unpack("<I", data[12:16])
     tree = json.loads(data[20 : 20 + length])
@@ -56,19 +56,19 @@ def _textures(path: Path) -> int:
 
 
 def main() -> None:
-    """Write all ways, print a table."""
+    """Write all variants and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--world", type=Path, default=ROOT / "bench-out" / "gate" / "demo" / "run")
-    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS))
+    parser.add_argument("--ways", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
     arguments = parser.parse_args()
     scene = read_scene(arguments.world)
     result: dict[str, Any] = {"ways": {}, "skipped": []}
-    for way in arguments.ways:
+    for variant in arguments.ways:
         try:
-            result["ways"][way] = found = measure(scene, WAYS[way])
-            print(f"{way:24}", json.dumps(found), flush=True)
+            result["ways"][variant] = found = measure(scene, VARIANTS[variant])
+            print(f"{variant:24}", json.dumps(found), flush=True)
         except UnavailableError as why:
-            result["skipped"].append(f"{way}: {why}")
+            result["skipped"].append(f"{variant}: {why}")
     print("RESULT", json.dumps(result))
 
 

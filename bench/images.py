@@ -1,16 +1,18 @@
-"""OpenCV and OpenImageIO side by side: what photos and pages they read, how true, how fast, in how much memory.
+"""Compare OpenCV and OpenImageIO: supported files, accuracy, speed and memory for photos and texture pages.
 
 `python -m bench.images [--width 5760] [--panorama 16384] [--repeats 5] [--parts reading panorama colours writing]`:
-all files are made in a temporary folder, from a photo of the committed tile scaled up, with grain.
+all files are generated in a temporary folder from a photo of the demo tile, scaled up, with noise.
 
-- reading: seconds, and the largest error (of 255 levels; JPEG: against OpenCV's pixels).
-- panorama: a region of 2048 x 2048 and an eighth of the size; seconds and growth of the peak memory, a process each.
-- colours: levels (mean, largest) that a photo with a profile is away from the truth in sRGB, which matrices tell. As
-  decoded; by OpenImageIO, told the colour space's name; by Pillow (LittleCMS), from the profile that the file has.
-- writing: seconds, megabytes, and the mean error of a page.
+- reading: seconds, and maximum error (in 255 levels; JPEG: relative to OpenCV's pixels).
+- panorama: a region of 2048 x 2048, and the whole image at an eighth of the size; seconds and growth of peak memory,
+  each in its own process.
+- colours: error in levels (mean, maximum) of a photo with a colour profile relative to its true sRGB values, which
+  follow from the matrices: as decoded; with OpenImageIO and the colour space's name; with Pillow (LittleCMS) and
+  the profile.
+- writing: seconds, megabytes, and mean error of a page.
 
-Seconds are of processors, all cores together, of the fastest of `--repeats`: others' work doesn't count. null: the
-library can't. Ends with `RESULT {json}`.
+Seconds are CPU times of all cores, the minimum of `--repeats` runs. null: not supported by the library. Ends with
+`RESULT {json}`.
 """
 
 from __future__ import annotations
@@ -40,20 +42,20 @@ from scan2sim.pipeline.io.images.decoders import openimageio
 
 Pixels = npt.NDArray[Any]
 PHOTO = ROOT / "data_samples" / "tile" / "photos" / "0000_front.jpg"
-REGION, REDUCED, TILE = 2048, 8, 256
+REGION_PX, REDUCTION, TILE_PX = 2048, 8, 256
 LIBRARIES = ("opencv", "openimageio")
 SRGB, P3, ADOBE = (
     ((0.640, 0.330), (0.300, 0.600), (0.150, 0.060)),
     ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
     ((0.640, 0.330), (0.210, 0.710), (0.150, 0.060)),
 )
-"""Chromaticities of primaries (IEC 61966-2-1, SMPTE EG 432-1, Adobe RGB 1998); the white of all is D65."""
+"""Chromaticities of primaries (IEC 61966-2-1, SMPTE EG 432-1, Adobe RGB 1998); the white point of all is D65."""
 D65, D50 = (0.3127, 0.3290), (0.3457, 0.3585)
 BRADFORD = np.array([(0.8951, 0.2664, -0.1614), (-0.7502, 1.7135, 0.0367), (0.0389, -0.0685, 1.0296)])
 
 
 def photo(width: int) -> U8:
-    """(width / 2, width, 3) RGB: a photo of the committed tile, scaled up, with grain as cameras have."""
+    """(width / 2, width, 3) RGB: a photo of the demo tile, scaled up, with sensor noise."""
     small = cv2.imread(str(PHOTO))[..., ::-1]
     large = cv2.resize(small, (width, width // 2), interpolation=cv2.INTER_CUBIC).astype(np.int16)
     large += np.random.default_rng(0).integers(-3, 4, large.shape, dtype=np.int16)
@@ -67,13 +69,13 @@ def decoded(rgb: Pixels) -> F64:
 
 
 def encoded(light: Pixels) -> F64:
-    """SRGB values of linear light, what is beyond 0 to 1 clipped."""
+    """SRGB values of linear light, clipped to 0 to 1."""
     x = np.clip(np.asarray(light, np.float64), 0, 1)
     return np.where(x <= 0.0031308, x * 12.92, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
 def to_xyz(primaries: tuple[tuple[float, float], ...], white: tuple[float, float] = D65) -> F64:
-    """(3, 3) from linear RGB to CIE XYZ."""
+    """(3, 3) matrix from linear RGB to CIE XYZ."""
     corners = np.array([(x / y, 1.0, (1 - x - y) / y) for x, y in primaries]).T
     return np.asarray(corners * np.linalg.solve(corners, _xyz(white)))
 
@@ -83,7 +85,7 @@ def _xyz(white: tuple[float, float]) -> F64:
 
 
 def profile(primaries: tuple[tuple[float, float], ...], gamma: float | None) -> bytes:
-    """An ICC profile (version 2, matrix and curves): a power, or sRGB's curve where that is None."""
+    """ICC profile (version 2, matrix and curves) with a power law, or with sRGB's curve if `gamma` is None."""
     cones = BRADFORD @ np.stack([_xyz(D50), _xyz(D65)], axis=1)
     adapted = np.linalg.inv(BRADFORD) @ np.diag(cones[:, 0] / cones[:, 1]) @ BRADFORD @ to_xyz(primaries)
     table = decoded(np.arange(1024) / 1023) if gamma is None else None
@@ -105,7 +107,7 @@ def profile(primaries: tuple[tuple[float, float], ...], gamma: float | None) -> 
 
 
 def write(path: Path, pixels: Pixels, kind: str, tile: int = 0, **attributes: str | int) -> None:
-    """A file by OpenImageIO; attributes as "png__compressionLevel"."""
+    """Write a file with OpenImageIO; attributes are named like "png__compressionLevel"."""
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
     spec.tile_width = spec.tile_height = tile
     if "channelnames" in attributes:
@@ -119,7 +121,7 @@ def write(path: Path, pixels: Pixels, kind: str, tile: int = 0, **attributes: st
 
 
 def by_opencv(path: Path) -> Pixels | None:
-    """A file's pixels as they lie in it."""
+    """Pixels of a file as stored."""
     try:
         found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
@@ -128,25 +130,25 @@ def by_opencv(path: Path) -> Pixels | None:
 
 
 def by_openimageio(path: Path) -> Pixels:
-    """The same."""
-    source = opened(path)
+    """Pixels of a file as stored."""
+    source = open_image(path)
     found: Pixels = source.read_image(0, 0, 0, source.spec().nchannels, str(source.spec().format))
     return found
 
 
-def opened(path: Path) -> Any:
-    """A file by OpenImageIO, its header read."""
+def open_image(path: Path) -> Any:
+    """Open a file with OpenImageIO and read its header."""
     source = oiio.ImageInput.open(str(path))
     if source is None:
         raise SystemExit(f"{path}: {oiio.geterror()}")
     return source
 
 
-READ: dict[str, Callable[[Path], Pixels | None]] = {"opencv": by_opencv, "openimageio": by_openimageio}
+READERS: dict[str, Callable[[Path], Pixels | None]] = {"opencv": by_opencv, "openimageio": by_openimageio}
 
 
 def fastest(task: Callable[[], Any], repeats: int) -> tuple[float, Any]:
-    """Seconds of all cores, of the fastest, and what it gave."""
+    """CPU seconds of the fastest run, and the result."""
     took = []
     for _ in range(repeats):
         start = time.process_time()
@@ -156,7 +158,7 @@ def fastest(task: Callable[[], Any], repeats: int) -> tuple[float, Any]:
 
 
 def files(folder: Path, rgb: U8) -> dict[Path, Pixels | None]:
-    """All kinds of photos, and what is in them, 0 to 1; None: what OpenCV decodes."""
+    """Write all kinds of photos; returns their true pixels from 0 to 1, None: the pixels decoded by OpenCV."""
     share = rgb / np.float32(255)
     fine = (share * 65535 + np.random.default_rng(1).integers(0, 257, rgb.shape)).clip(0, 65535).astype(np.uint16)
     light = decoded(share).astype(np.float32)
@@ -173,33 +175,33 @@ def files(folder: Path, rgb: U8) -> dict[Path, Pixels | None]:
         ("8.png", "uint8", 0, rgb, {}),
         ("16.png", "uint16", 0, fine, {}),
         ("8.tif", "uint8", 0, rgb, deflate),
-        ("8_tiled.tif", "uint8", TILE, rgb, deflate),
+        ("8_tiled.tif", "uint8", TILE_PX, rgb, deflate),
         ("16.tif", "uint16", 0, fine, deflate),
-        ("16_tiled.tif", "uint16", TILE, fine, deflate),
-        ("float_tiled.tif", "float", TILE, light, deflate),
+        ("16_tiled.tif", "uint16", TILE_PX, fine, deflate),
+        ("float_tiled.tif", "float", TILE_PX, light, deflate),
         ("half.exr", "half", 0, light.astype(np.float16), deflate),
-        ("half_tiled.exr", "half", TILE, light.astype(np.float16), deflate),
+        ("half_tiled.exr", "half", TILE_PX, light.astype(np.float16), deflate),
         ("float.exr", "float", 0, light, deflate),
     ):
         write(folder / name, pixels, kind, tile, **more)
-        found[folder / name] = of_one(pixels)
+        found[folder / name] = normalized(pixels)
     return found
 
 
-def of_one(pixels: Pixels) -> Pixels:
-    """Pixels as shares of the largest value."""
+def normalized(pixels: Pixels) -> Pixels:
+    """Pixels divided by the largest value of their type."""
     return pixels / np.float32(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else pixels.astype(np.float32)
 
 
 def reading(folder: Path, width: int, repeats: int) -> dict[str, Any]:
-    """Of every kind of photo."""
+    """Read every kind of photo."""
     found: dict[str, Any] = {}
     for path, truth in files(folder, photo(width)).items():
-        known = of_one(np.asarray(by_opencv(path))) if truth is None else truth
+        known = normalized(np.asarray(by_opencv(path))) if truth is None else truth
         one: dict[str, Any] = {"mb": round(path.stat().st_size / 1e6, 2)}
-        for library, read in READ.items():
+        for library, read in READERS.items():
             seconds, pixels = fastest(partial(read, path), repeats)
-            error = None if pixels is None else round(float(np.abs(of_one(pixels) - known).max() * 255), 3)
+            error = None if pixels is None else round(float(np.abs(normalized(pixels) - known).max() * 255), 3)
             one[library] = None if pixels is None else {"seconds": seconds, "error": error}
         found[path.name] = one
         print(f"{path.name:20s}", json.dumps(one), flush=True)
@@ -207,10 +209,10 @@ def reading(folder: Path, width: int, repeats: int) -> dict[str, Any]:
 
 
 def panorama(folder: Path, width: int) -> dict[str, Any]:
-    """Parts of a large one, each in a process of its own."""
+    """Read parts of a panorama, each in a new process."""
     rgb = photo(width)
     cv2.imwrite(str(folder / "p.jpg"), rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
-    write(folder / "p_tiled.tif", rgb, "uint8", TILE, compression="zip")
+    write(folder / "p_tiled.tif", rgb, "uint8", TILE_PX, compression="zip")
     write(folder / "p_rows.tif", rgb, "uint8", 0, compression="zip")
     whole = oiio.ImageBuf(rgb)
     if not oiio.ImageBufAlgo.make_texture(oiio.MakeTxTexture, whole, str(folder / "p_levels.tif")):
@@ -218,19 +220,19 @@ def panorama(folder: Path, width: int) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name in ("p.jpg", "p_rows.tif", "p_tiled.tif", "p_levels.tif"):
         for task in ("region", "eighth"):
-            one = {library: alone(globals()[f"{task}_{library}"], folder / name) for library in LIBRARIES}
+            one = {library: in_new_process(globals()[f"{task}_{library}"], folder / name) for library in LIBRARIES}
             found[f"{name} {task}"] = one
             print(f"{name:14s}{task:8s}", json.dumps(one), flush=True)
     return found
 
 
-def alone(task: Callable[[Path], Pixels], path: Path) -> dict[str, float]:
-    """Seconds, and megabytes by which the peak memory grew, in a fresh process."""
+def in_new_process(task: Callable[[Path], Pixels], path: Path) -> dict[str, float]:
+    """CPU seconds, and growth of peak memory in megabytes, in a new process."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(_alone, (task, path))
+        return pool.apply(_measure, (task, path))
 
 
-def _alone(task: Callable[[Path], Pixels], path: Path) -> dict[str, float]:
+def _measure(task: Callable[[Path], Pixels], path: Path) -> dict[str, float]:
     before, start = _peak(), time.process_time()
     task(path)
     return {"seconds": round(time.process_time() - start, 3), "mb": round(_peak() - before)}
@@ -241,33 +243,33 @@ def _peak() -> float:
 
 
 def region_opencv(path: Path) -> Pixels:
-    """A square in the middle."""
+    """A square in the centre."""
     whole = cv2.imread(str(path))
     x, y = whole.shape[1] // 2, whole.shape[0] // 2
-    return whole[y - REGION // 2 : y + REGION // 2, x - REGION // 2 : x + REGION // 2]
+    return whole[y - REGION_PX // 2 : y + REGION_PX // 2, x - REGION_PX // 2 : x + REGION_PX // 2]
 
 
 def region_openimageio(path: Path) -> Pixels:
-    """The same."""
+    """A square in the centre."""
     width, height, _ = openimageio.header(path)
-    x, y = (width - REGION) // 2, (height - REGION) // 2
-    return openimageio.pixels(path, box=(x, y, x + REGION, y + REGION))
+    x, y = (width - REGION_PX) // 2, (height - REGION_PX) // 2
+    return openimageio.pixels(path, box=(x, y, x + REGION_PX, y + REGION_PX))
 
 
 def eighth_opencv(path: Path) -> Pixels:
-    """The photo at an eighth; its decoder of JPEG makes it so."""
+    """The image at an eighth of the size; the JPEG decoder reduces it."""
     return cv2.imread(str(path), cv2.IMREAD_REDUCED_COLOR_8)
 
 
 def eighth_openimageio(path: Path) -> Pixels:
-    """The same; the level that the file holds, where it does."""
-    source, level = opened(path), REDUCED.bit_length() - 1
+    """The image at an eighth of the size; from the file's own level if it has one."""
+    source, level = open_image(path), REDUCTION.bit_length() - 1
     found: Pixels
     if source.seek_subimage(0, level):
         found = source.read_image(0, level, 0, 3, "uint8")
     else:
         whole = source.read_image(0, 0, 0, 3, "uint8")
-        found = cv2.resize(whole, None, fx=1 / REDUCED, fy=1 / REDUCED, interpolation=cv2.INTER_AREA)
+        found = cv2.resize(whole, None, fx=1 / REDUCTION, fy=1 / REDUCTION, interpolation=cv2.INTER_AREA)
     return found
 
 
@@ -278,7 +280,7 @@ SPACES = {
 
 
 def colours(folder: Path, width: int, repeats: int) -> dict[str, Any]:
-    """Of photos with a profile, lossless, so that nothing else is wrong; and of linear light."""
+    """Convert photos with a colour profile; they are lossless, so that there are no other errors."""
     rgb, found = photo(width), {}
     for name, (primaries, gamma, space) in SPACES.items():
         icc, path = profile(primaries, gamma), folder / f"{name}.png"
@@ -294,8 +296,8 @@ def colours(folder: Path, width: int, repeats: int) -> dict[str, Any]:
             own, srgb = ImageCms.getOpenProfile(io.BytesIO(icc)), ImageCms.createProfile("sRGB")
             return np.asarray(ImageCms.profileToProfile(Image.fromarray(rgb), own, srgb))
 
-        told = opened(path).spec().get_string_attribute("oiio:ColorSpace")
-        one: dict[str, Any] = {"openimageio_tells": told}
+        space_name = open_image(path).spec().get_string_attribute("oiio:ColorSpace")
+        one: dict[str, Any] = {"openimageio_tells": space_name}
         for way, task in (("as decoded", lambda: rgb), ("openimageio, named", named), ("pillow", by_profile)):
             seconds, pixels = fastest(task, repeats)
             away = np.abs(pixels[::4] - truth)
@@ -310,7 +312,7 @@ def colours(folder: Path, width: int, repeats: int) -> dict[str, Any]:
 
 
 def writing(folder: Path, width: int, repeats: int) -> dict[str, Any]:
-    """Of a page of 4096 x 4096, or what `width` allows."""
+    """Write a page of 4096 x 4096, or less if `width` is smaller."""
     page = photo(2 * min(width, 4096))[:, : min(width, 4096)]
     bgr, found = np.ascontiguousarray(page[..., ::-1]), {}
     rgb = np.ascontiguousarray(page)
@@ -336,7 +338,7 @@ def writing(folder: Path, width: int, repeats: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Print the tables."""
+    """Run the benchmark and print tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--width", type=int, default=5760)
     parser.add_argument("--panorama", type=int, default=16384)

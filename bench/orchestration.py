@@ -1,17 +1,17 @@
-"""Services through OSM: whole lifecycles, faults, kills, and a hundred at once.
+"""Orchestration of services with OSM: lifecycles, faults, killed runs, and a hundred services at once.
 
-`python -m bench.orchestration [--parts lifecycles faults kills hundred] [--kills 50]`, against OSM's stand-in
-(`tests/fakes/osm.py`), which answers as OSM's own interface was seen to; nothing runs behind it.
+`python -m bench.orchestration [--parts lifecycles faults kills hundred] [--kills 50]` runs against a fake OSM
+(`tests/fakes/osm.py`) that returns recorded responses and deploys nothing.
 
-- lifecycles: the four toolboxes and a worker of surveys are brought up, scaled and removed by `scan2sim orchestrate`.
-- faults: every refusal that SOL005 names, a token that is taken back, connections cut, operations that fail or never
-  end: what was said, and whether the next run ends as if nothing had been.
-- kills: `apply` killed (SIGKILL) at random moments; the next run must end in the same state.
-- hundred: services brought up by one `apply`.
+- lifecycles: the four toolboxes and a survey worker are started, scaled and removed with `scan2sim orchestrate`.
+- faults: every error status of SOL005, revoked tokens, broken connections, operations that fail or never end: the
+  message, and whether the next run recovers.
+- kills: `apply` is killed (SIGKILL) at random moments; the next run must reach the same final state.
+- hundred: a hundred services are started with one `apply`.
 
-Ends with `RESULT {json}`: `lifecycles` that went through, `faults_tried`, `faults_clear`, `orphans` left in all of it,
-`kills`, `kills_resumed`, `hundred_requests_per_second_max` (in any second, about instances and their operations, for
-each of those that are worked on at once; packages are sent before, one after another).
+Ends with `RESULT {json}`: completed `lifecycles`, `faults_tried`, `faults_clear` (clear message and recovery),
+`orphans` left by all parts, `kills`, `kills_resumed`, `hundred_requests_per_second_max` (highest rate in any second of
+requests about instances and operations, per instance in parallel; packages are onboarded before, one by one).
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from typing import Any
 
 from scan2sim.pipeline.core.errors import ScanError
 from scan2sim.services.orchestration import apply, deployment
-from scan2sim.services.orchestration.apply import Applied
-from scan2sim.services.orchestration.osm import FAULTS, Osm
+from scan2sim.services.orchestration.apply import ApplyResult
+from scan2sim.services.orchestration.osm import HTTP_ERRORS, Osm
 from scan2sim.services.orchestration.settings import ApplyParams
-from tests.fakes.osm import CUT_AFTER, CUT_BEFORE, Fake, Fault, State
+from tests.fakes.osm import CUT_AFTER, CUT_BEFORE, FakeOsm, Fault, OsmState
 
-TOWN = ("classify", "detect", "movement", "segment", "worker")
-HUNDRED = 100
+SERVICES = ("classify", "detect", "movement", "segment", "worker")
+SERVICE_COUNT = 100
 PARALLEL = 10
-"""Instances that are worked on at once, of the hundred."""
+"""Number of instances that are changed at the same time, of the hundred."""
 
 
 def services(folder: Path, replicas: int = 1, count: int = 0) -> Path:
-    """A services.toml of the four toolboxes and a worker, or of so many services."""
-    names = [(name, name) for name in TOWN] if not count else [(f"robot-{i}", TOWN[i % 5]) for i in range(count)]
+    """Write a services.toml with the four toolboxes and a worker, or with `count` services."""
+    names = [(f"robot-{i}", SERVICES[i % 5]) for i in range(count)] if count else [(name, name) for name in SERVICES]
     text = 'deployment = "town"\n'
     for name, service in names:
         text += f'[[service]]\nname = "{name}"\nservice = "{service}"\nreplicas = {replicas}\n'
@@ -56,22 +56,22 @@ def services(folder: Path, replicas: int = 1, count: int = 0) -> Path:
     return path
 
 
-def bring(fake: Fake, path: Path, timeout: float = 30.0) -> Applied:
-    """Apply a file, here."""
+def apply_file(fake: FakeOsm, path: Path, timeout: float = 30.0) -> ApplyResult:
+    """Apply a services.toml in this process."""
     params = ApplyParams(osm=fake.address, wait=True, timeout=timeout)
     with Osm(params) as osm:
-        there = apply.target(osm, deployment.read(path), path.parent)
-        return apply.apply(osm, there, params, lambda fraction, message="": None)
+        state = apply.load_state(osm, deployment.read(path), path.parent)
+        return apply.apply(osm, state, params, lambda fraction, message="": None)
 
 
-def command(fake: Fake, *arguments: object) -> list[str]:
-    """Of `scan2sim orchestrate`."""
+def command(fake: FakeOsm, *arguments: object) -> list[str]:
+    """Command line of `scan2sim orchestrate`."""
     return [sys.executable, "-m", "scan2sim.flows.cli", "orchestrate", *map(str, arguments), "--osm", fake.address]
 
 
 def lifecycles(folder: Path) -> dict[str, Any]:
-    """Bring up, scale and remove by the command."""
-    with Fake(State(seconds=0.5)) as fake:
+    """Start, scale and remove services with the command."""
+    with FakeOsm(OsmState(seconds=0.5)) as fake:
         path = services(folder)
         subprocess.run(command(fake, "apply", path, "--wait"), check=True)
         up = {one["name"] for one in fake.state.instances.values() if one["nsState"] == "READY"}
@@ -88,50 +88,50 @@ def lifecycles(folder: Path) -> dict[str, Any]:
 
 
 def faults(folder: Path) -> dict[str, Any]:
-    """Each fault, then a run without: a line of a table each."""
+    """A run with each fault, then one without; prints a Markdown table."""
     path, tried, clear, orphans = services(folder), 0, 0, 0
-    print("| fault | what was said | the next run |\n| --- | --- | --- |")
-    for name, spoil in _faults():
-        with Fake(State(seconds=0.02)) as fake:
-            spoil(fake.state)
-            said = _said(fake, path)
+    print("| fault | message | next run |\n| --- | --- | --- |")
+    for name, inject in _faults():
+        with FakeOsm(OsmState(seconds=0.02)) as fake:
+            inject(fake.state)
+            message = _message(fake, path)
             fake.state.faults = lambda method, path: None
             fake.state.outcome = lambda kind, name: "COMPLETED"
-            ended = not bring(fake, path).failed and len(fake.state.instances) == len(TOWN)
+            ended = not apply_file(fake, path).failed and len(fake.state.instances) == len(SERVICES)
             left = len(fake.state.orphans())
-            tried, clear, orphans = tried + 1, clear + (ended and not left and bool(said)), orphans + left
-        print(f"| {name} | {said} | {'ends as if it had not been' if ended and not left else '**does not mend it**'} |")
+            tried, clear, orphans = tried + 1, clear + (ended and not left and bool(message)), orphans + left
+        print(f"| {name} | {message} | {'recovers' if ended and not left else '**does not recover**'} |")
     return {"faults_tried": tried, "faults_clear": clear, "orphans": orphans}
 
 
-def _faults() -> list[tuple[str, Callable[[State], None]]]:
-    """What goes wrong, by name."""
+def _faults() -> list[tuple[str, Callable[[OsmState], None]]]:
+    """Functions that inject each fault, with its name."""
 
-    def always(fault: Fault, part: str, get: bool = False) -> Callable[[State], None]:
-        def spoil(state: State) -> None:
+    def always(fault: Fault, part: str, get: bool = False) -> Callable[[OsmState], None]:
+        def inject(state: OsmState) -> None:
             state.faults = lambda method, path: fault if part in path and (get or method != "GET") else None
 
-        return spoil
+        return inject
 
-    def once(fault: Fault, nth: int) -> Callable[[State], None]:
-        def spoil(state: State) -> None:
+    def once(fault: Fault, nth: int) -> Callable[[OsmState], None]:
+        def inject(state: OsmState) -> None:
             count = itertools.count()
             state.faults = lambda method, path: fault if next(count) == nth else None
 
-        return spoil
+        return inject
 
-    def ends(outcome: str, kind: str) -> Callable[[State], None]:
-        def spoil(state: State) -> None:
+    def ends(outcome: str, kind: str) -> Callable[[OsmState], None]:
+        def inject(state: OsmState) -> None:
             state.outcome = lambda done, name: outcome if (done, name) == (kind, "detect") else "COMPLETED"
 
-        return spoil
+        return inject
 
-    def token(state: State) -> None:
+    def revoke_tokens(state: OsmState) -> None:
         count = itertools.count()
         state.faults = lambda method, path: state.tokens.clear() if next(count) % 25 == 24 else None
 
-    found: list[tuple[str, Callable[[State], None]]] = []
-    for status in sorted(FAULTS):
+    found: list[tuple[str, Callable[[OsmState], None]]] = []
+    for status in sorted(HTTP_ERRORS):
         for part, what in (
             ("vnf_packages", "functions"),
             ("ns_instances", "instances"),
@@ -142,23 +142,23 @@ def _faults() -> list[tuple[str, Callable[[State], None]]]:
     for fault, nth in itertools.product(cuts, range(3, 60, 8)):
         found.append((f"{fault}, at request {nth}", once(fault, nth)))
     found += [
-        ("the token is taken back at every 25th request", token),
+        ("the token is revoked at every 25th request", revoke_tokens),
         ("an instantiation fails", ends("FAILED", "instantiate")),
         ("an instantiation never ends", ends("never", "instantiate")),
-        ("the password is refused", always(401, "tokens", get=True)),
+        ("the password is rejected", always(401, "tokens", get=True)),
     ]
     return found
 
 
-def _said(fake: Fake, path: Path) -> str:
-    """What a run says, in one sentence; "" if it says nothing clear."""
+def _message(fake: FakeOsm, path: Path) -> str:
+    """Message of a run with a fault; empty if it isn't complete."""
     try:
-        applied = bring(fake, path, timeout=1.0)
+        result = apply_file(fake, path, timeout=1.0)
     except ScanError as error:
         return f"{error.cause}. {error.remedy}"
-    if not applied.failed:
-        return "nothing: it was tried again"
-    first = next(iter(applied.failed.values()))
+    if not result.failed:
+        return "none: a retry succeeded"
+    first = next(iter(result.failed.values()))
     return f"{first.cause}. {first.remedy}" if first.cause and first.remedy else ""
 
 
@@ -166,48 +166,49 @@ def kills(folder: Path, count: int) -> dict[str, Any]:
     """Kill `apply` at random moments of its run, and run it again."""
     rng, resumed, orphans = random.Random(0), 0, 0
     path = services(folder)
-    with Fake(State(seconds=0.5)) as fake:
+    with FakeOsm(OsmState(seconds=0.5)) as fake:
         begun = time.monotonic()
         subprocess.run(command(fake, "apply", path, "--wait"), check=True, stdout=subprocess.DEVNULL)
         whole, lasts = fake.state.summary(), time.monotonic() - begun
-        first = fake.state.asked[0][0] - begun
+        first = fake.state.requests[0][0] - begun
     for number in range(count):
-        with Fake(State(seconds=0.5)) as fake:
+        with FakeOsm(OsmState(seconds=0.5)) as fake:
             run = subprocess.Popen(command(fake, "apply", path, "--wait"), stdout=subprocess.DEVNULL)
             time.sleep(rng.uniform(0.8 * first, lasts))
             run.send_signal(signal.SIGKILL)
             run.wait()
-            asked = len(fake.state.asked)
-            bring(fake, path)
+            requests = len(fake.state.requests)
+            apply_file(fake, path)
             same = fake.state.summary() == whole
             resumed, orphans = resumed + same, orphans + len(fake.state.orphans())
-        print(f"kill {number + 1}: after {asked} requests, {'the same end' if same else 'ANOTHER END'}", flush=True)
+        state = "same final state" if same else "DIFFERENT FINAL STATE"
+        print(f"kill {number + 1}: after {requests} requests, {state}", flush=True)
     return {"kills": count, "kills_resumed": resumed, "orphans": orphans}
 
 
 def hundred(folder: Path) -> dict[str, Any]:
-    """A hundred services in one `apply`, whose operations take five seconds."""
-    with Fake(State(seconds=5.0)) as fake:
-        path = services(folder, count=HUNDRED)
+    """Start a hundred services with one `apply`; each operation takes five seconds."""
+    with FakeOsm(OsmState(seconds=5.0)) as fake:
+        path = services(folder, count=SERVICE_COUNT)
         begun = time.monotonic()
         subprocess.run(
             command(fake, "apply", path, "--wait", "--parallel", PARALLEL), check=True, stdout=subprocess.DEVNULL
         )
         seconds = time.monotonic() - begun
         ready = sum(one["nsState"] == "READY" for one in fake.state.instances.values())
-        times = sorted(when for when, _, path in fake.state.asked if "nslcm" in path)
-        most = max(bisect_left(times, when + 1.0) - i for i, when in enumerate(times))
+        times = sorted(when for when, _, path in fake.state.requests if "nslcm" in path)
+        highest = max(bisect_left(times, when + 1.0) - i for i, when in enumerate(times))
         return {
-            "hundred_requests_per_second_max": round(most / PARALLEL, 2),
+            "hundred_requests_per_second_max": round(highest / PARALLEL, 2),
             "hundred_ready": ready,
             "hundred_seconds": round(seconds, 1),
-            "hundred_running_max": max(fake.state.running),
+            "hundred_running_max": max(fake.state.running_counts),
             "orphans": len(fake.state.orphans()),
         }
 
 
 def main() -> None:
-    """Run the parts, and print their figures."""
+    """Run the parts and print their results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = ["lifecycles", "faults", "kills", "hundred"]
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts)

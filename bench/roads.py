@@ -1,19 +1,19 @@
-"""Roads as data against the synthetic streets' truth.
+"""Extracted roads line_errors with the truth of synthetic streets.
 
 `python -m bench.roads [--seeds 0 1] [--length 60 --points 3e6 --photos 24] [--tile 30] [--out bench-out/roads]
 [--pictures]`
-makes each street's world as `scan2sim run` does, with its photos, and reads the GeoJSON and the OpenDRIVE beside it.
+builds each street's world with `scan2sim run`, including photos, and reads its GeoJSON and OpenDRIVE.
 
-- `road_centre_p95_m`: metres from places on the reference line to the street's axis, where its centre line is painted;
-  `road_width_p95_m`: error of the width from edge to edge, across each of those places.
-- `lane_edge_p95_m`: metres from places on painted lines and on edges to the nearest true one.
-- `height_p95_m`: of all these places, above or below the true ground.
-- `told`: share of the street's lines (three painted ones, two kerbs) of whose length something is told.
-- `carla_lane_p95_m`, `carla_off_lane`: what `carla.Map` makes of the OpenDRIVE: waypoints a metre apart, metres from
-  the middles of the true lanes, and how many are nearer to another lane's; null without the package `carla`.
-- with `--tile METRES` each street is cut into tiles so long and made as a survey: the same of its roads as one.
+- `road_centre_p95_m`: distance from points on the reference line to the street's axis, where the centre line is
+  painted; `road_width_p95_m`: error of the width between the edges at each of these points.
+- `lane_edge_p95_m`: distance from points on markings and edges to the nearest true one.
+- `height_p95_m`: height error of all these points relative to the true ground.
+- `told`: share of the length of the street's lines (three markings, two kerbs) that was extracted.
+- `carla_lane_p95_m`, `carla_off_lane`: waypoints of `carla.Map` for the OpenDRIVE, a metre apart: distance from the
+  centres of the true lanes, and share that is nearer to another lane; null without the package `carla`.
+- with `--tile METRES` each street is cut into tiles of this length and built as a survey, with the same metrics.
 
-`--pictures` draws what is told into an orthophoto, `roads.png` beside each world. Ends with `RESULT {json}`.
+`--pictures` draws the roads into an orthophoto, `roads.png` beside each world. Ends with `RESULT {json}`.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from scan2sim.data_samples.layout import FRAME, Layout, lay_out
 from scan2sim.pipeline.camera.renderer import Renderer, textured
 from scan2sim.pipeline.core.types import F64, Bools
 
-FROM_EDGE = 0.21
-"""Metres from the carriageway's edge to the middle of the line along it (`data_samples/materials.py`)."""
-PIXEL = 0.04
+LINE_INSET_M = 0.21
+"""Distance from the carriageway's edge to the centre of its line (`data_samples/materials.py`)."""
+PIXEL_M = 0.04
 COLOURS = {"reference": (255, 0, 255), "edge": (255, 0, 0), "solid": (0, 160, 255), "broken": (0, 255, 0)}
 
 
 def main() -> None:
-    """Run the streets asked for."""
+    """Evaluate the streets."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--length", type=float, default=60.0)
@@ -64,7 +64,7 @@ def main() -> None:
             subprocess.run([*command, "--overwrite"], check=True, stdout=subprocess.DEVNULL)
             made = [scan2sim, "survey", str(cut), "--out", str(run)]
         subprocess.run(made, check=True, stdout=subprocess.DEVNULL)
-        errors = compared(run / "world", lay_out(arguments.length, seed))
+        errors = line_errors(run / "world", lay_out(arguments.length, seed))
         print(f"seed {seed}: " + json.dumps(summary(errors)), flush=True)
         for name, values in errors.items():
             found.setdefault(name, []).append(values)
@@ -73,12 +73,12 @@ def main() -> None:
     print("RESULT " + json.dumps(summary({name: np.concatenate(values) for name, values in found.items()})))
 
 
-def compared(world: Path, layout: Layout) -> dict[str, F64]:
-    """Errors of all places on lines, metres, by the names of the module's docstring."""
+def line_errors(world: Path, layout: Layout) -> dict[str, F64]:
+    """Errors in metres of all points on lines, by the names of the module's docstring."""
     features = json.loads(next(world.glob("*roads.geojson")).read_text(encoding="utf-8"))["features"]
     kinds = [f["properties"]["kind"] for f in features]
-    lines = [layout_place(layout, f["geometry"]["coordinates"]) for f in features]
-    painted = np.array([layout.lane - FROM_EDGE, 0.0, FROM_EDGE - layout.lane])
+    lines = [layout_coordinates(layout, f["geometry"]["coordinates"]) for f in features]
+    painted = np.array([layout.lane - LINE_INSET_M, 0.0, LINE_INSET_M - layout.lane])
     kerbs = np.array([layout.kerb(1), -layout.kerb(-1)])
     s = np.arange(0.5, layout.axis.length, 1.0)
     found: dict[str, list[F64]] = {"centre": [], "lane_edge": [], "height": []}
@@ -101,25 +101,25 @@ def compared(world: Path, layout: Layout) -> dict[str, F64]:
     width = np.abs(np.abs(left - right) - (layout.kerb(1) + layout.kerb(-1)))
     errors["width"] = width[np.isfinite(width)]
     errors["told"] = np.concatenate(list(told.values())).astype(float)
-    return errors | driven(next(world.glob("*.xodr")), layout)
+    return errors | carla_errors(next(world.glob("*.xodr")), layout)
 
 
 def _across(line: F64, s: F64) -> F64:
-    """(N,) offsets of a line (M, 3) at chainages; NaN where it isn't told."""
+    """(N,) offsets of a line (M, 3) at chainages; NaN outside of it."""
     line = line[np.argsort(line[:, 0])]
     return np.interp(s, line[:, 0], line[:, 1], left=np.nan, right=np.nan)
 
 
-def layout_place(layout: Layout, places: Any) -> F64:
-    """(N, 3) chainage, offset and height above the true ground of places (N, 3) in the CRS."""
+def layout_coordinates(layout: Layout, places: Any) -> F64:
+    """(N, 3) chainage, offset and height above the true ground of points (N, 3) in the CRS."""
     xyz = FRAME.to_local(np.asarray(places, np.float64))
     s, t = layout.axis.locate(xyz[:, :2])
     on = np.sign(t) * np.minimum(np.abs(t), np.where(t > 0, layout.kerb(1), layout.kerb(-1)) - 1e-3)
     return np.column_stack([s, t, xyz[:, 2] - layout.height(s, on)])
 
 
-def driven(xodr: Path, layout: Layout) -> dict[str, F64]:
-    """Where `carla.Map` has waypoints of driving lanes; empty without the package."""
+def carla_errors(xodr: Path, layout: Layout) -> dict[str, F64]:
+    """Errors of `carla.Map`'s waypoints of driving lanes; empty without the package."""
     try:
         import carla
     except ImportError:
@@ -132,10 +132,10 @@ def driven(xodr: Path, layout: Layout) -> dict[str, F64]:
     origin = np.array([float(offset.attrib[k]) for k in "xyz"])
     points = carla.Map("road", text).generate_waypoints(1.0)
     places = np.array([(p.transform.location.x, -p.transform.location.y, p.transform.location.z) for p in points])
-    place = layout_place(layout, places + origin)
-    middles = np.array([1, -1]) * (layout.lane - FROM_EDGE) / 2
+    place = layout_coordinates(layout, places + origin)
+    middles = np.array([1, -1]) * (layout.lane - LINE_INSET_M) / 2
     away = np.abs(place[:, 1:2] - middles)
-    side = away.argmin(axis=1) == [int(p.lane_id > 0) for p in points]  # all alike, whichever way the line runs
+    side = away.argmin(axis=1) == [int(p.lane_id > 0) for p in points]  # all alike, whatever the line's direction
     return {
         "carla_lane": away.min(axis=1),
         "carla_off_lane": np.minimum(side.mean(), 1 - side.mean()) * np.ones(len(side)),
@@ -143,7 +143,7 @@ def driven(xodr: Path, layout: Layout) -> dict[str, F64]:
 
 
 def summary(errors: dict[str, F64]) -> dict[str, float | None]:
-    """The figures of the module's docstring."""
+    """Metrics of the module's docstring."""
     names = {"centre": "road_centre", "width": "road_width", "lane_edge": "lane_edge", "height": "height"}
     names |= {"carla_lane": "carla_lane"}
     found: dict[str, float | None] = {
@@ -156,17 +156,17 @@ def summary(errors: dict[str, F64]) -> dict[str, float | None]:
 
 
 def draw(run: Path) -> None:
-    """What is told of roads in an orthophoto of the ground: `roads.png`."""
+    """Draw the extracted roads into an orthophoto of the ground: `roads.png`."""
     import cv2
 
     folder = max((run / "steps" / "texture.terrain").glob("*/textured"), key=lambda path: path.stat().st_mtime)
     body = textured(folder)
     low, high = body.mesh.vertices.min(axis=0).astype(float), body.mesh.vertices.max(axis=0).astype(float)
-    picture = Renderer([body]).above(low, high, width=int((high[0] - low[0]) / PIXEL)).rgb.copy()
+    picture = Renderer([body]).above(low, high, width=int((high[0] - low[0]) / PIXEL_M)).rgb.copy()
     for feature in json.loads((run / "world" / "roads.geojson").read_text(encoding="utf-8"))["features"]:
         about = feature["properties"]
         places = body.mesh.frame.to_local(feature["geometry"]["coordinates"])[:, :2] - low[:2]
-        pixels = np.column_stack([places[:, 0], high[1] - low[1] - places[:, 1]]) / PIXEL
+        pixels = np.column_stack([places[:, 0], high[1] - low[1] - places[:, 1]]) / PIXEL_M
         colour = COLOURS[about.get("marking") or about["kind"]]
         cv2.polylines(picture, [np.rint(pixels).astype(np.int32)], False, colour, 2, cv2.LINE_AA)
     cv2.imwrite(str(run / "roads.png"), picture[..., ::-1])

@@ -1,10 +1,10 @@
-"""A kilometre in ten tiles: workers, rerun, borders, and what Prefect costs.
+"""A survey of one kilometre in ten tiles: workers, rerun, borders, and Prefect's overhead.
 
 `python -m bench.survey [--out bench-out/survey] [--parts plain one two ray rerun photo] [--fine]`. The synthetic street
-is generated and cut once; every part runs the same survey into a folder of its own, each step on one core, so that two
-workers are two cores and one is one. Settings are coarser than the defaults (`COARSE`), so that five runs of a
-kilometre take an hour and not three; `--fine` leaves them out. What Prefect costs weighs the more. Parts that aren't
-asked for are read from their last run's notes. Ends with `RESULT {json}`.
+is generated and cut once; every part runs the same survey into its own folder, each task on one core, so that two
+workers are two cores and one is one. Settings are coarser than the defaults (`COARSE_SETTINGS`), so that five runs of a
+kilometre take one hour instead of three (Prefect's share is larger then); `--fine` uses the defaults. Results of parts
+that aren't run are read from their last run. Ends with `RESULT {json}`.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ RUNS = {  # part: options of `scan2sim survey`
     "two": ("--runner", "dask", "--jobs", "2"),
     "ray": ("--runner", "ray", "--jobs", "2"),
 }
-COARSE = ("voxel.size=0.2", "unwrap.texel=0.04", "visibility.pixels=500000", "pictures.width=640")
-EMPTY = """
+COARSE_SETTINGS = ("voxel.size=0.2", "unwrap.texel=0.04", "visibility.pixels=500000", "pictures.width=640")
+EMPTY_FLOW = """
 import scan2sim.flows.deployed.prefect_settings
 from prefect import flow
 flow(lambda: None, name="empty")()
@@ -46,20 +46,20 @@ flow(lambda: None, name="empty")()
 
 
 def main() -> None:
-    """Run the parts and print their figures."""
+    """Run the parts and print their results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "survey")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--fine", action="store_true", help="the defaults' settings: three hours")
+    parser.add_argument("--fine", action="store_true", help="default settings: takes three hours")
     arguments = parser.parse_args()
-    settings = () if arguments.fine else tuple(part for value in COARSE for part in ("--set", value))
+    settings = () if arguments.fine else tuple(part for value in COARSE_SETTINGS for part in ("--set", value))
     out: Path = arguments.out
     survey = street(out)
     notes = out / "notes.json"
     known: dict[str, dict[str, Any]] = json.loads(notes.read_text(encoding="utf-8")) if notes.is_file() else {}
     for part in (name for name in PARTS if name in arguments.parts):
         if part in RUNS:
-            known[part] = whole(survey, out / part, (*RUNS[part], *settings))
+            known[part] = run_survey(survey, out / part, (*RUNS[part], *settings))
         elif part == "rerun":
             known[part] = rerun(survey, out / "two", (*RUNS["two"], *settings))
         elif part == "photo":
@@ -72,7 +72,7 @@ def main() -> None:
 
 
 def street(out: Path) -> Path:
-    """The kilometre, generated and cut if it isn't there; path of its survey."""
+    """The kilometre, generated and cut if missing; returns the folder of its survey."""
     corridor, survey = out / "street", out / "tiles"
     if not (corridor / "tile.toml").is_file():
         generate(
@@ -87,13 +87,13 @@ def street(out: Path) -> Path:
 
 
 def command(survey: Path, out: Path, options: tuple[str, ...]) -> list[str]:
-    """The command that runs a survey, a core a step."""
+    """Command that runs a survey with one core per task."""
     scan2sim = str(Path(sys.executable).parent / "scan2sim")
     return [scan2sim, "survey", str(survey), "--out", str(out), "--cores", "1", *options]
 
 
-def whole(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
-    """Run all tiles from nothing."""
+def run_survey(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
+    """Run all tiles from scratch."""
     shutil.rmtree(out, ignore_errors=True)
     ran = measure(command(survey, out, options))
     if ran.status != 0:
@@ -112,16 +112,16 @@ def whole(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
 
 
 def rerun(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
-    """Run an unchanged survey again, and a flow that does nothing."""
-    empty = measure([sys.executable, "-c", EMPTY])
+    """Run an unchanged survey again, and an empty flow."""
+    empty = measure([sys.executable, "-c", EMPTY_FLOW])
     again = measure(command(survey, out, options))
     return {"seconds": round(again.seconds, 1), "empty_flow_seconds": round(empty.seconds, 1)}
 
 
 def one_tile(tile: Path, out: Path) -> dict[str, Any]:
-    """Run one tile with the defaults' settings, a core a step: what kilometres are projected from.
+    """Run one tile with default settings, one core per task, to extrapolate to many kilometres.
 
-    What is read is clouds and photos once, and of other steps' results all that each step is given.
+    Bytes read are clouds and photos once, and the inputs of each task from other tasks' results.
     """
     shutil.rmtree(out, ignore_errors=True)
     for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
@@ -134,7 +134,7 @@ def one_tile(tile: Path, out: Path) -> dict[str, Any]:
     }
     sources = read_tile(tile)
     read = sum(path.stat().st_size for path in (*sources.clouds, *(view.photo for view in sources.views)))
-    between = sum(size(made, source) for manifest in made.values() for source in manifest["inputs"].values())
+    between = sum(input_bytes(made, source) for manifest in made.values() for source in manifest["inputs"].values())
     return {
         "step_seconds": body["seconds"],
         "largest_step_gb": round(body["peak_mb"] / 1000, 2),
@@ -146,8 +146,8 @@ def one_tile(tile: Path, out: Path) -> dict[str, Any]:
     }
 
 
-def size(made: dict[str, Any], source: str) -> int:
-    """Bytes of a step's input `KEY/NAME` that is another one's output; sources are counted apart."""
+def input_bytes(made: dict[str, Any], source: str) -> int:
+    """Bytes of an input `KEY/NAME` that is another task's output; 0 for source files."""
     key, _, name = source.partition("/")
     if key not in made or not name:
         return 0
@@ -156,10 +156,12 @@ def size(made: dict[str, Any], source: str) -> int:
 
 
 def photo(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
-    """Change one photo in the middle of the street, and see what is made anew."""
+    """Change one photo in the middle of the street and report which results change."""
     place = out / "street" / "photos"
     changed = sorted(place.glob("*.jpg"))[len(list(place.glob("*.jpg"))) // 2]
-    seen = [path.parent.name for path in survey.glob("*/tile.toml") if changed.name in path.read_text(encoding="utf-8")]
+    affected = [
+        path.parent.name for path in survey.glob("*/tile.toml") if changed.name in path.read_text(encoding="utf-8")
+    ]
     before, original, stat = contents(out / "two"), changed.read_bytes(), changed.stat()
     try:
         import cv2
@@ -172,13 +174,13 @@ def photo(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
     finally:
         changed.write_bytes(original)
         os.utime(changed, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-    anew = sorted({node for node, content in after.items() if before.get(node) != content})
+    changed_results = sorted({node for node, content in after.items() if before.get(node) != content})
     made = json.loads((out / "two" / "survey.json").read_text(encoding="utf-8"))["tiles"]
     return {
         "seconds": round(ran.seconds, 1),
-        "tiles_that_see_it": sorted(seen),
+        "tiles_that_see_it": sorted(affected),
         "tiles_made": sorted(name for name, tile in made.items() if tile["state"] == "done"),
-        "results_changed": len(anew),
+        "results_changed": len(changed_results),
         "results": len(after),
     }
 
@@ -190,7 +192,7 @@ def contents(out: Path) -> dict[str, str]:
 
 
 def borders(out: Path) -> dict[str, float]:
-    """The widest gap, the mean colour step, and lengths, over all borders."""
+    """Widest gap, mean colour step, and lengths over all borders."""
     body = json.loads((out / "survey.json").read_text(encoding="utf-8"))["borders"]
     length = np.array([b["length_m"] for b in body])
     return {
@@ -222,13 +224,13 @@ def report(known: dict[str, dict[str, Any]], out: Path) -> None:
     if {"one", "plain"} <= known.keys():
         one, plain = known["one"], known["plain"]
         result["prefect_overhead"] = round(one["seconds"] / plain["seconds"] - 1, 3)
-        # the machine's own pace differs from hour to hour, and steps take most of the time: what is spent beside them
+        # the machine's speed varies from hour to hour, and steps take most of the time: compare the time beside them
         more = (one["seconds"] - one["step_seconds"]) - (plain["seconds"] - plain["step_seconds"])
         result["prefect_overhead_beside_steps"] = round(more / plain["seconds"], 3)
     if "tile" in known:
         cost = {name: round(1000 * value, 1) for name, value in known["tile"].items() if name.startswith("gb_")}
         cost["cpu_hours"] = round(1000 * known["tile"]["step_seconds"] / 3600, 1)
-        print("100 km, a thousand such tiles:", json.dumps(cost))
+        print("100 km, a thousand of these tiles:", json.dumps(cost))
     print("RESULT " + json.dumps(result))
 
 

@@ -1,18 +1,19 @@
-"""Who sees what, against the truth of a generated street: leaks and false hiding of the depth maps.
+"""Visibility by depth maps, compared with the truth of a generated street: leaks and false hiding.
 
 `python -m bench.visibility [--length 40 --points 1.5e6 --photos 16 --width 1024 --seed 0] [--out bench-out]`.
 
-Our steps make meshes, clouds and depth maps of the street. The meshes are sampled evenly, as texels do, within
-reach of each photo; what the depth map says of every sample is compared with rays cast in the true street, parked
-cars and the moving car (where it was at that moment) included. Beside ours, what others draw depth maps from.
+The pipeline builds meshes, clouds and depth maps of the street. The meshes are sampled evenly, like texels, within
+range of each photo; the visibility of each sample according to the depth map is compared with rays cast in the true
+street, including parked cars and the moving car (at its position at that time). Other kinds of depth maps are
+evaluated for comparison.
 
-- leak: of the samples that are truly hidden, those taken as seen.
-- false hiding: of the samples that are truly visible, those taken as hidden.
-- wrong: of the samples taken as seen, those that are truly hidden: they get the texture of something else.
+- leak: share of truly hidden samples that are classified as visible.
+- false hiding: share of truly visible samples that are classified as hidden.
+- wrong: share of samples classified as visible that are truly hidden: they get a wrong texture.
 
-A mesh is some centimetres off; at the edges of what hides, no test of it can know the truth. So the shares are given
-twice: of the samples around which the truth is the same (clear), and of all. Ends with `RESULT {json}`, totals over
-the classes.
+The mesh is some centimetres off the true surface, so at the edges of occluders the truth is ambiguous. Therefore the
+shares are printed twice: for samples with the same truth all around (clear), and for all. Ends with `RESULT {json}`,
+totals over the classes.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ from scan2sim.data_samples.scene import Scene
 from scan2sim.data_samples.street import generate
 from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.planning import plan
-from scan2sim.flows.pipelines.graph import NodeId, needed
+from scan2sim.flows.pipelines.graph import TaskId, required_tasks
 from scan2sim.flows.pipelines.settings import Settings
-from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.flows.pipelines.tile import build_graph
 from scan2sim.pipeline.camera import depth_map
 from scan2sim.pipeline.camera.depth_map import DepthMap
 from scan2sim.pipeline.camera.projection import pixels
@@ -46,27 +47,27 @@ from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.visibility import VisibilityParams
 
 OURS = "mesh + discs (ours)"
-SPLAT = 8
-"""Pixels to a side of the boxes that points are splatted as, for comparison."""
-SPLAT_BIAS = 0.3
-"""Metres that a sample may lie behind such a box besides: a box is as near all over as the point in its middle."""
-REACH = 40.0
-"""Metres beyond which a photo isn't used."""
-FLATTEST = 0.08
-"""Cosine of the angle between normal and ray below which a photo isn't used."""
-ASTRAY = 0.15
-"""Metres to the nearest true surface beyond which a sample has no true place, and isn't counted."""
-EDGE = 0.05
-"""Metres, about what the mesh is off the true surface: where so small a shift of the ray decides, nobody can know."""
-RELIEF = 0.10
-"""Metres, the voxel size: what stands out of the surface around a sample by less is its roughness and hides nothing."""
+SPLAT_PX = 8
+"""Size of the boxes of splatted points, for comparison."""
+SPLAT_BIAS_M = 0.3
+"""Depth tolerance behind such a box, whose depth is that of the point in its centre."""
+PHOTO_RANGE_M = 40.0
+"""Maximum distance from which a photo is used."""
+MIN_INCIDENCE_COS = 0.08
+"""Minimum cosine of the angle between normal and ray."""
+MAX_TRUTH_DISTANCE_M = 0.15
+"""Maximum distance to the true surface; samples beyond it are ignored."""
+EDGE_SHIFT_M = 0.05
+"""About the error of the mesh; where such a shift of the ray changes the visibility, the truth is ambiguous."""
+ROUGHNESS_M = 0.10
+"""Voxel size; smaller relief around a sample is roughness and hides nothing."""
 
 Method = Callable[[View], DepthMap]
 
 
 @dataclass(frozen=True)
 class Made:
-    """What our steps made of the street: a mesh a class, the whole thinned cloud, the views."""
+    """Results of the pipeline: a mesh per class, the whole thinned cloud, the views."""
 
     meshes: dict[str, Mesh]
     cloud: PointCloud
@@ -75,13 +76,13 @@ class Made:
 
 @dataclass(frozen=True)
 class Samples:
-    """Places on a mesh that a view would texture if nothing hid them.
+    """Points on a mesh that a view would texture if nothing occluded them.
 
     Attributes:
-        points, normals: (N, 3) local metres, and unit.
-        hidden: (N,) whether the true street hides them.
-        clear: (N,) whether it does, or doesn't, around the sample as well; the others lie at an edge of what hides.
-        blocker: (N,) LAS class of what hides; 0 for the visible ones.
+        points, normals: (N, 3) local metres, and unit vectors.
+        hidden: (N,) whether the true street occludes them.
+        clear: (N,) whether the same holds around the sample; other samples lie at an edge of the occluder.
+        blocker: (N,) LAS class of the occluder; 0 if visible.
     """
 
     points: F32
@@ -92,14 +93,14 @@ class Samples:
 
 
 def main() -> None:
-    """Make the street and its meshes, draw depth maps by all methods, print shares."""
+    """Generate the street and its meshes, compute depth maps with all methods, and print shares."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--length", type=float, default=40.0)
     parser.add_argument("--points", type=float, default=1.5e6)
     parser.add_argument("--photos", type=int, default=16)
     parser.add_argument("--width", type=int, default=1024)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--samples", type=int, default=60_000, help="of a class for every view")
+    parser.add_argument("--samples", type=int, default=60_000, help="number of samples per class and view")
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out")
     a = parser.parse_args()
     street = a.out / f"seen_{a.length:g}_{a.points:g}_{a.photos}_{a.width}_{a.seed}"
@@ -140,21 +141,21 @@ def main() -> None:
 
 
 def make(tile: Tile, out: Path) -> Made:
-    """Run our recipe up to what depth maps are drawn from; what an earlier run has finished is kept."""
-    meshes, clouds = [NodeId("decimate", g) for g in GROUPS], [NodeId("voxel", part) for part in (*GROUPS, "rest")]
+    """Run the pipeline up to the inputs of depth maps; results of an earlier run are reused."""
+    meshes, clouds = [TaskId("decimate", g) for g in GROUPS], [TaskId("voxel", part) for part in (*GROUPS, "rest")]
     store = Store(out)
-    planned = plan(needed(recipe(tile, Settings()), [*meshes, *clouds]), store)
-    execute(planned, store, jobs=2, watch=lambda node, event, fraction, message: None)
-    folder = {p.node.id: store.folder(p.node.full_name, p.key) for p in planned}
+    planned = plan(required_tasks(build_graph(tile, Settings()), [*meshes, *clouds]), store)
+    execute(planned, store, jobs=2, on_event=lambda task, event, fraction, message: None)
+    folder = {p.task.id: store.folder(p.task.full_name, p.key) for p in planned}
     return Made(
-        {g: Mesh.load(folder[node] / "mesh.npz") for g, node in zip(GROUPS, meshes, strict=True)},
-        PointCloud.join([PointCloud.load(folder[node] / "cloud.npz") for node in clouds]),
+        {g: Mesh.load(folder[task] / "mesh.npz") for g, task in zip(GROUPS, meshes, strict=True)},
+        PointCloud.join([PointCloud.load(folder[task] / "cloud.npz") for task in clouds]),
         tile.views,
     )
 
 
 def draw(meshes: dict[str, Mesh], view: View, count: int, seed: int) -> Iterator[tuple[str, tuple[F32, F32]]]:
-    """Class, and (N, 3) points and normals spread evenly over its mesh that the view could texture, of `count`."""
+    """Class, points and normals (N, 3) of samples spread evenly over its mesh that the view could texture."""
     rng = np.random.default_rng(seed)
     for group, mesh in meshes.items():
         area = np.cumsum(mesh.face_area, dtype=np.float64)
@@ -165,17 +166,17 @@ def draw(meshes: dict[str, Mesh], view: View, count: int, seed: int) -> Iterator
         to = view.centre - points
         distance = np.linalg.norm(to, axis=1)
         _, shown = pixels(view.camera, view.T_world_cam, points)
-        facing = np.einsum("ij,ij->i", to, normals) > FLATTEST * distance
-        keep = shown & facing & (distance < REACH)
+        facing = np.einsum("ij,ij->i", to, normals) > MIN_INCIDENCE_COS * distance
+        keep = shown & facing & (distance < PHOTO_RANGE_M)
         yield group, (points[keep].astype(np.float32), normals[keep])
 
 
 class Truth:
-    """The street that the tile was made of.
+    """The true street.
 
     Args:
-        length, points, seed: as it was generated with.
-        frame: of the samples and views.
+        length, points, seed: parameters of its generation.
+        frame: frame of the samples and views.
     """
 
     def __init__(self, length: float, points: float, seed: int, frame: Frame) -> None:
@@ -189,52 +190,52 @@ class Truth:
         self._still.add_triangles(still.vertices, still.faces.astype(np.uint32))
 
     def judge(self, points: F32, normals: F32, view: View) -> Samples:
-        """What the true street hides from the view, of points (N, 3) with normals (N, 3); those astray are left out.
+        """True visibility of points (N, 3) with normals (N, 3) in a view; points far from the true surface are dropped.
 
-        A sample's true place is the nearest on the true static surface. Lifted off it by `RELIEF`, along the
-        sample's normal, it is hidden if the ray to it from the camera meets something more than `RELIEF` before it.
-        That is clear if four rays, moved aside by `EDGE`, say the same.
+        A sample's true position is the nearest on the true static surface. Lifted by `ROUGHNESS_M` along the sample's
+        normal, it is hidden if the camera ray meets something more than `ROUGHNESS_M` before it. The result is clear if
+        four rays, shifted by `EDGE_SHIFT_M`, agree.
         """
         moved = (points + self._shift).astype(np.float32)
         true = self._still.compute_closest_points(moved)["points"].numpy()
-        near = np.linalg.norm(true - moved, axis=1) < ASTRAY
+        near = np.linalg.norm(true - moved, axis=1) < MAX_TRUTH_DISTANCE_M
         points, normals = points[near], normals[near]
-        to = true[near] + RELIEF * normals - (view.centre + self._shift)
+        to = true[near] + ROUGHNESS_M * normals - (view.centre + self._shift)
         right = np.cross(to, [0.0, 0.0, 1.0])
-        right *= EDGE / np.linalg.norm(right, axis=1, keepdims=True)
+        right *= EDGE_SHIFT_M / np.linalg.norm(right, axis=1, keepdims=True)
         up = np.cross(right, to / np.linalg.norm(to, axis=1, keepdims=True))
         blocker, *around = (self._blocker(view, to + aside) for aside in (0, right, -right, up, -up))
         clear = np.all([(other > 0) == (blocker > 0) for other in around], axis=0)
         return Samples(points, normals, blocker > 0, clear, blocker)
 
     def _blocker(self, view: View, to: F64) -> U8:
-        """(N,) LAS class of what the rays from the view to camera + `to` (N, 3) meet before their ends; 0: nothing."""
+        """(N,) LAS class of the first hit of rays from the camera by `to` (N, 3), before their ends; 0: none."""
         distance = np.linalg.norm(to, axis=1)
         assert view.time is not None
         car = self.drive.car(self.scene, np.array([view.time])).repeated(len(to))
         origins = np.broadcast_to((view.centre + self._shift).astype(np.float32), to.shape)
         hits = self.scene.cast(origins, (to / distance[:, None]).astype(np.float32), car)
-        hidden = hits.distance < distance - RELIEF
+        hidden = hits.distance < distance - ROUGHNESS_M
         return np.where(hidden, self.scene.surface.classification[hits.face], 0).astype(np.uint8)
 
 
 def methods_of(made: Made) -> dict[str, Method]:
-    """Name to a function that draws the depth map of a view."""
+    """Functions by name that compute the depth map of a view."""
     p, meshes = VisibilityParams.model_validate({}), list(made.meshes.values())
 
     def of(hides: depth_map.Scene) -> Method:
         return lambda view: depth_map.depth_map(view.camera, view.T_world_cam, hides, time=view.time, pixels=p.pixels)
 
     return {
-        f"boxes of points, {SPLAT} px": lambda view: boxes(made.cloud, view),
+        f"boxes of points, {SPLAT_PX} px": lambda view: boxes(made.cloud, view),
         "discs of points": of(depth_map.scene([], made.cloud, radius=p.radius)),
         "mesh": of(depth_map.scene(meshes)),
-        OURS: of(depth_map.scene(meshes, made.cloud, radius=p.radius, lacking=p.lacking)),
+        OURS: of(depth_map.scene(meshes, made.cloud, radius=p.radius, mesh_distance=p.lacking)),
     }
 
 
 def boxes(cloud: PointCloud, view: View) -> DepthMap:
-    """A depth map of the photo's size: every point a box of `SPLAT` pixels at its distance, the nearest kept."""
+    """A depth map of the photo's size: each point as a box of `SPLAT_PX` pixels at its distance, the nearest wins."""
     import cv2
 
     camera = view.camera
@@ -242,29 +243,29 @@ def boxes(cloud: PointCloud, view: View) -> DepthMap:
     column, row = np.floor(uv[keep] + 0.5).astype(int).T
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
     np.minimum.at(depth, (row, column), np.linalg.norm(cloud.xyz[keep] - view.centre, axis=1).astype(np.float32))
-    splats = np.asarray(cv2.erode(depth, np.ones((SPLAT, SPLAT))), np.float32)
-    return DepthMap(camera, view.T_world_cam, splats + np.float32(SPLAT_BIAS))
+    splats = np.asarray(cv2.erode(depth, np.ones((SPLAT_PX, SPLAT_PX))), np.float32)
+    return DepthMap(camera, view.T_world_cam, splats + np.float32(SPLAT_BIAS_M))
 
 
 def tally(seen: Bools, hidden: Bools) -> I64:
-    """(4,) samples: hidden and seen, hidden, visible and not seen, visible."""
+    """(4,) number of samples: hidden but seen, hidden, visible but not seen, visible."""
     return np.array([(hidden & seen).sum(), hidden.sum(), (~hidden & ~seen).sum(), (~hidden).sum()])
 
 
 def total(counts: dict[str, I64]) -> I64:
-    """Tallies of all classes, summed: (2, 4), those of clear samples and those of all."""
+    """Tallies summed over all classes: (2, 4), of clear samples and of all."""
     return np.sum(list(counts.values()), axis=0)
 
 
 def shares(tallied: I64) -> tuple[float, float, float]:
-    """Leak, false hiding, and wrong: see the top of this file."""
+    """Leak, false hiding and wrong, see the module's docstring."""
     leaked, hidden, missed, visible = (int(n) for n in tallied)
     seen = leaked + visible - missed
     return leaked / max(1, hidden), missed / max(1, visible), leaked / max(1, seen)
 
 
 def print_methods(counts: dict[str, dict[str, I64]], seconds: dict[str, float]) -> None:
-    """A line a method and class, shares in percent: of the clear samples, and of all, those at edges too."""
+    """Print shares in percent by method and class: of clear samples, and of all including edges."""
     print(f"{'':<34}{'clear samples':>33}{'':>18} |{'those at edges too':>27}")
     titles = f"{'leak %':>8}{'false hiding %':>16}{'wrong %':>9}"
     print(f"{'method':<22}{'class':<12}{titles}{'hidden':>9}{'visible':>9} |{titles}{'edges %':>9}")
@@ -273,11 +274,11 @@ def print_methods(counts: dict[str, dict[str, I64]], seconds: dict[str, float]) 
             columns = [f"{100 * a:>8.2f}{100 * b:>16.2f}{100 * c:>9.2f}" for a, b, c in (shares(clear), shares(every))]
             edges = 100 * (1 - (clear[1] + clear[3]) / max(1, every[1] + every[3]))
             print(f"{name:<22}{group:<12}{columns[0]}{clear[1]:>9,}{clear[3]:>9,} |{columns[1]}{edges:>9.1f}")
-        print(f"{'':<22}{seconds[name]:.2f} s a view")
+        print(f"{'':<22}{seconds[name]:.2f} s per view")
 
 
 def print_blockers(hidden: I64, leaked: I64) -> None:
-    """A line for every class of things that hides: what it hides, and what leaks through it."""
+    """Print for each class of occluders what it hides, and what leaks through it."""
     print(f"\n{'hidden by':<22}{'samples':>10}{'leaked':>9}{'leak %':>8}{'of all leaks %':>16}")
     for c in CLASSES:
         if hidden[c.code]:

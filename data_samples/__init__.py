@@ -1,4 +1,4 @@
-"""A synthetic street with its ground truth: generator, and one small committed tile."""
+"""Generators of synthetic streets, drives and crossings with ground truth, and a small committed tile."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Meshes of further borders of gardens, along x, their outside towards -y: walls, fences, banks of bushes, thickets."""
+"""Meshes of garden borders along x, their outside towards -y: walls, fences, rows of bushes, thickets."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from scan2sim.data_samples.paints import RGB, Material, Paint
 from scan2sim.data_samples.plants import clump
 from scan2sim.data_samples.shapes import Part, box, join, tube
 
-WALLS = (Material.PLAIN, Material.PLASTER, Material.GRIT, Material.PANELS, Material.STONE, Material.BRICK)
+WALL_MATERIALS = (Material.PLAIN, Material.PLASTER, Material.GRIT, Material.PANELS, Material.STONE, Material.BRICK)
 
 
 def bare_wall(length: float, height: float, material: Material, colour: RGB, seed: int) -> Part:
-    """A wall of any material, with a cap of another shade at times."""
+    """A wall of a given material, sometimes with a cap of another brightness."""
     rng = np.random.default_rng([seed, 71])
     parts = [box((0, -0.12, -0.8), (length, 0.12, height), Paint(material, colour, paints.WALL, seed))]
     if rng.random() < 0.5:
@@ -23,7 +23,7 @@ def bare_wall(length: float, height: float, material: Material, colour: RGB, see
 
 
 def slat_fence(length: float, height: float, colour: RGB, seed: int) -> Part:
-    """Posts with boards between them, upright or lying, with or without gaps."""
+    """Posts with vertical or horizontal boards between them, with or without gaps."""
     rng = np.random.default_rng([seed, 72])
     wood = Paint(Material.WOOD, colour, paints.WALL, seed)
     wide = rng.uniform(0.08, 0.2)
@@ -43,7 +43,7 @@ def slat_fence(length: float, height: float, colour: RGB, seed: int) -> Part:
 
 
 def wire_fence(length: float, height: float, colour: RGB, seed: int) -> Part:
-    """A mesh of wires between thin posts."""
+    """A wire mesh between thin posts."""
     wire = Paint(Material.PLAIN, colour, paints.WALL, seed)
     parts = [tube([(x, 0, -0.4), (x, 0, height)], [0.03, 0.03], wire, sides=6) for x in np.arange(0, length + 0.1, 2.5)]
     parts += [box((x, -0.004, 0.05), (x + 0.008, 0.004, height), wire) for x in np.arange(0.05, length, 0.1)]
@@ -52,7 +52,7 @@ def wire_fence(length: float, height: float, colour: RGB, seed: int) -> Part:
 
 
 def bank(length: float, height: float, colour: RGB, seed: int, *, high: bool = False) -> Part:
-    """Bushes grown together to `height`; a thicket, high vegetation, if `high`."""
+    """A row of bushes of a given height; if `high`, a thicket with the class of high vegetation."""
     rng = np.random.default_rng([seed, 73])
     leaf = Paint(Material.FOLIAGE, colour, paints.TREE if high else paints.BUSH, seed)
     parts = []

@@ -1,4 +1,4 @@
-"""Meshes of people and bicycles, each standing at its own origin, x forwards."""
+"""Meshes of people and bicycles, x forwards, the origin on the ground below them."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from scan2sim.data_samples import paints
 from scan2sim.data_samples.paints import RGB, Material, Paint
 from scan2sim.data_samples.shapes import Part, blob, join, tube
 
-SKIN: tuple[RGB, ...] = ((0.55, 0.33, 0.24), (0.35, 0.19, 0.12), (0.10, 0.055, 0.035))
-SEAT = 0.95  # metres above ground
+SKIN_RGB: tuple[RGB, ...] = ((0.55, 0.33, 0.24), (0.35, 0.19, 0.12), (0.10, 0.055, 0.035))
+SADDLE_HEIGHT_M = 0.95  # metres above ground
 
 
 def person(seed: int, *, rides: bool = False) -> Part:
-    """Someone who stands, walks or (`rides`) sits on a bicycle: limbs, trunk and head, in clothes of any colour."""
+    """A person who stands, walks or, if `rides`, sits on a bicycle: limbs, trunk and head, in random clothes."""
     rng = np.random.default_rng([seed, 61])
     tall, wide = rng.uniform(1.5, 1.95), rng.uniform(0.8, 1.3)
     cloth = [_any(rng, Material.GRIT if rng.random() < 0.3 else Material.PLAIN) for _ in range(3)]
-    skin = Paint(Material.PLAIN, SKIN[rng.integers(len(SKIN))], paints.PERSON)
-    hip, neck = (SEAT, SEAT + 0.32 * tall) if rides else (0.5 * tall, 0.83 * tall)
+    skin = Paint(Material.PLAIN, SKIN_RGB[rng.integers(len(SKIN_RGB))], paints.PERSON)
+    hip, neck = (SADDLE_HEIGHT_M, SADDLE_HEIGHT_M + 0.32 * tall) if rides else (0.5 * tall, 0.83 * tall)
     lean, stride = (0.25, 0.15) if rides else (rng.uniform(-0.03, 0.08), rng.uniform(0, 0.3))
     parts = []
     for side in (-1, 1):
@@ -47,21 +47,21 @@ def bicycle(seed: int) -> Part:
     parts = [tube(circle + (x, 0, 0.34), np.full(21, 0.022), tyre, sides=5) for x in (-0.52, 0.52)]
     for path in (
         [(-0.52, 0, 0.34), (0, 0, 0.3), (0.42, 0, 0.75), (-0.15, 0, 0.8), (-0.52, 0, 0.34)],
-        [(0, 0, 0.3), (-0.2, 0, SEAT)],
+        [(0, 0, 0.3), (-0.2, 0, SADDLE_HEIGHT_M)],
         [(0.52, 0, 0.34), (0.4, 0, 1.0)],
         [(0.35, -0.28, 1.0), (0.4, 0, 1.0), (0.35, 0.28, 1.0)],
     ):
         parts.append(tube(path, np.full(len(path), 0.022), frame, sides=5))
-    saddle = blob((-0.2, 0, SEAT), (0.13, 0.07, 0.04), rng, tyre, bump=0.02, rounds=1)
+    saddle = blob((-0.2, 0, SADDLE_HEIGHT_M), (0.13, 0.07, 0.04), rng, tyre, bump=0.02, rounds=1)
     return join([*parts, saddle])
 
 
 def cyclist(seed: int) -> Part:
-    """Someone on a bicycle."""
+    """A person on a bicycle."""
     return join([bicycle(seed), person(seed, rides=True)])
 
 
 def _any(rng: np.random.Generator, material: Material = Material.PLAIN, classification: int = paints.PERSON) -> Paint:
-    """A colour, dark ones rather than light ones."""
+    """Paint of a random colour, rather dark than light."""
     r, g, b = np.clip(np.exp(rng.uniform(-4, -0.4)) * np.exp(rng.normal(0, 0.5, 3)), 0.01, 0.9).tolist()
     return Paint(material, (r, g, b), classification, int(rng.integers(1 << 20)))

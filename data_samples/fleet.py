@@ -1,4 +1,4 @@
-"""Road users of many looks, by the class that they are to be found as."""
+"""Random meshes of road users, by object class."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from scan2sim.pipeline.core.types import F64
 Rng = np.random.Generator
 
 CLASSES = ("car", "van", "bus", "truck", "train", "person", "cyclist")
-"""Of things that are found; trains: `trains`."""
-ROOFS = {  # metres along a car, and how high its roof is there at least
+"""Object classes; meshes of trains are in `trains`."""
+ROOF_PROFILES = {  # positions along a car in metres, and the least height of its roof there
     "saloon": ([0.0], [0.0]),
     "hatchback": ([-2.2, -2.1, -1.8, -1.2, -1.0], [0.9, 1.05, 1.30, 1.44, 0.0]),
     "estate": ([-2.2, -2.12, -2.0, -1.2, -1.0], [0.95, 1.25, 1.40, 1.46, 0.0]),
@@ -26,32 +26,38 @@ ROOFS = {  # metres along a car, and how high its roof is there at least
 }
 
 
-def any_user(label: str, rng: Rng) -> Part:
-    """A car, van, bus, truck, person or cyclist, x forwards, standing at its own origin."""
+def random_road_user(label: str, rng: Rng) -> Part:
+    """Random car, van, bus, truck, person or cyclist, x forwards, the origin on the ground below it."""
     return _MAKERS[label](rng)
 
 
 def _painted(rng: Rng) -> RGB:
-    """As vehicles are: white, grey and black rather than of a hue."""
+    """Random colour of a vehicle, preferably white, grey or black."""
     return colour(rng, 0.45) if rng.random() < 0.45 else grey(rng, 0.012, 0.9)
 
 
 def _car(rng: Rng) -> Part:
     mesh = objects.car(_painted(rng))
     xyz = mesh.vertices.astype(np.float64)
-    xyz[:, 2] = _raised(xyz, *ROOFS[str(rng.choice(list(ROOFS), p=[0.35, 0.35, 0.25, 0.05]))])
+    xyz[:, 2] = _raised(xyz, *ROOF_PROFILES[str(rng.choice(list(ROOF_PROFILES), p=[0.35, 0.35, 0.25, 0.05]))])
     scale = rng.uniform([0.82, 0.92, 0.95], [1.1, 1.06, 1.12]) * (1.0, 1.0, rng.choice([1.0, 1.2], p=[0.7, 0.3]))
     xyz *= scale
     return replace(mesh, vertices=xyz.astype(np.float32), normals=smooth_normals(xyz, mesh.faces).astype(np.float32))
 
 
 def _raised(xyz: F64, at: list[float], least: list[float], belt: float = 0.75) -> F64:
-    """(V,) heights where a car's upper side is pulled up to a profile along it."""
+    """(V,) heights of a car's vertices (V, 3) after raising its roof to a profile.
+
+    Args:
+        xyz: vertices.
+        at, least: positions along the car, and least height of the roof there.
+        belt: height below which vertices stay unchanged.
+    """
     stations, index = np.unique(np.round(xyz[:, 0], 3), return_inverse=True)
     top = np.zeros(len(stations))
     np.maximum.at(top, index, xyz[:, 2])
-    wanted = np.maximum(top, np.interp(stations, at, least))
-    stretch = ((wanted - belt) / np.maximum(top - belt, 0.03))[index]
+    target = np.maximum(top, np.interp(stations, at, least))
+    stretch = ((target - belt) / np.maximum(top - belt, 0.03))[index]
     return np.asarray(np.where(xyz[:, 2] > belt, belt + (xyz[:, 2] - belt) * stretch, xyz[:, 2]), np.float64)
 
 

@@ -1,4 +1,4 @@
-"""A consumer GPS receiver: positions that wander by metres, slowly."""
+"""Simulated consumer GPS receiver, with a slowly changing error of metres."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from scan2sim.pipeline.core.types import F64, Trajectory
 
 ORIGIN = (49.2, 16.6, 230.0)  # latitude, longitude (degrees, WGS 84), altitude of the world's origin
-WANDER = (1.5, 1.5, 2.5)  # metres, standard deviation of the correlated error: east, north, up
-MEMORY = 60.0  # seconds after which it has decayed to 1/e
-JITTER = 0.15  # metres, white
+BIAS_SIGMA_M = (1.5, 1.5, 2.5)  # standard deviation of the slowly changing error: east, north, up
+BIAS_TIME_S = 60.0  # correlation time of that error
+NOISE_SIGMA_M = 0.15  # standard deviation of the white noise
 
 
 def receiver(
@@ -22,37 +22,39 @@ def receiver(
     gaps: Sequence[tuple[float, float]] = (),
     jumps: Sequence[tuple[float, float]] = (),
 ) -> tuple[F64, F64]:
-    """Times (K,) and positions (K, 3), local metres, that a receiver reports along a trajectory.
+    """Fixes of a receiver along a trajectory: times (K,) and positions (K, 3) in local metres.
 
     Args:
-        rate: fixes a second.
-        gaps: (from, to) seconds without a fix.
-        jumps: (time, metres): from then on the position is off by so much in some horizontal direction, until the
-            next one (multipath); (time, 0) ends it.
+        trajectory: true trajectory.
+        rate: fixes per second.
+        seed: seed of the errors.
+        gaps: (from, to) seconds without fixes.
+        jumps: (time, metres): from this time to the next jump, positions are offset by this distance in a random
+            horizontal direction (multipath); (time, 0) ends it.
     """
     rng = np.random.default_rng([seed, 13])
     start, end = float(trajectory.times[0]), float(trajectory.times[-1])
     times = start + np.arange(int(np.floor((end - start) * rate + 1e-9)) + 1) / rate
-    keep = np.exp(-1 / (rate * MEMORY))
-    error = rng.normal(size=(len(times), 3)) * WANDER
-    for i in range(1, len(error)):  # Gauss-Markov
-        error[i] = keep * error[i - 1] + np.sqrt(1 - keep**2) * error[i]
-    error += rng.normal(0, JITTER, error.shape)
+    decay = np.exp(-1 / (rate * BIAS_TIME_S))
+    error = rng.normal(size=(len(times), 3)) * BIAS_SIGMA_M
+    for i in range(1, len(error)):  # Gauss-Markov process
+        error[i] = decay * error[i - 1] + np.sqrt(1 - decay**2) * error[i]
+    error += rng.normal(0, NOISE_SIGMA_M, error.shape)
     angle = rng.uniform(0, 2 * np.pi, len(jumps))
     shift = np.zeros((len(times), 2))
-    for (since, far), a in sorted(zip(jumps, angle, strict=True)):
-        shift[times >= since] = far * np.array([np.cos(a), np.sin(a)])
+    for (since, distance), a in sorted(zip(jumps, angle, strict=True)):
+        shift[times >= since] = distance * np.array([np.cos(a), np.sin(a)])
     error[:, :2] += shift
-    seen = np.ones(len(times), bool)
+    available = np.ones(len(times), bool)
     for since, until in gaps:
-        seen &= (times < since) | (times >= until)
-    return times[seen], (trajectory.at(times) + error)[seen]
+        available &= (times < since) | (times >= until)
+    return times[available], (trajectory.at(times) + error)[available]
 
 
 def geographic(positions: F64, origin: tuple[float, float, float] = ORIGIN) -> F64:
-    """(K, 3) latitude, longitude (degrees), altitude (metres) of local east, north, up metres (K, 3).
+    """(K, 3) latitude, longitude (degrees) and altitude (metres) of local positions (K, 3) in metres.
 
-    Local axes are those of a topocentric frame at `origin`.
+    Local axes (east, north, up) are those of a topocentric frame at `origin`.
     """
     from pyproj import Transformer
 

@@ -1,4 +1,4 @@
-"""Meshes of buildings with few windows or none, and of what hangs on fronts."""
+"""Meshes of halls (buildings with few windows), and of attachments of facades: awnings, boards, downpipes."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from scan2sim.data_samples import paints, signs
 from scan2sim.data_samples.paints import RGB, Material, Paint
 from scan2sim.data_samples.shapes import Opening, Part, box, join, quads, tube, wall
 
-SKINS = (Material.PANELS, Material.PANELS, Material.PLASTER, Material.PLAIN, Material.BRICK, Material.GRIT)
+WALL_MATERIALS = (Material.PANELS, Material.PANELS, Material.PLASTER, Material.PLAIN, Material.BRICK, Material.GRIT)
 
 
 def hall(width: float, depth: float, height: float, colours: tuple[RGB, RGB], seed: int) -> Part:
-    """A bare building: x along its front (0 .. width), y into the plot; a gate and a strip of windows at times."""
+    """A hall: x along its front (0 .. width), y into the plot; sometimes with a gate and a strip of windows."""
     rng = np.random.default_rng([seed, 81])
-    skin = Paint(SKINS[rng.integers(len(SKINS))], colours[0], paints.BUILDING, seed)
+    skin = Paint(WALL_MATERIALS[rng.integers(len(WALL_MATERIALS))], colours[0], paints.BUILDING, seed)
     trim = Paint(Material.PLAIN, colours[1], paints.BUILDING, seed)
     plinth = (rng.uniform(0.2, 1.5), trim) if rng.random() < 0.5 else None
     parts = []
@@ -37,7 +37,7 @@ def hall(width: float, depth: float, height: float, colours: tuple[RGB, RGB], se
 
 
 def awning(width: float, colour: RGB, seed: int) -> Part:
-    """A slanted roof of cloth before a front (y < 0), from 2.9 m down to 2.3 m."""
+    """A slanted awning in front of a facade (y < 0), from 2.9 m down to 2.3 m."""
     rng = np.random.default_rng([seed, 82])
     cloth = Paint(Material.PANELS if rng.random() < 0.5 else Material.PLAIN, colour, paints.BUILDING, seed)
     out = rng.uniform(0.7, 1.8)
@@ -48,7 +48,7 @@ def awning(width: float, colour: RGB, seed: int) -> Part:
 
 
 def panel(width: float, height: float, low: float, colour: RGB, seed: int) -> Part:
-    """A board on a front: a picture, or one colour; the building's, whatever it shows."""
+    """A board on a facade, with an image or of one colour; it has the class of the building."""
     rng = np.random.default_rng([seed, 83])
     back = Paint(Material.PLAIN, colour, paints.BUILDING, seed)
     board = box((0, -0.08, low), (width, 0.0, low + height), back, bottom=True)

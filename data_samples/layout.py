@@ -1,4 +1,4 @@
-"""What stands where in the street, drawn from a seed and a `Style`."""
+"""Random layout of a street: positions and parameters of all objects, from a seed and a `Style`."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ HALF_WIDTH = 20.0
 
 @dataclass(frozen=True)
 class Style:
-    """The ranges and lists from which a street is drawn; change some to randomise its looks.
+    """Ranges and choices of a street's random parameters; change them to vary its appearance.
 
-    Lengths in metres, angles in degrees, colours linear RGB, shares in [0, 1]. `moving_car`: whether one drives
-    in the other lane; all else is the same without it.
+    Lengths in metres, angles in degrees, colours in linear RGB, shares in [0, 1]. `moving_car`: whether a car drives in
+    the other lane; without it everything else is the same.
     """
 
     curve_radius: Span = (260.0, 900.0)
@@ -65,9 +65,9 @@ class Style:
 
 @dataclass(frozen=True)
 class Axis:
-    """The road's axis: a circular arc of signed `curvature` (1/m), chainage s from 0 to `length`.
+    """Axis of the road: a circular arc of signed `curvature` (1/m), chainage s from 0 to `length`.
 
-    Offsets t are to the left of the axis. Local coordinates' origin is the arc's middle.
+    Offsets t are to the left of the axis. The origin of local coordinates is the middle of the arc.
     """
 
     length: float
@@ -98,7 +98,7 @@ class Axis:
 
 @dataclass(frozen=True)
 class House:
-    """A house: from chainage s on, front wall at distance `front` from the axis."""
+    """A house that starts at chainage s, its front wall at distance `front` from the axis."""
 
     side: Side
     s: float
@@ -119,7 +119,7 @@ class House:
 
 @dataclass(frozen=True)
 class Tree:
-    """A tree or (`bush`) a shrub at chainage s and offset t."""
+    """A tree, or a shrub if `bush`, at chainage s and offset t."""
 
     s: float
     t: float
@@ -132,7 +132,7 @@ class Tree:
 
 @dataclass(frozen=True)
 class Boundary:
-    """A garden's border along chainage s0..s1 at offset t."""
+    """Border of a garden along chainage s0..s1 at offset t."""
 
     kind: Literal["hedge", "brick_wall", "picket_fence", "iron_fence"]
     s0: float
@@ -144,7 +144,7 @@ class Boundary:
 
 @dataclass(frozen=True)
 class Post:
-    """A lamp, or a pole with a sign (index into `signs.NAMES`), facing traffic that drives `towards` +s or -s."""
+    """A lamp, or a pole with a sign (index into `signs.NAMES`) for traffic that drives towards +s (1) or -s (-1)."""
 
     s: float
     t: float
@@ -154,7 +154,7 @@ class Post:
 
 @dataclass(frozen=True)
 class ParkedCar:
-    """A parked car; `towards` which way its front looks."""
+    """A parked car; `towards`: direction of its front, +s (1) or -s (-1)."""
 
     s: float
     t: float
@@ -164,7 +164,7 @@ class ParkedCar:
 
 @dataclass(frozen=True)
 class Walk:
-    """A strip of other ground than slabs beside the road, from `near` to `far` metres off the axis."""
+    """A strip of ground beside the road that replaces the slabs, from `near` to `far` metres off the axis."""
 
     side: Side
     near: float
@@ -173,32 +173,39 @@ class Walk:
 
 
 @dataclass(frozen=True)
-class Placed:
-    """A thing of another kind at chainage s and offset t, its mesh made when the street is built.
+class PlacedObject:
+    """An additional object (`variety`) whose mesh is created when the street is built.
 
     Attributes:
-        turn: radians, of its x axis from the road's direction.
-        loose: it is no part of a world: a vehicle, a person.
+        s, t: chainage and offset.
+        turn: rotation of its x axis from the road's direction, radians.
+        make: creates the mesh.
+        movable: not part of the static world: a vehicle, a person.
     """
 
     s: float
     t: float
     turn: float
     make: Callable[[], Part]
-    loose: bool = False
+    movable: bool = False
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The whole street.
+    """Layout of a whole street.
 
     Attributes:
-        lane: half the carriageway's width, metres.
+        lane: half the width of the carriageway, metres.
         parking: side of the parking bays.
         sun: (3,) unit vector towards the sun.
-        road: parameters that the asphalt's pattern needs: half width, chainage of the zebra, of a dash.
-        bays, walks: other ground than setts and slabs; more: what else stands there (`variety`).
-        pavement, step: width of the pavement, height of the kerb, metres.
+        road: parameters of the asphalt's markings: half width, chainage of the zebra crossing and of a dash.
+        moving: colour of the moving car.
+        hills, bumps: relief of the terrain beside the road.
+        bays: paint of the parking bays; None: setts.
+        walks: ground that replaces slabs and grass.
+        extras: additional objects (`variety`).
+        pavement: width of the pavement, metres.
+        kerb_height: metres.
     """
 
     axis: Axis
@@ -223,9 +230,9 @@ class Layout:
     bumps: Field = field(repr=False)
     bays: Paint | None = None
     walks: tuple[Walk, ...] = ()
-    more: tuple[Placed, ...] = ()
+    extras: tuple[PlacedObject, ...] = ()
     pavement: float = 2.3
-    step: float = 0.12
+    kerb_height: float = 0.12
 
     BAY = 2.15
 
@@ -238,7 +245,7 @@ class Layout:
         return self.kerb(side) + self.pavement
 
     def height(self, s: npt.ArrayLike, t: npt.ArrayLike, *, below_kerb: bool = False) -> F64:
-        """Height of the ground; on the kerb's line itself the upper edge, or the lower one if `below_kerb`."""
+        """Height of the ground at (s, t); exactly at the kerb that of its upper edge, or the lower if `below_kerb`."""
         s, t = np.broadcast_arrays(np.asarray(s, np.float64), np.asarray(t, np.float64))
         z = np.zeros(s.shape)
         for side in (1, -1):
@@ -248,8 +255,8 @@ class Layout:
             camber = np.interp(
                 u, [0, self.lane, k + step, k + step + 1e-6, g, HALF_WIDTH],
                 [0, -0.024 * self.lane, -0.024 * self.lane - 0.02 * (k - self.lane),
-                 -0.024 * self.lane - 0.02 * (k - self.lane) + self.step,
-                 -0.024 * self.lane + self.step + 0.02, 0.45],
+                 -0.024 * self.lane - 0.02 * (k - self.lane) + self.kerb_height,
+                 -0.024 * self.lane + self.kerb_height + 0.02, 0.45],
             )  # fmt: skip
             z = np.where(u >= 0, camber, z)
             wild = u > g
@@ -262,7 +269,7 @@ class Layout:
 
 
 def lay_out(length: float, seed: int, style: Style | None = None) -> Layout:
-    """Draw a street of `length` metres."""
+    """Random layout of a street of `length` metres."""
     style = style or Style()
     rng = np.random.default_rng([seed, 1])
     lane = rng.uniform(*style.lane_width)
@@ -290,32 +297,32 @@ def lay_out(length: float, seed: int, style: Style | None = None) -> Layout:
         trees=tuple(trees),
         posts=tuple(_posts(rng, length, kerb, zebra, trees)),
         parked=tuple(_parked(rng, style, length, lane, parking, zebra)),
-        moving=_pick(rng, style.car),  # drawn in any case: without the car all else stays as it is
+        moving=_pick(rng, style.car),  # always drawn, so that the random numbers after it don't depend on the car
         moving_car=style.moving_car,
         seed=seed,
         hills=waves(rng, 7.0, dimensions=2),
         bumps=waves(rng, 1.3, dimensions=2),
         pavement=style.pavement,
-        step=style.kerb,
+        kerb_height=style.kerb,
     )
 
 
 def _pick(rng: np.random.Generator, colours: tuple[RGB, ...]) -> RGB:
-    """One of the colours, a little changed."""
+    """One of the colours with a small random change."""
     colour, change = np.array(colours[rng.integers(len(colours))]), rng.uniform(0.92, 1.06, 3)
-    r, g, b = colour * (0.7 * change.mean() + 0.3 * change)  # lighter or darker rather than another hue
+    r, g, b = colour * (0.7 * change.mean() + 0.3 * change)  # varies brightness more than hue
     return float(r), float(g), float(b)
 
 
 def _sun(rng: np.random.Generator, axis: Axis, style: Style) -> F64:
-    """Towards the sun: across the street rather than along it, and behind the recording vehicle rather than ahead."""
+    """Unit vector towards the sun: rather across the street than along it, and behind the recording vehicle."""
     azimuth = axis.heading + rng.choice([-1, 1]) * rng.uniform(2.2, 2.75)
     elevation = np.radians(rng.uniform(*style.sun_elevation))
     return np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
 
 
 def _houses(rng: np.random.Generator, style: Style, length: float, side: Side, garden: float) -> list[House]:
-    """A row of houses, some wall to wall, some with gaps; none beyond the street's ends."""
+    """A row of houses within the street's ends, some adjoining, some with gaps."""
     houses: list[House] = []
     s = rng.uniform(0.3, 1.5)
     setback = rng.uniform(*style.front_garden)
@@ -351,7 +358,7 @@ def _trees(
     rng: np.random.Generator, style: Style, length: float, kerb: dict[int, float], garden: dict[int, float],
     houses: list[House], zebra: float,
 ) -> list[Tree]:  # fmt: skip
-    """Street trees along the kerb, trees in the gaps, bushes in the front gardens."""
+    """Trees along the kerb and in the gaps, bushes in the front gardens."""
     trees = []
     for side in (1, -1):
         s = rng.uniform(2.0, 5.0)
@@ -389,7 +396,7 @@ def _gaps(houses: list[House], side: int, length: float) -> list[Span]:
 def _boundaries(
     rng: np.random.Generator, style: Style, length: float, garden: dict[int, float], houses: list[House]
 ) -> list[Boundary]:
-    """A border along every front garden (open before the door) and across every gap."""
+    """Borders along every front garden (with an opening at the door) and across every gap."""
     borders = []
     kinds = ("hedge", "brick_wall", "picket_fence", "iron_fence")
 
@@ -422,7 +429,7 @@ def _boundaries(
 def _posts(
     rng: np.random.Generator, length: float, kerb: dict[int, float], zebra: float, trees: list[Tree]
 ) -> list[Post]:
-    """Lamps every 20-odd metres and signs along the kerbs, clear of the trees."""
+    """Lamps every 19 to 24 m, and signs along the kerbs, clear of trees."""
 
     def clear(s: float, t: float) -> float:
         near = [tree.s for tree in trees if abs(tree.t - t) < 1.5 and abs(tree.s - s) < 1.7]

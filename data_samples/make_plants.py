@@ -1,7 +1,7 @@
 """Generate the low-poly plants of `pipeline.terrain`: `python -m scan2sim.data_samples.make_plants [FILE]`.
 
-Crowns of the generator's own trees and bushes, of few triangles: 1 high and of radius 1 around the trunk, which is no
-part of them. Arrays of the k-th: `vertices<k>` (V, 3), `faces<k>` (F, 3), `light<k>` (V,) openness to the sky.
+Crowns of the generator's trees and bushes with few triangles and without the trunk, scaled to a height and radius of 1.
+Arrays of model k: `vertices<k>` (V, 3), `faces<k>` (F, 3), `light<k>` (V,) sky openness.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ GREEN = (0.2, 0.4, 0.1)
 
 
 def make(out: Path = low_poly_plants.MODELS) -> Path:
-    """Write the models."""
-    trees = [leafy_tree(Tree(0, 0, 8.0, 2.5, GREEN, seed), rounds=0) for seed in range(low_poly_plants.TREES)]
-    bushes = [shrub(1.0, GREEN, seed, rounds=1) for seed in range(low_poly_plants.BUSHES)]
+    """Write the models to an .npz file; returns its path."""
+    trees = [leafy_tree(Tree(0, 0, 8.0, 2.5, GREEN, seed), rounds=0) for seed in range(low_poly_plants.TREE_MODELS)]
+    bushes = [shrub(1.0, GREEN, seed, rounds=1) for seed in range(low_poly_plants.BUSH_MODELS)]
     arrays: dict[str, Any] = {}
     for k, plant in enumerate([*trees, *bushes]):
         vertices, faces, light = _crown(plant)
@@ -34,7 +34,7 @@ def make(out: Path = low_poly_plants.MODELS) -> Path:
 
 
 def _crown(plant: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A plant's leaves, 1 high and of radius 1."""
+    """Vertices, faces and sky openness of a plant's leaves, scaled to a height and radius of 1."""
     faces = plant.faces[plant.material == Material.FOLIAGE]
     used, index = np.unique(faces, return_inverse=True)
     xyz = plant.vertices[used].astype(np.float64)

@@ -1,4 +1,4 @@
-"""Make the small committed tile again: `python -m scan2sim.data_samples.make_tile [FOLDER]`."""
+"""Regenerate the small committed tile: `python -m scan2sim.data_samples.make_tile [FOLDER]`."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ from scan2sim.data_samples import SMALL
 from scan2sim.data_samples.photos import Effects
 from scan2sim.data_samples.street import generate
 
-LENGTH, SEED = 26.0, 5
-"""Of its street."""
+STREET_LENGTH_M, SEED = 26.0, 5
 
 
 def make(out: Path = SMALL) -> Path:
-    """Write the tile that `data_samples/README.md` describes; returns its `tile.toml`."""
+    """Write the tile described in `data_samples/README.md`; returns the path of its `tile.toml`."""
     return generate(
         out,
-        length=LENGTH,
+        length=STREET_LENGTH_M,
         points=4.2e5,
         photos=10,
         seed=SEED,

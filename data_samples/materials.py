@@ -1,7 +1,7 @@
-"""Colour of a surface point: procedural patterns, compiled.
+"""Procedural materials: colour of a surface point, compiled.
 
-No detail is finer than 2 cm, and edges are box-filtered over `footprint`, the width in metres that
-a sample stands for, so that a texture of 1 cm can hold everything and distant photos don't alias.
+No detail is finer than 2 cm, and edges are box-filtered over `footprint`, the width of a sample in metres, so that
+textures of 1 cm contain all details, and distant photos don't alias.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ GRIT, PANELS = int(Material.GRIT), int(Material.PANELS)
 
 @njit(cache=True, inline="always")
 def _hash(i: int, j: int, k: int) -> float:
-    """A number in [0, 1) for three integers."""
+    """Hash of three integers, in [0, 1)."""
     h = (i * 374761393 + j * 668265263 + k * 362437) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     h = ((h ^ (h >> 15)) * 2246822519) & 0xFFFFFFFF
@@ -42,7 +42,7 @@ def _hash(i: int, j: int, k: int) -> float:
 
 @njit(cache=True)
 def noise(x: float, y: float, wavelength: float, w: float, k: int) -> float:
-    """Value noise in [-1, 1], faded out where the footprint `w` exceeds its wavelength."""
+    """Value noise in [-1, 1], faded out when the footprint `w` approaches the wavelength; `k`: seed."""
     fade = 2.0 - 2.0 * w / wavelength
     if fade <= 0.0:
         return 0.0
@@ -63,13 +63,13 @@ def _clamp(x: float) -> float:
 
 @njit(cache=True)
 def _inside(x: float, low: float, high: float, w: float) -> float:
-    """Share of [x - w/2, x + w/2] that lies in [low, high]."""
+    """Share of the interval [x - w/2, x + w/2] inside [low, high]."""
     return max(min(x + w / 2, high) - max(x - w / 2, low), 0.0) / w
 
 
 @njit(cache=True)
 def _joint(x: float, period: float, width: float, w: float) -> float:
-    """Coverage of lines of `width` at the multiples of `period`."""
+    """Coverage by lines of a width at all multiples of `period`."""
     if w > period:
         return width / period
     d = x - period * math.floor(x / period + 0.5)
@@ -78,15 +78,15 @@ def _joint(x: float, period: float, width: float, w: float) -> float:
 
 @njit(cache=True)
 def _asphalt(s: float, t: float, w: float, k: int, road: npt.NDArray[Any]) -> tuple[float, float]:
-    """Brightness of the road surface and coverage of white paint; `road` is `Layout.road`."""
+    """Brightness of the road surface, and coverage by white paint; `road`: `Layout.road`."""
     half, zebra, dash = road[0], road[1], road[2]
     v = 1.0 + 0.07 * noise(s, t, 2.7, w, k) + 0.05 * noise(s, t, 0.55, w, k + 1)
     v += 0.10 * noise(s, t, 0.11, w, k + 2) + 0.20 * noise(s, t, 0.042, w, k + 3) + 0.26 * noise(s, t, 0.021, w, k + 4)
-    lane = abs(abs(t) - half / 2)  # wheels polish two tracks in each lane
+    lane = abs(abs(t) - half / 2)  # two wheel tracks in each lane are darker
     v *= 1.0 - 0.10 * math.exp(-(((lane - 0.78) / 0.24) ** 2)) * (1 + 0.4 * noise(s * 0.1, t, 0.5, w, k + 5))
     seam = _inside(t + 0.03 * noise(s, 0.0, 3.0, w, k + 6), -0.16, -0.135, w)
     v *= 1.0 - 0.35 * seam * _clamp(1 + noise(s, 0.0, 1.1, w, k + 13))
-    cell = int(math.floor(s / 8.5))  # mended patches
+    cell = int(math.floor(s / 8.5))  # repaired patches
     if _hash(cell, 3, k) < 0.55:
         s0 = 8.5 * cell + 1 + 3 * _hash(cell, 4, k)
         t0 = (2 * _hash(cell, 5, k) - 1) * (half - 1.3) - 0.6
@@ -126,7 +126,7 @@ def _asphalt(s: float, t: float, w: float, k: int, road: npt.NDArray[Any]) -> tu
 
 @njit(cache=True)
 def _bond(u: float, v: float, length: float, height: float, joint: float, w: float, k: int) -> tuple[float, float]:
-    """Running bond: coverage of joints, and a number in [0, 1) for the stone (0.5 where they blur)."""
+    """Running bond: coverage by joints, and a random number in [0, 1) per stone (0.5 where stones blur)."""
     row = int(math.floor(v / height))
     x = u + (0.5 * length if row % 2 else 0.0)
     column = int(math.floor(x / length))
@@ -137,7 +137,7 @@ def _bond(u: float, v: float, length: float, height: float, joint: float, w: flo
 
 @njit(cache=True)
 def _window(u: float, v: float, a: float, b: float, w: float, k: int) -> tuple[float, float, float, float]:
-    """Coverage of the frame, then the colour of what is behind the glass."""
+    """Coverage by the frame, and the colour seen through the glass."""
     frame = 1.0 - _inside(u, 0.065, a - 0.065, w) * _inside(v, 0.065, b - 0.065, w)
     kind = _hash(k, 1, 7)
     if a > 0.8:
@@ -165,30 +165,30 @@ def _window(u: float, v: float, a: float, b: float, w: float, k: int) -> tuple[f
         r += cloth * (fold * (0.9 + 0.2 * tint) - r)
         g += cloth * (fold * 0.92 - g)
         bl += cloth * (fold * (0.98 - 0.25 * tint) - bl)
-    rim = 1.0 - _inside(u, 0.095, a - 0.095, w) * _inside(v, 0.065, b - 0.11, w)  # the frame's shade on the pane
+    rim = 1.0 - _inside(u, 0.095, a - 0.095, w) * _inside(v, 0.065, b - 0.11, w)  # shadow of the frame on the pane
     dim = 1.0 - 0.45 * rim
     return frame, r * dim, g * dim, bl * dim
 
 
 @njit(cache=True)
-def _sample(picture: npt.NDArray[Any], u: float, v: float, channel: int) -> float:
-    """Bilinear sample of a square picture (n, n, 3); v upwards."""
-    n = picture.shape[0]
+def _sample(image: npt.NDArray[Any], u: float, v: float, channel: int) -> float:
+    """Bilinear sample of a square image (n, n, 3); v upwards."""
+    n = image.shape[0]
     x = min(max(u * n - 0.5, 0.0), n - 1.001)
     y = min(max((1 - v) * n - 0.5, 0.0), n - 1.001)
     i, j = int(x), int(y)
     a, b = x - i, y - j
-    top = picture[j, i, channel] * (1 - a) + picture[j, i + 1, channel] * a
-    low = picture[j + 1, i, channel] * (1 - a) + picture[j + 1, i + 1, channel] * a
+    top = image[j, i, channel] * (1 - a) + image[j, i + 1, channel] * a
+    low = image[j + 1, i, channel] * (1 - a) + image[j + 1, i + 1, channel] * a
     return top * (1 - b) + low * b
 
 
 @njit(cache=True)
 def _colour(
     m: int, u: float, v: float, r: float, g: float, b: float, k: int, a: float, h: float, w: float,
-    road: npt.NDArray[Any], pictures: npt.NDArray[Any],
+    road: npt.NDArray[Any], sign_images: npt.NDArray[Any],
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Albedo (linear RGB) of material `m` with base colour r, g, b, seed k and size a x h at (u, v)."""
+    """Albedo (linear RGB) at (u, v) of material `m` with base colour r, g, b, seed k, size a x h and footprint w."""
     if m == ASPHALT:
         f, paint = _asphalt(u, v, w, k, road)
         warm = 0.03 * noise(u, v, 4.0, w, k + 20)
@@ -234,7 +234,7 @@ def _colour(
         j, tone = _bond(u, v, 0.5, 0.5, 0.013, w, k)
         f = (0.88 + 0.24 * tone) * (1 + 0.09 * noise(u, v, 0.022, w, k) + 0.07 * noise(u, v, 0.13, w, k + 1))
         f *= (1 + 0.09 * noise(u, v, 2.3, w, k + 2)) * (1 - 0.55 * j)
-        spot = _clamp(6 * (noise(u, v, 0.07, w, k + 3) - 0.83))  # old chewing gum
+        spot = _clamp(6 * (noise(u, v, 0.07, w, k + 3) - 0.83))  # stains of chewing gum
         f *= 1 - 0.35 * spot
         return r * f, g * f * (0.99 + 0.02 * tone), b * f * (0.96 + 0.08 * tone)
     if m == BRICK:
@@ -360,13 +360,13 @@ def _colour(
         grey = 0.022 * (1 - rim) + rim * (0.06 + 0.38 * spokes)
         return grey, grey, grey
     if m == SIGN:
-        p = pictures[k]
+        p = sign_images[k]
         return _sample(p, u, v, 0), _sample(p, u, v, 1), _sample(p, u, v, 2)
     if m == GRIT:
         size, deep = 0.03 * 20 ** _hash(k, 1, 9), 0.15 + 0.55 * _hash(k, 2, 9)
         f = 1 + deep * (noise(u, v, size, w, k) + 0.5 * noise(u, v, 3 * size, w, k + 1))
         f *= 1 + 0.25 * noise(u, v, 1.7, w, k + 2) + 0.3 * _hash(k, 3, 9) * noise(u, v, 6.0, w, k + 3)
-        other = _clamp(3 * noise(u, v, 2.5 * size, w, k + 4) - 3 * _hash(k, 4, 9))  # a second colour among it
+        other = _clamp(3 * noise(u, v, 2.5 * size, w, k + 4) - 3 * _hash(k, 4, 9))  # share of a second colour
         x, y, z = _hash(k, 5, 9), _hash(k, 6, 9), _hash(k, 7, 9)
         f = max(f, 0.1)
         return (
@@ -391,18 +391,20 @@ def surface(
     face: npt.NDArray[Any], bary: npt.NDArray[Any], footprint: npt.NDArray[Any],
     faces: npt.NDArray[Any], normals: npt.NDArray[Any], uv: npt.NDArray[Any], sky: npt.NDArray[Any],
     material: npt.NDArray[Any], colour: npt.NDArray[Any], seed: npt.NDArray[Any], size: npt.NDArray[Any],
-    road: npt.NDArray[Any], pictures: npt.NDArray[Any],
+    road: npt.NDArray[Any], sign_images: npt.NDArray[Any],
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:  # fmt: skip
-    """What the surface is at points given by face and barycentric coordinates.
+    """Surface properties at points given by face and barycentric coordinates.
 
     Args:
-        face: (N,) faces hit.
+        face: (N,) faces.
         bary: (N, 2) weights of the face's second and third corner.
-        footprint: (N,) metres that the sample stands for.
-        others: the arrays of a `shapes.Part`, `Layout.road`, and `signs.pictures()`.
+        footprint: (N,) width of the sample, metres.
+        faces, normals, uv, sky, material, colour, seed, size: arrays of a `shapes.Part`.
+        road: `Layout.road`.
+        sign_images: `signs.images()`.
 
     Returns:
-        Albedo (N, 3) linear RGB, shading normal (N, 3) unit, openness to the sky (N,), all float32.
+        Albedo (N, 3) in linear RGB, shading normal (N, 3), sky openness (N,), all float32.
     """
     n = len(face)
     albedo, normal, openness = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.float32)
@@ -426,7 +428,7 @@ def surface(
             size[f, 1],
             w,
             road,
-            pictures,
+            sign_images,
         )
         albedo[i, 0], albedo[i, 1], albedo[i, 2] = _clamp(r), _clamp(g), _clamp(b)
         x = c0 * normals[p, 0] + c1 * normals[q, 0] + c2 * normals[s, 0]

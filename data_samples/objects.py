@@ -1,4 +1,4 @@
-"""Meshes of the things of a street, each standing at its own origin (z = 0 is the ground)."""
+"""Meshes of a street's objects, each in its own coordinates (z = 0 is the ground)."""
 
 from __future__ import annotations
 
@@ -10,35 +10,35 @@ from scan2sim.data_samples.paints import RGB, Material, Paint, linear
 from scan2sim.data_samples.shapes import Opening, Part, blob, box, join, leaves, part, quads, sheet, tube, wall, waves
 from scan2sim.pipeline.core.types import F64
 
-GROUND_STOREY, STOREY = 3.35, 2.95
-FOOT = 1.2  # how far walls reach below the ground at their origin
-STEEL = linear("#8d9093")
-DARK_STEEL = linear("#3c4245")
+GROUND_STOREY_M, STOREY_M = 3.35, 2.95
+FOUNDATION_M = 1.2  # depth of walls below the ground at their origin
+STEEL_RGB = linear("#8d9093")
+DARK_STEEL_RGB = linear("#3c4245")
 
 
 def house(plan: House) -> Part:
-    """A house: x along its front (0 .. width), y into the plot (0 .. depth); the front looks towards -y."""
+    """A house: x along its front (0 .. width), y into the plot (0 .. depth); the front faces -y."""
     rng = np.random.default_rng(plan.seed)
     body = Paint(Material.BRICK if plan.brick else Material.PLASTER, plan.colour, paints.BUILDING, plan.seed)
     trim = Paint(Material.PLAIN, plan.trim, paints.BUILDING, plan.seed)
     plinth = (0.55, Paint(Material.STONE, linear("#8f897f"), paints.BUILDING, plan.seed))
     height = eaves(plan)
     front, extras = _front(plan, rng, trim)
-    parts = [*extras, wall(plan.width, height, front, body, foot=FOOT, plinth=plinth)]
+    parts = [*extras, wall(plan.width, height, front, body, foot=FOUNDATION_M, plinth=plinth)]
     for width, turn, at in (
         (plan.depth, np.pi / 2, (plan.width, 0, 0)),
         (plan.width, np.pi, (plan.width, plan.depth, 0)),
         (plan.depth, -np.pi / 2, (0, plan.depth, 0)),
     ):
         rows = _windows(plan, width, rng, columns=max(1, int(width / 3.6)))
-        parts.append(wall(width, height, rows, body, foot=FOOT, plinth=plinth).moved(turn, at))
+        parts.append(wall(width, height, rows, body, foot=FOUNDATION_M, plinth=plinth).moved(turn, at))
     parts += _flat_roof(plan, height, trim) if plan.roof == "flat" else _gable_roof(plan, height, body, trim, rng)
     return join(parts)
 
 
 def eaves(plan: House) -> float:
-    """Height of the walls' top."""
-    return GROUND_STOREY + (plan.storeys - 1) * STOREY + (0.75 if plan.roof == "flat" else 0.15)
+    """Height of the top of the walls, metres."""
+    return GROUND_STOREY_M + (plan.storeys - 1) * STOREY_M + (0.75 if plan.roof == "flat" else 0.15)
 
 
 def _window_paint(plan: House, rng: np.random.Generator) -> Paint:
@@ -50,7 +50,7 @@ def _windows(plan: House, width: float, rng: np.random.Generator, columns: int, 
     w, h = min(1.15, 0.55 * pitch), 1.5
     openings = []
     for storey in range(first, plan.storeys):
-        z = 0.95 + (GROUND_STOREY - STOREY + storey * STOREY if storey else 0.1)
+        z = 0.95 + (GROUND_STOREY_M - STOREY_M + storey * STOREY_M if storey else 0.1)
         for c in range(columns):
             x = (c + 0.5) * pitch - w / 2
             openings.append(Opening(x, z, x + w, z + h, _window_paint(plan, rng)))
@@ -58,7 +58,7 @@ def _windows(plan: House, width: float, rng: np.random.Generator, columns: int, 
 
 
 def _front(plan: House, rng: np.random.Generator, trim: Paint) -> tuple[list[Opening], list[Part]]:
-    """Openings of the front wall, and what stands out of it: sills, surrounds, cornice, sign, downpipe, steps."""
+    """Openings of the front wall, and meshes protruding from it: sills, surrounds, cornice, sign, downpipe, steps."""
     columns = max(2, int(plan.width / rng.uniform(2.3, 2.9)))
     pitch = plan.width / columns
     upper = _windows(plan, plan.width, rng, columns, first=1)
@@ -77,7 +77,7 @@ def _front(plan: House, rng: np.random.Generator, trim: Paint) -> tuple[list[Ope
         ground = [Opening(a, 0.5, b, 2.55, pane) for a, b in spans]
         a, b = max(spans, key=lambda s: s[1] - s[0])
         middle, half = (a + b) / 2, min((b - a) / 2, 2.1)
-        board = Paint(Material.SIGN, (1, 1, 1), paints.BUILDING, signs.SHOPS + plan.shop)
+        board = Paint(Material.SIGN, (1, 1, 1), paints.BUILDING, signs.FIRST_SHOP + plan.shop)
         x0, x1, z0, z1, y = middle - half, middle + half, 2.68, 2.68 + half * 0.305, -0.10
         parts.append(box((x0, y, z0), (x1, 0.0, z1), Paint(Material.PLAIN, plan.door, paints.BUILDING), bottom=True))
         face = [
@@ -101,7 +101,7 @@ def _front(plan: House, rng: np.random.Generator, trim: Paint) -> tuple[list[Ope
             for x in (o.x0 - 0.12, o.x1):
                 parts.append(box((x, -0.035, o.z0), (x + 0.12, 0.0, o.z1 + 0.14), trim))
             parts.append(box((o.x0, -0.035, o.z1), (o.x1, 0.0, o.z1 + 0.14), trim, bottom=True))
-    top = GROUND_STOREY - (0.12 if plan.shop is not None else 0.25)
+    top = GROUND_STOREY_M - (0.12 if plan.shop is not None else 0.25)
     if plan.storeys > 1 and (plan.shop is not None or rng.random() < 0.75):
         parts.append(box((0.0, -0.09, top), (plan.width, 0.02, top + 0.16), trim, bottom=True))
     height = eaves(plan)
@@ -115,7 +115,7 @@ def _front(plan: House, rng: np.random.Generator, trim: Paint) -> tuple[list[Ope
 
 
 def _balconies(plan: House, upper: list[Opening], columns: int, rng: np.random.Generator, trim: Paint) -> list[Part]:
-    iron = Paint(Material.PLAIN, DARK_STEEL, paints.BUILDING)
+    iron = Paint(Material.PLAIN, DARK_STEEL_RGB, paints.BUILDING)
     column = int(rng.integers(columns))
     parts = []
     for o in upper[column::columns]:
@@ -141,7 +141,7 @@ def _gable_roof(plan: House, height: float, body: Paint, trim: Paint, rng: np.ra
     slope = (d / 2 + lip) / np.cos(plan.pitch)
     parts = []
     for turn in (False, True):
-        # the slope that looks towards -y; the other is its mirror, turned half round
+        # the slope that faces -y; the other one is rotated by half a turn
         a, b = (-side, -lip, height - drop), (w + side, -lip, height - drop)
         c, e = (w + side, d / 2, height + rise), (-side, d / 2, height + rise)
         up = np.array([0, 0, thick])
@@ -184,14 +184,14 @@ def _flat_roof(plan: House, height: float, trim: Paint) -> list[Part]:
         ((a, a), (w - a, b)), ((a, d - b), (w - a, d - a)), ((a, b), (b, d - b)), ((w - b, b), (w - a, d - b)),
     ):  # fmt: skip
         parts.append(box((*low, height), (*high, height + c), trim, bottom=True))
-        e = 0.01  # clear of the walls' outside
+        e = 0.01  # inset, to avoid coplanar faces with the walls
         inner = ((max(low[0], e), max(low[1], e), z), (min(high[0], w - e), min(high[1], d - e), height))
         parts.append(box(*inner, trim))
     return parts
 
 
 def tree(plan: Tree) -> Part:
-    """A tree: trunk and boughs, a crown of bumpy blobs under leaves."""
+    """A tree: trunk and branches, a crown of bumpy blobs covered with leaves."""
     rng = np.random.default_rng(plan.seed)
     bark = Paint(Material.BARK, linear("#6f5d4b"), paints.TREE, plan.seed)
     clear = max(2.1, 0.34 * plan.height)
@@ -215,7 +215,7 @@ def tree(plan: Tree) -> Part:
 
 
 def bush(plan: Tree) -> Part:
-    """A shrub: a few blobs on the ground, under leaves."""
+    """A shrub: a few blobs on the ground, covered with leaves."""
     rng = np.random.default_rng(plan.seed)
     count = 5
     centres = np.column_stack(
@@ -239,7 +239,7 @@ def _foliage(
     leaf: float,
     per_m2: float,
 ) -> list[Part]:
-    """Dark blobs, and leaves on their skin where no other blob covers it."""
+    """Dark blobs, and leaves on their surface where it isn't inside another blob."""
     inner = Paint(Material.FOLIAGE, tuple(0.75 * np.array(plan.colour)), classification, plan.seed)
     parts, points, outward = [], [], []
     for i, (centre, radius) in enumerate(zip(centres, radii, strict=True)):
@@ -276,7 +276,7 @@ def _foliage(
 
 
 def _scattered(n: int, rng: np.random.Generator) -> F64:
-    """(n, 3) unit vectors, evenly scattered and jittered."""
+    """(n, 3) unit vectors, evenly distributed and jittered."""
     k = np.arange(n) + 0.5
     z = 1 - 2 * k / max(n, 1)
     angle = np.pi * (1 + 5**0.5) * k + rng.uniform(0, 6)
@@ -286,7 +286,7 @@ def _scattered(n: int, rng: np.random.Generator) -> F64:
 
 
 def boundary(plan: Boundary, length: float) -> Part:
-    """A garden's border of `length` metres along x, its outside towards -y."""
+    """Border of a garden, `length` metres along x, its outside towards -y: hedge, wall or fence."""
     rng = np.random.default_rng(plan.seed)
     if plan.kind == "hedge":
         return _hedge(plan, length, rng)
@@ -319,7 +319,7 @@ def boundary(plan: Boundary, length: float) -> Part:
 
 
 def _picket(x: float, wood: Paint) -> Part:
-    """A pointed board."""
+    """A pointed board of a picket fence."""
     y, w, h, tip = -0.025, 0.085, 0.98, 1.06
     outline = [(x, 0.06), (x + w, 0.06), (x + w, h), (x + w / 2, tip), (x, h)]
     front = np.array([(a, y, b) for a, b in outline])
@@ -334,7 +334,7 @@ def _picket(x: float, wood: Paint) -> Part:
 
 
 def _hedge(plan: Boundary, length: float, rng: np.random.Generator) -> Part:
-    """A clipped hedge: a bumpy bar under small leaves."""
+    """A clipped hedge: a bumpy bar covered with small leaves."""
     h, half = rng.uniform(0.8, 1.25), 0.27
     profile = np.array(
         [(-half, -0.3), (-half, 0.0), *((-half, z) for z in np.linspace(0.15, h - 0.15, 6)), (-half + 0.08, h - 0.03),
@@ -388,8 +388,8 @@ def lamp() -> Part:
 
 
 def sign(index: int) -> Part:
-    """A sign on a pole; it looks towards -y."""
-    steel = Paint(Material.PLAIN, STEEL, paints.POLE, 9)
+    """A traffic sign on a pole, facing -y; `index`: into `signs.NAMES`."""
+    steel = Paint(Material.PLAIN, STEEL_RGB, paints.POLE, 9)
     face = Paint(Material.SIGN, (1, 1, 1), paints.SIGN, index)
     grey = Paint(Material.PLAIN, linear("#a0a3a5"), paints.SIGN, 3)
     kind = signs.SHAPES.get(signs.NAMES[index], "square")
@@ -415,11 +415,11 @@ def sign(index: int) -> Part:
     ])  # fmt: skip
 
 
-CAR_LENGTH = 4.36
+CAR_LENGTH_M = 4.36
 
 
 def car(colour: RGB) -> Part:
-    """A car: x forwards, y to the left; one loft for body and cabin, four wheels."""
+    """A car, x forwards, y to the left: a loft for body and cabin, and four wheels."""
     x = np.unique(np.concatenate([np.linspace(-2.18, 2.18, 45), [0.98, 0.28, -1.05, -1.72]]))
     top = np.interp(
         x, [-2.18, -2.12, -1.95, -1.72, -1.05, -0.5, 0.0, 0.28, 0.98, 1.3, 1.8, 2.05, 2.15, 2.18],
@@ -430,14 +430,14 @@ def car(colour: RGB) -> Part:
     belt = np.minimum(top - 0.03, np.interp(x, [-2.2, 1.0, 2.2], [0.93, 0.90, 0.5]))
     cabin = np.clip((top - belt) / 0.5, 0, 1)
     roof = half * 0.94 - 0.20 * cabin
-    ring = np.stack([  # right half of the section, from the bottom up: (y, z) a station
+    ring = np.stack([  # right half of the cross section, from the bottom up: (y, z) per station
         np.stack([0 * x, low], axis=1), np.stack([0.93 * half, low], axis=1),
         np.stack([half, low * 0.4 + 0.36], axis=1),
         np.stack([half, np.minimum(0.66, belt - 0.02)], axis=1), np.stack([0.965 * half, belt], axis=1),
         np.stack([roof, top - 0.025 - 0.03 * cabin], axis=1), np.stack([roof * 0.82, top], axis=1),
         np.stack([0 * x, top + 0.02 * cabin], axis=1),
     ], axis=0)  # fmt: skip
-    loop = np.concatenate([ring * [-1, 1], ring[-2:0:-1]])  # all around, counter-clockwise seen from the front
+    loop = np.concatenate([ring * [-1, 1], ring[-2:0:-1]])  # whole outline, counter-clockwise seen from the front
     k, n = len(loop), len(x)
     xyz = np.empty((k + 1, n, 3))
     xyz[:k, :, 0], xyz[:k, :, 1:] = x, loop
@@ -448,7 +448,7 @@ def car(colour: RGB) -> Part:
     flat = xyz.reshape(-1, 3)
     body = part(flat, faces, flat[:, [0, 2]], Paint(Material.CAR_BODY, colour, paints.VEHICLE, 1))
     row = np.repeat(np.arange(k), 2 * (n - 1))
-    row = np.minimum(row, k - 1 - row)  # the same on both sides
+    row = np.minimum(row, k - 1 - row)  # symmetric
     middle = flat[faces].mean(axis=1)
     side_glass = (row == 4) & (middle[:, 0] < 0.9) & (middle[:, 0] > -1.62) & (np.interp(middle[:, 0], x, cabin) > 0.12)
     slanted = ((middle[:, 0] > 0.30) & (middle[:, 0] < 0.96)) | ((middle[:, 0] < -1.07) & (middle[:, 0] > -1.70))

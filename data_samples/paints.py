@@ -1,4 +1,4 @@
-"""What a surface is made of: the materials' names, and a paint for every kind of thing."""
+"""Materials of surfaces, paints, and class codes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ RGB = tuple[float, float, float]
 
 
 class Material(IntEnum):
-    """Pattern that `materials.surface` draws; `uv` is in metres along the surface unless said otherwise."""
+    """Pattern drawn by `materials.surface`; `uv` is in metres along the surface unless noted otherwise."""
 
     PLAIN = 0
     ASPHALT = 1  # uv: chainage and offset from the axis
@@ -33,9 +33,9 @@ class Material(IntEnum):
     CAR_GLASS = 17  # the same
     CAR_END = 18  # uv: across the car, and height; size[0]: +1 front, -1 rear
     WHEEL = 19  # uv from the hub
-    SIGN = 20  # uv in [0, 1] on the picture that the seed names
-    GRIT = 21  # gravel, litter, rubble, render: sizes and contrast by the seed
-    PANELS = 22  # boards, sheets, slats: sizes and direction by the seed
+    SIGN = 20  # uv in [0, 1] on the image whose index is the seed
+    GRIT = 21  # gravel, litter, rubble, render: grain size and contrast by the seed
+    PANELS = 22  # boards, sheets, slats: size and direction by the seed
 
 
 class Paint(NamedTuple):

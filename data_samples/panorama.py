@@ -1,7 +1,7 @@
-"""Equirectangular pictures of a town, fast: rays through Open3D, colours from a compiled shader.
+"""Fast renderer of equirectangular images of a town: ray casting by Open3D, colours by a compiled shader.
 
-Textures are procedural and band-limited: what is finer than a pixel's footprint fades out (`materials`).
-The ground is no triangles: two planes and a raster of distances (`ground`) give road, kerb and pavement.
+Textures are procedural and band-limited: details finer than a pixel's footprint fade out (`materials`). The ground is
+not a mesh: two planes and a raster of distances (`ground`) define road, kerb and pavement.
 """
 
 from __future__ import annotations
@@ -15,37 +15,37 @@ import numpy.typing as npt
 
 from scan2sim.data_samples import rays as tracing
 from scan2sim.data_samples import shader, signs, sky
-from scan2sim.data_samples.ground import CELL, KERB
-from scan2sim.data_samples.hills import heights, seen_from
+from scan2sim.data_samples.ground import CELL_M, KERB_HEIGHT_M
+from scan2sim.data_samples.hills import heights, relative_waves
 from scan2sim.data_samples.scene import srgb
 from scan2sim.data_samples.shapes import Part
 from scan2sim.data_samples.town import Town
 from scan2sim.data_samples.traffic import Traffic
 from scan2sim.pipeline.core.types import F32, F64, U8
 
-RADIUS = 220.0  # metres around the camera in which things have triangles
-STEP = 0.25  # of the radius, driven before they are gathered anew
-ROOF = -60.0  # degrees of elevation below which the camera sees its own car
-GAIN = (0.6, 1.4)
-ROUGH = 20  # of 255: pixels that differ more from a neighbour are sampled again
-LENS = 0.55  # pixels, standard deviation
+MESH_RADIUS_M = 220.0  # around the camera, within which meshes are loaded
+REBUILD_SHARE = 0.25  # share of the radius driven before the meshes are rebuilt
+OWN_CAR_ELEVATION_DEG = -60.0  # elevation below which the camera sees its own car
+GAIN_RANGE = (0.6, 1.4)  # bounds of the exposure
+SUPERSAMPLING_CONTRAST = 20  # difference of neighbouring pixels, in 8-bit levels, above which more rays are cast
+LENS_BLUR_PX = 0.55  # standard deviation
 GLARE = ((40.0, 0.8), (1.5, 5.0), (0.25, 30.0))
-"""Linear light that a low sun adds, and degrees away from it in which that falls to 1/e: the disc, a glow, a veil."""
-TABLE = srgb(np.linspace(0, 1, 8192) ** 2)
-"""By the root of the light."""
+"""Glare of a low sun as (linear light, angle in degrees at which it falls to 1/e): the disc, a glow, a veil."""
+SRGB_TABLE = srgb(np.linspace(0, 1, 8192) ** 2)
+"""sRGB values by the square root of linear light."""
 
 Index = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)
-class Picture:
-    """What the camera sees.
+class PanoramaImage:
+    """A rendered panorama.
 
     Attributes:
         rgb: (H, W, 3).
         depth: (H, W) metres along the ray (infinite: sky, NaN: own car).
-        moving: (H, W) whether another vehicle is there.
-        gain: what the exposure multiplied the light by.
+        moving: (H, W) whether the pixel shows another vehicle.
+        gain: exposure, factor on the light.
     """
 
     rgb: U8
@@ -55,15 +55,16 @@ class Picture:
 
 
 class Panorama:
-    """A camera in a town.
+    """A 360-degree camera in a town.
 
     Args:
-        town, traffic: what there is; None: nobody else on the road.
-        height: rows of a picture; it has twice as many columns.
-        seed: of the light's changes.
-        samples: rays of a pixel where neighbours differ; 1 is fastest.
-        lens: metres of the front lens before the camera's place, and of the back one behind it.
-        radius: metres around the camera in which things are seen.
+        town: static surroundings.
+        traffic: other vehicles; None: none.
+        height: rows of an image; it has twice as many columns.
+        seed: seed of the exposure changes.
+        samples: rays per pixel where neighbours differ; 1 is fastest.
+        lens: distance of the front lens, and of the back lens, from the camera's centre, metres.
+        radius: distance from the camera within which objects are rendered, metres.
     """
 
     def __init__(
@@ -74,43 +75,43 @@ class Panorama:
         seed: int = 0,
         samples: int = 3,
         lens: float = 0.0,
-        radius: float = RADIUS,
+        radius: float = MESH_RADIUS_M,
     ) -> None:
         self.samples, self.lens, self.radius = samples, lens, radius
         self.town, self.traffic, self.height, self.width = town, traffic, height, 2 * height
         self._centre = np.full(2, np.inf)
         self._static: tuple[Any, ...] = ()
         self._caster: Any = None
-        self._pictures = signs.pictures()
+        self._sign_images = signs.images()
         self._sky = _sky(town)
         self.mask, self._own = own_car(height), _roof(height)
-        self._seen = int(np.flatnonzero(self.mask.any(axis=1))[-1]) + 1  # rows that see anything
+        self._visible_rows = int(np.flatnonzero(self.mask.any(axis=1))[-1]) + 1  # rows not covered by the own car
         rng = np.random.default_rng([seed, 41])
         self._waves = rng.uniform(0.015, 0.22, 9), rng.uniform(0, 2 * np.pi, 9)
 
     def gain(self, time: float) -> float:
-        """What the exposure multiplies the light by: smooth, between the bounds of `GAIN`."""
+        """Exposure at a time, a factor on the light: smooth, between the bounds of `GAIN_RANGE`."""
         frequency, phase = self._waves
         x = np.sin(2 * np.pi * frequency * time + phase).sum() / np.sqrt(len(phase) / 2)
-        low, high = GAIN
+        low, high = GAIN_RANGE
         return float(low * (high / low) ** (0.5 + 0.5 * np.tanh(0.9 * x)))
 
-    def render(self, poses: F64, time: float = 0.0) -> Picture:
-        """The picture at a time.
+    def render(self, poses: F64, time: float = 0.0) -> PanoramaImage:
+        """Render an image.
 
         Args:
-            poses: (4, 4), or (H, 4, 4) one a row (rolling shutter), camera to world.
-            time: seconds, for traffic (which stands still while the rows are read) and light.
+            poses: (4, 4) camera to world, or (H, 4, 4) one per row (rolling shutter).
+            time: seconds, for traffic (which doesn't move during the readout) and exposure.
         """
-        h, w, seen = self.height, self.width, self._seen
-        rows = np.broadcast_to(poses, (h, 4, 4))[:seen]
-        self._gather(rows[len(rows) // 2, :2, 3])
+        h, w, visible = self.height, self.width, self._visible_rows
+        rows = np.broadcast_to(poses, (h, 4, 4))[:visible]
+        self._update_meshes(rows[len(rows) // 2, :2, 3])
         trace = self._tracer(rows, time)
-        rgb, distance, moved = trace(np.arange(seen * w), 0.0, 0.0)
+        rgb, distance, moved = trace(np.arange(visible * w), 0.0, 0.0)
         if self.samples > 1:
-            at = np.flatnonzero(tracing.rough(rgb.reshape(seen, w, 3), ROUGH))
+            at = np.flatnonzero(tracing.high_contrast(rgb.reshape(visible, w, 3), SUPERSAMPLING_CONTRAST))
             total = rgb[at].astype(np.uint16)
-            for right, down in spread(self.samples - 1):
+            for right, down in subpixel_offsets(self.samples - 1):
                 total += trace(at, right, down)[0]
             rgb[at] = (total + self.samples // 2) // self.samples
         image, depth, moving = (
@@ -118,17 +119,18 @@ class Panorama:
             np.full((h, w), np.nan, np.float32),
             np.zeros((h, w), bool),
         )
-        image[:seen], depth[:seen], moving[:seen] = (a.reshape(seen, w, *a.shape[1:]) for a in (rgb, distance, moved))
-        image = _through_lens(image)
+        parts = (a.reshape(visible, w, *a.shape[1:]) for a in (rgb, distance, moved))
+        image[:visible], depth[:visible], moving[:visible] = parts
+        image = _lens_blur(image)
         if self.town.low_sun:
-            image = self._dazzled(image, rows[len(rows) // 2], time)
+            image = self._with_glare(image, rows[len(rows) // 2], time)
         low = slice(int(np.flatnonzero((self.mask == 0).any(axis=1))[0]), None)
         own = self.mask[low] == 0
         image[low][own], depth[low][own], moving[low][own] = self._own[low][own], np.nan, False
-        return Picture(image, depth, moving, self.gain(time))
+        return PanoramaImage(image, depth, moving, self.gain(time))
 
     def _tracer(self, rows: F64, time: float) -> Callable[[Index, float, float], tuple[U8, F32, Index]]:
-        """What gives rgb (N, 3), distance (N,) and whether a vehicle is there (N,), for pixels and a place in them."""
+        """Function that renders pixels (N,) at a subpixel offset: rgb (N, 3), distance (N,), vehicle or not (N,)."""
         origins = (rows[:, :3, 3] - [*self._centre, 0]).astype(np.float32)
         turns = np.ascontiguousarray(rows[:, :3, :3], np.float32)
         moving, boxes = self.traffic.near(time, self._centre) if self.traffic else (None, np.zeros((0, 6), np.float32))
@@ -136,11 +138,11 @@ class Panorama:
         caster = None if moving is None else _scene(moving)
         other = self._static if moving is None else _arrays(moving)
         g = self.town.ground
-        hills = seen_from(g.hills, self._centre)
+        hills = relative_waves(g.hills, self._centre)
         up = heights(boxes[:, :2], hills)
-        there = _around(boxes, up, rows, self._centre, self.width, self.height)
+        near_vehicle = _pixels_of_vehicles(boxes, up, rows, self._centre, self.width, self.height)
         lines = g.line[:, :2] - self._centre
-        ground = (g.distance, g.nearest, g.line, g.origin - self._centre, CELL, KERB, lines, hills)
+        ground = (g.distance, g.nearest, g.line, g.origin - self._centre, CELL_M, KERB_HEIGHT_M, lines, hills)
         sun, gain = self.town.sun.astype(np.float32), self.gain(time)
 
         def trace(index: Index, right: float, down: float) -> tuple[U8, F32, Index]:
@@ -148,82 +150,83 @@ class Panorama:
             distance, face, uv = _cast(self._caster, rays)
             moved = np.zeros(len(rays), bool)
             if caster is not None:
-                at = np.flatnonzero(there[index])
+                at = np.flatnonzero(near_vehicle[index])
                 near, near_face, near_uv = _cast(caster, rays[at])
                 closer = near < distance[at]
                 at = at[closer]
                 distance[at], face[at], uv[at], moved[at] = near[closer], near_face[closer], near_uv[closer], True
             kind, normal, shadow = tracing.hit_ground(rays, distance, face, uv, moved, self._static, other, ground, sun)
             dark = self._caster.test_occlusions(_tensor(shadow)).numpy()
-            rgb = shader.paint(
+            rgb = shader.shade(
                 rays, distance, face, uv, moved, kind, normal, dark, self._static, other, ground, boxes, sun, self._sky,
-                self._centre, self._pictures, np.pi / self.height, gain, TABLE, self.town.seed % 1000,
+                self._centre, self._sign_images, np.pi / self.height, gain, SRGB_TABLE, self.town.seed % 1000,
             )  # fmt: skip
             return rgb, distance, moved
 
         return trace
 
-    def _dazzled(self, image: U8, pose: F64, time: float) -> U8:
-        """What a lens makes of a sun that shines into it: a glow and a veil, as much of them as houses let through."""
-        around = np.random.default_rng(0).normal(0, np.radians(0.6), (32, 3))
+    def _with_glare(self, image: U8, pose: F64, time: float) -> U8:
+        """Image with the glare of the sun in the lens, in proportion to the visible share of the sun."""
+        jitter = np.random.default_rng(0).normal(0, np.radians(0.6), (32, 3))
         ray = np.concatenate(
-            [np.broadcast_to(pose[:3, 3] - [*self._centre, 0], around.shape), self.town.sun + around], 1
+            [np.broadcast_to(pose[:3, 3] - [*self._centre, 0], jitter.shape), self.town.sun + jitter], 1
         )
-        free = 1 - self._caster.test_occlusions(_tensor(ray.astype(np.float32))).numpy().mean()
+        visible = 1 - self._caster.test_occlusions(_tensor(ray.astype(np.float32))).numpy().mean()
         to = self.town.sun @ pose[:3, :3]
         lon = ((np.arange(self.width) + 0.5) / self.width - 0.5) * 2 * np.pi
         lat = ((np.arange(self.height) + 0.5) / self.height - 0.5) * np.pi
         level = to[0] * np.sin(lon) + to[2] * np.cos(lon)
         cosine = np.cos(lat)[:, None] * level + (np.sin(lat) * to[1])[:, None]
-        away = np.degrees(np.arccos(np.clip(cosine, -1, 1))).astype(np.float32)
-        glow = sum(strength * np.exp(-away / width) for strength, width in GLARE)
-        return shown(light_of(image) + (free * self.gain(time) * glow)[..., None] * np.array(shader.SUN, np.float32))
+        angle = np.degrees(np.arccos(np.clip(cosine, -1, 1))).astype(np.float32)
+        glow = sum(strength * np.exp(-angle / width) for strength, width in GLARE)
+        glare = (visible * self.gain(time) * glow)[..., None] * np.array(shader.SUN_RGB, np.float32)
+        return to_srgb(linear_light(image) + glare)
 
-    def _gather(self, centre: F64) -> None:
-        """Make the triangles around a place, unless those there are will do."""
-        if np.linalg.norm(centre - self._centre) < STEP * self.radius:
+    def _update_meshes(self, centre: F64) -> None:
+        """Rebuild the meshes around a position if the camera has moved far enough."""
+        if np.linalg.norm(centre - self._centre) < REBUILD_SHARE * self.radius:
             return
         self._centre = np.round(centre)
         part = self.town.near(self._centre, self.radius)
         self._static, self._caster = _arrays(part), _scene(part)
 
 
-def light_of(image: U8) -> F32:
-    """Linear light of sRGB."""
+def linear_light(image: U8) -> F32:
+    """Linear light of an 8-bit sRGB image."""
     x = np.arange(256, dtype=np.float32) / 255
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)[image]
 
 
-def shown(light: F32) -> U8:
-    """SRGB of linear light, clipped."""
+def to_srgb(light: F32) -> U8:
+    """8-bit sRGB of linear light, clipped."""
     roots = np.sqrt(np.clip(light, 0, 1))
-    return TABLE[(roots * (len(TABLE) - 1)).astype(np.int32)]
+    return SRGB_TABLE[(roots * (len(SRGB_TABLE) - 1)).astype(np.int32)]
 
 
-def spread(count: int) -> list[tuple[float, float]]:
-    """Places in a pixel around its centre."""
+def subpixel_offsets(count: int) -> list[tuple[float, float]]:
+    """Offsets (right, down) of additional rays around a pixel's centre, in pixels."""
     angle = 0.4 + 2 * np.pi * np.arange(count) / max(count, 1)
     return [(0.37 * float(np.cos(a)), 0.37 * float(np.sin(a))) for a in angle]
 
 
-def _through_lens(image: U8) -> U8:
-    """A little blurred, as by a lens; the left edge meets the right one."""
+def _lens_blur(image: U8) -> U8:
+    """Image blurred slightly as by a lens, wrapping around at the left and right edge."""
     import cv2
 
-    wide = cv2.GaussianBlur(np.concatenate([image[:, -4:], image, image[:, :4]], axis=1), (5, 5), LENS)
+    wide = cv2.GaussianBlur(np.concatenate([image[:, -4:], image, image[:, :4]], axis=1), (5, 5), LENS_BLUR_PX)
     return np.ascontiguousarray(wide[:, 4:-4])
 
 
 def own_car(height: int) -> U8:
-    """(H, 2H) the mask: 0 where the camera sees its own car, 255 elsewhere."""
+    """(H, 2H) ego-vehicle mask: 0 where the camera sees its own car, 255 elsewhere."""
     lon = ((np.arange(2 * height) + 0.5) / height - 1) * np.pi
     lat = 90 - (np.arange(height) + 0.5) / height * 180
-    edge = ROOF - 5 * np.sin(lon) ** 4 + 2 * np.cos(lon)  # the roof is longer than wide
+    edge = OWN_CAR_ELEVATION_DEG - 5 * np.sin(lon) ** 4 + 2 * np.cos(lon)  # the roof is longer than it is wide
     return np.where(lat[:, None] < edge, 0, 255).astype(np.uint8)
 
 
 def _roof(height: int) -> U8:
-    """(H, 2H, 3) the car's roof: grey, a little lighter ahead, with two rails."""
+    """(H, 2H, 3) image of the own car's roof: grey, slightly lighter ahead, with two rails."""
     lon = ((np.arange(2 * height) + 0.5) / height - 1) * np.pi
     lat = ((np.arange(height) + 0.5) / height - 0.5) * np.pi
     r = 1 / np.tan(np.maximum(lat, 0.1))[:, None]
@@ -233,7 +236,7 @@ def _roof(height: int) -> U8:
 
 
 def _sky(town: Town, height: int = 1024) -> F32:
-    """(height / 2, 2 height, 3) linear light of the upper half of the world, row 0 the zenith, column 0 along -x."""
+    """Sky image (height / 2, 2 height, 3), linear light of the upper hemisphere: row 0 is the zenith, column 0 -x."""
     lon = ((np.arange(2 * height) + 0.5) / height - 1) * np.pi
     lat = np.pi / 2 * (1 - (np.arange(height // 2) + 0.5) / (height // 2))
     c = np.cos(lat)[:, None]
@@ -245,29 +248,37 @@ def _sky(town: Town, height: int = 1024) -> F32:
     return light.reshape(height // 2, 2 * height, 3)
 
 
-def _around(boxes: F32, up: F64, rows: F64, centre: F64, width: int, height: int) -> Index:
-    """(R * W,) bool: pixels in whose direction there may be one of the vehicles."""
-    seen = np.zeros((len(rows), width), bool)  # of the rows that see anything
+def _pixels_of_vehicles(boxes: F32, up: F64, rows: F64, centre: F64, width: int, height: int) -> Index:
+    """(R * W,) bool: pixels that may show one of the vehicles.
+
+    Args:
+        boxes: (K, 6) vehicles, as of `Traffic.near`.
+        up: (K,) height of the ground below them.
+        rows: (R, 4, 4) camera pose of each row.
+        centre: (2,) origin of the boxes' coordinates.
+        width, height: size of the image.
+    """
+    covered = np.zeros((len(rows), width), bool)
     pose = rows[len(rows) // 2]
     for (x, y, _, _, long, wide), z in zip(boxes.tolist(), up.tolist(), strict=True):
-        reach = np.hypot(long, wide) + 0.3
+        radius = np.hypot(long, wide) + 0.3
         to = (np.array([*(np.array([x, y]) + centre), 1.5 + z]) - pose[:3, 3]) @ pose[:3, :3]
-        far = np.hypot(to[0], to[2])
-        if far < reach + 0.5:
-            seen[:] = True
+        distance = np.hypot(to[0], to[2])
+        if distance < radius + 0.5:
+            covered[:] = True
             continue
-        lon, half = np.arctan2(to[0], to[2]), np.arcsin(min(reach / far, 1.0)) + 0.02
-        top, low = (np.arctan2(z, far - reach) + 0.06 for z in (to[1] - 3.2, to[1] + 2.0))
+        lon, half = np.arctan2(to[0], to[2]), np.arcsin(min(radius / distance, 1.0)) + 0.02
+        top, low = (np.arctan2(z, distance - radius) + 0.06 for z in (to[1] - 3.2, to[1] + 2.0))
         columns = np.arange(
             int((lon - half + np.pi) / (2 * np.pi) * width), int((lon + half + np.pi) / (2 * np.pi) * width) + 2
         )
         row = [int((a / np.pi + 0.5) * height) for a in (top - 0.12, low)]
-        seen[max(row[0], 0) : row[1] + 2, columns % width] = True
-    return seen.ravel()
+        covered[max(row[0], 0) : row[1] + 2, columns % width] = True
+    return covered.ravel()
 
 
 def _arrays(part: Part) -> tuple[Any, ...]:
-    """What the shader needs of a part."""
+    """Arrays of a mesh in the order in which the shader expects them."""
     return (part.faces, part.normals, part.uv, part.sky[:, None], part.material, part.colour, part.seed, part.size)
 
 

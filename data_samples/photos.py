@@ -1,4 +1,4 @@
-"""Cameras of the recording vehicle, and what they see: ray-cast photos with exact poses."""
+"""Cameras of the recording vehicle, and their ray-cast photos with exact poses."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from scan2sim.data_samples.scanner import Drive
 from scan2sim.data_samples.scene import Scene, srgb
 from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Camera
 
-CAMERAS = ("front", "pano", "left", "right")
-STATION = 5.0  # metres of road between stations, at most (where there are photos enough)
-EDGE = 0.1  # difference of neighbouring pixels (sRGB, 0 to 1) above which more rays are cast
-MORE = ((-0.3, -0.1), (0.1, -0.3), (0.3, 0.1), (-0.1, 0.3))  # rays of such a pixel, around its centre
+CAMERA_ORDER = ("front", "pano", "left", "right")
+STATION_SPACING_M = 5.0  # greatest distance between stations (if there are enough photos)
+SUPERSAMPLING_CONTRAST = 0.1  # difference of neighbouring pixels (sRGB, 0 to 1) above which more rays are cast
+SUBPIXEL_OFFSETS = ((-0.3, -0.1), (0.1, -0.3), (0.3, 0.1), (-0.1, 0.3))  # their positions around a pixel's centre
 
 
 @dataclass(frozen=True)
 class Effects:
-    """What a camera adds to the light.
+    """Effects of a camera.
 
     Attributes:
-        exposure_ev: exposures are drawn from [-exposure_ev, exposure_ev].
-        noise: standard deviation of the sensor's noise, of full scale (sRGB).
-        vignetting: light lost in the corners, share.
-        quality: of the JPEG.
+        exposure_ev: exposures are random in [-exposure_ev, exposure_ev], EV.
+        noise: standard deviation of the sensor noise, as a share of full scale (sRGB).
+        vignetting: share of light lost in the corners.
+        quality: JPEG quality.
     """
 
     exposure_ev: float = 0.3
@@ -38,7 +38,7 @@ class Effects:
 
 @dataclass(frozen=True)
 class Shot:
-    """A photo to be taken: camera's name, pose (camera to local), GPS time, exposure in EV."""
+    """A planned photo: its name, the camera's name, pose (camera to local), GPS time, exposure in EV."""
 
     name: str
     camera: str
@@ -49,7 +49,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Rendering:
-    """What a camera sees: linear light (H, W, 3) float32, LAS codes (H, W), 0 for the sky, distance (H, W) metres."""
+    """Rendered image: linear light (H, W, 3) float32, LAS codes (H, W), 0 for the sky, distance (H, W) metres."""
 
     light: F32
     classification: U8
@@ -82,15 +82,15 @@ MOUNTS = {
 
 
 def plan_shots(layout: Layout, drive: Drive, photos: int, exposure_ev: float) -> list[Shot]:
-    """When and where `photos` photos are taken on the first pass: stations at most 5 m apart, cameras in turn."""
+    """Plan `photos` photos on the first pass, at stations at most 5 m apart, with the cameras in turn."""
     rng = np.random.default_rng([layout.seed, 3])
     length = layout.axis.length
-    each = max(1, photos // int(np.ceil(length / STATION)))
+    each = max(1, photos // int(np.ceil(length / STATION_SPACING_M)))
     stations = int(np.ceil(photos / each)) if photos else 0
     shots = []
     for i in range(photos):
         s = (i // each + 0.5) * length / stations
-        camera = CAMERAS[i % 4]
+        camera = CAMERA_ORDER[i % 4]
         time = drive.time_at(s)
         pose = _pose(layout, drive, float(time), camera, rng)
         shots.append(
@@ -100,7 +100,7 @@ def plan_shots(layout: Layout, drive: Drive, photos: int, exposure_ev: float) ->
 
 
 def _pose(layout: Layout, drive: Drive, time: float, camera: str, rng: np.random.Generator) -> F64:
-    """Camera to local coordinates; the vehicle sways a little."""
+    """(4, 4) pose, camera to local coordinates, with small random rotations of the vehicle."""
     (ahead, left, up), yaw, pitch = MOUNTS[camera]
     ground, heading = drive.ground(np.array([time]))
     roll, sway, nod = rng.normal(0, np.radians(0.5), 3)
@@ -118,7 +118,7 @@ def _pose(layout: Layout, drive: Drive, time: float, camera: str, rng: np.random
 
 
 def directions(camera: Camera, pixels: npt.ArrayLike) -> F64:
-    """Unit rays (..., 3) in camera axes through pixels (..., 2)."""
+    """(..., 3) unit directions of rays through pixels (..., 2), in camera axes."""
     p = np.asarray(pixels, np.float64)
     if camera.model == "equirectangular":
         lon = ((p[..., 0] + 0.5) / camera.width - 0.5) * 2 * np.pi
@@ -132,7 +132,7 @@ def directions(camera: Camera, pixels: npt.ArrayLike) -> F64:
 
 
 def _undistorted(distorted: F64, coefficients: tuple[float, ...]) -> F64:
-    """Invert Brown-Conrady's k1 k2 p1 p2 on the plane z = 1, by fixed-point iteration to 1e-9."""
+    """Undistorted points (..., 2) on the plane z = 1: inverts Brown-Conrady k1 k2 p1 p2 by fixed-point iteration."""
     k1, k2, p1, p2 = coefficients
     xy = distorted.copy()
     for _ in range(60):
@@ -149,10 +149,14 @@ def _undistorted(distorted: F64, coefficients: tuple[float, ...]) -> F64:
 
 
 def render(scene: Scene, drive: Drive, camera: Camera, T_world_cam: F64, time: float | None) -> Rendering:
-    """Cast a ray through every pixel, and four more where neighbours differ.
+    """Render a photo: a ray through every pixel, and four more where neighbours differ.
 
     Args:
-        time: GPS time, for the moving car's place; None leaves it out.
+        scene: the street.
+        drive: the vehicle's drive, which determines the moving car's pose.
+        camera: the camera.
+        T_world_cam: (4, 4) camera to local coordinates.
+        time: GPS time; None: without the moving car.
     """
     h, w = camera.height, camera.width
     v, u = np.mgrid[:h, :w]
@@ -160,11 +164,15 @@ def render(scene: Scene, drive: Drive, camera: Camera, T_world_cam: F64, time: f
     light = np.empty((h * w, 3), np.float32)
     classification, distance = np.empty(h * w, np.uint8), np.empty(h * w, np.float32)
     for part in _blocks(h * w):
-        light[part], classification[part], distance[part] = _see(scene, drive, camera, T_world_cam, time, pixels[part])
+        light[part], classification[part], distance[part] = _cast_pixels(
+            scene, drive, camera, T_world_cam, time, pixels[part]
+        )
     rough = np.flatnonzero(_edges(light.reshape(h, w, 3)))
     for part in _blocks(len(rough)):
         at = rough[part]
-        light[at] = np.mean([_see(scene, drive, camera, T_world_cam, time, pixels[at] + d)[0] for d in MORE], axis=0)
+        light[at] = np.mean(
+            [_cast_pixels(scene, drive, camera, T_world_cam, time, pixels[at] + d)[0] for d in SUBPIXEL_OFFSETS], axis=0
+        )
     return Rendering(light.reshape(h, w, 3), classification.reshape(h, w), distance.reshape(h, w))
 
 
@@ -173,11 +181,11 @@ def _blocks(n: int, size: int = 1 << 20) -> Iterator[slice]:
 
 
 def _edges(light: F32) -> Bools:
-    """(H * W,) pixels that differ much from a neighbour."""
-    shown = np.clip(light, 0, 1) ** np.float32(1 / 2.2)
+    """(H * W,) whether a pixel differs by more than the contrast threshold from a neighbour."""
+    gamma = np.clip(light, 0, 1) ** np.float32(1 / 2.2)
     edge = np.zeros(light.shape[:2], bool)
-    across = np.abs(np.diff(shown, axis=1)).max(axis=2) > EDGE
-    down = np.abs(np.diff(shown, axis=0)).max(axis=2) > EDGE
+    across = np.abs(np.diff(gamma, axis=1)).max(axis=2) > SUPERSAMPLING_CONTRAST
+    down = np.abs(np.diff(gamma, axis=0)).max(axis=2) > SUPERSAMPLING_CONTRAST
     edge[:, 1:] |= across
     edge[:, :-1] |= across
     edge[1:] |= down
@@ -185,7 +193,7 @@ def _edges(light: F32) -> Bools:
     return edge.ravel()
 
 
-def _see(
+def _cast_pixels(
     scene: Scene, drive: Drive, camera: Camera, T_world_cam: F64, time: float | None, pixels: F64
 ) -> tuple[F32, U8, F32]:
     """Linear light (N, 3), classification (N,) and distance (N,) through pixels (N, 2)."""
@@ -207,7 +215,7 @@ def _see(
 
 
 def develop(rendering: Rendering, ev: float, effects: Effects, rng: np.random.Generator) -> U8:
-    """The photo (H, W, 3) 8-bit sRGB: exposure multiplies the light, then the sensor's noise is added."""
+    """Photo (H, W, 3) in 8-bit sRGB: applies exposure and vignetting, then sensor noise."""
     light = rendering.light * np.float32(2.0**ev)
     if effects.vignetting:
         h, w = light.shape[:2]

@@ -1,4 +1,4 @@
-"""Meshes of plants: few triangles; their leaves are in the shader."""
+"""Meshes of plants with few triangles; their leaves are drawn by the shader."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scan2sim.data_samples.layout import Tree
 from scan2sim.data_samples.paints import RGB, Material, Paint, linear
 from scan2sim.data_samples.shapes import Part, blob, box, join, tube
 
-SHAPES = 40  # different clumps of leaves
+CLUMP_SHAPES = 40  # number of different clumps of leaves
 
 
 @lru_cache
@@ -26,8 +26,8 @@ def _unit_clump(shape: int, rounds: int) -> Part:
 def clump(
     centre: npt.ArrayLike, radius: float, paint: Paint, rng: np.random.Generator, rounds: int, flat: float = 1.0
 ) -> Part:
-    """A bumpy ball of leaves, `flat` times as high as wide."""
-    unit = _unit_clump(int(rng.integers(SHAPES)), rounds)
+    """A bumpy ball of leaves; `flat`: ratio of height to width."""
+    unit = _unit_clump(int(rng.integers(CLUMP_SHAPES)), rounds)
     return replace(
         unit,
         vertices=(unit.vertices * (radius, radius, radius * flat) + np.asarray(centre)).astype(np.float32),
@@ -38,7 +38,7 @@ def clump(
 
 
 def leafy_tree(plan: Tree, rounds: int = 2) -> Part:
-    """A tree: a trunk and a crown of clumps, of 20 * 4 ** `rounds` triangles each."""
+    """A tree: a trunk, and a crown of clumps with 20 * 4 ** `rounds` triangles each."""
     rng = np.random.default_rng(plan.seed)
     bark = Paint(Material.BARK, linear("#6f5d4b"), paints.TREE, plan.seed)
     leaf = Paint(Material.FOLIAGE, plan.colour, paints.TREE, plan.seed)
@@ -56,7 +56,7 @@ def leafy_tree(plan: Tree, rounds: int = 2) -> Part:
 
 
 def shrub(radius: float, colour: RGB, seed: int, rounds: int = 2) -> Part:
-    """A bush of two clumps, the larger of 20 * 4 ** `rounds` triangles."""
+    """A bush of two clumps, the larger with 20 * 4 ** `rounds` triangles."""
     rng = np.random.default_rng(seed)
     leaf = Paint(Material.FOLIAGE, colour, paints.BUSH, seed)
     beside = (0.8 * radius, 0.3 * radius, 0.4 * radius)

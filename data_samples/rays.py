@@ -1,4 +1,4 @@
-"""Rays of a panorama, compiled: through which pixels, and where they hit the ground."""
+"""Rays of a panorama, compiled: their directions, and their intersections with the ground."""
 
 from __future__ import annotations
 
@@ -9,26 +9,28 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from scan2sim.data_samples.ground import HALF
-from scan2sim.data_samples.hills import reach, rise
+from scan2sim.data_samples.ground import HALF_ROAD_M
+from scan2sim.data_samples.hills import ground_height, ground_intersection
 
 Array = npt.NDArray[Any]
 
-SKY, THING, ROAD, WALL, PAVEMENT = range(5)  # what a ray meets; WALL: the face of a kerb
-BLOCK, MIX = 1021, 1_000_003  # pixels of a task, and a prime by which tasks are mixed: sky is quicker than road
+SKY, OBJECT, ROAD, WALL, PAVEMENT = range(5)  # kinds of hits; WALL: the face of a kerb
+TASK_PIXELS = 1021  # pixels per task
+TASK_STRIDE = 1_000_003  # prime that shuffles the tasks, to balance the load: sky is faster than road
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
 def rays(
     rotations: Array, origins: Array, width: int, height: int, index: Array, right: float, down: float, lens: float
 ) -> Array:
-    """(N, 6) origins and unit directions through pixels of an equirectangular picture.
+    """(N, 6) origins and unit directions of rays through pixels of an equirectangular image.
 
     Args:
-        rotations, origins: (R, 3, 3) and (R, 3) of each row.
+        rotations, origins: (R, 3, 3) and (R, 3) camera pose of each row.
+        width, height: size of the image.
         index: (N,) pixels, row by row.
-        right, down: where in them, pixels from their centres.
-        lens: metres of the front lens before the origin, and of the back one behind it.
+        right, down: offset from the pixels' centres, in pixels.
+        lens: distance of the front lens before the origin, and of the back lens behind it, metres.
     """
     out = np.empty((len(index), 6), np.float32)
     lon = ((np.arange(width) + 0.5 + right) / width - 0.5) * 2 * math.pi
@@ -46,14 +48,14 @@ def rays(
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
-def rough(image: Array, limit: int) -> Array:
+def high_contrast(image: Array, limit: int) -> Array:
     """(H, W) bool: pixels of (H, W, 3) uint8 that differ from a neighbour by more than `limit` in some channel."""
     h, w = image.shape[0], image.shape[1]
     out = np.zeros((h, w), np.bool_)
     for r in prange(h):
         for c in range(w):
             for k in range(3):
-                v = np.int64(image[r, c, k])  # Numba keeps int() of an unsigned number unsigned
+                v = np.int64(image[r, c, k])  # in Numba, int() of an unsigned number stays unsigned
                 most = max(abs(v - image[r, c - 1, k]), abs(v - image[r, (c + 1) % w, k]))
                 most = max(most, abs(v - image[max(r - 1, 0), c, k]), abs(v - image[min(r + 1, h - 1), c, k]))
                 if most > limit:
@@ -77,15 +79,15 @@ def from_road(x: float, y: float, ground: Any) -> float:
 
 @njit(cache=True, error_model="numpy", inline="always")
 def task(turn: int, n: int) -> tuple[int, int]:
-    """First and last + 1 pixel of a task; neighbouring turns are far apart, so that threads have equal shares."""
-    tasks = n // BLOCK + 1
-    first = (turn * MIX) % tasks * BLOCK
-    return first, min(first + BLOCK, n)
+    """First pixel, and last pixel + 1, of a task; consecutive tasks are far apart, to balance the load of threads."""
+    tasks = n // TASK_PIXELS + 1
+    first = (turn * TASK_STRIDE) % tasks * TASK_PIXELS
+    return first, min(first + TASK_PIXELS, n)
 
 
 @njit(cache=True, error_model="numpy")
-def mixed(values: Array, part: Any, face: int, uv: Array) -> tuple[float, float, float]:
-    """The first three columns (or the first, thrice) of values at a face's corners, by barycentric uv."""
+def interpolated(values: Array, part: Any, face: int, uv: Array) -> tuple[float, float, float]:
+    """Barycentric interpolation of the first three columns of vertex values (of one column: three times)."""
     p, q, r = part[0][face, 0], part[0][face, 1], part[0][face, 2]
     b, c = uv[0], uv[1]
     a = 1 - b - c
@@ -101,19 +103,19 @@ def mixed(values: Array, part: Any, face: int, uv: Array) -> tuple[float, float,
 def _ground(
     ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, t: float, ground: Any
 ) -> tuple[int, float, float, float, float]:
-    """What of the ground a ray meets before `t` (SKY: nothing), how far away, and the normal."""
-    high, nears = reach(ox, oy, oz - ground[5], dx, dy, dz, t, ground[7])
+    """First hit of a ray on the ground before distance `t`: kind (SKY: none), distance, normal."""
+    high, nears = ground_intersection(ox, oy, oz - ground[5], dx, dy, dz, t, ground[7])
     if high >= t:
         return SKY, t, 0.0, 0.0, 1.0
     low = high + ground[5] / nears
-    _, to_x, to_y = rise(ox + high * dx, oy + high * dy, ground[7])
+    _, to_x, to_y = ground_height(ox + high * dx, oy + high * dy, ground[7])
     up = 1 / math.sqrt(1 + to_x * to_x + to_y * to_y)
     d = from_road(ox + high * dx, oy + high * dy, ground)
-    if d >= HALF:
+    if d >= HALF_ROAD_M:
         return PAVEMENT, high, -to_x * up, -to_y * up, up
     e = from_road(ox + low * dx, oy + low * dy, ground)
-    if e >= HALF:
-        at = high + (low - high) * (HALF - d) / (e - d)
+    if e >= HALF_ROAD_M:
+        at = high + (low - high) * (HALF_ROAD_M - d) / (e - d)
         if at < t:
             flat = math.sqrt(dx * dx + dy * dy) + 1e-9
             return WALL, at, -dx / flat, -dy / flat, 0.0
@@ -126,22 +128,22 @@ def _ground(
 def hit_ground(
     ray: Array, distance: Array, face: Array, uv: Array, moved: Array, static: Any, other: Any, ground: Any, sun: Array
 ) -> tuple[Array, Array, Array]:
-    """Let rays that miss all things, or hit them underground, hit the ground; `distance` (N,) is updated.
+    """Intersect rays with the ground where they hit no object before it; updates `distance` (N,) in place.
 
     Returns:
-        What each meets (N,) uint8, the normal there (N, 3), and the ray (N, 6) from there to the sun (one that
-        meets nothing, where the sun doesn't matter).
+        (N,) uint8 kind of hit, (N, 3) normal, and (N, 6) shadow ray from there to the sun; where no shadow test is
+        needed, the shadow ray starts far above everything.
     """
     n = len(ray)
     kind, normal, shadow = np.empty(n, np.uint8), np.empty((n, 3), np.float32), np.empty((n, 6), np.float32)
-    for turn in prange(n // BLOCK + 1):
+    for turn in prange(n // TASK_PIXELS + 1):
         first, last = task(turn, n)
         for i in range(first, last):
             ox, oy, oz, dx, dy, dz = ray[i, 0], ray[i, 1], ray[i, 2], ray[i, 3], ray[i, 4], ray[i, 5]
             what, t, nx, ny, nz = _ground(ox, oy, oz, dx, dy, dz, distance[i], ground)
             if what == SKY and t < 1e9:
-                what, part = THING, other if moved[i] else static
-                nx, ny, nz = mixed(part[1], part, face[i], uv[i])
+                what, part = OBJECT, other if moved[i] else static
+                nx, ny, nz = interpolated(part[1], part, face[i], uv[i])
                 length = max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-6)
                 nx, ny, nz = nx / length, ny / length, nz / length
             distance[i], kind[i] = t, what

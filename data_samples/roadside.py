@@ -1,4 +1,4 @@
-"""Meshes of further furniture of roads: poles, bollards, boards of direction, traffic lights, lorries."""
+"""Meshes of road furniture and lorries: poles, bollards, direction signs, traffic lights."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from scan2sim.data_samples.shapes import Part, box, join, part, quads, tube
 
 
 def mast(height: float, radius: float, colour: RGB, seed: int) -> Part:
-    """A pole of steel or wood, upright or nearly, at times with an arm."""
+    """A pole of steel or wood, almost upright, sometimes with an arm."""
     rng = np.random.default_rng([seed, 91])
     skin = Paint(Material.WOOD if rng.random() < 0.4 else Material.PLAIN, colour, paints.POLE, seed)
     lean = rng.normal(0, 0.01, 2) * height
     parts = [tube([(0, 0, -0.4), (0, 0, 0), (*lean, height)], [radius, radius, 0.6 * radius], skin, sides=10)]
     if rng.random() < 0.4:
-        reach = rng.uniform(0.6, 2.5)
+        arm = rng.uniform(0.6, 2.5)
         x, y = lean
-        parts.append(tube([(x, y, height - 0.1), (x, y + reach, height + 0.1)], [0.04, 0.04], skin, sides=7))
-        parts.append(box((x - 0.1, reach - 0.5, height), (x + 0.1, reach, height + 0.12), skin, bottom=True))
+        parts.append(tube([(x, y, height - 0.1), (x, y + arm, height + 0.1)], [0.04, 0.04], skin, sides=7))
+        parts.append(box((x - 0.1, arm - 0.5, height), (x + 0.1, arm, height + 0.12), skin, bottom=True))
     return join(parts)
 
 
 def bollard(height: float, radius: float, colours: tuple[RGB, RGB]) -> Part:
-    """A short post with a ring of another colour."""
+    """A short post with a coloured ring."""
     post, ring = (Paint(Material.PLAIN, colour, paints.POLE) for colour in colours)
     return join([
         tube([(0, 0, -0.2), (0, 0, height)], [radius, radius], post, sides=10),
@@ -33,7 +33,7 @@ def bollard(height: float, radius: float, colours: tuple[RGB, RGB]) -> Part:
 
 
 def board(width: float, height: float, low: float, seed: int) -> Part:
-    """A large sign on two posts, looking towards -y: one colour with a rim, or a picture."""
+    """A large sign on two posts, facing -y: a coloured plate with an image."""
     rng = np.random.default_rng([seed, 92])
     steel = Paint(Material.PLAIN, (0.3, 0.3, 0.3), paints.POLE, seed)
     ground = ((0.02, 0.09, 0.4), (0.8, 0.8, 0.8), (0.75, 0.55, 0.02), (0.01, 0.2, 0.08), (0.6, 0.02, 0.02))
@@ -41,16 +41,16 @@ def board(width: float, height: float, low: float, seed: int) -> Part:
     x = width / 2
     parts = [box((-x, -0.03, low), (x, 0.0, low + height), plate, bottom=True)]
     parts += [tube([(p, 0.04, -0.3), (p, 0.04, low + height)], [0.04, 0.04], steel) for p in (-0.7 * x, 0.7 * x)]
-    picture = Paint(Material.SIGN, (1, 1, 1), paints.SIGN, int(rng.integers(len(signs.NAMES))))
+    image = Paint(Material.SIGN, (1, 1, 1), paints.SIGN, int(rng.integers(len(signs.NAMES))))
     a, b = -0.9 * x, rng.uniform(-0.2, 0.9) * x
     c, d = low + 0.1 * height, low + 0.9 * height
     corners = [[(a, -0.04, c), (b, -0.04, c), (b, -0.04, d), (a, -0.04, d)]]
-    parts.append(quads(corners, [[(0, 0), (1, 0), (1, 1), (0, 1)]], picture))
+    parts.append(quads(corners, [[(0, 0), (1, 0), (1, 1), (0, 1)]], image))
     return join(parts)
 
 
 def traffic_light(seed: int) -> Part:
-    """Three lamps in a dark box on a pole, looking towards -y; the box is a sign."""
+    """A traffic light: three lamps in a dark box on a pole, facing -y; the box has the class of a sign."""
     rng = np.random.default_rng([seed, 93])
     grey = Paint(Material.PLAIN, (0.2, 0.2, 0.2), paints.POLE)
     dark = Paint(Material.PLAIN, (0.015, 0.02, 0.015), paints.SIGN)
@@ -67,7 +67,7 @@ def traffic_light(seed: int) -> Part:
 
 
 def lorry(length: float, height: float, colours: tuple[RGB, RGB], seed: int) -> Part:
-    """A cab and a box on wheels, x forwards."""
+    """A lorry: a cab and a box body on wheels, x forwards."""
     rng = np.random.default_rng([seed, 94])
     cab, load = (Paint(Material.PLAIN, colour, paints.VEHICLE, seed + i) for i, colour in enumerate(colours))
     if rng.random() < 0.5:

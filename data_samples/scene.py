@@ -1,4 +1,4 @@
-"""The street as triangles under a sun: what a ray hits, and how it is lit."""
+"""Street as a triangle mesh under sun and sky: ray casting and shading."""
 
 from __future__ import annotations
 
@@ -14,64 +14,63 @@ from scan2sim.data_samples.paints import Material, Paint, linear
 from scan2sim.data_samples.shapes import Part, join, sheet
 from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools, Mesh
 
-CAR_SPEED = 8.0
+CAR_SPEED_M_S = 8.0  # of the moving car
 SUN_COLOUR = np.array([1.06, 1.0, 0.88], np.float32)
 SKY_COLOUR = np.array([0.90, 1.0, 1.16], np.float32)
-GROUND_STEP = 0.33  # metres between vertices of the ground
-CLEAR = 0.2  # metres above a surface from where its openness to the sky is traced: beyond sills and surrounds
-FINE = np.float32(0.01)  # metres that a true colour stands for
+GROUND_SPACING_M = 0.33  # between vertices of the ground
+OPENNESS_OFFSET_M = 0.2  # offset from a surface at which its sky openness is traced, to clear sills and surrounds
+TRUTH_FOOTPRINT_M = np.float32(0.01)  # width over which textures of the ground truth are filtered
 
 
 def build(layout: Layout) -> tuple[Part, Part, Part]:
-    """Meshes of what stays in a world, of the parked cars (local coordinates), and of the moving car (its own)."""
-    still = [*_ground(layout)]
+    """Meshes of the static world and of the parked cars (local coordinates), and of the moving car (its own)."""
+    static = [*_ground(layout)]
     for h in layout.houses:
         xy, heading = layout.axis.place(h.s + h.width / 2, h.side * h.front)
-        still.append(_upright(layout, objects.house(h), -h.width / 2, h.side, xy, heading))
+        static.append(_facing_road(layout, objects.house(h), -h.width / 2, h.side, xy, heading))
     for t in layout.trees:
         xy, heading = layout.axis.place(t.s, t.t)
         mesh = objects.bush(t) if t.bush else objects.tree(t)
-        still.append(mesh.moved(float(heading), (*xy, float(layout.height(t.s, t.t)))))
+        static.append(mesh.moved(float(heading), (*xy, float(layout.height(t.s, t.t)))))
     for b in layout.boundaries:
-        pieces = max(1, round((b.s1 - b.s0) / 6))  # straight pieces follow the road's bend
+        pieces = max(1, round((b.s1 - b.s0) / 6))  # short straight pieces follow the curve of the road
         for s0 in np.linspace(b.s0, b.s1, pieces + 1)[:-1]:
             length = (b.s1 - b.s0) / pieces
             xy, heading = layout.axis.place(s0 + length / 2, b.t)
             piece = objects.boundary(replace(b, seed=b.seed + int(s0 * 10)), length)
-            still.append(_upright(layout, piece, -length / 2, 1 if b.t > 0 else -1, xy, heading))
+            static.append(_facing_road(layout, piece, -length / 2, 1 if b.t > 0 else -1, xy, heading))
     for p in layout.posts:
         xy, heading = layout.axis.place(p.s, p.t)
-        if p.sign is None:  # the lamp's arm reaches over the road
+        if p.sign is None:  # the lamp's arm extends over the road
             mesh, turn = objects.lamp(), float(heading) + (np.pi if p.t > 0 else 0.0)
-        else:  # a sign faces those who drive towards it
+        else:  # a sign faces approaching traffic
             mesh, turn = objects.sign(p.sign), float(heading) + (-np.pi / 2 if p.towards == 1 else np.pi / 2)
-        still.append(mesh.moved(turn, (*xy, float(layout.height(p.s, p.t)))))
+        static.append(mesh.moved(turn, (*xy, float(layout.height(p.s, p.t)))))
     parked = []
     for c in layout.parked:
         xy, heading = layout.axis.place(c.s, c.t)
         turn = float(heading) + (0.0 if c.towards == 1 else np.pi)
         parked.append(objects.car(c.colour).moved(turn, (*xy, float(layout.height(c.s, c.t)) + 0.01)))
-    for other in layout.more:
-        xy, heading = layout.axis.place(other.s, other.t)
-        mesh = other.make().moved(float(heading) + other.turn, (*xy, float(layout.height(other.s, other.t))))
-        (parked if other.loose else still).append(mesh)
+    for extra in layout.extras:
+        xy, heading = layout.axis.place(extra.s, extra.t)
+        mesh = extra.make().moved(float(heading) + extra.turn, (*xy, float(layout.height(extra.s, extra.t))))
+        (parked if extra.movable else static).append(mesh)
     moving = objects.car(layout.moving)
-    empty = _slice(moving, np.zeros(len(moving.faces), bool))
-    fixed = join(still)
-    grid = np.round(fixed.vertices * 2048) / np.float32(
-        2048
-    )  # half a millimetre: exact in float32, and compresses well
+    empty = _face_subset(moving, np.zeros(len(moving.faces), bool))
+    fixed = join(static)
+    # multiples of half a millimetre are exact in float32, and compress well
+    grid = np.round(fixed.vertices * 2048) / np.float32(2048)
     return replace(fixed, vertices=grid.astype(np.float32)), join(parked) if parked else empty, moving
 
 
-def _upright(layout: Layout, mesh: Part, x: float, side: int, xy: F64, heading: F64) -> Part:
-    """Stand a mesh whose front looks towards -y at `xy` beside the road, its front to the road."""
+def _facing_road(layout: Layout, mesh: Part, x: float, side: int, xy: F64, heading: F64) -> Part:
+    """Place a mesh whose front faces -y at `xy` beside the road, its front towards the road."""
     turn = float(heading) + (0.0 if side == 1 else np.pi)
     s, t = layout.axis.locate(xy)
     return mesh.moved(0.0, (x, 0, 0)).moved(turn, (*xy, float(layout.height(s, t))))
 
 
-def _slice(mesh: Part, keep: Bools) -> Part:
+def _face_subset(mesh: Part, keep: Bools) -> Part:
     per_face = {
         name: getattr(mesh, name)[keep] for name in ("faces", "material", "classification", "colour", "seed", "size")
     }
@@ -79,8 +78,8 @@ def _slice(mesh: Part, keep: Bools) -> Part:
 
 
 def _ground(layout: Layout) -> list[Part]:
-    """Carriageway, bays, kerbs, pavements and terrain, as strips along the axis; none inside houses."""
-    rows, step = max(2, round(layout.axis.length / GROUND_STEP) + 1), layout.step
+    """Carriageway, bays, kerbs, pavements and terrain, as strips along the axis; no terrain inside houses."""
+    rows, kerb_height = max(2, round(layout.axis.length / GROUND_SPACING_M) + 1), layout.kerb_height
     s = np.linspace(0, layout.axis.length, rows)
     grass = Paint(Material.GRASS, linear("#5d7434"), paints.TERRAIN, layout.seed % 1000)
     slabs = Paint(Material.SLABS, linear("#b5b0a6"), paints.SIDEWALK, layout.seed % 1000)
@@ -89,7 +88,7 @@ def _ground(layout: Layout) -> list[Part]:
     asphalt = Paint(Material.ASPHALT, layout.asphalt, paints.ROAD, 100 + layout.seed % 1000)
 
     def strip(t0: float, t1: float, paint: Paint, *, below: bool = False) -> Part:
-        count = max(2, round((t1 - t0) / GROUND_STEP) + 1)
+        count = max(2, round((t1 - t0) / GROUND_SPACING_M) + 1)
         return surface(np.linspace(t0, t1, count), paint, below)
 
     def surface(t: F64, paint: Paint, below: bool) -> Part:
@@ -113,13 +112,14 @@ def _ground(layout: Layout) -> list[Part]:
         foot = np.column_stack([xy, layout.height(s, side * k, below_kerb=True)])
         top = np.column_stack([xy, layout.height(s, side * k)])
         face = np.stack([foot, top] if side == 1 else [top, foot])
-        uv = np.stack([np.column_stack([s, v + 0 * s]) for v in ((0, step) if side == 1 else (step, 0))])
+        v_range = (0, kerb_height) if side == 1 else (kerb_height, 0)
+        uv = np.stack([np.column_stack([s, v + 0 * s]) for v in v_range])
         parts.append(sheet(face[::-1], uv[::-1], stone))
-    return [_slice(p, ~_inside_houses(layout, p)) if p.classification[0] == paints.TERRAIN else p for p in parts]
+    return [_face_subset(p, ~_inside_houses(layout, p)) if p.classification[0] == paints.TERRAIN else p for p in parts]
 
 
 def _inside_houses(layout: Layout, mesh: Part) -> Bools:
-    """(F,) whether a face lies well inside a house."""
+    """(F,) whether a face lies inside a house, with a margin of 0.4 m."""
     middle = mesh.vertices[mesh.faces].mean(axis=1)[:, :2]
     inside = np.zeros(len(middle), bool)
     for h in layout.houses:
@@ -133,13 +133,13 @@ def _inside_houses(layout: Layout, mesh: Part) -> Bools:
 
 @dataclass(frozen=True)
 class Hits:
-    """What rays hit.
+    """First hits of rays.
 
     Attributes:
-        distance: (N,) float32 metres, infinite where nothing was hit.
-        face: (N,) int32 into `Scene.surface`, -1 where nothing was hit.
-        bary: (N, 2) float32 weights of the face's second and third corner.
-        heading: (N,) float32, how far the moving car that was hit is turned; 0 for what stands still.
+        distance: (N,) float32 metres, infinite if nothing was hit.
+        face: (N,) int32 index into `Scene.surface`, -1 if nothing was hit.
+        bary: (N, 2) float32 barycentric weights of the face's second and third corner.
+        heading: (N,) float32 heading of the moving car if it was hit, radians; 0 for static surfaces.
     """
 
     distance: F32
@@ -149,59 +149,65 @@ class Hits:
 
     @property
     def hit(self) -> Bools:
-        """(N,) whether anything was hit."""
+        """(N,) whether a surface was hit."""
         return self.face >= 0
 
 
 class Scene:
-    """A street that rays can be cast into; local float32 coordinates of `layout.FRAME`.
+    """A street for ray casting, in local float32 coordinates of `layout.FRAME`.
 
     Attributes:
-        surface: everything: the static street, then parked cars, then the moving car in its own coordinates.
-        static: number of faces that stay in a world.
+        layout: the street.
+        surface: static street, then parked cars, then the moving car in its own coordinates.
+        static: number of faces of the static street.
     """
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
-        still, parked, moving = build(layout)
-        self.static = len(still.faces)
+        static, parked, moving = build(layout)
+        self.static = len(static.faces)
         self._moving_at = self.static + len(parked.faces)
-        both = join([still, parked])
+        both = join([static, parked])
         self._street = caster(both)
         self._car = caster(moving)
-        self._pictures = signs.pictures()
+        self._sign_images = signs.images()
         car_sky = np.clip(0.55 + 0.4 * moving.normals[:, 2], 0, 1).astype(np.float32)
         self.surface = join([replace(both, sky=self._openness(both)), replace(moving, sky=car_sky)])
 
     def truth_mesh(self) -> Mesh:
-        """The static street, labelled; vehicles are left out."""
+        """Labelled mesh of the static street, without vehicles."""
         part = self.surface
         mesh = Mesh(FRAME, part.vertices, part.faces, classification=part.classification)
         return mesh.keep(np.arange(len(part.faces)) < self.static)
 
     def car_at(self, time: npt.ArrayLike, centre: Any = 0.0, way: Any = 1.0) -> tuple[F64, F64, Bools]:
-        """Where the moving car is `time` seconds after it passes the street's middle.
+        """Pose of the moving car `time` seconds after it passes the middle of the street.
+
+        Args:
+            time: (...) seconds.
+            centre: offset of the chainage, metres.
+            way: direction of travel along the axis, 1 or -1.
 
         Returns:
-            Position (..., 3), heading (...), and whether it is within the street (never, if the style has none).
+            Position (..., 3), heading (...), and whether it is within the street (never if the style has none).
         """
-        s = self.layout.axis.length / 2 + np.asarray(time, np.float64) * CAR_SPEED * way + centre
+        s = self.layout.axis.length / 2 + np.asarray(time, np.float64) * CAR_SPEED_M_S * way + centre
         t = -np.asarray(way) * self.layout.lane / 2
         xy, heading = self.layout.axis.place(s, t)
         z = self.layout.height(s, t) + 0.01
-        margin = objects.CAR_LENGTH / 2 + 0.1
+        margin = objects.CAR_LENGTH_M / 2 + 0.1
         inside = self.layout.moving_car & (s > margin) & (s < self.layout.axis.length - margin)
         return np.concatenate([xy, z[..., None]], axis=-1), heading + np.where(np.asarray(way) > 0, 0.0, np.pi), inside
 
     def cast(self, origins: F32, directions: F32, car: CarPoses | None = None) -> Hits:
-        """First hits of rays (N, 3), (N, 3) unit; `car`: where the moving car is for each ray."""
+        """First hits of rays with origins (N, 3) and unit directions (N, 3); `car`: pose of the moving car per ray."""
         rays = np.concatenate([origins, directions], axis=1)
-        answer = struck(self._street, rays)
+        answer = cast_rays(self._street, rays)
         heading = np.zeros(len(rays), np.float32)
         if car is not None:
             index, own = self._to_car(rays, car)
             if len(index):
-                near = struck(self._car, own)
+                near = cast_rays(self._car, own)
                 closer = near.distance < answer.distance[index]
                 at = index[closer]
                 answer.distance[at] = near.distance[closer]
@@ -211,7 +217,7 @@ class Scene:
         return replace(answer, heading=heading)
 
     def _to_car(self, rays: F32, car: CarPoses) -> tuple[npt.NDArray[np.intp], F32]:
-        """Rays that may hit the moving car: their indices, and the rays in the car's coordinates."""
+        """Rays that may hit the moving car: their indices, and the rays (M, 6) in the car's coordinates."""
         if not car.present.any():
             return np.zeros(0, np.intp), np.zeros((0, 6), np.float32)
         middle = car.position + np.array([0, 0, 0.7], np.float32)
@@ -234,11 +240,13 @@ class Scene:
     def colour(
         self, origins: F32, directions: F32, hits: Hits, footprint: npt.ArrayLike, car: CarPoses | None = None
     ) -> F32:
-        """Linear light (N, 3) from where rays hit; zero where they hit nothing.
+        """(N, 3) linear light along rays from their hits; zero without a hit.
 
         Args:
-            footprint: (N,) or scalar, metres that a ray stands for at its hit.
-            car: the moving car, for its shadow; None leaves the shadow out.
+            origins, directions: (N, 3) rays.
+            hits: their hits.
+            footprint: (N,) or scalar width of the pixel at the hit, metres.
+            car: the moving car, for its shadow; None: without its shadow.
         """
         light = np.zeros((len(directions), 3), np.float32)
         at = np.flatnonzero(hits.hit)
@@ -248,13 +256,13 @@ class Scene:
         return light
 
     def lit(self, xyz: F32, face: Any, bary: F32, heading: F32, footprint: F32, car: CarPoses | None = None) -> F32:
-        """Linear light (N, 3) that leaves the surface points `xyz` (the surfaces are matt: in all directions)."""
+        """(N, 3) linear light reflected by surface points `xyz`, the same in all directions (Lambertian)."""
         from scan2sim.data_samples import materials
 
         p = self.surface
         albedo, normal, sky = materials.surface(
             face, bary, footprint, p.faces, p.normals, p.uv, p.sky, p.material, p.colour, p.seed, p.size,
-            self.layout.road, self._pictures,
+            self.layout.road, self._sign_images,
         )  # fmt: skip
         turned = np.flatnonzero(heading)
         if len(turned):
@@ -274,10 +282,10 @@ class Scene:
             index, own = self._to_car(rays, car.take(lit))
             shaded[index] |= occluded(self._car, own)
         facing[lit[shaded]] = 0
-        return illuminated(albedo, normal, sky, facing, self.layout.sun_strength, self.layout.sky_strength)
+        return reflected_light(albedo, normal, sky, facing, self.layout.sun_strength, self.layout.sky_strength)
 
     def _openness(self, part: Part) -> F32:
-        """(V,) share of the hemisphere above each vertex that is open for 5 metres, cosine-weighted."""
+        """(V,) sky openness: cosine-weighted share of the hemisphere above each vertex that is free for 5 m."""
         rng = np.random.default_rng([self.layout.seed, 2])
         sky = part.sky.copy()
         todo = np.flatnonzero(np.isnan(sky))
@@ -287,7 +295,7 @@ class Scene:
             normal = part.normals[block]
             d = normal[:, None] * 1.02 + directions[None]
             d /= np.linalg.norm(d, axis=2, keepdims=True)
-            o = np.broadcast_to((part.vertices[block] + CLEAR * normal)[:, None], d.shape)
+            o = np.broadcast_to((part.vertices[block] + OPENNESS_OFFSET_M * normal)[:, None], d.shape)
             rays = np.concatenate([o, d], axis=2).reshape(-1, 6).astype(np.float32)
             sky[block] = 1 - occluded(self._street, rays, 5.0).reshape(-1, len(directions)).mean(axis=1)
         return np.clip(0.12 + 0.88 * sky, 0, 1).astype(np.float32)
@@ -295,24 +303,24 @@ class Scene:
 
 @dataclass(frozen=True)
 class CarPoses:
-    """Where the moving car is for each of N rays: position (N, 3) float32, heading (N,), present (N,)."""
+    """Pose of the moving car for each of N rays: position (N, 3) float32, heading (N,), presence (N,)."""
 
     position: F32
     heading: F32
     present: Bools
 
     def repeated(self, times: int) -> CarPoses:
-        """Each pose for that many rays in a row."""
+        """Each pose repeated `times` times."""
         index = np.repeat(np.arange(len(self.heading)), times)
         return self.take(index)
 
     def take(self, index: npt.NDArray[Any]) -> CarPoses:
-        """Those of some of the rays."""
+        """Poses of selected rays."""
         return CarPoses(self.position[index], self.heading[index], self.present[index])
 
 
 def caster(part: Part) -> Any:
-    """What rays can be cast at, of a mesh."""
+    """Open3D ray casting scene of a mesh."""
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
@@ -326,7 +334,7 @@ def _tensor(array: npt.NDArray[Any]) -> Any:
     return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array))
 
 
-def struck(caster: Any, rays: F32) -> Hits:
+def cast_rays(caster: Any, rays: F32) -> Hits:
     """First hits of rays (N, 6), origins and unit directions."""
     answer = caster.cast_rays(_tensor(rays))
     distance = answer["t_hit"].numpy().copy()
@@ -335,19 +343,20 @@ def struck(caster: Any, rays: F32) -> Hits:
 
 
 def occluded(caster: Any, rays: F32, far: float = float("inf")) -> Bools:
-    """(N,) whether rays (N, 6) meet anything within `far` metres."""
+    """(N,) whether rays (N, 6) hit anything within `far` metres."""
     if len(rays) == 0:
         return np.zeros(0, bool)
     return caster.test_occlusions(_tensor(rays), 0.0, far).numpy().copy()
 
 
-def illuminated(albedo: F32, normal: F32, sky: F32, facing: F32, sun_strength: float, sky_strength: float) -> F32:
-    """Linear light (N, 3) that leaves matt surfaces under sun and sky.
+def reflected_light(albedo: F32, normal: F32, sky: F32, facing: F32, sun_strength: float, sky_strength: float) -> F32:
+    """(N, 3) linear light reflected by Lambertian surfaces under sun and sky.
 
     Args:
         albedo, normal: (N, 3).
-        sky: (N,) openness to the sky.
-        facing: (N,) cosine of the angle between normal and sun, 0 in the shade.
+        sky: (N,) sky openness.
+        facing: (N,) cosine of the angle between normal and sun, 0 in shadow.
+        sun_strength, sky_strength: irradiance of sun and sky.
     """
     up = normal[:, 2]
     direct = facing[:, None] * (SUN_COLOUR * np.float32(sun_strength))
@@ -357,6 +366,6 @@ def illuminated(albedo: F32, normal: F32, sky: F32, facing: F32, sun_strength: f
 
 
 def srgb(light: npt.ArrayLike) -> U8:
-    """Linear light to 8-bit sRGB, clipped."""
+    """8-bit sRGB of linear light, clipped."""
     x = np.clip(np.asarray(light, np.float32), 0, 1)
     return (255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** np.float32(1 / 2.4) - 0.055) + 0.5).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Triangle meshes of simple things: quads, boxes, tubes, bumpy blobs, walls with openings, leaves."""
+"""Triangle meshes of simple shapes: quads, boxes, tubes, bumpy blobs, walls with openings, leaves."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ Field = Callable[[F64], F64]
 
 @dataclass(frozen=True)
 class Part:
-    """Triangles and what their surface is made of.
+    """Triangle mesh with materials.
 
     Attributes:
         vertices: (V, 3) float32 metres.
-        normals: (V, 3) float32 unit, for shading.
-        uv: (V, 2) float32, as the material wants it.
-        sky: (V,) float32, openness to the sky in [0, 1]; NaN where it is still to be traced.
+        normals: (V, 3) float32 unit shading normals.
+        uv: (V, 2) float32 texture coordinates, as defined by the material.
+        sky: (V,) float32 sky openness in [0, 1]; NaN where it must still be traced.
         faces: (F, 3) int32, counter-clockwise seen from outside.
         material, classification: (F,) uint8.
         colour: (F, 3) float32 linear RGB.
-        seed: (F,) int32.
-        size: (F, 2) float32, metres; extents of the uv of openings.
+        seed: (F,) int32 seed of the material's pattern.
+        size: (F, 2) float32 extent of the uv of openings, metres.
     """
 
     vertices: F32
@@ -43,7 +43,7 @@ class Part:
     size: F32
 
     def moved(self, heading: float | F64, position: npt.ArrayLike) -> Part:
-        """Turned by `heading` (radians, about z), then moved."""
+        """Mesh rotated by `heading` (radians, about z), then translated by `position`."""
         c, s = np.cos(heading), np.sin(heading)
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         return replace(
@@ -74,7 +74,7 @@ def part(
     sky: npt.ArrayLike | None = None,
     seeds: npt.ArrayLike | None = None,
 ) -> Part:
-    """A part of one paint; normals are those of the faces around a vertex unless given."""
+    """Mesh with a single paint; normals are averaged over the faces around a vertex unless given."""
     xyz, tri = np.asarray(vertices, np.float64), np.asarray(faces, np.int32).reshape(-1, 3)
     n = len(tri)
     return Part(
@@ -92,7 +92,7 @@ def part(
 
 
 def join(parts: Sequence[Part]) -> Part:
-    """One part of many."""
+    """Concatenation of several meshes."""
     starts = np.cumsum([0] + [len(p.vertices) for p in parts])
     columns = {
         name: np.concatenate([getattr(p, name) for p in parts])
@@ -110,14 +110,14 @@ def smooth_normals(vertices: F64, faces: I32) -> F64:
 
 
 def quads(corners: npt.ArrayLike, uv: npt.ArrayLike, paint: Paint, size: tuple[float, float] = (1.0, 1.0)) -> Part:
-    """Flat quads of their own: corners (Q, 4, 3) counter-clockwise, uv (Q, 4, 2)."""
+    """Separate flat quads: corners (Q, 4, 3) counter-clockwise, uv (Q, 4, 2)."""
     xyz = np.asarray(corners, np.float64).reshape(-1, 3)
     faces = (4 * np.arange(len(xyz) // 4)[:, None] + np.array([0, 1, 2, 0, 2, 3])).reshape(-1, 3)
     return part(xyz, faces, np.asarray(uv).reshape(-1, 2), paint, size=size)
 
 
 def box(low: npt.ArrayLike, high: npt.ArrayLike, paint: Paint, *, bottom: bool = False) -> Part:
-    """An axis-parallel box; uv in metres along each side. Without its bottom unless asked for."""
+    """An axis-parallel box, uv in metres along each side; without its lower face unless `bottom`."""
     (x0, y0, z0), (x1, y1, z1) = np.asarray(low, float), np.asarray(high, float)
     sides = [
         ([(x0, y0, z0), (x1, y0, z0), (x1, y0, z1), (x0, y0, z1)], (0, 2)),
@@ -134,7 +134,7 @@ def box(low: npt.ArrayLike, high: npt.ArrayLike, paint: Paint, *, bottom: bool =
 
 
 def tube(path: npt.ArrayLike, radii: npt.ArrayLike, paint: Paint, sides: int = 10) -> Part:
-    """A round tube along `path` (P, 3) with `radii` (P,), closed at its end."""
+    """A round tube along `path` (P, 3) with radii (P,), closed at its end."""
     path, radii = np.asarray(path, float), np.asarray(radii, float)
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -163,13 +163,13 @@ def _lattice(rows: int, columns: int) -> I32:
 
 
 def sheet(xyz: F64, uv: F64, paint: Paint) -> Part:
-    """A smooth sheet of a grid of vertices (rows, columns, 3)."""
+    """A smooth surface from a grid of vertices (rows, columns, 3)."""
     rows, columns = xyz.shape[:2]
     return part(xyz.reshape(-1, 3), _lattice(rows, columns), uv.reshape(-1, 2), paint)
 
 
 def waves(rng: np.random.Generator, wavelength: float, count: int = 14, dimensions: int = 3) -> Field:
-    """A smooth random field, about [-1, 1], no finer than 0.6 of `wavelength`: a sum of plane waves."""
+    """Smooth random field of about [-1, 1], a sum of plane waves no shorter than 0.6 of `wavelength`."""
     direction = rng.normal(size=(count, dimensions))
     direction *= (2 * np.pi / wavelength / rng.uniform(0.6, 1.8, count) / np.linalg.norm(direction, axis=1))[:, None]
     phase = rng.uniform(0, 2 * np.pi, count)
@@ -184,7 +184,7 @@ def blob(
     centre: npt.ArrayLike, radii: npt.ArrayLike, rng: np.random.Generator, paint: Paint, *, bump: float = 0.12,
     wavelength: float = 0.7, rounds: int = 3, shade: tuple[float, float] | None = None,
 ) -> Part:  # fmt: skip
-    """A bumpy ellipsoid; `shade`: openness to the sky at its foot and top, else to be traced."""
+    """A bumpy ellipsoid; `shade`: sky openness at its bottom and top; None: to be traced."""
     unit, faces = _sphere(rounds)
     radii = np.broadcast_to(np.asarray(radii, float), 3)
     xyz = unit * radii
@@ -195,7 +195,7 @@ def blob(
 
 
 def _sphere(rounds: int) -> tuple[F64, I32]:
-    """An icosahedron, subdivided `rounds` times, on the unit sphere."""
+    """Vertices and faces of an icosahedron on the unit sphere, subdivided `rounds` times."""
     g = (1 + 5**0.5) / 2
     xyz = np.array(
         [(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g), (0, -1, -g), (0, 1, -g),
@@ -218,7 +218,7 @@ def _sphere(rounds: int) -> tuple[F64, I32]:
 
 
 def leaves(points: F64, outward: F64, sky: F64, rng: np.random.Generator, paint: Paint, length: float = 0.16) -> Part:
-    """Lozenge leaves at `points` (N, 3), shaded as if they faced `outward`, which they do roughly."""
+    """Rhombic leaves at `points` (N, 3), facing approximately `outward` (N, 3), which also determines their shading."""
     n = len(points)
     if n == 0:
         return part(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2)), paint, normals=np.zeros((0, 3)))
@@ -245,10 +245,16 @@ def wall(
     width: float, height: float, openings: Sequence[Opening], paint: Paint, *, foot: float = 0.0, recess: float = 0.14,
     plinth: tuple[float, Paint] | None = None,
 ) -> Part:  # fmt: skip
-    """A wall in the plane y = 0 that looks towards -y, from z = -foot to `height`, with recessed openings.
+    """A wall in the plane y = 0, facing -y, with recessed openings.
 
     Args:
-        plinth: height below which the wall has another paint.
+        width: extent along x from 0, metres.
+        height: upper end; the wall starts at z = -foot.
+        openings: windows and doors.
+        paint: paint of the wall.
+        foot: depth below z = 0, metres.
+        recess: depth of the openings, metres.
+        plinth: height below which the wall has another paint, and this paint.
     """
     rows = {-foot, height, *(o.z0 for o in openings), *(o.z1 for o in openings)}
     if plinth:

@@ -1,4 +1,4 @@
-"""Pictures of signs and shop fronts, drawn once."""
+"""Images of traffic signs and shop boards."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ NAMES = (
     "flowers",
 )
 SHAPES = {"give_way": "triangle", "stop": "octagon", "speed_30": "round", "no_parking": "round", "priority": "diamond"}
-SHOPS = 7  # index of the first shop front
-N = 256
+FIRST_SHOP = 7  # index of the first shop front
+IMAGE_SIZE_PX = 256
 
 
-def pictures() -> F32:
-    """(K, 256, 256, 3) linear RGB, one picture a name of `NAMES`; shop fronts are stretched to their board."""
+def images() -> F32:
+    """(K, 256, 256, 3) linear RGB images in the order of `NAMES`; shop boards are stretched to the square."""
     drawn = np.stack([_draw(name) for name in NAMES]).astype(np.float32) / 255
     return (0.9 * np.where(drawn <= 0.04045, drawn / 12.92, ((drawn + 0.055) / 1.055) ** 2.4)).astype(np.float32)
 
@@ -34,13 +34,15 @@ def _draw(name: str) -> U8:
     import cv2
 
     white, red, blue, black, yellow = (245, 245, 245), (190, 25, 30), (25, 80, 165), (20, 20, 22), (245, 190, 20)
-    p = np.full((N, N, 3), white, np.uint8)
-    c = (N // 2, N // 2)
+    p = np.full((IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3), white, np.uint8)
+    c = (IMAGE_SIZE_PX // 2, IMAGE_SIZE_PX // 2)
 
     def text(words: str, scale: float, colour: tuple[int, int, int], thick: int, y: int = 0) -> None:
         font = cv2.FONT_HERSHEY_DUPLEX
         (w, h), _ = cv2.getTextSize(words, font, scale, thick)
-        cv2.putText(p, words, ((N - w) // 2, (N + h) // 2 + y), font, scale, colour, thick, cv2.LINE_AA)
+        cv2.putText(
+            p, words, ((IMAGE_SIZE_PX - w) // 2, (IMAGE_SIZE_PX + h) // 2 + y), font, scale, colour, thick, cv2.LINE_AA
+        )
 
     def shape(points: list[tuple[int, int]], colour: tuple[int, int, int]) -> None:
         cv2.fillPoly(p, [np.array(points, np.int32)], colour, cv2.LINE_AA)
@@ -87,9 +89,9 @@ def _draw(name: str) -> U8:
             "flowers": ((225, 222, 205), (60, 105, 50), "FLOWERS"),
         }[name]
         p[:] = ground
-        wide = np.full((64, 420, 3), ground, np.uint8)  # drawn in the board's own proportions
+        wide = np.full((64, 420, 3), ground, np.uint8)  # drawn in the proportions of the board
         (w, h), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_TRIPLEX, 1.6, 3)
         cv2.putText(wide, words, ((420 - w) // 2, (64 + h) // 2), cv2.FONT_HERSHEY_TRIPLEX, 1.6, ink, 3, cv2.LINE_AA)
         cv2.rectangle(wide, (3, 3), (416, 60), ink, 2)
-        p[:] = cv2.resize(wide, (N, N), interpolation=cv2.INTER_AREA)
+        p[:] = cv2.resize(wide, (IMAGE_SIZE_PX, IMAGE_SIZE_PX), interpolation=cv2.INTER_AREA)
     return p

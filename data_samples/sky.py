@@ -1,4 +1,4 @@
-"""What lies beyond the street: sky, hills at the horizon, and the land in between; compiled."""
+"""Background beyond the street: sky, hills at the horizon, and the plain in between; compiled."""
 
 from __future__ import annotations
 
@@ -17,12 +17,15 @@ def beyond(
     origins: npt.NDArray[Any], directions: npt.NDArray[Any], sun: npt.NDArray[Any], cloudiness: float,
     axis: npt.NDArray[Any], ends: npt.NDArray[Any], seed: int,
 ) -> npt.NDArray[Any]:  # fmt: skip
-    """Linear light (N, 3) float32 along rays that leave the street.
+    """(N, 3) float32 linear light of rays that leave the street.
 
     Args:
-        origins, directions: (N, 3) local metres, unit.
+        origins, directions: (N, 3) local metres, and unit vectors.
+        sun: (3,) unit vector towards the sun.
+        cloudiness: share of clouds.
         axis: the road's heading, curvature, and half width.
-        ends: (2,) height of the ground at the road's start and end; the road goes on from there, on a plain.
+        ends: (2,) height of the ground at the road's start and end, from where the road continues on a plain.
+        seed: seed of hills and clouds.
     """
     n = len(directions)
     light = np.empty((n, 3), np.float32)
@@ -41,7 +44,7 @@ def beyond(
         r = 0.16 + 0.44 * haze + glow
         g = 0.32 + 0.36 * haze + 0.95 * glow
         b = 0.66 + 0.16 * haze + 0.8 * glow
-        if z > 0.02:  # clouds on a plane far above
+        if z > 0.02:  # clouds, on a horizontal plane
             u, v = x / (z + 0.08), y / (z + 0.08)
             w = (
                 noise(u, v, 1.9, 0.0, seed + 4)

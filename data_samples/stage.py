@@ -1,7 +1,7 @@
-"""Pictures of a camera that stands still: what stands is rendered once, what moves is cast where it is.
+"""Fast renderer for a static camera: the static scene is rendered once, moving objects are cast into each frame.
 
-Light is as in `scene`, and simpler: openness to the sky is guessed, vehicles shade the ground and not each other. Paint
-and glass of vehicles mirror the sky a little.
+Shading is a simplification of `scene`: sky openness is guessed, and vehicles cast shadows on the ground but not on each
+other. Paint and glass of vehicles reflect the sky slightly.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from numba import njit
 from scan2sim.data_samples import materials, signs, sky
 from scan2sim.data_samples.paints import Material
 from scan2sim.data_samples.photos import directions
-from scan2sim.data_samples.scene import Hits, caster, illuminated, occluded, srgb, struck
+from scan2sim.data_samples.scene import Hits, cast_rays, caster, occluded, reflected_light, srgb
 from scan2sim.data_samples.shapes import Part
-from scan2sim.data_samples.town import lit
+from scan2sim.data_samples.town import with_sky_openness
 from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools, Camera
 
-LENS = 0.55
-"""Pixels, standard deviation of a lens's blur."""
+LENS_BLUR_PX = 0.55
+"""Standard deviation of the lens's blur."""
 NO_ROAD = np.array([3.2, -1e6, 0.0])
-NEAR = 0.3
-MIRRORS = {Material.CAR_BODY: 0.04, Material.CAR_END: 0.04, Material.CAR_GLASS: 0.10, Material.WINDOW: 0.08}
-"""Share of the light that comes from ahead which materials of vehicles mirror."""
+DEPTH_MIN_M = 0.3
+REFLECTANCE = {Material.CAR_BODY: 0.04, Material.CAR_END: 0.04, Material.CAR_GLASS: 0.10, Material.WINDOW: 0.08}
+"""Specular reflectance of materials of vehicles at normal incidence."""
 
 
 @dataclass(frozen=True)
 class Light:
-    """The light of an hour.
+    """Light of a time of day.
 
     Attributes:
-        sun: (3,) unit, towards it.
+        sun: (3,) unit vector towards the sun.
         sun_strength, sky_strength: as in `layout.Style`.
-        cloudiness: share of the sky.
-        exposure: mean of the pictures of what stands, of 1, that the camera aims at.
+        cloudiness: share of clouds in the sky.
+        exposure: target mean of the static image, in 0 to 1 (sRGB), of the camera's exposure control.
     """
 
     sun: F64
@@ -49,37 +49,38 @@ class Light:
 
 
 class Body:
-    """A thing's mesh that rays can be cast at, in its own coordinates; x forwards."""
+    """Mesh of an object for ray casting, in its own coordinates, x forwards."""
 
     def __init__(self, part: Part) -> None:
-        self.part = lit(part)
+        self.part = with_sky_openness(part)
         self.low, self.high = part.vertices.min(axis=0), part.vertices.max(axis=0)
         self.mirror = np.zeros(256, np.float32)
-        for material, share in MIRRORS.items():
+        for material, share in REFLECTANCE.items():
             self.mirror[material] = share
 
     @cached_property
     def caster(self) -> Any:
-        """Of the mesh."""
+        """Ray casting scene of the mesh."""
         return caster(self.part)
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A body at its place (3,), turned by `heading` about z."""
+    """A body at a position (3,), rotated by `heading` about z, radians."""
 
     body: Body
-    place: F64
+    position: F64
     heading: float
 
 
 @dataclass(frozen=True)
 class Actor:
-    """A thing that is to be found: a car of one piece, a train of several.
+    """A labelled object: a car of one piece, or a train of several.
 
     Attributes:
-        label: its class, of `fleet.CLASSES`.
-        track: the same in all frames.
+        label: its class, one of `fleet.CLASSES`.
+        track: track id, the same in all frames.
+        pieces: its bodies.
         speed: m/s.
     """
 
@@ -90,14 +91,15 @@ class Actor:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What a picture shows of an actor.
+class VisibleActor:
+    """Ground truth of an actor in a frame.
 
     Attributes:
-        box: x0, y0, x1, y1, pixels: all of it that lies within the picture, whether hidden or not; edges of pixels, so
-            that a whole picture is 0, 0, W, H.
-        visible: share of its pixels within the picture that nothing hides.
-        pixels: how many are seen.
+        actor: the actor.
+        box: x0, y0, x1, y1 in pixels, clipped to the frame, including occluded parts; edges of pixels, so that the
+            whole frame is 0, 0, W, H.
+        visible: share of its pixels within the frame that aren't occluded.
+        pixels: number of visible pixels.
     """
 
     actor: Actor
@@ -108,21 +110,22 @@ class Seen:
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture (H, W, 3), what it shows, and of which actor each pixel is, (H, W), -1: of none."""
+    """A rendered frame: image (H, W, 3), its actors, and the index of the actor at each pixel (H, W), -1: none."""
 
     rgb: U8
-    seen: list[Seen]
+    visible: list[VisibleActor]
     owner: I32
 
 
 @dataclass(frozen=True)
 class Backdrop:
-    """What stands, seen by a camera (wider than the pictures, so that they can shake).
+    """Static image of a camera, with a border around the frames for camera shake.
 
     Attributes:
-        sunny, shady: (H, W, 3) with the sun, and where something is before it.
+        camera, T_world_cam: intrinsics and pose.
+        sunny, shady: (H, W, 3) in sunlight, and in the shadow of an actor.
         distance: (H, W) metres along the ray, infinite for the sky.
-        gain: what the camera multiplies light by.
+        gain: exposure, factor on the light.
     """
 
     camera: Camera
@@ -134,34 +137,35 @@ class Backdrop:
 
 
 class Stage:
-    """What stands, and its light.
+    """Static scene and its light.
 
     Args:
-        part: all that stands.
-        seed: of the sky and the land beyond.
+        part: static mesh.
+        light: light.
+        seed: seed of the sky and the background.
     """
 
     def __init__(self, part: Part, light: Light, seed: int = 0) -> None:
-        self.part, self.light, self.seed = lit(part), light, seed
+        self.part, self.light, self.seed = with_sky_openness(part), light, seed
         self._caster = caster(part)
-        self._pictures = signs.pictures()
+        self._sign_images = signs.images()
 
-    def clear(self, camera: Camera, T_world_cam: F64, step: int = 16) -> F32:
-        """(h, w) distance that some pixels, `step` apart, see."""
+    def distances(self, camera: Camera, T_world_cam: F64, step: int = 16) -> F32:
+        """(h, w) distance to the static scene at every `step`-th pixel, metres."""
         return self._cast(*self._rays(camera, T_world_cam, step))[0].distance.reshape(camera.height // step, -1)
 
     def backdrop(self, camera: Camera, T_world_cam: F64, samples: int = 2) -> Backdrop:
-        """What stands as the camera sees it, by `samples` squared rays a pixel."""
-        places = (np.arange(samples) + 0.5) / samples - 0.5
+        """Render the static scene, with `samples` squared rays per pixel."""
+        offsets = (np.arange(samples) + 0.5) / samples - 0.5
         sunny, shady = np.zeros((2, camera.height * camera.width, 3), np.float32)
-        for right in places:
-            for down in places:
+        for right in offsets:
+            for down in offsets:
                 origins, rays = self._rays(camera, T_world_cam, 1, (right, down))
                 hits, light, shade = self._cast(origins, rays, 1 / camera.fx)
                 sunny += light
                 shady += shade
         shape = (camera.height, camera.width)
-        gain = _exposed(sunny / np.float32(samples**2), self.light.exposure)
+        gain = _exposure_gain(sunny / np.float32(samples**2), self.light.exposure)
         bright, dark = (srgb(x / samples**2 * gain).reshape(*shape, 3) for x in (sunny, shady))
         return Backdrop(camera, T_world_cam, bright, dark, hits.distance.reshape(shape), gain)
 
@@ -174,8 +178,8 @@ class Stage:
         return np.broadcast_to(T_world_cam[:3, 3].astype(np.float32), rays.shape), rays
 
     def _cast(self, origins: F32, rays: F32, angle: float = 0.002) -> tuple[Hits, F32, F32]:
-        """Hits of rays (N, 3), and the linear light from there (N, 3), with the sun and without."""
-        hits = struck(self._caster, np.concatenate([origins, rays], axis=1))
+        """Hits of rays with origins and directions (N, 3), and their linear light (N, 3) with and without sun."""
+        hits = cast_rays(self._caster, np.concatenate([origins, rays], axis=1))
         at, light = np.flatnonzero(hits.hit), self.light
         sun = light.sun.astype(np.float32)
         size = (angle * hits.distance[at]).astype(np.float32)
@@ -183,12 +187,12 @@ class Stage:
         facing = np.maximum(normal @ sun, 0)
         leaf = self.part.material[hits.face[at]] == Material.FOLIAGE
         facing = np.where(leaf, 0.3 + 0.7 * facing, facing).astype(np.float32)
-        place = origins[at] + rays[at] * hits.distance[at, None] + 0.02 * normal + 0.012 * sun
-        toward = np.concatenate([place, np.broadcast_to(sun, place.shape)], axis=1).astype(np.float32)
+        start = origins[at] + rays[at] * hits.distance[at, None] + 0.02 * normal + 0.012 * sun
+        toward = np.concatenate([start, np.broadcast_to(sun, start.shape)], axis=1).astype(np.float32)
         facing[occluded(self._caster, toward)] = 0
         both = np.zeros((2, len(rays), 3), np.float32)
         for which, direct in enumerate((facing, np.zeros_like(facing))):
-            both[which, at] = illuminated(albedo, normal, open_, direct, light.sun_strength, light.sky_strength)
+            both[which, at] = reflected_light(albedo, normal, open_, direct, light.sun_strength, light.sky_strength)
         out = np.flatnonzero(~hits.hit)
         axis, ends = np.array([0.0, 1e-4, 0.0]), np.zeros(2)
         beyond = sky.beyond(origins[out], rays[out], light.sun, light.cloudiness, axis, ends, self.seed)
@@ -198,19 +202,21 @@ class Stage:
     def _surface(self, part: Part, face: Any, bary: F32, size: F32) -> tuple[F32, F32, F32]:
         return materials.surface(
             face, bary, size, part.faces, part.normals, part.uv, part.sky, part.material, part.colour, part.seed,
-            part.size, NO_ROAD, self._pictures,
+            part.size, NO_ROAD, self._sign_images,
         )  # fmt: skip
 
     def frame(self, backdrop: Backdrop, actors: list[Actor], size: tuple[int, int], shake: F64 | None = None) -> Frame:
-        """The picture with actors in it.
+        """Render a frame with actors.
 
         Args:
-            size: width and height.
-            shake: (2, 3) from the picture's pixels to the backdrop's; None: from its middle.
+            backdrop: static image.
+            actors: moving objects.
+            size: width and height of the frame, pixels.
+            shake: (2, 3) affine transform from the frame's pixels to the backdrop's; None: centred.
         """
         import cv2
 
-        view = View(backdrop, size, middle(backdrop, size) if shake is None else shake)
+        view = View(backdrop, size, centred_shake(backdrop, size) if shake is None else shake)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         sunny, shady = (cv2.warpAffine(x, view.shake, size, flags=flags) for x in (backdrop.sunny, backdrop.shady))
         nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
@@ -221,24 +227,26 @@ class Stage:
             rgb[beside] = (rgb[beside] * dim[beside, None]).astype(np.uint8)
         owner = np.full(distance.shape, -1, np.int32)
         hidden = np.zeros((len(actors), *distance.shape), bool)
-        near = [(float(np.linalg.norm(p.place - view.origin)), i, p) for i, a in enumerate(actors) for p in a.pieces]
-        for _, i, piece in sorted(near, key=lambda x: x[:2]):  # near ones first: what they hide needs no colours
+        order = [
+            (float(np.linalg.norm(p.position - view.origin)), i, p) for i, a in enumerate(actors) for p in a.pieces
+        ]
+        for _, i, piece in sorted(order, key=lambda x: x[:2]):  # nearest first: occluded pixels need no shading
             self._add(view, piece, i, rgb, distance, owner, hidden[i])
-        seen = [_seen(actor, hidden[i], owner == i) for i, actor in enumerate(actors)]
-        return Frame(cv2.GaussianBlur(rgb, (5, 5), LENS), [s for s in seen if s is not None], owner)
+        truths = [_visible(actor, hidden[i], owner == i) for i, actor in enumerate(actors)]
+        return Frame(cv2.GaussianBlur(rgb, (5, 5), LENS_BLUR_PX), [s for s in truths if s is not None], owner)
 
     def _add(self, view: View, piece: Piece, index: int, rgb: U8, distance: F32, owner: I32, whole: Bools) -> None:
-        """Cast a piece, and draw it where it is the nearest."""
+        """Cast a piece, and draw it where it is the nearest surface; `whole`: its pixels, including occluded ones."""
         body = piece.body
         rect = view.around(corners(piece))
         if rect is None:
             return
         rays = view.rays(rect)
-        turn = turned(piece.heading)
+        turn = rotation_z(piece.heading)
         own = np.empty((len(rays), 6), np.float32)
-        own[:, :3] = (view.origin - piece.place) @ turn
+        own[:, :3] = (view.origin - piece.position) @ turn
         own[:, 3:] = rays @ turn.astype(np.float32)
-        hits = struck(body.caster, own)
+        hits = cast_rays(body.caster, own)
         shape = distance[rect].shape
         whole[rect] |= hits.hit.reshape(shape)
         closer = hits.distance.reshape(shape) < distance[rect]
@@ -250,45 +258,45 @@ class Stage:
         rgb[rect][closer] = self._lit(body, hits, at, rays[at], turn, view)
 
     def _lit(self, body: Body, hits: Hits, at: npt.NDArray[np.intp], rays: F32, turn: F64, view: View) -> U8:
-        """(N, 3) colours of what rays hit of a body."""
+        """(N, 3) sRGB colours of a body's surface at the hits `at` (N,)."""
         light, sun = self.light, self.light.sun.astype(np.float32)
         size = (view.angle * hits.distance[at]).astype(np.float32)
         albedo, normal, open_ = self._surface(body.part, hits.face[at], hits.bary[at], size)
         normal = normal @ turn.T.astype(np.float32)
         facing = np.maximum(normal @ sun, 0)
-        out = illuminated(albedo, normal, open_, facing, light.sun_strength, light.sky_strength)
+        out = reflected_light(albedo, normal, open_, facing, light.sun_strength, light.sky_strength)
         share = body.mirror[body.part.material[hits.face[at]]][:, None]
         cosine = np.abs(np.einsum("ij,ij->i", rays, normal))[:, None]
         share = np.where(share > 0, share + (1 - share) * (1 - cosine) ** 5, 0)
         up = (rays - 2 * np.einsum("ij,ij->i", rays, normal)[:, None] * normal)[:, 2:]
-        mirrored = light.sky_strength * np.where(up > 0, 1.9 - 0.9 * np.clip(up, 0, 1), 0.25)
+        reflected = light.sky_strength * np.where(up > 0, 1.9 - 0.9 * np.clip(up, 0, 1), 0.25)
         glint = np.maximum((rays - 2 * (rays * normal).sum(axis=1)[:, None] * normal) @ sun, 0)[:, None] ** 60
-        out = out + share * (mirrored + 4 * light.sun_strength * glint)
+        out = out + share * (reflected + 4 * light.sun_strength * glint)
         return srgb(out * view.gain)
 
     def _shade(self, view: View, actors: list[Actor], distance: F32) -> tuple[Bools, F32]:
-        """(H, W) what of the ground lies in actors' shade, and how much light is left beneath and beside them."""
+        """(H, W) whether a pixel is in the shadow of an actor, and (H, W) contact shadow: factor on the light."""
         dark, dim = np.zeros(distance.shape, bool), np.ones(distance.shape, np.float32)
         sun = self.light.sun
         for piece in (p for a in actors for p in a.pieces):
             box = corners(piece)
             ground = box.copy()
-            ground[:, 2] = piece.place[2]
-            wide = piece.place + (ground - piece.place) * 1.4
-            rect = view.around(np.concatenate([box, _thrown(box, sun, float(piece.place[2])), wide]))
+            ground[:, 2] = piece.position[2]
+            contact = piece.position + (ground - piece.position) * 1.4
+            rect = view.around(np.concatenate([box, _shadow_corners(box, sun, float(piece.position[2])), contact]))
             if rect is None:
                 continue
             low, high = piece.body.low.astype(np.float64), piece.body.high.astype(np.float64)
-            own = turned(piece.heading)
-            _cover(
-                view.rays(rect), distance[rect].ravel(), (view.origin - piece.place) @ own, own, sun @ own, low, high,
-                dark[rect], dim[rect],
+            own = rotation_z(piece.heading)
+            _cast_shadow(
+                view.rays(rect), distance[rect].ravel(), (view.origin - piece.position) @ own, own, sun @ own, low,
+                high, dark[rect], dim[rect],
             )  # fmt: skip
         return dark, dim
 
 
 class View:
-    """A picture's place within a backdrop."""
+    """Geometry of a frame within a backdrop."""
 
     def __init__(self, backdrop: Backdrop, size: tuple[int, int], shake: F64) -> None:
         self.shake, self.size = np.asarray(shake, np.float64), size
@@ -303,21 +311,21 @@ class View:
         self._rays = rays
 
     def rays(self, rect: tuple[slice, slice]) -> F32:
-        """(N, 3) unit rays through the pixels of a part."""
+        """(N, 3) unit directions of the rays through the pixels of a rectangle."""
         return np.ascontiguousarray(self._rays[rect]).reshape(-1, 3)
 
-    def project(self, places: F64) -> tuple[F64, F64]:
-        """Pixels (N, 2) of the picture, and depth (N,), of places (N, 3)."""
-        own = (places - self.origin) @ self._pose[:3, :3]
+    def project(self, points: F64) -> tuple[F64, F64]:
+        """Pixels (N, 2) of the frame, and depth (N,), of points (N, 3)."""
+        own = (points - self.origin) @ self._pose[:3, :3]
         depth = own[:, 2]
         flat = own[:, :2] / np.maximum(depth, 1e-6)[:, None]
         wide = flat * [self._camera.fx, self._camera.fy] + [self._camera.cx, self._camera.cy]
         return wide @ self._back[:2, :2].T + self._back[:2, 2], depth
 
-    def around(self, places: F64) -> tuple[slice, slice] | None:
-        """Rows and columns that a convex thing with these corners (N, 3) may cover; None: none."""
-        pixels, depth = self.project(places)
-        ahead = depth > NEAR
+    def around(self, points: F64) -> tuple[slice, slice] | None:
+        """Rows and columns of the frame that the convex hull of points (N, 3) may cover; None: none."""
+        pixels, depth = self.project(points)
+        ahead = depth > DEPTH_MIN_M
         if not ahead.any():
             return None
         width, height = self.size
@@ -331,78 +339,89 @@ class View:
 
 @lru_cache(4)
 def _pixels(size: tuple[int, int]) -> F32:
-    """(H, W, 3) x, y and 1 of each pixel."""
+    """(H, W, 3) homogeneous coordinates of each pixel: x, y, 1."""
     v, u = np.mgrid[: size[1], : size[0]].astype(np.float32)
     return np.stack([u, v, np.ones_like(u)], axis=-1)
 
 
-def middle(backdrop: Backdrop, size: tuple[int, int], turn: float = 0.0, aside: npt.ArrayLike = (0.0, 0.0)) -> F64:
-    """(2, 3) from a picture's pixels to the backdrop's: turned (radians) about the middle of both, moved (pixels)."""
+def centred_shake(
+    backdrop: Backdrop, size: tuple[int, int], turn: float = 0.0, aside: npt.ArrayLike = (0.0, 0.0)
+) -> F64:
+    """(2, 3) affine transform from a frame's pixels to the backdrop's.
+
+    Args:
+        backdrop: static image.
+        size: width and height of the frame.
+        turn: rotation about the common centre, radians.
+        aside: translation, pixels.
+    """
     c, s = np.cos(turn), np.sin(turn)
-    turning = np.array([[c, -s], [s, c]])
-    own = (np.array(size) - 1) / 2
-    wide = (np.array([backdrop.camera.width, backdrop.camera.height]) - 1) / 2 + np.asarray(aside)
-    return np.column_stack([turning, wide - turning @ own])
+    rotation = np.array([[c, -s], [s, c]])
+    frame_centre = (np.array(size) - 1) / 2
+    centre = (np.array([backdrop.camera.width, backdrop.camera.height]) - 1) / 2 + np.asarray(aside)
+    return np.column_stack([rotation, centre - rotation @ frame_centre])
 
 
-def wider(camera: Camera, margin: int) -> Camera:
-    """The camera with so many more pixels on each side."""
+def with_margin(camera: Camera, margin: int) -> Camera:
+    """Camera whose image has `margin` more pixels on each side."""
     return replace(
         camera, width=camera.width + 2 * margin, height=camera.height + 2 * margin,
         cx=camera.cx + margin, cy=camera.cy + margin,
     )  # fmt: skip
 
 
-def _exposed(light: F32, aim: float) -> float:
-    """The gain that linear light (N, 3) needs for a picture whose mean, of 1, is `aim`."""
-    some, low, high = light[:: max(1, len(light) // 20_000)], 0.05, 20.0
+def _exposure_gain(light: F32, aim: float) -> float:
+    """Gain for which the image of linear light (N, 3) has the mean `aim`, in 0 to 1 (sRGB)."""
+    sample, low, high = light[:: max(1, len(light) // 20_000)], 0.05, 20.0
     for _ in range(20):
         gain = float(np.sqrt(low * high))
-        low, high = (gain, high) if srgb(some * gain).mean() < 255 * aim else (low, gain)
+        low, high = (gain, high) if srgb(sample * gain).mean() < 255 * aim else (low, gain)
     return gain
 
 
 def corners(piece: Piece) -> F64:
-    """(8, 3) corners of the box around a piece."""
+    """(8, 3) corners of a piece's bounding box."""
     low, high = piece.body.low, piece.body.high
     own = np.array([(x, y, z) for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    return own @ turned(piece.heading).T + piece.place
+    return own @ rotation_z(piece.heading).T + piece.position
 
 
-def turned(heading: float) -> F64:
-    """(3, 3) from a body's own axes to the world's."""
+def rotation_z(heading: float) -> F64:
+    """(3, 3) rotation from a body's axes to the world's."""
     c, s = np.cos(heading), np.sin(heading)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _thrown(box: F64, sun: F64, ground: float) -> F64:
-    """(8, 3) where the shade of a box's corners falls, at most 40 metres away."""
-    far = np.minimum((box[:, 2] - ground) / max(sun[2], 0.02), 40.0)
-    return box - far[:, None] * sun
+def _shadow_corners(box: F64, sun: F64, ground: float) -> F64:
+    """(8, 3) projection of a box's corners along the sunlight to the ground, at most 40 metres away."""
+    distance = np.minimum((box[:, 2] - ground) / max(sun[2], 0.02), 40.0)
+    return box - distance[:, None] * sun
 
 
-def _seen(actor: Actor, whole: Bools, own: Bools) -> Seen | None:
-    """What is seen of an actor; None: none of it is within the picture."""
+def _visible(actor: Actor, whole: Bools, own: Bools) -> VisibleActor | None:
+    """Ground truth of an actor from masks of all, and of its visible pixels; None: it is outside of the frame."""
     rows, columns = np.flatnonzero(whole.any(axis=1)), np.flatnonzero(whole.any(axis=0))
     if not len(rows):
         return None
     box = (int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
     pixels = int(own.sum())
-    return Seen(actor, box, round(pixels / int(whole.sum()), 4), pixels)
+    return VisibleActor(actor, box, round(pixels / int(whole.sum()), 4), pixels)
 
 
 @njit(cache=True)
-def _cover(
+def _cast_shadow(
     rays: npt.NDArray[Any], distance: npt.NDArray[Any], origin: npt.NDArray[Any], turn: npt.NDArray[Any],
     sun: npt.NDArray[Any], low: npt.NDArray[Any], high: npt.NDArray[Any], dark: npt.NDArray[Any],
     dim: npt.NDArray[Any],
 ) -> None:  # fmt: skip
-    """Mark what a box keeps the sun from, and dim what is below and beside it; all but `rays` in the box's axes.
+    """Mark pixels in the shadow of a box, and darken those below and beside it (contact shadow).
 
     Args:
-        rays, distance: (N, 3), (N,) of pixels, in the world's axes.
-        turn: (3, 3) from the box's axes to the world's.
-        dark, dim: (h, w), changed.
+        rays, distance: (N, 3), (N,) of pixels, in world axes.
+        origin, sun: (3,) camera, and direction of the sun, in the box's axes.
+        turn: (3, 3) rotation from the box's axes to the world's.
+        low, high: (3,) corners of the box, in its axes.
+        dark, dim: (h, w), updated in place.
     """
     w = dark.shape[1]
     for i in range(len(rays)):

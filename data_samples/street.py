@@ -1,4 +1,4 @@
-"""Make a synthetic street: a tile as a mobile-mapping vehicle would record it, with its ground truth."""
+"""Generator of synthetic streets: a tile as recorded by a mobile mapping vehicle, with ground truth."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from scan2sim.data_samples.layout import FRAME, Layout, Style, lay_out
 from scan2sim.data_samples.photos import Effects, Shot, cameras, develop, plan_shots, render
 from scan2sim.data_samples.scanner import Drive, plan_drive, scan
-from scan2sim.data_samples.scene import FINE, Scene, srgb
+from scan2sim.data_samples.scene import TRUTH_FOOTPRINT_M, Scene, srgb
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F64, Mesh, PointCloud, Trajectory
 
-SHORTEST = 8.0
+LENGTH_MIN_M = 8.0
 
 
 def generate(
@@ -34,28 +34,29 @@ def generate(
     name: str = "street",
     report: Report = silent,
 ) -> Path:
-    """Write a tile folder and return the path of its `tile.toml`; the same arguments write the same bytes.
+    """Write a tile folder, and return the path of its `tile.toml`; the same arguments write the same bytes.
 
     Args:
-        out: the folder; made if need be, files of the same names are replaced.
-        length: metres of road.
-        points: lidar returns; kept to the point.
-        photos: in all; taken at stations at most 5 m apart where there are enough of them. One that shows nothing of
-            the street (the last station's looks ahead) is left out.
-        seed: of everything drawn.
-        photo_width: pixels of a pinhole photo (4:3); panoramas are 1.28 times as wide (2:1).
-        truth_density: true surface samples a square metre.
-        photo_labels: also write `truth/labels/NAME.png`, LAS class codes a pixel, 0 for the sky.
-        cloud_scale: metres, the precision of LAZ coordinates.
-        style: ranges from which the street is drawn; the default is a European town.
-        effects: what the cameras add: exposure changes, noise, vignetting, JPEG quality.
-        name: of the tile.
+        out: output folder; created if missing, files of the same names are replaced.
+        length: length of the road, metres.
+        points: exact number of lidar returns.
+        photos: number of photos; they are taken at stations at most 5 m apart if there are enough of them. Photos that
+            show nothing of the street (the last station's front camera) are omitted.
+        seed: seed of all random numbers.
+        photo_width: width of a pinhole photo (4:3), pixels; panoramas (2:1) are 1.28 times as wide.
+        truth_density: samples of the true surface per square metre.
+        photo_labels: also write `truth/labels/NAME.png` with a LAS class code per pixel, 0 for the sky.
+        cloud_scale: resolution of the LAZ coordinates, metres.
+        style: ranges of the street's random parameters; the default is a European town.
+        effects: camera effects: exposure changes, noise, vignetting, JPEG quality.
+        name: name of the tile.
+        report: receives progress.
 
     Raises:
-        SettingError: a length, number or width that no street can be made of.
+        SettingError: length, points, photos or photo_width is too small.
     """
     for key, value, least in (
-        ("length", length, SHORTEST),
+        ("length", length, LENGTH_MIN_M),
         ("points", points, 1),
         ("photos", photos, 0),
         ("photo_width", photo_width, 64),
@@ -94,7 +95,7 @@ def generate(
         trajectory="trajectory.csv",
         truth={"mesh": "truth/mesh.npz", "points": "truth/points.laz"},
     )
-    read_tile(path)  # what is written must be readable
+    read_tile(path)  # validates the written tile
     report(1.0, "done")
     return path
 
@@ -107,7 +108,7 @@ def _write_trajectory(path: Path, trajectory: Trajectory) -> None:
 def _take_photos(
     out: Path, scene: Scene, drive: Drive, photos: int, width: int, effects: Effects, labels: bool, report: Report
 ) -> list[dict[str, object]]:
-    """Render and write the photos and their exposures; their `[[photos]]` entries."""
+    """Render and write the photos and their exposures; returns their `[[photos]]` entries."""
     import cv2
 
     kinds = cameras(width)
@@ -148,13 +149,13 @@ def _write_truth(folder: Path, scene: Scene, density: float, scale: float) -> No
     mesh = scene.truth_mesh()
     assert mesh.classification is not None
     frame = np.array([mesh.frame.crs, repr(mesh.frame.origin), repr(mesh.frame.unit)])
-    with open(folder / "mesh.npz", "wb") as file:  # as Mesh.save does, but compressed
+    with open(folder / "mesh.npz", "wb") as file:  # like Mesh.save, but compressed
         np.savez_compressed(file, frame=frame, vertices=mesh.vertices, faces=mesh.faces, label=mesh.classification)
     las.write(folder / "points.laz", sample_truth(scene, mesh, density), scale)
 
 
 def sample_truth(scene: Scene, mesh: Mesh, density: float) -> PointCloud:
-    """Random points of the static surface above the ground, `density` a square metre, with true lit colours."""
+    """Random samples of the static surface above the ground, `density` per square metre, with true lit colours."""
     rng = np.random.default_rng([scene.layout.seed, 6])
     area = mesh.face_area.astype(np.float64)
     count = max(1, round(density * area.sum()))
@@ -164,14 +165,14 @@ def sample_truth(scene: Scene, mesh: Mesh, density: float) -> PointCloud:
     bary[outside] = 1 - bary[outside]
     c = scene.surface.vertices[scene.surface.faces[face]]
     xyz = c[:, 0] + bary[:, :1] * (c[:, 1] - c[:, 0]) + bary[:, 1:] * (c[:, 2] - c[:, 0])
-    seen = ~_buried(scene.layout, xyz.astype(np.float64))
-    xyz, face, bary = xyz[seen], face[seen], bary[seen]
+    above = ~_buried(scene.layout, xyz.astype(np.float64))
+    xyz, face, bary = xyz[above], face[above], bary[above]
     n = len(xyz)
     colour = np.empty((n, 3), np.uint8)
     for i in range(0, n, 1 << 20):
         at = slice(i, i + (1 << 20))
-        still = np.zeros(len(face[at]), np.float32)
-        colour[at] = srgb(scene.lit(xyz[at], face[at], bary[at], still, still + FINE))
+        no_heading = np.zeros(len(face[at]), np.float32)
+        colour[at] = srgb(scene.lit(xyz[at], face[at], bary[at], no_heading, no_heading + TRUTH_FOOTPRINT_M))
     return PointCloud(FRAME, xyz.astype(np.float32), rgb=colour, classification=scene.surface.classification[face])
 
 

@@ -1,10 +1,10 @@
-"""Labelled photos of many synthetic streets, no two alike, for a segmentation network to learn from.
+"""Training images of synthetic streets with labels, for a segmentation network.
 
-`python -m scan2sim.data_samples.training OUT [--images 1200] [--seed 1000]`: OUT/images/*.jpg, OUT/labels/*.png (LAS
-class codes a pixel, 0 sky, 255 not to be learnt) and OUT/channels/*.png (what a perfect scan would tell, as
-`segmentation.lidar_channels` codes it, at a quarter of the size). Streets, light, weather, camera and place are drawn
-anew, far beyond what the streets of tests and benchmarks look like; seeds from 1000 on are kept for training, below for
-everything else.
+`python -m scan2sim.data_samples.training OUT [--images 1200] [--seed 1000]` writes OUT/images/*.jpg, OUT/labels/*.png
+(LAS class code per pixel; 0: sky, 255: ignored in training) and OUT/channels/*.png (lidar channels of a perfect scan,
+encoded by `segmentation.lidar_channels`, at a quarter of the size). Streets, light, weather, camera and position are
+randomized far beyond the streets of tests and benchmarks. Seeds from 1000 on are reserved for training, smaller ones
+for everything else.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from scan2sim.data_samples.scanner import Drive, plan_drive
 from scan2sim.data_samples.scene import Scene
 from scan2sim.data_samples.variety import varied
 from scan2sim.pipeline.core.types import F64, U8, Camera
-from scan2sim.segmentation.lidar_channels import FRACTION, Level, coded, level
+from scan2sim.segmentation.lidar_channels import DOWNSAMPLING, GroundLevel, encode, ground_level
 
-PER_STREET = 20
-LENGTH = 80.0
-CLEARANCE = 1.2
-"""Metres that most of what a camera sees is away from it: none stands inside a van."""
-HILLS = 0.11
-"""Sine of the elevation above which what is beyond the street is surely sky."""
+IMAGES_PER_STREET = 20
+STREET_LENGTH_M = 80.0
+CLEARANCE_M = 1.2
+"""Least distance of most surfaces from a camera, so that none is inside a van."""
+HILL_SINE_MAX = 0.11
+"""Sine of the elevation above which there is only sky beyond the street."""
 FIRST_SEED = 1000
-"""Seeds from here on are of training streets."""
+"""First seed of training streets."""
 
 
 @dataclass(frozen=True)
 class Weather:
-    """What is between camera and street: share of fog's light, the distance it takes (metres), its colour."""
+    """Fog: distance in which it covers all but 1/e of a surface's light, metres, and its colour."""
 
-    reach: float
+    visibility: float
     colour: RGB
 
 
-def any_style(rng: np.random.Generator) -> Style:
-    """A street of any town, season and light."""
+def random_style(rng: np.random.Generator) -> Style:
+    """Random style: colours, proportions, season and light of a street."""
 
     def near(value: float) -> tuple[float, float]:
         return (value, value * 1.02 + 1e-6)
@@ -59,7 +59,7 @@ def any_style(rng: np.random.Generator) -> Style:
         return tuple((float(r), float(g), float(b)) for r, g, b in rgb)
 
     def leaves(n: int) -> tuple[RGB, ...]:
-        """Greens, from dark firs to yellow and brown autumn."""
+        """Colours of foliage, from dark green to yellow and brown."""
         base = np.array([0.10, 0.20, 0.05]) * np.exp(rng.uniform(-1.0, 0.7, (n, 1)))
         base[:, 0] *= np.exp(rng.uniform(-0.4, 1.3, n) * (rng.random(n) < 0.7))
         rgb = np.clip(base * np.exp(rng.normal(0, 0.15, (n, 3))), 0.005, 0.9)
@@ -96,24 +96,24 @@ def any_style(rng: np.random.Generator) -> Style:
     )
 
 
-def any_street(seed: int) -> Layout:
-    """A street of any style, with all that streets may have, but for a fifth of them."""
+def random_street(seed: int) -> Layout:
+    """Random street: four fifths with all variations (`variety.varied`), the others without."""
     rng = np.random.default_rng([seed, 77])
-    style = any_style(rng)
+    style = random_style(rng)
     if rng.random() < 0.2:
-        return lay_out(LENGTH, seed, style)
-    dark = rng.random() < 0.4  # shadows as photos have them
+        return lay_out(STREET_LENGTH_M, seed, style)
+    dark = rng.random() < 0.4  # dark shadows, as in photos
     style = replace(
         style,
         pavement=float(rng.uniform(1.6, 4.5)),
         kerb=float(rng.choice([0.02, 0.05, 0.09, 0.12, 0.15])),
         sky_strength=(0.08, 0.25) if dark else style.sky_strength,
     )
-    return varied(lay_out(LENGTH, seed, style), LENGTH)
+    return varied(lay_out(STREET_LENGTH_M, seed, style), STREET_LENGTH_M)
 
 
-def any_camera(rng: np.random.Generator) -> Camera:
-    """A lens of 45 to 85 degrees, a wide strip such as cars' cameras take, or a panorama."""
+def random_camera(rng: np.random.Generator) -> Camera:
+    """Random camera: a lens of 45 to 85 degrees, a wide image as of cameras in cars, or a panorama."""
     kind = rng.random()
     if kind < 0.15:
         return Camera("equirectangular", 1024, 512)
@@ -124,12 +124,12 @@ def any_camera(rng: np.random.Generator) -> Camera:
     return Camera("pinhole", 512, 384, f, f, 255.5, 191.5)
 
 
-def any_pose(rng: np.random.Generator, scene: Scene, drive: Drive, camera: Camera) -> tuple[F64, float]:
-    """Somewhere on the vehicle's way, or beside it, looking anywhere but rather along the road; and the time."""
+def random_pose(rng: np.random.Generator, scene: Scene, drive: Drive, camera: Camera) -> tuple[F64, float]:
+    """Random pose (4, 4) on or beside the vehicle's path, preferably looking along the road, and its GPS time."""
     length = scene.layout.axis.length
     s = float(rng.uniform(2, length - 2))
     yaw = rng.choice([rng.normal(0, 0.3), rng.normal(np.pi, 0.3), rng.uniform(-np.pi, np.pi)], p=[0.45, 0.15, 0.4])
-    if np.cos(yaw) * (s - length / 2) > 0.15 * length:  # not out of the street
+    if np.cos(yaw) * (s - length / 2) > 0.15 * length:  # don't look out of the street
         s = length - s
     time = float(drive.time_at(s))
     ground, heading = drive.ground(np.array([time]))
@@ -148,14 +148,14 @@ def any_pose(rng: np.random.Generator, scene: Scene, drive: Drive, camera: Camer
     return pose, time
 
 
-def in_weather(seen: Rendering, rng: np.random.Generator) -> Rendering:
-    """Mist before what is far, at times."""
+def with_fog(seen: Rendering, rng: np.random.Generator) -> Rendering:
+    """Rendering with random fog in 30 % of the cases."""
     if rng.random() > 0.3:
         return seen
     weather = Weather(float(np.exp(rng.uniform(np.log(25), np.log(250)))), (0.55, 0.58, 0.62))
     distance = np.where(seen.classification == 0, 150.0, np.where(np.isfinite(seen.distance), seen.distance, 150.0))
-    clear = np.exp(-distance / weather.reach)[..., None]
-    light = seen.light * clear + np.array(weather.colour) * rng.uniform(0.5, 1.1) * (1 - clear)
+    transmission = np.exp(-distance / weather.visibility)[..., None]
+    light = seen.light * transmission + np.array(weather.colour) * rng.uniform(0.5, 1.1) * (1 - transmission)
     return replace(seen, light=light.astype(np.float32))
 
 
@@ -163,18 +163,18 @@ def street(out: Path, seed: int, images: int) -> int:
     """Write `images` labelled photos of the street of `seed`; returns the seed."""
     import cv2
 
-    scene = Scene(any_street(seed))
+    scene = Scene(random_street(seed))
     drive, ground = plan_drive(scene.layout, 1e6), _ground(scene)
     for i in range(images):
         name = f"{seed:05d}_{i:02d}"
         if (out / "labels" / f"{name}.png").is_file():
             continue
         rng = np.random.default_rng([seed, 78, i])
-        camera = any_camera(rng)
-        pose, time = any_pose(rng, scene, drive, camera)
+        camera = random_camera(rng)
+        pose, time = random_pose(rng, scene, drive, camera)
         while _blocked(scene, camera, pose):
-            pose, time = any_pose(rng, scene, drive, camera)
-        seen = in_weather(render(scene, drive, camera, pose, time), rng)
+            pose, time = random_pose(rng, scene, drive, camera)
+        seen = with_fog(render(scene, drive, camera, pose, time), rng)
         ev = float(rng.uniform(-0.8, 0.8))
         image = develop(
             seen, ev, Effects(noise=float(rng.uniform(0, 0.01)), vignetting=float(rng.uniform(0, 0.3))), rng
@@ -186,25 +186,25 @@ def street(out: Path, seed: int, images: int) -> int:
 
 
 def _blocked(scene: Scene, camera: Camera, pose: F64) -> bool:
-    """Whether a quarter of the picture is right before the lens."""
+    """Whether more than a quarter of the image shows surfaces nearer than `CLEARANCE_M`."""
     v, u = np.mgrid[: camera.height : 16, : camera.width : 16]
     rays = (directions(camera, np.stack([u, v], axis=-1)).reshape(-1, 3) @ pose[:3, :3].T).astype(np.float32)
     origins = np.broadcast_to(pose[:3, 3].astype(np.float32), rays.shape)
-    return bool((scene.cast(origins, rays).distance < CLEARANCE).mean() > 0.25)
+    return bool((scene.cast(origins, rays).distance < CLEARANCE_M).mean() > 0.25)
 
 
-def _ground(scene: Scene) -> Level:
-    """The level of the street's ground."""
+def _ground(scene: Scene) -> GroundLevel:
+    """Ground level of the street."""
     part = scene.surface
     on = np.isin(part.classification, (paints.ROAD, paints.SIDEWALK, paints.TERRAIN))
-    return level(part.vertices[np.unique(part.faces[on])])
+    return ground_level(part.vertices[np.unique(part.faces[on])])
 
 
 def scanned(
-    scene: Scene, drive: Drive, ground: Level, camera: Camera, pose: F64, time: float, rng: np.random.Generator
+    scene: Scene, drive: Drive, ground: GroundLevel, camera: Camera, pose: F64, time: float, rng: np.random.Generator
 ) -> U8:
-    """(h, w, 4) channels of what a perfect scan has in a photo's place, mostly without what drove past."""
-    small = camera.scaled(1 / FRACTION)
+    """(h, w, 4) lidar channels of a perfect scan from the photo's pose, mostly without the moving car."""
+    small = camera.scaled(1 / DOWNSAMPLING)
     v, u = np.mgrid[: small.height, : small.width]
     rays = directions(small, np.stack([u, v], axis=-1)).reshape(-1, 3) @ pose[:3, :3].T
     origins = np.broadcast_to(pose[:3, 3].astype(np.float32), rays.shape)
@@ -214,35 +214,45 @@ def scanned(
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     up = np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-9)
     hit_place = np.where(hits.hit, hits.distance, 0)[:, None] * rays + origins
-    codes = coded(ground.above(hit_place.astype(np.float32)), hits.distance, up.astype(np.float32))
+    codes = encode(ground.above(hit_place.astype(np.float32)), hits.distance, up.astype(np.float32))
     return codes.reshape(small.height, small.width, -1)
 
 
 def class_map(seen: Rendering, camera: Camera, pose: F64) -> U8:
-    """Labels (H, W) to learn from: 255, not to be learnt, where a ray leaves the street below the hills."""
+    """Labels (H, W) for training: 255 (ignored) where a ray leaves the street below the hills' elevation."""
     v, u = np.mgrid[: camera.height, : camera.width]
     up = directions(camera, np.stack([u, v], axis=-1)) @ pose[2, :3]
-    return np.where((seen.classification == 0) & (up < HILLS), 255, seen.classification).astype(np.uint8)
+    return np.where((seen.classification == 0) & (up < HILL_SINE_MAX), 255, seen.classification).astype(np.uint8)
 
 
 def write(out: Path, images: int, seed: int = FIRST_SEED, processes: int | None = None) -> Iterator[float]:
-    """Write a training set, going on from what is there; yields the share that is done."""
+    """Write a training set, or complete an existing one; yields the share that is done.
+
+    Args:
+        out: output folder.
+        images: number of images.
+        seed: seed of the first street.
+        processes: number of worker processes; None: one per CPU core.
+    """
     for folder in ("images", "labels", "channels"):
         (out / folder).mkdir(parents=True, exist_ok=True)
-    streets = -(-images // PER_STREET)
+    streets = -(-images // IMAGES_PER_STREET)
     with ProcessPoolExecutor(processes or os.cpu_count()) as pool:
-        jobs = [pool.submit(street, out, seed + k, min(PER_STREET, images - k * PER_STREET)) for k in range(streets)]
+        jobs = [
+            pool.submit(street, out, seed + k, min(IMAGES_PER_STREET, images - k * IMAGES_PER_STREET))
+            for k in range(streets)
+        ]
         for k, job in enumerate(jobs):
             job.result()
             yield (k + 1) / streets
 
 
 def main() -> None:
-    """Write a training set."""
+    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--images", type=int, default=1200)
-    parser.add_argument("--seed", type=int, default=FIRST_SEED)
+    parser.add_argument("out", type=Path, help="output folder")
+    parser.add_argument("--images", type=int, default=1200, help="number of images (default: 1200)")
+    parser.add_argument("--seed", type=int, default=FIRST_SEED, help="seed of the first street (default: 1000)")
     arguments = parser.parse_args()
     for share in write(arguments.out, arguments.images, arguments.seed):
         print(f"\r{share:.0%}", end="", flush=True)

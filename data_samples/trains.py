@@ -1,4 +1,4 @@
-"""Meshes of trains: locomotives, coaches and wagons, x forwards, each standing with its middle at its own origin."""
+"""Meshes of trains: locomotives, coaches and wagons, x forwards, the origin on the ground below their centre."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from scan2sim.pipeline.core.types import F64
 
 Rng = np.random.Generator
 
-GAP = 1.0
-"""Metres between the bodies of two vehicles that are coupled."""
-WHEEL = 0.46
-LAMP: RGB = (0.95, 0.93, 0.85)
-DARK: RGB = (0.016, 0.016, 0.018)
+COUPLING_GAP_M = 1.0
+"""Between the bodies of two coupled vehicles."""
+WHEEL_RADIUS_M = 0.46
+LAMP_RGB: RGB = (0.95, 0.93, 0.85)
+DARK_RGB: RGB = (0.016, 0.016, 0.018)
 
 
 class Livery(NamedTuple):
-    """Colours of a train: of its bodies, of the band below the windows, of doors and fronts, of roofs."""
+    """Colours of a train: bodies, band below the windows, doors and fronts, roofs."""
 
     body: RGB
     band: RGB
@@ -40,14 +40,14 @@ LIVERIES = tuple(
         ("#f3b61f", "#26282b", "#26282b", "#5b5e60"), ("#2b2e33", "#d4572a", "#d4572a", "#2b2e33"),
     )
 )  # fmt: skip
-FREIGHT = ("#7a3b2a", "#5a5f63", "#8a8f92", "#33523f", "#284a72", "#a8622b", "#b8b29f", "#3b3a38")
-CONTAINERS = ("#b5372a", "#1f5a8f", "#2f7a4a", "#d98a1f", "#8d9499", "#e6e4dd", "#5b2f5f", "#213047")
+WAGON_COLOURS = ("#7a3b2a", "#5a5f63", "#8a8f92", "#33523f", "#284a72", "#a8622b", "#b8b29f", "#3b3a38")
+CONTAINER_COLOURS = ("#b5372a", "#1f5a8f", "#2f7a4a", "#d98a1f", "#8d9499", "#e6e4dd", "#5b2f5f", "#213047")
 
 
-def any_train(rng: Rng) -> list[tuple[Part, float]]:
-    """A train from its head to its tail: meshes, and how long each is.
+def random_train(rng: Rng) -> list[tuple[Part, float]]:
+    """A random train from head to tail: mesh and length in metres of each vehicle.
 
-    Multiple units with a cab at both ends, locomotives with coaches, locomotives with wagons.
+    Kinds: multiple units with a cab at both ends, locomotives with coaches, locomotives with wagons.
     """
     livery, kind = LIVERIES[rng.integers(len(LIVERIES))], rng.random()
     if kind < 0.3:
@@ -74,7 +74,7 @@ def any_train(rng: Rng) -> list[tuple[Part, float]]:
 
 
 def loft(x: F64, sections: F64, paint: Paint) -> Part:
-    """A body through convex sections (N, K, 2), y and z counter-clockwise seen from the front, at x (N,); closed."""
+    """Closed body through convex sections (N, K, 2) at x (N,); y, z counter-clockwise seen from the front."""
     n, k = sections.shape[:2]
     at = np.broadcast_to(x[:, None, None], (n, k, 1))
     xyz = np.concatenate([at, sections], axis=2)
@@ -89,7 +89,7 @@ def loft(x: F64, sections: F64, paint: Paint) -> Part:
 
 
 def _section(half: float, low: float, high: float, roof: float) -> F64:
-    """(K, 2) a vehicle's outline: straight sides from `low` to `high`, a bent roof above."""
+    """(K, 2) cross section of a vehicle: straight sides from `low` to `high`, a curved roof above."""
     right = [(-0.94 * half, low), (-half, low + 0.3), (-half, high), (-0.88 * half, high + 0.6 * (roof - high))]
     right.append((-0.5 * half, roof))
     mirrored = [(-y, z) for y, z in right]
@@ -98,23 +98,23 @@ def _section(half: float, low: float, high: float, roof: float) -> F64:
 
 def _chassis(length: float, rng: Rng) -> list[Part]:
     """Frame, bogies with their wheels, buffers and couplings."""
-    dark = Paint(Material.PLAIN, DARK, paints.VEHICLE, int(rng.integers(1 << 20)))
+    dark = Paint(Material.PLAIN, DARK_RGB, paints.VEHICLE, int(rng.integers(1 << 20)))
     x = length / 2
     parts = [box((-x, -1.2, 0.75), (x, 1.2, 1.1), dark, bottom=True)]
-    parts.append(box((-x - GAP / 2, -0.12, 0.85), (x + GAP / 2, 0.12, 1.05), dark, bottom=True))
+    parts.append(box((-x - COUPLING_GAP_M / 2, -0.12, 0.85), (x + COUPLING_GAP_M / 2, 0.12, 1.05), dark, bottom=True))
     for end in (-1, 1):
         near, far = sorted((end * x, end * (x + 0.4)))
         for y in (-0.85, 0.85):
             parts.append(box((near, y - 0.18, 0.8), (far, y + 0.18, 1.1), dark, bottom=True))
     angle = np.linspace(0, 2 * np.pi, 17)[:-1]
-    disc = WHEEL * np.column_stack([np.cos(angle), np.sin(angle)])
+    disc = WHEEL_RADIUS_M * np.column_stack([np.cos(angle), np.sin(angle)])
     fan = np.column_stack([np.zeros(14), np.arange(1, 15), np.arange(2, 16)]).astype(int)
     steel = Paint(Material.PLAIN, (0.07, 0.06, 0.055), paints.VEHICLE)
     for middle in (-0.62 * x, 0.62 * x):
         parts.append(box((middle - 1.5, -1.12, 0.35), (middle + 1.5, 1.12, 0.72), dark, bottom=True))
         for cx in (middle - 0.95, middle + 0.95):
             for side in (-1, 1):
-                rim = np.column_stack([cx + disc[:, 0], np.full(16, side * 1.14), WHEEL + disc[:, 1]])
+                rim = np.column_stack([cx + disc[:, 0], np.full(16, side * 1.14), WHEEL_RADIUS_M + disc[:, 1]])
                 parts.append(part(rim, fan[:, ::-side], 0.6 * disc, steel))
     return parts
 
@@ -133,7 +133,7 @@ def locomotive(length: float, livery: Livery, rng: Rng) -> Part:
         pitch = (length - 2 * slope - 4.4) / (count := int(rng.integers(3, 8)))
         for i in range(count):
             start = -x + slope + 2.2 + i * pitch
-            grille = Paint(Material.PANELS, DARK, paints.VEHICLE, seed + 1)
+            grille = Paint(Material.PANELS, DARK_RGB, paints.VEHICLE, seed + 1)
             parts.append(panel(start, start + 0.6 * pitch, side * (half + 0.02), 2.3, 2.95, side, grille))
         for way in (-1, 1):
             near, far = sorted((way * (x - slope - 0.3), way * (x - slope - 1.2)))
@@ -150,7 +150,7 @@ def locomotive(length: float, livery: Livery, rng: Rng) -> Part:
 
 
 def _front(way: int, x: float, slope: float, roof: float, livery: Livery, rng: Rng) -> Part:
-    """Windscreen, lamps and warning colour of the front that looks along `way`."""
+    """Windscreen, lamps and warning colour of the front that faces `way` (1: +x, -1: -x)."""
     low, high = np.array([x, 2.35]), np.array([x - slope, roof])
     out = np.array([high[1] - low[1], low[0] - high[0]])
     out = 0.02 * out / np.linalg.norm(out)
@@ -160,14 +160,14 @@ def _front(way: int, x: float, slope: float, roof: float, livery: Livery, rng: R
     parts = [quads([pane], [[(0, 0), (2.2, 0), (2.2, tall), (0, tall)]], glass(rng), size=(2.2, tall))]
     colour = Paint(Material.PLAIN, livery.door, paints.VEHICLE, int(rng.integers(1 << 20)))
     parts.append(end_panel(way * (x + 0.01), 1.2, 1.0, 1.7, way, colour))
-    lamp = Paint(Material.PLAIN, LAMP, paints.VEHICLE)
+    lamp = Paint(Material.PLAIN, LAMP_RGB, paints.VEHICLE)
     for y in (-0.9, 0.9):
         parts.append(end_panel(way * (x + 0.03), 0.16, 1.35, 1.65, way, lamp).moved(0.0, (0, y, 0)))
     return join(parts)
 
 
 def coach(length: float, livery: Livery, rng: Rng, *, tall: bool = False, cab: int = 0) -> Part:
-    """A passenger coach: a row of windows (`tall`: two), doors, a band; `cab`: a driver's end that looks that way."""
+    """A passenger coach: a row of windows (`tall`: two), doors, a band; `cab`: side of a driver's cab, 1, -1 or 0."""
     x, half, roof = length / 2, 1.42, 4.55 if tall else 3.9
     seed, slope = int(rng.integers(1 << 20)), float(rng.uniform(0.6, 2.0))
     body, band, door, top = (Paint(Material.PLAIN, colour, paints.VEHICLE, seed) for colour in livery)
@@ -200,7 +200,7 @@ def coach(length: float, livery: Livery, rng: Rng, *, tall: bool = False, cab: i
     return join(parts)
 
 
-def _freight(colours: tuple[str, ...], rng: Rng, material: Material = Material.PANELS) -> Paint:
+def _wagon_paint(colours: tuple[str, ...], rng: Rng, material: Material = Material.PANELS) -> Paint:
     colour = np.array(linear(colours[rng.integers(len(colours))])) * rng.uniform(0.7, 1.2)
     r, g, b = np.clip(colour, 0.01, 0.9).tolist()
     return Paint(material, (r, g, b), paints.VEHICLE, int(rng.integers(1 << 20)))
@@ -208,31 +208,33 @@ def _freight(colours: tuple[str, ...], rng: Rng, material: Material = Material.P
 
 def covered(length: float, rng: Rng) -> Part:
     """A covered wagon with a sliding door."""
-    x, skin = length / 2, _freight(FREIGHT, rng)
+    x, skin = length / 2, _wagon_paint(WAGON_COLOURS, rng)
     outline = _section(1.4, 1.1, 3.0, float(rng.uniform(3.5, 4.0)))
     parts = [*_chassis(length, rng), loft(np.array([-x, x]), np.stack([outline, outline]), skin)]
     for side in (-1, 1):
-        door = _freight(FREIGHT, rng, Material.PLAIN)
+        door = _wagon_paint(WAGON_COLOURS, rng, Material.PLAIN)
         parts.append(panel(-1.3, 1.3, side * 1.42, 1.2, 2.95, side, door))
     return join(parts)
 
 
 def tank(length: float, rng: Rng) -> Part:
-    """A lying drum with a dome, and a band."""
+    """A tank wagon: a horizontal drum with a dome and a band."""
     x, radius = length / 2, float(rng.uniform(1.15, 1.4))
-    skin = _freight((*FREIGHT, "#e2e0d8", "#151618"), rng, Material.PLAIN)
+    skin = _wagon_paint((*WAGON_COLOURS, "#e2e0d8", "#151618"), rng, Material.PLAIN)
     z = 1.15 + radius
     drum = tube(
         [(-x + 0.3, 0, z), (-x + 0.31, 0, z), (0, 0, z), (x - 0.3, 0, z)], [0.02, radius, radius, radius], skin, 20
     )
-    ring = tube([(-0.4, 0, z), (0.4, 0, z)], [1.01 * radius] * 2, _freight(CONTAINERS, rng, Material.PLAIN), 20)
+    ring = tube(
+        [(-0.4, 0, z), (0.4, 0, z)], [1.01 * radius] * 2, _wagon_paint(CONTAINER_COLOURS, rng, Material.PLAIN), 20
+    )
     dome = tube([(0, 0, z), (0, 0, z + radius + 0.25)], [0.35, 0.35], skin, 10)
     return join([*_chassis(length, rng), drum, ring, dome])
 
 
 def hopper(length: float, rng: Rng) -> Part:
-    """An open wagon with a heap in it."""
-    x, high, skin = length / 2, float(rng.uniform(2.4, 3.2)), _freight(FREIGHT, rng)
+    """An open wagon loaded with bulk goods."""
+    x, high, skin = length / 2, float(rng.uniform(2.4, 3.2)), _wagon_paint(WAGON_COLOURS, rng)
     heap = Paint(Material.GRIT, (0.05, 0.045, 0.04), paints.VEHICLE, int(rng.integers(1 << 20)))
     load = blob((0, 0, high - 0.1), (x - 0.3, 1.2, 0.45), rng, heap, bump=0.2)
     rib, y = skin._replace(material=Material.PLAIN), 1.4
@@ -244,13 +246,13 @@ def hopper(length: float, rng: Rng) -> Part:
 
 
 def flat(length: float, rng: Rng) -> Part:
-    """A flat wagon with containers, with room for none at times."""
+    """A flat wagon with up to two containers."""
     parts, a = _chassis(length, rng), -length / 2 + 0.2
     for _ in range(2):
         size = float(rng.choice([6.1, 12.2]))
         if a + size > length / 2 or rng.random() < 0.15:
             continue
-        skin = _freight(CONTAINERS, rng)
+        skin = _wagon_paint(CONTAINER_COLOURS, rng)
         parts.append(box((a, -1.22, 1.15), (a + size, 1.22, 3.75), skin, bottom=True))
         for side in (-1, 1):
             logo = Paint(Material.SIGN, (1, 1, 1), paints.VEHICLE, int(rng.integers(len(signs.NAMES))))

@@ -1,4 +1,4 @@
-"""Film a turn at a junction with a perspective camera, as KITTI's odometry comes: pictures, poses, calibration.
+"""Render a turn at a junction with a perspective camera, in KITTI's odometry format: images, poses, calibration.
 
 `python -m scan2sim.data_samples.turn OUT` writes `image_l/000000.png` and so on, `poses.txt`, `calib.txt`.
 """
@@ -18,41 +18,43 @@ from scan2sim.pipeline.camera.models import pixel_rays, project
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import Camera, Trajectory
 
-WAY, TOWARDS, LONG = 600.0, 74.0, 52.0
-"""Metres: of the town's path, from its start to the film's, and of the film; in it, the path turns by 98 degrees."""
+PATH_LENGTH_M, FILM_START_M, FILM_LENGTH_M = 600.0, 74.0, 52.0
+"""Length of the town's path, and start and length of the rendered part, in which the path turns by 98 degrees."""
 FPS = 6.5
-"""Frames a second: about a metre from one to the next, as in KITTI's turns."""
-SPEED = 10.0  # m/s on straights
+"""About a metre between frames, as in KITTI's turns."""
+SPEED_M_S = 10.0  # m/s on straights
 
 
 def camera_of(height: int) -> Camera:
-    """KITTI's angle of view, as fine as a panorama of `height` rows in its middle."""
+    """Camera with KITTI's field of view, and the angular resolution of a panorama of `height` rows at its centre."""
     focal = height / np.pi
     width, rows = round(1.755 * focal / 2) * 2, round(0.532 * focal / 2) * 2
     return Camera("pinhole", width, rows, focal, focal, (width - 1) / 2, (rows - 1) / 2)
 
 
 def filmed(whole: Trajectory) -> Trajectory:
-    """The poses of a drive that are filmed."""
-    way = paths.chainage(whole.positions[:, :2])
-    there = (way >= TOWARDS) & (way <= TOWARDS + LONG)
+    """Poses of a drive that are rendered."""
+    travelled = paths.chainage(whole.positions[:, :2])
+    rendered = (travelled >= FILM_START_M) & (travelled <= FILM_START_M + FILM_LENGTH_M)
     assert whole.rotations is not None
-    return Trajectory(whole.times[there], whole.positions[there], whole.rotations[there])
+    return Trajectory(whole.times[rendered], whole.positions[rendered], whole.rotations[rendered])
 
 
 def generate_turn(out: Path, *, height: int = 2048, seed: int = 0, report: Report = silent) -> Path:
-    """Write the folder `out`, as the module says, and return it.
+    """Render a turn into the folder `out`, and return it; see the module's description.
 
     Args:
-        height: rows of the panoramas that the pictures are cut from.
-        seed: of town, traffic and light.
+        out: output folder.
+        height: rows of the panoramas from which the images are resampled.
+        seed: seed of town, traffic and light.
+        report: receives progress.
     """
     import cv2
 
-    way, camera = paths.town_path(seed, WAY), camera_of(height)
-    whole = paths.drive(way, SPEED, FPS, still=0.0, seed=seed)
+    path, camera = paths.town_path(seed, PATH_LENGTH_M), camera_of(height)
+    whole = paths.drive(path, SPEED_M_S, FPS, still=0.0, seed=seed)
     driven = filmed(whole)
-    town = Panorama(build(way, seed), Traffic(way, whole, seed), height, seed)
+    town = Panorama(build(path, seed), Traffic(path, whole, seed), height, seed)
     uv, _ = project(Camera("equirectangular", 2 * height, height), pixel_rays(camera).reshape(-1, 3).astype(np.float64))
     maps = uv.reshape(camera.height, camera.width, 2).transpose(2, 0, 1).astype(np.float32)
     (out / "image_l").mkdir(parents=True, exist_ok=True)
@@ -70,9 +72,9 @@ def generate_turn(out: Path, *, height: int = 2048, seed: int = 0, report: Repor
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m scan2sim.data_samples.turn", description=__doc__)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--height", type=int, default=2048, help="rows of the panoramas that pictures are cut from")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("out", type=Path, help="output folder")
+    parser.add_argument("--height", type=int, default=2048, help="rows of the panoramas to resample (default: 2048)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of town, traffic and light (default: 0)")
     a = parser.parse_args()
     generate_turn(
         a.out, height=a.height, seed=a.seed, report=lambda share, text="": print(f"{100 * share:.0f} %", text)

@@ -1,6 +1,6 @@
-"""What streets of training have beyond the default one: other pavements, borders, halls, traffic, people, clutter.
+"""Variations of training streets: other pavements, borders, halls, vehicles, people, street furniture.
 
-Nothing of it is drawn for any other street. Each kind has a random stream of its own.
+Other streets don't have them. Each kind has its own stream of random numbers.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from scan2sim.data_samples import borders, figures, halls, objects, paints, roadside
-from scan2sim.data_samples.layout import HALF_WIDTH, Boundary, House, Layout, ParkedCar, Placed, Side, Walk
+from scan2sim.data_samples.layout import HALF_WIDTH, Boundary, House, Layout, ParkedCar, PlacedObject, Side, Walk
 from scan2sim.data_samples.paints import RGB, Material, Paint
 from scan2sim.data_samples.shapes import Part
 from scan2sim.data_samples.traffic import coach
@@ -26,15 +26,15 @@ SIDES: tuple[Side, Side] = (1, -1)
 
 
 def varied(layout: Layout, length: float) -> Layout:
-    """The street with a share of its things replaced, and more of them."""
+    """Street with a share of its objects replaced, and with additional ones."""
     streams = (np.random.default_rng([layout.seed, 200 + i]) for i in range(9))
     ground, build, border, drive, live, stand, hang, plant, shine = streams
     built, kept = _halls(layout, build)
     bordered, open_ = _borders(layout, border)
     driven, parked = _vehicles(layout, drive)
     fixed = replace(layout, houses=kept)
-    more = [*built, *bordered, *driven, *_alive(layout, length, live), *_furniture(layout, length, stand)]
-    more += [*_fronts(fixed, hang), *_banks(layout, length, plant)]
+    extras = [*built, *bordered, *driven, *_people(layout, length, live), *_furniture(layout, length, stand)]
+    extras += [*_facade_attachments(fixed, hang), *_banks(layout, length, plant)]
     bay = Paint(PAVINGS[ground.integers(len(PAVINGS))], grey(ground), paints.ROAD, _seed(ground))
     return replace(
         fixed,
@@ -42,18 +42,18 @@ def varied(layout: Layout, length: float) -> Layout:
         parked=parked,
         walks=tuple(w for side in SIDES for w in _walks(layout, side, ground)),
         bays=bay if ground.random() < 0.6 else None,
-        more=tuple(more),
-        sun=_turned(layout.sun, shine),
+        extras=tuple(extras),
+        sun=_rotated_sun(layout.sun, shine),
     )
 
 
 def grey(rng: Rng, low: float = 0.03, high: float = 0.75) -> RGB:
-    """Of light between `low` and `high`, tinted a little."""
+    """Random grey of linear light between `low` and `high`, slightly tinted."""
     return _rgb(np.exp(rng.uniform(np.log(low), np.log(high))) * np.exp(rng.normal(0, 0.09, 3)))
 
 
 def colour(rng: Rng, strength: float = 0.6) -> RGB:
-    """Of any hue, from black to white."""
+    """Random colour of any hue, from black to white; `strength`: of the hue."""
     return _rgb(np.exp(rng.uniform(np.log(0.015), np.log(0.8))) * np.exp(rng.normal(0, strength, 3)))
 
 
@@ -70,15 +70,15 @@ def _seed(rng: Rng) -> int:
     return int(rng.integers(1 << 20))
 
 
-def _turned(sun: F64, rng: Rng) -> F64:
-    """The sun from anywhere, for half of the streets."""
+def _rotated_sun(sun: F64, rng: Rng) -> F64:
+    """Direction of the sun, with a random azimuth for half of the streets."""
     a = rng.uniform(0, 2 * np.pi) * (rng.random() < 0.5)
     x, y, z = sun
     return np.array([x * np.cos(a) - y * np.sin(a), x * np.sin(a) + y * np.cos(a), z])
 
 
 def _walks(layout: Layout, side: Side, rng: Rng) -> list[Walk]:
-    """Verge, path for bicycles, pavement and garden, from the kerb outwards."""
+    """Verge, cycle path, pavement and garden, from the kerb outwards."""
     near, end = layout.kerb(side) + 0.15, layout.garden(side)
     strips: list[Walk] = []
 
@@ -104,7 +104,7 @@ def _walks(layout: Layout, side: Side, rng: Rng) -> list[Walk]:
 
 
 def _soft(rng: Rng) -> Paint:
-    """Grass, dry grass, soil, litter or gravel: terrain."""
+    """Paint of unsealed ground: grass, dry grass, soil, litter or gravel."""
     if rng.random() < 0.6:
         tint = _rgb(np.array([0.10, 0.16, 0.04]) * np.exp(rng.uniform(-0.8, 0.8)) * np.exp(rng.normal(0, 0.3, 3)))
         return Paint(Material.GRASS, tint, paints.TERRAIN, _seed(rng))
@@ -113,17 +113,17 @@ def _soft(rng: Rng) -> Paint:
 
 
 def _facing(side: int) -> float:
-    """Turn of a mesh whose front looks towards -y, so that it looks to the road from its side."""
+    """Rotation of a mesh whose front faces -y, so that it faces the road from its side."""
     return 0.0 if side == 1 else np.pi
 
 
 def _along(s: float, width: float, side: int) -> float:
-    """Chainage of the origin of such a mesh that covers s to s + width."""
+    """Chainage of the origin of a mesh that faces the road and covers s to s + width."""
     return s if side == 1 else s + width
 
 
-def _halls(layout: Layout, rng: Rng) -> tuple[list[Placed], tuple[House, ...]]:
-    """A share of the houses becomes bare buildings."""
+def _halls(layout: Layout, rng: Rng) -> tuple[list[PlacedObject], tuple[House, ...]]:
+    """Replace a share of the houses by halls; returns halls and remaining houses."""
     share = rng.choice([0.0, 0.3, 0.9], p=[0.45, 0.35, 0.2])
     out, kept = [], []
     for h in layout.houses:
@@ -132,12 +132,12 @@ def _halls(layout: Layout, rng: Rng) -> tuple[list[Placed], tuple[House, ...]]:
             continue
         tall, tints = rng.uniform(3.0, 11.0), (colour(rng, 0.25), colour(rng))
         make = partial(halls.hall, h.width, h.depth, tall, tints, _seed(rng))
-        out.append(Placed(_along(h.s, h.width, h.side), h.side * h.front, _facing(h.side), make))
+        out.append(PlacedObject(_along(h.s, h.width, h.side), h.side * h.front, _facing(h.side), make))
     return out, tuple(kept)
 
 
-def _borders(layout: Layout, rng: Rng) -> tuple[list[Placed], tuple[Boundary, ...]]:
-    """A share of the borders becomes walls and fences of other kinds, and hedges become banks."""
+def _borders(layout: Layout, rng: Rng) -> tuple[list[PlacedObject], tuple[Boundary, ...]]:
+    """Replace a share of the garden borders by other walls, fences and banks; returns these and the remaining ones."""
     share = rng.choice([0.0, 0.5, 1.0], p=[0.25, 0.4, 0.35])
     out, kept = [], []
     for b in layout.boundaries:
@@ -146,7 +146,7 @@ def _borders(layout: Layout, rng: Rng) -> tuple[list[Placed], tuple[Boundary, ..
             continue
         side = 1 if b.t > 0 else -1
         kind, height, seed = rng.random(), float(rng.uniform(0.5, 2.8)), _seed(rng)
-        material, tint = borders.WALLS[rng.integers(len(borders.WALLS))], colour(rng, 0.2)
+        material, tint = borders.WALL_MATERIALS[rng.integers(len(borders.WALL_MATERIALS))], colour(rng, 0.2)
         green, low = _green(rng), float(rng.uniform(0.3, 1.8))
         pieces = max(1, round((b.s1 - b.s0) / 6))
         width = (b.s1 - b.s0) / pieces
@@ -159,17 +159,17 @@ def _borders(layout: Layout, rng: Rng) -> tuple[list[Placed], tuple[Boundary, ..
             make = partial(borders.wire_fence, width, 0.6 * height + 0.6, tint, seed)
         else:
             make = partial(borders.bank, width, low, green, seed)
-        out += [Placed(_along(b.s0 + i * width, width, side), b.t, _facing(side), make) for i in range(pieces)]
+        out += [PlacedObject(_along(b.s0 + i * width, width, side), b.t, _facing(side), make) for i in range(pieces)]
     return out, tuple(kept)
 
 
-def _vehicles(layout: Layout, rng: Rng) -> tuple[list[Placed], tuple[ParkedCar, ...]]:
-    """Parked cars become vans, lorries and cars of other sizes; some park on the other side."""
+def _vehicles(layout: Layout, rng: Rng) -> tuple[list[PlacedObject], tuple[ParkedCar, ...]]:
+    """Replace parked cars by vans, lorries and cars of other sizes, some on the other side of the road."""
     out, kept = [], []
     cars = list(layout.parked)
-    if rng.random() < 0.5:  # on the carriageway opposite
-        some = cars[:: int(rng.integers(2, 5))]
-        cars += [replace(c, t=-np.sign(c.t) * (layout.lane - 0.9), s=c.s + 2.0) for c in some]
+    if rng.random() < 0.5:  # more cars, on the opposite side of the carriageway
+        sample = cars[:: int(rng.integers(2, 5))]
+        cars += [replace(c, t=-np.sign(c.t) * (layout.lane - 0.9), s=c.s + 2.0) for c in sample]
     for i, c in enumerate(cars):
         kind, turn = rng.random(), 0.0 if c.towards == 1 else np.pi
         tint = colour(rng, 0.35) if rng.random() < 0.5 else grey(rng, 0.01, 0.9)
@@ -185,7 +185,7 @@ def _vehicles(layout: Layout, rng: Rng) -> tuple[list[Placed], tuple[ParkedCar, 
             make = partial(_van, size, tint, layout.seed + i)
         else:
             make = partial(roadside.lorry, rng.uniform(5, 7), rng.uniform(2.4, 3.6), (tint, colour(rng)), _seed(rng))
-        out.append(Placed(c.s, c.t, turn + rng.normal(0, 0.03), make, loose=True))
+        out.append(PlacedObject(c.s, c.t, turn + rng.normal(0, 0.03), make, movable=True))
     return out, tuple(kept)
 
 
@@ -198,8 +198,8 @@ def _scaled_car(tint: RGB, scale: tuple[float, float, float]) -> Part:
     return replace(car, vertices=(car.vertices * np.array(scale)).astype(np.float32))
 
 
-def _alive(layout: Layout, length: float, rng: Rng) -> list[Placed]:
-    """People on the pavements and the road, bicycles ridden and parked."""
+def _people(layout: Layout, length: float, rng: Rng) -> list[PlacedObject]:
+    """Pedestrians on the pavements and the road, cyclists and parked bicycles."""
     out = []
     for _ in range(int(rng.integers(0, 22))):
         side, s, seed = SIDES[rng.integers(2)], rng.uniform(1, length - 1), _seed(rng)
@@ -208,14 +208,14 @@ def _alive(layout: Layout, length: float, rng: Rng) -> list[Placed]:
         turn = rng.choice([0.0, np.pi]) + rng.normal(0, 0.5)
         kind = rng.random()
         make = partial(figures.person if kind < 0.65 else figures.cyclist if kind < 0.8 else figures.bicycle, seed)
-        out.append(Placed(s, side * t, turn, make, loose=True))
-        if kind < 0.65 and rng.random() < 0.4:  # two together
-            out.append(Placed(s + 0.1, side * (t + 0.6), turn, partial(figures.person, seed + 1), loose=True))
+        out.append(PlacedObject(s, side * t, turn, make, movable=True))
+        if kind < 0.65 and rng.random() < 0.4:  # a pair
+            out.append(PlacedObject(s + 0.1, side * (t + 0.6), turn, partial(figures.person, seed + 1), movable=True))
     return out
 
 
-def _furniture(layout: Layout, length: float, rng: Rng) -> list[Placed]:
-    """Masts, bollards, boards and lights beside the kerbs and before the gardens."""
+def _furniture(layout: Layout, length: float, rng: Rng) -> list[PlacedObject]:
+    """Masts, bollards, direction signs and traffic lights along kerbs and gardens."""
     out = []
     for _ in range(int(rng.integers(0, 16))):
         side, s, seed, kind = SIDES[rng.integers(2)], rng.uniform(1, length - 1), _seed(rng), rng.random()
@@ -234,12 +234,12 @@ def _furniture(layout: Layout, length: float, rng: Rng) -> list[Placed]:
             make = partial(roadside.traffic_light, seed)
         else:
             make = partial(objects.sign, int(rng.integers(7)))
-        out.append(Placed(s, side * t, turn, make))
+        out.append(PlacedObject(s, side * t, turn, make))
     return out
 
 
-def _fronts(layout: Layout, rng: Rng) -> list[Placed]:
-    """Boards, awnings and pipes on houses."""
+def _facade_attachments(layout: Layout, rng: Rng) -> list[PlacedObject]:
+    """Boards, awnings and downpipes on houses."""
     out = []
     for h in layout.houses:
         for _ in range(rng.poisson(1.0)):
@@ -253,12 +253,12 @@ def _fronts(layout: Layout, rng: Rng) -> list[Placed]:
                 make = partial(halls.awning, width, colour(rng), _seed(rng))
             else:
                 width, make = 0.1, partial(halls.pipe, objects.eaves(h) - 0.2, grey(rng))
-            out.append(Placed(_along(s, width, h.side), h.side * h.front, _facing(h.side), make))
+            out.append(PlacedObject(_along(s, width, h.side), h.side * h.front, _facing(h.side), make))
     return out
 
 
-def _banks(layout: Layout, length: float, rng: Rng) -> list[Placed]:
-    """Beds of low bushes and thickets behind the pavement, at times."""
+def _banks(layout: Layout, length: float, rng: Rng) -> list[PlacedObject]:
+    """Beds of low bushes and thickets behind the pavement, on some sides."""
     out = []
     for side in SIDES:
         if rng.random() < 0.55:
@@ -269,6 +269,6 @@ def _banks(layout: Layout, length: float, rng: Rng) -> list[Placed]:
             height = rng.uniform(2.2, 6.0) if high else rng.uniform(0.25, 1.3)
             t = layout.garden(side) + rng.uniform(0.2, 2.0)
             make = partial(borders.bank, width, height, _green(rng), _seed(rng), high=high)
-            out.append(Placed(_along(s, width, side), side * t, _facing(side), make))
+            out.append(PlacedObject(_along(s, width, side), side * t, _facing(side), make))
             s += width + rng.exponential(8)
     return out

@@ -1,1 +1,1 @@
-"""What chains the rooms: the recipe of a tile and the command that runs it."""
+"""Pipelines of steps, their execution, reports, and the `scan2sim` command."""

@@ -1,4 +1,4 @@
-"""The `scan2sim` command: starts in a blink, loads the one that is asked for, and tells errors by one table."""
+"""The `scan2sim` command: imports a subcommand only when it is used, and maps errors to messages and exit codes."""
 
 from __future__ import annotations
 
@@ -17,68 +17,81 @@ from scan2sim import __version__
 from scan2sim.pipeline.core.errors import INTERRUPTED, IncompleteError, ScanError, exit_code, from_os_error
 
 PAGES = Path(__file__).parents[1] / "docs"
-"""Where the pages are that help and errors name as docs/NAME.md: they come with a wheel, too."""
+"""Folder of the pages that help and errors name as docs/NAME.md; part of the wheel."""
 COMMANDS = {
-    "run": ("run", "Make a world of a tile; what an earlier run has finished is kept."),
-    "plan": ("plan", "Show what `run` would run, and why; of a drive.toml, what `survey` would run before its tiles."),
-    "tile": ("tile", "Cut a long corridor into tiles that overlap: a survey."),
-    "survey": ("survey", "Make the worlds of all tiles of a survey, which meet, and one of them all."),
-    "export": ("export", "Write a finished world in other formats, for other simulators."),
-    "view": ("view", "Open a finished world in the browser, or render a flight through it."),
-    "verify": ("verify", "Read all that was made, and say what is damaged; the next run makes that anew."),
-    "inspect": ("inspect", "Show one screen of facts."),
-    "sample": ("sample", "Generate a synthetic street with its ground truth."),
-    "import": ("imports", "Make a tile from your files."),
-    "segment": ("segment", "Classes of a tile's points and photos: `segment TILE --out DIR`."),
-    "monitor": ("monitor", "The event bus: topics of ROS 2 watched, and what goes through them told."),
-    "toolbox": ("toolbox", "ML toolboxes: objects, movement, classes, segments of images, from files or as a service."),
-    "qos": ("qos", "Quality of service of toolboxes: what is required, and what a network and a machine give."),
-    "orchestrate": (
-        "orchestrate",
-        "Services on edge and cloud through Open Source MANO: what is to run, and where.",
+    "run": ("run", "Build the world of a tile; steps that an earlier run has finished are not repeated."),
+    "plan": (
+        "plan",
+        "List the steps that `run` would execute, and why (for a drive.toml: `survey`, before its tiles).",
     ),
-    "teleop": ("teleop", "Vehicles driven from afar, by several links at once."),
-    "slam": ("slam", "Where the camera of a video went: `slam VIDEO --out DIR`."),
+    "export": ("export", "Convert a finished world to other formats, for other simulators."),
+    "view": ("view", "Open a finished world in the browser, or render a flight through it as a video."),
+    "verify": ("verify", "Check all results against their checksums; the next run rebuilds the damaged ones."),
+    "inspect": ("inspect", "Show a summary of a point cloud, a tile, a mesh or a world."),
+    "import": ("imports", "Import recordings: create a tile from point clouds, photos, sweeps or data sets."),
+    "sample": ("sample", "Generate a synthetic street recording with ground truth, to try the program."),
+    "segment": ("segment", "Classify the points and photos of a tile: `segment TILE --out DIR`."),
+    "slam": ("slam", "Estimate the trajectory of a video's camera (visual SLAM): `slam VIDEO --out DIR`."),
+    "tile": ("tile", "Cut a long recording (a corridor) into a survey of overlapping tiles."),
+    "survey": (
+        "survey",
+        "Build the worlds of all tiles of a survey, with matching borders, and one world of them all.",
+    ),
+    "monitor": ("monitor", "Monitor ROS 2 topics and publish their statistics; alarms, archive, autoscaling."),
+    "toolbox": ("toolbox", "Run ML toolboxes on images: detection, movement, classification, segmentation."),
+    "qos": ("qos", "Quality of service of the toolboxes: requirements, measurement, choice of the image encoding."),
+    "orchestrate": ("orchestrate", "Deploy services on edge and cloud through Open Source MANO (OSM)."),
+    "teleop": ("teleop", "Drive vehicles remotely, over several network links at once."),
 }
-"""Commands to their files in `flows.commands`, each with an `app`, and what they are for."""
+"""Command name: its module in `flows.commands`, which has an `app`, and its help; in the order of `PANELS`."""
+PANELS = {
+    "Worlds": ("run", "plan", "export", "view", "verify", "inspect"),
+    "Recordings": ("import", "sample", "segment", "slam"),
+    "Surveys": ("tile", "survey"),
+    "Services": ("monitor", "toolbox", "qos", "orchestrate", "teleop"),
+}
+"""Panels of `scan2sim --help` and the commands in them."""
 
 
-class _Later(TyperCommand):
-    """Stands for a command until it is asked for."""
+class _LazyCommand(TyperCommand):
+    """Placeholder of a command, whose module is imported when the command runs."""
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         return loaded(str(self.name)).make_context(info_name, args, parent, **extra)
 
 
-class _Commands(TyperGroup):
-    """All of `COMMANDS`, each loaded when it is asked for."""
+class _LazyGroup(TyperGroup):
+    """All of `COMMANDS`, each imported when it runs."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(COMMANDS)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        return _Later(cmd_name, help=COMMANDS[cmd_name][1]) if cmd_name in COMMANDS else None
+        if cmd_name not in COMMANDS:
+            return None
+        panel = next(name for name, commands in PANELS.items() if cmd_name in commands)
+        return _LazyCommand(cmd_name, help=COMMANDS[cmd_name][1], rich_help_panel=panel)
 
 
 def loaded(name: str) -> Any:
-    """The command of that name, as its file declares it."""
+    """The command of that name, imported from its module."""
     module = importlib.import_module(f"scan2sim.flows.commands.{COMMANDS[name][0]}")
     return typer.main.get_command(module.app)
 
 
 app = typer.Typer(
     name="scan2sim",
-    cls=_Commands,
-    help="Street scans (lidar clouds and posed photos) to textured worlds for robot simulators.",
+    cls=_LazyGroup,
+    help="Convert street scans (lidar point clouds and posed photos) to textured worlds for robot simulators.",
     no_args_is_help=True,
-    epilog=f"Pages (docs/...) are in {PAGES}.",
+    epilog=f"The documentation pages that help texts name as docs/... are in {PAGES}.",
     add_completion=False,
     pretty_exceptions_enable=False,
 )
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _print_version(requested: bool) -> None:
+    if requested:
         typer.echo(f"scan2sim {__version__}")
         raise typer.Exit
 
@@ -86,16 +99,18 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def _root(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Show it.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
 ) -> None:
-    context.obj = _through_prefect
+    context.obj = _run_survey_with_prefect
 
 
-def _through_prefect(*arguments: Any) -> None:
-    """Make a survey as a flow of Prefect; arguments as the flow's.
+def _run_survey_with_prefect(*arguments: Any) -> None:
+    """Build a survey as a Prefect flow, with the flow's arguments.
 
     Raises:
-        IncompleteError: side products failed; the world is finished.
+        IncompleteError: the world is finished, but side products failed.
     """
     from scan2sim.flows.deployed.survey import check_server, survey
     from scan2sim.flows.deployed.tile import WITH_WARNINGS
@@ -107,21 +122,23 @@ def _through_prefect(*arguments: Any) -> None:
         raise IncompleteError(report.parent / "world", state.message or "")
 
 
-def replace_what_cannot_be_encoded() -> None:
-    """Print `?` for characters that the terminal's encoding doesn't have (Latin-1, say), rather than fail."""
+def replace_unencodable_characters() -> None:
+    """Print `?` for characters that the terminal's encoding (such as Latin-1) lacks, instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
 
 
 def main() -> None:
-    """Run the command; errors become one message and an exit code (`pipeline.core.errors.EXIT_CODES`)."""
-    os.environ.setdefault("PYTHONSAFEPATH", "1")  # a random.py in the current folder is not our processes' own
-    replace_what_cannot_be_encoded()
+    """Run the command; each error becomes a message and an exit code (`pipeline.core.errors.EXIT_CODES`)."""
+    os.environ.setdefault(
+        "PYTHONSAFEPATH", "1"
+    )  # or a random.py in the current folder would shadow the standard library in subprocesses
+    replace_unencodable_characters()
     try:
         app()
     except SystemExit as ended:
-        if ended.code == exit_code(KeyboardInterrupt()):  # as typer turns Ctrl-C into
+        if ended.code == exit_code(KeyboardInterrupt()):  # typer's exit code for Ctrl-C
             typer.echo(INTERRUPTED, err=True)
         raise
     except Exception as error:
@@ -131,7 +148,7 @@ def main() -> None:
         if isinstance(error, ScanError):
             level, colour = ("warning", "yellow") if isinstance(error, IncompleteError) else ("error", "red")
             typer.secho(f"{level}: {error.where}: {error.cause}", fg=colour, err=True)
-            remedy = re.sub(r"(?<![\w/])docs(?=/\w+\.md)", str(PAGES), error.remedy)
+            remedy = re.sub(r"(?<![\w/])docs(?=/[\w/-]+\.md)", str(PAGES), error.remedy)
             typer.echo(f"  {remedy}{'' if remedy.endswith('?') else '.'}", err=True)
         else:
             from scan2sim.flows.commands.display import log_unexpected

@@ -1,6 +1,6 @@
-"""The core: types, what a step is, geometry steps, store, readers and writers."""
+"""The pipeline: types, the step interface, geometry steps, the result store, readers and writers."""
 
 import os
 
-# numba's first choice, TBB, is too old on many machines, which it warns of at length
+# numba prefers TBB, which is too old on many machines and then causes a long warning
 os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp workqueue tbb")

@@ -1,7 +1,42 @@
 """scan2sim: street scans to textured, lightweight worlds for robot simulators.
 
-The rooms stand at the top of the repository. Links here (in the wheel: the folders themselves) give them one name,
-`scan2sim.<room>`, in a checkout and installed, whatever else is called `pipeline` or `flows` on a user's path.
+The packages are folders at the top of the repository. Links here (in the wheel: the folders themselves) give them one
+name, `scan2sim.<package>`, in a checkout and installed, whatever else is called `pipeline` or `flows` on a user's path.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from scan2sim.flows.api import (
+        ScanError,
+        World,
+        import_clouds,
+        import_kitti_odometry,
+        import_kitti_raw,
+        import_photogrammetry,
+        read_world,
+        run,
+        survey,
+    )
+
 __version__ = "0.1.0"
+__all__ = [
+    "ScanError",
+    "World",
+    "__version__",
+    "import_clouds",
+    "import_kitti_odometry",
+    "import_kitti_raw",
+    "import_photogrammetry",
+    "read_world",
+    "run",
+    "survey",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Load the API when it is first used: `import scan2sim` alone stays quick."""
+    if name in __all__:
+        return getattr(import_module("scan2sim.flows.api"), name)
+    raise AttributeError(f"module 'scan2sim' has no attribute {name!r}")

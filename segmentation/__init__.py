@@ -1,1 +1,1 @@
-"""Photos to classes per pixel to classes per point."""
+"""Semantic segmentation: classes per pixel of the photos, and from them classes per point of the cloud."""

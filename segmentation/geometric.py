@@ -1,13 +1,13 @@
-"""Classes from shape alone, for clouds that come without any.
+"""Point classification by shape alone, for clouds without classes.
 
 Ground by a morphological filter (SMRF: Pingel, Clarke, McBride, "An improved simple morphological
-filter for the terrain classification of airborne LIDAR data", ISPRS J. 77, 2013); what stands above
-it by the covariance of each point's neighbourhood (Demantke et al., "Dimensionality based scale
-selection in 3D lidar point clouds", ISPRS Laser Scanning 2011): smooth surfaces that are large and
-high are buildings, thin upright lines poles, compact smooth things of a car's size vehicles, and
-what is rough vegetation.
+filter for the terrain classification of airborne LIDAR data", ISPRS J. 77, 2013). Points above
+ground by the covariance of each point's neighbourhood (Demantke et al., "Dimensionality based scale
+selection in 3D lidar point clouds", ISPRS Laser Scanning 2011): large, high and smooth surfaces are
+buildings, thin upright lines are poles, compact smooth components of a car's size are vehicles, and
+rough components are vegetation.
 
-What stands above ground is looked at in voxels' centroids, and their classes carried back to the points.
+Points above ground are classified as centroids of voxels, and the classes are transferred back to the points.
 """
 
 from __future__ import annotations
@@ -23,35 +23,35 @@ from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F32, F64, I32, I64, U8, Bools, PointCloud
 
 NEIGHBOURS = 20
-FEW = 30  # points, fewer have no shape
-# ground (SMRF; tolerances in metres)
-CELL = 0.5
-SLOPE = 0.15  # rise over run that ground may have at the scale of the opening
-WINDOW = 45.0  # half the widest roof
-GROUND_GAP = 0.2  # how far from the ground's surface its points may be, on level ground
-BLIND = 5.0  # gaps wider than twice this are taken to be as low as what is around them
+MIN_POINTS = 30  # components with fewer points have no shape
+# ground (SMRF)
+GROUND_CELL_M = 0.5
+GROUND_MAX_SLOPE = 0.15  # rise over run at the scale of the morphological opening
+GROUND_WINDOW_M = 45.0  # largest radius of the opening: half the width of the widest roof
+GROUND_TOLERANCE_M = 0.2  # distance of ground points from the ground surface, where that is level
+GROUND_GAP_RADIUS_M = 5.0  # gaps wider than twice this are filled with the lowest height around them
 # surfaces
-SMOOTH = 0.04  # surface variation, smallest eigenvalue over the sum, at any point of a smooth surface
-EVEN = 0.018  # its mean over a surface that was built; smooth crowns are above
-BEND = 0.95  # cosine between neighbouring normals on one surface
-BUILDING_AREA, BUILDING_HEIGHT = 5.0, 2.2
-WALL_LENGTH, WALL_HEIGHT = 6.0, 0.8
-# things
-VEHICLE_LENGTH, VEHICLE_WIDTH, VEHICLE_HEIGHT = (1.8, 6.5), (0.7, 3.0), (0.9, 2.6)
-VEHICLE_VARIATION = 0.07
-DOORS = (0.3, 1.2)  # heights at which a car is separate from kerbs and crowns
-POLE_WIDTH, POLE_HEIGHT = 0.6, 1.5
-ROUGH = 0.03
-VOTES = 3
+SMOOTH_MAX_VARIATION = 0.04  # surface variation (smallest eigenvalue over the sum) of points on a smooth surface
+BUILT_MAX_MEAN_VARIATION = 0.018  # its mean over a built surface; smooth tree crowns are above
+SURFACE_MIN_NORMAL_COS = 0.95  # cosine between neighbouring normals on one surface
+BUILDING_MIN_AREA_M2, BUILDING_MIN_HEIGHT_M = 5.0, 2.2
+WALL_MIN_LENGTH_M, WALL_MIN_HEIGHT_M = 6.0, 0.8
+# objects
+VEHICLE_LENGTH_M, VEHICLE_WIDTH_M, VEHICLE_HEIGHT_M = (1.8, 6.5), (0.7, 3.0), (0.9, 2.6)
+VEHICLE_MAX_VARIATION = 0.07
+VEHICLE_BAND_M = (0.3, 1.2)  # heights of the doors, where a car is separate from kerbs and tree crowns
+POLE_MAX_WIDTH_M, POLE_MIN_HEIGHT_M = 0.6, 1.5
+VEGETATION_MIN_VARIATION = 0.03
+VOTING_ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Neighbourhoods of (M, 3) points.
+    """Local shape of (M, 3) points, from their neighbourhoods.
 
     Attributes:
-        near: (M, K) indices of the nearest points, nearest first, itself excluded.
-        gap: (M, K) metres to them.
+        near: (M, K) indices of the nearest points, nearest first, without the point itself.
+        gap: (M, K) distances to them in metres.
         variation: (M,) smallest eigenvalue over the sum: 0 on a plane or line, 1/3 in a ball.
         linearity: (M,) (largest - middle) / largest eigenvalue.
         normal: (M, 3) unit, direction of the smallest eigenvalue.
@@ -70,11 +70,13 @@ def classify(cloud: PointCloud, report: Report = silent, *, voxel: float = 0.2) 
     """(N,) LAS codes: terrain, low/mid/high vegetation, building, wall_or_fence, vehicle, pole, unclassified.
 
     Args:
-        voxel: metres; what is above ground is looked at in this detail. A neighbourhood, some five
-            voxels wide, should be large against the noise of merged sweeps and small against a car.
+        cloud: points to classify; only positions are used.
+        report: progress callback.
+        voxel: voxel size in metres above ground. A neighbourhood, about five voxels wide, should be
+            large compared to the noise of merged sweeps and small compared to a car.
     """
     xyz = cloud.xyz
-    if len(xyz) < FEW:
+    if len(xyz) < MIN_POINTS:
         return np.full(len(xyz), CODE["unclassified"], np.uint8)
     report(0.0, "ground")
     height, ground = split_ground(xyz)
@@ -82,28 +84,29 @@ def classify(cloud: PointCloud, report: Report = silent, *, voxel: float = 0.2) 
     classification[ground] = CODE["terrain"]
     above = np.flatnonzero(~ground & (height > 0))
     del ground
-    if len(above) >= FEW:
+    if len(above) >= MIN_POINTS:
         report(0.1, "voxels")
-        centre, of = _voxels(xyz[above], voxel)
-        count = np.bincount(of)
-        tall = (np.bincount(of, height[above]) / count).astype(np.float32)
-        if len(centre) >= FEW:
-            classification[above] = _above_ground(centre, tall, count.astype(np.float64), report)[of]
+        centre, voxel_index = _voxels(xyz[above], voxel)
+        count = np.bincount(voxel_index)
+        mean_height = (np.bincount(voxel_index, height[above]) / count).astype(np.float32)
+        if len(centre) >= MIN_POINTS:
+            codes = _above_ground(centre, mean_height, count.astype(np.float64), report)
+            classification[above] = codes[voxel_index]
     report(1.0, "done")
     return classification
 
 
 def split_ground(xyz: F32) -> tuple[F32, Bools]:
-    """Height above ground (N,) in metres, and whether each point is of the ground.
+    """Height above ground (N,) in metres, and whether each point is ground.
 
-    SMRF on a grid of the lowest points, with two additions: what lies below its surroundings by far is
-    no ground (multipath), and wide gaps without points are taken to be low, so that a roof with
-    nothing measured around it is still seen to stand out.
+    SMRF on a grid of the lowest points, with two additions: points far below their surroundings are
+    rejected (multipath), and wide gaps without points are filled with low heights, so that a roof
+    without measured ground around it still stands out.
     """
     from scipy import ndimage
 
     low = xyz[:, :2].min(axis=0)
-    at = (xyz[:, :2] - low) / CELL
+    at = (xyz[:, :2] - low) / GROUND_CELL_M
     index = at.astype(np.int64)
     shape = tuple(index.max(axis=0) + 1)
     flat = np.ravel_multi_index((index[:, 0], index[:, 1]), shape)
@@ -111,24 +114,26 @@ def split_ground(xyz: F32) -> tuple[F32, Bools]:
     np.minimum.at(lowest.reshape(-1), flat, xyz[:, 2])
     empty = ~np.isfinite(lowest)
     surface = _fill(lowest, empty)
-    pit = ndimage.grey_closing(surface, size=(3, 3)) - surface > 0.5 + 5 * SLOPE * CELL
-    blind = ndimage.distance_transform_edt(empty) * CELL > BLIND if empty.any() else empty
-    floor = ndimage.minimum_filter(ndimage.grey_closing(surface, size=(5, 5)), size=2 * int(WINDOW / CELL) + 1)
-    surface = np.where(blind, floor, _fill(surface, pit))
+    pit = ndimage.grey_closing(surface, size=(3, 3)) - surface > 0.5 + 5 * GROUND_MAX_SLOPE * GROUND_CELL_M
+    in_gap = ndimage.distance_transform_edt(empty) * GROUND_CELL_M > GROUND_GAP_RADIUS_M if empty.any() else empty
+    floor = ndimage.minimum_filter(
+        ndimage.grey_closing(surface, size=(5, 5)), size=2 * int(GROUND_WINDOW_M / GROUND_CELL_M) + 1
+    )
+    surface = np.where(in_gap, floor, _fill(surface, pit))
 
-    thing = empty | pit
+    not_ground = empty | pit
     opened = surface
-    for radius in _radii(round(WINDOW / CELL)):
+    for radius in _radii(round(GROUND_WINDOW_M / GROUND_CELL_M)):
         below = ndimage.grey_opening(opened, size=(2 * radius + 1,) * 2)
-        thing |= opened - below > SLOPE * radius * CELL
+        not_ground |= opened - below > GROUND_MAX_SLOPE * radius * GROUND_CELL_M
         opened = below
-    if thing.all():
+    if not_ground.all():
         return np.zeros(len(xyz), np.float32), np.ones(len(xyz), bool)
-    ground = ndimage.gaussian_filter(_fill(surface, thing), 1.0)
-    rise = np.hypot(*(np.gradient(ground, CELL, axis=k) if shape[k] > 1 else 0 * ground for k in (0, 1)))
-    here = (at - 0.5).T
-    height = xyz[:, 2] - ndimage.map_coordinates(ground, here, order=1, mode="nearest")
-    slack = GROUND_GAP + CELL * ndimage.map_coordinates(rise, here, order=1, mode="nearest")
+    ground = ndimage.gaussian_filter(_fill(surface, not_ground), 1.0)
+    rise = np.hypot(*(np.gradient(ground, GROUND_CELL_M, axis=k) if shape[k] > 1 else 0 * ground for k in (0, 1)))
+    grid_position = (at - 0.5).T
+    height = xyz[:, 2] - ndimage.map_coordinates(ground, grid_position, order=1, mode="nearest")
+    slack = GROUND_TOLERANCE_M + GROUND_CELL_M * ndimage.map_coordinates(rise, grid_position, order=1, mode="nearest")
     return height.astype(np.float32), np.abs(height) < slack
 
 
@@ -141,7 +146,7 @@ def _radii(widest: int) -> list[int]:
 
 
 def _fill(grid: F32, holes: Bools) -> F32:
-    """`grid` with its holes taken from the nearest cell that is none."""
+    """`grid` with its holes filled from the nearest other cell."""
     from scipy import ndimage
 
     if not holes.any():
@@ -156,9 +161,9 @@ def _voxels(xyz: F32, size: float) -> tuple[F32, I64]:
     spans = cells.max(axis=0) + 1
     keys = (cells[:, 0] * spans[1] + cells[:, 1]) * spans[2] + cells[:, 2]
     del cells
-    _, of, count = np.unique(keys, return_inverse=True, return_counts=True)
-    centre = np.stack([np.bincount(of, xyz[:, k]) / count for k in range(3)], axis=1)
-    return centre.astype(np.float32), of
+    _, index, count = np.unique(keys, return_inverse=True, return_counts=True)
+    centre = np.stack([np.bincount(index, xyz[:, k]) / count for k in range(3)], axis=1)
+    return centre.astype(np.float32), index
 
 
 def _above_ground(xyz: F32, height: F32, weight: F64, report: Report) -> U8:
@@ -167,12 +172,12 @@ def _above_ground(xyz: F32, height: F32, weight: F64, report: Report) -> U8:
     report(0.6, "surfaces")
     classification = np.zeros(len(xyz), np.uint8)
     _buildings(classification, xyz, height, shape)
-    report(0.8, "things")
+    report(0.8, "poles and vehicles")
     rough = _mean(shape.variation, shape)
     _poles(classification, xyz, shape)
     _vehicles(classification, xyz, height, shape, rough)
     rest = classification == 0
-    classification[rest & (rough > ROUGH)] = CODE["high_vegetation"]
+    classification[rest & (rough > VEGETATION_MIN_VARIATION)] = CODE["high_vegetation"]
     report(0.9, "votes")
     _vote(classification, shape)
     plant = classification == CODE["high_vegetation"]
@@ -183,7 +188,7 @@ def _above_ground(xyz: F32, height: F32, weight: F64, report: Report) -> U8:
 
 
 def describe(xyz: F32, weight: F64, k: int) -> Shape:
-    """Shape of the `k` nearest neighbours of each of (M, 3) points."""
+    """Shape of the neighbourhood of each point (M, 3): its `k` nearest points, weighted by `weight` (M,)."""
     from scipy.spatial import cKDTree
 
     n = len(xyz)
@@ -215,156 +220,158 @@ def _mean(values: F32, shape: Shape) -> F32:
 
 @dataclass(frozen=True)
 class Parts:
-    """Connected parts of some of the points.
+    """Connected components of some of the points.
 
     Attributes:
-        of: (M,) part of each point, -1 for points of none.
+        part: (M,) component of each point, -1 for points in none.
         low, high: (P, 3) bounding boxes.
-        count: (P,) points.
+        count: (P,) number of points.
     """
 
-    of: I64
+    part: I64
     low: F64
     high: F64
     count: I64
 
     @property
     def size(self) -> F64:
-        """(P, 3) metres along the axes."""
+        """(P, 3) size along the axes in metres."""
         return self.high - self.low
 
     def total(self, values: npt.NDArray[Any]) -> F64:
-        """(P,) sum of a value of each point over each part."""
-        inside = self.of >= 0
-        return np.bincount(self.of[inside], values[inside], len(self.count)).astype(np.float64)
+        """(P,) sum of the values (M,) over each component."""
+        inside = self.part >= 0
+        return np.bincount(self.part[inside], values[inside], len(self.count)).astype(np.float64)
 
     def mean(self, values: npt.NDArray[Any]) -> F64:
-        """(P,) mean of a value of each point over each part."""
+        """(P,) mean of the values (M,) over each component."""
         return self.total(values) / np.maximum(self.count, 1)
 
 
 def _parts(xyz: F32, member: Bools, a: I64, b: I64) -> Parts:
-    """Connected parts of the points that are `member`, over edges `a`-`b` between them."""
+    """Connected components of the points that are `member`, with edges from `a` to `b`."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     n = len(xyz)
     edges = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(n, n))
-    _, of = connected_components(edges, directed=False)
-    of = np.where(member, of, -1).astype(np.int64)
-    _, of[member] = np.unique(of[member], return_inverse=True)
-    return _boxes(xyz, of)
+    _, part = connected_components(edges, directed=False)
+    part = np.where(member, part, -1).astype(np.int64)
+    _, part[member] = np.unique(part[member], return_inverse=True)
+    return _boxes(xyz, part)
 
 
-def _boxes(xyz: F32, of: I64) -> Parts:
-    """Parts numbered 0, 1, ... by `of` (-1 for none), with their bounding boxes."""
-    count = np.bincount(of[of >= 0])
+def _boxes(xyz: F32, part: I64) -> Parts:
+    """Components numbered 0, 1, ... by `part` (-1 for none), with their bounding boxes."""
+    count = np.bincount(part[part >= 0])
     if len(count) == 0:
-        return Parts(of, np.empty((0, 3)), np.empty((0, 3)), count)
-    order = np.argsort(of, kind="stable")[np.count_nonzero(of < 0) :]
+        return Parts(part, np.empty((0, 3)), np.empty((0, 3)), count)
+    order = np.argsort(part, kind="stable")[np.count_nonzero(part < 0) :]
     starts = np.cumsum(count) - count
     low = np.minimum.reduceat(xyz[order], starts).astype(np.float64)
     high = np.maximum.reduceat(xyz[order], starts).astype(np.float64)
-    return Parts(of, low, high, count)
+    return Parts(part, low, high, count)
 
 
-def _edges(shape: Shape, member: Bools, k: int, reach: float) -> tuple[I64, I64]:
-    """Pairs of neighbours (first `k`) that are members, nearer than `reach` or than three times the local spacing."""
+def _edges(shape: Shape, member: Bools, k: int, distance: float) -> tuple[I64, I64]:
+    """Pairs of members among the first `k` neighbours, nearer than `distance` or three times the local spacing."""
     rows = np.flatnonzero(member)
     near, gap = shape.near[rows, :k], shape.gap[rows, :k]
-    close = (gap < np.maximum(reach, 3 * gap[:, :1])) & member[near]
+    close = (gap < np.maximum(distance, 3 * gap[:, :1])) & member[near]
     return rows[np.nonzero(close)[0]], near[close].astype(np.int64)
 
 
 def _buildings(classification: U8, xyz: F32, height: F32, shape: Shape) -> None:
-    """Large smooth surfaces: high ones are buildings, long low upright ones walls."""
-    smooth = shape.variation < SMOOTH
+    """Classify large smooth surfaces, in place: high ones are buildings, long low upright ones walls."""
+    smooth = shape.variation < SMOOTH_MAX_VARIATION
     a, b = _edges(shape, smooth, 8, 0.3)
-    same = np.abs(np.einsum("ni,ni->n", shape.normal[a], shape.normal[b])) > BEND
+    same = np.abs(np.einsum("ni,ni->n", shape.normal[a], shape.normal[b])) > SURFACE_MIN_NORMAL_COS
     parts = _parts(xyz, smooth, a[same], b[same])
     k = shape.gap.shape[1]
     area = parts.total(np.pi * shape.gap[:, -1] ** 2 / k)
     top = _top(parts, height)
     tilt = parts.mean(np.abs(shape.normal[:, 2]))
     length = np.hypot(parts.size[:, 0], parts.size[:, 1])
-    even = (parts.count >= FEW) & (parts.mean(shape.variation) < EVEN)
-    building = even & (area > BUILDING_AREA) & (top > BUILDING_HEIGHT)
-    wall = even & (tilt < 0.3) & (length > WALL_LENGTH) & (top > WALL_HEIGHT) & ~building
-    _paint(classification, parts, building, CODE["building"])
-    _paint(classification, parts, wall, CODE["wall_or_fence"])
-    # what hangs on a building and on little else: edges, balconies, sparsely seen walls
-    hangs = (classification[shape.near] == CODE["building"]).any(axis=1)
+    even = (parts.count >= MIN_POINTS) & (parts.mean(shape.variation) < BUILT_MAX_MEAN_VARIATION)
+    building = even & (area > BUILDING_MIN_AREA_M2) & (top > BUILDING_MIN_HEIGHT_M)
+    wall = even & (tilt < 0.3) & (length > WALL_MIN_LENGTH_M) & (top > WALL_MIN_HEIGHT_M) & ~building
+    _assign(classification, parts, building, CODE["building"])
+    _assign(classification, parts, wall, CODE["wall_or_fence"])
+    # components attached to a building and to little else: edges, balconies, sparsely scanned walls
+    attached = (classification[shape.near] == CODE["building"]).any(axis=1)
     parts = _parts(xyz, classification == 0, *_edges(shape, classification == 0, 8, 0.3))
-    _paint(classification, parts, parts.mean(hangs) > 0.5, CODE["building"])
+    _assign(classification, parts, parts.mean(attached) > 0.5, CODE["building"])
 
 
 def _poles(classification: U8, xyz: F32, shape: Shape) -> None:
-    """Thin upright lines, trunks of trees among them."""
+    """Classify thin upright lines, including tree trunks, as poles, in place."""
     line = (classification == 0) & (shape.linearity > 0.6) & (shape.upright > 0.9)
     parts = _parts(xyz, line, *_edges(shape, line, NEIGHBOURS, 0.4))
-    thin = (np.hypot(parts.size[:, 0], parts.size[:, 1]) < POLE_WIDTH) & (parts.size[:, 2] > POLE_HEIGHT)
-    _paint(classification, parts, thin, CODE["pole"])
+    thin = (np.hypot(parts.size[:, 0], parts.size[:, 1]) < POLE_MAX_WIDTH_M) & (parts.size[:, 2] > POLE_MIN_HEIGHT_M)
+    _assign(classification, parts, thin, CODE["pole"])
 
 
 def _vehicles(classification: U8, xyz: F32, height: F32, shape: Shape, rough: F32) -> None:
-    """Compact things of a car's size, smoother than bushes.
+    """Classify compact components of a car's size that are smoother than bushes as vehicles, in place.
 
-    Parked cars touch what is beside them near the ground and crowns overhang them, so they are found
-    apart in a band at the height of their doors; what is above and below it follows.
+    Parked cars touch other objects near the ground, and tree crowns overhang them. They are separated
+    in a band at the height of their doors; the points above and below are assigned to the nearest
+    component in the band.
     """
     from scipy.spatial import cKDTree
 
     free = (classification == 0) & ~((shape.linearity > 0.5) & (shape.upright > 0.9))
-    band = np.flatnonzero(free & (height > DOORS[0]) & (height < DOORS[1]))
+    band = np.flatnonzero(free & (height > VEHICLE_BAND_M[0]) & (height < VEHICLE_BAND_M[1]))
     if len(band) == 0:
         return
     inside = np.zeros(len(classification), bool)
     inside[band] = True
-    of = _parts(xyz, inside, *_edges(shape, inside, NEIGHBOURS, 0.3)).of
-    rest = np.flatnonzero(free & ~inside & (height < VEHICLE_HEIGHT[1]))
+    part = _parts(xyz, inside, *_edges(shape, inside, NEIGHBOURS, 0.3)).part
+    rest = np.flatnonzero(free & ~inside & (height < VEHICLE_HEIGHT_M[1]))
     gap, nearest = cKDTree(xyz[band, :2]).query(xyz[rest, :2], distance_upper_bound=0.3)
     close = np.isfinite(gap)
-    of[rest[close]] = of[band[nearest[close]]]
-    parts = _boxes(xyz, of)
+    part[rest[close]] = part[band[nearest[close]]]
+    parts = _boxes(xyz, part)
     length, width = _footprints(parts, xyz)
     top = _top(parts, height)
-    car = (length > VEHICLE_LENGTH[0]) & (length < VEHICLE_LENGTH[1]) & (top > VEHICLE_HEIGHT[0])
-    car &= (width > VEHICLE_WIDTH[0]) & (width < VEHICLE_WIDTH[1]) & (parts.mean(rough) < VEHICLE_VARIATION)
-    _paint(classification, parts, car, CODE["vehicle"])
+    car = (length > VEHICLE_LENGTH_M[0]) & (length < VEHICLE_LENGTH_M[1]) & (top > VEHICLE_HEIGHT_M[0])
+    car &= (width > VEHICLE_WIDTH_M[0]) & (width < VEHICLE_WIDTH_M[1]) & (parts.mean(rough) < VEHICLE_MAX_VARIATION)
+    _assign(classification, parts, car, CODE["vehicle"])
 
 
 def _top(parts: Parts, height: F32) -> F64:
-    """(P,) largest height above ground of each part."""
-    inside = parts.of >= 0
+    """(P,) largest height above ground of each component."""
+    inside = parts.part >= 0
     top = np.zeros(len(parts.count))
-    np.maximum.at(top, parts.of[inside], height[inside])
+    np.maximum.at(top, parts.part[inside], height[inside])
     return top
 
 
 def _footprints(parts: Parts, xyz: F32) -> tuple[F64, F64]:
-    """(P,) length and width of each part seen from above, along its principal axes."""
+    """(P,) length and width of each component in plan, along its principal axes."""
     length, width = np.zeros(len(parts.count)), np.zeros(len(parts.count))
-    order = np.argsort(parts.of, kind="stable")
-    ends = np.searchsorted(parts.of[order], np.arange(len(parts.count) + 1))
-    for i in np.flatnonzero(parts.count >= FEW):
+    order = np.argsort(parts.part, kind="stable")
+    ends = np.searchsorted(parts.part[order], np.arange(len(parts.count) + 1))
+    for i in np.flatnonzero(parts.count >= MIN_POINTS):
         xy = xyz[order[ends[i] : ends[i + 1]], :2].astype(np.float64)
         xy -= xy.mean(axis=0)
         along = xy @ np.linalg.eigh(xy.T @ xy)[1]
-        low, high = np.percentile(along, (3, 97), axis=0)  # mixed pixels stray
+        low, high = np.percentile(along, (3, 97), axis=0)  # mixed pixels are outliers
         width[i], length[i] = np.sort(high - low)
     return length, width
 
 
-def _paint(classification: U8, parts: Parts, chosen: Bools, code: int) -> None:
-    inside = np.flatnonzero(parts.of >= 0)
-    classification[inside[chosen[parts.of[inside]]]] = code
+def _assign(classification: U8, parts: Parts, selected: Bools, code: int) -> None:
+    """Assign a class to the points of the `selected` (P,) components, in place."""
+    inside = np.flatnonzero(parts.part >= 0)
+    classification[inside[selected[parts.part[inside]]]] = code
 
 
 def _vote(classification: U8, shape: Shape) -> None:
-    """Points take the class of most of their neighbours; poles and vehicles stay as they are."""
+    """Majority vote among each point's neighbours, in place; poles and vehicles keep their class."""
     fixed = np.isin(classification, (CODE["pole"], CODE["vehicle"]))
     codes = np.unique(classification)
-    for _ in range(VOTES):
+    for _ in range(VOTING_ROUNDS):
         best, most = classification.copy(), np.zeros(len(classification), np.int16)
         for code in codes:
             votes = (classification == code)[shape.near].sum(axis=1, dtype=np.int16) - (1 if code == 0 else 0)

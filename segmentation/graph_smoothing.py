@@ -1,8 +1,9 @@
-"""Smooth: photos' votes and the points' shape together, so that classes end at real edges. Import late: loads numba.
+"""Smoothing of point classes by a conditional random field (CRF) on the neighbourhood graph. Import late: loads numba.
 
-Shape is classified without photos (`segmentation.geometric`): how likely each class is to have a shape is a
-table. A mean field over each point's nearest neighbours (Krahenbuhl and Koltun, NIPS 2011, on a graph instead of a
-lattice) then lets alike neighbours agree: alike are those whose normals and colours are.
+Unary potentials combine the votes of the photos with the likelihood of each class given the shape, which is classified
+without photos (`segmentation.geometric`). Mean field inference over each point's nearest neighbours (Krahenbuhl and
+Koltun, NIPS 2011, on a graph instead of a lattice) makes similar neighbours agree, so that classes end at real edges;
+the similarity depends on normals and colours.
 """
 
 from __future__ import annotations
@@ -14,28 +15,32 @@ from numba import njit, prange
 
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.types import F32, I32, U8, Bools, PointCloud
-from scan2sim.segmentation.labels import CLASSES, GROUND, SKY
-from scan2sim.segmentation.postprocess import by_height, with_feet, without_specks
+from scan2sim.segmentation.labels import CLASSES, GROUND_CLASSES, SKY
+from scan2sim.segmentation.postprocess import correct_vegetation_height, correct_wall_feet, remove_specks
 from scan2sim.segmentation.votes import Votes
 
 NEIGHBOURS = 24
-ROUNDS = 10
-PULL = 16.0
-"""Weight of all neighbours together against a point's own evidence."""
-TRUST = 0.25
-"""Power of the shape's likelihood beside photos: features of one place aren't independent."""
-ENOUGH = 0.6
-"""Votes' weight at which a point's photos say all that they can."""
-UNSURE = 0.02
-UNSEEN = 0.05
-"""Votes' weight up to which a point counts as unseen."""
-REACH_GROUND, REACH, LENT, LENDERS = 4.0, 2.0, 1.0, 8
-"""Metres over which the unseen takes after the seen, the share at no distance, and of how many."""
-ABOVE = 0.4
-"""Metres above ground: what no built thing or plant is and photos take for ground there was seen through: it moved."""
-LIKELY: dict[str, dict[str, float]] = {
-    # what the shape says: how often a class has it, against the others; what isn't named: 0.05
-    "terrain": dict.fromkeys(GROUND, 1.0) | {"low_vegetation": 0.15, "vehicle": 0.08, "wall_or_fence": 0.08},
+MEAN_FIELD_ITERATIONS = 10
+PAIRWISE_WEIGHT = 16.0
+"""Weight of all neighbours together, relative to the unary potentials."""
+SHAPE_LIKELIHOOD_POWER = 0.25
+"""Exponent of the shape's likelihood beside photos: the evidence of neighbouring points is not independent."""
+FULL_VOTE_WEIGHT = 0.6
+"""Weight of votes from which the photos' probabilities count in full."""
+PROBABILITY_FLOOR = 0.02
+"""Added to the photos' probabilities before the logarithm."""
+UNSEEN_VOTE_WEIGHT = 0.05
+"""Weight of votes up to which a point counts as unseen."""
+TRANSFER_DISTANCE_GROUND_M, TRANSFER_DISTANCE_M = 4.0, 2.0
+"""Decay length in metres of the transfer of potentials from seen to unseen points, on the ground and above it."""
+TRANSFER_WEIGHT, TRANSFER_NEIGHBOURS = 1.0, 8
+"""Weight of the transfer at no distance, and number of seen neighbours that are averaged."""
+SEEN_THROUGH_MIN_HEIGHT_M = 0.4
+"""Height above ground from which points of vehicle or unclassified shape that photos classify as ground are assumed to
+have been seen through: a moving vehicle."""
+SHAPE_LIKELIHOODS: dict[str, dict[str, float]] = {
+    # by shape class: how often each class has this shape, relative to the other classes; 0.05 for classes not listed
+    "terrain": dict.fromkeys(GROUND_CLASSES, 1.0) | {"low_vegetation": 0.15, "vehicle": 0.08, "wall_or_fence": 0.08},
     "building": {"building": 1.0, "wall_or_fence": 0.4, "road_sign": 0.15, "high_vegetation": 0.15, "vehicle": 0.15,
                  "pole": 0.15, "low_vegetation": 0.1},
     "wall_or_fence": {"wall_or_fence": 1.0, "building": 0.6, "low_vegetation": 0.6, "vehicle": 0.2},
@@ -44,10 +49,10 @@ LIKELY: dict[str, dict[str, float]] = {
     "vegetation": {"high_vegetation": 1.0, "low_vegetation": 1.0, "building": 0.25, "wall_or_fence": 0.3,
                    "vehicle": 0.25, "pole": 0.3, "road_sign": 0.3, "person": 0.3},
 }  # fmt: skip
-"""What the geometric classes say of the classes."""
+"""Likelihood of each class given the class by shape alone."""
 
 
-def decide(
+def smooth_classes(
     votes: Votes,
     shape: U8,
     height: F32,
@@ -57,56 +62,57 @@ def decide(
     knows_low_vegetation: bool,
     normal_pull: float = 4.0,
 ) -> tuple[U8, F32]:
-    """Index into `CLASSES` (N,), and its probability (N,).
+    """Class of each point, index into `CLASSES` (N,), and its probability (N,).
 
     Args:
-        votes: of the photos.
+        votes: votes of the photos.
         shape: (N,) LAS codes classified by shape alone.
         height: (N,) metres above ground.
-        moved: (N,) which points are of moving things (`segmentation.transient_points`).
-        cloud: the points, with normals; colours are used where there are any.
-        knows_low_vegetation: whether the network distinguishes low from high vegetation; else height does.
-        normal_pull: sharpness by which neighbours with other normals count less.
+        moved: (N,) points of moving objects (`segmentation.transient_points`).
+        cloud: points with normals; colours are used if there are any.
+        knows_low_vegetation: whether the network distinguishes low from high vegetation; otherwise height does.
+        normal_pull: sharpness by which neighbours with other normals are down-weighted.
     """
     from scipy.spatial import cKDTree
 
-    unary = evidence(votes, shape, height, moved, knows_low_vegetation=knows_low_vegetation)
+    unary = unary_potentials(votes, shape, height, moved, knows_low_vegetation=knows_low_vegetation)
     k = min(NEIGHBOURS, len(cloud) - 1)
     tree = cKDTree(cloud.xyz)
-    _borrow(unary, votes.weight, shape, cloud.xyz)
+    _transfer_to_unseen(unary, votes.weight, shape, cloud.xyz)
     _, near = tree.query(cloud.xyz, k + 1, workers=-1)
     near = near[:, 1:].astype(np.int32)
     assert cloud.normal is not None
     rgb = np.zeros((0, 3), np.uint8) if cloud.rgb is None else cloud.rgb
-    alike = _alike(near, cloud.normal, rgb, normal_pull)
-    settled = mean_field(unary, near, alike)
-    best = settled.argmax(axis=1).astype(np.uint8)
-    probability = np.empty_like(settled)  # agreeing neighbours make sure of anything: count them as one witness
-    _settle(unary, settled, near, alike, probability, np.float32(1))
-    sure = probability[np.arange(len(best)), best]
-    best = without_specks(best, height, cloud.xyz, near[:, :8])
-    best = with_feet(best, cloud.normal, near)
-    return by_height(best, height, cloud.xyz), sure.astype(np.float32)
+    similarity = _similarity(near, cloud.normal, rgb, normal_pull)
+    marginals = mean_field(unary, near, similarity)
+    best = marginals.argmax(axis=1).astype(np.uint8)
+    # mean field is overconfident where neighbours agree: for the confidence all neighbours count as one observation
+    probability = np.empty_like(marginals)
+    _mean_field_step(unary, marginals, near, similarity, probability, np.float32(1))
+    confidence = probability[np.arange(len(best)), best]
+    best = remove_specks(best, height, cloud.xyz, near[:, :8])
+    best = correct_wall_feet(best, cloud.normal, near)
+    return correct_vegetation_height(best, height, cloud.xyz), confidence.astype(np.float32)
 
 
 def likelihood(shape: U8) -> F32:
-    """(N, C) how likely points of each class are to have `shape` (LAS codes classified by shape alone)."""
+    """(N, C) likelihood of `shape` (N,) (LAS codes classified by shape alone) for each class."""
     plants = ("low_vegetation", "mid_vegetation", "high_vegetation")
     table = np.full((256, len(CLASSES)), 0.3, np.float32)
-    for name, row in LIKELY.items():
+    for name, row in SHAPE_LIKELIHOODS.items():
         values = [row.get(c, 0.05) for c in CLASSES]
         for code in [CODE[p] for p in plants] if name == "vegetation" else [CODE[name]]:
             table[code] = values
     return table[shape]
 
 
-def evidence(votes: Votes, shape: U8, height: F32, moved: Bools, *, knows_low_vegetation: bool) -> F32:
-    """(N, C) logarithms of what photos and shape say of each point, by itself."""
-    seen = np.minimum(1.0, votes.weight / ENOUGH)[:, None]
+def unary_potentials(votes: Votes, shape: U8, height: F32, moved: Bools, *, knows_low_vegetation: bool) -> F32:
+    """(N, C) log probabilities of the classes of each point by photos and shape, without its neighbours."""
+    seen = np.minimum(1.0, votes.weight / FULL_VOTE_WEIGHT)[:, None]
     share = votes.score / np.maximum(votes.weight, 1e-9)[:, None]
     flat = 1.0 / (len(CLASSES) - 1)
     photos = seen * share + (1 - seen) * flat
-    if not knows_low_vegetation:  # a network that knows vegetation alone: height parts it
+    if not knows_low_vegetation:  # the network has one class of vegetation: split it by height
         low, high = CLASSES.index("low_vegetation"), CLASSES.index("high_vegetation")
         both = photos[:, low] + photos[:, high]
         tall = 1 / (1 + np.exp(-(height - 1.5) / 0.4))
@@ -115,36 +121,37 @@ def evidence(votes: Votes, shape: U8, height: F32, moved: Bools, *, knows_low_ve
     trust = np.where(moved, np.where(shape == CODE["building"], 0.4, 0.85), 0.0).astype(np.float32)[:, None]
     photos = photos * (1 - trust)
     photos[:, vehicle] += trust[:, 0]
-    through = (height > ABOVE) & np.isin(shape, (CODE["vehicle"], CODE["unclassified"]))
-    ground = np.array([CLASSES.index(name) for name in GROUND])
+    through = (height > SEEN_THROUGH_MIN_HEIGHT_M) & np.isin(shape, (CODE["vehicle"], CODE["unclassified"]))
+    ground = np.array([CLASSES.index(name) for name in GROUND_CLASSES])
     photos[through, vehicle] += photos[through][:, ground].sum(axis=1)
     photos[np.ix_(np.flatnonzero(through), ground)] = 0
-    out = np.log(photos + UNSURE) + np.where(
-        moved[:, None], 0, TRUST * np.log(likelihood(shape)) * (1 + 1.5 * (1 - seen))
+    out = np.log(photos + PROBABILITY_FLOOR) + np.where(
+        moved[:, None], 0, SHAPE_LIKELIHOOD_POWER * np.log(likelihood(shape)) * (1 + 1.5 * (1 - seen))
     )
     out[:, SKY] = -20
     return out.astype(np.float32)
 
 
-def _borrow(unary: F32, weight: F32, shape: U8, xyz: F32) -> None:
-    """What no photo sees takes after the nearest that one sees: ground after ground, the rest after the rest."""
+def _transfer_to_unseen(unary: F32, weight: F32, shape: U8, xyz: F32) -> None:
+    """Add the potentials of the nearest seen points to unseen points, in place; separately on and above the ground."""
     from scipy.spatial import cKDTree
 
     ground = shape == CODE["terrain"]
-    for kind, reach in ((ground, REACH_GROUND), (~ground, REACH)):
-        want, have = np.flatnonzero(kind & (weight <= UNSEEN)), np.flatnonzero(kind & (weight > UNSEEN))
-        if not len(want) or not len(have):
+    for group, decay_length in ((ground, TRANSFER_DISTANCE_GROUND_M), (~ground, TRANSFER_DISTANCE_M)):
+        unseen = np.flatnonzero(group & (weight <= UNSEEN_VOTE_WEIGHT))
+        seen = np.flatnonzero(group & (weight > UNSEEN_VOTE_WEIGHT))
+        if not len(unseen) or not len(seen):
             continue
-        k = min(LENDERS, len(have))
-        distance, at = cKDTree(xyz[have]).query(xyz[want], k=[*range(1, k + 1)], workers=-1)
-        near = (LENT * np.exp(-distance[:, 0] / reach))[:, None].astype(np.float32)
-        lent = sum(unary[have[at[:, j]]] for j in range(k)) / np.float32(k)
-        unary[want] += near * (lent - lent.max(axis=1, keepdims=True))
+        k = min(TRANSFER_NEIGHBOURS, len(seen))
+        distance, at = cKDTree(xyz[seen]).query(xyz[unseen], k=[*range(1, k + 1)], workers=-1)
+        share = (TRANSFER_WEIGHT * np.exp(-distance[:, 0] / decay_length))[:, None].astype(np.float32)
+        mean = sum(unary[seen[at[:, j]]] for j in range(k)) / np.float32(k)
+        unary[unseen] += share * (mean - mean.max(axis=1, keepdims=True))
 
 
 @njit(cache=True, parallel=True)
-def _alike(near: I32, normals: F32, rgb: U8, pull: float) -> F32:
-    """(N, K) float32 weights of neighbours that sum to 1 or less."""
+def _similarity(near: I32, normals: F32, rgb: U8, normal_pull: float) -> F32:
+    """(N, K) float32 weights of the neighbours by normals and colours; they sum to at most 1."""
     n, k = near.shape
     out = np.empty((n, k), np.float32)
     for i in prange(n):
@@ -153,7 +160,7 @@ def _alike(near: I32, normals: F32, rgb: U8, pull: float) -> F32:
             dot = 0.0
             for c in range(3):
                 dot += normals[i, c] * normals[o, c]
-            w = math.exp(-pull * (1 - abs(dot)))
+            w = math.exp(-normal_pull * (1 - abs(dot)))
             if rgb.shape[0] > 0:
                 d2 = 0.0
                 for c in range(3):
@@ -164,27 +171,28 @@ def _alike(near: I32, normals: F32, rgb: U8, pull: float) -> F32:
     return out
 
 
-def mean_field(unary: F32, near: I32, alike: F32) -> F32:
-    """(N, C) probabilities after `ROUNDS` rounds."""
+def mean_field(unary: F32, near: I32, similarity: F32) -> F32:
+    """(N, C) marginal probabilities after `MEAN_FIELD_ITERATIONS` iterations."""
     q = np.empty_like(unary)
-    _settle(unary, unary, near, alike, q, np.float32(0))
-    for _ in range(ROUNDS):
+    _mean_field_step(unary, unary, near, similarity, q, np.float32(0))
+    for _ in range(MEAN_FIELD_ITERATIONS):
         new = np.empty_like(q)
-        _settle(unary, q, near, alike, new, np.float32(PULL))
+        _mean_field_step(unary, q, near, similarity, new, np.float32(PAIRWISE_WEIGHT))
         q = new
     return q
 
 
 @njit(cache=True, parallel=True)
-def _settle(unary: F32, q: F32, near: I32, alike: F32, out: F32, pull: np.float32) -> None:
+def _mean_field_step(unary: F32, q: F32, near: I32, similarity: F32, out: F32, pairwise_weight: np.float32) -> None:
+    """One mean field update of the probabilities `q` (N, C) into `out` (N, C)."""
     n, classes = unary.shape
     for i in prange(n):
         most = -1e30
         for c in range(classes):
             value = unary[i, c]
-            if pull > 0:
+            if pairwise_weight > 0:
                 for j in range(near.shape[1]):
-                    value += pull * alike[i, j] * q[near[i, j], c]
+                    value += pairwise_weight * similarity[i, j] * q[near[i, j], c]
             out[i, c] = value
             most = max(most, value)
         total = 0.0

@@ -1,4 +1,4 @@
-"""The classes that networks predict, as LAS codes, and how the label sets of others map onto them by name."""
+"""Classes that networks predict, their LAS codes, and the mapping of other label sets onto them by name."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from scan2sim.pipeline.core.classes import CODE, SHOWN
+from scan2sim.pipeline.core.classes import CODE, PHOTO_CLASSES
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import U8
 
-CLASSES = SHOWN
-GROUND = ("road", "sidewalk", "terrain")
+CLASSES = PHOTO_CLASSES
+GROUND_CLASSES = ("road", "sidewalk", "terrain")
 SKY = CLASSES.index("sky")
+"""Index of the sky."""
 IGNORED = 255
-"""Index of what is not to be learnt, or says nothing."""
+"""Index of pixels that are ignored in training, and of labels without a class."""
 
 
 def code_of_index() -> U8:
@@ -23,7 +24,7 @@ def code_of_index() -> U8:
 
 
 def index_of_code() -> U8:
-    """(256,) index into `CLASSES` of a LAS code; code 0 is the sky, 255 and what networks don't predict `IGNORED`."""
+    """(256,) index into `CLASSES` of each LAS code; 0 is sky; 255 and codes without a class are `IGNORED`."""
     table = np.full(256, IGNORED, np.uint8)
     for i, name in enumerate(CLASSES):
         table[CODE.get(name, 0)] = i
@@ -31,20 +32,20 @@ def index_of_code() -> U8:
     return table
 
 
-def _named(**names: str) -> dict[str, str]:
-    """Comma-separated foreign names by class, turned round."""
+def _class_by_label(**names: str) -> dict[str, str]:
+    """Class by label name, from comma-separated label names by class."""
     return {name.strip(): ours for ours, many in names.items() for name in many.split(",")}
 
 
 LABEL_SETS: dict[str, dict[str, str]] = {
-    "cityscapes": _named(
+    "cityscapes": _class_by_label(
         road="road, parking, ground, bridge, tunnel", sidewalk="sidewalk", terrain="terrain, rail track, dynamic",
         building="building", road_sign="traffic sign, traffic light", pole="pole, polegroup",
         high_vegetation="vegetation", person="person, rider",
         vehicle="car, truck, bus, train, motorcycle, bicycle, caravan, trailer, license plate, ego vehicle",
         wall_or_fence="wall, fence, guard rail", sky="sky",
     ),
-    "vistas": _named(
+    "vistas": _class_by_label(
         road="road, bike lane, crosswalk - plain, lane marking - crosswalk, lane marking - general, parking, "
         "service lane, manhole, catch basin, pothole, bridge, tunnel, rail track",
         sidewalk="sidewalk, pedestrian area, curb, curb cut", terrain="terrain, sand, snow, mountain, water",
@@ -56,7 +57,7 @@ LABEL_SETS: dict[str, dict[str, str]] = {
         "ego vehicle, car mount",
         wall_or_fence="wall, fence, guard rail, barrier", sky="sky",
     ),
-    "ade20k": _named(
+    "ade20k": _class_by_label(
         road="road, runway, path, dirt track", sidewalk="sidewalk, stairs, step, stairway",
         terrain="earth, grass, field, sand, land, hill, mountain, rock, water, floor",
         building="building, house, skyscraper, hovel, tower, windowpane, door, awning, booth, column, bridge, canopy",
@@ -69,15 +70,15 @@ LABEL_SETS: dict[str, dict[str, str]] = {
 }  # fmt: skip
 
 
-def mapped(names: Sequence[str], where: str) -> U8:
-    """(len(names),) index into `CLASSES` of every label of a network, `IGNORED` where it has none of ours.
+def map_labels(names: Sequence[str], where: str) -> U8:
+    """(len(names),) index into `CLASSES` of every label of a network, `IGNORED` for labels without a class.
 
     Args:
-        names: of the network's labels, in order, of any of `LABEL_SETS`; the set is found by them.
-        where: the file, for the message.
+        names: names of the network's labels, in order; the best matching set of `LABEL_SETS` is used.
+        where: file with the labels, for the error message.
 
     Raises:
-        InputError: the names are of no known set.
+        InputError: the names belong to none of `LABEL_SETS`.
     """
     plain = [name.lower().strip().split(";")[0].split(",")[0] for name in names]
     best = max(LABEL_SETS, key=lambda key: sum(name in LABEL_SETS[key] for name in plain))
@@ -86,7 +87,7 @@ def mapped(names: Sequence[str], where: str) -> U8:
     if len({table[name] for name in known}) < 4:
         raise InputError(
             where,
-            f"tells labels of no known set ({', '.join(list(names)[:6])} ...)",
+            f"unknown label set ({', '.join(list(names)[:6])} ...)",
             f"Use weights trained on one of: {', '.join(LABEL_SETS)}",
         )
     return np.array([CLASSES.index(table[name]) if name in table else IGNORED for name in plain], np.uint8)

@@ -1,11 +1,11 @@
-"""Channels beside the colours: what a scan measures of each pixel's height, distance and slope.
+"""Lidar channels of a network's input: height, distance and slope of each pixel, measured by a scan.
 
-A picture of them is (h, w, 4) uint8, at a `FRACTION`-th of the pixels that a network looks at:
+An image of them is (h, w, 4) uint8, at 1/`DOWNSAMPLING` of the resolution at which a network classifies a photo:
 
-- height above the ground, of the level that a few metres of it have: kerbs and walls both show (`coded_height`);
-- distance, by its logarithm;
-- how level the surface is: the upward part of its normal, without sign;
-- 255 where the scan has something, else 0 in all four.
+- height above the ground level, averaged over a few metres, so that both kerbs and walls show (`encode_height`);
+- logarithm of the distance;
+- slope of the surface: |z| of its normal;
+- validity: 255 where the scan has a point; elsewhere all four are 0.
 """
 
 from __future__ import annotations
@@ -17,58 +17,62 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64, U8
 
-COUNT = 4
-FRACTION = 4
-CELL = 0.5
-"""Metres of the ground's raster."""
-LEVELLED = 2.0
-"""Metres, standard deviation, over which the ground is levelled: pavements stay above roads, hills don't show."""
-NEAR, FAR = 0.5, 120.0
-"""Metres between which distances are told apart."""
+CHANNELS = 4
+DOWNSAMPLING = 4
+GROUND_CELL_M = 0.5
+"""Cell size of the ground level's grid."""
+GROUND_SIGMA_M = 2.0
+"""Sigma of the Gaussian that smooths the ground level: pavements stay above roads, hills don't show."""
+MIN_DISTANCE_M, MAX_DISTANCE_M = 0.5, 120.0
+"""Range of encoded distances."""
 
 
 @dataclass(frozen=True)
-class Level:
-    """The ground's level: (X, Y) heights, `CELL` apart from `low` (2,) on, local metres."""
+class GroundLevel:
+    """Smoothed ground level: (X, Y) heights on a grid of `GROUND_CELL_M` from `low` (2,), local metres."""
 
     low: F64
     height: F32
 
     def above(self, xyz: F32) -> F32:
-        """(N,) metres of points (N, 3) above it."""
+        """(N,) heights of points (N, 3) above the ground level in metres."""
         from scipy.ndimage import map_coordinates
 
-        at = ((xyz[:, :2] - self.low) / CELL - 0.5).T
+        at = ((xyz[:, :2] - self.low) / GROUND_CELL_M - 0.5).T
         return np.asarray(xyz[:, 2] - map_coordinates(self.height, at, order=1, mode="nearest"), np.float32)
 
 
-def level(ground: F32) -> Level:
-    """Of points (N, 3) on the ground: their mean height by cell, levelled; where none is near, that of the nearest."""
+def ground_level(ground: F32) -> GroundLevel:
+    """Ground level of ground points (N, 3): smoothed mean height per cell, extrapolated from the nearest cell."""
     from scipy import ndimage
 
     low = ground[:, :2].min(axis=0).astype(np.float64)
-    cells = ((ground[:, :2] - low) / CELL).astype(np.int64)
+    cells = ((ground[:, :2] - low) / GROUND_CELL_M).astype(np.int64)
     shape = tuple(cells.max(axis=0) + 1)
     flat = np.ravel_multi_index((cells[:, 0], cells[:, 1]), shape)
     count = np.bincount(flat, minlength=shape[0] * shape[1]).reshape(shape)
     total = np.bincount(flat, ground[:, 2], shape[0] * shape[1]).reshape(shape)
     known = (count > 0).astype(np.float64)
     mean = total / np.maximum(count, 1)
-    sigma = LEVELLED / CELL
+    sigma = GROUND_SIGMA_M / GROUND_CELL_M
     share = ndimage.gaussian_filter(known, sigma)
-    levelled = ndimage.gaussian_filter(mean * known, sigma) / np.maximum(share, 1e-6)
+    smoothed = ndimage.gaussian_filter(mean * known, sigma) / np.maximum(share, 1e-6)
     nearest = ndimage.distance_transform_edt(share < 1e-3, return_distances=False, return_indices=True)
-    return Level(low, levelled[tuple(nearest)].astype(np.float32))
+    return GroundLevel(low, smoothed[tuple(nearest)].astype(np.float32))
 
 
-def coded_height(metres: F32) -> F32:
-    """Code 0 to 255 of heights: 128 the ground's level, steps of 4 mm there and of 70 cm at 16 m."""
+def encode_height(metres: F32) -> F32:
+    """Codes 0 to 255 of heights: 128 at ground level; resolution 4 mm there and 70 cm at 16 m."""
     return np.clip(128 + 25 * np.sign(metres) * np.log1p(np.abs(metres) / 0.1), 0, 255)
 
 
-def coded(height: F32, distance: F32, up: F32) -> U8:
-    """(..., 4) codes of height, distance (metres, inf: nothing there) and upward part of the normal."""
-    there = np.isfinite(distance) & (distance < FAR)
-    far = 255 * np.log(np.clip(distance, NEAR, FAR) / NEAR) / math.log(FAR / NEAR)
-    codes = np.stack([coded_height(height), far, 255 * np.abs(up), np.full(far.shape, 255)], axis=-1)
-    return np.where(there[..., None], np.nan_to_num(codes) + 0.5, 0).astype(np.uint8)
+def encode(height: F32, distance: F32, up: F32) -> U8:
+    """(..., 4) codes of height and distance (metres, inf: no point) and of |z| of the normal."""
+    valid = np.isfinite(distance) & (distance < MAX_DISTANCE_M)
+    far = (
+        255
+        * np.log(np.clip(distance, MIN_DISTANCE_M, MAX_DISTANCE_M) / MIN_DISTANCE_M)
+        / math.log(MAX_DISTANCE_M / MIN_DISTANCE_M)
+    )
+    codes = np.stack([encode_height(height), far, 255 * np.abs(up), np.full(far.shape, 255)], axis=-1)
+    return np.where(valid[..., None], np.nan_to_num(codes) + 0.5, 0).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Score: predicted classes against known ones."""
+"""Evaluation of predicted classes against ground truth: confusion matrix and intersection over union (IoU)."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from scan2sim.pipeline.core.classes import CLASSES, CODE, UNKNOWN
 from scan2sim.pipeline.core.types import I64, U8
 
 MEAN_OF = ("road", "terrain", "building", "low_vegetation", "high_vegetation")
-"""Classes that the mean intersection over union is of."""
+"""Classes over which the mean intersection over union is taken."""
 
 
 @dataclass(frozen=True)
 class Confusion:
-    """How many points of each class were classified as each.
+    """Confusion matrix.
 
     Attributes:
         codes: (K,) LAS codes that occur.
-        count: (K, K) rows: known, columns: predicted.
+        count: (K, K) number of points; rows: true class, columns: predicted class.
     """
 
     codes: tuple[int, ...]
@@ -27,7 +27,7 @@ class Confusion:
 
     @property
     def iou(self) -> dict[str, float]:
-        """Intersection over union of every class that is known somewhere, by name."""
+        """Intersection over union of every class that occurs in the ground truth, by name."""
         names = {c.code: c.name for c in CLASSES}
         both = np.diag(self.count)
         either = self.count.sum(axis=0) + self.count.sum(axis=1) - both
@@ -38,12 +38,12 @@ class Confusion:
         }
 
     def mean(self, classes: tuple[str, ...] = MEAN_OF) -> float:
-        """Mean over those of `classes` that are known somewhere."""
+        """Mean IoU over those of `classes` that occur in the ground truth."""
         values = [self.iou[name] for name in classes if name in self.iou]
         return sum(values) / len(values) if values else float("nan")
 
     def table(self) -> str:
-        """As text: a row a known class, shares of what it was classified as, in per cent."""
+        """Table as text: one row per true class, with the percentages of the predicted classes."""
         names = {c.code: c.name for c in CLASSES}
         heads = [names.get(code, str(code))[:9] for code in self.codes]
         lines = [f"{'known as':16s}{'points':>11s}{'IoU':>7s} " + "".join(f"{head:>10s}" for head in heads)]
@@ -57,7 +57,7 @@ class Confusion:
 
 
 def confusion(known: U8, predicted: U8) -> Confusion:
-    """Of LAS codes (N,); points whose class isn't known, or is noise, don't count, middle vegetation is low."""
+    """Confusion matrix of LAS codes (N,); unknown classes and noise are left out, mid vegetation counts as low."""
     known, predicted = _merged(known), _merged(predicted)
     some = ~np.isin(known, (*UNKNOWN, 7, 18))
     known, predicted = known[some], predicted[some]

@@ -1,8 +1,8 @@
 """The project's own small segmentation network. Import late: loads torch.
 
-Inverted residuals (Sandler et al., "MobileNetV2", CVPR 2018), the whole picture's context, and a feature pyramid of
-depthwise convolutions (Lin et al., CVPR 2017). It looks at photos at one angular resolution, so that a thing of a size
-at a distance always looks the same size.
+Inverted residuals (Sandler et al., "MobileNetV2", CVPR 2018), global context, and a feature pyramid (FPN, Lin et al.,
+CVPR 2017) of depthwise convolutions. All photos are classified at the same angular resolution, so that objects of the
+same size and distance have the same size in pixels.
 """
 
 from __future__ import annotations
@@ -11,17 +11,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from scan2sim.segmentation.lidar_channels import COUNT
+from scan2sim.segmentation.lidar_channels import CHANNELS
 
-PIXELS_A_RADIAN = 500.0
-"""Angular resolution at which photos are looked at."""
-MEAN, SPREAD = (0.42, 0.43, 0.42), (0.25, 0.25, 0.26)
-CODE_MEAN, CODE_SPREAD = 0.55, 0.15
-"""Of the codes of `segmentation.lidar_channels`, 1 for 255."""
+PIXELS_PER_RADIAN = 500.0
+"""Angular resolution at which photos are classified."""
+RGB_MEAN, RGB_STD = (0.42, 0.43, 0.42), (0.25, 0.25, 0.26)
+"""Normalisation of the colours (0 to 1)."""
+LIDAR_MEAN, LIDAR_STD = 0.55, 0.15
+"""Normalisation of the codes of `segmentation.lidar_channels` (0 to 1)."""
 
 
 class Convolution(nn.Sequential):
-    """Without bias, then normalised over the batch, then rectified."""
+    """Convolution without bias, batch normalisation, and ReLU (if `act`)."""
 
     def __init__(self, i: int, o: int, kernel: int = 1, stride: int = 1, groups: int = 1, act: bool = True) -> None:
         super().__init__(
@@ -32,7 +33,7 @@ class Convolution(nn.Sequential):
 
 
 class Residual(nn.Module):
-    """An inverted residual: widened, filtered by channel, narrowed."""
+    """Inverted residual block: expansion, depthwise convolution, projection."""
 
     def __init__(self, i: int, o: int, stride: int, kernel: int) -> None:
         super().__init__()
@@ -43,12 +44,12 @@ class Residual(nn.Module):
         self.adds = stride == 1 and i == o
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, o, H / stride, W / stride) of (B, i, H, W)."""
+        """(B, i, H, W) to (B, o, H / stride, W / stride)."""
         return x + self.body(x) if self.adds else self.body(x)
 
 
 class Merge(nn.Module):
-    """A level of the pyramid: what is coarser, enlarged, added to what is finer."""
+    """A level of the feature pyramid: the upsampled coarser map is added to the finer one."""
 
     def __init__(self, i: int, o: int) -> None:
         super().__init__()
@@ -56,19 +57,19 @@ class Merge(nn.Module):
         self.smooth = nn.Sequential(Convolution(o, o, 3, groups=o), Convolution(o, o))
 
     def forward(self, fine: Tensor, coarse: Tensor) -> Tensor:
-        """(B, o, H, W) of (B, i, H, W) and a coarser (B, o, h, w)."""
+        """(B, i, H, W) and a coarser map (B, o, h, w) to (B, o, H, W)."""
         up = F.interpolate(coarse, size=fine.shape[2:], mode="bilinear", align_corners=False)
         return self.smooth(F.relu(self.side(fine) + up))
 
 
 class Pyramid(nn.Module):
-    """Maps of a picture at several strides, coarser ones with the whole picture's context.
+    """Backbone with a feature pyramid: maps of an image at several strides, with wide context at the coarsest.
 
     Args:
-        channels: of the picture.
-        widths: channels at strides 2, 4, 8, 16, 32.
-        pyramid: channels of the maps.
-        merges: how many strides finer than 32 there are maps of.
+        channels: channels of the image.
+        widths: channels of the backbone at strides 2, 4, 8, 16, 32.
+        pyramid: channels of the pyramid's maps.
+        merges: number of maps at strides finer than 32.
     """
 
     def __init__(
@@ -77,8 +78,8 @@ class Pyramid(nn.Module):
         super().__init__()
         self.mean: Tensor
         self.spread: Tensor
-        self.register_buffer("mean", torch.tensor(MEAN)[:, None, None], persistent=False)
-        self.register_buffer("spread", torch.tensor(SPREAD)[:, None, None], persistent=False)
+        self.register_buffer("mean", torch.tensor(RGB_MEAN)[:, None, None], persistent=False)
+        self.register_buffer("spread", torch.tensor(RGB_STD)[:, None, None], persistent=False)
         self.stem = Convolution(channels, widths[0], 3, 2)
         self.stages = nn.ModuleList(
             nn.Sequential(Residual(i, o, 2, 3), *(Residual(o, o, 1, kernel) for _ in range(depth)))
@@ -89,7 +90,7 @@ class Pyramid(nn.Module):
         self.merges = nn.ModuleList(Merge(w, pyramid) for w in widths[-2:0:-1][:merges])
 
     def maps(self, seen: Tensor) -> list[Tensor]:
-        """(B, pyramid, H / s, W / s) of (B, channels, H, W), for s 32 first, then 16 and so on."""
+        """Maps (B, pyramid, H / s, W / s) of images (B, channels, H, W), for strides s of 32, 16 and so on."""
         x = self.stem(seen)
         levels = []
         for stage in self.stages:
@@ -102,31 +103,32 @@ class Pyramid(nn.Module):
 
 
 class StreetNet(Pyramid):
-    """(B, 3 + 4, H, W) colours and `segmentation.lidar_channels` in [0, 1] to (B, classes, H / 4, W / 4) logits.
+    """Colours and `segmentation.lidar_channels` (B, 3 + 4, H, W) in [0, 1] to logits (B, classes, H / 4, W / 4).
 
-    Once trained it predicts twice, the second time the picture mirrored, and gives the mean.
+    In evaluation mode it predicts twice, the second time for the mirrored image, and returns the mean (test-time
+    augmentation).
 
     Args:
-        classes: number of them.
+        classes: number of classes.
         widths, pyramid: see `Pyramid`.
     """
 
     def __init__(self, classes: int, widths: tuple[int, ...] = (16, 32, 64, 128, 192), pyramid: int = 64) -> None:
-        super().__init__(3 + COUNT, widths, pyramid)
+        super().__init__(3 + CHANNELS, widths, pyramid)
         self.head = nn.Sequential(nn.Dropout2d(0.1), nn.Conv2d(pyramid, classes, 1))
 
     def forward(self, seen: Tensor) -> Tensor:
-        """(B, classes, H / 4, W / 4) logits of (B, 3 + COUNT, H, W) colours and channels.
+        """Logits (B, classes, H / 4, W / 4) of colours and channels (B, 3 + CHANNELS, H, W).
 
-        Outside of training, the mean of what it says of them and of their mirror image.
+        In evaluation mode, the mean of the predictions for the images and for their mirror images.
         """
         if self.training:
             return self._classify(seen)
         return (self._classify(seen) + self._classify(seen.flip(3)).flip(3)) / 2
 
     def _classify(self, seen: Tensor) -> Tensor:
-        rgb, codes, there = seen[:, :3], seen[:, 3:-1], seen[:, -1:]
-        codes = (codes - CODE_MEAN) / CODE_SPREAD * there
-        maps = self.maps(torch.cat([(rgb - self.mean) / self.spread, codes, there], dim=1))
+        rgb, codes, valid = seen[:, :3], seen[:, 3:-1], seen[:, -1:]
+        codes = (codes - LIDAR_MEAN) / LIDAR_STD * valid
+        maps = self.maps(torch.cat([(rgb - self.mean) / self.spread, codes, valid], dim=1))
         logits: Tensor = self.head(maps[-1])
         return logits

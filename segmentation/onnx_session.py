@@ -1,4 +1,4 @@
-"""Networks in ONNX files: opened with onnxruntime, and what their files say of themselves."""
+"""Networks in ONNX files: inference sessions of onnxruntime, and the metadata of the files."""
 
 from __future__ import annotations
 
@@ -11,90 +11,92 @@ from typing import Any
 from scan2sim.pipeline.core.errors import InputError, SettingError
 
 FLOATS = {"tensor(float)": "float32", "tensor(float16)": "float16"}
-"""Types of inputs that images are converted to, as numpy calls them."""
+"""NumPy type by ONNX type of the supported inputs."""
 CUDA = "CUDAExecutionProvider"
 
 
-def opened(path: Path, device: str, setting: str) -> Any:
-    """An `onnxruntime.InferenceSession` of a file, on a device ("auto", "cpu", "cuda", "cuda:1").
+def open_session(path: Path, device: str, setting: str) -> Any:
+    """An `onnxruntime.InferenceSession` of a file on a device ("auto", "cpu", "cuda", "cuda:1").
 
     Args:
-        setting: that named the device, for the message.
+        path: ONNX file.
+        device: device to use.
+        setting: name of the setting of the device, for the error message.
 
     Raises:
         SettingError: onnxruntime can't use the device.
         InputError: the file is missing or damaged.
-        MemoryError: it doesn't fit.
+        MemoryError: the network doesn't fit into memory.
     """
     import onnxruntime
 
     if not path.is_file():
-        raise InputError(path, "is no file", "Give an ONNX file on this disk; nothing is downloaded")
+        raise InputError(path, "file not found", "Pass the path of a local ONNX file; nothing is downloaded")
     number = {"device_id": device.partition(":")[2] or "0"}
     providers = [] if device == "cpu" or CUDA not in onnxruntime.get_available_providers() else [(CUDA, number)]
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # its errors are raised; no need to print them as well
+    options.log_severity_level = 4  # errors are raised as exceptions, so they need not be logged
     options.intra_op_num_threads = _threads()
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # several nodes share the cores
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # several tasks share the cores
     try:
         session = onnxruntime.InferenceSession(path, options, [*providers, "CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's errors have no kind in common
-        remedy = "Copy or export it again, with its .data if it has one"
-        raise failure(error, path, "can't be loaded", remedy) from None
+    except Exception as error:  # onnxruntime's errors have no common base class
+        remedy = "Copy or export it again, with its .data file if it has one"
+        raise session_error(error, path, "can't be loaded", remedy) from None
     if device.startswith("cuda") and CUDA not in session.get_providers():
         raise SettingError(setting, f"onnxruntime can't use {device!r} here", "Install onnxruntime-gpu, or set cpu")
     return session
 
 
-def failure(error: Exception, path: Path, cause: str, remedy: str) -> Exception:
-    """What to raise for an error of onnxruntime's: MemoryError where it lacks memory, else an InputError."""
+def session_error(error: Exception, path: Path, cause: str, remedy: str) -> Exception:
+    """Exception to raise for an error of onnxruntime: MemoryError if memory is exhausted, else InputError."""
     why = str(error).strip().split("\n")[0]
-    full = any(
+    out_of_memory = any(
         words in str(error).lower() for words in ("out of memory", "allocate memory", "bad_alloc", "alloc_failed")
     )
-    return MemoryError(why) if full else InputError(path, f"{cause} ({why})", remedy)
+    return MemoryError(why) if out_of_memory else InputError(path, f"{cause} ({why})", remedy)
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of a file, and of the `.data` beside it where exporters put large weights."""
-    together = hashlib.sha256(path.read_bytes())
-    beside = path.with_name(path.name + ".data")
-    if beside.is_file():
-        together.update(beside.read_bytes())
-    return together.hexdigest()
+    """SHA-256 of an ONNX file, including its `.data` file for large weights if there is one."""
+    checksum = hashlib.sha256(path.read_bytes())
+    data_file = path.with_name(path.name + ".data")
+    if data_file.is_file():
+        checksum.update(data_file.read_bytes())
+    return checksum.hexdigest()
 
 
-def value(text: str | None, other: object) -> Any:
-    """A value of the metadata, as it stands if it is no JSON; `other` where nothing is."""
+def metadata_value(text: str | None, default: object) -> Any:
+    """Value of a metadata entry, parsed as JSON if possible; `default` if the entry is missing."""
     try:
-        return other if text is None else json.loads(text)
+        return default if text is None else json.loads(text)
     except ValueError:
         return text
 
 
-def labels(path: Path, metadata: dict[str, str]) -> tuple[str, ...]:
-    """Names of a network's classes, by its metadata "labels", or by `<name>.labels.txt` beside it, one a line.
+def read_labels(path: Path, metadata: dict[str, str]) -> tuple[str, ...]:
+    """Names of a network's classes, from its metadata "labels", or from `<name>.labels.txt`, one per line.
 
     Raises:
-        InputError: neither names any.
+        InputError: the labels are missing or invalid.
     """
-    beside = path.with_suffix(".labels.txt")
-    remedy = f'Name them in order of the channels: metadata "labels" as a JSON list, or {beside.name}, one a line'
+    label_file = path.with_suffix(".labels.txt")
+    remedy = f'Name them in order of the channels: metadata "labels" as a JSON list, or {label_file.name}, one per line'
     try:
-        names = value(metadata.get("labels"), None) or [
-            line.strip() for line in beside.read_text("utf-8-sig").split("\n")
+        names = metadata_value(metadata.get("labels"), None) or [
+            line.strip() for line in label_file.read_text("utf-8-sig").split("\n")
         ]
     except FileNotFoundError:
-        raise InputError(path, "doesn't name its labels", remedy) from None
+        raise InputError(path, "no labels found for the network's classes", remedy) from None
     except (OSError, ValueError) as error:
-        raise InputError(beside, f"can't be read ({error})", remedy) from None
+        raise InputError(label_file, f"can't be read ({error})", remedy) from None
     if not isinstance(names, list) or not any(names) or not all(isinstance(name, str) for name in names):
-        raise InputError(path, "has labels that are no list of names", remedy)
+        raise InputError(path, "labels are not a list of names", remedy)
     return tuple(name for name in names if name)
 
 
 def _threads() -> int:
-    """As many as OpenMP's libraries take; onnxruntime itself doesn't ask."""
+    """Number of threads according to OMP_NUM_THREADS, which onnxruntime doesn't read, else of available cores."""
     count = os.environ.get("OMP_NUM_THREADS", "")
     if count.isdecimal() and int(count):
         return int(count)

@@ -1,43 +1,43 @@
-"""Tidy: what no neighbourhood mends: specks of plants and of road in the air, feet of walls, plants' heights."""
+"""Rule-based correction of point classes: floating specks, feet of walls, heights of vegetation."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from scan2sim.pipeline.core.types import F32, I32, U8, Bools
-from scan2sim.segmentation.labels import CLASSES, GROUND
+from scan2sim.segmentation.labels import CLASSES, GROUND_CLASSES
 
-FLOATING, LINK = 0.35, 0.35
-"""What has its lowest so many metres above ground floats; its points are linked within so many."""
-SPECK = 400
-"""Voxels: smaller floating pieces of vegetation or ground are none."""
-PIECE, HUG, MOSTLY = 3000, 0.5, 0.6
-"""Nor is larger vegetation of which so much lies within so many metres of a wall."""
-UPRIGHT = 0.7
-"""Normals that rise less are a wall's."""
-HIGH, LOW = 2.6, 1.2
-"""Metres above ground: vegetation higher is high; where nothing around is higher than the second, it is low."""
+FLOATING_MIN_HEIGHT_M, LINK_DISTANCE_M = 0.35, 0.35
+"""A component floats if its lowest point is higher than this above ground; its points are linked within 0.35 m."""
+SPECK_MAX_VOXELS = 400
+"""Floating components of vegetation or ground with fewer voxels are wrong."""
+WALL_PIECE_MAX_VOXELS, WALL_DISTANCE_M, WALL_SHARE_MIN = 3000, 0.5, 0.6
+"""So are floating components of vegetation with fewer than 3000 voxels, of which 60 % lie within 0.5 m of a wall."""
+WALL_MAX_NORMAL_Z = 0.7
+"""Largest |z| of the normals of a wall."""
+HIGH_VEGETATION_MIN_M, LOW_VEGETATION_MAX_M = 2.6, 1.2
+"""Heights above ground: vegetation is high above the first, and low where nothing in its cell is above the second."""
 
 
-def without_specks(best: U8, height: F32, xyz: F32, near: I32) -> U8:
-    """(N,) indices of classes; small vegetation that touches no ground is what stands around it.
+def remove_specks(best: U8, height: F32, xyz: F32, near: I32) -> U8:
+    """(N,) class indices with small floating components of vegetation and ground replaced by the class around them.
 
-    Bay windows and balconies are taken for such. So is ground in the air, as photos take the inside of a car for that
-    is seen through its window.
+    Bay windows and balconies are often classified as vegetation, and the interior of cars, seen through their windows,
+    as ground.
     """
     plants = np.isin(best, [CLASSES.index("low_vegetation"), CLASSES.index("high_vegetation")])
-    ground = np.isin(best, [CLASSES.index(name) for name in GROUND])
+    ground = np.isin(best, [CLASSES.index(name) for name in GROUND_CLASSES])
     walls = np.isin(best, [CLASSES.index("building"), CLASSES.index("wall_or_fence")])
     speck = _specks(plants, height, xyz, near, xyz[walls]) | _specks(ground, height, xyz, near)
     want, have = np.flatnonzero(speck), np.flatnonzero(~speck & ~ground)
     out = best.copy()
     if len(want) and len(have):
-        out[want] = _most_around(best[have], xyz[have], xyz[want])
+        out[want] = _majority_class(best[have], xyz[have], xyz[want])
     return out
 
 
 def _specks(member: Bools, height: F32, xyz: F32, near: I32, walls: F32 | None = None) -> Bools:
-    """(N,) which members are of small pieces that touch no ground, or of larger ones that hug `walls` (M, 3)."""
+    """(N,) members of small floating components, or of larger ones that lie along `walls` (M, 3)."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -45,52 +45,54 @@ def _specks(member: Bools, height: F32, xyz: F32, near: I32, walls: F32 | None =
     rows = np.flatnonzero(member)
     if not len(rows):
         return member
-    close = member[near[rows]] & (np.linalg.norm(xyz[near[rows]] - xyz[rows, None], axis=2) < LINK)
+    close = member[near[rows]] & (np.linalg.norm(xyz[near[rows]] - xyz[rows, None], axis=2) < LINK_DISTANCE_M)
     a, b = np.repeat(rows, near.shape[1])[close.ravel()], near[rows][close]
     n = len(member)
     _, part = connected_components(coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(n, n)), False)
     size, lowest = np.bincount(part[rows], minlength=n), np.full(n, np.inf)
     np.minimum.at(lowest, part[rows], height[rows])
-    small = size < SPECK
+    small = size < SPECK_MAX_VOXELS
     if walls is not None:
-        hugs = np.isfinite(cKDTree(walls).query(xyz[rows], distance_upper_bound=HUG, workers=-1)[0])
-        hugging = np.bincount(part[rows], hugs, minlength=n) / np.maximum(size, 1)
-        small |= (size < PIECE) & (hugging > MOSTLY)
-    return np.asarray(member & ((lowest > FLOATING) & small)[part])
+        near_wall = np.isfinite(cKDTree(walls).query(xyz[rows], distance_upper_bound=WALL_DISTANCE_M, workers=-1)[0])
+        wall_share = np.bincount(part[rows], near_wall, minlength=n) / np.maximum(size, 1)
+        small |= (size < WALL_PIECE_MAX_VOXELS) & (wall_share > WALL_SHARE_MIN)
+    return np.asarray(member & ((lowest > FLOATING_MIN_HEIGHT_M) & small)[part])
 
 
-def _most_around(best: U8, xyz: F32, places: F32) -> U8:
-    """(M,) the class that most of the 15 points nearest to each place have."""
+def _majority_class(best: U8, xyz: F32, positions: F32) -> U8:
+    """(M,) most frequent class among the 15 points nearest to each position."""
     from scipy.spatial import cKDTree
 
     k = min(15, len(best))
-    around = best[cKDTree(xyz).query(places, k=[*range(1, k + 1)], workers=-1)[1]]
+    around = best[cKDTree(xyz).query(positions, k=[*range(1, k + 1)], workers=-1)[1]]
     return np.asarray(
         np.stack([(around == c).sum(axis=1) for c in range(len(CLASSES))], axis=1).argmax(axis=1), np.uint8
     )
 
 
-def with_feet(best: U8, normal: F32, near: I32) -> U8:
-    """The lowest rows of a wall, classified as the ground before it, are the wall's: (N,) indices."""
+def correct_wall_feet(best: U8, normal: F32, near: I32) -> U8:
+    """(N,) class indices with upright ground points beside buildings, the feet of walls, changed to building."""
     building = CLASSES.index("building")
-    rows = np.flatnonzero(np.isin(best, [CLASSES.index(g) for g in GROUND]) & (np.abs(normal[:, 2]) < UPRIGHT))
+    rows = np.flatnonzero(
+        np.isin(best, [CLASSES.index(g) for g in GROUND_CLASSES]) & (np.abs(normal[:, 2]) < WALL_MAX_NORMAL_Z)
+    )
     out = best.copy()
     out[rows[(best[near[rows]] == building).any(axis=1)]] = building
     return out
 
 
-def by_height(best: U8, height: F32, xyz: F32) -> U8:
-    """Vegetation classified low or high against all reason is classified anew: (N,) indices."""
+def correct_vegetation_height(best: U8, height: F32, xyz: F32) -> U8:
+    """(N,) class indices with low or high vegetation that contradicts its height changed to the other."""
     low, high = CLASSES.index("low_vegetation"), CLASSES.index("high_vegetation")
     plants = np.flatnonzero((best == low) | (best == high))
     if not len(plants):
         return best
     cells = np.floor((xyz[plants, :2] - xyz[:, :2].min(axis=0)) / 0.5).astype(np.int64)
-    of = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
-    _, of = np.unique(of, return_inverse=True)
-    top = np.full(of.max() + 1, -np.inf, np.float32)
-    np.maximum.at(top, of, height[plants])
+    cell = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
+    _, cell = np.unique(cell, return_inverse=True)
+    top = np.full(cell.max() + 1, -np.inf, np.float32)
+    np.maximum.at(top, cell, height[plants])
     out = best.copy()
-    out[plants[height[plants] > HIGH]] = high
-    out[plants[top[of] < LOW]] = low
+    out[plants[height[plants] > HIGH_VEGETATION_MIN_M]] = high
+    out[plants[top[cell] < LOW_VEGETATION_MAX_M]] = low
     return out

@@ -1,1 +1,1 @@
-"""Companion services: a room each, over one transport."""
+"""Companion services, one package each, on one ROS 2 transport."""

@@ -1,4 +1,4 @@
-"""Credentials in URLs, replaced before a URL is shown, logged, published or written."""
+"""Redacts credentials in URLs before a URL is displayed, logged, published or written."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _PARAMETER = re.compile(
 
 
 def redacted(text: str) -> str:
-    """A URL, or text with URLs in it, without their credentials; anything else stays as it is.
+    """Replace the credentials in a URL, or in text that contains URLs; any other text is returned unchanged.
 
-    User and password before the host become `***`, and so do the values of query parameters whose name ends like a
-    credential's: `?password=`, `&access_token=`, `&X-Amz-Signature=`. Redacting twice changes nothing.
+    User and password before the host become `***`, and so do the values of query parameters whose name ends like that
+    of a credential: `?password=`, `&access_token=`, `&X-Amz-Signature=`. Redaction is idempotent.
     """
     return _PARAMETER.sub(rf"\1{HIDDEN}", _USERINFO.sub(rf"\1{HIDDEN}@", text))

@@ -1,4 +1,4 @@
-"""Spools that nobody named: in the user's state folder, of one living process each; what dead ones left is sent."""
+"""Default outbox files in the user's state folder: one per running process; leftovers of dead processes are sent."""
 
 from __future__ import annotations
 
@@ -6,48 +6,48 @@ import os
 from pathlib import Path
 
 from scan2sim.pipeline.core.errors import BusyError, SpaceError
-from scan2sim.services.outbox import Spool
+from scan2sim.services.outbox import Outbox
 
-LONGEST = 200
-"""Characters of a name; what is behind them doesn't count."""
+MAX_NAME_CHARS = 200
+"""File names are cut to this length."""
 
 
-def opened(node: str, topic: str) -> Spool:
-    """The spool of a node's records for a topic, by their full names.
+def open_outbox(node: str, topic: str) -> Outbox:
+    """Open the outbox for a node's records on a topic, both given by their full names.
 
-    The first process of that name has NAME.1.spool, one that runs beside it NAME.2.spool, and so on. Whatever waits in
-    files that no process has is taken over.
+    The first process of that name gets NAME.1.spool, a second one that runs at the same time NAME.2.spool, and so on.
+    Records left in files that no process has open are moved into the new outbox.
 
     Raises:
-        SpaceError: there is no folder for it, and none can be made.
+        SpaceError: the state folder can't be created or written.
     """
-    name = f"{node}.{topic}".replace("/", ".").strip(".")[:LONGEST]
-    folder, number = _folder(), 1
-    while (own := _free(folder / f"{name}.{number}.spool")) is None:
+    name = f"{node}.{topic}".replace("/", ".").strip(".")[:MAX_NAME_CHARS]
+    folder, number = _state_folder(), 1
+    while (own := _open_if_free(folder / f"{name}.{number}.spool")) is None:
         number += 1
     while (path := folder / f"{name}.{(number := number + 1)}.spool").exists():
-        if (left := _free(path)) is not None:
-            own.take_over(left)
-            left.close()
+        if (abandoned := _open_if_free(path)) is not None:
+            own.take_over(abandoned)
+            abandoned.close()
     return own
 
 
-def _free(path: Path) -> Spool | None:
-    """The spool in a file; None: another process has it."""
+def _open_if_free(path: Path) -> Outbox | None:
+    """Open the outbox in a file; None if another process has it open."""
     try:
-        return Spool(path)
+        return Outbox(path)
     except BusyError:
         return None
 
 
-def _folder() -> Path:
-    """Below the user's state folder (XDG Base Directory Specification 0.8), nobody else's to read."""
+def _state_folder() -> Path:
+    """Folder below the user's state folder (XDG Base Directory Specification 0.8), readable by the user only."""
     try:
         state = os.environ.get("XDG_STATE_HOME")
         path = (Path(state) if state else Path.home() / ".local" / "state") / "scan2sim" / "spools"
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
         path.chmod(0o700)
-    except (OSError, RuntimeError) as error:  # the latter: who has no home
-        remedy = "Set XDG_STATE_HOME to a folder of yours, or name a file: --spool"
-        raise SpaceError("folder for records that wait", f"can't be used ({error})", remedy) from None
+    except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home folder
+        remedy = "Set XDG_STATE_HOME to a writable folder, or name a file: --spool FILE"
+        raise SpaceError("folder for unsent records", f"can't be used ({error})", remedy) from None
     return path

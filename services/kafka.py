@@ -1,4 +1,4 @@
-"""Kafka: records sent to a topic, and read from it."""
+"""Kafka producer and consumer of records, with retries and deduplication by record id."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from scan2sim.pipeline.core import optional_deps
-from scan2sim.services.outbox import Kept, Once
+from scan2sim.services.outbox import Deduplicator, OutboxRecord
 
 log = logging.getLogger(__name__)
 
@@ -19,109 +19,111 @@ Servers = Annotated[
     str,
     Field(
         pattern=f"^{_SERVER}(,{_SERVER})*$",
-        json_schema_extra={"range": "HOST:PORT, or several of them parted by commas"},
+        json_schema_extra={"range": "HOST:PORT, or several separated by commas"},
     ),
 ]
-"""Addresses of brokers, as a setting."""
-ACKNOWLEDGED_WITHIN = 10.0
-"""Seconds for a batch; then the broker counts as lost."""
-ID = "record id"
-"""Header of a message that holds its record's id."""
-
-
-LARGEST = 2**24
-"""Bytes of a record; a broker may take less."""
+"""Type of a setting: broker addresses (`bootstrap.servers`)."""
+ACKNOWLEDGE_TIMEOUT_S = 10.0
+"""Time for a batch to be acknowledged; after that the broker counts as lost."""
+RECORD_ID_HEADER = "record id"
+"""Message header with the id of the record."""
+MAX_RECORD_BYTES = 2**24
+"""Largest record that is sent; the broker's own limit may be lower."""
 
 
 def topic_name(topic: str) -> str:
-    """What a topic of ROS 2 is called in Kafka, which allows no slashes: "/robot/records" is "robot.records"."""
+    """Kafka name of a ROS 2 topic; Kafka allows no slashes: "/robot/records" becomes "robot.records"."""
     return topic.strip("/").replace("/", ".")
 
 
-class Topic:
-    """Sends records to a topic, for `records.Sender`."""
+class TopicProducer:
+    """Sends records to a topic; its `send` is the one of an `outbox.Sender`."""
 
     def __init__(self, servers: str, topic: str) -> None:
-        """`servers` as "host:port,host:port"; they need not be there yet."""
-        optional_deps.need("Kafka", "confluent_kafka")
+        """`servers` as "host:port,host:port"; they need not be reachable yet."""
+        optional_deps.require("Kafka", "confluent_kafka")
         from confluent_kafka import KafkaError, KafkaException, Producer
 
         self._servers, self._topic = servers, topic_name(topic)
-        self._errors: Any = KafkaError
-        self._refusal: type[Exception] = KafkaException
+        self._error_codes: Any = KafkaError
+        self._exception: type[Exception] = KafkaException
         self._producer = Producer(
             {
                 "bootstrap.servers": servers,
                 "acks": "all",
-                "max.in.flight.requests.per.connection": 1,  # in order
-                "message.timeout.ms": int(1000 * ACKNOWLEDGED_WITHIN),
-                "message.max.bytes": LARGEST,
+                "max.in.flight.requests.per.connection": 1,  # keeps the order
+                "message.timeout.ms": int(1000 * ACKNOWLEDGE_TIMEOUT_S),
+                "message.max.bytes": MAX_RECORD_BYTES,
                 "linger.ms": 5,
-                "logger": _silent(),
-                "error_cb": self._failed,
+                "logger": _silent_logger(),
+                "error_cb": self._on_error,
             }
         )
-        self._gone, self._cause = False, ""
+        self._brokers_down, self._cause = False, ""
 
-    def _failed(self, error: Any) -> None:
-        if error.code() == self._errors._ALL_BROKERS_DOWN:
-            self._gone = True
+    def _on_error(self, error: Any) -> None:
+        if error.code() == self._error_codes._ALL_BROKERS_DOWN:
+            self._brokers_down = True
         else:
             self._cause = self._cause or _cause(error)
 
-    def send(self, records: Sequence[Kept]) -> None:
-        """Send records in order; those that the broker will never take, as they are too large, are given up.
+    def send(self, records: Sequence[OutboxRecord]) -> None:
+        """Send records in order; those that are larger than the broker accepts are dropped.
 
         Raises:
-            ConnectionError: not all were acknowledged, or the broker was gone since the last ones.
+            ConnectionError: not all were acknowledged, or the broker was down since the previous call.
         """
         self._producer.poll(0)
-        if self._gone:
-            self._gone = False
-            raise self._no_broker()
+        if self._brokers_down:
+            self._brokers_down = False
+            raise self._connection_error()
         failed: list[Any] = []
 
         def delivered(error: Any, _: Any) -> None:
-            if error is not None and not self._refused(error):
+            if error is not None and not self._is_too_large(error):
                 failed.append(error)
 
         for record in records:
-            maker = record.id.rpartition(":")[0]
+            producer_id = record.id.rpartition(":")[0]
             try:
                 self._producer.produce(
-                    self._topic, record.body, key=maker, headers={ID: record.id}, on_delivery=delivered
+                    self._topic,
+                    record.body,
+                    key=producer_id,
+                    headers={RECORD_ID_HEADER: record.id},
+                    on_delivery=delivered,
                 )
-            except self._refusal as error:
+            except self._exception as error:
                 delivered(error.args[0], None)
-        left = self._producer.flush(ACKNOWLEDGED_WITHIN)
-        if left:
+        unsent = self._producer.flush(ACKNOWLEDGE_TIMEOUT_S)
+        if unsent:
             self._producer.purge()
             self._producer.flush(1.0)
-        if left or failed:
-            self._cause = next((_cause(one) for one in failed if one.code() > 0), self._cause)  # what the broker says
-            raise self._no_broker()
+        if unsent or failed:
+            self._cause = next((_cause(one) for one in failed if one.code() > 0), self._cause)  # > 0: the broker's own
+            raise self._connection_error()
         self._cause = ""
 
-    def _refused(self, error: Any) -> bool:
-        if error.code() != self._errors.MSG_SIZE_TOO_LARGE:
+    def _is_too_large(self, error: Any) -> bool:
+        if error.code() != self._error_codes.MSG_SIZE_TOO_LARGE:
             return False
-        log.warning("Kafka at %s takes no record as large as one that was given up", self._servers)
+        log.warning("a record was dropped: it is larger than Kafka at %s accepts", self._servers)
         return True
 
-    def _no_broker(self) -> ConnectionError:
-        return ConnectionError(no_broker(self._servers, self._cause))
+    def _connection_error(self) -> ConnectionError:
+        return ConnectionError(no_broker_message(self._servers, self._cause))
 
 
-def no_broker(servers: str, cause: str) -> str:
-    """What a user is to know where no broker answers."""
-    return f"no Kafka at {servers} ({cause or 'nothing answers'}); check the address. It is tried on"
+def no_broker_message(servers: str, cause: str) -> str:
+    """Warning for the user when no broker answers."""
+    return f"no Kafka at {servers} ({cause or 'no answer'}); check the address. The connection is retried"
 
 
 def _cause(error: Any) -> str:
-    """Of one of librdkafka's errors, without its own addresses and times."""
+    """Cause of a librdkafka error, without the addresses and times in its text."""
     text = re.sub(r" \(after .*?\)", "", str(error.str()))
     if error.name() in ("_BAD_MSG", "_UNDERFLOW") or "ApiVersion" in text:
-        return "what answers there is no Kafka"
+        return "the server there isn't Kafka"
     return text.rpartition(": ")[2]
 
 
@@ -136,46 +138,46 @@ def read(
     dropped: Callable[[str], None] = lambda _: None,
     wait: float = 1.0,
 ) -> Iterator[bytes | None]:
-    """Bodies of a topic's records, each once, for ever; None after `wait` seconds without one.
+    """Iterate over the bodies of a topic's records without duplicates, forever; None after `wait` seconds without one.
 
-    Records of no id (other programs') are handed on as they come.
+    Messages without a record id (of other programs) are not deduplicated.
 
     Args:
-        servers: as "host:port,host:port"; they need not be there yet.
-        topic: its name; it is made if it isn't there.
-        group: of readers, who share a topic's records.
-        from_start: begin with the oldest record that is kept, if the group is new; else with what comes.
-        since: seconds since the epoch: begin with the records that came to Kafka from then on.
-        connected: is called with whether the broker is there: has given the topic out, or is gone.
-        dropped: is called with the ids of doubles.
-        wait: seconds.
+        servers: as "host:port,host:port"; they need not be reachable yet.
+        topic: its name; created if it doesn't exist.
+        group: consumer group, whose members share the topic's records.
+        from_start: start with the oldest stored record if the group is new, else with new records only.
+        since: start with the records that reached Kafka at or after this time, in seconds since the epoch.
+        connected: called with True when the broker has assigned the topic, with False when all brokers are down.
+        dropped: called with the id of each duplicate.
+        wait: seconds per poll.
     """
-    optional_deps.need("Kafka", "confluent_kafka")
+    optional_deps.require("Kafka", "confluent_kafka")
     from confluent_kafka import Consumer, KafkaError, KafkaException
 
-    cause, found = "", False
+    cause, warned = "", False
 
-    def failed(error: Any) -> None:
-        nonlocal cause, found
+    def on_error(error: Any) -> None:
+        nonlocal cause, warned
         if error.code() == KafkaError._ALL_BROKERS_DOWN:
             connected(False)
-            if not found:
-                log.warning("%s", no_broker(servers, cause))
-                found = True  # is said once
+            if not warned:
+                log.warning("%s", no_broker_message(servers, cause))
+                warned = True
         else:
             cause = _cause(error)
 
-    def assigned(consumer: Any, partitions: list[Any]) -> None:
-        nonlocal found
-        found = True
+    def on_assign(consumer: Any, partitions: list[Any]) -> None:
+        nonlocal warned
+        warned = True
         connected(True)
         if since is not None:
-            for one in partitions:
-                one.offset = int(1000 * since)
+            for partition in partitions:
+                partition.offset = int(1000 * since)
             try:
-                consumer.assign(consumer.offsets_for_times(partitions, ACKNOWLEDGED_WITHIN))
+                consumer.assign(consumer.offsets_for_times(partitions, ACKNOWLEDGE_TIMEOUT_S))
             except KafkaException as error:
-                log.warning("%s: earlier records can't be had, only what comes (%s)", topic, error)
+                log.warning("%s: earlier records are unavailable, only new ones are read (%s)", topic, error)
 
     consumer = Consumer(
         {
@@ -185,13 +187,13 @@ def read(
             "session.timeout.ms": 6000,
             "fetch.wait.max.ms": 10,
             "allow.auto.create.topics": True,
-            "topic.metadata.refresh.interval.ms": 1000,  # a topic may come later
-            "logger": _silent(),
-            "error_cb": failed,
+            "topic.metadata.refresh.interval.ms": 1000,  # the topic may be created later
+            "logger": _silent_logger(),
+            "error_cb": on_error,
         }
     )
-    consumer.subscribe([topic_name(topic)], on_assign=assigned)
-    once = Once()
+    consumer.subscribe([topic_name(topic)], on_assign=on_assign)
+    deduplicator = Deduplicator()
     try:
         while True:
             message = consumer.poll(wait)
@@ -199,8 +201,8 @@ def read(
                 yield None
                 continue
             connected(True)
-            record_id = dict(message.headers() or ()).get(ID)
-            if not isinstance(record_id, bytes) or once.new(record_id.decode()):
+            record_id = dict(message.headers() or ()).get(RECORD_ID_HEADER)
+            if not isinstance(record_id, bytes) or deduplicator.is_new(record_id.decode()):
                 yield message.value()
             else:
                 dropped(record_id.decode())
@@ -208,7 +210,7 @@ def read(
         consumer.close()
 
 
-def _silent() -> logging.Logger:
+def _silent_logger() -> logging.Logger:
     logger = logging.getLogger("scan2sim.kafka")
     logger.setLevel(logging.CRITICAL)
     return logger

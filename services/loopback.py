@@ -1,4 +1,4 @@
-"""Which addresses only this machine reaches; what listens on any other must be protected."""
+"""Loopback addresses: a server that listens on any other address must be protected."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from scan2sim.pipeline.core.errors import SettingError
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches an address: 127.0.0.0/8, ::1 or localhost.
+    """Whether an address can be reached from this machine only: 127.0.0.0/8, ::1 or localhost.
 
-    0.0.0.0, :: and an empty one are all addresses of this machine, and other names may lead anywhere.
+    0.0.0.0, :: and the empty string stand for all addresses of this machine; other names may resolve to any address.
     """
     with contextlib.suppress(ValueError):
         return ipaddress.ip_address(host.strip("[]")).is_loopback
@@ -19,16 +19,16 @@ def is_loopback(host: str) -> bool:
 
 
 def require_protection(host: str, *, protected: bool, options: str) -> None:
-    """Refuse to listen where other machines reach it and nothing protects it.
+    """Refuse to listen on an address that other machines can reach unless the server is protected.
 
     Args:
         host: address to listen on.
         protected: whether a token, a key or a certificate is given.
-        options: which give one, as "--token FILE".
+        options: the options that provide protection, such as "--token FILE".
 
     Raises:
-        SettingError: `host` is beyond the loopback and unprotected.
+        SettingError: `host` isn't a loopback address and the server is unprotected.
     """
     if not protected and not is_loopback(host):
-        cause = f"{host or 'an empty address'} is reached by other machines, and nothing protects it"
-        raise SettingError("--host", cause, f"Give {options}, or listen on this machine alone: --host 127.0.0.1")
+        cause = f"other machines can reach {host or 'an empty address'}, and nothing protects the server"
+        raise SettingError("--host", cause, f"Give {options}, or listen on this machine only: --host 127.0.0.1")

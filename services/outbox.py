@@ -1,7 +1,7 @@
-"""Records with ids: kept on disk within bounds, sent in order once there is who takes them, doubles dropped by id.
+"""Outbox: a bounded store-and-forward queue of records on disk, sent in order when a broker is available.
 
-A record may be sent twice: when its sender died before it was acknowledged, or when who took it went away soon after (a
-broker that keeps all in memory forgets it). Who reads them drops doubles by id.
+Delivery is at least once. A record is sent twice if its sender died before the acknowledgement, or if the broker went
+away soon after it (one that keeps records in memory has lost them). Readers drop duplicates by record id.
 """
 
 from __future__ import annotations
@@ -21,35 +21,35 @@ from scan2sim.pipeline.core.errors import BusyError, InputError
 
 log = logging.getLogger(__name__)
 
-KEPT_BYTES = 64 * 2**20
-"""Bytes of records that wait on disk, at most: at 5 kB a second for over three hours."""
-SENT_AGAIN = 60.0
-"""Seconds for which records are kept that were acknowledged, to be sent again if their taker goes away."""
-BATCH = 500
-"""Records sent at once."""
-LONGEST_PAUSE = 5.0
-"""Seconds between two tries, at most."""
+MAX_OUTBOX_BYTES = 64 * 2**20
+"""Largest total size of unsent records on disk: more than three hours at 5 kB/s."""
+RESEND_WINDOW_S = 60.0
+"""How long acknowledged records are kept, to send them again if the broker goes away."""
+BATCH_RECORDS = 500
+"""Records per call of `send`."""
+MAX_RETRY_PAUSE_S = 5.0
+"""Upper bound of the exponential backoff between two attempts."""
 
 
 @dataclass(frozen=True)
-class Kept:
-    """A record that waits.
+class OutboxRecord:
+    """A record in the outbox.
 
     Attributes:
-        number: its place in the order.
-        id: unlike any other's.
-        body: what it says.
-        share: what it counts for, where room is short.
+        number: position in the sending order.
+        id: globally unique.
+        body: serialized content.
+        category: group that is charged for its size when the outbox is full.
     """
 
     number: int
     id: str
     body: bytes
-    share: str = ""
+    category: str = ""
 
 
 def new_ids() -> Callable[[], str]:
-    """Makes ids of records: one identity for this life of their maker, and a number that grows."""
+    """Create a generator of record ids: a random identity of this process's producer and a running number."""
     identity, number = uuid.uuid4().hex, 0
 
     def next_id() -> str:
@@ -61,142 +61,146 @@ def new_ids() -> Callable[[], str]:
 
 
 _TABLE = "CREATE TABLE IF NOT EXISTS records (number INTEGER PRIMARY KEY, id TEXT, share TEXT, body BLOB, sent REAL)"
-_WAIT = "FROM records WHERE sent IS NULL"
+_UNSENT = "FROM records WHERE sent IS NULL"
 
 
-class Spool:
-    """Records on disk, first in, first out; may be used from any thread, and by one process at a time.
+class Outbox:
+    """First-in, first-out queue of records in an SQLite file; thread-safe, open in one process at a time.
 
-    Where room is short, the share that takes most of it gives up its oldest record (longest queue drop: Suter et al.,
-    Design considerations for supporting TCP with per-flow queueing, 1998): none crowds out others.
+    When the outbox is full, the category that occupies the most bytes loses its oldest record (longest queue drop:
+    Suter et al., Design considerations for supporting TCP with per-flow queueing, 1998), so that a flood of one
+    category doesn't displace the others.
 
     Attributes:
-        dropped: by share, records that were given up unsent, as there was no room.
+        dropped: number of records dropped unsent because the outbox or the disk was full, by category.
     """
 
-    def __init__(self, path: Path, most_bytes: int = KEPT_BYTES) -> None:
-        """Keep them in a file, which is made if it isn't there; what an earlier life left there is sent first.
+    def __init__(self, path: Path, max_bytes: int = MAX_OUTBOX_BYTES) -> None:
+        """Open or create the file; records that an earlier process left there are sent first.
 
-        Where it left any unsent, who took its last ones may have gone away, and forgotten them: they are sent again.
+        If that process left unsent records, the broker may have gone away and lost the last ones it acknowledged: these
+        are sent again.
 
         Raises:
-            BusyError: another process has it.
-            InputError: there is something else in its place.
+            BusyError: another process has the file open.
+            InputError: the file isn't an outbox.
         """
-        self._most, self._lock = most_bytes, threading.Lock()
+        self._max_bytes, self._lock = max_bytes, threading.Lock()
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._base = _connected(path)
-        shares = self._base.execute("SELECT share, sum(length(body)) FROM records GROUP BY share").fetchall()
-        self._bytes = Counter(dict(shares))
+        self._database = _open_locked(path)
+        sizes = self._database.execute("SELECT share, sum(length(body)) FROM records GROUP BY share").fetchall()
+        self._bytes = Counter(dict(sizes))
         self.dropped = Counter[str]()
         if len(self):
-            self.again()
+            self.requeue_sent()
 
-    def append(self, record_id: str, body: bytes, share: str = "") -> None:
-        """Keep a record."""
+    def append(self, record_id: str, body: bytes, category: str = "") -> None:
+        """Store a record; drops the oldest record of the largest category while the outbox is over its size."""
         with self._lock:
             try:
-                self._base.execute("INSERT INTO records (id, share, body) VALUES (?, ?, ?)", (record_id, share, body))
+                insert = "INSERT INTO records (id, share, body) VALUES (?, ?, ?)"
+                self._database.execute(insert, (record_id, category, body))
             except sqlite3.OperationalError as error:  # the disk is full
-                self.dropped[share] += 1
-                log.warning("a record could not be kept: %s", error)
+                self.dropped[category] += 1
+                log.warning("a record could not be stored and was dropped: %s", error)
                 return
-            self._bytes[share] += len(body)
-            while self._bytes.total() > self._most:
+            self._bytes[category] += len(body)
+            while self._bytes.total() > self._max_bytes:
                 (largest, _), *_ = self._bytes.most_common(1)
                 oldest = "SELECT number, sent IS NULL FROM records WHERE share = ? ORDER BY number LIMIT 1"
-                number, unsent = self._base.execute(oldest, (largest,)).fetchone()
-                self._forget("number = ?", number)
+                number, unsent = self._database.execute(oldest, (largest,)).fetchone()
+                self._delete("number = ?", number)
                 if unsent and not self.dropped[largest]:
-                    log.warning("there is no room on disk for all that waits: the oldest %s go", largest or "records")
+                    log.warning("the outbox is full: its oldest unsent %s are dropped", largest or "records")
                 self.dropped[largest] += unsent
 
-    def take_over(self, other: Spool) -> None:
-        """Keep what waits in another, which is empty then."""
-        while waiting := other.first():
-            for record in waiting:
-                self.append(record.id, record.body, record.share)
-            other.done(waiting[-1])
+    def take_over(self, other: Outbox) -> None:
+        """Move all unsent records of another outbox into this one."""
+        while batch := other.pending():
+            for record in batch:
+                self.append(record.id, record.body, record.category)
+            other.acknowledge(batch[-1])
 
-    def first(self, count: int = BATCH) -> list[Kept]:
-        """The records that wait longest, in order."""
+    def pending(self, count: int = BATCH_RECORDS) -> list[OutboxRecord]:
+        """The oldest unsent records, in order."""
         with self._lock:
-            rows = self._base.execute(f"SELECT number, id, body, share {_WAIT} ORDER BY number LIMIT ?", (count,))
-            return [Kept(*row) for row in rows]
+            query = f"SELECT number, id, body, share {_UNSENT} ORDER BY number LIMIT ?"
+            return [OutboxRecord(*row) for row in self._database.execute(query, (count,))]
 
-    def done(self, last: Kept) -> None:
-        """A record and all before it are acknowledged; they are forgotten after `SENT_AGAIN`."""
+    def acknowledge(self, last: OutboxRecord) -> None:
+        """Mark a record and all before it as sent; they are deleted after `RESEND_WINDOW_S`."""
         now = time.time()
         with self._lock:
-            self._base.execute("UPDATE records SET sent = ? WHERE number <= ? AND sent IS NULL", (now, last.number))
-            self._forget("sent < ?", now - SENT_AGAIN)
+            self._database.execute("UPDATE records SET sent = ? WHERE number <= ? AND sent IS NULL", (now, last.number))
+            self._delete("sent < ?", now - RESEND_WINDOW_S)
 
-    def again(self) -> None:
-        """Who took the last records is gone: they wait again."""
+    def requeue_sent(self) -> None:
+        """Mark the recently acknowledged records as unsent: the broker that took them is gone."""
         with self._lock:
-            self._base.execute("UPDATE records SET sent = NULL")
+            self._database.execute("UPDATE records SET sent = NULL")
 
     def __len__(self) -> int:
-        """Records that wait."""
+        """Number of unsent records."""
         with self._lock:
-            return int(self._base.execute(f"SELECT count(*) {_WAIT}").fetchone()[0])
+            return int(self._database.execute(f"SELECT count(*) {_UNSENT}").fetchone()[0])
 
-    def _forget(self, which: str, value: float) -> None:
-        sizes = self._base.execute(
-            f"SELECT share, sum(length(body)) FROM records WHERE {which} GROUP BY share", (value,)
+    def _delete(self, condition: str, value: float) -> None:
+        sizes = self._database.execute(
+            f"SELECT share, sum(length(body)) FROM records WHERE {condition} GROUP BY share", (value,)
         )
         self._bytes.subtract(dict(sizes.fetchall()))
-        self._base.execute(f"DELETE FROM records WHERE {which}", (value,))
+        self._database.execute(f"DELETE FROM records WHERE {condition}", (value,))
 
     def close(self) -> None:
-        """Release the file."""
+        """Close the file and release its lock."""
         with self._lock:
-            self._base.close()
+            self._database.close()
 
 
-def _connected(path: Path) -> sqlite3.Connection:
-    """The file, which is locked until it is closed or the process ends, however that comes."""
-    base = None
+def _open_locked(path: Path) -> sqlite3.Connection:
+    """Open the file with an exclusive lock, which lasts until it is closed or the process ends for any reason."""
+    database = None
     try:
-        base = sqlite3.connect(path, timeout=0, check_same_thread=False, isolation_level=None)
-        base.execute("PRAGMA locking_mode = EXCLUSIVE")
-        base.execute("PRAGMA journal_mode = WAL")
-        base.execute("PRAGMA synchronous = OFF")  # a kill loses nothing, a power cut the last moments
-        base.execute(_TABLE)
-        base.execute("UPDATE records SET share = share WHERE number IS NULL")  # writes nothing, but takes the lock
+        database = sqlite3.connect(path, timeout=0, check_same_thread=False, isolation_level=None)
+        database.execute("PRAGMA locking_mode = EXCLUSIVE")
+        database.execute("PRAGMA journal_mode = WAL")
+        database.execute("PRAGMA synchronous = OFF")  # a kill loses nothing, a power cut the last moments
+        database.execute(_TABLE)
+        database.execute("UPDATE records SET share = share WHERE number IS NULL")  # changes nothing but takes the lock
     except sqlite3.DatabaseError as error:
-        if base is not None:
-            base.close()
+        if database is not None:
+            database.close()
         if error.sqlite_errorcode == sqlite3.SQLITE_BUSY:
-            raise BusyError(path, "another process keeps records there", "Give each a --spool of its own") from None
-        raise InputError(path, f"can't hold records ({error})", "Name another file, or move that one away") from None
-    return base
+            cause = "another process is using this outbox file"
+            raise BusyError(path, cause, "Give each process its own --spool FILE") from None
+        raise InputError(path, f"not an outbox file ({error})", "Name another file, or move this one away") from None
+    return database
 
 
 class Sender:
-    """Sends what a spool holds, in a thread of its own, for as long as it takes; whoever appends never waits."""
+    """Sends the records of an outbox in a background thread and retries with backoff; `append` never blocks."""
 
-    def __init__(self, spool: Spool, send: Callable[[Sequence[Kept]], None]) -> None:
-        """Begin.
+    def __init__(self, outbox: Outbox, send: Callable[[Sequence[OutboxRecord]], None]) -> None:
+        """Start the thread.
 
         Args:
-            spool: that it empties.
-            send: returns when all are acknowledged, in order; raises ConnectionError if not, or if who took the last
-                ones is gone.
+            outbox: whose records are sent.
+            send: returns when all records are acknowledged, in order; raises ConnectionError if they weren't, or if the
+                broker that took the previous ones is gone.
         """
-        self._spool, self._send = spool, send
+        self._outbox, self._send = outbox, send
         self._wake, self._stop = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="records", daemon=True)
         self._thread.start()
 
     def wake(self) -> None:
-        """There is something to send."""
+        """Notify the thread that a record was appended."""
         self._wake.set()
 
     def close(self, timeout: float = 5.0) -> None:
-        """Send what waits if that can be done in so many seconds; the rest stays on disk."""
+        """Send the pending records within `timeout` seconds and stop; the rest stays on disk."""
         end = time.monotonic() + timeout
-        while len(self._spool) and time.monotonic() < end and self._thread.is_alive():
+        while len(self._outbox) and time.monotonic() < end and self._thread.is_alive():
             self._wake.set()
             time.sleep(0.02)
         self._stop.set()
@@ -204,57 +208,57 @@ class Sender:
         self._thread.join(timeout)
 
     def _run(self) -> None:
-        with contextlib.suppress(sqlite3.ProgrammingError):  # the spool was closed, as `close` waits no longer
-            self._empty()
+        with contextlib.suppress(sqlite3.ProgrammingError):  # the outbox was closed after `close` timed out
+            self._send_pending()
 
-    def _empty(self) -> None:
+    def _send_pending(self) -> None:
         pause = 0.0
         while not self._stop.is_set():
-            waiting = self._spool.first()
-            if not waiting:
+            batch = self._outbox.pending()
+            if not batch:
                 self._wake.wait(1.0)
                 self._wake.clear()
                 continue
             try:
-                self._send(waiting)
+                self._send(batch)
             except ConnectionError as error:
                 if not pause:
-                    log.warning("records wait on disk: %s", error)
-                    self._spool.again()
-                pause = min(LONGEST_PAUSE, 2 * pause or 0.1)
+                    log.warning("records are buffered on disk: %s", error)
+                    self._outbox.requeue_sent()
+                pause = min(MAX_RETRY_PAUSE_S, 2 * pause or 0.1)
                 self._stop.wait(pause)
                 continue
             if pause:
-                log.warning("records are sent again")
+                log.warning("the connection is back: buffered records are being sent")
             pause = 0.0
-            self._spool.done(waiting[-1])
+            self._outbox.acknowledge(batch[-1])
 
 
-class Once:
-    """Drops doubles; a reader's memory of what it took, within bounds."""
+class Deduplicator:
+    """Recognizes duplicate records by id, with bounded memory."""
 
-    MAKERS = 10_000
-    """Makers that are remembered, at most: those of the last records."""
-    AWAITED = 10_000
-    """Numbers of one maker that may still come, after later ones."""
+    MAX_PRODUCERS = 10_000
+    """Producers that are remembered: those of the latest records."""
+    MAX_OUTSTANDING = 10_000
+    """Numbers of one producer that may still arrive late, after higher ones."""
 
     def __init__(self) -> None:
         self._last: dict[str, int] = {}
-        self._awaited: dict[str, set[int]] = {}
+        self._outstanding: dict[str, set[int]] = {}
 
-    def new(self, record_id: str) -> bool:
-        """Whether a record, by its id, wasn't taken yet; it counts as taken from now on."""
-        maker, _, numbered = record_id.rpartition(":")
-        number, last = int(numbered), self._last.pop(maker, 0)
-        awaited = self._awaited.setdefault(maker, set())
-        self._last[maker] = max(last, number)
-        if len(self._last) > self.MAKERS:
+    def is_new(self, record_id: str) -> bool:
+        """Whether a record id was not seen before; from now on it counts as seen."""
+        producer, _, suffix = record_id.rpartition(":")
+        number, last = int(suffix), self._last.pop(producer, 0)
+        outstanding = self._outstanding.setdefault(producer, set())
+        self._last[producer] = max(last, number)
+        if len(self._last) > self.MAX_PRODUCERS:
             oldest = next(iter(self._last))
-            del self._last[oldest], self._awaited[oldest]
+            del self._last[oldest], self._outstanding[oldest]
         if number > last:
-            awaited.update(range(max(last + 1, number - self.AWAITED), number))
+            outstanding.update(range(max(last + 1, number - self.MAX_OUTSTANDING), number))
             return True
-        if number in awaited:
-            awaited.remove(number)
+        if number in outstanding:
+            outstanding.remove(number)
             return True
         return False

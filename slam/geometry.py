@@ -1,6 +1,6 @@
-"""Geometry of viewing directions: rotations, triangulation, the relative pose of two cameras. Import late: numba.
+"""Geometry of bearings: rotations, triangulation, relative pose of two cameras. Uses numba: import it late.
 
-Bearings are unit vectors in camera axes, so that any camera will do, and nothing is special about seam or poles.
+Bearings are unit vectors in camera axes: they work with any camera model, without special cases at seam or poles.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from scan2sim.pipeline.core.types import F64, I32, I64, Bools
 
 
 def exp_so3(w: npt.ArrayLike) -> F64:
-    """(..., 3, 3) rotations of rotation vectors (..., 3), radians."""
+    """(..., 3, 3) rotation matrices of rotation vectors (..., 3), radians."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_rotvec(np.asarray(w, np.float64)).as_matrix()
 
 
 def log_so3(R: npt.ArrayLike) -> F64:
-    """(..., 3) rotation vectors, radians, of rotations (..., 3, 3)."""
+    """(..., 3) rotation vectors, radians, of rotation matrices (..., 3, 3)."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(np.asarray(R, np.float64)).as_rotvec()
 
 
 def rigid(R: F64, t: F64) -> F64:
-    """(4, 4) pose."""
+    """Pose (4, 4) of a rotation (3, 3) and a translation (3,)."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
     return T
 
 
 def inverse(T: F64) -> F64:
-    """Of poses (..., 4, 4)."""
+    """Inverse of poses (..., 4, 4)."""
     out = np.zeros_like(T)
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
     out[..., :3, :3], out[..., 3, 3] = Rt, 1
@@ -46,16 +46,16 @@ def inverse(T: F64) -> F64:
 
 @njit(cache=True, nogil=True)
 def triangulate(poses: F64, starts: I64, camera_of: I32, bearing: F64) -> tuple[F64, F64]:
-    """Where rays meet, by least squares of the distances to them, and the widest angle between two.
+    """Triangulate points: least squares of the distances to their rays, and the widest angle between two rays.
 
     Args:
         poses: (C, 4, 4) camera to world.
         starts: (P + 1,) observations of point p are starts[p] to starts[p + 1].
         camera_of: (O,) camera of each observation.
-        bearing: (O, 3).
+        bearing: (O, 3) unit vectors, camera axes.
 
     Returns:
-        (P, 3) points and (P,) radians; NaN where rays are parallel or meet behind a camera.
+        (P, 3) points, NaN where rays are parallel or intersect behind a camera, and (P,) angles, radians.
     """
     n = len(starts) - 1
     points = np.full((n, 3), np.nan)
@@ -104,13 +104,13 @@ def triangulate(poses: F64, starts: I64, camera_of: I32, bearing: F64) -> tuple[
 
 
 def angles(poses: F64, points: F64, bearing: F64) -> F64:
-    """(N,) radians from bearings (N, 3) to the directions of points (N, 3); poses (4, 4) or (N, 4, 4), to world."""
+    """(N,) angles, radians, between bearings (N, 3) and points (N, 3); poses (4, 4) or (N, 4, 4) camera to world."""
     seen = ((points - poses[..., :3, 3])[:, None, :] @ poses[..., :3, :3])[:, 0]
     return np.arctan2(np.linalg.norm(np.cross(seen, bearing), axis=1), np.einsum("ni,ni->n", seen, bearing))
 
 
 def epipolar_errors(E: F64, a: F64, b: F64) -> F64:
-    """(..., N) radians of bearings b off the epipolar planes of a, both ways the larger: E (..., 3, 3), b' E a = 0."""
+    """(..., N) symmetric epipolar errors, radians, of bearings a, b (N, 3) for E (..., 3, 3) with b' E a = 0."""
     la, lb = a @ np.swapaxes(E, -1, -2), b @ E
     sine = np.abs(np.einsum("...nk,nk->...n", la, b))
     na, nb = np.linalg.norm(la, axis=-1), np.linalg.norm(lb, axis=-1)
@@ -118,7 +118,7 @@ def epipolar_errors(E: F64, a: F64, b: F64) -> F64:
 
 
 def essential(T: F64) -> F64:
-    """(3, 3) of the pose (4, 4) of a first camera in a second's axes: bearings fulfil b' E a = 0."""
+    """Essential matrix (3, 3) of the pose (4, 4) of camera a in the axes of camera b: b' E a = 0."""
     x, y, z = T[:3, 3] / max(float(np.linalg.norm(T[:3, 3])), 1e-9)
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ T[:3, :3]
 
@@ -126,13 +126,13 @@ def essential(T: F64) -> F64:
 def relative_pose(
     a: F64, b: F64, *, threshold: float, rng: np.random.Generator, rounds: int = 300
 ) -> tuple[F64, Bools] | None:
-    """Pose (4, 4) of camera b in camera a's axes, baseline of length 1, from bearings (N, 3) of the same features.
+    """Relative pose (4, 4) of camera b in camera a's axes, with a unit baseline, and the inliers (N,).
 
-    RANSAC with eight rays each (Hartley's linear method, on the sphere), then refined on all inliers.
+    RANSAC with the eight-point algorithm on bearings (Hartley's linear method), then refined on all inliers.
 
     Args:
-        a, b: bearings.
-        threshold: radians, of an inlier.
+        a, b: (N, 3) bearings of the same features in both cameras.
+        threshold: greatest epipolar error of an inlier, radians.
         rng: for the samples.
         rounds: number of samples.
 
@@ -163,13 +163,13 @@ def relative_pose(
 
 
 def _nearest_essential(E: F64) -> F64:
-    """The nearest essential matrices of (B, 3, 3)."""
+    """(B, 3, 3) essential matrices nearest to given matrices (B, 3, 3)."""
     u, _, vt = np.linalg.svd(E)
     return u @ np.diag([1.0, 1.0, 0.0]) @ vt
 
 
 def _decompose(E: F64, a: F64, b: F64, inlier: Bools) -> tuple[F64, Bools]:
-    """Of the four poses that E may mean, that in which most rays meet in front of both cameras."""
+    """Pose with most points in front of both cameras, among the four that E allows, and these points (N,)."""
     u, _, vt = np.linalg.svd(E)
     u, vt = u * np.sign(np.linalg.det(u)), vt * np.sign(np.linalg.det(vt))
     W = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])

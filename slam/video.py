@@ -1,4 +1,4 @@
-"""Video: frames of a video file, or of a folder of pictures, one at a time, in order of their times."""
+"""Video input: reads the frames of a video file, or of a folder of images, in order of time."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import F64, U8
 from scan2sim.pipeline.io.images.image import SUFFIXES, read_levels
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame: its number in the source, `time` in seconds from the first, `grey` (H, W) and a name."""
+    """A frame: its number in the source, `time` in seconds since the first frame, `grey` (H, W) image and name."""
 
     number: int
     time: float
@@ -29,16 +29,16 @@ class Frame:
 
 @dataclass(frozen=True)
 class Video:
-    """What frames come from.
+    """A video file, or a folder of images.
 
     Attributes:
         path: video file or folder.
-        width, height: pixels of the first frame.
-        count: of frames, as the file says; None if it doesn't.
-        fps: frames a second, as the file says, or as was given for a folder.
-        start: UNIX time of the first frame where the file tells it, else None.
-        times: (N,) seconds of a folder's pictures, where they are given.
-        focal_35mm: millimetres, of film as large, where a file's metadata tell it.
+        width, height: size of the first frame, pixels.
+        count: number of frames by the file's metadata; None if unknown.
+        fps: frames per second by the file's metadata, or as given for a folder.
+        start: UNIX time of the first frame by the file's metadata; None if unknown.
+        times: (N,) seconds of a folder's images, if given.
+        focal_35mm: 35 mm equivalent focal length by the file's metadata, millimetres; None if unknown.
     """
 
     path: Path
@@ -52,20 +52,26 @@ class Video:
 
     @property
     def first(self) -> Path:
-        """The first picture of a folder."""
+        """First image of a folder."""
         return _files(self.path)[0]
 
     def frames(self, *, every: int = 1, warn: Callable[[str], None] = lambda _: None) -> Iterator[Frame]:
-        """Every so manieth frame; frames that are damaged, of another size or out of order are left out, and told."""
+        """Every Nth frame, N = `every`.
+
+        Out-of-order frames are skipped; reading stops at a damaged frame or one of another size. `warn` receives a
+        warning for each of these.
+        """
         source = _of_folder(self) if self.path.is_dir() else _of_file(self, warn)
         last, number = -np.inf, -1
         for number, frame in enumerate(source):
             if frame.grey.shape != (self.height, self.width):
                 size = f"{frame.grey.shape[1]}x{frame.grey.shape[0]}"
-                warn(f"frame {number} is {size} instead of {self.width}x{self.height}: the video is read up to there")
+                warn(
+                    f"frame {number} is {size} instead of {self.width}x{self.height}: the rest of the video is ignored"
+                )
                 return
             if frame.time <= last:
-                warn(f"frame {number} is out of order ({frame.time:.3f} s after {last:.3f} s): left out")
+                warn(f"frame {number} is out of order ({frame.time:.3f} s after {last:.3f} s): skipped")
                 continue
             last = frame.time
             if number % every == 0:
@@ -75,12 +81,12 @@ class Video:
 
 
 def open_video(path: Path, *, fps: float = 10.0, times: Path | None = None) -> Video:
-    """Look at a video file or a folder of pictures.
+    """Open a video file or a folder of images, and read its metadata.
 
     Args:
-        path: of either.
-        fps: of a folder's pictures, where `times` isn't given.
-        times: of a folder's pictures, seconds, one a line.
+        path: video file or folder.
+        fps: frames per second of a folder's images, if `times` isn't given.
+        times: text file with the times of a folder's images, seconds, one per line.
 
     Raises:
         InputError: there are no frames, or they can't be read.
@@ -88,12 +94,12 @@ def open_video(path: Path, *, fps: float = 10.0, times: Path | None = None) -> V
     if path.is_dir():
         return _folder(path, fps, times)
     if not path.is_file():
-        raise InputError(path, "is missing", "Name a video file, or a folder of pictures")
+        raise InputError(path, "file not found", "Check the path; give a video file, or a folder of images")
     av = _av()
     try:
         with av.open(str(path)) as container:
             if not container.streams.video or container.streams.video[0].codec_context is None:
-                raise InputError(path, "has no video stream to read", "Name a video file, or a folder of pictures")
+                raise InputError(path, "has no readable video stream", "Give a video file, or a folder of images")
             stream = container.streams.video[0]
             rate = float(stream.average_rate or stream.base_rate or 30)
             count = stream.frames or (round(stream.duration * stream.time_base * rate) if stream.duration else None)
@@ -102,21 +108,21 @@ def open_video(path: Path, *, fps: float = 10.0, times: Path | None = None) -> V
             size = stream.codec_context.width, stream.codec_context.height
             return Video(path, *size, count, rate, start, None, focal)
     except (av.error.FFmpegError, UnicodeDecodeError) as error:
-        raise InputError(path, f"is no readable video ({error})", "Copy or convert it again") from None
+        raise InputError(path, f"isn't a readable video ({error})", "Copy or convert it again") from None
 
 
 def _av() -> Any:
-    need("a video", "av")
+    require("a video", "av")
     import av
 
     return av
 
 
 def _focal(metadata: dict[str, str]) -> float | None:
-    """Millimetres on 35 mm film, as telephones write it."""
-    told = [text for name, text in metadata.items() if name.lower().endswith("focal_length.35mm_equivalent")]
+    """35 mm equivalent focal length, millimetres, from metadata as phones write it."""
+    values = [text for name, text in metadata.items() if name.lower().endswith("focal_length.35mm_equivalent")]
     try:
-        return next((focal for text in told if (focal := float(text)) > 1), None)
+        return next((focal for text in values if (focal := float(text)) > 1), None)
     except ValueError:
         return None
 
@@ -139,20 +145,20 @@ def _files(path: Path) -> list[Path]:
 def _folder(path: Path, fps: float, times: Path | None) -> Video:
     files = _files(path)
     if not files:
-        raise InputError(path, f"holds no pictures ({' '.join(SUFFIXES)})", "Name a folder of pictures, or a video")
-    shown = None
+        raise InputError(path, f"holds no images ({' '.join(SUFFIXES)})", "Give a folder of images, or a video file")
+    seconds = None
     if times is not None:
         try:
-            shown = np.loadtxt(times, ndmin=1).astype(np.float64)
+            seconds = np.loadtxt(times, ndmin=1).astype(np.float64)
         except (OSError, ValueError) as error:
-            raise InputError(times, f"is no list of times ({error})", "Write seconds, one a line") from None
-        if len(shown) != len(files):
+            raise InputError(times, f"is no list of times ({error})", "Write seconds, one per line") from None
+        if len(seconds) != len(files):
             raise InputError(
-                times, f"has {len(shown)} times for {len(files)} pictures", "Write a time for every picture"
+                times, f"has {len(seconds)} times for {len(files)} images", "Write one time for every image"
             )
-        shown = shown - shown[0]
+        seconds = seconds - seconds[0]
     height, width = read_levels(files[0]).shape
-    return Video(path, width, height, len(files), fps, None, shown)
+    return Video(path, width, height, len(files), fps, None, seconds)
 
 
 def _of_folder(video: Video) -> Iterator[Frame]:
@@ -179,7 +185,7 @@ def _of_file(video: Video, warn: Callable[[str], None]) -> Iterator[Frame]:
 
 
 def _grey(frame: Any) -> U8:
-    """(H, W): the luma plane, where the frame has one."""
+    """(H, W) grey image: the luma plane if the frame has one."""
     if frame.format.name in ("yuv420p", "yuvj420p", "nv12", "yuv422p", "yuvj422p", "yuv444p"):
         plane = frame.planes[0]
         rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)

@@ -1,4 +1,4 @@
-"""Encoding: a video made smaller, slower and worse, as a vehicle's link would have it (D3.2, tables 4 and 5)."""
+"""Video degradation: reduces resolution, frame rate and bitrate to those of a vehicle's link (D3.2, tables 4 and 5)."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from scan2sim.slam.video import Video, _files
 
 
 def encode(video: Video, file: Path, *, size: tuple[int, int], bitrate: float, rate: float) -> float:
-    """Write a video scaled down, at a lower rate, compressed (libx264, superfast); returns its seconds.
+    """Write a video at a lower resolution, frame rate and bitrate (libx264, superfast); returns its duration, seconds.
 
     Args:
         video: the source.
-        file: to be written.
-        size: pixels, (width, height), even.
-        bitrate: Mbit/s that are aimed at.
-        rate: frames a second; times of frames stay those of the source.
+        file: video to write.
+        size: (width, height), even numbers of pixels.
+        bitrate: target bitrate, Mbit/s.
+        rate: frames per second; frames keep their times in the source.
 
     Raises:
         InputError: the source has fewer than two frames.
     """
     chosen, last, start = -1, 0.0, 0.0
     with Encoder(file, size, rate, bitrate=1e6 * bitrate, preset="superfast") as encoder:
-        for time, picture in _pictures(video, size):
-            # a frame whenever the slower clock ticks: times stay those of the source
+        for time, yuv in _yuv_frames(video, size):
+            # take one frame per tick of the lower rate, with its time in the source
             tick = math.floor((time + 0.25 / video.fps) * rate)
             if tick > chosen or rate > 0.98 * video.fps:
                 start = time if chosen < 0 else start
                 chosen, last = tick, time
-                encoder.add(picture(), time)
+                encoder.add(yuv(), time)
     if encoder.count < 2:
         raise InputError(video.path, f"has {encoder.count} frames", "Give a longer video")
     return (last - start) * encoder.count / (encoder.count - 1)
 
 
-def _pictures(video: Video, size: tuple[int, int]) -> Iterator[tuple[float, Callable[[], U8]]]:
-    """Times from the first frame, and what makes the frame as planar YUV (H * 3 / 2, W), scaled."""
+def _yuv_frames(video: Video, size: tuple[int, int]) -> Iterator[tuple[float, Callable[[], U8]]]:
+    """Per frame: seconds since the first one, and a function that returns it scaled, as planar YUV (H * 3 / 2, W)."""
     if video.path.is_dir():
         times = np.arange(video.count or 0) / video.fps if video.times is None else video.times
         for time, path in zip(times.tolist(), _files(video.path), strict=True):
-            yield time, lambda path=path: _of_picture(path, size)  # type: ignore[misc]
+            yield time, lambda path=path: _yuv_of_image(path, size)  # type: ignore[misc]
         return
     import av
 
@@ -61,22 +61,22 @@ def _pictures(video: Video, size: tuple[int, int]) -> Iterator[tuple[float, Call
                 time = number / video.fps if frame.time is None else frame.time
                 first = time if first is None else first
 
-                def picture(frame: Any = frame) -> U8:
+                def yuv(frame: Any = frame) -> U8:
                     if frame.format.name not in ("yuv420p", "yuvj420p"):
                         frame = frame.reformat(format="yuv420p")
                     planes = [_plane(plane) for plane in frame.planes]
                     return _planar(planes[0], planes[1], planes[2], size)
 
-                yield time - first, picture
+                yield time - first, yuv
         except av.error.FFmpegError:
-            return  # what could be read is what there is; `track` tells of it
+            return  # use the readable part; the track step warns about the rest
 
 
 def _plane(plane: Any) -> U8:
     return np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
 
 
-def _of_picture(path: Path, size: tuple[int, int]) -> U8:
+def _yuv_of_image(path: Path, size: tuple[int, int]) -> U8:
     import cv2
 
     small = cv2.resize(read_rgb(path), size, interpolation=cv2.INTER_AREA)
@@ -84,7 +84,7 @@ def _of_picture(path: Path, size: tuple[int, int]) -> U8:
 
 
 def _planar(y: U8, u: U8, v: U8, size: tuple[int, int]) -> U8:
-    """(H * 3 / 2, W) of planes of any size."""
+    """(H * 3 / 2, W) planar YUV 4:2:0 image, scaled from planes of any size."""
     import cv2
 
     width, height = size
@@ -97,6 +97,6 @@ def _planar(y: U8, u: U8, v: U8, size: tuple[int, int]) -> U8:
 
 
 def scaled(camera: Camera, height: int) -> Camera:
-    """The camera of frames scaled to a height, and to an even width."""
+    """Camera of frames scaled to a height, and to the nearest even width."""
     width = 2 * round(height * camera.width / camera.height / 2)
     return camera.resized(width, height)

@@ -1,7 +1,7 @@
-"""Weights: tensors of the user's files, checked before they are used; no code that a file may hold is run.
+"""Network weights: loads tensors from files supplied by the user, after checking them; never executes code in a file.
 
-Nothing is ever downloaded, and nothing of others is part of the project: who uses a network gives its file, and is
-told by `Weights.describe` what it is and under which licence.
+Nothing is downloaded, and no third-party weights are part of the project. `Weights.describe` reports the model, hash
+and licence of a file.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from scan2sim.pipeline.core.errors import InputError, SettingError
 Shape = tuple[int, ...]
 
 NEEDS = ("torch", "safetensors")
-"""Packages that networks of SLAM need."""
-SIGNS = {
+"""Packages that the networks need."""
+NETWORK_SIGNATURES = {
     r"convPa\.weight": "SuperPoint",
     r"bin_score": "SuperGlue",
     r"log_assignment\.\d+\.matchability\.weight": "LightGlue",
@@ -30,20 +30,20 @@ SIGNS = {
     r"(matcher\.)?loftr_coarse\..*": "LoFTR",
     r"segformer\..*": "SegFormer",
 }
-"""What names of tensors tell of the network they are of."""
+"""Patterns of tensor names that identify a network."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A network that a file may be of.
+    """Expected contents of a weights file.
 
     Attributes:
-        name: to tell people.
-        shapes: of its tensors.
-        licence: of its published weights.
+        name: name of the network, for messages.
+        shapes: shapes of its tensors by name.
+        licence: licence of its published weights.
         published: names of published files by their SHA-256.
-        optional: pattern of names that may be there or not, and aren't used.
-        renames: pattern and replacement of names in files to those in `shapes`.
+        optional: pattern of tensor names that may occur and are ignored.
+        renames: patterns and replacements that convert names in files to those in `shapes`.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Weights:
-    """Of a model: float32 `tensors` by name, on a device of torch."""
+    """Weights of a model: float32 `tensors` by name, on a torch device."""
 
     path: Path
     model: Model
@@ -65,14 +65,14 @@ class Weights:
     tensors: dict[str, Any]
 
     def describe(self) -> str:
-        """What is used: file, model, hash, licence."""
+        """Description for logs: file, model, hash, licence."""
         known = self.model.published.get(self.sha256)
         origin = f"as published ({known})" if known else "not a file known to the project"
         return f"{self.path.name}: {self.model.name}, SHA-256 {self.sha256}, {origin}; licence: {self.model.licence}"
 
 
 def torch_device(device: str) -> str:
-    """The device of torch that "auto" stands for here: a GPU where there is one."""
+    """Resolve "auto" to "cuda" if a GPU is available, else "cpu"; other device names are returned unchanged."""
     if device != "auto":
         return device
     import torch
@@ -81,33 +81,33 @@ def torch_device(device: str) -> str:
 
 
 def load(path: Path | None, models: Sequence[Model], *, hint: str, device: str = "auto") -> Weights:
-    """Tensors of a safetensors file or one of `torch.save`.
+    """Load the tensors of a safetensors file, or of a file written by `torch.save`.
 
     Args:
         path: the user's file.
-        models: one of which it should be of.
-        hint: which file to give.
-        device: of torch, or "auto".
+        models: accepted models.
+        hint: which file to supply, for error messages.
+        device: torch device, or "auto".
 
     Raises:
         SettingError: no file is given.
-        InputError: it is missing, damaged, of another model, or holds more than tensors.
+        InputError: the file is missing, damaged, of another model, or contains more than tensors.
     """
     if path is None:
-        raise SettingError("track.weights", f"{models[0].name} comes without weights", hint)
+        raise SettingError("track.weights", f"{models[0].name} needs a weights file", hint)
     if not path.is_file():
-        raise InputError(path, "is no file", f"{hint}; nothing is downloaded")
+        raise InputError(path, "file not found", f"{hint}; weights aren't downloaded")
     state = _tensors(path, hint)
-    fits = [(_faults(state, model), model) for model in models]
-    faults, model = min(fits, key=lambda fit: len(fit[0]))
-    if faults:
-        raise _wrong(path, state, models, faults, hint)
+    checks = [(_mismatches(state, model), model) for model in models]
+    mismatches, model = min(checks, key=lambda check: len(check[0]))
+    if mismatches:
+        raise _wrong_model(path, state, models, mismatches, hint)
     renamed = _renamed(state, model)
     device = torch_device(device)
     tensors = {name: renamed[name].float().to(device) for name in model.shapes}
     bad = next((name for name, value in tensors.items() if not bool(value.isfinite().all())), None)
     if bad:
-        raise InputError(path, f"holds numbers that aren't finite, in {bad}", "Copy or download it again")
+        raise InputError(path, f"contains NaN or infinite values in {bad}", "Copy or download it again")
     return Weights(path, model, device, hashlib.sha256(path.read_bytes()).hexdigest(), tensors)
 
 
@@ -120,36 +120,39 @@ def _renamed(state: dict[str, Any], model: Model) -> dict[str, Any]:
     return out
 
 
-def _faults(state: dict[str, Any], model: Model) -> list[str]:
-    """What speaks against a file's being of a model."""
+def _mismatches(state: dict[str, Any], model: Model) -> list[str]:
+    """Differences between a file's tensors and those of a model."""
     shapes = {name: tuple(value.shape) for name, value in _renamed(state, model).items()}
-    faults = [f"{name} is missing" for name in model.shapes if name not in shapes]
-    faults += [
+    mismatches = [f"{name} is missing" for name in model.shapes if name not in shapes]
+    mismatches += [
         f"{name} is {_size(shapes[name])}, not {_size(shape)}"
         for name, shape in model.shapes.items()
         if name in shapes and shapes[name] != shape
     ]
-    strays = [name for name in shapes if name not in model.shapes and not re.fullmatch(model.optional, name)]
-    return faults + [f"{name} is unknown" for name in strays]
+    unknown = [name for name in shapes if name not in model.shapes and not re.fullmatch(model.optional, name)]
+    return mismatches + [f"{name} is unknown" for name in unknown]
 
 
 def _size(shape: Shape) -> str:
     return " x ".join(map(str, shape)) or "a number"
 
 
-def _wrong(path: Path, state: dict[str, Any], models: Sequence[Model], faults: list[str], hint: str) -> InputError:
-    """What was expected, and what was found."""
+def _wrong_model(
+    path: Path, state: dict[str, Any], models: Sequence[Model], mismatches: list[str], hint: str
+) -> InputError:
+    """Error that names the expected model, and the one found."""
     expected = " or ".join(model.name for model in models)
-    found = {kind for sign, kind in SIGNS.items() for name in state if re.fullmatch(sign, name)}
+    found = {kind for sign, kind in NETWORK_SIGNATURES.items() for name in state if re.fullmatch(sign, name)}
     if found and not any(model.name.startswith(kind) for model in models for kind in found):
         return InputError(path, f"holds weights of {' and '.join(sorted(found))}, expected {expected}", hint)
-    some = ", ".join(list(state)[:3]) or "nothing"
-    kind = f"weights of {' and '.join(sorted(found))} of another shape" if found else f"another network ({some} ...)"
-    return InputError(path, f"holds {kind}, expected {expected}: {faults[0]}, {len(faults)} such faults", hint)
+    first = ", ".join(list(state)[:3]) or "nothing"
+    kind = f"weights of {' and '.join(sorted(found))} of another shape" if found else f"another network ({first} ...)"
+    count = f"{len(mismatches)} mismatches"
+    return InputError(path, f"holds {kind}, expected {expected}: {mismatches[0]}, {count}", hint)
 
 
 def _tensors(path: Path, hint: str) -> dict[str, Any]:
-    """By name; code that a pickle may hold isn't run."""
+    """Tensors of a file by name; code in a pickle isn't executed."""
     import torch
 
     try:
@@ -161,13 +164,13 @@ def _tensors(path: Path, hint: str) -> dict[str, Any]:
             state = torch.load(path, "cpu", weights_only=True)
     except MemoryError:
         raise
-    except Exception as error:  # damaged files raise a dozen kinds
+    except Exception as error:  # damaged files raise many types of errors
         code = re.search(r"GLOBAL (\S+)", str(error))
         if code:
-            cause = f"holds code or objects besides tensors; not run ({code[1]})"
-            raise InputError(path, cause, "Ask who made it for a .safetensors file, which can't hold any") from None
+            cause = f"holds code or objects besides tensors; not executed ({code[1]})"
+            raise InputError(path, cause, "Ask its author for a .safetensors file, which can't contain code") from None
         why = str(error).rpartition("WeightsUnpickler error:")[2].strip().split("\n")[0] or type(error).__name__
-        raise InputError(path, f"is no whole file of tensors alone ({why})", f"Copy it again. {hint}") from None
+        raise InputError(path, f"is damaged, or no file of tensors ({why})", f"Copy it again. {hint}") from None
     if not isinstance(state, dict) or not all(isinstance(value, torch.Tensor) for value in state.values()):
-        raise InputError(path, "holds no tensors by name", "Save the network's `state_dict()` alone")
+        raise InputError(path, "holds no named tensors", "Save only the network's `state_dict()`")
     return state

@@ -51,7 +51,7 @@ PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
     links: (links.Backend,),
     encoders: (encoders.Backend,),
     cameras: (cameras.Backend,),
-    adapters: (adapters.Translator,),
+    adapters: (adapters.VehicleAdapter,),
 }
 """Packages of backends, and what their modules are: one of these."""
 ALL = [(package, name) for package in PROTOCOLS for name in plugins.names(package.__name__)]
@@ -96,7 +96,7 @@ def test_it_says_what_it_needs(package: ModuleType, name: str, monkeypatch: pyte
 
 @pytest.mark.parametrize("package", PROTOCOLS, ids=lambda p: p.__name__)
 def test_an_unknown_name_tells_the_known_ones(package: ModuleType) -> None:
-    with pytest.raises(SettingError, match=r"a\.setting: there is no 'surf'") as caught:
+    with pytest.raises(SettingError, match=r"a\.setting: unknown value 'surf'") as caught:
         plugins.find(package.__name__, "surf", "a.setting")
     assert all(name in caught.value.remedy for name in plugins.names(package.__name__))
 
@@ -135,10 +135,10 @@ def test_a_network_is_one_file(add: Add) -> None:
 
     add(networks, "allroad", """
 import numpy as np
-from scan2sim.segmentation.backends import Facts
+from scan2sim.segmentation.backends import NetworkInfo
 
 class Network:
-    facts = Facts("allroad", ("road", "building", "vegetation", "car"), "0" * 64, "none", None)
+    info = NetworkInfo("allroad", ("road", "building", "vegetation", "car"), "0" * 64, "none", None)
     def probabilities(self, seen):
         return np.stack([np.full(seen.shape[:2], share, np.float32) for share in (0.7, 0.1, 0.1, 0.1)])
 
@@ -163,7 +163,7 @@ def test_a_feature_is_one_file(add: Add) -> None:
     add(features, "blobs", """
 import cv2
 import numpy as np
-from scan2sim.slam.features import Found
+from scan2sim.slam.features import FeatureSet
 
 class Blobs:
     name, binary, dimension = "blobs", False, 25
@@ -171,7 +171,7 @@ class Blobs:
         uv = cv2.goodFeaturesToTrack(picture, 300, 0.01, 5).reshape(-1, 2)
         looks = np.stack([cv2.getRectSubPix(picture, (5, 5), tuple(map(float, at))).ravel() for at in uv])
         looks = looks.astype(np.float32) / np.linalg.norm(looks, axis=1, keepdims=True)
-        return Found(uv, looks, np.linspace(1, 0, len(uv), dtype=np.float32))
+        return FeatureSet(uv, looks, np.linspace(1, 0, len(uv), dtype=np.float32))
     def describe(self):
         return "blobs"
 

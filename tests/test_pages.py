@@ -28,7 +28,12 @@ from scan2sim.services.orchestration.deployment import Deployment
 from tests.conftest import ROOT
 
 ROOMS = ("pipeline", "segmentation", "texturing", "slam", "flows", "services", "data_samples")
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md")), ROOT / "data_samples/README.md"]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted(ROOT.glob("docs/**/*.md")),
+    ROOT / "data_samples/README.md",
+]
 MODULES = sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
 PARAMS: dict[str, type[BaseModel]] = {step.name: step.params for step in STEPS}
 OTHERS = re.compile(r"\b(prefect|docker|dask|ray|gz|pip|aws|curl|trtexec|export.py)\b")
@@ -148,7 +153,7 @@ def test_toml_has_the_fields_that_are_read(page: Path) -> None:
 
 
 def test_the_page_of_drives_names_all_their_fields_and_no_others() -> None:
-    page = (ROOT / "docs" / "scale.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "surveys.md").read_text(encoding="utf-8")
     block = next(b for b in re.findall(r"```toml\n(.*?)```", page, re.DOTALL) if "[sweeps]" in b)
     parts = {name: Drive.model_fields[name].annotation for name in ("slam", "sweeps", "tiles")}
     fields = {field for part in parts.values() for field in _model(part).model_fields}

@@ -1,4 +1,4 @@
-"""docs/third-party.md names what is installed: made again whenever the constraints change."""
+"""docs/reference/third-party.md names what is installed: made again whenever the constraints change."""
 
 from __future__ import annotations
 
@@ -14,11 +14,16 @@ def test_the_page_names_every_pinned_package_of_the_core() -> None:
     pins = dict(re.findall(r"^([\w.-]+)==(\S+)$", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE))
     pins = {canonicalize_name(name): version for name, version in pins.items()}
     core = [name for name in closure(project()["core"]) if name in pins]
-    page = (ROOT / "docs" / "third-party.md").read_text(encoding="utf-8").split("## Core")[1].split("\n## ")[0]
+    page = (
+        (ROOT / "docs" / "reference" / "third-party.md")
+        .read_text(encoding="utf-8")
+        .split("## Core")[1]
+        .split("\n## ")[0]
+    )
     assert len(core) > 20
     for name in core:
         assert f"| {name} | {pins[name]} |" in page, (
-            f"{name}: python -m bench.packaging.third_party > docs/third-party.md"
+            f"{name}: python -m bench.packaging.third_party > docs/reference/third-party.md"
         )
 
 

@@ -113,10 +113,10 @@ def test_a_users_folders_and_files_are_not_taken_for_ours(installed: Installed) 
     assert "not empty" in installed.scan2sim("sample", "--small", "tile", code=2)
     assert "EPSG:32633" in installed.scan2sim("inspect", "tile")
     assert "poisson.terrain" in installed.scan2sim("plan", "tile")
-    call = "from scan2sim.pipeline import isolate; print(isolate.call('operator:add', 1, 2, timeout=60))"
+    call = "from scan2sim.pipeline.core import sandbox; print(sandbox.call('operator:add', 1, 2, timeout=60))"
     assert installed.run(installed.environment / "bin" / "python", "-P", "-c", call) == "3\n"
     printed = installed.scan2sim("plan", "tile", "--set", "voxel.size=-1", code=2)
-    (page,) = re.findall(r"/\S+/docs/settings.md", printed)  # hints name pages where they are
+    (page,) = re.findall(r"/\S+/docs/reference/settings.md", printed)  # hints name pages where they are
     assert "voxel.size" in Path(page).read_text(encoding="utf-8")
     (installed.user / "tile" / "cloud.laz").write_bytes(b"LASF")  # found out by the first step, in its own process
     printed = installed.scan2sim("run", "tile", "--out", "out", code=3)

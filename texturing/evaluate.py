@@ -1,4 +1,4 @@
-"""How good a texture is: renderings against photos that were held out of texturing."""
+"""Texture evaluation: PSNR, SSIM and sharpness of renderings against photos held out of texturing."""
 
 from __future__ import annotations
 
@@ -19,26 +19,28 @@ if TYPE_CHECKING:
     from scan2sim.pipeline.camera.renderer import Image, Renderer
 
 
-SAMPLES = 3
-"""Rays a pixel each way: a rendering is as soft with distance as a simulator's, which filters with mip-maps."""
-BANDS = (5.0, 10.0, 20.0, 40.0)
+RAYS_PER_PIXEL_SIDE = 3
+"""Rays per pixel in each direction: renderings get as soft with distance as a simulator's, which uses mip-maps."""
+BAND_EDGES_M = (5.0, 10.0, 20.0, 40.0)
 """Metres from the camera at which one distance band ends and the next begins."""
 BAND_NAMES = ("0-5 m", "5-10 m", "10-20 m", "20-40 m", "40+ m")
-SCALE = 64
-"""Grey levels apart at which an error picture is at its brightest."""
-GAP = 4  # pixels between the parts of an error picture
-NOT_COUNTED = 128
+ERROR_IMAGE_MAX_LEVELS = 64
+"""Difference in grey levels that an error image shows at full brightness."""
+ERROR_IMAGE_GAP_PX = 4
+"""Pixels between the parts of an error image."""
+ERROR_IMAGE_UNCOUNTED_LEVEL = 128
+"""Grey level of pixels that are not counted."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """How a rendering differs from its photo, pixel by pixel: (H, W) float32, NaN where nothing counts.
+    """Per-pixel errors of a rendering against its photo: (H, W) float32, NaN for pixels that are not counted.
 
     Attributes:
         squared: squared difference, mean of the channels.
         squared_gain: the same, after the least-squares gain of each channel over the whole photo.
-        ssim: structural similarity of the grey images in the window about the pixel (Wang et al. 2004); NaN too where
-            the window lies mostly outside of what counts.
+        ssim: structural similarity of the grey images in the window around the pixel (Wang et al. 2004); also NaN
+            where the window lies mostly outside the mask.
     """
 
     squared: F32
@@ -48,17 +50,17 @@ class Errors:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """A photo that was held out, and how it was met.
+    """A held-out photo and the scores of its rendering.
 
     Attributes:
         view: posed photo.
         photo: (H, W, 3) uint8 RGB.
-        render: what the world looks like from there, with the index of the folder (`body`) and the metres from the
-            camera (`range`) of every pixel.
-        mask: (H, W) pixels that count: a surface that another photo saw, hidden from this one by nothing that
-            the world leaves out (a parked car), and not masked out. Of a photo that shows none, any surface; of one
-            that shows no surface at all, everything: what the world lacks there is its fault, and counts.
-        errors: pixel by pixel.
+        render: rendering of the world from the photo's pose, with the index of the folder (`body`) and the distance
+            from the camera in metres (`range`) of every pixel.
+        mask: (H, W) pixels that are counted: surfaces that another photo saw, that this photo sees without an object
+            in front that the world leaves out (a parked car), and that are not masked out. If there are none, any
+            surface is counted; if there is no surface at all, all pixels are: missing surfaces are errors of the world.
+        errors: per-pixel errors.
         coverage: share of the pixels with a surface that another photo saw.
         psnr_db, psnr_gain_db, ssim, sharpness: see `score`.
     """
@@ -76,25 +78,25 @@ class HeldOut:
 
 
 def score(photo: U8, render: U8, mask: Bools) -> dict[str, float]:
-    """Likeness of a rendering to a photo (H, W, 3) where `mask` (H, W) holds.
+    """Similarity of a rendering to a photo, (H, W, 3) each, over the pixels of `mask` (H, W).
 
     Returns:
-        psnr_db: as it is; psnr_gain_db: after the least-squares gain of each channel, and so are ssim, the mean
-        structural similarity, and sharpness (see there): a photo's exposure is not the texture's. NaN where nothing
-        counts.
+        psnr_db: PSNR of the rendering as it is. psnr_gain_db: PSNR after the least-squares gain of each channel, which
+        compensates the photo's exposure. ssim: mean structural similarity after the gain. sharpness: see `sharpness`,
+        after the gain. NaN if no pixel is counted.
     """
     return _score(errors(photo, render, mask), photo, render, mask)
 
 
-def _score(of: Errors, photo: U8, render: U8, mask: Bools) -> dict[str, float]:
-    whole = figures(tally(of, np.zeros(mask.shape, np.int64), 1)[0])
-    return {name: whole[name] for name in ("psnr_db", "psnr_gain_db", "ssim")} | {
+def _score(pixel_errors: Errors, photo: U8, render: U8, mask: Bools) -> dict[str, float]:
+    scores = figures(tally(pixel_errors, np.zeros(mask.shape, np.int64), 1)[0])
+    return {name: scores[name] for name in ("psnr_db", "psnr_gain_db", "ssim")} | {
         "sharpness": sharpness(photo, matched(photo, render, mask), mask)
     }
 
 
 def errors(photo: U8, render: U8, mask: Bools) -> Errors:
-    """The errors of a rendering (H, W, 3) against a photo, where `mask` (H, W) holds."""
+    """Per-pixel errors of a rendering (H, W, 3) against a photo (H, W, 3), within `mask` (H, W)."""
     like = matched(photo, render, mask)
     squared, squared_gain = (np.full(mask.shape, np.nan, np.float32) for _ in range(2))
     squared[mask] = ((photo[mask].astype(np.float64) - render[mask]) ** 2).mean(axis=1)
@@ -103,16 +105,16 @@ def errors(photo: U8, render: U8, mask: Bools) -> Errors:
 
 
 def matched(photo: U8, render: U8, mask: Bools) -> U8:
-    """The rendering (H, W, 3) with the least-squares gain of each channel that makes it most like the photo."""
+    """The rendering (H, W, 3) scaled by the least-squares gain of each channel to match the photo."""
     a, b = photo[mask].astype(np.float64), render[mask].astype(np.float64)
     gain = (a * b).sum(axis=0) / np.maximum((b * b).sum(axis=0), 1.0)
     return np.clip(np.round(render * gain), 0, 255).astype(np.uint8)
 
 
 def sharpness(photo: U8, render: U8, mask: Bools) -> float:
-    """Mean absolute Laplacian of the grey rendering over that of the photo: 1 is as sharp as it, less is softer.
+    """Sharpness ratio: mean absolute Laplacian of the grey rendering over that of the photo; below 1 is softer.
 
-    Pixels count whose eight neighbours are in the mask; NaN where there are none, or the photo has no detail there.
+    Pixels are counted whose eight neighbours are in the mask; NaN if there are none, or the photo has no detail there.
     """
     import cv2
 
@@ -124,17 +126,17 @@ def sharpness(photo: U8, render: U8, mask: Bools) -> float:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         return float(np.abs(cv2.Laplacian(grey, cv2.CV_32F)[inner]).mean())
 
-    of_photo = detail(photo)
-    return detail(render) / of_photo if of_photo > 0 else math.nan
+    photo_detail = detail(photo)
+    return detail(render) / photo_detail if photo_detail > 0 else math.nan
 
 
-def tally(of: Errors, part: npt.NDArray[Any], count: int) -> F64:
-    """Sums of a photo's errors by part; those of several photos may be added up.
+def tally(pixel_errors: Errors, part: npt.NDArray[Any], count: int) -> F64:
+    """Sums of a photo's errors by part; sums of several photos can be added.
 
     Args:
-        of: a photo's errors.
-        part: (H, W) integers, the part that a pixel belongs to; negative: none.
-        count: of parts.
+        pixel_errors: errors of one photo.
+        part: (H, W) integers, the part that a pixel belongs to (such as its class); negative: none.
+        count: number of parts.
 
     Returns:
         (count, 5): pixels, sums of `squared` and `squared_gain`, pixels with a window, sum of `ssim`.
@@ -146,12 +148,12 @@ def tally(of: Errors, part: npt.NDArray[Any], count: int) -> F64:
         pixels, total = (np.bincount(part[counts], weight, count).astype(np.float64) for weight in weights)
         return pixels, total
 
-    pixels, squared = sums(of.squared)
-    return np.stack([pixels, squared, sums(of.squared_gain)[1], *sums(of.ssim)], axis=1)
+    pixels, squared = sums(pixel_errors.squared)
+    return np.stack([pixels, squared, sums(pixel_errors.squared_gain)[1], *sums(pixel_errors.ssim)], axis=1)
 
 
 def figures(sums: F64) -> dict[str, Any]:
-    """What sums (5,) of `tally` come to: `psnr_db`, `psnr_gain_db`, `ssim` (NaN where nothing counts), `pixels`."""
+    """Scores from sums (5,) of `tally`: `psnr_db`, `psnr_gain_db`, `ssim` (NaN if no pixel is counted), `pixels`."""
     pixels, squared, squared_gain, windows, ssim = sums.tolist()
     return {
         "psnr_db": psnr(squared / pixels) if pixels else math.nan,
@@ -162,12 +164,12 @@ def figures(sums: F64) -> dict[str, Any]:
 
 
 def psnr(squared: float) -> float:
-    """In dB, of a mean squared error of 8-bit values; at most 78."""
+    """Peak signal-to-noise ratio in dB of a mean squared error of 8-bit values; at most 78."""
     return 10 * math.log10(255**2 / max(squared, 1e-3))
 
 
 def _ssim(photo: U8, render: U8, mask: Bools) -> F32:
-    """(H, W) by Gaussian windows of sigma 1.5; pixels outside the mask have no say in them."""
+    """(H, W) SSIM with Gaussian windows of sigma 1.5; pixels outside the mask are excluded from the windows."""
     import cv2
 
     def blur(image: F32) -> F32:
@@ -185,13 +187,13 @@ def _ssim(photo: U8, render: U8, mask: Bools) -> F32:
 
 
 def held_out(world: Renderer, views: Sequence[View], depths: Sequence[Path] | None = None) -> Iterator[HeldOut]:
-    """Render textured meshes from each of the views, and score; views whose photo or mask can't be read are skipped.
+    """Render textured meshes from each held-out view and score the renderings; skips unreadable photos and masks.
 
     Args:
-        world: the textured meshes.
-        views: held out.
-        depths: files of the views' depth maps, which tell where a photo shows something that the world leaves
-            out; None: every pixel with a surface counts.
+        world: renderer of the textured meshes.
+        views: held-out views.
+        depths: depth map file of each view; pixels where it shows an object that the world leaves out are not
+            counted. None: every pixel with a surface is counted.
     """
     import cv2
 
@@ -199,9 +201,9 @@ def held_out(world: Renderer, views: Sequence[View], depths: Sequence[Path] | No
     for view, depth in zip(views, files, strict=True):
         try:
             photo, allowed = image.read_photo(view), image.read_mask(view)
-        except InputError:  # `views` has told
+        except InputError:  # the step `views` has warned about it
             continue
-        render = world.view(view.camera, view.T_world_cam, samples=SAMPLES)
+        render = world.view(view.camera, view.T_world_cam, samples=RAYS_PER_PIXEL_SIDE)
         surface = render.hit if allowed is None else render.hit & (allowed > 0)
         if depth is not None:
             first = cv2.resize(np.load(depth), surface.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -210,29 +212,31 @@ def held_out(world: Renderer, views: Sequence[View], depths: Sequence[Path] | No
         coverage = float(mask.sum() / max(1, surface.sum()))
         if not mask.any():
             mask = surface if surface.any() else np.ones_like(surface) if allowed is None else allowed > 0
-        of = errors(photo, render.rgb, mask)
-        yield HeldOut(view, photo, render, mask, of, coverage, **_score(of, photo, render.rgb, mask))
+        pixel_errors = errors(photo, render.rgb, mask)
+        scores = _score(pixel_errors, photo, render.rgb, mask)
+        yield HeldOut(view, photo, render, mask, pixel_errors, coverage, **scores)
 
 
-def error_picture(result: HeldOut, *, width: int = 1600) -> U8:
+def error_image(result: HeldOut, *, width: int = 1600) -> U8:
     """Photo, rendering and their difference side by side: (H, W, 3) RGB, at most `width` pixels wide.
 
-    The difference is the mean of the channels', from black (alike) to bright yellow (`SCALE` grey levels or more);
-    grey where nothing counts.
+    The difference, averaged over the channels, is drawn from black (equal) to bright yellow
+    (`ERROR_IMAGE_MAX_LEVELS` grey levels or more); grey where pixels are not counted.
     """
     import cv2
 
-    height, wide = result.photo.shape[:2]
-    across = max(1, min(wide, (width - 2 * GAP) // 3))
-    size = (across, max(1, round(height * across / wide)))
+    photo_height, photo_width = result.photo.shape[:2]
+    part_width = max(1, min(photo_width, (width - 2 * ERROR_IMAGE_GAP_PX) // 3))
+    size = (part_width, max(1, round(photo_height * part_width / photo_width)))
 
     def small(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
     counted = small(result.mask.astype(np.float32))
-    apart = np.abs(result.photo.astype(np.float32) - result.render.rgb).mean(axis=2) * result.mask
-    level = np.clip(small(apart) / np.maximum(counted, 1e-6) * (255 / SCALE), 0, 255).astype(np.uint8)
+    absolute = np.abs(result.photo.astype(np.float32) - result.render.rgb).mean(axis=2) * result.mask
+    scale = 255 / ERROR_IMAGE_MAX_LEVELS
+    level = np.clip(small(absolute) / np.maximum(counted, 1e-6) * scale, 0, 255).astype(np.uint8)
     coloured = np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO))[..., ::-1]
-    difference = np.where(counted[..., None] > 0.5, coloured, NOT_COUNTED).astype(np.uint8)
-    gap = np.full((size[1], GAP, 3), 255, np.uint8)
+    difference = np.where(counted[..., None] > 0.5, coloured, ERROR_IMAGE_UNCOUNTED_LEVEL).astype(np.uint8)
+    gap = np.full((size[1], ERROR_IMAGE_GAP_PX, 3), 255, np.uint8)
     return np.hstack([small(result.photo), gap, small(result.render.rgb), gap, difference])

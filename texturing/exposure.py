@@ -1,10 +1,10 @@
-"""Exposure: what makes all photos of a tile alike, solved jointly.
+"""Exposure step: photometric calibration of all photos of a tile (exposure, white balance, vignetting), solved jointly.
 
-Places on the surface are sampled in every photo that sees them. In the encoded values' power law a change of
-exposure or white balance is a factor, so its logarithm is a sum: photo's gain (per channel) + camera's vignetting
-(a polynomial of the distance to the middle) + the place's own colour. Least squares over all of them, made robust
-by reweighting (Huber), with the places eliminated, and a prior towards no change, or towards what an earlier tile
-found, so that neighbouring tiles agree.
+Surface points are sampled in every photo that sees them. Encoded sRGB values follow a power law, in which a change of
+exposure or white balance is a factor, so the logarithm of a sample is a sum: gain of the photo (per channel) +
+vignetting of the camera (a polynomial of the distance to the image centre) + colour of the point. Solved by robust
+least squares (Huber, iteratively reweighted) with the point colours eliminated (Schur complement), and with a prior
+towards no change, or towards the exposures of an earlier tile, so that neighbouring tiles agree.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.core.parameters import FileName, Reach, Stops
+from scan2sim.pipeline.core.parameters import Distance, ExposureStops, FileName
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, I64, U8, View
 from scan2sim.pipeline.io import views as views_io
@@ -28,46 +28,46 @@ if TYPE_CHECKING:
 
 
 class ExposureParams(Params):
-    """How photos are made alike.
+    """Settings of the exposure calibration.
 
     Attributes:
-        solve: False leaves all photos as they are.
-        vignetting: solve a camera's darkening towards the corners, too.
-        prior: an earlier tile's `exposure.json`, whose photos and cameras keep what it found for them.
-        samples: places sampled for each photo.
-        max_distance: metres beyond which a photo is not sampled.
-        spread: stops (EV) by which exposures are expected to differ: the prior's standard deviation.
-        tint: stops by which a channel's gain is expected to differ from the others'.
+        solve: estimate exposures; False leaves all photos unchanged.
+        vignetting: also estimate each camera's darkening towards the corners.
+        prior: `exposure.json` of an earlier tile; photos and cameras that occur in it keep its values.
+        samples: surface points sampled per photo.
+        max_distance: metres from the camera beyond which a photo is not sampled.
+        spread: expected difference between exposures in stops (EV): standard deviation of the prior.
+        tint: expected difference between a channel's gain and the other channels' in stops (EV).
     """
 
     solve: bool = True
     vignetting: bool = True
     prior: FileName = ""
     samples: int = Field(1500, ge=50, le=100_000)
-    max_distance: Reach = 100.0
-    spread: Stops = 1.0
-    tint: Stops = 0.15
+    max_distance: Distance = 100.0
+    spread: ExposureStops = 1.0
+    tint: ExposureStops = 0.15
 
 
-PIXELS = 400_000
-"""Places are drawn from depth maps of this size at most."""
-OUTLIER = 0.06
-"""Residual, of the encoded values' logarithm, beyond which an observation's say falls (Huber)."""
-DARK, BRIGHT = 12, 243
-"""Grey levels outside of which an observation says nothing."""
-KNOWN = 0.05
-"""Stops by which a photo may depart from what an earlier tile found for it."""
-ROUNDS = 8
-WORTH = 0.8
-"""Vignetting is kept if it makes photos disagree less than this share of before."""
+SAMPLING_PIXELS_MAX = 400_000
+"""Points are sampled from depth maps of at most this many pixels."""
+HUBER_RESIDUAL = 0.06
+"""Residual (logarithm of encoded values) beyond which an observation is down-weighted (Huber)."""
+GREY_LEVEL_MIN, GREY_LEVEL_MAX = 12, 243
+"""Grey levels outside of which an observation is rejected as under- or overexposed."""
+PRIOR_TOLERANCE_EV = 0.05
+"""Stops by which a photo may depart from the exposure that an earlier tile estimated for it (standard deviation)."""
+IRLS_ITERATIONS = 8
+VIGNETTING_RESIDUAL_RATIO_MAX = 0.8
+"""Vignetting is kept if it reduces the median residual below this share of the residual without it."""
 MIN_COS = 0.15
-BIAS = 0.04
+VISIBILITY_BIAS_M = 0.04
 
 
 def exposure(inputs: Inputs, params: ExposureParams, out: Path, report: Report) -> Done:
-    """Solve the exposures of all photos that are not held out.
+    """Estimate the exposures of all photos that are not held out.
 
-    Inputs: `views`, `depth` (folder of depth maps), `prior` (an earlier tile's exposures) or none.
+    Inputs: `views`, `depth` (folder of depth maps), `prior` (exposures of an earlier tile, optional).
     File: `exposures`, JSON of `texturing.photo_cache.Exposures`.
     """
     from scan2sim.texturing.photo_cache import Exposures, camera_of
@@ -75,16 +75,16 @@ def exposure(inputs: Inputs, params: ExposureParams, out: Path, report: Report) 
     views = views_io.load(inputs["views"])
     held = views_io.load_held_out(inputs["views"])
     prior = Exposures.load(inputs["prior"]) if "prior" in inputs else Exposures()
-    facts: dict[str, object] = {"photos": 0}
+    metrics: dict[str, object] = {"photos": 0}
     solved = prior
     if params.solve and sum(view.camera.model != "orthographic" for view in views) > 1:
-        # an orthophoto's colours were balanced when it was put together
+        # orthophotos were already colour balanced when they were mosaicked
         used = [i for i, view in enumerate(views) if not held[i] and view.camera.model != "orthographic"]
         seen = observe(views, used, lambda i: inputs["depth"] / f"{i}.npy", params, report)
         solved, spread = solve(seen, views, params, prior)
         gain = solved.gain
         stops = np.log2([sum(gain[views[i].name]) / 3 for i in used if views[i].name in gain] or [1.0])
-        facts = {
+        metrics = {
             "photos": len(gain),
             "observations": len(seen.value),
             "largest_change_ev": round(float(np.abs(stops).max()), 3),
@@ -94,15 +94,21 @@ def exposure(inputs: Inputs, params: ExposureParams, out: Path, report: Report) 
             "cameras": len({camera_of(v) for v in views}),
         }
     solved.save(out / "exposures.json")
-    return Done({"exposures": out / "exposures.json"}, facts)
+    return Done({"exposures": out / "exposures.json"}, metrics)
 
 
 @dataclass(frozen=True)
-class Observed:
-    """Places seen in several photos: index of photo (N,), of place (N,), log values (N, 3), q (N,) of `Exposures`."""
+class Observations:
+    """Samples of surface points that several photos see.
+
+    Attributes:
+        photo, point: (N,) indices of the photo and of the surface point.
+        value: (N, 3) logarithms of the encoded values.
+        q: (N,) normalised squared distance from the image centre, see `Exposures`.
+    """
 
     photo: I64
-    place: I64
+    point: I64
     value: F64
     q: F64
 
@@ -113,10 +119,10 @@ def observe(
     depth_file: Callable[[int], Path],
     params: ExposureParams,
     report: Report,
-) -> Observed:
-    """Sample random places of every photo in all photos that see them; read photo by photo."""
+) -> Observations:
+    """Sample random surface points of every photo in all photos that see them; photos are read one at a time."""
     from scan2sim.pipeline.camera.depth_map import load_depth_map
-    from scan2sim.texturing.photo_cache import Photos
+    from scan2sim.texturing.photo_cache import PhotoCache
     from scan2sim.texturing.photo_prediction import surface
 
     rng = np.random.default_rng(0)
@@ -124,12 +130,12 @@ def observe(
     for i in used:
         view = views[i]
         depth = load_depth_map(depth_file(i), view.camera, view.T_world_cam)
-        coarse = surface(depth.camera.scaled(min(1.0, (PIXELS / depth.range.size) ** 0.5)), depth)
-        p, n = coarse.some(params.samples, params.max_distance, rng)
+        coarse = surface(depth.camera.scaled(min(1.0, (SAMPLING_PIXELS_MAX / depth.range.size) ** 0.5)), depth)
+        p, n = coarse.sample(params.samples, params.max_distance, rng)
         points.append(p)
         normals.append(n)
-    place, normal = np.concatenate(points), np.concatenate(normals)
-    photos = Photos(views)
+    point, normal = np.concatenate(points), np.concatenate(normals)
+    photos = PhotoCache(views)
     rows = []
     for done, i in enumerate(used):
         report(done / len(used), views[i].name)
@@ -137,13 +143,13 @@ def observe(
         if photo is None:
             continue
         depth = load_depth_map(depth_file(i), views[i].camera, views[i].T_world_cam)
-        rows.append((i, *_observe(photo.low, photo.mask, views[i], depth, place, normal, params.max_distance)))
+        rows.append((i, *_observe(photo.low, photo.mask, views[i], depth, point, normal, params.max_distance)))
     if not rows:
-        return Observed(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
+        return Observations(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
     index = np.concatenate([np.full(len(r[1]), r[0]) for r in rows])
     at, value, q = (np.concatenate([r[k] for r in rows]) for k in (1, 2, 3))
-    several = np.bincount(at, minlength=len(place))[at] > 1
-    return Observed(index[several], at[several], value[several], q[several])
+    several = np.bincount(at, minlength=len(point))[at] > 1
+    return Observations(index[several], at[several], value[several], q[several])
 
 
 def _observe(
@@ -151,54 +157,54 @@ def _observe(
     mask: U8,
     view: View,
     depth: DepthMap,
-    place: F64,
+    point: F64,
     normal: F64,
     max_distance: float,
 ) -> tuple[I64, F64, F64]:
-    """Indices of the places (P, 3) that a photo sees well, their log values (N, 3), and q (N,)."""
+    """Indices (N,) of the points (P, 3) that a photo sees well, their log values (N, 3), and q (N,)."""
     import cv2
 
     from scan2sim.pipeline.camera.depth_map import DepthMap as Map
     from scan2sim.pipeline.camera.depth_map import visible
     from scan2sim.pipeline.camera.projection import pixels
-    from scan2sim.texturing.photo_cache import OFFSET
+    from scan2sim.texturing.photo_cache import SRGB_OFFSET
 
     camera = view.camera
-    to = view.centre - place
+    to = view.centre - point
     distance = np.linalg.norm(to, axis=1)
     cos = np.einsum("ij,ij->i", to, normal) / np.maximum(distance, 1e-9)
     at = np.flatnonzero((distance < max_distance) & (cos > MIN_COS))
-    uv, shown = pixels(camera, view.T_world_cam, place[at])
-    at, uv = at[shown], uv[shown]
-    # beside something nearer the low frequencies mix both: not asked there
-    reach = 2 * round(camera.width / low.shape[1] * depth.camera.width / camera.width) + 1
-    near = Map(depth.camera, depth.T_world_cam, np.asarray(cv2.erode(depth.range, np.ones((reach, reach)))))
-    good = visible(near, place[at], normal[at], bias=0.3 + BIAS)
+    uv, inside = pixels(camera, view.T_world_cam, point[at])
+    at, uv = at[inside], uv[inside]
+    # no samples beside depth edges: the low frequencies mix both surfaces there
+    kernel = 2 * round(camera.width / low.shape[1] * depth.camera.width / camera.width) + 1
+    near = Map(depth.camera, depth.T_world_cam, np.asarray(cv2.erode(depth.range, np.ones((kernel, kernel)))))
+    good = visible(near, point[at], normal[at], bias=0.3 + VISIBILITY_BIAS_M)
     at, uv = at[good], uv[good]
     x = np.clip((uv[:, 0] + 0.5) * low.shape[1] / camera.width - 0.5, 0, low.shape[1] - 1).astype(np.float32)
     y = np.clip((uv[:, 1] + 0.5) * low.shape[0] / camera.height - 0.5, 0, low.shape[0] - 1).astype(np.float32)
     rgb = np.zeros((len(at), 3))
-    # whole levels, by cv2.remap: `pipeline.camera.image_sampling`'s fractions would bring other exposures, at four
-    # times the time
-    for first in range(0, len(at), 30_000):  # it knows no more rows than 32767
+    # cv2.remap rounds to whole grey levels; the fractions of `pipeline.camera.image_sampling` would change the
+    # exposures and take four times as long
+    for first in range(0, len(at), 30_000):  # cv2.remap takes at most 32767 rows
         part = slice(first, first + 30_000)
         rgb[part] = cv2.remap(low, x[part, None], y[part, None], cv2.INTER_LINEAR)[:, 0]
-    usable = ((rgb > DARK) & (rgb < BRIGHT)).all(axis=1)
+    usable = ((rgb > GREY_LEVEL_MIN) & (rgb < GREY_LEVEL_MAX)).all(axis=1)
     if mask.size:
         usable &= mask[np.clip(np.round(uv[:, 1]).astype(int), 0, camera.height - 1),
                        np.clip(np.round(uv[:, 0]).astype(int), 0, camera.width - 1)] > 0  # fmt: skip
     cx, cy = (camera.width - 1) / 2, (camera.height - 1) / 2
     q = ((uv[:, 0] - cx) ** 2 + (uv[:, 1] - cy) ** 2) / (cx * cx + cy * cy)
-    return at[usable], np.log(rgb[usable] + OFFSET), q[usable].astype(np.float64)
+    return at[usable], np.log(rgb[usable] + SRGB_OFFSET), q[usable].astype(np.float64)
 
 
 def solve(
-    seen: Observed, views: Sequence[View], params: ExposureParams, prior: Exposures
+    seen: Observations, views: Sequence[View], params: ExposureParams, prior: Exposures
 ) -> tuple[Exposures, tuple[float, float]]:
-    """The exposures, and how far places' values are apart before and after (median, logarithms of encoded values).
+    """Exposures, and the median absolute residual before and after (logarithms of encoded values).
 
-    A camera's vignetting is kept only where it explains much: surfaces that look brighter against the sun, which
-    are in a photo's middle when far away, look like a little of it.
+    Vignetting is kept only where it explains much. Distant surfaces appear in the image centre and look brighter
+    against the sun, which resembles weak vignetting.
     """
     from scan2sim.texturing.photo_cache import camera_of
 
@@ -208,26 +214,26 @@ def solve(
     lenses = sorted({camera_of(views[i]) for i in np.unique(seen.photo) if views[i].camera.model != "equirectangular"})
     if not (params.vignetting and lenses):
         return plain, spread
-    falling, less = _least_squares(seen, views, lenses, params, prior)
-    return (falling, less) if less[1] < WORTH * spread[1] else (plain, spread)
+    vignetted, less = _least_squares(seen, views, lenses, params, prior)
+    return (vignetted, less) if less[1] < VIGNETTING_RESIDUAL_RATIO_MAX * spread[1] else (plain, spread)
 
 
 def _least_squares(
-    seen: Observed, views: Sequence[View], lenses: Sequence[str], params: ExposureParams, prior: Exposures
+    seen: Observations, views: Sequence[View], lenses: Sequence[str], params: ExposureParams, prior: Exposures
 ) -> tuple[Exposures, tuple[float, float]]:
-    """Solve gains, and the vignetting of the cameras named `lenses`."""
+    """Estimate the gains, and the vignetting of the cameras named `lenses`."""
     import scipy.sparse as sp
 
-    from scan2sim.texturing.photo_cache import GAMMA, Exposures, camera_of
+    from scan2sim.texturing.photo_cache import SRGB_GAMMA, Exposures, camera_of
 
     photos = np.unique(seen.photo)
-    n, m, places = len(photos), len(lenses), len(np.unique(seen.place))
+    n, m, points = len(photos), len(lenses), len(np.unique(seen.point))
     own = np.searchsorted(photos, seen.photo)
     index = {name: k for k, name in enumerate(lenses)}
     lens = np.array([index.get(camera_of(views[i]), -1) for i in photos])[own]
-    _, place = np.unique(seen.place, return_inverse=True)
+    _, point = np.unique(seen.point, return_inverse=True)
     count = len(own)
-    # unknowns: three gains a photo, then a and b a camera; a row an observation and channel
+    # unknowns: three gains per photo, then a and b per camera; one row per observation and channel
     has = np.flatnonzero(lens >= 0)
     rows, columns, values = [], [], []
     for channel in range(3):
@@ -236,13 +242,13 @@ def _least_squares(
         values += [np.ones(count), seen.q[has], seen.q[has] ** 2]
     at = (np.concatenate(rows), np.concatenate(columns))
     A = sp.csr_array((np.concatenate(values), at), (3 * count, 3 * n + 2 * m))
-    owner = np.concatenate([channel * places + place for channel in range(3)])
-    P = sp.csr_array((np.ones(3 * count), (np.arange(3 * count), owner)), (3 * count, 3 * places))
-    y = -seen.value.T.ravel()  # gain less the place's colour is the value's negative
+    owner = np.concatenate([channel * points + point for channel in range(3)])
+    P = sp.csr_array((np.ones(3 * count), (np.arange(3 * count), owner)), (3 * count, 3 * points))
+    y = -seen.value.T.ravel()  # gain minus the point's colour equals minus the observed value
     centre, precision = _prior(views, photos, lenses, prior, params)
     w = np.ones(3 * count)
     x, residual = centre, y
-    for _ in range(ROUNDS):  # places eliminated by the Schur complement, outliers weighed down
+    for _ in range(IRLS_ITERATIONS):  # point colours eliminated by the Schur complement, outliers down-weighted
         WA = A.multiply(w[:, None]).tocsr()
         total = np.maximum(P.T @ w, 1e-12)
         cross = (P.T @ WA).tocsr()
@@ -251,15 +257,15 @@ def _least_squares(
         x = np.linalg.solve(normal, WA.T @ y - scaled.T @ (P.T @ (w * y)) + precision @ centre)
         residual = A @ x - y
         residual -= P @ ((P.T @ (w * residual)) / total)
-        w = np.minimum(1.0, OUTLIER / np.maximum(np.abs(residual), 1e-9))
+        w = np.minimum(1.0, HUBER_RESIDUAL / np.maximum(np.abs(residual), 1e-9))
     before = y - P @ ((P.T @ y) / (P.T @ np.ones(3 * count)))
-    gain, falling = dict(prior.gain), dict(prior.vignetting)
+    gain, vignetting = dict(prior.gain), dict(prior.vignetting)
     for k, i in enumerate(photos):
-        r, g, b = (float(np.exp(GAMMA * x[c * n + k])) for c in range(3))
+        r, g, b = (float(np.exp(SRGB_GAMMA * x[c * n + k])) for c in range(3))
         gain[views[i].name] = (r, g, b)
     for k, name in enumerate(lenses):
-        falling[name] = (float(GAMMA * x[3 * n + k]), float(GAMMA * x[3 * n + m + k]))
-    return Exposures(gain, falling), (float(np.median(np.abs(before))), float(np.median(np.abs(residual))))
+        vignetting[name] = (float(SRGB_GAMMA * x[3 * n + k]), float(SRGB_GAMMA * x[3 * n + m + k]))
+    return Exposures(gain, vignetting), (float(np.median(np.abs(before))), float(np.median(np.abs(residual))))
 
 
 def _prior(
@@ -269,27 +275,28 @@ def _prior(
     prior: Exposures,
     params: ExposureParams,
 ) -> tuple[F64, F64]:
-    """Centre (U,) and precision (U, U) of the unknowns, in units of an observation's own precision."""
-    from scan2sim.texturing.photo_cache import GAMMA
+    """Mean (U,) and precision (U, U) of the unknowns' prior, in units of one observation's precision."""
+    from scan2sim.texturing.photo_cache import SRGB_GAMMA
 
-    stop = np.log(2) / GAMMA  # a stop, in logarithms of encoded values
+    stop = np.log(2) / SRGB_GAMMA  # one stop, as logarithm of encoded values
     n, m = len(photos), len(lenses)
     centre, weight = np.zeros(3 * n + 2 * m), np.zeros((3 * n + 2 * m, 3 * n + 2 * m))
-    noise = OUTLIER**2
+    noise = HUBER_RESIDUAL**2
     for k, i in enumerate(photos):
         at = [k, n + k, 2 * n + k]
         known: Mapping[str, tuple[float, float, float]] = prior.gain
         if views[i].name in known:
-            centre[at] = np.log(known[views[i].name]) / GAMMA
-            weight[at, at] += noise / (KNOWN * stop) ** 2 * 1e3  # an earlier tile saw it as often as this one does
+            centre[at] = np.log(known[views[i].name]) / SRGB_GAMMA
+            # the earlier tile observed the photo about as often as this one does
+            weight[at, at] += noise / (PRIOR_TOLERANCE_EV * stop) ** 2 * 1e3
             continue
-        # overall: (r + g + b) / 3 within `spread`; differences between channels within `tint`
+        # mean gain (r + g + b) / 3 within `spread`; differences between channels within `tint`
         weight[np.ix_(at, at)] += noise / (params.spread * stop) ** 2 / 9
         difference = np.eye(3) - 1 / 3
         weight[np.ix_(at, at)] += noise / (params.tint * stop) ** 2 * difference
     for k, name in enumerate(lenses):
         for power, at_ in enumerate((3 * n + k, 3 * n + m + k)):
-            centre[at_] = prior.vignetting.get(name, (0.0, 0.0))[power] / GAMMA
+            centre[at_] = prior.vignetting.get(name, (0.0, 0.0))[power] / SRGB_GAMMA
             weight[at_, at_] += noise / (0.3 * stop) ** 2 * 50
     return centre, weight
 

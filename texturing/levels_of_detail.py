@@ -1,9 +1,9 @@
-"""Levels of detail of a scene: each tile in coarser ones, and above the tiles such that stand for several.
+"""Hierarchical levels of detail (HLOD) of a scene: coarser versions of each tile, then of groups of tiles.
 
-Each has a quarter of the triangles and texels of what it stands for, so its texels are twice as wide: first the tile
-itself, as often as is asked for, then up to four neighbours as one, until one stands for all. Where two levels may be
-shown side by side they share their vertices: open edges between vertices that another tile has, too, stay as they are,
-until that tile is part of the same level.
+Each level has a quarter of the triangles and texels of the finer levels that it replaces, so its texels are twice as
+wide. First each tile is simplified as many times as wanted, then up to four neighbours are merged into one level, until
+one level represents the whole scene. Levels that may be shown side by side share vertices: open edges between vertices
+that another tile has, too, are kept until that tile is part of the same level.
 """
 
 from __future__ import annotations
@@ -18,102 +18,102 @@ import numpy as np
 from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.step import Report
 from scan2sim.pipeline.core.types import F64, I64, Mesh
-from scan2sim.pipeline.io.file_checks import pass_on
+from scan2sim.pipeline.io.file_checks import link_or_copy
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.worlds import textured_mesh
-from scan2sim.pipeline.io.worlds.scene import Level, Scene, SceneTile, figures
+from scan2sim.pipeline.io.worlds.scene import Level, Scene, SceneTile, statistics
 from scan2sim.pipeline.tiling.borders.boundary_curve import curve
-from scan2sim.texturing.simplify_textured import SAME, Share, shrink
+from scan2sim.texturing.simplify_textured import WELD_DISTANCE_M, Share, simplify_group
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.io.worlds.textured_mesh import Textured
 
-SHARE = Share(0.25, 0.25)
-"""Of the triangles and texels of what a level stands for."""
+LEVEL_SHARE = Share(0.25, 0.25)
+"""Share of the triangles and texels that a level keeps of the finer levels."""
 
 
-class Meeting(NamedTuple):
-    """Where two tiles meet.
+class SharedBorder(NamedTuple):
+    """Border between two tiles.
 
     Attributes:
-        group: the surface that both have there.
-        tile, other: their names.
-        places: (K, 3) vertices of open edges that both have, metres from the scene's origin.
+        group: surface group that both tiles have there.
+        tile, other: names of the tiles.
+        points: (K, 3) vertices of open edges that both tiles have, metres from the scene's origin.
     """
 
     group: str
     tile: str
     other: str
-    places: F64
+    points: F64
 
 
-def detailed(scene: Scene, levels: int, folder: Path, report: Report) -> Scene:
-    """A scene with coarser levels.
+def with_levels(scene: Scene, levels: int, folder: Path, report: Report) -> Scene:
+    """Scene with coarser levels of detail.
 
     Args:
-        scene: its tiles are the finest level.
-        levels: of each tile, itself counted.
-        folder: where coarser ones are kept.
-        report: progress.
+        scene: scene whose tiles are the finest level.
+        levels: number of levels of each tile, including the tile itself.
+        folder: folder for the coarser levels.
+        report: progress callback.
     """
     if levels < 2:
         return scene
-    making = _Making(scene, folder, report)
-    coarse = [Level(tile, texel=_texel(tile.textured().values())) for tile in scene.tiles]
+    builder = _LevelBuilder(scene, folder, report)
+    coarse = [Level(tile, texel=_texel_m(tile.textured().values())) for tile in scene.tiles]
     for _ in range(1, levels):
-        coarse = [making.above([level]) for level in coarse]
-    return replace(scene, coarse=making.one_for(coarse))
+        coarse = [builder.coarser([level]) for level in coarse]
+    return replace(scene, coarse=builder.merge(coarse))
 
 
-class _Making:
-    """Of all levels of a scene."""
+class _LevelBuilder:
+    """Builds the coarser levels of a scene."""
 
     def __init__(self, scene: Scene, folder: Path, report: Report) -> None:
         self._folder, self._report = folder, report
-        self._meetings = meetings(scene)
-        self._made = 0
-        self._all = len(scene.tiles)
+        self._borders = shared_borders(scene)
+        self._built = 0
+        self._tiles = len(scene.tiles)
 
-    def one_for(self, levels: Sequence[Level]) -> Level:
-        """One level for all of these, and whatever is between."""
+    def merge(self, levels: Sequence[Level]) -> Level:
+        """Root of a tree of coarser levels over `levels`, with up to four children each."""
         if len(levels) == 1:
             return levels[0]
-        return self.above([self.one_for(part) for half in _halves(levels) for part in _halves(half)])
+        return self.coarser([self.merge(part) for half in _halves(levels) for part in _halves(half)])
 
-    def above(self, finer: Sequence[Level]) -> Level:
-        """The level above some, which stands for all of them."""
+    def coarser(self, finer: Sequence[Level]) -> Level:
+        """Coarser level that replaces all of `finer`."""
         first = finer[0].tile
         height = 1 + max(level.height for level in finer)
-        place = self._folder / f"level{height}" / first.name
-        below = {tile.name for level in finer for tile in level.stands_for()}
-        self._made += 1
-        self._report(1 - 1 / (1 + self._made / self._all), f"level {height} of {first.name}")
+        level_folder = self._folder / f"level{height}" / first.name
+        below = {tile.name for level in finer for tile in level.source_tiles()}
+        self._built += 1
+        self._report(1 - 1 / (1 + self._built / self._tiles), f"level {height} of {first.name}")
         shapes, errors = {}, []
         for group in sorted({group for level in finer for group in level.tile.groups}):
             source = first.folder / group
             if len(finer) > 1:
-                source = place / "joined" / group
+                source = level_folder / "joined" / group
                 _join([level.tile for level in finer], group, source)
             shape = textured_mesh.read(source)
             assert shape is not None
-            borders = self._borders(below, group) - np.asarray(first.offset)
-            shrink(group, shape, source, SHARE, borders, place / group)
-            small = textured_mesh.read(place / group)
+            borders = self._outer_borders(below, group) - np.asarray(first.offset)
+            simplify_group(group, shape, source, LEVEL_SHARE, borders, level_folder / group)
+            small = textured_mesh.read(level_folder / group)
             assert small is not None
             shapes[group] = small
-            errors.append(_apart(shape.mesh, small.mesh))
-        tile = replace(first, groups={group: figures(shape) for group, shape in shapes.items()}, folder=place)
+            errors.append(_geometric_error(shape.mesh, small.mesh))
+        tile = replace(first, groups={group: statistics(shape) for group, shape in shapes.items()}, folder=level_folder)
         error = max(level.error for level in finer) + max(errors)
-        return Level(tile, height, error, _texel(shapes.values()), tuple(finer))
+        return Level(tile, height, error, _texel_m(shapes.values()), tuple(finer))
 
-    def _borders(self, below: set[str], group: str) -> F64:
-        """(K, 3) where tiles of these names meet others, metres from the scene's origin."""
-        ends = [m.places for m in self._meetings if m.group == group and m.tile in below and m.other not in below]
-        return np.concatenate([np.zeros((0, 3)), *ends])
+    def _outer_borders(self, below: set[str], group: str) -> F64:
+        """(K, 3) border vertices between the tiles named `below` and other tiles, metres from the scene's origin."""
+        points = [b.points for b in self._borders if b.group == group and b.tile in below and b.other not in below]
+        return np.concatenate([np.zeros((0, 3)), *points])
 
 
 def _halves(levels: Sequence[Level]) -> list[Sequence[Level]]:
-    """Halves of what lies together; itself where there is one."""
+    """Levels split spatially into two halves; a single level stays as it is."""
     if len(levels) == 1:
         return [levels]
     middle = np.array([np.add(t.offset, (np.add(t.low, t.high)) / 2) for t in (level.tile for level in levels)])
@@ -122,25 +122,30 @@ def _halves(levels: Sequence[Level]) -> list[Sequence[Level]]:
     return [[levels[i] for i in order[:half]], [levels[i] for i in order[half:]]]
 
 
-def meetings(scene: Scene) -> list[Meeting]:
-    """Where tiles of a scene meet, each from both sides."""
+def shared_borders(scene: Scene) -> list[SharedBorder]:
+    """Borders between the tiles of a scene, each from both sides."""
     from scipy.spatial import cKDTree
 
     found = []
     for group in SURFACES:
-        ends = {tile.name: _ends(tile, group) for tile in scene.tiles if group in tile.groups}
-        boxes = {name: (ends.min(axis=0) - SAME, ends.max(axis=0) + SAME) for name, ends in ends.items() if len(ends)}
+        vertices = {tile.name: _open_vertices(tile, group) for tile in scene.tiles if group in tile.groups}
+        boxes = {
+            name: (points.min(axis=0) - WELD_DISTANCE_M, points.max(axis=0) + WELD_DISTANCE_M)
+            for name, points in vertices.items()
+            if len(points)
+        }
         for name, (low, high) in boxes.items():
             for other, (bottom, top) in boxes.items():
                 if name == other or (low > top).any() or (high < bottom).any():
                     continue
-                shared = np.isfinite(cKDTree(ends[other]).query(ends[name], distance_upper_bound=SAME)[0])
+                tree = cKDTree(vertices[other])
+                shared = np.isfinite(tree.query(vertices[name], distance_upper_bound=WELD_DISTANCE_M)[0])
                 if shared.any():
-                    found.append(Meeting(group, name, other, ends[name][shared]))
+                    found.append(SharedBorder(group, name, other, vertices[name][shared]))
     return found
 
 
-def _ends(tile: SceneTile, group: str) -> F64:
+def _open_vertices(tile: SceneTile, group: str) -> F64:
     """(V, 3) vertices of open edges, metres from the scene's origin."""
     mesh = Mesh.load(tile.folder / group / "mesh.npz")
     opened = np.unique(curve(mesh.faces, np.ones(len(mesh.vertices), bool)).edges)
@@ -148,7 +153,7 @@ def _ends(tile: SceneTile, group: str) -> F64:
 
 
 def _join(tiles: Sequence[SceneTile], group: str, out: Path) -> None:
-    """Write a group of several tiles as one textured mesh, local to the first, welded where they meet."""
+    """Write a group of several tiles as one textured mesh, local to the first tile, welded along their borders."""
     out.mkdir(parents=True)
     vertices, faces, uv, page, codes = np.zeros((0, 3)), [], [], [], []
     pages = 0
@@ -165,10 +170,10 @@ def _join(tiles: Sequence[SceneTile], group: str, out: Path) -> None:
         uv.append(mesh.uv)
         page.append(mesh.page + pages)
         codes.append(np.zeros(len(mesh), np.uint8) if mesh.classification is None else mesh.classification)
-        for i, picture in enumerate(shape.pages):
-            pass_on(picture, out / f"page_{pages + i}.png")
+        for i, image_file in enumerate(shape.pages):
+            link_or_copy(image_file, out / f"page_{pages + i}.png")
         for i, mask in enumerate(shape.seen):
-            pass_on(mask, out / f"page_{pages + i}_seen.png")
+            link_or_copy(mask, out / f"page_{pages + i}_seen.png")
         pages += len(shape.pages)
     Mesh(
         tiles[0].frame,
@@ -181,25 +186,25 @@ def _join(tiles: Sequence[SceneTile], group: str, out: Path) -> None:
 
 
 def _welded(vertices: F64, more: F64) -> tuple[F64, I64]:
-    """Vertices and those of `more` (N, 3) that aren't among them yet, and where each of these is then (N,)."""
+    """`vertices` extended by the new ones of `more` (N, 3), and the index (N,) of each of `more` among them."""
     from scipy.spatial import cKDTree
 
     if not len(vertices):
         return more, np.arange(len(more))
-    distance, same = cKDTree(vertices).query(more, distance_upper_bound=SAME)
+    distance, same = cKDTree(vertices).query(more, distance_upper_bound=WELD_DISTANCE_M)
     new = ~np.isfinite(distance)
     return np.concatenate([vertices, more[new]]), np.where(new, len(vertices) + np.cumsum(new) - 1, same)
 
 
-def _apart(fine: Mesh, coarse: Mesh) -> float:
-    """Metres from places on a mesh to a coarser one: 95 % of them are nearer."""
+def _geometric_error(fine: Mesh, coarse: Mesh) -> float:
+    """95th percentile of the distance in metres from points on a mesh to a coarser mesh."""
     from scan2sim.pipeline.steps.collision import deviation
 
     return deviation(fine, coarse, 0)["p95"]
 
 
-def _texel(shapes: Iterable[Textured]) -> float:
-    """Metres that a texel spans, the root of the mean area."""
+def _texel_m(shapes: Iterable[Textured]) -> float:
+    """Texel size in metres: root of the mean area of a texel."""
     area = texels = 0.0
     for shape in shapes:
         assert shape.mesh.uv is not None and shape.mesh.page is not None

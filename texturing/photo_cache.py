@@ -1,4 +1,4 @@
-"""Photos read when needed and let go: their halvings, their low frequencies, masks, and corrected exposures."""
+"""LRU cache of photos with their image pyramids, low frequencies and masks; exposure corrections."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, U8, View
 from scan2sim.pipeline.io.images import image
 
-CACHE = 300_000_000
+CACHE_MAX_BYTES = 300_000_000
 """Bytes of photos kept in memory between uses."""
-OFFSET = 255 * 0.055
-"""sRGB is a power law of (value + this): a change of exposure is a factor there, all but exactly."""
-GAMMA = 2.4
+SRGB_OFFSET = 255 * 0.055
+"""sRGB is a power law of (value + offset): a change of exposure is almost exactly a factor of that sum."""
+SRGB_GAMMA = 2.4
 
 
 @dataclass(frozen=True)
 class Exposures:
-    """What makes photos alike: a factor of light per photo and channel, and one falling to the corners per camera.
+    """Photometric corrections: a gain per photo and channel, and the vignetting of each camera.
 
     Attributes:
-        gain: view's name to (3,) factors of linear light that its photo is multiplied with.
-        vignetting: camera's name to (a, b): the photo is multiplied with exp(a q + b q^2) of light, where q is the
-            squared distance from the image's middle, 1 in its corners.
+        gain: view name to (3,) factors by which the linear light of its photo is multiplied.
+        vignetting: camera name to (a, b): linear light is multiplied by exp(a q + b q^2), where q is the squared
+            distance from the image centre, 1 in the corners.
     """
 
     gain: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     vignetting: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def of(self, view: View) -> F64:
-        """(5,) for the kernels: logarithms of the encoded factors a channel, and a and b likewise."""
-        gain, falling = self.gain.get(view.name, (1.0, 1.0, 1.0)), self.vignetting.get(camera_of(view), (0.0, 0.0))
-        return np.array([*(math.log(g) for g in gain), *falling]) / GAMMA
+        """(5,) correction of a view for the kernels: log factors of the encoded values per channel, then a and b."""
+        gain, vignetting = self.gain.get(view.name, (1.0, 1.0, 1.0)), self.vignetting.get(camera_of(view), (0.0, 0.0))
+        return np.array([*(math.log(g) for g in gain), *vignetting]) / SRGB_GAMMA
 
     def save(self, path: Path) -> None:
         """Write as JSON."""
@@ -53,35 +53,35 @@ class Exposures:
         """Read what `save` wrote.
 
         Raises:
-            InputError: it is no such file.
+            InputError: the file is missing or not an exposure file.
         """
         try:
             body = json.loads(path.read_text(encoding="utf-8"))
             gain = {str(k): (float(r), float(g), float(b)) for k, (r, g, b) in body["gain"].items()}
-            falling = {str(k): (float(a), float(b)) for k, (a, b) in body["vignetting"].items()}
+            vignetting = {str(k): (float(a), float(b)) for k, (a, b) in body["vignetting"].items()}
             if not all(math.isfinite(x) and x > 0 for v in gain.values() for x in v):
-                raise ValueError("a gain is not above zero")
+                raise ValueError("a gain is not a positive number")
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(
-                path, f"is no exposure file ({error})", "Give the `exposure.json` of another tile's run"
+                path, f"not an exposure file ({error})", "Pass the `exposure.json` of another tile's run"
             ) from None
-        return cls(gain, falling)
+        return cls(gain, vignetting)
 
 
 def camera_of(view: View) -> str:
-    """A name that photos of one lens share, also across tiles: model, size and focal length."""
+    """Name of a view's camera, the same in all tiles: model, image size and focal length."""
     c = view.camera
     return f"{c.model}_{c.width}x{c.height}_{c.fx:.0f}"
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo ready to be sampled.
+    """A photo prepared for sampling.
 
     Attributes:
-        levels: (h, w, 3) uint8: the photo, halved, and halved again.
-        low: its low frequencies, at an eighth of its size or so.
-        mask: (h, w) uint8, 0 where it must not be used; (0, 0) for none.
+        levels: image pyramid, (h, w, 3) uint8 each: full, half and quarter resolution.
+        low: (h, w, 3) uint8 low frequencies, at 1/band of the full resolution.
+        mask: (h, w) uint8, 0 where the photo must not be used; (0, 0): no mask.
     """
 
     levels: tuple[U8, U8, U8]
@@ -90,66 +90,66 @@ class Photo:
 
     @property
     def bytes(self) -> int:
-        """What it takes in memory."""
+        """Memory size in bytes."""
         return sum(a.nbytes for a in (*self.levels, self.low, self.mask))
 
 
-class Photos:
-    """The photos of views, by index, the last used ones kept.
+class PhotoCache:
+    """Photos of views by index, read on demand; the least recently used ones are evicted.
 
     Args:
         views: posed photos.
-        band: pixels of a photo below which detail is taken from one photo alone; its low frequencies are coarser.
+        band: wavelength in pixels of a photo; `Photo.low` contains what is coarser.
 
     Attributes:
-        skipped: index of a view to the reason why its photo was left out.
+        skipped: index of a view to the reason why its photo can't be used.
     """
 
     def __init__(self, views: Sequence[View], band: int = 8) -> None:
         self._views, self._band = views, band
-        self._kept: OrderedDict[int, Photo] = OrderedDict()
+        self._cached: OrderedDict[int, Photo] = OrderedDict()
         self.skipped: dict[int, str] = {}
 
     def get(self, i: int) -> Photo | None:
-        """Photo `i`; None if it can't be used (`skipped` tells why)."""
-        if i in self._kept:
-            self._kept.move_to_end(i)
-            return self._kept[i]
+        """Photo `i`; None if it can't be used (the reason is in `skipped`)."""
+        if i in self._cached:
+            self._cached.move_to_end(i)
+            return self._cached[i]
         if i in self.skipped:
             return None
         photo = self._read(i)
         if photo is not None:
-            self._kept[i] = photo
-            while len(self._kept) > 1 and sum(p.bytes for p in self._kept.values()) > CACHE:
-                self._kept.popitem(last=False)
+            self._cached[i] = photo
+            while len(self._cached) > 1 and sum(p.bytes for p in self._cached.values()) > CACHE_MAX_BYTES:
+                self._cached.popitem(last=False)
         return photo
 
     def mask(self, i: int) -> U8 | None:
-        """The mask of view `i` at its photo's size, (0, 0) for none; None if it can't be used."""
+        """Mask of view `i` at its photo's size, (0, 0) if it has none; None if the mask can't be used."""
         view = self._views[i]
         try:
             mask = image.read_mask(view)
         except InputError as error:
-            self.skipped[i] = f"{view.mask} {error.cause}"
+            self.skipped[i] = f"{view.mask}: {error.cause}"
             return None
         return np.zeros((0, 0), np.uint8) if mask is None else mask
 
     def _read(self, i: int) -> Photo | None:
         view = self._views[i]
         try:
-            whole = image.read_photo(view)
+            full = image.read_photo(view)
         except InputError as error:
-            self.skipped[i] = f"{view.photo} {error.cause}"
+            self.skipped[i] = f"{view.photo}: {error.cause}"
             return None
         mask = self.mask(i)
         if mask is None:
             return None
-        half = shrunk(whole, 2)
-        return Photo((whole, half, shrunk(half, 2)), low_frequencies(whole, self._band), mask)
+        half = downsampled(full, 2)
+        return Photo((full, half, downsampled(half, 2)), low_frequencies(full, self._band), mask)
 
 
-def shrunk(image: U8, factor: int) -> U8:
-    """The image at 1/factor of its size, means of its pixels."""
+def downsampled(image: U8, factor: int) -> U8:
+    """The image at 1/factor of its size, by area averaging."""
     import cv2
 
     size = (max(1, round(image.shape[1] / factor)), max(1, round(image.shape[0] / factor)))
@@ -157,7 +157,7 @@ def shrunk(image: U8, factor: int) -> U8:
 
 
 def low_frequencies(image: U8, band: int) -> U8:
-    """The image without what is finer than about `band` pixels, at 1/band of its size."""
+    """Low-pass filtered image without detail finer than about `band` pixels, at 1/band of its size."""
     import cv2
 
-    return np.asarray(cv2.GaussianBlur(shrunk(image, band), (0, 0), 1.0), np.uint8)
+    return np.asarray(cv2.GaussianBlur(downsampled(image, band), (0, 0), 1.0), np.uint8)

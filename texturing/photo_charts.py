@@ -1,8 +1,8 @@
-"""Charts cut out of photos: faces that take their detail from one photo are laid flat as that photo sees them.
+"""Charts by projection into photos: faces that take their detail from one photo are flattened as the photo sees them.
 
-OpenMVS and mvs-texturing use the photo's own pixels; here every chart is projected on from the camera's centre to
-the chart's own plane, so that texels are metric and alike in all directions, whatever the camera's model. What a
-camera sees doesn't overlap itself, so nothing needs to be unfolded: a million faces take seconds.
+OpenMVS and mvs-texturing use the pixels of the photo; here every chart is projected from the camera centre onto the
+chart's own plane, so that texels are metric and isotropic for any camera model. What a camera sees doesn't overlap
+itself, so no unfolding is needed: a million faces take seconds.
 """
 
 from __future__ import annotations
@@ -14,26 +14,25 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.core.types import F32, F64, I32, I64, Bools, Mesh
 
-TILT = 0.2
-"""How far a chart's plane is turned from its faces' mean normal towards the camera."""
-STRETCH = 4.0
+PLANE_TILT = 0.2
+"""Weight of the direction to the camera in a chart's plane normal; the rest is the faces' mean normal."""
+MAX_AREA_RATIO = 4.0
 """Faces whose area changes by more than this factor are left to the unwrapper."""
-COVERED = 0.6
-"""Share of its texels that a face must keep where others lie over it."""
-
-CELLS = 8
-"""Charts are cut at a grid of this many cells along their largest side."""
+VISIBLE_TEXELS_MIN = 0.6
+"""Share of its texels that a face must own where other faces overlap it."""
+GRID_CELLS = 8
+"""Cells of the grid that cuts charts, along the largest possible chart."""
 
 
 @dataclass(frozen=True)
 class Charts:
-    """Faces laid flat.
+    """Flattened faces.
 
     Attributes:
         face: (N,) indices of the faces.
-        chart: (N,) which chart each belongs to, 0 to `count` - 1.
-        flat: (N, 3, 2) float32 texels within the chart, from (0, 0).
-        size: (C, 2) width and height of every chart, texels.
+        chart: (N,) chart of each face, 0 to C - 1.
+        flat: (N, 3, 2) float32 positions in texels within the chart, from (0, 0).
+        size: (C, 2) width and height of every chart in texels.
     """
 
     face: I64
@@ -43,50 +42,50 @@ class Charts:
 
 
 def cut(mesh: Mesh, view: I32, centres: F64, texel: float, largest: int) -> Charts:
-    """Charts of connected faces of one view; faces that can't be laid so are left out.
+    """Charts of connected faces of one view; faces that would be distorted too much are left out.
 
     Args:
-        mesh: to be cut.
+        mesh: mesh to be cut into charts.
         view: (F,) view of every face, -1 for none.
         centres: (V, 3) camera centres, local metres.
-        texel: metres a texel spans.
-        largest: side of a chart, texels, that it must not exceed.
+        texel: texel size in metres.
+        largest: largest side of a chart in texels.
     """
-    part = _components(mesh, view, largest * texel / CELLS)
+    part = _components(mesh, view, largest * texel / GRID_CELLS)
     face = np.flatnonzero(part >= 0)
     chart = part[face]
     corners = mesh.corners[face].astype(np.float64)
-    eye = centres[view[face]]
+    centre = centres[view[face]]
     normal, area = mesh.face_normal[face].astype(np.float64), mesh.face_area[face].astype(np.float64)
     count = int(chart.max()) + 1 if len(chart) else 0
 
     def mean(values: F64) -> F64:
-        """Of every chart, weighted by area."""
+        """(C, K) mean over the faces of every chart, weighted by area."""
         total = np.stack([np.bincount(chart, values[:, k] * area, count) for k in range(values.shape[1])], axis=1)
         return total / np.maximum(np.bincount(chart, area, count), 1e-12)[:, None]
 
     middle = corners.mean(axis=1)
-    towards = _unit(eye - middle)
-    plane = _unit((1 - TILT) * _unit(mean(normal)) + TILT * _unit(mean(towards)))
-    at = mean(middle)
-    # each corner along its ray from the eye to the chart's plane
-    ray = corners - eye[:, None]
-    n, foot = plane[chart][:, None], at[chart][:, None]
+    towards = _unit(centre - middle)
+    plane = _unit((1 - PLANE_TILT) * _unit(mean(normal)) + PLANE_TILT * _unit(mean(towards)))
+    origin = mean(middle)
+    # project each corner along its ray from the camera centre onto the chart's plane
+    ray = corners - centre[:, None]
+    n, foot = plane[chart][:, None], origin[chart][:, None]
     along = np.einsum("nkc,nkc->nk", ray, np.broadcast_to(n, ray.shape))
-    reach = np.einsum("nkc,nkc->nk", foot - eye[:, None], n)
+    distance = np.einsum("nkc,nkc->nk", foot - centre[:, None], n)
     with np.errstate(divide="ignore", invalid="ignore"):
-        hit = eye[:, None] + ray * (reach / along)[..., None] - foot
+        hit = centre[:, None] + ray * (distance / along)[..., None] - foot
     across, up = _axes(plane)
     flat = np.stack([np.einsum("nkc,nc->nk", hit, across[chart]), np.einsum("nkc,nc->nk", hit, up[chart])], axis=-1)
-    flat = _upright(flat, chart, count) / texel
+    flat = _aligned(flat, chart, count) / texel
     drawn = _signed_area(flat) * texel**2
-    good = np.isfinite(flat).all(axis=(1, 2)) & (reach / np.where(along == 0, 1, along) > 0).all(axis=1)
-    good &= (drawn > area / STRETCH**2) & (drawn < area * STRETCH**2)
-    # as many texels a chart as its area asks for
+    good = np.isfinite(flat).all(axis=(1, 2)) & (distance / np.where(along == 0, 1, along) > 0).all(axis=1)
+    good &= (drawn > area / MAX_AREA_RATIO**2) & (drawn < area * MAX_AREA_RATIO**2)
+    # scale each chart to the texel density of its area
     total, wanted = (np.bincount(chart, np.where(good, value, 0), count) for value in (drawn, area))
     scale = np.sqrt(wanted / np.maximum(total, 1e-12))[chart]
     flat, drawn = flat * scale[:, None, None], drawn * scale**2
-    good &= (drawn > area / STRETCH) & (drawn < area * STRETCH)
+    good &= (drawn > area / MAX_AREA_RATIO) & (drawn < area * MAX_AREA_RATIO)
     face, chart, flat = face[good], chart[good], flat[good]
     used, chart = np.unique(chart, return_inverse=True)
     low, high = np.full((len(used), 2), np.inf), np.full((len(used), 2), -np.inf)
@@ -95,23 +94,23 @@ def cut(mesh: Mesh, view: I32, centres: F64, texel: float, largest: int) -> Char
     size = np.ceil(high - low).astype(np.int64) + 1
     small = (size <= largest).all(axis=1)
     keep = small[chart]
-    renamed = np.cumsum(small) - 1
+    new_index = np.cumsum(small) - 1
     flat = (flat - low[chart][:, None]).astype(np.float32)
-    return Charts(face[keep], renamed[chart[keep]], flat[keep], size[small])
+    return Charts(face[keep], new_index[chart[keep]], flat[keep], size[small])
 
 
 def pack(size: I64, side: int, gutter: int) -> tuple[I64, I64, list[tuple[int, int]]]:
-    """Rectangles onto pages, on shelves of falling height.
+    """Pack rectangles onto pages by shelf packing, in order of decreasing height.
 
     Args:
         size: (C, 2) width and height.
-        side: of a page, at most.
-        gutter: room around each.
+        side: largest side of a page.
+        gutter: margin around each rectangle.
 
     Returns:
-        place (C, 2) of their lower corner, page (C,), and (width, height) of every page.
+        Position (C, 2) of their lower corner, page (C,), and (width, height) of every page.
     """
-    place, page = np.zeros((len(size), 2), np.int64), np.zeros(len(size), np.int64)
+    position, page = np.zeros((len(size), 2), np.int64), np.zeros(len(size), np.int64)
     pages: list[tuple[int, int]] = []
     x = y = shelf = 0
     width = min(side, int(np.ceil(np.sqrt(float(((size + 2 * gutter).prod(axis=1)).sum()) * 1.1)))) if len(size) else 0
@@ -124,15 +123,15 @@ def pack(size: I64, side: int, gutter: int) -> tuple[I64, I64, list[tuple[int, i
         if y + h > side:
             pages.append((widest, y))
             x = y = shelf = widest = 0
-        place[k], page[k] = (x + gutter, y + gutter), len(pages)
+        position[k], page[k] = (x + gutter, y + gutter), len(pages)
         x, shelf, widest = x + w, max(shelf, h), max(widest, x + w)
     if len(size):
         pages.append((widest, y + shelf))
-    return place, page, pages
+    return position, page, pages
 
 
 def overlapping(flat: F32, page: I64, pages: list[tuple[int, int]]) -> Bools:
-    """(N,) faces of which others cover too much; `flat` (N, 3, 2) texels of their page."""
+    """(N,) faces that own too few of their texels because others overlap them; `flat` (N, 3, 2) texels of the page."""
     from scan2sim.texturing.bake.texel_map import owners
 
     area = np.abs(_signed_area(flat))
@@ -141,20 +140,20 @@ def overlapping(flat: F32, page: I64, pages: list[tuple[int, int]]) -> Bools:
         on = np.flatnonzero(page == k)
         owner = owners(flat[on], width, height)
         texels = np.bincount(owner[owner >= 0], minlength=len(on))
-        covered[on] = texels < COVERED * area[on] - 3 - np.sqrt(area[on])
+        covered[on] = texels < VISIBLE_TEXELS_MIN * area[on] - 3 - np.sqrt(area[on])
     return covered
 
 
 def _components(mesh: Mesh, view: I32, cell: float) -> I64:
-    """(F,) connected faces of one view within one cell of a grid (metres); -1 without a view."""
+    """(F,) connected component of each face: same view, same cell of a grid (metres); -1 without a view."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     from scan2sim.texturing.view_selection.mrf import adjacent
 
     pairs, _ = adjacent(mesh.faces)
-    place = np.floor(mesh.corners.mean(axis=1) / cell).astype(np.int64)
-    same = (view[pairs[:, 0]] == view[pairs[:, 1]]) & (place[pairs[:, 0]] == place[pairs[:, 1]]).all(axis=1)
+    cells = np.floor(mesh.corners.mean(axis=1) / cell).astype(np.int64)
+    same = (view[pairs[:, 0]] == view[pairs[:, 1]]) & (cells[pairs[:, 0]] == cells[pairs[:, 1]]).all(axis=1)
     p = pairs[same & (view[pairs[:, 0]] >= 0)]
     links = coo_array((np.ones(len(p), np.int8), (p[:, 0], p[:, 1])), shape=(len(mesh), len(mesh)))
     _, part = connected_components(links, directed=False)
@@ -165,7 +164,7 @@ def _components(mesh: Mesh, view: I32, cell: float) -> I64:
 
 
 def _signed_area(flat: npt.NDArray[np.floating]) -> F64:
-    """(N,) of triangles (N, 3, 2); positive if they run counter-clockwise."""
+    """(N,) signed area of triangles (N, 3, 2); positive if counter-clockwise."""
     a, b = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
     return np.asarray((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2, np.float64)
 
@@ -175,14 +174,14 @@ def _unit(v: F64) -> F64:
 
 
 def _axes(normal: F64) -> tuple[F64, F64]:
-    """Two unit vectors (C, 3) each, across every normal (C, 3), right-handed with it."""
+    """Two unit vectors (C, 3) perpendicular to every normal (C, 3), forming a right-handed frame with it."""
     helper = np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     across = _unit(np.cross(helper, normal))
     return across, np.cross(normal, across)
 
 
-def _upright(flat: F64, chart: I64, count: int) -> F64:
-    """Charts turned so that their longest extent lies along x."""
+def _aligned(flat: F64, chart: I64, count: int) -> F64:
+    """Charts rotated so that their longest extent lies along x."""
     points = np.nan_to_num(flat.mean(axis=1))
     n = np.maximum(np.bincount(chart, minlength=count), 1)
     mean = np.stack([np.bincount(chart, points[:, k], count) / n for k in range(2)], axis=1)

@@ -1,9 +1,9 @@
-"""Agreement: where photos disagree with the rest, and which of them do so as a whole.
+"""Photo consistency step (`agreement`): compares each photo with its neighbours and masks what is inconsistent.
 
-Every photo is predicted from those around it (`texturing.photo_prediction`). What at least two others agree on and it
-doesn't is a ghost (a moving car, a person, its shadow, a reflection) and masked, as is sky where a surface should show
-(`texturing.sky`). A photo that is shifted against its prediction has a pose that is off; one less sharp is blurred:
-told in the report, and left out beyond a limit.
+Every photo is predicted from its neighbours (`texturing.photo_prediction`). Regions where at least two other photos
+agree and this one differs are ghosts (a moving car, a person, its shadow, a reflection) and are masked, as is sky that
+shows where a surface should be (`texturing.sky`). A photo that is shifted against its prediction has a wrong pose; one
+that is less sharp is blurred. Both are reported, and the photo is excluded beyond a limit.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.parameters import Cosine, Depth, Reach
+from scan2sim.pipeline.core.parameters import Cosine, Depth, Distance
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, U8, Bools, View
 from scan2sim.pipeline.io import views as views_io
@@ -27,47 +27,49 @@ from scan2sim.pipeline.io.images import image
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.camera.depth_map import DepthMap
-    from scan2sim.texturing.photo_cache import Exposures, Photos
+    from scan2sim.texturing.photo_cache import Exposures, PhotoCache
     from scan2sim.texturing.photo_prediction import Prediction
 
-KEPT = 16
+DEPTH_MAPS_CACHED = 16
 """Depth maps kept in memory."""
-PIXELS = 250_000
-"""Photos are compared at this size at most."""
-SAMPLES = 300
-MAX_WARP, SMOOTH, FAINT = 5.0, 5.0, 8.0
-"""Pixels of the compared size: displacements believed, and smoothed over; and slope that says too little."""
-SEED, GROWN = 26.0, 12.0
-"""Grey levels of disagreement that a ghost starts from, and down to which it spreads."""
-SLACK = 2
-"""Pixels (of the compared size) by which edges may be displaced and still agree."""
-SPECK = 60
-"""Pixels of the smallest ghost."""
-HAUNTED = 0.25
-"""Share of a photo beyond which what disagrees is no ghost: the photo as a whole is displaced."""
-WHITE = 250
+COMPARED_PIXELS_MAX = 250_000
+"""Photos are compared at this size at most; "compared pixels" below are pixels at this size."""
+SAMPLES_PER_PHOTO = 300
+"""Surface points per photo by which its neighbours are chosen."""
+WARP_MAX_PX, WARP_SMOOTHING_PX, WARP_GRADIENT = 5.0, 5.0, 8.0
+"""Compared pixels: longest displacement that is used, and sigma of the smoothing; image gradient at which the warp is
+halved."""
+GHOST_SEED_LEVELS, GHOST_GROWN_LEVELS = 26.0, 12.0
+"""Difference in grey levels that seeds a ghost, and down to which the ghost grows (hysteresis thresholds)."""
+GHOST_EDGE_SLACK_PX = 2
+"""Compared pixels by which edges may be displaced and still agree."""
+GHOST_MIN_PIXELS = 60
+"""Compared pixels of the smallest ghost."""
+GHOST_SHARE_MAX = 0.25
+"""Share of a photo beyond which differences are not ghosts: the photo as a whole is displaced."""
+OVEREXPOSED_LEVEL = 250
 """Grey level from which a pixel counts as overexposed."""
-SHARP = 0.6
-"""Sharpness against that of the same camera's photos below which one counts as blurred."""
-FEW = 3
-"""Photos of a camera from which its usual sharpness is known."""
-LOOSE = 0.5
-"""Metres by which a surface's outline may be off: five voxels of the mission's, as leaves are."""
-BURNT = 0.6
-"""Share of overexposed pixels beyond which a photo is left out."""
+OVEREXPOSED_SHARE_MAX = 0.6
+"""Share of overexposed pixels beyond which a photo is excluded."""
+SHARPNESS_RATIO_MIN = 0.6
+"""Sharpness relative to the median of the same camera's photos below which a photo counts as blurred."""
+SHARPNESS_PHOTOS_MIN = 3
+"""Photos of a camera needed to know its median sharpness."""
+SKY_OUTLINE_TOLERANCE_M = 0.5
+"""Error of a surface's outline in metres: five voxels of the default size, as for foliage."""
 
 
 class AgreementParams(Params):
-    """How disagreement is dealt with.
+    """Settings of the photo consistency check.
 
     Attributes:
-        ghosts: mask what the others agree on and a photo doesn't.
-        sky: mask sky that shows beside outlines, and what mixes with it.
-        align: shift parts of photos by pixels so that they meet what the others show there.
-        neighbours: photos that each is compared with.
-        max_shift: pixels (of a photo scaled to 0.45 MP) by which a photo may be shifted against the others;
-            beyond it, it is left out; 0: never.
-        max_distance, min_cos, bias: as in `choose`.
+        ghosts: mask regions of a photo that differ from what the other photos agree on.
+        sky: mask sky that shows beside the outlines of surfaces, and pixels that mix with it.
+        align: warp photos locally, by a few pixels, onto what the other photos show.
+        neighbours: number of photos that each photo is compared with.
+        max_shift: pixels (of a photo scaled to 0.25 MP) by which a photo may be shifted against the others; photos
+            with a larger shift are excluded; 0: no limit.
+        max_distance, min_cos, bias: as in the step `choose`.
     """
 
     ghosts: bool = True
@@ -75,28 +77,32 @@ class AgreementParams(Params):
     align: bool = True
     neighbours: int = Field(8, ge=2, le=16)
     max_shift: float = Field(3.0, ge=0, le=100)
-    max_distance: Reach = 100.0
+    max_distance: Distance = 100.0
     min_cos: Cosine = 0.02
     bias: Depth = 0.04
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """What `agreement` found, by index of view.
+class PhotoConsistency:
+    """Result of the step `agreement`, by index of view.
 
     Attributes:
-        folder: with `agreement.json` and the masks.
-        usable: whether the photo is to be used for texture.
-        sharp: factor on its quality, 1 unless it is blurred.
+        folder: contains `agreement.json`, masks and warps.
+        usable: whether the photo may be used for texture.
+        quality_factors: factor on the photo's quality, below 1 if it is blurred.
     """
 
     folder: Path
     usable: tuple[bool, ...]
-    sharp: tuple[float, ...]
+    quality_factors: tuple[float, ...]
 
     @classmethod
-    def load(cls, folder: Path) -> Agreement:
-        """Read the folder that the step wrote."""
+    def load(cls, folder: Path) -> PhotoConsistency:
+        """Read the folder that the step wrote.
+
+        Raises:
+            InputError: `agreement.json` is missing or damaged.
+        """
         path = folder / "agreement.json"
         try:
             rows = json.loads(path.read_text(encoding="utf-8"))
@@ -105,38 +111,39 @@ class Agreement:
         return cls(folder, tuple(row["usable"] for row in rows), tuple(row["sharpness_factor"] for row in rows))
 
     def sharpness(self, i: int) -> float:
-        """Factor on the quality of view `i`."""
-        return self.sharp[i]
+        """Factor on the quality of view `i`, below 1 if it is blurred."""
+        return self.quality_factors[i]
 
     def mask(self, i: int, view: View) -> U8:
-        """(h, w) uint8, 0 where photo `i` must not be used: its own mask, ghosts and sky; (0, 0) for nowhere."""
+        """(h, w) uint8, 0 where photo `i` must not be used (its own mask, ghosts, sky); (0, 0): nothing is masked."""
         path = self.folder / f"mask_{i}.png"
         return image.read_levels(path) if path.is_file() else np.zeros((0, 0), np.uint8)
 
     def warp(self, i: int) -> F32:
-        """(h, w, 2) float32 pixels to be added to where photo `i` is looked up; (0, 0, 2) for none."""
+        """(h, w, 2) float32 displacement in pixels, to be added to positions in photo `i`; (0, 0, 2): no warp."""
         path = self.folder / f"warp_{i}.npy"
         return np.load(path) if path.is_file() else np.zeros((0, 0, 2), np.float32)
 
 
 def agreement(inputs: Inputs, params: AgreementParams, out: Path, report: Report) -> Done:
-    """Compare every photo that is not held out with the others.
+    """Compare every photo that is not held out with its neighbours.
 
     Inputs: `views`, `depth` (folder of depth maps), `exposures`.
-    Folder: `agreement`, with `agreement.json` (a row a view), and `mask_<i>.png` where a photo has some, ghosts or sky.
+    Folder: `agreement`, with `agreement.json` (one row per view), `mask_<i>.png` for photos with masked pixels (own
+    mask, ghosts, sky), and `warp_<i>.npy` for photos that are warped.
     """
     from scan2sim.pipeline.camera.depth_map import load_depth_map
-    from scan2sim.texturing.photo_cache import Exposures, Photos, camera_of
+    from scan2sim.texturing.photo_cache import Exposures, PhotoCache, camera_of
 
     folder = out / "agreement"
     folder.mkdir()
     views = views_io.load(inputs["views"])
     held = views_io.load_held_out(inputs["views"])
-    # an orthophoto is put together of many photos: nothing moves in it, and it fits by its georeference or not at all
+    # an orthophoto is a mosaic of many photos: it shows no moving objects, and its georeference is taken as given
     used = [i for i, view in enumerate(views) if not held[i] and view.camera.model != "orthographic"]
-    exposures, photos = Exposures.load(inputs["exposures"]), Photos(views)
+    exposures, photos = Exposures.load(inputs["exposures"]), PhotoCache(views)
 
-    @lru_cache(maxsize=KEPT)
+    @lru_cache(maxsize=DEPTH_MAPS_CACHED)
     def depth(i: int) -> DepthMap:
         return load_depth_map(inputs["depth"] / f"{i}.npy", views[i].camera, views[i].T_world_cam)
 
@@ -161,43 +168,43 @@ def agreement(inputs: Inputs, params: AgreementParams, out: Path, report: Report
             image.write(folder / f"mask_{i}.png", mask)
         if params.align and compared.warp is not None:
             np.save(folder / f"warp_{i}.npy", compared.warp)
-    _judge(rows, params)
+    _exclude_and_downweight(rows, params)
     (folder / "agreement.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
-    return Done({"agreement": folder}, _facts(rows, used), [str(row["reason"]) for row in rows if "reason" in row])
+    return Done({"agreement": folder}, _metrics(rows, used), [str(row["reason"]) for row in rows if "reason" in row])
 
 
 def neighbours(
     views: Sequence[View], used: Sequence[int], depth: Callable[[int], DepthMap], params: AgreementParams
 ) -> dict[int, list[int]]:
-    """The views that see most of what each one sees, at no much lower resolution."""
+    """For each view the neighbours that see most of its surface at a similar resolution, best first."""
     from scan2sim.pipeline.camera.depth_map import visible
     from scan2sim.pipeline.camera.models import pixel_angle
     from scan2sim.texturing.photo_prediction import surface
 
     rng = np.random.default_rng(0)
-    place, normal, owner = [], [], []
+    points, normals, owners = [], [], []
     for i in used:
         camera = views[i].camera
         small = surface(camera.scaled(min(1.0, (60_000 / (camera.width * camera.height)) ** 0.5)), depth(i))
-        p, n = small.some(SAMPLES, params.max_distance, rng)
-        place.append(p)
-        normal.append(n)
-        owner.append(np.full(len(p), i))
-    if not place:
+        p, n = small.sample(SAMPLES_PER_PHOTO, params.max_distance, rng)
+        points.append(p)
+        normals.append(n)
+        owners.append(np.full(len(p), i))
+    if not points:
         return {}
-    xyz, facing, whose = np.concatenate(place), np.concatenate(normal), np.concatenate(owner)
-    sharp = np.zeros((len(views), len(xyz)), np.float32)  # pixels a radian over distance, where seen
+    xyz, normal, owner = np.concatenate(points), np.concatenate(normals), np.concatenate(owners)
+    resolution = np.zeros((len(views), len(xyz)), np.float32)  # pixels per metre on the surface, 0 where not seen
     for j in used:
         to = views[j].centre - xyz
         distance = np.linalg.norm(to, axis=1)
-        cos = np.einsum("ij,ij->i", to, facing) / np.maximum(distance, 1e-9)
+        cos = np.einsum("ij,ij->i", to, normal) / np.maximum(distance, 1e-9)
         close = np.flatnonzero((distance < params.max_distance) & (cos > params.min_cos))
-        seen = close[visible(depth(j), xyz[close], facing[close], bias=params.bias)]
-        sharp[j, seen] = 1 / (pixel_angle(views[j].camera) * distance[seen])
+        seen = close[visible(depth(j), xyz[close], normal[close], bias=params.bias)]
+        resolution[j, seen] = 1 / (pixel_angle(views[j].camera) * distance[seen])
     out = {}
     for i in used:
-        own = whose == i
-        share = np.minimum(1.0, sharp[:, own] / np.maximum(sharp[i, own], 1e-9)).sum(axis=1)
+        own = owner == i
+        share = np.minimum(1.0, resolution[:, own] / np.maximum(resolution[i, own], 1e-9)).sum(axis=1)
         share[i] = 0
         best = np.argsort(-share, kind="stable")[: params.neighbours]
         out[i] = [int(j) for j in best if share[j] > 0]
@@ -205,8 +212,14 @@ def neighbours(
 
 
 @dataclass(frozen=True)
-class Compared:
-    """A photo beside its prediction: figures, where it shows a ghost (h, w), its warp (`warp_of`); None: unknown."""
+class Comparison:
+    """A photo compared with its prediction.
+
+    Attributes:
+        figures: columns of `agreement.json`.
+        ghosts: (h, w) where the photo shows a ghost; None: unknown.
+        warp: displacement field of `warp_of`; None: unknown.
+    """
 
     figures: dict[str, Any]
     ghosts: Bools | None = None
@@ -218,11 +231,11 @@ def compare(
     others: Sequence[int],
     views: Sequence[View],
     depth: Callable[[int], DepthMap],
-    photos: Photos,
+    photos: PhotoCache,
     exposures: Exposures,
     params: AgreementParams,
-) -> Compared:
-    """Predict photo `i` from `others`, and tell how it differs."""
+) -> Comparison:
+    """Predict photo `i` from the photos `others`, and compare it with the prediction."""
     import cv2
 
     from scan2sim.texturing.photo_prediction import Predictor, corrected_photo, surface
@@ -230,43 +243,44 @@ def compare(
     photo = photos.get(i)
     assert photo is not None
     camera = views[i].camera
-    small = camera.scaled(min(1.0, (PIXELS / (camera.width * camera.height)) ** 0.5))
-    shows = surface(small, depth(i))
+    small = camera.scaled(min(1.0, (COMPARED_PIXELS_MAX / (camera.width * camera.height)) ** 0.5))
+    visible_surface = surface(small, depth(i))
     predictor = Predictor(
-        shows, len(others), max_distance=params.max_distance, min_cos=params.min_cos, bias=params.bias
+        visible_surface, len(others), max_distance=params.max_distance, min_cos=params.min_cos, bias=params.bias
     )
     own = np.asarray(cv2.resize(photo.levels[0], (small.width, small.height), interpolation=cv2.INTER_AREA))
     for j in others:
         other = photos.get(j)
         if other is not None:
             predictor.add(other, views[j].camera, views[j].T_world_cam, depth(j), exposures.of(views[j]))
-    there = np.isfinite(shows.points[..., 0])
-    burnt = float(np.all(own[there] >= WHITE, axis=1).mean()) if there.any() else 0.0
-    figures: dict[str, Any] = {"overexposed": round(burnt, 3)}
+    has_surface = np.isfinite(visible_surface.points[..., 0])
+    overexposed = float(np.all(own[has_surface] >= OVEREXPOSED_LEVEL, axis=1).mean()) if has_surface.any() else 0.0
+    figures: dict[str, Any] = {"overexposed": round(overexposed, 3)}
     predicted = predictor.result()
-    sure = predicted.support >= 2
-    if sure.sum() < 2000:
-        return Compared(figures)
+    reliable = predicted.support >= 2
+    if reliable.sum() < 2000:
+        return Comparison(figures)
     mine = np.clip(corrected_photo(own, small, exposures.of(views[i])), 0, 255).astype(np.float32)
-    ghosts = ghost_mask(mine, predicted, own >= WHITE)
+    ghosts = ghost_mask(mine, predicted, own >= OVEREXPOSED_LEVEL)
     figures["ghost_share"] = round(float(ghosts.mean()), 4)
-    displaced = ghosts[sure].mean() > HAUNTED
-    displacement, warp = _shift(mine, predicted, sure if displaced else sure & ~ghosts, camera.width / small.width)
-    return Compared(figures | displacement, ghosts, warp)
+    is_displaced = ghosts[reliable].mean() > GHOST_SHARE_MAX
+    compared = reliable if is_displaced else reliable & ~ghosts
+    displacement, warp = _shift(mine, predicted, compared, camera.width / small.width)
+    return Comparison(figures | displacement, ghosts, warp)
 
 
-def _shift(mine: F32, predicted: Prediction, sure: Bools, scale: float) -> tuple[dict[str, float], F32 | None]:
-    """How a photo is displaced against its prediction by optical flow: figures (pixels of the photo), and its warp."""
+def _shift(mine: F32, predicted: Prediction, compared: Bools, scale: float) -> tuple[dict[str, float], F32 | None]:
+    """Displacement of a photo against its prediction by optical flow: figures (pixels of the photo), and its warp."""
     import cv2
 
     grey = cv2.cvtColor(mine, cv2.COLOR_RGB2GRAY)
-    other = np.where(sure, cv2.cvtColor(predicted.rgb, cv2.COLOR_RGB2GRAY), grey)
+    other = np.where(compared, cv2.cvtColor(predicted.rgb, cv2.COLOR_RGB2GRAY), grey)
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(
         np.clip(other, 0, 255).astype(np.uint8), np.clip(grey, 0, 255).astype(np.uint8), None
     )
-    inner = cv2.erode(sure.astype(np.uint8), np.ones((7, 7))) > 0
-    slope = np.hypot(cv2.Sobel(other, cv2.CV_32F, 1, 0), cv2.Sobel(other, cv2.CV_32F, 0, 1))
-    at = inner & (slope > 40)  # flow means something where there is something to see
+    inner = cv2.erode(compared.astype(np.uint8), np.ones((7, 7))) > 0
+    gradient = np.hypot(cv2.Sobel(other, cv2.CV_32F, 1, 0), cv2.Sobel(other, cv2.CV_32F, 0, 1))
+    at = inner & (gradient > 40)  # flow is reliable only where the image has structure
     if at.sum() < 500:
         return {}, None
     dx, dy = np.median(flow[at], axis=0)
@@ -278,60 +292,63 @@ def _shift(mine: F32, predicted: Prediction, sure: Bools, scale: float) -> tuple
         "spread_px": round(float(np.median(np.hypot(*(flow[at] - (dx, dy)).T)) * scale), 2),
         "sharpness": round(float(mine_fine / max(float(other_fine), 1e-6)), 3),
     }
-    return figures, warp_of(flow, np.where(inner, slope, 0).astype(np.float32), scale)
+    return figures, warp_of(flow, np.where(inner, gradient, 0).astype(np.float32), scale)
 
 
-def warp_of(flow: F32, slope: F32, scale: float) -> F32:
-    """Where a photo shows what should be at a pixel, smoothed: (h / 4, w / 4, 2) pixels of the photo to be added.
+def warp_of(flow: F32, gradient: F32, scale: float) -> F32:
+    """Smoothed displacement field (h / 4, w / 4, 2), in pixels of the photo, that aligns a photo with its prediction.
 
     Args:
-        flow: (h, w, 2) from the prediction to the photo, pixels of the compared size.
-        slope: (h, w) how much there is to see; 0 where nothing is known.
-        scale: pixels of the photo per pixel of the compared size.
+        flow: (h, w, 2) optical flow from the prediction to the photo, compared pixels.
+        gradient: (h, w) image gradient, the weight of the flow; 0 where the flow is unknown.
+        scale: pixels of the photo per compared pixel.
     """
     import cv2
 
     length = np.linalg.norm(flow, axis=2)
-    weight = np.where(length < MAX_WARP, np.minimum(slope, 200), 0).astype(np.float32)
-    total = cv2.GaussianBlur(weight, (0, 0), SMOOTH)
-    smooth = cv2.GaussianBlur(flow * weight[..., None], (0, 0), SMOOTH) / (total + FAINT)[..., None]
+    weight = np.where(length < WARP_MAX_PX, np.minimum(gradient, 200), 0).astype(np.float32)
+    total = cv2.GaussianBlur(weight, (0, 0), WARP_SMOOTHING_PX)
+    weighted = cv2.GaussianBlur(flow * weight[..., None], (0, 0), WARP_SMOOTHING_PX)
+    smooth = weighted / (total + WARP_GRADIENT)[..., None]
     size = (max(1, flow.shape[1] // 4), max(1, flow.shape[0] // 4))
     return np.asarray(cv2.resize(smooth, size, interpolation=cv2.INTER_AREA) * scale, np.float32)
 
 
-def ghost_mask(mine: F32, predicted: Prediction, white: Bools) -> Bools:
-    """Where a photo shows what the others agree is not there: (h, w).
+def ghost_mask(mine: F32, predicted: Prediction, overexposed: Bools) -> Bools:
+    """(h, w) ghosts: where a photo differs from what the other photos agree on.
 
     Args:
         mine: the photo (h, w, 3), exposure corrected.
-        predicted: what the others show.
-        white: (h, w, 3) where it is overexposed: as bright as it shows, or brighter.
+        predicted: its prediction from the other photos.
+        overexposed: (h, w, 3) where the photo is overexposed: the true value may be brighter, so a brighter
+            prediction is no difference.
     """
     import cv2
 
-    sure = predicted.support >= 2
-    theirs = np.where(sure[..., None], predicted.rgb, mine)
+    reliable = predicted.support >= 2
+    theirs = np.where(reliable[..., None], predicted.rgb, mine)
     a, b = cv2.blur(mine, (3, 3)), cv2.blur(theirs, (3, 3))
-    kernel = np.ones((2 * SLACK + 1, 2 * SLACK + 1))
-    darker = np.where(white, 0, cv2.erode(b, kernel) - a)
+    kernel = np.ones((2 * GHOST_EDGE_SLACK_PX + 1, 2 * GHOST_EDGE_SLACK_PX + 1))
+    darker = np.where(overexposed, 0, cv2.erode(b, kernel) - a)
     channels = cv2.split(np.maximum(a - cv2.dilate(b, kernel), darker))
-    apart = cv2.max(cv2.max(channels[0], channels[1]), channels[2])
-    apart[~sure] = 0
-    seeds = cv2.morphologyEx((apart > SEED).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3)))
-    grown = cv2.morphologyEx((apart > GROWN).astype(np.uint8) | seeds, cv2.MORPH_CLOSE, np.ones((7, 7)))
+    difference = cv2.max(cv2.max(channels[0], channels[1]), channels[2])
+    difference[~reliable] = 0
+    seeds = cv2.morphologyEx((difference > GHOST_SEED_LEVELS).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3)))
+    candidates = (difference > GHOST_GROWN_LEVELS).astype(np.uint8) | seeds
+    grown = cv2.morphologyEx(candidates, cv2.MORPH_CLOSE, np.ones((7, 7)))
     n, component, stats, _ = cv2.connectedComponentsWithStats(grown, connectivity=8)
-    seeded = np.bincount(component[seeds > 0], minlength=n) * 4 > SPECK
-    ghost = (seeded & (stats[:, cv2.CC_STAT_AREA] > SPECK))[component] & (grown > 0)
+    is_seeded = np.bincount(component[seeds > 0], minlength=n) * 4 > GHOST_MIN_PIXELS
+    ghost = (is_seeded & (stats[:, cv2.CC_STAT_AREA] > GHOST_MIN_PIXELS))[component] & (grown > 0)
     return np.asarray(cv2.dilate(ghost.astype(np.uint8), np.ones((7, 7)))) > 0
 
 
 def without_sky(view: View, rgb: U8, mask: U8, depth: DepthMap) -> tuple[U8, float]:
-    """A photo's mask, (0, 0) for none, 0 also where it shows sky, and how large a share that is."""
+    """A photo's mask with sky set to 0 as well ((0, 0): no mask), and the share of sky in the photo."""
     from scan2sim.pipeline.camera.models import pixel_angle, pixel_rays
     from scan2sim.texturing.sky import sky
 
     up = np.nan_to_num(pixel_rays(view.camera.scaled(1 / 8))) @ view.T_world_cam[2, :3].astype(np.float32)
-    found = sky(rgb, depth.range, up, pixel_angle(view.camera), LOOSE)
+    found = sky(rgb, depth.range, up, pixel_angle(view.camera), SKY_OUTLINE_TOLERANCE_M)
     if found is None:
         return mask, 0.0
     allowed = np.where(found, 0, 255).astype(np.uint8)
@@ -339,7 +356,7 @@ def without_sky(view: View, rgb: U8, mask: U8, depth: DepthMap) -> tuple[U8, flo
 
 
 def combined(ghosts: Bools | None, mask: U8) -> U8 | None:
-    """The photo's own mask and its ghosts as one, 0 where it must not be used; None where that is nowhere."""
+    """The photo's own mask combined with its ghosts, 0 where it must not be used; None if nothing is masked."""
     import cv2
 
     if ghosts is None or not ghosts.any():
@@ -352,31 +369,36 @@ def combined(ghosts: Bools | None, mask: U8) -> U8 | None:
     return allowed
 
 
-def _judge(rows: list[dict[str, Any]], params: AgreementParams) -> None:
-    """Decide from the figures which photos are left out, and how much blurred ones count."""
+def _exclude_and_downweight(rows: list[dict[str, Any]], params: AgreementParams) -> None:
+    """Exclude overexposed and shifted photos, and set the weight of blurred ones, by their figures; in place."""
     for row in rows:
         if not row["usable"]:
             continue
-        alike = [other["sharpness"] for other in rows if other["camera"] == row["camera"] and "sharpness" in other]
-        usual = float(np.median(alike)) if len(alike) >= FEW else 1e-6
+        same_camera = [
+            other["sharpness"] for other in rows if other["camera"] == row["camera"] and "sharpness" in other
+        ]
+        usual = float(np.median(same_camera)) if len(same_camera) >= SHARPNESS_PHOTOS_MIN else 1e-6
         relative = row.get("sharpness", usual) / usual
-        row["sharpness_factor"] = 1.0 if relative > SHARP else round(max(0.02, relative**2), 3)
-        if row.get("overexposed", 0.0) > BURNT:
+        row["sharpness_factor"] = 1.0 if relative > SHARPNESS_RATIO_MIN else round(max(0.02, relative**2), 3)
+        if row.get("overexposed", 0.0) > OVEREXPOSED_SHARE_MAX:
             row |= {
                 "usable": False,
-                "reason": f"{row['name']}: left out, {row['overexposed']:.0%} of it is overexposed",
+                "reason": f"{row['name']}: excluded, {row['overexposed']:.0%} of it is overexposed",
             }
         elif params.max_shift and row.get("shift_compared_px", 0.0) > params.max_shift:
             row |= {
                 "usable": False,
-                "reason": f"{row['name']}: left out, it is shifted by {row['shift_px']:.1f} pixels against the other "
+                "reason": f"{row['name']}: excluded, it is shifted by {row['shift_px']:.1f} pixels against the other "
                 "photos: check its pose (`agreement.max_shift` is the limit)",
             }
         elif row["sharpness_factor"] < 1:
-            row["reason"] = f"{row['name']}: blurred, {relative:.0%} as sharp as the others; used for little detail"
+            row["reason"] = (
+                f"{row['name']}: blurred, {relative:.0%} as sharp as the camera's other photos; down-weighted for "
+                "detail"
+            )
 
 
-def _facts(rows: Sequence[dict[str, Any]], used: Sequence[int]) -> dict[str, Any]:
+def _metrics(rows: Sequence[dict[str, Any]], used: Sequence[int]) -> dict[str, Any]:
     ghosts = [rows[i]["ghost_share"] for i in used if "ghost_share" in rows[i]]
     shifts = {rows[i]["name"]: rows[i]["shift_px"] for i in used if "shift_px" in rows[i]}
     return {

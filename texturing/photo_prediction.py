@@ -1,8 +1,8 @@
-"""Photos predicted from those around them: what each should show. Import late: loads numba.
+"""Photo prediction: renders what a photo should show from its neighbours. Import late: loads numba.
 
-Through the depth map, every pixel of a photo is a place on the surface; the others that see that place give
-its colour. Where a photo disagrees with what the others agree on, something stood there that is no part of the
-street (a ghost), or its pose is off.
+The depth map gives the surface point at every pixel of a photo; the other photos that see the point give its colour.
+Where a photo differs from what the others agree on, something stood there that is no part of the street (a ghost), or
+the pose of the photo is wrong.
 """
 
 from __future__ import annotations
@@ -16,23 +16,32 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from scan2sim.pipeline.camera.depth_map import DepthMap
-from scan2sim.pipeline.camera.image_sampling import allows, halving, read
+from scan2sim.pipeline.camera.image_sampling import allows, mip_level, read
 from scan2sim.pipeline.camera.models import EQUIRECTANGULAR, pixel_angle, pixel_rays
-from scan2sim.pipeline.camera.projection import Eye, Ranges, eye, incidence, is_visible, pixel_of, to_camera, turned
+from scan2sim.pipeline.camera.projection import (
+    PosedCamera,
+    Ranges,
+    incidence,
+    is_visible,
+    pixel_of,
+    posed_camera,
+    rotate_to_camera,
+    to_camera,
+)
 from scan2sim.pipeline.core.types import F32, F64, U8, Camera
 from scan2sim.texturing.bake.blend_numba import corrected, vignette
-from scan2sim.texturing.photo_cache import OFFSET, Photo
+from scan2sim.texturing.photo_cache import SRGB_OFFSET, Photo
 
-ALIKE = 28.0
+AGREEMENT_LEVELS = 28.0
 """Grey levels within which photos agree on a colour."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """What a view's pixels show.
+    """Surface points visible at a view's pixels.
 
     Attributes:
-        camera: the view's, scaled to the prediction's size.
+        camera: the view's camera, scaled to the size of the prediction.
         T_world_cam: (4, 4).
         points, normals: (H, W, 3) float32 in camera axes; points NaN where there is no surface.
     """
@@ -42,8 +51,8 @@ class Surface:
     points: F32
     normals: F32
 
-    def some(self, count: int, max_distance: float, rng: np.random.Generator) -> tuple[F64, F64]:
-        """At most `count` random places (N, 3) nearer than that, and their normals (N, 3), local coordinates."""
+    def sample(self, count: int, max_distance: float, rng: np.random.Generator) -> tuple[F64, F64]:
+        """At most `count` random points (N, 3) within `max_distance`, and their normals (N, 3); local coordinates."""
         near = np.einsum("hwk,hwk->hw", self.points, self.points) < max_distance**2
         at = np.flatnonzero(near.ravel())
         at = rng.choice(at, min(count, len(at)), replace=False) if len(at) else at
@@ -53,12 +62,12 @@ class Surface:
 
 @dataclass(frozen=True)
 class Prediction:
-    """A photo as the others show it.
+    """A photo predicted from other photos.
 
     Attributes:
-        rgb: (H, W, 3) float32, corrected exposure.
-        support: (H, W) uint8, photos that agree on it.
-        others: (H, W) uint8, photos that see the place.
+        rgb: (H, W, 3) float32, exposure corrected.
+        support: (H, W) uint8, number of photos that agree on the colour.
+        others: (H, W) uint8, number of photos that see the point.
     """
 
     rgb: F32
@@ -67,7 +76,7 @@ class Prediction:
 
 
 def surface(camera: Camera, depth: DepthMap) -> Surface:
-    """The surface that a camera (the view's, scaled to the size wanted) sees, from the view's depth map."""
+    """Surface seen by a camera (the view's camera, scaled to the wanted size), from the view's depth map."""
     rays = pixel_rays(camera)
     rows = np.clip(np.round((np.arange(camera.height) + 0.5) * depth.camera.height / camera.height - 0.5), 0, None)
     columns = np.clip(np.round((np.arange(camera.width) + 0.5) * depth.camera.width / camera.width - 0.5), 0, None)
@@ -77,12 +86,12 @@ def surface(camera: Camera, depth: DepthMap) -> Surface:
 
 
 class Predictor:
-    """Collects what other photos show of a surface.
+    """Predicts a view from other photos of its surface.
 
     Args:
-        surface: of the view that is predicted.
-        count: photos that will be added.
-        max_distance, min_cos, bias: as for texturing.
+        surface: visible surface of the view.
+        count: number of photos that will be added.
+        max_distance, min_cos, bias: as in `ChooseParams`.
     """
 
     def __init__(self, surface: Surface, count: int, *, max_distance: float, min_cos: float, bias: float) -> None:
@@ -94,27 +103,27 @@ class Predictor:
         self._added = 0
 
     def add(self, photo: Photo, camera: Camera, T_world_cam: F64, depth: DepthMap, exposure: F64) -> None:
-        """Add what one photo shows; `exposure` (5,) of `Exposures.of`."""
+        """Sample the surface in one photo; `exposure` (5,) from `Exposures.of`."""
         s, (max_distance, min_cos, bias) = self._surface, self._limits
         _sample(
             self._rgb[self._added], self._weight[self._added], s.points, s.normals, pixel_angle(s.camera),
-            photo.levels, photo.mask, eye(camera, T_world_cam, s.T_world_cam), depth.ranges, exposure,
+            photo.levels, photo.mask, posed_camera(camera, T_world_cam, s.T_world_cam), depth.ranges, exposure,
             max_distance, min_cos, bias,
         )  # fmt: skip
         self._added += 1
 
     def result(self) -> Prediction:
-        """What those added agree on."""
+        """Colours on which the added photos agree."""
         h, w = self._weight.shape[1:]
         rgb = np.zeros((h, w, 3), np.float32)
         support, others = np.zeros((h, w), np.uint8), np.zeros((h, w), np.uint8)
-        _agree(self._rgb[: self._added], self._weight[: self._added], rgb, support, others, ALIKE)
+        _agree(self._rgb[: self._added], self._weight[: self._added], rgb, support, others, AGREEMENT_LEVELS)
         return Prediction(rgb, support, others)
 
 
 @njit(cache=True, parallel=True)
 def _normals(points: F32) -> F32:
-    """(H, W, 3) unit normals towards the camera, from each pixel's nearer neighbours; along the ray at borders."""
+    """(H, W, 3) unit normals towards the camera, from each pixel's closer neighbours; along the ray at borders."""
     height, width = points.shape[:2]
     out = np.zeros((height, width, 3), np.float32)
     for v in prange(height):
@@ -161,7 +170,7 @@ def _sample(
     own_pixel: float,
     levels: tuple[U8, U8, U8],
     mask: U8,
-    eye: Eye,
+    camera: PosedCamera,
     ranges: Ranges,
     exposure: F64,
     max_distance: float,
@@ -169,7 +178,7 @@ def _sample(
     bias: float,
 ) -> None:
     height, width = weight.shape
-    wide = eye.model == EQUIRECTANGULAR
+    wide = camera.model == EQUIRECTANGULAR
     factors = (math.exp(exposure[0]), math.exp(exposure[1]), math.exp(exposure[2]))
     for row in prange(height):
         for column in range(width):
@@ -177,33 +186,33 @@ def _sample(
             r2 = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
             if not 0.01 < r2 < max_distance * max_distance:
                 continue
-            x, y, z = to_camera(eye.T, a[0], a[1], a[2])
+            x, y, z = to_camera(camera.T, a[0], a[1], a[2])
             d2 = x * x + y * y + z * z
             if not 0.01 < d2 < max_distance * max_distance:
                 continue
-            u, v, ok = pixel_of(eye, x, y, z)
+            u, v, ok = pixel_of(camera, x, y, z)
             if not ok:
                 continue
-            nx, ny, nz = turned(eye.T, n[0], n[1], n[2])
-            distance, cos = incidence(eye, x, y, z, nx, ny, nz)
-            if cos < min_cos or not allows(mask, eye.p, u, v):
+            nx, ny, nz = rotate_to_camera(camera.T, n[0], n[1], n[2])
+            distance, cos = incidence(camera, x, y, z, nx, ny, nz)
+            if cos < min_cos or not allows(mask, camera.p, u, v):
                 continue
-            if not is_visible(eye, ranges, u, v, distance, cos, bias):
+            if not is_visible(camera, ranges, u, v, distance, cos, bias):
                 continue
-            ratio = math.sqrt(r2) * own_pixel / (distance * eye.pixel)
+            ratio = math.sqrt(r2) * own_pixel / (distance * camera.pixel)
             share = min(ratio, 1.0)
-            level = halving(ratio, len(levels))
-            r, g, b = read(levels[level], eye.p, u, v, wide)
-            fall = vignette(exposure, eye.p, u, v)
-            rgb[row, column, 0] = min(255.0, max(0.0, corrected(r, factors[0] * fall) + 0.5))
-            rgb[row, column, 1] = min(255.0, max(0.0, corrected(g, factors[1] * fall) + 0.5))
-            rgb[row, column, 2] = min(255.0, max(0.0, corrected(b, factors[2] * fall) + 0.5))
+            level = mip_level(ratio, len(levels))
+            r, g, b = read(levels[level], camera.p, u, v, wide)
+            vignetting_factor = vignette(exposure, camera.p, u, v)
+            rgb[row, column, 0] = min(255.0, max(0.0, corrected(r, factors[0] * vignetting_factor) + 0.5))
+            rgb[row, column, 1] = min(255.0, max(0.0, corrected(g, factors[1] * vignetting_factor) + 0.5))
+            rgb[row, column, 2] = min(255.0, max(0.0, corrected(b, factors[2] * vignetting_factor) + 0.5))
             weight[row, column] = cos * share * share + 1e-3
 
 
 @njit(cache=True, parallel=True)
-def _agree(rgb: U8, weight: F32, out: F32, support: U8, others: U8, alike: float) -> None:
-    """The mean of those that are alike the sample which most are alike to."""
+def _agree(rgb: U8, weight: F32, out: F32, support: U8, others: U8, tolerance: float) -> None:
+    """Robust mean per pixel: of the samples within `tolerance` of the sample that most others agree with."""
     count, height, width = weight.shape
     for row in prange(height):
         for column in range(width):
@@ -215,8 +224,9 @@ def _agree(rgb: U8, weight: F32, out: F32, support: U8, others: U8, alike: float
                 total = 0.0
                 for j in range(count):
                     if j != i and weight[j, row, column] > 0:
-                        total += weight[j, row, column] * min(alike, _apart(rgb[i, row, column], rgb[j, row, column]))
-                total -= weight[i, row, column] * alike  # of two that are alone, the better
+                        difference = _colour_difference(rgb[i, row, column], rgb[j, row, column])
+                        total += weight[j, row, column] * min(tolerance, difference)
+                total -= weight[i, row, column] * tolerance  # of two samples that disagree, the better one
                 if total < least:
                     best, least = i, total
             others[row, column] = seen
@@ -225,8 +235,8 @@ def _agree(rgb: U8, weight: F32, out: F32, support: U8, others: U8, alike: float
             w = 0.0
             for i in range(count):
                 if weight[i, row, column] > 0:
-                    d = _apart(rgb[best, row, column], rgb[i, row, column])
-                    if d < alike:
+                    d = _colour_difference(rgb[best, row, column], rgb[i, row, column])
+                    if d < tolerance:
                         support[row, column] += 1
                         w += weight[i, row, column]
                         for k in range(3):
@@ -236,8 +246,8 @@ def _agree(rgb: U8, weight: F32, out: F32, support: U8, others: U8, alike: float
 
 
 @njit(cache=True, inline="always")
-def _apart(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> np.float32:
-    """How far two colours are apart: the mean over channels, grey levels."""
+def _colour_difference(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> np.float32:
+    """Mean absolute difference of two colours over the channels, grey levels."""
     return (
         abs(np.float32(a[0]) - np.float32(b[0]))
         + abs(np.float32(a[1]) - np.float32(b[1]))
@@ -246,10 +256,10 @@ def _apart(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> np.float32:
 
 
 def corrected_photo(photo: U8, camera: Camera, exposure: F64) -> F32:
-    """The photo (H, W, 3), of a camera scaled to it, with its exposure corrected; (H, W, 3) float32, unclipped."""
+    """Exposure corrected photo (H, W, 3) float32, unclipped; `camera` is scaled to the size of `photo` (H, W, 3)."""
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
     cx, cy = (camera.width - 1) / 2, (camera.height - 1) / 2
     q = ((u - cx) ** 2 + (v - cy) ** 2) / (cx * cx + cy * cy)
-    fall = exposure[3] * q + exposure[4] * q * q
-    factor = np.exp(fall[..., None] + exposure[:3]).astype(np.float32)
-    return (photo.astype(np.float32) + np.float32(OFFSET)) * factor - np.float32(OFFSET)
+    vignetting = exposure[3] * q + exposure[4] * q * q
+    factor = np.exp(vignetting[..., None] + exposure[:3]).astype(np.float32)
+    return (photo.astype(np.float32) + np.float32(SRGB_OFFSET)) * factor - np.float32(SRGB_OFFSET)

@@ -1,8 +1,8 @@
-"""A textured mesh made smaller: fewer triangles, unwrapped anew, painted from the one that it is made of.
+"""Simplification of textured meshes: decimated, unwrapped again, and the texture transferred from the original mesh.
 
-Charts of street meshes are of a few triangles each, whose borders couldn't be kept: so the surface is simplified as a
-whole, and each texel of the new pages takes its colour, and where that is from, from the nearest place of the old
-surface, the mean of several where texels become wider. Edges where tiles meet stay as they are.
+Charts of street meshes have a few triangles each, so their borders can't be kept. The surface is decimated as a whole,
+and each texel of the new pages takes colour and mask from the nearest point of the original surface, or the mean of
+several points where texels become wider. Edges on the borders of tiles are kept.
 """
 
 from __future__ import annotations
@@ -21,40 +21,40 @@ from scan2sim.pipeline.io.worlds.scene import Scene, Surface
 if TYPE_CHECKING:
     from scan2sim.pipeline.io.worlds.textured_mesh import Textured
 
-LEAST = 4
-"""Triangles that each class keeps."""
-TRIES = 4
-"""At the width of texels that keeps to the budget."""
-GUTTER, PADDING = 2, 16
-"""Texels between charts, and that colours are carried beyond them."""
-FEW = 5000
-"""Triangles up to which the unwrapper with fewer charts is worth its time: on small pages all is room between them."""
-FILLED = {"uvatlas": 0.9, "xatlas": 0.5}
-"""Shares of a page that charts cover, to begin with."""
-FINE = 4
-"""Places a side, at most, whose mean a wider texel is."""
-SAME = 1e-3
-"""Metres within which a vertex is one of those that stay."""
-CHUNK = 2_000_000
-"""Places whose colours are asked for at once."""
+MIN_TRIANGLES_PER_CLASS = 4
+MAX_UNWRAP_ATTEMPTS = 4
+"""Attempts to find a texel size that meets the texel budget."""
+GUTTER_TEXELS, PADDING_TEXELS = 2, 16
+"""Texels between charts, and texels by which colours are extended beyond charts."""
+UVATLAS_MAX_TRIANGLES = 5000
+"""Triangles up to which UVAtlas, which makes fewer charts, is worth its time: on small pages gutters dominate."""
+INITIAL_UTILISATION = {"uvatlas": 0.9, "xatlas": 0.5}
+"""Share of a page that charts are expected to cover, for the first attempt."""
+MAX_SUPERSAMPLING = 4
+"""Largest number of samples per texel in each direction."""
+WELD_DISTANCE_M = 1e-3
+"""Distance in metres within which vertices are the same."""
+CHUNK_POINTS = 2_000_000
+"""Points whose colours are looked up at once."""
 
 
 class Share(NamedTuple):
-    """What is left: shares of the triangles and of the texels."""
+    """Shares of the triangles and texels that are kept."""
 
     triangles: float
     texels: float
 
 
-def reduced(scene: Scene, triangles: int | None, texels: float | None, folder: Path, report: Report) -> Scene:
-    """A scene whose tiles have at most about so many triangles and texels each; smaller ones stay as they are.
+def simplified_scene(scene: Scene, triangles: int | None, texels: float | None, folder: Path, report: Report) -> Scene:
+    """Scene whose tiles are simplified to a budget of triangles and texels; tiles within the budget are unchanged.
 
     Args:
-        scene: to be made smaller.
-        triangles: that a tile's surfaces may have together; more where its borders alone need them.
-        texels: of a tile's pages together.
-        folder: where what is made is kept.
-        report: progress.
+        scene: scene to be simplified.
+        triangles: maximum number of triangles of a tile's surfaces together (exceeded where its borders alone need
+            more); None: no limit.
+        texels: maximum number of texels of a tile's pages together; None: no limit.
+        folder: folder for the new scene.
+        report: progress callback.
     """
     world = folder / "world"
     for i, tile in enumerate(scene.tiles):
@@ -62,82 +62,84 @@ def reduced(scene: Scene, triangles: int | None, texels: float | None, folder: P
         shapes = tile.textured()
         share = Share(
             min(1.0, (triangles or np.inf) / sum(map(len, shapes.values()))),
-            min(1.0, (texels or np.inf) / sum(map(texels_of, shapes.values()))),
+            min(1.0, (texels or np.inf) / sum(map(texel_count, shapes.values()))),
         )
         sources = {group: tile.folder / group for group in shapes}
         photos = {group: shape.photo for group, shape in shapes.items() if shape.photo is not None}
         for group, shape in shapes.items() if min(share) < 1 else ():
             sources[group] = folder / tile.name / group
-            small = shrink(group, shape, tile.folder / group, share, None, sources[group])
+            small = simplify_group(group, shape, tile.folder / group, share, None, sources[group])
             if group in photos:
                 photos[group] = photos[group][_nearest(shape.mesh, small)]
-        scenes.keep(
-            world, tile.name, sources, tile.folder / scenes.SOLID, tile.known, tile.friction,
+        scenes.save_tile(
+            world, tile.name, sources, tile.folder / scenes.COLLISION_FILE, tile.extra_files, tile.friction,
             views=tile.views(), photos=photos,
         )  # fmt: skip
-    scenes.describe(world, scene.name, scene.frame, [tile.name for tile in scene.tiles])
+    scenes.write_scene_file(world, scene.name, scene.frame, [tile.name for tile in scene.tiles])
     return scenes.read_scene(world)
 
 
-def shrink(group: str, shape: Textured, source: Path, share: Share, borders: F64 | None, out: Path) -> Mesh:
-    """Write a group with shares of its triangles and texels as a textured mesh; returns it.
+def simplify_group(group: str, shape: Textured, source: Path, share: Share, borders: F64 | None, out: Path) -> Mesh:
+    """Write a simplified surface group as a textured mesh; returns the mesh.
 
     Args:
-        group: its name.
-        shape: the group.
+        group: name of the group.
+        shape: textured mesh of the group.
         source: folder that it was read from.
-        share: what is left.
-        borders: (K, 3) local metres, vertices that other tiles have, too: open edges between them stay as they are.
-            None: all open edges stay.
-        out: a new folder.
+        share: shares of triangles and texels to keep.
+        borders: (K, 3) vertices, local metres, that other tiles have, too: open edges between them are kept.
+            None: all open edges are kept.
+        out: folder to be created.
     """
     from scan2sim.texturing.unwrap import UNWRAP, UnwrapParams
 
     out.mkdir(parents=True)
     frame, parts = shape.mesh.frame, scenes.by_class(group, shape)
-    small = _joined(frame, [(part, _simplified(part.shape.mesh, share.triangles, borders)) for part in parts])
+    small = _joined(frame, [(part, _decimated(part.shape.mesh, share.triangles, borders)) for part in parts])
     small.save(out / "small.npz")
-    most = share.texels * texels_of(shape)
-    backend: Literal["xatlas", "uvatlas"] = "uvatlas" if len(small) <= FEW else "xatlas"
-    wide = float(np.sqrt(small.face_area.sum(dtype=np.float64) / (FILLED[backend] * most)))
-    for _ in range(TRIES):  # how well charts fill pages shows afterwards
-        params = UnwrapParams(backend=backend, texel=float(np.clip(wide, 0.0005, 10)), gutter=GUTTER)
+    budget = share.texels * texel_count(shape)
+    backend: Literal["xatlas", "uvatlas"] = "uvatlas" if len(small) <= UVATLAS_MAX_TRIANGLES else "xatlas"
+    texel = float(np.sqrt(small.face_area.sum(dtype=np.float64) / (INITIAL_UTILISATION[backend] * budget)))
+    for _ in range(MAX_UNWRAP_ATTEMPTS):  # the utilisation of the pages is known only after unwrapping
+        params = UnwrapParams(backend=backend, texel=float(np.clip(texel, 0.0005, 10)), gutter=GUTTER_TEXELS)
         flat = Mesh.load(UNWRAP.run({"mesh": out / "small.npz"}, params, out, silent).files["mesh"])
         pages = json.loads((out / "pages.json").read_text(encoding="utf-8"))
-        found = sum(page["width"] * page["height"] for page in pages)
-        if found <= most:
+        count = sum(page["width"] * page["height"] for page in pages)
+        if count <= budget:
             break
-        wide *= 1.05 * np.sqrt(found / most)
-    _paint(flat, pages, source, out, int(np.clip(np.rint(share.texels**-0.5), 1, FINE)))
+        texel *= 1.05 * np.sqrt(count / budget)
+    _paint(flat, pages, source, out, int(np.clip(np.rint(share.texels**-0.5), 1, MAX_SUPERSAMPLING)))
     return flat
 
 
 def _nearest(mesh: Mesh, small: Mesh) -> I64:
-    """(F,) of each face of `small`, the face of `mesh` whose middle is nearest to its own."""
+    """(F,) for each face of `small`, the face of `mesh` with the nearest centroid."""
     from scipy.spatial import cKDTree
 
     return np.asarray(cKDTree(mesh.corners.mean(axis=1)).query(small.corners.mean(axis=1))[1], np.int64)
 
 
-def _simplified(mesh: Mesh, share: float, borders: F64 | None) -> Mesh:
-    from scan2sim.pipeline.tiling.borders.open_edges import thinned
+def _decimated(mesh: Mesh, share: float, borders: F64 | None) -> Mesh:
+    from scan2sim.pipeline.tiling.borders.open_edges import decimate_keeping_borders
 
-    return thinned(mesh, max(LEAST, int(share * len(mesh))), _among(mesh, borders))
+    return decimate_keeping_borders(
+        mesh, max(MIN_TRIANGLES_PER_CLASS, int(share * len(mesh))), _on_borders(mesh, borders)
+    )
 
 
-def _among(mesh: Mesh, places: F64 | None) -> Bools:
-    """(V,) which vertices are at some of these places; None: all."""
+def _on_borders(mesh: Mesh, borders: F64 | None) -> Bools:
+    """(V,) vertices at one of the border points (K, 3); None: all."""
     from scipy.spatial import cKDTree
 
-    if places is None:
+    if borders is None:
         return np.ones(len(mesh.vertices), bool)
-    if not len(places):
+    if not len(borders):
         return np.zeros(len(mesh.vertices), bool)
-    return np.isfinite(cKDTree(places).query(mesh.vertices, distance_upper_bound=SAME)[0])
+    return np.isfinite(cKDTree(borders).query(mesh.vertices, distance_upper_bound=WELD_DISTANCE_M)[0])
 
 
 def _joined(frame: Frame, parts: list[tuple[Surface, Mesh]]) -> Mesh:
-    """One mesh of several, which says of each face its class."""
+    """Several meshes joined into one, with the class of each face."""
     first = np.cumsum([0, *(len(mesh.vertices) for _, mesh in parts)])
     own = {surface.group for surface, _ in parts}
     codes = [0 if surface.name in own else surface.code for surface, _ in parts]
@@ -149,46 +151,46 @@ def _joined(frame: Frame, parts: list[tuple[Surface, Mesh]]) -> Mesh:
     )
 
 
-def _paint(mesh: Mesh, pages: list[dict[str, int]], source: Path, out: Path, fine: int) -> None:
-    """Write a mesh's pages, of these sizes, from the textured mesh in `source`; a texel is the mean of fine² places."""
+def _paint(mesh: Mesh, pages: list[dict[str, int]], source: Path, out: Path, samples: int) -> None:
+    """Write a mesh's `pages` with texture from the textured mesh in `source`, with samples x samples per texel."""
     from scan2sim.pipeline.camera import renderer
     from scan2sim.texturing.bake import texel_map as texels
-    from scan2sim.texturing.bake.page_writer import Writer
+    from scan2sim.texturing.bake.page_writer import PageWriter
     from scan2sim.texturing.inpainting import hole_filling
 
     assert mesh.uv is not None and mesh.page is not None
-    old = renderer.Renderer([renderer.textured(source)])
-    writer = Writer()
+    original = renderer.Renderer([renderer.textured(source)])
+    writer = PageWriter()
     for k, size in enumerate(pages):
         faces = np.flatnonzero(mesh.page == k)
         corners = mesh.corners[faces]
-        flat = texels.corners(mesh.uv[faces], fine * size["width"], fine * size["height"])
-        owner = texels.owners(flat, fine * size["width"], fine * size["height"])
+        flat = texels.corners(mesh.uv[faces], samples * size["width"], samples * size["height"])
+        owner = texels.owners(flat, samples * size["width"], samples * size["height"])
         rows, columns = np.nonzero(owner >= 0)
         rgb = np.zeros((*owner.shape, 3), np.uint8)
         seen = np.zeros(owner.shape, np.uint8)
-        for first in range(0, len(rows), CHUNK):
-            here = rows[first : first + CHUNK], columns[first : first + CHUNK]
-            rgb[here], seen[here], _ = old.nearest(hole_filling.texel_places(owner, flat, corners, *here))
-        rgb, seen = _wider(rgb, seen, fine)
-        hole_filling.pad(rgb, seen, PADDING)
+        for first in range(0, len(rows), CHUNK_POINTS):
+            chunk = rows[first : first + CHUNK_POINTS], columns[first : first + CHUNK_POINTS]
+            rgb[chunk], seen[chunk], _ = original.nearest(hole_filling.texel_points(owner, flat, corners, *chunk))
+        rgb, seen = _downsampled(rgb, seen, samples)
+        hole_filling.pad(rgb, seen, PADDING_TEXELS)
         writer.write(out / f"page_{k}", hole_filling.Page(rgb, seen, owner, flat, corners))
     writer.finish()
 
 
-def _wider(rgb: U8, seen: U8, fine: int) -> tuple[U8, U8]:
-    """A page of texels `fine` times as wide: the mean of those that have a colour, and the least of their marks."""
-    height, width = (side // fine for side in seen.shape)
-    marks = seen.reshape(height, fine, width, fine)
+def _downsampled(rgb: U8, seen: U8, factor: int) -> tuple[U8, U8]:
+    """Page at 1/factor of its resolution: mean of the texels that have a colour, and the smallest of their marks."""
+    height, width = (side // factor for side in seen.shape)
+    marks = seen.reshape(height, factor, width, factor)
     count = (marks > 0).sum(axis=(1, 3))
-    total = rgb.reshape(height, fine, width, fine, 3).sum(axis=(1, 3), dtype=np.uint32)
+    total = rgb.reshape(height, factor, width, factor, 3).sum(axis=(1, 3), dtype=np.uint32)
     mean = (total + count[..., None] // 2) // np.maximum(count, 1)[..., None]
     least = np.where(marks > 0, marks, 255).min(axis=(1, 3))
     return mean.astype(np.uint8), np.where(count > 0, least, 0).astype(np.uint8)
 
 
-def texels_of(shape: Textured) -> int:
-    """Of all pages that its faces lie on."""
+def texel_count(shape: Textured) -> int:
+    """Number of texels of all pages that the faces of a textured mesh use."""
     from scan2sim.pipeline.io.images import image
 
     return sum(int(np.prod(image.size_of(shape.pages[page]))) for page in shape.used_pages)

@@ -1,4 +1,4 @@
-"""What becomes of records when the broker dies under load (part `broker` of `bench.bus`): none lost, none double."""
+"""Delivery of records when the broker fails under load: none lost, no duplicates (part `broker` of `bench.bus`)."""
 
 from __future__ import annotations
 
@@ -12,43 +12,43 @@ from pathlib import Path
 
 from bench.paths import ROOT
 from scan2sim.services import kafka
-from scan2sim.services.outbox import Once
+from scan2sim.services.outbox import Deduplicator
 from tests.fakes.broker import Broker
 
-NODES, PERIOD = 10, 0.1
-"""Nodes that tell, and seconds between the records of each."""
-BEFORE, DOWN, AFTER = 20.0, 60.0, 20.0
-"""Seconds that they tell: with the broker, without, and with it again."""
+NODES, PERIOD_S = 10, 0.1
+"""Number of publishing nodes, and seconds between the records of each."""
+UP_S, DOWN_S, RECOVERED_S = 20.0, 60.0, 20.0
+"""Seconds with the broker, without it, and with the restarted broker."""
 TOPIC = "monitor_data"
 
 
-def broker_down(before: float = BEFORE, down: float = DOWN, after: float = AFTER) -> dict[str, float]:
-    """Nodes tell, the broker is killed and started again; a reader reads all along.
+def broker_down(before: float = UP_S, down: float = DOWN_S, after: float = RECOVERED_S) -> dict[str, float]:
+    """Kill and restart the broker while nodes publish records and a reader reads them.
 
     Returns:
-        broker_down_lost: records that no reader got; broker_down_doubles: that it got twice, by their ids; records,
-        how many there were; doubles_sent, those that came twice and were dropped.
+        broker_down_lost: records that were not read; broker_down_doubles: records that were read twice, by their ids;
+        records: number of records; doubles_sent: duplicates that were dropped.
     """
     broker = Broker()
     broker.start()
     with tempfile.TemporaryDirectory() as folder:
         talkers = [_talker(Path(folder), number, broker.servers) for number in range(NODES)]
-        taken: list[str] = []
-        doubles: list[str] = []
+        received: list[str] = []
+        duplicates: list[str] = []
 
         def read(seconds: float, enough: int = 0) -> None:
-            """By a reader of its own: what an earlier one took is a double for it, too."""
+            """Read with a new reader; records that an earlier one has received are duplicates."""
             end = time.monotonic() + seconds
             for body in kafka.read(
-                broker.servers, TOPIC, group="bench", from_start=True, wait=0.1, dropped=doubles.append
+                broker.servers, TOPIC, group="bench", from_start=True, wait=0.1, dropped=duplicates.append
             ):
                 if body:
-                    told = json.loads(body)["record id"]
-                    (taken if once.new(told) else doubles).append(told)
-                if time.monotonic() > end or (enough and len(taken) >= enough):
+                    record_id = json.loads(body)["record id"]
+                    (received if deduplicator.is_new(record_id) else duplicates).append(record_id)
+                if time.monotonic() > end or (enough and len(received) >= enough):
                     return
 
-        once = Once()
+        deduplicator = Deduplicator()
         read(before)
         broker.kill()
         time.sleep(down)
@@ -58,14 +58,14 @@ def broker_down(before: float = BEFORE, down: float = DOWN, after: float = AFTER
             talker.terminate()
         for talker in talkers:
             talker.wait(60)
-        told = [json.loads(line)["record id"] for log in Path(folder).glob("*.log") for line in log.open()]
-        read(60.0, len(told))
+        published = [json.loads(line)["record id"] for log in Path(folder).glob("*.log") for line in log.open()]
+        read(60.0, len(published))
     broker.kill()
     return {
-        "broker_down_lost": len(set(told) - set(taken)),
-        "broker_down_doubles": len(taken) - len(set(taken)),
-        "records": len(told),
-        "doubles_sent": len(doubles),
+        "broker_down_lost": len(set(published) - set(received)),
+        "broker_down_doubles": len(received) - len(set(received)),
+        "records": len(published),
+        "doubles_sent": len(duplicates),
     }
 
 
@@ -80,7 +80,7 @@ def _talker(folder: Path, number: int, servers: str) -> subprocess.Popen[bytes]:
         "--interval",
         "0.01",
     ]
-    command += ["--period", str(PERIOD), "--kafka", servers, "--to", TOPIC]
+    command += ["--period", str(PERIOD_S), "--kafka", servers, "--to", TOPIC]
     command += ["--log", str(folder / f"{number}.log"), "--spool", str(folder / f"{number}.spool")]
     environment = os.environ | {"ROS_DOMAIN_ID": "88", "SCAN2SIM_TRANSPORT": "cyclone", "PYTHONPATH": str(ROOT)}
     return subprocess.Popen(command, env=environment, cwd=ROOT, stderr=subprocess.DEVNULL)

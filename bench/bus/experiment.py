@@ -1,8 +1,8 @@
-"""The experiment of D3.2, section 3.2, through real nodes: cameras' events of a Monday, workers asked for as they come.
+"""Experiment of D3.2, section 3.2 with real nodes: camera events of a Monday, and workers requested for them.
 
-Every ten cameras are a dataset talker; a node queues their events and has them worked on by local processes, each of
-two events a second; another asks for workers. All are processes of their own, started by `scan2sim monitor ...`. Faster
-than real time, all that is a time in the mission is divided by the speed, and a worker is as much faster.
+Each dataset talker replays ten cameras; one node queues their events and has local processes handle them, two events
+per second each; another node requests workers. All are separate processes, started with `scan2sim monitor ...`. If
+replayed faster than real time, all durations are divided by the speed, and workers are faster by the same factor.
 """
 
 from __future__ import annotations
@@ -23,21 +23,20 @@ from scan2sim.services.monitoring.autoscale import traffic_model
 from scan2sim.services.monitoring.autoscale.traffic_model import TrafficParams
 from scan2sim.services.monitoring.example_nodes import worker
 
-GROUP = 10
-"""Cameras of a talker."""
-LIMIT = 5.0
-"""Seconds that an event may be old (D3.2, table 3: delay)."""
+CAMERAS_PER_TALKER = 10
+MAX_AGE_S = 5.0
+"""Maximum age of an event in seconds (D3.2, table 3: delay)."""
 CAPACITY, PERIOD, WINDOW, DELAY = 2.0, 10.0, 300.0, 4.0
-"""Events a second of a worker, seconds of a record, of the average, for what waits: all of the mission's time."""
+"""Events per second of a worker; seconds of a record, of the average, and of tolerated waiting, in simulated time."""
 TOPIC = "/vehicles"
 
 
 @dataclass(frozen=True)
 class Replay:
-    """What is replayed: cameras, hours of Monday, how fast, whether messages are as large as events.
+    """A replay: cameras, hours of Monday, speed, and whether messages have the real size of events.
 
     Attributes:
-        kafka: servers that records and events go to, too, as "host:port".
+        kafka: Kafka servers that also receive records and events, as "host:port".
     """
 
     cameras: int
@@ -50,26 +49,26 @@ class Replay:
 
     @property
     def name(self) -> str:
-        """Of its folder."""
+        """Name of its folder."""
         return f"{self.cameras}-{'sizes' if self.real_sizes else 'fields'}-{self.speed:g}x"
 
 
 def replays(speed: float) -> list[Replay]:
-    """D3.2's three: 10, 20 and 50 cameras, from 6 to 10 h."""
+    """The three replays of D3.2: 10, 20 and 50 cameras from 6 to 10 h."""
     return [Replay(cameras, speed) for cameras in (10, 20, 50)]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of it, in the mission's time.
+    """Outcome of a replay, in simulated time.
 
     Attributes:
-        series: by record: seconds from the start, events that came a second, their average, workers that were asked
-            for, workers that ran.
-        sent, done: events.
-        oldest: seconds from sending to done, of the oldest.
-        late: records in which one was older than `LIMIT`.
-        bandwidth: largest of a record, bytes a second of the mission's time.
+        series: for each record: seconds from the start, events received per second, their average, requested workers,
+            running workers.
+        sent, done: number of events.
+        oldest: largest age of an event when it was done, seconds.
+        late: number of records with an event older than `MAX_AGE_S`.
+        bandwidth: largest bandwidth of a record, bytes per second.
     """
 
     series: list[tuple[float, float, float, int, int]]
@@ -80,7 +79,7 @@ class Outcome:
     bandwidth: float
 
     def result(self) -> dict[str, Any]:
-        """For RESULT."""
+        """Values for RESULT."""
         return {
             "workers_max": max(one[3] for one in self.series),
             "oldest_event_s": round(self.oldest, 2),
@@ -90,11 +89,11 @@ class Outcome:
 
 
 def replay(replays: Sequence[Replay], folder: Path, domain: int = 60) -> list[Outcome]:
-    """Run some at once, each in a DDS domain of its own, and read what came of them."""
+    """Run replays at the same time, each in its own DDS domain, and return their outcomes."""
     runs = [_Run(one, folder / one.name, domain + number) for number, one in enumerate(replays)]
     try:
         for run in runs:
-            run.talk()
+            run.start_talkers()
         for run in runs:
             run.wait()
     finally:
@@ -104,48 +103,48 @@ def replay(replays: Sequence[Replay], folder: Path, domain: int = 60) -> list[Ou
 
 
 class _Run:
-    def __init__(self, told: Replay, folder: Path, domain: int) -> None:
-        self._told, self._folder, self._domain = told, folder, domain
+    def __init__(self, params: Replay, folder: Path, domain: int) -> None:
+        self._params, self._folder, self._domain = params, folder, domain
         folder.mkdir(parents=True, exist_ok=True)
         for name in ("scale.log", "work.log"):
             (folder / name).unlink(missing_ok=True)
-        speed = told.speed
+        speed = params.speed
         serve = shlex.join(worker.command(1 / (CAPACITY * speed)))
-        self._watching = [
+        self._monitors = [
             self._start("scale", "--capacity", CAPACITY * speed, "--delay", DELAY / speed, "--window", WINDOW / speed,
-                        "--cool-down", WINDOW / speed, "--min-workers", told.min_workers,
+                        "--cool-down", WINDOW / speed, "--min-workers", params.min_workers,
                         "--log", folder / "scale.log"),
             self._start("work", TOPIC, serve, "--period", PERIOD / speed, "--log", folder / "work.log"),
         ]  # fmt: skip
         self.sent = 0
         self._talkers: list[subprocess.Popen[bytes]] = []
 
-    def talk(self) -> None:
-        """Start the talkers, once all is ready to be told of."""
+    def start_talkers(self) -> None:
+        """Start the talkers once the scaling node publishes records."""
         while not self._states():
             time.sleep(0.2)
-        told, folder, speed = self._told, self._folder, self._told.speed
-        for group in range(told.cameras // GROUP):
+        params, folder, speed = self._params, self._folder, self._params.speed
+        for group in range(params.cameras // CAMERAS_PER_TALKER):
             data = folder / f"{group}.csv"
             self.sent += traffic_model.write(
-                TrafficParams(out=data, cameras=GROUP, from_hour=told.hours[0], to_hour=told.hours[1],
-                              seed=1000 * told.seed + group)
+                TrafficParams(out=data, cameras=CAMERAS_PER_TALKER, from_hour=params.hours[0], to_hour=params.hours[1],
+                              seed=1000 * params.seed + group)
             )  # fmt: skip
             self._talkers.append(
                 self._start("dataset-talker", TOPIC, data, "--name", f"cameras_{group}", "--speed", speed,
                             "--subscribers", 1, "--period", 1,
-                            *([] if told.real_sizes else ["--size-as-field"]))
+                            *([] if params.real_sizes else ["--size-as-field"]))
             )  # fmt: skip
 
     def _start(self, *arguments: Any) -> subprocess.Popen[bytes]:
-        kafka = ["--kafka", self._told.kafka] if self._told.kafka else []
+        kafka = ["--kafka", self._params.kafka] if self._params.kafka else []
         command = [sys.executable, "-m", "scan2sim.flows.cli", "monitor", *map(str, arguments), *kafka]
         environment = os.environ | {"ROS_DOMAIN_ID": str(self._domain), "PYTHONPATH": str(ROOT)}
         log = (self._folder / f"{arguments[0]}.err").open("ab")
         return subprocess.Popen(command, env=environment, stderr=log)
 
     def wait(self) -> None:
-        """Until all is sent and done, or nothing is done any more."""
+        """Wait until all events are done, or nothing happens any more."""
         for talker in self._talkers:
             talker.wait()
         done = -1
@@ -154,10 +153,10 @@ class _Run:
             time.sleep(2.0)
 
     def close(self) -> None:
-        """End all."""
-        for process in (*self._talkers, *self._watching):
+        """Terminate all processes."""
+        for process in (*self._talkers, *self._monitors):
             process.terminate()
-        for process in (*self._talkers, *self._watching):
+        for process in (*self._talkers, *self._monitors):
             try:
                 process.wait(20)
             except subprocess.TimeoutExpired:
@@ -170,7 +169,7 @@ class _Run:
             return []
 
     def outcome(self) -> Outcome:
-        states, speed = self._states(), self._told.speed
+        states, speed = self._states(), self._params.speed
         first = next(number for number, one in enumerate(states) if one["arrived"])
         began = states[first]["time"] - states[first]["seconds"]
         records = [json.loads(line) for line in (self._folder / "work.log").read_text(encoding="utf-8").splitlines()]
@@ -184,6 +183,6 @@ class _Run:
             sent=self.sent,
             done=sum(one["done"] for one in states),
             oldest=max(one["oldest_done"] for one in states) * speed,
-            late=sum(one["oldest_done"] * speed > LIMIT for one in states),
+            late=sum(one["oldest_done"] * speed > MAX_AGE_S for one in states),
             bandwidth=max(flow["bandwidth"] for flow in flows) / speed,
         )  # fmt: skip

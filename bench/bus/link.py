@@ -1,14 +1,13 @@
-"""What monitors tell, held against shaped links (part `link` of `bench.bus`): bandwidth, losses and latency.
+"""Bandwidth, loss and latency reported by monitors, compared with emulated links (part `link` of `bench.bus`).
 
-A watched node talks in one network namespace, a monitor watches the topic in another, and the link between them
-(`services.qos.emulated_link`) is as slow, late or lossy as is set. Wants root, nftables and what shapes links.
+A monitored node publishes in one network namespace, a monitor subscribes in another, and the link between them
+(`services.qos.emulated_link`) has a given rate, delay or loss. Requires root, nftables and a backend for links.
 
-- bandwidth: more is published than the link lets through. The truth is the rate that is set, times the share of
-  messages' own bytes in what came by the interface: the kernel counts both.
-- losses: each message is a packet of its own. The truth is the packets that left by the one interface and didn't come
-  by the other, as the kernel counts them.
-- latency: the truth is the delay that is set. What nodes take by themselves is told on a link that does nothing, and
-  taken away.
+- bandwidth: more is published than the link can carry. Truth: the configured rate, times the share of message bytes in
+  the traffic received by the interface, which the kernel counts.
+- loss: each message is one packet. Truth: packets sent by one interface minus packets received by the other, as counted
+  by the kernel.
+- latency: truth is the configured delay. The nodes' own latency is measured on a link without delay and subtracted.
 """
 
 from __future__ import annotations
@@ -30,157 +29,157 @@ from bench.bus.overhead import ROS_PYTHON
 from bench.paths import ROOT
 from scan2sim.services.qos.counters import Counter
 from scan2sim.services.qos.emulated_link import Link
-from scan2sim.services.qos.link_profile import Shape
+from scan2sim.services.qos.link_profile import LinkProfile
 from scan2sim.services.qos.namespaces import Namespace
 
 PYTHONS = {"cyclone": Path(sys.executable), "rclpy": ROS_PYTHON}
-SIZE = 1000
-"""Characters of a message, which makes one packet."""
-CDR = SIZE + 9
-"""Bytes of it: four of encapsulation, four of length, the text and what ends it."""
-PACKET = (SIZE, SIZE + 400)
-"""Bytes of a packet with a message, headers of UDP and RTPS included; no other packet is so long."""
-RATES = (1e6, 2e6, 8e6)
-"""Bits a second."""
-FLOOD, FLOODED = 2.0, 10.0
-"""How much more is published than the link's rate, and for how many seconds it is measured."""
-LOSSES = ((Shape(loss=0.01), 100.0), (Shape(loss=0.05), 40.0), (Shape(loss=0.05, burst=5), 40.0))
-"""And seconds of a thousand messages each."""
+MESSAGE_CHARS = 1000
+"""Characters of a message, which fits into one packet."""
+MESSAGE_BYTES = MESSAGE_CHARS + 9
+"""Size of a serialized message: 4 bytes of encapsulation, 4 of length, the text and its terminator."""
+PACKET_BYTES = (MESSAGE_CHARS, MESSAGE_CHARS + 400)
+"""Minimum and maximum size of a packet with a message, including UDP and RTPS headers; other packets are smaller."""
+LINK_RATES_BPS = (1e6, 2e6, 8e6)
+OVERLOAD, OVERLOAD_S = 2.0, 10.0
+"""Published rate as a multiple of the link's rate, and duration of the measurement."""
+LOSSES = ((LinkProfile(loss=0.01), 100.0), (LinkProfile(loss=0.05), 40.0), (LinkProfile(loss=0.05, burst=5), 40.0))
+"""Link profiles and durations in seconds, with a thousand messages per second."""
 DELAYS = ((0.005, False), (0.02, False), (0.1, False), (0.02, True))
-"""Seconds; and whether the ends take themselves for two machines."""
-AHEAD = {"cyclone": 0.5, "rclpy": 0.0}
-"""Seconds by which the other machine's clock is ahead; rclpy's messages are stamped below Python, where none can be."""
-DELAYED = 15.0
-"""Seconds that are measured."""
-PRIORITY = 10
-"""Of nodes: it is the link that is to be seen, not who else works here; the link's own is higher."""
-JOINS = 60.0
-"""Seconds within which nodes find each other."""
+"""Delays in seconds, and whether the ends act as two machines with separate clocks."""
+CLOCK_OFFSET_S = {"cyclone": 0.5, "rclpy": 0.0}
+"""Clock offset of the other machine; none for rclpy, which stamps messages in C++ code that can't be patched."""
+LATENCY_S = 15.0
+"""Duration of a latency measurement."""
+NODE_PRIORITY = 10
+"""Real-time priority of the nodes, so that other load doesn't affect them; below the link's own priority."""
+DISCOVERY_TIMEOUT_S = 60.0
+"""Seconds within which nodes must discover each other."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A setting, by the transport: what was set, what was to be found by it, what monitors told.
+    """Truth and measurement of one link, by transport.
 
     Attributes:
         what: bandwidth, loss or latency.
-        link: what the link did, in words.
-        truth, told: bytes a second, shares or seconds.
+        link: description of the link.
+        truth, measured: bytes per second, shares or seconds.
     """
 
     what: str
     transport: str
     link: str
     truth: float
-    told: float
+    measured: float
 
     @property
     def error(self) -> float:
-        """Share of the truth that it is off by."""
-        return abs(self.told / self.truth - 1)
+        """Relative error of the measurement."""
+        return abs(self.measured / self.truth - 1)
 
     def line(self) -> str:
-        """As a line of a table."""
-        truth, told = (f"{value:.6g}" for value in (self.truth, self.told))
-        return f"{self.what:<10} {self.transport:<8} {self.link:<48} {truth:>10} {told:>10} {self.error:>8.2%}"
+        """Row of a table."""
+        truth, measured = (f"{value:.6g}" for value in (self.truth, self.measured))
+        return f"{self.what:<10} {self.transport:<8} {self.link:<48} {truth:>10} {measured:>10} {self.error:>8.2%}"
 
 
-class Watch:
-    """A monitor on the far side, and what it tells of the topic."""
+class MonitorLog:
+    """Records of a monitor on the far side."""
 
     def __init__(self, log: Path, process: subprocess.Popen[Any]) -> None:
         self._log, self._process = log, process
         self.flows: list[dict[str, Any]] = []
 
     def read(self) -> None:
-        """Take what it told so far: flows, with the `time` and `period` of their records."""
+        """Read all flows written so far, with the `time` and `period` of their records."""
         lines = self._log.read_text(encoding="utf-8").splitlines(keepends=True) if self._log.exists() else []
         records = [json.loads(line) for line in lines if line.endswith("\n")]
         self.flows = [flow | {key: one[key] for key in ("time", "period")} for one in records for flow in one["flows"]]
 
-    def until(self, told: Callable[[dict[str, Any]], Any]) -> None:
-        """Wait until some record tells so."""
-        end = time.monotonic() + JOINS
-        while not any(map(told, self.flows)):
+    def wait_for(self, condition: Callable[[dict[str, Any]], Any]) -> None:
+        """Wait until some flow meets a condition."""
+        end = time.monotonic() + DISCOVERY_TIMEOUT_S
+        while not any(map(condition, self.flows)):
             if self._process.poll() is not None:
-                raise RuntimeError("the node that watches has ended")
+                raise RuntimeError("the monitor has ended")
             if time.monotonic() > end:
-                raise RuntimeError(f"nodes didn't find each other, or clocks, within {JOINS:g} s")
+                raise RuntimeError(f"nodes or clocks weren't synchronized within {DISCOVERY_TIMEOUT_S:g} s")
             time.sleep(0.1)
             self.read()
 
 
 @contextmanager
-def watched(link: Link, transport: str, interval: float, machines: bool = False) -> Iterator[Watch]:
-    """A talker on the near side, watched from the far one; afterwards all was told of what was sent."""
+def monitored(link: Link, transport: str, interval: float, machines: bool = False) -> Iterator[MonitorLog]:
+    """A talker on the near side and a monitor on the far side; at the end, records cover everything that was sent."""
     with tempfile.TemporaryDirectory() as name:
-        log = Path(name) / "watch.log"
-        listens = _started(link.far, transport, "watch", log, *(("--machine", "far") if machines else ()))
-        other = ("--machine", "near", "--ahead", AHEAD[transport]) if machines else ()
-        how = ("--size", SIZE, "--interval", interval)
-        talks = _started(link.near, transport, "talk", Path(name) / "talk.log", *how, *other)
-        watch = Watch(log, listens)
-        watch.until(lambda flow: flow["messages"])
-        yield watch
-        for process, rest in ((talks, 1.5), (listens, 0.0)):
+        path = Path(name) / "watch.log"
+        monitor = _start(link.far, transport, "watch", path, *(("--machine", "far") if machines else ()))
+        other = ("--machine", "near", "--ahead", CLOCK_OFFSET_S[transport]) if machines else ()
+        options = ("--size", MESSAGE_CHARS, "--interval", interval)
+        talker = _start(link.near, transport, "talk", Path(name) / "talk.log", *options, *other)
+        log = MonitorLog(path, monitor)
+        log.wait_for(lambda flow: flow["messages"])
+        yield log
+        for process, pause in ((talker, 1.5), (monitor, 0.0)):
             process.terminate()
-            process.wait(JOINS)
-            time.sleep(rest)
-        watch.read()
+            process.wait(DISCOVERY_TIMEOUT_S)
+            time.sleep(pause)
+        log.read()
 
 
-def _started(side: Namespace, transport: str, *arguments: object) -> subprocess.Popen[Any]:
-    told = {"SCAN2SIM_TRANSPORT": transport, "PYTHONPATH": str(ROOT)}
-    told |= {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}  # both ends have this machine's memory, and would share it
+def _start(side: Namespace, transport: str, *arguments: object) -> subprocess.Popen[Any]:
+    variables = {"SCAN2SIM_TRANSPORT": transport, "PYTHONPATH": str(ROOT)}
+    variables |= {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}  # both ends could use this machine's shared memory
     command = (PYTHONS[transport], "-m", "bench.bus.link_node", *arguments)
-    return side.popen(*command, priority=PRIORITY, env=os.environ | told, cwd=ROOT)
+    return side.popen(*command, priority=NODE_PRIORITY, env=os.environ | variables, cwd=ROOT)
 
 
 def bandwidth(transport: str, rate: float) -> Row:
-    """More is published than a rate lets through."""
-    with Link(Shape(rate=rate)) as link, watched(link, transport, CDR * 8 / (rate * FLOOD)) as watch:
+    """Publish more than a link's rate."""
+    interval = MESSAGE_BYTES * 8 / (rate * OVERLOAD)
+    with Link(LinkProfile(rate=rate)) as link, monitored(link, transport, interval) as log:
         time.sleep(2.0)
-        came = Counter(link.far, "input", *PACKET)
+        incoming = Counter(link.far, "input", *PACKET_BYTES)
         before, began = link.far.counts().received_bytes, time.time()
-        time.sleep(FLOODED)
-        through, packets, ended = link.far.counts().received_bytes - before, came.read().packets, time.time()
-    flows = [one for one in watch.flows if began + one["period"] <= one["time"] <= ended]
-    told = sum(one["bandwidth"] * one["period"] for one in flows) / sum(one["period"] for one in flows)
-    more = sum(one["published messages"] for one in flows) / sum(one["messages"] for one in flows)
-    did = 8 * through / (ended - began) / 1e6
-    done = f"{rate / 1e6:g} Mbit/s (did {did:.3f}), {more:.1f}x published"
-    return Row("bandwidth", transport, done, rate / 8 * CDR * packets / through, told)
+        time.sleep(OVERLOAD_S)
+        through, packets, ended = link.far.counts().received_bytes - before, incoming.read().packets, time.time()
+    flows = [one for one in log.flows if began + one["period"] <= one["time"] <= ended]
+    measured = sum(one["bandwidth"] * one["period"] for one in flows) / sum(one["period"] for one in flows)
+    overload = sum(one["published messages"] for one in flows) / sum(one["messages"] for one in flows)
+    actual = 8 * through / (ended - began) / 1e6
+    description = f"{rate / 1e6:g} Mbit/s (actual {actual:.3f}), {overload:.1f}x published"
+    return Row("bandwidth", transport, description, rate / 8 * MESSAGE_BYTES * packets / through, measured)
 
 
-def loss(transport: str, shape: Shape, seconds: float) -> Row:
-    """Each message is a packet; some are lost, once the nodes know each other: before, who watches expects none."""
-    with Link(Shape()) as link:
-        left, came = Counter(link.near, "output", *PACKET), Counter(link.far, "input", *PACKET)
-        with watched(link, transport, 0.001) as watch:
-            before = left.read().packets
-            link.shape(shape)
+def loss(transport: str, profile: LinkProfile, seconds: float) -> Row:
+    """Lose single packets, after discovery: before it, the monitor expects no messages."""
+    with Link(LinkProfile()) as link:
+        outgoing, incoming = Counter(link.near, "output", *PACKET_BYTES), Counter(link.far, "input", *PACKET_BYTES)
+        with monitored(link, transport, 0.001) as log:
+            before = outgoing.read().packets
+            link.shape(profile)
             time.sleep(seconds)
-        sent, lost = left.read().packets - before, left.read().packets - came.read().packets
-    told = sum(one["lost messages"] for one in watch.flows)
-    bursts = f", {shape.burst:g} in a row" if shape.burst > 1 else ""
-    return Row("loss", transport, f"{shape.loss:.0%}{bursts}, of {sent} messages", lost / sent, told / sent)
+        sent, lost = outgoing.read().packets - before, outgoing.read().packets - incoming.read().packets
+    measured = sum(one["lost messages"] for one in log.flows)
+    bursts = f", {profile.burst:g} in a row" if profile.burst > 1 else ""
+    return Row("loss", transport, f"{profile.loss:.0%}{bursts}, of {sent} messages", lost / sent, measured / sent)
 
 
 def latencies(transport: str) -> Iterator[Row]:
-    """Each delay; what nodes take by themselves is taken away."""
-    own = latency(transport, Shape(), machines=False)
+    """Latency for each delay, minus the nodes' own latency."""
+    own = latency(transport, LinkProfile(), machines=False)
     for delay, machines in DELAYS:
-        told = latency(transport, Shape(delay=delay), machines) - own
-        clocks = f", two clocks {AHEAD[transport]:g} s apart" if machines else ""
-        yield Row("latency", transport, f"{delay * 1e3:g} ms{clocks} (nodes: {own * 1e3:.2f} ms)", delay, told)
+        measured = latency(transport, LinkProfile(delay=delay), machines) - own
+        clocks = f", two clocks {CLOCK_OFFSET_S[transport]:g} s apart" if machines else ""
+        yield Row("latency", transport, f"{delay * 1e3:g} ms{clocks} (nodes: {own * 1e3:.2f} ms)", delay, measured)
 
 
-def latency(transport: str, shape: Shape, machines: bool) -> float:
-    """Median of what records tell, once it is known how far the clocks are off, seconds."""
-    with Link(shape) as link, watched(link, transport, 0.005, machines) as watch:
-        watch.until(_clock_known)
-        time.sleep(DELAYED)
-    return median(one["latency (nanoseconds)"] for one in watch.flows if one["messages"] and _clock_known(one)) / 1e9
+def latency(transport: str, profile: LinkProfile, machines: bool) -> float:
+    """Median of the reported latencies in seconds, once the clock offset is known."""
+    with Link(profile) as link, monitored(link, transport, 0.005, machines) as log:
+        log.wait_for(_clock_known)
+        time.sleep(LATENCY_S)
+    return median(one["latency (nanoseconds)"] for one in log.flows if one["messages"] and _clock_known(one)) / 1e9
 
 
 def _clock_known(flow: dict[str, Any]) -> bool:
@@ -188,7 +187,7 @@ def _clock_known(flow: dict[str, Any]) -> bool:
 
 
 def link() -> dict[str, float]:
-    """Worst errors of what monitors tell, by all transports that are here, as shares of the truth."""
+    """Largest relative errors of all available transports."""
     worst: dict[str, float] = {}
     for row in _rows():
         print(row.line(), flush=True)
@@ -200,12 +199,12 @@ def link() -> dict[str, float]:
 def _rows() -> Iterator[Row]:
     for transport, python in PYTHONS.items():
         if not python.exists():
-            print(f"{transport}: left out, there is no {python}")
+            print(f"{transport}: skipped, {python} doesn't exist")
             continue
-        for rate in RATES:
+        for rate in LINK_RATES_BPS:
             yield bandwidth(transport, rate)
-        for shape, seconds in LOSSES:
-            yield loss(transport, shape, seconds)
+        for profile, seconds in LOSSES:
+            yield loss(transport, profile, seconds)
         yield from latencies(transport)
 
 

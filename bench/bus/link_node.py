@@ -1,8 +1,8 @@
-"""A node at one end of a shaped link, for `bench.bus.link`: it talks, or watches, until it is asked to end.
+"""Node at one end of an emulated link, for `bench.bus.link`: publishes or monitors until it is terminated.
 
 `python -m bench.bus.link_node talk|watch LOG [--machine NAME] [--ahead SECONDS] [--size N] [--interval SECONDS]`: with
-`--machine` it takes itself for one on another machine, and asks for the time; with `--ahead` its clock goes wrong by so
-much (what reads the time otherwise than through Python isn't fooled: rclpy).
+`--machine` it acts as a node on another machine and synchronizes its clock; with `--ahead` its clock is offset (only as
+seen from Python: rclpy's own clock isn't affected).
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import time
 from pathlib import Path
 
 TOPIC = "/link"
-WINDOW = 100_000
-"""Latencies that a record's mean is of, at most: all."""
+WINDOW_SIZE = 100_000
+"""Number of latencies averaged by a record: all of them."""
 
 
 def main() -> None:
-    """Run it."""
+    """Run the node."""
     parser = argparse.ArgumentParser()
     parser.add_argument("role", choices=("talk", "watch"))
     parser.add_argument("log", type=Path)
@@ -31,8 +31,8 @@ def main() -> None:
     from scan2sim.services.monitoring.node import clock_sync
 
     if given.ahead:
-        right, ahead = time.time_ns, round(given.ahead * 1e9)
-        time.time_ns = lambda: right() + ahead
+        true_time, ahead = time.time_ns, round(given.ahead * 1e9)
+        time.time_ns = lambda: true_time() + ahead
     if given.machine:
         clock_sync.this_host = lambda: given.machine  # type: ignore[assignment]
     _spin(given)
@@ -44,16 +44,16 @@ def _spin(given: argparse.Namespace) -> None:
     from scan2sim.services.monitoring.node.topic_monitor import TopicMonitor
     from scan2sim.services.monitoring.settings.monitor import TalkerParams, TopicParams
 
-    asked: list[int] = []
+    signals: list[int] = []
     ros.init()
-    signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))  # after rclpy's own
+    signal.signal(signal.SIGTERM, lambda number, _: signals.append(number))  # after rclpy has set its handler
     if given.role == "talk":
         node = Talker(TalkerParams(topic=TOPIC, size=given.size, interval=given.interval, log_file=given.log))
     else:
         node = TopicMonitor(
-            TopicParams(topics=[TOPIC], type=STRING, best_effort=True, window_size=WINDOW, log_file=given.log)
+            TopicParams(topics=[TOPIC], type=STRING, best_effort=True, window_size=WINDOW_SIZE, log_file=given.log)
         )
-    while not asked:
+    while not signals:
         ros.spin_once(node, 0.1)
     node.destroy_node()
     ros.shutdown()

@@ -1,7 +1,7 @@
-"""A publisher or a subscriber for `bench.bus.overhead`, bare or watched: its figures as JSON, on one line.
+"""Publisher or subscriber for `bench.bus.overhead`, plain or monitored; prints its results as one line of JSON.
 
-`python -m bench.bus.overhead_node talk|hear bare|watched SIZE RATE COUNT`; the transport is SCAN2SIM_TRANSPORT's. Bare
-ones are rclpy's own node, or cyclonedds' own writer and reader of the same type.
+`python -m bench.bus.overhead_node talk|hear bare|watched SIZE RATE COUNT`; SCAN2SIM_TRANSPORT selects the transport.
+Plain nodes are those of rclpy, or a cyclonedds writer and reader of the same type.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from scan2sim.services.transport import QoS, load
 
 ros = load()
 TEXT, IMAGE = "std_msgs/msg/String", "sensor_msgs/msg/Image"
-TOPIC, QUEUE = "cost", 5
-WARM = 0.1
-"""Share of the messages that are left out at the beginning."""
+TOPIC, QUEUE_DEPTH = "cost", 5
+WARM_UP_SHARE = 0.1
+"""Share of the messages at the beginning that are ignored."""
 
 
 def main() -> None:
-    """Send or hear, and print the figures."""
+    """Publish or subscribe, and print the results."""
     role, kind = sys.argv[1], sys.argv[2]
     size, rate, count = int(sys.argv[3]), float(sys.argv[4]), int(sys.argv[5])
     ros.init()
-    told = (talk if role == "talk" else hear)(_node(role, kind), size, rate, count)
-    print(json.dumps(told), flush=True)
-    os._exit(0)  # what is measured is over
+    result = (talk if role == "talk" else hear)(_node(role, kind), size, rate, count)
+    print(json.dumps(result), flush=True)
+    os._exit(0)  # skip the slow shutdown
 
 
 def talk(node: Any, size: int, rate: float, count: int) -> dict[str, Any]:
-    """Send so many messages at a rate: CPU milliseconds a message."""
+    """Publish `count` messages at a rate; returns CPU milliseconds per message."""
     name = IMAGE if size > 100_000 else TEXT
-    publisher = node.create_publisher(ros.message_type(name), TOPIC, QUEUE)
+    publisher = node.create_publisher(ros.message_type(name), TOPIC, QUEUE_DEPTH)
     while publisher.get_subscription_count() < 1:
         time.sleep(0.05)
     time.sleep(1.0)
@@ -54,13 +54,13 @@ def talk(node: Any, size: int, rate: float, count: int) -> dict[str, Any]:
         rest = began + (number + 1) / rate - time.perf_counter()
         if rest > 0:
             time.sleep(rest)
-    told = {"cpu_ms": (time.process_time() - cpu) / count * 1e3}
+    result = {"cpu_ms": (time.process_time() - cpu) / count * 1e3}
     time.sleep(1.0)
-    return told
+    return result
 
 
 def hear(node: Any, size: int, rate: float, count: int) -> dict[str, Any]:
-    """Hear so many messages, or what comes of them: CPU milliseconds a message, latency, messages a second."""
+    """Receive up to `count` messages; returns CPU milliseconds per message, latency and messages per second."""
     latencies: list[int] = []
     times: list[float] = []
     cpu = 0.0
@@ -73,11 +73,11 @@ def hear(node: Any, size: int, rate: float, count: int) -> dict[str, Any]:
         if len(times) == 1:
             cpu = time.process_time()
 
-    node.create_subscription(ros.message_type(IMAGE if size > 100_000 else TEXT), TOPIC, take, QUEUE)
-    quiet = time.perf_counter() + 30
-    while len(times) < count and time.perf_counter() < (times[-1] + 2 if times else quiet):
+    node.create_subscription(ros.message_type(IMAGE if size > 100_000 else TEXT), TOPIC, take, QUEUE_DEPTH)
+    first_deadline = time.perf_counter() + 30
+    while len(times) < count and time.perf_counter() < (times[-1] + 2 if times else first_deadline):
         node.spin_bare(0.2) if hasattr(node, "spin_bare") else ros.spin_once(node, 0.2)
-    warm = int(WARM * len(times))
+    warm = int(WARM_UP_SHARE * len(times))
     return {
         "cpu_ms": (time.process_time() - cpu) / len(times) * 1e3,
         "p50_ms": median(latencies[warm:]) / 1e6,
@@ -95,22 +95,22 @@ def _node(role: str, kind: str) -> Any:
         import rclpy
 
         node = rclpy.create_node(role)
-        node.own_executor = None  # as `spin_once` wants it
+        node.own_executor = None  # required by `spin_once`
         return node
-    return _Bare()
+    return _PlainNode()
 
 
-class _Bare:
-    """cyclonedds' own writer and reader."""
+class _PlainNode:
+    """A cyclonedds writer or reader without monitoring."""
 
     def __init__(self) -> None:
         from cyclonedds.domain import Domain, DomainParticipant
 
-        from scan2sim.services.transport.cyclone import SETTINGS
+        from scan2sim.services.transport.cyclone import DOMAIN_CONFIG
 
         ros.shutdown()
         domain = int(os.environ.get("ROS_DOMAIN_ID") or 0)
-        self._domain = Domain(domain, SETTINGS.strip())
+        self._domain = Domain(domain, DOMAIN_CONFIG.strip())
         self._participant = DomainParticipant(domain)
 
     def _topic(self, message_type: Any) -> Any:

@@ -1,7 +1,7 @@
-"""What takes exports in: a file a consumer, found by name, run by `bench.gate`.
+"""Consumers of exports: one module per program, found by name and run by `bench.gate`.
 
-Each module has `FORMAT`, the format that it reads; `missing()`, why it can't run here, or an empty text; and
-`check(export, places)`, which gives figures, or raises `Fault` with the first thing that it finds wrong.
+Each module has `FORMAT`, the format that it reads; `missing()`, the reason why it can't run here, or an empty text; and
+`check(export, reference)`, which returns metrics or raises `Fault` for the first error.
 """
 
 from __future__ import annotations
@@ -10,37 +10,37 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 
 
 class Fault(Exception):
-    """A consumer refuses an export, or what happens in it is wrong.
+    """A consumer rejects an export, or behaves wrongly with it.
 
     Args:
-        text: what.
-        figures: that were measured all the same.
+        text: description.
+        metrics: metrics measured nevertheless.
     """
 
-    def __init__(self, text: str, figures: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, text: str, metrics: Mapping[str, Any] | None = None) -> None:
         super().__init__(text)
-        self.figures = dict(figures or {})
+        self.metrics = dict(metrics or {})
 
 
 class Consumer(Protocol):
-    """What a consumer's module has."""
+    """Interface of a consumer's module."""
 
     FORMAT: str
 
     def missing(self) -> str:
         """Why it can't run here, or an empty text."""
 
-    def check(self, export: Path, places: Places) -> dict[str, Any]:
-        """Figures of an exported world.
+    def check(self, export: Path, reference: WorldReference) -> dict[str, Any]:
+        """Check an exported world and return metrics.
 
         Args:
             export: folder of the world in the consumer's format.
-            places: what is known of the same world: where to drop things, ways to drive, photos.
+            reference: reference data of the world: drop points, routes, photos.
 
         Raises:
-            Fault: something is wrong.
+            Fault: the check failed.
         """

@@ -1,4 +1,4 @@
-"""What Blender makes of exported files: run as a program, or as a module of Python, in a process of its own."""
+"""Import of exported files into Blender, run as a program or as a Python module, in a separate process."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import Any
 
 from bench.consumers import Fault
 
-LIMIT = 900.0
-"""Seconds for all files."""
-APART = 0.01
-"""Metres by which corners of the box around all may be off."""
-SAID = "SAID "
+TIMEOUT_S = 900.0
+"""Time limit for all files."""
+MAX_BOX_ERROR_M = 0.01
+"""Maximum error of the corners of the bounding box."""
+OUTPUT_PREFIX = "SAID "
 SCRIPT = """
 import bpy, json, sys
 import mathutils
@@ -31,7 +31,7 @@ for file in FILES:
 shown = [o for o in bpy.context.scene.objects if o.type == "MESH" and o.data.materials]
 corners = [o.matrix_world @ mathutils.Vector(c) for o in shown for c in o.bound_box]
 images = [i for i in bpy.data.images if i.source == "FILE"]
-print({said!r} + json.dumps({{
+print({prefix!r} + json.dumps({{
     "objects": len(shown),
     "triangles": sum(len(o.data.polygons) for o in shown),
     "textures": sum(i.size[0] > 0 for i in images),
@@ -49,54 +49,54 @@ def module_missing() -> str:
 
 
 def module() -> tuple[str, ...]:
-    """The command that runs a script with Blender as a module."""
+    """Command that runs a script with Blender as a module."""
     return (sys.executable,)
 
 
 def check(command: Sequence[str], export: Path, files: Sequence[Path], suffix: str, double: int = 0) -> dict[str, Any]:
-    """Import files into one empty scene, and hold what is there against the export's own figures.
+    """Import files into one empty scene and compare it with the export's metadata.
 
     Args:
-        command: runs a script in Blender.
+        command: command that runs a script in Blender.
         export: folder of the export, with `metadata.json`.
-        files: to be imported.
-        suffix: of them, and of the files whose triangles `metadata.json` counts.
-        double: triangles that Blender leaves out.
+        files: files to import.
+        suffix: their suffix, also of the files whose triangles `metadata.json` counts.
+        double: number of duplicate triangles, which Blender drops.
 
     Raises:
-        Fault: triangles, textures or coordinates are missing, or they lie elsewhere.
+        Fault: triangles or textures are missing, or coordinates are wrong.
     """
     about = json.loads((export / "metadata.json").read_text(encoding="utf-8"))
     wanted = sum(count for file, count in about["triangles_by_file"].items() if file.endswith(suffix)) - double
     found = _imported(command, files, suffix)
-    figures = {name: found[name] for name in ("objects", "triangles", "textures")}
+    metrics = {name: found[name] for name in ("objects", "triangles", "textures")}
     if found["triangles"] != wanted:
-        raise Fault(f"{found['triangles']} triangles of {wanted}", figures)
+        raise Fault(f"{found['triangles']} triangles of {wanted}", metrics)
     if found["missing"] or found["untextured"]:
-        raise Fault(f"without texture: {(found['missing'] + found['untextured'])[0]}", figures)
-    if suffix != ".dae":  # models stand where the SDF puts them
+        raise Fault(f"without texture: {(found['missing'] + found['untextured'])[0]}", metrics)
+    if suffix != ".dae":  # the SDF, not the DAE, positions models
         low, high = _box(about)
         far = max(abs(a - b) for a, b in zip([*low, *high], [*found["low"], *found["high"]], strict=True))
-        if far > APART:
-            raise Fault(f"its box is {far:.3f} m off", figures)
-        figures["box_off_m"] = round(far, 4)
-    return figures
+        if far > MAX_BOX_ERROR_M:
+            raise Fault(f"its bounding box is {far:.3f} m off", metrics)
+        metrics["box_off_m"] = round(far, 4)
+    return metrics
 
 
 def _imported(command: Sequence[str], files: Sequence[Path], suffix: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as place:
-        script = Path(place) / "look.py"
+        script = Path(place) / "import.py"
         names = json.dumps([str(file.resolve()) for file in files])
-        script.write_text(SCRIPT.format(files=names, suffix=suffix, said=SAID), encoding="utf-8")
-        done = subprocess.run([*command, str(script)], capture_output=True, text=True, timeout=LIMIT)
-    said = [line for line in done.stdout.splitlines() if line.startswith(SAID)]
-    if done.returncode or not said:
+        script.write_text(SCRIPT.format(files=names, suffix=suffix, prefix=OUTPUT_PREFIX), encoding="utf-8")
+        done = subprocess.run([*command, str(script)], capture_output=True, text=True, timeout=TIMEOUT_S)
+    output = [line for line in done.stdout.splitlines() if line.startswith(OUTPUT_PREFIX)]
+    if done.returncode or not output:
         raise Fault(f"Blender fails: {(done.stderr or done.stdout).strip().splitlines()[-1:]}")
-    return dict(json.loads(said[0].removeprefix(SAID)))
+    return dict(json.loads(output[0].removeprefix(OUTPUT_PREFIX)))
 
 
 def _box(about: dict[str, Any]) -> tuple[list[float], list[float]]:
-    """Corners of the world by its `metadata.json`, metres from its origin."""
+    """Corners of the world's bounding box from its `metadata.json`, metres from its origin."""
     parts = []
     if "tiles" in about:
         for tile in about["tiles"].values():

@@ -1,4 +1,4 @@
-"""Debian's Blender (3.4; later ones read no Collada): it imports every DAE, all triangles and textures among them."""
+"""Debian's Blender (3.4; later versions don't read Collada) imports every DAE with all triangles and textures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bench.consumers import blender
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 
 FORMAT = "gazebo"
 PROGRAM = ("blender", "--background", "--factory-startup", "--python-exit-code", "1", "--python")
@@ -20,14 +20,14 @@ def missing() -> str:
     return "" if shutil.which("blender") else "Blender isn't installed (apt-get install blender)"
 
 
-def check(export: Path, places: Places) -> dict[str, Any]:
-    """Import, and count what is there."""
+def check(export: Path, reference: WorldReference) -> dict[str, Any]:
+    """Import all files and count objects, triangles and textures."""
     files = sorted(export.rglob("*.dae"))
     return blender.check(PROGRAM, export, files, ".dae", sum(map(_double, files)))
 
 
 def _double(path: Path) -> int:
-    """Triangles on the same three vertices as another one: Blender has but one of them, whichever way it faces."""
+    """Number of triangles with the same three vertices as another one; Blender keeps one of them, whatever its side."""
     import collada
 
     parts = [part.vertex_index for shape in collada.Collada(str(path)).geometries for part in shape.primitives]

@@ -1,4 +1,4 @@
-"""Blender as a module (PyPI's bpy): it imports the OpenUSD stage, all triangles and textures among them."""
+"""Blender as a module (PyPI's bpy) imports the OpenUSD stage with all triangles and textures."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.consumers import blender
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 
 FORMAT = "usd"
 
@@ -16,6 +16,6 @@ def missing() -> str:
     return blender.module_missing()
 
 
-def check(export: Path, places: Places) -> dict[str, Any]:
-    """Import, and count what is there."""
+def check(export: Path, reference: WorldReference) -> dict[str, Any]:
+    """Import the stage and count objects, triangles and textures."""
     return blender.check(blender.module(), export, sorted(export.glob("*.usdc")), ".usdc")

@@ -1,7 +1,7 @@
-"""CARLA's own reader of OpenDRIVE, without its server: `carla.Map`, asked for the lanes along the way that one drives.
+"""CARLA's OpenDRIVE parser without its server: `carla.Map` is queried for lanes along the route.
 
-Where it isn't told which way lanes go they are "bidirectional": CARLA knows such lanes, but has no traffic on them
-(`driving`: its waypoints a metre apart, which are of driving lanes alone).
+Lanes whose direction isn't known are "bidirectional": CARLA knows such lanes, but has no traffic on them (`driving`:
+number of waypoints a metre apart, which exist for driving lanes only).
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from bench.consumers import Fault
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 
 FORMAT = "opendrive"
-EVERY = 2
-"""Every so many places of the way are asked for."""
-HEIGHT = 0.1
-"""Metres between a lane and the cloud's surface, p95."""
+ROUTE_STRIDE = 2
+"""Every Nth point of the route is checked."""
+MAX_HEIGHT_ERROR_M = 0.1
+"""Maximum distance between a lane and the cloud's surface, p95."""
 
 
 def missing() -> str:
@@ -27,8 +27,8 @@ def missing() -> str:
     return "" if importlib.util.find_spec("carla") else "CARLA's library isn't installed (pip install carla)"
 
 
-def check(export: Path, places: Places) -> dict[str, Any]:
-    """Wherever one drives there is a lane, whose middle lies on the road, at its height."""
+def check(export: Path, reference: WorldReference) -> dict[str, Any]:
+    """Check that there is a lane everywhere along the route, centred on the road and at its height."""
     import carla
 
     (path,) = export.glob("*.xodr")
@@ -37,22 +37,27 @@ def check(export: Path, places: Places) -> dict[str, Any]:
     except RuntimeError as why:
         raise Fault(str(why)) from None
     kinds = carla.LaneType.Driving, carla.LaneType.Bidirectional
-    asked = [carla.Location(x, -y, z) for x, y, z in places.ways[0][::EVERY].tolist()]  # CARLA is left-handed
+    asked = [carla.Location(x, -y, z) for x, y, z in reference.ways[0][::ROUTE_STRIDE].tolist()]  # CARLA is left-handed
     lanes = [[roads.get_waypoint(at, project_to_road=False, lane_type=kind) for kind in kinds] for at in asked]
     found = [next(filter(None, of_place), None) for of_place in lanes]
     at = [waypoint.transform.location for waypoint in found if waypoint]
     xyz = np.array([(one.x, -one.y, one.z) for one in at]).reshape(-1, 3)
-    heights = places.heights(xyz[:, :2])
+    heights = reference.heights(xyz[:, :2])
     seen = np.isfinite(heights)
-    figures: dict[str, Any] = {
+    metrics: dict[str, Any] = {
         "places": len(asked),
         "without_lane": found.count(None),
         "driving": len(roads.generate_waypoints(1.0)),
-        "beside_road": int(np.sum(~places.on_road(xyz[seen, :2]))),
+        "beside_road": int(np.sum(~reference.on_road(xyz[seen, :2]))),
         "height_p95_m": round(float(np.percentile(np.abs(xyz[seen, 2] - heights[seen]), 95)), 3)
         if seen.any()
         else None,
     }
-    if figures["without_lane"] or figures["beside_road"] or not seen.any() or figures["height_p95_m"] > HEIGHT:
-        raise Fault("its lanes aren't where the road is", figures)
-    return figures
+    if (
+        metrics["without_lane"]
+        or metrics["beside_road"]
+        or not seen.any()
+        or metrics["height_p95_m"] > MAX_HEIGHT_ERROR_M
+    ):
+        raise Fault("its lanes don't match the road", metrics)
+    return metrics

@@ -1,6 +1,6 @@
-"""Drake's SDF parser, strict: an element that it doesn't know, or a file that isn't there, is an error.
+"""Drake's SDF parser in strict mode: unknown elements and missing files are errors.
 
-What only Gazebo has a use for (`GAZEBOS`) is taken out of a copy first: valid SDF that Drake has nothing for.
+Elements used only by Gazebo (`GAZEBO_ELEMENTS`) are removed from a copy first; they are valid SDF that Drake ignores.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from bench.consumers import Fault
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 
 FORMAT = "gazebo"
-GAZEBOS = ("plugin", "sensor", "cast_shadows")
+GAZEBO_ELEMENTS = ("plugin", "sensor", "cast_shadows")
 
 
 def missing() -> str:
@@ -24,8 +24,8 @@ def missing() -> str:
     return "" if importlib.util.find_spec("pydrake") else "pydrake isn't installed (pip install drake)"
 
 
-def check(export: Path, places: Places) -> dict[str, Any]:
-    """Parse every model with warnings as errors, its meshes among them."""
+def check(export: Path, reference: WorldReference) -> dict[str, Any]:
+    """Parse every model, including its meshes, with warnings as errors."""
     from pydrake.multibody.parsing import Parser
     from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
     from pydrake.systems.framework import DiagramBuilder
@@ -48,10 +48,10 @@ def check(export: Path, places: Places) -> dict[str, Any]:
 
 
 def _strip(path: Path) -> None:
-    """Write an SDF without what only Gazebo has a use for, in place of its link."""
+    """Replace a linked SDF by a copy without elements used only by Gazebo."""
     tree = ET.parse(path)
     for parent in tree.iter():
-        for child in [one for one in parent if one.tag in GAZEBOS]:
+        for child in [one for one in parent if one.tag in GAZEBO_ELEMENTS]:
             parent.remove(child)
     path.unlink()
     tree.write(path)

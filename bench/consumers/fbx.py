@@ -1,4 +1,4 @@
-"""assimp, on CARLA's package: every FBX is whole and textured, and the road's meshes are where the road is."""
+"""assimp, on CARLA's package: every FBX is complete and textured, and the road's meshes cover the road."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from bench.consumers import Fault
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 from scan2sim.pipeline.camera.renderer import Body, Renderer
 from scan2sim.pipeline.core.types import F64, Frame, Mesh
 from tests.pipeline.io import scene_readers
 
 FORMAT = "carla"
 ROAD = "_Road_Road_"
-NEAR = 0.1
-"""Metres from a place on the road to the road's mesh."""
+MAX_ROAD_DISTANCE_M = 0.1
+"""Maximum distance from a point on the road to the road's mesh."""
 
 
 def missing() -> str:
@@ -26,28 +26,28 @@ def missing() -> str:
     return "" if importlib.util.find_spec("assimp_py") else "assimp isn't installed (pip install assimp-py)"
 
 
-def check(export: Path, places: Places) -> dict[str, Any]:
-    """Read all files; see the module."""
+def check(export: Path, reference: WorldReference) -> dict[str, Any]:
+    """Read all files, see the module's docstring."""
     counts = json.loads((export / "metadata.json").read_text(encoding="utf-8"))["triangles_by_file"]
     read = {file: list(scene_readers.fbx(export / file)) for file in counts if file.endswith(".fbx")}
     road = []
     for file, meshes in read.items():
         if sum(len(corners) for _, corners, *_ in meshes) != counts[file]:
-            raise Fault(f"{file} has lost triangles: there are to be {counts[file]}")
+            raise Fault(f"{file} has lost triangles: {counts[file]} expected")
         for name, corners, _, picture in meshes:
             if not picture.is_file():
-                raise Fault(f"{file}: there is no {picture.name}")
+                raise Fault(f"{file}: texture {picture.name} is missing")
             if ROAD in name:
                 road.append(Body(_mesh(corners)))
-    nearest, _ = Renderer(road).nearest_places(places.road.astype(np.float32))
-    away = np.linalg.norm(nearest - places.road, axis=1)
-    figures = {"files": len(read), "road_meshes": len(road), "off_road": int((~(away < NEAR)).sum())}
-    if figures["off_road"]:
-        raise Fault("places on the road have no mesh of a road", figures)
-    return figures
+    nearest, _ = Renderer(road).closest_points(reference.road.astype(np.float32))
+    away = np.linalg.norm(nearest - reference.road, axis=1)
+    metrics = {"files": len(read), "road_meshes": len(road), "off_road": int((~(away < MAX_ROAD_DISTANCE_M)).sum())}
+    if metrics["off_road"]:
+        raise Fault("the road's meshes don't cover the road", metrics)
+    return metrics
 
 
 def _mesh(corners: F64) -> Mesh:
-    """Triangles (F, 3, 3) that share no vertex."""
+    """Triangles (F, 3, 3) without shared vertices, as a mesh."""
     index = np.arange(3 * len(corners), dtype=np.int32)
     return Mesh(Frame(), corners.reshape(-1, 3).astype(np.float32), index.reshape(-1, 3))

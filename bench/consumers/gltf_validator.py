@@ -1,4 +1,4 @@
-"""Khronos' glTF validator (npm): every GLB without an error or a warning."""
+"""Khronos' glTF validator (npm): no errors or warnings in any GLB."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.consumers import Fault
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 from tests.cesium import node_module
 
 FORMAT = "glb"
@@ -27,7 +27,7 @@ def missing() -> str:
     return "" if node_module(NAME) else f"{NAME} isn't installed (npm install -g {NAME})"
 
 
-def check(export: Path, places: Places) -> dict[str, Any]:
+def check(export: Path, reference: WorldReference) -> dict[str, Any]:
     """Validate all GLBs."""
     files = sorted(export.glob("*.glb"))
     for path in files:
@@ -38,7 +38,7 @@ def check(export: Path, places: Places) -> dict[str, Any]:
 
 
 def issues(path: Path) -> dict[str, Any]:
-    """What the validator says of a GLB: `numErrors`, `numWarnings`, `messages`."""
+    """Issues found in a GLB: `numErrors`, `numWarnings`, `messages`."""
     command = ["node", "-e", VALIDATE, str(node_module(NAME)), str(path)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return dict(json.loads(done.stdout))

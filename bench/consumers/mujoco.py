@@ -1,4 +1,4 @@
-"""MuJoCo: balls fall, the robot is driven along the road, a picture is taken from a photo's pose (EGL or OSMesa)."""
+"""MuJoCo (EGL or OSMesa): balls are dropped, the robot is driven along the road, a photo's view is rendered."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 
 from bench.gate import drive, drops, renderings
 from bench.gate.drive import Pose
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 from bench.gate.renderings import Photo
 from scan2sim.pipeline.core.types import U8
 from scan2sim.pipeline.simulation.robot import ROBOT
 
 FORMAT = "mujoco"
-REST = 2.5
+SETTLE_S = 2.5
 """Seconds until balls rest."""
 os.environ.setdefault("MUJOCO_GL", "egl")
 
@@ -31,37 +31,37 @@ def missing() -> str:
     try:
         mujoco.GLContext(8, 8).free()
     except Exception as why:  # whatever the driver raises
-        return f"MuJoCo can't draw here ({why}): see MUJOCO_GL in its manual"
+        return f"MuJoCo can't render here ({why}): see MUJOCO_GL in its manual"
     return ""
 
 
-def check(export: Path, places: Places) -> dict[str, Any]:
-    """Load the world; see the module."""
+def check(export: Path, reference: WorldReference) -> dict[str, Any]:
+    """Load the world, see the module's docstring."""
     (world,) = (path for path in export.glob("*.xml") if path.stem != ROBOT.name)
-    engine = _Engine(world, places)
-    figures = drops.told(drops.gaps(engine.fallen(), places))
-    figures |= drive.drive(engine, places)
-    seen = renderings.photo(places)
-    return figures | renderings.compare(export, "mujoco", seen, *engine.picture(seen))
+    engine = _Engine(world, reference)
+    metrics = drops.rest_metrics(drops.rest_gaps(engine.fallen(), reference))
+    metrics |= drive.drive(engine, reference)
+    seen = renderings.photo(reference)
+    return metrics | renderings.compare(export, "mujoco", seen, *engine.picture(seen))
 
 
 class _Engine:
-    """The world with balls above its road, and a camera to be placed."""
+    """The world with balls above its road, and a camera at the photo's pose."""
 
-    def __init__(self, world: Path, places: Places) -> None:
+    def __init__(self, world: Path, reference: WorldReference) -> None:
         import mujoco
 
         self._mj = mujoco
         spec = mujoco.MjSpec.from_file(str(world))
-        self._balls = len(drops.starts(places))
-        for i, place in enumerate(drops.starts(places)):
+        self._balls = len(drops.start_positions(reference))
+        for i, place in enumerate(drops.start_positions(reference)):
             ball = spec.worldbody.add_body(name=f"ball{i}", pos=place)
             ball.add_freejoint()
             ball.add_geom(
-                name=f"ball{i}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[drops.BALL, 0, 0], mass=1, condim=6,
+                name=f"ball{i}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[drops.BALL_RADIUS_M, 0, 0], mass=1, condim=6,
                 friction=[0.9, 0.01, 0.01],
             )  # fmt: skip
-        seen = renderings.photo(places)
+        seen = renderings.photo(reference)
         own = seen.camera
         spec.worldbody.add_camera(
             name="photo", pos=seen.pose[:3, 3], quat=_quaternion(seen.pose[:3, :3] * [1, -1, -1]),
@@ -74,26 +74,26 @@ class _Engine:
         mujoco.mj_forward(self._model, self._data)
 
     def fallen(self) -> Any:
-        """(N, 3) where balls rest; nothing holds them any more then."""
-        self._step(REST)
+        """(N, 3) positions of the balls at rest; afterwards they no longer collide."""
+        self._step(SETTLE_S)
         rests = np.array([self._data.body(f"ball{i}").xpos.copy() for i in range(self._balls)])
         for i in range(self._balls):
             self._model.geom(f"ball{i}").contype = self._model.geom(f"ball{i}").conaffinity = 0
         return rests
 
     def pose(self) -> Pose:
-        """Where the robot is."""
+        """Pose of the robot."""
         body = self._data.body(ROBOT.name)
         return Pose(body.xpos.copy(), body.xmat.reshape(3, 3).copy())
 
     def turn(self, left: float, right: float, seconds: float) -> None:
-        """Have the wheels turn so fast for a time."""
+        """Turn the wheels at the given velocities for some time."""
         for wheel, speed in zip(ROBOT.wheels, (left, right), strict=True):
             self._data.actuator(wheel.name).ctrl[:] = speed
         self._step(seconds)
 
     def picture(self, seen: Photo) -> tuple[U8, Any]:
-        """What a camera sees from a photo's pose, and where it sees anything."""
+        """Image from the photo's pose, and mask of the pixels that show the world."""
         with self._mj.Renderer(self._model, seen.camera.height, seen.camera.width) as renderer:
             renderer.update_scene(self._data, "photo")
             taken = renderer.render().copy()
@@ -106,7 +106,7 @@ class _Engine:
 
 
 def _quaternion(rotation: Any) -> Any:
-    """w, x, y, z."""
+    """Quaternion w, x, y, z."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(rotation).as_quat(scalar_first=True)

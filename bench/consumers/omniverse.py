@@ -1,6 +1,6 @@
-"""NVIDIA's asset validator of Omniverse, which Isaac Sim's users are pointed to: warnings don't count.
+"""NVIDIA's Omniverse asset validator, recommended for Isaac Sim; warnings are counted only.
 
-It warns of what scans are like, such as edges of more than two faces.
+It warns about typical properties of scans, such as non-manifold edges.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.consumers import Fault
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 
 FORMAT = "usd"
 FAILED = ("ERROR", "FAILURE")
@@ -23,13 +23,13 @@ def missing() -> str:
     return "the asset validator isn't installed (pip install omniverse-asset-validator)"
 
 
-def check(export: Path, places: Places) -> dict[str, Any]:
-    """Validate the stage by its default rules."""
+def check(export: Path, reference: WorldReference) -> dict[str, Any]:
+    """Validate the stage with the default rules."""
     (stage,) = export.glob("*.usdc")
     issues = found(stage)
     failed = [text for severity, text in issues if severity in FAILED]
     if failed:
-        raise Fault(f"{len(failed)}, the first: {failed[0]}")
+        raise Fault(f"{len(failed)} issues, the first: {failed[0]}")
     return {"warnings": len(issues)}
 
 

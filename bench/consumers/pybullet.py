@@ -1,4 +1,4 @@
-"""PyBullet: balls fall, the robot is driven along the road, a picture is taken from a photo's pose (TinyRenderer)."""
+"""PyBullet: balls are dropped, the robot is driven along the road, an image is rendered from a photo's pose."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import numpy as np
 
 from bench.gate import drive, drops, renderings
 from bench.gate.drive import Pose
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 from bench.gate.renderings import Photo
 from scan2sim.pipeline.core.types import F64, U8
 from scan2sim.pipeline.simulation.robot import ROBOT
 
 FORMAT = "urdf"
-STEP = 1 / 240
-REST = 2.5
+TIME_STEP_S = 1 / 240
+SETTLE_S = 2.5
 """Seconds until balls rest."""
-NEAR, FAR = 0.1, 300.0
-"""Metres that its camera sees."""
+NEAR_PLANE_M, FAR_PLANE_M = 0.1, 300.0
+"""Clipping planes of its camera."""
 
 
 def missing() -> str:
@@ -29,23 +29,23 @@ def missing() -> str:
     return "" if importlib.util.find_spec("pybullet") else "pybullet isn't installed (pip install pybullet)"
 
 
-def check(export: Path, places: Places) -> dict[str, Any]:
-    """Load the world; see the module."""
+def check(export: Path, reference: WorldReference) -> dict[str, Any]:
+    """Load the world, see the module's docstring."""
     import pybullet
 
     client = pybullet.connect(pybullet.DIRECT)
     try:
         engine = _Engine(export)
-        figures = drops.told(drops.gaps(engine.fallen(drops.starts(places)), places))
-        figures |= drive.drive(engine, places)
-        seen = renderings.photo(places)
-        return figures | renderings.compare(export, "pybullet", seen, *engine.picture(seen))
+        metrics = drops.rest_metrics(drops.rest_gaps(engine.fallen(drops.start_positions(reference)), reference))
+        metrics |= drive.drive(engine, reference)
+        seen = renderings.photo(reference)
+        return metrics | renderings.compare(export, "pybullet", seen, *engine.picture(seen))
     finally:
         pybullet.disconnect(client)
 
 
 class _Engine:
-    """The world and the robot, by the export's own files."""
+    """The world and the robot, loaded from the export's files."""
 
     def __init__(self, export: Path) -> None:
         import pybullet
@@ -60,26 +60,26 @@ class _Engine:
         joints = range(pybullet.getNumJoints(self._robot))
         self._joints = {pybullet.getJointInfo(self._robot, i)[1].decode(): i for i in joints}
 
-    def fallen(self, starts: F64) -> F64:
-        """(N, 3) where balls rest; they are taken away then."""
-        shape = self._p.createCollisionShape(self._p.GEOM_SPHERE, radius=drops.BALL)
-        balls = [self._p.createMultiBody(1, shape, basePosition=place) for place in starts.tolist()]
+    def fallen(self, start_positions: F64) -> F64:
+        """(N, 3) positions of the balls at rest; afterwards they are removed."""
+        shape = self._p.createCollisionShape(self._p.GEOM_SPHERE, radius=drops.BALL_RADIUS_M)
+        balls = [self._p.createMultiBody(1, shape, basePosition=place) for place in start_positions.tolist()]
         for ball in balls:
             self._p.changeDynamics(ball, -1, rollingFriction=0.01, spinningFriction=0.01)
-        self._step(REST)
+        self._step(SETTLE_S)
         rests = np.array([self._p.getBasePositionAndOrientation(ball)[0] for ball in balls])
         for ball in balls:
             self._p.removeBody(ball)
         return rests
 
     def pose(self) -> Pose:
-        """Where the robot is: PyBullet tells of the middle of its body's mass."""
+        """Pose of the robot; PyBullet reports the centre of mass of its base."""
         place, quaternion = self._p.getBasePositionAndOrientation(self._robot)
         rotation = np.reshape(self._p.getMatrixFromQuaternion(quaternion), (3, 3))
         return Pose(np.asarray(place) - rotation @ ROBOT.base.place, rotation)
 
     def turn(self, left: float, right: float, seconds: float) -> None:
-        """Have the wheels turn so fast for a time."""
+        """Turn the wheels at the given velocities for some time."""
         for wheel, speed in zip(ROBOT.wheels, (left, right), strict=True):
             joint = self._joints[f"{wheel.name}_joint"]
             kind = self._p.VELOCITY_CONTROL
@@ -87,11 +87,13 @@ class _Engine:
         self._step(seconds)
 
     def picture(self, seen: Photo) -> tuple[U8, Any]:
-        """What a camera sees from a photo's pose, and where it sees anything."""
+        """Image from the photo's pose, and mask of the pixels that show the world."""
         own = seen.camera
         left, top = -(own.cx + 0.5) / own.fx, (own.cy + 0.5) / own.fy
         right, bottom = left + own.width / own.fx, top - own.height / own.fy
-        lens = self._p.computeProjectionMatrix(*(NEAR * side for side in (left, right, bottom, top)), NEAR, FAR)
+        lens = self._p.computeProjectionMatrix(
+            *(NEAR_PLANE_M * side for side in (left, right, bottom, top)), NEAR_PLANE_M, FAR_PLANE_M
+        )
         centre, rotation = seen.pose[:3, 3], seen.pose[:3, :3]
         view = self._p.computeViewMatrix(centre, centre + rotation[:, 2], -rotation[:, 1])
         taken = self._p.getCameraImage(
@@ -102,5 +104,5 @@ class _Engine:
         return rgb, np.reshape(taken[4], (own.height, own.width)) >= 0
 
     def _step(self, seconds: float) -> None:
-        for _ in range(round(seconds / STEP)):
+        for _ in range(round(seconds / TIME_STEP_S)):
             self._p.stepSimulation()

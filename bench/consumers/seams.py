@@ -1,4 +1,4 @@
-"""Seams of 3D Tiles: how wide a crack opens at most where two tiles stand side by side, whatever levels they are at."""
+"""Seams of 3D Tiles: maximum width of cracks between neighbouring tiles at any combination of levels of detail."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from typing import Any
 import numpy as np
 
 from bench.consumers import Fault
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 from scan2sim.pipeline.camera.renderer import Body, Renderer
 from scan2sim.pipeline.core.types import F64, Frame, Mesh
 from scan2sim.pipeline.tiling.borders.boundary_curve import curve
 
 FORMAT = "tiles3d"
-SAME = 2e-3
-"""Metres within which two tiles' vertices are one."""
-WITHIN = 1e-3
-"""Metres that a crack may be wide."""
-ALONG = 5
-"""Places on each edge of a border."""
+VERTEX_TOLERANCE_M = 2e-3
+"""Distance within which vertices of two tiles are the same."""
+MAX_CRACK_M = 1e-3
+"""Maximum width of a crack."""
+SAMPLES_PER_EDGE = 5
+"""Number of samples on each edge of a border."""
 
 
 @dataclass(frozen=True)
-class Shown:
-    """A tile of the tileset.
+class TileContent:
+    """Content of a tile of the tileset.
 
     Attributes:
-        tiles: names of the finest tiles that it stands for.
-        finer: whether there are any.
-        mesh: all that it shows, metres around a tile's origin.
+        tiles: names of the finest tiles that it covers.
+        finer: whether there are finer levels.
+        mesh: its mesh, metres in the frame of a tile.
     """
 
     tiles: frozenset[str]
@@ -42,12 +42,12 @@ class Shown:
 
 
 def missing() -> str:
-    """It needs nothing."""
+    """It has no requirements."""
     return ""
 
 
-def check(export: Path, places: Places) -> dict[str, Any]:
-    """Measure all cracks that can open; see the module."""
+def check(export: Path, reference: WorldReference) -> dict[str, Any]:
+    """Measure all possible cracks, see the module's docstring."""
     root = json.loads((export / "tileset.json").read_text(encoding="utf-8"))["root"]
     start = np.eye(4) if "content" in root else np.asarray(np.linalg.inv(_place(root["children"][0])))
     shown = list(_shown(export, root, start))
@@ -58,28 +58,28 @@ def check(export: Path, places: Places) -> dict[str, Any]:
         edges = _shared(own_ends, other_ends)
         if len(edges):
             borders += float(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1).sum()) / 2
-            between = np.linspace(edges[:, 0], edges[:, 1], ALONG).reshape(-1, 3)
+            between = np.linspace(edges[:, 0], edges[:, 1], SAMPLES_PER_EDGE).reshape(-1, 3)
             worst = max([worst, *(_away(one.mesh, between) for one in shown if _beside(one, own, other))])
-    figures = {
+    metrics = {
         "tiles": len(shown),
         "finest": len(fine),
         "borders_m": round(borders, 1),
         "crack_max_m": round(2 * worst, 6),
     }
-    if 2 * worst > WITHIN:
-        raise Fault(f"cracks open where levels meet: {figures}")
-    return figures
+    if 2 * worst > MAX_CRACK_M:
+        raise Fault(f"cracks between levels: {metrics}")
+    return metrics
 
 
-def _shown(export: Path, node: dict[str, Any], above: F64) -> Iterator[Shown]:
-    """All tiles at and below a node, whose metres `above` turns into those that are measured in."""
+def _shown(export: Path, node: dict[str, Any], above: F64) -> Iterator[TileContent]:
+    """All tiles at and below a node; `above` transforms the node's frame to that of the measurements."""
     below = []
     for child in node.get("children", ()):
         below += list(_shown(export, child, above @ _place(child)))
     yield from below
     if "content" in node:
         names = frozenset().union(*(one.tiles for one in below)) or frozenset({node["content"]["uri"]})
-        yield Shown(names, bool(below), _mesh(export / node["content"]["uri"], above))
+        yield TileContent(names, bool(below), _mesh(export / node["content"]["uri"], above))
 
 
 def _place(node: dict[str, Any]) -> F64:
@@ -87,7 +87,7 @@ def _place(node: dict[str, Any]) -> F64:
 
 
 def _mesh(path: Path, place: F64) -> Mesh:
-    """All meshes of a GLB as one, a vertex a place, z up and placed."""
+    """All meshes of a GLB as one with merged vertices, z up and transformed."""
     import trimesh
 
     read = trimesh.load_scene(path, process=False)
@@ -99,27 +99,27 @@ def _mesh(path: Path, place: F64) -> Mesh:
 
 
 def _ends(mesh: Mesh) -> F64:
-    """(E, 2, 3) edges of one face alone."""
+    """(E, 2, 3) boundary edges, of one face only."""
     edges = curve(mesh.faces, np.ones(len(mesh.vertices), bool)).edges
     return mesh.vertices[edges].astype(np.float64)
 
 
 def _shared(own: F64, other: F64) -> F64:
-    """Those edges of a tile whose ends another one has, too."""
+    """Edges of a tile whose ends are also vertices of another one."""
     from scipy.spatial import cKDTree
 
     if not len(own) or not len(other):
         return own[:0]
-    distance, _ = cKDTree(other.reshape(-1, 3)).query(own, distance_upper_bound=SAME)
+    distance, _ = cKDTree(other.reshape(-1, 3)).query(own, distance_upper_bound=VERTEX_TOLERANCE_M)
     return np.asarray(own[np.isfinite(distance).all(axis=1)])
 
 
-def _beside(one: Shown, own: Shown, other: Shown) -> bool:
-    """Whether a tile can be what is shown on one side of a border."""
+def _beside(one: TileContent, own: TileContent, other: TileContent) -> bool:
+    """Whether a content can be shown on `own`'s side of the border to `other`."""
     return own.tiles <= one.tiles and not other.tiles <= one.tiles
 
 
-def _away(mesh: Mesh, places: F64) -> float:
-    """Metres from places to a mesh, at most."""
-    nearest, _ = Renderer([Body(mesh)]).nearest_places(places.astype(np.float32))
-    return float(np.linalg.norm(nearest - places, axis=1).max())
+def _away(mesh: Mesh, points: F64) -> float:
+    """Largest distance in metres from points to a mesh."""
+    nearest, _ = Renderer([Body(mesh)]).closest_points(points.astype(np.float32))
+    return float(np.linalg.norm(nearest - points, axis=1).max())

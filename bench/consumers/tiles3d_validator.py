@@ -1,4 +1,4 @@
-"""Cesium's validator of 3D Tiles: the tileset, and every GLB by Khronos' validator within it."""
+"""Cesium's 3D Tiles validator: the tileset, and every GLB with Khronos' validator."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.consumers import Fault
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 from tests.cesium import node_module
 
 FORMAT = "tiles3d"
@@ -21,21 +21,21 @@ def missing() -> str:
     return "" if node_module(NAME) else f"{NAME} isn't installed (npm install -g {NAME})"
 
 
-def check(export: Path, places: Places) -> dict[str, Any]:
-    """Validate: neither an error nor a warning."""
+def check(export: Path, reference: WorldReference) -> dict[str, Any]:
+    """Validate: neither errors nor warnings."""
     package = node_module(NAME)
     assert package is not None
     program = package / next(iter(json.loads((package / "package.json").read_text(encoding="utf-8"))["bin"].values()))
     with tempfile.TemporaryDirectory() as place:
-        told = Path(place) / "report.json"
+        report_path = Path(place) / "report.json"
         done = subprocess.run(
-            ["node", program, "--tilesetFile", export / "tileset.json", "--reportFile", told],
+            ["node", program, "--tilesetFile", export / "tileset.json", "--reportFile", report_path],
             capture_output=True, text=True,
         )  # fmt: skip
-        if not told.is_file():
-            raise Fault(f"it told nothing: {(done.stderr or done.stdout)[-500:]}")
-        report = json.loads(told.read_text(encoding="utf-8"))
-    figures = {"errors": report["numErrors"], "warnings": report["numWarnings"]}
-    if any(figures.values()):
-        raise Fault(f"{figures}: {json.dumps(report['issues'])[:500]}")
-    return figures
+        if not report_path.is_file():
+            raise Fault(f"no report was written: {(done.stderr or done.stdout)[-500:]}")
+        report = json.loads(report_path.read_text(encoding="utf-8"))
+    metrics = {"errors": report["numErrors"], "warnings": report["numWarnings"]}
+    if any(metrics.values()):
+        raise Fault(f"{metrics}: {json.dumps(report['issues'])[:500]}")
+    return metrics

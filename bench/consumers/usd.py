@@ -1,4 +1,4 @@
-"""OpenUSD's own validators, all of them."""
+"""All validators of OpenUSD."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.consumers import Fault
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 
 FORMAT = "usd"
 
@@ -17,17 +17,17 @@ def missing() -> str:
     return "" if importlib.util.find_spec("pxr") else "OpenUSD isn't installed (pip install usd-core)"
 
 
-def check(export: Path, places: Places) -> dict[str, Any]:
+def check(export: Path, reference: WorldReference) -> dict[str, Any]:
     """Validate the stage with all its payloads."""
     (stage,) = export.glob("*.usdc")
     count, found = faults(stage)
     if found:
-        raise Fault(f"{len(found)}, the first: {found[0]}")
+        raise Fault(f"{len(found)} issues, the first: {found[0]}")
     return {"validators": count}
 
 
 def faults(path: Path) -> tuple[int, list[str]]:
-    """How many validators there are, and what they find."""
+    """Number of validators, and the issues that they find."""
     from pxr import Usd, UsdValidation
 
     every = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()

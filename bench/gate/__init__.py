@@ -1,1 +1,1 @@
-"""The gate: exported worlds run through the programs that use them: `python -m bench.gate`."""
+"""Acceptance gate: exported worlds are run in the programs that use them: `python -m bench.gate`."""

@@ -1,4 +1,4 @@
-"""The robot of an export is driven along the road in a consumer's engine, by pure pursuit (Coulter 1992)."""
+"""Drive the exported robot along the road in a consumer's physics engine, with pure pursuit (Coulter 1992)."""
 
 from __future__ import annotations
 
@@ -7,99 +7,99 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from bench.consumers import Fault
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.simulation.robot import ROBOT
 
-FAR = 20.0
-"""Metres to drive, or to the way's end."""
-SPEED, AHEAD = 1.0, 1.5
-"""Metres a second, and metres ahead of the robot of the place that it steers for."""
-TICK = 0.05
-"""Seconds between two looks."""
-UPRIGHT = 0.9
-"""Cosine of the tilt at which a robot has fallen over."""
+DRIVE_DISTANCE_M = 20.0
+"""Distance to drive, if the route is long enough."""
+SPEED_M_S, LOOKAHEAD_M = 1.0, 1.5
+"""Speed, and distance from the robot to the point that it steers for."""
+CONTROL_PERIOD_S = 0.05
+"""Time between two control updates."""
+MIN_UPRIGHT = 0.9
+"""Cosine of the tilt at which a robot counts as fallen over."""
 
 
 class Pose(NamedTuple):
-    """Of the robot's frame: place (3,) in the world, metres, and rotation (3, 3) to it."""
+    """Pose of the robot's base frame: position (3,) in the world, metres, and rotation (3, 3) to the world."""
 
     place: F64
     rotation: F64
 
 
 class Engine(Protocol):
-    """A world with the robot in it."""
+    """A simulated world with the robot in it."""
 
     def pose(self) -> Pose:
-        """Where the robot is."""
+        """Pose of the robot."""
 
     def turn(self, left: float, right: float, seconds: float) -> None:
-        """Have the wheels turn so fast, radians a second, for a time."""
+        """Turn the wheels at the given angular velocities, rad/s, for some time."""
 
 
-def drive(engine: Engine, places: Places) -> dict[str, Any]:
-    """Drive along the way that the robot stands on.
+def drive(engine: Engine, reference: WorldReference) -> dict[str, Any]:
+    """Drive along the route nearest to the robot.
 
     Returns:
-        `robot_driven_m`; `robot_off_way_max_m`: metres to the side of the way; `robot_left_road`: looks at which a
-        wheel was on other ground than a road; `robot_above_max_m`: metres between its wheels and the cloud's surface.
+        `robot_driven_m`; `robot_off_way_max_m`: lateral distance from the route; `robot_left_road`: number of updates
+        with a wheel off the road; `robot_above_max_m`: distance between its wheels and the cloud's surface.
 
     Raises:
-        Fault: it left the road, fell over, or got stuck.
+        Fault: it left the road, fell over or got stuck.
     """
     pose = engine.pose()
-    way = min(places.ways, key=lambda one: float(np.linalg.norm(one - pose.place, axis=1).min()))
+    way = min(reference.ways, key=lambda one: float(np.linalg.norm(one - pose.place, axis=1).min()))
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1))])
     first = _chainage(way, along, pose.place)
-    far = min(FAR, along[-1] - first - AHEAD)
+    far = min(DRIVE_DISTANCE_M, along[-1] - first - LOOKAHEAD_M)
     left, aside, above, driven = 0, 0.0, 0.0, 0.0
-    for _ in range(int(3 * far / SPEED / TICK)):
-        engine.turn(*ROBOT.turning(SPEED, _steering(way, along, pose)), TICK)
+    for _ in range(int(3 * far / SPEED_M_S / CONTROL_PERIOD_S)):
+        engine.turn(*ROBOT.wheel_speeds(SPEED_M_S, _steering(way, along, pose)), CONTROL_PERIOD_S)
         pose = engine.pose()
-        if pose.rotation[2, 2] < UPRIGHT:
+        if pose.rotation[2, 2] < MIN_UPRIGHT:
             raise Fault(f"the robot fell over after {driven:.1f} m at {np.round(pose.place, 2).tolist()}")
         below = _wheels(pose)
-        left += not places.on_road(below[:, :2]).all()
-        above = max(above, float(np.nanmax(np.abs(below[:, 2] - places.heights(below[:, :2])), initial=0.0)))
+        left += not reference.on_road(below[:, :2]).all()
+        above = max(above, float(np.nanmax(np.abs(below[:, 2] - reference.heights(below[:, :2])), initial=0.0)))
         at = _chainage(way, along, pose.place)
-        aside = max(aside, float(np.linalg.norm(_place(way, along, at) - pose.place[:2])))
+        aside = max(aside, float(np.linalg.norm(_point_at(way, along, at) - pose.place[:2])))
         driven = at - first
         if driven >= far:
             break
-    figures = {
+    metrics = {
         "robot_driven_m": round(driven, 2),
         "robot_off_way_max_m": round(aside, 3),
         "robot_above_max_m": round(above, 3),
         "robot_left_road": left,
     }
     if driven < far or left:
-        raise Fault(f"the robot was to drive {far:.1f} m along the road", figures)
-    return figures
+        raise Fault(f"the robot didn't drive {far:.1f} m on the road", metrics)
+    return metrics
 
 
 def _chainage(way: F64, along: F64, place: F64) -> float:
-    """Metres along a way (W, 2 or 3) to the place on it that is nearest."""
+    """Distance along a route (W, 2 or 3) to its point nearest to a position."""
     i = int(np.linalg.norm(way[:, :2] - place[:2], axis=1)[:-1].argmin())
     step = way[i + 1, :2] - way[i, :2]
     share = float((place[:2] - way[i, :2]) @ step / max(float(step @ step), 1e-9))
     return float(along[i] + share * (along[i + 1] - along[i]))
 
 
-def _place(way: F64, along: F64, at: float) -> F64:
-    """(2,) the place on a way at a chainage."""
+def _point_at(way: F64, along: F64, at: float) -> F64:
+    """(2,) point on a route at a distance along it."""
     return np.array([np.interp(at, along, k) for k in way[:, :2].T])
 
 
 def _steering(way: F64, along: F64, pose: Pose) -> float:
-    """Radians a second to the left."""
-    at = _chainage(way, along, pose.place) + AHEAD
-    goal = _place(way, along, at) - pose.place[:2]
+    """Yaw rate in rad/s, positive to the left."""
+    at = _chainage(way, along, pose.place) + LOOKAHEAD_M
+    goal = _point_at(way, along, at) - pose.place[:2]
     aside = float(goal @ pose.rotation[:2, 1])
-    return 2 * SPEED * aside / max(float(goal @ goal), 1e-6)
+    return 2 * SPEED_M_S * aside / max(float(goal @ goal), 1e-6)
 
 
 def _wheels(pose: Pose) -> F64:
-    """(3, 3) the lowest places of the wheels and the caster."""
+    """(3, 3) lowest points of the wheels and the caster."""
     touching = [(x, y, 0.0) for x, y, _ in (link.place for link in (*ROBOT.wheels, ROBOT.link("caster")))]
     return np.asarray(touching) @ pose.rotation.T + pose.place

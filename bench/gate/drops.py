@@ -1,4 +1,4 @@
-"""Balls that a consumer's engine drops on a world's road and on the borders of tiles, and where they come to rest."""
+"""Balls dropped by a consumer's physics engine on the road and on tile borders, and where they come to rest."""
 
 from __future__ import annotations
 
@@ -7,42 +7,40 @@ from typing import Any
 import numpy as np
 
 from bench.consumers import Fault
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 from scan2sim.pipeline.core.types import F64
 
-BALL = 0.11
-"""Radius in metres."""
-FALL = 0.15
-"""Metres that bodies fall."""
-WITHIN = 0.02
-"""Metres from the cloud's surface within which a body comes to rest."""
-THROUGH = 0.3
-"""Metres below it where a body has fallen through."""
+BALL_RADIUS_M = 0.11
+DROP_HEIGHT_M = 0.15
+MAX_REST_GAP_M = 0.02
+"""Maximum distance from the cloud's surface of a body at rest."""
+FALL_THROUGH_M = 0.3
+"""Depth below the surface at which a body counts as fallen through."""
 
 
-def starts(places: Places) -> F64:
-    """(N, 3) middles of balls before they fall."""
-    return np.concatenate([places.road, places.borders]) + [0.0, 0.0, BALL + FALL]
+def start_positions(reference: WorldReference) -> F64:
+    """(N, 3) centres of the balls before they fall."""
+    return np.concatenate([reference.road, reference.borders]) + [0.0, 0.0, BALL_RADIUS_M + DROP_HEIGHT_M]
 
 
-def gaps(rests: F64, places: Places) -> F64:
-    """(N,) metres between the lowest places of balls, their middles at `rests` (N, 3), and the cloud's surface."""
+def rest_gaps(rests: F64, reference: WorldReference) -> F64:
+    """(N,) gaps in metres between balls with centres `rests` (N, 3) and the cloud's surface."""
     rests = np.asarray(rests, np.float64).reshape(-1, 3)
-    return rests[:, 2] - BALL - places.heights(rests[:, :2])
+    return rests[:, 2] - BALL_RADIUS_M - reference.heights(rests[:, :2])
 
 
-def told(off: F64) -> dict[str, Any]:
-    """Figures of bodies that rest so far (N,) from the cloud's surface.
+def rest_metrics(off: F64) -> dict[str, Any]:
+    """Metrics of bodies that rest at distances (N,) from the cloud's surface.
 
     Raises:
-        Fault: one is too far from it, fell through, or left the places that points tell of.
+        Fault: a body is too far from the surface, fell through, or left the area covered by points.
     """
-    figures = {
+    metrics = {
         "dropped": len(off),
         "drop_mean_m": round(float(np.nanmean(np.abs(off))), 4),
         "drop_max_m": round(float(np.nanmax(np.abs(off))), 4),
-        "fell_through": int(np.sum(off < -THROUGH)),
+        "fell_through": int(np.sum(off < -FALL_THROUGH_M)),
     }
-    if figures["fell_through"] or figures["drop_max_m"] > WITHIN or np.isnan(off).any():
-        raise Fault(f"bodies don't come to rest on the cloud's surface: {np.round(off, 3).tolist()}", figures)
-    return figures
+    if metrics["fell_through"] or metrics["drop_max_m"] > MAX_REST_GAP_M or np.isnan(off).any():
+        raise Fault(f"bodies don't rest on the cloud's surface: {np.round(off, 3).tolist()}", metrics)
+    return metrics

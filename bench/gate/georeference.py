@@ -1,4 +1,4 @@
-"""Points surveyed 5 km from a world's origin, taken through every format and back to the CRS."""
+"""Surveyed points 5 km from a world's origin: coordinates after a round trip through every format."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from scan2sim.pipeline.io.world_formats import SceneParams
 from tests.pipeline import synthetic
 from tests.pipeline.io.scene_readers import READERS, surveyed_off
 
-APART = 5000.1234567
+TILE_DISTANCE_M = 5000.1234567
 
 
 def georeference(folder: Path) -> dict[str, Any]:
-    """Print the metres between where the points were surveyed and where each format's own readers find them.
+    """Print the distances in metres between surveyed points and the same points read from each format.
 
     Returns:
-        `georef_max_m`: the largest of them.
+        `georef_max_m`: the largest distance.
     """
     shutil.rmtree(folder, ignore_errors=True)
-    scene = synthetic.scene(folder / "scene", tiles=2, apart=APART)
+    scene = synthetic.scene(folder / "scene", tiles=2, apart=TILE_DISTANCE_M)
     off = {}
     for name in READERS:
         if plugins.missing(world_formats.PACKAGE, name):

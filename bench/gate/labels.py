@@ -1,4 +1,4 @@
-"""Classes that a world shows from its photos' own poses, beside the photos' true ones."""
+"""Class labels of a world rendered from its photos' poses, compared with the photos' true labels."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from scan2sim.pipeline.core.types import U8, Mesh
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.io.worlds.scene import Scene
 
-EACH = 4
-"""Every so many photos are looked at."""
+PHOTO_STRIDE = 4
+"""Every Nth photo is compared."""
 SKY = 0
-OWN = (CODE["road_sign"], CODE["pole"])
-"""Classes that a world's labels tell from their group's."""
-GONE = (CODE["vehicle"], CODE["person"])
-"""What stands or moves in photos, and not in the world: its pixels don't count."""
+SEPARATE_CLASSES = (CODE["road_sign"], CODE["pole"])
+"""Classes with a label of their own in worlds, apart from their group's."""
+MOVABLE_CLASSES = (CODE["vehicle"], CODE["person"])
+"""Classes that are in photos but not in worlds; their pixels are ignored."""
 
 
-def agreement(scene: Scene, street: Path) -> dict[str, float]:
-    """Shares of the photos' pixels at which the world shows the class that is there.
+def label_agreement(scene: Scene, street: Path) -> dict[str, float]:
+    """Shares of the photos' pixels at which the world shows the true class.
 
     Args:
-        scene: of a generated street.
-        street: the tile as it was generated, with `truth/labels` of its photos.
+        scene: world of a generated street.
+        street: the generated tile, with `truth/labels` of its photos.
 
     Returns:
-        `labels_agree`, of all pixels but those of vehicles and people; `labels_agree_surface`, of those of them that
-        show no sky; and the share of each class's pixels, `labels_agree.building` and so on.
+        `labels_agree` of all pixels except vehicles and people; `labels_agree_surface` of those of them that aren't
+        sky; and the share of each class's pixels, `labels_agree.building` and so on.
     """
     tile = read_tile(street)
     codes, renderer = _world(scene)
     table = np.zeros((256, 256), np.int64)  # true class, shown class
     shift = np.asarray(tile.frame.origin) - np.asarray(scene.origin)
-    for view in tile.views[::EACH]:
+    for view in tile.views[::PHOTO_STRIDE]:
         truth = cv2.imread(str(street / "truth" / "labels" / f"{view.photo.stem}.png"), cv2.IMREAD_UNCHANGED)
         pose = np.array(view.T_world_cam, np.float64)
         pose[:3, 3] += shift
         image = renderer.view(view.camera, pose)
         shown = np.where(image.hit, codes[image.face.clip(0)], SKY)
         np.add.at(table, (_label(truth), shown), 1)
-    table[list(GONE)] = 0
+    table[list(MOVABLE_CLASSES)] = 0
     whole, surface = table.sum(), table[1:].sum()
     agree = {"labels_agree": np.trace(table) / whole, "labels_agree_surface": np.trace(table[1:, 1:]) / surface}
     names = {CODE_OF_SURFACE[group]: group for group in GROUPS} | {CODE["road_sign"]: "road_sign", CODE["pole"]: "pole"}
@@ -53,7 +53,7 @@ def agreement(scene: Scene, street: Path) -> dict[str, float]:
 
 
 def _world(scene: Scene) -> tuple[U8, Renderer]:
-    """Labels (F,) of all faces of a world, and what casts rays at them."""
+    """Labels (F,) of all faces of a world, and a renderer of the world."""
     vertices, faces, codes, first = [], [], [], 0
     for tile in scene.tiles:
         for surface in tile.surfaces():
@@ -67,11 +67,11 @@ def _world(scene: Scene) -> tuple[U8, Renderer]:
 
 
 def _label(truth: U8) -> U8:
-    """A photo's true classes as a world labels them."""
+    """True classes of a photo, mapped to the labels of worlds."""
     group = group_of()
     table = np.zeros(256, np.uint8)
     for code in range(256):
-        if code in (*OWN, *GONE):
+        if code in (*SEPARATE_CLASSES, *MOVABLE_CLASSES):
             table[code] = code
         elif group[code] >= 0:
             table[code] = CODE_OF_SURFACE[GROUPS[group[code]]]

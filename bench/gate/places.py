@@ -1,4 +1,4 @@
-"""What the gate knows of a world beside its export: its road, the cloud's surface, ways to drive, photos."""
+"""Reference data of a world, independent of its export: road points, the cloud's surface, routes, photos."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.types import F64, Bools, PointCloud, View
-from scan2sim.pipeline.geometry.height_map import Raster, grown
+from scan2sim.pipeline.geometry.height_map import Raster, dilate
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.io.worlds.scene import Scene
 from scan2sim.pipeline.simulation.spawn import courses
@@ -21,32 +21,32 @@ from scan2sim.pipeline.tiling.voronoi_cell import Cell
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-COUNT = 20
-"""Places on the road."""
-ROOM = 2.5
-"""Metres around a place on which there is ground, and nothing that stands."""
-KERB = 0.5
-"""Metres to ground of other classes: at a kerb there is no one height."""
-LOW, HIGH = 0.25, 3.0
-"""Metres above the ground in which things stand in a car's way."""
-AROUND = 0.3
-"""Metres around a place whose points tell the surface's height there."""
-ON = 0.15
-"""Metres from a border on which a place lies."""
-CELL = 0.25
+ROAD_POINT_COUNT = 20
+"""Number of points chosen on the road."""
+CLEARANCE_M = 2.5
+"""Radius around a chosen point with ground and without obstacles."""
+KERB_DISTANCE_M = 0.5
+"""Minimum distance to ground of other classes: at a kerb the height isn't unique."""
+OBSTACLE_MIN_M, OBSTACLE_MAX_M = 0.25, 3.0
+"""Heights above the ground at which objects block a car."""
+SURFACE_RADIUS_M = 0.3
+"""Radius of the points that determine the surface's height at a position."""
+BORDER_DISTANCE_M = 0.15
+"""Maximum distance from a border of a point on it."""
+CELL_M = 0.25
 
 
 @dataclass(frozen=True)
-class Places:
-    """Of a world; coordinates are the world's, metres.
+class WorldReference:
+    """Reference data of a world; world coordinates in metres.
 
     Attributes:
-        road: (N, 3) on the road, far from each other: things are dropped there.
-        borders: (M, 3) on borders of tiles, likewise.
-        ground: (K, 3) points of the ground, as scanned.
-        paved: (K,) which of them are of a road; all, where no road is told from other ground.
-        ways: (W, 3) each, along roads, the longest first.
-        views: photos, posed in the world.
+        road: (N, 3) points on the road, far from each other, where objects are dropped.
+        borders: (M, 3) points on tile borders, likewise.
+        ground: (K, 3) scanned ground points.
+        paved: (K,) which of them belong to a road; all, if there is no road class.
+        ways: routes (W, 3) along roads, the longest first.
+        views: photos with poses in the world.
     """
 
     road: F64
@@ -57,24 +57,24 @@ class Places:
     views: tuple[View, ...] = ()
 
     def heights(self, xy: F64) -> F64:
-        """(N,) heights of the cloud's surface at places (N, 2): of a plane through the points around; NaN without."""
+        """(N,) heights of the cloud's surface at positions (N, 2), from a plane fit; NaN without points."""
         out = np.full(len(xy), np.nan)
         for i, near in enumerate(self._near(xy)):
             if len(near) >= 10:
                 part = self.ground[near]
                 part = part[np.abs(part[:, 2] - np.median(part[:, 2])) < 0.1]
                 away = part[:, :2] - xy[i]
-                if np.linalg.norm(away.mean(axis=0)) < AROUND / 3:  # else all points lie to one side
+                if np.linalg.norm(away.mean(axis=0)) < SURFACE_RADIUS_M / 3:  # otherwise all points lie to one side
                     out[i] = np.linalg.lstsq(np.column_stack([away, np.ones(len(part))]), part[:, 2], rcond=None)[0][2]
         return out
 
     def on_road(self, xy: F64) -> Bools:
-        """(N,) whether most points around places (N, 2) are of a road."""
+        """(N,) whether most points around positions (N, 2) belong to a road."""
         return np.array([len(near) > 0 and self.paved[near].mean() > 0.5 for near in self._near(xy)])
 
     def _near(self, xy: F64) -> Sequence[list[int]]:
-        """Indices of the ground's points around each of the places (N, 2)."""
-        return self._tree.query_ball_point(xy, AROUND)
+        """Indices of the ground points around each of the positions (N, 2)."""
+        return self._tree.query_ball_point(xy, SURFACE_RADIUS_M)
 
     @cached_property
     def _tree(self) -> cKDTree:
@@ -83,12 +83,12 @@ class Places:
         return cKDTree(self.ground[:, :2])
 
 
-def find(scene: Scene, run: Path, tiles: Sequence[Path]) -> Places:
-    """Places in a world, by the points that its run classified.
+def find(scene: Scene, run: Path, tiles: Sequence[Path]) -> WorldReference:
+    """Reference data from the points that a run classified.
 
     Args:
         scene: the world.
-        run: its folder of kept results.
+        run: folder of the run's cached results.
         tiles: folders of its tiles, in the scene's order.
     """
     many = len(scene.tiles) > 1
@@ -112,8 +112,8 @@ def find(scene: Scene, run: Path, tiles: Sequence[Path]) -> Places:
     raster, free = _free(points, standing, points[~road])
     on_road = road & free[raster.at(points)]
     borders = [_on_border(points[on_road], scene, *pair) for pair in _pairs(cells)]
-    return Places(
-        _spread(points[on_road], COUNT),
+    return WorldReference(
+        _spread(points[on_road], ROAD_POINT_COUNT),
         np.concatenate([np.zeros((0, 3)), *borders]),
         points,
         road,
@@ -123,7 +123,7 @@ def find(scene: Scene, run: Path, tiles: Sequence[Path]) -> Places:
 
 
 def _views(scene: Scene, tiles: Sequence[Path]) -> Iterator[View]:
-    """The photos of all tiles, each once, posed in the world."""
+    """The photos of all tiles without duplicates, with poses in the world."""
     known = set()
     for tile in map(read_tile, tiles):
         shift = np.asarray(tile.frame.origin) - np.asarray(scene.origin)
@@ -140,16 +140,16 @@ def _inside(cloud: PointCloud, cell: Cell) -> Bools:
 
 
 def _free(ground: F64, standing: F64, kerb: F64) -> tuple[Raster, Bools]:
-    """Where there is ground all around, nothing stands, and no kerb is near."""
-    raster = Raster.over(CELL, [ground, standing])
+    """Cells with ground all around, without obstacles and away from kerbs."""
+    raster = Raster.over(CELL_M, [ground, standing])
     height = -raster.highest(np.column_stack([ground[:, :2], -ground[:, 2]]).astype(np.float32))
     over = standing[:, 2] - height[raster.at(standing)]
-    hindered = raster.covered(standing[(over > LOW) & (over < HIGH)]) | grown(np.isnan(height), 0)
-    return raster, ~grown(hindered, ROOM / CELL) & ~grown(raster.covered(kerb), KERB / CELL)
+    hindered = raster.covered(standing[(over > OBSTACLE_MIN_M) & (over < OBSTACLE_MAX_M)]) | dilate(np.isnan(height), 0)
+    return raster, ~dilate(hindered, CLEARANCE_M / CELL_M) & ~dilate(raster.covered(kerb), KERB_DISTANCE_M / CELL_M)
 
 
 def _spread(points: F64, count: int) -> F64:
-    """Some of the points, each far from those before it."""
+    """Points chosen by farthest point sampling."""
     if not len(points):
         return np.zeros((0, 3))
     points = points[:: max(1, len(points) // 20_000)]
@@ -166,6 +166,8 @@ def _pairs(cells: dict[str, Cell]) -> list[tuple[Cell, str]]:
 
 
 def _on_border(points: F64, scene: Scene, cell: Cell, other: str) -> F64:
-    """Three places where the road crosses a border."""
+    """Three points where the road crosses a border."""
     xy = points[:, :2] + np.asarray(scene.origin[:2])
-    return _spread(points[(np.abs(cell.beyond(other, xy)) < ON) & (cell.outside(xy) < ON)], 3)
+    return _spread(
+        points[(np.abs(cell.beyond(other, xy)) < BORDER_DISTANCE_M) & (cell.outside(xy) < BORDER_DISTANCE_M)], 3
+    )

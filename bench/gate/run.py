@@ -1,14 +1,14 @@
-"""The gate: exported worlds go through those who use them.
+"""Acceptance gate: exported worlds are run in the programs that use them.
 
 `make gate`, or `python -m bench.gate [--out bench-out/gate] [--worlds demo raw0009 survey] [--consumers gazebo ...]`.
-The demo tile, a real street and a world of ten tiles are made by the defaults (the ten tiles coarser) where they aren't
-there yet, exported in the format that a consumer reads, and read, driven on or looked at by it (`bench/consumers`, a
-file each). Beside that: steps of the ground at the tiles' borders, labels against the photos' true ones, roads against
-the generated streets', surveyed points through all formats, and what loading costs Gazebo (`bench/gate_*.py`).
-Consumers and worlds that aren't there are skipped, and said.
+The demo tile, a real street and a world of ten tiles are built with default settings (the ten tiles coarser) if
+missing, exported in each consumer's format, and read, driven on or rendered by the consumer (`bench/consumers`, a file
+each). Further checks: height steps at tile borders, labels compared with the photos' true ones, roads compared with
+those of the generated streets, surveyed points through all formats, and Gazebo's loading cost (`bench/gate`).
+Consumers and worlds that aren't available are reported as skipped.
 
-Ends with `RESULT {json}`: `consumers` that ran without a fault on every world, `skipped`, `faults`, and figures, the
-worst of all worlds. Exit status 1 where there is a fault.
+Ends with `RESULT {json}`: number of `consumers` without a fault on any world, `skipped`, `faults`, and metrics, the
+worst of all worlds. Exit status 1 if there is a fault.
 """
 
 from __future__ import annotations
@@ -22,92 +22,92 @@ from typing import Any
 
 from bench import consumers
 from bench.consumers import Fault
-from bench.gate.borders import steps
+from bench.gate.borders import border_steps
 from bench.gate.georeference import georeference
-from bench.gate.labels import agreement
+from bench.gate.labels import label_agreement
 from bench.gate.load import load
 from bench.gate.places import find
-from bench.gate.worlds import WORLDS, Absent, Subject, scan2sim
+from bench.gate.worlds import WORLDS, GateWorld, WorldUnavailable, scan2sim
 from bench.paths import ROOT
-from bench.roads import compared, summary
+from bench.roads import line_errors, summary
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.io import robot_formats
 from scan2sim.pipeline.io.worlds.scene import read_scene
 
-WORST = (
+MAX_METRICS = (
     "drop_max_m", "border_step_max_m", "robot_off_way_max_m", "picture_off_px", "road_centre_p95_m", "lane_edge_p95_m",
 )  # fmt: skip
-"""Figures of which the largest counts."""
-LEFT = "robot_left_road"
-"""Looks at robots that were beside the road, all together."""
+"""Metrics of which the largest value is reported."""
+LEFT_ROAD = "robot_left_road"
+"""Metric that is summed: number of updates with a robot off the road."""
 
 
 def main() -> None:
-    """Make the worlds, run the consumers, print a table."""
+    """Build the worlds, run the consumers and print a table."""
     known = plugins.names(consumers.__name__)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "gate")
     parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=list(WORLDS))
     parser.add_argument("--consumers", nargs="*", choices=known, default=known)
     parser.add_argument(
-        "--no-load", action="store_true", help="leave the comparison of loading times out: it takes a minute"
+        "--no-load", action="store_true", help="skip the comparison of loading costs, which takes a minute"
     )
     arguments = parser.parse_args()
     result: dict[str, Any] = {"skipped": [], "faults": []}
-    able = {name: plugins.module(consumers.__name__, name) for name in arguments.consumers}
-    for name, module in able.items():
-        if why := module.missing():
-            result["skipped"].append(f"{name}: {why}")
-    able = {name: module for name, module in able.items() if not module.missing()}
+    available = {name: plugins.module(consumers.__name__, name) for name in arguments.consumers}
+    for name, module in available.items():
+        if reason := module.missing():
+            result["skipped"].append(f"{name}: {reason}")
+    available = {name: module for name, module in available.items() if not module.missing()}
     runs: dict[str, Path] = {}
     for name in arguments.worlds:
         try:
             subject = WORLDS[name](arguments.out / name)
-        except Absent as why:
-            result["skipped"].append(f"{name}: {why}")
+        except WorldUnavailable as reason:
+            result["skipped"].append(f"{name}: {reason}")
             continue
         runs[name] = subject.run
-        _through(subject, able, result)
-    if "gazebo" in able and not arguments.no_load:
+        _check_world(subject, available, result)
+    if "gazebo" in available and not arguments.no_load:
         result |= load(arguments.out / "load", runs)
     result |= georeference(arguments.out / "georeference")
     faulty = {fault.split(" ")[0] for fault in result["faults"]}
-    print("RESULT", json.dumps({"consumers": len(set(able) - faulty), **result}))
+    print("RESULT", json.dumps({"consumers": len(set(available) - faulty), **result}))
     sys.exit(bool(result["faults"]))
 
 
-def _through(subject: Subject, able: dict[str, Any], result: dict[str, Any]) -> None:
-    """Export a world, let all consumers have it, and put their figures into `result`."""
+def _check_world(subject: GateWorld, available: dict[str, Any], result: dict[str, Any]) -> None:
+    """Export a world, run all consumers on it, and add their metrics to `result`."""
     scene = read_scene(subject.run)
-    places = find(scene, subject.run, subject.tiles)
-    formats = sorted({module.FORMAT for module in able.values()})
+    reference = find(scene, subject.run, subject.tiles)
+    formats = sorted({module.FORMAT for module in available.values()})
     for form in formats:
         folder = subject.run.parent / "exports" / form
         shutil.rmtree(folder, ignore_errors=True)
         driven = ["--robot"] if form in plugins.names(robot_formats.PACKAGE) else []
         scan2sim("export", subject.run, "--to", form, "--out", folder, *driven)
-    for name, module in able.items():
+    for name, module in available.items():
         try:
-            _tell(subject, name, module.check(subject.run.parent / "exports" / module.FORMAT, places), result)
-        except Fault as why:
-            _tell(subject, name, why.figures, result)
-            print(f"{subject.name:8} {name:10} FAULT: {why}", flush=True)
-            result["faults"].append(f"{name} on {subject.name}: {why}")
+            _record(subject, name, module.check(subject.run.parent / "exports" / module.FORMAT, reference), result)
+        except Fault as reason:
+            _record(subject, name, reason.metrics, result)
+            print(f"{subject.name:8} {name:10} FAULT: {reason}", flush=True)
+            result["faults"].append(f"{name} on {subject.name}: {reason}")
     if len(scene.tiles) > 1:
-        _tell(subject, "borders", steps(scene, subject.tiles), result)
+        _record(subject, "borders", border_steps(scene, subject.tiles), result)
     if subject.street is not None:
-        _tell(subject, "labels", agreement(scene, subject.street), result)
+        _record(subject, "labels", label_agreement(scene, subject.street), result)
     if subject.layout is not None:
-        _tell(subject, "roads", summary(compared(subject.run / "world", subject.layout)), result)
+        _record(subject, "roads", summary(line_errors(subject.run / "world", subject.layout)), result)
 
 
-def _tell(subject: Subject, what: str, figures: dict[str, Any], result: dict[str, Any]) -> None:
-    """Print figures of a world, and keep those of the gate."""
-    print(f"{subject.name:8} {what:10} {json.dumps(figures)}", flush=True)
-    for name in WORST:
-        if figures.get(name) is not None:
-            result[name] = max(result.get(name, 0.0), figures[name])
-    if LEFT in figures:
-        result[LEFT] = result.get(LEFT, 0) + figures[LEFT]
-    if "labels_agree" in figures:
-        result["labels_agree"] = figures["labels_agree"]
+def _record(subject: GateWorld, what: str, metrics: dict[str, Any], result: dict[str, Any]) -> None:
+    """Print metrics of a world and add the gate's own to the result."""
+    print(f"{subject.name:8} {what:10} {json.dumps(metrics)}", flush=True)
+    for name in MAX_METRICS:
+        if metrics.get(name) is not None:
+            result[name] = max(result.get(name, 0.0), metrics[name])
+    if LEFT_ROAD in metrics:
+        result[LEFT_ROAD] = result.get(LEFT_ROAD, 0) + metrics[LEFT_ROAD]
+    if "labels_agree" in metrics:
+        result["labels_agree"] = metrics["labels_agree"]

@@ -1,1 +1,1 @@
-"""What an installation holds: licences, shared libraries, containers, size."""
+"""Content of an installation: licences, shared libraries, containers, size."""

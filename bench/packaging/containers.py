@@ -1,4 +1,4 @@
-"""The toolboxes' container files (deploy/toolboxes), as far as this project writes such: read where no engine runs."""
+"""Parser of the toolboxes' container files (deploy/toolboxes), for checks without a container engine."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from pathlib import Path
 from bench.paths import ROOT
 
 FOLDER = ROOT / "deploy" / "toolboxes"
-OWN = {"scan2sim-toolbox": FOLDER / "base.Dockerfile"}
-"""Images that others are built on, and their files."""
+OWN_IMAGES = {"scan2sim-toolbox": FOLDER / "base.Dockerfile"}
+"""Base images built by this project, and their files."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A part of a container file: what it starts from, its name, and its instructions with what they say."""
+    """A build stage: base image, name and instructions with their arguments."""
 
     base: str
     name: str
     instructions: tuple[tuple[str, str], ...]
 
-    def said(self, word: str) -> list[str]:
-        """What follows an instruction's word, of each."""
+    def arguments_of(self, word: str) -> list[str]:
+        """Arguments of all instructions of a kind."""
         return [rest for one, rest in self.instructions if one == word]
 
 
 def stages(path: Path) -> list[Stage]:
-    """Of a container file, the final one last."""
+    """Stages of a container file, the final one last."""
     lines = [
         line for line in path.read_text(encoding="utf-8").splitlines() if line.strip() and not line.startswith("#")
     ]
@@ -45,21 +45,26 @@ def stages(path: Path) -> list[Stage]:
 
 
 def image(path: Path) -> list[Stage]:
-    """The stages that a file's image is made of, the final one last: what it starts from, and copies packages of."""
+    """Stages that contribute to a file's image, the final one last: base images and stages to copy from."""
     all_of_file = {stage.name: stage for stage in stages(path)}
     final = stages(path)[-1]
-    copied = [all_of_file[name] for rest in final.said("COPY") for name in re.findall(r"--from=(\w+)", rest)]
-    below = image(OWN[final.base]) if final.base in OWN else []
-    return [*below, *(stage for stage in copied if stage.base not in OWN), final]
+    copied = [all_of_file[name] for rest in final.arguments_of("COPY") for name in re.findall(r"--from=(\w+)", rest)]
+    below = image(OWN_IMAGES[final.base]) if final.base in OWN_IMAGES else []
+    return [*below, *(stage for stage in copied if stage.base not in OWN_IMAGES), final]
 
 
 def requirements(path: Path) -> list[Path]:
-    """Files of requirements that an image is installed by."""
-    names = [name for stage in image(path) for rest in stage.said("RUN") for name in re.findall(r"-r /\w+/(\S+)", rest)]
+    """Requirements files installed into an image."""
+    names = [
+        name
+        for stage in image(path)
+        for rest in stage.arguments_of("RUN")
+        for name in re.findall(r"-r /\w+/(\S+)", rest)
+    ]
     return [FOLDER / name for name in names]
 
 
 def entry_point(path: Path) -> list[str]:
-    """The command that an image runs."""
-    found: list[str] = json.loads(image(path)[-1].said("ENTRYPOINT")[0])
+    """Command that an image runs."""
+    found: list[str] = json.loads(image(path)[-1].arguments_of("ENTRYPOINT")[0])
     return found

@@ -1,4 +1,4 @@
-"""The global adjustment against odometry alone: which path is better, and which one the witnesses keep."""
+"""Global adjustment compared with odometry alone: which path is better, and which one cross-validation keeps."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.slam.frames import Sequence, odometry, places
+from bench.slam.frames import Sequence, odometry, positions
 from bench.slam.world import DRIVE as STREET
 from bench.slam.world import prepare
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.importers import kitti_raw
-from scan2sim.slam.mapping.cross_validation import judge
-from scan2sim.slam.mapping.global_adjustment import adjusted
-from scan2sim.slam.mapping.map_file import Mapped
-from scan2sim.slam.mapping.sparse_model import move
+from scan2sim.slam.mapping.cross_validation import compare_paths
+from scan2sim.slam.mapping.global_adjustment import bundle_adjust
+from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.mapping.sparse_model import update_map
 from scan2sim.slam.odometry.odometry import Odometry
 from scan2sim.slam.video import open_video
 from tests.slam.synthetic import Follower, Narrow, ate, drive, run, scatter
 
 DRIVES, SECONDS = 20, 20.0
-COUNTS = 640, 700, 760
+FEATURE_COUNTS = 640, 700, 760
 
 
 class Outcome(NamedTuple):
-    """ATE (m) of odometry alone and of the adjusted path; and by how much witnesses fit the latter better."""
+    """ATE (m) of odometry alone and of the adjusted path, and gain of the latter on held-out observations."""
 
     alone: float
     adjusted: float
@@ -36,31 +36,31 @@ class Outcome(NamedTuple):
 
     @property
     def kept(self) -> float:
-        """Of that which is kept."""
+        """ATE of the path that is kept."""
         return self.adjusted if self.gain > 0 else self.alone
 
     @property
     def best(self) -> float:
-        """Of the better one."""
+        """ATE of the better path."""
         return min(self.alone, self.adjusted)
 
 
 def outcome(found: Odometry, error: Callable[[F64], float]) -> Outcome:
-    """Of the adjustment of an odometry that kept all; `error` (m) of places (T, 3)."""
-    mapped = Mapped.of(found, [])
-    alone, before = error(places(found)), np.stack([k.T_world_cam for k in mapped.map.keyframes])
-    new = adjusted(mapped)
-    said = judge(mapped.map, before, new.poses)
-    move(mapped, new.known, new.poses, new.xyz)
-    return Outcome(alone, error(places(found)), said.gain)
+    """Adjust an odometry that has kept its tracks; `error` returns the error (m) of positions (T, 3)."""
+    mapped = MapCheckpoint.of(found, [])
+    alone, before = error(positions(found)), np.stack([k.T_world_cam for k in mapped.map.keyframes])
+    new = bundle_adjust(mapped)
+    comparison = compare_paths(mapped.map, before, new.poses)
+    update_map(mapped, new.known, new.poses, new.xyz)
+    return Outcome(alone, error(positions(found)), comparison.gain)
 
 
 def street() -> Sequence:
-    """KITTI 0009, beside the places that its sweeps were matched by."""
+    """KITTI 0009 with the registered positions of its sweeps."""
     drive = next(p for p in STREET.iterdir() if p.is_dir())
     with tempfile.TemporaryDirectory() as folder:
         T_cam_velo = np.loadtxt(prepare(Path(folder), drive)["extrinsics"])
-    P = kitti_raw.entry(drive, "calib_cam_to_cam.txt", "P_rect_02", 12).reshape(3, 4)
+    P = kitti_raw.calibration_entry(drive, "calib_cam_to_cam.txt", "P_rect_02", 12).reshape(3, 4)
     frames = next(drive.glob("*_sync")) / "image_02" / "data"
     video = open_video(frames)
     poses = np.loadtxt(next(STREET.glob("T_velo0_velo_icp*"))).reshape(-1, 3, 4)
@@ -72,7 +72,7 @@ def street() -> Sequence:
 
 
 def simulated() -> list[Outcome]:
-    """Over drives without pictures: every other one with a 360 camera, the others perspective."""
+    """Simulated drives without images: half with a 360 camera, half perspective."""
     out = []
     for seed in range(DRIVES):
         times, poses = drive(SECONDS, turn=0.05 * (1 + seed % 4))
@@ -84,10 +84,10 @@ def simulated() -> list[Outcome]:
 
 
 def chosen(sequences: Iterable[Sequence]) -> dict[str, float | None]:
-    """What is kept: on pictures and KITTI 0009's, each by three numbers of features, and on simulated drives."""
+    """How often the better path is kept: on frames with three numbers of features, and on simulated drives."""
     sequences = [*sequences, *([street()] if STREET.is_dir() else [])]
     known = {
-        one.name: [outcome(odometry(one, keep=True, count=n)[0], one.ate) for n in COUNTS] for one in sequences
+        one.name: [outcome(odometry(one, keep=True, count=n)[0], one.ate) for n in FEATURE_COUNTS] for one in sequences
     } | {f"{DRIVES} simulated drives": simulated()}
     for name, outcomes in known.items():
         table = np.array([(one.alone, one.adjusted, one.kept, one.best) for one in outcomes])
@@ -95,7 +95,7 @@ def chosen(sequences: Iterable[Sequence]) -> dict[str, float | None]:
         print(
             f"{name}: alone {100 * table[:, 0].mean():.2f} cm, adjusted {100 * table[:, 1].mean():.2f}, kept "
             f"{100 * table[:, 2].mean():.2f}, the better one {100 * table[:, 3].mean():.2f}; kept on {right} of "
-            f"{len(outcomes)}; witnesses' gain {', '.join(f'{one.gain:.4f}' for one in outcomes)}",
+            f"{len(outcomes)}; gain on held-out observations {', '.join(f'{one.gain:.4f}' for one in outcomes)}",
             flush=True,
         )
     every = [one for outcomes in known.values() for one in outcomes]

@@ -1,4 +1,4 @@
-"""Whether a trajectory's covariances can be trusted: simulated drives, whose truth is known, and their ellipsoids."""
+"""Calibration of a trajectory's covariances: simulated drives with known truth, and their 95 % ellipsoids."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.core.types import F64, GpsTrack
-from scan2sim.slam.calibration.lens import better, changed, told
+from scan2sim.slam.calibration.lens import changed_lens, fit_lens, lens_warning
 from scan2sim.slam.mapping.covariance import covariances
-from scan2sim.slam.mapping.map_file import Mapped
+from scan2sim.slam.mapping.map_file import MapCheckpoint
 from scan2sim.slam.trajectory import scale
 from scan2sim.slam.trajectory.gps import smooth
 from tests.slam.synthetic import LENS, Follower, Narrow, ate, drifting_turn, drive, inside, mistaken, off, run, scatter
@@ -18,13 +18,13 @@ DRIVES, SECONDS = 20, 20.0
 
 
 def covariance(out: Path) -> dict[str, float | None]:
-    """The share of positions in their 95 % ellipsoids: every other drive with a 360 camera, the others perspective."""
+    """Share of positions inside their 95 % ellipsoids: half of the drives with a 360 camera, half perspective."""
     held = []
     for seed in range(DRIVES):
         times, poses = drive(SECONDS, turn=0.05 * (1 + seed % 4))
         kind, count = ((Follower, 6000), (Narrow, 20000))[seed % 2]
         odometry = run(times, kind(poses, scatter(poses, count, seed), seed=seed), parallax=(3.0, 1.0)[seed % 2])
-        errors, known = off(odometry, poses), covariances(Mapped.of(odometry, ()), None)
+        errors, known = off(odometry, poses), covariances(MapCheckpoint.of(odometry, ()), None)
         held.append(float(inside(errors, known).mean()))
         if seed < 2:
             found = np.stack([odometry.pose_of(p)[:3, 3] for p in odometry.placed])
@@ -39,12 +39,12 @@ def covariance(out: Path) -> dict[str, float | None]:
 
 
 def gps_gain() -> dict[str, float | None]:
-    """ATE of a turn that drifts as KITTI's does, with GPS of 10 cm over that without; the mean of ten receivers."""
+    """ATE of a turn with KITTI-like scale drift, with 10 cm GPS relative to without; mean of ten receivers."""
     times, truth, found = drifting_turn()
     tied = []
     for seed in range(10):
         gps = smooth(GpsTrack(times, truth + np.random.default_rng(seed).normal(0, 0.1, truth.shape)))
-        factor = scale.factors(times, found, np.zeros(len(times), bool), gps, scale.AHEAD)
+        factor = scale.factors(times, found, np.zeros(len(times), bool), gps, scale.DRIFT_PERSPECTIVE)
         tied.append(ate(scale.apply(found, factor), truth))
     alone = ate(found, truth)
     print(f"a turn whose scale drifts: {alone:.3f} m, with GPS of 10 cm {np.mean(tied):.3f} m", flush=True)
@@ -52,22 +52,20 @@ def gps_gain() -> dict[str, float | None]:
 
 
 def lens() -> dict[str, float | None]:
-    """The shares of ten simulated drives on which a focal length 5 % off is noticed, and a centre off by 5 % of it.
+    """Shares of ten simulated drives with a warning for a focal length 5 % off, and for a centre off by 5 % of it.
 
-    And false alarms on the same ten.
+    Also false alarms on the same drives.
     """
 
     def alarms(*off: float) -> list[bool]:
-        cameras = [changed(LENS, np.array([*off, 0, 0]) * (1, -1)[seed % 2]) for seed in range(10)]
+        cameras = [changed_lens(LENS, np.array([*off, 0, 0]) * (1, -1)[seed % 2]) for seed in range(10)]
         return [
-            told(camera, better(camera, mistaken(camera, seed).map.misfits)) is not None
+            lens_warning(camera, fit_lens(camera, mistaken(camera, seed).map.misfits)) is not None
             for seed, camera in enumerate(cameras)
         ]
 
     focal, centre, false = alarms(np.log(0.95), 0), alarms(0, 0.05), alarms(0, 0)
-    print(
-        f"a focal length 5 % off: noticed on {sum(focal)} of 10 drives; a centre off by as much: {sum(centre)}", end=""
-    )
+    print(f"focal length 5 % off: warning on {sum(focal)} of 10 drives; centre off by as much: {sum(centre)}", end="")
     print(f"; false alarms: {sum(false)}", flush=True)
     return {
         "focal_noticed": float(np.mean(focal)), "centre_noticed": float(np.mean(centre)),
@@ -76,7 +74,7 @@ def lens() -> dict[str, float | None]:
 
 
 def _draw(file: Path, found: F64, truth: F64, known: F64) -> None:
-    """Path over truth from above, and errors beside their standard deviations, along the map's x and z."""
+    """Plot the path and the truth from above, and errors with their standard deviations along the map's x and z."""
     import matplotlib.pyplot as plt
     from matplotlib.patches import Ellipse
 

@@ -1,4 +1,4 @@
-"""A rendered drive of 1.5 km, and `scan2sim slam` on it, by ours and by the mission's solver."""
+"""A rendered drive of 1.5 km, and `scan2sim slam` on it with both solvers."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.slam.trajectory.evaluate import Evaluation, evaluate, plot
 
 DATA = ROOT.parent / "shared" / "data"
-UNSURE = 9
-"""Exit status where most of a path is unsure: its errors are told like others'."""
+EXIT_MOSTLY_EXTRAPOLATED = 9
+"""Exit status if most of the path is extrapolated; its errors are reported all the same."""
 
 
 def drive_of(out: Path, path: str, length: float) -> Path:
-    """The rendered drive along a KITTI path, or a made-up one; made if absent."""
+    """The rendered drive along a KITTI path, or a generated one; rendered if missing."""
     from scan2sim.data_samples import paths
     from scan2sim.data_samples.drive import generate_drive
 
     folder, file = out / f"drive_{path}", DATA / "kitti_gt_poses" / f"{path}.txt"
     if not (folder / "video.mp4").is_file():
-        print(f"rendering {length:.0f} m of {path}: about a second a frame", flush=True)
+        print(f"rendering {length:.0f} m of {path}: about a second per frame", flush=True)
         way = paths.kitti_path(file, length) if file.is_file() else paths.town_path(0, length)
         shutil.rmtree(folder, ignore_errors=True)
         generate_drive(folder, way, length=length, speed=15, fps=15, height=1024, bitrate=10e6, samples=4)
@@ -33,12 +33,12 @@ def drive_of(out: Path, path: str, length: float) -> Path:
 
 
 def slam(drive: Path, out: Path, *options: object) -> tuple[Evaluation, dict[str, Any]]:
-    """Run `scan2sim slam` on a drive; how far it is from the truth, and its facts."""
+    """Run `scan2sim slam` on a drive; returns its errors and metrics."""
     shutil.rmtree(out, ignore_errors=True)
     command = [str(Path(sys.executable).parent / "scan2sim"), "slam", str(drive / "video.mp4"), "--out", str(out)]
     command += ["--gps", str(drive / "gps.csv"), "--gps-offset", "0", "--mask", str(drive / "mask.png")]
     measured = measure([*command, *map(str, options)])
-    if measured.status not in (0, UNSURE):
+    if measured.status not in (0, EXIT_MOSTLY_EXTRAPOLATED):
         sys.exit(f"scan2sim slam failed with exit status {measured.status}")
     found = evaluate(trajectory_io.read(out / "trajectory.csv"), trajectory_io.read(drive / "truth.csv"))
     plot(found, out / "plot.png")
@@ -46,7 +46,7 @@ def slam(drive: Path, out: Path, *options: object) -> tuple[Evaluation, dict[str
 
 
 def drive(out: Path, path: str, length: float, stretch: float) -> dict[str, float | None]:
-    """The two errors on the rendered drive; on its first `stretch` seconds by both solvers."""
+    """Errors on the rendered drive; on its first `stretch` seconds with both solvers."""
     made = drive_of(out, path, length)
     adjacent = ("--backend", "adam", "--set", "slam.gps_chords=adjacent")
     kinds: list[tuple[str, tuple[object, ...]]] = [("lm", ())]

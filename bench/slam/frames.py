@@ -1,4 +1,4 @@
-"""Odometry and pycolmap's mapping over folders of perspective pictures, as KITTI's odometry has them."""
+"""Odometry and pycolmap's mapping on folders of perspective frames, such as KITTI odometry's."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from scan2sim.slam.video import open_video
 
 @dataclass(frozen=True)
 class Sequence:
-    """Pictures with their truth.
+    """Frames with their true path.
 
     Attributes:
-        name: for tables.
-        frames: folder of pictures.
-        camera: of them.
-        truth: (T, 3) metres, of the camera.
+        name: name for tables.
+        frames: folder of images.
+        camera: their camera.
+        truth: (T, 3) camera positions in metres.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Sequence:
 
     @classmethod
     def of(cls, folder: Path, name: str, camera: int = 0) -> Sequence:
-        """A folder with `poses.txt`, `calib.txt`, and pictures of one of its cameras."""
+        """From a folder with `poses.txt`, `calib.txt` and the images of one of its cameras."""
         lines = (folder / "calib.txt").read_text(encoding="utf-8").splitlines()
         P = [float(v) for v in next((x.split(":")[1] for x in lines if x.startswith(f"P{camera}:")), lines[0]).split()]
         frames = folder / ("image_2" if camera == 2 else "image_l")
@@ -46,20 +46,20 @@ class Sequence:
         return cls(name, frames, Camera("pinhole", video.width, video.height, P[0], P[5], P[2], P[6]), truth)
 
     def ate(self, found: F64, rows: slice | list[int] = slice(None)) -> float:
-        """Root mean square metres of (T, 3) places after a similarity."""
+        """Absolute trajectory error: RMS distance in metres of (T, 3) positions after a similarity alignment."""
         off = umeyama(found, self.truth[rows], scaled=True).apply(found) - self.truth[rows]
         return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
-def lit(_: int) -> float:
-    """Light as it is."""
+def constant_light(_: int) -> float:
+    """Constant brightness."""
     return 1.0
 
 
 def odometry(
-    sequence: Sequence, light: Callable[[int], float] = lit, *, keep: bool = False, **params: object
+    sequence: Sequence, light: Callable[[int], float] = constant_light, *, keep: bool = False, **params: object
 ) -> tuple[Odometry, float]:
-    """Odometry over a sequence, each frame's brightness multiplied by `light`; seconds of processor time."""
+    """Odometry of a sequence, each frame's brightness multiplied by `light`; and seconds of CPU time."""
     found = Odometry(sequence.camera, OdometryParams.model_validate(params), keep=keep)
     began = time.process_time()
     for frame in open_video(sequence.frames).frames():
@@ -67,13 +67,13 @@ def odometry(
     return found, time.process_time() - began
 
 
-def places(found: Odometry) -> F64:
-    """(T, 3) of the camera."""
+def positions(found: Odometry) -> F64:
+    """(T, 3) positions of the camera."""
     return np.stack([found.pose_of(p)[:3, 3] for p in found.placed])
 
 
 def pycolmap(sequence: Sequence, out: Path) -> tuple[float, float, float, int]:
-    """ATE, seconds, seconds of processor time and frames of pycolmap's incremental mapping with known intrinsics."""
+    """ATE, seconds, CPU seconds and number of frames of pycolmap's incremental mapping with known intrinsics."""
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     camera = sequence.camera
@@ -92,14 +92,14 @@ options.mapper.init_max_forward_motion = 1
 options.mapper.init_min_tri_angle = 2
 models = pycolmap.incremental_mapping(out / "db.db", images, out, options)
 best = max(models.values(), key=lambda m: m.num_reg_images())
-places = {{best.images[i].name: best.images[i].projection_center().tolist() for i in best.reg_image_ids()}}
-(out / "places.json").write_text(json.dumps([places, time.process_time()]))
+positions = {{best.images[i].name: best.images[i].projection_center().tolist() for i in best.reg_image_ids()}}
+(out / "positions.json").write_text(json.dumps([positions, time.process_time()]))
 """
     began = time.perf_counter()
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     seconds = time.perf_counter() - began
     if done.returncode:
         sys.exit(f"pycolmap failed: {done.stderr[-500:]}")
-    found, busy = json.loads((out / "places.json").read_text(encoding="utf-8"))
+    found, busy = json.loads((out / "positions.json").read_text(encoding="utf-8"))
     rows = sorted((int(Path(name).stem), place) for name, place in found.items())
     return sequence.ate(np.array([p for _, p in rows]), [i for i, _ in rows]), seconds, busy, len(rows)

@@ -1,13 +1,13 @@
-"""Lidar, camera and GPS, each alone and all in one graph: how far each path of a scanner is from the truth.
+"""Lidar, camera and GPS, each alone and fused in one graph: error of the scanner's path for each.
 
 `python -m bench.slam.lidar [--out bench-out/slam_lidar] [--turn FRAMES]`, over
 
-- KITTI odometry 04: 25 real sweeps and photos, true poses, a receiver as `data_samples.gps` makes up;
+- KITTI odometry 04: 25 real sweeps and photos, true poses, a simulated receiver (`data_samples.gps`);
 - the rendered turn of `data_samples.turn` (FRAMES, if it is rendered already), with sweeps of the same town;
 - ten simulated drives of 400 m (`simulated`), each with a tunnel of 60 m for the lidar, a dark stretch of 50 m for the
   camera, whose scale drifts, and GPS with outliers and a jump.
 
-Metres are the root mean square of places after a rigid alignment, the camera's (which has no scale) after a similarity.
+Errors are RMS distances in metres after a rigid alignment, for the camera (without scale) after a similarity.
 Ends with `RESULT {json}`.
 """
 
@@ -37,21 +37,21 @@ from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.slam.geometry import exp_so3, inverse
 from scan2sim.slam.steps.fuse import FuseParams, fuse_path
 from scan2sim.slam.steps.lidar import LidarParams, lidar
-from scan2sim.slam.trajectory.fusion import Fixes, Fused, Steps, camera_steps, fuse
+from scan2sim.slam.trajectory.fusion import Fused, GpsFixes, RelativeMotions, camera_motions, fuse
 
 KITTI = ROOT.parent / "shared" / "data" / "kitti_odo04_f00-24"
 SENSORS = ("lidar", "visual", "gps", "fused")
 T_CAMERA_SCANNER = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.3], [1, 0, 0, 0], [0, 0, 0, 1]])
-"""Of the turn: the scanner stands 30 cm above the camera."""
-ROWS, LOWEST, HIGHEST = 360, -25.0, 15.0
-"""Of the turn's sweeps: rows of half a degree, and elevations (degrees)."""
-NOISE = 0.02
-"""Metres, of their ranges."""
+"""Extrinsics in the turn: the scanner is 30 cm above the camera."""
+SWEEP_ROWS, MIN_ELEVATION_DEG, MAX_ELEVATION_DEG = 360, -25.0, 15.0
+"""Rows of half a degree in the turn's sweeps, and their range of elevations."""
+RANGE_NOISE_M = 0.02
+"""Standard deviation of the ranges."""
 
 
-def ate(places: F64, truth: F64, *, scaled: bool = False) -> float:
-    """Root mean square metres of places (N, 3) after they are aligned."""
-    off = umeyama(places, truth, scaled=scaled).apply(places) - truth
+def ate(positions: F64, truth: F64, *, scaled: bool = False) -> float:
+    """Absolute trajectory error: RMS distance in metres of positions (N, 3) after alignment."""
+    off = umeyama(positions, truth, scaled=scaled).apply(positions) - truth
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
@@ -61,9 +61,9 @@ class Recorded:
 
     Attributes:
         sweeps, photos: folders.
-        truth: (T, 4, 4) of the scanner, at `times` (T,), when each sweep and each photo was taken.
-        focal, centre: of the photos, pixels.
-        extrinsics, clock, gps: files: T_camera_scanner, the times, a receiver's fixes.
+        truth: (T, 4, 4) scanner poses at `times` (T,), at which each sweep and each photo was taken.
+        focal, centre: intrinsics of the photos, pixels.
+        extrinsics, clock, gps: files with T_camera_scanner, the times and the receiver's fixes.
     """
 
     sweeps: Path
@@ -77,7 +77,7 @@ class Recorded:
     gps: Path
 
     def measure(self, out: Path) -> dict[str, float]:
-        """ATE of each sensor alone, and of all together."""
+        """ATE of each sensor alone, and of all fused."""
         scan2sim("slam", self.photos, "--focal", self.focal, "--centre", *self.centre, "--times", self.clock,
                  "--out", out / "slam")  # fmt: skip
         for name in ("lidar", "fused"):
@@ -102,16 +102,16 @@ class Recorded:
         }
 
 
-def received(truth: F64, times: F64, out: Path) -> Path:
-    """A file of what a consumer's receiver says, five times a second, of poses (T, 4, 4) with z up."""
+def write_fixes(truth: F64, times: F64, out: Path) -> Path:
+    """Write the fixes of a simulated consumer receiver, five per second, for poses (T, 4, 4) with z up."""
     way = Trajectory(np.append(times, times[-1] + 0.3), np.concatenate([truth, truth[-1:]])[:, :3, 3])
-    when, places = receiver(way, rate=5.0)
-    np.savetxt(out, np.column_stack([when, places]), "%.4f", delimiter=",", header="time,x,y,z", comments="")
+    when, positions = receiver(way, rate=5.0)
+    np.savetxt(out, np.column_stack([when, positions]), "%.4f", delimiter=",", header="time,x,y,z", comments="")
     return out
 
 
 def kitti(out: Path) -> Recorded:
-    """Of KITTI odometry 04: its scanner's true poses are those of camera 0, by `Tr`."""
+    """KITTI odometry 04: the scanner's true poses are those of camera 0, transformed with `Tr`."""
     out.mkdir(parents=True, exist_ok=True)
     calib, photos = KITTI / "calib.txt", KITTI / "image_2"
     T = io.read_extrinsics(calib)
@@ -127,20 +127,20 @@ def kitti(out: Path) -> Recorded:
     P = [float(value) for value in line.split()[1:]]
     return Recorded(
         KITTI / "velodyne", photos, truth, times, P[0], (P[2], P[6]), out / "extrinsics.txt", out / "times.txt",
-        received(truth, times, out / "gps.csv"),
+        write_fixes(truth, times, out / "gps.csv"),
     )  # fmt: skip
 
 
-def turned(out: Path, frames: Path | None) -> Recorded:
-    """The rendered turn, and sweeps of the town around it, each taken at once."""
+def turn_drive(out: Path, frames: Path | None) -> Recorded:
+    """The rendered turn, with instantaneous sweeps of the town around it."""
     frames = turn.generate_turn(out / "frames") if frames is None else frames
-    path = paths.town_path(0, turn.WAY)
-    whole = paths.drive(path, turn.SPEED, turn.FPS, still=0.0, seed=0)
+    path = paths.town_path(0, turn.PATH_LENGTH_M)
+    whole = paths.drive(path, turn.SPEED_M_S, turn.FPS, still=0.0, seed=0)
     driven = turn.filmed(whole)
-    town = Panorama(build(path, 0), Traffic(path, whole, 0), ROWS, 0)
-    rays = pixel_rays(Camera("equirectangular", 2 * ROWS, ROWS)).reshape(-1, 3).astype(np.float64)
+    town = Panorama(build(path, 0), Traffic(path, whole, 0), SWEEP_ROWS, 0)
+    rays = pixel_rays(Camera("equirectangular", 2 * SWEEP_ROWS, SWEEP_ROWS)).reshape(-1, 3).astype(np.float64)
     height = np.degrees(np.arcsin(-rays[:, 1]))
-    beam = (height > LOWEST) & (height < HIGHEST)
+    beam = (height > MIN_ELEVATION_DEG) & (height < MAX_ELEVATION_DEG)
     truth, rng = driven.poses @ T_CAMERA_SCANNER, np.random.default_rng(0)
     (out / "sweeps").mkdir(parents=True, exist_ok=True)
     for i, (pose, time) in enumerate(zip(truth, driven.times, strict=True)):
@@ -148,7 +148,7 @@ def turned(out: Path, frames: Path | None) -> Recorded:
         looking[:3, :3] = pose[:3, :3] @ T_CAMERA_SCANNER[:3, :3].T
         far = town.render(looking, float(time)).depth.ravel()
         hit = beam & (far < 80) & (far > 1)
-        xyz = rays[hit] * (far[hit] + rng.normal(0, NOISE, int(hit.sum())))[:, None] @ T_CAMERA_SCANNER[:3, :3]
+        xyz = rays[hit] * (far[hit] + rng.normal(0, RANGE_NOISE_M, int(hit.sum())))[:, None] @ T_CAMERA_SCANNER[:3, :3]
         np.column_stack([xyz, np.full(len(xyz), 0.5)]).astype(np.float32).tofile(out / "sweeps" / f"{i:06d}.bin")
     np.savetxt(out / "extrinsics.txt", T_CAMERA_SCANNER[:3], "%.9f")
     times = driven.times - driven.times[0]
@@ -156,39 +156,39 @@ def turned(out: Path, frames: Path | None) -> Recorded:
     P = [float(value) for value in (frames / "calib.txt").read_text(encoding="utf-8").split()]
     return Recorded(
         out / "sweeps", frames / "image_l", truth, times, P[0], (P[2], P[6]), out / "extrinsics.txt",
-        out / "times.txt", received(truth, times, out / "gps.csv"),
+        out / "times.txt", write_fixes(truth, times, out / "gps.csv"),
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Simulated:
-    """What sensors say of a drive: the scanner's `truth` (N, 4, 4) at `times`, steps of a lidar, a camera's path."""
+    """Simulated sensors of a drive: scanner poses `truth` (N, 4, 4) at `times`, lidar steps, camera path, GPS."""
 
     times: F64
     truth: F64
-    lidar: Steps
+    lidar: RelativeMotions
     camera: Trajectory
     T_camera_scanner: F64
     gps: F64
 
     @property
-    def fixes(self) -> Fixes:
-        """GPS as a factor."""
-        return Fixes(self.gps, 0.3, 1.5, 60.0)
+    def fixes(self) -> GpsFixes:
+        """GPS positions as a factor."""
+        return GpsFixes(self.gps, 0.3, 1.5, 60.0)
 
     def fused(self, *sensors: str) -> Fused:
-        """The path by some of lidar, camera, gps."""
+        """Path fused from some of lidar, camera and gps."""
         return fuse(
             self.times,
             lidar=self.lidar if "lidar" in sensors else None,
-            camera=camera_steps(self.camera, self.times) if "camera" in sensors else None,
+            camera=camera_motions(self.camera, self.times) if "camera" in sensors else None,
             T_camera_scanner=self.T_camera_scanner,
             fixes=self.fixes if "gps" in sensors else None,
             first=self.truth[0],
         )
 
     def measure(self) -> dict[str, float]:
-        """ATE of each sensor alone, and of all together."""
+        """ATE of each sensor alone, and of all fused."""
         truth = self.truth[:, :3, 3]
         beside = (self.truth @ inverse(self.T_camera_scanner))[:, :3, 3]
         return {
@@ -206,12 +206,12 @@ def simulated(
     dark: tuple[int, int] = (250, 300),
     outliers: int = 40,
 ) -> Simulated:
-    """A drive of 400 m in 40 s, by sensors that fail in places.
+    """A drive of 400 m in 40 s with sensors that fail in places.
 
     Args:
-        tunnel: steps in which the lidar sees three tenths of the way, and knows that it doesn't know.
-        dark: steps in which the camera is carried on, and marked unsure.
-        outliers: fixes of 400 that are off by tens of metres; fifteen more, together, by 9 m.
+        tunnel: steps in which the lidar measures 0.3 of the motion, with a large covariance.
+        dark: steps in which the camera's motion is extrapolated and marked unsure.
+        outliers: number of GPS fixes out of 400 that are off by tens of metres; fifteen more in a row are off by 9 m.
     """
     rng, n = np.random.default_rng(seed), 400
     times: F64 = np.arange(n, dtype=np.float64) * 0.1
@@ -232,7 +232,7 @@ def simulated(
     sigma[inside, 0] = np.sqrt(tunnel[1] - tunnel[0])
     sure = np.ones(n - 1, bool)
     sure[inside] = False
-    lidar_steps = Steps(step, sigma[:, :, None] ** 2 * np.eye(6), sure)
+    lidar_motions = RelativeMotions(step, sigma[:, :, None] ** 2 * np.eye(6), sure)
 
     camera = truth @ inverse(T)
     seen = inverse(camera[:-1]) @ camera[1:]
@@ -255,21 +255,21 @@ def simulated(
     gps[rng.choice(n, outliers, replace=False)] += rng.normal(0, 30, (outliers, 3))
     if outliers:
         gps[330:345] += [8, 5, 0]
-    return Simulated(times, truth, lidar_steps, Trajectory(times, poses[:, :3, 3], poses[:, :3, :3], unsure), T, gps)
+    return Simulated(times, truth, lidar_motions, Trajectory(times, poses[:, :3, 3], poses[:, :3, :3], unsure), T, gps)
 
 
 def main() -> None:
-    """The command line."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "slam_lidar")
-    parser.add_argument("--turn", type=Path, help="what `python -m scan2sim.data_samples.turn` wrote")
+    parser.add_argument("--turn", type=Path, help="output folder of `python -m scan2sim.data_samples.turn`")
     a = parser.parse_args()
     rows: dict[str, Mapping[str, float]] = {}
     if KITTI.is_dir():
         rows["kitti"] = kitti(a.out / "kitti").measure(a.out / "kitti")
     drives = [simulated(seed).measure() for seed in range(10)]
     rows["simulated"] = {name: float(np.mean([one[name] for one in drives])) for name in SENSORS}
-    rows["turn"] = turned(a.out / "turn", a.turn).measure(a.out / "turn")
+    rows["turn"] = turn_drive(a.out / "turn", a.turn).measure(a.out / "turn")
     print(f"{'ATE, m':<12}" + "".join(f"{name:>10}" for name in SENSORS))
     for drive, row in rows.items():
         print(f"{drive:<12}" + "".join(f"{row[name]:>10.3f}" for name in SENSORS))

@@ -1,6 +1,6 @@
-"""Peak memory of odometry over ever more frames: `python -m bench.slam.memory DRIVE COUNT`, a process of its own.
+"""Peak memory of odometry over a growing number of frames: `python -m bench.slam.memory DRIVE COUNT` in a new process.
 
-A rendered drive of half a minute (512x256) is seen forwards, backwards, forwards again: nothing is lost on the way.
+A rendered drive of half a minute (512x256) is played forwards and backwards, so that tracking is never lost.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from scan2sim.pipeline.core.types import U8, Camera
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 
 SECONDS, HEIGHT, FPS = 34.0, 256, 15.0
-TOLD = (1000, 3000, 10_000)
+FRAME_COUNTS = (1000, 3000, 10_000)
 
 
 def memory(out: Path) -> dict[str, float | None]:
-    """The peak after 10,000 frames, over that after 1,000, less one."""
+    """Relative growth of the peak from 1,000 to 10,000 frames."""
     from scan2sim.data_samples import paths
     from scan2sim.data_samples.drive import generate_drive
 
     folder = out / "drive_small"
     if not (folder / "video.mp4").is_file():
         generate_drive(folder, paths.town_path(0, 600), seconds=SECONDS, fps=FPS, height=HEIGHT, lossless=True)
-    command = [sys.executable, "-m", "bench.slam.memory", str(folder), str(TOLD[-1])]
+    command = [sys.executable, "-m", "bench.slam.memory", str(folder), str(FRAME_COUNTS[-1])]
     done = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True)
     peaks = json.loads(done.stdout)
-    return {"memory_10000_growth": peaks[str(TOLD[-1])] / peaks[str(TOLD[0])] - 1}
+    return {"memory_10000_growth": peaks[str(FRAME_COUNTS[-1])] / peaks[str(FRAME_COUNTS[0])] - 1}
 
 
 def there_and_back(folder: Path) -> Iterator[U8]:
-    """(H, W) frames of a drive and back, for ever; read from files, so that they take no memory."""
+    """(H, W) frames of a drive forwards and backwards without end, read from files to save memory."""
     import cv2
 
     files = sorted((folder / "frames").glob("*.png"))
@@ -45,14 +45,14 @@ def there_and_back(folder: Path) -> Iterator[U8]:
 
 
 def peaks(folder: Path, frames: int) -> dict[int, float]:
-    """Gigabytes at most, by the number of frames so far."""
+    """Peak memory in GB by number of frames."""
     import cv2
 
     mask, found = cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE), {}
     odometry = Odometry(Camera("equirectangular", 2 * HEIGHT, HEIGHT), OdometryParams(count=300), mask=mask)
     for number, grey in enumerate(islice(there_and_back(folder), frames), 1):
         odometry.add(number / FPS, grey)
-        if number in TOLD:
+        if number in FRAME_COUNTS:
             found[number] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
             unsure = sum(p.unsure for p in odometry.placed) / number
             print(f"{number} frames: {found[number]:.3f} GB, {unsure:.1%} unsure", file=sys.stderr, flush=True)

@@ -1,27 +1,27 @@
-"""Visual SLAM against a rendered drive's truth, KITTI's, pycolmap, and the mission's own method.
+"""Visual SLAM compared with the truth of a rendered drive and of KITTI, with pycolmap, and with the method of D3.2.
 
 `python -m bench.slam [--parts drive hard kitti turn adjust trust solvers pano memory] [--length 1500] [--out DIR]`
 
-- drive: 360-degree video (1024 px high, 10 Mbit/s, 15 fps) along a real path (KITTI 00; without the data a made-up one)
-  through a synthetic town with traffic, odometry alone, a consumer receiver's GPS for the scale: D3.2's two errors;
-  frames a second; the first 40 seconds by the mission's method, too (`--backend adam`, adjacent distances).
+- drive: 360-degree video (1024 px high, 10 Mbit/s, 15 fps) along a real path (KITTI 00; without the data a generated
+  one) through a synthetic town with traffic: odometry scaled by a consumer GPS receiver; D3.2's two errors; frames
+  per second; the first 40 seconds also with the method of D3.2 (`--backend adam`, adjacent distances).
 - hard: drives of 100 m with hills, sharp turns, motion blur, rolling shutter, offset lenses and glare, each alone and
-  all together: drift, the share of unsure frames, rolling shutter and lens offset estimated against what was rendered.
-- kitti: 51 frames of KITTI odometry 06 (perspective, real): ATE after a similarity, odometry alone and with the
-  global adjustment; pycolmap's incremental mapping of the same frames, and the ratio of the times.
-- turn: 51 frames of a rendered turn of 98 degrees (perspective, 52 m): ATE, alone and adjusted, and pycolmap's; what
-  it costs there and on KITTI's frames when every other frame has .45 of its brightness; its focal length, found from
-  nothing.
+  all together: drift, share of extrapolated frames, estimated and true rolling shutter and lens offset.
+- kitti: 51 frames of KITTI odometry 06 (perspective, real): ATE after a similarity alignment, for odometry alone and
+  with global adjustment; pycolmap's incremental mapping of the same frames, and the ratio of the times.
+- turn: 51 frames of a rendered turn of 98 degrees (perspective, 52 m): ATE, alone and adjusted, and pycolmap's; the
+  effect of dimming every other frame to 0.45 of its brightness, here and on KITTI; focal length from
+  self-calibration.
 - adjust: odometry alone and adjusted on the above, two more streets (KITTI 04, 0009) and 20 simulated drives; how often
-  the better one is kept, and by how much what is kept is worse than the better one (geometric mean).
-- trust: the share of positions that lie in their 95 % ellipsoids, over 20 simulated drives; pictures of these;
-  what GPS of 10 cm leaves of the error of a turn whose scale drifts as KITTI's did (step lengths .885, 1.001, 1.048);
-  on how many drives a focal length 5 % off, or a centre off by as much, is noticed.
-- pano: rotation and direction of motion between two real 360 frames, against their reference.
-- solvers: `adam` against `lm` with equal chords and equal GPS over ten simulated drives, a paired test.
-- memory: peak of the process over 10,000 frames.
+  the better path is kept, and the ratio of the kept path's error to the better one's (geometric mean).
+- trust: share of positions inside their 95 % ellipsoids over 20 simulated drives, with plots; error of a turn whose
+  scale drifts like KITTI's (step lengths .885, 1.001, 1.048) with 10 cm GPS, relative to without; number of drives with
+  a warning for a focal length or a centre that is 5 % off.
+- pano: rotation and direction of motion between two real 360 frames, compared with a reference.
+- solvers: `adam` and `lm` with equal distance constraints and equal GPS on ten simulated drives, with a paired test.
+- memory: peak memory of the process over 10,000 frames.
 
-Ends with `RESULT {json}`; null where a part was left out.
+Ends with `RESULT {json}`; null for parts that were not run.
 """
 
 from __future__ import annotations
@@ -38,67 +38,67 @@ from bench.paths import ROOT
 from bench.slam.adjust import chosen
 from bench.slam.covariance import covariance, gps_gain, lens
 from bench.slam.drive import DATA, drive
-from bench.slam.frames import Sequence, lit, odometry, places, pycolmap
+from bench.slam.frames import Sequence, constant_light, odometry, positions, pycolmap
 from bench.slam.hard import hard
 from bench.slam.memory import memory
 from bench.slam.solvers import solvers
 from scan2sim.pipeline.core.types import Camera
-from scan2sim.slam.calibration.calibrate import looked_for
+from scan2sim.slam.calibration.calibrate import calibrated_from_scratch
 from scan2sim.slam.geometry import log_so3, relative_pose
 from scan2sim.slam.mapping.global_adjustment import adjust
-from scan2sim.slam.mapping.map_file import Mapped
-from scan2sim.slam.odometry.relocalization import describe, matches
-from scan2sim.slam.odometry.track_log import record
-from scan2sim.slam.odometry.virtual_cameras import Facets
+from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.odometry.relocalization import detect_features, match_descriptors
+from scan2sim.slam.odometry.track_log import record_tracks
+from scan2sim.slam.odometry.virtual_cameras import VirtualViews
 from scan2sim.slam.trackers import named
 from scan2sim.slam.video import open_video
 
 PARTS = ("drive", "hard", "kitti", "turn", "adjust", "trust", "solvers", "pano", "memory")
-USUAL = ("drive", "kitti", "turn", "adjust", "trust", "pano")
+DEFAULT_PARTS = ("drive", "kitti", "turn", "adjust", "trust", "pano")
 
 
 def kitti(out: Path) -> dict[str, float | None]:
-    """ATE on 51 real frames, and the time against pycolmap's incremental mapping."""
+    """ATE on 51 real frames, and the time relative to pycolmap's incremental mapping."""
     sequence = Sequence.of(DATA / "kitti_odo06_vo51", "KITTI 06")
-    odometry(sequence)  # compiled code and file caches are no part of either's time
+    odometry(sequence)  # warm up compiled code and file caches
     began = time.perf_counter()
-    alone = sequence.ate(places(odometry(sequence)[0]))
+    alone = sequence.ate(positions(odometry(sequence)[0]))
     seconds = time.perf_counter() - began
     found, _ = odometry(sequence, keep=True)
     began = time.perf_counter()
-    adjust(Mapped.of(found, []))
+    adjust(MapCheckpoint.of(found, []))
     adjusting = time.perf_counter() - began
     theirs, their_seconds, _, registered = pycolmap(sequence, out / "pycolmap")
     print(f"KITTI 06, 51 frames: odometry {100 * alone:.2f} cm in {seconds:.1f} s")
-    print(f"  with global adjustment {100 * sequence.ate(places(found)):.2f} cm, {adjusting:.1f} s more")
+    print(f"  with global adjustment {100 * sequence.ate(positions(found)):.2f} cm, {adjusting:.1f} s more")
     print(f"  pycolmap {100 * theirs:.2f} cm in {their_seconds:.1f} s, {registered} frames", flush=True)
     return {"kitti06_ate_m": alone, "pycolmap_time_ratio": their_seconds / seconds}
 
 
 def pictures(out: Path) -> list[Sequence]:
-    """The rendered turn, made if absent, and KITTI's odometry 06 and 04 where they are."""
+    """The rendered turn, generated if missing, and KITTI odometry 06 and 04 if available."""
     from scan2sim.data_samples.turn import generate_turn
 
     folder = out / "turn"
     if not (folder / "calib.txt").is_file():
-        print("rendering a turn: about ten seconds a frame", flush=True)
+        print("rendering a turn: about ten seconds per frame", flush=True)
         generate_turn(folder)
     known = [(DATA / "kitti_odo06_vo51", "KITTI 06", 0), (DATA / "kitti_odo04_f00-24", "KITTI 04", 2)]
     return [Sequence.of(folder, "turn"), *(Sequence.of(*one) for one in known if one[0].is_dir())]
 
 
 def turn(out: Path) -> dict[str, float | None]:
-    """ATE in a rendered turn, against pycolmap's; what light that flickers costs there, and on KITTI's frames."""
+    """ATE in a rendered turn, compared with pycolmap's; the effect of flickering light here and on KITTI's frames."""
     sequence, *streets = pictures(out)
     ratios = [_flicker(one) for one in (sequence, *streets)]
     found, busy = odometry(sequence)
-    alone = sequence.ate(places(found))
+    alone = sequence.ate(positions(found))
     found, _ = odometry(sequence, keep=True)
     began = time.process_time()
-    adjust(Mapped.of(found, []))
-    adjusting, adjusted = time.process_time() - began, sequence.ate(places(found))
+    adjust(MapCheckpoint.of(found, []))
+    adjusting, adjusted = time.process_time() - began, sequence.ate(positions(found))
     theirs, _, their_busy, registered = pycolmap(sequence, out / "pycolmap_turn")
-    print(f"turn, 51 frames: odometry {100 * alone:.2f} cm in {busy:.1f} s of processor time")
+    print(f"turn, 51 frames: odometry {100 * alone:.2f} cm in {busy:.1f} s of CPU time")
     print(f"  with global adjustment {100 * adjusted:.2f} cm, {adjusting:.1f} s more")
     print(f"  pycolmap {100 * theirs:.2f} cm in {their_busy:.1f} s, {registered} frames", flush=True)
     return {
@@ -109,10 +109,10 @@ def turn(out: Path) -> dict[str, float | None]:
 
 
 def _calibrated(sequence: Sequence) -> float | None:
-    """By how many percent the focal length is off that calibration finds, of which nothing is known before."""
-    known = looked_for(record(open_video(sequence.frames), None))
+    """Error in percent of the focal length found by self-calibration without prior knowledge."""
+    known = calibrated_from_scratch(record_tracks(open_video(sequence.frames), None))
     if known is None:
-        print(f"{sequence.name}: no lens is found")
+        print(f"{sequence.name}: self-calibration failed")
         return None
     true, own = sequence.camera, known.camera
     print(
@@ -124,21 +124,25 @@ def _calibrated(sequence: Sequence) -> float | None:
 
 
 def _flicker(sequence: Sequence) -> float:
-    """ATE with every other frame at .45 of its brightness, over that without: means over three numbers of features."""
-    lights: list[Callable[[int], float]] = [lit, lambda k: 0.45 if k % 2 else 1.0, lambda k: 0.35 if k >= 12 else 1.0]
+    """ATE with every other frame dimmed to 0.45, relative to without; means over three numbers of features."""
+    lights: list[Callable[[int], float]] = [
+        constant_light,
+        lambda k: 0.45 if k % 2 else 1.0,
+        lambda k: 0.35 if k >= 12 else 1.0,
+    ]
     means = [
-        np.mean([sequence.ate(places(odometry(sequence, light, count=n)[0])) for n in (640, 700, 760)])
+        np.mean([sequence.ate(positions(odometry(sequence, light, count=n)[0])) for n in (640, 700, 760)])
         for light in lights
     ]
-    told = ", ".join(f"{100 * mean:.2f}" for mean in means)
-    print(f"{sequence.name}: {told} cm (as it is; every other frame at .45; .35 from the 13th on)", flush=True)
+    text = ", ".join(f"{100 * mean:.2f}" for mean in means)
+    print(f"{sequence.name}: {text} cm (original; every other frame at .45; .35 from the 13th on)", flush=True)
     return float(means[1] / means[0])
 
 
 def pano() -> None:
     """Rotation and direction of motion between two real 360 frames, by descriptors and by tracked corners.
 
-    The reference holds world-to-camera poses in axes of its own: x back, y right, z up (told by its motion).
+    The reference has world-to-camera poses with axes x back, y right, z up (inferred from its motion).
     """
     import cv2
 
@@ -152,10 +156,10 @@ def pano() -> None:
         cv2.resize(cv2.imread(str(f), cv2.IMREAD_GRAYSCALE), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
         for f in sorted(folder.glob("2019*.jpg"))
     )
-    facets, rng = Facets(Camera("equirectangular", 1024, 512)), np.random.default_rng(0)
-    a, b = (describe(facets, facets.pictures(grey)) for grey in (first, second))
-    pairs = matches(a.descriptor, b.descriptor)
-    tracker = named("corners", facets, None, 600)
+    views, rng = VirtualViews(Camera("equirectangular", 1024, 512)), np.random.default_rng(0)
+    a, b = (detect_features(views, views.images(grey)) for grey in (first, second))
+    pairs = match_descriptors(a.descriptor, b.descriptor)
+    tracker = named("corners", views, None, 600)
     tracker.track(first)
     tracker.refill()
     before = tracker.tracks
@@ -179,12 +183,12 @@ def pano() -> None:
 
 
 def main() -> None:
-    """Run the parts, print tables and the result."""
+    """Run the parts, and print tables and the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=USUAL)
-    parser.add_argument("--path", default="00", help="of kitti_gt_poses")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=DEFAULT_PARTS)
+    parser.add_argument("--path", default="00", help="name of the path in kitti_gt_poses")
     parser.add_argument("--length", type=float, default=1500.0)
-    parser.add_argument("--adam", type=float, default=40.0, help="seconds for the mission's method; 0: leave it out")
+    parser.add_argument("--adam", type=float, default=40.0, help="seconds for the method of D3.2; 0: skip it")
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "slam")
     arguments = parser.parse_args()
     out: Path = arguments.out
@@ -209,7 +213,7 @@ def main() -> None:
         if part not in arguments.parts:
             continue
         if not (DATA / needed).is_dir():
-            print(f"{part}: left out, there is no {DATA / needed}")
+            print(f"{part}: skipped, {DATA / needed} doesn't exist")
         elif part == "kitti":
             result |= kitti(out)
         else:

@@ -1,4 +1,4 @@
-"""The mission's solver against ours, with all else equal: simulated drives, the same chords, the same GPS."""
+"""The `adam` solver of D3.2 compared with `lm`, all else equal: simulated drives, distance constraints and GPS."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 from scan2sim.slam.trajectory.gps import smooth
 from tests.slam.synthetic import Follower, ate, drive, scatter
 
-SEEDS, SECONDS, TRACKS, PARALLAX = 10, 8.0, 150, 6.0
-WANDER, MEMORY, JITTER = 1.5, 60.0, 0.15
-"""Of a receiver: metres of its slow error, seconds until that has decayed to 1/e, metres of its white one."""
+SEEDS, SECONDS, TRACKS, PARALLAX_DEG = 10, 8.0, 150, 6.0
+GPS_DRIFT_M, GPS_DRIFT_S, GPS_NOISE_M = 1.5, 60.0, 0.15
+"""Slow error of the receiver, its correlation time (decay to 1/e), and its white noise."""
 
-Chords = Literal["long", "adjacent"]
+DistanceConstraints = Literal["long", "adjacent"]
 
 
-def receiver(times: F64, places: F64, seed: int) -> GpsTrack:
-    """One fix a second, smoothed, off by a slow error and a white one."""
+def receiver(times: F64, positions: F64, seed: int) -> GpsTrack:
+    """One smoothed fix per second with a slowly varying error and white noise."""
     rng = np.random.default_rng([seed, 7])
-    which = np.arange(0, len(times), 10)
-    keep = np.exp(-1 / MEMORY)
-    error = rng.normal(0, WANDER, (len(which), 3))
-    for i in range(1, len(which)):
+    rows = np.arange(0, len(times), 10)
+    keep = np.exp(-1 / GPS_DRIFT_S)
+    error = rng.normal(0, GPS_DRIFT_M, (len(rows), 3))
+    for i in range(1, len(rows)):
         error[i] = keep * error[i - 1] + np.sqrt(1 - keep**2) * error[i]
-    return smooth(GpsTrack(times[which], places[which] + error + rng.normal(0, JITTER, error.shape)))
+    return smooth(GpsTrack(times[rows], positions[rows] + error + rng.normal(0, GPS_NOISE_M, error.shape)))
 
 
-def error(seed: int, backend: str, chords: Chords) -> float:
-    """ATE of a simulated drive in per cent of its way."""
+def error(seed: int, backend: str, chords: DistanceConstraints) -> float:
+    """ATE of a simulated drive in percent of its length."""
     times, poses = drive(SECONDS, turn=0.05 * (1 + seed % 4))
     truth = poses[:, :3, 3]
     follower = Follower(poses, scatter(poses, 5000, seed), count=TRACKS, noise=np.radians(0.05), seed=seed)
     odometry = Odometry(
-        Camera("equirectangular", 2048, 1024), OdometryParams(gps_chords=chords, parallax=PARALLAX, seed=seed),
+        Camera("equirectangular", 2048, 1024), OdometryParams(gps_chords=chords, parallax=PARALLAX_DEG, seed=seed),
         tracker=follower,
         gps=receiver(times, truth, seed), backend=backend,
     )  # fmt: skip
@@ -47,15 +47,15 @@ def error(seed: int, backend: str, chords: Chords) -> float:
 
 
 def solvers() -> dict[str, float | None]:
-    """Wilcoxon's paired test over the seeds: `adam` against `lm` with chords alike; and chords with `lm` alone."""
+    """Paired Wilcoxon test over the seeds: `adam` and adjacent distance constraints, each compared with `lm`."""
     from scipy.stats import wilcoxon
 
-    kinds: tuple[tuple[str, Chords], ...] = (("lm", "long"), ("adam", "long"), ("lm", "adjacent"))
+    kinds: tuple[tuple[str, DistanceConstraints], ...] = (("lm", "long"), ("adam", "long"), ("lm", "adjacent"))
     found = {kind: np.array([error(seed, *kind) for seed in range(SEEDS)]) for kind in kinds}
     ours = found[kinds[0]]
     for (backend, chords), errors in found.items():
-        told = f"{backend}, {chords} chords: {errors.mean():.4f} % ({errors.min():.4f} to {errors.max():.4f})"
+        summary = f"{backend}, {chords} distances: {errors.mean():.4f} % ({errors.min():.4f} to {errors.max():.4f})"
         better = int((errors < ours).sum())
         p = 1.0 if errors is ours else float(wilcoxon(errors, ours).pvalue)
-        print(f"{told}, better than lm with long ones on {better} of {SEEDS} drives, p {p:.3f}", flush=True)
+        print(f"{summary}, better than lm with long ones on {better} of {SEEDS} drives, p {p:.3f}", flush=True)
     return {"adam_lm_p": float(wilcoxon(found[kinds[1]], ours).pvalue)}

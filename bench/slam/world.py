@@ -1,11 +1,11 @@
-"""A real street's world from SLAM's poses, beside the same from poses that its lidar sweeps were matched by.
+"""World of a real street from SLAM poses, compared with the world from registered lidar poses.
 
-`python -m bench.slam.world [--out bench-out/slam_world]`: the photos of a KITTI drive go through `scan2sim slam` (its
-OXTS, with 10 cm of noise, ties the scale), `import sweeps` assembles lidar and photos, `run` makes the world;
-`import kitti-raw` with the matched poses makes the other. Every fifth photo is held out in both.
+`python -m bench.slam.world [--out bench-out/slam_world]`: the photos of a KITTI drive are processed by `scan2sim slam`
+(scaled by its OXTS positions with 10 cm of noise), `import sweeps` assembles lidar and photos, `run` builds the world;
+`import kitti-raw` with the registered poses gives the other world. Every fifth photo is held out in both.
 
-Ends with `RESULT {json}`: how far apart places of the same returns are, the cloud's distance to its own mesh, and the
-held-out photos' PSNR, each for both.
+Ends with `RESULT {json}`: mean distance between the two paths, distance of the cloud to its own mesh, and PSNR of the
+held-out photos, for both.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ DRIVE = ROOT.parent / "shared" / "data" / "kitti_raw0009_f00-24"
 
 
 def seconds(file: Path, start: float) -> np.ndarray:
-    """(T,) seconds after `start` (UNIX) of a file of KITTI's time stamps."""
+    """(T,) seconds after `start` (UNIX time), from a KITTI time stamp file."""
     return (
         np.array(
             [
@@ -42,7 +42,7 @@ def seconds(file: Path, start: float) -> np.ndarray:
 
 
 def prepare(out: Path, drive: Path) -> dict[str, Path]:
-    """What `slam` and `import sweeps` need of a KITTI drive: GPS, times, where the camera is."""
+    """Write the inputs of `slam` and `import sweeps` for a KITTI drive: GPS, times, extrinsics."""
     sync = next(drive.glob("*_sync"))
     start = seconds(sync / "image_02" / "timestamps.txt", 0.0)[0]
     oxts = np.array(
@@ -67,7 +67,7 @@ def prepare(out: Path, drive: Path) -> dict[str, Path]:
             key, _, values = line.partition(":")
             numbers[key] = values
     T = np.eye(4)
-    T[:3, :3] = np.array(numbers["R"].split(), float).reshape(3, 3)  # the later file's: scanner to camera 0
+    T[:3, :3] = np.array(numbers["R"].split(), float).reshape(3, 3)  # of the second file: scanner to camera 0
     T[:3, 3] = np.array(numbers["T"].split(), float)
     rectify, P = np.eye(4), np.array(numbers["P_rect_02"].split(), float).reshape(3, 4)
     rectify[:3, :3] = np.array(numbers["R_rect_00"].split(), float).reshape(3, 3)
@@ -78,12 +78,12 @@ def prepare(out: Path, drive: Path) -> dict[str, Path]:
 
 
 def main() -> None:
-    """Make both worlds and compare them."""
+    """Build both worlds and compare them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "slam_world")
     out: Path = parser.parse_args().out
     if not DRIVE.is_dir():
-        sys.exit(f"there is no {DRIVE}")
+        sys.exit(f"{DRIVE} doesn't exist")
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     drive = next(p for p in DRIVE.iterdir() if p.is_dir())

@@ -1,4 +1,4 @@
-"""KITTI's tracking boxes of raw drive 0009 (tracking sequence 0001): masks, and what is left of cars."""
+"""KITTI's tracking boxes of raw drive 0009 (tracking sequence 0001): masks, and surface remaining of cars."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from scan2sim.pipeline.core.types import F64, Bools
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-SEEN_IN = 3
-"""Frames that a vehicle's box is drawn in at least for its place to be known."""
-NEAR = 30.0
-"""Metres from the path: cars further away have few returns and boxes that jump."""
-GROUND = 0.3
-"""Metres above a box's bottom below which a surface is the ground: kerbs, and boxes that stand a little low."""
-SIDES = 0.1
-"""Metres that a box is smaller to each side: a wall that a car touches isn't the car."""
-SPACING = 400.0
-"""Samples a square metre of surface."""
+MIN_FRAMES = 3
+"""Minimum number of frames with a vehicle's box for its position to be reliable."""
+MAX_DISTANCE_M = 30.0
+"""Maximum distance from the path: cars beyond have few returns and unstable boxes."""
+GROUND_M = 0.3
+"""Height above a box's bottom below which surface counts as ground: kerbs, and boxes that are a little low."""
+SIDE_MARGIN_M = 0.1
+"""Margin by which a box is reduced on each side: a wall touching a car isn't part of it."""
+SAMPLES_PER_M2 = 400.0
+"""Density of surface samples."""
 
 
 @dataclass(frozen=True)
 class Box:
-    """A vehicle: `T` (4, 4), its bottom's middle, x along it, to local metres; `size` (3,) along it, across and up."""
+    """A vehicle: `T` (4, 4) from its bottom's centre, x forward, to local metres; `size` (3,) length, width, height."""
 
     track: int
     T: F64
@@ -38,7 +38,7 @@ class Box:
 
 
 def mask(labels: Path, frame: int, shape: Sequence[int]) -> Bools:
-    """(H, W) pixels within a frame's 2D boxes, those that KITTI says nothing of (DontCare) among them."""
+    """(H, W) pixels within a frame's 2D boxes, including those that KITTI doesn't label (DontCare)."""
     out = np.zeros(tuple(shape[:2]), bool)
     for row in _rows(labels):
         if int(row[0]) == frame:
@@ -48,73 +48,73 @@ def mask(labels: Path, frame: int, shape: Sequence[int]) -> Bools:
 
 
 def boxes(labels: Path, photos: Mapping[int, Photo]) -> list[Box]:
-    """The parked vehicles' boxes in the world: medians over the frames; those that move are left out."""
+    """Boxes of the parked vehicles in the world: medians over the frames; moving vehicles are excluded."""
     tracks: dict[int, list[tuple[F64, F64, F64]]] = {}
     for row in _rows(labels):
         if row[2] == "DontCare" or int(row[0]) not in photos:
             continue
         height, width, length, x, y, z, ry = (float(v) for v in row[10:17])
-        # labels are in the rectified camera 0, photos of camera 2: 6 cm beside it
+        # labels are in the rectified camera 0, photos in camera 2, 6 cm beside it
         T = photos[int(row[0])].T
         place = T[:3, :3] @ (np.array([x, y, z]) + CAMERA_0) + T[:3, 3]
         along = T[:3, :3] @ np.array([np.cos(ry), 0, -np.sin(ry)])
-        if np.hypot(x, z) < NEAR:
+        if np.hypot(x, z) < MAX_DISTANCE_M:
             tracks.setdefault(int(row[1]), []).append((place, along, np.array([length, width, height])))
     out = []
     for track, drawn in tracks.items():
-        places = np.array([d[0] for d in drawn])
-        if len(drawn) < SEEN_IN or np.ptp(places[:, :2], axis=0).max() > 2.5:
+        samples = np.array([d[0] for d in drawn])
+        if len(drawn) < MIN_FRAMES or np.ptp(samples[:, :2], axis=0).max() > 2.5:
             continue
         along = np.median([d[1] for d in drawn], axis=0) * [1, 1, 0]
         along /= np.linalg.norm(along)
         T = np.eye(4)
-        T[:3, 0], T[:3, 1], T[:3, 3] = along, [-along[1], along[0], 0], np.median(places, axis=0)
+        T[:3, 0], T[:3, 1], T[:3, 3] = along, [-along[1], along[0], 0], np.median(samples, axis=0)
         out.append(Box(track, T, np.median([d[2] for d in drawn], axis=0)))
     return out
 
 
 CAMERA_0 = np.array([0.0597, 0.0, 0.0])
-"""Metres: camera 0's points in camera 2, from P_rect_02 (its fourth column by the focal length)."""
+"""Position of camera 0 in camera 2, metres, from P_rect_02 (its fourth column divided by the focal length)."""
 
 
 def remains(world: World, parked: Sequence[Box]) -> dict[int, float]:
     """Square metres of surface within each vehicle's box, above the ground, by track."""
-    places = spread(world)
+    samples = sample_surface(world)
     out = {}
     for box in parked:
-        local = (places - box.T[:3, 3]) @ box.T[:3, :3]
-        half = box.size[:2] / 2 - SIDES
-        inside = (np.abs(local[:, :2]) < half).all(axis=1) & (local[:, 2] > GROUND) & (local[:, 2] < box.size[2])
-        out[box.track] = float(inside.sum() / SPACING)
+        local = (samples - box.T[:3, 3]) @ box.T[:3, :3]
+        half = box.size[:2] / 2 - SIDE_MARGIN_M
+        inside = (np.abs(local[:, :2]) < half).all(axis=1) & (local[:, 2] > GROUND_M) & (local[:, 2] < box.size[2])
+        out[box.track] = float(inside.sum() / SAMPLES_PER_M2)
     return out
 
 
 def corridor(world: World, path: F64) -> float:
-    """Square metres of surface where the recording car itself drove, and nothing static can be.
+    """Square metres of surface where the recording car itself drove, which must be free.
 
-    That is 1 m to each side of the cameras' path, from 1.1 m below them to their height.
+    This is 1 m to each side of the cameras' path, from 1.1 m below them up to their height.
     """
-    places = spread(world)
-    out = np.zeros(len(places), bool)
+    samples = sample_surface(world)
+    out = np.zeros(len(samples), bool)
     for a, b in pairwise(path):
         along = (b - a) * [1, 1, 0]
         length = float(np.linalg.norm(along))
         if length < 0.05:
             continue
         along /= length
-        to = places - a
+        to = samples - a
         ahead, beside = to @ along, to @ [-along[1], along[0], 0]
         out |= (ahead >= 0) & (ahead <= length) & (np.abs(beside) < 1) & (to[:, 2] > -1.1) & (to[:, 2] < 0)
-    return float(out.sum() / SPACING)
+    return float(out.sum() / SAMPLES_PER_M2)
 
 
-def spread(world: World) -> F64:
-    """Places (N, 3) spread evenly over the world's surface."""
+def sample_surface(world: World) -> F64:
+    """Samples (N, 3) sample_surface evenly over the world's surface."""
     rng = np.random.default_rng(0)
     corner = world.vertices[world.faces].astype(np.float64)
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) / 2
     total = np.cumsum(area)
-    face = np.searchsorted(total, rng.uniform(0, total[-1], int(total[-1] * SPACING))).clip(max=len(area) - 1)
+    face = np.searchsorted(total, rng.uniform(0, total[-1], int(total[-1] * SAMPLES_PER_M2))).clip(max=len(area) - 1)
     u, v = np.sqrt(rng.uniform(size=(len(face), 1))), rng.uniform(size=(len(face), 1))
     a, b, c = corner[face].transpose(1, 0, 2)
     return np.asarray((1 - u) * a + u * (1 - v) * b + u * v * c)

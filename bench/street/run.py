@@ -1,25 +1,25 @@
-"""Two real streets, from raw data to a scored world, by a scorer of its own, with OpenMVS' figures beside.
+"""Two real streets from raw data to a scored world, with an independent renderer; OpenMVS' results beside.
 
 `python -m bench.street [--parts odo04 raw0009 keep synthetic time] [--out bench-out/street] [--score-only]
 [--set KEY=VALUE ...]`
 
 The streets are 25 frames each of KITTI odometry 04 (traffic) and of KITTI raw drive 0009 (parked cars); every 8th photo
-(frames 4, 12 and 20) is held out. The world is read as anyone would read it (OBJ and PNG), cast with 3 x 3 rays a pixel
-through true pixel centres. One gain a channel is solved for each photo; figures are means over the three photos, each
-of which counts, however bad it is.
+(frames 4, 12 and 20) is held out. The world is read from its exported files (OBJ and PNG) and rendered with 3 x 3 rays
+per pixel. A gain per channel is solved for each photo; metrics are means over the three photos, all of which count.
 
-**Which pixels count**: those whose middle ray meets the world, whether a photo ever saw the place or not (grey counts
-as what it is); not those that show what moves or, where vehicles are removed, any vehicle: by KITTI's tracking boxes
-on raw 0009, by hand on odometry 04 (`street_truth.json`). Sky and places without surface don't count; `uncovered` is
-the share of the held-out frame's own returns within 30 m that fall on such pixels, so that leaving surface out shows.
+**Which pixels count**: those whose central ray hits the world, whether the surface is textured by a photo or not; not
+those that show moving objects or, if vehicles are removed, any vehicle: from KITTI's tracking boxes on raw 0009, drawn
+by hand on odometry 04 (`truth.json`). Sky and pixels without surface don't count; `uncovered` is the share of the
+held-out frame's own returns within 30 m that fall on such pixels, so that missing surface is visible.
 
-- odo04, raw0009: the streets by the defaults. keep: raw 0009 with `split.vehicles=keep`, all pixels counting.
-- synthetic: figures against the truth of a synthetic street (`street_synthetic.py`), and of straight edges
+- odo04, raw0009: the streets with default settings. keep: raw 0009 with `split.vehicles=keep`, counting all pixels.
+- synthetic: metrics with ground truth on a synthetic street (`bench/street/synthetic.py`), and straightness of edges
   (`bench.edges`).
-- time: the street of nine million points by this checkout and by an older one (`--old FOLDER`).
+- time: the street of nine million points with this checkout and with an older one (`--old FOLDER`).
 
-A part's figures stay in its `figures.json` below `--out`; what isn't run again is told from there. Pictures of photo
-and rendering lie beside it. Ends with `RESULT {json}`; null, with a reason before it, where there is no figure.
+Results of a part are stored in its `figures.json` below `--out`; parts that aren't run again are read from there.
+Images of photo and rendering are written beside it. Ends with `RESULT {json}`; null, with a reason before it, without a
+result.
 """
 
 from __future__ import annotations
@@ -41,28 +41,28 @@ from bench.measure import measure
 from bench.paths import ROOT
 from bench.street import boxes, score
 from bench.street import synthetic as street_synthetic
-from bench.street.world import BACKGROUND, Photo, Seen, World, photos
+from bench.street.world import BACKGROUND, Photo, Rendering, World, photos
 from scan2sim.pipeline.core.types import F64, I64, U8, Bools
 
 DATA = ROOT.parent / "shared" / "data"
 HELD_OUT = (4, 12, 20)
-NEAR, PER_PHOTO = 30.0, 0.05
-"""Metres within which returns are to be covered, and seconds from the photo's time to those of its own sweep."""
-BESIDE = 3
-"""Pixels beside a return that the lidar has reached, too."""
+MAX_RANGE_M, SWEEP_WINDOW_S = 30.0, 0.05
+"""Range within which returns must be covered, and maximum time from the photo to the returns of its own sweep."""
+RETURN_RADIUS_PX = 3
+"""Radius around a return that counts as reached by the lidar."""
 PARTS = ("odo04", "raw0009", "keep", "synthetic", "time")
 EDGES = "bench.edges"
-"""Measures `edge_cm`."""
+"""Module that measures `edge_cm`."""
 OPENMVS = {"odo04": "17.6 / .63 / 1.20 (on a carved mesh)", "raw0009": "18.5 / .80 / 1.14 (on this chain's mesh)"}
-"""TextureMesh: dB, SSIM, sharpness; measured over 51 and 25 frames."""
-SIGN = 12.0
-"""Pixels across from which a plate is to be readable."""
+"""Results of OpenMVS' TextureMesh: dB, SSIM, sharpness; measured over 51 and 25 frames."""
+MIN_SIGN_PX = 12.0
+"""Minimum size of a sign in which it must be readable."""
 NOTHING: dict[str, Any] = {}
 
 
 @dataclass(frozen=True)
 class Street:
-    """A real street: what imports it, and where its vehicles' boxes are (None: drawn by hand alone)."""
+    """A real street: arguments of its import, and its vehicles' boxes (None: drawn by hand only)."""
 
     name: str
     data: Path
@@ -84,8 +84,8 @@ STREETS = {
 
 
 def scan2sim(*arguments: object, code: Path | None = None) -> float:
-    """Run the command, of another checkout if given; seconds."""
-    at = code or ROOT  # the folder it runs from comes before all others on Python's path
+    """Run the command, optionally from another checkout; returns seconds."""
+    at = code or ROOT  # the folder that it runs in is first on Python's search path
     command = [sys.executable, "-m", "scan2sim.flows.cli", *map(str, arguments)]
     measured = measure(["env", f"--chdir={at}", f"PYTHONPATH={at}", *command])
     if measured.status:
@@ -93,8 +93,8 @@ def scan2sim(*arguments: object, code: Path | None = None) -> float:
     return measured.seconds
 
 
-def made(street: Street, folder: Path, settings: tuple[str, ...] = (), *, run: bool = True) -> tuple[Path, Path]:
-    """Import the street and make its world; folders of tile and run. What is made already stays."""
+def build_world(street: Street, folder: Path, settings: tuple[str, ...] = (), *, run: bool = True) -> tuple[Path, Path]:
+    """Import the street and build its world; returns the folders of tile and run. Existing results are reused."""
     tile, out = folder / "tile", folder / "run"
     if not (tile / "tile.toml").is_file():
         scan2sim("import", *street.importing, "--out", tile)
@@ -103,8 +103,8 @@ def made(street: Street, folder: Path, settings: tuple[str, ...] = (), *, run: b
     return tile, out
 
 
-def scored(street: Street, tile: Path, run: Path, pictures: Path, *, keep: bool = False) -> dict[str, Any]:
-    """All figures of a street's world."""
+def score_world(street: Street, tile: Path, run: Path, pictures: Path, *, keep: bool = False) -> dict[str, Any]:
+    """All metrics of a street's world."""
     import laspy
 
     world = World(run / "world")
@@ -115,24 +115,27 @@ def scored(street: Street, tile: Path, run: Path, pictures: Path, *, keep: bool 
     times_of = np.asarray(cloud.gps_time)
     for frame in HELD_OUT:
         photo, drawn = views[frame], score.truth()[street.name][str(frame)]
-        seen = world.seen(photo)
+        rendering = world.render(photo)
         masked = np.zeros(photo.rgb.shape[:2], bool) if keep else _vehicles(street, frame, photo)
-        counts = seen.hit & ~masked
-        own = np.abs(times_of - photo.time) < PER_PHOTO
-        rows[frame] = score.likeness(photo.rgb, seen.rgb, counts)
-        rows[frame] |= {"counted": float(counts.mean()), "uncovered": _uncovered(returns[own], photo, seen, masked)}
+        counts = rendering.hit & ~masked
+        own = np.abs(times_of - photo.time) < SWEEP_WINDOW_S
+        rows[frame] = score.similarity(photo.rgb, rendering.rgb, counts)
+        rows[frame] |= {
+            "counted": float(counts.mean()),
+            "uncovered": _uncovered(returns[own], photo, rendering, masked),
+        }
         reached = _reached(returns, photo)
-        gained = np.round(score.gained(photo.rgb, seen.rgb, counts)).astype(np.uint8)
+        corrected = np.round(score.apply_gain(photo.rgb, rendering.rgb, counts)).astype(np.uint8)
         for kind, lines in drawn["outlines"].items():
             for i, line in enumerate(lines):
-                shift, (column, row) = _shifts(photo.rgb, gained, line)
+                shift, (column, row) = _shifts(photo.rgb, corrected, line)
                 shifts.append((f"{frame} {kind} {i}", shift))
                 scanned.append(reached[row, column])
         for name, polygon in drawn["signs"].items():
-            if np.ptp(np.array(polygon), axis=0).max() >= SIGN:
+            if np.ptp(np.array(polygon), axis=0).max() >= MIN_SIGN_PX:
                 at = score.filled([polygon], photo.rgb.shape)
-                signs[f"{frame} {name}"] = score.psnr(score.squared_error(photo.rgb, gained, at))
-        _picture(pictures / f"{street.name}_{frame:02d}.png", photo.rgb, gained, counts)
+                signs[f"{frame} {name}"] = score.psnr(score.squared_error(photo.rgb, corrected, at))
+        _picture(pictures / f"{street.name}_{frame:02d}.png", photo.rgb, corrected, counts)
     parked = boxes.boxes(street.labels, views) if street.labels and not keep else []
     path = np.array([views[f].T[:3, 3] for f in sorted(views)])
     left = boxes.remains(world, parked)
@@ -169,17 +172,17 @@ def _shifts(photo: U8, rendering: U8, line: Sequence[Sequence[float]]) -> tuple[
 
 
 def _reached(returns: F64, photo: Photo) -> Bools:
-    """(H, W) pixels beside which any sweep's return within 60 m falls: what of the photo the lidar reached."""
+    """(H, W) pixels near any sweep's return within 60 m: the part of the photo that the lidar reached."""
     from scipy.ndimage import binary_dilation
 
-    column, row = _pixels(returns, photo, 2 * NEAR)
+    column, row = _pixels(returns, photo, 2 * MAX_RANGE_M)
     out = np.zeros(photo.rgb.shape[:2], bool)
     out[row, column] = True
-    return np.asarray(binary_dilation(out, iterations=BESIDE))
+    return np.asarray(binary_dilation(out, iterations=RETURN_RADIUS_PX))
 
 
 def _pixels(returns: F64, photo: Photo, far: float) -> tuple[I64, I64]:
-    """Columns and rows of the places (N, 3) in front of a photo, nearer than `far` metres, that fall into it."""
+    """Columns and rows of points (N, 3) in front of a photo, nearer than `far` metres, that project into it."""
     local = (returns - photo.T[:3, 3]) @ photo.T[:3, :3]
     local = local[(local[:, 2] > 0.5) & (np.linalg.norm(local, axis=1) < far)] @ photo.K.T
     column, row = np.round(local[:, :2] / local[:, 2:]).astype(np.int64).T
@@ -188,11 +191,11 @@ def _pixels(returns: F64, photo: Photo, far: float) -> tuple[I64, I64]:
     return column[inside], row[inside]
 
 
-def _uncovered(own: F64, photo: Photo, seen: Seen, masked: Bools) -> float:
-    """Share of the returns of the photo's own sweep, on pixels that aren't masked, where the world shows nothing."""
-    column, row = _pixels(own, photo, NEAR)
+def _uncovered(own: F64, photo: Photo, rendering: Rendering, masked: Bools) -> float:
+    """Share of returns of the photo's own sweep, on unmasked pixels, without surface."""
+    column, row = _pixels(own, photo, MAX_RANGE_M)
     free = ~masked[row, column]
-    return float((~seen.hit[row, column])[free].mean())
+    return float((~rendering.hit[row, column])[free].mean())
 
 
 def _picture(path: Path, photo: U8, rendering: U8, counts: Bools) -> None:
@@ -206,17 +209,17 @@ def _picture(path: Path, photo: U8, rendering: U8, counts: Bools) -> None:
 
 
 def can_keep() -> bool:
-    """Whether vehicles can be kept."""
+    """Whether the pipeline has the setting to keep vehicles."""
     from scan2sim.pipeline.steps.split import SPLIT
 
     return "vehicles" in SPLIT.params.model_fields
 
 
 def synthetic(folder: Path) -> dict[str, Any]:
-    """Figures against truth; that of edges null where its bench isn't there."""
-    out: dict[str, Any] = dict(street_synthetic.figures(folder, scan2sim))
+    """Metrics with ground truth; null for edges if their benchmark isn't available."""
+    out: dict[str, Any] = dict(street_synthetic.metrics(folder, scan2sim))
     if importlib.util.find_spec(EDGES) is None:
-        print(f"edge_cm: null, there is no {EDGES}")
+        print(f"edge_cm: null, {EDGES} isn't available")
         return out | {"edge_cm": None}
     command = [sys.executable, "-m", EDGES, str(folder / "tile"), str(folder / "run")]
     output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
@@ -226,7 +229,7 @@ def synthetic(folder: Path) -> dict[str, Any]:
 
 
 def times(folder: Path, old: Path | None) -> dict[str, Any]:
-    """The street of nine million points by an older checkout and by this one, one after the other."""
+    """Time of the street of nine million points with an older checkout and with this one, one after the other."""
     if old is None or not (old / "pyproject.toml").is_file():
         print("time_ratio: null, no older checkout was given (--old)")
         return {"time_ratio": None}
@@ -237,14 +240,14 @@ def times(folder: Path, old: Path | None) -> dict[str, Any]:
     seconds = {}
     for name, code in (("old", old), ("new", ROOT)):
         sample = code / "data_samples" / "tile"
-        scan2sim("run", sample, "--out", folder / f"warm_{name}", code=code)  # kernels compiled before times are taken
+        scan2sim("run", sample, "--out", folder / f"warm_{name}", code=code)  # warm up: compile kernels
         shutil.rmtree(folder / name, ignore_errors=True)
         seconds[name] = scan2sim("run", tile, "--out", folder / name, code=code)
     return {"time_ratio": seconds["new"] / seconds["old"], "seconds": seconds}
 
 
 def table(figures: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print what was found."""
+    """Print the results."""
     for name in ("odo04", "raw0009", "keep"):
         one = figures.get(name)
         if not one or "psnr_db" not in one:
@@ -259,10 +262,12 @@ def table(figures: Mapping[str, Mapping[str, Any]]) -> None:
         print(
             f"  cameras within 1 m of a surface: {one['inside_mesh']} of 25, nearest {one['nearest_m']:.2f} m;", end=""
         )
-        print(f" surface where the car drove: {one['corridor_m2']:.1f} m2; seen {one['seen_share']:.0%}")
+        print(
+            f" surface where the car drove: {one['corridor_m2']:.1f} m2; textured from photos {one['seen_share']:.0%}"
+        )
         if one["remains_m2"]:
             left = {track: round(area, 2) for track, area in one["remains_m2"].items()}
-            print(f"  left of vehicles, m2 by track: {left}")
+            print(f"  surface remaining of vehicles, m2 by track: {left}")
         near = one["displacements_scanned_px"]
         print(f"  outlines that the lidar reached: median {np.median(near):.2f} px, {len(near)} of", end="")
         print(f" {len(one['displacements_px'])} places")
@@ -272,8 +277,8 @@ def table(figures: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def result(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """The figures that are to be reached."""
-    odo, raw, keep, made_up, time = (figures.get(name, NOTHING) for name in PARTS)
+    """Results that have targets."""
+    odo, raw, keep, synthetic_part, time = (figures.get(name, NOTHING) for name in PARTS)
     both = [part for part in (odo, raw) if part]
     shifts = [s for part in both for s in part["displacements_px"]]
     signs = [db for part in both for db in part["signs_db"].values()]
@@ -286,24 +291,24 @@ def result(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         "sharpness_min": min((part["sharpness"] for part in both), default=None),
         "inside_mesh": sum(part["inside_mesh"] for part in both) if both else None,
         "remains_m2": max(raw["remains_m2"].values()) if raw.get("remains_m2") else None,
-        "static_lost": made_up.get("static_lost"),
-        "pole_recall": made_up.get("pole_recall"),
+        "static_lost": synthetic_part.get("static_lost"),
+        "pole_recall": synthetic_part.get("pole_recall"),
         "seen_share_min": min((part["seen_share"] for part in both), default=None),
         "outline_px": float(np.median(shifts)) if shifts else None,
         "sign_psnr_db": float(np.mean(signs)) if signs else None,
-        "edge_cm": made_up.get("edge_cm"),
+        "edge_cm": synthetic_part.get("edge_cm"),
         "time_ratio": time.get("time_ratio"),
     }
     return {k: round(v, 3) if isinstance(v, float) else v for k, v in found.items()}
 
 
 def main() -> None:
-    """Run the parts, print tables and the result."""
+    """Run the parts, and print tables and the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "street")
     parser.add_argument("--old", type=Path, help="an older checkout, for `time`")
-    parser.add_argument("--score-only", action="store_true", help="score the worlds that are there already")
+    parser.add_argument("--score-only", action="store_true", help="score existing worlds")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the real streets' runs")
     arguments = parser.parse_args()
     out: Path = arguments.out.resolve()
@@ -312,15 +317,15 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         street = STREETS.get("raw0009" if part == "keep" else part)
         if street and not street.data.is_dir():
-            print(f"{part}: left out, there is no {street.data}")
+            print(f"{part}: skipped, {street.data} doesn't exist")
             continue
         if part == "keep" and not can_keep():
-            print("raw0009_keep_psnr_db: null, there is no split.vehicles yet")
+            print("raw0009_keep_psnr_db: null, this version has no split.vehicles")
             continue
         if street:
             settings = (*arguments.set, *(("split.vehicles=keep",) if part == "keep" else ()))
-            tile, run = made(street, folder, settings, run=not arguments.score_only)
-            found = scored(street, tile, run, out / "pictures" / part, keep=part == "keep")
+            tile, run = build_world(street, folder, settings, run=not arguments.score_only)
+            found = score_world(street, tile, run, out / "pictures" / part, keep=part == "keep")
         else:
             found = synthetic(folder) if part == "synthetic" else times(folder, arguments.old)
         (folder / "figures.json").write_text(json.dumps(found, indent=1), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""How near a rendering comes to a photo: likeness, outlines, signs. What counts is told by masks drawn by hand."""
+"""Image metrics between a rendering and a photo: similarity, outlines, signs, within masks drawn by hand."""
 
 from __future__ import annotations
 
@@ -17,25 +17,24 @@ from scan2sim.pipeline.core.types import F64, I64, U8, Bools
 
 TRUTH = Path(__file__).with_name("truth.json")
 
-WINDOW = 1.5
-"""Pixels: sigma of SSIM's Gaussian window (Wang et al. 2004)."""
-FARTHEST = 12.0
-"""Pixels within which a rendered outline is looked for, and what one that isn't found counts as."""
-PROFILE, ALONG, STEP = 5.0, 3, 0.25
-"""Pixels of a profile to each side of an outline, pixels along the outline that one is meaned over to each side,
-and between two places of it."""
-ALIKE = 0.6
-"""Correlation of two profiles across an outline from which both show it."""
+SSIM_SIGMA_PX = 1.5
+"""Sigma of SSIM's Gaussian window (Wang et al. 2004)."""
+MAX_SHIFT_PX = 12.0
+"""Search range for a rendered outline, and the displacement of one that isn't found."""
+PROFILE_PX, AVERAGE_PX, STEP_PX = 5.0, 3, 0.25
+"""Half length of a profile across an outline, half length of averaging along it, sampling distance of profiles."""
+MIN_CORRELATION = 0.6
+"""Minimum correlation of two profiles that show the same outline."""
 
 
 @cache
 def truth() -> Mapping[str, Any]:
-    """What was drawn by hand: street, frame, kind."""
+    """Hand-drawn ground truth: street, frame, kind."""
     return dict(json.loads(TRUTH.read_text(encoding="utf-8")))
 
 
 def filled(polygons: Sequence[Sequence[Sequence[float]]], shape: tuple[int, ...]) -> Bools:
-    """(H, W) whether a pixel's middle lies in a polygon."""
+    """(H, W) whether a pixel's centre lies in a polygon."""
     import cv2
 
     out = np.zeros(shape[:2], np.uint8)
@@ -44,16 +43,16 @@ def filled(polygons: Sequence[Sequence[Sequence[float]]], shape: tuple[int, ...]
     return out > 0
 
 
-def likeness(photo: U8, rgb: U8, counts: Bools) -> dict[str, float]:
-    """Likeness where `counts` (H, W), after one least-squares gain a channel.
+def similarity(photo: U8, rgb: U8, counts: Bools) -> dict[str, float]:
+    """Similarity where `counts` (H, W), after a least-squares gain per channel.
 
     Returns:
-        psnr_db, mse, pixels; ssim (grey) of the windows of 11 x 11 that hold nothing but pixels that count; sharpness,
-        the mean absolute Laplacian by the photo's.
+        psnr_db, mse, pixels; ssim (grey) over windows of 11 x 11 in which all pixels count; sharpness, the mean
+        absolute Laplacian relative to the photo's.
     """
     from scipy.ndimage import binary_erosion, laplace
 
-    like = gained(photo, rgb, counts)
+    like = apply_gain(photo, rgb, counts)
     mse = squared_error(photo, like, counts)
     inner = binary_erosion(counts, np.ones((3, 3)))
     grey = [_grey(image) for image in (photo, like)]
@@ -67,19 +66,19 @@ def likeness(photo: U8, rgb: U8, counts: Bools) -> dict[str, float]:
     }
 
 
-def gained(photo: U8, rgb: U8, counts: Bools) -> F64:
-    """The rendering with the gain a channel that makes it most like the photo where `counts`."""
+def apply_gain(photo: U8, rgb: U8, counts: Bools) -> F64:
+    """The rendering with the gain per channel that minimizes the error to the photo where `counts`."""
     a, b = photo[counts].astype(np.float64), rgb[counts].astype(np.float64)
     return np.asarray(np.clip(rgb * ((a * b).sum(axis=0) / np.maximum((b * b).sum(axis=0), 1)), 0, 255))
 
 
 def squared_error(photo: U8, like: npt.NDArray[Any], counts: Bools) -> float:
-    """Mean squared error of all channels where `counts`."""
+    """Mean squared error over all channels where `counts`."""
     return float(((like[counts].astype(np.float64) - photo[counts]) ** 2).mean())
 
 
 def psnr(mse: float) -> float:
-    """In dB, of a mean squared error of 8-bit values."""
+    """PSNR in dB from the mean squared error of 8-bit values."""
     return 10 * math.log10(255**2 / max(mse, 1e-3))
 
 
@@ -91,7 +90,7 @@ def _ssim(a: F64, b: F64, counts: Bools) -> float:
     from scipy.ndimage import binary_erosion, gaussian_filter
 
     def mean(values: F64) -> F64:
-        return np.asarray(gaussian_filter(values, WINDOW, truncate=3.5))
+        return np.asarray(gaussian_filter(values, SSIM_SIGMA_PX, truncate=3.5))
 
     ma, mb = mean(a), mean(b)
     va, vb, cov = mean(a * a) - ma * ma, mean(b * b) - mb * mb, mean(a * b) - ma * mb
@@ -101,28 +100,28 @@ def _ssim(a: F64, b: F64, counts: Bools) -> float:
 
 
 def displacements(photo: U8, rgb: U8, line: Sequence[Sequence[float]]) -> tuple[F64, I64]:
-    """Pixels by which a rendering shows an outline beside where the photo does, every second pixel along it.
+    """Displacement in pixels of an outline in a rendering relative to the photo, every second pixel along it.
 
     Returns:
-        (N,) pixels, and the places' (N, 2) columns and rows.
+        (N,) displacements, and the columns and rows of the samples (N, 2).
 
-    The photo's brightness across the outline, five pixels to each side, is looked for in the rendering's, shifted by
-    up to `FARTHEST`; where nothing there is alike (correlation below `ALIKE`), it counts as so far off.
+    The photo's brightness profile across the outline, five pixels to each side, is searched in the rendering's profile
+    within `MAX_SHIFT_PX`; without a match (correlation below `MIN_CORRELATION`), the displacement is the maximum.
 
     Args:
         photo, rgb: (H, W, 3).
-        line: drawn places (x, y), pixels.
+        line: drawn polyline (x, y), pixels.
     """
     from scipy.ndimage import map_coordinates
 
     places, ways = _along(np.array(line, np.float64) - 0.5)
     shown = [_grey(photo), _grey(rgb)]
-    reach = np.arange(-PROFILE - FARTHEST, PROFILE + FARTHEST + STEP / 2, STEP)
-    inner = slice(round(FARTHEST / STEP), len(reach) - round(FARTHEST / STEP))
+    reach = np.arange(-PROFILE_PX - MAX_SHIFT_PX, PROFILE_PX + MAX_SHIFT_PX + STEP_PX / 2, STEP_PX)
+    inner = slice(round(MAX_SHIFT_PX / STEP_PX), len(reach) - round(MAX_SHIFT_PX / STEP_PX))
     out, at = [], []
     for place, way in zip(places, ways, strict=True):
         normal = np.array([-way[1], way[0]])
-        strip = place + way * np.arange(-ALONG, ALONG + 1)[:, None, None] + normal * reach[:, None]
+        strip = place + way * np.arange(-AVERAGE_PX, AVERAGE_PX + 1)[:, None, None] + normal * reach[:, None]
         if not _within(strip[:, inner], photo.shape):
             continue
         across = [map_coordinates(g, strip[..., ::-1].reshape(-1, 2).T, order=1, mode="nearest") for g in shown]
@@ -133,7 +132,7 @@ def displacements(photo: U8, rgb: U8, line: Sequence[Sequence[float]]) -> tuple[
 
 
 def _along(line: F64) -> tuple[F64, F64]:
-    """Places every second pixel of a polyline, and the directions of it there."""
+    """Samples every second pixel of a polyline, and its directions there."""
     places, ways = [], []
     for a, b in pairwise(line):
         length = float(np.linalg.norm(b - a))
@@ -148,13 +147,13 @@ def _within(strip: F64, shape: tuple[int, ...]) -> bool:
 
 
 def _shift(mine: F64, other: F64) -> float:
-    """Pixels by which profile `mine` (n,) lies beside its place in `other` (m > n, its middle in the same place)."""
+    """Displacement in pixels of profile `mine` (n,) in `other` (m > n, with the same centre)."""
     windows = np.lib.stride_tricks.sliding_window_view(other, len(mine))
     windows = windows - windows.mean(axis=1, keepdims=True)
     size = np.linalg.norm(windows, axis=1) * np.linalg.norm(mine - mine.mean())
     alike = windows @ (mine - mine.mean()) / np.maximum(size, len(mine))
-    offset = np.abs(np.arange(len(windows)) - len(windows) // 2) * STEP
-    if alike.max() < ALIKE:
-        return FARTHEST
-    # of places that are about as like, the nearest: bars and stripes repeat
+    offset = np.abs(np.arange(len(windows)) - len(windows) // 2) * STEP_PX
+    if alike.max() < MIN_CORRELATION:
+        return MAX_SHIFT_PX
+    # of about equally similar matches, the nearest: bars and stripes repeat
     return float(offset[alike > alike.max() - 0.02].min())

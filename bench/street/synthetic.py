@@ -1,4 +1,4 @@
-"""Figures of real streets' steps that need a truth: how much that stands still is lost, how many poles are found."""
+"""Metrics that need ground truth, on a synthetic street: lost static points, and recall of poles."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from bench.street.world import World
 from scan2sim.pipeline.core.types import F64, U8, PointCloud
 
 STREET: dict[str, Any] = {"length": 40.0, "points": 1.6e6, "photos": 16, "seed": 0}
-REACH = 0.1
-"""Metres from a true sample within which it was scanned, or is shown."""
-APART = 0.3
-"""Metres on the plan beyond which samples are of another pole."""
-SHOWN = 0.5
-"""Share of a pole's scanned samples that are shown where it is found."""
+MATCH_DISTANCE_M = 0.1
+"""Distance from a true sample within which it counts as scanned, or as shown."""
+MIN_POLE_DISTANCE_M = 0.3
+"""Horizontal distance beyond which samples belong to different poles."""
+MIN_SHOWN_SHARE = 0.5
+"""Minimum share of a pole's scanned samples that are shown for the pole to be found."""
 
 
-def figures(folder: Path, run: Callable[..., float]) -> dict[str, float]:
-    """`static_lost` and `pole_recall` on the synthetic street, in which a car drives; `run` is the command's."""
+def metrics(folder: Path, run: Callable[..., float]) -> dict[str, float]:
+    """`static_lost` and `pole_recall` on the synthetic street with a moving car; `run` runs a command."""
     from scan2sim.data_samples.layout import Style
     from scan2sim.data_samples.street import generate
 
@@ -33,7 +33,7 @@ def figures(folder: Path, run: Callable[..., float]) -> dict[str, float]:
 
 
 def static_lost(out: Path) -> float:
-    """Share that `carve` dropped of the points that are of neither vehicles nor people."""
+    """Share of the points other than vehicles and people that `carve` removed."""
     from scan2sim.pipeline.core.classes import CODE
 
     classification = PointCloud.load(next((out / "steps" / "ingest").glob("*/cloud.npz"))).classification
@@ -44,7 +44,7 @@ def static_lost(out: Path) -> float:
 
 
 def pole_recall(tile: Path, world: World) -> float:
-    """Share of the true poles of which the world shows half of what was scanned, in its place to 10 cm."""
+    """Share of the true poles of which the world shows half of the scanned samples within 10 cm."""
     import laspy
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -57,10 +57,10 @@ def pole_recall(tile: Path, world: World) -> float:
 
     (truth, classification), (cloud, _) = read("truth/points.laz"), read("cloud.laz")
     pole = truth[classification == CODE["pole"]]
-    pole = pole[cKDTree(cloud).query(pole)[0] < REACH]
-    pairs = cKDTree(pole[:, :2]).sparse_distance_matrix(cKDTree(pole[:, :2]), APART)
+    pole = pole[cKDTree(cloud).query(pole)[0] < MATCH_DISTANCE_M]
+    pairs = cKDTree(pole[:, :2]).sparse_distance_matrix(cKDTree(pole[:, :2]), MIN_POLE_DISTANCE_M)
     count, which = connected_components(pairs, directed=False)
-    shown = world.distance(pole) < REACH
-    found = np.array([shown[which == i].mean() >= SHOWN for i in range(count)])
-    print(f"synthetic street: {found.sum()} of {count} poles are shown; {shown.mean():.0%} of their scanned surface")
+    shown = world.distance(pole) < MATCH_DISTANCE_M
+    found = np.array([shown[which == i].mean() >= MIN_SHOWN_SHARE for i in range(count)])
+    print(f"synthetic street: {found.sum()} of {count} poles are shown; {shown.mean():.0%} of their scanned samples")
     return float(found.mean())

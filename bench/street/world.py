@@ -1,4 +1,4 @@
-"""A finished world as anyone would open it: OBJ and PNG by trimesh, cast by Open3D; nothing of the pipeline's own."""
+"""Independent renderer of a finished world: OBJ and PNG read by trimesh, rays cast by Open3D, no pipeline code."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.core.types import F32, F64, U8, Bools
 
-SAMPLES = 3
-"""Rays a pixel each way."""
-CHUNK = 400_000
-"""Rays at a time."""
+SAMPLES_PER_AXIS = 3
+"""Number of rays per pixel in each direction."""
+RAYS_PER_BATCH = 400_000
 BACKGROUND = (200, 214, 230)
-"""What a pixel shows where its ray meets nothing: a plain sky."""
+"""Colour of pixels without a hit: a plain sky."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +26,9 @@ class Photo:
 
     Attributes:
         rgb: (H, W, 3) uint8.
-        K: (3, 3) intrinsics, (0, 0) the middle of the first pixel.
-        T: (4, 4) camera (x right, y down, z forward) to the world's local metres.
-        time: seconds, on the cloud's clock.
+        K: (3, 3) intrinsics; (0, 0) is the centre of the first pixel.
+        T: (4, 4) camera (x right, y down, z forward) to the world's local frame, metres.
+        time: seconds on the cloud's clock.
     """
 
     rgb: U8
@@ -39,25 +38,25 @@ class Photo:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What a photo's pixels see of the world: `rgb` (H, W, 3) uint8, `range` (H, W) metres, inf where nothing is."""
+class Rendering:
+    """Rendered pixels of a photo's view: `rgb` (H, W, 3) uint8, `range` (H, W) metres, inf without a hit."""
 
     rgb: U8
     range: F32
 
     @property
     def hit(self) -> Bools:
-        """(H, W) whether the ray through the pixel's middle meets a surface."""
+        """(H, W) whether the ray through the pixel's centre hits a surface."""
         return np.isfinite(self.range)
 
 
 class World:
-    """The visual meshes below `folder` (the `world` of a run), in local metres, z up.
+    """The visual meshes in `folder` (the `world` of a run), in the local frame, z up.
 
     Attributes:
-        origin: (3,) of the local metres.
-        casting: Open3D's scene of all of them.
-        vertices, faces: (V, 3) and (F, 3) of all of them.
+        origin: (3,) origin of the local frame.
+        casting: Open3D scene with all meshes.
+        vertices, faces: (V, 3) and (F, 3) of all meshes.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -84,17 +83,19 @@ class World:
                 count += len(corner)
         self.vertices, self.faces = np.concatenate(vertices), np.concatenate(faces)
 
-    def seen(self, photo: Photo) -> Seen:
-        """The world from a photo's place: the colour of a pixel is the mean of those of its rays that meet something.
+    def render(self, photo: Photo) -> Rendering:
+        """Render the world from a photo's pose: a pixel's colour is the mean over its rays that hit a surface.
 
-        A pixel whose middle ray meets nothing is background.
+        A pixel whose central ray hits nothing is background.
         """
         height, width = photo.rgb.shape[:2]
         row, column = np.divmod(np.arange(height * width), width)
-        offset = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
+        offset = (np.arange(SAMPLES_PER_AXIS) + 0.5) / SAMPLES_PER_AXIS - 0.5
         rgb = np.tile(np.array(BACKGROUND, np.uint8), (height * width, 1))
         distance = np.full(height * width, np.inf, np.float32)
-        for part in np.array_split(np.arange(height * width), height * width * SAMPLES**2 // CHUNK + 1):
+        for part in np.array_split(
+            np.arange(height * width), height * width * SAMPLES_PER_AXIS**2 // RAYS_PER_BATCH + 1
+        ):
             distance[part], _ = self._cast(photo, column[part], row[part], colours=False)
             hit = np.isfinite(distance[part])
             total, hits = np.zeros((hit.sum(), 3)), np.zeros(hit.sum())
@@ -105,12 +106,12 @@ class World:
                     hits += np.isfinite(far)
             mean = np.round(total / np.maximum(hits, 1)[:, None]).astype(np.uint8)
             rgb[part[hit]] = np.where(hits[:, None] > 0, mean, rgb[part[hit]])
-        return Seen(rgb.reshape(height, width, 3), distance.reshape(height, width))
+        return Rendering(rgb.reshape(height, width, 3), distance.reshape(height, width))
 
     def _cast(
         self, photo: Photo, column: npt.NDArray[Any], row: npt.NDArray[Any], *, colours: bool = True
     ) -> tuple[F32, F64]:
-        """Metres (N,) to what rays through places in the photo meet, and its colours (N, 3), black where nothing is."""
+        """Distances (N,) to the hits of rays through a photo's pixels, and colours (N, 3), black without a hit."""
         import open3d as o3d
 
         way = np.stack([column, row, np.ones(len(row))], axis=1) @ np.linalg.inv(photo.K).T
@@ -129,12 +130,12 @@ class World:
         return distance, rgb
 
     def distance(self, places: F64) -> F32:
-        """(N,) metres from places (N, 3), local, to the nearest surface."""
+        """(N,) distances in metres from positions (N, 3), local, to the nearest surface."""
         return np.asarray(self.casting.compute_distance(np.ascontiguousarray(places, np.float32)).numpy())
 
 
 def _sample(page: U8, uv: npt.NDArray[Any]) -> F64:
-    """Bilinear colours (N, 3) of a picture at uv (N, 2), (0, 0) its lower left corner."""
+    """Bilinear colours (N, 3) of an image at uv (N, 2); (0, 0) is the lower left corner."""
     height, width = page.shape[:2]
     x = np.clip(uv[:, 0] * width - 0.5, 0, width - 1.001)
     y = np.clip((1 - uv[:, 1]) * height - 0.5, 0, height - 1.001)
@@ -146,10 +147,9 @@ def _sample(page: U8, uv: npt.NDArray[Any]) -> F64:
 
 
 def photos(tile: Path, run: Path, origin: F64) -> dict[int, Photo]:
-    """All photos of an imported street by their frame's number, read from its `tile.toml`.
+    """All photos of an imported street by frame number, read from its `tile.toml`.
 
-    Where the run refined the photos' poses (the step `refine`), theirs are taken: a world in its own frame is met
-    from where its photos are in it.
+    Poses refined by the run (step `refine`) are used if available, since the world is built in their frame.
     """
     from PIL import Image
 
@@ -169,7 +169,7 @@ def photos(tile: Path, run: Path, origin: F64) -> dict[int, Photo]:
 
 
 def _refined(run: Path) -> dict[str, tuple[F64, F64]]:
-    """Refined intrinsics and poses (local metres) by the photo's name; empty where the run has none."""
+    """Refined intrinsics and poses (local metres) by the photo's name; empty if the run has none."""
     out = {}
     for path in sorted((run / "steps" / "refine").glob("*/views.json")):
         for view in json.loads(path.read_text(encoding="utf-8")):

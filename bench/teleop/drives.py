@@ -1,4 +1,4 @@
-"""Drives by a script over shaped links (parts of `bench.teleop`): glass to glass, cuts, joining, table 6."""
+"""Scripted drives over emulated links (parts of `bench.teleop`): glass to glass, cuts, joining, table 6."""
 
 from __future__ import annotations
 
@@ -13,116 +13,116 @@ from statistics import median
 from typing import Any, NamedTuple
 
 from scan2sim.services.qos import requirements
-from scan2sim.services.qos.compare import passed, rows
-from scan2sim.services.qos.link_profile import Shape
-from scan2sim.services.qos.requirements import MACHINE, NETWORK, UNITS, Environment
+from scan2sim.services.qos.compare import compare_metrics, passed
+from scan2sim.services.qos.link_profile import LinkProfile
+from scan2sim.services.qos.requirements import MACHINE_METRICS, NETWORK_METRICS, UNITS, Environment
 from scan2sim.services.teleoperation.control.messages import Kind
 from scan2sim.services.teleoperation.qos.measure import (
-    WIRES,
-    Measured,
-    Pair,
+    WIRE_COUNT,
+    Measurement,
+    ScriptedPair,
     delays,
-    film,
+    ignore_progress,
     measure,
-    pair,
     percentile,
-    quiet,
+    render_test_images,
+    scripted_pair,
 )
 from scan2sim.services.teleoperation.qos.scripted_drive import Setup
 from scan2sim.services.teleoperation.settings import MeasureParams
 
-Say = Callable[[str], None]
-MOBILE = Shape(delay=0.04, jitter=0.01, loss=0.01)
-CUT, WORSE = MOBILE.model_copy(update={"loss": 0.9999}), MOBILE.model_copy(update={"loss": 0.05})
-SINGLE = 0.2
-"""Of the time that two links are tried for, a single one is."""
-GROWN = 10.0
-"""Seconds until video has grown to what links carry."""
-CALM = 3.0
-"""Seconds without events at the end, so that what was lost is known."""
+Report = Callable[[str], None]
+MOBILE = LinkProfile(delay=0.04, jitter=0.01, loss=0.01)
+CUT, DEGRADED = MOBILE.model_copy(update={"loss": 0.9999}), MOBILE.model_copy(update={"loss": 0.05})
+SINGLE_LINK_SHARE = 0.2
+"""Duration with a single link, as a share of that with two."""
+RAMP_UP_S = 10.0
+"""Seconds until the video's bit rate has grown to the capacity of the links."""
+QUIET_S = 3.0
+"""Seconds without events at the end, until all losses are known."""
 
 
 @contextmanager
-def mobile(wires: Sequence[int] = range(WIRES), cameras: int = 4) -> Iterator[Pair]:
-    """A pair over the mobile link's wires; not yet joined."""
+def mobile(wires: Sequence[int] = range(WIRE_COUNT), cameras: int = 4) -> Iterator[ScriptedPair]:
+    """Vehicle and station at the ends of the mobile link's wires; not yet joined."""
     with tempfile.TemporaryDirectory(prefix="bench-teleop-") as name:
         folder = Path(name)
-        setup = replace(Setup("", ""), cameras=cameras, pictures=str(film(folder / "pictures")))
-        with pair((MOBILE, MOBILE), setup, folder, wires) as ends:
+        setup = replace(Setup("", ""), cameras=cameras, pictures=str(render_test_images(folder / "pictures")))
+        with scripted_pair((MOBILE, MOBILE), setup, folder, wires) as ends:
             yield ends
 
 
-def told(what: str, measured: Measured, say: Say) -> None:
-    """A line of a drive."""
-    glass, ways = measured.glass_to_glass, delays(measured.vehicle["messages"], Kind.COMMAND)
-    say(
-        f"{what}: {len(glass) / measured.seconds:.0f} pictures/s, "
+def report_drive(what: str, measured: Measurement, report: Report) -> None:
+    """Report the results of a drive in one line."""
+    glass, one_way = measured.glass_to_glass, delays(measured.vehicle["messages"], Kind.COMMAND)
+    report(
+        f"{what}: {len(glass) / measured.seconds:.0f} frames/s, "
         f"{measured.station['seen'].get('bytes', 0) * 8e-6 / measured.seconds:.1f} Mbit/s, glass to glass "
         f"{percentile(glass, 50):.0f} ms, p95 {percentile(glass, 95):.0f}; {measured.lost_frames:.3%} of frames lost, "
-        f"{measured.station['seen'].get('unseen', 0)} not decoded; commands {percentile(ways, 95):.0f} ms p95, "
+        f"{measured.station['seen'].get('unseen', 0)} not decoded; commands {percentile(one_way, 95):.0f} ms p95, "
         f"longest gap {measured.command_gap:.0f} ms; stopped {max(len(measured.station['stops']) - 1, 0)} times "
         f"{measured.station['reasons']}"
     )
 
 
-def glass(scale: float, say: Say) -> dict[str, Any]:
-    """Four cameras over the mobile link."""
+def glass(scale: float, report: Report) -> dict[str, Any]:
+    """Glass-to-glass latency of four cameras over the mobile link."""
     with mobile() as ends:
         ends.station.ask("join")
         ends.station.ask("drive")
-        time.sleep(GROWN)
+        time.sleep(RAMP_UP_S)
         measured = ends.measured(max(5.0, 60.0 * scale))
-    told("glass", measured, say)
+    report_drive("glass", measured, report)
     return {"glass_to_glass_p95_ms": round(percentile(measured.glass_to_glass, 95), 1)}
 
 
 class Event(NamedTuple):
-    """A wire is another from a moment on, seconds."""
+    """Change of a wire's profile at a time, seconds."""
 
     at: float
     wire: int
-    shape: Shape
+    profile: LinkProfile
 
 
 def schedule(seconds: float, chance: random.Random) -> list[Event]:
-    """One of two wires is cut, or loses more, for a while, then is as it was; the other is left alone meanwhile."""
+    """Cut or degrade one of two wires at a time for a while, then restore it."""
     events, at = list[Event](), 1.0
     while True:
-        wire, cut = chance.randrange(WIRES), chance.random() < 0.6
+        wire, cut = chance.randrange(WIRE_COUNT), chance.random() < 0.6
         lasts = chance.uniform(0.3, 5.0) if cut else chance.uniform(2.0, 6.0)
-        if at + lasts > seconds - CALM:
+        if at + lasts > seconds - QUIET_S:
             return events
-        events += [Event(at, wire, CUT if cut else WORSE), Event(at + lasts, wire, MOBILE)]
-        at += lasts + chance.uniform(2.0, 5.0)  # a link that was cut takes about two seconds to be back
+        events += [Event(at, wire, CUT if cut else DEGRADED), Event(at + lasts, wire, MOBILE)]
+        at += lasts + chance.uniform(2.0, 5.0)  # a cut link takes about two seconds to reconnect
 
 
-def shaken(seconds: float, wires: Sequence[int], say: Say) -> Measured:
-    """A drive over some of two wires that are cut and restored."""
+def drive_with_cuts(seconds: float, wires: Sequence[int], report: Report) -> Measurement:
+    """Drive over some of two wires that are cut and restored."""
     with mobile(wires) as ends:
         assert ends.link is not None
         ends.station.ask("join")
         ends.station.ask("drive")
         time.sleep(3.0)
         events = schedule(seconds, random.Random(21))
-        say(f"{len(events)} events in {seconds:.0f} s, {len(wires)} links")
+        report(f"{len(events)} events in {seconds:.0f} s, {len(wires)} links")
         began = time.monotonic()
 
-        def happen(fraction: float, message: str = "") -> None:
+        def apply_events(fraction: float, message: str = "") -> None:
             while events and events[0].at <= time.monotonic() - began:
                 event = events.pop(0)
                 assert ends.link is not None
-                ends.link.shape(event.shape, wire=event.wire)
+                ends.link.shape(event.profile, wire=event.wire)
 
-        return ends.measured(seconds, happen)
+        return ends.measured(seconds, apply_events)
 
 
-def cuts(scale: float, say: Say) -> dict[str, Any]:
-    """One of two links cut, restored, degraded; and the same with a single link."""
+def cuts(scale: float, report: Report) -> dict[str, Any]:
+    """Cut, restore and degrade one of two links; then the same with a single link."""
     seconds = max(20.0, 600.0 * scale)
-    two = shaken(seconds, range(WIRES), say)
-    told("two links", two, say)
-    one = shaken(max(20.0, SINGLE * seconds), [0], say)
-    told("a single link", one, say)
+    two = drive_with_cuts(seconds, range(WIRE_COUNT), report)
+    report_drive("two links", two, report)
+    one = drive_with_cuts(max(20.0, SINGLE_LINK_SHARE * seconds), [0], report)
+    report_drive("a single link", one, report)
     ratio = two.lost_frames / one.lost_frames if one.lost_frames else None
     return {
         "command_gap_max_ms": round(two.command_gap, 1),
@@ -130,8 +130,8 @@ def cuts(scale: float, say: Say) -> dict[str, Any]:
     }
 
 
-def join(scale: float, say: Say) -> dict[str, Any]:
-    """Joined and parted, again and again: until it can be driven, and all cameras are seen."""
+def join(scale: float, report: Report) -> dict[str, Any]:
+    """Join and release repeatedly: time until pictures of all cameras arrive, and until driving is possible."""
     times, hands, ready = list[float](), list[float](), list[float]()
     with mobile() as ends:
         for _ in range(max(3, round(20 * scale))):
@@ -141,25 +141,26 @@ def join(scale: float, say: Say) -> dict[str, Any]:
             hands += found["handshakes_s"]
             ends.station.ask("release")
             time.sleep(0.5)
-    say(
+    report(
         f"join: {len(times)} times, half within {median(times):.2f} s, all within {max(times):.2f} s with pictures, "
-        f"{max(ready):.2f} s until it may be driven; handshakes {max(hands):.2f} s at most; {found['ciphers']}"
+        f"{max(ready):.2f} s until ready to drive; handshakes at most {max(hands):.2f} s; {found['ciphers']}"
     )
     return {"join_s": round(max(times), 2)}
 
 
-def qos(scale: float, say: Say) -> dict[str, Any]:
-    """Table 6, in all environments."""
+def qos(scale: float, report: Report) -> dict[str, Any]:
+    """D3.2, table 6 in all environments."""
     service, verdicts = requirements.read("teleoperation"), dict[str, bool]()
     for environment in Environment:
         required = service.of(environment)
-        params = MeasureParams(environment=environment, seconds=max(5.0, 30.0 * scale), warm=GROWN)
-        found = rows(required, measure(params, required, quiet))
-        verdicts[environment] = passed(found, NETWORK)
+        params = MeasureParams(environment=environment, seconds=max(5.0, 30.0 * scale), warm=RAMP_UP_S)
+        found = compare_metrics(required, measure(params, required, ignore_progress))
+        verdicts[environment] = passed(found, NETWORK_METRICS)
         for row in found:
             value = "-" if row.measured is None else f"{row.measured:.4g}"
             verdict = {True: "pass", False: "FAIL", None: ""}[row.passed]
-            asked = "-" if row.required is None else row.required
-            say(f"{environment:<6} {row.metric:<14} {asked!s:<16} {value:>9} {UNITS.get(row.metric, ''):<7} {verdict}")
-        say(f"{environment:<6} machine: {'passed' if passed(found, MACHINE) else 'FAILED'}")
+            required_text = "-" if row.required is None else row.required
+            unit = UNITS.get(row.metric, "")
+            report(f"{environment:<6} {row.metric:<14} {required_text!s:<16} {value:>9} {unit:<7} {verdict}")
+        report(f"{environment:<6} machine: {'passed' if passed(found, MACHINE_METRICS) else 'FAILED'}")
     return {"qos": verdicts}

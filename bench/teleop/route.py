@@ -1,7 +1,7 @@
-"""A drive along a world's street by script: its path against the intended one (part of `bench.teleop`).
+"""Scripted drive along a world's street: cross-track error of its path (part of `bench.teleop`).
 
-`python -m bench.teleop.route WORLD PICTURE [--seconds 30]`, as root, draws it too. The driver steers by what the
-vehicle tells, as late as that comes: over no network, the mobile link, and one that is four times as slow.
+`python -m bench.teleop.route WORLD PICTURE [--seconds 30]`, as root, also plots it. The driver steers by the vehicle's
+delayed telemetry: without a network, over the mobile link, and over one with four times its delay.
 """
 
 from __future__ import annotations
@@ -18,58 +18,60 @@ import numpy as np
 
 from bench.teleop.drives import MOBILE
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.services.qos.link_profile import Shape
-from scan2sim.services.teleoperation.qos.measure import Measured, film, pair, percentile
+from scan2sim.services.qos.link_profile import LinkProfile
+from scan2sim.services.teleoperation.qos.measure import Measurement, percentile, render_test_images, scripted_pair
 from scan2sim.services.teleoperation.qos.scripted_drive import Setup
-from scan2sim.services.teleoperation.sim.route import aside
+from scan2sim.services.teleoperation.sim.route import cross_track_error
 
-Say = Callable[[str], None]
-NETWORKS: dict[str, Shape | None] = {
+Report = Callable[[str], None]
+NETWORKS: dict[str, LinkProfile | None] = {
     "no network": None,
     "mobile": MOBILE,
     "slow": MOBILE.model_copy(update={"delay": 4 * MOBILE.delay}),
 }
-LIMIT = 600.0
-"""Milliseconds: over the slow network no command is younger than the limit that is usual."""
+MAX_COMMAND_AGE_MS = 600.0
+"""Limit of the command age: over the slow network all commands are older than the default limit."""
 
 
-def drives(world: Path, seconds: float) -> dict[str, Measured]:
-    """Along the street, again and again for so long, by network."""
+def drives(world: Path, seconds: float) -> dict[str, Measurement]:
+    """Repeated drives along the street, by network."""
     if not world.is_dir():
-        raise InputError(world, "isn't there", "`make demo` makes one; or name another by --world")
+        raise InputError(world, "folder not found", "Build it with `make demo`, or choose another with --world")
     found = {}
-    for name, shape in NETWORKS.items():
+    for name, profile in NETWORKS.items():
         with ExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="bench-teleop-")))
-            setup = replace(Setup("", ""), cameras=1, pictures=str(film(folder / "pictures")), world=str(world))
-            shapes = None if shape is None else (shape, shape)
-            ends = stack.enter_context(pair(shapes, replace(setup, limit=LIMIT), folder))
+            setup = replace(
+                Setup("", ""), cameras=1, pictures=str(render_test_images(folder / "pictures")), world=str(world)
+            )
+            profiles = None if profile is None else (profile, profile)
+            ends = stack.enter_context(scripted_pair(profiles, replace(setup, limit=MAX_COMMAND_AGE_MS), folder))
             ends.station.ask("join")
             ends.station.ask("drive")
             found[name] = ends.measured(seconds)
     return found
 
 
-def route(world: Path, scale: float, say: Say) -> dict[str, Any]:
-    """How far off the way the car was: on average, and of 95 %, by network."""
+def route(world: Path, scale: float, report: Report) -> dict[str, Any]:
+    """Cross-track error by network: mean and 95th percentile."""
     found = dict[str, list[float]]()
     for name, measured in drives(world, max(12.0, 25.0 * scale)).items():
-        off = measured.aside
+        off = measured.cross_track_error
         found[name] = [round(sum(off) / len(off), 3), round(percentile(off, 95), 3)]
-        say(
-            f"route, {name}: {measured.vehicle['runs']} times along {_length(measured):.0f} m, {found[name][0]:.2f} m "
-            f"off the way on average, 95 % within {found[name][1]:.2f}, all within {max(off):.2f}; "
+        report(
+            f"route, {name}: {measured.vehicle['runs']} times along {_length(measured):.0f} m, cross-track error "
+            f"{found[name][0]:.2f} m on average, p95 {found[name][1]:.2f}, max {max(off):.2f}; "
             f"faults {measured.vehicle['faults']}"
         )
     return {"off_way_m": found}
 
 
-def _length(measured: Measured) -> float:
+def _length(measured: Measurement) -> float:
     return float(np.linalg.norm(np.diff(np.array(measured.vehicle["way"]), axis=0), axis=1).sum())
 
 
-def draw(found: dict[str, Measured], picture: Path) -> None:
-    """The ways from above, and how far off the car was along them."""
+def draw(found: dict[str, Measurement], picture: Path) -> None:
+    """Plot the paths from above, and the cross-track error along them."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -84,7 +86,7 @@ def draw(found: dict[str, Measured], picture: Path) -> None:
     for (name, measured), colour in zip(found.items(), ("#2a6f97", "#e07a1f", "#b3261e"), strict=True):
         driven = np.array(measured.vehicle["driven"])
         places = (driven[:, 1:] - begin) @ turned
-        left = aside(way, measured.vehicle["driven"])
+        left = cross_track_error(way, measured.vehicle["driven"])
         for run in np.unique(driven[:, 0]):
             mine = driven[:, 0] == run
             label = name if run == driven[0, 0] else None
@@ -94,7 +96,7 @@ def draw(found: dict[str, Measured], picture: Path) -> None:
     above.set_ylabel("m across the street")
     above.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, fontsize=9, frameon=False)
     off.axhline(0.0, color="0.6", linewidth=1)
-    off.set_ylabel("m to the left of the way")
+    off.set_ylabel("cross-track error, m (left)")
     off.set_xlabel("m along the street")
     for axes in (above, off):
         axes.spines[["top", "right"]].set_visible(False)
@@ -103,11 +105,11 @@ def draw(found: dict[str, Measured], picture: Path) -> None:
 
 
 def main() -> None:
-    """Drive, and draw."""
+    """Drive and plot."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("world", type=Path)
     parser.add_argument("picture", type=Path)
-    parser.add_argument("--seconds", type=float, default=30.0, help="by each network")
+    parser.add_argument("--seconds", type=float, default=30.0, help="duration with each network")
     given = parser.parse_args()
     draw(drives(given.world, given.seconds), given.picture)
 

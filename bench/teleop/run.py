@@ -1,18 +1,18 @@
-"""Teleoperation under what the world does to it: delays, losses, cuts, intruders (docs/teleoperation.md).
+"""Teleoperation under delays, losses, link failures and attacks (docs/teleoperation.md).
 
 `python -m bench.teleop [--parts glass,cuts,stops,clocks,hostile,join,qos,route] [--minutes 10] [--world demo-out]`, as
-root: it makes networks. It takes 25 minutes; `--minutes` is how long links are cut and restored, and all else in
-proportion. It ends with a line `RESULT {json}`.
+root, since it creates network namespaces. Takes 25 minutes; `--minutes` is the duration of `cuts`, and the other parts
+scale with it. Ends with a line `RESULT {json}`.
 
-- glass: four cameras over a mobile link of two wires (40 ms one way, 10 ms jitter, 1 % loss): from a picture's taking
-  to its being decoded at the station, by the time that is drawn into it.
-- cuts: one of two such links is cut, restored, degraded at random; lost frames against those of a single link.
-- stops: all links of a vehicle are cut, a thousand times: when its translator brakes.
-- clocks: a wall clock is wrong by 10 s: whether both sides notice before anybody drives.
-- hostile: intruders, malformed and replayed datagrams, video sent once more by others, a flood.
-- join: how long it takes to join a vehicle and a station.
-- qos: table 6 of D3.2 on the robot, the edge and the cloud, as `scan2sim teleop measure` tells.
-- route: a drive along the street of a finished world (`make demo`): how far off its way, by what network.
+- glass: four cameras over a mobile link of two wires (40 ms one way, 10 ms jitter, 1 % loss): latency from capture to
+  decoding at the station, by a timecode drawn into each frame.
+- cuts: one of two such links is cut, restored and degraded at random; lost frames relative to a single link.
+- stops: all links of a vehicle are cut, a thousand times: time until its adapter brakes.
+- clocks: a wall clock is wrong by 10 s: whether both sides warn before the vehicle drives.
+- hostile: intruders, malformed and replayed datagrams, replayed video, a flood.
+- join: time to join a vehicle and a station.
+- qos: table 6 of D3.2 on the robot, the edge and the cloud, see `scan2sim teleop measure`.
+- route: a drive along the street of a finished world (`make demo`): cross-track error by network.
 """
 
 from __future__ import annotations
@@ -31,12 +31,11 @@ from typing import Any, NamedTuple
 
 from bench.teleop import drives, hostile, route, stops
 
-FULL = 10.0
-"""Minutes."""
+DEFAULT_MINUTES = 10.0
 
 
 class Part(NamedTuple):
-    """What is done, the results that it gives, and the seconds that it may take at full length."""
+    """Function of a part, keys of its results, and its time limit at the default duration, seconds."""
 
     do: Callable[[float, Callable[[str], None]], dict[str, Any]]
     gives: tuple[str, ...]
@@ -54,26 +53,26 @@ PARTS = {
     "qos": Part(drives.qos, ("qos",), 330),
     "route": Part(partial(route.route, WORLD), ("off_way_m",), 180),
 }
-LEAST = 150.0
-"""Seconds that each part may take, however short it is."""
+MIN_LIMIT_S = 150.0
+"""Minimum time limit of a part."""
 
 
-def done(name: str, part: Part, scale: float) -> dict[str, Any]:
-    """A part, in a process of its own, which is ended at its limit; what it didn't give is None."""
+def run_part(name: str, part: Part, scale: float) -> dict[str, Any]:
+    """Run a part in a process with a time limit; missing results are None."""
     spawn = multiprocessing.get_context("spawn")
     here, there = spawn.Pipe(duplex=False)
     process = spawn.Process(target=_run, args=(part, scale, there))
     began = time.monotonic()
     process.start()
     there.close()
-    limit, found = max(LEAST, part.limit * scale), dict[str, Any]()
+    limit, found = max(MIN_LIMIT_S, part.limit * scale), dict[str, Any]()
     try:
         if here.poll(limit):
             found = here.recv()
         else:
-            print(f"{name}: isn't done after {limit:.0f} s", flush=True)
+            print(f"{name}: not finished after {limit:.0f} s", flush=True)
     except EOFError:
-        print(f"{name}: has failed", flush=True)
+        print(f"{name}: failed", flush=True)
     process.join(10.0)
     process.kill()
     process.join()
@@ -84,25 +83,27 @@ def done(name: str, part: Part, scale: float) -> dict[str, Any]:
 def _run(part: Part, scale: float, pipe: Connection) -> None:
     try:
         pipe.send(part.do(scale, lambda text: print(f"  {text}", flush=True)))
-    except Exception:  # whatever it is, other parts go on
+    except Exception:  # continue with the other parts, whatever it is
         traceback.print_exc()
     finally:
         pipe.close()
 
 
 def main() -> None:
-    """Do all parts, or some."""
+    """Run all parts, or some."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", default=",".join(PARTS), help="of them, with commas between")
-    parser.add_argument("--minutes", type=float, default=FULL, help="that links are cut and restored")
-    parser.add_argument("--world", type=Path, default=WORLD, help="whose street is driven along")
+    parser.add_argument("--parts", default=",".join(PARTS), help="parts to run, separated by commas")
+    parser.add_argument(
+        "--minutes", type=float, default=DEFAULT_MINUTES, help="duration of `cuts`; others scale with it"
+    )
+    parser.add_argument("--world", type=Path, default=WORLD, help="finished world for `route`")
     given = parser.parse_args()
     parts = PARTS | {"route": PARTS["route"]._replace(do=partial(route.route, given.world))}
     chosen = given.parts.split(",")
     if unknown := set(chosen) - set(PARTS):
-        parser.error(f"no such parts: {', '.join(sorted(unknown))}")
+        parser.error(f"unknown parts: {', '.join(sorted(unknown))}")
     result: dict[str, Any] = {key: None for part in PARTS.values() for key in part.gives}
     for name in chosen:
-        result |= done(name, parts[name], given.minutes / FULL)
+        result |= run_part(name, parts[name], given.minutes / DEFAULT_MINUTES)
     print("RESULT", json.dumps(result))
     sys.exit(any(result[key] is None for name in chosen for key in PARTS[name].gives))

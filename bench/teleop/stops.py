@@ -1,6 +1,6 @@
-"""All links of a vehicle cut, again and again: when its translator brakes; clocks that are wrong (of `bench.teleop`).
+"""Repeated loss of all links of a vehicle: time until its adapter brakes; and wrong clocks (parts of `bench.teleop`).
 
-Many pairs at once, some a process; between vehicle and station is a network in this program, as in the tests.
+Many pairs run at once in a few processes; the network between vehicle and station is emulated in the process.
 """
 
 from __future__ import annotations
@@ -16,32 +16,31 @@ from typing import Any
 
 from scan2sim.services.teleoperation.control.controls import Controls
 from scan2sim.services.teleoperation.control.messages import Kind, Message, Telemetry
-from scan2sim.services.teleoperation.control.safety import LIMIT_MS
+from scan2sim.services.teleoperation.control.safety import COMMAND_MAX_AGE_MS
 from scan2sim.services.teleoperation.gateway.identity import Role
-from scan2sim.services.teleoperation.qos.scripted_drive import EVERY, Plain, Route
-from scan2sim.services.teleoperation.transport.clock_sync import Clocks
-from scan2sim.services.teleoperation.transport.multipath import Bundle
+from scan2sim.services.teleoperation.qos.scripted_drive import COMMAND_PERIOD_S, PlainCar, ScriptedCommands
+from scan2sim.services.teleoperation.transport.clock_sync import ClockSync
+from scan2sim.services.teleoperation.transport.multipath import MultipathConnection
 from scan2sim.services.teleoperation.transport.station_side import Listener
-from scan2sim.services.teleoperation.transport.vehicle_side import Link, dial
-from scan2sim.services.teleoperation.vehicle.adapter import TranslateParams, Translating
-from scan2sim.services.teleoperation.vehicle.onboard_unit import CarParams, CarUnit
+from scan2sim.services.teleoperation.transport.vehicle_side import Link, connect_station
+from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
+from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardParams, OnboardUnit
 from tests.services.teleoperation.certificates import identity
 from tests.services.teleoperation.transport.relay import Relay
 
-Say = Callable[[str], None]
+Report = Callable[[str], None]
 HOSTS = ("127.0.0.1", "127.0.0.2")
-ALLOWED = 50.0
-"""Milliseconds beyond the limit."""
-PROCESSES, PAIRS = 2, 4
-"""And pairs of each."""
-WRONG, WITHIN = 10.0, 3.0
-"""Seconds that a wall clock is set wrong by; that its driver tries to drive nevertheless."""
-PATIENCE = 20.0
-"""Seconds within which a pair is to drive again, and to brake."""
+TOLERANCE_MS = 50.0
+"""Tolerance beyond the limit."""
+PROCESSES, PAIRS_PER_PROCESS = 2, 4
+CLOCK_ERROR_S, DRIVE_ATTEMPT_S = 10.0, 3.0
+"""Error of a wall clock, and how long the driver tries to drive nevertheless."""
+STATE_TIMEOUT_S = 20.0
+"""Time within which a pair must drive again, or brake."""
 
 
-class Braking(Plain):
-    """Notes when it is told to drive, and when to brake."""
+class BrakeMonitor(PlainCar):
+    """Vehicle that records when it is commanded to drive and when to brake."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -55,10 +54,10 @@ class Braking(Plain):
             self.drives, self.since = drives, time.monotonic()
 
 
-class Stopped:
-    """A pair whose links are cut; `apart`: seconds that the vehicle's and the station's wall clocks are wrong by."""
+class InterruptedPair:
+    """A pair whose links are cut; `clock_errors`: errors of the vehicle's and the station's wall clocks, s."""
 
-    def __init__(self, seed: int, apart: tuple[float, float] = (0.0, 0.0)) -> None:
+    def __init__(self, seed: int, clock_errors: tuple[float, float] = (0.0, 0.0)) -> None:
         self._chance, self._ended, self._told = random.Random(seed), threading.Event(), list[Telemetry]()
         car, desk = identity(Role.VEHICLE, "car"), identity(Role.STATION, "desk")
         self._listener = Listener(desk, [(HOSTS[0], 0)])
@@ -66,37 +65,37 @@ class Stopped:
         for host in HOSTS:
             shape = self._relay.shapes[host]
             shape.delay, shape.jitter, shape.loss = 0.03, 0.02, 0.01
-        self._vehicle = Braking()
-        translating = Translating(self._vehicle, TranslateParams(port=0))
-        host, port = translating.address
-        self._unit = CarUnit(CarParams(translator=f"{host}:{port}"))
+        self._vehicle = BrakeMonitor()
+        adapter_server = AdapterServer(self._vehicle, AdapterParams(port=0))
+        host, port = adapter_server.address
+        self._unit = OnboardUnit(OnboardParams(translator=f"{host}:{port}"))
         links = [Link(host, host) for host in HOSTS]
-        clocks = [Clocks(wall=partial(_wall, wrong)) for wrong in apart]
-        self._bundle = self._listener.expect(car.me, self._received, clocks=clocks[1])
+        clocks = [ClockSync(wall=partial(_wall, wrong)) for wrong in clock_errors]
+        self._connection = self._listener.expect(car.me, self._received, clocks=clocks[1])
 
-        def dialled(received: Callable[[Message], None], began: Callable[[], None]) -> Bundle:
+        def connect(received: Callable[[Message], None], began: Callable[[], None]) -> MultipathConnection:
             remote = [self._relay.address]
-            return dial(car, desk.me, links, remote, received=received, began=began, clocks=clocks[0])
+            return connect_station(car, desk.me, links, remote, received=received, restarted=began, clocks=clocks[0])
 
-        self._unit.join(dialled)
+        self._unit.join(connect)
         self._threads = [
-            threading.Thread(target=partial(translating.run, self._ended), daemon=True),
+            threading.Thread(target=partial(adapter_server.run, self._ended), daemon=True),
             threading.Thread(target=self._drive, daemon=True),
         ]
         for thread in self._threads:
             thread.start()
 
     def stop(self) -> float | None:
-        """Cut all links while it drives, then restore them; ms until it braked, None: it didn't, or went on by itself.
+        """Cut all links while it drives, then restore them; ms until it braked, None: it didn't, or resumed by itself.
 
         Raises:
-            TimeoutError: it didn't drive.
+            TimeoutError: it doesn't drive.
         """
         vehicle = self._vehicle
         if not self._until(
             lambda: vehicle.drives and time.monotonic() > vehicle.since + self._chance.uniform(0.1, 0.4)
         ):
-            raise TimeoutError("a pair doesn't drive again")
+            raise TimeoutError("a pair doesn't resume driving")
         self._cut(True)
         began = time.monotonic()
         braked = self._until(lambda: not vehicle.drives)
@@ -106,17 +105,17 @@ class Stopped:
         self._cut(False)
         return took if braked and stays else None
 
-    def noticed(self) -> str:
-        """What vehicle and station say of their clocks while a driver tries; nothing: one said nothing, or it drove."""
-        wrong = self._bundle.clocks
+    def clock_warning(self) -> str:
+        """Warning of vehicle and station about their clocks while a driver tries to drive; empty if one is missing."""
+        wrong = self._connection.clocks
         both = self._until(lambda: wrong.wall_wrong and bool(self._told) and "NTP" in self._told[0].reason)
-        end = time.monotonic() + WITHIN
+        end = time.monotonic() + DRIVE_ATTEMPT_S
         while time.monotonic() < end and not self._vehicle.drives:
             time.sleep(0.01)
         return self._told[0].reason if both and not self._vehicle.drives else ""
 
     def close(self) -> None:
-        """End."""
+        """Stop the pair."""
         self._ended.set()
         for thread in self._threads:
             thread.join()
@@ -133,14 +132,14 @@ class Stopped:
             self._told[:] = [Telemetry.unpack(message.body)]
 
     def _drive(self) -> None:
-        route = Route()
-        while not self._ended.wait(EVERY):
+        route = ScriptedCommands()
+        while not self._ended.wait(COMMAND_PERIOD_S):
             if self._told:
-                self._bundle.send(Kind.COMMAND, route.command(self._told[0], time.monotonic()).pack())
+                self._connection.send(Kind.COMMAND, route.command(self._told[0], time.monotonic()).pack())
 
     @staticmethod
     def _until(true: Callable[[], bool]) -> bool:
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + STATE_TIMEOUT_S
         while not (found := true()) and time.monotonic() < end:
             time.sleep(0.005)
         return found
@@ -150,33 +149,34 @@ def _wall(wrong: float) -> int:
     return time.time_ns() + round(wrong * 1e9)
 
 
-def clocks(scale: float, say: Say) -> dict[str, Any]:
-    """A wall clock of either side is wrong, to either side; a driver tries to drive, and both are to notice before."""
-    tries, noticed = [(wrong, side) for wrong in (WRONG, -WRONG) for side in ("vehicle", "station")], 0
-    for wrong, side in tries:
-        pair = Stopped(1, (wrong, 0.0) if side == "vehicle" else (0.0, wrong))
-        told = pair.noticed()
+def clocks(scale: float, report: Report) -> dict[str, Any]:
+    """A wrong wall clock at either side, in both directions; both sides must warn before the vehicle drives."""
+    cases = [(wrong, side) for wrong in (CLOCK_ERROR_S, -CLOCK_ERROR_S) for side in ("vehicle", "station")]
+    noticed = 0
+    for wrong, side in cases:
+        pair = InterruptedPair(1, (wrong, 0.0) if side == "vehicle" else (0.0, wrong))
+        warning = pair.clock_warning()
         pair.close()
-        noticed += bool(told)
-        say(f"the {side}'s clock {wrong:+.0f} s: {told or 'NOT NOTICED'}")
-    return {"wrong_clocks": len(tries), "wrong_clocks_noticed": noticed}
+        noticed += bool(warning)
+        report(f"the {side}'s clock {wrong:+.0f} s: {warning or 'NO WARNING'}")
+    return {"wrong_clocks": len(cases), "wrong_clocks_noticed": noticed}
 
 
 def _pairs(each: int, seed: int, pipe: multiprocessing.connection.Connection) -> None:
-    """The process of some pairs; tells each stop."""
+    """Process of some pairs; sends the result of each stop."""
 
     def one(number: int) -> None:
-        stopped = Stopped(seed + number)
+        pair = InterruptedPair(seed + number)
         try:
             for _ in range(each):
-                took = stopped.stop()
+                took = pair.stop()
                 with lock:
                     pipe.send(took)
         finally:
-            stopped.close()
+            pair.close()
 
     lock = threading.Lock()
-    threads = [threading.Thread(target=one, args=(number,)) for number in range(PAIRS)]
+    threads = [threading.Thread(target=one, args=(number,)) for number in range(PAIRS_PER_PROCESS)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -184,9 +184,9 @@ def _pairs(each: int, seed: int, pipe: multiprocessing.connection.Connection) ->
     pipe.close()
 
 
-def stops(scale: float, say: Say) -> dict[str, Any]:
-    """So many stops, of all pairs."""
-    each = max(3, round(1000 * scale / PROCESSES / PAIRS))
+def stops(scale: float, report: Report) -> dict[str, Any]:
+    """Stops of all pairs."""
+    each = max(3, round(1000 * scale / PROCESSES / PAIRS_PER_PROCESS))
     spawn = multiprocessing.get_context("spawn")
     pipes, processes = list[multiprocessing.connection.Connection](), list[Any]()
     for number in range(PROCESSES):
@@ -205,15 +205,16 @@ def stops(scale: float, say: Say) -> dict[str, Any]:
                 pipes.remove(pipe)
                 continue
             if len(taken) % 100 == 0:
-                say(f"{len(taken)} stops")
+                report(f"{len(taken)} stops")
     for process in processes:
         process.join()
     times = sorted(one for one in taken if one is not None)
-    expected = each * PROCESSES * PAIRS
+    expected = each * PROCESSES * PAIRS_PER_PROCESS
     if times:
         middle, last = times[len(times) // 2], times[-1]
-        say(
-            f"stops: {len(taken)} of {expected}, half within {middle:.0f} ms, all within {last:.0f}; limit {LIMIT_MS:g}"
+        report(
+            f"stops: {len(taken)} of {expected}, half within {middle:.0f} ms, all within {last:.0f}; "
+            f"limit {COMMAND_MAX_AGE_MS:g}"
         )
-    in_time = sum(one <= LIMIT_MS + ALLOWED for one in times)
+    in_time = sum(one <= COMMAND_MAX_AGE_MS + TOLERANCE_MS for one in times)
     return {"stops": expected, "stops_in_time": in_time}

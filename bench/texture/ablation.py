@@ -1,7 +1,7 @@
-"""What each part of texturing is worth: ours with one part off at a time, on the scenes of `bench.texture`.
+"""Ablation of texturing: one part switched off at a time, on the scenes of `bench.texture`.
 
 `python -m bench.texture.ablation [--scenes kitti street_hard] [--out bench-out/texture]`, after `python -m
-bench.texture`, whose depth maps it takes. Figures as there; ends with `RESULT {json}`: scene, part, figures.
+bench.texture`, whose depth maps it uses. Metrics as there; ends with `RESULT {json}`: scene, part, metrics.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ OFF: dict[str, dict[str, dict[str, Any]]] = {
     "fading along seams": {"texture": {"fade": False}},
     "charts cut from photos": {"unwrap": {"backend": "xatlas"}},
 }
-"""What is switched off, and by which parameters of which step."""
+"""Parameters by step that switch off each part."""
 
 
 def paint(scene: Scene, given: dict[str, dict[str, Any]], folder: Path) -> Path:
-    """Our texture of a scene with some parameters; its folder."""
+    """Texture a scene with some parameters; returns the texture's folder."""
     files = {"mesh": scene.mesh, "views": scene.views, "depth": scene.depth} | scene.clouds
     for step in (EXPOSURE, AGREEMENT, CHOOSE, UNWRAP, TEXTURE):
         files |= run(step, files, fresh(folder / step.name), **given.get(step.name, {}))
     return files["textured"]
 
 
-def figures(scene: Scene, folder: Path, clean: Path | None) -> dict[str, float]:
-    """Of a texture: at the held-out photos, and on a street against its truth; ghosts where `clean` is given."""
+def metrics(scene: Scene, folder: Path, clean: Path | None) -> dict[str, float]:
+    """Metrics of a texture at the held-out photos, on streets also against the truth; ghosts if `clean` is given."""
     from scan2sim.pipeline.camera.renderer import Renderer, textured
     from scan2sim.texturing.evaluate import held_out
 
@@ -69,7 +69,7 @@ def figures(scene: Scene, folder: Path, clean: Path | None) -> dict[str, float]:
 
 
 def main() -> None:
-    """Print a table a scene, and the result."""
+    """Print a table per scene, and the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=["kitti", "street_hard"])
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "texture")
@@ -82,7 +82,7 @@ def main() -> None:
         for part, given in OFF.items():
             folder = paint(scene, given, scene.folder / "ablation")
             clean = scene.folder.with_name("street_clean") / "methods" / "ours" if name == "street_hard" else None
-            result[name][part] = figures(scene, folder, clean)
+            result[name][part] = metrics(scene, folder, clean)
             print(f"{name:12s} {part:26s} {result[name][part]}", flush=True)
     print("RESULT " + json.dumps(result))
 

@@ -1,6 +1,6 @@
-"""Textures as they are usually made, on the same mesh, atlas and photos as ours.
+"""Baseline texturing methods, on the same mesh, atlas and photos as ours.
 
-Each writes what the step `texture` writes: `mesh.npz`, `page_<i>.png`, `page_<i>_seen.png`.
+Each writes the same files as the step `texture`: `mesh.npz`, `page_<i>.png`, `page_<i>_seen.png`.
 """
 
 from __future__ import annotations
@@ -14,10 +14,19 @@ import numpy as np
 from numba import njit, prange
 
 from bench.texture.scenes import Scene
-from scan2sim.pipeline.camera.depth_map import BIAS, load_depth_map
+from scan2sim.pipeline.camera.depth_map import RANGE_BIAS_M, load_depth_map
 from scan2sim.pipeline.camera.image_sampling import bilinear
 from scan2sim.pipeline.camera.models import EQUIRECTANGULAR
-from scan2sim.pipeline.camera.projection import Eye, Ranges, eye, incidence, is_visible, pixel_of, to_camera, turned
+from scan2sim.pipeline.camera.projection import (
+    PosedCamera,
+    Ranges,
+    incidence,
+    is_visible,
+    pixel_of,
+    posed_camera,
+    rotate_to_camera,
+    to_camera,
+)
 from scan2sim.pipeline.core.types import F32, I32, I64, U8, Mesh
 from scan2sim.pipeline.io.images import image
 from scan2sim.texturing.bake import texel_map
@@ -25,12 +34,12 @@ from scan2sim.texturing.inpainting import hole_filling
 
 OPEN3D_SIZE = 4096
 PADDING = 16
-MAX_DISTANCE, MIN_COS = 40.0, 0.08
-"""Metres and cosine (normal to ray) at which a photo is used for a surface at all, as by ours."""
+MAX_DISTANCE_M, MIN_INCIDENCE_COS = 40.0, 0.08
+"""Maximum distance and minimum cosine (normal to ray) at which a photo is used for a surface, as in ours."""
 
 
 def parametrize(scene: Scene, out: Path) -> None:
-    """Unwrap as xatlas does by itself, the whole mesh at once; only its time is of interest."""
+    """Plain unwrapping of the whole mesh by xatlas; only its cost is of interest."""
     import xatlas
 
     mesh = Mesh.load(scene.mesh)
@@ -38,9 +47,9 @@ def parametrize(scene: Scene, out: Path) -> None:
 
 
 def open3d(scene: Scene, out: Path) -> None:
-    """Open3D's `project_images_to_albedo` of the perspective photos, distortion removed; it knows no other cameras.
+    """Open3D's `project_images_to_albedo` with the perspective photos, undistorted; it supports no other cameras.
 
-    It paints one atlas alone: several pages of ours become a grid in it. Black texels are those that it left out.
+    It textures a single atlas: several pages of ours become a grid. Black texels are those without colour.
     """
     import cv2
     import open3d as o3d
@@ -69,7 +78,7 @@ def open3d(scene: Scene, out: Path) -> None:
 
 
 def _one_atlas(mesh: Mesh) -> Mesh:
-    """The mesh with its pages laid out as the cells of a square grid on one."""
+    """The mesh with its pages arranged as a square grid on one page."""
     assert mesh.uv is not None and mesh.page is not None
     side = math.ceil(math.sqrt(int(mesh.page.max()) + 1))
     cell = np.stack([mesh.page % side, mesh.page // side], axis=1)[:, None]
@@ -77,12 +86,12 @@ def _one_atlas(mesh: Mesh) -> Mesh:
 
 
 def nearest(scene: Scene, out: Path) -> None:
-    """Every texel from the nearest photo that sees it."""
+    """Each texel from the nearest photo that sees it."""
     _paint(scene, out, only_nearest=True)
 
 
 def inverse_square(scene: Scene, out: Path) -> None:
-    """Every texel the mean of all photos that see it, weighted by the inverse square of their distance."""
+    """Each texel as the mean of all photos that see it, weighted by the inverse square of their distance."""
     _paint(scene, out, only_nearest=False)
 
 
@@ -97,14 +106,14 @@ def _paint(scene: Scene, out: Path, *, only_nearest: bool) -> None:
         owner = texel_map.owners(flat, width, height)
         at = np.nonzero(owner >= 0)
         face = owner[at]
-        places = _places(flat, corners[faces], face, *at)
+        points = _points(flat, corners[faces], face, *at)
         total = np.zeros((len(face), 4), np.float32)
         for i, view in scene.photos(held_out=False).items():
             photo = image.read_rgb(view.photo)
             depth = load_depth_map(scene.depth / f"{i}.npy", view.camera, view.T_world_cam)
             _add(
-                total, places, normals[faces], face, photo, eye(view.camera, view.T_world_cam), depth.ranges,
-                BIAS, MAX_DISTANCE, MIN_COS, only_nearest,
+                total, points, normals[faces], face, photo, posed_camera(view.camera, view.T_world_cam), depth.ranges,
+                RANGE_BIAS_M, MAX_DISTANCE_M, MIN_INCIDENCE_COS, only_nearest,
             )  # fmt: skip
         rgb, seen = np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.uint8)
         rgb[at] = np.rint(total[:, :3] / np.maximum(total[:, 3:], 1e-12))
@@ -120,8 +129,8 @@ def _write(out: Path, page: int, rgb: U8, seen: U8) -> None:
 
 
 @njit(cache=True, parallel=True)
-def _places(flat: F32, corners: F32, face: I32, rows: I64, columns: I64) -> F32:
-    """(N, 3) float32: where the texels lie in space."""
+def _points(flat: F32, corners: F32, face: I32, rows: I64, columns: I64) -> F32:
+    """(N, 3) float32 positions of the texels."""
     out = np.empty((len(face), 3), np.float32)
     for i in prange(len(face)):
         origin, per_x, per_y, _ = texel_map.frame(flat, corners, face[i])
@@ -133,34 +142,34 @@ def _places(flat: F32, corners: F32, face: I32, rows: I64, columns: I64) -> F32:
 @njit(cache=True, parallel=True)
 def _add(
     total: F32,
-    places: F32,
+    points: F32,
     normals: F32,
     face: I32,
     photo: U8,
-    eye: Eye,
+    camera: PosedCamera,
     ranges: Ranges,
     bias: float,
     max_distance: float,
     min_cos: float,
     only_nearest: bool,
 ) -> None:
-    """Add a photo's weighted colour to the texels (N, 4) that it sees, or put it in the place of a farther one's."""
-    for i in prange(len(places)):
-        place, normal = places[i], normals[face[i]]
-        x, y, z = to_camera(eye.T, place[0], place[1], place[2])
-        nx, ny, nz = turned(eye.T, normal[0], normal[1], normal[2])
-        r, cos = incidence(eye, x, y, z, nx, ny, nz)
+    """Add a photo's weighted colour to the texels (N, 4) that it sees, or replace that of a farther photo."""
+    for i in prange(len(points)):
+        place, normal = points[i], normals[face[i]]
+        x, y, z = to_camera(camera.T, place[0], place[1], place[2])
+        nx, ny, nz = rotate_to_camera(camera.T, normal[0], normal[1], normal[2])
+        r, cos = incidence(camera, x, y, z, nx, ny, nz)
         if r > max_distance or cos < min_cos:
             continue
-        u, v, ok = pixel_of(eye, x, y, z)
-        if not ok or not is_visible(eye, ranges, u, v, r, cos, bias):
+        u, v, ok = pixel_of(camera, x, y, z)
+        if not ok or not is_visible(camera, ranges, u, v, r, cos, bias):
             continue
         w = 1.0 / (r * r)
         if only_nearest:
             if w <= total[i, 3]:
                 continue
             total[i, :] = 0
-        rgb = bilinear(photo, u, v, eye.model == EQUIRECTANGULAR)
+        rgb = bilinear(photo, u, v, camera.model == EQUIRECTANGULAR)
         for k in range(3):
             total[i, k] += w * rgb[k]
         total[i, 3] += w

@@ -1,13 +1,13 @@
-"""What refined poses are worth: on a street whose true poses are known, and on two real ones.
+"""Effect of pose refinement: on a street with known poses, and on two real ones.
 
 `python -m bench.texture.pose_refinement [--parts synthetic raw0009 odo04] [--out bench-out/refine]`
 
-- synthetic: 40 m of the synthetic street, front and side cameras and panoramas, its photos' poses disturbed by 3 cm and
-  2 mrad each, and each camera by 5 cm and 5 mrad (lengths of random vectors). Error in pixels: `absolute`, how far from
-  the truth surface within 20 m is seen; `between`, how far apart two photos that follow each other have the same place,
-  over the surface: what blurs texture. With the true poses none must move.
-- raw0009, odo04: the real streets of `bench.street`, without and with the step `refine`, by that bench's scorer:
-  held-out photos, and outlines of what is drawn in them.
+- synthetic: 40 m of the synthetic street with front and side cameras and panoramas; poses of the photos are disturbed
+  by 3 cm and 2 mrad each, and each camera by 5 cm and 5 mrad (lengths of random vectors). Errors in pixels: `absolute`,
+  the displacement of surface points within 20 m relative to the truth; `between`, the relative displacement of the same
+  point in two successive photos, which blurs textures. With true poses nothing may move.
+- raw0009, odo04: the real streets of `bench.street` without and with the step `refine`, scored by that benchmark:
+  held-out photos, and their outlines.
 
 Ends with `RESULT {json}`.
 """
@@ -36,25 +36,28 @@ from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import F64, Mesh, PointCloud, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.texturing.photo_prediction import surface
-from scan2sim.texturing.pose_refinement.step import RefineParams, lenses, refine
+from scan2sim.texturing.pose_refinement.step import RefineParams, group_by_camera, refine
 
 PARTS = ("synthetic", "raw0009", "odo04")
-PHOTO, CAMERA = (0.002, 0.03), (0.005, 0.05)
-"""Radians and metres of the disturbances."""
-NEAR, PLACES, SMALL = 20.0, 4000, 200_000
+PHOTO_ERROR, CAMERA_ERROR = (0.002, 0.03), (0.005, 0.05)
+"""Disturbances of each photo and of each camera: radians and metres."""
+MAX_RANGE_M, SAMPLES, DEPTH_MAP_PIXELS = 20.0, 4000, 200_000
 
 
 def disturbed(views: Sequence[View], rng: np.random.Generator) -> list[View]:
-    """Views whose poses are wrong by what their photo and what their camera adds."""
+    """Views with poses disturbed by an error of each photo and one of its camera."""
 
-    def some(count: int, lengths: tuple[float, float]) -> tuple[F64, F64]:
+    def random_errors(count: int, lengths: tuple[float, float]) -> tuple[F64, F64]:
         ways = rng.normal(size=(2, count, 3))
         turn, shift = ways / np.linalg.norm(ways, axis=2, keepdims=True)
         return turn * lengths[0], shift * lengths[1]
 
-    names, camera = lenses(views)
+    names, camera = group_by_camera(views)
     turn, shift = (
-        own + lens[camera] for own, lens in zip(some(len(views), PHOTO), some(len(names), CAMERA), strict=True)
+        own + lens[camera]
+        for own, lens in zip(
+            random_errors(len(views), PHOTO_ERROR), random_errors(len(names), CAMERA_ERROR), strict=True
+        )
     )
     out = []
     for k, view in enumerate(views):
@@ -66,21 +69,21 @@ def disturbed(views: Sequence[View], rng: np.random.Generator) -> list[View]:
 
 
 def errors(views: Sequence[View], truth: Sequence[View], maps: Sequence[DepthMap]) -> dict[str, float]:
-    """Medians of the pixels by which places are seen elsewhere than from the true poses, see above."""
+    """Median pixel displacements relative to the true poses, see the module's docstring."""
     rng = np.random.default_rng(0)
     absolute: list[F64] = []
     between: list[F64] = []
     for k, (view, true, depth) in enumerate(zip(views, truth, maps, strict=True)):
         shown = surface(depth.camera, depth)
-        places, normal = shown.some(PLACES, NEAR, rng)
-        absolute.append(np.linalg.norm(_pixels(view, places) - _pixels(true, places), axis=1))
-        ray = unproject(view.camera, _pixels(true, places)) @ view.T_world_cam[:3, :3].T
-        far = np.einsum("ij,ij->i", places - view.centre, normal) / np.einsum("ij,ij->i", ray, normal)
-        taken = view.centre + ray * far[:, None]  # where these poses have what this photo shows
+        samples, normal = shown.sample(SAMPLES, MAX_RANGE_M, rng)
+        absolute.append(np.linalg.norm(_pixels(view, samples) - _pixels(true, samples), axis=1))
+        ray = unproject(view.camera, _pixels(true, samples)) @ view.T_world_cam[:3, :3].T
+        far = np.einsum("ij,ij->i", samples - view.centre, normal) / np.einsum("ij,ij->i", ray, normal)
+        taken = view.centre + ray * far[:, None]  # position of the photo's content according to these poses
         for j in (k - 1, k + 1):
             if 0 <= j < len(views):
-                seen = visible(maps[j], places, normal)
-                off = _pixels(views[j], taken[seen]) - _pixels(truth[j], places[seen])
+                seen = visible(maps[j], samples, normal)
+                off = _pixels(views[j], taken[seen]) - _pixels(truth[j], samples[seen])
                 between.append(np.linalg.norm(off, axis=1))
     return {
         "absolute": float(np.nanmedian(np.concatenate(absolute))),
@@ -88,20 +91,20 @@ def errors(views: Sequence[View], truth: Sequence[View], maps: Sequence[DepthMap
     }
 
 
-def _pixels(view: View, places: F64) -> F64:
-    """(N, 2) where a photo has places; NaN outside of it."""
-    uv, shown = pixels(view.camera, view.T_world_cam, places)
+def _pixels(view: View, samples: F64) -> F64:
+    """(N, 2) pixels of points in a photo; NaN outside of it."""
+    uv, shown = pixels(view.camera, view.T_world_cam, samples)
     return np.where(shown[:, None], uv, np.nan).astype(np.float64)
 
 
 def synthetic(folder: Path) -> dict[str, Any]:
-    """The street with known poses."""
+    """Refine disturbed poses of the synthetic street."""
     made = Scene(folder / "street_clean")
     if not made.views.is_file():
         make("street_clean", made)
     truth, held = views_io.load(made.views), views_io.load_held_out(made.views)
     hides = scene([Mesh.load(made.mesh)], PointCloud.join([PointCloud.load(path) for path in made.clouds.values()]))
-    maps = [depth_map(v.camera, v.T_world_cam, hides, time=v.time, pixels=SMALL) for v in truth]
+    maps = [depth_map(v.camera, v.T_world_cam, hides, time=v.time, pixels=DEPTH_MAP_PIXELS) for v in truth]
     scan = {"mesh.surface": made.mesh} | {k: path for k, path in made.clouds.items() if k == "cloud.rest"}
 
     settings = RefineParams.of("refine", {})
@@ -113,7 +116,7 @@ def synthetic(folder: Path) -> dict[str, Any]:
         done = refine({"views": folder / "views.json", **scan}, settings, out, silent)
         return views_io.load(done.files["views"]), done.facts, time.perf_counter() - start
 
-    refined(truth)  # kernels compiled before times are taken
+    refined(truth)  # warm up: compile kernels
     _, still, _ = refined(truth)
     wrong = disturbed(truth, np.random.default_rng(0))
     found, facts, seconds = refined(wrong)
@@ -131,22 +134,22 @@ def synthetic(folder: Path) -> dict[str, Any]:
 
 
 def real(name: str, folder: Path) -> dict[str, Any]:
-    """A real street without and with refined poses."""
-    figures = {}
+    """Compare a real street without and with refined poses."""
+    metrics = {}
     for when in ("never", "auto"):
         at = folder / name / when
         if when == "auto" and not at.is_dir():
-            shutil.copytree(folder / name / "never", at, symlinks=True)  # what is the same isn't made twice
-        tile, run = street.made(street.STREETS[name], at, (f"refine.when={when}",))
-        figures[when] = street.scored(street.STREETS[name], tile, run, folder / "pictures" / f"{name}_{when}")
+            shutil.copytree(folder / name / "never", at, symlinks=True)  # reuse identical results
+        tile, run = street.build_world(street.STREETS[name], at, (f"refine.when={when}",))
+        metrics[when] = street.score_world(street.STREETS[name], tile, run, folder / "pictures" / f"{name}_{when}")
     refined = json.loads((run / "report.json").read_text(encoding="utf-8"))["steps"]["refine"]
-    return compared(name, figures, refined)
+    return compare(name, metrics, refined)
 
 
-def compared(name: str, figures: dict[str, dict[str, Any]], refined: dict[str, Any]) -> dict[str, Any]:
-    """Figures of both worlds of a street, and of the step."""
-    never, auto = figures["never"], figures["auto"]
-    outlines = {when: float(np.median(f["displacements_px"])) for when, f in figures.items()}
+def compare(name: str, metrics: dict[str, dict[str, Any]], refined: dict[str, Any]) -> dict[str, Any]:
+    """Metrics of both worlds of a street, and of the step."""
+    never, auto = metrics["never"], metrics["auto"]
+    outlines = {when: float(np.median(f["displacements_px"])) for when, f in metrics.items()}
     facts = refined["facts"]
     print(
         f"{name}: matches {facts['displaced_px']:.2f} -> {facts.get('displaced_after_px')} pixels; held-out photos ",
@@ -165,7 +168,7 @@ def compared(name: str, figures: dict[str, dict[str, Any]], refined: dict[str, A
 
 
 def main() -> None:
-    """Run the parts, print a line each and the result."""
+    """Run the parts, print a line for each, and the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "refine")
@@ -174,10 +177,10 @@ def main() -> None:
     found: dict[str, Any] = {}
     for part in arguments.parts:
         if part != "synthetic" and not street.STREETS[part].data.is_dir():
-            print(f"{part}: left out, there is no {street.STREETS[part].data}")
+            print(f"{part}: skipped, {street.STREETS[part].data} doesn't exist")
             continue
-        figures = synthetic(arguments.out) if part == "synthetic" else real(part, arguments.out)
-        found |= {f"{part}_{k}": round(v, 3) if isinstance(v, float) else v for k, v in figures.items()}
+        metrics = synthetic(arguments.out) if part == "synthetic" else real(part, arguments.out)
+        found |= {f"{part}_{k}": round(v, 3) if isinstance(v, float) else v for k, v in metrics.items()}
     print("RESULT " + json.dumps(found))
 
 

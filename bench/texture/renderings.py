@@ -1,4 +1,4 @@
-"""Photo and renderings side by side: whole, and close-ups of a facade, the kerb and the road."""
+"""Photo and renderings side by side: overview, and close-ups of a facade, the kerb and the road."""
 
 from __future__ import annotations
 
@@ -10,36 +10,36 @@ import numpy as np
 from scan2sim.pipeline.core.types import U8
 from scan2sim.pipeline.io.images import image
 
-COLUMN = 640
-"""Pixels that a picture is wide in the overview."""
-CLOSE = (360, 270)
-"""Pixels of a close-up, at full size; shown twice as large."""
-CLOSE_AT = {"left": (0.18, 0.42), "middle": (0.5, 0.66), "right": (0.8, 0.55)}
-"""Where the close-ups' middles are, shares of width and height."""
+OVERVIEW_WIDTH_PX = 640
+"""Width of an image in the overview."""
+CLOSE_UP_PX = (360, 270)
+"""Size of a close-up in the original; shown at twice this size."""
+CLOSE_UP_CENTRES = {"left": (0.18, 0.42), "middle": (0.5, 0.66), "right": (0.8, 0.55)}
+"""Centres of the close-ups, as shares of width and height."""
 
-Named = Sequence[tuple[str, U8]]
+NamedImages = Sequence[tuple[str, U8]]
 
 
-def side_by_side(folder: Path, name: str, images: Named) -> None:
-    """Write `<name>.png` and a `<name>_<place>.png` for each close-up; `images` (H, W, 3) are named and of one size."""
+def side_by_side(folder: Path, name: str, images: NamedImages) -> None:
+    """Write `<name>.png`, and `<name>_<place>.png` for each close-up; named `images` (H, W, 3) of the same size."""
     import cv2
 
     height, width = images[0][1].shape[:2]
-    size = (COLUMN, round(COLUMN * height / width))
+    size = (OVERVIEW_WIDTH_PX, round(OVERVIEW_WIDTH_PX * height / width))
     image.write(
         folder / f"{name}.png",
         _row([(n, np.asarray(cv2.resize(i, size, interpolation=cv2.INTER_AREA))) for n, i in images]),
     )
-    w, h = min(CLOSE[0], width), min(CLOSE[1], height)
-    for place, (across, down) in CLOSE_AT.items():
+    w, h = min(CLOSE_UP_PX[0], width), min(CLOSE_UP_PX[1], height)
+    for place, (across, down) in CLOSE_UP_CENTRES.items():
         x = int(np.clip(across * width - w / 2, 0, width - w))
         y = int(np.clip(down * height - h / 2, 0, height - h))
         parts = [(n, np.repeat(np.repeat(i[y : y + h, x : x + w], 2, axis=0), 2, axis=1)) for n, i in images]
         image.write(folder / f"{name}_{place}.png", _row(parts))
 
 
-def _row(images: Named) -> U8:
-    """Pictures in rows of up to three, with their names."""
+def _row(images: NamedImages) -> U8:
+    """Images in rows of up to three, with their names."""
     import cv2
 
     height, width = images[0][1].shape[:2]

@@ -1,23 +1,23 @@
-"""Our textures beside those of the usual baselines, on one mesh, one atlas and one set of photos.
+"""Our textures compared with common baselines, on one mesh, one atlas and one set of photos.
 
 `python -m bench.texture [--scenes kitti street_clean street_hard] [--methods open3d nearest inverse_square ours]
 [--out bench-out/texture] [--pictures DIR] [--keep]`
 
-Scenes (`bench.texture.scenes`) are made when absent: a KITTI street (skipped where its data is absent), and a generated
-one, without and with exposure changes and a moving car. Methods run one after another, each in processes of its own;
-every photo held out is compared with each method's rendering on the pixels that the method itself painted.
+Scenes (`bench.texture.scenes`) are created if missing: a KITTI street (skipped without its data), and a generated one
+without and with exposure changes and a moving car. Methods run one after another, each in separate processes;
+held-out photos are compared with each method's rendering on the pixels textured by the method.
 
-- seconds and GB of ours are those of its steps visibility; exposure, agreement, choose and unwrap; texture: three
-  processes, imports included (seconds summed, the largest memory). The baselines nearest and inverse_square are given
+- Seconds and GB of ours are those of the steps visibility; exposure, agreement, choose and unwrap; texture: three
+  processes including imports (sum of seconds, maximum of memory). The baselines nearest and inverse_square are given
   atlas and depth maps; Open3D is given the atlas, but time_ratio and memory_ratio add xatlas' plain unwrapping of the
-  whole mesh to its albedo.
-- truth (streets): PSNR against the true surface colours where a photo saw them at 15 m or nearer, as it is and with one
-  gain a channel for the whole street. truth_psnr_db of the RESULT is street_clean's as it is, truth_hard_psnr_db
-  street_hard's with the gain: photos of unknown exposure leave the whole's brightness open.
+  whole mesh to its albedo projection.
+- truth (streets): PSNR against the true surface colours where a photo saw them within 15 m, without and with one gain
+  per channel for the whole street. truth_psnr_db of RESULT is street_clean's without gain, truth_hard_psnr_db
+  street_hard's with gain, as photos with unknown exposure don't determine the overall brightness.
 - ghosts (street_hard): see `bench.texture.truth.Road`; needs street_clean by the same method.
-- *_over_best_db: mean PSNR (gain solved) at the held-out photos, ours less the best baseline's; street: street_hard.
+- *_over_best_db: mean PSNR (with gain) at the held-out photos, ours minus the best baseline's; street: street_hard.
 
-Ends with `RESULT {json}`; null where a scene or method was left out.
+Ends with `RESULT {json}`; null for scenes or methods that were not run.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.measure import Measured, measure
+from bench.measure import Measurement, measure
 from bench.paths import ROOT
-from bench.texture.scenes import KITTI, SCENES, WARM, Scene, available, fresh, make, run
+from bench.texture.scenes import KITTI, SCENES, WARM_UP, Scene, available, fresh, make, run
 from scan2sim.pipeline.core.sandbox import die_with_parent
 from scan2sim.pipeline.steps.visibility import VISIBILITY
 from scan2sim.texturing.exposure import EXPOSURE
@@ -44,16 +44,16 @@ from scan2sim.texturing.unwrap import UNWRAP
 from scan2sim.texturing.view_selection.step import CHOOSE
 
 METHODS = ("open3d", "nearest", "inverse_square", "ours")
-FIGURES = ("psnr_db", "psnr_gain_db", "ssim", "sharpness", "coverage")
+METRICS = ("psnr_db", "psnr_gain_db", "ssim", "sharpness", "coverage")
 
 
 def visibility(scene: Scene, out: Path) -> None:
-    """Our depth maps, which all methods but Open3D's ask."""
+    """Depth maps of ours, used by all methods except Open3D's."""
     run(VISIBILITY, {"mesh.surface": scene.mesh, "views": scene.views} | scene.clouds, out)
 
 
 def unwrap(scene: Scene, out: Path) -> None:
-    """Our atlas, which all methods paint; its charts are cut by the photos that ours chooses."""
+    """Atlas of ours, used by all methods; its charts are cut by the photos chosen by ours."""
     files = {"mesh": scene.mesh, "views": scene.views, "depth": scene.depth}
     for step in (EXPOSURE, AGREEMENT, CHOOSE):
         files |= run(step, files, scene.folder / "choice" / step.name)
@@ -61,7 +61,7 @@ def unwrap(scene: Scene, out: Path) -> None:
 
 
 def ours(scene: Scene, out: Path) -> None:
-    """Our texture by the step that follows those, with its defaults."""
+    """Texture of ours with the default settings of the step `texture`."""
     choice = scene.folder / "choice"
     inputs = {
         "mesh": scene.atlas / "mesh.npz",
@@ -78,7 +78,7 @@ def ours(scene: Scene, out: Path) -> None:
 
 
 def work(method: str, scene: Scene, out: Path) -> None:
-    """What a child process does: make a scene or a part of it, or a method's texture."""
+    """Task of a child process: create a scene or a part of it, or a method's texture."""
     die_with_parent()
     if method in ("unwrap", "visibility", "ours"):
         globals()[method](scene, out)
@@ -92,36 +92,36 @@ def work(method: str, scene: Scene, out: Path) -> None:
 
 @dataclass
 class Row:
-    """A method's figures in a scene.
+    """Results of a method in a scene.
 
     Attributes:
         measured: time and memory.
-        photos: held-out photo to its figures (`FIGURES`).
-        more: truth's and ghosts' figures, for the streets.
+        photos: metrics (`METRICS`) by held-out photo.
+        more: metrics of truth and ghosts, for the streets.
     """
 
-    measured: Measured
+    measured: Measurement
     photos: dict[str, dict[str, float]] = field(default_factory=dict)
     more: dict[str, float] = field(default_factory=dict)
 
     def mean(self, figure: str) -> float:
-        """Over the photos."""
+        """Mean over the photos."""
         values = [photo[figure] for photo in self.photos.values()]
         return sum(values) / len(values) if values else float("nan")
 
 
 class Bench:
-    """A run of the bench: scenes below `out`, methods in turn.
+    """A run of the benchmark: scenes below `out`, methods one after another.
 
     Args:
-        keep: results of an earlier run stand, but for ours.
+        keep: reuse results of an earlier run, except for ours.
     """
 
     def __init__(self, out: Path, methods: Sequence[str], *, keep: bool, pictures: Path | None) -> None:
         self.out, self.methods, self.keep, self.pictures = out, methods, keep, pictures
 
     def scene(self, name: str) -> Scene:
-        """The scene of that name, made if need be."""
+        """The scene of that name, created if missing."""
         scene = Scene(self.out / name)
         if not scene.views.is_file():
             if name == "street_hard":
@@ -130,7 +130,7 @@ class Bench:
         return scene
 
     def folder(self, scene: Scene, method: str) -> Path:
-        """Where a method's texture of a scene is."""
+        """Folder of a method's texture of a scene."""
         return scene.folder / "methods" / method
 
     def textures(self, scene: Scene) -> dict[str, Row]:
@@ -140,30 +140,30 @@ class Bench:
         for method in self.methods:
             mine = self._run(scene, method, again=method == "ours")
             parts = [*prepared, mine] if method == "ours" else [mine]
-            rows[method] = Row(_together(parts))
+            rows[method] = Row(_total(parts))
         return rows
 
-    def _shared(self, scene: Scene, step: str, folder: Path) -> Measured:
-        """Atlas or depth maps: drawn once a run, and once and for all where ours does not run."""
+    def _shared(self, scene: Scene, step: str, folder: Path) -> Measurement:
+        """Atlas or depth maps: computed once per run, or only once if ours isn't run."""
         note = scene.folder / f"{step}.json"
         if "ours" in self.methods or not note.is_file():
             note.write_text(json.dumps(asdict(self._child(step, scene, fresh(folder)))), encoding="utf-8")
-        return Measured(**json.loads(note.read_text(encoding="utf-8")))
+        return Measurement(**json.loads(note.read_text(encoding="utf-8")))
 
-    def _run(self, scene: Scene, method: str, *, again: bool) -> Measured:
+    def _run(self, scene: Scene, method: str, *, again: bool) -> Measurement:
         folder = self.folder(scene, method)
         note = folder.with_suffix(".json")
         if again or not (self.keep and note.is_file()):
             note.unlink(missing_ok=True)
             measured = self._child(method, scene, fresh(folder))
             note.write_text(json.dumps(asdict(measured)), encoding="utf-8")
-        return Measured(**json.loads(note.read_text(encoding="utf-8")))
+        return Measurement(**json.loads(note.read_text(encoding="utf-8")))
 
-    def parametrize(self, scene: Scene) -> Measured:
-        """The plain unwrapping of xatlas, of the whole mesh."""
+    def parametrize(self, scene: Scene) -> Measurement:
+        """Plain unwrapping of the whole mesh by xatlas."""
         return self._run(scene, "parametrize", again=False)
 
-    def _child(self, method: str, scene: Scene, out: Path) -> Measured:
+    def _child(self, method: str, scene: Scene, out: Path) -> Measurement:
         command = [sys.executable, "-m", "bench.texture", "--method", method]
         measured = measure([*command, "--scene", str(scene.folder), "--out", str(out)])
         if measured.status != 0:
@@ -172,7 +172,7 @@ class Bench:
         return measured
 
     def score(self, scene: Scene, rows: dict[str, Row]) -> None:
-        """Compare renderings with the photos that were held out."""
+        """Compare renderings with the held-out photos."""
         from scan2sim.pipeline.camera.renderer import Renderer, textured
         from scan2sim.texturing.evaluate import held_out
 
@@ -182,7 +182,7 @@ class Bench:
         for method, row in rows.items():
             for result in held_out(Renderer([textured(self.folder(scene, method))]), list(held.values()), depths):
                 name = Path(result.view.name).name
-                row.photos[name] = {figure: getattr(result, figure, float("nan")) for figure in FIGURES}
+                row.photos[name] = {figure: getattr(result, figure, float("nan")) for figure in METRICS}
                 shown.setdefault(name, [("photo", result.photo)]).append(
                     (method, np.where(result.render.hit[..., None], result.render.rgb, np.uint8(255)))
                 )
@@ -193,21 +193,21 @@ class Bench:
                 side_by_side(self.pictures, f"{scene.folder.name}_{name}", images)
 
     def score_truth(self, scene: Scene, rows: dict[str, Row]) -> None:
-        """Compare textures with the true surface colours, and say how near the photos themselves come."""
+        """Compare textures with the true surface colours, and print the PSNR of the photos themselves."""
         from bench.texture.truth import likeness, samples, truth_psnr
 
         truth = samples(scene)
         ceiling = likeness(truth.photo, truth.rgb.astype(np.float32))
         print(
-            f"{scene.folder.name}: {len(truth.xyz):,} true samples seen at 15 m or nearer; the nearest photo itself, "
-            f"looked up there: {ceiling[0]:.2f} dB, gain solved {ceiling[1]:.2f} dB (the ceiling)"
+            f"{scene.folder.name}: {len(truth.xyz):,} true samples seen within 15 m; PSNR of the nearest photo itself: "
+            f"{ceiling[0]:.2f} dB, with gain {ceiling[1]:.2f} dB (upper bound)"
         )
         for method, row in rows.items():
             figures = truth_psnr(self.folder(scene, method), truth)
             row.more |= dict(zip(("truth_db", "truth_gain_db", "truth_coverage"), figures, strict=True))
 
     def score_ghosts(self, clean: Scene, hard: Scene, rows: dict[str, Row]) -> None:
-        """Count the ghost texels on the road of the street with the moving car."""
+        """Count ghost texels on the road of the street with the moving car."""
         from bench.texture.truth import Road
 
         road = Road(clean, hard)
@@ -218,18 +218,18 @@ class Bench:
             row.more |= {"ghosts": count, "ghost_painted": painted}
 
 
-def _together(parts: Sequence[Measured]) -> Measured:
-    return Measured(sum(p.seconds for p in parts), max(p.peak_gb for p in parts), 0)
+def _total(parts: Sequence[Measurement]) -> Measurement:
+    return Measurement(sum(p.seconds for p in parts), max(p.peak_gb for p in parts), 0)
 
 
 def table(name: str, rows: dict[str, Row]) -> str:
-    """A scene's figures, a line a method."""
+    """Table of a scene's results, a row per method."""
     more = list(dict.fromkeys(key for row in rows.values() for key in row.more))
     heads = ["PSNR", "gain", "SSIM", "sharp", "cover", *more, "s", "GB"]
     widths = [max(8, len(head) + 2) for head in heads]
     lines = ["", f"{name:<16}" + "".join(f"{head:>{w}}" for head, w in zip(heads, widths, strict=True))]
     for method, row in rows.items():
-        values = [f"{row.mean(f):.2f}" for f in FIGURES[:2]] + [f"{row.mean(f):.3f}" for f in FIGURES[2:]]
+        values = [f"{row.mean(f):.2f}" for f in METRICS[:2]] + [f"{row.mean(f):.3f}" for f in METRICS[2:]]
         values += [f"{row.more[key]:,.0f}" if key == "ghosts" else f"{row.more[key]:.2f}" for key in more]
         values += [f"{row.measured.seconds:.1f}", f"{row.measured.peak_gb:.2f}"]
         lines.append(f"{method:<16}" + "".join(f"{value:>{w}}" for value, w in zip(values, widths, strict=True)))
@@ -240,13 +240,13 @@ def table(name: str, rows: dict[str, Row]) -> str:
 
 
 def over_best(rows: dict[str, Row]) -> float | None:
-    """Decibels that ours is above the best baseline, gain solved; None without both."""
+    """PSNR in dB of ours above the best baseline, with gain; None without both."""
     others = [row.mean("psnr_gain_db") for method, row in rows.items() if method != "ours"]
     return rows["ours"].mean("psnr_gain_db") - max(others) if others and "ours" in rows else None
 
 
-def result(tables: dict[str, dict[str, Row]], parametrize: Measured | None) -> dict[str, float | None]:
-    """The figures of the last line."""
+def result(tables: dict[str, dict[str, Row]], parametrize: Measurement | None) -> dict[str, float | None]:
+    """Values of the RESULT line."""
     kitti, clean, hard = (tables.get(name, {}) for name in SCENES)
     mine, theirs = kitti.get("ours"), kitti.get("open3d")
     out: dict[str, float | None] = {
@@ -262,20 +262,20 @@ def result(tables: dict[str, dict[str, Row]], parametrize: Measured | None) -> d
         "memory_ratio": None,
     }
     if mine and theirs and parametrize:
-        whole = _together([parametrize, theirs.measured])
+        whole = _total([parametrize, theirs.measured])
         out["time_ratio"] = whole.seconds / mine.measured.seconds
         out["memory_ratio"] = mine.measured.peak_gb / whole.peak_gb
     return {key: None if value is None or value != value else round(value, 3) for key, value in out.items()}
 
 
 def main() -> None:
-    """Make scenes, run methods, print a table a scene and the result."""
+    """Create scenes, run methods, print a table per scene and the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", choices=[*SCENES, WARM], default=list(SCENES))
+    parser.add_argument("--scenes", nargs="+", choices=[*SCENES, WARM_UP], default=list(SCENES))
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "texture")
-    parser.add_argument("--pictures", type=Path, help="write photo and renderings side by side there")
-    parser.add_argument("--keep", action="store_true", help="results of an earlier run stand, but for ours")
+    parser.add_argument("--pictures", type=Path, help="folder for images of photo and renderings side by side")
+    parser.add_argument("--keep", action="store_true", help="reuse results of an earlier run, except for ours")
     parser.add_argument("--method", help=argparse.SUPPRESS)  # in a child process: the one to run,
     parser.add_argument("--scene", type=Path, help=argparse.SUPPRESS)  # and its scene
     arguments = parser.parse_args()
@@ -290,17 +290,17 @@ def main() -> None:
     print("RESULT " + json.dumps(result(tables, parametrize)))
 
 
-def _run(bench: Bench, scenes: Sequence[str]) -> tuple[dict[str, dict[str, Row]], Measured | None]:
-    """Tables of the scenes, printed as they come; what xatlas' plain unwrapping of KITTI's mesh took."""
+def _run(bench: Bench, scenes: Sequence[str]) -> tuple[dict[str, dict[str, Row]], Measurement | None]:
+    """Tables of the scenes, printed as they are computed, and cost of xatlas' plain unwrapping of KITTI's mesh."""
     tables: dict[str, dict[str, Row]] = {}
     parametrize = None
     others = [method for method in bench.methods if method != "open3d"]
-    print("warming up: kernels are compiled on a machine's first run, not on every tile's")
+    print("warming up: compiling kernels, which happens only once per machine")
     warm = Bench(bench.out, others, keep=False, pictures=None)
-    warm.textures(warm.scene(WARM))
+    warm.textures(warm.scene(WARM_UP))
     for name in scenes:
         if not available(name):
-            print(f"{name}: left out, there is no {KITTI}")
+            print(f"{name}: skipped, {KITTI} doesn't exist")
             continue
         scene = bench.scene(name)
         rows = tables[name] = bench.textures(scene)

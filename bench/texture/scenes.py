@@ -1,7 +1,7 @@
-"""What `bench.texture` compares textures on: scans made into one mesh, its photos, and which of them are held out.
+"""Scenes of `bench.texture`: a scan meshed as a single surface, its photos, and the held-out ones.
 
-A scene is a folder. `street_hard` takes mesh and surface points from `street_clean`, so that both are the same
-surface to the texel; its photos, and the points that only hide (its moving car's trail among them), are its own.
+A scene is a folder. `street_hard` takes its mesh and surface points from `street_clean`, so that both have exactly the
+same surface; its photos and its occluding points (including the moving car's trail) are its own.
 """
 
 from __future__ import annotations
@@ -31,87 +31,87 @@ from scan2sim.pipeline.steps.voxel import VOXEL
 
 KITTI = ROOT.parent / "shared" / "data" / "kitti_raw0009_f00-24"
 SCENES = ("kitti", "street_clean", "street_hard")
-WARM = "sample"
-"""The committed tile: small enough to have every kernel compiled before times are taken."""
+WARM_UP = "sample"
+"""The demo tile, small enough to warm up: compile all kernels before times are measured."""
 FACES = 200_000
-LIMITS = {"max_edge": 0.5, "max_distance": 0.5, "max_spacing": 1.6}  # the terrain's: small holes get closed
-HOLD_OUT = 8  # every 8th photo of each camera: of the 25 of KITTI those of frames 4, 12 and 20
+LIMITS = {"max_edge": 0.5, "max_distance": 0.5, "max_spacing": 1.6}  # those of terrain: small holes are closed
+HOLD_OUT = 8  # every 8th photo of each camera: frames 4, 12 and 20 of KITTI's 25
 STREET: dict[str, Any] = {"length": 40.0, "points": 1.6e6, "photos": 32, "photo_width": 1600, "seed": 0}
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Where the files of a scene are; `atlas` and `depth` are those of our steps `unwrap` and `visibility`."""
+    """Files of a scene; `atlas` and `depth` are results of the steps `unwrap` and `visibility`."""
 
     folder: Path
 
     @property
     def tile(self) -> Path:
-        """The scan's folder."""
+        """Folder of the scan."""
         return self.folder / "tile"
 
     @property
     def mesh(self) -> Path:
-        """The one `Mesh`."""
+        """File of the single `Mesh`."""
         return self.folder / "mesh.npz"
 
     @property
     def views(self) -> Path:
-        """`views.json`, with those that are held out."""
+        """File `views.json`, including held-out views."""
         return self.folder / "views" / "views.json"
 
     @property
     def clouds(self) -> dict[str, Path]:
-        """The thinned points of the surface, and those that only hide (`cloud.rest`) where there are any."""
+        """Thinned points of the surface, and points that only occlude (`cloud.rest`) if there are any."""
         files = {f"cloud.{part}": self.folder / f"{part}.npz" for part in ("surface", "rest")}
         return {name: path for name, path in files.items() if path.is_file()}
 
     @property
     def atlas(self) -> Path:
-        """Folder of `mesh.npz` (with uv and page) and `pages.json`."""
+        """Folder with `mesh.npz` (with uv and page) and `pages.json`."""
         return self.folder / "atlas"
 
     @property
     def depth(self) -> Path:
-        """Folder of a depth map a view."""
+        """Folder with a depth map per view."""
         return self.folder / "visibility" / "depth"
 
     def photos(self, *, held_out: bool) -> dict[int, View]:
-        """Views by index: those that are held out, or those that are used."""
+        """Views by index: either the held-out or the used ones."""
         views, held = views_io.load(self.views), views_io.load_held_out(self.views)
         return {i: view for i, view in enumerate(views) if held[i] == held_out}
 
 
 def fresh(folder: Path) -> Path:
-    """The folder, made anew and empty."""
+    """An empty folder; existing content is deleted."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     return folder
 
 
 def run(step: Step, inputs: Mapping[str, Path], folder: Path, **given: Any) -> dict[str, Path]:
-    """A step with its defaults, but for what is given; its files."""
+    """Run a step with default settings except the given ones; returns its files."""
     return step.run(inputs, step.params(**given), fresh(folder), silent).files
 
 
 def available(name: str) -> bool:
-    """Whether the scene can be made here."""
+    """Whether the scene's data are available."""
     return name != "kitti" or KITTI.is_dir()
 
 
 def make(name: str, scene: Scene) -> None:
-    """Make a scene's scan (one that is there stays), mesh, points and views."""
+    """Create a scene's scan (unless it exists), mesh, points and views."""
     scene.folder.mkdir(parents=True, exist_ok=True)
     if not (scene.tile / "tile.toml").is_file():
         _scan(name, scene.tile)
     if name == "street_hard":
         _surface_of(scene, Scene(scene.folder.with_name("street_clean")))
     else:
-        _surface(scene, 10 if name == "kitti" else None, 20_000 if name == WARM else FACES)
+        _surface(scene, 10 if name == "kitti" else None, 20_000 if name == WARM_UP else FACES)
 
 
 def _scan(name: str, tile: Path) -> None:
-    if name == WARM:
+    if name == WARM_UP:
         tile.symlink_to(ROOT / "data_samples" / "tile")
     elif name == "kitti":
         from scan2sim.pipeline.importers.kitti_raw import import_kitti_raw
@@ -127,7 +127,7 @@ def _scan(name: str, tile: Path) -> None:
 
 
 def _surface(scene: Scene, depth: int | None, faces: int) -> None:
-    """Mesh everything that belongs to a surface as one: 10 cm voxels, Poisson, trim, islands, decimate."""
+    """Mesh all surface points as one: 10 cm voxels, Poisson, trim, islands, decimate."""
     tile, steps = read_tile(scene.tile), scene.folder / "steps"
     thin = _thinned(tile, steps)
     for part, path in thin.items():
@@ -143,7 +143,7 @@ def _surface(scene: Scene, depth: int | None, faces: int) -> None:
 
 
 def _surface_of(scene: Scene, other: Scene) -> None:
-    """The surface of another scene, in this one's frame; what only hides, and the views, of this one."""
+    """Use another scene's surface in this one's frame; occluding points and views are its own."""
     tile, steps = read_tile(scene.tile), scene.folder / "steps"
     shutil.copyfile(_thinned(tile, steps)["rest"], scene.folder / "rest.npz")
     shutil.rmtree(steps)
@@ -158,7 +158,7 @@ def _moved(cloud: PointCloud, frame: Frame) -> PointCloud:
 
 
 def _thinned(tile: Tile, steps: Path) -> dict[str, Path]:
-    """`surface`, and `rest` where the points have classes: one point a voxel, normals towards the scanner."""
+    """`surface`, and `rest` if the points have classes: one point per voxel, normals towards the scanner."""
     frame = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
     whole = run(INGEST, {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}, steps / "ingest", **frame)
     scanner = run(PATH, {}, steps / "path", **scanner_path(tile))

@@ -1,17 +1,17 @@
-"""Solvers of view selection (`texturing.view_selection.mrf`) compared: energy, time, and the resulting textures.
+"""Compare solvers of view selection (`texturing.view_selection.mrf`): energy, time, and the resulting textures.
 
 `python -m bench.texture.view_selection [--scenes kitti street_clean street_hard] [--solvers best ours ...]
 [--energies] [--out DIR]`,
-after `python -m bench.texture`, whose scenes and depth maps it takes (`--scenes sample` makes its own small one).
+after `python -m bench.texture`, whose scenes and depth maps it uses (`--scenes sample` generates its own small one).
 
-- best: each face its own best photo, no matter what its neighbours take.
-- settled: from there on, face after face its cheapest photo given its neighbours' (iterated conditional modes).
-- scipy: alpha expansion (Boykov et al. 2001), each move cut by `scipy.sparse.csgraph.maximum_flow` on integers.
-- pymaxflow: the same by PyMaxflow (GPL; no dependency of ours), where it is installed.
+- best: the best photo of each face, independent of its neighbours.
+- settled: iterated conditional modes from there: each face's best photo given its neighbours'.
+- scipy: alpha expansion (Boykov et al. 2001) with `scipy.sparse.csgraph.maximum_flow` on integers.
+- pymaxflow: the same with PyMaxflow (GPL; not a dependency), if installed.
 - ours: message passing.
 
-Energies are above the bound that ours proves, in percent of it; seconds are a processor's. Textures: as in
-`bench.texture.ablation`. Ends with `RESULT {json}`: scene, solver, figures.
+Energies are given in percent above our lower bound; seconds are CPU time. Textures: as in `bench.texture.ablation`.
+Ends with `RESULT {json}`: scene, solver, metrics.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 
 from bench.paths import ROOT
-from bench.texture.ablation import figures
-from bench.texture.scenes import SCENES, WARM, Scene, available, fresh, make, run
+from bench.texture.ablation import metrics
+from bench.texture.scenes import SCENES, WARM_UP, Scene, available, fresh, make, run
 from scan2sim.pipeline.core.types import F32, F64, I32, Bools, Mesh
 from scan2sim.pipeline.steps.visibility import VISIBILITY
 from scan2sim.texturing.exposure import EXPOSURE
@@ -36,23 +36,23 @@ from scan2sim.texturing.photo_consistency import AGREEMENT
 from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
 from scan2sim.texturing.view_selection import mrf
-from scan2sim.texturing.view_selection.step import CHOOSE, Choice, ChooseParams, seams
+from scan2sim.texturing.view_selection.step import CHOOSE, Choice, ChooseParams, seam_costs
 
-SWEEPS = 3
-UNSEEN = 1e3
+MAX_SWEEPS = 3
+UNSEEN_COST = 1e3
 Cut = Callable[[F64, F64, I32, I32, F64], Bools]
-"""Which nodes go over: costs of going and staying (N,), pairs p, q (E,), and what it costs if q goes and p stays."""
+"""Nodes that move: from costs of moving and staying (N,), pairs p, q (E,), and the cost if q moves and p stays."""
 Problem = tuple[I32, F32, I32, F32]
-"""Candidates (F, K), their costs, pairs (E, 2), prices (E,)."""
+"""Candidates (F, K), their costs, pairs (E, 2), smoothness costs (E,)."""
 
 
 def best(view: I32, cost: F32, pairs: I32, price: F32) -> I32:
-    """Each face's own best."""
+    """Best photo of each face."""
     return np.where(np.isfinite(cost).any(axis=1), view[np.arange(len(view)), cost.argmin(axis=1)], -1)
 
 
-def settled(view: I32, cost: F32, pairs: I32, price: F32) -> I32:
-    """Face after face its cheapest photo, until none changes."""
+def iterated_conditional_modes(view: I32, cost: F32, pairs: I32, price: F32) -> I32:
+    """Best photo of one face after another, given its neighbours, until none changes."""
     chosen = best(view, cost, pairs, price)
     beside: list[list[tuple[int, float]]] = [[] for _ in view]
     for (a, b), paid in zip(pairs.tolist(), price.tolist(), strict=True):
@@ -73,13 +73,13 @@ def settled(view: I32, cost: F32, pairs: I32, price: F32) -> I32:
 
 
 def expansion(problem: Problem, cut: Cut) -> I32:
-    """Alpha expansion: for each view in turn the best set of faces that go over to it."""
+    """Alpha expansion: for each view in turn the best set of faces that move to it."""
     view, cost, pairs, price = problem
     current = best(*problem)
-    cost = np.where(np.isfinite(cost), cost, UNSEEN)
+    cost = np.where(np.isfinite(cost), cost, UNSEEN_COST)
     both = (current[pairs] >= 0).all(axis=1)
     pairs, price = pairs[both], price[both]
-    for _ in range(SWEEPS):
+    for _ in range(MAX_SWEEPS):
         if not sum(_expand(int(a), view, cost, current, pairs, price, cut) for a in np.unique(view[view >= 0])):
             break
     return current
@@ -98,13 +98,13 @@ def _expand(alpha: int, view: I32, cost: F32, current: I32, pairs: I32, price: F
     touching = free[pairs].any(axis=1)
     pairs, price = pairs[touching], price[touching].astype(np.float64)
     inner = free[pairs].all(axis=1)
-    for side in (0, 1):  # neighbours that can't move, or are at alpha already
+    for side in (0, 1):  # neighbours that can't move, or have alpha already
         edge = ~inner & free[pairs[:, side]]
         mine, other = pairs[edge, side], pairs[edge, 1 - side]
         np.add.at(stay, index[mine], price[edge] * (current[mine] != current[other]))
         np.add.at(go, index[mine], price[edge] * (current[other] != alpha))
     p, q = pairs[inner, 0], pairs[inner, 1]
-    apart = price[inner] * (current[p] != current[q])  # both stay; if one goes it is `price`, if both go nothing
+    apart = price[inner] * (current[p] != current[q])  # cost if both stay; `price` if one moves, nothing if both do
     # E = apart + (price - apart) x_p - price x_q + (2 price - apart) (1 - x_p) x_q
     np.add.at(go, index[p], price[inner] - apart)
     np.add.at(stay, index[q], price[inner])
@@ -114,7 +114,7 @@ def _expand(alpha: int, view: I32, cost: F32, current: I32, pairs: I32, price: F
 
 
 def by_pymaxflow(go: F64, stay: F64, p: I32, q: I32, weight: F64) -> Bools:
-    """In the source's segment a node stays, in the sink's it goes: cutting source -> node costs `go`."""
+    """Minimum cut with PyMaxflow: nodes in the sink's segment move; cutting source -> node costs `go`."""
     import maxflow
 
     graph = maxflow.Graph[float](len(go), len(p))
@@ -126,7 +126,7 @@ def by_pymaxflow(go: F64, stay: F64, p: I32, q: I32, weight: F64) -> Bools:
 
 
 def by_scipy(go: F64, stay: F64, p: I32, q: I32, weight: F64) -> Bools:
-    """The same on capacities in ten thousandths; nodes that the residual graph reaches from the source stay."""
+    """Minimum cut with scipy, capacities in 1e-4; nodes reachable from the source in the residual graph stay."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
@@ -147,10 +147,10 @@ def by_scipy(go: F64, stay: F64, p: I32, q: I32, weight: F64) -> Bools:
 
 
 def solvers() -> dict[str, Callable[[Problem], I32]]:
-    """By name, those that can run here."""
+    """Available solvers by name."""
     found: dict[str, Callable[[Problem], I32]] = {
         "best": lambda problem: best(*problem),
-        "settled": lambda problem: settled(*problem),
+        "settled": lambda problem: iterated_conditional_modes(*problem),
         "scipy": lambda problem: expansion(problem, by_scipy),
         "ours": lambda problem: mrf.solve(*problem).view,
     }
@@ -160,14 +160,14 @@ def solvers() -> dict[str, Callable[[Problem], I32]]:
 
 
 def energy(chosen: I32, view: I32, cost: F32, pairs: I32, price: F32) -> float:
-    """What a choice costs: (F,) the view of each face."""
+    """Energy of a labelling: (F,) the view of each face."""
     own = np.where((view == chosen[:, None]) & (chosen >= 0)[:, None], cost, 0).sum(dtype=np.float64)
     apart = (chosen[pairs[:, 0]] != chosen[pairs[:, 1]]) & (chosen[pairs] >= 0).all(axis=1)
     return float(own + price[apart].sum(dtype=np.float64))
 
 
 def prepare(scene: Scene, folder: Path) -> dict[str, Path]:
-    """The files that choice and painting read: views' exposures and agreement, candidates."""
+    """Input files of view selection and texturing: exposures, photo consistency, candidates."""
     if not scene.depth.is_dir():
         run(VISIBILITY, {"mesh.surface": scene.mesh, "views": scene.views} | scene.clouds, scene.depth.parent)
     files = {"mesh": scene.mesh, "views": scene.views, "depth": scene.depth} | scene.clouds
@@ -177,7 +177,7 @@ def prepare(scene: Scene, folder: Path) -> dict[str, Path]:
 
 
 def textured(files: dict[str, Path], choice: Choice, folder: Path) -> Path:
-    """The texture that a choice leads to; its folder."""
+    """Texture a scene with a choice of views; returns the texture's folder."""
     choice.save(folder / "choice.npz")
     files = files | {"choice": folder / "choice.npz"}
     for step in (UNWRAP, TEXTURE):
@@ -186,12 +186,12 @@ def textured(files: dict[str, Path], choice: Choice, folder: Path) -> Path:
 
 
 def compare(scene: Scene, names: Sequence[str], *, textures: bool) -> dict[str, dict[str, Any]]:
-    """Figures of all solvers, printed as they come."""
+    """Metrics of all solvers, printed as they are computed."""
     folder = scene.folder / "choices"
     found = folder / "choose" / "choice.npz"
     files = prepare(scene, folder) if textures or not found.is_file() else {}
     choice, mesh = Choice.load(found), Mesh.load(scene.mesh)
-    pairs, length, price = seams(mesh, ChooseParams.model_validate({}).smoothness)
+    pairs, length, price = seam_costs(mesh, ChooseParams.model_validate({}).smoothness)
     problem = (choice.view, mrf.costs(choice.view, choice.quality), pairs, price)
     bound = mrf.solve(*problem).bound
     result: dict[str, dict[str, Any]] = {}
@@ -209,18 +209,18 @@ def compare(scene: Scene, names: Sequence[str], *, textures: bool) -> dict[str, 
         }
         if textures:
             painted = textured(files, Choice(choice.view, choice.quality, chosen.astype(np.int32)), folder)
-            result[name] |= figures(scene, painted, None)
+            result[name] |= metrics(scene, painted, None)
         print(f"{scene.folder.name:12s} {name:10s} {result[name]}", flush=True)
     return result
 
 
 def main() -> None:
-    """Print a table a scene, and the result."""
+    """Print a table per scene, and the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=[*SCENES, WARM])
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=[*SCENES, WARM_UP])
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "texture")
     parser.add_argument("--solvers", nargs="+", default=list(solvers()), choices=list(solvers()))
-    parser.add_argument("--energies", action="store_true", help="no textures; candidates of an earlier run stand")
+    parser.add_argument("--energies", action="store_true", help="no textures; reuse candidates of an earlier run")
     arguments = parser.parse_args()
     result = {}
     for name in arguments.scenes:

@@ -1,1 +1,1 @@
-"""The main job beside the obvious chain of libraries: `python -m bench.tile`."""
+"""The reconstruction compared with a straightforward chain of libraries: `python -m bench.tile`."""

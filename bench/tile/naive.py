@@ -1,6 +1,6 @@
-"""The chain that anyone would write first: Open3D for all geometry, xatlas, Open3D's albedo projection.
+"""Straightforward baseline: Open3D for all geometry, xatlas, and Open3D's albedo projection.
 
-Run as `python -m bench.tile.naive TILE OUT`; writes OUT/naive.json with seconds a step and the meshes.
+Run as `python -m bench.tile.naive TILE OUT`; writes OUT/naive.json with seconds per step, and the meshes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def timed(step: str) -> Iterator[None]:
 
 
 def main(tile_path: Path, out: Path) -> None:
-    """Make a textured OBJ a class from the tile's first cloud and its perspective photos."""
+    """Build a textured OBJ per class from the tile's first cloud and its perspective photos."""
     out.mkdir(parents=True, exist_ok=True)
     tile = read_tile(tile_path)
     with timed("read"):
@@ -87,7 +87,7 @@ def texture(path: Path, vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray
     for view in views:
         camera = view.camera
         if camera.model not in ("pinhole", "opencv"):
-            continue  # Open3D's projection knows perspective photos alone
+            continue  # Open3D's projection supports perspective photos only
         k = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
         photo = cv2.imread(str(view.photo))[:, :, ::-1]
         if camera.distortion:

@@ -1,9 +1,9 @@
-"""The main job beside the chain that anyone would write first, on one generated street, in one run.
+"""The reconstruction compared with a straightforward baseline, on one generated street.
 
 `make bench`, or `python -m bench.tile [--length 100 --points 9e6 --photos 40] [--out bench-out]`.
-Both chains run alone, one after the other, in processes of their own. Ours makes more of it (visibility
-over all classes, several pages at 1 cm a texel, 360-degree photos, Gazebo, Collada, GLB, the report):
-all of that is in its time. Ends with `RESULT {json}`.
+Both chains run alone, one after the other, in separate processes. Ours includes more in its time (visibility over all
+classes, several pages at 1 cm per texel, 360-degree photos, Gazebo, Collada, GLB, the report). Ends with
+`RESULT {json}`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from bench.measure import Measured, measure
+from bench.measure import Measurement, measure
 from bench.paths import ROOT
 from scan2sim.pipeline.core.classes import GROUPS
 from scan2sim.pipeline.core.types import Mesh
@@ -22,12 +22,12 @@ from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.geometry import truth_error
 
 SAMPLES = 200_000
-# our steps beside the naive chain's
+# steps of ours that correspond to each step of the baseline
 STEPS = {
     "read": ("ingest", "label", "segment"),
     "split": ("split",),
     "voxel": ("voxel", "path"),
-    "normals": (),  # ours are a part of voxel
+    "normals": (),  # part of our voxel
     "poisson": ("poisson",),
     "trim": ("trim",),
     "islands": ("islands",),
@@ -39,7 +39,7 @@ STEPS = {
 
 
 def main() -> None:
-    """Generate the street, run both chains, print ratios."""
+    """Generate the street, run both chains, and print ratios."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--length", type=float, default=100.0)
     parser.add_argument("--points", type=float, default=9e6)
@@ -51,7 +51,7 @@ def main() -> None:
     if not (street / "tile.toml").is_file():
         sizes = [f"--{k}={getattr(arguments, k):g}" for k in ("length", "points", "photos")]
         _checked(measure([scan2sim, "sample", *sizes, "--seed=0", str(street)]), "sample")
-    # compiled kernels are a matter of the first run on a machine, not of every tile
+    # warm up: kernels are compiled only once per machine
     sample = ROOT / "data_samples" / "tile"
     _checked(measure([scan2sim, "run", str(sample), "--out", str(arguments.out / "warm")]), "warm-up")
 
@@ -64,7 +64,7 @@ def main() -> None:
 
     steps = json.loads((ours_out / "report.json").read_text(encoding="utf-8"))["steps"]
     baseline = json.loads((naive_out / "naive.json").read_text(encoding="utf-8"))
-    print(f"\n{'step':<12}{'naive s':>9}{'ours s':>9}{'ratio':>8}   (ours: sum over steps, two of which run at a time)")
+    print(f"\n{'step':<12}{'naive s':>9}{'ours s':>9}{'ratio':>8}   (ours: sum over steps, of which two run at a time)")
     for name, parts in STEPS.items():
         own = sum(s["seconds"] for node, s in steps.items() if node.split(".")[0] in parts)
         theirs = baseline.get(name, 0.0)
@@ -93,7 +93,7 @@ def main() -> None:
     print("RESULT " + json.dumps(result))
 
 
-def _checked(measured: Measured, what: str) -> Measured:
+def _checked(measured: Measurement, what: str) -> Measurement:
     if measured.status != 0:
         sys.exit(f"{what} failed with exit status {measured.status}")
     print(f"{what}: {measured.seconds:.1f} s, peak {measured.peak_gb:.2f} GB", flush=True)

@@ -1,10 +1,10 @@
-"""Classes of images and of pixels, out of the box, against truth (parts `classes` and `pixels` of `bench.toolboxes`).
+"""Classification and segmentation with pretrained networks, compared with ground truth (parts `classes`, `pixels`).
 
-- classes: KITTI's boxes of cars and vans that nothing hides, 60 pixels high at least (frames 0-24 of raw 0009), cut
-  out: right where the likeliest of ImageNet's classes is a motor vehicle (`VEHICLES`). It is little, and of one kind of
-  thing: no other photos whose content is known are at hand.
-- pixels: photos of synthetic streets of seeds below those of training, without what a scan tells: mean intersection
-  over union of `segmentation.metrics.MEAN_OF`.
+- classes: crops of KITTI's unoccluded cars and vans at least 60 pixels high (frames 0-24 of raw 0009): correct if the
+  likeliest ImageNet class is a motor vehicle (`VEHICLES`). A small test of a single kind of object; no other labelled
+  photos are available.
+- pixels: photos of synthetic streets with seeds below those of training, without scan channels: mean intersection over
+  union over `segmentation.metrics.MEAN_OF`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from scan2sim.segmentation.labels import code_of_index
 from scan2sim.segmentation.metrics import confusion
 from scan2sim.services.toolboxes.tasks import classify, segment
 
-HIGH = 60.0
+MIN_HEIGHT_PX = 60.0
 VEHICLES = frozenset(
     (
         "ambulance", "beach wagon", "cab", "convertible", "fire engine", "garbage truck", "go-kart", "golfcart", "jeep",
@@ -31,39 +31,41 @@ VEHICLES = frozenset(
         "recreational vehicle", "sports car", "tow truck", "tractor", "trailer truck", "school bus", "trolleybus",
     )
 )  # fmt: skip
-"""ImageNet's classes below WordNet's "motor vehicle", and buses."""
+"""ImageNet classes below WordNet's "motor vehicle", and buses."""
 SEED, IMAGES = 900, 40
 
 
 def classes() -> dict[str, float] | None:
-    """Share of cut-out vehicles whose likeliest class is one; None without the data."""
+    """Share of vehicle crops with a vehicle as likeliest class; None without the data."""
     if not TRUTH.exists():
-        print(f"classes: left out, there is no {TRUTH}")
+        print(f"classes: skipped, {TRUTH} doesn't exist")
         return None
     model = classify.load(classify.Params(whole=True))
-    right = [body.classes[0].label in VEHICLES for body in (model([one])[0] for one in _cut_out()) if body.classes]
+    right = [
+        body.classes[0].label in VEHICLES for body in (model([one])[0] for one in _vehicle_crops()) if body.classes
+    ]
     top1 = float(np.mean(right))
-    print(f"classes: {len(right)} vehicles cut out of KITTI, {top1:.3f} are one by their likeliest class")
+    print(f"classes: {len(right)} vehicles cropped from KITTI, {top1:.3f} with a vehicle as likeliest class")
     return {"classify_top1": round(top1, 3)}
 
 
-def _cut_out() -> list[U8]:
+def _vehicle_crops() -> list[U8]:
     photos = sorted(KITTI.rglob("image_02/data/*.png"))
     found = []
     for line in TRUTH.read_text(encoding="utf-8").splitlines():
         words = line.split()
         left, top, right, bottom = (round(float(word)) for word in words[6:10])
-        if words[2] in ("Car", "Van") and words[3] == words[4] == "0" and bottom - top >= HIGH:
+        if words[2] in ("Car", "Van") and words[3] == words[4] == "0" and bottom - top >= MIN_HEIGHT_PX:
             image = cv2.imread(str(photos[int(words[0])]))
             found.append(np.ascontiguousarray(image[max(0, top) : bottom, max(0, left) : right, ::-1]))
     return found
 
 
 def pixels(out: Path) -> dict[str, float]:
-    """Mean intersection over union."""
+    """Mean intersection over union of the segmentation."""
     folder = out / "labelled-streets"
     render = [sys.executable, "-m", training.__name__, str(folder), "--images", str(IMAGES), "--seed", str(SEED)]
-    subprocess.run(render, check=True, stdout=subprocess.DEVNULL)  # it forks, which none should who runs networks
+    subprocess.run(render, check=True, stdout=subprocess.DEVNULL)  # a child process, as forking breaks networks
     model, codes = segment.load(segment.Params()), code_of_index()
     known, predicted = [], []
     for path in sorted((folder / "images").glob("*.jpg")):

@@ -1,16 +1,16 @@
-"""The project's own detector, or another in YOLOv5's exported form, on pictures whose boxes are known.
+"""The project's own detector, or another in YOLOv5's export format, on images with known boxes.
 
 `python -m bench.toolboxes.detect [--weights FILE.onnx] [--parts synthetic kitti time] [--out bench-out/toolbox_detect]`
 
-- synthetic: 240 pictures of streets and crossings of seeds below those of training. detect_ap50_synthetic is the mean
-  over the classes of average precision (VOC 2010) at an overlap of a half, ap50 by class. Things hidden by more
-  than three quarters, or without a side of 12 pixels, count neither way.
-- kitti: frames 0-24 of KITTI raw 0009 (../shared/data), cars, vans and trucks as one class. Boxes that KITTI calls
-  largely hidden or cut off count neither way, as its DontCare. Recall by height in pixels, and precision, at a score of
-  `--threshold`; kitti_ap50 over all from 25 pixels.
-- time: CPU milliseconds a picture on one thread, 640 x 384 and 384 x 256, and of what is before and after.
+- synthetic: 240 images of streets and crossings with seeds below those of training. detect_ap50_synthetic is the mean
+  over classes of the average precision (VOC 2010) at an overlap of one half, ap50 by class. Objects occluded by more
+  than three quarters, or without a side of 12 pixels, are ignored.
+- kitti: frames 0-24 of KITTI raw 0009 (../shared/data); cars, vans and trucks as one class. Boxes that are largely
+  occluded, truncated or DontCare are ignored. Recall by height in pixels, and precision, at a score of `--threshold`;
+  kitti_ap50 over all boxes from 25 pixels.
+- time: CPU milliseconds per image on one thread, 640 x 384 and 384 x 256, and of pre- and postprocessing.
 
-`--pictures` writes what was found into OUT. Ends with `RESULT {json}`; null where a part was left out.
+`--pictures` writes images with detections into OUT. Ends with `RESULT {json}`; null for parts that were not run.
 """
 
 from __future__ import annotations
@@ -30,83 +30,87 @@ from bench.paths import ROOT
 from scan2sim.data_samples import boxes
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.toolboxes import yolo
-from scan2sim.services.toolboxes.detector.dataset import HIDDEN, picture, read
-from scan2sim.services.toolboxes.detector.metrics import Found, Truth, average_precision, matched
+from scan2sim.services.toolboxes.detector.dataset import MIN_VISIBLE_SHARE, read, read_image
+from scan2sim.services.toolboxes.detector.metrics import GroundTruth, Predictions, average_precision, match
 
 DATA = ROOT.parent / "shared" / "data"
-OWN = ROOT / "services" / "toolboxes" / "weights" / "vehicles.onnx"
-SEED, PICTURES, SMALL = 500, 240, 12.0
+OWN_WEIGHTS = ROOT / "services" / "toolboxes" / "weights" / "vehicles.onnx"
+SEED, IMAGES, MIN_SIDE_PX = 500, 240, 12.0
 VEHICLES = ("car", "van", "bus", "truck")
 HEIGHTS = ((15, 25), (25, 40), (40, 80), (80, 1000))
 PARTS = ("synthetic", "kitti", "time")
 
 
 class Detector:
-    """An ONNX file, on one thread."""
+    """A detector from an ONNX file, on one thread."""
 
     def __init__(self, weights: Path) -> None:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
         self._session = onnxruntime.InferenceSession(weights, options, ["CPUExecutionProvider"])
-        told = self._session.get_modelmeta().custom_metadata_map
-        self.names: list[str] = json.loads(told["names"])
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        self.names: list[str] = json.loads(metadata["names"])
 
     def run(self, batch: Any) -> Any:
-        """(B, N, 5 + C) of (B, 3, H, W)."""
+        """Network output (B, N, 5 + C) for a batch (B, 3, H, W)."""
         return self._session.run(None, {self._session.get_inputs()[0].name: batch})[0]
 
-    def find(self, rgb: U8, size: int, threshold: float) -> Found:
-        """Boxes of a picture, its longer side `size` pixels."""
+    def find(self, rgb: U8, size: int, threshold: float) -> Predictions:
+        """Boxes in an image, resized to `size` pixels on its longer side."""
         image, transform = yolo.letterbox(rgb, size)
         got = yolo.decode(self.run(image[None])[0], transform, threshold)
-        return Found(got.corners, got.scores, got.labels)
+        return Predictions(got.corners, got.scores, got.labels)
 
 
 def synthetic(detector: Detector, out: Path, size: int) -> dict[str, Any]:
-    """Average precision by class on pictures that are made in `out` unless they are there."""
-    for _ in boxes.write(out, PICTURES, SEED):
+    """Average precision by class on images that are generated in `out` if missing."""
+    for _ in boxes.write(out, IMAGES, SEED):
         pass
     known, names = read(out)
     found, truth = [], []
     for one in known:
-        found.append(detector.find(picture(one.image), size, 0.01))
+        found.append(detector.find(read_image(one.image), size, 0.01))
         sides = (one.boxes[:, 2:] - one.boxes[:, :2]).max(axis=1, initial=0)
-        truth.append(Truth(one.boxes, one.classes.astype(np.int32), (one.visible < HIDDEN) | (sides < SMALL)))
+        truth.append(
+            GroundTruth(
+                one.boxes, one.classes.astype(np.int32), (one.visible < MIN_VISIBLE_SHARE) | (sides < MIN_SIDE_PX)
+            )
+        )
     ap = {name: round(average_precision(found, truth, k), 4) for k, name in enumerate(names)}
     return {"detect_ap50_synthetic": round(float(np.nanmean(list(ap.values()))), 4), "ap50": ap}
 
 
-def kitti(detector: Detector, size: int, threshold: float) -> tuple[dict[str, Any], list[tuple[U8, Found]]]:
-    """Recall by size, precision and average precision of vehicles; and the pictures with what was found."""
+def kitti(detector: Detector, size: int, threshold: float) -> tuple[dict[str, Any], list[tuple[U8, Predictions]]]:
+    """Recall by size, precision and average precision of vehicles; and the images with detections."""
     folder, count = DATA / "kitti_raw0009_f00-24", {bounds: [0, 0] for bounds in HEIGHTS}
     wanted, right, shown = 0, 0, []
     found, truth = [], []
     for rgb, true in kitti_pictures(folder):
         got = detector.find(rgb, size, 0.01)
         own = np.isin(got.labels, [detector.names.index(name) for name in VEHICLES if name in detector.names])
-        vehicles = Found(got.corners[own], got.scores[own], np.zeros(int(own.sum()), np.int32))
+        vehicles = Predictions(got.corners[own], got.scores[own], np.zeros(int(own.sum()), np.int32))
         found.append(vehicles)
         truth.append(true)
         sure = vehicles.scores >= threshold
-        best = Found(vehicles.corners[sure], vehicles.scores[sure], vehicles.labels[sure])
+        best = Predictions(vehicles.corners[sure], vehicles.scores[sure], vehicles.labels[sure])
         shown.append((rgb, best))
         tall = true.corners[:, 3] - true.corners[:, 1]
-        every = Truth(true.corners, true.labels, true.spared | (tall < HEIGHTS[0][0]))
-        hit, left_out = matched(best, every)
+        every = GroundTruth(true.corners, true.labels, true.ignored | (tall < HEIGHTS[0][0]))
+        hit, left_out = match(best, every)
         wanted, right = wanted + int((~left_out).sum()), right + int((hit >= 0).sum())
         for low, high in HEIGHTS:
-            of = (tall >= low) & (tall < high) & ~true.spared
+            of = (tall >= low) & (tall < high) & ~true.ignored
             count[low, high][0] += int(np.isin(np.flatnonzero(of), hit).sum())
             count[low, high][1] += int(of.sum())
-    tall_ones = [Truth(t.corners, t.labels, t.spared | (t.corners[:, 3] - t.corners[:, 1] < 25)) for t in truth]
+    tall_ones = [GroundTruth(t.corners, t.labels, t.ignored | (t.corners[:, 3] - t.corners[:, 1] < 25)) for t in truth]
     recall = {f"{low}-{high}": f"{a} of {n}" for (low, high), (a, n) in count.items()}
     precision = round(right / max(wanted, 1), 4)
     ap = round(average_precision(found, tall_ones, 0), 4)
     return {"kitti_recall": recall, "kitti_precision": precision, "kitti_ap50": ap}, shown
 
 
-def kitti_pictures(folder: Path) -> Iterator[tuple[U8, Truth]]:
-    """Pictures, and their vehicles; what is hidden, cut off or nobody's care is spared."""
+def kitti_pictures(folder: Path) -> Iterator[tuple[U8, GroundTruth]]:
+    """Images and their vehicles; occluded, truncated and DontCare boxes are ignored."""
     rows = [
         line.split() for line in (folder / "tracking_gt_0001_frames_0-24.txt").read_text(encoding="utf-8").splitlines()
     ]
@@ -114,12 +118,12 @@ def kitti_pictures(folder: Path) -> Iterator[tuple[U8, Truth]]:
         own = [r for r in rows if int(r[0]) == number and r[2] in ("Car", "Van", "Truck", "Tram", "Misc", "DontCare")]
         spared = [r[2] in ("DontCare", "Tram", "Misc") or float(r[3]) > 1 or int(r[4]) > 1 for r in own]
         corners = np.array([[float(v) for v in r[6:10]] for r in own], np.float32).reshape(-1, 4)
-        yield picture(image), Truth(corners, np.zeros(len(own), np.int32), np.array(spared, bool))
+        yield read_image(image), GroundTruth(corners, np.zeros(len(own), np.int32), np.array(spared, bool))
 
 
 def times(detector: Detector) -> dict[str, float]:
-    """CPU milliseconds a picture."""
-    told = {}
+    """CPU milliseconds per image."""
+    milliseconds = {}
     rgb = np.random.default_rng(0).integers(0, 255, (720, 1280, 3), np.uint8)
     for width, height in ((640, 384), (384, 256)):
         image, transform = yolo.letterbox(rgb, (height, width))
@@ -134,12 +138,12 @@ def times(detector: Detector) -> dict[str, float]:
                 start = time.process_time()
                 work()
                 spent.append(time.process_time() - start)
-            told[f"{name}_{width}"] = round(1000 * float(np.median(spent)), 2)
-    return told
+            milliseconds[f"{name}_{width}"] = round(1000 * float(np.median(spent)), 2)
+    return milliseconds
 
 
-def drawn(rgb: U8, found: Found, names: list[str] | None = None) -> U8:
-    """The picture with boxes, BGR."""
+def drawn(rgb: U8, found: Predictions, names: list[str] | None = None) -> U8:
+    """The image with boxes, BGR."""
     out = rgb[..., ::-1].copy()
     for (x0, y0, x1, y1), score, label in zip(found.corners, found.scores, found.labels, strict=True):
         cv2.rectangle(out, (int(x0), int(y0)), (int(x1), int(y1)), (0, 0, 255), 2)
@@ -149,15 +153,15 @@ def drawn(rgb: U8, found: Found, names: list[str] | None = None) -> U8:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--weights", type=Path, default=OWN)
+    parser.add_argument("--weights", type=Path, default=OWN_WEIGHTS)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--out", type=Path, default=Path("bench-out/toolbox_detect"))
     parser.add_argument("--threshold", type=float, default=0.3)
-    parser.add_argument("--size", type=int, default=640, help="longer side of synthetic pictures")
-    parser.add_argument("--kitti-size", type=int, default=1242, help="longer side of KITTI's")
-    parser.add_argument("--pictures", action="store_true")
+    parser.add_argument("--size", type=int, default=640, help="longer side of synthetic images, pixels")
+    parser.add_argument("--kitti-size", type=int, default=1242, help="longer side of KITTI's images, pixels")
+    parser.add_argument("--pictures", action="store_true", help="write images with detections")
     a = parser.parse_args()
     detector = Detector(a.weights)
     result: dict[str, Any] = dict.fromkeys(
@@ -167,8 +171,8 @@ def main() -> None:
     if "synthetic" in a.parts:
         result |= synthetic(detector, a.out / "synthetic", a.size)
     if "kitti" in a.parts and (DATA / "kitti_raw0009_f00-24").is_dir():
-        told, shown = kitti(detector, a.kitti_size, a.threshold)
-        result |= told
+        scores, shown = kitti(detector, a.kitti_size, a.threshold)
+        result |= scores
         if a.pictures:
             for i, (rgb, found) in enumerate(shown):
                 cv2.imwrite(str(a.out / f"kitti_{i:02d}.jpg"), drawn(rgb, found))

@@ -1,4 +1,4 @@
-"""A toolbox under more than it can do (part `load` of `bench.toolboxes`): memory, drops, latency, recovery."""
+"""An overloaded toolbox (part `load` of `bench.toolboxes`): memory, dropped images, latency, recovery."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from scan2sim.services.toolboxes.frames import Frame
 from scan2sim.services.toolboxes.results import Result, State
 
 BOX = "detect"
-TIMES = 5.0
-"""More images come than can be worked on."""
-SECONDS = 600.0
-ALONE = 30
-"""Images that the capacity is measured with, one by one."""
+OVERLOAD = 5.0
+"""Rate of images as a multiple of the toolbox's capacity."""
+OVERLOAD_S = 600.0
+CAPACITY_IMAGES = 30
+"""Number of images, one by one, with which the capacity is measured."""
 DEADLINE = 2.0
-"""Seconds that a result may take (D3.2, table 7)."""
-SETTLED = 60.0
-"""Seconds after which memory should have grown to what it needs."""
+"""Maximum time to a result in seconds (D3.2, table 7)."""
+SETTLE_S = 60.0
+"""Seconds after which memory should have stopped growing."""
 
 
-class _Account:
-    """What became of frames."""
+class _Results:
+    """States and latencies of the frames' results."""
 
     def __init__(self) -> None:
         self.states: Counter[str] = Counter()
@@ -50,45 +50,45 @@ class _Account:
             self._came.wait_for(lambda: self.states.total() >= frames)
 
 
-def load(seconds: float = SECONDS) -> dict[str, float]:
-    """Overload a toolbox, and kill its model.
+def load(seconds: float = OVERLOAD_S) -> dict[str, float]:
+    """Overload a toolbox, then kill its model.
 
     Returns:
-        overload_memory_growth: share by which memory (of all its processes) grew after the first minute.
-        overload_latency_s: of what was answered, at most; overload_dropped: share that was dropped.
-        recovery_s: from the flood's end until an image is answered as fast as before it.
-        ready_false_s, restart_s: from the model's death until it is told, and until it is back.
+        overload_memory_growth: relative growth of memory (of all its processes) after the first minute.
+        overload_latency_s: largest latency of a result; overload_dropped: share of dropped images.
+        recovery_s: from the end of the overload until an image is processed as fast as before.
+        ready_false_s, restart_s: from the model's death until it is reported, and until the model is back.
     """
-    pictures = _pictures()
+    images = _images()
     engine = Engine(BOX, tasks.find(BOX).Params(deadline=DEADLINE))
     try:
-        usual = _alone(engine, pictures)
-        rate = TIMES / usual
-        account, memory = _flooded(engine, pictures, rate, seconds)
-        recovered = _recovery(engine, pictures, usual)
-        noticed, restarted = _killed(engine, pictures)
+        usual = _seconds_per_image(engine, images)
+        rate = OVERLOAD / usual
+        results, memory = _overload(engine, images, rate, seconds)
+        recovered = _recovery(engine, images, usual)
+        noticed, restarted = _kill_model(engine, images)
     finally:
         engine.close()
-    settled = [used for at, used in memory if at > min(SETTLED, seconds / 4)]
+    settled = [used for at, used in memory if at > min(SETTLE_S, seconds / 4)]
     first, last = np.mean(settled[: len(settled) // 5 + 1]), np.mean(settled[-(len(settled) // 5 + 1) :])
-    states = account.states
+    states = results.states
     found = {
         "overload_memory_growth": round(float(last / first - 1), 4),
         "overload_memory_mb": round(max(settled) / 2**20),
-        "overload_latency_s": round(max(account.latencies), 3),
+        "overload_latency_s": round(max(results.latencies), 3),
         "overload_dropped": round(1 - states[State.DONE] / states.total(), 3),
         "recovery_s": round(recovered, 3),
         "ready_false_s": round(noticed, 3),
         "restart_s": round(restarted, 3),
     }
     print(
-        f"{BOX}: {1 / usual:.1f} images a second alone; {rate:.0f} for {seconds:.0f} s: {dict(states)}; {found}",
+        f"{BOX}: {1 / usual:.1f} images per second alone; {rate:.0f} for {seconds:.0f} s: {dict(states)}; {found}",
         flush=True,
     )
     return found
 
 
-def _pictures() -> list[bytes]:
+def _images() -> list[bytes]:
     """JPEGs of a synthetic street, 1280 pixels wide."""
     import cv2
 
@@ -101,16 +101,16 @@ def _pictures() -> list[bytes]:
     return found
 
 
-def _alone(engine: Engine, pictures: list[bytes]) -> float:
-    """Seconds an image, one by one."""
+def _seconds_per_image(engine: Engine, images: list[bytes]) -> float:
+    """Seconds per image, one by one."""
     began = time.monotonic()
-    for i in range(ALONE):
-        _asked(engine, pictures[i % len(pictures)])
-    return (time.monotonic() - began) / ALONE
+    for i in range(CAPACITY_IMAGES):
+        _infer(engine, images[i % len(images)])
+    return (time.monotonic() - began) / CAPACITY_IMAGES
 
 
-def _asked(engine: Engine, picture: bytes) -> tuple[float, Result]:
-    """Seconds that one image takes, and its result."""
+def _infer(engine: Engine, picture: bytes) -> tuple[float, Result]:
+    """Seconds until the result of one image, and the result."""
     came: queue.Queue[Result] = queue.Queue()
     began = time.monotonic()
     engine.submit(Frame("one", "probe", None, picture, came.put))
@@ -118,10 +118,10 @@ def _asked(engine: Engine, picture: bytes) -> tuple[float, Result]:
     return time.monotonic() - began, result
 
 
-def _flooded(
-    engine: Engine, pictures: list[bytes], rate: float, seconds: float
-) -> tuple[_Account, list[tuple[float, float]]]:
-    account, memory = _Account(), list[tuple[float, float]]()
+def _overload(
+    engine: Engine, images: list[bytes], rate: float, seconds: float
+) -> tuple[_Results, list[tuple[float, float]]]:
+    results, memory = _Results(), list[tuple[float, float]]()
     began = time.monotonic()
     sampled = began
     for number in count():
@@ -130,28 +130,28 @@ def _flooded(
         now = time.monotonic()
         if now - began > seconds:
             break
-        engine.submit(Frame(str(number), f"camera {number % 4}", None, pictures[number % len(pictures)], account.take))
+        engine.submit(Frame(str(number), f"camera {number % 4}", None, images[number % len(images)], results.take))
         if now - sampled > 1:
             sampled = now
             memory.append((now - began, _memory()))
-    return account, memory
+    return results, memory
 
 
 def _memory() -> float:
-    """Bytes of this process and the model's."""
+    """Memory of this process and the model's, bytes."""
     own = psutil.Process()
     return float(sum(one.memory_info().rss for one in (own, *own.children(recursive=True))))
 
 
-def _recovery(engine: Engine, pictures: list[bytes], usual: float) -> float:
+def _recovery(engine: Engine, images: list[bytes], usual: float) -> float:
     began = time.monotonic()
     while True:
-        took, result = _asked(engine, pictures[0])
+        took, result = _infer(engine, images[0])
         if result.state == State.DONE and took < 2 * usual:
             return time.monotonic() - began
 
 
-def _killed(engine: Engine, pictures: list[bytes]) -> tuple[float, float]:
+def _kill_model(engine: Engine, images: list[bytes]) -> tuple[float, float]:
     pid = engine.pid()
     assert pid
     began = time.monotonic()
@@ -159,7 +159,7 @@ def _killed(engine: Engine, pictures: list[bytes]) -> tuple[float, float]:
     while engine.is_ready():
         time.sleep(0.001)
     noticed = time.monotonic() - began
-    while _asked(engine, pictures[0])[1].state != State.DONE:
+    while _infer(engine, images[0])[1].state != State.DONE:
         time.sleep(0.01)
     return noticed, time.monotonic() - began
 

@@ -1,9 +1,9 @@
-"""Whether things move, held against truth, by frame (part `movement` of `bench.toolboxes`; D3.2, table 9).
+"""Accuracy of motion classification by frame (part `movement` of `bench.toolboxes`; D3.2, table 9).
 
-Films of level crossings (`data_samples.crossing`: ten views, day and dusk, a mast in the wind) go through the toolbox.
-A thing counts in a frame if it has been seen for a second, at least half of it and 20 pixels of its shorter side; it
-moves if it did so on the mean of that second (`STANDS` and faster). A frame is right if the toolbox says the same of
-what overlaps it most; of a thing that it hasn't found it says nothing, which is wrong.
+Films of level crossings (`data_samples.crossing`: ten views, day and dusk, on a mast swaying in the wind) are processed
+by the toolbox. An object counts in a frame if it has been visible for a second, at least half of it and 20 pixels of
+its shorter side; it moves if its mean speed over that second is at least `MOVING_SPEED_MIN`. A frame is correct if the
+toolbox agrees for the detection that overlaps most; for an object without a detection it is wrong.
 """
 
 from __future__ import annotations
@@ -17,39 +17,38 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from scan2sim.data_samples.crossing_traffic import STANDS
+from scan2sim.data_samples.crossing_traffic import MOVING_SPEED_MIN
 from scan2sim.services.toolboxes import sources
 from scan2sim.services.toolboxes.frames import Frame
-from scan2sim.services.toolboxes.iou import overlaps
+from scan2sim.services.toolboxes.iou import iou_matrix
 from scan2sim.services.toolboxes.results import Body, Moving
 from scan2sim.services.toolboxes.tasks import movement
 
 VIEWS, FRAMES, SEED = 10, 1000, 0
 FOLLOWED = ("train", "car", "van", "bus", "truck")
-HISTORY = 1.0
-"""Seconds."""
-SEEN = 0.5
-"""Share of a thing that is seen."""
-SMALLEST = 20.0
-"""Pixels of a thing's shorter side: what is smaller neither counts nor spoils anything."""
-OVERLAP = 0.3
-"""Intersection over union from which a detection is of a thing."""
+HISTORY_S = 1.0
+MIN_VISIBLE_SHARE = 0.5
+"""Minimum visible share of an object."""
+MIN_SIDE_PX = 20.0
+"""Minimum shorter side of an object; smaller ones are ignored."""
+MIN_IOU = 0.3
+"""Minimum intersection over union of a detection with an object."""
 BATCH = 4
 
 
 @dataclass(frozen=True)
-class Said:
-    """Of a thing in a frame: whether it moves, and what was said (None: nothing)."""
+class Prediction:
+    """Prediction for an object in a frame: whether it truly moves, and the toolbox's answer (None: none)."""
 
     view: int
     label: str
     moves: bool
-    said: bool | None
+    predicted: bool | None
     found: bool
 
 
 def rendered(out: Path, views: int = VIEWS, frames: int = FRAMES, seed: int = SEED) -> Path:
-    """The films, made where they aren't there yet."""
+    """The films, rendered if missing."""
     folder = out / f"crossings-{views}-{frames}-{seed}"
     if not (folder / "truth.jsonl").exists():
         command = [sys.executable, "-m", "scan2sim.data_samples.crossing", str(folder)]
@@ -57,8 +56,8 @@ def rendered(out: Path, views: int = VIEWS, frames: int = FRAMES, seed: int = SE
     return folder
 
 
-def said_of(folder: Path) -> Iterator[Said]:
-    """Of all things in all films."""
+def predictions(folder: Path) -> Iterator[Prediction]:
+    """Predictions for all objects in all films."""
     truth: dict[int, list[dict[str, Any]]] = defaultdict(list)
     for line in (folder / "truth.jsonl").open():
         one = json.loads(line)
@@ -68,28 +67,32 @@ def said_of(folder: Path) -> Iterator[Said]:
         yield from _of_film(folder / f"view_{view:02}.mp4", model, view, frames)
 
 
-def _of_film(film: Path, model: Any, view: int, truth: Sequence[dict[str, Any]]) -> Iterator[Said]:
-    follow = movement.follow(movement.Params())
-    assert follow
+def _of_film(film: Path, model: Any, view: int, truth: Sequence[dict[str, Any]]) -> Iterator[Prediction]:
+    post_processor = movement.post_processor(movement.Params())
+    assert post_processor
     history: dict[int, list[tuple[float, float]]] = defaultdict(list)
     for shot, body, frame in _detected(film, model, truth):
-        followed = follow(
+        tracked = post_processor(
             Frame(shot.name, str(film), round(frame["time"] * 1e9), shot.image, lambda _: None), shot.image, body
         )
         for thing in frame["things"]:
-            if thing["class"] in FOLLOWED and thing["visible"] >= SEEN and _side(thing["box"]) >= SMALLEST:
+            if (
+                thing["class"] in FOLLOWED
+                and thing["visible"] >= MIN_VISIBLE_SHARE
+                and _side(thing["box"]) >= MIN_SIDE_PX
+            ):
                 past = history[thing["track"]]
                 past.append((frame["time"], abs(thing["speed"])))
-                if frame["time"] - past[0][0] >= HISTORY:
-                    yield _said(view, thing, past, followed)
+                if frame["time"] - past[0][0] >= HISTORY_S:
+                    yield _predict(view, thing, past, tracked)
             else:
                 history.pop(thing["track"], None)
 
 
 def _detected(film: Path, model: Any, truth: Sequence[dict[str, Any]]) -> Iterator[tuple[Any, Body, dict[str, Any]]]:
-    """A film's images, what the detector found in each, and their truth; some at a time."""
+    """A film's images in batches, with the detections in each, and their truth."""
     batch = []
-    for shot, frame in zip(sources.shots(film), truth, strict=True):
+    for shot, frame in zip(sources.stored_images(film), truth, strict=True):
         batch.append((shot, frame))
         if len(batch) == BATCH or frame is truth[-1]:
             bodies = model([one.image for one, _ in batch])
@@ -98,14 +101,14 @@ def _detected(film: Path, model: Any, truth: Sequence[dict[str, Any]]) -> Iterat
             batch = []
 
 
-def _said(view: int, thing: dict[str, Any], past: list[tuple[float, float]], body: Body) -> Said:
-    recent = [speed for time, speed in past if past[-1][0] - time <= HISTORY]
+def _predict(view: int, thing: dict[str, Any], past: list[tuple[float, float]], body: Body) -> Prediction:
+    recent = [speed for time, speed in past if past[-1][0] - time <= HISTORY_S]
     things = body.detections or ()
-    shares = overlaps([one.box for one in things], [thing["box"]])[:, 0]
-    found = bool((shares >= OVERLAP).any())
+    shares = iou_matrix([one.box for one in things], [thing["box"]])[:, 0]
+    found = bool((shares >= MIN_IOU).any())
     best = things[int(shares.argmax())] if found else None
-    said = best.moving if isinstance(best, Moving) else None
-    return Said(view, thing["class"], sum(recent) / len(recent) >= STANDS, said, found)
+    predicted = best.moving if isinstance(best, Moving) else None
+    return Prediction(view, thing["class"], sum(recent) / len(recent) >= MOVING_SPEED_MIN, predicted, found)
 
 
 def _side(box: Sequence[float]) -> float:
@@ -113,16 +116,16 @@ def _side(box: Sequence[float]) -> float:
 
 
 def movement_accuracy(out: Path, views: int = VIEWS, frames: int = FRAMES) -> dict[str, Any]:
-    """Shares of frames that are right, of moving and of standing things, and of those that were found."""
+    """Shares of correct frames, of moving and of standing objects, and of those that were detected."""
     counts: Counter[tuple[int, str, bool, str]] = Counter()
-    for one in said_of(rendered(out, views, frames)):
+    for one in predictions(rendered(out, views, frames)):
         outcome = (
             "right"
-            if one.said == one.moves
+            if one.predicted == one.moves
             else "unfound"
             if not one.found
             else "unknown"
-            if one.said is None
+            if one.predicted is None
             else "wrong"
         )
         counts[one.view, one.label, one.moves, outcome] += 1

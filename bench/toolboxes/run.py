@@ -1,18 +1,17 @@
-"""ML toolboxes and their quality of service, measured.
+"""Benchmarks of the ML toolboxes and their quality of service.
 
 `python -m bench.toolboxes [--parts tracks detect movement classes pixels batch load qos] [--out DIR]`
 
-- tracks: MOTA and IDF1 on KITTI's boxes, degraded (bench/toolboxes/tracks.py).
-- detect: the detector on synthetic pictures (bench/toolboxes/detect.py has more).
+- tracks: MOTA and IDF1 on degraded boxes of KITTI (bench/toolboxes/tracks.py).
+- detect: the detector on synthetic images (bench/toolboxes/detect.py has more).
 - movement: moving or standing, by frame, in ten films of 1000 frames (bench/toolboxes/movement.py); rendering them
-  takes
-  a quarter of an hour the first time.
-- classes, pixels: classification and segmentation out of the box (bench/toolboxes/classes.py).
-- batch: seconds an image alone by seconds an image of four at once, of one thread; above 1, batching gains.
-- load: ten minutes at five times what a toolbox can do, then its model is killed (bench/toolboxes/load.py).
-- qos: all toolboxes in all environments; wants root.
+  takes a quarter of an hour the first time.
+- classes, pixels: pretrained classification and segmentation (bench/toolboxes/classes.py).
+- batch: time per image alone relative to time per image of four at once, on one thread; above 1, batching gains.
+- load: ten minutes at five times a toolbox's capacity, then its model is killed (bench/toolboxes/load.py).
+- qos: all toolboxes in all environments; requires root.
 
-Ends with `RESULT {json}`; null where a part was left out.
+Ends with `RESULT {json}`; null for parts that were not run.
 """
 
 from __future__ import annotations
@@ -37,19 +36,19 @@ KEYS = (
     "moving", "standing", "mota", "idf1", "detect_ap50_synthetic", "classify_top1", "segment_miou", "qos", "batch_gain",
     "overload_memory_growth", "recovery_s",
 )  # fmt: skip
-BATCH, TURNS = 4, 5
+BATCH, ROUNDS = 4, 5
 QOS_RATE, QOS_SECONDS = "1", "30"
 Found = dict[str, Any]
 
 
 def detect(out: Path) -> Found:
-    """As bench.toolboxes.detect, on synthetic pictures."""
-    told = _told("bench.toolboxes.detect", "--parts", "synthetic", "--out", str(out / "detect"))
-    return {"detect_ap50_synthetic": told["detect_ap50_synthetic"]}
+    """Result of bench.toolboxes.detect on synthetic images."""
+    result = _result_of("bench.toolboxes.detect", "--parts", "synthetic", "--out", str(out / "detect"))
+    return {"detect_ap50_synthetic": result["detect_ap50_synthetic"]}
 
 
-def _told(*module: str) -> Found:
-    """The result of another bench."""
+def _result_of(*module: str) -> Found:
+    """Result of another benchmark."""
     done = subprocess.run([sys.executable, "-m", *module], stdout=subprocess.PIPE, text=True, check=True)
     print(done.stdout, end="", flush=True)
     found: Found = json.loads(done.stdout.splitlines()[-1].removeprefix("RESULT "))
@@ -57,7 +56,7 @@ def _told(*module: str) -> Found:
 
 
 def batch() -> Found:
-    """By toolbox, how many times as long an image takes alone as one of four at once."""
+    """Time per image alone relative to time per image of four at once, by toolbox."""
     gains = {}
     for name in ("detect", "classify", "segment"):
         size = read(name).image
@@ -65,16 +64,18 @@ def batch() -> Found:
         model = tasks.find(name).load(tasks.find(name).Params(threads=1))
         image = np.random.default_rng(0).integers(0, 255, (size[1], size[0], 3), np.uint8)
         alone, together = [], []
-        for _ in range(TURNS):
+        for _ in range(ROUNDS):
             alone.append(_seconds(model, [[image]] * BATCH))
             together.append(_seconds(model, [[image] * BATCH]))
         gains[name] = round(float(np.median(alone) / np.median(together)), 3)
-        print(f"batch of {BATCH}, {name}: {np.median(alone) / BATCH:.4f} s of work an image alone, gain {gains[name]}")
+        print(
+            f"batch of {BATCH}, {name}: {np.median(alone) / BATCH:.4f} CPU seconds per image alone, gain {gains[name]}"
+        )
     return {"batch_gain": gains}
 
 
 def _seconds(model: tasks.Model, batches: list[list[U8]]) -> float:
-    """Of a processor."""
+    """CPU seconds."""
     began = time.process_time()
     for images in batches:
         model(images)
@@ -82,7 +83,7 @@ def _seconds(model: tasks.Model, batches: list[list[U8]]) -> float:
 
 
 def qos(out: Path) -> Found:
-    """Whether each toolbox's service passes in each environment, and the machine."""
+    """Whether each toolbox's service and the machine pass in each environment."""
     service: dict[str, dict[str, bool]] = {}
     machine: dict[str, dict[str, bool]] = {}
     for name in tasks.names():
@@ -90,9 +91,9 @@ def qos(out: Path) -> Found:
             file = out / f"qos-{name}-{environment}.json"
             command = [sys.executable, "-m", "scan2sim.flows.cli", "qos", "measure", name, "--environment", environment]
             subprocess.run([*command, "--rate", QOS_RATE, "--seconds", QOS_SECONDS, "--out", str(file)], check=True)
-            told = json.loads(file.read_text(encoding="utf-8"))
-            service.setdefault(name, {})[environment] = told["passed"]
-            machine.setdefault(name, {})[environment] = told["machine_passed"]
+            report = json.loads(file.read_text(encoding="utf-8"))
+            service.setdefault(name, {})[environment] = report["passed"]
+            machine.setdefault(name, {})[environment] = report["machine_passed"]
     return {"qos": service, "qos_machine": machine}
 
 
@@ -109,7 +110,7 @@ PARTS: dict[str, Callable[[Path], Found | None]] = {
 
 
 def main() -> None:
-    """Run the parts, print the result."""
+    """Run the parts and print the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--out", type=Path, default=Path("bench-out") / "toolboxes")

@@ -1,8 +1,7 @@
-"""Tracks of things through images, against truth (part `tracks` of `bench.toolboxes`): MOTA and IDF1.
+"""Object tracking compared with ground truth (part `tracks` of `bench.toolboxes`): MOTA and IDF1.
 
-KITTI's own boxes of 25 frames, degraded: each is left out one time in ten, its corners are off by 2 pixels, and false
-boxes are added; and the boxes of a detector. Figures are motmetrics' (Bernardin and Stiefelhagen, 2008; Ristani et
-al., 2016).
+KITTI's own boxes of 25 frames, degraded: one in ten is dropped, corners have an error of 2 pixels, and false boxes are
+added. Metrics are computed by motmetrics (Bernardin and Stiefelhagen, 2008; Ristani et al., 2016).
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ KITTI = ROOT.parent / "shared" / "data" / "kitti_raw0009_f00-24"
 TRUTH = KITTI / "tracking_gt_0001_frames_0-24.txt"
 FRAMES, RATE = 25, 10.0
 FOLLOWED = ("Car", "Van", "Truck")
-LEFT_OUT, OFF, FALSE = 0.1, 2.0, 0.5
-"""Share of boxes that are left out, pixels that corners are off by (standard deviation), false boxes an image."""
+DROPPED_SHARE, CORNER_ERROR_PX, FALSE_PER_IMAGE = 0.1, 2.0, 0.5
+"""Share of dropped boxes, standard deviation of corners, mean number of false boxes per image."""
 SEEDS = 20
-MATCHED = 0.5
-"""Intersection over union from which a track's box is a true thing's."""
+MIN_IOU = 0.5
+"""Minimum intersection over union of a track's box with a true one."""
 
 Truth = Mapping[int, Mapping[int, Sequence[float]]]
-"""By frame, and number of the thing: left, top, right, bottom."""
+"""By frame and number of the object: left, top, right, bottom."""
 
 
 def truth() -> Truth:
@@ -44,14 +43,16 @@ def truth() -> Truth:
 
 
 def degraded(boxes: Truth, seed: int) -> Callable[[int], list[Detection]]:
-    """Detections of a frame, as a detector might find them."""
+    """Detections by frame, as a detector might find them."""
     rng = np.random.default_rng(seed)
 
     def found(frame: int) -> list[Detection]:
         here = [
-            np.array(box) + rng.normal(scale=OFF, size=4) for box in boxes[frame].values() if rng.random() > LEFT_OUT
+            np.array(box) + rng.normal(scale=CORNER_ERROR_PX, size=4)
+            for box in boxes[frame].values()
+            if rng.random() > DROPPED_SHARE
         ]
-        for _ in range(rng.poisson(FALSE)):
+        for _ in range(rng.poisson(FALSE_PER_IMAGE)):
             corner = rng.uniform((0, 100), (1100, 250))
             here.append(np.concatenate([corner, corner + rng.uniform(20, 120, 2)]))
         return [Detection(label="car", score=0.9, box=tuple(box.tolist())) for box in here]
@@ -59,13 +60,13 @@ def degraded(boxes: Truth, seed: int) -> Callable[[int], list[Detection]]:
     return found
 
 
-def scored(boxes: Truth, found: Callable[[int], list[Detection]]) -> tuple[float, float]:
-    """MOTA and IDF1 of the tracks of what was found."""
-    setattr(np, "asfarray", partial(np.asarray, dtype=np.float64))  # noqa: B010 - of numpy 1, which motmetrics wants
+def score(boxes: Truth, found: Callable[[int], list[Detection]]) -> tuple[float, float]:
+    """MOTA and IDF1 of the tracks of detections."""
+    setattr(np, "asfarray", partial(np.asarray, dtype=np.float64))  # noqa: B010 - of numpy 1, which motmetrics needs
     import motmetrics
 
     tracker, account = (
-        Tracker(sure=movement.Params().threshold, lost=1.0, rate=RATE),
+        Tracker(activation_score=movement.Params().threshold, lost_s=1.0, rate=RATE),
         motmetrics.MOTAccumulator(auto_id=True),
     )
     for frame in sorted(boxes):
@@ -73,7 +74,7 @@ def scored(boxes: Truth, found: Callable[[int], list[Detection]]) -> tuple[float
         tracks = tracker.update(detections)
         followed = {track: one.box for track, one in zip(tracks, detections, strict=True) if track is not None}
         distances = motmetrics.distances.iou_matrix(
-            _sized(boxes[frame].values()), _sized(followed.values()), max_iou=1 - MATCHED
+            _sized(boxes[frame].values()), _sized(followed.values()), max_iou=1 - MIN_IOU
         )
         account.update(list(boxes[frame]), list(followed), distances)
     with warnings.catch_warnings():
@@ -89,12 +90,12 @@ def _sized(boxes: object) -> F64:
 
 
 def tracks() -> dict[str, float] | None:
-    """MOTA and IDF1, means over seeds; None without the data."""
+    """Mean MOTA and IDF1 over seeds; None without the data."""
     if not TRUTH.exists():
-        print(f"tracks: left out, there is no {TRUTH}")
+        print(f"tracks: skipped, {TRUTH} doesn't exist")
         return None
     boxes = truth()
-    figures = np.array([scored(boxes, degraded(boxes, seed)) for seed in range(SEEDS)])
+    figures = np.array([score(boxes, degraded(boxes, seed)) for seed in range(SEEDS)])
     mota, idf1 = figures.mean(axis=0)
     least = figures.min(axis=0)
     print(f"{SEEDS} degraded copies: MOTA {mota:.3f} ({least[0]:.3f} at least), IDF1 {idf1:.3f} ({least[1]:.3f})")

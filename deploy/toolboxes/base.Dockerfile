@@ -1,6 +1,6 @@
 # syntax=docker/dockerfile:1
 # docker build -f deploy/toolboxes/base.Dockerfile -t scan2sim-toolbox .
-# What the four toolboxes share; they are built on it, each by its own file.
+# Base image of the four toolboxes; each has its own file.
 FROM python:3.11-slim AS environment
 RUN python -m venv /opt/venv
 ENV PATH=/opt/venv/bin:$PATH

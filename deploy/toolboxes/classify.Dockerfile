@@ -1,6 +1,6 @@
 # syntax=docker/dockerfile:1
 # docker build -f deploy/toolboxes/classify.Dockerfile -t scan2sim-classify .     (after base.Dockerfile)
-# torch writes the network as ONNX, and stays behind
+# torch exports the network as ONNX in a stage of its own, and isn't part of the image
 FROM scan2sim-toolbox AS network
 COPY constraints.txt deploy/toolboxes/imagenet.txt /requirements/
 USER root

@@ -1,1 +1,1 @@
-"""The `scan2sim` command, a file a command; without Prefect."""
+"""Subcommands of `scan2sim`, one module each; none imports Prefect."""

@@ -1,4 +1,4 @@
-"""What commands are made of: numbers looked at before they begin, and the options that several have."""
+"""Building blocks of the commands: validation of numeric options, and options shared by several commands."""
 
 from __future__ import annotations
 
@@ -10,18 +10,27 @@ from typer.core import TyperCommand, TyperGroup
 
 from scan2sim.flows.commands import option_ranges
 from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.pipeline.core import optional_deps
 
 
 class _Command(TyperCommand):
-    """A command whose numbers are looked at before it begins."""
+    """A command whose packages and numeric options are checked before it runs.
+
+    Attributes:
+        requirement: arguments of `optional_deps.require`: what needs the packages, and their names.
+    """
+
+    requirement: tuple[str, ...] = ()
 
     def invoke(self, ctx: Any) -> Any:
+        if self.requirement:
+            optional_deps.require(*self.requirement)
         option_ranges.check(ctx.params)
         return super().invoke(ctx)
 
 
-class _FirstIsDefault(TyperGroup):
-    """`segment TILE` is `segment tile TILE`, `slam VIDEO` is `slam video VIDEO`."""
+class _DefaultCommandGroup(TyperGroup):
+    """A group whose first command is the default: `segment TILE` means `segment tile TILE`."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args and args[0] not in self.commands:
@@ -33,49 +42,89 @@ class _FirstIsDefault(TyperGroup):
 
 
 class App(typer.Typer):
-    """A command, or a group of them, as they are declared.
+    """A command, or a group of commands.
 
     Args:
-        first: the group's first command is meant where none is named.
+        help: help of the group; None for a single command.
+        first: run the group's first command where none is named.
+        requirement: what needs optional packages, and their names; checked when a command runs, not for its help.
     """
 
-    def __init__(self, help: str | None = None, *, first: bool = False) -> None:
-        group = _FirstIsDefault if first else TyperGroup
+    def __init__(self, help: str | None = None, *, first: bool = False, requirement: tuple[str, ...] = ()) -> None:
+        self._requirement = requirement
+        group = _DefaultCommandGroup if first else TyperGroup
         super().__init__(cls=group, help=help, no_args_is_help=help is not None, add_completion=False)
 
     def command(self, name: str | None = None, **options: Any) -> Any:
-        """As Typer's."""
-        return super().command(name, cls=_Command, **options)
+        """Decorator that declares a command, with the arguments of `Typer.command`."""
+        command_class = type("_Command", (_Command,), {"requirement": self._requirement})
+        return super().command(name, cls=command_class, **options)
 
 
-TilePath = Annotated[Path, typer.Argument(metavar="TILE", help="A tile.toml, or the folder that holds one.")]
-OutDir = Annotated[Path, typer.Option("--out", "-o", help="Folder for the world, the report and kept results.")]
-Sets = Annotated[list[str] | None, typer.Option("--set", metavar="STEP.PARAM=VALUE", help="Change a setting.")]
-Config = Annotated[Path | None, typer.Option("--config", help="Settings as a TOML file.")]
-HoldOut = Annotated[
-    int | None, typer.Option("--hold-out", metavar="N", help="Keep every Nth photo out of texturing, to score it.")
+TilePath = Annotated[
+    Path,
+    typer.Argument(
+        metavar="TILE", help="Tile (clouds and photos, see `scan2sim import`): its folder, or its tile.toml."
+    ),
 ]
-Force = Annotated[bool, typer.Option("--force", help="Run everything again.")]
-From = Annotated[str | None, typer.Option("--from", metavar="STEP", help="Run this step and what follows again.")]
+OutDir = Annotated[Path, typer.Option("--out", "-o", help="Output folder: world, report, log and cached results.")]
+Sets = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="STEP.PARAM=VALUE",
+        help="Change a setting of a step; repeatable; docs/reference/settings.md lists all settings.",
+    ),
+]
+Config = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE", help="TOML file with settings; --set overrides it.")
+]
+HoldOut = Annotated[
+    int | None,
+    typer.Option(
+        "--hold-out",
+        metavar="N",
+        help="Exclude every Nth photo from texturing, to measure the quality of the texture with it; default: none.",
+    ),
+]
+Force = Annotated[bool, typer.Option("--force", help="Repeat all steps, even those with cached results.")]
+From = Annotated[
+    str | None,
+    typer.Option("--from", metavar="STEP", help="Repeat this step, and all that depend on it; reuse the others."),
+]
 Bus = Annotated[
     str | None,
-    typer.Option("--bus", metavar="HOST:PORT,...", help="Tell the event bus of it: Kafka there, `ros2`, or both."),
+    typer.Option(
+        "--bus",
+        metavar="HOST:PORT,...",
+        help="Publish progress: to Kafka at these addresses, to ROS 2 (`ros2`), or both, comma-separated.",
+    ),
 ]
-Name = Annotated[str | None, typer.Option("--name", help="The tile's name; default: from the folder.")]
-TileOut = Annotated[Path, typer.Option("--out", "-o", help="The tile's folder.")]
-Crs = Annotated[str | None, typer.Option(help='CRS, where the files lack it: "EPSG:32633", or "local".')]
+Name = Annotated[
+    str | None,
+    typer.Option("--name", help="Name of the tile: letters, digits, underscores; default: from the folder's name."),
+]
+TileOut = Annotated[Path, typer.Option("--out", "-o", help="Folder of the tile to create.")]
+Crs = Annotated[
+    str | None,
+    typer.Option(help='CRS of the coordinates, if the files don\'t give one: "EPSG:32633", or "local" for none.'),
+]
 Classes = Annotated[
-    str, typer.Option(metavar="CODE=CLASS,...", help="What codes of the cloud are: 65=noise,200=5 (docs/formats.md).")
+    str,
+    typer.Option(
+        metavar="CODE=CLASS,...",
+        help="Meaning of the cloud's class codes, such as 65=noise,200=5 (docs/reference/formats.md).",
+    ),
 ]
-Link = Annotated[bool, typer.Option("--link", help="Link files into the tile instead of copying them.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a tile that is there already.")]
+Link = Annotated[bool, typer.Option("--link", help="Link the input files into the tile instead of copying them.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing tile.")]
 
 
 def settings_of(set_: list[str] | None, config: Path | None, hold_out: int | None = None) -> Settings:
-    """Settings as the options of a command say.
+    """Settings from the options --set, --config and --hold-out of a command.
 
     Raises:
-        SettingError: a file can't be read, or an assignment isn't one.
+        SettingError: the file can't be read, or an assignment has a wrong form.
     """
     held_out = [] if hold_out is None else [f"views.hold_out={hold_out}"]
     return Settings.read(config, [*(set_ or []), *held_out])

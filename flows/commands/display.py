@@ -1,4 +1,4 @@
-"""What the user sees of long work: progress bars on a terminal, lines elsewhere."""
+"""Console output of long operations: progress bars on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 from rich.table import Column
 
 from scan2sim.flows.engine.ready_queue import Event
-from scan2sim.flows.pipelines.graph import Node
+from scan2sim.flows.pipelines.graph import Task
 from scan2sim.pipeline.core.errors import printable
 from scan2sim.pipeline.core.step import Report
 
@@ -28,7 +28,7 @@ def _progress() -> Progress:
         TextColumn("{task.description:<22}"),
         BarColumn(bar_width=28, table_column=Column(no_wrap=True)),
         TimeElapsedColumn(),
-        # what is left of the line, so that long messages on narrow terminals take none of the bar's room
+        # takes the rest of the line: long messages must not shrink the bar on narrow terminals
         TextColumn("[dim]{task.fields[message]}", table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis")),
         expand=True,
         console=console,
@@ -39,7 +39,7 @@ def _progress() -> Progress:
 
 @contextmanager
 def progress(title: str) -> Iterator[Report]:
-    """One bar for one long call."""
+    """A progress bar for one long call."""
     with _progress() as bars:
         task = bars.add_task(title, total=1.0, message="")
 
@@ -55,35 +55,35 @@ def warn(text: str) -> None:
 
 
 class RunDisplay:
-    """A bar for every step that runs, one for the whole, and a line for each that ends."""
+    """A progress bar for each running task and one for the whole run, and a line for each finished task."""
 
-    def __init__(self, nodes: int) -> None:
+    def __init__(self, task_count: int) -> None:
         self._bars = _progress()
-        self._nodes = nodes
-        self._tasks: dict[str, TaskID] = {}
+        self._task_count = task_count
+        self._bar_ids: dict[str, TaskID] = {}
         self._started: dict[str, float] = {}
         self._done = self._kept = 0
 
     def __enter__(self) -> RunDisplay:
         self._bars.start()
-        self._whole = self._bars.add_task("[bold]tile", total=self._nodes, message="")
+        self._whole = self._bars.add_task("[bold]tile", total=self._task_count, message="")
         return self
 
     def __exit__(self, *_: object) -> None:
         self._bars.stop()
         if self._kept:
-            console.print(f"[dim]{self._kept} of {self._nodes} results kept from before")
+            console.print(f"[dim]{self._kept} of {self._task_count} results reused from earlier runs")
 
-    def watch(self, node: Node, event: Event, fraction: float, message: str) -> None:
-        """An `execute.Watch`."""
+    def on_event(self, task: Task, event: Event, fraction: float, message: str) -> None:
+        """Show an event: an `EventCallback` of `execute`."""
         if event == "start":
-            self._started[node.full_name] = time.perf_counter()
-            self._tasks[node.full_name] = self._bars.add_task(node.full_name, total=1.0, message="")
+            self._started[task.full_name] = time.perf_counter()
+            self._bar_ids[task.full_name] = self._bars.add_task(task.full_name, total=1.0, message="")
         elif event == "progress":
-            self._bars.update(self._tasks[node.full_name], completed=fraction, message=escape(message))
+            self._bars.update(self._bar_ids[task.full_name], completed=fraction, message=escape(message))
         elif event == "again":
-            if node.full_name in self._tasks:
-                self._bars.remove_task(self._tasks.pop(node.full_name))
+            if task.full_name in self._bar_ids:
+                self._bars.remove_task(self._bar_ids.pop(task.full_name))
             self._done, self._kept = self._done - 1, self._kept - 1
             console.print(f"[yellow]![/] {escape(message)}", highlight=False, soft_wrap=True)
         else:
@@ -91,15 +91,15 @@ class RunDisplay:
             self._kept += event == "kept"
             self._bars.update(self._whole, completed=self._done)
             if event in ("done", "failed"):
-                self._bars.remove_task(self._tasks.pop(node.full_name))
-                seconds = time.perf_counter() - self._started[node.full_name]
-                failed = "[yellow]✗[/]" if node.step.side_product else "[red]✗[/]"
+                self._bars.remove_task(self._bar_ids.pop(task.full_name))
+                seconds = time.perf_counter() - self._started[task.full_name]
+                failed = "[yellow]✗[/]" if task.step.side_product else "[red]✗[/]"
                 mark = "[green]✓[/]" if event == "done" else failed
-                console.print(f"{mark} {node.full_name:<22}[dim]{seconds:7.1f} s  {self._done}/{self._nodes}")
+                console.print(f"{mark} {task.full_name:<22}[dim]{seconds:7.1f} s  {self._done}/{self._task_count}")
 
 
 def log_unexpected(error: BaseException) -> Path:
-    """Write an unexpected error's traceback where the user can find it."""
+    """Write the traceback of an unexpected error to a temporary file; returns its path."""
     with tempfile.NamedTemporaryFile("w", prefix="scan2sim-error-", suffix=".log", delete=False) as file:
         file.write("".join(traceback.format_exception(error)))
     return Path(file.name)

@@ -1,4 +1,4 @@
-"""What comes before a survey's tiles: SLAM where it is asked for, import, and the cut; each redone if it must be."""
+"""Prepares a survey from a drive: SLAM, import of sweeps, cutting into tiles; repeats only what has changed."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from pathlib import Path
 from scan2sim.flows.commands.slam import check_sure, publish_path
 from scan2sim.flows.engine.execution import Executor
 from scan2sim.flows.engine.lock import locked
-from scan2sim.flows.engine.planning import STORE, Planned, drop_damaged, plan
-from scan2sim.flows.pipelines.drive import Drive, recipe
+from scan2sim.flows.engine.planning import STORE, PlannedTask, drop_damaged, plan
+from scan2sim.flows.pipelines.drive import Drive, build_graph
 from scan2sim.pipeline.core.cache import Digests, Manifest, Store
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.io.remote import is_remote, likeness
+from scan2sim.pipeline.io.remote import is_remote, local_copy
 
 PREPARED, DRIVE = "prepared", "drive.toml"
-SHOWN = {"import_sweeps": "corridor", "cut": "survey"}
-"""Of steps, the output that is shown beside the store, by a link."""
+LINKED_OUTPUTS = {"import_sweeps": "corridor", "cut": "survey"}
+"""Step to the output that is linked into the folder `prepared/`."""
 
 
 def survey_of(
@@ -29,30 +29,30 @@ def survey_of(
     buffer: float | None = None,
     warn: Callable[[str], None] = lambda _: None,
 ) -> str:
-    """The `survey.toml` of a source: a survey itself, a corridor (`tile.toml`), or a drive (`drive.toml`).
+    """Path of the `survey.toml` of a source: a survey itself, a corridor (`tile.toml`), or a drive (`drive.toml`).
 
-    What has to be made of it is kept in the target, and made again only where what it is made of has changed.
+    A survey made from a corridor or drive is cached in the target, and rebuilt when its inputs or settings change.
 
     Args:
-        place: a file, or a folder that holds one; in object storage a survey's folder.
-        target: gets `prepared/` with `slam/`, `corridor/` and `survey/`, as needed.
+        place: a file, or the folder that contains it; in object storage the folder of a survey.
+        target: output folder; gets `prepared/` with `slam/`, `corridor/` and `survey/`, as needed.
         run: runs the steps.
-        length, buffer: metres, how it is cut, if not as the drive says or as usual.
-        warn: gets what the steps that ran have warned of.
+        length, buffer: tile length and overlap in metres; default: those of the drive.
+        warn: receives the warnings of the steps that ran.
 
     Raises:
-        InputError: it is none of these, or says something impossible.
-        UnsureError: most of the path that SLAM found is unsure; it is there to be looked at.
-        ScanError: as SLAM, import and cut.
+        InputError: it is none of these, or has invalid content.
+        LowConfidenceError: most of the trajectory is extrapolated; it is written, for inspection.
+        ScanError: raised by SLAM, import or cutting.
     """
     if is_remote(place):
         return str(place)
-    source, out = found(Path(place)), likeness(target) / PREPARED
+    source, out = found(Path(place)), local_copy(target) / PREPARED
     if source.name == "survey.toml":
         return str(source)
     with locked(out):
         planned, store, digests = plan_drive(source, out, length=length, buffer=buffer)
-        if drop_damaged(planned, store, {item.node.id.name for item in planned}):
+        if drop_damaged(planned, store, {item.task.id.name for item in planned}):
             planned, store, digests = plan_drive(source, out, length=length, buffer=buffer)
         outcome = run(planned, store)
         if "place" in outcome.of_tile():
@@ -60,26 +60,29 @@ def survey_of(
             _check_path(planned, outcome.of_tile(), out / "slam")
         outcome.check()
         for item in planned:
-            for text in outcome.done[item.node.id].warnings if item.reason is not None else ():
+            for text in outcome.done[item.task.id].warnings if item.reason is not None else ():
                 warn(text)
-        folders = {item.node.id.name: store.folder(item.node.full_name, item.key) for item in planned}
-        for name in SHOWN.keys() & folders.keys():
-            _link(folders[name] / SHOWN[name], out / SHOWN[name])
-        store.sweep({item.node.id.name: item.key for item in planned})
+        folders = {item.task.id.name: store.folder(item.task.full_name, item.key) for item in planned}
+        for name in LINKED_OUTPUTS.keys() & folders.keys():
+            _link(folders[name] / LINKED_OUTPUTS[name], out / LINKED_OUTPUTS[name])
+        store.sweep({item.task.id.name: item.key for item in planned})
         digests.save()
     return str(folders["cut"] / "survey" / "survey.toml")
 
 
-def _check_path(planned: list[Planned], done: dict[str, Manifest], slam: Path) -> None:
-    """Raise an UnsureError where the video's path is mostly unsure, alone, and not asked for all the same."""
-    names = {item.node.id.name for item in planned}
-    if "fuse" not in names and not any(getattr(item.node.params, "keep_unsure", False) for item in planned):
-        remedy = "Give [slam] a gps, or mend what slam.json warns of; or say keep_unsure = true under [sweeps]"
+def _check_path(planned: list[PlannedTask], done: dict[str, Manifest], slam: Path) -> None:
+    """Raise a LowConfidenceError if the sweeps depend on a video trajectory that is mostly extrapolated.
+
+    With `keep_unsure`, or fused with other sources, such a trajectory is accepted.
+    """
+    names = {item.task.id.name for item in planned}
+    if "fuse" not in names and not any(getattr(item.task.params, "keep_unsure", False) for item in planned):
+        remedy = "Add gps to [slam], fix the causes that slam.json lists, or set keep_unsure = true in [sweeps]"
         check_sure(done["place"].facts["unsure_share"], slam, remedy)
 
 
 def found(place: Path) -> Path:
-    """The file of a source: itself, or the one in a folder.
+    """The file of a source: `place` itself, or a survey.toml, drive.toml or tile.toml in that folder.
 
     Raises:
         InputError: there is none.
@@ -88,29 +91,29 @@ def found(place: Path) -> Path:
     if place.is_dir():
         place = next((place / name for name in names if (place / name).is_file()), place)
     if not place.is_file():
-        raise InputError(place, "there is no survey here", f"Name one of {', '.join(names)}, or a folder that has it")
+        raise InputError(place, "no survey found", f"Name a {', '.join(names)}, or a folder that contains one")
     return place
 
 
 def plan_drive(
     source: Path, out: Path, *, length: float | None = None, buffer: float | None = None
-) -> tuple[list[Planned], Store, Digests]:
-    """What would run of a drive, or to cut a corridor; the store that keeps it, and what is known of its sources.
+) -> tuple[list[PlannedTask], Store, Digests]:
+    """The plan of a drive, or of cutting a corridor; the cache of its results, and the digests of its sources.
 
     Raises:
-        ScanError: the file can't be read, or says something impossible.
+        ScanError: the file can't be read, or has invalid content.
     """
-    whole = source.name != DRIVE
-    drive = Drive(corridor=Path(source.name)) if whole else Drive.read(source)
+    is_corridor = source.name != DRIVE
+    drive = Drive(corridor=Path(source.name)) if is_corridor else Drive.read(source)
     given = {name: value for name, value in (("length", length), ("buffer", buffer)) if value is not None}
     drive = drive.model_copy(update={"tiles": drive.tiles.model_copy(update=given)})
     store = Store(out / STORE)
     digests = Digests(store.root / "digests.json")
-    return plan(recipe(drive, source.parent), store, digest=digests), store, digests
+    return plan(build_graph(drive, source.parent), store, digest=digests), store, digests
 
 
 def _link(folder: Path, place: Path) -> None:
-    """Have a link lead to a result."""
+    """Create or update the symbolic link `place` to a result."""
     if place.is_symlink():
         place.unlink()
     if not place.exists():

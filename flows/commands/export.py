@@ -1,4 +1,4 @@
-"""`scan2sim export`: a finished world in other formats, without running any step again."""
+"""`scan2sim export`: converts a finished world to other formats, without repeating any step."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from scan2sim.flows.commands.app import App
-from scan2sim.flows.commands.budget import Budget, parse
+from scan2sim.flows.commands.budget import Budget, parse_budget
 from scan2sim.flows.commands.display import console, progress, warn
 from scan2sim.flows.commands.options import options
 from scan2sim.pipeline.core.errors import SettingError
@@ -26,63 +26,76 @@ app = App()
 
 
 @contextmanager
-def _within(scene: Scene, limits: Budget, levels: int, report: Report) -> Iterator[Scene]:
-    """The scene within a budget and in levels of detail, for as long as it is written."""
+def _simplified(scene: Scene, limits: Budget, levels: int, report: Report) -> Iterator[Scene]:
+    """The scene reduced to a budget, with levels of detail; its files are temporary, deleted with the context."""
     with tempfile.TemporaryDirectory() as work:
         if limits != Budget():
-            from scan2sim.texturing.simplify_textured import reduced
+            from scan2sim.texturing.simplify_textured import simplified_scene
 
-            scene = reduced(scene, limits.triangles, limits.texels, Path(work) / "within", report)
+            scene = simplified_scene(scene, limits.triangles, limits.texels, Path(work) / "within", report)
         if levels > 1:
-            from scan2sim.texturing.levels_of_detail import detailed
+            from scan2sim.texturing.levels_of_detail import with_levels
 
-            scene = detailed(scene, levels, Path(work) / "levels", report)
+            scene = with_levels(scene, levels, Path(work) / "levels", report)
         yield scene
 
 
-def _tell(scene: Scene, limits: Budget) -> None:
-    """Warn of tiles that are over the budget all the same."""
+def _warn_of_exceeded_budget(scene: Scene, limits: Budget) -> None:
+    """Warn of tiles that exceed the budget even after simplification."""
     for tile in scene.tiles:
         count = sum(figures["triangles"] for figures in tile.groups.values())
         if limits.triangles is not None and count > 1.05 * limits.triangles:
-            warn(f"{tile.name} has {count:,} triangles: where its surfaces end they are kept, for tiles to meet")
+            warn(f"{tile.name} has {count:,} triangles, more than the budget: those at its borders can't be simplified")
 
 
 @app.command()
 @options(SceneParams)
 def export(
     params: SceneParams,
-    world: Annotated[Path, typer.Argument(metavar="WORLD", help="The folder that run or survey was given as --out.")],
-    to: Annotated[str, typer.Option("--to", metavar="FORMAT,...", help="Formats (docs/simulators.md).")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for what is written.")],
+    world: Annotated[Path, typer.Argument(metavar="WORLD", help="Output folder of `scan2sim run` or `survey`.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            metavar="FORMAT,...",
+            help=f"Formats to write: {', '.join(world_formats.format_names())} (docs/simulators.md).",
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the converted world.")],
     budget: Annotated[
         str | None,
-        typer.Option("--budget", metavar="triangles=200k,texture=64MP", help="What each tile may have, at most."),
+        typer.Option(
+            "--budget",
+            metavar="triangles=200k,texture=64MP",
+            help="Limits of each tile, simplified to meet them: number of triangles, megapixels of texture.",
+        ),
     ] = None,
     levels: Annotated[
         int | None,
-        typer.Option("--levels", help="Levels of detail of each tile, from 1 to 6. Default: 3 for tiles3d, else 1."),
+        typer.Option(
+            "--levels", help="Number of levels of detail (LOD) of each tile, 1 to 6; default: 3 for tiles3d, else 1."
+        ),
     ] = None,
     robot: Annotated[
         bool,
-        typer.Option("--robot", help="Put a small robot with camera and lidar on the road (docs/robot.md)."),
+        typer.Option("--robot", help="Add a small robot with camera and lidar, on the road (docs/robot.md)."),
     ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an export that is there already.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing export.")] = False,
 ) -> None:
-    """Write a finished world in other formats, for other simulators."""
+    """Convert a finished world to other formats, for other simulators."""
     formats = list(dict.fromkeys(filter(None, map(str.strip, to.split(",")))))
     if not formats:
-        raise SettingError("--to", "names no format", f"Choose of: {', '.join(world_formats.known())}")
+        raise SettingError("--to", "names no format", f"Choose from: {', '.join(world_formats.format_names())}")
     world_formats.check(formats, params, "--to", robot)
-    limits = parse(budget)
+    limits = parse_budget(budget)
     scene = read_scene(world)
     with (
         progress("export") as report,
         tile_folder(out, overwrite, "world") as folder,
-        _within(scene, limits, levels or world_formats.levels(formats), report) as small,
+        _simplified(scene, limits, levels or world_formats.levels(formats), report) as small,
     ):
         world_formats.write(small, formats, folder, params, report, robot)
-        _tell(small, limits)
+        _warn_of_exceeded_budget(small, limits)
     if scene.frame.crs == LOCAL:
-        warn(f"{scene.name} has no CRS, so nothing says where on the earth it is")
+        warn(f"{scene.name} has no CRS: the export is not georeferenced")
     console.print(f"World:  {out}", highlight=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""`scan2sim import`: a tile from a user's files."""
+"""`scan2sim import`: creates a tile from a user's files."""
 
 from __future__ import annotations
 
@@ -13,73 +13,101 @@ from scan2sim.flows.commands.display import progress
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.commands.sweeps import scanner_path
 from scan2sim.flows.pipelines.sweeps import Sweeps, path, placed
-from scan2sim.pipeline.core.classes import parse
+from scan2sim.pipeline.core.classes import parse_mapping
 from scan2sim.pipeline.importers.clouds_and_photos import import_las
 from scan2sim.pipeline.importers.kitti_odometry import import_kitti_odometry
 from scan2sim.pipeline.importers.kitti_raw import import_kitti_raw
 from scan2sim.pipeline.importers.photogrammetry import import_model
-from scan2sim.pipeline.steps.import_sweeps import tile_of
+from scan2sim.pipeline.steps.import_sweeps import build_tile
 
-app = App("Make a tile from your files.")
-Cameras = Annotated[list[str] | None, typer.Option("--camera", help="Its folder; several times for several.")]
-MaxRange = Annotated[float, typer.Option(help="Metres; returns from further away are left out.")]
+app = App("Import recordings: create a tile from point clouds, photos, sweeps or data sets.")
+KITTI_CAMERA_HELP = "Image folder of a camera, such as {}, to take photos from; repeatable; default: {}."
+MaxRange = Annotated[float, typer.Option(help="Largest range of a lidar return in metres; farther ones are dropped.")]
 
 
 @app.command("kitti-raw")
 def import_kitti(
-    drive: Annotated[Path, typer.Argument(help="A drive's folder (..._sync), or one that holds it.")],
+    drive: Annotated[
+        Path, typer.Argument(metavar="DRIVE", help="Folder of a drive (..._sync), or a folder that contains it.")
+    ],
     out: TileOut,
-    poses: Annotated[Path | None, typer.Option(help="Sweep poses instead of OXTS: row-major 3x4 a line.")] = None,
-    camera: Cameras = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="File of sweep poses to use instead of OXTS: a row-major 3x4 matrix per line.")
+    ] = None,
+    camera: Annotated[
+        list[str] | None, typer.Option("--camera", help=KITTI_CAMERA_HELP.format("image_03", "image_02"))
+    ] = None,
     max_range: MaxRange = 50.0,
-    rigid: Annotated[bool, typer.Option("--rigid", help="Sweeps are motion-compensated already.")] = False,
+    rigid: Annotated[
+        bool, typer.Option("--rigid", help="The sweeps are motion-compensated already: don't deskew them.")
+    ] = False,
     name: Name = None,
     link: Link = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """KITTI raw: merge sweeps by OXTS or a pose file, colour points from the photos."""
+    """KITTI raw: merge the sweeps by OXTS or a pose file, colour the points from the photos."""
     with progress("import") as report:
         path = import_kitti_raw(
             drive, out, poses=poses, cameras=camera or ["image_02"], max_range=max_range, deskew=not rigid,
             name=name, link=link, overwrite=overwrite, report=report,
         )  # fmt: skip
-    _imported(path)
+    _print_imported(path)
 
 
 @app.command("kitti-odometry")
 def import_kitti_sequence(
-    sequence: Annotated[Path, typer.Argument(help="A sequence's folder: velodyne, image_2, calib.txt, times.txt.")],
+    sequence: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SEQUENCE", help="Folder of a sequence, with velodyne, image_2, calib.txt and times.txt."
+        ),
+    ],
     out: TileOut,
-    poses: Annotated[Path | None, typer.Option(help="Of camera 0, 3x4 a line; default: poses.txt in it.")] = None,
-    camera: Cameras = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="File of poses of camera 0, a 3x4 matrix per line; default: its poses.txt.")
+    ] = None,
+    camera: Annotated[
+        list[str] | None, typer.Option("--camera", help=KITTI_CAMERA_HELP.format("image_3", "image_2"))
+    ] = None,
     max_range: MaxRange = 50.0,
     name: Name = None,
     link: Link = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """KITTI odometry: merge a sequence's sweeps by its poses, colour points from the photos."""
+    """KITTI odometry: merge the sweeps of a sequence by its poses, colour the points from the photos."""
     with progress("import") as report:
         path = import_kitti_odometry(
             sequence, out, poses=poses, cameras=camera or ["image_2"], max_range=max_range, name=name, link=link,
             overwrite=overwrite, report=report,
         )  # fmt: skip
-    _imported(path)
+    _print_imported(path)
 
 
 def _import_model(kind: str, about: str) -> None:
-    """`scan2sim import KIND`: the same options for every program's posed photos."""
+    """Declare `scan2sim import KIND`, which imports posed photos of a photogrammetry program."""
 
     def command(
-        model: Annotated[Path, typer.Argument(help="The program's file or folder, as above.")],
-        images: Annotated[Path, typer.Argument(help="Folder of the photos.")],
+        model: Annotated[
+            Path, typer.Argument(metavar="MODEL", help="File or folder of the photogrammetry program (see above).")
+        ],
+        images: Annotated[Path, typer.Argument(metavar="IMAGES", help="Folder of the photos.")],
         out: TileOut,
-        cloud: Annotated[Path | None, typer.Option(help="Dense cloud; default: the sparse points.")] = None,
-        crs: Annotated[
-            str | None, typer.Option(help="To bring it to; or that it is in, where it isn't georeferenced.")
+        cloud: Annotated[
+            Path | None, typer.Option(help="File of the dense point cloud; default: the model's sparse points.")
         ] = None,
-        gps: Annotated[bool, typer.Option("--gps", help="Place it by the GPS in the photos' EXIF.")] = False,
-        upright: Annotated[bool, typer.Option("--upright", help="Turn it so that photos stand upright.")] = False,
-        scale: Annotated[float, typer.Option(help="Metres per unit of the model.")] = 1.0,
+        crs: Annotated[
+            str | None,
+            typer.Option(
+                help='CRS to convert to ("EPSG:32633"); for a model without georeference, the CRS that it is in.'
+            ),
+        ] = None,
+        gps: Annotated[
+            bool, typer.Option("--gps", help="Georeference the model by the GPS positions in the photos' EXIF.")
+        ] = False,
+        upright: Annotated[
+            bool, typer.Option("--upright", help="Rotate the model so that the photos are upright (z up).")
+        ] = False,
+        scale: Annotated[float, typer.Option(help="Scale of the model, metres per unit.")] = 1.0,
         classes: Classes = "",
         name: Name = None,
         link: Link = False,
@@ -90,53 +118,64 @@ def _import_model(kind: str, about: str) -> None:
         with progress("import") as report:
             path = import_model(
                 kind, model, images, out, cloud=cloud, crs=crs, gps=gps, up="photos" if upright else None, scale=scale,
-                classes=parse(classes), name=name, link=link, overwrite=overwrite, warn=warnings.append, report=report,
+                classes=parse_mapping(classes), name=name, link=link, overwrite=overwrite, warn=warnings.append,
+                report=report,
             )  # fmt: skip
-        _imported(path, warnings)
+        _print_imported(path, warnings)
 
     app.command(kind, help=about)(command)
 
 
-_import_model("colmap", "COLMAP: a folder of cameras, images and points3D, .txt or .bin (often sparse/0).")
-_import_model("opensfm", "OpenSfM or OpenDroneMap: a reconstruction.json, or the project's folder.")
+_import_model("colmap", "COLMAP: the folder of cameras, images and points3D, .txt or .bin (often sparse/0).")
+_import_model("opensfm", "OpenSfM or OpenDroneMap: a reconstruction.json, or the folder of the project.")
 _import_model("metashape", "Agisoft Metashape: a cameras.xml (Export Cameras, Agisoft XML); needs a --cloud.")
-_import_model("bundler", "Bundler: a bundle.out, with its list.txt beside it.")
+_import_model("bundler", "Bundler: a bundle.out with list.txt in the same folder.")
 _import_model("nvm", "VisualSFM: a .nvm file (NVM_V3).")
 
 
-@app.command("las", hidden=True)  # what it was called when it read LAS and PLY alone
+@app.command("las", hidden=True)  # alias for scripts: the former name
 @app.command("clouds")
 def import_plain_clouds(
     clouds: Annotated[
-        list[Path], typer.Argument(help="LAS, LAZ, COPC, PLY, E57, PCD, XYZ, CSV files, or an ept.json.")
+        list[Path],
+        typer.Argument(
+            metavar="CLOUD...", help="Point clouds: LAS, LAZ, COPC, PLY, E57, PCD, XYZ, CSV, or an ept.json."
+        ),
     ],
     out: TileOut,
-    photos: Annotated[Path | None, typer.Option(help="CSV of photos and poses (docs/formats.md).")] = None,
-    cameras: Annotated[Path | None, typer.Option(help="CSV of cameras, where the photos' lacks them.")] = None,
-    images: Annotated[Path | None, typer.Option(help="Folder of the photos; default: the CSV's.")] = None,
+    photos: Annotated[
+        Path | None, typer.Option(help="CSV file with the photos and their poses (docs/reference/formats.md).")
+    ] = None,
+    cameras: Annotated[
+        Path | None, typer.Option(help="CSV file with the cameras' intrinsics, if the one of --photos has none.")
+    ] = None,
+    images: Annotated[Path | None, typer.Option(help="Folder of the photos; default: that of the CSV file.")] = None,
     crs: Crs = None,
-    units: Annotated[str | None, typer.Option(help="m, ft or us-ft, where the CRS doesn't say.")] = None,
-    trajectory: Annotated[Path | None, typer.Option(help="CSV of the scanner's path: time,x,y,z.")] = None,
+    units: Annotated[
+        str | None, typer.Option(help="Unit of the coordinates: m, ft or us-ft; default: that of the CRS.")
+    ] = None,
+    trajectory: Annotated[Path | None, typer.Option(help="CSV file with the scanner's path: time,x,y,z.")] = None,
     orthophoto: Annotated[
-        Path | None, typer.Option(help="GeoTIFF, or JPEG, PNG with a world file: drapes what it covers.")
+        Path | None,
+        typer.Option(help="Orthophoto that textures what it covers: a GeoTIFF, or a JPEG or PNG with a world file."),
     ] = None,
     footprints: Annotated[
-        Path | None, typer.Option(help="GeoJSON or GeoPackage of buildings: where walls stand.")
+        Path | None, typer.Option(help="Building footprints (GeoJSON or GeoPackage), for the positions of walls.")
     ] = None,
     classes: Classes = "",
     name: Name = None,
     link: Link = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Plain clouds, with a CSV of photos if there are any."""
+    """Point clouds (LAS, PLY, E57, ...), optionally with posed photos listed in a CSV file."""
     warnings: list[str] = []
     with progress("import") as report:
         path = import_las(
             clouds, out, photos=photos, cameras=cameras, images=images, crs=crs, units=units, trajectory=trajectory,
-            classes=parse(classes), orthophoto=orthophoto, footprints=footprints, name=name, link=link,
+            classes=parse_mapping(classes), orthophoto=orthophoto, footprints=footprints, name=name, link=link,
             overwrite=overwrite, warn=warnings.append, report=report,
         )  # fmt: skip
-    _imported(path, warnings)
+    _print_imported(path, warnings)
 
 
 @app.command("sweeps")
@@ -144,7 +183,11 @@ def import_plain_clouds(
 def import_sweeps_and_poses(
     sweeps: Sweeps,
     poses: Annotated[
-        Path | None, typer.Argument(metavar="[TRAJECTORY]", help="Of `slam` for example: .csv, .tum, .kitti; z-up.")
+        Path | None,
+        typer.Argument(
+            metavar="TRAJECTORY",
+            help="Trajectory (.csv, .tum, .kitti; z up), such as one of `scan2sim slam`; default: match the sweeps.",
+        ),
     ] = None,
     *,
     out: TileOut,
@@ -152,7 +195,7 @@ def import_sweeps_and_poses(
     link: Link = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """A scanner's sweeps placed by a trajectory, by GPS and each other, with photos if there are any."""
+    """Lidar sweeps, merged by a trajectory, GPS, or lidar odometry (sweep matching); optionally with photos."""
     warnings: list[str] = []
     files, params = placed(sweeps, Path(), sweeps.poses)
     nodes = path(sweeps, Path(), sweeps.poses)
@@ -160,13 +203,13 @@ def import_sweeps_and_poses(
         files["poses"] = scanner_path(nodes, out.with_name(f"{out.name}-path"))
     inputs = {key: file for key, file in files.items() if isinstance(file, Path)}
     with progress("import") as report:
-        tile = tile_of(
+        tile = build_tile(
             inputs, params, out, link=link, overwrite=overwrite, name=name, warn=warnings.append, report=report
         )
-    _imported(tile, warnings)
+    _print_imported(tile, warnings)
 
 
-def _imported(path: Path, warnings: Sequence[str] = ()) -> None:
+def _print_imported(path: Path, warnings: Sequence[str] = ()) -> None:
     for warning in warnings:
         typer.secho(f"warning: {warning}", fg="yellow", err=True)
     typer.echo(f"Tile: {path}")

@@ -1,4 +1,4 @@
-"""`scan2sim inspect`: one screen of facts about a cloud, a tile, a mesh or a world."""
+"""`scan2sim inspect`: prints a summary of a point cloud, a tile, a mesh or a world."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ app = App()
 
 
 @app.command()
-def inspect(path: Annotated[Path, typer.Argument(help="A cloud, a tile, a mesh, or a world.")]) -> None:
-    """Show one screen of facts."""
+def inspect(path: Annotated[Path, typer.Argument(metavar="PATH", help="A point cloud, tile, mesh or world.")]) -> None:
+    """Show a summary of a point cloud, a tile, a mesh or a world."""
     inspect_path(path)
 
 
 def inspect_path(path: Path) -> None:
-    """Print what is at `path`.
+    """Print a summary of `path`.
 
     Raises:
-        InputError: nothing is there, or of no known kind.
+        InputError: it doesn't exist, or is of an unknown kind.
     """
     kind, facts = _reader(path)(path)
     table = Table(
@@ -59,9 +59,11 @@ def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
         if any(path.glob("*.sdf")):
             return lambda p: _world(_sdf(p))
         raise InputError(
-            path, "holds neither tile.toml nor a world", "Name a cloud, a tile (of a survey, too), a mesh or a world"
+            path,
+            "contains neither a tile.toml nor a world",
+            "Name a cloud, a tile (or one of a survey), a mesh or a world",
         )
-    file_checks.check(path, "Mend the name")
+    file_checks.check(path, "Check the path")
     readers = {
         **dict.fromkeys(clouds.formats(), _cloud), ".toml": _tile, ".sdf": _world, ".npz": _result,
         ".obj": _mesh, ".dae": _mesh, ".glb": _mesh, ".ply": _ply,
@@ -69,7 +71,9 @@ def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
     if path.name in readers:
         return readers[path.name]
     if path.suffix.lower() not in readers:
-        raise InputError(path, f"is of no known kind ({path.suffix or 'no suffix'})", f"Known: {' '.join(readers)}")
+        raise InputError(
+            path, f"has an unknown file type ({path.suffix or 'no suffix'})", f"Known: {' '.join(readers)}"
+        )
     return readers[path.suffix.lower()]
 
 
@@ -89,12 +93,12 @@ def _cloud(path: Path) -> tuple[str, Facts]:
         ("extent", _bounds(header.low, header.high)),
         ("density", f"{header.count / area:,.1f} per square unit of its bounding box"),
         ("colours", "yes" if cloud.rgb is not None else "no"),
-        *(("beware", note) for note in header.notes),
+        *(("warning", note) for note in header.notes),
     ]
     if cloud.time is not None and len(cloud):
         facts.append(("GPS time", f"{cloud.time.min():.3f} to {cloud.time.max():.3f} s"))
     if cloud.classification is not None:
-        table = clouds.meanings(path, {})
+        table = clouds.code_table(path, {})
         codes, counts = np.unique(cloud.classification, return_counts=True)
         facts += [
             (
@@ -131,8 +135,8 @@ def _mesh(path: Path) -> tuple[str, Facts]:
         loaded = trimesh.load_scene(path, process=False)
         meshes = [part for part in loaded.geometry.values() if isinstance(part, trimesh.Trimesh)]
         bounds = loaded.bounds
-    except Exception as error:  # trimesh's parsers raise whatever the damage leads to
-        raise InputError(path, f"is no readable mesh ({error})", "Export it again") from None
+    except Exception as error:  # trimesh's parsers raise any exception on damaged files
+        raise InputError(path, f"is not a readable mesh ({error})", "Export it again") from None
     textures = {getattr(getattr(m.visual, "material", None), "name", None) for m in meshes} - {None}
     return "mesh", [
         ("parts", str(len(meshes))),
@@ -153,15 +157,15 @@ def _result(path: Path) -> tuple[str, Facts]:
     try:
         with np.load(path) as data:
             facts = [(name, f"{data[name].shape} {data[name].dtype}") for name in data.files]
-    except Exception as error:  # a damaged archive raises whatever zipfile, zlib and numpy come upon
-        raise InputError(path, f"can't be read ({error})", "Run the step that makes it again") from None
-    return "kept result", facts
+    except Exception as error:  # zipfile, zlib and numpy raise any exception on damaged files
+        raise InputError(path, f"can't be read ({error})", "Run the step that writes it again") from None
+    return "cached result", facts
 
 
 def _sdf(folder: Path) -> Path:
     worlds = sorted(folder.glob("*.sdf"))
     if not worlds:
-        raise InputError(folder, "holds no .sdf file", "Name the folder of a world")
+        raise InputError(folder, "contains no .sdf file", "Name the folder of a world")
     return worlds[0]
 
 
@@ -179,6 +183,6 @@ def _world(path: Path) -> tuple[str, Facts]:
             body = json.loads(metadata.read_text(encoding="utf-8"))
             facts += [(key, json.dumps(value)) for key, value in body.items() if key not in ("crs",)]
         except (ValueError, AttributeError, RecursionError) as error:
-            raise InputError(metadata, f"is no readable JSON ({str(error)[:100]})", "Export it again") from None
+            raise InputError(metadata, f"is not readable as JSON ({str(error)[:100]})", "Export it again") from None
     size = sum(p.stat().st_size for p in path.parent.rglob("*") if p.is_file())
     return "world", [*facts, ("size", f"{size / 1e6:,.1f} MB")]

@@ -1,4 +1,4 @@
-"""`run.log`: what was asked for, what ran when, what steps told, and the details of errors."""
+"""The log file of a run, `run.log`: settings, start and end of each task, messages of steps, tracebacks of errors."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from scan2sim.pipeline.core.errors import ScanError, from_os_error
 
 
 class Log:
-    """`run.log`: what was asked for, what ran when, what steps told, and the details of errors."""
+    """Appends to a log file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def write(self, *lines: str) -> None:
-        """Append lines, the first with the time."""
+        """Append lines; the first one gets a timestamp."""
         with open(self.path, "a", encoding="utf-8") as file:
             file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} " + "".join(f"{line.rstrip()}\n" for line in lines))
 
     def write_failed(self, side: SideProducts) -> None:
-        """Append the side products that failed, with the details of each."""
+        """Append the side products that failed, with their tracebacks."""
         for text, error in zip(side.warnings(), side.failed.values(), strict=True):
             self.write(text, *getattr(error, "__notes__", ()))
 
     @contextmanager
     def errors(self, out: Path) -> Iterator[None]:
-        """Write down what goes wrong within, and pass it on; an error of the system becomes one of ours about `out`."""
+        """Log errors raised in the context and re-raise them; an `OSError` becomes a `ScanError` about `out`."""
         try:
             yield
         except ScanError as error:

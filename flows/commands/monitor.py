@@ -1,4 +1,4 @@
-"""`scan2sim monitor`: nodes of the event bus (services/monitoring)."""
+"""`scan2sim monitor`: monitoring of ROS 2 topics, alarms, archive and autoscaling (services/monitoring)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ from scan2sim.services.monitoring.settings.monitor import (
     WorkParams,
 )
 
-app = App("The event bus: topics of ROS 2 watched, and what goes through them told.")
+app = App(
+    "Monitor ROS 2 topics and publish their statistics; alarms, archive, autoscaling.",
+    requirement=("the event bus", "psutil"),
+)
 
 NODE_OPTIONS = {
     "window_size": "--window",
@@ -36,37 +39,32 @@ NODE_OPTIONS = {
     "log_file": "--log",
     "prometheus_port": "--metrics",
 }
-"""Names of `Watched`'s fields on the command line, where they are shorter there."""
+"""Fields of instrumented nodes' parameters with other names on the command line."""
 Limits = Annotated[
     list[str] | None, typer.Option("--limit", metavar="KEY=VALUE", help=PageParams.model_fields["limit"].description)
 ]
 BUS_OPTIONS = {"kafka_bootstrap_servers": "--kafka", "log_file": "--log"}
 
 
-@app.callback()
-def _bus() -> None:
-    optional_deps.need("the event bus", "psutil")
-
-
 @app.command("topic")
 @options(TopicParams, topics="TOPIC...", **NODE_OPTIONS)
 def monitor_topic(params: TopicParams, limit: Limits = None) -> None:
-    """Watch topics from outside, whoever publishes on them."""
+    """Monitor existing topics: publish bandwidth, message counts, losses and latency of each every period."""
     from scan2sim.services.monitoring.node.topic_monitor import TopicMonitor
 
-    def made() -> Any:
+    def create() -> Any:
         node = TopicMonitor(params)
         if not params.type:
             node.find(params.timeout, lambda text: console.print(text, highlight=False, markup=False))
         return node
 
-    spin(made)
+    spin(create)
 
 
 @app.command("talker")
 @options(TalkerParams, **NODE_OPTIONS)
 def monitor_talker(params: TalkerParams, limit: Limits = None) -> None:
-    """Send messages of a size at an interval, to try the bus with."""
+    """Test node: publish text messages of a given size at a given interval."""
     from scan2sim.services.monitoring.example_nodes.talker import Talker
 
     spin(lambda: Talker(params))
@@ -75,7 +73,7 @@ def monitor_talker(params: TalkerParams, limit: Limits = None) -> None:
 @app.command("dataset-talker")
 @options(DatasetParams, **NODE_OPTIONS)
 def monitor_dataset_talker(params: DatasetParams, limit: Limits = None) -> None:
-    """Send messages when, and as large as, a file says."""
+    """Test node: publish messages at the times and with the sizes listed in a CSV file."""
     from scan2sim.services.monitoring.example_nodes.dataset_talker import DatasetTalker
 
     spin(lambda: DatasetTalker(params), lambda node: node.finished)
@@ -84,7 +82,7 @@ def monitor_dataset_talker(params: DatasetParams, limit: Limits = None) -> None:
 @app.command("listener")
 @options(ListenerParams, **NODE_OPTIONS)
 def monitor_listener(params: ListenerParams, limit: Limits = None) -> None:
-    """Hear strings, and say what was heard."""
+    """Test node: subscribe to text messages and log them."""
     from scan2sim.services.monitoring.example_nodes.listener import Listener
 
     spin(lambda: Listener(params))
@@ -93,7 +91,7 @@ def monitor_listener(params: ListenerParams, limit: Limits = None) -> None:
 @app.command("traffic")
 @options(TrafficParams, cameras="--cameras", from_hour="--from", to_hour="--to")
 def monitor_traffic(params: TrafficParams) -> None:
-    """Draw events of cameras over some hours of a day, for `dataset-talker`."""
+    """Generate random camera events over some hours of a day, as a CSV file for `dataset-talker`."""
     from scan2sim.services.monitoring.autoscale.traffic_model import write
 
     count = write(params)
@@ -103,16 +101,16 @@ def monitor_traffic(params: TrafficParams) -> None:
 @app.command("work")
 @options(WorkParams, command="WORKER", **NODE_OPTIONS)
 def monitor_work(params: WorkParams, limit: Limits = None) -> None:
-    """Have a topic's events worked on by local processes, as many as are asked for on the bus."""
-    from scan2sim.services.monitoring.work.worker_node import Work
+    """Process the events of a topic in local worker processes; `monitor scale` sets their number."""
+    from scan2sim.services.monitoring.work.worker_node import WorkerNode
 
-    spin(lambda: Work(params))
+    spin(lambda: WorkerNode(params))
 
 
 @app.command("scale")
 @options(ScaleParams, **BUS_OPTIONS)
 def monitor_scale(params: ScaleParams) -> None:
-    """Ask for as many workers as the queues that are told of on the bus need."""
+    """Autoscaler: request workers according to the load of the queues reported on the bus."""
     from scan2sim.services.monitoring.autoscale.node import ScalerNode
 
     spin(lambda: ScalerNode(params))
@@ -121,7 +119,7 @@ def monitor_scale(params: ScaleParams) -> None:
 @app.command("pool")
 @options(PoolParams, **BUS_OPTIONS)
 def monitor_pool(params: PoolParams) -> None:
-    """Start and stop workers of a Prefect pool as the bus asks for them."""
+    """Start and stop workers of a Prefect work pool as the autoscaler requests them."""
     from scan2sim.services.monitoring.autoscale.actuators.prefect import PrefectWorkers
     from scan2sim.services.monitoring.autoscale.pool_node import PoolNode
 
@@ -131,20 +129,20 @@ def monitor_pool(params: PoolParams) -> None:
 @app.command("alarms")
 @options(AlarmsParams, **BUS_OPTIONS)
 def monitor_alarms(params: AlarmsParams) -> None:
-    """Hold rules against what monitors tell: alarms go to the bus and to the console."""
+    """Check the published statistics against alarm rules; publish and print the alarms."""
     from scan2sim.services.monitoring.events.alarm_node import AlarmsNode
 
-    def tell(alarm: Any) -> None:
+    def print_alarm(alarm: Any) -> None:
         console.print(f"{alarm.state} {alarm.rule}: {alarm.subject}, {alarm.value:.4g}", highlight=False, markup=False)
 
-    spin(lambda: AlarmsNode(params, tell))
+    spin(lambda: AlarmsNode(params, print_alarm))
 
 
 @app.command("page")
 @options(PageParams, kafka_bootstrap_servers="--kafka")
 def monitor_page(params: PageParams, limit: Limits = None) -> None:
-    """Show what nodes tell by Kafka as a page in the browser, live."""
-    optional_deps.need("the page", "fastapi", "uvicorn", "prometheus_client", "confluent_kafka")
+    """Serve a live dashboard of the statistics, runs and alarms that arrive through Kafka."""
+    optional_deps.require("the page", "fastapi", "uvicorn", "prometheus_client", "confluent_kafka")
     from scan2sim.services.monitoring.dashboard.app import serve
 
     serve(params, lambda text: console.print(text, highlight=False, markup=False))
@@ -153,14 +151,14 @@ def monitor_page(params: PageParams, limit: Limits = None) -> None:
 @app.command("archive")
 @options(ArchiveParams, kafka_bootstrap_servers="--kafka")
 def monitor_archive(params: ArchiveParams) -> None:
-    """Keep records that come by Kafka, as Parquet by hour."""
-    optional_deps.need("the archive", "pyarrow", "confluent_kafka")
-    from scan2sim.services.monitoring.export.archive import keep
+    """Archive the statistics that arrive through Kafka, as hourly Parquet files."""
+    optional_deps.require("the archive", "pyarrow", "confluent_kafka")
+    from scan2sim.services.monitoring.export.archive import archive_records
 
-    ended = threading.Event()
+    stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: ended.set())
-    keep(params, ended, warn)
+        signal.signal(number, lambda *_: stop.set())
+    archive_records(params, stop, warn)
 
 
 @app.command("query")
@@ -169,10 +167,12 @@ def monitor_query(
     params: QueryParams,
     begin: Annotated[str | None, typer.Option("--from", help=QueryParams.model_fields["begin"].description)] = None,
     end: Annotated[str | None, typer.Option("--until", help=QueryParams.model_fields["end"].description)] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="CSV file; default: print it.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="CSV file to write; default: standard output.")
+    ] = None,
 ) -> None:
-    """Ask an archive: messages, bandwidth, losses and latency by node, topic and span of time, as CSV."""
-    optional_deps.need("the archive", "pyarrow")
+    """Query an archive: messages, bandwidth, losses and latency by node, topic and interval, as CSV."""
+    optional_deps.require("the archive", "pyarrow")
     from pyarrow import csv
 
     from scan2sim.services.monitoring.export.archive import query

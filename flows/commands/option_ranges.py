@@ -1,4 +1,4 @@
-"""Ranges of the numbers that commands take as options, in one table: a name means the same in all commands."""
+"""Ranges of numeric command options, in one table: an option of one name has one range in all commands."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from scan2sim.pipeline.core.parameters import Buffer, Length, Range, Seed
 from scan2sim.pipeline.core.step import Params
 
 
-class Numbers(Params):
-    """Options by their names, those that are given; the commands' help says what they mean."""
+class NumericOptions(Params):
+    """Values of numeric options by name, None where not given; the commands' help has their meanings."""
 
     hold_out: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
     jobs: Annotated[int, Field(ge=0, le=1024)] | None = None
@@ -32,12 +32,12 @@ class Numbers(Params):
 
 
 def check(given: Mapping[str, Any]) -> None:
-    """See that numbers among a command's options are in their ranges; others are left to the command.
+    """Check that numeric options are in their ranges; the command itself checks the others.
 
     Raises:
         SettingError: naming the option and its range.
     """
     for name, value in given.items():
-        if name in Numbers.model_fields and isinstance(value, (int, float, tuple)):
+        if name in NumericOptions.model_fields and isinstance(value, (int, float, tuple)):
             option = f"--{name.replace('_', '-')}"
-            Numbers.of("", {name: value}, remedy=f"Give another {option}; `--help` says what it means")
+            NumericOptions.of("", {name: value}, remedy=f"Change {option}; `--help` describes it")

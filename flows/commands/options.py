@@ -1,4 +1,4 @@
-"""Options of a command that are the fields of parameters: their names, defaults, ranges and help are said once."""
+"""Command options generated from the fields of a `Params` model: names, defaults, ranges and help."""
 
 from __future__ import annotations
 
@@ -17,79 +17,79 @@ P = TypeVar("P", bound=Params)
 
 
 def options(model: type[P], **named: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Decorator of a command: its first parameter, a `model`, is given as arguments and options.
+    """Decorator of a command: generates arguments and options for its first parameter, a `model`.
 
     Args:
-        model: field by field an option, or an argument where it has no default; what is given is checked against its
-            ranges, and fields that aren't given aren't set. A parameter of the command's by a field's name declares it.
-        named: what an argument is called in the help, or an option on the command line, by its field.
+        model: a required field becomes an argument, any other an option. Values are validated by the model, and fields
+            that keep their defaults stay unset. A parameter of the command with a field's name overrides its option.
+        named: field name to the metavar of its argument, or to the name of its option ("--out").
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        own = list(inspect.signature(command, eval_str=True).parameters.values())[1:]
+        own_parameters = list(inspect.signature(command, eval_str=True).parameters.values())[1:]
         fields = model.model_fields
-        declared = {one.name for one in own}
-        taken = [_parameter(name, field, named.get(name)) for name, field in fields.items() if name not in declared]
-        taken.sort(key=lambda one: fields[one.name].is_required(), reverse=True)
+        declared = {parameter.name for parameter in own_parameters}
+        generated = [_parameter(name, field, named.get(name)) for name, field in fields.items() if name not in declared]
+        generated.sort(key=lambda parameter: fields[parameter.name].is_required(), reverse=True)
 
-        def called(**given: Any) -> None:
+        def wrapper(**given: Any) -> None:
             values = {name: given[name] for name in fields}
             changed = {name: value for name, value in values.items() if value != fields[name].get_default()}
             rest = {name: value for name, value in given.items() if name in declared}
-            command(model.of("", changed, remedy="`--help` says what it means"), **rest)
+            command(model.of("", changed, remedy="`--help` describes it"), **rest)
 
-        # arguments, then what the command itself must be given, then options
-        order = [*taken, *own]
-        signature = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in order]
-        called.__name__, called.__doc__ = command.__name__, command.__doc__
-        called.__signature__ = inspect.Signature(signature)  # type: ignore[attr-defined]
-        called.__annotations__ = {one.name: one.annotation for one in signature}
-        return called
+        parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (*generated, *own_parameters)]
+        wrapper.__name__, wrapper.__doc__ = command.__name__, command.__doc__
+        wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        wrapper.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        return wrapper
 
     return decorate
 
 
 def assigned(assignments: Sequence[str], example: str) -> dict[str, Any]:
-    """Settings by their names, of texts as "threshold=0.4", that a command was given by --set.
+    """Settings by name from the texts of option --set, such as "threshold=0.4".
 
     Args:
-        example: what to write instead, where one isn't.
+        example: a valid assignment, for the error message.
 
     Raises:
-        SettingError: a text assigns nothing.
+        SettingError: a text has no `=`.
     """
     given: dict[str, Any] = {}
     for text in assignments:
         name, equals, value = text.partition("=")
         if not equals:
-            raise SettingError("--set", f"{text!r} assigns nothing", f"Write --set {example}")
+            raise SettingError("--set", f"{text!r} has no `=`", f"Write for example --set {example}")
         given[name.strip()] = parsed(value.strip())
     return given
 
 
 def _parameter(name: str, field: FieldInfo, named: str | None) -> inspect.Parameter:
-    """The field as Typer wants it: without its ranges, which the model checks."""
-    kind = _plain(field.annotation)
+    """A field as a parameter of a Typer command, without its range, which the model checks."""
+    kind = _without_ranges(field.annotation)
     if field.is_required():
-        about: Any = typer.Argument(help=field.description, metavar=named or name.upper())
+        declaration: Any = typer.Argument(help=field.description, metavar=named or name.upper())
         default = inspect.Parameter.empty
     else:
-        about = typer.Option(named or f"--{name.replace('_', '-')}", help=field.description)
+        declaration = typer.Option(named or f"--{name.replace('_', '-')}", help=field.description)
         default = field.get_default()
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, about])
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, declaration]
+    )
 
 
-def _plain(kind: Any) -> Any:
-    """A type without the ranges of its numbers."""
+def _without_ranges(kind: Any) -> Any:
+    """A type without the annotated ranges of its numbers."""
     if get_origin(kind) is Annotated:
-        return _plain(get_args(kind)[0])
+        return _without_ranges(get_args(kind)[0])
     parts = get_args(kind)
     if get_origin(kind) is list:
-        return list[_plain(parts[0])]  # type: ignore[misc]
+        return list[_without_ranges(parts[0])]  # type: ignore[misc]
     if get_origin(kind) is tuple and parts[-1] is Ellipsis:
-        return list[_plain(parts[0])]  # type: ignore[misc]
+        return list[_without_ranges(parts[0])]  # type: ignore[misc]
     if get_origin(kind) is tuple:
-        return tuple[tuple(_plain(part) for part in parts)]  # type: ignore[misc]
+        return tuple[tuple(_without_ranges(part) for part in parts)]  # type: ignore[misc]
     if parts and type(None) in parts:
-        return _plain(next(part for part in parts if part is not type(None))) | None
+        return _without_ranges(next(part for part in parts if part is not type(None))) | None
     return kind

@@ -1,4 +1,4 @@
-"""`scan2sim orchestrate`: services through Open Source MANO's northbound interface (services/orchestration)."""
+"""`scan2sim orchestrate`: deployment of services through the northbound API of Open Source MANO (OSM)."""
 
 from __future__ import annotations
 
@@ -15,67 +15,83 @@ from rich.table import Table
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import options
-from scan2sim.flows.commands.ros_spin import ends, spin
+from scan2sim.flows.commands.ros_spin import spin, stop_on_signal
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.pipeline.core.errors import ScanError, SettingError
 from scan2sim.services.orchestration import description, placement
 from scan2sim.services.orchestration.settings import (
-    ActParams,
     ApplyParams,
+    AutoscaleParams,
     Connection,
+    InstantiateParams,
+    OperationParams,
     PageParams,
-    ResizeParams,
-    ScaledParams,
-    StartParams,
+    ScaleInstanceParams,
 )
 from scan2sim.services.qos.requirements import Environment
 
 if TYPE_CHECKING:
-    from scan2sim.services.orchestration.apply import Applied, Change
-    from scan2sim.services.orchestration.lifecycle import Patience
+    from scan2sim.services.orchestration.apply import ApplyResult, Change
+    from scan2sim.services.orchestration.lifecycle import WaitPolicy
     from scan2sim.services.orchestration.osm import Osm
 
-app = App("Services on edge and cloud through Open Source MANO: what is to run, and where.")
+app = App(
+    "Deploy services on edge and cloud through Open Source MANO (OSM).",
+    requirement=("orchestration", "httpx", "yaml", "jsonschema"),
+)
 
-Vim = Annotated[str, typer.Option("--vim", help="VIM account that it runs on, by name or id.")]
-Cluster = Annotated[str, typer.Option("--cluster", help="Kubernetes cluster that it runs on, by name or id.")]
-Instance = Annotated[str, typer.Argument(metavar="INSTANCE", help="Its name in OSM, or its id.")]
-Services = Annotated[Path, typer.Argument(metavar="SERVICES", help="TOML file of what is to run (services.toml).")]
-
-
-@app.callback()
-def _orchestration() -> None:
-    optional_deps.need("orchestration", "httpx", "yaml", "jsonschema")
+Vim = Annotated[str, typer.Option("--vim", help="Name or id of the VIM account to run it on; give this or --cluster.")]
+Cluster = Annotated[
+    str, typer.Option("--cluster", help="Name or id of the Kubernetes cluster to run it on; give this or --vim.")
+]
+Instance = Annotated[str, typer.Argument(metavar="INSTANCE", help="Name or id of the network service instance in OSM.")]
+Services = Annotated[
+    Path,
+    typer.Argument(
+        metavar="SERVICES", help="TOML file that lists the services to run (services.toml; docs/orchestration.md)."
+    ),
+]
 
 
 @app.command("package")
 def orchestrate_package(
     service: Annotated[
-        str, typer.Argument(help=f"A description's TOML file, or one of: {', '.join(description.names())}.")
+        str,
+        typer.Argument(
+            metavar="SERVICE", help=f"TOML file of a service description, or one of: {', '.join(description.names())}."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the packages.")],
     environment: Annotated[
-        Environment, typer.Option(help="Where it will run, which says what it needs.")
+        Environment, typer.Option(help="Where the service will run; selects its resource requirements.")
     ] = Environment.EDGE,
-    machine: Annotated[bool, typer.Option("--machine", help="As a virtual machine, not as a container.")] = False,
-    prefix: Annotated[str, typer.Option(help="Of the packages' ids.")] = "scan2sim",
+    machine: Annotated[
+        bool,
+        typer.Option(
+            "--machine", help="Package the service as a virtual machine; default: as a container (Helm chart)."
+        ),
+    ] = False,
+    prefix: Annotated[str, typer.Option(help="Prefix of the packages' ids.")] = "scan2sim",
     repository: Annotated[
-        str | None, typer.Option(help="Helm repository of OSM that has the chart; default: it comes along.")
+        str | None,
+        typer.Option(
+            help="Helm repository in OSM that contains the chart; default: the chart is included in the package."
+        ),
     ] = None,
 ) -> None:
-    """Write a service's packages, of its function and its network service, as OSM takes them."""
+    """Write the OSM packages of a service: its network function (VNF/KNF) and its network service (NS)."""
     from scan2sim.services.orchestration.package import build
 
-    made = build(description.read(service), environment, "machine" if machine else "container", prefix, repository)
+    packages = build(description.read(service), environment, "machine" if machine else "container", prefix, repository)
     out.mkdir(parents=True, exist_ok=True)
-    for one in (made.function, made.service):
+    for one in (packages.function, packages.service):
         _say(str(one.save(out)))
 
 
 @app.command("list")
 @options(Connection)
 def orchestrate_list(params: Connection) -> None:
-    """List packages and instances in OSM."""
+    """List the packages and instances in OSM."""
     from scan2sim.services.orchestration.osm import FUNCTIONS, SERVICES
 
     with _osm(params) as osm:
@@ -84,7 +100,9 @@ def orchestrate_list(params: Connection) -> None:
             for one in osm.packages(collection):
                 state = str((one.get("_admin") or {}).get("onboardingState", ""))
                 packages.add_row(escape(str(one.get("id") or one["_id"])), kind, state.lower())
-        instances = Table("instance", "network service", "state", "made by", title="Instances", title_justify="left")
+        instances = Table(
+            "instance", "network service", "state", "description", title="Instances", title_justify="left"
+        )
         for one in osm.instances():
             state = str(one.get("nsState", "")).lower().replace("_", " ")
             facts = (one.get("name", ""), one.get("nsd-ref", ""), state, one.get("description") or "")
@@ -97,80 +115,86 @@ def orchestrate_list(params: Connection) -> None:
 @options(Connection)
 def orchestrate_onboard(
     params: Connection,
-    files: Annotated[list[Path], typer.Argument(metavar="PACKAGE...", help="Packages (.tar.gz), in any order.")],
+    files: Annotated[list[Path], typer.Argument(metavar="PACKAGE...", help="Package files (.tar.gz), in any order.")],
 ) -> None:
-    """Bring packages into OSM; those that it has stay."""
+    """Upload packages to OSM; those that it has already stay unchanged."""
     from scan2sim.services.orchestration import operations, package
 
     packages = [package.read(path) for path in files]
     with _osm(params) as osm:
         for name in operations.onboard(osm, packages):
-            _say(f"{name} is in OSM")
+            _say(f"{name} is onboarded")
 
 
 @app.command("instantiate")
-@options(StartParams)
+@options(InstantiateParams)
 def orchestrate_instantiate(
-    params: StartParams,
-    name: Annotated[str, typer.Argument(help="Of the instance.")],
-    nsd: Annotated[str, typer.Argument(metavar="NSD", help="Id of its network service's descriptor.")],
+    params: InstantiateParams,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the new instance.")],
+    nsd: Annotated[
+        str, typer.Argument(metavar="NSD", help="Id of the network service descriptor (NSD) to instantiate.")
+    ],
     vim: Vim = "",
     cluster: Cluster = "",
     ssh_key: Annotated[
-        list[Path] | None, typer.Option(help="Public SSH key of who may log in; may be given again.")
+        list[Path] | None,
+        typer.Option(help="File of a public SSH key that may log in to its virtual machine; repeatable."),
     ] = None,
     value: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=VALUE", help="Given to its chart or machine.")
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="Value passed to its Helm chart or virtual machine; repeatable."),
     ] = None,
-    namespace: Annotated[str, typer.Option(help="Of Kubernetes; default: the project's.")] = "",
+    namespace: Annotated[
+        str, typer.Option(help="Kubernetes namespace to run it in; default: that of the OSM project.")
+    ] = "",
 ) -> None:
-    """Have an instance of a network service run."""
+    """Create and start an instance of a network service."""
     from scan2sim.services.orchestration import operations
     from scan2sim.services.orchestration.deployment import read_key
 
     if bool(vim) == bool(cluster):
-        raise SettingError("--vim", "or --cluster says where it runs", "Give one of them")
+        raise SettingError("--vim", "exactly one of --vim and --cluster is needed", "Give one of them")
     keys, values = tuple(read_key(path) for path in ssh_key or ()), _values(value or [])
-    with _acting(params, name) as (osm, patience, say):
+    with _operation(params, name) as (osm, wait_policy, notify):
         site = osm.cluster(cluster) if cluster else osm.vim(vim)
         operations.instantiate(
             osm, name, nsd, site, replicas=params.replicas, keys=keys, values=values, namespace=namespace,
-            patience=patience, say=say,
+            wait_policy=wait_policy, notify=notify,
         )  # fmt: skip
     _say(f"{name} {'runs' if params.wait else 'is being started'}")
 
 
 @app.command("scale")
-@options(ResizeParams, name="INSTANCE")
-def orchestrate_scale(params: ResizeParams) -> None:
-    """Have so many of an instance's function."""
+@options(ScaleInstanceParams, name="INSTANCE")
+def orchestrate_scale(params: ScaleInstanceParams) -> None:
+    """Set the number of replicas of an instance's function."""
     from scan2sim.services.orchestration import operations
 
-    with _acting(params, params.name) as (osm, patience, say):
-        operations.resize(osm, params.name, params.replicas, patience, say)
-    _say(f"{params.name}: {params.replicas}")
+    with _operation(params, params.name) as (osm, wait_policy, notify):
+        operations.scale(osm, params.name, params.replicas, wait_policy, notify)
+    _say(f"{params.name}: {params.replicas} replicas")
 
 
 @app.command("heal")
-@options(ActParams)
-def orchestrate_heal(params: ActParams, name: Instance) -> None:
-    """Have an instance made whole: machines anew, charts applied again."""
+@options(OperationParams)
+def orchestrate_heal(params: OperationParams, name: Instance) -> None:
+    """Heal an instance: recreate its virtual machines, apply its charts again."""
     from scan2sim.services.orchestration import operations
 
-    with _acting(params, name) as (osm, patience, say):
-        operations.heal(osm, name, patience, say)
-    _say(f"{name} {'is whole' if params.wait else 'is being healed'}")
+    with _operation(params, name) as (osm, wait_policy, notify):
+        operations.heal(osm, name, wait_policy, notify)
+    _say(f"{name} {'is healed' if params.wait else 'is being healed'}")
 
 
 @app.command("terminate")
-@options(ActParams)
-def orchestrate_terminate(params: ActParams, name: Instance) -> None:
-    """End an instance, and keep its record."""
+@options(OperationParams)
+def orchestrate_terminate(params: OperationParams, name: Instance) -> None:
+    """Stop an instance; its record stays in OSM."""
     from scan2sim.services.orchestration import operations
 
-    with _acting(params, name) as (osm, patience, say):
-        operations.terminate(osm, name, patience, say)
-    _say(f"{name} is ended")
+    with _operation(params, name) as (osm, wait_policy, notify):
+        operations.terminate(osm, name, wait_policy, notify)
+    _say(f"{name} is terminated")
 
 
 @app.command("delete")
@@ -179,154 +203,160 @@ def orchestrate_delete(
     params: ApplyParams,
     what: Annotated[
         list[str],
-        typer.Argument(metavar="WHAT...", help="A services.toml, of which all goes; packages' files; or names in OSM."),
+        typer.Argument(
+            metavar="WHAT...",
+            help="A services.toml, to delete all that it lists; package files; or names or ids in OSM.",
+        ),
     ],
 ) -> None:
-    """Remove what a services.toml made, or a service by its packages, or instances and packages by name or id."""
+    """Delete all services of a services.toml, or a service by its package files, or instances and packages by name."""
     from scan2sim.services.orchestration import operations, package
-    from scan2sim.services.orchestration.lifecycle import Patience, find
+    from scan2sim.services.orchestration.lifecycle import WaitPolicy, find
 
     files = [Path(one) for one in what if one.endswith((".gz", ".tgz", ".toml"))]
     if len(files) not in (0, len(what)):
-        raise SettingError("WHAT", "names files and things in OSM together", "Give one or the other")
+        raise SettingError("WHAT", "mixes files with names in OSM", "Give only files, or only names")
     if any(path.suffix == ".toml" for path in files):
         for path in files:
-            _apply(params, path, nothing=True)
+            _apply(params, path, delete=True)
         return
     with _osm(params) as osm, progress("delete") as report:
-        patience = Patience(params.timeout)
+        wait_policy = WaitPolicy(params.timeout)
         if files:
-            operations.delete(osm, [package.read(path) for path in files], patience, lambda text: report(0.5, text))
+            operations.delete(osm, [package.read(path) for path in files], wait_policy, lambda text: report(0.5, text))
         instances = [name for name in what if not files and find(osm, name)]
         for name in instances:
-            operations.delete_instance(osm, name, patience, lambda text: report(0.5, text))
+            operations.delete_instance(osm, name, wait_policy, lambda text: report(0.5, text))
         if rest := [name for name in what if not files and name not in instances]:
             operations.delete_packages(osm, rest)
     for name in what:
-        _say(f"{name} is removed")
+        _say(f"{name} is deleted")
 
 
 @app.command("plan")
 @options(Connection)
 def orchestrate_plan(params: Connection, services: Services) -> None:
-    """Say what `apply` would do, and why."""
+    """List what `apply` would do, and why."""
     from scan2sim.services.orchestration import apply, deployment
 
-    asked = deployment.read(services)
+    requested = deployment.read(services)
     with _osm(params) as osm:
-        changes = apply.plan(apply.target(osm, asked, services.parent))
-    console.print(_changes(changes)) if changes else _say("nothing: all is as the file says")
+        changes = apply.plan(apply.load_state(osm, requested, services.parent))
+    console.print(_changes(changes)) if changes else _say("nothing to do: all services are as described")
 
 
 @app.command("apply")
 @options(ApplyParams)
 def orchestrate_apply(params: ApplyParams, services: Services) -> None:
-    """Bring what runs to what the file says: make, change and remove, nothing twice."""
+    """Create, change and delete services until those in OSM are as described in the file (idempotent)."""
     _apply(params, services)
 
 
 @app.command("place")
 def orchestrate_place(
-    service: Annotated[str, typer.Argument(help="Toolbox that is to run.")],
+    service: Annotated[
+        str, typer.Argument(metavar="SERVICE", help="Toolbox to place: detect, movement, classify or segment.")
+    ],
     measured: Annotated[
-        list[Path], typer.Argument(metavar="MEASURED...", help="What `scan2sim qos measure --out` wrote, of each site.")
+        list[Path],
+        typer.Argument(metavar="MEASURED...", help="JSON files of `scan2sim qos measure --out`, one per site."),
     ],
 ) -> None:
-    """Say which sites meet a toolbox's needs, and why the others don't."""
-    table = Table("site", "", "why not", title=f"{service}: where it may run", title_justify="left")
-    found = placement.place(service, [placement.read(path) for path in measured])
-    for one in found:
-        table.add_row(one.environment, "[green]fits" if one.fits else "[red]no", escape("\n".join(one.why)))
+    """List the sites that meet the requirements of a toolbox, by measurements, and why others don't."""
+    table = Table("site", "", "why not", title=f"Placement of {service}", title_justify="left")
+    placements = placement.place(service, [placement.read(path) for path in measured])
+    for one in placements:
+        table.add_row(one.environment, "[green]fits" if one.fits else "[red]no", escape("\n".join(one.unmet)))
     console.print(table)
-    nearest = next((one for one in found if one.fits), None)
-    _say(f"nearest to the robot: {nearest.environment}" if nearest else "none of them will do")
+    nearest = next((one for one in placements if one.fits), None)
+    _say(f"nearest to the robot: {nearest.environment}" if nearest else "no site meets the requirements")
 
 
 @app.command("page")
 @options(PageParams)
 def orchestrate_page(params: PageParams) -> None:
-    """Show services as a page in the browser: upload packages, onboard, instantiate, delete."""
-    optional_deps.need("the page", "fastapi", "uvicorn", "prometheus_client")
+    """Serve a web page for packages and instances: upload, onboard, instantiate, delete."""
+    optional_deps.require("the page", "fastapi", "uvicorn", "prometheus_client")
     from scan2sim.services.orchestration.page import serve
 
     serve(params, _say)
 
 
 @app.command("pool")
-@options(ScaledParams, kafka_bootstrap_servers="--kafka", log_file="--log")
-def orchestrate_pool(params: ScaledParams) -> None:
-    """Scale an instance as the event bus asks for workers."""
-    optional_deps.need("the event bus", "psutil")
+@options(AutoscaleParams, kafka_bootstrap_servers="--kafka", log_file="--log")
+def orchestrate_pool(params: AutoscaleParams) -> None:
+    """Scale an instance as the autoscaler (`monitor scale`) requests workers."""
+    optional_deps.require("the event bus", "psutil")
 
-    def made() -> Any:
+    def create() -> Any:
         from scan2sim.services.monitoring.autoscale.actuators.osm import OsmReplicas
         from scan2sim.services.monitoring.autoscale.pool_node import PoolNode
 
         return PoolNode(params, params.queue or params.instance, OsmReplicas(params, params.instance))
 
-    spin(made)
+    spin(create)
 
 
-def _apply(params: ApplyParams, path: Path, *, nothing: bool = False) -> None:
+def _apply(params: ApplyParams, path: Path, *, delete: bool = False) -> None:
     from scan2sim.services.orchestration import apply, deployment
 
-    asked = deployment.read(path)
-    if nothing:
-        asked = deployment.Deployment(deployment=asked.deployment)
-    stop, pace = threading.Event(), apply.Pace()
-    with _osm(params, pace) as osm, progress(asked.deployment) as report, ends(stop):
-        applied = apply.apply(osm, apply.target(osm, asked, path.parent), params, report, stop, pace)
-    _tell(applied)
+    requested = deployment.read(path)
+    if delete:
+        requested = deployment.Deployment(deployment=requested.deployment)
+    stop, pacer = threading.Event(), apply.RequestPacer()
+    with _osm(params, pacer) as osm, progress(requested.deployment) as report, stop_on_signal(stop):
+        result = apply.apply(osm, apply.load_state(osm, requested, path.parent), params, report, stop, pacer)
+    _print_result(result)
     if stop.is_set():
         raise KeyboardInterrupt
-    if (error := apply.failure(applied)) is not None:
+    if (error := apply.failure(result)) is not None:
         raise error
 
 
 @contextmanager
-def _osm(params: Connection, pace: Any = None) -> Iterator[Osm]:
+def _osm(params: Connection, pacer: Any = None) -> Iterator[Osm]:
     from scan2sim.services.orchestration.osm import Osm
 
-    with Osm(params, asked=pace) as osm:
+    with Osm(params, before_request=pacer) as osm:
         yield osm
 
 
 @contextmanager
-def _acting(params: ActParams, name: str) -> Iterator[tuple[Osm, Patience, Any]]:
-    from scan2sim.services.orchestration.lifecycle import Patience
+def _operation(params: OperationParams, name: str) -> Iterator[tuple[Osm, WaitPolicy, Any]]:
+    from scan2sim.services.orchestration.lifecycle import WaitPolicy
 
     with _osm(params) as osm, progress(name) as report:
-        yield osm, Patience(params.timeout, params.wait), lambda text: report(0.5, text)
+        yield osm, WaitPolicy(params.timeout, params.wait), lambda text: report(0.5, text)
 
 
 def _values(given: list[str]) -> dict[str, str]:
     pairs = [one.partition("=") for one in given]
     if wrong := next((one for one, sign, _ in pairs if not sign or not one), None):
-        raise SettingError("--value", f"{wrong!r} is no NAME=VALUE", "Write it as NAME=VALUE")
+        raise SettingError("--value", f"{wrong!r} has not the form NAME=VALUE", "Write for example --value size=large")
     return {name: value for name, _, value in pairs}
 
 
-def _tell(applied: Applied) -> None:
-    if not applied.done and not applied.failed:
-        _say("nothing was to be done: all is as the file says")
+def _print_result(result: ApplyResult) -> None:
+    if not result.done and not result.failed:
+        _say("nothing to do: all services are as described")
         return
     table = Table("name", "", "")
-    for change in applied.done:
-        table.add_row(escape(change.name), f"[green]{change.what}", "")
-    for name, error in applied.failed.items():
-        table.add_row(escape(name), "[red]failed", escape(_said(error, name)))
+    for change in result.done:
+        table.add_row(escape(change.name), f"[green]{change.action}", "")
+    for name, error in result.failed.items():
+        table.add_row(escape(name), "[red]failed", escape(_error_text(error, name)))
     console.print(table)
 
 
-def _said(error: ScanError, name: str) -> str:
+def _error_text(error: ScanError, name: str) -> str:
     where = "" if error.where == name else f"{error.where}: "
     return f"{where}{error.cause}. {error.remedy}"
 
 
 def _changes(changes: list[Change]) -> Table:
-    table = Table("name", "would be", "because it")
+    table = Table("name", "action", "reason")
     for one in changes:
-        table.add_row(escape(one.name), one.what, one.why)
+        table.add_row(escape(one.name), one.action, one.reason)
     return table
 
 

@@ -1,4 +1,4 @@
-"""`scan2sim qos`: quality of service, as required and as measured (services/qos)."""
+"""`scan2sim qos`: quality of service of toolboxes, required and measured (services/qos)."""
 
 from __future__ import annotations
 
@@ -18,32 +18,42 @@ from scan2sim.flows.commands.options import options
 from scan2sim.flows.commands.qos_table import or_dash
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.services.qos import requirements
-from scan2sim.services.qos.compare import RATES, Needs, Row, needs, passed, rows
+from scan2sim.services.qos.compare import (
+    IMAGE_RATES,
+    MetricComparison,
+    ResourceNeeds,
+    compare_metrics,
+    passed,
+    resource_needs,
+)
 from scan2sim.services.qos.encoding import ChoiceParams, Jpeg, choose_h264, choose_jpeg
 from scan2sim.services.qos.measure import MeasureParams, measure
-from scan2sim.services.qos.requirements import MACHINE, NETWORK, UNITS, Environment, Requirements
+from scan2sim.services.qos.requirements import MACHINE_METRICS, NETWORK_METRICS, UNITS, Environment, Requirements
 from scan2sim.services.toolboxes import sources
 
-TRIED = 60
-"""Images that a choice is tried on, at most: a stream's need to be in a row."""
+MAX_TEST_IMAGES = 60
+"""Number of images, consecutive ones of a video, on which encodings are compared."""
 
-app = App("Quality of service of toolboxes: what is required, and what a network and a machine give.")
+app = App("Quality of service of the toolboxes: requirements, measurement, choice of the image encoding.")
 
 
 @app.command("show")
 def qos_show(
     service: Annotated[
-        str, typer.Argument(help=f"TOML of requirements, or one of: {', '.join(requirements.names())}.")
+        str,
+        typer.Argument(
+            metavar="SERVICE", help=f"TOML file of requirements, or one of: {', '.join(requirements.names())}."
+        ),
     ],
 ) -> None:
-    """Show what a service requires, by where it runs."""
+    """Show the requirements of a service for each environment: robot, edge, cloud."""
     read = requirements.read(service)
     table = Table("metric", *Environment, title=f"{read.title} ({read.source})", title_justify="left")
     for metric in Requirements.model_fields:
-        asked = [getattr(getattr(read, one), metric, None) for one in Environment]
-        if any(asked):
+        values = [getattr(getattr(read, one), metric, None) for one in Environment]
+        if any(values):
             unit = UNITS.get(metric, "")
-            table.add_row(metric.replace("_", " "), *(f"{one} {unit}" if one else "-" for one in asked))
+            table.add_row(metric.replace("_", " "), *(f"{one} {unit}" if one else "-" for one in values))
     console.print(table)
 
 
@@ -51,61 +61,63 @@ def qos_show(
 @options(MeasureParams)
 def qos_measure(
     params: MeasureParams,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="JSON file for all that was measured.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="JSON file for the measurements; input of `orchestrate place`.")
+    ] = None,
 ) -> None:
-    """Run a toolbox and a robot over a network like the environment's, and hold what is measured against its needs."""
-    optional_deps.need("measuring", "psutil", "fastapi", "uvicorn", "prometheus_client")
+    """Measure a toolbox with a robot over an emulated network, and compare the results with its requirements."""
+    optional_deps.require("qos measure", "psutil", "fastapi", "uvicorn", "prometheus_client")
     service = requirements.read(params.requirements or params.toolbox)
     required = service.of(params.environment)
     with progress(f"{params.toolbox} {params.environment}") as report:
         measured = measure(params, service, report)
-    found = rows(required, measured)
-    console.print(qos_table.table(f"{service.title}, {params.environment} ({service.source})", found))
-    console.print(_needs_table([needs(measured, rate) for rate in RATES]))
-    answers = measured.answers
+    comparisons = compare_metrics(required, measured)
+    console.print(qos_table.table(f"{service.title}, {params.environment} ({service.source})", comparisons))
+    console.print(_needs_table([resource_needs(measured, rate) for rate in IMAGE_RATES]))
+    answers = measured.requests
     done = answers.states.get("done", 0)
     _say(f"{done} of {answers.sent} images were answered, half of them within {or_dash(answers.response_p50)} ms")
-    _say(f"images were sent as JPEGs{_told(measured.encoding)}")
+    _say(f"images were sent as JPEGs{_jpeg_text(measured.encoding)}")
     if required.slice:
         _say(f"preferred slice of a 5G network: {required.slice}")
-    for name, metrics in (("service", NETWORK), ("machine", MACHINE)):
-        _say(f"{name}: {'passed' if passed(found, metrics) else 'FAILED'}")
+    for name, metrics in (("service", NETWORK_METRICS), ("machine", MACHINE_METRICS)):
+        _say(f"{name}: {'passed' if passed(comparisons, metrics) else 'FAILED'}")
     if out:
-        told = {
+        document = {
             "toolbox": params.toolbox,
             "environment": params.environment,
-            "passed": passed(found, NETWORK),
-            "machine_passed": passed(found, MACHINE),
-            "rows": [_json(row) for row in found],
+            "passed": passed(comparisons, NETWORK_METRICS),
+            "machine_passed": passed(comparisons, MACHINE_METRICS),
+            "rows": [_json(row) for row in comparisons],
             "answers": asdict(answers),
             "encoding": asdict(measured.encoding),
         }
-        out.write_text(json.dumps(told, indent=1), encoding="utf-8")
+        out.write_text(json.dumps(document, indent=1), encoding="utf-8")
 
 
 @app.command("choose")
 @options(ChoiceParams, images="IMAGES")
 def qos_choose(params: ChoiceParams) -> None:
-    """Choose how images like these are sent at a rate, so that they fit: as JPEGs, or as a stream of H.264."""
-    images = list(islice(sources.images(params.images), TRIED))
+    """Choose the encoding of images so that they fit into a bandwidth: JPEG quality and size, or H.264 bit rate."""
+    images = list(islice(sources.decoded_images(params.images), MAX_TEST_IMAGES))
     jpeg = choose_jpeg(images, params.rate, params.budget)
-    _say(f"JPEGs{_told(jpeg)}")
+    _say(f"JPEGs{_jpeg_text(jpeg)}")
     stream = choose_h264(images, params.rate, params.budget)
     _say(f"H.264: {stream.bitrate * 1e-6:.3g} Mbit/s for the encoder, at most {stream.megabits:.3g} on the wire")
 
 
-def _told(jpeg: Jpeg) -> str:
+def _jpeg_text(jpeg: Jpeg) -> str:
     size = "" if jpeg.scale == 1 else f" of {jpeg.scale:g} times the size"
     return f"{size} of quality {jpeg.quality}: at most {jpeg.megabits:.3g} Mbit/s on the wire"
 
 
-def _json(row: Row) -> dict[str, object]:
+def _json(row: MetricComparison) -> dict[str, object]:
     return asdict(row) | {"required": str(row.required) if row.required else None}
 
 
-def _needs_table(found: list[Needs]) -> Table:
-    table = Table(title="What rates need (of this machine's cores)", title_justify="left")
-    for name in ("images a second", "Mbit/s on the network", "cores"):
+def _needs_table(found: list[ResourceNeeds]) -> Table:
+    table = Table(title="Resources needed by image rate (cores of this machine)", title_justify="left")
+    for name in ("images per second", "Mbit/s on the network", "cores"):
         table.add_column(name, justify="right")
     for one in found:
         table.add_row(f"{one.rate:g}", or_dash(one.bandwidth), f"{one.cores:.2f}")

@@ -1,4 +1,4 @@
-"""What a command runs until it is told to end: nodes of ROS 2, services."""
+"""Runs ROS 2 nodes and services until they finish, or until Ctrl-C or SIGTERM."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any
 from scan2sim.services import transport
 
 
-def spin(made: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: False) -> None:
-    """Run a node until it has finished, or is told to end, by Ctrl-C or SIGTERM."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # what ends services ends them as Ctrl-C does
+def spin(create: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: False) -> None:
+    """Create a ROS 2 node and spin it until it has `finished`, or until Ctrl-C or SIGTERM."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # service managers stop services by SIGTERM
     ros = transport.load()
     ros.init()
     try:
-        node = made()
+        node = create()
         try:
             while not finished(node):
                 ros.spin_once(node, 0.2)
@@ -28,8 +28,8 @@ def spin(made: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: Fa
 
 
 @contextmanager
-def ends(stop: threading.Event) -> Iterator[None]:
-    """Ctrl-C, or the machine's end, lets what is begun come to where it can be left."""
+def stop_on_signal(stop: threading.Event) -> Iterator[None]:
+    """Set `stop` on Ctrl-C or SIGTERM instead of interrupting, so that work in progress ends in a clean state."""
     before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield

@@ -1,4 +1,4 @@
-"""`scan2sim run`: a tile to a world and its report, in processes, without Prefect."""
+"""`scan2sim run`: builds the world of a tile and its report, in local processes, without Prefect."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from scan2sim.flows.commands.app import App, Bus, Config, Force, From, HoldOut, 
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.plan import plan_tile
-from scan2sim.flows.commands.run_with_progress import execute_shown, show_failed, show_findings, show_results
+from scan2sim.flows.commands.run_with_progress import execute_with_progress, show_failed, show_findings, show_results
 from scan2sim.flows.engine.execution import Executor, run_to_world
 from scan2sim.flows.engine.lock import locked
-from scan2sim.flows.engine.planning import Planned, drop_damaged
+from scan2sim.flows.engine.planning import PlannedTask, drop_damaged
 from scan2sim.flows.engine.progress import PublishedRun, published
 from scan2sim.flows.engine.ready_queue import Outcome
 from scan2sim.flows.engine.versions import versions
-from scan2sim.flows.pipelines.graph import NodeId
+from scan2sim.flows.pipelines.graph import TaskId
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.reports.publish import publish, to_read
 from scan2sim.flows.reports.side_products import SideProducts
@@ -41,10 +41,10 @@ def run(
     hold_out: HoldOut = None,
     force: Force = False,
     from_: From = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Steps at a time; 0: as the cores allow.")] = 0,
+    jobs: Annotated[int, typer.Option(min=0, help="Steps that run at the same time; 0: 2, or 3 from 6 cores on.")] = 0,
     bus: Bus = None,
 ) -> None:
-    """Make a world of a tile; what an earlier run has finished is kept."""
+    """Build the world of a tile; steps that an earlier run has finished are not repeated."""
     settings = settings_of(set_, config, hold_out)
     with published(bus, "run", str(tile)) as on_bus:
         run_tile(tile, out, settings, force=force, start=from_, jobs=jobs, bus=on_bus)
@@ -61,17 +61,24 @@ def run_tile(
     run: Executor | None = None,
     bus: PublishedRun | None = None,
 ) -> Path:
-    """Make the world of the tile at `path` in `out`; returns the report's path.
+    """Build the world of the tile at `path` in the folder `out`; returns the report's path.
 
-    `out` gets: `world/`, `report.html`, `report.json`, `config.json` (all settings as resolved),
-    `run.log`, and `steps/` (kept results).
+    `out` gets `world/`, `report.html`, `report.json`, `config.json` (resolved settings), `run.log` and `steps/` (cached
+    results).
 
     Args:
-        run: runs the steps; by default up to `jobs` processes at a time, and `bus` is told.
+        path: a `tile.toml`, or its folder.
+        out: output folder.
+        settings: of all steps.
+        force: repeat all steps.
+        start: name of a step to repeat, with all that depend on it.
+        jobs: processes at a time; 0: by the number of cores.
+        run: runs the steps; default: in local processes.
+        bus: publishes the progress.
 
     Raises:
-        IncompleteError: side products failed; the world is finished.
-        ScanError: see `pipeline.core.errors`; earlier results stay.
+        IncompleteError: the world is finished, but side products failed.
+        ScanError: see `pipeline.core.errors`; results of earlier runs stay.
     """
     began = time.perf_counter()
     tile, side, report = read_tile(path), SideProducts(out), None
@@ -84,10 +91,10 @@ def run_tile(
         missing = sum(p.reason is not None for p in planned)
         with log.errors(out):
 
-            def execute(planned: list[Planned], store: Store) -> Outcome:
-                return execute_shown(planned, store, log, jobs, bus=bus)
+            def execute(planned: list[PlannedTask], store: Store) -> Outcome:
+                return execute_with_progress(planned, store, log, jobs, bus=bus)
 
-            def replan(without: Collection[NodeId]) -> list[Planned]:
+            def replan(without: Collection[TaskId]) -> list[PlannedTask]:
                 return plan_tile(tile, out, settings, force, start, without)[0]
 
             planned, outcome = run_to_world(planned, replan, store, run or execute)
@@ -98,16 +105,14 @@ def run_tile(
                 seconds = time.perf_counter() - began
                 report = write_report(tile, planned, done, store, out, seconds=seconds, failed=side.failed)
             log.write_failed(side)
-        store.sweep({p.node.id.name: p.key for p in planned})
+        store.sweep({p.task.id.name: p.key for p in planned})
     for warning in changed:
         warn(warning)
     show_failed(side, log)
     show_findings(done)
     show_results(out / "world" / f"{tile.name}.sdf", report)
     if missing == 0:
-        console.print(
-            f"[dim]nothing to do: all is as the tile and the settings say ({time.perf_counter() - began:.1f} s)"
-        )
+        console.print(f"[dim]nothing to do: the world is up to date ({time.perf_counter() - began:.1f} s)")
     side.check()
-    assert report is not None, "without a report the check has raised"
+    assert report is not None, "side.check() raises if there is no report"
     return report

@@ -1,4 +1,4 @@
-"""`scan2sim sample`: the synthetic street with its ground truth."""
+"""`scan2sim sample`: generates a synthetic street recording with ground truth."""
 
 from __future__ import annotations
 
@@ -20,15 +20,20 @@ app = App()
 
 @app.command()
 def sample(
-    out: Annotated[Path, typer.Argument(help="The tile's folder.")],
-    small: Annotated[bool, typer.Option("--small", help="The street of 26 m that comes along, at once.")] = False,
-    length: Annotated[float, typer.Option(help="Metres of road.")] = 100.0,
-    points: Annotated[float, typer.Option(help="Points of the cloud.")] = 9e6,
-    photos: Annotated[int, typer.Option(help="Photos in all.")] = 40,
-    seed: Annotated[int, typer.Option(help="Another seed, another street.")] = 0,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the tile to create.")],
+    small: Annotated[
+        bool,
+        typer.Option(
+            "--small", help="Copy the bundled street of 26 m instead of generating one; ignores the other options."
+        ),
+    ] = False,
+    length: Annotated[float, typer.Option(help="Length of the road in metres.")] = 100.0,
+    points: Annotated[float, typer.Option(help="Number of points of the cloud.")] = 9e6,
+    photos: Annotated[int, typer.Option(help="Number of photos.")] = 40,
+    seed: Annotated[int, typer.Option(help="Random seed; each seed gives another street.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Generate a synthetic street with its ground truth."""
+    """Generate a synthetic street recording with ground truth, to try the program."""
     with progress("street") as report, tile_folder(out, overwrite) as folder:
         if small:
             shutil.copytree(SMALL, folder, dirs_exist_ok=True)

@@ -1,4 +1,4 @@
-"""`scan2sim segment`: classes for a tile's points and photos, training, and figures; the recipe's first steps."""
+"""`scan2sim segment`: classifies the points and photos of a tile, trains and evaluates the network."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import typer
 from scan2sim.flows.commands.app import App, Config, Sets, TilePath, settings_of
 from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.log import Log
-from scan2sim.flows.commands.run_with_progress import run_shown, show_warnings
+from scan2sim.flows.commands.run_with_progress import plan_and_run, show_warnings
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import STORE
-from scan2sim.flows.pipelines.graph import NodeId, needed
+from scan2sim.flows.pipelines.graph import TaskId, required_tasks
 from scan2sim.flows.pipelines.settings import Settings
-from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.flows.pipelines.tile import build_graph
 from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.core.errors import DataError, SettingError
-from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import U8, Camera, PointCloud, Tile
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.clouds import las
@@ -33,35 +33,42 @@ from scan2sim.segmentation.metrics import confusion
 from scan2sim.segmentation.photos import Classifier, class_map
 from scan2sim.segmentation.steps.instances import THINGS
 from scan2sim.segmentation.steps.label import LABEL
-from scan2sim.segmentation.steps.segment import OWN, SHAPE
+from scan2sim.segmentation.steps.segment import SOURCE_CLOUD, SOURCE_SHAPE
 from scan2sim.segmentation.training.dataset import pairs, read, read_channels
 
-CLOUDS = (".las", ".laz", ".copc")
+LAS_SUFFIXES = (".las", ".laz", ".copc")
 
-
-app = App("Classes of a tile's points and photos: `segment TILE --out DIR`.", first=True)
+app = App("Classify the points and photos of a tile: `segment TILE --out DIR`.", first=True)
 
 
 @app.command("tile")
 def segment_a_tile(
     tile: TilePath,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for clouds, labels, masks and kept results.")],
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Tell classes anew where the cloud has some.")] = False,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Output folder: classified clouds, label images, masks, cached results.")
+    ],
+    overwrite: Annotated[
+        bool,
+        typer.Option("--overwrite", help="Predict the classes of all points, even if the cloud is classified already."),
+    ] = False,
     set_: Sets = None,
     config: Config = None,
 ) -> None:
-    """Classify a tile's points from its photos; write LAZ, label pictures and masks."""
+    """Classify the points of a tile from its photos; write LAZ files, label images and masks."""
     segment_tile(tile, out, settings_of([*(set_ or []), *(["segment.overwrite=true"] if overwrite else [])], config))
 
 
 @app.command("train")
 def segment_train(
-    folder: Annotated[Path, typer.Argument(help="Of images/ and labels/ (docs/segmentation.md).")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="ONNX file of the weights.")] = Path("street.onnx"),
-    minutes: Annotated[float, typer.Option(help="At most; 0: no limit.")] = 0,
-    steps: Annotated[int, typer.Option(help="Of the optimiser.")] = 3000,
-    seed: Annotated[int, typer.Option(help="Of weights, crops and looks.")] = 0,
-    start: Annotated[Path | None, typer.Option(help="Weights (safetensors) to go on from.")] = None,
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", help="Training data: folder with images/ and labels/ (docs/segmentation.md)."),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="ONNX file to write the weights to.")] = Path("street.onnx"),
+    minutes: Annotated[float, typer.Option(help="Time limit of the training in minutes; 0: no limit.")] = 0,
+    steps: Annotated[int, typer.Option(help="Number of optimiser steps.")] = 3000,
+    seed: Annotated[int, typer.Option(help="Random seed of initial weights, crops and augmentation.")] = 0,
+    start: Annotated[Path | None, typer.Option(help="Weights (.safetensors) to start from; default: random.")] = None,
 ) -> None:
     """Train the project's own network on labelled photos."""
     train_network(folder, out, minutes=minutes, steps=steps, seed=seed, start=start)
@@ -69,37 +76,42 @@ def segment_train(
 
 @app.command("evaluate")
 def segment_evaluate(
-    path: Annotated[Path, typer.Argument(help="A tile whose cloud has classes, or a folder of labelled photos.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for a tile's results.")] = Path("segment-out"),
+    path: Annotated[
+        Path,
+        typer.Argument(metavar="PATH", help="A tile whose cloud is classified, or a folder with images/ and labels/."),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Output folder for the results of a tile.")] = Path(
+        "segment-out"
+    ),
     set_: Sets = None,
     config: Config = None,
 ) -> None:
-    """Print how classes that are told compare with those that are known."""
+    """Compare predicted with known classes: IoU per class, and the confusion matrix of a tile."""
     evaluate(path, out, settings_of([*(set_ or []), "segment.overwrite=true"], config))
 
 
 def segment_tile(path: Path, out: Path, settings: Settings) -> None:
-    """Write `classified/*.laz`, `probabilities/*.png` (LAS codes a pixel) and `masks/*.png` of the tile at `path`.
+    """Write `classified/*.laz`, `labels/*.png` (LAS code of each pixel) and `masks/*.png` of the tile at `path`.
 
-    Results are kept in `out/steps`, so that `scan2sim run --out` the same folder goes on from there.
+    Results are cached in `out/steps`: `scan2sim run` with the same --out reuses them.
 
     Raises:
-        ScanError: see `pipeline.core.errors`; earlier results stay.
+        ScanError: see `pipeline.core.errors`; results of earlier runs stay.
     """
     tile = read_tile(path)
     with locked(out):
         store = Store(out / STORE)
-        nodes = recipe(tile, settings)
-        last = "things" if any(node.step is THINGS for node in nodes) else "segment"
+        tasks = build_graph(tile, settings)
+        last = "things" if any(task.step is THINGS for task in tasks) else "segment"
         log = Log(out / "run.log")
         log.write(f"segment {tile.path}, settings {json.dumps(settings.values)}")
         read = {"ingest", "carve", "views", "label", "segment", "things"}
         with log.errors(out):
-            planned, done = run_shown(needed(nodes, [NodeId(last)]), store, log, read)
-        keys = {p.node.id.name: p.key for p in planned}
+            planned, done = plan_and_run(required_tasks(tasks, [TaskId(last)]), store, log, read)
+        keys = {p.task.id.name: p.key for p in planned}
         files = {
-            (node, name): store.folder(node, keys[node]) / file
-            for node, manifest in done.items()
+            (task, name): store.folder(task, keys[task]) / file
+            for task, manifest in done.items()
             for name, file in manifest.files.items()
         }
         predicted, own = (
@@ -113,10 +125,10 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
             if len(dropped):
                 kept = done["segment"].facts["source"] == "cloud"
                 whole = PointCloud.load(files["ingest", "cloud"]).classification if kept else None
-                columns = _of_all(dropped, whole, *columns)
+                columns = _with_dropped(dropped, whole, *columns)
             _write_clouds(tile, out / "classified", *columns)
         if ("label", "labels") in files:
-            _write_pictures(files["views", "views"], files["label", "labels"], out)
+            _write_label_images(files["views", "views"], files["label", "labels"], out)
     show_warnings(done)
     console.print(json.dumps(done["segment"].facts, indent=1), highlight=False, markup=False)
     if own is not None and done["segment"].facts["source"] != "cloud" and done["segment"].facts["own_classes"] > 0:
@@ -124,40 +136,42 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
     console.print(f"Clouds: {out / 'classified'}", highlight=False, soft_wrap=True, markup=False)
 
 
-def _of_all(dropped: U8, own: U8 | None, predicted: U8, sure: U8, source: U8) -> tuple[U8, U8, U8]:
-    """Classes of all points, how sure they are and where from, with those that `carve` has dropped.
+def _with_dropped(dropped: U8, own: U8 | None, predicted: U8, confidence: U8, source: U8) -> tuple[U8, U8, U8]:
+    """Classes, confidences and sources (N,) of all points, including those that step `carve` has dropped.
 
     Args:
-        dropped: (N,) uint8, 0 where a point is kept, else what it is for `carve`.
-        own: (N,) the cloud's own classes, where they are kept, or None.
-        predicted, sure, source: (K,) of those kept.
+        dropped: (N,) uint8, 0 for points that were kept, else the class that step `carve` gave them.
+        own: (N,) the cloud's own classes if they are kept, or None.
+        predicted, confidence, source: (K,) values of the kept points.
     """
     kept = dropped == 0
     codes = dropped.copy() if own is None else own
     codes[kept] = predicted
-    all_sure = np.full(len(kept), 255, np.uint8)
-    all_sure[kept] = sure
-    sources = np.full(len(kept), SHAPE if own is None else OWN, np.uint8)
+    confidences = np.full(len(kept), 255, np.uint8)
+    confidences[kept] = confidence
+    sources = np.full(len(kept), SOURCE_SHAPE if own is None else SOURCE_CLOUD, np.uint8)
     sources[kept] = source
-    return codes, all_sure, sources
+    return codes, confidences, sources
 
 
 def _write_clouds(tile: Tile, out: Path, code: np.ndarray, confidence: np.ndarray, source: np.ndarray) -> None:
-    """Every cloud of the tile with its points' classes."""
+    """Write every cloud of the tile with the classes of its points."""
     out.mkdir(parents=True, exist_ok=True)
-    counts = [las.read_header(path)[0] if path.suffix.lower() in CLOUDS else 0 for path in tile.clouds]
+    counts = [las.read_header(path)[0] if path.suffix.lower() in LAS_SUFFIXES else 0 for path in tile.clouds]
     if 0 in counts or sum(counts) != len(code):
         raise DataError(
-            tile.path, "has clouds that aren't LAS, or points that aren't finite", "Convert the clouds to LAZ first"
+            tile.path,
+            "has clouds that aren't LAS, or points with non-finite coordinates",
+            "Convert the clouds to LAZ first",
         )
     for path, n, start in zip(tile.clouds, counts, np.cumsum([0, *counts]), strict=False):
-        here = slice(int(start), int(start) + n)
-        write_classified(path, out / f"{path.stem}.laz", code[here], confidence[here], source[here])
+        part = slice(int(start), int(start) + n)
+        write_classified(path, out / f"{path.stem}.laz", code[part], confidence[part], source[part])
 
 
-def _write_pictures(views: Path, probabilities: Path, out: Path) -> None:
-    """Codes of every pixel, and masks: 0 on vehicles, people and the sky, 255 elsewhere."""
-    away = np.isin(np.arange(len(CLASSES)), [CLASSES.index(name) for name in ("vehicle", "person", "sky")])
+def _write_label_images(views: Path, probabilities: Path, out: Path) -> None:
+    """Write label images (LAS code of each pixel) and masks: 0 on vehicles, people and the sky, 255 elsewhere."""
+    masked = np.isin(np.arange(len(CLASSES)), [CLASSES.index(name) for name in ("vehicle", "person", "sky")])
     for folder in (out / "labels", out / "masks"):
         folder.mkdir(exist_ok=True)
     for i, view in enumerate(views_io.load(views)):
@@ -165,59 +179,63 @@ def _write_pictures(views: Path, probabilities: Path, out: Path) -> None:
             best, _ = class_map(np.load(probabilities / f"{i}.npy"), (view.camera.height, view.camera.width))
             name = f"{Path(view.name).stem}.png"
             image.write(out / "labels" / name, code_of_index()[best])
-            image.write(out / "masks" / name, np.where(away[best], 0, 255).astype(np.uint8))
+            image.write(out / "masks" / name, np.where(masked[best], 0, 255).astype(np.uint8))
 
 
 def train_network(folder: Path, weights: Path, *, minutes: float, steps: int, seed: int, start: Path | None) -> None:
     """Train the project's own network on a folder of labelled photos, and write its weights.
 
     Args:
-        weights: an ONNX file; what torch reads lies beside it then.
-        start: weights (safetensors) to go on from.
+        folder: with `images/` and `labels/`.
+        weights: ONNX file to write; the torch weights (.safetensors) are written next to it.
+        minutes: time limit; 0: none.
+        steps: of the optimiser.
+        seed: of the random numbers.
+        start: weights (.safetensors) to start from.
 
     Raises:
-        SettingError: the file's name ends otherwise.
+        SettingError: `weights` doesn't end in .onnx.
         UnavailableError: torch isn't installed.
     """
     if weights.suffix != ".onnx":
-        raise SettingError("--out", f"{weights.name} is no name of an ONNX file", "Name one that ends in .onnx")
-    need("segment train", "torch", "safetensors", "onnx")
+        raise SettingError("--out", f"{weights.name} is not an ONNX file", "Give a name that ends in .onnx")
+    require("segment train", "torch", "safetensors", "onnx")
     from scan2sim.segmentation.backends.street import save
-    from scan2sim.segmentation.training.train import Recipe, train
+    from scan2sim.segmentation.training.train import TrainingSettings, train
 
-    recipe_ = Recipe(steps=steps, minutes=minutes, seed=seed, start=start)
+    training_settings = TrainingSettings(steps=steps, minutes=minutes, seed=seed, start=start)
     with progress("training") as report:
-        trained = train(folder, recipe_, report)
-    save(trained.network, weights, {"recipe": str(recipe_), "iou": trained.iou})
+        trained = train(folder, training_settings, report)
+    save(trained.network, weights, {"recipe": str(training_settings), "iou": trained.iou})
     _print_iou(trained.iou)
     console.print(f"Weights: {weights}", highlight=False, soft_wrap=True, markup=False)
 
 
 def evaluate(path: Path, out: Path, settings: Settings) -> None:
-    """Print figures: of a folder of labelled photos, by pixel; of a tile whose cloud has classes, by point."""
+    """Print the accuracy of the classes: per pixel of a folder of labelled photos, per point of a classified tile."""
     if (path / "labels").is_dir():
-        _print_iou(_pixels(path, settings))
+        _print_iou(_pixel_iou(path, settings))
         return
     segment_tile(path, out, settings)
 
 
-def _pixels(folder: Path, settings: Settings) -> dict[str, float]:
-    """Intersection over union of a network's pixels, by class; photos taken as they are, with channels if there are."""
+def _pixel_iou(folder: Path, settings: Settings) -> dict[str, float]:
+    """Intersection over union by class, over all pixels of a folder's photos and their extra channels, if any."""
     given = settings.params(LABEL)
     network = load(given.network, given.weights, given.device)
-    classifier = Classifier(network, str(given.weights or network.facts.name))
-    resolution = network.facts.pixels_a_radian or 1.0
+    classifier = Classifier(network, str(given.weights or network.info.name))
+    resolution = network.info.pixels_per_radian or 1.0
     known, predicted = [], []
     for pair in pairs(folder):
         rgb, truth = read(*pair)
         h, w = truth.shape
         camera = Camera("pinhole", w, h, resolution, resolution, (w - 1) / 2, (h - 1) / 2)
         best, _ = class_map(classifier.probabilities(rgb, camera, read_channels(pair[0], (h, w))), (h, w))
-        some = truth != IGNORED
-        known.append(truth[some])
-        predicted.append(best[some])
+        labelled = truth != IGNORED
+        known.append(truth[labelled])
+        predicted.append(best[labelled])
     codes = code_of_index()
-    codes[CLASSES.index("sky")] = 255  # a code of its own: 0 says unknown
+    codes[CLASSES.index("sky")] = 255  # not 0, which means unknown
     found = confusion(codes[np.concatenate(known)], codes[np.concatenate(predicted)]).iou
     return {("sky" if name == "255" else name): value for name, value in found.items()}
 

@@ -1,4 +1,4 @@
-"""`scan2sim survey`: all tiles of a survey to worlds that meet, one world and one report, without Prefect."""
+"""`scan2sim survey`: builds all tiles of a survey with matching borders, one world and one report, without Prefect."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from scan2sim.flows.commands.app import App, Bus, Config, HoldOut, Sets, setting
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.log import Log
-from scan2sim.flows.commands.run_with_progress import default_jobs, execute_shown, show_failed, show_results
+from scan2sim.flows.commands.run_with_progress import default_jobs, execute_with_progress, show_failed, show_results
 from scan2sim.flows.engine import workers
 from scan2sim.flows.engine.execution import Executor, limit_cores
 from scan2sim.flows.engine.lock import locked
-from scan2sim.flows.engine.memory import parse
-from scan2sim.flows.engine.planning import STORE, Planned, Reason, drop_damaged, plan
+from scan2sim.flows.engine.memory import parse_memory
+from scan2sim.flows.engine.planning import STORE, PlannedTask, Reason, drop_damaged, plan
 from scan2sim.flows.engine.progress import published
 from scan2sim.flows.engine.ready_queue import Outcome
 from scan2sim.flows.engine.versions import versions
-from scan2sim.flows.pipelines.graph import NodeId
+from scan2sim.flows.pipelines.graph import TaskId
 from scan2sim.flows.pipelines.settings import Settings
-from scan2sim.flows.pipelines.survey import survey_recipe
+from scan2sim.flows.pipelines.survey import build_survey_graph
 from scan2sim.flows.pipelines.tile import check_here
-from scan2sim.flows.reports.finish import TILES, Made, finish, is_finished
+from scan2sim.flows.reports.finish import TILES, TileResult, finish, is_finished
 from scan2sim.flows.reports.publish import to_read
 from scan2sim.flows.reports.side_products import SideProducts
 from scan2sim.pipeline.core import system_libs
 from scan2sim.pipeline.core.cache import Digests, Manifest, Store
 from scan2sim.pipeline.core.errors import ScanError, SettingError, SpaceError, StepError
-from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import Tile
-from scan2sim.pipeline.io.remote import Remote, is_remote, likeness
+from scan2sim.pipeline.io.remote import Remote, is_remote, local_copy
 from scan2sim.pipeline.io.survey import Survey, read_survey
 from scan2sim.pipeline.io.tile import read_tile
 
@@ -47,127 +47,150 @@ app = App()
 def survey(
     context: typer.Context,
     source: Annotated[
-        str, typer.Argument(metavar="SOURCE", help="A survey.toml, tile.toml or drive.toml, or its folder.")
+        str,
+        typer.Argument(
+            metavar="SOURCE", help="A survey.toml, a tile.toml to cut into tiles, a drive.toml, or its folder."
+        ),
     ],
     out: Annotated[
-        str, typer.Option("--out", "-o", help="Folder for worlds, reports and kept results, or its s3:// URL.")
+        str, typer.Option("--out", "-o", help="Output folder, or its s3:// URL: worlds, reports and cached results.")
     ],
-    length: Annotated[float | None, typer.Option(help="Metres of road a tile, where it is cut here.")] = None,
-    buffer: Annotated[float | None, typer.Option(help="Metres of overlap, where it is cut here.")] = None,
+    length: Annotated[
+        float | None, typer.Option(help="Length of road per tile in metres, if SOURCE is to be cut; default: 100.")
+    ] = None,
+    buffer: Annotated[
+        float | None,
+        typer.Option(
+            help="Margin in metres by which tiles overlap their neighbours, if SOURCE is to be cut; default: 5."
+        ),
+    ] = None,
     set_: Sets = None,
     config: Config = None,
     hold_out: HoldOut = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Steps at a time; 0: as the cores allow.")] = 0,
-    memory: Annotated[str | None, typer.Option(help="What steps may need together, as 20GB.")] = None,
+    jobs: Annotated[int, typer.Option(min=0, help="Steps that run at the same time; 0: 2, or 3 from 6 cores on.")] = 0,
+    memory: Annotated[
+        str | None, typer.Option(help="Memory that all running steps may use together, such as 20GB.")
+    ] = None,
     runner: Annotated[
-        Literal["processes", "threads", "dask", "ray"], typer.Option(help="The last three: through Prefect.")
+        Literal["processes", "threads", "dask", "ray"],
+        typer.Option(help="Where steps run: local processes, or as a Prefect flow on threads, Dask or Ray."),
     ] = "processes",
-    address: Annotated[str | None, typer.Option(help="Of a Dask scheduler or Ray cluster.")] = None,
-    cores: Annotated[int | None, typer.Option(min=1, help="That a step may use; default: all.")] = None,
+    address: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler or Ray cluster; default: start one here.")
+    ] = None,
+    cores: Annotated[int | None, typer.Option(min=1, help="CPU cores that each step may use; default: all.")] = None,
     bus: Bus = None,
 ) -> None:
-    """Make the worlds of all tiles of a survey, which meet, and one of them all."""
-    run_source(
-        source, out, settings_of(set_, config, hold_out), length=length, buffer=buffer, jobs=jobs, memory=memory,
-        runner=runner, address=address, cores=cores, prefect=context.obj, bus=bus,
-    )  # fmt: skip
+    """Build the worlds of all tiles of a survey, with matching borders, and one world of them all."""
+    settings = settings_of(set_, config, hold_out)
+    if runner == "processes":
+        run_source(source, out, settings, length=length, buffer=buffer, jobs=jobs, memory=memory, cores=cores, bus=bus)
+    else:
+        require(f"--runner {runner}", "prefect")
+        workers.check(runner)
+        as_flow: Callable[..., object] = context.obj
+        jobs = jobs or default_jobs()
+        as_flow(source, out, length, buffer, settings.values, runner, jobs, memory, cores, address, bus)
 
 
 def run_source(
-    source: str, target: str, settings: Settings, *, length: float | None, buffer: float | None, jobs: int,
-    memory: str | None, runner: str, address: str | None, cores: int | None, prefect: Callable[..., object],
+    source: str,
+    target: str,
+    settings: Settings,
+    *,
+    length: float | None = None,
+    buffer: float | None = None,
+    jobs: int = 0,
+    memory: str | None = None,
+    cores: int | None = None,
     bus: str | None = None,
-) -> None:  # fmt: skip
-    """`scan2sim survey`: in processes of this machine, or through Prefect on a runner that is named.
+) -> Path:
+    """Build a survey in processes of this machine, and its tiles before that where the source is not cut yet.
 
     Args:
         source: a drive, a corridor or a survey (`commands.drive`).
-        target: folder for all that is made; both may be in object storage.
-        length, buffer: metres, of tiles that are cut here; default: as the drive says, or 100 and 5.
-        jobs: steps at a time; 0: as the cores allow.
-        memory: what steps may need together, "20GB".
-        runner: "processes", or Prefect's "threads", "dask", "ray".
-        address: of a Dask scheduler or a Ray cluster.
-        cores: that a step may use.
-        prefect: makes a survey as a flow of Prefect (`flows.cli`).
-        bus: that is told how steps fare (`services.monitoring.export.event_publishers`).
+        target: output folder; source and target may be URLs of object storage.
+        settings: of all steps.
+        length, buffer: tile length and overlap in metres if the source is cut; default: of the drive, or 100 and 5.
+        jobs: steps at a time; 0: by the number of cores.
+        memory: limit of the memory of all running steps, "20GB".
+        cores: CPU cores per step.
+        bus: where progress is published (`services.monitoring.export.event_publishers`).
+
+    Returns:
+        The path of the report.
 
     Raises:
         StepError: tiles failed; all others are finished.
-        ScanError: see `pipeline.core.errors`; earlier results stay.
+        ScanError: see `pipeline.core.errors`; results of earlier runs stay.
     """
-    jobs, gigabytes = jobs or default_jobs(), parse(memory)
-    if runner != "processes":
-        need(f"--runner {runner}", "prefect")
-        workers.check(runner)
-        prefect(source, target, length, buffer, settings.values, runner, jobs, memory, cores, address, bus)
-        return
+    jobs, gigabytes = jobs or default_jobs(), parse_memory(memory)
     limit_cores(cores)
     system_libs.check()
     check_here(settings)
-    log = Log(likeness(target) / "run.log")
+    log = Log(local_copy(target) / "run.log")
 
     with published(bus, "survey", source) as on_bus:
 
-        def run(planned: list[Planned], store: Store) -> Outcome:
-            return execute_shown(planned, store, log, jobs, to_the_end=True, memory=gigabytes, bus=on_bus)
+        def run(planned: list[PlannedTask], store: Store) -> Outcome:
+            return execute_with_progress(planned, store, log, jobs, keep_going=True, memory=gigabytes, bus=on_bus)
 
         path = survey_of(source, target, run, length=length, buffer=buffer, warn=warn)
-        make_survey(path, target, settings, run)
+        return make_survey(path, target, settings, run)
 
 
 def make_survey(place: str | Path, target: str | Path, settings: Settings, run: Executor) -> Path:
-    """Make all worlds of the survey at `place` in the folder `target`; returns the report's path.
+    """Build all worlds of the survey at `place` in the folder `target`; returns the report's path.
 
-    Both may be in object storage (`pipeline.io.remote`); the report's path is that of its likeness here then.
+    Both may be in object storage (`pipeline.io.remote`); the returned path is then that of the local copy.
 
     The folder gets `survey.html`, `survey.json`, `world/` (all tiles in one), `stac/`, `tiles/NAME/` (as `scan2sim run`
-    writes it) and `steps/` (kept results). A tile that fails is reported; its neighbours are made as if it
-    weren't there, and anew once it is.
+    writes it) and `steps/` (cached results). A tile that fails is reported; its neighbours are built as if it did not
+    exist, and rebuilt once it succeeds.
 
     Raises:
         StepError: tiles failed; all others are finished.
-        IncompleteError: side products failed; the world is finished.
-        ScanError: see `pipeline.core.errors`; earlier results stay.
+        IncompleteError: the world is finished, but side products failed.
+        ScanError: see `pipeline.core.errors`; results of earlier runs stay.
     """
     began = time.perf_counter()
-    sources, results = _remote(place), _remote(target)
-    survey = read_survey(sources.pull_all() if sources else Path(place))
-    out = likeness(target)
+    remote_source, remote_target = _remote(place), _remote(target)
+    survey = read_survey(remote_source.pull_all() if remote_source else Path(place))
+    out = local_copy(target)
     log, side = Log(out / "run.log"), SideProducts(out)
     with locked(out), log.errors(out):
         log.write(f"survey {survey.path}, settings {json.dumps(settings.values)}, versions {json.dumps(versions())}")
         store = _store(place, target)
         digests = Digests(store.root / "digests.json")
-        made = _make(survey, settings, store, run, digests, side)
-        report = finish(survey, made, store, out, settings, digests, side, warn)
+        tile_results = _run_tiles(survey, settings, store, run, digests, side)
+        report = finish(survey, tile_results, store, out, settings, digests, side, warn)
         digests.save()
         log.write_failed(side)
-        failed = [one for one in made if one.error is not None]
-        for one in failed:
-            log.write(f"{one.name}: failed: {one.error}")
-        if results:
+        failed = [result for result in tile_results if result.error is not None]
+        for result in failed:
+            log.write(f"{result.name}: failed: {result.error}")
+        if remote_target:
             files = (path.relative_to(out) for path in sorted(out.rglob("*")) if path.is_file())
-            results.push_all(file.as_posix() for file in files if file.parts[0] not in (STORE, ".lock"))
+            remote_target.push_all(file.as_posix() for file in files if file.parts[0] not in (STORE, ".lock"))
     show_failed(side, log)
-    kept = all(one.kept for one in made)
+    up_to_date = all(result.up_to_date for result in tile_results)
     show_results(out / "world" / f"{survey.name}.sdf", report)
-    if kept and not failed and not side.failed:
-        console.print(f"[dim]nothing to do: all is as the survey says ({time.perf_counter() - began:.1f} s)")
+    if up_to_date and not failed and not side.failed:
+        console.print(f"[dim]nothing to do: all worlds are up to date ({time.perf_counter() - began:.1f} s)")
     if failed:
-        first = failed[0].error
+        names, first_error = ", ".join(result.name for result in failed), failed[0].error
         raise StepError(
             report or out,
-            f"{len(failed)} of {len(made)} tiles failed: {', '.join(one.name for one in failed)} ({first})",
-            "Mend what the report names and run again: what is finished is kept",
+            f"{len(failed)} of {len(tile_results)} tiles failed: {names} ({first_error})",
+            "Fix what the report names and run again: finished steps are not repeated",
         )
     side.check()
-    assert report is not None, "without a report the check has raised"
+    assert report is not None, "side.check() raises if there is no report"
     return report
 
 
 def read_tiles(survey: Survey) -> tuple[dict[str, Tile], dict[str, ScanError]]:
-    """The survey's tiles by name, and why others can't be read."""
+    """The survey's tiles by name, and the errors of those that can't be read."""
     tiles: dict[str, Tile] = {}
     failed: dict[str, ScanError] = {}
     for name, path in survey.tiles.items():
@@ -183,75 +206,75 @@ def plan_survey(
     store: Store,
     settings: Settings,
     digest: Callable[[Path], str],
-    without: Collection[NodeId] = (),
-) -> list[Planned]:
-    """What would run of all tiles, without side products that failed, and why."""
-    return plan(survey_recipe(list(tiles.values()), settings, without), store, digest=digest)
+    without: Collection[TaskId] = (),
+) -> list[PlannedTask]:
+    """The plan of all tiles, `without` side products that failed."""
+    return plan(build_survey_graph(list(tiles.values()), settings, without), store, digest=digest)
 
 
-def _make(
+def _run_tiles(
     survey: Survey, settings: Settings, store: Store, run: Executor, digests: Digests, side: SideProducts
-) -> list[Made]:
-    """Run all tiles; again without tiles and side products that fail, until none does."""
+) -> list[TileResult]:
+    """Run all tiles; repeat without the tiles and side products that failed, until none fails."""
     out = side.out
     tiles, failed = read_tiles(survey)
     unread = set(failed)
-    side_failed: dict[NodeId, ScanError] = {}
-    ran: dict[tuple[NodeId, str], Reason] = {}  # why, of what an earlier round of this run has made
-    before: dict[NodeId, set[str]] = {}  # what there was, of all that is run
+    side_failed: dict[TaskId, ScanError] = {}
+    ran: dict[tuple[TaskId, str], Reason] = {}  # reasons of tasks that an earlier round of this run executed
+    before: dict[TaskId, set[str]] = {}  # contents of the results that existed before each task ran
     first = plan_survey(tiles, store, settings, digests)
     for name in tiles:
-        own = [item for item in first if item.node.tile == name]
-        if not is_finished(store.within(name), own, out / TILES / name):
-            drop_damaged(own, store, to_read(store.within(name), own, out / TILES / name))
+        own_tasks = [item for item in first if item.task.tile == name]
+        if not is_finished(store.within(name), own_tasks, out / TILES / name):
+            drop_damaged(own_tasks, store, to_read(store.within(name), own_tasks, out / TILES / name))
     while True:
         planned = plan_survey(tiles, store, settings, digests, side_failed)
-        planned = [replace(item, reason=item.reason or ran.get((item.node.id, item.key))) for item in planned]
-        ran |= {(item.node.id, item.key): item.reason for item in planned if item.reason is not None}
-        for node in {item.node.id for item in planned if item.reason is not None} - before.keys():
-            before[node] = store.contents(node.full_name)
+        planned = [replace(item, reason=item.reason or ran.get((item.task.id, item.key))) for item in planned]
+        ran |= {(item.task.id, item.key): item.reason for item in planned if item.reason is not None}
+        for task in {item.task.id for item in planned if item.reason is not None} - before.keys():
+            before[task] = store.contents(task.full_name)
         outcome = run(planned, store)
         for error in outcome.failed.values():
-            if isinstance(error, (SpaceError, SettingError)):  # no tile's fault
+            if isinstance(error, (SpaceError, SettingError)):  # not the fault of a single tile
                 raise error
         side_failed |= outcome.side_failed
         if not (outcome.failed or outcome.side_failed):
             break
-        for node, error in outcome.failed.items():
-            failed.setdefault(node.tile, error)
+        for task, error in outcome.failed.items():
+            failed.setdefault(task.tile, error)
         tiles = {name: tile for name, tile in tiles.items() if name not in failed}
-    side.add({node: error for node, error in side_failed.items() if node.tile in tiles})
+    side.add({task: error for task, error in side_failed.items() if task.tile in tiles})
     return [
-        Made(name, None if name in unread else read_tile(path), error=failed[name])
+        TileResult(name, None if name in unread else read_tile(path), error=failed[name])
         if name in failed
-        else Made(name, tiles[name], *_of_tile(name, planned, outcome, before))
+        else TileResult(name, tiles[name], *_tile_result_parts(name, planned, outcome, before))
         for name, path in survey.tiles.items()
     ]
 
 
-def _of_tile(
-    name: str, planned: Sequence[Planned], outcome: Outcome, before: Mapping[NodeId, set[str]]
-) -> tuple[tuple[Planned, ...], dict[str, Manifest], bool]:
-    """A tile's own nodes, and results by their names within it; whether any isn't as `before`."""
-    own = tuple(item for item in planned if item.node.tile == name)
-    ran = before.keys() & {item.node.id for item in own}
-    return own, outcome.of_tile(name), any(outcome.done[node].content not in before[node] for node in ran)
+def _tile_result_parts(
+    name: str, planned: Sequence[PlannedTask], outcome: Outcome, before: Mapping[TaskId, set[str]]
+) -> tuple[tuple[PlannedTask, ...], dict[str, Manifest], bool]:
+    """A tile's tasks, their results by name within the tile, and whether any result differs from `before`."""
+    own_tasks = tuple(item for item in planned if item.task.tile == name)
+    ran = before.keys() & {item.task.id for item in own_tasks}
+    return own_tasks, outcome.of_tile(name), any(outcome.done[task].content not in before[task] for task in ran)
 
 
 def changes(place: str | Path, target: str | Path, settings: Settings) -> dict[str, str]:
-    """Why each tile of a survey would run, by name; empty where all is as it was.
+    """Reasons why tiles of a survey would be rebuilt, by tile name; empty if all are up to date.
 
     Raises:
         ScanError: see `pipeline.core.errors`.
     """
-    sources, store = _remote(place), _store(place, target)
+    remote_source, store = _remote(place), _store(place, target)
     digests = Digests(store.root / "digests.json")
-    tiles, failed = read_tiles(read_survey(sources.pull_all() if sources else Path(place)))
-    found = {name: str(error) for name, error in failed.items()}
+    tiles, failed = read_tiles(read_survey(remote_source.pull_all() if remote_source else Path(place)))
+    reasons = {name: str(error) for name, error in failed.items()}
     for item in plan_survey(tiles, store, settings, digests):
         if item.reason is not None:
-            found.setdefault(item.node.tile, f"{item.node.step.name}: {item.reason.value}")
-    return found
+            reasons.setdefault(item.task.tile, f"{item.task.step.name}: {item.reason.value}")
+    return reasons
 
 
 def _remote(place: str | Path) -> Remote | None:
@@ -260,4 +283,4 @@ def _remote(place: str | Path) -> Remote | None:
 
 def _store(place: str | Path, target: str | Path) -> Store:
     results = _remote(target)
-    return Store(likeness(target) / STORE, results and results.below(STORE), _remote(place))
+    return Store(local_copy(target) / STORE, results and results.below(STORE), _remote(place))

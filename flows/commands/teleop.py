@@ -1,4 +1,4 @@
-"""`scan2sim teleop`: vehicles driven from afar (services/teleoperation)."""
+"""`scan2sim teleop`: teleoperation of vehicles (services/teleoperation)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.table import Table
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import assigned, options
-from scan2sim.flows.commands.ros_spin import ends
+from scan2sim.flows.commands.ros_spin import stop_on_signal
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.pipeline.core.errors import SettingError, StepError
 from scan2sim.services.teleoperation.settings import (
@@ -26,63 +26,88 @@ from scan2sim.services.teleoperation.settings import (
     VehicleParams,
 )
 from scan2sim.services.teleoperation.vehicle import adapters
-from scan2sim.services.teleoperation.vehicle.adapter import TranslateParams, Translating
+from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
 
-app = App("Vehicles driven from afar, by several links at once.")
-NEEDED = ("OpenSSL", "pylibsrtp", "websockets")
-"""Packages that each of these commands needs."""
-WINDOW = "Show the driver's page in a window of its own, without a browser's bars."
+app = App("Drive vehicles remotely, over several network links at once.")
+PACKAGES = ("OpenSSL", "pylibsrtp", "websockets")
+"""Packages that all of these commands need, except `translate`."""
+WINDOW_HELP = "Show the driver page in a window of its own, without the controls of a browser."
 
 
 @app.command("certificates")
 def teleop_certificates(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the authority and of all parties.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DIR", help="Folder for the certificates: of the certificate authority (CA), and one per party."
+        ),
+    ],
     gateway: Annotated[
         list[str] | None,
-        typer.Option(metavar="HOST", help="Name or address that the gateway is reached by; may be given again."),
+        typer.Option(
+            metavar="HOST", help="Create the gateway's certificate, for this host name or address; repeatable."
+        ),
     ] = None,
-    vehicle: Annotated[list[str] | None, typer.Option(metavar="NAME", help="A vehicle; may be given again.")] = None,
-    station: Annotated[list[str] | None, typer.Option(metavar="NAME", help="A station; may be given again.")] = None,
-    days: Annotated[float, typer.Option(help="That new certificates are valid.")] = 365,
-    renew: Annotated[bool, typer.Option("--renew", help="Make those named anew, though they still hold.")] = False,
+    vehicle: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Create a certificate for a vehicle of this name; repeatable."),
+    ] = None,
+    station: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Create a certificate for a driver station of this name; repeatable."),
+    ] = None,
+    days: Annotated[float, typer.Option(help="Days for which new certificates are valid.")] = 365,
+    renew: Annotated[
+        bool, typer.Option("--renew", help="Renew the named certificates even if they are still valid.")
+    ] = False,
 ) -> None:
-    """Make certificates of a gateway, vehicles and stations, and the authority that signs them, or renew them."""
-    _need()
+    """Create or renew the certificates of a gateway, vehicles and stations, and of the CA that signs them."""
+    _require()
     from scan2sim.services.teleoperation.gateway.pki import certify
 
     if not (gateway or vehicle or station):
-        raise SettingError("teleop certificates", "nobody is named", "Give --gateway, --vehicle or --station")
+        raise SettingError("teleop certificates", "no party is named", "Give --gateway, --vehicle or --station")
     table = Table("party", "folder", "", "valid until (UTC)")
     for one in certify(folder, gateway or [], vehicle or [], station or [], days, renew):
-        state = "made" if one.made else "kept"
+        state = "created" if one.created else "unchanged"
         table.add_row(escape(one.party), escape(str(one.folder)), state, f"{one.expires:%Y-%m-%d %H:%M}")
     console.print(table)
 
 
 @app.command("translate")
-@options(TranslateParams)
+@options(AdapterParams)
 def teleop_translate(
-    params: TranslateParams,
-    name: Annotated[str, typer.Argument(metavar="TRANSLATOR", help=f"The vehicle's: {', '.join(adapters.names())}.")],
+    params: AdapterParams,
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="ADAPTER", help=f"Adapter for the interface of the vehicle: {', '.join(adapters.names())}."
+        ),
+    ],
     set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="PARAM=VALUE", help="One of its settings; may be given again.")
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="PARAM=VALUE",
+            help="Setting of the adapter, such as channel=can0; repeatable (docs/teleoperation.md).",
+        ),
     ] = None,
 ) -> None:
-    """Run a vehicle's translator: a car unit's orders in, the vehicle's own commands out."""
-    found = adapters.find(name)
-    settings = found.Params.of(name, assigned(set_ or (), "channel=can0"), remedy="docs/teleoperation.md lists them")
-    ended = threading.Event()
-    with ends(ended):
-        translating = Translating(found.connect(settings), params)
-        _say(f"{name}: listens on {translating.address[0]}:{translating.address[1]}; Ctrl-C ends it")
-        translating.run(ended, lambda news: _say(f"the vehicle {news}"))
+    """Run a vehicle adapter: converts the commands of `teleop vehicle` to those of the vehicle (CAN, ROS 2, ...)."""
+    adapter = adapters.find(name)
+    settings = adapter.Params.of(name, assigned(set_ or (), "channel=can0"), remedy="docs/teleoperation.md lists them")
+    stop = threading.Event()
+    with stop_on_signal(stop):
+        server = AdapterServer(adapter.connect(settings), params)
+        _say(f"{name}: listens on {server.address[0]}:{server.address[1]}; Ctrl-C stops it")
+        server.run(stop, lambda news: _say(f"the vehicle {news}"))
 
 
 @app.command("gateway")
 @options(GatewayParams, certificates="CERTIFICATES")
 def teleop_gateway(params: GatewayParams) -> None:
-    """Be the gateway that vehicles and stations meet at, and serve the fleet's page."""
-    _need("fastapi", "uvicorn")
+    """Run the gateway that connects vehicles and stations, and serve the fleet page."""
+    _require("fastapi", "uvicorn")
     from scan2sim.services.teleoperation.gateway.web import serve
 
     serve(params, _say)
@@ -92,10 +117,10 @@ def teleop_gateway(params: GatewayParams) -> None:
 @options(StationParams, certificates="CERTIFICATES", gateway="GATEWAY")
 def teleop_station(
     params: StationParams,
-    window: Annotated[bool, typer.Option("--window", help=WINDOW)] = False,
+    window: Annotated[bool, typer.Option("--window", help=WINDOW_HELP)] = False,
 ) -> None:
-    """Be a station: show what its vehicle's cameras see, and send what its driver asks for."""
-    _need("fastapi", "uvicorn")
+    """Run a driver station: serve the driver page with the vehicle's video, and send the driver's commands."""
+    _require("fastapi", "uvicorn")
     from scan2sim.services.teleoperation.station.web import serve
 
     serve(params, _say, window)
@@ -104,73 +129,76 @@ def teleop_station(
 @app.command("vehicle")
 @options(VehicleParams, certificates="CERTIFICATES", gateway="GATEWAY")
 def teleop_vehicle(params: VehicleParams) -> None:
-    """Be a vehicle's car unit: send what its cameras see, and have its translator do what the driver asks for."""
-    _need("av")
+    """Run the onboard unit of a vehicle: send its video, and pass the driver's commands to the vehicle adapter."""
+    _require("av")
     from scan2sim.services.teleoperation.vehicle.app import serve
 
-    ended = threading.Event()
-    with ends(ended):
-        serve(params, ended, _say)
+    stop = threading.Event()
+    with stop_on_signal(stop):
+        serve(params, stop, _say)
 
 
 @app.command("demo")
 @options(DemoParams, world="WORLD")
 def teleop_demo(
     params: DemoParams,
-    browse: Annotated[bool, typer.Option("--browse/--no-browse", help="Open the driver's page.")] = True,
-    window: Annotated[bool, typer.Option("--window", help=WINDOW)] = False,
+    browse: Annotated[bool, typer.Option("--browse/--no-browse", help="Open the driver page in the browser.")] = True,
+    window: Annotated[bool, typer.Option("--window", help=WINDOW_HELP)] = False,
 ) -> None:
     """Drive a simulated car through a finished world: gateway, vehicle and station on this machine."""
-    _need("av", "fastapi", "uvicorn")
+    _require("av", "fastapi", "uvicorn")
     from scan2sim.services.teleoperation.sim.demo import demo
     from scan2sim.services.teleoperation.station import app_window
 
     if window:
         app_window.browser()
-    ended = threading.Event()
-    with ends(ended), demo(params, _say) as made, ExitStack() as stack:
+    stop = threading.Event()
+    with stop_on_signal(stop), demo(params, _say) as running, ExitStack() as stack:
         if window:
-            stack.enter_context(app_window.window(made.page))
+            stack.enter_context(app_window.window(running.page))
         elif browse:
-            webbrowser.open(made.page)
-        while not ended.wait(1.0):
-            if (why := made.ended()) is not None:
-                raise StepError("teleop demo", why, "Start it again; `--help` says what can be changed")
+            webbrowser.open(running.page)
+        while not stop.wait(1.0):
+            if (why := running.ended()) is not None:
+                raise StepError("teleop demo", why, "Start it again; `--help` lists what can be changed")
 
 
 @app.command("measure")
 @options(MeasureParams)
 def teleop_measure(params: MeasureParams) -> None:
-    """Drive by a script over a network like the environment's, and hold what is measured against D3.2's table 6."""
-    _need("av", "psutil")
+    """Measure latency, loss and driving of a scripted drive over an emulated network, against 5G-ERA D3.2, table 6."""
+    _require("av", "psutil")
     from scan2sim.flows.commands import qos_table
     from scan2sim.services.qos import requirements
-    from scan2sim.services.qos.compare import passed, rows
-    from scan2sim.services.qos.requirements import MACHINE, NETWORK
+    from scan2sim.services.qos.compare import compare_metrics, passed
+    from scan2sim.services.qos.requirements import MACHINE_METRICS, NETWORK_METRICS
     from scan2sim.services.teleoperation.qos.measure import measure, percentile
 
     service = requirements.read("teleoperation")
     required = service.of(params.environment)
     with progress(f"teleoperation {params.environment}") as report:
         measured = measure(params, required, report)
-    found = rows(required, measured)
-    console.print(qos_table.table(f"{service.title}, {params.environment} ({service.source})", found))
+    comparisons = compare_metrics(required, measured)
+    console.print(qos_table.table(f"{service.title}, {params.environment} ({service.source})", comparisons))
     times = measured.glass_to_glass
     _say(
-        f"{len(times)} pictures were shown, half of them within {percentile(times, 50):.0f} ms of their taking, "
-        f"95 % within {percentile(times, 95):.0f} ms; {measured.lost_frames:.2%} were lost"
+        f"{len(times)} frames were shown; glass-to-glass latency: median {percentile(times, 50):.0f} ms, "
+        f"95th percentile {percentile(times, 95):.0f} ms; {measured.lost_frames:.2%} of the frames were lost"
     )
-    _say(f"the longest time without a command was {measured.command_gap:.0f} ms")
-    if off := measured.aside:
-        mean, most = sum(off) / len(off), percentile(off, 95)
+    _say(f"longest gap between commands: {measured.command_gap:.0f} ms")
+    if offsets := measured.cross_track_error:
+        mean, p95 = sum(offsets) / len(offsets), percentile(offsets, 95)
         runs = measured.vehicle["runs"]
-        _say(f"driven {runs} times along the street, {mean:.2f} m off the way on average, 95 % within {most:.2f} m")
-    for name, metrics in (("service", NETWORK), ("machine", MACHINE)):
-        _say(f"{name}: {'passed' if passed(found, metrics) else 'FAILED'}")
+        _say(
+            f"driven {runs} times along the street; deviation from the path: mean {mean:.2f} m, "
+            f"95th percentile {p95:.2f} m"
+        )
+    for name, metrics in (("service", NETWORK_METRICS), ("machine", MACHINE_METRICS)):
+        _say(f"{name}: {'passed' if passed(comparisons, metrics) else 'FAILED'}")
 
 
-def _need(*packages: str) -> None:
-    optional_deps.need("teleop", *NEEDED, *packages, extra="teleop")
+def _require(*packages: str) -> None:
+    optional_deps.require("teleop", *PACKAGES, *packages, extra="teleop")
 
 
 def _say(text: str) -> None:

@@ -1,4 +1,4 @@
-"""`scan2sim tile`: a corridor cut into the overlapping tiles of a survey."""
+"""`scan2sim tile`: cuts a corridor (a long recording) into the overlapping tiles of a survey."""
 
 from __future__ import annotations
 
@@ -19,12 +19,16 @@ app = App()
 @options(CutParams, copy_photos="--copy")
 def tile(
     params: CutParams,
-    corridor: Annotated[Path, typer.Argument(metavar="CORRIDOR", help="A tile.toml too long for one tile.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The survey's folder.")],
-    name: Annotated[str | None, typer.Option(help="The survey's name; default: the corridor's.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a survey that is there already.")] = False,
+    corridor: Annotated[
+        Path, typer.Argument(metavar="CORRIDOR", help="tile.toml of the long recording, or its folder.")
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder of the survey to create: survey.toml and the tiles.")
+    ],
+    name: Annotated[str | None, typer.Option(help="Name of the survey; default: that of the recording.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing survey.")] = False,
 ) -> None:
-    """Cut a long corridor into tiles that overlap: a survey."""
+    """Cut a long recording (a corridor) into a survey of overlapping tiles."""
     warnings: list[str] = []
     with progress("tile") as report:
         path = cut_survey(corridor, out, params, name=name, overwrite=overwrite, report=report, warn=warnings.append)

@@ -1,4 +1,4 @@
-"""`scan2sim toolbox`: ML toolboxes over files, by HTTP and as nodes of ROS 2 (services/toolboxes)."""
+"""`scan2sim toolbox`: ML toolboxes on files, as HTTP services and as ROS 2 nodes (services/toolboxes)."""
 
 from __future__ import annotations
 
@@ -20,40 +20,52 @@ from scan2sim.services.toolboxes.results import State
 from scan2sim.services.toolboxes.settings import CameraParams, NodeParams, ServeParams, ToolboxParams
 from scan2sim.services.toolboxes.tasks import classify, detect, movement, segment
 
-app = App("ML toolboxes: objects, movement, classes, segments of images, from files or as a service.")
+app = App("Run ML toolboxes on images: detection, movement, classification, segmentation.")
 
-Images = Annotated[Path, typer.Argument(metavar="IMAGES", help="A folder of pictures, a picture or a video.")]
-Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for results, and pictures or a film with them.")]
-Draw = Annotated[bool, typer.Option(help="Draw results into pictures, or a film of a video.")]
-Box = Annotated[str, typer.Argument(metavar="TOOLBOX", help=", ".join(tasks.names()))]
-Sets = Annotated[list[str] | None, typer.Option("--set", metavar="PARAM=VALUE", help="Change one of its settings.")]
+Images = Annotated[Path, typer.Argument(metavar="IMAGES", help="An image, a folder of images, or a video.")]
+Out = Annotated[
+    Path,
+    typer.Option(
+        "--out", "-o", help="Folder for the results (JSON lines), and for images or a video with the results drawn."
+    ),
+]
+Draw = Annotated[bool, typer.Option(help="Draw the results into copies of the images or the video.")]
+Box = Annotated[str, typer.Argument(metavar="TOOLBOX", help=f"Toolbox to run: {', '.join(tasks.names())}.")]
+Sets = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="PARAM=VALUE",
+        help="Setting of the toolbox, such as threshold=0.4; repeatable; `scan2sim toolbox TOOLBOX --help` lists them.",
+    ),
+]
 
 
 @app.command("detect")
 @options(detect.Params)
 def toolbox_detect(params: detect.Params, images: Images, out: Out, draw: Draw = True) -> None:
-    """Find objects, and box them."""
+    """Detect objects: label, score and bounding box of each."""
     _over_files("detect", params, images, out, draw)
 
 
 @app.command("movement")
 @options(movement.Params)
 def toolbox_movement(params: movement.Params, images: Images, out: Out, draw: Draw = True) -> None:
-    """Find objects, follow them, and say which move; the camera must stand."""
+    """Detect and track objects, and report which of them move; for a stationary camera."""
     _over_files("movement", params, images, out, draw)
 
 
 @app.command("classify")
 @options(classify.Params)
 def toolbox_classify(params: classify.Params, images: Images, out: Out, draw: Draw = True) -> None:
-    """Say what images show."""
+    """Classify whole images: the most likely classes of each."""
     _over_files("classify", params, images, out, draw)
 
 
 @app.command("segment")
 @options(segment.Params)
 def toolbox_segment(params: segment.Params, images: Images, out: Out, draw: Draw = True) -> None:
-    """Say what each pixel shows."""
+    """Segment images: a class for each pixel."""
     _over_files("segment", params, images, out, draw)
 
 
@@ -67,8 +79,8 @@ def toolbox_serve(
         list[str] | None, typer.Option("--camera", help=ServeParams.model_fields["camera"].description)
     ] = None,
 ) -> None:
-    """Serve a toolbox by HTTP, as the Open Inference Protocol says."""
-    optional_deps.need("a toolbox by HTTP", "fastapi", "uvicorn", "prometheus_client")
+    """Serve a toolbox by HTTP (Open Inference Protocol)."""
+    optional_deps.require("a toolbox by HTTP", "fastapi", "uvicorn", "prometheus_client")
     from scan2sim.services.http import factory
     from scan2sim.services.toolboxes.api import application
     from scan2sim.services.toolboxes.sources import Cameras
@@ -80,7 +92,7 @@ def toolbox_serve(
         if cameras:
             cameras.start()
         try:
-            factory.run(served, params, lambda address: _say(f"{address}v2/models/{box}/infer; Ctrl-C ends it"))
+            factory.run(served, params, lambda address: _say(f"{address}v2/models/{box}/infer; Ctrl-C stops it"))
         finally:
             if cameras:
                 cameras.stop()
@@ -95,9 +107,10 @@ def toolbox_node(
         list[str], typer.Option("--images", metavar="TOPIC", help=NodeParams.model_fields["images"].description)
     ],
     set_: Sets = None,
+    limit: Limits = None,
 ) -> None:
-    """Run a toolbox as a node of ROS 2: images on topics in, results on a topic out."""
-    optional_deps.need("a toolbox as a node", "psutil")
+    """Run a toolbox as a ROS 2 node: subscribes to image topics, publishes results to a topic."""
+    optional_deps.require("a toolbox as a node", "psutil")
     from scan2sim.services.toolboxes.node import ToolboxNode
 
     with closing(Engine(box, _params(box, set_))) as engine:
@@ -107,28 +120,28 @@ def toolbox_node(
 @app.command("camera")
 @options(CameraParams, **NODE_OPTIONS)
 def toolbox_camera(params: CameraParams, limit: Limits = None) -> None:
-    """Run a camera as a node of ROS 2: images of a folder, a video or a camera on a topic."""
-    optional_deps.need("a camera as a node", "psutil")
+    """Run a camera as a ROS 2 node: publishes the images of a folder, a video or a camera to a topic."""
+    optional_deps.require("a camera as a node", "psutil")
     from scan2sim.services.toolboxes.camera import CameraNode
 
     spin(lambda: CameraNode(params), lambda node: node.finished)
 
 
 def _over_files(box: str, params: ToolboxParams, images: Path, out: Path, draw: bool) -> None:
-    """Run a toolbox over files, which can wait."""
-    patient = params.model_copy(update={"deadline": offline.PATIENT})
+    """Run a toolbox on files, without the deadline of live images."""
+    patient = params.model_copy(update={"deadline": offline.OFFLINE_DEADLINE_S})
     with closing(Engine(box, patient)) as engine, progress(box) as report:
-        ended = offline.work_through(engine, images, out, report, draw=draw)
-    _say(f"{ended.pop(State.DONE, 0)} images: {out / offline.RESULTS}")
+        ended = offline.process_files(engine, images, out, report, draw=draw)
+    _say(f"{ended.pop(State.DONE, 0)} images: {out / offline.RESULTS_FILE}")
     for state, count in ended.items():
-        warn(f"{count} images were {state}; {out / offline.RESULTS} says why")
+        warn(f"{count} images were {state}; {out / offline.RESULTS_FILE} has the reasons")
 
 
 def _params(box: str, assignments: list[str] | None) -> ToolboxParams:
-    """A toolbox's settings.
+    """Settings of a toolbox from option --set.
 
     Raises:
-        SettingError: there is no such toolbox, or setting.
+        SettingError: there is no such toolbox or setting, or a value is out of range.
     """
     given = assigned(assignments or (), "threshold=0.4")
     kind = tasks.find(box).Params

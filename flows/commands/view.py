@@ -1,4 +1,4 @@
-"""`scan2sim view`: a finished world in the browser, or a flight through it as a video."""
+"""`scan2sim view`: shows a finished world in the browser, or renders a flight through it as a video."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.reports import film as films
 from scan2sim.flows.reports.view import INDEX, Pages, ViewParams, server
-from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.importers.tile_folder import tile_folder
 from scan2sim.pipeline.io.worlds.scene import Scene, read_scene
 
@@ -26,17 +26,23 @@ app = App()
 @options(ViewParams)
 def view(
     params: ViewParams,
-    world: Annotated[Path, typer.Argument(metavar="WORLD", help="The folder that run or survey was given as --out.")],
+    world: Annotated[Path, typer.Argument(metavar="WORLD", help="Output folder of `scan2sim run` or `survey`.")],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Keep the page in this folder, to be opened by a double click.")
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="Write the page to this folder, to open it without a server; default: serve it."
+        ),
     ] = None,
-    film: Annotated[Path | None, typer.Option("--film", metavar="FLIGHT.mp4", help="Render a flight instead.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a page that is there already.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Serve the page, and open no browser.")] = False,
+    film: Annotated[
+        Path | None,
+        typer.Option("--film", metavar="FLIGHT.mp4", help="Render a flight through the world to this video."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing page.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Serve the page without opening a browser.")] = False,
 ) -> None:
-    """Open a finished world in the browser, or render a flight through it."""
+    """Open a finished world in the browser, or render a flight through it as a video."""
     if film is not None:
-        need("--film", "av")
+        require("--film", "av")
     scene = read_scene(world)
     if film is not None:
         with progress("flight") as report:
@@ -59,7 +65,7 @@ def _serve(scene: Scene, params: ViewParams, *, browser: bool) -> None:
         pages = Pages(scene, Path(folder), params.megapixels)
         with server(pages, params.port) as served:
             address = f"http://localhost:{served.server_port}/"
-            console.print(f"World:  {address}  (Ctrl-C ends)", highlight=False, soft_wrap=True)
+            console.print(f"World:  {address}  (Ctrl-C stops the server)", highlight=False, soft_wrap=True)
             if browser:
                 webbrowser.open(address)
             with suppress(KeyboardInterrupt):

@@ -1,1 +1,1 @@
-"""Flows of Prefect over the same recipes: the only files that import it."""
+"""Prefect flows that run the same pipelines; the only modules that import Prefect."""

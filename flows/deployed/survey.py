@@ -1,4 +1,4 @@
-"""Prefect: a whole survey as a flow, from what a vehicle brought home to one world (D3.2, section 4.2)."""
+"""Prefect flow `survey`: a whole survey, from the recordings of a drive to one world (5G-ERA D3.2, section 4.2)."""
 
 from __future__ import annotations
 
@@ -19,37 +19,38 @@ from prefect.states import Completed
 
 from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.survey import make_survey
-from scan2sim.flows.deployed.prefect_server_guard import guard
-from scan2sim.flows.deployed.tile import artifact_key, by_tasks, with_warnings
+from scan2sim.flows.deployed.prefect_server_guard import kill_server_on_exit
+from scan2sim.flows.deployed.tile import artifact_key, prefect_executor, with_warnings
 from scan2sim.flows.engine.progress import published
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.reports.survey import PAGE, overview, rows
 from scan2sim.pipeline.core.errors import INTERRUPTED, IncompleteError, StepError, UnavailableError, exit_code
-from scan2sim.pipeline.io.remote import likeness
+from scan2sim.pipeline.io.remote import local_copy
 
 
 def check_server() -> None:
-    """Find out early whether the server that is named answers; without one the run starts its own.
+    """Check that the configured Prefect server answers; if none is configured, prepare for a temporary one.
 
-    Ctrl-C interrupts that one, too, and Prefect would try for minutes to tell it: the process ends at once instead.
+    Ctrl-C also interrupts the temporary server, and Prefect would retry for minutes to notify it: so on Ctrl-C the
+    process exits at once.
 
     Raises:
-        UnavailableError: it doesn't answer.
+        UnavailableError: the configured server doesn't answer.
     """
     url = PREFECT_API_URL.value()
     if url is None:
-        signal.signal(signal.SIGINT, _end)
-        guard()
+        signal.signal(signal.SIGINT, _exit)
+        kill_server_on_exit()
         return
     with get_client(sync_client=True) as client:
         problem = client.api_healthcheck()
     if problem is not None:
-        remedy = "Start it (`prefect server start`), or unset PREFECT_API_URL to run without one"
-        raise UnavailableError(url, f"Prefect's server doesn't answer ({problem})", remedy)
+        remedy = "Start it (`prefect server start`), or unset PREFECT_API_URL to use a temporary server"
+        raise UnavailableError(url, f"the Prefect server doesn't answer ({problem})", remedy)
 
 
-def _end(*_: object) -> None:
-    from prefect.server.api.server import SubprocessASGIServer  # slow, and loaded by now where there is one
+def _exit(*_: object) -> None:
+    from prefect.server.api.server import SubprocessASGIServer  # slow to import; already imported if the server runs
 
     SubprocessASGIServer().stop()
     print(INTERRUPTED, file=sys.stderr, flush=True)
@@ -57,9 +58,9 @@ def _end(*_: object) -> None:
 
 
 def publish(out: Path) -> None:
-    """Show how the tiles fare, their figures and a picture as artifacts of the flow run."""
+    """Publish the states and metrics of the tiles and an image as artifacts of the flow run."""
     create_markdown_artifact(overview(out), key=artifact_key("survey", out.name), description="tiles by state")
-    create_table_artifact(rows(out), key=artifact_key("tiles", out.name), description="figures of all tiles")
+    create_table_artifact(rows(out), key=artifact_key("tiles", out.name), description="metrics of all tiles")
     for picture in sorted(out.glob("tiles/*/picture.jpg"))[:1]:
         pixels = base64.b64encode(picture.read_bytes()).decode()
         create_image_artifact(f"data:image/jpeg;base64,{pixels}", key=artifact_key("picture", out.name))
@@ -71,33 +72,32 @@ def survey(
     settings: dict[str, Any] | None = None, runner: str = "threads", workers: int = 2,
     memory: str | None = None, cores: int | None = None, address: str | None = None, bus: str | None = None,
 ) -> State[str]:  # fmt: skip
-    """Make a survey's worlds, a task per tile and step; what an earlier run has finished is kept.
+    """Build the worlds of a survey, with a Prefect task per tile and step; finished steps are not repeated.
 
-    The result is the report's path.
+    The result is the path of the report.
 
     Args:
         source: a drive, a corridor or a survey (`commands.drive`).
-        out: folder for the worlds, the reports and kept results.
-        length, buffer: metres, of tiles that are cut here; default: as the drive says, or 100 and 5.
+        out: output folder for worlds, reports and cached results.
+        length, buffer: tile length and overlap in metres if the source is cut; default: of the drive, or 100 and 5.
         settings: by step, as in a settings file.
         runner: "threads", "dask" or "ray": where steps run (`engine.workers`).
-        workers: steps at a time.
-        memory: what steps on one machine may need together, "20GB".
-        cores: that a step may use; default: all.
-        address: of a Dask scheduler or a Ray cluster; default: started here.
-        bus: that is told how steps fare, by the flow and by its workers
-        (`services.monitoring.export.event_publishers`).
+        workers: number of steps that run at the same time.
+        memory: limit of the memory of all steps on one machine, "20GB".
+        cores: CPU cores per step; default: all.
+        address: of a Dask scheduler or a Ray cluster; default: start one here.
+        bus: where the flow and its workers publish progress (`services.monitoring.export.event_publishers`).
     """
     try:
-        with published(bus, "survey", source, here=False) as on_bus:
-            run = by_tasks(runner, workers, address, memory, cores, on_bus)
+        with published(bus, "survey", source, local=False) as on_bus:
+            run = prefect_executor(runner, workers, address, memory, cores, on_bus)
             path = survey_of(source, out, run, length=length, buffer=buffer)
             try:
                 report = str(make_survey(path, out, Settings(settings), run))
-            except (StepError, IncompleteError):  # tiles or side products failed, all else is there
-                publish(likeness(out))
+            except (StepError, IncompleteError):  # some tiles or side products failed; the others are finished
+                publish(local_copy(out))
                 raise
     except IncompleteError as error:
-        return with_warnings(error, likeness(out) / PAGE)
-    publish(likeness(out))
+        return with_warnings(error, local_copy(out) / PAGE)
+    publish(local_copy(out))
     return Completed(message=f"The world is finished: {report}", data=report)

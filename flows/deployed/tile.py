@@ -1,4 +1,4 @@
-"""Prefect: one tile as a flow, and what every flow runs its steps with: a task per tile and step."""
+"""Prefect flow `tile`: one tile; and the executor of all flows, which runs each step of a tile as a Prefect task."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from prefect.states import Completed
 from scan2sim.flows.commands.run import run_tile
 from scan2sim.flows.engine.dispatch import dispatch
 from scan2sim.flows.engine.execution import Executor, run_on_worker
-from scan2sim.flows.engine.memory import parse
-from scan2sim.flows.engine.planning import Planned, check
+from scan2sim.flows.engine.memory import parse_memory
+from scan2sim.flows.engine.planning import PlannedTask, check
 from scan2sim.flows.engine.progress import PublishedRun, published
-from scan2sim.flows.engine.ready_queue import Outcome, unwatched
+from scan2sim.flows.engine.ready_queue import Outcome, ignore_event
 from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.engine.workers import workers
 from scan2sim.flows.pipelines.settings import Settings
@@ -28,12 +28,12 @@ from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.errors import IncompleteError
 
 WITH_WARNINGS = "CompletedWithWarnings"
-"""Name of a flow's final state where the world is finished, but side products failed."""
+"""Name of the final state of a flow whose world is finished, but side products failed."""
 
 
-@task(name="step", task_run_name="{node}", cache_policy=NO_CACHE)
-def run_step(node: str, work: Callable[[], Manifest], manifest: str) -> str:
-    """Have a worker run a step, and wait for it; returns its manifest's path."""
+@task(name="step", task_run_name="{name}", cache_policy=NO_CACHE)
+def run_step(name: str, work: Callable[[], Manifest], manifest: str) -> str:
+    """Run a step on a worker and wait for it; returns the path of its manifest."""
     log, done = get_run_logger(), work()
     for line in [done.facts["told"]] if "told" in done.facts else []:
         log.info(line)
@@ -42,45 +42,45 @@ def run_step(node: str, work: Callable[[], Manifest], manifest: str) -> str:
     return manifest
 
 
-def by_tasks(
+def prefect_executor(
     runner: str = "threads", count: int = 2, address: str | None = None,
     memory: str | None = None, cores: int | None = None, bus: PublishedRun | None = None,
 ) -> Executor:  # fmt: skip
-    """Runs plans as tasks of the flow that it is called in.
+    """Executor that runs plans as Prefect tasks of the flow that calls it.
 
     Args:
-        runner, count, address: of the workers (`engine.workers`), which are there while there is work.
-        memory: what steps on one machine may need together, "20GB".
-        cores: that a step may use.
-        bus: that is told how steps fare.
+        runner, count, address: kind, number and address of the workers (`engine.workers`); they run only during a plan.
+        memory: limit of the memory of all steps on one machine, "20GB".
+        cores: CPU cores per step.
+        bus: publishes the progress.
 
     Raises:
-        ScanError: there are no such workers.
+        ScanError: this kind of workers isn't available.
     """
-    gigabytes, version, channel = parse(memory), versions(), bus and bus.channel
-    workers(runner, count, address)  # tells early of what there isn't
+    gigabytes, version, channel = parse_memory(memory), versions(), bus and bus.channel
+    workers(runner, count, address)  # raises early if they aren't available
 
-    def run(planned: list[Planned], store: Store) -> Outcome:
+    def run(planned: list[PlannedTask], store: Store) -> Outcome:
         if address is None:
-            check(planned)  # workers elsewhere may have what is missing here
+            check(planned)  # remote workers may have packages that are missing here
         missing = any(item.reason is not None for item in planned)
         with workers(runner if missing else "threads", count, address) as call:
 
-            def submit(item: Planned) -> Any:
-                manifest = store.folder(item.node.full_name, item.key) / "manifest.json"
+            def submit(item: PlannedTask) -> Any:
+                manifest = store.folder(item.task.full_name, item.key) / "manifest.json"
                 work = partial(call, run_on_worker, item, store, gigabytes, cores, version, channel)
-                return run_step.submit(item.node.full_name, work, str(manifest))
+                return run_step.submit(item.task.full_name, work, str(manifest))
 
-            # those of a cluster find their next step waiting
-            at_once = count if runner == "threads" else 2 * count
-            watch = bus.steps.watching(planned, store) if bus else unwatched
-            return dispatch(planned, store, submit, at_once, _progress(), watch)
+            # on a cluster, each worker has its next step queued
+            max_submitted = count if runner == "threads" else 2 * count
+            on_event = bus.steps.track(planned, store) if bus else ignore_event
+            return dispatch(planned, store, submit, max_submitted, _progress(), on_event)
 
     return run
 
 
 def _progress() -> Callable[[str, float], None]:
-    """Shows a tile's progress as an artifact of the flow run."""
+    """Callback that shows the progress of a tile as an artifact of the flow run."""
     known: dict[str, Any] = {}
 
     def show(name: str, percent: float) -> None:
@@ -93,7 +93,7 @@ def _progress() -> Callable[[str, float], None]:
 
 
 def artifact_key(*parts: str) -> str:
-    """A key as Prefect allows it: lower-case letters, digits, dashes."""
+    """Key of an artifact, in the characters that Prefect allows: lower-case letters, digits, dashes."""
     return "-".join(parts).lower().replace("_", "-")
 
 
@@ -102,10 +102,10 @@ def tile(
     path: str, out: str, settings: dict[str, Any] | None = None, memory: str | None = None, cores: int | None = None,
     bus: str | None = None,
 ) -> State[str]:  # fmt: skip
-    """Make one tile's world, a task a step, in threads of this process; the result is the report's path."""
+    """Build the world of one tile, with a Prefect task per step in threads; the result is the path of the report."""
     try:
-        with published(bus, "tile", path, here=False) as on_bus:
-            run = by_tasks(memory=memory, cores=cores, bus=on_bus)
+        with published(bus, "tile", path, local=False) as on_bus:
+            run = prefect_executor(memory=memory, cores=cores, bus=on_bus)
             report = str(run_tile(Path(path), Path(out), Settings(settings), run=run))
     except IncompleteError as error:
         return with_warnings(error, Path(out) / "report.html")

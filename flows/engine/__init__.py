@@ -1,1 +1,1 @@
-"""Runs graphs of steps: what of them would run, and why; in processes, on workers, within memory."""
+"""Execution of task graphs: planning, caching, processes and workers, memory budget, progress."""

@@ -1,4 +1,4 @@
-"""A plan handed step by step to whatever runs elsewhere (a cluster, say), and how far its tiles are."""
+"""Executes a plan on workers elsewhere, such as a cluster: submits each task once its inputs exist."""
 
 from __future__ import annotations
 
@@ -8,112 +8,116 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any, Protocol
 
-from scan2sim.flows.engine.planning import Planned
-from scan2sim.flows.engine.ready_queue import Event, Frontier, Outcome, Watch, unwatched
-from scan2sim.flows.pipelines.graph import Node, NodeId
+from scan2sim.flows.engine.planning import PlannedTask
+from scan2sim.flows.engine.ready_queue import Event, EventCallback, Outcome, ReadyQueue, ignore_event
+from scan2sim.flows.pipelines.graph import Task, TaskId
 from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.core.errors import DamagedError, ScanError, StepError
 
-PERIOD = 1.0  # seconds between two looks; what shows it may cost a tenth of one
+PROGRESS_INTERVAL_S = 1.0  # seconds between updates of `show`, which may take a tenth of a second
 
 
 class Future(Protocol):
-    """Of a step that runs elsewhere (Prefect's futures are such)."""
+    """Interface of a submitted task, implemented by Prefect's futures."""
 
     def add_done_callback(self, fn: Callable[[Any], None]) -> None:
-        """Have `fn` called once the step has ended."""
+        """Call `fn` once the task has ended."""
 
     def result(self, *, raise_on_failure: bool) -> Any:
-        """What the step returned, or its exception."""
+        """The value that the task returned, or its exception."""
 
 
 def dispatch(
-    planned: Sequence[Planned],
+    planned: Sequence[PlannedTask],
     store: Store,
-    submit: Callable[[Planned], Future],
-    at_once: int,
+    submit: Callable[[PlannedTask], Future],
+    max_submitted: int,
     show: Callable[[str, float], None],
-    watch: Watch = unwatched,
+    on_event: EventCallback = ignore_event,
 ) -> Outcome:
-    """Submit what a plan says is missing as soon as what it reads is there; an `execute.Executor` but for the rest.
+    """Submit the tasks of a plan without cached results, each once its inputs exist.
 
-    Steps are submitted when they can run, not before: those that wait would take the places of those that could.
+    Tasks are not submitted earlier: waiting tasks would occupy workers that others could use.
 
     Args:
-        submit: has a step run, which leaves its result in the store.
-        at_once: steps are submitted and not yet ended at a time.
-        show: told a tile's name and how many percent of its steps are done, once a second at most.
-        watch: told what else happens, but for what workers know of a step that runs.
+        planned: the plan.
+        store: cache that workers write results to.
+        submit: starts a task, which leaves its result in the store.
+        max_submitted: maximum number of submitted tasks that have not ended.
+        show: receives the name of a tile and the percentage of its finished tasks, at most once per second.
+        on_event: receives the events of tasks that the submitting process knows; workers publish start and progress.
     """
-    board = Board(planned, show)
+    tile_progress = TileProgress(planned, show)
 
-    def watching(node: Node, event: Event, fraction: float, message: str) -> None:
-        watch(node, event, fraction, message)
+    def track(task: Task, event: Event, fraction: float, message: str) -> None:
+        on_event(task, event, fraction, message)
         if event != "again":
-            board.end(node.id)
+            tile_progress.end(task.id)
 
-    front = Frontier(planned, store, watching)
-    running: dict[NodeId, tuple[Planned, Future]] = {}
-    ended: SimpleQueue[NodeId] = SimpleQueue()
-    while front or running:
-        for item in front.ready():
-            if len(running) >= at_once:
+    queue = ReadyQueue(planned, store, track)
+    running: dict[TaskId, tuple[PlannedTask, Future]] = {}
+    ended: SimpleQueue[TaskId] = SimpleQueue()
+    while queue or running:
+        for item in queue.ready():
+            if len(running) >= max_submitted:
                 break
-            front.take(item)
-            running[item.node.id] = (item, submit(item))
-            running[item.node.id][1].add_done_callback(partial(_notify, ended, item.node.id))
+            queue.take(item)
+            running[item.task.id] = (item, submit(item))
+            running[item.task.id][1].add_done_callback(partial(_notify, ended, item.task.id))
         if running:
             item, future = running.pop(ended.get())
             try:
                 outcome = future.result(raise_on_failure=False)
-            except Exception as error:  # the runner has given the step up: it took several workers with it
+            except Exception as error:  # the runner gives a task up after it crashed several workers
                 outcome = error
             if isinstance(outcome, DamagedError):
-                front.again(item, outcome)
+                queue.rebuild_damaged(item, outcome)
                 continue
-            name = item.node.full_name
+            name = item.task.full_name
             manifest = None if isinstance(outcome, BaseException) else store.find(name, item.key)
             if manifest is not None:
-                front.end(item, manifest)
+                queue.end(item, manifest)
             else:
                 cause = f"its worker failed ({type(outcome).__name__}: {outcome})"
-                lost = StepError(name, cause, "Run again: what is finished is kept; the worker's log tells more")
-                front.fail(item, outcome if isinstance(outcome, ScanError) else lost)
-    board.flush()
-    return front.outcome
+                lost = StepError(
+                    name, cause, "Run again: finished steps are not repeated; the worker's log has the details"
+                )
+                queue.fail(item, outcome if isinstance(outcome, ScanError) else lost)
+    tile_progress.flush()
+    return queue.outcome
 
 
-def _notify(ended: SimpleQueue[NodeId], node: NodeId, _: object) -> None:
-    ended.put(node)
+def _notify(ended: SimpleQueue[TaskId], task: TaskId, _: object) -> None:
+    ended.put(task)
 
 
-class Board:
-    """Counts each tile's steps as they end.
+class TileProgress:
+    """Counts the finished tasks of each tile.
 
     Args:
-        planned: of one tile or several.
-        show: told a tile's name and how many percent of its steps are done.
+        planned: tasks of one or several tiles.
+        show: receives the name of a tile and the percentage of its finished tasks.
     """
 
-    def __init__(self, planned: Sequence[Planned], show: Callable[[str, float], None]) -> None:
+    def __init__(self, planned: Sequence[PlannedTask], show: Callable[[str, float], None]) -> None:
         self._show = show
-        self._left: dict[str, set[NodeId]] = {}
+        self._left: dict[str, set[TaskId]] = {}
         for item in planned:
-            self._left.setdefault(item.node.tile, set()).add(item.node.id)
-        self._steps = {name: len(nodes) for name, nodes in self._left.items()}
+            self._left.setdefault(item.task.tile, set()).add(item.task.id)
+        self._steps = {name: len(tasks) for name, tasks in self._left.items()}
         self._changed: set[str] = set()
         self._next = 0.0
 
-    def end(self, node: NodeId) -> None:
-        """A step has ended."""
-        self._left[node.tile].discard(node)
-        self._changed.add(node.tile)
+    def end(self, task: TaskId) -> None:
+        """Record that a task has ended."""
+        self._left[task.tile].discard(task)
+        self._changed.add(task.tile)
         if time.monotonic() >= self._next:
             self.flush()
 
     def flush(self) -> None:
-        """Show what has changed."""
+        """Show the tiles whose progress has changed."""
         for name in sorted(self._changed):
             self._show(name or "tile", 100.0 * (1 - len(self._left[name]) / self._steps[name]))
         self._changed.clear()
-        self._next = time.monotonic() + PERIOD
+        self._next = time.monotonic() + PROGRESS_INTERVAL_S

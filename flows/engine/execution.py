@@ -1,4 +1,4 @@
-"""Runs a plan: what is missing, in processes; every result is kept in the store."""
+"""Executes a plan in local processes: runs the tasks without cached results, and caches each result."""
 
 from __future__ import annotations
 
@@ -9,132 +9,136 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 
 from scan2sim.flows.engine import processes
-from scan2sim.flows.engine.memory import need, share
-from scan2sim.flows.engine.planning import Planned, check
+from scan2sim.flows.engine.memory import expected_memory, reserve_memory
+from scan2sim.flows.engine.planning import PlannedTask, check
 from scan2sim.flows.engine.progress import Channel, published_step
-from scan2sim.flows.engine.ready_queue import Frontier, Outcome, Watch
+from scan2sim.flows.engine.ready_queue import EventCallback, Outcome, ReadyQueue
 from scan2sim.flows.engine.versions import check_version
-from scan2sim.flows.pipelines.graph import NodeId
+from scan2sim.flows.pipelines.graph import TaskId
 from scan2sim.pipeline.core import system_libs
 from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.errors import DamagedError, ScanError
 
-Executor = Callable[[list[Planned], Store], Outcome]
-"""Runs what a plan says is missing."""
+Executor = Callable[[list[PlannedTask], Store], Outcome]
+"""Runs the tasks of a plan that have no cached results."""
 
 
 def execute(
-    planned: Sequence[Planned],
+    planned: Sequence[PlannedTask],
     store: Store,
     *,
     jobs: int,
-    watch: Watch,
-    to_the_end: bool = False,
+    on_event: EventCallback,
+    keep_going: bool = False,
     memory: float | None = None,
 ) -> Outcome:
-    """Run what the plan says is missing, up to `jobs` nodes at a time, each in a process of its own.
+    """Run the tasks of a plan that have no cached results, up to `jobs` at a time, each in a process of its own.
 
     Args:
-        to_the_end: run all that doesn't depend on what has failed, rather than stop at the first failure. Side
+        planned: the plan.
+        store: cache of the results.
+        jobs: maximum number of processes.
+        on_event: receives start, progress and end of each task.
+        keep_going: after a failure, run all tasks that don't depend on the failed one; default: stop. Failed side
             products never stop a run.
-        memory: GB that nodes may need together (`engine.memory`); one that needs more runs alone.
+        memory: GB that tasks may use together (`engine.memory`); a task that needs more runs alone.
 
     Raises:
-        ScanError: of a node that can't run here, before any does.
-        KeyboardInterrupt: what was finished is kept.
+        ScanError: a task can't run on this machine; raised before any task starts.
+        KeyboardInterrupt: results of finished tasks are cached.
     """
     check(planned)
-    front = Frontier(planned, store, watch)
-    running: dict[Connection, tuple[Planned, ForkServerProcess, float]] = {}
+    queue = ReadyQueue(planned, store, on_event)
+    running: dict[Connection, tuple[PlannedTask, ForkServerProcess, float]] = {}
     try:
-        while front or running:
-            for item in front.ready():
+        while queue or running:
+            for item in queue.ready():
                 if len(running) >= jobs:
                     break
                 try:
-                    needed = 0.0 if memory is None else need(item, store)
+                    needed = 0.0 if memory is None else expected_memory(item, store)
                     if memory is not None and running and sum(r[2] for r in running.values()) + needed > memory:
                         continue
                     started, process = processes.start(item, store)
                 except DamagedError as error:
-                    front.again(item, error)
+                    queue.rebuild_damaged(item, error)
                     break
-                front.take(item)
-                watch(item.node, "start", 0.0, "")
+                queue.take(item)
+                on_event(item.task, "start", 0.0, "")
                 running[started] = (item, process, needed)
             for connection in wait(list(running), timeout=1.0) if running else ():
                 assert isinstance(connection, Connection)
                 item, process, _ = running[connection]
                 try:
-                    manifest = processes.receive(connection, item, process, watch)
+                    manifest = processes.receive(connection, item, process, on_event)
                 except DamagedError as error:
-                    front.again(item, error)
+                    queue.rebuild_damaged(item, error)
                 except ScanError as error:
-                    front.fail(item, error)
-                    if not (to_the_end or item.node.step.side_product):
-                        return front.outcome
+                    queue.fail(item, error)
+                    if not (keep_going or item.task.step.side_product):
+                        return queue.outcome
                 else:
                     if manifest is None:
                         continue
-                    front.end(item, manifest)
+                    queue.end(item, manifest)
                 process.join()
                 del running[connection]
     finally:
         for _, process, _ in running.values():
             processes.stop(process)
-    return front.outcome
+    return queue.outcome
 
 
 def run_to_world(
-    planned: list[Planned], plan: Callable[[Collection[NodeId]], list[Planned]], store: Store, run: Executor
-) -> tuple[list[Planned], Outcome]:
-    """Run a plan; where side products fail, again without them, until nothing more fails.
+    planned: list[PlannedTask], plan: Callable[[Collection[TaskId]], list[PlannedTask]], store: Store, run: Executor
+) -> tuple[list[PlannedTask], Outcome]:
+    """Run a plan; if side products fail, plan and run again without them, until nothing fails.
 
     Args:
-        planned: what to run first.
-        plan: plans without the side products that failed.
-        store: that keeps results.
+        planned: the first plan.
+        plan: makes a plan without the side products that failed.
+        store: cache of the results.
         run: runs a plan.
 
     Returns:
         The last plan and its outcome, with all side products that failed.
 
     Raises:
-        ScanError: of a node that isn't a side product.
+        ScanError: a task that isn't a side product failed.
     """
-    failed: dict[NodeId, ScanError] = {}
-    made: dict[NodeId, str] = {}
+    failed: dict[TaskId, ScanError] = {}
+    made: dict[TaskId, str] = {}
     while True:
         outcome = run(planned, store)
         outcome.check()
         if not outcome.side_failed:
             return planned, replace(outcome, side_failed=failed)
         failed |= outcome.side_failed
-        made |= {item.node.id: item.key for item in planned if item.node.id in outcome.done}
-        # what was forced to run again has by now
-        planned = [replace(item, reason=None) if made.get(item.node.id) == item.key else item for item in plan(failed)]
+        made |= {item.task.id: item.key for item in planned if item.task.id in outcome.done}
+        # a task that was forced to run has run in this loop already
+        planned = [replace(item, reason=None) if made.get(item.task.id) == item.key else item for item in plan(failed)]
 
 
 def limit_cores(cores: int | None) -> None:
-    """Let steps that this process starts use so many cores each; None: all. Counts from the first step on."""
+    """Limit the CPU cores of each step that this process starts (None: all); call it before the first step starts."""
     if cores is not None:
         for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM", "OPENBLAS_NUM_THREADS"):
             os.environ[name] = str(cores)
 
 
-def run_apart(item: Planned, store: Store, watch: Watch) -> Manifest:
-    """Run one node in a process of its own and wait for it; a result that is there by now is kept.
+def run_in_subprocess(item: PlannedTask, store: Store, on_event: EventCallback) -> Manifest:
+    """Run one task in a process of its own and wait for it; returns at once if its result is cached by now.
 
     Raises:
-        ScanError: as `run_node`.
+        ScanError: as `run_task`.
     """
-    kept = item.kept(store)
-    if kept is not None:
-        return kept
+    cached = item.cached_result(store)
+    if cached is not None:
+        return cached
     connection, process = processes.start(item, store)
     try:
         while True:
-            manifest = processes.receive(connection, item, process, watch)
+            manifest = processes.receive(connection, item, process, on_event)
             if manifest is not None:
                 process.join()
                 return manifest
@@ -143,28 +147,30 @@ def run_apart(item: Planned, store: Store, watch: Watch) -> Manifest:
 
 
 def run_on_worker(
-    item: Planned,
+    item: PlannedTask,
     store: Store,
     memory: float | None,
     cores: int | None,
     wanted: Mapping[str, str],
     channel: Channel | None = None,
 ) -> Manifest:
-    """Run one node as a worker that serves a flow elsewhere.
+    """Run one task on a worker, for a flow in another process or on another machine.
 
     Args:
-        memory: GB that steps on one machine may need together (`engine.memory`).
-        cores: that the step may use.
+        item: the task.
+        store: cache of the results.
+        memory: GB that tasks on one machine may use together (`engine.memory`); None: no limit.
+        cores: CPU cores that the step may use; None: all.
         wanted: the flow's `versions()`.
-        channel: where the bus is told of the flow's run; None: nowhere.
+        channel: where to publish the progress of the flow's run; None: nowhere.
 
     Raises:
-        UnavailableError: this worker has other versions, or lacks libraries.
-        ScanError: as `run_node`.
+        UnavailableError: this worker has other versions, or libraries are missing.
+        ScanError: as `run_task`.
     """
     check_version(item, wanted)
     system_libs.check()
     limit_cores(cores)
-    os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)  # Dask's, for processes that live on: it slows steps down
-    with share(memory, need(item, store)), published_step(channel, item, store) as watch:
-        return run_apart(item, store, watch)
+    os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)  # set by Dask for long-lived processes; it slows steps down
+    with reserve_memory(memory, expected_memory(item, store)), published_step(channel, item, store) as on_event:
+        return run_in_subprocess(item, store, on_event)

@@ -1,4 +1,4 @@
-"""Libraries that nearly every step needs, loaded once in the server that node processes fork from."""
+"""Libraries that nearly every step needs, imported once by the server from which task processes are forked."""
 
 import cv2  # noqa: F401
 import numba  # noqa: F401

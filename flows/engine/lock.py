@@ -1,4 +1,4 @@
-"""One run at a time in a folder."""
+"""Locks a folder, so that only one run at a time uses it."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from scan2sim.pipeline.core.errors import BusyError, from_os_error
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold a folder for one run at a time.
+    """Create a folder and hold its lock while the context is active.
 
     Raises:
-        BusyError: another run holds it.
-        SpaceError: it can't be made.
+        BusyError: another run holds the lock.
+        SpaceError: the folder can't be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -27,5 +27,7 @@ def locked(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise BusyError(folder, "another run is writing here", "Wait for it, or choose another --out") from None
+            raise BusyError(
+                folder, "another run is using this folder", "Wait until it ends, or choose another --out"
+            ) from None
         yield

@@ -1,4 +1,4 @@
-"""How much memory a step needs, and a machine's memory shared out among the steps that run on it."""
+"""Memory budget: expected memory of a task, and reservation among all tasks on a machine."""
 
 from __future__ import annotations
 
@@ -16,75 +16,78 @@ from scan2sim.pipeline.core.errors import SettingError, UnavailableError, from_o
 from scan2sim.pipeline.io.images.image import SUFFIXES
 
 if TYPE_CHECKING:
-    from scan2sim.flows.engine.planning import Planned
+    from scan2sim.flows.engine.planning import PlannedTask
     from scan2sim.pipeline.core.cache import Store
 
-SLOT = 0.25  # GB; memory is shared out in pieces of it
-LARGEST = 20_000  # GB, of what steps may need together
-PAUSE = 0.2  # seconds between looks for free memory
+SLOT_GB = 0.25  # memory is reserved in slots of this size
+MAX_MEMORY_GB = 20_000  # largest budget that is accepted
+POLL_INTERVAL_S = 0.2  # seconds between attempts to reserve memory
 
 
-def need(item: Planned, store: Store) -> float:
-    """GB that a node is expected to need at its peak, from the sizes of what it reads."""
-    least, share = item.node.step.memory
-    # photos are read one after the other, and are no matter of the whole
+def expected_memory(item: PlannedTask, store: Store) -> float:
+    """Expected peak memory of a task in GB, from the sizes of its input files."""
+    base, factor = item.task.step.memory
+    # photos are read one at a time
     sizes = [_size(path) for path in item.inputs(store).values() if path.suffix.lower() not in SUFFIXES]
-    return least + share * sum(sizes) / 1e9
+    return base + factor * sum(sizes) / 1e9
 
 
 def _size(path: Path) -> int:
     if path.is_dir():
-        return 0  # depth maps, pages: one at a time
+        return 0  # depth maps, texture pages: read one at a time
     return path.stat().st_size if path.exists() else 0
 
 
-def parse(text: str | None) -> float | None:
-    """GB of "20GB", "800 MB" or "20"; None of None.
+def parse_memory(text: str | None) -> float | None:
+    """Memory in GB from "20GB", "800 MB" or "20" (GB); None for None.
 
     Raises:
-        SettingError: it is none.
+        SettingError: the text has another form.
     """
     if text is None:
         return None
     match = re.fullmatch(r"\s*(\d{1,9}(?:\.\d{1,9})?)\s*(GB|G|MB|M)?\s*", text, re.IGNORECASE)
     size = float(match[1]) * (1e-3 if (match[2] or "G").upper().startswith("M") else 1) if match else 0.0
-    if not 0 < size <= LARGEST:
-        raise SettingError("--memory", f"`{text[:40]}` is no amount of memory", "Write 20GB, or 800MB")
+    if not 0 < size <= MAX_MEMORY_GB:
+        raise SettingError("--memory", f"`{text[:40]}` is not an amount of memory", "Write for example 20GB, or 800MB")
     return size
 
 
 @contextmanager
-def share(total: float | None, gigabytes: float) -> Iterator[None]:
-    """Hold `gigabytes` of the `total` that steps on this machine may take together; waits until so much is free.
+def reserve_memory(total: float | None, gigabytes: float) -> Iterator[None]:
+    """Reserve `gigabytes` of the `total` memory of this machine; waits until that much is free.
 
-    All processes of a user that declare a total take from the same memory, whichever survey or runner they belong
-    to. What a killed process held is free at once: the kernel lets go of its locks. One that needs more than the
-    total runs alone.
+    All processes of a user share one budget, across surveys and runners. Slots are file locks, which the kernel
+    releases when a process dies. A task that needs more than the total runs alone.
+
+    Args:
+        total: GB that all tasks may use together; None: no limit.
+        gigabytes: GB to reserve.
     """
     if total is None:
         yield
         return
-    slots = max(1, int(total / SLOT))
-    wanted = min(slots, max(1, round(gigabytes / SLOT)))
+    slots = max(1, int(total / SLOT_GB))
+    wanted = min(slots, max(1, round(gigabytes / SLOT_GB)))
     with ExitStack() as held:
         folder = Path(tempfile.gettempdir()) / f"scan2sim-memory-{os.getuid()}"
         try:
             with ExitStack() as stack:
                 place = _own_folder(folder, stack)
-                queue = _opened(place, "queue", stack)  # held while waiting: nobody small overtakes
+                queue = _open_file(place, "queue", stack)  # held while waiting, so that smaller tasks don't overtake
                 fcntl.flock(queue, fcntl.LOCK_EX)
-                while not _taken(place, slots, wanted, held):
-                    time.sleep(PAUSE)
+                while not _lock_slots(place, slots, wanted, held):
+                    time.sleep(POLL_INTERVAL_S)
         except OSError as error:
             raise from_os_error(error, folder) from error
         yield
 
 
 def _own_folder(folder: Path, stack: ExitStack) -> int:
-    """A folder of this user's alone, open; others may have put something else in its predictable place.
+    """Open a folder that only this user can access; its path is predictable, so another user may have created it.
 
     Raises:
-        UnavailableError: they have.
+        UnavailableError: the path belongs to another user, or is not a folder.
     """
     with suppress(FileExistsError):
         folder.mkdir(0o700)
@@ -95,26 +98,28 @@ def _own_folder(folder: Path, stack: ExitStack) -> int:
     except OSError:
         stat = None
     if stat is None or stat.st_uid != os.getuid():
-        remedy = "Have it removed, or set TMPDIR to a folder of your own, the same for all runs"
-        raise UnavailableError(folder, "is a link, a file, or another user's: runs can't share memory out", remedy)
+        remedy = "Delete it, or set TMPDIR to a folder of your own, the same for all runs"
+        raise UnavailableError(
+            folder, "is a link, a file, or belongs to another user: runs can't coordinate their memory", remedy
+        )
     os.fchmod(place, 0o700)
     return place
 
 
-def _opened(place: int, name: str, stack: ExitStack) -> int:
-    """A file in the folder, open until the stack ends."""
+def _open_file(place: int, name: str, stack: ExitStack) -> int:
+    """Open a file of the folder until the stack is closed."""
     file = os.open(name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600, dir_fd=place)
     stack.callback(os.close, file)
     return file
 
 
-def _taken(place: int, slots: int, wanted: int, held: ExitStack) -> bool:
-    """Try to lock `wanted` slots, all or none."""
+def _lock_slots(place: int, slots: int, wanted: int, held: ExitStack) -> bool:
+    """Try to lock `wanted` free slots, all or none; whether that succeeded."""
     with ExitStack() as stack:
         count = 0
         for i in range(slots):
             with ExitStack() as one:
-                file = _opened(place, f"{i:05d}", one)
+                file = _open_file(place, f"{i:05d}", one)
                 try:
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:

@@ -1,4 +1,4 @@
-"""What of a recipe would run, and why: keys of all results, and which of them are there."""
+"""Plans the execution of a graph: computes the cache key of each task, and which tasks must run and why."""
 
 from __future__ import annotations
 
@@ -7,174 +7,181 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
-from scan2sim.flows.pipelines.graph import Node, NodeId, Output
+from scan2sim.flows.pipelines.graph import Output, Task, TaskId
 from scan2sim.pipeline.core import system_libs
 from scan2sim.pipeline.core.cache import Manifest, Store, digest, key_of
 from scan2sim.pipeline.core.errors import DamagedError
 
 STORE = "steps"
-"""Folder of kept results, below that of a run."""
+"""Name of the folder of cached results within an output folder."""
 
 
 class Reason(Enum):
-    """Why a node runs; the value says it to the user."""
+    """Reason why a task runs; the value is shown to the user."""
 
-    NEW = "it was never run"
-    CHANGED = "its input, settings or version changed"
-    DAMAGED = "its result was damaged or deleted"
-    FORCED = "forced"
-    REQUESTED = "asked for by --from"
-    FOLLOWS = "follows what --from asks for"
+    NEW = "never run before"
+    CHANGED = "input, settings or version changed"
+    DAMAGED = "cached result damaged or deleted"
+    FORCED = "requested by --force"
+    REQUESTED = "requested by --from"
+    FOLLOWS = "depends on the step of --from"
 
     @property
-    def again(self) -> bool:
-        """Whether it holds though a result may be there."""
+    def ignores_cache(self) -> bool:
+        """Whether the task runs even if its result is cached."""
         return self in (Reason.FORCED, Reason.REQUESTED, Reason.FOLLOWS)
 
 
 @dataclass(frozen=True)
-class Planned:
-    """A node with its key, and why it will run (None: its result is kept).
+class PlannedTask:
+    """A task with its cache key, and the reason why it will run.
 
     Attributes:
-        keys: input name to the key (of a node's output) or digest (of a file).
+        task: the task.
+        key: cache key of its result.
+        keys: input name to the key (of a task's output) or digest (of a file).
+        reason: why it will run; None: its result is cached.
     """
 
-    node: Node
+    task: Task
     key: str
     keys: dict[str, str]
     reason: Reason | None
 
     @property
-    def again(self) -> bool:
-        """Whether it is to run though its result may be there."""
-        return self.reason is not None and self.reason.again
+    def ignores_cache(self) -> bool:
+        """Whether it runs even if its result is cached."""
+        return self.reason is not None and self.reason.ignores_cache
 
     @property
-    def upstream(self) -> list[NodeId]:
-        """The nodes whose outputs it reads."""
-        return [source.node for source in self.node.inputs.values() if isinstance(source, Output)]
+    def upstream(self) -> list[TaskId]:
+        """The tasks whose outputs it reads."""
+        return [source.task for source in self.task.inputs.values() if isinstance(source, Output)]
 
-    def fed(self, store: Store) -> str:
-        """The key by contents: of what it reads, whatever made it.
+    def content_key(self, store: Store) -> str:
+        """Cache key by the contents of the inputs, independent of how these were computed.
 
         Raises:
-            DamagedError: a result that it reads is gone.
+            DamagedError: a result that it reads is missing.
         """
         contents = dict(self.keys)
-        for name, source in self.node.inputs.items():
+        for name, source in self.task.inputs.items():
             if isinstance(source, Output):
-                manifest = self._found(store.find(source.node.full_name, self._key(name)), source)
+                manifest = self._found(store.find(source.task.full_name, self._key(name)), source)
                 contents[name] = f"{manifest.content}/{source.name}"
-        return key_of(self.node.step, self.node.params, contents)
+        return key_of(self.task.step, self.task.params, contents)
 
-    def kept(self, store: Store) -> Manifest | None:
-        """Its result if there is one: made before, or made of the same contents; None if it is to run."""
-        if self.again:
+    def cached_result(self, store: Store) -> Manifest | None:
+        """Its cached result, by key or by equal input contents; None if it must run."""
+        if self.ignores_cache:
             return None
-        name = self.node.full_name
-        return store.find(name, self.key) or store.adopt(name, self.key, self.fed(store), self.keys)
+        name = self.task.full_name
+        return store.find(name, self.key) or store.reuse_same_content(
+            name, self.key, self.content_key(store), self.keys
+        )
 
     def inputs(self, store: Store) -> dict[str, Path]:
-        """Where the files are that it reads.
+        """Paths of its input files by name.
 
         Raises:
-            DamagedError: a result that it reads is gone.
+            DamagedError: a result that it reads is missing.
         """
         paths = {}
-        for name, source in self.node.inputs.items():
+        for name, source in self.task.inputs.items():
             if isinstance(source, Output):
-                manifest = self._found(store.read(source.node.full_name, self._key(name)), source)
-                paths[name] = store.folder(source.node.full_name, self._key(name)) / manifest.files[source.name]
+                manifest = self._found(store.read(source.task.full_name, self._key(name)), source)
+                paths[name] = store.folder(source.task.full_name, self._key(name)) / manifest.files[source.name]
             else:
                 paths[name] = store.source(source)
         return paths
 
     def check(self, store: Store) -> None:
-        """See that what it reads is as it was made; what this run has made isn't read for it.
+        """Verify the digests of the cached results that it reads, except those computed by this run.
 
         Raises:
-            DamagedError: naming the node whose result is to be made anew.
+            DamagedError: names the task whose result must be rebuilt.
         """
-        for name, source in self.node.inputs.items():
-            if isinstance(source, Output) and not store.intact(source.node.full_name, self._key(name)):
-                raise DamagedError(source.node.full_name)
+        for name, source in self.task.inputs.items():
+            if isinstance(source, Output) and not store.intact(source.task.full_name, self._key(name)):
+                raise DamagedError(source.task.full_name)
 
     def _key(self, name: str) -> str:
         return self.keys[name].split("/")[0]
 
     def _found(self, manifest: Manifest | None, source: Output) -> Manifest:
         if manifest is None:
-            raise DamagedError(source.node.full_name, "its result has gone in the meantime")
+            raise DamagedError(source.task.full_name, "its result was deleted during the run")
         return manifest
 
 
 def plan(
-    nodes: Sequence[Node],
+    tasks: Sequence[Task],
     store: Store,
     *,
     force: bool = False,
     start: str | None = None,
     digest: Callable[[Path], str] = digest,
-) -> list[Planned]:
-    """What would run and why, in order.
+) -> list[PlannedTask]:
+    """Plan the tasks of a graph, in its order.
 
     Args:
-        force: everything runs again.
-        digest: of a source file.
-        start: the name of a step that runs again, with all that depends on it.
+        tasks: each after those that it reads.
+        store: cache of the results.
+        force: run all tasks.
+        start: name of a step to run, with all tasks that depend on it.
+        digest: function that computes the digest of a source file.
     """
-    planned: dict[NodeId, Planned] = {}
+    planned: dict[TaskId, PlannedTask] = {}
     digests: dict[Path, str] = {}
-    for node in nodes:
+    for task in tasks:
         keys = {}
-        for name, source in sorted(node.inputs.items()):
+        for name, source in sorted(task.inputs.items()):
             if isinstance(source, Output):
-                keys[name] = f"{planned[source.node].key}/{source.name}"
+                keys[name] = f"{planned[source.task].key}/{source.name}"
             else:
                 if source not in digests:
                     digests[source] = digest(source)
                 keys[name] = digests[source]
-        key = key_of(node.step, node.params, keys)
-        reason = _reason(node, key, store)
+        key = key_of(task.step, task.params, keys)
+        reason = _reason(task, key, store)
         if force:
             reason = Reason.FORCED
-        elif start is not None and node.step.name == start:
+        elif start is not None and task.step.name == start:
             reason = Reason.REQUESTED
-        elif any(planned[s.node].again for s in node.inputs.values() if isinstance(s, Output)):
+        elif any(planned[s.task].ignores_cache for s in task.inputs.values() if isinstance(s, Output)):
             reason = Reason.FOLLOWS
-        planned[node.id] = Planned(node, key, keys, reason)
+        planned[task.id] = PlannedTask(task, key, keys, reason)
     return list(planned.values())
 
 
-def check(planned: Sequence[Planned]) -> None:
-    """Refuse at once a plan with steps that can't run on this machine, where a library or a package is missing.
+def check(planned: Sequence[PlannedTask]) -> None:
+    """Reject a plan with steps that can't run on this machine because a library or package is missing.
 
     Raises:
-        UnavailableError: the system lacks libraries.
-        ScanError: of the first such step.
+        UnavailableError: system libraries are missing.
+        ScanError: the first step that can't run.
     """
-    missing = [item.node for item in planned if item.reason is not None]
+    missing = [item.task for item in planned if item.reason is not None]
     if missing:
         system_libs.check()
-    for node in missing:
-        if node.step.check:
-            node.step.check(node.params)
+    for task in missing:
+        if task.step.check:
+            task.step.check(task.params)
 
 
-def drop_damaged(planned: Sequence[Planned], store: Store, names: Collection[str]) -> bool:
-    """Remove those results of nodes of these names that are kept, and not as they were made; whether there were any."""
-    kept = [item for item in planned if item.reason is None and item.node.id.name in names]
-    damaged = [item for item in kept if not store.intact(item.node.full_name, item.key)]
+def drop_damaged(planned: Sequence[PlannedTask], store: Store, names: Collection[str]) -> bool:
+    """Delete the damaged cached results of tasks of these names; returns whether there were any."""
+    cached = [item for item in planned if item.reason is None and item.task.id.name in names]
+    damaged = [item for item in cached if not store.intact(item.task.full_name, item.key)]
     for item in damaged:
-        store.discard(item.node.full_name, item.key)
+        store.discard(item.task.full_name, item.key)
     return bool(damaged)
 
 
-def _reason(node: Node, key: str, store: Store) -> Reason | None:
-    if store.find(node.full_name, key) is not None:
+def _reason(task: Task, key: str, store: Store) -> Reason | None:
+    if store.find(task.full_name, key) is not None:
         return None
-    if store.folder(node.full_name, key).exists():
+    if store.folder(task.full_name, key).exists():
         return Reason.DAMAGED
-    others = [p for p in (store.root / node.full_name).glob("*") if not p.name.startswith(".")]
+    others = [p for p in (store.root / task.full_name).glob("*") if not p.name.startswith(".")]
     return Reason.CHANGED if others else Reason.NEW

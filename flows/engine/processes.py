@@ -1,4 +1,4 @@
-"""Processes of nodes: one each, forked from a server that has the heavy libraries loaded; they end with their run."""
+"""Processes of tasks: one per task, forked from a server with the heavy libraries loaded; they end with their run."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
-from scan2sim.flows.engine.planning import Planned
-from scan2sim.flows.engine.ready_queue import Watch
-from scan2sim.flows.engine.run_task import run_node
+from scan2sim.flows.engine.planning import PlannedTask
+from scan2sim.flows.engine.ready_queue import EventCallback
+from scan2sim.flows.engine.run_task import run_task
 from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.errors import ScanError, StepError
 
-TRACKER = "ignore:resource_tracker"
-"""A filter of warnings for Python's own process that clears up after killed ones, and says so."""
-SAID = 10_000
-"""Bytes of what a failed step's libraries printed that go into the log."""
+TRACKER_WARNING_FILTER = "ignore:resource_tracker"
+"""Silences the warnings of Python's resource tracker, which cleans up after killed processes."""
+MAX_OUTPUT_BYTES = 10_000
+"""Size limit of the output of a failed step's libraries in the log; its end is kept."""
 
 
-def _processes() -> Any:
-    """Processes forked from a server that has the heavy libraries loaded."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # several nodes share the cores: don't spin
-    if TRACKER not in sys.warnoptions:
-        sys.warnoptions.append(TRACKER)
+def _fork_server() -> Any:
+    """Multiprocessing context of a fork server with the heavy libraries loaded."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # several tasks share the cores: don't spin
+    if TRACKER_WARNING_FILTER not in sys.warnoptions:
+        sys.warnoptions.append(TRACKER_WARNING_FILTER)
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["scan2sim.flows.engine.forkserver_preload"])
-    # Ctrl-C in a terminal reaches the server as well: until it is ready, it would die of it, and say so at length
+    # Ctrl-C in a terminal also reaches the server, which would die with a traceback until it is ready
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         forkserver.ensure_running()
@@ -43,11 +43,11 @@ def _processes() -> Any:
     return context
 
 
-def start(item: Planned, store: Store) -> tuple[Connection, ForkServerProcess]:
-    """Start a node in a process of its own."""
-    # workers of a cluster are daemons, which may not have children; ours end with them (`_end_with_the_run`)
+def start(item: PlannedTask, store: Store) -> tuple[Connection, ForkServerProcess]:
+    """Start a task in a process of its own; returns the connection that its messages come through."""
+    # workers of a cluster are daemons, which may not have children; task processes end with them (`_exit_with_parent`)
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
-    context = _processes()
+    context = _fork_server()
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_child, args=(theirs, item, store, item.inputs(store)))
     process.start()
@@ -55,52 +55,58 @@ def start(item: Planned, store: Store) -> tuple[Connection, ForkServerProcess]:
     return ours, process
 
 
-def _child(connection: Connection, item: Planned, store: Store, inputs: dict[str, Path]) -> None:
-    """Body of a node's process: sends ("progress", fraction, message), then ("done" | "error", value, log).
+def _child(connection: Connection, item: PlannedTask, store: Store, inputs: dict[str, Path]) -> None:
+    """Main function of a task's process: sends ("progress", fraction, message), then ("done" | "error", value, log).
 
-    What libraries print is kept from the screen, and goes into the log with an error.
+    Output of libraries is captured; it goes into the log if the task fails.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and stops its children
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and stops its children
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     os.setpgrp()
-    said = tempfile.TemporaryFile() if sys.platform != "linux" else os.fdopen(os.memfd_create("said"), "w+b")
+    output = tempfile.TemporaryFile() if sys.platform != "linux" else os.fdopen(os.memfd_create("said"), "w+b")
     for stream in (1, 2):
-        os.dup2(said.fileno(), stream)
-    threading.Thread(target=_end_with_the_run, daemon=True).start()
+        os.dup2(output.fileno(), stream)
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
 
     def report(fraction: float, message: str = "") -> None:
         connection.send(("progress", fraction, message))
 
     try:
-        connection.send(("done", run_node(item, store, inputs, report), ""))
+        connection.send(("done", run_task(item, store, inputs, report), ""))
     except ScanError as error:
-        said.seek(max(0, said.seek(0, os.SEEK_END) - SAID))
-        heard = said.read().decode(errors="replace")
-        connection.send(("error", error, traceback.format_exc() + heard))
+        output.seek(max(0, output.seek(0, os.SEEK_END) - MAX_OUTPUT_BYTES))
+        output_text = output.read().decode(errors="replace")
+        connection.send(("error", error, traceback.format_exc() + output_text))
 
 
-def _end_with_the_run() -> None:
-    """Wait for the death of the process that runs the recipe, and follow it: nobody would take the result."""
+def _exit_with_parent() -> None:
+    """Wait for the death of the parent process, then kill this process group: nobody would receive the result."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     wait([parent.sentinel])
     os.killpg(os.getpgrp(), signal.SIGKILL)
 
 
-def receive(connection: Connection, item: Planned, process: ForkServerProcess, watch: Watch) -> Manifest | None:
-    """Handle one message of a node; its manifest once it is done."""
+def receive(
+    connection: Connection, item: PlannedTask, process: ForkServerProcess, on_event: EventCallback
+) -> Manifest | None:
+    """Handle one message of a task; returns its manifest once it is done, else None.
+
+    Raises:
+        ScanError: the task failed, or its process died.
+    """
     try:
         kind, value, message = connection.recv()
     except EOFError:
         process.join()
-        cause = "was killed, probably for want of memory" if process.exitcode == -signal.SIGKILL else "crashed"
+        cause = "was killed, probably because memory ran out" if process.exitcode == -signal.SIGKILL else "crashed"
         raise StepError(
-            item.node.full_name,
+            item.task.full_name,
             f"{cause} (exit status {process.exitcode})",
             "Run again with --jobs 1, or use a smaller tile",
         ) from None
     if kind == "progress":
-        watch(item.node, "progress", value, message)
+        on_event(item.task, "progress", value, message)
         return None
     if kind == "error":
         value.add_note(message)
@@ -109,7 +115,7 @@ def receive(connection: Connection, item: Planned, process: ForkServerProcess, w
 
 
 def stop(process: ForkServerProcess) -> None:
-    """End a node's process and whatever it has started."""
+    """Terminate a task's process and all processes that it has started."""
     if process.pid is None or not process.is_alive():
         return
     process.terminate()

@@ -1,7 +1,7 @@
-"""Publishes on the event bus how the steps of a run fare; no run waits for that, or fails because of it.
+"""Publishes the progress of a run's steps on the event bus; runs neither wait for it nor fail because of it.
 
-`watch` only notes what it is told. A thread of the publisher's own opens the ways onto the bus, looks once a second for
-what has changed, and sends that; what a broker doesn't take waits on disk (`services.outbox`).
+`on_event` only records events. A background thread opens the outlets to the bus and publishes changes once per second;
+messages that a broker doesn't accept wait on disk (`services.outbox`).
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from scan2sim.flows.engine.planning import Planned
-from scan2sim.flows.engine.ready_queue import Event, Watch, unwatched
-from scan2sim.flows.pipelines.graph import Node, NodeId
+from scan2sim.flows.engine.planning import PlannedTask
+from scan2sim.flows.engine.ready_queue import Event, EventCallback, ignore_event
+from scan2sim.flows.pipelines.graph import Task, TaskId
 from scan2sim.pipeline.core.cache import Store, read_manifest
 from scan2sim.pipeline.core.errors import DamagedError, IncompleteError, ScanError, printable
 from scan2sim.services.monitoring.events.schema import Events, Outlet, RunState, StepState
@@ -28,14 +28,14 @@ from scan2sim.services.monitoring.export import event_publishers
 
 log = logging.getLogger(__name__)
 
-EVERY = 1.0
-"""Seconds between two looks at what has changed."""
-AGAIN = 5.0
-"""Seconds after which the run, and what runs, is told again though nothing has changed: it lives."""
-CLOSING = 2.0
-"""Seconds that a run's end waits for its last events to be sent, at most."""
-LONGEST, LONGEST_NAME = 400, 256
-"""Characters of a message, of a name."""
+PUBLISH_INTERVAL_S = 1.0
+"""Seconds between publications of changed states."""
+HEARTBEAT_INTERVAL_S = 5.0
+"""Seconds after which the state of the run and of running steps is published again, unchanged, as a sign of life."""
+CLOSE_TIMEOUT_S = 2.0
+"""Maximum time that the end of a run waits until its last events are sent."""
+MAX_MESSAGE_CHARS, MAX_NAME_CHARS = 400, 256
+"""Maximum length of published messages and names."""
 
 State = Literal["waiting", "running", "done", "kept", "failed"]
 STATES: dict[Event, State] = {
@@ -50,11 +50,11 @@ STATES: dict[Event, State] = {
 
 @dataclass(frozen=True)
 class Channel:
-    """Where the steps of a run are told of, for workers elsewhere that run them.
+    """Where the progress of a run's steps is published, for workers in other processes or on other machines.
 
     Attributes:
-        where: as `--bus` has it (`services.monitoring.export.event_publishers`).
-        run: the run's id.
+        where: value of option `--bus` (`services.monitoring.export.event_publishers`).
+        run: id of the run.
     """
 
     where: str
@@ -63,17 +63,17 @@ class Channel:
 
 @dataclass
 class _Step:
-    """What is known of a step; times as `time.monotonic`."""
+    """State of a step; times are those of `time.monotonic`."""
 
-    item: Planned
+    item: PlannedTask
     manifest: Path
     state: State = "waiting"
     progress: float = 0.0
     message: str = ""
     began: float = 0.0
     ended: float | None = None
-    told: float | None = None
-    """None: what is known hasn't been told."""
+    published_at: float | None = None
+    """None: the current state is not published yet."""
 
 
 class Publisher:
@@ -82,119 +82,122 @@ class Publisher:
     def __init__(
         self,
         run: str,
-        opened: Callable[[], Sequence[Outlet]],
+        open_outlets: Callable[[], Sequence[Outlet]],
         about: Callable[[Counter[State]], RunState] | None = None,
         host: str | None = None,
     ) -> None:
-        """Begin.
+        """Start the background thread.
 
         Args:
-            run: its id.
-            opened: opens the ways onto the bus.
-            about: how the run itself fares, of its steps by their states; None: another tells that.
-            host: the machine that steps run on, where it is known.
+            run: id of the run.
+            open_outlets: opens the outlets to the bus.
+            about: makes the state of the run from the number of its steps in each state; None: another process
+                publishes it.
+            host: name of the machine that runs the steps, if known.
         """
-        self._run, self._opened, self._about, self._host = run, opened, about, host
-        self._steps: dict[NodeId, _Step] = {}
+        self._run, self._open_outlets, self._run_state, self._host = run, open_outlets, about, host
+        self._steps: dict[TaskId, _Step] = {}
         self._lock, self._ended = threading.Lock(), threading.Event()
-        self._told = -AGAIN
-        self._thread = threading.Thread(target=self._tell, name="publisher", daemon=True)
+        self._run_published = -HEARTBEAT_INTERVAL_S
+        self._thread = threading.Thread(target=self._publish_loop, name="publisher", daemon=True)
         self._thread.start()
 
-    def watching(self, planned: Sequence[Planned], store: Store) -> Watch:
-        """Expect these steps; the watch that is to be told of them."""
+    def track(self, planned: Sequence[PlannedTask], store: Store) -> EventCallback:
+        """Add the steps of a plan; returns the callback for their events."""
         with self._lock:
             for item in planned:
-                manifest = store.folder(item.node.full_name, item.key) / "manifest.json"
-                self._steps.setdefault(item.node.id, _Step(item, manifest)).manifest = manifest
-        return self.watch
+                manifest = store.folder(item.task.full_name, item.key) / "manifest.json"
+                self._steps.setdefault(item.task.id, _Step(item, manifest)).manifest = manifest
+        return self.on_event
 
-    def watch(self, node: Node, event: Event, fraction: float, message: str) -> None:
-        """An `execution.Watch`: notes what it is told."""
+    def on_event(self, task: Task, event: Event, fraction: float, message: str) -> None:
+        """Record an event: an `EventCallback` of `execution.execute`."""
         now = time.monotonic()
         with self._lock:
-            step = self._steps[node.id]
+            step = self._steps[task.id]
             if event == "kept" and step.state == "done":
-                return  # by an earlier round of this run
+                return  # an earlier round of this run computed it
             if event == "start":
                 step.began, step.ended = now, None
-            step.state, step.progress, step.message, step.told = STATES[event], fraction, message, None
+            step.state, step.progress, step.message, step.published_at = STATES[event], fraction, message, None
             if step.state not in ("waiting", "running"):
                 step.ended = now
 
-    def close(self, timeout: float = CLOSING) -> None:
-        """Tell what is left; after so many seconds that goes on by itself, as long as the process lives."""
+    def close(self, timeout: float = CLOSE_TIMEOUT_S) -> None:
+        """Publish the last states; after `timeout` seconds that continues in the background until the process ends."""
         self._ended.set()
         self._thread.join(timeout)
 
-    def _tell(self) -> None:
+    def _publish_loop(self) -> None:
         try:
-            events, found = Events("scan2sim"), self._opened()
-            events.outlets.extend(found)
+            events, outlets = Events("scan2sim"), self._open_outlets()
+            events.outlets.extend(outlets)
             ended = False
             while not ended:
-                ended = self._ended.wait(EVERY)
-                changed, now = self._changed(), time.monotonic()
+                ended = self._ended.wait(PUBLISH_INTERVAL_S)
+                changed, now = self._take_changed(), time.monotonic()
                 for step in changed:
                     events.send("step", self._state_of(step))
-                if self._about and (ended or changed or now - self._told >= AGAIN):
-                    self._told = now
-                    events.send("run", self._about(self._count()))
-            for outlet in found:
+                if self._run_state and (ended or changed or now - self._run_published >= HEARTBEAT_INTERVAL_S):
+                    self._run_published = now
+                    events.send("run", self._run_state(self._count()))
+            for outlet in outlets:
                 outlet.close()
-        except Exception as error:  # whatever it is, the run goes on
-            log.warning("the bus isn't told of this run any more: %s: %s", type(error).__name__, error)
+        except Exception as error:  # a failure to publish must not stop the run
+            log.warning("progress is no longer published: %s: %s", type(error).__name__, error)
 
-    def _changed(self) -> list[_Step]:
-        """Copies of the steps that are to be told of now."""
-        now, found = time.monotonic(), []
+    def _take_changed(self) -> list[_Step]:
+        """Copies of the steps whose state is to be published now; marks them as published."""
+        now, changed = time.monotonic(), []
         with self._lock:
             for step in self._steps.values():
-                if step.told is None or (step.state == "running" and now - step.told >= AGAIN):
-                    step.told = now
-                    found.append(_Step(**vars(step)))
-        return found
+                if step.published_at is None or (
+                    step.state == "running" and now - step.published_at >= HEARTBEAT_INTERVAL_S
+                ):
+                    step.published_at = now
+                    changed.append(_Step(**vars(step)))
+        return changed
 
     def _count(self) -> Counter[State]:
         with self._lock:
             return Counter(step.state for step in self._steps.values())
 
     def _state_of(self, step: _Step) -> StepState:
-        node = step.item.node.id
+        task = step.item.task.id
         seconds = None if not step.began else (step.ended or time.monotonic()) - step.began
-        made = read_manifest(step.manifest) if step.state == "done" else None
+        manifest = read_manifest(step.manifest) if step.state == "done" else None
         return StepState(
             run=self._run,
-            tile=node.tile[:LONGEST_NAME],
-            step=node.name[:LONGEST_NAME],
+            tile=task.tile[:MAX_NAME_CHARS],
+            step=task.name[:MAX_NAME_CHARS],
             state=step.state,
             progress=min(1.0, max(0.0, step.progress)),
-            seconds=made.seconds if made else seconds if step.state in ("running", "failed") else None,
-            memory=round(made.peak_mb * 2**20) if made else None,
-            message=printable(step.message)[:LONGEST],
+            seconds=manifest.seconds if manifest else seconds if step.state in ("running", "failed") else None,
+            memory=round(manifest.peak_mb * 2**20) if manifest else None,
+            message=printable(step.message)[:MAX_MESSAGE_CHARS],
             host=self._host if step.state in ("running", "done", "failed") else None,
         )
 
 
 @contextmanager
-def published(where: str | None, command: str, source: str, *, here: bool = True) -> Iterator[PublishedRun | None]:
-    """Publish how a run fares, from its beginning to its end, however that comes; None where there is no bus.
+def published(where: str | None, command: str, source: str, *, local: bool = True) -> Iterator[PublishedRun | None]:
+    """Publish the progress of a run from its start to its end or failure; yields None without a bus.
 
     Args:
-        where: as `--bus` has it; None: nowhere.
-        command: what runs.
-        source: what of, as it was named.
-        here: whether its steps run on this machine.
+        where: value of option `--bus`; None: don't publish.
+        command: name of the command that runs.
+        source: what it runs on, as the user named it.
+        local: whether the steps run on this machine.
 
     Raises:
-        SettingError: `where` is no place.
-        UnavailableError: what it needs isn't installed.
+        SettingError: `where` is not valid.
+        UnavailableError: a package that the bus needs isn't installed.
     """
     if where is None:
         yield None
         return
-    event_publishers.check(where)
-    run = PublishedRun(where, command, source, here=here)
+    event_publishers.check_address(where)
+    run = PublishedRun(where, command, source, local=local)
     try:
         yield run
     except IncompleteError as error:
@@ -211,31 +214,31 @@ class PublishedRun:
     """A run whose state is published.
 
     Attributes:
-        steps: publishes their states.
-        channel: for workers elsewhere.
+        steps: publishes the states of its steps.
+        channel: passed to workers in other processes.
     """
 
-    def __init__(self, where: str, command: str, source: str, *, here: bool) -> None:
-        """Begin, as `published`."""
+    def __init__(self, where: str, command: str, source: str, *, local: bool) -> None:
+        """Start publishing; arguments as of `published`."""
         self.channel = Channel(where, uuid.uuid4().hex)
         self._command, self._source, self._host = command, source, platform.node()
         self._began = time.monotonic()
         self._state: Literal["running", "done", "failed", "stopped"] = "running"
         self._message = ""
-        host = self._host if here else None
-        self.steps = Publisher(self.channel.run, lambda: event_publishers.opened(where), self._about, host)
+        host = self._host if local else None
+        self.steps = Publisher(self.channel.run, lambda: event_publishers.open_outlets(where), self._run_state, host)
 
     def end(self, state: Literal["done", "failed", "stopped"], message: str = "") -> None:
-        """Tell how it ended."""
+        """Publish how the run ended."""
         self._message, self._state = message, state
         self.steps.close()
 
-    def _about(self, steps: Counter[State]) -> RunState:
+    def _run_state(self, steps: Counter[State]) -> RunState:
         return RunState(
             run=self.channel.run,
             command=self._command,
-            source=printable(self._source)[-LONGEST_NAME:],
-            host=printable(self._host)[:LONGEST_NAME],
+            source=printable(self._source)[-MAX_NAME_CHARS:],
+            host=printable(self._host)[:MAX_NAME_CHARS],
             state=self._state,
             steps=steps.total(),
             running=steps["running"],
@@ -243,27 +246,27 @@ class PublishedRun:
             kept=steps["kept"],
             failed=steps["failed"],
             seconds=time.monotonic() - self._began,
-            message=printable(self._message)[:LONGEST],
+            message=printable(self._message)[:MAX_MESSAGE_CHARS],
         )
 
 
 @contextmanager
-def published_step(channel: Channel | None, item: Planned, store: Store) -> Iterator[Watch]:
-    """Publish how one step of a run that goes on elsewhere fares, from the worker that runs it."""
+def published_step(channel: Channel | None, item: PlannedTask, store: Store) -> Iterator[EventCallback]:
+    """Publish the progress of one step from the worker that runs it; the run itself is published elsewhere."""
     if channel is None:
-        yield unwatched
+        yield ignore_event
         return
-    publisher = Publisher(channel.run, lambda: event_publishers.opened(channel.where), host=platform.node())
-    watch = publisher.watching([item], store)
+    publisher = Publisher(channel.run, lambda: event_publishers.open_outlets(channel.where), host=platform.node())
+    on_event = publisher.track([item], store)
     try:
-        watch(item.node, "start", 0.0, "")
-        yield watch
-        watch(item.node, "done", 1.0, "")
+        on_event(item.task, "start", 0.0, "")
+        yield on_event
+        on_event(item.task, "done", 1.0, "")
     except DamagedError as error:
-        watch(item.node, "again", 0.0, error.cause)
+        on_event(item.task, "again", 0.0, error.cause)
         raise
     except ScanError as error:
-        watch(item.node, "failed", 1.0, error.cause)
+        on_event(item.task, "failed", 1.0, error.cause)
         raise
     finally:
         publisher.close(0.0)

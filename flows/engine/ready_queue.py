@@ -1,4 +1,4 @@
-"""How far a plan has come: which of its nodes can run next, and what came of the others."""
+"""State of a plan's execution: which tasks are ready to run, done or failed."""
 
 from __future__ import annotations
 
@@ -6,111 +6,111 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from scan2sim.flows.engine.planning import Planned
-from scan2sim.flows.pipelines.graph import Node, NodeId
+from scan2sim.flows.engine.planning import PlannedTask
+from scan2sim.flows.pipelines.graph import Task, TaskId
 from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.errors import DamagedError, ScanError
 
 Event = Literal["start", "progress", "done", "kept", "failed", "again"]
-Watch = Callable[[Node, Event, float, str], None]
-"""Told what happens: node, event, fraction done, message."""
+EventCallback = Callable[[Task, Event, float, str], None]
+"""Receives what happens to a task: task, event, fraction done, message."""
 
 
-def unwatched(node: Node, event: Event, fraction: float, message: str) -> None:
-    """A `Watch` that tells nobody."""
+def ignore_event(task: Task, event: Event, fraction: float, message: str) -> None:
+    """An `EventCallback` that does nothing."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a plan.
+    """Result of executing a plan.
 
     Attributes:
-        done: results, what is kept from before among them.
-        failed: why others failed; what depends on them is in neither.
-        side_failed: the same of side products.
+        done: results by task, cached ones included.
+        failed: errors by task; tasks that depend on failed ones are neither in `done` nor in `failed`.
+        side_failed: errors of side products by task.
     """
 
-    done: Mapping[NodeId, Manifest]
-    failed: Mapping[NodeId, ScanError]
-    side_failed: Mapping[NodeId, ScanError] = field(default_factory=dict)
+    done: Mapping[TaskId, Manifest]
+    failed: Mapping[TaskId, ScanError]
+    side_failed: Mapping[TaskId, ScanError] = field(default_factory=dict)
 
     def of_tile(self, tile: str = "") -> dict[str, Manifest]:
-        """Results of one tile by their names within it (`poisson.terrain`)."""
-        return {node.name: manifest for node, manifest in self.done.items() if node.tile == tile}
+        """Results of one tile by task name within the tile (`poisson.terrain`)."""
+        return {task.name: manifest for task, manifest in self.done.items() if task.tile == tile}
 
     def check(self) -> None:
-        """Raise the first error, if any node failed that isn't a side product."""
+        """Raise the first error of a task that isn't a side product, if any failed."""
         for error in self.failed.values():
             raise error
 
 
-class Frontier:
-    """Which nodes of a plan can run next, as results come in.
+class ReadyQueue:
+    """Tasks of a plan that are ready to run, updated as results come in.
 
     Attributes:
-        done: results; what is kept from before comes by itself.
-        failed, side_failed: why others failed.
+        done: results by task; `ready` adds cached ones.
+        failed, side_failed: errors by task.
     """
 
-    def __init__(self, planned: Sequence[Planned], store: Store, watch: Watch) -> None:
-        self.done: dict[NodeId, Manifest] = {}
-        self.failed: dict[NodeId, ScanError] = {}
-        self.side_failed: dict[NodeId, ScanError] = {}
-        self._store, self._watch = store, watch
-        self._planned = {item.node.id: item for item in planned}
-        self._by_name = {item.node.full_name: item.node.id for item in planned}
+    def __init__(self, planned: Sequence[PlannedTask], store: Store, on_event: EventCallback) -> None:
+        self.done: dict[TaskId, Manifest] = {}
+        self.failed: dict[TaskId, ScanError] = {}
+        self.side_failed: dict[TaskId, ScanError] = {}
+        self._store, self._watch = store, on_event
+        self._planned = {item.task.id: item for item in planned}
+        self._by_name = {item.task.full_name: item.task.id for item in planned}
         self._waiting = dict(self._planned)
-        self._missing: set[NodeId] = set()  # known not to be kept
-        self._lost: set[NodeId] = set()  # failed, or in need of what failed
+        self._missing: set[TaskId] = set()  # known to have no cached result
+        self._lost: set[TaskId] = set()  # failed, or depending on a failed task
 
     def __bool__(self) -> bool:
         return bool(self._waiting)
 
     @property
     def outcome(self) -> Outcome:
-        """As far as the plan has come."""
+        """The state so far."""
         return Outcome(self.done, self.failed, self.side_failed)
 
-    def ready(self) -> Iterator[Planned]:
-        """Nodes that can run now, in the plan's order; to be taken, or offered again."""
-        for node, item in list(self._waiting.items()):
+    def ready(self) -> Iterator[PlannedTask]:
+        """Tasks that can run now, in the plan's order; those not passed to `take` are yielded again next time."""
+        for task, item in list(self._waiting.items()):
             if not self._lost.isdisjoint(item.upstream):
                 self.take(item)
-                self._lost.add(node)
+                self._lost.add(task)
             elif all(name in self.done for name in item.upstream):
-                kept = None if node in self._missing else item.kept(self._store)
-                if kept is None:
-                    self._missing.add(node)
+                cached = None if task in self._missing else item.cached_result(self._store)
+                if cached is None:
+                    self._missing.add(task)
                     yield item
                 else:
                     self.take(item)
-                    self.done[node] = kept
-                    self._watch(item.node, "kept", 1.0, "")
+                    self.done[task] = cached
+                    self._watch(item.task, "kept", 1.0, "")
 
-    def take(self, item: Planned) -> None:
-        """The node has been started."""
-        self._waiting.pop(item.node.id, None)
+    def take(self, item: PlannedTask) -> None:
+        """Record that a task was started."""
+        self._waiting.pop(item.task.id, None)
 
-    def end(self, item: Planned, manifest: Manifest) -> None:
-        """The node is done; what it has read was intact."""
-        self.done[item.node.id] = manifest
-        for node in (item.node.id, *item.upstream):
-            self._store.trust(node.full_name, self._planned[node].key)
-        self._watch(item.node, "done", 1.0, "")
+    def end(self, item: PlannedTask, manifest: Manifest) -> None:
+        """Record the result of a task; its inputs were intact."""
+        self.done[item.task.id] = manifest
+        for task in (item.task.id, *item.upstream):
+            self._store.mark_verified(task.full_name, self._planned[task].key)
+        self._watch(item.task, "done", 1.0, "")
 
-    def again(self, item: Planned, error: DamagedError) -> None:
-        """The node has met a result that is damaged: that is made anew, and the node waits for it."""
-        self._waiting[item.node.id] = item
+    def rebuild_damaged(self, item: PlannedTask, error: DamagedError) -> None:
+        """Record that a task found a damaged input: the input is rebuilt, and the task waits for it."""
+        self._waiting[item.task.id] = item
         damaged = self._by_name[error.where]
         if self.done.pop(damaged, None) is not None:
             self._store.discard(damaged.full_name, self._planned[damaged].key)
             self._missing.add(damaged)
             self._waiting[damaged] = self._planned[damaged]
-        self._watch(item.node, "again", 0.0, f"the kept result of {damaged} is damaged: made anew")
+        self._watch(item.task, "again", 0.0, f"the cached result of {damaged} is damaged: rebuilding it")
 
-    def fail(self, item: Planned, error: ScanError) -> None:
-        """The node, and whatever depends on it, will not be done."""
+    def fail(self, item: PlannedTask, error: ScanError) -> None:
+        """Record the error of a task; tasks that depend on it are dropped."""
         self.take(item)
-        self._lost.add(item.node.id)
-        (self.side_failed if item.node.step.side_product else self.failed)[item.node.id] = error
-        self._watch(item.node, "failed", 1.0, error.cause)
+        self._lost.add(item.task.id)
+        (self.side_failed if item.task.step.side_product else self.failed)[item.task.id] = error
+        self._watch(item.task, "failed", 1.0, error.cause)

@@ -1,4 +1,4 @@
-"""Runs one node in this process, and keeps its result."""
+"""Runs one task in this process and caches its result."""
 
 from __future__ import annotations
 
@@ -7,50 +7,50 @@ import shutil
 import time
 from pathlib import Path
 
-from scan2sim.flows.engine.planning import Planned
+from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.errors import ScanError, from_exception
 from scan2sim.pipeline.core.step import Report, silent
 
 
-def run_node(item: Planned, store: Store, inputs: dict[str, Path], report: Report = silent) -> Manifest:
-    """Run one node in this process and keep its result.
+def run_task(item: PlannedTask, store: Store, inputs: dict[str, Path], report: Report = silent) -> Manifest:
+    """Run one task in this process and commit its result to the store.
 
     Raises:
-        DamagedError: a result that it reads isn't as it was made.
-        ScanError: as the step says; a full disk as `SpaceError`; anything else as `StepError`.
+        DamagedError: a cached result that it reads is damaged.
+        ScanError: raised by the step; a full disk as `SpaceError`, any other exception as `StepError`.
     """
-    node = item.node
+    task = item.task
     item.check(store)
-    fed = item.fed(store)
-    folder = store.begin(node.full_name)
+    content_key = item.content_key(store)
+    folder = store.begin(task.full_name)
     start = time.perf_counter()
-    _forget_peak()
+    _reset_peak_memory()
     try:
-        kept = {"checkpoint": store.checkpoint(node.full_name, item.key)} if node.step.resumes else {}
-        result = node.step.run(inputs, node.params, folder, report, **kept)
+        kept = {"checkpoint": store.checkpoint(task.full_name, item.key)} if task.step.resumes else {}
+        result = task.step.run(inputs, task.params, folder, report, **kept)
         about = {
-            "version": node.step.version,
-            "params": node.params.model_dump(mode="json"),
+            "version": task.step.version,
+            "params": task.params.model_dump(mode="json"),
             "inputs": item.keys,
-            "fed": fed,
+            "fed": content_key,
             "seconds": round(time.perf_counter() - start, 3),
             "peak_mb": _peak_mb(),
         }
-        return store.commit(node.full_name, item.key, folder, result, about)
+        return store.commit(task.full_name, item.key, folder, result, about)
     except ScanError:
         raise
     except Exception as error:
-        raise from_exception(error, node.full_name, folder) from error
+        raise from_exception(error, task.full_name, folder) from error
     finally:
-        shutil.rmtree(folder, ignore_errors=True)  # moved away by now, unless it failed
+        shutil.rmtree(folder, ignore_errors=True)  # already moved into the store, unless the step failed
 
 
-def _forget_peak() -> None:
+def _reset_peak_memory() -> None:
     try:
         Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
     except OSError:
-        pass  # not Linux: the peak is then that of the process so far
+        pass  # not Linux: the peak includes what the process did before
 
 
 def _peak_mb() -> float:

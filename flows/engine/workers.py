@@ -1,8 +1,8 @@
-"""Where the steps of a flow run, by name: in threads of its process, on workers of Dask, on workers of Ray.
+"""Workers that run the steps of a flow: threads of its process, Dask workers or Ray workers.
 
-A task of Prefect waits in the flow's process for its step; the worker knows of the step alone. So workers need neither
-Prefect nor its server. (Prefect's own runners for Dask and Ray set up Prefect's client, settings and context on the
-worker anew for every task, which costs more than many a step takes.)
+A Prefect task waits in the flow's process while a worker runs the step. So workers need neither Prefect nor its server.
+(Prefect's own task runners for Dask and Ray set up Prefect's client, settings and context on the worker for every task,
+which takes longer than many steps.)
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 from scan2sim.pipeline.core.errors import SettingError, UnavailableError
-from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.optional_deps import require
 
 Call = Callable[..., Any]
-"""Has a worker call a function with arguments, waits, and returns its result or raises its exception."""
+"""Calls a function on a worker, waits, and returns its result or raises its exception."""
 
 
 def workers(name: str, count: int, address: str | None = None) -> AbstractContextManager[Call]:
-    """Workers that call one function at a time each; what a worker was at that died is done by another.
+    """Workers that run one function at a time each; if a worker dies, another one repeats its function.
 
     Args:
         name: "threads", "dask" or "ray".
-        count: of workers that are started here.
-        address: of a Dask scheduler or a Ray cluster, whose workers are taken instead.
+        count: number of workers to start here.
+        address: of a Dask scheduler or a Ray cluster whose workers to use instead.
 
     Raises:
-        UnavailableError: once entered, nothing answers at the address.
+        UnavailableError: when the context is entered, nothing answers at the address.
         ScanError: as `check`.
     """
     check(name)
@@ -38,7 +38,7 @@ def workers(name: str, count: int, address: str | None = None) -> AbstractContex
 
 
 def check(name: str) -> None:
-    """See that there is such a kind of workers here.
+    """Check that this kind of workers exists and is installed.
 
     Raises:
         SettingError: there is no such kind.
@@ -47,7 +47,7 @@ def check(name: str) -> None:
     packages: dict[str, list[str]] = {"threads": [], "dask": ["distributed"], "ray": ["ray"]}
     if name not in packages:
         raise SettingError("runner", f"there is no `{name}`", "Choose threads, dask or ray")
-    need(f"--runner {name}", *packages[name])
+    require(f"--runner {name}", *packages[name])
 
 
 @contextmanager
@@ -60,32 +60,32 @@ def _dask(count: int, address: str | None) -> Iterator[Call]:
     import dask
     from distributed import Client
 
-    # Dask would count a step's memory as its worker's, and kill it
-    own: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "memory_limit": 0}
-    own["dashboard_address"] = "127.0.0.1:0"  # it asks for no token
-    unwatched = {"distributed.worker.profile.enabled": False}  # a hundred looks a second at what a worker does
+    # by default Dask counts the memory of a step's process as its worker's, and kills the worker
+    local: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "memory_limit": 0}
+    local["dashboard_address"] = "127.0.0.1:0"  # the dashboard has no authentication
+    no_profiler = {"distributed.worker.profile.enabled": False}  # it samples workers a hundred times per second
     try:
-        with dask.config.set(unwatched):
-            client = Client(address) if address else Client(**own)
+        with dask.config.set(no_profiler):
+            client = Client(address) if address else Client(**local)
     except OSError as error:
-        raise _away(address, "scheduler of Dask", error) from error
+        raise _unreachable(address, "Dask scheduler", error) from error
     with client:
         yield lambda function, *arguments: client.submit(function, *arguments, pure=False).result()
 
 
 @contextmanager
 def _ray(count: int, address: str | None) -> Iterator[Call]:
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported home
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no telemetry
     import ray
 
-    own: dict[str, Any] = {"address": "local", "num_cpus": count, "include_dashboard": False}
+    local: dict[str, Any] = {"address": "local", "num_cpus": count, "include_dashboard": False}
     try:
-        if address and re.fullmatch(r"[^/]+:\d+", address):  # Ray itself would try for minutes
+        if address and re.fullmatch(r"[^/]+:\d+", address):  # Ray itself retries for minutes
             host, port = address.rsplit(":", 1)
             socket.create_connection((host, int(port)), 10).close()
-        ray.init(address=address) if address else ray.init(**own)
+        ray.init(address=address) if address else ray.init(**local)
     except OSError as error:
-        raise _away(address, "cluster of Ray", error) from error
+        raise _unreachable(address, "Ray cluster", error) from error
 
     def call(function: Callable[..., Any], *arguments: Any) -> Any:
         try:
@@ -99,5 +99,5 @@ def _ray(count: int, address: str | None) -> Iterator[Call]:
         ray.shutdown()
 
 
-def _away(address: str | None, what: str, error: Exception) -> UnavailableError:
+def _unreachable(address: str | None, what: str, error: Exception) -> UnavailableError:
     return UnavailableError(address or "localhost", f"no {what} answers ({error})", "Start it, or correct --address")

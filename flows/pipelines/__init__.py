@@ -1,1 +1,1 @@
-"""Which steps make a tile or a survey, in order, and the settings of their steps."""
+"""Pipeline definitions: the task graphs of a tile, a survey, a video and a drive, and the settings of their steps."""

@@ -1,4 +1,4 @@
-"""What graphs of steps are made of: nodes, and outputs of nodes as inputs of others."""
+"""Task graph (DAG): a task runs a step; its inputs are files and outputs of other tasks."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from scan2sim.pipeline.core.step import Params, Step
 
 
 @dataclass(frozen=True, order=True)
-class NodeId:
-    """Which node of a graph.
+class TaskId:
+    """Identifies a task of a graph.
 
     Attributes:
         step: name of the step.
-        group: the class that it is run for, of a step that is run per class.
-        tile: of a survey; "" where one tile is made for itself.
+        group: surface class that a per-class step is run for, else "".
+        tile: name of the survey's tile; "" for a single tile.
     """
 
     step: str
@@ -25,12 +25,12 @@ class NodeId:
 
     @property
     def name(self) -> str:
-        """Within the tile: `poisson.terrain`."""
+        """Name within the tile: `poisson.terrain`."""
         return f"{self.step}.{self.group}" if self.group else self.step
 
     @property
     def full_name(self) -> str:
-        """On screens, and as the folder in the store: `street_0001/poisson.terrain`."""
+        """Name in messages, and of the folder in the store: `street_0001/poisson.terrain`."""
         return f"{self.tile}/{self.name}" if self.tile else self.name
 
     def __str__(self) -> str:
@@ -39,20 +39,20 @@ class NodeId:
 
 @dataclass(frozen=True)
 class Output:
-    """An output of a node, as another's input."""
+    """An output of a task, as an input of another one."""
 
-    node: NodeId
+    task: TaskId
     name: str
 
 
 @dataclass(frozen=True)
-class Node:
-    """A step to be run.
+class Task:
+    """A step to run with its parameters and inputs.
 
     Attributes:
-        step, params: what is run.
-        inputs: name to a source file, or to another node's output.
-        group, tile: as of its id.
+        step, params: the step and its parameters.
+        inputs: input name to a source file, or to the output of another task.
+        group, tile: as in its `TaskId`.
     """
 
     step: Step
@@ -62,20 +62,20 @@ class Node:
     tile: str = ""
 
     @property
-    def id(self) -> NodeId:
-        """By which others name it; unique in the graph."""
-        return NodeId(self.step.name, self.group, self.tile)
+    def id(self) -> TaskId:
+        """Id of the task, unique in the graph."""
+        return TaskId(self.step.name, self.group, self.tile)
 
     @property
     def full_name(self) -> str:
-        """As `NodeId.full_name`."""
+        """As `TaskId.full_name`."""
         return self.id.full_name
 
 
-def needed(nodes: Sequence[Node], wanted: Iterable[NodeId]) -> list[Node]:
-    """The nodes that these need, and themselves, in order."""
+def required_tasks(tasks: Sequence[Task], wanted: Iterable[TaskId]) -> list[Task]:
+    """The wanted tasks and all tasks that they depend on, in order."""
     found = set(wanted)
-    for node in reversed(nodes):
-        if node.id in found:
-            found |= {source.node for source in node.inputs.values() if isinstance(source, Output)}
-    return [node for node in nodes if node.id in found]
+    for task in reversed(tasks):
+        if task.id in found:
+            found |= {source.task for source in task.inputs.values() if isinstance(source, Output)}
+    return [task for task in tasks if task.id in found]

@@ -1,11 +1,12 @@
-"""Settings of a run: the mission's defaults, a TOML file, and `--set step.param=value`, in that order.
+"""Settings of a run: defaults, overridden by a TOML file, overridden by `--set step.param=value`.
 
-`--set decimate.target=50000` holds for every class, `--set decimate.building.target=50000` for one.
+`--set decimate.target=50000` applies to all surface classes, `--set decimate.building.target=50000` to one.
 In a file: `[decimate]` and `[decimate.building]`.
 """
 
 from __future__ import annotations
 
+import copy
 import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -20,42 +21,51 @@ P = TypeVar("P", bound=Params)
 
 
 class Settings:
-    """What the user set, by step and class; `params` merges it with a step's defaults."""
+    """The user's settings by step and class; `params` merges them with the defaults of a step."""
 
     def __init__(self, values: Mapping[str, Mapping[str, Any]] | None = None) -> None:
         self.values = dict(values or {})
 
     @classmethod
     def read(cls, file: Path | None = None, assignments: Iterable[str] = ()) -> Settings:
-        """From a TOML file and `step[.class].param=value` texts; later ones win.
+        """Read a TOML file and `step[.class].param=value` texts; later ones override earlier ones.
 
         Raises:
-            SettingError: the file can't be read, or an assignment isn't one.
+            SettingError: the file can't be read, or an assignment has a wrong form.
         """
         values: dict[str, Any] = {}
         if file is not None:
             try:
                 values = toml.table(file)
             except InputError as error:
-                raise SettingError(file, error.cause, "Mend it, or leave --config out") from None
+                raise SettingError(file, error.cause, "Fix it, or leave --config out") from None
         for text in assignments:
             path, equals, value = text.partition("=")
-            parts = path.strip().split(".")
-            if not equals or len(parts) not in (2, 3):
-                raise SettingError(f"--set {text}", "is no assignment", "Write --set step.param=value")
-            table: Any = values
-            for part in parts[:-1]:
-                table = table.setdefault(part, {})
-                if not isinstance(table, dict):
-                    raise SettingError(f"--set {text}", f"`{part}` was given a value before", "Make it a table there")
-            table[parts[-1]] = parsed(value.strip())
+            if not equals:
+                raise SettingError(f"--set {text}", "is not an assignment", "Write --set step.param=value")
+            _assign(values, path.strip(), parsed(value.strip()), f"--set {text}")
         return cls(values)
 
-    def check(self, steps: Iterable[Step]) -> None:
-        """Refuse names that no step knows, and classes where a step is not run per class.
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> Settings:
+        """From `{"decimate": {"target": 50000}}` or `{"decimate.target": 50000}`, in Python.
 
         Raises:
-            SettingError: naming the nearest name that exists.
+            SettingError: a name has a wrong form.
+        """
+        tables: dict[str, Any] = {}
+        for name, value in values.items():
+            if "." in name:
+                _assign(tables, name, value, name)
+            else:
+                tables[name] = copy.deepcopy(value)
+        return cls(tables)
+
+    def check(self, steps: Iterable[Step]) -> None:
+        """Reject unknown steps and parameters, and classes for steps that are not run per class.
+
+        Raises:
+            SettingError: suggests the closest existing name.
         """
         known = {step.name: step for step in steps}
         for name, table in self.values.items():
@@ -73,10 +83,10 @@ class Settings:
                         raise SettingError(f"{name}.{param}", "there is no such parameter", _nearest(param, fields))
 
     def params(self, step: Step, group: str = "", **given: Any) -> Any:
-        """The step's parameters: `given` by the recipe, defaults of the class, what the user set.
+        """Parameters of a step: values `given` by the pipeline, defaults of the class, then the user's settings.
 
         Raises:
-            SettingError: a value out of range or of the wrong kind, or one that only the recipe sets.
+            SettingError: a value out of range or of a wrong type, or one that only the pipeline sets.
         """
         table = self.values.get(step.name, {})
         classes: dict[str, Mapping[str, Any]] = {
@@ -85,13 +95,26 @@ class Settings:
         general = {k: v for k, v in table.items() if k not in classes}
         special = classes.get(group, {})
         for name in {*general, *special} & set(given):
-            raise SettingError(f"{step.name}.{name}", "follows from the tile or other settings", "Leave it out")
+            raise SettingError(f"{step.name}.{name}", "is derived from the tile or from other settings", "Leave it out")
         merged = {**given, **step.class_defaults.get(group, {}), **general, **special}
         return step.params.of(step.name, merged)
 
 
+def _assign(tables: dict[str, Any], path: str, value: object, where: str) -> None:
+    """Put a value at `step.param` or `step.class.param`; `where` names the assignment in errors."""
+    parts = path.split(".")
+    if len(parts) not in (2, 3):
+        raise SettingError(where, "is not an assignment", "Write step.param=value or step.class.param=value")
+    table: Any = tables
+    for part in parts[:-1]:
+        table = table.setdefault(part, {})
+        if not isinstance(table, dict):
+            raise SettingError(where, f"`{part}` has a value already, it is not a table", "Remove that value")
+    table[parts[-1]] = value
+
+
 def parsed(text: str) -> Any:
-    """A TOML value where it is one, else the text itself."""
+    """The text as a TOML value if it is one, else as it is."""
     try:
         return toml.parse(f"value = {text}")["value"]
     except ValueError:
@@ -100,4 +123,4 @@ def parsed(text: str) -> Any:
 
 def _nearest(name: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, known, 1)
-    return f"Did you mean `{close[0]}`?" if close else f"There are: {', '.join(sorted(known))}"
+    return f"Did you mean `{close[0]}`?" if close else f"Choose one of: {', '.join(sorted(known))}"

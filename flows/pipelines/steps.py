@@ -1,4 +1,4 @@
-"""All steps of all recipes."""
+"""All steps of all pipelines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which steps make the study of compression: a graph a cell of D3.2's tables 4 and 5."""
+"""Pipeline definition of the compression study: a task graph for each cell of tables 4 and 5 of 5G-ERA D3.2."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from scan2sim.flows.pipelines.graph import Node, NodeId, Output
+from scan2sim.flows.pipelines.graph import Output, Task, TaskId
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.pipelines.video import STEPS as VIDEO
 from scan2sim.pipeline.core.errors import InputError
@@ -22,15 +22,15 @@ from scan2sim.slam.steps.encode import ENCODE
 from scan2sim.slam.steps.evaluate import EVALUATE
 from scan2sim.slam.steps.place import PLACE
 from scan2sim.slam.steps.track import TRACK
-from scan2sim.slam.trajectory.evaluate import SEGMENT, way
+from scan2sim.slam.trajectory.evaluate import SEGMENT_M, distance_along
 from scan2sim.slam.trajectory.gps import smooth
 from scan2sim.slam.video import Video, open_video
 from scan2sim.slam.video_degradation import scaled
 
 STEPS: tuple[Step, ...] = (ENCODE, EVALUATE)
-ROOM = 1.2
-"""The truth must be this many times as long as a segment, or else shorter segments are taken."""
-SHORTER = (200.0, 100.0, 50.0, 20.0, 10.0)
+MIN_TRUTH_SEGMENTS = 1.2
+"""Minimum length of the ground truth, in segments; if it is shorter, shorter segments are used."""
+SHORTER_SEGMENTS_M = (200.0, 100.0, 50.0, 20.0, 10.0)
 
 
 def _even(height: int) -> int:
@@ -40,7 +40,7 @@ def _even(height: int) -> int:
 
 
 class Study(Params):
-    """What is studied; heights in pixels, bit rates in Mbit/s, rates in frames a second; all as in D3.2's tables."""
+    """Parameters of the study: heights in pixels, bit rates in Mbit/s, frame rates in Hz; defaults as in D3.2."""
 
     source: Path
     truth: Path
@@ -55,21 +55,21 @@ class Study(Params):
     rates: tuple[Annotated[float, Field(ge=0.5, le=1000)], ...] = Field((30.0, 15.0), min_length=1)
 
     def video(self) -> Video:
-        """The video of a file, of a folder of pictures, or of a drive; pictures without loss are preferred.
+        """The video of a file, of a folder of images, or of a drive's folder, whose lossless frames are preferred.
 
         Raises:
             InputError: it can't be read.
         """
         file, frames = self.source / "video.mp4", self.source / "frames"
         if self.source.is_dir() and file.is_file():
-            made = open_video(file)
-            return open_video(frames, fps=made.fps) if frames.is_dir() else made
+            video = open_video(file)
+            return open_video(frames, fps=video.fps) if frames.is_dir() else video
         return open_video(self.source)
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A video to make and to follow: `height` in pixels, `bitrate` in Mbit/s, `rate` in frames a second."""
+    """A cell of the tables: a re-encoded video with a height in pixels, a bit rate in Mbit/s and a frame rate in Hz."""
 
     height: int
     bitrate: float
@@ -77,18 +77,18 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Of its node: rows, megabits a second and frames a second."""
+        """Group of its tasks: height, bit rate and frame rate."""
         return f"h{self.height}_b{self.bitrate:g}_f{self.rate:g}"
 
 
 def cells(study: Study) -> list[Cell]:
-    """All cells of the tables: rates descending, heights and bit rates ascending."""
+    """All cells of the tables, by descending frame rate, ascending height and bit rate."""
     axes = sorted(study.rates)[::-1], sorted(study.heights), sorted(study.bitrates)
     return [Cell(height, bitrate, rate) for rate, height, bitrate in product(*axes)]
 
 
-def refused(cell: Cell, video: Video) -> str | None:
-    """Why a cell can't be made of a video: nothing is scaled up, no frame shown twice."""
+def rejection(cell: Cell, video: Video) -> str | None:
+    """Why a cell can't be made from a video: neither images nor frame rates are scaled up; None if it can."""
     if cell.height > video.height:
         return f"the source has only {video.height} px"
     if cell.rate > 1.02 * video.fps:
@@ -96,56 +96,62 @@ def refused(cell: Cell, video: Video) -> str | None:
     return None
 
 
-def recipe(study: Study, video: Video, segment: float, settings: Settings) -> list[Node]:
-    """The graph of all cells that can be made of the video; a node's group is its cell's name.
+def build_graph(study: Study, video: Video, segment: float, settings: Settings) -> list[Task]:
+    """The task graph of all cells that can be made from the video; the group of a task is the name of its cell.
 
     Args:
-        study: what is asked.
+        study: parameters of the study.
         video: its source.
-        segment: metres, of the local error (`segment_of`).
+        segment: length of the segments of the local error in metres (`segment_of`).
         settings: of the steps.
 
     Raises:
         SettingError: a setting that doesn't exist or is out of range.
     """
     settings.check((*VIDEO, *STEPS))
-    nodes: list[Node] = []
+    tasks: list[Task] = []
     for cell in cells(study):
-        if refused(cell, video) is None:
-            nodes += _of_cell(cell, study, video, segment, settings)
-    return nodes
+        if rejection(cell, video) is None:
+            tasks += _cell_tasks(cell, study, video, segment, settings)
+    return tasks
 
 
-def _of_cell(cell: Cell, study: Study, video: Video, segment: float, settings: Settings) -> list[Node]:
-    """A cell's video made, followed, placed and compared with the truth."""
+def _cell_tasks(cell: Cell, study: Study, video: Video, segment: float, settings: Settings) -> list[Task]:
+    """The tasks of a cell: encode the video, track it, place the trajectory, evaluate it against the ground truth."""
     camera = camera_of(video, "auto", None, None)
     if camera is None:
-        raise InputError(video.path, "is no 360 video: its camera isn't known", "Give one twice as wide as high")
+        raise InputError(
+            video.path, "is not a 360 degree video, so its camera is unknown", "Give a video twice as wide as high"
+        )
     name, camera = cell.name, scaled(camera, cell.height)
     size = (camera.width, camera.height)
-    beside: dict[str, Path | Output] = {key: path for key, path in (("gps", study.gps), ("mask", study.mask)) if path}
+    gps_and_mask: dict[str, Path | Output] = {
+        key: path for key, path in (("gps", study.gps), ("mask", study.mask)) if path
+    }
 
-    def add(step: Step, inputs: Mapping[str, Path | Output], **given: Any) -> Node:
-        return Node(step, settings.params(step, name, **given), inputs, name)
+    def add(step: Step, inputs: Mapping[str, Path | Output], **given: Any) -> Task:
+        return Task(step, settings.params(step, name, **given), inputs, name)
 
-    def made(step: Step, output: str) -> dict[str, Output]:
-        return {output: Output(NodeId(step.name, name), output)}
+    def output_of(step: Step, output: str) -> dict[str, Output]:
+        return {output: Output(TaskId(step.name, name), output)}
 
     return [
         add(ENCODE, {"video": video.path}, size=size, bitrate=cell.bitrate, rate=cell.rate, fps=video.fps),
-        add(TRACK, made(ENCODE, "video") | beside, cameras=(asdict(camera),), gps_offset=0.0),
-        add(PLACE, made(TRACK, "mapped"), georeference=False),
-        add(EVALUATE, made(PLACE, "trajectory") | {"truth": study.truth}, segment=segment),
+        add(TRACK, output_of(ENCODE, "video") | gps_and_mask, cameras=(asdict(camera),), gps_offset=0.0),
+        add(PLACE, output_of(TRACK, "mapped"), georeference=False),
+        add(EVALUATE, output_of(PLACE, "trajectory") | {"truth": study.truth}, segment=segment),
     ]
 
 
 def segment_of(video: Video, truth: Trajectory | GpsTrack) -> float:
-    """D3.2's 400 m, or less where the truth is too short while the video lasts."""
+    """Length of the segments in metres: 400 as in D3.2, or less if the ground truth during the video is too short."""
     times = truth.times
     if video.count:
         times = times[(times >= 0) & (times <= video.count / video.fps)]
-    track_ = smooth(truth, 2.0) if isinstance(truth, GpsTrack) else truth
-    places = track_.at(times)
-    places = places[np.isfinite(places).all(axis=1)]
-    length = float(way(places[:, :2])[-1]) if len(places) else 0.0
-    return next((s for s in (SEGMENT, *SHORTER) if length >= ROOM * s), SHORTER[-1])
+    trajectory = smooth(truth, 2.0) if isinstance(truth, GpsTrack) else truth
+    positions = trajectory.at(times)
+    positions = positions[np.isfinite(positions).all(axis=1)]
+    length = float(distance_along(positions[:, :2])[-1]) if len(positions) else 0.0
+    return next(
+        (s for s in (SEGMENT_M, *SHORTER_SEGMENTS_M) if length >= MIN_TRUTH_SEGMENTS * s), SHORTER_SEGMENTS_M[-1]
+    )

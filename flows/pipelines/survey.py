@@ -1,38 +1,38 @@
-"""The graph of several tiles of a survey, which meet."""
+"""Pipeline definition of a survey: the task graph of several tiles with matching borders."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from scan2sim.flows.pipelines.graph import Node, NodeId, Output
+from scan2sim.flows.pipelines.graph import Output, Task, TaskId
 from scan2sim.flows.pipelines.settings import Settings
-from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.flows.pipelines.tile import build_graph
 from scan2sim.pipeline.core.types import Tile
 
 
-def survey_recipe(tiles: Sequence[Tile], settings: Settings, without: Collection[NodeId] = ()) -> list[Node]:
-    """The graph of several tiles of a survey, which meet.
+def build_survey_graph(tiles: Sequence[Tile], settings: Settings, without: Collection[TaskId] = ()) -> list[Task]:
+    """The task graph of several tiles of a survey, with matching borders.
 
-    Each node comes after those that it reads; else tile after tile, so that the first are finished early.
+    Each task comes after those that it reads, otherwise tile by tile, so that the first tiles are finished early.
 
     Args:
-        tiles: to be made.
+        tiles: the tiles to build.
         settings: of all steps.
-        without: side products that failed, of any tile.
+        without: side products of any tile to leave out, because they failed.
 
     Raises:
-        SettingError: as `recipe`.
+        SettingError: as `tile.build_graph`.
     """
     names = [tile.name for tile in tiles]
-    nodes = {node.id: node for tile in tiles for node in recipe(tile, settings, names, without)}
-    ordered: dict[NodeId, Node] = {}
+    tasks = {task.id: task for tile in tiles for task in build_graph(tile, settings, names, without)}
+    ordered: dict[TaskId, Task] = {}
 
-    def add(node: Node) -> None:
-        for source in node.inputs.values():
-            if isinstance(source, Output) and source.node not in ordered:
-                add(nodes[source.node])
-        ordered.setdefault(node.id, node)
+    def add(task: Task) -> None:
+        for source in task.inputs.values():
+            if isinstance(source, Output) and source.task not in ordered:
+                add(tasks[source.task])
+        ordered.setdefault(task.id, task)
 
-    for node in nodes.values():
-        add(node)
+    for task in tasks.values():
+        add(task)
     return list(ordered.values())

@@ -1,4 +1,4 @@
-"""Which steps place a scanner's sweeps, in order: matched, fused with what else tells the path, and imported."""
+"""Pipeline definition of lidar sweeps: lidar odometry, fusion with GPS and other poses, and import."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import Field
 
-from scan2sim.flows.pipelines.graph import Node, NodeId, Output
+from scan2sim.flows.pipelines.graph import Output, Task, TaskId
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.parameters import Shift
 from scan2sim.pipeline.core.step import Step
@@ -21,88 +21,102 @@ STEPS: tuple[Step, ...] = (LIDAR, FUSE, IMPORT_SWEEPS)
 
 
 class Sweeps(SweepsParams):
-    """Sweeps and what is beside them: the options of `scan2sim import sweeps`, and `[sweeps]` of a `drive.toml`."""
+    """Sweeps and related files: the options of `scan2sim import sweeps`, and table `[sweeps]` of a `drive.toml`."""
 
-    folder: Path = Field(description="Folder of sweeps in scanner axes: .bin, .pcd, .ply, .las, .laz.")
-    poses: Path | None = Field(None, description="Trajectory, of `slam` for example: .csv, .tum, .kitti; z-up.")
-    gps: Path | None = Field(None, description="GPX, NMEA, CSV, or a GoPro video: fused with the rest, and places it.")
-    gps_offset: Shift = Field(0.0, description="Seconds to add to GPS's times.")
-    lidar: bool = Field(False, description="Match sweeps, too, where there is a trajectory (without, they always are).")
-    extrinsics: Path | None = Field(
-        None, description="T_camera_scanner, 3 or 4 rows, or KITTI's calibration: poses are the camera's."
+    folder: Path = Field(description="Folder of sweeps in scanner coordinates: .bin, .pcd, .ply, .las or .laz files.")
+    poses: Path | None = Field(
+        None, description="Trajectory (.csv, .tum, .kitti; z up), such as one of `scan2sim slam`."
     )
-    times: Path | None = Field(None, description="Of sweeps, seconds, one a line; default: names, or order.")
-    photos: Path | None = Field(None, description="Folder of photos: they colour the points.")
-    photo_times: Path | None = Field(None, description="Of photos, likewise.")
-    mask: Path | None = Field(None, description="Of all photos: 0 where the car itself is seen.")
+    gps: Path | None = Field(
+        None, description="GPS track, to fuse and to georeference: GPX, NMEA, CSV, or a GoPro video."
+    )
+    gps_offset: Shift = Field(0.0, description="Seconds to add to the times of the GPS track.")
+    lidar: bool = Field(
+        False,
+        description="Run lidar odometry also if a trajectory is given; without one it always runs.",
+    )
+    extrinsics: Path | None = Field(
+        None,
+        description="File of the matrix T_camera_scanner (3 or 4 rows, or KITTI's), if the poses are the camera's.",
+    )
+    times: Path | None = Field(
+        None,
+        description="Text file with the times of the sweeps: seconds, one per line; default: file names, or order.",
+    )
+    photos: Path | None = Field(None, description="Folder of photos, which colour the points and texture the world.")
+    photo_times: Path | None = Field(
+        None, description="Text file with the times of the photos: seconds, one per line; default: as for the sweeps."
+    )
+    mask: Path | None = Field(None, description="Ego-vehicle mask of all photos: an image, 0 on the car.")
 
     @property
     def camera_file(self) -> Path | None:
-        """Where the photos' camera is described, if `camera` is no model's name."""
+        """TOML file of the photos' camera, if `camera` names a file and not a camera model."""
         return Path(self.camera) if self.camera.endswith(".toml") or Path(self.camera).is_file() else None
 
     def inputs(self, here: Path) -> dict[str, Path]:
-        """Of the import; files are relative to `here`."""
+        """Input files of the import; paths are relative to `here`."""
         beside = ("poses", "extrinsics", "times", "photos", "photo_times", "mask")
         files = {"sweeps": self.folder, "camera": self.camera_file} | {name: getattr(self, name) for name in beside}
         return {name: here / path for name, path in files.items() if path is not None}
 
     def params(self) -> SweepsParams:
-        """Of the import: what isn't a file."""
+        """Parameters of the import, without files."""
         given = {name: getattr(self, name) for name in SweepsParams.model_fields}
         return SweepsParams(**given | ({"camera": "auto"} if self.camera_file else {}))
 
 
-def alone(sweeps: Sweeps, poses: bool) -> bool:
-    """Whether a trajectory alone places sweeps; `poses`: there is one."""
+def uses_only_poses(sweeps: Sweeps, poses: bool) -> bool:
+    """Whether only a given trajectory places the sweeps; `poses`: whether there is one."""
     return poses and not sweeps.lidar and sweeps.gps is None
 
 
-def path(sweeps: Sweeps, here: Path, poses: Path | Output | None) -> list[Node]:
-    """The graph of the scanner's path: none where a trajectory alone tells it.
+def path(sweeps: Sweeps, here: Path, poses: Path | Output | None) -> list[Task]:
+    """The tasks that estimate the scanner's trajectory; none if a given trajectory suffices.
 
     Args:
-        here: what files are relative to.
-        poses: the trajectory, or None.
+        sweeps: sweeps and related files.
+        here: folder that paths are relative to.
+        poses: the given trajectory, or None.
 
     Raises:
         SettingError: `scanner_poses` without poses.
     """
-    if alone(sweeps, poses is not None):
+    if uses_only_poses(sweeps, poses is not None):
         return []
     files: dict[str, Path | Output] = {"sweeps": here / sweeps.folder}
     if sweeps.times is not None:
         files["times"] = here / sweeps.times
-    told = dict(files)
-    nodes = []
+    fused = dict(files)
+    tasks = []
     if sweeps.lidar or poses is None:
         own = {name: getattr(sweeps, name) for name in LidarParams.model_fields}
-        nodes.append(Node(LIDAR, LidarParams(**own), files))
-        told["matched"] = Output(NodeId("lidar"), "matched")
+        tasks.append(Task(LIDAR, LidarParams(**own), files))
+        fused["matched"] = Output(TaskId("lidar"), "matched")
     if poses is not None:
-        told["poses"] = poses
+        fused["poses"] = poses
         if sweeps.extrinsics is not None:
-            told["extrinsics"] = here / sweeps.extrinsics
+            fused["extrinsics"] = here / sweeps.extrinsics
     elif sweeps.scanner_poses:
-        raise SettingError("--scanner-poses", "there are no poses", "Leave it out, or give a trajectory")
+        raise SettingError("--scanner-poses", "no trajectory is given", "Leave it out, or give a trajectory")
     if sweeps.gps is not None:
-        told["gps"] = here / sweeps.gps
+        fused["gps"] = here / sweeps.gps
     own = {name: getattr(sweeps, name) for name in FuseParams.model_fields}
-    return [*nodes, Node(FUSE, FuseParams(**own), told)]
+    return [*tasks, Task(FUSE, FuseParams(**own), fused)]
 
 
 def placed(sweeps: Sweeps, here: Path, poses: Path | Output | None) -> tuple[dict[str, Path | Output], SweepsParams]:
-    """What the import reads, and its parameters; arguments as of `path`.
+    """Inputs and parameters of the import; arguments as for `path`.
 
     Raises:
-        ScanError: GPS can't be read.
+        ScanError: the GPS track can't be read.
     """
     files: dict[str, Path | Output] = {**sweeps.inputs(here)}
     if poses is not None:
         files["poses"] = poses
-    if alone(sweeps, poses is not None):
+    if uses_only_poses(sweeps, poses is not None):
         return files, sweeps.params()
-    files["poses"] = Output(NodeId("fuse"), "trajectory")
+    files["poses"] = Output(TaskId("fuse"), "trajectory")
     crs = sweeps.crs
     if crs == crs_io.LOCAL and sweeps.gps is not None:
         crs = gps_io.read(here / sweeps.gps).frame.crs
@@ -110,7 +124,7 @@ def placed(sweeps: Sweeps, here: Path, poses: Path | Output | None) -> tuple[dic
     return files, sweeps.params().model_copy(update=changed)
 
 
-def recipe(sweeps: Sweeps, here: Path, poses: Path | Output | None) -> list[Node]:
-    """The graph that makes a corridor of sweeps; arguments and errors as of `path`."""
+def build_graph(sweeps: Sweeps, here: Path, poses: Path | Output | None) -> list[Task]:
+    """The task graph that makes a corridor of sweeps; arguments and errors as for `path`."""
     files, params = placed(sweeps, here, poses)
-    return [*path(sweeps, here, poses), Node(IMPORT_SWEEPS, params, files)]
+    return [*path(sweeps, here, poses), Task(IMPORT_SWEEPS, params, files)]

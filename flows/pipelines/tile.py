@@ -1,4 +1,4 @@
-"""Which steps make a tile, in order: the whole graph on one page."""
+"""Pipeline definition of a tile: the task graph from clouds and photos to the world and its reports."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.flows.pipelines.graph import Node, NodeId, Output
+from scan2sim.flows.pipelines.graph import Output, Task, TaskId
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.pipeline.core.classes import GROUPS
 from scan2sim.pipeline.core.step import Step
@@ -65,347 +65,369 @@ STEPS: tuple[Step, ...] = (
 
 
 Sources = dict[str, Path | Output]
+"""Inputs of a task by name: source files and outputs of other tasks."""
 
 
-def recipe(
-    tile: Tile, settings: Settings, beside: Collection[str] | None = None, without: Collection[NodeId] = ()
-) -> list[Node]:
-    """The graph of a tile, each node after those that it reads of the same tile.
+def build_graph(
+    tile: Tile, settings: Settings, survey_tiles: Collection[str] | None = None, without: Collection[TaskId] = ()
+) -> list[Task]:
+    """The task graph of a tile, each task after those of the same tile that it reads.
 
     Args:
-        tile: to be made.
+        tile: the tile to build.
         settings: of all steps.
-        beside: names of the tiles of its survey that are made, too: nodes are `tile/step` then, and what happens at the
-            borders reads neighbours' results. Without it the tile is made for itself, and ends at its borders.
-        without: side products that failed, of this tile and its neighbours: the graph is as if they were switched off.
+        survey_tiles: names of all tiles of the survey that are built: tasks are then named `tile/step`, and steps at
+            the borders read results of the neighbours. None: the tile is built alone, and ends at its borders.
+        without: side products of this tile and its neighbours to leave out, because they failed.
 
     Raises:
         SettingError: a setting that doesn't exist or is out of range.
     """
     settings.check(STEPS)
-    graph = _Graph(tile, settings, beside, without)
-    evidence = graph.classes()
-    graph.parts(graph.whole())
-    made = graph.made_up(evidence)
+    graph = _GraphBuilder(tile, settings, survey_tiles, without)
+    evidence = graph.classify()
+    graph.split_cloud(graph.merge_neighbours())
+    synthesized = graph.synthesize_points(evidence)
     for group in graph.groups:
-        graph.surface(group, made.get(group, {}))
-    lists = graph.places()
-    surfaces, seen = graph.photos(evidence, lists)
-    textured = graph.textures(surfaces, seen, made)
-    lists |= graph.roads(textured)
-    graph.results(surfaces, textured, seen, lists, made)
-    return graph.nodes
+        graph.add_surface(group, synthesized.get(group, {}))
+    lists = graph.add_lists()
+    surfaces, seen = graph.analyse_photos(evidence, lists)
+    textured = graph.add_textures(surfaces, seen, synthesized)
+    lists |= graph.add_roads(textured)
+    graph.add_results(surfaces, textured, seen, lists, synthesized)
+    return graph.tasks
 
 
-class _Graph:
-    """A tile's graph as it grows.
+class _GraphBuilder:
+    """Builds the task graph of a tile.
 
     Attributes:
-        nodes: so far.
-        cell: parameters of what happens at borders; empty where the tile was cut from nothing.
-        adjoining: neighbours that are made, too, and
-        first: those of them that own the border with this one.
-        photographed: whether there are photos from the ground.
-        scanner: the path, where there is one, and
-        rays: it again where it is the scanner's own, not the cameras'.
-        listed: the things that were found.
-        standing: furniture, by class, and what is known of it.
-        kept: whether vehicles are.
-        groups: classes that get a surface; `parted`: all that the cloud is split into.
+        tasks: tasks added so far.
+        cell: parameters of the steps at borders; empty if the tile isn't part of a survey.
+        neighbours: names of the neighbouring tiles that are built, too.
+        border_owners: those neighbours that own the border with this tile.
+        has_ground_photos: whether there are photos other than orthophotos.
+        path: path of the scanner or else of the cameras, as an input; empty if there is none.
+        scanner_path: the same, but only of the scanner, for rays to the points.
+        instances: detected instances (vehicles, ...), as an input.
+        furniture: outputs of step `furniture` by name.
+        keep_vehicles: whether parked vehicles get a surface.
+        groups: classes that get a surface.
+        cloud_groups: classes that the cloud is split into.
     """
 
     def __init__(
-        self, tile: Tile, settings: Settings, beside: Collection[str] | None, without: Collection[NodeId]
+        self, tile: Tile, settings: Settings, survey_tiles: Collection[str] | None, without: Collection[TaskId]
     ) -> None:
-        self.nodes: list[Node] = []
+        self.tasks: list[Task] = []
         self.tile, self.settings, self._without = tile, settings, without
-        self._name = "" if beside is None else tile.name
+        self._name = "" if survey_tiles is None else tile.name
         self.cell: dict[str, Any] = {}
         if tile.cell:
             self.cell = {"seed": tile.cell.seed, "neighbours": dict(tile.cell.neighbours)}
-        self.adjoining = [name for name in self.cell.get("neighbours", {}) if name in (beside or ())]
-        self.first = [name for name in self.adjoining if name < tile.name]
-        self.photographed = any(view.camera.model != "orthographic" for view in tile.views)
-        self.scanner: Sources = {}
-        self.rays: Sources = {}
-        self.listed: Sources = {}
-        self.standing: Sources = {}
-        self.kept = False
+        self.neighbours = [name for name in self.cell.get("neighbours", {}) if name in (survey_tiles or ())]
+        self.border_owners = [name for name in self.neighbours if name < tile.name]
+        self.has_ground_photos = any(view.camera.model != "orthographic" for view in tile.views)
+        self.path: Sources = {}
+        self.scanner_path: Sources = {}
+        self.instances: Sources = {}
+        self.furniture: Sources = {}
+        self.keep_vehicles = False
         self.groups: list[str] = []
-        self.parted: tuple[str, ...] = ()
+        self.cloud_groups: tuple[str, ...] = ()
 
-    def at(self, step: Step, name: str, group: str = "", other: str | None = None) -> Output:
-        """An output of a node of this tile, or of the neighbour `other`."""
-        return Output(NodeId(step.name, group, self._name if other is None else other), name)
+    def output(self, step: Step, name: str, group: str = "", other: str | None = None) -> Output:
+        """An output of a task of this tile, or of the neighbour `other`."""
+        return Output(TaskId(step.name, group, self._name if other is None else other), name)
 
-    def runs(self, step: Step, other: str | None = None) -> bool:
-        """Whether a side product of this tile, or of the neighbour `other`, has not failed."""
-        return NodeId(step.name, tile=self._name if other is None else other) not in self._without
+    def is_enabled(self, step: Step, other: str | None = None) -> bool:
+        """Whether a step of this tile, or of the neighbour `other`, is not among the failed side products."""
+        return TaskId(step.name, tile=self._name if other is None else other) not in self._without
 
     def add(self, step: Step, inputs: Mapping[str, Path | Output], group: str = "", **given: Any) -> None:
-        """One more node, unless it is a side product that failed."""
-        if self.runs(step):
-            self.nodes.append(Node(step, self.settings.params(step, group, **given), inputs, group, self._name))
+        """Add a task, unless it is a side product that failed."""
+        if self.is_enabled(step):
+            self.tasks.append(Task(step, self.settings.params(step, group, **given), inputs, group, self._name))
 
-    def of_neighbours(self, step: Step, name: str, group: str = "", prefix: str | None = None) -> Sources:
-        """An output of all neighbours' nodes, by `prefix` (default: its name) and the tile's name."""
-        made = [tile for tile in self.adjoining if self.runs(step, tile)]
-        return {f"{prefix or name}.{tile}": self.at(step, name, group, tile) for tile in made}
+    def neighbour_outputs(self, step: Step, name: str, group: str = "", prefix: str | None = None) -> Sources:
+        """An output of the tasks of all neighbours, as inputs `prefix.tile`; default prefix: the output's name."""
+        tiles = [tile for tile in self.neighbours if self.is_enabled(step, tile)]
+        return {f"{prefix or name}.{tile}": self.output(step, name, group, tile) for tile in tiles}
 
-    def classes(self) -> Sources:
-        """What each point is, by photos and shape; returns what photos tell of points."""
-        tile, at, add = self.tile, self.at, self.add
+    def classify(self) -> Sources:
+        """Add the classification of points by photos and shape; returns the inputs with the photos' classes."""
+        tile, output, add = self.tile, self.output, self.add
         frame: dict[str, Any] = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
         files = {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}
         add(INGEST, files, **frame, classes=dict(tile.classes))
         path = scanner_path(tile)
         if path:
             add(PATH, {}, **path)
-            self.scanner = {"path": at(PATH, "path")}
-        self.rays = self.scanner if tile.trajectory is not None else {}  # cameras aren't where the scanner was
-        cameras = _rows([view.centre for view in tile.views if view.camera.model != "orthographic"])
-        add(CARVE, {"cloud": at(INGEST, "cloud")} | self.rays, cameras=cameras)
-        whole: Sources = {"cloud": at(CARVE, "cloud")}
+            self.path = {"path": output(PATH, "path")}
+        self.scanner_path = (
+            self.path if tile.trajectory is not None else {}
+        )  # cameras are not at the scanner's position
+        cameras = _position_rows([view.centre for view in tile.views if view.camera.model != "orthographic"])
+        add(CARVE, {"cloud": output(INGEST, "cloud")} | self.scanner_path, cameras=cameras)
+        whole: Sources = {"cloud": output(CARVE, "cloud")}
         photos: Sources = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
         masks: Sources = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
         add(VIEWS, photos | masks | whole, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
         evidence: Sources = {}
-        if self.photographed:
-            add(LABEL, whole | self._views() | _weights(self.settings), **_kept(self.settings))
-            evidence = {**self._views(), **self._moving(), "labels": at(LABEL, "labels")}
-        add(SEGMENT, whole | self.scanner | evidence)
+        if self.has_ground_photos:
+            add(LABEL, whole | self._views_input() | _weights_input(self.settings), **_label_params(self.settings))
+            evidence = {**self._views_input(), **self._moving_input(), "labels": output(LABEL, "labels")}
+        add(SEGMENT, whole | self.path | evidence)
         return evidence
 
-    def _views(self) -> Sources:
-        return {"views": self.at(VIEWS, "views")}
+    def _views_input(self) -> Sources:
+        return {"views": self.output(VIEWS, "views")}
 
-    def _moving(self) -> Sources:
-        return {"moving": self.at(CARVE, "moving")}
+    def _moving_input(self) -> Sources:
+        return {"moving": self.output(CARVE, "moving")}
 
-    def whole(self) -> Output:
-        """The cloud without what moves or is too far, with what neighbours know of the border; returns it."""
-        at, add = self.at, self.add
-        last = SEGMENT  # step whose cloud is split, in every tile of a survey the same
-        if self.settings.params(THINGS).find and (self.scanner or self.adjoining):
-            classified: Sources = {name: at(SEGMENT, name) for name in ("cloud", "confidence")}
-            add(THINGS, classified | self._moving() | self.scanner)
-            last, self.listed = THINGS, {"things": at(THINGS, "things")} if self.scanner else {}
+    def merge_neighbours(self) -> Output:
+        """Add instances, photo coverage and the neighbours' points at borders; returns the resulting cloud."""
+        output, add = self.output, self.add
+        last = SEGMENT  # the step whose cloud is split; the same one in all tiles of a survey
+        if self.settings.params(THINGS).find and (self.path or self.neighbours):
+            classified: Sources = {name: output(SEGMENT, name) for name in ("cloud", "confidence")}
+            add(THINGS, classified | self._moving_input() | self.path)
+            last, self.instances = THINGS, {"things": output(THINGS, "things")} if self.path else {}
         limit = self.settings.params(REACH).limit
-        if limit != "off" and (self.adjoining or (self.scanner and (self.photographed or limit != "auto"))):
-            shown = self._views() if self.photographed else {}
+        if limit != "off" and (self.neighbours or (self.path and (self.has_ground_photos or limit != "auto"))):
+            shown = self._views_input() if self.has_ground_photos else {}
             size = self.settings.params(VOXEL, "terrain").size
-            add(REACH, {"cloud": at(last, "cloud")} | self.scanner | shown, voxel=size)
+            add(REACH, {"cloud": output(last, "cloud")} | self.path | shown, voxel=size)
             last = REACH
-        if not (self.adjoining and self.tile.cell):
-            return at(last, "cloud")
-        others = self.of_neighbours(last, "cloud")
+        if not (self.neighbours and self.tile.cell):
+            return output(last, "cloud")
+        others = self.neighbour_outputs(last, "cloud")
         cell = self.tile.cell
-        add(OVERLAP, {"cloud": at(last, "cloud")} | others, name=self.tile.name, buffer=cell.buffer, **self.cell)
-        return at(OVERLAP, "cloud")
+        add(OVERLAP, {"cloud": output(last, "cloud")} | others, name=self.tile.name, buffer=cell.buffer, **self.cell)
+        return output(OVERLAP, "cloud")
 
-    def parts(self, cloud: Output) -> None:
-        """Furniture taken out, the rest split by class and thinned."""
-        wanted = (self.scanner or self.adjoining) and self.settings.params(FURNITURE).when == "auto"
-        if wanted:
-            self.add(FINDS, {"cloud": cloud} | self.scanner, **self.cell)
-        if wanted and self.runs(FINDS) and self.runs(FURNITURE):
-            found = {"finds": self.at(FINDS, "finds")} | self.of_neighbours(FINDS, "finds")
-            self.add(FURNITURE, {"cloud": cloud} | found, name=self.tile.name, **self.cell)
+    def split_cloud(self, cloud: Output) -> None:
+        """Add removal of street furniture from the cloud, its split by class, and the voxel filter of each part."""
+        enabled = (self.path or self.neighbours) and self.settings.params(FURNITURE).when == "auto"
+        if enabled:
+            self.add(FINDS, {"cloud": cloud} | self.path, **self.cell)
+        if enabled and self.is_enabled(FINDS) and self.is_enabled(FURNITURE):
+            detections = {"finds": self.output(FINDS, "finds")} | self.neighbour_outputs(FINDS, "finds")
+            self.add(FURNITURE, {"cloud": cloud} | detections, name=self.tile.name, **self.cell)
             names = (*GROUPS[1:], "taken", "plates", "beside", "geojson", "csv")
-            self.standing = {name: self.at(FURNITURE, name) for name in names}
-        given = self.settings.params(SPLIT)
-        self.kept = given.vehicles == "keep" and bool(self.listed)
-        taken = {name: self.standing[name] for name in self.standing if name == "taken"}
-        self.add(SPLIT, {"cloud": cloud} | (self.listed if self.kept else {}) | taken)
-        vehicle = ("vehicle",) if self.kept else ()
-        self.groups = [g for g in (*GROUPS, *vehicle) if g != "vegetation" or given.vegetation != "locations"]
-        self.parted = (*GROUPS, "rest", *vehicle)
-        for part in self.parted:
-            self.add(VOXEL, {"cloud": self.at(SPLIT, part)} | self.scanner, part)
+            self.furniture = {name: self.output(FURNITURE, name) for name in names}
+        split_params = self.settings.params(SPLIT)
+        self.keep_vehicles = split_params.vehicles == "keep" and bool(self.instances)
+        removed_points = {name: self.furniture[name] for name in self.furniture if name == "taken"}
+        self.add(SPLIT, {"cloud": cloud} | (self.instances if self.keep_vehicles else {}) | removed_points)
+        vehicle = ("vehicle",) if self.keep_vehicles else ()
+        self.groups = [g for g in (*GROUPS, *vehicle) if g != "vegetation" or split_params.vegetation != "locations"]
+        self.cloud_groups = (*GROUPS, "rest", *vehicle)
+        for part in self.cloud_groups:
+            self.add(VOXEL, {"cloud": self.output(SPLIT, part)} | self.path, part)
 
-    def made_up(self, evidence: Sources) -> dict[str, Sources]:
-        """Points that no scanner saw: ground below what hid it, walls below roofs and above its reach; by class."""
-        made: dict[str, Sources] = {}
+    def synthesize_points(self, evidence: Sources) -> dict[str, Sources]:
+        """Add points that the scanner did not see: occluded ground, walls below roofs and above its view; by class."""
+        synthesized: dict[str, Sources] = {}
         when = self.settings.params(GROUND).when
-        hidden = self.listed if when == "auto" else {}
-        if hidden or self._from_above(when):
+        hidden = self.instances if when == "auto" else {}
+        if hidden or self._runs_on_airborne(when):
             others: Sources = {}
             for name in hidden:
-                others |= self.of_neighbours(THINGS, name)
-            made["terrain"] = self._make_up(GROUND, (*GROUPS, "rest"), {**hidden, **others})
-        if self._from_above(self.settings.params(WALLS).when):
-            below: Sources = {"ground": made["terrain"]["made"]} if "terrain" in made else {}
+                others |= self.neighbour_outputs(THINGS, name)
+            synthesized["terrain"] = self._add_synthesis(GROUND, (*GROUPS, "rest"), {**hidden, **others})
+        if self._runs_on_airborne(self.settings.params(WALLS).when):
+            below: Sources = {"ground": synthesized["terrain"]["made"]} if "terrain" in synthesized else {}
             below |= {"footprints": self.tile.footprints} if self.tile.footprints else {}
-            made["building"] = self._make_up(WALLS, ("building", "terrain"), below)
-        if self.rays and self.photographed and "building" not in made and self.settings.params(FACADES).when == "auto":
+            synthesized["building"] = self._add_synthesis(WALLS, ("building", "terrain"), below)
+        if (
+            self.scanner_path
+            and self.has_ground_photos
+            and "building" not in synthesized
+            and self.settings.params(FACADES).when == "auto"
+        ):
             shown = {name: evidence[name] for name in ("views", "labels")}
             size = self.settings.params(VOXEL, "building").size
-            clouds = {"cloud": self.at(VOXEL, "cloud", "building")} | self._beside("building")
-            self.add(FACADES, clouds | self.rays | shown, voxel=size, **self.cell)
-            made["building"] = {"made": self.at(FACADES, "made")}
-        return made
+            clouds = {"cloud": self.output(VOXEL, "cloud", "building")} | self._other_clouds("building")
+            self.add(FACADES, clouds | self.scanner_path | shown, voxel=size, **self.cell)
+            synthesized["building"] = {"made": self.output(FACADES, "made")}
+        return synthesized
 
-    def _from_above(self, when: str) -> bool:
-        """Whether a step for airborne clouds is to run."""
-        return when == "always" or (when == "auto" and not self.scanner)
+    def _runs_on_airborne(self, when: str) -> bool:
+        """Whether a step for airborne clouds runs: always, or if there is no path on the ground."""
+        return when == "always" or (when == "auto" and not self.path)
 
-    def _make_up(self, step: Step, parts: Sequence[str], more: Sources) -> Sources:
-        """What a step makes up of the voxels of some classes, the neighbours' among them."""
-        inputs: Sources = {part: self.at(VOXEL, "cloud", part) for part in parts}
+    def _add_synthesis(self, step: Step, parts: Sequence[str], more: Sources) -> Sources:
+        """Add a step that synthesizes points from the voxels of some classes, including those of the neighbours."""
+        inputs: Sources = {part: self.output(VOXEL, "cloud", part) for part in parts}
         for part in parts:
-            inputs |= self.of_neighbours(VOXEL, "cloud", part, prefix=part)
+            inputs |= self.neighbour_outputs(VOXEL, "cloud", part, prefix=part)
         cell = self.tile.cell
-        around = {"name": self.tile.name, "buffer": cell.buffer, **self.cell} if cell else {}
-        self.add(step, inputs | more, **around)
-        return {"made": self.at(step, "made")}
+        border = {"name": self.tile.name, "buffer": cell.buffer, **self.cell} if cell else {}
+        self.add(step, inputs | more, **border)
+        return {"made": self.output(step, "made")}
 
-    def _beside(self, group: str) -> Sources:
-        """The voxels of all other classes."""
-        return {f"other.{part}": self.at(VOXEL, "cloud", part) for part in self.parted if part != group}
+    def _other_clouds(self, group: str) -> Sources:
+        """The voxels of all other classes, as inputs."""
+        return {f"other.{part}": self.output(VOXEL, "cloud", part) for part in self.cloud_groups if part != group}
 
-    def surface(self, group: str, made: Sources) -> None:
-        """A class's mesh: reconstructed, trimmed, straightened, met with the neighbours', decimated."""
-        at, add, cell = self.at, self.add, self.cell
-        cloud, size = at(VOXEL, "cloud", group), self.settings.params(VOXEL, group).size
-        borne: Sources = {"cloud": cloud, **made}
-        add(POISSON, borne, group, voxel=size, aligned=bool(cell))
-        add(TRIM, {"mesh": at(POISSON, "mesh", group), **borne}, group, voxel=size)
-        surface = at(TRIM, "mesh", group)
+    def add_surface(self, group: str, synthesized: Sources) -> None:
+        """Add the mesh of a class: reconstruct, trim, snap to planes, join with the neighbours' meshes, decimate."""
+        output, add, cell = self.output, self.add, self.cell
+        cloud, size = output(VOXEL, "cloud", group), self.settings.params(VOXEL, group).size
+        point_inputs: Sources = {"cloud": cloud, **synthesized}
+        add(POISSON, point_inputs, group, voxel=size, aligned=bool(cell))
+        add(TRIM, {"mesh": output(POISSON, "mesh", group), **point_inputs}, group, voxel=size)
+        surface = output(TRIM, "mesh", group)
         when = self.settings.params(PLANES).when
-        if group == "building" and (when == "always" or (when == "auto" and self.scanner)):
-            points = {**borne, "points": at(SPLIT, group)}
-            add(PLANES, {"mesh": surface, **points, **self._beside(group)}, voxel=size, **cell)
-            surface = at(PLANES, "mesh")
+        if group == "building" and (when == "always" or (when == "auto" and self.path)):
+            points = {**point_inputs, "points": output(SPLIT, group)}
+            add(PLANES, {"mesh": surface, **points, **self._other_clouds(group)}, voxel=size, **cell)
+            surface = output(PLANES, "mesh")
         add(ISLANDS, {"mesh": surface}, group)
-        surface = at(ISLANDS, "mesh", group)
+        surface = output(ISLANDS, "mesh", group)
         if cell:
             add(CLIP, {"mesh": surface}, group, **cell)
-            surface = at(CLIP, "mesh", group)
-        if self.adjoining:
-            clipped = {name: at(CLIP, name, group) for name in ("mesh", "on")}
-            others = {f"{name}.{tile}": at(CLIP, name, group, tile) for tile in self.first for name in clipped}
+            surface = output(CLIP, "mesh", group)
+        if self.neighbours:
+            clipped = {name: output(CLIP, name, group) for name in ("mesh", "on")}
+            others = {
+                f"{name}.{tile}": output(CLIP, name, group, tile) for tile in self.border_owners for name in clipped
+            }
             add(JOIN, clipped | others, group, name=self.tile.name, **cell)
-            surface = at(JOIN, "mesh", group)
-        things = {"furniture": self.standing[group]} if group in self.standing else {}
+            surface = output(JOIN, "mesh", group)
+        things = {"furniture": self.furniture[group]} if group in self.furniture else {}
         add(DECIMATE, {"mesh": surface, **things}, group, keep_border=bool(cell))
 
-    def places(self) -> Sources:
-        """Lists of what stands where, for the export."""
+    def add_lists(self) -> Sources:
+        """Add lists of street furniture and plants; returns them as inputs of the export."""
         lists: Sources = {}
-        if self.standing and self.scanner:
-            lists = {"furniture": self.standing["geojson"], "furniture_csv": self.standing["csv"]}
-        if self.settings.params(SPLIT).vegetation != "mesh" and self.runs(PLANTS):
-            clouds = {name: self.at(VOXEL, "cloud", name) for name in ("vegetation", "terrain")}
+        if self.furniture and self.path:
+            lists = {"furniture": self.furniture["geojson"], "furniture_csv": self.furniture["csv"]}
+        if self.settings.params(SPLIT).vegetation != "mesh" and self.is_enabled(PLANTS):
+            clouds = {name: self.output(VOXEL, "cloud", name) for name in ("vegetation", "terrain")}
             self.add(PLANTS, clouds, **self.cell)
-            lists |= {"plants": self.at(PLANTS, "geojson"), "plants_csv": self.at(PLANTS, "csv")}
+            lists |= {"plants": self.output(PLANTS, "geojson"), "plants_csv": self.output(PLANTS, "csv")}
         return lists
 
-    def planted(self, output: str) -> Sources:
-        """Models of plants, where there is no mesh of vegetation."""
+    def plant_models(self, output: str) -> Sources:
+        """Models of plants as an input, if there is no mesh of the vegetation."""
         wanted = self.settings.params(PLANTS).models and self.settings.params(SPLIT).vegetation == "locations"
-        return {"vegetation": self.at(PLANTS, output)} if wanted and self.runs(PLANTS) else {}
+        return {"vegetation": self.output(PLANTS, output)} if wanted and self.is_enabled(PLANTS) else {}
 
-    def photos(self, evidence: Sources, lists: Sources) -> tuple[Sources, Sources]:
-        """What photos see of the meshes, and how well they agree; signs are fitted to them, and listed in `lists`.
+    def analyse_photos(self, evidence: Sources, lists: Sources) -> tuple[Sources, Sources]:
+        """Add pose refinement, sign fitting, visibility, exposure and photo consistency; adds signs to `lists`.
 
         Returns:
-            The final mesh of each class, and what is known of the photos.
+            The final mesh of each class, and the inputs about photos.
         """
-        at, add = self.at, self.add
-        surfaces: Sources = {group: at(DECIMATE, "mesh", group) for group in self.groups}
-        seen, clouds = self._views(), self._clouds()
-        if self.photographed and self.settings.params(REFINE).when == "auto":
-            add(REFINE, _meshes(surfaces) | {"cloud.rest": clouds["cloud.rest"]} | self._moving() | seen)
-            seen = {"views": at(REFINE, "views")}
-        if self.photographed and self.standing and self.settings.params(SIGNS).when == "auto" and self.runs(SIGNS):
-            plates = {name: self.standing[name] for name in ("plates", "beside", "geojson")}
-            add(SIGNS, _meshes(surfaces) | plates | seen | {"labels": evidence["labels"]}, **self.cell)
-            surfaces |= {group: at(SIGNS, group) for group in self.groups if group in ("building", "vegetation")}
-            lists |= {"furniture": at(SIGNS, "geojson"), "furniture_csv": at(SIGNS, "csv")}
-        add(VISIBILITY, _meshes(surfaces) | clouds | self._moving() | seen)
-        seen = {**seen, "depth": at(VISIBILITY, "depth")}
+        output, add = self.output, self.add
+        surfaces: Sources = {group: output(DECIMATE, "mesh", group) for group in self.groups}
+        seen, clouds = self._views_input(), self._cloud_inputs()
+        if self.has_ground_photos and self.settings.params(REFINE).when == "auto":
+            add(REFINE, _mesh_inputs(surfaces) | {"cloud.rest": clouds["cloud.rest"]} | self._moving_input() | seen)
+            seen = {"views": output(REFINE, "views")}
+        if (
+            self.has_ground_photos
+            and self.furniture
+            and self.settings.params(SIGNS).when == "auto"
+            and self.is_enabled(SIGNS)
+        ):
+            plates = {name: self.furniture[name] for name in ("plates", "beside", "geojson")}
+            add(SIGNS, _mesh_inputs(surfaces) | plates | seen | {"labels": evidence["labels"]}, **self.cell)
+            surfaces |= {group: output(SIGNS, group) for group in self.groups if group in ("building", "vegetation")}
+            lists |= {"furniture": output(SIGNS, "geojson"), "furniture_csv": output(SIGNS, "csv")}
+        add(VISIBILITY, _mesh_inputs(surfaces) | clouds | self._moving_input() | seen)
+        seen = {**seen, "depth": output(VISIBILITY, "depth")}
         prior = self.settings.params(EXPOSURE).prior
         add(EXPOSURE, seen | ({"prior": Path(prior)} if prior else {}))
-        seen = {**seen, "exposures": at(EXPOSURE, "exposures")}
+        seen = {**seen, "exposures": output(EXPOSURE, "exposures")}
         add(AGREEMENT, seen)
-        return surfaces, {**seen, "agreement": at(AGREEMENT, "agreement")}
+        return surfaces, {**seen, "agreement": output(AGREEMENT, "agreement")}
 
-    def _clouds(self) -> Sources:
-        return {f"cloud.{part}": self.at(VOXEL, "cloud", part) for part in self.parted}
+    def _cloud_inputs(self) -> Sources:
+        return {f"cloud.{part}": self.output(VOXEL, "cloud", part) for part in self.cloud_groups}
 
-    def textures(self, surfaces: Sources, seen: Sources, made: Mapping[str, Sources]) -> Sources:
-        """Each class's mesh with its pages, in the neighbours' colours at borders."""
-        at, add = self.at, self.add
-        own: Sources = {"cloud.furniture": at(SPLIT, "furniture")} if self.standing else {}
-        points = self._clouds() | own | _invented(made)
+    def add_textures(self, surfaces: Sources, seen: Sources, synthesized: Mapping[str, Sources]) -> Sources:
+        """Add view selection, unwrapping and texturing of each class, and colour harmonization with the neighbours."""
+        output, add = self.output, self.add
+        own: Sources = {"cloud.furniture": output(SPLIT, "furniture")} if self.furniture else {}
+        points = self._cloud_inputs() | own | _synthesized_inputs(synthesized)
         for group in self.groups:
             mesh = {"mesh": surfaces[group]}
             add(CHOOSE, mesh | seen, group)
-            choice = {"choice": at(CHOOSE, "choice", group)}
+            choice = {"choice": output(CHOOSE, "choice", group)}
             by_photo = {**choice, **seen} if self.settings.params(UNWRAP, group).backend == "photo" else {}
             add(UNWRAP, mesh | by_photo, group)
-            unwrapped = {name: at(UNWRAP, name, group) for name in ("mesh", "pages")}
-            stood = self.listed if group == "terrain" and not self.kept else {}
-            add(TEXTURE, {**unwrapped, **choice, **points, **seen, **stood}, group)
+            unwrapped = {name: output(UNWRAP, name, group) for name in ("mesh", "pages")}
+            occluders = self.instances if group == "terrain" and not self.keep_vehicles else {}
+            add(TEXTURE, {**unwrapped, **choice, **points, **seen, **occluders}, group)
         last = TEXTURE
-        if self.adjoining:
+        if self.neighbours:
             last = LEVEL
             for group in self.groups:
-                others = self.of_neighbours(TEXTURE, "textured", group, prefix="neighbour")
-                add(LEVEL, {"textured": at(TEXTURE, "textured", group)} | others, group)
-        return {group: at(last, "textured", group) for group in self.groups}
+                others = self.neighbour_outputs(TEXTURE, "textured", group, prefix="neighbour")
+                add(LEVEL, {"textured": output(TEXTURE, "textured", group)} | others, group)
+        return {group: output(last, "textured", group) for group in self.groups}
 
-    def roads(self, textured: Sources) -> Sources:
-        """Roads as data, and the path, for the export."""
-        if not self.scanner or self.settings.params(ROADS).when == "never" or not self.runs(ROADS):
-            return self.scanner
-        ground = {"cloud": self.at(SPLIT, "terrain"), "textured": textured["terrain"]}
+    def add_roads(self, textured: Sources) -> Sources:
+        """Add the roads; returns them and the path as inputs of the export."""
+        if not self.path or self.settings.params(ROADS).when == "never" or not self.is_enabled(ROADS):
+            return self.path
+        ground = {"cloud": self.output(SPLIT, "terrain"), "textured": textured["terrain"]}
         origin = self.settings.params(EXPORT).world_origin
-        self.add(ROADS, ground | self.scanner, name=self.tile.name, world_origin=origin, **self.cell)
+        self.add(ROADS, ground | self.path, name=self.tile.name, world_origin=origin, **self.cell)
         outputs = {"roads": "geojson", "roads_seen": "seen", "opendrive": "opendrive"}
-        return self.scanner | {name: self.at(ROADS, output) for name, output in outputs.items()}
+        return self.path | {name: self.output(ROADS, output) for name, output in outputs.items()}
 
-    def results(
-        self, surfaces: Sources, textured: Sources, seen: Sources, lists: Sources, made: Mapping[str, Sources]
+    def add_results(
+        self, surfaces: Sources, textured: Sources, seen: Sources, lists: Sources, synthesized: Mapping[str, Sources]
     ) -> None:
-        """What users get: the world, maps, figures and pictures."""
-        at, add, tile = self.at, self.add, self.tile
+        """Add the export of the world, rasters, metrics, images and previews."""
+        output, add, tile = self.output, self.add, self.tile
         cell = {"place": self.cell["seed"], "neighbours": self.cell["neighbours"]} if self.cell else {}
-        add(COLLISION, {**surfaces, **self.planted("mesh"), "cloud": at(SPLIT, "terrain")}, **cell)
-        planted = self.planted("textured")
-        choice = {f"choice.{g}": at(CHOOSE, "choice", g) for g in self.groups}
-        shown = {"views": seen["views"], "collision": at(COLLISION, "mesh")}
-        add(EXPORT, textured | planted | choice | lists | self.listed | shown, name=tile.name)
+        add(COLLISION, {**surfaces, **self.plant_models("mesh"), "cloud": output(SPLIT, "terrain")}, **cell)
+        planted = self.plant_models("textured")
+        choice = {f"choice.{g}": output(CHOOSE, "choice", g) for g in self.groups}
+        shown = {"views": seen["views"], "collision": output(COLLISION, "mesh")}
+        add(EXPORT, textured | planted | choice | lists | self.instances | shown, name=tile.name)
         if self.settings.params(EXPORT).rasters:
-            add(RASTERS, textured, name=tile.name, **_fineness(self.settings))
+            add(RASTERS, textured, name=tile.name, **_raster_params(self.settings))
         truth: Sources = {}
         if tile.truth_mesh and tile.truth_points:
             truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
-        add(GEOMETRY, _meshes(surfaces) | self._clouds() | _invented(made) | truth, **self.cell)
-        add(SCORE, textured | {name: seen[name] for name in ("views", "depth")} | self.listed | truth)
-        if self.adjoining:
-            mine = {f"textured.{g}": at(LEVEL, "textured", g) for g in self.groups}
-            theirs = {f"textured.{g}.{n}": at(LEVEL, "textured", g, n) for g in self.groups for n in self.first}
+        add(
+            GEOMETRY,
+            _mesh_inputs(surfaces) | self._cloud_inputs() | _synthesized_inputs(synthesized) | truth,
+            **self.cell,
+        )
+        add(SCORE, textured | {name: seen[name] for name in ("views", "depth")} | self.instances | truth)
+        if self.neighbours:
+            mine = {f"textured.{g}": output(LEVEL, "textured", g) for g in self.groups}
+            theirs = {
+                f"textured.{g}.{n}": output(LEVEL, "textured", g, n) for g in self.groups for n in self.border_owners
+            }
             add(BORDERS, mine | theirs, **self.cell)
-        add(PREVIEW, textured | planted | self.scanner)
-        stages = {f"decimate.{g}": at(DECIMATE, "mesh", g) for g in self.groups}
-        add(PICTURES, textured | stages | self._clouds() | {"views": seen["views"]} | self.scanner)
+        add(PREVIEW, textured | planted | self.path)
+        stages = {f"decimate.{g}": output(DECIMATE, "mesh", g) for g in self.groups}
+        add(PICTURES, textured | stages | self._cloud_inputs() | {"views": seen["views"]} | self.path)
 
 
-def _meshes(surfaces: Sources) -> Sources:
+def _mesh_inputs(surfaces: Sources) -> Sources:
     return {f"mesh.{group}": mesh for group, mesh in surfaces.items()}
 
 
-def _invented(made: Mapping[str, Sources]) -> Sources:
-    return {f"made.{group}": points["made"] for group, points in made.items()}
+def _synthesized_inputs(synthesized: Mapping[str, Sources]) -> Sources:
+    return {f"made.{group}": points["made"] for group, points in synthesized.items()}
 
 
 def check_here(settings: Settings) -> None:
-    """Refuse settings that don't exist or can't be had on this machine, before there is a tile.
+    """Reject settings that don't exist or can't be used on this machine, before a tile is read.
 
     Raises:
-        SettingError: as `recipe`.
-        ScanError: of a step that can't run here.
+        SettingError: as `build_graph`.
+        ScanError: a step can't run on this machine.
     """
     settings.check(STEPS)
     for step in STEPS:
@@ -413,40 +435,44 @@ def check_here(settings: Settings) -> None:
             step.check(settings.params(step))
 
 
-def _weights(settings: Settings) -> dict[str, Path | Output]:
-    """The user's weights as an input: others make other classes."""
+def _weights_input(settings: Settings) -> dict[str, Path | Output]:
+    """The user's weights file as an input, so that other weights change the cache key."""
     weights = settings.params(LABEL).weights
     return {"weights": weights} if weights and weights.is_file() else {}
 
 
-def _kept(settings: Settings) -> dict[str, Any]:
-    """When photos are looked at for classes: `segment` says so, for both steps."""
-    given = settings.params(SEGMENT)
-    return {"overwrite": given.overwrite, "min_classified": given.min_classified, "photos": given.photos}
+def _label_params(settings: Settings) -> dict[str, Any]:
+    """Parameters of step `label` that are settings of step `segment`: when photos are classified."""
+    segment_params = settings.params(SEGMENT)
+    return {
+        "overwrite": segment_params.overwrite,
+        "min_classified": segment_params.min_classified,
+        "photos": segment_params.photos,
+    }
 
 
-def _fineness(settings: Settings) -> dict[str, Any]:
-    """Of rasters: `export` says so."""
+def _raster_params(settings: Settings) -> dict[str, Any]:
+    """Parameters of step `rasters` that are settings of `export` and `unwrap`."""
     wanted, texel = settings.params(EXPORT).rasters, settings.params(UNWRAP, "terrain").texel
     return {"pixel": texel if wanted is True else wanted, "texel": texel}
 
 
 def scanner_path(tile: Tile) -> dict[str, Any]:
-    """Parameters of the path: the trajectory, else the cameras; empty where there is neither.
+    """Parameters of step `path`: positions of the trajectory or else of the cameras; empty if there is neither.
 
-    An orthophoto is taken from no place at all.
+    Orthophotos have no camera position.
     """
     if tile.trajectory is not None:
-        return {"positions": _rows(tile.trajectory.positions), "times": tuple(tile.trajectory.times.tolist())}
+        return {"positions": _position_rows(tile.trajectory.positions), "times": tuple(tile.trajectory.times.tolist())}
     views = [view for view in tile.views if view.camera.model != "orthographic"]
     if not views:
         return {}
     times = tuple(view.time for view in views)
     return {
-        "positions": _rows([view.centre for view in views]),
+        "positions": _position_rows([view.centre for view in views]),
         "times": times if all(t is not None for t in times) else None,
     }
 
 
-def _rows(positions: object) -> tuple[tuple[float, ...], ...]:
+def _position_rows(positions: object) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in np.asarray(positions).round(4).tolist())

@@ -1,1 +1,1 @@
-"""What a person looks at: a tile's page, a survey's, what is wrong with them."""
+"""Reports and web pages of tiles and surveys, quality findings, and the viewer of worlds."""

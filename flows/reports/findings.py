@@ -1,4 +1,4 @@
-"""What is wrong with a finished world, in words, worst first: told from the steps' facts and warnings."""
+"""Quality findings: problems of a finished world as text, worst first, from the metrics and warnings of the steps."""
 
 from __future__ import annotations
 
@@ -13,33 +13,46 @@ from scan2sim.pipeline.core.errors import ScanError
 Level = Literal["unusable", "poor", "note"]
 LEVELS: tuple[Level, ...] = ("unusable", "poor", "note")
 
-BAD = 15.0
-"""dB after a gain a channel: below it a rendering has little in common with its photo."""
-FAILED = 1 / 3
-"""Share of the held-out photos that are bad, or of the photos that disagree, beyond which the world is unusable."""
-INSIDE = 0.05
-"""Share of the photos taken from inside or beside a surface beyond which the world is unusable."""
-SEEN = (0.2, 0.6)
-"""Shares of the surface seen by photos below which a world is poor, and below which it is worth a note."""
-MOVED = 0.05
-"""Share of the points that moved beyond which they are worth a note."""
-REMAINS = 0.5
-"""Square metres of surface where a vehicle was taken out beyond which the place is poor: a bonnet's half."""
-LEFT_OUT = 0.1
-"""Share of the photos left out beyond which a world is poor."""
-NAMED = 3
-"""Photos that a finding names."""
+
+@dataclass(frozen=True)
+class FindingLimits:
+    """Thresholds of the findings.
+
+    Attributes:
+        min_psnr_db: PSNR after a gain per channel, dB; below it a rendering has little in common with its photo.
+        max_bad_photos: share of bad held-out photos, or of rejected photos, above which the world is unusable.
+        max_inside: share of photos taken from inside a surface, or close to one, above which the world is unusable.
+        min_seen_poor: share of the surface seen by photos below which the world is poor.
+        min_seen: share of the surface seen by photos below which there is a note.
+        max_moving: share of moving points above which there is a note.
+        max_remains_m2: area of surface that remains of a removed vehicle above which the place is poor (half a bonnet).
+        max_rejected: share of rejected photos above which the world is poor.
+    """
+
+    min_psnr_db: float = 15.0
+    max_bad_photos: float = 1 / 3
+    max_inside: float = 0.05
+    min_seen_poor: float = 0.2
+    min_seen: float = 0.6
+    max_moving: float = 0.05
+    max_remains_m2: float = 0.5
+    max_rejected: float = 0.1
+
+
+LIMITS = FindingLimits()
+MAX_NAMED_PHOTOS = 3
+"""Number of photos that a finding names."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is wrong.
+    """A problem of a world.
 
     Attributes:
-        level: what it does to the world: it can't be used as it is, parts of it are poor, or it is to be known.
-        about: the step that found it.
-        text: what is wrong, and what to do.
-        weight: how bad it is among those of its level.
+        level: "unusable": the world can't be used as it is; "poor": parts of it are poor; "note": for information.
+        about: name of the task that found it.
+        text: what is wrong, and what to do about it.
+        weight: severity among the findings of its level.
     """
 
     level: Level
@@ -49,24 +62,24 @@ class Finding:
 
 
 def findings(done: Mapping[str, Manifest], failed: Mapping[str, ScanError] | None = None) -> list[Finding]:
-    """All findings of a run, worst first; those of a level and weight in the order of the steps.
+    """All findings of a run, worst first; equally severe ones in the order of the steps.
 
     Args:
-        done: results by node.
-        failed: errors of side products, by name.
+        done: results by task name.
+        failed: errors of side products by name.
     """
-    facts = {node: manifest.facts for node, manifest in done.items()}
+    facts = {task: manifest.facts for task, manifest in done.items()}
     checks = (_cameras, _held_out, _unseen, _remains, _moved, _disagreeing)
     found = [one for check in checks for one in check(facts)]
-    found += [Finding("poor", name, without(name, error)) for name, error in (failed or {}).items()]
-    found += [Finding("note", node, text) for node, manifest in done.items() for text in manifest.warnings]
+    found += [Finding("poor", name, failure_text(name, error)) for name, error in (failed or {}).items()]
+    found += [Finding("note", task, text) for task, manifest in done.items() for text in manifest.warnings]
     return sorted(found, key=lambda one: (LEVELS.index(one.level), -one.weight))
 
 
-def without(name: str, error: ScanError) -> str:
-    """A sentence on a side product that failed: the world is made without it."""
+def failure_text(name: str, error: ScanError) -> str:
+    """A sentence about a failed side product, without which the world is made."""
     cause = error.cause if name.endswith(error.where) else f"{error.where}: {error.cause}"
-    return f"failed, and the world is made without it: {cause}. {error.remedy}"
+    return f"failed; the world is made without it: {cause}. {error.remedy}"
 
 
 Facts = Mapping[str, Mapping[str, Any]]
@@ -78,27 +91,28 @@ def _cameras(facts: Facts) -> Iterator[Finding]:
     if near:
         share = len(near) / cameras["count"]
         yield Finding(
-            "unusable" if share > INSIDE else "poor",
+            "unusable" if share > LIMITS.max_inside else "poor",
             "score",
-            f"{_of(len(near), cameras['count'])} taken from inside a surface or within a metre of one "
-            f"({_named([f'{name}: {metres:.2f} m' for name, metres in near.items()])}): what moved along with the "
-            "camera, or the car that carried it, has become part of the world, or poses are wrong",
+            f"{_count_text(len(near), cameras['count'])} taken from inside a surface or within a metre of one "
+            f"({_named([f'{name}: {metres:.2f} m' for name, metres in near.items()])}): objects that moved with the "
+            "camera, or the ego vehicle, are part of the world, or poses are wrong",
             share,
         )
 
 
 def _held_out(facts: Facts) -> Iterator[Finding]:
     photos = facts.get("score", {}).get("photos", {})
-    likeness = {name: one["psnr_gain_db"] for name, one in photos.items() if one.get("psnr_gain_db") is not None}
-    bad = sorted((name for name, db in likeness.items() if db < BAD), key=lambda name: likeness[name])
+    psnr = {name: one["psnr_gain_db"] for name, one in photos.items() if one.get("psnr_gain_db") is not None}
+    bad = sorted((name for name, db in psnr.items() if db < LIMITS.min_psnr_db), key=lambda name: psnr[name])
     if bad:
-        share = len(bad) / len(likeness)
+        share = len(bad) / len(psnr)
         yield Finding(
-            "unusable" if share > FAILED else "poor",
+            "unusable" if share > LIMITS.max_bad_photos else "poor",
             "score",
-            f"{_of(len(bad), len(likeness), 'held-out photo')} met with less than {BAD:g} dB "
-            f"({_named([f'{name}: {likeness[name]:.1f} dB' for name in bad])}): the world doesn't look like them; see "
-            "their pictures in the report",
+            f"{_count_text(len(bad), len(psnr), 'held-out photo')} matched with less than "
+            f"{LIMITS.min_psnr_db:g} dB PSNR "
+            f"({_named([f'{name}: {psnr[name]:.1f} dB' for name in bad])}): the world doesn't look like them; see "
+            "the error images in the report",
             share,
         )
     blind = [name for name, one in photos.items() if one.get("coverage") == 0]
@@ -106,8 +120,8 @@ def _held_out(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "poor",
             "score",
-            f"{_of(len(blind), len(photos), 'held-out photo')} of nothing that another photo saw ({_named(blind)}): "
-            "it counts as what it is, mostly grey or empty",
+            f"{_count_text(len(blind), len(photos), 'held-out photo')} of surfaces that no other photo saw "
+            f"({_named(blind)}): the score includes them although the world is mostly grey or empty there",
             len(blind) / len(photos),
         )
 
@@ -118,51 +132,53 @@ def _unseen(facts: Facts) -> Iterator[Finding]:
     painted = [facts[f"texture.{group}"] for group in SURFACES if f"texture.{group}" in facts]
     area = sum(one.get("area_m2", 0.0) for one in painted)
     seen = sum(one.get("seen_m2", 0.0) for one in painted) / area if area else 1.0
-    if seen < SEEN[1]:
+    if seen < LIMITS.min_seen:
         yield Finding(
-            "poor" if seen < SEEN[0] else "note",
+            "poor" if seen < LIMITS.min_seen_poor else "note",
             "texture",
-            f"{1 - seen:.0%} of the surface was never seen by a photo: it has the points' colours, or made-up ones",
+            f"{1 - seen:.0%} of the surface is not visible in any photo: it has the points' colours, or inpainted ones",
             1 - seen,
         )
 
 
 def _remains(facts: Facts) -> Iterator[Finding]:
     left = facts.get("score", {}).get("remains_m2", [])
-    bad = sorted((area for area in left if area > REMAINS), reverse=True)
+    bad = sorted((area for area in left if area > LIMITS.max_remains_m2), reverse=True)
     if bad:
         yield Finding(
             "poor",
             "score",
-            f"{_of(len(bad), len(left), 'vehicle')} not wholly gone: up to {bad[0]:.1f} m2 of surface stand where "
-            "one was taken out",
+            f"{_count_text(len(bad), len(left), 'vehicle')} not removed completely: up to {bad[0]:.1f} m2 of "
+            "surface remain of one",
             len(bad) / len(left),
         )
 
 
 def _moved(facts: Facts) -> Iterator[Finding]:
     share = max((facts.get(step, {}).get("moving_share", 0.0) for step in ("carve", "segment")), default=0.0)
-    if share > MOVED:
-        yield Finding("note", "carve", f"{share:.0%} of the points moved, and were left out", share)
+    if share > LIMITS.max_moving:
+        yield Finding("note", "carve", f"{share:.0%} of the points belong to moving objects and were removed", share)
 
 
 def _disagreeing(facts: Facts) -> Iterator[Finding]:
     about = facts.get("agreement", {})
     out, count = about.get("left_out", []), about.get("photos", 0)
-    if count and len(out) / count > LEFT_OUT:
+    if count and len(out) / count > LIMITS.max_rejected:
         share = len(out) / count
         yield Finding(
-            "unusable" if share > FAILED else "poor",
+            "unusable" if share > LIMITS.max_bad_photos else "poor",
             "agreement",
-            f"{_of(len(out), count)} left out, as the others disagree ({_named(out)}): check their poses and times",
+            f"{_count_text(len(out), count)} rejected because the others contradict them "
+            f"({_named(out)}): check their poses and times",
             share,
         )
 
 
-def _of(some: int, count: int, what: str = "photo") -> str:
-    """Such as "3 of 25 photos are", "1 of 1 photo is"."""
+def _count_text(some: int, count: int, what: str = "photo") -> str:
+    """Text such as "3 of 25 photos are" or "1 of 1 photo is"."""
     return f"{some} of {count} {what}{'s' if count > 1 else ''} {'is' if some == 1 else 'are'}"
 
 
 def _named(names: Sequence[str]) -> str:
-    return ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
+    more = len(names) - MAX_NAMED_PHOTOS
+    return ", ".join(names[:MAX_NAMED_PHOTOS]) + (f" and {more} more" if more > 0 else "")

@@ -1,4 +1,4 @@
-"""What is made of a survey's tiles once they are done: their pages, one world, a catalogue, one report."""
+"""Final products of a survey: reports of the tiles, the common world, a STAC catalogue, the survey report."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.flows.engine.planning import Planned
+from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.reports.findings import findings
 from scan2sim.flows.reports.publish import publish, published, to_read
@@ -34,32 +34,32 @@ Warn = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Made:
+class TileResult:
     """A tile of a survey after a run.
 
     Attributes:
         tile: None if it can't be read.
-        planned, done: its nodes and results, by their names within the tile.
-        anew: whether any result has come out otherwise than before.
+        planned, done: its tasks, and results by name within the tile.
+        changed: whether any result differs from the one before.
         error: why it failed, or None.
     """
 
     name: str
     tile: Tile | None
-    planned: Sequence[Planned] = ()
+    planned: Sequence[PlannedTask] = ()
     done: Mapping[str, Manifest] | None = None
-    anew: bool = False
+    changed: bool = False
     error: ScanError | None = None
 
     @property
-    def kept(self) -> bool:
-        """Whether nothing that it depends on has changed."""
+    def up_to_date(self) -> bool:
+        """Whether nothing that the tile depends on has changed."""
         return all(item.reason is None for item in self.planned)
 
 
 def finish(
     survey: Survey,
-    made: Sequence[Made],
+    results: Sequence[TileResult],
     store: Store,
     out: Path,
     settings: Settings,
@@ -67,61 +67,65 @@ def finish(
     side: SideProducts,
     warn: Warn,
 ) -> Path | None:
-    """Write all that users look at below `out`; returns the survey's page, None if it failed.
+    """Write the results of each tile and of the survey; returns the path of the survey's page, None if it failed.
 
     Args:
-        survey: that was made.
-        made: its tiles.
-        store: that keeps their results.
-        out: the survey's folder.
+        survey: the survey.
+        results: its tiles after the run.
+        store: cache of their results.
+        out: output folder.
         settings, digests: of the run.
-        side: records the side products that fail: reports, roads of all tiles, the catalogue.
-        warn: gets warnings of files that were edited.
+        side: records failed side products: reports, roads of all tiles, the catalogue.
+        warn: receives warnings about files that the user has edited.
 
     Raises:
-        ScanError: see `pipeline.core.errors`; what was there stays.
+        ScanError: see `pipeline.core.errors`; earlier results stay.
     """
-    whole = [one for one in made if one.done is not None]
-    for one in whole:
-        _finish_tile(one, store.within(one.name), out / TILES / one.name, settings, side, warn)
-    if whole:
-        _together(survey, whole, out, digests, side, warn)
+    finished = [result for result in results if result.done is not None]
+    for result in finished:
+        _finish_tile(result, store.within(result.name), out / TILES / result.name, settings, side, warn)
+    if finished:
+        _assemble(survey, finished, out, digests, side, warn)
     with side.attempt("report", out / SURVEY_PAGE, out / SURVEY_DATA):
-        return write_survey_report(out, survey.name, [_state(one, out, side) for one in made], failed=side.of_tile(""))
+        return write_survey_report(
+            out, survey.name, [_state(result, out, side) for result in results], failed=side.of_tile("")
+        )
     return None
 
 
-def _finish_tile(one: Made, store: Store, out: Path, settings: Settings, side: SideProducts, warn: Warn) -> None:
-    """A tile's folder, as `scan2sim run` leaves it; what is no longer of use is removed from the store."""
-    assert one.tile is not None and one.done is not None
-    planned, done = list(one.planned), dict(one.done)
-    keys = {item.node.id.name: item.key for item in planned}
+def _finish_tile(
+    result: TileResult, store: Store, out: Path, settings: Settings, side: SideProducts, warn: Warn
+) -> None:
+    """Write the folder of a tile like `scan2sim run` does, and delete outdated results from the store."""
+    assert result.tile is not None and result.done is not None
+    planned, done = list(result.planned), dict(result.done)
+    keys = {item.task.id.name: item.key for item in planned}
     out.mkdir(parents=True, exist_ok=True)
-    failed = side.of_tile(one.name)
-    if not (one.kept and is_finished(store, planned, out) and failed_before(out) == failed.keys()):
-        for node in keys.keys() & to_read(store, planned, out):
-            store.read(node, keys[node])
-        for warning in publish(store, planned, done, out, one.tile, settings):
+    failed = side.of_tile(result.name)
+    if not (result.up_to_date and is_finished(store, planned, out) and failed_before(out) == failed.keys()):
+        for task in keys.keys() & to_read(store, planned, out):
+            store.read(task, keys[task])
+        for warning in publish(store, planned, done, out, result.tile, settings):
             warn(warning)
-        seconds = sum(done[item.node.id.name].seconds for item in planned if item.reason is not None)
+        seconds = sum(done[item.task.id.name].seconds for item in planned if item.reason is not None)
         (out / PICTURE).unlink(missing_ok=True)
-        with side.attempt(f"{one.name}/report", out / PAGE, out / DATA):
+        with side.attempt(f"{result.name}/report", out / PAGE, out / DATA):
             if "pictures" in done:
                 album = store.folder("pictures", keys["pictures"]) / done["pictures"].files["pictures"]
                 shutil.copyfile(album / "hero.jpg", out / PICTURE)
-            write_report(one.tile, planned, done, store, out, seconds=seconds, failed=failed)
+            write_report(result.tile, planned, done, store, out, seconds=seconds, failed=failed)
     store.sweep(keys)
 
 
-def is_finished(store: Store, planned: Sequence[Planned], out: Path) -> bool:
-    """Whether a tile's folder shows its kept results already."""
+def is_finished(store: Store, planned: Sequence[PlannedTask], out: Path) -> bool:
+    """Whether the folder of a tile already has the reports and files of its cached results."""
     return (out / DATA).is_file() and (out / PAGE).is_file() and published(store, planned, out)
 
 
-def _together(
-    survey: Survey, done: Sequence[Made], out: Path, digests: Digests, side: SideProducts, warn: Warn
+def _assemble(
+    survey: Survey, done: Sequence[TileResult], out: Path, digests: Digests, side: SideProducts, warn: Warn
 ) -> None:
-    """The world of all tiles, their roads, the STAC catalogue, the virtual point cloud and rasters."""
+    """Write the common world of all tiles with their roads, the STAC catalogue, the virtual point cloud and rasters."""
     tiles = [merge.TileWorld(one.name, out / TILES / one.name / "world", one.tile.frame) for one in done if one.tile]
     merge.assemble(out, survey.name, tiles, warn=warn)
     with side.attempt("roads"):
@@ -130,8 +134,8 @@ def _together(
         _catalogue(survey, done, out, digests)
 
 
-def _catalogue(survey: Survey, done: Sequence[Made], out: Path, digests: Digests) -> None:
-    """The STAC catalogue, the virtual point cloud and rasters of all tiles."""
+def _catalogue(survey: Survey, done: Sequence[TileResult], out: Path, digests: Digests) -> None:
+    """Write the STAC catalogue, the virtual point cloud and the rasters of all tiles."""
     items = []
     for one in done:
         assert one.tile is not None
@@ -143,8 +147,8 @@ def _catalogue(survey: Survey, done: Sequence[Made], out: Path, digests: Digests
             stac.TileItem(
                 one.name, one.tile.frame, sources, scanned,
                 None if times is None or not np.isfinite(times).all() else (float(times[0]), float(times[-1])),
-                _there(place / "world" / f"{one.name}.sdf"), _there(place / "world" / f"{one.name}.glb"),
-                _there(place / PAGE), _there(place / PICTURE), geotiff.find(place / "rasters", one.name),
+                _existing(place / "world" / f"{one.name}.sdf"), _existing(place / "world" / f"{one.name}.glb"),
+                _existing(place / PAGE), _existing(place / PICTURE), geotiff.find(place / "rasters", one.name),
             )
         )  # fmt: skip
     stac.write(out, survey.name, f"{len(items)} tiles of {survey.name}, made by scan2sim", items)
@@ -156,23 +160,23 @@ def _catalogue(survey: Survey, done: Sequence[Made], out: Path, digests: Digests
             geotiff.write_vrt(whole, found)
 
 
-def _there(path: Path) -> Path | None:
+def _existing(path: Path) -> Path | None:
     return path if path.is_file() else None
 
 
-def _state(one: Made, out: Path, side: SideProducts) -> TileState:
-    """What the survey's page tells of a tile."""
+def _state(one: TileResult, out: Path, side: SideProducts) -> TileState:
+    """State of a tile for the survey's page."""
     cell = one.tile.cell if one.tile else None
     ring = np.zeros((0, 2)) if one.tile is None or cell is None else outline(cell, *_bounds(one.tile))
     done, place = one.done or {}, out / TILES / one.name
     return TileState(
         name=one.name,
         outline=ring,
-        state="failed" if one.error else ("done" if one.anew else "kept"),
+        state="failed" if one.error else ("done" if one.changed else "kept"),
         reason=str(one.error) if one.error else None,
         figures=_figures(one.tile, done) if one.tile and done else {},
         report=f"{TILES}/{one.name}/{PAGE}" if done and (place / PAGE).is_file() else None,
-        thumbnail=_there(place / PICTURE),
+        thumbnail=_existing(place / PICTURE),
         warnings=[f"{one.about}: {one.text}" for one in findings(done, side.of_tile(one.name))],
         borders=_borders(done),
     )
@@ -186,7 +190,7 @@ def _bounds(tile: Tile) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
-    """The figures of a tile that surveys are compared by."""
+    """Metrics of a tile for the survey report."""
     body = figures(tile, done)
     return {
         "seconds": body["seconds"],
@@ -203,7 +207,7 @@ def _figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
 
 
 def _borders(done: Mapping[str, Manifest]) -> list[dict[str, Any]]:
-    """A tile's borders with the neighbours before it: over all classes, the widest gap and the mean colour step."""
+    """Metrics of a tile's borders with the neighbours that own them, over all classes."""
     found = done["borders"].facts["neighbours"] if "borders" in done else {}
     rows = []
     for name, classes in found.items():

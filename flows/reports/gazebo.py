@@ -1,4 +1,4 @@
-"""How a world is opened in Gazebo: commands to be copied into a shell, on the screen and in reports."""
+"""Shell commands that open a world in Gazebo, for the terminal and for reports."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ RELEASES = {
     "gz sim": ("Garden and later", "GZ_SIM_RESOURCE_PATH"),
     "ign gazebo": ("Fortress", "IGN_GAZEBO_RESOURCE_PATH"),
 }
-"""Command to the releases that it is of, and the variable by which it finds models."""
+"""Command to the Gazebo releases that have it, and their environment variable for model paths."""
 
 
 def commands(sdf: Path) -> dict[str, str]:
-    """Releases of Gazebo to the line of shell that opens a world; empty where there is no such file.
+    """Gazebo release to the shell command that opens a world; empty if the file doesn't exist.
 
     Args:
-        sdf: the world, beside its `models/`.
+        sdf: the world file, in the folder of its `models/`.
     """
     if not sdf.is_file():
         return {}
@@ -30,9 +30,9 @@ def commands(sdf: Path) -> dict[str, str]:
 
 
 def lines(sdf: Path) -> list[str]:
-    """What is said at the end of a run: where the world is, and what shows it, a browser or this machine's Gazebo."""
-    here = "ign gazebo" if shutil.which("ign") else "gz sim"
-    found = commands(sdf)
-    place = sdf.parent
-    world = [f"World:  {place}", f"View:   scan2sim view {shlex.quote(str(place))}"] if place.is_dir() else []
-    return [*world, *([f"Gazebo: {found[RELEASES[here][0]]}"] if found else [])]
+    """Lines printed at the end of a run: path of the world, commands that open it in a browser and in Gazebo."""
+    installed = "ign gazebo" if shutil.which("ign") else "gz sim"
+    by_release = commands(sdf)
+    folder = sdf.parent
+    world = [f"World:  {folder}", f"View:   scan2sim view {shlex.quote(str(folder))}"] if folder.is_dir() else []
+    return [*world, *([f"Gazebo: {by_release[RELEASES[installed][0]]}"] if by_release else [])]

@@ -1,4 +1,4 @@
-"""What users see of a tile's results: its world and its settings, beside the report."""
+"""Publishes a tile's results from the cache to the output folder: world, rasters, preview and settings."""
 
 from __future__ import annotations
 
@@ -7,109 +7,126 @@ import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from scan2sim.flows.engine.planning import Planned
+from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.reports.tile import PAGES, SCRIPTS
 from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.errors import DamagedError
 from scan2sim.pipeline.core.types import Tile
-from scan2sim.pipeline.io.worlds.merge import EDITED, STAMP, link, same_file, same_unless_edited, swap
+from scan2sim.pipeline.io.worlds.merge import (
+    STAMP_FILE,
+    USER_EDITABLE_SUFFIXES,
+    link,
+    same_file,
+    same_unless_edited,
+    swap,
+)
 
-THREE = "three.js"
-PLACES = {"export": ("world", "world"), "rasters": ("rasters", "rasters"), "preview": ("preview", SCRIPTS)}
-"""Of nodes, which output is published, and where."""
-READ = ("exposure", "pictures", "score")
-"""Nodes whose files are read for what is shown."""
-BULKY = ("poses", "positions", "times")  # parameters that repeat the tile
+THREE_JS = "three.js"
+PUBLISHED_OUTPUTS = {"export": ("world", "world"), "rasters": ("rasters", "rasters"), "preview": ("preview", SCRIPTS)}
+"""Task to the output that is published, and its folder in the output folder."""
+REPORTED_TASKS = ("exposure", "pictures", "score")
+"""Tasks whose files are read for the report."""
+OMITTED_PARAMS = ("poses", "positions", "times")
+"""Large parameters that repeat the tile, left out of config.json."""
 
 
 def publish(
-    store: Store, planned: list[Planned], done: dict[str, Manifest], out: Path, tile: Tile, settings: Settings
+    store: Store, planned: list[PlannedTask], done: dict[str, Manifest], out: Path, tile: Tile, settings: Settings
 ) -> list[str]:
-    """Put the world, rasters, exposures and the resolved settings beside the report; a world that is there stays.
+    """Publish the world, rasters, exposures and resolved settings; what is up to date stays.
 
     Returns:
-        What the user should read: of files that were edited.
+        Warnings about files that the user has edited.
 
     Raises:
-        DamagedError: a result has gone in the meantime.
+        DamagedError: a cached result was deleted during the run.
     """
-    keys = {p.node.id.name: p.key for p in planned}
+    keys = {p.task.id.name: p.key for p in planned}
     changed: list[Path] = []
-    places = _published(store, keys, out)
-    for node in PLACES.keys() & done.keys():
-        if done[node].files and node not in places:
-            raise DamagedError(node)
-    for node, (source, place) in places.items():
-        if not _current(source, place, keys[node]):
-            _publish(source, place, keys[node])
+    folders = _published_folders(store, keys, out)
+    for task in PUBLISHED_OUTPUTS.keys() & done.keys():
+        if done[task].files and task not in folders:
+            raise DamagedError(task)
+    for task, (source, place) in folders.items():
+        if not _current(source, place, keys[task]):
+            _publish(source, place, keys[task])
         changed += edited(source, place)
-    for node, (_, name) in PLACES.items():
-        if not (node in done and done[node].files) and (out / name / STAMP).is_file():  # of an earlier world
+    for task, (_, name) in PUBLISHED_OUTPUTS.items():
+        if (
+            not (task in done and done[task].files) and (out / name / STAMP_FILE).is_file()
+        ):  # published from an earlier world
             shutil.rmtree(out / name)
     if "preview" in done and done["preview"].files:
-        shutil.copyfile(PAGES / THREE, out / SCRIPTS / THREE)
+        shutil.copyfile(PAGES / THREE_JS, out / SCRIPTS / THREE_JS)
     solved = store.folder("exposure", keys["exposure"]) / done["exposure"].files["exposures"]
-    shutil.copyfile(solved, out / "exposure.json")  # for the next tile's `exposure.prior`
+    shutil.copyfile(solved, out / "exposure.json")  # for setting `exposure.prior` of other tiles
     config = {
         "tile": str(tile.path),
         "versions": versions(),
         "set": settings.values,
-        "steps": {node: {k: v for k, v in m.params.items() if k not in BULKY} for node, m in done.items()},
+        "steps": {task: {k: v for k, v in m.params.items() if k not in OMITTED_PARAMS} for task, m in done.items()},
     }
     (out / "config.json").write_text(json.dumps(config, indent=1), encoding="utf-8")
-    return [f"{path} was changed since it was made, and stays so: remove it to have it made anew" for path in changed]
+    return [f"{path} was edited and is kept; delete it to have it rebuilt" for path in changed]
 
 
-def to_read(store: Store, planned: Iterable[Planned], out: Path) -> set[str]:
-    """Labels of results that will be read for what is shown; what is published already isn't read again."""
-    keys = {item.node.id.name: item.key for item in planned}
-    places = _published(store, keys, out)
-    return {*READ, *(node for node, (source, place) in places.items() if not _current(source, place, keys[node]))}
+def to_read(store: Store, planned: Iterable[PlannedTask], out: Path) -> set[str]:
+    """Names of tasks whose results will be read for publishing and reports; up-to-date folders aren't read again."""
+    keys = {item.task.id.name: item.key for item in planned}
+    folders = _published_folders(store, keys, out)
+    return {
+        *REPORTED_TASKS,
+        *(task for task, (source, place) in folders.items() if not _current(source, place, keys[task])),
+    }
 
 
-def published(store: Store, planned: Iterable[Planned], out: Path) -> bool:
-    """Whether all that is published beside the report is as the kept results are, file by file."""
-    keys = {item.node.id.name: item.key for item in planned}
-    places = _published(store, keys, out)
-    return "export" in places and all(_current(*both, keys[node]) for node, both in places.items())
+def published(store: Store, planned: Iterable[PlannedTask], out: Path) -> bool:
+    """Whether all published files equal those of the cached results."""
+    keys = {item.task.id.name: item.key for item in planned}
+    folders = _published_folders(store, keys, out)
+    return "export" in folders and all(_current(*both, keys[task]) for task, both in folders.items())
 
 
-def _published(store: Store, keys: Mapping[str, str], out: Path) -> dict[str, tuple[Path, Path]]:
-    """Of results that are kept, by node: the folder that is to be published, and where."""
+def _published_folders(store: Store, keys: Mapping[str, str], out: Path) -> dict[str, tuple[Path, Path]]:
+    """Task to the folder of its cached result that is published, and to its destination."""
     found = {}
-    for node, (output, place) in PLACES.items():
-        manifest = store.find(node, keys[node]) if node in keys else None
+    for task, (output, place) in PUBLISHED_OUTPUTS.items():
+        manifest = store.find(task, keys[task]) if task in keys else None
         if manifest is not None and output in manifest.files:
-            found[node] = store.folder(node, keys[node]) / manifest.files[output], out / place
+            found[task] = store.folder(task, keys[task]) / manifest.files[output], out / place
     return found
 
 
 def _current(source: Path, place: Path, key: str) -> bool:
-    """Whether a published folder is of this result, and its files, but for edits, as when they were published."""
+    """Whether a published folder is from this result, with unchanged files except for the user's edits."""
     files = [path.relative_to(source) for path in source.rglob("*") if path.is_file()]
-    return bool(files) and _is_of(place, key) and all(same_unless_edited(source / f, place / f) for f in files)
+    return bool(files) and _is_from(place, key) and all(same_unless_edited(source / f, place / f) for f in files)
 
 
-def _is_of(place: Path, key: str) -> bool:
-    """Whether a folder was published of this result."""
-    stamp = place / STAMP
+def _is_from(place: Path, key: str) -> bool:
+    """Whether a folder was published from the result with this key."""
+    stamp = place / STAMP_FILE
     return stamp.is_file() and stamp.read_text(errors="replace", encoding="utf-8") == key
 
 
 def edited(source: Path, place: Path) -> list[Path]:
-    """Published files that were changed by a user (or by damage: nobody can tell which), of kinds that users edit."""
-    pairs = [(source / path.relative_to(place), path) for path in sorted(place.rglob("*")) if path.suffix in EDITED]
+    """Published files of editable types that differ from the result: edited by a user (or damaged)."""
+    pairs = [
+        (source / path.relative_to(place), path)
+        for path in sorted(place.rglob("*"))
+        if path.suffix in USER_EDITABLE_SUFFIXES
+    ]
     return [b for a, b in pairs if a.is_file() and not same_file(a, b) and a.read_bytes() != b.read_bytes()]
 
 
 def _publish(source: Path, place: Path, key: str) -> None:
-    """Copy a folder from the store (large files as hard links, where that can be); edits of the same one stay."""
+    """Copy a folder from the store (large files as hard links if possible); keeps edits of the same result."""
     fresh = place.with_name(f".{place.name}")
     shutil.rmtree(fresh, ignore_errors=True)
     shutil.copytree(source, fresh, copy_function=link)
-    for file in edited(source, place) if _is_of(place, key) else ():
+    for file in edited(source, place) if _is_from(place, key) else ():
         shutil.copy2(file, fresh / file.relative_to(place))
-    (fresh / STAMP).write_text(key, encoding="utf-8")
+    (fresh / STAMP_FILE).write_text(key, encoding="utf-8")
     swap(fresh, place)

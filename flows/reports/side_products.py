@@ -1,4 +1,4 @@
-"""Side products (roads, pictures, reports, ...): one that fails costs a warning and an exit code, never the world."""
+"""Side products (roads, images, reports, ...): a failure causes a warning and an exit code, but the world is kept."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from scan2sim.flows.pipelines.graph import NodeId
-from scan2sim.flows.reports.findings import without
+from scan2sim.flows.pipelines.graph import TaskId
+from scan2sim.flows.reports.findings import failure_text
 from scan2sim.pipeline.core.errors import IncompleteError, ScanError, from_exception
 
 
 class SideProducts:
-    """Collects the side products of a run that failed: steps, and what is written after them.
+    """Collects the failed side products of a run: steps, and files that are written after them.
 
     Attributes:
-        out: folder of the run.
-        failed: errors by full name (`street_0001/roads`, `report`); what is in the log of each is in its notes.
+        out: output folder of the run.
+        failed: errors by full name (`street_0001/roads`, `report`); their notes contain the tracebacks.
     """
 
     def __init__(self, out: Path) -> None:
         self.out = out
         self.failed: dict[str, ScanError] = {}
 
-    def add(self, failed: Mapping[NodeId, ScanError]) -> None:
-        """Add steps that failed."""
-        self.failed |= {node.full_name: error for node, error in failed.items()}
+    def add(self, failed: Mapping[TaskId, ScanError]) -> None:
+        """Add failed steps."""
+        self.failed |= {task.full_name: error for task, error in failed.items()}
 
     @contextmanager
     def attempt(self, name: str, *files: Path) -> Iterator[None]:
-        """Catch whatever fails within and record it under `name`; then its earlier `files` are removed."""
+        """Record an exception in the context as failure of `name`, and delete `files`, which an earlier run wrote."""
         try:
             yield
         except Exception as error:
@@ -40,16 +40,16 @@ class SideProducts:
                 file.unlink(missing_ok=True)
 
     def of_tile(self, tile: str) -> dict[str, ScanError]:
-        """Those of a survey's tile, by their names within it; of "" those that are of no tile."""
+        """Errors of a survey's tile by name within the tile; for "": errors that belong to no tile."""
         names = {name: name.rpartition("/") for name in self.failed}
         return {part: self.failed[name] for name, (owner, _, part) in names.items() if owner == tile}
 
     def warnings(self) -> list[str]:
-        """A sentence on each."""
-        return [f"{name}: {without(name, error)}" for name, error in self.failed.items()]
+        """A sentence about each failure."""
+        return [f"{name}: {failure_text(name, error)}" for name, error in self.failed.items()]
 
     def check(self) -> None:
-        """Raise an IncompleteError that names those that failed, if any."""
+        """Raise an IncompleteError that names the failed side products, if any."""
         if self.failed:
             what = "a side product failed" if len(self.failed) == 1 else f"{len(self.failed)} side products failed"
             cause = f"the world is finished, but {what}: {', '.join(self.failed)}"

@@ -1,7 +1,7 @@
-"""The tables and the plot of the study of compression: how resolution, bit rate and frame rate change the error.
+"""Tables and plot of the compression study: influence of resolution, bit rate and frame rate on the error.
 
-`table.md` has the layout of D3.2's tables 4 and 5, `table.csv` all figures, a row a cell. What can't be measured is
-N/A, with the reason.
+`table.md` has the layout of tables 4 and 5 of 5G-ERA D3.2, `table.csv` has all metrics with one row per cell. Cells
+that can't be measured are N/A, with the reason.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from scan2sim.flows.pipelines.study import Cell
-from scan2sim.pipeline.io.trajectory import replacing
-from scan2sim.slam.trajectory.evaluate import SEGMENT
+from scan2sim.pipeline.io.trajectory import atomic_write
+from scan2sim.slam.trajectory.evaluate import SEGMENT_M
 from scan2sim.slam.video import Video
 
 
 @dataclass(frozen=True)
 class Result:
-    """Of a cell: figures by name, and why they are N/A if they are."""
+    """Result of a cell: metrics by name, and the reason if they are N/A."""
 
     figures: dict[str, Any] = field(default_factory=dict)
     reason: str | None = None
@@ -29,19 +29,19 @@ class Result:
 
 @dataclass(frozen=True)
 class Tables:
-    """What the tables tell.
+    """Content of the tables.
 
     Attributes:
         video: the source.
-        by_gps: whether GPS ties the scale.
-        backend: of the tracking.
-        segment: metres, of the local error.
-        cells: all, in the tables' order.
-        results: of those that are done, or can't be.
+        scaled_by_gps: whether GPS gives the scale.
+        backend: optimiser of the tracking.
+        segment: length of the segments of the local error in metres.
+        cells: all cells, in the order of the tables.
+        results: of the finished, failed and impossible cells.
     """
 
     video: Video
-    by_gps: bool
+    scaled_by_gps: bool
     backend: str
     segment: float
     cells: Sequence[Cell]
@@ -49,21 +49,21 @@ class Tables:
 
 
 def write(out: Path, tables: Tables) -> Path:
-    """Write `table.md`, `table.csv` and `plot.png` into `out`, each whole or not at all; returns the first."""
+    """Write `table.md`, `table.csv` and `plot.png` into `out`, each atomically; returns the path of the first."""
     for name, text in (("table.md", _markdown(tables)), ("table.csv", _csv(tables.cells, tables.results))):
-        with replacing(out / name) as fresh:
+        with atomic_write(out / name) as fresh:
             fresh.write_text(text, encoding="utf-8")
     _plot(out / "plot.png", tables.segment, tables.cells, tables.results)
     return out / "table.md"
 
 
 def _errors(segment: float) -> tuple[tuple[str, str], ...]:
-    """Keys and titles of the two errors."""
+    """Keys and titles of the two error metrics."""
     return ("global_mean_m", "Global mean error"), (f"local_median_{segment:g}_m", f"Local median error {segment:g}")
 
 
 def _markdown(tables: Tables) -> str:
-    """The mission's layout: rows are bit rates, columns resolutions, blocks frame rates and the two errors."""
+    """Tables in the layout of D3.2: rows are bit rates, columns resolutions, blocks frame rates and errors."""
     video, segment, cells, results = tables.video, tables.segment, tables.cells, tables.results
     heights, bitrates, rates = _axes(cells)
     errors = _errors(segment)
@@ -71,12 +71,14 @@ def _markdown(tables: Tables) -> str:
         "# Influence of vertical resolution, bit rate and frame rate",
         "",
         f"Source: `{video.path}`, {video.width}x{video.height}, {video.fps:.4g} fps. Errors in metres, in the ground "
-        "plane, after rotation, scale and translation onto the truth (D3.2, section 4.1); "
-        + ("scale along the way by GPS; " if tables.by_gps else "")
+        "plane, after alignment (rotation, scale, translation) with the ground truth (D3.2, section 4.1); "
+        + ("scale from GPS along the path; " if tables.scaled_by_gps else "")
         + f"backend {tables.backend}.",
     ]
-    if segment != SEGMENT:
-        lines.append(f"The truth is too short for segments of {SEGMENT:g} m: they are of {segment:g} m.")
+    if segment != SEGMENT_M:
+        lines.append(
+            f"The ground truth is too short for segments of {SEGMENT_M:g} m: segments of {segment:g} m are used."
+        )
     titles = [f"{title.split(' ')[0].lower()}, {height} px" for _, title in errors for height in heights]
     lines += [
         "",
@@ -97,26 +99,26 @@ def _markdown(tables: Tables) -> str:
             reasons.setdefault(str(results[cell].reason), []).append(where)
     if reasons:
         lines += ["", "N/A:", "", *(f"- {reason}: {', '.join(where)}" for reason, where in reasons.items())]
-    off = [
+    deviating = [
         f"{cell.height} px {cell.bitrate:g} Mbit/s {cell.rate:g} fps: {result.figures['mbit_s']:.3g}"
         for cell, result in ((cell, results[cell]) for cell in cells if cell in results)
         if result.figures.get("mbit_s") and abs(result.figures["mbit_s"] / cell.bitrate - 1) > 0.1
     ]
-    if off:
+    if deviating:
         lines += [
             "",
-            "Bit rates that came out more than 10 % off what was asked, Mbit/s:",
+            "Cells whose bit rate deviates from the target by more than 10 %, in Mbit/s:",
             "",
-            *(f"- {o}" for o in off),
+            *(f"- {o}" for o in deviating),
         ]
     missing = sum(cell not in results for cell in cells)
     if missing:
-        lines += ["", f"{missing} of {len(cells)} cells are still to be run (…)."]
+        lines += ["", f"{missing} of {len(cells)} cells have not run yet (…)."]
     return "\n".join(lines) + "\n"
 
 
 def _axes(cells: Sequence[Cell]) -> tuple[list[int], list[float], list[float]]:
-    """Heights and bit rates ascending, rates descending, as in the mission's tables."""
+    """Heights and bit rates ascending, rates descending, as in the tables of D3.2."""
     heights, bitrates = sorted({c.height for c in cells}), sorted({c.bitrate for c in cells})
     return heights, bitrates, sorted({c.rate for c in cells}, reverse=True)
 
@@ -129,7 +131,7 @@ def _cell(result: Result | None, key: str) -> str:
 
 
 def _csv(cells: Sequence[Cell], results: Mapping[Cell, Result]) -> str:
-    """A row a cell, with all figures."""
+    """CSV table with all metrics, one row per cell."""
     names = list(dict.fromkeys(name for cell in cells if cell in results for name in results[cell].figures))
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -143,7 +145,7 @@ def _csv(cells: Sequence[Cell], results: Mapping[Cell, Result]) -> str:
 
 
 def _plot(file: Path, segment: float, cells: Sequence[Cell], results: Mapping[Cell, Result]) -> None:
-    """Write a PNG: errors against bit rate, a line a resolution, a row of panels a frame rate."""
+    """Write a PNG: errors over bit rate; one line per resolution, one row of panels per frame rate."""
     from matplotlib.figure import Figure
 
     heights, bitrates, rates = _axes(cells)
@@ -153,9 +155,11 @@ def _plot(file: Path, segment: float, cells: Sequence[Cell], results: Mapping[Ce
     for rate, row in zip(rates, panels, strict=True):
         for (key, title), axes in zip(_errors(segment), row, strict=True):
             for k, height in enumerate(heights):
-                found = [(b, results.get(Cell(height, b, rate))) for b in bitrates]
+                cells_of_line = [(b, results.get(Cell(height, b, rate))) for b in bitrates]
                 points = [
-                    (b, r.figures[key]) for b, r in found if r and not r.reason and r.figures.get(key) is not None
+                    (b, r.figures[key])
+                    for b, r in cells_of_line
+                    if r and not r.reason and r.figures.get(key) is not None
                 ]
                 label = f"{height} px" + ("" if points else " (N/A)")
                 x, y = zip(*points, strict=True) if points else ((), ())
@@ -168,7 +172,7 @@ def _plot(file: Path, segment: float, cells: Sequence[Cell], results: Mapping[Ce
             axes.grid(alpha=0.3)
             axes.legend()
     for axes in panels[-1]:
-        axes.set_xlabel("Mbit/s asked for")
-        axes.set_ylim(bottom=0)  # all that share this axis have drawn
-    with replacing(file) as fresh:
+        axes.set_xlabel("target bit rate, Mbit/s")
+        axes.set_ylim(bottom=0)  # only now have all panels that share this axis been drawn
+    with atomic_write(file) as fresh:
         figure.savefig(fresh, format="png")

@@ -1,4 +1,4 @@
-"""The report of a survey: `survey.json` for programs, `survey.html`, one page with a map of all tiles, for people."""
+"""Report of a survey: metrics as `survey.json`, a web page with a map of all tiles as `survey.html`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.reports import gazebo
-from scan2sim.flows.reports.tile import write_whole
+from scan2sim.flows.reports.tile import write_atomically
 from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.errors import ScanError, from_os_error
 from scan2sim.pipeline.core.types import F64
@@ -27,13 +27,17 @@ State = Literal["done", "kept", "failed", "waiting"]
 STATES: tuple[State, ...] = ("failed", "waiting", "done", "kept")
 TEMPLATE = "survey.html.j2"
 PAGE, DATA = "survey.html", "survey.json"
-WIDTH, HEIGHT, RIM = 1100.0, 600.0, 24.0
-"""Pixels: the largest map, and what is left free around it."""
-LABELLED = 60  # tiles at most, if their names are to be read on the map
-TINY = 10.0  # pixels: smaller tiles are drawn larger than they are, to be seen at all
-THUMBNAIL = 96  # pixels wide: three kilobytes a tile
-SHOWN = 40  # borders and warnings on the page; survey.json has all
-SCALES = {  # colours from low to high, told apart by people who see no red or green, in light and in dark
+MAP_WIDTH_PX, MAP_HEIGHT_PX, MAP_MARGIN_PX = 1100.0, 600.0, 24.0
+"""Maximum size of the map, and the margin around it."""
+MAX_LABELLED_TILES = 60
+"""Number of tiles up to which the map shows their names."""
+MIN_TILE_PX = 10.0
+"""Size on the map below which tiles are drawn larger than they are, to be visible."""
+THUMBNAIL_WIDTH_PX = 96
+"""Width of a tile's thumbnail; about three kilobytes per tile."""
+MAX_SHOWN = 40
+"""Number of borders and warnings on the page; survey.json has all."""
+COLOUR_SCALES = {  # colours from low to high; distinguishable with colour blindness, on light and dark backgrounds
     "quality": ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725"),
     "cost": ("#cfe3ef", "#8fb9d9", "#5287bd", "#3d5a9b", "#33276b"),
 }
@@ -41,21 +45,21 @@ SCALES = {  # colours from low to high, told apart by people who see no red or g
 
 @dataclass(frozen=True)
 class TileState:
-    """How a tile of a survey fares.
+    """State and metrics of a tile of a survey.
 
     Attributes:
         name: unique in the survey.
-        outline: (K, 2) world metres, of its cell; empty where it isn't known.
-        state: "done" now, "kept" as it was before, "failed", or "waiting" to be made.
+        outline: (K, 2) outline of its cell in world metres; empty if unknown.
+        state: "done" in this run, "kept" (up to date before), "failed", or "waiting".
         reason: why it failed.
-        figures: what is known of `points`, `photos`, `coverage` (share of the surface that a photo saw), `psnr_db`
-            (or None: nothing was held out), `cloud_to_mesh_m` (mean, by class), `triangles`, `bytes` of its world,
-            `bytes_written` in all, `seconds` of work, `peak_mb`.
-        report: its own page, relative to the survey's, or None.
-        thumbnail: a picture of it, or None.
+        figures: known ones of `points`, `photos`, `coverage` (share of the surface seen by a photo), `psnr_db` (None
+            without held-out photos), `cloud_to_mesh_m` (mean, by class), `triangles`, `bytes` of its world,
+            `bytes_written` in total, `seconds` of computing time, `peak_mb`.
+        report: path of its page, relative to that of the survey, or None.
+        thumbnail: path of an image, or None.
         warnings: of its steps.
-        borders: with each `neighbour`: `gap_m`, `colour_step` (grey levels) and `one_sided_m` (metres of border where
-            only one of both has a surface), as far as they are known.
+        borders: known metrics of the border with each `neighbour`: `gap_m`, `colour_step` (grey levels) and
+            `one_sided_m` (metres of border where only one of the tiles has a surface).
     """
 
     name: str
@@ -77,25 +81,25 @@ def write_survey_report(
     path: npt.ArrayLike | None = None,
     failed: Mapping[str, ScanError] | None = None,
 ) -> Path:
-    """Write both reports into `out`, each whole or not at all; returns the page's path.
+    """Write both reports into `out`, each atomically; returns the path of the page.
 
     Args:
-        out: the survey's folder.
+        out: output folder of the survey.
         name: of the survey.
-        tiles: in the order in which they are listed.
-        path: (N, 2) or (N, 3) world metres, along the drive, or None.
-        failed: errors of the survey's own side products, by name.
+        tiles: all tiles, in the order of the list.
+        path: (N, 2) or (N, 3) positions along the drive in world metres, or None.
+        failed: errors of side products of the whole survey by name.
 
     Raises:
-        SpaceError: the disk is full or can't be written to.
+        SpaceError: the disk is full or not writable.
     """
     drive = np.zeros((0, 2)) if path is None else np.asarray(path, np.float64)[:, :2]
     try:
         out.mkdir(parents=True, exist_ok=True)
         body = summary(name, tiles, drive, failed)
-        write_whole(out / DATA, json.dumps(body, indent=1))
+        write_atomically(out / DATA, json.dumps(body, indent=1))
         world = out / "world" / f"{name}.sdf"
-        write_whole(out / PAGE, _render(body, tiles, drive, gazebo.commands(world)))
+        write_atomically(out / PAGE, _render(body, tiles, drive, gazebo.commands(world)))
     except OSError as error:
         raise from_os_error(error, out) from None
     return out / PAGE
@@ -104,7 +108,7 @@ def write_survey_report(
 def summary(
     name: str, tiles: Sequence[TileState], path: F64, failed: Mapping[str, ScanError] | None = None
 ) -> dict[str, Any]:
-    """All figures as one JSON-able table; keys as docs/formats.md names them."""
+    """All metrics as a JSON document; docs/reference/formats.md describes the keys."""
     return {
         "survey": name,
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
@@ -127,21 +131,19 @@ def summary(
 
 
 def overview(out: Path) -> str:
-    """How a survey fares, as Markdown, from its `survey.json`."""
+    """Summary of a survey as Markdown, from its `survey.json`."""
     body = _read(out)
     if body is None:
-        return "No tile is made yet."
+        return "No tile is finished yet."
     totals = body["totals"]
     lines = [f"**{body['survey']}**: " + ", ".join(f"{totals[state]} {state}" for state in STATES)]
     lines += [f"- {name}: {tile['reason']}" for name, tile in body["tiles"].items() if tile["state"] == "failed"]
-    lines += [
-        f"- {name}: failed, and the world is made without it: {one['cause']}" for name, one in body["failed"].items()
-    ]
+    lines += [f"- {name}: failed; the world is made without it: {one['cause']}" for name, one in body["failed"].items()]
     return "\n".join(lines)
 
 
 def rows(out: Path) -> list[dict[str, Any]]:
-    """A row a tile: its name, state and figures, from the survey's `survey.json`."""
+    """Table with the name, state and metrics of each tile, from the survey's `survey.json`."""
     body = _read(out)
     if body is None:
         return []
@@ -189,7 +191,7 @@ def _area(outline: F64) -> float:
 
 
 def _borders(tiles: Sequence[TileState]) -> list[dict[str, Any]]:
-    """Every border once, the worst first; where both tiles tell of it, the worse of both figures."""
+    """Each border once, worst first; if both of its tiles have metrics, the worse of each."""
     found: dict[tuple[str, ...], dict[str, Any]] = {}
     for tile in tiles:
         for border in tile.borders:
@@ -218,32 +220,32 @@ def _render(body: Mapping[str, Any], tiles: Sequence[TileState], path: F64, open
         thumbnails={tile.name: _thumbnail(tile.thumbnail) for tile in tiles if tile.thumbnail},
         groups=SURFACES,
         gazebo=opened,
-        shown=SHOWN,
+        shown=MAX_SHOWN,
     )
 
 
 def _map(tiles: Sequence[TileState], path: F64) -> dict[str, Any] | None:
-    """What the template draws: polygons with their colours, the path, a scale bar; None where there is no outline."""
+    """Data of the map: polygons with their colours, the path, a scale bar; None if no tile has an outline."""
     drawn = sorted((t for t in tiles if len(t.outline) >= 3), key=lambda t: -STATES.index(t.state))  # failed on top
     if not drawn:
         return None
-    places = np.concatenate([tile.outline for tile in drawn] + [path])
-    low, high = places.min(axis=0), places.max(axis=0)
-    scale = float(min((WIDTH, HEIGHT) / np.maximum(high - low, 1e-9)))  # pixels a metre
+    positions = np.concatenate([tile.outline for tile in drawn] + [path])
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    scale = float(min((MAP_WIDTH_PX, MAP_HEIGHT_PX) / np.maximum(high - low, 1e-9)))  # pixels per metre
     quality = "psnr_db" if any(tile.figures.get("psnr_db") is not None for tile in drawn) else "coverage"
     colours, legends = {}, {}
     for attribute, key in (("quality", quality), ("cost", "seconds")):
         colours[attribute], legends[attribute] = _colours(attribute, [tile.figures.get(key) for tile in drawn])
 
     def pixels(xy: F64) -> F64:
-        return np.column_stack([xy[:, 0] - low[0], high[1] - xy[:, 1]]) * scale + RIM
+        return np.column_stack([xy[:, 0] - low[0], high[1] - xy[:, 1]]) * scale + MAP_MARGIN_PX
 
     prefix = _prefix([tile.name for tile in drawn])
-    width, height = ((high - low) * scale + 2 * RIM).tolist()
+    width, height = ((high - low) * scale + 2 * MAP_MARGIN_PX).tolist()
     return {
         "width": round(width, 1),
-        "height": round(height + 20, 1),  # below: the scale bar
-        "tiny": float(np.median([np.ptp(tile.outline, axis=0).max() for tile in drawn])) * scale < TINY,
+        "height": round(height + 20, 1),  # space for the scale bar
+        "tiny": float(np.median([np.ptp(tile.outline, axis=0).max() for tile in drawn])) * scale < MIN_TILE_PX,
         "quality": quality,
         "legends": legends,
         "tiles": [
@@ -251,7 +253,7 @@ def _map(tiles: Sequence[TileState], path: F64) -> dict[str, Any] | None:
                 "tile": tile,
                 "points": _points(pixels(tile.outline)),
                 "middle": pixels(tile.outline).mean(axis=0).round(1).tolist(),
-                "label": tile.name[len(prefix) :] if len(drawn) <= LABELLED else None,
+                "label": tile.name[len(prefix) :] if len(drawn) <= MAX_LABELLED_TILES else None,
                 "quality": colours["quality"][i],
                 "cost": colours["cost"][i],
             }
@@ -265,12 +267,12 @@ def _map(tiles: Sequence[TileState], path: F64) -> dict[str, Any] | None:
 def _colours(
     attribute: str, values: Sequence[float | None]
 ) -> tuple[list[str | None], tuple[float, float, str] | None]:
-    """Each value's colour, and the legend: lowest and highest value, and their gradient in CSS."""
+    """The colour of each value, and the legend: lowest value, highest value, colours of the gradient in CSS."""
     known = [value for value in values if value is not None]
     if not known:
         return [None] * len(values), None
     low, high = min(known), max(known)
-    stops = np.array([[int(stop[i : i + 2], 16) for i in (1, 3, 5)] for stop in SCALES[attribute]], float)
+    stops = np.array([[int(stop[i : i + 2], 16) for i in (1, 3, 5)] for stop in COLOUR_SCALES[attribute]], float)
     at = np.linspace(0, 1, len(stops))
 
     def colour(value: float | None) -> str | None:
@@ -279,7 +281,7 @@ def _colours(
         share = (value - low) / (high - low) if high > low else 1.0
         return "#" + "".join(f"{round(float(np.interp(share, at, stops[:, c]))):02x}" for c in range(3))
 
-    return [colour(value) for value in values], (low, high, ", ".join(SCALES[attribute]))
+    return [colour(value) for value in values], (low, high, ", ".join(COLOUR_SCALES[attribute]))
 
 
 def _points(xy: F64) -> str:
@@ -287,42 +289,42 @@ def _points(xy: F64) -> str:
 
 
 def _thinned(xy: F64) -> F64:
-    """Places a pixel or more after the one before: a drive has a million of them."""
+    """Points at least a pixel apart along the line: a drive has up to a million."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
     _, first = np.unique(np.floor(along), return_index=True)
     return xy[first]
 
 
 def _prefix(names: Sequence[str]) -> str:
-    """What all names begin with, so that it needn't be on the map; something is left of each."""
-    alike = itertools.takewhile(lambda pair: pair[0] == pair[1], zip(min(names), max(names), strict=False))
-    return min(names)[: min(len(list(alike)), min(map(len, names)) - 1)]
+    """Common prefix of all names, which labels on the map omit; leaves at least one character of each name."""
+    equal = itertools.takewhile(lambda pair: pair[0] == pair[1], zip(min(names), max(names), strict=False))
+    return min(names)[: min(len(list(equal)), min(map(len, names)) - 1)]
 
 
 def _bar(scale: float) -> dict[str, Any]:
-    """A scale bar of a round length, a sixth of the map's width or less."""
-    longest = WIDTH / 6 / scale
+    """A scale bar of a round length, at most a sixth of the map's width."""
+    longest = MAP_WIDTH_PX / 6 / scale
     power = 10.0 ** np.floor(np.log10(longest))
     metres = next(float(f * power) for f in (5, 2, 1) if f * power <= longest)
     return {"pixels": round(metres * scale, 1), "text": f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"}
 
 
 def _thumbnail(path: Path) -> str | None:
-    """A picture's small copy as a data URI; None where it can't be read."""
+    """A thumbnail of an image as a data URI; None if it can't be read."""
     try:
         return _small(path, path.stat().st_mtime_ns)
     except OSError:
         return None
 
 
-@functools.lru_cache(maxsize=4096)  # a page is written again whenever a tile is done
+@functools.lru_cache(maxsize=4096)  # the page is written after every tile
 def _small(path: Path, changed: int) -> str | None:
     import cv2
 
     picture = cv2.imread(str(path), cv2.IMREAD_REDUCED_COLOR_4)
     if picture is None:
         return None
-    height = max(1, round(picture.shape[0] * THUMBNAIL / picture.shape[1]))
-    small = cv2.resize(picture, (THUMBNAIL, height), interpolation=cv2.INTER_AREA)
+    height = max(1, round(picture.shape[0] * THUMBNAIL_WIDTH_PX / picture.shape[1]))
+    small = cv2.resize(picture, (THUMBNAIL_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
     data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
     return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"

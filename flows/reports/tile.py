@@ -1,4 +1,4 @@
-"""The report of a run: `report.json` for programs, `report.html` for people."""
+"""Report of a tile: metrics as `report.json`, a web page as `report.html`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from scan2sim.flows.engine.planning import Planned
+from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.reports import gazebo
 from scan2sim.flows.reports.findings import findings
@@ -24,15 +24,15 @@ TEMPLATE = "tile.html.j2"
 PAGE, DATA = "report.html", "report.json"
 PAGES = Path(__file__).parent / "pages"
 SCRIPTS = "report_files"
-"""Folder beside the page: what it loads to show the world."""
+"""Folder next to the page with the scripts and data of its 3D view."""
 AREAS = ("area_m2", "seen_m2", "coloured_m2", "filled_m2")
 Picture = dict[str, Any]
-"""An entry of an album's index.json: `file`, `role`, `title`, `caption`, and perhaps `other`."""
+"""An image in the index.json of an album: `file`, `role`, `title`, `caption`, and optionally `other`."""
 
 
 def write_report(
     tile: Tile,
-    planned: Sequence[Planned],
+    planned: Sequence[PlannedTask],
     done: Mapping[str, Manifest],
     store: Store,
     out: Path,
@@ -40,40 +40,40 @@ def write_report(
     seconds: float,
     failed: Mapping[str, ScanError] | None = None,
 ) -> Path:
-    """Write both reports into `out`; returns the page's path.
+    """Write both reports into `out`; returns the path of the page.
 
     Args:
-        tile: that was made.
-        planned, done: its nodes, and results by node.
-        store: that keeps them.
-        out: the run's folder.
-        seconds: that this run took.
-        failed: errors of side products, by name.
+        tile: the tile.
+        planned, done: its tasks, and results by task name.
+        store: cache of the results.
+        out: output folder.
+        seconds: duration of this run.
+        failed: errors of side products by name.
     """
     body = figures(tile, done, failed) | {"seconds_this_run": round(seconds, 2)}
-    write_whole(out / DATA, json.dumps(body, indent=1))
-    keys = {p.node.id.name: p.key for p in planned}
+    write_atomically(out / DATA, json.dumps(body, indent=1))
+    keys = {p.task.id.name: p.key for p in planned}
     pictures: list[Picture] = []
-    for node, name in (("pictures", "pictures"), ("score", "error")):
-        if node in done:
-            folder = store.folder(node, keys[node]) / done[node].files[name]
+    for task, name in (("pictures", "pictures"), ("score", "error")):
+        if task in done:
+            folder = store.folder(task, keys[task]) / done[task].files[name]
             entries = json.loads((folder / "index.json").read_text(encoding="utf-8"))
-            shown = representative(entries, done[node].facts["photos"]) if name == "error" else entries
+            shown = representative(entries, done[task].facts["photos"]) if name == "error" else entries
             pictures += [_with_pixels(entry, folder) for entry in shown]
     page = out / PAGE
     view = done["preview"].facts if "preview" in done and done["preview"].files else None
-    write_whole(page, _render(body, pictures, view, gazebo.commands(out / "world" / f"{tile.name}.sdf")))
+    write_atomically(page, _render(body, pictures, view, gazebo.commands(out / "world" / f"{tile.name}.sdf")))
     return page
 
 
 def failed_before(out: Path) -> set[str]:
-    """Names of the side products that had failed when the report in `out` was written."""
+    """Names of the failed side products according to the report in `out`."""
     return set(json.loads((out / DATA).read_text(encoding="utf-8")).get("failed", {}))
 
 
 def figures(tile: Tile, done: Mapping[str, Manifest], failed: Mapping[str, ScanError] | None = None) -> dict[str, Any]:
-    """All figures of a run as one JSON-able table; keys as docs/formats.md names them."""
-    facts = {node: manifest.facts for node, manifest in done.items()}
+    """All metrics of a run as a JSON document; docs/reference/formats.md describes the keys."""
+    facts = {task: manifest.facts for task, manifest in done.items()}
     geometry: dict[str, dict[str, float]] = {}
     for group, values in facts.get("geometry", {}).items():
         for name, value in values.items():
@@ -99,14 +99,14 @@ def figures(tile: Tile, done: Mapping[str, Manifest], failed: Mapping[str, ScanE
         "texture": texture | facts.get("score", {}),
         "world": facts["export"],
         "steps": {
-            node: {"seconds": m.seconds, "peak_mb": m.peak_mb, "facts": m.facts, "warnings": m.warnings}
-            for node, m in done.items()
+            task: {"seconds": m.seconds, "peak_mb": m.peak_mb, "facts": m.facts, "warnings": m.warnings}
+            for task, m in done.items()
         },
     }
 
 
 def representative(entries: Sequence[Picture], scores: Mapping[str, Mapping[str, float]]) -> list[Picture]:
-    """Of the error pictures the worst, the median and the best by `psnr_gain_db`, which `scores` gives by title."""
+    """The worst, the median and the best error image by `psnr_gain_db`, which `scores` has by title."""
     ordered = sorted(entries, key=lambda entry: scores[entry["title"]]["psnr_gain_db"])
     if len(ordered) < 3:
         return ordered
@@ -115,7 +115,7 @@ def representative(entries: Sequence[Picture], scores: Mapping[str, Mapping[str,
 
 
 def _with_pixels(entry: Picture, folder: Path) -> Picture:
-    """The picture with what the page shows of it: `src`, and `other_src` where there is another."""
+    """The image with its data URIs: `src`, and `other_src` if there is another image to compare with."""
     other = {"other_src": _embedded(folder / entry["other"])} if "other" in entry else {}
     return entry | {"src": _embedded(folder / entry["file"])} | other
 
@@ -138,13 +138,13 @@ def _render(
 
 
 def _embedded(path: Path) -> str:
-    """The picture as a data URI, so that the page can be sent as one file."""
+    """The image as a data URI, so that the page is a single file."""
     kind = mimetypes.guess_type(path.name)[0]
     return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
+def write_atomically(path: Path, text: str) -> None:
+    """Write a text file atomically."""
     fresh = path.with_name(f".{path.name}")
     fresh.write_text(text, encoding="utf-8")
     fresh.replace(path)

@@ -1,4 +1,4 @@
-"""A finished world as a page: a folder that a browser shows without a server, tile by tile, or with one."""
+"""Web viewer of a finished world: a folder that a browser opens with or without a server, loading tile by tile."""
 
 from __future__ import annotations
 
@@ -25,40 +25,47 @@ from scan2sim.pipeline.io.worlds.glb import GlbParams
 from scan2sim.pipeline.io.worlds.provenance import SOURCES
 from scan2sim.pipeline.io.worlds.scene import Scene, SceneTile
 from scan2sim.pipeline.simulation.spawn import courses
-from scan2sim.pipeline.steps.pictures import EYE_HEIGHT, SEEN_RGB, bird_pose
+from scan2sim.pipeline.steps.pictures import DRIVER_EYE_HEIGHT_M, SEEN_RGB, bird_pose
 
 TEMPLATE, INDEX, TILES, COLLISION = "view.html.j2", "index.html", "tiles", "_collision"
 SCRIPTS = ("three.js", "walk.js", "view.js")
 CALL = "scan2simTile"
-"""The page's function that each tile's script calls."""
+"""JavaScript function of the page that the script of each tile calls."""
 SOURCE_RGB = {name: SEEN_RGB[level] for name, level in zip(SOURCES, (64, 128, 255), strict=True)}
-OWN_NAMES = ("localhost", "127.0.0.1", "[::1]")
-"""Of this machine for itself: a page of another name that leads here isn't answered."""
+LOOPBACK_HOSTS = ("localhost", "127.0.0.1", "[::1]")
+"""Accepted Host headers; others are rejected, as protection against DNS rebinding."""
 
 
 class ViewParams(Params):
-    """What a browser is given.
+    """Parameters of the web viewer and of the flight.
 
     Attributes:
-        megapixels: of a tile's texture pages together; larger ones are scaled down.
-        port: to be served on; 0: any that is free.
-        seconds: that a flight takes.
-        width: of its picture, pixels.
+        megapixels: maximum size of all textures of a tile; larger ones are scaled down.
+        port: TCP port of the server; 0: any free one.
+        seconds: duration of the flight.
+        width: image width of the flight in pixels.
     """
 
-    megapixels: float = Field(16.0, ge=0.1, le=1000, description="Of a tile's textures, which are scaled down to that.")
-    port: int = Field(0, ge=0, le=65535, description="Port on this machine; 0 for any that is free.")
-    seconds: float = Field(10.0, ge=0.1, le=3600, description="That the flight takes.")
-    width: int = Field(960, ge=64, le=7680, description="Of the flight's picture, pixels; it is 16 to 9.")
+    megapixels: float = Field(
+        16.0,
+        ge=0.1,
+        le=1000,
+        description="Maximum texture size of each tile in megapixels; larger textures are scaled down.",
+    )
+    port: int = Field(0, ge=0, le=65535, description="Port of the page on this machine; 0: any free port.")
+    seconds: float = Field(10.0, ge=0.1, le=3600, description="Duration of the flight (--film) in seconds.")
+    width: int = Field(
+        960, ge=64, le=7680, description="Image width of the flight (--film) in pixels; the aspect ratio is 16:9."
+    )
 
 
 class Pages:
-    """The folder of a world's page.
+    """The folder of a world's web page.
 
     Args:
         scene: the world.
-        folder: for the page; made.
-        megapixels: of a tile's texture pages together.
+        folder: folder of the page; created.
+        megapixels: maximum size of all textures of a tile.
     """
 
     def __init__(self, scene: Scene, folder: Path, megapixels: float) -> None:
@@ -73,11 +80,11 @@ class Pages:
 
     @property
     def scripts(self) -> list[str]:
-        """Of all tiles: names of files that `write` makes."""
+        """Names of the script files of all tiles, which `write` creates."""
         return [f"{name}{kind}.js" for name in self._tiles for kind in ("", COLLISION)]
 
     def write(self, script: str) -> None:
-        """Make a tile's script, unless it is there; names of others are nothing's."""
+        """Create the script of a tile unless it exists; ignores unknown names."""
         if script not in self.scripts:
             return
         with self._writing:
@@ -98,10 +105,10 @@ class Pages:
 
 
 def server(pages: Pages, port: int) -> ThreadingHTTPServer:
-    """What serves a page on this machine alone, tiles made as they are asked for; begin with `serve_forever`.
+    """HTTP server of a page, for this machine only; creates tiles on request. Start it by `serve_forever`.
 
     Raises:
-        SettingError: the port is taken.
+        SettingError: the port is in use.
     """
 
     class Handler(SimpleHTTPRequestHandler):
@@ -110,8 +117,8 @@ def server(pages: Pages, port: int) -> ThreadingHTTPServer:
 
         def do_GET(self) -> None:
             host = self.headers.get("Host", "").rsplit(":", 1)[0]
-            if host not in OWN_NAMES:
-                self.send_error(403, "Ask for localhost")
+            if host not in LOOPBACK_HOSTS:
+                self.send_error(403, "Use the host name localhost")
                 return
             _, _, script = urlsplit(self.path).path.partition(f"/{TILES}/")
             pages.write(script)
@@ -127,11 +134,13 @@ def server(pages: Pages, port: int) -> ThreadingHTTPServer:
     try:
         return ThreadingHTTPServer(("127.0.0.1", port), Handler)
     except OSError as error:
-        raise SettingError("--port", f"can't listen on port {port} ({error})", "Choose another, or 0") from None
+        raise SettingError(
+            "--port", f"can't listen on port {port} ({error})", "Choose another port, or 0 for any free one"
+        ) from None
 
 
 def _write_shown(path: Path, tile: SceneTile, megapixels: float) -> None:
-    """A tile as it is seen, its pages scaled to so many megapixels."""
+    """Write the visible meshes of a tile as GLB, with its textures scaled down to `megapixels`."""
     pages = [shape.pages[page] for shape in tile.textured().values() for page in shape.used_pages]
     texels = sum(int(np.prod(image.size_of(page))) for page in pages)
     scale = min(1.0, (megapixels * 1e6 / texels) ** 0.5)
@@ -147,7 +156,7 @@ def _page(scene: Scene) -> str:
 
 
 def _about(scene: Scene) -> dict[str, Any]:
-    """What the page is told: tiles and photos' poses, metres in the world."""
+    """Data of the page: tiles and photo poses, in world metres."""
     low = np.min([np.add(tile.low, tile.offset) for tile in scene.tiles], axis=0)
     high = np.max([np.add(tile.high, tile.offset) for tile in scene.tiles], axis=0)
     air = bird_pose(low, high)
@@ -170,7 +179,7 @@ def _about(scene: Scene) -> dict[str, Any]:
 
 
 def _photos(scene: Scene) -> list[dict[str, Any]]:
-    """Where photos were taken, each once, in the order of their times and names."""
+    """Name, pose and field of view of each photo, sorted by time and name."""
     found: dict[str, tuple[float, dict[str, Any]]] = {}
     for tile in scene.tiles:
         for view in tile.views():
@@ -190,18 +199,18 @@ def _photo(view: View, tile: SceneTile) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _ahead(pose: F64, reach: float = 20.0) -> list[list[float]]:
-    """Where a camera is, and what lies so many metres ahead of it."""
+def _ahead(pose: F64, distance: float = 20.0) -> list[list[float]]:
+    """Position of a camera, and the point at `distance` metres in its viewing direction."""
     eye = pose[:3, 3]
-    return [eye.round(3).tolist(), (eye + reach * pose[:3, 2]).round(3).tolist()]
+    return [eye.round(3).tolist(), (eye + distance * pose[:3, 2]).round(3).tolist()]
 
 
 def _on_ground(scene: Scene, low: F64, high: F64) -> list[list[float]]:
-    """An eye on the road that looks along it, else along the world; the page puts it onto the ground."""
+    """Start position and target on the road, else along the longer side; the page moves it to the ground."""
     for way in courses(scene):
-        places = way.places + (0, 0, 0 if way.by == "path" else EYE_HEIGHT)
-        return [places[len(places) // 4].round(3).tolist(), places[-1].round(3).tolist()]
+        positions = way.places + (0, 0, 0 if way.by == "path" else DRIVER_EYE_HEIGHT_M)
+        return [positions[len(positions) // 4].round(3).tolist(), positions[-1].round(3).tolist()]
     middle, along = (low + high) / 2, np.eye(3)[int(np.argmax((high - low)[:2]))]
     start = middle - along * (high - low) * 0.4
-    start[2] = middle[2] = low[2] + EYE_HEIGHT
+    start[2] = middle[2] = low[2] + DRIVER_EYE_HEIGHT_M
     return [start.round(3).tolist(), middle.round(3).tolist()]

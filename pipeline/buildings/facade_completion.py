@@ -1,9 +1,8 @@
-"""Walls and the scanner's rays: where a wall's scan ends only because the rays do, and where it has gaps.
+"""Facade completion: extent of walls above the scanner's field of view, and closing of gaps in walls.
 
-A wall is an upright plane of the cloud, cut into cells. A column of it may go on above its scan where that ends at the
-scanner's uppermost rays; a gap may be closed where no ray went through. How high a column goes is a line over all
-columns, solved by dynamic programming: as high as what is told of its cells says, and neighbours alike. Import late: it
-loads numba.
+A wall is a vertical plane of the cloud, divided into cells. A column of cells may be extended if its scanned part ends
+at the scanner's highest rays; a gap may be closed if no ray passed through it. The top of the wall is a curve over all
+columns, found by dynamic programming from the evidence of each cell and a smoothness term. Import lazily: loads numba.
 """
 
 from __future__ import annotations
@@ -21,39 +20,42 @@ from numba import njit
 from scan2sim.pipeline.core.types import F32, F64, I32, I64, Bools
 from scan2sim.pipeline.geometry.planes import Planes
 
-UPRIGHT = float(np.sin(np.radians(10.0)))
-"""|nz| of a wall's plane at most."""
-OPENING = 2.0
-"""Metres along a wall of the windows and doors in it."""
-RAGGED = 3
-"""Cells by which a scan's end may be below the uppermost rays."""
-SPACING = 0.015
-"""Radians likewise: two of a scanner's lines."""
-STEADY = 1.0
-"""Metres along a wall over which most columns say whether it was reached."""
-AZIMUTHS, FEW, CLOSE, LOOSE = 72, 50, 3.0, 0.005
-"""Directions in which the uppermost rays are looked for, points of one, metres from which on they count, and radians by
-which a direction may be lower: else it shows no more than what stands there."""
-SEEN_THROUGH = 0.25
-"""Share of its cells that rays went through, beyond which a wall is none."""
-DEEP = 0.3
-"""Metres behind a wall from which on a ray went through it."""
-SHOWN = 2.0
-"""What an edge of the picture is worth, in cells of which it is sure that they are the wall's."""
-STEP, JUMP = 0.6, 10.0
-"""Price of each cell by which neighbouring columns end at different heights, and the most that is paid."""
+WALL_MAX_NORMAL_Z = float(np.sin(np.radians(10.0)))
+"""Largest |nz| of a wall's plane."""
+
+
+@dataclass(frozen=True)
+class CompletionLimits:
+    """Parameters of facade completion."""
+
+    max_opening_m: float = 2.0  # width of windows and doors
+    top_tolerance_cells: int = 3  # distance below the highest rays at which the scanned part counts as limited by them
+    top_tolerance_rad: float = 0.015  # the same as an angle: two scan lines
+    smoothing_m: float = 1.0  # length along a wall of the majority vote on whether the top was reached
+    azimuth_bins: int = 72  # for the elevation of the highest rays
+    min_bin_points: int = 50
+    min_range_m: float = 3.0  # nearer returns are not used for the highest rays
+    elevation_tolerance_rad: float = 0.005  # bins lower than the fitted cone by more than this saw no high objects
+    max_open_fraction: float = 0.25  # walls with more cells that rays passed through are fences or gates
+    min_behind_m: float = 0.3  # a ray that ends this far behind a wall passed through it
+    edge_reward: float = 2.0  # of an image edge at the top of the wall, relative to a certain wall cell
+    step_cost: float = 0.6  # per cell of height difference between neighbouring columns
+    max_step_cost: float = 10.0
+
+
+LIMITS = CompletionLimits()
 
 
 @dataclass(frozen=True)
 class Wall:
-    """A wall's plane, cut into square cells, rows upwards.
+    """The plane of a wall, divided into square cells, rows upwards.
 
     Attributes:
-        plane: its index.
-        corner: (3,) local metres, the middle of cell (0, 0).
-        along, up, normal: (3,) unit; `along` is level.
-        cell: metres.
-        known: (R, C) where it was scanned.
+        plane: index of the plane.
+        corner: (3,) centre of cell (0, 0), local metres.
+        along, up, normal: (3,) unit vectors; `along` is horizontal.
+        cell: cell size, metres.
+        known: (R, C) bool, scanned cells.
     """
 
     plane: int
@@ -65,12 +67,12 @@ class Wall:
     known: Bools
 
     def part(self, low: int, high: int) -> Wall:
-        """Its rows from `low` up to `high`, without it."""
+        """The part of the wall with rows `low` to `high` - 1."""
         return replace(self, corner=self.places(low, 0), known=self.known[low:high])
 
     @cached_property
     def tops(self) -> I32:
-        """(C,) the highest scanned row of each column, of those without any between their neighbours'."""
+        """Highest scanned row (C,) of each column; interpolated for columns without scanned cells."""
         rows, columns = self.known.shape
         has = np.flatnonzero(self.known.any(axis=0))
         if not len(has):
@@ -80,33 +82,33 @@ class Wall:
 
     @cached_property
     def ends(self) -> I32:
-        """(C,) the row that the scan of each column ends at; dips narrower than `OPENING`, over windows, are none."""
-        width = 2 * round(OPENING / self.cell / 2) + 1
+        """`tops` (C,) with dips narrower than `max_opening_m` (above windows) closed."""
+        width = 2 * round(LIMITS.max_opening_m / self.cell / 2) + 1
         whole = cv2.morphologyEx(self.tops[None].astype(np.int16), cv2.MORPH_CLOSE, np.ones((1, width), np.uint8))
         return whole[0].astype(np.int32)
 
     def places(self, row: npt.ArrayLike, column: npt.ArrayLike) -> F64:
-        """(..., 3) local metres of places given in cells."""
+        """Positions (..., 3) in local metres of rows and columns, which may be fractional."""
         r, c = np.asarray(row, np.float64)[..., None], np.asarray(column, np.float64)[..., None]
         return self.corner + self.cell * (r * self.up + c * self.along)
 
     def column_of(self, xyz: npt.ArrayLike) -> I32:
-        """(N,) columns of places (N, 3)."""
+        """Columns (N,) of points (N, 3)."""
         at = np.rint((np.asarray(xyz, np.float64) - self.corner) @ self.along / self.cell)
         return np.clip(at, 0, self.known.shape[1] - 1).astype(np.int32)
 
 
 def walls(xyz: F32, which: I32, planes: Planes, cell: float, rise: float) -> Iterator[Wall]:
-    """The upright planes of a thinned cloud as walls, with room for `rise` metres above what was scanned.
+    """Walls of a thinned cloud: its vertical planes, with `rise` metres of empty rows above the scanned part.
 
     Args:
         xyz: (N, 3) local metres.
-        which: (N,) each point's plane, -1 for none.
-        planes: of the points.
-        cell: metres.
+        which: (N,) index of each point's plane, -1 for none.
+        planes: planes of the points.
+        cell: cell size, metres.
         rise: metres.
     """
-    for p in np.flatnonzero(np.abs(planes.normal[:, 2]) <= UPRIGHT):
+    for p in np.flatnonzero(np.abs(planes.normal[:, 2]) <= WALL_MAX_NORMAL_Z):
         normal, points = planes.normal[p], xyz[which == p].astype(np.float64)
         along = np.array([-normal[1], normal[0], 0.0]) / np.hypot(*normal[:2])
         up = np.cross(normal, along)
@@ -121,13 +123,13 @@ def walls(xyz: F32, which: I32, planes: Planes, cell: float, rise: float) -> Ite
 
 @dataclass(frozen=True)
 class Rays:
-    """The scanner's rays, one a thinned point.
+    """Rays of the scanner, one per thinned point.
 
     Attributes:
-        origin: (N, 3) local metres, where the scanner was.
-        end: (N, 3) local metres, what it hit.
-        limit: (3,) of the elevation (radians) that its rays end at: of 1, cosine and sine of their azimuth. The
-            uppermost rays are a cone, tilted as the scanner is.
+        origin: (N, 3) scanner positions, local metres.
+        end: (N, 3) returns, local metres.
+        limit: (3,) coefficients of the highest elevation (radians): constant, cosine and sine of the azimuth. The
+            highest rays form a cone that is tilted with the scanner.
     """
 
     origin: F64
@@ -136,29 +138,29 @@ class Rays:
 
     @staticmethod
     def of(origin: F64, end: F32) -> Rays:
-        """Rays whose upper limit is told from themselves."""
+        """Build rays, and estimate their upper limit from them."""
         ray = end.astype(np.float64) - origin
         azimuth, elevation, level = _directions(ray)
-        bins = np.floor((azimuth / (2 * np.pi) + 0.5) * AZIMUTHS).astype(int) % AZIMUTHS
-        terms, highest = [], []
-        for k in range(AZIMUTHS):
-            own = (bins == k) & (level > CLOSE)
-            if own.sum() >= FEW:
-                middle = ((k + 0.5) / AZIMUTHS - 0.5) * 2 * np.pi
+        bins = np.floor((azimuth / (2 * np.pi) + 0.5) * LIMITS.azimuth_bins).astype(int) % LIMITS.azimuth_bins
+        terms, max_elevation = [], []
+        for k in range(LIMITS.azimuth_bins):
+            own = (bins == k) & (level > LIMITS.min_range_m)
+            if own.sum() >= LIMITS.min_bin_points:
+                middle = ((k + 0.5) / LIMITS.azimuth_bins - 0.5) * 2 * np.pi
                 terms.append((1.0, np.cos(middle), np.sin(middle)))
-                highest.append(np.percentile(elevation[own], 99.8))
+                max_elevation.append(np.percentile(elevation[own], 99.8))
         if len(terms) < 3:
             return Rays(origin, end.astype(np.float64), np.array([np.pi / 2, 0.0, 0.0]))
-        columns, values = np.array(terms), np.array(highest)
+        columns, values = np.array(terms), np.array(max_elevation)
         limit, fits = np.zeros(3), np.ones(len(values), bool)
-        for _ in range(10):  # where nothing is high, the uppermost rays hit nothing
+        for _ in range(10):  # robust: where no object is high, the highest rays have no returns
             limit = np.linalg.lstsq(columns[fits], values[fits], rcond=None)[0]
             off = values - columns @ limit
-            fits = off >= min(-LOOSE, float(np.sort(off)[-3]))
+            fits = off >= min(-LIMITS.elevation_tolerance_rad, float(np.sort(off)[-3]))
         return Rays(origin, end.astype(np.float64), limit)
 
-    def reach(self, which: I64) -> tuple[F64, F64]:
-        """Heights that the uppermost rays from the origins of some are at where those end, and how far away: (K,)."""
+    def max_heights(self, which: I64) -> tuple[F64, F64]:
+        """Heights (K,) of the highest rays at the returns of rays `which`, and horizontal distances (K,), metres."""
         ray = self.end[which] - self.origin[which]
         azimuth, _, level = _directions(ray)
         elevation = np.stack([np.ones(len(azimuth)), np.cos(azimuth), np.sin(azimuth)], axis=1) @ self.limit
@@ -166,66 +168,79 @@ class Rays:
 
 
 def _directions(ray: F64) -> tuple[F64, F64, F64]:
-    """Azimuth and elevation, radians, and level length of rays (N, 3)."""
+    """Azimuth and elevation in radians, and horizontal length of rays (N, 3)."""
     level = np.hypot(ray[:, 0], ray[:, 1])
     return np.arctan2(ray[:, 1], ray[:, 0]), np.arctan2(ray[:, 2], level), level
 
 
-def ceiling(wall: Wall, rays: Rays, own: I64) -> I32:
-    """(C,) the highest row that each column may go on to.
+def max_rows(wall: Wall, rays: Rays, own: I64) -> I32:
+    """Highest row (C,) that each column may be extended to.
 
-    Any where its scan ends as the scanner's rays do, else up to the ray that would have passed above it.
+    Unlimited where the scanned part ends at the scanner's highest rays, else up to the next ray above it.
 
     Args:
-        wall: to be raised.
-        rays: of all points.
-        own: (N,) those that end on the wall.
+        wall: the wall.
+        rays: rays of all points.
+        own: (N,) indices of the rays that end on the wall.
     """
     rows, columns = wall.known.shape
     column = wall.column_of(rays.end[own])
-    height, level = rays.reach(own)
+    height, level = rays.max_heights(own)
     order = np.lexsort((height, column))
     first = np.searchsorted(column[order], np.arange(columns + 1))
-    some = np.flatnonzero(first[1:] > first[:-1])
-    far = order[first[some] + 3 * (first[some + 1] - first[some]) // 4]  # of the upper quartile
-    above = np.maximum(RAGGED * wall.cell, SPACING * level[far])
+    columns_with_rays = np.flatnonzero(first[1:] > first[:-1])
+    far = order[
+        first[columns_with_rays] + 3 * (first[columns_with_rays + 1] - first[columns_with_rays]) // 4
+    ]  # the ray at the 75th percentile of height
+    above = np.maximum(LIMITS.top_tolerance_cells * wall.cell, LIMITS.top_tolerance_rad * level[far])
     open_, between = np.zeros(columns), np.zeros(columns)
-    open_[some] = wall.places(wall.ends[some], some)[:, 2] >= height[far] - above
-    between = np.interp(np.arange(columns), some, above / wall.cell)
+    open_[columns_with_rays] = wall.places(wall.ends[columns_with_rays], columns_with_rays)[:, 2] >= height[far] - above
+    between = np.interp(np.arange(columns), columns_with_rays, above / wall.cell)
     ends = wall.ends + np.rint(between).astype(np.int32)
-    return np.where(_along(open_, wall.cell) > 0.5, rows - 1, np.minimum(ends, rows - 1)).astype(np.int32)
+    return np.where(_smoothed_along_wall(open_, wall.cell) > 0.5, rows - 1, np.minimum(ends, rows - 1)).astype(np.int32)
 
 
 def solid(wall: Wall, through: Bools) -> Bools:
-    """(C,) columns of which, as of most beside them, rays hardly went `through` what was scanned: no fence, no gate."""
+    """(C,) bool, True for columns where few rays passed `through` the scanned part (majority over neighbours)."""
     rows = np.arange(len(wall.known))[:, None]
     below = (rows <= wall.ends) & (wall.known | through)
-    seen_through = (below & through).sum(axis=0) > SEEN_THROUGH * below.sum(axis=0)
-    return np.asarray(_along(seen_through, wall.cell) < 0.5)
+    seen_through = (below & through).sum(axis=0) > LIMITS.max_open_fraction * below.sum(axis=0)
+    return np.asarray(_smoothed_along_wall(seen_through, wall.cell) < 0.5)
 
 
-def passed(wall: Wall, rays: Rays) -> Bools:
-    """(R, C) cells that rays went through, to end behind the wall."""
+def cells_passed_through(wall: Wall, rays: Rays) -> Bools:
+    """(R, C) bool, cells that rays passed through and ended behind the wall."""
     out = np.zeros(wall.known.shape, np.bool_)
-    _cross(out, rays.origin, rays.end, wall.corner, wall.normal, wall.up / wall.cell, wall.along / wall.cell, DEEP)
+    _mark_crossings(
+        out,
+        rays.origin,
+        rays.end,
+        wall.corner,
+        wall.normal,
+        wall.up / wall.cell,
+        wall.along / wall.cell,
+        LIMITS.min_behind_m,
+    )
     return out
 
 
 @njit(cache=True)
-def _cross(out: Bools, origin: F64, end: F64, corner: F64, normal: F64, up: F64, along: F64, deep: float) -> None:
-    """Mark in `out` (R, C) the cells of a plane that rays cross from before it to `deep` metres behind it."""
+def _mark_crossings(
+    out: Bools, origin: F64, end: F64, corner: F64, normal: F64, up: F64, along: F64, min_behind: float
+) -> None:
+    """Mark in `out` (R, C) the cells of a plane that rays cross from the front and end `min_behind` metres behind."""
     rows, columns = out.shape
     for i in range(len(end)):
         before, behind = 0.0, 0.0
         for k in range(3):
             before += (origin[i, k] - corner[k]) * normal[k]
             behind += (end[i, k] - corner[k]) * normal[k]
-        if before <= 0 or behind >= -deep:
+        if before <= 0 or behind >= -min_behind:
             continue
-        share = before / (before - behind)
+        fraction = before / (before - behind)
         row, column = 0.0, 0.0
         for k in range(3):
-            beyond = origin[i, k] + share * (end[i, k] - origin[i, k]) - corner[k]
+            beyond = origin[i, k] + fraction * (end[i, k] - origin[i, k]) - corner[k]
             row += beyond * up[k]
             column += beyond * along[k]
         row, column = np.rint(row), np.rint(column)
@@ -233,38 +248,40 @@ def _cross(out: Bools, origin: F64, end: F64, corner: F64, normal: F64, up: F64,
             out[int(row), int(column)] = True
 
 
-def closed(known: Bools, through: Bools, reach: int) -> Bools:
-    """(R, C) cells of gaps in what is `known` of a wall, less than twice `reach` cells wide.
+def gap_cells(known: Bools, through: Bools, radius: int) -> Bools:
+    """(R, C) bool, cells of gaps in the `known` part of a wall narrower than twice `radius` (closing).
 
-    Those that rays went `through` are none, and what is beside them.
+    Cells that rays passed `through`, and their neighbours, are excluded.
     """
-    if reach < 1:
+    if radius < 1:
         return np.zeros_like(known)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    whole = cv2.morphologyEx(np.pad(known, reach).astype(np.uint8), cv2.MORPH_CLOSE, disc)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    whole = cv2.morphologyEx(np.pad(known, radius).astype(np.uint8), cv2.MORPH_CLOSE, disc)
     open_ = cv2.dilate(through.astype(np.uint8), np.ones((3, 3)))
-    return np.asarray((whole[reach:-reach, reach:-reach] > 0) & ~known & (open_ == 0))
+    return np.asarray((whole[radius:-radius, radius:-radius] > 0) & ~known & (open_ == 0))
 
 
-def highest(value: F32, edge: F32, least: I32, most: I32) -> I32:
-    """(C,) the row that each column ends at: those with most of `value` below, at an `edge`, neighbours alike.
+def top_rows(value: F32, edge: F32, min_row: I32, max_row: I32) -> I32:
+    """Top row (C,) of each column, by dynamic programming over the columns.
+
+    Maximizes the sum of `value` below the top plus a reward for an `edge`, minus the cost of height differences.
 
     Args:
-        value: (R, C) of each cell.
-        edge: (R, C) from 0 to 1, whether there is an edge above each cell.
-        least, most: (C,) rows between which each ends.
+        value: (R, C) evidence of each cell for the wall.
+        edge: (R, C) from 0 to 1, strength of the image edge above each cell.
+        min_row, max_row: (C,) range of each top row.
     """
     rows, columns = value.shape
     row = np.arange(rows)
     gain = np.cumsum(value, axis=0, dtype=np.float64)
-    step = np.minimum(STEP * np.abs(row[:, None] - row), JUMP)
+    step = np.minimum(LIMITS.step_cost * np.abs(row[:, None] - row), LIMITS.max_step_cost)
     cost, back = np.zeros(rows), np.zeros((columns, rows), np.int64)
     for c in range(columns):
         through = cost + step
         back[c] = np.argmin(through, axis=1)
         cost = through[row, back[c]]
-        cost = cost - gain[:, c] - SHOWN * edge[:, c]
-        cost[(row < least[c]) | (row > most[c])] = np.inf
+        cost = cost - gain[:, c] - LIMITS.edge_reward * edge[:, c]
+        cost[(row < min_row[c]) | (row > max_row[c])] = np.inf
     out = np.empty(columns, np.int32)
     out[-1] = np.argmin(cost)
     for c in range(columns - 1, 0, -1):
@@ -272,8 +289,8 @@ def highest(value: F32, edge: F32, least: I32, most: I32) -> I32:
     return out
 
 
-def _along(values: npt.NDArray[Any], cell: float) -> F32:
-    """(C,) means of values over `STEADY` metres along a wall."""
-    width = 2 * round(STEADY / cell / 2) + 1
+def _smoothed_along_wall(values: npt.NDArray[Any], cell: float) -> F32:
+    """Moving average (C,) of values over `smoothing_m` along a wall."""
+    width = 2 * round(LIMITS.smoothing_m / cell / 2) + 1
     row = np.asarray(values, np.float32)[None]
     return np.asarray(cv2.blur(row, (width, 1), borderType=cv2.BORDER_REPLICATE)[0], np.float32)

@@ -1,6 +1,6 @@
-"""Outlines of roofs seen from above: which cells are one roof, and straight sides around each.
+"""Roof outlines: segmentation of roofs in a height raster, and their regularized outlines.
 
-Sides are fitted to the outline of a mask and turned to the building's main directions (as Sampath and Shan, "Building
+Sides are fitted to the contour of a mask and aligned to the building's main directions (Sampath and Shan, "Building
 boundary tracing and regularization from airborne lidar point clouds", PE&RS 73, 2007).
 """
 
@@ -12,23 +12,23 @@ from itertools import pairwise
 import numpy as np
 
 from scan2sim.pipeline.core.types import F64, I64, Bools
-from scan2sim.pipeline.geometry.height_map import Raster, closed, signed_area
+from scan2sim.pipeline.geometry.height_map import Raster, close_gaps, signed_area
 
-FINE = 4  # pixels of the outline's picture in a cell
-TURN = np.radians(12.0)  # by which a side may be turned to the building's main directions
-CORNER = np.radians(20.0)  # sides that differ by less have no corner in common
-END = 0.15  # share of a side at each end, near corners, that its line is not fitted to
-CLOSE = 2  # cells: gaps within one roof
+PIXELS_PER_CELL = 4  # of the image in which contours are traced
+MAX_ALIGNMENT_RAD = np.radians(12.0)  # largest rotation of a side to a main direction
+MIN_CORNER_RAD = np.radians(20.0)  # sides that differ by less are connected by a step instead of a corner
+END_FRACTION = 0.15  # part of a side at each end, near corners, that is not used to fit its line
+GAP_CELLS = 2  # gaps within one roof
 
 
 @dataclass(frozen=True)
-class Places:
-    """Places along the sides of rings.
+class OutlinePoints:
+    """Points along the sides of rings.
 
     Attributes:
         xy: (N, 2) local metres.
-        outward: (N, 2) unit, away from what the ring encloses.
-        side: (N,) number of the side, counted through all rings.
+        outward: (N, 2) unit vectors, away from the inside of the ring.
+        side: (N,) number of the side, counted over all rings.
     """
 
     xy: F64
@@ -39,8 +39,8 @@ class Places:
         return len(self.xy)
 
     @staticmethod
-    def along(rings: list[F64], step: float) -> Places:
-        """Places every `step` metres, or a little closer, along rings (K, 2) that have their inside to the left."""
+    def along(rings: list[F64], step: float) -> OutlinePoints:
+        """Points at most `step` metres apart along rings (K, 2) with their inside to the left."""
         xy, outward, side = [np.zeros((0, 2))], [np.zeros((0, 2))], [np.zeros(0, np.int64)]
         count = 0
         for ring in rings:
@@ -54,14 +54,14 @@ class Places:
                 outward.append(np.tile([forward[1], -forward[0]], (n, 1)))
                 side.append(np.full(n, count))
                 count += 1
-        return Places(np.concatenate(xy), np.concatenate(outward), np.concatenate(side))
+        return OutlinePoints(np.concatenate(xy), np.concatenate(outward), np.concatenate(side))
 
 
-def roofs(top: F64, cell: float, step: float, least: float) -> I64:
-    """Which roof each cell belongs to, 0: none.
+def roofs(top: F64, cell: float, step: float, min_area: float) -> I64:
+    """Number of the roof of each cell, 0: none.
 
-    Cells are of one roof where one gets from one to the other without a step of more than `step` metres; what is
-    smaller than `least` m2 (chimneys) belongs to the roof around it, or to none.
+    Cells of one roof are connected without a height step above `step` metres. Components smaller than `min_area` m2
+    (chimneys) belong to the roof around them, or to none.
 
     Args:
         top: (rows, columns) heights, NaN where there is no roof.
@@ -70,7 +70,7 @@ def roofs(top: F64, cell: float, step: float, least: float) -> I64:
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    mask = closed(np.isfinite(top), CLOSE)
+    mask = close_gaps(np.isfinite(top), GAP_CELLS)
     if not mask.any():
         return np.zeros(top.shape, np.int64)
     height = nearest_value(top, np.isfinite(top))
@@ -84,33 +84,33 @@ def roofs(top: F64, cell: float, step: float, least: float) -> I64:
     i, j = np.concatenate(pairs, axis=1)
     n = int(mask.sum())
     _, piece = connected_components(coo_matrix((np.ones(len(i), bool), (i, j)), shape=(n, n)), directed=False)
-    large = np.bincount(piece) * cell**2 >= least
+    large = np.bincount(piece) * cell**2 >= min_area
     component = np.zeros(top.shape, np.int64)
     component[mask] = np.where(large[piece], np.cumsum(large)[piece], 0)
-    loose = mask & (component == 0)
-    if loose.any() and component.any():
-        reach, index = ndimage.distance_transform_edt(component == 0, return_indices=True)
-        near = loose & (reach <= np.sqrt(least) / cell)
+    small = mask & (component == 0)
+    if small.any() and component.any():
+        distance, index = ndimage.distance_transform_edt(component == 0, return_indices=True)
+        near = small & (distance <= np.sqrt(min_area) / cell)
         component[near] = component[tuple(index)][near]
     return component
 
 
 def nearest_value(values: F64, known: Bools) -> F64:
-    """The array with every cell's value that of the nearest known one."""
+    """Fill every cell with the value of the nearest known one."""
     from scipy import ndimage
 
     index = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     return values[tuple(index)]
 
 
-def rings(mask: Bools, raster: Raster, tolerance: float, least: float) -> list[F64]:
-    """Rings (K, 2) of straight sides around a mask's cells and its holes, their inside to the left, local metres.
+def rings(mask: Bools, raster: Raster, tolerance: float, min_area: float) -> list[F64]:
+    """Rings (K, 2) of straight sides around the cells of a mask and its holes, inside to the left, local metres.
 
     Args:
         mask: (rows, columns).
-        raster: where they are.
-        tolerance: metres by which a side may miss the outline of the cells.
-        least: m2 of a hole that is a courtyard.
+        raster: raster of the mask.
+        tolerance: largest distance of a side from the contour of the cells, metres.
+        min_area: smallest area of a hole (courtyard), m2.
     """
     import cv2
 
@@ -119,25 +119,27 @@ def rings(mask: Bools, raster: Raster, tolerance: float, least: float) -> list[F
         return []
     low, high = (rows.min(), columns.min()), (rows.max() + 1, columns.max() + 1)
     part = np.pad(mask[low[0] : high[0], low[1] : high[1]], 3)
-    picture = part.repeat(FINE, axis=0).repeat(FINE, axis=1).astype(np.float32)
-    picture = cv2.GaussianBlur(picture, (0, 0), 0.6 * FINE)
-    contours, tree = cv2.findContours((picture > 0.5).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    image = part.repeat(PIXELS_PER_CELL, axis=0).repeat(PIXELS_PER_CELL, axis=1).astype(np.float32)
+    image = cv2.GaussianBlur(image, (0, 0), 0.6 * PIXELS_PER_CELL)
+    contours, tree = cv2.findContours((image > 0.5).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     found = []
     for contour, links in zip(contours, tree[0] if tree is not None else (), strict=True):
         hole, points = links[3] >= 0, contour[:, 0].astype(np.float64)
-        if len(points) < 4 * FINE or (hole and cv2.contourArea(contour) * (raster.cell / FINE) ** 2 < least):
+        if len(points) < 4 * PIXELS_PER_CELL or (
+            hole and cv2.contourArea(contour) * (raster.cell / PIXELS_PER_CELL) ** 2 < min_area
+        ):
             continue
-        local = ((points + 0.5) / FINE - 3 + (low[1], low[0]) + raster.low) * raster.cell
+        local = ((points + 0.5) / PIXELS_PER_CELL - 3 + (low[1], low[0]) + raster.low) * raster.cell
         if (signed_area(local) > 0) == hole:
             local = local[::-1]
-        ring = straight(local, tolerance)
+        ring = regularize(local, tolerance)
         if ring is not None:
             found.append(ring)
     return found
 
 
-def straight(contour: F64, tolerance: float) -> F64 | None:
-    """A ring (K, 2) of straight sides through a contour (N, 2); None where it has less than three."""
+def regularize(contour: F64, tolerance: float) -> F64 | None:
+    """Ring (K, 2) of straight sides along a contour (N, 2); None if it has fewer than three."""
     import cv2
 
     middle = contour.mean(axis=0)
@@ -153,9 +155,9 @@ def straight(contour: F64, tolerance: float) -> F64 | None:
     lines = [_line(run, contour[j % len(contour)] - contour[i]) for run, (i, j) in zip(runs, ends, strict=True)]
     length = np.array([len(run) for run in runs], float)
     angle = np.array([np.arctan2(d[1], d[0]) for _, d in lines])
-    main = np.arctan2((length * np.sin(4 * angle)).sum(), (length * np.cos(4 * angle)).sum()) / 4
-    off = (angle - main + np.pi / 4) % (np.pi / 2) - np.pi / 4
-    angle = np.where(np.abs(off) < TURN, angle - off, angle)
+    main_direction = np.arctan2((length * np.sin(4 * angle)).sum(), (length * np.cos(4 * angle)).sum()) / 4
+    off = (angle - main_direction + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    angle = np.where(np.abs(off) < MAX_ALIGNMENT_RAD, angle - off, angle)
     lines = [(centre, np.array([np.cos(a), np.sin(a)])) for (centre, _), a in zip(lines, angle, strict=True)]
     corners: list[F64] = []
     for k, (i, _) in enumerate(ends):
@@ -164,8 +166,8 @@ def straight(contour: F64, tolerance: float) -> F64 | None:
 
 
 def _line(run: F64, along: F64) -> tuple[F64, F64]:
-    """A point and the direction of the line through a run of points, which goes `along`."""
-    cut = int(END * len(run))
+    """Point and direction of the line fitted to a run of points, oriented `along`."""
+    cut = int(END_FRACTION * len(run))
     inner = run[cut : len(run) - cut] if len(run) - 2 * cut >= 3 else run
     centre = inner.mean(axis=0)
     direction = np.linalg.svd(inner - centre, full_matrices=False)[2][0] if len(inner) > 2 else along
@@ -173,12 +175,12 @@ def _line(run: F64, along: F64) -> tuple[F64, F64]:
     return centre, direction / max(float(np.linalg.norm(direction)), 1e-9)
 
 
-def _corner(place: F64, before: tuple[F64, F64], after: tuple[F64, F64], tolerance: float) -> list[F64]:
-    """Where two lines intersect, near `place`; where they don't, the feet of `place` on both."""
+def _corner(position: F64, before: tuple[F64, F64], after: tuple[F64, F64], tolerance: float) -> list[F64]:
+    """Intersection of two lines near `position`; if there is none, the projections of `position` onto both."""
     (p, d), (q, e) = before, after
     cross = d[0] * e[1] - d[1] * e[0]
-    if abs(cross) > np.sin(CORNER):
+    if abs(cross) > np.sin(MIN_CORNER_RAD):
         t = ((q - p)[0] * e[1] - (q - p)[1] * e[0]) / cross
-        if np.linalg.norm(p + t * d - place) < 3 * tolerance:
+        if np.linalg.norm(p + t * d - position) < 3 * tolerance:
             return [p + t * d]
-    return [p + ((place - p) @ d) * d, q + ((place - q) @ e) * e]
+    return [p + ((position - p) @ d) * d, q + ((position - q) @ e) * e]

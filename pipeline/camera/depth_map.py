@@ -1,15 +1,15 @@
-"""Who sees what: range images of meshes and points, and the test of a point against them.
+"""Visibility by depth maps (range images): occluders, rendering of range images, visibility test of points.
 
-A range image holds, for every pixel of a scaled camera, the distance along the pixel's ray to
-its first hit, whatever the camera model. Meshes are hit by ray casting (Embree); for discs every
-pixel of their footprint asks exactly where its own ray meets the plane.
+A range image stores, for every pixel of a scaled camera, the distance along the pixel's ray to the first hit, for any
+camera model. Meshes are rendered by ray casting (Embree), points as discs (splatting) with exact ray-plane
+intersections per pixel.
 
-What hides: the meshes where points bear them out (Poisson rounds off what is thin, and such a bulge hides nothing),
-and of the cloud only what the meshes lack (cars, people, what was trimmed away), as discs along the points'
-normals. What drove past while it was scanned left a trail of points, most of which `carve` has told apart: each hides
-only from photos taken at about the time when it was scanned. A point is visible if its range is no more than the range
-image's plus a bias that grows with the slope at which the surface is seen. Measured on a street whose truth is known
-by `bench/visibility.py`.
+Occluders are the mesh faces that are supported by points (a surface that Poisson inflates around thin structures has
+no points and occludes nothing), and those points of the cloud that no mesh represents (cars, people, trimmed
+surfaces), as discs with the points' normals. Objects that moved during the scan left trails of points, most of which
+`carve` has separated: such a point occludes only in photos taken at about the time when it was scanned. A point is
+visible if its range is at most that of the range image plus a bias that grows with the slope of the surface. Evaluated
+against ground truth by `bench/visibility.py`.
 """
 
 from __future__ import annotations
@@ -29,47 +29,46 @@ from scan2sim.pipeline.core.types import F32, F64, Bools, Camera, Mesh, PointClo
 if TYPE_CHECKING:
     from scan2sim.pipeline.camera.projection import Ranges
 
-BIAS = 0.04
-"""Metres that a point may lie behind what the range image shows and still count as seen."""
-PIXELS = 2_000_000
-"""Range images are at most this large."""
-ENLARGED = 2.0
-"""They are at most this many times as wide as the photo: finer pixels leak less and hide less falsely."""
-SUPPORT = 1.3
-"""A mesh farther from every point than so many times the points' usual spacing hides nothing there."""
-LOOSE = 2.5
-"""Leaves stand off the mesh of their crown: their points are left to it even so many times farther away."""
+RANGE_BIAS_M = 0.04
+"""A point up to this far behind the range image still counts as visible."""
+MAX_PIXELS = 2_000_000
+"""Maximum number of pixels of a range image."""
+MAX_UPSCALING = 2.0
+"""Maximum width of a range image relative to the photo; smaller pixels reduce both leaking and false occlusion."""
+SUPPORT_DISTANCE_SPACINGS = 1.3
+"""Mesh vertices farther from all points than this many median point spacings are unsupported and don't occlude."""
+FOLIAGE_DISTANCE_FACTOR = 2.5
+"""Leaves scatter around the mesh of their crown: factor on the distance within which a mesh represents a point."""
 MOVABLE = (CODE["vehicle"], CODE["person"])
 FOLIAGE = (CODE["low_vegetation"], CODE["mid_vegetation"], CODE["high_vegetation"])
-PASSING = 1.0
-"""Seconds: a movable thing moves where the points around one of its points were all scanned within this time."""
-AROUND = 1.0
-"""Metres: the points that are around another."""
-PASS = 5.0
-"""Seconds between scans of the same place that are told apart as two passes of the scanner."""
-PRESENT = (-0.1, 0.4)
-"""Seconds after its scan within which a point of a moving thing hides: points tell when their place was first scanned,
-and a car takes about so long to leave it."""
-MOMENT = 0.1
-"""The same, before and after, of points that `carve` found moving: the scanner's next turn has new ones."""
-FASTEST = 20.0
-"""Metres a second: points of moving things belong together less, the longer the time between them."""
-CLOSING = 0.7
-"""Discs of movable things reach so far of the way to the eighth neighbour: seen from one side, they are sparse."""
-SPARSE = 3.0
-"""Though to at most so many times the discs' radius."""
+MOVING_MAX_SCAN_TIME_S = 1.0
+"""A point of a movable class is moving if all points around it were scanned within this time."""
+MOVING_NEIGHBOURHOOD_M = 1.0
+"""Radius of the neighbourhood for `MOVING_MAX_SCAN_TIME_S`."""
+SAME_PASS_MAX_S = 5.0
+"""Points scanned further apart in time belong to different passes of the scanner."""
+MOVING_OCCLUSION_S = (-0.1, 0.4)
+"""Time window around its scan in which a point of a moving object occludes: a car leaves its own length in 0.4 s."""
+CARVED_OCCLUSION_S = 0.1
+"""Half of that window for points that `carve` classified as moving: the scanner's next turn has new points."""
+TIME_WEIGHT_M_PER_S = 20.0
+"""Scale from time to distance in the neighbour search among moving points: only points of one moment are neighbours."""
+DISC_RADIUS_FRACTION = 0.7
+"""Disc radius of movable objects relative to the distance of the eighth neighbour; their points are sparse."""
+MAX_DISC_SCALE = 3.0
+"""Upper limit of that radius, relative to the radius of other discs."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What hides.
+    """Occluders: meshes and discs.
 
     Attributes:
-        casting: Open3D's `RaycastingScene` of the meshes.
-        triangles: number of them.
-        centres, normals: (N, 3) of the discs; unit normals.
-        radii: (N,) of the discs, metres.
-        spans: (N, 2) of the discs, seconds from and to which they hide; NaN for those that hide at all times.
+        casting: Open3D `RaycastingScene` of the meshes.
+        triangles: number of mesh triangles.
+        centres, normals: (N, 3) centres and unit normals of the discs.
+        radii: (N,) radii of the discs, metres.
+        spans: (N, 2) time span in which each disc occludes, seconds; NaN: always.
     """
 
     casting: Any
@@ -82,10 +81,10 @@ class Scene:
 
 @dataclass(frozen=True)
 class DepthMap:
-    """What a view sees first.
+    """Range image of a posed camera.
 
     Attributes:
-        camera: the view's, scaled.
+        camera: the view's camera, scaled.
         T_world_cam: (4, 4) camera to local coordinates.
         range: (H, W) float32 metres along each pixel's ray; inf where it meets nothing.
     """
@@ -96,7 +95,7 @@ class DepthMap:
 
     @property
     def ranges(self) -> Ranges:
-        """As kernels take it."""
+        """The range image in the form that kernels take."""
         from scan2sim.pipeline.camera.models import pixel_angle
         from scan2sim.pipeline.camera.projection import Ranges
 
@@ -108,101 +107,109 @@ def scene(
     cloud: PointCloud | None = None,
     *,
     radius: float = 0.08,
-    lacking: float = 0.2,
+    mesh_distance: float = 0.2,
     moving: PointCloud | None = None,
 ) -> Scene:
-    """What hides, from the meshes of all classes and the whole cloud.
+    """Build the occluders from the meshes of all classes and the whole cloud.
 
     Args:
-        meshes: all classes.
-        cloud: with normals; None if only meshes hide, all of them.
-        radius: of the discs, metres; about the cloud's voxel size.
-        lacking: points nearer than this to a mesh (metres) are left to the mesh.
-        moving: what the step `carve` found moving, with normals and time.
+        meshes: meshes of all classes.
+        cloud: cloud with normals; None: all faces of the meshes occlude, and nothing else.
+        radius: radius of the discs in metres; about the cloud's voxel size.
+        mesh_distance: points nearer than this to a mesh (metres) are represented by the mesh and get no disc.
+        moving: points that the step `carve` classified as moving, with normals and time.
     """
     import open3d as o3d
 
-    whole = cloud is None or not len(cloud) or cloud.normal is None
-    if cloud is not None and not whole:
-        meshes = _borne_out(meshes, cloud)
+    meshes_only = cloud is None or not len(cloud) or cloud.normal is None
+    if cloud is not None and not meshes_only:
+        meshes = _supported_faces(meshes, cloud)
     casting, triangles = o3d.t.geometry.RaycastingScene(), 0
     for mesh in meshes:
         if len(mesh):
             casting.add_triangles(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces, np.uint32))
             triangles += len(mesh)
-    if cloud is None or whole:
+    if cloud is None or meshes_only:
         empty = np.zeros((0, 3), np.float32)
-        still = Scene(casting, triangles, empty, empty, np.zeros(0, np.float32), np.zeros((0, 2)))
-        return _with(still, moving, radius)
+        static = Scene(casting, triangles, empty, empty, np.zeros(0, np.float32), np.zeros((0, 2)))
+        return _with_moving(static, moving, radius)
     if triangles:
-        near = casting.compute_distance(np.ascontiguousarray(cloud.xyz)).numpy()
-        cloud = cloud.take(near > np.where(_of_class(cloud, FOLIAGE), LOOSE * lacking, lacking))
+        distance = casting.compute_distance(np.ascontiguousarray(cloud.xyz)).numpy()
+        cloud = cloud.take(
+            distance > np.where(_of_class(cloud, FOLIAGE), FOLIAGE_DISTANCE_FACTOR * mesh_distance, mesh_distance)
+        )
     assert cloud.normal is not None
-    spans = times_of_moving(cloud)[:, None] + PRESENT
-    return _with(Scene(casting, triangles, cloud.xyz, cloud.normal, _radii(cloud, radius), spans), moving, radius)
+    spans = times_of_moving(cloud)[:, None] + MOVING_OCCLUSION_S
+    return _with_moving(
+        Scene(casting, triangles, cloud.xyz, cloud.normal, _radii(cloud, radius), spans), moving, radius
+    )
 
 
-def _with(still: Scene, moving: PointCloud | None, radius: float) -> Scene:
-    """The scene with the points of what moved, each at its time."""
+def _with_moving(static: Scene, moving: PointCloud | None, radius: float) -> Scene:
+    """The scene with discs of moving points, each limited to the time of its scan."""
     from scipy.spatial import cKDTree
 
     if moving is None or not len(moving):
-        return still
+        return static
     assert moving.normal is not None and moving.time is not None
-    since = FASTEST * (moving.time - moving.time.min())
-    there = np.column_stack([moving.xyz, since])
-    distance, _ = cKDTree(there).query(there, k=[min(9, len(there))], workers=-1)
-    radii = np.clip(CLOSING * distance[:, 0], radius, SPARSE * radius).astype(np.float32)
+    scaled_time = TIME_WEIGHT_M_PER_S * (moving.time - moving.time.min())
+    xyzt = np.column_stack([moving.xyz, scaled_time])
+    distance, _ = cKDTree(xyzt).query(xyzt, k=[min(9, len(xyzt))], workers=-1)
+    radii = np.clip(DISC_RADIUS_FRACTION * distance[:, 0], radius, MAX_DISC_SCALE * radius).astype(np.float32)
     return replace(
-        still,
-        centres=np.concatenate([still.centres, moving.xyz]),
-        normals=np.concatenate([still.normals, moving.normal]),
-        radii=np.concatenate([still.radii, radii]),
-        spans=np.concatenate([still.spans, moving.time[:, None] + (-MOMENT, MOMENT)]),
+        static,
+        centres=np.concatenate([static.centres, moving.xyz]),
+        normals=np.concatenate([static.normals, moving.normal]),
+        radii=np.concatenate([static.radii, radii]),
+        spans=np.concatenate([static.spans, moving.time[:, None] + (-CARVED_OCCLUSION_S, CARVED_OCCLUSION_S)]),
     )
 
 
 def _of_class(cloud: PointCloud, codes: tuple[int, ...]) -> Bools:
-    """(N,) which points are of these classes; none where the classes aren't known."""
+    """(N,) bool, True for points of these classes; all False if the cloud has no classes."""
     return np.zeros(len(cloud), bool) if cloud.classification is None else np.isin(cloud.classification, codes)
 
 
-def _borne_out(meshes: Iterable[Mesh], cloud: PointCloud) -> list[Mesh]:
-    """The faces whose corners all have a point near by; how near, the points' usual spacing says.
+def _supported_faces(meshes: Iterable[Mesh], cloud: PointCloud) -> list[Mesh]:
+    """Faces supported by points: all their corners are within a multiple of the median point spacing of a point.
 
-    Those with a class of their own are things' (`furniture`), fitted to points that are in no surface's cloud.
+    Faces with a class of their own (from `furniture`) are always kept: their points are not in this cloud.
     """
     from scipy.spatial import cKDTree
 
     tree = cKDTree(cloud.xyz)
-    some = cloud.xyz[:: max(1, len(cloud) // 20_000)]
-    spacing, _ = tree.query(some, k=min(7, len(cloud)), workers=-1)
-    reach = SUPPORT * float(np.median(np.atleast_2d(spacing)[:, 1:].mean(axis=1))) if len(cloud) > 1 else np.inf
+    sample = cloud.xyz[:: max(1, len(cloud) // 20_000)]
+    spacing, _ = tree.query(sample, k=min(7, len(cloud)), workers=-1)
+    max_distance = (
+        SUPPORT_DISTANCE_SPACINGS * float(np.median(np.atleast_2d(spacing)[:, 1:].mean(axis=1)))
+        if len(cloud) > 1
+        else np.inf
+    )
     kept = []
     for mesh in meshes:
-        distance, _ = tree.query(mesh.vertices, distance_upper_bound=reach, workers=-1)
-        near = np.isfinite(distance)[mesh.faces].all(axis=1)
-        kept.append(mesh.keep(near if mesh.classification is None else near | (mesh.classification > 0)))
+        distance, _ = tree.query(mesh.vertices, distance_upper_bound=max_distance, workers=-1)
+        supported = np.isfinite(distance)[mesh.faces].all(axis=1)
+        kept.append(mesh.keep(supported if mesh.classification is None else supported | (mesh.classification > 0)))
     return kept
 
 
 def _radii(cloud: PointCloud, radius: float) -> F32:
-    """(N,) metres: `radius`, and of movable things so large that their discs close the surface between them."""
+    """(N,) disc radii in metres: `radius`; for movable objects, large enough that the discs overlap."""
     from scipy.spatial import cKDTree
 
     radii = np.full(len(cloud), radius, np.float32)
     movable = np.flatnonzero(_of_class(cloud, MOVABLE))
     if len(movable):
         xyz = cloud.xyz[movable]
-        distance, _ = cKDTree(xyz).query(xyz, k=[9], workers=-1)  # the first is the point itself
-        radii[movable] = np.clip(CLOSING * distance[:, 0], radius, SPARSE * radius)
+        distance, _ = cKDTree(xyz).query(xyz, k=[9], workers=-1)  # the first neighbour is the point itself
+        radii[movable] = np.clip(DISC_RADIUS_FRACTION * distance[:, 0], radius, MAX_DISC_SCALE * radius)
     return radii
 
 
 def times_of_moving(cloud: PointCloud) -> F64:
-    """(N,) seconds: when points of moving things were scanned; NaN for all that stands, or of which it isn't known.
+    """Times (N,) in seconds at which points of moving objects were scanned; NaN for static or undecided points.
 
-    The scanner sees what stands for seconds while it drives by, and what drives past only for a moment at each place.
+    A scanner that drives by sees a static object for seconds, and a moving object only briefly at each position.
     """
     from scipy.spatial import cKDTree
 
@@ -211,37 +218,37 @@ def times_of_moving(cloud: PointCloud) -> F64:
     if len(movable) == 0 or cloud.time is None:
         return times
     xyz, own = cloud.xyz[movable], cloud.time[movable]
-    some = slice(None, None, 8)  # enough to tell, and so few that a fixed number of neighbours reaches far
-    _, near = cKDTree(xyz[some]).query(xyz, k=32, distance_upper_bound=AROUND, workers=-1)
-    around = np.append(own[some], np.nan)[near]
-    around[~(np.abs(around - own[:, None]) < PASS)] = np.nan
-    around[:, 0] = own
-    moving = np.nanmax(around, axis=1) - np.nanmin(around, axis=1) < PASSING
+    every_8th = slice(None, None, 8)  # thinned, so that 32 neighbours cover the neighbourhood
+    _, near = cKDTree(xyz[every_8th]).query(xyz, k=32, distance_upper_bound=MOVING_NEIGHBOURHOOD_M, workers=-1)
+    neighbour_times = np.append(own[every_8th], np.nan)[near]
+    neighbour_times[~(np.abs(neighbour_times - own[:, None]) < SAME_PASS_MAX_S)] = np.nan
+    neighbour_times[:, 0] = own
+    moving = np.nanmax(neighbour_times, axis=1) - np.nanmin(neighbour_times, axis=1) < MOVING_MAX_SCAN_TIME_S
     times[movable[moving]] = own[moving]
     return times
 
 
 def depth_map(
-    camera: Camera, T_world_cam: F64, hides: Scene, *, time: float | None = None, pixels: int = PIXELS
+    camera: Camera, T_world_cam: F64, occluders: Scene, *, time: float | None = None, pixels: int = MAX_PIXELS
 ) -> DepthMap:
-    """The range image of a view.
+    """Render the range image of a view.
 
     Args:
-        camera: of the view, at full size.
+        camera: camera of the view, at full size.
         T_world_cam: (4, 4) camera to local coordinates.
-        hides: see `scene`.
-        time: of the photo, seconds, for what moves; None: everything hides wherever it was scanned.
-        pixels: the camera is scaled to at most this many, and to at most `ENLARGED` times its width.
+        occluders: from `scene`.
+        time: time of the photo in seconds, selects moving points; None: all moving points occlude.
+        pixels: maximum number of pixels; the range image is also at most `MAX_UPSCALING` times as wide as the photo.
     """
     from scan2sim.pipeline.camera import disc_splatting
     from scan2sim.pipeline.camera.models import pixel_rays, ray_origins
-    from scan2sim.pipeline.camera.projection import eye
+    from scan2sim.pipeline.camera.projection import posed_camera
 
-    camera = camera.scaled(min(ENLARGED, math.sqrt(pixels / (camera.width * camera.height))))
+    camera = camera.scaled(min(MAX_UPSCALING, math.sqrt(pixels / (camera.width * camera.height))))
     rays = pixel_rays(camera)
     T_world_cam = np.asarray(T_world_cam, np.float64)
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
-    if hides.triangles:
+    if occluders.triangles:
         cast = np.empty((camera.height, camera.width, 6), np.float32)
         cast[..., :3], cast[..., 3:] = (
             T_world_cam[:3, 3],
@@ -251,37 +258,37 @@ def depth_map(
             v, u = np.mgrid[: camera.height, : camera.width]
             begin = ray_origins(camera, np.column_stack([u.ravel(), v.ravel()])).reshape(*u.shape, 3)
             cast[..., :3] += begin @ T_world_cam[:3, :3].T
-        hit = hides.casting.cast_rays(cast)["t_hit"].numpy()
+        hit = occluders.casting.cast_rays(cast)["t_hit"].numpy()
         depth = np.where(np.isfinite(rays[..., 0]), hit, np.inf).astype(np.float32)
-    there = np.ones(len(hides.centres), bool)
+    active = np.ones(len(occluders.centres), bool)
     if time is not None:
-        there = np.isnan(hides.spans[:, 0]) | ((time > hides.spans[:, 0]) & (time < hides.spans[:, 1]))
-    if there.any():
-        centres, normals, radii = hides.centres[there], hides.normals[there], hides.radii[there]
-        disc_splatting.draw_discs(depth, rays, eye(camera, T_world_cam), centres, normals, radii)
+        active = np.isnan(occluders.spans[:, 0]) | ((time > occluders.spans[:, 0]) & (time < occluders.spans[:, 1]))
+    if active.any():
+        centres, normals, radii = occluders.centres[active], occluders.normals[active], occluders.radii[active]
+        disc_splatting.draw_discs(depth, rays, posed_camera(camera, T_world_cam), centres, normals, radii)
     return DepthMap(camera, T_world_cam, depth)
 
 
 def load_depth_map(path: Path, camera: Camera, T_world_cam: F64) -> DepthMap:
-    """The range image kept at `path` (.npy, (H, W) float32) of a view with that camera and pose."""
+    """Load the range image of a view with that camera and pose from `path` (.npy, (H, W) float32)."""
     depth = np.load(path)
     height, width = depth.shape
     return DepthMap(camera.resized(width, height), np.asarray(T_world_cam, np.float64), depth)
 
 
 def visible(
-    depth: DepthMap, points: npt.ArrayLike, normals: npt.ArrayLike | None = None, *, bias: float = BIAS
+    depth: DepthMap, points: npt.ArrayLike, normals: npt.ArrayLike | None = None, *, bias: float = RANGE_BIAS_M
 ) -> Bools:
-    """(N,) which points the view sees: within the image, and not behind what its range image shows.
+    """(N,) bool, True for points that the view sees: inside the image, and not behind its range image.
 
     Args:
-        depth: of the view.
+        depth: range image of the view.
         points: (N, 3) local metres.
-        normals: (N, 3) unit, of the surface at the points; either side; None: seen head-on.
-        bias: metres allowed behind the range image, before the slope's share.
+        normals: (N, 3) unit surface normals at the points, of either sign; None: assume frontal incidence.
+        bias: tolerance behind the range image in metres, to which a term for the slope is added.
     """
-    from scan2sim.pipeline.camera.projection import eye, visible_places
+    from scan2sim.pipeline.camera.projection import posed_camera, visible_points
 
     points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
     facing = np.zeros((0, 3)) if normals is None else np.ascontiguousarray(normals, np.float64).reshape(-1, 3)
-    return visible_places(eye(depth.camera, depth.T_world_cam), depth.ranges, points, facing, bias)
+    return visible_points(posed_camera(depth.camera, depth.T_world_cam), depth.ranges, points, facing, bias)

@@ -1,4 +1,4 @@
-"""Lenses that other programs describe in their own ways, as OpenCV's coefficients."""
+"""Fit OpenCV distortion coefficients to lens models of other programs."""
 
 from __future__ import annotations
 
@@ -8,42 +8,43 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import F64
 
-EXACT = 0.05
-"""Pixels that a fitted lens may be off at worst: a tenth of what photos fit to in the best of cases."""
+MAX_FIT_ERROR_PX = 0.05
+"""Largest accepted error of a fitted lens: a tenth of the best reprojection errors of photos."""
 
 
-def radial(factor: Callable[[F64], F64], reach: float, focal: float) -> tuple[F64, float]:
-    """OpenCV's radial coefficients of a lens that moves what is seen at radius r to r * `factor(r)`.
+def fit_radial(factor: Callable[[F64], F64], max_radius: float, focal: float) -> tuple[F64, float]:
+    """Fit OpenCV's radial coefficients to a lens whose distorted radius is r * `factor(r)`.
 
-    A rational of third degree in r2 over another, which OpenCV's k1...k6 are, is fitted by least squares, made linear
-    as Sanathanan and Koerner do (Transfer function synthesis as a ratio of two complex polynomials, 1963).
+    OpenCV's k1...k6 are a rational function (cubic polynomials in r2), fitted by linearized least squares with
+    iterative reweighting (Sanathanan and Koerner, Transfer function synthesis as a ratio of two complex polynomials,
+    1963).
 
     Args:
-        factor: of (N,) radii, tangents of angles to the axis, without distortion.
-        reach: largest radius that is in the picture.
-        focal: pixels.
+        factor: function of (N,) undistorted radii (tangents of the angle to the optical axis).
+        max_radius: largest undistorted radius inside the image.
+        focal: focal length in pixels.
 
     Returns:
-        (6,) k1 k2 k3 k4 k5 k6, and how many pixels they are off at worst, up to `reach`.
+        (6,) k1 k2 k3 k4 k5 k6, and the largest error in pixels up to `max_radius`.
     """
-    r = np.linspace(0, reach, 2000)[1:]
-    wanted, s = factor(r), (r / reach) ** 2  # powers of what is at most 1: better conditioned
+    r = np.linspace(0, max_radius, 2000)[1:]
+    target, s = factor(r), (r / max_radius) ** 2  # powers of values up to 1 are better conditioned
     powers = np.stack([s, s**2, s**3], axis=1)
-    best, off = np.zeros(6), np.inf
-    for below in range(4):  # terms of the denominator: more of them fit better, but may have a pole within reach
-        rows, weight, k = np.hstack([powers, -wanted[:, None] * powers[:, :below]]), r, np.zeros(6)
-        for _ in range(5):  # weighted by the last round's denominator, the error is that of the quotient itself
-            k[: 3 + below] = np.linalg.lstsq(rows * weight[:, None], (wanted - 1) * weight, rcond=1e-13)[0]
+    best, max_error = np.zeros(6), np.inf
+    for denominator_terms in range(4):  # more terms fit better, but may have a pole inside the image
+        rows, weight, k = np.hstack([powers, -target[:, None] * powers[:, :denominator_terms]]), r, np.zeros(6)
+        for _ in range(5):  # weighting by the previous denominator makes the residual that of the quotient
+            k[: 3 + denominator_terms] = np.linalg.lstsq(rows * weight[:, None], (target - 1) * weight, rcond=1e-13)[0]
             weight = r / np.maximum(np.abs(1 + powers @ k[3:]), 1e-9)
         divisor = 1 + powers @ k[3:]
-        error = np.abs((1 + powers @ k[:3]) / divisor - wanted) * r if (divisor > 0).all() else np.full(1, np.inf)
-        if error.max() * focal < off:
-            best, off = k, float(error.max() * focal)
-    return best / np.tile(reach ** np.array([2.0, 4.0, 6.0]), 2), off
+        error = np.abs((1 + powers @ k[:3]) / divisor - target) * r if (divisor > 0).all() else np.full(1, np.inf)
+        if error.max() * focal < max_error:
+            best, max_error = k, float(error.max() * focal)
+    return best / np.tile(max_radius ** np.array([2.0, 4.0, 6.0]), 2), max_error
 
 
-def reach(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> float:
-    """The largest distorted radius in a picture: that of the corner which is farthest from the axis."""
+def max_distorted_radius(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> float:
+    """Largest distorted radius in an image: that of the corner farthest from the principal point."""
     x = np.array([-0.5 - cx, width - 0.5 - cx]) / fx
     y = np.array([-0.5 - cy, height - 0.5 - cy]) / fy
     return float(np.hypot(np.abs(x).max(), np.abs(y).max()))

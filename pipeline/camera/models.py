@@ -1,8 +1,8 @@
-"""Camera models: points to pixels and pixels to rays. Distortion is written once, here.
+"""Camera models: projection of points to pixels, unprojection of pixels to rays, distortion.
 
-A camera travels into numba kernels as two things: `MODEL_ID[camera.model]` and `parameters(camera)`.
+Kernels take a camera as `MODEL_ID[camera.model]` and `parameters(camera)`.
 Models and coefficient order are OpenCV's (calib3d and its fisheye module); see `pipeline.core.types.Camera`.
-Import this module late: it loads numba.
+Import this module lazily: it loads numba.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ MODEL_ID: dict[str, int] = {
     "equirectangular": EQUIRECTANGULAR,
     "orthographic": ORTHOGRAPHIC,
 }
-ALIKE = 1000.0
-"""An orthographic camera is rated as a photo of so many pixels' focal length whose pixels are as large."""
-FEW = 10_000
-"""Points, and pixels, for which one thread takes less time than to wake others."""
-# layout of the parameter array: fx fy cx cy, k1 k2 p1 p2 k3 k4 k5 k6, width height, limit
+ORTHO_EQUIVALENT_FOCAL_PX = 1000.0
+"""Focal length of the perspective camera with the same ground sample distance, for rating orthographic views."""
+SERIAL_MAX = 10_000
+"""Up to this number of points or pixels, a single thread is faster than starting several."""
+# layout of the parameter array: fx fy cx cy, k1 k2 p1 p2 k3 k4 k5 k6, width height, limit of validity
 _WIDTH, _HEIGHT, _LIMIT = 12, 13, 14
 
 
 def parameters(camera: Camera) -> F64:
-    """(15,) what the kernels need of a camera: focal lengths, centre, distortion, size, limit of validity.
+    """Parameters (15,) of a camera for kernels: focal lengths, principal point, distortion, size, limit of validity.
 
-    The limit is where the distortion polynomial stops growing and starts to fold back on itself:
+    Beyond the limit of validity, the distortion polynomial decreases and folds back on itself:
     tan(angle to the axis) for "opencv", the angle itself in radians for "fisheye".
     """
     p = np.zeros(15)
@@ -54,47 +54,47 @@ def parameters(camera: Camera) -> F64:
     return p
 
 
-def _first_fold(x: F64, y: F64, never: float) -> float:
-    falls = np.flatnonzero(np.diff(y) <= 0)
-    return float(x[falls[0]]) if len(falls) else never
+def _first_fold(x: F64, y: F64, no_fold: float) -> float:
+    decreasing = np.flatnonzero(np.diff(y) <= 0)
+    return float(x[decreasing[0]]) if len(decreasing) else no_fold
 
 
 def project(camera: Camera, points_cam: npt.ArrayLike) -> tuple[F32, Bools]:
-    """Pixels of points given in camera coordinates.
+    """Project points given in camera coordinates.
 
     Args:
         camera: its intrinsics.
         points_cam: (N, 3) metres, camera axes.
 
     Returns:
-        uv (N, 2) float32 pixels, and valid (N,) bool: in front of the camera and within the field where
-        its distortion holds. Whether a pixel lies within the image is not looked at (`inside`).
+        uv (N, 2) float32 pixels, and valid (N,) bool: in front of the camera and within the field of view
+        where its distortion model is valid. Doesn't check whether a pixel lies inside the image (`inside` does).
     """
     uv, valid = project_exactly(camera, points_cam)
     return uv.astype(np.float32), valid
 
 
 def project_exactly(camera: Camera, points_cam: npt.ArrayLike) -> tuple[F64, Bools]:
-    """`project` in float64, for differences of pixels."""
+    """`project` in float64, for numerical derivatives."""
     points = np.ascontiguousarray(points_cam, np.float64).reshape(-1, 3)
-    kernel = _project if len(points) > FEW else _project_few
+    kernel = _project if len(points) > SERIAL_MAX else _project_serial
     return kernel(MODEL_ID[camera.model], parameters(camera), points)
 
 
 def unproject(camera: Camera, uv: npt.ArrayLike) -> F64:
-    """(N, 3) unit rays in camera axes through pixels (N, 2); NaN for a pixel that no ray reaches."""
+    """Unit rays (N, 3) in camera axes through pixels (N, 2); NaN for pixels outside the valid field of view."""
     pixels = np.ascontiguousarray(uv, np.float64).reshape(-1, 2)
-    kernel = _unproject if len(pixels) > FEW else _unproject_few
+    kernel = _unproject if len(pixels) > SERIAL_MAX else _unproject_serial
     return kernel(MODEL_ID[camera.model], parameters(camera), pixels)
 
 
 def pixel_rays(camera: Camera) -> F32:
-    """(H, W, 3) unit rays, camera axes, through every pixel's centre; NaN where no ray reaches."""
+    """Unit rays (H, W, 3) in camera axes through the pixel centres; NaN outside the valid field of view."""
     return _pixel_rays(MODEL_ID[camera.model], parameters(camera), camera.height, camera.width)
 
 
 def ray_origins(camera: Camera, uv: npt.ArrayLike) -> F64:
-    """(N, 3) where the rays through pixels (N, 2) begin, camera axes: the centre, but for an orthographic camera."""
+    """Origins (N, 3) of the rays through pixels (N, 2) in camera axes: 0 except for an orthographic camera."""
     uv = np.asarray(uv, np.float64).reshape(-1, 2)
     origins = np.zeros((len(uv), 3))
     if camera.model == "orthographic":
@@ -103,14 +103,14 @@ def ray_origins(camera: Camera, uv: npt.ArrayLike) -> F64:
 
 
 def inside(camera: Camera, uv: npt.NDArray[np.floating]) -> Bools:
-    """(N,) whether pixels (N, 2) lie within the image, its half-pixel border included; a panorama's sides are none."""
+    """(N,) whether pixels (N, 2) lie inside the image, half-pixel border included; panoramas wrap around."""
     u, v = uv[:, 0], uv[:, 1]
     across = (u >= -0.5) & (u < camera.width - 0.5) | (camera.model == "equirectangular")
     return across & (v >= -0.5) & (v < camera.height - 0.5)
 
 
 def pixel_angle(camera: Camera) -> float:
-    """Radians that a pixel spans at the image's centre; metres, of an orthographic camera."""
+    """Angle of a pixel at the image centre in radians; for an orthographic camera, its width in metres."""
     if camera.model == "equirectangular":
         return max(2 * math.pi / camera.width, math.pi / camera.height)
     return 1.0 / min(camera.fx, camera.fy)
@@ -135,7 +135,7 @@ def _fisheye_radius(p: F64, theta: float) -> float:
 
 @njit(cache=True)
 def project_point(model: int, p: F64, x: float, y: float, z: float) -> tuple[float, float, bool]:
-    """(u, v, ok): the pixel of a point in camera axes; every kernel projects through this one."""
+    """(u, v, ok): pixel of a point in camera axes; the projection function of all kernels."""
     if model == EQUIRECTANGULAR:
         r = math.sqrt(x * x + y * y + z * z)
         if r < 1e-9:
@@ -164,7 +164,7 @@ def project_point(model: int, p: F64, x: float, y: float, z: float) -> tuple[flo
 
 @njit(cache=True)
 def unproject_pixel(model: int, p: F64, u: float, v: float) -> tuple[float, float, float]:
-    """(x, y, z): the unit ray through a pixel, camera axes; NaN where there is none."""
+    """(x, y, z): unit ray through a pixel in camera axes; NaN outside the valid field of view."""
     if model == EQUIRECTANGULAR:
         lon = ((u + 0.5) / p[12] - 0.5) * 2 * math.pi
         lat = ((v + 0.5) / p[13] - 0.5) * math.pi
@@ -188,7 +188,7 @@ def unproject_pixel(model: int, p: F64, u: float, v: float) -> tuple[float, floa
 
 @njit(cache=True)
 def _fisheye_angle(p: F64, radius: float) -> float:
-    """Inverse of `_fisheye_radius` by bisection on its monotonous part."""
+    """Inverse of `_fisheye_radius` by bisection on its monotonic part."""
     low, high = 0.0, p[14]
     if radius > _fisheye_radius(p, high):
         return math.nan
@@ -242,7 +242,7 @@ def _project(model: int, p: F64, points: F64) -> tuple[F64, Bools]:
 
 
 @njit(cache=True)
-def _project_few(model: int, p: F64, points: F64) -> tuple[F64, Bools]:
+def _project_serial(model: int, p: F64, points: F64) -> tuple[F64, Bools]:
     uv = np.empty((len(points), 2))
     valid = np.empty(len(points), np.bool_)
     for i in range(len(points)):
@@ -260,7 +260,7 @@ def _unproject(model: int, p: F64, uv: F64) -> F64:
 
 
 @njit(cache=True)
-def _unproject_few(model: int, p: F64, uv: F64) -> F64:
+def _unproject_serial(model: int, p: F64, uv: F64) -> F64:
     rays = np.empty((len(uv), 3))
     for i in range(len(uv)):
         rays[i, 0], rays[i, 1], rays[i, 2] = unproject_pixel(model, p, uv[i, 0], uv[i, 1])

@@ -1,7 +1,7 @@
-"""How finely photos see the points of a cloud, and what of it is worth a surface. Import late: loads numba.
+"""Photo coverage: ground sample distance (GSD) of points in the photos, and selection of the points to be meshed.
 
-A photo that shows a patch of surface in less than a pixel has nothing to say of it. The side of the patch that one
-pixel covers, range x the pixel's angle / sqrt(cos of incidence), is what the texture's choice of photos goes by, too.
+The GSD is the side of the surface patch that one pixel covers, range x pixel angle / sqrt(cos of incidence); view
+selection for textures uses the same measure. Import lazily: loads numba.
 """
 
 from __future__ import annotations
@@ -13,86 +13,101 @@ import numpy as np
 from numba import njit, prange
 
 from scan2sim.pipeline.camera.depth_map import depth_map, scene
-from scan2sim.pipeline.camera.projection import Eye, Ranges, eye, incidence, is_visible, pixel_of, to_camera, turned
+from scan2sim.pipeline.camera.projection import (
+    PosedCamera,
+    Ranges,
+    incidence,
+    is_visible,
+    pixel_of,
+    posed_camera,
+    rotate_to_camera,
+    to_camera,
+)
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F32, F64, Bools, PointCloud, View
 
-PIXELS = 300_000
-"""Range images are at most this large: points of decimetres need no finer ones."""
-LEAST_COS = 0.02
-"""Of incidence; what is seen more edge-on than this is coloured by no photo (`texturing.view_selection.step`)."""
+MAX_PIXELS = 300_000
+"""Maximum number of pixels of a range image; enough for discs of some decimetres."""
+MIN_COS_INCIDENCE = 0.02
+"""Lower limit of the cosine of incidence; no photo textures steeper surfaces (`texturing.view_selection.step`)."""
 
 
-def finest(cloud: PointCloud, views: Sequence[View], *, size: float, coarsest: float, report: Report = silent) -> F32:
-    """(N,) metres: side of the smallest patch that a pixel of any photo covers at each point; inf where none sees it.
+def finest_gsd(
+    cloud: PointCloud, views: Sequence[View], *, voxel: float, max_gsd: float, report: Report = silent
+) -> F32:
+    """Finest ground sample distance (N,) of each point in any photo, metres; inf where no photo sees the point.
 
     Args:
-        cloud: with normals; thinned to about one point a voxel of `size` metres. It hides what is behind it.
-        views: photos with a perspective.
-        size: metres, of the voxels: points hide by discs of it, and may lie so far behind them.
-        coarsest: metres; what all pixels cover more coarsely isn't asked for.
-        report: progress.
+        cloud: cloud with normals, thinned to about one point per voxel; it is also the occluder.
+        views: perspective photos.
+        voxel: voxel size in metres: radius of the occluding discs and tolerance behind them.
+        max_gsd: coarser values (metres) are not needed and may be returned as inf.
+        report: progress callback.
     """
-    hides = scene([], cloud, radius=0.8 * size)
-    patch = np.full(len(cloud), np.inf, np.float32)
+    occluders = scene([], cloud, radius=0.8 * voxel)
+    gsd = np.full(len(cloud), np.inf, np.float32)
     assert cloud.normal is not None
     for i, view in enumerate(views):
         report(i / len(views), view.name)
-        depth = depth_map(view.camera, view.T_world_cam, hides, time=view.time, pixels=PIXELS)
-        sees = eye(view.camera, view.T_world_cam)
-        _refine(patch, cloud.xyz, cloud.normal, sees, depth.ranges, size, coarsest)
-    return patch
+        depth = depth_map(view.camera, view.T_world_cam, occluders, time=view.time, pixels=MAX_PIXELS)
+        camera = posed_camera(view.camera, view.T_world_cam)
+        _refine(gsd, cloud.xyz, cloud.normal, camera, depth.ranges, voxel, max_gsd)
+    return gsd
 
 
 @njit(cache=True, parallel=True)
-def _refine(patch: F32, xyz: F32, normals: F32, eye: Eye, ranges: Ranges, bias: float, coarsest: float) -> None:
-    """Lower `patch` in place to what one photo's pixels cover, where that photo sees the point."""
-    for i in prange(len(patch)):
-        x, y, z = to_camera(eye.T, xyz[i, 0], xyz[i, 1], xyz[i, 2])
+def _refine(gsd: F32, xyz: F32, normals: F32, camera: PosedCamera, ranges: Ranges, bias: float, max_gsd: float) -> None:
+    """Lower `gsd` in place to the ground sample distance in one photo, for the points that it sees."""
+    for i in prange(len(gsd)):
+        x, y, z = to_camera(camera.T, xyz[i, 0], xyz[i, 1], xyz[i, 2])
         r = math.sqrt(x * x + y * y + z * z)
-        if eye.pixel * r >= min(coarsest, patch[i]) or r < 1e-3:
+        if camera.pixel * r >= min(max_gsd, gsd[i]) or r < 1e-3:
             continue
-        u, v, ok = pixel_of(eye, x, y, z)
+        u, v, ok = pixel_of(camera, x, y, z)
         if not ok:
             continue
-        nx, ny, nz = turned(eye.T, normals[i, 0], normals[i, 1], normals[i, 2])
-        r, cos = incidence(eye, x, y, z, nx, ny, nz)
-        side = eye.pixel * r / math.sqrt(max(abs(cos), LEAST_COS))
-        if side < patch[i] and is_visible(eye, ranges, u, v, r, cos, bias):
-            patch[i] = side
+        nx, ny, nz = rotate_to_camera(camera.T, normals[i, 0], normals[i, 1], normals[i, 2])
+        r, cos = incidence(camera, x, y, z, nx, ny, nz)
+        side = camera.pixel * r / math.sqrt(max(abs(cos), MIN_COS_INCIDENCE))
+        if side < gsd[i] and is_visible(camera, ranges, u, v, r, cos, bias):
+            gsd[i] = side
 
 
-def around(xyz: F32, chosen: Bools, reach: float) -> Bools:
-    """(N,) which points are chosen, or within `reach` metres of one that is."""
+def dilate_selection(xyz: F32, selected: Bools, distance: float) -> Bools:
+    """(N,) bool, True for points that are selected or within `distance` metres of a selected point."""
     from scipy.spatial import cKDTree
 
-    out = chosen.copy()
-    if chosen.any():
-        rest = np.flatnonzero(~chosen)
-        distance, _ = cKDTree(xyz[chosen]).query(xyz[rest], distance_upper_bound=reach, workers=-1)
-        out[rest[np.isfinite(distance)]] = True
+    out = selected.copy()
+    if selected.any():
+        rest = np.flatnonzero(~selected)
+        nearest, _ = cKDTree(xyz[selected]).query(xyz[rest], distance_upper_bound=distance, workers=-1)
+        out[rest[np.isfinite(nearest)]] = True
     return out
 
 
-def along(xyz: F32, path: F64, reach: float) -> Bools:
-    """(N,) which points are within `reach` metres of the path (M, 3) and what is between its places, in plan."""
+def near_path(xyz: F32, path: F64, distance: float) -> Bools:
+    """(N,) bool, True for points within `distance` metres of the path (M, 3), a polyline, in plan view."""
     from scipy.spatial import cKDTree
 
-    from scan2sim.pipeline.tiling.cut_plan import dense
+    from scan2sim.pipeline.tiling.cut_plan import resample_path
 
-    distance, _ = cKDTree(dense(path[:, :2])).query(xyz[:, :2], distance_upper_bound=reach, workers=-1)
-    return np.isfinite(distance)
+    nearest, _ = cKDTree(resample_path(path[:, :2])).query(xyz[:, :2], distance_upper_bound=distance, workers=-1)
+    return np.isfinite(nearest)
 
 
-def closed(xyz: F32, chosen: Bools, cell: float, gap: float) -> Bools:
-    """(N,) which points are in a plan's cells that hold a chosen one, holes and bays up to `gap` metres wide closed."""
+def close_selection(xyz: F32, selected: Bools, cell: float, gap: float) -> Bools:
+    """Morphological closing of a selection (N,) in plan view.
+
+    Selects all points in grid cells of `cell` metres that hold a selected point, and fills holes and bays up to `gap`
+    metres wide.
+    """
     from scipy import ndimage
 
-    if not chosen.any():
-        return chosen
+    if not selected.any():
+        return selected
     radius = max(1, round(gap / 2 / cell))
     index = np.floor((xyz[:, :2] - xyz[:, :2].min(axis=0)) / cell).astype(np.int64) + radius
-    plan = np.zeros(index.max(axis=0) + radius + 1, bool)
-    plan[tuple(index[chosen].T)] = True
+    grid = np.zeros(index.max(axis=0) + radius + 1, bool)
+    grid[tuple(index[selected].T)] = True
     disc = np.hypot(*np.mgrid[-radius : radius + 1, -radius : radius + 1]) <= radius + 0.5
-    return np.asarray(ndimage.binary_closing(plan, disc)[tuple(index.T)])
+    return np.asarray(ndimage.binary_closing(grid, disc)[tuple(index.T)])

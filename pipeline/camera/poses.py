@@ -1,4 +1,4 @@
-"""Poses: between others, and with rotations whose digits were rounded."""
+"""Poses: interpolation, and orthonormalization of rounded rotation matrices."""
 
 from __future__ import annotations
 
@@ -9,30 +9,31 @@ F64 = npt.NDArray[np.float64]
 
 
 def interpolate(poses: F64, at: F64, times: F64) -> F64:
-    """(N, 4, 4) poses at `times` (N,), by the motion between neighbours; beyond the ends it goes on.
+    """Interpolated poses (N, 4, 4) at `times` (N,); beyond the ends, the first or last motion is extrapolated.
 
-    Positions move straight from pose to pose, rotations turn evenly about one axis (slerp: Shoemake 1985).
+    Positions are interpolated linearly, rotations by slerp (Shoemake 1985).
 
     Args:
         poses: (T, 4, 4), at least one.
-        at: (T,) their times, ascending.
+        at: (T,) times of the poses, ascending.
+        times: (N,) times to interpolate at.
     """
     from scipy.spatial.transform import Rotation
 
     if len(poses) == 1:
         return np.repeat(poses, len(times), axis=0)
-    b = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
-    a = b - 1
-    span = at[b] - at[a]
-    share = np.divide(times - at[a], span, out=np.zeros(len(times)), where=span > 0)[:, None]
-    turn = Rotation.from_matrix(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3]).as_rotvec()[a]
+    after = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
+    before = after - 1
+    span = at[after] - at[before]
+    fraction = np.divide(times - at[before], span, out=np.zeros(len(times)), where=span > 0)[:, None]
+    rotvec = Rotation.from_matrix(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3]).as_rotvec()[before]
     out = np.tile(np.eye(4), (len(times), 1, 1))
-    out[:, :3, :3] = poses[a, :3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
-    out[:, :3, 3] = poses[a, :3, 3] + share * (poses[b, :3, 3] - poses[a, :3, 3])
+    out[:, :3, :3] = poses[before, :3, :3] @ Rotation.from_rotvec(fraction * rotvec).as_matrix()
+    out[:, :3, 3] = poses[before, :3, 3] + fraction * (poses[after, :3, 3] - poses[before, :3, 3])
     return out
 
 
 def nearest_rotation(R: F64) -> F64:
-    """The rotations nearest to matrices (..., 3, 3) that are rotations but for rounding."""
+    """Rotation matrices (..., 3, 3) nearest to rounded rotation matrices (polar decomposition by SVD)."""
     u, _, vt = np.linalg.svd(R)
     return np.asarray(u @ vt, np.float64)

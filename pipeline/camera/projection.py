@@ -1,8 +1,8 @@
-"""Places projected into posed cameras, written once: into the camera's axes, into the image, and the visibility test.
+"""Projection of points into posed cameras: world to camera axes, camera axes to pixels, and the visibility test.
 
-Kernels take scalars, one place at a time; votes, reach, choice, prediction, range images and blending are put together
-of them (how a picture is read at a pixel: `pipeline.camera.image_sampling`). `pixels` does it for arrays. Import late:
-loads numba.
+The kernels take scalars, one point at a time. Semantic voting, photo coverage, view selection, photo prediction, range
+images and blending are built from them (image lookup: `pipeline.camera.image_sampling`). `pixels` works on arrays.
+Import lazily: loads numba.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from scan2sim.pipeline.camera.models import (
 )
 from scan2sim.pipeline.core.types import F32, F64, Bools, Camera
 
-SLOPE_SHARE = 0.4
-"""Of a pixel's footprint times the slope, what is added to the bias; more leaks, less hides falsely."""
+SLOPE_BIAS_FACTOR = 0.4
+"""Part of a pixel's depth change on a slope that is added to the bias; higher leaks more, lower occludes falsely."""
 MAX_SLOPE = 30.0
-"""tan(incidence) beyond which the bias grows no more (88 degrees)."""
+"""tan(incidence) above which the bias doesn't grow any further (88 degrees)."""
 
 
-class Eye(NamedTuple):
-    """A posed camera, as kernels take it.
+class PosedCamera(NamedTuple):
+    """A posed camera in the form that kernels take.
 
     Attributes:
-        model, p: of the camera (`cameras.MODEL_ID`, `cameras.parameters`).
-        T: (4, 4) to camera axes from those that places are given in.
-        pixel: radians that a pixel spans (`cameras.pixel_angle`).
+        model, p: camera model and parameters (`models.MODEL_ID`, `models.parameters`).
+        T: (4, 4) from the axes of the points to camera axes.
+        pixel: angle of a pixel in radians (`models.pixel_angle`).
     """
 
     model: int
@@ -47,46 +47,46 @@ class Eye(NamedTuple):
 
 
 class Ranges(NamedTuple):
-    """What an eye sees first, as kernels take it.
+    """A range image in the form that kernels take.
 
     Attributes:
-        first: (H, W) float32 metres along the rays to the first hit; of any size, covering the eye's image.
-        pixel: radians that its pixels span.
+        first: (H, W) float32 metres along the rays to the first hit; of any size, covering the whole image.
+        pixel: angle of its pixels in radians.
     """
 
     first: F32
     pixel: float
 
 
-def eye(camera: Camera, T_world_cam: F64, axes: F64 | None = None) -> Eye:
-    """The eye of a camera at `T_world_cam` (4, 4).
+def posed_camera(camera: Camera, T_world_cam: F64, axes: F64 | None = None) -> PosedCamera:
+    """The camera with pose `T_world_cam` (4, 4), for kernels.
 
     Args:
-        camera: its intrinsics.
-        T_world_cam: its pose.
-        axes: (4, 4) pose of the axes that places will be given in; None: local coordinates.
+        camera: intrinsics.
+        T_world_cam: pose.
+        axes: (4, 4) pose of the axes in which points will be given; None: local coordinates.
     """
     T = np.linalg.inv(np.asarray(T_world_cam, np.float64))
     T = np.ascontiguousarray(T if axes is None else T @ axes)
-    return Eye(MODEL_ID[camera.model], parameters(camera), T, pixel_angle(camera))
+    return PosedCamera(MODEL_ID[camera.model], parameters(camera), T, pixel_angle(camera))
 
 
-def pixels(camera: Camera, T_world_cam: F64, places: npt.ArrayLike) -> tuple[F32, Bools]:
-    """Where a camera shows places, whether or not something hides them.
+def pixels(camera: Camera, T_world_cam: F64, points: npt.ArrayLike) -> tuple[F32, Bools]:
+    """Project points into a camera, regardless of occlusion.
 
     Args:
         camera, T_world_cam: intrinsics and pose.
-        places: (N, 3) local metres.
+        points: (N, 3) local metres.
 
     Returns:
-        uv (N, 2) float32 pixels, and (N,) which of them are within the image.
+        uv (N, 2) float32 pixels, and (N,) bool, True for pixels inside the image.
     """
-    return _pixels(eye(camera, T_world_cam), np.ascontiguousarray(places, np.float64).reshape(-1, 3))
+    return _pixels(posed_camera(camera, T_world_cam), np.ascontiguousarray(points, np.float64).reshape(-1, 3))
 
 
 @njit(cache=True, inline="always")
 def to_camera(T: F64, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """(x, y, z) of a place in the axes that T (4, 4) leads to."""
+    """(x, y, z): a point transformed by T (4, 4)."""
     return (
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
         T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
@@ -95,8 +95,8 @@ def to_camera(T: F64, x: float, y: float, z: float) -> tuple[float, float, float
 
 
 @njit(cache=True, inline="always")
-def turned(T: F64, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """(x, y, z) of a direction in the axes that T (4, 4) leads to."""
+def rotate_to_camera(T: F64, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """(x, y, z): a direction rotated by T (4, 4)."""
     return (
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z,
         T[1, 0] * x + T[1, 1] * y + T[1, 2] * z,
@@ -105,85 +105,87 @@ def turned(T: F64, x: float, y: float, z: float) -> tuple[float, float, float]:
 
 
 @njit(cache=True)
-def pixel_of(eye: Eye, x: float, y: float, z: float) -> tuple[float, float, bool]:
-    """(u, v, ok): the pixel of a place in camera axes; ok: it is within the image and its border of half a pixel."""
-    u, v, ok = project_point(eye.model, eye.p, x, y, z)
-    ok = ok and -0.5 <= v < eye.p[13] - 0.5
-    return u, v, ok and (eye.model == EQUIRECTANGULAR or -0.5 <= u < eye.p[12] - 0.5)
+def pixel_of(camera: PosedCamera, x: float, y: float, z: float) -> tuple[float, float, bool]:
+    """(u, v, ok): pixel of a point in camera axes; ok: inside the image, half-pixel border included."""
+    u, v, ok = project_point(camera.model, camera.p, x, y, z)
+    ok = ok and -0.5 <= v < camera.p[13] - 0.5
+    return u, v, ok and (camera.model == EQUIRECTANGULAR or -0.5 <= u < camera.p[12] - 0.5)
 
 
 @njit(cache=True, inline="always")
-def incidence(eye: Eye, x: float, y: float, z: float, nx: float, ny: float, nz: float) -> tuple[float, float]:
-    """(range, cos) of a place and its unit normal, camera axes: metres along the ray, and cosine of the incidence.
+def incidence(
+    camera: PosedCamera, x: float, y: float, z: float, nx: float, ny: float, nz: float
+) -> tuple[float, float]:
+    """(range, cos) of a point and its unit normal in camera axes: metres along the ray, and cosine of incidence.
 
-    The cosine is above 0 for what is seen from the side that the normal is on.
+    The cosine is positive if the camera is on the side of the normal.
     """
-    if eye.model == ORTHOGRAPHIC:
+    if camera.model == ORTHOGRAPHIC:
         return z, -nz
     r = math.sqrt(x * x + y * y + z * z)
     return r, -(x * nx + y * ny + z * nz) / r
 
 
 @njit(cache=True, inline="always")
-def range_pixel(eye: Eye, ranges: Any, u: float, v: float, r: float, cos: float) -> tuple[int, int, float]:
-    """(row, column, lean): the pixel of the range image that a place seen at (range, cos) is in.
+def range_pixel(camera: PosedCamera, ranges: Any, u: float, v: float, r: float, cos: float) -> tuple[int, int, float]:
+    """(row, column, lean): pixel of the range image that contains a point seen at (range, cos).
 
-    And the metres by which the range changes across it, on a surface that is so inclined.
+    `lean` is the change of range in metres across that pixel on a surface of that inclination.
     """
-    row, column = nearest(eye.p, u, v, ranges.first)
+    row, column = nearest(camera.p, u, v, ranges.first)
     c = min(1.0, abs(cos))
     slope = min(MAX_SLOPE, math.sqrt(1 - c * c) / max(c, 1e-6))
-    return row, column, slope * (ranges.pixel if eye.model == ORTHOGRAPHIC else r * ranges.pixel)
+    return row, column, slope * (ranges.pixel if camera.model == ORTHOGRAPHIC else r * ranges.pixel)
 
 
 @njit(cache=True, inline="always")
-def is_behind(r: float, first: float, lean: float, pixels: float, bias: float) -> bool:
-    """Whether a place is hidden by the `first` hit; every test of visibility is this one.
+def is_occluded(r: float, first: float, lean: float, pixels: float, bias: float) -> bool:
+    """Whether a point is occluded by the `first` hit; the comparison used by all visibility tests.
 
     Args:
-        r, lean: metres along the ray to it, and of `range_pixel`.
-        first: metres to the first hit, in the range image's pixel or in some pixels around.
-        pixels: by which the surface may lean; from the middle of one, or as far around as `first` is the least of.
-        bias: metres that it may lie behind `first`, see `pipeline.camera.depth_map.BIAS`.
+        r, lean: range of the point in metres, and `lean` from `range_pixel`.
+        first: range of the first hit in metres, in the pixel of the range image, or the minimum over a neighbourhood.
+        pixels: number of pixels over which the range may change by `lean` each.
+        bias: tolerance behind `first` in metres, see `pipeline.camera.depth_map.RANGE_BIAS_M`.
     """
     return r > first + bias + pixels * lean
 
 
 @njit(cache=True)
-def is_visible(eye: Eye, ranges: Ranges, u: float, v: float, r: float, cos: float, bias: float) -> bool:
-    """Whether nothing hides what is at a pixel within the image.
+def is_visible(camera: PosedCamera, ranges: Ranges, u: float, v: float, r: float, cos: float, bias: float) -> bool:
+    """Whether a point at a pixel inside the image is not occluded.
 
     Args:
-        eye, ranges: of the view.
-        u, v: `pixel_of` the place.
-        r, cos: of it (`incidence`); cos 1: it is taken for seen head-on.
-        bias: of `is_behind`.
+        camera, ranges: camera and range image of the view.
+        u, v: pixel of the point (`pixel_of`).
+        r, cos: range and cosine of incidence (`incidence`); cos 1 assumes frontal incidence.
+        bias: see `is_occluded`.
     """
-    row, column, lean = range_pixel(eye, ranges, u, v, r, cos)
-    return not is_behind(r, ranges.first[row, column], lean, SLOPE_SHARE, bias)
+    row, column, lean = range_pixel(camera, ranges, u, v, r, cos)
+    return not is_occluded(r, ranges.first[row, column], lean, SLOPE_BIAS_FACTOR, bias)
 
 
 @njit(cache=True, parallel=True)
-def visible_places(eye: Eye, ranges: Ranges, places: F64, normals: F64, bias: float) -> Bools:
-    """(N,) bool: `is_visible` for places (N, 3) and normals (N, 3), or (0, 3): all head-on."""
-    seen = np.zeros(len(places), np.bool_)
-    for i in prange(len(places)):
-        x, y, z = to_camera(eye.T, places[i, 0], places[i, 1], places[i, 2])
-        u, v, ok = pixel_of(eye, x, y, z)
+def visible_points(camera: PosedCamera, ranges: Ranges, points: F64, normals: F64, bias: float) -> Bools:
+    """(N,) bool: `is_visible` for points (N, 3) and normals (N, 3); (0, 3): assume frontal incidence."""
+    seen = np.zeros(len(points), np.bool_)
+    for i in prange(len(points)):
+        x, y, z = to_camera(camera.T, points[i, 0], points[i, 1], points[i, 2])
+        u, v, ok = pixel_of(camera, x, y, z)
         if not ok:
             continue
         nx = ny = nz = 0.0
         if len(normals) > 0:
-            nx, ny, nz = turned(eye.T, normals[i, 0], normals[i, 1], normals[i, 2])
-        r, cos = incidence(eye, x, y, z, nx, ny, nz)
-        seen[i] = is_visible(eye, ranges, u, v, r, cos if len(normals) > 0 else 1.0, bias)
+            nx, ny, nz = rotate_to_camera(camera.T, normals[i, 0], normals[i, 1], normals[i, 2])
+        r, cos = incidence(camera, x, y, z, nx, ny, nz)
+        seen[i] = is_visible(camera, ranges, u, v, r, cos if len(normals) > 0 else 1.0, bias)
     return seen
 
 
 @njit(cache=True, parallel=True)
-def _pixels(eye: Eye, places: F64) -> tuple[F32, Bools]:
-    uv, ok = np.empty((len(places), 2), np.float32), np.empty(len(places), np.bool_)
-    for i in prange(len(places)):
-        x, y, z = to_camera(eye.T, places[i, 0], places[i, 1], places[i, 2])
-        uv[i, 0], uv[i, 1], ok[i] = pixel_of(eye, x, y, z)
+def _pixels(camera: PosedCamera, points: F64) -> tuple[F32, Bools]:
+    uv, ok = np.empty((len(points), 2), np.float32), np.empty(len(points), np.bool_)
+    for i in prange(len(points)):
+        x, y, z = to_camera(camera.T, points[i, 0], points[i, 1], points[i, 2])
+        uv[i, 0], uv[i, 1], ok[i] = pixel_of(camera, x, y, z)
     return uv, ok

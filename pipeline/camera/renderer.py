@@ -1,6 +1,6 @@
-"""Pictures of meshes by ray casting: from a photo's own camera, from above, from a driver's eye.
+"""Renderer of textured meshes by ray casting: perspective, fisheye, panoramic and orthographic views.
 
-Used to score textures against photos that were held out, and for the report's pictures.
+Used to score textures against held-out photos, and for the images of the report.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ import numpy.typing as npt
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools, Camera, Mesh
 
-CHUNK = 500_000
-"""Rays at a time, to bound memory."""
-SKY = (200, 214, 230)
-SUN = np.array([0.45, 0.3, 0.84])
+RAY_CHUNK = 500_000
+"""Number of rays cast at a time, to bound memory."""
+SKY_RGB = (200, 214, 230)
+SUN_DIRECTION = np.array([0.45, 0.3, 0.84])
 
 Rays = Callable[[F64, F64], tuple[F64, F64]]
-"""Column and row of places (N,) in a picture, pixels, to origins and directions (N, 3) of the rays through them."""
+"""Function from columns and rows (N,) of an image, pixels, to origins and directions (N, 3) of the rays."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """A mesh to be rendered, and what gives it its colour.
+    """A mesh to be rendered, with its textures or colours.
 
     Attributes:
         mesh: with `uv` and `page` if it has `pages`.
-        pages: texture images (RGB) of the mesh's pages; the masks `page_<i>_seen.png` beside them are read as well.
-        colour: (F, 3) or (3,) uint8 of the faces, where there are no pages.
+        pages: texture images (RGB) of the mesh's pages; their colour source masks `page_<i>_seen.png` are read as well.
+        colour: (F, 3) or (3,) uint8, colour of the faces if there are no pages.
     """
 
     mesh: Mesh
@@ -44,12 +44,12 @@ class Body:
 
 @dataclass(frozen=True)
 class Image:
-    """A rendered picture; arrays are (H, W).
+    """A rendered image; arrays are (H, W).
 
     Attributes:
         rgb: (H, W, 3) uint8.
         hit: bool, whether the pixel's ray hit a mesh.
-        seen: uint8 of the textures' masks (255 from a photo, 128 from points, 64 filled); 0 without textures.
+        seen: uint8 value of the colour source mask (255 photo, 128 points, 64 inpainted); 0 without textures.
         face: int32 within its body's mesh, -1 where nothing was hit.
         body: int16 index of the body, -1 where nothing was hit.
         range: float32 metres along the ray, inf where nothing was hit.
@@ -66,7 +66,7 @@ class Image:
 
 
 def textured(folder: Path) -> Body:
-    """The body of a folder that the step `texture` wrote (`mesh.npz`, `page_<i>.png`)."""
+    """Load a body from a folder written by the step `texture` (`mesh.npz`, `page_<i>.png`)."""
     mesh = Mesh.load(folder / "mesh.npz")
     count = 0 if mesh.page is None or not len(mesh) else int(mesh.page.max()) + 1
     return Body(mesh, tuple(folder / f"page_{i}.png" for i in range(count)))
@@ -82,10 +82,10 @@ class _Hits(NamedTuple):
 
 
 class Renderer:
-    """Meshes ready to be rendered from any number of cameras.
+    """Renders a set of meshes from any number of cameras.
 
     Args:
-        bodies: what there is to see.
+        bodies: meshes to render.
     """
 
     def __init__(self, bodies: Sequence[Body]) -> None:
@@ -101,28 +101,28 @@ class Renderer:
                     _tensor(body.mesh.faces.astype(np.uint32)),
                 )
                 self._body_of[int(key)] = i
-        self._pixels = lru_cache(maxsize=16)(_read)
+        self._load_page = lru_cache(maxsize=16)(_read)
 
     def view(
         self,
         camera: Camera,
         T_world_cam: F64,
         *,
-        background: tuple[int, int, int] = SKY,
+        background: tuple[int, int, int] = SKY_RGB,
         shaded: bool = False,
         wireframe: bool = False,
         samples: int = 1,
     ) -> Image:
-        """What a camera sees.
+        """Render the view of a camera.
 
         Args:
             camera, T_world_cam: intrinsics and pose.
-            background: colour where nothing is.
-            shaded: darken by the angle to a made-up sun (for plain colours; textures have their own light).
-            wireframe: draw the triangles' edges.
-            samples: rays a pixel each way; the colour of a pixel whose centre meets a mesh is the mean of those of
-                them that meet one. A simulator filters far textures with mip-maps; one ray a pixel makes them look
-                sharper than they are. All but the colours is of the ray through the pixel's centre.
+            background: colour of pixels without a hit.
+            shaded: apply Lambertian shading by a fixed sun (for plain colours; textures contain the real light).
+            wireframe: draw the edges of triangles.
+            samples: rays per pixel in each direction (supersampling); the colour of a pixel whose centre hits a mesh is
+                the mean of the rays that hit one. Simulators filter distant textures with mip-maps; one ray per pixel
+                would look sharper. All other outputs are those of the ray through the pixel's centre.
         """
         from scan2sim.pipeline.camera.models import ray_origins, unproject
 
@@ -145,25 +145,25 @@ class Renderer:
         wireframe: bool = False,
         samples: int = 1,
     ) -> Image:
-        """A map: straight down onto the box from `low` to `high` (3,), x to the right and y up.
+        """Render an orthographic map of the box from `low` to `high` (3,), x to the right and y up.
 
-        Its `range` is measured from 1 m above the box; `samples` and all else are as in `view`.
+        `range` is measured from 1 m above the box; other arguments are as in `view`.
         """
         low, high = np.asarray(low, float), np.asarray(high, float)
-        metre = max(high[0] - low[0], 1e-3) / width
-        height = max(1, round((high[1] - low[1]) / metre))
+        pixel_m = max(high[0] - low[0], 1e-3) / width
+        height = max(1, round((high[1] - low[1]) / pixel_m))
         top = high[2] + 1.0
 
         def rays(column: F64, row: F64) -> tuple[F64, F64]:
-            x, y = low[0] + (column + 0.5) * metre, high[1] - (row + 0.5) * metre
+            x, y = low[0] + (column + 0.5) * pixel_m, high[1] - (row + 0.5) * pixel_m
             return np.column_stack([x, y, np.full(len(x), top)]), np.broadcast_to([0.0, 0.0, -1.0], (len(x), 3))
 
         return self._cast(width, height, rays, background, shaded, wireframe, samples)
 
-    def down(self, places: F64) -> Image:
-        """What is straight below each of the places (H, W, 3), as a picture of them; `range` is the depth below."""
-        height, width = places.shape[:2]
-        flat = places.reshape(-1, 3)
+    def down(self, points: F64) -> Image:
+        """Image of the surface straight below each of the points (H, W, 3); `range` is the distance below."""
+        height, width = points.shape[:2]
+        flat = points.reshape(-1, 3)
 
         def rays(column: F64, row: F64) -> tuple[F64, F64]:
             origin = flat[(row * width + column).astype(int)]
@@ -172,7 +172,7 @@ class Renderer:
         return self._cast(width, height, rays, (0, 0, 0), shaded=False, wireframe=False, samples=1)
 
     def nearest(self, points: F32) -> tuple[U8, U8, F32]:
-        """Colours (N, 3) and masks (N,) of the places on the meshes nearest to points (N, 3), and metres to them."""
+        """Colours (N, 3) and mask values (N,) of the surface nearest to points (N, 3), and distances (N,) in metres."""
         rgb, seen = np.zeros((len(points), 3), np.uint8), np.zeros(len(points), np.uint8)
         distance = np.full(len(points), np.inf, np.float32)
         if not self._body_of:
@@ -183,15 +183,15 @@ class Renderer:
         face = answer["primitive_ids"].numpy().astype(np.int32)
         barycentric, which = answer["primitive_uvs"].numpy(), answer["geometry_ids"].numpy()
         for key, i in self._body_of.items():
-            at = np.flatnonzero(which == key)
-            if len(at):
-                rgb[at], seen[at] = self._colour(self.bodies[i], face[at], barycentric[at])
+            index = np.flatnonzero(which == key)
+            if len(index):
+                rgb[index], seen[index] = self._colour(self.bodies[i], face[index], barycentric[index])
         return rgb, seen, distance
 
-    def nearest_places(self, points: F32) -> tuple[F32, F32]:
-        """The places on the meshes nearest to points (N, 3), local metres, and the unit normals of the faces there.
+    def closest_points(self, points: F32) -> tuple[F32, F32]:
+        """Nearest surface points (N, 3) to points (N, 3), local metres, and unit normals (N, 3) of the faces there.
 
-        Both (N, 3) float32; NaN where there is no mesh.
+        Both float32; NaN if there is no mesh.
         """
         if not self._body_of:
             return np.full((len(points), 3), np.nan, np.float32), np.full((len(points), 3), np.nan, np.float32)
@@ -213,7 +213,7 @@ class Renderer:
         face, which = np.full(n, -1, np.int32), np.full(n, -1, np.int16)
         distance, barycentric = np.full(n, np.inf, np.float32), np.zeros((n, 2), np.float32)
         across, down = _sub_pixels(samples)
-        step = max(1, CHUNK // samples**2)
+        step = max(1, RAY_CHUNK // samples**2)
         for first in range(0, n, step) if self._body_of else ():
             here = slice(first, min(n, first + step))
             row, column = np.divmod(np.arange(here.start, here.stop, dtype=np.float64), width)
@@ -235,7 +235,7 @@ class Renderer:
         )  # fmt: skip
 
     def _intersect(self, origin: F64, direction: F64) -> _Hits:
-        """First hits of rays from origins along directions (N, 3); a direction of NaN hits nothing."""
+        """First hits of rays with origins and directions (N, 3); rays with a NaN direction hit nothing."""
         cast, known = np.concatenate([origin, direction], axis=1, dtype=np.float32), np.isfinite(direction).all(axis=1)
         cast[~known] = 0
         answer = self._casting.cast_rays(_tensor(cast))
@@ -250,20 +250,20 @@ class Renderer:
         return _Hits(face, body, np.where(hit, t, np.inf).astype(np.float32), barycentric)
 
     def _shade_hits(self, hits: _Hits, direction: F64, shaded: bool, wireframe: bool) -> tuple[U8, U8]:
-        """Colours (N, 3) and masks (N,) of what rays hit, black and 0 where that is nothing."""
+        """Colours (N, 3) and mask values (N,) at hits; black and 0 for rays without a hit."""
         rgb, seen = np.zeros((len(hits.body), 3), np.uint8), np.zeros(len(hits.body), np.uint8)
         for i, body in enumerate(self.bodies):
-            at = np.flatnonzero(hits.body == i)
-            if len(at):
-                rgb[at], seen[at] = self._colour(body, hits.face[at], hits.barycentric[at])
+            index = np.flatnonzero(hits.body == i)
+            if len(index):
+                rgb[index], seen[index] = self._colour(body, hits.face[index], hits.barycentric[index])
                 if shaded:
-                    rgb[at] = _shade(body.mesh, hits.face[at], direction[at], rgb[at])
+                    rgb[index] = _shade(body.mesh, hits.face[index], direction[index], rgb[index])
         if wireframe:
-            at = np.flatnonzero(hits.body >= 0)
-            size = np.linalg.norm(direction[at], axis=1)
-            width = 0.0012 * hits.range[at] * size + 0.002
-            edge = self._edge_distance(hits.body[at], hits.face[at], hits.barycentric[at]) < width
-            rgb[at[edge]] = (rgb[at[edge]] * 0.35).astype(np.uint8)
+            index = np.flatnonzero(hits.body >= 0)
+            size = np.linalg.norm(direction[index], axis=1)
+            width = 0.0012 * hits.range[index] * size + 0.002
+            edge = self._edge_distance(hits.body[index], hits.face[index], hits.barycentric[index]) < width
+            rgb[index[edge]] = (rgb[index[edge]] * 0.35).astype(np.uint8)
         return rgb, seen
 
     def _colour(self, body: Body, face: I32, barycentric: F32) -> tuple[U8, U8]:
@@ -280,12 +280,12 @@ class Renderer:
         rgb, seen = np.empty((len(face), 3), np.uint8), np.empty(len(face), np.uint8)
         for k in np.unique(page).tolist():
             on = np.flatnonzero(page == k)
-            texture, mask = self._pixels(body.pages[k])
+            texture, mask = self._load_page(body.pages[k])
             rgb[on], seen[on] = _sample(texture, mask, uv[on])
         return rgb, seen
 
     def _edge_distance(self, which: npt.NDArray[np.int16], face: I32, barycentric: F32) -> F32:
-        """(N,) metres from a hit to the nearest edge of its triangle."""
+        """Distance (N,) in metres from a hit to the nearest edge of its triangle."""
         out = np.empty(len(face), np.float32)
         for i, body in enumerate(self.bodies):
             on = which == i
@@ -298,14 +298,14 @@ class Renderer:
 
 
 def _sub_pixels(samples: int) -> tuple[F64, F64]:
-    """Offsets (samples^2,) across and down of a regular grid within a pixel, from its centre, pixels."""
+    """Offsets (samples^2,) across and down of a regular grid within a pixel, relative to its centre, in pixels."""
     offset = (np.arange(samples) + 0.5) / samples - 0.5
     down, across = np.meshgrid(offset, offset, indexing="ij")
     return across.ravel(), down.ravel()
 
 
 def _mean(colours: U8, hit: Bools, centre: U8) -> U8:
-    """Mean (N, 3) of the S colours (N * S, 3) of every pixel that `hit` (N * S,); of none: the `centre`'s (N, 3)."""
+    """Mean colours (N, 3) per pixel of its S samples (N * S, 3) that `hit` (N * S,); `centre` (N, 3) if none did."""
     pixels, each = len(centre), len(hit) // max(1, len(centre))
     count = hit.reshape(pixels, each, 1).sum(axis=1)
     total = (colours * hit[:, None]).reshape(pixels, each, 3).sum(axis=1, dtype=np.float32)
@@ -315,18 +315,18 @@ def _mean(colours: U8, hit: Bools, centre: U8) -> U8:
 def _tensor(array: npt.NDArray[Any]) -> Any:
     import open3d as o3d
 
-    return o3d.core.Tensor(np.ascontiguousarray(array))  # its stubs know no typed arrays
+    return o3d.core.Tensor(np.ascontiguousarray(array))  # Open3D's stubs don't accept typed arrays
 
 
 def _read(path: Path) -> tuple[U8, U8 | None]:
-    """A page (H, W, 3) RGB, and its mask (H, W) or None."""
+    """Read a page (H, W, 3) RGB, and its colour source mask (H, W) or None."""
     import cv2
 
     page = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if page is None:
         raise InputError(path, "can't be read as an image", "Run again with `--from texture`")
     mask: Any = cv2.imread(str(path.with_name(f"{path.stem}_seen.png")), cv2.IMREAD_GRAYSCALE)
-    if mask is not None:  # the nearest texel of a hit on a chart's border may be one of the room around it
+    if mask is not None:  # the nearest texel of a hit on a chart's border may lie in the padding around the chart
         mask = np.where(mask == 0, cv2.dilate(mask, np.ones((3, 3), np.uint8)), mask)
     return np.ascontiguousarray(page[..., ::-1]).astype(np.uint8, copy=False), mask
 
@@ -345,17 +345,21 @@ def _sample(page: U8, mask: U8 | None, uv: F32) -> tuple[U8, U8]:
 
 
 def _shade(mesh: Mesh, face: I32, direction: F64, rgb: U8) -> U8:
-    """Lambert's law under a made-up sun and sky; faces seen from behind are lit as from their front."""
+    """Lambertian shading by a fixed sun and sky; back faces are lit like front faces."""
     c = mesh.corners[face]
     normal = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]).astype(np.float64)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
     normal *= np.where(np.einsum("ij,ij->i", normal, direction) > 0, -1.0, 1.0)[:, None]
-    light = 0.35 + 0.2 * (0.5 + 0.5 * normal[:, 2]) + 0.5 * np.maximum(0, normal @ (SUN / np.linalg.norm(SUN)))
+    light = (
+        0.35
+        + 0.2 * (0.5 + 0.5 * normal[:, 2])
+        + 0.5 * np.maximum(0, normal @ (SUN_DIRECTION / np.linalg.norm(SUN_DIRECTION)))
+    )
     return np.clip(rgb * light[:, None], 0, 255).astype(np.uint8)
 
 
 def look_at(eye: npt.ArrayLike, target: npt.ArrayLike) -> F64:
-    """(4, 4) pose of an upright camera at `eye` that looks towards `target` (both (3,), local coordinates)."""
+    """Pose (4, 4) of an upright camera at `eye` that looks towards `target` (both (3,), local coordinates)."""
     eye, target = np.asarray(eye, float), np.asarray(target, float)
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])

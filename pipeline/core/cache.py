@@ -1,17 +1,17 @@
-"""Where results are kept: one folder a result, named by a key of everything it came from.
+"""Cache of step results: one folder per result, named by a key (hash) of the step, its parameters and its inputs.
 
 ```
-ROOT/poisson.terrain/3f9a.../manifest.json   what was run, on what, how long, with which outputs
+ROOT/poisson.terrain/3f9a.../manifest.json   step, inputs, run time, outputs and metrics
                             /mesh.npz        the outputs
-ROOT/track/.part-81c2.../                    how far a step has come that was killed, where it says so itself
+ROOT/track/.part-81c2.../                    checkpoint of a step that can resume after it was killed
 ```
-A result is written to a temporary folder and moved into place, so that a killed run leaves nothing
-half-made. A result counts as present while all its files are there with the sizes that the
-manifest gives, and none has changed since that was written; one that has is digested, and counts if its bytes are the
-same (it was copied, say). All bytes are digested before a step reads a result that its run hasn't made (`intact`). What
-is deleted or damaged is rebuilt, and nothing that depends on it (same key, same bytes).
+A result is written to a temporary folder and moved into place, so that a killed run leaves no partial result. A cached
+result is valid while all its files exist with the sizes recorded in the manifest and none is newer than the manifest;
+a newer file is hashed and accepted if its SHA-256 still matches (a copied file, for example). Before a step reads a
+result of an earlier run, all its bytes are hashed (`intact`). A deleted or damaged result is rebuilt; results that
+depend on it stay valid, because the rebuilt one has the same key and the same bytes.
 
-A manifest is sealed by its digest, and one that names files outside of its folder is none.
+A manifest holds a digest of itself; one that doesn't match it, or that names files outside its folder, is invalid.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ from scan2sim.pipeline.core.step import Done, Params, Step
 from scan2sim.pipeline.io.remote import Remote
 
 KEY_LENGTH = 24
-TEMPORARY, PART = ".tmp-", ".part-"
+TEMPORARY_PREFIX, CHECKPOINT_PREFIX = ".tmp-", ".part-"
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """What is kept of a result beside its files.
+    """Metadata of a cached result, stored beside its files.
 
     Attributes:
-        label: the full name of its node (`poisson.terrain`).
-        version, params, inputs: what the key was made of; inputs are keys or digests by name.
-        fed: like the key, but of the contents of what was read, whatever made them.
+        label: full name of its task (`poisson.terrain`).
+        version, params, inputs: what the key was computed from; inputs are keys or digests by name.
+        fed: like the key, but computed from the contents of the inputs instead of their keys (cache hit by content).
         content: digest of all output files.
         files: output name to path relative to the result's folder.
         sizes: bytes of every file below it.
         digests: SHA-256 of each of them.
-        facts, warnings: as the step gave them.
+        facts, warnings: metrics and warnings of the step.
         seconds, peak_mb: wall time and peak memory of the step's process and its children.
     """
 
@@ -69,15 +69,12 @@ class Manifest:
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of a source file, or of a folder's files by their names; "missing" where it isn't there.
-
-    The step says what that means.
-    """
+    """SHA-256 of a source file, or of a folder's files by name; "missing" if there is none (the step reports that)."""
     try:
         if path.is_dir():
             return content_of({file.name: digest(file) for file in path.iterdir() if file.is_file()})
         if path.exists() and not path.is_file():
-            return "missing"  # a pipe, which would be waited on for ever
+            return "missing"  # reading a pipe could block for ever
         with open(path, "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except FileNotFoundError:
@@ -87,9 +84,9 @@ def digest(path: Path) -> str:
 
 
 class Digests:
-    """`digest`, remembered in a file for sources whose size and time of change are as they were.
+    """`digest`, cached in a file for sources whose size, modification time and inode are unchanged.
 
-    A kilometre of survey is gigabytes: looking for what changed must not read them all again.
+    A kilometre of survey is gigabytes: detecting changes must not read all of it again.
     """
 
     def __init__(self, file: Path) -> None:
@@ -101,36 +98,36 @@ class Digests:
         self._used: dict[str, list[Any]] = {}
 
     def __call__(self, path: Path) -> str:
-        """SHA-256 of a file or folder, in hex; of a file that is as it was, the one that was told before."""
+        """SHA-256 of a file or folder, in hex; taken from the cache for an unchanged file."""
         try:
             stat = path.stat()
         except OSError:
             return digest(path)
         if path.is_dir():
             return content_of({file.name: self(file) for file in path.iterdir() if file.is_file()})
-        mark = [stat.st_size, stat.st_mtime_ns, stat.st_ino]
-        known = self._known.get(str(path))
-        found = known[3] if known and known[:3] == mark else digest(path)
-        self._used[str(path)] = [*mark, found]
+        fingerprint = [stat.st_size, stat.st_mtime_ns, stat.st_ino]
+        cached = self._known.get(str(path))
+        found = cached[3] if cached and cached[:3] == fingerprint else digest(path)
+        self._used[str(path)] = [*fingerprint, found]
         return str(found)
 
     def save(self) -> None:
-        """Write what was asked for."""
+        """Write the digests that were requested since this object was created."""
         try:
             self._file.parent.mkdir(parents=True, exist_ok=True)
-            fresh = self._file.with_suffix(".tmp")
-            fresh.write_text(json.dumps(self._used), encoding="utf-8")
-            fresh.replace(self._file)
+            temporary = self._file.with_suffix(".tmp")
+            temporary.write_text(json.dumps(self._used), encoding="utf-8")
+            temporary.replace(self._file)
         except OSError as error:
             raise from_os_error(error, self._file) from None
 
 
 def content_of(digests: Mapping[str, str]) -> str:
-    """One digest of all files of a result, by their names and digests."""
-    together = hashlib.sha256()
+    """Digest of all files of a result, computed from their names and digests."""
+    combined = hashlib.sha256()
     for name in sorted(digests):
-        together.update(f"{name}\0{digests[name]}\n".encode())
-    return together.hexdigest()
+        combined.update(f"{name}\0{digests[name]}\n".encode())
+    return combined.hexdigest()
 
 
 def _seal(body: Mapping[str, Any]) -> str:
@@ -138,7 +135,7 @@ def _seal(body: Mapping[str, Any]) -> str:
 
 
 def read_manifest(path: Path) -> Manifest | None:
-    """The manifest in a file; None where there is none, it isn't as it was written, or names files elsewhere."""
+    """Read a manifest; None if it is missing, was altered, or names files outside its folder."""
     try:
         body = json.loads(path.read_text(encoding="utf-8"))
         if body.pop("seal") != _seal(body):
@@ -155,93 +152,93 @@ def read_manifest(path: Path) -> Manifest | None:
 
 
 def damaged(folder: Path, manifest: Manifest) -> list[str]:
-    """Names of those of a result's files whose bytes aren't as they were made."""
-    return [name for name, known in manifest.digests.items() if digest(folder / name) != known]
+    """Names of the files of a result whose bytes no longer match the manifest."""
+    return [name for name, expected in manifest.digests.items() if digest(folder / name) != expected]
 
 
 def key_of(step: Step, params: Params, inputs: Mapping[str, str]) -> str:
-    """The key of a result: step, version, parameters and the keys of what it reads."""
+    """Cache key of a result: hash of step name, version, parameters and the keys of its inputs."""
     text = json.dumps([step.name, step.version, params.model_dump(mode="json"), dict(inputs)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
 
 
 class Store:
-    """Results below one folder; a `node` is named by its full name in the recipe (`poisson.terrain`).
+    """Cached results below one folder, by `task` (its full name in the pipeline, `poisson.terrain`) and key.
 
     Args:
         root: the folder.
-        remote: where results are kept besides, for machines that share no disk; `root` is its likeness then.
-        sources: where files of the survey come from that aren't on this machine.
+        remote: object storage that mirrors `root`, for machines that share no disk.
+        sources: storage from which files of the survey that aren't on this machine are fetched.
     """
 
     def __init__(self, root: Path, remote: Remote | None = None, sources: Remote | None = None) -> None:
         self.root, self.remote, self.sources = root, remote, sources
-        self._sound: set[Path] = set()  # folders of results that this run has made, or digested
+        self._verified: set[Path] = set()  # folders of results that this run has made or hashed
 
     def within(self, name: str) -> Store:
-        """The store of the nodes whose full names begin with `name/`."""
+        """The store of the tasks whose full names begin with `name/`."""
         store = Store(self.root / name, self.remote and self.remote.below(name), self.sources)
-        store._sound = self._sound
+        store._verified = self._verified
         return store
 
-    def folder(self, node: str, key: str) -> Path:
-        """Where the result is, or will be."""
-        return self.root / node / key
+    def folder(self, task: str, key: str) -> Path:
+        """Folder of a result, which may not exist yet."""
+        return self.root / task / key
 
-    def find(self, node: str, key: str) -> Manifest | None:
-        """The manifest of a complete result; None where it is absent or a file of it was deleted."""
-        manifest = self._manifest(node, key)
-        if manifest is None or self._complete(node, key, manifest):
+    def find(self, task: str, key: str) -> Manifest | None:
+        """The manifest of a complete result; None if it is absent or one of its files was deleted or changed."""
+        manifest = self._manifest(task, key)
+        if manifest is None or self._complete(task, key, manifest):
             return manifest
-        return manifest if self.remote is not None else None  # its files are fetched when they are read
+        return manifest if self.remote is not None else None  # `read` fetches its files
 
-    def read(self, node: str, key: str) -> Manifest | None:
-        """As `find`, with its files on this machine."""
-        manifest = self.find(node, key)
-        if manifest is not None and self.remote is not None and not self._complete(node, key, manifest):
-            return manifest if self.remote.pull(f"{node}/{key}/{name}" for name in manifest.sizes) else None
+    def read(self, task: str, key: str) -> Manifest | None:
+        """As `find`, and fetch its files to this machine."""
+        manifest = self.find(task, key)
+        if manifest is not None and self.remote is not None and not self._complete(task, key, manifest):
+            return manifest if self.remote.pull(f"{task}/{key}/{name}" for name in manifest.sizes) else None
         return manifest
 
-    def intact(self, node: str, key: str) -> bool:
-        """Whether a result's files are on this machine, each with the bytes that it was made with."""
-        folder = self.folder(node, key)
-        if folder in self._sound:
+    def intact(self, task: str, key: str) -> bool:
+        """Whether all files of a result are on this machine with unchanged bytes (SHA-256)."""
+        folder = self.folder(task, key)
+        if folder in self._verified:
             return True
-        manifest = self.read(node, key)
+        manifest = self.read(task, key)
         if manifest is not None and self.remote is not None and damaged(folder, manifest):
-            shutil.rmtree(folder, ignore_errors=True)  # what was fetched: the storage has it
-            manifest = self.read(node, key)
+            shutil.rmtree(folder, ignore_errors=True)  # a fetched copy: the storage holds the original
+            manifest = self.read(task, key)
         if manifest is None or damaged(folder, manifest):
             return False
-        self.trust(node, key)
+        self.mark_verified(task, key)
         return True
 
-    def trust(self, node: str, key: str) -> None:
-        """The result was made in this run, or found intact: it isn't looked into any more."""
-        self._sound.add(self.folder(node, key))
+    def mark_verified(self, task: str, key: str) -> None:
+        """Skip further integrity checks of a result: it was made in this run, or has been hashed."""
+        self._verified.add(self.folder(task, key))
 
-    def discard(self, node: str, key: str) -> None:
-        """Remove a result that is of no use."""
-        self._sound.discard(self.folder(node, key))
+    def discard(self, task: str, key: str) -> None:
+        """Remove a result, from remote storage as well."""
+        self._verified.discard(self.folder(task, key))
         if self.remote is not None:
-            self.remote.remove(f"{node}/{key}/manifest.json")
-        shutil.rmtree(self.folder(node, key), ignore_errors=True)
+            self.remote.remove(f"{task}/{key}/manifest.json")
+        shutil.rmtree(self.folder(task, key), ignore_errors=True)
 
     def source(self, path: Path) -> Path:
-        """A source file, fetched if it isn't on this machine and it is known where from."""
+        """A source file, fetched from `sources` if it isn't on this machine."""
         if self.sources is not None and not path.exists() and path.is_relative_to(self.sources.local):
             self.sources.pull([path.relative_to(self.sources.local).as_posix()])
         return path
 
-    def _manifest(self, node: str, key: str) -> Manifest | None:
-        path = self.folder(node, key) / "manifest.json"
+    def _manifest(self, task: str, key: str) -> Manifest | None:
+        path = self.folder(task, key) / "manifest.json"
         if self.remote is not None and not path.is_file():
-            self.remote.pull([f"{node}/{key}/manifest.json"])
+            self.remote.pull([f"{task}/{key}/manifest.json"])
         manifest = read_manifest(path)
-        return manifest if manifest is not None and f"/{manifest.label}".endswith(f"/{node}") else None
+        return manifest if manifest is not None and f"/{manifest.label}".endswith(f"/{task}") else None
 
-    def _complete(self, node: str, key: str, manifest: Manifest) -> bool:
-        folder = self.folder(node, key)
+    def _complete(self, task: str, key: str, manifest: Manifest) -> bool:
+        folder = self.folder(task, key)
         try:
             written = newest = (folder / "manifest.json").stat().st_mtime_ns
             for name, size in manifest.sizes.items():
@@ -253,40 +250,40 @@ class Store:
                 newest = max(newest, stat.st_mtime_ns)
         except OSError:
             return False
-        if newest > written:  # copied, fetched: not to be digested again
+        if newest > written:  # copied or fetched files: don't hash them again
             with suppress(OSError):
                 os.utime(folder / "manifest.json", ns=(newest, newest))
         return True
 
-    def begin(self, node: str) -> Path:
-        """A fresh temporary folder to write a result in."""
+    def begin(self, task: str) -> Path:
+        """Create a temporary folder to write a result in."""
         try:
-            parent = self.root / node
+            parent = self.root / task
             parent.mkdir(parents=True, exist_ok=True)
-            return Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=parent))
+            return Path(tempfile.mkdtemp(prefix=TEMPORARY_PREFIX, dir=parent))
         except OSError as error:
             raise from_os_error(error, self.root) from None
 
-    def checkpoint(self, node: str, key: str) -> Path:
-        """A folder that outlives a killed run: what the same step left there of the same inputs and parameters."""
-        place = self.root / node / f"{PART}{key}"
+    def checkpoint(self, task: str, key: str) -> Path:
+        """Checkpoint folder: survives a killed run, for the same step with the same inputs and parameters."""
+        target = self.root / task / f"{CHECKPOINT_PREFIX}{key}"
         try:
-            place.mkdir(parents=True, exist_ok=True)
+            target.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise from_os_error(error, self.root) from None
-        return place
+        return target
 
-    def commit(self, node: str, key: str, folder: Path, done: Done, about: Mapping[str, Any]) -> Manifest:
+    def commit(self, task: str, key: str, folder: Path, done: Done, about: Mapping[str, Any]) -> Manifest:
         """Move a finished result into place, replacing an incomplete one of the same key.
 
         Args:
-            folder: what `begin` gave, holding the outputs.
+            folder: the folder from `begin`, holding the outputs.
             about: the manifest's version, params, inputs, fed, seconds and peak_mb.
         """
         sizes = {p.relative_to(folder).as_posix(): p.stat().st_size for p in sorted(folder.rglob("*")) if p.is_file()}
         digests = {name: digest(folder / name) for name in sizes}
         manifest = Manifest(
-            label=node,
+            label=task,
             content=content_of(digests),
             files={name: path.relative_to(folder).as_posix() for name, path in done.files.items()},
             sizes=sizes,
@@ -296,30 +293,30 @@ class Store:
             **about,
         )
         self._place(manifest, key, folder)
-        shutil.rmtree(self.root / node / f"{PART}{key}", ignore_errors=True)
+        shutil.rmtree(self.root / task / f"{CHECKPOINT_PREFIX}{key}", ignore_errors=True)
         return manifest
 
-    def contents(self, node: str) -> set[str]:
-        """Digests of the contents of all results of a node, of whatever key."""
-        keys = (path.parent.name for path in (self.root / node).glob("*/manifest.json"))
-        return {manifest.content for manifest in (self.find(node, key) for key in keys) if manifest is not None}
+    def contents(self, task: str) -> set[str]:
+        """Content digests of all cached results of a task, under any key."""
+        keys = (path.parent.name for path in (self.root / task).glob("*/manifest.json"))
+        return {manifest.content for manifest in (self.find(task, key) for key in keys) if manifest is not None}
 
-    def adopt(self, node: str, key: str, fed: str, inputs: Mapping[str, str]) -> Manifest | None:
-        """Take a result over that was made of the same contents by the same step, whatever made those; None: no such.
+    def reuse_same_content(self, task: str, key: str, fed: str, inputs: Mapping[str, str]) -> Manifest | None:
+        """Cache hit by content: reuse a result of the same step on inputs with the same bytes; None if there is none.
 
-        What was made anew and came out the same ends the need to redo what depends on it.
+        If an input was rebuilt with the same bytes, nothing that depends on it runs again (early cutoff).
         """
-        for other in self.folder(node, key).parent.glob("*/manifest.json"):
-            old = self.find(node, other.parent.name)
+        for other in self.folder(task, key).parent.glob("*/manifest.json"):
+            old = self.find(task, other.parent.name)
             if old is not None and old.fed == fed:
-                folder = self.begin(node)
+                folder = self.begin(task)
                 try:
                     shutil.copytree(other.parent, folder, symlinks=True, copy_function=os.link, dirs_exist_ok=True)
                     (folder / "manifest.json").unlink()  # shared with the old result
                     manifest = replace(old, inputs=dict(inputs))
                     self._place(manifest, key, folder)
                 except OSError:
-                    return None  # no hard links here: it is made again
+                    return None  # hard links are not supported here: the step runs again
                 finally:
                     shutil.rmtree(folder, ignore_errors=True)
                 return manifest
@@ -331,19 +328,19 @@ class Store:
             body = asdict(manifest)
             text = json.dumps(body | {"seal": _seal(body)}, indent=1)
             (folder / "manifest.json").write_text(text, encoding="utf-8")
-            place = self.folder(manifest.label, key)
-            if place.is_symlink():
-                place.unlink()
-            elif place.exists():
-                shutil.rmtree(place)
-            folder.replace(place)
+            target = self.folder(manifest.label, key)
+            if target.is_symlink():
+                target.unlink()
+            elif target.exists():
+                shutil.rmtree(target)
+            folder.replace(target)
         except OSError as error:
             raise from_os_error(error, self.root) from None
-        if self.remote is not None:  # the manifest last: with it the result counts
+        if self.remote is not None:  # the manifest last: it makes the result valid
             self.remote.push(f"{manifest.label}/{key}/{name}" for name in (*manifest.sizes, "manifest.json"))
 
     def sweep(self, used: Mapping[str, str]) -> None:
-        """Remove what `used` (node to key) does not name, leftovers of killed runs included."""
+        """Remove all results that `used` (task to key) does not name, and what killed runs left behind."""
         for path in self.root.glob("*/*"):
             if used.get(path.parent.name) != path.name:
                 shutil.rmtree(path, ignore_errors=True)

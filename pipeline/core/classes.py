@@ -1,9 +1,9 @@
-"""The classes of points and what becomes of each: one table.
+"""Point classes: LAS codes, names, display colours, and the surface group that each is meshed in.
 
 Codes are those of ASPRS LAS 1.4 (2 ground, 3-5 vegetation, 6 building, 11 road, ...) and, from 64
-on, user-definable ones: another survey's 65 is no pole (`meanings`). A group is a surface that is
-meshed by itself (D3.2, section 4.2: terrain, building, vegetation); classes without a group are left
-out of the surface, though they still hide what is behind them.
+on, user-definable ones, which differ between surveys (`code_table` maps them to ours). A group is a surface that is
+meshed separately (D3.2, section 4.2: terrain, building, vegetation); points of classes without a group are not
+meshed, but still occlude what is behind them.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from scan2sim.pipeline.core.types import U8, Bools
 Group = Literal["terrain", "building", "vegetation", "vehicle"]
 GROUPS: tuple[Group, ...] = ("terrain", "building", "vegetation")
 SURFACES: tuple[Group, ...] = (*GROUPS, "vehicle")
-"""All that a world may have: the groups, and what is parked where `split.vehicles` keeps it."""
+"""All surfaces of a world: the groups, and parked vehicles if `split.vehicles` keeps them."""
 
 
 class PointClass(NamedTuple):
-    """A class of points: LAS code, name (15 characters at most, as LAS asks), group, colour."""
+    """A point class: LAS code, name (at most 15 characters, a limit of LAS), group, display colour."""
 
     code: int
     name: str
@@ -63,81 +63,81 @@ CODE_OF_SURFACE: dict[str, int] = {
     "terrain": CODE["terrain"], "building": CODE["building"], "vegetation": CODE["high_vegetation"],
     "vehicle": CODE["vehicle"],
 }  # fmt: skip
-"""The label of a surface's faces that have no class of their own."""
-OTHER_NAMES = {"ground": 2, "vegetation": 5, "noise": 7, "bridge": 17, "sign": 64, "car": 66, "wall": 68, "fence": 68}
-SHOWN = (
+"""Class of a surface's faces that have none of their own."""
+SYNONYMS = {"ground": 2, "vegetation": 5, "noise": 7, "bridge": 17, "sign": 64, "car": 66, "wall": 68, "fence": 68}
+PHOTO_CLASSES = (
     "road", "sidewalk", "terrain", "building", "road_sign", "pole", "low_vegetation", "high_vegetation", "vehicle",
     "person", "wall_or_fence", "sky",
 )  # fmt: skip
-"""The classes that networks predict for a photo's pixels, in the order of the step `label`'s probabilities."""
+"""Classes that networks predict for pixels of a photo, in the channel order of the probabilities of step `label`."""
 NOISE = (7, 18)
 UNCLASSIFIED = CODE["unclassified"]
 UNKNOWN = (0, UNCLASSIFIED, 12)  # never classified, unclassified, legacy overlap
-OF_THE_SURVEY = 64
-"""From this code on each survey has classes of its own (LAS 1.4 R15, table 17)."""
+FIRST_USER_CODE = 64
+"""First user-definable code: from here on, each survey defines its own classes (LAS 1.4 R15, table 17)."""
 
 
 def code_of(text: str) -> int | None:
-    """The code of a class by its name, however that is written ("Road sign"), or by itself ("64"); None: no such."""
+    """Code of a class given by name ("Road sign"; case and spaces don't matter) or by code ("64"); None if unknown."""
     plain = _plain(text)
-    names = {_plain(name): code for name, code in (OTHER_NAMES | CODE).items()}
+    names = {_plain(name): code for name, code in (SYNONYMS | CODE).items()}
     return names.get(plain, int(plain) if plain in map(str, CODE.values()) else None)
 
 
 def name_of(code: int) -> str:
-    """What a code is called; "code_31" where it has no name."""
+    """Name of a code; "code_31" if it has none."""
     return next((c.name for c in CLASSES if c.code == code), f"code_{code}")
 
 
-def parse(text: str) -> dict[int, int]:
-    """Codes of a survey and what they are here, of "65=noise,200=5".
+def parse_mapping(text: str) -> dict[int, int]:
+    """Parse a mapping of a survey's codes to ours, "65=noise,200=5".
 
     Raises:
-        SettingError: a code or class that there isn't.
+        SettingError: a code is out of range or given twice, or a class is unknown.
     """
     given: dict[str, str] = {}
     for entry in filter(None, map(str.strip, text.split(","))):
         code, _, name = entry.partition("=")
         if not name or code.strip() in given:
             cause = f"{entry[:40]!r} " + ("names no class" if not name else "names a class for this code again")
-            raise SettingError("classes", cause, "Write 65=noise,200=5: each code once")
+            raise SettingError("classes", cause, "Write CODE=CLASS pairs, each code once: 65=noise,200=5")
         given[code.strip()] = name
     return mapping(given)
 
 
 def mapping(given: Mapping[str, str | int]) -> dict[int, int]:
-    """Codes of a survey (0 to 255) and what they are here, of texts: `{"65": "noise"}`.
+    """Mapping of a survey's codes (0 to 255) to ours, from text: `{"65": "noise"}`.
 
     Raises:
-        SettingError: a code or class that there isn't.
+        SettingError: a code is out of range, or a class is unknown.
     """
     found = {}
     for code, name in given.items():
-        meant = code_of(name if isinstance(name, str) else str(min(max(name, -1), 256)))
+        target = code_of(name if isinstance(name, str) else str(min(max(name, -1), 256)))
         if not (code.strip().isdecimal() and len(code.strip()) < 4 and int(code) < 256):
             raise SettingError(
-                "classes", f"{code[:40]!r} is no code", "Write 65=noise: a code of the file from 0 to 255"
+                "classes", f"{code[:40]!r} is no code", "Write CODE=CLASS with a code from 0 to 255: 65=noise"
             )
-        if meant is None:
+        if target is None:
             raise SettingError(
                 "classes",
                 f"there is no class {str(name)[:40]!r} (for {code})",
-                f"There are: {', '.join(CODE)}, or codes",
+                f"Use one of these names, or its code: {', '.join(CODE)}",
             )
-        found[int(code)] = meant
+        found[int(code)] = target
     return found
 
 
-def meanings(ours: bool, names: Mapping[int, str], given: Mapping[int, int]) -> U8:
-    """Lookup table (256,): a file's code to ours.
+def code_table(ours: bool, names: Mapping[int, str], given: Mapping[int, int]) -> U8:
+    """Lookup table (256,) from a file's codes to ours.
 
-    Codes below 64 are the standard's. Others are unclassified, but where the file names them as we do, or says that
-    it is of this project; and what the user says holds before all that.
+    Codes below 64 are standard LAS. User-definable codes become unclassified, unless the file gives them a name that we
+    know, or scan2sim wrote the file. The user's mapping takes precedence over all of these.
 
     Args:
-        ours: the file says that scan2sim wrote it.
-        names: what the file calls its codes.
-        given: the user's word, code to code.
+        ours: whether scan2sim wrote the file.
+        names: class names in the file, by code.
+        given: the user's mapping, code to code.
     """
     table = np.arange(256, dtype=np.uint8)
     known = set(CODE.values())
@@ -145,36 +145,38 @@ def meanings(ours: bool, names: Mapping[int, str], given: Mapping[int, int]) -> 
         named = code_of(names.get(code, ""))
         if code in given:
             table[code] = given[code]
-        elif code in known and (code < OF_THE_SURVEY or (ours and not names.get(code))):
+        elif code in known and (code < FIRST_USER_CODE or (ours and not names.get(code))):
             continue
         elif named is not None:
             table[code] = named
-        elif code >= OF_THE_SURVEY:
+        elif code >= FIRST_USER_CODE:
             table[code] = UNCLASSIFIED
     return table
 
 
-def known() -> Bools:
-    """Lookup table (256,): whether a LAS code says what a point is."""
+def classified_codes() -> Bools:
+    """Lookup table (256,): whether a LAS code is a known class other than unclassified."""
     table = np.zeros(256, bool)
     table[list(CODE.values())] = True
     table[list(UNKNOWN)] = False
     return table
 
 
-def strangers(count: npt.NDArray[np.integer], table: U8) -> str:
-    """What to say of a file's codes, of which there are so many (256,), that `meanings` made nothing of; mostly empty.
+def unmapped_codes_warning(count: npt.NDArray[np.integer], table: U8) -> str:
+    """Warning about user-definable codes in a file that `code_table` left unclassified; empty if there are none.
 
-    Codes of the survey's own are meant: what has none is told of where surfaces are made (`split`).
+    Args:
+        count: (256,) number of points of each code.
+        table: from `code_table`.
     """
-    lost = [c for c in np.flatnonzero(count).tolist() if c >= OF_THE_SURVEY and table[c] == UNCLASSIFIED]
-    if not lost:
+    unmapped = [c for c in np.flatnonzero(count).tolist() if c >= FIRST_USER_CODE and table[c] == UNCLASSIFIED]
+    if not unmapped:
         return ""
-    codes = ", ".join(f"{c} ({count[c] / count.sum():.1%})" for c in lost[:8])
-    one = lost[0]
+    codes = ", ".join(f"{c} ({count[c] / count.sum():.1%})" for c in unmapped[:8])
+    one = unmapped[0]
     return (
-        f"codes {codes} are the survey's own (LAS leaves {OF_THE_SURVEY} and up to it), and taken as unclassified. "
-        f'Say what they are: import with --classes {one}=building, or write [classes] {one} = "building" in tile.toml'
+        f"codes {codes} are the survey's own (LAS: {FIRST_USER_CODE} and up), read as unclassified. "
+        f'Map them to classes: import with --classes {one}=building, or set [classes] {one} = "building" in tile.toml'
     )
 
 
@@ -183,7 +185,7 @@ def _plain(text: str) -> str:
 
 
 def group_of() -> npt.NDArray[np.int8]:
-    """Lookup table (256,): LAS code to index into `GROUPS`, -1 for what is left out."""
+    """Lookup table (256,): LAS code to index into `GROUPS`, -1 for classes without a group."""
     table = np.full(256, -1, np.int8)
     for c in CLASSES:
         if c.group is not None:

@@ -1,7 +1,6 @@
-"""What can go wrong, said once: every error names the file, the cause and the remedy.
+"""Errors for the user: each names the file or setting, the cause and the remedy.
 
-`EXIT_CODES` is the one table that turns errors into exit codes of the command (and, for the
-services, HTTP statuses).
+`EXIT_CODES` maps them to exit codes of the command and, for services, to HTTP statuses.
 """
 
 from __future__ import annotations
@@ -9,8 +8,8 @@ from __future__ import annotations
 import errno
 from pathlib import Path
 
-REBUILT = "Run again: it is rebuilt, and nothing else"
-RETRIED = "Run again to retry what failed; run.log has the details"
+REMEDY_REBUILD = "Run again: only this result is rebuilt"
+REMEDY_RETRY = "Run again to retry what failed; run.log has the details"
 
 
 class ScanError(Exception):
@@ -33,7 +32,7 @@ class ScanError(Exception):
 
 
 def printable(text: str) -> str:
-    """Text, which may hold names of files, with codes for what would steer a terminal or begin a line."""
+    """Text with non-printable characters escaped: a file name may hold terminal control codes or line breaks."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
@@ -42,45 +41,47 @@ class SettingError(ScanError):
 
 
 class InputError(ScanError):
-    """A file of the tile that is missing, unreadable, or says something impossible."""
+    """An input file that is missing, unreadable or inconsistent."""
 
 
 class DataError(ScanError):
-    """Readable input from which no world can be made (too few points, nothing overlaps)."""
+    """Readable input from which no world can be made (too few points, no overlap)."""
 
 
 class StepError(ScanError):
-    """A step that failed, its retry and its fallback included."""
+    """A step that failed, and so did its retry and its fallback."""
 
 
 class DamagedError(StepError):
-    """A kept result whose bytes aren't as they were made; `where` is the full name of its node, which is run again."""
+    """A cached result with changed bytes; `where` is the full name of its task, which runs again."""
 
-    def __init__(self, where: str | Path, cause: str = "its kept result is damaged", remedy: str = REBUILT) -> None:
+    def __init__(
+        self, where: str | Path, cause: str = "its cached result is damaged", remedy: str = REMEDY_REBUILD
+    ) -> None:
         super().__init__(where, cause, remedy)
 
 
 class SpaceError(ScanError):
-    """The disk is full or may not be written to."""
+    """The disk is full, or writing is not permitted."""
 
 
 class BusyError(ScanError):
-    """Another run is at work in the same place."""
+    """Another run is using the same folder."""
 
 
-class UnsureError(ScanError):
-    """What came out is there, but most of it was guessed, not seen."""
+class LowConfidenceError(ScanError):
+    """The result was written, but most of it is extrapolated, not measured."""
 
 
 class IncompleteError(ScanError):
-    """The world is finished, but side products (roads, pictures, the report) failed; `where` is the world's folder."""
+    """The world is finished, but side products (roads, images, the report) failed; `where` is the world's folder."""
 
-    def __init__(self, where: str | Path, cause: str, remedy: str = RETRIED) -> None:
+    def __init__(self, where: str | Path, cause: str, remedy: str = REMEDY_RETRY) -> None:
         super().__init__(where, cause, remedy)
 
 
 class UnavailableError(ScanError):
-    """Something that is not installed or can't run on this machine."""
+    """A package, program or device that is missing, or doesn't run on this machine."""
 
 
 # exception: (exit code, HTTP status, meaning)
@@ -88,20 +89,20 @@ EXIT_CODES: dict[type[BaseException], tuple[int, int, str]] = {
     SettingError: (2, 422, "a setting or option is wrong"),
     InputError: (3, 422, "an input file is missing, unreadable or wrong"),
     DataError: (4, 422, "the input is readable, but no world can be made from it"),
-    StepError: (5, 500, "a step failed, its retry and fallback included"),
-    SpaceError: (6, 507, "the disk is full or can't be written to"),
-    UnavailableError: (7, 501, "something needed is not installed or can't run here"),
-    BusyError: (8, 409, "another run is at work in the same folder"),
-    UnsureError: (9, 422, "the result is there, but most of it was guessed, not seen"),
-    IncompleteError: (10, 500, "the world is finished, but a side product failed (roads, pictures, the report, ...)"),
-    KeyboardInterrupt: (130, 499, "interrupted; what was finished is kept"),
+    StepError: (5, 500, "a step failed, and so did its retry and fallback"),
+    SpaceError: (6, 507, "the disk is full, or writing is not permitted"),
+    UnavailableError: (7, 501, "a required package, program or device is missing, or doesn't run here"),
+    BusyError: (8, 409, "another run is using the same folder"),
+    LowConfidenceError: (9, 422, "the result was written, but most of it is extrapolated, not measured"),
+    IncompleteError: (10, 500, "the world is finished, but a side product failed (roads, images, the report, ...)"),
+    KeyboardInterrupt: (130, 499, "interrupted; finished steps are kept"),
 }
 
-INTERRUPTED = "Interrupted; what was finished is kept, the same command goes on from there."
+INTERRUPTED = "Interrupted; finished steps are kept, the same command resumes from there."
 
 
 def exit_code(error: BaseException) -> int:
-    """The command's exit code for an error; 1 for one that the table doesn't know."""
+    """The command's exit code for an error; 1 for one that is not in the table."""
     for kind, (code, _, _) in EXIT_CODES.items():
         if isinstance(error, kind):
             return code
@@ -109,7 +110,7 @@ def exit_code(error: BaseException) -> int:
 
 
 def http_status(error: BaseException) -> int:
-    """A service's HTTP status for an error; 500 for one that the table doesn't know."""
+    """A service's HTTP status for an error; 500 for one that is not in the table."""
     for kind, (_, status, _) in EXIT_CODES.items():
         if isinstance(error, kind):
             return status
@@ -117,7 +118,7 @@ def http_status(error: BaseException) -> int:
 
 
 def from_exception(error: Exception, where: str, folder: Path) -> ScanError:
-    """Turn any exception of `where`, a step or a side product that writes into `folder`, into an error for the user."""
+    """Convert an exception of `where` (a step or side product that writes into `folder`) into an error for the user."""
     if isinstance(error, ScanError):
         return error
     if isinstance(error, OSError):
@@ -125,17 +126,17 @@ def from_exception(error: Exception, where: str, folder: Path) -> ScanError:
     if isinstance(error, MemoryError):
         return StepError(where, "ran out of memory", "Use a smaller tile, or larger voxels")
     cause = f"failed unexpectedly ({type(error).__name__}: {error})"
-    return StepError(where, cause, "The log holds the details; please report it")
+    return StepError(where, cause, "The log has the traceback; please report it as a bug")
 
 
 def from_os_error(error: OSError, path: str | Path) -> ScanError:
-    """Turn an operating system's refusal to write into a `SpaceError` that names the path."""
+    """Convert an `OSError` into an error that names the path; a `SpaceError` if the disk is full or not writable."""
     where = error.filename or path
-    partial_write = error.errno is None and "written" in str(error)  # as numpy tells of a full disk
+    partial_write = error.errno is None and "written" in str(error)  # numpy's error for a full disk
     if error.errno in (errno.ENOSPC, errno.EDQUOT) or partial_write:
         return SpaceError(where, "no space left on the disk", "Free some space and run again; finished steps are kept")
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return SpaceError(where, "may not be written to", "Choose another --out, or change its permissions")
+        return SpaceError(where, "no permission to write", "Choose another --out, or change its permissions")
     if error.errno in (errno.EEXIST, errno.ENOTDIR, errno.EISDIR):
-        return SettingError(where, str(error.strerror), "Name another path: there is something else in its place")
+        return SettingError(where, str(error.strerror), "Choose another path: something else exists here")
     return InputError(where, str(error.strerror or error), "Check that the path exists and can be read")

@@ -1,4 +1,4 @@
-"""Packages that only some of the work needs: which extra brings each, and what to say where one is missing."""
+"""Optional dependencies: the extra that installs each package, and the error when one is missing."""
 
 from __future__ import annotations
 
@@ -48,33 +48,33 @@ EXTRA_OF = {
     "can": "can",
     "cantools": "can",
 }
-"""A package's import name to the extra of `scan2sim` that installs it."""
+"""Import name of a package: extra of `scan2sim` that installs it."""
 
 
 def missing(*packages: str) -> str | None:
-    """Those that aren't installed, as "torch, safetensors"; None: all are."""
+    """Names of the packages that aren't installed, as "torch, safetensors"; None if all are."""
     return ", ".join(name for name in packages if importlib.util.find_spec(name) is None) or None
 
 
-def need(what: str, *packages: str, instead: str = "", extra: str = "") -> None:
-    """Go on only if all packages are installed.
+def require(what: str, *packages: str, instead: str = "", extra: str = "") -> None:
+    """Raise an error unless all packages are installed.
 
     Args:
-        what: needs them: a setting, option or command.
-        instead: what to do without them, a sentence's second half ("or set ...").
-        extra: that brings them all, where another than `EXTRA_OF` tells is meant.
+        what: the setting, option or command that needs them.
+        instead: alternative to installing them, the second half of a sentence ("or set ...").
+        extra: the extra that installs them all; "": the extras in `EXTRA_OF`.
 
     Raises:
-        UnavailableError: some aren't; it names them, and the extra that brings them.
+        UnavailableError: packages are missing; names them and the extra that installs them.
     """
-    lacking = missing(*packages)
-    if lacking:
-        raise unavailable(what, lacking, instead, extra)
+    absent = missing(*packages)
+    if absent:
+        raise unavailable(what, absent, instead, extra)
 
 
-def unavailable(what: str, lacking: str, instead: str = "", extra: str = "") -> UnavailableError:
-    """The error of `need`, for packages as `missing` tells them."""
-    names = lacking.split(", ")
+def unavailable(what: str, absent: str, instead: str = "", extra: str = "") -> UnavailableError:
+    """The error of `require`, for packages listed by `missing`."""
+    names = absent.split(", ")
     extras = extra or ",".join(sorted({EXTRA_OF[name] for name in names if name in EXTRA_OF}))
     install = f"pip install 'scan2sim[{extras}]'" if extras else f"pip install {' '.join(names)}"
-    return UnavailableError(what, f"needs {lacking}, not installed here", " ".join(filter(None, [install, instead])))
+    return UnavailableError(what, f"needs {absent}, not installed here", " ".join(filter(None, [install, instead])))

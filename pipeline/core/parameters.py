@@ -1,7 +1,7 @@
-"""Ranges of parameters: the types that several share, and the sentence that describes a range.
+"""Shared parameter types with their ranges, and the text that describes a range in messages.
 
-They are generous: what is outside would be a slip of the pen, or take more memory or time than any machine has. What
-takes memory by the data as well (texels of a surface, pixels of a map) is estimated and refused by its step.
+Ranges are generous: a value outside is a typing error, or would take more memory or time than any machine has. Memory
+that depends on the data as well (texels of a surface, pixels of a map) is estimated by the step, which rejects it.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from pydantic import AfterValidator, Field
 from pydantic.fields import FieldInfo
 
 Voxel = Annotated[float, Field(ge=0.005, le=100)]
-"""Metres; finer than any scanner's noise there is nothing."""
+"""Voxel edge in metres; the lower limit is below the noise of any scanner."""
 Texel = Annotated[float, Field(ge=0.0005, le=10)]
-"""Metres."""
-Reach = Annotated[float, Field(ge=0.001, le=10_000)]
-"""Metres up to which something is looked for, or taken for the same."""
+"""Texture resolution in metres."""
+Distance = Annotated[float, Field(ge=0.001, le=10_000)]
+"""Search radius or tolerance in metres."""
 Depth = Annotated[float, Field(ge=0, le=10)]
-"""Metres that something may lie behind something else."""
+"""Depth tolerance in metres."""
 Cosine = Annotated[float, Field(ge=0, le=0.99)]
-Share = Annotated[float, Field(ge=0, le=1)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
 Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
-"""Metres (or feet) in a CRS: two and a half times around the earth."""
-Place = tuple[Coordinate, Coordinate]
+"""Coordinate in a CRS, metres or feet; the limit is two and a half times the circumference of the earth."""
+PlanPoint = tuple[Coordinate, Coordinate]
 Metres = Annotated[float, Field(ge=0, le=10_000)]
 Length = Annotated[float, Field(ge=1, le=100_000)]
 Stretch = Annotated[float, Field(ge=1, le=10_000)]
@@ -34,17 +34,17 @@ Buffer = Annotated[float, Field(ge=0, le=1000)]
 Range = Annotated[float, Field(ge=0.1, le=10_000)]
 Pixels = Annotated[float, Field(ge=-1_000_000, le=1_000_000)]
 Focal = Annotated[float, Field(ge=1, le=1_000_000)]
-"""Pixels."""
+"""Focal length in pixels."""
 Rate = Annotated[float, Field(ge=0.01, le=1000)]
-"""Frames a second."""
+"""Frame rate in Hz."""
 Shift = Annotated[float, Field(ge=-1e10, le=1e10)]
-"""Seconds between two clocks, of which one may count from 1970."""
+"""Clock offset in seconds; one of the clocks may count from 1970."""
 Seconds = Annotated[float, Field(ge=0.001, le=604_800)]
-"""Up to a week."""
+"""Duration in seconds, up to a week."""
 Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
-"""Of random numbers."""
-Stops = Annotated[float, Field(ge=0.001, le=20)]
-"""Of exposure, EV."""
+"""Seed of a random number generator."""
+ExposureStops = Annotated[float, Field(ge=0.001, le=20)]
+"""Exposure difference in EV."""
 Device = Annotated[
     str,
     Field(
@@ -52,25 +52,25 @@ Device = Annotated[
         json_schema_extra={"range": "auto, numba, cpu, cuda, mps or xpu; cuda:1 for the second"},
     ),
 ]
-"""What computes: "numba" in the step `texture` alone, the others as torch or onnxruntime call them."""
+"""Compute device: "numba" only in the step `texture`, the others are names of torch and onnxruntime devices."""
 NAME = r"^[A-Za-z0-9_]{1,100}$"
-"""What tiles and surveys may be called: names become folders, files and names in SDF."""
+"""Names of tiles and surveys, which become names of folders, files and SDF elements."""
 Name = Annotated[str, Field(pattern=NAME)]
 
 
 def _no_nul(text: Any) -> Any:
     if "\0" in str(text) or len(str(text)) > 4096:
-        raise ValueError("no path")
+        raise ValueError("not a valid path")
     return text
 
 
 FileName = Annotated[str, AfterValidator(_no_nul)]
-"""Of a file; "" where there is none."""
+"""Path of a file as text; "" for none."""
 File = Annotated[Path, AfterValidator(_no_nul)]
 
 
 def described(field: FieldInfo) -> str:
-    """What a parameter may be: "0.005 to 100"."""
+    """The allowed values of a parameter as text: "0.005 to 100"."""
     extra = field.json_schema_extra
     if isinstance(extra, dict) and "range" in extra:
         return str(extra["range"])
@@ -90,7 +90,7 @@ def _described(kind: Any, limits: Sequence[Any]) -> str:
         inner = [m for a in arguments[1:] for m in (a.metadata if isinstance(a, FieldInfo) else [a])]
         return _described(arguments[0], [*inner, *limits])
     if origin in (Union, types.UnionType):
-        return ", or ".join("left out" if a is type(None) else _described(a, limits) for a in arguments)
+        return ", or ".join("unset" if a is type(None) else _described(a, limits) for a in arguments)
     if origin is Literal:
         return _either([str(a) for a in arguments])
     if origin is list:

@@ -1,4 +1,4 @@
-"""Names of files that come from elsewhere (a manifest, a key of object storage), kept inside their folder."""
+"""Path traversal check for file names from untrusted sources (manifests, keys of object storage)."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from scan2sim.pipeline.core.errors import InputError
 
 
 def inside(folder: Path, name: str) -> Path:
-    """`folder/name`; the file itself may be a link, the folders that lead to it may not lead elsewhere.
+    """`folder/name`, checked to be inside `folder`; the file itself may be a symbolic link, its parent folders may not.
 
     Raises:
-        InputError: the name is absolute, holds `..`, or would lead out of the folder.
+        InputError: the name is absolute, contains `..`, or leads out of the folder through a link.
     """
     parts = PurePosixPath(name).parts
     if not parts or name.startswith("/") or ".." in parts or "\0" in name:
-        raise InputError(folder, f"holds the name {name!r}, which leads out of it", "Take it from where it was made")
+        raise InputError(folder, f"contains {name!r}, which leads out of it", "Copy the folder from its source again")
     path = folder / name
     if not path.parent.resolve().is_relative_to(folder.resolve()):
-        raise InputError(path, "leads out of its folder by a link", "Remove the link")
+        raise InputError(path, "leads out of its folder through a link", "Remove the link")
     return path

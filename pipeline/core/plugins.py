@@ -1,9 +1,9 @@
-"""Backends and formats: a file each, found by its name in its package; each says what it needs to run here.
+"""Plugins: backends and file formats, one module each, found by module name in their package.
 
-To add one: a file in the package. It has what the package's protocol asks for, and, where that takes more than the
-project's own dependencies, `NEEDS`, their import names (`EXTRA`: what brings them, where several extras do). Files are
-formats by `SUFFIXES`, ends of their names. Where one of several is chosen unasked, `RANK` says which are better, and
-`lacking()` what of the machine isn't there.
+To add one, add a module to the package. It implements the package's protocol. Attributes: `NEEDS`, import names of
+optional packages that it requires (`EXTRA`: the extra that installs them, if several do); `SUFFIXES`, endings of file
+names that a format handles. If the best available backend is chosen automatically: `RANK`, lowest is best, and
+`unavailable()`, the reason why it can't run on this machine.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scan2sim.pipeline.core.errors import SettingError, UnavailableError
 
 
 def names(package: str) -> list[str]:
-    """Of all backends in a package, ascending."""
+    """Names of all backends in a package, sorted."""
     return sorted(module.name for module in pkgutil.iter_modules(importlib.import_module(package).__path__))
 
 
@@ -27,81 +27,81 @@ def module(package: str, name: str) -> Any:
 
 
 def missing(package: str, name: str) -> str | None:
-    """Packages that a backend can't run here without, as "torch, safetensors"; None: it can."""
+    """Missing packages that a backend requires, as "torch, safetensors"; None if all are installed."""
     return optional_deps.missing(*needs(module(package, name)))
 
 
 def needs(backend: Any) -> tuple[str, ...]:
     """Import names of the packages that a backend needs."""
-    named: tuple[str, ...] = getattr(backend, "NEEDS", ())
-    return named
+    packages: tuple[str, ...] = getattr(backend, "NEEDS", ())
+    return packages
 
 
 def find(package: str, name: str, setting: str) -> Any:
-    """The module of a backend that can run here; only what its file imports is loaded.
+    """Load the module of a backend and check that the packages it requires are installed.
 
     Args:
-        package: its full name.
-        name: of the backend, as the user gave it.
-        setting: that named it, for errors.
+        package: full name of the package of backends.
+        name: name of the backend, as given by the user.
+        setting: name of the setting, for error messages.
 
     Raises:
         SettingError: there is no such backend.
-        UnavailableError: it can't run here.
+        UnavailableError: packages that it requires are missing.
     """
     known = names(package)
     if name not in known:
-        raise SettingError(setting, f"there is no {name!r}", f"Choose one of: {', '.join(known)}")
+        raise SettingError(setting, f"unknown value {name!r}", f"Choose one of: {', '.join(known)}")
     backend = module(package, name)
-    optional_deps.need(f"{setting} {name}", *needs(backend), extra=_extra(backend))
+    optional_deps.require(f"{setting} {name}", *needs(backend), extra=_extra(backend))
     return backend
 
 
 def _extra(backend: Any) -> str:
-    named: str = getattr(backend, "EXTRA", "")
-    return named
+    extra: str = getattr(backend, "EXTRA", "")
+    return extra
 
 
-class Lacking(NamedTuple):
-    """Why a backend can't run here, and what to do about it."""
+class Unavailable(NamedTuple):
+    """Why a backend can't run on this machine, and the remedy."""
 
     cause: str
     remedy: str
 
 
 def best(package: str, name: str | None, setting: str, what: str) -> Any:
-    """The module of a backend that can run here: of that name, or the one of least `RANK`.
+    """Load a backend that can run on this machine: the named one, or the available one with the lowest `RANK`.
 
     Args:
-        package: its full name.
-        name: of the backend, as the user gave it; None: the best.
-        setting: that named it, for errors.
-        what: needs one, for errors.
+        package: full name of the package of backends.
+        name: name of the backend, as given by the user; None: the best available.
+        setting: name of the setting, for error messages.
+        what: what needs a backend, for error messages.
 
     Raises:
         SettingError: there is no such backend.
-        UnavailableError: it can't run here, or none can.
+        UnavailableError: the named one can't run on this machine, or none can.
     """
-    asked = [find(package, name, setting)] if name else [module(package, one) for one in names(package)]
-    why = {}
-    for backend in sorted(asked, key=lambda one: one.RANK):
-        lacking = _lacking(backend)
-        if lacking is None:
+    candidates = [find(package, name, setting)] if name else [module(package, one) for one in names(package)]
+    reasons = {}
+    for backend in sorted(candidates, key=lambda one: one.RANK):
+        reason = _unavailable(backend)
+        if reason is None:
             return backend
-        why[backend.__name__.rpartition(".")[2]] = lacking
-    causes = "; ".join(f"{one} {lacking.cause}" for one, lacking in why.items())
-    raise UnavailableError(what, causes, " or ".join(dict.fromkeys(lacking.remedy for lacking in why.values())))
+        reasons[backend.__name__.rpartition(".")[2]] = reason
+    causes = "; ".join(f"{one} {reason.cause}" for one, reason in reasons.items())
+    raise UnavailableError(what, causes, " or ".join(dict.fromkeys(reason.remedy for reason in reasons.values())))
 
 
-def _lacking(backend: Any) -> Lacking | None:
+def _unavailable(backend: Any) -> Unavailable | None:
     packages = optional_deps.missing(*needs(backend))
     if packages:
         error = optional_deps.unavailable(backend.__name__, packages, extra=_extra(backend))
-        return Lacking(error.cause, error.remedy)
-    lacking: Lacking | None = backend.lacking()
-    return lacking
+        return Unavailable(error.cause, error.remedy)
+    reason: Unavailable | None = backend.unavailable()
+    return reason
 
 
 def by_suffix(package: str) -> dict[str, str]:
-    """Ends of files' names to the formats in a package that read them."""
+    """Map file name endings to the formats in a package that read them."""
     return {suffix: name for name in names(package) for suffix in module(package, name).SUFFIXES}

@@ -1,4 +1,4 @@
-"""Calls of native code that can hang or crash, in a child process with a time limit."""
+"""Run native code that can hang or crash in a child process with a time limit."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def call(target: str, *args: Any, timeout: float, threads: int | None = None) ->
     Args:
         target: an importable function; arguments and result are pickled.
         timeout: seconds, after which the child is killed.
-        threads: threads that native code may use; None for all cores.
+        threads: number of threads for native code; None: all cores.
 
     Raises:
         StepError: the child crashed, raised, or ran out of time.
     """
-    # the parent's own search path: a user's folder may hold modules named like ours
+    # the parent's search path: modules in the user's working folder must not shadow ours
     environment = dict(os.environ, OMP_WAIT_POLICY="passive", PYTHONPATH=os.pathsep.join(filter(None, sys.path)))
     if threads is not None:
         environment |= {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
@@ -44,8 +44,8 @@ def call(target: str, *args: Any, timeout: float, threads: int | None = None) ->
         try:
             _, stderr = child.communicate(timeout=timeout)
         except subprocess.TimeoutExpired:
-            raise StepError(target, f"did not finish within {timeout:.0f} s", "Give it a smaller tile") from None
-        finally:  # the interruption of a run included
+            raise StepError(target, f"did not finish within {timeout:.0f} s", "Use a smaller tile") from None
+        finally:  # also when the run is interrupted
             if child.poll() is None:
                 os.killpg(child.pid, signal.SIGKILL)
                 child.wait()
@@ -57,7 +57,7 @@ def call(target: str, *args: Any, timeout: float, threads: int | None = None) ->
 
 
 def die_with_parent() -> None:
-    """Have the kernel end this process when the one that started it dies (Linux; elsewhere nothing)."""
+    """Have the kernel kill this process when its parent dies (Linux only; no effect elsewhere)."""
     if sys.platform == "linux":
         PR_SET_PDEATHSIG = 1
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -1,6 +1,6 @@
-"""What a step is: a pure function on files with frozen parameters, a name and a version.
+"""Definition of a step: a pure function on files with frozen parameters, a name and a version.
 
-To add one: a function, its `Params`, one line in `flows/pipelines/tile.py`, one test.
+To add one, write a function, its `Params`, one line in `flows/pipelines/tile.py`, and a test.
 """
 
 from __future__ import annotations
@@ -17,19 +17,23 @@ from scan2sim.pipeline.core.parameters import described
 
 
 class Params(BaseModel):
-    """Base of every step's parameters: frozen, and unknown names are refused."""
+    """Base class of every step's parameters: frozen, unknown names are rejected."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     @classmethod
-    def of(cls, where: str, values: Mapping[str, Any], *, remedy: str = "docs/settings.md lists them") -> Self:
-        """Of what a user has set.
+    def of(
+        cls, where: str, values: Mapping[str, Any], *, remedy: str = "docs/reference/settings.md lists all settings"
+    ) -> Self:
+        """Validate values from the user.
 
         Args:
-            where: what its names stand below, as "poisson", in messages; "" for options of a command.
+            where: prefix of the names in messages, such as "poisson"; "" for options of a command.
+            values: values by name.
+            remedy: last sentence of the error message.
 
         Raises:
-            SettingError: naming the first value out of its range, and the range.
+            SettingError: names the first unknown, missing or invalid value, and the range.
         """
         try:
             return cls(**values)
@@ -37,7 +41,7 @@ class Params(BaseModel):
             first = error.errors()[0]
             name = str(first["loc"][0]) if first["loc"] else ""
             if name not in cls.model_fields:
-                raise SettingError(f"{where}.{name}", "there is no such setting", remedy) from None
+                raise SettingError(f"{where}.{name}", "unknown setting", remedy) from None
             if name not in values:
                 raise SettingError(f"{where}.{name}", "is missing", remedy) from None
             value = f"{values[name]!r:.60}"
@@ -49,11 +53,11 @@ class Report(Protocol):
     """Progress callback: a bar in the command, an artifact in Prefect, nothing in tests."""
 
     def __call__(self, fraction: float, message: str = "") -> None:
-        """Say that `fraction` (0 to 1) of the step is done, and what it is at."""
+        """Report that `fraction` (0 to 1) of the step is done, and what it is working on."""
 
 
 def silent(fraction: float, message: str = "") -> None:
-    """A `Report` that says nothing."""
+    """A `Report` that discards progress."""
 
 
 Inputs = Mapping[str, Path]
@@ -61,12 +65,12 @@ Inputs = Mapping[str, Path]
 
 @dataclass(frozen=True)
 class Done:
-    """What a step made.
+    """Result of a step.
 
     Attributes:
         files: name to path of a file or folder inside the step's output folder.
-        facts: JSON-able figures for the report (counts in and out, errors, ...).
-        warnings: sentences that the user should read; shown and kept with the result.
+        facts: metrics for the report, JSON-serializable (counts in and out, errors, ...).
+        warnings: sentences for the user, printed and stored with the result.
     """
 
     files: dict[str, Path]
@@ -75,28 +79,28 @@ class Done:
 
 
 Run = Callable[..., Done]
-"""The function of a step, `run(inputs, params, out, report)`: reads `inputs`, writes below the folder `out` only. Of a
-step that `resumes` it gets a folder `checkpoint`, too: what it leaves there is there again after it was killed."""
+"""The function of a step, `run(inputs, params, out, report)`: reads `inputs`, writes only below the folder `out`. If
+the step `resumes`, it also gets a folder `checkpoint`, whose contents survive when the step is killed."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """A step of the mission.
+    """A step of the pipeline.
 
     Attributes:
         name: as on the command line (`--from NAME`, `--set NAME.param=value`).
-        version: raised whenever its results change for the same input and parameters.
-        run: the function; must be importable by name (it may run in another process), and
-            import what is heavy inside.
-        params: its parameters; defaults are the mission's numbers.
-        class_defaults: by class, defaults that differ between terrain, building and vegetation.
-        check: given parameters, which then need defaults, raises a ScanError if the step can't run with them on this
-            machine (a package is missing, say); called before any step runs, and quick. None: it always can.
-        per_class: whether it is run for each class apart.
-        resumes: whether it goes on where it was killed.
-        side_product: whether the world is made without its results where it fails (`flows.pipelines.tile`).
-        memory: GB at least, and GB for every GB that it reads (photos not counted), as measured on generated streets
-            (docs/scale.md).
+        version: increased whenever results change for the same inputs and parameters.
+        run: the function; must be importable by name, as it may run in another process, and import heavy modules
+            only when called.
+        params: class of its parameters; defaults are those of D3.2.
+        class_defaults: defaults that differ between terrain, building and vegetation, by class.
+        check: optional function of the parameters (which then all need defaults), called before any step runs; raises
+            a ScanError if the step can't run with them on this machine, for a missing package, for example. Fast.
+        per_class: whether it runs once for each class.
+        resumes: whether it can resume from a checkpoint after it was killed.
+        side_product: whether the world is finished without its result if it fails (`flows.pipelines.tile`).
+        memory: base memory in GB, and GB per GB of input (without photos), measured on generated streets
+            (docs/surveys.md).
     """
 
     name: str

@@ -1,7 +1,7 @@
-"""Libraries of the system that the wheels load, and Debian's packages that hold them.
+"""System libraries (shared objects) that the wheels load, and the Debian packages that contain them.
 
-`python -m bench.packaging.libraries` holds this table against every shared object of every wheel; `packages.txt` lists
-the packages. Needs nothing but Python: `deploy/install.py` reads it before anything is installed.
+`python -m bench.packaging.libraries` compares this table with every shared object of every wheel; `packages.txt` lists
+the packages. Uses only the standard library: `deploy/install.py` imports it before anything is installed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import sys
 from scan2sim.pipeline.core.errors import UnavailableError
 
 PACKAGE_OF = {
-    "libEGL.so.1": "libegl1",  # Open3D, this and the next five, though nothing is drawn on a screen
+    "libEGL.so.1": "libegl1",  # this and the next five: Open3D, even when it runs headless
     "libGL.so.1": "libgl1",
     "libX11.so.6": "libx11-6",
     "libidn2.so.0": "libidn2-0",
@@ -26,35 +26,35 @@ PACKAGE_OF = {
 
 
 def missing() -> dict[str, str]:
-    """Libraries that can't be loaded here, and their packages; wheels for other systems than Linux need none."""
+    """Libraries that can't be loaded, and their packages; empty on other systems than Linux, where wheels need none."""
     return {name: package for name, package in PACKAGE_OF.items() if sys.platform == "linux" and not loads(name)}
 
 
 def check() -> None:
-    """Go on only if this system has all libraries.
+    """Raise an error unless this system has all libraries.
 
     Raises:
-        UnavailableError: it hasn't; names them, their packages, and what installs them here.
+        UnavailableError: libraries are missing; names them, and the command that installs their packages.
     """
-    lacking = missing()
-    if lacking:
-        cause = "the system lacks what Open3D and numba load"
-        raise UnavailableError(", ".join(lacking), cause, f"Run: {command(lacking)}")
+    absent = missing()
+    if absent:
+        cause = "system libraries that Open3D and numba load are missing"
+        raise UnavailableError(", ".join(absent), cause, f"Run: {command(absent)}")
 
 
-def command(lacking: dict[str, str]) -> str:
-    """What installs libraries (and their packages) on this system."""
+def command(absent: dict[str, str]) -> str:
+    """Command that installs missing libraries (keys) by their packages (values) on this system."""
     sudo = "" if os.geteuid() == 0 else "sudo "
     if shutil.which("apt-get"):
-        return f"{sudo}apt-get install --no-install-recommends {' '.join(lacking.values())}"
-    for manager in ("dnf", "zypper"):  # RPM knows packages by the libraries in them
+        return f"{sudo}apt-get install --no-install-recommends {' '.join(absent.values())}"
+    for manager in ("dnf", "zypper"):  # RPM resolves packages by the libraries that they provide
         if shutil.which(manager):
-            return f"{sudo}{manager} install " + " ".join(f"'{name}()(64bit)'" for name in lacking if ".so" in name)
-    return f"your system's package manager, for {', '.join(lacking)}"
+            return f"{sudo}{manager} install " + " ".join(f"'{name}()(64bit)'" for name in absent if ".so" in name)
+    return f"your system's package manager, for {', '.join(absent)}"
 
 
 def loads(library: str) -> bool:
-    """Whether a library is here, by the name that others ask for it."""
+    """Whether a library can be loaded by its soname."""
     try:
         ctypes.CDLL(library)
     except OSError:

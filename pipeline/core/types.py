@@ -1,4 +1,4 @@
-"""The values that flow between steps: frozen, each spatial one with its CRS and origin.
+"""Value types passed between steps: frozen dataclasses, spatial ones with their CRS and origin.
 
 Conventions, everywhere inside: metres; world z-up; camera axes of OpenCV (x right, y down,
 z forward); poses are `T_world_cam` (camera to world). World coordinates are float64; a `Frame`'s
@@ -30,14 +30,14 @@ CameraModel = Literal["pinhole", "opencv", "fisheye", "equirectangular", "orthog
 
 @dataclass(frozen=True)
 class Frame:
-    """Where local coordinates are: `crs = (local + origin) / unit`.
+    """Frame of local coordinates: `crs = (local + origin) / unit`.
 
     Attributes:
         crs: WKT or authority code of the CRS; "local" where there is none.
         origin: (3,) metres, subtracted from world coordinates.
         unit: metres per unit of the CRS's axes (0.3048 for international feet).
 
-    Numbers of NumPy become Python's, which are written and compared alike everywhere.
+    NumPy scalars are converted to Python floats, whose text form and comparison don't depend on NumPy's version.
     """
 
     crs: str = "local"
@@ -66,10 +66,10 @@ class Camera:
         model: "pinhole"; "opencv" (Brown-Conrady, k1 k2 p1 p2 [k3 [k4 k5 k6]]); "fisheye" (OpenCV's
             equidistant model, k1 k2 k3 k4); "equirectangular" (full sphere; column 0 looks back,
             the centre looks along +z, the right half along +x; fx, fy, cx, cy unused); "orthographic" (all rays
-            along +z; fx, fy in pixels a metre).
+            along +z; fx, fy in pixels per metre).
         width, height: pixels.
         fx, fy, cx, cy: pixels; the centre of the top left pixel is (0, 0), as in OpenCV.
-        distortion: coefficients as `model` says.
+        distortion: coefficients in the order given under `model`.
     """
 
     model: CameraModel
@@ -86,7 +86,7 @@ class Camera:
         return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
 
     def resized(self, width: int, height: int) -> Camera:
-        """The camera of the photo resized to so many pixels (pixel centres kept aligned)."""
+        """The camera of the photo resized to `width` x `height` pixels (pixel centres kept aligned)."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy,
@@ -127,8 +127,8 @@ class Trajectory:
     Attributes:
         times: (T,) seconds, ascending.
         positions: (T, 3) local metres, float64.
-        rotations: (T, 3, 3) of the sensor's axes to local coordinates, or None where only positions are known.
-        unsure: (T,) bool, where the pose was bridged, not seen, or None.
+        rotations: (T, 3, 3), sensor axes to local coordinates, or None if only positions are known.
+        unsure: (T,) bool, True where the pose is dead-reckoned (interpolated or extrapolated), not measured; or None.
         covariance: (T, 6, 6) of position (m) and rotation (rad, about the local axes), or None.
     """
 
@@ -143,20 +143,20 @@ class Trajectory:
 
     @property
     def poses(self) -> F64:
-        """(T, 4, 4) sensor to local coordinates; only where rotations are known."""
+        """(T, 4, 4) sensor to local coordinates; requires rotations."""
         assert self.rotations is not None
         poses = np.tile(np.eye(4), (len(self), 1, 1))
         poses[:, :3, :3], poses[:, :3, 3] = self.rotations, self.positions
         return poses
 
     def at(self, times: F64) -> F64:
-        """(N, 3) positions at `times`, linearly interpolated, held at both ends."""
+        """(N, 3) positions at `times`, linearly interpolated, constant beyond both ends."""
         return np.stack([np.interp(times, self.times, self.positions[:, k]) for k in range(3)], axis=-1)
 
     def pose_at(self, times: npt.ArrayLike) -> F64:
-        """(N, 4, 4) sensor to local coordinates at `times` (N,), held at both ends; only where rotations are known.
+        """(N, 4, 4) sensor to local coordinates at `times` (N,), constant beyond both ends; requires rotations.
 
-        In between, as `pipeline.camera.poses.interpolate` says.
+        Interpolated by `pipeline.camera.poses.interpolate`.
         """
         moments = np.clip(np.asarray(times, np.float64), self.times[0], self.times[-1])
         return interpolate(self.poses, self.times, moments)
@@ -173,15 +173,15 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class GpsTrack:
-    """Where a receiver was.
+    """Positions of a GPS receiver.
 
     Attributes:
         times: (N,) seconds, ascending: UNIX time, or the video's own clock for telemetry inside a video.
-        positions: (N, 3) metres east, north, up, local to `frame`; heights as the receiver gave them.
-        sigma: (N,) metres, one standard deviation of a horizontal axis as the receiver's DOP tells it, or None.
+        positions: (N, 3) metres east, north, up, local to `frame`; heights as reported by the receiver.
+        sigma: (N,) metres, standard deviation per horizontal axis, derived from the receiver's DOP, or None.
         frame: UTM zone of the track, origin near its first fix; "local" for a file of local metres.
-        epoch: UNIX time at which `times` are 0, where a video's telemetry tells it, or None.
-        scatter: metres, one standard deviation of a horizontal axis: what smoothing has left of the fixes' scatter.
+        epoch: UNIX time at which `times` are 0, if a video's telemetry contains it, or None.
+        scatter: metres, standard deviation per horizontal axis of the noise that remains after smoothing.
     """
 
     times: F64
@@ -209,15 +209,15 @@ class GpsTrack:
         return np.where(inside[..., None], positions, np.nan)
 
     def distance(self, start: npt.ArrayLike, end: npt.ArrayLike, max_gap: float = 3.0) -> F64:
-        """Metres as the crow flies between the positions at times `start` and `end` (M,); NaN as `at` has it.
+        """Straight-line distance in metres between the positions at times `start` and `end` (M,); NaN as in `at`.
 
-        Short chords of a track that wasn't smoothed are mostly noise: take 1 s or 50 m at least.
+        Short distances on a track that wasn't smoothed are mostly noise: use at least 1 s or 50 m.
         """
         return np.linalg.norm(self.at(end, max_gap) - self.at(start, max_gap), axis=-1)
 
 
 STORED = {"classification": "label"}
-"""What attributes are called in a .npz, where that differs: files that were written before keep their meaning."""
+"""Attribute name: array name in a .npz, where they differ (compatibility with older files)."""
 
 
 def _save(value: Any, path: Path) -> None:
@@ -245,17 +245,17 @@ def _load(cls: Any, path: Path) -> Any:
 
 
 UNCOLOURED = 128
-"""Grey level, in all channels, of a point whose colour isn't known, in a cloud whose others' is."""
+"""Grey level (all channels) of points of unknown colour in a cloud that has colours."""
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points in local coordinates with what is known of each; absent attributes are None.
+    """Points in local coordinates with their attributes; absent attributes are None.
 
     Attributes:
         frame: CRS and origin.
         xyz: (N, 3) float32, local metres.
-        rgb: (N, 3) uint8; `UNCOLOURED` where it isn't known.
+        rgb: (N, 3) uint8; `UNCOLOURED` where unknown.
         normal: (N, 3) float32, unit.
         classification: (N,) uint8, LAS class codes (`pipeline.core.classes`).
         time: (N,) float64, GPS time in seconds.
@@ -275,7 +275,7 @@ class PointCloud:
 
     @property
     def coloured(self) -> npt.NDArray[np.bool_]:
-        """(N,) which points have a colour."""
+        """(N,) bool, True for points with a known colour."""
         return np.zeros(len(self), bool) if self.rgb is None else (self.rgb != UNCOLOURED).any(axis=1)
 
     def take(self, index: npt.NDArray[Any] | slice) -> Self:
@@ -285,10 +285,10 @@ class PointCloud:
 
     @staticmethod
     def join(clouds: Sequence[PointCloud]) -> PointCloud:
-        """All points of clouds in one frame, in order.
+        """Concatenate clouds that share a frame.
 
-        Colours become grey and classes 1 (unclassified) where only some clouds have them; other
-        attributes that not all of them have are dropped.
+        If only some clouds have colours or classes, the other points become grey or class 1 (unclassified); other
+        attributes are dropped unless all clouds have them.
         """
         if len(clouds) == 1:
             return clouds[0]
@@ -332,7 +332,7 @@ class Mesh:
         frame: CRS and origin.
         vertices: (V, 3) float32, local metres.
         faces: (F, 3) int32, into `vertices`.
-        density: (V,) float32, Poisson's octree depth of the samples near the vertex, or None.
+        density: (V,) float32, octree depth of the Poisson samples near the vertex, or None.
         uv: (F, 3, 2) float32, per corner in [0, 1], origin at the lower left (as in OBJ), or None.
         page: (F,) int16, index of the face's texture page, or None.
         classification: (F,) uint8, LAS class codes, or None.
@@ -376,7 +376,7 @@ class Mesh:
         return replace(self, frame=frame, vertices=(self.vertices + shift).astype(np.float32))
 
     def keep(self, mask: npt.NDArray[np.bool_]) -> Mesh:
-        """The faces that `mask` (F,) selects, without the vertices that none of them uses."""
+        """The faces selected by `mask` (F,), without unused vertices."""
         faces = self.faces[mask]
         used = np.zeros(len(self.vertices), bool)
         used[faces] = True
@@ -403,18 +403,18 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Tile:
-    """What `tile.toml` names, checked (`pipeline.io.tile`).
+    """Validated contents of a `tile.toml` (`pipeline.io.tile`).
 
     Attributes:
         path: the `tile.toml`.
-        name: of the tile and its world.
-        frame: CRS, unit and origin that the clouds will be brought to (origin of the tile's data).
+        name: name of the tile and its world.
+        frame: CRS, unit and origin (near the tile's data) that the clouds are converted to.
         clouds: point cloud files.
         views: posed photos, poses in the frame's local coordinates.
         trajectory: the scanner's path, or None.
-        classes: codes of the clouds and what they are here, where the user says so (`pipeline.core.classes`).
-        cell: what of the survey that it was cut from is the tile's own, or None: all of it.
-        footprints: polygons of buildings (GeoJSON, GeoPackage), or None.
+        classes: the user's mapping of codes in the clouds to ours (`pipeline.core.classes`).
+        cell: the tile's cell within the survey that it was cut from, or None: everything belongs to the tile.
+        footprints: file of building footprint polygons (GeoJSON, GeoPackage), or None.
         truth_mesh: ground-truth surface (.npz `Mesh` with its classes), for generated tiles, or None.
         truth_points: ground-truth coloured surface samples (LAZ), for generated tiles, or None.
     """

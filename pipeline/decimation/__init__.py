@@ -1,6 +1,6 @@
-"""Decimation: fewer triangles by quadric edge collapse (Garland and Heckbert 1997).
+"""Decimation: mesh simplification by quadric edge collapse (Garland and Heckbert 1997).
 
-A file a library (`pipeline.core.plugins`), named in `decimate.backend`.
+One module per library (`pipeline.core.plugins`), selected by `decimate.backend`.
 """
 
 from __future__ import annotations
@@ -17,43 +17,50 @@ SETTING = "decimate.backend"
 
 
 class Backend(Protocol):
-    """What a library's module has.
+    """Interface of a library's module.
 
     Attributes:
-        KEEPS_BORDER: whether it can keep all edges of one face alone as they are, to the bit.
+        KEEPS_BORDER: whether it can preserve open border edges exactly.
     """
 
     KEEPS_BORDER: bool
 
     def simplify(self, vertices: F64, faces: I32, target: int, keep_border: bool) -> tuple[F64, I32]:
-        """Vertices and faces of a mesh with about `target` faces; more where kept borders need them.
+        """Simplify a mesh to about `target` faces, or more if preserved borders need them.
 
         Args:
             vertices, faces: (V, 3) metres and (F, 3), more faces than `target`.
-            keep_border: keep the edges of one face alone; only asked of what `KEEPS_BORDER`.
+            target: number of faces.
+            keep_border: preserve open border edges; only True if `KEEPS_BORDER`.
         """
 
 
 def find(name: str, *, keep_border: bool = False) -> Backend:
-    """A library that can run here, and keep borders where that is asked.
+    """Load a backend that can run on this machine and, if `keep_border`, preserve borders.
 
     Raises:
-        SettingError: there is none of that name, or it can't keep borders.
+        SettingError: there is no backend of that name, or it can't preserve borders.
         UnavailableError: it isn't installed.
     """
     backend: Backend = plugins.find(__name__, name, SETTING)
     if keep_border and not backend.KEEPS_BORDER:
-        able = [one for one in plugins.names(__name__) if plugins.module(__name__, one).KEEPS_BORDER]
-        raise SettingError(SETTING, f"{name!r} can't keep borders, where tiles meet", f"Choose {' or '.join(able)}")
+        capable = [one for one in plugins.names(__name__) if plugins.module(__name__, one).KEEPS_BORDER]
+        raise SettingError(
+            SETTING,
+            f"{name!r} can't keep borders, which is required where tiles meet",
+            f"Choose {' or '.join(capable)}",
+        )
     return backend
 
 
 def simplify(mesh: Mesh, target: int, *, keep_border: bool = True, backend: str = "pyfqmr") -> Mesh:
-    """A mesh with about `target` faces, or as it is where it has no more; its attributes are dropped.
+    """Simplify a mesh to about `target` faces, if it has more; its attributes are dropped.
 
     Args:
-        keep_border: keep the edges of one face alone as they are, and have more faces where these need them.
-        backend: name of a file here.
+        mesh: the mesh.
+        target: number of faces.
+        keep_border: preserve open border edges, even if that needs more faces.
+        backend: name of a module of this package.
 
     Raises:
         SettingError, UnavailableError: as `find`.

@@ -1,4 +1,4 @@
-"""fast-simplification: the same passes as pyfqmr's, by the authors of PyVista."""
+"""fast-simplification, by the authors of PyVista: the same algorithm as pyfqmr."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from scan2sim.pipeline.core.types import F64, I32
 NEEDS = ("fast_simplification",)
 KEEPS_BORDER = True
 AGGRESSIVENESS = 5.0
-"""As pyfqmr's."""
+"""See `pipeline.decimation.pyfqmr`."""
 
 
 def simplify(vertices: F64, faces: I32, target: int, keep_border: bool) -> tuple[F64, I32]:

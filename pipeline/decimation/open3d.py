@@ -1,4 +1,4 @@
-"""Open3D: always the cheapest edge first, from a heap; it can weigh borders, but not keep them."""
+"""Open3D: collapses the cheapest edge first (heap); it can weight borders, but not preserve them exactly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""pyfqmr: in passes over all edges with a rising limit of error, and refuses collapses that flip a face."""
+"""pyfqmr: passes over all edges with an increasing error threshold; rejects collapses that flip a face."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from scan2sim.pipeline.core.types import F64, I32
 
 KEEPS_BORDER = True
 AGGRESSIVENESS = 5
-"""How fast the limit rises: lower ones are nearer to the surface and slower."""
+"""Growth of the error threshold: lower values are more accurate and slower."""
 
 
 def simplify(vertices: F64, faces: I32, target: int, keep_border: bool) -> tuple[F64, I32]:

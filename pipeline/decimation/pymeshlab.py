@@ -1,4 +1,4 @@
-"""MeshLab, through pymeshlab, which is under the GPL: always the cheapest edge first, from a heap."""
+"""MeshLab, through pymeshlab (GPL): collapses the cheapest edge first (heap)."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ KEEPS_BORDER = True
 def simplify(vertices: F64, faces: I32, target: int, keep_border: bool) -> tuple[F64, I32]:
     """See `pipeline.decimation.Backend`.
 
-    Its own `preserveboundary` is a weight, which lets borders slip. Here all faces at a border are left out of the
-    selection that is decimated, which holds their vertices in place.
+    MeshLab's `preserveboundary` is only a weight, so borders can move. Therefore faces at a border are excluded from
+    the selection that is decimated, which fixes their vertices.
 
     Raises:
-        UnavailableError: libraries of the system are missing.
+        UnavailableError: system libraries are missing.
     """
     try:
         import pymeshlab
-    except ImportError as error:  # its Qt wants libraries of a desktop
-        remedy = "Install that library of the system (Debian: libopengl0, libxcb1), or choose another backend"
+    except ImportError as error:  # its Qt needs desktop libraries
+        remedy = "Install the missing system library (Debian: libopengl0, libxcb1), or choose another backend"
         raise UnavailableError("decimate.backend pymeshlab", f"can't be loaded ({error})", remedy) from error
 
     meshes = pymeshlab.MeshSet()
@@ -33,7 +33,7 @@ def simplify(vertices: F64, faces: I32, target: int, keep_border: bool) -> tuple
     if keep_border:
         meshes.compute_selection_by_condition_per_face(condselect="(fq > 0.5)")
     meshes.meshing_decimation_quadric_edge_collapse(
-        targetfacenum=max(0, target - int((~free).sum())),  # of those that are selected
+        targetfacenum=max(0, target - int((~free).sum())),  # number of selected faces
         selected=keep_border,
         preservenormal=True,
         autoclean=False,
@@ -43,7 +43,7 @@ def simplify(vertices: F64, faces: I32, target: int, keep_border: bool) -> tuple
 
 
 def _at_border(faces: I32, n: int) -> Bools:
-    """(F,) faces that have a vertex, of `n`, on an edge of one face alone."""
+    """(F,) bool, True for faces with a vertex (of `n`) on an open border edge."""
     on = np.zeros(n, bool)
     on[curve(faces, np.ones(n, bool)).edges] = True
     return np.asarray(on[faces].any(axis=1))

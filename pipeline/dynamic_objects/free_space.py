@@ -1,19 +1,19 @@
-"""Free space: where a scanner's rays have passed, and where therefore nothing stands.
+"""Free space detection by ray casting in a voxel grid: points in free space belong to objects that moved.
 
-Every return proves that its ray was empty up to it. Space is cut into voxels, time into windows about as long as a
-turn of a spinning scanner. In a window a voxel is *hit* where a return lies in it or beside it, else it is *passed*
-where so many rays went through it that they would have hit a thing of its size. A place is free if it and all its
-neighbours were passed in several windows, and it was seldom hit. What no ray has been behind is never free: roads and
-walls stay however flatly they are seen, and whatever a pose is off by less than a voxel. Thin and see-through things
-stay as they are hit again and again. Each time that the scanner comes by is judged by itself: what it saw through once,
-however often it was hit an hour before, has left. A thing's outermost layer lies beside what no ray has passed (the
-road below, the sky above): it goes with the rest of its thing, where rays passed at least its own voxel.
+A ray proves that space is free between the scanner and its return. Space is divided into voxels, time into windows of
+about one turn of a spinning scanner. In a window, a voxel is *hit* if a return lies in it or in a neighbour; else it is
+*passed* if enough rays crossed it to hit an object of its size. A voxel is free if it and all its neighbours were
+passed in several windows, and it was rarely hit. Voxels that no ray has seen from behind are never free: roads and
+walls are kept at any angle of incidence, and for pose errors below a voxel. Thin and semi-transparent objects are kept
+because they are hit repeatedly. Each pass of the scanner is evaluated separately: an object that was there in one pass
+and not in the next has moved. The outermost layer of an object borders on voxels that no ray passed (the road below,
+the sky above): its points are removed with the rest of the object if rays passed their own voxel.
 
-Rays are followed exactly, each from where the scanner was at its moment, so any scanner will do that sees a place more
-than once: one that spins in every turn, a profile scanner in every pass.
+Rays are traced exactly, each from the scanner's position at its time, so any scanner that sees a location more than
+once is supported: a spinning one in every turn, a profile scanner in every pass.
 
-After DUFOMap (Duberg et al., "DUFOMap: Efficient Dynamic Awareness Mapping", RA-L 2024), with votes over windows in
-place of its single sight. Import this module late: it loads numba.
+After DUFOMap (Duberg et al., "DUFOMap: Efficient Dynamic Awareness Mapping", RA-L 2024), with votes over windows
+instead of a single observation. Import this module lazily: it loads numba.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from numba import njit, prange
 
 from scan2sim.pipeline.core.types import F32, F64, I32, I64, U8, Bools
 
-BLOCK = 32.0
-"""Metres: space is worked on in square blocks of this side, one a thread, which bounds memory."""
-RAYS = 2
-"""Rays through a voxel in one window that make a pass: farther apart, they miss what is narrower than it."""
-FREE, OPEN, STANDS = 1, 2, 3
-"""What is said of a point: its voxel is free with all around it; or it alone is, passed twice as often as hit; or it
-was looked at as often, and is neither. 0: it wasn't."""
-LAYER = 1.5
-"""Voxels from a point in free space up to which those that are open, of the same window, are of the same thing."""
-PAUSE = 100
-"""Windows without a point, after which the scanner comes by another time."""
-HALO = 2
-"""Voxels around a block: its own voxels' neighbours, and theirs."""
+BLOCK_M = 32.0
+"""Side of the square blocks that space is processed in, one per thread; bounds memory."""
+MIN_RAYS = 2
+"""Rays through a voxel in one window that count as a pass: fewer could miss a narrower object."""
+FREE, OPEN, STATIC = 1, 2, 3
+"""State of a point: its voxel and all neighbours are free; only its voxel is, passed twice as often as hit; observed as
+often, but neither. 0: observed too rarely."""
+OUTER_LAYER_VOXELS = 1.5
+"""Open points within this distance of a free point of the same window belong to the same object."""
+PASS_GAP_WINDOWS = 100
+"""Number of windows without a point after which a new pass of the scanner begins."""
+HALO_VOXELS = 2
+"""Margin around a block: neighbours of its voxels, and their neighbours."""
 
 
 def in_free_space(
@@ -52,19 +52,19 @@ def in_free_space(
     low: float = -np.inf,
     high: float = np.inf,
 ) -> tuple[Bools, float]:
-    """(N,) which points lie where other rays have found nothing; and the share of points that rays can tell of.
+    """(N,) bool, True for points in free space; and the fraction of candidate points that were observed often enough.
 
     Args:
         xyz: (N, 3) local metres, in order of time.
-        origins: (N, 3) where the scanner was when it measured each; NaN where that isn't known.
-        windows: (N,) number of each point's window of time, ascending.
-        voxel: metres; poses must be better than this.
-        reach: metres from the scanner up to which rays count: beyond, what angles are off by may exceed a voxel.
-        votes: windows that must have passed a place.
+        origins: (N, 3) position of the scanner at each point's time; NaN if unknown.
+        windows: (N,) number of each point's time window, ascending.
+        voxel: voxel size in metres; poses must be more accurate than this.
+        reach: maximum length of rays, metres: beyond it, angular errors may exceed a voxel.
+        votes: number of windows in which a voxel must have been passed.
         low, high: heights (local z, metres) between which points are classified.
     """
     first = np.flatnonzero(np.diff(windows, prepend=windows[:1] - 1))
-    again = np.append(False, np.diff(windows[first]) > PAUSE)
+    new_pass = np.append(False, np.diff(windows[first]) > PASS_GAP_WINDOWS)
     starts = np.append(first, len(xyz))
     candidates = (xyz[:, 2] > low) & (xyz[:, 2] < high)
     path = origins[np.isfinite(origins[:, 0])]
@@ -75,34 +75,34 @@ def in_free_space(
     if not candidates.any():
         return candidates, 0.0
     boxes = _boxes(xyz[candidates])
-    verdict = _in_free_space(xyz, origins, candidates, starts, again, boxes, voxel, reach, votes)
-    return _with_outer_layer(xyz, windows, verdict, LAYER * voxel), float((verdict[candidates] > 0).mean())
+    state = _in_free_space(xyz, origins, candidates, starts, new_pass, boxes, voxel, reach, votes)
+    return _with_outer_layer(xyz, windows, state, OUTER_LAYER_VOXELS * voxel), float((state[candidates] > 0).mean())
 
 
-def _with_outer_layer(xyz: F32, windows: I64, verdict: U8, reach: float) -> Bools:
-    """(N,) the points in free space, and those in the open that lie within `reach` of one of the same window."""
+def _with_outer_layer(xyz: F32, windows: I64, state: U8, max_distance: float) -> Bools:
+    """(N,) bool, True for free points, and for open points within `max_distance` of a free one of the same window."""
     from scipy.spatial import cKDTree
 
-    free = verdict == FREE
-    index = np.flatnonzero((verdict == OPEN) & np.isin(windows, windows[free]))
+    free = state == FREE
+    index = np.flatnonzero((state == OPEN) & np.isin(windows, windows[free]))
     if not len(index):
         return free
-    apart = 2 * reach  # a fourth axis, on which windows are no neighbours
+    apart = 2 * max_distance  # scale of a fourth axis that separates the windows
     tree = cKDTree(np.column_stack([xyz[free], apart * windows[free]]))
     places = np.column_stack([xyz[index], apart * windows[index]])
-    distance, _ = tree.query(places, distance_upper_bound=reach, workers=-1)
+    distance, _ = tree.query(places, distance_upper_bound=max_distance, workers=-1)
     free[index] = np.isfinite(distance)
     return free
 
 
 def _boxes(xyz: F32) -> F64:
-    """(B, 6) least and greatest corner of the blocks that hold points (N, 3)."""
+    """Bounds (B, 6) (minimum, maximum corner) of the blocks that contain points (N, 3)."""
     low, high = xyz.min(axis=0).astype(np.float64), xyz.max(axis=0).astype(np.float64) + 1e-3
-    column = np.floor((xyz[:, :2] - low[:2]) / BLOCK).astype(np.int64)
+    column = np.floor((xyz[:, :2] - low[:2]) / BLOCK_M).astype(np.int64)
     found = np.unique(column[:, 0] << 32 | column[:, 1])
-    corner = low[:2] + BLOCK * np.column_stack([found >> 32, found & 0xFFFFFFFF])
+    corner = low[:2] + BLOCK_M * np.column_stack([found >> 32, found & 0xFFFFFFFF])
     return np.column_stack(
-        [corner, np.full(len(found), low[2]), np.minimum(corner + BLOCK, high[:2]), np.full(len(found), high[2])]
+        [corner, np.full(len(found), low[2]), np.minimum(corner + BLOCK_M, high[:2]), np.full(len(found), high[2])]
     )
 
 
@@ -112,7 +112,7 @@ def _in_free_space(
     origins: F32,
     candidates: Bools,
     starts: I64,
-    again: Bools,
+    new_pass: Bools,
     boxes: F64,
     voxel: float,
     reach: float,
@@ -124,19 +124,19 @@ def _in_free_space(
         spans[w] = _span(origins, starts[w], starts[w + 1], reach)
     out = np.zeros(len(xyz), np.uint8)
     for b in prange(len(boxes)):
-        _carve(xyz, origins, candidates, starts, again, ends, spans, boxes[b], voxel, reach, votes, out)
+        _carve(xyz, origins, candidates, starts, new_pass, ends, spans, boxes[b], voxel, reach, votes, out)
     return out
 
 
 @njit(cache=True)
-def _span(places: F32, first: int, end: int, reach: float) -> F64:
-    """Least and greatest corner of the box that holds all within `reach` of places."""
+def _span(places: F32, first: int, end: int, margin: float) -> F64:
+    """Bounding box (minimum, maximum corner) of positions, dilated by `margin`."""
     span = np.array([np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf])
     for i in range(first, end):
         if not math.isnan(places[i, 0]):
             for k in range(3):
-                span[k] = min(span[k], places[i, k] - reach)
-                span[k + 3] = max(span[k + 3], places[i, k] + reach)
+                span[k] = min(span[k], places[i, k] - margin)
+                span[k + 3] = max(span[k + 3], places[i, k] + margin)
     return span
 
 
@@ -146,7 +146,7 @@ def _carve(
     origins: F32,
     candidates: Bools,
     starts: I64,
-    again: Bools,
+    new_pass: Bools,
     ends: F64,
     spans: F64,
     box: F64,
@@ -155,19 +155,22 @@ def _carve(
     votes: int,
     out: U8,
 ) -> None:
-    """Mark in `out` which of the candidates that lie in the box are `FREE` or `OPEN`."""
-    corner = box[:3] - HALO * voxel
+    """Write the state of the candidates inside the box to `out`."""
+    corner = box[:3] - HALO_VOXELS * voxel
     shape = np.empty(3, np.int64)
     for k in range(3):
-        shape[k] = int(math.ceil((box[k + 3] - corner[k]) / voxel)) + HALO
+        shape[k] = int(math.ceil((box[k + 3] - corner[k]) / voxel)) + HALO_VOXELS
     far = corner + shape * voxel
     size = shape[0] * shape[1] * shape[2]
     passes, hits = np.zeros(size, np.uint16), np.zeros(size, np.uint16)
-    through, inside = np.zeros(size, np.uint16), np.zeros(size, np.uint16)  # passes and hits of the voxel alone
+    through, inside = (
+        np.zeros(size, np.uint16),
+        np.zeros(size, np.uint16),
+    )  # passes and hits of the voxel without its neighbours
     hit_in, inside_in = np.full(size, -1, np.int32), np.full(size, -1, np.int32)
-    rays = np.zeros(size, np.int32)  # through the voxel, counted on from `RAYS` + 1 times the window
+    rays = np.zeros(size, np.int32)  # rays through the voxel, with an offset of (`MIN_RAYS` + 1) x window
     for w in range(len(spans)):
-        if again[w]:
+        if new_pass[w]:
             _vote(xyz, candidates, box, corner, shape, voxel, votes, passes, hits, through, inside, out)
             for counts in (passes, hits, through, inside):
                 counts[:] = 0
@@ -193,7 +196,7 @@ def _vote(
     inside: npt.NDArray[np.uint16],
     out: U8,
 ) -> None:
-    """What the counts say of each point in the box, kept in `out` if it is more than was said before."""
+    """Classify the points in the box by the counts of a pass; `out` keeps the strongest state of all passes."""
     for i in range(len(xyz)):
         if not candidates[i] or out[i] == FREE or xyz[i, 0] < box[0] or xyz[i, 1] < box[1] or xyz[i, 2] < box[2]:
             continue
@@ -201,12 +204,12 @@ def _vote(
             continue
         x, y, z = _voxel(xyz, i, corner, voxel)
         at = (x * shape[1] + y) * shape[2] + z
-        if hits[at] <= passes[at] and _least(passes, x, y, z, shape) >= votes:
+        if hits[at] <= passes[at] and _min_of_neighbours(passes, x, y, z, shape) >= votes:
             out[i] = FREE
         elif through[at] >= votes and 2 * inside[at] <= through[at]:
             out[i] = OPEN
         elif out[i] == 0 and hits[at] + passes[at] >= votes:
-            out[i] = STANDS
+            out[i] = STATIC
 
 
 @njit(cache=True)
@@ -229,8 +232,8 @@ def _overlap(span: F64, corner: F64, far: F64) -> bool:
 
 
 @njit(cache=True)
-def _least(values: npt.NDArray[np.uint16], x: int, y: int, z: int, shape: I64) -> int:
-    """The least value of a voxel and its 26 neighbours."""
+def _min_of_neighbours(values: npt.NDArray[np.uint16], x: int, y: int, z: int, shape: I64) -> int:
+    """Minimum over a voxel and its 26 neighbours."""
     least = values[(x * shape[1] + y) * shape[2] + z]
     for jx in range(x - 1, x + 2):
         for jy in range(y - 1, y + 2):
@@ -253,13 +256,13 @@ def _hit(
     inside_in: I32,
     inside: npt.NDArray[np.uint16],
 ) -> None:
-    """Mark the voxel of a return and its neighbours."""
+    """Count a hit of the voxel of a return and its neighbours."""
     for k in range(3):
         if xyz[i, k] < corner[k] or xyz[i, k] >= far[k]:
             return
     x, y, z = _voxel(xyz, i, corner, voxel)
     own = (x * shape[1] + y) * shape[2] + z
-    if inside_in[own] == window:  # and so are its neighbours
+    if inside_in[own] == window:  # already counted in this window, with its neighbours
         return
     inside_in[own] = window
     inside[own] += 1
@@ -288,18 +291,18 @@ def _pass(
     passes: npt.NDArray[np.uint16],
     through: npt.NDArray[np.uint16],
 ) -> None:
-    """Walk along a ray from voxel to voxel (Amanatides and Woo, 1987), up to the last before its return."""
-    for k in range(3):  # most rays are nowhere near a block
+    """Traverse the voxels of a ray (Amanatides and Woo, 1987) up to the last one before its return."""
+    for k in range(3):  # fast rejection of rays that don't touch the block
         if max(origins[i, k], xyz[i, k]) < corner[k] or min(origins[i, k], xyz[i, k]) >= far[k]:
             return
     o = origins[i, 0], origins[i, 1], origins[i, 2]
     dx, dy, dz = float(xyz[i, 0] - o[0]), float(xyz[i, 1] - o[1]), float(xyz[i, 2] - o[2])
     r = math.sqrt(dx * dx + dy * dy + dz * dz)
     begin, end = 0.0, min(r - voxel, reach)
-    if not end > voxel:  # nor where the origin isn't known
+    if not end > voxel:  # also False if the origin is NaN
         return
     direction = (dx / r, dy / r, dz / r)
-    for k in range(3):  # what of it lies in the block
+    for k in range(3):  # clip the ray to the block
         d = direction[k]
         if abs(d) < 1e-9:
             if o[k] < corner[k] or o[k] >= far[k]:
@@ -323,12 +326,12 @@ def _pass(
     next_x = begin + ((ix + 1 - x) if dx > 0 else (x - ix)) * each_x
     next_y = begin + ((iy + 1 - y) if dy > 0 else (y - iy)) * each_y
     next_z = begin + ((iz + 1 - z) if dz > 0 else (z - iz)) * each_z
-    along, none = begin, window * (RAYS + 1)
+    along, none = begin, window * (MIN_RAYS + 1)
     while along < end and 0 <= ix < shape[0] and 0 <= iy < shape[1] and 0 <= iz < shape[2]:
         at = (ix * shape[1] + iy) * shape[2] + iz
-        if rays[at] < none + RAYS:
+        if rays[at] < none + MIN_RAYS:
             rays[at] = max(rays[at], none) + 1
-            if rays[at] == none + RAYS:
+            if rays[at] == none + MIN_RAYS:
                 through[at] += 1
                 if hit_in[at] != window:
                     passes[at] += 1

@@ -1,4 +1,4 @@
-"""What is left of vehicles that were taken out of a world: surface where they stood."""
+"""Vehicle residue: surface that removed vehicles left behind in a world."""
 
 from __future__ import annotations
 
@@ -9,67 +9,68 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64, Bools, Frame, Mesh
-from scan2sim.pipeline.steps.geometry import spread
+from scan2sim.pipeline.steps.geometry import sample_surface
 
-SIDES = 0.1
-"""Metres that a vehicle's box is taken smaller to each side: a wall that it touches is not its own."""
-GROUND = 0.3
-"""Metres above the ground below which a surface is the ground's: kerbs, and what slopes below a car."""
-SAMPLES = 400.0
-"""A square metre of surface."""
+BOX_INSET_M = 0.1
+"""A vehicle's box is reduced by this on each side: a wall that it touches is not residue."""
+GROUND_HEIGHT_M = 0.3
+"""Surfaces below this height above the ground belong to the ground: kerbs, slopes below a car."""
+SAMPLES_PER_M2 = 400.0
 
 
-def left_of_vehicles(meshes: Sequence[Mesh], listed: Path) -> list[float]:
-    """Square metres of surface within each vehicle's box, above the ground.
+def residue_areas(meshes: Sequence[Mesh], geojson: Path) -> list[float]:
+    """Area of the surface inside each vehicle's box, above the ground, m2.
 
     Args:
-        meshes: of the world, in one frame.
-        listed: GeoJSON of boxes on the ground in the meshes' CRS, as the step `things` writes it.
+        meshes: meshes of the world, in one frame.
+        geojson: GeoJSON of boxes on the ground in the meshes' CRS, from the step `things`.
     """
     out = []
-    for feature in json.loads(listed.read_text(encoding="utf-8"))["features"]:
-        about = feature["properties"]
-        if about["kind"] == "person" or not meshes:
+    for feature in json.loads(geojson.read_text(encoding="utf-8"))["features"]:
+        properties = feature["properties"]
+        if properties["kind"] == "person" or not meshes:
             continue
         ring = np.array(feature["geometry"]["coordinates"][0][:4], np.float64)
-        corners = meshes[0].frame.to_local(np.column_stack([ring, np.full(4, about["ground_z"])])).astype(np.float64)
-        out.append(sum(_within(mesh, corners, about["height_m"]) for mesh in meshes))
+        corners = (
+            meshes[0].frame.to_local(np.column_stack([ring, np.full(4, properties["ground_z"])])).astype(np.float64)
+        )
+        out.append(sum(_within(mesh, corners, properties["height_m"]) for mesh in meshes))
     return out
 
 
-def outlines(listed: Path, frame: Frame) -> list[F64]:
-    """(4, 2) corners of the boxes of vehicles that stood still, local metres.
+def parked_vehicle_outlines(geojson: Path, frame: Frame) -> list[F64]:
+    """Corners (4, 2) of the boxes of parked vehicles, local metres.
 
     Args:
-        listed: as in `left_of_vehicles`.
-        frame: that the corners are brought to.
+        geojson: as in `residue_areas`.
+        frame: frame of the corners.
     """
     out = []
-    for feature in json.loads(listed.read_text(encoding="utf-8"))["features"]:
-        about = feature["properties"]
-        if about["kind"] != "person" and not about["moved"]:
+    for feature in json.loads(geojson.read_text(encoding="utf-8"))["features"]:
+        properties = feature["properties"]
+        if properties["kind"] != "person" and not properties["moved"]:
             ring = np.array(feature["geometry"]["coordinates"][0][:4], np.float64)
             out.append(frame.to_local(np.column_stack([ring, np.zeros(4)]))[:, :2].astype(np.float64))
     return out
 
 
 def _within(mesh: Mesh, corners: F64, height: float) -> float:
-    """Square metres of a mesh above a rectangle (4, 3), corners in turn, from `GROUND` to `height` over it."""
-    low, high = corners.min(axis=0) + [0, 0, GROUND], corners.max(axis=0) + [0, 0, height]
-    places = mesh.corners
-    near = mesh.keep(((places.max(axis=1) > low) & (places.min(axis=1) < high)).all(axis=1))
+    """Area in m2 of a mesh above a rectangle (4, 3), from `GROUND_HEIGHT_M` to `height` above it."""
+    low, high = corners.min(axis=0) + [0, 0, GROUND_HEIGHT_M], corners.max(axis=0) + [0, 0, height]
+    points = mesh.corners
+    near = mesh.keep(((points.max(axis=1) > low) & (points.min(axis=1) < high)).all(axis=1))
     area = float(near.face_area.sum()) if len(near) else 0.0
     if area == 0:
         return 0.0
-    found = spread(near, max(1, round(area * SAMPLES)))
+    found = sample_surface(near, max(1, round(area * SAMPLES_PER_M2)))
     inside = (found[:, 2] > low[2]) & (found[:, 2] < high[2])
     for side in (corners[1] - corners[0], corners[3] - corners[0]):
         inside &= _along(found, corners[0], side)
     return float(inside.mean()) * area
 
 
-def _along(places: F32, start: F64, side: F64) -> Bools:
-    """(N,) whether places lie between the ends of a side, `SIDES` within them."""
+def _along(points: F32, start: F64, side: F64) -> Bools:
+    """(N,) bool, True for points between the ends of a side, at least `BOX_INSET_M` inside."""
     length = float(np.linalg.norm(side[:2]))
-    along = (places[:, :2] - start[:2]) @ side[:2] / max(length, 1e-6)
-    return np.asarray((along > SIDES) & (along < length - SIDES))
+    along = (points[:, :2] - start[:2]) @ side[:2] / max(length, 1e-6)
+    return np.asarray((along > BOX_INSET_M) & (along < length - BOX_INSET_M))

@@ -1,7 +1,8 @@
-"""Street furniture: which upright tubes are poles, signs or trunks, what they carry, and their meshes.
+"""Street furniture: classification of stems as poles, signs, lamps or trunks, their attachments, and meshes.
 
-Tubes are found by shape (`pipeline.furniture.poles`), plates around them (`pipeline.furniture.sign_panels`); plates
-that throw light back (signs are made so) are found by themselves, too, and their pole below them.
+Stems are detected by shape (`pipeline.furniture.poles`), then sign panels around them
+(`pipeline.furniture.sign_panels`). Retroreflective panels are also detected without a stem; their pole is then
+searched below them.
 """
 
 from __future__ import annotations
@@ -15,151 +16,149 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.core.classes import CODE, NOISE, group_of
 from scan2sim.pipeline.core.types import F32, F64, I64, Bools, PointCloud, Trajectory
-from scan2sim.pipeline.furniture.lamps import Arm, arm
-from scan2sim.pipeline.furniture.poles import SLAB, Columns, Stem, refined, stems
-from scan2sim.pipeline.furniture.sign_panels import Plate, plates
+from scan2sim.pipeline.furniture.lamps import Arm, fit_arm
+from scan2sim.pipeline.furniture.poles import STEM, Columns, Stem, refine_circle, stems
+from scan2sim.pipeline.furniture.sign_panels import SignPanel, detect_panels
 from scan2sim.pipeline.geometry import primitives
 from scan2sim.pipeline.geometry.primitives import Triangles
 
 Kind = Literal["pole", "sign", "lamp", "trunk"]
 
-LEAST = 1.25
-"""Metres that a pole or trunk stands free at least."""
-CROWN = 1.5
-"""Metres around a trunk's top in which its crown is looked for ..."""
-LEAFY = 0.5
-"""... and share of the points there, or of the trunk's own, that are vegetation."""
-THICK = 0.05
-"""Metres: trunks are thicker (radius)."""
-STOUT = 25.0
-"""A trunk below a crown is at most this many times as long as it is thick: lamps stand in crowns, too."""
-AROUND = 0.9
-"""Metres around a pole in which its plates lie."""
-AROUND_LAMP = 3.6
-"""Metres around a pole in which its lamp hangs."""
-HANGS = 0.8
-"""Metres above the ground where plates begin."""
-BEFORE = 0.2
-"""Metres before or behind its pole that a plate may lie."""
-BRIGHT = 2.0
-"""Times the intensity that nine of ten points stay below: what throws light back, no matt surface does."""
-TUBE = (0.02, 0.09)
-"""Metres: radius of a sign's pole."""
-SHEET = 0.02
-"""Metres of a plate's thickness."""
-SINK = 0.1
-"""Metres that a foot reaches into the ground, so that no gap shows."""
-SIDES = {"pole": 8, "sign": 8, "lamp": 8, "trunk": 10}
+PANEL_SEARCH_RADIUS_M = 0.9
+"""Distance of sign panels from their pole."""
+PANEL_THICKNESS_M = 0.02
+FOOT_DEPTH_M = 0.1
+"""Meshes of poles extend this far into the ground, so that no gap is visible."""
+TUBE_SIDES = {"pole": 8, "sign": 8, "lamp": 8, "trunk": 10}
 
 
 @dataclass(frozen=True)
-class Thing:
-    """A piece of street furniture.
+class ClassifyLimits:
+    """Thresholds of the classification."""
+
+    min_stem_length_m: float = 1.25  # of the isolated part of a pole or trunk
+    crown_radius_m: float = 1.5  # around the top of a trunk, for `min_leafy_fraction`
+    min_leafy_fraction: float = 0.5  # vegetation among the points of the crown, or of the trunk
+    min_trunk_radius_m: float = 0.05
+    max_trunk_slenderness: float = 25.0  # length to diameter of a trunk below a crown: lamps stand in crowns, too
+    lamp_search_radius_m: float = 3.6  # distance of a lamp from its pole
+    min_panel_height_m: float = 0.8  # above the ground
+    max_panel_offset_m: float = 0.2  # distance of a sign panel in front of or behind its pole
+    retroreflective_factor: float = 2.0  # intensity relative to the 90th percentile; above that of any matt surface
+    sign_pole_radius_m: tuple[float, float] = (0.02, 0.09)
+
+
+LIMITS = ClassifyLimits()
+
+
+@dataclass(frozen=True)
+class Detection:
+    """A detected piece of street furniture.
 
     Attributes:
-        kind: what it is.
+        kind: its kind.
         stem: its pole or trunk, from the ground up.
-        plates: what it carries.
-        arm: what reaches out from its top, or None.
+        plates: its sign panels.
+        arm: its lamp arm, or None.
     """
 
     kind: Kind
     stem: Stem
-    plates: tuple[Plate, ...] = ()
+    plates: tuple[SignPanel, ...] = ()
     arm: Arm | None = None
 
     @property
     def foot(self) -> F64:
-        """(3,) where it stands on the ground, local metres."""
+        """Position (3,) of its foot on the ground, local metres."""
         return self.stem.centre[0]
 
     @property
     def height(self) -> float:
-        """Metres from the ground to its highest place."""
+        """Height of its highest point above the ground, metres."""
         tops = [self.stem.centre[-1, 2], *(plate.centre[2] + plate.height / 2 for plate in self.plates)]
         return float(max(tops) - self.foot[2])
 
-    def moved(self, by: F64) -> Thing:
-        """It by (3,) metres elsewhere: in another frame."""
+    def moved(self, by: F64) -> Detection:
+        """The detection translated by (3,) metres, into another frame."""
         plates = tuple(plate.moved(by) for plate in self.plates)
-        return Thing(self.kind, self.stem.moved(by), plates, None if self.arm is None else self.arm.moved(by))
+        return Detection(self.kind, self.stem.moved(by), plates, None if self.arm is None else self.arm.moved(by))
 
     def to_json(self) -> dict[str, Any]:
-        """As `from_json` reads it."""
+        """JSON object, the inverse of `from_json`."""
         plates = [plate.to_json() for plate in self.plates]
         arm = None if self.arm is None else self.arm.to_json()
         return {"kind": self.kind, "stem": self.stem.to_json(), "plates": plates, "arm": arm}
 
     @classmethod
-    def from_json(cls, row: Mapping[str, Any]) -> Thing:
-        """What `to_json` told."""
-        plates = tuple(Plate.from_json(plate) for plate in row["plates"])
+    def from_json(cls, row: Mapping[str, Any]) -> Detection:
+        """Read the result of `to_json`."""
+        plates = tuple(SignPanel.from_json(plate) for plate in row["plates"])
         return cls(row["kind"], Stem.from_json(row["stem"]), plates, Arm.from_json(row["arm"]) if row["arm"] else None)
 
-    def held(self, xyz: npt.NDArray[np.floating]) -> Bools:
-        """(N,) which points (N, 3) are its own, those of noise around it among them."""
+    def contains(self, xyz: npt.NDArray[np.floating]) -> Bools:
+        """(N,) bool, True for points (N, 3) that belong to it, including measurement noise around it."""
         low, high = self.stem.centre[[0, -1], 2]
-        thin = max(0.06, 3 * self.stem.spread)
-        own = (self.stem.distance(xyz) < thin) & (xyz[:, 2] > low) & (xyz[:, 2] < high)
+        margin = max(0.06, 3 * self.stem.spread)
+        own = (self.stem.distance(xyz) < margin) & (xyz[:, 2] > low) & (xyz[:, 2] < high)
         for plate in self.plates:
-            own |= plate.holds(xyz, margin=thin, thin=thin + 0.04)
-        return own if self.arm is None else own | self.arm.held(xyz, thin)
+            own |= plate.contains(xyz, margin=margin, max_distance=margin + 0.04)
+        return own if self.arm is None else own | self.arm.contains(xyz, margin)
 
     def meshes(self) -> list[tuple[Triangles, int]]:
-        """Its parts, and the class code of each."""
+        """Meshes of its parts, each with its class code."""
         path = self.stem.centre.copy()
-        path[0, 2] -= SINK
-        pole = primitives.tube(path, self.stem.radius, SIDES[self.kind])
+        path[0, 2] -= FOOT_DEPTH_M
+        pole = primitives.tube(path, self.stem.radius, TUBE_SIDES[self.kind])
         parts = [(pole, CODE["high_vegetation"] if self.kind == "trunk" else CODE["pole"])]
         for plate in self.plates:
-            parts.append((sheet(plate), CODE["road_sign"]))
+            parts.append((panel_mesh(plate), CODE["road_sign"]))
         return parts + [(part, CODE["pole"]) for part in (self.arm.meshes() if self.arm else [])]
 
 
-def sheet(plate: Plate) -> Triangles:
-    """A plate's mesh."""
+def panel_mesh(plate: SignPanel) -> Triangles:
+    """Mesh of a sign panel."""
     corners = plate.centre + plate.outline[:, :1] * plate.across + plate.outline[:, 1:] * (0, 0, 1)
-    return primitives.plate(corners, -SHEET * plate.normal)
+    return primitives.plate(corners, -PANEL_THICKNESS_M * plate.normal)
 
 
 def eligible(cloud: PointCloud) -> tuple[Bools, I64]:
-    """(N,) which points are the ground's, and the indices of those that may be furniture's, by their classes alone."""
+    """Ground points (N,) bool, and indices of points that may be furniture, by their classes."""
     assert cloud.classification is not None
     ground = group_of()[cloud.classification] == 0
-    out_of_it = np.isin(cloud.classification, [*NOISE, CODE["vehicle"], CODE["person"]])
-    return ground, np.flatnonzero(~ground & ~out_of_it)
+    excluded = np.isin(cloud.classification, [*NOISE, CODE["vehicle"], CODE["person"]])
+    return ground, np.flatnonzero(~ground & ~excluded)
 
 
-def find(cloud: PointCloud, columns: Columns, height: F32, path: Trajectory) -> list[Thing]:
-    """All street furniture of a cloud.
+def detect_furniture(cloud: PointCloud, columns: Columns, height: F32, path: Trajectory) -> list[Detection]:
+    """Detect all street furniture of a cloud.
 
     Args:
-        cloud: N points above the ground, classified: of classes, only vegetation matters.
-        columns: of its points.
+        cloud: N classified points above the ground; only the class vegetation is used.
+        columns: index of its points.
         height: (N,) metres above the ground.
-        path: the scanner's.
+        path: path of the scanner.
     """
     xyz = cloud.xyz
     assert cloud.classification is not None
     leafy = group_of()[cloud.classification] == 2
-    things = []
-    for stem in stems(columns, height, LEAST):
-        n = columns.near(stem.middle, CROWN)
+    detections = []
+    for stem in stems(columns, height, LIMITS.min_stem_length_m):
+        n = columns.near(stem.middle, LIMITS.crown_radius_m)
         ground = float(np.median(xyz[n, 2] - height[n]))
-        standing = _grounded(stem, ground)
+        grounded = _extend_to_ground(stem, ground)
         if _is_trunk(stem, xyz[n], leafy[n]):
-            things.append(Thing("trunk", standing))
+            detections.append(Detection("trunk", grounded))
         else:
-            carried = _carried(standing, xyz[n], height[n])
-            around = columns.near(stem.middle, AROUND_LAMP)
-            lamp = arm(standing, ground, xyz[around].astype(np.float64), leafy[around])
-            kind: Kind = "lamp" if lamp else "sign" if carried else "pole"
-            things.append(Thing(kind, _up_to(standing, carried), tuple(carried), lamp))
-    return things + _lonely(cloud, columns, height, path, things)
+            panels = _panels_on(grounded, xyz[n], height[n])
+            around = columns.near(stem.middle, LIMITS.lamp_search_radius_m)
+            lamp = fit_arm(grounded, ground, xyz[around].astype(np.float64), leafy[around])
+            kind: Kind = "lamp" if lamp else "sign" if panels else "pole"
+            detections.append(Detection(kind, _extend_to_panels(grounded, panels), tuple(panels), lamp))
+    return detections + _retroreflective_signs(cloud, columns, height, path, detections)
 
 
-def _grounded(stem: Stem, ground: float) -> Stem:
-    """The stem down to the ground."""
+def _extend_to_ground(stem: Stem, ground: float) -> Stem:
+    """The stem extended down to the ground."""
     if stem.centre[0, 2] <= ground:
         return stem
     xy, radius = stem.at([ground])
@@ -168,9 +167,9 @@ def _grounded(stem: Stem, ground: float) -> Stem:
     )
 
 
-def _up_to(stem: Stem, carried: list[Plate]) -> Stem:
-    """The stem up to the middle of the highest plate, where it ended below."""
-    top = max((plate.centre[2] for plate in carried), default=-np.inf)
+def _extend_to_panels(stem: Stem, panels: list[SignPanel]) -> Stem:
+    """The stem extended up to the centre of the highest sign panel."""
+    top = max((plate.centre[2] for plate in panels), default=-np.inf)
     if top <= stem.centre[-1, 2]:
         return stem
     xy, radius = stem.at([top])
@@ -178,38 +177,50 @@ def _up_to(stem: Stem, carried: list[Plate]) -> Stem:
 
 
 def _is_trunk(stem: Stem, xyz: F32, leafy: Bools) -> bool:
-    """Whether it is thick, and itself or what is around its top is vegetation."""
-    if stem.thickness < THICK:
+    """Whether a stem is a trunk: thick, with vegetation on it or around its top."""
+    if stem.thickness < LIMITS.min_trunk_radius_m:
         return False
     off, top = stem.distance(xyz), stem.centre[-1, 2]
     own = (np.abs(off) < 0.05) & (xyz[:, 2] < top)
-    if own.any() and leafy[own].mean() >= LEAFY:
+    if own.any() and leafy[own].mean() >= LIMITS.min_leafy_fraction:
         return True
-    above = (off > 0.05) & (off < CROWN) & (xyz[:, 2] > top - 0.5) & (xyz[:, 2] < top + CROWN)
-    stout = stem.length < STOUT * 2 * stem.thickness
-    return bool(stout and above.sum() >= 20 and leafy[above].mean() >= LEAFY)
+    above = (
+        (off > 0.05)
+        & (off < LIMITS.crown_radius_m)
+        & (xyz[:, 2] > top - 0.5)
+        & (xyz[:, 2] < top + LIMITS.crown_radius_m)
+    )
+    stout = stem.length < LIMITS.max_trunk_slenderness * 2 * stem.thickness
+    return bool(stout and above.sum() >= 20 and leafy[above].mean() >= LIMITS.min_leafy_fraction)
 
 
-def _carried(stem: Stem, xyz: F32, height: F32) -> list[Plate]:
-    """Plates on a pole; they look away from it."""
+def _panels_on(stem: Stem, xyz: F32, height: F32) -> list[SignPanel]:
+    """Sign panels on a pole, facing away from it."""
     off = stem.distance(xyz)
-    near = (height > HANGS) & (off < AROUND)
+    near = (height > LIMITS.min_panel_height_m) & (off < PANEL_SEARCH_RADIUS_M)
     beside = xyz[near].astype(np.float64)
-    good: list[Plate] = []
-    for plate in plates(beside, off[near] > max(0.03, 2 * stem.spread), stem.middle):
+    good: list[SignPanel] = []
+    for plate in detect_panels(beside, off[near] > max(0.03, 2 * stem.spread), stem.middle):
         (axis,), (radius,) = stem.at([plate.centre[2]])
         d = axis - plate.centre[:2]
         if d @ plate.normal[:2] > 0:
             plate = replace(plate, normal=-plate.normal)
         before, aside = abs(d @ plate.normal[:2]), abs(d @ plate.across[:2])
-        near_top = plate.centre[2] - plate.height / 2 < stem.centre[-1, 2] + SLAB
-        if before < radius + BEFORE and aside < plate.width / 2 and near_top and plate.width > 3 * radius:
+        near_top = plate.centre[2] - plate.height / 2 < stem.centre[-1, 2] + STEM.slab_m
+        if (
+            before < radius + LIMITS.max_panel_offset_m
+            and aside < plate.width / 2
+            and near_top
+            and plate.width > 3 * radius
+        ):
             good.append(plate)
     return good
 
 
-def _lonely(cloud: PointCloud, columns: Columns, height: F32, path: Trajectory, things: list[Thing]) -> list[Thing]:
-    """Signs that throw light back, on poles that do not stand free."""
+def _retroreflective_signs(
+    cloud: PointCloud, columns: Columns, height: F32, path: Trajectory, detections: list[Detection]
+) -> list[Detection]:
+    """Signs with retroreflective panels on poles that were not detected because they are not isolated."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -217,9 +228,13 @@ def _lonely(cloud: PointCloud, columns: Columns, height: F32, path: Trajectory, 
     xyz, intensity = cloud.xyz, cloud.intensity
     if intensity is None:
         return []
-    bright = np.flatnonzero((intensity > BRIGHT * np.percentile(intensity, 90)) & (height > HANGS) & (height < 6))
-    for thing in things:
-        bright = bright[~thing.held(xyz[bright])]
+    bright = np.flatnonzero(
+        (intensity > LIMITS.retroreflective_factor * np.percentile(intensity, 90))
+        & (height > LIMITS.min_panel_height_m)
+        & (height < 6)
+    )
+    for detection in detections:
+        bright = bright[~detection.contains(xyz[bright])]
     if not len(bright):
         return []
     pairs = cKDTree(xyz[bright]).query_pairs(0.15, output_type="ndarray")
@@ -229,34 +244,36 @@ def _lonely(cloud: PointCloud, columns: Columns, height: F32, path: Trajectory, 
     for k in np.flatnonzero(np.bincount(piece) >= 20):
         own = bright[piece == k]
         middle = xyz[own, :2].mean(axis=0).astype(np.float64)
-        carried = plates(xyz[own].astype(np.float64), np.ones(len(own), bool), _viewer(cloud, own, path), most=2)
+        panels = detect_panels(
+            xyz[own].astype(np.float64), np.ones(len(own), bool), _viewpoint(cloud, own, path), max_panels=2
+        )
         near = columns.near(middle, 0.5)
-        stem = _below(xyz[near], height[near], middle, float(xyz[own, 2].min()))
-        if stem is not None and carried:
-            found.append(Thing("sign", _up_to(stem, carried), tuple(carried)))
+        stem = _pole_below(xyz[near], height[near], middle, float(xyz[own, 2].min()))
+        if stem is not None and panels:
+            found.append(Detection("sign", _extend_to_panels(stem, panels), tuple(panels)))
     return found
 
 
-def _viewer(cloud: PointCloud, index: I64, path: Trajectory) -> F64:
-    """(2,) from where the scanner saw points, on the ground plan: in the mean, or the path's nearest place."""
+def _viewpoint(cloud: PointCloud, index: I64, path: Trajectory) -> F64:
+    """Mean position (2,) of the scanner when it saw the points, in plan view; without times, of the path."""
     if cloud.time is not None and len(path.times) > 1 and np.isfinite(path.times).all():
         return np.asarray(path.at(cloud.time[index])[:, :2].mean(axis=0))
     middle = cloud.xyz[index, :2].mean(axis=0)
     return np.asarray(path.positions[np.hypot(*(path.positions[:, :2] - middle).T).argmin(), :2])
 
 
-def _below(xyz: F32, height: F32, middle: F64, top: float) -> Stem | None:
-    """The pole below something at `middle` (2,), though other things touch it: where points lie in slab upon slab."""
+def _pole_below(xyz: F32, height: F32, middle: F64, top: float) -> Stem | None:
+    """Pole below `middle` (2,) even if other objects touch it: the location with points in most slabs; or None."""
     import cv2
 
     ground = float(np.median(xyz[:, 2] - height))
-    low = (height > SLAB) & (xyz[:, 2] < top)
-    slabs = int((top - ground) / SLAB) - 1
+    low = (height > STEM.slab_m) & (xyz[:, 2] < top)
+    slabs = int((top - ground) / STEM.slab_m) - 1
     if slabs < 3 or low.sum() < 5 * slabs:
         return None
     cell, n = 0.04, 24
     at = np.floor((xyz[low, :2] - middle) / cell).astype(int) + n // 2
-    level = np.floor(height[low] / SLAB).astype(int) - 1
+    level = np.floor(height[low] / STEM.slab_m).astype(int) - 1
     ok = (at >= 0).all(axis=1) & (at < n).all(axis=1) & (level < slabs)
     held = np.zeros((slabs, n, n), np.float32)
     np.add.at(held, (level[ok], at[ok, 0], at[ok, 1]), 1)
@@ -267,10 +284,10 @@ def _below(xyz: F32, height: F32, middle: F64, top: float) -> Stem | None:
         return None
     place = middle + (np.array(peak) - n // 2 + 0.5) * cell
     flat = (xyz[low, :2] - place).astype(np.float64)
-    flat = flat[np.hypot(*flat.T) < 2 * cell + TUBE[1]]
-    centre, radius = refined(flat, np.ones(len(flat)), np.zeros(2), 0.04, 8, 10.0)
+    flat = flat[np.hypot(*flat.T) < 2 * cell + LIMITS.sign_pole_radius_m[1]]
+    centre, radius = refine_circle(flat, np.ones(len(flat)), np.zeros(2), 0.04, 8, 10.0)
     if np.hypot(*centre) > 0.15:
         centre = np.zeros(2)
     z = np.array([ground, top])
     xy = np.broadcast_to(place + centre, (2, 2))
-    return Stem(np.column_stack([xy, z]), np.full(2, np.clip(radius, *TUBE)), 0.02, 0.0)
+    return Stem(np.column_stack([xy, z]), np.full(2, np.clip(radius, *LIMITS.sign_pole_radius_m)), 0.02, 0.0)

@@ -1,4 +1,4 @@
-"""Lamps: what reaches out from the top of a tall pole, as an arm and the box at its end."""
+"""Lamps: fits an arm, and the lamp head at its end as a box, to the points near the top of a tall pole."""
 
 from __future__ import annotations
 
@@ -15,33 +15,34 @@ from scan2sim.pipeline.furniture.poles import Stem
 from scan2sim.pipeline.geometry import primitives
 from scan2sim.pipeline.geometry.primitives import Triangles
 
-TALL = 3.5
-"""Metres of a pole that carries a lamp."""
-REACH = (0.4, 3.5)
-"""Metres that an arm is long."""
-BELOW, ABOVE = 1.0, 1.5
-"""Metres below and above the pole's top between which an arm lies."""
-CLOSE = 0.2
-"""Metres between the points of an arm at most ..."""
-JOINED = 0.4
-"""... and from the pole's top."""
-NARROW = 0.5
-"""Metres across of an arm with its lamp at most."""
-STEP = 0.2
-"""Metres of an arm that share a middle."""
-HEAD = 0.1
-"""Metres across from which on it is the lamp's box."""
-FEWEST = 30
+
+@dataclass(frozen=True)
+class LampLimits:
+    """Thresholds of lamp detection."""
+
+    min_pole_height_m: float = 3.5
+    arm_length_m: tuple[float, float] = (0.4, 3.5)  # minimum and maximum
+    max_below_top_m: float = 1.0  # arm relative to the top of the pole
+    max_above_top_m: float = 1.5
+    max_point_gap_m: float = 0.2  # between points of the arm
+    max_pole_gap_m: float = 0.4  # between the arm and the top of the pole
+    max_width_m: float = 0.5  # of the arm with its lamp head
+    section_m: float = 0.2  # length of a section of the arm with a centre of its own
+    min_head_width_m: float = 0.1  # wider sections belong to the lamp head
+    min_points: int = 30
+
+
+LAMP = LampLimits()
 
 
 @dataclass(frozen=True)
 class Arm:
-    """What reaches out from a pole.
+    """The arm of a lamp, with or without a lamp head.
 
     Attributes:
-        path: (K, 3) of a tube from the pole outwards, local metres.
-        radius: metres of the tube.
-        box: (3,) centre and (3,) half extents along, across and up of the lamp's box, or None.
+        path: (K, 3) axis of the arm from the pole outwards, local metres.
+        radius: radius of the arm, metres.
+        box: (3,) centre and (3,) half extents (along, across, up) of the lamp head, or None.
     """
 
     path: F64
@@ -50,105 +51,108 @@ class Arm:
 
     @property
     def direction(self) -> F64:
-        """(2,) unit, on the ground plan, outwards."""
+        """Unit vector (2,) outwards, in plan view."""
         d = self.path[-1, :2] - self.path[0, :2]
         return np.asarray(d / np.linalg.norm(d))
 
     @property
     def axes(self) -> F64:
-        """(3, 3) rows along, across and up."""
+        """Axes (3, 3) of the box: rows along, across and up."""
         along = np.array([*self.direction, 0.0])
         return np.array([along, np.cross([0, 0, 1.0], along), [0, 0, 1.0]])
 
     def moved(self, by: F64) -> Arm:
-        """It by (3,) metres elsewhere."""
+        """The arm translated by (3,) metres."""
         box = None if self.box is None else (self.box[0] + by, self.box[1])
         return replace(self, path=self.path + by, box=box)
 
     def to_json(self) -> dict[str, Any]:
-        """As `from_json` reads it."""
+        """JSON object, the inverse of `from_json`."""
         box = None if self.box is None else [part.tolist() for part in self.box]
         return {"path": self.path.tolist(), "radius": self.radius, "box": box}
 
     @classmethod
     def from_json(cls, row: Mapping[str, Any]) -> Arm:
-        """What `to_json` told."""
+        """Read the result of `to_json`."""
         box = None if row["box"] is None else (np.array(row["box"][0]), np.array(row["box"][1]))
         return cls(np.array(row["path"], np.float64), row["radius"], box)
 
-    def held(self, xyz: npt.NDArray[np.floating], thin: float) -> Bools:
-        """(N,) which points are its own, `thin` metres around it."""
+    def contains(self, xyz: npt.NDArray[np.floating], margin: float) -> Bools:
+        """(N,) bool, True for points that belong to the arm, within `margin` metres of it."""
         own = np.zeros(len(xyz), bool)
         for a, b in pairwise(self.path):
             d = b - a
             t = np.clip((xyz - a) @ d / max(float(d @ d), 1e-9), 0, 1)
-            own |= np.linalg.norm(xyz - a - t[:, None] * d, axis=1) < self.radius + thin
+            own |= np.linalg.norm(xyz - a - t[:, None] * d, axis=1) < self.radius + margin
         if self.box is not None:
             centre, half = self.box
-            own |= (np.abs((xyz - centre) @ self.axes.T) < half + thin).all(axis=1)
+            own |= (np.abs((xyz - centre) @ self.axes.T) < half + margin).all(axis=1)
         return own
 
     def meshes(self) -> list[Triangles]:
-        """Its tube and box."""
+        """Meshes of the tube and the box."""
         parts = [primitives.tube(self.path, np.full(len(self.path), self.radius), 6)]
         return parts + ([] if self.box is None else [primitives.box(self.box[0], self.axes, self.box[1])])
 
 
-def arm(stem: Stem, ground: float, xyz: F64, leafy: Bools) -> Arm | None:
-    """What reaches out from the top of a pole; None: nothing does.
+def fit_arm(stem: Stem, ground: float, xyz: F64, leafy: Bools) -> Arm | None:
+    """Fit an arm to the points near the top of a pole; None if there is none.
 
     Args:
         stem: the pole.
-        ground: metres, z at its foot.
-        xyz: (N, 3) points around it, its own among them.
-        leafy: (N,) which of them are vegetation.
+        ground: z at its foot, metres.
+        xyz: (N, 3) points around it, including those of the pole.
+        leafy: (N,) bool, True for vegetation.
     """
     top = stem.centre[-1]
-    if top[2] - ground < TALL:
+    if top[2] - ground < LAMP.min_pole_height_m:
         return None
     d = xyz - top
     off = np.hypot(*d[:, :2].T)
-    near = (off < REACH[1]) & (d[:, 2] > -BELOW) & (d[:, 2] < ABOVE) & ~leafy
+    near = (off < LAMP.arm_length_m[1]) & (d[:, 2] > -LAMP.max_below_top_m) & (d[:, 2] < LAMP.max_above_top_m) & ~leafy
     near &= stem.distance(xyz) > max(0.04, 3 * stem.spread)
-    piece = _joined(xyz[near], top)
+    piece = _connected_to_top(xyz[near], top)
     own = d[near][piece]
-    if len(own) < FEWEST:
+    if len(own) < LAMP.min_points:
         return None
     middle = own[:, :2].mean(axis=0)
-    if np.linalg.norm(middle) < REACH[0] / 3:
+    if np.linalg.norm(middle) < LAMP.arm_length_m[0] / 3:
         return None
     along = middle / np.linalg.norm(middle)
     out, aside = own[:, :2] @ along, own[:, :2] @ np.array([-along[1], along[0]])
     length = float(np.percentile(out, 99))
-    if not REACH[0] < length < REACH[1] or np.ptp(np.percentile(aside, [2, 98])) > NARROW:
+    if (
+        not LAMP.arm_length_m[0] < length < LAMP.arm_length_m[1]
+        or np.ptp(np.percentile(aside, [2, 98])) > LAMP.max_width_m
+    ):
         return None
-    return _fitted(top, along, np.column_stack([out, aside, own[:, 2]]), length)
+    return _fit_arm_and_head(top, along, np.column_stack([out, aside, own[:, 2]]), length)
 
 
-def _joined(xyz: F64, top: F64) -> Bools:
-    """(N,) the points of the piece that reaches the top."""
+def _connected_to_top(xyz: F64, top: F64) -> Bools:
+    """(N,) bool, True for points of components that reach the top of the pole."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     if not len(xyz):
         return np.zeros(0, bool)
-    pairs = cKDTree(xyz).query_pairs(CLOSE, output_type="ndarray")
+    pairs = cKDTree(xyz).query_pairs(LAMP.max_point_gap_m, output_type="ndarray")
     links = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(xyz),) * 2)
     _, piece = connected_components(links, directed=False)
-    near = np.hypot(*(xyz - top)[:, :2].T) < JOINED
+    near = np.hypot(*(xyz - top)[:, :2].T) < LAMP.max_pole_gap_m
     return np.isin(piece, piece[near])
 
 
-def _fitted(top: F64, along: F64, own: F64, length: float) -> Arm:
-    """Tube and box of points (N, 3) out, aside and up from the top."""
-    count = max(2, int(length / STEP))
+def _fit_arm_and_head(top: F64, along: F64, own: F64, length: float) -> Arm:
+    """Arm and lamp head fitted to points (N, 3): outwards, sideways and up from the top of the pole."""
+    count = max(2, int(length / LAMP.section_m))
     edges = np.linspace(0, length, count + 1)
     parts = [own[(own[:, 0] >= a) & (own[:, 0] <= b)] for a, b in pairwise(edges.tolist())]
     parts = [part for part in parts if len(part) >= 3]
     middles = np.array([np.median(part, axis=0) for part in parts])
     across = np.array([np.ptp(np.percentile(part[:, 1], [10, 90])) for part in parts])
-    wide = across > HEAD
+    wide = across > LAMP.min_head_width_m
     first = len(parts)
     while first > 0 and wide[first - 1]:
         first -= 1

@@ -1,7 +1,7 @@
-"""Upright things as boxes: what physics engines take that know no concave meshes.
+"""Box decomposition of meshes, for physics engines without concave collision meshes.
 
-A surface is sampled, its samples fall into square columns over the ground plan; neighbours that reach from
-and to about the same height are one box.
+A surface is sampled, and the samples are sorted into square columns in plan view; adjacent columns with about the same
+bottom and top are merged into one box.
 """
 
 from __future__ import annotations
@@ -10,38 +10,38 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64, I64
 
-STEP = 0.25
-"""Metres to which columns' ends are rounded, downwards and upwards."""
+HEIGHT_STEP_M = 0.25
+"""Bottoms and tops of columns are rounded down and up to multiples of this."""
 
 
 def boxes(corners: F32, cell: float) -> tuple[F64, F64]:
-    """Lowest and highest corners (B, 3) each of boxes that hold all of the triangles (F, 3, 3), local metres.
+    """Lowest and highest corners, (B, 3) each, of boxes that contain the triangles (F, 3, 3), local metres.
 
     Args:
-        corners: of the triangles.
-        cell: metres a side of a column: how far a box may stick out.
+        corners: corners of the triangles.
+        cell: side of a column in metres: the largest distance by which a box may extend beyond the surface.
     """
     points = samples(corners, cell / 2)
     if not len(points):
         return np.zeros((0, 3)), np.zeros((0, 3))
-    place = np.floor(points[:, :2] / cell).astype(np.int64)
-    cells, of = np.unique(place, axis=0, return_inverse=True)
+    column_index = np.floor(points[:, :2] / cell).astype(np.int64)
+    cells, column_of = np.unique(column_index, axis=0, return_inverse=True)
     low, high = np.full(len(cells), np.inf), np.full(len(cells), -np.inf)
-    np.minimum.at(low, of.ravel(), points[:, 2])
-    np.maximum.at(high, of.ravel(), points[:, 2])
-    bottom = np.floor(low / STEP)
-    reach = np.column_stack([bottom, np.maximum(np.ceil(high / STEP), bottom + 1)]).astype(np.int64)
-    runs = _merged(np.column_stack([cells, cells, reach]), 0)
-    whole = _merged(runs, 1)
+    np.minimum.at(low, column_of.ravel(), points[:, 2])
+    np.maximum.at(high, column_of.ravel(), points[:, 2])
+    bottom = np.floor(low / HEIGHT_STEP_M)
+    height_range = np.column_stack([bottom, np.maximum(np.ceil(high / HEIGHT_STEP_M), bottom + 1)]).astype(np.int64)
+    runs = _merge(np.column_stack([cells, cells, height_range]), 0)
+    merged = _merge(runs, 1)
     size = np.array([cell, cell])
     return (
-        np.column_stack([whole[:, :2] * size, whole[:, 4] * STEP]),
-        np.column_stack([(whole[:, 2:4] + 1) * size, whole[:, 5] * STEP]),
+        np.column_stack([merged[:, :2] * size, merged[:, 4] * HEIGHT_STEP_M]),
+        np.column_stack([(merged[:, 2:4] + 1) * size, merged[:, 5] * HEIGHT_STEP_M]),
     )
 
 
 def samples(corners: F32, spacing: float) -> F64:
-    """(N, 3) points of triangles (F, 3, 3), no further than `spacing` from the next, corners among them."""
+    """Points (N, 3) on triangles (F, 3, 3), at most `spacing` apart, including the corners."""
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     pieces = np.maximum(1, np.ceil(edges / spacing)).astype(int)
     found = [np.zeros((0, 3))]
@@ -52,8 +52,8 @@ def samples(corners: F32, spacing: float) -> F64:
     return np.concatenate(found)
 
 
-def _merged(parts: I64, axis: int) -> I64:
-    """Blocks (x0, y0, x1, y1, low, high), in cells, with those joined that follow each other along an axis."""
+def _merge(parts: I64, axis: int) -> I64:
+    """Merge blocks (x0, y0, x1, y1, low, high), in cells, that are adjacent along an axis."""
     across = [k for k in (0, 1) if k != axis]
     same = [*across, *(k + 2 for k in across), 4, 5]
     parts = parts[np.lexsort([parts[:, axis], *(parts[:, k] for k in same)])]

@@ -1,7 +1,7 @@
-"""Rasters over the ground plan, for what is told of a cloud from above: heights, covers, holes closed from their rims.
+"""Height maps: rasters in plan view with heights, masks, morphology, and interpolation of holes.
 
-Cells begin at whole multiples of their size, so that tiles of a survey, whose origins are whole metres, have the same
-ones. Arrays are (rows, columns): y grows with the row, x with the column.
+Cells are aligned to multiples of their size, so that tiles of a survey, whose origins are whole metres, have the same
+cells. Arrays are (rows, columns): y increases with the row, x with the column.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ import numpy.typing as npt
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.types import F32, F64, I64, Bools
 
-SIZES = (0.1, 0.2, 0.25, 0.5, 1.0)
-"""Metres that cells may measure: whole numbers of them make whole metres."""
-SAMPLE = 20_000
-"""Points whose neighbours tell how far apart points are."""
-PER_CELL = 1.2
-"""Mean distance to six neighbours on a square lattice, in its cells."""
-MARGIN = 4
-"""Cells around everything."""
-MOST = 2 * 10**8
-"""Cells of a raster: several of them in float64 have to fit into memory."""
+CELL_SIZES_M = (0.1, 0.2, 0.25, 0.5, 1.0)
+"""Allowed cell sizes; a metre is a multiple of each."""
+SPACING_SAMPLES = 20_000
+"""Number of points that the point spacing is estimated from."""
+LATTICE_SPACING_CELLS = 1.2
+"""Mean distance to six neighbours on a square lattice, in cells."""
+MARGIN_CELLS = 4
+"""Empty cells around the data."""
+MAX_CELLS = 2 * 10**8
+"""Maximum size of a raster: several of them in float64 have to fit into memory."""
 
 
 @dataclass(frozen=True)
 class Raster:
-    """Where the cells of a raster are.
+    """Position and size of a raster.
 
     Attributes:
-        cell: metres.
+        cell: cell size, metres.
         low: (x, y) of the first cell's corner, in cells, local coordinates.
         shape: rows, columns.
     """
@@ -45,48 +45,48 @@ class Raster:
 
     @classmethod
     def over(cls, cell: float, parts: Sequence[npt.NDArray[Any]]) -> Raster:
-        """The raster over all points of `parts` (N, 2 or 3), with room around.
+        """Raster that contains all points of `parts` (N, 2 or 3), with a margin.
 
         Raises:
-            DataError: it would have more than `MOST` cells.
+            DataError: it would have more than `MAX_CELLS` cells.
         """
         filled = [part[:, :2] for part in parts if len(part)]
-        low = np.floor(np.min([part.min(axis=0) for part in filled], axis=0) / cell).astype(int) - MARGIN
-        high = np.floor(np.max([part.max(axis=0) for part in filled], axis=0) / cell).astype(int) + MARGIN + 1
+        low = np.floor(np.min([part.min(axis=0) for part in filled], axis=0) / cell).astype(int) - MARGIN_CELLS
+        high = np.floor(np.max([part.max(axis=0) for part in filled], axis=0) / cell).astype(int) + MARGIN_CELLS + 1
         columns, rows = int(high[0] - low[0]), int(high[1] - low[1])
-        if rows * columns > MOST:
+        if rows * columns > MAX_CELLS:
             raise DataError(
                 "the cloud",
-                f"is {columns * cell:,.0f} x {rows * cell:,.0f} m wide: {rows * columns:,} cells of {cell:g} m are too "
-                "many to make up walls and ground with",
+                f"covers {columns * cell:,.0f} x {rows * cell:,.0f} m: {rows * columns:,} cells of {cell:g} m are too "
+                "many for the completion of walls and ground",
                 "Cut it into tiles (scan2sim tile), or set ground.when and walls.when to never",
             )
         return cls(cell, (int(low[0]), int(low[1])), (rows, columns))
 
     def at(self, xy: npt.NDArray[Any]) -> tuple[I64, I64]:
-        """Rows and columns (N,) of places (N, 2 or 3); the outermost cell's for those beyond."""
+        """Rows and columns (N,) of points (N, 2 or 3), clipped to the raster."""
         index = np.floor(np.asarray(xy)[:, :2].astype(np.float64) / self.cell + 1e-6).astype(np.int64) - self.low
         return index[:, 1].clip(0, self.shape[0] - 1), index[:, 0].clip(0, self.shape[1] - 1)
 
     def centres(self, mask: Bools) -> F64:
-        """(N, 2) middles of the cells that `mask` selects, row by row."""
+        """Centres (N, 2) of the cells selected by `mask`, row by row."""
         row, column = np.nonzero(mask)
         return np.asarray((np.column_stack([column, row]) + self.low + 0.5) * self.cell, np.float64)
 
     def covered(self, xy: npt.NDArray[Any]) -> Bools:
-        """The cells that hold one of the places (N, 2 or 3)."""
+        """Mask of the cells that contain one of the points (N, 2 or 3)."""
         out = np.zeros(self.shape, bool)
         out[self.at(xy)] = True
         return out
 
     def highest(self, xyz: F32) -> F64:
-        """The greatest height of the points (N, 3) in each cell; NaN where there is none."""
+        """Maximum height of the points (N, 3) in each cell; NaN in empty cells."""
         out = np.full(self.shape, -np.inf)
         np.maximum.at(out, self.at(xyz), xyz[:, 2].astype(np.float64))
         return np.where(np.isfinite(out), out, np.nan)
 
     def mean(self, xyz: F32, values: npt.NDArray[Any]) -> F64:
-        """(rows, columns, K) means of values (N, K) of the points in each cell; NaN where there is none."""
+        """Means (rows, columns, K) of the values (N, K) of the points in each cell; NaN in empty cells."""
         row, column = self.at(xyz)
         flat, n = row * self.shape[1] + column, self.shape[0] * self.shape[1]
         count = np.bincount(flat, minlength=n).astype(np.float64)
@@ -95,19 +95,19 @@ class Raster:
         return np.stack(sums, axis=1).reshape(*self.shape, -1)
 
 
-def spacing(xyz: F32) -> float:
-    """About how far apart the points (N, 3) are, metres: one of `SIZES`, so that like clouds have the same."""
+def point_spacing(xyz: F32) -> float:
+    """Typical spacing of points (N, 3) in metres, rounded to `CELL_SIZES_M`, so that similar clouds have the same."""
     from scipy.spatial import cKDTree
 
     if len(xyz) < 7:
-        return SIZES[-1]
-    distance, _ = cKDTree(xyz).query(xyz[:: max(1, len(xyz) // SAMPLE)], k=7, workers=-1)
-    found = float(np.median(distance[:, 1:].mean(axis=1))) / PER_CELL
-    return min(SIZES, key=lambda size: abs(np.log(size / max(found, 1e-6))))
+        return CELL_SIZES_M[-1]
+    distance, _ = cKDTree(xyz).query(xyz[:: max(1, len(xyz) // SPACING_SAMPLES)], k=7, workers=-1)
+    found = float(np.median(distance[:, 1:].mean(axis=1))) / LATTICE_SPACING_CELLS
+    return min(CELL_SIZES_M, key=lambda size: abs(np.log(size / max(found, 1e-6))))
 
 
-def drawn(rings: Sequence[npt.NDArray[np.floating]], shape: tuple[int, int]) -> Bools:
-    """A mask of polygons (K, 2), x and y in cells from the first cell's corner."""
+def rasterize_polygons(rings: Sequence[npt.NDArray[np.floating]], shape: tuple[int, int]) -> Bools:
+    """Mask of polygons (K, 2), x and y in cells from the first cell's corner."""
     import cv2
 
     mask = np.zeros(shape, np.uint8)
@@ -116,30 +116,30 @@ def drawn(rings: Sequence[npt.NDArray[np.floating]], shape: tuple[int, int]) -> 
     return mask > 0
 
 
-def grown(mask: Bools, radius: float) -> Bools:
-    """A mask with all cells within a radius, in cells."""
-    return np.asarray(_away(mask) <= radius, bool) if mask.any() else mask
+def dilate(mask: Bools, radius: float) -> Bools:
+    """Dilate a mask by a radius in cells."""
+    return np.asarray(_distance_to(mask) <= radius, bool) if mask.any() else mask
 
 
-def _away(mask: Bools) -> F32:
-    """Cells from each one to the nearest of a mask."""
+def _distance_to(mask: Bools) -> F32:
+    """Distance of each cell to the nearest cell of a mask, in cells."""
     import cv2
 
     return np.asarray(cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
 
 
-def closed(mask: Bools, radius: float) -> Bools:
-    """A mask whose gaps of less than twice the radius, in cells, are closed."""
-    room = math.ceil(radius) + 1
-    wide = grown(np.pad(mask, room), radius)
-    return np.asarray(_away(~wide) > radius, bool)[room:-room, room:-room] | mask
+def close_gaps(mask: Bools, radius: float) -> Bools:
+    """Close gaps in a mask that are narrower than twice the radius, in cells (morphological closing)."""
+    padding = math.ceil(radius) + 1
+    dilated = dilate(np.pad(mask, padding), radius)
+    return np.asarray(_distance_to(~dilated) > radius, bool)[padding:-padding, padding:-padding] | mask
 
 
-def membrane(values: F64, wanted: Bools) -> F64:
-    """Values (rows, columns, K) with the `wanted` cells filled as a membrane that hangs from those that are known.
+def fill_membrane(values: F64, wanted: Bools) -> F64:
+    """Fill the `wanted` cells of values (rows, columns, K) by solving Laplace's equation (a membrane).
 
-    It is Laplace's equation, the known cells (not NaN) given, and no slope across where neither is. What is wanted but
-    touches nothing known stays NaN.
+    Known cells (not NaN) are Dirichlet conditions; the slope is zero towards cells that are neither known nor wanted.
+    Wanted regions that touch no known cell stay NaN.
     """
     from scipy import ndimage
     from scipy.sparse import coo_matrix
@@ -159,7 +159,7 @@ def membrane(values: F64, wanted: Bools) -> F64:
     diagonal, right = np.zeros(n), np.zeros((n, values.shape[2]))
     rows, columns = [], []
     for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
-        other, given, value = (_shifted(a, axis, step, fill) for a, fill in ((number, -1), (known, False), (values, 0)))
+        other, given, value = (_shift(a, axis, step, fill) for a, fill in ((number, -1), (known, False), (values, 0)))
         inner, rim = wanted & (other >= 0), wanted & given
         diagonal += (inner | rim)[wanted]
         rows.append(number[inner])
@@ -168,14 +168,14 @@ def membrane(values: F64, wanted: Bools) -> F64:
     i, j = np.concatenate([*rows, np.arange(n)]), np.concatenate([*columns, np.arange(n)])
     entries = np.concatenate([np.full(sum(map(len, rows)), -1.0), diagonal])
     matrix = coo_matrix((entries, (i, j)), shape=(n, n)).tocsc()
-    # the matrix is symmetric and dominated by its diagonal: without pivoting the factors stay as sparse as they can
+    # the matrix is symmetric and diagonally dominant: without pivoting, the factors stay sparse
     factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     out[wanted] = factors.solve(right)
     return out
 
 
-def _shifted(array: npt.NDArray[Any], axis: int, step: int, fill: float) -> npt.NDArray[Any]:
-    """The array moved by one cell, `fill` where nothing comes from."""
+def _shift(array: npt.NDArray[Any], axis: int, step: int, fill: float) -> npt.NDArray[Any]:
+    """The array shifted by one cell; `fill` at the border."""
     out = np.full_like(array, fill)
     to = [slice(None)] * array.ndim
     of = [slice(None)] * array.ndim
@@ -185,6 +185,6 @@ def _shifted(array: npt.NDArray[Any], axis: int, step: int, fill: float) -> npt.
 
 
 def signed_area(ring: npt.NDArray[np.floating]) -> float:
-    """m2 within a ring (K, 2), negative where it runs clockwise."""
+    """Area of a ring (K, 2) in m2, negative if it is clockwise."""
     x, y = (ring - ring[0]).T
     return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) / 2)

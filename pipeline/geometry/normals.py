@@ -1,4 +1,4 @@
-"""Normals of points, oriented to where the scanner was."""
+"""Normals of points, oriented towards the scanner."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ from scipy.spatial import cKDTree
 
 from scan2sim.pipeline.core.types import F32, F64, PointCloud, Trajectory
 
-STEEP = 0.3  # |nz| below which "up" says nothing of a surface's outside
-CHUNK = 20_000
-WALL_RADIUS = 3.0  # metres around a wall's point in which its building is looked for
+STEEP_MAX_NORMAL_Z = 0.3  # |nz| below which "up" doesn't define the outside of a surface
+QUERY_CHUNK = 20_000  # points per neighbour query
+BUILDING_RADIUS_M = 3.0  # radius around a wall point in which the mass of its building is measured
 
 
 def oriented_normals(cloud: PointCloud, neighbours: int, path: Trajectory | None) -> PointCloud:
-    """The cloud with unit normals (N, 3): smallest principal axis of `neighbours`, turned to the scanner.
+    """The cloud with unit normals (N, 3): smallest principal axis of `neighbours`, oriented towards the scanner.
 
-    With a path and GPS times that overlap, each point looks to where the scanner was at its time;
-    without times to the nearest point of the path; without a path, up and, where steep, away from
-    the mass around it.
+    With a path and GPS times that overlap, each normal is oriented to the scanner's position at the point's time;
+    without times, to the nearest point of the path; without a path, upwards and, if steep, away from the mass around
+    the point.
     """
     if len(cloud) < 3:
         return replace(cloud, normal=np.tile(np.array([0, 0, 1], np.float32), (len(cloud), 1)))
     normal = normals(cloud.xyz, neighbours)
-    toward = _away_from_mass(cloud.xyz, normal) if path is None else _scanner(cloud, path) - cloud.xyz
+    toward = _away_from_mass(cloud.xyz, normal) if path is None else _scanner_positions(cloud, path) - cloud.xyz
     normal[np.einsum("ij,ij->i", normal, toward) < 0] *= -1
     return replace(cloud, normal=normal)
 
 
 def normals(xyz: F32, neighbours: int) -> F32:
-    """Unit normals (N, 3) of points (N, 3), three at least, of either sign."""
+    """Unit normals (N, 3) of at least three points (N, 3), with arbitrary sign."""
     points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz.astype(np.float64)))
     points.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(min(neighbours, len(xyz))))
     return np.asarray(points.normals).astype(np.float32)
 
 
-def _scanner(cloud: PointCloud, path: Trajectory) -> F64:
-    """(N, 3) where the scanner was when it saw each point."""
+def _scanner_positions(cloud: PointCloud, path: Trajectory) -> F64:
+    """Scanner position (N, 3) for each point."""
     times = cloud.time
     if times is not None and len(path.times) > 1:
         inside = (times >= path.times[0] - 1) & (times <= path.times[-1] + 1)
@@ -49,15 +49,15 @@ def _scanner(cloud: PointCloud, path: Trajectory) -> F64:
 
 
 def _away_from_mass(xyz: F32, normal: F32) -> npt.NDArray[np.floating]:
-    """(N, 3) directions to the outside, for clouds scanned from above: up, and away from what is near."""
+    """Directions (N, 3) to the outside for airborne clouds: up, and for steep surfaces away from the points around."""
     toward = np.tile(np.array([0.0, 0.0, 1.0]), (len(xyz), 1))
-    steep = np.flatnonzero(np.abs(normal[:, 2]) < STEEP)
+    steep = np.flatnonzero(np.abs(normal[:, 2]) < STEEP_MAX_NORMAL_Z)
     if len(steep):
         coarse = np.unique(np.round(xyz / 0.5).astype(np.int32), axis=0).astype(np.float32) * 0.5
         tree = cKDTree(coarse)
-        for at in range(0, len(steep), CHUNK):  # lists of neighbours are large
-            here = steep[at : at + CHUNK]
-            near = tree.query_ball_point(xyz[here], WALL_RADIUS, workers=-1)
+        for at in range(0, len(steep), QUERY_CHUNK):  # in chunks: lists of neighbours are large
+            here = steep[at : at + QUERY_CHUNK]
+            near = tree.query_ball_point(xyz[here], BUILDING_RADIUS_M, workers=-1)
             toward[here] = [
                 xyz[i] - coarse[j].mean(axis=0) if j else (0, 0, 1) for i, j in zip(here, near, strict=True)
             ]

@@ -1,4 +1,4 @@
-"""Planes of a cloud: grown from where it is flat, fitted robustly. Import late: it loads numba.
+"""Plane detection in a cloud by region growing, with robust fitting. Import lazily: loads numba.
 
 Rabbani et al., "Segmentation of point clouds using smoothness constraint", ISPRS 2006.
 """
@@ -17,25 +17,24 @@ from scipy.spatial import cKDTree
 from scan2sim.pipeline.core.types import F32, F64, I32
 
 NEIGHBOURS = 12
-REACH = 2.6
-"""Voxels within which points are neighbours: over one that is missing."""
-FLAT_SHARE = 30
-"""Percentile of the points' residuals that is the noise of flat surfaces: so much of what was built is flat."""
-SIGMAS = 3.0
-LEAST, MOST = 0.15, 0.8
-"""Voxels that the tolerance is held to, whatever the noise."""
-TURN = float(np.cos(np.radians(20.0)))
-"""By which normals of one plane may differ: their neighbourhoods reach around corners."""
-POINTS = 40
-"""A plane's points, at least: .4 m2 at the mission's voxels."""
-BENT = float(np.radians(10.0))
-"""Turn of a plane's normal from end to end, by a parabola through its points, from which on it is no plane."""
-BENT_SAMPLE = 2000
-"""Points that tell it."""
-SCALE = 100.0
-"""Metres by which two planes are told as different as by a radian between their normals."""
-ROUNDS = 2
-"""Times that planes grow by the points beside them, whose normals are those of a corner."""
+NEIGHBOUR_RADIUS_VOXELS = 2.6
+"""Includes neighbours beyond one missing voxel."""
+FLAT_PERCENTILE = 30
+"""Percentile of the points' residuals that is the noise of flat surfaces: at least this part of buildings is flat."""
+TOLERANCE_SIGMAS = 3.0
+MIN_TOLERANCE_VOXELS, MAX_TOLERANCE_VOXELS = 0.15, 0.8
+MIN_NORMAL_COS = float(np.cos(np.radians(20.0)))
+"""Normals within one plane may differ by 20 degrees: their neighbourhoods extend around corners."""
+MIN_PLANE_POINTS = 40
+"""0.4 m2 at voxels of 10 cm."""
+MAX_BEND_RAD = float(np.radians(10.0))
+"""Largest change of the normal from end to end, by a parabola through the points; above it, the surface is curved."""
+BEND_SAMPLES = 2000
+"""Maximum number of points for that fit."""
+OFFSET_SCALE_M = 100.0
+"""Difference of offsets that counts as much as an angle of one radian between normals, when planes are matched."""
+GROWTH_ROUNDS = 2
+"""Number of passes in which planes take in adjacent points, whose normals are those of a corner."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class Planes:
     """Planes `normal . x = offset`.
 
     Attributes:
-        normal: (P, 3) unit, to the outside of what is there.
+        normal: (P, 3) unit vectors, to the outside of the surface.
         offset: (P,) metres.
     """
 
@@ -55,52 +54,64 @@ class Planes:
 
     @staticmethod
     def join(parts: Sequence[Planes]) -> Planes:
-        """All planes of parts, in order."""
+        """Concatenate planes."""
         return Planes(np.concatenate([p.normal for p in parts]), np.concatenate([p.offset for p in parts]))
 
-    def of(self, xyz: F32, normal: F32) -> I32:
-        """(N,) the plane that each of places (N, 3) was laid on, by their unit normals (N, 3)."""
-        places, facing = xyz.astype(np.float64), normal.astype(np.float64)
-        offset = np.einsum("ij,ij->i", places, facing)
-        tree = cKDTree(np.column_stack([SCALE * self.normal, self.offset]))
-        return np.asarray(tree.query(np.column_stack([SCALE * facing, offset]))[1], np.int32)
+    def nearest(self, xyz: F32, normal: F32) -> I32:
+        """Index (N,) of the plane most similar to the plane through each point (N, 3) with unit normal (N, 3)."""
+        points, facing = xyz.astype(np.float64), normal.astype(np.float64)
+        offset = np.einsum("ij,ij->i", points, facing)
+        tree = cKDTree(np.column_stack([OFFSET_SCALE_M * self.normal, self.offset]))
+        return np.asarray(tree.query(np.column_stack([OFFSET_SCALE_M * facing, offset]))[1], np.int32)
 
-    def beyond(self, xyz: npt.NDArray[Any], which: I32) -> F64:
-        """(N,) metres from points (N, 3), local coordinates, to planes `which` (N,), positive outside."""
+    def signed_distance(self, xyz: npt.NDArray[Any], which: I32) -> F64:
+        """Signed distance (N,) in metres of points (N, 3) from planes `which` (N,), positive outside."""
         return np.einsum("ij,ij->i", xyz, self.normal[which]) - self.offset[which]
 
 
 def detect(xyz: F32, normal: F32, voxel: float) -> tuple[Planes, I32, float]:
-    """Planes of a thinned cloud.
+    """Detect planes in a thinned cloud.
 
     Args:
-        xyz: (N, 3) local metres, one a voxel.
-        normal: (N, 3) unit, to the outside.
-        voxel: metres.
+        xyz: (N, 3) local metres, one point per voxel.
+        normal: (N, 3) unit normals to the outside.
+        voxel: voxel size, metres.
 
     Returns:
-        The planes, each point's (N,), -1 for none; and metres by which points of a plane may miss it: three times the
-        noise that flat places have.
+        The planes; the index (N,) of each point's plane, -1 for none; and the tolerance, the largest distance in metres
+        of a point from its plane: three times the noise of flat surfaces.
     """
     none = np.full(len(xyz), -1, np.int32)
-    if len(xyz) < POINTS:
-        return Planes(np.zeros((0, 3)), np.zeros(0)), none, LEAST * voxel
+    if len(xyz) < MIN_PLANE_POINTS:
+        return Planes(np.zeros((0, 3)), np.zeros(0)), none, MIN_TOLERANCE_VOXELS * voxel
     points, normals = xyz.astype(np.float64), normal.astype(np.float64)
-    near = cKDTree(xyz).query(xyz, NEIGHBOURS + 1, distance_upper_bound=REACH * voxel, workers=-1)[1].astype(np.int32)
-    rough = _residuals(points, normals, near)
-    tolerance = float(np.clip(SIGMAS * np.percentile(rough, FLAT_SHARE), LEAST * voxel, MOST * voxel))
-    order = np.argsort(rough, kind="stable").astype(np.int32)
-    which = _grow(points, normals, near, order[rough[order] <= tolerance], tolerance, TURN, POINTS)
-    which = _without_bent(points, which, _fitted(points, normals, which, tolerance))
-    planes = _fitted(points, normals, which, tolerance)
-    for _ in range(ROUNDS):
-        which = _widened(points, near, which, np.ascontiguousarray(planes.normal), planes.offset, tolerance)
-    return _fitted(points, normals, which, tolerance), which, tolerance
+    near = (
+        cKDTree(xyz)
+        .query(xyz, NEIGHBOURS + 1, distance_upper_bound=NEIGHBOUR_RADIUS_VOXELS * voxel, workers=-1)[1]
+        .astype(np.int32)
+    )
+    residual = _residuals(points, normals, near)
+    tolerance = float(
+        np.clip(
+            TOLERANCE_SIGMAS * np.percentile(residual, FLAT_PERCENTILE),
+            MIN_TOLERANCE_VOXELS * voxel,
+            MAX_TOLERANCE_VOXELS * voxel,
+        )
+    )
+    order = np.argsort(residual, kind="stable").astype(np.int32)
+    which = _grow(
+        points, normals, near, order[residual[order] <= tolerance], tolerance, MIN_NORMAL_COS, MIN_PLANE_POINTS
+    )
+    which = _remove_curved(points, which, _fit_planes(points, normals, which, tolerance))
+    planes = _fit_planes(points, normals, which, tolerance)
+    for _ in range(GROWTH_ROUNDS):
+        which = _absorb_neighbours(points, near, which, np.ascontiguousarray(planes.normal), planes.offset, tolerance)
+    return _fit_planes(points, normals, which, tolerance), which, tolerance
 
 
 @njit(cache=True, parallel=True)
 def _residuals(xyz: F64, normal: F64, near: I32) -> F64:
-    """(N,) root mean square distance of each point's neighbours to the plane through their middle."""
+    """RMS distance (N,) of each point's neighbours to the plane through their mean."""
     n = len(xyz)
     out = np.empty(n)
     for i in prange(n):
@@ -116,21 +127,23 @@ def _residuals(xyz: F64, normal: F64, near: I32) -> F64:
 
 
 @njit(cache=True, inline="always")
-def _along(places: F64, i: int, axis: F64) -> float:
-    """Place i (of (N, 3)) along an axis (3,)."""
-    return places[i, 0] * axis[0] + places[i, 1] * axis[1] + places[i, 2] * axis[2]
+def _dot(points: F64, i: int, axis: F64) -> float:
+    """Dot product of point i of (N, 3) with an axis (3,)."""
+    return points[i, 0] * axis[0] + points[i, 1] * axis[1] + points[i, 2] * axis[2]
 
 
 @njit(cache=True)
-def _grow(xyz: F64, normal: F64, near: I32, seeds: I32, tolerance: float, turn: float, least: int) -> I32:
-    """(N,) regions from each seed in turn: neighbours are added that lie on the plane so far; small ones dissolve."""
+def _grow(
+    xyz: F64, normal: F64, near: I32, seeds: I32, tolerance: float, min_normal_cos: float, min_points: int
+) -> I32:
+    """Region growing (N,) from each seed in turn: adds neighbours on the current plane; discards small regions."""
     n, found = len(xyz), 0
     which = np.full(n, -1, np.int32)
     members = np.empty(n, np.int32)
     for seed in seeds:
         if which[seed] >= 0:
             continue
-        axis, level = normal[seed].copy(), _along(xyz, seed, normal[seed])
+        axis, level = normal[seed].copy(), _dot(xyz, seed, normal[seed])
         total, outer = np.zeros(3), np.zeros((3, 3))
         count, at, refit = 1, 0, NEIGHBOURS
         members[0] = seed
@@ -151,13 +164,13 @@ def _grow(xyz: F64, normal: F64, near: I32, seeds: I32, tolerance: float, turn: 
                 axis = turned if np.dot(turned, axis) > 0 else -turned
                 level = np.dot(mean + xyz[seed], axis)
             for j in near[i]:
-                if j == n or which[j] >= 0 or _along(normal, j, axis) <= turn:
+                if j == n or which[j] >= 0 or _dot(normal, j, axis) <= min_normal_cos:
                     continue
-                if abs(_along(xyz, j, axis) - level) <= tolerance:
+                if abs(_dot(xyz, j, axis) - level) <= tolerance:
                     which[j] = found
                     members[count] = j
                     count += 1
-        if count < least:
+        if count < min_points:
             for k in range(count):
                 which[members[k]] = -1
         else:
@@ -166,61 +179,61 @@ def _grow(xyz: F64, normal: F64, near: I32, seeds: I32, tolerance: float, turn: 
 
 
 @njit(cache=True, parallel=True)
-def _widened(xyz: F64, near: I32, which: I32, normal: F64, offset: F64, tolerance: float) -> I32:
-    """Each point's plane: its own, else that of its neighbours' which it lies on best."""
+def _absorb_neighbours(xyz: F64, near: I32, which: I32, normal: F64, offset: F64, tolerance: float) -> I32:
+    """Assign points without a plane, or off their plane, to the nearest plane of their neighbours."""
     n = len(xyz)
     out = which.copy()
     for i in prange(n):
         best, own = tolerance, which[i]
         if own >= 0:
-            if abs(_along(xyz, i, normal[own]) - offset[own]) <= tolerance:
+            if abs(_dot(xyz, i, normal[own]) - offset[own]) <= tolerance:
                 continue
             out[i] = -1
         for j in near[i]:
             if j < n and which[j] >= 0:
-                d = abs(_along(xyz, i, normal[which[j]]) - offset[which[j]])
+                d = abs(_dot(xyz, i, normal[which[j]]) - offset[which[j]])
                 if d < best:
                     best = d
                     out[i] = which[j]
     return out
 
 
-def _fitted(xyz: F64, normal: F64, which: I32, tolerance: float) -> Planes:
-    """Each region's plane, by least squares with Tukey's weights."""
+def _fit_planes(xyz: F64, normal: F64, which: I32, tolerance: float) -> Planes:
+    """Plane of each region, by iteratively reweighted least squares (Tukey's biweight)."""
     count = int(which.max(initial=-1)) + 1
     own = np.flatnonzero(which >= 0)
-    plane, places = which[own], xyz[own]
+    plane, points = which[own], xyz[own]
     weight = np.ones(len(own))
     planes = Planes(np.zeros((count, 3)), np.zeros(count))
     outward = _sums(plane, normal[own], count)
     for _ in range(3):
         total = np.maximum(np.bincount(plane, weight, count), 1e-12)
-        middle = _sums(plane, places * weight[:, None], count) / total[:, None]
-        apart = places - middle[plane]
+        middle = _sums(plane, points * weight[:, None], count) / total[:, None]
+        apart = points - middle[plane]
         outer = np.einsum("ni,nj,n->nij", apart, apart, weight).reshape(-1, 9)
         axis = np.linalg.eigh(_sums(plane, outer, count).reshape(-1, 3, 3))[1][:, :, 0]
         axis = axis * np.where((axis * outward).sum(axis=1) < 0, -1.0, 1.0)[:, None]
         planes = Planes(axis, (axis * middle).sum(axis=1))
-        weight = np.maximum(0.0, 1 - (planes.beyond(places, plane) / (1.5 * tolerance)) ** 2) ** 2
+        weight = np.maximum(0.0, 1 - (planes.signed_distance(points, plane) / (1.5 * tolerance)) ** 2) ** 2
     return planes
 
 
-def _without_bent(xyz: F64, which: I32, planes: Planes) -> I32:
-    """The points' planes, numbered anew, without those that are strips of something round."""
+def _remove_curved(xyz: F64, which: I32, planes: Planes) -> I32:
+    """Remove planes that are strips of a curved surface, and renumber the planes of the points."""
     order = np.argsort(which, kind="stable")
     first = np.searchsorted(which[order], np.arange(len(planes) + 1))
     flat = np.ones(len(planes) + 1, bool)
     for p in range(len(planes)):
-        members = order[first[p] : first[p + 1]][:: max(1, (first[p + 1] - first[p]) // BENT_SAMPLE)]
+        members = order[first[p] : first[p + 1]][:: max(1, (first[p + 1] - first[p]) // BEND_SAMPLES)]
         apart = xyz[members] - xyz[members].mean(axis=0)
         u, v = (apart @ np.linalg.svd(apart, full_matrices=False)[2][:2].T).T
         columns = np.column_stack([u * u, v * v, u * v, u, v, np.ones(len(u))])
         bend = np.linalg.lstsq(columns, apart @ planes.normal[p], rcond=None)[0][:2]
-        flat[p] = (2 * np.abs(bend) * np.sqrt(12) * [u.std(), v.std()]).max() < BENT
-    flat[-1] = False  # of the points without a plane
+        flat[p] = (2 * np.abs(bend) * np.sqrt(12) * [u.std(), v.std()]).max() < MAX_BEND_RAD
+    flat[-1] = False  # entry of points without a plane
     return np.where(flat, np.cumsum(flat) - 1, -1)[which].astype(np.int32)
 
 
 def _sums(plane: I32, values: F64, count: int) -> F64:
-    """(count, K) sums of values (N, K) by plane (N,)."""
+    """Sums (count, K) of values (N, K) per plane (N,)."""
     return np.stack([np.bincount(plane, column, count) for column in values.T], axis=1)

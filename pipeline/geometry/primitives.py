@@ -1,4 +1,4 @@
-"""Meshes of simple things: tubes, plates, boxes. Faces run counter-clockwise seen from outside."""
+"""Meshes of primitive shapes: tubes, plates, boxes. Faces are counter-clockwise seen from outside."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy.typing as npt
 from scan2sim.pipeline.core.types import F64, I32
 
 Triangles = tuple[F64, I32]
-"""(V, 3) vertices and (F, 3) faces."""
+"""Vertices (V, 3) and faces (F, 3)."""
 
 
 def join(parts: list[Triangles]) -> Triangles:
-    """All triangles in one; empty of none."""
+    """Concatenate meshes; empty for an empty list."""
     first = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
     vertices = [part[0] for part in parts] or [np.zeros((0, 3))]
     faces = [part[1] + start for part, start in zip(parts, first[:-1], strict=True)] or [np.zeros((0, 3))]
@@ -22,14 +22,16 @@ def join(parts: list[Triangles]) -> Triangles:
 def tube(path: npt.ArrayLike, radius: npt.ArrayLike, sides: int) -> Triangles:
     """A round tube along `path` (K, 3) with `radius` (K,), closed at both ends.
 
-    A polygon of `sides` has the circle's area.
+    Its cross section is a polygon of `sides` corners with the area of the circle.
     """
     path = np.asarray(path, np.float64)
     out: F64 = np.asarray(radius, np.float64) * np.sqrt(2 * np.pi / sides / np.sin(2 * np.pi / sides))
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     helper = np.array([1.0, 0.0, 0.0]) if abs(along[:, 2]).min() > 0.5 else np.array([0.0, 0.0, 1.0])
-    if abs(along[:, 2]).min() <= 0.5 < abs(along[:, 2]).max():  # it bends from upright to level: across both
+    if (
+        abs(along[:, 2]).min() <= 0.5 < abs(along[:, 2]).max()
+    ):  # bends from vertical to horizontal: use a direction perpendicular to both
         helper = np.cross(along[0], along[-1])
     first = np.cross(np.broadcast_to(helper, along.shape), along)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -50,7 +52,7 @@ def tube(path: npt.ArrayLike, radius: npt.ArrayLike, sides: int) -> Triangles:
 
 
 def plate(corners: npt.ArrayLike, back: npt.ArrayLike) -> Triangles:
-    """A sheet: corners (K, 3) of its face, convex and counter-clockwise from its front; its back lies `back` off."""
+    """A plate with a convex front face, corners (K, 3) counter-clockwise from the front; `back`: offset of its back."""
     front = np.asarray(corners, np.float64)
     n = len(front)
     k = np.arange(n)
@@ -62,7 +64,7 @@ def plate(corners: npt.ArrayLike, back: npt.ArrayLike) -> Triangles:
 
 
 def box(centre: npt.ArrayLike, axes: npt.ArrayLike, half: npt.ArrayLike) -> Triangles:
-    """A box around `centre` (3,), along right-handed unit `axes` (3, 3; rows), `half` (3,) as large on each side."""
+    """A box around `centre` (3,) with right-handed unit `axes` (3, 3; rows) and half extents `half` (3,)."""
     along = np.asarray(axes, np.float64) * np.asarray(half, np.float64)[:, None]
     a, b, c = along
     face = np.asarray(centre, np.float64) + c + np.array([-a - b, a - b, a + b, -a + b])

@@ -1,4 +1,4 @@
-"""Many numbers in order, and where each came from."""
+"""Stable argsort of integer keys."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import numpy as np
 from scan2sim.pipeline.core.types import I64, Bools
 
 
-def ordered(codes: I64) -> tuple[I64, I64]:
-    """The stable order (N,) of codes (N,), not below 0, and the codes (N,) in that order.
+def stable_argsort(codes: I64) -> tuple[I64, I64]:
+    """Stable sort order (N,) of non-negative codes (N,), and the sorted codes (N,).
 
-    Numbers are sorted several times as fast as their places: where both fit into 63 bits, they are sorted as one.
+    Sorting values is several times faster than an argsort: if code and index fit into 63 bits, they are packed into one
+    integer and sorted.
     """
     bits = len(codes).bit_length()
     if int(codes.max(initial=0)).bit_length() + bits > 63:
@@ -21,5 +22,5 @@ def ordered(codes: I64) -> tuple[I64, I64]:
 
 
 def first_of_each(codes: I64) -> Bools:
-    """(N,) which of codes in order aren't like the one before."""
+    """(N,) bool, True for sorted codes that differ from their predecessor."""
     return np.concatenate([np.ones(min(1, len(codes)), bool), codes[1:] != codes[:-1]])

@@ -1,14 +1,14 @@
-"""KITTI raw drives (Geiger et al., "Vision meets Robotics: The KITTI Dataset", IJRR 2013) as tiles.
+"""Importer of KITTI raw drives (Geiger et al., "Vision meets Robotics: The KITTI Dataset", IJRR 2013).
 
 Sweeps are merged by OXTS (GPS/IMU) poses or by a file of scan-matched ones; photos become posed
-views. The tile is in UTM (WGS 84) where there is OXTS, with OXTS altitude as z; otherwise local,
+views. The tile is in UTM (WGS 84) if there is OXTS, with OXTS altitude as z; otherwise local,
 in the first sweep's axes.
 
-Sweeps of raw drives are not compensated for the car's motion: the scanner turns clockwise, starts
-and ends looking back, and faces forward at the sweep's time stamp. Each point is placed by the pose
-of its own moment (at 11 m/s that is up to half a metre of difference). Photos are taken as the
-scanner faces forward and get the pose of the sweep's time stamp. OXTS packets come up to 20 ms later
-than the sweep of the same number, so poses are interpolated to the sweep's time.
+Sweeps of raw drives are not motion-compensated: the scanner rotates clockwise, starts and ends
+pointing backwards, and points forward at the sweep's time stamp. Each point is transformed by the
+pose of its own time (deskewing; at 11 m/s this moves points by up to half a metre). Photos are
+triggered when the scanner points forward and get the pose of the sweep's time stamp. OXTS packets are
+up to 20 ms later than the sweep of the same number, so poses are interpolated to the sweep's time.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from scan2sim.pipeline.camera.poses import interpolate, nearest_rotation
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F32, F64, Camera, Frame, PointCloud
-from scan2sim.pipeline.importers.merge_sweeps import borrow_colours, colour, phase_of, read_bin
-from scan2sim.pipeline.importers.tile_folder import place, tile_folder
+from scan2sim.pipeline.importers.merge_sweeps import colour_from_photo, fill_colours, read_bin, scan_phase
+from scan2sim.pipeline.importers.tile_folder import add_file, tile_folder
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import crs as crs_io
@@ -34,16 +34,16 @@ from scan2sim.pipeline.io.images.image import SUFFIXES
 from scan2sim.pipeline.io.tile import tile_name, write_tile
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
-# the recording car's own returns, scanner axes: (low, high) corner in metres
-OWN_CAR: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-3.2, -1.3, -2.0), (2.8, 1.3, 0.3))
-FARTHEST = 1e8
-"""Metres that no pose on Earth is from another."""
+# box that contains the recording car's own returns, scanner axes: (low, high) corner in metres
+EGO_VEHICLE_BOX: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-3.2, -1.3, -2.0), (2.8, 1.3, 0.3))
+MAX_COORDINATE_M = 1e8
+"""Plausibility limit of poses and calibration values."""
 SAME_DAY = "Use the synced and rectified photos with the calibration of the same day"
 
 
 @dataclass(frozen=True)
 class Rig:
-    """A rectified camera and where it sits: `T_velo_cam` (4, 4), camera to scanner."""
+    """A rectified camera and its extrinsics: `T_velo_cam` (4, 4), camera to scanner."""
 
     camera: Camera
     T_velo_cam: F64
@@ -51,14 +51,14 @@ class Rig:
 
 @dataclass(frozen=True)
 class Drive:
-    """Sweeps of a moving car, its photos, and where it was.
+    """Sweeps, photos and poses of a drive.
 
     Attributes:
-        name: of the drive.
+        name: name of the drive.
         sweeps: files by frame number.
         rigs: cameras by the name of their folder.
-        photos: of each camera, files by frame number.
-        spans: (F, 3) seconds of each sweep's start, middle (facing forward) and end.
+        photos: files by camera and frame number.
+        spans: (F, 3) start, middle (scanner points forward) and end of each sweep, seconds.
         T_velo: (F, 4, 4) scanner to CRS at each sweep's middle.
         crs: code, or "local".
     """
@@ -86,57 +86,64 @@ def import_kitti_raw(
     name: str | None = None,
     report: Report = silent,
 ) -> Path:
-    """Make a tile of a KITTI raw drive (synced and rectified).
+    """Create a tile from a KITTI raw drive (synced and rectified).
 
-    Points get the colour of the photo of their own frame (scanner and camera sit side by side, so no
-    visibility test is made), otherwise that of the nearest coloured point within 0.5 m, otherwise
-    grey. Times are seconds since 1980-01-06 as the drive's time stamps count them.
+    Points get the colour of the photo of their own frame, otherwise that of the nearest coloured
+    point nearby (`merge_sweeps.fill_colours`), otherwise grey. Times are seconds since 1980-01-06,
+    from the drive's time stamps.
 
     Args:
-        drive: the `..._sync` folder, or a folder that holds exactly one; calibration files are
-            looked for in it and in its parent.
-        out: the tile's folder to make.
-        poses: row-major 3x4 matrices, one a line, scanner of sweep i to scanner of sweep 0; without
-            it, OXTS poses.
+        drive: the `..._sync` folder, or a folder that contains exactly one; calibration files are
+            searched in it and in its parent.
+        out: folder of the tile to create.
+        poses: row-major 3x4 matrices, one per line, scanner of sweep i to scanner of sweep 0;
+            default: OXTS poses.
         cameras: folders of photos.
-        frames: first and last frame number to take; all by default.
-        max_range: metres; farther returns are left out (a pose error of 0.1 degrees is 9 cm at 50 m).
-        deskew: place each point by the pose of its own moment; off for sweeps that are already
-            compensated (as those of KITTI odometry are).
-        link: link to the photos instead of copying them.
+        frames: first and last frame number; default: all frames.
+        max_range: metres; farther returns are removed (a pose error of 0.1 degrees is 9 cm at 50 m).
+        deskew: transform each point by the pose of its own time; disable for sweeps that are already
+            motion-compensated (such as those of KITTI odometry).
+        link: symlink photos instead of copying them.
+        overwrite: replace an existing tile.
+        name: name of the tile; default: that of the drive.
+        report: receives progress.
 
     Returns:
         Path of the `tile.toml`.
 
     Raises:
-        InputError: a file is missing or damaged. SettingError: `out` is not empty, no frame is left.
+        InputError: a file is missing or damaged. SettingError: `out` is not empty, or no frame is selected.
     """
     drive = _find_drive(drive)
-    sweeps = within(numbered(drive / "velodyne_points" / "data", ".bin"), frames, drive)
+    sweeps = select_frames(files_by_frame(drive / "velodyne_points" / "data", ".bin"), frames, drive)
     numbers = list(sweeps)
     spans = _spans(drive, numbers)
     T_velo, crs = _poses(drive, poses, numbers, spans[:, 1])
-    whole = Drive(
+    parsed = Drive(
         name or drive.name,
         sweeps,
         {folder: _rig(drive, folder) for folder in cameras},
-        {folder: numbered(drive / folder / "data", SUFFIXES) for folder in cameras},
+        {folder: files_by_frame(drive / folder / "data", SUFFIXES) for folder in cameras},
         spans,
         T_velo,
         crs,
     )
-    return assemble(whole, out, max_range=max_range, deskew=deskew, link=link, overwrite=overwrite, report=report)
+    return write_drive_tile(
+        parsed, out, max_range=max_range, deskew=deskew, link=link, overwrite=overwrite, report=report
+    )
 
 
-def assemble(
+def write_drive_tile(
     drive: Drive, out: Path, *, max_range: float, deskew: bool, link: bool, overwrite: bool, report: Report
 ) -> Path:
-    """Make a tile of a drive: sweeps merged, coloured by the photos of their own frames. As `import_kitti_raw` says."""
+    """Create a tile from a drive: merge sweeps, colour points by the photos of their frames; see `import_kitti_raw`."""
     numbers, sweeps, rigs, photos, spans = list(drive.sweeps), drive.sweeps, drive.rigs, drive.photos, drive.spans
     T_velo, crs = drive.T_velo.copy(), drive.crs
     if (np.diff(spans[:, 1]) <= 0).any():
         late = numbers[int(np.argmax(np.diff(spans[:, 1]) <= 0)) + 1]
-        raise InputError(sweeps[late], "its time stamp doesn't follow that of the sweep before", "Unpack them again")
+        raise InputError(
+            sweeps[late], "its time stamp is not after that of the previous sweep", "Unpack the sweeps again"
+        )
     frame = Frame(crs, (0.0, 0.0, 0.0) if crs == "local" else tuple(np.floor(T_velo[0, :3, 3]).tolist()))
     T_velo[:, :3, 3] -= frame.origin
 
@@ -144,16 +151,16 @@ def assemble(
     for i, number in enumerate(numbers):
         report(0.7 * i / len(numbers), f"sweep {number}")
         xyz, reflectance = _read_sweep(sweeps[number], max_range)
-        phase = phase_of(xyz) if deskew else np.full(len(xyz), 0.5)
+        phase = scan_phase(xyz) if deskew else np.full(len(xyz), 0.5)
         times = spans[i, 0] + phase * (spans[i, 2] - spans[i, 0])
-        at = interpolate(T_velo, spans[:, 1], times)
-        world = np.einsum("nij,nj->ni", at[:, :3, :3], xyz) + at[:, :3, 3]
+        poses = interpolate(T_velo, spans[:, 1], times)
+        world = np.einsum("nij,nj->ni", poses[:, :3, :3], xyz) + poses[:, :3, 3]
         rgb = np.zeros((len(xyz), 3), np.uint8)
         seen = np.zeros(len(xyz), bool)
         for folder, rig in rigs.items():
             if number in photos[folder]:
                 pose = T_velo[i] @ rig.T_velo_cam
-                colour(world, pose, rig.camera, photos[folder][number], rgb, seen, remedy=SAME_DAY)
+                colour_from_photo(world, pose, rig.camera, photos[folder][number], rgb, seen, remedy=SAME_DAY)
         parts.append(
             {
                 "xyz": world.astype(np.float32),
@@ -166,7 +173,7 @@ def assemble(
         )
     whole = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     report(0.7, "colours")
-    rgb = borrow_colours(whole["xyz"], whole["rgb"], whole["seen"], whole["range"])
+    rgb = fill_colours(whole["xyz"], whole["rgb"], whole["seen"], whole["range"])
     cloud = PointCloud(frame, whole["xyz"], rgb, time=whole["time"], intensity=whole["intensity"])
     report(0.85, "writing")
 
@@ -181,7 +188,7 @@ def assemble(
                 source = photos[key][number]
                 entries.append(
                     {
-                        "file": place(source, work, f"photos/{key}/{source.name}", link),
+                        "file": add_file(source, work, f"photos/{key}/{source.name}", link),
                         "camera": key,
                         "position": frame.to_crs(pose[:3, 3]),
                         "rotation": pose[:3, :3],
@@ -209,30 +216,30 @@ def _find_drive(folder: Path) -> Path:
     found = sorted(path.parent for path in folder.glob("**/velodyne_points") if path.is_dir())
     if len(found) == 1:
         return found[0]
-    cause = f"holds {len(found)} drives" if found else "holds no KITTI raw drive (no folder velodyne_points in it)"
-    raise InputError(folder, cause, "Name one folder ..._sync of the synced and rectified data")
+    cause = f"contains {len(found)} drives" if found else "contains no KITTI raw drive (no folder velodyne_points)"
+    raise InputError(folder, cause, "Give one folder ..._sync of the synced and rectified data")
 
 
-def within(sweeps: dict[int, Path], frames: tuple[int, int] | None, drive: Path) -> dict[int, Path]:
-    """Those whose number lies in `frames` (first and last), all where it is None.
+def select_frames(sweeps: dict[int, Path], frames: tuple[int, int] | None, drive: Path) -> dict[int, Path]:
+    """Sweeps with frame numbers in `frames` (first and last); None: all.
 
     Raises:
-        SettingError: none is left.
+        SettingError: no sweep is in the range.
     """
     if frames is None:
         return sweeps
-    some = {k: v for k, v in sweeps.items() if frames[0] <= k <= frames[1]}
-    if not some:
-        raise SettingError("frames", f"no sweep of {drive} lies in {frames[0]}..{frames[1]}", "Widen the range")
-    return some
+    selected = {k: v for k, v in sweeps.items() if frames[0] <= k <= frames[1]}
+    if not selected:
+        raise SettingError("frames", f"no sweep of {drive} is in {frames[0]}..{frames[1]}", "Widen the range")
+    return selected
 
 
-def numbered(folder: Path, suffixes: str | tuple[str, ...]) -> dict[int, Path]:
+def files_by_frame(folder: Path, suffixes: str | tuple[str, ...]) -> dict[int, Path]:
     """Files by frame number, ascending."""
     found = sorted(p for p in folder.glob("*") if p.name.lower().endswith(suffixes) and p.stem.isdigit())
     if not found:
         kind = suffixes if isinstance(suffixes, str) else " or ".join(suffixes)
-        raise InputError(folder, f"holds no numbered {kind} files", "Unpack the drive's synced data here")
+        raise InputError(folder, f"contains no numbered {kind} files", "Unpack the drive's synced data here")
     return {int(path.stem): path for path in found}
 
 
@@ -248,50 +255,50 @@ def _calibration(drive: Path, name: str) -> dict[str, F64]:
     return entries
 
 
-def entry(drive: Path, name: str, key: str, size: int) -> F64:
-    """(size,) numbers after `key:` in a calibration file of the drive or of the folder above.
+def calibration_entry(drive: Path, name: str, key: str, size: int) -> F64:
+    """The `size` numbers after `key:` in a calibration file of the drive or its parent folder.
 
     Raises:
         InputError: the file is missing, or has no such entry.
     """
     values = _calibration(drive, name).get(key)
-    if values is None or values.size != size or not (np.abs(values) < FARTHEST).all():
-        raise InputError(drive.parent / name, f"has no `{key}` of {size} numbers", "Unpack the calibration again")
+    if values is None or values.size != size or not (np.abs(values) < MAX_COORDINATE_M).all():
+        raise InputError(drive.parent / name, f"has no `{key}` with {size} numbers", "Unpack the calibration again")
     return values
 
 
 def _rigid(drive: Path, name: str) -> F64:
     T = np.eye(4)
-    T[:3, :3] = entry(drive, name, "R", 9).reshape(3, 3)
-    T[:3, 3] = entry(drive, name, "T", 3)
+    T[:3, :3] = calibration_entry(drive, name, "R", 9).reshape(3, 3)
+    T[:3, 3] = calibration_entry(drive, name, "T", 3)
     if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3:
-        raise InputError(drive.parent / name, "its `R` is no rotation", "Unpack the calibration again")
+        raise InputError(drive.parent / name, "its `R` is not a rotation matrix", "Unpack the calibration again")
     return T
 
 
 def _rig(drive: Path, folder: str) -> Rig:
     """The camera of a photo folder: `pixel ~ P_rect . R_rect_00 . T_cam0_velo . X`."""
     n, file = folder.removeprefix("image_"), "calib_cam_to_cam.txt"
-    P = entry(drive, file, f"P_rect_{n}", 12).reshape(3, 4)
-    width, height = entry(drive, file, f"S_rect_{n}", 2).astype(int).tolist()
+    P = calibration_entry(drive, file, f"P_rect_{n}", 12).reshape(3, 4)
+    width, height = calibration_entry(drive, file, f"S_rect_{n}", 2).astype(int).tolist()
     rectify = np.eye(4)
-    rectify[:3, :3] = entry(drive, file, "R_rect_00", 9).reshape(3, 3)
-    return rig(P, rectify @ _rigid(drive, "calib_velo_to_cam.txt"), width, height)
+    rectify[:3, :3] = calibration_entry(drive, file, "R_rect_00", 9).reshape(3, 3)
+    return rectified_rig(P, rectify @ _rigid(drive, "calib_velo_to_cam.txt"), width, height)
 
 
-def rig(P: F64, T_cam0_velo: F64, width: int, height: int) -> Rig:
-    """A rectified camera: KITTI gives its projection (3, 4) from rectified camera 0, and the scanner's place."""
+def rectified_rig(P: F64, T_cam0_velo: F64, width: int, height: int) -> Rig:
+    """A rectified camera, from KITTI's projection (3, 4) from rectified camera 0 and the extrinsics of the scanner."""
     K = P[:, :3]
     shift = np.eye(4)
-    shift[:3, 3] = np.linalg.solve(K, P[:, 3])  # rectified camera 0 to this camera
+    shift[:3, 3] = np.linalg.solve(K, P[:, 3])  # from rectified camera 0 to this camera
     T_cam_velo = shift @ T_cam0_velo
-    T_cam_velo[:3, :3] = nearest_rotation(T_cam_velo[:3, :3])  # the files have seven digits
+    T_cam_velo[:3, :3] = nearest_rotation(T_cam_velo[:3, :3])  # the files have only seven digits
     T_velo_cam = np.linalg.inv(T_cam_velo).astype(np.float64)
     return Rig(Camera("pinhole", width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2]), T_velo_cam)
 
 
 def _spans(drive: Path, numbers: list[int]) -> F64:
-    """(F, 3) seconds of each sweep's start, middle (facing forward) and end."""
+    """Start, middle (scanner points forward) and end (F, 3) of each sweep, seconds."""
     folder = drive / "velodyne_points"
     names = ("timestamps_start.txt", "timestamps.txt", "timestamps_end.txt")
     return np.stack([_times(folder / name, numbers) for name in names], axis=1)
@@ -308,23 +315,23 @@ def _times(path: Path, numbers: list[int]) -> F64:
             times[i] = (moment - GPS_EPOCH).total_seconds() + float(f"0.{fraction or 0}")
         except ValueError:
             raise InputError(
-                path, f"line {number + 1} is no time stamp ({line!r})", "Unpack it again, or leave that frame out"
+                path, f"line {number + 1} is not a time stamp ({line!r})", "Unpack it again, or exclude that frame"
             ) from None
     return times
 
 
 def _poses(drive: Path, poses: Path | None, numbers: list[int], times: F64) -> tuple[F64, str]:
-    """(F, 4, 4) scanner to CRS at each sweep's time stamp, and the CRS."""
+    """Poses (F, 4, 4) scanner to CRS at each sweep's time stamp, and the CRS."""
     has_oxts = (drive / "oxts" / "data").is_dir()
     if poses is None and not has_oxts:
-        raise InputError(drive / "oxts", "is missing, and no pose file is given", "Unpack oxts, or give poses")
+        raise InputError(drive / "oxts", "folder not found, and no pose file is given", "Unpack oxts, or give poses")
     crs = "local"
     first = np.eye(4)
     if has_oxts:
-        some = slice(None) if poses is None else slice(2)  # the first sweep's, interpolated, is all that is needed
-        T_imu, crs = _read_oxts(drive, numbers[some])
-        stamps = _times(drive / "oxts" / "timestamps.txt", numbers[some])
-        T_world = interpolate(T_imu, stamps, times[some]) @ np.linalg.inv(_rigid(drive, "calib_imu_to_velo.txt"))
+        needed = slice(None) if poses is None else slice(2)  # with poses, only the first sweep's, interpolated
+        T_imu, crs = _read_oxts(drive, numbers[needed])
+        stamps = _times(drive / "oxts" / "timestamps.txt", numbers[needed])
+        T_world = interpolate(T_imu, stamps, times[needed]) @ np.linalg.inv(_rigid(drive, "calib_imu_to_velo.txt"))
         if poses is None:
             return T_world, crs
         first = T_world[0]
@@ -334,31 +341,33 @@ def _poses(drive: Path, poses: Path | None, numbers: list[int], times: F64) -> t
 
 
 def read_poses(path: Path, numbers: list[int]) -> F64:
-    """(F, 4, 4) of the lines `numbers` of a file of row-major 3x4 matrices.
+    """Poses (F, 4, 4) from the lines `numbers` of a file of row-major 3x4 matrices.
 
     Raises:
-        InputError: it is none, or has too few.
+        InputError: not a pose file, or it has too few lines.
     """
     try:
         rows = np.loadtxt(file_checks.check(path), ndmin=2)
-        if rows.shape[1] != 12 or not (np.abs(rows) < FARTHEST).all():
+        if rows.shape[1] != 12 or not (np.abs(rows) < MAX_COORDINATE_M).all():
             raise ValueError(f"shape {rows.shape}, values up to {np.abs(rows).max(initial=0):g}")
     except ValueError as error:
-        raise InputError(path, f"is no pose file ({error})", "Write 12 numbers a line, row-major 3x4") from None
+        raise InputError(path, f"is not a pose file ({error})", "Write 12 numbers per line, row-major 3x4") from None
     if len(rows) <= numbers[-1]:
         raise InputError(
-            path, f"has {len(rows)} poses, but sweep {numbers[-1]} is asked for", "Give a line a frame, from 0 on"
+            path, f"has {len(rows)} poses, but sweep {numbers[-1]} is selected", "Give one line per frame, from 0 on"
         )
     T = np.tile(np.eye(4), (len(numbers), 1, 1))
     T[:, :3] = rows[numbers].reshape(-1, 3, 4)
     R = T[:, :3, :3]
     if np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() > 1e-2:
-        raise InputError(path, "its left 3x3 parts are no rotations", "Write 12 numbers a line, row-major 3x4")
+        raise InputError(
+            path, "its left 3x3 parts are not rotation matrices", "Write 12 numbers per line, row-major 3x4"
+        )
     return T
 
 
 def _read_oxts(drive: Path, numbers: list[int]) -> tuple[F64, str]:
-    """(F, 4, 4) IMU to UTM, and the zone's code; roll, pitch, yaw are against true east, north, up."""
+    """Poses (F, 4, 4) IMU to UTM, and the code of the zone; OXTS's roll, pitch, yaw refer to true east, north, up."""
     from pyproj import Proj, Transformer
     from scipy.spatial.transform import Rotation
 
@@ -369,13 +378,13 @@ def _read_oxts(drive: Path, numbers: list[int]) -> tuple[F64, str]:
         try:
             rows[i] = np.array(record[:6], np.float64)
         except ValueError as error:
-            raise InputError(path, f"is no OXTS record ({error})", "Unpack oxts again, or give poses") from None
+            raise InputError(path, f"is not an OXTS record ({error})", "Unpack oxts again, or give poses") from None
         if not np.isfinite(rows[i]).all() or abs(rows[i, 0]) > 84 or abs(rows[i, 1]) > 180:
-            raise InputError(path, "says an impossible place", "Unpack oxts again, or give poses")
+            raise InputError(path, "has an invalid position", "Unpack oxts again, or give poses")
     lat, lon, alt, roll, pitch, yaw = rows.T
     crs = crs_io.utm(lat[0], lon[0])
     east, north = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon, lat)
-    yaw = yaw + np.radians(Proj(crs).get_factors(lon, lat).meridian_convergence)  # true to grid
+    yaw = yaw + np.radians(Proj(crs).get_factors(lon, lat).meridian_convergence)  # true north to grid north
     T = np.tile(np.eye(4), (len(numbers), 1, 1))
     T[:, :3, :3] = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1)).as_matrix()
     T[:, :3, 3] = np.stack([east, north, alt], axis=1)
@@ -383,8 +392,8 @@ def _read_oxts(drive: Path, numbers: list[int]) -> tuple[F64, str]:
 
 
 def _read_sweep(path: Path, max_range: float) -> tuple[F32, F32]:
-    """(N, 3) points in scanner axes and (N,) reflectance, without the car itself and what is too far."""
+    """Points (N, 3) in scanner axes and reflectance (N,), without returns from the car and beyond `max_range`."""
     xyz, reflectance = read_bin(path)
-    low, high = np.array(OWN_CAR, np.float32)
+    low, high = np.array(EGO_VEHICLE_BOX, np.float32)
     keep = ~((xyz > low) & (xyz < high)).all(axis=1) & (np.linalg.norm(xyz, axis=1) <= max_range)
     return xyz[keep], reflectance[keep]

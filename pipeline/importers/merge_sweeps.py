@@ -1,4 +1,4 @@
-"""What importers of a moving scanner's sweeps share: sweeps as KITTI has them, colours from photos, thinning."""
+"""Shared functions of the importers of lidar sweeps: KITTI's sweep format, colours from photos, voxel thinning."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F32, F64, U8, UNCOLOURED, Bools, Camera
 from scan2sim.pipeline.io.images.image import read_rgb
 
-COLOUR_REACH = 0.2  # metres over which a point that its own photo doesn't show borrows a colour
-COLOUR_VOXEL = 0.1
-BIN = np.radians([0.3, 0.5])  # across and down, within which what is nearer hides what is farther
-BEHIND = 1.3  # times as far: the road itself recedes by so much within a bin
-NEAREST = 0.5  # metres: what is nearer to the lens gets no colour from it
+MAX_COLOUR_DISTANCE_M = 0.2  # from an uncoloured point to the coloured point whose colour it gets
+COLOUR_VOXEL_M = 0.1
+OCCLUSION_BIN_RAD = np.radians([0.3, 0.5])  # horizontal and vertical size of the bins of the occlusion test
+OCCLUSION_DISTANCE_RATIO = 1.3  # a point this much farther than the nearest is hidden; less occurs on the road itself
+MIN_PHOTO_DISTANCE_M = 0.5  # points nearer to the camera get no colour from it
 
 
 def read_bin(path: Path) -> tuple[F32, F32]:
-    """(N, 3) points in scanner axes and (N,) reflectance of a sweep as KITTI has it: float32 x, y, z, reflectance.
+    """Points (N, 3) in scanner axes and reflectance (N,) of a KITTI sweep: float32 x, y, z, reflectance.
 
     Raises:
-        InputError: it isn't one.
+        InputError: not such a file.
     """
     data = np.fromfile(path, np.float32)
     if data.size == 0 or data.size % 4:
-        raise InputError(path, f"is no Velodyne sweep ({data.size * 4} bytes)", "Copy it again")
+        raise InputError(path, f"is not a Velodyne sweep ({data.size * 4} bytes)", "Copy it again")
     data = data.reshape(-1, 4)
     data = data[np.isfinite(data).all(axis=1)]
     return data[:, :3], np.clip(data[:, 3], 0, 1)
 
 
-def phase_of(xyz: F32) -> F64:
-    """(N,) when within a sweep each point was measured, 0 to 1: by a scanner (z up, x ahead) as KITTI's.
+def scan_phase(xyz: F32) -> F64:
+    """Time (N,) of each point within its sweep, 0 to 1, for a scanner (z up, x forward) like KITTI's.
 
-    It turns clockwise, starts and ends looking back, and faces forward in the middle.
+    It rotates clockwise, starts and ends pointing backwards, and points forward in the middle.
     """
     return 0.5 - np.arctan2(xyz[:, 1], xyz[:, 0], dtype=np.float64) / (2 * np.pi)
 
 
-def colour(
+def colour_from_photo(
     world: F64,
     T_world_cam: F64,
     camera: Camera,
@@ -51,13 +51,19 @@ def colour(
     mask: U8 | None = None,
     remedy: str = "Give the camera that took it",
 ) -> None:
-    """Fill `rgb` and `seen` (N,) of points (N, 3) that fall into the photo and no earlier one has shown.
+    """Set `rgb` and `seen` (N,) of points (N, 3) that are visible in the photo and not coloured yet.
 
-    The points are those of the sweep taken beside it: what lies well behind others of them in the photo is hidden.
+    The points are those of the sweep taken beside the photo: points well behind others of them are occluded.
 
     Args:
+        world: (N, 3) points of the sweep.
+        T_world_cam: (4, 4) pose of the photo.
+        camera: its camera.
+        photo: image file.
+        rgb: (N, 3) colours, changed in place.
+        seen: (N,) whether a point has a colour, changed in place.
         mask: (H, W), 0 where the photo must not be used.
-        remedy: what to do about a photo of another size than its camera's.
+        remedy: remedy of the error if the photo's size differs from its camera's.
 
     Raises:
         InputError: the photo can't be read, or has another size.
@@ -67,41 +73,41 @@ def colour(
     image = read_rgb(photo)
     if image.shape[:2] != (camera.height, camera.width):
         size = f"{image.shape[1]}x{image.shape[0]}"
-        raise InputError(photo, f"is {size}, but its calibration says {camera.width}x{camera.height}", remedy)
+        raise InputError(photo, f"is {size}, but its calibration is for {camera.width}x{camera.height}", remedy)
     local = (world - T_world_cam[:3, 3]) @ T_world_cam[:3, :3]
     uv, valid = project(camera, local)
     distance = np.linalg.norm(local, axis=1)
-    good = valid & inside(camera, uv) & (distance > NEAREST)
-    good[good] = ~_hidden(uv[good], distance[good], camera)
+    good = valid & inside(camera, uv) & (distance > MIN_PHOTO_DISTANCE_M)
+    good[good] = ~_occluded(uv[good], distance[good], camera)
     good &= ~seen
     u, v = np.clip(np.rint(uv[good]).astype(int), 0, [camera.width - 1, camera.height - 1]).T
     if mask is not None:
-        shown = mask[v, u] > 0
-        good[good], u, v = shown, u[shown], v[shown]
+        usable = mask[v, u] > 0
+        good[good], u, v = usable, u[usable], v[usable]
     rgb[good] = image[v, u]
     seen |= good
 
 
-def _hidden(uv: F64, distance: F64, camera: Camera) -> Bools:
-    """(N,) which points at pixels (N, 2) lie well behind others of the sweep in the same or the next column of bins.
+def _occluded(uv: F64, distance: F64, camera: Camera) -> Bools:
+    """Whether each point (N,) at pixels (N, 2) is well behind others of the sweep in its own or an adjacent bin column.
 
-    Bins are as high as scan lines are apart: the road's own points, one line behind the other, hide none.
+    The height of a bin is the spacing of scan lines, so that lines on the road don't occlude each other.
     """
     from scan2sim.pipeline.camera.models import pixel_angle
 
-    bins = np.maximum(BIN / pixel_angle(camera), 1.0)  # pixels
+    bins = np.maximum(OCCLUSION_BIN_RAD / pixel_angle(camera), 1.0)  # pixels
     width, height = np.ceil([camera.width, camera.height] / bins).astype(int)
     u, v = np.clip(np.floor((uv + 0.5) / bins).astype(int), 0, [width - 1, height - 1]).T
     nearest = np.full((height, width + 2), np.inf)
     np.minimum.at(nearest, (v, u + 1), distance)
-    around = np.minimum(nearest[v, u], np.minimum(nearest[v, u + 1], nearest[v, u + 2]))
-    return np.asarray(distance > BEHIND * around + NEAREST, bool)
+    occluder = np.minimum(nearest[v, u], np.minimum(nearest[v, u + 1], nearest[v, u + 2]))
+    return np.asarray(distance > OCCLUSION_DISTANCE_RATIO * occluder + MIN_PHOTO_DISTANCE_M, bool)
 
 
-def borrow_colours(xyz: F32, rgb: U8, seen: Bools, distance: F32) -> U8:
-    """Colours (N, 3) where points that are not `seen` take that of the nearest seen one within reach, or grey.
+def fill_colours(xyz: F32, rgb: U8, seen: Bools, distance: F32) -> U8:
+    """Colours (N, 3) in which points that aren't `seen` get that of the nearest seen point nearby, or grey.
 
-    Of the seen points in a 10 cm voxel only the one at the smallest `distance` from its camera counts.
+    Of the seen points in a 10 cm voxel only the one with the smallest `distance` from its camera is used.
     """
     from scipy.spatial import cKDTree
 
@@ -110,18 +116,18 @@ def borrow_colours(xyz: F32, rgb: U8, seen: Bools, distance: F32) -> U8:
     index = np.flatnonzero(seen)
     if len(index) in (0, len(xyz)):
         return out
-    index = index[thin(xyz[index], COLOUR_VOXEL, distance[index])]
+    index = index[thin_voxels(xyz[index], COLOUR_VOXEL_M, distance[index])]
     tree = cKDTree(xyz[index])
-    rest = np.flatnonzero(~seen)
-    for some in np.array_split(rest, max(1, len(rest) // 2_000_000)):
-        gap, nearest = tree.query(xyz[some], distance_upper_bound=COLOUR_REACH, workers=-1)
+    unseen = np.flatnonzero(~seen)
+    for chunk in np.array_split(unseen, max(1, len(unseen) // 2_000_000)):
+        gap, nearest = tree.query(xyz[chunk], distance_upper_bound=MAX_COLOUR_DISTANCE_M, workers=-1)
         close = np.isfinite(gap)
-        out[some[close]] = rgb[index[nearest[close]]]
+        out[chunk[close]] = rgb[index[nearest[close]]]
     return out
 
 
-def thin(xyz: F32, size: float, rank: npt.NDArray[np.floating]) -> npt.NDArray[np.intp]:
-    """Indices of one point for each voxel of `size` metres: that of the smallest `rank` (N,)."""
+def thin_voxels(xyz: F32, size: float, rank: npt.NDArray[np.floating]) -> npt.NDArray[np.intp]:
+    """Indices of one point per voxel of `size` metres: the one with the smallest `rank` (N,)."""
     order = np.argsort(rank, kind="stable")
     cells = np.floor(xyz[order] / size).astype(np.int64)
     cells -= cells.min(axis=0)

@@ -1,4 +1,4 @@
-"""Tiles of other programs' posed photos (`pipeline.io.photogrammetry`): in a CRS, with a cloud, upright, in metres."""
+"""Importer of photogrammetry models (`pipeline.io.photogrammetry`): georeferences or scales them, adds a cloud."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F64, Frame, PointCloud
 from scan2sim.pipeline.geometry.similarity import Similarity
 from scan2sim.pipeline.importers import georeference
-from scan2sim.pipeline.importers.tile_folder import place, tile_folder
+from scan2sim.pipeline.importers.tile_folder import add_file, tile_folder
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.photogrammetry import Model, Photos, read
 from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
 
-FAR = 500.0
-"""Units between cloud and photos beyond which they are hardly of the same place."""
+MAX_CLOUD_DISTANCE = 500.0
+"""CRS units between cloud and photos above which a warning suggests that their coordinates differ."""
 Up = tuple[float, float, float] | Literal["photos"]
 
 
@@ -44,59 +44,64 @@ def import_model(
     warn: Callable[[str], None] = lambda _: None,
     report: Report = silent,
 ) -> Path:
-    """Make a tile of a program's posed photos.
+    """Create a tile from a photogrammetry model.
 
     Args:
-        kind: the program, as `pipeline.io.photogrammetry` names it.
+        kind: the program, a module name of `pipeline.io.photogrammetry`.
         model: the program's file or folder.
         images: folder of the photos.
-        out: the tile's folder to make.
-        cloud: point cloud; the model's own sparse points by default. One without a CRS is in the model's coordinates
-            and moves with it; one with a CRS is where it is, and so must the model be.
-        crs: to bring a georeferenced model to (default: the cloud's, the program's, or UTM); for others, the CRS that
-            its coordinates are in already ("local" by default).
-        up: direction of the model that becomes +z, or "photos" for the mean of the photos' up.
+        out: folder of the tile to create.
+        cloud: point cloud; default: the model's sparse points. A cloud without a CRS is in the model's coordinates and
+            is transformed with it; a cloud with a CRS stays, and the model must fit it.
+        crs: target CRS of a georeferenced model (default: the cloud's, the program's, or UTM); for other models, the
+            CRS of their coordinates (default: "local").
+        up: direction of the model that becomes +z, or "photos" for the mean up direction of the photos.
         scale: metres per unit of the model.
-        gps: place it by the GPS positions in the photos' EXIF.
-        link: link to the photos and the cloud instead of copying them.
-        classes: codes of the cloud and what they are here, where they differ (`pipeline.core.classes`).
-        warn: receives what was left out, assumed, and how well it fits.
+        gps: georeference the model by the GPS positions in the photos' EXIF.
+        link: symlink photos and cloud instead of copying them.
+        overwrite: replace an existing tile.
+        name: name of the tile; default: that of its folder.
+        classes: mapping of class codes of the cloud to those of `pipeline.core.classes`, where they differ.
+        warn: receives assumptions, omissions and the accuracy of the georeference.
+        report: receives progress.
 
     Returns:
         Path of the `tile.toml`.
 
     Raises:
-        InputError: a file can't be read or is missing. SettingError: `out` is not empty, or options that contradict.
-        DataError: GPS can't tell where it lies.
+        InputError: a file is missing or can't be read. SettingError: `out` is not empty, or options are contradictory.
+        DataError: the GPS is insufficient to georeference the model.
     """
-    header = None if cloud is None else cloud_io.read_header(cloud)  # refuses what is no cloud
+    header = None if cloud is None else cloud_io.read_header(cloud)  # fails early if it isn't a cloud
     found = read(kind, model, images)
     for note in found.notes:
         warn(f"{model}: {note}")
     if header is not None and header.crs and found.T_earth is None and (gps or up is not None or scale != 1.0):
         raise SettingError(
-            "gps, up, scale", f"would move the photos away from {cloud}, which has a CRS", "Align model and cloud first"
+            "gps, up, scale",
+            f"would move the photos relative to {cloud}, which has a CRS",
+            "Align model and cloud first",
         )
     files = [Photos(images).find(shot.file) for shot in found.shots] if gps else []
-    own = crs_io.short(header.crs) if header is not None and header.crs else None
-    onto, known = _onto(model, found, own, files, crs, up, scale, gps, warn)
-    placed = found.moved(onto)
+    cloud_crs = crs_io.short(header.crs) if header is not None and header.crs else None
+    onto, tile_crs = _model_to_tile(model, found, cloud_crs, files, crs, up, scale, gps, warn)
+    placed = found.transformed(onto)
     photos = Photos(images)
     with tile_folder(out, overwrite) as folder:
         if cloud is None:
-            las.write(folder / "cloud.laz", _sparse(model, placed, known))
+            las.write(folder / "cloud.laz", _sparse(model, placed, tile_crs))
             file = "cloud.laz"
         else:
             assert header is not None
-            moving = _moving(cloud, header, found, onto, warn)
-            file = _cloud(cloud, folder, onto if moving else None, known, link)
+            in_model = _in_model_coordinates(cloud, header, found, onto, warn)
+            file = _add_cloud(cloud, folder, onto if in_model else None, tile_crs, link)
         entries: list[dict[str, Any]] = []
         for i, shot in enumerate(placed.shots):
             report(i / len(placed.shots), shot.file)
             source = photos.find(shot.file)
             entries.append(
                 {
-                    "file": place(source, folder, f"photos/{source.relative_to(images).as_posix()}", link),
+                    "file": add_file(source, folder, f"photos/{source.relative_to(images).as_posix()}", link),
                     "camera": shot.camera,
                     "position": shot.pose[:3, 3],
                     "rotation": shot.pose[:3, :3],
@@ -105,15 +110,15 @@ def import_model(
         used = {shot.camera for shot in placed.shots}
         cameras = {key: camera for key, camera in placed.cameras.items() if key in used}
         write_tile(
-            folder, name=tile_name(name or Path(out).name), crs=known, clouds=[file], cameras=cameras, photos=entries,
-            classes=classes,
+            folder, name=tile_name(name or Path(out).name), crs=tile_crs, clouds=[file], cameras=cameras,
+            photos=entries, classes=classes,
         )  # fmt: skip
-        read_tile(folder)  # what it refuses is refused here, before the tile appears
+        read_tile(folder)  # an invalid tile is an error here, before its folder appears
     report(1.0, "done")
     return Path(out) / "tile.toml"
 
 
-def _onto(
+def _model_to_tile(
     model: Path,
     found: Model,
     cloud_crs: str | None,
@@ -124,50 +129,53 @@ def _onto(
     gps: bool,
     warn: Callable[[str], None],
 ) -> tuple[Similarity, str]:
-    """From the model's coordinates to the tile's, and the tile's CRS."""
+    """Similarity from model to tile coordinates, and the tile's CRS."""
     if found.T_earth is not None:
         if gps or up is not None or scale != 1.0:
-            raise SettingError("gps, up, scale", f"{model} says itself where it lies", "Leave them out")
-        fit = georeference.by_earth(model, found.T_earth, found.centres, crs or cloud_crs or found.crs)
+            raise SettingError("gps, up, scale", f"{model} is already georeferenced", "Leave these options out")
+        fit = georeference.from_geocentric(model, found.T_earth, found.centres, crs or cloud_crs or found.crs)
         for line in fit.notes:
             warn(f"{model}: {line}")
         return fit.onto, fit.crs
     if gps:
         if up is not None or scale != 1.0:
-            raise SettingError("up, scale", "GPS tells them", "Give either --gps or --upright and --scale")
-        fit = georeference.by_photos(model, found.centres, _ups(found), files, crs)
+            raise SettingError("up, scale", "are determined by GPS", "Give either --gps, or --upright and --scale")
+        fit = georeference.from_photo_gps(model, found.centres, _ups(found), files, crs)
         for line in fit.notes:
             warn(f"{model}: {line}")
         return fit.onto, fit.crs
     return Similarity(scale, _upright(_ups(found), up), np.zeros(3)), crs or cloud_crs or crs_io.LOCAL
 
 
-def _moving(cloud: Path, header: cloud_io.Header, found: Model, onto: Similarity, warn: Callable[[str], None]) -> bool:
-    """Whether a cloud is in the model's coordinates, and moves with it, or is where the model is brought to."""
+def _in_model_coordinates(
+    cloud: Path, header: cloud_io.Header, found: Model, onto: Similarity, warn: Callable[[str], None]
+) -> bool:
+    """Whether a cloud is in model coordinates, and must be transformed with the model, or already in the tile's CRS."""
     middle = found.centres.mean(axis=0)
-    inside_model, inside_crs = _gap(header, middle), _gap(header, onto.apply(middle[None])[0])
-    moving = not header.crs and (found.T_earth is None or inside_model < inside_crs)
+    distance_model = _distance_to_box(header, middle)
+    distance_crs = _distance_to_box(header, onto.apply(middle[None])[0])
+    in_model = not header.crs and (found.T_earth is None or distance_model < distance_crs)
     if not header.crs and found.T_earth is not None:
-        where = "the model's coordinates, and moves with it" if moving else "the CRS already"
-        warn(f"{cloud}: has no CRS; by where the photos are, it is in {where}")
-    gap = inside_model * onto.scale if moving else inside_crs
-    if gap > FAR:
-        warn(f"{cloud}: lies {gap:,.0f} units from the photos: are they in the same coordinates?")
-    return moving
+        coordinates = "model coordinates, and is transformed with the model" if in_model else "the CRS already"
+        warn(f"{cloud}: has no CRS; judging by the photos' positions, it is in {coordinates}")
+    distance = distance_model * onto.scale if in_model else distance_crs
+    if distance > MAX_CLOUD_DISTANCE:
+        warn(f"{cloud}: is {distance:,.0f} units away from the photos: check that both are in the same coordinates")
+    return in_model
 
 
-def _gap(header: cloud_io.Header, place: F64) -> float:
-    """How far a place is from a cloud's bounding box."""
-    return float(np.linalg.norm(np.maximum(0, np.maximum(header.low - place, place - header.high))))
+def _distance_to_box(header: cloud_io.Header, position: F64) -> float:
+    """Distance of a position from a cloud's bounding box."""
+    return float(np.linalg.norm(np.maximum(0, np.maximum(header.low - position, position - header.high))))
 
 
 def _ups(found: Model) -> F64:
-    """(P, 3) up of the photos, model coordinates."""
+    """Up directions (P, 3) of the photos, model coordinates."""
     return np.array([-shot.pose[:3, 1] for shot in found.shots])
 
 
 def _upright(ups: F64, up: Up | None) -> F64:
-    """(3, 3) the smallest rotation that takes `up` to +z."""
+    """Smallest rotation (3, 3) that maps `up` to +z."""
     from scipy.spatial.transform import Rotation
 
     if up is None:
@@ -175,7 +183,7 @@ def _upright(ups: F64, up: Up | None) -> F64:
     direction = ups.mean(axis=0) if up == "photos" else np.array(up, np.float64)
     length = np.linalg.norm(direction)
     if not length > 1e-6:
-        raise SettingError("up", f"{up} is no direction", "Give three numbers that are not all zero")
+        raise SettingError("up", f"{up} is not a direction", "Give three numbers that are not all zero")
     z = np.array([0.0, 0.0, 1.0])
     axis = np.cross(direction / length, z)
     sine, cosine = np.linalg.norm(axis), direction[2] / length
@@ -184,18 +192,18 @@ def _upright(ups: F64, up: Up | None) -> F64:
     return Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix()
 
 
-def _cloud(cloud: Path, folder: Path, onto: Similarity | None, crs: str, link: bool) -> str:
-    """The name in the tile of a cloud: as it is, or, where it moves or its format isn't kept, written anew as LAZ."""
-    stays = onto is None or (onto.scale == 1 and (onto.rotation == np.eye(3)).all() and not onto.translation.any())
-    if stays and cloud.suffix.lower() in cloud_io.AS_THEY_ARE:
-        return place(cloud, folder, f"cloud{cloud.suffix.lower()}", link)
+def _add_cloud(cloud: Path, folder: Path, onto: Similarity | None, crs: str, link: bool) -> str:
+    """Copy or link a cloud into the tile, or transform it and convert it to LAZ; returns its name there."""
+    unchanged = onto is None or (onto.scale == 1 and (onto.rotation == np.eye(3)).all() and not onto.translation.any())
+    if unchanged and cloud.suffix.lower() in cloud_io.COPIED_SUFFIXES:
+        return add_file(cloud, folder, f"cloud{cloud.suffix.lower()}", link)
 
     def parts() -> Iterator[PointCloud]:
         for part in cloud_io.chunks(cloud, Frame(crs)):
             xyz = part.frame.to_crs(part.xyz)
             yield _local(crs, xyz if onto is None else onto.apply(xyz), part)
 
-    las.write_parts(folder / "cloud.laz", parts(), software="")  # its classes are the survey's still
+    las.write_parts(folder / "cloud.laz", parts(), software="")  # class codes stay those of the survey
     return "cloud.laz"
 
 
@@ -206,7 +214,7 @@ def _sparse(model: Path, placed: Model, crs: str) -> PointCloud:
 
 
 def _local(crs: str, xyz: F64, like: PointCloud) -> PointCloud:
-    """CRS coordinates with the attributes of `like`, to be written at once: in the CRS's units, not metres."""
+    """A cloud from CRS coordinates with the attributes of `like`; its unit is that of the CRS, for writing only."""
     origin = np.floor(np.median(xyz, axis=0)).tolist()
     frame = Frame(crs, (origin[0], origin[1], origin[2]))
     return replace(like, frame=frame, xyz=frame.to_local(xyz).astype(np.float32), normal=None)

@@ -1,4 +1,4 @@
-"""What importers share: a tile's or survey's folder appears whole or not at all; files are copied or linked into it."""
+"""Output folders of importers: created atomically, with files copied or linked into them."""
 
 from __future__ import annotations
 
@@ -12,39 +12,39 @@ from typing import Literal
 from scan2sim.pipeline.core.errors import InputError, SettingError, from_os_error
 from scan2sim.pipeline.io import file_checks
 
-MARK = {"tile": "tile.toml", "survey": "survey.toml", "world": "metadata.json", "page": "view.js"}
-"""Of what is made, the file by which it is known."""
+MARKER_FILE = {"tile": "tile.toml", "survey": "survey.toml", "world": "metadata.json", "page": "view.js"}
+"""File by which a folder of each kind is recognized."""
 
 
 @contextmanager
 def tile_folder(
     out: Path, overwrite: bool = False, kind: Literal["tile", "survey", "world", "page"] = "tile"
 ) -> Iterator[Path]:
-    """A temporary folder beside `out` that takes its place when the block ends well, and is removed otherwise.
+    """Temporary folder beside `out`: renamed to `out` when the block succeeds, deleted when it raises.
 
     Args:
-        out: the folder.
-        overwrite: replace one that holds a tile (or what `kind` says).
-        kind: what is made; its file marks a folder that may be overwritten.
+        out: the folder to create.
+        overwrite: replace an existing folder of the same kind.
+        kind: kind of content; only folders with its marker file are overwritten.
 
     Raises:
-        SettingError: `out` exists, holds something, and `overwrite` is false; or it is a file.
-        SpaceError: the disk is full or may not be written to.
+        SettingError: `out` is a file, or a folder that isn't empty and may not be overwritten.
+        SpaceError: the disk is full or not writable.
     """
     out = Path.cwd() / out
     if out.exists() and not out.is_dir():
-        raise SettingError(out, "is a file, not a folder", "Name another folder")
+        raise SettingError(out, "is a file, not a folder", "Choose another folder")
     if out.is_dir() and any(out.iterdir()) and not overwrite:
-        raise SettingError(out, "exists and is not empty", "Name a new folder, or have it overwritten: --overwrite")
-    if out.is_dir() and any(out.iterdir()) and not (out / MARK[kind]).is_file():
-        raise SettingError(out, f"is no {kind}, and is not overwritten", f"Name a new folder, or a {kind}'s")
+        raise SettingError(out, "exists and is not empty", "Choose a new folder, or replace it with --overwrite")
+    if out.is_dir() and any(out.iterdir()) and not (out / MARKER_FILE[kind]).is_file():
+        raise SettingError(out, f"is not a {kind}, so it is not overwritten", f"Choose a new folder, or a {kind}'s")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
     except OSError as error:
         raise from_os_error(error, out) from error
     try:
-        work.chmod(0o755)  # mkdtemp makes it private
+        work.chmod(0o755)  # mkdtemp makes it accessible to the user only
         yield work
         if out.exists():
             old = Path(tempfile.mkdtemp(prefix=f".{out.name}-old-", dir=out.parent))
@@ -59,16 +59,16 @@ def tile_folder(
         shutil.rmtree(work, ignore_errors=True)
 
 
-def place(source: Path, folder: Path, name: str, link: bool = False) -> str:
-    """Copy (or link, by absolute path) `source` to `folder/name`; returns `name`.
+def add_file(source: Path, folder: Path, name: str, link: bool = False) -> str:
+    """Copy (or symlink, by absolute path) `source` to `folder/name`; returns `name`.
 
     Raises:
-        InputError: the source is missing, or another file has already taken the name.
+        InputError: the source is missing, or the name is already used by another file.
     """
     target = folder / name
-    file_checks.check(source, "Put it there, or leave out what names it")
+    file_checks.check(source, "Check the path, or remove the entry that names it")
     if target.exists() or target.is_symlink():
-        raise InputError(source, f"is the second file to be called {name} in the tile", "Rename one of them")
+        raise InputError(source, f"is the second file with the name {name} in the tile", "Rename one of them")
     target.parent.mkdir(parents=True, exist_ok=True)
     if link:
         target.symlink_to(source.resolve())
@@ -78,5 +78,5 @@ def place(source: Path, folder: Path, name: str, link: bool = False) -> str:
 
 
 def without_parents(name: str) -> str:
-    """A file name that stays in the tile's folder: `../a/b.jpg` and `/a/b.jpg` become `a/b.jpg`."""
+    """A relative file name inside the tile's folder: `../a/b.jpg` and `/a/b.jpg` become `a/b.jpg`."""
     return "/".join(part for part in Path(name).parts if part not in ("..", ".", Path(name).anchor))

@@ -1,20 +1,21 @@
-"""GPS time, as clouds and photos have it, as dates."""
+"""Conversion of GPS time, as stored in clouds and photos, to UTC."""
 
 from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
 
-WEEK, ADJUSTED = 604_800.0, 1e9  # seconds: of a GPS week; by which "adjusted" GPS times are less
-EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
-LEAP = 18.0  # seconds that GPS time is ahead of UTC since 2017
+GPS_WEEK_S = 604_800.0
+ADJUSTED_OFFSET_S = 1e9  # LAS's "adjusted standard GPS time" is GPS time minus this
+GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
+LEAP_SECONDS = 18.0  # GPS time minus UTC since 2017
 
 
 def from_gps(seconds: float) -> datetime | None:
-    """UTC of an "adjusted" GPS time (LAS: seconds since 1980, less a billion); None where it can't be one.
+    """UTC of an "adjusted" GPS time (LAS: seconds since 1980 minus a billion); None where it can't be one.
 
-    Times that count from the beginning of a week don't tell which week. Exact since 2017; before, leap seconds that
-    weren't yet there put it some seconds off.
+    Seconds of the week are refused, as the week is unknown. Exact since 2017; earlier dates are off by up to 18 s, as
+    the leap seconds of 2017 are applied.
     """
-    if 0 <= seconds <= WEEK or not -ADJUSTED < seconds < ADJUSTED:
+    if 0 <= seconds <= GPS_WEEK_S or not -ADJUSTED_OFFSET_S < seconds < ADJUSTED_OFFSET_S:
         return None
-    return EPOCH + timedelta(seconds=seconds + ADJUSTED - LEAP)
+    return GPS_EPOCH + timedelta(seconds=seconds + ADJUSTED_OFFSET_S - LEAP_SECONDS)

@@ -1,4 +1,4 @@
-"""Numbers in text files, block by block: no line, and no file, needs to fit into memory on its own word."""
+"""Numbers in text files, parsed block by block: memory is bounded whatever the file's size or line length."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ import numpy as np
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64
 
-BLOCK = 1 << 24
-"""Bytes that are parsed at a time, and that a line must not exceed."""
+BLOCK_BYTES = 1 << 24
+"""Bytes that are parsed at a time; also the maximum length of a line."""
 
 
 def blocks(path: Path, file: BinaryIO) -> Iterator[list[str]]:
-    """The lines of an open file from where it stands, some at a time; empty ones are left out.
+    """The lines of an open file from its current position, block by block, without empty ones.
 
     Raises:
-        InputError: it is no text, or has a line that never ends.
+        InputError: it is not text, or has a line longer than `BLOCK_BYTES`.
     """
     rest = b""
-    while data := file.read(BLOCK):
+    while data := file.read(BLOCK_BYTES):
         head, newline, tail = (rest + data).rpartition(b"\n")
-        if not newline and len(tail) >= BLOCK:
-            raise InputError(path, f"has a line of more than {BLOCK >> 20} MB", "Export it again, a point a line")
+        if not newline and len(tail) >= BLOCK_BYTES:
+            cause = f"has a line of more than {BLOCK_BYTES >> 20} MB"
+            raise InputError(path, cause, "Export it again, one point per line")
         rest = tail
         if lines := _lines(path, head):
             yield lines
@@ -37,17 +38,17 @@ def _lines(path: Path, data: bytes) -> list[str]:
     try:
         lines = data.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
-        raise InputError(path, f"is no text ({error})", "Export it again, as UTF-8") from None
+        raise InputError(path, f"is not text ({error})", "Export it again, as UTF-8") from None
     return [line for line in lines if line.strip()]
 
 
-def numbers(lines: list[str], delimiter: str | None, wide: int) -> F64:
-    """(N, wide) of lines; `delimiter` None is any white space.
+def numbers(lines: list[str], delimiter: str | None, width: int) -> F64:
+    """Parse lines of `width` numbers each to (N, width); `delimiter` None: any white space.
 
     Raises:
-        ValueError: a line holds something else, or another number of them.
+        ValueError: a line contains something else, or a different number of values.
     """
     values = np.loadtxt(lines, np.float64, delimiter=delimiter, comments=None, ndmin=2)
-    if values.size and values.shape[1] != wide:
-        raise ValueError(f"a line has {values.shape[1]} numbers, not {wide}")
-    return values.reshape(-1, wide)
+    if values.size and values.shape[1] != width:
+        raise ValueError(f"a line has {values.shape[1]} numbers, not {width}")
+    return values.reshape(-1, width)

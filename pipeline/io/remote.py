@@ -1,4 +1,4 @@
-"""Folders in object storage (by fsspec: `s3://`, `gs://`, `az://`, ...), each with its likeness on this machine."""
+"""Folders in object storage (through fsspec: `s3://`, `gs://`, `az://`, ...), each mirrored in a local cache."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from scan2sim.pipeline.core.errors import InputError, UnavailableError
 from scan2sim.pipeline.core.paths import inside
 from scan2sim.pipeline.core.step import Report, silent
 
-INDEX, PUSHED = ".remote.json", ".pushed.json"
-CACHE = "SCAN2SIM_CACHE"
-"""Environment variable: folder of likenesses; default: `~/.cache/scan2sim`. The same on all machines of a cluster."""
+PULLED_INDEX, PUSHED_INDEX = ".remote.json", ".pushed.json"
+CACHE_VARIABLE = "SCAN2SIM_CACHE"
+"""Environment variable: the cache folder; default: `~/.cache/scan2sim`. The same on all machines of a cluster."""
 
 
-def is_remote(place: str | Path) -> bool:
-    """Whether a place is a URL of object storage."""
-    return "://" in str(place)
+def is_remote(location: str | Path) -> bool:
+    """Whether a location is a URL of object storage."""
+    return "://" in str(location)
 
 
-def likeness(place: str | Path) -> Path:
-    """Where the files of a place are on this machine: itself, or the likeness of a folder in object storage."""
-    return Remote.of(str(place)).local if is_remote(place) else Path(place)
+def local_copy(location: str | Path) -> Path:
+    """Local path of a location: the path itself, or the cached copy of a folder in object storage."""
+    return Remote.of(str(location)).local if is_remote(location) else Path(location)
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class Remote:
     """A folder in object storage.
 
     Attributes:
-        url: as fsspec knows it, without a slash at its end.
-        local: where its files are on a machine that has fetched them.
+        url: fsspec URL without a trailing slash.
+        local: local folder that its files are cached in.
     """
 
     url: str
@@ -44,55 +44,55 @@ class Remote:
 
     @classmethod
     def of(cls, url: str) -> Remote:
-        """With its likeness in this user's cache."""
+        """The remote folder at a URL, cached in this user's cache folder."""
         url = url.rstrip("/")
-        cache = Path(os.environ.get(CACHE) or Path.home() / ".cache" / "scan2sim")
+        cache = Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "scan2sim")
         return cls(url, cache / f"{url.rsplit('/', 1)[-1]}-{hashlib.sha256(url.encode()).hexdigest()[:12]}")
 
     def below(self, name: str) -> Remote:
-        """A folder in it."""
+        """A subfolder."""
         return Remote(f"{self.url}/{name}", self.local / name)
 
     def pull(self, names: Iterable[str]) -> bool:
-        """Fetch files by their names in the folder, each whole or not at all; False if one isn't there.
+        """Download files by their names in the folder, each one atomically; False if one doesn't exist.
 
         Raises:
-            InputError: a name that leads out of the folder.
+            InputError: a name points outside of the folder.
             UnavailableError: the storage can't be reached or read.
         """
         files, root = self._open()
         for name in names:
             target = self._path(name)
             target.parent.mkdir(parents=True, exist_ok=True)
-            handle, fresh = tempfile.mkstemp(prefix=".fetch-", dir=target.parent)
+            handle, temporary = tempfile.mkstemp(prefix=".fetch-", dir=target.parent)
             os.close(handle)
             try:
-                files.get_file(f"{root}/{name}", fresh)
-                Path(fresh).replace(target)
+                files.get_file(f"{root}/{name}", temporary)
+                Path(temporary).replace(target)
             except FileNotFoundError:
                 return False
-            except Exception as error:  # each storage has errors of its own
+            except Exception as error:  # each storage has its own exception types
                 raise self._unreachable(error) from error
             finally:
-                Path(fresh).unlink(missing_ok=True)
+                Path(temporary).unlink(missing_ok=True)
         return True
 
     def pull_all(self, report: Report = silent) -> Path:
-        """Bring the likeness up to date: what is new or changed is fetched, what is gone removed; returns it.
+        """Synchronize the local copy: download new and changed files, delete removed ones; returns its folder.
 
         Raises:
-            InputError: there is nothing, or a key leads out of the folder.
+            InputError: the remote folder is empty, or a key points outside of it.
             UnavailableError: the storage can't be reached or read.
         """
         files, root = self._open()
-        index = self.local / INDEX
+        index = self.local / PULLED_INDEX
         try:
             files.invalidate_cache()
             found = {path[len(root) + 1 :]: str(files.ukey(path)) for path in files.find(root)}
         except Exception as error:
             raise self._unreachable(error) from error
         if not found:
-            raise InputError(self.url, "there is nothing", "Check the address; `scan2sim tile --copy` makes a survey")
+            raise InputError(self.url, "is empty", "Check the address; `scan2sim tile --copy` creates a survey")
         for name in found:
             self._path(name)
         known: dict[str, str] = json.loads(index.read_text(encoding="utf-8")) if index.is_file() else {}
@@ -107,7 +107,7 @@ class Remote:
         return self.local
 
     def push(self, names: Iterable[str]) -> None:
-        """Store files of the likeness, in order; what links lead to is stored, not links.
+        """Upload files of the local copy, in order; links are followed.
 
         Raises:
             UnavailableError: the storage can't be reached or written to.
@@ -120,7 +120,7 @@ class Remote:
             raise self._unreachable(error) from error
 
     def remove(self, name: str) -> None:
-        """Take a file out of the storage, if it is there.
+        """Delete a file from the storage, if it exists.
 
         Raises:
             UnavailableError: as `push`.
@@ -134,37 +134,37 @@ class Remote:
             raise self._unreachable(error) from error
 
     def push_all(self, names: Iterable[str]) -> None:
-        """Store those of the files that are new or have changed since this was last done from here.
+        """Upload the files that are new or have changed since the last `push_all` from this machine.
 
         Raises:
             UnavailableError: as `push`.
         """
-        index = self.local / PUSHED
+        index = self.local / PUSHED_INDEX
         known: dict[str, list[int]] = json.loads(index.read_text(encoding="utf-8")) if index.is_file() else {}
-        marks = {}
+        stamps = {}
         for name in names:
             stat = (self.local / name).stat()
-            marks[name] = [stat.st_size, stat.st_mtime_ns]
-        self.push(name for name, mark in marks.items() if known.get(name) != mark)
-        index.write_text(json.dumps(marks), encoding="utf-8")
+            stamps[name] = [stat.st_size, stat.st_mtime_ns]
+        self.push(name for name, stamp in stamps.items() if known.get(name) != stamp)
+        index.write_text(json.dumps(stamps), encoding="utf-8")
 
     def _path(self, name: str) -> Path:
-        """Where a key's file is on this machine."""
+        """Local path of a key."""
         try:
             return inside(self.local, name)
         except InputError:
-            remedy = "Take that key out of the storage: a survey's keys are plain paths below its folder"
-            raise InputError(f"{self.url}/{name}", "is a key that leads out of its folder", remedy) from None
+            remedy = "Delete that key from the storage: a survey's keys are plain paths below its folder"
+            raise InputError(f"{self.url}/{name}", "is a key that points outside of its folder", remedy) from None
 
     def _open(self) -> tuple[Any, str]:
-        """The file system and the folder's path in it."""
+        """The fsspec file system and the folder's path in it."""
         import fsspec
 
         try:
             files, root = fsspec.core.url_to_fs(self.url)
         except (ImportError, ValueError) as error:
             kind = self.url.split("://")[0]
-            remedy = f"Install what fsspec needs for {kind}:// (pip install 'scan2sim[s3]' for s3)"
+            remedy = f"Install fsspec's package for {kind}:// (pip install 'scan2sim[s3]' for s3)"
             raise UnavailableError(self.url, str(error), remedy) from None
         return files, root.rstrip("/")
 

@@ -1,14 +1,14 @@
-"""The survey: `survey.toml` names the tiles that a corridor was cut into.
+"""The survey: `survey.toml` lists the tiles that a corridor was cut into.
 
 ```toml
 name = "my_town"
 crs = "EPSG:32633"          # of all tiles
 units = "m"                 # "ft", "us-ft"; only for local coordinates
-length = 100.0              # metres of the path a tile
-buffer = 5.0                # metres that tiles' clouds reach beyond their borders
+length = 100.0              # metres of path per tile
+buffer = 5.0                # metres by which tiles' clouds extend beyond their borders
 tiles = ["my_town_0000", "my_town_0001"]     # folders beside this file, in order along the path
 ```
-What of the plane is a tile's own stands in its `tile.toml` under `[cell]`.
+The area that belongs to a tile is in its `tile.toml` under `[cell]`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from scan2sim.pipeline.io.tile import tile_name
 
 
 class SurveyFile(BaseModel):
-    """All of `survey.toml`."""
+    """Schema of `survey.toml`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -43,14 +43,14 @@ class SurveyFile(BaseModel):
 
 @dataclass(frozen=True)
 class Survey:
-    """What `survey.toml` names, checked.
+    """Content of a `survey.toml`, validated.
 
     Attributes:
         path: the `survey.toml`.
-        name: of the survey.
+        name: name of the survey.
         tiles: the `tile.toml` of every tile by its name, in order along the path.
-        length: metres of the path a tile.
-        buffer: metres that tiles' clouds reach beyond their borders.
+        length: metres of path per tile.
+        buffer: metres by which tiles' clouds extend beyond their borders.
     """
 
     path: Path
@@ -61,12 +61,12 @@ class Survey:
 
 
 def read_survey(path: Path) -> Survey:
-    """Read and check a survey: a `survey.toml`, or a folder that holds one.
+    """Read and validate a survey: a `survey.toml`, or a folder that contains one.
 
-    A tile that can't be read is left to the reader of tiles: it is no reason to refuse the others.
+    An unreadable tile is not an error here, so that the other tiles can still be processed; `read_tile` reports it.
 
     Raises:
-        InputError: naming the file, the field and what was expected; a tile is missing or named twice; two CRS.
+        InputError: the survey is invalid (names the field), a tile is missing or listed twice, or CRS differ.
     """
     path = path / "survey.toml" if path.is_dir() else path
     spec = _parse(path)
@@ -75,13 +75,13 @@ def read_survey(path: Path) -> Survey:
     for folder in spec.tiles:
         tile = path.parent / folder / "tile.toml"
         if not tile.is_file():
-            raise InputError(tile, f"is missing (named in {path.name})", "Put it back, or take it out of `tiles`")
+            raise InputError(tile, f"file not found (named in {path.name})", "Restore it, or remove it from `tiles`")
         name, crs[folder] = _peek(tile)
         if name in tiles:
             raise InputError(
                 path,
                 f"names two tiles {name} ({tiles[name].parent.name} and {tile.parent.name})",
-                "Take one of them out of `tiles`, or give it another `name`",
+                "Remove one of them from `tiles`, or give it another `name`",
             )
         tiles[name] = tile
     _check_crs(path, {folder: text for folder, text in crs.items() if text})
@@ -91,7 +91,7 @@ def read_survey(path: Path) -> Survey:
 def write_survey(
     folder: Path, *, name: str, crs: str, length: float, buffer: float, tiles: Sequence[str], units: str | None = None
 ) -> Path:
-    """Write `folder/survey.toml` and return its path; arguments are as in the file."""
+    """Write `folder/survey.toml` and return its path; arguments are those of the file."""
     import tomli_w
 
     body: dict[str, Any] = {"name": name, "crs": crs}
@@ -106,12 +106,12 @@ def write_survey(
 
 
 def _parse(path: Path) -> SurveyFile:
-    absent = ("there is no survey here", "Name a survey.toml or its folder; `scan2sim tile` cuts one from a tile")
-    return toml.read(path, SurveyFile, absent=absent, fields="docs/formats.md lists the fields of a survey")
+    absent = ("no survey found", "Give a survey.toml or its folder; `scan2sim tile` cuts a tile into a survey")
+    return toml.read(path, SurveyFile, absent=absent, fields="docs/reference/formats.md lists the fields of a survey")
 
 
 def _peek(tile: Path) -> tuple[str, str]:
-    """A tile's name and CRS, without opening its clouds; what can't be read: its folder's name, and an empty CRS."""
+    """A tile's name and CRS, without opening its clouds; if unreadable, its folder's name and an empty CRS."""
     try:
         body = tomllib.loads(tile.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError, OSError):
@@ -122,12 +122,12 @@ def _peek(tile: Path) -> tuple[str, str]:
 
 
 def _check_crs(path: Path, known: Mapping[str, str]) -> None:
-    """Refuse tiles (by their folders) from two CRS."""
+    """Raise an error if tiles (by their folders) have different CRS."""
     for folder, crs in known.items():
         first, other = next(iter(known.items()))
         if crs != other:
             raise InputError(
                 path,
                 f"has tiles from two CRS: {folder} is in {crs[:60]}, {first} in {other[:60]}",
-                "Cut all of it from one corridor, in one CRS",
+                "Cut all tiles from one corridor, in one CRS",
             )

@@ -1,15 +1,15 @@
-"""The tile: `tile.toml` names clouds, photos, cameras and poses, CRS and units.
+"""The tile: `tile.toml` lists clouds, photos, cameras and poses, CRS and units.
 
 ```toml
 name = "my_street"
 crs = "EPSG:32633"          # code or WKT; "local" without georeference; default: the clouds' own
-units = "m"                 # "ft", "us-ft"; default: as the CRS says, else metres
+units = "m"                 # "ft", "us-ft"; default: the unit of the CRS, else metres
 clouds = ["cloud.laz"]      # LAS, LAZ, COPC, PLY, E57, PCD, XYZ, CSV; coordinates in that CRS and unit
 trajectory = "path.csv"     # optional: the scanner's path, time,x,y,z or with rotations (.csv, .tum)
 orthophoto = "ortho.tif"    # optional: GeoTIFF, or JPEG, PNG, TIFF with a world file; in the CRS
-footprints = "houses.gpkg"  # optional: where buildings stand, GeoJSON or GeoPackage
+footprints = "houses.gpkg"  # optional: building footprints, GeoJSON or GeoPackage
 
-[classes]                   # optional: what codes of the clouds are, where they differ from docs/formats.md's
+[classes]                   # optional: meaning of class codes of the clouds that differ from docs/reference/formats.md
 65 = "noise"
 
 [[cameras]]
@@ -27,11 +27,11 @@ position = [500010.2, 5400020.1, 210.5]               # camera centre, CRS coord
 rotation = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]        # camera to world; x right, y down, z forward
 time = 1234.5               # optional: GPS time, seconds
 mask = "masks/0001.png"     # optional: 0 where the photo must not be used
-name = "photos/0001"        # optional: what it is called; default: the file without its suffix
+name = "photos/0001"        # optional: name of the view; default: the file without its suffix
 ```
-Paths are relative to the `tile.toml`. A tile that was cut from a survey also says what of it is its own:
+Paths are relative to the `tile.toml`. A tile that was cut from a survey also has its Voronoi cell:
 `[cell]` with `seed` (x, y in the CRS) and `[cell.neighbours]`, names of tiles to their seeds
-(`pipeline.tiling.voronoi_cell`). A generated tile also names its ground truth:
+(`pipeline.tiling.voronoi_cell`). A generated tile also has its ground truth:
 `[truth]` with `mesh` and `points`.
 """
 
@@ -57,8 +57,8 @@ from scan2sim.pipeline.io.geodata import orthophoto
 from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 Vector = tuple[float, float, float]
-FARTHEST, STRONGEST = 1e6, 1e6
-"""Pixels that a camera's centre may be from its first, and coefficients of its distortion."""
+MAX_PIXELS, MAX_DISTORTION = 1e6, 1e6
+"""Limits of a camera's focal lengths and centre (pixels) and of its distortion coefficients."""
 DISTORTION_LENGTHS = {
     "pinhole": (0,), "opencv": (0, 4, 5, 8), "fisheye": (0, 4), "equirectangular": (0,), "orthographic": (0,),
 }  # fmt: skip
@@ -107,7 +107,7 @@ class CellEntry(_Strict):
 
 
 class TileFile(_Strict):
-    """All of `tile.toml`."""
+    """Schema of `tile.toml`."""
 
     name: Name
     crs: str | None = None
@@ -124,13 +124,13 @@ class TileFile(_Strict):
 
 
 def read_tile(path: Path) -> Tile:
-    """Read and check a tile: a `tile.toml`, or a folder that holds one.
+    """Read and validate a tile: a `tile.toml`, or a folder that contains one.
 
     The frame's origin is the middle of the clouds' bounding box in x and y and its bottom in z,
     in whole metres.
 
     Raises:
-        InputError: naming the file, the field and what was expected.
+        InputError: names the file, the field and what was expected.
     """
     path = path / "tile.toml" if path.is_dir() else path
     spec = read_spec(path)
@@ -143,8 +143,8 @@ def read_tile(path: Path) -> Tile:
     frame = Frame(crs, (x, y, z), unit)
     cameras = {entry.id: _camera(path, entry) for entry in spec.cameras}
     if len(cameras) < len(spec.cameras):
-        twice = next(c.id for i, c in enumerate(spec.cameras) if c.id in {other.id for other in spec.cameras[:i]})
-        raise InputError(path, f"has two cameras `{twice}`", "Give each an id of its own")
+        duplicate = next(c.id for i, c in enumerate(spec.cameras) if c.id in {other.id for other in spec.cameras[:i]})
+        raise InputError(path, f"has two cameras `{duplicate}`", "Give each camera a unique id")
     views = [_view(path, i, entry, cameras, frame) for i, entry in enumerate(spec.photos)]
     if spec.orthophoto:
         views.append(orthophoto.read_view(_existing(path, spec.orthophoto, "orthophoto"), frame, float(high[2])))
@@ -182,8 +182,9 @@ def write_tile(
     """Write `folder/tile.toml` and return its path.
 
     Args:
+        folder: created if it doesn't exist; file names are relative to it.
         photos: dicts with the keys of a `[[photos]]` entry; `position` and `rotation` may be arrays.
-        others: as in `tile.toml`; file names relative to `folder`.
+        others: as in `tile.toml`.
     """
     import tomli_w
 
@@ -215,11 +216,11 @@ def write_tile(
     return path
 
 
-def sources_of(path: Path) -> list[Path]:
-    """What a tile is made of but for its photos: the `tile.toml`, clouds, trajectory, orthophoto, footprints.
+def source_files(path: Path) -> list[Path]:
+    """Files of a tile without its photos: the `tile.toml`, clouds, trajectory, orthophoto, footprints.
 
     Raises:
-        InputError: it can't be read.
+        InputError: the `tile.toml` can't be read.
     """
     spec = read_spec(path)
     others = (spec.trajectory, spec.orthophoto, spec.footprints)
@@ -227,52 +228,56 @@ def sources_of(path: Path) -> list[Path]:
 
 
 def tile_name(text: str) -> str:
-    """`text` made fit for a tile's name (letters, digits, underscores)."""
+    """Turn `text` into a valid tile name (letters, digits, underscores)."""
     return "".join(c if c.isascii() and c.isalnum() else "_" for c in text).strip("_") or "tile"
 
 
 def read_spec(path: Path) -> TileFile:
-    """What a `tile.toml` says; what it names is not looked at.
+    """Content of a `tile.toml`, validated; the files that it names are not checked.
 
     Raises:
-        InputError: it is missing, or not as it should be.
+        InputError: it doesn't exist or is invalid.
     """
-    absent = ("there is no tile here", "Name a tile.toml or its folder; `scan2sim import` makes one from your files")
-    return toml.read(path, TileFile, absent=absent, fields="docs/formats.md lists the fields of a tile")
+    absent = ("no tile found", "Give a tile.toml or its folder; `scan2sim import` creates one from your files")
+    return toml.read(path, TileFile, absent=absent, fields="docs/reference/formats.md lists the fields of a tile")
 
 
 def _existing(tile: Path, name: str, field: str) -> Path:
     path = tile.parent / name
     cause = file_checks.problem(path)
     if cause is not None:
-        raise InputError(path, f"{cause} (named under `{field}` of {tile.name})", file_checks.PUT_THERE)
+        raise InputError(path, f"{cause} (named under `{field}` of {tile.name})", file_checks.CHECK_PATH)
     return path
 
 
 def _cloud(tile: Path, name: str) -> Path:
     path = _existing(tile, name, "clouds")
-    if path.name == "ept.json":  # whose points are in other files: a change of them would go unnoticed
-        raise InputError(path, "is an index of many files", "`scan2sim import clouds` makes one LAZ file of it")
+    if path.name == "ept.json":  # its points are in other files, whose changes the result cache would not detect
+        raise InputError(path, "is an index of many files", "Convert it to LAZ with `scan2sim import clouds`")
     return path
 
 
 def _camera(tile: Path, entry: CameraEntry) -> Camera:
     where = f"camera `{entry.id}`"
     if min(entry.size) < 1:
-        raise InputError(tile, f"{where}: size {entry.size} is not positive", "Give the photo's size in pixels")
+        raise InputError(
+            tile, f"{where}: size {entry.size} is not positive", "Give the photo's width and height in pixels"
+        )
     if entry.model != "equirectangular" and not (
-        np.isfinite(entry.focal).all() and min(entry.focal) > 0 and max(entry.focal) <= FARTHEST
+        np.isfinite(entry.focal).all() and min(entry.focal) > 0 and max(entry.focal) <= MAX_PIXELS
     ):
         raise InputError(
             tile,
-            f"{where}: focal {entry.focal} is not positive, or more than {FARTHEST:,.0f}",
+            f"{where}: focal {entry.focal} is not positive, or exceeds {MAX_PIXELS:,.0f}",
             "Give fx and fy in pixels",
         )
-    if not (np.isfinite(entry.centre).all() and np.abs(entry.centre).max() <= FARTHEST):
-        raise InputError(tile, f"{where}: centre {entry.centre} is no place in a photo", "Give cx and cy in pixels")
-    if not (np.isfinite(entry.distortion).all() and np.abs(entry.distortion).max(initial=0) <= STRONGEST):
+    if not (np.isfinite(entry.centre).all() and np.abs(entry.centre).max() <= MAX_PIXELS):
+        raise InputError(tile, f"{where}: centre {entry.centre} is out of range", "Give cx and cy in pixels")
+    if not (np.isfinite(entry.distortion).all() and np.abs(entry.distortion).max(initial=0) <= MAX_DISTORTION):
         raise InputError(
-            tile, f"{where}: distortion {entry.distortion} is none of a lens", f"Give numbers within {STRONGEST:,.0f}"
+            tile,
+            f"{where}: distortion {entry.distortion} is out of range",
+            f"Give coefficients of at most {MAX_DISTORTION:,.0f}",
         )
     if len(entry.distortion) not in DISTORTION_LENGTHS[entry.model]:
         lengths = " or ".join(map(str, DISTORTION_LENGTHS[entry.model]))
@@ -294,14 +299,14 @@ def _camera_entry(key: str, camera: Camera) -> dict[str, Any]:
 def _view(tile: Path, index: int, entry: PhotoEntry, cameras: dict[str, Camera], frame: Frame) -> View:
     where = f"photo {index} ({entry.file})"
     if entry.camera not in cameras:
-        raise InputError(tile, f"{where}: there is no camera `{entry.camera}`", f"Cameras are: {', '.join(cameras)}")
+        raise InputError(tile, f"{where}: unknown camera `{entry.camera}`", f"Cameras are: {', '.join(cameras)}")
     rotation, position = np.array(entry.rotation), np.array(entry.position)
     if not (np.isfinite(rotation).all() and np.isfinite(position).all()):
-        raise InputError(tile, f"{where}: its pose holds NaN or infinity", "Mend the pose, or leave the photo out")
+        raise InputError(tile, f"{where}: its pose contains NaN or infinity", "Fix the pose, or remove the photo")
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
         raise InputError(
             tile,
-            f"{where}: `rotation` is no rotation (rows must be orthonormal, determinant +1)",
+            f"{where}: `rotation` is not a rotation matrix (rows must be orthonormal, determinant +1)",
             "Give the 3x3 camera-to-world rotation, camera axes x right, y down, z forward",
         )
     pose = np.eye(4)

@@ -1,14 +1,14 @@
-"""Trajectory files, told apart by their suffix; positions in them are CRS coordinates of a `Frame`.
+"""Trajectory files, one format per suffix; their positions are CRS coordinates of a `Frame`.
 
-| suffix | holds |
+| suffix | content |
 | --- | --- |
-| .csv | a heading, then time,x,y,z[,qx,qy,qz,qw][,unsure][,sx,sy,sz[,srx,sry,srz]]: all but correlations |
-| .tum | time x y z qx qy qz qw a line, as the TUM benchmark and evo have it |
-| .kitti | 12 numbers a line, row-major 3x4; ten poses a second unless times are given |
-| .geojson | the path in WGS84, and a point for each unsure stretch; only written |
+| .csv | a header line, then time,x,y,z[,qx,qy,qz,qw][,unsure][,sx,sy,sz[,srx,sry,srz]]: all but correlations |
+| .tum | time x y z qx qy qz qw per line, the format of the TUM benchmark and evo |
+| .kitti | 12 numbers per line, row-major 3x4; ten poses per second unless times are given |
+| .geojson | the path in WGS84, and a point for each unsure section; write-only |
 
-Quaternions turn the sensor's axes to the world's, scalar last. `sx` to `sz` are standard deviations in the CRS's
-unit, `srx` to `srz` in radians. Files of other suffixes are told by their first line.
+Quaternions rotate sensor axes to world axes, scalar last. `sx` to `sz` are standard deviations in the CRS's unit,
+`srx` to `srz` in radians. The format of files with other suffixes is detected from their first line.
 """
 
 from __future__ import annotations
@@ -28,112 +28,116 @@ from scan2sim.pipeline.core.types import F64, Frame, Trajectory
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.geodata import crs as crs_io
 
-POSITION = ("time", "x", "y", "z")
-QUATERNION = ("qx", "qy", "qz", "qw")
-DEVIATION = ("sx", "sy", "sz", "srx", "sry", "srz")
+POSITION_COLUMNS = ("time", "x", "y", "z")
+QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
+SIGMA_COLUMNS = ("sx", "sy", "sz", "srx", "sry", "srz")
 REMEDIES = {
-    ".csv": "Write a CSV: a heading, then time,x,y,z[,qx,qy,qz,qw] a line, CRS coordinates",
-    ".tum": "Write time x y z qx qy qz qw a line",
-    ".kitti": "Write 12 numbers a line, row-major 3x4",
+    ".csv": "Write a CSV: a header line, then time,x,y,z[,qx,qy,qz,qw] per line, CRS coordinates",
+    ".tum": "Write time x y z qx qy qz qw per line",
+    ".kitti": "Write 12 numbers per line, row-major 3x4",
 }
-KITTI_RATE = 10.0  # poses a second, as KITTI's cameras
-FARTHEST = 1e9
-"""Metres from a CRS's origin that no place has."""
-Lines = list[tuple[int, list[str]]]  # number in the file, from 1 on, and cells
+KITTI_RATE_HZ = 10.0  # KITTI's cameras: 10 poses per second
+MAX_COORDINATE_M = 1e9
+"""Plausibility limit: no position is farther from the origin of a CRS."""
+Lines = list[tuple[int, list[str]]]  # line number in the file, from 1 on, and cells
 
 
 def read(
     path: Path, frame: Frame | None = None, *, times: F64 | None = None, ordered: bool = True, timed: bool = False
 ) -> Trajectory:
-    """Read a trajectory into local coordinates of `frame` (by default those of the file itself).
+    """Read a trajectory into local coordinates of `frame` (default: coordinates of the file are kept).
 
     Args:
+        path: trajectory file.
+        frame: CRS and unit of the file's positions, and the local origin.
         times: (T,) seconds, for a .kitti file, which has none.
-        ordered: refuse times that don't ascend; otherwise lines are sorted by them.
-        timed: refuse a file without times, rather than count poses.
+        ordered: require ascending times; otherwise poses are sorted by time.
+        timed: require times, rather than assume `KITTI_RATE_HZ`.
 
     Raises:
-        InputError: naming file and line: unreadable, empty, NaN, wrong columns, times out of order, no rotation.
+        InputError: unreadable, empty, NaN, wrong columns, times out of order, invalid rotation; names file and line.
     """
     frame = frame or Frame()
     kind, lines = _lines(path)
     if kind == ".kitti":
         if timed and times is None:
-            raise InputError(path, "is no trajectory with times", REMEDIES[".csv"])
+            raise InputError(path, "has no times", REMEDIES[".csv"])
         trajectory = _from_kitti(path, lines, frame, times)
     else:
-        heading: tuple[str, ...] = POSITION + QUATERNION
+        columns: tuple[str, ...] = POSITION_COLUMNS + QUATERNION_COLUMNS
         if kind == ".csv":
-            heading, lines = _heading(path, lines)
-        trajectory = _from_columns(path, kind, heading, lines, frame)
-    far = np.flatnonzero(~(np.abs(trajectory.positions) < FARTHEST).all(axis=1))
+            columns, lines = _header_line(path, lines)
+        trajectory = _from_columns(path, kind, columns, lines, frame)
+    far = np.flatnonzero(~(np.abs(trajectory.positions) < MAX_COORDINATE_M).all(axis=1))
     if len(far):
-        raise _bad(path, kind, lines[far[0]][0], "a position that is nowhere on Earth", "Leave out what has no pose")
+        raise _bad(path, kind, lines[far[0]][0], "its position is out of range", "Remove lines without a pose")
     order = np.argsort(trajectory.times, kind="stable")
     if ordered and (np.diff(trajectory.times) <= 0).any():
         late = int(np.flatnonzero(np.diff(trajectory.times) <= 0)[0]) + 1
         number = lines[late][0] if late < len(lines) else late + 1
-        raise _bad(path, kind, number, "its time doesn't follow that of the line before", "Sort it, each time once")
-    return trajectory if ordered else _take(trajectory, order)
+        raise _bad(
+            path, kind, number, "its time is not after that of the previous line", "Sort by time, without duplicates"
+        )
+    return trajectory if ordered else _select(trajectory, order)
 
 
 def write(path: Path, trajectory: Trajectory, frame: Frame | None = None) -> None:
-    """Write a trajectory, whose positions are local to `frame`, as its suffix says; the file appears whole or not.
+    """Write a trajectory (positions local to `frame`) in the format of the path's suffix, atomically.
 
     Raises:
-        SettingError: unknown suffix; rotations are unknown but asked for; GeoJSON of a frame without a CRS.
-        DataError: nothing to write, or a pose with NaN.
-        SpaceError: the disk is full or may not be written to.
+        SettingError: unknown suffix; the format needs rotations but there are none; GeoJSON without a CRS.
+        DataError: the trajectory is empty or contains NaN.
+        SpaceError: the disk is full or not writable.
     """
     frame = frame or Frame()
     writers = {".csv": _to_csv, ".tum": _to_tum, ".kitti": _to_kitti, ".geojson": _to_geojson}
     kind = path.suffix.lower()
     if kind not in writers:
-        raise SettingError(path, "is no known trajectory format", f"End its name in one of {', '.join(writers)}")
+        raise SettingError(path, "has an unknown trajectory format", f"Use one of the suffixes {', '.join(writers)}")
     if kind in (".tum", ".kitti") and trajectory.rotations is None:
-        raise SettingError(path, "needs rotations, but only positions are known", "Write .csv or .geojson")
+        raise SettingError(path, "needs rotations, but the trajectory has only positions", "Write .csv or .geojson")
     if not len(trajectory) or not all(np.isfinite(part).all() for part in (trajectory.times, trajectory.positions)):
-        raise DataError(path, "its trajectory is empty or holds NaN", "Leave out what has no pose")
+        raise DataError(path, "the trajectory is empty or contains NaN", "Remove invalid poses")
     text = writers[kind](path, trajectory, frame)
-    with replacing(path) as fresh:
-        fresh.write_text(text, encoding="utf-8")
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends well, and is removed otherwise.
+def atomic_write(path: Path) -> Iterator[Path]:
+    """Temporary path beside `path`: renamed to `path` when the block succeeds, deleted when it raises.
 
     Raises:
-        SpaceError: the disk is full or may not be written to.
+        SpaceError: the disk is full or not writable.
     """
-    fresh = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        yield fresh
-        fresh.replace(path)
+        yield temporary
+        temporary.replace(path)
     except OSError as error:
         raise from_os_error(error, path) from error
     finally:
-        fresh.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def _bad(path: Path, kind: str, line: int, cause: str, remedy: str | None = None) -> InputError:
-    return InputError(path, f"is no trajectory (line {line}: {cause})", remedy or REMEDIES[kind])
+    return InputError(path, f"is not a valid trajectory (line {line}: {cause})", remedy or REMEDIES[kind])
 
 
 def _lines(path: Path) -> tuple[str, Lines]:
-    """The format of a file and its lines, without blank ones and (but for a CSV's heading) comments."""
+    """Format of a file and its lines, without blank ones and comments (except a CSV's header line)."""
     file_checks.check(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise from_os_error(error, path) from error
     except UnicodeDecodeError:
-        raise InputError(path, "is no trajectory (it is no text)", REMEDIES[".csv"]) from None
+        raise InputError(path, "is not a trajectory (not a text file)", REMEDIES[".csv"]) from None
     filled = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     plain = [(i, line) for i, line in filled if not line.lstrip().startswith("#")]
     kind = path.suffix.lower()
     if kind == ".geojson":
-        raise InputError(path, "is GeoJSON, which is only written", "Name the .csv beside it")
+        raise InputError(path, "is GeoJSON, which can only be written", "Give the .csv beside it")
     if kind not in REMEDIES:
         first = plain[0][1] if plain else ","
         kind = ".csv" if "," in first else {8: ".tum", 12: ".kitti"}.get(len(first.split()), ".csv")
@@ -141,24 +145,28 @@ def _lines(path: Path) -> tuple[str, Lines]:
         plain = filled[:1] + [line for line in plain if line not in filled[:1]]
     lines = [(i, line.split("," if kind == ".csv" else None)) for i, line in plain]
     if len(lines) <= (kind == ".csv"):
-        raise InputError(path, "is no trajectory (it holds no poses)", REMEDIES[kind])
+        raise InputError(path, "is not a trajectory (it contains no poses)", REMEDIES[kind])
     return kind, lines
 
 
-def _heading(path: Path, lines: Lines) -> tuple[tuple[str, ...], Lines]:
-    """Names of a CSV's columns, and the lines under them; four columns of other names are time,x,y,z."""
+def _header_line(path: Path, lines: Lines) -> tuple[tuple[str, ...], Lines]:
+    """Column names of a CSV, and the lines after them; four columns with other names are taken as time,x,y,z."""
     number, cells = lines[0]
     names = tuple(cell.strip(" #\t\"'").lower() for cell in cells)
     if all(_is_number(cell) for cell in cells):
-        raise _bad(path, ".csv", number, "it has no heading")
-    if set(POSITION) <= set(names):
-        partial = {"rotation": QUATERNION, "deviation": DEVIATION[:3], "turn deviation": DEVIATION[3:]}
+        raise _bad(path, ".csv", number, "it has no header line with column names")
+    if set(POSITION_COLUMNS) <= set(names):
+        partial = {
+            "rotation": QUATERNION_COLUMNS,
+            "position deviation": SIGMA_COLUMNS[:3],
+            "rotation deviation": SIGMA_COLUMNS[3:],
+        }
         for what, columns in partial.items():
             if 0 < len(set(columns) & set(names)) < len(columns):
                 raise _bad(path, ".csv", number, f"its {what} needs all of {','.join(columns)}")
         return names, lines[1:]
     if len(names) == 4:
-        return POSITION, lines[1:]
+        return POSITION_COLUMNS, lines[1:]
     raise _bad(path, ".csv", number, f"columns are {','.join(names)[:80]}")
 
 
@@ -171,7 +179,7 @@ def _is_number(text: str) -> bool:
 
 
 def _numbers(path: Path, kind: str, lines: Lines, width: int) -> F64:
-    """(T, width) the cells of all lines."""
+    """Parse the cells of all lines: (T, width)."""
     rows = np.empty((len(lines), width))
     for i, (number, cells) in enumerate(lines):
         if len(cells) != width:
@@ -182,7 +190,7 @@ def _numbers(path: Path, kind: str, lines: Lines, width: int) -> F64:
             raise _bad(path, kind, number, str(error)) from None
     odd = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(odd):
-        raise _bad(path, kind, lines[odd[0]][0], "holds NaN or infinity", "Leave out the lines that have no pose")
+        raise _bad(path, kind, lines[odd[0]][0], "contains NaN or infinity", "Remove lines without a pose")
     return rows
 
 
@@ -192,25 +200,27 @@ def _from_columns(path: Path, kind: str, names: tuple[str, ...], lines: Lines, f
     rows = _numbers(path, kind, lines, len(names))
     column = {name: rows[:, k] for k, name in enumerate(names)}
 
-    def block(wanted: Sequence[str]) -> F64 | None:
-        return np.stack([column[name] for name in wanted], axis=1) if set(wanted) <= set(column) else None
+    def block(columns: Sequence[str]) -> F64 | None:
+        return np.stack([column[name] for name in columns], axis=1) if set(columns) <= set(column) else None
 
-    quaternions = block(QUATERNION)
+    quaternions = block(QUATERNION_COLUMNS)
     if quaternions is not None:
         odd = np.flatnonzero(np.abs(np.linalg.norm(quaternions, axis=1) - 1) > 0.01)
         if len(odd):
-            raise _bad(path, kind, lines[odd[0]][0], "its quaternion is not of length 1", "Give qx, qy, qz, qw")
+            raise _bad(
+                path, kind, lines[odd[0]][0], "its quaternion is not normalized", "Give unit quaternions qx, qy, qz, qw"
+            )
     covariance = None
-    if set(DEVIATION[:3]) <= set(column):
-        deviation = np.full((len(rows), 6), np.inf)  # nothing is known of turns that the file doesn't tell of
-        for k, name in enumerate(DEVIATION):
+    if set(SIGMA_COLUMNS[:3]) <= set(column):
+        deviation = np.full((len(rows), 6), np.inf)  # rotations are unknown unless the file has their columns
+        for k, name in enumerate(SIGMA_COLUMNS):
             if name in column:
                 deviation[:, k] = column[name] * (frame.unit if k < 3 else 1)
         covariance = np.zeros((len(rows), 6, 6))
         covariance[:, np.arange(6), np.arange(6)] = deviation**2
     return Trajectory(
         column["time"],
-        frame.to_local(rows[:, [names.index(name) for name in POSITION[1:]]]),
+        frame.to_local(rows[:, [names.index(name) for name in POSITION_COLUMNS[1:]]]),
         None if quaternions is None else Rotation.from_quat(quaternions).as_matrix(),
         column["unsure"] != 0 if "unsure" in column else None,
         covariance,
@@ -223,15 +233,15 @@ def _from_kitti(path: Path, lines: Lines, frame: Frame, times: F64 | None) -> Tr
     skew = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     odd = np.flatnonzero((skew > 1e-3) | (np.linalg.det(rotations) < 0))
     if len(odd):
-        raise _bad(path, ".kitti", lines[odd[0]][0], "its left 3x3 is no rotation")
+        raise _bad(path, ".kitti", lines[odd[0]][0], "its left 3x3 is not a rotation matrix")
     if times is None:
-        times = np.arange(len(lines)) / KITTI_RATE
+        times = np.arange(len(lines)) / KITTI_RATE_HZ
     if len(times) != len(lines):
-        raise InputError(path, f"has {len(lines)} poses for {len(times)} times", "Give a time for each line")
+        raise InputError(path, f"has {len(lines)} poses for {len(times)} times", "Give one time per line")
     return Trajectory(np.asarray(times, np.float64), frame.to_local(matrices[:, :, 3]), nearest_rotation(rotations))
 
 
-def _take(trajectory: Trajectory, index: Any) -> Trajectory:
+def _select(trajectory: Trajectory, index: Any) -> Trajectory:
     t = trajectory
     optional = (None if part is None else part[index] for part in (t.rotations, t.unsure, t.covariance))
     return Trajectory(t.times[index], t.positions[index], *optional)
@@ -244,16 +254,16 @@ def _quaternions(rotations: F64) -> F64:
 
 
 def _rows(columns: Sequence[tuple[F64, str]], separator: str) -> str:
-    """Lines of columns, each (T,) or (T, K) with the format of its numbers."""
+    """Text lines of columns, each (T,) or (T, K) with its number format."""
     parts = [(part.reshape(len(part), -1), form) for part, form in columns]
     template = separator.join(separator.join([form] * part.shape[1]) for part, form in parts)
     return "".join(template % tuple(row) + "\n" for row in np.column_stack([part for part, _ in parts]).tolist())
 
 
 def _to_csv(path: Path, t: Trajectory, frame: Frame) -> str:
-    names, columns = list(POSITION), [(t.times, "%.6f"), (frame.to_crs(t.positions), "%.6f")]
+    names, columns = list(POSITION_COLUMNS), [(t.times, "%.6f"), (frame.to_crs(t.positions), "%.6f")]
     if t.rotations is not None:
-        names += QUATERNION
+        names += QUATERNION_COLUMNS
         columns.append((_quaternions(t.rotations), "%.9f"))
     if t.unsure is not None:
         names.append("unsure")
@@ -261,7 +271,7 @@ def _to_csv(path: Path, t: Trajectory, frame: Frame) -> str:
     if t.covariance is not None:
         deviation = np.sqrt(np.einsum("tkk->tk", t.covariance)) / ([frame.unit] * 3 + [1.0] * 3)
         known = 6 if np.isfinite(deviation).all() else 3
-        names += DEVIATION[:known]
+        names += SIGMA_COLUMNS[:known]
         columns.append((deviation[:, :known], "%.6g"))
     return ",".join(names) + "\n" + _rows(columns, ",")
 
@@ -279,35 +289,39 @@ def _to_kitti(path: Path, t: Trajectory, frame: Frame) -> str:
 
 
 def _to_geojson(path: Path, t: Trajectory, frame: Frame) -> str:
-    """The path, and a point in the middle of every unsure stretch with its largest horizontal deviation (1 sigma)."""
-    if crs_io.to_wgs84(frame) is None:  # it also refuses what is no CRS
-        raise SettingError(path, "can't be placed on the globe: its frame has no CRS", "Write .csv, or align to GPS")
+    """The path, and a point in the middle of each unsure section with its largest horizontal deviation (1 sigma)."""
+    if crs_io.to_wgs84(frame) is None:  # raises for an invalid CRS
+        raise SettingError(path, "GeoJSON needs a CRS, but the trajectory is local", "Write .csv, or align to GPS")
     from pyproj import CRS, Transformer
 
     x, y, _ = frame.to_crs(t.positions).T
-    horizontal = CRS.from_user_input(frame.crs).to_2d()  # heights stay as they are
+    horizontal = CRS.from_user_input(frame.crs).to_2d()  # heights are not transformed
     lon, lat = Transformer.from_crs(horizontal, "EPSG:4326", always_xy=True).transform(x, y)
     height = t.positions[:, 2] + frame.origin[2]
-    places = np.column_stack([np.round(lon, 8), np.round(lat, 8), np.round(height, 3)]).tolist()
-    whole = {"kind": "path", "start_s": float(t.times[0]), "end_s": float(t.times[-1]), "poses": len(t)}
-    line = {"type": "LineString", "coordinates": places} if len(t) > 1 else {"type": "Point", "coordinates": places[0]}
-    features = [{"type": "Feature", "properties": whole, "geometry": line}]
+    coordinates = np.column_stack([np.round(lon, 8), np.round(lat, 8), np.round(height, 3)]).tolist()
+    path_properties = {"kind": "path", "start_s": float(t.times[0]), "end_s": float(t.times[-1]), "poses": len(t)}
+    line = (
+        {"type": "LineString", "coordinates": coordinates}
+        if len(t) > 1
+        else {"type": "Point", "coordinates": coordinates[0]}
+    )
+    features = [{"type": "Feature", "properties": path_properties, "geometry": line}]
     edges = np.diff(np.concatenate([[False], t.unsure if t.unsure is not None else [], [False]]).astype(int))
     for first, end in zip(np.flatnonzero(edges > 0).tolist(), np.flatnonzero(edges < 0).tolist(), strict=True):
-        about = {
+        properties = {
             "kind": "unsure",
             "start_s": float(t.times[first]),
             "end_s": float(t.times[end - 1]),
             "length_m": round(float(np.linalg.norm(np.diff(t.positions[first:end], axis=0), axis=1).sum()), 3),
-            "sigma_m": None if t.covariance is None else _worst(t.covariance[first:end]),
+            "sigma_m": None if t.covariance is None else _max_horizontal_sigma(t.covariance[first:end]),
         }
-        point = {"type": "Point", "coordinates": places[(first + end - 1) // 2]}
-        features.append({"type": "Feature", "properties": about, "geometry": point})
+        point = {"type": "Point", "coordinates": coordinates[(first + end - 1) // 2]}
+        features.append({"type": "Feature", "properties": properties, "geometry": point})
     return json.dumps({"type": "FeatureCollection", "features": features}) + "\n"
 
 
-def _worst(covariance: F64) -> float | None:
-    """The largest horizontal standard deviation (m) of (N, 6, 6) covariances, along its worst direction."""
+def _max_horizontal_sigma(covariance: F64) -> float | None:
+    """Largest horizontal standard deviation (m) of (N, 6, 6) covariances, along the major axis."""
     horizontal = covariance[:, :2, :2]
     if not np.isfinite(horizontal).all():
         return None

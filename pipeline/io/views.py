@@ -1,4 +1,4 @@
-"""Posed photos as JSON (`views.json`): what steps hand on of a tile's views."""
+"""Posed photos as JSON (`views.json`), the form in which steps pass on a tile's views."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ CAMERA_FIELDS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion
 
 
 def to_json(view: View, *, with_paths: bool = True) -> dict[str, Any]:
-    """A view as JSON-able values; without paths, `photo` and `mask` are file names alone."""
+    """A view as JSON values; without paths, `photo` and `mask` are bare file names."""
 
-    def place(path: Path | None) -> str | None:
+    def location(path: Path | None) -> str | None:
         return None if path is None else (str(path) if with_paths else path.name)
 
     return {
         "name": view.name,
         "camera": {name: getattr(view.camera, name) for name in CAMERA_FIELDS},
         "T_world_cam": np.asarray(view.T_world_cam, np.float64).tolist(),
-        "photo": place(view.photo),
-        "mask": place(view.mask),
+        "photo": location(view.photo),
+        "mask": location(view.mask),
         "time": view.time,
     }
 
 
 def from_json(entry: dict[str, Any]) -> View:
-    """What `to_json` made of a view."""
+    """The view that `to_json` converted."""
     camera = dict(entry["camera"], distortion=tuple(entry["camera"]["distortion"]))
     return View(
         name=entry["name"],
@@ -45,37 +45,37 @@ def from_json(entry: dict[str, Any]) -> View:
     )
 
 
-def linked(view: View, folder: Path, index: int) -> View:
-    """The view with links in `folder`, for its photo and mask: relative ones, as a file beside them names them."""
+def with_links(view: View, folder: Path, index: int) -> View:
+    """The view with its photo and mask symlinked into `folder`; its paths are relative to `folder`."""
 
-    def link(file: Path, where: str) -> Path:
-        (folder / where).mkdir(exist_ok=True)
-        at = folder / where / f"{index:05d}_{file.name}"
-        at.symlink_to(file.resolve())
-        return at.relative_to(folder)
+    def link(file: Path, subfolder: str) -> Path:
+        (folder / subfolder).mkdir(exist_ok=True)
+        target = folder / subfolder / f"{index:05d}_{file.name}"
+        target.symlink_to(file.resolve())
+        return target.relative_to(folder)
 
     return replace(view, photo=link(view.photo, "photos"), mask=link(view.mask, "masks") if view.mask else None)
 
 
 def save(path: Path, views: Sequence[View], held_out: Sequence[bool] = ()) -> None:
-    """Write views, and which of them are held out of texturing (none by default)."""
+    """Write views, and which of them are held out from texturing (default: none)."""
     held = list(held_out) or [False] * len(views)
     rows = [to_json(view) | {"hold_out": bool(out)} for view, out in zip(views, held, strict=True)]
     path.write_text(json.dumps(rows, indent=1, default=np.generic.item), encoding="utf-8")
 
 
 def load(path: Path) -> tuple[View, ...]:
-    """Read the views that `save` wrote, in order; relative photos are beside the file, links are followed."""
+    """Read the views that `save` wrote, in order; photo paths are relative to the file, links are followed."""
 
-    def place(file: Path) -> Path:
+    def absolute(file: Path) -> Path:
         return (path.parent / file).resolve()
 
     views = (from_json(row) for row in _rows(path))
-    return tuple(replace(v, photo=place(v.photo), mask=place(v.mask) if v.mask else None) for v in views)
+    return tuple(replace(v, photo=absolute(v.photo), mask=absolute(v.mask) if v.mask else None) for v in views)
 
 
 def load_held_out(path: Path) -> tuple[bool, ...]:
-    """Read which of the views are held out of texturing, in the views' order."""
+    """Whether each view is held out from texturing, in order."""
     return tuple(bool(row["hold_out"]) for row in _rows(path))
 
 
@@ -83,4 +83,4 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, json.JSONDecodeError) as error:
-        raise InputError(path, f"is no list of views ({error})", "Run again with `--from views`") from None
+        raise InputError(path, f"is not a list of views ({error})", "Run again with `--from views`") from None

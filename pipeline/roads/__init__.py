@@ -1,1 +1,1 @@
-"""Roads as data: reference lines, lanes' edges and kerbs of what was scanned and photographed (docs/roads.md)."""
+"""Roads as vector data: reference lines, lane boundaries and kerbs from scans and photos (docs/roads.md)."""

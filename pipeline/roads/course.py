@@ -1,4 +1,4 @@
-"""The course that a vehicle takes along a road: its lane's middle where lanes are told, else the reference line."""
+"""Course of a vehicle along a road: the centre of its lane if lanes are known, else the reference line."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from scan2sim.pipeline.roads.lanes import Section, sections
 from scan2sim.pipeline.roads.listed import surface
 from scan2sim.pipeline.roads.model import Road
 
-STEP = 0.5
-"""Metres between places of a course."""
+STEP_M = 0.5
+"""Spacing of the points of a course."""
 
 
 @dataclass(frozen=True)
 class Course:
-    """Places to drive over, in order.
+    """A polyline to drive along.
 
     Attributes:
-        places: (N, 3) metres, in the road's frame.
-        by: "lane", "road" (its reference line) or "path" (of whoever recorded it).
+        places: (N, 3) points in metres, in the road's frame.
+        by: "lane", "road" (its reference line) or "path" (of the recording vehicle).
     """
 
     places: F64
@@ -29,14 +29,14 @@ class Course:
 
     @property
     def headings(self) -> F64:
-        """(N,) radians from the x axis."""
+        """Headings (N,) in radians from the x axis."""
         x, y = np.gradient(self.places[:, :2], axis=0).T
         return np.arctan2(y, x)
 
 
 def course(road: Road) -> Course:
-    """The course of a road, the way that it was driven."""
-    s = np.linspace(0.0, road.line.length, max(2, round(road.line.length / STEP) + 1))
+    """The course along a road, in the direction in which it was driven."""
+    s = np.linspace(0.0, road.line.length, max(2, round(road.line.length / STEP_M) + 1))
     t, by = np.zeros(len(s)), "road"
     for section in sections(road):
         lane = _lane(section, road.keeps_right)
@@ -48,6 +48,6 @@ def course(road: Road) -> Course:
 
 
 def _lane(section: Section, keeps_right: bool) -> int | None:
-    """The lane beside the centre line in which traffic runs along the road; None where directions aren't told."""
+    """Lane next to the centre line with traffic in the direction of the road; None if directions are unknown."""
     lane = section.centre if keeps_right else section.centre - 1
     return lane if 0 <= lane < len(section.kinds) and section.kinds[lane] == "driving" else None

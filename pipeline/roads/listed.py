@@ -1,4 +1,4 @@
-"""Roads as GeoJSON: lines with heights, in a tile's CRS, and what is known of each."""
+"""Roads as GeoJSON: lines with heights in a tile's CRS, and their properties."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from scan2sim.pipeline.roads.lanes import sections
 from scan2sim.pipeline.roads.model import Line, Road
 from scan2sim.pipeline.roads.profile import Profile
 
-STEP = 1.0
-"""Metres between places of a line."""
+STEP_M = 1.0
+"""Spacing of the points of a line."""
 
 
 def write(path: Path, frame: Frame, roads: Sequence[Road]) -> None:
-    """Write reference lines, painted lines and edges, stretch by stretch where they were seen."""
+    """Write reference lines, markings and edges; a feature for each part of a line that was observed."""
     features: list[tuple[list[list[float]], dict[str, Any]]] = []
     for number, road in enumerate(roads, start=1):
         zero = Profile.constant(road.height.knots, 0.0)
@@ -28,24 +28,24 @@ def write(path: Path, frame: Frame, roads: Sequence[Road]) -> None:
             (_line(frame, road, zero, 0.0, road.line.length), {"road": number, **about, "notes": notes(road)})
         )
         for line in (road.left, *road.markings, road.right):
-            for first, last in line.told if line else ():
+            for first, last in line.ranges if line else ():
                 assert line is not None
-                features.append((_line(frame, road, line.offset, first, last), {"road": number, **_about(line)}))
+                features.append((_line(frame, road, line.offset, first, last), {"road": number, **_properties(line)}))
     geojson.write_lines(path, frame.crs, features)
 
 
 def _line(frame: Frame, road: Road, offset: Profile, first: float, last: float) -> list[list[float]]:
-    s = np.linspace(first, last, max(2, round((last - first) / STEP) + 1))
+    s = np.linspace(first, last, max(2, round((last - first) / STEP_M) + 1))
     return [[round(value, 3) for value in place] for place in frame.to_crs(surface(road, s, offset.at(s))).tolist()]
 
 
 def surface(road: Road, s: F64, t: F64) -> F64:
-    """(N, 3) places on a road's surface, local metres."""
-    slope = np.where(t > 0, road.falls[0].at(s), road.falls[1].at(s))
-    return np.column_stack([road.line.places(s, t), road.height.at(s) + slope * np.abs(t)])
+    """Points (N, 3) on a road's surface, local metres."""
+    slope = np.where(t > 0, road.cross_slopes[0].at(s), road.cross_slopes[1].at(s))
+    return np.column_stack([road.line.points(s, t), road.height.at(s) + slope * np.abs(t)])
 
 
-def _about(line: Line) -> dict[str, Any]:
+def _properties(line: Line) -> dict[str, Any]:
     """Properties of a line."""
     if line.kind == "marking":
         about = {"kind": "marking", "marking": line.marking, "paint_width_m": line.width}
@@ -59,30 +59,30 @@ def _about(line: Line) -> dict[str, Any]:
 
 
 def notes(road: Road) -> list[str]:
-    """What can't be told of a road."""
-    said = []
+    """Notes on missing information about a road."""
+    found = []
     if not road.markings:
-        said.append("no painted line is seen: its lanes aren't told, only its edges")
+        found.append("no painted line is seen: its lanes aren't told, only its edges")
     elif road.reference != "marking":
-        said.append("no painted line is in its middle: which way its lanes go isn't told")
+        found.append("no painted line is in its middle: which way its lanes go isn't told")
     for line, side in ((road.left, "left"), (road.right, "right")):
         if line is None:
-            said.append(f"its {side} edge isn't told: nothing steps up, and no other ground begins, along one line")
+            found.append(f"its {side} edge isn't told: nothing steps up, and no other ground begins, along one line")
             continue
-        gaps = [(a, b) for (_, a), (b, _) in zip(line.told, line.told[1:], strict=False)]
+        gaps = [(a, b) for (_, a), (b, _) in zip(line.ranges, line.ranges[1:], strict=False)]
         if gaps:
             where = ", ".join(f"{a:.0f} to {b:.0f} m" for a, b in gaps)
-            said.append(f"its {side} edge isn't told from {where}: hidden, or other roads and drives begin there")
+            found.append(f"its {side} edge isn't told from {where}: hidden, or other roads and drives begin there")
     if not sections(road):
-        said.append("it has no two lines beside each other, and so no lanes in OpenDRIVE")
-    return said
+        found.append("it has no two lines beside each other, and so no lanes in OpenDRIVE")
+    return found
 
 
 def facts(road: Road) -> dict[str, Any]:
-    """Figures of a road for reports."""
+    """Metrics of a road for the report."""
     found: dict[str, Any] = {"length_m": round(road.line.length, 1), "reference": road.reference}
     if road.left and road.right:
-        s = np.arange(0.5, road.line.length, STEP)
+        s = np.arange(0.5, road.line.length, STEP_M)
         found["width_m"] = round(float(np.median(road.left.offset.at(s) - road.right.offset.at(s))), 2)
     lines = [line for line in (road.left, *road.markings, road.right) if line]
     found["markings"] = len(road.markings)

@@ -1,4 +1,4 @@
-"""A road drawn from what was seen of it: reference line, painted lines, edges, heights."""
+"""Road model: reference line, markings, edges and heights of a road, fitted to the observations."""
 
 from __future__ import annotations
 
@@ -11,44 +11,40 @@ import numpy as np
 from scan2sim.pipeline.core.types import F64, I64
 from scan2sim.pipeline.roads import clothoid, driven, kerbs, observed, paint, profile
 from scan2sim.pipeline.roads.clothoid import Clothoids
-from scan2sim.pipeline.roads.observed import BEYOND, Observed
+from scan2sim.pipeline.roads.observed import EXTENSION_M, Observed
 from scan2sim.pipeline.roads.profile import Profile
 
-KNOT = 10.0
-"""Metres, about, between places where cubics meet."""
-NOISE, BEND = 0.03, 0.05
-"""Metres: of what is seen of a line; by which a line leaves its straight course between two knots."""
-LEVEL = 0.02
-"""Metres: noise of heights."""
-FALL = 0.005
-"""By which the slope to a side changes between two knots."""
-NEAR = 3.0
-"""Metres from the reference line within which the surface's slopes are looked at."""
-LONGEST_GAP = 12.5
-"""Metres between strokes of one line: a US broken line has 9, a German motorway 12."""
-MEETS, TURNS = 0.15, 0.01
-"""Metres by which a stroke may miss its line's course, and by metre of the gap between them."""
-PAINTED = 3.0
-"""Metres of paint in a line, at least; SHARE of its length; its LENGTH."""
-SHARE, LENGTH = 0.24, 6.0
-DASH = 8.0
-"""Metres: a dash is shorter (6 m on motorways)."""
-REGULAR = 0.25
-"""Share by which dashes and gaps of a broken line differ, at most."""
-CLOSE = 0.3
-"""Metres within which a place bears an edge out."""
-BORNE = 3.0
-"""Metres along the road from such a place within which an edge is told."""
-MOSTLY = 0.4
-"""Share of a road's length along which an edge must be told, to be told at all."""
-CENTRAL = 0.25
-"""Share of the width by which a line may be off the middle to be the centre line."""
-BESIDE = 0.12
-"""Metres from an edge within which what looks like a line is the kerb's stone."""
-STONE = 0.2
-"""Share of a line along which there is a step, from which on it is of kerb stones, lowered elsewhere."""
-SHORTEST = 8.0
-"""Metres of road that are told of."""
+MAX_SURFACE_DISTANCE_M = 3.0
+"""Distance from the reference line within which heights and cross slopes are fitted."""
+MIN_ROAD_LENGTH_M = 8.0
+
+
+@dataclass(frozen=True)
+class ModelLimits:
+    """Parameters of the road model."""
+
+    knot_spacing_m: float = 10.0  # of profiles, approximate
+    line_sigma_m: float = 0.03  # noise of observed lines
+    line_bend_m: float = 0.05  # expected deviation of a line from a straight one between two knots
+    height_sigma_m: float = 0.02  # noise of heights
+    cross_slope_change: float = 0.005  # expected change of a cross slope between two knots
+    max_stroke_gap_m: float = 12.5  # between strokes of one line: US broken lines have 9 m, German motorways 12 m
+    max_stroke_offset_m: float = 0.15  # lateral offset of a stroke from the previous one ...
+    max_stroke_drift: float = 0.01  # ... plus this per metre of gap
+    min_paint_m: float = 3.0  # length of paint in a line
+    min_paint_fraction: float = 0.24  # of the length of a line
+    min_line_length_m: float = 6.0
+    max_dash_m: float = 8.0  # dashes are shorter (6 m on motorways)
+    dash_tolerance: float = 0.25  # of dashes and gaps in a broken line, relative to their period
+    edge_tolerance_m: float = 0.3  # distance of observations that support an edge
+    edge_support_m: float = 3.0  # distance along the road over which an observation supports an edge
+    min_edge_fraction: float = 0.4  # part of the road's length along which an edge must be supported
+    max_centre_offset: float = 0.25  # of a centre line from the middle, relative to the width
+    kerb_stone_m: float = 0.12  # lines within this distance of an edge are kerb stones
+    min_kerb_fraction: float = 0.2  # part of a line with height steps from which it is a line of kerb stones
+
+
+LIMITS = ModelLimits()
 
 
 Reference = Literal["marking", "middle", "way"]
@@ -60,19 +56,19 @@ class Line:
 
     Attributes:
         kind: "marking", or the road's "left" or "right" edge.
-        offset: from the reference line, metres to its left.
-        told: (first, last) chainages of where it was seen.
-        marking: "solid" or "broken", of a marking.
-        width: metres of paint.
-        dash, gap: metres, of a broken line; first: chainage of a dash's beginning.
-        kerb: metres of the step; None: the edge is where other ground begins.
-        deviation: metres from the line within which 95 % of what was seen of it lie.
-        seen: (M, 2) chainages and offsets of that.
+        offset: offset from the reference line, metres, positive to its left.
+        ranges: (first, last) chainages between which it was observed.
+        marking: "solid" or "broken", for a marking.
+        width: width of the paint, metres.
+        dash, gap: metres, for a broken line; first: chainage of the beginning of a dash.
+        kerb: height of the kerb, metres; None: the edge is a boundary to other ground.
+        deviation: 95th percentile of the distance of its observations, metres.
+        seen: (M, 2) chainages and offsets of its observations.
     """
 
     kind: Literal["marking", "left", "right"]
     offset: Profile
-    told: tuple[tuple[float, float], ...]
+    ranges: tuple[tuple[float, float], ...]
     deviation: float
     seen: F64
     marking: Literal["solid", "broken"] | None = None
@@ -85,7 +81,7 @@ class Line:
     @property
     def span(self) -> tuple[float, float]:
         """First and last chainage."""
-        return self.told[0][0], self.told[-1][1]
+        return self.ranges[0][0], self.ranges[-1][1]
 
 
 @dataclass(frozen=True)
@@ -93,19 +89,19 @@ class Road:
     """A road.
 
     Attributes:
-        line: its reference, and
-        reference: what that is: the painted centre line, the middle between the edges, or the way that was driven.
-        height: of the reference line, metres above the frame's origin.
-        falls: slope of the surface to the left and to the right, metres a metre outwards.
-        markings: from left to right.
-        left, right: the edges; None: not told.
-        keeps_right: whether the way was driven on the right of the centre line.
+        line: reference line.
+        reference: source of the reference line: painted centre line, middle between the edges, or driven way.
+        height: height of the reference line above the frame's origin, metres.
+        cross_slopes: slopes of the surface to the left and to the right, positive if it rises outwards.
+        markings: markings from left to right.
+        left, right: edges; None: unknown.
+        keeps_right: whether the way was driven on the right side of the centre line.
     """
 
     line: Clothoids
     reference: Reference
     height: Profile
-    falls: tuple[Profile, Profile]
+    cross_slopes: tuple[Profile, Profile]
     markings: tuple[Line, ...]
     left: Line | None
     right: Line | None
@@ -115,25 +111,24 @@ class Road:
 Warn = Callable[[str], None]
 
 
-def unheard(warning: str) -> None:
+def ignore_warning(warning: str) -> None:
     """A `Warn` that ignores warnings."""
 
 
-def network(ways: Sequence[Observed], origin: Sequence[float], warn: Warn = unheard) -> list[Road]:
-    """Roads along all ways (world metres), continued over borders of tiles; metres from `origin` (3,)."""
-    joined = observed.joined([way.moved(-np.asarray(origin)) for way in ways])
-    return [road for way in joined if (road := drawn(way, warn))]
+def network(ways: Sequence[Observed], origin: Sequence[float], warn: Warn = ignore_warning) -> list[Road]:
+    """Roads along all ways (world metres), joined across tile borders, in metres from `origin` (3,)."""
+    joined = observed.join([way.moved(-np.asarray(origin)) for way in ways])
+    return [road for way in joined if (road := build_road(way, warn))]
 
 
-def drawn(seen: Observed, warn: Warn = unheard) -> Road | None:
-    """The road along a way; None where nothing is seen of it over `SHORTEST` metres.
+def build_road(seen: Observed, warn: Warn = ignore_warning) -> Road | None:
+    """Build the road along a way; None if its observations are shorter than `MIN_ROAD_LENGTH_M`.
 
-    A road whose lines are seen, but no point of its surface beside the reference line, has no heights: it is left out,
-    with a warning.
+    A road without surface points near its reference line has no heights: it is omitted, with a warning.
     """
-    places = driven.extended(seen.way, BEYOND)
-    base = clothoid.fit(clothoid.through(places), places)
-    seen = _with_stones(base, seen)
+    places = driven.extend(seen.way, EXTENSION_M)
+    base = clothoid.fit(clothoid.approximate(places), places)
+    seen = _kerb_stones_to_edges(base, seen)
     markings, left, right = _lines(base, seen)
     centre = _centre(markings, left, right)
     lines = [one for one in (*markings, left, right) if one]
@@ -142,28 +137,31 @@ def drawn(seen: Observed, warn: Warn = unheard) -> Road | None:
     line: Clothoids = base
     reference: Reference = "way"
     if centre is not None:
-        line, reference = clothoid.fit(base, base.places(*centre.seen.T)), "marking"
-    elif left and right and len(middle := _between(base, left, right)) >= SHORTEST:
+        line, reference = clothoid.fit(base, base.points(*centre.seen.T)), "marking"
+    elif left and right and len(middle := _between(base, left, right)) >= MIN_ROAD_LENGTH_M:
         line, reference = clothoid.fit(base, middle), "middle"
-    ends = [base.places([s], [one.offset.at(s)]) for one in lines for s in one.span]
+    ends = [base.points([s], [one.offset.at(s)]) for one in lines for s in one.span]
     chainage = line.locate(np.concatenate(ends))[0]
     first, last = max(0.0, float(chainage.min())), min(line.length, float(chainage.max()))
-    if last - first < SHORTEST:
+    if last - first < MIN_ROAD_LENGTH_M:
         return None
     line = line.part(first, last)
     markings, left, right = _lines(line, seen)
     surface = _surface(line, seen.ground)
     if surface is None:
-        warn(f"a road of {line.length:.0f} m is left out: no point of its surface is within {NEAR:g} m of its line")
+        warn(
+            f"a road of {line.length:.0f} m is left out: no point of its surface is within "
+            f"{MAX_SURFACE_DISTANCE_M:g} m of its line"
+        )
         return None
-    height, falls = surface
+    height, cross_slopes = surface
     _, t = line.locate(seen.way)
-    return Road(line, reference, height, falls, tuple(markings), left, right, bool(np.median(t) < 0.5))
+    return Road(line, reference, height, cross_slopes, tuple(markings), left, right, bool(np.median(t) < 0.5))
 
 
 def _lines(line: Clothoids, seen: Observed) -> tuple[list[Line], Line | None, Line | None]:
-    """Markings from left to right, and the edges, along a line."""
-    knots = np.linspace(0, line.length, max(1, round(line.length / KNOT)) + 1)
+    """Markings from left to right, and edges, along a line."""
+    knots = np.linspace(0, line.length, max(1, round(line.length / LIMITS.knot_spacing_m)) + 1)
     ground = line.locate(seen.ground)[0].clip(0, line.length)
     length = float(np.ptp(ground)) if len(ground) else line.length
     left, right = (_edge(line, seen, knots, side, length) for side in (1, -1))
@@ -171,29 +169,29 @@ def _lines(line: Clothoids, seen: Observed) -> tuple[list[Line], Line | None, Li
     inside = (s >= 0) & (s <= line.length)
     for edge, side in ((left, 1), (right, -1)):
         if edge is not None:
-            inside &= (edge.offset.at(s) - t) * side > BESIDE
+            inside &= (edge.offset.at(s) - t) * side > LIMITS.kerb_stone_m
     markings = _markings(knots, s[inside], t[inside], seen.stroke[inside], seen.width[inside])
     return sorted(markings, key=_mean, reverse=True), left, right
 
 
-def _with_stones(line: Clothoids, seen: Observed) -> Observed:
-    """What was seen, but that light lines of kerb stones are edges and not paint.
+def _kerb_stones_to_edges(line: Clothoids, seen: Observed) -> Observed:
+    """Convert bright lines of kerb stones, which were detected as paint, to edges.
 
-    They are told by steps of the ground beside them; where there is none, the kerb is lowered.
+    They are recognized by height steps beside them; where there is no step, the kerb is dropped.
     """
     s, t = line.locate(seen.paint)
     at, offset = line.locate(seen.edge[:, :2])
     stepped = np.isfinite(seen.edge[:, 3])
     paint_, edge = np.ones(len(s), bool), [seen.edge]
-    for group in _linked(s, t, seen.stroke):
+    for group in _link_strokes(s, t, seen.stroke):
         own = np.isin(seen.stroke, group)
         for side in (1, -1):
             steps = stepped & (seen.edge[:, 2] == side) & (at > s[own].min()) & (at < s[own].max())
             nearest = np.abs(at[steps][:, None] - s[own]).argmin(axis=1) if steps.any() else np.zeros(0, int)
             beyond = (t[own][nearest] - offset[steps]) * side
-            along = (beyond > -BESIDE / 2) & (beyond < 2 * BESIDE)
-            if along.sum() * kerbs.ROW > STONE * np.ptp(s[own]):
-                places = line.places(s[own], t[own] - side * float(np.median(beyond[along])))
+            along = (beyond > -LIMITS.kerb_stone_m / 2) & (beyond < 2 * LIMITS.kerb_stone_m)
+            if along.sum() * kerbs.ROW_M > LIMITS.min_kerb_fraction * np.ptp(s[own]):
+                places = line.points(s[own], t[own] - side * float(np.median(beyond[along])))
                 edge.append(np.column_stack([places, np.full(len(places), side), np.zeros(len(places))]))
                 paint_ &= ~own
     whole = np.ones(len(seen.ground), bool)
@@ -201,7 +199,7 @@ def _with_stones(line: Clothoids, seen: Observed) -> Observed:
 
 
 def _edge(line: Clothoids, seen: Observed, knots: F64, side: int, length: float) -> Line | None:
-    """The edge on a side, by its kerb where that goes on along the road, else by where other ground begins."""
+    """The edge on a side: a kerb if it continues along the road, else the boundary to other ground."""
     s, t = line.locate(seen.edge[:, :2])
     held = (seen.edge[:, 2] == side) & (s >= 0) & (s <= line.length)
     s, t, step = s[held], t[held], seen.edge[held, 3]
@@ -209,59 +207,65 @@ def _edge(line: Clothoids, seen: Observed, knots: F64, side: int, length: float)
     for used in (stepped, np.ones(len(s), bool)):
         if used.sum() < 3:
             continue
-        offset = profile.fit(knots, s[used], t[used], NOISE, BEND)
+        offset = profile.fit(knots, s[used], t[used], LIMITS.line_sigma_m, LIMITS.line_bend_m)
         away = np.abs(t - offset.at(s))
-        close = used & (away < CLOSE)
-        told = _stretches(s[close], line.length)
-        far = sum(b - a for a, b in told)
-        if far >= MOSTLY * length or (far >= LENGTH and close.sum() > used.sum() / 2):
+        close = used & (away < LIMITS.edge_tolerance_m)
+        ranges = _supported_ranges(s[close], line.length)
+        far = sum(b - a for a, b in ranges)
+        if far >= LIMITS.min_edge_fraction * length or (
+            far >= LIMITS.min_line_length_m and close.sum() > used.sum() / 2
+        ):
             high = step[close & (step > 0)]
             kerb = float(np.median(high)) if (close & stepped).sum() > close.sum() / 2 and len(high) else None
             deviation = float(np.percentile(away[close], 95))
             points = np.column_stack([s, t])[close]
-            return Line("left" if side == 1 else "right", offset, told, deviation, points, kerb=kerb)
+            return Line("left" if side == 1 else "right", offset, ranges, deviation, points, kerb=kerb)
     return None
 
 
-def _stretches(s: F64, length: float) -> tuple[tuple[float, float], ...]:
-    """Where a line is told, by the chainages (M,) that bear it out."""
+def _supported_ranges(s: F64, length: float) -> tuple[tuple[float, float], ...]:
+    """Ranges of chainage in which a line is supported by observations at chainages (M,)."""
     if not len(s):
         return ()
     s = np.sort(s)
-    breaks = np.flatnonzero(np.diff(s) > 2 * BORNE)
+    breaks = np.flatnonzero(np.diff(s) > 2 * LIMITS.edge_support_m)
     firsts, lasts = s[np.append(0, breaks + 1)], s[np.append(breaks, len(s) - 1)]
     ends = ((max(0.0, a - 0.5), min(length, b + 0.5)) for a, b in zip(firsts.tolist(), lasts.tolist(), strict=True))
-    return tuple((a, b) for a, b in ends if b - a > BORNE)
+    return tuple((a, b) for a, b in ends if b - a > LIMITS.edge_support_m)
 
 
 def _markings(knots: F64, s: F64, t: F64, stroke: I64, width: F64) -> list[Line]:
-    """Lines of paint: strokes in a row, as (chainage, offset) (N,) by stroke."""
+    """Markings: chains of strokes, from points (N,) with chainage, offset and stroke."""
     found = []
-    for group in _linked(s, t, stroke):
-        for part in _alike(s, stroke, group):
-            own, ends = np.isin(stroke, part), _ends(s, stroke, part)
+    for group in _link_strokes(s, t, stroke):
+        for part in _split_by_type(s, stroke, group):
+            own, ends = np.isin(stroke, part), _stroke_ends(s, stroke, part)
             painted, span = float((ends[:, 1] - ends[:, 0]).sum()), float(ends[-1, 1] - ends[0, 0])
-            if painted < PAINTED or span < LENGTH or painted < SHARE * span:
+            if (
+                painted < LIMITS.min_paint_m
+                or span < LIMITS.min_line_length_m
+                or painted < LIMITS.min_paint_fraction * span
+            ):
                 continue
-            offset = profile.fit(knots, s[own], t[own], NOISE, BEND)
+            offset = profile.fit(knots, s[own], t[own], LIMITS.line_sigma_m, LIMITS.line_bend_m)
             deviation = float(np.percentile(np.abs(t[own] - offset.at(s[own])), 95))
             points = np.column_stack([s, t])[own]
-            told = ((max(0.0, float(ends[0, 0])), min(float(knots[-1]), float(ends[-1, 1]))),)
-            broken = _rhythm(ends)
+            ranges = ((max(0.0, float(ends[0, 0])), min(float(knots[-1]), float(ends[-1, 1]))),)
+            broken = _dash_pattern(ends)
             wide = round(float(np.median(width[own])), 2)
             marking: Literal["solid", "broken"] = "broken" if broken else "solid"
-            found.append(Line("marking", offset, told, deviation, points, marking, wide, *(broken or ())))
+            found.append(Line("marking", offset, ranges, deviation, points, marking, wide, *(broken or ())))
     return found
 
 
-def _ends(s: F64, stroke: I64, group: list[int]) -> F64:
-    """(K, 2) chainages of the ends of strokes."""
-    return np.array([(s[stroke == k].min() - paint.ROW / 2, s[stroke == k].max() + paint.ROW / 2) for k in group])
+def _stroke_ends(s: F64, stroke: I64, group: list[int]) -> F64:
+    """Chainages (K, 2) of the ends of strokes."""
+    return np.array([(s[stroke == k].min() - paint.ROW_M / 2, s[stroke == k].max() + paint.ROW_M / 2) for k in group])
 
 
-def _alike(s: F64, stroke: I64, group: list[int]) -> list[list[int]]:
-    """A line's strokes, parted where a broken line becomes a solid one."""
-    long = np.diff(_ends(s, stroke, group), axis=1)[:, 0] > DASH
+def _split_by_type(s: F64, stroke: I64, group: list[int]) -> list[list[int]]:
+    """Split the strokes of a line where it changes between broken and solid."""
+    long = np.diff(_stroke_ends(s, stroke, group), axis=1)[:, 0] > LIMITS.max_dash_m
     breaks = np.flatnonzero(np.diff(long)) + 1
     runs = [list(run) for run in np.split(np.array(group), breaks)]
     if all(len(run) > 2 or long[group.index(run[0])] for run in runs):
@@ -269,8 +273,8 @@ def _alike(s: F64, stroke: I64, group: list[int]) -> list[list[int]]:
     return [group]
 
 
-def _linked(s: F64, t: F64, stroke: I64) -> list[list[int]]:
-    """Strokes that go on in each other, over gaps."""
+def _link_strokes(s: F64, t: F64, stroke: I64) -> list[list[int]]:
+    """Groups of strokes that continue each other across gaps."""
     numbers = [k for k in np.unique(stroke).tolist() if (stroke == k).sum() > 1]
     ends = {k: (s[own := stroke == k].argmin(), s[own].argmax(), own) for k in numbers}
     begin = {k: (float(s[own][a]), float(t[own][a])) for k, (a, _, own) in ends.items()}
@@ -281,7 +285,10 @@ def _linked(s: F64, t: F64, stroke: I64) -> list[list[int]]:
         for group in groups:
             at, offset = end[group[-1]]
             gap, miss = begin[k][0] - at, abs(begin[k][1] - offset)
-            if -0.5 < gap < LONGEST_GAP and miss < MEETS + TURNS * gap:
+            if (
+                -0.5 < gap < LIMITS.max_stroke_gap_m
+                and miss < LIMITS.max_stroke_offset_m + LIMITS.max_stroke_drift * gap
+            ):
                 misses.append((miss, group))
         if misses:
             min(misses, key=lambda found: found[0])[1].append(k)
@@ -290,17 +297,18 @@ def _linked(s: F64, t: F64, stroke: I64) -> list[list[int]]:
     return groups
 
 
-def _rhythm(ends: F64) -> tuple[float, float, float] | None:
-    """Dash, gap and the chainage of a dash's beginning of strokes (K, 2); None: they are no broken line.
+def _dash_pattern(ends: F64) -> tuple[float, float, float] | None:
+    """Dash length, gap length and chainage of a dash's beginning of strokes (K, 2); None if they form no broken line.
 
-    The first and the last stroke may be cut off, and so tell nothing.
+    The first and the last stroke may be cut off, so their lengths are not used.
     """
     if len(ends) < 3:
         return None
     dashes, gaps = (ends[1:-1, 1] - ends[1:-1, 0]), ends[1:, 0] - ends[:-1, 1]
     dash, gap = float(np.median(dashes)), float(np.median(gaps))
     regular = [
-        np.mean(np.abs(x - middle) < REGULAR * (dash + gap)) > 0.5 for x, middle in ((dashes, dash), (gaps, gap))
+        np.mean(np.abs(x - middle) < LIMITS.dash_tolerance * (dash + gap)) > 0.5
+        for x, middle in ((dashes, dash), (gaps, gap))
     ]
     if not all(regular) or gap < 0.25:
         return None
@@ -313,7 +321,7 @@ def _mean(line: Line) -> float:
 
 
 def _centre(markings: list[Line], left: Line | None, right: Line | None) -> Line | None:
-    """The painted centre line: what is nearest to the middle of the outermost lines, or of the edges; None: none is."""
+    """Painted centre line: the marking nearest to the middle of the outermost lines, or of the edges; or None."""
     if not markings:
         return None
     outer = [markings[0], markings[-1]] if len(markings) > 2 else [one for one in (left, right) if one]
@@ -321,25 +329,32 @@ def _centre(markings: list[Line], left: Line | None, right: Line | None) -> Line
         return None
     low, high = sorted(map(_mean, outer))
     nearest = min(markings, key=lambda one: abs(_mean(one) - (low + high) / 2))
-    return nearest if abs(_mean(nearest) - (low + high) / 2) < CENTRAL * (high - low) else None
+    return nearest if abs(_mean(nearest) - (low + high) / 2) < LIMITS.max_centre_offset * (high - low) else None
 
 
 def _between(line: Clothoids, left: Line, right: Line) -> F64:
-    """(N, 2) places midway between the edges, a metre apart, where both are told."""
+    """Points (N, 2) midway between the edges, one per metre, where both were observed."""
     s = np.arange(0.5, line.length, 1.0)
-    both = np.all([np.any([(s >= a) & (s <= b) for a, b in one.told], axis=0) for one in (left, right)], axis=0)
-    return line.places(s[both], ((left.offset.at(s) + right.offset.at(s)) / 2)[both])
+    both = np.all([np.any([(s >= a) & (s <= b) for a, b in one.ranges], axis=0) for one in (left, right)], axis=0)
+    return line.points(s[both], ((left.offset.at(s) + right.offset.at(s)) / 2)[both])
 
 
 def _surface(line: Clothoids, ground: F64) -> tuple[Profile, tuple[Profile, Profile]] | None:
-    """The reference line's height, and the slopes to the left and to the right; None without ground beside the line."""
-    knots = np.linspace(0, line.length, max(1, round(line.length / KNOT)) + 1)
+    """Height of the reference line, and cross slopes to the left and right; None without ground near the line."""
+    knots = np.linspace(0, line.length, max(1, round(line.length / LIMITS.knot_spacing_m)) + 1)
     s, t = line.locate(ground)
     held = (s > -1) & (s < line.length + 1)
     s, t, z = s[held], t[held], ground[held, 2]
-    near = np.abs(t) < NEAR
+    near = np.abs(t) < MAX_SURFACE_DISTANCE_M
     if not near.any():
         return None
     factors = np.column_stack([np.ones(len(t)), t.clip(0, None), (-t).clip(0, None)])[near]
-    height, left, right = profile.fit_sum(knots, s[near], factors, z[near], LEVEL, [BEND, FALL, FALL])
+    height, left, right = profile.fit_sum(
+        knots,
+        s[near],
+        factors,
+        z[near],
+        LIMITS.height_sigma_m,
+        [LIMITS.line_bend_m, LIMITS.cross_slope_change, LIMITS.cross_slope_change],
+    )
     return height, (left, right)

@@ -1,4 +1,4 @@
-"""What simulators need beyond a picture: collision shapes, a small robot, a spawn pose in free space.
+"""Simulation assets: collision shapes, a small robot, a spawn pose in free space.
 
 Begin with `collision_shapes`; the step is `pipeline.steps.collision`.
 """

@@ -1,4 +1,4 @@
-"""Solids: a tile's collision mesh as what simulators take: a mesh a class, cylinders, each with its friction."""
+"""Collision shapes of a tile for simulators: a mesh per class, and cylinders, each with its friction."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ import numpy as np
 
 from scan2sim.pipeline.core.classes import CODE, group_of, name_of
 from scan2sim.pipeline.core.types import Mesh
-from scan2sim.pipeline.geometry.cylinders import Cylinder, told_apart
+from scan2sim.pipeline.geometry.cylinders import Cylinder, split_cylinders
 from scan2sim.pipeline.terrain.friction import coefficient
 
 
 @dataclass(frozen=True)
 class Solid:
-    """What bodies collide with, of one class.
+    """A collision shape of one class.
 
     Attributes:
-        name: unique in its tile: its class's, "road", and of cylinders with a number, "pole_1".
+        name: unique in its tile: name of the class ("road"), with a number for cylinders ("pole_1").
         code: LAS class code.
         friction: Coulomb friction coefficient.
-        shape: local metres, z up.
+        shape: mesh or cylinder, local metres, z up.
     """
 
     name: str
@@ -30,15 +30,15 @@ class Solid:
 
 
 def solids(mesh: Mesh, paved: float) -> list[Solid]:
-    """A collision mesh's ground, walls, poles and trunks; one without classes is all paved ground.
+    """Split a collision mesh into shapes by class; a mesh without classes is one shape of paved ground.
 
     Args:
-        mesh: as the step `collision` makes it.
-        paved: friction of roads (`pipeline.terrain.friction`).
+        mesh: result of the step `collision`.
+        paved: friction coefficient of roads (`pipeline.terrain.friction`).
     """
     if mesh.classification is None or not len(mesh):
         return [Solid("ground", CODE["terrain"], paved, mesh)] if len(mesh) else []
-    cylinders, rest = told_apart(mesh)
+    cylinders, rest = split_cylinders(mesh)
     assert rest.classification is not None
     ground = {code for code in np.unique(rest.classification).tolist() if group_of()[code] == 0}
     found = [

@@ -1,8 +1,8 @@
-"""A small robot to try worlds with, as data: what every simulator's writer makes it of.
+"""A small robot for testing worlds, as data from which writers for every simulator generate their model.
 
-A differential drive of the size and mass of outdoor research platforms (Clearpath's Jackal weighs 17 kg, its Husky 50):
-two driven wheels, a caster that slides, a mast with a camera, a lidar on top. Its frame (`base_link`, REP 105) lies on
-the ground, midway between the driven wheels: x ahead, y to the left, z up; metres, kilograms, radians.
+A differential drive with the size and mass of outdoor research platforms (Clearpath's Jackal weighs 17 kg, its Husky
+50 kg): two driven wheels, a sliding caster, a mast with a camera, a lidar on top. Its frame (`base_link`, REP 105) is
+on the ground, midway between the driven wheels: x forward, y left, z up; metres, kilograms, radians.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from dataclasses import dataclass
 from math import atan, radians, tan
 
 Vector = tuple[float, float, float]
-RUBBER, SLIDING = 0.9, 0.01
-"""Coulomb friction of tyres, and of the caster, which is a ball in a bearing."""
+TYRE_FRICTION, CASTER_FRICTION = 0.9, 0.01
+"""Coulomb friction coefficients of the tyres, and of the caster, which is a ball in a bearing."""
 
 
 @dataclass(frozen=True)
 class Box:
-    """size: (x, y, z)."""
+    """A box of `size` (x, y, z)."""
 
     size: Vector
 
 
 @dataclass(frozen=True)
 class Cylinder:
-    """axis: along "y", as wheels are, or "z"."""
+    """A cylinder along `axis` "y" (wheels) or "z"."""
 
     radius: float
     length: float
@@ -33,23 +33,23 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Sphere:
-    """Around its middle."""
+    """A sphere around the link's origin."""
 
     radius: float
 
 
 @dataclass(frozen=True)
 class Link:
-    """A rigid part of one shape, around whose middle its frame lies; the first link's frame is the robot's.
+    """A rigid link with one shape. Its frame is at the shape's centre; the first link's frame is that of the robot.
 
     Attributes:
-        name: as in ROS.
-        shape: of what is seen, of what collides, and of its mass.
-        place: of its middle in the robot's frame.
-        mass: spread evenly.
+        name: link name, as in ROS.
+        shape: shape for rendering, collision and inertia.
+        place: position of its centre in the robot's frame.
+        mass: mass, uniformly distributed.
         colour: RGB from 0 to 1.
-        friction: of its surface.
-        driven: whether a motor turns it about its axis, forwards where it turns positively; else it is fixed.
+        friction: friction coefficient of its surface.
+        driven: whether a motor rotates it about its axis (positive is forward); otherwise it is fixed.
     """
 
     name: str
@@ -57,12 +57,12 @@ class Link:
     place: Vector
     mass: float
     colour: Vector
-    friction: float = RUBBER
+    friction: float = TYRE_FRICTION
     driven: bool = False
 
     @property
     def inertia(self) -> Vector:
-        """Moments about its axes, kg m²."""
+        """Principal moments of inertia, kg m²."""
         shape, mass = self.shape, self.mass
         if isinstance(shape, Box):
             x, y, z = (side**2 for side in shape.size)
@@ -75,65 +75,65 @@ class Link:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera that looks ahead.
+    """A forward-looking pinhole camera.
 
     Attributes:
-        link: which it is part of; ahead: metres from that one's middle to its own.
+        link: name of its link; ahead: distance of the camera in front of the link's centre, metres.
         width, height: pixels.
-        across: horizontal field of view, radians.
-        nearest, farthest: metres.
-        rate: pictures a second.
+        horizontal_fov: radians.
+        min_range, max_range: clipping distances, metres.
+        rate: frame rate, Hz.
     """
 
     link: str
     ahead: float
     width: int
     height: int
-    across: float
-    nearest: float
-    farthest: float
+    horizontal_fov: float
+    min_range: float
+    max_range: float
     rate: float
 
     @property
-    def upright(self) -> float:
+    def vertical_fov(self) -> float:
         """Vertical field of view, radians."""
-        return 2 * atan(tan(self.across / 2) * self.height / self.width)
+        return 2 * atan(tan(self.horizontal_fov / 2) * self.height / self.width)
 
 
 @dataclass(frozen=True)
 class Lidar:
-    """A lidar that turns about the upright axis through the middle of its link.
+    """A lidar that rotates about the vertical axis through the centre of its link.
 
     Attributes:
-        link: which it is.
-        around: rays a turn.
-        rings: of them, from `lowest` to `highest`, radians.
-        nearest, farthest, noise: metres.
-        rate: turns a second.
+        link: name of its link.
+        rays_per_turn: horizontal samples.
+        rings: number of scan lines, from `min_elevation` to `max_elevation`, radians.
+        min_range, max_range, noise: metres.
+        rate: turns per second.
     """
 
     link: str
-    around: int
+    rays_per_turn: int
     rings: int
-    lowest: float
-    highest: float
-    nearest: float
-    farthest: float
+    min_elevation: float
+    max_elevation: float
+    min_range: float
+    max_range: float
     noise: float
     rate: float
 
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot with two driven wheels.
+    """A differential drive robot.
 
     Attributes:
-        name: of its model.
-        links: the body first, to which all others are joined.
-        camera, lidar: its sensors; an IMU lies in the robot's frame.
-        imu_rate: readings a second.
-        speed, acceleration: at most, m/s and m/s².
-        torque: of a motor at most, Nm.
+        name: name of its model.
+        links: links; all others are attached to the first, the body.
+        camera, lidar: sensors; an IMU is at the origin of the robot's frame.
+        imu_rate: Hz.
+        speed, acceleration: maximum, m/s and m/s².
+        torque: maximum of a motor, Nm.
     """
 
     name: str
@@ -146,7 +146,7 @@ class Robot:
     torque: float
 
     def link(self, name: str) -> Link:
-        """By its name."""
+        """The link with that name."""
         return next(link for link in self.links if link.name == name)
 
     @property
@@ -155,47 +155,47 @@ class Robot:
         return self.links[0]
 
     @property
-    def joined(self) -> tuple[Link, ...]:
-        """All but the body."""
+    def attached(self) -> tuple[Link, ...]:
+        """All links except the body."""
         return self.links[1:]
 
-    def within(self, link: Link) -> Vector:
-        """The middle of a link's shape in its own frame."""
+    def centre_in_link(self, link: Link) -> Vector:
+        """Centre of a link's shape in the link's own frame."""
         return link.place if link is self.base else (0.0, 0.0, 0.0)
 
     @property
     def wheels(self) -> tuple[Link, Link]:
-        """Left and right."""
+        """Left and right driven wheel."""
         left, right = sorted((link for link in self.links if link.driven), key=lambda link: -link.place[1])
         return left, right
 
     @property
     def wheel_radius(self) -> float:
-        """Of the driven ones."""
+        """Radius of the driven wheels, metres."""
         shape = self.wheels[0].shape
         assert isinstance(shape, Cylinder)
         return shape.radius
 
     @property
     def track(self) -> float:
-        """Metres between the driven wheels' middles."""
+        """Distance between the centres of the driven wheels, metres."""
         left, right = self.wheels
         return left.place[1] - right.place[1]
 
-    def turning(self, speed: float, turn: float) -> tuple[float, float]:
-        """Radians a second of the left and the right wheel for a speed (m/s) and a turn to the left (rad/s)."""
-        aside = turn * self.track / 2
-        return (speed - aside) / self.wheel_radius, (speed + aside) / self.wheel_radius
+    def wheel_speeds(self, speed: float, yaw_rate: float) -> tuple[float, float]:
+        """Angular velocities (rad/s) of the left and right wheel for a speed (m/s) and a yaw rate (rad/s)."""
+        difference = yaw_rate * self.track / 2
+        return (speed - difference) / self.wheel_radius, (speed + difference) / self.wheel_radius
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where a robot starts.
+    """Spawn pose of a robot.
 
     Attributes:
-        position: of its frame, world metres.
+        position: position of its frame, world metres.
         angles: roll, pitch and yaw (fixed axes x, y, z), radians.
-        by: what is known of the way that it faces along: "lane", "road" or "path".
+        by: what its heading follows: "lane", "road" or "path".
     """
 
     position: Vector
@@ -210,7 +210,7 @@ ROBOT = Robot(
         Link("base_link", Box((0.62, 0.40, 0.18)), (-0.14, 0.0, 0.25), 20.0, YELLOW),
         Link("left_wheel", Cylinder(0.165, 0.06, "y"), (0.0, 0.26, 0.165), 1.5, BLACK, driven=True),
         Link("right_wheel", Cylinder(0.165, 0.06, "y"), (0.0, -0.26, 0.165), 1.5, BLACK, driven=True),
-        Link("caster", Sphere(0.08), (-0.36, 0.0, 0.08), 0.6, GREY, friction=SLIDING),
+        Link("caster", Sphere(0.08), (-0.36, 0.0, 0.08), 0.6, GREY, friction=CASTER_FRICTION),
         Link("mast", Cylinder(0.02, 0.30, "z"), (0.05, 0.0, 0.49), 0.5, GREY),
         Link("camera_link", Box((0.04, 0.12, 0.04)), (0.09, 0.0, 0.58), 0.2, BLACK),
         Link("lidar_link", Cylinder(0.05, 0.08, "z"), (0.05, 0.0, 0.68), 0.8, BLACK),

@@ -1,1 +1,1 @@
-"""The steps of the mission (D3.2, section 4.2), one file each."""
+"""Steps of the pipeline (D3.2, section 4.2), one module each."""

@@ -1,4 +1,4 @@
-"""Carve: what moved while it was scanned goes, and what lies where the recording vehicle or a camera has been."""
+"""Dynamic object removal (step `carve`): removes objects that moved during the scan, and returns of the ego vehicle."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.parameters import Coordinate
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, Bools, Frame, PointCloud, Trajectory
-from scan2sim.pipeline.io.file_checks import pass_on
+from scan2sim.pipeline.io.file_checks import link_or_copy
 
-WINDOW = 0.1
-"""Seconds: a turn of most spinning scanners."""
-GAP = 1.0
-"""Seconds between two places of the path (or three times what is usual) over which the scanner's place isn't known."""
-ABOVE = 4.0
-"""Metres above the path from which on nothing moves: lorries are no higher above the ground."""
-AIRBORNE = 60.0
-"""Metres of median range from which on a scanner flies: its rays pass no place from several sides."""
-SEEN_AGAIN = 0.1
-"""Share of points that were looked at `votes` times below which the step says that rays tell next to nothing."""
-MANY = 0.2
-"""Share of points that moved above which a run warns."""
+SCAN_WINDOW_S = 0.1
+"""Duration of one turn of most spinning scanners."""
+MAX_PATH_GAP_S = 1.0
+"""Longest gap in the path (or three times the median interval) over which the position is interpolated."""
+MOVING_MAX_HEIGHT_M = 4.0
+"""Height above the path beyond which nothing is moving: lorries are no higher above the ground."""
+AIRBORNE_RANGE_M = 60.0
+"""Median range from which a scanner is airborne: its rays don't cross a location from several sides."""
+MIN_REVISITED_FRACTION = 0.1
+"""Minimum fraction of points whose voxel was crossed by rays at `votes` moments; below, rays decide almost nothing."""
+MOVING_FRACTION_WARNING = 0.2
+"""Fraction of moving points above which the step warns."""
 
 
 class CarveParams(Params):
-    """What is looked for.
+    """Detection of moving objects by free space.
 
     Attributes:
-        when: "auto": where there are the scanner's path and points' times; "never".
-        voxel: metres, of the cells that rays pass; a place is free only with all of its neighbours, so what moved stays
-            within so much of what stands, and poses may be off by so much.
-        reach: metres from the scanner up to which rays count: half a degree is a voxel at 20 m.
-        votes: moments (of a tenth of a second) that must have seen through a place. Of a profile scanner, passes.
-        camera: metres around every camera in which nothing stands; 0: that isn't looked at.
-        cameras: (x, y, z) local metres; set by the recipe.
+        when: "auto": if the scanner's path and the points' times are known; "never".
+        voxel: edge of the occupancy voxels in metres. A voxel is free only if all its neighbours are, so moving points
+            within one voxel of a static surface are kept, and poses may be wrong by one voxel.
+        reach: maximum length of rays in metres; at 20 m, half a degree is one voxel.
+        votes: number of moments (of 0.1 s; for a profile scanner, passes) at which rays must have crossed a voxel.
+        camera: radius in metres around every camera in which points are removed; 0: off.
+        cameras: camera positions (x, y, z) in local metres; set by the pipeline.
     """
 
     when: Literal["auto", "never"] = "auto"
@@ -50,13 +50,13 @@ class CarveParams(Params):
 
 
 def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Done:
-    """Part `cloud` into what stands and what moved, by the rays from `path`, the scanner's, where it is known.
+    """Split `cloud` into static and moving points by the free space along the rays from the scanner's `path`.
 
-    Files: `cloud`, without what moved, the recording vehicle's own returns and those within a camera's first metre;
-    `moving`, what moved, with time, normals towards the scanner and the class "vehicle"; `dropped`, .npy (N,) uint8 by
-    point of the cloud, 0 where it is kept, else "vehicle" (it moved) or "low_noise"; empty where all are.
+    Files: `cloud`, without moving points, returns of the ego vehicle, and points next to a camera; `moving`, the moving
+    points with time, normals towards the scanner and the class "vehicle"; `dropped`, .npy (N,) uint8 per point of the
+    input: 0 if kept, else the class "vehicle" (moving) or "low_noise"; empty if all points are kept.
     """
-    from scan2sim.pipeline.dynamic_objects.ego_vehicle_mask import in_first_metre, in_swept, swept
+    from scan2sim.pipeline.dynamic_objects.ego_vehicle_mask import in_swept_volume, near_cameras, swept_volume
 
     if params.when == "never" or not (params.cameras or "path" in inputs):
         why = "carve.when=never" if params.when == "never" else "neither path nor cameras are known"
@@ -66,18 +66,18 @@ def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Don
     path = Trajectory.load(inputs["path"]) if "path" in inputs else None
     seen_again = 0.0
     moved, origins, why = np.zeros(len(cloud), bool), np.zeros((0, 3)), "the scanner's path isn't known"
-    way = own = None
+    volume = own = None
     if path is not None:
-        report(0.1, "where the vehicle went")
+        report(0.1, "ego vehicle")
         origins, why = _origins(cloud, path)
-        if not why.startswith("the scanner flies"):
-            way = swept(cloud.xyz, path)
-            own = in_swept(cloud.xyz, way)
+        if not why.startswith("the scanner is airborne"):
+            volume = swept_volume(cloud.xyz, path)
+            own = in_swept_volume(cloud.xyz, volume)
     if not why:
-        report(0.2, "following rays")
+        report(0.2, "tracing rays")
         moved, seen_again = _moved(cloud, origins, path, params)
-        why = "" if seen_again > SEEN_AGAIN else "nearly every place was seen once alone"
-    near = in_first_metre(cloud.xyz, np.array(params.cameras, np.float64).reshape(-1, 3), params.camera, way)
+        why = "" if seen_again > MIN_REVISITED_FRACTION else "nearly all voxels were observed only once"
+    near = near_cameras(cloud.xyz, np.array(params.cameras, np.float64).reshape(-1, 3), params.camera, volume)
     own = np.zeros(len(cloud), bool) if own is None else own & ~moved
     near &= ~moved & ~own
     moving_share = float(moved.mean())
@@ -107,18 +107,19 @@ def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Don
     ).save(out / "moving.npz")  # fmt: skip
     files = {name: out / f"{name}.npz" for name in ("cloud", "moving")} | {"dropped": out / "dropped.npy"}
     warnings = []
-    if moving_share > MANY:
+    if moving_share > MOVING_FRACTION_WARNING:
         warnings.append(
-            f"{moving_share:.0%} of the points lie where other rays saw nothing, and are left out as moving: "
-            "are path and points of the same time, and poses better than a voxel? --set carve.when=never keeps them"
+            f"{moving_share:.0%} of the points were removed as moving objects, because other rays passed through them: "
+            "check that path and points share a clock, and that poses are accurate to a voxel. "
+            "--set carve.when=never keeps all points"
         )
     return Done(files, facts, warnings)
 
 
 def _untouched(cloud: Path, out: Path, why: str, facts: dict[str, object] | None = None) -> Done:
-    """The cloud as it is, linked, and nothing that moved."""
+    """Result without moving points: the input cloud, linked."""
     file, moving = out / "cloud.npz", out / "moving.npz"
-    pass_on(cloud, file)
+    link_or_copy(cloud, file)
     none = np.zeros((0, 3), np.float32)
     PointCloud(Frame(), none, none.astype(np.uint8), none, np.zeros(0, np.uint8), np.zeros(0)).save(moving)
     np.save(out / "dropped.npy", np.zeros(0, np.uint8))
@@ -126,7 +127,7 @@ def _untouched(cloud: Path, out: Path, why: str, facts: dict[str, object] | None
 
 
 def _origins(cloud: PointCloud, path: Trajectory) -> tuple[F64, str]:
-    """(N, 3) where the scanner was at each point's time, NaN where that isn't known; and why it isn't at all, or ""."""
+    """Scanner positions (N, 3) at each point's time, NaN where unknown; and the reason if rays can't be used, or ""."""
     if cloud.time is None:
         return np.zeros((0, 3)), "the points have no times"
     known = np.isfinite(path.times)
@@ -136,22 +137,22 @@ def _origins(cloud: PointCloud, path: Trajectory) -> tuple[F64, str]:
     origins = np.stack([np.interp(cloud.time, times, positions[:, k]) for k in range(3)], axis=1)
     after = np.clip(np.searchsorted(times, cloud.time), 1, len(times) - 1)
     span = np.diff(times)
-    usual = max(GAP, 3 * float(np.median(span)))
-    lost = span[after - 1] > usual
-    lost &= np.minimum(np.abs(cloud.time - times[after - 1]), np.abs(times[after] - cloud.time)) > WINDOW
-    lost |= (cloud.time < times[0] - WINDOW) | (cloud.time > times[-1] + WINDOW)
-    origins[lost] = np.nan
-    if lost.all():
-        return origins, "the path is of another time than the points"
-    some = slice(None, None, max(1, len(cloud) // 100_000))
-    ranges = np.linalg.norm(cloud.xyz[some] - origins[some], axis=1)
-    if np.nanmedian(ranges) > AIRBORNE:
-        return origins, f"the scanner flies: points are {np.nanmedian(ranges):.0f} m away"
+    max_gap = max(MAX_PATH_GAP_S, 3 * float(np.median(span)))
+    unknown = span[after - 1] > max_gap
+    unknown &= np.minimum(np.abs(cloud.time - times[after - 1]), np.abs(times[after] - cloud.time)) > SCAN_WINDOW_S
+    unknown |= (cloud.time < times[0] - SCAN_WINDOW_S) | (cloud.time > times[-1] + SCAN_WINDOW_S)
+    origins[unknown] = np.nan
+    if unknown.all():
+        return origins, "path and points don't overlap in time"
+    sample = slice(None, None, max(1, len(cloud) // 100_000))
+    ranges = np.linalg.norm(cloud.xyz[sample] - origins[sample], axis=1)
+    if np.nanmedian(ranges) > AIRBORNE_RANGE_M:
+        return origins, f"the scanner is airborne: points are {np.nanmedian(ranges):.0f} m away"
     return origins, ""
 
 
 def _moved(cloud: PointCloud, origins: F64, path: Trajectory | None, params: CarveParams) -> tuple[Bools, float]:
-    """(N,) which points other rays passed through, and the share of those that rays can tell of."""
+    """(N,) bool, True for points that other rays passed through; and the fraction of points in revisited voxels."""
     from scan2sim.pipeline.dynamic_objects.free_space import in_free_space
 
     assert cloud.time is not None and path is not None
@@ -160,11 +161,11 @@ def _moved(cloud: PointCloud, origins: F64, path: Trajectory | None, params: Car
     free, seen_again = in_free_space(
         cloud.xyz[order],
         origins[order].astype(np.float32),
-        np.floor((time - time[0]) / WINDOW + 0.5).astype(np.int64),
+        np.floor((time - time[0]) / SCAN_WINDOW_S + 0.5).astype(np.int64),
         voxel=params.voxel,
         reach=params.reach,
         votes=params.votes,
-        high=float(path.positions[:, 2].max()) + ABOVE,
+        high=float(path.positions[:, 2].max()) + MOVING_MAX_HEIGHT_M,
     )
     out = np.empty(len(cloud), bool)
     out[order] = free

@@ -1,4 +1,4 @@
-"""Clip: the mesh cut to the tile's own cell, where tiles of a survey meet."""
+"""Clip: cuts the mesh to the tile's Voronoi cell where tiles of a survey meet."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from pathlib import Path
 
 from pydantic import Field
 
-from scan2sim.pipeline.core.parameters import Place
+from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 
 class CellParams(Params):
-    """What of the survey is the tile's own, set by the recipe.
+    """The tile's Voronoi cell within the survey, set by the pipeline.
 
     Attributes:
         seed: (x, y) world metres (CRS coordinates times metres per unit).
-        neighbours: the names of tiles whose cells touch to their seeds, world metres.
+        neighbours: seeds of the tiles with adjacent cells, by name, world metres.
     """
 
-    seed: Place
-    neighbours: dict[str, Place] = Field(default_factory=dict)
+    seed: PlanPoint
+    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
 
     @property
     def cell(self) -> Cell:
@@ -30,7 +30,7 @@ class CellParams(Params):
 
 
 def clip(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Done:
-    """Cut `mesh` to the tile's own cell, and tell which vertices lie on which border (`on`)."""
+    """Cut `mesh` to the tile's cell; `on` records which vertices lie on which border."""
     from scan2sim.pipeline.tiling.borders.clip import clip as clip_mesh
 
     mesh = Mesh.load(inputs["mesh"])

@@ -1,4 +1,4 @@
-"""Cut: a corridor becomes the overlapping tiles of a survey."""
+"""Cut: splits a corridor into the overlapping tiles of a survey."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scan2sim.pipeline.tiling.cut_corridor import VERSION, CutParams, cut_survey
 
 
 def cut(inputs: Inputs, params: CutParams, out: Path, report: Report) -> Done:
-    """Cut the tile `corridor` (a `tile.toml`, or its folder); other inputs are what it names.
+    """Cut the tile `corridor` (a `tile.toml`, or its folder); other inputs are the files that it refers to.
 
     Raises:
         ScanError: as `cut_survey`.

@@ -1,4 +1,4 @@
-"""Decimate: fewer triangles, each class to its own target (D3.2, section 4.2)."""
+"""Decimate: mesh simplification, with a target per class (D3.2, section 4.2)."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from scan2sim.pipeline.core.types import Mesh
 
 
 class DecimateParams(Params):
-    """How many triangles are left.
+    """Mesh simplification.
 
     Attributes:
-        target: triangles; the mission's 100 K for terrain and buildings, 300 K for vegetation; 50 K for vehicles.
-        backend: "pyfqmr", "fast_simplification", "pymeshlab" or "open3d", which can't keep borders: the library that
-            does it (`pipeline/decimation/`).
-        keep_border: never thin the border, be there too many triangles; set by the recipe where tiles meet.
+        target: number of triangles; D3.2: 100 K for terrain and buildings, 300 K for vegetation; 50 K for vehicles.
+        backend: simplification library, "pyfqmr", "fast_simplification", "pymeshlab" or "open3d" (which can't preserve
+            borders); modules of `pipeline/decimation/`.
+        keep_border: never simplify open borders, even if that exceeds the target; set by the pipeline where tiles meet.
     """
 
     target: int = Field(100_000, ge=10_000, le=1_000_000)
@@ -28,13 +28,12 @@ class DecimateParams(Params):
 
 
 def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) -> Done:
-    """Collapse edges of `mesh` down to the target, borders kept where the library can (tiles and classes meet there).
+    """Simplify `mesh` by edge collapse to the target, preserving borders (of tiles and classes) if the library can.
 
-    What `furniture` (optional) holds is added as it is, within the target; its faces keep their classes, all others
-    have the class 0 then.
+    `furniture` (optional) is added unsimplified, within the target; its faces keep their classes, all other faces then
+    get class 0.
 
-    Where the border alone is more than the target allows, the border is thinned as well (but for `keep_border`),
-    and a warning says so.
+    If the border alone exceeds the target, it is simplified as well (unless `keep_border`), with a warning.
 
     Raises:
         SettingError, UnavailableError: as `can_decimate`.
@@ -44,37 +43,37 @@ def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) 
     border_kept = find(params.backend, keep_border=params.keep_border).KEEPS_BORDER
 
     mesh = Mesh.load(inputs["mesh"])
-    things = Mesh.load(inputs["furniture"]) if "furniture" in inputs else None
-    target = params.target - len(things or ())
+    furniture = Mesh.load(inputs["furniture"]) if "furniture" in inputs else None
+    target = params.target - len(furniture or ())
     small, warnings = simplify(mesh, target, keep_border=border_kept, backend=params.backend), []
     if len(small) > target * 1.05 and params.keep_border:
-        warnings.append(f"the border alone needs {len(small):,} triangles, {params.target:,} were asked for: kept")
+        warnings.append(f"{len(small):,} triangles instead of {params.target:,}: tile borders can't be simplified")
     elif len(small) > target * 1.05 and border_kept:
-        warnings.append(f"the border alone needs {len(small):,} triangles: thinned too, to {params.target:,}")
+        warnings.append(f"the border alone needs {len(small):,} triangles: it was simplified too, to {params.target:,}")
         small, border_kept = simplify(small, target, keep_border=False, backend=params.backend), False
-    if things is not None and len(things):
-        small = with_things(small, things)
+    if furniture is not None and len(furniture):
+        small = with_furniture(small, furniture)
     small.save(out / "mesh.npz")
     facts = {"faces_in": len(mesh), "faces": len(small), "target": params.target, "border_kept": border_kept}
     return Done({"mesh": out / "mesh.npz"}, facts, warnings)
 
 
-def with_things(mesh: Mesh, things: Mesh) -> Mesh:
-    """Both as one, the faces of `things` with their classes."""
-    assert things.classification is not None
+def with_furniture(mesh: Mesh, furniture: Mesh) -> Mesh:
+    """Concatenate a mesh (class 0) and street furniture, whose faces keep their classes."""
+    assert furniture.classification is not None
     return Mesh(
         mesh.frame,
-        np.concatenate([mesh.vertices, things.vertices]),
-        np.concatenate([mesh.faces, things.faces + len(mesh.vertices)]).astype(np.int32),
-        classification=np.concatenate([np.zeros(len(mesh), np.uint8), things.classification]),
+        np.concatenate([mesh.vertices, furniture.vertices]),
+        np.concatenate([mesh.faces, furniture.faces + len(mesh.vertices)]).astype(np.int32),
+        classification=np.concatenate([np.zeros(len(mesh), np.uint8), furniture.classification]),
     )
 
 
 def can_decimate(params: DecimateParams) -> None:
-    """Refuse a library that can't run here.
+    """Check that the library can run on this machine.
 
     Raises:
-        SettingError: there is none of that name, or it can't keep borders where that is asked.
+        SettingError: there is no backend of that name, or it can't preserve borders although `keep_border` is set.
         UnavailableError: it isn't installed.
     """
     from scan2sim.pipeline.decimation import find

@@ -1,4 +1,4 @@
-"""Finds: the signs, poles, lamps and trunks that a tile sees by itself, before its neighbours are asked."""
+"""Furniture detection (step `finds`): signs, poles, lamps and trunks of a tile, before merging with its neighbours."""
 
 from __future__ import annotations
 
@@ -9,76 +9,80 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.core.parameters import Place
+from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, Bools, PointCloud, Trajectory
 from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.furniture.classify import Thing
+    from scan2sim.pipeline.furniture.classify import Detection
 
     Bools = Bools
 
-CELL = 0.5  # metres, of the ground's heights
-LOW, HIGH = 0.2, 14.0  # metres above the ground where things are looked for
-BEYOND = 0.5  # metres beyond its cell from which on a tile leaves things to the neighbour, who sees more around them
+GROUND_CELL_M = 0.5  # cell of the ground height raster
+MIN_HEIGHT_M, MAX_HEIGHT_M = 0.2, 14.0  # height range above the ground of points used for detection
+MAX_OUTSIDE_CELL_M = 0.5  # detections farther outside the tile's cell are left to the neighbour
 KINDS = ("pole", "sign", "lamp", "trunk")
 
 
 class FindsParams(Params):
-    """What of the survey is the tile's own.
+    """The tile's cell within the survey.
 
     Attributes:
-        seed: the tile's (x, y), world metres, where it meets others: of what stands further than half a metre beyond
-            its cell it tells nothing; set by the recipe.
-        neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
+        seed: seed (x, y) of the tile's cell, world metres, if it has neighbours; detections more than 0.5 m outside
+            the cell are discarded; set by the pipeline.
+        neighbours: seeds of the tiles with adjacent cells, by name, world metres; set by the pipeline.
     """
 
-    seed: Place | None = None
-    neighbours: dict[str, Place] = Field(default_factory=dict)
+    seed: PlanPoint | None = None
+    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
 
 
 def finds(inputs: Inputs, params: FindsParams, out: Path, report: Report) -> Done:
-    """Find what stands upright and thin in the classified `cloud`, seen from the scanner's `path`.
+    """Detect street furniture (pole-like objects and sign panels) in the classified `cloud`, using the scanner `path`.
 
-    Tiles of a survey without a path find nothing.
-    File: `finds`, JSON list of `Thing`s in world metres. Facts: how many of each kind.
+    Without a path, nothing is detected.
+    File: `finds`, JSON list of `Detection`s in world metres. Metrics: number of detections of each kind.
     """
-    things: list[Thing] = []
+    detections: list[Detection] = []
     if "path" in inputs:
         cloud = PointCloud.load(inputs["cloud"])
         report(0.3, "stems")
-        things = seen(cloud, Trajectory.load(inputs["path"]))
+        detections = detect(cloud, Trajectory.load(inputs["path"]))
         origin = np.asarray(cloud.frame.origin, np.float64)
-        things = [thing.moved(origin) for thing in things]
-        if params.seed is not None and things:
-            outside = Cell(params.seed, params.neighbours).outside(np.array([thing.foot[:2] for thing in things]))
-            things = [thing for thing, far in zip(things, outside, strict=True) if far <= BEYOND]
-    (out / "finds.json").write_text(json.dumps([thing.to_json() for thing in things]), encoding="utf-8")
-    return Done({"finds": out / "finds.json"}, {kind: sum(t.kind == kind for t in things) for kind in KINDS})
+        detections = [detection.moved(origin) for detection in detections]
+        if params.seed is not None and detections:
+            outside = Cell(params.seed, params.neighbours).outside(
+                np.array([detection.foot[:2] for detection in detections])
+            )
+            detections = [
+                detection for detection, far in zip(detections, outside, strict=True) if far <= MAX_OUTSIDE_CELL_M
+            ]
+    (out / "finds.json").write_text(json.dumps([detection.to_json() for detection in detections]), encoding="utf-8")
+    return Done({"finds": out / "finds.json"}, {kind: sum(t.kind == kind for t in detections) for kind in KINDS})
 
 
-def seen(cloud: PointCloud, path: Trajectory) -> list[Thing]:
-    """What stands in a cloud, local metres."""
-    from scan2sim.pipeline.furniture.classify import eligible, find
+def detect(cloud: PointCloud, path: Trajectory) -> list[Detection]:
+    """Detections in a cloud, local metres."""
+    from scan2sim.pipeline.furniture.classify import detect_furniture, eligible
     from scan2sim.pipeline.furniture.poles import Columns
 
-    ground, some = eligible(cloud)
-    if not ground.any() or not len(some):
+    ground, candidates = eligible(cloud)
+    if not ground.any() or not len(candidates):
         return []
-    height = heights(cloud.xyz[ground], cloud.xyz[some])
-    within = (height > LOW) & (height < HIGH)
-    part = cloud.take(some[within])
-    return find(part, Columns(part.xyz), height[within], path) if len(part) else []
+    height = heights(cloud.xyz[ground], cloud.xyz[candidates])
+    within = (height > MIN_HEIGHT_M) & (height < MAX_HEIGHT_M)
+    near_ground = cloud.take(candidates[within])
+    return detect_furniture(near_ground, Columns(near_ground.xyz), height[within], path) if len(near_ground) else []
 
 
 def heights(ground: F32, xyz: F32) -> F32:
-    """(N,) metres of points (N, 3) above the lowest ground (M, 3) near them."""
+    """Height (N,) in metres of points (N, 3) above the lowest nearby ground points (M, 3)."""
     from scipy import ndimage
 
     from scan2sim.pipeline.geometry.height_map import Raster
 
-    raster = Raster.over(CELL, [ground, xyz])
+    raster = Raster.over(GROUND_CELL_M, [ground, xyz])
     low = -raster.highest(np.column_stack([ground[:, :2], -ground[:, 2]]).astype(np.float32))
     nearest = ndimage.distance_transform_edt(np.isnan(low), return_distances=False, return_indices=True)
     smooth = ndimage.median_filter(low[tuple(nearest)], 5)

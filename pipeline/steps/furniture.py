@@ -1,4 +1,4 @@
-"""Furniture: signs, poles, lamps and trunks as tubes and plates of their own, and where they stand."""
+"""Furniture: meshes of signs, poles, lamps and trunks, and the list of their positions."""
 
 from __future__ import annotations
 
@@ -10,108 +10,108 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.core.parameters import Place
+from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import I64, Bools, Frame, Mesh, PointCloud
 from scan2sim.pipeline.steps.finds import KINDS
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.furniture.classify import Thing
-    from scan2sim.pipeline.furniture.sign_panels import Plate
+    from scan2sim.pipeline.furniture.classify import Detection
+    from scan2sim.pipeline.furniture.sign_panels import SignPanel
 
     Bools = Bools
 
-AROUND = 4.0  # metres around its middle within which all of a thing's points lie
-COLUMNS = ("x", "y", "z", "kind", "height_m", "radius_m", "heading_deg", "shape", "plate_width_m", "plate_height_m")
+SEARCH_RADIUS_M = 4.0  # around the middle of a stem; contains all points of the object
+CSV_COLUMNS = ("x", "y", "z", "kind", "height_m", "radius_m", "heading_deg", "shape", "plate_width_m", "plate_height_m")
 
 
 class FurnitureParams(Params):
-    """What is made of street furniture.
+    """Street furniture as separate objects.
 
     Attributes:
-        when: "auto": where the tile has a scanner's path, or photos from the ground; "never": signs, poles and trunks
-            stay with the surfaces around them.
-        name: of the tile; set by the recipe.
-        seed: the tile's (x, y), world metres, where it meets others: what stands beyond its cell is theirs; set by the
-            recipe.
-        neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
+        when: "auto": if the tile has a scanner's path, or photos from the ground; "never": signs, poles and trunks
+            are meshed with the surfaces around them.
+        name: name of the tile; set by the pipeline.
+        seed: seed (x, y) of the tile's cell, world metres, if it has neighbours; objects outside the cell belong to
+            them; set by the pipeline.
+        neighbours: seeds of the tiles with adjacent cells, by name, world metres; set by the pipeline.
     """
 
     when: Literal["auto", "never"] = "auto"
     name: str = ""
-    seed: Place | None = None
-    neighbours: dict[str, Place] = Field(default_factory=dict)
+    seed: PlanPoint | None = None
+    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
 
 
 def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report) -> Done:
-    """Take the `finds` of the tile and of its neighbours, `finds.NAME`, out of the classified `cloud`.
+    """Model the detections `finds` of the tile and `finds.NAME` of its neighbours, and select their points in `cloud`.
 
-    All of a thing belongs to the tile in whose cell its foot stands; its points are taken out of every tile's surfaces
-    alike. What stands in the cell of a neighbour that isn't given is taken out, and shown by nobody.
+    An object belongs to the tile whose cell contains its foot; its points are removed from the surfaces of all tiles.
+    If that tile is not given, its points are removed nevertheless, and no tile has a mesh of it.
 
-    Files: `building` and `vegetation`, meshes of signs, poles and lamps, and of trunks, with a class code for every
-    face; `taken`, .npz with `index` (N,) of the cloud's points that are a thing's, and which of them are an `own` one's
-    (N,); `geojson` and `csv`: places in the tile's CRS, kind, height above the ground, radius, and of plates the way
-    that they face (of lamps, that they reach), clockwise from the CRS's north; `plates`, JSON list of all plates, local
-    metres; `beside`, JSON list of the places (x, y, z) where the neighbours' poles stand, local metres.
+    Files: `building` (signs, poles and lamps) and `vegetation` (trunks), meshes with a class code per face; `taken`,
+    .npz with `index` (N,) of the points of objects, and `own` (N,), True for objects of this tile; `geojson` and
+    `csv`: position in the tile's CRS, kind, height above the ground, radius, and heading of sign panels (of lamps: of
+    the arm), clockwise from the CRS's north; `plates`, JSON list of all sign panels, local metres; `beside`, JSON list
+    of the feet (x, y, z) of the neighbours' poles, local metres.
     """
     cloud = PointCloud.load(inputs["cloud"])
-    own, others = _parted(inputs, params, cloud.frame)
+    own, others = _load_detections(inputs, params, cloud.frame)
     report(0.5, "points")
-    index, whose = _held(cloud, own, others)
+    index, whose = _points_of(cloud, own, others)
     np.savez(out / "taken.npz", index=index, own=whose)
     files = {"taken": out / "taken.npz"}
     faces = 0
     for group, trunks in (("building", False), ("vegetation", True)):
-        mesh = _mesh(cloud.frame, [thing for thing in own if (thing.kind == "trunk") == trunks])
+        mesh = _mesh(cloud.frame, [detection for detection in own if (detection.kind == "trunk") == trunks])
         mesh.save(out / f"{group}.npz")
         files[group] = out / f"{group}.npz"
         faces += len(mesh)
-    files |= listed(out, cloud.frame.crs, [_row(thing, cloud.frame) for thing in own])
+    files |= write_lists(out, cloud.frame.crs, [_row(detection, cloud.frame) for detection in own])
     lists = {
-        "plates": [plate.to_json() for thing in own for plate in thing.plates],
-        "beside": [thing.foot.tolist() for thing in others if thing.kind != "trunk"],
+        "plates": [plate.to_json() for detection in own for plate in detection.plates],
+        "beside": [detection.foot.tolist() for detection in others if detection.kind != "trunk"],
     }
     for name, rows in lists.items():
         files[name] = out / f"{name}.json"
         files[name].write_text(json.dumps(rows), encoding="utf-8")
-    kinds = {kind: sum(thing.kind == kind for thing in own) for kind in KINDS}
+    kinds = {kind: sum(detection.kind == kind for detection in own) for kind in KINDS}
     return Done(files, {**kinds, "points": len(index), "of_neighbours": int((~whose).sum()), "faces": faces})
 
 
-def _parted(inputs: Inputs, params: FurnitureParams, frame: Frame) -> tuple[list[Thing], list[Thing]]:
-    """The tile's own things and its neighbours', local metres."""
-    from scan2sim.pipeline.furniture.classify import Thing
-    from scan2sim.pipeline.tiling.borders.merge_detections import agreed
+def _load_detections(inputs: Inputs, params: FurnitureParams, frame: Frame) -> tuple[list[Detection], list[Detection]]:
+    """The tile's own objects and its neighbours', local metres."""
+    from scan2sim.pipeline.furniture.classify import Detection
+    from scan2sim.pipeline.tiling.borders.merge_detections import merged_detections
 
-    def read(path: Path) -> list[Thing]:
-        return [Thing.from_json(row) for row in json.loads(path.read_text(encoding="utf-8"))]
+    def read(path: Path) -> list[Detection]:
+        return [Detection.from_json(row) for row in json.loads(path.read_text(encoding="utf-8"))]
 
     finds = {params.name: read(inputs["finds"])}
     finds |= {name: read(inputs[f"finds.{name}"]) for name in params.neighbours if f"finds.{name}" in inputs}
     if params.seed is None:
-        told = [(params.name, thing) for thing in finds[params.name]]
+        merged = [(params.name, detection) for detection in finds[params.name]]
     else:
-        told = agreed(finds, {params.name: params.seed, **params.neighbours})
+        merged = merged_detections(finds, {params.name: params.seed, **params.neighbours})
     here = -np.asarray(frame.origin, np.float64)
-    own = [thing.moved(here) for name, thing in told if name == params.name]
-    return own, [thing.moved(here) for name, thing in told if name != params.name]
+    own = [detection.moved(here) for name, detection in merged if name == params.name]
+    return own, [detection.moved(here) for name, detection in merged if name != params.name]
 
 
-def listed(out: Path, crs: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Path]:
-    """Write `furniture.csv` and `furniture.geojson`; each row's `x`, `y` and `z` are in the CRS."""
+def write_lists(out: Path, crs: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Path]:
+    """Write `furniture.csv` and `furniture.geojson`; `x`, `y` and `z` of each row are in the CRS."""
     from scan2sim.pipeline.io.geodata import geojson
 
     files = {"csv": out / "furniture.csv", "geojson": out / "furniture.geojson"}
-    text = "\n".join([",".join(COLUMNS), *(",".join(str(row.get(c, "")) for c in COLUMNS) for row in rows)])
+    text = "\n".join([",".join(CSV_COLUMNS), *(",".join(str(row.get(c, "")) for c in CSV_COLUMNS) for row in rows)])
     files["csv"].write_text(text + "\n", encoding="utf-8")
     features = [((r["x"], r["y"], r["z"]), {k: v for k, v in r.items() if k not in "xyz"}) for r in rows]
     geojson.write_points(files["geojson"], crs, features)
     return files
 
 
-def _held(cloud: PointCloud, own: Sequence[Thing], others: Sequence[Thing]) -> tuple[I64, Bools]:
-    """(N,) indices of the points that are a thing's, ascending, and which of them are an own one's."""
+def _points_of(cloud: PointCloud, own: Sequence[Detection], others: Sequence[Detection]) -> tuple[I64, Bools]:
+    """Indices (N,) of the points of all objects, ascending; and (N,) bool, True for objects of this tile."""
     from scan2sim.pipeline.furniture.classify import eligible
     from scan2sim.pipeline.furniture.poles import Columns
 
@@ -120,19 +120,19 @@ def _held(cloud: PointCloud, own: Sequence[Thing], others: Sequence[Thing]) -> t
     taken = np.zeros((2, len(some)), bool)
     if len(some) and (own or others):
         columns = Columns(xyz)
-        for k, things in enumerate((own, others)):
-            for thing in things:
-                near = columns.near(thing.stem.middle, AROUND)
-                taken[k, near[thing.held(xyz[near])]] = True
+        for k, detections in enumerate((own, others)):
+            for detection in detections:
+                near = columns.near(detection.stem.middle, SEARCH_RADIUS_M)
+                taken[k, near[detection.contains(xyz[near])]] = True
     held = taken.any(axis=0)
     return some[held], taken[0, held]
 
 
-def _mesh(frame: Frame, things: list[Thing]) -> Mesh:
-    """All of the things' parts, each face with its class."""
+def _mesh(frame: Frame, detections: list[Detection]) -> Mesh:
+    """Mesh of all parts of the objects, with a class per face."""
     from scan2sim.pipeline.geometry import primitives
 
-    parts = [part for thing in things for part in thing.meshes()]
+    parts = [part for detection in detections for part in detection.meshes()]
     vertices, faces = primitives.join([triangles for triangles, _ in parts])
     codes = [np.full(len(triangles[1]), code, np.uint8) for triangles, code in parts]
     return Mesh(
@@ -140,20 +140,20 @@ def _mesh(frame: Frame, things: list[Thing]) -> Mesh:
     )
 
 
-def _row(thing: Thing, frame: Frame) -> dict[str, Any]:
-    """What the lists tell of a thing."""
-    x, y, z = frame.to_crs(thing.foot[None])[0].tolist()
-    row: dict[str, Any] = {"x": round(x, 3), "y": round(y, 3), "z": round(z, 3), "kind": thing.kind}
-    row |= {"height_m": round(thing.height, 2), "radius_m": round(thing.stem.thickness, 3)}
-    if thing.arm is not None:
-        row["heading_deg"] = round(float(np.degrees(np.arctan2(*thing.arm.direction))) % 360, 1)
-    if thing.plates:
-        row |= of_plate(max(thing.plates, key=lambda p: p.width * p.height))
+def _row(detection: Detection, frame: Frame) -> dict[str, Any]:
+    """Row of an object in the CSV and GeoJSON lists."""
+    x, y, z = frame.to_crs(detection.foot[None])[0].tolist()
+    row: dict[str, Any] = {"x": round(x, 3), "y": round(y, 3), "z": round(z, 3), "kind": detection.kind}
+    row |= {"height_m": round(detection.height, 2), "radius_m": round(detection.stem.thickness, 3)}
+    if detection.arm is not None:
+        row["heading_deg"] = round(float(np.degrees(np.arctan2(*detection.arm.direction))) % 360, 1)
+    if detection.plates:
+        row |= sign_panel_columns(max(detection.plates, key=lambda p: p.width * p.height))
     return row
 
 
-def of_plate(plate: Plate) -> dict[str, Any]:
-    """What the lists tell of a plate."""
+def sign_panel_columns(plate: SignPanel) -> dict[str, Any]:
+    """Columns of a sign panel in the CSV and GeoJSON lists."""
     heading = float(np.degrees(np.arctan2(plate.normal[0], plate.normal[1]))) % 360
     size = {"plate_width_m": round(plate.width, 2), "plate_height_m": round(plate.height, 2)}
     return {"heading_deg": round(heading, 1), "shape": plate.shape, **size}

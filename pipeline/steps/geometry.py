@@ -1,4 +1,4 @@
-"""Geometry: how far the meshes are from the cloud, and from the true surface where it is known."""
+"""Geometry: accuracy of the meshes, as distances to the cloud, and to the ground-truth surface if there is one."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.classes import GROUPS, SURFACES, group_of
-from scan2sim.pipeline.core.parameters import Place
+from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, Mesh, PointCloud
 from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
-FAR = 1.0  # metres from the mesh beyond which one point in twenty is worth a warning
+P95_DISTANCE_WARNING_M = 1.0  # the step warns if 5 % of the points are farther from the mesh
 
 
 class GeometryParams(Params):
-    """How densely is measured.
+    """Sampling.
 
     Attributes:
-        samples: points a class, drawn from the cloud and from the mesh.
-        seed: the tile's (x, y), world metres, where it meets others: the mesh ends at its cell's borders, so only
-            points within them count; set by the recipe.
-        neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
+        samples: number of points per class, sampled from the cloud and from the mesh.
+        seed: seed (x, y) of the tile's cell, world metres, if it has neighbours; only points inside the cell, where
+            the mesh ends, are used; set by the pipeline.
+        neighbours: seeds of the tiles with adjacent cells, by name, world metres; set by the pipeline.
     """
 
     samples: int = Field(200_000, ge=1000, le=10_000_000)
-    seed: Place | None = None
-    neighbours: dict[str, Place] = Field(default_factory=dict)
+    seed: PlanPoint | None = None
+    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
 
 
 def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) -> Done:
-    """Measure `mesh.*` against `cloud.*`, and against `truth.mesh` where the tile is a generated one.
+    """Measure `mesh.*` against `cloud.*`, and against `truth.mesh` of a generated tile.
 
-    Facts, per class, in metres: `cloud_to_mesh_mean_m` and `cloud_to_mesh_p95_m` (from the points to
-    the nearest place on the mesh); `truth_mean_m` (from the mesh to the true surface of its class). `made_up` is the
-    share of the mesh's area that lies nearer to points that were made up (`made.*`) than to any of the cloud's.
+    Metrics per class, in metres: `cloud_to_mesh_mean_m` and `cloud_to_mesh_p95_m` (from points to the nearest point of
+    the mesh); `truth_mean_m` (from the mesh to the ground-truth surface of its class). `made_up` is the fraction of the
+    mesh's area that is nearer to synthesized points (`made.*`) than to scanned ones.
     """
     facts: dict[str, dict[str, Any]] = {}
     warnings: list[str] = []
@@ -54,72 +54,74 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
             cloud = cloud.take(own)
         if len(mesh) == 0 and len(cloud) > 0:
             warnings.append(
-                f"{group}: none of its {len(cloud):,} points became a surface (too few, or taken by trim and islands): "
+                f"{group}: none of its {len(cloud):,} points are in the mesh (too few, or removed by trim or islands): "
                 f"the world has no {group}"
             )
         if len(mesh) == 0 or len(cloud) == 0:
             continue
         points = cloud.xyz[:: max(1, len(cloud) // params.samples)]
         distance = distances(points, mesh)
-        figures = {
+        metrics = {
             "triangles": len(mesh),
             "area_m2": float(mesh.face_area.sum()),
             "cloud_to_mesh_mean_m": float(distance.mean()),
             "cloud_to_mesh_p95_m": float(np.percentile(distance, 95)),
         }
-        if figures["cloud_to_mesh_p95_m"] > FAR:
+        if metrics["cloud_to_mesh_p95_m"] > P95_DISTANCE_WARNING_M:
             warnings.append(
-                f"{group}: 5 % of the points are further than {figures['cloud_to_mesh_p95_m']:.1f} m from the mesh; "
-                "there the world lacks what was scanned (too few points for a surface, or of another class)"
+                f"{group}: 5 % of the points are further than {metrics['cloud_to_mesh_p95_m']:.1f} m from the mesh; "
+                "parts of the scan are missing in the world (too few points for a surface, or points of another class)"
             )
         if f"made.{group}" in inputs:
-            made = PointCloud.load(inputs[f"made.{group}"])
-            figures["made_up"] = made_up(mesh, PointCloud.load(inputs[f"cloud.{group}"]), made, params.samples)
+            synthesized = PointCloud.load(inputs[f"made.{group}"])
+            metrics["made_up"] = synthesized_fraction(
+                mesh, PointCloud.load(inputs[f"cloud.{group}"]), synthesized, params.samples
+            )
         if truth is not None and truth.classification is not None:
             error = truth_error(mesh, truth, group, params.samples)
-            figures |= {} if error is None else {"truth_mean_m": error}
-        facts[group] = {name: round(value, 4) for name, value in figures.items()}
+            metrics |= {} if error is None else {"truth_mean_m": error}
+        facts[group] = {name: round(value, 4) for name, value in metrics.items()}
     return Done({}, facts, warnings)
 
 
-def made_up(mesh: Mesh, cloud: PointCloud, made: PointCloud, samples: int) -> float:
-    """Share of the mesh's area whose nearest point is one that was made up."""
+def synthesized_fraction(mesh: Mesh, cloud: PointCloud, synthesized: PointCloud, samples: int) -> float:
+    """Fraction of the mesh's area whose nearest point is synthesized."""
     from scipy.spatial import cKDTree
 
-    if not len(made):
+    if not len(synthesized):
         return 0.0
-    places = spread(mesh, samples)
-    real, _ = cKDTree(cloud.xyz).query(places, workers=-1)
-    other, _ = cKDTree(made.xyz).query(places, workers=-1)
+    points = sample_surface(mesh, samples)
+    real, _ = cKDTree(cloud.xyz).query(points, workers=-1)
+    other, _ = cKDTree(synthesized.xyz).query(points, workers=-1)
     return float((other < real).mean())
 
 
-def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int, *, whatever: bool = False) -> float | None:
-    """Mean distance in metres from points spread evenly on the mesh to the true surface of its class.
+def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int, *, any_class: bool = False) -> float | None:
+    """Mean distance in metres from points sampled uniformly on the mesh to the ground-truth surface of its class.
 
-    Samples outside the bounds of that surface (a cloud reaches further than its street) don't count.
+    Samples outside the bounds of that surface are ignored: a cloud extends beyond its street.
 
     Args:
-        mesh: of `group`.
-        truth: the true surface, labelled.
-        group: of classes.
-        samples: how many.
-        whatever: the true surface of any class counts, not just of the mesh's.
+        mesh: mesh of `group`.
+        truth: ground-truth surface with classes.
+        group: group of classes.
+        samples: number of samples.
+        any_class: measure to the ground-truth surface of all classes, not only of the mesh's.
     """
     assert truth.classification is not None
     if group not in GROUPS:
-        return None  # no truth has what is parked
+        return None  # there is no ground truth of parked vehicles
     same = truth.keep(group_of()[truth.classification] == GROUPS.index(group)).moved_to(mesh.frame)
     if not len(same):
         return None
-    points = spread(mesh, samples)
+    points = sample_surface(mesh, samples)
     low, high = same.vertices.min(axis=0)[:2], same.vertices.max(axis=0)[:2]
     points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)]
-    return float(np.mean(distances(points, truth.moved_to(mesh.frame) if whatever else same)))
+    return float(np.mean(distances(points, truth.moved_to(mesh.frame) if any_class else same)))
 
 
 def distances(points: F32, mesh: Mesh) -> F32:
-    """(N,) metres from points (N, 3) to the nearest place on the mesh."""
+    """Distance (N,) in metres from points (N, 3) to the nearest point of the mesh."""
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
@@ -127,8 +129,8 @@ def distances(points: F32, mesh: Mesh) -> F32:
     return scene.compute_distance(np.ascontiguousarray(points, np.float32)).numpy()
 
 
-def spread(mesh: Mesh, count: int, seed: int = 0) -> F32:
-    """(count, 3) points drawn evenly from the mesh's surface."""
+def sample_surface(mesh: Mesh, count: int, seed: int = 0) -> F32:
+    """Points (count, 3) sampled uniformly from the mesh's surface."""
     random = np.random.default_rng(seed)
     area = np.cumsum(mesh.face_area, dtype=np.float64)
     face = np.searchsorted(area, random.uniform(0, area[-1], count)).clip(max=len(mesh) - 1)

@@ -1,4 +1,4 @@
-"""Ground: closed under roofs and crowns, where an airborne scanner saw none; in streets where something hid it."""
+"""Ground completion (step `ground`): fills ground under roofs and crowns (airborne scans) and occlusions in streets."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.classes import CODE
-from scan2sim.pipeline.core.parameters import Place
+from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import UNCOLOURED, Bools, Frame, PointCloud
 from scan2sim.pipeline.tiling.voronoi_cell import Cell, nearest
@@ -20,38 +20,38 @@ if TYPE_CHECKING:
 
     Bools = Bools
 
-FLAT = 0.5  # |nz| from which on a surface is a roof's
-COVER = 3  # cells of the points' spacing: gaps between points of one roof or crown
-BESIDE = 0.5  # metres around a vehicle's box within which its shadow in the scan may reach
-HOLE = 25.0  # m2 up to which a hole with ground all around it is closed: a courtyard isn't
+ROOF_MIN_NORMAL_Z = 0.5  # |nz| of a roof
+COVER_GAP_CELLS = 3  # largest gap between points of one roof or crown, in cells of the point spacing
+VEHICLE_MARGIN_M = 0.5  # around a vehicle's box, for its shadow in the scan
+MAX_HOLE_M2 = 25.0  # larger holes surrounded by ground, such as courtyards, are not closed
 
 
-class MadeUpParams(Params):
-    """Whether what an airborne scanner can't see is made up.
+class CompletionParams(Params):
+    """Completion of surfaces that an airborne scanner can't see.
 
     Attributes:
-        when: "auto": where the tile has neither a scanner's path nor photos with poses, and more of its buildings'
-            points lie on roofs than on walls; "always", "never".
-        seed: the tile's (x, y), world metres, where it meets others; set by the recipe.
-        neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
-        name: of the tile; set by the recipe.
-        buffer: metres beyond its cell up to which a tile's cloud reaches; set by the recipe.
+        when: "auto": if the tile has neither a scanner's path nor photos with poses, and more points of its buildings
+            are on roofs than on walls; "always"; "never".
+        seed: seed (x, y) of the tile's cell, world metres, if it has neighbours; set by the pipeline.
+        neighbours: seeds of the tiles with adjacent cells, by name, world metres; set by the pipeline.
+        name: name of the tile; set by the pipeline.
+        buffer: distance in metres by which the tile's cloud extends beyond its cell; set by the pipeline.
     """
 
     when: Literal["auto", "always", "never"] = "auto"
-    seed: Place | None = None
-    neighbours: dict[str, Place] = Field(default_factory=dict)
+    seed: PlanPoint | None = None
+    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
     name: str = ""
     buffer: float = Field(5.0, ge=0, le=1000)
 
 
-class GroundParams(MadeUpParams):
-    """Which holes are closed; the rest as of the walls, but that "auto" closes those of streets as well.
+class GroundParams(CompletionParams):
+    """Which holes are closed; other settings as of `walls`, but "auto" also closes the holes of streets.
 
     Attributes:
-        reach: metres; gaps between ground, roofs and crowns that are less than twice as wide are closed as well.
-        gap: metres; with a scanner's path, gaps of the ground that are less than twice as wide are closed, holes with
-            ground all around them up to 25 m2, and where parked vehicles were taken out.
+        reach: metres; gaps between ground, roofs and crowns narrower than twice this are closed as well.
+        gap: metres; with a scanner's path, gaps in the ground narrower than twice this are closed, as are holes up to
+            25 m2 that are surrounded by ground, and the ground under removed vehicles.
     """
 
     reach: float = Field(10.0, ge=0, le=50)
@@ -59,41 +59,41 @@ class GroundParams(MadeUpParams):
 
 
 def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> Done:
-    """Make up points of the ground where `terrain` has a hole under `building`, `vegetation` or `rest`.
+    """Synthesize ground points where `terrain` has holes under `building`, `vegetation` or `rest`.
 
-    With `things` (GeoJSON of vehicles that were taken out) it is a street's ground: what hid it is gone or is a low
-    wall, and just its gaps are closed (`gap`). The holes' heights and colours hang from their rims like a membrane;
-    a street's made-up points have no colour, as the texture goes on by itself. Where the tile meets others, their
-    clouds (`terrain.NAME` and so on) are looked at as well: both tiles fill a hole on their border alike.
-    File: `made`, a `PointCloud` with normals, as dense as the ground's own points are.
+    With `things` (GeoJSON of removed vehicles), the tile is a street: only gaps (`gap`) and the ground under vehicles
+    are filled. Heights and colours are interpolated from the edges of a hole by a membrane (Laplace equation); points
+    synthesized in a street have no colour, because the texture is inpainted. If the tile has neighbours, their clouds
+    (`terrain.NAME` and so on) are used too: both tiles fill a hole on their border identically.
+    File: `made`, a `PointCloud` with normals, as dense as the ground's points.
     """
-    from scan2sim.pipeline.geometry.height_map import Raster, closed, grown, membrane, spacing
-    from scan2sim.pipeline.tiling.borders.grid import on_grid
+    from scan2sim.pipeline.geometry.height_map import Raster, close_gaps, dilate, fill_membrane, point_spacing
+    from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
 
-    terrain = united(inputs, params, "terrain")
-    above = [united(inputs, params, part) for part in ("building", "vegetation", "rest") if part in inputs]
+    terrain = merge_neighbours(inputs, params, "terrain")
+    above = [merge_neighbours(inputs, params, part) for part in ("building", "vegetation", "rest") if part in inputs]
     street = "things" in inputs
-    active = street or params.when == "always" or from_above(above[0])
+    active = street or params.when == "always" or is_airborne(above[0])
     made = PointCloud(terrain.frame, np.zeros((0, 3), np.float32), normal=np.zeros((0, 3), np.float32))
     area = 0.0
     if active and len(terrain) and (street or any(map(len, above))):
         from scipy import ndimage
 
-        raster = Raster.over(spacing(terrain.xyz), [terrain.xyz, *(cloud.xyz for cloud in above)])
+        raster = Raster.over(point_spacing(terrain.xyz), [terrain.xyz, *(cloud.xyz for cloud in above)])
         columns = [terrain.xyz[:, 2:]] + ([] if terrain.rgb is None else [terrain.rgb])
         known = raster.mean(terrain.xyz, np.concatenate(columns, axis=1))
         has = np.isfinite(known[..., 0])
         if street:
-            wanted = gaps(has, stood(inputs, raster, terrain.frame), raster.cell, params.gap)
+            wanted = street_ground(has, vehicle_cells(inputs, raster, terrain.frame), raster.cell, params.gap)
         else:
-            cover = np.any([closed(raster.covered(cloud.xyz), COVER) for cloud in above], axis=0)
-            wanted = ndimage.binary_fill_holes(closed(has | cover, params.reach / raster.cell))
+            cover = np.any([close_gaps(raster.covered(cloud.xyz), COVER_GAP_CELLS) for cloud in above], axis=0)
+            wanted = ndimage.binary_fill_holes(close_gaps(has | cover, params.reach / raster.cell))
         report(0.3, "membrane")
-        field = membrane(known, np.asarray(wanted))
-        new = np.isfinite(field[..., 0]) & ~grown(has, 1.5)
+        field = fill_membrane(known, np.asarray(wanted))
+        new = np.isfinite(field[..., 0]) & ~dilate(has, 1.5)
         if params.seed is not None:
             new[new] = near_cell(raster.centres(new), params, terrain)
-        xyz = on_grid(np.column_stack([raster.centres(new), field[new][:, 0]])).astype(np.float32)
+        xyz = snap_to_grid(np.column_stack([raster.centres(new), field[new][:, 0]])).astype(np.float32)
         slope = np.gradient(np.where(np.isfinite(field[..., 0]), field[..., 0], np.nanmean(field[..., 0])), raster.cell)
         normal = np.column_stack([-slope[1][new], -slope[0][new], np.ones(len(xyz))])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -107,55 +107,52 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
     return Done({"made": out / "made.npz"}, {"from_above": active, "points": len(made), "made_up_m2": round(area, 1)})
 
 
-def gaps(has: Bools, stood: Bools, cell: float, gap: float) -> Bools:
-    """What of a street's ground is to be there: what is, its gaps, its small holes, and where something stood.
+def street_ground(has: Bools, vehicles: Bools, cell: float, gap: float) -> Bools:
+    """Cells of a street's ground after completion: scanned cells, gaps, small holes, and cells under vehicles.
 
     Args:
-        has: (rows, columns) where there are points of it.
-        stood: (rows, columns) where things stood that were taken out.
-        cell: metres.
-        gap: metres; half the width that gaps may have.
+        has: (rows, columns) cells with ground points.
+        vehicles: (rows, columns) cells under removed vehicles.
+        cell: cell size, metres.
+        gap: half the maximum width of gaps, metres.
     """
     from scipy import ndimage
 
-    from scan2sim.pipeline.geometry.height_map import closed
+    from scan2sim.pipeline.geometry.height_map import close_gaps
 
-    whole = closed(has, gap / cell) | stood
+    whole = close_gaps(has, gap / cell) | vehicles
     holes, count = ndimage.label(ndimage.binary_fill_holes(whole) & ~whole)
-    small = np.bincount(holes.ravel(), minlength=count + 1) * cell**2 <= HOLE
+    small = np.bincount(holes.ravel(), minlength=count + 1) * cell**2 <= MAX_HOLE_M2
     small[0] = False
     return np.asarray(whole | small[holes], bool)
 
 
-def stood(inputs: Inputs, raster: Raster, frame: Frame) -> Bools:
-    """The cells of a raster on which vehicles stood that were taken out, and a little around them.
-
-    They are of `things`, and of the neighbours' `things.NAME`.
-    """
-    from scan2sim.pipeline.dynamic_objects.vehicle_residue import outlines
-    from scan2sim.pipeline.geometry.height_map import drawn, grown
+def vehicle_cells(inputs: Inputs, raster: Raster, frame: Frame) -> Bools:
+    """Raster cells under removed vehicles with a margin, from `things` and the neighbours' `things.NAME`."""
+    from scan2sim.pipeline.dynamic_objects.vehicle_residue import parked_vehicle_outlines
+    from scan2sim.pipeline.geometry.height_map import dilate, rasterize_polygons
 
     listed = [path for name, path in sorted(inputs.items()) if name.partition(".")[0] == "things"]
-    rings = [ring / raster.cell - raster.low for path in listed for ring in outlines(path, frame)]
-    return np.asarray(grown(drawn(rings, raster.shape), BESIDE / raster.cell), bool)
+    rings = [ring / raster.cell - raster.low for path in listed for ring in parked_vehicle_outlines(path, frame)]
+    return np.asarray(dilate(rasterize_polygons(rings, raster.shape), VEHICLE_MARGIN_M / raster.cell), bool)
 
 
-def from_above(building: PointCloud) -> bool:
-    """Whether a scanner saw more of the buildings' roofs than of their walls; so it is without buildings, too."""
+def is_airborne(building: PointCloud) -> bool:
+    """Whether the scan is airborne: more points on roofs than on walls; also True without buildings."""
     assert building.normal is not None
-    return len(building) == 0 or float(np.mean(np.abs(building.normal[:, 2]) > FLAT)) >= 0.5
+    return len(building) == 0 or float(np.mean(np.abs(building.normal[:, 2]) > ROOF_MIN_NORMAL_Z)) >= 0.5
 
 
-def near_cell(xy: object, params: MadeUpParams, cloud: PointCloud) -> object:
-    """(N,) which local places (N, 2) lie in the tile's cell or within its buffer."""
+def near_cell(xy: object, params: CompletionParams, cloud: PointCloud) -> object:
+    """(N,) bool, True for local points (N, 2) in the tile's cell or within its buffer."""
     assert params.seed is not None
     world = np.asarray(xy) + np.asarray(cloud.frame.origin[:2])
     return Cell(params.seed, params.neighbours).outside(world) <= params.buffer
 
 
-def united(inputs: Inputs, params: MadeUpParams, part: str) -> PointCloud:
-    """The cloud `part` with what the neighbours' clouds `part.NAME` have where they own it, in the tile's own frame."""
-    from scan2sim.pipeline.tiling.borders.grid import on_grid
+def merge_neighbours(inputs: Inputs, params: CompletionParams, part: str) -> PointCloud:
+    """The cloud `part` merged with the neighbours' clouds `part.NAME` inside their own cells, in the tile's frame."""
+    from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
 
     own = PointCloud.load(inputs[part])
     given = sorted(name for name in params.neighbours if f"{part}.{name}" in inputs)
@@ -163,9 +160,9 @@ def united(inputs: Inputs, params: MadeUpParams, part: str) -> PointCloud:
         return own
     seeds = dict(sorted({params.name: params.seed, **{name: params.neighbours[name] for name in given}}.items()))
     parts = []
-    for i, name in enumerate(seeds):  # by name, in every tile alike
+    for i, name in enumerate(seeds):  # in order of names, which is the same in every tile
         cloud = own if name == params.name else PointCloud.load(inputs[f"{part}.{name}"])
-        world = on_grid(cloud.xyz + np.asarray(cloud.frame.origin))
+        world = snap_to_grid(cloud.xyz + np.asarray(cloud.frame.origin))
         mine = nearest(world[:, :2], list(seeds.values())) == i
         xyz = (world - np.asarray(own.frame.origin)).astype(np.float32)
         parts.append(replace(cloud, frame=own.frame, xyz=xyz).take(mine))

@@ -1,4 +1,4 @@
-"""Import sweeps: a moving scanner's sweeps and a trajectory become a corridor."""
+"""Import sweeps: builds a corridor tile from a moving scanner's sweeps and a trajectory."""
 
 from __future__ import annotations
 
@@ -12,26 +12,30 @@ from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.importers import sweeps as io
 
 
-class SweepsParams(io.Placing):
-    """How sweeps are placed, and photos taken along."""
+class SweepsParams(io.PlacementParams):
+    """How sweeps are registered, and photos are added."""
 
-    camera: str = Field("auto", description="auto, pinhole, equirectangular, or a TOML like a tile's.")
-    focal: Focal | None = Field(None, description="Pixels, of a pinhole camera.")
-    centre: tuple[Pixels, Pixels] | None = Field(None, description="Pixels; default: the middle.")
+    camera: str = Field(
+        "auto", description="Camera model of the photos: auto, pinhole, equirectangular, or a TOML file as in a tile."
+    )
+    focal: Focal | None = Field(None, description="Focal length of a pinhole camera in pixels.")
+    centre: tuple[Pixels, Pixels] | None = Field(
+        None, description="Principal point in pixels; default: the image centre."
+    )
 
 
 def import_sweeps(inputs: Inputs, params: SweepsParams, out: Path, report: Report) -> Done:
-    """A tile of `sweeps` (a folder) placed by `poses`; see `tile_of` for what else may be given.
+    """Build a tile from `sweeps` (a folder) and `poses`; see `build_tile` for optional inputs.
 
     Raises:
         ScanError: as `pipeline.importers.sweeps.import_sweeps`.
     """
     warnings: list[str] = []
-    tile = tile_of(inputs, params, out / "corridor", link=True, warn=warnings.append, report=report)
+    tile = build_tile(inputs, params, out / "corridor", link=True, warn=warnings.append, report=report)
     return Done({"corridor": tile.parent}, warnings=warnings)
 
 
-def tile_of(
+def build_tile(
     inputs: Inputs,
     params: SweepsParams,
     out: Path,
@@ -42,13 +46,13 @@ def tile_of(
     overwrite: bool = False,
     name: str | None = None,
 ) -> Path:
-    """Make the tile in the folder `out`; returns its `tile.toml`.
+    """Build the tile in the folder `out`; returns its `tile.toml`.
 
     Args:
-        inputs: `sweeps` and `poses`; `extrinsics`, `times`; `photos`, `photo_times`, `mask`, and `camera`, a file that
-            describes theirs.
-        params: how.
-        warn, report, link, overwrite, name: as of `pipeline.importers.sweeps.import_sweeps`.
+        inputs: `sweeps` and `poses`; optional `extrinsics`, `times`, `photos`, `photo_times`, `mask`, and `camera`, a
+            file with the photos' camera.
+        params: settings.
+        warn, report, link, overwrite, name: see `pipeline.importers.sweeps.import_sweeps`.
 
     Raises:
         ScanError: as `pipeline.importers.sweeps.import_sweeps`.
@@ -61,7 +65,7 @@ def tile_of(
             photos, model="auto" if file else params.camera, focal=params.focal, centre=params.centre, file=file
         )
         beside = None if extrinsics is None else io.photo_extrinsics(extrinsics, photos)
-        pictures = io.Pictures(photos, camera, inputs.get("photo_times"), inputs.get("mask"), beside)
+        pictures = io.PhotoInput(photos, camera, inputs.get("photo_times"), inputs.get("mask"), beside)
     return io.import_sweeps(
         inputs["sweeps"], inputs["poses"], out, params, photos=pictures, times=inputs.get("times"),
         extrinsics=None if extrinsics is None else io.read_extrinsics(extrinsics), link=link, overwrite=overwrite,

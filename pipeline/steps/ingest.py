@@ -1,4 +1,4 @@
-"""Ingest: the tile's clouds as one, in local coordinates."""
+"""Ingest: reads and joins the tile's clouds, in local coordinates."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import Frame, PointCloud
 
 MIN_POINTS = 1000
-WIDEST = 5000.0
-"""Metres that a tile's points may reach: float32 keeps half a millimetre there, and surfaces fit into memory."""
+MAX_EXTENT_M = 5000.0
+"""Maximum extent of a tile: float32 still resolves half a millimetre there, and surfaces fit into memory."""
 
 
 class IngestParams(Params):
-    """Where the cloud is brought to, and what its classes are; set by the recipe from the tile."""
+    """Frame of the cloud and mapping of its classes; set by the pipeline from the tile."""
 
     crs: str = "local"
     origin: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
@@ -29,13 +29,13 @@ class IngestParams(Params):
 
 
 def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> Done:
-    """Read all clouds (`inputs` in order of name), drop points that aren't finite, join.
+    """Read all clouds (`inputs` in order of name), remove points with non-finite coordinates, and join them.
 
-    Attributes that only some of the clouds have are dropped, but for colours and classes, which
-    become grey and "unclassified" where they lack.
+    Attributes that only some of the clouds have are dropped, except for colours and classes, which become grey and
+    "unclassified" where they are missing.
 
     Raises:
-        DataError: fewer than 1000 points in all, or points that are further apart than 5 km.
+        DataError: fewer than 1000 points in total, or an extent above 5 km.
     """
     from scan2sim.pipeline.io import clouds
 
@@ -47,27 +47,27 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
         warnings += [f"{inputs[name].name}: {note}" for note in clouds.read_header(inputs[name]).notes]
         cloud = clouds.read(inputs[name], frame)
         if cloud.classification is not None and len(cloud):
-            table = clouds.meanings(inputs[name], params.classes)
-            strange = classes.strangers(np.bincount(cloud.classification, minlength=256), table)
-            warnings += [f"{inputs[name].name}: {strange}"] if strange else []
+            table = clouds.code_table(inputs[name], params.classes)
+            unmapped = classes.unmapped_codes_warning(np.bincount(cloud.classification, minlength=256), table)
+            warnings += [f"{inputs[name].name}: {unmapped}"] if unmapped else []
             cloud = replace(cloud, classification=table[cloud.classification])
         finite = np.atleast_1d(np.isfinite(cloud.xyz).all(axis=1))
         if not finite.all():
-            warnings.append(f"{inputs[name].name}: {np.count_nonzero(~finite):,} points with NaN coordinates left out")
+            warnings.append(f"{inputs[name].name}: {np.count_nonzero(~finite):,} points with NaN coordinates removed")
             cloud = cloud.take(finite)
         parts.append(cloud)
     cloud = PointCloud.join(parts)
     if len(cloud) < MIN_POINTS:
         names = ", ".join(str(path) for path in inputs.values())
-        raise DataError(names, f"only {len(cloud):,} points in all", f"A tile needs {MIN_POINTS:,} points or more")
+        raise DataError(names, f"only {len(cloud):,} points in all", f"A tile needs at least {MIN_POINTS:,} points")
     low, high = cloud.xyz.min(axis=0), cloud.xyz.max(axis=0)
-    if (high - low).max() > WIDEST:
+    if (high - low).max() > MAX_EXTENT_M:
         most = np.ptp(np.percentile(cloud.xyz, (1, 99), axis=0), axis=0).max()
         raise DataError(
             ", ".join(str(path) for path in inputs.values()),
             f"points are up to {(high - low).max() / 1000:,.1f} km apart (98 % of them within {most:,.0f} m), "
-            f"a tile has room for {WIDEST / 1000:g} km",
-            "Remove stray points and check the CRS's unit, or cut it with `scan2sim tile`",
+            f"the limit of a tile is {MAX_EXTENT_M / 1000:g} km",
+            "Remove outliers and check the unit of the CRS, or cut the cloud into tiles with `scan2sim tile`",
         )
     report(0.9, "writing")
     cloud.save(out / "cloud.npz")
@@ -75,7 +75,7 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
         "points": len(cloud),
         "extent_m": (high - low).round(2).tolist(),
         "coloured": cloud.rgb is not None,
-        "classified": bool(cloud.classification is not None and classes.known()[cloud.classification].any()),
+        "classified": bool(cloud.classification is not None and classes.classified_codes()[cloud.classification].any()),
         "timed": cloud.time is not None,
     }
     return Done({"cloud": out / "cloud.npz"}, facts, warnings)

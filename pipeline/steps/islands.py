@@ -1,4 +1,4 @@
-"""Islands: remove isolated pieces of surface, often artefacts (D3.2, section 4.2)."""
+"""Islands: removes small isolated pieces of surface, often artefacts (D3.2, section 4.2)."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from scan2sim.pipeline.core.types import Mesh
 
 
 class IslandsParams(Params):
-    """What is an island.
+    """Minimum size of a connected component.
 
     Attributes:
-        min_area: m2 of surface below which a connected piece is removed.
+        min_area: connected components with a smaller area are removed, m2.
     """
 
     min_area: float = Field(0.5, ge=0, le=1_000_000)
 
 
 def islands(inputs: Inputs, params: IslandsParams, out: Path, report: Report) -> Done:
-    """Remove the pieces of `mesh` (faces connected by edges) that are smaller than `min_area`."""
+    """Remove the connected components of `mesh` (faces connected by edges) that are smaller than `min_area`."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

@@ -1,4 +1,4 @@
-"""Join: the mesh's border fitted to the neighbours', where tiles of a survey meet."""
+"""Join: fits the mesh's border to those of neighbouring tiles of a survey."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ class JoinParams(CellParams):
     """How far a border may be moved to meet the neighbour's.
 
     Attributes:
-        name: of the tile; set by the recipe, as the cell is. Of two tiles, the one whose name sorts first
+        name: name of the tile; set by the pipeline, as the cell is. Of two tiles, the one whose name sorts first
             keeps its border.
-        tolerance: metres that a vertex may be moved; where the neighbour has nothing that close, it stays.
-        reach: metres behind the border over which the surface is brought to the new height.
+        tolerance: maximum displacement of a vertex in metres; if the neighbour's border is farther away, it is kept.
+        reach: distance from the border in metres over which the surface is blended to the new height.
     """
 
     name: str
@@ -26,9 +26,9 @@ class JoinParams(CellParams):
 
 
 def join(inputs: Inputs, params: JoinParams, out: Path, report: Report) -> Done:
-    """Fit the border of the clipped `mesh` (`on`) to those of neighbours, `mesh.NAME` and `on.NAME`, where given.
+    """Fit the border of the clipped `mesh` (`on`) to those of neighbours, `mesh.NAME` and `on.NAME`, if given.
 
-    Neighbours whose names sort after the tile's own needn't be given: they fit theirs to this one.
+    Neighbours whose names sort after the tile's name aren't needed: they fit their border to this tile.
     """
     from scan2sim.pipeline.tiling.borders.clip import Clipped
     from scan2sim.pipeline.tiling.borders.join import join as join_mesh
@@ -41,7 +41,7 @@ def join(inputs: Inputs, params: JoinParams, out: Path, report: Report) -> Done:
     joined.mesh.save(out / "mesh.npz")
     facts = {"faces_in": len(clips[params.name].mesh), "faces": len(joined.mesh), "turned": joined.turned}
     missing = sorted(name for name in params.neighbours if name < params.name and name not in clips)
-    return Done({"mesh": out / "mesh.npz"}, facts | {"borders": joined.facts, "missing": missing})
+    return Done({"mesh": out / "mesh.npz"}, facts | {"borders": joined.metrics, "missing": missing})
 
 
 JOIN = Step("join", 1, join, JoinParams, per_class=True)

@@ -1,4 +1,4 @@
-"""Overlap: what two tiles both know of their border's surroundings, made the same for both."""
+"""Overlap: makes the points around a tile border identical in both tiles."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class OverlapParams(CellParams):
     """Which points of its neighbours a tile takes.
 
     Attributes:
-        name: of the tile; set by the recipe, as the cell is.
-        buffer: metres beyond its cell from which a tile takes points; set by the recipe.
+        name: name of the tile; set by the pipeline, as the cell is.
+        buffer: distance in metres beyond its cell within which a tile takes points; set by the pipeline.
     """
 
     name: str
@@ -27,23 +27,23 @@ class OverlapParams(CellParams):
 
 
 def overlap(inputs: Inputs, params: OverlapParams, out: Path, report: Report) -> Done:
-    """Take what is beyond the borders of `cloud` from the neighbours' clouds, `cloud.NAME`, where given.
+    """Replace the points of `cloud` beyond its cell by those of the neighbours' clouds, `cloud.NAME`, if given.
 
-    A point belongs to the tile with the nearest seed (of several as near, to the one whose name sorts first), and
-    is taken from there with what that tile knows of it, its class above all. So tiles see the same points around
-    their border. Where the nearest tile's cloud is not given, the tile's own points stand in. Coordinates are
-    rounded to `pipeline.tiling.borders.grid.GRID`: the same in every tile.
+    A point belongs to the tile with the nearest seed (of equally near ones, the first by name) and is taken from that
+    tile's cloud with its attributes, in particular its class, so that both tiles have the same points around their
+    border. If that tile's cloud is not given, the tile's own points are used. Coordinates are rounded to
+    `pipeline.tiling.borders.grid.GRID_M`, which is the same in every tile.
     """
-    from scan2sim.pipeline.tiling.borders.grid import on_grid
+    from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
 
     seeds = dict(sorted({params.name: params.seed, **params.neighbours}.items()))
     given = [name for name in seeds if name == params.name or f"cloud.{name}" in inputs]
     own = PointCloud.load(inputs["cloud"])
     parts = []
-    for i, name in enumerate(given):  # by name in every tile: of the points of a voxel the same one comes first
+    for i, name in enumerate(given):  # same order in every tile: the first point of a voxel is the same
         report(i / len(given), name)
         cloud = own if name == params.name else PointCloud.load(inputs[f"cloud.{name}"])
-        world = on_grid(cloud.xyz + np.asarray(cloud.frame.origin))
+        world = snap_to_grid(cloud.xyz + np.asarray(cloud.frame.origin))
         owner = np.array(list(seeds))[nearest(world[:, :2], list(seeds.values()))]
         if name == params.name:
             taken = (owner == name) | ~np.isin(owner, given)

@@ -1,4 +1,4 @@
-"""Path: where the scanner was, for the orientation of normals."""
+"""Path: positions of the scanner, for the orientation of normals."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from scan2sim.pipeline.core.types import Trajectory
 
 
 class PathParams(Params):
-    """The path, set by the recipe: the tile's trajectory, or else its cameras.
+    """The path, set by the pipeline: the tile's trajectory, or else its camera positions.
 
     Attributes:
         positions: (x, y, z) local metres.
-        times: GPS seconds, one a position; None where unknown.
+        times: GPS time in seconds of each position; None if unknown.
     """
 
-    model_config = ConfigDict(allow_inf_nan=True)  # times are NaN where the file doesn't say
+    model_config = ConfigDict(allow_inf_nan=True)  # times are NaN if the file has none
 
     positions: tuple[tuple[float, float, float], ...]
     times: tuple[float, ...] | None = None

@@ -1,4 +1,4 @@
-"""Pictures: what a person looks at in the report, rendered without a screen."""
+"""Pictures: images of the report, rendered headless."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ GROUP_RGB = {
     "vehicle": (120, 140, 190),
 }
 SEEN_RGB = {255: (92, 160, 96), 128: (222, 170, 70), 64: (196, 84, 76)}
-EYE_HEIGHT = 1.6  # metres above the ground, a driver's
-COARSE = 0.17  # metres a pixel of the map of points, enough for every voxel to fill its own
-SLANT = math.radians(38)  # at which an eye in the air looks down
-GLANCE = 96  # pixels across, enough to tell how much of a photo the world fills
+DRIVER_EYE_HEIGHT_M = 1.6  # above the ground
+POINT_MAP_PIXEL_M = 0.17  # smallest pixel of the map of points, so that every voxel fills its pixel
+AERIAL_PITCH_RAD = math.radians(38)  # downward pitch of the aerial view
+COVERAGE_WIDTH_PX = 96  # width of renderings that measure how much of a photo the world covers
 
 
 class PicturesParams(Params):
-    """How large pictures are.
+    """Images of the report.
 
     Attributes:
-        width: pixels.
-        compared: photos that the world is shown beside.
+        width: width in pixels.
+        compared: number of photos to compare with renderings.
     """
 
     width: int = Field(1280, ge=160, le=4096)
@@ -49,20 +49,20 @@ class PicturesParams(Params):
 
 @dataclass
 class Album:
-    """Pictures with what the report says of them, in a folder with an index."""
+    """Images with titles and captions for the report, in a folder with an index."""
 
     folder: Path
     index: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, name: str, rgb: U8, role: str, title: str, caption: str, other: U8 | None = None) -> None:
-        """Keep a picture; `other` is what it is laid over in a comparison."""
+        """Add an image; `other` is the second image of a comparison."""
         entry = {"file": self._write(name, rgb), "role": role, "title": title, "caption": caption}
         if other is not None:
             entry["other"] = self._write(f"{name}_other", other)
         self.index.append(entry)
 
     def save(self) -> None:
-        """Write the index beside the pictures: `index.json`."""
+        """Write `index.json` beside the images."""
         (self.folder / "index.json").write_text(json.dumps(self.index, indent=1), encoding="utf-8")
 
     def _write(self, name: str, rgb: U8) -> str:
@@ -71,10 +71,10 @@ class Album:
 
 
 def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) -> Done:
-    """Render the tile: its classes, meshes, triangles, textures, pages, and the world beside photos.
+    """Render the tile: classes, meshes, triangles, texture pages, the textured world, and comparisons with photos.
 
-    Held-out photos come first. The textured world is shown from above and from where it was scanned: where there is a
-    path, that is a driver's eye, else a bird's that has the whole tile before it.
+    Held-out photos are compared first. The textured world is shown from above and from the scanner's viewpoint: that of
+    a driver if there is a path, else an aerial view of the whole tile.
     """
     from scan2sim.pipeline.camera import renderer as render
 
@@ -94,14 +94,14 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
         eye, where = driver_pose(path.positions, low, high, plain), "From a driver's eye"
 
     def above(renderer: render.Renderer, **how: Any) -> U8:
-        return lying(renderer.above(low, high, width=params.width, **how).rgb)
+        return landscape(renderer.above(low, high, width=params.width, **how).rgb)
 
     report(0.1, where)
     first = world.view(camera, eye)
     album.add("hero", first.rgb, "hero", where, "")
     album.add("eye", first.rgb, "world", f"{where}.", "The textured world as a robot's camera sees it.")
     album.add("above", above(world), "world", "From above.", f"{high[0] - low[0]:.0f} m by {high[1] - low[1]:.0f} m.")
-    report(0.3, "bird's eye")
+    report(0.3, "aerial view")
     album.add("bird", world.view(camera, bird_pose(low, high)).rgb, "world", "From a bird's eye.", "")
     album.add(
         "seen",
@@ -145,15 +145,18 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
             )
 
     views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
-    filled = [world.view(view.camera.scaled(GLANCE / view.camera.width), view.T_world_cam).hit.mean() for view in views]
-    for i in _compared(held, filled, params.compared):
+    coverage = [
+        world.view(view.camera.scaled(COVERAGE_WIDTH_PX / view.camera.width), view.T_world_cam).hit.mean()
+        for view in views
+    ]
+    for i in _compared(held, coverage, params.compared):
         report(0.7 + 0.3 * i / max(1, len(views)), views[i].name)
         photo = image.usable_photo(views[i])
         if photo is None:
             continue
         small = views[i].camera.scaled(min(1.0, params.width / views[i].camera.width))
         shot = world.view(small, views[i].T_world_cam)
-        how = "held out of texturing" if held[i] else "one of those that the texture was made from"
+        how = "held out of texturing" if held[i] else "used for texturing"
         album.add(
             f"photo_{i}", resized(photo, small), "compare", views[i].name, f"({how}): drag to compare.", other=shot.rgb
         )
@@ -162,23 +165,23 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
 
 
 def bounds(parts: list[Any]) -> tuple[F64, F64]:
-    """Low and high corner of nearly all points: stray ones at the far ends don't count."""
+    """Low and high corner of the points, without outliers (0.2nd and 99.8th percentile)."""
     xyz = np.concatenate(parts)
     low, high = np.percentile(xyz, 0.2, axis=0), np.percentile(xyz, 99.8, axis=0)
     return low.astype(np.float64), high.astype(np.float64)
 
 
 def whole_pose(points: npt.NDArray[np.floating], camera: Camera) -> F64:
-    """(4, 4) pose of an eye in the air, across the longer side, as near as all points (N, 3) are in the picture."""
+    """Pose (4, 4) of an aerial camera facing the longer side, as near as possible with all points (N, 3) in view."""
     from scan2sim.pipeline.camera.renderer import look_at
 
     size = np.ptp(points, axis=0)
     side = np.array([-0.35, -0.94]) if size[0] >= size[1] else np.array([-0.94, -0.35])
-    pose = look_at(np.array([*side * math.cos(SLANT), math.sin(SLANT)]), np.zeros(3))
+    pose = look_at(np.array([*side * math.cos(AERIAL_PITCH_RAD), math.sin(AERIAL_PITCH_RAD)]), np.zeros(3))
     x, y, z = (points @ pose[:3, :3]).T
     middle, back = [], []
     for across, slope in ((x, camera.width / 2 / camera.fx), (y, camera.height / 2 / camera.fy)):
-        # a point at (across, z) is in the picture of an eye at (m, e) where |across - m| <= slope (z - e)
+        # a point at (across, z) is in the image of a camera at (m, e) where |across - m| <= slope (z - e)
         right, left = float((across - slope * z).max()), float((-across - slope * z).max())
         middle.append((right - left) / 2)
         back.append((right + left) / 2 / slope)
@@ -187,7 +190,7 @@ def whole_pose(points: npt.NDArray[np.floating], camera: Camera) -> F64:
 
 
 def driver_pose(path: F64 | None, low: F64, high: F64, ground: Any) -> F64:
-    """(4, 4) pose of an eye on the path, an eighth of it in, looking along it; without a path, along the tile."""
+    """Pose (4, 4) of a camera on the path, after an eighth of its length, looking along it, or along the tile."""
     from scan2sim.pipeline.camera.renderer import look_at
 
     if path is not None and len(path) > 1:
@@ -203,14 +206,14 @@ def driver_pose(path: F64 | None, low: F64, high: F64, ground: Any) -> F64:
         start, end = middle - axis * size * 0.45, middle + axis * size * 0.45
     start, end = start.copy(), end.copy()
     for point in (start, end):
-        point[2] = ground_height(ground, point, low, high) + EYE_HEIGHT
+        point[2] = ground_height(ground, point, low, high) + DRIVER_EYE_HEIGHT_M
     if np.linalg.norm(end - start) < 0.5:
         end = start + (1.0, 0, 0)
     return look_at(start, end - (0, 0, 0.02 * np.linalg.norm(end - start)))
 
 
 def ground_height(renderer: Any, point: F64, low: F64, high: F64) -> float:
-    """Height of the lowest surface about a point, metres; of the tile's floor where there is none."""
+    """Height of the lowest surface around a point, metres; of the tile's lowest point if there is none."""
     corner = np.array([point[0] - 1, point[1] - 1, low[2] - 50]), np.array([point[0] + 1, point[1] + 1, high[2] + 50])
     shot = renderer.above(*corner, width=9)
     if not shot.hit.any():
@@ -219,44 +222,44 @@ def ground_height(renderer: Any, point: F64, low: F64, high: F64) -> float:
 
 
 def bird_pose(low: F64, high: F64) -> F64:
-    """(4, 4) pose of an eye above one end that overlooks the tile."""
+    """Pose (4, 4) of a camera above one end of the tile that overlooks it."""
     from scan2sim.pipeline.camera.renderer import look_at
 
     size = high - low
     along = 0 if size[0] >= size[1] else 1
     across = 1 - along
-    reach = max(size[along] * 0.45, size[across] * 0.7, 10.0)
+    distance = max(size[along] * 0.45, size[across] * 0.7, 10.0)
     eye, target = (low + high) / 2, (low + high) / 2
-    eye[along] -= size[along] * 0.5 + reach * 0.25
+    eye[along] -= size[along] * 0.5 + distance * 0.25
     eye[across] -= size[across] * 0.35
-    eye[2] = low[2] + reach
+    eye[2] = low[2] + distance
     target[along] -= size[along] * 0.12
     target[2] = low[2]
     return look_at(eye, target)
 
 
 def points_from_above(cloud: PointCloud, low: F64, high: F64, width: int) -> U8:
-    """A map of the points by class, the highest of a pixel on top, its colour dimmed by depth."""
+    """Map of the points by class; the highest point of a pixel is on top, colours are darker at lower heights."""
     assert cloud.classification is not None
-    metre = max(float((high - low)[:2].max()) / width, COARSE)
-    size = np.maximum(np.ceil((high - low)[:2] / metre).astype(int), 1)
+    pixel_m = max(float((high - low)[:2].max()) / width, POINT_MAP_PIXEL_M)
+    size = np.maximum(np.ceil((high - low)[:2] / pixel_m).astype(int), 1)
     inside = ((cloud.xyz[:, :2] >= low[:2]) & (cloud.xyz[:, :2] < high[:2])).all(axis=1)
     xyz, classification = cloud.xyz[inside], cloud.classification[inside]
     order = np.argsort(xyz[:, 2], kind="stable")
-    cell = ((xyz[order, :2] - low[:2]) / metre).astype(int).clip(max=size - 1)
-    picture = np.full((size[1], size[0], 3), 250, np.uint8)
+    cell = ((xyz[order, :2] - low[:2]) / pixel_m).astype(int).clip(max=size - 1)
+    rgb = np.full((size[1], size[0], 3), 250, np.uint8)
     light = np.clip(0.75 + 0.35 * (xyz[order, 2] - low[2]) / max(high[2] - low[2], 1e-3), 0.6, 1.15)
-    picture[size[1] - 1 - cell[:, 1], cell[:, 0]] = np.clip(colour_of()[classification[order]] * light[:, None], 0, 255)
-    return lying(picture.repeat(max(1, width // max(size)), axis=0).repeat(max(1, width // max(size)), axis=1))
+    rgb[size[1] - 1 - cell[:, 1], cell[:, 0]] = np.clip(colour_of()[classification[order]] * light[:, None], 0, 255)
+    return landscape(rgb.repeat(max(1, width // max(size)), axis=0).repeat(max(1, width // max(size)), axis=1))
 
 
-def lying(picture: U8) -> U8:
-    """Turned so that its longer side is level."""
-    return np.ascontiguousarray(np.rot90(picture)) if picture.shape[0] > picture.shape[1] * 1.3 else picture
+def landscape(rgb: U8) -> U8:
+    """Rotate a portrait image to landscape."""
+    return np.ascontiguousarray(np.rot90(rgb)) if rgb.shape[0] > rgb.shape[1] * 1.3 else rgb
 
 
 def seen_colours(shot: Image) -> U8:
-    """The picture tinted by where each texel's colour comes from."""
+    """The image tinted by the source of each texel's colour."""
     tint = np.full(shot.rgb.shape, 230, np.uint8)
     for value, rgb in SEEN_RGB.items():
         tint[shot.hit & (shot.seen == value)] = rgb
@@ -265,7 +268,7 @@ def seen_colours(shot: Image) -> U8:
 
 
 def thumbnail(page: Path, width: int) -> U8:
-    """A texture page, at most `width` pixels wide."""
+    """A texture page scaled to at most `width` pixels."""
     import cv2
 
     pixels = image.read_rgb(page)
@@ -274,15 +277,15 @@ def thumbnail(page: Path, width: int) -> U8:
 
 
 def resized(photo: U8, camera: Camera) -> U8:
-    """The photo at a scaled camera's size."""
+    """The photo resized to the size of a scaled camera."""
     import cv2
 
     return cv2.resize(np.ascontiguousarray(photo), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
 
-def _compared(held: Sequence[bool], filled: Sequence[float], count: int) -> list[int]:
-    """Indices of views to compare: held-out ones first, of a kind those that the world fills most of."""
-    return sorted(range(len(held)), key=lambda i: (not held[i], -filled[i]))[:count]
+def _compared(held: Sequence[bool], coverage: Sequence[float], count: int) -> list[int]:
+    """Indices of views to compare: held-out ones first, then by how much of the photo the world covers."""
+    return sorted(range(len(held)), key=lambda i: (not held[i], -coverage[i]))[:count]
 
 
 PICTURES = Step("pictures", 4, pictures, PicturesParams, side_product=True, memory=(1.3, 3))

@@ -1,4 +1,4 @@
-"""Plants: where vegetation stands, instead of its mesh (D3.2, section 4.2, the mission's alternative)."""
+"""Plants: list of plants with positions and sizes, instead of a vegetation mesh (alternative of D3.2, section 4.2)."""
 
 from __future__ import annotations
 
@@ -8,41 +8,41 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from scan2sim.pipeline.core.parameters import Place
+from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, F64, U8, PointCloud
 from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
-CELL = 0.25  # metres, of the canopy raster
+CANOPY_CELL_M = 0.25
 
 
 class PlantsParams(Params):
-    """What counts as a plant.
+    """Detection of plants.
 
     Attributes:
-        min_height: metres above the ground.
-        min_distance: metres between two plants' tops.
-        seed: the tile's (x, y), world metres, where it meets others: plants beyond its cell are theirs; set by the
-            recipe.
-        neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
-        models: low-poly trees and bushes stand in the world where vegetation is only listed (`split.vegetation` is
+        min_height: minimum height above the ground in metres.
+        min_distance: minimum distance between the tops of two plants in metres.
+        seed: seed (x, y) of the tile's cell, world metres, if it has neighbours; plants outside the cell belong to
+            them; set by the pipeline.
+        neighbours: seeds of the tiles with adjacent cells, by name, world metres; set by the pipeline.
+        models: whether the world shows low-poly trees and bushes if vegetation is only listed (`split.vegetation` is
             "locations").
     """
 
     min_height: float = Field(0.4, ge=0.01, le=100)
     min_distance: float = Field(1.5, ge=0.1, le=1000)
-    seed: Place | None = None
-    neighbours: dict[str, Place] = Field(default_factory=dict)
+    seed: PlanPoint | None = None
+    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
     models: bool = True
 
 
 def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> Done:
-    """Find each plant's top in the canopy of `vegetation` above `terrain`; write GeoJSON and CSV.
+    """Detect the tops of plants in the canopy of `vegetation` above `terrain`; write GeoJSON and CSV.
 
-    Place and base are in the tile's CRS; height and crown radius (of the circle with the crown's
-    area) in metres; red, green and blue (0 to 255) are the mean of the crown's points, a usual green where they have
-    no colour. Crowns are grown from the tops by watershed (Vincent and Soille 1991). With `models` a textured mesh of
-    low-poly plants is written, too (`mesh`, and `textured`, its folder).
+    Position and base height are in the tile's CRS; height and crown radius (of the circle with the area of the crown)
+    in metres; red, green and blue (0 to 255) are the mean of the crown's points, or a default green if they have no
+    colour. Crowns are grown from the tops by watershed (Vincent and Soille 1991). With `models`, a textured mesh of
+    low-poly plants is written too (`mesh`, and its folder `textured`).
     """
     from scan2sim.pipeline.io.geodata import geojson
     from scan2sim.pipeline.terrain import low_poly_plants
@@ -76,12 +76,12 @@ def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> D
 
 
 def _colours(cloud: PointCloud, crown: npt.NDArray[np.int_], count: int) -> U8:
-    """(P, 3) mean colours of crowns' points; a usual green where they have none."""
-    from scan2sim.pipeline.terrain.low_poly_plants import LEAVES
+    """Mean colours (P, 3) of the points of each crown; a default green if they have none."""
+    from scan2sim.pipeline.terrain.low_poly_plants import DEFAULT_LEAF_RGB
 
     use = cloud.coloured & (crown >= 0)
     each = np.bincount(crown[use], minlength=count)
-    colour = np.tile(np.array(LEAVES, float), (count, 1))
+    colour = np.tile(np.array(DEFAULT_LEAF_RGB, float), (count, 1))
     if cloud.rgb is not None:
         for k in range(3):
             total = np.bincount(crown[use], cloud.rgb[use, k], count)
@@ -90,16 +90,18 @@ def _colours(cloud: PointCloud, crown: npt.NDArray[np.int_], count: int) -> U8:
 
 
 def crowns(xyz: F32, ground: F32, params: PlantsParams) -> tuple[F64, npt.NDArray[np.int_]]:
-    """(P, 5) x, y, z of the base, height, crown radius: metres, local; and of each point, whose it is, or -1."""
+    """Plants (P, 5): x, y, z of the base, height, crown radius, local metres; and (N,) plant of each point, or -1."""
     from scipy import ndimage
     from scipy.spatial import cKDTree
 
-    low = np.floor(xyz[:, :2].min(axis=0) / CELL) * CELL  # whole cells: neighbouring tiles find the same tops
-    cell = ((xyz[:, :2] - low) / CELL).astype(int)
+    low = (
+        np.floor(xyz[:, :2].min(axis=0) / CANOPY_CELL_M) * CANOPY_CELL_M
+    )  # origin at whole cells: neighbouring tiles get the same tops
+    cell = ((xyz[:, :2] - low) / CANOPY_CELL_M).astype(int)
     canopy = np.full(cell.max(axis=0) + 1, -np.inf)
     np.maximum.at(canopy, (cell[:, 0], cell[:, 1]), xyz[:, 2])
     filled = np.isfinite(canopy)
-    centres = (np.argwhere(filled) + 0.5) * CELL + low
+    centres = (np.argwhere(filled) + 0.5) * CANOPY_CELL_M + low
     base = np.zeros_like(canopy)
     if len(ground):
         _, nearest = cKDTree(ground[:, :2]).query(centres, workers=-1)
@@ -107,8 +109,8 @@ def crowns(xyz: F32, ground: F32, params: PlantsParams) -> tuple[F64, npt.NDArra
     else:
         base[filled] = xyz[:, 2].min()
     height = np.where(filled, canopy - base, 0.0)
-    smooth = ndimage.gaussian_filter(height, params.min_distance / CELL / 4)
-    size = max(3, round(params.min_distance / CELL) | 1)
+    smooth = ndimage.gaussian_filter(height, params.min_distance / CANOPY_CELL_M / 4)
+    size = max(3, round(params.min_distance / CANOPY_CELL_M) | 1)
     top = (smooth == ndimage.maximum_filter(smooth, size)) & (height > params.min_height)
     markers, count = ndimage.label(top)
     levels = np.clip((smooth.max() - smooth) / max(smooth.max(), 1e-6) * 65535, 0, 65535).astype(np.uint16)
@@ -122,8 +124,8 @@ def crowns(xyz: F32, ground: F32, params: PlantsParams) -> tuple[F64, npt.NDArra
     row, column = middle.astype(int).T
     crown = np.where(filled, grown, 0)
     tall = ndimage.maximum(height, crown, plant)
-    area = np.bincount(crown[crown > 0], minlength=count + 1)[1 : count + 1] * CELL**2
-    found = np.column_stack([(middle + 0.5) * CELL + low, base[row, column], tall, np.sqrt(area / np.pi)])
+    area = np.bincount(crown[crown > 0], minlength=count + 1)[1 : count + 1] * CANOPY_CELL_M**2
+    found = np.column_stack([(middle + 0.5) * CANOPY_CELL_M + low, base[row, column], tall, np.sqrt(area / np.pi)])
     return found, np.maximum(crown[cell[:, 0], cell[:, 1]], 0) - 1
 
 

@@ -1,4 +1,4 @@
-"""Poisson: oriented points to a closed surface (Kazhdan and Hoppe 2013; D3.2, section 4.2)."""
+"""Poisson: screened Poisson surface reconstruction from oriented points (Kazhdan and Hoppe 2013; D3.2, section 4.2)."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, I32, Mesh, PointCloud
 
 MIN_POINTS = 50
-MARGIN = 1.02  # the octree's cube must be a little larger than the cloud
+CUBE_SCALE = 1.02  # the octree's cube must be a little larger than the cloud
 MAX_DEPTH = 16
-BLOCK = 128  # finest cells: octrees that begin at multiples of so many agree where tiles overlap
+ALIGNMENT_CELLS = 128  # octrees aligned to multiples of this many finest cells agree where tiles overlap
 
 
 class PoissonParams(Params):
-    """How fine the surface is.
+    """Resolution of the surface.
 
     Attributes:
-        depth: of the octree; None derives it so that the finest cell is half a voxel at any length
-            of tile: 11, the mission's number, at 100 m and 10 cm.
-        voxel: metres, of the points that come in; set by the recipe.
-        point_weight: how strongly the surface is drawn to the points; 0 is the unscreened method.
-        threads: 1 gives the same surface at every run; 0, all cores, is up to 1.4 times faster and doesn't.
-        timeout: seconds, after which the reconstruction is given up.
-        aligned: begin the octree at a multiple of its cells in the world, so that neighbouring tiles' surfaces agree
-            where they overlap; set by the recipe where tiles meet.
+        depth: depth of the octree; unset: chosen so that the finest cell is half a voxel for any length of the tile
+            (11, as in D3.2, at 100 m and 10 cm).
+        voxel: voxel size of the input points in metres; set by the pipeline.
+        point_weight: weight of the points' positions (screening); 0 is the unscreened method.
+        threads: 1 is reproducible; 0 (all cores) is up to 1.4 times faster, but results differ from run to run.
+        timeout: seconds after which the reconstruction is aborted.
+        aligned: align the octree to a multiple of its cells in the world, so that surfaces of neighbouring tiles agree
+            where they overlap; set by the pipeline where tiles meet.
     """
 
     depth: int | None = Field(None, ge=4, le=MAX_DEPTH)
@@ -42,12 +42,12 @@ class PoissonParams(Params):
 
 
 def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) -> Done:
-    """Reconstruct `cloud`, with what was made up of it (`made`, optional), in a child process.
+    """Reconstruct `cloud`, with synthesized points (`made`, optional), in a child process.
 
-    On a crash again on one thread, then one level coarser.
+    After a crash, it is retried on one thread, then one octree level coarser.
 
     Raises:
-        StepError: all three failed.
+        StepError: all three attempts failed.
     """
     from scan2sim.pipeline.core import sandbox
 
@@ -61,8 +61,8 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
         return Done({"mesh": out / "mesh.npz"}, {"points": len(cloud), "faces": 0}, warnings)
 
     xyz, normal = cloud.xyz, cloud.normal
-    if params.aligned:  # two points in far corners make the cube: what they leave of surface is trimmed
-        xyz = np.concatenate([xyz, bounds(xyz, cloud.frame.origin, BLOCK * params.voxel / 2)])
+    if params.aligned:  # two points in opposite corners define the cube; surface near them is removed by `trim`
+        xyz = np.concatenate([xyz, bounds(xyz, cloud.frame.origin, ALIGNMENT_CELLS * params.voxel / 2)])
         normal = np.concatenate([normal, np.tile(np.array([0, 0, 1], np.float32), (2, 1))])
     length = float((xyz.max(axis=0) - xyz.min(axis=0)).max())
     depth, scale = octree(length, params.voxel / 2) if params.depth is None else (params.depth, 1.1)
@@ -70,7 +70,7 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
     summary = f"{length:.0f} m at a voxel of {params.voxel * 100:.0f} cm: depth {depth}, cell {cell * 100:.1f} cm"
     report(0.0, summary)
     warnings = []
-    # tries: as asked; on one thread, since several race on some inputs; the same surface, coarser
+    # attempts: as configured; on one thread (several race on some inputs); one level coarser
     for threads, coarser in ((params.threads, 0), (1, 0), (1, 1)):
         try:
             vertices, faces, density = sandbox.call(
@@ -89,7 +89,7 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
 
 
 def bounds(xyz: F32, origin: tuple[float, float, float], block: float) -> F32:
-    """(2, 3) opposite corners of a cube around the points, its middle at a multiple of `block` in the world."""
+    """Opposite corners (2, 3) of a cube around the points, centred at a multiple of `block` in the world."""
     low, high = xyz.min(axis=0) + np.asarray(origin), xyz.max(axis=0) + np.asarray(origin)
     middle = np.rint((low + high) / 2 / block) * block
     half = np.maximum(high - middle, middle - low).max()
@@ -98,8 +98,8 @@ def bounds(xyz: F32, origin: tuple[float, float, float], block: float) -> F32:
 
 def octree(length: float, cell: float) -> tuple[int, float]:
     """Depth of the octree and scale of its cube so that the finest cell is exactly `cell` metres."""
-    depth = max(4, math.ceil(math.log2(MARGIN * length / cell)))
-    return min(depth, MAX_DEPTH), max(MARGIN, cell * 2**depth / length)
+    depth = max(4, math.ceil(math.log2(CUBE_SCALE * length / cell)))
+    return min(depth, MAX_DEPTH), max(CUBE_SCALE, cell * 2**depth / length)
 
 
 def reconstruct(

@@ -1,4 +1,4 @@
-"""Preview: the world small enough for a browser, which the report shows to turn and to walk through."""
+"""Preview: a version of the world small enough for the browser, for the 3D view of the report."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from scan2sim.pipeline.steps.pictures import bird_pose, bounds, driver_pose, who
 if TYPE_CHECKING:
     from scan2sim.pipeline.io.worlds.textured_mesh import Textured
 
-CALL = b"scan2simWorld"  # the function of flows/pages/walk.js that is given the GLB
+CALLBACK = b"scan2simWorld"  # JavaScript function of the report's viewer that receives the GLB
 
 
 class PreviewParams(Params):
-    """How much a browser is given.
+    """Size of the preview.
 
     Attributes:
-        megapixels: of all texture pages together; larger ones are scaled down.
-        triangles: worlds of more have no preview.
-        jpeg_quality: of the pages.
+        megapixels: maximum size of all texture pages together; larger ones are scaled down.
+        triangles: maximum number of triangles; larger worlds get no preview.
+        jpeg_quality: JPEG quality of the texture pages.
     """
 
     megapixels: float = Field(32.0, ge=0.1, le=1000)
@@ -37,14 +37,14 @@ class PreviewParams(Params):
 def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) -> Done:
     """Pack the textured groups as a GLB inside a script, `preview/world.js`.
 
-    A page that is opened by a double click may read no other file but scripts. Facts: `scale` of the pages' sides,
-    `bytes`, and where eyes are at first, `walk` and `turn`: [eye, target], local metres; `start` is one of both, as in
-    the report's first picture.
+    A page opened from the file system can load scripts, but no other files. Metrics: `scale` of the texture pages,
+    `bytes`, and the initial camera poses `walk` and `turn` as [position, target], local metres; `start` names the one
+    to begin with, as in the report's first image.
     """
     from scan2sim.pipeline.camera import renderer
     from scan2sim.pipeline.io.worlds import glb, textured_mesh
     from scan2sim.pipeline.io.worlds.glb import GlbParams
-    from scan2sim.pipeline.io.worlds.scene import whole
+    from scan2sim.pipeline.io.worlds.scene import group_surface
 
     read = {group: textured_mesh.read(inputs[group]) for group in SURFACES if group in inputs}
     surfaces: dict[str, Textured] = {group: surface for group, surface in read.items() if surface is not None}
@@ -55,11 +55,11 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     folder = out / "preview"
     folder.mkdir()
     packed = out / "world.glb"
-    shown = [whole(group, surface) for group, surface in surfaces.items()]
+    shown = [group_surface(group, surface) for group, surface in surfaces.items()]
     glb.write(packed, shown, GlbParams(jpeg_quality=params.jpeg_quality, glb_bare=True), scale=scale)
-    report(0.7, "eyes")
+    report(0.7, "camera poses")
     script = folder / "world.js"
-    script.write_bytes(CALL + b'("' + base64.b64encode(packed.read_bytes()) + b'");\n')
+    script.write_bytes(CALLBACK + b'("' + base64.b64encode(packed.read_bytes()) + b'");\n')
     packed.unlink()
     path = Trajectory.load(inputs["path"]).positions if "path" in inputs else np.zeros((0, 3))
     driven = len(path) > 1
@@ -72,14 +72,14 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
         "scale": round(scale, 4),
         "bytes": script.stat().st_size,
         "start": "walk" if driven else "turn",
-        "walk": _eye(driver_pose(path if driven else None, low, high, shapes), low),
-        "turn": _eye(air, low),
+        "walk": _position_and_target(driver_pose(path if driven else None, low, high, shapes), low),
+        "turn": _position_and_target(air, low),
     }
     return Done({"preview": folder}, facts)
 
 
 def _texels(surfaces: dict[str, Textured]) -> int:
-    """Of all pages that a face lies on."""
+    """Number of texels of all pages that are in use."""
     from PIL import Image
 
     total = 0
@@ -90,11 +90,11 @@ def _texels(surfaces: dict[str, Textured]) -> int:
     return total
 
 
-def _eye(pose: F64, low: F64) -> list[list[float]]:
-    """Where a camera is, and what it looks at: the floor, or what is 20 m ahead."""
-    eye, ahead = pose[:3, 3], pose[:3, 2]
-    reach = (low[2] - eye[2]) / ahead[2] if ahead[2] < -0.1 else 20.0
-    return [eye.round(3).tolist(), (eye + ahead * reach).round(3).tolist()]
+def _position_and_target(pose: F64, low: F64) -> list[list[float]]:
+    """Position of a camera and its target: a point on the floor, or 20 m ahead."""
+    position, ahead = pose[:3, 3], pose[:3, 2]
+    distance = (low[2] - position[2]) / ahead[2] if ahead[2] < -0.1 else 20.0
+    return [position.round(3).tolist(), (position + ahead * distance).round(3).tolist()]
 
 
 PREVIEW = Step("preview", 3, preview, PreviewParams, side_product=True)

@@ -1,4 +1,4 @@
-"""Rasters: the world as maps that GIS tools read: an orthophoto, the highest surface, the ground."""
+"""Rasters: orthophoto, DSM (surface heights) and DTM (terrain heights) of the world, for GIS."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from scan2sim.pipeline.core.types import F64, U8
 if TYPE_CHECKING:
     from scan2sim.pipeline.camera.renderer import Image, Renderer
 
-BAND = 2_000_000
-"""Pixels that are rendered at a time, in whole rows."""
-LARGEST = 1e9
-"""Pixels of a raster: half an hour of rendering."""
-SAMPLES = 4
-"""Rays a pixel each way, at most."""
+BAND_PIXELS = 2_000_000
+"""Number of pixels that are rendered at a time, in whole rows."""
+MAX_PIXELS = 1e9
+"""Maximum size of a raster: half an hour of rendering."""
+MAX_SAMPLES = 4
+"""Maximum number of rays per pixel in each direction."""
 
 
 class RastersParams(Params):
-    """How fine rasters are; all is set by the recipe (`export.rasters` asks for them).
+    """Resolution of the rasters; set by the pipeline (enabled by `export.rasters`).
 
     Attributes:
-        name: of the tile.
-        pixel: metres a pixel.
-        texel: metres a texel of the ground: where pixels are larger, they are the mean of several rays.
+        name: name of the tile.
+        pixel: pixel size in metres.
+        texel: texel size of the ground's texture in metres; larger pixels are the mean of several rays.
     """
 
     name: Name = "tile"
@@ -41,10 +41,10 @@ class RastersParams(Params):
 
 
 def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) -> Done:
-    """Look at the textured groups from straight above, in the tile's CRS.
+    """Render the textured groups from straight above (orthographic), in the tile's CRS.
 
     Files below `rasters/`: `<name>_orthophoto.tif` (colours), `<name>_dsm.tif` (heights of the highest surface) and
-    `<name>_dtm.tif` (heights of the terrain's mesh alone: nothing where there is none).
+    `<name>_dtm.tif` (heights of the terrain mesh; no data where there is none).
 
     Raises:
         DataError: no group has a face.
@@ -57,20 +57,22 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
     bodies = {group: render.textured(inputs[group]) for group in SURFACES if group in inputs}
     bodies = {group: body for group, body in bodies.items() if len(body.mesh)}
     if not bodies:
-        raise DataError("rasters", "there is nothing to show: every surface is empty", "Check the classes of the cloud")
+        raise DataError(
+            "rasters", "there is nothing to render: all surfaces are empty", "Check the classes of the cloud"
+        )
     vertices = np.concatenate([body.mesh.vertices for body in bodies.values()])
     low, high = vertices.min(axis=0).astype(float), vertices.max(axis=0).astype(float)
     frame = next(iter(bodies.values())).mesh.frame
     grid = geotiff.Grid.around(frame, low, high, params.pixel)
-    if grid.width * grid.height > LARGEST:
+    if grid.width * grid.height > MAX_PIXELS:
         raise SettingError(
             "export.rasters",
-            f"{params.pixel:g} m a pixel are {grid.width} x {grid.height} pixels",
-            f"Set export.rasters={params.pixel * (grid.width * grid.height / LARGEST) ** 0.5 * 1.1:.2g} or more",
+            f"{params.pixel:g} m per pixel would give {grid.width} x {grid.height} pixels",
+            f"Set export.rasters={params.pixel * (grid.width * grid.height / MAX_PIXELS) ** 0.5 * 1.1:.2g} or more",
         )
 
     def rendered(renderer: Renderer, samples: int = 1) -> Iterator[Image]:
-        rows = max(1, BAND // grid.width)
+        rows = max(1, BAND_PIXELS // grid.width)
         for first in range(0, grid.height, rows):
             south_west, north_east = grid.band(first, min(rows, grid.height - first))
             corners = np.append(south_west, low[2]), np.append(north_east, high[2])
@@ -83,7 +85,7 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
 
     def colours() -> Iterator[U8]:
         for image in rendered(
-            render.Renderer(list(bodies.values())), min(SAMPLES, round(params.pixel / params.texel)) or 1
+            render.Renderer(list(bodies.values())), min(MAX_SAMPLES, round(params.pixel / params.texel)) or 1
         ):
             yield np.dstack([image.rgb, image.hit * np.uint8(255)])
 
@@ -103,7 +105,7 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
         "pixel_m": params.pixel,
         "bytes": sum(file.stat().st_size for file in folder.iterdir()),
     }
-    local = "the tile has no CRS, so its rasters have none: they lie at the tile's own coordinates"
+    local = "the tile has no CRS, so its rasters have none: they are in the tile's local coordinates"
     return Done({"rasters": folder}, facts, [local] if frame.crs == LOCAL else [])
 
 

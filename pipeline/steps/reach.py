@@ -1,4 +1,4 @@
-"""Reach: what lies so far from photos and path that it is worth no triangle is left out."""
+"""Photo coverage (step `reach`): removes points that no photo shows well and that are far from the scanner's path."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from scan2sim.pipeline.core.parameters import Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, Bools, PointCloud, Trajectory, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.io.file_checks import pass_on
+from scan2sim.pipeline.io.file_checks import link_or_copy
 from scan2sim.pipeline.steps.voxel import sample, voxel_groups
 
-PATCH = 2.0
-"""Voxels: a photo is asked for a pixel on every square of this side. Coarser, all that a voxel can show is a blur."""
-LANES = 3.5
-"""Metres to each side of the path: a lane's width."""
-RIM = {"terrain": 0.2, "building": 1.0, "vegetation": 0.2, "rest": 1.0}
-"""Metres around what photos see that belong to it: behind the edge of a wall goes on, a hedge is as deep as it is."""
-CELL, GAP = 0.5, 2.0
-"""Metres, of ground that nothing is seen of: gaps so wide between what is kept are closed (the far side of a car)."""
-HIGH = 15.0
-"""Metres of a path above the ground from which on it is none along a street: all is kept."""
+MAX_GSD_VOXELS = 2.0
+"""Coarsest ground sample distance of a covered point, in voxels; a coarser texture is blurred even at voxel scale."""
+ROADSIDE_M = 3.5
+"""Points within this distance of the path are kept: the width of a lane on each side."""
+MARGIN_M = {"terrain": 0.2, "building": 1.0, "vegetation": 0.2, "rest": 1.0}
+"""Margin around covered points, by group: a wall continues behind its edge, a hedge has depth."""
+CLOSING_CELL_M, CLOSING_GAP_M = 0.5, 2.0
+"""Uncovered ground between covered ground is kept up to this width (the far side of a car); closing on a grid."""
+AERIAL_PATH_HEIGHT_M = 15.0
+"""A path higher above the ground is not one of a street vehicle: all points are kept."""
 
 
 class ReachParams(Params):
-    """What is near enough.
+    """Which points are kept.
 
     Attributes:
-        limit: "auto", what a photo shows at a pixel or more to every square of two voxels, and what is beside the path;
-            metres, what is within so many of the path, seen or not; "off", everything.
-        voxel: metres, of the mesh's samples; set by the recipe.
+        limit: "auto": points with a ground sample distance of at most two voxels in a photo, and points beside the
+            path; a number: points within this distance of the path in metres, seen or not; "off": all points.
+        voxel: sample spacing of the mesh in metres; set by the pipeline.
     """
 
     limit: Literal["auto", "off"] | Annotated[float, Field(ge=1, le=10_000)] = "auto"
@@ -44,37 +44,37 @@ class ReachParams(Params):
 
 
 def reach(inputs: Inputs, params: ReachParams, out: Path, report: Report) -> Done:
-    """Drop the points of `cloud` that no photo of `views` shows well enough and that lie far from the scanner's `path`.
+    """Remove the points of `cloud` that no photo of `views` covers well enough and that are far from the `path`.
 
-    Photos that are held out don't count. Ground in between, and the rims of walls and plants, are kept (`GAP`, `RIM`).
-    A tile of a survey that has neither photos nor path keeps its cloud, and so does one whose path is in the air
-    (`HIGH`). Facts: `points` kept, `left_out` points, about `left_out_m2` of surface, and `far_m`, how far from the
-    path the farthest point is that is kept.
+    Held-out photos are ignored. Ground in between and margins of walls and plants are kept (`CLOSING_GAP_M`,
+    `MARGIN_M`). A tile without photos or path keeps its whole cloud, as does one with an aerial path
+    (`AERIAL_PATH_HEIGHT_M`). Metrics: `points` kept, `left_out` points removed, their approximate surface
+    `left_out_m2`, and `far_m`, distance from the path to the farthest kept point.
     """
     file = out / "cloud.npz"
     if "path" not in inputs or (params.limit == "auto" and "views" not in inputs):
-        pass_on(inputs["cloud"], file)
+        link_or_copy(inputs["cloud"], file)
         return Done({"cloud": file}, {"left_out": 0})
     report(0.0, "reading")
     cloud, path = PointCloud.load(inputs["cloud"]), Trajectory.load(inputs["path"])
-    size = PATCH * params.voxel
+    cell_m = MAX_GSD_VOXELS * params.voxel
     report(0.1, "thinning")
-    order, starts = voxel_groups(cloud.xyz, size)
-    thin = sample(replace(cloud, rgb=None), size, (order, starts))
-    if _above(thin, path.positions) > HIGH:
+    order, starts = voxel_groups(cloud.xyz, cell_m)
+    thin = sample(replace(cloud, rgb=None), cell_m, (order, starts))
+    if _path_height(thin, path.positions) > AERIAL_PATH_HEIGHT_M:
         kept = np.ones(len(thin), bool)
     elif not isinstance(params.limit, str):
-        from scan2sim.pipeline.camera.photo_coverage import along
+        from scan2sim.pipeline.camera.photo_coverage import near_path
 
-        kept = along(thin.xyz, path.positions, params.limit)
+        kept = near_path(thin.xyz, path.positions, params.limit)
     else:
         views = views_io.load(inputs["views"])
         held = views_io.load_held_out(inputs["views"])
-        shown = [v for v, out_ in zip(views, held, strict=True) if v.camera.model != "orthographic" and not out_]
-        kept = _worth(thin, shown, path, size, report)
+        used = [v for v, out_ in zip(views, held, strict=True) if v.camera.model != "orthographic" and not out_]
+        kept = _covered(thin, used, path, cell_m, report)
     report(0.9, "writing")
     if kept.all():
-        pass_on(inputs["cloud"], file)
+        link_or_copy(inputs["cloud"], file)
     else:
         voxel = np.empty(len(cloud), np.int64)
         voxel[order] = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(order))))
@@ -84,41 +84,42 @@ def reach(inputs: Inputs, params: ReachParams, out: Path, report: Report) -> Don
         "points_in": len(order),
         "points": len(cloud),
         "left_out": len(order) - len(cloud),
-        "left_out_m2": round(float((~kept).sum() * size**2)),
+        "left_out_m2": round(float((~kept).sum() * cell_m**2)),
         "far_m": round(_farthest(thin, kept, path.positions), 1),
     }
     return Done({"cloud": file}, facts)
 
 
-def _worth(thin: PointCloud, views: Sequence[View], path: Trajectory, size: float, report: Report) -> Bools:
-    """(N,) which points photos show well enough, or lie by the path, or belong to what does."""
-    from scan2sim.pipeline.camera.photo_coverage import along, around, closed, finest
+def _covered(thin: PointCloud, views: Sequence[View], path: Trajectory, cell_m: float, report: Report) -> Bools:
+    """(N,) bool, True for points that photos cover well enough, points near the path, and their surroundings."""
+    from scan2sim.pipeline.camera.photo_coverage import close_selection, dilate_selection, finest_gsd, near_path
     from scan2sim.pipeline.geometry.normals import oriented_normals
 
     report(0.2, "normals")
     thin = oriented_normals(thin, 12, path)
-    seen = finest(thin, views, size=size, coarsest=size, report=lambda f, m="": report(0.3 + 0.5 * f, m)) < size
+    gsd = finest_gsd(thin, views, voxel=cell_m, max_gsd=cell_m, report=lambda f, m="": report(0.3 + 0.5 * f, m))
+    seen = gsd < cell_m
     report(0.8, "surroundings")
-    kept = along(thin.xyz, path.positions, LANES)
+    kept = near_path(thin.xyz, path.positions, ROADSIDE_M)
     assert thin.classification is not None
     group = group_of()[thin.classification]
     for i, name in enumerate((*GROUPS, "rest")):
-        of = np.flatnonzero(group == (i if name != "rest" else -1))
-        near = around(thin.xyz[of], seen[of], RIM[name])
-        kept[of] |= near
+        members = np.flatnonzero(group == (i if name != "rest" else -1))
+        near = dilate_selection(thin.xyz[members], seen[members], MARGIN_M[name])
+        kept[members] |= near
         if name == "terrain":
-            kept[of] |= closed(thin.xyz[of], near | kept[of], CELL, GAP)
+            kept[members] |= close_selection(thin.xyz[members], near | kept[members], CLOSING_CELL_M, CLOSING_GAP_M)
     return kept
 
 
-def _above(thin: PointCloud, path: F64) -> float:
-    """Metres of the path above the ground beneath, in the middle."""
+def _path_height(thin: PointCloud, path: F64) -> float:
+    """Median height of the path above the ground below it, metres."""
     from scipy.spatial import cKDTree
 
-    some = path[:: max(1, len(path) // 1000)]
-    _, near = cKDTree(thin.xyz[:, :2]).query(some[:, :2], k=min(30, len(thin)), workers=-1)
-    low = np.percentile(thin.xyz[near.reshape(len(some), -1), 2], 20, axis=1)
-    return float(np.median(some[:, 2] - low))
+    positions = path[:: max(1, len(path) // 1000)]
+    _, near = cKDTree(thin.xyz[:, :2]).query(positions[:, :2], k=min(30, len(thin)), workers=-1)
+    low = np.percentile(thin.xyz[near.reshape(len(positions), -1), 2], 20, axis=1)
+    return float(np.median(positions[:, 2] - low))
 
 
 def _farthest(thin: PointCloud, kept: Bools, path: F64) -> float:

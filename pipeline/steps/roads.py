@@ -1,4 +1,4 @@
-"""Roads: reference lines, painted lines and kerbs, as data (docs/roads.md)."""
+"""Roads: reference lines, lane markings and kerbs as vector data (docs/roads.md)."""
 
 from __future__ import annotations
 
@@ -10,42 +10,42 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.classes import CODE
-from scan2sim.pipeline.core.parameters import Coordinate, Name, Place
+from scan2sim.pipeline.core.parameters import Coordinate, Name, PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, Bools, Frame, PointCloud, Trajectory
 from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
-DRIVEN_ON = ("road", "bridge_deck")
-UNDER = 3.0
-"""Metres from the path within which there are points of a road that it was driven on."""
+ROAD_CLASSES = ("road", "bridge_deck")
+MAX_ROAD_DISTANCE_M = 3.0
+"""Largest distance in plan of road points from a path that was driven on a road."""
 
 
 class RoadsParams(Params):
-    """Whether roads are told of.
+    """Extraction of roads.
 
     Attributes:
-        when: "auto": where the tile has a scanner's path, or photos from the ground; "never".
-        name: of the tile; set by the recipe.
-        world_origin: metres in the CRS, of the OpenDRIVE file; default: the tile's own origin; set by the recipe
-            (`export.world_origin`).
-        seed: the tile's (x, y), world metres, where it meets others: what is beyond its cell is theirs; set by the
-            recipe.
-        neighbours: names of tiles whose cells touch to their seeds, world metres; set by the recipe.
+        when: "auto": if the tile has a scanner's path, or photos from the ground; "never".
+        name: name of the tile; set by the pipeline.
+        world_origin: origin of the OpenDRIVE file in the CRS, metres; default: the tile's own origin; set by the
+            pipeline (`export.world_origin`).
+        seed: seed (x, y) of the tile's cell, world metres, if it has neighbours; observations outside the cell belong
+            to them; set by the pipeline.
+        neighbours: seeds of the tiles with adjacent cells, by name, world metres; set by the pipeline.
     """
 
     when: Literal["auto", "never"] = "auto"
     name: Name = "tile"
     world_origin: tuple[Coordinate, Coordinate, Coordinate] | None = None
-    seed: Place | None = None
-    neighbours: dict[str, Place] = Field(default_factory=dict)
+    seed: PlanPoint | None = None
+    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
 
 
 def roads(inputs: Inputs, params: RoadsParams, out: Path, report: Report) -> Done:
-    """Tell of the roads that `path` was driven on, by the classified points of the ground (`cloud`) and its texture.
+    """Extract the roads along the driven `path` from the classified ground points (`cloud`) and the ground's texture.
 
-    Files: `geojson`, lines of the roads; `seen`, .npz of what was seen of paint, edges and heights, world metres, of
-    which OpenDRIVE is drawn, one road over all tiles of a survey; `opendrive`, a folder with `<name>.xodr`, empty where
-    no road has lanes.
+    Files: `geojson`, lines of the roads; `seen`, .npz of the observations (paint, edges, heights) in world metres, from
+    which the OpenDRIVE roads of a whole survey are built; `opendrive`, a folder with `<name>.xodr`, empty if no road
+    has lanes.
     """
     from scan2sim.pipeline.camera import renderer as render
     from scan2sim.pipeline.io.geodata import opendrive
@@ -55,7 +55,7 @@ def roads(inputs: Inputs, params: RoadsParams, out: Path, report: Report) -> Don
     assert cloud.classification is not None
     xyz = cloud.xyz.astype(np.float64)
     own, origin = _own(params), np.asarray(cloud.frame.origin)
-    on = np.isin(cloud.classification, [CODE[name] for name in DRIVEN_ON])
+    on = np.isin(cloud.classification, [CODE[name] for name in ROAD_CLASSES])
     ways = driven.ways(path.positions, _over(path.positions, xyz[on]) & own(path.positions + origin))
     renderer = None
     if (inputs["textured"] / "mesh.npz").is_file():
@@ -68,7 +68,7 @@ def roads(inputs: Inputs, params: RoadsParams, out: Path, report: Report) -> Don
         parts = (np.column_stack([part[:, :2], np.zeros(len(part))]) for part in (one.paint, one.edge, one.ground))
         seen.append(one.kept(*(own(part + origin) for part in parts)))
     warnings: list[str] = []
-    drawn = [road for one in seen if (road := model.drawn(one, warnings.append))]
+    drawn = [road for one in seen if (road := model.build_road(one, warnings.append))]
     listed.write(out / "roads.geojson", cloud.frame, drawn)
     observed.save(out / "seen.npz", seen, cloud.frame)
     (out / "opendrive").mkdir()
@@ -81,7 +81,7 @@ def roads(inputs: Inputs, params: RoadsParams, out: Path, report: Report) -> Don
 
 
 def _own(params: RoadsParams) -> Callable[[F64], Bools]:
-    """Which world places (N, 3) are the tile's own."""
+    """Function that selects world positions (N, 3) inside the tile's cell."""
 
     def own(places: F64) -> Bools:
         if params.seed is None:
@@ -92,21 +92,21 @@ def _own(params: RoadsParams) -> Callable[[F64], Bools]:
 
 
 def _over(positions: F64, road: F64) -> Bools:
-    """(N,) positions below which there are points of a road."""
+    """(N,) bool, True for positions above points of a road."""
     from scipy.spatial import cKDTree
 
     if not len(road) or not len(positions):
         return np.zeros(len(positions), bool)
-    return np.asarray(cKDTree(road[:, :2]).query(positions[:, :2])[0] < UNDER)
+    return np.asarray(cKDTree(road[:, :2]).query(positions[:, :2])[0] < MAX_ROAD_DISTANCE_M)
 
 
 def _why_none(ways: Sequence[F64], on: Bools, drawn: Sequence[object]) -> dict[str, str]:
-    """Why no road is told of."""
+    """Reason why no road was extracted; empty if one was."""
     if drawn:
         return {}
     if not on.any():
-        return {"none": "no point is of a road's class"}
-    return {"none": "no line of a road is seen" if ways else "the path runs on no road"}
+        return {"none": "no point has a road class"}
+    return {"none": "no road line was detected" if ways else "the path is not on a road"}
 
 
 ROADS = Step("roads", 3, roads, RoadsParams, side_product=True)

@@ -1,4 +1,4 @@
-"""Split: the cloud by class into terrain, building and vegetation (D3.2, section 4.2)."""
+"""Split: separates the cloud by class into terrain, building and vegetation (D3.2, section 4.2)."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from typing import Literal
 
 import numpy as np
 
-from scan2sim.pipeline.core.classes import CODE, GROUPS, NOISE, UNKNOWN, group_of, known, name_of
+from scan2sim.pipeline.core.classes import CODE, GROUPS, NOISE, UNKNOWN, classified_codes, group_of, name_of
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import Bools, PointCloud
 
 REST, FURNITURE, VEHICLE = -1, len(GROUPS) + 1, len(GROUPS) + 2
-"""Of a point, beside the groups' numbers: it is of no surface, street furniture's, a parked vehicle's."""
-NOTABLE = 0.01
-"""Share of points without a class from which on a run warns."""
-AROUND = 0.4
-"""Metres around a vehicle's box within which points of the class are its own: mirrors, antennas."""
+"""Numbers of further parts beside those of the groups: no surface, street furniture, parked vehicle."""
+UNCLASSIFIED_FRACTION_WARNING = 0.01
+"""Fraction of unclassified points above which the step warns."""
+VEHICLE_BOX_MARGIN_M = 0.4
+"""Margin around a vehicle's box for points of the class vehicle: mirrors, antennas."""
 
 
 class SplitParams(Params):
-    """How the split is made.
+    """What becomes of vegetation and vehicles.
 
     Attributes:
-        vegetation: "mesh" (as the mission does), "locations" (each plant's place instead of a
-            mesh), or "both".
-        vehicles: "remove", or "keep" what is parked as a surface of its own (of streets with a path); what moved goes.
+        vegetation: "mesh" (as in D3.2), "locations" (a list of plants with positions instead of a mesh), or "both".
+        vehicles: "remove", or "keep" parked vehicles as a separate surface (requires a scanner's path); moving
+            vehicles are always removed.
     """
 
     vegetation: Literal["mesh", "locations", "both"] = "mesh"
@@ -35,12 +35,13 @@ class SplitParams(Params):
 
 
 def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Done:
-    """Cut the classified `cloud` into `terrain`, `building`, `vegetation` and `rest`.
+    """Split the classified `cloud` into `terrain`, `building`, `vegetation` and `rest`.
 
-    Signs and poles go with buildings, but for the points that `taken` (optional, `index` and `own` of an .npz) says are
-    street furniture's: they become `furniture`, and those of a neighbouring tile's `rest`. To keep vehicles, `things`
-    lists their boxes: points of the class in those of parked ones become `vehicle`. Other vehicles, people, wires and
-    what has no class are left out of the surface (`rest`), though they still hide what is behind; noise is dropped.
+    Signs and poles belong to `building`, except for points of street furniture listed in `taken` (optional .npz with
+    `index` and `own`): they become `furniture`, or `rest` if the object belongs to a neighbouring tile. To keep
+    vehicles, `things` (GeoJSON) lists their boxes: points of class vehicle in boxes of parked ones become `vehicle`.
+    Other vehicles, people, wires and unclassified points are not meshed (`rest`) but remain occluders; noise is
+    removed.
 
     Raises:
         DataError: no point belongs to any surface.
@@ -57,7 +58,9 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
         group[parked(cloud, inputs["things"])] = VEHICLE
         parts.append("vehicle")
     elif params.vehicles == "keep":
-        warnings.append("vehicles are kept only where a path tells which are parked (and things.find looks for them)")
+        warnings.append(
+            "split.vehicles=keep has no effect: it needs a scanner's path (to detect parked vehicles) and things.find"
+        )
     number: dict[str, int] = {name: i for i, name in enumerate(GROUPS)}
     number |= {"furniture": FURNITURE, "vehicle": VEHICLE}
     for i, name in enumerate(parts):
@@ -68,30 +71,30 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
         files[name] = out / f"{name}.npz"
         counts[name] = len(part)
         if name in GROUPS and len(part) == 0:
-            warnings.append(f"no point is of class {name}: the world will have none")
+            warnings.append(f"no point is of class {name}: the world will have no {name}")
     if sum(counts[name] for name in GROUPS) == 0:
         raise DataError(
             "classes",
             "no point belongs to terrain, building or vegetation",
-            "Check the cloud's classes, or classify it anew with --set segment.overwrite=true",
+            "Check the cloud's classes, or classify it again with --set segment.overwrite=true",
         )
     codes, numbers = np.unique(cloud.classification, return_counts=True)
     classes = {name_of(int(c)): int(n) for c, n in zip(codes, numbers, strict=True)}
-    vanished = {int(c): int(n) for c, n in zip(codes, numbers, strict=True) if not known()[c]}
-    if sum(vanished.values()) > NOTABLE * len(cloud):
-        which = ", ".join(f"{name_of(code)} {n / len(cloud):.1%}" for code, n in vanished.items())
-        foreign = max((code for code in vanished if code not in UNKNOWN), key=vanished.__getitem__, default=None)
-        mapping = f'Say what codes are by [classes] in tile.toml ({foreign} = "building"), or have'
+    unmeshed = {int(c): int(n) for c, n in zip(codes, numbers, strict=True) if not classified_codes()[c]}
+    if sum(unmeshed.values()) > UNCLASSIFIED_FRACTION_WARNING * len(cloud):
+        which = ", ".join(f"{name_of(code)} {n / len(cloud):.1%}" for code, n in unmeshed.items())
+        foreign = max((code for code in unmeshed if code not in UNKNOWN), key=unmeshed.__getitem__, default=None)
+        mapping = f'Map the codes in [classes] of tile.toml ({foreign} = "building"), or classify'
         warnings.append(
-            f"{sum(vanished.values()) / len(cloud):.1%} of the points have no class that says what they are ({which}): "
-            f"the world has no surface there. {mapping if foreign else 'Have'} all classes told "
-            "anew by --set segment.overwrite=true"
+            f"{sum(unmeshed.values()) / len(cloud):.1%} of the points have no known class ({which}): "
+            f"the world has no surface there. {mapping if foreign else 'Classify'} the cloud "
+            "again with --set segment.overwrite=true"
         )
     return Done(files, {"points_in": len(cloud), "points": counts, "classes": classes}, warnings)
 
 
 def parked(cloud: PointCloud, things: Path) -> Bools:
-    """(N,) which points of the class vehicle are in a box of `things` (GeoJSON of the step) that didn't move."""
+    """(N,) bool, True for points of class vehicle in the box of a parked vehicle in `things` (GeoJSON of that step)."""
     inside = np.zeros(len(cloud), bool)
     vehicle = np.flatnonzero(cloud.classification == CODE["vehicle"])
     for feature in json.loads(things.read_text(encoding="utf-8"))["features"]:
@@ -100,11 +103,11 @@ def parked(cloud: PointCloud, things: Path) -> Bools:
             continue
         ring = np.array(feature["geometry"]["coordinates"][0][:4])
         corners = cloud.frame.to_local(np.column_stack([ring, np.full(4, properties["ground_z"])]))
-        away = cloud.xyz[vehicle] - corners.mean(axis=0)
-        own = np.abs(away[:, 2] - properties["height_m"] / 2) < properties["height_m"] / 2 + AROUND
+        offset = cloud.xyz[vehicle] - corners.mean(axis=0)
+        own = np.abs(offset[:, 2] - properties["height_m"] / 2) < properties["height_m"] / 2 + VEHICLE_BOX_MARGIN_M
         for side in (corners[0] - corners[1], corners[1] - corners[2]):
             length = np.linalg.norm(side)
-            own &= np.abs(away @ side) < length * (length / 2 + AROUND)
+            own &= np.abs(offset @ side) < length * (length / 2 + VEHICLE_BOX_MARGIN_M)
         inside[vehicle[own]] = True
     return inside
 

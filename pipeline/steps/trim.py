@@ -1,4 +1,4 @@
-"""Trim: remove what Poisson made where no points are (D3.2, section 4.2)."""
+"""Trim: removes Poisson surface that is not supported by points (D3.2, section 4.2)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scan2sim.pipeline.core.parameters import Reach, Voxel
+from scan2sim.pipeline.core.parameters import Distance, Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, Mesh, PointCloud
 
@@ -15,31 +15,31 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 
-MISSION_VOXEL = 0.10  # metres, the voxels that the limits are made for (D3.2)
-FULL_VOXELS = 1.4  # mean distance to six neighbours on a surface whose every voxel holds a point, in voxels
+REFERENCE_VOXEL_M = 0.10  # voxel size that the limits are made for (D3.2)
+FULL_SPACING_VOXELS = 1.4  # mean distance to six neighbours on a surface with a point in every voxel
 
 
 class TrimParams(Params):
-    """What is removed, all in metres.
+    """Limits for faces, in metres.
 
-    The limits suit a cloud that fills voxels of 10 cm, as a mobile scanner's does. Where the points lie
-    sparser than that, or are thinned to larger voxels, limits grow in proportion (the fact `widened` tells how much).
+    The limits are for a cloud with a point in every 10 cm voxel, as from a mobile scanner. For sparser clouds or larger
+    voxels, they are scaled up in proportion (metric `widened`).
 
     Attributes:
-        max_edge: of a triangle; the mission's 50 cm for terrain (holes get closed), 25 cm else.
-        max_distance: of a vertex to the nearest point.
-        max_spacing: of the points around a vertex, as Poisson's density tells it.
-        voxel: size that the cloud was thinned to; set by the recipe.
+        max_edge: maximum edge length of a triangle; D3.2: 50 cm for terrain (closes holes), 25 cm otherwise.
+        max_distance: maximum distance of a vertex to the nearest point.
+        max_spacing: maximum point spacing around a vertex, from the density of the Poisson reconstruction.
+        voxel: voxel size of the thinned cloud; set by the pipeline.
     """
 
-    max_edge: Reach = 0.25
-    max_distance: Reach = 0.25
-    max_spacing: Reach = 0.8
+    max_edge: Distance = 0.25
+    max_distance: Distance = 0.25
+    max_spacing: Distance = 0.8
     voxel: Voxel = 0.10
 
 
 def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
-    """Keep the triangles of `mesh` that the points of `cloud`, or those made up (`made`, optional), bear out."""
+    """Keep the triangles of `mesh` that are supported by points of `cloud` or synthesized points (`made`, optional)."""
     from scipy.spatial import cKDTree
 
     mesh, cloud = Mesh.load(inputs["mesh"]), PointCloud.load(inputs["cloud"])
@@ -48,7 +48,7 @@ def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
         return Done({"mesh": out / "mesh.npz"}, {"faces_in": 0, "faces": 0})
     assert mesh.density is not None
     tree = cKDTree(cloud.xyz)
-    widened = max(1.0, _spacing(tree, cloud.xyz) / (FULL_VOXELS * MISSION_VOXEL))
+    widened = max(1.0, _spacing(tree, cloud.xyz) / (FULL_SPACING_VOXELS * REFERENCE_VOXEL_M))
     if "made" in inputs:
         tree = cKDTree(np.concatenate([cloud.xyz, PointCloud.load(inputs["made"]).xyz]))
     corners = mesh.corners
@@ -76,8 +76,8 @@ def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
 
 def _spacing(tree: cKDTree, xyz: F32) -> float:
     """Median over points of the mean distance to six neighbours, metres, from a sample of the points."""
-    some = xyz[:: max(1, len(xyz) // 20_000)]
-    distance, _ = tree.query(some, k=min(7, len(xyz)), workers=-1)
+    sample = xyz[:: max(1, len(xyz) // 20_000)]
+    distance, _ = tree.query(sample, k=min(7, len(xyz)), workers=-1)
     return float(np.median(distance[:, 1:].mean(axis=1)))
 
 

@@ -1,4 +1,4 @@
-"""Visibility: a depth map for every photo, from the meshes and from what of the cloud they lack."""
+"""Visibility: a depth map for every photo, from the meshes and from points that no mesh represents."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.core.parameters import Reach
+from scan2sim.pipeline.core.parameters import Distance
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import Mesh, PointCloud
 from scan2sim.pipeline.io import views as views_io
 
 
 class VisibilityParams(Params):
-    """How finely is looked.
+    """Resolution of the depth maps.
 
     Attributes:
-        pixels: depth maps are at most this large.
-        radius: of the discs that the cloud's points are drawn as, metres.
-        lacking: points further than this from every mesh hide by themselves (cars, people), metres.
+        pixels: maximum number of pixels of a depth map.
+        radius: radius in metres of the discs that represent points of the cloud.
+        lacking: points farther than this from every mesh (cars, people) occlude as discs, metres.
     """
 
     pixels: int = Field(2_000_000, ge=10_000, le=64_000_000)
     radius: float = Field(0.08, ge=0.001, le=10)
-    lacking: Reach = 0.2
+    lacking: Distance = 0.2
 
 
 def visibility(inputs: Inputs, params: VisibilityParams, out: Path, report: Report) -> Done:
-    """Draw a depth map of the meshes `mesh.*`, the clouds `cloud.*` and what is `moving` for every view of `views`.
+    """Render a depth map of the meshes `mesh.*`, the clouds `cloud.*` and the `moving` points for every view.
 
-    The maps are `depth/<view index>.npy`: (H, W) float32, metres along the pixel's ray.
+    Files: `depth/<view index>.npy`, (H, W) float32, metres along the pixel's ray.
     """
     from scan2sim.pipeline.camera import depth_map as kernel
 
@@ -42,12 +42,14 @@ def visibility(inputs: Inputs, params: VisibilityParams, out: Path, report: Repo
     meshes = [Mesh.load(path) for name, path in inputs.items() if name.startswith("mesh.")]
     cloud = PointCloud.join([PointCloud.load(path) for name, path in inputs.items() if name.startswith("cloud.")])
     moving = PointCloud.load(inputs["moving"]) if "moving" in inputs else None
-    hides = kernel.scene(meshes, cloud, radius=params.radius, lacking=params.lacking, moving=moving)
+    occluders = kernel.scene(meshes, cloud, radius=params.radius, mesh_distance=params.lacking, moving=moving)
     for i, view in enumerate(views):
         report(i / len(views), view.name)
-        depth = kernel.depth_map(view.camera, view.T_world_cam, hides, time=view.time, pixels=params.pixels)
+        depth = kernel.depth_map(view.camera, view.T_world_cam, occluders, time=view.time, pixels=params.pixels)
         np.save(folder / f"{i}.npy", depth.range)
-    return Done({"depth": folder}, {"views": len(views), "triangles": hides.triangles, "discs": len(hides.centres)})
+    return Done(
+        {"depth": folder}, {"views": len(views), "triangles": occluders.triangles, "discs": len(occluders.centres)}
+    )
 
 
 VISIBILITY = Step("visibility", 4, visibility, VisibilityParams, memory=(0.7, 3))

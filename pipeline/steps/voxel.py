@@ -1,4 +1,4 @@
-"""Voxel sampling: one point a voxel, with colour, class and an oriented normal (D3.2, section 4.2)."""
+"""Voxel sampling: one point per voxel, with colour, class and an oriented normal (D3.2, section 4.2)."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ Groups = tuple[I64, I64]
 
 
 class VoxelParams(Params):
-    """How the cloud is thinned.
+    """Voxel size and normals.
 
     Attributes:
-        size: metres; the mission's 10 cm keeps the geometry and makes Poisson affordable.
-        neighbours: points that a normal is fitted to.
+        size: voxel edge in metres; the 10 cm of D3.2 keep the geometry and make Poisson affordable.
+        neighbours: number of points that a normal is fitted to.
     """
 
     size: Voxel = 0.10
@@ -28,10 +28,9 @@ class VoxelParams(Params):
 
 
 def voxel(inputs: Inputs, params: VoxelParams, out: Path, report: Report) -> Done:
-    """Thin `cloud` and orient its normals to the scanner's path (`path`, optional).
+    """Thin `cloud` and orient its normals towards the scanner's path (`path`, optional).
 
-    Without a path (an airborne cloud, say) normals point up, and those of walls away from what
-    stands behind them.
+    Without a path (airborne clouds, for example), normals point up, and those of walls away from the building.
     """
     from scan2sim.pipeline.geometry.normals import oriented_normals
 
@@ -49,13 +48,13 @@ def voxel(inputs: Inputs, params: VoxelParams, out: Path, report: Report) -> Don
 
 
 def sample(cloud: PointCloud, size: float, groups: Groups | None = None) -> PointCloud:
-    """One point a voxel of `size` metres: mean position and colour; class, intensity and time of one member.
+    """One point per voxel of `size` metres: mean position and colour; class, intensity and time of one member.
 
-    `groups` are its `voxel_groups`, where they are known.
-    Means are rounded to `pipeline.tiling.borders.grid.GRID`, so that tiles which know the same points around their
-    border, in the same order (`overlap`), have the same samples there.
+    `groups` are its `voxel_groups`, if they were computed before.
+    Means are rounded to `pipeline.tiling.borders.grid.GRID_M`: tiles with the same points around their border, in the
+    same order (`overlap`), get the same samples there.
     """
-    from scan2sim.pipeline.tiling.borders.grid import on_grid
+    from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
 
     if len(cloud) == 0:
         return cloud
@@ -69,33 +68,32 @@ def sample(cloud: PointCloud, size: float, groups: Groups | None = None) -> Poin
         return total / (counts if weight is None else np.add.reduceat(weight[order], starts))[:, None]
 
     thin = cloud.take(first)
-    thin = replace(thin, xyz=on_grid(mean(cloud.xyz)).astype(np.float32), normal=None)
+    thin = replace(thin, xyz=snap_to_grid(mean(cloud.xyz)).astype(np.float32), normal=None)
     if cloud.rgb is not None:
-        known = cloud.coloured  # what has no colour lends none to what has
+        known = cloud.coloured  # uncoloured points must not affect the mean
         weight = None if known.all() else np.where(known, 1.0, 1e-9)
         thin = replace(thin, rgb=np.rint(mean(cloud.rgb, weight)).astype(np.uint8))
     return thin
 
 
 def voxel_groups(xyz: F32, size: float) -> Groups:
-    """Points sorted by voxel, and where each voxel starts in that order.
+    """Points sorted by voxel, and the start of each voxel in that order.
 
-    Voxels begin at whole multiples of `size`, in height half a voxel beside them (a level floor at a round height
-    isn't split in two). Tiles, whose origins are whole metres, have the same ones wherever a metre is a whole number
-    of voxels.
+    Voxels are aligned to multiples of `size`, in height with an offset of half a voxel (so that a level floor at a
+    round height isn't split). Origins of tiles are whole metres, so voxels agree if a metre is a multiple of `size`.
 
     Returns:
         order (N,) int64 into `xyz`, stable within a voxel; starts (V,) int64 into `order`.
     """
-    from scan2sim.pipeline.geometry.sorting import first_of_each, ordered
+    from scan2sim.pipeline.geometry.sorting import first_of_each, stable_argsort
 
     code = np.zeros(len(xyz), np.int64)
     for axis, shift in ((2, 0.5), (1, 0.0), (0, 0.0)):
-        # the guard: a place on the face of two voxels is in the same one, whatever the origin
+        # the epsilon assigns points on the face between two voxels to the same one for any origin
         cell = np.floor(xyz[:, axis].astype(np.float64) / size + shift + 1e-6).astype(np.int64)
         cell -= cell.min()
         code = code * (cell.max() + 1) + cell
-    order, code = ordered(code)
+    order, code = stable_argsort(code)
     starts = np.flatnonzero(first_of_each(code))
     return order, starts
 

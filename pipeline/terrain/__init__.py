@@ -1,4 +1,4 @@
-"""Terrain: the ground's heights fitted to its points, friction by class, low-poly plants.
+"""Terrain: fitting of ground heights to points, friction by class, low-poly plants.
 
-Begin with `ground_fit`, which the step `pipeline.steps.ground` uses.
+Begin with `ground_fit`, which the step `pipeline.steps.collision` uses.
 """

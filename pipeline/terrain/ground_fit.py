@@ -1,7 +1,8 @@
-"""Ground's heights: the vertices of a light mesh moved up or down to where its triangles fit the cloud best.
+"""Ground fit: adjusts the heights of a simplified ground mesh's vertices to the cloud.
 
-Least squares over all points near the mesh: each one's height is that of its triangle there, linear in the heights of
-the corners. Where there are no points the slope goes on: changes of slope between neighbouring triangles cost, too.
+Robust least squares over all points near the mesh: the height of a point is interpolated linearly from the corners of
+its triangle. Changes of slope between neighbouring triangles are penalized, so that the slope continues where there
+are no points.
 """
 
 from __future__ import annotations
@@ -13,26 +14,26 @@ import numpy as np
 from scan2sim.pipeline.core.types import F32, F64, I64, Bools, Mesh
 from scan2sim.pipeline.tiling.borders.common_faces import directed_edges
 
-NOISE = 0.02
-"""Metres: points' noise, from which on (Huber 1964) they count less."""
-BEND = 0.15
-"""Change of slope that weighs as much as `NOISE` does: a kerb's is 1, but many points hold it."""
-HELD = 0.1
-"""Metres that a vertex may lie off its old height for as much: only where nothing else holds it."""
-NEAR = 0.15
-"""Metres between a point and the mesh beyond which it is no ground's."""
-UPRIGHT = 0.5
-"""|nz| from which on a triangle has heights that points tell."""
-ROUNDS = 4
+POINT_SIGMA_M = 0.02
+"""Standard deviation of points, and threshold of the Huber loss (Huber 1964)."""
+SLOPE_CHANGE_SIGMA = 0.15
+"""Standard deviation of changes of slope; that of a kerb is 1, but it is supported by many points."""
+HEIGHT_PRIOR_SIGMA_M = 0.1
+"""Standard deviation of vertices from their old height; decisive only where there are no other constraints."""
+MAX_POINT_DISTANCE_M = 0.15
+"""Points farther from the mesh are not ground."""
+MIN_NORMAL_Z = 0.5
+"""Smallest |nz| of triangles whose heights are fitted."""
+REWEIGHTING_ROUNDS = 4
 
 
-def fitted(mesh: Mesh, points: F32, fixed: Bools) -> Mesh:
-    """A ground's mesh with its heights fitted to `points`; its plan and its triangles stay.
+def fit_heights(mesh: Mesh, points: F32, fixed: Bools) -> Mesh:
+    """Fit the heights of a ground mesh to `points`; horizontal positions and triangles are not changed.
 
     Args:
-        mesh: of the ground.
-        points: (N, 3) of the ground, local metres.
-        fixed: (V,) vertices that stay where they are.
+        mesh: ground mesh.
+        points: (N, 3) ground points, local metres.
+        fixed: (V,) bool, True for vertices that must not move.
     """
     from scipy.sparse import csr_matrix, diags, vstack
     from scipy.sparse.linalg import spsolve
@@ -41,34 +42,44 @@ def fitted(mesh: Mesh, points: F32, fixed: Bools) -> Mesh:
     if not len(points) or not len(free):
         return mesh
     start = mesh.vertices[:, 2].astype(np.float64)
-    face, shares, above = off_ground(mesh, points)
+    face, barycentric, above = heights_above_ground(mesh, points)
     count = len(face)
-    data = csr_matrix((shares.ravel(), (np.repeat(np.arange(count), 3), mesh.faces[face].ravel())), (count, len(start)))
+    data = csr_matrix(
+        (barycentric.ravel(), (np.repeat(np.arange(count), 3), mesh.faces[face].ravel())), (count, len(start))
+    )
     target = data @ start + above
-    rows = vstack([data / NOISE, _bends(mesh) / BEND, diags(np.full(len(start), 1 / HELD))]).tocsc()
-    wanted = np.concatenate([target / NOISE, np.zeros(rows.shape[0] - len(target) - len(start)), start / HELD])
-    own, rest = rows[:, free], wanted - rows[:, np.flatnonzero(fixed)] @ start[fixed]
-    z, weight = start.copy(), np.ones(len(wanted))
-    for _ in range(ROUNDS):
+    rows = vstack(
+        [
+            data / POINT_SIGMA_M,
+            _slope_changes(mesh) / SLOPE_CHANGE_SIGMA,
+            diags(np.full(len(start), 1 / HEIGHT_PRIOR_SIGMA_M)),
+        ]
+    ).tocsc()
+    rhs = np.concatenate(
+        [target / POINT_SIGMA_M, np.zeros(rows.shape[0] - len(target) - len(start)), start / HEIGHT_PRIOR_SIGMA_M]
+    )
+    own, rest = rows[:, free], rhs - rows[:, np.flatnonzero(fixed)] @ start[fixed]
+    z, weight = start.copy(), np.ones(len(rhs))
+    for _ in range(REWEIGHTING_ROUNDS):
         weighted = own.T @ diags(weight)
         z[free] = spsolve((weighted @ own).tocsc(), weighted @ rest)
-        off = np.abs(target / NOISE - (data / NOISE) @ z)
+        off = np.abs(target / POINT_SIGMA_M - (data / POINT_SIGMA_M) @ z)
         weight[: len(target)] = 1 / np.maximum(1, off)
     vertices = mesh.vertices.copy()
     vertices[free, 2] = z[free]
     return Mesh(mesh.frame, vertices, mesh.faces)
 
 
-def off_ground(mesh: Mesh, points: F32) -> tuple[I64, F64, F64]:
-    """Which triangles points near a ground's mesh lie over or under, where in them, and how far off.
+def heights_above_ground(mesh: Mesh, points: F32) -> tuple[I64, F64, F64]:
+    """Triangles above or below points near a ground mesh, with barycentric coordinates and height differences.
 
     Args:
-        mesh: of the ground.
+        mesh: ground mesh.
         points: (N, 3) local metres.
 
     Returns:
-        Of the M points that have one within `NEAR`: triangles (M,), shares of their three corners (M, 3), and heights
-        (M,) of the points above them in metres.
+        For the M points within `MAX_POINT_DISTANCE_M` of a triangle: triangles (M,), barycentric coordinates (M, 3),
+        and heights (M,) of the points above them in metres.
     """
     import open3d as o3d
 
@@ -77,14 +88,18 @@ def off_ground(mesh: Mesh, points: F32) -> tuple[I64, F64, F64]:
     closest = scene.compute_closest_points(points.astype(np.float32))
     face = closest["primitive_ids"].numpy().astype(np.int64)
     corners = mesh.corners.astype(np.float64)
-    shares = _shares(corners[face], points[:, :2].astype(np.float64))
-    above = points[:, 2] - np.einsum("nk,nk->n", shares, corners[face][..., 2])
-    inside = (shares > -1e-3).all(axis=1) & (np.abs(mesh.face_normal[face, 2]) > UPRIGHT) & (np.abs(above) < NEAR)
-    return face[inside], shares[inside], above[inside]
+    barycentric = _barycentric(corners[face], points[:, :2].astype(np.float64))
+    above = points[:, 2] - np.einsum("nk,nk->n", barycentric, corners[face][..., 2])
+    inside = (
+        (barycentric > -1e-3).all(axis=1)
+        & (np.abs(mesh.face_normal[face, 2]) > MIN_NORMAL_Z)
+        & (np.abs(above) < MAX_POINT_DISTANCE_M)
+    )
+    return face[inside], barycentric[inside], above[inside]
 
 
-def _shares(corners: F64, xy: F64) -> F64:
-    """(N, 3) barycentric coordinates on the plan of places (N, 2) in triangles (N, 3, 3)."""
+def _barycentric(corners: F64, xy: F64) -> F64:
+    """Barycentric coordinates (N, 3), in plan view, of points (N, 2) in triangles (N, 3, 3)."""
     a, b, c = np.moveaxis(corners[..., :2], 1, 0)
     area = np.maximum(np.abs(_cross(b - a, c - a)), 1e-12) * np.sign(_cross(b - a, c - a) + 1e-30)
     first, second = _cross(b - xy, c - xy) / area, _cross(c - xy, a - xy) / area
@@ -95,8 +110,8 @@ def _cross(a: F64, b: F64) -> F64:
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def _bends(mesh: Mesh) -> Any:
-    """Rows (E, V) that give the change of slope across inner edges, where neither triangle is steep."""
+def _slope_changes(mesh: Mesh) -> Any:
+    """Matrix (E, V) from heights to changes of slope across inner edges between triangles that are not steep."""
     from scipy.sparse import csr_matrix
 
     edges = np.sort(directed_edges(mesh.faces), axis=1)
@@ -105,7 +120,7 @@ def _bends(mesh: Mesh) -> Any:
     edges, face = edges[order], face[order]
     same = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
     first, second, edge = face[same], face[same + 1], edges[same]
-    flat = np.abs(mesh.face_normal[:, 2]) > UPRIGHT
+    flat = np.abs(mesh.face_normal[:, 2]) > MIN_NORMAL_Z
     keep = flat[first] & flat[second]
     first, second, edge = first[keep], second[keep], edge[keep]
     corners = mesh.corners[..., :2].astype(np.float64)
@@ -119,7 +134,7 @@ def _bends(mesh: Mesh) -> Any:
 
 
 def _slopes(corners: F64, direction: F64) -> F64:
-    """(N, 3) what heights of the corners (N, 3, 2) add to triangles' slopes in directions (N, 2)."""
+    """Derivatives (N, 3) of triangles' slopes in directions (N, 2) by the heights of their corners (N, 3, 2)."""
     a, b, c = np.moveaxis(corners, 1, 0)
     area = _cross(b - a, c - a)
     opposite = np.stack([c - b, a - c, b - a], axis=1)

@@ -1,7 +1,8 @@
-"""Low-poly trees and bushes where vegetation is listed instead of meshed, in the size and colour of the real ones.
+"""Low-poly trees and bushes with the size and colour of the scanned plants, if vegetation is listed instead of meshed.
 
-The crowns are models of the project (`plants.npz`, made by `data_samples.make_plants`), trunks are tubes, which bodies
-collide with as cylinders. All of a tile are one textured mesh, so every format shows them, labelled as vegetation.
+The crowns are models of the project (`plants.npz`, made by `data_samples.make_plants`); trunks are tubes, whose
+collision shapes are cylinders. All plants of a tile are one textured mesh with the class vegetation, which every world
+format supports.
 """
 
 from __future__ import annotations
@@ -17,50 +18,50 @@ from scan2sim.pipeline.geometry.primitives import tube
 from scan2sim.pipeline.io.images import image
 
 MODELS = Path(__file__).with_name("plants.npz")
-TREES, BUSHES = 4, 2
-"""Models of each, the trees first."""
-TREE = 2.5
-"""Metres of height from which on a plant is a tree with a trunk."""
-TRUNK, SIDES = 0.025, 8
-"""The trunk's radius, as a share of the height, and its sides."""
-IN_CROWN, IN_GROUND = 0.6, 0.3
-"""Share of the height that the trunk reaches up to, and metres that it begins below the ground."""
-BARK = (111, 93, 75)
-LEAVES = (96, 118, 62)
-"""Where the points have no colour."""
-DARK, BRIGHT = 0.6, 1.3
-"""How much darker and brighter than its mean colour a crown is within, and on top."""
-LEVELS = 16
-"""Colours are told apart by so many levels a channel."""
-BAND, RAMP = 8, 64
-"""Texels that a colour is high on the page, and its ramp from dark to bright is long."""
-FROM_POINTS = 128
-"""Of the page that tells where colours are from, as the step `texture` codes it."""
+TREE_MODELS, BUSH_MODELS = 4, 2
+"""Number of models of each, trees first."""
+MIN_TREE_HEIGHT_M = 2.5
+"""Taller plants are trees with a trunk."""
+TRUNK_RADIUS_FRACTION, TRUNK_SIDES = 0.025, 8
+"""Radius of the trunk relative to the height of the plant, and number of its sides."""
+TRUNK_TOP_FRACTION, TRUNK_DEPTH_M = 0.6, 0.3
+"""Top of the trunk relative to the height of the plant, and depth of its foot below the ground."""
+BARK_RGB = (111, 93, 75)
+DEFAULT_LEAF_RGB = (96, 118, 62)
+"""Colour of crowns whose points have no colour."""
+MIN_BRIGHTNESS, MAX_BRIGHTNESS = 0.6, 1.3
+"""Brightness inside and on top of a crown, relative to its mean colour."""
+COLOUR_LEVELS = 16
+"""Number of levels per channel that colours are quantized to."""
+BAND_TEXELS, RAMP_TEXELS = 8, 64
+"""Height of a colour's band on the texture page, and length of its ramp from dark to bright."""
+SOURCE_POINTS = 128
+"""Value of the colour source mask for point colours, as in the step `texture`."""
 
 
-def plant(places: F64, height: F64, radius: F64, colour: U8, frame: Frame, out: Path) -> None:
-    """Write all plants of a tile as a textured mesh below `out`, as `pipeline.io.worlds.textured_mesh` reads it.
+def plant(positions: F64, height: F64, radius: F64, colour: U8, frame: Frame, out: Path) -> None:
+    """Write all plants of a tile as a textured mesh below `out`, readable by `pipeline.io.worlds.textured_mesh`.
 
-    Faces of trunks have the class of high vegetation, crowns none of their own.
+    Faces of trunks have the class high vegetation, those of crowns none of their own.
 
     Args:
-        places: (P, 3) local metres, on the ground.
-        height, radius: (P,) metres, of the crown's outline.
-        colour: (P, 3) of the crown.
-        frame: of the mesh.
-        out: a folder.
+        positions: (P, 3) local metres, on the ground.
+        height, radius: (P,) height of the plant and radius of its crown, metres.
+        colour: (P, 3) colour of the crown.
+        frame: frame of the mesh.
+        out: folder.
     """
-    palette, row = np.unique(_coarse(np.concatenate([[BARK], colour])), axis=0, return_inverse=True)
+    palette, row = np.unique(_quantize(np.concatenate([[BARK_RGB], colour])), axis=0, return_inverse=True)
     image.write(out / "page_0.png", _page(palette))
-    image.write(out / "page_0_seen.png", np.full((len(palette) * BAND, RAMP), FROM_POINTS, np.uint8))
+    image.write(out / "page_0_seen.png", np.full((len(palette) * BAND_TEXELS, RAMP_TEXELS), SOURCE_POINTS, np.uint8))
     vertices, faces, uv, codes, count = [np.zeros((0, 3))], [], [], [], 0
-    for i, place in enumerate(places):
-        crown = _crown(place, height[i], radius[i])
+    for i, position in enumerate(positions):
+        crown = _crown(position, height[i], radius[i])
         parts = [(*crown, row[1 + i], 0)]
-        if height[i] >= TREE:
+        if height[i] >= MIN_TREE_HEIGHT_M:
             parts.append((*_trunk(height[i]), row[0], CODE["high_vegetation"]))
         for own, triangles, light, band, code in parts:
-            vertices.append(own + place)
+            vertices.append(own + position)
             faces.append(triangles + count)
             uv.append(_uv(light, band, len(palette))[triangles])
             codes.append(np.full(len(triangles), code, np.uint8))
@@ -78,41 +79,45 @@ def plant(places: F64, height: F64, radius: F64, colour: U8, frame: Frame, out: 
 
 @lru_cache
 def models() -> list[tuple[F32, I32, F32]]:
-    """Vertices, faces and openness to the sky of all crowns; 1 high, of radius 1."""
+    """Vertices, faces and sky visibility of all crown models, scaled to height 1 and radius 1."""
     with np.load(MODELS) as kept:
-        return [(kept[f"vertices{k}"], kept[f"faces{k}"], kept[f"light{k}"]) for k in range(TREES + BUSHES)]
+        return [(kept[f"vertices{k}"], kept[f"faces{k}"], kept[f"light{k}"]) for k in range(TREE_MODELS + BUSH_MODELS)]
 
 
-def _crown(place: F64, height: float, radius: float) -> tuple[F64, I32, F32]:
-    """A crown around its foot; which model, and how it is turned, follows from where it stands."""
-    chance = np.random.default_rng(np.abs(np.rint(100 * place)).astype(np.int64))
-    k = int(chance.integers(TREES)) if height >= TREE else TREES + int(chance.integers(BUSHES))
+def _crown(position: F64, height: float, radius: float) -> tuple[F64, I32, F32]:
+    """A crown around its foot; its model and rotation are pseudo-random, seeded by the position."""
+    random = np.random.default_rng(np.abs(np.rint(100 * position)).astype(np.int64))
+    k = (
+        int(random.integers(TREE_MODELS))
+        if height >= MIN_TREE_HEIGHT_M
+        else TREE_MODELS + int(random.integers(BUSH_MODELS))
+    )
     vertices, faces, light = models()[k]
-    turn = chance.uniform(0, 2 * np.pi)
-    c, s = np.cos(turn), np.sin(turn)
+    angle = random.uniform(0, 2 * np.pi)
+    c, s = np.cos(angle), np.sin(angle)
     return vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) * (radius, radius, height), faces, light
 
 
 def _trunk(height: float) -> tuple[F64, I32, F32]:
     """A trunk around its foot."""
-    path = [(0, 0, -IN_GROUND), (0, 0, IN_CROWN * height)]
-    vertices, faces = tube(path, np.full(2, TRUNK * height), SIDES)
+    path = [(0, 0, -TRUNK_DEPTH_M), (0, 0, TRUNK_TOP_FRACTION * height)]
+    vertices, faces = tube(path, np.full(2, TRUNK_RADIUS_FRACTION * height), TRUNK_SIDES)
     return vertices, faces, np.full(len(vertices), 0.5, np.float32)
 
 
-def _coarse(colour: U8) -> U8:
-    """The nearest of few colours."""
-    step = 256 // LEVELS
+def _quantize(colour: U8) -> U8:
+    """Quantize colours to `COLOUR_LEVELS` per channel."""
+    step = 256 // COLOUR_LEVELS
     return (colour // step * step + step // 2).astype(np.uint8)
 
 
 def _page(palette: U8) -> U8:
-    """A band a colour, from dark to bright."""
-    ramp = np.linspace(DARK, BRIGHT, RAMP)[None, :, None] * palette[:, None].astype(float)
-    return np.repeat(np.rint(ramp).clip(0, 255).astype(np.uint8), BAND, axis=0)
+    """Texture page with a horizontal band per colour, from dark to bright."""
+    ramp = np.linspace(MIN_BRIGHTNESS, MAX_BRIGHTNESS, RAMP_TEXELS)[None, :, None] * palette[:, None].astype(float)
+    return np.repeat(np.rint(ramp).clip(0, 255).astype(np.uint8), BAND_TEXELS, axis=0)
 
 
 def _uv(light: F32, band: int, bands: int) -> F64:
-    """(V, 2) places on the page: how bright a vertex is, in the middle of its colour's band."""
-    u = (0.5 + light.clip(0, 1) * (RAMP - 1)) / RAMP
+    """Texture coordinates (V, 2): brightness of the vertex along the middle of its colour's band."""
+    u = (0.5 + light.clip(0, 1) * (RAMP_TEXELS - 1)) / RAMP_TEXELS
     return np.column_stack([u, np.full(len(light), 1 - (band + 0.5) / bands)])

@@ -1,5 +1,5 @@
-"""Tiling of surveys: where a long drive is cut, and how the meshes of neighbouring tiles meet.
+"""Tiling of surveys: cutting of a long drive into tiles, and stitching of the meshes of neighbouring tiles.
 
-Begin with `cut_plan` (seeds along the path) and `voronoi_cell` (the area of one tile); `cut_corridor` distributes
-points and photos to tiles, `borders/` makes the meshes of neighbours meet vertex for vertex.
+Start reading at `cut_plan` (seeds along the path) and `voronoi_cell` (the area of one tile); `cut_corridor` distributes
+points and photos to tiles, `borders/` makes the meshes of neighbours share the vertices of their borders.
 """

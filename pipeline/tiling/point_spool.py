@@ -1,4 +1,4 @@
-"""Points on their way to many tiles: one raw file a tile, so that no survey needs to fit into memory."""
+"""Temporary storage of points while a survey is cut: one raw file per tile, so that memory is bounded."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.core.types import F64, I32, UNCOLOURED, Frame, PointCloud
 
-QUANTUM = 0.001
-"""CRS units, of coordinates; a whole number of them makes a unit, so that tiles with whole offsets agree on them."""
+COORDINATE_STEP = 0.001
+"""Resolution of coordinates, CRS units; it divides 1, so that tiles with integer offsets store equal coordinates."""
 UNCLASSIFIED = 1
-POINT = np.dtype(
+POINT_DTYPE = np.dtype(
     [
-        ("place", "<i4", 3),
+        ("xyz", "<i4", 3),
         ("rgb", "u1", 3),
         ("classification", "u1"),
         ("time", "<f8"),
@@ -25,47 +25,47 @@ POINT = np.dtype(
         ("own", "?"),
     ]
 )
-CHUNK = 500_000
+CHUNK_POINTS = 500_000
 
 
 @dataclass
-class Held:
-    """What a tile has been given.
+class TilePoints:
+    """Statistics of a tile's points.
 
     Attributes:
-        count: points.
-        own: of them, those that are in no other tile's cell.
-        low, high: (3,) bounds, in `QUANTUM` from the spool's base.
-        some: attributes that a point has.
-        lacking: attributes that a point lacks.
+        count: number of points.
+        own: number of points in the tile's own cell, without those in its buffer.
+        low, high: (3,) bounds, in `COORDINATE_STEP` from the spool's base.
+        present: attributes that at least one point has.
+        missing: attributes that at least one point doesn't have.
     """
 
     count: int = 0
     own: int = 0
     low: I32 = field(default_factory=lambda: np.full(3, np.iinfo(np.int32).max, np.int32))
     high: I32 = field(default_factory=lambda: np.full(3, np.iinfo(np.int32).min, np.int32))
-    some: set[str] = field(default_factory=set)
-    lacking: set[str] = field(default_factory=set)
+    present: set[str] = field(default_factory=set)
+    missing: set[str] = field(default_factory=set)
 
 
 class Spool:
     """Points of many tiles in raw files of a folder; a file is open only while it is written to."""
 
     def __init__(self, folder: Path, base: npt.ArrayLike, unit: float, tiles: int) -> None:
-        """`base` (3,) are whole CRS units near all points, `unit` the metres of one."""
+        """Create an empty spool; `base` (3,) is a position near all points in integer CRS units, `unit` metres each."""
         self.folder, self.base, self.unit = folder, np.asarray(base, np.float64), unit
-        self.held = [Held() for _ in range(tiles)]
-        self.lost = 0  # points without a place: NaN
+        self.tiles = [TilePoints() for _ in range(tiles)]
+        self.invalid = 0  # number of points with NaN coordinates
 
     def rows(self, cloud: PointCloud) -> npt.NDArray[Any]:
-        """The finite points of a cloud as records, none of them any tile's own yet."""
-        places = np.rint((cloud.frame.to_crs(cloud.xyz) - self.base) / QUANTUM)
-        good = np.asarray((np.abs(places) < np.iinfo(np.int32).max).all(axis=1))  # NaN is none of them
+        """The finite points of a cloud as records, with `own` false."""
+        steps = np.rint((cloud.frame.to_crs(cloud.xyz) - self.base) / COORDINATE_STEP)
+        good = np.asarray((np.abs(steps) < np.iinfo(np.int32).max).all(axis=1))  # false for NaN
         if not good.all():
-            self.lost += int(np.count_nonzero(~good))
-            cloud, places = cloud.take(good), places[good]
-        rows = np.zeros(len(cloud), POINT)
-        rows["place"] = places
+            self.invalid += int(np.count_nonzero(~good))
+            cloud, steps = cloud.take(good), steps[good]
+        rows = np.zeros(len(cloud), POINT_DTYPE)
+        rows["xyz"] = steps
         rows["rgb"] = UNCOLOURED if cloud.rgb is None else cloud.rgb
         rows["classification"] = UNCLASSIFIED if cloud.classification is None else cloud.classification
         for name in ("time", "intensity"):
@@ -74,47 +74,47 @@ class Spool:
         return rows
 
     def world(self, rows: npt.NDArray[Any]) -> F64:
-        """(N, 3) world metres of records."""
-        return (self.base + rows["place"] * QUANTUM) * self.unit
+        """World coordinates (N, 3) of records, metres."""
+        return (self.base + rows["xyz"] * COORDINATE_STEP) * self.unit
 
     def add(self, tile: int, rows: npt.NDArray[Any], source: PointCloud) -> None:
-        """Give a tile records of points; `source` tells which attributes they have."""
-        held = self.held[tile]
-        held.count += len(rows)
-        held.own += int(np.count_nonzero(rows["own"]))
-        held.low = np.minimum(held.low, rows["place"].min(axis=0))
-        held.high = np.maximum(held.high, rows["place"].max(axis=0))
+        """Append records to a tile; `source` is the cloud they are from, which determines their attributes."""
+        points = self.tiles[tile]
+        points.count += len(rows)
+        points.own += int(np.count_nonzero(rows["own"]))
+        points.low = np.minimum(points.low, rows["xyz"].min(axis=0))
+        points.high = np.maximum(points.high, rows["xyz"].max(axis=0))
         for name in ("rgb", "classification", "time", "intensity"):
-            (held.lacking if getattr(source, name) is None else held.some).add(name)
+            (points.missing if getattr(source, name) is None else points.present).add(name)
         with open(self._file(tile), "ab") as file:
             rows.tofile(file)
 
     def bounds(self, tile: int) -> tuple[F64, F64]:
-        """(3,) low and high corner of a tile's points, world metres."""
-        held = self.held[tile]
-        return (self.base + held.low * QUANTUM) * self.unit, (self.base + held.high * QUANTUM) * self.unit
+        """Low and high corner (3,) of a tile's points, world metres."""
+        low, high = self.tiles[tile].low, self.tiles[tile].high
+        return (self.base + low * COORDINATE_STEP) * self.unit, (self.base + high * COORDINATE_STEP) * self.unit
 
-    def sample(self, tile: int, most: int) -> F64:
-        """(N, 3) at most so many of a tile's own points, drawn the same at every run, world metres."""
-        rows: npt.NDArray[Any] = np.memmap(self._file(tile), POINT, "r")
-        if len(rows) > most:
-            rows = rows[np.unique(np.random.default_rng(0).integers(0, len(rows), most))]
+    def sample(self, tile: int, max_count: int) -> F64:
+        """Deterministic random sample (N, 3) of at most `max_count` of a tile's own points, world metres."""
+        rows: npt.NDArray[Any] = np.memmap(self._file(tile), POINT_DTYPE, "r")
+        if len(rows) > max_count:
+            rows = rows[np.unique(np.random.default_rng(0).integers(0, len(rows), max_count))]
         return self.world(rows[rows["own"]])
 
     def parts(self, tile: int, crs: str) -> Iterator[PointCloud]:
-        """A tile's points in their order, a chunk at a time, in a frame in the middle of them.
+        """A tile's points in order, in chunks, in a frame with its origin in the middle of them.
 
-        Colours are grey and classes "unclassified" where only some points have them; other attributes that not all
-        of them have are left out (as by `PointCloud.join`).
+        If only some points have colours or classes, the others are grey or unclassified; other attributes that not all
+        points have are omitted (as in `PointCloud.join`).
         """
-        held = self.held[tile]
-        middle = np.floor(self.base + (held.low.astype(np.float64) + held.high) / 2 * QUANTUM)
+        points = self.tiles[tile]
+        middle = np.floor(self.base + (points.low.astype(np.float64) + points.high) / 2 * COORDINATE_STEP)
         x, y, z = (middle * self.unit).tolist()
         frame = Frame(crs, (x, y, z), self.unit)
-        kept = (held.some & {"rgb", "classification"}) | (held.some - held.lacking)
+        kept = (points.present & {"rgb", "classification"}) | (points.present - points.missing)
         with open(self._file(tile), "rb") as file:
-            while len(rows := np.fromfile(file, POINT, CHUNK)):
-                local = (rows["place"] * QUANTUM - (middle - self.base)) * self.unit
+            while len(rows := np.fromfile(file, POINT_DTYPE, CHUNK_POINTS)):
+                local = (rows["xyz"] * COORDINATE_STEP - (middle - self.base)) * self.unit
                 columns = {name: rows[name].copy() for name in sorted(kept)}
                 yield PointCloud(frame, local.astype(np.float32), **columns)
 

@@ -1,8 +1,8 @@
-"""Cells: what of the plane is a tile's own, so that neighbours share their borders without a word.
+"""Voronoi cells of tiles; neighbours compute identical borders independently.
 
-A survey is cut by seeds along its trajectory: a place belongs to the tile whose seed is nearest (Voronoi), so cells
-are convex, borders are upright planes halfway between two seeds, and every tile that knows its neighbours' seeds
-computes the same borders. Everything here is in world metres (CRS coordinates times metres per unit).
+A survey is cut by seeds along its trajectory: a point belongs to the tile with the nearest seed, so cells are convex,
+borders are vertical planes halfway between two seeds, and every tile that knows its neighbours' seeds computes the
+same borders. Coordinates are world metres (CRS coordinates times metres per unit).
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ import numpy.typing as npt
 
 F64 = npt.NDArray[np.float64]
 Seed = tuple[float, float]
-TOUCH = 0.01
-"""Metres within which two cells touch, in a corner at least."""
+CONTACT_TOLERANCE_M = 0.01
+"""Distance up to which two cells count as touching, at least in a corner."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A tile's own part of the plane: what is nearer to its seed than to any neighbour's.
+    """Voronoi cell of a tile: the points that are nearer to its seed than to any neighbour's.
 
     Attributes:
         seed: (x, y) world metres.
-        neighbours: name of every tile whose cell touches this one (in a corner at least) to its seed. The tile whose
+        neighbours: name of every tile whose cell touches this one (at least in a corner) to its seed. The tile whose
             name sorts first owns a border: the other one fits its mesh to it.
-        buffer: metres that the tile's cloud reaches beyond its borders.
+        buffer: metres by which the tile's cloud extends beyond its borders.
     """
 
     seed: Seed
@@ -35,11 +35,11 @@ class Cell:
     buffer: float = 5.0
 
     def beyond(self, neighbour: str, xy: npt.ArrayLike) -> F64:
-        """(N,) metres that world places (N, 2) lie beyond the border with a neighbour; negative on the own side."""
+        """Signed distance (N,) of world points (N, 2) from the border with a neighbour, negative inside the cell."""
         return beyond(self.seed, self.neighbours[neighbour], xy)
 
     def outside(self, xy: npt.ArrayLike) -> F64:
-        """(N,) metres beyond the farthest border, negative inside; -inf without neighbours."""
+        """Signed distance (N,) from the cell: maximum over its borders, negative inside; -inf without neighbours."""
         xy = np.asarray(xy, np.float64)
         distance = np.full(len(xy), -np.inf)
         for name in self.neighbours:
@@ -48,9 +48,9 @@ class Cell:
 
 
 def beyond(own: Seed, other: Seed, xy: npt.ArrayLike) -> F64:
-    """(N,) metres from the plane halfway between two seeds, positive on the other's side.
+    """Signed distance (N,) from the plane halfway between two seeds, positive on the other seed's side.
 
-    The sum is the same, but for its sign, whichever of the two seeds asks.
+    Swapping the seeds changes only the sign, bit for bit.
     """
     first, second = sorted((own, other))
     a, b = np.asarray(first, np.float64), np.asarray(second, np.float64)
@@ -60,17 +60,17 @@ def beyond(own: Seed, other: Seed, xy: npt.ArrayLike) -> F64:
 
 
 def nearest(xy: F64, seeds: Sequence[Seed]) -> npt.NDArray[np.int64]:
-    """(N,) index of the nearest seed to each world place (N, 2), the first of several as near."""
-    index, least = np.zeros(len(xy), np.int64), np.full(len(xy), np.inf)
+    """Index (N,) of the seed nearest to each world point (N, 2), the first of several at the same distance."""
+    index, smallest = np.zeros(len(xy), np.int64), np.full(len(xy), np.inf)
     for i, seed in enumerate(seeds):
         square = ((xy - seed) ** 2).sum(axis=1)
-        nearer = square < least
-        index[nearer], least[nearer] = i, square[nearer]
+        nearer = square < smallest
+        index[nearer], smallest[nearer] = i, square[nearer]
     return index
 
 
 def outline(cell: Cell, low: npt.ArrayLike, high: npt.ArrayLike) -> F64:
-    """(K, 2) corners of a cell within a rectangle (its corners (2,)), counter-clockwise, world metres."""
+    """Polygon (K, 2) of a cell clipped to a rectangle (corners (2,)), counter-clockwise, world metres."""
     (left, bottom), (right, top) = np.asarray(low, np.float64), np.asarray(high, np.float64)
     corners = np.array([(left, bottom), (right, bottom), (right, top), (left, top)])
     for name in cell.neighbours:
@@ -86,29 +86,29 @@ def outline(cell: Cell, low: npt.ArrayLike, high: npt.ArrayLike) -> F64:
     return corners
 
 
-def cells(seeds: Mapping[str, Seed], near: float) -> dict[str, Cell]:
-    """Every tile's cell with its neighbours: all whose cells touch it, in a corner at least.
+def cells(seeds: Mapping[str, Seed], max_distance: float) -> dict[str, Cell]:
+    """Every tile's cell with its neighbours: the tiles whose cells touch it, at least in a corner.
 
     Args:
-        seeds: tile's name to its seed, world metres.
-        near: metres; seeds further apart than this are no neighbours (their cells meet far from any data).
+        seeds: seed of each tile by name, world metres.
+        max_distance: metres; seeds farther apart aren't neighbours (their cells meet far from any data).
     """
     from scipy.spatial import cKDTree
 
     names = sorted(seeds)
     if not names:
         return {}
-    places = np.array([seeds[name] for name in names])
-    tree = cKDTree(places)
-    around = [sorted(set(close) - {i}) for i, close in enumerate(tree.query_ball_point(places, near))]
-    whole = [Cell(seeds[name], {names[j]: seeds[names[j]] for j in around[i]}) for i, name in enumerate(names)]
+    positions = np.array([seeds[name] for name in names])
+    tree = cKDTree(positions)
+    around = [sorted(set(close) - {i}) for i, close in enumerate(tree.query_ball_point(positions, max_distance))]
+    candidates = [Cell(seeds[name], {names[j]: seeds[names[j]] for j in around[i]}) for i, name in enumerate(names)]
     touching: list[set[int]] = [set() for _ in names]
-    for i, cell in enumerate(whole):
-        corners = outline(cell, np.subtract(cell.seed, near), np.add(cell.seed, near))
+    for i, cell in enumerate(candidates):
+        corners = outline(cell, np.subtract(cell.seed, max_distance), np.add(cell.seed, max_distance))
         for j in around[i]:
-            if len(corners) and float(np.max(cell.beyond(names[j], corners))) > -TOUCH:
+            if len(corners) and float(np.max(cell.beyond(names[j], corners))) > -CONTACT_TOLERANCE_M:
                 touching[i].add(j)
-    for i in range(len(names)):  # what one finds touching, the other knows, too
+    for i in range(len(names)):  # make the relation symmetric
         for j in list(touching[i]):
             touching[j].add(i)
     return {

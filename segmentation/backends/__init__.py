@@ -1,4 +1,4 @@
-"""Segmentation networks behind one protocol: a file a backend (`pipeline.core.plugins`), found by its name."""
+"""Segmentation networks behind one protocol: one module per backend, found by name (`pipeline.core.plugins`)."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from scan2sim.pipeline.core.types import F32, U8
 
 
 @dataclass(frozen=True)
-class Facts:
-    """What is known of a network.
+class NetworkInfo:
+    """Description of a network.
 
     Attributes:
-        name: of backend and weights.
-        labels: names of its classes, in order of its channels.
-        sha256: of the weights' file.
-        licence: of the weights, as far as the file tells.
-        pixels_a_radian: angular resolution that photos should be resampled to; None: as they are.
-        channels: whether it takes those of `segmentation.lidar_channels`, too.
+        name: name of backend and weights.
+        labels: names of its classes, in order of its output channels.
+        sha256: checksum of the weights' file.
+        licence: licence of the weights, as stated in the file.
+        pixels_per_radian: angular resolution to which photos should be resampled; None: their own.
+        channels: whether it takes `segmentation.lidar_channels`.
     """
 
     name: str
     labels: tuple[str, ...]
     sha256: str
     licence: str
-    pixels_a_radian: float | None
+    pixels_per_radian: float | None
     channels: bool = False
 
 
 class Network(Protocol):
-    """A network that is loaded."""
+    """A loaded network."""
 
-    facts: Facts
+    info: NetworkInfo
 
     def probabilities(self, seen: U8) -> F32:
-        """(C, h, w) float32 that sum to 1 over the labels, for (H, W, 3) uint8; h, w may be a fraction of H, W.
+        """(C, h, w) float32 probabilities of the labels, which sum to 1; h, w may be a fraction of H, W.
 
         Args:
-            seen: colours; for a network that takes `channels` (H, W, 7), with them, 0 where nothing is known.
+            seen: (H, W, 3) uint8 colours; for a network with `channels` (H, W, 7), with them, 0 where unknown.
 
         Raises:
             MemoryError: the photo doesn't fit on the device; smaller tiles may.
@@ -50,62 +50,64 @@ class Network(Protocol):
 
 
 class Backend(Protocol):
-    """What a backend's module has."""
+    """Functions of a backend's module."""
 
     def check(self, weights: Path | None) -> None:
-        """Refuse weights that it can't run here; nothing heavy is loaded.
+        """Check that the backend can run these weights on this machine, without loading anything large.
 
         Raises:
-            ScanError: as `check`.
+            ScanError: as raised by `backends.check`.
         """
 
     def load(self, weights: Path | None, device: str) -> Network:
-        """The network with these weights, which were checked."""
+        """The network with these weights, which were checked before."""
 
 
 def load(name: str, weights: Path | None, device: str = "auto") -> Network:
-    """The network of a backend, with the user's weights or, for "street", the project's own.
+    """The network of a backend, with your weights or, for "street", the project's own.
 
     Raises:
-        SettingError: the device isn't there.
+        SettingError: the device is not available.
         InputError: the weights are damaged, of another architecture, or unsafe to read.
-        ScanError: as `check`.
+        ScanError: as raised by `check`.
     """
     return check(name, weights).load(weights, device)
 
 
 def check(name: str, weights: Path | None) -> Backend:
-    """The module of a backend that can run here; nothing heavy is loaded.
+    """The module of a backend that can run on this machine; nothing large is loaded.
 
     Raises:
-        SettingError: there is no such backend, or it wants weights.
+        SettingError: the backend is unknown, or needs weights.
         UnavailableError: a package is missing.
-        InputError: the weights aren't there.
+        InputError: the weights don't exist.
     """
     backend: Backend = plugins.find(__name__, name, "label.network")
     backend.check(weights)
     return backend
 
 
-def given(name: str, weights: Path | None) -> Path:
-    """Weights of the user's, for a backend that comes without.
+def require_weights(name: str, weights: Path | None) -> Path:
+    """The user's weights, for a backend without its own.
 
     Raises:
-        SettingError: there are none.
-        InputError: they aren't there.
+        SettingError: no weights are set.
+        InputError: they don't exist.
     """
     if weights is None:
-        raise SettingError("label.weights", f"{name!r} comes without weights", "Name yours: --set label.weights=PATH")
+        raise SettingError(
+            "label.weights", f"{name!r} comes without weights", "Pass your weights: --set label.weights=PATH"
+        )
     if not weights.exists():
-        raise InputError(weights, "is no file or folder", "Give one on this disk; nothing is downloaded")
+        raise InputError(weights, "file or folder not found", "Pass a local path; nothing is downloaded")
     return weights
 
 
 def torch_device(device: str) -> str:
-    """A device of torch; "auto" stands for a GPU where there is one.
+    """A torch device; for "auto" a GPU if there is one, else "cpu".
 
     Raises:
-        SettingError: torch can't use it here.
+        SettingError: torch can't use the device on this machine.
     """
     if device == "auto" and shutil.which("nvidia-smi") is None:
         return "cpu"
@@ -117,4 +119,4 @@ def torch_device(device: str) -> str:
         return str(torch.zeros(1, device=device).device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
-        raise SettingError("label.device", f"torch can't use {device!r} here ({reason})", "Say cpu, or auto") from None
+        raise SettingError("label.device", f"torch can't use {device!r} here ({reason})", "Set cpu or auto") from None

@@ -1,10 +1,11 @@
-"""Any segmentation network in an ONNX file, by onnxruntime.
+"""Backend "onnx": any segmentation network in an ONNX file, run by onnxruntime.
 
 The file has one input, (1, 3, H, W) float RGB, and one output, (1, C, h, w) logits or probabilities. Its
-`metadata_props` may tell, as JSON: "labels", names of the C channels in order (else `<name>.labels.txt` beside it, one
-a line); "mean" and "std" that the input, 1 for white, is normalised with (else ImageNet's); "pixels_a_radian", the
-angular resolution that photos are resampled to (else they are taken as they are); "channels", true if the input is
-(1, 7, H, W), with those of `segmentation.lidar_channels` from 0 to 1 after the colours. "license" is told on.
+`metadata_props` may contain, as JSON: "labels", names of the C channels in order (else they are read from
+`<name>.labels.txt`, one per line); "mean" and "std", the normalisation of the input in [0, 1] (else ImageNet's);
+"pixels_a_radian", the angular resolution to which photos are resampled (else they are not resampled); "channels", true
+if the input is (1, 7, H, W), with `segmentation.lidar_channels` in [0, 1] after the colours; "license", which is
+reported.
 """
 
 from __future__ import annotations
@@ -16,17 +17,17 @@ import numpy as np
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F32, U8
 from scan2sim.segmentation import onnx_session
-from scan2sim.segmentation.backends import Facts, given
-from scan2sim.segmentation.backends.segformer import MEAN, STD, numbers
-from scan2sim.segmentation.lidar_channels import COUNT
+from scan2sim.segmentation.backends import NetworkInfo, require_weights
+from scan2sim.segmentation.backends.segformer import MEAN, STD, normalisation
+from scan2sim.segmentation.lidar_channels import CHANNELS
 
 NEEDS = ("onnxruntime",)
-REMEDY = "Export the network with one input (1, 3, H, W) of floats and one output (1, C, h, w)"
+REMEDY = "Export the network with one float input (1, 3, H, W) and one output (1, C, h, w)"
 
 
 def check(weights: Path | None) -> None:
     """See `segmentation.backends.Backend`."""
-    given("onnx", weights)
+    require_weights("onnx", weights)
 
 
 def load(weights: Path | None, device: str) -> Network:
@@ -34,46 +35,49 @@ def load(weights: Path | None, device: str) -> Network:
 
     Raises:
         SettingError: onnxruntime can't use the device.
-        InputError: it is missing, damaged, has other inputs or outputs, or doesn't name its labels.
+        InputError: the file is missing or damaged, has other inputs or outputs, or has no labels.
     """
-    return Network(given("onnx", weights), device)
+    return Network(require_weights("onnx", weights), device)
 
 
 class Network:
-    """See `segmentation.backends.Network`; h, w are what the file gives, also where it wants photos of a fixed size."""
+    """See `segmentation.backends.Network`; h, w are the size of the file's output, also if its input size is fixed."""
 
     def __init__(self, path: Path, device: str, backend: str = "onnx") -> None:
         self._path = path
-        self._session = onnx_session.opened(path, device, "label.device")
+        self._session = onnx_session.open_session(path, device, "label.device")
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if len(inputs) != 1 or len(outputs) != 1:
             names = ", ".join(value.name for value in [*inputs, *outputs])
-            raise InputError(path, f"has {len(inputs)} inputs and {len(outputs)} outputs ({names})", REMEDY)
-        (given,), (got,) = inputs, outputs
+            raise InputError(path, f"{len(inputs)} inputs and {len(outputs)} outputs ({names}), not one each", REMEDY)
+        (source,), (output,) = inputs, outputs
         meta = self._session.get_modelmeta().custom_metadata_map
-        more = bool(onnx_session.value(meta.get("channels"), False))
-        wanted, produced = _sizes(given.shape), _sizes(got.shape)
-        fits = len(wanted) == 4 and wanted[0] in (1, None) and wanted[1] in (3 + COUNT * more, None)
-        if given.type not in onnx_session.FLOATS or not fits:
-            raise InputError(path, f"takes {given.type} of {given.shape}", REMEDY)
-        if got.type not in onnx_session.FLOATS or (got.shape and len(produced) != 4):
-            raise InputError(path, f"gives {got.type} of {got.shape}", REMEDY)
-        self._input, self._type, self._size = given.name, onnx_session.FLOATS[given.type], wanted[2:]
-        labels = onnx_session.labels(path, meta)
-        if got.shape and produced[1] not in (None, len(labels)):
-            raise InputError(path, f"gives {produced[1]} channels, but {len(labels)} labels are named", "Name one each")
-        self._mean = numbers(onnx_session.value(meta.get("mean"), MEAN), 3, path, least=-np.inf)
-        self._std = numbers(onnx_session.value(meta.get("std"), STD), 3, path)
-        licence = meta.get("license") or "not told"
-        density = onnx_session.value(meta.get("pixels_a_radian"), None)
-        resolution = None if density is None else float(numbers([density], 1, path)[0])
-        self.facts = Facts(f"{backend} ({path.name})", labels, onnx_session.digest(path), licence, resolution, more)
+        takes_channels = bool(onnx_session.metadata_value(meta.get("channels"), False))
+        wanted, produced = _sizes(source.shape), _sizes(output.shape)
+        fits = len(wanted) == 4 and wanted[0] in (1, None) and wanted[1] in (3 + CHANNELS * takes_channels, None)
+        if source.type not in onnx_session.FLOATS or not fits:
+            raise InputError(path, f"unsupported input: {source.type} of shape {source.shape}", REMEDY)
+        if output.type not in onnx_session.FLOATS or (output.shape and len(produced) != 4):
+            raise InputError(path, f"unsupported output: {output.type} of shape {output.shape}", REMEDY)
+        self._input, self._type, self._size = source.name, onnx_session.FLOATS[source.type], wanted[2:]
+        labels = onnx_session.read_labels(path, meta)
+        if output.shape and produced[1] not in (None, len(labels)):
+            raise InputError(
+                path, f"{produced[1]} output channels, but {len(labels)} labels", "Name one label per channel"
+            )
+        self._mean = normalisation(onnx_session.metadata_value(meta.get("mean"), MEAN), 3, path, minimum=-np.inf)
+        self._std = normalisation(onnx_session.metadata_value(meta.get("std"), STD), 3, path)
+        licence = meta.get("license") or "not stated"
+        density = onnx_session.metadata_value(meta.get("pixels_a_radian"), None)
+        resolution = None if density is None else float(normalisation([density], 1, path)[0])
+        name = f"{backend} ({path.name})"
+        self.info = NetworkInfo(name, labels, onnx_session.digest(path), licence, resolution, takes_channels)
 
     def probabilities(self, seen: U8) -> F32:
         """See `segmentation.backends.Network`.
 
         Raises:
-            InputError: the network can't take a photo of this size, or gives something else than it should.
+            InputError: the network fails on photos of this size, or its output has another shape than it states.
         """
         import cv2
 
@@ -85,19 +89,20 @@ class Network:
         x[..., :3] = (x[..., :3] - self._mean) / self._std
         try:
             (out,) = self._session.run(None, {self._input: x.transpose(2, 0, 1)[None].astype(self._type)})
-        except Exception as error:  # onnxruntime's errors have no kind in common
-            raise onnx_session.failure(error, self._path, f"fails on a photo of {width} x {height}", REMEDY) from None
-        if out.ndim != 4 or out.shape[:2] != (1, len(self.facts.labels)):
-            cause = f"gives {out.shape} for {len(self.facts.labels)} labels"
-            raise InputError(self._path, cause, "Name a label for every channel of a (1, C, h, w) output")
+        except Exception as error:  # onnxruntime's errors have no common base class
+            cause = f"fails on a photo of {width} x {height} pixels"
+            raise onnx_session.session_error(error, self._path, cause, REMEDY) from None
+        if out.ndim != 4 or out.shape[:2] != (1, len(self.info.labels)):
+            cause = f"output of shape {out.shape} for {len(self.info.labels)} labels"
+            raise InputError(self._path, cause, "Name one label per channel of the output (1, C, h, w)")
         logits = out[0].astype(np.float32)
         total = logits.sum(axis=0, keepdims=True)
-        if logits.min() >= 0 and np.abs(total - 1).max() < 0.01:  # probabilities; rounded, if in half precision
+        if logits.min() >= 0 and np.abs(total - 1).max() < 0.01:  # already probabilities, possibly in half precision
             return np.asarray(logits / total, np.float32)
         powers = np.exp(logits - logits.max(axis=0, keepdims=True))
         return np.asarray(powers / powers.sum(axis=0, keepdims=True), np.float32)
 
 
 def _sizes(shape: list[int | str | None]) -> tuple[int | None, ...]:
-    """None for what is known only when it runs."""
+    """Shape with None for dynamic dimensions."""
     return tuple(size if isinstance(size, int) and size > 0 else None for size in shape)

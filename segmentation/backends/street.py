@@ -1,7 +1,7 @@
-"""The project's own network, trained on the synthetic street: the default, which needs no download.
+"""Backend "street": the project's own network, trained on synthetic streets; the default, which needs no download.
 
-Its weights come in two forms: ONNX, which onnxruntime runs on any processor, and safetensors, which torch runs where
-there is a GPU. `scan2sim segment train` writes both.
+Its weights come in two formats: ONNX, run by onnxruntime on any CPU, and safetensors, run by torch if there is a GPU.
+`scan2sim segment train` writes both.
 """
 
 from __future__ import annotations
@@ -17,48 +17,52 @@ import numpy as np
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F32, U8
-from scan2sim.segmentation.backends import Facts, given, onnx, torch_device
 from scan2sim.segmentation.backends import Network as AnyNetwork
-from scan2sim.segmentation.lidar_channels import COUNT
+from scan2sim.segmentation.backends import NetworkInfo, onnx, require_weights, torch_device
+from scan2sim.segmentation.lidar_channels import CHANNELS
 
 if TYPE_CHECKING:
     from scan2sim.segmentation.network import StreetNet
 
 NEEDS = onnx.NEEDS
-OWN = Path(__file__).resolve().parent.parent / "weights" / "street.onnx"
+DEFAULT_WEIGHTS = Path(__file__).resolve().parent.parent / "weights" / "street.onnx"
 LICENCE = "as the project's"
 OPSET = 17
 
 
 def check(weights: Path | None) -> None:
     """See `segmentation.backends.Backend`; without weights, the project's own are used."""
-    if weights is not None and _is_torchs(weights):
-        optional_deps.need("label.network street", "torch", "safetensors")
+    if weights is not None and _is_safetensors(weights):
+        optional_deps.require("label.network street", "torch", "safetensors")
     if weights is not None:
-        given("street", weights)
+        require_weights("street", weights)
 
 
 def load(weights: Path | None, device: str) -> AnyNetwork:
-    """The network with the project's own weights, or others that `scan2sim segment train` wrote, in either form."""
+    """The network with the project's own weights, or with others written by `scan2sim segment train`."""
     if weights is None:
-        weights = OWN.with_suffix(".safetensors") if _has_gpu(device) else OWN
-    return Network(weights, torch_device(device)) if _is_torchs(weights) else onnx.Network(weights, device, "street")
+        weights = DEFAULT_WEIGHTS.with_suffix(".safetensors") if _uses_gpu(device) else DEFAULT_WEIGHTS
+    if _is_safetensors(weights):
+        return Network(weights, torch_device(device))
+    return onnx.Network(weights, device, "street")
 
 
-def _is_torchs(weights: Path) -> bool:
+def _is_safetensors(weights: Path) -> bool:
     return weights.suffix != ".onnx"
 
 
-def _has_gpu(device: str) -> bool:
-    """Whether torch is here and has a GPU that is wanted."""
+def _uses_gpu(device: str) -> bool:
+    """Whether the device is a GPU that torch can use."""
     return device != "cpu" and not optional_deps.missing("torch", "safetensors") and torch_device(device) != "cpu"
 
 
 def save(network: StreetNet, path: Path, metadata: dict[str, object]) -> None:
-    """Write weights in half precision, with their labels and what is told of their training.
+    """Write weights in half precision, with their labels and metadata of their training.
 
     Args:
-        path: of the ONNX file; one of the same name with `.safetensors` is written beside it.
+        network: trained network.
+        path: path of the ONNX file; a file with the suffix `.safetensors` is written next to it.
+        metadata: entries added to the files' metadata.
     """
     import torch
     from safetensors.torch import save_file
@@ -68,30 +72,30 @@ def save(network: StreetNet, path: Path, metadata: dict[str, object]) -> None:
     state = {name: value for name, value in network.state_dict().items() if value.dtype != torch.int64}
     halves = {name: value.half().contiguous() for name, value in state.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
-    facts = {"network": "StreetNet", "labels": CLASSES, **metadata}
-    save_file(halves, str(path.with_suffix(".safetensors")), {key: _text(value) for key, value in facts.items()})
+    entries = {"network": "StreetNet", "labels": CLASSES, **metadata}
+    save_file(halves, str(path.with_suffix(".safetensors")), {key: _text(value) for key, value in entries.items()})
     network.load_state_dict({name: value.float() for name, value in halves.items()}, strict=False)
-    _export(network, path, facts)
+    _export(network, path, entries)
 
 
-def _export(network: StreetNet, path: Path, facts: dict[str, Any]) -> None:
-    """Write the network as ONNX, as `backends.onnx` reads it; it normalises photos itself."""
+def _export(network: StreetNet, path: Path, entries: dict[str, Any]) -> None:
+    """Write the network as ONNX for `backends.onnx`; it normalises photos itself."""
     import onnx as files
     import torch
 
-    from scan2sim.segmentation.network import PIXELS_A_RADIAN
+    from scan2sim.segmentation.network import PIXELS_PER_RADIAN
 
-    with warnings.catch_warnings():  # the exporter that replaces this one needs onnxscript; this one does
+    with warnings.catch_warnings():  # deprecation: the new exporter needs onnxscript, the old one is sufficient
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            network.eval(), (torch.zeros(1, 3 + COUNT, 64, 96),), str(path), dynamo=False, opset_version=OPSET,
+            network.eval(), (torch.zeros(1, 3 + CHANNELS, 64, 96),), str(path), dynamo=False, opset_version=OPSET,
             input_names=["image"], output_names=["logits"],
             dynamic_axes={"image": {2: "height", 3: "width"}, "logits": {2: "h", 3: "w"}},
         )  # fmt: skip
     model = files.load(path)
-    normalised = {"mean": [0, 0, 0], "std": [1, 1, 1], "pixels_a_radian": PIXELS_A_RADIAN, "license": LICENCE}
-    normalised["channels"] = True
-    files.helper.set_model_props(model, {key: _text(value) for key, value in (facts | normalised).items()})
+    inputs = {"mean": [0, 0, 0], "std": [1, 1, 1], "pixels_a_radian": PIXELS_PER_RADIAN, "license": LICENCE}
+    inputs["channels"] = True
+    files.helper.set_model_props(model, {key: _text(value) for key, value in (entries | inputs).items()})
     files.save(model, path)
 
 
@@ -100,36 +104,36 @@ def _text(value: object) -> str:
 
 
 class Network:
-    """See `segmentation.backends.Network`: by torch."""
+    """See `segmentation.backends.Network`; runs the safetensors weights by torch."""
 
     def __init__(self, path: Path, device: str) -> None:
         from safetensors import SafetensorError, safe_open
 
-        from scan2sim.segmentation.network import PIXELS_A_RADIAN, StreetNet
+        from scan2sim.segmentation.network import PIXELS_PER_RADIAN, StreetNet
 
-        remedy = "Give weights that `scan2sim segment train` wrote, or leave `label.weights` out"
+        remedy = "Pass weights written by `scan2sim segment train`, or leave `label.weights` unset"
         try:
             with safe_open(str(path), "pt") as file:
                 metadata = file.metadata() or {}
                 state = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
         except (OSError, SafetensorError) as error:
-            raise InputError(path, f"is no whole safetensors file ({error})", remedy) from None
+            raise InputError(path, f"not a complete safetensors file ({error})", remedy) from None
         if metadata.get("network") != "StreetNet" or "labels" not in metadata:
             raise InputError(
-                path, f"holds weights of {metadata.get('network', 'another network')}, not StreetNet", remedy
+                path, f"contains weights of {metadata.get('network', 'another network')}, not StreetNet", remedy
             )
         labels = tuple(json.loads(metadata["labels"]))
         self._net = StreetNet(len(labels))
         try:
             missing, unknown = self._net.load_state_dict(state, strict=False)
         except RuntimeError as error:
-            raise InputError(path, f"doesn't fit StreetNet ({str(error).splitlines()[-1].strip()})", remedy) from None
+            raise InputError(path, f"doesn't match StreetNet ({str(error).splitlines()[-1].strip()})", remedy) from None
         if unknown or [name for name in missing if not name.endswith("num_batches_tracked")]:
-            raise InputError(path, "lacks weights of StreetNet, or has others", remedy)
+            raise InputError(path, "doesn't match StreetNet: weights are missing or unknown", remedy)
         self._device = device
         self._net.eval().to(device)
-        self.facts = Facts(f"street ({path.name})", labels, digest, LICENCE, PIXELS_A_RADIAN, channels=True)
+        self.info = NetworkInfo(f"street ({path.name})", labels, digest, LICENCE, PIXELS_PER_RADIAN, channels=True)
 
     def probabilities(self, seen: U8) -> F32:
         """See `segmentation.backends.Network`."""

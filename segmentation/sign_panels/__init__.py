@@ -1,4 +1,4 @@
 """Sign panels from photos: triangulated from detections, outlines fitted, attached to their poles.
 
-Begin with `triangulate`; the step is `segmentation.steps.signs`.
+Start with `triangulate`; the pipeline step is `segmentation.steps.signs`.
 """

@@ -1,4 +1,4 @@
-"""Signs that photos show: places where several photos agree that a sign hangs, detected by a network's classes."""
+"""Triangulation of signs: 3D positions at which several photos agree on a sign, from a network's classes."""
 
 from __future__ import annotations
 
@@ -9,42 +9,44 @@ import numpy as np
 from scan2sim.pipeline.core.types import F32, F64, U8, View
 from scan2sim.segmentation.labels import CLASSES
 
-SURE = 127.5
-"""Probability, of 255, from which a pixel shows a sign."""
-SMALLEST = 3
-"""Pixels of a network's picture that a sign covers at least."""
-NEAR, FAR, STEPS = 4.0, 60.0, 150
-"""Metres between which signs are looked for along a ray, and places there, by equal steps of parallax."""
-OTHERS, FARTHER = 2, 1.5
-"""Photos that must agree with one, and how much farther away than it they may be to be asked."""
-APART = 0.5
-"""Metres between two signs: nearer ones are found around one another."""
+DETECTION_THRESHOLD = 127.5
+"""Probability (of 255) from which a pixel shows a sign."""
+MIN_PIXELS = 3
+"""Smallest number of pixels of a sign in a network's output."""
+MIN_DISTANCE_M, MAX_DISTANCE_M, SAMPLES_PER_RAY = 4.0, 60.0, 150
+"""Range in which signs are searched along a ray, and samples there, with equal steps of parallax."""
+MIN_AGREEING_PHOTOS, MAX_DISTANCE_RATIO = 2, 1.5
+"""Number of other photos that must agree, and their largest distance relative to the first photo's."""
+MIN_SEPARATION_M = 0.5
+"""Distance between two signs: nearer ones are found when panels are fitted around one of them."""
 
 
-def hanging(views: Sequence[View], probabilities: Mapping[int, U8]) -> list[F64]:
-    """Places (3,), local metres, where signs hang, the surest first.
+def triangulate_signs(views: Sequence[View], probabilities: Mapping[int, U8]) -> list[F64]:
+    """Positions (3,) of signs in local metres, the most certain first.
 
     Args:
-        views: all of them.
+        views: all views.
         probabilities: index of a view to its probabilities (h, w, C), 255 for 1, by class of `segmentation.labels`.
     """
-    shown = {i: np.ascontiguousarray(picture[..., CLASSES.index("road_sign")]) for i, picture in probabilities.items()}
-    found = [one for i in shown for ray in _rays(views[i], shown[i]) if (one := _along(ray, i, views, shown))]
-    places: list[F64] = []
-    for _, place in sorted(found, key=lambda one: -one[0]):
-        if all(np.linalg.norm(place - other) > APART for other in places):
-            places.append(place)
-    return places
+    signs = {i: np.ascontiguousarray(classes[..., CLASSES.index("road_sign")]) for i, classes in probabilities.items()}
+    found = [
+        detection for i in signs for ray in _rays(views[i], signs[i]) if (detection := _along(ray, i, views, signs))
+    ]
+    positions: list[F64] = []
+    for _, position in sorted(found, key=lambda detection: -detection[0]):
+        if all(np.linalg.norm(position - other) > MIN_SEPARATION_M for other in positions):
+            positions.append(position)
+    return positions
 
 
 def _rays(view: View, sign: U8) -> list[F64]:
-    """Unit rays (3,), local axes, through the middles of what a photo shows as signs."""
+    """Unit rays (3,), local axes, through the centres of the signs detected in a photo."""
     from scipy import ndimage
 
     from scan2sim.pipeline.camera.models import unproject
 
-    part, count = ndimage.label(sign > SURE)
-    large = [k for k in range(1, count + 1) if (part == k).sum() >= SMALLEST]
+    part, count = ndimage.label(sign > DETECTION_THRESHOLD)
+    large = [k for k in range(1, count + 1) if (part == k).sum() >= MIN_PIXELS]
     if not large:
         return []
     middle = np.array(ndimage.center_of_mass(sign, part, large))[:, ::-1]
@@ -53,28 +55,28 @@ def _rays(view: View, sign: U8) -> list[F64]:
     return [ray for ray in rays if np.isfinite(ray).all()]
 
 
-def _along(ray: F64, own: int, views: Sequence[View], shown: Mapping[int, U8]) -> tuple[float, F64] | None:
-    """The place along a photo's ray that most others show as a sign, after how surely; None where too few do."""
-    distance = 1 / np.linspace(1 / NEAR, 1 / FAR, STEPS)
-    places = views[own].centre + distance[:, None] * ray
-    votes, seeing = np.zeros(STEPS), np.zeros(STEPS)
-    for j, sign in shown.items():
+def _along(ray: F64, own: int, views: Sequence[View], signs: Mapping[int, U8]) -> tuple[float, F64] | None:
+    """Score, and the point along a photo's ray at which most other photos show a sign; None if too few do."""
+    distance = 1 / np.linspace(1 / MIN_DISTANCE_M, 1 / MAX_DISTANCE_M, SAMPLES_PER_RAY)
+    points = views[own].centre + distance[:, None] * ray
+    votes, observations = np.zeros(SAMPLES_PER_RAY), np.zeros(SAMPLES_PER_RAY)
+    for j, sign in signs.items():
         if j != own:
-            probability = _sampled(views[j], sign, places)
-            near = np.linalg.norm(places - views[j].centre, axis=1) < FARTHER * distance
-            counts = np.isfinite(probability) & near
-            votes += np.where(counts, probability > SURE, 0)
-            seeing += counts
-    share = np.where(votes >= OTHERS, votes / np.maximum(seeing, 1), 0)
+            probability = _probability_at(views[j], sign, points)
+            near = np.linalg.norm(points - views[j].centre, axis=1) < MAX_DISTANCE_RATIO * distance
+            observed = np.isfinite(probability) & near
+            votes += np.where(observed, probability > DETECTION_THRESHOLD, 0)
+            observations += observed
+    share = np.where(votes >= MIN_AGREEING_PHOTOS, votes / np.maximum(observations, 1), 0)
     best = np.flatnonzero(share == share.max())
-    return (float(share.max()), places[best[len(best) // 2]]) if share.max() > 0.5 else None
+    return (float(share.max()), points[best[len(best) // 2]]) if share.max() > 0.5 else None
 
 
-def _sampled(view: View, sign: U8, places: F64) -> F32:
-    """(N,) how surely a photo shows a sign at places (N, 3), of 255; NaN where it doesn't show them."""
+def _probability_at(view: View, sign: U8, points: F64) -> F32:
+    """(N,) probability (of 255) of a sign in a photo at points (N, 3); NaN outside the photo."""
     from scan2sim.pipeline.camera.projection import pixels
 
-    uv, valid = pixels(view.camera, view.T_world_cam, places)
+    uv, valid = pixels(view.camera, view.T_world_cam, points)
     uv = np.where(valid[:, None], uv, 0)
     column = ((uv[:, 0] + 0.5) * sign.shape[1] / view.camera.width).astype(int).clip(0, sign.shape[1] - 1)
     row = ((uv[:, 1] + 0.5) * sign.shape[0] / view.camera.height).astype(int).clip(0, sign.shape[0] - 1)

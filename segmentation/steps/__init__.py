@@ -1,5 +1,5 @@
-"""The steps of segmentation, one file each.
+"""Pipeline steps of the segmentation, one file each.
 
-`label` (photos to class probabilities per pixel), `segment` (to a class per point), `instances` (vehicles and people),
+`label` (class probabilities per pixel of the photos), `segment` (a class per point), `instances` (vehicles and people),
 `signs` (sign panels fitted to photos).
 """

@@ -1,4 +1,4 @@
-"""Label: a network's classes for every pixel of every photo, and masks of what is no street."""
+"""Label step: a network's class probabilities for every pixel of every photo."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scan2sim.pipeline.core.classes import known
+from scan2sim.pipeline.core.classes import classified_codes
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.parameters import Device, File, Name, Share, Voxel
+from scan2sim.pipeline.core.parameters import Device, File, Fraction, Name, Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import U8, PointCloud
 from scan2sim.pipeline.io import views as views_io
@@ -18,22 +18,22 @@ from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.steps.voxel import sample
 
 if TYPE_CHECKING:
-    from scan2sim.segmentation.project_scan import Drawn
+    from scan2sim.segmentation.project_scan import ScanProjector
 
-FEW = 30
-"""Points, fewer tell nothing."""
+MIN_POINTS = 30
+"""Points below which a cloud is not projected into photos."""
 
 
 class LabelParams(Params):
-    """Which network looks at the photos.
+    """Settings of the segmentation network.
 
     Attributes:
-        network: "street", the project's own; "segformer" or "onnx", with the user's weights.
-        weights: file or folder of the weights; default: those that come with the project (of "street").
-        device: "cpu", or "cuda" by torch or onnxruntime; "auto": a GPU where they have one.
-        size: metres of the voxels that the cloud is drawn into photos by, for networks that ask for it.
-        overwrite, min_classified, photos: as of `segment`, set by the recipe: photos are not looked at where the
-            cloud keeps its own classes, or where they aren't asked.
+        network: "street", the project's own network; "segformer" or "onnx", with your weights.
+        weights: file or folder with the weights; default: the weights of "street" that come with the project.
+        device: "cpu" or "cuda" (torch or onnxruntime); "auto": a GPU if one is available.
+        size: voxel size in metres at which the cloud is projected into photos, for networks with scan channels.
+        overwrite, min_classified, photos: as in `segment`, set by the pipeline: photos are not classified if the cloud
+            keeps its own classes, or if photos are not used.
     """
 
     network: Name = "street"
@@ -41,15 +41,17 @@ class LabelParams(Params):
     device: Device = "auto"
     size: Voxel = 0.1
     overwrite: bool = False
-    min_classified: Share = 0.2
+    min_classified: Fraction = 0.2
     photos: bool = True
 
 
 def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Done:
-    """Look at every photo of `views`, with `cloud` beside it, unless that has classes that are kept.
+    """Classify every photo of `views`, with channels of `cloud` if the network takes them.
+
+    Nothing is done if the cloud keeps its own classes.
 
     Folder: `labels`, with `<view index>.npy`: (h, w, C) uint8 probabilities by class of `segmentation.labels`, and
-    `network.json`: what is known of the network.
+    `network.json`: name, checksum, licence and classes of the network.
     """
     from scan2sim.segmentation.backends import load
     from scan2sim.segmentation.photos import Classifier
@@ -60,24 +62,26 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
     cloud = PointCloud.load(inputs["cloud"])
     kept = not params.overwrite and classified(cloud.classification) >= params.min_classified
     if kept or not views or not params.photos:
-        return Done({"labels": folder}, {"photos": 0, "why": "the cloud has classes" if kept else "none is asked"})
+        return Done(
+            {"labels": folder}, {"photos": 0, "why": "the cloud keeps its classes" if kept else "photos are not used"}
+        )
     network = load(params.network, params.weights, params.device)
-    classifier = Classifier(network, str(params.weights or network.facts.name))
-    scan = scanned(cloud, params.size, report) if classifier.takes_channels else None
+    classifier = Classifier(network, str(params.weights or network.info.name))
+    scan = scan_projector(cloud, params.size, report) if classifier.takes_channels else None
     warnings = []
     for i, view in enumerate(views):
         report(0.2 + 0.8 * i / len(views), view.name)
-        if view.camera.model == "orthographic":  # networks know streets from the street
+        if view.camera.model == "orthographic":  # networks were trained on photos taken from the street
             continue
         try:
             rgb = image.read_photo(view)
         except InputError as error:
-            warnings.append(f"{view.photo} {error.cause}: it tells no classes")
+            warnings.append(f"{view.photo}: {error.cause}: not classified")
             continue
-        channels = scan.into(view, classifier.size(view.camera)) if scan else None
+        channels = scan.channels(view, classifier.size(view.camera)) if scan else None
         np.save(folder / f"{i}.npy", classifier.probabilities(rgb, view.camera, channels))
-    facts = network.facts
-    about = {"network": facts.name, "sha256": facts.sha256, "licence": facts.licence, "tells": classifier.classes}
+    info = network.info
+    about = {"network": info.name, "sha256": info.sha256, "licence": info.licence, "tells": classifier.classes}
     (folder / "network.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
     return Done(
         {"labels": folder},
@@ -86,27 +90,27 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
     )
 
 
-def scanned(cloud: PointCloud, size: float, report: Report) -> Drawn | None:
-    """The cloud, to be drawn into photos; None if it has hardly any points."""
-    from scan2sim.segmentation.project_scan import Drawn
+def scan_projector(cloud: PointCloud, size: float, report: Report) -> ScanProjector | None:
+    """Projector of the cloud, sampled to one point per voxel, into photos; None if there are too few points."""
+    from scan2sim.segmentation.project_scan import ScanProjector
 
-    report(0.0, "thinning")
+    report(0.0, "downsampling the cloud")
     thin = sample(cloud, size)
-    return Drawn(thin, size) if len(thin) >= FEW else None
+    return ScanProjector(thin, size) if len(thin) >= MIN_POINTS else None
 
 
 def classified(classification: U8 | None) -> float:
-    """Share of points whose class says what they are: not "unclassified", nor a code that has no meaning."""
+    """Fraction of points whose class says what they are: not "unclassified", nor a code that has no meaning."""
     if classification is None or not len(classification):
         return 0.0
-    return float(known()[classification].mean())
+    return float(classified_codes()[classification].mean())
 
 
 def can_label(params: LabelParams) -> None:
-    """Refuse a network that can't run here.
+    """Check that the network can run on this machine.
 
     Raises:
-        ScanError: as `segmentation.backends.check`.
+        ScanError: as raised by `segmentation.backends.check`.
     """
     from scan2sim.segmentation.backends import check
 

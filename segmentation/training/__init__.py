@@ -1,5 +1,5 @@
 """Training of the project's own segmentation network.
 
-Begin with `train`; `dataset` reads labelled photos, `augment` varies them. The network itself is
+Start with `train`; `dataset` reads labelled photos, `augment` is the data augmentation. The network itself is
 `segmentation.network`.
 """

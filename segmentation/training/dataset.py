@@ -1,7 +1,7 @@
-"""Labelled photos, to learn from and to check with: `images/*.jpg` (or png) and `labels/*.png` of the same names.
+"""Dataset of labelled photos for training and validation: `images/*.jpg` (or png) and `labels/*.png` of the same names.
 
-Labels are LAS class codes a pixel (0 sky, 255 not to be learnt), as `data_samples.training` writes them. What a scan
-tells of the same pixels may lie in `channels/*.png`, as `segmentation.lidar_channels` codes it.
+Labels are LAS class codes per pixel (0 sky, 255 ignored), as written by `data_samples.training`. Lidar channels of the
+photos may be in `channels/*.png`, encoded by `segmentation.lidar_channels`.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import numpy as np
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.types import U8
 from scan2sim.segmentation.labels import index_of_code
-from scan2sim.segmentation.lidar_channels import COUNT, FRACTION
+from scan2sim.segmentation.lidar_channels import CHANNELS, DOWNSAMPLING
 
 
 def pairs(folder: Path) -> list[tuple[Path, Path]]:
-    """Images and their ground truth (LAS codes a pixel), by name.
+    """Pairs of image file and label file in a folder, by name.
 
     Raises:
-        DataError: there are none.
+        DataError: the folder has no such pairs.
     """
     found = [
         (image, truth)
@@ -30,46 +30,51 @@ def pairs(folder: Path) -> list[tuple[Path, Path]]:
     ]
     if not found:
         raise DataError(
-            folder, "has no images/NAME.jpg with labels/NAME.png", "Make some, as docs/segmentation.md says"
+            folder,
+            "no images/NAME.jpg with labels/NAME.png found",
+            "Create training data as described in docs/segmentation.md",
         )
     return found
 
 
 def split(found: Sequence[tuple[Path, Path]], share: float) -> tuple[list[tuple[Path, Path]], list[tuple[Path, Path]]]:
-    """To learn from, and to check with: whole streets, the last ones."""
+    """Pairs for training, and for validation: all pairs of the last streets, a `share` of the streets."""
     streets = sorted({image.stem.split("_")[0] for image, _ in found})
     last = set(streets[len(streets) - round(share * len(streets)) :])
-    learn = [pair for pair in found if pair[0].stem.split("_")[0] not in last]
-    return (learn, [pair for pair in found if pair[0].stem.split("_")[0] in last]) if learn else (list(found), [])
+    training = [pair for pair in found if pair[0].stem.split("_")[0] not in last]
+    validation = [pair for pair in found if pair[0].stem.split("_")[0] in last]
+    return (training, validation) if training else (list(found), [])
 
 
 def read(image: Path, truth: Path) -> tuple[U8, U8]:
-    """(H, W, 3) colours and (H, W) indices of classes, `IGNORED` where there is none.
+    """(H, W, 3) colours and (H, W) class indices, `IGNORED` for pixels without a class.
 
     Raises:
-        DataError: either can't be read, or they differ in size.
+        DataError: a file can't be read, or they differ in size.
     """
     import cv2
 
     bgr, codes = cv2.imread(str(image)), cv2.imread(str(truth), cv2.IMREAD_GRAYSCALE)
     if bgr is None or codes is None or bgr.shape[:2] != codes.shape:
-        raise DataError(truth, "and its image can't be read, or differ in size", "Make them again")
+        raise DataError(truth, "the label file or its image can't be read, or their sizes differ", "Create both again")
     return np.asarray(bgr[..., ::-1], np.uint8), index_of_code()[codes]
 
 
 def read_channels(image: Path, size: tuple[int, int]) -> U8:
-    """(h, w, 4) channels beside a photo of `size` (H, W) pixels; nothing in them where it has none.
+    """(h, w, 4) lidar channels of a photo of `size` (H, W) pixels; all 0 if it has none.
 
     Raises:
-        DataError: they can't be read, or aren't a `FRACTION`-th of the photo's size.
+        DataError: the file can't be read, or its size is not 1/`DOWNSAMPLING` of the photo's.
     """
     import cv2
 
-    small = round(size[0] / FRACTION), round(size[1] / FRACTION)
+    small = round(size[0] / DOWNSAMPLING), round(size[1] / DOWNSAMPLING)
     path = image.parent.parent / "channels" / f"{image.stem}.png"
     if not path.is_file():
-        return np.zeros((*small, COUNT), np.uint8)
+        return np.zeros((*small, CHANNELS), np.uint8)
     codes = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if codes is None or codes.shape != (*small, COUNT):
-        raise DataError(path, f"is no picture of {COUNT} channels, {small[1]} x {small[0]} pixels", "Make it again")
+    if codes is None or codes.shape != (*small, CHANNELS):
+        raise DataError(
+            path, f"not an image with {CHANNELS} channels of {small[1]} x {small[0]} pixels", "Create it again"
+        )
     return np.asarray(codes, np.uint8)

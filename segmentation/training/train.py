@@ -1,7 +1,7 @@
 """Training of the project's own network on labelled photos. Import late: loads torch.
 
-From a folder as `segmentation.training.dataset` reads it. Runs are repeatable for a seed, on one machine with one
-number of threads.
+The folder of labelled photos is described in `segmentation.training.dataset`. Training is reproducible for a seed on
+the same machine with the same number of threads.
 """
 
 from __future__ import annotations
@@ -19,27 +19,28 @@ import torch.nn.functional as F
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F32, I64
 from scan2sim.segmentation.labels import CLASSES, IGNORED, index_of_code
-from scan2sim.segmentation.lidar_channels import COUNT
+from scan2sim.segmentation.lidar_channels import CHANNELS
 from scan2sim.segmentation.network import StreetNet
-from scan2sim.segmentation.training.augment import augmented
+from scan2sim.segmentation.training.augment import augment
 from scan2sim.segmentation.training.dataset import pairs, read, read_channels, split
 
-MEMORY = 0.002
-"""Share of a step's weights in their running mean."""
+AVERAGING_RATE = 0.002
+"""Share of a step's weights in the exponential moving average."""
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """How the network is trained.
+class TrainingSettings:
+    """Settings of the training.
 
     Attributes:
-        steps: of the optimiser.
-        batch, crop: photos a step, and pixels of each, height and width.
-        rate: the highest learning rate, of one cycle.
-        held_out: share of the streets (the names' first part) that figures are told from.
-        minutes: at most; the cycle is shortened to fit, 0: no limit.
-        seed: of weights, crops and looks.
-        start: weights (safetensors) to go on from; None: from nothing.
+        steps: number of optimiser steps.
+        batch: photos per step.
+        crop: height and width of the crops in pixels.
+        rate: maximum learning rate of the one-cycle schedule.
+        held_out: share of the streets (first part of the file names) used for validation.
+        minutes: time limit; the schedule is shortened to fit; 0: no limit.
+        seed: seed of initial weights, crops and augmentations.
+        start: weights (safetensors) to continue from; None: random weights.
     """
 
     steps: int = 3000
@@ -54,34 +55,38 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Trained:
-    """A network, and how it does on streets that it wasn't trained on: intersection over union, by class."""
+    """A trained network, and its intersection over union by class on the validation streets."""
 
     network: StreetNet
     iou: dict[str, float]
 
 
-def train(folder: Path, recipe: Recipe, report: Report = silent) -> Trained:
-    """Train on the labelled photos of a folder."""
-    torch.manual_seed(recipe.seed)
-    rng = np.random.default_rng(recipe.seed)
-    learn, check = split(pairs(folder), recipe.held_out)
+def train(folder: Path, settings: TrainingSettings, report: Report = silent) -> Trained:
+    """Train on the labelled photos of a folder.
+
+    Raises:
+        DataError: the folder has no labelled photos.
+    """
+    torch.manual_seed(settings.seed)
+    rng = np.random.default_rng(settings.seed)
+    training_pairs, validation_pairs = split(pairs(folder), settings.held_out)
     network = StreetNet(len(CLASSES))
-    if recipe.start is not None:
-        network.load_state_dict(_widened(recipe.start), strict=False)
+    if settings.start is not None:
+        network.load_state_dict(_widened(settings.start), strict=False)
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    weight = class_weights([file for _, file in learn])
-    optimiser = torch.optim.AdamW(network.parameters(), recipe.rate, weight_decay=1e-2)
-    smooth = torch.optim.swa_utils.AveragedModel(network, avg_fn=averaged, use_buffers=True)
+    weight = class_weights([file for _, file in training_pairs])
+    optimiser = torch.optim.AdamW(network.parameters(), settings.rate, weight_decay=1e-2)
+    smooth = torch.optim.swa_utils.AveragedModel(network, avg_fn=moving_average, use_buffers=True)
     network.train()
     start, done = time.monotonic(), 0.0
     step = 0
     while done < 1:
         spent = (time.monotonic() - start) / 60
-        done = max(step / recipe.steps, spent / recipe.minutes if recipe.minutes else 0.0)
+        done = max(step / settings.steps, spent / settings.minutes if settings.minutes else 0.0)
         for group in optimiser.param_groups:
-            group["lr"] = recipe.rate * one_cycle(done)
-        some = [learn[i] for i in rng.integers(0, len(learn), recipe.batch)]
-        views = [_seen(pair, recipe.crop, rng) for pair in some]
+            group["lr"] = settings.rate * one_cycle(done)
+        some = [training_pairs[i] for i in rng.integers(0, len(training_pairs), settings.batch)]
+        views = [_seen(pair, settings.crop, rng) for pair in some]
         seen = torch.from_numpy(np.stack([image for image, _ in views])).permute(0, 3, 1, 2)
         truth = torch.from_numpy(np.stack([classes for _, classes in views]))
         logits = network(seen.contiguous(memory_format=torch.channels_last))
@@ -98,37 +103,37 @@ def train(folder: Path, recipe: Recipe, report: Report = silent) -> Trained:
     best = smooth.module
     assert isinstance(best, StreetNet)
     best.eval()
-    return Trained(best, evaluate(best, check) if check else {})
+    return Trained(best, evaluate(best, validation_pairs) if validation_pairs else {})
 
 
 def _seen(pair: tuple[Path, Path], crop: tuple[int, int], rng: np.random.Generator) -> tuple[F32, I64]:
     rgb, classes = read(*pair)
-    return augmented(rgb, classes, read_channels(pair[0], classes.shape), crop, rng)
+    return augment(rgb, classes, read_channels(pair[0], classes.shape), crop, rng)
 
 
 def _widened(path: Path) -> dict[str, torch.Tensor]:
-    """Weights of a `StreetNet`; of one that took colours alone, with zeros for the other channels."""
+    """Weights of a `StreetNet`; those of a network without lidar channels get zeros for these channels."""
     from safetensors.torch import load_file
 
     state = {name: value.float() for name, value in load_file(str(path)).items()}
     first = state["stem.0.weight"]
-    lacking = 3 + COUNT - first.shape[1]
-    state["stem.0.weight"] = torch.cat([first, first.new_zeros(len(first), lacking, *first.shape[2:])], dim=1)
+    missing = 3 + CHANNELS - first.shape[1]
+    state["stem.0.weight"] = torch.cat([first, first.new_zeros(len(first), missing, *first.shape[2:])], dim=1)
     return state
 
 
-def averaged(mean: torch.Tensor, new: torch.Tensor, n: torch.Tensor | int) -> torch.Tensor:
-    """A running mean of weights over some 500 steps, over fewer at the beginning."""
-    return mean + (new - mean) * max(MEMORY, 9 / (10 + int(n)))
+def moving_average(mean: torch.Tensor, new: torch.Tensor, n: torch.Tensor | int) -> torch.Tensor:
+    """Moving average of weights over about 500 steps, over fewer at the beginning."""
+    return mean + (new - mean) * max(AVERAGING_RATE, 9 / (10 + int(n)))
 
 
 def one_cycle(done: float) -> float:
-    """Share of the highest rate: up over the first twentieth, down along a cosine."""
+    """Learning rate as a share of the maximum: rises over the first 5 %, then falls along a cosine."""
     return min(1.0, done / 0.05 + 0.02) * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
 
 
 def class_weights(truth: Sequence[Path]) -> torch.Tensor:
-    """(C,) what an error costs by class: rare ones more, by the root of their share."""
+    """(C,) weights of the loss by class: inverse root of the class's share, so that rare classes count more."""
     import cv2
 
     count = np.zeros(256)
@@ -140,13 +145,13 @@ def class_weights(truth: Sequence[Path]) -> torch.Tensor:
 
 
 @torch.inference_mode()
-def evaluate(network: StreetNet, check: Sequence[tuple[Path, Path]]) -> dict[str, float]:
-    """Intersection over union of the pixels, by class."""
+def evaluate(network: StreetNet, validation_pairs: Sequence[tuple[Path, Path]]) -> dict[str, float]:
+    """Intersection over union of the pixels by class."""
     import cv2
 
     n = len(CLASSES)
     confusion = np.zeros((n, n), np.int64)
-    for pair in check:
+    for pair in validation_pairs:
         rgb, truth = read(*pair)
         codes = cv2.resize(read_channels(pair[0], truth.shape), truth.shape[::-1], interpolation=cv2.INTER_NEAREST)
         seen = np.concatenate([rgb, codes], axis=2).astype(np.float32) / 255

@@ -1,4 +1,4 @@
-"""How all services are served over HTTP: one factory for health, metrics, tokens, TLS, limits and pages.
+"""HTTP server of all services: health checks, metrics, tokens, TLS, limits and web pages.
 
-Begin with `factory`; `settings` are the options that every service has.
+Begin with `factory`; `settings` has the options that every service shares.
 """

@@ -1,8 +1,8 @@
-"""Whether a service is ready, as its exit code: for containers, which needn't have curl.
+"""Health check of a service by exit code, for containers without curl.
 
     python -m scan2sim.services.http.healthcheck [http://localhost:8080]
 
-Health needs no token. A certificate is not checked: who is asked is on this machine.
+The health endpoint needs no token. The certificate is not verified, because the service runs on this machine.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ import sys
 from urllib.error import HTTPError
 from urllib.request import HTTPSHandler, ProxyHandler, build_opener
 
-OWN = "http://localhost:8080"
-"""Where services listen unless told otherwise."""
-WITHIN = 4.0
-"""Seconds for an answer."""
+DEFAULT_ADDRESS = "http://localhost:8080"
+"""Default address of the services."""
+TIMEOUT_S = 4.0
+"""Time for a response."""
 
 
 def failing(address: str) -> str | None:
-    """Why a service can't be asked; None: it is ready.
+    """Why a service isn't ready; None: it is.
 
     Args:
-        address: as `http://localhost:8080`.
+        address: such as `http://localhost:8080`.
     """
     unchecked = ssl.create_default_context()
     unchecked.check_hostname, unchecked.verify_mode = False, ssl.CERT_NONE
     direct = build_opener(ProxyHandler({}), HTTPSHandler(context=unchecked))
     try:
-        with direct.open(f"{address.rstrip('/')}/health/ready", timeout=WITHIN):
+        with direct.open(f"{address.rstrip('/')}/health/ready", timeout=TIMEOUT_S):
             return None
     except HTTPError as error:
         return f"{error.code} {error.read(1000).decode('utf-8', 'replace')}"
@@ -37,8 +37,8 @@ def failing(address: str) -> str | None:
 
 
 def main() -> None:
-    """Print what fails, and end with 1, if anything does."""
-    address = sys.argv[1] if len(sys.argv) > 1 else OWN
+    """Print the cause and exit with 1 if the service isn't ready."""
+    address = sys.argv[1] if len(sys.argv) > 1 else DEFAULT_ADDRESS
     if reason := failing(address):
         sys.exit(f"{address} is not ready: {reason}")
 

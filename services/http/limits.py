@@ -1,4 +1,4 @@
-"""Connections to what is served, within bounds: one that asks for nothing is closed, and keeps nobody out."""
+"""Connection limits of the HTTP server: idle connections are closed, and their number is bounded."""
 
 from __future__ import annotations
 
@@ -8,48 +8,49 @@ from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-SILENT = 10.0
-"""Seconds from a connection's beginning within which it must have asked for something."""
-MOST = 4000
-"""Connections that are open at once; further ones are closed at once."""
-SPARE = 200
-"""Files that a service has open beside its connections."""
+FIRST_REQUEST_TIMEOUT_S = 10.0
+"""A connection that sends no request within this time is closed."""
+MAX_CONNECTIONS = 4000
+"""Open connections; further ones are closed immediately."""
+SPARE_FILES = 200
+"""File descriptors reserved for other purposes than connections."""
 
 
-class Impatient(H11Protocol):
-    """HTTP/1.1 as uvicorn speaks it, that waits for no one for ever."""
+class LimitedHttpProtocol(H11Protocol):
+    """HTTP/1.1 protocol of uvicorn with a timeout for the first request and a limit of connections."""
 
     def connection_made(self, transport: Any) -> None:
-        """Begin to wait for a request."""
+        """Start the timeout for the first request."""
         super().connection_made(transport)
-        if len(self.connections) > MOST:
+        if len(self.connections) > MAX_CONNECTIONS:
             transport.abort()
         else:
-            self._waiting = self.loop.call_later(SILENT, self._close_if_silent)
+            self._timeout = self.loop.call_later(FIRST_REQUEST_TIMEOUT_S, self._close_if_idle)
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        """A WebSocket is asked for, which may be silent."""
-        self._wait_no_more()
+        """Cancel the timeout: a WebSocket may be silent."""
+        self._cancel_timeout()
         super().handle_websocket_upgrade(event)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Wait no more."""
-        self._wait_no_more()
+        """Cancel the timeout."""
+        self._cancel_timeout()
         super().connection_lost(exc)
 
-    def _wait_no_more(self) -> None:
-        waiting: asyncio.TimerHandle | None = getattr(self, "_waiting", None)
-        if waiting:
-            waiting.cancel()
+    def _cancel_timeout(self) -> None:
+        timeout: asyncio.TimerHandle | None = getattr(self, "_timeout", None)
+        if timeout:
+            timeout.cancel()
 
-    def _close_if_silent(self) -> None:
+    def _close_if_idle(self) -> None:
         if self.cycle is None:
             self.transport.close()
 
 
-def allow_many() -> None:
-    """Have the system let this process open as many files as connections may need, if it does."""
+def raise_file_limit() -> None:
+    """Raise this process's limit of open files to what the connections need, as far as the hard limit permits."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = MOST + SPARE if hard == resource.RLIM_INFINITY else min(MOST + SPARE, hard)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    needed = MAX_CONNECTIONS + SPARE_FILES
+    limit = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+    if soft != resource.RLIM_INFINITY and soft < limit:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))

@@ -1,4 +1,4 @@
-"""Where and how a service listens: what every one of them is told, on the command line as in code."""
+"""Server settings that all HTTP services share, for code and command line: address, token, TLS."""
 
 from __future__ import annotations
 
@@ -14,30 +14,31 @@ from scan2sim.pipeline.core.parameters import File
 from scan2sim.pipeline.core.step import Params
 from scan2sim.services.loopback import is_loopback, require_protection
 
-SHORTEST_TOKEN = 16
-"""Characters of a token, at least."""
+MIN_TOKEN_CHARS = 16
 
 
-class Served(Params):
-    """Options of every HTTP service.
+class ServerParams(Params):
+    """Server settings of an HTTP service.
 
     Raises:
-        SettingError: it would listen beyond the loopback without a token or a certificate.
+        SettingError: other machines could reach it, and neither a token nor a certificate is given.
     """
 
     host: Annotated[
         str,
         Field(
-            description="Address to listen on; 0.0.0.0 for all of this machine. Other machines reach all but 127.0.0.1 "
-            "and ::1, so these need --token, or --certificate and --key."
+            description="Address to listen on; 0.0.0.0 for all network interfaces. Addresses other than 127.0.0.1 and "
+            "::1 can be reached by other machines and require --token, or --certificate and --key."
         ),
     ] = "127.0.0.1"
-    port: Annotated[int, Field(ge=0, le=65535, description="Port to listen on; 0 for any that is free.")] = 8080
+    port: Annotated[int, Field(ge=0, le=65535, description="Port to listen on; 0: any free port.")] = 8080
     token: Annotated[
-        File | None, Field(description="File that holds a token; who asks for anything must bring it (Bearer).")
+        File | None, Field(description="File with a secret token that clients must send (Authorization: Bearer TOKEN).")
     ] = None
-    certificate: Annotated[File | None, Field(description="Certificate (PEM): serve by TLS; with --key.")] = None
-    key: Annotated[File | None, Field(description="The certificate's private key (PEM).")] = None
+    certificate: Annotated[
+        File | None, Field(description="TLS certificate (PEM): serve over HTTPS; requires --key.")
+    ] = None
+    key: Annotated[File | None, Field(description="Private key of the TLS certificate (PEM).")] = None
 
     @model_validator(mode="after")
     def _is_protected(self) -> Self:
@@ -46,29 +47,29 @@ class Served(Params):
         return self
 
     def secret(self) -> str | None:
-        """The token; None: everybody may ask.
+        """Read the token; None: no token is required.
 
         Raises:
-            InputError: its file can't be read, or holds none that is worth the name.
+            InputError: the file can't be read or holds no valid token.
         """
         if self.token is None:
             return None
         text = _text(self.token).strip()
-        if len(text) < SHORTEST_TOKEN or not text.isascii() or not text.isprintable() or " " in text:
-            cause = f"must hold one token, {SHORTEST_TOKEN} characters at least, no spaces"
-            raise InputError(self.token, cause, "Make one: openssl rand -hex 32")
+        if len(text) < MIN_TOKEN_CHARS or not text.isascii() or not text.isprintable() or " " in text:
+            cause = f"must contain one token of at least {MIN_TOKEN_CHARS} ASCII characters without spaces"
+            raise InputError(self.token, cause, "Generate one: openssl rand -hex 32")
         return text
 
     def check_tls(self) -> bool:
-        """Whether it is served by TLS.
+        """Validate certificate and key; returns whether TLS is used.
 
         Raises:
-            SettingError: of certificate and key there is but one.
-            InputError: they can't be read, or don't belong together.
+            SettingError: only one of certificate and key is given.
+            InputError: they can't be read, or don't match.
         """
         if (self.certificate is None) != (self.key is None):
             missing = "--key" if self.key is None else "--certificate"
-            raise SettingError(missing, "is missing: TLS needs certificate and key", "Give both, or neither")
+            raise SettingError(missing, "is missing: TLS needs a certificate and its key", "Give both, or neither")
         if self.certificate is None or self.key is None:
             return False
         for path in (self.certificate, self.key):
@@ -76,33 +77,34 @@ class Served(Params):
         try:
             ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(self.certificate, self.key)
         except (ssl.SSLError, OSError) as error:
-            raise InputError(self.certificate, f"can't be used with {self.key} ({error})", "Give PEM files") from None
+            cause = f"can't be used with {self.key} ({error})"
+            raise InputError(self.certificate, cause, "Give a certificate and its private key as PEM files") from None
         return True
 
     def listen(self) -> socket.socket:
-        """A socket that listens.
+        """Open a listening socket.
 
         Raises:
-            SettingError: the address isn't this machine's, or the port is taken or reserved.
+            SettingError: the address isn't this machine's, or the port is in use or reserved.
         """
         family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
         try:
             return socket.create_server((self.host, self.port), family=family)
         except OSError as error:
-            cause = f"can't be listened on ({error.strerror or error})"
+            cause = f"can't listen on this address ({error.strerror or error})"
             raise SettingError(f"{self.host}:{self.port}", cause, "Choose another --port or --host") from None
 
     def address(self, port: int) -> str:
-        """Where a browser finds it, once it listens on a port."""
+        """URL of the service for browsers, once it listens on a port."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'https' if self.certificate else 'http'}://{host}:{port}/"
 
     def is_local(self) -> bool:
-        """Whether only this machine reaches it."""
+        """Whether it can be reached from this machine only."""
         return is_loopback(self.host)
 
     def is_open(self) -> bool:
-        """Whether other machines may use it without a token."""
+        """Whether other machines can use it without a token."""
         return self.token is None and not self.is_local()
 
 

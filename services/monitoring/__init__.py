@@ -1,1 +1,1 @@
-"""The smart event bus: every stream watched, alarms raised, workers asked for (docs/event-bus.md; D3.2, chapter 3)."""
+"""Monitoring and event bus: topic statistics, alarms, autoscaling (docs/monitoring.md; D3.2, chapter 3)."""

@@ -1,6 +1,7 @@
-"""What runs is brought to what `services.toml` says: packages, then instances, then what isn't wanted any more goes.
+"""Reconcile OSM with `services.toml`: onboard packages, then update instances, then remove what is no longer listed.
 
-Records in OSM carry the deployment's name: nothing else is ever touched, and nothing needs to be remembered here.
+Records in OSM are tagged with the deployment's name. Records without this tag are never changed, and no state is kept
+on this side.
 """
 
 from __future__ import annotations
@@ -17,45 +18,47 @@ from typing import Any
 from scan2sim.pipeline.core.errors import ScanError, StepError
 from scan2sim.pipeline.core.step import Report
 from scan2sim.services.orchestration import deployment as files
-from scan2sim.services.orchestration.deployment import Deployment, Entry
-from scan2sim.services.orchestration.instance import MARK, Instance, Wanted, next_action
-from scan2sim.services.orchestration.lifecycle import Patience, bring, find_own, look
-from scan2sim.services.orchestration.lifecycle import find as find_id
-from scan2sim.services.orchestration.onboarding import marks_of, onboard, record_of
+from scan2sim.services.orchestration.deployment import Deployment, ServiceEntry
+from scan2sim.services.orchestration.instance import OWNER_TAG, DesiredInstance, Instance, next_action
+from scan2sim.services.orchestration.lifecycle import WaitPolicy, find_owned, load_instance, reconcile
+from scan2sim.services.orchestration.lifecycle import find as find_by_id
+from scan2sim.services.orchestration.onboarding import onboard, record_of, tags_of
 from scan2sim.services.orchestration.osm import (
     FUNCTIONS,
     SERVICES,
     Osm,
-    Refused,
+    OsmError,
     collection_of,
 )
 from scan2sim.services.orchestration.package import Package, Packages
 from scan2sim.services.orchestration.settings import ApplyParams
 
-APART = 1.0
-"""Seconds between two requests about one instance, at least."""
+REQUEST_INTERVAL_S = 1.0
+"""Minimum number of seconds between two requests about one instance."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """What is done, or would be.
+    """A change that was made or is planned.
 
     Attributes:
-        name: of an instance or a package; what: happens to it; why: in a few words.
+        name: name of the instance or package.
+        action: what happens to it.
+        reason: why, in a few words.
     """
 
     name: str
-    what: str
-    why: str = ""
+    action: str
+    reason: str = ""
 
 
 @dataclass
-class Applied:
-    """What became of it.
+class ApplyResult:
+    """Outcome of `apply`.
 
     Attributes:
-        done: that was.
-        failed: what wasn't, by name.
+        done: changes that were made.
+        failed: errors by name of the instance or package.
     """
 
     done: list[Change] = field(default_factory=list)
@@ -63,221 +66,227 @@ class Applied:
 
 
 @dataclass(frozen=True)
-class Target:
-    """A deployment made ready: what is to be in OSM, and what is.
+class DeploymentState:
+    """Desired and observed state of a deployment.
 
     Attributes:
-        name: of the deployment.
-        packages: by their descriptors' ids; functions first.
-        wanted: instances by their names.
-        records: of packages that are the deployment's, by collection.
-        instances: by name, those of the deployment; without: ids of those that aren't wanted, by name.
+        name: name of the deployment.
+        packages: desired packages by collection and descriptor id, functions first.
+        desired: desired instances by name.
+        records: the deployment's package records in OSM, by collection.
+        instances: the deployment's instances in OSM that are desired, by name.
+        obsolete: ids of its instances that aren't desired, by name.
     """
 
     name: str
     packages: Mapping[str, Package]
-    wanted: Mapping[str, Wanted]
+    desired: Mapping[str, DesiredInstance]
     records: Mapping[str, list[dict[str, Any]]]
     instances: Mapping[str, Instance]
-    without: Mapping[str, str]
+    obsolete: Mapping[str, str]
 
 
-def target(osm: Osm, asked: Deployment, folder: Path) -> Target:
-    """Look at what is there, and at what is to be; `folder` is where the file's own files are.
+def load_state(osm: Osm, requested: Deployment, folder: Path) -> DeploymentState:
+    """Compare a deployment with OSM; relative paths in `services.toml` start at `folder`.
 
     Raises:
-        ScanError: something that is named isn't there, or OSM refuses.
+        ScanError: a service, site or key wasn't found, or OSM rejected a request.
     """
-    made: dict[str, Packages] = {e.name: files.packages(e, asked.deployment, folder) for e in asked.services}
+    built: dict[str, Packages] = {e.name: files.packages(e, requested.deployment, folder) for e in requested.services}
     sites: dict[tuple[str, str], str] = {}
 
-    def vim(entry: Entry) -> str:
+    def vim(entry: ServiceEntry) -> str:
         site = (entry.vim, entry.cluster)
         if site not in sites:
             sites[site] = osm.cluster(entry.cluster) if entry.cluster else osm.vim(entry.vim)
         return sites[site]
 
-    wanted = {e.name: files.wanted(e, asked.deployment, made[e.name], folder, vim) for e in asked.services}
-    functions = {one.function.descriptor.id: one.function for one in made.values()}
-    services = {one.service.descriptor.id: one.service for one in made.values()}
+    desired = {
+        e.name: files.desired_instance(e, requested.deployment, built[e.name], folder, vim) for e in requested.services
+    }
+    functions = {one.function.descriptor.id: one.function for one in built.values()}
+    services = {one.service.descriptor.id: one.service for one in built.values()}
     packages = {f"{FUNCTIONS} {key}": one for key, one in functions.items()}
     packages |= {f"{SERVICES} {key}": one for key, one in services.items()}
     records = {
-        collection: [one for one in osm.packages(collection) if marks_of(one).get(MARK) == asked.deployment]
+        collection: [one for one in osm.packages(collection) if tags_of(one).get(OWNER_TAG) == requested.deployment]
         for collection in (FUNCTIONS, SERVICES)
     }
-    ours = [one for one in osm.instances() if Instance.of(one, ()).is_of(asked.deployment)]
+    ours = [one for one in osm.instances() if Instance.of(one, ()).belongs_to(requested.deployment)]
     ours.sort(key=lambda one: one.get("create-time", 0))
     instances: dict[str, Instance] = {}
-    without: dict[str, str] = {}
+    obsolete: dict[str, str] = {}
     for one in ours:
         name = str(one.get("name"))
-        if name in wanted and name not in instances:
-            instances[name] = look(osm, one)
+        if name in desired and name not in instances:
+            instances[name] = load_instance(osm, one)
         else:
-            without[name if name not in instances else f"{name} ({one['_id']})"] = str(one["_id"])
-    return Target(asked.deployment, packages, wanted, records, instances, without)
+            obsolete[name if name not in instances else f"{name} ({one['_id']})"] = str(one["_id"])
+    return DeploymentState(requested.deployment, packages, desired, records, instances, obsolete)
 
 
-def plan(there: Target) -> list[Change]:
-    """What `apply` would do."""
+def plan(state: DeploymentState) -> list[Change]:
+    """Changes that `apply` would make."""
     changes = []
-    for package in there.packages.values():
-        record = record_of(package, there.records[collection_of(package)])
+    for package in state.packages.values():
+        record = record_of(package, state.records[collection_of(package)])
         if record is None or not record.get("id"):
-            changes.append(Change(package.name, "onboard", "is half onboarded" if record else "isn't there"))
-    changes += [Change(name, "remove", "isn't asked for") for name in there.without]
-    for name, wanted in there.wanted.items():
-        instance = there.instances.get(name)
-        action = next_action(wanted, instance)
+            changes.append(Change(package.name, "onboard", "its upload is incomplete" if record else "not in OSM"))
+    changes += [Change(name, "remove", "not in services.toml") for name in state.obsolete]
+    for name, desired in state.desired.items():
+        instance = state.instances.get(name)
+        action = next_action(desired, instance)
         if action is None:
             continue
         if instance is None:
-            changes.append(Change(name, "create", "isn't there"))
-        elif instance.mark != wanted.mark:
-            changes.append(Change(name, "make anew", "is of another package, site or key"))
+            changes.append(Change(name, "create", "not in OSM"))
+        elif instance.tag != desired.tag:
+            changes.append(Change(name, "recreate", "its package, site or key changed"))
         else:
-            changes.append(Change(name, str(action), _why(instance, wanted)))
-    changes += [Change(str(one.get("id") or one["_id"]), "remove", "nothing needs it") for _, one in _unneeded(there)]
+            changes.append(Change(name, str(action), _reason(instance, desired)))
+    changes += [Change(str(one.get("id") or one["_id"]), "remove", "unused") for _, one in _unused(state)]
     return changes
 
 
-def _why(there: Instance, wanted: Wanted) -> str:
-    if there.running:
-        return f"its {there.running.get('lcmOperationType')} runs"
-    if not there.instantiated:
-        return "was created only"
-    if there.state == "BROKEN":
-        return "is broken"
-    return f"{there.machines} of {wanted.replicas}" if wanted.kind == "machine" else "is to have other values"
+def _reason(instance: Instance, desired: DesiredInstance) -> str:
+    if instance.running_operation:
+        return f"its {instance.running_operation.get('lcmOperationType')} is running"
+    if not instance.instantiated:
+        return "created but not instantiated"
+    if instance.state == "BROKEN":
+        return "its state is BROKEN"
+    return f"{instance.machine_count} of {desired.replicas}" if desired.kind == "machine" else "its values changed"
 
 
-class Pace:
-    """Called before each request (`Osm`): keeps requests of threads apart that work on one instance each."""
+class RequestPacer:
+    """Rate limit, called before each request (`Osm`): each worker thread handles one instance at a time."""
 
-    def __init__(self, apart: float = APART) -> None:
-        self._apart, self._last = apart, threading.local()
+    def __init__(self, interval_s: float = REQUEST_INTERVAL_S) -> None:
+        self._interval_s, self._last = interval_s, threading.local()
 
     def begin(self) -> None:
-        """From now on, this thread's requests are kept apart."""
+        """Limit the requests of the calling thread from now on."""
         self._last.time = 0.0
 
     def __call__(self) -> None:
-        """Wait until this thread may ask again."""
+        """Wait until the calling thread may send its next request."""
         if not hasattr(self._last, "time"):
             return
-        time.sleep(max(0.0, self._last.time + self._apart - time.monotonic()))
+        time.sleep(max(0.0, self._last.time + self._interval_s - time.monotonic()))
         self._last.time = time.monotonic()
 
 
 def apply(
     osm: Osm,
-    there: Target,
+    state: DeploymentState,
     params: ApplyParams,
     report: Report,
     stop: threading.Event | None = None,
-    pace: Pace | None = None,
-) -> Applied:
-    """Do it; what fails doesn't keep the rest from being done.
+    pacer: RequestPacer | None = None,
+) -> ApplyResult:
+    """Make the planned changes; a failure doesn't stop the other changes.
 
     Args:
-        stop: set to begin nothing more; what is done is kept.
-        pace: called before each of `osm`'s requests.
+        stop: set it to start no further changes; completed changes are kept.
+        pacer: rate limit, called before each of `osm`'s requests.
     """
-    ended = stop or threading.Event()
-    patience = Patience(params.timeout, params.wait, ended.is_set)
-    applied = Applied()
-    records = _onboard(osm, there, applied, report, ended)
-    work: list[tuple[str, Wanted | None]] = [(name, None) for name in there.without]
-    changed = [n for n, one in there.wanted.items() if next_action(one, there.instances.get(n)) is not None]
-    work += [(name, there.wanted[name]) for name in changed if there.wanted[name].nsd in records]
+    stopping = stop or threading.Event()
+    wait_policy = WaitPolicy(params.timeout, params.wait, stopping.is_set)
+    result = ApplyResult()
+    service_records = _onboard(osm, state, result, report, stopping)
+    work: list[tuple[str, DesiredInstance | None]] = [(name, None) for name in state.obsolete]
+    changed = [n for n, one in state.desired.items() if next_action(one, state.instances.get(n)) is not None]
+    work += [(name, state.desired[name]) for name in changed if state.desired[name].nsd in service_records]
     done, lock = 0, threading.Lock()
 
-    def one(task: tuple[str, Wanted | None]) -> None:
+    def reconcile_one(task: tuple[str, DesiredInstance | None]) -> None:
         nonlocal done
-        name, wanted = task
-        if wanted:
-            find, record = partial(find_own, osm, name, there.name), records[wanted.nsd]
+        name, desired = task
+        if desired:
+            find, record = partial(find_owned, osm, name, state.name), service_records[desired.nsd]
         else:
-            find, record = partial(find_id, osm, there.without[name]), ""
+            find, record = partial(find_by_id, osm, state.obsolete[name]), ""
         try:
-            bring(osm, find, wanted, record, patience, lambda what: report(done / len(work), f"{name}: {what}"))
+            reconcile(osm, find, desired, record, wait_policy, lambda text: report(done / len(work), f"{name}: {text}"))
         except ScanError as error:
             with lock:
-                applied.failed[name] = error
+                result.failed[name] = error
         else:
             with lock:
-                applied.done.append(Change(name, "as asked" if wanted else "removed"))
+                result.done.append(Change(name, "up to date" if desired else "removed"))
         with lock:
             done += 1
             report(done / len(work), name)
 
-    with ThreadPoolExecutor(params.parallel, initializer=pace.begin if pace else None) as pool:
+    with ThreadPoolExecutor(params.parallel, initializer=pacer.begin if pacer else None) as pool:
         try:
-            list(pool.map(one, work))
+            list(pool.map(reconcile_one, work))
         except KeyboardInterrupt:
-            ended.set()
+            stopping.set()
             raise
-    if not ended.is_set():
-        _prune(osm, there, applied)
-    return applied
+    if not stopping.is_set():
+        _prune(osm, state, result)
+    return result
 
 
-def _onboard(osm: Osm, there: Target, applied: Applied, report: Report, ended: threading.Event) -> dict[str, str]:
-    """Packages that are missing, functions first; returns records of network services by their descriptors' ids."""
-    found: dict[str, str] = {}
-    refused: set[str] = set()
-    for package in there.packages.values():
-        if ended.is_set():
+def _onboard(
+    osm: Osm, state: DeploymentState, result: ApplyResult, report: Report, stopping: threading.Event
+) -> dict[str, str]:
+    """Onboard missing packages, functions first; returns record ids of network services by descriptor id."""
+    service_records: dict[str, str] = {}
+    rejected: set[str] = set()
+    for package in state.packages.values():
+        if stopping.is_set():
             break
-        if refused & set(package.descriptor.functions):
+        if rejected & set(package.descriptor.functions):
             continue
-        known = record_of(package, there.records[collection_of(package)])
+        known = record_of(package, state.records[collection_of(package)])
         if known and known.get("id"):
             record = str(known["_id"])
         else:
-            report(0.0, f"onboards {package.name}")
+            report(0.0, f"onboarding {package.name}")
             try:
-                record = onboard(osm, package, there.name)
+                record = onboard(osm, package, state.name)
             except ScanError as error:
-                applied.failed[package.name] = error
-                refused.add(package.descriptor.id)
+                result.failed[package.name] = error
+                rejected.add(package.descriptor.id)
                 continue
-            applied.done.append(Change(package.name, "onboarded"))
-        if package.descriptor.sort == "nsd":
-            found[package.descriptor.id] = record
-    return found
+            result.done.append(Change(package.name, "onboarded"))
+        if package.descriptor.type == "nsd":
+            service_records[package.descriptor.id] = record
+    return service_records
 
 
-def _prune(osm: Osm, there: Target, applied: Applied) -> None:
-    """Packages of the deployment that nothing needs: network services before their functions."""
-    for collection, record in _unneeded(there):
+def _prune(osm: Osm, state: DeploymentState, result: ApplyResult) -> None:
+    """Remove the deployment's unused packages: network services before their functions."""
+    for collection, record in _unused(state):
         name = str(record.get("id") or record["_id"])
         try:
             osm.remove(collection, str(record["_id"]))
         except ScanError as error:
-            if not (isinstance(error, Refused) and error.status == 409):  # an instance that failed to go has it still
-                applied.failed[name] = error
+            # 409: an instance whose removal failed still uses it
+            if not (isinstance(error, OsmError) and error.status == 409):
+                result.failed[name] = error
             continue
-        applied.done.append(Change(name, "removed"))
+        result.done.append(Change(name, "removed"))
 
 
-def _unneeded(there: Target) -> list[tuple[str, dict[str, Any]]]:
-    """Records of packages that aren't wanted, or twice, by their collections; network services first."""
+def _unused(state: DeploymentState) -> list[tuple[str, dict[str, Any]]]:
+    """Package records that are unused or duplicates, with their collections; network services first."""
     found = []
     for collection in (SERVICES, FUNCTIONS):
-        records = there.records[collection]
-        needed = [record_of(one, records) for one in there.packages.values() if collection_of(one) == collection]
+        records = state.records[collection]
+        needed = [record_of(one, records) for one in state.packages.values() if collection_of(one) == collection]
         keep = {str(one["_id"]) for one in needed if one}
         found += [(collection, one) for one in records if str(one["_id"]) not in keep]
     return found
 
 
-def failure(applied: Applied) -> StepError | None:
-    """What to say of what failed; None: nothing did."""
-    if not applied.failed:
+def failure(result: ApplyResult) -> StepError | None:
+    """One error for all failures; None if nothing failed."""
+    if not result.failed:
         return None
-    name, first = next(iter(applied.failed.items()))
-    others = len(applied.failed) - 1
+    name, first = next(iter(result.failed.items()))
+    others = len(result.failed) - 1
     cause = first.cause + (f"; {others} more failed" if others else "")
     return StepError(name if first.where == name else f"{name}: {first.where}", cause, first.remedy)

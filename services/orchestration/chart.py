@@ -1,6 +1,6 @@
-"""A Helm chart of a service: a Deployment, its variables, a Secret with its token, a Service where it listens.
+"""Helm chart of a service: Deployment, ConfigMap with its variables, Secret with its token, Service if it has a port.
 
-Templates are JSON, which is YAML that needs no quoting, around what Helm puts in when a chart is installed.
+Templates are written as JSON, a subset of YAML that needs no quoting rules, around Helm's template expressions.
 """
 
 from __future__ import annotations
@@ -12,17 +12,19 @@ from typing import Any
 from scan2sim.services.orchestration.description import Description
 from scan2sim.services.qos.requirements import Requirements
 
-REPLICAS = "replicaCount"
-"""The value that says how many there are."""
-NAME = "{{ .Release.Name }}"
-TOKEN = "{{ dig `data` `token` (randAlphaNum 32 | b64enc) (lookup `v1` `Secret` .Release.Namespace .Release.Name) }}"
-"""A random token, base64; that of the installed release where there is one, so that an upgrade keeps it."""
+REPLICA_COUNT_KEY = "replicaCount"
+"""Helm value with the number of replicas."""
+RELEASE_NAME = "{{ .Release.Name }}"
+TOKEN_TEMPLATE = (
+    "{{ dig `data` `token` (randAlphaNum 32 | b64enc) (lookup `v1` `Secret` .Release.Namespace .Release.Name) }}"
+)
+"""Helm expression for a random token (base64); upgrades keep the token of the installed release."""
 
 
 def files(service: Description, needs: Requirements, version: str) -> dict[str, str]:
-    """A chart's files by their paths."""
+    """Files of the chart by path."""
     about = {"apiVersion": "v2", "name": service.name, "description": service.title, "version": version}
-    labels = {"app.kubernetes.io/name": service.name, "app.kubernetes.io/instance": NAME}
+    labels = {"app.kubernetes.io/name": service.name, "app.kubernetes.io/instance": RELEASE_NAME}
     made = {
         "Chart.yaml": about,
         "values.yaml": _values(service, needs),
@@ -30,33 +32,33 @@ def files(service: Description, needs: Requirements, version: str) -> dict[str, 
         "templates/variables.yaml": {
             "apiVersion": "v1",
             "kind": "ConfigMap",
-            "metadata": {"name": NAME, "labels": labels},
-            "data": _put(".Values.variables"),
+            "metadata": {"name": RELEASE_NAME, "labels": labels},
+            "data": _placeholder(".Values.variables"),
         },
     }
     if service.port:
         made["templates/service.yaml"] = {
             "apiVersion": "v1",
             "kind": "Service",
-            "metadata": {"name": NAME, "labels": labels},
+            "metadata": {"name": RELEASE_NAME, "labels": labels},
             "spec": {"selector": labels, "ports": [{"name": "http", "port": service.port, "targetPort": "http"}]},
         }
     if service.token:
         made["templates/token.yaml"] = {
             "apiVersion": "v1",
             "kind": "Secret",
-            "metadata": {"name": NAME, "labels": labels},
-            "data": {"token": TOKEN},
+            "metadata": {"name": RELEASE_NAME, "labels": labels},
+            "data": {"token": TOKEN_TEMPLATE},
         }
     return {path: _text(content) for path, content in made.items()}
 
 
 def _values(service: Description, needs: Requirements) -> dict[str, Any]:
-    """What may be set; graphics processors are asked for by `resources.limits`, as `nvidia.com/gpu`."""
+    """Default values; GPUs are requested with `resources.limits`, for example `nvidia.com/gpu`."""
     requests = {"cpu": f"{needs.cpu_cores.value:g}"} if needs.cpu_cores else {}
     limits = {"memory": f"{needs.memory.value:g}Mi"} if needs.memory else {}
     return {
-        REPLICAS: 1,
+        REPLICA_COUNT_KEY: 1,
         "image": service.image,
         "hostNetwork": service.host_network,
         "variables": service.variables,
@@ -68,8 +70,8 @@ def _deployment(service: Description, labels: dict[str, str]) -> dict[str, Any]:
     container: dict[str, Any] = {
         "name": service.name,
         "image": "{{ .Values.image }}",
-        "envFrom": [{"configMapRef": {"name": NAME}}],
-        "resources": _put(".Values.resources"),
+        "envFrom": [{"configMapRef": {"name": RELEASE_NAME}}],
+        "resources": _placeholder(".Values.resources"),
     }
     if service.command:
         container["command"] = list(service.command)
@@ -78,28 +80,35 @@ def _deployment(service: Description, labels: dict[str, str]) -> dict[str, Any]:
     if service.port:
         container["ports"] = [{"name": "http", "containerPort": service.port}]
     if service.port and service.ready:
-        asked = {"httpGet": {"path": service.ready, "port": "http"}}
-        container |= {"readinessProbe": asked, "startupProbe": asked | {"failureThreshold": 60, "periodSeconds": 5}}
+        probe = {"httpGet": {"path": service.ready, "port": "http"}}
+        container |= {"readinessProbe": probe, "startupProbe": probe | {"failureThreshold": 60, "periodSeconds": 5}}
     volumes = []
     if service.token:
         path = PurePosixPath(service.token)
         container["volumeMounts"] = [{"name": "token", "mountPath": str(path.parent), "readOnly": True}]
-        volumes = [{"name": "token", "secret": {"secretName": NAME, "items": [{"key": "token", "path": path.name}]}}]
-    changed = {"scan2sim/variables": "{{ toJson .Values.variables | sha256sum }}"}  # starts pods anew when they change
+        volumes = [
+            {"name": "token", "secret": {"secretName": RELEASE_NAME, "items": [{"key": "token", "path": path.name}]}}
+        ]
+    # the checksum restarts pods when variables change
+    annotations = {"scan2sim/variables": "{{ toJson .Values.variables | sha256sum }}"}
     pod = {
-        "metadata": {"labels": labels, "annotations": changed},
-        "spec": {"hostNetwork": _put(".Values.hostNetwork"), "containers": [container], "volumes": volumes},
+        "metadata": {"labels": labels, "annotations": annotations},
+        "spec": {"hostNetwork": _placeholder(".Values.hostNetwork"), "containers": [container], "volumes": volumes},
     }
     return {
         "apiVersion": "apps/v1",
         "kind": "Deployment",
-        "metadata": {"name": NAME, "labels": labels},
-        "spec": {"replicas": _put(f".Values.{REPLICAS}"), "selector": {"matchLabels": labels}, "template": pod},
+        "metadata": {"name": RELEASE_NAME, "labels": labels},
+        "spec": {
+            "replicas": _placeholder(f".Values.{REPLICA_COUNT_KEY}"),
+            "selector": {"matchLabels": labels},
+            "template": pod,
+        },
     }
 
 
-def _put(value: str) -> str:
-    """What `_text` writes as `{{ toJson VALUE }}`, without quotes."""
+def _placeholder(value: str) -> str:
+    """Placeholder that `_text` replaces by `{{ toJson VALUE }}`, without quotes."""
     return f"@{value}@"
 
 

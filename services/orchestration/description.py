@@ -1,6 +1,6 @@
-"""What a service is, said once: its image, what it listens on, what it needs; packages are made of it.
+"""Description of a service: container image, port and requirements. Packages are built from it.
 
-Those that come along are in `described/`, a TOML file each; yours is given by its path.
+Built-in descriptions are TOML files in `services/`; your own is given by its path.
 """
 
 from __future__ import annotations
@@ -16,29 +16,30 @@ from scan2sim.services.qos import requirements
 from scan2sim.services.qos.requirements import Environment, Requirements
 
 FOLDER = Path(__file__).parent / "services"
-LABEL = r"^[a-z]([-a-z0-9]{0,39}[a-z0-9])?$"
-"""What Kubernetes takes for a name, short enough for OSM to add to it."""
-Label = Annotated[str, Field(pattern=LABEL, json_schema_extra={"range": "a-z, 0-9 and -, up to 41 characters"})]
+LABEL_PATTERN = r"^[a-z]([-a-z0-9]{0,39}[a-z0-9])?$"
+"""A valid Kubernetes name, short enough for the suffixes that OSM appends."""
+Label = Annotated[str, Field(pattern=LABEL_PATTERN, json_schema_extra={"range": "a-z, 0-9 and -, up to 41 characters"})]
 
 
 class Description(Params):
-    """Of a service.
+    """Description of a service.
 
     Attributes:
-        name: of its packages.
-        title: for people.
-        image: of its container, as a registry names it.
-        command: in place of the image's entry point; arguments: behind it.
-        port: that it serves on; None: it only asks others.
-        ready: path on that port that says whether it can be asked.
-        token: file in its container with the token that its callers need; its chart generates one, as a Secret.
-        requirements: whose needs it has, as `scan2sim qos show` prints them.
-        needs: its needs, where no table has them.
-        machine: image of a virtual machine that runs it, as the VIM knows it.
-        storage: GB of that machine's disk.
-        replicas: how many there may be, at most.
-        host_network: share the host's network, as nodes of ROS 2 must that find each other by multicast.
-        variables: of the container's environment, with their defaults.
+        name: name used in its packages.
+        title: title for people.
+        image: container image, as a registry names it.
+        command: replaces the image's entry point.
+        arguments: arguments of the command.
+        port: port that it serves on; None if it only connects to others.
+        ready: HTTP path of the readiness check on that port.
+        token: path of the token file in the container; the Helm chart generates the token as a Secret.
+        requirements: name of the built-in requirements to use, see `scan2sim qos show`.
+        needs: the requirements themselves, in place of built-in ones.
+        machine: name of the virtual machine image at the VIM.
+        storage: disk of that machine in GB.
+        replicas: maximum number of replicas.
+        host_network: share the host's network, which ROS 2 nodes need for discovery by multicast.
+        variables: environment variables of the container with their defaults.
     """
 
     name: Label
@@ -57,11 +58,11 @@ class Description(Params):
     host_network: bool = False
     variables: dict[str, str] = Field(default_factory=dict)
 
-    def needed(self, environment: Environment) -> Requirements:
-        """Where it runs.
+    def requirements_in(self, environment: Environment) -> Requirements:
+        """Requirements in the environment where it runs.
 
         Raises:
-            SettingError: it isn't meant to run there.
+            SettingError: the service isn't meant for this environment.
         """
         if self.needs is not None or self.requirements is None:
             return self.needs or Requirements()
@@ -69,16 +70,16 @@ class Description(Params):
 
 
 def names() -> list[str]:
-    """Of the services that come along."""
+    """Names of the built-in services."""
     return sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 
 def read(which: str | Path) -> Description:
-    """A service that comes along, or a file's.
+    """Read a built-in description or a file.
 
     Raises:
-        InputError: the file can't be read, or says something else.
+        InputError: the file can't be read or is invalid.
     """
     path = FOLDER / f"{which}.toml" if str(which) in names() else Path(which)
-    absent = ("is neither a file nor a service that comes along", f"Give a file, or one of: {', '.join(names())}")
+    absent = ("neither a file nor a built-in service", f"Give a file, or one of: {', '.join(names())}")
     return toml.read(path, Description, absent=absent, fields="docs/orchestration.md lists the fields")

@@ -1,4 +1,4 @@
-"""A network service's instance, as wanted and as OSM tells of it, and what to do next about it."""
+"""Instance of a network service, desired and as reported by OSM, and the next action to reconcile them."""
 
 from __future__ import annotations
 
@@ -12,22 +12,23 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from scan2sim.pipeline.core.errors import StepError
-from scan2sim.services.orchestration.chart import REPLICAS
-from scan2sim.services.orchestration.sol006 import ASPECT, MEMBER, Kind
+from scan2sim.services.orchestration.chart import REPLICA_COUNT_KEY
+from scan2sim.services.orchestration.sol006 import MEMBER_INDEX, SCALING_ASPECT, FunctionKind
 
-MARK = "scan2sim"
-"""How a description of what was made here begins; deployment and digest follow."""
+OWNER_TAG = "scan2sim"
+"""First word of the description of everything created by this package; deployment and digest follow."""
 RUNNING = ("PROCESSING", "ROLLING_BACK", "STARTING", "FAILED_TEMP")
+"""States of a running operation."""
 DONE = ("COMPLETED", "PARTIALLY_COMPLETED")
-"""States of operations."""
+"""States of a successful operation."""
 
 
 class Action(StrEnum):
-    """What to do next about an instance."""
+    """Next action on an instance."""
 
     CREATE = "create"
     INSTANTIATE = "instantiate"
-    FOLLOW = "follow"
+    WAIT = "wait"
     UPGRADE = "upgrade"
     SCALE_OUT = "scale out"
     SCALE_IN = "scale in"
@@ -36,25 +37,26 @@ class Action(StrEnum):
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """An instance as it is to be.
+class DesiredInstance:
+    """Desired state of an instance.
 
     Attributes:
-        name: of the instance, which no other has.
-        deployment: that it is of.
-        service: of what kind of function it is; kind: what that runs as.
-        nsd: its network service's descriptor, by id.
-        vim: VIM account, by id.
-        replicas: how many of its function.
-        keys: public SSH keys of who may log in to machines.
-        values: what is given to its chart, or to its machine when it starts.
-        namespace: of Kubernetes; "": the project's.
+        name: unique name of the instance.
+        deployment: name of the deployment that it belongs to.
+        service: name of the function's chart or machine.
+        kind: whether the function is a container or a machine.
+        nsd: id of the network service's descriptor.
+        vim: id of the VIM account.
+        replicas: number of replicas of the function.
+        keys: public SSH keys that may log in to machines.
+        values: Helm values of the chart, or parameters of the machine at instantiation.
+        namespace: Kubernetes namespace; empty: the project's.
     """
 
     name: str
     deployment: str
     service: str
-    kind: Kind
+    kind: FunctionKind
     nsd: str
     vim: str
     replicas: int = 1
@@ -63,34 +65,34 @@ class Wanted:
     namespace: str = ""
 
     @property
-    def mark(self) -> str:
-        """Its description in OSM: whose it is, and a digest of what can't be changed while it runs."""
+    def tag(self) -> str:
+        """Description in OSM: owner, deployment and a digest of all that can't be changed while the instance runs."""
         fixed: list[Any] = [self.service, self.kind, self.nsd, self.vim, self.keys, self.namespace]
         if self.kind == "machine":
-            fixed.append(self.given)
+            fixed.append(self.function_values)
         digest = hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:12]
-        return f"{MARK} {self.deployment} {digest}"
+        return f"{OWNER_TAG} {self.deployment} {digest}"
 
     @property
-    def given(self) -> dict[str, Any]:
-        """All values that its function is given."""
+    def function_values(self) -> dict[str, Any]:
+        """All values passed to the function."""
         values = dict(self.values or {})
-        return values | ({REPLICAS: self.replicas} if self.kind == "container" else {})
+        return values | ({REPLICA_COUNT_KEY: self.replicas} if self.kind == "container" else {})
 
     def request(self, nsd_record: str) -> dict[str, Any]:
-        """What it is created and instantiated by; `nsd_record` is the descriptor's record in OSM."""
-        function: dict[str, Any] = {"member-vnf-index": MEMBER}
+        """Body of the requests that create and instantiate it; `nsd_record`: id of its descriptor's record in OSM."""
+        function: dict[str, Any] = {"member-vnf-index": MEMBER_INDEX}
         if self.namespace:
             function["k8s-namespace"] = self.namespace
         if self.kind == "container":
-            function["additionalParamsForKdu"] = [{"kdu_name": self.service, "additionalParams": self.given}]
-        elif self.given:
-            function["additionalParams"] = self.given
+            function["additionalParamsForKdu"] = [{"kdu_name": self.service, "additionalParams": self.function_values}]
+        elif self.function_values:
+            function["additionalParams"] = self.function_values
         body: dict[str, Any] = {
             "nsName": self.name,
             "nsdId": nsd_record,
             "vimAccountId": self.vim,
-            "nsDescription": self.mark,
+            "nsDescription": self.tag,
         }
         if len(function) > 1:
             body["additionalParamsForVnf"] = [function]
@@ -98,26 +100,26 @@ class Wanted:
             body["ssh_keys"] = list(self.keys)
         return body
 
-    def change(self, action: Action) -> tuple[str, dict[str, Any]]:
-        """Path and body of the request that makes it as wanted."""
+    def change_request(self, action: Action) -> tuple[str, dict[str, Any]]:
+        """Path and body of the request that upgrades or scales it."""
         if action == Action.UPGRADE:
-            return "action", upgrade(self.service, self.given)
-        return "scale", scale(1 if action == Action.SCALE_OUT else -1)
+            return "action", upgrade_request(self.service, self.function_values)
+        return "scale", scale_request(1 if action == Action.SCALE_OUT else -1)
 
 
-def upgrade(function: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Body of the request that gives a chart other values."""
+def upgrade_request(function: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Body of the request that changes a chart's values."""
     return {
-        "member_vnf_index": MEMBER,
+        "member_vnf_index": MEMBER_INDEX,
         "kdu_name": function,
         "primitive": "upgrade",
         "primitive_params": dict(values),
     }
 
 
-def scale(by: int) -> dict[str, Any]:
-    """Body of the request for a machine more, or one fewer."""
-    step = {"scaling-group-descriptor": ASPECT, "member-vnf-index": MEMBER}
+def scale_request(by: int) -> dict[str, Any]:
+    """Body of the request that adds a machine (`by` > 0) or removes one."""
+    step = {"scaling-group-descriptor": SCALING_ASPECT, "member-vnf-index": MEMBER_INDEX}
     kind = "SCALE_OUT" if by > 0 else "SCALE_IN"
     return {"scaleType": "SCALE_VNF", "scaleVnfData": {"scaleVnfType": kind, "scaleByStepData": step}}
 
@@ -140,81 +142,81 @@ _VALUES, _FUNCTIONS = TypeAdapter(dict[str, Any]), TypeAdapter(list[_Function])
 
 @dataclass(frozen=True)
 class Instance:
-    """As OSM tells of it.
+    """State of an instance as reported by OSM.
 
     Attributes:
-        id: of its record; name: that it was given.
-        nsd: its descriptor's id.
-        mark: its description.
-        state: "READY", "BROKEN", ... as OSM says.
+        id, name: id and name of its record.
+        nsd: id of its descriptor.
+        tag: its description, see `DesiredInstance.tag`.
+        state: state such as "READY" or "BROKEN".
         instantiated: whether there is something to terminate.
-        operations: in the order in which they began.
+        operations: its operations in the order of their start.
     """
 
     id: str
     name: str
     nsd: str
-    mark: str
+    tag: str
     state: str
     instantiated: bool
     operations: tuple[Mapping[str, Any], ...]
 
     @classmethod
     def of(cls, record: Mapping[str, Any], operations: Sequence[Mapping[str, Any]]) -> Instance:
-        """Of OSM's record."""
+        """Instance from OSM's record."""
         return cls(
             id=str(record["_id"]),
             name=str(record.get("name", "")),
             nsd=str(record.get("nsd-ref") or (record.get("nsd") or {}).get("id", "")),
-            mark=str(record.get("description") or ""),
+            tag=str(record.get("description") or ""),
             state=str(record.get("nsState", "")),
             instantiated=(record.get("_admin") or {}).get("nsState") == "INSTANTIATED",
             operations=tuple(operations),
         )
 
     @property
-    def running(self) -> Mapping[str, Any] | None:
-        """The operation that isn't over; None: all are."""
+    def running_operation(self) -> Mapping[str, Any] | None:
+        """The operation in progress; None if there is none."""
         return next((one for one in reversed(self.operations) if one.get("operationState") in RUNNING), None)
 
-    def is_of(self, deployment: str) -> bool:
-        """Whether a deployment made it."""
-        return self.mark.split(" ")[:2] == [MARK, deployment]
+    def belongs_to(self, deployment: str) -> bool:
+        """Whether a deployment created it."""
+        return self.tag.split(" ")[:2] == [OWNER_TAG, deployment]
 
     @property
     def values(self) -> dict[str, Any]:
-        """Values that its chart was last given.
+        """Values of its chart as last set.
 
         Raises:
-            StepError: OSM returns parameters of that operation that can't be read.
+            StepError: the parameters that OSM returns can't be read.
         """
         for one in reversed(self.operations):
             if one.get("operationState") not in DONE:
                 continue
             params = one.get("operationParams") or {}
             if one.get("lcmOperationType") == "action" and params.get("primitive") == "upgrade":
-                return self._read(params, "primitive_params", _VALUES) or {}
+                return self._parameter(params, "primitive_params", _VALUES) or {}
             if one.get("lcmOperationType") == "instantiate":
-                functions = self._read(params, "additionalParamsForVnf", _FUNCTIONS)
+                functions = self._parameter(params, "additionalParamsForVnf", _FUNCTIONS)
                 charts = functions[0].charts if functions else None
                 return (charts[0].values if charts else None) or {}
         return {}
 
-    def _read(self, params: Mapping[str, Any], name: str, kind: TypeAdapter[T]) -> T | None:
-        """A parameter of an operation; current releases return a string of JSON, Release 8 the object that was sent."""
+    def _parameter(self, params: Mapping[str, Any], name: str, kind: TypeAdapter[T]) -> T | None:
+        """A parameter of an operation; newer releases return a JSON string, Release 8 the object that was sent."""
         value = params.get(name)
         if not value:
             return None
         try:
             return kind.validate_json(value) if isinstance(value, str) else kind.validate_python(value)
         except ValidationError as error:
-            cause = f"OSM returns an operation whose {name} can't be read ({error.errors()[0]['msg']})"
+            cause = f"OSM returned an operation whose {name} can't be read ({error.errors()[0]['msg']})"
             remedy = "Remove it (scan2sim orchestrate delete) and instantiate it again"
             raise StepError(self.name, cause, remedy) from None
 
     @property
-    def machines(self) -> int:
-        """How many there are of its function, where that is a machine."""
+    def machine_count(self) -> int:
+        """Number of machines of its function."""
         count = 1
         for one in self.operations:
             data = (one.get("operationParams") or {}).get("scaleVnfData") or {}
@@ -223,26 +225,26 @@ class Instance:
         return count
 
 
-def next_action(wanted: Wanted | None, there: Instance | None) -> Action | None:
-    """What to do about an instance, so that it is as wanted; None: it is.
+def next_action(desired: DesiredInstance | None, observed: Instance | None) -> Action | None:
+    """Next action to bring an instance to its desired state; None if there is nothing to do.
 
     Args:
-        wanted: None: it isn't to be.
-        there: None: it isn't.
+        desired: None if the instance is to be removed.
+        observed: None if it doesn't exist.
 
     Raises:
-        StepError: as `Instance.values`.
+        StepError: see `Instance.values`.
     """
-    if there is None:
-        return Action.CREATE if wanted else None
-    if there.running:
-        return Action.FOLLOW  # deleting it now would forget the operation, and leave what it makes behind
-    if wanted is None or there.mark != wanted.mark or (there.instantiated and there.state == "BROKEN"):
-        return Action.TERMINATE if there.instantiated else Action.DELETE
-    if not there.instantiated:
+    if observed is None:
+        return Action.CREATE if desired else None
+    if observed.running_operation:
+        return Action.WAIT  # if it were deleted now, OSM would forget the operation and leave its resources behind
+    if desired is None or observed.tag != desired.tag or (observed.instantiated and observed.state == "BROKEN"):
+        return Action.TERMINATE if observed.instantiated else Action.DELETE
+    if not observed.instantiated:
         return Action.INSTANTIATE
-    if wanted.kind == "container":
-        return Action.UPGRADE if there.values != wanted.given else None
-    if there.machines != wanted.replicas:
-        return Action.SCALE_OUT if there.machines < wanted.replicas else Action.SCALE_IN
+    if desired.kind == "container":
+        return Action.UPGRADE if observed.values != desired.function_values else None
+    if observed.machine_count != desired.replicas:
+        return Action.SCALE_OUT if observed.machine_count < desired.replicas else Action.SCALE_IN
     return None

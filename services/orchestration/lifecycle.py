@@ -1,6 +1,6 @@
-"""One instance's life: what is to be done next is decided from what OSM says, until it is as wanted.
+"""Reconcile one instance: repeat the next action, chosen from OSM's current state, until the desired state is reached.
 
-Nothing is remembered here: whoever goes on after a crash, or after an answer that was lost, decides the same.
+No state is kept on this side, so that a run after a crash or a lost response continues in the same way.
 """
 
 from __future__ import annotations
@@ -11,32 +11,32 @@ from dataclasses import dataclass
 from typing import Any
 
 from scan2sim.pipeline.core.errors import StepError
-from scan2sim.services.orchestration.instance import DONE, RUNNING, Action, Instance, Wanted, next_action
-from scan2sim.services.orchestration.osm import INSTANCES, PASSING, Osm, Refused, Unsure, pause
+from scan2sim.services.orchestration.instance import DONE, RUNNING, Action, DesiredInstance, Instance, next_action
+from scan2sim.services.orchestration.osm import INSTANCES, TRANSIENT_STATUSES, Osm, OsmError, ResponseLost, back_off
 
-Say = Callable[[str], None]
-"""Told what happens."""
+Notify = Callable[[str], None]
+"""Called with progress messages."""
 Stop = Callable[[], bool]
-"""Whether to begin nothing more."""
+"""Returns True if no further action is to be started."""
 
-POLL = 1.0
-"""Seconds between two looks at an operation, at first, and `LONGEST_POLL` at last."""
-LONGEST_POLL = 5.0
-LOST = 5
-"""Answers that may be lost in a row."""
-BEGUN = (Action.INSTANTIATE, Action.UPGRADE, Action.SCALE_OUT, Action.SCALE_IN)
-"""Actions that need not be waited for."""
-
-
-Find = Callable[[], Instance | None]
-"""Looks at what is there of an instance."""
+POLL_INTERVAL_S = 1.0
+"""First and longest interval between two queries of an operation's state, seconds."""
+MAX_POLL_INTERVAL_S = 5.0
+MAX_LOST_RESPONSES = 5
+"""Maximum number of consecutive lost responses."""
+ASYNC_ACTIONS = (Action.INSTANTIATE, Action.UPGRADE, Action.SCALE_OUT, Action.SCALE_IN)
+"""Actions that are only awaited with `WaitPolicy.wait`."""
 
 
-class Failed(StepError):
-    """An operation that OSM began and gave up.
+FindInstance = Callable[[], Instance | None]
+"""Returns the current state of an instance."""
+
+
+class OperationFailed(StepError):
+    """An operation that failed in OSM.
 
     Attributes:
-        kind: of the operation.
+        kind: type of the operation.
     """
 
     def __init__(self, where: str, cause: str, remedy: str, kind: str = "") -> None:
@@ -46,13 +46,13 @@ class Failed(StepError):
 
 
 @dataclass(frozen=True)
-class Patience:
-    """How long to wait.
+class WaitPolicy:
+    """How long to wait for operations.
 
     Attributes:
-        timeout: seconds for an operation.
-        wait: whether operations are waited for at all, beyond what must be.
-        stop: asked between two steps.
+        timeout: timeout of one operation in seconds.
+        wait: wait for every operation, not only for those that the next action depends on.
+        stop: checked before each action.
     """
 
     timeout: float = 1800.0
@@ -61,129 +61,146 @@ class Patience:
 
 
 def find(osm: Osm, name: str) -> Instance | None:
-    """An instance by its name or id; None: there is none.
+    """An instance by its name or id; None if there is none.
 
     Raises:
-        StepError: there are several.
+        StepError: more than one instance has this name.
     """
     found = [one for one in osm.instances() if name in (one.get("name"), one.get("_id"))]
     if len(found) > 1:
         ids = ", ".join(str(one["_id"]) for one in found)
-        raise StepError(name, f"there are {len(found)} instances of that name", f"Name one by its id: {ids}")
-    return look(osm, found[0]) if found else None
+        raise StepError(name, f"{len(found)} instances have this name", f"Choose one by its id: {ids}")
+    return load_instance(osm, found[0]) if found else None
 
 
-def find_own(osm: Osm, name: str, deployment: str) -> Instance | None:
-    """A deployment's instance by its name, the oldest where an answer that was lost has left two; None: there is none.
+def find_owned(osm: Osm, name: str, deployment: str) -> Instance | None:
+    """A deployment's instance by its name; None if there is none. The oldest if a lost response has left duplicates.
 
     Raises:
-        StepError: the name is that of another one's instance.
+        StepError: an instance of another owner has this name.
     """
     found = [one for one in osm.instances() if one.get("name") == name]
-    own = [one for one in found if Instance.of(one, ()).is_of(deployment)]
+    own = [one for one in found if Instance.of(one, ()).belongs_to(deployment)]
     if found and not own:
-        cause = "is the name of an instance that isn't this deployment's"
+        cause = "the name belongs to an instance of another deployment"
         raise StepError(name, cause, "Choose another name, or delete it: scan2sim orchestrate delete")
-    return look(osm, min(own, key=lambda one: one.get("create-time", 0))) if own else None
+    return load_instance(osm, min(own, key=lambda one: one.get("create-time", 0))) if own else None
 
 
-def look(osm: Osm, record: Mapping[str, Any]) -> Instance:
-    """An instance with its operations, of what a list says of it.
+def load_instance(osm: Osm, record: Mapping[str, Any]) -> Instance:
+    """An instance with its operations, from an entry of a list.
 
-    Its record is asked for after them: one of them may end in between, and be taken for done too early else.
+    Its record is read after the operations: if one of them ended in between, its effect would be missed otherwise.
     """
     operations = osm.operations(str(record["_id"]))
     return Instance.of(osm.instance(str(record["_id"])), operations)
 
 
-def bring(osm: Osm, there: Find, wanted: Wanted | None, record: str, patience: Patience, say: Say) -> None:
-    """Make an instance as wanted; None: have none.
+def reconcile(
+    osm: Osm,
+    find_instance: FindInstance,
+    desired: DesiredInstance | None,
+    record: str,
+    wait_policy: WaitPolicy,
+    notify: Notify,
+) -> None:
+    """Bring an instance to its desired state; None removes it.
 
     Args:
-        there: looks at the instance.
-        record: of its network service's descriptor, in OSM.
+        find_instance: returns the current state of the instance.
+        record: id of its descriptor's record in OSM.
 
     Raises:
-        Failed: OSM gave up. StepError: it takes too long, or the name is another one's. Refused: as `Osm`.
+        OperationFailed: OSM reports a failure. StepError: timeout, or the name belongs to another owner.
+        OsmError: see `Osm`.
     """
-    failure: Failed | None = None
+    failure: OperationFailed | None = None
     lost = 0
-    while not patience.stop():
+    while not wait_policy.stop():
         try:
-            found = there()
-            action = next_action(None if failure else wanted, found)
+            found = find_instance()
+            action = next_action(None if failure else desired, found)
             if action is None:
                 break
-            say(_told(action, found, wanted))
-            _act(osm, action, found, wanted, record, patience)
+            notify(_progress_message(action, found, desired))
+            _act(osm, action, found, desired, record, wait_policy)
             lost = 0
-            if not patience.wait and action in BEGUN:
+            if not wait_policy.wait and action in ASYNC_ACTIONS:
                 break
-        except Failed as error:
-            if failure or wanted is None or error.kind != "instantiate":
+        except OperationFailed as error:
+            if failure or desired is None or error.kind != "instantiate":
                 raise
-            failure = error  # what is half made is taken down before that is said
-            say(f"{error.cause}; it is taken down")
-        except (Unsure, Refused) as error:
+            failure = error  # raised after the incomplete instance has been removed
+            notify(f"{error.cause}; removing the incomplete instance")
+        except (ResponseLost, OsmError) as error:
             lost += 1
-            if lost > LOST or (isinstance(error, Refused) and error.status not in PASSING):
+            if lost > MAX_LOST_RESPONSES or (isinstance(error, OsmError) and error.status not in TRANSIENT_STATUSES):
                 raise
-            pause(lost - 1)
+            back_off(lost - 1)
     if failure:
         raise failure
 
 
-def _told(action: Action, there: Instance | None, wanted: Wanted | None) -> str:
-    if action == Action.FOLLOW and there and there.running:
-        return f"waits for its {there.running.get('lcmOperationType')}"
-    again = there is not None and wanted is not None and action in (Action.TERMINATE, Action.DELETE)
-    return f"{action}{', to make it anew' if again else ''}"
+def _progress_message(action: Action, observed: Instance | None, desired: DesiredInstance | None) -> str:
+    if action == Action.WAIT and observed and observed.running_operation:
+        return f"waiting for its {observed.running_operation.get('lcmOperationType')}"
+    recreated = observed is not None and desired is not None and action in (Action.TERMINATE, Action.DELETE)
+    return f"{action}{', to recreate it' if recreated else ''}"
 
 
 def _act(
-    osm: Osm, action: Action, there: Instance | None, wanted: Wanted | None, record: str, patience: Patience
+    osm: Osm,
+    action: Action,
+    observed: Instance | None,
+    desired: DesiredInstance | None,
+    record: str,
+    wait_policy: WaitPolicy,
 ) -> None:
-    """Do one thing, and wait for its end."""
+    """Run one action and wait for its end."""
     if action == Action.CREATE:
-        assert wanted
-        osm.create(wanted.request(record))
+        assert desired
+        osm.create(desired.request(record))
         return
-    assert there
-    if action == Action.FOLLOW:
-        assert there.running
-        follow(osm, there.name, str(there.running["_id"]), patience)
+    assert observed
+    if action == Action.WAIT:
+        assert observed.running_operation
+        wait_for_operation(osm, observed.name, str(observed.running_operation["_id"]), wait_policy)
     elif action == Action.DELETE:
-        osm.remove(INSTANCES, there.id)
+        osm.remove(INSTANCES, observed.id)
     elif action == Action.TERMINATE:
-        follow(osm, there.name, osm.act(there.id, "terminate", {}), patience)
+        wait_for_operation(osm, observed.name, osm.start_operation(observed.id, "terminate", {}), wait_policy)
     else:
-        assert wanted
+        assert desired
         new = action == Action.INSTANTIATE
-        what, body = ("instantiate", wanted.request(record)) if new else wanted.change(action)
-        operation = osm.act(there.id, what, body)
-        if patience.wait:
-            follow(osm, there.name, operation, patience)
+        kind, body = ("instantiate", desired.request(record)) if new else desired.change_request(action)
+        operation = osm.start_operation(observed.id, kind, body)
+        if wait_policy.wait:
+            wait_for_operation(osm, observed.name, operation, wait_policy)
 
 
-def follow(osm: Osm, name: str, operation: str, patience: Patience, say: Say = lambda _: None) -> None:
-    """Wait for an operation's end.
+def wait_for_operation(
+    osm: Osm, name: str, operation: str, wait_policy: WaitPolicy, notify: Notify = lambda _: None
+) -> None:
+    """Wait until an operation has ended.
 
     Raises:
-        Failed: it failed. StepError: it takes longer than `patience.timeout`.
+        OperationFailed: it failed. StepError: it exceeds `wait_policy.timeout`.
     """
-    ends, pause = time.monotonic() + patience.timeout, POLL
-    while not patience.stop():
-        told = osm.operation(operation)
-        kind, state = str(told.get("lcmOperationType")), str(told.get("operationState"))
+    ends, interval = time.monotonic() + wait_policy.timeout, POLL_INTERVAL_S
+    while not wait_policy.stop():
+        record = osm.operation(operation)
+        kind, state = str(record.get("lcmOperationType")), str(record.get("operationState"))
         if state in DONE:
             return
-        detail = str(told.get("errorMessage") or told.get("detailed-status") or "")[:300]
+        detail = str(record.get("errorMessage") or record.get("detailed-status") or "")[:300]
         if state not in RUNNING:
-            cause = f"OSM gave up its {kind} ({state}: {detail or 'no reason given'})"
-            raise Failed(name, cause, "Its lifecycle manager's log says why; mend it and run again", kind)
-        say(f"{kind} {detail}".strip())
+            cause = f"OSM's {kind} failed ({state}: {detail or 'no reason given'})"
+            raise OperationFailed(
+                name, cause, "See the log of OSM's lifecycle manager; fix the cause and run again", kind
+            )
+        notify(f"{kind} {detail}".strip())
         if time.monotonic() > ends:
-            cause = f"its {kind} isn't over after {patience.timeout:g} s{f' ({detail})' if detail else ''}"
-            raise StepError(name, cause, "Run again to go on waiting; nothing was undone")
-        time.sleep(pause)
-        pause = min(LONGEST_POLL, 1.2 * pause)
+            cause = f"{kind} still running after {wait_policy.timeout:g} s{f' ({detail})' if detail else ''}"
+            raise StepError(name, cause, "Run again to continue waiting; nothing was undone")
+        time.sleep(interval)
+        interval = min(MAX_POLL_INTERVAL_S, 1.2 * interval)

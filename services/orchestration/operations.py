@@ -1,6 +1,6 @@
-"""What is done to one service by hand: brought in, started, scaled, healed, ended, removed (D3.2, section 2.3).
+"""Single operations: onboard, instantiate, scale, heal, terminate and delete services (D3.2, section 2.3).
 
-Each may be repeated: what is so already stays.
+All operations are idempotent.
 """
 
 from __future__ import annotations
@@ -12,25 +12,32 @@ from typing import Any
 
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.services.orchestration import onboarding
-from scan2sim.services.orchestration.chart import REPLICAS
+from scan2sim.services.orchestration.chart import REPLICA_COUNT_KEY
 from scan2sim.services.orchestration.descriptor import Descriptor
-from scan2sim.services.orchestration.instance import Instance, Wanted, scale, upgrade
-from scan2sim.services.orchestration.lifecycle import Patience, Say, bring, find, find_own, follow
+from scan2sim.services.orchestration.instance import DesiredInstance, Instance, scale_request, upgrade_request
+from scan2sim.services.orchestration.lifecycle import (
+    Notify,
+    WaitPolicy,
+    find,
+    find_owned,
+    reconcile,
+    wait_for_operation,
+)
 from scan2sim.services.orchestration.osm import FUNCTIONS, SERVICES, Osm, collection_of
 from scan2sim.services.orchestration.package import Package
 
-BY_HAND = "-"
-"""Stands for a deployment's name where there is none."""
-ABSENT = ("OSM has no such package or instance", "`scan2sim orchestrate list` lists them")
+NO_DEPLOYMENT = "-"
+"""Takes the place of the deployment's name for instances and packages that were created by a single command."""
+NOT_FOUND = ("OSM has no such package or instance", "`scan2sim orchestrate list` lists them")
 
 
 @dataclass(frozen=True)
 class Function:
-    """Of a network service: its descriptor's record in OSM.
+    """Function of a network service, from its descriptor's record in OSM.
 
     Attributes:
-        name: of its chart, or of its machine.
-        container: whether it is a chart.
+        name: name of its chart or machine.
+        container: True for a chart, False for a machine.
     """
 
     name: str
@@ -38,29 +45,31 @@ class Function:
 
 
 def onboard(osm: Osm, packages: Sequence[Package]) -> dict[str, str]:
-    """Onboard a service's packages, functions first; returns their records by their descriptors' ids.
+    """Onboard a service's packages, functions first; returns record ids by descriptor type and id.
 
     Raises:
-        InputError: a network service names a function that is neither among them nor in OSM.
+        InputError: a network service refers to a function that is neither among the packages nor in OSM.
     """
-    ordered = sorted(packages, key=lambda one: one.descriptor.sort, reverse=True)
-    ids = [(one.descriptor.sort, one.descriptor.id) for one in packages]
-    twice = next((one for one in ids if ids.count(one) > 1), None)
-    if twice is not None:
-        raise InputError(twice[1], f"is the id of two packages ({twice[0]})", "Give each descriptor an id of its own")
+    ordered = sorted(packages, key=lambda one: one.descriptor.type, reverse=True)
+    ids = [(one.descriptor.type, one.descriptor.id) for one in packages]
+    duplicate = next((one for one in ids if ids.count(one) > 1), None)
+    if duplicate is not None:
+        raise InputError(duplicate[1], f"two packages ({duplicate[0]}) have this id", "Give each descriptor its own id")
     known = {str(one.get("id")) for one in osm.packages(FUNCTIONS)} | {
-        one.descriptor.id for one in packages if one.descriptor.sort == "vnfd"
+        one.descriptor.id for one in packages if one.descriptor.type == "vnfd"
     }
     for one in ordered:
         _check_functions(one.descriptor, known, one.name)
-    return {f"{one.descriptor.sort} {one.descriptor.id}": onboarding.onboard(osm, one, BY_HAND) for one in ordered}
+    return {
+        f"{one.descriptor.type} {one.descriptor.id}": onboarding.onboard(osm, one, NO_DEPLOYMENT) for one in ordered
+    }
 
 
-def _check_functions(found: Descriptor, known: set[str], where: str) -> None:
-    for name in found.functions:
+def _check_functions(descriptor: Descriptor, known: set[str], where: str) -> None:
+    for name in descriptor.functions:
         if name not in known:
-            cause = f"is of the function {name}, which is neither given nor in OSM"
-            raise InputError(where, cause, "Give its package (VNFD), too")
+            cause = f"refers to the function {name}, which is neither given nor in OSM"
+            raise InputError(where, cause, "Also give its package (VNFD)")
 
 
 def instantiate(
@@ -73,114 +82,126 @@ def instantiate(
     keys: tuple[str, ...] = (),
     values: Mapping[str, Any] | None = None,
     namespace: str = "",
-    patience: Patience,
-    say: Say,
+    wait_policy: WaitPolicy,
+    notify: Notify,
 ) -> None:
-    """Have an instance of a network service run.
+    """Create and start an instance of a network service.
 
     Args:
-        name: that it is given; nsd: its descriptor's id; vim: VIM account's id.
+        name: name of the instance; nsd: id of its descriptor; vim: id of the VIM account.
 
     Raises:
-        SettingError: there is no such descriptor. StepError: the name is another one's, or OSM gave up.
+        SettingError: there is no such descriptor.
+        StepError: the name belongs to another owner, or OSM reports a failure.
     """
     record = _record(osm, SERVICES, nsd)
     function = function_of(osm, nsd)
     kind = "container" if function.container else "machine"
-    wanted = Wanted(name, BY_HAND, function.name, kind, nsd, vim, replicas, keys, values, namespace)  # type: ignore[arg-type]
-    bring(osm, partial(find_own, osm, name, BY_HAND), wanted, str(record["_id"]), patience, say)
+    desired = DesiredInstance(
+        name,
+        NO_DEPLOYMENT,
+        function.name,
+        kind,  # type: ignore[arg-type]
+        nsd,
+        vim,
+        replicas,
+        keys,
+        values,
+        namespace,
+    )
+    reconcile(osm, partial(find_owned, osm, name, NO_DEPLOYMENT), desired, str(record["_id"]), wait_policy, notify)
 
 
-def resize(osm: Osm, name: str, replicas: int, patience: Patience, say: Say) -> None:
-    """Have so many of an instance's function.
-
-    Raises:
-        SettingError: there is no such instance, or it isn't running.
-    """
-    there = _running(osm, name)
-    function = function_of(osm, there.nsd)
-    if function.container:
-        if there.values.get(REPLICAS) != replicas:
-            body = upgrade(function.name, there.values | {REPLICAS: replicas})
-            _wait(osm, there, "action", body, patience, say)
-        return
-    by = 1 if replicas > there.machines else -1
-    for _ in range(abs(replicas - there.machines)):
-        _wait(osm, there, "scale", scale(by), Patience(patience.timeout, True, patience.stop), say)
-
-
-def heal(osm: Osm, name: str, patience: Patience, say: Say) -> None:
-    """Have an instance's function made whole: machines anew; a chart is applied again, as Kubernetes heals pods itself.
+def scale(osm: Osm, name: str, replicas: int, wait_policy: WaitPolicy, notify: Notify) -> None:
+    """Set the number of replicas of an instance's function.
 
     Raises:
-        SettingError: there is no such instance, or it isn't running.
+        SettingError: there is no such instance, or it isn't instantiated.
     """
-    there = _running(osm, name)
-    function = function_of(osm, there.nsd)
+    instance = _instantiated(osm, name)
+    function = function_of(osm, instance.nsd)
     if function.container:
-        _wait(osm, there, "action", upgrade(function.name, there.values), patience, say)
+        if instance.values.get(REPLICA_COUNT_KEY) != replicas:
+            body = upgrade_request(function.name, instance.values | {REPLICA_COUNT_KEY: replicas})
+            _run(osm, instance, "action", body, wait_policy, notify)
         return
-    record = next(one for one in osm.instances() if one["_id"] == there.id)
+    by = 1 if replicas > instance.machine_count else -1
+    for _ in range(abs(replicas - instance.machine_count)):
+        _run(osm, instance, "scale", scale_request(by), WaitPolicy(wait_policy.timeout, True, wait_policy.stop), notify)
+
+
+def heal(osm: Osm, name: str, wait_policy: WaitPolicy, notify: Notify) -> None:
+    """Repair an instance: restart machines; upgrade a chart to its current values (Kubernetes heals pods itself).
+
+    Raises:
+        SettingError: there is no such instance, or it isn't instantiated.
+    """
+    instance = _instantiated(osm, name)
+    function = function_of(osm, instance.nsd)
+    if function.container:
+        _run(osm, instance, "action", upgrade_request(function.name, instance.values), wait_policy, notify)
+        return
+    record = next(one for one in osm.instances() if one["_id"] == instance.id)
     broken = [{"vnfInstanceId": key, "cause": "asked for"} for key in record.get("constituent-vnfr-ref", ())]
-    _wait(osm, there, "heal", {"healVnfData": broken}, patience, say)
+    _run(osm, instance, "heal", {"healVnfData": broken}, wait_policy, notify)
 
 
-def terminate(osm: Osm, name: str, patience: Patience, say: Say) -> None:
-    """End an instance, and keep its record.
-
-    Raises:
-        SettingError: there is no such instance.
-    """
-    there = _there(osm, name)
-    if there.running:
-        follow(osm, there.name, str(there.running["_id"]), patience, say)
-        there = _there(osm, name)
-    if there.instantiated:
-        _wait(osm, there, "terminate", {}, Patience(patience.timeout, True, patience.stop), say)
-
-
-def delete_instance(osm: Osm, name: str, patience: Patience, say: Say) -> None:
-    """End an instance and forget it, with what may still be begun for it waited for.
+def terminate(osm: Osm, name: str, wait_policy: WaitPolicy, notify: Notify) -> None:
+    """Terminate an instance and keep its record.
 
     Raises:
         SettingError: there is no such instance.
     """
-    there = _there(osm, name)
-    bring(osm, partial(find, osm, there.id), None, "", patience, say)
+    instance = _find(osm, name)
+    if instance.running_operation:
+        wait_for_operation(osm, instance.name, str(instance.running_operation["_id"]), wait_policy, notify)
+        instance = _find(osm, name)
+    if instance.instantiated:
+        _run(osm, instance, "terminate", {}, WaitPolicy(wait_policy.timeout, True, wait_policy.stop), notify)
+
+
+def delete_instance(osm: Osm, name: str, wait_policy: WaitPolicy, notify: Notify) -> None:
+    """Wait for an instance's running operations, terminate it and delete its record.
+
+    Raises:
+        SettingError: there is no such instance.
+    """
+    instance = _find(osm, name)
+    reconcile(osm, partial(find, osm, instance.id), None, "", wait_policy, notify)
 
 
 def delete_packages(osm: Osm, ids: Sequence[str]) -> None:
-    """Remove network services and functions by their descriptors' ids, in that order.
+    """Delete network services, then functions, by the ids of their descriptors.
 
     Raises:
-        SettingError: there is none of an id. Refused: something uses it.
+        SettingError: an id doesn't exist. OsmError: a package is still in use.
     """
     found = [(where, one) for where in (SERVICES, FUNCTIONS) for one in osm.packages(where) if one.get("id") in ids]
     missing = set(ids) - {str(one.get("id")) for _, one in found}
     if missing:
-        raise SettingError(min(missing), *ABSENT)
+        raise SettingError(min(missing), *NOT_FOUND)
     for where, one in found:
         osm.remove(where, str(one["_id"]))
 
 
-def delete(osm: Osm, packages: Sequence[Package], patience: Patience, say: Say) -> None:
-    """Undo a service by its packages: its instances, its network service, its functions."""
-    services = {one.descriptor.id for one in packages if one.descriptor.sort == "nsd"}
-    for record in osm.instances():
-        if Instance.of(record, ()).nsd in services:
-            delete_instance(osm, str(record["_id"]), patience, say)
-    for one in sorted(packages, key=lambda one: one.descriptor.sort):
-        record_there = onboarding.record_of(one, osm.packages(collection_of(one)))
-        if record_there:
-            say(f"removes {one.descriptor.id}")
-            osm.remove(collection_of(one), str(record_there["_id"]))
+def delete(osm: Osm, packages: Sequence[Package], wait_policy: WaitPolicy, notify: Notify) -> None:
+    """Delete all that belongs to the given packages: instances, network services, functions."""
+    services = {one.descriptor.id for one in packages if one.descriptor.type == "nsd"}
+    for running in osm.instances():
+        if Instance.of(running, ()).nsd in services:
+            delete_instance(osm, str(running["_id"]), wait_policy, notify)
+    for one in sorted(packages, key=lambda one: one.descriptor.type):
+        record = onboarding.record_of(one, osm.packages(collection_of(one)))
+        if record:
+            notify(f"removing {one.descriptor.id}")
+            osm.remove(collection_of(one), str(record["_id"]))
 
 
 def function_of(osm: Osm, nsd: str) -> Function:
-    """The function of a network service.
+    """Function of a network service, given by the id of its descriptor.
 
     Raises:
-        SettingError: it isn't in OSM.
+        SettingError: OSM doesn't have the package.
     """
     names = _record(osm, SERVICES, nsd).get("vnfd-id") or [""]
     record = _record(osm, FUNCTIONS, str(names[0]))
@@ -191,25 +212,27 @@ def function_of(osm: Osm, nsd: str) -> Function:
 def _record(osm: Osm, collection: str, name: str) -> Mapping[str, Any]:
     found = next((one for one in osm.packages(collection) if name in (one.get("id"), one["_id"])), None)
     if found is None:
-        raise SettingError(name, "is no package in OSM", "Onboard it: scan2sim orchestrate onboard")
+        raise SettingError(name, "OSM has no such package", "Onboard it: scan2sim orchestrate onboard")
     return found
 
 
-def _there(osm: Osm, name: str) -> Instance:
-    there = find(osm, name)
-    if there is None:
-        raise SettingError(name, *ABSENT)
-    return there
+def _find(osm: Osm, name: str) -> Instance:
+    instance = find(osm, name)
+    if instance is None:
+        raise SettingError(name, *NOT_FOUND)
+    return instance
 
 
-def _running(osm: Osm, name: str) -> Instance:
-    there = _there(osm, name)
-    if not there.instantiated:
-        raise SettingError(name, f"isn't running ({there.state or 'created only'})", "Instantiate it first")
-    return there
+def _instantiated(osm: Osm, name: str) -> Instance:
+    instance = _find(osm, name)
+    if not instance.instantiated:
+        raise SettingError(name, f"not running (state: {instance.state or 'created'})", "Instantiate it first")
+    return instance
 
 
-def _wait(osm: Osm, there: Instance, what: str, body: Mapping[str, Any], patience: Patience, say: Say) -> None:
-    operation = osm.act(there.id, what, body)
-    if patience.wait:
-        follow(osm, there.name, operation, patience, say)
+def _run(
+    osm: Osm, instance: Instance, kind: str, body: Mapping[str, Any], wait_policy: WaitPolicy, notify: Notify
+) -> None:
+    operation = osm.start_operation(instance.id, kind, body)
+    if wait_policy.wait:
+        wait_for_operation(osm, instance.name, operation, wait_policy, notify)

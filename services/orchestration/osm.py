@@ -1,7 +1,7 @@
-"""OSM's northbound interface (ETSI GS NFV-SOL 005), as far as services need it: a client.
+"""Client of OSM's northbound interface (ETSI GS NFV-SOL 005).
 
-What may be done twice is tried again; what makes or fills something (POST, PUT) never is, as its answer may be lost and
-its work not: who asked looks at what is there and goes on from that (`lifecycle`).
+Idempotent requests (GET, DELETE) are retried. POST and PUT are never retried: if their response is lost, the
+request may have succeeded, so the caller reads the current state and continues from there (`lifecycle`).
 """
 
 from __future__ import annotations
@@ -28,51 +28,51 @@ OPERATIONS = "/osm/nslcm/v1/ns_lcm_op_occs"
 VIMS = "/osm/admin/v1/vim_accounts"
 CLUSTERS = "/osm/admin/v1/k8sclusters"
 
-logging.getLogger("httpcore").setLevel(logging.WARNING)  # it would log the token, which OSM sends as an address, too
+logging.getLogger("httpcore").setLevel(logging.WARNING)  # it would log the token, which is part of some URLs
 
-PATIENCE = 30.0
-"""Seconds for an answer."""
-TRIES = 4
-"""Of what may be done twice."""
-TOKENS_TRIED = 3
-"""Of a request that is refused for its token."""
-PAUSE = 0.5
-"""Seconds before it is asked again, twice as many each time."""
-EARLY = 60.0
-"""Seconds before its end at which a token is renewed."""
-TOLD = 300
-"""Characters of what OSM says of a fault."""
+RESPONSE_TIMEOUT_S = 30.0
+"""Seconds to wait for a response."""
+MAX_ATTEMPTS = 4
+"""Attempts of an idempotent request."""
+MAX_TOKEN_RENEWALS = 3
+"""Attempts with a renewed token after a request was rejected with 401."""
+RETRY_DELAY_S = 0.5
+"""Seconds before the first retry; doubled for each further one."""
+TOKEN_RENEWAL_MARGIN_S = 60.0
+"""Seconds before its expiry at which a token is renewed."""
+ERROR_DETAIL_MAX_CHARS = 300
+"""Maximum length of OSM's error detail in messages."""
 
-FAULTS: dict[int, tuple[str, str]] = {
+HTTP_ERRORS: dict[int, tuple[str, str]] = {
     400: (
-        "OSM takes the request for malformed",
-        "It may be of another release than those in docs/orchestration.md",
+        "OSM rejected the request as malformed",
+        "Check that its release is one of those in docs/orchestration.md",
     ),
-    401: ("OSM refuses user, password or project", "Check --user, --project and the password"),
-    403: ("this user may not do that in this project", "Ask OSM's administrator for a role that may"),
-    404: ("OSM has no such thing (any more)", "`scan2sim orchestrate list` says what there is"),
-    405: ("this OSM can't do that", "It may be of an older release"),
+    401: ("OSM rejected user, password or project", "Check --user, --project and the password"),
+    403: ("permission denied in this project", "Ask OSM's administrator for a role with this permission"),
+    404: ("not found in OSM", "`scan2sim orchestrate list` lists what exists"),
+    405: ("not supported by this OSM", "Its release may be too old"),
     406: ("OSM can't answer in JSON", "Check that --osm is the northbound interface's address"),
-    409: ("OSM says that this contradicts what is there", "`scan2sim orchestrate list` says what there is"),
-    413: ("it is too large for OSM", "Make the package smaller, or raise the limit of what stands before OSM"),
-    416: ("OSM has no such part of it", "Run again"),
-    422: ("OSM can't work with what was sent", "Mend what it names"),
-    429: ("OSM was asked too often", "Run again in a while, with a smaller --parallel"),
-    500: ("OSM failed", "Its log says why; run again"),
-    502: ("what stands before OSM can't reach it", "Run again in a while"),
-    503: ("OSM is busy or being started", "Run again in a while"),
-    504: ("OSM didn't answer what stands before it in time", "Run again in a while"),
+    409: ("conflict with the current state of OSM", "`scan2sim orchestrate list` lists what exists"),
+    413: ("too large for OSM", "Make the package smaller, or raise the size limit of the proxy in front of OSM"),
+    416: ("OSM rejected the requested range", "Run again"),
+    422: ("OSM can't process the request", "Fix what the message names"),
+    429: ("too many requests to OSM", "Run again later, with a smaller --parallel"),
+    500: ("internal error of OSM", "See its log; run again"),
+    502: ("the proxy in front of OSM can't reach it", "Run again later"),
+    503: ("OSM is busy or starting", "Run again later"),
+    504: ("OSM didn't respond to its proxy in time", "Run again later"),
 }
-"""By status: what it means, and what to do."""
-PASSING = (429, 502, 503, 504)
-"""Statuses that may be others a moment later."""
+"""Cause and remedy by HTTP status."""
+TRANSIENT_STATUSES = (429, 502, 503, 504)
+"""HTTP statuses after which a request is retried."""
 
 
-class Refused(StepError):
-    """What OSM answered in place of doing it.
+class OsmError(StepError):
+    """Error response of OSM.
 
     Attributes:
-        status: of HTTP.
+        status: HTTP status.
     """
 
     def __init__(self, where: str, cause: str, remedy: str, status: int = 500) -> None:
@@ -81,30 +81,33 @@ class Refused(StepError):
         self.status = status
 
 
-class Unsure(StepError):
-    """A connection that broke before an answer came: what was asked for may have been done."""
+class ResponseLost(StepError):
+    """The connection broke before a response was received; the request may have been executed."""
 
 
 class Osm:
-    """A user's view of OSM; may be asked from many threads."""
+    """OSM client of one user; thread-safe."""
 
-    def __init__(self, connection: Connection, *, asked: Callable[[], None] | None = None) -> None:
-        """Of a connection; nothing is sent yet. `asked` is called before each request.
+    def __init__(self, connection: Connection, *, before_request: Callable[[], None] | None = None) -> None:
+        """Prepare a client; nothing is sent yet. `before_request` is called before each request.
 
         Raises:
-            ScanError: as the connection's parts.
+            ScanError: address, password or certificate are missing or invalid.
         """
-        self._address, self._password = connection.northbound(), connection.login()
+        self._address, self._password = connection.northbound_url(), connection.read_password()
         self._user = connection.user or os.environ.get("OSM_USER", "admin")
         self._project = connection.project or os.environ.get("OSM_PROJECT", "admin")
         self._client = httpx.Client(
-            base_url=self._address, verify=connection.trust(), timeout=PATIENCE, headers={"Accept": "application/json"}
+            base_url=self._address,
+            verify=connection.ssl_context(),
+            timeout=RESPONSE_TIMEOUT_S,
+            headers={"Accept": "application/json"},
         )
-        self._asked, self._lock = asked, threading.Lock()
+        self._before_request, self._lock = before_request, threading.Lock()
         self._token, self._expires = "", 0.0
 
     def close(self) -> None:
-        """Close what is open."""
+        """Close the connections."""
         self._client.close()
 
     def __enter__(self) -> Osm:
@@ -116,181 +119,184 @@ class Osm:
     # packages
 
     def packages(self, collection: str) -> list[dict[str, Any]]:
-        """All of `FUNCTIONS` or `SERVICES`."""
+        """Package records in `FUNCTIONS` or `SERVICES`."""
         return self._list(collection)
 
-    def onboard(self, package: Package, marks: Mapping[str, str]) -> str:
-        """Make a record for a package and send it; returns the record's id.
+    def onboard(self, package: Package, tags: Mapping[str, str]) -> str:
+        """Create a record for a package and upload the package; returns the record's id.
 
         Args:
-            marks: what is kept beside it, so that it can be told whose it is before it has a name.
+            tags: user-defined data of the record, which identify its owner before the upload has given it a name.
         """
         collection = collection_of(package)
-        made = self._ask("POST", collection, {"userDefinedData": dict(marks)})
+        made = self._request("POST", collection, {"userDefinedData": dict(tags)})
         self.fill(package, made["id"])
         return str(made["id"])
 
     def fill(self, package: Package, record: str) -> None:
-        """Send a package's content to a record that has none."""
-        content = "package_content" if package.descriptor.sort == "vnfd" else "nsd_content"
+        """Upload a package's content to an empty record."""
+        content = "package_content" if package.descriptor.type == "vnfd" else "nsd_content"
         headers = {"Content-Type": "application/gzip", "Content-File-MD5": package.md5}
-        self._ask("PUT", f"{collection_of(package)}/{record}/{content}", package.data, headers)
+        self._request("PUT", f"{collection_of(package)}/{record}/{content}", package.data, headers)
 
     def remove(self, collection: str, record: str) -> None:
-        """Delete a package's record, or an instance's; one that is gone is well."""
+        """Delete the record of a package or an instance; no error if it doesn't exist."""
         try:
-            self._ask("DELETE", f"{collection}/{record}")
-        except Refused as error:
+            self._request("DELETE", f"{collection}/{record}")
+        except OsmError as error:
             if error.status != 404:
                 raise
 
     # instances
 
     def instances(self) -> list[dict[str, Any]]:
-        """All of network services."""
+        """Records of all network service instances."""
         return self._list(INSTANCES)
 
-    def instance(self, which: str) -> dict[str, Any]:
-        """One of them."""
-        return dict(self._ask("GET", f"{INSTANCES}/{which}"))
+    def instance(self, instance_id: str) -> dict[str, Any]:
+        """Record of an instance."""
+        return dict(self._request("GET", f"{INSTANCES}/{instance_id}"))
 
     def operations(self, instance: str) -> list[dict[str, Any]]:
-        """Of an instance, in the order in which they began."""
+        """Operations of an instance in the order of their start."""
         found = self._list(f"{OPERATIONS}?nsInstanceId={instance}")
         ours = [one for one in found if one.get("nsInstanceId") == instance]
         return sorted(ours, key=lambda one: one.get("startTime", 0))
 
-    def operation(self, which: str) -> dict[str, Any]:
-        """One of them."""
-        return dict(self._ask("GET", f"{OPERATIONS}/{which}"))
+    def operation(self, operation_id: str) -> dict[str, Any]:
+        """Record of an operation."""
+        return dict(self._request("GET", f"{OPERATIONS}/{operation_id}"))
 
     def create(self, body: Mapping[str, Any]) -> str:
-        """An instance that isn't instantiated; returns its id."""
-        return str(self._ask("POST", INSTANCES, body)["id"])
+        """Create an instance that isn't instantiated yet; returns its id."""
+        return str(self._request("POST", INSTANCES, body)["id"])
 
-    def act(self, instance: str, what: str, body: Mapping[str, Any]) -> str:
-        """Begin `instantiate`, `terminate`, `scale`, `heal` or `action`; returns the operation's id."""
-        return str(self._ask("POST", f"{INSTANCES}/{instance}/{what}", body)["id"])
+    def start_operation(self, instance: str, kind: str, body: Mapping[str, Any]) -> str:
+        """Start `instantiate`, `terminate`, `scale`, `heal` or `action`; returns the operation's id."""
+        return str(self._request("POST", f"{INSTANCES}/{instance}/{kind}", body)["id"])
 
     # sites
 
     def vim(self, name: str) -> str:
-        """Id of a VIM account by its name or id.
+        """Id of the VIM account with this name or id.
 
         Raises:
-            SettingError: there is none.
+            SettingError: there is none or more than one.
         """
-        return str(self._named(VIMS, name, "VIM account")["_id"])
+        return str(self._find(VIMS, name, "VIM account")["_id"])
 
     def cluster(self, name: str) -> str:
-        """Id of the VIM account of a Kubernetes cluster by its name or id.
+        """Id of the VIM account of the Kubernetes cluster with this name or id.
 
         Raises:
-            SettingError: there is none.
+            SettingError: there is none or more than one.
         """
-        return str(self._named(CLUSTERS, name, "Kubernetes cluster")["vim_account"])
+        return str(self._find(CLUSTERS, name, "Kubernetes cluster")["vim_account"])
 
-    def _named(self, collection: str, name: str, what: str) -> dict[str, Any]:
+    def _find(self, collection: str, name: str, kind: str) -> dict[str, Any]:
         found = self._list(collection)
         chosen = [one for one in found if name in (one.get("name"), one.get("_id"))]
         if len(chosen) != 1:
             known = ", ".join(sorted(str(one.get("name")) for one in found)) or "none"
             count = "no" if not chosen else "more than one"
-            raise SettingError(name, f"there is {count} {what} of that name in OSM", f"There are: {known}")
+            raise SettingError(name, f"OSM has {count} {kind} of this name", f"Available: {known}")
         return chosen[0]
 
     # requests
 
     def _list(self, path: str) -> list[dict[str, Any]]:
-        found = self._ask("GET", path)
+        found = self._request("GET", path)
         if not isinstance(found, list):
-            raise Refused(path, "OSM's answer is no list", "Check that --osm is the northbound interface's address")
+            raise OsmError(
+                path, "OSM's response isn't a list", "Check that --osm is the northbound interface's address"
+            )
         return found
 
-    def _ask(self, method: str, path: str, body: Any = None, headers: Mapping[str, str] = {}) -> Any:
-        """Ask with a token that is good, again where that does no harm."""
-        for left in reversed(range(TRIES if method in ("GET", "DELETE") else 1)):
+    def _request(self, method: str, path: str, body: Any = None, headers: Mapping[str, str] = {}) -> Any:
+        """Send a request with a valid token; retry it if it is idempotent."""
+        for left in reversed(range(MAX_ATTEMPTS if method in ("GET", "DELETE") else 1)):
             try:
-                return self._ask_once(method, path, body, headers)
-            except Unsure:
+                return self._request_once(method, path, body, headers)
+            except ResponseLost:
                 if not left:
                     raise
-            except Refused as error:
-                if not left or error.status not in PASSING:
+            except OsmError as error:
+                if not left or error.status not in TRANSIENT_STATUSES:
                     raise
-            pause(TRIES - left - 1)
+            back_off(MAX_ATTEMPTS - left - 1)
         raise AssertionError
 
-    def _ask_once(self, method: str, path: str, body: Any, headers: Mapping[str, str]) -> Any:
-        token = self._fresh()
-        answer = self._send(method, path, body, headers, token)
-        for _ in range(TOKENS_TRIED):
-            if answer.status_code != 401:
+    def _request_once(self, method: str, path: str, body: Any, headers: Mapping[str, str]) -> Any:
+        token = self._valid_token()
+        response = self._send(method, path, body, headers, token)
+        for _ in range(MAX_TOKEN_RENEWALS):
+            if response.status_code != 401:
                 break
-            token = self._fresh(refused=token)  # it may have been taken back before its time
-            answer = self._send(method, path, body, headers, token)
-        return _content(answer, f"{method} {path}")
+            token = self._valid_token(rejected=token)  # OSM may revoke a token before its expiry
+            response = self._send(method, path, body, headers, token)
+        return _content(response, f"{method} {path}")
 
-    def _fresh(self, refused: str = "") -> str:
-        """A token that is good for a while, and not the one that was refused."""
+    def _valid_token(self, rejected: str = "") -> str:
+        """A token that isn't about to expire and isn't the rejected one; logs in if necessary."""
         with self._lock:
-            if time.time() > self._expires - EARLY or self._token == refused:
-                given = {"username": self._user, "password": self._password, "project_id": self._project}
-                told = _content(self._send("POST", TOKENS, given, {}, None), f"POST {TOKENS}")
-                self._token = str(told["id"])
-                now, ends = time.time(), float(told.get("expires", 0))
-                self._expires = ends if ends > now + EARLY else now + 2 * EARLY  # its clock may be another one
+            if time.time() > self._expires - TOKEN_RENEWAL_MARGIN_S or self._token == rejected:
+                credentials = {"username": self._user, "password": self._password, "project_id": self._project}
+                created = _content(self._send("POST", TOKENS, credentials, {}, None), f"POST {TOKENS}")
+                self._token = str(created["id"])
+                now, ends = time.time(), float(created.get("expires", 0))
+                # OSM's clock may differ from this one
+                self._expires = ends if ends > now + TOKEN_RENEWAL_MARGIN_S else now + 2 * TOKEN_RENEWAL_MARGIN_S
             return self._token
 
     def _send(self, method: str, path: str, body: Any, headers: Mapping[str, str], token: str | None) -> httpx.Response:
-        if self._asked:
-            self._asked()
-        sent = dict(headers) | ({"Authorization": f"Bearer {token}"} if token else {})
+        if self._before_request:
+            self._before_request()
+        all_headers = dict(headers) | ({"Authorization": f"Bearer {token}"} if token else {})
         content = {"content": body} if isinstance(body, bytes) else {"json": body} if body is not None else {}
         try:
-            return self._client.request(method, path, headers=sent, **content)
+            return self._client.request(method, path, headers=all_headers, **content)
         except httpx.ConnectError as error:
             if "CERTIFICATE" in str(error).upper():
                 cause = f"its certificate isn't trusted ({error})"
-                raise UnavailableError(self._address, cause, "Give --ca, the authority that signed it") from None
-            cause = f"can't be reached ({error})"
-            raise UnavailableError(self._address, cause, "Check --osm, and that it runs") from None
+                raise UnavailableError(self._address, cause, "Give --ca, its certificate authority") from None
+            cause = f"can't connect ({error})"
+            raise UnavailableError(self._address, cause, "Check --osm, and that OSM is running") from None
         except httpx.HTTPError as error:
-            cause = f"the connection broke before an answer came ({type(error).__name__})"
-            raise Unsure(f"{method} {path}", cause, "Run again: it goes on from what is there") from None
+            cause = f"the connection broke before a response was received ({type(error).__name__})"
+            raise ResponseLost(f"{method} {path}", cause, "Run again to continue from the current state") from None
 
 
-def pause(times: int) -> None:
-    """Wait before something is tried again, so many times after the first."""
-    time.sleep(PAUSE * 2**times)
+def back_off(retry: int) -> None:
+    """Wait before retry number `retry`, counted from 0: exponential backoff."""
+    time.sleep(RETRY_DELAY_S * 2**retry)
 
 
 def collection_of(package: Package) -> str:
-    """Where its kind of packages is kept."""
-    return FUNCTIONS if package.descriptor.sort == "vnfd" else SERVICES
+    """Collection of OSM that stores this kind of package."""
+    return FUNCTIONS if package.descriptor.type == "vnfd" else SERVICES
 
 
-def _content(answer: httpx.Response, where: str) -> Any:
-    """What an answer says.
+def _content(response: httpx.Response, where: str) -> Any:
+    """Decoded body of a response.
 
     Raises:
-        Refused: it is a refusal.
+        OsmError: it is an error response.
     """
-    if answer.is_success:
-        if not answer.content:
+    if response.is_success:
+        if not response.content:
             return {}
         try:
-            return answer.json()
+            return response.json()
         except ValueError:
-            raise Refused(where, "OSM's answer is no JSON", FAULTS[406][1], answer.status_code) from None
-    cause, remedy = FAULTS.get(answer.status_code, ("OSM answered what it doesn't say it would", FAULTS[500][1]))
-    raise Refused(where, f"{cause} ({answer.status_code}{_detail(answer)})", remedy, answer.status_code)
+            raise OsmError(where, "OSM's response isn't JSON", HTTP_ERRORS[406][1], response.status_code) from None
+    cause, remedy = HTTP_ERRORS.get(response.status_code, ("unexpected response of OSM", HTTP_ERRORS[500][1]))
+    raise OsmError(where, f"{cause} ({response.status_code}{_detail(response)})", remedy, response.status_code)
 
 
-def _detail(answer: httpx.Response) -> str:
+def _detail(response: httpx.Response) -> str:
     try:
-        told = answer.json()
-        detail = told.get("detail") if isinstance(told, dict) else None
+        body = response.json()
+        detail = body.get("detail") if isinstance(body, dict) else None
     except (ValueError, json.JSONDecodeError):
         detail = None
-    return f": {printable(str(detail))[:TOLD]}" if detail else ""
+    return f": {printable(str(detail))[:ERROR_DETAIL_MAX_CHARS]}" if detail else ""

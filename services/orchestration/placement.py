@@ -1,6 +1,6 @@
-"""Where a service may run: what sites can do, as measured, held against what the service needs (D3.2, section 2.2).
+"""Compare measured sites with a service's requirements to find where it may run (D3.2, section 2.2).
 
-A site is what `scan2sim qos measure TOOLBOX --environment ... --out FILE` wrote of it: the toolbox ran there.
+A site is a file written by `scan2sim qos measure TOOLBOX --environment ... --out FILE`, which ran the toolbox there.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from pydantic import BaseModel, ValidationError
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.services.qos.requirements import UNITS, Environment
 
-LARGEST = 1_000_000
-"""Bytes of a measurement's file."""
+MAX_FILE_BYTES = 1_000_000
+"""Maximum size of a measurement file."""
 
 
 class _Row(BaseModel):
@@ -27,11 +27,12 @@ class _Row(BaseModel):
 
 
 class Site(BaseModel):
-    """What was measured of a service somewhere.
+    """Measurement of a service at a site.
 
     Attributes:
-        toolbox: that ran; environment: where.
-        rows: metric by metric, what is required and what was measured.
+        toolbox: toolbox that was measured.
+        environment: environment of the site.
+        rows: required and measured value of each metric.
     """
 
     toolbox: str
@@ -40,61 +41,62 @@ class Site(BaseModel):
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """On a site.
+class Placement:
+    """Result of the comparison for one site.
 
     Attributes:
-        environment: that it is.
-        fits: whether all needs are met; why: what isn't, sentence by sentence.
+        environment: environment of the site.
+        fits: whether all requirements are met.
+        unmet: unmet requirements, one sentence each.
     """
 
     environment: Environment
     fits: bool
-    why: tuple[str, ...]
+    unmet: tuple[str, ...]
 
 
 def read(path: Path) -> Site:
-    """A site's file.
+    """Read a measurement file.
 
     Raises:
-        InputError: it is none.
+        InputError: not a measurement file.
     """
-    remedy = "Make one: scan2sim qos measure TOOLBOX --environment edge --out FILE"
+    remedy = "Create one: scan2sim qos measure TOOLBOX --environment edge --out FILE"
     try:
-        if path.stat().st_size > LARGEST:
-            raise InputError(path, "is too large for a measurement", remedy)
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise InputError(path, "too large for a measurement file", remedy)
         return Site.model_validate(json.loads(path.read_text("utf-8")))
     except OSError as error:
         raise InputError(path, f"can't be read ({error.strerror})", remedy) from None
     except (ValueError, RecursionError) as error:
-        said = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
-        raise InputError(path, f"is no measurement ({said})", remedy) from None
+        cause = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
+        raise InputError(path, f"not a measurement file ({cause})", remedy) from None
 
 
-def place(service: str, sites: Sequence[Site]) -> list[Verdict]:
-    """Which sites meet a service's needs, nearest to the robot first.
+def place(service: str, sites: Sequence[Site]) -> list[Placement]:
+    """Compare sites with a service's requirements, nearest to the robot first.
 
     Raises:
-        InputError: a site's measurement is of another service.
+        InputError: a measurement is of another service.
     """
     for site in sites:
         if site.toolbox != service:
-            cause = f"was measured with {site.toolbox}, not with {service}"
-            raise InputError(site.environment, cause, f"scan2sim qos measure {service}")
+            cause = f"measured with {site.toolbox}, not with {service}"
+            raise InputError(site.environment, cause, f"Measure it: scan2sim qos measure {service}")
     ordered = sorted(sites, key=lambda one: list(Environment).index(one.environment))
-    return [_verdict(site) for site in ordered]
+    return [_compare(site) for site in ordered]
 
 
-def _verdict(site: Site) -> Verdict:
-    why = tuple(_said(row) for row in site.rows if row.passed is False)
-    return Verdict(site.environment, not why, why)
+def _compare(site: Site) -> Placement:
+    unmet = tuple(_unmet(row) for row in site.rows if row.passed is False)
+    return Placement(site.environment, not unmet, unmet)
 
 
-def _said(row: _Row) -> str:
+def _unmet(row: _Row) -> str:
     unit = UNITS.get(row.metric, "")
     name = row.metric.replace("_", " ")
     if row.measured is None:
-        return f"{name}: there is none, {row.required} {unit}".rstrip() + " is asked"
+        return f"{name}: not available, required: {row.required} {unit}".rstrip()
     if row.required is None:
-        return f"{name}: answers don't come"
-    return f"{name} is {row.measured:.4g} {unit}".rstrip() + f", {row.required} is asked"
+        return f"{name}: some requests were not answered"
+    return f"{name}: {row.measured:.4g} {unit}".rstrip() + f", required: {row.required}"

@@ -1,4 +1,4 @@
-"""What commands and the page are told: where OSM is, who asks, how long to wait."""
+"""Settings of the `scan2sim orchestrate` commands and the web page: address of OSM, credentials, waiting."""
 
 from __future__ import annotations
 
@@ -13,106 +13,106 @@ from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.parameters import File
 from scan2sim.pipeline.core.step import Params
 from scan2sim.services.credentials import redacted
-from scan2sim.services.http.settings import Served
+from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.loopback import is_loopback
-from scan2sim.services.monitoring.settings.bus import FollowedParams
+from scan2sim.services.monitoring.settings.bus import WorkerPoolParams
 
 
 class Connection(Params):
-    """Where OSM is, and who asks; the variables are those of its own client."""
+    """Address of OSM and credentials; the environment variables are those of OSM's own client."""
 
     osm: Annotated[
-        str, Field(max_length=500, description="Address of OSM's northbound interface; default: $OSM_HOSTNAME.")
+        str, Field(max_length=500, description="Address of OSM's northbound interface. Default: $OSM_HOSTNAME.")
     ] = ""
-    user: Annotated[str, Field(max_length=200, description="User; default: $OSM_USER, or admin.")] = ""
-    project: Annotated[str, Field(max_length=200, description="Project; default: $OSM_PROJECT, or admin.")] = ""
+    user: Annotated[str, Field(max_length=200, description="User name. Default: $OSM_USER, or admin.")] = ""
+    project: Annotated[str, Field(max_length=200, description="Project. Default: $OSM_PROJECT, or admin.")] = ""
     password: Annotated[
-        File | None, Field(description="File that holds the password; default: what $OSM_PASSWORD says.")
+        File | None, Field(description="File with the password. Default: the value of $OSM_PASSWORD.")
     ] = None
     ca: Annotated[
-        File | None, Field(description="Certificate (PEM) that OSM's is signed by, where no public authority did.")
+        File | None, Field(description="CA certificate (PEM) to trust, if OSM's isn't signed by a public authority.")
     ] = None
 
-    def northbound(self) -> str:
-        """https://HOST:PORT.
+    def northbound_url(self) -> str:
+        """URL of the northbound interface: https://HOST:PORT.
 
         Raises:
-            SettingError: it is none.
+            SettingError: the address is missing or invalid.
         """
         given = self.osm or os.environ.get("OSM_HOSTNAME", "")
         if not given:
-            raise SettingError("--osm", "is missing, and so is $OSM_HOSTNAME", "Give https://HOST:9999")
+            raise SettingError("--osm", "missing, and $OSM_HOSTNAME isn't set", "Give https://HOST:9999")
         parts = urlsplit(given if "://" in given else f"https://{given}")
         if parts.scheme != "https" and not (is_loopback(parts.hostname or "") and parts.scheme == "http"):
-            raise SettingError("--osm", f"{redacted(given):.100} isn't reached by TLS", "Give https://HOST:9999")
+            raise SettingError("--osm", f"{redacted(given):.100} doesn't use TLS", "Give https://HOST:9999")
         if not parts.hostname or "@" in parts.netloc or parts.path not in ("", "/", "/osm", "/osm/"):
-            raise SettingError("--osm", f"{redacted(given):.100} is no address of OSM's", "Give https://HOST:9999")
+            raise SettingError("--osm", f"{redacted(given):.100} isn't an address of OSM", "Give https://HOST:9999")
         return f"{parts.scheme}://{parts.netloc}" + ("" if parts.port else ":9999")
 
-    def login(self) -> str:
-        """The password.
+    def read_password(self) -> str:
+        """The password, from its file or $OSM_PASSWORD.
 
         Raises:
-            InputError: its file can't be read. SettingError: there is none.
+            InputError: the file can't be read. SettingError: there is no password.
         """
         if self.password is not None:
             try:
                 return self.password.read_text("utf-8").strip()
             except (OSError, UnicodeError) as error:
-                raise InputError(self.password, f"can't be read ({error})", "Write the password into it") from None
+                raise InputError(self.password, f"can't be read ({error})", "Give a text file that holds it") from None
         if "OSM_PASSWORD" not in os.environ:
-            raise SettingError("--password", "is missing, and so is $OSM_PASSWORD", "Give a file that holds it")
+            raise SettingError("--password", "missing, and $OSM_PASSWORD isn't set", "Give a file with the password")
         return os.environ["OSM_PASSWORD"]
 
-    def trust(self) -> ssl.SSLContext:
-        """Whose certificates are good.
+    def ssl_context(self) -> ssl.SSLContext:
+        """TLS context that trusts the given CA certificate, or public authorities.
 
         Raises:
-            InputError: the authority's file is none.
+            InputError: the certificate file can't be read.
         """
         try:
             return ssl.create_default_context(cafile=self.ca)
         except (OSError, ssl.SSLError) as error:
-            raise InputError(self.ca or "", f"is no certificate ({error})", "Give a PEM file") from None
+            raise InputError(self.ca or "", f"not a certificate ({error})", "Give a PEM file") from None
 
 
 class ApplyParams(Connection):
-    """How a deployment is brought about."""
+    """Settings of `apply` and `delete`."""
 
-    wait: Annotated[bool, Field(description="Wait until all services run, and say how that went.")] = False
-    timeout: Annotated[float, Field(ge=1, le=86_400, description="Seconds for one operation of OSM's.")] = 1800.0
-    parallel: Annotated[int, Field(ge=1, le=100, description="Instances that are worked on at once.")] = 10
-
-
-class ActParams(Connection):
-    """How something is done by hand."""
-
-    wait: Annotated[bool, Field(description="Wait until OSM is done with it.")] = False
-    timeout: Annotated[float, Field(ge=1, le=86_400, description="Seconds for one operation of OSM's.")] = 1800.0
+    wait: Annotated[bool, Field(description="Wait until all services are running, and report the outcome.")] = False
+    timeout: Annotated[float, Field(ge=1, le=86_400, description="Timeout of one OSM operation in seconds.")] = 1800.0
+    parallel: Annotated[int, Field(ge=1, le=100, description="Number of instances to change at the same time.")] = 10
 
 
-class StartParams(ActParams):
-    """How an instance is begun."""
+class OperationParams(Connection):
+    """Settings of a single operation."""
 
-    replicas: Annotated[int, Field(ge=1, le=1000, description="How many of its function there are to be.")] = 1
-
-
-class ResizeParams(ActParams):
-    """How an instance is scaled."""
-
-    name: Annotated[str, Field(max_length=200, description="Its name in OSM, or its id.")]
-    replicas: Annotated[int, Field(ge=1, le=1000, description="How many of its function there are to be.")]
+    wait: Annotated[bool, Field(description="Wait until OSM has completed the operation.")] = False
+    timeout: Annotated[float, Field(ge=1, le=86_400, description="Timeout of one OSM operation in seconds.")] = 1800.0
 
 
-class PageParams(Connection, Served):
-    """Of the page."""
+class InstantiateParams(OperationParams):
+    """Settings of `instantiate`."""
 
-    packages: Annotated[File, Field(description="Folder of packages, which those that are uploaded go to as well.")]
-    vim: Annotated[str, Field(max_length=200, description="VIM account that services are instantiated on.")] = ""
-    cluster: Annotated[str, Field(max_length=200, description="Kubernetes cluster that they are instantiated on.")] = ""
+    replicas: Annotated[int, Field(ge=1, le=1000, description="Number of replicas of its function.")] = 1
 
 
-class ScaledParams(FollowedParams, Connection):
-    """Of a node that scales an instance as the event bus asks."""
+class ScaleInstanceParams(OperationParams):
+    """Settings of `scale`."""
 
-    instance: Annotated[str, Field(max_length=200, description="Its name in OSM.")]
+    name: Annotated[str, Field(max_length=200, description="Name or id of the instance in OSM.")]
+    replicas: Annotated[int, Field(ge=1, le=1000, description="Number of replicas of its function.")]
+
+
+class PageParams(Connection, ServerParams):
+    """Settings of the web page."""
+
+    packages: Annotated[File, Field(description="Folder of packages; uploads are stored here too.")]
+    vim: Annotated[str, Field(max_length=200, description="VIM account to instantiate services on.")] = ""
+    cluster: Annotated[str, Field(max_length=200, description="Kubernetes cluster to instantiate services on.")] = ""
+
+
+class AutoscaleParams(WorkerPoolParams, Connection):
+    """Settings of the node that scales an instance according to queue load."""
+
+    instance: Annotated[str, Field(max_length=200, description="Name of the instance in OSM.")]

@@ -1,13 +1,13 @@
-// The live page of the event bus: six plots of what the service tells (/api/live, /api/history), nodes, their remarks.
+// Dashboard of the event bus: plots, nodes, queues and warnings from /api/live and /api/history.
 "use strict";
 
 const PLOTS = [
   { key: "bandwidth", title: "Bandwidth by node", unit: "rate" },
   { key: "latency", title: "Latency", unit: "seconds" },
-  { key: "sums", title: "Sums", unit: "rate", legend: true },
-  { key: "lost", title: "Lost messages a period", unit: "count" },
-  { key: "messages", title: "Messages a period", unit: "count" },
-  { key: "size", title: "Mean size of messages", unit: "bytes" },
+  { key: "sums", title: "Total bandwidth", unit: "rate", legend: true },
+  { key: "lost", title: "Lost messages per period", unit: "count" },
+  { key: "messages", title: "Messages per period", unit: "count" },
+  { key: "size", title: "Mean message size", unit: "bytes" },
 ];
 const METRICS = ["bandwidth", "latency", "lost", "messages", "size"],
   KINDS = ["mean", "min", "max"];
@@ -17,15 +17,15 @@ const SUMS = [
   ["difference", 3],
 ];
 
-const chosen = new Set(); // names of nodes that are shown; none: all
+const chosen = new Set(); // names of the selected nodes; empty: all
 let range = { seconds: 300 }; // or {from, to}
-let held = null; // the window that is shown
+let shownWindow = null; // time window that is displayed, as /api/history returns it
 let plots = null;
 let stopped = new AbortController();
 
 // ---- windows
 
-// A window with another's later buckets in the place of its own, from `begin` on.
+// Replaces the latest buckets of a window by those of an update and drops the buckets before `begin`.
 function merged(old, fresh, begin) {
   if (!old || old.step !== fresh.step) return fresh;
   const middle = begin + old.step / 2 - 1e-6,
@@ -58,84 +58,84 @@ function draw(from, to) {
   for (const plot of plots) {
     const series =
       plot.key === "sums"
-        ? SUMS.map(([name, number]) => ({ name, number, mean: held.sums[name] }))
-        : held.nodes.map(({ name, number, ...metrics }) => ({ name, number, ...metrics[plot.key] }));
-    plot.plot.show(held.times, series, [from, to]);
+        ? SUMS.map(([name, number]) => ({ name, number, mean: shownWindow.sums[name] }))
+        : shownWindow.nodes.map(({ name, number, ...metrics }) => ({ name, number, ...metrics[plot.key] }));
+    plot.plot.show(shownWindow.times, series, [from, to]);
   }
 }
 
-function take(told) {
-  tellState(told.state);
+function applyUpdate(update) {
+  showState(update.state);
   if (!plots) {
     plots = PLOTS.map((one) => ({
       key: one.key,
-      plot: new Plot(byId("plots"), { ...one, limit: told.state.limits[one.key], ranged: showPast }),
+      plot: new Plot(byId("plots"), { ...one, limit: update.state.limits[one.key], ranged: showPast }),
     }));
   }
   if (range.seconds) {
-    held = merged(held, told, told.begin);
-    draw(told.state.now - range.seconds, told.state.now);
+    shownWindow = merged(shownWindow, update, update.begin);
+    draw(update.state.now - range.seconds, update.state.now);
   } else {
-    held = told;
+    shownWindow = update;
     draw(range.from, range.to);
   }
 }
 
-// ---- what is told beside the plots
+// ---- tables and messages
 
-function tellState(state) {
+function showState(state) {
   const { topic, servers, connected, limits, nodes, runs, counts, last_refused, events_topic, events_refused } = state;
   byId("topic").textContent = `${topic} and ${events_topic} on ${servers}`;
-  tellAlarms(state.alarms, events_topic);
-  tellRuns(runs, state.now);
-  tellQueues(state.queues);
-  if (range.seconds) status(connected ? "live" : "lost", connected ? "live" : "Kafka is gone");
+  showAlarms(state.alarms, events_topic);
+  showRuns(runs, state.now);
+  showQueues(state.queues);
+  if (range.seconds) status(connected ? "live" : "lost", connected ? "live" : "Kafka is unreachable");
   nodes.sort((a, b) => a.name.localeCompare(b.name, undefined, { numeric: true })); // node_2 before node_10
   const empty = byId("empty");
   empty.hidden = nodes.length > 0 || runs.length > 0;
   byId("plots").hidden = !nodes.length && runs.length > 0;
   empty.textContent = connected
-    ? `No node has told anything on ${topic} yet.`
-    : `Kafka at ${servers} doesn't answer; the page goes on trying.`;
-  tellChips(nodes);
+    ? `No records on topic ${topic} yet.`
+    : `Kafka at ${servers} doesn't answer; retrying.`;
+  showChips(nodes);
   byId("nodes").tBodies[0].replaceChildren(...nodes.map((node) => row(node, limits)));
-  const remarks = nodes.flatMap((node) => [
+  const warnings = nodes.flatMap((node) => [
     ...node.remarks.map((text) => `${node.name}: ${text}`),
-    ...(node.dropped ? [`${node.name}: ${node.dropped} records were dropped, as there was no room for them`] : []),
+    ...(node.dropped ? [`${node.name}: ${node.dropped} records were dropped because the outbox was full`] : []),
   ]);
   byId("remarks").replaceChildren(
-    ...(remarks.length ? [...new Set(remarks)] : ["none"]).map((text) => element("li", text)),
+    ...(warnings.length ? [...new Set(warnings)] : ["none"]).map((text) => element("li", text)),
   );
-  const { shown, ...refused } = counts;
+  const { shown, ...rejected } = counts;
   byId("counts").textContent =
     `${shown ?? 0} records shown` +
-    (Object.keys(refused).length ? `; not shown: ${listed(refused)} (last: ${last_refused})` : "") +
+    (Object.keys(rejected).length ? `; rejected: ${listed(rejected)} (last: ${last_refused})` : "") +
     (Object.keys(events_refused.counts).length
-      ? `; events left: ${listed(events_refused.counts)} (last: ${events_refused.last})`
+      ? `; rejected events: ${listed(events_refused.counts)} (last: ${events_refused.last})`
       : "");
 }
 
 function listed(counts) {
   return Object.entries(counts)
-    .map(([why, count]) => `${count} ${why}`)
+    .map(([reason, count]) => `${count} ${reason}`)
     .join(", ");
 }
 
-function tellChips(nodes) {
+function showChips(nodes) {
   const chips = byId("chips"),
     shown = JSON.stringify([
       nodes.map(({ name, gone }) => [name, gone]),
       [...chosen],
       document.documentElement.dataset.theme,
     ]);
-  if (chips.dataset.shown === shown) return; // what is about to be clicked stays
+  if (chips.dataset.shown === shown) return; // don't replace elements that may be about to be clicked
   chips.dataset.shown = shown;
   chips.classList.toggle("some", chosen.size > 0);
   chips.replaceChildren(
     ...nodes.map(({ name, number, gone }) => {
       const chip = element("button", undefined, gone ? "gone" : "");
       chip.type = "button";
-      chip.title = chosen.has(name) ? `${name}: show others, too` : `${name}: show it alone, or beside those chosen`;
+      chip.title = chosen.has(name) ? `${name}: deselect` : `${name}: show only selected nodes`;
       chip.setAttribute("aria-pressed", chosen.has(name));
       chip.append(key(number), element("span", name));
       chip.addEventListener("click", () => {
@@ -186,8 +186,8 @@ function row(node, limits) {
   return made;
 }
 
-function tellQueues(queues) {
-  const each = (value) => `${+value.toPrecision(2)}/s`;
+function showQueues(queues) {
+  const perSecond = (value) => `${+value.toPrecision(2)}/s`;
   const rows = queues.map((one) => {
     const made = element("tr"),
       name = element("td");
@@ -195,9 +195,9 @@ function tellQueues(queues) {
     made.append(
       name,
       element("td", one.silent ? "silent" : "live", one.silent ? "bad" : ""),
-      element("td", each(one.arrived), "n"),
-      element("td", each(one.done), "n"),
-      element("td", each(one.refused), one.refused ? "n bad" : "n"),
+      element("td", perSecond(one.arrived), "n"),
+      element("td", perSecond(one.done), "n"),
+      element("td", perSecond(one.refused), one.refused ? "n bad" : "n"),
       element("td", one.waiting, "n"),
       element("td", one.done ? UNITS.seconds(one.oldest_done) : "–", "n"),
       element("td", one.workers, "n"),
@@ -213,7 +213,7 @@ function status(state, text) {
   byId("status").textContent = text;
 }
 
-// ---- what is asked for
+// ---- requests
 
 function query(values) {
   return new URLSearchParams([...Object.entries(values), ...[...chosen].map((name) => ["nodes", name])]);
@@ -222,24 +222,24 @@ function query(values) {
 async function begin() {
   stopped.abort();
   const { signal } = (stopped = new AbortController());
-  held = null;
+  shownWindow = null;
   for (let pause = 500; !signal.aborted;) {
     try {
       if (!range.seconds) {
-        take(await (await ask(`/api/history?${query(range)}`, signal)).json());
+        applyUpdate(await (await request(`/api/history?${query(range)}`, signal)).json());
         status("past", "past");
         return;
       }
-      await follow(`/api/live?${query(range)}`, signal, (told) => {
+      await followEvents(`/api/live?${query(range)}`, signal, (update) => {
         pause = 500;
-        if (!signal.aborted) take(told);
+        if (!signal.aborted) applyUpdate(update);
       });
     } catch (error) {
       if (signal.aborted) return;
       if (error instanceof NoToken) return askForToken();
       status("lost", range.seconds ? "the service doesn't answer" : error.message);
       if (!range.seconds) return;
-      held = null;
+      shownWindow = null;
       await new Promise((done) => setTimeout(done, (pause = Math.min(5000, 2 * pause))));
     }
   }
@@ -247,7 +247,7 @@ async function begin() {
 
 function askForToken() {
   byId("token").hidden = false;
-  status("lost", sessionStorage.getItem("token") ? "another token is wanted" : "a token is wanted");
+  status("lost", sessionStorage.getItem("token") ? "the token is wrong" : "a token is required");
 }
 
 function showLive(seconds) {
@@ -263,7 +263,7 @@ function showPast(from, to) {
   begin();
 }
 
-// Writes a range, seconds, into the form, which speaks of local time.
+// Writes a range in seconds into the form, as local times.
 function fill(from, to) {
   const local = (time) => new Date(time - 60000 * new Date(time).getTimezoneOffset()).toISOString().slice(0, 19);
   for (const [name, seconds] of [

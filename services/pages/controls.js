@@ -1,28 +1,29 @@
-// The driver's input from keyboard, gamepads and the page's brake button. The brake is the strongest of all devices,
-// whichever steers, and overrides the throttle.
+// The driver's input from keyboard, gamepads and the page's brake button. The strongest brake of all devices applies,
+// whichever device steers, and overrides the throttle.
 "use strict";
 
-const PERIOD = 20; // ms between two commands
-const BRAKES = ["Space", "ArrowDown", "KeyS", "Button"]; // codes of the keys that brake, and of the page's button
-const DEAD_ZONE = 0.05; // of a gamepad's stick and triggers, which seldom rest at exactly 0
+const PERIOD = 20; // interval between two commands, ms
+const BRAKES = ["Space", "ArrowDown", "KeyS", "Button"]; // codes of the brake keys, and of the page's brake button
+const DEAD_ZONE = 0.05; // of a gamepad's stick and triggers, which rarely rest at exactly 0
 const STICK = 0,
   LEFT_TRIGGER = 6,
-  RIGHT_TRIGGER = 7; // of the standard gamepad
+  RIGHT_TRIGGER = 7; // indices of the standard gamepad mapping
 
 const pressed = new Set(),
-  keys = { steering: 0, throttle: 0, brake: 0 }; // of the keyboard and the button: ramped
-let gamepad = null; // index of the one that drives
+  keys = { steering: 0, throttle: 0, brake: 0 }; // of keyboard and brake button, ramped
+let gamepad = null; // index of the gamepad in use; null: keyboard
 
 const any = (...codes) => codes.some((code) => pressed.has(code));
 const gamepads = () => [...(navigator.getGamepads?.() ?? [])].filter((one) => one?.connected);
 const beyondDeadZone = (value = 0) => (Math.abs(value) < DEAD_ZONE ? 0 : value);
 
+// Moves a value towards its target by at most `rate` per second.
 function ramped(value, target, rate) {
-  const most = rate * (PERIOD / 1000);
-  return Math.abs(target - value) <= most ? target : value + Math.sign(target - value) * most;
+  const step = rate * (PERIOD / 1000);
+  return Math.abs(target - value) <= step ? target : value + Math.sign(target - value) * step;
 }
 
-// Steering, throttle and brake now; null: the gamepad that drives is unplugged.
+// Current steering, throttle and brake; null: the gamepad in use was unplugged.
 function controls() {
   const pads = gamepads(),
     pad = pads.find((one) => one.index === gamepad);
@@ -38,7 +39,7 @@ function controls() {
   return { steering, throttle: brake > 0 ? 0 : throttle, brake };
 }
 
-// The first gamepad of which a button is pressed drives from then on.
+// Uses the first gamepad on which a button is pressed.
 function chooseGamepad() {
   gamepad ??= gamepads().find((one) => one.buttons.some((button) => button.pressed))?.index ?? null;
 }
@@ -50,7 +51,7 @@ function resetControls() {
 }
 
 addEventListener("keyup", (event) => pressed.delete(event.code));
-// Without the focus no release of a key arrives: everything is released but the brake, which holds until the focus is back.
+// Without focus the release of a key isn't reported: all keys are released except brakes, which hold until focus returns.
 addEventListener("blur", () => {
   for (const code of pressed) if (!BRAKES.includes(code)) pressed.delete(code);
 });

@@ -1,4 +1,4 @@
-// What pages are built with.
+// Helpers that create DOM elements.
 "use strict";
 
 const byId = (id) => document.getElementById(id);

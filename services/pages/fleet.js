@@ -1,21 +1,21 @@
-// Fleet management: who is there, on which links; joins, hands over, takes back and releases.
+// Fleet page: vehicles, stations and their links; joins, hands over, takes back and releases vehicles.
 "use strict";
 
-const EVERY = 1000;
+const REFRESH_PERIOD = 1000; // ms
 
-function tell(fault) {
-  byId("fault").hidden = !fault;
-  byId("fault").textContent = fault ?? "";
+function showError(error) {
+  byId("fault").hidden = !error;
+  byId("fault").textContent = error ?? "";
 }
 
-async function act(vehicle, what, body) {
+async function act(vehicle, action, body) {
   try {
-    tell(null);
-    await send("POST", `/api/vehicles/${encodeURIComponent(vehicle)}/${what}`, body && JSON.stringify(body));
+    showError(null);
+    await send("POST", `/api/vehicles/${encodeURIComponent(vehicle)}/${action}`, body && JSON.stringify(body));
   } catch (error) {
-    tell(error.message);
+    showError(error.message);
   }
-  await look();
+  await refresh();
 }
 
 function pill(text, good) {
@@ -24,7 +24,7 @@ function pill(text, good) {
   return made;
 }
 
-function linked(link) {
+function linkPill(link) {
   const trip = link.round_trip === null ? "" : ` ${Math.round(link.round_trip)} ms`;
   const loss = link.loss ? ` ${(100 * link.loss).toFixed(1)} % lost` : "";
   return pill(`${link.name}${link.up ? `${trip}${loss} ${link.rate.toFixed(1)} Mbit/s` : " down"}`, link.up);
@@ -32,18 +32,18 @@ function linked(link) {
 
 const time = (seconds) => new Date(1000 * seconds).toLocaleTimeString();
 
-function card(one, doing) {
+function card(one, pairText) {
   const made = element("article", undefined, "run"),
     line = element("div", undefined, "bar");
   const speed = one.speed === null ? "" : `${(3.6 * one.speed).toFixed(1)} km/h`;
-  const old = one.age === null ? "" : `${Math.round(one.age)} ms`;
+  const latency = one.age === null ? "" : `${Math.round(one.age)} ms`;
   line.append(
     element("b", one.name),
-    pill(one.there ? "there" : `gone since ${time(one.since)}`, one.there),
+    pill(one.there ? "connected" : `disconnected since ${time(one.since)}`, one.there),
     element("span", one.address, "soft"),
-    element("span", doing, "soft"),
-    element("span", [speed, old].filter(Boolean).join(", ")),
-    ...one.links.map(linked),
+    element("span", pairText, "soft"),
+    element("span", [speed, latency].filter(Boolean).join(", ")),
+    ...one.links.map(linkPill),
   );
   made.append(line);
   if (one.told) made.append(element("p", one.told, "failure"));
@@ -51,17 +51,17 @@ function card(one, doing) {
 }
 
 function vehicle(one, stations) {
-  const [made, line] = card(one, one.other ? `driven from ${one.other}` : "nobody drives it");
+  const [made, line] = card(one, one.other ? `driven from ${one.other}` : "no station");
   const choice = element("span", undefined, "choice"),
     select = element("select");
   const free = stations.filter((station) => station.there && station.pair === null);
   select.ariaLabel = `station for ${one.name}`;
   select.append(...free.map((station) => element("option", station.name)));
-  const chosen = () => ({ station: select.value });
+  const selected = () => ({ station: select.value });
   if (free.length && one.there) choice.append(select);
-  if (one.pair === null) choice.append(button("Join", !free.length || !one.there, () => act(one.name, "join", chosen())));
+  if (one.pair === null) choice.append(button("Join", !free.length || !one.there, () => act(one.name, "join", selected())));
   else {
-    choice.append(button("Hand over", !free.length, () => act(one.name, "hand-over", chosen())));
+    choice.append(button("Hand over", !free.length, () => act(one.name, "hand-over", selected())));
     if (one.before) choice.append(button(`Back to ${one.before}`, false, () => act(one.name, "take-back")));
     choice.append(button("Release", false, () => act(one.name, "release")));
   }
@@ -69,9 +69,9 @@ function vehicle(one, stations) {
   return made;
 }
 
-const station = (one) => card(one, one.other ? `drives ${one.other}` : "drives nobody")[0];
+const station = (one) => card(one, one.other ? `drives ${one.other}` : "no vehicle")[0];
 
-function entry(one) {
+function auditRow(one) {
   const made = element("tr");
   for (const text of [new Date(1000 * one.time).toLocaleString(), one.what, one.vehicle, one.station, one.by]) made.append(element("td", text));
   return made;
@@ -79,17 +79,17 @@ function entry(one) {
 
 let shown = "";
 
-async function look() {
+async function refresh() {
   const status = byId("status");
   try {
-    const told = await (await ask("/api/fleet", AbortSignal.timeout(5000))).json();
-    const audit = await (await ask("/api/audit", AbortSignal.timeout(5000))).json();
-    const text = JSON.stringify([told, audit]);
+    const fleet = await (await request("/api/fleet", AbortSignal.timeout(5000))).json();
+    const audit = await (await request("/api/audit", AbortSignal.timeout(5000))).json();
+    const text = JSON.stringify([fleet, audit]);
     if (text !== shown && document.activeElement?.tagName !== "SELECT") {
-      byId("vehicles").replaceChildren(...told.vehicles.map((one) => vehicle(one, told.stations)));
-      byId("stations").replaceChildren(...told.stations.map(station));
-      byId("audit").replaceChildren(...audit.map(entry));
-      byId("none").hidden = told.vehicles.length > 0;
+      byId("vehicles").replaceChildren(...fleet.vehicles.map((one) => vehicle(one, fleet.stations)));
+      byId("stations").replaceChildren(...fleet.stations.map(station));
+      byId("audit").replaceChildren(...audit.map(auditRow));
+      byId("none").hidden = fleet.vehicles.length > 0;
       shown = text;
     }
     byId("token").hidden = true;
@@ -97,7 +97,7 @@ async function look() {
     status.dataset.state = "live";
   } catch (error) {
     byId("token").hidden = !(error instanceof NoToken);
-    status.textContent = error instanceof NoToken ? "needs a token" : error.message;
+    status.textContent = error instanceof NoToken ? "a token is required" : error.message;
     status.dataset.state = "lost";
   }
 }
@@ -105,12 +105,12 @@ async function look() {
 byId("token").addEventListener("submit", (event) => {
   event.preventDefault();
   sessionStorage.setItem("token", event.target.elements.token.value);
-  look();
+  refresh();
 });
 
 (async () => {
   for (;;) {
-    if (!document.hidden) await look();
-    await new Promise((done) => setTimeout(done, EVERY));
+    if (!document.hidden) await refresh();
+    await new Promise((done) => setTimeout(done, REFRESH_PERIOD));
   }
 })();

@@ -1,21 +1,21 @@
-// The page of services in OSM: asks how things stand every two seconds, and sends what its buttons are for.
+// Page of the services in OSM: shows their state, refreshed every two seconds, and onboards, instantiates and deletes them.
 "use strict";
 
-const EVERY = 2000;
+const REFRESH_PERIOD = 2000; // ms
 
-function tell(fault) {
-  byId("fault").hidden = !fault;
-  byId("fault").textContent = fault ?? "";
+function showError(error) {
+  byId("fault").hidden = !error;
+  byId("fault").textContent = error ?? "";
 }
 
-async function act(service, what, body) {
+async function act(service, action, body) {
   try {
-    tell(null);
-    await send("POST", `/api/services/${encodeURIComponent(service)}/${what}`, body && JSON.stringify(body));
+    showError(null);
+    await send("POST", `/api/services/${encodeURIComponent(service)}/${action}`, body && JSON.stringify(body));
   } catch (error) {
-    tell(error.message);
+    showError(error.message);
   }
-  await look();
+  await refresh();
 }
 
 function pill(name, state) {
@@ -29,7 +29,7 @@ function card(service) {
     made = element("article", undefined, "run"),
     line = element("div", undefined, "bar"),
     buttons = element("div", undefined, "choice");
-  const packages = service.missing.length ? `lacks ${service.missing.join(", ")}` : service.onboarded ? "in OSM" : "not in OSM";
+  const packages = service.missing.length ? `missing: ${service.missing.join(", ")}` : service.onboarded ? "in OSM" : "not in OSM";
   const start = () => {
     const name = prompt("Name of the instance (a-z, 0-9, -)", service.id.slice(0, 41).replace(/-+$/, ""));
     if (name) act(service.id, "instantiate", { name });
@@ -57,21 +57,21 @@ function card(service) {
 
 let shown = "";
 
-async function look() {
+async function refresh() {
   const status = byId("status");
   try {
-    const told = await (await ask("/api/services", AbortSignal.timeout(15000))).json();
-    byId("osm").textContent = told.osm;
-    byId("empty").hidden = told.services.length > 0;
-    const text = JSON.stringify(told.services);
-    if (text !== shown) byId("services").replaceChildren(...told.services.map(card)); // keeps focus where nothing changed
+    const state = await (await request("/api/services", AbortSignal.timeout(15000))).json();
+    byId("osm").textContent = state.osm;
+    byId("empty").hidden = state.services.length > 0;
+    const text = JSON.stringify(state.services);
+    if (text !== shown) byId("services").replaceChildren(...state.services.map(card)); // keeps focus if nothing changed
     shown = text;
     byId("token").hidden = true;
     status.textContent = "live";
     status.dataset.state = "live";
   } catch (error) {
     byId("token").hidden = !(error instanceof NoToken);
-    status.textContent = error instanceof NoToken ? "needs a token" : error.message;
+    status.textContent = error instanceof NoToken ? "a token is required" : error.message;
     status.dataset.state = "lost";
   }
 }
@@ -79,24 +79,24 @@ async function look() {
 byId("token").addEventListener("submit", (event) => {
   event.preventDefault();
   sessionStorage.setItem("token", event.target.elements.token.value);
-  look();
+  refresh();
 });
 
 byId("upload").addEventListener("submit", async (event) => {
   event.preventDefault();
   try {
-    tell(null);
+    showError(null);
     for (const file of event.target.elements.files.files) await send("PUT", "/api/packages", file, "application/gzip");
     event.target.reset();
   } catch (error) {
-    tell(error.message);
+    showError(error.message);
   }
-  look();
+  refresh();
 });
 
 (async () => {
   for (;;) {
-    if (!document.hidden) await look();
-    await new Promise((done) => setTimeout(done, EVERY));
+    if (!document.hidden) await refresh();
+    await new Promise((done) => setTimeout(done, REFRESH_PERIOD));
   }
 })();

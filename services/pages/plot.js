@@ -1,22 +1,22 @@
-// A plot of lines over time, as all pages have it: means as lines, strokes from least to most, red dots beyond a limit.
+// Time series plot: means as lines, strokes from minimum to maximum, red dots above a limit.
 "use strict";
 
 const HUES = [212, 32, 140, 275, 182, 55, 318, 95, 245],
   DASHES = [[], [7, 4], [2, 4], [10, 4, 2, 4]];
 
-function look(number) {
+function lineStyle(number) {
   return { hue: HUES[number % HUES.length], dash: DASHES[Math.floor(number / HUES.length) % DASHES.length] };
 }
 
-function styled(name) {
+function cssVariable(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
 
 function colour(number) {
-  return `hsl(${look(number).hue} 62% ${styled("--light")})`;
+  return `hsl(${lineStyle(number).hue} 62% ${cssVariable("--light")})`;
 }
 
-// How a line looks, for legends.
+// Sample of a line's style, for legends.
 function key(number) {
   const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg"),
     line = document.createElementNS(svg.namespaceURI, "line");
@@ -27,7 +27,7 @@ function key(number) {
     y2: 4,
     stroke: colour(number),
     "stroke-width": 3,
-    "stroke-dasharray": look(number).dash.join(" "),
+    "stroke-dasharray": lineStyle(number).dash.join(" "),
   };
   for (const [name, value] of Object.entries(shape)) line.setAttribute(name, value);
   svg.setAttribute("class", "key");
@@ -35,9 +35,9 @@ function key(number) {
   return svg;
 }
 
-// A value in the largest of some units, [least value, name, size], with three digits.
+// Formats a value with three digits in the largest fitting unit of a list of [smallest value, name, factor].
 function scaled(value, units) {
-  const [, name, size] = units.findLast(([least]) => Math.abs(value) >= least);
+  const [, name, size] = units.findLast(([smallest]) => Math.abs(value) >= smallest);
   const shown = value / size;
   return `${Math.abs(shown) >= 100 ? Math.round(shown) : +shown.toPrecision(3)} ${name}`.trim();
 }
@@ -74,8 +74,8 @@ const UNITS = {
 };
 
 class Plot {
-  // `unit`: a key of UNITS; `limit`: a value, or none; `ranged(from, to)`: called with seconds when a range is drawn;
-  // `legend`: whether lines are named beside the title.
+  // `unit`: a key of UNITS; `limit`: optional upper limit; `ranged(from, to)`: called with seconds when the user selects
+  // a range; `legend`: whether the lines are named beside the title.
   constructor(place, { title, unit, limit, ranged, legend }) {
     this.unit = UNITS[unit];
     this.limit = limit;
@@ -85,8 +85,8 @@ class Plot {
     const caption = document.createElement("figcaption"),
       name = document.createElement("b");
     name.textContent = title;
-    this.told = document.createElement("output");
-    caption.append(name, this.told);
+    this.readout = document.createElement("output");
+    caption.append(name, this.readout);
     this.box = document.createElement("div");
     this.figure.append(caption, this.box);
     place.append(this.figure);
@@ -100,14 +100,14 @@ class Plot {
     return { width: Math.max(200, this.box.clientWidth), height: 190 };
   }
 
-  // `times`: seconds; `series`: [{name, number, mean, min, max}], lists as long as times, null where nothing is known.
+  // `times`: seconds; `series`: [{name, number, mean, min, max}], lists as long as `times`, null where there is no data.
   show(times, series, window) {
     const lines = (list) => JSON.stringify(list.map((one) => [one.name, one.number]));
     const same = this.chart && lines(series) === lines(this.series);
     [this.times, this.series, this.window] = [times, series, window];
     if (same) this.chart.setData(this.data());
     else this.rebuild();
-    this.tell();
+    this.updateReadout();
   }
 
   data() {
@@ -118,8 +118,8 @@ class Plot {
     this.chart?.destroy();
     this.focused = null;
     const axis = {
-      stroke: styled("--soft"),
-      grid: { stroke: styled("--line"), width: 1 },
+      stroke: cssVariable("--soft"),
+      grid: { stroke: cssVariable("--line"), width: 1 },
       ticks: { show: false },
       font: "12px system-ui",
     };
@@ -144,19 +144,19 @@ class Plot {
         ...this.series.map((one) => ({
           label: one.name,
           stroke: colour(one.number),
-          dash: look(one.number).dash,
+          dash: lineStyle(one.number).dash,
           width: 1.5,
-          points: { show: true, filter: lonely, size: 4, fill: colour(one.number) },
+          points: { show: true, filter: isolated, size: 4, fill: colour(one.number) },
         })),
       ],
       hooks: {
         drawAxes: [(u) => this.drawSpread(u)],
         draw: [(u) => this.drawLimit(u)],
-        setCursor: [() => this.chart && this.tell()],
+        setCursor: [() => this.chart && this.updateReadout()],
         setSeries: [
           (_, line) => {
-            this.focused = line; // the one that is nearest to the pointer; null: none is near
-            if (this.chart) this.tell();
+            this.focused = line; // the line nearest to the pointer; null: none is near
+            if (this.chart) this.updateReadout();
           },
         ],
         setSelect: [
@@ -183,7 +183,7 @@ class Plot {
     return low === high ? [0, 1] : [low * 1.08, high * 1.08];
   }
 
-  // Strokes from the least to the most of a bucket.
+  // Strokes from the minimum to the maximum of each bucket.
   drawSpread(u) {
     inside(u, (context, x, y) => {
       context.globalAlpha = 0.4;
@@ -202,18 +202,18 @@ class Plot {
     });
   }
 
-  // The limit as a dashed line, and a filled dot wherever a node was beyond it.
+  // The limit as a dashed line, and a filled dot wherever a node exceeded it.
   drawLimit(u) {
     if (this.limit === undefined) return;
     inside(u, (context, x, y) => {
-      context.strokeStyle = context.fillStyle = styled("--bad");
+      context.strokeStyle = context.fillStyle = cssVariable("--bad");
       context.lineWidth = devicePixelRatio;
       context.setLineDash([5 * devicePixelRatio, 4 * devicePixelRatio]);
       context.beginPath();
       context.moveTo(u.bbox.left, y(this.limit));
       context.lineTo(u.bbox.left + u.bbox.width, y(this.limit));
       context.stroke();
-      for (const [i, value] of this.beyond()) {
+      for (const [i, value] of this.exceeded()) {
         context.beginPath();
         context.arc(x(this.times[i]), y(value), 3 * devicePixelRatio, 0, 2 * Math.PI);
         context.fill();
@@ -221,8 +221,8 @@ class Plot {
     });
   }
 
-  // Where nodes were beyond the limit: [index, value] each.
-  beyond() {
+  // Values that exceed the limit: [index, value] each.
+  exceeded() {
     const found = [];
     for (const one of this.series)
       (one.max ?? one.mean).forEach((value, i) => {
@@ -231,26 +231,26 @@ class Plot {
     return found;
   }
 
-  // Beside the title: what is under the pointer, else what is beyond the limit.
-  tell() {
+  // Text beside the title: the value under the pointer, else how often the limit is exceeded.
+  updateReadout() {
     const { idx, left } = this.chart.cursor;
-    this.told.className = "";
+    this.readout.className = "";
     if (left >= 0 && idx !== null && idx !== undefined) {
       const one = this.series[this.focused - 1],
         value = one?.mean[idx];
       const shown = one ? ` · ${one.name} · ${value === null ? "–" : this.unit(value)}` : "";
-      this.told.textContent = new Date(1000 * this.times[idx]).toLocaleTimeString([], { hour12: false }) + shown;
+      this.readout.textContent = new Date(1000 * this.times[idx]).toLocaleTimeString([], { hour12: false }) + shown;
     } else if (this.limit !== undefined) {
-      const times = this.beyond().length;
-      this.told.className = times ? "bad" : "";
-      this.told.textContent = times ? `${times} beyond ${this.unit(this.limit)}` : `limit ${this.unit(this.limit)}`;
+      const count = this.exceeded().length;
+      this.readout.className = count ? "bad" : "";
+      this.readout.textContent = count ? `${count} above ${this.unit(this.limit)}` : `limit ${this.unit(this.limit)}`;
     } else if (this.legend) {
-      this.told.replaceChildren(...this.series.flatMap((one) => [key(one.number), ` ${one.name} `]));
-    } else this.told.textContent = "";
+      this.readout.replaceChildren(...this.series.flatMap((one) => [key(one.number), ` ${one.name} `]));
+    } else this.readout.textContent = "";
   }
 }
 
-// Calls `draw(context, x, y)`, whose `x` and `y` turn seconds and values into pixels of the canvas, inside the plot.
+// Calls `draw(context, x, y)` clipped to the plot; `x` and `y` convert seconds and values to pixels of the canvas.
 function inside(u, draw) {
   const { ctx, bbox } = u;
   ctx.save();
@@ -265,20 +265,20 @@ function inside(u, draw) {
   ctx.restore();
 }
 
-// Points that have no neighbour, and so no line.
-function lonely(u, number) {
+// Points without a neighbour, which no line shows.
+function isolated(u, number) {
   const values = u.data[number];
   return values.flatMap((value, i) => (value != null && values[i - 1] == null && values[i + 1] == null ? [i] : []));
 }
 
 function clock(_, ticks, axis, space, step) {
   const days = ticks.length && ticks.at(-1) - ticks[0] > 86400;
-  const told = {
+  const format = {
     hour12: false,
     hour: "2-digit",
     minute: "2-digit",
     ...(step < 60 && { second: "2-digit" }),
     ...(days && { day: "2-digit", month: "2-digit" }),
   };
-  return ticks.map((tick) => new Date(1000 * tick).toLocaleString([], told));
+  return ticks.map((tick) => new Date(1000 * tick).toLocaleString([], format));
 }

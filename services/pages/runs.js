@@ -1,8 +1,8 @@
-// Runs of steps and alarms on the page of the event bus, as the state of /api/live has them (services/monitoring/dashboard/state.py).
+// Runs and alarms on the dashboard of the event bus, from the state in /api/live (services/monitoring/dashboard/state.py).
 "use strict";
 
-const details = new Map(); // by run: what the service tells only when it has changed
-const unfolded = new Map(); // by run: whether its steps are shown, where a reader chose
+const details = new Map(); // by run: details, which the service sends only when they have changed
+const unfolded = new Map(); // by run: whether its tasks are unfolded, if the user chose
 
 function duration(seconds) {
   if (seconds === null || seconds === undefined) return "";
@@ -14,24 +14,24 @@ function duration(seconds) {
     : `${Math.floor(minutes / 60)}:${two(minutes % 60)} h`;
 }
 
-// A time of today by its hour, another with its day.
+// Time of day for a time of today, date and time for others.
 function moment(seconds) {
   const at = new Date(1000 * seconds),
     time = at.toLocaleTimeString([], { hour12: false });
   return at.toDateString() === new Date().toDateString() ? time : `${at.toLocaleDateString()} ${time}`;
 }
 
-function bar(share, about) {
+function progressBar(fraction, label) {
   const made = element("progress");
   made.max = 1;
-  made.value = share;
-  made.setAttribute("aria-label", about);
+  made.value = fraction;
+  made.setAttribute("aria-label", label);
   return made;
 }
 
 // ---- runs
 
-function tellRuns(runs, now) {
+function showRuns(runs, now) {
   for (const run of runs) if (run.details) details.set(run.run, run.details);
   for (const name of details.keys()) if (!runs.some(({ run }) => run === name)) details.delete(name);
   byId("runs").hidden = !runs.length;
@@ -59,21 +59,21 @@ function fillCard(made, { run, silent, version, came }, now) {
   const { last, steps, known, others } = details.get(run),
     [summary, failure, scroll, rest] = made.children;
   const state = silent ? "silent" : (last?.state ?? "running");
-  const told = silent ? `silent for ${duration(now - came)}` : state;
+  const label = silent ? `silent for ${duration(now - came)}` : state;
   made.open = unfolded.get(run) ?? (state === "running" || state === "failed");
-  const mark = `${version} ${told}`;
-  if (made.dataset.shown === mark) return; // what is about to be clicked or is selected stays
-  made.dataset.shown = mark;
+  const fingerprint = `${version} ${label}`;
+  if (made.dataset.shown === fingerprint) return; // don't replace elements that may be selected or about to be clicked
+  made.dataset.shown = fingerprint;
   const done = steps.filter((step) => step.state === "done").length + (others.done ?? 0) + (others.kept ?? 0);
-  const over = last ? last.done + last.kept : done,
+  const finished = last ? last.done + last.kept : done,
     all = last ? last.steps : known;
-  const pill = element("output", told, "pill");
+  const pill = element("output", label, "pill");
   pill.dataset.state = state;
   summary.replaceChildren(
     pill,
-    element("b", last ? `${last.command} ${last.source}` : "a run that hasn't said what it is"),
-    ...(all ? [bar(over / all, "Steps done")] : []),
-    element("span", !all ? "" : `${over} of ${all} steps${last?.kept ? `, ${last.kept} kept from before` : ""}`, "soft"),
+    element("b", last ? `${last.command} ${last.source}` : "unknown run"),
+    ...(all ? [progressBar(finished / all, "Tasks done")] : []),
+    element("span", !all ? "" : `${finished} of ${all} tasks${last?.kept ? `, ${last.kept} cached` : ""}`, "soft"),
     element("span", last?.failed ? `${last.failed} failed` : "", "bad"),
     element("span", last ? `${duration(last.seconds)} on ${last.host}` : "", "soft"),
   );
@@ -81,7 +81,9 @@ function fillCard(made, { run, silent, version, came }, now) {
   failure.hidden = !failure.textContent;
   scroll.replaceChildren(table(steps, state));
   scroll.hidden = !steps.length;
-  const counted = ["failed", "done", "kept", "waiting"].filter((one) => others[one]).map((one) => `${others[one]} ${one}`);
+  const counted = ["failed", "done", "kept", "waiting"]
+    .filter((one) => others[one])
+    .map((one) => `${others[one]} ${one === "kept" ? "cached" : one}`);
   rest.textContent = counted.length ? `${steps.length ? "and " : ""}${counted.join(", ")}` : "";
   rest.hidden = !rest.textContent;
 }
@@ -89,7 +91,7 @@ function fillCard(made, { run, silent, version, came }, now) {
 function table(steps, state) {
   const made = element("table"),
     head = element("tr");
-  for (const [name, kind] of [["step"], ["state"], ["progress"], ["time", "n"], ["peak of memory", "n"], ["machine"], [""]])
+  for (const [name, kind] of [["task"], ["state"], ["progress"], ["time", "n"], ["peak memory", "n"], ["machine"], [""]])
     head.append(element("th", name, kind));
   made.createTHead().append(head);
   made.createTBody().append(
@@ -97,12 +99,12 @@ function table(steps, state) {
       const row = element("tr", undefined, step.state === "failed" ? "failed" : ""),
         name = element("td"),
         progress = element("td"),
-        cut = step.state === "running" && state !== "running"; // its run ended, or fell silent
+        interrupted = step.state === "running" && state !== "running"; // its run ended, or fell silent
       name.append(element("span", step.tile ? `${step.tile}/${step.step}` : step.step));
-      if (step.state === "running") progress.append(bar(step.progress, `Progress of ${step.step}`));
+      if (step.state === "running") progress.append(progressBar(step.progress, `Progress of ${step.step}`));
       row.append(
         name,
-        element("td", cut ? "not finished" : step.state, step.state === "failed" ? "bad" : ""),
+        element("td", interrupted ? "not finished" : step.state, step.state === "failed" ? "bad" : ""),
         progress,
         element("td", duration(step.seconds), "n"),
         element("td", step.memory === null ? "" : UNITS.bytes(step.memory), "n"),
@@ -117,20 +119,20 @@ function table(steps, state) {
 
 // ---- alarms
 
-const NAMED = 3; // alarms that the strip names
+const NAMED_ALARMS = 3; // alarms that are named in the strip at the top
 
-function tellAlarms({ raised, cleared }, events_topic) {
+function showAlarms({ raised, cleared }, events_topic) {
   const strip = byId("alarm");
   strip.hidden = !raised.length;
-  const told = raised.length
+  const text = raised.length
     ? `${raised.length === 1 ? "Alarm" : `${raised.length} alarms`}: ` +
       raised
-        .slice(0, NAMED)
+        .slice(0, NAMED_ALARMS)
         .map((one) => `${one.rule}, ${one.subject}, since ${moment(one.since)}`)
         .join("; ") +
-      (raised.length > NAMED ? `; and ${raised.length - NAMED} more` : "")
+      (raised.length > NAMED_ALARMS ? `; and ${raised.length - NAMED_ALARMS} more` : "")
     : "";
-  if (strip.textContent !== told) strip.textContent = told; // a reader's screen says it once
+  if (strip.textContent !== text) strip.textContent = text; // so that a screen reader announces it once
   const rows = [...raised, ...cleared].map((one) => {
     const row = element("tr"),
       rule = element("td");

@@ -1,41 +1,42 @@
-// What pages ask their service for: JSON and streams of events, with a token where it wants one.
+// Requests of the pages to their service: JSON and server-sent events, with a token if the service requires one.
 "use strict";
 
 class NoToken extends Error {}
 
-async function ask(path, signal) {
+async function request(path, signal) {
   const token = sessionStorage.getItem("token");
   const answer = await fetch(path, { signal, headers: token ? { Authorization: `Bearer ${token}` } : {} });
   if (answer.status === 401) throw new NoToken();
-  if (!answer.ok) {
-    const told = await answer.json().catch(() => ({}));
-    throw new Error(told.cause ? `${told.where}: ${told.cause}. ${told.remedy}` : `status ${answer.status}`);
-  }
+  if (!answer.ok) throw await errorOf(answer);
   return answer;
 }
 
-// Has a service do something, with a body of JSON unless it says otherwise.
+// The service's error message: {where, cause, remedy}.
+async function errorOf(answer) {
+  const error = await answer.json().catch(() => ({}));
+  return new Error(error.cause ? `${error.where}: ${error.cause}. ${error.remedy}` : `status ${answer.status}`);
+}
+
+// Sends a request with a body, of type JSON by default.
 async function send(method, path, body, type) {
   const token = sessionStorage.getItem("token");
   const headers = { "Content-Type": type ?? "application/json", ...(token ? { Authorization: `Bearer ${token}` } : {}) };
   const answer = await fetch(path, { method, headers, body });
-  if (answer.ok) return;
-  const told = await answer.json().catch(() => ({}));
-  throw new Error(told.cause ? `${told.where}: ${told.cause}. ${told.remedy}` : `status ${answer.status}`);
+  if (!answer.ok) throw await errorOf(answer);
 }
 
-// Calls `taken` with each event of a stream, until it ends or is silent for `longest` ms.
-async function follow(path, signal, taken, longest = 10000) {
-  const reader = (await ask(path, signal)).body.pipeThrough(new TextDecoderStream()).getReader();
+// Calls `callback` with each event of a stream until it ends or is silent for `timeout` ms.
+async function followEvents(path, signal, callback, timeout = 10000) {
+  const reader = (await request(path, signal)).body.pipeThrough(new TextDecoderStream()).getReader();
   for (let text = ""; ;) {
     let timer;
     const silence = new Promise((_, fail) => {
-      timer = setTimeout(() => fail(new Error("silent")), longest);
+      timer = setTimeout(() => fail(new Error("silent")), timeout);
     });
     const { done, value } = await Promise.race([reader.read(), silence]).finally(() => clearTimeout(timer));
     if (done) throw new Error("ended");
     const events = (text + value).split("\n\n");
     text = events.pop();
-    for (const event of events) taken(JSON.parse(event.slice("data: ".length)));
+    for (const event of events) callback(JSON.parse(event.slice("data: ".length)));
   }
 }

@@ -1,4 +1,4 @@
-// The switch between light, dark and what the system says; runs before anything is drawn.
+// Switch between the light, dark and system theme; runs before anything is drawn.
 "use strict";
 
 (() => {

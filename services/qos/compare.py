@@ -1,4 +1,4 @@
-"""What was asked against what was measured, and what other rates would need."""
+"""Compare measured metrics with requirements, and extrapolate resource needs to other image rates."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from scan2sim.services.qos.measure import Measured
-from scan2sim.services.qos.requirements import MACHINE, NETWORK, Bound, Requirements
+from scan2sim.services.qos.measure import Measurement
+from scan2sim.services.qos.requirements import MACHINE_METRICS, NETWORK_METRICS, Bound, Requirements
 
-RATES = (1.0, 2.0, 5.0, 10.0, 25.0)
-"""Images a second that needs are told for."""
-LOADED = 0.7
-"""Share of a processor's time that may be taken: beyond it, images wait long for each other."""
+IMAGE_RATES = (1.0, 2.0, 5.0, 10.0, 25.0)
+"""Image rates (images per second) for which resource needs are printed."""
+MAX_CPU_LOAD = 0.7
+"""Maximum share of CPU time; above it, images queue for long."""
 
 
 @dataclass(frozen=True)
-class Row:
-    """Of a metric; passed is None where nothing is asked, or there is nothing to measure."""
+class MetricComparison:
+    """Comparison of one metric; `passed` is None if it isn't required or can't be measured."""
 
     metric: str
     required: Bound | None
@@ -25,49 +25,51 @@ class Row:
     passed: bool | None
 
 
-class Valued(Protocol):
-    """Whatever was measured."""
+class MetricSource(Protocol):
+    """A measurement."""
 
     def values(self) -> dict[str, float | None]:
-        """By the metrics of `Requirements`; None: there is no such thing here."""
+        """Values of the metrics of `Requirements`; None: not applicable."""
 
 
-def rows(required: Requirements, measured: Valued) -> list[Row]:
-    """Of all metrics that are asked or measured.
+def compare_metrics(required: Requirements, measured: MetricSource) -> list[MetricComparison]:
+    """Compare all metrics that are required or measured.
 
-    What is asked of a network that isn't there is met; an answer that never came is too late, whatever is asked.
+    Network requirements pass if there is no network. A request without a response fails the response time, even if none
+    is required.
     """
     values = measured.values()
     found = []
-    for metric in (*NETWORK, *MACHINE):
+    for metric in (*NETWORK_METRICS, *MACHINE_METRICS):
         bound, value = getattr(required, metric), values[metric]
         if bound is None and value is None:
             continue
-        found.append(Row(metric, bound, value, _met(metric, bound, value)))
+        found.append(MetricComparison(metric, bound, value, _met(metric, bound, value)))
     return found
 
 
 def _met(metric: str, bound: Bound | None, value: float | None) -> bool | None:
     if value is None:
-        idle = metric.endswith("_usage")  # of a processor that isn't there
-        return None if bound is None or idle else False
+        unused = metric.endswith("_usage")  # of a processor that doesn't exist
+        return None if bound is None or unused else False
     if bound is None:
         return False if math.isinf(value) else None
     return bound.met(value)
 
 
-def passed(found: list[Row], metrics: tuple[str, ...]) -> bool:
-    """Whether all of some metrics are as asked."""
+def passed(found: list[MetricComparison], metrics: tuple[str, ...]) -> bool:
+    """Whether none of the given metrics fails its requirement."""
     return all(row.passed is not False for row in found if row.metric in metrics)
 
 
 @dataclass(frozen=True)
-class Needs:
-    """Of a rate of images.
+class ResourceNeeds:
+    """Resources needed for an image rate.
 
     Attributes:
-        bandwidth: Mbit/s on the network, both ways; None: there is none.
-        cores: of this machine's kind.
+        rate: images per second.
+        bandwidth: Mbit/s on the network, both ways; None: no network.
+        cores: number of CPU cores like those of this machine.
     """
 
     rate: float
@@ -75,8 +77,8 @@ class Needs:
     cores: float
 
 
-def needs(measured: Measured, rate: float) -> Needs:
-    """What a rate needs: bytes and work are in proportion to the images."""
-    sent = measured.answers.sent
-    on_wire = measured.wire_bytes / sent * rate * 8e-6 if measured.seen else None
-    return Needs(rate, on_wire, measured.usage.cpu_seconds / sent * rate / LOADED)
+def resource_needs(measured: Measurement, rate: float) -> ResourceNeeds:
+    """Resources needed for an image rate; bytes and CPU time are proportional to the number of images."""
+    sent = measured.requests.sent
+    on_wire = measured.wire_bytes / sent * rate * 8e-6 if measured.probe else None
+    return ResourceNeeds(rate, on_wire, measured.usage.cpu_seconds / sent * rate / MAX_CPU_LOAD)

@@ -1,4 +1,4 @@
-"""Where a robot's and a service's programs run: both on this machine, or each at an end of a shaped link."""
+"""Hosts of the robot and the service: both on this machine, or at the two ends of an emulated link."""
 
 from __future__ import annotations
 
@@ -10,108 +10,108 @@ from contextlib import contextmanager
 from typing import Any, Protocol
 
 from scan2sim.pipeline.core.errors import StepError
-from scan2sim.services.qos import probe
+from scan2sim.services.qos import probe as probe_module
 from scan2sim.services.qos.emulated_link import Link
 from scan2sim.services.qos.environments import Network
-from scan2sim.services.qos.probe import Seen
+from scan2sim.services.qos.probe import ProbeResult
 
-PROBES, PORT = 200.0, 9100
-"""Packets a second that probe a network, and where they are received."""
-REPORTS_WITHIN = 60.0
+PROBE_RATE, PROBE_PORT = 200.0, 9100
+"""Packets per second that probe the network, and the UDP port that receives them."""
+PROBE_TIMEOUT_S = 60.0
 
 
-class Places(Protocol):
-    """Two places, and what is between them.
+class Hosts(Protocol):
+    """Host of the robot and host of the service, and the network between them.
 
     Attributes:
-        address: of the service's place, as the robot sees it.
+        address: address of the service's host, as seen by the robot.
     """
 
     address: str
 
-    def robot(self, *command: object, **named: Any) -> subprocess.Popen[Any]:
-        """Start a program where the robot is."""
+    def start_robot(self, *command: object, **options: Any) -> subprocess.Popen[Any]:
+        """Start a program on the robot's host."""
 
-    def service(self, *command: object, **named: Any) -> subprocess.Popen[Any]:
-        """Start a program where the service is."""
+    def start_service(self, *command: object, **options: Any) -> subprocess.Popen[Any]:
+        """Start a program on the service's host."""
 
-    def bytes(self) -> int:
-        """That went through the network, both ways, so far."""
+    def wire_bytes(self) -> int:
+        """Bytes transferred so far, both ways."""
 
-    def seen(self, probing: Any) -> Seen | None:
-        """What probes that were begun have seen; None: there is no network."""
+    def probe_result(self, probe: Any) -> ProbeResult | None:
+        """Wait for a probe and return its result; None: no network."""
 
-    def probe(self, seconds: float) -> Any:
-        """Begin to probe the network, for so long."""
+    def start_probe(self, seconds: float) -> Any:
+        """Start probing the network for a number of seconds."""
 
 
-class Here:
-    """Both on this machine: there is no network."""
+class SameHost:
+    """Robot and service on this machine, without a network."""
 
     address = "127.0.0.1"
 
-    def robot(self, *command: object, **named: Any) -> subprocess.Popen[Any]:
-        """See `Places`."""
-        return subprocess.Popen([str(one) for one in command], **named)
+    def start_robot(self, *command: object, **options: Any) -> subprocess.Popen[Any]:
+        """See `Hosts`."""
+        return subprocess.Popen([str(one) for one in command], **options)
 
-    service = robot
+    start_service = start_robot
 
-    def bytes(self) -> int:
-        """None."""
+    def wire_bytes(self) -> int:
+        """Always 0."""
         return 0
 
-    def probe(self, seconds: float) -> None:
-        """Nothing."""
+    def start_probe(self, seconds: float) -> None:
+        """No network, no probe."""
 
-    def seen(self, probing: None) -> None:
-        """Nothing."""
+    def probe_result(self, probe: None) -> None:
+        """No network, no result."""
 
 
-class Apart:
-    """At the ends of a link: the robot at the near one, the service at the far one."""
+class LinkedHosts:
+    """Robot at the near end of an emulated link, service at its far end."""
 
     def __init__(self, link: Link) -> None:
         self._link, self.address = link, link.far.address
 
-    def robot(self, *command: object, **named: Any) -> subprocess.Popen[Any]:
-        """See `Places`."""
-        return self._link.near.popen(*command, **named)
+    def start_robot(self, *command: object, **options: Any) -> subprocess.Popen[Any]:
+        """See `Hosts`."""
+        return self._link.near.popen(*command, **options)
 
-    def service(self, *command: object, **named: Any) -> subprocess.Popen[Any]:
-        """See `Places`."""
-        return self._link.far.popen(*command, **named)
+    def start_service(self, *command: object, **options: Any) -> subprocess.Popen[Any]:
+        """See `Hosts`."""
+        return self._link.far.popen(*command, **options)
 
-    def bytes(self) -> int:
-        """See `Places`."""
+    def wire_bytes(self) -> int:
+        """See `Hosts`."""
         counts = self._link.near.counts()
         return counts.sent_bytes + counts.received_bytes
 
-    def probe(self, seconds: float) -> subprocess.Popen[str]:
-        """See `Places`."""
-        command = (sys.executable, "-m", probe.__name__)
-        receiver = self.service(*command, "receive", PORT, stdout=subprocess.PIPE, text=True)
+    def start_probe(self, seconds: float) -> subprocess.Popen[str]:
+        """See `Hosts`."""
+        command = (sys.executable, "-m", probe_module.__name__)
+        receiver = self.start_service(*command, "receive", PROBE_PORT, stdout=subprocess.PIPE, text=True)
         assert receiver.stdout
         receiver.stdout.readline()
-        self.robot(*command, "send", self.address, PORT, PROBES, seconds)
+        self.start_robot(*command, "send", self.address, PROBE_PORT, PROBE_RATE, seconds)
         return receiver
 
-    def seen(self, probing: subprocess.Popen[str]) -> Seen:
-        """See `Places`."""
-        line, _ = probing.communicate(timeout=REPORTS_WITHIN)
-        if probing.returncode:
-            raise StepError("the network's probe", "got no packets through", "Make the link less bad")
-        return Seen(**json.loads(line))
+    def probe_result(self, probe: subprocess.Popen[str]) -> ProbeResult:
+        """See `Hosts`."""
+        line, _ = probe.communicate(timeout=PROBE_TIMEOUT_S)
+        if probe.returncode:
+            raise StepError("the network probe", "no packets were received", "Use a link with less loss")
+        return ProbeResult(**json.loads(line))
 
 
 @contextmanager
-def between(network: Network | None) -> Iterator[Places]:
-    """The places at the ends of a network; None: both are this machine.
+def open_hosts(network: Network | None) -> Iterator[Hosts]:
+    """Hosts at the ends of a network; None: both on this machine.
 
     Raises:
-        UnavailableError: no network can be made here (it takes root).
+        UnavailableError: a network can't be created here (it requires root).
     """
     if network is None:
-        yield Here()
+        yield SameHost()
         return
     with Link(network.there, network.back) as link:
-        yield Apart(link)
+        yield LinkedHosts(link)

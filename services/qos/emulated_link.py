@@ -1,7 +1,7 @@
-"""A link between two machines that are made up of this one: as fast, late and lossy as it is asked to be.
+"""Emulated network link between two network namespaces of this machine, with given rate, delay and loss.
 
 ```
-with Link(Shape(rate=8e6, delay=0.02, loss=0.01)) as link:
+with Link(LinkProfile(rate=8e6, delay=0.02, loss=0.01)) as link:
     link.far.popen("iperf3", "-s")
     link.near.run("iperf3", "-c", link.far.address)
 ```
@@ -14,15 +14,15 @@ from contextlib import ExitStack
 from typing import Self
 
 from scan2sim.services.qos import links, namespaces
-from scan2sim.services.qos.link_profile import Shape
+from scan2sim.services.qos.link_profile import LinkProfile
 from scan2sim.services.qos.namespaces import Namespace
 
 
 class Link:
-    """Two namespaces and what is between them, from `with` to its end; then all that runs in them is killed.
+    """Two namespaces and the link between them, a context manager; processes in them are killed at its end.
 
     Attributes:
-        near, far: the namespaces; both have this machine's files, clock and name.
+        near, far: the namespaces; both share this machine's files, clock and host name.
     """
 
     near: Namespace
@@ -30,46 +30,46 @@ class Link:
 
     def __init__(
         self,
-        there: Shape,
-        back: Shape | None = None,
+        there: LinkProfile,
+        back: LinkProfile | None = None,
         *,
-        beside: Sequence[tuple[Shape, Shape]] = (),
+        beside: Sequence[tuple[LinkProfile, LinkProfile]] = (),
         backend: str | None = None,
     ) -> None:
-        """A link of one wire, or of several.
+        """Prepare a link of one wire or several.
 
         Args:
-            there: what becomes of packets from the near side to the far one.
-            back: of those the other way; None: the same.
-            beside: likewise, there and back, of further wires beside the first.
-            backend: what shapes it, a file in `links`; None: what is best here.
+            there: profile of the direction from the near side to the far side.
+            back: profile of the other direction; None: the same.
+            beside: profiles, there and back, of further parallel wires.
+            backend: backend that shapes the traffic, a module in `links`; None: the best available.
         """
-        self._shapes, self._backend = ((there, back or there), *beside), backend
+        self._profiles, self._backend = ((there, back or there), *beside), backend
         self._open = ExitStack()
 
     def __enter__(self) -> Self:
-        """Make it.
+        """Create the namespaces and wires.
 
         Raises:
             SettingError: there is no such backend.
-            UnavailableError: a link can't be made here; it says what to do.
+            UnavailableError: a link can't be created here; the message says what is missing.
         """
         with ExitStack() as made:
             self.near, self.far, folder = made.enter_context(namespaces.pair())
             backend = links.find(self._backend)
-            self._wires = [backend.connect(self.near, self.far, folder, wire) for wire in range(len(self._shapes))]
-            for wire, shapes in enumerate(self._shapes):
+            self._wires = [backend.connect(self.near, self.far, folder, wire) for wire in range(len(self._profiles))]
+            for wire, profiles in enumerate(self._profiles):
                 for side in (self.near, self.far):
-                    side.up(wire)
-                self.near.know(self.far, wire)
-                self.far.know(self.near, wire)
-                self._wires[wire].shape(*shapes)
+                    side.bring_up(wire)
+                self.near.add_static_neighbour(self.far, wire)
+                self.far.add_static_neighbour(self.near, wire)
+                self._wires[wire].shape(*profiles)
             self._open = made.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._open.close()
 
-    def shape(self, there: Shape, back: Shape | None = None, *, wire: int = 0) -> None:
-        """A wire is another from now on."""
+    def shape(self, there: LinkProfile, back: LinkProfile | None = None, *, wire: int = 0) -> None:
+        """Change the profiles of a wire."""
         self._wires[wire].shape(there, back or there)

@@ -1,7 +1,7 @@
-"""How images are sent so that they fit a link: the quality and scale of JPEGs, or the bit rate of an H.264 stream.
+"""Choose how images are encoded so that they fit a link: JPEG quality and scale, or bit rate of an H.264 stream.
 
-What is counted are the images' own bytes, encoded here, with the overhead of what carries them. What a choice costs in
-accuracy `bench/toolboxes/quality.py` measures.
+Sizes are measured by encoding the images; protocol overhead is added. `bench/toolboxes/quality.py` measures the effect
+on accuracy.
 """
 
 from __future__ import annotations
@@ -16,42 +16,42 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.parameters import File
 from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.core.types import U8
 
-QUALITIES = (90, 85, 80, 75, 70, 65, 60, 55, 50, 45, 40, 35, 30)
-"""Of JPEGs, best first; above and below them a byte buys less than in the next scale."""
-SCALES = (1.0, 0.75, 0.5, 0.35, 0.25)
-SEGMENT, HEADERS = 1448, 66
-"""Bytes of a TCP segment's load, and of its headers (Ethernet 14, IP 20, TCP with timestamps 32)."""
-ANSWER = 3000
-"""Bytes of a request's headers and its answer: some dozen results, in JSON."""
-PACKET, PACKET_HEADERS = 1400, 54
-"""Bytes of an RTP packet's load, and of its headers (Ethernet 14, IP 20, UDP 8, RTP 12)."""
-BITRATES = tuple(40e6 * 0.85**step for step in range(48))
-"""Of streams, highest first, down to 20 kbit/s."""
+JPEG_QUALITIES = (90, 85, 80, 75, 70, 65, 60, 55, 50, 45, 40, 35, 30)
+"""JPEG qualities, best first. Outside this range, changing the scale is more efficient than changing the quality."""
+IMAGE_SCALES = (1.0, 0.75, 0.5, 0.35, 0.25)
+TCP_PAYLOAD_BYTES, TCP_HEADER_BYTES = 1448, 66
+"""Payload of a TCP segment, and its headers (Ethernet 14, IP 20, TCP with timestamps 32)."""
+HTTP_OVERHEAD_BYTES = 3000
+"""Size of a request's headers and its response: some dozen results in JSON."""
+RTP_PAYLOAD_BYTES, RTP_HEADER_BYTES = 1400, 54
+"""Payload of an RTP packet, and its headers (Ethernet 14, IP 20, UDP 8, RTP 12)."""
+H264_BITRATES = tuple(40e6 * 0.85**step for step in range(48))
+"""Bit rates of H.264 streams, highest first, down to 20 kbit/s."""
 
 
 class ChoiceParams(Params):
-    """Of a choice."""
+    """Settings of `scan2sim qos choose`."""
 
-    images: Annotated[File, Field(description="Folder of pictures, a picture or a video.")]
-    rate: Annotated[float, Field(ge=0.01, le=1000, description="Images a second.")] = 10.0
-    budget: Annotated[float, Field(ge=0.01, le=10_000, description="Mbit/s that they may take, overhead and all.")] = (
-        5.0
-    )
+    images: Annotated[File, Field(description="Folder of images, an image or a video.")]
+    rate: Annotated[float, Field(ge=0.01, le=1000, description="Images per second.")] = 10.0
+    budget: Annotated[
+        float, Field(ge=0.01, le=10_000, description="Available bandwidth in Mbit/s, including overhead.")
+    ] = 5.0
 
 
 @dataclass(frozen=True)
 class Jpeg:
-    """How images are sent as JPEGs.
+    """Encoding as JPEGs.
 
     Attributes:
-        quality: as libjpeg counts it, 1 to 100.
-        scale: of their sides.
-        megabits: Mbit/s that they take, overhead and all.
+        quality: JPEG quality, 1 to 100 as in libjpeg.
+        scale: scale of width and height.
+        megabits: required bandwidth in Mbit/s, including overhead.
     """
 
     quality: int
@@ -59,92 +59,93 @@ class Jpeg:
     megabits: float
 
     def encoded(self, image: U8) -> bytes:
-        """An (H, W, 3) RGB image."""
+        """Encode an (H, W, 3) RGB image."""
         return jpeg(scaled(image, self.scale), self.quality)
 
 
 @dataclass(frozen=True)
 class H264:
-    """How images are streamed: bits a second that the encoder is told, Mbit/s that it takes, overhead and all."""
+    """Encoding as an H.264 stream: bit rate of the encoder in bit/s, and required bandwidth in Mbit/s with overhead."""
 
     bitrate: float
     megabits: float
 
 
-def by_http(size: int) -> int:
-    """Bytes on the wire, both ways, of an image of so many that is posted, and of its answer."""
-    segments = -(-size // SEGMENT)
-    return size + segments * HEADERS + segments // 2 * HEADERS + ANSWER
+def http_wire_bytes(size: int) -> int:
+    """Bytes on the wire, both ways, for posting an image of `size` bytes and receiving its results."""
+    segments = -(-size // TCP_PAYLOAD_BYTES)
+    return size + segments * TCP_HEADER_BYTES + segments // 2 * TCP_HEADER_BYTES + HTTP_OVERHEAD_BYTES
 
 
-def by_rtp(size: int) -> int:
-    """Bytes on the wire of a stream's picture of so many."""
-    return size + -(-size // PACKET) * PACKET_HEADERS
+def rtp_wire_bytes(size: int) -> int:
+    """Bytes on the wire for a video frame of `size` bytes."""
+    return size + -(-size // RTP_PAYLOAD_BYTES) * RTP_HEADER_BYTES
 
 
 def choose_jpeg(images: Sequence[U8], rate: float, budget: float) -> Jpeg:
-    """The best JPEGs that fit: first the quality is lowered, then the size, and the quality anew.
+    """The best JPEG encoding that fits: reduce the quality, then the scale, then the quality again.
 
     Args:
-        images: (H, W, 3) RGB; the largest of them has to fit.
-        rate: images a second.
-        budget: Mbit/s.
+        images: (H, W, 3) RGB; the largest one has to fit.
+        rate: images per second.
+        budget: available bandwidth in Mbit/s.
 
     Raises:
-        InputError: even the smallest take more.
+        InputError: even the smallest images need more.
     """
     least = math.inf
-    for scale in SCALES:
+    for scale in IMAGE_SCALES:
         smaller = [scaled(image, scale) for image in images]
-        for quality in QUALITIES:
+        for quality in JPEG_QUALITIES:
             made = Jpeg(quality, scale, _megabits(smaller, rate, quality))
             if made.megabits <= budget:
                 return made
             least = min(least, made.megabits)
-    raise InputError(f"{budget:g} Mbit/s", f"are too few for {rate:g} images a second: {least:.2g} are needed", FEWER)
+    cause = f"not enough for {rate:g} images per second, which need at least {least:.2g} Mbit/s"
+    raise InputError(f"{budget:g} Mbit/s", cause, BUDGET_REMEDY)
 
 
-def as_jpeg(images: Sequence[U8], rate: float, quality: int) -> Jpeg:
-    """What JPEGs of a quality take, at so many images a second."""
+def jpeg_at_quality(images: Sequence[U8], rate: float, quality: int) -> Jpeg:
+    """JPEG encoding with a given quality, at the original size."""
     return Jpeg(quality, 1.0, _megabits(images, rate, quality))
 
 
 def _megabits(images: Sequence[U8], rate: float, quality: int) -> float:
-    """Mbit/s, were all as large as the largest."""
-    return 8e-6 * rate * max(by_http(len(jpeg(image, quality))) for image in images)
+    """Bandwidth in Mbit/s if all images were as large as the largest."""
+    return 8e-6 * rate * max(http_wire_bytes(len(jpeg(image, quality))) for image in images)
 
 
 def choose_h264(images: Sequence[U8], rate: float, budget: float) -> H264:
-    """The highest bit rate whose stream fits.
+    """H.264 encoding with the highest bit rate that fits.
 
     Args:
-        images: (H, W, 3) RGB, in a row; what they take over any second has to fit.
-        rate: images a second.
-        budget: Mbit/s.
+        images: (H, W, 3) RGB, in sequence; their size in any second has to fit.
+        rate: images per second.
+        budget: available bandwidth in Mbit/s.
 
     Raises:
-        InputError: no stream is so small.
+        InputError: even the lowest bit rate needs more.
         UnavailableError: PyAV isn't installed.
     """
-    for bitrate in (one for one in BITRATES if one <= budget * 1e6):
-        megabits = busiest([by_rtp(len(packet)) for packet in stream(images, rate, bitrate)], rate)
+    for bitrate in (one for one in H264_BITRATES if one <= budget * 1e6):
+        megabits = peak_megabits([rtp_wire_bytes(len(packet)) for packet in encode_h264(images, rate, bitrate)], rate)
         if megabits <= budget:
             return H264(bitrate, megabits)
-    raise InputError(f"{budget:g} Mbit/s", f"are too few for {rate:g} images a second", FEWER)
+    raise InputError(f"{budget:g} Mbit/s", f"not enough for H.264 at {rate:g} images per second", BUDGET_REMEDY)
 
 
-FEWER = "Send fewer images a second, or smaller ones, or allow more"
+BUDGET_REMEDY = "Send fewer or smaller images, or increase the budget"
 
 
-def busiest(sizes: Sequence[int], rate: float) -> float:
-    """Mbit/s of the second with the most bytes, of pictures in a row."""
+def peak_megabits(sizes: Sequence[int], rate: float) -> float:
+    """Bandwidth in Mbit/s of the second with the most bytes, from the sizes of successive frames."""
     span = max(1, min(len(sizes), round(rate)))
     sums = np.convolve(sizes, np.ones(span), "valid")
     return float(8e-6 * sums.max() * rate / span)
 
 
 def scaled(image: U8, scale: float) -> U8:
-    """An image whose sides are so many times as long."""
+    """An image resized by a factor."""
     import cv2
 
     if scale == 1.0:
@@ -153,24 +154,24 @@ def scaled(image: U8, scale: float) -> U8:
 
 
 def jpeg(image: U8, quality: int) -> bytes:
-    """An (H, W, 3) RGB image as a JPEG."""
+    """Encode an (H, W, 3) RGB image as a JPEG."""
     import cv2
 
     return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
-def stream(images: Sequence[U8], rate: float, bitrate: float) -> Iterator[bytes]:
-    """Pictures of an H.264 stream, as a robot sends it live: none waits for a later one, no second is over the rate.
+def encode_h264(images: Sequence[U8], rate: float, bitrate: float) -> Iterator[bytes]:
+    """Encode frames as an H.264 live stream: no frame depends on a later one, and no second exceeds the bit rate.
 
     Args:
-        images: (H, W, 3) RGB, in a row; an odd row or column at the end is cut off.
-        rate: images a second.
-        bitrate: bits a second.
+        images: (H, W, 3) RGB, in sequence; an odd last row or column is cropped.
+        rate: images per second.
+        bitrate: bits per second.
 
     Raises:
         UnavailableError: PyAV isn't installed.
     """
-    need("H.264", "av")
+    require("H.264", "av")
     import av
 
     height, width = (side // 2 * 2 for side in images[0].shape[:2])
@@ -179,7 +180,7 @@ def stream(images: Sequence[U8], rate: float, bitrate: float) -> Iterator[bytes]
     encoder.framerate = Fraction(rate).limit_denominator(1001)
     encoder.time_base = 1 / encoder.framerate
     encoder.bit_rate, encoder.gop_size = round(bitrate), max(1, round(2 * rate))
-    half = str(round(bitrate / 2))  # seconds that may be ahead of the rate
+    half = str(round(bitrate / 2))  # buffer of half a second
     encoder.options = {"preset": "veryfast", "tune": "zerolatency", "maxrate": str(round(bitrate)), "bufsize": half}
     for number, image in enumerate(images):
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image[:height, :width]), format="rgb24")
@@ -187,13 +188,13 @@ def stream(images: Sequence[U8], rate: float, bitrate: float) -> Iterator[bytes]
         yield b"".join(bytes(packet) for packet in encoder.encode(frame))
 
 
-def pictures(packets: Sequence[bytes]) -> Iterator[U8]:
-    """(H, W, 3) RGB of a stream's pictures.
+def decode_h264(packets: Sequence[bytes]) -> Iterator[U8]:
+    """Decode an H.264 stream to (H, W, 3) RGB frames.
 
     Raises:
         UnavailableError: PyAV isn't installed.
     """
-    need("H.264", "av")
+    require("H.264", "av")
     import av
 
     decoder = av.CodecContext.create("h264", "r")

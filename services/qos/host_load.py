@@ -1,4 +1,4 @@
-"""The machine that a service runs on, and what the service takes of it."""
+"""Hardware of this machine, and the resources used by a process."""
 
 from __future__ import annotations
 
@@ -6,20 +6,22 @@ import shutil
 import subprocess
 import time
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
-import psutil
+if TYPE_CHECKING:
+    import psutil
 
-QUERY = ("clocks.max.sm", "memory.total", "utilization.gpu")
+NVIDIA_SMI_FIELDS = ("clocks.max.sm", "memory.total", "utilization.gpu")
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What a machine has; None: no graphics processor, or it doesn't say.
+    """Hardware of a machine; None: no GPU, or unknown.
 
     Attributes:
-        cpu_cores: that this process may use.
-        cpu_frequency, gpu_frequency: MHz.
-        gpu_memory: MB.
+        cpu_cores: number of cores available to this process.
+        cpu_frequency, gpu_frequency: maximum clock in MHz.
+        gpu_memory: memory of the GPU in MB.
     """
 
     cpu_cores: int
@@ -30,23 +32,25 @@ class Machine:
 
 
 def machine() -> Machine:
-    """This one."""
+    """Hardware of this machine."""
+    import psutil
+
     frequency = psutil.cpu_freq()
     gpu = _gpu()
     return Machine(
         cpu_cores=len(psutil.Process().cpu_affinity() or ()) or psutil.cpu_count() or 1,
         cpu_frequency=(frequency.max or frequency.current or None) if frequency else None,
-        gpu_cores=None,  # nvidia-smi doesn't say
+        gpu_cores=None,  # not reported by nvidia-smi
         gpu_frequency=gpu[0] if gpu else None,
         gpu_memory=gpu[1] if gpu else None,
     )
 
 
 def _gpu() -> tuple[float, float, float] | None:
-    """Clock (MHz), memory (MB) and load (%) of the first graphics processor."""
+    """Clock (MHz), memory (MB) and load (%) of the first GPU."""
     if shutil.which("nvidia-smi") is None:
         return None
-    command = ["nvidia-smi", f"--query-gpu={','.join(QUERY)}", "--format=csv,noheader,nounits"]
+    command = ["nvidia-smi", f"--query-gpu={','.join(NVIDIA_SMI_FIELDS)}", "--format=csv,noheader,nounits"]
     done = subprocess.run(command, capture_output=True, text=True)
     try:
         clock, memory, load = (float(value) for value in done.stdout.splitlines()[0].split(","))
@@ -57,56 +61,58 @@ def _gpu() -> tuple[float, float, float] | None:
 
 @dataclass(frozen=True)
 class Usage:
-    """What a process and those that it started take, from a moment on.
+    """Resources used by a process and its children since `start`.
 
     Attributes:
-        cpu_seconds: of all cores; cpu_percent: of the machine's capacity.
-        memory_mb: at most.
-        gpu_percent: mean load of the first graphics processor; None: there is none.
+        cpu_seconds: CPU time of all cores; cpu_percent: share of the machine's capacity.
+        memory_mb: peak resident memory.
+        gpu_percent: mean load of the first GPU; None: no GPU.
     """
 
     process: psutil.Process
-    began: float
-    before: float
+    started_at: float
+    initial_cpu_seconds: float
     cpu_seconds: float = 0.0
     memory_mb: float = 0.0
     seconds: float = 0.0
     gpu_loads: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, process: psutil.Process) -> Usage:
-        """From now on."""
+    def start(cls, process: psutil.Process) -> Usage:
+        """Start measuring."""
         return cls(process, time.monotonic(), _cpu_seconds(process))
 
     def updated(self) -> Usage:
-        """Until now."""
+        """Usage up to now."""
         gpu = _gpu()
         return replace(
             self,
-            cpu_seconds=_cpu_seconds(self.process) - self.before,
-            memory_mb=max(self.memory_mb, sum(one.memory_info().rss for one in _family(self.process)) / 2**20),
-            seconds=time.monotonic() - self.began,
+            cpu_seconds=_cpu_seconds(self.process) - self.initial_cpu_seconds,
+            memory_mb=max(self.memory_mb, sum(one.memory_info().rss for one in _process_tree(self.process)) / 2**20),
+            seconds=time.monotonic() - self.started_at,
             gpu_loads=(*self.gpu_loads, *([gpu[2]] if gpu else [])),
         )
 
     @property
     def cpu_percent(self) -> float:
-        """Of the machine's capacity."""
+        """CPU time as a percentage of the machine's capacity."""
         return 100 * self.cpu_seconds / max(self.seconds, 1e-9) / machine().cpu_cores
 
     @property
     def gpu_percent(self) -> float | None:
-        """Mean."""
+        """Mean load of the first GPU."""
         return sum(self.gpu_loads) / len(self.gpu_loads) if self.gpu_loads else None
 
 
-def _family(process: psutil.Process) -> list[psutil.Process]:
+def _process_tree(process: psutil.Process) -> list[psutil.Process]:
     return [process, *process.children(recursive=True)]
 
 
 def _cpu_seconds(process: psutil.Process) -> float:
+    import psutil
+
     found = 0.0
-    for one in _family(process):
+    for one in _process_tree(process):
         try:
             times = one.cpu_times()
         except psutil.NoSuchProcess:

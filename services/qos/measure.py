@@ -1,4 +1,4 @@
-"""A toolbox's quality of service, measured: it serves a robot over an environment's network (D3.2, 2.1 and 2.2)."""
+"""Measure a toolbox's quality of service while it serves a robot over an environment's network (D3.2, 2.1 and 2.2)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import psutil
 from pydantic import Field
 
 from scan2sim.pipeline.core.errors import InputError, StepError
@@ -25,84 +24,84 @@ from scan2sim.pipeline.core.parameters import File
 from scan2sim.pipeline.core.step import Params, Report
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.qos import deployment, encoding, robot
-from scan2sim.services.qos.deployment import Places
+from scan2sim.services.qos.deployment import Hosts
 from scan2sim.services.qos.encoding import Jpeg
 from scan2sim.services.qos.environments import Network, network
 from scan2sim.services.qos.host_load import Machine, Usage, machine
-from scan2sim.services.qos.probe import Seen
-from scan2sim.services.qos.requirements import Environment, Requirements, Service
-from scan2sim.services.qos.robot import Answers
+from scan2sim.services.qos.probe import ProbeResult
+from scan2sim.services.qos.requirements import Environment, Requirements, ServiceRequirements
+from scan2sim.services.qos.robot import RequestStats
 
 ROOT = Path(__file__).resolve().parents[2]
-STREET = ROOT / "data_samples" / "tile"
-STARTS_WITHIN = 300.0
-"""Seconds for a toolbox to be ready."""
-PORT = 9000
-"""Of a toolbox, where it has the place to itself."""
-WARM = 3.0
-"""Seconds that the robot asks before anything is measured: what comes first is slow."""
-PICTURES = 16
-"""That are sent in turn, at most."""
-FREE = 0.8
-"""Share of a network's rate that images may take: beyond it they wait for each other."""
+SAMPLE_IMAGES = ROOT / "data_samples" / "tile"
+START_TIMEOUT_S = 300.0
+"""Seconds to wait until a toolbox is ready."""
+TOOLBOX_PORT = 9000
+"""Port of the toolbox on a host of its own."""
+WARM_UP_S = 3.0
+"""Seconds of requests before the measurement, as the first ones are slow."""
+MAX_IMAGES = 16
+"""Maximum number of different images to send."""
+MAX_LINK_UTILIZATION = 0.8
+"""Maximum share of the network's rate used for images; above it, images queue for each other."""
 
 
 class MeasureParams(Params):
-    """Of a measurement."""
+    """Settings of `scan2sim qos measure`."""
 
-    toolbox: Annotated[str, Field(description="That is measured: detect, movement, classify or segment.")]
+    toolbox: Annotated[str, Field(description="Toolbox to measure: detect, movement, classify or segment.")]
     environment: Annotated[Environment, Field(description="Where it runs: robot, edge or cloud.")] = Environment.EDGE
-    rate: Annotated[float, Field(ge=0.01, le=1000, description="Images a second that the robot sends.")] = 2.0
-    seconds: Annotated[float, Field(ge=1, le=86_400, description="Seconds that it is measured for.")] = 30.0
+    rate: Annotated[float, Field(ge=0.01, le=1000, description="Images per second sent by the robot.")] = 2.0
+    seconds: Annotated[float, Field(ge=1, le=86_400, description="Duration of the measurement in seconds.")] = 30.0
     images: Annotated[
-        File | None, Field(description="Folder of pictures that are sent; default: photos of the synthetic street.")
+        File | None, Field(description="Folder of images to send. Default: photos of the synthetic street.")
     ] = None
     quality: Annotated[
-        int | None, Field(ge=5, le=100, description="Quality of the JPEGs that are sent; default: the best that fits.")
+        int | None, Field(ge=5, le=100, description="JPEG quality of the images. Default: the best that fits.")
     ] = None
     budget: Annotated[
         float | None,
-        Field(ge=0.01, le=10_000, description="Mbit/s for images; default: as required, within the network's rate."),
+        Field(ge=0.01, le=10_000, description="Mbit/s for images. Default: as required, within the network's rate."),
     ] = None
-    network: Annotated[
-        File | None, Field(description="TOML of a network, in place of what the environment's is assumed to be.")
-    ] = None
+    network: Annotated[File | None, Field(description="TOML file that replaces the environment's assumed network.")] = (
+        None
+    )
     requirements: Annotated[
-        str | None, Field(description="TOML of requirements, or a name of those that come along; default: its own.")
+        str | None, Field(description="TOML file or name of built-in requirements. Default: the toolbox's own.")
     ] = None
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What was measured.
+class Measurement:
+    """Results of a measurement.
 
     Attributes:
-        answers: what the robot got.
-        seen: what the network did to packets; None: there is none.
-        usage: what the toolbox took while it worked.
-        machine: what it ran on.
-        wire_bytes: that crossed the network for images and results, overhead and all.
-        encoding: of the images.
+        requests: statistics of the robot's requests.
+        probe: what the network did to packets; None: no network.
+        usage: resources used by the toolbox.
+        machine: hardware it ran on.
+        wire_bytes: bytes transferred for images and results, including overhead.
+        encoding: encoding of the images.
     """
 
-    answers: Answers
-    seen: Seen | None
+    requests: RequestStats
+    probe: ProbeResult | None
     usage: Usage
     machine: Machine
     wire_bytes: int
     encoding: Jpeg
 
     def values(self) -> dict[str, float | None]:
-        """By the metrics of `requirements.Requirements`; None: there is no such thing here."""
-        answers, seen = self.answers, self.seen
+        """Values of the metrics of `requirements.Requirements`; None: not applicable."""
+        requests, probe = self.requests, self.probe
         return {
-            "response_time": answers.response_p95,
-            "delay": seen.delay if seen else None,
-            "jitter": seen.jitter if seen else None,
-            "data_rate": answers.sent * answers.image_bytes * 8e-6 / answers.seconds,
-            "bandwidth": self.wire_bytes * 8e-6 / answers.seconds if seen else None,
-            "loss_rate": seen.loss_rate if seen else None,
-            "error_rate": seen.error_rate if seen else None,
+            "response_time": requests.response_p95,
+            "delay": probe.delay if probe else None,
+            "jitter": probe.jitter if probe else None,
+            "data_rate": requests.sent * requests.image_bytes * 8e-6 / requests.seconds,
+            "bandwidth": self.wire_bytes * 8e-6 / requests.seconds if probe else None,
+            "loss_rate": probe.loss_rate if probe else None,
+            "error_rate": probe.error_rate if probe else None,
             "cpu_cores": self.machine.cpu_cores,
             "cpu_frequency": self.machine.cpu_frequency,
             "cpu_usage": self.usage.cpu_percent,
@@ -114,74 +113,77 @@ class Measured:
         }
 
 
-def measure(params: MeasureParams, service: Service, report: Report) -> Measured:
-    """Run a toolbox, and a robot that asks it, over the environment's network.
+def measure(params: MeasureParams, service: ServiceRequirements, report: Report) -> Measurement:
+    """Run a toolbox and a robot that sends it images over the environment's network.
 
     Raises:
-        InputError: there are no pictures, or the network is too slow for any.
-        UnavailableError: no network can be made here (it takes root).
+        InputError: there are no images, or the network is too slow for any.
+        UnavailableError: a network can't be created here (it requires root).
         StepError: the toolbox doesn't start, or the robot fails.
     """
-    between = network(params.environment, params.network)
-    with tempfile.TemporaryDirectory(prefix="scan2sim-qos-") as folder, deployment.between(between) as ends:
-        chosen = _write_pictures(params, service, between, Path(folder))
-        report(0.0, "the toolbox starts")
-        with _serving(ends, params.toolbox, Path(folder)) as (server, port):
-            _answers(_asking(ends, params, folder, port, WARM))
-            usage, before = Usage.of(psutil.Process(server.pid)), ends.bytes()
-            probing, asking = ends.probe(params.seconds), _asking(ends, params, folder, port, params.seconds)
+    import psutil
+
+    link = network(params.environment, params.network)
+    with tempfile.TemporaryDirectory(prefix="scan2sim-qos-") as folder, deployment.open_hosts(link) as hosts:
+        chosen = _write_images(params, service, link, Path(folder))
+        report(0.0, "starting the toolbox")
+        with _toolbox(hosts, params.toolbox, Path(folder)) as (server, port):
+            _robot_stats(_start_robot(hosts, params, folder, port, WARM_UP_S))
+            usage, before = Usage.start(psutil.Process(server.pid)), hosts.wire_bytes()
+            running_probe = hosts.start_probe(params.seconds)
+            running_robot = _start_robot(hosts, params, folder, port, params.seconds)
             began = time.monotonic()
-            while asking.poll() is None:
-                report(min(1.0, (time.monotonic() - began) / params.seconds), "the robot asks")
+            while running_robot.poll() is None:
+                report(min(1.0, (time.monotonic() - began) / params.seconds), "the robot sends images")
                 usage = usage.updated()
                 time.sleep(0.2)
-            answers, usage, seen = _answers(asking), usage.updated(), ends.seen(probing)
-            crossed = ends.bytes() - before - (seen.bytes if seen else 0)
-    return Measured(answers, seen, usage, machine(), crossed, chosen)
+            requests, usage, probe = _robot_stats(running_robot), usage.updated(), hosts.probe_result(running_probe)
+            transferred = hosts.wire_bytes() - before - (probe.bytes if probe else 0)
+    return Measurement(requests, probe, usage, machine(), transferred, chosen)
 
 
-def _write_pictures(params: MeasureParams, service: Service, between: Network | None, folder: Path) -> Jpeg:
-    """JPEGs that the robot sends, of the size that the requirements are for, as well as they allow."""
-    images = _pictures(params, service.image)
-    chosen = encoding_of(images, params, service.of(params.environment), between)
+def _write_images(params: MeasureParams, service: ServiceRequirements, link: Network | None, folder: Path) -> Jpeg:
+    """Write the JPEGs that the robot sends, with the required image size and the best quality that fits."""
+    images = _read_images(params, service.image)
+    chosen = encoding_of(images, params, service.of(params.environment), link)
     for number, image in enumerate(images):
         (folder / f"{number:03}.jpg").write_bytes(chosen.encoded(image))
     return chosen
 
 
-def encoding_of(images: Sequence[U8], params: MeasureParams, required: Requirements, between: Network | None) -> Jpeg:
-    """The quality that is asked for, or the best that fits what is allowed, required and there.
+def encoding_of(images: Sequence[U8], params: MeasureParams, required: Requirements, link: Network | None) -> Jpeg:
+    """Encoding with the given quality, or the best that fits budget, requirements and link.
 
     Raises:
-        InputError: nothing fits.
+        InputError: no encoding fits.
     """
     if params.quality is not None:
-        return encoding.as_jpeg(images, params.rate, params.quality)
-    rate = between.there.rate if between else None
+        return encoding.jpeg_at_quality(images, params.rate, params.quality)
+    rate = link.there.rate if link else None
     allowed = (
         params.budget,
         None if params.budget or not required.bandwidth else required.bandwidth.value,
-        None if rate is None else FREE * rate * 1e-6,
+        None if rate is None else MAX_LINK_UTILIZATION * rate * 1e-6,
     )
     return encoding.choose_jpeg(images, params.rate, min((one for one in allowed if one is not None), default=math.inf))
 
 
-def _pictures(params: MeasureParams, size: tuple[int, int] | None) -> list[U8]:
-    """(H, W, 3) RGB."""
+def _read_images(params: MeasureParams, size: tuple[int, int] | None) -> list[U8]:
+    """(H, W, 3) RGB images to send."""
     import cv2
 
-    place = params.images or STREET
-    found = sorted(path for path in place.rglob("*") if path.suffix.lower() in (".jpg", ".jpeg", ".png"))
-    step = max(1, len(found) // PICTURES)
-    pictures = [image for path in found[::step][:PICTURES] if (image := cv2.imread(str(path))) is not None]
-    if not pictures:
-        raise InputError(place, "holds no pictures", "Give --images a folder of JPEGs or PNGs")
-    loaded = (np.ascontiguousarray(image[..., ::-1]) for image in pictures)
-    return [image if size is None else _fitted(image, size) for image in loaded]
+    folder = params.images or SAMPLE_IMAGES
+    found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in (".jpg", ".jpeg", ".png"))
+    step = max(1, len(found) // MAX_IMAGES)
+    images = [image for path in found[::step][:MAX_IMAGES] if (image := cv2.imread(str(path))) is not None]
+    if not images:
+        raise InputError(folder, "contains no images", "Give --images a folder of JPEGs or PNGs")
+    loaded = (np.ascontiguousarray(image[..., ::-1]) for image in images)
+    return [image if size is None else _center_crop(image, size) for image in loaded]
 
 
-def _fitted(image: U8, size: tuple[int, int]) -> U8:
-    """The middle of an image, as large as asked."""
+def _center_crop(image: U8, size: tuple[int, int]) -> U8:
+    """An image scaled and cropped around its center to a size."""
     import cv2
 
     width, height = size
@@ -192,15 +194,16 @@ def _fitted(image: U8, size: tuple[int, int]) -> U8:
 
 
 @contextmanager
-def _serving(ends: Places, toolbox: str, folder: Path) -> Iterator[tuple[subprocess.Popen[Any], int]]:
-    """A toolbox that serves, and its port."""
-    local = ends.address == deployment.Here.address
-    token = folder / robot.TOKEN
-    token.write_text(secrets.token_hex(32), encoding="utf-8")  # beyond the loopback nothing is served without one
-    command = [sys.executable, "-m", "scan2sim.flows.cli", "toolbox", "serve", toolbox, "--host", ends.address]
+def _toolbox(hosts: Hosts, toolbox: str, folder: Path) -> Iterator[tuple[subprocess.Popen[Any], int]]:
+    """Start a toolbox; yields its process and port."""
+    local = hosts.address == deployment.SameHost.address
+    token = folder / robot.TOKEN_FILE
+    token.write_text(secrets.token_hex(32), encoding="utf-8")  # required beyond the loopback interface
+    command = [sys.executable, "-m", "scan2sim.flows.cli", "toolbox", "serve", toolbox, "--host", hosts.address]
     command += ["--token", str(token)]
     with (folder / "toolbox.log").open("w+") as log:
-        server = ends.service(*command, "--port", 0 if local else PORT, stdout=log, stderr=log, env=_environment())
+        port = 0 if local else TOOLBOX_PORT
+        server = hosts.start_service(*command, "--port", port, stdout=log, stderr=log, env=_environment())
         try:
             yield server, _port(server, folder / "toolbox.log")
         finally:
@@ -209,30 +212,31 @@ def _serving(ends: Places, toolbox: str, folder: Path) -> Iterator[tuple[subproc
 
 
 def _port(server: subprocess.Popen[Any], log: Path) -> int:
-    """Where it says that it listens, once it does."""
-    limit = time.monotonic() + STARTS_WITHIN
-    while server.poll() is None and time.monotonic() < limit:
+    """Port of a toolbox, from its log; waits until it listens."""
+    deadline = time.monotonic() + START_TIMEOUT_S
+    while server.poll() is None and time.monotonic() < deadline:
         for word in log.read_text(encoding="utf-8").split():
             if word.startswith("http://") and word.count(":") >= 2:
                 return int(word.split(":")[2].partition("/")[0])
         time.sleep(0.1)
-    raise StepError("the toolbox", f"doesn't serve ({log.read_text().strip()[-300:]})", "Try `scan2sim toolbox serve`")
+    log_end = log.read_text().strip()[-300:]
+    raise StepError("the toolbox", f"didn't start ({log_end})", "Try `scan2sim toolbox serve`")
 
 
-def _asking(ends: Places, params: MeasureParams, folder: str, port: int, seconds: float) -> subprocess.Popen[Any]:
-    command = (sys.executable, "-m", robot.__name__, f"http://{ends.address}:{port}", params.toolbox, folder)
-    return ends.robot(
+def _start_robot(hosts: Hosts, params: MeasureParams, folder: str, port: int, seconds: float) -> subprocess.Popen[Any]:
+    command = (sys.executable, "-m", robot.__name__, f"http://{hosts.address}:{port}", params.toolbox, folder)
+    return hosts.start_robot(
         *command, params.rate, seconds, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=_environment()
     )
 
 
-def _answers(asking: subprocess.Popen[Any]) -> Answers:
-    line, errors = asking.communicate()
-    if asking.returncode:
-        raise StepError("the robot", f"failed ({errors.strip()[-300:]})", "Report it")
-    return Answers(**json.loads(line))
+def _robot_stats(process: subprocess.Popen[Any]) -> RequestStats:
+    line, errors = process.communicate()
+    if process.returncode:
+        raise StepError("the robot", f"failed ({errors.strip()[-300:]})", "Report it as a bug")
+    return RequestStats(**json.loads(line))
 
 
 def _environment() -> dict[str, str]:
-    """This program's own search path for those that it starts."""
+    """Environment with this program's search path for Python modules."""
     return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

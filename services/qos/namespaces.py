@@ -1,6 +1,6 @@
-"""Machines made up of one: network namespaces, and what runs in them.
+"""Network namespaces that act as separate hosts, and the processes in them.
 
-They are gone with the process that made them, however that ends: a shell waits for it, and clears up.
+They are removed with the process that created them, even if it is killed: a shell waits for its end and cleans up.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from typing import Any
 
 from scan2sim.pipeline.core.errors import UnavailableError
 
-WHAT = "a shaped link"
-CLEAR = """
+FEATURE = "a shaped link"
+CLEANUP_SCRIPT = """
 read -r _
 for name in "$2" "$3"; do
   while pids=$(ip netns pids "$name") && [ -n "$pids" ]; do kill -9 $pids; done
@@ -28,13 +28,13 @@ for name in "$2" "$3"; do
 done 2>/dev/null
 rm -rf "$1"
 """
-"""A shell's script: ends what runs in two namespaces, and them, when there is input or no more of it."""
+"""Shell script: after input or its end, kills all processes in two namespaces and removes the namespaces."""
 _numbers = itertools.count()
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Of an interface since it was made; bytes are those of Ethernet frames, without their checksums."""
+    """Traffic of an interface since its creation; bytes of Ethernet frames without checksum."""
 
     received_packets: int
     received_bytes: int
@@ -43,92 +43,91 @@ class Counts:
 
 
 class Namespace:
-    """A namespace with an interface a wire, beside its loopback; wires count from 0."""
+    """A network namespace with a loopback interface and one interface per wire, numbered from 0."""
 
     def __init__(self, name: str, host: int) -> None:
-        """`host`: the last number of its addresses."""
+        """Create the namespace; `host` is the last number of its IPv4 addresses."""
         self.name, self._host = name, host
         self._started: list[subprocess.Popen[Any]] = []
         ip("netns", "add", name)
 
     @property
     def address(self) -> str:
-        """On the first wire (IPv4)."""
+        """IPv4 address on the first wire."""
         return self.address_on(0)
 
     def address_on(self, wire: int) -> str:
-        """On a wire: each is a network of 24 bits."""
+        """IPv4 address on a wire; each wire is a /24 network."""
         return f"10.0.{wire}.{self._host}"
 
     @staticmethod
     def interface(wire: int = 0) -> str:
-        """Its name, on both sides."""
+        """Name of a wire's interface, the same on both sides."""
         return f"wire{wire}"
 
-    def up(self, wire: int = 0) -> None:
-        """Give an interface its address, once it is there."""
+    def bring_up(self, wire: int = 0) -> None:
+        """Assign the address of an existing interface and enable it."""
         ip("-n", self.name, "link", "set", "dev", "lo", "up")
         ip("-n", self.name, "address", "add", f"{self.address_on(wire)}/24", "dev", self.interface(wire))
         ip("-n", self.name, "link", "set", "dev", self.interface(wire), "up")
 
-    def know(self, other: Namespace, wire: int = 0) -> None:
-        """Never ask for another's hardware address: on a link that loses packets, that takes seconds."""
+    def add_static_neighbour(self, other: Namespace, wire: int = 0) -> None:
+        """Add a static ARP entry: address resolution takes seconds on a link that loses packets."""
         address = json.loads(ip("-j", "-n", other.name, "link", "show", "dev", other.interface(wire)))[0]["address"]
-        known = ["lladdr", address, "dev", self.interface(wire), "nud", "permanent"]
-        ip("-n", self.name, "neighbour", "replace", other.address_on(wire), *known)
+        entry = ["lladdr", address, "dev", self.interface(wire), "nud", "permanent"]
+        ip("-n", self.name, "neighbour", "replace", other.address_on(wire), *entry)
 
-    def ready(self, wire: int = 0) -> bool:
-        """Whether an interface is there."""
+    def has_interface(self, wire: int = 0) -> bool:
+        """Whether a wire's interface exists."""
         done = self.run("ip", "link", "show", "dev", self.interface(wire), capture_output=True)
         return done.returncode == 0
 
-    def inside(self, *command: object) -> list[str]:
-        """A command that runs another in here."""
+    def command_inside(self, *command: object) -> list[str]:
+        """Command line that runs a command in the namespace."""
         return ["ip", "netns", "exec", self.name, *map(str, command)]
 
-    def popen(self, *command: object, priority: int = 0, **named: Any) -> subprocess.Popen[Any]:
-        """Start a program here, as `subprocess.Popen` does; it ends with the namespace.
+    def popen(self, *command: object, priority: int = 0, **options: Any) -> subprocess.Popen[Any]:
+        """Start a program in the namespace, like `subprocess.Popen`; it is killed with the namespace.
 
-        `priority`: from 1 to 99, it goes before what else wants a processor, where this process may say so (real-time
-        scheduling, in turn); 0: it is as others.
+        `priority`: real-time priority from 1 to 99 (round-robin scheduling), if permitted; 0: normal scheduling.
         """
-        started = subprocess.Popen(self.inside(*command), **named)
+        started = subprocess.Popen(self.command_inside(*command), **options)
         self._started.append(started)
         if priority:
             with contextlib.suppress(PermissionError):
                 os.sched_setscheduler(started.pid, os.SCHED_RR, os.sched_param(priority))
         return started
 
-    def run(self, *command: object, **named: Any) -> subprocess.CompletedProcess[Any]:
-        """Run a program here to its end, as `subprocess.run` does."""
-        return subprocess.run(self.inside(*command), **named)
+    def run(self, *command: object, **options: Any) -> subprocess.CompletedProcess[Any]:
+        """Run a program in the namespace, like `subprocess.run`."""
+        return subprocess.run(self.command_inside(*command), **options)
 
     def counts(self, wire: int = 0) -> Counts:
-        """What went through an interface."""
-        told = json.loads(ip("-j", "-s", "-n", self.name, "link", "show", "dev", self.interface(wire)))[0]["stats64"]
-        return Counts(told["rx"]["packets"], told["rx"]["bytes"], told["tx"]["packets"], told["tx"]["bytes"])
+        """Traffic of a wire's interface."""
+        stats = json.loads(ip("-j", "-s", "-n", self.name, "link", "show", "dev", self.interface(wire)))[0]["stats64"]
+        return Counts(stats["rx"]["packets"], stats["rx"]["bytes"], stats["tx"]["packets"], stats["tx"]["bytes"])
 
-    def reap(self) -> None:
-        """Wait for what was started here, after it was ended."""
+    def wait_for_processes(self) -> None:
+        """Wait until all processes started here have ended."""
         for process in self._started:
             process.wait()
 
 
 @contextlib.contextmanager
 def pair() -> Iterator[tuple[Namespace, Namespace, Path]]:
-    """Two namespaces, yet without their interfaces, and a folder for their programs.
+    """Create two namespaces, without interfaces yet, and a folder for their programs.
 
     Raises:
-        UnavailableError: this process may not make any.
+        UnavailableError: this process isn't permitted to create namespaces.
     """
     if os.geteuid() != 0:
-        raise UnavailableError(WHAT, "only root may make network namespaces", "Run it as root (sudo)")
+        raise UnavailableError(FEATURE, "only root may create network namespaces", "Run it as root (sudo)")
     name = f"scan2sim-{os.getpid()}-{next(_numbers)}"
     folder = Path(tempfile.mkdtemp(prefix=f"{name}-"))
     sides = [f"{name}-near", f"{name}-far"]
-    # a session of its own, so that what ends this process by its group leaves it
-    clearing = subprocess.Popen(
-        ["sh", "-c", CLEAR, "clear", str(folder), *sides], stdin=subprocess.PIPE, start_new_session=True
+    # a session of its own survives if the process group of this process is killed
+    cleanup = subprocess.Popen(
+        ["sh", "-c", CLEANUP_SCRIPT, "clear", str(folder), *sides], stdin=subprocess.PIPE, start_new_session=True
     )
     made: list[Namespace] = []
     try:
@@ -136,21 +135,21 @@ def pair() -> Iterator[tuple[Namespace, Namespace, Path]]:
             made.append(Namespace(side, number))
         yield made[0], made[1], folder
     finally:
-        clearing.communicate(b"\n")  # not only by closing: a child forked meanwhile would hold it open
+        cleanup.communicate(b"\n")  # closing alone isn't enough: a forked child may still hold the pipe
         for one in made:
-            one.reap()
+            one.wait_for_processes()
 
 
 def ip(*arguments: str) -> str:
-    """What iproute2's `ip` prints.
+    """Run iproute2's `ip` and return its output.
 
     Raises:
-        UnavailableError: it is missing, or refuses.
+        UnavailableError: it is missing or fails.
     """
     if shutil.which("ip") is None:
-        raise UnavailableError(WHAT, "needs ip, not installed here", "apt-get install iproute2")
+        raise UnavailableError(FEATURE, "needs ip, which isn't installed", "apt-get install iproute2")
     done = subprocess.run(["ip", *arguments], capture_output=True, text=True)
     if done.returncode:
         cause = f"ip {' '.join(arguments)} failed ({done.stderr.strip()})"
-        raise UnavailableError(WHAT, cause, "In a container, allow it CAP_SYS_ADMIN and CAP_NET_ADMIN")
+        raise UnavailableError(FEATURE, cause, "In a container, grant CAP_SYS_ADMIN and CAP_NET_ADMIN")
     return done.stdout

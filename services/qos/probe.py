@@ -1,7 +1,7 @@
-"""What a network does to packets: numbered datagrams with their times, sent through it beside what else goes there.
+"""Network probe: sends numbered, timestamped datagrams beside other traffic and measures loss, delay and jitter.
 
-`python -m scan2sim.services.qos.probe receive PORT` and `... send HOST PORT RATE SECONDS`; both ends need one clock,
-as two namespaces of one machine have. The receiver prints a line of JSON (`Seen`) once it has heard the end.
+`python -m scan2sim.services.qos.probe receive PORT` and `... send HOST PORT RATE SECONDS`. Both ends must share a
+clock, like two namespaces of one machine. At the end, the receiver prints one line of JSON (`ProbeResult`).
 """
 
 from __future__ import annotations
@@ -16,25 +16,26 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-LAYOUT = struct.Struct("!QQI")
-"""Number, nanoseconds of sending, checksum of the filling."""
-FILLING = bytes(range(64))
-END = 2**64 - 1
-"""Number of the last ones, which say how many there were in place of a time."""
-ENDS = 20
-SILENT = 10.0
-"""Seconds without a packet after which the receiver gives up."""
+PACKET_FORMAT = struct.Struct("!QQI")
+"""Sequence number, send time in ns, CRC-32 of the payload."""
+PAYLOAD = bytes(range(64))
+END_NUMBER = 2**64 - 1
+"""Sequence number of the last datagrams, which contain the number of datagrams in place of a time."""
+END_REPEATS = 20
+RECEIVE_TIMEOUT_S = 10.0
+"""Seconds without a datagram after which the receiver gives up."""
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What came.
+class ProbeResult:
+    """Result of a probe.
 
     Attributes:
-        sent: packets.
-        loss_rate, error_rate: shares of those sent that didn't come, and of those that came with other bytes.
-        delay, jitter: ms, means: of the way, and of the difference of two packets' in a row (RFC 3393).
-        bytes: of all that was sent, with the headers of Ethernet, IP and UDP.
+        sent: number of datagrams.
+        loss_rate: share of sent datagrams that were lost.
+        error_rate: share of received datagrams that were corrupted.
+        delay, jitter: mean delay, and mean difference between the delays of successive datagrams (RFC 3393), ms.
+        bytes: total size of sent datagrams with Ethernet, IP and UDP headers.
     """
 
     sent: int
@@ -45,60 +46,60 @@ class Seen:
     bytes: int
 
 
-HEADERS = 14 + 20 + 8
+HEADER_BYTES = 14 + 20 + 8
 
 
 def send(host: str, port: int, rate: float, seconds: float) -> None:
-    """Send so many packets a second for so long."""
+    """Send `rate` datagrams per second for `seconds`."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         began, count = time.monotonic(), round(rate * seconds)
         for number in range(count):
             time.sleep(max(0.0, began + number / rate - time.monotonic()))
-            out.sendto(LAYOUT.pack(number, time.monotonic_ns(), zlib.crc32(FILLING)) + FILLING, (host, port))
+            out.sendto(PACKET_FORMAT.pack(number, time.monotonic_ns(), zlib.crc32(PAYLOAD)) + PAYLOAD, (host, port))
         time.sleep(1.0)
-        for _ in range(ENDS):
-            out.sendto(LAYOUT.pack(END, count, 0), (host, port))
+        for _ in range(END_REPEATS):
+            out.sendto(PACKET_FORMAT.pack(END_NUMBER, count, 0), (host, port))
             time.sleep(0.02)
 
 
-def receive(port: int) -> Seen:
-    """Take packets until the end.
+def receive(port: int) -> ProbeResult:
+    """Receive datagrams until the end of the probe.
 
     Raises:
-        TimeoutError: there came none for a while.
+        TimeoutError: no datagram was received for `RECEIVE_TIMEOUT_S`.
     """
     delays: dict[int, int] = {}
-    wrong = 0
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as came:
-        came.bind(("", port))
-        came.settimeout(SILENT)
+    corrupted = 0
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as incoming:
+        incoming.bind(("", port))
+        incoming.settimeout(RECEIVE_TIMEOUT_S)
         print("ready", flush=True)
         while True:
-            data = came.recv(2048)
+            data = incoming.recv(2048)
             now = time.monotonic_ns()
-            number, sent, checksum = LAYOUT.unpack_from(data)
-            if number == END:
-                return _seen(delays, sent, wrong)
+            number, sent, checksum = PACKET_FORMAT.unpack_from(data)
+            if number == END_NUMBER:
+                return _result(delays, sent, corrupted)
             delays[number] = now - sent
-            wrong += zlib.crc32(data[LAYOUT.size :]) != checksum
+            corrupted += zlib.crc32(data[PACKET_FORMAT.size :]) != checksum
 
 
-def _seen(delays: dict[int, int], sent: int, wrong: int) -> Seen:
+def _result(delays: dict[int, int], sent: int, corrupted: int) -> ProbeResult:
     numbers = sorted(delays)
-    ways = np.array([delays[number] for number in numbers]) / 1e6
-    follows = np.diff(numbers) == 1
-    return Seen(
+    delays_ms = np.array([delays[number] for number in numbers]) / 1e6
+    successive = np.diff(numbers) == 1
+    return ProbeResult(
         sent=sent,
         loss_rate=1 - len(delays) / sent,
-        error_rate=wrong / max(1, len(delays)),
-        delay=float(ways.mean()) if len(ways) else float("nan"),
-        jitter=float(np.abs(np.diff(ways))[follows].mean()) if follows.any() else 0.0,
-        bytes=sent * (LAYOUT.size + len(FILLING) + HEADERS),
+        error_rate=corrupted / max(1, len(delays)),
+        delay=float(delays_ms.mean()) if len(delays_ms) else float("nan"),
+        jitter=float(np.abs(np.diff(delays_ms))[successive].mean()) if successive.any() else 0.0,
+        bytes=sent * (PACKET_FORMAT.size + len(PAYLOAD) + HEADER_BYTES),
     )
 
 
 def main() -> None:
-    """Send or receive, as the arguments say."""
+    """Send or receive according to the arguments."""
     if sys.argv[1] == "send":
         send(sys.argv[2], int(sys.argv[3]), float(sys.argv[4]), float(sys.argv[5]))
     else:

@@ -1,7 +1,7 @@
-"""A robot that asks a toolbox for results: images at a rate by HTTP, and how long each takes.
+"""A robot that sends images to a toolbox by HTTP at a fixed rate and measures response times.
 
 `python -m scan2sim.services.qos.robot ADDRESS TOOLBOX FOLDER RATE SECONDS` sends a folder's JPEGs in turn, with the
-token in its file `token` if there is one, and prints a line of JSON (`Answers`).
+token in its file `token` if there is one, and prints a line of JSON (`RequestStats`).
 """
 
 from __future__ import annotations
@@ -19,23 +19,25 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-CONNECTIONS = 8
-"""Requests that are on their way at once, at most."""
-PATIENCE = 30.0
-"""Seconds for an answer."""
-TOKEN = "token"
-"""File with the toolbox's token, in the folder of images."""
+MAX_CONNECTIONS = 8
+"""Maximum number of concurrent requests."""
+RESPONSE_TIMEOUT_S = 30.0
+"""Seconds to wait for a response."""
+TOKEN_FILE = "token"
+"""Name of the file with the toolbox's token, in the folder of images."""
 
 
 @dataclass(frozen=True)
-class Answers:
-    """What was sent and answered.
+class RequestStats:
+    """Statistics of the requests.
 
     Attributes:
-        sent: images; states: how they ended, by the result's state or the kind of error.
-        response_p50, response_p95: ms from when an image is due to its result; infinite, where there is none.
-        image_bytes: of an image, mean.
-        seconds: from the first to the last.
+        sent: number of images sent.
+        states: number of requests by state of the result, or by name of the error.
+        response_p50, response_p95: percentiles of the response time in ms, counted from when an image is due; infinite
+            without a response.
+        image_bytes: mean size of an image.
+        seconds: duration.
     """
 
     sent: int
@@ -46,9 +48,11 @@ class Answers:
     seconds: float
 
 
-def ask(address: str, toolbox: str, images: list[bytes], rate: float, seconds: float, token: str = "") -> Answers:
-    """Send `rate` images a second for `seconds`; one that finds all connections busy waits for one."""
-    line: queue.Queue[tuple[float, bytes] | None] = queue.Queue()
+def send_images(
+    address: str, toolbox: str, images: list[bytes], rate: float, seconds: float, token: str = ""
+) -> RequestStats:
+    """Send `rate` images per second for `seconds`; images queue while all connections are busy."""
+    pending: queue.Queue[tuple[float, bytes] | None] = queue.Queue()
     states: Counter[str] = Counter()
     responses: list[float] = []
     lock = threading.Lock()
@@ -56,10 +60,10 @@ def ask(address: str, toolbox: str, images: list[bytes], rate: float, seconds: f
     headers |= {"Authorization": f"Bearer {token}"} if token else {}
 
     def work() -> None:
-        place = urlsplit(address)
-        connection = http.client.HTTPConnection(place.hostname or "", place.port or 80, timeout=PATIENCE)
-        while (taken := line.get()) is not None:
-            due, image = taken
+        url = urlsplit(address)
+        connection = http.client.HTTPConnection(url.hostname or "", url.port or 80, timeout=RESPONSE_TIMEOUT_S)
+        while (item := pending.get()) is not None:
+            due, image = item
             try:
                 state = _state(connection, toolbox, image, headers)
             except (OSError, http.client.HTTPException, ValueError) as error:
@@ -69,19 +73,19 @@ def ask(address: str, toolbox: str, images: list[bytes], rate: float, seconds: f
                 states[state] += 1
                 responses.append(1000 * (time.monotonic() - due) if state == "done" else float("inf"))
 
-    workers = [threading.Thread(target=work, daemon=True) for _ in range(CONNECTIONS)]
+    workers = [threading.Thread(target=work, daemon=True) for _ in range(MAX_CONNECTIONS)]
     for worker in workers:
         worker.start()
     began, count = time.monotonic(), max(1, round(rate * seconds))
     for number in range(count):
         due = began + number / rate
         time.sleep(max(0.0, due - time.monotonic()))
-        line.put((due, images[number % len(images)]))
+        pending.put((due, images[number % len(images)]))
     for _ in workers:
-        line.put(None)
+        pending.put(None)
     for worker in workers:
         worker.join()
-    return Answers(
+    return RequestStats(
         sent=count,
         states=dict(states),
         response_p50=float(np.percentile(responses, 50, method="higher")),
@@ -92,28 +96,29 @@ def ask(address: str, toolbox: str, images: list[bytes], rate: float, seconds: f
 
 
 def _state(connection: http.client.HTTPConnection, toolbox: str, image: bytes, headers: dict[str, str]) -> str:
-    """How a request ends; asked again where the server closed a connection that lay idle."""
+    """State of a request's result; retries once if the server has closed the idle connection."""
     idle = connection.sock is not None
     try:
-        return _asked(connection, toolbox, image, headers)
+        return _request(connection, toolbox, image, headers)
     except ConnectionError:
         if not idle:
             raise
         connection.close()
-        return _asked(connection, toolbox, image, headers)
+        return _request(connection, toolbox, image, headers)
 
 
-def _asked(connection: http.client.HTTPConnection, toolbox: str, image: bytes, headers: dict[str, str]) -> str:
+def _request(connection: http.client.HTTPConnection, toolbox: str, image: bytes, headers: dict[str, str]) -> str:
     connection.request("POST", f"/v2/models/{toolbox}/infer", image, headers)
     return str(json.loads(connection.getresponse().read()).get("state", "refused"))
 
 
 def main() -> None:
-    """Ask, as the arguments say."""
+    """Run the robot according to the arguments."""
     address, toolbox, folder, rate, seconds = sys.argv[1:]
     images = [path.read_bytes() for path in sorted(Path(folder).glob("*.jpg"))]
-    token = path.read_text(encoding="utf-8").strip() if (path := Path(folder) / TOKEN).exists() else ""
-    print(json.dumps(asdict(ask(address, toolbox, images, float(rate), float(seconds), token))), flush=True)
+    token = path.read_text(encoding="utf-8").strip() if (path := Path(folder) / TOKEN_FILE).exists() else ""
+    stats = send_images(address, toolbox, images, float(rate), float(seconds), token)
+    print(json.dumps(asdict(stats)), flush=True)
 
 
 if __name__ == "__main__":

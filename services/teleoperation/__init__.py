@@ -1,1 +1,1 @@
-"""Teleoperation: a vehicle driven from afar, by several links at once (D3.2, section 4.3; docs/teleoperation.md)."""
+"""Teleoperation: remote driving of a vehicle over several network links at once (D3.2, 4.3; docs/teleoperation.md)."""

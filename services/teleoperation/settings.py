@@ -1,4 +1,4 @@
-"""What gateway, vehicle and station are told, on the command line as in code."""
+"""Settings of the gateway, station, vehicle, demo and measurement; command-line options are made from them."""
 
 from __future__ import annotations
 
@@ -11,123 +11,150 @@ from pydantic import Field
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.parameters import File
 from scan2sim.pipeline.core.step import Params
-from scan2sim.services.http.settings import Served
+from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.qos.requirements import Environment
 from scan2sim.services.teleoperation.gateway.protocol import Address
-from scan2sim.services.teleoperation.vehicle.onboard_unit import CarParams
+from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardParams
 
-GATEWAY, STATION = 7443, 7444
-"""Ports that are listened on, unless another is named."""
+GATEWAY_PORT, STATION_PORT = 7443, 7444
+"""Default ports: TCP port of the gateway, UDP port of a station."""
 
-Side = Annotated[int, Field(ge=16, le=4096)]
-Folder = Annotated[Path, Field(description="Folder of its certificate: DIR/ROLE-NAME of `teleop certificates DIR`.")]
-Named = Annotated[str, Field(description="HOST:PORT of the gateway.")]
+ImageSide = Annotated[int, Field(ge=16, le=4096)]
+CertificateFolder = Annotated[
+    Path,
+    Field(description="Folder with this party's certificate: DIR/ROLE-NAME, written by `teleop certificates DIR`."),
+]
+GatewayAddress = Annotated[str, Field(description="HOST[:PORT] of the gateway; default port 7443.")]
 
 
-def address(where: str, text: str, port: int) -> Address:
-    """Of "HOST", "HOST:PORT" or "[HOST]:PORT".
+def parse_address(option: str, text: str, default_port: int) -> Address:
+    """Parse "HOST", "HOST:PORT" or "[HOST]:PORT".
 
     Args:
-        where: the option that says so.
-        port: where none is said.
+        option: command-line option that the text was given to, for the error.
+        default_port: used where the text names no port.
 
     Raises:
-        SettingError: it is none of these.
+        SettingError: the text has none of these forms, or the port is not in 1 to 65535.
     """
     found = re.fullmatch(r"(?:\[([0-9a-fA-F:.%]+)\]|([^:\[\]\s]+))(?::(\d{1,5}))?", text)
-    number = port if found is None or found[3] is None else int(found[3])
+    number = default_port if found is None or found[3] is None else int(found[3])
     if found is None or not 0 < number < 65536:
-        raise SettingError(where, f"{text:.60} is no HOST:PORT", "Give a name or an address, as 192.0.2.1:7443")
+        remedy = "Give a host name or an IP address, with or without a port, as 192.0.2.1:7443"
+        raise SettingError(option, f"{text:.60} is not HOST or HOST:PORT", remedy)
     return Address(host=found[1] or found[2], port=number)
 
 
-class GatewayParams(Served):
-    """Of a gateway; `Served` is its page's."""
+class GatewayParams(ServerParams):
+    """Settings of the gateway; `ServerParams` has those of its web page."""
 
-    certificates: Folder
-    listening: Annotated[str, Field(description="HOST:PORT where vehicles and stations connect.")] = (
-        f"0.0.0.0:{GATEWAY}"
-    )
-    state: Annotated[Path, Field(description="Folder that pairs and the audit trail are kept in.")] = Path(
+    certificates: CertificateFolder
+    listening: Annotated[
+        str, Field(description="HOST:PORT (TCP) on which the gateway accepts vehicles and stations.")
+    ] = f"0.0.0.0:{GATEWAY_PORT}"
+    state: Annotated[Path, Field(description="Folder for the fleet's pairs and the audit trail.")] = Path(
         "teleop-state"
     )
 
 
-class StationParams(Served):
-    """Of a station; `Served` is its page's."""
+class StationParams(ServerParams):
+    """Settings of a station; `ServerParams` has those of its web page."""
 
-    certificates: Folder
-    gateway: Named
+    certificates: CertificateFolder
+    gateway: GatewayAddress
     listening: Annotated[
-        tuple[str, ...], Field(description="HOST:PORT where vehicles dial; given again for another link.")
-    ] = (f"0.0.0.0:{STATION}",)
+        tuple[str, ...],
+        Field(description="HOST:PORT (UDP) on which the station accepts vehicles; repeat for several addresses."),
+    ] = (f"0.0.0.0:{STATION_PORT}",)
     reached: Annotated[
         tuple[str, ...],
-        Field(description="HOST:PORT that vehicles are to dial; default: where it listens. Needed behind a router."),
+        Field(
+            description="HOST:PORT that vehicles connect to, where it differs from the listening address: behind a "
+            "router that forwards a port. Default: the listening address."
+        ),
     ] = ()
 
 
-class VehicleParams(CarParams):
-    """Of a vehicle; `CarParams` is its way to its translator."""
+class VehicleParams(OnboardParams):
+    """Settings of a vehicle; `OnboardParams` has those of the connection to its vehicle adapter."""
 
-    certificates: Folder
-    gateway: Named
+    certificates: CertificateFolder
+    gateway: GatewayAddress
     link: Annotated[
         tuple[str, ...],
-        Field(description="NAME=ADDRESS or NAME=INTERFACE of this machine's; given again for each. Default: one."),
+        Field(
+            description="Network link to the station as NAME=ADDRESS or NAME=INTERFACE of this machine; repeat for "
+            "several links. Default: one link over the system's default route."
+        ),
     ] = ()
     camera: Annotated[
         tuple[str, ...],
         Field(
-            description="NAME=KIND:WHERE, as front=device:/dev/video0; given again for each. Kinds: device, replay, "
-            "pattern, world; @DEGREES to the left after a world's folder."
+            description="Camera as NAME=KIND:WHERE, such as front=device:/dev/video0; repeat for several cameras. "
+            "KIND is device, replay, pattern or world; after the folder of a world, @DEGREES turns the camera left."
         ),
     ] = ()
     share: Annotated[
-        bool, Field(description="Video takes the links in turn, for more bandwidth; default: each takes all of it.")
+        bool,
+        Field(
+            description="Send each video packet over one link in turn: more bandwidth, no redundancy. "
+            "Default: each packet goes over all links."
+        ),
     ] = False
     size: Annotated[
-        tuple[Side, Side], Field(description="Width and height of pictures that a camera is asked for.")
+        tuple[ImageSide, ImageSide], Field(description="Requested width and height of camera frames, pixels.")
     ] = (
         640,
         480,
     )
-    rate: Annotated[float, Field(ge=1, le=60, description="Pictures a second, at most.")] = 30.0
+    rate: Annotated[float, Field(ge=1, le=60, description="Maximum frame rate of each camera, frames/s.")] = 30.0
     bitrate: Annotated[
-        float, Field(ge=0.2, le=100, description="Mbit/s of a camera's video, at most; it follows the links.")
+        float,
+        Field(ge=0.2, le=100, description="Maximum bit rate of each camera, Mbit/s; the rate adapts to the links."),
     ] = 2.5
 
 
 class DemoParams(Params):
-    """Of the demonstration."""
+    """Settings of the demo: gateway, station and simulated vehicle on one machine."""
 
-    world: Annotated[File, Field(description="Folder of a finished world: that of `run --out` or `survey --out`.")]
-    port: Annotated[int, Field(ge=1024, le=65534, description="Of the driver's page; the fleet's is the next.")] = 8080
-    cameras: Annotated[int, Field(ge=1, le=4, description="Of the car: front, left, right, rear.")] = 4
-    rate: Annotated[float, Field(ge=1, le=30, description="Pictures a second, as far as the machine renders them.")] = (
-        15.0
-    )
+    world: Annotated[File, Field(description="Folder of a finished world, written by `run --out` or `survey --out`.")]
+    port: Annotated[
+        int, Field(ge=1024, le=65534, description="Port of the driver page; the fleet page uses port + 1.")
+    ] = 8080
+    cameras: Annotated[
+        int, Field(ge=1, le=4, description="Number of cameras: front, left, right, rear, in this order.")
+    ] = 4
+    rate: Annotated[
+        float,
+        Field(ge=1, le=30, description="Maximum frame rate of each camera, frames/s; limited by rendering speed."),
+    ] = 15.0
 
 
 class MeasureParams(Params):
-    """Of a measurement."""
+    """Settings of a quality of service measurement."""
 
-    environment: Annotated[Environment, Field(description="Where the station is: robot, edge or cloud.")] = (
-        Environment.EDGE
-    )
-    seconds: Annotated[float, Field(ge=1, le=86_400, description="Seconds that it is measured for.")] = 30.0
+    environment: Annotated[
+        Environment, Field(description="Where the station runs, which selects the network: robot, edge or cloud.")
+    ] = Environment.EDGE
+    seconds: Annotated[float, Field(ge=1, le=86_400, description="Duration of the measurement, seconds.")] = 30.0
     warm: Annotated[
-        float, Field(ge=0, le=600, description="Seconds driven before that: video grows to what the links carry.")
+        float,
+        Field(ge=0, le=600, description="Seconds driven before the measurement, while the video bit rate adapts."),
     ] = 10.0
-    cameras: Annotated[int, Field(ge=1, le=16, description="Of the vehicle, 640x480 at 30 pictures a second.")] = 4
+    cameras: Annotated[
+        int, Field(ge=1, le=16, description="Number of cameras of the vehicle, each 640x480 at 30 frames/s.")
+    ] = 4
     bitrate: Annotated[
         float | None,
-        Field(ge=0.2, le=100, description="Mbit/s of a camera's video, at most; default: as its requirements ask."),
+        Field(
+            ge=0.2, le=100, description="Maximum bit rate of each camera, Mbit/s. Default: from the required data rate."
+        ),
     ] = None
     network: Annotated[
-        File | None, Field(description="TOML of a network, in place of what the environment's is assumed to be.")
+        File | None,
+        Field(description="TOML file that describes the network. Default: the environment's assumed network."),
     ] = None
     world: Annotated[
         File | None,
-        Field(description="Folder of a finished world, along whose street is driven; default: bends on a plain."),
+        Field(description="Folder of a finished world to drive in. Default: driving in bends on a plain."),
     ] = None

@@ -1,1 +1,1 @@
-"""ML toolboxes: images in, JSON results out, whatever the model behind (D3.2, chapters 2 and 5)."""
+"""ML toolboxes: inference on images with JSON results, independent of the model (D3.2, chapters 2 and 5)."""

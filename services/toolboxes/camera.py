@@ -1,4 +1,4 @@
-"""A camera as a node of ROS 2 that the bus watches: a folder, a video or a camera in, images on a topic out."""
+"""Camera node: publishes the images of a folder, a video or a camera on a ROS 2 topic; instrumented."""
 
 from __future__ import annotations
 
@@ -17,46 +17,46 @@ from scan2sim.services.toolboxes.settings import COMPRESSED, IMAGE, CameraParams
 from scan2sim.services.transport import QoS
 
 HEADER, TIME = "std_msgs/msg/Header", "builtin_interfaces/msg/Time"
-RATE = 10.0
-"""Images a second, where neither a video nor the user says."""
-IMAGES = QoS(depth=5)
-"""Fits all subscriptions: those that want every image, and those that take what comes."""
+DEFAULT_RATE_HZ = 10.0
+"""Images per second if neither the video nor the user gives a rate."""
+IMAGES_QOS = QoS(depth=5)
+"""Reliable, which is compatible with both reliable and best-effort subscriptions."""
 
 
 class CameraNode(Monitor):
-    """Publishes images at a rate, each stamped with the time when it is sent.
+    """Publishes images at a fixed rate, stamped with the time of publication.
 
     Attributes:
-        finished: whether all images of a file are sent.
+        finished: whether all images of a folder or video were sent.
     """
 
     def __init__(self, params: CameraParams) -> None:
         live = sources.is_camera(params.images)
-        rate = params.rate or (None if live else sources.rate_of(Path(params.images))) or RATE
-        super().__init__(params.name, **params.monitored())
+        rate = params.rate or (None if live else sources.rate_of(Path(params.images))) or DEFAULT_RATE_HZ
+        super().__init__(params.name, **params.monitor_settings())
         self._params, self._begun, self.finished = params, False, False
         kind = COMPRESSED if params.compressed else IMAGE
-        self._publisher = self.create_publisher(ros.message_type(kind), params.topic, IMAGES)
-        self._newest: U8 | None = None
-        self._reader = sources.Reader(params.images, self._keep) if live else None
+        self._publisher = self.create_publisher(ros.message_type(kind), params.topic, IMAGES_QOS)
+        self._latest: U8 | None = None
+        self._reader = sources.CameraReader(params.images, self._set_latest) if live else None
         rounds = itertools.count() if params.loop else range(1)
-        self._shown = (image for _ in rounds for image in sources.images(Path(params.images)))
+        self._images = (image for _ in rounds for image in sources.decoded_images(Path(params.images)))
         if self._reader:
             self._reader.start()
         self.create_timer(1 / rate, self._send_next)
 
-    def _keep(self, image: U8) -> None:
-        self._newest = image
+    def _set_latest(self, image: U8) -> None:
+        self._latest = image
 
     def _send_next(self) -> None:
-        """Send a file's next image, or a camera's newest, once those who are waited for are there."""
+        """Publish the next image of a file, or the latest of a camera, once the expected subscribers are matched."""
         self._begun = self._begun or self._publisher.get_subscription_count() >= self._params.subscribers
         if not self._begun:
             return
         if self._reader:
-            image, self._newest = self._newest, None
+            image, self._latest = self._latest, None
         else:
-            image = next(self._shown, None)
+            image = next(self._images, None)
             self.finished = image is None
         if image is not None:
             self._publisher.publish(self._message(image))
@@ -73,7 +73,7 @@ class CameraNode(Monitor):
         return ros.message(IMAGE, header=header, encoding="rgb8", **size, data=image.reshape(-1))
 
     def destroy_node(self) -> Any:
-        """Read no more, and end."""
+        """Stop reading and destroy the node."""
         if self._reader:
             self._reader.stop()
         return super().destroy_node()

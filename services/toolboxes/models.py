@@ -1,4 +1,4 @@
-"""Files of models: the user's own, or what comes along; tensors alone, never a pickle's code."""
+"""Weight files: the user's, or those included here; only formats that can't contain code, no pickles."""
 
 from __future__ import annotations
 
@@ -9,32 +9,33 @@ from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.services.toolboxes.settings import ToolboxParams
 
 FOLDER = Path(__file__).parent / "weights"
-"""Of models that come along."""
-SAFE = (".onnx", ".safetensors")
-"""Ends of files that can't hold code."""
-IMAGENET = FOLDER / "imagenet.labels.txt"
-"""Names of ImageNet's thousand classes (of WordNet's synsets), in the usual order."""
+"""Folder of the included weights."""
+SAFE_SUFFIXES = (".onnx", ".safetensors")
+"""File formats that can't contain code."""
+IMAGENET_LABELS = FOLDER / "imagenet.labels.txt"
+"""Names of ImageNet's thousand classes (WordNet synsets), in the usual order."""
 
 
-def chosen(params: ToolboxParams, own: Path | None) -> Path:
-    """The user's file or, without one, what comes along.
+def weights_file(params: ToolboxParams, included: Path | None) -> Path:
+    """Path of the weights: the user's file or, without one, the included file.
 
     Raises:
-        SettingError: nothing comes along.
-        InputError: the file isn't there, may hold code, or isn't the one that was meant.
+        SettingError: there are no included weights.
+        InputError: the file is missing, may contain code, or has another SHA-256 than expected.
     """
-    path = params.weights or own
+    path = params.weights or included
     if path is None:
-        raise SettingError("--weights", "is missing: this model comes without any", "Give a file on this disk")
+        raise SettingError("--weights", "is missing: no weights are included for this model", "Give a local file")
     if params.weights is not None:
-        _check_kind(path)
+        _check_format(path)
     if params.sha256 is not None and (found := sha256(path)) != params.sha256:
-        raise InputError(path, f"has the SHA-256 {found}, not {params.sha256}", "Copy it again, from where you trust")
+        cause = f"has SHA-256 {found} instead of {params.sha256}"
+        raise InputError(path, cause, "Copy it again from a trusted source")
     return path
 
 
 def sha256(path: Path) -> str:
-    """Of a file.
+    """SHA-256 of a file.
 
     Raises:
         InputError: it can't be read.
@@ -43,16 +44,16 @@ def sha256(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise InputError(path, f"can't be read ({error.strerror})", "Give a file on this disk") from None
+        raise InputError(path, f"can't be read ({error.strerror})", "Give a readable local file") from None
 
 
 def imagenet() -> tuple[str, ...]:
     """Names of ImageNet's classes."""
-    return tuple(IMAGENET.read_text("utf-8").split("\n")[:-1])
+    return tuple(IMAGENET_LABELS.read_text("utf-8").split("\n")[:-1])
 
 
-def _check_kind(path: Path) -> None:
+def _check_format(path: Path) -> None:
     if not path.exists():
-        raise InputError(path, "is not there", "Give a file on this disk; nothing is downloaded")
-    if path.is_file() and path.suffix not in SAFE:
-        raise InputError(path, "may hold code, as pickled weights do", f"Export it: {' or '.join(SAFE)}")
+        raise InputError(path, "file not found", "Give a local file; weights are never downloaded")
+    if path.is_file() and path.suffix not in SAFE_SUFFIXES:
+        raise InputError(path, "may contain code, like pickled weights", f"Export it as {' or '.join(SAFE_SUFFIXES)}")

@@ -1,4 +1,4 @@
-"""A toolbox over a folder or a video: results as lines of JSON, and pictures or a film with them drawn in."""
+"""Offline processing of a folder or a video: results as JSON lines, and images or a video with the results drawn."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.frames import Frame
 from scan2sim.services.toolboxes.results import Result, State
 
-RESULTS, FILM, PICTURES = "results.jsonl", "film.mp4", "pictures"
-"""What is in the folder afterwards: a film of a video, pictures of pictures."""
-PATIENT = 3600.0
-"""Seconds; files can wait."""
+RESULTS_FILE, VIDEO_FILE, IMAGES_FOLDER = "results.jsonl", "film.mp4", "pictures"
+"""Names in the output folder: drawn results are a video for a video, images for images."""
+OFFLINE_DEADLINE_S = 3600.0
+"""Deadline of a frame: files have no real-time requirement."""
 
 
-def work_through(engine: Engine, path: Path, out: Path, report: Report, *, draw: bool = True) -> dict[str, int]:
-    """Have all images of a folder or a video worked on; returns how many ended in which state.
+def process_files(engine: Engine, path: Path, out: Path, report: Report, *, draw: bool = True) -> dict[str, int]:
+    """Process all images of a folder or a video; returns the number of images by final state.
 
     Raises:
-        InputError: there are none.
-        UnavailableError: a film can't be written here.
+        InputError: there are no images.
+        UnavailableError: no video encoder is available.
     """
     total, rate = sources.count(path), sources.rate_of(path)
     out.mkdir(parents=True, exist_ok=True)
     ended: dict[str, int] = {}
     with ExitStack() as stack:
-        lines = stack.enter_context((out / RESULTS).open("w"))
-        pictures = stack.enter_context(_Pictures(engine.name, out, rate)) if draw else None
-        for number, (frame, result) in enumerate(_worked(engine, path)):
-            _note(lines, result)
+        lines = stack.enter_context((out / RESULTS_FILE).open("w"))
+        drawings = stack.enter_context(_DrawnResults(engine.name, out, rate)) if draw else None
+        for number, (frame, result) in enumerate(_results(engine, path)):
+            _write_line(lines, result)
             ended[result.state] = ended.get(result.state, 0) + 1
-            if pictures and result.state == State.DONE:
-                pictures.add(frame, result)
+            if drawings and result.state == State.DONE:
+                drawings.add(frame, result)
             report(min(1.0, (number + 1) / total), f"image {number + 1}")
     return ended
 
 
-def _worked(engine: Engine, path: Path) -> Iterator[tuple[Frame, Result]]:
-    """Frames with their results, in the frames' order; a few are on their way at a time."""
+def _results(engine: Engine, path: Path) -> Iterator[tuple[Frame, Result]]:
+    """Iterate over the frames with their results, in the order of the frames; several are processed concurrently."""
     answers: queue.Queue[Result] = queue.Queue()
     sent: dict[str, Frame] = {}
     done: dict[str, Result] = {}
@@ -64,54 +64,54 @@ def _worked(engine: Engine, path: Path) -> Iterator[tuple[Frame, Result]]:
                 return
             done[result.id] = result
 
-    for shot in sources.shots(path):
-        frame = Frame(shot.name, str(path), shot.stamp, shot.image, answers.put)
-        sent[shot.name] = frame
+    for stored in sources.stored_images(path):
+        frame = Frame(stored.name, str(path), stored.stamp, stored.image, answers.put)
+        sent[stored.name] = frame
         while not engine.submit_when_free(frame, 1.0):
             yield from ready(block=False)
         yield from ready(block=False)
     yield from ready(block=True)
 
 
-def _note(lines: IO[str], result: Result) -> None:
+def _write_line(lines: IO[str], result: Result) -> None:
     lines.write(result.json_line() + "\n")
 
 
-class _Pictures:
-    """Pictures, or a film, of results."""
+class _DrawnResults:
+    """Writes images, or a video if `rate` is given, with the results drawn."""
 
-    def __init__(self, box: str, out: Path, rate: float | None) -> None:
-        self._box, self._out, self._rate = tasks.find(box), out, rate
-        self._film: Encoder | None = None
+    def __init__(self, task: str, out: Path, rate: float | None) -> None:
+        self._task, self._out, self._rate = tasks.find(task), out, rate
+        self._video: Encoder | None = None
         self._count = 0
 
-    def __enter__(self) -> _Pictures:
+    def __enter__(self) -> _DrawnResults:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._film:
-            self._film.close()
+        if self._video:
+            self._video.close()
 
     def add(self, frame: Frame, result: Result) -> None:
-        """Draw a result."""
+        """Draw a result and write the image."""
         import cv2
 
         assert result.body
-        drawn = self._box.draw(frames.rgb(frame), result.body)
+        drawn = self._task.draw(frames.rgb(frame), result.body)
         if self._rate is None:
-            folder = self._out / PICTURES
+            folder = self._out / IMAGES_FOLDER
             folder.mkdir(exist_ok=True)
             cv2.imwrite(str(folder / f"{Path(frame.id).stem}.jpg"), drawn[..., ::-1])
             return
-        self._add_to_film(np.ascontiguousarray(drawn[: drawn.shape[0] // 2 * 2, : drawn.shape[1] // 2 * 2]))
+        self._add_to_video(np.ascontiguousarray(drawn[: drawn.shape[0] // 2 * 2, : drawn.shape[1] // 2 * 2]))
 
-    def _add_to_film(self, image: U8) -> None:
+    def _add_to_video(self, image: U8) -> None:
         import cv2
 
         assert self._rate
-        if self._film is None:
+        if self._video is None:
             size = (image.shape[1], image.shape[0])
-            self._film = Encoder(self._out / FILM, size, self._rate, preset="veryfast", crf="23")
+            self._video = Encoder(self._out / VIDEO_FILE, size, self._rate, preset="veryfast", crf="23")
         yuv: Any = cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420)
-        self._film.add(yuv, self._count / self._rate)
+        self._video.add(yuv, self._count / self._rate)
         self._count += 1

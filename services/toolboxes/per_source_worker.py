@@ -1,4 +1,4 @@
-"""Followers: a thread a source, which does what a toolbox does with that source's results, in order."""
+"""Worker thread per source that post-processes the results of that source in order (tracking, for example)."""
 
 from __future__ import annotations
 
@@ -12,48 +12,48 @@ from scan2sim.pipeline.core.types import U8
 from scan2sim.services.credentials import redacted
 from scan2sim.services.toolboxes.frames import Frame
 from scan2sim.services.toolboxes.results import Body
-from scan2sim.services.toolboxes.tasks import Follow
+from scan2sim.services.toolboxes.tasks import PostProcessor
 
 log = logging.getLogger(__name__)
 
-WAITING = 8
-"""Frames of a source that wait to be followed; then the model waits."""
+MAX_WAITING = 8
+"""Frames of a source that wait for post-processing; beyond it, the dispatcher blocks."""
 
 Outcome = Callable[[Body | str], None]
-"""Is called with the result, or with why there is none."""
+"""Called with the result, or with an error message."""
 
 
-class Follower:
-    """Of one source."""
+class SourceWorker:
+    """Worker thread of one source."""
 
-    def __init__(self, source: str, follow: Follow) -> None:
-        self._source, self._follow = redacted(source), follow
-        self._line: queue.Queue[tuple[Frame, U8, Body, Outcome] | None] = queue.Queue(WAITING)
+    def __init__(self, source: str, post_processor: PostProcessor) -> None:
+        self._source, self._post_processor = redacted(source), post_processor
+        self._queue: queue.Queue[tuple[Frame, U8, Body, Outcome] | None] = queue.Queue(MAX_WAITING)
         self._last = time.monotonic()
-        self._thread = threading.Thread(target=self._run, name=f"follower of {self._source}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"worker of {self._source}", daemon=True)
         self._thread.start()
 
     def put(self, frame: Frame, image: U8, body: Body, outcome: Outcome) -> None:
-        """Have a frame followed, once there is room for it."""
+        """Queue a frame; blocks while the queue is full."""
         self._last = time.monotonic()
-        self._line.put((frame, image, body, outcome))
+        self._queue.put((frame, image, body, outcome))
 
     def idle(self) -> float:
-        """Seconds since it was given a frame."""
+        """Seconds since the last frame was queued."""
         return time.monotonic() - self._last
 
     def close(self) -> None:
-        """End after what waits."""
-        self._line.put(None)
+        """Process the queued frames and stop."""
+        self._queue.put(None)
         self._thread.join()
 
     def _run(self) -> None:
-        while (one := self._line.get()) is not None:
+        while (one := self._queue.get()) is not None:
             frame, image, body, outcome = one
-            followed: Body | str
+            result: Body | str
             try:
-                followed = self._follow(frame, image, body)
-            except Exception as error:  # the next frame is another
-                log.exception("%s could not be followed", self._source)
-                followed = f"could not be followed ({error})"
-            outcome(followed)
+                result = self._post_processor(frame, image, body)
+            except Exception as error:  # a failure must not affect the next frames
+                log.exception("%s: post-processing failed", self._source)
+                result = f"post-processing failed ({error})"
+            outcome(result)

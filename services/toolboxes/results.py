@@ -1,4 +1,4 @@
-"""Results: what a toolbox says of an image, as JSON. Run as a program, it prints the schema."""
+"""JSON results of toolboxes. Run as a program, it prints their JSON Schema."""
 
 from __future__ import annotations
 
@@ -9,84 +9,84 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 SCHEMA = "scan2sim-result-1"
-"""Changes when a field does."""
+"""Schema identifier; changes whenever a field does."""
 
 
 class State(StrEnum):
-    """What became of a frame."""
+    """Final state of a frame."""
 
     DONE = "done"
     DROPPED = "dropped"
-    """Newer frames of its source had to wait."""
+    """Dropped because newer frames of its source were waiting."""
     LATE = "late"
-    """Its deadline had passed, or would have."""
+    """Its deadline had passed, or would have passed before the result."""
     REFUSED = "refused"
-    """Its image can't be used."""
+    """Its image could not be decoded."""
     FAILED = "failed"
     """The model failed."""
 
 
-class Told(BaseModel):
-    """Base of all that results are made of."""
+class ResultModel(BaseModel):
+    """Base class of results and their parts."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Detection(Told):
-    """A thing in an image."""
+class Detection(ResultModel):
+    """An object detected in an image."""
 
     label: str
     score: float = Field(ge=0, le=1)
-    box: tuple[float, float, float, float] = Field(description="Left, top, right, bottom: pixels of the image.")
+    box: tuple[float, float, float, float] = Field(description="Left, top, right, bottom in pixels of the image.")
 
 
 class Moving(Detection):
-    """A thing that was followed through a source's images."""
+    """An object that is tracked through the images of a source."""
 
-    track: int = Field(description="Number of the thing, of its source alone.")
-    moving: bool | None = Field(description="Over the last second; null: it isn't known yet.")
-    speed: float | None = Field(description="Pixels a second, of its corners against the background's.")
-    detected: bool = Field(True, description="false: missed in this image; the box is where the thing's corners went.")
+    track: int = Field(description="Track number, unique within its source.")
+    moving: bool | None = Field(description="Whether it moved in the last second; null: not known yet.")
+    speed: float | None = Field(description="Speed relative to the background, pixels per second.")
+    detected: bool = Field(True, description="false: not detected in this image, the box follows its tracked corners.")
 
 
-class Class(Told):
-    """What an image may show."""
+class Class(ResultModel):
+    """A class of an image with its probability."""
 
     label: str
     score: float = Field(ge=0, le=1)
 
 
-class Segmentation(Told):
-    """Classes of an image's pixels."""
+class Segmentation(ResultModel):
+    """Semantic segmentation of an image."""
 
-    labels: tuple[str, ...] = Field(description="Names of the classes, by the mask's value.")
-    shares: dict[str, float] = Field(description="Share of the pixels, of classes that are there.")
-    mask: str = Field(description="8-bit grey PNG of the classes' numbers, base64.")
-    size: tuple[int, int] = Field(description="Width and height of the mask, pixels; it shows the whole image.")
+    labels: tuple[str, ...] = Field(description="Names of the classes, indexed by the values of the mask.")
+    shares: dict[str, float] = Field(description="Fraction of the pixels by class, for the classes that occur.")
+    mask: str = Field(description="Class indices as an 8-bit greyscale PNG in base64.")
+    size: tuple[int, int] = Field(description="Width and height of the mask in pixels; it covers the whole image.")
 
 
-class Body(Told):
-    """What a model says of an image: one of these, by the toolbox."""
+class Body(ResultModel):
+    """Output of a model for an image; the toolbox determines which field is set."""
 
     detections: tuple[Moving | Detection, ...] | None = None
     classes: tuple[Class, ...] | None = None
     segmentation: Segmentation | None = None
 
 
-class Times(Told):
-    """Seconds that a frame took."""
+class Times(ResultModel):
+    """Processing times of a frame in seconds."""
 
-    waited: float = Field(description="In the queue.")
-    worked: float = Field(description="From the queue to the result.")
+    waited: float = Field(description="Time in the queue.")
+    worked: float = Field(description="Time from the queue to the result.")
 
 
-class Result(Told):
-    """What became of a frame.
+class Result(ResultModel):
+    """Result of a frame.
 
     Attributes:
-        id, source, stamp: the frame's.
-        size: width and height of its image, pixels; None: it was never decoded.
-        error: why there is no result.
+        id, source, stamp: those of the frame.
+        size: width and height of its image in pixels; None: it was not decoded.
+        error: cause if there is no output.
     """
 
     schema_name: Literal["scan2sim-result-1"] = Field("scan2sim-result-1", alias="schema")
@@ -104,7 +104,7 @@ class Result(Told):
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
     def json_line(self) -> str:
-        """As one line of JSON; what is null is left out."""
+        """Serialize as one line of JSON without null fields."""
         return self.model_dump_json(by_alias=True, exclude_none=True)
 
 

@@ -1,4 +1,4 @@
-"""Sources of images: folders, videos and cameras, each read by a thread of its own."""
+"""Image sources: folders, videos, and cameras with a reader thread each."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from scan2sim.services.toolboxes.results import Result
 
 log = logging.getLogger(__name__)
 
-PICTURES = (".jpg", ".jpeg", ".png", ".webp")
-"""Ends of files' names that a folder is searched for."""
-REMEDY = "Give a folder of pictures, a picture or a video"
-LONGEST_PAUSE = 5.0
-"""Seconds between two tries to reach a camera, at most."""
-SILENT = 5.0
-"""Seconds without an image after which a camera counts as gone."""
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
+"""File names with these suffixes are read from a folder."""
+REMEDY = "Give a folder of images, an image or a video"
+MAX_RETRY_PAUSE_S = 5.0
+"""Upper bound of the exponential backoff between attempts to connect to a camera."""
+CAMERA_TIMEOUT_S = 5.0
+"""A camera without an image for so long counts as unavailable."""
 
 
 @dataclass(frozen=True)
-class Shot:
+class StoredImage:
     """An image of a folder or a video.
 
     Attributes:
-        name: of its file, or its number in the video.
-        stamp: nanoseconds since the video began; None for a folder's.
-        image: encoded, or (H, W, 3) RGB.
+        name: file name, or frame number in the video.
+        stamp: nanoseconds since the start of the video; None in a folder.
+        image: encoded bytes, or (H, W, 3) RGB.
     """
 
     name: str
@@ -48,117 +48,121 @@ class Shot:
 
 
 def is_camera(address: str) -> bool:
-    """Whether it is a camera's, no file's: rtsp://..., http://..., or a device's number."""
+    """Whether an address is that of a camera, not a file: rtsp://..., http://..., or a device number."""
     return "://" in address or address.isdecimal()
 
 
 def rate_of(path: Path) -> float | None:
-    """Images a second of a video; None for pictures."""
+    """Frame rate of a video in Hz; None for images."""
     import cv2
 
-    return None if _is_pictures(path) else cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FPS) or None
+    return None if _holds_images(path) else cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FPS) or None
 
 
 def count(path: Path) -> int:
-    """Images of a folder or video, about.
+    """Approximate number of images in a folder or video.
 
     Raises:
-        InputError: there are none.
+        InputError: there are no images.
     """
     import cv2
 
-    if _is_pictures(path):
-        return len(_pictures(path))
+    if _holds_images(path):
+        return len(_image_files(path))
     return max(1, int(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT)))
 
 
-def shots(path: Path) -> Iterator[Shot]:
-    """Images of a folder, of a picture alone, or of a video, in order.
+def stored_images(path: Path) -> Iterator[StoredImage]:
+    """Iterate over the images of a folder, a single image, or the frames of a video, in order.
 
     Raises:
-        InputError: there are none, or it can't be read.
+        InputError: there are no images, or the file can't be read.
     """
-    if _is_pictures(path):
-        for picture in _pictures(path):
-            yield Shot(picture.name, None, picture.read_bytes())
+    if _holds_images(path):
+        for file in _image_files(path):
+            yield StoredImage(file.name, None, file.read_bytes())
         return
     import cv2
 
     video = cv2.VideoCapture(str(path))
     rate, number = video.get(cv2.CAP_PROP_FPS) or 25.0, 0
     while (image := _read(video)) is not None:
-        yield Shot(f"{number:06}", round(number / rate * 1e9), image)
+        yield StoredImage(f"{number:06}", round(number / rate * 1e9), image)
         number += 1
     if number == 0:
-        raise InputError(redacted(str(path)), "is no video that can be read", REMEDY)
+        raise InputError(redacted(str(path)), "can't be read as a video", REMEDY)
 
 
-def images(path: Path) -> Iterator[U8]:
-    """(H, W, 3) RGB of all of them.
+def decoded_images(path: Path) -> Iterator[U8]:
+    """Iterate over the decoded images (H, W, 3) RGB of a folder or video.
 
     Raises:
-        InputError: there are none, or one can't be decoded.
+        InputError: there are no images, or one can't be decoded.
     """
-    for shot in shots(path):
-        yield frames.rgb(Frame(shot.name, str(path), shot.stamp, shot.image, lambda _: None))
+    for stored in stored_images(path):
+        yield frames.rgb(Frame(stored.name, str(path), stored.stamp, stored.image, lambda _: None))
 
 
-def _is_pictures(path: Path) -> bool:
+def _holds_images(path: Path) -> bool:
+    """Whether a path is a folder or an image, not a video."""
     if not path.exists():
-        raise InputError(redacted(str(path)), "is not there", REMEDY)
-    return path.is_dir() or path.suffix.lower() in PICTURES
+        raise InputError(redacted(str(path)), "not found", REMEDY)
+    return path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES
 
 
-def _pictures(path: Path) -> list[Path]:
+def _image_files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
-    found = sorted(one for one in path.iterdir() if one.suffix.lower() in PICTURES)
+    found = sorted(one for one in path.iterdir() if one.suffix.lower() in IMAGE_SUFFIXES)
     if not found:
-        raise InputError(path, f"holds no {', '.join(PICTURES)}", REMEDY)
+        raise InputError(path, f"contains no {', '.join(IMAGE_SUFFIXES)} files", REMEDY)
     return found
 
 
 def _read(video: Any) -> U8 | None:
-    good, image = video.read()
-    return np.ascontiguousarray(image[..., ::-1]) if good else None
+    success, image = video.read()
+    return np.ascontiguousarray(image[..., ::-1]) if success else None
 
 
 class Cameras:
-    """Reads cameras, a thread each, and keeps the last result of each; a camera that is gone is looked for again."""
+    """Reads cameras in a thread each, submits their images to an engine and stores the latest result of each."""
 
     def __init__(self, engine: Engine, addresses: list[str]) -> None:
-        """Of an engine; addresses as OpenCV takes them: rtsp://..., http://..., a device's number, a file.
+        """Create the readers.
 
-        Results, states and logs name a camera by its address without credentials.
+        Args:
+            engine: processes the images.
+            addresses: as OpenCV accepts them: rtsp://..., http://..., a device number, a file. Results, states and logs
+                name a camera by its address without credentials.
         """
         self._readers = [_Camera(engine, *named) for named in zip(addresses, names(addresses), strict=True)]
 
     def start(self) -> None:
-        """Read from now on."""
+        """Start reading all cameras."""
         for reader in self._readers:
             reader.start()
 
     def stop(self) -> None:
-        """Read nothing."""
+        """Stop reading all cameras."""
         for reader in self._readers:
             reader.stop()
 
     def running(self) -> bool:
-        """Whether they are read."""
+        """Whether any camera is being read."""
         return any(reader.running() for reader in self._readers)
 
     def last(self, source: str | None = None) -> list[Result]:
-        """The last result of each camera, or of one, by its name or its address."""
-        wanted = source and redacted(source)
-        return [one.last for one in self._readers if one.last and wanted in (None, one.name)]
+        """Latest result of each camera, or of one given by its name or address."""
+        name = source and redacted(source)
+        return [one.last for one in self._readers if one.last and name in (None, one.name)]
 
     def states(self) -> dict[str, dict[str, Any]]:
-        """By camera's name, whether it sends images, and how many it did."""
-        return {one.name: {"there": one.is_there(), "images": one.count} for one in self._readers}
+        """State by camera name: `there`, whether it delivers images, and `images`, their number so far."""
+        return {one.name: {"there": one.is_available(), "images": one.count} for one in self._readers}
 
 
 def names(addresses: Sequence[str]) -> list[str]:
-    """Addresses without credentials; the second and further ones that look alike then are numbered."""
+    """Addresses without credentials; further ones that become equal are numbered."""
     seen: Counter[str] = Counter()
     found = []
     for name in map(redacted, addresses):
@@ -167,40 +171,40 @@ def names(addresses: Sequence[str]) -> list[str]:
     return found
 
 
-class Reader:
-    """Reads a camera in a thread of its own; one that is gone is looked for again.
+class CameraReader:
+    """Reads a camera in a background thread and reconnects if it is unavailable.
 
     Attributes:
-        name: address without credentials, unless another is given.
-        count: images that came.
+        name: address without credentials, unless another name is given.
+        count: number of received images.
     """
 
-    def __init__(self, address: str, take: Callable[[U8], None], name: str = "") -> None:
-        """Of an address as OpenCV takes it; `take` is given each image, (H, W, 3) RGB, in that thread."""
-        self._address, self._take, self.name = address, take, name or redacted(address)
-        self.count, self._seen = 0, 0.0
+    def __init__(self, address: str, callback: Callable[[U8], None], name: str = "") -> None:
+        """`address` as OpenCV accepts it; `callback` is called with each image (H, W, 3) RGB in the reader's thread."""
+        self._address, self._callback, self.name = address, callback, name or redacted(address)
+        self.count, self._last_image_at = 0, 0.0
         self._stopped, self._thread = threading.Event(), threading.Thread()
 
     def start(self) -> None:
-        """Read from now on."""
+        """Start reading."""
         if not self.running():
             self._stopped = threading.Event()
             self._thread = threading.Thread(target=self._run, args=(self._stopped,), name=self.name, daemon=True)
             self._thread.start()
 
     def stop(self) -> None:
-        """Read nothing."""
+        """Stop reading."""
         self._stopped.set()
         if self._thread.ident:
-            self._thread.join(SILENT)
+            self._thread.join(CAMERA_TIMEOUT_S)
 
     def running(self) -> bool:
-        """Whether it is read, or looked for."""
+        """Whether the camera is being read, or reconnected to."""
         return self._thread.is_alive() and not self._stopped.is_set()
 
-    def is_there(self) -> bool:
-        """Whether it sends images."""
-        return self.running() and time.monotonic() - self._seen < SILENT
+    def is_available(self) -> bool:
+        """Whether the camera delivers images."""
+        return self.running() and time.monotonic() - self._last_image_at < CAMERA_TIMEOUT_S
 
     def _run(self, stopped: threading.Event) -> None:
         import cv2
@@ -212,17 +216,17 @@ class Reader:
             while not stopped.is_set() and (image := _read(video)) is not None:
                 pause = 0.0
                 self.count += 1
-                self._seen = time.monotonic()
-                self._take(image)
+                self._last_image_at = time.monotonic()
+                self._callback(image)
             video.release()
             if self.count == before and not warned and not stopped.is_set():
-                log.warning("%s gives no images: check its address and that it runs; it is tried again", self.name)
+                log.warning("%s delivers no images: check its address and that it is running; retrying", self.name)
             warned = self.count == before
-            pause = min(LONGEST_PAUSE, 2 * pause or 0.2)
+            pause = min(MAX_RETRY_PAUSE_S, 2 * pause or 0.2)
 
 
-class _Camera(Reader):
-    """Whose images an engine works on."""
+class _Camera(CameraReader):
+    """Camera whose images are submitted to an engine."""
 
     def __init__(self, engine: Engine, address: str, name: str) -> None:
         super().__init__(address, self._submit, name)
@@ -234,8 +238,8 @@ class _Camera(Reader):
         self.last = None
 
     def _submit(self, image: U8) -> None:
-        self._engine.submit(Frame(f"{self.count}", self.name, time.time_ns(), image, self._keep))
+        self._engine.submit(Frame(f"{self.count}", self.name, time.time_ns(), image, self._set_last))
 
-    def _keep(self, result: Result) -> None:
+    def _set_last(self, result: Result) -> None:
         if result.body is not None:
             self.last = result

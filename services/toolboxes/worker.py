@@ -1,4 +1,4 @@
-"""A toolbox's model in a process of its own: where it dies or hangs, the toolbox lives, and starts it anew."""
+"""Model of a toolbox in its own process, so that the toolbox survives a crash or hang and can restart it."""
 
 from __future__ import annotations
 
@@ -18,113 +18,113 @@ from scan2sim.pipeline.core.types import U8
 from scan2sim.services.toolboxes import tasks
 from scan2sim.services.toolboxes.results import Body
 from scan2sim.services.toolboxes.settings import ToolboxParams
-from scan2sim.services.toolboxes.tasks import Facts
+from scan2sim.services.toolboxes.tasks import ModelInfo
 
-LOADS_WITHIN = 300.0
-"""Seconds for a model to be loaded and to answer its first image."""
-ENDS_WITHIN = 2.0
-PROBE = np.zeros((64, 64, 3), np.uint8)
-"""An image that a model must answer before it counts as ready."""
-
-
-class WorkerDied(Exception):
-    """The process is gone, or hangs."""
+LOAD_TIMEOUT_S = 300.0
+"""Time for a model to load and process the probe image."""
+STOP_TIMEOUT_S = 2.0
+PROBE_IMAGE = np.zeros((64, 64, 3), np.uint8)
+"""Image that a model must process before it counts as ready."""
 
 
-class Worker:
-    """Runs a model; of one thread."""
+class ModelProcessDied(Exception):
+    """The process has ended, or hung and was killed."""
 
-    def __init__(self, box: str, params: ToolboxParams) -> None:
-        """Start it, and wait until the model has answered.
+
+class ModelProcess:
+    """Process that runs a model; not thread-safe."""
+
+    def __init__(self, task: str, params: ToolboxParams) -> None:
+        """Start the process and wait until the model is ready.
 
         Raises:
-            ScanError: as `boxes.Toolbox.load`.
-            WorkerDied: it died meanwhile.
+            ScanError: raised by `tasks.Toolbox.load`.
+            ModelProcessDied: the process died while loading.
         """
         context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, box, params), name=box, daemon=True)
+        self._connection, child_end = context.Pipe()
+        self._process = context.Process(target=_serve, args=(child_end, task, params), name=task, daemon=True)
         self._process.start()
-        theirs.close()
+        child_end.close()
         self._hangs = params.hangs
         try:
-            self.facts: Facts = self._answer(LOADS_WITHIN)
+            self.info: ModelInfo = self._receive(LOAD_TIMEOUT_S)
         except BaseException:
             self.close()
             raise
 
     @property
     def pid(self) -> int | None:
-        """Of the process."""
+        """Process id."""
         return self._process.pid
 
     def is_alive(self) -> bool:
-        """Whether the process is there."""
+        """Whether the process is running."""
         return self._process.is_alive()
 
     def infer(self, images: Sequence[U8]) -> list[Body]:
-        """What the model says of each image.
+        """Run the model on a batch of images.
 
         Raises:
-            ScanError: the model failed at one of them.
-            WorkerDied: it is gone, or didn't answer in time and was killed; another must be made.
+            ScanError: the model failed on one of them.
+            ModelProcessDied: the process has ended, or timed out and was killed; create a new one.
         """
         try:
             self._connection.send(list(images))
         except OSError as error:
-            raise WorkerDied(f"the model's process is gone ({error})") from None
-        answered: list[Body] = self._answer(self._hangs)
-        return answered
+            raise ModelProcessDied(f"the model's process has ended ({error})") from None
+        bodies: list[Body] = self._receive(self._hangs)
+        return bodies
 
-    def _answer(self, timeout: float) -> Any:
+    def _receive(self, timeout: float) -> Any:
         try:
             if not self._connection.poll(timeout):
                 self._process.kill()
-                raise WorkerDied(f"the model didn't answer within {timeout:g} s")
-            answer = self._connection.recv()
+                raise ModelProcessDied(f"the model didn't respond within {timeout:g} s")
+            response = self._connection.recv()
         except (EOFError, OSError):
-            self._process.join(ENDS_WITHIN)
-            raise WorkerDied(f"the model's process ended ({self._process.exitcode})") from None
-        if isinstance(answer, ScanError):
-            raise answer
-        return answer
+            self._process.join(STOP_TIMEOUT_S)
+            raise ModelProcessDied(f"the model's process ended with exit code {self._process.exitcode}") from None
+        if isinstance(response, ScanError):
+            raise response
+        return response
 
     def kill(self) -> None:
-        """End it at once; may be called from any thread."""
+        """Kill the process; thread-safe."""
         self._process.kill()
 
     def close(self) -> None:
-        """End it."""
+        """Stop the process."""
         self._connection.close()
-        self._process.join(ENDS_WITHIN)
+        self._process.join(STOP_TIMEOUT_S)
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
 
 
-def _serve(connection: Connection, box: str, params: ToolboxParams) -> None:
-    """Answer lists of images until there is nobody who sends any."""
+def _serve(connection: Connection, task: str, params: ToolboxParams) -> None:
+    """Main function of the process: process batches of images until the connection is closed."""
     die_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the toolbox, which then closes the connection
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the toolbox, which closes the connection
     if params.threads:
         os.environ["OMP_NUM_THREADS"] = str(params.threads)
-    with contextlib.suppress(EOFError, OSError):  # the toolbox has ended
+    with contextlib.suppress(EOFError, OSError):  # the toolbox closed the connection
         try:
-            model = tasks.find(box).load(params)
-            model([PROBE])
+            model = tasks.find(task).load(params)
+            model([PROBE_IMAGE])
         except ScanError as error:
             connection.send(error)
             return
-        connection.send(model.facts)
+        connection.send(model.info)
         while True:
-            connection.send(_answered(model, connection.recv(), box))
+            connection.send(_infer(model, connection.recv(), task))
 
 
-def _answered(model: tasks.Model, images: list[U8], box: str) -> list[Body] | ScanError:
+def _infer(model: tasks.Model, images: list[U8], task: str) -> list[Body] | ScanError:
     try:
         return model(images)
     except ScanError as error:
         return error
-    except Exception as error:  # whatever a model raises, the next image is another
+    except Exception as error:  # a failure must not affect the next images
         sizes = ", ".join(f"{one.shape[1]} x {one.shape[0]}" for one in images)
-        return StepError(box, f"failed on {sizes} ({type(error).__name__}: {error})", "Send another image")
+        return StepError(task, f"failed on {sizes} ({type(error).__name__}: {error})", "Send another image")

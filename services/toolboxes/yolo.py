@@ -1,7 +1,8 @@
-"""Before and after a detector in YOLOv5's exported form: letterboxed pictures in, boxes of pictures out.
+"""Pre- and post-processing of a detector in YOLOv5's exported form: letterboxing, decoding, non-maximum suppression.
 
-A network takes (B, 3, H, W) float32 RGB in [0, 1], H and W multiples of its stride, and gives (B, N, 5 + C): centre x
-and y, width, height in its input's pixels, objectness, and a score a class. The project's own detector does the same.
+The network's input is (B, 3, H, W) float32 RGB in [0, 1], H and W multiples of its stride; its output is (B, N, 5 + C):
+centre x and y, width, height in pixels of the input, objectness, and a score per class. The project's own detector has
+the same form.
 """
 
 from __future__ import annotations
@@ -13,20 +14,20 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.core.types import F32, I32, U8
 
-GREY = 114
-"""Of what fills a letterbox, of 255."""
-CANDIDATES = 3000
-"""Boxes of highest score that overlap is looked for among."""
-MOST = 300
-"""Boxes of a picture, at most."""
+PADDING_GREY = 114
+"""Grey level of the padding, 0 to 255."""
+MAX_NMS_CANDIDATES = 3000
+"""Boxes of highest score that enter the non-maximum suppression."""
+MAX_BOXES = 300
+"""Boxes per image."""
 
 
 @dataclass(frozen=True)
 class Transform:
-    """How a picture lies in a network's input: scaled, then moved (pixels right and down).
+    """Letterbox transform from an image to the network's input: scaled, then shifted (pixels right and down).
 
     Attributes:
-        size: (H, W) of the picture.
+        size: (H, W) of the image.
     """
 
     scale: float
@@ -34,8 +35,8 @@ class Transform:
     down: int
     size: tuple[int, int]
 
-    def back(self, boxes: F32) -> F32:
-        """(K, 4) corners x0, y0, x1, y1 in the picture's pixels, within it, of those in the input's."""
+    def to_image(self, boxes: F32) -> F32:
+        """Map corners (K, 4) x0, y0, x1, y1 from pixels of the input to pixels of the image, clipped to it."""
         moved = (boxes - np.array([self.right, self.down] * 2, np.float32)) / np.float32(self.scale)
         height, width = self.size
         return np.clip(moved, 0, [width, height, width, height]).astype(np.float32)
@@ -43,7 +44,7 @@ class Transform:
 
 @dataclass(frozen=True)
 class Boxes:
-    """What was found in a picture, best first: corners (K, 4) x0, y0, x1, y1 in its pixels, scores, classes (K,)."""
+    """Detections of an image by descending score: corners (K, 4) x0, y0, x1, y1 in pixels, scores and classes (K,)."""
 
     corners: F32
     scores: F32
@@ -51,14 +52,14 @@ class Boxes:
 
 
 def letterbox(image: U8, size: int | tuple[int, int], stride: int = 64) -> tuple[F32, Transform]:
-    """A picture (H, W, 3), scaled into a network's input, grey around it.
+    """Scale an image (H, W, 3) into the network's input and pad it with grey.
 
     Args:
-        size: (height, width) of the input, rounded up to the stride; or of its longer side alone: the shorter one is as
-            long as the picture needs.
+        size: (height, width) of the input, rounded up to the stride; or its longer side only: the shorter one follows
+            from the image.
 
     Returns:
-        (3, h, w) in [0, 1], and how the picture lies in it.
+        Input (3, h, w) in [0, 1], and its transform.
     """
     import cv2
 
@@ -66,23 +67,23 @@ def letterbox(image: U8, size: int | tuple[int, int], stride: int = 64) -> tuple
     if isinstance(size, int):
         scale = size / max(height, width)
         size = (round(height * scale), round(width * scale))
-    high, wide = (-(-side // stride) * stride for side in size)
+    padded_h, padded_w = (-(-side // stride) * stride for side in size)
     scale = min(size[0] / height, size[1] / width)
     h, w = max(1, round(height * scale)), max(1, round(width * scale))
     flag = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    small = image if (h, w) == (height, width) else cv2.resize(image, (w, h), interpolation=flag)
-    out = np.full((high, wide, 3), GREY, np.uint8)
-    down, right = (high - h) // 2, (wide - w) // 2
-    out[down : down + h, right : right + w] = small
+    scaled = image if (h, w) == (height, width) else cv2.resize(image, (w, h), interpolation=flag)
+    out = np.full((padded_h, padded_w, 3), PADDING_GREY, np.uint8)
+    down, right = (padded_h - h) // 2, (padded_w - w) // 2
+    out[down : down + h, right : right + w] = scaled
     return out.transpose(2, 0, 1).astype(np.float32) / np.float32(255), Transform(scale, right, down, (height, width))
 
 
 def decode(output: npt.NDArray[np.floating], transform: Transform, threshold: float = 0.25, iou: float = 0.45) -> Boxes:
-    """The boxes that a network's output (N, 5 + C) of a picture tells of, overlapping ones of a class dropped.
+    """Decode the network's output (N, 5 + C) of an image, with non-maximum suppression per class.
 
     Args:
-        threshold: least score, objectness times the class's.
-        iou: overlap from which on the lower score of two of a class is dropped.
+        threshold: minimum score, objectness times class score.
+        iou: intersection over union above which the lower score of two boxes of a class is dropped.
     """
     import cv2
 
@@ -90,7 +91,7 @@ def decode(output: npt.NDArray[np.floating], transform: Transform, threshold: fl
     scores = rows[:, 4:5] * rows[:, 5:]
     labels = scores.argmax(axis=1) if len(rows) else np.zeros(0, np.int64)
     best = scores[np.arange(len(rows)), labels]
-    order = np.argsort(-best, kind="stable")[:CANDIDATES]
+    order = np.argsort(-best, kind="stable")[:MAX_NMS_CANDIDATES]
     order = order[best[order] > threshold]
     rows, best, labels = rows[order], best[order], labels[order]
     centre, sides = rows[:, :2], rows[:, 2:4]
@@ -98,6 +99,6 @@ def decode(output: npt.NDArray[np.floating], transform: Transform, threshold: fl
     kept = np.zeros(0, np.intp)
     if len(rows):
         found = cv2.dnn.NMSBoxesBatched(corner.tolist(), best.tolist(), labels.tolist(), threshold, iou)
-        kept = np.sort(np.asarray(found, np.intp).ravel())[:MOST]
+        kept = np.sort(np.asarray(found, np.intp).ravel())[:MAX_BOXES]
     corner[:, 2:] += corner[:, :2]
-    return Boxes(transform.back(corner[kept]), best[kept].astype(np.float32), labels[kept].astype(np.int32))
+    return Boxes(transform.to_image(corner[kept]), best[kept].astype(np.float32), labels[kept].astype(np.int32))

@@ -1,6 +1,6 @@
-"""Topics of ROS 2, in two files behind one interface: rclpy where it imports, cyclonedds with ROS names elsewhere.
+"""Transport over ROS 2 topics, with two implementations: rclpy if it is installed, else cyclonedds with ROS 2's names.
 
-Services know nothing else of ROS. Both files have what `Transport` lists; nodes of both see each other's topics.
+Services use no other ROS API. Both modules implement `Transport`; nodes of both are interoperable.
 """
 
 from __future__ import annotations
@@ -14,110 +14,112 @@ from scan2sim.pipeline.core import optional_deps
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.transport.types import Arrival, Endpoint, QoS
 
-CHOICE = "SCAN2SIM_TRANSPORT"
-"""Environment variable that names the transport; without it, the first of `NAMES` that imports here."""
-NAMES = ("rclpy", "cyclone")
+TRANSPORT_VARIABLE = "SCAN2SIM_TRANSPORT"
+"""Environment variable that selects the transport; default: the first of `TRANSPORTS` that is installed."""
+TRANSPORTS = ("rclpy", "cyclone")
 
 
 class Publisher(Protocol):
     """Sends messages on a topic."""
 
     def publish(self, message: Any) -> None:
-        """Send a message, or one that is serialized already (bytes of CDR with its encapsulation)."""
+        """Publish a message, or a serialized one (bytes of CDR with the encapsulation header)."""
 
     def get_subscription_count(self) -> int:
-        """Subscriptions that are matched with it now."""
+        """Number of currently matched subscriptions."""
 
 
 class Node(Protocol):
-    """A node of ROS 2; methods are named as in rclpy, and their arguments mean the same.
+    """A ROS 2 node; methods and arguments are those of rclpy.
 
-    `published`, `received` and `unreadable` are called in the thread that sends a message or takes it; a subclass that
-    overrides them sees all that goes through the node (`services.monitoring.node.monitor`).
+    `published`, `received` and `unreadable` are hooks, called in the thread that sends or takes a message; a subclass
+    that overrides them sees all traffic of the node (`services.monitoring.node.monitor`).
     """
 
     def __init__(self, node_name: str, *, namespace: str = "/", hidden: bool = False) -> None:
-        """Join the network; `hidden`: without parameters and a log of its own (its name should begin with _)."""
+        """Create the node; `hidden`: without parameter services and /rosout (its name should begin with _)."""
 
     def get_name(self) -> str:
-        """Its name, without namespace."""
+        """Name without namespace."""
 
     def get_namespace(self) -> str:
-        """Its namespace, which begins with a slash."""
+        """Namespace, beginning with a slash."""
 
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any) -> Any:
-        """A `Publisher`; the profile is a `QoS`, or a depth."""
+        """Create a `Publisher`; the profile is a `QoS`, or a history depth."""
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., None], qos_profile: Any, *, raw: bool = False
     ) -> Any:
-        """Have each message handed to `callback(message)`; `raw` as bytes of CDR with its encapsulation."""
+        """Subscribe with `callback(message)`; `raw`: messages are bytes of CDR with the encapsulation header."""
 
     def raw_type(self, topic: str, type_name: str) -> Any:
-        """Stands for messages of a topic, to subscribe to it raw.
+        """Message type for a raw subscription to a topic.
 
         Raises:
-            SettingError: the transport needs their definition, and doesn't have it.
+            SettingError: the transport needs the definition of the type and doesn't have it.
         """
 
     def create_timer(self, timer_period_sec: float, callback: Callable[[], None]) -> Any:
-        """Have `callback()` called every so many seconds."""
+        """Call `callback()` periodically."""
 
     def endpoints(self, topic: str) -> tuple[Endpoint, ...]:
-        """All publishers and subscriptions of a topic that were discovered so far, this node's own among them."""
+        """All discovered publishers and subscriptions of a topic, including this node's own."""
 
     def topics(self) -> dict[str, tuple[str, ...]]:
-        """Topics that were discovered, and the names of their types."""
+        """Discovered topics and the names of their types."""
 
     def destroy_node(self) -> Any:
-        """Leave the network."""
+        """Destroy the node."""
 
     def published(self, topic: str, size: int) -> None:
-        """Called after a message of so many bytes was sent."""
+        """Hook, called after a message of `size` bytes was published."""
 
     def received(self, arrival: Arrival) -> None:
-        """Called before a message is handed on."""
+        """Hook, called before a received message is passed to the callback."""
 
     def unreadable(self, topic: str) -> None:
-        """Called instead of handing a message on that isn't of its type, after `received`."""
+        """Hook, called after `received` instead of the callback if a message can't be deserialized."""
 
 
 class Transport(Protocol):
-    """What both files have."""
+    """Interface of the transport modules."""
 
     Node: type[Any]
 
     def init(self, domain: int | None = None) -> None:
-        """Join the network, before any node is made; the domain is ROS_DOMAIN_ID's without one."""
+        """Initialize the transport before any node is created; default domain: ROS_DOMAIN_ID."""
 
     def message_type(self, name: str) -> Any:
-        """The class of messages, by a name as "std_msgs/msg/String"."""
+        """Message class by its name, such as "std_msgs/msg/String"."""
 
     def message(self, name: str, **fields: Any) -> Any:
-        """A message; fields that aren't given are zero or empty."""
+        """Create a message; fields that aren't given are zero or empty."""
 
     def type_name(self, msg_type: Any) -> str:
-        """The name of a class of messages."""
+        """Name of a message class."""
 
     def spin_once(self, node: Any, timeout_sec: float) -> None:
-        """Wait for messages and timers so long, and have them handled."""
+        """Process messages and timers of a node, waiting up to `timeout_sec`."""
 
     def shutdown(self) -> None:
-        """Leave the network; all nodes end."""
+        """Shut the transport down, with all nodes."""
 
 
 def load(name: str | None = None) -> Any:
-    """The transport that is asked for (argument, then `CHOICE`), else the first that imports here: a `Transport`.
+    """Load a `Transport`: by name, by the environment variable `TRANSPORT_VARIABLE`, or the first that is installed.
 
     Raises:
-        SettingError: there is none of that name.
-        UnavailableError: what it needs isn't installed.
+        SettingError: unknown name.
+        UnavailableError: a required package isn't installed.
     """
-    asked = name or os.environ.get(CHOICE)
-    if asked and asked not in NAMES:
-        raise SettingError(CHOICE, f"there is no transport {asked!r}", f"Choose one of: {', '.join(NAMES)}")
-    chosen = asked or ("rclpy" if optional_deps.missing("rclpy") is None else "cyclone")
-    optional_deps.need(f"the transport {chosen}", *{"rclpy": ("rclpy",), "cyclone": ("cyclonedds", "rosbags")}[chosen])
+    requested = name or os.environ.get(TRANSPORT_VARIABLE)
+    if requested and requested not in TRANSPORTS:
+        cause = f"unknown transport {requested!r}"
+        raise SettingError(TRANSPORT_VARIABLE, cause, f"Choose one of: {', '.join(TRANSPORTS)}")
+    chosen = requested or ("rclpy" if optional_deps.missing("rclpy") is None else "cyclone")
+    packages = {"rclpy": ("rclpy",), "cyclone": ("cyclonedds", "rosbags")}[chosen]
+    optional_deps.require(f"the transport {chosen}", *packages)
     return importlib.import_module(f"{__name__}.{chosen}")
 
 

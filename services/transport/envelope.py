@@ -1,7 +1,7 @@
-"""A message and what is to be known of it: number, publisher and time of sending, behind its own bytes.
+"""Message envelope: a trailer with sequence number, publisher and source timestamp after the message's bytes.
 
-A reader of CDR stops where its type ends, so nodes that know nothing of the envelope read what it wraps
-(tried: Fast DDS and cyclonedds).
+A CDR reader stops at the end of its type, so nodes that don't know the envelope read the message unchanged
+(verified with Fast DDS and cyclonedds).
 """
 
 from __future__ import annotations
@@ -9,20 +9,20 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple
 
-MARK = b"scan2sim"
-BEHIND = struct.Struct("<QQ16sq8s")
-"""Bytes of the message, its number, GID of the publisher, nanoseconds since the epoch, mark."""
-ALIGNED = 4
-"""DDS pads messages to as many bytes."""
+MAGIC = b"scan2sim"
+TRAILER = struct.Struct("<QQ16sq8s")
+"""Size of the message in bytes, its number, GID of the publisher, nanoseconds since the epoch, magic number."""
+ALIGNMENT = 4
+"""DDS pads messages to a multiple of this number of bytes."""
 
 
 class Header(NamedTuple):
-    """What is known of a message; one is made for each, so it is a tuple, which costs least.
+    """Metadata of a message; a tuple because one is created per message.
 
     Attributes:
-        number: one more than that of the publisher's last message.
-        publisher: its GID.
-        sent: nanoseconds since the epoch, by the sender's clock.
+        number: sequence number of the publisher, increasing by one.
+        publisher: GID of the publisher.
+        sent: source timestamp, nanoseconds since the epoch by the sender's clock.
     """
 
     number: int
@@ -30,14 +30,14 @@ class Header(NamedTuple):
     sent: int
 
 
-def wrapped(data: bytes | memoryview, number: int, publisher: bytes, sent: int) -> bytes:
-    """A message's bytes with the envelope behind them."""
-    return b"".join((data, bytes(-len(data) % ALIGNED), BEHIND.pack(len(data), number, publisher, sent, MARK)))
+def wrap(data: bytes | memoryview, number: int, publisher: bytes, sent: int) -> bytes:
+    """Append the envelope to the bytes of a message."""
+    return b"".join((data, bytes(-len(data) % ALIGNMENT), TRAILER.pack(len(data), number, publisher, sent, MAGIC)))
 
 
-def opened(data: bytes) -> tuple[memoryview, Header | None]:
-    """The message's own bytes, and what the envelope says; None: there is none."""
-    if not data.endswith(MARK) or len(data) < BEHIND.size:
+def unwrap(data: bytes) -> tuple[memoryview, Header | None]:
+    """Split into the message's own bytes and the content of the envelope; None if there is no envelope."""
+    if not data.endswith(MAGIC) or len(data) < TRAILER.size:
         return memoryview(data), None
-    size, number, publisher, sent, _ = BEHIND.unpack_from(data, len(data) - BEHIND.size)
+    size, number, publisher, sent, _ = TRAILER.unpack_from(data, len(data) - TRAILER.size)
     return memoryview(data)[:size], Header(number, publisher, sent)

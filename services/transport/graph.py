@@ -1,6 +1,6 @@
-"""Who is on the network, for cyclonedds: endpoints from DDS's own discovery, names of their nodes from ROS 2's.
+"""ROS graph for cyclonedds: endpoints from DDS discovery, names of their nodes from ROS 2's discovery topic.
 
-ROS 2 announces nodes as `rmw_dds_common/msg/ParticipantEntitiesInfo` on `ros_discovery_info`: which endpoints each has.
+ROS 2 announces the endpoints of each node as `rmw_dds_common/msg/ParticipantEntitiesInfo` on `ros_discovery_info`.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from scan2sim.services.transport.names import dds_topic, ros_topic, ros_type
 from scan2sim.services.transport.policies import qos_of
 from scan2sim.services.transport.types import Endpoint, Kind
 
-ANNOUNCED = "ros_discovery_info"
-INFO = "rmw_dds_common/msg/ParticipantEntitiesInfo"
-BARE = "_CREATED_BY_BARE_DDS_APP_"
-"""What ROS 2 calls a node whose participant announces none."""
+DISCOVERY_TOPIC = "ros_discovery_info"
+DISCOVERY_TYPE = "rmw_dds_common/msg/ParticipantEntitiesInfo"
+UNANNOUNCED_NODE = "_CREATED_BY_BARE_DDS_APP_"
+"""Name that ROS 2 gives to the node of a participant that announces none."""
 ALIVE = ViewState.Any | SampleState.Any | InstanceState.Alive
-ANNOUNCED_WITHIN = 2_000_000_000
-"""Nanoseconds that a publisher has to say what its type is."""
+TYPE_LOOKUP_TIMEOUT_NS = 2_000_000_000
+"""Time for a publisher to send the definition of its type."""
 KINDS: tuple[Kind, ...] = ("PUBLISHER", "SUBSCRIPTION")
-MOST = 10_000
-"""Endpoints read at once."""
+MAX_READ = 10_000
+"""Samples of a discovery topic per read."""
 
 
 @dataclass
 class Entities:
-    """Endpoints of one node of this process: their GIDs."""
+    """GIDs of the endpoints of one node of this process."""
 
     namespace: str
     name: str
@@ -48,17 +48,17 @@ class Entities:
 
 
 class Graph:
-    """Discovery of one participant; may be used from any thread."""
+    """Discovery of one participant; thread-safe."""
 
     def __init__(self, participant: DomainParticipant) -> None:
         self._participant, self._gid = participant, participant.guid.bytes
         self._lock = threading.Lock()
         self._nodes: list[Entities] = []
-        topic = Topic(participant, ANNOUNCED, sample_type(INFO))
-        kept = Qos(Policy.Reliability.Reliable(0), Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
-        self._writer = DataWriter(participant, topic, kept)
-        all_of_them = Qos(Policy.Reliability.Reliable(0), Policy.Durability.TransientLocal, Policy.History.KeepAll)
-        self._reader = DataReader(participant, topic, all_of_them)
+        topic = Topic(participant, DISCOVERY_TOPIC, sample_type(DISCOVERY_TYPE))
+        keep_last = Qos(Policy.Reliability.Reliable(0), Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
+        self._writer = DataWriter(participant, topic, keep_last)
+        keep_all = Qos(Policy.Reliability.Reliable(0), Policy.Durability.TransientLocal, Policy.History.KeepAll)
+        self._reader = DataReader(participant, topic, keep_all)
         self._endpoints = {
             "PUBLISHER": _Endpoints(participant, BuiltinTopicDcpsPublication),
             "SUBSCRIPTION": _Endpoints(participant, BuiltinTopicDcpsSubscription),
@@ -66,26 +66,26 @@ class Graph:
         self._names: dict[bytes, dict[bytes, tuple[str, str]]] = {}
 
     def announce(self, node: Entities) -> None:
-        """Tell all others of a node of this process, or of what it has now."""
+        """Publish a new or changed node of this process on the discovery topic."""
         with self._lock:
             if node not in self._nodes:
                 self._nodes.append(node)
             self._publish()
 
     def withdraw(self, node: Entities) -> None:
-        """Tell all others that a node is gone."""
+        """Publish that a node of this process is gone."""
         with self._lock:
             self._nodes = [other for other in self._nodes if other is not node]
             self._publish()
 
     def endpoints(self, topic: str) -> tuple[Endpoint, ...]:
-        """Publishers and subscriptions of a topic, by its full name."""
+        """Publishers and subscriptions of a topic, given by its full name."""
         with self._lock:
             names = self._read_names()
             wanted = dds_topic(topic)
             return tuple(
                 Endpoint(
-                    *names.get(found.key.bytes, (BARE, BARE)),
+                    *names.get(found.key.bytes, (UNANNOUNCED_NODE, UNANNOUNCED_NODE)),
                     type_name=ros_type(found.type_name),
                     kind=kind,
                     gid=found.key.bytes,
@@ -97,17 +97,17 @@ class Graph:
             )
 
     def announced_type(self, topic: str, type_name: str) -> Any | None:
-        """A type as a publisher of a topic announces it (DDS-XTypes 1.3, section 7.6.3.3); None: none does."""
+        """Type that a publisher of a topic announces (DDS-XTypes 1.3, section 7.6.3.3); None: not announced."""
         with self._lock:
             found = [one for one in self._endpoints["PUBLISHER"].alive() if one.topic_name == dds_topic(topic)]
         for one in found:
             if one.type_id is not None and ros_type(one.type_name) == type_name:
-                with contextlib.suppress(DDSException):  # it has gone, or says nothing
-                    return get_types_for_typeid(self._participant, one.type_id, ANNOUNCED_WITHIN)[0]
+                with contextlib.suppress(DDSException):  # the publisher is gone, or doesn't reply
+                    return get_types_for_typeid(self._participant, one.type_id, TYPE_LOOKUP_TIMEOUT_NS)[0]
         return None
 
     def topics(self) -> dict[str, tuple[str, ...]]:
-        """ROS 2's topics, and the names of their types."""
+        """ROS 2 topics and the names of their types."""
         found: dict[str, set[str]] = {}
         with self._lock:
             for kind in KINDS:
@@ -119,18 +119,18 @@ class Graph:
     def _publish(self) -> None:
         gid, node_info = STORE.types["rmw_dds_common/msg/Gid"], STORE.types["rmw_dds_common/msg/NodeEntitiesInfo"]
 
-        def gids(of: list[bytes]) -> list[Any]:
-            return [gid(_numbers(one)) for one in of]
+        def gids(endpoints: list[bytes]) -> list[Any]:
+            return [gid(_as_array(one)) for one in endpoints]
 
         nodes = [node_info(node.namespace, node.name, gids(node.readers), gids(node.writers)) for node in self._nodes]
-        info = STORE.types[INFO](gid(_numbers(self._gid)), nodes)
-        self._writer.write(sample_type(INFO)(bytes(STORE.serialize_cdr(info, INFO))))
+        info = STORE.types[DISCOVERY_TYPE](gid(_as_array(self._gid)), nodes)
+        self._writer.write(sample_type(DISCOVERY_TYPE)(bytes(STORE.serialize_cdr(info, DISCOVERY_TYPE))))
 
     def _read_names(self) -> dict[bytes, tuple[str, str]]:
-        """GIDs of endpoints to the name and namespace of their node."""
-        for sample in self._reader.take(MOST):
+        """Mapping from the GID of an endpoint to the name and namespace of its node."""
+        for sample in self._reader.take(MAX_READ):
             if sample.sample_info.valid_data:
-                info: Any = STORE.deserialize_cdr(sample.data, INFO)
+                info: Any = STORE.deserialize_cdr(sample.data, DISCOVERY_TYPE)
                 self._names[bytes(info.gid.data)] = {
                     bytes(one.data): (node.node_name, node.node_namespace)
                     for node in info.node_entities_info_seq
@@ -140,23 +140,23 @@ class Graph:
 
 
 class _Endpoints:
-    """Publishers or subscriptions that are on the network; read anew only when some have come or gone.
+    """Discovered publishers or subscriptions, cached until one appears or disappears.
 
-    To read one takes a fifth of a millisecond, and a machine of a hundred nodes has hundreds.
+    Reading one takes 0.2 ms, and a machine with a hundred nodes has hundreds.
     """
 
     def __init__(self, participant: DomainParticipant, topic: Any) -> None:
         self._reader = BuiltinDataReader(participant, topic)
         self._condition = ReadCondition(self._reader, ALIVE)
-        self._news = ReadCondition(self._reader, ViewState.Any | SampleState.NotRead | InstanceState.Any)
+        self._changed = ReadCondition(self._reader, ViewState.Any | SampleState.NotRead | InstanceState.Any)
         self._found: list[Any] = []
 
     def alive(self) -> list[Any]:
-        if self._news.triggered:
-            self._reader.read(MOST, self._news)  # who has gone counts as read, too
-            self._found = list(self._reader.read(MOST, self._condition))
+        if self._changed.triggered:
+            self._reader.read(MAX_READ, self._changed)  # marks all samples as read, including those of gone endpoints
+            self._found = list(self._reader.read(MAX_READ, self._condition))
         return self._found
 
 
-def _numbers(gid: bytes) -> Any:
+def _as_array(gid: bytes) -> Any:
     return np.frombuffer(gid, np.uint8)

@@ -1,6 +1,6 @@
-"""Types of ROS 2's messages for cyclonedds, made of their definitions; samples are bytes, which others read and write.
+"""IDL types of ROS 2 messages for cyclonedds, from their definitions; samples are serialized bytes.
 
-A peer of another vendor takes data only where the type that is announced is its own, field for field.
+A DDS implementation of another vendor accepts data only if the announced type matches its own field by field.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.transport.names import checked_type, dds_type
 
 STORE: Typestore = get_typestore(Stores.ROS2_KILTED)
-"""Definitions of the types that ROS 2 brings, and of `ackermann_msgs`, which cars are driven by."""
+"""Definitions of ROS 2's standard message types, and of `ackermann_msgs` (drive commands of cars)."""
 _ANGLES = "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\nfloat32 acceleration\nfloat32 jerk"
 _STAMPED = "std_msgs/Header header\nackermann_msgs/AckermannDrive drive"
 STORE.register(
     get_types_from_msg(_ANGLES, "ackermann_msgs/msg/AckermannDrive")
     | get_types_from_msg(_STAMPED, "ackermann_msgs/msg/AckermannDriveStamped")
 )
-types: Any = _types  # its generics are no generics to type checkers
+types: Any = _types  # its generics aren't recognized by type checkers
 _VALUES = {
     "bool": bool,
     "byte": types.byte,
@@ -48,48 +48,46 @@ _ZERO: dict[str, Any] = {"bool": False, "string": "", "float32": 0.0, "float64":
 
 
 def known(name: str) -> str:
-    """The name of a type whose definition is known.
+    """Check that the definition of a type is known and return its name.
 
     Raises:
-        SettingError: it isn't.
+        SettingError: it is unknown.
     """
     if checked_type(name) not in STORE.types:
-        raise SettingError(
-            f"type {name}",
-            "its definition isn't known here",
-            "Without rclpy only ROS 2's own messages are; install rclpy and source the workspace that defines it",
-        )
+        remedy = "Without rclpy only ROS 2's standard types are known: install it and source the workspace of this type"
+        raise SettingError(f"type {name}", "its definition is unknown", remedy)
     return name
 
 
 @cache
 def sample_type(name: str) -> Any:
-    """The class of samples of a type, whose `data` are bytes of CDR with their encapsulation."""
-    return _samples(_struct(known(name)))
+    """Sample class of a type; its `data` are bytes of CDR with the encapsulation header."""
+    return _sample_class(_struct(known(name)))
 
 
 @dataclass(frozen=True)
-class Foreign:
-    """Stands for a type whose definition isn't known here: its messages can be received raw.
+class OpaqueType:
+    """A message type whose definition is unknown: its messages can only be received raw.
 
     Attributes:
-        __msgtype__: its name.
-        sample: the class of its samples.
+        __msgtype__: name of the type.
+        sample: its sample class.
     """
 
     __msgtype__: str
     sample: Any
 
 
-def foreign(name: str, announced: Any | None) -> Foreign:
-    """Of a name, and of what its publisher announces it to be; None: it announces nothing, as Fast DDS doesn't."""
+def opaque_type(name: str, announced: Any | None) -> OpaqueType:
+    """Create an opaque type; `announced`: type announced by its publisher, None if it announces none (Fast DDS)."""
     plain = {"bytes": types.sequence[types.byte]}
-    return Foreign(name, _samples(announced or make_idl_struct("Foreign", dds_type(name).replace("::", "."), plain)))
+    struct = announced or make_idl_struct("Foreign", dds_type(name).replace("::", "."), plain)
+    return OpaqueType(name, _sample_class(struct))
 
 
-def _samples(made: Any) -> Any:
-    class Sample(made):  # type: ignore[misc]
-        """Bytes of CDR."""
+def _sample_class(struct: Any) -> Any:
+    class Sample(struct):  # type: ignore[misc]
+        """Sample that holds serialized bytes of CDR."""
 
         __slots__ = ("data", "sample_info")
 
@@ -103,14 +101,14 @@ def _samples(made: Any) -> Any:
         def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Sample:
             return cls(data)
 
-    Sample.__idl__ = made.__idl__
+    Sample.__idl__ = struct.__idl__
     return Sample
 
 
 @cache
 def _struct(name: str) -> Any:
     fields = {field: _type(*definition) for field, definition in STORE.get_msgdef(name).fields}
-    # a struct without fields isn't allowed: what ROS 2 puts there instead
+    # IDL doesn't allow an empty struct; ROS 2 adds this dummy field
     return make_idl_struct(
         name.rpartition("/")[2] + "_",
         dds_type(name).replace("::", "."),
@@ -120,21 +118,21 @@ def _struct(name: str) -> Any:
 
 @cache
 def unbounded(name: str) -> bool:
-    """Whether messages of a type can be of any length: a reader keeps room for no more than the longest."""
-    return any(_grows(*definition) for _, definition in STORE.get_msgdef(name).fields)
+    """Whether a type has unbounded size; for others, readers allocate no more than the largest message."""
+    return any(_is_unbounded(*definition) for _, definition in STORE.get_msgdef(name).fields)
 
 
-def _grows(node: Any, definition: Any) -> bool:
+def _is_unbounded(node: Any, definition: Any) -> bool:
     if node.name == "BASE":
         return bool(definition[0] == "string" and not definition[1])
     if node.name == "NAME":
         return unbounded(definition)
     item, count = definition
-    return _grows(*item) or (node.name == "SEQUENCE" and not count)
+    return _is_unbounded(*item) or (node.name == "SEQUENCE" and not count)
 
 
 def _type(node: Any, definition: Any) -> Any:
-    """Of a field, as rosbags parses definitions: (kind, name or (item, count))."""
+    """IDL type of a field from its definition as rosbags parses it: (kind, name or (item, count))."""
     if node.name == "BASE":
         base, bound = definition
         return types.bounded_str[bound] if base == "string" and bound else _VALUES[base]
@@ -147,9 +145,9 @@ def _type(node: Any, definition: Any) -> Any:
 
 
 def default(name: str) -> Any:
-    """A message with all fields zero or empty."""
-    made = {field: _default(*definition) for field, definition in STORE.get_msgdef(name).fields}
-    return STORE.types[name](**made)
+    """Create a message with all fields zero or empty."""
+    fields = {field: _default(*definition) for field, definition in STORE.get_msgdef(name).fields}
+    return STORE.types[name](**fields)
 
 
 def _default(node: Any, definition: Any) -> Any:

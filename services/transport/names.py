@@ -1,4 +1,4 @@
-"""Names of ROS 2 on DDS: topics, types and hashes, as every vendor of its middleware maps them.
+"""Mapping of ROS 2 names of topics and types to DDS, as all RMW implementations define it.
 
 Source: design.ros2.org, "Topic and Service name mapping to DDS"; REP 2011 (type hashes).
 """
@@ -17,47 +17,47 @@ TopicName = Annotated[
     str,
     Field(
         pattern=f"^{TOPIC.pattern}$",
-        json_schema_extra={"range": "a name of ROS 2: the letters a to z, digits and _, parts of them parted by /"},
+        json_schema_extra={"range": "a ROS 2 name: parts of the letters a to z, digits and _, separated by /"},
     ),
 ]
-"""Of a topic, as a setting."""
+"""Type of a setting: name of a topic."""
 TYPE = re.compile(r"[a-zA-Z][a-zA-Z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*")
 
 
 def qualified(topic: str, namespace: str = "/") -> str:
-    """The full name of a topic, "/robot/image".
+    """Full name of a topic, such as "/robot/image".
 
     Raises:
-        SettingError: ROS 2 allows no such name.
+        SettingError: the name is invalid in ROS 2.
     """
     if not TOPIC.fullmatch(topic):
         raise SettingError(
             f"topic {topic!r}",
-            "ROS 2 has no topics of such names",
-            "Names are made of the letters a to z, digits and _, parts of them parted by /; none begins with a digit",
+            "not a valid name of a ROS 2 topic",
+            "Use the letters a to z, digits and _, in parts separated by /; no part may begin with a digit",
         )
     return topic if topic.startswith("/") else f"{namespace.rstrip('/')}/{topic}"
 
 
 def dds_topic(topic: str) -> str:
-    """What a topic is called on DDS: "/image" is "rt/image"."""
+    """DDS name of a topic: "/image" becomes "rt/image"."""
     return "rt" + topic
 
 
 def ros_topic(name: str) -> str | None:
-    """A topic's name by what it is called on DDS; None: it is none of ROS."""
+    """ROS 2 name of a DDS topic; None if it isn't a ROS 2 topic."""
     return name[2:] if name.startswith("rt/") else None
 
 
 def dds_type(name: str) -> str:
-    """What a type is called on DDS: "std_msgs/msg/String" is "std_msgs::msg::dds_::String_"; others stay."""
+    """DDS name of a type: "std_msgs/msg/String" becomes "std_msgs::msg::dds_::String_"; others are unchanged."""
     package, _, rest = name.partition("/")
     kind, _, leaf = rest.partition("/")
     return f"{package}::{kind}::dds_::{leaf}_" if leaf else name
 
 
 def ros_type(name: str) -> str:
-    """A type's name by what it is called on DDS; what isn't of ROS stays as it is."""
+    """ROS 2 name of a DDS type; unchanged if it isn't a ROS 2 type."""
     parts = name.split("::")
     if len(parts) == 4 and parts[2] == "dds_" and name.endswith("_"):
         return f"{parts[0]}/{parts[1]}/{parts[3][:-1]}"
@@ -65,11 +65,12 @@ def ros_type(name: str) -> str:
 
 
 def checked_type(name: str) -> str:
-    """The name of a type of messages, if it is one.
+    """Check the name of a message type and return it.
 
     Raises:
-        SettingError: it isn't of the form PACKAGE/msg/NAME.
+        SettingError: it doesn't have the form PACKAGE/msg/NAME.
     """
     if not TYPE.fullmatch(name):
-        raise SettingError(f"type {name!r}", "no name of a message", "Give it as PACKAGE/msg/NAME: std_msgs/msg/String")
+        cause = "not the name of a message type"
+        raise SettingError(f"type {name!r}", cause, "Use PACKAGE/msg/NAME, such as std_msgs/msg/String")
     return name

@@ -1,4 +1,4 @@
-"""Qualities of service as cyclonedds has them."""
+"""Conversion of QoS profiles to and from cyclonedds."""
 
 from __future__ import annotations
 
@@ -6,27 +6,29 @@ from cyclonedds.qos import Policy, Qos
 
 from scan2sim.services.transport.types import INFINITE, Durability, QoS
 
-BLOCKED = 100_000_000
-"""Nanoseconds that a reliable publisher waits for a full queue, as ROS 2's middleware does."""
+MAX_BLOCKING_NS = 100_000_000
+"""Time that a reliable publisher waits when its queue is full (max_blocking_time), as in ROS 2's middleware."""
 
 
 def policies(qos: QoS, userdata: bytes = b"") -> Qos:
-    """A profile in DDS's terms."""
+    """Convert a QoS profile to DDS policies."""
     liveliness = Policy.Liveliness.ManualByTopic if qos.liveliness == "MANUAL_BY_TOPIC" else Policy.Liveliness.Automatic
     chosen = [
-        Policy.Reliability.Reliable(BLOCKED) if qos.reliability == "RELIABLE" else Policy.Reliability.BestEffort,
+        Policy.Reliability.Reliable(MAX_BLOCKING_NS)
+        if qos.reliability == "RELIABLE"
+        else Policy.Reliability.BestEffort,
         Policy.Durability.TransientLocal if qos.durability == "TRANSIENT_LOCAL" else Policy.Durability.Volatile,
         Policy.History.KeepLast(qos.depth) if qos.depth else Policy.History.KeepAll,
         Policy.Deadline(qos.deadline),
         liveliness(qos.lease),
     ]
-    if userdata:  # subscriptions have neither
+    if userdata:  # publishers only
         chosen += [Policy.Lifespan(qos.lifespan), Policy.Userdata(userdata)]
     return Qos(*chosen)
 
 
 def qos_of(found: Qos) -> QoS:
-    """A profile of DDS's terms, as discovery has them; what it leaves out has its default."""
+    """Convert discovered DDS policies to a QoS profile; missing policies have their defaults."""
     scopes = {policy.__scope__: policy for policy in found}
     reliability, history = scopes.get("Reliability"), scopes.get("History")
     liveliness = scopes.get("Liveliness")

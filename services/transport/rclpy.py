@@ -1,7 +1,7 @@
-"""The transport over rclpy: ROS 2's own library, whatever middleware it is set to.
+"""Transport over rclpy, ROS 2's Python client library, with any RMW implementation.
 
-DDS wraps every message in a header of its own that holds what monitoring needs: the publisher's GID, a number and the
-time of sending (DDSI-RTPS 2.5, sections 8.3.8.2 and 8.3.8.9), so messages go out as they are, at no cost.
+DDS sends every message with a header that has all that monitoring needs: the publisher's GID, a sequence number and
+the source timestamp (DDSI-RTPS 2.5, sections 8.3.8.2 and 8.3.8.9), so messages are sent unchanged.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from rclpy.qos import (
 from rclpy.signals import SignalHandlerOptions
 
 from scan2sim.pipeline.core.errors import SettingError
-from scan2sim.services.transport.cdr import size
+from scan2sim.services.transport.cdr import serialized_size
 from scan2sim.services.transport.names import checked_type
 from scan2sim.services.transport.types import INFINITE, Arrival, Endpoint, Kind, QoS
 
 
 class _Publisher(RosPublisher):  # type: ignore[misc]
-    """Reports to its node what it sends."""
+    """Publisher that reports each message to its node."""
 
     node: Node
 
     def publish(self, msg: Any) -> None:
-        """Send, and report it."""
+        """Publish a message and report it."""
         super().publish(msg)
-        self.node.published(self.topic_name, len(msg) if isinstance(msg, bytes) else size(msg))
+        self.node.published(self.topic_name, len(msg) if isinstance(msg, bytes) else serialized_size(msg))
 
 
 class Node(rclpy.node.Node):  # type: ignore[misc]
-    """A node of rclpy that reports every message (`services.transport.Node`)."""
+    """An rclpy node that reports every message (`services.transport.Node`)."""
 
     def __init__(self, node_name: str, *, namespace: str = "/", hidden: bool = False, **others: Any) -> None:
         if hidden:
@@ -52,36 +52,37 @@ class Node(rclpy.node.Node):  # type: ignore[misc]
         self.own_executor: Any = None
 
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **others: Any) -> Any:
-        """As rclpy's; the profile may be ours."""
-        made = super().create_publisher(msg_type, topic, _profile(qos_profile), publisher_class=_Publisher, **others)
-        made.node = self
-        return made
+        """Like rclpy's `create_publisher`; the profile may be a `QoS`."""
+        profile = _profile(qos_profile)
+        publisher = super().create_publisher(msg_type, topic, profile, publisher_class=_Publisher, **others)
+        publisher.node = self
+        return publisher
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., None], qos_profile: Any, **others: Any
     ) -> Any:
-        """As rclpy's; the profile may be ours."""
+        """Like rclpy's `create_subscription`; the profile may be a `QoS`."""
         full = self.resolve_topic_name(topic)
 
-        def taken(message: Any, info: Any) -> None:
+        def on_message(message: Any, info: Any) -> None:
             self.received(_arrival(full, message, info))
             callback(message)
 
-        return super().create_subscription(msg_type, topic, taken, _profile(qos_profile), **others)
+        return super().create_subscription(msg_type, topic, on_message, _profile(qos_profile), **others)
 
     def endpoints(self, topic: str) -> tuple[Endpoint, ...]:
-        """Publishers and subscriptions of a topic, as rclpy lists them."""
+        """Discovered publishers and subscriptions of a topic."""
         return tuple(
             [_endpoint(info, "PUBLISHER") for info in self.get_publishers_info_by_topic(topic)]
             + [_endpoint(info, "SUBSCRIPTION") for info in self.get_subscriptions_info_by_topic(topic)]
         )
 
     def topics(self) -> dict[str, tuple[str, ...]]:
-        """Topics and the names of their types."""
+        """Discovered topics and the names of their types."""
         return {name: tuple(kinds) for name, kinds in self.get_topic_names_and_types()}
 
     def raw_type(self, topic: str, type_name: str) -> Any:
-        """Of a topic; rclpy needs its definition.
+        """Message type for a raw subscription; rclpy needs its definition.
 
         Raises:
             SettingError: its package isn't installed.
@@ -89,33 +90,33 @@ class Node(rclpy.node.Node):  # type: ignore[misc]
         try:
             return message_type(type_name)
         except SettingError as error:
-            remedy = f"{error.remedy}, or watch without it: SCAN2SIM_TRANSPORT=cyclone"
+            remedy = f"{error.remedy}, or monitor the topic without its definition: SCAN2SIM_TRANSPORT=cyclone"
             raise SettingError(error.where, error.cause, remedy) from None
 
     def destroy_node(self) -> Any:
-        """As rclpy's; what spun it ends with it."""
+        """Destroy the node and its executor."""
         if self.own_executor is not None:
             self.own_executor.shutdown()
         return super().destroy_node()
 
     def published(self, topic: str, size: int) -> None:
-        """To be overridden: a message was sent."""
+        """Hook: a message was published."""
 
     def received(self, arrival: Arrival) -> None:
-        """To be overridden: a message has come."""
+        """Hook: a message was received."""
 
     def unreadable(self, topic: str) -> None:
-        """Never called: rclpy hands what isn't of its type on with its fields empty."""
+        """Never called: rclpy passes malformed messages on with empty fields."""
 
 
 def init(domain: int | None = None) -> None:
-    """Join the network; signals are left to the program: rclpy's own way would end nodes before their last record."""
+    """Initialize rclpy without its signal handlers, which would end nodes before they publish their last record."""
     if not rclpy.ok():
         rclpy.init(domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
 
 
 def message_type(name: str) -> Any:
-    """The class of messages of that name.
+    """Message class by its name.
 
     Raises:
         SettingError: its package isn't installed.
@@ -125,23 +126,23 @@ def message_type(name: str) -> Any:
         return getattr(importlib.import_module(f"{package}.{kind}"), leaf)
     except (ImportError, AttributeError) as error:
         raise SettingError(
-            f"type {name}", f"not known here ({error})", "Source the workspace that defines it"
+            f"type {name}", f"its definition is unknown ({error})", "Source the workspace that defines it"
         ) from None
 
 
 def message(name: str, **fields: Any) -> Any:
-    """A message of that type."""
+    """Create a message with the given fields."""
     return message_type(name)(**fields)
 
 
 def type_name(msg_type: Any) -> str:
-    """The name of a class of messages."""
+    """Name of a message class."""
     package, kind = msg_type.__module__.split(".")[:2]
     return f"{package}/{kind}/{msg_type.__name__}"
 
 
 def spin_once(node: Node, timeout_sec: float) -> None:
-    """Handle what comes within so long; nodes may be spun by threads of their own."""
+    """Process messages and timers of a node, waiting up to `timeout_sec`; each node has its own executor."""
     if node.own_executor is None:
         node.own_executor = SingleThreadedExecutor()
         node.own_executor.add_node(node)
@@ -152,7 +153,7 @@ def spin_once(node: Node, timeout_sec: float) -> None:
 
 
 def shutdown() -> None:
-    """Leave the network."""
+    """Shut rclpy down."""
     rclpy.try_shutdown()
 
 
@@ -160,7 +161,7 @@ def _arrival(topic: str, message: Any, info: Any) -> Arrival:
     gid = info.get("publisher_gid")
     return Arrival(
         topic=topic,
-        size=len(message) if isinstance(message, bytes) else size(message),
+        size=len(message) if isinstance(message, bytes) else serialized_size(message),
         received=time.time_ns(),
         sent=info["source_timestamp"] or None,
         publisher=gid["data"] if gid else None,
@@ -180,7 +181,7 @@ def _endpoint(info: Any, kind: Kind) -> Endpoint:
 
 
 def _profile(qos: Any) -> Any:
-    """Rclpy's profile of ours; its own, and depths, stay as they are."""
+    """Convert a `QoS` to rclpy's profile; rclpy's own profiles and depths are unchanged."""
     if not isinstance(qos, QoS):
         return qos
     return QoSProfile(

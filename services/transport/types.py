@@ -1,4 +1,4 @@
-"""What both transports share: qualities of service, endpoints and what is known of a message that arrived.
+"""Types of both transports: QoS profiles, endpoints and metadata of received messages.
 
 Names and values are those of DDS and ROS 2 (OMG DDS 1.4, section 2.2.3; rclpy's `QoSProfile`).
 """
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 INFINITE = 2**63 - 1
-"""Nanoseconds that stand for "never", as ROS 2 writes them."""
+"""Infinite duration in nanoseconds, as in ROS 2."""
 
 Reliability = Literal["RELIABLE", "BEST_EFFORT"]
 Durability = Literal["VOLATILE", "TRANSIENT_LOCAL"]
@@ -19,13 +19,13 @@ Kind = Literal["PUBLISHER", "SUBSCRIPTION"]
 
 @dataclass(frozen=True)
 class QoS:
-    """Quality of service of a publisher or a subscription; the defaults are ROS 2's.
+    """QoS profile of a publisher or a subscription; the defaults are ROS 2's.
 
     Attributes:
-        depth: messages kept for who is slow or late; 0 keeps all.
-        lifespan: nanoseconds after which a message isn't delivered any more.
-        deadline: nanoseconds between messages, at most.
-        lease: nanoseconds after which a publisher that said nothing counts as gone.
+        depth: history depth, messages; 0: keep all.
+        lifespan: nanoseconds after which a message is no longer delivered.
+        deadline: maximum time between two messages, nanoseconds.
+        lease: liveliness lease duration, nanoseconds.
     """
 
     reliability: Reliability = "RELIABLE"
@@ -38,21 +38,21 @@ class QoS:
 
 
 SENSOR_DATA = QoS(reliability="BEST_EFFORT", depth=5)
-"""ROS 2's profile of that name: the newest matters, what is lost is lost."""
+"""ROS 2's profile for sensor data: best effort, small depth."""
 
 
 def as_qos(qos: QoS | int) -> QoS:
-    """A profile, where a number is the depth of the default one, as in rclpy."""
+    """Convert a history depth to the default profile with that depth, as in rclpy."""
     return QoS(depth=qos) if isinstance(qos, int) else qos
 
 
 @dataclass(frozen=True)
 class Endpoint:
-    """A publisher or a subscription that was discovered.
+    """A discovered publisher or subscription.
 
     Attributes:
-        type_name: as "std_msgs/msg/String".
-        gid: 16 bytes (24 where ROS 2 is Humble or older), unlike any other's.
+        type_name: such as "std_msgs/msg/String".
+        gid: globally unique id, 16 bytes (24 with ROS 2 Humble or older).
     """
 
     node_name: str
@@ -64,15 +64,15 @@ class Endpoint:
 
 
 class Arrival(NamedTuple):
-    """A message that arrived; one is made for each, so it is a tuple, which costs least.
+    """Metadata of a received message; a tuple because one is created per message.
 
     Attributes:
-        topic: its full name.
-        size: bytes in CDR, with its four bytes of encapsulation.
-        received: nanoseconds since the epoch, by this machine's clock.
-        sent: likewise by the sender's; None: unknown.
-        publisher: its GID; None: unknown.
-        number: that the publisher gave it, one more than the last one's; None: unknown, so losses can't be counted.
+        topic: full name of the topic.
+        size: serialized size in CDR, bytes, with the encapsulation header of four bytes.
+        received: time of arrival, nanoseconds since the epoch by this machine's clock.
+        sent: source timestamp by the sender's clock; None: unknown.
+        publisher: GID of the publisher; None: unknown.
+        number: sequence number of the publisher, increasing by one; None: unknown, losses can't be counted.
     """
 
     topic: str

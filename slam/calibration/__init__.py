@@ -1,4 +1,4 @@
-"""The camera: given, read from metadata or estimated; whether a lens fits the images.
+"""Camera intrinsics: given by the user, read from metadata, or estimated by self-calibration.
 
-Begin with `camera`; `lens` checks and estimates intrinsics, `calibrate` does so over a whole drive.
+Start reading at `camera`. `lens` checks and estimates intrinsics from turns, `calibrate` does so over a whole drive.
 """

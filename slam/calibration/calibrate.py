@@ -1,8 +1,8 @@
-"""Calibrate: the lens that a whole drive fits best, by odometry over what was followed, with one lens after another.
+"""Self-calibration: the lens that fits a whole drive best, by running odometry over a track log with several lenses.
 
-Odometry with a lens that is wrong says what a better one is (`lens.py`), as long as it isn't lost; with that, it is run
-again, until nothing changes. Where the lens isn't known at all, this begins with a wide one, then with longer ones:
-odometry loses itself sooner with a lens that is too long than with one that is too short.
+Odometry with a wrong lens yields a better estimate (`lens.py`) unless tracking is lost; it is repeated with that
+estimate until it converges. If the lens is unknown, it starts with a wide one, then tries longer ones: tracking is lost
+sooner with a focal length that is too long than with one that is too short.
 """
 
 from __future__ import annotations
@@ -10,62 +10,63 @@ from __future__ import annotations
 import numpy as np
 
 from scan2sim.pipeline.core.types import Camera
-from scan2sim.slam.calibration.lens import WORTH, Known, better, changed, difference
+from scan2sim.slam.calibration.lens import SIGNIFICANT_CHANGE, LensEstimate, changed_lens, fit_lens, lens_difference
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
-from scan2sim.slam.odometry.track_log import Recording, plain, replay
+from scan2sim.slam.odometry.track_log import TrackLog, centred_pinhole, replay
 
-ROUNDS = 8
-"""Most often that odometry is run, with one lens after another."""
-STARTS = ((0.45, 0.0), (0.45, -0.15), (0.9, 0.0), (1.8, 0.0))
-"""Focal lengths that are begun with, in widths of the picture, and k1."""
-LOST = 0.3
-"""Of the frames, from which on odometry has lost itself."""
-TELLS = 0.05
-"""Of the focal length, how well it must come to be known."""
-STRETCH = 60
-"""Frames in which a lens that isn't known is looked for."""
+ROUNDS_MAX = 8
+"""Greatest number of odometry runs per starting lens."""
+INITIAL_LENSES = ((0.45, 0.0), (0.45, -0.15), (0.9, 0.0), (1.8, 0.0))
+"""Starting focal lengths, in widths of the image, and k1."""
+LOST_SHARE_MAX = 0.3
+"""Share of unsure frames above which odometry counts as lost."""
+FOCAL_SIGMA_MAX = 0.05
+"""Greatest accepted relative standard deviation of the focal length."""
+SEARCH_FRAMES = 60
+"""Number of frames over which an unknown lens is first searched for."""
 
 
-def calibrated(recording: Recording, camera: Camera) -> Known | None:
-    """The lens that a recording fits best, from one that is about right.
+def calibrated(log: TrackLog, camera: Camera) -> LensEstimate | None:
+    """Lens that fits a track log best, from an approximately known one.
 
-    None where the recording doesn't turn enough to tell, or odometry loses itself.
+    None if the camera turns too little to determine it, or tracking is lost.
     """
-    for _ in range(ROUNDS):
-        odometry = replay(recording, camera, OdometryParams())
-        found = better(camera, odometry.map.misfits)
-        if found is None or not 0.1 < found.camera.fx / recording.size[0] < 10:
+    for _ in range(ROUNDS_MAX):
+        odometry = replay(log, camera, OdometryParams())
+        found = fit_lens(camera, odometry.map.misfits)
+        if found is None or not 0.1 < found.camera.fx / log.size[0] < 10:
             return None
-        if np.all(np.abs(difference(camera, found.camera)) < 0.1 * WORTH):
-            return found if found.sigma[0] < TELLS and lost(odometry) < LOST else None
+        if np.all(np.abs(lens_difference(camera, found.camera)) < 0.1 * SIGNIFICANT_CHANGE):
+            return found if found.sigma[0] < FOCAL_SIGMA_MAX and lost_share(odometry) < LOST_SHARE_MAX else None
         camera = found.camera
     return None
 
 
-def lost(odometry: Odometry) -> float:
-    """The share of frames that are unsure."""
+def lost_share(odometry: Odometry) -> float:
+    """Share of unsure frames."""
     return float(np.mean([placed.unsure for placed in odometry.placed]))
 
 
-def looked_for(recording: Recording) -> Known | None:
-    """The lens of a recording of which nothing is known; None: it isn't told."""
-    part = turning(recording)
-    for share, k1 in STARTS:
-        found = calibrated(part, changed(plain(*recording.size, share * recording.size[0]), np.array([0, 0, 0, k1])))
+def calibrated_from_scratch(log: TrackLog) -> LensEstimate | None:
+    """Lens of a track log without any prior knowledge; None if it can't be determined."""
+    part = most_turning_part(log)
+    for widths, k1 in INITIAL_LENSES:
+        start = changed_lens(centred_pinhole(*log.size, widths * log.size[0]), np.array([0, 0, 0, k1]))
+        found = calibrated(part, start)
         if found is not None:
-            whole = None if len(part.times) == len(recording.times) else calibrated(recording, found.camera)
+            whole = None if len(part.times) == len(log.times) else calibrated(log, found.camera)
             return whole or found
     return None
 
 
-def turning(recording: Recording) -> Recording:
-    """The frames in which what is seen crosses the picture farthest."""
+def most_turning_part(log: TrackLog) -> TrackLog:
+    """The `SEARCH_FRAMES` frames with the largest horizontal image motion."""
     moved = [0.0]
-    for before, now in zip(range(len(recording.times)), range(1, len(recording.times)), strict=False):
-        _, a, b = np.intersect1d(recording.ids[before], recording.ids[now], return_indices=True)
-        across = recording.uv[now][b, 0] - recording.uv[before][a, 0]
-        moved.append(float(np.median(across)) if len(across) else 0.0)
-    way = np.cumsum(moved)
-    ends = np.minimum(np.arange(len(way)) + STRETCH, len(way) - 1)
-    first = int(np.abs(way[ends] - way).argmax())
-    return recording.part(min(first, max(0, len(way) - STRETCH)), first + STRETCH)
+    for before, now in zip(range(len(log.times)), range(1, len(log.times)), strict=False):
+        _, a, b = np.intersect1d(log.ids[before], log.ids[now], return_indices=True)
+        shift = log.uv[now][b, 0] - log.uv[before][a, 0]
+        moved.append(float(np.median(shift)) if len(shift) else 0.0)
+    total = np.cumsum(moved)
+    ends = np.minimum(np.arange(len(total)) + SEARCH_FRAMES, len(total) - 1)
+    first = int(np.abs(total[ends] - total).argmax())
+    return log.part(min(first, max(0, len(total) - SEARCH_FRAMES)), first + SEARCH_FRAMES)

@@ -1,4 +1,4 @@
-"""Camera: what a video was filmed with: as is said, as its EXIF or metadata say, or as its pictures fit best."""
+"""Camera of a video: given by the user, read from EXIF or video metadata, or estimated by self-calibration."""
 
 from __future__ import annotations
 
@@ -14,25 +14,26 @@ import numpy as np
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.io.images import exif
-from scan2sim.slam.calibration.calibrate import calibrated, looked_for
-from scan2sim.slam.calibration.lens import Known, changed
-from scan2sim.slam.odometry.track_log import Recording, plain
+from scan2sim.slam.calibration.calibrate import calibrated, calibrated_from_scratch
+from scan2sim.slam.calibration.lens import LensEstimate, changed_lens
+from scan2sim.slam.odometry.track_log import TrackLog, centred_pinhole
 from scan2sim.slam.video import Video
 
-EXIF = np.array([0.05, 0.05, 0.05, 0.0])
-"""How well EXIF knows a lens, as `lens.LIKELY` names it: whole millimetres, of a sensor of which videos show a part."""
-DIAGONAL = math.hypot(36, 24)
-"""Millimetres, of the film that "35 mm equivalent" means (CIPA DCG-001)."""
+EXIF_SIGMA = np.array([0.05, 0.05, 0.05, 0.0])
+"""Standard deviation of a lens from EXIF, in the parameters of `lens.PRIOR_SIGMA`: it is in whole millimetres, and
+videos show only a part of the sensor."""
+FILM_DIAGONAL_MM = math.hypot(36, 24)
+"""Diagonal of the film that "35 mm equivalent" refers to (CIPA DCG-001)."""
 
 
 @dataclass(frozen=True)
-class Found:
-    """A camera that wasn't simply told.
+class EstimatedCamera:
+    """A camera from metadata or self-calibration.
 
     Attributes:
-        camera: it.
-        sigma: (4,) how well it is known, as `lens.LIKELY` names it.
-        how: it was found.
+        camera: the camera.
+        sigma: (4,) standard deviations of the parameters of `lens.PRIOR_SIGMA`.
+        how: source of the estimate, for messages.
     """
 
     camera: Camera
@@ -40,12 +41,12 @@ class Found:
     how: str
 
     @classmethod
-    def of(cls, known: Known, how: str) -> Self:
-        """What calibration found."""
-        return cls(known.camera, known.sigma, how)
+    def of(cls, estimate: LensEstimate, how: str) -> Self:
+        """Camera of a calibration result."""
+        return cls(estimate.camera, estimate.sigma, how)
 
-    def facts(self) -> dict[str, Any]:
-        """For `slam.json`: pixels with their standard deviations, and the options that say the same."""
+    def metrics(self) -> dict[str, Any]:
+        """Entry for `slam.json`: values in pixels, their standard deviations, and the equivalent options."""
         camera, pixels = self.camera, np.round(self.sigma[:3] * self.camera.fx, 1).tolist()
         k1 = (camera.distortion or (0.0,))[0]
         options = f"--focal {camera.fx:.2f} --centre {camera.cx:.2f} {camera.cy:.2f}"
@@ -57,15 +58,15 @@ class Found:
         }  # fmt: skip
         return {"lens": lens}
 
-    def told(self) -> str:
-        """For a user."""
+    def message(self) -> str:
+        """Message for the user."""
         return (
             f"the camera's focal length is {self.camera.fx:.0f} +- {self.sigma[0] * self.camera.fx:.0f} pixels by "
-            f"{self.how}: {self.facts()['lens']['options']}"
+            f"{self.how}: {self.metrics()['lens']['options']}"
         )
 
     def write(self, path: Path) -> None:
-        """As JSON."""
+        """Write as JSON."""
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(
             json.dumps({"camera": asdict(self.camera), "sigma": self.sigma.tolist(), "how": self.how}), encoding="utf-8"
@@ -73,7 +74,7 @@ class Found:
 
     @classmethod
     def read(cls, path: Path) -> Self | None:
-        """What `write` wrote; None where it isn't whole."""
+        """Read a file written by `write`; None if it is missing or damaged."""
         try:
             tree = json.loads(path.read_text(encoding="utf-8"))
             camera = Camera(**tree["camera"] | {"distortion": tuple(tree["camera"]["distortion"])})
@@ -85,69 +86,77 @@ class Found:
 def camera_of(
     video: Video, model: str, focal: float | None, centre: tuple[float, float] | None, k1: float | None = None
 ) -> Camera | None:
-    """The camera of a video: equirectangular if it is twice as wide as high and nothing else is said.
+    """Camera of a video from the options; "auto" is equirectangular if the frames have an aspect ratio of 2:1.
 
-    None: a perspective one whose focal length isn't said.
+    None for a perspective camera without a focal length.
 
     Raises:
-        InputError: a 360 video of another shape.
+        InputError: the camera is equirectangular, but the aspect ratio isn't 2:1.
     """
     w, h = video.width, video.height
     if model == "auto":
         model = "equirectangular" if w == 2 * h and focal is None else "pinhole"
     if model == "equirectangular":
         if abs(w - 2 * h) > 2:
-            raise InputError(video.path, f"is {w}x{h}, not twice as wide as high", "Name its camera: --camera pinhole")
+            raise InputError(
+                video.path,
+                f"is {w}x{h}, not twice as wide as high like a 360 video",
+                "Set the camera: --camera pinhole",
+            )
         return Camera("equirectangular", w, h)
     if focal is None:
         return None
     cx, cy = centre or ((w - 1) / 2, (h - 1) / 2)
-    return changed(Camera("pinhole", w, h, focal, focal, cx, cy), np.array([0, 0, 0, k1 or 0.0]))
+    return changed_lens(Camera("pinhole", w, h, focal, focal, cx, cy), np.array([0, 0, 0, k1 or 0.0]))
 
 
-def found(video: Video, camera: Camera | None, record: Callable[[], Recording], *, calibrate: bool) -> Found | None:
-    """What the video's camera is, where that isn't said, or is to be calibrated; None: as is said.
+def estimated_camera(
+    video: Video, camera: Camera | None, record: Callable[[], TrackLog], *, calibrate: bool
+) -> EstimatedCamera | None:
+    """Camera from metadata or self-calibration; None if the given camera is used.
 
     Args:
-        camera: as is said; None: it isn't.
-        record: follows the video's features.
-        calibrate: find what fits the whole drive best, even where a camera is said, or EXIF tells one.
+        video: the video.
+        camera: camera given by the user or the tile; None: unknown.
+        record: tracks corners through the video.
+        calibrate: calibrate over the whole drive even if the camera is given, or in EXIF.
 
     Raises:
-        InputError: nothing tells it.
+        InputError: the camera is unknown and can't be calibrated.
     """
     if camera is not None and camera.model == "equirectangular":
         if calibrate:
-            raise InputError(video.path, "is a 360 video, whose lens is no question", "Leave --calibrate out")
+            raise InputError(video.path, "is a 360 video, which has no lens to calibrate", "Remove --calibrate")
         return None
     if camera is not None and not calibrate:
         return None
-    written = focal_written(video) if camera is None else None
-    if written is not None and not calibrate:
-        return Found(plain(video.width, video.height, written[0]), EXIF, written[1])
-    recording = record()
-    start = plain(video.width, video.height, written[0]) if written else camera
-    known = None if start is None else calibrated(recording, start)
-    known = known or looked_for(recording)
-    if known is not None:
-        return Found.of(known, f"self-calibration over {len(recording.times)} frames")
+    from_metadata = metadata_focal(video) if camera is None else None
+    if from_metadata is not None and not calibrate:
+        focal, source = from_metadata
+        return EstimatedCamera(centred_pinhole(video.width, video.height, focal), EXIF_SIGMA, source)
+    log = record()
+    start = centred_pinhole(video.width, video.height, from_metadata[0]) if from_metadata else camera
+    estimate = None if start is None else calibrated(log, start)
+    estimate = estimate or calibrated_from_scratch(log)
+    if estimate is not None:
+        return EstimatedCamera.of(estimate, f"self-calibration over {len(log.times)} frames")
     if camera is None:
         raise InputError(
-            video.path, "nothing tells its focal length: no EXIF, and the camera turns too little to calibrate it",
-            "Give --focal (pixels), a part of the video that turns by 45 degrees or more, or a tile whose camera it is",
+            video.path, "focal length unknown: there is no EXIF, and the camera turns too little for self-calibration",
+            "Give --focal (pixels), a part of the video with a turn of 45 degrees or more, or the tile with its camera",
         )  # fmt: skip
     raise InputError(
-        video.path, "doesn't tell its lens: the camera turns too little",
-        "Leave --calibrate out, or give a part of the video that turns by 45 degrees or more",
+        video.path, "can't be calibrated: the camera turns too little",
+        "Remove --calibrate, or give a part of the video with a turn of 45 degrees or more",
     )  # fmt: skip
 
 
-def focal_written(video: Video) -> tuple[float, str] | None:
-    """Pixels, and where they are from: the first picture's EXIF, or the video's metadata; None where neither tells."""
+def metadata_focal(video: Video) -> tuple[float, str] | None:
+    """Focal length in pixels, and its source: EXIF of the first image, or the video's metadata; None if in neither."""
     if video.path.is_dir():
         equivalent, source = exif.focal_35mm(video.first), "EXIF"
     else:
         equivalent, source = video.focal_35mm, "the video's metadata"
     if equivalent is None:
         return None
-    return equivalent / DIAGONAL * math.hypot(video.width, video.height), source
+    return equivalent / FILM_DIAGONAL_MM * math.hypot(video.width, video.height), source

@@ -9,19 +9,19 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import U8
 from scan2sim.slam import weights as files
-from scan2sim.slam.features import Found, enlarged, reduced, unmasked
+from scan2sim.slam.features import FeatureSet, enlarged, reduced, unmasked
 from scan2sim.slam.features.superpoint import local_maxima, strongest
 
-THRESHOLD, RADIUS, TEMPERATURE = 0.2, 2, 0.1
-"""Least score, pixels between features, and how sharply a peak's place is averaged: as published."""
-STEP = 32
-"""Pictures are as many times this wide and high."""
+SCORE_MIN, SUPPRESSION_RADIUS_PX, SOFTMAX_TEMPERATURE = 0.2, 2, 0.1
+"""Least score, radius of non-maximum suppression, and temperature of the soft-argmax refinement, as published."""
+SIZE_MULTIPLE_PX = 32
+"""Images are padded to a multiple of this."""
 NEEDS = files.NEEDS
 HINT = "Give one of ALIKED's aliked-t16.pth, aliked-n16.pth, aliked-n16rot.pth, aliked-n32.pth"
 
 
 def _shapes(channels: tuple[int, int, int, int], positions: int) -> dict[str, files.Shape]:
-    """Of the tensors of a network of four blocks, with descriptors taken at so many positions."""
+    """Shapes of the tensors of a network of four blocks, whose descriptors are sampled at `positions` positions."""
     dim = channels[3]
     out: dict[str, files.Shape] = {}
     for block, (inner, outer) in enumerate(zip((3, *channels[:3]), channels, strict=True), 1):
@@ -79,33 +79,33 @@ class Aliked:
         self.weights, self.count, self.upsample = weights, count, upsample
         self.dimension = weights.model.shapes["desc_head.sf_conv.weight"][0]
 
-    def detect(self, picture: U8, mask: U8 | None = None) -> Found:
+    def detect(self, image: U8, mask: U8 | None = None) -> FeatureSet:
         """See `slam.features.Features`."""
         import torch
         from torch.nn.functional import pad
 
-        large, where = enlarged(picture, mask, self.upsample)
+        large, where = enlarged(image, mask, self.upsample)
         height, width = large.shape
         with torch.inference_mode():
             x = torch.from_numpy(np.ascontiguousarray(large)).to(self.weights.device)[None, None].float() / 255
-            x = pad(x, (0, -width % STEP, 0, -height % STEP), mode="replicate")
+            x = pad(x, (0, -width % SIZE_MULTIPLE_PX, 0, -height % SIZE_MULTIPLE_PX), mode="replicate")
             scores, maps = self._maps(x.expand(-1, 3, -1, -1))
             scores, maps = scores[:height, :width], maps[:, :height, :width]
-            peaks = local_maxima(scores, RADIUS, RADIUS)
+            peaks = local_maxima(scores, SUPPRESSION_RADIUS_PX, SUPPRESSION_RADIUS_PX)
             if where is not None:
                 peaks *= torch.from_numpy(where > 0).to(peaks.device)
-            uv, _ = strongest(peaks, THRESHOLD, self.count)
-            uv, best = _peaks(scores, uv)
-            found = self._describe(maps, uv)
-        uv, found, best = uv.cpu().numpy(), found.cpu().numpy(), best.cpu().numpy()
-        return unmasked(Found(reduced(uv, self.upsample), found, best), mask)
+            uv, _ = strongest(peaks, SCORE_MIN, self.count)
+            uv, best = _refined_peaks(scores, uv)
+            descriptors = self._describe(maps, uv)
+        uv, descriptors, best = uv.cpu().numpy(), descriptors.cpu().numpy(), best.cpu().numpy()
+        return unmasked(FeatureSet(reduced(uv, self.upsample), descriptors, best), mask)
 
     def describe(self) -> str:
         """See `slam.features.Features`."""
         return self.weights.describe()
 
     def _maps(self, x: Any) -> tuple[Any, Any]:
-        """(H, W) scores and (D, H, W) features of (1, 3, H, W)."""
+        """(H, W) scores and (D, H, W) feature maps of an image (1, 3, H, W)."""
         import torch
         from torch.nn.functional import avg_pool2d, conv2d, interpolate, normalize, selu
 
@@ -123,7 +123,7 @@ class Aliked:
         return scores[0, 0], normalize(maps, dim=1)[0]
 
     def _block(self, block: int, x: Any) -> Any:
-        """Two convolutions; from the second block on with a way past them, from the third on deformable."""
+        """Two convolutions; residual from the second block on, deformable from the third on."""
         from torch.nn.functional import batch_norm, conv2d, selu
 
         t, given = self.weights.tensors, x
@@ -145,7 +145,7 @@ class Aliked:
         return selu(x + conv2d(given, t[f"block{block}.downsample.weight"], t[f"block{block}.downsample.bias"]))
 
     def _describe(self, maps: Any, uv: Any) -> Any:
-        """(N, D) at pixels (N, 2): of what is seen at places around each, which its surroundings tell."""
+        """(N, D) descriptors at pixels (N, 2): sampled at positions around each, predicted from its 3 x 3 patch."""
         import torch
         from torch.nn.functional import conv2d, grid_sample, normalize, selu
 
@@ -153,14 +153,14 @@ class Aliked:
         dim, height, width = maps.shape
         if not len(uv):
             return maps.new_zeros(0, dim)
-        reach = max(height, width) / 4
+        max_shift = max(height, width) / 4
         steps = torch.arange(-1, 2, device=maps.device)
         u = uv[:, 0].long().clamp(1, width - 2)[:, None, None] + steps[None, None]
         v = uv[:, 1].long().clamp(1, height - 2)[:, None, None] + steps[None, :, None]
-        around = maps[:, v, u].permute(1, 0, 2, 3)  # (N, D, 3, 3)
-        shifts = selu(conv2d(around, t["desc_head.offset_conv.0.weight"], t["desc_head.offset_conv.0.bias"]))
+        patch = maps[:, v, u].permute(1, 0, 2, 3)  # (N, D, 3, 3)
+        shifts = selu(conv2d(patch, t["desc_head.offset_conv.0.weight"], t["desc_head.offset_conv.0.bias"]))
         shifts = conv2d(shifts, t["desc_head.offset_conv.2.weight"], t["desc_head.offset_conv.2.bias"])
-        shifts = shifts.clamp(-reach, reach).reshape(len(uv), 2, -1).transpose(1, 2)
+        shifts = shifts.clamp(-max_shift, max_shift).reshape(len(uv), 2, -1).transpose(1, 2)
         edge = torch.tensor([width - 1, height - 1], device=maps.device)
         at = (uv[:, None] + shifts) / edge * 2 - 1  # (N, M, 2)
         sampled = grid_sample(maps[None], at[None], mode="bilinear", align_corners=True)  # (1, D, N, M)
@@ -169,19 +169,19 @@ class Aliked:
 
 
 def deformed(x: Any, shifts: Any, kernel: Any) -> Any:
-    """A 3 x 3 convolution of (1, C, H, W) whose nine places are shifted, everywhere differently; zero outside.
+    """Deformable 3 x 3 convolution: each kernel tap is shifted individually at every pixel; zero outside the image.
 
     Args:
-        x: (1, C, H, W).
-        shifts: (1, 18, H, W) pixels down and right of each of the nine, row by row.
-        kernel: (D, C, 3, 3).
+        x: (1, C, H, W) input.
+        shifts: (1, 18, H, W) shift down and right of each of the nine taps, row by row, pixels.
+        kernel: (D, C, 3, 3) weights.
     """
     import torch
     from torch.nn.functional import conv2d, grid_sample
 
     height, width = x.shape[-2:]
-    reach = max(height, width) / 4
-    shifts = shifts.clamp(-reach, reach)
+    max_shift = max(height, width) / 4
+    shifts = shifts.clamp(-max_shift, max_shift)
     v, u = torch.meshgrid(
         torch.arange(height, device=x.device, dtype=x.dtype),
         torch.arange(width, device=x.device, dtype=x.dtype),
@@ -190,7 +190,7 @@ def deformed(x: Any, shifts: Any, kernel: Any) -> Any:
     out = x.new_zeros(1, len(kernel), height, width)
     for tap in range(9):
         down, right = tap // 3 - 1, tap % 3 - 1
-        # centres of pixels, unlike with align_corners, are told of a single row or column, too
+        # without align_corners, pixel centres are also defined for a single row or column
         at_u = (u + right + shifts[0, 2 * tap + 1] + 0.5) / width * 2 - 1
         at_v = (v + down + shifts[0, 2 * tap] + 0.5) / height * 2 - 1
         sampled = grid_sample(x, torch.stack([at_u, at_v], dim=-1)[None], mode="bilinear", align_corners=False)
@@ -198,17 +198,17 @@ def deformed(x: Any, shifts: Any, kernel: Any) -> Any:
     return out
 
 
-def _peaks(scores: Any, uv: Any) -> tuple[Any, Any]:
-    """Places (N, 2) between pixels of peaks at pixels (N, 2), and scores (N,) there."""
+def _refined_peaks(scores: Any, uv: Any) -> tuple[Any, Any]:
+    """(N, 2) subpixel positions of the peaks at pixels (N, 2), by soft-argmax, and (N,) their scores."""
     import torch
     from torch.nn.functional import grid_sample
 
     height, width = scores.shape
-    steps = torch.arange(-RADIUS, RADIUS + 1, device=uv.device)
+    steps = torch.arange(-SUPPRESSION_RADIUS_PX, SUPPRESSION_RADIUS_PX + 1, device=uv.device)
     u, v = uv[:, 0].long()[:, None, None] + steps[None, None], uv[:, 1].long()[:, None, None] + steps[None, :, None]
-    share = (scores[v, u].flatten(1) / TEMPERATURE).softmax(dim=1).reshape(-1, len(steps), len(steps))
-    moved = torch.stack([(share * steps).sum(dim=(1, 2)), (share * steps[:, None]).sum(dim=(1, 2))], dim=1)
-    uv = uv + moved
+    share = (scores[v, u].flatten(1) / SOFTMAX_TEMPERATURE).softmax(dim=1).reshape(-1, len(steps), len(steps))
+    shift = torch.stack([(share * steps).sum(dim=(1, 2)), (share * steps[:, None]).sum(dim=(1, 2))], dim=1)
+    uv = uv + shift
     at = uv / torch.tensor([width - 1, height - 1], device=uv.device) * 2 - 1
     best = grid_sample(scores[None, None], at[None, None], mode="bilinear", align_corners=True)
     return uv, best[0, 0, 0]

@@ -1,4 +1,4 @@
-"""SuperPoint (DeTone et al. 2018) with the user's superpoint_v1.pth, whose licence forbids commercial use."""
+"""SuperPoint (DeTone et al. 2018), with superpoint_v1.pth supplied by the user; its licence forbids commercial use."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import U8
 from scan2sim.slam import weights as files
-from scan2sim.slam.features import Found, enlarged, reduced, unmasked
+from scan2sim.slam.features import FeatureSet, enlarged, reduced, unmasked
 
-CELL = 8
-"""Pixels a side, of the squares that a row of the network's output is about."""
-SUPPRESS, THRESHOLD, BORDER = 4, 0.005, 4
-"""Pixels between features, least probability, pixels at the frame's edge without any: as published."""
+CELL_PX = 8
+"""Side of the square of pixels that one cell of the network's output covers."""
+SUPPRESSION_RADIUS_PX, PROBABILITY_MIN, BORDER_PX = 4, 0.005, 4
+"""Radius of non-maximum suppression, least probability, and border without features, as published."""
 NEEDS = files.NEEDS
 HINT = "Give Magic Leap's superpoint_v1.pth"
 _LAYERS = {
@@ -47,24 +47,24 @@ class SuperPoint:
     def __init__(self, weights: files.Weights, count: int, upsample: int) -> None:
         self.weights, self.count, self.upsample = weights, count, upsample
 
-    def detect(self, picture: U8, mask: U8 | None = None) -> Found:
+    def detect(self, image: U8, mask: U8 | None = None) -> FeatureSet:
         """See `slam.features.Features`."""
         import torch
 
-        large, where = enlarged(picture, mask, self.upsample)
-        height, width = (n // CELL * CELL for n in large.shape)  # up to 7 rows and columns aren't looked at
+        large, where = enlarged(image, mask, self.upsample)
+        height, width = (n // CELL_PX * CELL_PX for n in large.shape)  # ignores up to 7 rows and columns
         if not height or not width:
-            return Found(np.zeros((0, 2), np.float32), np.zeros((0, 256), np.float32), np.zeros(0, np.float32))
+            return FeatureSet(np.zeros((0, 2), np.float32), np.zeros((0, 256), np.float32), np.zeros(0, np.float32))
         with torch.inference_mode():
             grey = torch.from_numpy(np.ascontiguousarray(large[:height, :width])).to(self.weights.device)
             scores, coarse = self._maps(grey[None, None].float() / 255)
-            scores = local_maxima(scores, SUPPRESS, BORDER)
+            scores = local_maxima(scores, SUPPRESSION_RADIUS_PX, BORDER_PX)
             if where is not None:
                 scores *= torch.from_numpy(where[:height, :width] > 0).to(scores.device)
-            uv, best = strongest(scores, THRESHOLD, self.count)
-            found = self._describe(coarse, uv)
-        uv, found, best = uv.cpu().numpy(), found.cpu().numpy(), best.cpu().numpy()
-        return unmasked(Found(reduced(uv, self.upsample), found, best), mask)
+            uv, best = strongest(scores, PROBABILITY_MIN, self.count)
+            descriptors = self._describe(coarse, uv)
+        uv, descriptors, best = uv.cpu().numpy(), descriptors.cpu().numpy(), best.cpu().numpy()
+        return unmasked(FeatureSet(reduced(uv, self.upsample), descriptors, best), mask)
 
     def describe(self) -> str:
         """See `slam.features.Features`."""
@@ -77,34 +77,35 @@ class SuperPoint:
         return conv2d(x, weight, self.weights.tensors[f"{name}.bias"], padding=weight.shape[-1] // 2)
 
     def _maps(self, x: Any) -> tuple[Any, Any]:
-        """(H, W) probabilities and (256, H / 8, W / 8) descriptors of (1, 1, H, W)."""
+        """(H, W) probabilities and (256, H / 8, W / 8) descriptors of an image (1, 1, H, W)."""
         from torch.nn.functional import max_pool2d, normalize, pixel_shuffle
 
         for block in "1234":
             x = self._layer(f"conv{block}a", x).relu()
             x = self._layer(f"conv{block}b", x).relu()
             x = max_pool2d(x, 2) if block != "4" else x
-        where = self._layer("convPb", self._layer("convPa", x).relu()).softmax(dim=1)[:, :-1]  # the last: none
-        what = self._layer("convDb", self._layer("convDa", x).relu())
-        return pixel_shuffle(where, CELL)[0, 0], normalize(what, dim=1)[0]
+        # the last channel is "no feature in this cell"
+        probability = self._layer("convPb", self._layer("convPa", x).relu()).softmax(dim=1)[:, :-1]
+        descriptors = self._layer("convDb", self._layer("convDa", x).relu())
+        return pixel_shuffle(probability, CELL_PX)[0, 0], normalize(descriptors, dim=1)[0]
 
     def _describe(self, coarse: Any, uv: Any) -> Any:
-        """(N, 256) at pixels (N, 2)."""
+        """(N, 256) descriptors at pixels (N, 2), interpolated."""
         import torch
         from torch.nn.functional import grid_sample, normalize
 
         size = torch.tensor([coarse.shape[2], coarse.shape[1]], device=coarse.device)
-        # as the weights were trained: a cell's descriptor is at 3.5 of its 8 pixels, corners are aligned
-        at = (uv - (CELL - 1) / 2) / (size * CELL - (CELL + 1) / 2) * 2 - 1
+        # as in training: a cell's descriptor lies at 3.5 of its 8 pixels, with aligned corners
+        at = (uv - (CELL_PX - 1) / 2) / (size * CELL_PX - (CELL_PX + 1) / 2) * 2 - 1
         sampled = grid_sample(coarse[None], at[None, None], mode="bilinear", align_corners=True)
         return normalize(sampled[0, :, 0].T, dim=1)
 
 
 def local_maxima(scores: Any, radius: int, border: int) -> Any:
-    """(H, W) scores, 0 but at maxima within `radius` pixels and away from the border.
+    """Non-maximum suppression: (H, W) scores, 0 except at maxima within `radius` pixels, and in the border.
 
-    Twice, places are found that are largest of what isn't near those found before: so that a chain of ever larger
-    neighbours doesn't leave only its end.
+    Two more rounds add maxima among the pixels that aren't near a maximum found before, so that of a chain of
+    increasing neighbours more than its end remains.
     """
     from torch.nn.functional import max_pool2d
 
@@ -125,7 +126,7 @@ def local_maxima(scores: Any, radius: int, border: int) -> Any:
 
 
 def strongest(scores: Any, threshold: float, count: int) -> tuple[Any, Any]:
-    """Pixels (N, 2) and scores (N,) of the `count` largest of (H, W) above a threshold, largest first."""
+    """(N, 2) pixels and (N,) scores of the `count` largest scores (H, W) above a threshold, largest first."""
     import torch
 
     v, u = torch.nonzero(scores > threshold, as_tuple=True)

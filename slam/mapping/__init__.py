@@ -1,5 +1,5 @@
-"""The map: keyframes and points, the factor graph over them, loop closure and global adjustment.
+"""The map: keyframes and points, the factor graph over them, loop closure and global bundle adjustment.
 
-Begin with `local_map` (keyframes and the window that is optimised) and `factor_graph` (the problem; solvers are in
-`slam.solvers`).
+Start reading at `local_map` (keyframes and the optimized window) and `factor_graph` (the optimization problem; its
+solvers are in `slam.solvers`).
 """

@@ -1,4 +1,4 @@
-"""The graph: explicit 3D points, cameras, what each camera sees of them, and what else is known (D3.2, section 4.1)."""
+"""Factor graph of bundle adjustment: cameras, 3D points, observations and further constraints (D3.2, section 4.1)."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from scan2sim.pipeline.core.types import F64, I32, Bools
 
 
 @dataclass(frozen=True)
-class Chord:
-    """The distance of two cameras is known: from GPS, say.
+class DistanceConstraint:
+    """Relative distance constraint between two cameras, for example from GPS.
 
     Attributes:
-        first, second: cameras.
+        first, second: indices of the cameras.
         distance: metres.
-        sigma: metres.
+        sigma: standard deviation, metres.
     """
 
     first: int
@@ -29,14 +29,14 @@ class Chord:
 
 @dataclass(frozen=True)
 class Factor:
-    """A constraint of your own between cameras.
+    """User-defined constraint between cameras.
 
     Attributes:
-        cameras: which.
-        residual: of their poses (4, 4) each, camera to world, and `measured`, to a vector that should be zero, already
-            divided by its standard deviations. Written with operators and indexing alone, it serves arrays and
-            tensors alike.
-        measured: what it is given besides.
+        cameras: indices of the cameras.
+        residual: function of their poses, (4, 4) camera to world each, and `measured`; returns the residual vector
+            divided by its standard deviations. It must use operators and indexing only, so that it works with NumPy
+            arrays and torch tensors.
+        measured: last argument of `residual`.
     """
 
     cameras: tuple[int, ...]
@@ -46,22 +46,22 @@ class Factor:
 
 @dataclass(frozen=True)
 class Graph:
-    """What is to be solved.
+    """A bundle adjustment problem.
 
     Attributes:
         poses: (C, 4, 4) camera to world.
         points: (P, 3) world.
-        point_of, camera_of: (O,) what each observation sees, and which camera does; sorted by point.
-        bearing: (O, 3) unit, camera axes.
-        fixed: (C,) cameras that stay.
-        sigma: radians, of a bearing: errors much above it count little (Cauchy).
-        chords: known distances.
+        point_of, camera_of: (O,) point and camera of each observation; sorted by point.
+        bearing: (O, 3) unit vectors of the observations, camera axes.
+        fixed: (C,) whether a camera is fixed.
+        sigma: standard deviation of a bearing, radians; scale of the Cauchy loss.
+        distances: relative distance constraints.
         factors: other constraints.
-        bend: (O, S, 6) how a unit of each shared parameter moves (m) and turns (rad, about world axes) the camera of an
-            observation: rolling shutter, lens offset.
-        shared: (S,) the shared parameters.
-        shared_sigma: (S,) how far they may well be from what is believed.
-        believed: (S,) what that is; None: as they are.
+        shared_jacobian: (O, S, 6) translation (m) and rotation (rad, about world axes) of an observation's camera per
+            unit of each shared parameter: rolling shutter, lens offset.
+        shared: (S,) shared parameters.
+        shared_sigma: (S,) standard deviations of their prior.
+        shared_prior: (S,) mean of their prior; None: `shared`.
     """
 
     poses: F64
@@ -71,17 +71,17 @@ class Graph:
     bearing: F64
     fixed: Bools
     sigma: float
-    chords: tuple[Chord, ...] = ()
+    distances: tuple[DistanceConstraint, ...] = ()
     factors: tuple[Factor, ...] = ()
-    bend: F64 = field(default_factory=lambda: np.zeros((0, 0, 6)))
+    shared_jacobian: F64 = field(default_factory=lambda: np.zeros((0, 0, 6)))
     shared: F64 = field(default_factory=lambda: np.zeros(0))
     shared_sigma: F64 = field(default_factory=lambda: np.zeros(0))
-    believed: F64 | None = None
+    shared_prior: F64 | None = None
 
 
 @dataclass(frozen=True)
 class Solution:
-    """What came out: `poses` (C, 4, 4), `points` (P, 3), `shared` (S,)."""
+    """Solved variables of a graph: `poses` (C, 4, 4), `points` (P, 3), `shared` (S,)."""
 
     poses: F64
     points: F64
@@ -89,12 +89,12 @@ class Solution:
 
 
 def errors(graph: Graph, poses: F64, points: F64, shared: F64 | None = None) -> F64:
-    """(O,) radians between every observation and the direction of its point."""
+    """(O,) reprojection errors: angle between each observation and the direction of its point, radians."""
     R, t = poses[graph.camera_of, :3, :3], poses[graph.camera_of, :3, 3]
-    if graph.bend.shape[1] and shared is not None:
+    if graph.shared_jacobian.shape[1] and shared is not None:
         from scan2sim.slam.geometry import exp_so3
 
-        moved = np.einsum("osk,s->ok", graph.bend, shared)
+        moved = np.einsum("osk,s->ok", graph.shared_jacobian, shared)
         t = t + moved[:, :3]
         R = exp_so3(moved[:, 3:]) @ R
     seen = np.einsum("oji,oj->oi", R, points[graph.point_of] - t)

@@ -1,7 +1,7 @@
-"""Global adjustment: all keyframes and points at once, by pycolmap (Ceres), after odometry; reported apart from it.
+"""Global bundle adjustment of all keyframes and points after odometry, by pycolmap (Ceres).
 
-Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016; pycolmap knows equirectangular cameras. Features
-that neither odometry nor the adjustment has used (`cross_validation.py`) tell which of both paths is kept.
+Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016; pycolmap supports equirectangular cameras. The
+adjusted path is kept only if held-out features (`cross_validation.py`) fit it better than odometry's path.
 """
 
 from __future__ import annotations
@@ -14,95 +14,97 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.camera.models import project
-from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import F64, Trajectory
 from scan2sim.pipeline.geometry.similarity import umeyama
 from scan2sim.pipeline.io.colmap_writer import SparseMap
 from scan2sim.pipeline.io.colmap_writer import write as write_colmap
 from scan2sim.slam.geometry import angles
-from scan2sim.slam.mapping.cross_validation import judge, laid
+from scan2sim.slam.mapping.cross_validation import compare_paths, points_by_fixed_cameras
 from scan2sim.slam.mapping.factor_graph import Graph
-from scan2sim.slam.mapping.map_file import Mapped
-from scan2sim.slam.mapping.sparse_model import Kept, kept, move
+from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.mapping.sparse_model import SparsePoints, sparse_points, update_map
 
-LOSS = 3.0
-"""Times the median error, beyond which Cauchy's loss counts observations ever less: that loses little of what Gaussian
-errors tell."""
-WRONG = 2.0
-"""Observations off by more than so many times the odometry's gate are left out."""
-EDGE, POLE = 20.0, 0.9
-"""Pixels from a 360 frame's seam, and sine of the elevation, beyond which observations are left out."""
+LOSS_SCALE = 3.0
+"""Scale of the Cauchy loss, as a multiple of the median error: keeps most of the information of Gaussian errors."""
+OUTLIER_GATES = 2.0
+"""Multiple of the odometry's inlier gate beyond which observations are excluded."""
+SEAM_MARGIN_PX = 20.0
+"""Distance from a 360 frame's seam within which observations are excluded."""
+POLE_SINE_MAX = 0.9
+"""Sine of the elevation in a 360 frame beyond which observations are excluded."""
 
 
 @dataclass(frozen=True)
 class Adjusted:
-    """Where keyframes and points fit best.
+    """Result of the bundle adjustment.
 
     Attributes:
-        known: what odometry knew of the points.
+        known: odometry's points and observations.
         poses: (C, 4, 4) of the keyframes, camera to world.
-        xyz: (P, 3) the points.
-        before, after: pixels, mean error of all observations.
+        xyz: (P, 3) points.
+        before, after: mean reprojection error of all observations, pixels.
     """
 
-    known: Kept
+    known: SparsePoints
     poses: F64
     xyz: F64
     before: float
     after: float
 
 
-def adjust(mapped: Mapped) -> dict[str, Any]:
-    """Move the keyframes of an odometry that was told to `keep` to where all observations fit best; figures.
+def adjust(checkpoint: MapCheckpoint) -> dict[str, Any]:
+    """Bundle-adjust a map that was built with `keep`, in place; returns metrics.
 
-    Where witnesses fit the adjusted path no better, all stays where it was.
+    The map stays unchanged if the held-out features don't fit the adjusted path better.
 
     Raises:
         UnavailableError: pycolmap isn't installed.
     """
-    new = adjusted(mapped)
-    said = judge(mapped.map, np.stack([k.T_world_cam for k in mapped.map.keyframes]), new.poses)
-    if said.better:
-        move(mapped, new.known, new.poses, new.xyz)
+    new = bundle_adjust(checkpoint)
+    comparison = compare_paths(checkpoint.map, np.stack([k.T_world_cam for k in checkpoint.map.keyframes]), new.poses)
+    if comparison.second_is_better:
+        update_map(checkpoint, new.known, new.poses, new.xyz)
     return {
-        "adjustment_kept": said.better, "witnesses": said.witnesses, "witnesses_gain": round(said.gain, 4),
+        "adjustment_kept": comparison.second_is_better,
+        "witnesses": comparison.held_out, "witnesses_gain": round(comparison.gain, 4),
         "adjusted_keyframes": len(new.poses), "adjusted_points": len(new.xyz),
         "reprojection_before_px": round(new.before, 4), "reprojection_after_px": round(new.after, 4),
     }  # fmt: skip
 
 
-def adjusted(mapped: Mapped) -> Adjusted:
-    """The keyframes of an odometry that was told to `keep`, where all observations fit best.
+def bundle_adjust(checkpoint: MapCheckpoint) -> Adjusted:
+    """Keyframes and points with the least reprojection error, of a map that was built with `keep`.
 
-    The whole keeps its place, orientation and scale: those are the odometry's, or GPS's.
+    Position, orientation and scale of the whole map stay those of odometry, or GPS.
 
     Raises:
         UnavailableError: pycolmap isn't installed.
     """
-    need("--adjust", "pycolmap")
+    require("--adjust", "pycolmap")
     import pycolmap
 
-    keyframes = mapped.map.keyframes
+    keyframes = checkpoint.map.keyframes
     poses = np.stack([k.T_world_cam for k in keyframes])
-    known = kept(mapped)
-    camera = mapped.map.camera
-    still = np.ones(len(poses), bool)
-    graph = Graph(poses, known.xyz, known.point, known.keyframe, known.bearing, still, mapped.map.sigma)
-    xyz = laid(graph)  # cameras have moved since some points left the window
+    known = sparse_points(checkpoint)
+    camera = checkpoint.map.camera
+    all_fixed = np.ones(len(poses), bool)
+    graph = Graph(poses, known.xyz, known.point, known.keyframe, known.bearing, all_fixed, checkpoint.map.sigma)
+    xyz = points_by_fixed_cameras(graph)  # keyframes have moved since some points left the window
     known = replace(known, xyz=np.where(np.isfinite(xyz), xyz, known.xyz))
-    uv, inside = project(camera, known.bearing)
+    uv, use = project(camera, known.bearing)
     error = angles(poses[known.keyframe], known.xyz[known.point], known.bearing)
-    inside &= error < WRONG * mapped.map.gate
-    if (
-        camera.model == "equirectangular"
-    ):  # pycolmap measures in pixels, which jump at the seam and stretch at the poles
-        inside &= (np.abs(uv[:, 0] - camera.width / 2) < camera.width / 2 - EDGE) & (np.abs(known.bearing[:, 1]) < POLE)
-    seen = np.bincount(known.point[inside], minlength=len(known.xyz))
-    inside &= seen[known.point] > 1
-    if not inside.any():
+    use &= error < OUTLIER_GATES * checkpoint.map.gate
+    if camera.model == "equirectangular":
+        # pycolmap's residuals are in pixels, which jump at the seam and stretch at the poles
+        use &= np.abs(uv[:, 0] - camera.width / 2) < camera.width / 2 - SEAM_MARGIN_PX
+        use &= np.abs(known.bearing[:, 1]) < POLE_SINE_MAX
+    counts = np.bincount(known.point[use], minlength=len(known.xyz))
+    use &= counts[known.point] > 1
+    if not use.any():
         return Adjusted(known, poses, known.xyz, 0.0, 0.0)
     path = Trajectory(np.arange(len(poses), dtype=np.float64), poses[:, :3, 3], poses[:, :3, :3])
-    sparse = SparseMap(known.xyz, known.point[inside], known.keyframe[inside], uv[inside].astype(np.float64))
+    sparse = SparseMap(known.xyz, known.point[use], known.keyframe[use], uv[use].astype(np.float64))
     with tempfile.TemporaryDirectory(prefix="scan2sim-adjust-") as folder:
         write_colmap(Path(folder), path, camera, [f"{i:06d}" for i in range(len(poses))], sparse)
         model = pycolmap.Reconstruction(folder)
@@ -111,7 +113,7 @@ def adjusted(mapped: Mapped) -> Adjusted:
     options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = LOSS * float(np.median(error[inside])) / mapped.map.pixel
+    options.ceres.loss_function_scale = LOSS_SCALE * float(np.median(error[use])) / checkpoint.map.pixel
     options.ceres.solver_options.max_num_iterations = 50
     pycolmap.bundle_adjustment(model, options)
     model.update_point_3d_errors()

@@ -1,4 +1,4 @@
-"""The local map: keyframes, the points they see, and the window in which both are optimised (D3.2, section 4.1)."""
+"""Local map: keyframes, their points, and the sliding window in which both are optimized (D3.2, section 4.1)."""
 
 from __future__ import annotations
 
@@ -9,42 +9,45 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.core.parameters import Reach
+from scan2sim.pipeline.core.parameters import Distance
 from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.core.types import F64, I32, I64, Bools, Camera, GpsTrack
 from scan2sim.slam import solvers
-from scan2sim.slam.calibration.lens import misfit
+from scan2sim.slam.calibration.lens import lens_information
 from scan2sim.slam.geometry import angles, triangulate
 from scan2sim.slam.mapping import rolling_shutter as shared
-from scan2sim.slam.mapping.factor_graph import Chord, Graph, errors
+from scan2sim.slam.mapping.factor_graph import DistanceConstraint, Graph, errors
 from scan2sim.slam.mapping.marginalization import Information
 from scan2sim.slam.solvers import lm
 
-WITNESSES = 10
-"""Of so many features one never becomes a point where all is kept: a path is judged by them that they had no say in."""
+HELD_OUT_EVERY = 10
+"""With `keep`, one in this number of features is held out: it never becomes a point, and serves cross-validation."""
+GPS_DISTANCE_MIN_M = 20
+"""Shorter "long" GPS distances aren't used as constraints."""
 
 
 class MapParams(Params):
-    """How points come and go, and what is optimised; the mission's numbers where it gives any.
+    """Creation and rejection of points, and optimization; defaults are those of D3.2 where it gives any.
 
     Attributes:
-        window: keyframes that are optimised together (D3.2: 20).
-        anchors: older ones that stay and hold the window.
-        sigma: pixels, of a bearing.
+        window: number of keyframes optimized together (D3.2: 20).
+        anchors: number of fixed keyframes before the window.
+        sigma: standard deviation of a bearing, pixels.
         below: metres; points farther below the camera are rejected (D3.2: 10).
         beyond: metres; points farther away are rejected (D3.2: 500).
-        off: degrees; points whose median error is larger are rejected (D3.2: 0.7).
-        views: keyframes that must see a point (D3.2: 3).
-        gps_chords: distances by GPS within the window: "long" ones, "adjacent" ones (D3.2), or "none".
-        gps_sigma: metres, of a GPS distance.
-        rolling_shutter: estimate the readout time, one for all frames.
-        lens_offset: estimate how far the front and back lens of a 360 camera are apart.
+        off: degrees; points whose median reprojection error is larger are rejected (D3.2: 0.7).
+        views: number of keyframes that must observe a point (D3.2: 3).
+        gps_chords: relative distance constraints from GPS within the window: "long" ones, "adjacent" ones (D3.2), or
+            "none".
+        gps_sigma: standard deviation of a GPS distance, metres.
+        rolling_shutter: estimate the readout time, one value for all frames.
+        lens_offset: estimate the distance between the front and back lens of a 360 camera.
     """
 
     window: int = Field(20, ge=3, le=500)
     anchors: int = Field(5, ge=1, le=500)
     sigma: float = Field(0.5, ge=0.01, le=50)
-    below: Reach = 10.0
+    below: Distance = 10.0
     beyond: float = Field(500.0, ge=1, le=1_000_000)
     off: float = Field(0.7, ge=0.001, le=180)
     views: int = Field(3, ge=2, le=100)
@@ -56,15 +59,15 @@ class MapParams(Params):
 
 @dataclass
 class Keyframe:
-    """A frame of the graph.
+    """A keyframe.
 
     Attributes:
         time: seconds.
-        T_world_cam: (4, 4).
-        ids, bearing: (N,), (N, 3) the features it sees.
-        part: number of the map it belongs to.
-        velocity: (6,) metres and radians a second, in the camera's axes.
-        tied: whether it was placed by what the keyframes before it see; else it is where it is believed to be.
+        T_world_cam: (4, 4) camera to world.
+        ids, bearing: (N,) ids and (N, 3) unit bearings of the observed features.
+        part: index of the map it belongs to.
+        velocity: (6,) metres and radians per second, in the camera's axes.
+        tied: whether its pose was estimated relative to previous keyframes; otherwise it was dead-reckoned.
     """
 
     time: float
@@ -78,7 +81,7 @@ class Keyframe:
 
 @dataclass
 class Landmarks:
-    """Points that are known: `ids` (P,) ascending, `xyz` (P, 3)."""
+    """Map points: `ids` (P,) ascending, `xyz` (P, 3)."""
 
     ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
     xyz: F64 = field(default_factory=lambda: np.zeros((0, 3)))
@@ -87,41 +90,58 @@ class Landmarks:
         return len(self.ids)
 
     def find(self, ids: I64) -> tuple[I64, Bools]:
-        """(N,) rows of ids, and whether each is known."""
+        """(N,) rows of ids, and whether each id is a map point."""
         if not len(self.ids):
             return np.zeros(len(ids), np.int64), np.zeros(len(ids), bool)
         rows = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
         return rows, self.ids[rows] == ids
 
     def put(self, ids: I64, xyz: F64) -> None:
-        """Add, or replace."""
+        """Add points, or replace those of the same ids."""
         keep = ~np.isin(self.ids, ids)
         ids, xyz = np.concatenate([self.ids[keep], ids]), np.concatenate([self.xyz[keep], xyz])
         order = np.argsort(ids)
         self.ids, self.xyz = ids[order], xyz[order]
 
     def keep(self, mask: Bools) -> Landmarks:
-        """Drop all but those that `mask` (P,) selects; returns the dropped."""
-        gone = Landmarks(self.ids[~mask], self.xyz[~mask])
+        """Remove all points but those selected by `mask` (P,); returns the removed ones."""
+        removed = Landmarks(self.ids[~mask], self.xyz[~mask])
         self.ids, self.xyz = self.ids[mask], self.xyz[mask]
-        return gone
+        return removed
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Of some keyframes, sorted by id: `ids` (O,), `of` (O,) place of the keyframe among them, `bearing` (O, 3)."""
+    """Observations by some keyframes, sorted by id.
+
+    Attributes:
+        ids: (O,) features.
+        camera_of: (O,) index of the observing keyframe in the given list.
+        bearing: (O, 3) unit vectors, camera axes.
+    """
 
     ids: I64
-    of: I32
+    camera_of: I32
     bearing: F64
 
     def keep(self, mask: Bools) -> Observations:
-        """Those that `mask` (O,) selects."""
-        return Observations(self.ids[mask], self.of[mask], self.bearing[mask])
+        """Observations selected by `mask` (O,)."""
+        return Observations(self.ids[mask], self.camera_of[mask], self.bearing[mask])
 
 
 class LocalMap:
-    """Keyframes and landmarks; `part` counts the maps begun."""
+    """Keyframes and landmarks.
+
+    Attributes:
+        keyframes: all keyframes; without `keep`, older ones than the window have no observations.
+        landmarks: points observed in the window.
+        retired: marginalized points, which have left the window; only with `keep`.
+        part: index of the current map; a new map is started when tracking was lost.
+        information: information matrix of all keyframes' poses, from marginalized points.
+        misfits: information on the lens from windows that turn (`slam.calibration.lens.lens_information`).
+        pixel, sigma, gate: radians: a pixel, a bearing's standard deviation, and the inlier threshold.
+        names, shared: names and values of the shared parameters (`slam.mapping.rolling_shutter`).
+    """
 
     STATE = ("keyframes", "landmarks", "retired", "_others", "part", "shared", "misfits")
     PARTS = ("information",)
@@ -129,7 +149,7 @@ class LocalMap:
     def __init__(
         self, camera: Camera, params: MapParams, pixel: float, *, gps: GpsTrack | None, backend: str, keep: bool
     ) -> None:
-        """`pixel`: radians; `backend`: name of one of `slam.solvers`; `keep`: remember what has left the window."""
+        """`pixel`: radians; `backend`: a solver in `slam.solvers`; `keep`: keep points and observations of all time."""
         self.camera, self.params, self.gps, self.backend, self.keep = camera, params, gps, backend, keep
         self.pixel, self.sigma = pixel, params.sigma * pixel
         self.gate = 4 * self.sigma
@@ -137,207 +157,217 @@ class LocalMap:
         self.landmarks = Landmarks()
         self.retired: list[Landmarks] = []
         self.information = Information(params.window + params.anchors + 1)
-        self.misfits: list[F64] = []  # what windows that turn say of the lens
-        self._others = 0  # of those retired, how many are of earlier maps
+        self.misfits: list[F64] = []
+        self._others = 0  # number of entries in `retired` that belong to earlier maps
         self.part = 0
-        wanted = zip(shared.NAMES, shared.SIGMA, (params.rolling_shutter, params.lens_offset), strict=True)
-        chosen = [(name, sigma) for name, sigma, on in wanted if on]
+        available = zip(shared.NAMES, shared.SIGMA, (params.rolling_shutter, params.lens_offset), strict=True)
+        chosen = [(name, sigma) for name, sigma, enabled in available if enabled]
         self.names = tuple(name for name, _ in chosen)
         self.shared, self._shared_sigma = np.zeros(len(chosen)), np.array([sigma for _, sigma in chosen])
 
-    def begin(self, keyframe: Keyframe) -> None:
-        """A new map, of one keyframe."""
-        self.tell()
+    def start(self, keyframe: Keyframe) -> None:
+        """Start a new map with its first keyframe."""
+        self.marginalize()
         self._retire(self.landmarks)
         self.landmarks, self._others = Landmarks(), len(self.retired)
         self.keyframes.append(keyframe)
-        self._forget()
+        self._leave_window()
 
     def add(self, keyframe: Keyframe) -> I64:
-        """A keyframe more: new points, optimisation, rejections; ids of features that are no good."""
+        """Add a keyframe: triangulate new points, optimize, reject outliers; returns ids of features to drop."""
         self.keyframes.append(keyframe)
-        self._new_points()
-        self._optimise()
+        self._triangulate_new_points()
+        self._optimize()
         if self.camera.model != "equirectangular" and len(self.keyframes) % (self.params.window // 2) == 0:
             self._check_lens()
-        self._forget()
-        return self._reject()
+        self._leave_window()
+        return self._reject_outliers()
 
-    def see(self, ids: I64, bearing: F64) -> None:
-        """The newest keyframe sees features that have just been found, too."""
+    def add_observations(self, ids: I64, bearing: F64) -> None:
+        """Add newly detected features (N,), with bearings (N, 3), to the newest keyframe."""
         newest = self.keyframes[-1]
         fresh = ~np.isin(ids, newest.ids)
         newest.ids = np.concatenate([newest.ids, ids[fresh]])
         newest.bearing = np.concatenate([newest.bearing, bearing[fresh]])
 
     def rescale(self, factor: float) -> None:
-        """Enlarge this map about its first keyframe."""
-        mine = [k for k in self.keyframes if k.part == self.part]
-        centre = mine[0].T_world_cam[:3, 3].copy()
-        for keyframe in mine:
+        """Scale the current map about its first keyframe."""
+        current = [k for k in self.keyframes if k.part == self.part]
+        centre = current[0].T_world_cam[:3, 3].copy()
+        for keyframe in current:
             keyframe.T_world_cam = keyframe.T_world_cam.copy()
             keyframe.T_world_cam[:3, 3] = centre + factor * (keyframe.T_world_cam[:3, 3] - centre)
             keyframe.velocity = keyframe.velocity * np.repeat([factor, 1.0], 3)
         for points in (self.landmarks, *self.retired[self._others :]):
             points.xyz = centre + factor * (points.xyz - centre)
-        self.information.rescale(len(self.keyframes) - len(mine), factor)
+        self.information.rescale(len(self.keyframes) - len(current), factor)
 
-    def tell(self) -> None:
-        """Let all points that are known say what they do of the keyframes; twice is once."""
+    def marginalize(self) -> None:
+        """Add all current points' information on the keyframes to `information`; repeating it adds nothing."""
         if self.keyframes:
             part = self.keyframes[-1].part
             first = max(0, len(self.keyframes) - self.params.window - self.params.anchors - 1)
             for k in range(first, len(self.keyframes)):
                 if self.keyframes[k].part == part:
-                    self._tell(k)
+                    self._marginalize_points_of(k)
 
-    def _tell(self, first: int) -> None:
-        """Let the points that a keyframe sees say what they do of it and of those after it."""
+    def _marginalize_points_of(self, first: int) -> None:
+        """Add the information of the points that keyframe `first` observes, on it and the later ones."""
         which = list(range(first, len(self.keyframes)))
-        ids = self.information.untold(self.keyframes[first].ids, first)
+        ids = self.information.not_added(self.keyframes[first].ids, first)
         seen = self.observations(which)
         seen = seen.keep(np.isin(seen.ids, ids[self.landmarks.find(ids)[1]]))
         if not len(seen.ids):
             return
         xyz = self.landmarks.xyz[self.landmarks.find(seen.ids)[0]]
-        error = angles(self.poses(which)[seen.of], xyz, seen.bearing)
+        error = angles(self.poses(which)[seen.camera_of], xyz, seen.bearing)
         seen, error = seen.keep(error < self.gate), error[error < self.gate]
-        names, rows, counts = np.unique(seen.ids, return_inverse=True, return_counts=True)
+        point_ids, rows, counts = np.unique(seen.ids, return_inverse=True, return_counts=True)
         several = counts[rows] >= 2
-        seen, error, names = seen.keep(several), error[several], names[counts >= 2]
-        if len(names):
-            xyz = self.landmarks.xyz[self.landmarks.find(names)[0]]
-            graph = self.graph(which, seen, names, xyz, np.zeros(len(which), bool))
-            self.information.tell(which, names, lm.information(graph), error)
+        seen, error, point_ids = seen.keep(several), error[several], point_ids[counts >= 2]
+        if len(point_ids):
+            xyz = self.landmarks.xyz[self.landmarks.find(point_ids)[0]]
+            graph = self.graph(which, seen, point_ids, xyz, np.zeros(len(which), bool))
+            self.information.add(which, point_ids, lm.information(graph), error)
 
-    def _retire(self, gone: Landmarks) -> None:
-        if self.keep and len(gone):
-            self.retired.append(gone)
+    def _retire(self, removed: Landmarks) -> None:
+        if self.keep and len(removed):
+            self.retired.append(removed)
 
-    def _forget(self) -> None:
-        """What keyframes saw that have left the window, so that memory doesn't grow."""
+    def _leave_window(self) -> None:
+        """Marginalize the points of the keyframe that just left the window, and free its observations."""
         last = len(self.keyframes) - self.params.window - self.params.anchors - 1
         if last < 0:
             return
         if self.keyframes[last].part == self.part:
-            self._tell(last)
+            self._marginalize_points_of(last)
         if not self.keep:
             self.keyframes[last].ids, self.keyframes[last].bearing = np.zeros(0, np.int64), np.zeros((0, 3))
 
     def window(self) -> list[int]:
-        """Keyframes of this map that are optimised or hold those that are, oldest first."""
+        """Indices of the current map's keyframes that are optimized or fixed in the optimization, oldest first."""
         first = max(0, len(self.keyframes) - self.params.window - self.params.anchors)
         return [k for k in range(first, len(self.keyframes)) if self.keyframes[k].part == self.part]
 
     def poses(self, which: list[int]) -> F64:
-        """(C, 4, 4)."""
+        """(C, 4, 4) poses of keyframes, camera to world."""
         return np.stack([self.keyframes[k].T_world_cam for k in which])
 
     def observations(self, which: list[int]) -> Observations:
-        """What keyframes see."""
+        """All observations by keyframes."""
         ids = np.concatenate([self.keyframes[k].ids for k in which])
-        of = np.repeat(np.arange(len(which), dtype=np.int32), [len(self.keyframes[k].ids) for k in which])
+        camera_of = np.repeat(np.arange(len(which), dtype=np.int32), [len(self.keyframes[k].ids) for k in which])
         bearing = np.concatenate([self.keyframes[k].bearing for k in which])
-        order = np.lexsort((of, ids))
-        return Observations(ids[order], of[order], bearing[order])
+        order = np.lexsort((camera_of, ids))
+        return Observations(ids[order], camera_of[order], bearing[order])
 
     def graph(
-        self, which: list[int], seen: Observations, names: I64, xyz: F64, fixed: Bools, chords: tuple[Chord, ...] = ()
+        self,
+        which: list[int],
+        seen: Observations,
+        point_ids: I64,
+        xyz: F64,
+        fixed: Bools,
+        distances: tuple[DistanceConstraint, ...] = (),
     ) -> Graph:
-        """Keyframes `which`, points `names` (P,) ascending at (P, 3), and what is seen of them."""
+        """Factor graph of keyframes `which`, points `point_ids` (P,) ascending, at (P, 3), and their observations."""
         poses = self.poses(which)
         velocity = np.stack([self.keyframes[k].velocity for k in which])
+        point_of = np.searchsorted(point_ids, seen.ids).astype(np.int32)
         return Graph(
-            poses, xyz, np.searchsorted(names, seen.ids).astype(np.int32), seen.of, seen.bearing, fixed, self.sigma,
-            chords=chords, bend=self.bend(poses, velocity, seen.of, seen.bearing), shared=self.shared,
+            poses, xyz, point_of, seen.camera_of, seen.bearing, fixed, self.sigma, distances=distances,
+            shared_jacobian=self.shared_jacobian(poses, velocity, seen.camera_of, seen.bearing), shared=self.shared,
             shared_sigma=self._shared_sigma,
         )  # fmt: skip
 
-    def bend(self, poses: F64, velocity: F64, of: I32, bearing: F64) -> F64:
-        """See `slam.mapping.rolling_shutter.bend`."""
+    def shared_jacobian(self, poses: F64, velocity: F64, camera_of: I32, bearing: F64) -> F64:
+        """See `slam.mapping.rolling_shutter.shared_jacobian`."""
         if not self.names:
             return np.zeros((0, 0, 6))
-        return shared.bend(self.camera, self.names, poses, velocity, of, bearing)
+        return shared.shared_jacobian(self.camera, self.names, poses, velocity, camera_of, bearing)
 
-    def _new_points(self) -> None:
-        """Tracks that enough keyframes see, from directions that differ, become points."""
+    def _triangulate_new_points(self) -> None:
+        """Triangulate tracks that enough keyframes observe, with enough parallax."""
         window = self.window()
         seen = self.observations(window)
         seen = seen.keep(~self.landmarks.find(seen.ids)[1])
         if self.keep:
-            seen = seen.keep(seen.ids % WITNESSES > 0)
-        names, counts = np.unique(seen.ids, return_counts=True)
+            seen = seen.keep(seen.ids % HELD_OUT_EVERY > 0)
+        point_ids, counts = np.unique(seen.ids, return_counts=True)
         needed = min(len(window), self.params.views)
-        names = names[(counts >= needed) & np.isin(names, self.keyframes[-1].ids)]
-        seen = seen.keep(np.isin(seen.ids, names))
-        if not len(names):
+        point_ids = point_ids[(counts >= needed) & np.isin(point_ids, self.keyframes[-1].ids)]
+        seen = seen.keep(np.isin(seen.ids, point_ids))
+        if not len(point_ids):
             return
-        starts = np.append(np.searchsorted(seen.ids, names), len(seen.ids))
-        xyz, angle = triangulate(self.poses(window), starts, seen.of, seen.bearing)
+        starts = np.append(np.searchsorted(seen.ids, point_ids), len(seen.ids))
+        xyz, angle = triangulate(self.poses(window), starts, seen.camera_of, seen.bearing)
         good = np.isfinite(xyz[:, 0]) & (angle > 10 * self.sigma)
-        graph = self.graph(window, seen, names, xyz, np.zeros(len(window), bool))
+        graph = self.graph(window, seen, point_ids, xyz, np.zeros(len(window), bool))
         with np.errstate(invalid="ignore"):
             worst = np.maximum.reduceat(errors(graph, graph.poses, xyz, self.shared), starts[:-1])
-            good &= (worst < 1.5 * self.gate) & self._within(xyz)
-        self.landmarks.put(names[good], xyz[good])
+            good &= (worst < 1.5 * self.gate) & self._in_range(xyz)
+        self.landmarks.put(point_ids[good], xyz[good])
 
-    def _within(self, xyz: F64) -> Bools:
-        """(P,) not too far below the newest camera, nor too far away."""
+    def _in_range(self, xyz: F64) -> Bools:
+        """(P,) whether points are neither too far below the newest camera nor too far away."""
         newest = self.keyframes[-1].T_world_cam
         seen = xyz - newest[:3, 3]
         return (seen @ newest[:3, 1] < self.params.below) & (np.linalg.norm(seen, axis=1) < self.params.beyond)
 
-    def _optimise(self) -> None:
-        """The window's keyframes and points; the oldest hold still."""
+    def _optimize(self) -> None:
+        """Optimize the window's keyframes and points; the oldest keyframes are fixed."""
         window = self.window()
         seen = self.observations(window)
         seen = seen.keep(self.landmarks.find(seen.ids)[1])
-        names, counts = np.unique(seen.ids, return_counts=True)
-        names = names[counts >= 2]
-        seen = seen.keep(np.isin(seen.ids, names))
-        if not len(names):
+        point_ids, counts = np.unique(seen.ids, return_counts=True)
+        point_ids = point_ids[counts >= 2]
+        seen = seen.keep(np.isin(seen.ids, point_ids))
+        if not len(point_ids):
             return
         fixed = np.arange(len(window)) < max(1, len(window) - self.params.window)
-        chords = self._chords(window)
-        if fixed.sum() == 1 and not chords:  # nothing else holds the scale
+        distances = self._gps_constraints(window)
+        if fixed.sum() == 1 and not distances:  # nothing else fixes the scale
             start, end = self.poses(window[:2])[:, :3, 3]
             length = max(float(np.linalg.norm(end - start)), 1e-6)
-            chords = (Chord(0, 1, length, 1e-3 * length),)
-        xyz = self.landmarks.xyz[self.landmarks.find(names)[0]]
-        solved = solvers.named(self.backend).solve(self.graph(window, seen, names, xyz, fixed, chords))
+            distances = (DistanceConstraint(0, 1, length, 1e-3 * length),)
+        xyz = self.landmarks.xyz[self.landmarks.find(point_ids)[0]]
+        solved = solvers.named(self.backend).solve(self.graph(window, seen, point_ids, xyz, fixed, distances))
         for k, pose in zip(window, solved.poses, strict=True):
             self.keyframes[k].T_world_cam = pose
-        self.landmarks.put(names, solved.points)
+        self.landmarks.put(point_ids, solved.points)
         self.shared = solved.shared
 
     def _check_lens(self) -> None:
-        """Ask the window whether the lens fits."""
+        """Collect the window's information on the lens."""
         window = self.window()
         seen = self.observations(window)
         seen = seen.keep(self.landmarks.find(seen.ids)[1])
-        names, rows, counts = np.unique(seen.ids, return_inverse=True, return_counts=True)
-        names, seen = names[counts > 2], seen.keep(counts[rows] > 2)
-        if len(names) and len(window) > 2:
-            xyz = self.landmarks.xyz[self.landmarks.find(names)[0]]
-            says = misfit(self.camera, self.graph(window, seen, names, xyz, np.zeros(len(window), bool)))
-            self.misfits += [] if says is None else [says]
+        point_ids, rows, counts = np.unique(seen.ids, return_inverse=True, return_counts=True)
+        point_ids, seen = point_ids[counts > 2], seen.keep(counts[rows] > 2)
+        if len(point_ids) and len(window) > 2:
+            xyz = self.landmarks.xyz[self.landmarks.find(point_ids)[0]]
+            information = lens_information(
+                self.camera, self.graph(window, seen, point_ids, xyz, np.zeros(len(window), bool))
+            )
+            self.misfits += [] if information is None else [information]
 
-    def _chords(self, window: list[int]) -> tuple[Chord, ...]:
-        """GPS distances within the window."""
+    def _gps_constraints(self, window: list[int]) -> tuple[DistanceConstraint, ...]:
+        """Relative distance constraints from GPS within the window."""
         if self.gps is None or self.params.gps_chords == "none" or len(window) < 3:
             return ()
-        near = self.params.gps_chords == "adjacent"
+        adjacent = self.params.gps_chords == "adjacent"
         n = len(window)
-        pairs = [(i, i + 1) for i in range(n - 1)] if near else [(0, j) for j in range(n // 2, n)]
-        chords = []
+        pairs = [(i, i + 1) for i in range(n - 1)] if adjacent else [(0, j) for j in range(n // 2, n)]
+        constraints = []
         for i, j in pairs:
-            far = gps_distance(self.gps, self.keyframes[window[i]].time, self.keyframes[window[j]].time)
-            if far is not None and (near or far > 20):
-                chords.append(Chord(i, j, far, self.params.gps_sigma * math.sqrt(len(pairs))))
-        return tuple(chords)
+            metres = gps_distance(self.gps, self.keyframes[window[i]].time, self.keyframes[window[j]].time)
+            if metres is not None and (adjacent or metres > GPS_DISTANCE_MIN_M):
+                sigma = self.params.gps_sigma * math.sqrt(len(pairs))
+                constraints.append(DistanceConstraint(i, j, metres, sigma))
+        return tuple(constraints)
 
-    def _reject(self) -> I64:
-        """The mission's rejections; points that have left the window are retired."""
+    def _reject_outliers(self) -> I64:
+        """Remove points by the criteria of D3.2, and retire those that left the window; returns the removed ids."""
         window = self.window()
         seen = self.observations(window)
         rows, known = self.landmarks.find(seen.ids)
@@ -349,7 +379,7 @@ class LocalMap:
         middle = np.cumsum(counts) - counts + counts // 2
         median = np.full(len(xyz), np.inf)
         median[counts > 0] = error[np.lexsort((error, rows))][middle[counts > 0]]
-        bad = (median > min(math.radians(self.params.off), 2 * self.gate)) | ~self._within(xyz)
+        bad = (median > min(math.radians(self.params.off), 2 * self.gate)) | ~self._in_range(xyz)
         ids = self.landmarks.ids[bad & (counts > 0)]
         self._retire(self.landmarks.keep(counts > 0))
         self.landmarks.keep(~np.isin(self.landmarks.ids, ids))
@@ -357,11 +387,14 @@ class LocalMap:
 
 
 def gps_distance(gps: GpsTrack | None, start: float, end: float) -> float | None:
-    """Metres between two times, None where GPS doesn't say; a second before and after its fixes it is believed to."""
+    """Distance between the GPS positions at two times, metres; None if unknown.
+
+    The track is extrapolated by up to a second before its first and after its last fix.
+    """
     if gps is None:
         return None
     first, last = np.clip((start, end), gps.times[0], gps.times[-1])
     if last <= first or max(first - start, end - last) > 1.0:
         return None
-    far = float(gps.distance(first, last)) * (end - start) / (last - first)
-    return None if math.isnan(far) else far
+    metres = float(gps.distance(first, last)) * (end - start) / (last - first)
+    return None if math.isnan(metres) else metres

@@ -1,8 +1,9 @@
-"""Loops: places that were passed before are recognised, and the path is bent so that they coincide.
+"""Loop closure: recognizes places that were passed before, and corrects the path by pose graph optimization.
 
-A keyframe is remembered as a thumbnail of its horizon and its descriptors. Thumbnails are compared at all headings, so
-that a 360 camera knows a street that it drives back. What looks alike is then placed by descriptors against the old
-keyframes' points, and a pose graph spreads the difference over the path. For pure odometry, leave it off.
+Of each keyframe, a thumbnail of its horizon and its descriptors are indexed. Thumbnails are compared at all headings,
+so that a 360 camera recognizes a street that it drives in the opposite direction. Similar keyframes are relocalized by
+their descriptors, and a pose graph distributes the accumulated drift over the path. Leave it off to measure pure
+odometry.
 """
 
 from __future__ import annotations
@@ -11,116 +12,128 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64, U8
 from scan2sim.slam.geometry import exp_so3, inverse, log_so3
-from scan2sim.slam.mapping.map_file import Mapped
-from scan2sim.slam.mapping.sparse_model import kept, move
-from scan2sim.slam.odometry.relocalization import Remembered, Seen, describe, relocalise
-from scan2sim.slam.odometry.virtual_cameras import Facets
+from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.mapping.sparse_model import sparse_points, update_map
+from scan2sim.slam.odometry.relocalization import FrameFeatures, KeyframeFeatures, detect_features, relocalize
+from scan2sim.slam.odometry.virtual_cameras import VirtualViews
 
-THUMBNAIL = 64, 12
-APART = 60.0
-"""Metres driven between two passes of a place, at least."""
-NEAR = 25.0
-DRIFT = 0.05
-"""A place may have drifted by so many metres, plus so much of the way between."""
-ALIKE = 0.45
-"""Correlation of thumbnails from which on descriptors are compared."""
-EVERY = 2
-"""Keyframes are compared with every so manieth that was before."""
-ODOMETRY = (0.01, 2e-4)
-"""Standard deviation of a step between keyframes: of its length, and radians a metre."""
-LOOP = (0.1, 2e-3)
-"""Of a recognised place: metres and radians."""
+THUMBNAIL_PX = 64, 12
+"""Width and height."""
+LOOP_MIN_M = 60.0
+"""Least distance driven between two passes of a place."""
+DRIFT_MAX_M, DRIFT_MAX_SHARE = 25.0, 0.05
+"""Greatest drift between two passes: metres, plus a share of the distance driven."""
+CORRELATION_MIN = 0.45
+"""Least correlation of thumbnails to compare descriptors."""
+CANDIDATE_EVERY = 2
+"""Every Nth keyframe is a candidate for a loop."""
+ODOMETRY_SIGMA = (0.01, 2e-4)
+"""Standard deviation of the motion between keyframes: metres, and radians, each per square root of a metre driven."""
+LOOP_SIGMA = (0.1, 2e-3)
+"""Standard deviation of a relocalized pose: metres and radians."""
 
 
-class Places:
-    """Remembers keyframes."""
+class KeyframeIndex:
+    """Thumbnails and features of keyframes, for place recognition."""
 
-    def __init__(self, facets: Facets) -> None:
-        self.facets = facets
+    def __init__(self, views: VirtualViews) -> None:
+        self.views = views
         self.thumbnail: dict[int, F32] = {}
-        self.seen: dict[int, Seen] = {}
+        self.features: dict[int, FrameFeatures] = {}
 
-    def __call__(self, keyframe: int, pictures: list[U8]) -> None:
-        """The facets of a keyframe."""
-        self.thumbnail[keyframe] = thumbnail(pictures[0])
-        self.seen[keyframe] = describe(self.facets, pictures)
+    def add(self, keyframe: int, images: list[U8]) -> None:
+        """Index a keyframe by its virtual views."""
+        self.thumbnail[keyframe] = thumbnail(images[0])
+        self.features[keyframe] = detect_features(self.views, images)
 
 
-def thumbnail(picture: U8) -> F32:
-    """A small picture of mean 0 and length 1; of a panorama's band, its rows go once around."""
+def thumbnail(image: U8) -> F32:
+    """Thumbnail of mean 0 and norm 1; that of a 360 frame's horizon band covers one full turn."""
     import cv2
 
-    small = cv2.resize(picture, THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float32)
+    small = cv2.resize(image, THUMBNAIL_PX, interpolation=cv2.INTER_AREA).astype(np.float32)
     small -= cv2.GaussianBlur(small, (0, 0), 6)
     return (small / max(float(np.linalg.norm(small)), 1e-6)).astype(np.float32)
 
 
-def alike(a: F32, b: F32, *, around: bool) -> float:
-    """Correlation of two thumbnails, at the best heading where they go around."""
-    if not around:
+def thumbnail_correlation(a: F32, b: F32, *, panoramic: bool) -> float:
+    """Correlation of two thumbnails; of panoramic ones the maximum over all headings."""
+    if not panoramic:
         return float((a * b).sum())
     spectrum = np.fft.rfft(a, axis=1) * np.conj(np.fft.rfft(b, axis=1))
     return float(np.fft.irfft(spectrum.sum(axis=0), n=a.shape[1]).max())
 
 
-def close(mapped: Mapped, places: Places) -> dict[str, float]:
-    """Find loops and bend the keyframes' path; figures."""
-    keyframes = mapped.map.keyframes
+def correct_by_loops(checkpoint: MapCheckpoint, index: KeyframeIndex) -> dict[str, float]:
+    """Detect loops, and correct keyframes and points by pose graph optimization, in place; returns metrics."""
+    keyframes = checkpoint.map.keyframes
     poses = np.stack([k.T_world_cam for k in keyframes])
-    way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
-    loops = _find(mapped, places, poses, way)
+    travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
+    loops = _detect_loops(checkpoint, index, poses, travelled)
     if loops:
-        moved, known = pose_graph(poses, way, loops), kept(mapped)
-        first = np.zeros(len(known.xyz), np.int64)  # points go where the keyframe goes that saw them first
+        moved, known = optimize_pose_graph(poses, travelled, loops), sparse_points(checkpoint)
+        first = np.zeros(len(known.xyz), np.int64)  # points move with the keyframe that observed them first
         first[known.point[::-1]] = known.keyframe[::-1]
         change = (moved @ inverse(poses))[first]
         xyz = np.einsum("pij,pj->pi", change[:, :3, :3], known.xyz) + change[:, :3, 3]
-        move(mapped, known, moved, xyz)
+        update_map(checkpoint, known, moved, xyz)
     return {"loops": len(loops)}
 
 
-def _find(mapped: Mapped, places: Places, poses: F64, way: F64) -> list[tuple[int, int, F64]]:
-    """(earlier keyframe, later keyframe, pose (4, 4) of the later in the earlier's axes)."""
+def _detect_loops(
+    checkpoint: MapCheckpoint, index: KeyframeIndex, poses: F64, travelled: F64
+) -> list[tuple[int, int, F64]]:
+    """Loops: (earlier keyframe, later keyframe, pose (4, 4) of the later in the earlier's axes)."""
     rng = np.random.default_rng(0)
-    around = not places.facets.whole
+    panoramic = not index.views.single
     last = -10
-    found = []
-    for k in sorted(places.seen):
+    loops = []
+    for k in sorted(index.features):
         if k - last < 3:  # one loop in three keyframes is enough
             continue
-        before = [
+        candidates = [
             j
-            for j in list(places.seen)[::EVERY]
-            if way[k] - way[j] > APART
-            and np.linalg.norm(poses[k, :3, 3] - poses[j, :3, 3]) < NEAR + DRIFT * (way[k] - way[j])
-            and j + 2 in places.seen
+            for j in list(index.features)[::CANDIDATE_EVERY]
+            if travelled[k] - travelled[j] > LOOP_MIN_M
+            and np.linalg.norm(poses[k, :3, 3] - poses[j, :3, 3])
+            < DRIFT_MAX_M + DRIFT_MAX_SHARE * (travelled[k] - travelled[j])
+            and j + 2 in index.features
         ]
-        scores = [alike(places.thumbnail[k], places.thumbnail[j], around=around) for j in before]
-        for at in np.argsort(scores)[::-1][:2]:
-            j = before[at]
-            if scores[at] < ALIKE:
+        scores = [
+            thumbnail_correlation(index.thumbnail[k], index.thumbnail[j], panoramic=panoramic) for j in candidates
+        ]
+        for best in np.argsort(scores)[::-1][:2]:
+            j = candidates[best]
+            if scores[best] < CORRELATION_MIN:
                 break
-            pair = [Remembered(places.seen[i], poses[i]) for i in (j, j + 2)]
-            placed = relocalise(places.seen[k], pair[0], pair[1], sigma=mapped.map.sigma, rng=rng)
-            if placed is not None:
-                found.append((j, k, inverse(poses[j]) @ placed))
+            pair = [KeyframeFeatures(index.features[i], poses[i]) for i in (j, j + 2)]
+            pose = relocalize(index.features[k], pair[0], pair[1], sigma=checkpoint.map.sigma, rng=rng)
+            if pose is not None:
+                loops.append((j, k, inverse(poses[j]) @ pose))
                 last = k
                 break
-    return found
+    return loops
 
 
-def pose_graph(poses: F64, way: F64, loops: list[tuple[int, int, F64]], rounds: int = 10) -> F64:
-    """(C, 4, 4) poses that fit steps between neighbours and loops; the first stays."""
+def optimize_pose_graph(poses: F64, travelled: F64, loops: list[tuple[int, int, F64]], rounds: int = 10) -> F64:
+    """(C, 4, 4) poses that best fit the motions between neighbours and the loops; the first pose is fixed.
+
+    Args:
+        poses: (C, 4, 4) camera to world.
+        travelled: (C,) metres driven.
+        loops: (earlier pose, later pose, pose (4, 4) of the later in the earlier's axes).
+        rounds: maximum number of Gauss-Newton iterations.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve
 
     n = len(poses)
-    steps = np.maximum(np.diff(way), 0.1)
+    lengths = np.maximum(np.diff(travelled), 0.1)
     first = np.concatenate([np.arange(n - 1), [a for a, _, _ in loops]]).astype(int)
     second = np.concatenate([np.arange(1, n), [b for _, b, _ in loops]]).astype(int)
     measured = np.concatenate([inverse(poses[:-1]) @ poses[1:], np.array([T for _, _, T in loops]).reshape(-1, 4, 4)])
-    sigma_t = np.concatenate([ODOMETRY[0] * np.sqrt(steps), np.full(len(loops), LOOP[0])])
-    sigma_r = np.concatenate([ODOMETRY[1] * np.sqrt(steps), np.full(len(loops), LOOP[1])])
+    sigma_t = np.concatenate([ODOMETRY_SIGMA[0] * np.sqrt(lengths), np.full(len(loops), LOOP_SIGMA[0])])
+    sigma_r = np.concatenate([ODOMETRY_SIGMA[1] * np.sqrt(lengths), np.full(len(loops), LOOP_SIGMA[1])])
     is_loop = np.arange(len(first)) >= n - 1
     poses = poses.copy()
     for _ in range(rounds):
@@ -130,7 +143,7 @@ def pose_graph(poses: F64, way: F64, loops: list[tuple[int, int, F64]], rounds: 
         r_t = (RiT @ between[:, :, None])[:, :, 0] - measured[:, :3, 3]
         r_r = log_so3(measured[:, :3, :3].transpose(0, 2, 1) @ RiT @ Rj)
         residual = np.concatenate([r_t / sigma_t[:, None], r_r / sigma_r[:, None]], axis=1)
-        weight = np.where(is_loop, 1 / (1 + (residual**2).sum(axis=1) / 1e4), 1.0)  # false loops count little
+        weight = np.where(is_loop, 1 / (1 + (residual**2).sum(axis=1) / 1e4), 1.0)  # down-weights false loops
         J_i, J_j = np.zeros((len(first), 6, 6)), np.zeros((len(first), 6, 6))
         J_i[:, :3, :3], J_j[:, :3, :3] = -RiT, RiT
         J_i[:, :3, 3:] = RiT @ _cross(between)
@@ -152,7 +165,7 @@ def pose_graph(poses: F64, way: F64, loops: list[tuple[int, int, F64]], rounds: 
 
 
 def _cross(v: F64) -> F64:
-    """(N, 3, 3) matrices that multiply w (3,) to v x w."""
+    """(N, 3, 3) cross-product matrices of vectors v (N, 3): [v] w = v x w."""
     out = np.zeros((len(v), 3, 3))
     out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
     return out - out.transpose(0, 2, 1)

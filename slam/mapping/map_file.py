@@ -1,4 +1,4 @@
-"""Mapped: what odometry leaves to the steps after it, kept in a file: where frames are, and the map."""
+"""Map checkpoint: frame poses and the map of a video, the file that odometry passes to the following steps."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from typing import Any, Self
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Camera, Frame, GpsTrack
 from scan2sim.slam.mapping.local_map import Keyframe, Landmarks, LocalMap, MapParams
-from scan2sim.slam.odometry.checkpoint import WrongState, load, save
+from scan2sim.slam.odometry.checkpoint import InvalidCheckpoint, load, save
 from scan2sim.slam.odometry.odometry import Odometry, Placed
-from scan2sim.slam.odometry.virtual_cameras import Facets
+from scan2sim.slam.odometry.virtual_cameras import VirtualViews
 
 VALUES = (Camera, Frame, GpsTrack, Keyframe, Landmarks, Placed)
-"""What the file consists of, besides arrays and numbers."""
+"""Types that occur in the file. Their names and fields, and all names in `STATE`, are keys of the file format."""
 
 
-class Mapped:
-    """Frames and map of a video.
+class MapCheckpoint:
+    """Frame poses and map of a video.
 
     Attributes:
-        names: of the frames.
-        placed: where each is, by its keyframe.
-        camera: of the frames.
-        gps: the track in the frames' times, smoothed, or None.
-        map: keyframes and points; what has left the window too, where odometry was told to keep it.
+        names: names of the frames.
+        placed: poses of the frames, relative to keyframes.
+        camera: camera of the frames.
+        gps: smoothed GPS track in the frames' times, or None.
+        map: keyframes and points; with `keep`, also those that have left the window.
     """
 
     STATE = ("names", "placed", "camera", "gps", "_params", "_solver")
@@ -42,13 +42,13 @@ class Mapped:
 
     @cached_property
     def map(self) -> LocalMap:
-        """Empty at first: its camera and parameters are read before it."""
-        params = MapParams.model_validate(self._params)
-        return LocalMap(self.camera, params, Facets(self.camera).pixel, gps=self.gps, backend=self._solver, keep=True)
+        """The map; created empty by its first use, which must follow the restoring of camera and parameters."""
+        params, pixel = MapParams.model_validate(self._params), VirtualViews(self.camera).pixel
+        return LocalMap(self.camera, params, pixel, gps=self.gps, backend=self._solver, keep=True)
 
     @classmethod
     def of(cls, odometry: Odometry, names: Sequence[str]) -> Self:
-        """What an odometry has come to."""
+        """Checkpoint of an odometry's result; `names`: names of the frames."""
         new = cls()
         new.names, new.placed, new.camera, new.gps = list(names), odometry.placed, odometry.map.camera, odometry.gps
         new._params = {name: getattr(odometry.params, name) for name in MapParams.model_fields}
@@ -58,23 +58,23 @@ class Mapped:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """What `write` wrote.
+        """Read a file written by `write`.
 
         Raises:
-            InputError: it is something else.
+            InputError: the file isn't a map checkpoint, or is damaged.
         """
         new = cls()
         try:
             load(path, new, VALUES)
-        except WrongState as error:
-            raise InputError(path, f"is no map of a video ({error})", "Track the video again") from error
+        except InvalidCheckpoint as error:
+            raise InputError(path, f"isn't a valid map checkpoint ({error})", "Track the video again") from error
         return new
 
     def write(self, path: Path) -> Path:
-        """Into one file; returns it."""
+        """Write the checkpoint to one file; returns its path."""
         save(path, self, VALUES)
         return path
 
     def pose_of(self, placed: Placed) -> F64:
-        """(4, 4) camera to world, as the map knows it now."""
+        """(4, 4) camera to world, by the current pose of its keyframe."""
         return self.map.keyframes[placed.keyframe].T_world_cam @ placed.T_key_cam

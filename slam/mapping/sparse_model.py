@@ -1,4 +1,4 @@
-"""The sparse map: all points that odometry kept, and which keyframes saw them where, for COLMAP and for adjustment."""
+"""Sparse model: all points and observations kept by odometry, for the COLMAP model and global adjustment."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from scan2sim.pipeline.camera.models import project
 from scan2sim.pipeline.core.types import F64, I32, I64, Trajectory
 from scan2sim.pipeline.io.colmap_writer import SparseMap
 from scan2sim.slam.mapping.local_map import Landmarks
-from scan2sim.slam.mapping.map_file import Mapped
-from scan2sim.slam.trajectory.align import Placing
+from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.trajectory.align import Alignment
 
 
 @dataclass(frozen=True)
-class Kept:
-    """What odometry knows of points.
+class SparsePoints:
+    """Points and observations in odometry's world.
 
     Attributes:
-        ids: (P,) ascending.
-        xyz: (P, 3) in odometry's world.
-        point, keyframe: (O,) what is seen, and from where, by point.
-        bearing: (O, 3) in which direction.
+        ids: (P,) ids of the points, ascending.
+        xyz: (P, 3) points.
+        point, keyframe: (O,) point and keyframe of each observation, sorted by point.
+        bearing: (O, 3) unit vectors of the observations, camera axes.
     """
 
     ids: I64
@@ -32,44 +32,44 @@ class Kept:
     bearing: F64
 
 
-def kept(mapped: Mapped) -> Kept:
-    """What odometry, told to `keep`, knows of points: those that two keyframes or more see."""
-    known = mapped.map
-    ids = np.concatenate([known.landmarks.ids, *(gone.ids for gone in known.retired)])
-    xyz = np.concatenate([known.landmarks.xyz, *(gone.xyz for gone in known.retired)])
+def sparse_points(checkpoint: MapCheckpoint) -> SparsePoints:
+    """All points that at least two keyframes observe, of a map that was built with `keep`."""
+    local_map = checkpoint.map
+    ids = np.concatenate([local_map.landmarks.ids, *(points.ids for points in local_map.retired)])
+    xyz = np.concatenate([local_map.landmarks.xyz, *(points.xyz for points in local_map.retired)])
     ids, first = np.unique(ids, return_index=True)
-    seen = known.observations(list(range(len(known.keyframes))))
+    seen = local_map.observations(list(range(len(local_map.keyframes))))
     rows = np.minimum(np.searchsorted(ids, seen.ids), len(ids) - 1)
-    real = ids[rows] == seen.ids
-    real &= np.bincount(rows[real], minlength=len(ids))[rows] > 1
-    rows = rows[real]
+    valid = ids[rows] == seen.ids
+    valid &= np.bincount(rows[valid], minlength=len(ids))[rows] > 1
+    rows = rows[valid]
     used = np.unique(rows)
-    return Kept(
+    return SparsePoints(
         ids[used],
         xyz[first][used],
         np.searchsorted(used, rows).astype(np.int32),
-        seen.of[real].astype(np.int32),
-        seen.bearing[real],
+        seen.camera_of[valid].astype(np.int32),
+        seen.bearing[valid],
     )
 
 
-def move(mapped: Mapped, known: Kept, poses: F64, xyz: F64) -> None:
-    """Put keyframes and the points of `known` elsewhere: (C, 4, 4), (P, 3)."""
-    for keyframe, pose in zip(mapped.map.keyframes, poses, strict=True):
+def update_map(checkpoint: MapCheckpoint, known: SparsePoints, poses: F64, xyz: F64) -> None:
+    """Replace the poses (C, 4, 4) of all keyframes, and the positions (P, 3) of the points `known`."""
+    for keyframe, pose in zip(checkpoint.map.keyframes, poses, strict=True):
         keyframe.T_world_cam = pose
-    alive = np.isin(known.ids, mapped.map.landmarks.ids)
-    mapped.map.landmarks = Landmarks(known.ids[alive], xyz[alive])
-    mapped.map.retired = [Landmarks(known.ids[~alive], xyz[~alive])]
+    alive = np.isin(known.ids, checkpoint.map.landmarks.ids)
+    checkpoint.map.landmarks = Landmarks(known.ids[alive], xyz[alive])
+    checkpoint.map.retired = [Landmarks(known.ids[~alive], xyz[~alive])]
 
 
-def sparse_map(mapped: Mapped, placing: Placing, trajectory: Trajectory) -> SparseMap:
-    """The points in the trajectory's coordinates, seen from its poses."""
-    known = kept(mapped)
-    frame_of = np.searchsorted(trajectory.times, [k.time for k in mapped.map.keyframes])
-    uv, inside = project(mapped.map.camera, known.bearing)
+def sparse_map(checkpoint: MapCheckpoint, alignment: Alignment, trajectory: Trajectory) -> SparseMap:
+    """Points and observations in the coordinates of the finished trajectory."""
+    known = sparse_points(checkpoint)
+    frame_of = np.searchsorted(trajectory.times, [k.time for k in checkpoint.map.keyframes])
+    uv, inside = project(checkpoint.map.camera, known.bearing)
     frame = frame_of[known.keyframe]
     at: I64 = np.zeros(len(known.xyz), np.int64)
     at[known.point[::-1]] = frame[::-1]
-    before = np.stack([mapped.pose_of(p)[:3, 3] for p in mapped.placed])
-    points = placing.points(known.xyz, at, before, trajectory)
+    before = np.stack([checkpoint.pose_of(p)[:3, 3] for p in checkpoint.placed])
+    points = alignment.points(known.xyz, at, before, trajectory)
     return SparseMap(points, known.point[inside], frame[inside].astype(np.int32), uv[inside].astype(np.float64))

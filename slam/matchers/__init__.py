@@ -1,4 +1,4 @@
-"""Matchers of features between two images: one file for each backend, found by its name (`pipeline.core.plugins`)."""
+"""Feature matchers. Each backend is a module in this package, loaded by its name (`pipeline.core.plugins`)."""
 
 from __future__ import annotations
 
@@ -11,61 +11,61 @@ import numpy as np
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.types import I64
-from scan2sim.slam.features import Features, Found
+from scan2sim.slam.features import Features, FeatureSet
 from scan2sim.slam.weights import Weights
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 
 class Matcher(Protocol):
-    """A backend that is loaded.
+    """Interface of a matcher.
 
     Attributes:
-        name: of the backend.
-        takes: names of the features that it was made for; None: of any.
-        dimension: of descriptors that it takes; None: any.
+        name: name of the backend.
+        takes: name of the feature backend that it was trained for; None: any.
+        dimension: dimension of the descriptors that it was trained for; None: any.
     """
 
     name: str
     takes: str | None
     dimension: int | None
 
-    def match(self, a: Found, b: Found, sizes: Sizes) -> I64:
-        """(M, 2) rows of a and of b that are the same, each at most once.
+    def match(self, a: FeatureSet, b: FeatureSet, sizes: Sizes) -> I64:
+        """(M, 2) rows in a and b of matching features, each row at most once.
 
         Args:
-            a, b: features of two pictures.
-            sizes: (width, height) of either.
+            a, b: features of two images.
+            sizes: (width, height) of both images.
         """
 
     def describe(self) -> str:
-        """What this is, for logs: with the hash and licence of weights."""
+        """Description for logs, with hash and licence of the weights."""
 
 
-class ByNetwork(ABC):
-    """What matchers by networks share: pairs are each other's most probable, and probable enough.
+class NetworkMatcher(ABC):
+    """Base class of neural matchers: matches are mutual maxima of the match probability, above a threshold.
 
     Attributes:
-        least: probability of a match, as published.
+        probability_min: least probability of a match, as published.
     """
 
-    least: float
+    probability_min: float
 
     def __init__(self, weights: Weights) -> None:
         self.weights = weights
 
     @abstractmethod
-    def shares(self, a: Found, b: Found, sizes: Sizes) -> Any:
-        """(N, M) probabilities of matches, a tensor."""
+    def probabilities(self, a: FeatureSet, b: FeatureSet, sizes: Sizes) -> Any:
+        """Tensor (N, M) of match probabilities."""
 
-    def match(self, a: Found, b: Found, sizes: Sizes) -> I64:
+    def match(self, a: FeatureSet, b: FeatureSet, sizes: Sizes) -> I64:
         """See `Matcher`."""
         import torch
 
         if not len(a.uv) or not len(b.uv):
             return np.zeros((0, 2), np.int64)
         with torch.inference_mode():
-            return mutual(self.shares(a, b, sizes), self.least)
+            return mutual(self.probabilities(a, b, sizes), self.probability_min)
 
     def describe(self) -> str:
         """See `Matcher`."""
@@ -73,23 +73,23 @@ class ByNetwork(ABC):
 
 
 class Backend(Protocol):
-    """What a backend's module has."""
+    """Interface of a backend's module."""
 
     def load(self, weights: Path | None, device: str) -> Matcher:
         """See `named`."""
 
 
 def named(name: str, weights: Path | None = None, *, device: str = "auto") -> Matcher:
-    """A backend.
+    """Load the matcher backend of a name.
 
     Args:
-        name: of its file here.
-        weights: the user's file, for networks.
-        device: of torch, for networks.
+        name: name of the backend's module in this package.
+        weights: the user's weights file, for networks.
+        device: torch device, for networks.
 
     Raises:
-        SettingError: there is no such backend, or it wants weights, or none.
-        UnavailableError: it can't run here.
+        SettingError: there is no such backend, or weights are missing, or given to a backend without any.
+        UnavailableError: a package that it needs isn't installed.
         InputError: the weights are damaged, of another network, or unsafe to read.
     """
     backend: Backend = plugins.find(__name__, name, "track.matcher")
@@ -98,22 +98,22 @@ def named(name: str, weights: Path | None = None, *, device: str = "auto") -> Ma
 
 def check(features: Features, matcher: Matcher) -> None:
     """Raise SettingError unless a matcher can match these features."""
-    named_so = matcher.takes in (None, features.name)
-    if not named_so or matcher.dimension not in (None, features.dimension):
-        made_for = f"{matcher.takes or 'features'} of {matcher.dimension} numbers"
+    name_fits = matcher.takes in (None, features.name)
+    if not name_fits or matcher.dimension not in (None, features.dimension):
+        expected = f"{matcher.takes or 'descriptors'} of {matcher.dimension} numbers"
         given = f"{features.name} of {features.dimension} {'bytes' if features.binary else 'numbers'}"
         raise SettingError(
-            "track.matcher", f"{matcher.name!r} was made for {made_for}, not for {given}",
-            "Choose others, or `nearest`, which takes any",
+            "track.matcher", f"{matcher.name!r} was made for {expected}, not for {given}",
+            "Choose another matcher or other features; the matcher `nearest` takes any",
         )  # fmt: skip
 
 
-def mutual(scores: Any, least: float) -> I64:
-    """(M, 2) rows and columns of a tensor (N, M) that are each other's largest, and above `least`."""
+def mutual(scores: Any, score_min: float) -> I64:
+    """(M, 2) rows and columns of a score tensor (N, M) that are mutual maxima and above `score_min`."""
     import torch
 
-    best, there = scores.max(dim=1)
-    back = scores.argmax(dim=0)
-    rows = torch.arange(len(there), device=scores.device)
-    good = (back[there] == rows) & (best > least)
-    return np.asarray(torch.stack([rows[good], there[good]], dim=1).cpu().numpy(), np.int64)
+    best, column_of = scores.max(dim=1)
+    row_of = scores.argmax(dim=0)
+    rows = torch.arange(len(column_of), device=scores.device)
+    good = (row_of[column_of] == rows) & (best > score_min)
+    return np.asarray(torch.stack([rows[good], column_of[good]], dim=1).cpu().numpy(), np.int64)

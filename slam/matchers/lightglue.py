@@ -1,6 +1,7 @@
-"""LightGlue (Lindenberger et al. 2023) with the user's superpoint_lightglue.pth or aliked_lightglue.pth.
+"""LightGlue (Lindenberger et al. 2023), with superpoint_lightglue.pth or aliked_lightglue.pth supplied by the user.
 
-All layers are run for all features: stopping early saves time where pictures are alike, but changes what is matched.
+All layers are run for all features, without early stopping and pruning: these save time on similar images, but change
+the matches.
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from scan2sim.slam import weights as files
-from scan2sim.slam.features import Found
-from scan2sim.slam.matchers import ByNetwork, Sizes
+from scan2sim.slam.features import FeatureSet
+from scan2sim.slam.matchers import NetworkMatcher, Sizes
 
 LAYERS, HEADS, DIM = 9, 4, 256
-THRESHOLD = 0.1
-"""Least probability of a match: as published."""
+PROBABILITY_MIN = 0.1
+"""Least probability of a match, as published."""
 NEEDS = files.NEEDS
 HINT = "Give LightGlue's superpoint_lightglue.pth or aliked_lightglue.pth"
 
@@ -49,7 +50,7 @@ def _model(features: str, dimension: int, published: dict[str, str], licence: st
         licence,
         published,
         optional=r"confidence_thresholds|token_confidence\..*|log_assignment\..*",
-        renames=((r"^(self_attn|cross_attn)\.(\d+)\.", r"transformers.\2.\1."),),  # as the published files name them
+        renames=((r"^(self_attn|cross_attn)\.(\d+)\.", r"transformers.\2.\1."),),  # the published files' names
     )
 
 
@@ -72,33 +73,33 @@ def load(weights: Path | None, device: str) -> LightGlue:
     return LightGlue(files.load(weights, [_SUPERPOINT, _ALIKED], hint=HINT, device=device))
 
 
-class LightGlue(ByNetwork):
+class LightGlue(NetworkMatcher):
     """See `slam.matchers.Matcher`."""
 
-    name, least = "lightglue", THRESHOLD
+    name, probability_min = "lightglue", PROBABILITY_MIN
 
     def __init__(self, weights: files.Weights) -> None:
         super().__init__(weights)
         self.takes, self.dimension = ("aliked", 128) if "input_proj.weight" in weights.tensors else ("superpoint", DIM)
 
-    def shares(self, a: Found, b: Found, sizes: Sizes) -> Any:
-        """See `slam.matchers.ByNetwork`."""
+    def probabilities(self, a: FeatureSet, b: FeatureSet, sizes: Sizes) -> Any:
+        """See `slam.matchers.NetworkMatcher`."""
         from torch.nn.functional import logsigmoid
 
-        (xa, turn_a), (xb, turn_b) = self._encoded(a, sizes[0]), self._encoded(b, sizes[1])
+        (xa, encoding_a), (xb, encoding_b) = self._encoded(a, sizes[0]), self._encoded(b, sizes[1])
         for i in range(LAYERS):
-            xa, xb = self._own(i, xa, turn_a), self._own(i, xb, turn_b)
-            xa, xb = self._across(i, xa, xb)
+            xa, xb = self._self_attention(i, xa, encoding_a), self._self_attention(i, xb, encoding_b)
+            xa, xb = self._cross_attention(i, xa, xb)
         last = f"log_assignment.{LAYERS - 1}"
         scores = self._linear(f"{last}.final_proj", xa) @ self._linear(f"{last}.final_proj", xb).T / math.sqrt(DIM)
-        shares = scores.log_softmax(dim=1) + scores.log_softmax(dim=0)
-        for x, across in ((xa, False), (xb, True)):
-            sure = logsigmoid(self._linear(f"{last}.matchability", x))
-            shares = shares + (sure.T if across else sure)
-        return shares.exp()
+        log_probability = scores.log_softmax(dim=1) + scores.log_softmax(dim=0)
+        for x, of_columns in ((xa, False), (xb, True)):
+            matchability = logsigmoid(self._linear(f"{last}.matchability", x))
+            log_probability = log_probability + (matchability.T if of_columns else matchability)
+        return log_probability.exp()
 
-    def _encoded(self, found: Found, size: tuple[int, int]) -> tuple[Any, Any]:
-        """(N, D) descriptors, and how places turn them: cosines and sines (2, N, D / HEADS)."""
+    def _encoded(self, found: FeatureSet, size: tuple[int, int]) -> tuple[Any, Any]:
+        """(N, D) descriptors, and their rotary positional encoding: cosines and sines (2, N, D / HEADS)."""
         import torch
 
         half = np.array(size, np.float32) / 2
@@ -115,7 +116,7 @@ class LightGlue(ByNetwork):
         return linear(x, self.weights.tensors[f"{name}.weight"], self.weights.tensors[f"{name}.bias"])
 
     def _updated(self, name: str, x: Any, message: Any) -> Any:
-        """Features (N, D) after a message (N, D)."""
+        """Features (N, D) updated by an attention message (N, D)."""
         import torch
         from torch.nn.functional import gelu, layer_norm
 
@@ -124,17 +125,17 @@ class LightGlue(ByNetwork):
         inner = layer_norm(inner, inner.shape[1:], t[f"{name}.ffn.1.weight"], t[f"{name}.ffn.1.bias"])
         return x + self._linear(f"{name}.ffn.3", gelu(inner))
 
-    def _own(self, i: int, x: Any, turn: Any) -> Any:
-        """After self-attention, within the picture."""
+    def _self_attention(self, i: int, x: Any, encoding: Any) -> Any:
+        """Features (N, D) after self-attention, within the image."""
         from torch.nn.functional import scaled_dot_product_attention
 
         name = f"transformers.{i}.self_attn"
         query, key, value = self._linear(f"{name}.Wqkv", x).reshape(len(x), HEADS, -1, 3).permute(3, 1, 0, 2)
-        message = scaled_dot_product_attention(_turned(query, turn), _turned(key, turn), value)
+        message = scaled_dot_product_attention(_rotated(query, encoding), _rotated(key, encoding), value)
         return self._updated(name, x, self._linear(f"{name}.out_proj", message.transpose(0, 1).reshape(len(x), DIM)))
 
-    def _across(self, i: int, xa: Any, xb: Any) -> tuple[Any, Any]:
-        """After cross-attention, to the other picture."""
+    def _cross_attention(self, i: int, xa: Any, xb: Any) -> tuple[Any, Any]:
+        """Features of both images after cross-attention to the other image."""
         from torch.nn.functional import scaled_dot_product_attention
 
         name = f"transformers.{i}.cross_attn"
@@ -143,17 +144,17 @@ class LightGlue(ByNetwork):
             for part in ("to_qk", "to_v")
         )
         out = []
-        for x, mine, other in ((xa, 0, 1), (xb, 1, 0)):
-            message = scaled_dot_product_attention(keys[mine], keys[other], values[other])
+        for x, own, other in ((xa, 0, 1), (xb, 1, 0)):
+            message = scaled_dot_product_attention(keys[own], keys[other], values[other])
             out.append(
                 self._updated(name, x, self._linear(f"{name}.to_out", message.transpose(0, 1).reshape(len(x), DIM)))
             )
         return out[0], out[1]
 
 
-def _turned(x: Any, turn: Any) -> Any:
-    """(HEADS, N, K), each pair of numbers turned by the angle of its place."""
+def _rotated(x: Any, encoding: Any) -> Any:
+    """(HEADS, N, K) rotary encoding: each pair of numbers is rotated by the angle of its position."""
     import torch
 
     even, odd = x[..., ::2], x[..., 1::2]
-    return x * turn[0] + torch.stack([-odd, even], dim=-1).flatten(-2) * turn[1]
+    return x * encoding[0] + torch.stack([-odd, even], dim=-1).flatten(-2) * encoding[1]

@@ -1,6 +1,6 @@
-"""SuperGlue (Sarlin et al. 2020) with the user's superglue_outdoor.pth or superglue_indoor.pth, for SuperPoint.
+"""SuperGlue (Sarlin et al. 2020) for SuperPoint, with superglue_outdoor.pth or superglue_indoor.pth from the user.
 
-Their licence forbids commercial use.
+The licence of these weights forbids commercial use.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from scan2sim.slam import weights as files
-from scan2sim.slam.features import Found
-from scan2sim.slam.matchers import ByNetwork, Sizes
+from scan2sim.slam.features import FeatureSet
+from scan2sim.slam.matchers import NetworkMatcher, Sizes
 
 LAYERS, HEADS, DIM = 18, 4, 256
-"""Layers attend in turn within a picture and across."""
-ROUNDS, THRESHOLD = 100, 0.2
-"""Of Sinkhorn's normalisation, and least probability of a match: as published."""
+"""Even layers are self-attention, odd layers cross-attention."""
+SINKHORN_ITERATIONS, PROBABILITY_MIN = 100, 0.2
+"""Iterations of the Sinkhorn normalization, and least probability of a match, as published."""
 NEEDS = files.NEEDS
 HINT = "Give Magic Leap's superglue_outdoor.pth (or superglue_indoor.pth)"
 
@@ -29,7 +29,7 @@ def _layer(name: str, inner: int, outer: int) -> dict[str, files.Shape]:
 
 
 def _layers(name: str, widths: tuple[int, ...]) -> dict[str, files.Shape]:
-    """Of layers with a normalisation (and a gate, which has no weights) between them."""
+    """Shapes of linear layers with batch normalization (and a ReLU, which has no weights) between them."""
     out: dict[str, files.Shape] = {}
     for i, (inner, outer) in enumerate(pairwise(widths)):
         out |= _layer(f"{name}.{3 * i}", inner, outer)
@@ -63,35 +63,35 @@ def load(weights: Path | None, device: str) -> SuperGlue:
     return SuperGlue(files.load(weights, [MODEL], hint=HINT, device=device))
 
 
-class SuperGlue(ByNetwork):
+class SuperGlue(NetworkMatcher):
     """See `slam.matchers.Matcher`."""
 
-    name, takes, dimension, least = "superglue", "superpoint", DIM, THRESHOLD
+    name, takes, dimension, probability_min = "superglue", "superpoint", DIM, PROBABILITY_MIN
 
-    def shares(self, a: Found, b: Found, sizes: Sizes) -> Any:
-        """See `slam.matchers.ByNetwork`."""
+    def probabilities(self, a: FeatureSet, b: FeatureSet, sizes: Sizes) -> Any:
+        """See `slam.matchers.NetworkMatcher`."""
         xa, xb = self._encoded(a, sizes[0]), self._encoded(b, sizes[1])
         for i in range(LAYERS):
-            seen = (xb, xa) if i % 2 else (xa, xb)
-            xa, xb = xa + self._attend(i, xa, seen[0]), xb + self._attend(i, xb, seen[1])
+            sources = (xb, xa) if i % 2 else (xa, xb)
+            xa, xb = xa + self._attend(i, xa, sources[0]), xb + self._attend(i, xb, sources[1])
         scores = self._layer("final_proj", xa).T @ self._layer("final_proj", xb) / math.sqrt(DIM)
-        return transported(scores, self.weights.tensors["bin_score"], ROUNDS)[:-1, :-1]
+        return sinkhorn(scores, self.weights.tensors["bin_score"], SINKHORN_ITERATIONS)[:-1, :-1]
 
-    def _encoded(self, found: Found, size: tuple[int, int]) -> Any:
-        """(D, N) descriptors that know where in the picture they are, and how sure."""
+    def _encoded(self, found: FeatureSet, size: tuple[int, int]) -> Any:
+        """(D, N) descriptors plus the encoding of their positions and scores."""
         import torch
 
         half = np.array(size, np.float32) / 2
         at = torch.from_numpy((found.uv - half) / (1.4 * half.max())).to(self.weights.device)
-        what, sure = (torch.from_numpy(x).to(self.weights.device) for x in (found.descriptors, found.scores))
-        return what.T + self._stack("kenc.encoder", 5, torch.cat([at, sure[:, None]], dim=1).T)
+        descriptors, scores = (torch.from_numpy(x).to(self.weights.device) for x in (found.descriptors, found.scores))
+        return descriptors.T + self._stack("kenc.encoder", 5, torch.cat([at, scores[:, None]], dim=1).T)
 
     def _layer(self, name: str, x: Any) -> Any:
         t = self.weights.tensors
         return t[f"{name}.weight"][..., 0] @ x + t[f"{name}.bias"][:, None]
 
     def _stack(self, name: str, count: int, x: Any) -> Any:
-        """Layers, normalised and gated between."""
+        """Linear layers with batch normalization and ReLU between them."""
         from torch.nn.functional import batch_norm
 
         t = self.weights.tensors
@@ -104,7 +104,7 @@ class SuperGlue(ByNetwork):
         return x
 
     def _attend(self, i: int, x: Any, source: Any) -> Any:
-        """(D, N) attention of features x to features `source`."""
+        """(D, N) message to features x from features `source`, by attention."""
         import torch
         from torch.nn.functional import scaled_dot_product_attention
 
@@ -117,17 +117,23 @@ class SuperGlue(ByNetwork):
         return self._stack(f"gnn.layers.{i}.mlp", 2, torch.cat([x, self._layer(f"{name}.merge", message)]))
 
 
-def transported(scores: Any, nowhere: Any, rounds: int) -> Any:
-    """(N + 1, M + 1) probabilities of scores (N, M) by Sinkhorn's normalisation; the last row and column: no match."""
+def sinkhorn(scores: Any, no_match: Any, iterations: int) -> Any:
+    """(N + 1, M + 1) probabilities from scores (N, M), by Sinkhorn normalization; last row and column: no match.
+
+    Args:
+        scores: (N, M) tensor.
+        no_match: score of "no match", a tensor of one number.
+        iterations: number of row and column normalizations.
+    """
     import torch
 
     n, m = scores.shape
-    full = nowhere.expand(n + 1, m + 1).clone()
+    full = no_match.expand(n + 1, m + 1).clone()
     full[:n, :m] = scores
     rows, columns = full.new_zeros(n + 1), full.new_zeros(m + 1)
     rows[n], columns[m] = math.log(m), math.log(n)
     u, v = torch.zeros_like(rows), torch.zeros_like(columns)
-    for _ in range(rounds):
+    for _ in range(iterations):
         u = rows - torch.logsumexp(full + v, dim=1)
         v = columns - torch.logsumexp(full + u[:, None], dim=0)
     return (full + u[:, None] + v).exp()

@@ -1,5 +1,5 @@
-"""Visual odometry: frames to poses, one after the other (D3.2, section 4.1).
+"""Visual odometry: estimates the camera pose of each video frame in turn (D3.2, section 4.1).
 
-Begin with `odometry` (what happens to a frame); `video_odometry` runs it over a video with checkpoints,
-`virtual_cameras` cuts 360-degree frames into pinhole views, `relocalization` finds the pose after a loss of tracking.
+Start reading at `odometry` (what happens to one frame). `video_odometry` runs it over a video with checkpoints,
+`virtual_cameras` cuts 360-degree frames into virtual views, `relocalization` finds the pose after tracking was lost.
 """

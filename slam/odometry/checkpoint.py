@@ -1,7 +1,7 @@
-"""What an interrupted run goes on from, in a file of numbers and JSON: nothing that it holds is run when it is read.
+"""Checkpoints: the state of an object tree in one .npz file of arrays and JSON; reading it never executes code.
 
-Objects that change name what of them does (`STATE`), and which parts of theirs have a state of their own (`PARTS`): it
-is read back into objects that were made anew, of the same camera, parameters and weights.
+A class names the attributes that are saved (`STATE`), and the attributes that are objects with a `STATE` of their own
+(`PARTS`). A checkpoint is loaded into a newly constructed object of the same camera, parameters and weights.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from typing import Any
 import numpy as np
 
 
-class WrongState(ValueError):
-    """A file that holds no such state."""
+class InvalidCheckpoint(ValueError):
+    """A checkpoint file is damaged, or holds the state of another class."""
 
 
 def save(path: Path, root: Any, values: Sequence[type]) -> None:
-    """Write an object's state; the file is whole or not there.
+    """Write the state of `root` atomically: an interrupted write leaves no partial file at `path`.
 
     Args:
-        values: dataclasses and named tuples that the state may consist of, besides arrays and what JSON knows.
+        values: dataclasses and named tuples that may occur in the state, besides arrays and JSON types.
 
     Raises:
-        TypeError: it consists of something else.
-        OSError: it can't be written.
+        TypeError: the state contains any other type.
+        OSError: the file can't be written.
     """
     data = bytearray()
     tree = json.dumps(_state(root, values, data))
@@ -39,11 +39,11 @@ def save(path: Path, root: Any, values: Sequence[type]) -> None:
 
 
 def load(path: Path, root: Any, values: Sequence[type]) -> None:
-    """Give an object the state that a file holds.
+    """Restore the state of `root` from a file.
 
     Raises:
-        WrongState: it is damaged, or of another object; this one is of no use then.
-        OSError: it can't be read.
+        InvalidCheckpoint: the file is damaged, or of another class; discard `root` then, it may be partly restored.
+        OSError: the file can't be read.
     """
     known = {kind.__name__: kind for kind in values}
     try:
@@ -51,13 +51,13 @@ def load(path: Path, root: Any, values: Sequence[type]) -> None:
             tree, data = json.loads(file["tree"].tobytes()), file["data"].tobytes()
         _restore(root, tree, known, data)
     except (ValueError, KeyError, TypeError, AttributeError, EOFError, RecursionError, zipfile.BadZipFile) as error:
-        raise WrongState(f"{type(error).__name__}: {error}") from error
+        raise InvalidCheckpoint(f"{type(error).__name__}: {error}") from error
 
 
 def _state(part: Any, values: Sequence[type], data: bytearray) -> dict[str, Any]:
     tree = {name: _encoded(getattr(part, name), values, data) for name in part.STATE}
-    below = {name: getattr(part, name) for name in getattr(part, "PARTS", ())}
-    return tree | {name: _state(value, values, data) for name, value in below.items() if hasattr(value, "STATE")}
+    children = {name: getattr(part, name) for name in getattr(part, "PARTS", ())}
+    return tree | {name: _state(value, values, data) for name, value in children.items() if hasattr(value, "STATE")}
 
 
 def _restore(part: Any, tree: dict[str, Any], known: dict[str, type], data: bytes) -> None:
@@ -69,7 +69,7 @@ def _restore(part: Any, tree: dict[str, Any], known: dict[str, type], data: byte
 
 
 def _encoded(value: Any, values: Sequence[type], data: bytearray) -> Any:
-    """JSON of a value; what an array holds is appended to `data`."""
+    """A value as JSON; the contents of arrays are appended to `data`."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, np.generic):
@@ -87,11 +87,11 @@ def _encoded(value: Any, values: Sequence[type], data: bytearray) -> Any:
     if type(value) in (list, tuple):
         tree = [_encoded(one, values, data) for one in value]
         return tree if isinstance(value, list) else {"tuple": tree}
-    raise TypeError(f"{type(value).__name__} is no part of a state")
+    raise TypeError(f"{type(value).__name__} can't be saved in a checkpoint")
 
 
 def _decoded(tree: Any, known: dict[str, type], data: bytes) -> Any:
-    """The value of its JSON."""
+    """Inverse of `_encoded`."""
     if isinstance(tree, list):
         return [_decoded(one, known, data) for one in tree]
     if not isinstance(tree, dict):

@@ -1,8 +1,8 @@
-"""Exposure: how much brighter one picture is than another, by what both show; pictures made alike for Lucas-Kanade.
+"""Exposure compensation: gain and offset between two images, applied before Lucas-Kanade optical flow.
 
-Lucas-Kanade takes a place for the same where grey values are the same. Cameras change their exposure: a gain and an
-offset (Jin, Favaro and Soatto 2001) are solved between every two frames from the values about the features themselves,
-so that what comes into view doesn't count as light.
+Lucas-Kanade assumes brightness constancy, but cameras change their exposure. A gain and an offset (Jin, Favaro and
+Soatto 2001) are estimated between consecutive frames from the grey values around common features, so that objects that
+enter the view don't bias them.
 """
 
 from __future__ import annotations
@@ -13,89 +13,90 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64, U8, Bools
 
-ENOUGH = 30
-"""Features from which both numbers can be told."""
-AROUND = 17
-"""Pixels, of the square about a feature whose mean is taken: Lucas-Kanade's larger one."""
-SURROUNDINGS = 31
-"""Pixels, of the square about a pixel whose mean is taken from it: well over Lucas-Kanade's smaller one."""
-STEADY = 0.05
-"""Gains nearer to 1 than this, and changes of the mean below it, aren't told from none: where the exposure is held,
-what comes nearer looks otherwise by some 2 % (one standard deviation; two real streets and a rendered one), which
-isn't light. What is followed is aligned with its first look afterwards, whatever the light (`patches.py`): on three
-real streets, little depends on this number."""
-DARKEST = 50.0
-"""A picture whose values spread so many times less shows nothing."""
-OFF = 2.5 * 1.4826
-"""Times the median residual beyond which a feature isn't believed."""
+FEATURES_MIN = 30
+"""Common features needed to estimate gain and offset."""
+FEATURE_WINDOW_PX = 17
+"""Side of the square around a feature whose mean grey value is compared: the larger Lucas-Kanade window."""
+LOCAL_MEAN_WINDOW_PX = 31
+"""Side of the square whose mean is subtracted from its central pixel: well over the smaller Lucas-Kanade window."""
+CHANGE_MIN = 0.05
+"""Relative change of gain or mean below which the exposure counts as constant. At constant exposure, the appearance of
+approaching objects changes by some 2 % (one standard deviation, on two real streets and a rendered one). Tracks are
+afterwards aligned with their first template whatever the exposure (`patch_alignment.py`): on three real streets, the
+result depends little on this value."""
+GAIN_MIN = 1 / 50.0
+"""Gain below which the second image is considered blank."""
+OUTLIER_RESIDUAL = 2.5 * 1.4826
+"""Multiple of the median residual beyond which a feature is rejected."""
 
 
 class Exposure(NamedTuple):
-    """A second picture's grey values are `gain` x those of the first, plus `offset`."""
+    """Exposure change: grey values of the second image are `gain` x those of the first, plus `offset`."""
 
     gain: float = 1.0
     offset: float = 0.0
 
-    def alike(self, first: U8, second: U8) -> tuple[U8, U8]:
-        """Both, the darker made as bright as the other."""
+    def equalize(self, first: U8, second: U8) -> tuple[U8, U8]:
+        """Both images (H, W) at the same exposure; the darker one is brightened."""
         if self.gain < 1:
-            return first, _lit(second, 1 / self.gain, -self.offset / self.gain)
-        return _lit(first, self.gain, self.offset), second
+            return first, _apply(second, 1 / self.gain, -self.offset / self.gain)
+        return _apply(first, self.gain, self.offset), second
 
 
-def level(picture: U8) -> U8:
-    """By how much each value is above the mean about it, plus 128: how bright the picture is doesn't count any more.
+def subtract_local_mean(image: U8) -> U8:
+    """Difference of each pixel from its local mean, plus 128: removes what is left of an exposure change.
 
-    Lucas-Kanade shifts a feature by what its square is brighter or darker by, and by as much back: unnoticed.
+    Without this, Lucas-Kanade shifts a feature in proportion to the brightness change of its window, and by as much
+    back, so that the forward-backward check doesn't detect it.
     """
     import cv2
 
-    mean = cv2.blur(picture, (SURROUNDINGS, SURROUNDINGS))
-    return np.asarray(cv2.addWeighted(picture, 1.0, mean, -1.0, 128.0), np.uint8)
+    mean = cv2.blur(image, (LOCAL_MEAN_WINDOW_PX, LOCAL_MEAN_WINDOW_PX))
+    return np.asarray(cv2.addWeighted(image, 1.0, mean, -1.0, 128.0), np.uint8)
 
 
-def _lit(picture: U8, gain: float, offset: float) -> U8:
+def _apply(image: U8, gain: float, offset: float) -> U8:
     import cv2
 
     table = np.clip(np.round(gain * np.arange(256) + offset), 0, 255).astype(np.uint8)
-    return picture if (gain, offset) == (1, 0) else np.asarray(cv2.LUT(picture, table), np.uint8)
+    return image if (gain, offset) == (1, 0) else np.asarray(cv2.LUT(image, table), np.uint8)
 
 
-def between(first: U8, second: U8, there: F32, now: F32) -> Exposure:
-    """The exposure of a second picture against a first; by the pictures as a whole, where too few features tell.
+def estimate(first: U8, second: U8, uv_first: F32, uv_second: F32) -> Exposure:
+    """Exposure of the second image relative to the first; from the whole images if there are too few features.
 
     Args:
         first, second: (H, W).
-        there, now: (N, 2) the same features in both, pixels; those outside or NaN don't count.
+        uv_first, uv_second: (N, 2) pixels of common features; those outside an image and NaN are ignored.
     """
-    inside = _inside(first, there) & _inside(second, now)
-    if inside.sum() < ENOUGH:
-        return _line(first, second)
-    a, b = _values(first, there[inside]), _values(second, now[inside])
+    inside = _inside(first, uv_first) & _inside(second, uv_second)
+    if inside.sum() < FEATURES_MIN:
+        return _moment_fit(first, second)
+    a, b = _local_means(first, uv_first[inside]), _local_means(second, uv_second[inside])
     keep = np.ones(len(a), bool)
     for _ in range(3):
-        gain, offset = _line(a[keep], b[keep], steady=0)
+        gain, offset = _moment_fit(a[keep], b[keep], change_min=0)
         residual = np.abs(b - gain * a - offset)
-        keep = residual <= OFF * np.median(residual)
-    return _line(a[keep], b[keep])
+        keep = residual <= OUTLIER_RESIDUAL * np.median(residual)
+    return _moment_fit(a[keep], b[keep])
 
 
-def _line(a: F64 | U8, b: F64 | U8, steady: float = STEADY) -> Exposure:
-    """That which gives values `a` the mean and the spread of values `b`: neither picture is the truth."""
+def _moment_fit(a: F64 | U8, b: F64 | U8, change_min: float = CHANGE_MIN) -> Exposure:
+    """Gain and offset that give values `a` the mean and standard deviation of values `b`; symmetric in both."""
     gain, brighter = float(b.std() / max(a.std(), 1.0)), float(b.mean() / max(a.mean(), 1.0))
-    if max(abs(gain - 1), abs(brighter - 1)) < steady or gain < 1 / DARKEST:
+    if max(abs(gain - 1), abs(brighter - 1)) < change_min or gain < GAIN_MIN:
         return Exposure()
     return Exposure(gain, float(b.mean() - gain * a.mean()))
 
 
-def _inside(picture: U8, uv: F32) -> Bools:
-    height, width = picture.shape
-    return np.asarray(((uv > 0) & (uv < (width - 1, height - 1))).all(axis=1))  # NaN isn't
+def _inside(image: U8, uv: F32) -> Bools:
+    height, width = image.shape
+    return np.asarray(((uv > 0) & (uv < (width - 1, height - 1))).all(axis=1))  # False for NaN
 
 
-def _values(picture: U8, uv: F32) -> F64:
-    """(N,) mean grey values about places (N, 2)."""
+def _local_means(image: U8, uv: F32) -> F64:
+    """(N,) mean grey values of the squares around pixels (N, 2)."""
     import cv2
 
     column, row = np.round(uv).astype(np.int64).T
-    return np.asarray(cv2.blur(picture, (AROUND, AROUND))[row, column], np.float64)
+    return np.asarray(cv2.blur(image, (FEATURE_WINDOW_PX, FEATURE_WINDOW_PX))[row, column], np.float64)

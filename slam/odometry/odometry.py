@@ -1,9 +1,9 @@
-"""Odometry: frames to poses, one after the other (D3.2, section 4.1).
+"""Visual odometry: estimates the camera pose of each frame in turn (D3.2, section 4.1).
 
-Every frame, features are followed and the camera is placed by those whose points are known; every few metres a
-keyframe is added to the local map. When too few points agree, or speed and GPS don't, the car is lost: poses are
-carried on at the last speed, or GPS's, and marked unsure; the last keyframes are looked for; where they aren't found, a
-new map begins where the car is believed to be, never at the origin.
+In every frame, features are tracked, and the pose is estimated from those whose map points are known; every few metres
+a keyframe is added to the local map. When too few points are inliers, or the displacement contradicts GPS, tracking is
+lost: poses are dead-reckoned at the last velocity, or GPS's speed, and marked unsure, while relocalization searches
+for the last keyframes. If it fails, a new map starts at the dead-reckoned pose, never at the origin.
 """
 
 from __future__ import annotations
@@ -20,36 +20,46 @@ from scan2sim.pipeline.core.parameters import Seed
 from scan2sim.pipeline.core.types import F64, U8, Camera, GpsTrack
 from scan2sim.slam.geometry import exp_so3, inverse, log_so3, relative_pose, rigid
 from scan2sim.slam.mapping.local_map import Keyframe, LocalMap, MapParams, gps_distance
-from scan2sim.slam.odometry.relocalization import Remembered, describe, relocalise
-from scan2sim.slam.odometry.track_pose import Located, locate
-from scan2sim.slam.odometry.virtual_cameras import Facets
+from scan2sim.slam.odometry.relocalization import KeyframeFeatures, detect_features, relocalize
+from scan2sim.slam.odometry.track_pose import PoseEstimate, estimate_pose
+from scan2sim.slam.odometry.virtual_cameras import VirtualViews
 from scan2sim.slam.trackers import Tracker, Tracks
 from scan2sim.slam.trackers import named as tracker_named
 
-AROUND, AHEAD = 3.0, 1.0
-"""Degrees of parallax to a keyframe, for 360 cameras and for others; the latter's maps begin with no more, whatever is
-asked: straight ahead features leave the view before they have moved much."""
-LOST = 0.4
-"""Seconds after which a new map is begun."""
-QUARREL = 0.4, 2.5
-"""Vision that says less, or more, of GPS's distance over two seconds is mistaken: it followed a bus, say."""
-SETTLED = 15.0, 60.0
-"""Metres after which a map's scale, first taken from two keyframes, is set by GPS anew."""
-STILL = 1e-6 * np.eye(6)
-"""Square metres, square radians: of a car that stands."""
-REMEMBER = 20.0
-"""Seconds for which the keyframes before a loss are looked for."""
+KEYFRAME_PARALLAX_DEG = 3.0
+"""Median parallax to the last keyframe that triggers a new one, for 360 cameras."""
+KEYFRAME_PARALLAX_PERSPECTIVE_DEG = 1.0
+"""The same for perspective cameras, and an upper limit for the two-view initialization of their maps whatever
+`parallax` is set to: when driving straight ahead, features leave the view before they have moved much."""
+NEW_MAP_AFTER_S = 0.4
+"""Seconds of lost tracking after which a new map is started."""
+GPS_DISTANCE_RATIO_MIN, GPS_DISTANCE_RATIO_MAX = 0.4, 2.5
+"""Accepted ratio of visual to GPS displacement over `GPS_CHECK_S`. Outside it the visual pose is rejected: it may have
+tracked a moving bus."""
+GPS_DISTANCE_SLACK_M = 3.0, 5.0
+"""Metres by which the displacement may be below the minimum, or above the maximum, of that ratio."""
+GPS_CHECK_S = 2.0
+RESCALE_AT_M = 15.0, 60.0
+"""Lengths of a map at which its scale, initially that of its first two keyframes, is reset from GPS."""
+STANDSTILL_COVARIANCE = 1e-6 * np.eye(6)
+"""Pose covariance of a standing car, square metres and square radians."""
+RELOCALIZATION_S = 20.0
+"""Seconds after a loss of tracking for which the keyframes before it are searched for."""
+INLIERS_MIN, INLIER_SHARE_MIN = 20, 0.3
+"""Inliers, and their share of the known points, that a pose needs to be plausible."""
+MAP_FEATURES_MIN = 30
+"""Features that a map's first keyframe needs, and points that its second one needs."""
 
 
 class OdometryParams(MapParams):
-    """How frames become poses, besides `MapParams`.
+    """Settings of feature tracking and keyframe selection, in addition to `MapParams`.
 
     Attributes:
-        count: of features followed at a time.
-        parallax: degrees; a keyframe where the median feature has moved so far, turning apart; None: 3 for a 360
-            camera, 1 for others, in whose view little moves.
-        survival: or where fewer than this share of the last keyframe's are still followed.
-        seed: of random samples.
+        count: number of features tracked at a time.
+        parallax: degrees; a frame becomes a keyframe when its median parallax to the last keyframe, rotation
+            compensated, exceeds this. None: 3 for a 360 camera, 1 for a perspective one, in whose view little moves.
+        survival: a frame also becomes a keyframe when less than this share of the last keyframe's features is tracked.
+        seed: seed of the random samples (RANSAC).
     """
 
     count: int = Field(700, ge=50, le=20_000)
@@ -60,14 +70,15 @@ class OdometryParams(MapParams):
 
 @dataclass
 class Placed:
-    """Where a frame is.
+    """Pose of a frame, relative to a keyframe.
 
     Attributes:
         time: seconds.
-        keyframe: number of the one whose axes the pose is in.
-        T_key_cam: (4, 4).
-        unsure: it was bridged, not seen; or nothing ties the map that it was seen in to those before.
-        covariance: (6, 6) of its pose against the map's points, metres and radians about world axes; None: bridged.
+        keyframe: index of the keyframe that the pose is relative to.
+        T_key_cam: (4, 4) camera to keyframe.
+        unsure: the pose was dead-reckoned, or the map it was estimated in is unanchored.
+        covariance: (6, 6) of the pose relative to the map's points, metres and radians about world axes; None if it was
+            dead-reckoned.
     """
 
     time: float
@@ -78,11 +89,11 @@ class Placed:
 
 
 class Odometry:
-    """Feed `add` with frames; `placed` and `map` hold what came out."""
+    """Visual odometry: pass frames to `add`; `placed` holds their poses, `map` the local map."""
 
     STATE = (
-        "placed", "_rng", "_pose", "_time", "_velocity", "_started", "_blind", "_waiting", "_settled", "_adrift",
-        "_lost_at", "_memory", "_known",
+        "placed", "_rng", "_pose", "_time", "_velocity", "_initialized", "_featureless", "_pending_tracks", "_rescaled",
+        "_unanchored", "_lost_at", "_recent_keyframes", "_relocalization",
     )  # fmt: skip
     PARTS = ("map", "tracker")
 
@@ -98,80 +109,81 @@ class Odometry:
         keep: bool = False,
         warn: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """Begin.
+        """Odometry before its first frame.
 
         Args:
-            camera: of the frames.
-            params: see there.
-            mask: (H, W), 0 where the car itself is seen.
-            gps: the track, in the frames' times, smoothed; its distances are used.
-            backend: name of one of `slam.solvers`.
-            tracker: what follows features; default: corners.
-            keep: keep all points and what keyframes see of them, for loops, adjustment and COLMAP.
-            warn: receives what went wrong, and when.
+            camera: camera of the frames.
+            params: settings.
+            mask: (H, W) ego-vehicle mask, 0 where the car itself is visible.
+            gps: smoothed GPS track in the frames' times; only its distances are used.
+            backend: name of a solver in `slam.solvers`.
+            tracker: feature tracker; default: corners by Lucas-Kanade.
+            keep: keep all points and observations, for loop closure, global adjustment and the COLMAP model.
+            warn: receives warnings, each beginning with its time.
         """
         self.params, self.gps, self.warn = params, gps, warn
-        self.facets = Facets(camera)
-        self.tracker = tracker or tracker_named("corners", self.facets, mask, params.count)
-        self.map = LocalMap(camera, params, self.facets.pixel, gps=gps, backend=backend, keep=keep)
+        self.views = VirtualViews(camera)
+        self.tracker = tracker or tracker_named("corners", self.views, mask, params.count)
+        self.map = LocalMap(camera, params, self.views.pixel, gps=gps, backend=backend, keep=keep)
         self.placed: list[Placed] = []
         self._rng = np.random.default_rng(params.seed)
-        self._masks = None if mask is None else self.facets.pictures(mask)
+        self._masks = None if mask is None else self.views.images(mask)
         self._pose, self._time = np.eye(4), 0.0
         self._velocity = np.zeros(6)
-        self._started = self._blind = False
-        self._parallax = math.radians(params.parallax or (AHEAD if self.facets.whole else AROUND))
-        self._begins = min(self._parallax, math.radians(AHEAD)) if self.facets.whole else self._parallax
-        self._waiting: list[Tracks] = []  # of frames since the first keyframe of a map, or since the car moved
-        self._settled = 0
-        self._adrift = False  # nothing ties this map to those before
+        self._initialized = self._featureless = False
+        perspective = KEYFRAME_PARALLAX_PERSPECTIVE_DEG
+        self._parallax = math.radians(params.parallax or (perspective if self.views.single else KEYFRAME_PARALLAX_DEG))
+        self._init_parallax = min(self._parallax, math.radians(perspective)) if self.views.single else self._parallax
+        self._pending_tracks: list[Tracks] = []  # of frames since the first keyframe of a map, or since the car moved
+        self._rescaled = 0  # number of lengths in `RESCALE_AT_M` that this map has passed
+        self._unanchored = False  # neither relocalization nor GPS connects this map to the previous ones
         self._lost_at: float | None = None
-        self._memory: list[tuple[list[U8], F64]] = []  # facets and poses of the last good keyframes
-        self._known: tuple[float, list[Remembered]] | None = None
+        self._recent_keyframes: list[tuple[list[U8], F64]] = []  # views and poses of the last good keyframes
+        self._relocalization: tuple[float, list[KeyframeFeatures]] | None = None
 
-    # each frame
+    # --- each frame
 
     def add(self, time: float, grey: U8) -> None:
-        """The next frame (H, W), `time` in seconds, later than the last."""
-        guess = self._predicted(time)
-        self.tracker.track(grey, self._expected(guess))
+        """Process the next frame (H, W); `time` in seconds, later than that of the last frame."""
+        guess = self._predicted_pose(time)
+        self.tracker.track(grey, self._predicted_bearings(guess))
         if not self.map.keyframes:
             self._time = time
-            self._begin(time, np.eye(4))
-        elif self._blind:
-            self._anew(time, guess)
-        elif not self._started:
-            self._initialise(time, guess)
+            self._first_keyframe(time, np.eye(4))
+        elif self._featureless:
+            self._start_new_map(time, guess)
+        elif not self._initialized:
+            self._initialize(time, guess)
         else:
-            self._continue(time, guess)
+            self._track_frame(time, guess)
 
     def pose_of(self, placed: Placed) -> F64:
-        """(4, 4) camera to world, as the map knows it now."""
+        """(4, 4) camera to world, by the current pose of its keyframe."""
         return self.map.keyframes[placed.keyframe].T_world_cam @ placed.T_key_cam
 
-    def _predicted(self, time: float) -> F64:
-        """The pose at the last speed; at GPS's while lost."""
+    def _predicted_pose(self, time: float) -> F64:
+        """(4, 4) pose at constant velocity; at GPS's speed while tracking is lost."""
         dt = time - self._time
         step = self._velocity[:3] * dt
         if self._lost_at is not None and self.gps is not None:
-            far = gps_distance(self.gps, time - 1.0, time)
+            gps_metres = gps_distance(self.gps, time - 1.0, time)
             length = float(np.linalg.norm(step))
-            if far is not None and length > 0:
-                step = step * (far * dt / length)
+            if gps_metres is not None and length > 0:
+                step = step * (gps_metres * dt / length)
         return self._pose @ rigid(exp_so3(self._velocity[3:] * dt), step)
 
-    def _expected(self, guess: F64) -> F64:
-        """(N, 3) where tracks will probably be seen: known points at their place, others as the camera turns."""
+    def _predicted_bearings(self, guess: F64) -> F64:
+        """(N, 3) predicted bearings of the tracks: known points are projected, the others turn with the camera."""
         tracks = self.tracker.tracks
         expected = tracks.bearing @ (guess[:3, :3].T @ self._pose[:3, :3]).T
         rows, known = self.map.landmarks.find(tracks.ids)
-        if self._started and known.any():
+        if self._initialized and known.any():
             seen = (self.map.landmarks.xyz[rows[known]] - guess[:3, 3]) @ guess[:3, :3]
             expected[known] = seen / np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-9)
         return expected
 
-    def _place(self, time: float, pose: F64, *, unsure: bool, covariance: F64 | None = None) -> None:
-        """Keep a frame's pose, and what it says of the car's speed."""
+    def _append_pose(self, time: float, pose: F64, *, unsure: bool, covariance: F64 | None = None) -> None:
+        """Store a frame's pose, and update the velocity from it."""
         dt = time - self._time
         if dt > 0:
             moved = inverse(self._pose) @ pose
@@ -179,182 +191,194 @@ class Odometry:
         self._pose, self._time = pose, time
         last = len(self.map.keyframes) - 1
         from_key = inverse(self.map.keyframes[last].T_world_cam) @ pose
-        self.placed.append(Placed(time, last, from_key, unsure or self._adrift, covariance))
+        self.placed.append(Placed(time, last, from_key, unsure or self._unanchored, covariance))
 
-    def _continue(self, time: float, guess: F64) -> None:
-        found = locate(self.map, self.tracker.tracks, guess, self._velocity)
-        self.tracker.drop(found.wrong)
-        if not self._sound(time, found):
-            self._bridge(time, guess)
+    def _track_frame(self, time: float, guess: F64) -> None:
+        """Estimate a frame's pose by the map, or dead-reckon it; make the frame a keyframe if one is needed."""
+        found = estimate_pose(self.map, self.tracker.tracks, guess, self._velocity)
+        self.tracker.drop(found.outliers)
+        if not self._is_plausible(time, found):
+            self._dead_reckon(time, guess)
             return
         if self._lost_at is not None:
-            self.warn(f"{time:.2f} s: found again, {time - self._lost_at:.2f} s after it was lost")
+            self.warn(f"{time:.2f} s: tracking resumed, {time - self._lost_at:.2f} s after it was lost")
             self._lost_at = None
-        self._place(time, found.pose, unsure=False, covariance=found.covariance)
-        if self._due():
-            self._keyframe(time)
+        self._append_pose(time, found.pose, unsure=False, covariance=found.covariance)
+        if self._needs_keyframe():
+            self._add_keyframe(time)
 
-    def _sound(self, time: float, found: Located) -> bool:
-        """Whether a pose can be believed: enough points agree, and no quarrel with GPS."""
-        if found.agree < 20 or found.agree < 0.3 * found.known:
+    def _is_plausible(self, time: float, found: PoseEstimate) -> bool:
+        """Whether a pose has enough inliers, and a displacement over `GPS_CHECK_S` that fits GPS's."""
+        if found.inliers < INLIERS_MIN or found.inliers < INLIER_SHARE_MIN * found.known:
             return False
         if self.gps is None:
             return True
-        since = time - 2.0
-        far = gps_distance(self.gps, since, time)
+        since = time - GPS_CHECK_S
+        gps_metres = gps_distance(self.gps, since, time)
         back = next((p for p in reversed(self.placed) if p.time <= since), None)
-        if far is None or back is None or back.unsure:
+        if gps_metres is None or back is None or back.unsure:
             return True
         moved = float(np.linalg.norm(found.pose[:3, 3] - self.pose_of(back)[:3, 3]))
-        return QUARREL[0] * far - 3 < moved < QUARREL[1] * far + 5
+        below, above = GPS_DISTANCE_SLACK_M
+        return GPS_DISTANCE_RATIO_MIN * gps_metres - below < moved < GPS_DISTANCE_RATIO_MAX * gps_metres + above
 
-    def _common(self, keyframe: Keyframe) -> tuple[F64, F64]:
-        """Bearings (M, 3) of what a keyframe saw and is still followed: there, and now."""
+    def _common_bearings(self, keyframe: Keyframe) -> tuple[F64, F64]:
+        """Bearings (M, 3) of a keyframe's features that are still tracked: in the keyframe, and now."""
         tracks = self.tracker.tracks
-        _, mine, his = np.intersect1d(tracks.ids, keyframe.ids, return_indices=True)
-        return keyframe.bearing[his], tracks.bearing[mine]
+        _, now, then = np.intersect1d(tracks.ids, keyframe.ids, return_indices=True)
+        return keyframe.bearing[then], tracks.bearing[now]
 
-    def _due(self) -> bool:
-        """Whether this frame is to be a keyframe."""
+    def _needs_keyframe(self) -> bool:
+        """Whether the current frame should become a keyframe: too few common features, or enough parallax."""
         last = self.map.keyframes[-1]
-        there, now = self._common(last)
+        then, now = self._common_bearings(last)
         if len(now) < self.params.survival * len(last.ids):
             return True
         turn = last.T_world_cam[:3, :3].T @ self._pose[:3, :3]
-        return _median_angle(now @ turn.T, there) > self._parallax
+        return _median_angle(now @ turn.T, then) > self._parallax
 
-    def _keyframe(self, time: float) -> None:
-        """Make the frame just placed a keyframe."""
+    def _add_keyframe(self, time: float) -> None:
+        """Make the frame whose pose was appended last a keyframe."""
         tracks = self.tracker.tracks
         self.tracker.drop(
             self.map.add(Keyframe(time, self._pose, tracks.ids, tracks.bearing, self.map.part, self._velocity))
         )
         self.tracker.refill()
-        self.map.see(self.tracker.tracks.ids, self.tracker.tracks.bearing)
-        self._settle()
+        self.map.add_observations(self.tracker.tracks.ids, self.tracker.tracks.bearing)
+        self._rescale_to_gps()
         self._pose = self.map.keyframes[-1].T_world_cam
         self.placed[-1].keyframe, self.placed[-1].T_key_cam = len(self.map.keyframes) - 1, np.eye(4)
-        self._memory = [*self._memory[-3:], (self.tracker.pictures, self._pose)]
+        self._recent_keyframes = [*self._recent_keyframes[-3:], (self.tracker.images, self._pose)]
 
-    def _settle(self) -> None:
-        """Set the scale of a map that has just become so long that GPS knows it well."""
-        mine = [k for k in self.map.keyframes if k.part == self.map.part]
-        if self.gps is None or self._settled >= len(SETTLED):
+    def _rescale_to_gps(self) -> None:
+        """Reset the current map's scale from GPS when its length passes one of `RESCALE_AT_M`."""
+        keyframes = [k for k in self.map.keyframes if k.part == self.map.part]
+        if self.gps is None or self._rescaled >= len(RESCALE_AT_M):
             return
-        far = gps_distance(self.gps, mine[0].time, mine[-1].time)
-        length = float(np.linalg.norm(mine[-1].T_world_cam[:3, 3] - mine[0].T_world_cam[:3, 3]))
-        if far is None or far < SETTLED[self._settled] or length < 1e-6:
+        gps_metres = gps_distance(self.gps, keyframes[0].time, keyframes[-1].time)
+        length = float(np.linalg.norm(keyframes[-1].T_world_cam[:3, 3] - keyframes[0].T_world_cam[:3, 3]))
+        if gps_metres is None or gps_metres < RESCALE_AT_M[self._rescaled] or length < 1e-6:
             return
-        self._settled += 1
-        self.map.rescale(far / length)
-        first = len(self.map.keyframes) - len(mine)
+        self._rescaled += 1
+        self.map.rescale(gps_metres / length)
+        first = len(self.map.keyframes) - len(keyframes)
         for placed in reversed(self.placed):
             if placed.keyframe < first:
                 break
-            placed.T_key_cam[:3, 3] *= far / length
-        self._velocity = self._velocity * np.repeat([far / length, 1.0], 3)
+            placed.T_key_cam[:3, 3] *= gps_metres / length
+        self._velocity = self._velocity * np.repeat([gps_metres / length, 1.0], 3)
 
-    # beginning, and beginning anew
+    # --- initialization, loss of tracking, new maps
 
-    def _begin(self, time: float, pose: F64, *, tied: bool = True) -> None:
-        """The first keyframe of a map, unless there is nothing to see; `tied`: its place has been seen."""
+    def _first_keyframe(self, time: float, pose: F64, *, tied: bool = True) -> None:
+        """Add a map's first keyframe, unless the image has too few features; `tied`: its pose was relocalized."""
         found = self.tracker.refill()
         tracks = self.tracker.tracks
-        self._blind, self._started, self._waiting, self._settled = found < 30, False, [], 0
-        if not self.map.keyframes or not self._blind:
+        self._featureless = found < MAP_FEATURES_MIN
+        self._initialized, self._pending_tracks, self._rescaled = False, [], 0
+        if not self.map.keyframes or not self._featureless:
             keyframe = Keyframe(time, pose, tracks.ids, tracks.bearing, self.map.part, self._velocity, tied)
-            self.map.begin(keyframe)
-        self._place(time, pose, unsure=self.map.part > 0 or self._blind)
+            self.map.start(keyframe)
+        self._append_pose(time, pose, unsure=self.map.part > 0 or self._featureless)
 
-    def _initialise(self, time: float, guess: F64) -> None:
-        """A map's second keyframe, once features have moved enough against the first."""
+    def _initialize(self, time: float, guess: F64) -> None:
+        """Add a map's second keyframe once there is enough parallax to the first; until then keep the tracks."""
         first = self.map.keyframes[-1]
-        there, now = self._common(first)
-        if len(now) < max(30, 0.2 * len(first.ids)):
-            self._anew(time, guess)
+        then, now = self._common_bearings(first)
+        if len(now) < max(MAP_FEATURES_MIN, 0.2 * len(first.ids)):
+            self._start_new_map(time, guess)
             return
-        moved, found = _median_angle(there, now), None
-        if not self.map.part and moved < self.map.gate:  # the car stands
-            self._waiting = []
-            self._place(time, first.T_world_cam, unsure=False, covariance=STILL)
+        moved, found = _median_angle(then, now), None
+        if not self.map.part and moved < self.map.gate:  # the car stands still
+            self._pending_tracks = []
+            self._append_pose(time, first.T_world_cam, unsure=False, covariance=STANDSTILL_COVARIANCE)
             return
         if moved > math.radians(0.5):
-            found = relative_pose(there, now, threshold=self.map.gate, rng=self._rng)
-        if found is None or _median_angle(now @ found[0][:3, :3].T, there) < self._begins:
-            self._waiting.append(self.tracker.tracks)
-            self._place(time, guess if self.map.part else first.T_world_cam, unsure=self.map.part > 0)
+            found = relative_pose(then, now, threshold=self.map.gate, rng=self._rng)
+        if found is None or _median_angle(now @ found[0][:3, :3].T, then) < self._init_parallax:
+            self._pending_tracks.append(self.tracker.tracks)
+            self._append_pose(time, guess if self.map.part else first.T_world_cam, unsure=self.map.part > 0)
             return
-        self._second(time, found[0], self._baseline(first, time, guess))
+        self._two_view_init(time, found[0], self._baseline(first, time, guess))
 
-    def _second(self, time: float, T: F64, baseline: float) -> None:
-        """A map's second keyframe, at T (4, 4) from the first, whose length is `baseline`; the frames between."""
+    def _two_view_init(self, time: float, T: F64, baseline: float) -> None:
+        """Add the second keyframe, and estimate the pending frames' poses by the points of both keyframes.
+
+        Args:
+            time: seconds.
+            T: (4, 4) pose of the second keyframe in the first one's axes, with a unit baseline; is scaled in place.
+            baseline: metres.
+        """
         T[:3, 3] *= baseline
-        since = self.placed[-1 - len(self._waiting)].time
-        self._place(time, self.map.keyframes[-1].T_world_cam @ T, unsure=self.map.part > 0)
+        since = self.placed[-1 - len(self._pending_tracks)].time
+        self._append_pose(time, self.map.keyframes[-1].T_world_cam @ T, unsure=self.map.part > 0)
         self._velocity = np.concatenate([T[:3, 3], log_so3(T[:3, :3])]) / (time - since)
-        self._started = True
-        self._keyframe(time)
-        if self.map.landmarks.find(self.tracker.tracks.ids)[1].sum() < 30:
+        self._initialized = True
+        self._add_keyframe(time)
+        if self.map.landmarks.find(self.tracker.tracks.ids)[1].sum() < MAP_FEATURES_MIN:
             self.map.keyframes.pop()
             self.placed.pop()
             self._time = self.placed[-1].time
-            self._anew(time, self._pose)
+            self._start_new_map(time, self._pose)
             return
-        between, ends = self.placed[-1 - len(self._waiting) : -1], self.map.poses([-2, -1])
+        between, ends = self.placed[-1 - len(self._pending_tracks) : -1], self.map.poses([-2, -1])
         guesses = interpolate(ends, np.array([since, time]), np.array([p.time for p in between]))
-        for placed, tracks, guess in zip(between, self._waiting, guesses, strict=True):
-            found = locate(self.map, tracks, guess, self._velocity)
+        for placed, tracks, guess in zip(between, self._pending_tracks, guesses, strict=True):
+            found = estimate_pose(self.map, tracks, guess, self._velocity)
             placed.T_key_cam = inverse(ends[0]) @ (guess if placed.unsure else found.pose)
             placed.covariance = None if placed.unsure else found.covariance
 
     def _baseline(self, first: Keyframe, time: float, guess: F64) -> float:
-        """Metres between a map's first two keyframes: GPS's, else at the speed before, else 1."""
-        far = gps_distance(self.gps, first.time, time)
-        if far:
-            return far
+        """Metres between a map's first two keyframes: by GPS, else by the previous map's velocity, else 1."""
+        gps_metres = gps_distance(self.gps, first.time, time)
+        if gps_metres:
+            return gps_metres
         moved = float(np.linalg.norm(guess[:3, 3] - first.T_world_cam[:3, 3]))
         return moved if self.map.part and moved > 0 else 1.0
 
-    def _bridge(self, time: float, guess: F64) -> None:
-        """A frame that can't be placed is carried on; after a while a new map begins."""
+    def _dead_reckon(self, time: float, guess: F64) -> None:
+        """Extrapolate the pose of a frame that can't be tracked; after `NEW_MAP_AFTER_S` start a new map."""
         if self._lost_at is None:
             self._lost_at = time
-            self._known = None
-            self.warn(f"{time:.2f} s: lost, poses are carried on")
-        if time - self._lost_at > LOST:
-            self._anew(time, guess)
+            self._relocalization = None
+            self.warn(f"{time:.2f} s: tracking lost, poses are dead-reckoned")
+        if time - self._lost_at > NEW_MAP_AFTER_S:
+            self._start_new_map(time, guess)
         else:
-            self._place(time, guess, unsure=True)
+            self._append_pose(time, guess, unsure=True)
 
-    def _anew(self, time: float, guess: F64) -> None:
-        """A new map where the last keyframes say that the car is, else where it is believed to be."""
+    def _start_new_map(self, time: float, guess: F64) -> None:
+        """Start a map at the relocalized pose, or else at the dead-reckoned one."""
         if self._lost_at is None:
             self._lost_at = time
-            self.warn(f"{time:.2f} s: lost, poses are carried on")
+            self.warn(f"{time:.2f} s: tracking lost, poses are dead-reckoned")
         self.map.part += 1
         self.tracker.tracks = Tracks()
-        found = self._recognised(time)
-        self._adrift = found is None and not self._bridged_by_gps(time)
-        self._begin(time, guess if found is None else found, tied=found is not None)
+        found = self._relocalized_pose(time)
+        self._unanchored = found is None and not self._gps_spans_loss(time)
+        self._first_keyframe(time, guess if found is None else found, tied=found is not None)
 
-    def _bridged_by_gps(self, time: float) -> bool:
-        """Whether GPS tells how far the car came while it was lost."""
+    def _gps_spans_loss(self, time: float) -> bool:
+        """Whether GPS knows the distance driven since tracking was lost."""
         return self._lost_at is not None and gps_distance(self.gps, self._lost_at - 1.0, time) is not None
 
-    def _recognised(self, time: float) -> F64 | None:
-        """The pose by the keyframes before the loss."""
-        if self._lost_at is None or time - self._lost_at > REMEMBER or len(self._memory) < 2:
+    def _relocalized_pose(self, time: float) -> F64 | None:
+        """(4, 4) pose by two of the keyframes before the loss; None if they don't match, or it was too long ago."""
+        if self._lost_at is None or time - self._lost_at > RELOCALIZATION_S or len(self._recent_keyframes) < 2:
             return None
-        if self._known is None:
-            few = (self._memory[-1], self._memory[max(0, len(self._memory) - 3)])
-            self._known = time, [Remembered(describe(self.facets, c, self._masks), pose) for c, pose in few]
-        now = describe(self.facets, self.tracker.pictures, self._masks)
-        found = relocalise(now, *self._known[1], sigma=self.map.sigma, rng=self._rng)
+        if self._relocalization is None:
+            two = (self._recent_keyframes[-1], self._recent_keyframes[max(0, len(self._recent_keyframes) - 3)])
+            features = [
+                KeyframeFeatures(detect_features(self.views, images, self._masks), pose) for images, pose in two
+            ]
+            self._relocalization = time, features
+        now = detect_features(self.views, self.tracker.images, self._masks)
+        found = relocalize(now, *self._relocalization[1], sigma=self.map.sigma, rng=self._rng)
         if found is not None:
-            self.warn(f"{time:.2f} s: recognised the place")
+            self.warn(f"{time:.2f} s: relocalized by the keyframes before the loss")
         return found
 
 
 def _median_angle(a: F64, b: F64) -> float:
-    """Radians between unit vectors (N, 3), the median."""
+    """Median angle between unit vectors a and b (N, 3), radians; 0 if there are none."""
     return float(np.median(np.arccos(np.clip(np.einsum("ij,ij->i", a, b), -1, 1)))) if len(a) else 0.0

@@ -1,4 +1,4 @@
-"""Track: a video, frame by frame, to a trajectory; what was done is kept, so that an interrupted run goes on."""
+"""Video odometry: runs odometry over the frames of a video, with checkpoints from which an interrupted run resumes."""
 
 from __future__ import annotations
 
@@ -12,33 +12,32 @@ import numpy as np
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import U8
-from scan2sim.slam.features import Found
+from scan2sim.slam.features import FeatureSet
 from scan2sim.slam.mapping.local_map import Keyframe, Landmarks
-from scan2sim.slam.odometry.checkpoint import WrongState, load, save
+from scan2sim.slam.odometry.checkpoint import InvalidCheckpoint, load, save
 from scan2sim.slam.odometry.odometry import Odometry, Placed
 from scan2sim.slam.odometry.patch_alignment import Patches
-from scan2sim.slam.odometry.relocalization import Remembered, Seen
+from scan2sim.slam.odometry.relocalization import FrameFeatures, KeyframeFeatures
 from scan2sim.slam.trackers import Tracks
-from scan2sim.slam.trackers.descriptors import SeenInFacet
+from scan2sim.slam.trackers.descriptors import ViewFeatures
 from scan2sim.slam.video import Video
 
 VERSION = 11
-"""Raised whenever the same video comes to another trajectory with the same options: what older code left, a state of an
-interrupted run or a trajectory that is kept, is begun anew then."""
-KEEP_EVERY = 60.0
-"""Seconds between states kept."""
-VALUES = (Found, Keyframe, Landmarks, Patches, Placed, Remembered, Seen, SeenInFacet, Tracks)
-"""What states consist of."""
+"""Version of the step's result. Increased whenever the same video and options give another trajectory: checkpoints and
+cached trajectories of an older version are then discarded and computed again."""
+CHECKPOINT_INTERVAL_S = 60.0
+VALUES = (FeatureSet, Keyframe, Landmarks, Patches, Placed, KeyframeFeatures, FrameFeatures, ViewFeatures, Tracks)
+"""Types that occur in a checkpoint."""
 
 
 class Run:
-    """A run over a video, as far as it has come.
+    """State of a run over a video.
 
     Attributes:
-        names: of the frames that were taken.
-        warnings: sentences a user should read.
-        seconds: that it took.
-        odometry: what it has found.
+        names: names of the frames processed so far.
+        warnings: warnings for the user.
+        seconds: computing time so far.
+        odometry: odometry after the last frame.
     """
 
     STATE = ("names", "warnings", "seconds")
@@ -50,16 +49,16 @@ class Run:
         self.seconds = 0.0
         self.odometry = start(self.warnings.append)
 
-    def facts(self) -> dict[str, Any]:
-        """Figures of it."""
-        found = self.odometry.map
+    def metrics(self) -> dict[str, Any]:
+        """Metrics for the report."""
+        local_map = self.odometry.map
         return {
             "frames": len(self.names),
-            "keyframes": len(found.keyframes),
-            "maps": found.part + 1,
+            "keyframes": len(local_map.keyframes),
+            "maps": local_map.part + 1,
             "seconds": round(self.seconds, 2),
             "fps": round(len(self.names) / max(self.seconds, 1e-9), 2),
-            **dict(zip(found.names, np.round(found.shared, 5).tolist(), strict=True)),
+            **dict(zip(local_map.names, np.round(local_map.shared, 5).tolist(), strict=True)),
         }
 
 
@@ -77,47 +76,49 @@ def track(
 
     Args:
         video: frames.
-        start: makes the odometry, given where to send warnings.
-        every: take every so manieth frame.
-        until: stop after so many seconds of the video.
-        state: file in which the state is kept every minute, and from which an interrupted run goes on.
-        watch: is shown odometry and frame after each.
-        report: progress.
+        start: creates the odometry; its argument receives warnings.
+        every: process every Nth frame.
+        until: seconds of the video after which to stop.
+        state: checkpoint file, written every minute; if it exists, the run resumes from it.
+        watch: called with odometry and image after each frame.
+        report: receives progress.
 
     Raises:
         DataError: fewer than two frames.
     """
-    kept = _begin(start, state)
-    began, saved = clock.perf_counter() - kept.seconds, clock.perf_counter()
-    last = kept.odometry.placed[-1].time if kept.odometry.placed else -np.inf
-    for frame in video.frames(every=every, warn=kept.warnings.append):
+    run = _new_or_resumed(start, state)
+    began, saved = clock.perf_counter() - run.seconds, clock.perf_counter()
+    last = run.odometry.placed[-1].time if run.odometry.placed else -np.inf
+    for frame in video.frames(every=every, warn=run.warnings.append):
         if frame.time <= last:
             continue
         if until is not None and frame.time > until:
             break
-        kept.odometry.add(frame.time, frame.grey)
-        kept.names.append(frame.name)
+        run.odometry.add(frame.time, frame.grey)
+        run.names.append(frame.name)
         if watch is not None:
-            watch(kept.odometry, frame.grey)
+            watch(run.odometry, frame.grey)
         if video.count:
-            report(min(1.0, frame.number / video.count), f"{len(kept.names)} frames")
-        if state is not None and clock.perf_counter() - saved > KEEP_EVERY:
-            kept.seconds, saved = clock.perf_counter() - began, clock.perf_counter()
-            save(state, kept, VALUES)
-    if len(kept.names) < 2:
-        raise DataError(video.path, f"has {len(kept.names)} frames", "Give a longer video")
-    kept.seconds = clock.perf_counter() - began
-    return kept
+            report(min(1.0, frame.number / video.count), f"{len(run.names)} frames")
+        if state is not None and clock.perf_counter() - saved > CHECKPOINT_INTERVAL_S:
+            run.seconds, saved = clock.perf_counter() - began, clock.perf_counter()
+            save(state, run, VALUES)
+    if len(run.names) < 2:
+        raise DataError(video.path, f"has only {len(run.names)} readable frames, 2 are needed", "Give a longer video")
+    run.seconds = clock.perf_counter() - began
+    return run
 
 
-def _begin(start: Callable[[Callable[[str], None]], Odometry], state: Path | None) -> Run:
-    """A run at its beginning, or where an earlier one was interrupted."""
+def _new_or_resumed(start: Callable[[Callable[[str], None]], Odometry], state: Path | None) -> Run:
+    """A new run, or an interrupted one restored from its checkpoint."""
     if state is None or not state.is_file():
         return Run(start)
     try:
         run = Run(start)
         load(state, run, VALUES)
-    except WrongState:
+    except InvalidCheckpoint:
         run = Run(start)
-        run.warnings.append(f"what an interrupted run left in {state.name} is damaged: begun anew")
+        run.warnings.append(
+            f"the checkpoint {state.name} of an interrupted run is damaged: starting from the beginning"
+        )
     return run

@@ -1,4 +1,4 @@
-"""What solves the graph of cameras and points: a file a backend (`pipeline.core.plugins`), found by its name."""
+"""Solvers of the factor graph. Each backend is a module here, loaded by its name (`pipeline.core.plugins`)."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from scan2sim.slam.mapping.factor_graph import Graph, Solution
 
 
 class Solver(Protocol):
-    """What a backend's module has."""
+    """Interface of a backend's module."""
 
     def solve(self, graph: Graph, *, iterations: int | None = None, points: bool = True) -> Solution:
-        """Cameras and points that fit best; `points` False moves cameras alone."""
+        """Optimize cameras and points; with `points` False, points are fixed. `iterations` None: the default."""
 
 
 def named(name: str) -> Solver:
-    """A backend.
+    """Load the solver backend of a name.
 
     Raises:
-        SettingError: there is none of that name.
-        UnavailableError: it can't run here.
+        SettingError: there is no such backend.
+        UnavailableError: a package that it needs isn't installed.
     """
     solver: Solver = plugins.find(__name__, name, "track.backend")
     return solver

@@ -1,8 +1,9 @@
-"""The mission's optimiser (D3.2, section 4.1): torch's automatic differentiation and Adam, to compare with.
+"""Optimizer of D3.2 (section 4.1), for comparison: automatic differentiation and Adam, by torch.
 
-The error of an observation is the length of the cross product of seen and estimated direction, linear in it, so that
-outliers weigh little; adjacent distances from GPS enter squared, with a very low weight. A camera is its position and
-three rotation angles. 20 iterations place a camera, 180 move a window. Runs on a GPU where there is one.
+The error of an observation is the norm of the cross product of observed and predicted direction; it enters linearly
+(L1), so that outliers have little influence. Adjacent distances from GPS enter squared, with a very low weight. A
+camera is its position and three rotation angles. A camera's pose takes 20 iterations, a window 180. Uses a GPU if there
+is one.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from scan2sim.slam.mapping.factor_graph import Graph, Solution
 
 NEEDS = ("torch",)
 POSE_ITERATIONS, WINDOW_ITERATIONS = 20, 180
-RATE = 0.02
-"""Metres of a first step (D3.2 names none); radians are a tenth of it."""
+LEARNING_RATE_M = 0.02
+"""Initial learning rate of positions, metres; of rotations a tenth of it, radians. D3.2 gives none."""
 GPS_WEIGHT = 1e-3
-"""Of a squared distance in metres, against radians (D3.2: very low)."""
+"""Weight of a squared distance error in metres, relative to radians (D3.2: very low)."""
 
 
 def solve(graph: Graph, *, iterations: int | None = None, points: bool = True) -> Solution:
-    """See `slam.solvers.Solver`; shared parameters are left as they are."""
+    """See `slam.solvers.Solver`; shared parameters aren't optimized."""
     import torch
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -35,18 +36,18 @@ def solve(graph: Graph, *, iterations: int | None = None, points: bool = True) -
     R0, t0, X0 = tensor(graph.poses[:, :3, :3]), tensor(graph.poses[:, :3, 3]), tensor(graph.points)
     seen, camera = tensor(graph.bearing), tensor(graph.camera_of, torch.long)
     point = tensor(graph.point_of, torch.long)
-    first, second = (tensor([getattr(c, end) for c in graph.chords], torch.long) for end in ("first", "second"))
-    distance = tensor([c.distance for c in graph.chords])
+    first, second = (tensor([getattr(c, end) for c in graph.distances], torch.long) for end in ("first", "second"))
+    distance = tensor([c.distance for c in graph.distances])
     measured = [tensor(f.measured) for f in graph.factors]
     move = torch.zeros_like(t0, requires_grad=True)
     angles = torch.zeros_like(t0, requires_grad=True)
     shift = torch.zeros_like(X0, requires_grad=points)
-    groups = [{"params": [move], "lr": RATE}, {"params": [angles], "lr": 0.1 * RATE}]
+    groups = [{"params": [move], "lr": LEARNING_RATE_M}, {"params": [angles], "lr": 0.1 * LEARNING_RATE_M}]
     if points:
-        groups.append({"params": [shift], "lr": RATE})
+        groups.append({"params": [shift], "lr": LEARNING_RATE_M})
     adam = torch.optim.Adam(groups)
     count = iterations or (WINDOW_ITERATIONS if points else POSE_ITERATIONS)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, count, eta_min=0.02 * RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, count, eta_min=0.02 * LEARNING_RATE_M)
     for _ in range(count):
         adam.zero_grad()
         t, R, X = t0 + free * move, _rotations(free * angles) @ R0, X0 + shift
@@ -56,20 +57,20 @@ def solve(graph: Graph, *, iterations: int | None = None, points: bool = True) -
         lengths = (t[second] - t[first]).norm(dim=1)
         loss = loss + GPS_WEIGHT * ((lengths - distance) ** 2).sum()
         for factor, value in zip(graph.factors, measured, strict=True):
-            mine = [_pose(R[c], t[c]) for c in factor.cameras]
-            loss = loss + graph.sigma * (factor.residual(*mine, value) ** 2).sum()
+            involved = [_pose(R[c], t[c]) for c in factor.cameras]
+            loss = loss + graph.sigma * (factor.residual(*involved, value) ** 2).sum()
         loss.backward()
         adam.step()
         schedule.step()
-    turned = exp_so3((free * angles).detach().cpu().numpy())
+    rotation = exp_so3((free * angles).detach().cpu().numpy())
     poses = graph.poses.copy()
-    poses[:, :3, :3] = turned @ poses[:, :3, :3]
+    poses[:, :3, :3] = rotation @ poses[:, :3, :3]
     poses[:, :3, 3] += (free * move).detach().cpu().numpy()
     return Solution(poses, graph.points + shift.detach().cpu().numpy(), graph.shared)
 
 
 def _rotations(w: Any) -> Any:
-    """(C, 3, 3) rotations of rotation vectors (C, 3): Rodrigues' formula."""
+    """(C, 3, 3) rotation matrices of rotation vectors (C, 3), by Rodrigues' formula."""
     import torch
 
     angle = w.square().sum(dim=1).clamp(min=1e-16).sqrt()[:, None, None]

@@ -1,8 +1,9 @@
-"""Levenberg-Marquardt with the Schur complement: points are eliminated, cameras and shared parameters solved densely.
+"""Levenberg-Marquardt with the Schur complement: eliminates points, solves cameras and shared parameters densely.
 
-The residual is the cross product of seen and estimated direction, in its two components across the seen one, so that
-there is neither seam nor pole; since it vanishes behind the camera, too, points there don't count. Cauchy's weights
-make outliers count little. The kernels run on one thread: problems are small, and frames are read beside them.
+The residual is the cross product of observed and predicted direction, in its two components perpendicular to the
+observed one, so that it has no singularity at seam or poles. As it also vanishes behind the camera, points there are
+excluded. The Cauchy loss down-weights outliers. The kernels run on one thread: problems are small, and frames are
+decoded in parallel.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from scan2sim.pipeline.core.types import F64, I32, I64, Bools
 from scan2sim.slam.geometry import exp_so3
 from scan2sim.slam.mapping.factor_graph import Factor, Graph, Solution
 
-ITERATIONS = 8
-ENOUGH = 1e-4
-"""Relative fall of the cost below which no further iteration is made."""
+ITERATIONS_MAX = 8
+COST_DECREASE_MIN = 1e-4
+"""Relative decrease of the cost below which the iteration stops."""
 
 
 def solve(graph: Graph, *, iterations: int | None = None, points: bool = True) -> Solution:
@@ -31,7 +32,7 @@ def solve(graph: Graph, *, iterations: int | None = None, points: bool = True) -
     if not size and not points:
         return Solution(poses, xyz, shared)
     damping, cost = 1e-4, _cost(graph, poses, xyz, shared)
-    for _ in range(ITERATIONS if iterations is None else iterations):
+    for _ in range(ITERATIONS_MAX if iterations is None else iterations):
         H, g, V, gp, W = _normal(graph, poses, xyz, shared, free, starts, size, points)
         better = False
         for _ in range(6):
@@ -45,16 +46,19 @@ def solve(graph: Graph, *, iterations: int | None = None, points: bool = True) -
             damping *= 10
         if not better:
             break
-        fell = (cost - new_cost) / max(cost, 1e-30)
+        decrease = (cost - new_cost) / max(cost, 1e-30)
         poses, xyz, shared, cost = new_poses, new_xyz, new_shared, new_cost
         damping = max(damping / 10, 1e-9)
-        if fell < ENOUGH:
+        if decrease < COST_DECREASE_MIN:
             break
     return Solution(poses, xyz, shared)
 
 
 def information(graph: Graph, *, points: bool = True) -> F64:
-    """(6 C, 6 C) what the observations alone say of the cameras, per squared radian; points eliminated, or believed."""
+    """(6 C, 6 C) information matrix of the cameras from the observations alone, per squared radian.
+
+    Points are eliminated; with `points` False, they are fixed instead.
+    """
     count = len(graph.poses)
     free, starts = np.arange(count), np.searchsorted(graph.point_of, np.arange(len(graph.points) + 1))
     none = np.zeros((0, 0, 6)), np.zeros(0)
@@ -65,13 +69,16 @@ def information(graph: Graph, *, points: bool = True) -> F64:
 
 
 def information_of_shared(graph: Graph) -> F64:
-    """(S, S) what the observations say of the shared parameters; points and cameras eliminated, sigma taken as 1."""
-    S = graph.bend.shape[1]
+    """(S, S) information matrix of the shared parameters from the observations, for a sigma of 1.
+
+    Points and cameras are eliminated.
+    """
+    S = graph.shared_jacobian.shape[1]
     size = 6 * len(graph.poses) + S
     free, starts = np.arange(len(graph.poses)), np.searchsorted(graph.point_of, np.arange(len(graph.points) + 1))
     H, g, V, gp, W = _accumulate(
-        graph.poses, graph.points, starts, graph.camera_of, graph.bearing, graph.bend, graph.shared, free, size,
-        graph.sigma,
+        graph.poses, graph.points, starts, graph.camera_of, graph.bearing, graph.shared_jacobian, graph.shared, free,
+        size, graph.sigma,
     )  # fmt: skip
     H = _reduce(H, g, V, gp, W, starts, graph.camera_of, free, S, 0.0)[0] * graph.sigma**2
     between = H[:-S, -S:]
@@ -88,19 +95,19 @@ def _moved(poses: F64, shared: F64, step: F64, fixed: Bools) -> tuple[F64, F64]:
     return out, shared + step[6 * n :]
 
 
-def _away(graph: Graph, shared: F64) -> F64:
-    """(S,) of the shared parameters from what is believed of them."""
-    return shared - (graph.shared if graph.believed is None else graph.believed)
+def _prior_residual(graph: Graph, shared: F64) -> F64:
+    """(S,) difference of the shared parameters from the mean of their prior."""
+    return shared - (graph.shared if graph.shared_prior is None else graph.shared_prior)
 
 
 def _cost(graph: Graph, poses: F64, xyz: F64, shared: F64) -> float:
     total = _robust_cost(
-        poses, xyz, graph.point_of, graph.camera_of, graph.bearing, graph.bend, shared, graph.sigma
+        poses, xyz, graph.point_of, graph.camera_of, graph.bearing, graph.shared_jacobian, shared, graph.sigma
     ).sum()
-    for chord in graph.chords:
-        r = (np.linalg.norm(poses[chord.second, :3, 3] - poses[chord.first, :3, 3]) - chord.distance) / chord.sigma
+    for known in graph.distances:
+        r = (np.linalg.norm(poses[known.second, :3, 3] - poses[known.first, :3, 3]) - known.distance) / known.sigma
         total += math.log1p(r * r)
-    total += float(((_away(graph, shared) / graph.shared_sigma) ** 2).sum())
+    total += float(((_prior_residual(graph, shared) / graph.shared_sigma) ** 2).sum())
     for factor in graph.factors:
         residual = np.asarray(factor.residual(*(poses[c] for c in factor.cameras), factor.measured))
         total += float((residual**2).sum())
@@ -110,35 +117,35 @@ def _cost(graph: Graph, poses: F64, xyz: F64, shared: F64) -> float:
 def _normal(
     graph: Graph, poses: F64, xyz: F64, shared: F64, free: I64, starts: I64, size: int, points: bool
 ) -> tuple[F64, F64, F64, F64, F64]:
-    """Normal equations: H, g of cameras and shared parameters; V, gp of points; W between."""
+    """Normal equations: H, g of cameras and shared parameters; V, gp of points; W couples both."""
     H, g, V, gp, W = _accumulate(
-        poses, xyz, starts, graph.camera_of, graph.bearing, graph.bend, shared, free, size, graph.sigma
+        poses, xyz, starts, graph.camera_of, graph.bearing, graph.shared_jacobian, shared, free, size, graph.sigma
     )
     last = np.arange(size - len(shared), size)
     H[last, last] += 1 / graph.shared_sigma**2
-    g[last] += _away(graph, shared) / graph.shared_sigma**2
-    for chord in graph.chords:
-        between = poses[chord.second, :3, 3] - poses[chord.first, :3, 3]
+    g[last] += _prior_residual(graph, shared) / graph.shared_sigma**2
+    for known in graph.distances:
+        between = poses[known.second, :3, 3] - poses[known.first, :3, 3]
         length = max(float(np.linalg.norm(between)), 1e-9)
-        r = (length - chord.distance) / chord.sigma
+        r = (length - known.distance) / known.sigma
         J = np.zeros((1, size))
-        for camera, sign in ((chord.second, 1), (chord.first, -1)):
+        for camera, sign in ((known.second, 1), (known.first, -1)):
             if free[camera] >= 0:
-                J[0, 6 * free[camera] : 6 * free[camera] + 3] = sign * between / length / chord.sigma
+                J[0, 6 * free[camera] : 6 * free[camera] + 3] = sign * between / length / known.sigma
         w = 1 / (1 + r * r)
         H += w * J.T @ J
         g += w * J[0] * r
     for factor in graph.factors:
-        J, residual = _numeric(factor, poses, free, size)
+        J, residual = _numeric_jacobian(factor, poses, free, size)
         H += J.T @ J
         g += J.T @ residual
     return H, g, V, gp, W
 
 
-def _numeric(factor: Factor, poses: F64, free: I64, size: int) -> tuple[F64, F64]:
-    """Jacobian of a user's factor by central differences, and its residual."""
-    mine = [poses[c] for c in factor.cameras]
-    residual = np.atleast_1d(np.asarray(factor.residual(*mine, factor.measured), np.float64))
+def _numeric_jacobian(factor: Factor, poses: F64, free: I64, size: int) -> tuple[F64, F64]:
+    """Jacobian of a user-defined factor by central differences, and its residual."""
+    involved = [poses[c] for c in factor.cameras]
+    residual = np.atleast_1d(np.asarray(factor.residual(*involved, factor.measured), np.float64))
     J = np.zeros((len(residual), size))
     for k, camera in enumerate(factor.cameras):
         if free[camera] < 0:
@@ -148,8 +155,8 @@ def _numeric(factor: Factor, poses: F64, free: I64, size: int) -> tuple[F64, F64
             for h in (1e-6, -1e-6):
                 step = np.zeros((1, 6))
                 step[0, d] = h
-                moved, _ = _moved(mine[k][None], np.zeros(0), step.ravel(), np.zeros(1, bool))
-                ends.append(np.asarray(factor.residual(*mine[:k], moved[0], *mine[k + 1 :], factor.measured)))
+                moved, _ = _moved(involved[k][None], np.zeros(0), step.ravel(), np.zeros(1, bool))
+                ends.append(np.asarray(factor.residual(*involved[:k], moved[0], *involved[k + 1 :], factor.measured)))
             J[:, 6 * free[camera] + d] = (ends[0] - ends[1]) / 2e-6
     return J, residual
 
@@ -167,37 +174,40 @@ def _step(
     damping: float,
     points: bool,
 ) -> tuple[F64, F64]:
-    """Change of cameras and shared parameters (size,), and of points (P, 3)."""
+    """Update of cameras and shared parameters (size,), and of points (P, 3)."""
     from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-    still = np.zeros((len(V), 3))
+    fixed_points, n_shared = np.zeros((len(V), 3)), graph.shared_jacobian.shape[1]
     if points:
-        reduced, right = _reduce(H, g, V, gp, W, starts, graph.camera_of, free, graph.bend.shape[1], damping)
+        reduced, right = _reduce(H, g, V, gp, W, starts, graph.camera_of, free, n_shared, damping)
     else:
         reduced, right = H.copy(), g.copy()
     if not size:
-        return np.zeros(0), _back(np.zeros(0), V, gp, W, starts, graph.camera_of, free, graph.bend.shape[1], damping)
+        return np.zeros(0), _back_substitute(np.zeros(0), V, gp, W, starts, graph.camera_of, free, n_shared, damping)
     diagonal = np.diag_indices(size)
     reduced[diagonal] += damping * H[diagonal] + 1e-12
     try:
         step = -cho_solve(cho_factor(reduced), right)
     except (LinAlgError, ValueError):
-        return np.zeros(size), still
+        return np.zeros(size), fixed_points
     if not points:
-        return step, still
-    return step, _back(step, V, gp, W, starts, graph.camera_of, free, graph.bend.shape[1], damping)
+        return step, fixed_points
+    return step, _back_substitute(step, V, gp, W, starts, graph.camera_of, free, n_shared, damping)
 
 
 def _reduce(
     H: F64, g: F64, V: F64, gp: F64, W: F64, starts: I64, camera_of: I32, free: I64, n_shared: int, damping: float
 ) -> tuple[F64, F64]:
+    """H and g of cameras and shared parameters with the points eliminated (Schur complement)."""
     less, less_g = _schur(V, gp, W, starts, camera_of, free, n_shared, len(g), damping)
     return H - less, g - less_g
 
 
 @njit(cache=True, inline="always")
-def _transformed(T: F64, X: F64, bend: F64, shared: F64, R: F64) -> tuple[float, float, float, float, float, float]:
-    """Point in the camera's axes; `R` (3, 3) receives the camera's rotation, bent by the shared parameters."""
+def _transformed(
+    T: F64, X: F64, shared_jacobian: F64, shared: F64, R: F64
+) -> tuple[float, float, float, float, float, float]:
+    """Point in camera axes, and its offset in world axes; fills `R` (3, 3) with the rotation by shared parameters."""
     tx, ty, tz = T[0, 3], T[1, 3], T[2, 3]
     for r in range(3):
         for c in range(3):
@@ -205,13 +215,13 @@ def _transformed(T: F64, X: F64, bend: F64, shared: F64, R: F64) -> tuple[float,
     if shared.shape[0] > 0:
         wx, wy, wz = 0.0, 0.0, 0.0
         for s in range(shared.shape[0]):
-            tx += shared[s] * bend[s, 0]
-            ty += shared[s] * bend[s, 1]
-            tz += shared[s] * bend[s, 2]
-            wx += shared[s] * bend[s, 3]
-            wy += shared[s] * bend[s, 4]
-            wz += shared[s] * bend[s, 5]
-        for c in range(3):  # first order: such turns are small
+            tx += shared[s] * shared_jacobian[s, 0]
+            ty += shared[s] * shared_jacobian[s, 1]
+            tz += shared[s] * shared_jacobian[s, 2]
+            wx += shared[s] * shared_jacobian[s, 3]
+            wy += shared[s] * shared_jacobian[s, 4]
+            wz += shared[s] * shared_jacobian[s, 5]
+        for c in range(3):  # first order: these rotations are small
             a, b, d = T[0, c], T[1, c], T[2, c]
             R[0, c] = a + wy * d - wz * b
             R[1, c] = b + wz * a - wx * d
@@ -229,14 +239,14 @@ def _transformed(T: F64, X: F64, bend: F64, shared: F64, R: F64) -> tuple[float,
 
 @njit(cache=True, nogil=True)
 def _robust_cost(
-    poses: F64, xyz: F64, point_of: I32, camera_of: I32, bearing: F64, bend: F64, shared: F64, sigma: float
+    poses: F64, xyz: F64, point_of: I32, camera_of: I32, bearing: F64, shared_jacobian: F64, shared: F64, sigma: float
 ) -> F64:
-    """(O,) Cauchy's cost of every observation; of those behind the camera, that of a right angle."""
+    """(O,) Cauchy cost of every observation; for points behind the camera, that of a right angle."""
     out = np.empty(len(point_of))
     none = np.zeros((0, 6))
     for o in range(len(point_of)):
         R = np.empty((3, 3))
-        b = bend[o] if shared.shape[0] > 0 else none
+        b = shared_jacobian[o] if shared.shape[0] > 0 else none
         x, y, z, _, _, _ = _transformed(poses[camera_of[o]], xyz[point_of[o]], b, shared, R)
         p, q, s = bearing[o, 0], bearing[o, 1], bearing[o, 2]
         cx, cy, cz = q * z - s * y, s * x - p * z, p * y - q * x
@@ -255,12 +265,13 @@ def _accumulate(
     starts: I64,
     camera_of: I32,
     bearing: F64,
-    bend: F64,
+    shared_jacobian: F64,
     shared: F64,
     free: I64,
     size: int,
     sigma: float,
 ) -> tuple[F64, F64, F64, F64, F64]:
+    """Normal equations of the observations: H, g of cameras and shared parameters; V, gp of points; W couples both."""
     S = shared.shape[0]
     D = 6 + S
     n = len(starts) - 1
@@ -277,14 +288,14 @@ def _accumulate(
     for p in range(n):
         for o in range(starts[p], starts[p + 1]):
             camera = camera_of[o]
-            b = bend[o] if S > 0 else none
+            b = shared_jacobian[o] if S > 0 else none
             x, y, z, dx, dy, dz = _transformed(poses[camera], xyz[p], b, shared, R)
             length = math.sqrt(x * x + y * y + z * z)
             bx, by, bz = bearing[o, 0], bearing[o, 1], bearing[o, 2]
             if length < 1e-9 or bx * x + by * y + bz * z <= 0:
                 continue
             ux, uy, uz = x / length, y / length, z / length
-            # two directions across the bearing
+            # two directions perpendicular to the bearing
             if abs(bx) < 0.6:
                 e1x, e1y, e1z = 0.0, bz, -by
             else:
@@ -296,14 +307,14 @@ def _accumulate(
                 ex, ey, ez = (e1x, e1y, e1z) if k == 0 else (e2x, e2y, e2z)
                 dot = ex * ux + ey * uy + ez * uz
                 r[k] = dot
-                # e (I - u u') / length, turned to world: derivative by the point
+                # e (I - u u') / length, rotated to world axes: derivative by the point
                 fx, fy, fz = (ex - dot * ux) / length, (ey - dot * uy) / length, (ez - dot * uz) / length
                 wx = R[0, 0] * fx + R[0, 1] * fy + R[0, 2] * fz
                 wy = R[1, 0] * fx + R[1, 1] * fy + R[1, 2] * fz
                 wz = R[2, 0] * fx + R[2, 1] * fy + R[2, 2] * fz
                 Jp[k, 0], Jp[k, 1], Jp[k, 2] = wx, wy, wz
                 J[k, 0], J[k, 1], J[k, 2] = -wx, -wy, -wz
-                # turning the camera by w moves the point's place by -w x d: derivative w . (f x d)
+                # rotating the camera by w moves the point relative to it by -w x d: derivative w . (f x d)
                 J[k, 3], J[k, 4], J[k, 5] = wy * dz - wz * dy, wz * dx - wx * dz, wx * dy - wy * dx
                 for s in range(S):
                     total = 0.0
@@ -349,7 +360,7 @@ def _inverse3(A: F64, damping: float, out: F64) -> None:
 def _schur(
     V: F64, gp: F64, W: F64, starts: I64, camera_of: I32, free: I64, S: int, size: int, damping: float
 ) -> tuple[F64, F64]:
-    """What eliminating the points takes from H and g."""
+    """Schur complement: the terms that eliminating the points subtracts from H and g."""
     n = len(starts) - 1
     D = 6 + S
     H = np.zeros((size, size))
@@ -382,8 +393,10 @@ def _schur(
 
 
 @njit(cache=True, nogil=True)
-def _back(step: F64, V: F64, gp: F64, W: F64, starts: I64, camera_of: I32, free: I64, S: int, damping: float) -> F64:
-    """(P, 3) change of the points that follows from that of the cameras."""
+def _back_substitute(
+    step: F64, V: F64, gp: F64, W: F64, starts: I64, camera_of: I32, free: I64, S: int, damping: float
+) -> F64:
+    """(P, 3) update of the points from that of the cameras."""
     n = len(starts) - 1
     size = len(step)
     D = 6 + S

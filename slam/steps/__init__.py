@@ -1,1 +1,1 @@
-"""The steps from a video to a trajectory (D3.2, section 4.1), a file each; `flows/pipelines/video.py` chains them."""
+"""Steps from a video to a trajectory (D3.2, section 4.1), one module each; `flows/pipelines/video.py` chains them."""

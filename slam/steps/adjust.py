@@ -1,26 +1,27 @@
-"""Adjust: all keyframes and points of a video at once, afterwards."""
+"""Step `adjust`: global bundle adjustment of all keyframes and points of a video."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.slam.mapping.global_adjustment import adjust
-from scan2sim.slam.mapping.map_file import Mapped
+from scan2sim.slam.mapping.map_file import MapCheckpoint
 
 
 def adjust_all(inputs: Inputs, params: Params, out: Path, report: Report) -> Done:
-    """Move keyframes and points of `mapped` to where all observations fit best."""
-    mapped = Mapped.read(inputs["mapped"])
-    facts = adjust(mapped)
-    stays = f"{facts['witnesses']} features that had no say in it fit the adjusted path no better: odometry's is kept"
-    return Done({"mapped": mapped.write(out / "mapped.npz")}, facts, [] if facts["adjustment_kept"] else [stays])
+    """Global bundle adjustment of all keyframes and points of `mapped`, kept if held-out features fit it better."""
+    checkpoint = MapCheckpoint.read(inputs["mapped"])
+    metrics = adjust(checkpoint)
+    rejected = f"the adjusted path doesn't fit {metrics['witnesses']} held-out features better: odometry's path is kept"
+    warnings = [] if metrics["adjustment_kept"] else [rejected]
+    return Done({"mapped": checkpoint.write(out / "mapped.npz")}, metrics, warnings)
 
 
 def can_adjust(params: Params) -> None:
     """Raise an UnavailableError where pycolmap isn't installed."""
-    need("--adjust", "pycolmap")
+    require("--adjust", "pycolmap")
 
 
 ADJUST = Step("adjust", 4, adjust_all, Params, check=can_adjust)

@@ -1,4 +1,4 @@
-"""Encode: a video, as a link of so many Mbit/s would bring it."""
+"""Step `encode`: re-encodes a video at the resolution, frame rate and bitrate of a vehicle's link."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.parameters import Rate
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.slam.video import open_video
@@ -17,13 +17,13 @@ Pixels = Annotated[int, Field(ge=2, le=100_000, multiple_of=2)]
 
 
 class EncodeParams(Params):
-    """How the video comes; set by the recipe.
+    """Settings of the encoded video; set by the pipeline.
 
     Attributes:
-        size: pixels, width and height, even.
-        bitrate: Mbit/s that are aimed at.
-        rate: frames a second.
-        fps: of a source that is a folder of pictures.
+        size: width and height, even numbers of pixels.
+        bitrate: target bitrate, Mbit/s.
+        rate: frames per second.
+        fps: frames per second of a source that is a folder of images.
     """
 
     size: tuple[Pixels, Pixels] = (2048, 1024)
@@ -33,17 +33,17 @@ class EncodeParams(Params):
 
 
 def encode_video(inputs: Inputs, params: EncodeParams, out: Path, report: Report) -> Done:
-    """`video`, smaller, slower and worse."""
+    """Re-encode `video` at a lower resolution, frame rate and bitrate."""
     file = out / "video.mp4"
     video = open_video(inputs["video"], fps=params.fps)
     seconds = encode(video, file, size=params.size, bitrate=params.bitrate, rate=params.rate)
-    facts = {"width": params.size[0], "mbit_s": round(8e-6 * file.stat().st_size / seconds, 4)}
-    return Done({"video": file}, facts)
+    metrics = {"width": params.size[0], "mbit_s": round(8e-6 * file.stat().st_size / seconds, 4)}
+    return Done({"video": file}, metrics)
 
 
 def can_encode(params: Any) -> None:
-    """Raise an UnavailableError where PyAV isn't installed."""
-    need("slam study", "av", "matplotlib")
+    """Raise UnavailableError if PyAV or matplotlib isn't installed."""
+    require("slam study", "av", "matplotlib")
 
 
 ENCODE = Step("encode", 1, encode_video, EncodeParams, check=can_encode)

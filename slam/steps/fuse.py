@@ -1,4 +1,4 @@
-"""Fuse: where a scanner was at each of its sweeps, by all that tells: its sweeps, a trajectory, GPS."""
+"""Step `fuse`: the scanner's pose at each sweep, by sensor fusion of matched sweeps, a trajectory and GPS."""
 
 from __future__ import annotations
 
@@ -17,48 +17,58 @@ from scan2sim.pipeline.core.types import F64, Frame, GpsTrack, Trajectory
 from scan2sim.pipeline.importers import sweeps as io
 from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io.geodata import crs as crs_io
-from scan2sim.slam.lidar_odometry import Matched
+from scan2sim.slam.lidar_odometry import MatchedSweeps
 from scan2sim.slam.trajectory import output
-from scan2sim.slam.trajectory.fusion import BELIEVED, Fixes, Fused, Steps, camera_steps, fuse, lidar_steps
+from scan2sim.slam.trajectory.fusion import (
+    MODEL,
+    Fused,
+    GpsFixes,
+    RelativeMotions,
+    camera_motions,
+    fuse,
+    lidar_motions,
+)
 from scan2sim.slam.trajectory.gps import smooth
-from scan2sim.slam.trajectory.scale import MEMORY, SLOW
+from scan2sim.slam.trajectory.scale import GPS_BIAS_M, GPS_BIAS_S
 
-SMOOTHED = 2.0
-"""Seconds of a track that was smoothed whose scatter is the same."""
-SCATTER = 0.1
-"""Of a receiver's slow error, what its fixes scatter at least: a short track doesn't tell."""
-SHARPEST = 0.01
-"""Metres by which any receiver is off."""
-GAPS = 3.0
-"""Times what is usual between two poses: over more, there is none in between."""
+SMOOTHING_S = 2.0
+"""Correlation time of a smoothed track's scatter."""
+SCATTER_SHARE_MIN = 0.1
+"""Least scatter of fixes as a share of the slow error; a short track underestimates it."""
+GPS_SIGMA_MIN_M = 0.01
+"""Least error of any receiver."""
+POSE_GAP_FACTOR = 3.0
+"""Multiple of the median interval between poses above which there is a gap."""
 
 
 class FuseParams(Params):
-    """How the sensors belong together.
+    """Settings that relate the sensors.
 
     Attributes:
-        scanner_poses, time_offset, crs: as of `pipeline.importers.sweeps.Placing`.
-        gps_offset: seconds to add to GPS's times: to the clock of the trajectory, or of the sweeps.
+        scanner_poses: treat the poses as scanner poses even if extrinsics are given.
+        time_offset: seconds to add to the times of sweeps and photos.
+        gps_offset: seconds to add to GPS times, to convert them to the clock of the trajectory, or of the sweeps.
+        crs: projected CRS of the poses, such as "EPSG:32633"; "local" if they aren't georeferenced.
     """
 
-    scanner_poses: bool = Field(False, description="Poses are the scanner's all the same.")
-    time_offset: Shift = Field(0.0, description="Seconds to add to times of sweeps and photos.")
-    gps_offset: Shift = Field(0.0, description="Seconds to add to GPS's times.")
+    scanner_poses: bool = Field(False, description="Treat the poses as scanner poses even if extrinsics are given.")
+    time_offset: Shift = Field(0.0, description="Seconds to add to the times of sweeps and photos.")
+    gps_offset: Shift = Field(0.0, description="Seconds to add to GPS times.")
     crs: str = Field("local", description='CRS of the poses: "EPSG:32633", or "local".')
 
 
 def fuse_path(inputs: Inputs, params: FuseParams, out: Path, report: Report) -> Done:
-    """The path of `sweeps` by what there is of `matched`, `poses` (with `extrinsics`) and `gps`.
+    """Path of `sweeps` from any of `matched` sweeps, `poses` (with optional `extrinsics`), and `gps`.
 
-    Its times are the sweeps' own (`time_offset` counts where the others are looked up).
+    The result has the sweeps' own times; `time_offset` only converts them to the clock of the other inputs.
 
     Raises:
-        InputError: a file is damaged, or they are of different times.
-        DataError: nothing tells where any sweep was taken.
+        InputError: a file is damaged, or the times of the inputs don't overlap.
+        DataError: the pose of no sweep can be determined.
     """
-    files = io.files_of(inputs["sweeps"])
+    files = io.list_files(inputs["sweeps"])
     given = io.read_poses(inputs["poses"], params.crs) if "poses" in inputs else None
-    matched = Matched.load(inputs["matched"]) if "matched" in inputs else None
+    matched = MatchedSweeps.load(inputs["matched"]) if "matched" in inputs else None
     seconds = _seconds(inputs, files, None if given is None else given[0], matched)
     times = seconds + params.time_offset
     frame, camera, first, T_camera_scanner = Frame(), None, None, np.eye(4)
@@ -74,126 +84,139 @@ def fuse_path(inputs: Inputs, params: FuseParams, out: Path, report: Report) -> 
     elif given is not None and frame.crs != crs_io.LOCAL:
         fixes = _georeference(given[0], times)
     report(0.1, "solving")
-    lidar = None if matched is None else lidar_steps(matched)
+    lidar = None if matched is None else lidar_motions(matched)
     fused = fuse(times, lidar=lidar, camera=camera, T_camera_scanner=T_camera_scanner, fixes=fixes, first=first)
     path = fused.trajectory
     assert path.unsure is not None
     if path.unsure.all():
         raise DataError(
-            inputs["sweeps"], "show too little of one another to tell where they were taken",
-            "See that they follow each other by name, or give a trajectory",
+            inputs["sweeps"], "overlap too little with each other to determine the scanner's path",
+            "Check that the order of their names is the order of time, or give a trajectory",
         )  # fmt: skip
     warnings: list[str] = []
-    told = _told(fused, lidar, camera, "gps" in inputs, warnings.append)
+    summary = _summary(fused, lidar, camera, "gps" in inputs, warnings.append)
     output.write(out / "path", replace(path, times=seconds), frame)
     return Done(
         {"path": out / "path", "trajectory": out / "path" / "trajectory.csv"},
-        {"told": told, "unsure_share": round(float(path.unsure.mean()), 4)},
+        {"told": summary, "unsure_share": round(float(path.unsure.mean()), 4)},
         warnings,
     )
 
 
-def _seconds(inputs: Inputs, files: list[Path], path: Trajectory | None, matched: Matched | None) -> F64:
+def _seconds(inputs: Inputs, files: list[Path], path: Trajectory | None, matched: MatchedSweeps | None) -> F64:
     """(N,) seconds of each sweep, in the sweeps' own clock.
 
     Raises:
-        InputError: something asks for them, and nothing tells.
+        InputError: times are needed but unknown, or they don't increase.
     """
-    told = io.told_times(files, inputs.get("times"))
-    if told is None and path is not None:
-        told = io.moments(files, None, path, inputs["sweeps"])
-    if told is None and "gps" in inputs:
-        remedy = "Give their times in a file, seconds, one a line"
-        raise InputError(inputs["sweeps"], "its sweeps have no times, and GPS is known by time", remedy)
-    if told is None:
+    seconds = io.file_times(files, inputs.get("times"))
+    if seconds is None and path is not None:
+        seconds = io.timestamps(files, None, path, inputs["sweeps"])
+    if seconds is None and "gps" in inputs:
+        remedy = "Give a file with their times: seconds, one per line"
+        raise InputError(inputs["sweeps"], "its sweeps have no times, which GPS needs", remedy)
+    if seconds is None:
         assert matched is not None
         return matched.times
-    if len(told) < 2 or (np.diff(told) <= 0).any():
-        raise InputError(inputs["sweeps"], "its sweeps' times don't ascend", "Mend the times; each once, two at least")
-    return told
+    if len(seconds) < 2 or (np.diff(seconds) <= 0).any():
+        raise InputError(
+            inputs["sweeps"],
+            "its sweeps' times don't increase",
+            "Fix the times: at least two, each later than the last",
+        )
+    return seconds
 
 
-def _camera(path: Trajectory, times: F64, file: Path) -> Steps:
-    """The steps of a trajectory.
+def _camera(path: Trajectory, times: F64, file: Path) -> RelativeMotions:
+    """Relative motions of a trajectory.
 
     Raises:
-        InputError: it is of another time.
+        InputError: its times don't overlap with those of the sweeps.
     """
-    usual = float(np.median(np.diff(path.times))) if len(path) > 1 else 0.0
-    steps = camera_steps(path, times, max(io.GAP, GAPS * usual))
+    interval = float(np.median(np.diff(path.times))) if len(path) > 1 else 0.0
+    motions = camera_motions(path, times, max(io.MAX_POSE_GAP_S, POSE_GAP_FACTOR * interval))
     if times[-1] < path.times[0] or times[0] > path.times[-1]:
-        raise _apart(file, path.times, times, "--time-offset")
-    return steps
+        raise _no_time_overlap(file, path.times, times, "--time-offset")
+    return motions
 
 
-def _gps(file: Path, params: FuseParams, frame: Frame, times: F64) -> tuple[Frame, Fixes]:
-    """GPS's fixes at times (N,), and the frame they are in: the trajectory's if that is georeferenced, or their own.
+def _gps(file: Path, params: FuseParams, frame: Frame, times: F64) -> tuple[Frame, GpsFixes]:
+    """GPS positions at times (N,), and their frame: the trajectory's if it is georeferenced, else the track's.
 
     Raises:
-        InputError: the track can't be read, or is of another time.
+        InputError: the track can't be read, or its times don't overlap with those of the sweeps.
     """
     raw = gps_io.read(file).shifted(params.gps_offset)
     track = smooth(raw)
-    there = track.at(times)
-    if not np.isfinite(there).any():
-        raise _apart(file, track.times, times, "--gps-offset")
+    local = track.at(times)
+    if not np.isfinite(local).any():
+        raise _no_time_overlap(file, track.times, times, "--gps-offset")
     crs = track.frame.crs if params.crs == crs_io.LOCAL else params.crs
-    places = _into(track, there, crs)
+    positions = _in_crs(track, local, crs)
     if frame.crs == crs_io.LOCAL:
-        x, y, z = np.floor(places[np.isfinite(places[:, 0])][0]).tolist()
+        x, y, z = np.floor(positions[np.isfinite(positions[:, 0])][0]).tolist()
         frame = Frame(crs, (x, y, z))
     rate = len(times) / max(float(times[-1] - times[0]), 1e-9)
-    slow = SLOW if track.sigma is None else max(float(np.median(track.sigma)), SHARPEST)
-    scatter = max(track.scatter, SCATTER * slow) * np.sqrt(max(1.0, rate * SMOOTHED))
-    return frame, Fixes(frame.to_local(places), float(scatter), slow, MEMORY)
+    bias = GPS_BIAS_M if track.sigma is None else max(float(np.median(track.sigma)), GPS_SIGMA_MIN_M)
+    scatter = max(track.scatter, SCATTER_SHARE_MIN * bias) * np.sqrt(max(1.0, rate * SMOOTHING_S))
+    return frame, GpsFixes(frame.to_local(positions), float(scatter), bias, GPS_BIAS_S)
 
 
-def _into(track: GpsTrack, there: F64, crs: str) -> F64:
-    """(N, 3) places of a track in another CRS; heights stay as they are."""
-    places = track.frame.to_crs(there)
+def _in_crs(track: GpsTrack, local: F64, crs: str) -> F64:
+    """(N, 3) local positions of a track, converted to a CRS; heights stay unchanged."""
+    positions = track.frame.to_crs(local)
     if crs_io.LOCAL in (crs, track.frame.crs) or crs_io.same(crs, track.frame.crs):
-        return places
+        return positions
     from pyproj import CRS, Transformer
 
-    own, wanted = (CRS.from_user_input(one).to_2d() for one in (track.frame.crs, crs))
-    x, y = Transformer.from_crs(own, wanted, always_xy=True).transform(places[:, 0], places[:, 1])
-    return np.column_stack([x, y, places[:, 2]])
+    own, target = (CRS.from_user_input(one).to_2d() for one in (track.frame.crs, crs))
+    x, y = Transformer.from_crs(own, target, always_xy=True).transform(positions[:, 0], positions[:, 1])
+    return np.column_stack([x, y, positions[:, 2]])
 
 
-def _georeference(path: Trajectory, times: F64) -> Fixes:
-    """What a georeferenced trajectory says of places: it was tied by GPS, which errs slowly."""
+def _georeference(path: Trajectory, times: F64) -> GpsFixes:
+    """Positions of a georeferenced trajectory as GPS fixes: it was aligned to GPS, and has its slow error."""
     known = GpsTrack(path.times, path.positions)
-    places = known.at(times)
+    positions = known.at(times)
     if path.unsure is not None:
-        places[np.interp(times, path.times, path.unsure) > 0] = np.nan
-    sigma = SLOW
+        positions[np.interp(times, path.times, path.unsure) > 0] = np.nan
+    sigma = GPS_BIAS_M
     if path.covariance is not None:
         sigma = float(np.median(np.sqrt(path.covariance[:, 0, 0] + path.covariance[:, 1, 1]) / np.sqrt(2)))
     rate = len(times) / max(float(times[-1] - times[0]), 1e-9)
-    sigma = max(sigma, SHARPEST)
-    return Fixes(places, SCATTER * sigma * float(np.sqrt(max(1.0, rate * SMOOTHED))), sigma, MEMORY)
+    sigma = max(sigma, GPS_SIGMA_MIN_M)
+    scatter = SCATTER_SHARE_MIN * sigma * float(np.sqrt(max(1.0, rate * SMOOTHING_S)))
+    return GpsFixes(positions, scatter, sigma, GPS_BIAS_S)
 
 
-def _apart(file: Path, own: F64, times: F64, option: str) -> InputError:
+def _no_time_overlap(file: Path, own: F64, times: F64, option: str) -> InputError:
     spans = f"spans {own[0]:.2f} to {own[-1]:.2f} s, the sweeps {times[0]:.2f} to {times[-1]:.2f} s"
-    return InputError(file, spans, f"Give times of one clock, or {option}")
+    return InputError(file, spans, f"Give times of the same clock, or {option}")
 
 
-def _told(fused: Fused, lidar: Steps | None, camera: Steps | None, gps: bool, warn: Callable[[str], None]) -> str:
-    """What was used, in words."""
+def _summary(
+    fused: Fused,
+    lidar: RelativeMotions | None,
+    camera: RelativeMotions | None,
+    gps: bool,
+    warn: Callable[[str], None],
+) -> str:
+    """Summary for the report: which sensors determined the path, and to what share."""
     parts = []
-    for name, what, steps in (("lidar", "sweeps", lidar), ("camera", "trajectory", camera)):
-        if steps is not None:
-            share = float((steps.sure & (fused.trust[name] > BELIEVED)).mean())
-            parts.append(f"{what} ({100 * share:.0f} % of the steps)")
+    for name, label, motions in (("lidar", "sweeps", lidar), ("camera", "trajectory", camera)):
+        if motions is not None:
+            share = float((motions.sure & (fused.trust[name] > MODEL.trust_min)).mean())
+            parts.append(f"{label} ({100 * share:.0f} % of the motions)")
     if lidar is not None and camera is not None:
         both = lidar.sure & camera.sure
-        against = both & (np.minimum(fused.trust["lidar"], fused.trust["camera"]) < BELIEVED)
-        if both.any() and against.sum() > 0.5 * both.sum():
-            part = f"{100 * against.sum() / both.sum():.0f} %"
-            warn(f"sweeps and trajectory contradict each other at {part} of the steps: are extrinsics, times right?")
+        contradicting = both & (np.minimum(fused.trust["lidar"], fused.trust["camera"]) < MODEL.trust_min)
+        if both.any() and contradicting.sum() > 0.5 * both.sum():
+            part = f"{100 * contradicting.sum() / both.sum():.0f} %"
+            warn(f"sweeps and trajectory contradict each other in {part} of the motions: check extrinsics and times")
     if gps:
-        parts.append(f"GPS ({int((fused.trust['gps'] > BELIEVED).sum())} of {len(fused.trust['gps'])} places)")
+        parts.append(
+            f"GPS ({int((fused.trust['gps'] > MODEL.trust_min).sum())} of {len(fused.trust['gps'])} positions)"
+        )
     return "placed by " + ", ".join(parts)
 
 

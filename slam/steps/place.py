@@ -1,4 +1,4 @@
-"""Place: poses of a video's frames become a trajectory: upright, in GPS's scale, where GPS says; in all formats."""
+"""Step `place`: aligns a video's poses (upright, scaled by GPS, georeferenced) and writes the trajectory."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
-from scan2sim.slam.mapping.map_file import Mapped
+from scan2sim.slam.mapping.map_file import MapCheckpoint
 from scan2sim.slam.mapping.sparse_model import sparse_map
 from scan2sim.slam.trajectory import output
-from scan2sim.slam.trajectory.align import finish
+from scan2sim.slam.trajectory.align import aligned_trajectory
 
 
 class PlaceParams(Params):
-    """What is made of the poses.
+    """Settings of the trajectory's alignment and output.
 
     Attributes:
-        georeference: place the trajectory where GPS says; else GPS ties its scale alone.
-        colmap: give the COLMAP model its points, too.
+        georeference: georeference the trajectory by GPS; otherwise GPS determines only its scale.
+        colmap: write points and observations into the COLMAP model; otherwise it has only the poses.
     """
 
     georeference: bool = True
@@ -26,20 +26,21 @@ class PlaceParams(Params):
 
 
 def place(inputs: Inputs, params: PlaceParams, out: Path, report: Report) -> Done:
-    """The trajectory of `mapped` as `trajectory.csv`, `.tum`, `.kitti`, `.geojson` where it is georeferenced."""
-    mapped = Mapped.read(inputs["mapped"])
-    trajectory, placing = finish(mapped, mapped.gps, georeference=params.georeference)
+    """Write the trajectory of `mapped` as `trajectory.csv`, `.tum`, `.kitti`, and `.geojson` if georeferenced."""
+    checkpoint = MapCheckpoint.read(inputs["mapped"])
+    trajectory, alignment = aligned_trajectory(checkpoint, checkpoint.gps, georeference=params.georeference)
     folder = out / "path"
-    sparse = sparse_map(mapped, placing, trajectory) if params.colmap else None
-    output.write(folder, trajectory, placing.frame, camera=mapped.camera, names=mapped.names, sparse=sparse)
+    sparse = sparse_map(checkpoint, alignment, trajectory) if params.colmap else None
+    output.write(folder, trajectory, alignment.frame, camera=checkpoint.camera, names=checkpoint.names, sparse=sparse)
     assert trajectory.unsure is not None
-    way = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
-    facts = {
-        "length_m": round(float(way.sum()), 2),
+    lengths = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
+    metrics = {
+        "length_m": round(float(lengths.sum()), 2),
         "unsure_share": round(float(trajectory.unsure.mean()), 4),
     }
-    alone = "there is no GPS: lengths are in multiples of the first two keyframes' distance"
-    return Done({"path": folder, "trajectory": folder / "trajectory.csv"}, facts, [] if mapped.gps else [alone])
+    unscaled = "without GPS the scale is unknown: the unit of length is the distance of the first two keyframes"
+    warnings = [] if checkpoint.gps else [unscaled]
+    return Done({"path": folder, "trajectory": folder / "trajectory.csv"}, metrics, warnings)
 
 
 PLACE = Step("place", 2, place, PlaceParams)

@@ -1,4 +1,4 @@
-"""Track: a video, frame by frame, to poses and a map; goes on where it was killed."""
+"""Step `track`: visual odometry over a video, resumed from a checkpoint if it was interrupted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import Field
 
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.parameters import Focal, Pixels, Rate, Shift
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import U8, Camera, GpsTrack
@@ -19,12 +19,12 @@ from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io.images import image
 from scan2sim.slam import features, matchers, solvers, trackers
 from scan2sim.slam.calibration import calibrate, lens
-from scan2sim.slam.calibration.camera import Found, camera_of, found
-from scan2sim.slam.mapping.map_file import Mapped
+from scan2sim.slam.calibration.camera import EstimatedCamera, camera_of, estimated_camera
+from scan2sim.slam.mapping.map_file import MapCheckpoint
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
-from scan2sim.slam.odometry.track_log import Recording, record
+from scan2sim.slam.odometry.track_log import TrackLog, record_tracks
 from scan2sim.slam.odometry.video_odometry import VERSION, track
-from scan2sim.slam.odometry.virtual_cameras import Facets
+from scan2sim.slam.odometry.virtual_cameras import VirtualViews
 from scan2sim.slam.trackers import Tracker
 from scan2sim.slam.tracking_video import Recorder
 from scan2sim.slam.trajectory.gps import smooth
@@ -32,29 +32,44 @@ from scan2sim.slam.video import Video, open_video
 
 
 class Filmed(Params):
-    """How a video was filmed, and what follows it."""
+    """Camera, timing and backends of a video's odometry."""
 
-    camera: str = Field("auto", description="auto, equirectangular or pinhole.")
-    focal: Focal | None = Field(None, description="Pixels, of a pinhole camera; default: EXIF's, or what fits best.")
-    centre: tuple[Pixels, Pixels] | None = Field(None, description="Pixels; default: the middle.")
-    k1: Annotated[float, Field(ge=-1, le=1)] | None = Field(None, description="Radial distortion, OpenCV's.")
-    calibrate: bool = Field(False, description="Find focal length, centre and k1 that fit the whole drive.")
-    fps: Rate = Field(10.0, description="Of a folder of pictures.")
-    every: Annotated[int, Field(ge=1, le=1_000_000)] = Field(1, description="Take every Nth frame.")
-    until: Annotated[float, Field(ge=0, le=1e7)] = Field(0.0, description="Seconds of the video; 0: all.")
-    gps_offset: Shift | None = Field(None, description="Seconds to add to its times; first frame at 0.")
-    backend: str = Field("lm", description="lm, or adam: the mission's.")
-    features: str = Field("corners", description="corners (tracked), orb, rootsift, superpoint, aliked.")
-    matcher: str = Field("nearest", description="nearest, superglue, lightglue.")
+    camera: str = Field("auto", description="Camera model: equirectangular, pinhole, or auto (by the aspect ratio).")
+    focal: Focal | None = Field(
+        None, description="Focal length of a pinhole camera in pixels; default: from EXIF, or self-calibration."
+    )
+    centre: tuple[Pixels, Pixels] | None = Field(
+        None, description="Principal point of a pinhole camera in pixels; default: the image centre."
+    )
+    k1: Annotated[float, Field(ge=-1, le=1)] | None = Field(
+        None, description="Radial distortion k1 of a pinhole camera (OpenCV model); default: none."
+    )
+    calibrate: bool = Field(
+        False, description="Estimate focal length, principal point and k1 by self-calibration over the whole video."
+    )
+    fps: Rate = Field(10.0, description="Frames per second of a folder of images without times.")
+    every: Annotated[int, Field(ge=1, le=1_000_000)] = Field(1, description="Process every Nth frame.")
+    until: Annotated[float, Field(ge=0, le=1e7)] = Field(
+        0.0, description="Process only this many seconds of the video; 0: all of it."
+    )
+    gps_offset: Shift | None = Field(
+        None,
+        description="Seconds to add to GPS times, so that they count from the first frame; default: by the clocks.",
+    )
+    backend: str = Field("lm", description="Solver: lm (Levenberg-Marquardt), or adam (as in D3.2).")
+    features: str = Field(
+        "corners", description="Features: corners (optical flow), orb, rootsift, superpoint or aliked."
+    )
+    matcher: str = Field("nearest", description="Matcher of features: nearest, superglue or lightglue.")
 
 
 class TrackParams(OdometryParams, Filmed):
-    """See `Filmed` and `OdometryParams`.
+    """Settings of the step, besides those of `Filmed` and `OdometryParams`.
 
     Attributes:
-        cameras: of which the one of the video's size is taken; set by the recipe from a tile.
-        keep: keep all points, for loops, adjustment and COLMAP; set by the recipe.
-        view: record what is tracked, and where.
+        cameras: cameras of a tile, of which the one with the video's image size is used; set by the pipeline.
+        keep: keep all points and observations, for loop closure, global adjustment and COLMAP; set by the pipeline.
+        view: record a video of the tracked features and the path.
     """
 
     cameras: tuple[dict[str, Any], ...] = ()
@@ -63,79 +78,79 @@ class TrackParams(OdometryParams, Filmed):
 
 
 def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, checkpoint: Path) -> Done:
-    """Follow `video` (a file, or a folder of pictures with `times`), with `gps`, `mask` and weights if there are any.
+    """Visual odometry over `video` (a file, or a folder of images with `times`), with optional `gps`, `mask`, weights.
 
     Raises:
-        InputError: one of them can't be read, or the camera isn't known.
+        InputError: an input can't be read, or the camera is unknown.
         DataError: the video is too short.
     """
     video = open_video(inputs["video"], fps=params.fps, times=inputs.get("times"))
     mask = read_mask(video, inputs.get("mask"))
 
-    def recorded() -> Recording:
-        return record(video, mask, every=params.every, until=params.until or None, report=report)
+    def track_log() -> TrackLog:
+        return record_tracks(video, mask, every=params.every, until=params.until or None, report=report)
 
-    camera, own = video_camera(video, params, recorded, checkpoint / "lens.json")
-    warnings: list[str] = [own.told()] if own is not None else []
+    camera, estimated = video_camera(video, params, track_log, checkpoint / "lens.json")
+    warnings: list[str] = [estimated.message()] if estimated is not None else []
     gps = read_gps(video, inputs.get("gps"), params.gps_offset, warnings.append)
-    tracker, about = tracker_of(camera, mask, params, inputs)
+    tracker, description = tracker_of(camera, mask, params, inputs)
 
     def start(warn: Callable[[str], None]) -> Odometry:
         return Odometry(
             camera, params, mask=mask, gps=gps, backend=params.backend, keep=params.keep, warn=warn, tracker=tracker
         )
 
-    film = out / "view.mp4"
-    with Recorder(film, fps=video.fps / params.every) if params.view else nullcontext() as recorder:
+    view = out / "view.mp4"
+    with Recorder(view, fps=video.fps / params.every) if params.view else nullcontext() as recorder:
         run = track(
             video, start, every=params.every, until=params.until or None, state=checkpoint / "state.npz",
             watch=recorder, report=report,
         )  # fmt: skip
-    wrong = _doubted(camera, run.odometry, recorded)
-    warnings += [] if wrong is None or params.calibrate else [wrong]
-    files = {"mapped": Mapped.of(run.odometry, run.names).write(out / "mapped.npz")}
-    films = {"view": film} if params.view else {}
+    wrong_lens = _lens_warning(camera, run.odometry, track_log)
+    warnings += [] if wrong_lens is None or params.calibrate else [wrong_lens]
+    files = {"mapped": MapCheckpoint.of(run.odometry, run.names).write(out / "mapped.npz")}
+    views = {"view": view} if params.view else {}
+    metrics = run.metrics() | ({"told": description} if description else {})
     return Done(
-        files | films, run.facts() | ({"told": about} if about else {}) | (own.facts() if own else {}),
-        [*warnings, *dict.fromkeys(run.warnings)],
-    )  # fmt: skip
+        files | views, metrics | (estimated.metrics() if estimated else {}), [*warnings, *dict.fromkeys(run.warnings)]
+    )
 
 
-def _doubted(camera: Camera, odometry: Odometry, recorded: Callable[[], Recording]) -> str | None:
-    """What is wrong with the lens, as turns tell; where the path was lost, by looking for it as if it weren't known."""
+def _lens_warning(camera: Camera, odometry: Odometry, track_log: Callable[[], TrackLog]) -> str | None:
+    """Warning if the lens doesn't fit the turns; if tracking was lost too often, after calibration from scratch."""
     if camera.model not in lens.MODELS:
         return None
-    said = lens.told(camera, lens.better(camera, odometry.map.misfits))
-    if calibrate.lost(odometry) < calibrate.LOST:
-        return said
-    return lens.told(camera, calibrate.looked_for(recorded())) or said
+    warning = lens.lens_warning(camera, lens.fit_lens(camera, odometry.map.misfits))
+    if calibrate.lost_share(odometry) < calibrate.LOST_SHARE_MAX:
+        return warning
+    return lens.lens_warning(camera, calibrate.calibrated_from_scratch(track_log())) or warning
 
 
 def can_track(params: TrackParams) -> None:
-    """Raise a ScanError for backends that don't exist, or can't run here."""
+    """Raise a ScanError if a backend doesn't exist, or a package that it needs isn't installed."""
     solvers.named(params.backend)
     if params.features != "corners":
         plugins.find(features.__name__, params.features, "track.features")
         plugins.find(matchers.__name__, params.matcher, "track.matcher")
     if params.view:
-        need("--view", "av")
+        require("--view", "av")
 
 
 def video_camera(
-    video: Video, params: TrackParams, recorded: Callable[[], Recording], kept: Path
-) -> tuple[Camera, Found | None]:
-    """Of the frames: as is said, or the one of a tile's that has their size; or as was found, which is `kept`.
+    video: Video, params: TrackParams, track_log: Callable[[], TrackLog], cache: Path
+) -> tuple[Camera, EstimatedCamera | None]:
+    """Camera of the frames: from a tile, from the options, or estimated; an estimate is stored in the file `cache`.
 
     Raises:
-        InputError: there is none.
+        InputError: the camera is unknown.
     """
-    said = _tile_camera(video, params) or camera_of(video, params.camera, params.focal, params.centre, params.k1)
-    own = Found.read(kept) or found(video, said, recorded, calibrate=params.calibrate)
-    if own is not None:
-        own.write(kept)
-        return own.camera, own
-    assert said is not None
-    return said, None
+    given = _tile_camera(video, params) or camera_of(video, params.camera, params.focal, params.centre, params.k1)
+    estimated = EstimatedCamera.read(cache) or estimated_camera(video, given, track_log, calibrate=params.calibrate)
+    if estimated is not None:
+        estimated.write(cache)
+        return estimated.camera, estimated
+    assert given is not None
+    return given, None
 
 
 def _tile_camera(video: Video, params: TrackParams) -> Camera | None:
@@ -145,38 +160,43 @@ def _tile_camera(video: Video, params: TrackParams) -> Camera | None:
             return camera
     if params.cameras:
         size = f"{video.width}x{video.height}"
-        raise InputError(video.path, f"the tile has no camera of {size}", "Give --camera and --focal")
+        raise InputError(
+            video.path, f"the tile has no camera with an image size of {size}", "Give --camera and --focal"
+        )
     return None
 
 
 def read_gps(video: Video, path: Path | None, offset: float | None, warn: Callable[[str], None]) -> GpsTrack | None:
-    """The track in the frames' times, smoothed.
+    """Smoothed GPS track in the frames' times; None without a file.
 
     Args:
-        offset: seconds that are added to its times; None: as the clocks of both tell.
+        video: the video.
+        path: GPS file.
+        offset: seconds to add to its times; None: determined from both clocks.
+        warn: receives a warning if the clocks can't be compared.
 
     Raises:
-        InputError: it can't be read.
+        InputError: the file can't be read.
     """
     if path is None:
         return None
-    found = gps_io.read(path)
-    absolute = found.times[0] > 1e8
+    gps = gps_io.read(path)
+    absolute = gps.times[0] > 1e8
     if offset is not None:
-        found = found.shifted(offset)
-    elif absolute and video.start is not None and abs(video.start - found.times[0]) < 3600:
-        found = found.shifted(-video.start)
+        gps = gps.shifted(offset)
+    elif absolute and video.start is not None and abs(video.start - gps.times[0]) < 3600:
+        gps = gps.shifted(-video.start)
     elif absolute:
-        warn("no clock of the video's: its first frame is taken to be at the first fix")
-        found = found.shifted(-float(found.times[0]))
-    return smooth(found)
+        warn("the video has no start time: its first frame is assumed to be at the first GPS fix (see --gps-offset)")
+        gps = gps.shifted(-float(gps.times[0]))
+    return smooth(gps)
 
 
 def read_mask(video: Video, path: Path | None) -> U8 | None:
-    """(H, W) of the frames' size, 0 where the car itself is seen.
+    """Ego-vehicle mask (H, W) in the frames' size, 0 where the car itself is visible; None without a file.
 
     Raises:
-        InputError: it can't be read.
+        InputError: the file can't be read.
     """
     if path is None:
         return None
@@ -187,14 +207,14 @@ def read_mask(video: Video, path: Path | None) -> U8 | None:
 
 
 def tracker_of(camera: Camera, mask: U8 | None, params: TrackParams, inputs: Inputs) -> tuple[Tracker, str]:
-    """What follows features: corners by Lucas-Kanade, or descriptors from frame to frame (D3.2); and what it is."""
-    facets = Facets(camera)
+    """Feature tracker (corners by Lucas-Kanade, or descriptors as in D3.2), and its description for the report."""
+    views = VirtualViews(camera)
     if params.features == "corners":
-        return trackers.named("corners", facets, mask, params.count), ""
+        return trackers.named("corners", views, mask, params.count), ""
     detector = features.named(params.features, inputs.get("weights"))
     matcher = matchers.named(params.matcher, inputs.get("matcher_weights"))
     matchers.check(detector, matcher)
-    tracker = trackers.named("descriptors", facets, mask, params.count, detector, matcher)
+    tracker = trackers.named("descriptors", views, mask, params.count, detector, matcher)
     return tracker, f"{detector.describe()}; {matcher.describe()}"
 
 

@@ -1,4 +1,4 @@
-"""Trackers of features through frames: one file for each backend, found by its name (`pipeline.core.plugins`)."""
+"""Feature trackers. Each backend is a module in this package, loaded by its name (`pipeline.core.plugins`)."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.types import F64, I64, U8, Bools
 from scan2sim.slam.features import Features
 from scan2sim.slam.matchers import Matcher
-from scan2sim.slam.odometry.virtual_cameras import Facets
+from scan2sim.slam.odometry.virtual_cameras import VirtualViews
 
 
 @dataclass
 class Tracks:
-    """Features that are followed.
+    """Tracked features.
 
     Attributes:
-        ids: (N,) numbers that stay a feature's own.
-        bearing: (N, 3) unit, in the axes of the last frame's camera.
+        ids: (N,) ids, unique and constant over the life of a track.
+        bearing: (N, 3) unit vectors, in the axes of the last frame's camera.
     """
 
     ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -30,65 +30,65 @@ class Tracks:
         return len(self.ids)
 
     def keep(self, mask: Bools) -> Tracks:
-        """Those that `mask` (N,) selects."""
+        """Tracks selected by `mask` (N,)."""
         return Tracks(self.ids[mask], self.bearing[mask])
 
 
 class Tracker(Protocol):
-    """A backend that has begun.
+    """Interface of a tracker.
 
     Attributes:
-        tracks: of the last frame.
-        pictures: facets of the last frame.
+        tracks: tracks in the last frame.
+        images: virtual views of the last frame.
     """
 
     tracks: Tracks
-    pictures: list[U8]
+    images: list[U8]
 
     def track(self, grey: U8, expected: F64 | None = None) -> float:
-        """Follow all tracks into the next frame; returns the share that could be followed.
+        """Track all features into the next frame; returns the share that was tracked.
 
         Args:
-            grey: (H, W).
-            expected: (N, 3) bearings where they are probably seen now.
+            grey: (H, W) next frame.
+            expected: (N, 3) predicted bearings of the tracks.
         """
 
     def drop(self, ids: I64) -> None:
-        """Don't follow these any more."""
+        """Stop tracking these ids."""
 
     def refill(self) -> int:
-        """Find features where few are followed; how many."""
+        """Detect new features where there are few tracks; returns how many were added."""
 
 
 class Backend(Protocol):
-    """What a backend's module has."""
+    """Interface of a backend's module."""
 
     def load(
-        self, facets: Facets, mask: U8 | None, count: int, features: Features | None, matcher: Matcher | None
+        self, views: VirtualViews, mask: U8 | None, count: int, features: Features | None, matcher: Matcher | None
     ) -> Tracker:
         """See `named`."""
 
 
 def named(
     name: str,
-    facets: Facets,
+    views: VirtualViews,
     mask: U8 | None,
     count: int,
     features: Features | None = None,
     matcher: Matcher | None = None,
 ) -> Tracker:
-    """A backend.
+    """Load the tracker backend of a name.
 
     Args:
-        name: of its file here.
-        facets: of the frames.
-        mask: (H, W), 0 where the car itself is; None: nowhere.
-        count: features to keep alive.
-        features, matcher: for a backend that finds features and matches them.
+        name: name of the backend's module in this package.
+        views: virtual views of the frames.
+        mask: (H, W) ego-vehicle mask, 0 where the car itself is visible; None: nowhere.
+        count: number of features to track.
+        features, matcher: feature detector and matcher, for backends that use them.
 
     Raises:
-        SettingError: there is none of that name, or it lacks features or a matcher, or they don't fit.
-        UnavailableError: it can't run here.
+        SettingError: there is no such backend, or its features or matcher are missing or don't fit each other.
+        UnavailableError: a package that it needs isn't installed.
     """
     backend: Backend = plugins.find(__name__, name, "slam.tracker")
-    return backend.load(facets, mask, count, features, matcher)
+    return backend.load(views, mask, count, features, matcher)

@@ -1,4 +1,4 @@
-"""Trajectories: aligned to GPS, scaled, fused with other sensors, evaluated against ground truth, written.
+"""Trajectories: alignment to GPS, scale correction, sensor fusion, evaluation against ground truth, output.
 
-Begin with `align` (upright, scaled, georeferenced); `fusion` is the pose graph over sweeps, video and GPS.
+Start reading at `align` (upright, scaled, georeferenced). `fusion` is the pose graph over sweeps, video and GPS.
 """

@@ -1,4 +1,4 @@
-"""Finish: what odometry placed becomes a trajectory: upright, in GPS's scale, where GPS says."""
+"""Alignment: turns odometry's poses into a trajectory that is upright, scaled by GPS and georeferenced."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import F64, I64, Frame, GpsTrack, Trajectory
 from scan2sim.slam.geometry import exp_so3
-from scan2sim.slam.mapping.covariance import covariances, moved
-from scan2sim.slam.mapping.map_file import Mapped
+from scan2sim.slam.mapping.covariance import covariances, transformed
+from scan2sim.slam.mapping.map_file import MapCheckpoint
 from scan2sim.slam.trajectory import scale
 
 
 @dataclass(frozen=True)
-class Placing:
-    """How the camera's own world becomes that of the trajectory.
+class Alignment:
+    """Transform from odometry's world to that of the trajectory.
 
     Attributes:
-        R: (3, 3) rotation, then
-        shift: (3,) metres.
-        factor: (T - 1,) what every step's length is multiplied by.
-        frame: of the result.
+        R: (3, 3) rotation, applied before `shift`.
+        shift: (3,) translation, metres.
+        factor: (T - 1,) scale factors of the motions between poses.
+        frame: coordinate frame of the result.
     """
 
     R: F64
@@ -30,42 +30,56 @@ class Placing:
     frame: Frame
 
     def points(self, xyz: F64, at: I64, before: F64, after: Trajectory) -> F64:
-        """Points (P, 3) of the camera's world, carried along with the poses `at` (P,) which they were seen from.
+        """Transform points; each moves with the pose that observed it.
 
-        `before` (T, 3) are the positions in the camera's world, `after` the finished trajectory.
+        Args:
+            xyz: (P, 3) points in odometry's world.
+            at: (P,) index of the pose that observed each point.
+            before: (T, 3) positions in odometry's world.
+            after: the finished trajectory.
+
+        Returns:
+            (P, 3) points in the trajectory's frame.
         """
         steps = np.append(self.factor, self.factor[-1:] if len(self.factor) else [1.0])
         return (xyz - before[at]) * steps[at, None] @ self.R.T + after.positions[at]
 
 
-def finish(mapped: Mapped, gps: GpsTrack | None, *, georeference: bool = True) -> tuple[Trajectory, Placing]:
-    """The trajectory, camera to a z-up world; `gps` in the frames' times ties its scale, and places it.
+def aligned_trajectory(
+    checkpoint: MapCheckpoint, gps: GpsTrack | None, *, georeference: bool = True
+) -> tuple[Trajectory, Alignment]:
+    """Trajectory, camera to a z-up world, and the transform to it.
 
-    Without GPS, the world begins at the first camera, its x axis along that camera's view.
+    Args:
+        checkpoint: odometry's result.
+        gps: GPS track in the frames' times, from which scale and position are determined. Without it, the origin is
+            the first camera, and the x axis its viewing direction.
+        georeference: place the trajectory by GPS; otherwise GPS determines only the scale.
     """
-    placed = mapped.placed
+    placed = checkpoint.placed
     times = np.array([p.time for p in placed])
     unsure = np.array([p.unsure for p in placed])
-    poses = np.stack([mapped.pose_of(p) for p in placed])
+    poses = np.stack([checkpoint.pose_of(p) for p in placed])
     R = upright(poses)
     positions, rotations = poses[:, :3, 3] @ R.T, R @ poses[:, :3, :3]
     factor, frame = np.ones(len(times) - 1), Frame()
     if gps is not None:
-        drifting = scale.AROUND if mapped.camera.model == "equirectangular" else scale.AHEAD
-        factor = scale.factors(times, positions, unsure, gps, drifting)
+        equirectangular = checkpoint.camera.model == "equirectangular"
+        drift = scale.DRIFT_360 if equirectangular else scale.DRIFT_PERSPECTIVE
+        factor = scale.factors(times, positions, unsure, gps, drift)
         positions = scale.apply(positions, factor)
         if georeference:
-            turn, shift = place(positions, gps.at(times))
+            turn, shift = align_to_gps(positions, gps.at(times))
             R, positions, rotations = turn @ R, positions @ turn.T + shift, turn @ rotations
             frame = gps.frame
     unit = float(np.median(factor)) if len(factor) else 1.0
-    covariance = moved(covariances(mapped, gps, unit, placed=gps is not None and georeference), R, unit)
+    covariance = transformed(covariances(checkpoint, gps, unit, placed=gps is not None and georeference), R, unit)
     trajectory = Trajectory(times, positions, rotations, unsure, covariance)
-    return trajectory, Placing(R, positions[0] - poses[0, :3, 3] @ R.T, factor, frame)
+    return trajectory, Alignment(R, positions[0] - poses[0, :3, 3] @ R.T, factor, frame)
 
 
 def upright(poses: F64) -> F64:
-    """(3, 3) rotation to a z-up world whose x axis is the first view's direction: cameras stand upright on average."""
+    """(3, 3) rotation to a z-up world; assumes that cameras are upright on average. x is the first view direction."""
     down = poses[:, :3, 1].mean(axis=0)
     up = -down / np.linalg.norm(down)
     ahead = poses[0, :3, 2] - up * (poses[0, :3, 2] @ up)
@@ -73,12 +87,17 @@ def upright(poses: F64) -> F64:
     return np.stack([ahead, np.cross(up, ahead), up])
 
 
-def place(positions: F64, there: F64) -> tuple[F64, F64]:
-    """Turn about z (3, 3) and shift (3,) that bring positions (T, 3) to GPS's (T, 3; NaN where unknown), robustly."""
-    known = np.isfinite(there[:, 0])
+def align_to_gps(positions: F64, gps_positions: F64) -> tuple[F64, F64]:
+    """Robust rigid alignment: rotation about z (3, 3) and shift (3,) from positions to GPS positions.
+
+    Args:
+        positions: (T, 3) metres.
+        gps_positions: (T, 3) metres, NaN where unknown.
+    """
+    known = np.isfinite(gps_positions[:, 0])
     if known.sum() < 2:
         return np.eye(3), np.zeros(3)
-    a, b = positions[known], there[known]
+    a, b = positions[known], gps_positions[known]
     w = np.ones(len(a))
     for _ in range(10):
         ma, mb = np.average(a, axis=0, weights=w), np.average(b, axis=0, weights=w)
@@ -88,6 +107,6 @@ def place(positions: F64, there: F64) -> tuple[F64, F64]:
         )
         turn = exp_so3([0.0, 0.0, angle])
         shift = mb - turn @ ma
-        off = np.linalg.norm((a @ turn.T + shift - b)[:, :2], axis=1)
-        w = 1 / (1 + (off / 3.0) ** 2)
+        error = np.linalg.norm((a @ turn.T + shift - b)[:, :2], axis=1)
+        w = 1 / (1 + (error / 3.0) ** 2)
     return turn, shift

@@ -1,10 +1,10 @@
-"""Fusion: one path of a scanner by its sweeps, a camera's trajectory and GPS, as factors of one graph.
+"""Sensor fusion: a scanner's path from its sweeps, a camera's trajectory and GPS, by pose graph optimization.
 
-The graph is a chain of states, one a sweep: the scanner's pose, the logarithm of the camera's scale there, and GPS's
-slow error. Factors between neighbours are the lidar's step with its covariance, the camera's step (in its scale, which
-drifts), and how scale and GPS's error go on; factors of one state are GPS's fixes. Those that contradict the others
-count little (Cauchy). Gauss-Newton over a banded system takes time and memory by the length of the drive alone, and
-its blocks give every pose's covariance.
+The graph is a chain of states, one per sweep: the scanner's pose, the logarithm of the camera's scale, and GPS's slow
+error (bias). Factors between neighbours are the lidar's relative motion with its covariance, the camera's relative
+motion (in its drifting scale), and the random walks of scale and bias; GPS fixes are factors of one state. The Cauchy
+loss down-weights factors that contradict the others. Gauss-Newton over a banded system takes time and memory linear in
+the length of the drive, and its blocks give the covariance of every pose.
 """
 
 from __future__ import annotations
@@ -18,44 +18,56 @@ import numpy as np
 from scan2sim.pipeline.camera.poses import interpolate, nearest_rotation
 from scan2sim.pipeline.core.types import F64, I64, Bools, Trajectory
 from scan2sim.slam.geometry import exp_so3, inverse, log_so3
-from scan2sim.slam.lidar_odometry import Matched
-from scan2sim.slam.trajectory.align import place
+from scan2sim.slam.lidar_odometry import MatchedSweeps
+from scan2sim.slam.trajectory.align import align_to_gps
 
-SIZE = 10
-"""Of a state: position (m), rotation (rad, about the world's axes), logarithm of the camera's scale, GPS's error."""
-POSE, SCALE, ERROR = slice(0, 6), slice(6, 7), slice(7, 10)
-CAMERA = (0.005, 0.01, 0.0007)
-"""Of a camera's step: metres, share of its length, radians."""
-DRIFT = 0.02
-"""Of a camera's scale, over a way of ten metres (`scale.AHEAD` allows more, in turns)."""
-UNIT = 1.0
-"""Of the logarithm of a camera's scale at first: without GPS, its unit is any."""
-HELD = (1e-3, 1e-4)
-"""Metres and radians of the first pose, where nothing else says where the world is."""
-LEVEL = 0.02
-"""Radians by which the whole path may be off the vertical, where GPS places it."""
-ANYWHERE = 1e3
-"""Metres, and radians about the vertical, of what GPS alone tells."""
-HEIGHT = 2.0
-"""How much worse GPS's heights are than its places."""
-DOUBT = 4.0
-"""Squared deviations, of each number of a factor, from which on it counts little."""
-ROUNDS, STILL = 40, 1e-5
-ANY_SPEED = (300.0, 10.0)
-"""Metres and radians a second that no vehicle goes or turns."""
-BELIEVED = 0.2
-"""Weight of a factor from which on the others contradict it."""
-LOST = (2.5, 0.02)
-"""Metres, and share of the way, of deviation from which on a pose is unsure whatever held it to its neighbours."""
+STATE_SIZE = 10
+"""Size of a state: position (m), rotation (rad, about world axes), logarithm of the camera's scale, GPS bias (m)."""
+POSE, SCALE, BIAS = slice(0, 6), slice(6, 7), slice(7, 10)
+"""Parts of a state."""
 
 
-class Steps(NamedTuple):
-    """What a sensor says of the way from each state to the next.
+@dataclass(frozen=True)
+class FusionModel:
+    """Noise model and limits of the fusion; standard deviations unless noted otherwise."""
+
+    camera_sigma: tuple[float, float, float] = (0.005, 0.01, 0.0007)
+    """Of a camera's relative motion: metres, plus a share of its length; radians."""
+    scale_drift: float = 0.02
+    """Of a camera's scale over ten metres (`scale.DRIFT_PERSPECTIVE` allows more, in turns)."""
+    initial_scale_sigma: float = 1.0
+    """Of the logarithm of a camera's initial scale: without GPS its unit is arbitrary."""
+    origin_sigma: tuple[float, float] = (1e-3, 1e-4)
+    """Of the first pose if it is the world's origin: metres, radians."""
+    upright_sigma: float = 0.02
+    """Of the first pose's roll and pitch if GPS places the path, radians."""
+    unknown_sigma: float = 1e3
+    """Of the first pose's position (m) and heading (rad) if GPS places the path."""
+    speed_sigma: tuple[float, float] = (300.0, 10.0)
+    """Metres and radians per second, faster than any vehicle: prior for motions that no sensor measured."""
+    height_factor: float = 2.0
+    """Ratio of GPS's vertical to its horizontal error."""
+    cauchy_scale: float = 4.0
+    """Squared scale of the Cauchy loss, per component of a factor."""
+    iterations_max: int = 40
+    step_min: float = 1e-5
+    """Gauss-Newton stops at a smaller update (m, rad) of all poses."""
+    trust_min: float = 0.2
+    """Weight of a factor below which it contradicts the others."""
+    unsure_sigma: tuple[float, float] = (2.5, 0.02)
+    """Of a position above which it is unsure: metres, plus a share of the distance driven."""
+
+
+MODEL = FusionModel()
+
+
+class RelativeMotions(NamedTuple):
+    """Relative motions of a sensor from each state to the next.
 
     Attributes:
-        T: (L, 4, 4) pose of the second in the first's axes.
+        T: (L, 4, 4) pose of the second state in the first's axes.
         covariance: (L, 6, 6) of position (m) and rotation (rad), in the second's axes.
-        sure: (L,) whether the sensor saw that.
+        sure: (L,) whether the sensor measured the motion; otherwise it is extrapolated.
     """
 
     T: F64
@@ -63,29 +75,30 @@ class Steps(NamedTuple):
     sure: Bools
 
 
-class Fixes(NamedTuple):
-    """Where GPS says that the scanner is.
+class GpsFixes(NamedTuple):
+    """GPS positions of the scanner.
 
     Attributes:
-        places: (N, 3) in the world; NaN where it says nothing.
-        scatter: metres, one standard deviation of a horizontal axis, from one to the next.
-        slow: metres by which they are off together for `memory` seconds.
+        positions: (N, 3) in the world; NaN where there is none.
+        scatter: standard deviation of the independent error of each fix, horizontal axis, metres.
+        bias: standard deviation of the slowly changing error, horizontal axis, metres.
+        bias_time: correlation time of the slowly changing error, seconds.
     """
 
-    places: F64
+    positions: F64
     scatter: float
-    slow: float
-    memory: float
+    bias: float
+    bias_time: float
 
 
 @dataclass(frozen=True)
 class Fused:
-    """What came out.
+    """Result of the fusion.
 
     Attributes:
-        trajectory: of the scanner, in the world's axes, with covariance and where it is unsure.
-        scale: (N,) what the camera's steps were multiplied by.
-        trust: of each sensor, (L,) or (N,) how much its factors counted in the end, 0 to 1.
+        trajectory: the scanner's trajectory in world axes, with covariance and unsure poses.
+        scale: (N,) scale factor of the camera's motions.
+        trust: by sensor, (L,) or (N,) final weights of its factors, 0 to 1.
     """
 
     trajectory: Trajectory
@@ -93,10 +106,11 @@ class Fused:
     trust: dict[str, F64]
 
 
-def lidar_steps(matched: Matched) -> Steps:
-    """What matched sweeps say of the way between them.
+def lidar_motions(matched: MatchedSweeps) -> RelativeMotions:
+    """Relative motions of matched sweeps.
 
-    Where nothing holds them (along a tunnel), they slide on and on: the errors of such a stretch's steps are one.
+    Over a degenerate stretch (a tunnel), the errors of all motions are correlated: each covariance is multiplied by
+    the number of motions in the stretch.
     """
     sure = matched.sure
     edges = np.flatnonzero(np.diff(np.concatenate([[True], sure, [True]]).astype(int)))
@@ -104,95 +118,101 @@ def lidar_steps(matched: Matched) -> Steps:
     for first, end in zip(edges[::2], edges[1::2], strict=True):
         length[first:end] = end - first
     T = inverse(matched.poses[:-1]) @ matched.poses[1:]
-    return Steps(T, matched.covariance * length[:, None, None], sure)
+    return RelativeMotions(T, matched.covariance * length[:, None, None], sure)
 
 
-def camera_steps(path: Trajectory, times: F64, gap: float = 1.0) -> Steps:
-    """What a camera's path (rotations and all) says of the way between times (N,); nothing beyond it and in its gaps.
+def camera_motions(path: Trajectory, times: F64, gap: float = 1.0) -> RelativeMotions:
+    """Relative motions of a camera's trajectory between given times; unsure outside of it and in its gaps.
 
     Args:
-        gap: seconds between two of its poses over which there is none in between.
+        path: the trajectory, with rotations.
+        times: (N,) seconds.
+        gap: seconds between two of its poses above which there is a gap.
     """
     poses = interpolate(path.poses, path.times, times)
     T = inverse(poses[:-1]) @ poses[1:]
-    way = np.linalg.norm(T[:, :3, 3], axis=1)
+    length = np.linalg.norm(T[:, :3, 3], axis=1)
     last = len(path) - 1
     before = np.clip(np.searchsorted(path.times, times[:-1] + 1e-6, "right") - 1, 0, last)
     after = np.clip(np.searchsorted(path.times, times[1:] - 1e-6), 0, last)
     unsure = np.concatenate([[0], np.cumsum(np.zeros(len(path)) if path.unsure is None else path.unsure)])
-    wide = np.concatenate([[0], np.cumsum(np.diff(path.times) > gap)])
-    seen = (times[:-1] > path.times[0] - 1e-6) & (times[1:] < path.times[-1] + 1e-6)
-    seen &= (wide[after] == wide[before]) & (unsure[after + 1] == unsure[before])
-    variance = np.repeat([[CAMERA[0] ** 2, CAMERA[2] ** 2]], len(T), axis=0)
-    variance[:, 0] += (CAMERA[1] * way) ** 2
+    gaps = np.concatenate([[0], np.cumsum(np.diff(path.times) > gap)])
+    sure = (times[:-1] > path.times[0] - 1e-6) & (times[1:] < path.times[-1] + 1e-6)
+    sure &= (gaps[after] == gaps[before]) & (unsure[after + 1] == unsure[before])
+    variance = np.repeat([[MODEL.camera_sigma[0] ** 2, MODEL.camera_sigma[2] ** 2]], len(T), axis=0)
+    variance[:, 0] += (MODEL.camera_sigma[1] * length) ** 2
     if path.covariance is not None:
-        variance += _growth(path.covariance, before, after, way)
-    return Steps(T, np.repeat(variance, 3, axis=1)[:, :, None] * np.eye(6), seen)
+        variance += _covariance_growth(path.covariance, before, after, length)
+    return RelativeMotions(T, np.repeat(variance, 3, axis=1)[:, :, None] * np.eye(6), sure)
 
 
-def _growth(covariance: F64, before: I64, after: I64, way: F64) -> F64:
-    """(L, 2) variances of position (m) and rotation (rad) that a path's own (T, 6, 6) covariance gains between poses.
+def _covariance_growth(covariance: F64, before: I64, after: I64, length: F64) -> F64:
+    """(L, 2) growth of a path's own covariance (T, 6, 6) between poses: variances of position (m) and rotation (rad).
 
-    Of a place's, less what a turned path alone explains by the way between: where poses were bridged, that is much.
+    The part of the position's growth that the previous pose's rotation error explains (lever arm) is subtracted. Growth
+    is large where poses were dead-reckoned.
     """
-    place, turn = (np.einsum("tkk->t", covariance[:, part, part]) / 3 for part in (slice(0, 3), slice(3, 6)))
+    position, turn = (np.einsum("tkk->t", covariance[:, part, part]) / 3 for part in (slice(0, 3), slice(3, 6)))
     turn = np.where(np.isfinite(turn), turn, 0.0)
-    lever = 2 * np.sqrt(place[before] * turn[before]) * way + turn[before] * way**2
-    return np.maximum(np.stack([place[after] - place[before] - lever, turn[after] - turn[before]], axis=1), 0.0)
+    lever = 2 * np.sqrt(position[before] * turn[before]) * length + turn[before] * length**2
+    growth = np.stack([position[after] - position[before] - lever, turn[after] - turn[before]], axis=1)
+    return np.maximum(growth, 0.0)
 
 
 def fuse(
     times: F64,
     *,
-    lidar: Steps | None = None,
-    camera: Steps | None = None,
+    lidar: RelativeMotions | None = None,
+    camera: RelativeMotions | None = None,
     T_camera_scanner: F64 | None = None,
-    fixes: Fixes | None = None,
+    fixes: GpsFixes | None = None,
     first: F64 | None = None,
 ) -> Fused:
-    """The scanner's path at times (N,) by what sensors say; at least one tells steps.
+    """The scanner's path from all given sensors; `lidar` or `camera` is required.
 
     Args:
-        lidar: steps of the scanner itself.
-        camera: steps of the camera, in a unit of its own.
-        T_camera_scanner: (4, 4) scanner's axes to the camera's.
-        fixes: by GPS.
-        first: (4, 4) the scanner's first pose in a z-up world; by default its own axes are the world's.
+        times: (N,) seconds of the states.
+        lidar: relative motions of the scanner.
+        camera: relative motions of the camera, in an arbitrary unit.
+        T_camera_scanner: (4, 4) scanner to camera.
+        fixes: GPS positions.
+        first: (4, 4) the scanner's first pose in a z-up world; by default, the world's axes are those of this pose.
     """
     mount = np.eye(4) if T_camera_scanner is None else inverse(T_camera_scanner)
     sensors = {"lidar": (lidar, np.eye(4)), "camera": (camera, mount)}
-    told = {name: (steps, own) for name, (steps, own) in sensors.items() if steps is not None}
-    graph = _Graph(times, told, fixes)
-    starts = [graph.begin(name, np.eye(4) if first is None else first) for name in told]
+    given = {name: (motions, own) for name, (motions, own) in sensors.items() if motions is not None}
+    graph = _Graph(times, given, fixes)
+    starts = [graph.initial(name, np.eye(4) if first is None else first) for name in given]
     solved = min((graph.solve(start) for start in starts), key=graph.cost)
     return graph.finished(solved)
 
 
 @dataclass(frozen=True)
 class _States:
-    """Where all states are: `poses` (N, 4, 4), `scale` (N,) its logarithm, `error` (N, 3) metres."""
+    """Values of all states: `poses` (N, 4, 4), logarithm of the `scale` (N,), GPS `bias` (N, 3) in metres."""
 
     poses: F64
     scale: F64
-    error: F64
+    bias: F64
 
     def moved(self, by: F64) -> _States:
-        """By (N, SIZE)."""
+        """States after an update (N, STATE_SIZE)."""
         poses = self.poses.copy()
         poses[:, :3, 3] += by[:, :3]
         poses[:, :3, :3] = exp_so3(by[:, 3:6]) @ poses[:, :3, :3]
-        return _States(poses, self.scale + by[:, 6], self.error + by[:, ERROR])
+        return _States(poses, self.scale + by[:, 6], self.bias + by[:, BIAS])
 
 
 class _Block(NamedTuple):
-    """Factors of a kind.
+    """Factors of one kind.
 
     Attributes:
-        residual: (K, M) whitened.
-        J: (K, M, SIZE) how it changes with the states `at` (K,).
-        K: likewise, with the states after them, or None.
-        weight: (K,) how much each counts.
-        cost: (K,) what each costs.
+        residual: (K, M) whitened residuals.
+        J: (K, M, STATE_SIZE) Jacobian by the states `at`.
+        K: (K, M, STATE_SIZE) Jacobian by the states after them, or None.
+        at: (K,) indices of the states.
+        weight: (K,) robust weights.
+        cost: (K,) costs.
     """
 
     residual: F64
@@ -204,20 +224,20 @@ class _Block(NamedTuple):
 
 
 class _Graph:
-    """The chain: what its factors say of states."""
+    """Chain of states and their factors; `sensors`: relative motions, and pose of the sensor in scanner axes."""
 
-    def __init__(self, times: F64, sensors: Mapping[str, tuple[Steps, F64]], fixes: Fixes | None) -> None:
+    def __init__(self, times: F64, sensors: Mapping[str, tuple[RelativeMotions, F64]], fixes: GpsFixes | None) -> None:
         self.times, self.sensors, self.fixes = times, sensors, fixes
         self.seconds = np.diff(times)
         self._whiten = {
-            name: np.linalg.inv(np.linalg.cholesky(steps.covariance)) for name, (steps, _) in sensors.items()
+            name: np.linalg.inv(np.linalg.cholesky(motions.covariance)) for name, (motions, _) in sensors.items()
         }
         self._origin: F64 = np.eye(4)
 
     # --- states
 
-    def begin(self, preferred: str, first: F64) -> _States:
-        """States by the steps of one sensor, by the others' where it doesn't see; placed where GPS says."""
+    def initial(self, preferred: str, first: F64) -> _States:
+        """Initial states: motions of the preferred sensor, or of the others where it has none; aligned to GPS."""
         n = len(self.times)
         unit = self._unit()
         order = sorted(self.sensors, key=lambda name: name != preferred)
@@ -229,6 +249,7 @@ class _Graph:
                 T = given.T.copy()
                 if name == "camera":
                     T[:, :3, 3] *= unit
+                # in the second round, unsure motions of the lidar fill what is missing
                 take = ~known & (given.sure if trusted else np.full(n - 1, name == "lidar"))
                 steps[take] = (own @ T @ inverse(own))[take]
                 known |= take
@@ -239,58 +260,58 @@ class _Graph:
             poses.append(poses[-1] @ steps[i])
         chain = np.array(poses)
         if self.fixes is not None:
-            turn, shift = place(chain[:, :3, 3], self.fixes.places)
+            turn, shift = align_to_gps(chain[:, :3, 3], self.fixes.positions)
             chain[:, :3, 3] = chain[:, :3, 3] @ turn.T + shift
             chain[:, :3, :3] = turn @ chain[:, :3, :3]
         self._origin = chain[0]
         return _States(chain, np.full(n, np.log(unit)), np.zeros((n, 3)))
 
     def _unit(self) -> float:
-        """Metres of the camera's unit, roughly: by the lidar's steps, or by GPS."""
+        """Approximate metres per unit of the camera: by the lidar's motions, or by GPS."""
         if "camera" not in self.sensors:
             return 1.0
         camera = self.sensors["camera"][0]
-        far = np.linalg.norm(camera.T[:, :3, 3], axis=1)
+        camera_length = np.linalg.norm(camera.T[:, :3, 3], axis=1)
         if "lidar" in self.sensors:
             lidar = self.sensors["lidar"][0]
-            both = camera.sure & lidar.sure & (far > 1e-3)
-            ratio = np.linalg.norm(lidar.T[:, :3, 3], axis=1)[both] / far[both]
+            both = camera.sure & lidar.sure & (camera_length > 1e-3)
+            ratio = np.linalg.norm(lidar.T[:, :3, 3], axis=1)[both] / camera_length[both]
             return float(np.median(ratio)) if len(ratio) and np.median(ratio) > 1e-3 else 1.0
         if self.fixes is None:
             return 1.0
-        way = np.concatenate([[0], np.cumsum(far)])
-        known = np.flatnonzero(np.isfinite(self.fixes.places[:, 0]))
+        travelled = np.concatenate([[0], np.cumsum(camera_length)])
+        known = np.flatnonzero(np.isfinite(self.fixes.positions[:, 0]))
         ends = known[np.minimum(np.arange(len(known)) + max(1, len(known) // 4), len(known) - 1)]
-        chords = np.linalg.norm(self.fixes.places[ends] - self.fixes.places[known], axis=1)
-        driven = way[ends] - way[known]
-        return float(np.median(chords[driven > 0] / driven[driven > 0])) if (driven > 0).any() else 1.0
+        gps_distance = np.linalg.norm(self.fixes.positions[ends] - self.fixes.positions[known], axis=1)
+        driven = travelled[ends] - travelled[known]
+        return float(np.median(gps_distance[driven > 0] / driven[driven > 0])) if (driven > 0).any() else 1.0
 
     def solve(self, states: _States) -> _States:
-        """States that fit all factors, by Gauss-Newton."""
-        for _ in range(ROUNDS):
+        """Optimized states, by Gauss-Newton."""
+        for _ in range(MODEL.iterations_max):
             D, above, g = self._normal(states)
             step = _solved(D, above, -g)
             states = states.moved(step)
-            if np.abs(step[:, POSE]).max() < STILL:
+            if np.abs(step[:, POSE]).max() < MODEL.step_min:
                 break
         return states
 
     def cost(self, states: _States) -> float:
-        """What all factors cost."""
+        """Sum of the costs of all factors."""
         return float(sum(block.cost.sum() for block in self._blocks(states).values()))
 
     def finished(self, states: _States) -> Fused:
-        """The path of solved states, with covariance and where it is unsure."""
+        """Trajectory of optimized states, with covariance and unsure poses."""
         blocks = self._blocks(states)
         D, above, _ = self._normal(states)
         covariance = _marginals(D, above)[:, POSE, POSE]
-        seen = np.zeros(len(self.seconds), bool)
-        for name, (steps, _) in self.sensors.items():
-            seen |= steps.sure & (blocks[name].weight > BELIEVED)
-        unsure = np.concatenate([~seen[:1], ~seen])
-        way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(states.poses[:, :3, 3], axis=0), axis=1))])
-        off = np.sqrt(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1])
-        unsure |= off > LOST[0] + LOST[1] * way
+        measured = np.zeros(len(self.seconds), bool)
+        for name, (motions, _) in self.sensors.items():
+            measured |= motions.sure & (blocks[name].weight > MODEL.trust_min)
+        unsure = np.concatenate([~measured[:1], ~measured])
+        travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(states.poses[:, :3, 3], axis=0), axis=1))])
+        sigma = np.sqrt(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1])
+        unsure |= sigma > MODEL.unsure_sigma[0] + MODEL.unsure_sigma[1] * travelled
         poses = states.poses
         path = Trajectory(self.times, poses[:, :3, 3], nearest_rotation(poses[:, :3, :3]), unsure, covariance)
         sources = [name for name in blocks if name in self.sensors or name == "gps"]
@@ -299,9 +320,10 @@ class _Graph:
     # --- factors
 
     def _normal(self, states: _States) -> tuple[F64, F64, F64]:
-        """Of the normal equations: blocks on the diagonal (N, SIZE, SIZE) and above it; the gradient (N, SIZE)."""
+        """Normal equations: blocks (N, STATE_SIZE, STATE_SIZE) on and above the diagonal; gradient (N, STATE_SIZE)."""
         n = len(self.times)
-        D, above, g = np.zeros((n, SIZE, SIZE)), np.zeros((n - 1, SIZE, SIZE)), np.zeros((n, SIZE))
+        D, above = np.zeros((n, STATE_SIZE, STATE_SIZE)), np.zeros((n - 1, STATE_SIZE, STATE_SIZE))
+        g = np.zeros((n, STATE_SIZE))
         for r, J, K, at, weight, _ in self._blocks(states).values():
             Jw = J * weight[:, None, None]
             np.add.at(D, at, np.einsum("kma,kmb->kab", Jw, J))
@@ -313,122 +335,126 @@ class _Graph:
         return D, above, g
 
     def _blocks(self, states: _States) -> dict[str, _Block]:
-        """All factors, by their kind."""
-        blocks = {name: self._steps(name, states) for name in self.sensors}
-        blocks["carried"] = self._carried(states)
-        blocks["first"] = self._first(states)
-        blocks["unit"] = _quiet(states.scale[:1, None] / UNIT, _at(SCALE, 1 / UNIT)[None], None, np.zeros(1, np.int64))
-        way = np.maximum(np.linalg.norm(np.diff(states.poses[:, :3, 3], axis=0), axis=1), 0.1)
-        drift = DRIFT * np.sqrt(way / 10)
-        blocks["scale"] = self._wander(states.scale[:, None], SCALE, np.ones(len(way)), drift[:, None])
-        sigma = np.ones(3) if self.fixes is None else self.fixes.slow * np.array([1, 1, HEIGHT])
-        keep = np.exp(-self.seconds / (60.0 if self.fixes is None else self.fixes.memory))
-        blocks["error"] = self._wander(states.error, ERROR, keep, np.sqrt(1 - keep**2 + 1e-12)[:, None] * sigma)
-        first = _at(ERROR, 1 / sigma)
-        blocks["error.first"] = _quiet(states.error[:1] / sigma, first[None], None, np.zeros(1, np.int64))
+        """All factors, by kind."""
+        blocks = {name: self._relative_motions(name, states) for name in self.sensors}
+        blocks["speed"] = self._speed_prior(states)
+        blocks["first"] = self._first_pose_prior(states)
+        only_first = np.zeros(1, np.int64)
+        prior = _jacobian_of(SCALE, 1 / MODEL.initial_scale_sigma)[None]
+        blocks["unit"] = _squared(states.scale[:1, None] / MODEL.initial_scale_sigma, prior, None, only_first)
+        length = np.maximum(np.linalg.norm(np.diff(states.poses[:, :3, 3], axis=0), axis=1), 0.1)
+        drift = MODEL.scale_drift * np.sqrt(length / 10)
+        blocks["scale"] = self._random_walk(states.scale[:, None], SCALE, np.ones(len(length)), drift[:, None])
+        sigma = np.ones(3) if self.fixes is None else self.fixes.bias * np.array([1, 1, MODEL.height_factor])
+        decay = np.exp(-self.seconds / (60.0 if self.fixes is None else self.fixes.bias_time))
+        noise = np.sqrt(1 - decay**2 + 1e-12)[:, None] * sigma
+        blocks["bias"] = self._random_walk(states.bias, BIAS, decay, noise)
+        blocks["bias.first"] = _squared(states.bias[:1] / sigma, _jacobian_of(BIAS, 1 / sigma)[None], None, only_first)
         if self.fixes is not None:
-            blocks["gps"] = self._fixes(states, self.fixes)
+            blocks["gps"] = self._gps_fixes(states, self.fixes)
         return blocks
 
-    def _steps(self, name: str, states: _States) -> _Block:
-        """Of the steps of a sensor that is mounted at the scanner."""
-        steps, own = self.sensors[name]
+    def _relative_motions(self, name: str, states: _States) -> _Block:
+        """Relative motions of a sensor mounted beside the scanner."""
+        motions, own = self.sensors[name]
         R, t = states.poses[:, :3, :3], states.poses[:, :3, 3]
         lever = R @ own[:3, 3]
         S, c = R @ own[:3, :3], t + lever
-        StT, ZT = S[:-1].transpose(0, 2, 1), steps.T[:, :3, :3].transpose(0, 2, 1)
+        StT, ZT = S[:-1].transpose(0, 2, 1), motions.T[:, :3, :3].transpose(0, 2, 1)
         between = c[1:] - c[:-1]
-        size = np.exp(states.scale[:-1]) if name == "camera" else np.ones(len(between))
-        go = size[:, None] * steps.T[:, :3, 3]
+        scale = np.exp(states.scale[:-1]) if name == "camera" else np.ones(len(between))
+        measured = scale[:, None] * motions.T[:, :3, 3]
         r = np.concatenate([
-            np.einsum("kab,kb->ka", ZT, np.einsum("kab,kb->ka", StT, between) - go),
+            np.einsum("kab,kb->ka", ZT, np.einsum("kab,kb->ka", StT, between) - measured),
             log_so3(ZT @ StT @ S[1:]),
         ], axis=1)  # fmt: skip
-        J, K = np.zeros((len(r), 6, SIZE)), np.zeros((len(r), 6, SIZE))
+        J, K = np.zeros((len(r), 6, STATE_SIZE)), np.zeros((len(r), 6, STATE_SIZE))
         A = ZT @ StT
         J[:, :3, :3], K[:, :3, :3] = -A, A
         J[:, :3, 3:6], K[:, :3, 3:6] = A @ (_cross(between) + _cross(lever[:-1])), -A @ _cross(lever[1:])
         J[:, 3:, 3:6], K[:, 3:, 3:6] = -S[1:].transpose(0, 2, 1), S[1:].transpose(0, 2, 1)
         if name == "camera":
-            J[:, :3, SCALE] = -np.einsum("kab,kb->ka", ZT, go)[:, :, None]
+            J[:, :3, SCALE] = -np.einsum("kab,kb->ka", ZT, measured)[:, :, None]
         W = self._whiten[name]
-        block = _loud(np.einsum("kab,kb->ka", W, r), W @ J, W @ K, np.arange(len(r)))
-        if name == "camera":  # what it didn't see was made up
-            block = block._replace(weight=block.weight * steps.sure, cost=block.cost * steps.sure)
+        block = _robust(np.einsum("kab,kb->ka", W, r), W @ J, W @ K, np.arange(len(r)))
+        if name == "camera":  # unsure motions of the camera are extrapolated: they don't count
+            block = block._replace(weight=block.weight * motions.sure, cost=block.cost * motions.sure)
         return block
 
-    def _carried(self, states: _States) -> _Block:
-        """Where no sensor tells anything, the way goes on evenly."""
+    def _speed_prior(self, states: _States) -> _Block:
+        """Weak prior of a small motion, where no sensor measured one."""
         t, R = states.poses[:, :3, 3], states.poses[:, :3, :3]
-        sigma = self.seconds[:, None] * np.repeat(ANY_SPEED, 3)
+        sigma = self.seconds[:, None] * np.repeat(MODEL.speed_sigma, 3)
         r = np.concatenate([t[1:] - t[:-1], log_so3(R[1:] @ R[:-1].transpose(0, 2, 1))], axis=1) / sigma
-        K = np.zeros((len(r), 6, SIZE))
+        K = np.zeros((len(r), 6, STATE_SIZE))
         K[:, np.arange(6), np.arange(6)] = 1 / sigma
-        return _quiet(r, -K, K, np.arange(len(r)))
+        return _squared(r, -K, K, np.arange(len(r)))
 
-    def _first(self, states: _States) -> _Block:
-        """The first pose stays where it is; where GPS tells, it is upright."""
+    def _first_pose_prior(self, states: _States) -> _Block:
+        """Prior of the first pose: fixed; with GPS, only upright."""
         T, origin = states.poses[0], self._origin
-        sigma = np.repeat(HELD, 3)
+        sigma = np.repeat(MODEL.origin_sigma, 3)
         if self.fixes is not None:
-            sigma = np.array([ANYWHERE, ANYWHERE, ANYWHERE, LEVEL, LEVEL, ANYWHERE])
+            sigma = np.array(
+                [*3 * [MODEL.unknown_sigma], MODEL.upright_sigma, MODEL.upright_sigma, MODEL.unknown_sigma]
+            )
         r = np.concatenate([T[:3, 3] - origin[:3, 3], log_so3(T[:3, :3] @ origin[:3, :3].T)]) / sigma
-        J = np.zeros((1, 6, SIZE))
+        J = np.zeros((1, 6, STATE_SIZE))
         J[0, np.arange(6), np.arange(6)] = 1 / sigma
-        return _quiet(r[None], J, None, np.zeros(1, np.int64))
+        return _squared(r[None], J, None, np.zeros(1, np.int64))
 
-    def _wander(self, value: F64, part: slice, keep: F64, sigma: F64) -> _Block:
-        """A part of the state is `keep` times what it was before, but for `sigma` (L, M)."""
-        r = (value[1:] - keep[:, None] * value[:-1]) / sigma
-        J, K = np.zeros((*r.shape, SIZE)), np.zeros((*r.shape, SIZE))
-        J[:, :, part] = -keep[:, None, None] * (np.eye(r.shape[1]) / sigma[:, :, None])
+    def _random_walk(self, value: F64, part: slice, decay: F64, sigma: F64) -> _Block:
+        """A part (N, M) of the state is `decay` (L,) times its previous value, plus noise of `sigma` (L, M)."""
+        r = (value[1:] - decay[:, None] * value[:-1]) / sigma
+        J, K = np.zeros((*r.shape, STATE_SIZE)), np.zeros((*r.shape, STATE_SIZE))
+        J[:, :, part] = -decay[:, None, None] * (np.eye(r.shape[1]) / sigma[:, :, None])
         K[:, :, part] = np.eye(r.shape[1]) / sigma[:, :, None]
-        return _quiet(r, J, K, np.arange(len(r)))
+        return _squared(r, J, K, np.arange(len(r)))
 
-    def _fixes(self, states: _States, fixes: Fixes) -> _Block:
-        at = np.flatnonzero(np.isfinite(fixes.places[:, 0]))
-        sigma = fixes.scatter * np.array([1, 1, HEIGHT])
-        r = (states.poses[at, :3, 3] + states.error[at] - fixes.places[at]) / sigma
-        J = np.zeros((len(at), 3, SIZE))
+    def _gps_fixes(self, states: _States, fixes: GpsFixes) -> _Block:
+        at = np.flatnonzero(np.isfinite(fixes.positions[:, 0]))
+        sigma = fixes.scatter * np.array([1, 1, MODEL.height_factor])
+        r = (states.poses[at, :3, 3] + states.bias[at] - fixes.positions[at]) / sigma
+        J = np.zeros((len(at), 3, STATE_SIZE))
         J[:, np.arange(3), np.arange(3)] = J[:, np.arange(3), np.arange(7, 10)] = 1 / sigma
-        return _loud(r, J, None, at)
+        return _robust(r, J, None, at)
 
 
-def _quiet(residual: F64, J: F64, K: F64 | None, at: I64) -> _Block:
-    """Factors that count as they are."""
+def _squared(residual: F64, J: F64, K: F64 | None, at: I64) -> _Block:
+    """Factors with a squared loss."""
     return _Block(residual, J, K, at, np.ones(len(at)), (residual**2).sum(axis=1))
 
 
-def _loud(residual: F64, J: F64, K: F64 | None, at: I64) -> _Block:
-    """Factors that count little where they contradict the others (Cauchy)."""
-    doubt = DOUBT * residual.shape[1]
-    excess = (residual**2).sum(axis=1) / doubt
-    return _Block(residual, J, K, at, 1 / (1 + excess), doubt * np.log1p(excess))
+def _robust(residual: F64, J: F64, K: F64 | None, at: I64) -> _Block:
+    """Factors with a Cauchy loss, which down-weights those that contradict the others."""
+    scale = MODEL.cauchy_scale * residual.shape[1]
+    excess = (residual**2).sum(axis=1) / scale
+    return _Block(residual, J, K, at, 1 / (1 + excess), scale * np.log1p(excess))
 
 
-def _at(part: slice, value: F64 | float) -> F64:
-    """(M, SIZE) a diagonal of `value` at a part of the state."""
-    out = np.zeros((part.stop - part.start, SIZE))
+def _jacobian_of(part: slice, value: F64 | float) -> F64:
+    """(M, STATE_SIZE) Jacobian that is `value` on the diagonal of a part of the state."""
+    out = np.zeros((part.stop - part.start, STATE_SIZE))
     out[:, part] = np.eye(part.stop - part.start) * value
     return out
 
 
 def _solved(D: F64, above: F64, b: F64) -> F64:
-    """(N, SIZE) x of the block-tridiagonal system of `_Graph._normal`, by a banded Cholesky decomposition."""
+    """(N, STATE_SIZE) solution of the block-tridiagonal system of `_Graph._normal`, by a banded Cholesky solver."""
     from scipy.linalg import solveh_banded
 
-    n = len(D)
-    band = np.zeros((2 * SIZE, n * SIZE))
-    row, column = np.indices((SIZE, SIZE))
+    n, size = len(D), STATE_SIZE
+    band = np.zeros((2 * size, n * size))
+    row, column = np.indices((size, size))
     upper = row <= column
-    place = SIZE * np.arange(n)[:, None]
-    band[(2 * SIZE - 1 + row - column)[upper], place + column[upper]] = D[:, row[upper], column[upper]]
-    band[(SIZE - 1 + row - column).ravel(), place[1:] + column.ravel()] = above.reshape(n - 1, -1)
-    return np.asarray(solveh_banded(band, b.ravel())).reshape(-1, SIZE)
+    first = size * np.arange(n)[:, None]
+    band[(2 * size - 1 + row - column)[upper], first + column[upper]] = D[:, row[upper], column[upper]]
+    band[(size - 1 + row - column).ravel(), first[1:] + column.ravel()] = above.reshape(n - 1, -1)
+    return np.asarray(solveh_banded(band, b.ravel())).reshape(-1, size)
 
 
 def _marginals(D: F64, above: F64) -> F64:
-    """(N, SIZE, SIZE) the blocks on the diagonal of the inverse."""
+    """(N, STATE_SIZE, STATE_SIZE) blocks on the diagonal of the inverse (marginal covariances)."""
     left = np.empty_like(D)
     left[0] = D[0]
     for k in range(1, len(D)):
@@ -441,7 +467,7 @@ def _marginals(D: F64, above: F64) -> F64:
 
 
 def _cross(v: F64) -> F64:
-    """(N, 3, 3) matrices that multiply w (3,) to v x w."""
+    """(N, 3, 3) cross-product matrices of vectors v (N, 3): [v] w = v x w."""
     out = np.zeros((len(v), 3, 3))
     out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
     return out - out.transpose(0, 2, 1)

@@ -1,4 +1,4 @@
-"""GPS tracks smoothed, and how noisy they are; `pipeline.io.gps` reads them."""
+"""Smoothing and noise estimation of GPS tracks; `pipeline.io.gps` reads them."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from scan2sim.pipeline.core.types import F64, GpsTrack
 
 
 def smooth(track: GpsTrack, seconds: float = 1.0, max_gap: float = 3.0) -> GpsTrack:
-    """The track through a robust local parabola about every fix; gaps over `max_gap` seconds are not smoothed across.
+    """Smooth a track by a robust local parabola around every fix; gaps over `max_gap` seconds aren't bridged.
 
-    LOWESS (Cleveland 1979) of degree 2: neighbours weigh by a Gaussian of `seconds`, and fixes that stray from their
-    neighbours' curve lose their weight. `sigma` stays: a receiver's error hardly changes within seconds.
+    LOWESS (Cleveland 1979) of degree 2: neighbours are weighted by a Gaussian of `seconds`, and outliers are
+    down-weighted. `sigma` stays unchanged: a receiver's error is almost constant over seconds.
     """
     positions, leverage = _lowess(track, seconds, max_gap)
     return replace(track, positions=positions, scatter=noise(track) * float(np.sqrt(np.median(leverage))))
 
 
 def noise(track: GpsTrack, seconds: float = 1.5, max_gap: float = 3.0) -> float:
-    """Metres, one standard deviation of a horizontal axis: how far fixes scatter about their smoothed path.
+    """Scatter of the fixes about their smoothed path: standard deviation of a horizontal axis, metres.
 
-    Robust (median absolute deviation), of what changes within some 6 x `seconds`. Slower errors, which are the larger
-    part of a receiver's, can't be told from driving: the true error is at least this.
+    Robust (median absolute deviation); includes errors that change within about 6 x `seconds`. Slower errors, the
+    larger part of a receiver's, can't be distinguished from motion: this is a lower bound of the true error.
     """
     smoothed, leverage = _lowess(track, seconds, max_gap)
-    free = leverage < 0.9  # the ends of stretches follow their fixes whatever they say
+    free = leverage < 0.9  # at the ends of stretches, the fit follows the fixes
     scatter = (track.positions - smoothed)[free, :2] / np.sqrt(1 - leverage[free])[:, None]
     return float(1.4826 * np.median(np.abs(scatter))) if free.any() else 0.0
 
 
 def _lowess(track: GpsTrack, seconds: float, max_gap: float, rounds: int = 3) -> tuple[F64, F64]:
-    """(N, 3) smoothed positions, and (N,) the weight of each fix in its own."""
+    """(N, 3) smoothed positions, and (N,) leverage: the weight of each fix in its own smoothed position."""
     times, positions = track.times, track.positions
     n = len(times)
     stretch = np.concatenate([[0], np.cumsum(np.diff(times) > max_gap)])
@@ -56,7 +56,7 @@ def _lowess(track: GpsTrack, seconds: float, max_gap: float, rounds: int = 3) ->
             smoothed[block] = positions[block] + np.einsum("bi,bik->bk", inverse[:, 0], right)
             leverage[block] = np.minimum(inverse[:, 0, 0] * trust[block] * robust[block], 1.0)
         own = np.linalg.norm((positions - smoothed)[:, :2], axis=1)
-        alone = own / np.maximum(1 - leverage, 0.05)  # as if the fix had had no say in its own place
-        scale = max(1.4826 * float(np.median(alone)), 0.1)
-        robust = np.maximum(1 - (alone / (6 * scale)) ** 2, 1e-6) ** 2
+        left_out = own / np.maximum(1 - leverage, 0.05)  # leave-one-out residual
+        scale = max(1.4826 * float(np.median(left_out)), 0.1)
+        robust = np.maximum(1 - (left_out / (6 * scale)) ** 2, 1e-6) ** 2
     return smoothed, leverage

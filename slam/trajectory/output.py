@@ -1,4 +1,4 @@
-"""What SLAM leaves behind: the trajectory in every format, and the map as a COLMAP model."""
+"""Output of SLAM: the trajectory in all formats, and the map as a COLMAP model."""
 
 from __future__ import annotations
 
@@ -23,15 +23,19 @@ def write(
     """Write `trajectory.csv`, `.tum`, `.kitti`, `.geojson` (if georeferenced), and with a camera and names `colmap/`.
 
     Args:
-        trajectory: local coordinates of `frame`; camera to world for COLMAP.
-        names: of the photos, one for each pose.
+        folder: output folder.
+        trajectory: in local coordinates of `frame`; camera to world for COLMAP.
+        frame: coordinate frame; None: local.
+        camera: camera of the COLMAP model.
+        names: names of the photos, one per pose.
+        sparse: points and observations of the COLMAP model.
 
     Returns:
-        The files.
+        The files written.
 
     Raises:
-        DataError: names, poses and observations that don't belong together.
-        SpaceError: the disk is full or may not be written to.
+        DataError: names, poses and observations don't match in number.
+        SpaceError: the disk is full or write-protected.
     """
     frame = frame or Frame()
     suffixes = [".csv"]

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from scan2sim.data_samples import crossing
-from scan2sim.data_samples.crossing_traffic import STANDS, STEP
+from scan2sim.data_samples.crossing_traffic import MOVING_SPEED_MIN, TIME_STEP_S
 from scan2sim.data_samples.stage import View as Placed
-from scan2sim.data_samples.stage import turned
+from scan2sim.data_samples.stage import rotation_z
 from scan2sim.pipeline.core.types import Bools
 
 
@@ -25,14 +25,16 @@ def test_boxes_lie_where_the_meshes_project(view: crossing.View) -> None:
     checked = 0
     for index in range(0, 1000, 90):
         frame = view.frame(index)
-        placed = Placed(view.backdrop, crossing.SIZE, view.shake(index / crossing.FPS))
-        for seen in frame.seen:
-            places = np.concatenate([p.body.part.vertices @ turned(p.heading).T + p.place for p in seen.actor.pieces])
+        placed = Placed(view.backdrop, crossing.FRAME_SIZE_PX, view.shake(index / crossing.FPS))
+        for seen in frame.visible:
+            places = np.concatenate(
+                [p.body.part.vertices @ rotation_z(p.heading).T + p.position for p in seen.actor.pieces]
+            )
             pixels, depth = placed.project(places.astype(np.float64))
             if (depth < 1).any():
                 continue
             low, high = pixels.min(axis=0), pixels.max(axis=0) + 1
-            if (low < 0).any() or (high > crossing.SIZE).any():
+            if (low < 0).any() or (high > crossing.FRAME_SIZE_PX).any():
                 continue  # what is outside may be higher than what is within
             assert np.abs(np.array(seen.box) - [*low, *high]).max() < 2.5, (index, seen.actor.label)
             checked += 1
@@ -41,14 +43,14 @@ def test_boxes_lie_where_the_meshes_project(view: crossing.View) -> None:
 
 def test_pixels_change_where_things_are_and_in_their_shade_alone(view: crossing.View) -> None:
     actors = view.traffic.at(500)
-    empty = view.stage.frame(view.backdrop, [], crossing.SIZE).rgb.astype(int)
-    frame = view.stage.frame(view.backdrop, actors, crossing.SIZE)
+    empty = view.stage.frame(view.backdrop, [], crossing.FRAME_SIZE_PX).rgb.astype(int)
+    frame = view.stage.frame(view.backdrop, actors, crossing.FRAME_SIZE_PX)
     changed = np.abs(frame.rgb - empty).max(axis=2) > 12
     near: Bools = cv2.dilate((frame.owner >= 0).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     lighter = (frame.rgb - empty).max(axis=2) > 12
     assert changed[frame.owner >= 0].mean() > 0.7
     assert not (lighter & ~near).any(), "outside of things there is shade, never light"
-    for k, seen in enumerate(s for s in frame.seen if s.visible == 1):
+    for k, seen in enumerate(s for s in frame.visible if s.visible == 1):
         rows, columns = np.nonzero(frame.owner == actors.index(seen.actor))
         x0, y0, x1, y1 = seen.box
         assert (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1) == (x0, y0, x1, y1), k
@@ -57,7 +59,7 @@ def test_pixels_change_where_things_are_and_in_their_shade_alone(view: crossing.
 def test_the_same_seed_makes_the_same_frames(view: crossing.View) -> None:
     again = crossing.view(0, 4, 40.0)
     np.testing.assert_array_equal(view.frame(300).rgb, again.frame(300).rgb)
-    assert crossing.told(view.frame(300)) == crossing.told(again.frame(300))
+    assert crossing.labels(view.frame(300)) == crossing.labels(again.frame(300))
     other = crossing.view(1, 4, 40.0)
     assert (view.frame(300).rgb != other.frame(300).rgb).mean() > 0.5
 
@@ -71,11 +73,11 @@ def test_speeds_are_how_far_things_get(view: crossing.View) -> None:
             a, b = now[track], then[track]
             if len(a.pieces) != len(b.pieces) or not a.pieces:
                 continue  # a train that comes or goes
-            way = np.linalg.norm(b.pieces[0].place - a.pieces[0].place) / STEP
+            way = np.linalg.norm(b.pieces[0].position - a.pieces[0].position) / TIME_STEP_S
             assert abs(way - a.speed) < 0.6, (index, a.label)
             if a.speed == 0 == b.speed:
                 assert way == 0
-            kinds.add((a.label == "train", a.speed >= STANDS))
+            kinds.add((a.label == "train", a.speed >= MOVING_SPEED_MIN))
     assert len(kinds) == 4, "trains and cars, moving and standing"
 
 
@@ -105,4 +107,4 @@ def test_films_come_with_a_line_a_frame(tmp_path: Path) -> None:
     for thing in (t for line in lines for t in line["things"]):
         x0, y0, x1, y1 = thing["box"]
         assert 0 <= x0 < x1 <= 640 and 0 <= y0 < y1 <= 360 and 0 <= thing["visible"] <= 1
-        assert thing["moving"] == (thing["speed"] >= STANDS)
+        assert thing["moving"] == (thing["speed"] >= MOVING_SPEED_MIN)

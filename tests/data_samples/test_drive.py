@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from scan2sim.data_samples import gps, hills, paths
-from scan2sim.data_samples.drive import Hardships, exposed, generate_drive, row_poses
-from scan2sim.data_samples.ground import HALF
-from scan2sim.data_samples.panorama import GAIN, Panorama, Picture
+from scan2sim.data_samples.drive import DriveConditions, generate_drive, render_exposed_frame, row_poses
+from scan2sim.data_samples.ground import HALF_ROAD_M
+from scan2sim.data_samples.panorama import GAIN_RANGE, Panorama, PanoramaImage
 from scan2sim.data_samples.photos import directions
-from scan2sim.data_samples.planner import PLOT
+from scan2sim.data_samples.planner import PLOT_DISTANCE_M
 from scan2sim.data_samples.scene import srgb
 from scan2sim.data_samples.town import Town, build
 from scan2sim.data_samples.traffic import Traffic
@@ -55,7 +55,7 @@ def project(points: F64, pose: F64) -> tuple[np.ndarray, F64]:
     return np.stack([np.round(u).astype(int) % (2 * H), np.clip(np.round(v).astype(int), 0, H - 1)], axis=1), far
 
 
-def points_of(picture: Picture, poses: F64) -> tuple[np.ndarray, F64]:
+def points_of(picture: PanoramaImage, poses: F64) -> tuple[np.ndarray, F64]:
     """(N, 2) pixels that see something that stands still, and where it is (N, 3)."""
     seen = np.isfinite(picture.depth) & ~picture.moving & (picture.depth < 40)
     v, u = np.nonzero(seen)
@@ -64,7 +64,7 @@ def points_of(picture: Picture, poses: F64) -> tuple[np.ndarray, F64]:
     return np.stack([u, v], axis=1), np.einsum("nij,nj->ni", rows[:, :3, :3], rays) + rows[:, :3, 3]
 
 
-def agreement(a: Picture, poses_a: F64, b: Picture, poses_b: F64) -> tuple[float, float]:
+def agreement(a: PanoramaImage, poses_a: F64, b: PanoramaImage, poses_b: F64) -> tuple[float, float]:
     """Share of a's still points that b sees too, and their median relative difference of light."""
     pixels, points = points_of(a, poses_a)
     if poses_b.ndim == 2:
@@ -106,15 +106,15 @@ def test_a_drive_is_smooth_and_starts_from_standing(tmp_path: Path, file: str) -
 
 
 def test_nothing_stands_on_the_road(town: Town) -> None:
-    houses = [t for t in town.things if getattr(t.make, "func", t.make).__name__ == "house"]
+    houses = [t for t in town.placed if getattr(t.make, "func", t.make).__name__ == "house"]
     assert len(houses) > 10
     for t in houses:
         corners = t.make().moved(t.heading, (0, 0, 0)).vertices[:, :2] + t.at
-        assert town.ground.at(corners).min() > PLOT - 0.6
-    assert min(float(town.ground.at(t.at)) for t in town.things) > HALF - 1.5
+        assert town.ground.at(corners).min() > PLOT_DISTANCE_M - 0.6
+    assert min(float(town.ground.at(t.at)) for t in town.placed) > HALF_ROAD_M - 1.5
     from scipy.spatial import cKDTree
 
-    assert cKDTree(town.ground.driven).query(np.array([t.at for t in town.things]))[0].min() > 2.0
+    assert cKDTree(town.ground.driven).query(np.array([t.at for t in town.placed]))[0].min() > 2.0
 
 
 @pytest.mark.slow
@@ -144,7 +144,7 @@ def test_rows_of_a_rolling_shutter_have_their_own_poses(camera: Panorama, trajec
     assert difference < 0.06
 
 
-def filmed(town: Town, poses: F64, time: float, lens: float = 0.0) -> Picture:
+def filmed(town: Town, poses: F64, time: float, lens: float = 0.0) -> PanoramaImage:
     return Panorama(town, None, H, seed=3, radius=90.0, lens=lens).render(poses, time)
 
 
@@ -163,7 +163,7 @@ def test_hills_lift_everything_and_tilt_the_car(trajectory: Trajectory) -> None:
         picture = camera.render(driven.poses[k], k / 15)
         pixels, points = points_of(picture, driven.poses[k])
         above = points[:, 2] - hills.heights(points[:, :2], waves)
-        road = (camera.town.ground.at(points[:, :2]) < HALF - 0.5) & (pixels[:, 1] > 0.6 * H)
+        road = (camera.town.ground.at(points[:, :2]) < HALF_ROAD_M - 0.5) & (pixels[:, 1] > 0.6 * H)
         assert road.sum() > 500
         assert np.quantile(np.abs(above[road]), 0.8) < 0.01  # what isn't the road is a parked car
         assert above.min() > -0.05
@@ -183,7 +183,9 @@ def test_lenses_have_places_of_their_own(town: Town, trajectory: Trajectory) -> 
 
 def test_an_exposure_blurs_what_passes_and_keeps_its_light(town: Town, trajectory: Trajectory) -> None:
     camera, i = Panorama(town, None, H, seed=3, samples=1, radius=90.0), 70
-    sharp, blurred = (light(exposed(camera, trajectory, i, Hardships(exposure=s)), 1.0) for s in (0.0, 0.04))
+    sharp, blurred = (
+        light(render_exposed_frame(camera, trajectory, i, DriveConditions(exposure=s)), 1.0) for s in (0.0, 0.04)
+    )
     rows, beside = slice(H * 2 // 5, H * 3 // 5), np.r_[H // 2 - 10 : H // 2 + 10, 3 * H // 2 - 10 : 3 * H // 2 + 10]
     edges = [np.nanmean(np.abs(np.diff(picture[rows], axis=1))[:, beside]) for picture in (sharp, blurred)]
     assert edges[1] < 0.9 * edges[0]
@@ -218,8 +220,8 @@ def test_the_picture_closes_at_the_seam_and_hides_its_own_car(camera: Panorama, 
 
 def test_exposure_changes_smoothly(camera: Panorama) -> None:
     gains = np.array([camera.gain(t) for t in np.arange(0, 120, 1 / 15)])
-    assert GAIN[0] <= gains.min() < 0.85
-    assert 1.05 < gains.max() <= GAIN[1]
+    assert GAIN_RANGE[0] <= gains.min() < 0.85
+    assert 1.05 < gains.max() <= GAIN_RANGE[1]
     assert np.abs(np.diff(gains)).max() < 0.06
 
 

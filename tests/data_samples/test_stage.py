@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scan2sim.data_samples.crossing import looking
+from scan2sim.data_samples.crossing import look_at_pose
 from scan2sim.data_samples.paints import ROAD, VEHICLE, Material, Paint
 from scan2sim.data_samples.shapes import box, join
-from scan2sim.data_samples.stage import Actor, Backdrop, Body, Light, Piece, Stage, middle, wider
+from scan2sim.data_samples.stage import Actor, Backdrop, Body, Light, Piece, Stage, centred_shake, with_margin
 from scan2sim.pipeline.core.types import Camera
 
 SIZE = (160, 120)
@@ -20,8 +20,8 @@ def stage(wall: bool) -> tuple[Stage, Backdrop]:
     ground = box((-50, -50, -1), (80, 50, 0), Paint(Material.PLAIN, (0.3, 0.3, 0.3), ROAD))
     parts = [ground, *([box((9, 0, 0), (9.2, 20, 6), Paint(Material.PLAIN, (0.6, 0.6, 0.6), ROAD))] if wall else [])]
     made = Stage(join(parts), Light(np.array([0.0, -0.6, 0.8]), 0.9, 0.4, 0.3))
-    pose = looking(np.array([0.0, 0.0, 2.0]), np.array([20.0, 0.0, 1.0]))
-    return made, made.backdrop(wider(CAMERA, 10), pose, 1)
+    pose = look_at_pose(np.array([0.0, 0.0, 2.0]), np.array([20.0, 0.0, 1.0]))
+    return made, made.backdrop(with_margin(CAMERA, 10), pose, 1)
 
 
 def actor(x: float, y: float, track: int) -> Actor:
@@ -30,9 +30,9 @@ def actor(x: float, y: float, track: int) -> Actor:
 
 def test_what_stands_before_a_thing_hides_its_share() -> None:
     made, backdrop = stage(wall=True)
-    (seen,) = made.frame(backdrop, [actor(20, 0, 1)], SIZE).seen
+    (seen,) = made.frame(backdrop, [actor(20, 0, 1)], SIZE).visible
     assert seen.visible == pytest.approx(0.5, abs=0.04)
-    (open_one,) = made.frame(stage(wall=False)[1], [actor(20, 0, 1)], SIZE).seen
+    (open_one,) = made.frame(stage(wall=False)[1], [actor(20, 0, 1)], SIZE).visible
     assert open_one.visible == 1 and open_one.box == seen.box
 
 
@@ -41,7 +41,7 @@ def test_a_near_thing_hides_a_far_one_in_any_order() -> None:
     near, far = actor(12, 0, 1), actor(25, 0.5, 2)
     for order in ([near, far], [far, near]):
         frame = made.frame(backdrop, order, SIZE)
-        told = {s.actor.track: s for s in frame.seen}
+        told = {s.actor.track: s for s in frame.visible}
         assert told[1].visible == 1 and told[2].visible < 0.3
         assert frame.owner[60, 79] == order.index(near)
 
@@ -49,8 +49,8 @@ def test_a_near_thing_hides_a_far_one_in_any_order() -> None:
 def test_a_shake_moves_the_picture_and_the_boxes() -> None:
     made, backdrop = stage(wall=False)
     still = made.frame(backdrop, [actor(20, 0, 1)], SIZE)
-    moved = made.frame(backdrop, [actor(20, 0, 1)], SIZE, middle(backdrop, SIZE, 0.0, (3.0, -2.0)))
-    np.testing.assert_array_equal(np.array(moved.seen[0].box) - still.seen[0].box, [-3, 2, -3, 2])
+    moved = made.frame(backdrop, [actor(20, 0, 1)], SIZE, centred_shake(backdrop, SIZE, 0.0, (3.0, -2.0)))
+    np.testing.assert_array_equal(np.array(moved.visible[0].box) - still.visible[0].box, [-3, 2, -3, 2])
     a, b = still.rgb[20:100, 20:140].astype(int), moved.rgb[22:102, 17:137].astype(int)
     assert np.abs(a - b).mean() < 1
 

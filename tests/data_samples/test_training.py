@@ -15,7 +15,7 @@ from scan2sim.data_samples.training import street
 from scan2sim.data_samples.variety import varied
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.segmentation.labels import CLASSES
-from scan2sim.segmentation.lidar_channels import FRACTION
+from scan2sim.segmentation.lidar_channels import DOWNSAMPLING
 from scan2sim.segmentation.training.dataset import pairs, read_channels
 
 
@@ -33,7 +33,7 @@ def test_streets_of_training_have_every_class_and_no_two_are_alike() -> None:
     for seed in (3, 4):
         layout = lay_out(30.0, seed)
         some = varied(layout, 30.0)
-        assert not layout.more and not layout.walks
+        assert not layout.extras and not layout.walks
         scene = Scene(some)
         labels.append(np.bincount(scene.surface.classification, minlength=256))
         world = scene.truth_mesh().classification
@@ -46,7 +46,7 @@ def test_streets_of_training_have_every_class_and_no_two_are_alike() -> None:
 def test_a_street_is_the_same_each_time_its_things_are_made() -> None:
     layout = varied(lay_out(20.0, 5), 20.0)
     again = varied(lay_out(20.0, 5), 20.0)
-    for a, b in zip(layout.more, again.more, strict=True):
+    for a, b in zip(layout.extras, again.extras, strict=True):
         assert replace(a, make=b.make) == b
         np.testing.assert_array_equal(a.make().vertices, a.make().vertices)
         np.testing.assert_array_equal(a.make().seed, b.make().seed)
@@ -56,8 +56,8 @@ def test_channels_show_what_the_labels_show(made: Path) -> None:
     for image, truth in pairs(made):
         codes = cv2.imread(str(truth), cv2.IMREAD_GRAYSCALE)
         channels = read_channels(image, codes.shape)
-        assert channels.shape == (codes.shape[0] // FRACTION, codes.shape[1] // FRACTION, 4)
-        coarse = codes[FRACTION // 2 :: FRACTION, FRACTION // 2 :: FRACTION]
+        assert channels.shape == (codes.shape[0] // DOWNSAMPLING, codes.shape[1] // DOWNSAMPLING, 4)
+        coarse = codes[DOWNSAMPLING // 2 :: DOWNSAMPLING, DOWNSAMPLING // 2 :: DOWNSAMPLING]
         there = channels[..., 3] == 255
         assert (channels[~there] == 0).all()
         assert there[coarse == 0].mean() < 0.1, "the sky is nowhere"

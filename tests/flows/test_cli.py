@@ -1,4 +1,4 @@
-"""The command as a user types it, on a small street: worlds, reports, resuming, and bad input."""
+"""The command line on a small street: worlds, reports, resuming, and bad input."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from tests.conftest import ROOT
 from tests.fakes.broker import Broker
 from tests.gazebo.checker import check_world
 
-SHOWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
+NEXT_FRAME_DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
 SMALL = ["--set", "unwrap.texel=0.05", "--set", "decimate.target=10000"]
 
 
 def scan2sim(*arguments: object, timeout: float = 300) -> subprocess.CompletedProcess[str]:
-    """Run the command."""
+    """Run `scan2sim` in a subprocess."""
     return subprocess.run(
         [sys.executable, "-m", "scan2sim.flows.cli", *map(str, arguments)],
         cwd=ROOT,
@@ -43,13 +43,14 @@ def scan2sim(*arguments: object, timeout: float = 300) -> subprocess.CompletedPr
     )
 
 
-def good(result: subprocess.CompletedProcess[str]) -> str:
+def stdout_of(result: subprocess.CompletedProcess[str]) -> str:
+    """Standard output of a command that must succeed."""
     assert result.returncode == 0, result.stderr + result.stdout
     return result.stdout
 
 
-def bad(result: subprocess.CompletedProcess[str], code: int, *parts: str) -> None:
-    """The command failed with an exit code and one message that holds all parts, without a traceback."""
+def assert_fails(result: subprocess.CompletedProcess[str], code: int, *parts: str) -> None:
+    """Assert that a command failed with an exit code and one message that contains all parts, without a traceback."""
     assert result.returncode == code, (result.returncode, result.stderr, result.stdout)
     for part in parts:
         assert part in result.stderr, result.stderr
@@ -59,7 +60,7 @@ def bad(result: subprocess.CompletedProcess[str], code: int, *parts: str) -> Non
 
 @pytest.fixture(scope="module")
 def street(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the small street that tests may damage copies of."""
+    """A copy of the small street."""
     copy = tmp_path_factory.mktemp("street") / "tile"
     shutil.copytree(small_street, copy)
     return copy
@@ -69,27 +70,27 @@ def street(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 def world(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of the small street."""
     out = tmp_path_factory.mktemp("world")
-    good(scan2sim("run", street, "--out", out, "--hold-out", 4, *SMALL))
+    stdout_of(scan2sim("run", street, "--out", out, "--hold-out", 4, *SMALL))
     return out
 
 
-def test_the_bus_is_told_of_a_run(
+def test_run_publishes_its_progress_on_the_bus(
     street: Path, world: Path, tmp_path: Path, broker: Broker, monkeypatch: pytest.MonkeyPatch
 ) -> None:  # fmt: skip
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     out = shutil.copytree(world, tmp_path / "out")
     shutil.rmtree(out / "steps" / "preview")
     command = ("run", street, "--out", out, "--hold-out", 4, *SMALL, "--bus", broker.servers)
-    good(scan2sim(*command))
+    stdout_of(scan2sim(*command))
     broker.kill()
     began = time.monotonic()
-    assert "nothing to do" in good(scan2sim(*command))
+    assert "nothing to do" in stdout_of(scan2sim(*command))
     assert time.monotonic() - began < 30
     broker.start()
-    good(scan2sim(*command))  # sends what the one before couldn't, and what the broker has forgotten
+    stdout_of(scan2sim(*command))  # also sends what the previous run couldn't, and what the broker has lost
     steps, runs = defaultdict[str, set[str]](set), list[tuple[str, int, int]]()
-    for told in kafka.read(broker.servers, "bus_events", group="test", from_start=True, wait=0.5):
-        event = json.loads(told or "{}")
+    for message in kafka.read(broker.servers, "bus_events", group="test", from_start=True, wait=0.5):
+        event = json.loads(message or "{}")
         if event.get("kind") == "step":
             steps[event["body"]["step"]].add(event["body"]["state"])
         elif event.get("kind") == "run" and event["body"]["state"] == "done":
@@ -97,18 +98,18 @@ def test_the_bus_is_told_of_a_run(
         if len(runs) == 3 or time.monotonic() - began > 90:
             break
     count = len(steps)
-    # each run's events are in order, runs may be read in any: a broker parts them
+    # events of one run are in order, but runs may arrive in any order: the topic has partitions
     assert sorted(runs) == [(str(street), count - 1, 1), (str(street), count, 0), (str(street), count, 0)]
     assert all("kept" in states for states in steps.values()) and "preview" in steps
 
 
-def test_rasters_are_made_where_they_are_asked_for(street: Path, world: Path, tmp_path: Path) -> None:
+def test_rasters_are_built_only_if_requested(street: Path, world: Path, tmp_path: Path) -> None:
     rasterio = pytest.importorskip("rasterio", reason="rasterio isn't installed")
     out = shutil.copytree(world, tmp_path / "out")
     command = (street, "--out", out, "--hold-out", 4, *SMALL)
-    assert "rasters" not in good(scan2sim("plan", *command))
+    assert "rasters" not in stdout_of(scan2sim("plan", *command))
     assert not (out / "rasters").exists()
-    good(scan2sim("run", *command, "--set", "export.rasters=0.1"))
+    stdout_of(scan2sim("run", *command, "--set", "export.rasters=0.1"))
     tile = read_tile(street)
     assert tile.truth_mesh is not None
     truth = Mesh.load(tile.truth_mesh)
@@ -119,11 +120,11 @@ def test_rasters_are_made_where_they_are_asked_for(street: Path, world: Path, tm
         height = np.array([value[0] for value in raster.sample(middle[:, :2])], float)
     error = np.abs(height - middle[:, 2])[height > geotiff.NODATA]
     assert len(error) > 1000 and np.median(error) < 0.02 and np.percentile(error, 90) < 0.06
-    good(scan2sim("run", *command))
-    assert not (out / "rasters").exists()  # they are of another run than the world
+    stdout_of(scan2sim("run", *command))
+    assert not (out / "rasters").exists()  # they were of another run than the world
 
 
-def test_the_report_has_the_world_to_turn_and_walk_through(world: Path, tmp_path: Path) -> None:
+def test_report_has_a_3d_view_to_orbit_and_walk(world: Path, tmp_path: Path) -> None:
     def eye() -> np.ndarray:
         return np.array(page.value("document.querySelector('output').value").split(), float)
 
@@ -133,11 +134,11 @@ def test_the_report_has_the_world_to_turn_and_walk_through(world: Path, tmp_path
         page.until("document.querySelector('header').dataset.state == 'open' && document.querySelector('output').value")
         street, start = page.picture()[50:450], eye()
         assert street.std() > 15, "the canvas shows more than one colour"
-        while np.linalg.norm((eye() - start)[:2]) < 0.3:  # frames are few without a GPU
+        while np.linalg.norm((eye() - start)[:2]) < 0.3:  # few frames per second without a GPU
             page.key("KeyW", "w", 0.3)
         assert abs((eye() - start)[2]) < 0.5, "it walks on the ground"
         page.drag((400, 300), (700, 300))
-        page.until(SHOWN)
+        page.until(NEXT_FRAME_DRAWN)
         assert np.abs(page.picture()[50:450].astype(int) - street).mean() > 10
         page.click("[data-to=turn]")
         page.until(f"Number(document.querySelector('output').value.split('  ')[2]) > {start[2] + 5}")
@@ -148,16 +149,16 @@ def test_the_report_has_the_world_to_turn_and_walk_through(world: Path, tmp_path
         page.until("document.querySelector('output').value")
         street, start = page.picture()[50:560], eye()
         page.touch("canvas", 0.3, across=120)
-        page.until(SHOWN)
+        page.until(NEXT_FRAME_DRAWN)
         assert np.abs(page.picture()[50:560].astype(int) - street).mean() > 2 and (eye() == start).all()
         while np.linalg.norm((eye() - start)[:2]) < 0.3:
             page.touch(".pad [data-key=KeyW]", 0.3)
-        page.open(Path(shutil.copy(world / "report.html", tmp_path)))  # without what lies beside it
+        page.open(Path(shutil.copy(world / "report.html", tmp_path)))  # without its scripts
         page.click("[data-open]")
         page.until("document.querySelector('[role=status]').textContent.includes(\"isn't beside this page\")")
 
 
-def test_without_webgl_the_report_shows_the_picture_and_says_why(world: Path, tmp_path: Path) -> None:
+def test_report_without_webgl_shows_the_image_and_the_reason(world: Path, tmp_path: Path) -> None:
     with chromium(tmp_path, "--disable-3d-apis") as page:
         page.open(world / "report.html")
         page.click("[data-open]")
@@ -179,7 +180,7 @@ def edit(tile: Path, old: str, new: str, count: int = 1) -> None:
     (tile / "tile.toml").write_text(text.replace(old, new, count), encoding="utf-8")
 
 
-def test_a_terminal_that_is_not_utf8_gets_question_marks(tmp_path: Path) -> None:
+def test_unencodable_characters_are_printed_as_question_marks(tmp_path: Path) -> None:
     tile = tmp_path / "straße\u2026"
     shutil.copytree(ROOT / "data_samples" / "tile", tile)
     command = [sys.executable, "-m", "scan2sim.flows.cli", "inspect", str(tile)]
@@ -189,12 +190,12 @@ def test_a_terminal_that_is_not_utf8_gets_question_marks(tmp_path: Path) -> None
 
 
 def test_version_and_help() -> None:
-    assert good(scan2sim("--version")).startswith("scan2sim 0.")
-    text = good(scan2sim("--help"))
+    assert stdout_of(scan2sim("--version")).startswith("scan2sim 0.")
+    text = stdout_of(scan2sim("--help"))
     assert all(command in text for command in ("run", "plan", "inspect", "import", "sample"))
 
 
-def test_a_street_becomes_a_world_with_its_report(world: Path) -> None:
+def test_run_builds_world_and_report(world: Path) -> None:
     assert len(list((world / "world").glob("*.sdf"))) == 1
     report = json.loads((world / "report.json").read_text(encoding="utf-8"))
     for group in ("terrain", "building", "vegetation"):
@@ -208,7 +209,7 @@ def test_a_street_becomes_a_world_with_its_report(world: Path) -> None:
     assert page.count("data:image/") >= 8 and "http" not in page.split("<main>")[1]
 
 
-def test_gazebo_loads_the_world_and_a_box_rests_on_its_road(street: Path, world: Path) -> None:
+def test_gazebo_loads_the_world_and_a_box_rests_on_the_road(street: Path, world: Path) -> None:
     tile = read_tile(street)
     assert tile.trajectory is not None
     x, y, z = tile.trajectory.positions[len(tile.trajectory.times) // 4]
@@ -220,81 +221,81 @@ def test_gazebo_loads_the_world_and_a_box_rests_on_its_road(street: Path, world:
     assert {name.split("_")[0] for name in textures} == {"terrain", "building", "vegetation"}
 
 
-def test_running_again_does_nothing_and_a_deleted_page_comes_back(street: Path, world: Path) -> None:
+def test_second_run_does_nothing_and_a_deleted_texture_is_rebuilt(street: Path, world: Path) -> None:
     command = ("run", street, "--out", world, "--hold-out", 4, *SMALL)
     before = {p: p.stat().st_mtime_ns for p in (world / "steps").rglob("*") if p.is_file()}
-    assert "nothing to do" in good(scan2sim(*command))
+    assert "nothing to do" in stdout_of(scan2sim(*command))
     assert before == {p: p.stat().st_mtime_ns for p in (world / "steps").rglob("*") if p.is_file()}
     next((world / "steps" / "texture.building").rglob("page_0.png")).unlink()
-    plan = good(scan2sim("plan", *command[1:]))
+    plan = stdout_of(scan2sim("plan", *command[1:]))
     assert [line.split()[0] for line in plan.splitlines() if " yes " in line] == ["texture.building"]
-    good(scan2sim(*command))
+    stdout_of(scan2sim(*command))
     after = {p: p.stat().st_mtime_ns for p in (world / "steps").rglob("*") if p.is_file()}
     assert {p.parts[-3] for p in before if before[p] != after.get(p)} <= {"texture.building"} | {
         p.parts[-3] for p in before if "texture.building" in str(p)
     }
 
 
-def test_plan_says_what_a_setting_changes(street: Path, world: Path) -> None:
-    text = good(
+def test_plan_lists_the_steps_affected_by_a_setting(street: Path, world: Path) -> None:
+    text = stdout_of(
         scan2sim("plan", street, "--out", world, "--hold-out", 4, *SMALL, "--set", "trim.building.max_edge=0.3")
     )
     again = {line.split()[0] for line in text.splitlines() if " yes " in line}
-    assert "trim.building" in again and "texture.terrain" in again  # buildings hide what is behind them
+    assert "trim.building" in again and "texture.terrain" in again  # buildings occlude the terrain
     assert not again & {"ingest", "poisson.building", "trim.terrain", "decimate.terrain"}
 
 
-def test_inspect_tells_of_cloud_tile_mesh_and_world(street: Path, world: Path) -> None:
-    assert "EPSG" in good(scan2sim("inspect", street / "cloud.laz"))
-    assert "photos" in good(scan2sim("inspect", street))
-    assert "triangles" in good(scan2sim("inspect", next((world / "world").rglob("terrain*.obj"))))
-    assert "place" in good(scan2sim("inspect", world))
-    bad(scan2sim("inspect", street / "nothing.laz"), 3, "nothing.laz", "is missing")
+def test_inspect_summarizes_cloud_tile_mesh_and_world(street: Path, world: Path) -> None:
+    assert "EPSG" in stdout_of(scan2sim("inspect", street / "cloud.laz"))
+    assert "photos" in stdout_of(scan2sim("inspect", street))
+    assert "triangles" in stdout_of(scan2sim("inspect", next((world / "world").rglob("terrain*.obj"))))
+    assert "place" in stdout_of(scan2sim("inspect", world))
+    assert_fails(scan2sim("inspect", street / "nothing.laz"), 3, "nothing.laz", "file not found")
 
 
-def test_plants_as_places(street: Path, world: Path, tmp_path: Path) -> None:
+def test_vegetation_as_locations_with_low_poly_plants(street: Path, world: Path, tmp_path: Path) -> None:
     out = shutil.copytree(world, tmp_path / "out")
-    good(scan2sim("run", street, "--out", out, "--hold-out", 4, *SMALL, "--set", "split.vegetation=locations"))
+    stdout_of(scan2sim("run", street, "--out", out, "--hold-out", 4, *SMALL, "--set", "split.vegetation=locations"))
     pages = list((out / "world").rglob("vegetation*.png"))
-    assert len(pages) == 1  # of the low-poly plants that stand there
+    assert len(pages) == 1  # texture of the low-poly plants
     features = json.loads(next((out / "world").rglob("plants.geojson")).read_text(encoding="utf-8"))["features"]
     assert features and all(f["properties"]["height_m"] > 0 for f in features)
 
 
-def test_a_cloud_alone_without_colours_or_classes(street: Path, tmp_path: Path) -> None:
+def test_cloud_without_photos_colours_and_classes(street: Path, tmp_path: Path) -> None:
     frame = Frame("EPSG:32633", (500000.0, 5400000.0, 200.0))
     cloud = las.read(street / "cloud.laz", read_tile(street).frame)
     las.write(tmp_path / "plain.laz", PointCloud(frame, cloud.xyz))
-    good(scan2sim("import", "las", tmp_path / "plain.laz", "--out", tmp_path / "tile"))
-    good(scan2sim("run", tmp_path / "tile", "--out", tmp_path / "out", *SMALL))
+    stdout_of(scan2sim("import", "las", tmp_path / "plain.laz", "--out", tmp_path / "tile"))
+    stdout_of(scan2sim("run", tmp_path / "tile", "--out", tmp_path / "out", *SMALL))
     report = json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
     assert report["texture"]["coverage"] == 0 and report["steps"]["segment"]["facts"]["source"] == "shape"
 
 
-def test_truncated_cloud(damaged: Path, tmp_path: Path) -> None:
+def test_truncated_cloud_is_an_input_error(damaged: Path, tmp_path: Path) -> None:
     data = (damaged / "cloud.laz").read_bytes()
     (damaged / "cloud.laz").write_bytes(data[: len(data) // 2])
-    bad(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "cloud.laz", "Copy it again")
+    assert_fails(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "cloud.laz", "Copy it again")
 
 
-def test_no_crs(damaged: Path, tmp_path: Path) -> None:
+def test_missing_crs_is_an_input_error(damaged: Path, tmp_path: Path) -> None:
     cloud = las.read(damaged / "cloud.laz", read_tile(damaged).frame)
     las.write(damaged / "cloud.laz", PointCloud(Frame(), cloud.xyz))
     text = (damaged / "tile.toml").read_text(encoding="utf-8")
     (damaged / "tile.toml").write_text(
         "\n".join(line for line in text.splitlines() if not line.startswith("crs")), encoding="utf-8"
     )
-    bad(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "cloud.laz", "no CRS", 'crs = "local"')
+    assert_fails(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "cloud.laz", "no CRS", 'crs = "local"')
 
 
-def test_two_crs(damaged: Path, tmp_path: Path) -> None:
+def test_clouds_with_different_crs_are_an_input_error(damaged: Path, tmp_path: Path) -> None:
     cloud = las.read(damaged / "cloud.laz", read_tile(damaged).frame)
     las.write(damaged / "other.laz", PointCloud(Frame("EPSG:2154", (600000.0, 6000000.0, 0.0)), cloud.xyz[:5000]))
     edit(damaged, '"cloud.laz"', '"cloud.laz", "other.laz"')
-    bad(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "other.laz", "EPSG:2154", "one CRS")
+    assert_fails(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "other.laz", "EPSG:2154", "one CRS")
 
 
-def test_cloud_and_cameras_that_never_meet(damaged: Path, tmp_path: Path) -> None:
+def test_photos_that_see_no_point_are_a_data_error(damaged: Path, tmp_path: Path) -> None:
     lines = (damaged / "tile.toml").read_text(encoding="utf-8").splitlines()
     inside = False
     for i, line in enumerate(lines):
@@ -307,23 +308,28 @@ def test_cloud_and_cameras_that_never_meet(damaged: Path, tmp_path: Path) -> Non
         if line.startswith("position") and line.endswith("]"):
             lines[i], inside = "position = [12345.0, 12345.0, 12345.0]", False
     (damaged / "tile.toml").write_text("\n".join(lines), encoding="utf-8")
-    bad(scan2sim("run", damaged, "--out", tmp_path / "out", *SMALL), 4, "never meet", "CRS, units and axes")
+    assert_fails(
+        scan2sim("run", damaged, "--out", tmp_path / "out", *SMALL),
+        4,
+        "photos sees a point of the cloud",
+        "CRS, units and axes",
+    )
 
 
-def test_missing_and_unreadable_photos_are_skipped(damaged: Path, world: Path, tmp_path: Path) -> None:
+def test_missing_and_unreadable_photos_are_skipped_with_a_warning(damaged: Path, world: Path, tmp_path: Path) -> None:
     photos = sorted((damaged / "photos").rglob("*.jpg"))
     photos[0].unlink()
     photos[1].write_bytes(b"no photo")
     data = photos[2].read_bytes()
     photos[2].write_bytes(data[: len(data) // 3])
     shutil.copytree(world, tmp_path / "out")
-    said = good(scan2sim("run", damaged, "--out", tmp_path / "out", *SMALL))
+    printed = stdout_of(scan2sim("run", damaged, "--out", tmp_path / "out", *SMALL))
     for photo in photos[:3]:
-        assert photo.name in said, said
+        assert photo.name in printed, printed
 
 
 @pytest.mark.slow
-def test_masks_named_as_their_photos_keep_pixels_out(damaged: Path, world: Path, tmp_path: Path) -> None:
+def test_masked_pixels_are_not_used(damaged: Path, world: Path, tmp_path: Path) -> None:
     (damaged / "masks").mkdir()
     text, out = (damaged / "tile.toml").read_text(encoding="utf-8"), []
     for line in text.splitlines():
@@ -335,48 +341,48 @@ def test_masks_named_as_their_photos_keep_pixels_out(damaged: Path, world: Path,
             out.append(f'mask = "masks/{name}"')
     (damaged / "tile.toml").write_text("\n".join(out), encoding="utf-8")
     shutil.copytree(world, tmp_path / "out")
-    good(scan2sim("run", damaged, "--out", tmp_path / "out", *SMALL))
+    stdout_of(scan2sim("run", damaged, "--out", tmp_path / "out", *SMALL))
     assert json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))["texture"]["coverage"] == 0
 
 
-def test_a_folder_that_is_no_tile_is_not_overwritten(street: Path, tmp_path: Path) -> None:
+def test_folder_that_is_not_a_tile_is_not_overwritten(street: Path, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     result = scan2sim("import", "las", street / "cloud.laz", "--out", tmp_path, "--overwrite")
-    bad(result, 2, "is no tile")
+    assert_fails(result, 2, "is not a tile")
     assert (tmp_path / "notes.txt").read_text(encoding="utf-8") == "mine"
 
 
 @pytest.mark.parametrize("options", [["--jobs", "-1"], ["--set", "ingest.unit=2.0"], ["--set", "split.roof.x=1"]])
-def test_options_that_make_no_sense(street: Path, tmp_path: Path, options: list[str]) -> None:
+def test_invalid_options_are_setting_errors(street: Path, tmp_path: Path, options: list[str]) -> None:
     assert scan2sim("run", street, "--out", tmp_path / "out", *options).returncode == 2
 
 
-def test_a_users_edit_of_the_world_stays(street: Path, world: Path) -> None:
+def test_user_edits_of_the_world_are_kept(street: Path, world: Path) -> None:
     sdf = next((world / "world").glob("*.sdf"))
     sdf.write_text(sdf.read_text(encoding="utf-8") + "<!-- my robot -->", encoding="utf-8")
-    good(scan2sim("run", street, "--out", world, "--hold-out", 4, *SMALL))
+    stdout_of(scan2sim("run", street, "--out", world, "--hold-out", 4, *SMALL))
     assert "my robot" in sdf.read_text(encoding="utf-8")
 
 
-def test_all_photos_gone(damaged: Path, tmp_path: Path) -> None:
+def test_missing_photo_folder_is_an_input_error(damaged: Path, tmp_path: Path) -> None:
     shutil.rmtree(damaged / "photos")
-    bad(scan2sim("run", damaged, "--out", tmp_path / "out", *SMALL), 3, "no photo of the tile can be read")
+    assert_fails(scan2sim("run", damaged, "--out", tmp_path / "out", *SMALL), 3, "no photo of the tile can be read")
 
 
-def test_nan_pose_and_no_rotation(damaged: Path, tmp_path: Path) -> None:
+def test_invalid_poses_are_input_errors(damaged: Path, tmp_path: Path) -> None:
     text = (damaged / "tile.toml").read_text(encoding="utf-8")
     head, tail = text.split("rotation", 1)
     (damaged / "tile.toml").write_text(
         head + "rotation = [[1,0,0],[0,2,0],[0,0,1]]\n#" + _one_line(tail), encoding="utf-8"
     )
-    bad(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "tile.toml", "is no rotation")
+    assert_fails(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "tile.toml", "is not a rotation matrix")
     head, tail = text.split("position", 1)
     (damaged / "tile.toml").write_text(head + "position = [nan, 0.0, 0.0]\n#" + _one_line(tail), encoding="utf-8")
-    bad(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "tile.toml", "NaN")
+    assert_fails(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "tile.toml", "NaN")
 
 
 def _one_line(rest: str) -> str:
-    """A TOML value's remainder with the value commented out, whether on one line or several."""
+    """The rest of a TOML file with the value at its start joined to one line, to be commented out."""
     depth, end = 0, rest.index("[")
     while depth > 0 or rest[end] == "[":
         depth += {"[": 1, "]": -1}.get(rest[end], 0)
@@ -385,7 +391,7 @@ def _one_line(rest: str) -> str:
 
 
 def flip(path: Path, *, hide: bool = False) -> None:
-    """Change a byte in the middle of a file, and leave its time as it was if it is to be hidden."""
+    """Flip a bit in the middle of a file; with `hide`, restore its modification time."""
     stat, data = path.stat(), bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
@@ -393,26 +399,26 @@ def flip(path: Path, *, hide: bool = False) -> None:
         os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
 
 
-def test_damage_is_noticed_told_and_mended(street: Path, world: Path, tmp_path: Path) -> None:
+def test_damaged_results_are_reported_and_rebuilt(street: Path, world: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(world, out, symlinks=True)
     options = ["run", street, "--out", out, "--hold-out", 4, *SMALL]
-    assert "are as they were made" in good(scan2sim("verify", out))
-    assert "nothing to do" in good(scan2sim(*options))
+    assert "are intact" in stdout_of(scan2sim("verify", out))
+    assert "nothing to do" in stdout_of(scan2sim(*options))
 
     (page,) = list((out / "world").rglob("*building*.png"))[:1]
     (sdf,) = (out / "world").glob("*.sdf")
     whole = page.read_bytes(), sdf.read_bytes()
     flip(page)
-    flip(sdf)  # an edit, for all that can be known
-    changed = f"{sdf} was changed since it was made, and stays so"
+    flip(sdf)  # can't be distinguished from an edit
+    changed = f"{sdf} was edited and is kept"
     checked = scan2sim("verify", out)
     assert checked.returncode == 5 and changed in checked.stdout and "1 of" in checked.stderr
-    assert changed in good(scan2sim(*options))
+    assert changed in stdout_of(scan2sim(*options))
     assert page.read_bytes() == whole[0] and sdf.read_bytes() != whole[1]
-    assert changed in good(scan2sim(*options))
+    assert changed in stdout_of(scan2sim(*options))
     sdf.unlink()
-    good(scan2sim(*options))
+    stdout_of(scan2sim(*options))
     made = next((out / "steps" / "export").rglob(sdf.name))
     assert (page.read_bytes(), sdf.read_bytes()) == (whole[0], made.read_bytes())
 
@@ -425,14 +431,14 @@ def test_damage_is_noticed_told_and_mended(street: Path, world: Path, tmp_path: 
     result = scan2sim("verify", out)
     assert result.returncode == 5 and "Traceback" not in result.stderr
     assert "decimate.terrain" in result.stdout and page.name in result.stdout
-    printed = good(scan2sim(*options))
+    printed = stdout_of(scan2sim(*options))
     assert (kept.read_bytes(), page.read_bytes()) == whole
     assert [line.split()[1] for line in printed.splitlines() if line.startswith("✓")] == ["decimate.terrain"]
-    good(scan2sim("verify", out))
-    bad(scan2sim("verify", tmp_path), 3, "holds no results")
+    stdout_of(scan2sim("verify", out))
+    assert_fails(scan2sim("verify", tmp_path), 3, "contains no results")
 
 
-def test_bad_input_leaves_earlier_results(street: Path, world: Path, tmp_path: Path) -> None:
+def test_bad_input_keeps_earlier_results(street: Path, world: Path, tmp_path: Path) -> None:
     shutil.copytree(world, tmp_path / "out", symlinks=True)
     shutil.copytree(street, tmp_path / "tile")
     data = (tmp_path / "tile" / "cloud.laz").read_bytes()
@@ -446,7 +452,7 @@ def test_bad_input_leaves_earlier_results(street: Path, world: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("megabytes", [6, pytest.param(40, marks=pytest.mark.slow)])
-def test_a_full_disk(street: Path, tmp_path: Path, megabytes: int) -> None:
+def test_full_disk_is_a_space_error(street: Path, tmp_path: Path, megabytes: int) -> None:
     mount = tmp_path / "small_disk"
     mount.mkdir()
     if subprocess.run(
@@ -454,20 +460,22 @@ def test_a_full_disk(street: Path, tmp_path: Path, megabytes: int) -> None:
     ).returncode:
         pytest.skip("a small file system can't be mounted here (not root)")
     try:
-        bad(scan2sim("run", street, "--out", mount / "out", *SMALL), 6, "no space left", "Free some space")
+        assert_fails(scan2sim("run", street, "--out", mount / "out", *SMALL), 6, "no space left", "Free some space")
     finally:
         subprocess.run(["umount", str(mount)], check=True)
 
 
-def test_ctrl_c_ends_with_a_message_and_frees_the_folder(street: Path, tmp_path: Path) -> None:
+def test_ctrl_c_prints_a_message_and_releases_the_lock(street: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "scan2sim.flows.cli", "run", str(street), "--out", str(tmp_path / "out"), *SMALL]
     child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while child.poll() is None and not (tmp_path / "out" / "steps" / "poisson.terrain").exists():
         time.sleep(0.02)
     child.send_signal(signal.SIGINT)
     _, message = child.communicate(timeout=120)
-    assert child.returncode == 130 and "what was finished is kept" in message and "Traceback" not in message
-    bad(scan2sim("run", street, "--out", tmp_path / "out", "--from", "roof"), 2, "no such step")  # not locked
+    assert child.returncode == 130 and "finished steps are kept" in message and "Traceback" not in message
+    assert_fails(
+        scan2sim("run", street, "--out", tmp_path / "out", "--from", "roof"), 2, "no such step"
+    )  # not BusyError
 
 
 @pytest.mark.parametrize(
@@ -477,7 +485,7 @@ def test_ctrl_c_ends_with_a_message_and_frees_the_folder(street: Path, tmp_path:
         *(pytest.param(s, marks=pytest.mark.slow) for s in ("ingest", "unwrap.building", "texture.terrain", "export")),
     ],
 )
-def test_kill_9_at_any_step_then_resume_gives_the_same_to_the_last_bit(
+def test_resume_after_sigkill_gives_identical_textures(
     street: Path, world: Path, tmp_path: Path, step: str
 ) -> None:  # fmt: skip
     arguments = ["run", str(street), "--out", str(tmp_path / "out"), "--hold-out", "4", *SMALL]
@@ -490,9 +498,9 @@ def test_kill_9_at_any_step_then_resume_gives_the_same_to_the_last_bit(
     child.wait()
     time.sleep(1)
     finished = {p.parent.name for p in (tmp_path / "out" / "steps").glob("*/*") if not p.name.startswith(".tmp-")}
-    out = good(scan2sim(*arguments))
+    out = stdout_of(scan2sim(*arguments))
     again = {line.split()[1] for line in out.splitlines() if line.startswith("✓")}
-    assert not finished & again, "what was finished is kept"
+    assert not finished & again, "finished steps are not repeated"
     assert (tmp_path / "out" / "report.html").is_file()
     assert not list((tmp_path / "out" / "steps").rglob(".tmp-*"))
     for path in sorted((world / "world").rglob("*.png")):

@@ -1,4 +1,4 @@
-"""Progress on narrow terminals."""
+"""Progress bars on narrow terminals."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scan2sim.flows.commands import display
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_a_long_message_takes_none_of_the_bars_room(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_message_does_not_shrink_the_progress_bar(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(display, "console", Console(file=io.StringIO(), width=width, force_terminal=True))
     bars = display._progress()
     bars.add_task("poisson.vegetation", total=1, completed=1, message="photos/panorama_000123.jpg " * 9)

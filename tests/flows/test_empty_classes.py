@@ -1,4 +1,4 @@
-"""Any class of the cloud may be empty, the ground included: the world is made of the others."""
+"""Any class of the cloud may be empty, even the ground: the world is built from the others."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from scan2sim.pipeline.io.survey import read_survey
 from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
 from tests.flows.tiny import COARSE, keep_points, loaded, points, scan2sim, tiny
 
-EVERYTHING = COARSE | {"split": {"vegetation": "both", "vehicles": "keep"}}
+ALL_SURFACES = COARSE | {"split": {"vegetation": "both", "vehicles": "keep"}}
 CLASSES: dict[str, np.ndarray] = {name: np.flatnonzero(group_of() == number) for number, name in enumerate(GROUPS)}
 CLASSES |= {"vehicle": np.array([CODE["vehicle"]]), "furniture": np.array([CODE["road_sign"], CODE["pole"]])}
-FEW = 34
-"""Points that are too few for a surface, as a SLAM map had of the ground."""
-NO_WORLD = 4
-FAST = {("without", "terrain", "street"), ("alone", "vegetation", "map"), ("few", "terrain", "map")}
+FEW_POINTS = 34
+"""Number of points that is too small for a surface; a SLAM map had as many on the ground."""
+DATA_ERROR = 4
+"""Exit code if no world can be built."""
+FAST_CASES = {("without", "terrain", "street"), ("alone", "vegetation", "map"), ("few", "terrain", "map")}
 
 
 @pytest.fixture(scope="module", params=["street", "map"])
 def tile(request: pytest.FixtureRequest, small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A tiny street, and the same as a map that SLAM left: neither photos nor a trajectory."""
+    """A tiny street, and the same street like a SLAM map: without photos and trajectory."""
     is_map = request.param == "map"
     made = tiny(small_street, tmp_path_factory.mktemp("tiny") / "tile", photos=0 if is_map else 2)
     if is_map:
@@ -36,34 +37,34 @@ def tile(request: pytest.FixtureRequest, small_street: Path, tmp_path_factory: p
 
 
 def thinned(how: str, classification: np.ndarray, name: str) -> Bools:
-    """Which points are kept (N,): all without a class, the class alone, or all with few of the class."""
+    """Mask (N,) of the points to keep: all but a class, only the class, or all with few points of the class."""
     own = np.isin(classification, CLASSES[name])
     if how == "alone":
         return own
     few = np.zeros(len(own), bool)
     if how == "few":
-        few[np.flatnonzero(own)[:: max(1, own.sum() // FEW)][:FEW]] = True
+        few[np.flatnonzero(own)[:: max(1, own.sum() // FEW_POINTS)][:FEW_POINTS]] = True
     return np.asarray(~own | few)
 
 
 @pytest.mark.parametrize(
     ("how", "name", "tile"),
     [
-        pytest.param(how, name, kind, marks=() if (how, name, kind) in FAST else pytest.mark.slow)
+        pytest.param(how, name, kind, marks=() if (how, name, kind) in FAST_CASES else pytest.mark.slow)
         for kind in ("street", "map")
         for how in ("without", "alone", "few")
         for name in CLASSES
     ],
     indirect=["tile"],
 )
-def test_a_world_is_made_of_what_there_is(tile: Path, tmp_path: Path, how: str, name: str) -> None:
+def test_world_is_built_from_the_remaining_classes(tile: Path, tmp_path: Path, how: str, name: str) -> None:
     copy = shutil.copytree(tile, tmp_path / "tile")
     cloud = points(copy)
     assert cloud.classification is not None
     keep_points(copy, thinned(how, cloud.classification, name))
-    code, printed = scan2sim("run", copy, "--out", tmp_path / "out", settings=EVERYTHING)
+    code, printed = scan2sim("run", copy, "--out", tmp_path / "out", settings=ALL_SURFACES)
     if how == "alone" and name in ("vehicle", "furniture"):
-        assert code == NO_WORLD and ("no point belongs to terrain" in printed or "points in all" in printed)
+        assert code == DATA_ERROR and ("no point belongs to terrain" in printed or "points in all" in printed)
         return
     assert code == 0, printed
     (made,) = loaded(tmp_path / "out").tiles
@@ -74,9 +75,7 @@ def test_a_world_is_made_of_what_there_is(tile: Path, tmp_path: Path, how: str, 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CLASSES)
 @pytest.mark.parametrize("how", ["without", "alone", "few"])
-def test_a_survey_is_made_though_a_tile_has_none_of_a_class(
-    small_street: Path, tmp_path: Path, how: str, name: str
-) -> None:
+def test_survey_is_built_if_a_tile_lacks_a_class(small_street: Path, tmp_path: Path, how: str, name: str) -> None:
     corridor = tiny(small_street, tmp_path / "corridor")
     cut_survey(corridor, tmp_path / "survey", CutParams(length=6.0, buffer=3.0))
     last = [*read_survey(tmp_path / "survey" / "survey.toml").tiles.values()][-1].parent
@@ -84,8 +83,10 @@ def test_a_survey_is_made_though_a_tile_has_none_of_a_class(
     assert cloud.classification is not None
     kept = thinned(how, cloud.classification, name)
     keep_points(last, kept)
-    code, printed = scan2sim("survey", tmp_path / "survey", "--out", tmp_path / "out", settings=EVERYTHING)
-    if how == "alone" and name == "furniture":  # of vehicles alone the neighbour's points at the border make a world
+    code, printed = scan2sim("survey", tmp_path / "survey", "--out", tmp_path / "out", settings=ALL_SURFACES)
+    if (
+        how == "alone" and name == "furniture"
+    ):  # with only vehicles, the neighbour's points at the border suffice for a world
         assert code == 5 and "1 of 2 tiles failed" in printed and "points in all" in printed
         assert len(loaded(tmp_path / "out").tiles) == 1
     else:
@@ -94,7 +95,7 @@ def test_a_survey_is_made_though_a_tile_has_none_of_a_class(
 
 
 @pytest.mark.slow
-def test_a_slam_map_with_34_points_of_ground_ends_in_a_world(real_data: Path, tmp_path: Path) -> None:
+def test_slam_map_with_34_ground_points_becomes_a_world(real_data: Path, tmp_path: Path) -> None:
     cloud = real_data / "slam_maps" / "hdl501.pcd"
     assert scan2sim("import", "clouds", cloud, "--crs", "local", "--out", tmp_path / "tile", settings={})[0] == 0
     code, printed = scan2sim("run", tmp_path / "tile", "--out", tmp_path / "out", settings=COARSE)

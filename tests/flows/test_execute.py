@@ -1,4 +1,4 @@
-"""Planning and execution: what runs again and what doesn't, and that nothing is lost on failures."""
+"""Planning and execution: which tasks run again, and that failures lose no results."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ import scan2sim
 from scan2sim.flows.engine.dispatch import dispatch
 from scan2sim.flows.engine.execution import execute, run_to_world
 from scan2sim.flows.engine.lock import locked
-from scan2sim.flows.engine.planning import Planned, Reason, plan
+from scan2sim.flows.engine.planning import PlannedTask, Reason, plan
 from scan2sim.flows.engine.ready_queue import Outcome
-from scan2sim.flows.engine.run_task import run_node
-from scan2sim.flows.engine.versions import APART, check_version, versions
-from scan2sim.flows.pipelines.graph import Node, NodeId, Output
+from scan2sim.flows.engine.run_task import run_task
+from scan2sim.flows.engine.versions import EXTRAS_WITHOUT_STEPS, check_version, versions
+from scan2sim.flows.pipelines.graph import Output, Task, TaskId
 from scan2sim.pipeline.core.cache import Digests, Manifest, Store, _seal, digest
 from scan2sim.pipeline.core.errors import BusyError, DataError, ScanError, StepError, UnavailableError
 from scan2sim.pipeline.core.optional_deps import EXTRA_OF
@@ -46,12 +46,12 @@ def source(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def run(tmp_path: Path, source: Path) -> Run:
-    """Run the toy chain; keyword arguments by node, or of `plan`."""
+    """Run the toy graph; keyword arguments are parameters by task, or of `plan`."""
 
     def go(force: bool = False, start: str | None = None, **changes: dict[str, object]) -> dict[str, Manifest]:
         store = Store(tmp_path / "store")
-        nodes = chain(source, tmp_path / "log", **changes)
-        outcome = execute(plan(nodes, store, force=force, start=start), store, jobs=2, watch=lambda *_: None)
+        tasks = chain(source, tmp_path / "log", **changes)
+        outcome = execute(plan(tasks, store, force=force, start=start), store, jobs=2, on_event=lambda *_: None)
         outcome.check()
         return outcome.of_tile()
 
@@ -60,7 +60,7 @@ def run(tmp_path: Path, source: Path) -> Run:
 
 @pytest.fixture
 def ran(tmp_path: Path) -> Callable[[], str]:
-    """Names of the nodes that ran since the last call, sorted."""
+    """Names of the tasks that ran since the last call, sorted."""
 
     def take() -> str:
         log = tmp_path / "log"
@@ -71,14 +71,14 @@ def ran(tmp_path: Path) -> Callable[[], str]:
     return take
 
 
-def test_runs_all_once_then_nothing(run: Run, ran: Callable[[], str]) -> None:
+def test_second_run_uses_the_cache(run: Run, ran: Callable[[], str]) -> None:
     assert run()["d"].facts == {"total": 2}
     assert ran() == "abcd"
     assert run()["d"].facts == {"total": 2}
     assert ran() == ""
 
 
-def test_changes_rerun_what_depends_on_them_alone(run: Run, ran: Callable[[], str], source: Path) -> None:
+def test_changes_rerun_only_dependent_tasks(run: Run, ran: Callable[[], str], source: Path) -> None:
     run()
     ran()
     run(c={"value": 5})
@@ -88,7 +88,7 @@ def test_changes_rerun_what_depends_on_them_alone(run: Run, ran: Callable[[], st
     assert ran() == "abcd"
 
 
-def test_touching_a_source_without_changing_it_reruns_nothing(run: Run, ran: Callable[[], str], source: Path) -> None:
+def test_new_modification_time_alone_reruns_nothing(run: Run, ran: Callable[[], str], source: Path) -> None:
     run()
     ran()
     os.utime(source, (0, 0))
@@ -96,7 +96,7 @@ def test_touching_a_source_without_changing_it_reruns_nothing(run: Run, ran: Cal
     assert ran() == ""
 
 
-def test_what_comes_out_the_same_ends_the_need_to_redo(run: Run, ran: Callable[[], str], source: Path) -> None:
+def test_unchanged_output_cuts_off_dependent_tasks(run: Run, ran: Callable[[], str], source: Path) -> None:
     run()
     ran()
     source.write_text("1\n", encoding="utf-8")  # other bytes, the same number
@@ -108,7 +108,7 @@ def test_what_comes_out_the_same_ends_the_need_to_redo(run: Run, ran: Callable[[
     assert ran() == "abcd"
 
 
-def test_digests_are_remembered_until_a_file_changes(tmp_path: Path, source: Path) -> None:
+def test_digests_are_cached_until_a_file_changes(tmp_path: Path, source: Path) -> None:
     file = tmp_path / "digests.json"
     first = Digests(file)
     known = first(source)
@@ -118,20 +118,20 @@ def test_digests_are_remembered_until_a_file_changes(tmp_path: Path, source: Pat
     assert Digests(file)(source) == digest(source) != known
 
 
-def test_a_failure_is_noted_and_the_rest_goes_on(tmp_path: Path, source: Path, ran: Callable[[], str]) -> None:
+def test_keep_going_runs_all_independent_tasks(tmp_path: Path, source: Path, ran: Callable[[], str]) -> None:
     store = Store(tmp_path / "store")
-    nodes = chain(source, tmp_path / "log", b={"does": "fail"})
-    outcome = execute(plan(nodes, store), store, jobs=1, watch=lambda *_: None, to_the_end=True)
-    assert set(outcome.of_tile()) == {"a", "c"} and set(outcome.failed) == {NodeId("b")}
+    tasks = chain(source, tmp_path / "log", b={"does": "fail"})
+    outcome = execute(plan(tasks, store), store, jobs=1, on_event=lambda *_: None, keep_going=True)
+    assert set(outcome.of_tile()) == {"a", "c"} and set(outcome.failed) == {TaskId("b")}
     assert ran() == "abc"
 
 
-class Ran:
-    """A `dispatch.Future` of a node that has run in this process."""
+class FinishedFuture:
+    """A `dispatch.Future` of a task that has run in this process."""
 
-    def __init__(self, item: Planned, store: Store) -> None:
+    def __init__(self, item: PlannedTask, store: Store) -> None:
         try:
-            self._outcome: object = run_node(item, store, item.inputs(store))
+            self._outcome: object = run_task(item, store, item.inputs(store))
         except ScanError as error:
             self._outcome = error
 
@@ -143,30 +143,30 @@ class Ran:
 
 
 @pytest.mark.parametrize("how", ["processes", "dispatched"])
-def test_a_side_product_that_fails_stops_nothing_and_what_reads_it_runs_without_it(
+def test_failed_side_product_is_left_out_and_its_readers_run_without_it(
     tmp_path: Path, source: Path, ran: Callable[[], str], how: str
 ) -> None:
     store = Store(tmp_path / "store")
 
-    def planned(without: Collection[NodeId] = (), **changes: dict[str, object]) -> list[Planned]:
-        nodes = []
-        for node in chain(source, tmp_path / "log", **changes):
-            kept = {name: at for name, at in node.inputs.items() if not (isinstance(at, Output) and at.node in without)}
-            if node.id not in without:
-                nodes.append(replace(node, inputs=kept, step=replace(node.step, side_product=node.step.name == "b")))
-        return plan(nodes, store, force=True)
+    def planned(without: Collection[TaskId] = (), **changes: dict[str, object]) -> list[PlannedTask]:
+        tasks = []
+        for task in chain(source, tmp_path / "log", **changes):
+            kept = {name: at for name, at in task.inputs.items() if not (isinstance(at, Output) and at.task in without)}
+            if task.id not in without:
+                tasks.append(replace(task, inputs=kept, step=replace(task.step, side_product=task.step.name == "b")))
+        return plan(tasks, store, force=True)
 
-    def run(planned: list[Planned], store: Store) -> Outcome:
+    def run(planned: list[PlannedTask], store: Store) -> Outcome:
         if how == "dispatched":
-            return dispatch(planned, store, lambda item: Ran(item, store), 1, lambda *_: None)
-        return execute(planned, store, jobs=1, watch=lambda *_: None)
+            return dispatch(planned, store, lambda item: FinishedFuture(item, store), 1, lambda *_: None)
+        return execute(planned, store, jobs=1, on_event=lambda *_: None)
 
     broken = partial(planned, b={"does": "bug"})
     last, outcome = run_to_world(broken(), broken, store, run)
-    assert ran() == "abcd", "each once, though forced"
-    assert {item.node.step.name for item in last} == outcome.of_tile().keys() == {"a", "c", "d"}
+    assert ran() == "abcd", "each runs once, although forced"
+    assert {item.task.step.name for item in last} == outcome.of_tile().keys() == {"a", "c", "d"}
     assert outcome.of_tile()["d"].facts == {"total": 1} and not outcome.failed
-    assert "a bug" in outcome.side_failed[NodeId("b")].cause and not list((tmp_path / "store" / "b").glob("*"))
+    assert "a bug" in outcome.side_failed[TaskId("b")].cause and not list((tmp_path / "store" / "b").glob("*"))
     _, outcome = run_to_world(planned(), planned, store, run)
     assert outcome.of_tile()["d"].facts == {"total": 2} and not outcome.side_failed, "it is retried"
     with pytest.raises(DataError, match="to fail"):
@@ -174,14 +174,14 @@ def test_a_side_product_that_fails_stops_nothing_and_what_reads_it_runs_without_
 
 
 class CountParams(Params):
-    """Counts to `to`; is killed on the way unless it began above `above`."""
+    """Counts to `to`; the process is killed at 2 unless the count started above `above`."""
 
     to: int = 4
     above: int = 0
 
 
 def count(inputs: Inputs, params: CountParams, out: Path, report: Report, checkpoint: Path) -> Done:
-    """Count from where it was killed."""
+    """Count, resuming from the checkpoint."""
     known = checkpoint / "known.txt"
     first = int(known.read_text(encoding="utf-8")) if known.exists() else 0
     for number in range(first, params.to):
@@ -192,18 +192,18 @@ def count(inputs: Inputs, params: CountParams, out: Path, report: Report, checkp
     return Done({"number": out / "number.txt"}, {"began": first})
 
 
-def test_a_long_step_goes_on_where_it_was_killed_with_the_same_input_alone(tmp_path: Path, source: Path) -> None:
+def test_killed_step_resumes_from_its_checkpoint_only_with_the_same_input(tmp_path: Path, source: Path) -> None:
     store, step = Store(tmp_path / "store"), Step("count", 1, count, CountParams, resumes=True)
 
     def run(**params: int) -> Manifest:
-        nodes = [Node(step, CountParams(**params), {"source": source})]
-        outcome = execute(plan(nodes, store), store, jobs=1, watch=lambda *_: None)
+        tasks = [Task(step, CountParams(**params), {"source": source})]
+        outcome = execute(plan(tasks, store), store, jobs=1, on_event=lambda *_: None)
         outcome.check()
         return outcome.of_tile()["count"]
 
     with pytest.raises(StepError, match="killed"):
         run()
-    assert run(above=-1).facts == {"began": 0}, "other parameters begin anew"
+    assert run(above=-1).facts == {"began": 0}, "other parameters don't use the checkpoint"
     assert len(list((store.root / "count").glob(".part-*"))) == 1
     assert run().facts == {"began": 2} and not list((store.root / "count").glob(".part-*"))
     with pytest.raises(StepError, match="killed"):
@@ -217,7 +217,7 @@ def test_a_long_step_goes_on_where_it_was_killed_with_the_same_input_alone(tmp_p
     assert not list((store.root / "count").iterdir())
 
 
-def test_a_folder_is_a_source_by_its_files(tmp_path: Path) -> None:
+def test_digest_of_a_folder_covers_names_and_contents(tmp_path: Path) -> None:
     folder, digests = tmp_path / "frames", Digests(tmp_path / "digests.json")
     folder.mkdir()
     (folder / "1.png").write_bytes(b"one")
@@ -227,7 +227,7 @@ def test_a_folder_is_a_source_by_its_files(tmp_path: Path) -> None:
     assert digests(folder) == digest(folder) != before
 
 
-def test_a_deleted_output_is_rebuilt_and_nothing_else(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
+def test_deleted_output_is_rebuilt_and_nothing_else(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
     run()
     ran()
     next((tmp_path / "store" / "b").rglob("number.txt")).unlink()
@@ -239,15 +239,17 @@ def number(tmp_path: Path, name: str) -> Path:
     return next((tmp_path / "store" / name).rglob("number.txt"))
 
 
-def test_a_changed_output_is_redone_and_nothing_else(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
+def test_changed_output_is_rebuilt_and_nothing_else(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
     run()
     ran()
-    number(tmp_path, "b").write_text("7", encoding="utf-8")  # as many bytes
+    number(tmp_path, "b").write_text("7", encoding="utf-8")  # same number of bytes
     assert run()["d"].facts == {"total": 2}
     assert ran() == "b" and number(tmp_path, "b").read_text(encoding="utf-8") == "1"
 
 
-def test_damage_that_leaves_no_trace_is_found_when_it_is_read(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
+def test_damage_with_unchanged_size_and_time_is_found_when_read(
+    run: Run, ran: Callable[[], str], tmp_path: Path
+) -> None:
     run()
     ran()
     damaged = number(tmp_path, "a")
@@ -255,12 +257,12 @@ def test_damage_that_leaves_no_trace_is_found_when_it_is_read(run: Run, ran: Cal
     damaged.write_text("7", encoding="utf-8")
     os.utime(damaged, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     run()
-    assert ran() == "", "what isn't read is looked at, not into"
+    assert ran() == "", "results that aren't read are checked by size and time only"
     assert run(c={"value": 5})["d"].facts == {"total": 7}
     assert ran() == "acd" and number(tmp_path, "a").read_text(encoding="utf-8") == "1"
 
 
-def test_a_store_that_was_copied_is_as_good(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
+def test_copied_store_is_valid(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
     run()
     ran()
     shutil.copytree(tmp_path / "store", tmp_path / "copy", copy_function=shutil.copyfile)
@@ -272,7 +274,7 @@ def test_a_store_that_was_copied_is_as_good(run: Run, ran: Callable[[], str], tm
     assert ran() == ""
 
 
-def test_a_manifest_that_is_damaged_is_none(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
+def test_damaged_manifest_is_ignored(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
     run()
     ran()
     path = number(tmp_path, "d").with_name("manifest.json")
@@ -282,7 +284,7 @@ def test_a_manifest_that_is_damaged_is_none(run: Run, ran: Callable[[], str], tm
 
 
 @pytest.mark.parametrize("name", ["/etc/hostname", "../../../secret.txt", "link/secret.txt", "link.txt", "a\0b"])
-def test_a_manifest_that_leads_elsewhere_is_refused(
+def test_manifest_with_paths_outside_its_folder_is_rejected(
     run: Run, ran: Callable[[], str], tmp_path: Path, name: str
 ) -> None:
     run()
@@ -299,7 +301,7 @@ def test_a_manifest_that_leads_elsewhere_is_refused(
     assert ran() == "abd"
 
 
-def test_from_a_step_reruns_it_and_what_follows(run: Run, ran: Callable[[], str]) -> None:
+def test_from_reruns_a_step_and_its_dependents(run: Run, ran: Callable[[], str]) -> None:
     run()
     ran()
     run(start="c")
@@ -308,8 +310,8 @@ def test_from_a_step_reruns_it_and_what_follows(run: Run, ran: Callable[[], str]
     assert ran() == "abcd"
 
 
-def test_a_failing_step_keeps_what_was_done(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="told to fail"):
+def test_failing_step_keeps_finished_results(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="configured to fail"):
         run(d={"does": "fail"})
     ran()
     assert not list((tmp_path / "store" / "d").glob("*"))
@@ -317,7 +319,7 @@ def test_a_failing_step_keeps_what_was_done(run: Run, ran: Callable[[], str], tm
     assert ran() == "d"
 
 
-def test_a_bug_and_a_killed_process_become_step_errors(run: Run) -> None:
+def test_exceptions_and_killed_processes_become_step_errors(run: Run) -> None:
     with pytest.raises(StepError, match="a bug"):
         run(b={"does": "bug"})
     with pytest.raises(StepError, match="killed"):
@@ -325,15 +327,15 @@ def test_a_bug_and_a_killed_process_become_step_errors(run: Run) -> None:
 
 
 @pytest.mark.parametrize("how", ["litter", "bug", "SIGINT"])
-def test_whatever_ends_a_run_nothing_but_its_message_is_shown(tmp_path: Path, source: Path, how: str) -> None:
+def test_failed_or_interrupted_run_prints_only_its_message(tmp_path: Path, source: Path, how: str) -> None:
     script = (
         "import sys; from pathlib import Path; from scan2sim.flows.engine.execution import *\n"
         "from scan2sim.flows.engine.planning import *; from scan2sim.pipeline.core.errors import *\n"
         "from tests.flows.toy import chain\n"
         f"p, does = Path({str(tmp_path)!r}), {'hang' if how == 'SIGINT' else how!r}\n"
         "store = Store(p / 'store')\n"
-        "nodes = chain(p / 'source.txt', p / 'log', b={'does': does}, c={'does': 'hang'})\n"
-        "try: execute(plan(nodes, store), store, jobs=2, watch=lambda *_: None).check()\n"
+        "tasks = chain(p / 'source.txt', p / 'log', b={'does': does}, c={'does': 'hang'})\n"
+        "try: execute(plan(tasks, store), store, jobs=2, on_event=lambda *_: None).check()\n"
         "except ScanError as error: sys.exit(str(error))\n"
         "except KeyboardInterrupt: sys.exit('interrupted')\n"
     )
@@ -345,17 +347,17 @@ def test_whatever_ends_a_run_nothing_but_its_message_is_shown(tmp_path: Path, so
         while child.poll() is None and not (tmp_path / "pid_b").exists():
             time.sleep(0.05)
         os.killpg(child.pid, signal.SIGINT)  # as a terminal does
-    said = "".join(child.communicate(timeout=120))
-    assert len(said.splitlines()) == 1 and "Traceback" not in said, said
+    printed = "".join(child.communicate(timeout=120))
+    assert len(printed.splitlines()) == 1 and "Traceback" not in printed, printed
     message = {"litter": "was killed", "bug": "failed unexpectedly", "SIGINT": "interrupted"}[how]
-    assert message in said
+    assert message in printed
 
 
-def test_ctrl_c_before_anything_runs_is_quiet_too(tmp_path: Path, source: Path) -> None:
+def test_ctrl_c_before_the_first_task_prints_no_traceback(tmp_path: Path, source: Path) -> None:
     script = (
         "import os, signal, sys; from scan2sim.flows.engine import processes\n"
         "try:\n"
-        "    processes._processes(); os.killpg(0, signal.SIGINT); import time; time.sleep(20)\n"
+        "    processes._fork_server(); os.killpg(0, signal.SIGINT); import time; time.sleep(20)\n"
         "except KeyboardInterrupt: sys.exit('interrupted')\n"
     )
     child = subprocess.run(
@@ -364,12 +366,12 @@ def test_ctrl_c_before_anything_runs_is_quiet_too(tmp_path: Path, source: Path) 
     assert (child.stdout + child.stderr).strip() == "interrupted"
 
 
-def test_plan_says_why(tmp_path: Path, source: Path, run: Run) -> None:
+def test_plan_has_reasons(tmp_path: Path, source: Path, run: Run) -> None:
     run()
     store = Store(tmp_path / "store")
 
     def reasons(**changes: dict[str, object]) -> dict[str, Reason | None]:
-        return {p.node.full_name: p.reason for p in plan(chain(source, tmp_path / "log", **changes), store)}
+        return {p.task.full_name: p.reason for p in plan(chain(source, tmp_path / "log", **changes), store)}
 
     assert set(reasons().values()) == {None}
     changed = reasons(b={"value": 1})
@@ -377,17 +379,18 @@ def test_plan_says_why(tmp_path: Path, source: Path, run: Run) -> None:
     assert changed["b"] is Reason.CHANGED
 
 
-def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
+def test_second_run_in_the_same_folder_is_a_busy_error(tmp_path: Path) -> None:
     with locked(tmp_path / "out"), pytest.raises(BusyError, match="another run"), locked(tmp_path / "out"):
         pass
 
 
-def test_kill_9_leaves_nothing_half_made_and_no_process_behind(tmp_path: Path, source: Path, run: Run) -> None:
+def test_sigkill_leaves_no_partial_result_and_no_process(tmp_path: Path, source: Path, run: Run) -> None:
     script = (
         "from pathlib import Path; from scan2sim.flows.engine.execution import *\n"
         "from scan2sim.flows.engine.planning import plan; from tests.flows.toy import chain\n"
         f"p = Path({str(tmp_path)!r}); s = Store(p / 'store')\n"
-        "execute(plan(chain(p / 'source.txt', p / 'log', b={'does': 'hang'}), s), s, jobs=1, watch=lambda *_: None)\n"
+        "planned = plan(chain(p / 'source.txt', p / 'log', b={'does': 'hang'}), s)\n"
+        "execute(planned, s, jobs=1, on_event=lambda *_: None)\n"
     )
     child = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
     log = tmp_path / "log"
@@ -398,17 +401,17 @@ def test_kill_9_leaves_nothing_half_made_and_no_process_behind(tmp_path: Path, s
     child.send_signal(signal.SIGKILL)
     child.wait()
     store = Store(tmp_path / "store")
-    kept = {p.node.full_name: p.reason for p in plan(chain(source, log), store)}
+    kept = {p.task.full_name: p.reason for p in plan(chain(source, log), store)}
     assert kept["a"] is None and kept["b"] is not None
     assert run()["d"].facts == {"total": 2}
-    pid = (tmp_path / "pid_b").read_text(encoding="utf-8")  # of the run above, which ended
+    pid = (tmp_path / "pid_b").read_text(encoding="utf-8")  # of the second run, which has ended
     assert hanging != pid
     while time.monotonic() < deadline and Path(f"/proc/{hanging}").exists():
         time.sleep(0.1)
     assert not Path(f"/proc/{hanging}").exists()
 
 
-def test_versions_are_told_of_all_that_computes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_versions_include_all_packages_that_steps_use(monkeypatch: pytest.MonkeyPatch) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     lines = [*project["dependencies"], *(f'{one}; extra == "{name}"' for name in extras for one in extras[name])]
@@ -416,20 +419,23 @@ def test_versions_are_told_of_all_that_computes(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(importlib.metadata, "version", lambda name: f"1 of {name}")
     found = versions.__wrapped__()
     computing = {"numpy", "numba", "scipy", "pyproj", "torch", "onnxruntime", "pycolmap", "opencv-python-headless"}
-    computing |= {package for package, extra in EXTRA_OF.items() if extra not in APART} - {"pxr", "kiss_icp"}
+    computing |= {package for package, extra in EXTRA_OF.items() if extra not in EXTRAS_WITHOUT_STEPS} - {
+        "pxr",
+        "kiss_icp",
+    }
     computing |= {"usd-core", "kiss-icp"}
     assert computing <= found.keys()
     assert found["scan2sim"] == scan2sim.__version__ and not {"prefect", "ray", "s3fs", "pytest"} & found.keys()
 
 
-def test_a_worker_with_another_numba_is_refused_but_not_one_without_plots(tmp_path: Path, source: Path) -> None:
-    node = plan(chain(source, tmp_path / "log"), Store(tmp_path / "store"))[0]
-    check_version(node, dict(versions()) | {"a-package-of-an-extra": "1"})
+def test_worker_with_another_numba_is_rejected_but_missing_extras_are_allowed(tmp_path: Path, source: Path) -> None:
+    task = plan(chain(source, tmp_path / "log"), Store(tmp_path / "store"))[0]
+    check_version(task, dict(versions()) | {"a-package-of-an-extra": "1"})
     with pytest.raises(UnavailableError, match=r"numba .* instead of 0\.1"):
-        check_version(node, dict(versions()) | {"numba": "0.1"})
+        check_version(task, dict(versions()) | {"numba": "0.1"})
 
 
-def test_versions_are_told_without_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_versions_without_package_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
     def none(name: str) -> str:
         raise importlib.metadata.PackageNotFoundError(name)
 

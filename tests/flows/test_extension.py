@@ -1,4 +1,4 @@
-"""A step of one's own: one file, and one line in a recipe."""
+"""A custom step: one file, and one line in a pipeline definition."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import pytest
 
 from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.planning import Reason, plan
-from scan2sim.flows.pipelines.graph import Node, NodeId, Output, needed
+from scan2sim.flows.pipelines.graph import Output, Task, TaskId, required_tasks
 from scan2sim.flows.pipelines.settings import Settings
-from scan2sim.flows.pipelines.tile import STEPS, recipe
+from scan2sim.flows.pipelines.tile import STEPS, build_graph
 from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.io.tile import read_tile
 
 FILE = '''
-"""Lift: the cloud, so many metres higher."""
+"""Lift: moves the cloud up."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ LIFT = Step("lift", 1, lift, LiftParams)
 '''
 
 
-def test_a_step_of_ones_own_is_one_file_and_one_line(
+def test_custom_step_needs_one_file_and_one_line(
     small_street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "lifting.py").write_text(FILE, encoding="utf-8")
@@ -51,11 +51,11 @@ def test_a_step_of_ones_own_is_one_file_and_one_line(
     def run(*assignments: str) -> tuple[float, dict[str, Reason | None]]:
         settings = Settings.read(None, assignments)
         settings.check((*STEPS, step))
-        line = Node(step, settings.params(step), {"cloud": Output(NodeId("ingest"), "cloud")})
-        planned = plan(needed([*recipe(tile, Settings()), line], [line.id]), store)
-        outcome = execute(planned, store, jobs=1, watch=lambda *_: None)
+        line = Task(step, settings.params(step), {"cloud": Output(TaskId("ingest"), "cloud")})
+        planned = plan(required_tasks([*build_graph(tile, Settings()), line], [line.id]), store)
+        outcome = execute(planned, store, jobs=1, on_event=lambda *_: None)
         outcome.check()
-        return outcome.of_tile()["lift"].facts["highest"], {item.node.full_name: item.reason for item in planned}
+        return outcome.of_tile()["lift"].facts["highest"], {item.task.full_name: item.reason for item in planned}
 
     low, why = run()
     assert why == {"ingest": Reason.NEW, "lift": Reason.NEW}

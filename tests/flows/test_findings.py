@@ -1,4 +1,4 @@
-"""What a run says is wrong with its world: made-up bad worlds, and a good one that nothing is said of."""
+"""Quality findings of synthetic good and bad worlds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from scan2sim.flows.commands.run_with_progress import WORST, show_findings
+from scan2sim.flows.commands.run_with_progress import MAX_FINDINGS, show_findings
 from scan2sim.flows.reports.findings import findings
 from scan2sim.pipeline.core.cache import Manifest
 
@@ -24,7 +24,7 @@ GOOD: dict[str, dict[str, Any]] = {
 
 
 def run_of(warnings: dict[str, list[str]] | None = None, /, **changed: dict[str, Any]) -> dict[str, Manifest]:
-    """Manifests of the good run, with facts of steps changed, and warnings."""
+    """Manifests of the good run, with changed metrics of steps, and warnings."""
     facts = {step: GOOD.get(step, {}) | changed.get(step, {}) for step in GOOD | changed}
     return {
         step: Manifest(step, 1, {}, {}, "", "", {}, {}, {}, about, (warnings or {}).get(step, []), 1.0, 1.0)
@@ -36,55 +36,55 @@ def scored(*db: float, coverage: float = 0.9) -> dict[str, Any]:
     return {"photos": {f"photo{i}": {"psnr_gain_db": value, "coverage": coverage} for i, value in enumerate(db)}}
 
 
-def test_nothing_is_said_of_a_good_world() -> None:
+def test_good_world_has_no_findings() -> None:
     assert findings(run_of()) == []
 
 
-def test_cameras_in_a_wall_make_a_world_unusable() -> None:
+def test_many_cameras_inside_surfaces_make_a_world_unusable() -> None:
     near = {"count": 10, "near_m": {"photo3": 0.01, "photo4": 0.3}}
     (one,) = findings(run_of(score={"cameras": near}))
     assert one.level == "unusable" and "2 of 10 photos" in one.text and "photo3: 0.01 m" in one.text
 
 
-def test_one_camera_of_many_beside_a_surface_is_no_reason_to_throw_the_world_away() -> None:
+def test_single_camera_close_to_a_surface_makes_a_world_poor() -> None:
     (one,) = findings(run_of(score={"cameras": {"count": 100, "near_m": {"photo3": 0.9}}}))
     assert one.level == "poor" and "1 of 100 photos is" in one.text
 
 
 @pytest.mark.parametrize(("db", "level"), [((20, 14, 21, 22), "poor"), ((20, 11, 12), "unusable")])
-def test_held_out_photos_that_the_world_does_not_look_like(db: tuple[float, ...], level: str) -> None:
+def test_held_out_photos_with_low_psnr(db: tuple[float, ...], level: str) -> None:
     (one,) = findings(run_of(score=scored(*db)))
     assert one.level == level and "less than 15 dB" in one.text and "photo1" in one.text and "photo0" not in one.text
 
 
-def test_held_out_photos_of_what_no_other_saw() -> None:
+def test_held_out_photos_of_unseen_surfaces() -> None:
     (one,) = findings(run_of(score=scored(21, 22, coverage=0.0)))
     assert one.level == "poor" and "2 of 2" in one.text
 
 
 @pytest.mark.parametrize(("seen", "levels"), [(70.0, []), (40.0, ["note"]), (14.0, ["poor"])])
-def test_surface_that_no_photo_saw(seen: float, levels: list[str]) -> None:
+def test_share_of_unseen_surface(seen: float, levels: list[str]) -> None:
     found = findings(run_of(**{"texture.terrain": {"seen_m2": seen}}))
     assert [one.level for one in found] == levels
     assert all(f"{1 - seen / 100:.0%} of the surface" in one.text for one in found)
 
 
-def test_a_tile_without_photos_is_not_told_that_none_saw_it() -> None:
+def test_tile_without_photos_has_no_finding_about_unseen_surface() -> None:
     assert not findings(run_of(views={"usable": 0}, **{"texture.terrain": {"seen_m2": 0.0}}))
 
 
-def test_vehicles_that_are_not_wholly_gone() -> None:
+def test_remains_of_removed_vehicles() -> None:
     assert not findings(run_of(score={"remains_m2": [0.0, 0.3]}))
     (one,) = findings(run_of(score={"remains_m2": [0.0, 2.53, 10.2]}))
     assert one.level == "poor" and "2 of 3 vehicles" in one.text and "10.2 m2" in one.text
 
 
-def test_photos_that_disagree() -> None:
+def test_rejected_photos() -> None:
     (one,) = findings(run_of(agreement={"left_out": ["a", "b", "c"]}))
     assert one.level == "unusable" and "3 of 8 photos" in one.text and "a, b, c" in one.text
 
 
-def test_the_worst_three_are_shown_and_the_rest_counted(capsys: pytest.CaptureFixture[str]) -> None:
+def test_worst_findings_are_printed_and_the_others_counted(capsys: pytest.CaptureFixture[str]) -> None:
     run = run_of(
         {"ingest": ["no colours"], "views": ["a photo is missing"]},
         ingest={},
@@ -95,4 +95,8 @@ def test_the_worst_three_are_shown_and_the_rest_counted(capsys: pytest.CaptureFi
     show_findings(run)
     shown = capsys.readouterr().out
     assert shown.index("can't be used") < shown.index("a metre of") < shown.index("15 dB") < shown.index("70%")
-    assert shown.count("warning:") == WORST and "2 more in the report" in shown and "no colours" not in shown
+    assert (
+        shown.count("warning:") == MAX_FINDINGS
+        and "2 more findings in the report" in shown
+        and "no colours" not in shown
+    )

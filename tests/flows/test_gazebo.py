@@ -1,4 +1,4 @@
-"""The commands that open a world, as a shell takes them."""
+"""The shell commands that open a world."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ from scan2sim.flows.reports import gazebo
 
 
 @pytest.mark.parametrize(("program", "release"), [("gz", "Garden and later"), ("ign", "Fortress")])
-def test_a_shell_hands_gazebo_the_world_and_its_models_whatever_the_folder_is_called(
-    tmp_path: Path, program: str, release: str
-) -> None:
+def test_command_passes_world_and_models_of_any_folder_name(tmp_path: Path, program: str, release: str) -> None:
     world = tmp_path / "it's a $HOME & more" / "world"
     (world / "models").mkdir(parents=True)
     (world / "street.sdf").write_text("<sdf/>", encoding="utf-8")
@@ -24,15 +22,15 @@ def test_a_shell_hands_gazebo_the_world_and_its_models_whatever_the_folder_is_ca
     fake.write_text('#!/bin/sh\necho "$2"\necho "$GZ_SIM_RESOURCE_PATH$IGN_GAZEBO_RESOURCE_PATH"\n', encoding="utf-8")
     fake.chmod(0o755)
     variables = {"GZ_SIM_RESOURCE_PATH": "/robots"} if program == "gz" else {"IGN_GAZEBO_RESOURCE_PATH": "/robots"}
-    said = subprocess.run(
+    printed = subprocess.run(
         ["sh", "-c", gazebo.commands(world / "street.sdf")[release]],
         env={"PATH": f"{fake.parent}:{os.environ['PATH']}", **variables},
         check=True, capture_output=True, text=True,
     ).stdout.splitlines()  # fmt: skip
-    assert said == [str(world / "street.sdf"), f"{world / 'models'}:/robots"]
+    assert printed == [str(world / "street.sdf"), f"{world / 'models'}:/robots"]
 
 
-def test_a_world_without_gazebos_files_has_no_command(tmp_path: Path) -> None:
+def test_missing_world_has_no_commands(tmp_path: Path) -> None:
     assert gazebo.commands(tmp_path / "street.sdf") == {}
     shown = f"View:   scan2sim view {shlex.quote(str(tmp_path))}"
     assert gazebo.lines(tmp_path / "street.sdf") == [f"World:  {tmp_path}", shown]

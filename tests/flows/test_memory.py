@@ -1,4 +1,4 @@
-"""Memory is shared out: what doesn't fit waits, what a killed process held is free."""
+"""Memory reservation: requests beyond the total wait, killed processes release their memory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from scan2sim.flows.engine.execution import execute
-from scan2sim.flows.engine.memory import parse, share
+from scan2sim.flows.engine.memory import parse_memory, reserve_memory
 from scan2sim.flows.engine.planning import plan
 from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.core.errors import ScanError, SettingError
@@ -26,18 +26,23 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
 
 
-def test_amounts() -> None:
-    assert parse("20GB") == 20 and parse("800 MB") == 0.8 and parse("1.5") == 1.5 and parse(None) is None
+def test_amounts_of_memory_are_parsed() -> None:
+    assert (
+        parse_memory("20GB") == 20
+        and parse_memory("800 MB") == 0.8
+        and parse_memory("1.5") == 1.5
+        and parse_memory(None) is None
+    )
     for wrong in ("lots", "0GB", "-3", "nan", "inf", "1e300GB", "9" * 400, "99999999999GB"):
-        with pytest.raises(SettingError, match="no amount"):
-            parse(wrong)
+        with pytest.raises(SettingError, match="not an amount"):
+            parse_memory(wrong)
 
 
-def test_what_does_not_fit_waits() -> None:
+def test_reservations_beyond_the_total_wait() -> None:
     inside, most = [], []
 
     def work() -> None:
-        with share(4.0, 1.5):
+        with reserve_memory(4.0, 1.5):
             inside.append(1)
             most.append(len(inside))
             time.sleep(0.2)
@@ -51,12 +56,12 @@ def test_what_does_not_fit_waits() -> None:
     assert max(most) == 2 and len(most) == 5
 
 
-def test_more_than_there_is_runs_alone() -> None:
-    with share(1.0, 50.0):
+def test_reservation_larger_than_the_total_runs_alone() -> None:
+    with reserve_memory(1.0, 50.0):
         waited = threading.Event()
 
         def wait() -> None:
-            with share(1.0, 0.25):
+            with reserve_memory(1.0, 0.25):
                 waited.set()
 
         thread = threading.Thread(target=wait)
@@ -66,22 +71,22 @@ def test_more_than_there_is_runs_alone() -> None:
     thread.join()
 
 
-def test_a_killed_process_gives_its_share_back(tmp_path: Path) -> None:
+def test_killed_process_releases_its_memory(tmp_path: Path) -> None:
     script = (
         f"import tempfile, time; tempfile.tempdir = {str(tmp_path)!r}\n"
-        "from scan2sim.flows.engine.memory import share\n"
-        "with share(1.0, 1.0): print('held', flush=True); time.sleep(60)"
+        "from scan2sim.flows.engine.memory import reserve_memory\n"
+        "with reserve_memory(1.0, 1.0): print('held', flush=True); time.sleep(60)"
     )
     child = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE)
     assert child.stdout and child.stdout.readline()
     child.send_signal(signal.SIGKILL)
     child.wait()
-    with share(1.0, 1.0):
+    with reserve_memory(1.0, 1.0):
         pass
 
 
 @pytest.mark.parametrize("planted", ["folder", "queue", "00000", "file", "another user's"])
-def test_nothing_that_others_plant_is_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, planted: str) -> None:
+def test_files_planted_by_others_are_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, planted: str) -> None:
     victim, folder = tmp_path / "victim", tmp_path / f"scan2sim-memory-{os.getuid()}"
     (victim / "below").mkdir(parents=True)
     (victim / "kept.txt").write_text("precious", encoding="utf-8")
@@ -97,30 +102,28 @@ def test_nothing_that_others_plant_is_followed(tmp_path: Path, monkeypatch: pyte
             folder.rename(tmp_path / f"scan2sim-memory-{uid + 1}")
         else:
             (folder / planted).symlink_to(victim / "kept.txt")
-    with pytest.raises(ScanError, match="scan2sim-memory|queue|00000"), share(1.0, 0.25):
+    with pytest.raises(ScanError, match="scan2sim-memory|queue|00000"), reserve_memory(1.0, 0.25):
         pass
     assert (victim / "kept.txt").read_text(encoding="utf-8") == "precious" and not list((victim / "below").iterdir())
 
 
-def test_the_queue_is_its_users_alone(tmp_path: Path) -> None:
-    with share(1.0, 0.25):
+def test_queue_folder_is_private_to_the_user(tmp_path: Path) -> None:
+    with reserve_memory(1.0, 0.25):
         (folder,) = tmp_path.glob("scan2sim-memory-*")
         assert folder.stat().st_mode & 0o777 == 0o700
 
 
-def test_steps_that_do_not_fit_together_run_one_after_the_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("scan2sim.flows.engine.execution.need", lambda *_: 3.0)
+def test_tasks_that_exceed_the_memory_together_run_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scan2sim.flows.engine.execution.expected_memory", lambda *_: 3.0)
     (tmp_path / "source.txt").write_text("1", encoding="utf-8")
     running: set[int] = set()
     most: list[int] = []
 
-    def watch(node: object, event: str, *_: object) -> None:
-        (running.add if event == "start" else running.discard)(id(node))
+    def on_event(task: object, event: str, *_: object) -> None:
+        (running.add if event == "start" else running.discard)(id(task))
         most.append(len(running))
 
     store = Store(tmp_path / "store")
     planned = plan(chain(tmp_path / "source.txt", tmp_path / "log"), store)
-    outcome = execute(planned, store, jobs=4, watch=watch, memory=5.0)
+    outcome = execute(planned, store, jobs=4, on_event=on_event, memory=5.0)
     assert set(outcome.of_tile()) == set("abcd") and max(most) == 1

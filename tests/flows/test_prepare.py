@@ -1,4 +1,4 @@
-"""What comes before the tiles: drives, corridors, and what is redone of them."""
+"""Preparation of a survey from drives and corridors, and which steps run again."""
 
 from __future__ import annotations
 
@@ -15,18 +15,20 @@ from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
 from scan2sim.flows.commands.drive import PREPARED, plan_drive
-from scan2sim.flows.commands.drive import survey_of as made_of
+from scan2sim.flows.commands.drive import survey_of as prepare_survey
 from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.pipelines.drive import Drive
-from scan2sim.pipeline.core.errors import BusyError, InputError, UnsureError
+from scan2sim.pipeline.core.errors import BusyError, InputError, LowConfidenceError
 from scan2sim.pipeline.io.survey import read_survey
 from scan2sim.pipeline.steps.cut import CUT
 from scan2sim.pipeline.steps.import_sweeps import IMPORT_SWEEPS
 
 
 def survey_of(place: Path | str, out: Path, **how: Any) -> str:
-    return made_of(place, out, lambda planned, store: execute(planned, store, jobs=1, watch=lambda *_: None), **how)
+    return prepare_survey(
+        place, out, lambda planned, store: execute(planned, store, jobs=1, on_event=lambda *_: None), **how
+    )
 
 
 @pytest.fixture
@@ -41,7 +43,7 @@ def drive(folder: Path, text: str) -> Path:
     return path
 
 
-def test_a_corridor_is_cut_once_and_again_when_it_changes(corridor: Path, tmp_path: Path) -> None:
+def test_corridor_is_cut_again_only_if_it_changes(corridor: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
 
     def cut(**how: Any) -> tuple[Path, int]:
@@ -60,13 +62,13 @@ def test_a_corridor_is_cut_once_and_again_when_it_changes(corridor: Path, tmp_pa
     assert other != finer and read_survey(other[0]).name == "road"
 
 
-def test_a_drive_says_how_it_is_cut_unless_it_is_said_otherwise(corridor: Path, tmp_path: Path) -> None:
+def test_options_override_the_tile_length_of_a_drive(corridor: Path, tmp_path: Path) -> None:
     drive(tmp_path, 'corridor = "corridor"\n[tiles]\nlength = 6.0\nbuffer = 1.0\n')
     assert len(read_survey(Path(survey_of(tmp_path, tmp_path / "out"))).tiles) == 2
     assert len(read_survey(Path(survey_of(tmp_path, tmp_path / "out", length=4.0))).tiles) > 2
 
 
-def test_steps_of_a_drive_are_done_again_by_newer_code_and_of_other_files(
+def test_new_step_versions_and_changed_files_rerun_steps_of_a_drive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("video.mp4", "camera.toml", "velodyne/0.bin", "image/0.png"):
@@ -76,15 +78,15 @@ def test_steps_of_a_drive_are_done_again_by_newer_code_and_of_other_files(
     place, known = drive(tmp_path, text), dict[str, str]()
 
     def changed() -> set[str]:
-        keys = {item.node.id.name: item.key for item in plan_drive(place, tmp_path / "out")[0]}
+        keys = {item.task.id.name: item.key for item in plan_drive(place, tmp_path / "out")[0]}
         others = {name for name, key in keys.items() if known.get(name) != key}
         known.update(keys)
         return others
 
     assert changed() == {"track", "place", "import_sweeps", "cut"} and changed() == set()
     for step in (CUT, IMPORT_SWEEPS):
-        recipe = "drive" if step is CUT else "sweeps"
-        monkeypatch.setattr(f"scan2sim.flows.pipelines.{recipe}.{step.name.upper()}", replace(step, version=1000))
+        pipeline = "drive" if step is CUT else "sweeps"
+        monkeypatch.setattr(f"scan2sim.flows.pipelines.{pipeline}.{step.name.upper()}", replace(step, version=1000))
         assert changed() == ({"cut"} if step is CUT else {"import_sweeps", "cut"})
     for name in ("camera.toml", "velodyne/0.bin", "image/0.png"):
         (tmp_path / name).write_text("another", encoding="utf-8")
@@ -95,25 +97,25 @@ def test_steps_of_a_drive_are_done_again_by_newer_code_and_of_other_files(
     assert changed() == {"track", "place", "import_sweeps", "cut"}
 
 
-def test_a_drive_is_planned_like_a_tile(corridor: Path, tmp_path: Path) -> None:
+def test_plan_of_a_drive(corridor: Path, tmp_path: Path) -> None:
     place = drive(tmp_path, 'corridor = "corridor"\n[tiles]\nlength = 6.0\nbuffer = 1.0\n')
 
     def printed() -> str:
         return CliRunner().invoke(app, ["plan", str(place), "--out", str(tmp_path / "out")]).output
 
-    assert re.search(r"cut +yes +it was never run", printed())
+    assert re.search(r"cut +yes +never run before", printed())
     survey_of(place, tmp_path / "out")
-    assert re.search(r"cut +no +kept", printed())
+    assert re.search(r"cut +no +cached", printed())
 
 
-def test_a_survey_is_itself(corridor: Path, tmp_path: Path) -> None:
+def test_source_that_is_a_survey_is_used_directly(corridor: Path, tmp_path: Path) -> None:
     survey = survey_of(corridor, tmp_path / "out", length=6.0, buffer=2.0)
     assert survey_of(survey, tmp_path / "other") == survey
     assert survey_of(Path(survey).parent, tmp_path / "other") == survey
     assert survey_of("s3://bucket/survey", tmp_path) == "s3://bucket/survey"
 
 
-def test_no_world_is_made_along_a_path_that_was_mostly_guessed(tmp_path: Path) -> None:
+def test_mostly_extrapolated_trajectory_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "frames").mkdir()
     (tmp_path / "velodyne").mkdir()
     np.zeros((9, 4), np.float32).tofile(tmp_path / "velodyne" / "0.bin")
@@ -121,7 +123,7 @@ def test_no_world_is_made_along_a_path_that_was_mostly_guessed(tmp_path: Path) -
     for k in range(8):
         cv2.imwrite(str(tmp_path / "frames" / f"{k}.png"), light if k < 2 else np.full_like(light, 9))
     place = drive(tmp_path, '[slam]\nvideo = "frames"\n[sweeps]\nfolder = "velodyne"\n')
-    with pytest.raises(UnsureError, match=r"of the poses are unsure.*keep_unsure"):
+    with pytest.raises(LowConfidenceError, match=r"of the poses are extrapolated.*keep_unsure"):
         survey_of(place, tmp_path / "out")
     assert (tmp_path / "out" / "prepared" / "slam" / "trajectory.csv").is_file()
 
@@ -129,17 +131,17 @@ def test_no_world_is_made_along_a_path_that_was_mostly_guessed(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "neither or both"),
-        ('corridor = "a"\n[sweeps]\nfolder = "b"\nposes = "c"', "neither or both"),
+        ("", "must have either"),
+        ('corridor = "a"\n[sweeps]\nfolder = "b"\nposes = "c"', "must have either"),
         ('corridor = "a"\nspeed = 3', "`speed`"),
         ("corridor = [", "TOML"),
     ],
 )
-def test_what_no_drive_says_is_told(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_drive_is_an_input_error(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Drive.read(drive(tmp_path, text))
 
 
-def test_two_at_once_are_told(corridor: Path, tmp_path: Path) -> None:
+def test_second_run_of_a_drive_is_a_busy_error(corridor: Path, tmp_path: Path) -> None:
     with locked(tmp_path / "out" / PREPARED), pytest.raises(BusyError):
         survey_of(corridor, tmp_path / "out")

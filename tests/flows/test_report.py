@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.flows.engine.planning import Planned
-from scan2sim.flows.pipelines.graph import Node
+from scan2sim.flows.engine.planning import PlannedTask
+from scan2sim.flows.pipelines.graph import Task
 from scan2sim.flows.reports.tile import representative, write_report
 from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.step import Done, Params, Step
@@ -47,16 +47,16 @@ FACTS: dict[str, dict[str, Any]] = {
 
 @pytest.fixture
 def report(tmp_path: Path) -> Any:
-    """Write a report of made-up results; returns report.json's figures and the page."""
+    """Write a report of synthetic results; returns the content of report.json and the page."""
 
     def write(scored: dict[str, Any]) -> tuple[dict[str, Any], str]:
         store, done, planned = Store(tmp_path / "steps"), dict[str, Manifest](), []
-        for node, facts in {**FACTS, "score": scored}.items():
-            folder = store.begin(node)
-            files = {"error": album(folder, list(scored["photos"]))} if node == "score" else {}
+        for task, facts in {**FACTS, "score": scored}.items():
+            folder = store.begin(task)
+            files = {"error": album(folder, list(scored["photos"]))} if task == "score" else {}
             about = {"version": 1, "params": {}, "inputs": {}, "fed": "", "seconds": 1.0, "peak_mb": 100.0}
-            done[node] = store.commit(node, "key", folder, Done(files, facts), about)
-            planned.append(Planned(Node(Step(node, 1, no_step), Params(), {}), "key", {}, None))
+            done[task] = store.commit(task, "key", folder, Done(files, facts), about)
+            planned.append(PlannedTask(Task(Step(task, 1, no_step), Params(), {}), "key", {}, None))
         tile = Tile(tmp_path / "tile.toml", "made_up", Frame(), ())
         page = write_report(tile, planned, done, store, tmp_path, seconds=1.0).read_text(encoding="utf-8")
         return json.loads((tmp_path / "report.json").read_text(encoding="utf-8")), page
@@ -65,7 +65,7 @@ def report(tmp_path: Path) -> Any:
 
 
 def no_step(*_: Any) -> Done:
-    raise AssertionError("nothing is run here")
+    raise AssertionError("no step runs here")
 
 
 def album(folder: Path, titles: list[str]) -> Path:
@@ -77,7 +77,7 @@ def album(folder: Path, titles: list[str]) -> Path:
     return folder / "error"
 
 
-def test_figures_of_the_texture(report: Any) -> None:
+def test_texture_metrics(report: Any) -> None:
     texture = report(SCORED)[0]["texture"]
     assert texture["sharpness"] == 0.83 and texture["by_class"]["terrain"] == PART
     assert texture["area_by_class"]["terrain"] == {
@@ -86,27 +86,27 @@ def test_figures_of_the_texture(report: Any) -> None:
     assert texture["area_by_class"]["building"]["filled_m2"] == 0
 
 
-def test_the_page_shows_worst_median_and_best_and_the_tables(report: Any) -> None:
+def test_page_shows_tables_and_worst_median_and_best_images(report: Any) -> None:
     page = report(SCORED)[1].split("<main>")[1]
     assert page.count("data:image/jpeg") == 3
     assert all(f"({rank} of 5)" in page for rank in ("worst", "median", "best"))
-    assert "83 % as sharp" in page and "29.3 dB where a photo was near" in page
+    assert "sharpness 83 % of theirs" in page and "29.3 dB near photos" in page
     assert page.count("20.1</td>") == 2 and "–</td>" in page and "100.0 %</td>" in page
     assert "7 m²" in page and "None" not in page.split("<h2>Steps")[0]
 
 
-def test_names_of_photos_are_no_code_on_the_page(report: Any) -> None:
+def test_photo_names_are_escaped(report: Any) -> None:
     name = "<img src=x onerror=alert(1)>"
     page = report({**SCORED, "photos": {name: {"psnr_gain_db": 20.0}}})[1]
     assert name not in page and "&lt;img" in page
 
 
-def test_a_page_without_held_out_photos(report: Any) -> None:
+def test_page_without_held_out_photos(report: Any) -> None:
     page = report(UNSCORED)[1]
-    assert "--hold-out 8" in page and "Where it differs" not in page and "24.0 dB" in page
+    assert "--hold-out 8" in page and "Differences from held-out photos" not in page and "24.0 dB" in page
 
 
-def test_representative_pictures_are_the_worst_the_median_and_the_best() -> None:
+def test_representative_images_are_worst_median_and_best() -> None:
     entries = [{"title": str(i), "caption": ""} for i in range(5)]
     scores = {str(i): {"psnr_gain_db": float(value)} for i, value in enumerate([3, 1, 4, 5, 2])}
     assert [entry["title"] for entry in representative(entries, scores)] == ["1", "0", "3"]

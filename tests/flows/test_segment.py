@@ -1,4 +1,4 @@
-"""`scan2sim segment` as a user types it, with the network that comes along."""
+"""`scan2sim segment` on the command line, with the bundled network."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import pytest
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.segmentation.metrics import confusion
-from tests.flows.test_cli import bad, good, scan2sim
+from tests.flows.test_cli import assert_fails, scan2sim, stdout_of
 
 
 @pytest.fixture(scope="module")
 def segmented(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """The small street segmented anew, and what the command printed."""
-    out = tmp_path_factory.mktemp("told")
-    return out, good(scan2sim("segment", small_street, "--out", out, "--overwrite"))
+    """Output folder of the small street, classified with --overwrite, and the printed text."""
+    out = tmp_path_factory.mktemp("segmented")
+    return out, stdout_of(scan2sim("segment", small_street, "--out", out, "--overwrite"))
 
 
-def test_points_get_their_classes_from_the_photos(small_street: Path, segmented: tuple[Path, str]) -> None:
+def test_points_are_classified_from_the_photos(small_street: Path, segmented: tuple[Path, str]) -> None:
     out, printed = segmented
     tile = read_tile(small_street)
     before = las.read(tile.clouds[0], tile.frame)
@@ -35,7 +35,7 @@ def test_points_get_their_classes_from_the_photos(small_street: Path, segmented:
     assert "known as" in printed and "road_sign" in printed
 
 
-def test_photos_get_labels_and_masks(small_street: Path, segmented: tuple[Path, str]) -> None:
+def test_label_images_and_masks_are_written(small_street: Path, segmented: tuple[Path, str]) -> None:
     out, _ = segmented
     for view in read_tile(small_street).views:
         codes = cv2.imread(str(out / "labels" / f"{view.photo.stem}.png"), cv2.IMREAD_GRAYSCALE)
@@ -44,15 +44,15 @@ def test_photos_get_labels_and_masks(small_street: Path, segmented: tuple[Path, 
         np.testing.assert_array_equal(mask == 0, np.isin(codes, (0, 66, 67)))
 
 
-def test_a_run_goes_on_from_there(small_street: Path, segmented: tuple[Path, str]) -> None:
+def test_run_reuses_the_segmentation(small_street: Path, segmented: tuple[Path, str]) -> None:
     out, _ = segmented
-    plan = good(scan2sim("plan", small_street, "--out", out, "--set", "segment.overwrite=true"))
+    plan = stdout_of(scan2sim("plan", small_street, "--out", out, "--set", "segment.overwrite=true"))
     again = {line.split()[0] for line in plan.splitlines() if " yes " in line}
     assert "split" in again and not again & {"label", "segment", "ingest"}
 
 
-def test_classes_that_are_there_are_kept(small_street: Path, tmp_path: Path) -> None:
-    good(scan2sim("segment", small_street, "--out", tmp_path))
+def test_existing_classes_are_kept(small_street: Path, tmp_path: Path) -> None:
+    stdout_of(scan2sim("segment", small_street, "--out", tmp_path))
     tile = read_tile(small_street)
     before = las.read(tile.clouds[0], tile.frame)
     after = las.read(tmp_path / "classified" / "cloud.laz", tile.frame)
@@ -61,24 +61,24 @@ def test_classes_that_are_there_are_kept(small_street: Path, tmp_path: Path) -> 
     assert not list((tmp_path / "labels").glob("*.png"))
 
 
-def test_bad_weights_leave_earlier_results(small_street: Path, segmented: tuple[Path, str], tmp_path: Path) -> None:
+def test_bad_weights_keep_earlier_results(small_street: Path, segmented: tuple[Path, str], tmp_path: Path) -> None:
     out, _ = segmented
     before = (out / "classified" / "cloud.laz").read_bytes()
     (tmp_path / "w.pt").write_bytes(pickle.dumps({"x": 1}))
     command = ("segment", small_street, "--out", out, "--overwrite", "--set")
-    bad(scan2sim(*command, f"label.weights={tmp_path / 'w.pt'}"), 3, "w.pt", "safetensors")
-    bad(scan2sim(*command, f"label.weights={tmp_path / 'no.safetensors'}"), 3, "no.safetensors")
-    bad(scan2sim(*command, "label.network=deeplab"), 2, "deeplab", "segformer")
+    assert_fails(scan2sim(*command, f"label.weights={tmp_path / 'w.pt'}"), 3, "w.pt", "safetensors")
+    assert_fails(scan2sim(*command, f"label.weights={tmp_path / 'no.safetensors'}"), 3, "no.safetensors")
+    assert_fails(scan2sim(*command, "label.network=deeplab"), 2, "deeplab", "segformer")
     assert (out / "classified" / "cloud.laz").read_bytes() == before
 
 
-def test_pixels_are_scored_against_labels(small_street: Path, tmp_path: Path) -> None:
+def test_evaluate_compares_pixels_with_labels(small_street: Path, tmp_path: Path) -> None:
     from scan2sim.data_samples.street import generate
 
     generate(tmp_path / "tile", length=10, points=20_000, photos=4, seed=8, photo_width=320, photo_labels=True)
     (tmp_path / "set").mkdir()
     (tmp_path / "set" / "images").symlink_to(tmp_path / "tile" / "photos")
     (tmp_path / "set" / "labels").symlink_to(tmp_path / "tile" / "truth" / "labels")
-    printed = good(scan2sim("segment", "evaluate", tmp_path / "set"))
+    printed = stdout_of(scan2sim("segment", "evaluate", tmp_path / "set"))
     values = {line.split()[0]: float(line.split()[1]) for line in printed.splitlines() if len(line.split()) == 2}
     assert values["road"] > 0.6 and values["building"] > 0.6 and 0 < values["mean"] < 1

@@ -1,4 +1,4 @@
-"""Settings: defaults of the mission, what the user sets, and what is refused."""
+"""Settings: defaults of D3.2, the user's values, and rejected values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from scan2sim.flows.cli import COMMANDS, app, loaded
-from scan2sim.flows.commands.option_ranges import Numbers
+from scan2sim.flows.commands.option_ranges import NumericOptions
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.pipelines.steps import STEPS
 from scan2sim.flows.reports.view import ViewParams
@@ -27,12 +27,12 @@ from scan2sim.services.monitoring.settings.archive import QueryParams
 from scan2sim.services.monitoring.settings.bus import ScaleParams
 from scan2sim.services.monitoring.settings.dashboard import PageParams
 from scan2sim.services.monitoring.settings.monitor import DatasetParams, TalkerParams, TopicParams, WorkParams
-from scan2sim.services.orchestration.settings import ApplyParams, ResizeParams
+from scan2sim.services.orchestration.settings import ApplyParams, ScaleInstanceParams
 from scan2sim.services.qos.encoding import ChoiceParams
 from scan2sim.services.qos.measure import MeasureParams
 from scan2sim.services.teleoperation.settings import DemoParams, VehicleParams
 from scan2sim.services.teleoperation.settings import MeasureParams as DrivenParams
-from scan2sim.services.teleoperation.vehicle.adapter import TranslateParams
+from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams
 from scan2sim.services.toolboxes.settings import CameraParams, NodeParams, ServeParams
 from scan2sim.services.toolboxes.tasks import classify, detect, movement, segment
 from scan2sim.slam.steps.track import Filmed
@@ -40,7 +40,7 @@ from scan2sim.texturing.unwrap import UnwrapParams, check_size
 from tests.conftest import ROOT
 
 
-def test_defaults_are_the_missions_numbers() -> None:
+def test_defaults_are_those_of_d32() -> None:
     settings = Settings.read()
     assert [settings.params(DECIMATE, g).target for g in ("terrain", "building", "vegetation")] == [
         100_000,
@@ -50,7 +50,7 @@ def test_defaults_are_the_missions_numbers() -> None:
     assert [settings.params(TRIM, g).max_edge for g in ("terrain", "building", "vegetation")] == [0.5, 0.25, 0.25]
 
 
-def test_a_class_wins_over_all_classes_and_the_command_line_over_the_file(tmp_path: Path) -> None:
+def test_class_overrides_general_setting_and_command_line_overrides_file(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text(
         "[decimate]\ntarget = 20000\n[decimate.building]\ntarget = 30000\n", encoding="utf-8"
     )
@@ -69,11 +69,11 @@ def test_a_class_wins_over_all_classes_and_the_command_line_over_the_file(tmp_pa
         ("decimat.target=50000", "Did you mean `decimate`"),
         ("decimate.targt=50000", "Did you mean `target`"),
         ("decimate.roof.target=50000", "no such parameter"),
-        ("decimate.target", "is no assignment"),
-        ("target=5", "is no assignment"),
+        ("decimate.target", "is not an assignment"),
+        ("target=5", "is not an assignment"),
     ],
 )
-def test_unknown_names_are_refused_with_the_nearest(text: str, message: str) -> None:
+def test_unknown_names_are_rejected_with_a_suggestion(text: str, message: str) -> None:
     with pytest.raises(SettingError) as caught:
         Settings.read(None, [text]).check(STEPS)
     assert message in str(caught.value)
@@ -83,83 +83,83 @@ def test_unknown_names_are_refused_with_the_nearest(text: str, message: str) -> 
     "text",
     ["decimate.target=5", "decimate.target=many", "split.vegetation=maybe", "voxel.size=-1", "texture.device=gpu"],
 )
-def test_values_out_of_range_are_refused(text: str) -> None:
+def test_values_out_of_range_are_rejected(text: str) -> None:
     settings = Settings.read(None, [text])
     step = next(s for s in STEPS if s.name == text.split(".")[0])
     with pytest.raises(SettingError, match=text.split("=")[0]):
         settings.params(step, "terrain")
 
 
-def test_a_broken_file_is_refused(tmp_path: Path) -> None:
+def test_broken_file_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text("[decimate\n", encoding="utf-8")
     with pytest.raises(SettingError, match="TOML"):
         Settings.read(tmp_path / "s.toml")
 
 
-# every setting: what is no number, or beyond all measure, is refused by its name and range, or is harmless
+# every setting: wild values are rejected with name and range, or are harmless
 
 MODELS: dict[str, type[Params]] = {
-    **{step.name: step.params for step in STEPS}, "": Numbers,
+    **{step.name: step.params for step in STEPS}, "": NumericOptions,
 }  # fmt: skip
 SETTINGS = [(where, name) for where, model in MODELS.items() for name in model.model_fields]
-WILD: tuple[Any, ...] = (
+WILD_VALUES: tuple[Any, ...] = (
     float("nan"), float("inf"), float("-inf"), -1, -1e300, 0, 1e300, 1e-300, 10**30, "9" * 6000, "wild", "a\0b",
     "x" * 100_000, [], {}, [float("nan")] * 3, [1e300] * 2, True, None,
 )  # fmt: skip
-BY_RECIPE = {"path.positions", "path.times"}
-"""Read from files, which are checked where they are read."""
+SET_BY_THE_PIPELINE = {"path.positions", "path.times"}
+"""Come from files, which are checked when they are read."""
 
 
 @pytest.mark.parametrize(("where", "name"), SETTINGS)
-def test_wild_values_are_refused_by_name_and_range(where: str, name: str) -> None:
+def test_wild_values_are_rejected_with_name_and_range(where: str, name: str) -> None:
     model = MODELS[where]
     given = {k: v for k, v in {"seed": (0, 0), "name": "a", "positions": ()}.items() if k in model.model_fields}
     required = {k: v for k, v in given.items() if model.model_fields[k].is_required()}
-    for value in WILD:
+    for value in WILD_VALUES:
         try:
             made = model.of(where, required | {name: value})
         except SettingError as error:
             where_named = f"{where}.{name}" if where else f"--{name.replace('_', '-')}"
             assert error.where == where_named and described(model.model_fields[name]) in error.cause, (value, error)
-            assert len(str(error)) < 400, "as long as what is told, not as what was given"
+            assert len(str(error)) < 400, "the message doesn't repeat a long value"
         else:
-            assert harmless(getattr(made, name)) or f"{where}.{name}" in BY_RECIPE, (value, made)
+            assert is_harmless(getattr(made, name)) or f"{where}.{name}" in SET_BY_THE_PIPELINE, (value, made)
 
 
-def harmless(value: object) -> bool:
-    """Whether all numbers in a value are finite, and none is beyond what anything is measured by."""
+def is_harmless(value: object) -> bool:
+    """Whether all numbers in a value are finite and at most 1e10."""
     if isinstance(value, (list, tuple)):
-        return all(map(harmless, value))
+        return all(map(is_harmless, value))
     return not isinstance(value, (int, float)) or abs(value) <= 1e10
 
 
 @pytest.mark.parametrize(("where", "name"), SETTINGS)
-def test_every_number_has_two_ends(where: str, name: str) -> None:
-    if f"{where}.{name}" not in BY_RECIPE:
+def test_every_number_has_minimum_and_maximum(where: str, name: str) -> None:
+    if f"{where}.{name}" not in SET_BY_THE_PIPELINE:
         assert "any" not in described(MODELS[where].model_fields[name]).replace(",", "").split()
 
 
-def test_the_page_of_settings_tells_their_ranges() -> None:
-    text = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
+def test_settings_page_has_the_ranges() -> None:
+    text = (ROOT / "docs" / "reference" / "settings.md").read_text(encoding="utf-8")
     for step in STEPS:
         for name, field in step.params.model_fields.items():
             line = next(line for line in text.splitlines() if line.startswith(f"| `{step.name}.{name}` "))
             assert line.split("|")[3].strip() == described(field), line
 
 
-def test_every_number_that_a_command_takes_has_a_range() -> None:
+def test_every_numeric_option_has_a_range() -> None:
     found = [loaded(name) for name in COMMANDS]
     single = [one for some in found for one in getattr(some, "commands", {"": some}).values()]
     hints = [get_type_hints(one.callback) for one in single]
     shown = (SceneParams, ViewParams)
     boxes = (detect.Params, movement.Params, classify.Params, segment.Params, ServeParams, NodeParams, CameraParams)
     bus = (QueryParams, TopicParams, TalkerParams, DatasetParams, TrafficParams, WorkParams, ScaleParams, PageParams)
-    osm, qos = (ApplyParams, ResizeParams), (MeasureParams, ChoiceParams)
-    driven = (VehicleParams, DemoParams, TranslateParams, DrivenParams)
+    osm, qos = (ApplyParams, ScaleInstanceParams), (MeasureParams, ChoiceParams)
+    driven = (VehicleParams, DemoParams, AdapterParams, DrivenParams)
     numbers = {name for of in hints for name, kind in of.items() if {int, float} & {kind, *get_args(kind)}}
     assert len(numbers) > 15 and numbers <= {
         name
-        for model in (Numbers, Filmed, CutParams, SweepsParams, *shown, *qos, *osm, *bus, *boxes, *driven)
+        for model in (NumericOptions, Filmed, CutParams, SweepsParams, *shown, *qos, *osm, *bus, *boxes, *driven)
         for name in model.model_fields
     }
 
@@ -185,20 +185,20 @@ def test_every_number_that_a_command_takes_has_a_range() -> None:
         (("survey", "data_samples/tile", "--buffer", "inf"), "--buffer"),
     ],
 )
-def test_commands_refuse_wild_numbers_at_once(arguments: tuple[str, ...], option: str, tmp_path: Path) -> None:
+def test_commands_reject_wild_numbers_before_they_run(arguments: tuple[str, ...], option: str, tmp_path: Path) -> None:
     given = ["data_samples/tile" if a == "tile" and i else a for i, a in enumerate(arguments)]
     result = CliRunner().invoke(app, [*given, "--out", str(tmp_path / "out")])
     assert isinstance(result.exception, SettingError) and result.exception.where == option
     assert "must be" in result.exception.cause and not (tmp_path / "out" / "steps").exists()
 
 
-def test_a_sample_of_wild_size_is_refused(tmp_path: Path) -> None:
+def test_sample_of_wild_size_is_rejected(tmp_path: Path) -> None:
     for option, value in (("--length", "1e300"), ("--points", "nan"), ("--photos", "-3"), ("--seed", "-1")):
         result = CliRunner().invoke(app, ["sample", str(tmp_path / "street"), option, value])
         assert isinstance(result.exception, SettingError) and result.exception.where == option
 
 
-def test_texels_too_fine_for_a_surface_are_refused() -> None:
+def test_texel_too_small_for_a_surface_is_rejected() -> None:
     check_size(2e8, UnwrapParams(texel=0.01))
-    with pytest.raises(SettingError, match=r"0\.0005 m a texel makes .* Set unwrap\.texel=0\.0023 or larger"):
+    with pytest.raises(SettingError, match=r"texels of 0\.0005 m give .* Set unwrap\.texel=0\.0023 or larger"):
         check_size(8e10, UnwrapParams(texel=0.0005))

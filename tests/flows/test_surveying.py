@@ -1,4 +1,4 @@
-"""A survey from the command: tiles that meet, one world, reruns, tiles that fail."""
+"""Command `survey`: borders of tiles, the common world, repeated runs, failing tiles."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
-from tests.flows.test_cli import SMALL, bad, good, scan2sim
+from tests.flows.test_cli import SMALL, assert_fails, scan2sim, stdout_of
 from tests.gazebo.checker import check_world
 
 
 @pytest.fixture(scope="module")
 def survey(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The small street in two tiles, with photos of its own."""
+    """The small street cut into two tiles."""
     folder = tmp_path_factory.mktemp("survey")
     shutil.copytree(small_street, folder / "corridor")
-    context = 3.0  # metres: what crowns and planes near a border are told from
+    context = 3.0  # metres of overlap, for crowns and planes near the border
     cut_survey(folder / "corridor", folder / "tiles", CutParams(length=6.0, buffer=context))
     return folder / "tiles"
 
 
 @pytest.fixture(scope="module")
 def failed(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the command made of it while the second tile's cloud was damaged; its report is beside it as failed.json."""
+    """Output folder of a run while the cloud of the second tile was damaged; failed.json next to it is its report."""
     out = tmp_path_factory.mktemp("made") / "out"
     cloud = sorted(survey.glob("*/cloud.laz"))[1]
     whole = cloud.read_bytes()
     cloud.write_bytes(whole[: len(whole) // 2])
-    bad(scan2sim("survey", survey, "--out", out, *SMALL), 5, "1 of 2 tiles failed", "truncated or damaged")
+    assert_fails(scan2sim("survey", survey, "--out", out, *SMALL), 5, "1 of 2 tiles failed", "truncated or damaged")
     shutil.copyfile(out / "survey.json", out.parent / "failed.json")
     cloud.write_bytes(whole)
     return out
@@ -46,8 +46,8 @@ def failed(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def made(survey: Path, failed: Path) -> Path:
-    """What it makes of it, once that is mended."""
-    good(scan2sim("survey", survey, "--out", failed, *SMALL))
+    """Output folder of the next run, with the cloud repaired."""
+    stdout_of(scan2sim("survey", survey, "--out", failed, *SMALL))
     return failed
 
 
@@ -55,7 +55,7 @@ def report_of(out: Path) -> dict[str, Any]:
     return json.loads((out / "survey.json").read_text(encoding="utf-8"))
 
 
-def test_tiles_share_their_borders(made: Path) -> None:
+def test_meshes_of_neighbouring_tiles_share_their_borders(made: Path) -> None:
     (border,) = report_of(made)["borders"]
     assert border["length_m"] > 10
     assert border["gap_m"] < 0.3 and border["gap_p99_m"] == 0 and border["overlap_m"] < 1e-3
@@ -64,7 +64,7 @@ def test_tiles_share_their_borders(made: Path) -> None:
     assert border["colour_step"] < 2
 
 
-def test_furniture_is_listed_by_the_tile_in_whose_cell_it_stands(made: Path, survey: Path) -> None:
+def test_furniture_is_listed_once_by_the_tile_of_its_cell(made: Path, survey: Path) -> None:
     feet = []
     for path in sorted(survey.glob("*/tile.toml")):
         tile = read_tile(path)
@@ -76,15 +76,15 @@ def test_furniture_is_listed_by_the_tile_in_whose_cell_it_stands(made: Path, sur
     assert len(feet) >= 3 and apart.min() > 0.5
 
 
-def test_the_road_over_both_tiles_is_one(made: Path) -> None:
+def test_roads_of_both_tiles_are_connected(made: Path) -> None:
     (network,) = (made / "world").glob("*.xodr")
     roads = ET.parse(network).getroot().findall("road")
     assert [float(road.attrib["length"]) for road in roads] == [pytest.approx(12.0, abs=1.5)]
     assert (made / "world" / f"{network.stem}_roads.geojson").is_file()
 
 
-def test_where_classes_meet_there_is_no_hole(made: Path, survey: Path) -> None:
-    """Between a point of the ground and one of a wall's foot right beside it: rays from above hit something."""
+def test_surfaces_of_ground_and_walls_meet_without_holes(made: Path, survey: Path) -> None:
+    """Rays from above, between a ground point and a nearby point of a wall's foot, hit a surface."""
     import open3d as o3d
 
     for path in survey.glob("*/tile.toml"):
@@ -118,15 +118,19 @@ def test_gazebo_loads_all_tiles_as_one_world(made: Path) -> None:
     assert abs(box["rest"][2]) < 5 and box["speed"] < 0.1
 
 
-def test_an_unchanged_survey_is_left_as_it_is(survey: Path, made: Path) -> None:
+def test_unchanged_survey_is_not_rebuilt(survey: Path, made: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in (made / "steps").rglob("manifest.json")}
-    said = good(scan2sim("survey", survey, "--out", made, *SMALL))
-    assert "nothing to do" in said and f"World:  {made / 'world'}" in said and f"Report: {made / 'survey.html'}" in said
+    printed = stdout_of(scan2sim("survey", survey, "--out", made, *SMALL))
+    assert (
+        "nothing to do" in printed
+        and f"World:  {made / 'world'}" in printed
+        and f"Report: {made / 'survey.html'}" in printed
+    )
     assert {path: path.stat().st_mtime_ns for path in (made / "steps").rglob("manifest.json")} == before
     assert {tile["state"] for tile in report_of(made)["tiles"].values()} == {"kept"}
 
 
-def test_a_tile_that_fails_is_told_and_the_others_are_made(survey: Path, failed: Path) -> None:
+def test_failed_tile_is_reported_and_the_others_are_built(survey: Path, failed: Path) -> None:
     tiles = json.loads((failed.parent / "failed.json").read_text(encoding="utf-8"))["tiles"]
     assert tiles.keys() == {tile.parent.name for tile in survey.glob("*/tile.toml")}
     first, second = tiles.values()
@@ -135,7 +139,7 @@ def test_a_tile_that_fails_is_told_and_the_others_are_made(survey: Path, failed:
 
 
 @pytest.mark.slow
-def test_a_survey_that_failed_first_is_as_one_made_at_once_and_names_of_folders_do_not_count(
+def test_results_depend_neither_on_earlier_failures_nor_on_folder_names(
     survey: Path, made: Path, tmp_path: Path
 ) -> None:  # fmt: skip
     other = renamed(survey, tmp_path / "tiles")
@@ -143,12 +147,12 @@ def test_a_survey_that_failed_first_is_as_one_made_at_once_and_names_of_folders_
         tile.write_text(
             tile.read_text(encoding="utf-8").replace('"../../corridor', f'"{survey.parent}/corridor'), encoding="utf-8"
         )
-    good(scan2sim("survey", other, "--out", tmp_path / "out", *SMALL))
+    stdout_of(scan2sim("survey", other, "--out", tmp_path / "out", *SMALL))
     assert contents(tmp_path / "out") == contents(made)
 
 
 def renamed(survey: Path, to: Path) -> Path:
-    """A copy whose tiles' folders aren't called as the tiles."""
+    """A copy of the survey in which the folders have other names than the tiles."""
     shutil.copytree(survey, to)
     for i, tile in enumerate(sorted(to.glob("*/tile.toml"))):
         listing = to / "survey.toml"
@@ -165,16 +169,18 @@ def contents(out: Path) -> dict[str, str]:
     return {manifest["label"]: manifest["content"] for manifest in manifests}
 
 
-def test_two_runs_do_not_share_a_store(survey: Path, made: Path) -> None:
+def test_second_run_of_a_survey_is_a_busy_error(survey: Path, made: Path) -> None:
     from scan2sim.flows.engine.lock import locked
 
     with locked(made):
-        bad(scan2sim("survey", survey, "--out", made, *SMALL), 8, "another run")
+        assert_fails(scan2sim("survey", survey, "--out", made, *SMALL), 8, "another run")
 
 
-def test_what_is_no_survey_is_told(tmp_path: Path) -> None:
-    bad(scan2sim("survey", tmp_path, "--out", tmp_path / "out"), 3, "there is no survey here", "survey.toml")
+def test_folder_without_survey_is_an_input_error(tmp_path: Path) -> None:
+    assert_fails(scan2sim("survey", tmp_path, "--out", tmp_path / "out"), 3, "no survey found", "survey.toml")
 
 
-def test_an_unknown_amount_of_memory_is_told(survey: Path, tmp_path: Path) -> None:
-    bad(scan2sim("survey", survey, "--out", tmp_path, "--memory", "lots"), 2, "--memory", "Write 20GB")
+def test_invalid_memory_is_a_setting_error(survey: Path, tmp_path: Path) -> None:
+    assert_fails(
+        scan2sim("survey", survey, "--out", tmp_path, "--memory", "lots"), 2, "--memory", "Write for example 20GB"
+    )

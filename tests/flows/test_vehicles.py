@@ -1,4 +1,4 @@
-"""Parked vehicles: left out by default, a surface of their own where asked; what moved is in no world."""
+"""Parked vehicles: removed by default, or a surface of their own; moving ones are always removed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scan2sim.data_samples.scene import build
 from scan2sim.data_samples.street import generate
 from scan2sim.flows.cli import app
 from scan2sim.flows.pipelines.settings import Settings
-from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.flows.pipelines.tile import build_graph
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Frame, Mesh, PointCloud
@@ -27,24 +27,24 @@ KEEP = Settings({"split": {"vehicles": "keep"}})
 STREET = ROOT / "data_samples" / "tile"
 
 
-def test_only_where_asked_there_are_steps_for_vehicles() -> None:
+def test_vehicle_tasks_exist_only_if_vehicles_are_kept() -> None:
     tile = read_tile(STREET)
-    plain, kept = ({node.full_name: node for node in recipe(tile, s)} for s in (Settings(), KEEP))
+    plain, kept = ({task.full_name: task for task in build_graph(tile, s)} for s in (Settings(), KEEP))
     assert not any(label.endswith(".vehicle") for label in plain)
     assert {"voxel.vehicle", "poisson.vehicle", "decimate.vehicle", "texture.vehicle"} <= kept.keys()
     assert "vehicle" in kept["export"].inputs and "vehicle" in kept["collision"].inputs
     assert kept["decimate.vehicle"].params.target == 50_000  # type: ignore[attr-defined]
-    airborne = {node.full_name for node in recipe(replace(tile, views=(), trajectory=None), KEEP)}
+    airborne = {task.full_name for task in build_graph(replace(tile, views=(), trajectory=None), KEEP)}
     assert not any(label.endswith(".vehicle") for label in airborne)
 
 
-def test_what_is_parked_is_kept_and_what_moved_is_not(tmp_path: Path) -> None:
+def test_parked_vehicles_are_kept_and_moving_ones_removed(tmp_path: Path) -> None:
     frame = Frame("EPSG:32633", (500_000.0, 5_400_000.0, 200.0))
     random = np.random.default_rng(0)
-    places = {"parked": (0.0, 0.0), "moved": (10.0, 0.0), "alone": (20.0, 0.0)}
+    positions = {"parked": (0.0, 0.0), "moved": (10.0, 0.0), "alone": (20.0, 0.0)}
     body = random.uniform((-2.2, -0.9, 0.2), (2.2, 0.9, 1.5), (500, 3))
     road = np.column_stack([random.uniform(-5, 25, (500, 2)), np.zeros(500)])
-    xyz = np.concatenate([road, *(body + (*xy, 0.0) for xy in places.values())]).astype(np.float32)
+    xyz = np.concatenate([road, *(body + (*xy, 0.0) for xy in positions.values())]).astype(np.float32)
     classification = np.repeat([CODE["road"], CODE["vehicle"]], [500, 1500]).astype(np.uint8)
     PointCloud(frame, xyz, classification=classification).save(tmp_path / "cloud.npz")
     features = [
@@ -57,8 +57,8 @@ def test_what_is_parked_is_kept_and_what_moved_is_not(tmp_path: Path) -> None:
             },
             "properties": {"kind": "car", "moved": name == "moved", "ground_z": 200.0, "height_m": 1.5},
         }
-        for name, (x, y) in places.items()
-        if name != "alone"  # told to be a vehicle's, but of no vehicle that was found
+        for name, (x, y) in positions.items()
+        if name != "alone"  # classified as vehicle, but without a detected instance
     ]
     (tmp_path / "things.geojson").write_text(json.dumps({"features": features}), encoding="utf-8")
     inputs = {"cloud": tmp_path / "cloud.npz", "things": tmp_path / "things.geojson"}
@@ -70,8 +70,8 @@ def test_what_is_parked_is_kept_and_what_moved_is_not(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_world_with_its_parked_cars(tmp_path: Path) -> None:
-    """Both worlds of a street: the cars' surface is where cars are, textured, in every format; or nothing is there."""
+def test_world_with_parked_cars(tmp_path: Path) -> None:
+    """Both worlds of a street: with the cars' surface, textured and in every format, or without any."""
     tile = generate(tmp_path / "tile", length=20, points=400_000, photos=16, seed=3, photo_width=640).parent
     layout = lay_out(20, 3, None)
     parked = build(layout)[1]
@@ -89,5 +89,5 @@ def test_a_world_with_its_parked_cars(tmp_path: Path) -> None:
     assert report["texture"]["coverage_by_class"]["vehicle"] > 0.3
     made = Mesh.load(next((tmp_path / "keep" / "steps" / "decimate.vehicle").rglob("mesh.npz")))
     low, high = parked.vertices.min(axis=0)[:2] - 0.5, parked.vertices.max(axis=0)[:2] + 0.5
-    places = made.moved_to(FRAME).vertices[:, :2]
-    assert ((places > low) & (places < high)).all(), "the moving car is in no world"
+    positions = made.moved_to(FRAME).vertices[:, :2]
+    assert ((positions > low) & (positions < high)).all(), "the moving car is removed"

@@ -1,4 +1,4 @@
-"""`scan2sim view`: a world's page as who opens it sees it, how it is served, and the flight through it."""
+"""`scan2sim view`: the web viewer in a browser, its server, and the flight video."""
 
 from __future__ import annotations
 
@@ -23,8 +23,10 @@ from scan2sim.pipeline.io.worlds.scene import read_scene
 from tests.browser import Page, chromium
 from tests.pipeline import synthetic
 
-HERE = "world.here.size >= world.about.tiles.length && !document.querySelector('[role=status]').textContent"
-DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
+ALL_TILES_LOADED = (
+    "world.loaded.size >= world.about.tiles.length && !document.querySelector('[role=status]').textContent"
+)
+NEXT_FRAME_DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
 
 
 def run(*words: object) -> None:
@@ -33,59 +35,59 @@ def run(*words: object) -> None:
         raise done.exception
 
 
-def seen(page: Page) -> np.ndarray:
-    """What the canvas shows, below the buttons."""
-    page.value(DRAWN)
+def canvas_pixels(page: Page) -> np.ndarray:
+    """Pixels of the canvas below the buttons."""
+    page.value(NEXT_FRAME_DRAWN)
     return page.picture()[80:700, :900].astype(int)
 
 
-def test_all_tiles_are_shown_by_photos_classes_and_sources(tmp_path: Path) -> None:
+def test_viewer_shows_all_tiles_in_all_colour_modes(tmp_path: Path) -> None:
     synthetic.scene(tmp_path)
     run(tmp_path / "world", "--out", tmp_path / "page")
     with chromium(tmp_path) as page:
-        page.open(tmp_path / "page" / "index.html")  # by a double click: no server
-        page.until(f"window.world && {HERE}")
+        page.open(tmp_path / "page" / "index.html")  # from a file, without a server
+        page.until(f"window.world && {ALL_TILES_LOADED}")
         page.click("[data-photo='1']")
         eye = np.array(page.value("document.querySelector('output').value").split(), float)
         np.testing.assert_allclose(eye, [-8, -9, 2], atol=0.01)
-        photo = seen(page)
+        photo = canvas_pixels(page)
         assert photo.std() > 30
         pictures = [photo]
         for kind in ("class", "source", "distance"):
             page.click(f"[data-colour={kind}]")
-            pictures.append(seen(page))
+            pictures.append(canvas_pixels(page))
             assert page.value("document.getElementById('legend').innerText").strip()
         assert all(np.abs(a - b).mean() > 3 for i, a in enumerate(pictures) for b in pictures[:i])
         page.click("[data-colour=photo]")
-        assert (seen(page) == photo).all()
+        assert (canvas_pixels(page) == photo).all()
         page.click("[data-toggle=wireframe]")
-        assert np.abs(seen(page) - photo).mean() > 0.5
+        assert np.abs(canvas_pixels(page) - photo).mean() > 0.5
         page.click("[data-toggle=wireframe]")
         page.click("[data-toggle=collision]")
-        page.until(f"world.here.size === 4 && {HERE}")
-        assert np.abs(seen(page) - photo).mean() > 3
+        page.until(f"world.loaded.size === 4 && {ALL_TILES_LOADED}")
+        assert np.abs(canvas_pixels(page) - photo).mean() > 3
         page.click("[data-to=turn]")
-        assert np.abs(seen(page) - photo).mean() > 10
+        assert np.abs(canvas_pixels(page) - photo).mean() > 10
         page.open(tmp_path / "page" / "index.html", phone=True)
-        page.until(f"window.world && {HERE}")
+        page.until(f"window.world && {ALL_TILES_LOADED}")
         assert page.errors == []
 
 
-def test_a_world_without_photos_is_walked_through_too(tmp_path: Path) -> None:
+def test_viewer_walks_through_a_world_without_photos(tmp_path: Path) -> None:
     synthetic.world(tmp_path)
     run(tmp_path / "export" / "world", "--out", tmp_path / "page")
     with chromium(tmp_path) as page:
         page.open(tmp_path / "page" / "index.html")
-        page.until(f"window.world && {HERE}")
-        above = seen(page)
+        page.until(f"window.world && {ALL_TILES_LOADED}")
+        above = canvas_pixels(page)
         page.click("[data-to=walk]")
-        assert np.abs(seen(page) - above).mean() > 10 and page.errors == []
+        assert np.abs(canvas_pixels(page) - above).mean() > 10 and page.errors == []
         x, y, z = map(float, page.value("document.querySelector('output').value").split())
         assert z == pytest.approx(float(synthetic.height(np.array(x), np.array(y))) + 1.6, abs=0.1)
         assert page.value("document.getElementById('photos').hidden")
 
 
-def test_a_page_that_lacks_a_tile_says_so(tmp_path: Path) -> None:
+def test_missing_tile_script_is_reported(tmp_path: Path) -> None:
     synthetic.scene(tmp_path)
     run(tmp_path / "world", "--out", tmp_path / "page")
     (tmp_path / "page" / "tiles" / "tile1.js").unlink()
@@ -94,7 +96,7 @@ def test_a_page_that_lacks_a_tile_says_so(tmp_path: Path) -> None:
         page.until("document.querySelector('[role=status]').textContent.includes(\"tile1.js isn't beside\")")
 
 
-def test_tiles_are_made_when_they_are_asked_for_and_for_this_machine_alone(tmp_path: Path) -> None:
+def test_server_creates_tiles_on_request_and_rejects_other_hosts(tmp_path: Path) -> None:
     pages = Pages(synthetic.scene(tmp_path), tmp_path / "page", 1.0)
     with server(pages, 0) as served:
         threading.Thread(target=served.serve_forever, daemon=True).start()
@@ -106,9 +108,9 @@ def test_tiles_are_made_when_they_are_asked_for_and_for_this_machine_alone(tmp_p
                 body = urllib.request.urlopen(f"{address}/tiles/{script}").read()
                 assert body.startswith(f'scan2simTile("{script.removesuffix(".js")}", "'.encode())
             for name, host in (("/tiles/tile7.js", None), ("/../world/metadata.json", None), ("/", "elsewhere.org")):
-                asked = urllib.request.Request(address + name, headers={"Host": host} if host else {})
+                request = urllib.request.Request(address + name, headers={"Host": host} if host else {})
                 with pytest.raises(urllib.error.HTTPError) as caught:
-                    urllib.request.urlopen(asked)
+                    urllib.request.urlopen(request)
                 assert caught.value.code == (403 if host else 404)
             with pytest.raises(SettingError, match="can't listen"):
                 server(pages, served.server_port)
@@ -116,7 +118,7 @@ def test_tiles_are_made_when_they_are_asked_for_and_for_this_machine_alone(tmp_p
             served.shutdown()
 
 
-def test_a_flight_is_a_video_of_the_world(tmp_path: Path) -> None:
+def test_flight_is_a_video_of_the_world(tmp_path: Path) -> None:
     av = pytest.importorskip("av", reason="PyAV isn't installed")
     synthetic.scene(tmp_path)
     run(tmp_path / "world", "--film", tmp_path / "flight.mp4", "--seconds", 0.25, "--width", 160)
@@ -127,13 +129,13 @@ def test_a_flight_is_a_video_of_the_world(tmp_path: Path) -> None:
     assert np.abs(frames[0].astype(int) - frames[3]).mean() > 5
 
 
-def test_a_flight_that_fails_costs_itself_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failing_flight_keeps_the_earlier_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("av", reason="PyAV isn't installed")
     scene = synthetic.scene(tmp_path)
     view = Renderer.view
 
     def failing(self: Renderer, camera: Camera, pose: F64, **how: Any) -> Image:
-        if len(seen_from) > 50:  # the encoder has written by then
+        if len(seen_from) > 50:  # the encoder has written data by then
             raise ZeroDivisionError("a bug")
         seen_from.append(pose)
         return view(self, camera, pose, **how)
@@ -147,8 +149,8 @@ def test_a_flight_that_fails_costs_itself_alone(tmp_path: Path, monkeypatch: pyt
     assert read_scene(tmp_path) == scene and sorted(path.suffix for path in tmp_path.glob("*flight*")) == [".mp4"]
 
 
-def test_without_a_road_the_flight_circles_around_the_world(tmp_path: Path) -> None:
+def test_flight_without_road_circles_around_the_world(tmp_path: Path) -> None:
     poses = np.array(flight(synthetic.scene(tmp_path, tiles=1), 12))
     away = np.linalg.norm(poses[:, :2, 3], axis=1)
     assert np.ptp(away) < 1 and away.min() > 14 and (poses[:, 2, 3] > 5).all()
-    assert (poses[:, :3, 2] * poses[:, :3, 3] < 1).all() and (poses[:, 2, 2] < 0).all()  # they look at its middle
+    assert (poses[:, :3, 2] * poses[:, :3, 3] < 1).all() and (poses[:, 2, 2] < 0).all()  # they look at the middle

@@ -1,4 +1,4 @@
-"""A street in seconds: few points, two photos, coarse settings, and steps that fail where a test wants them to."""
+"""Small street that is built in seconds: few points, two photos, coarse settings; steps can be made to fail."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 
 from scan2sim.flows import cli
-from scan2sim.flows.pipelines import tile as tile_recipe
+from scan2sim.flows.pipelines import tile as tile_pipeline
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report
 from scan2sim.pipeline.core.types import Bools, PointCloud
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.io.worlds.scene import Scene, read_scene
-from tests.gazebo.checker import built, check_world
+from tests.gazebo.checker import build, check_world
 
 COARSE: dict[str, dict[str, Any]] = {
     "voxel": {"size": 0.3},
@@ -55,20 +55,20 @@ def keep_points(tile: Path, kept: Bools) -> None:
 
 
 def broken(inputs: Inputs, params: Params, out: Path, report: Report) -> Done:
-    """A step with a programming error that shows once half of its result is written."""
+    """A step with a programming error, raised after half of its result is written."""
     (out / "half.txt").write_text("half", encoding="utf-8")
     raise ZeroDivisionError("a bug")
 
 
 def fail(patch: pytest.MonkeyPatch, steps: Collection[str]) -> None:
-    """Let steps of tiles fail, by their names."""
+    """Make the steps of these names fail."""
     for name in steps:
-        step = getattr(tile_recipe, name.upper())
-        patch.setattr(tile_recipe, name.upper(), replace(step, run=broken))
+        step = getattr(tile_pipeline, name.upper())
+        patch.setattr(tile_pipeline, name.upper(), replace(step, run=broken))
 
 
 def scan2sim(*arguments: object, failing: Collection[str] = (), settings: object = COARSE) -> tuple[int, str]:
-    """Run the command in this process with coarse settings; returns its exit code and what it printed, as one line.
+    """Run `scan2sim` in this process with coarse settings; returns its exit code and its output as one line.
 
     Args:
         arguments: of the command.
@@ -88,12 +88,12 @@ def scan2sim(*arguments: object, failing: Collection[str] = (), settings: object
 
 
 def loaded(out: Path) -> Scene:
-    """The finished world of a run or a survey, each of its meshes read; by Gazebo, too, where that is installed."""
+    """The finished world of a run or survey, with all meshes read; also loads it in Gazebo if that is installed."""
     scene = read_scene(out)
     assert all(len(shape) for tile in scene.tiles for shape in tile.textured().values())
     assert all(len(tile.solid()) for tile in scene.tiles)
     world = out / "world" / f"{scene.name}.sdf"
     assert ET.parse(world).getroot().find("world") is not None
-    if not built():
+    if not build():
         check_world(world)
     return scene

@@ -1,4 +1,4 @@
-"""A toy recipe for tests of planning and execution; steps count their runs in a file."""
+"""A toy pipeline for tests of planning and execution; steps log their runs to a file."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import time
 from pathlib import Path
 from typing import Any, Literal
 
-from scan2sim.flows.pipelines.graph import Node, NodeId, Output
+from scan2sim.flows.pipelines.graph import Output, Task, TaskId
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 
 
 class ToyParams(Params):
-    """What the toy does: nothing, fail, die, hang, or die noisily and leave litter; `log` counts its runs."""
+    """What the toy step does: work, fail, crash, hang, or die with open locks and output; `log` lists its runs."""
 
     log: Path
     name: str
@@ -32,14 +32,14 @@ def toy(inputs: Inputs, params: ToyParams, out: Path, report: Report) -> Done:
     total = params.value + sum(int(path.read_text(encoding="utf-8")) for path in inputs.values())
     (out / "number.txt").write_text(str(total), encoding="utf-8")
     if params.does == "fail":
-        raise DataError("toy", "was told to fail", "Tell it otherwise")
+        raise DataError("toy", "is configured to fail", "Change its settings")
     if params.does == "bug":
         raise ZeroDivisionError("a bug")
     if params.does == "die":
         os.kill(os.getpid(), signal.SIGKILL)
     if params.does == "litter":
         locks = [multiprocessing.get_context("forkserver").Lock() for _ in range(3)]
-        print(f"{len(locks)} locks are never given back", file=sys.stderr, flush=True)
+        print(f"{len(locks)} locks are never released", file=sys.stderr, flush=True)
         os.write(2, b"a library says this\n")
         os.kill(os.getpid(), signal.SIGKILL)
     if params.does == "hang":
@@ -51,15 +51,15 @@ def toy(inputs: Inputs, params: ToyParams, out: Path, report: Report) -> Done:
 TOY = Step("toy", 1, toy, ToyParams)
 
 
-def chain(source: Path, log: Path, **changes: dict[str, Any]) -> list[Node]:
-    """source -> a -> b -> d, a -> c -> d; `changes` by node name."""
+def chain(source: Path, log: Path, **changes: dict[str, Any]) -> list[Task]:
+    """Graph source -> a -> b -> d, a -> c -> d; `changes` are parameters by task name."""
 
-    def node(name: str, inputs: dict[str, Path | Output]) -> Node:
-        return Node(Step(name, 1, toy, ToyParams), ToyParams(log=log, name=name, **changes.get(name, {})), inputs)
+    def task(name: str, inputs: dict[str, Path | Output]) -> Task:
+        return Task(Step(name, 1, toy, ToyParams), ToyParams(log=log, name=name, **changes.get(name, {})), inputs)
 
     return [
-        node("a", {"source": source}),
-        node("b", {"a": Output(NodeId("a"), "number")}),
-        node("c", {"a": Output(NodeId("a"), "number")}),
-        node("d", {"b": Output(NodeId("b"), "number"), "c": Output(NodeId("c"), "number")}),
+        task("a", {"source": source}),
+        task("b", {"a": Output(TaskId("a"), "number")}),
+        task("c", {"a": Output(TaskId("a"), "number")}),
+        task("d", {"b": Output(TaskId("b"), "number"), "c": Output(TaskId("c"), "number")}),
     ]

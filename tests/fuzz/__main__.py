@@ -1,4 +1,4 @@
-"""`python -m tests.fuzz [--cases N] [--first N] [KIND ...]`: counts of what became of damaged files."""
+"""`python -m tests.fuzz [--cases N] [--first N] [KIND ...]`: outcomes of reading damaged files, counted per kind."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from tests.fuzz.kinds import KINDS
 
 
 def main() -> None:
-    """Print a line a kind, the failures, and all counts."""
+    """Print a summary line per kind, the failures and the total counts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", type=int, default=300)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first case")
     parser.add_argument("kinds", nargs="*", default=list(KINDS))
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     child, codes, failures, slowest, largest = Child(), Counter[str](), list[str](), 0.0, 0.0
-    for kind in given.kinds:
+    for kind in arguments.kinds:
         with TemporaryDirectory() as folder:
-            tally = fuzz(kind, range(given.first, given.first + given.cases), Path(folder) / "x", child)
+            seeds = range(arguments.first, arguments.first + arguments.cases)
+            tally = fuzz(kind, seeds, Path(folder) / "x", child)
         summary = ", ".join(f"{code}: {n}" for code, n in sorted(tally.codes.items(), key=str))
         print(f"{kind:24s} {summary}; {tally.seconds:.1f} s, {tally.mb:.0f} MB at most", flush=True)
         for failure in tally.failures:

@@ -1,4 +1,4 @@
-"""The process that reads damaged files: one for hundreds of them, bounded, and started anew when it dies."""
+"""Process that reads damaged files: reused for hundreds of them, with limited memory, restarted when it dies."""
 
 from __future__ import annotations
 
@@ -10,35 +10,35 @@ import sys
 import traceback
 from pathlib import Path
 
-MOST = 6 << 30
-"""Bytes of data that a process may ask for: what goes wild ends in an error, not in the machine's."""
+MAX_DATA_BYTES = 6 << 30
+"""Data segment limit of the process: runaway allocations end in an error and don't exhaust the machine's memory."""
 
 
 def main() -> None:
-    """Read cases, a JSON a line (`kind`, `folder`), and answer each: `code`, `said`, `mb`."""
-    wire = os.fdopen(os.dup(1), "w")
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.dup2(nowhere, 2)
-    resource.setrlimit(resource.RLIMIT_DATA, (MOST, MOST))
-    from scan2sim.flows.cli import replace_what_cannot_be_encoded
+    """Read cases (one JSON object per line: `kind`, `folder`), and print an outcome each: `code`, `message`, `mb`."""
+    output = os.fdopen(os.dup(1), "w")
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 1)
+    os.dup2(null, 2)
+    resource.setrlimit(resource.RLIMIT_DATA, (MAX_DATA_BYTES, MAX_DATA_BYTES))
+    from scan2sim.flows.cli import replace_unencodable_characters
     from tests.fuzz.kinds import KINDS
 
-    replace_what_cannot_be_encoded()
+    replace_unencodable_characters()
 
     for line in sys.stdin:
         case = json.loads(line)
-        _forget_peak()
-        said, code = "", 0
+        _reset_peak_memory()
+        message, code = "", 0
         try:
             KINDS[case["kind"]].read(Path(case["folder"]))
-        except BaseException as error:  # panics of native code are no Exceptions
-            code, said = _outcome(error)
-        print(json.dumps({"code": code, "said": said, "mb": _peak()}), file=wire, flush=True)
+        except BaseException as error:  # panics of native code aren't Exceptions
+            code, message = _outcome(error)
+        print(json.dumps({"code": code, "message": message, "mb": _peak_memory_mb()}), file=output, flush=True)
 
 
 def _outcome(error: BaseException) -> tuple[int, str]:
-    """As the command's `main` tells it; an error that the table doesn't know with all that is known of it."""
+    """Exit code and message as in the command's `main`; with the traceback if the error has no exit code of its own."""
     from scan2sim.pipeline.core.errors import ScanError, exit_code, from_os_error
 
     if isinstance(error, OSError):
@@ -48,10 +48,10 @@ def _outcome(error: BaseException) -> tuple[int, str]:
     return code, str(error)[:400] if known else "".join(traceback.format_exception(error))[-3000:]
 
 
-def _forget_peak() -> None:
+def _reset_peak_memory() -> None:
     Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
 
 
-def _peak() -> float:
+def _peak_memory_mb() -> float:
     found = re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text(encoding="utf-8"))
     return int(found[1]) / 1024 if found else 0.0

@@ -1,4 +1,4 @@
-"""Clouds of all formats, whole, and the damage that only they know."""
+"""Valid point clouds in all formats, and damage specific to their formats."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from scan2sim.flows.commands.inspect import inspect_path
 from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.importers.clouds_and_photos import import_las
 from scan2sim.pipeline.io import clouds
-from tests.fuzz.damage import REAL, WHOLE
+from tests.fuzz.damage import FLOATS, INTEGERS
 from tests.pipeline.io.test_cloud_formats import Format, e57_changed
 from tests.pipeline.io.test_clouds import FRAME, made
 
-HEADER = (
+LAS_HEADER_FIELDS = (
     (24, "<B"), (25, "<B"), (94, "<H"), (96, "<I"), (100, "<I"), (104, "<B"), (105, "<H"), (107, "<I"), (131, "<d"),
     (155, "<d"), (179, "<d"), (187, "<d"), (211, "<d"), (227, "<Q"), (235, "<Q"), (243, "<I"), (247, "<Q"),
 )  # fmt: skip
-"""Fields of a LAS header: version, sizes, counts, offsets, scales, bounds."""
+"""Byte offset and type of fields of a LAS header: version, sizes, counts, offsets, scales, bounds."""
 
 
-def whole(form: Format) -> Callable[[Path], list[Path]]:
-    """Makes a cloud of a format, and names its files."""
+def writer(form: Format) -> Callable[[Path], list[Path]]:
+    """Function that writes a cloud in a format and returns its files."""
 
     def make(folder: Path) -> list[Path]:
         form.write(folder / form.file, made(1000))
@@ -32,8 +32,8 @@ def whole(form: Format) -> Callable[[Path], list[Path]]:
     return make
 
 
-def read(form: Format) -> Callable[[Path], None]:
-    """Reads it in all ways there are."""
+def reader(form: Format) -> Callable[[Path], None]:
+    """Function that reads a cloud in all available ways: inspection, chunks, import."""
 
     def read(folder: Path) -> None:
         path = folder / form.file
@@ -47,7 +47,7 @@ def read(form: Format) -> Callable[[Path], None]:
 
 
 def e57_content(data: bytes, rng: Random) -> bytes:
-    """Bytes of what is behind the checksums, which are right again."""
+    """Change bytes of the content of an E57 file, and update its checksums."""
 
     def change(plain: bytes) -> bytes:
         body, xml = bytearray(plain), plain.find(b"<?xml")
@@ -59,8 +59,8 @@ def e57_content(data: bytes, rng: Random) -> bytes:
 
 
 def las_field(data: bytes, rng: Random) -> bytes:
-    """A field of the header that says something else."""
-    at, form = rng.choice(HEADER)
-    value: float = rng.choice(REAL) if form == "<d" else rng.choice(WHOLE) % 2 ** (8 * struct.calcsize(form))
+    """Replace a field of the header with another value."""
+    at, form = rng.choice(LAS_HEADER_FIELDS)
+    value: float = rng.choice(FLOATS) if form == "<d" else rng.choice(INTEGERS) % 2 ** (8 * struct.calcsize(form))
     body = struct.pack(form, value)
     return data[:at] + body + data[at + len(body) :]

@@ -1,6 +1,6 @@
-"""Damaged files through the readers: what must hold of each, whatever it is.
+"""Read damaged files in a child process, and check exit code, message, time and memory of each.
 
-`python -m tests.fuzz --cases 300` prints a line a kind, and all failures.
+`python -m tests.fuzz --cases 300` prints a summary line per kind, and all failures.
 """
 
 from __future__ import annotations
@@ -22,40 +22,40 @@ from tests.fuzz.damage import damaged
 from tests.fuzz.kinds import KINDS
 
 ROOT = Path(__file__).resolve().parents[2]
-CODES = {0, *(code for code, _, _ in EXIT_CODES.values())}
-SECONDS, MEGABYTES = 10.0, 2000.0
-"""Bounds of a case. The memory is the whole process's, libraries included."""
-START = 120.0
-"""Seconds for a child to start and to read something whole, on a busy machine."""
+VALID_CODES = {0, *(code for code, _, _ in EXIT_CODES.values())}
+MAX_SECONDS, MAX_MEGABYTES = 10.0, 2000.0
+"""Limits per case; the memory is that of the whole process, libraries included."""
+START_TIMEOUT_S = 120.0
+"""Time for a child to start and to read an undamaged file on a busy machine."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a case: the exit code (None: the process died, or took too long), what was said, what it cost."""
+    """Result of a case: exit code (None: the process died or timed out), error message, time and peak memory."""
 
     code: int | None
-    said: str
+    message: str
     seconds: float
     mb: float = 0.0
 
     @property
-    def wrong(self) -> str:
-        """What must not be, or nothing."""
-        if self.code not in CODES:
-            return f"exit code {self.code}: {self.said}"
-        if self.seconds > SECONDS or self.mb > MEGABYTES:
-            return f"{self.seconds:.1f} s, {self.mb:.0f} MB: {self.said}"
-        return "" if self.code == 0 or len(self.said) > 20 else f"says only {self.said!r}"
+    def failure(self) -> str:
+        """Reason why the outcome is not acceptable; empty if it is."""
+        if self.code not in VALID_CODES:
+            return f"exit code {self.code}: {self.message}"
+        if self.seconds > MAX_SECONDS or self.mb > MAX_MEGABYTES:
+            return f"{self.seconds:.1f} s, {self.mb:.0f} MB: {self.message}"
+        return "" if self.code == 0 or len(self.message) > 20 else f"message too short: {self.message!r}"
 
 
 class Child:
-    """A process that reads what it is told to."""
+    """Child process that reads files on request; started again when it has died."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
 
-    def read(self, kind: str, folder: Path, limit: float = SECONDS + 5) -> Outcome:
-        """Have it read a kind from a folder."""
+    def read(self, kind: str, folder: Path, timeout_s: float = MAX_SECONDS + 5) -> Outcome:
+        """Read the files of a kind in a folder."""
         process, fresh = self._process, self._process is None
         if process is None:
             command = [sys.executable, "-c", "from tests.fuzz.child import main; main()"]
@@ -65,16 +65,16 @@ class Child:
         began = time.perf_counter()
         process.stdin.write(json.dumps({"kind": kind, "folder": str(folder)}) + "\n")
         process.stdin.flush()
-        ready, _, _ = select.select([process.stdout], [], [], START if fresh else limit)
+        ready, _, _ = select.select([process.stdout], [], [], START_TIMEOUT_S if fresh else timeout_s)
         answer = process.stdout.readline() if ready else ""
         seconds = time.perf_counter() - began
         if not answer:
             self.close()
-            return Outcome(None, f"died ({process.returncode})" if ready else "took too long", seconds)
+            return Outcome(None, f"died ({process.returncode})" if ready else "timed out", seconds)
         return Outcome(seconds=seconds, **json.loads(answer))
 
     def close(self) -> None:
-        """End it."""
+        """Kill the process."""
         if self._process is not None:
             self._process.kill()
             self._process.communicate()
@@ -83,7 +83,7 @@ class Child:
 
 @dataclass
 class Tally:
-    """What became of a kind's cases."""
+    """Outcomes of all cases of a kind: counts of exit codes, failures, maximum time and memory."""
 
     codes: Counter[int | None] = field(default_factory=Counter)
     failures: list[str] = field(default_factory=list)
@@ -92,28 +92,28 @@ class Tally:
 
 
 def fuzz(kind: str, seeds: range, folder: Path, child: Child) -> Tally:
-    """Read a kind whole, then once damaged for every seed; files are as they were afterwards."""
+    """Read the files of a kind undamaged, then once with damage per seed; files are restored afterwards."""
     folder.mkdir(parents=True, exist_ok=True)
     files = KINDS[kind].make(folder)
     tally = Tally()
-    whole = child.read(kind, folder, START)
-    assert whole.code == 0, f"{kind} can't be read whole: {whole.said}"
+    undamaged = child.read(kind, folder, START_TIMEOUT_S)
+    assert undamaged.code == 0, f"{kind} can't be read undamaged: {undamaged.message}"
     for seed, path, data in _cases(kind, seeds, files):
         good = path.read_bytes()
         path.write_bytes(data)
         outcome = child.read(kind, folder)
         path.write_bytes(good)
-        if child._process is None:  # the next one begins with its imports
-            child.read(kind, folder, START)
+        if child._process is None:  # let the next process do its imports before it is timed
+            child.read(kind, folder, START_TIMEOUT_S)
         tally.codes[outcome.code] += 1
         tally.seconds, tally.mb = max(tally.seconds, outcome.seconds), max(tally.mb, outcome.mb)
-        if outcome.wrong:
-            tally.failures.append(f"{kind}, seed {seed}, {path.name}: {outcome.wrong}")
+        if outcome.failure:
+            tally.failures.append(f"{kind}, seed {seed}, {path.name}: {outcome.failure}")
     return tally
 
 
 def _cases(kind: str, seeds: range, files: list[Path]) -> Iterator[tuple[int, Path, bytes]]:
-    """Seed, file and what it holds then."""
+    """Seeds, files and their damaged content."""
     special = KINDS[kind].special
     for seed in seeds:
         rng = Random(zlib.crc32(kind.encode()) + seed)

@@ -1,6 +1,6 @@
-"""All that users hand in, a line each: how it is made whole, how it is read, and what damage only it knows.
+"""Kinds of input files: how to write valid ones, how to read them, and damage specific to them.
 
-To have a reader fuzzed: a line in `KINDS`. A format of clouds is here once `test_cloud_formats.FORMATS` has it.
+To have a reader fuzzed, add it to `KINDS`. Cloud formats of `test_cloud_formats.FORMATS` are included automatically.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from tests.pipeline.io.test_cloud_formats import FORMATS
 
 @dataclass(frozen=True)
 class Kind:
-    """Something that users hand in.
+    """Kind of input.
 
     Attributes:
-        make: writes it whole below a folder; returns the files of it that get damaged.
-        read: reads it from that folder, as a command would; what it writes goes below the folder, too.
-        special: damage that only it knows, as often as all others.
+        make: writes valid files below a folder; returns those to be damaged.
+        read: reads them from that folder, as a command would; any output is written below the folder.
+        special: damage specific to the kind, used in half of the cases.
     """
 
     make: Callable[[Path], list[Path]]
@@ -37,9 +37,9 @@ class Kind:
 
 
 SPECIAL: dict[str, Damage] = {**dict.fromkeys(("las", "laz", "copc"), clouds.las_field), "e57": clouds.e57_content}
-SET = "decimate.target=50000\nsplit.vegetation=both\ndecimate.building.target=2e4\nvoxel.size=0.1\n"
+SET_OPTIONS = "decimate.target=50000\nsplit.vegetation=both\ndecimate.building.target=2e4\nvoxel.size=0.1\n"
 KINDS: dict[str, Kind] = {
-    **{n: Kind(clouds.whole(f), clouds.read(f), SPECIAL.get(n)) for n, f in FORMATS.items()},
+    **{n: Kind(clouds.writer(f), clouds.reader(f), SPECIAL.get(n)) for n, f in FORMATS.items()},
     "photo jpg": Kind(*models.photo(".jpg")),
     "photo png": Kind(*models.photo(".png")),
     "photo tif": Kind(*models.photo(".tif")),
@@ -48,7 +48,7 @@ KINDS: dict[str, Kind] = {
     "survey.toml": Kind(tables.survey, tables.read_survey_folder),
     "drive.toml": Kind(tables.written("drive.toml", tables.DRIVE), tables.read_drive_file),
     "settings.toml": Kind(tables.written("settings.toml", tomli_w.dumps(tables.SETTINGS)), tables.settings),
-    "--set": Kind(tables.written("set.txt", SET), tables.assignments, tables.every_setting),
+    "--set": Kind(tables.written("set.txt", SET_OPTIONS), tables.assignments, tables.every_setting),
     "photos.csv": Kind(tables.photos, tables.read_photos),
     "cameras.toml": Kind(tables.camera_file, tables.read_camera_file),
     "trajectory csv": Kind(*tables.trajectory(".csv")),
@@ -57,8 +57,8 @@ KINDS: dict[str, Kind] = {
     "gps gpx": Kind(*tables.track("g.gpx", gps.gpx("1.1"))),
     "gps nmea": Kind(*tables.track("g.nmea", gps.nmea())),
     "gps csv": Kind(*tables.track("g.csv", gps.table("time,latitude,longitude,altitude"))),
-    "gps gopro": Kind(tables.film, lambda folder: gps_io.read(folder / "g.mp4"), tables.telemetry),
-    "video": Kind(tables.film, models.read_video),
+    "gps gopro": Kind(tables.video, lambda folder: gps_io.read(folder / "g.mp4"), tables.telemetry),
+    "video": Kind(tables.video, models.read_video),
     "colmap txt": Kind(*models.colmap("txt")),
     "colmap bin": Kind(*models.colmap("bin")),
     **{name: Kind(*models.model(name)) for name in WRITERS},

@@ -1,4 +1,4 @@
-"""What importers take, whole: photos, COLMAP models, KITTI drives, sweeps; and what is inspected: results, worlds."""
+"""Valid inputs of importers (photos, COLMAP models, KITTI drives, sweeps) and of inspection (results, worlds)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scan2sim.pipeline.importers.kitti_odometry import import_kitti_odometry
 from scan2sim.pipeline.importers.kitti_raw import import_kitti_raw
 from scan2sim.pipeline.importers.merge_sweeps import read_bin
 from scan2sim.pipeline.importers.photogrammetry import import_model
-from scan2sim.pipeline.importers.sweeps import Pictures, Placing, import_sweeps, read_sweep
+from scan2sim.pipeline.importers.sweeps import PhotoInput, PlacementParams, import_sweeps, read_sweep
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.steps.views import _problem
 from scan2sim.slam.video import open_video
@@ -31,7 +31,7 @@ Read: TypeAlias = Callable[[Path], object]
 
 
 def photo(suffix: str) -> tuple[Make, Read]:
-    """A photo, and all that looks at one."""
+    """Photo file: writer and reader."""
     rgb = np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8)
 
     def make(folder: Path) -> list[Path]:
@@ -47,7 +47,7 @@ def photo(suffix: str) -> tuple[Make, Read]:
 
 
 def colmap(form: str) -> tuple[Make, Read]:
-    """A COLMAP model."""
+    """COLMAP model: writer and reader (import)."""
 
     def make(folder: Path) -> list[Path]:
         make_model(folder, ["SIMPLE_RADIAL", "OPENCV", "PINHOLE"])
@@ -61,7 +61,7 @@ def colmap(form: str) -> tuple[Make, Read]:
 
 
 def model(kind: str) -> tuple[Make, Read]:
-    """A model of another program."""
+    """Model of another photogrammetry program: writer and reader (import)."""
 
     def make(folder: Path) -> list[Path]:
         WRITERS[kind](folder)
@@ -78,47 +78,47 @@ def model(kind: str) -> tuple[Make, Read]:
 
 
 def kitti(folder: Path) -> list[Path]:
-    """A KITTI drive: calibration, time stamps, OXTS, sweeps."""
+    """Write a drive of KITTI raw: calibration, time stamps, OXTS, sweeps."""
     make_drive(folder)
     return sorted(path for path in folder.rglob("*") if path.suffix in (".txt", ".bin"))
 
 
 def read_kitti(folder: Path) -> object:
-    """The tile of it."""
+    """Import the drive as a tile."""
     out = folder / "tile"
     return import_kitti_raw(folder / "2011_09_26", out, overwrite=out.exists())
 
 
 def odometry(folder: Path) -> list[Path]:
-    """A sequence of KITTI's odometry."""
+    """Write a sequence of KITTI odometry."""
     make_sequence(folder)
     return sorted(path for path in folder.rglob("*") if path.suffix in (".txt", ".bin"))
 
 
 def read_odometry(folder: Path) -> object:
-    """The tile of it."""
+    """Import the sequence as a tile."""
     out = folder / "tile"
     return import_kitti_odometry(folder / "sequences" / "31", out, overwrite=out.exists())
 
 
 def drive(folder: Path) -> list[Path]:
-    """Sweeps, poses, photos and extrinsics."""
+    """Write sweeps, poses, photos and extrinsics."""
     sweeps.make(folder)
     return sorted(path for path in folder.rglob("*") if path.is_file())
 
 
 def read_drive(folder: Path) -> object:
-    """The tile of them."""
+    """Import the sweeps and photos as a tile."""
     out = folder / "tile"
-    pictures = Pictures(folder / "photos", sweeps.CAMERA)
+    photos = PhotoInput(folder / "photos", sweeps.CAMERA)
     return import_sweeps(
-        folder / "sweeps", folder / "camera.csv", out, Placing(), extrinsics=sweeps.T_CAMERA_SCANNER, photos=pictures,
-        overwrite=out.exists(),
+        folder / "sweeps", folder / "camera.csv", out, PlacementParams(), extrinsics=sweeps.T_CAMERA_SCANNER,
+        photos=photos, overwrite=out.exists(),
     )  # fmt: skip
 
 
 def sweep(suffix: str) -> tuple[Make, Read]:
-    """A sweep alone."""
+    """Single sweep: writer and reader."""
     write = sweeps.to_bin if suffix == ".bin" else sweeps.to_open3d(suffix)
 
     def make(folder: Path) -> list[Path]:
@@ -133,25 +133,25 @@ def sweep(suffix: str) -> tuple[Make, Read]:
 
 
 def result(folder: Path) -> list[Path]:
-    """A kept result."""
+    """Write a cached result."""
     np.savez(folder / "r.npz", a=np.arange(1000), b=np.zeros((3, 4)), c=np.array(["x", "y"]))
     return [folder / "r.npz"]
 
 
 def world(folder: Path) -> list[Path]:
-    """A world with its model, and a GLB."""
+    """Write a world with its model, and a GLB."""
     synthetic.world(folder)
     kinds = (".sdf", ".obj", ".dae", ".glb", ".json")
     return sorted(path for path in folder.rglob("*") if path.suffix in kinds)
 
 
 def read_world(folder: Path) -> None:
-    """One screen of facts about each."""
+    """Inspect all files."""
     for path in sorted(folder.rglob("*")):
         if path.suffix in (".sdf", ".obj", ".dae", ".glb"):
             inspect_path(path)
 
 
 def read_video(folder: Path) -> object:
-    """All its frames."""
+    """Decode all frames."""
     return [frame.time for frame in open_video(folder / "g.mp4").frames()]

@@ -1,4 +1,4 @@
-"""Text files of users, whole: tile.toml and its like, CSVs of photos, trajectories, GPS tracks, settings."""
+"""Valid text inputs: tile.toml, survey.toml and drive.toml, CSVs of photos, trajectories, GPS tracks, settings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.survey import read_survey, write_survey
 from scan2sim.pipeline.io.tile import read_tile
-from tests.fuzz.damage import TEXT
+from tests.fuzz.damage import TEXTS
 from tests.pipeline.importers.test_clouds_and_photos import cloud
 from tests.pipeline.io import test_gps as gps
 from tests.pipeline.io.test_tile import body, save
@@ -31,7 +31,7 @@ Read: TypeAlias = Callable[[Path], object]
 
 
 def written(name: str, text: str) -> Make:
-    """A file of that name and text."""
+    """Writer of a file with given name and text."""
 
     def make(folder: Path) -> list[Path]:
         (folder / name).write_text(text, encoding="utf-8")
@@ -41,7 +41,7 @@ def written(name: str, text: str) -> Make:
 
 
 def tile(folder: Path) -> list[Path]:
-    """A tile with a camera, a photo, a trajectory, a cell and classes."""
+    """Write a tile with a camera, a photo, a trajectory, a cell and classes."""
     (folder / "path.csv").write_text("time,x,y,z\n1,500000,5400000,101\n2,500001,5400000,101\n", encoding="utf-8")
     more = {"trajectory": "path.csv", "classes": {"65": "noise"}, "cell": {"seed": [500_010.0, 5_400_010.0]}}
     save(folder, body(folder, **more))
@@ -49,7 +49,7 @@ def tile(folder: Path) -> list[Path]:
 
 
 def survey(folder: Path) -> list[Path]:
-    """A survey of a tile."""
+    """Write a survey of one tile."""
     (folder / "a").mkdir()
     save(folder / "a", body(folder / "a", name="a", photos=[], cameras=[]))
     made = write_survey(folder, name="s", crs="EPSG:32632", length=100.0, buffer=5.0, tiles=["a"])
@@ -78,32 +78,32 @@ SETTINGS: dict[str, object] = {
 
 
 def settings(folder: Path) -> object:
-    """All parameters of all steps, as the file says."""
+    """Parameters of all steps, with the settings of the file."""
     return _params(Settings.read(folder / "settings.toml"))
 
 
 def assignments(folder: Path) -> object:
-    """The same of `--set`, a line each."""
+    """Parameters of all steps, with `--set` options, one per line of the file."""
     lines = (folder / "set.txt").read_bytes().decode("utf-8", "replace").splitlines()
     return _params(Settings.read(None, [line for line in lines if line]))
 
 
-def _params(found: Settings) -> object:
-    found.check(STEPS)
-    whole = [step for step in STEPS if not any(f.is_required() for f in step.params.model_fields.values())]
-    return [found.params(step, group) for step in whole for group in ("terrain", "building")]
+def _params(settings: Settings) -> object:
+    settings.check(STEPS)
+    steps = [step for step in STEPS if not any(f.is_required() for f in step.params.model_fields.values())]
+    return [settings.params(step, group) for step in steps for group in ("terrain", "building")]
 
 
 def every_setting(data: bytes, rng: Random) -> bytes:
-    """Any parameter of any step as anything."""
+    """Assign a random value to a random parameter of a random step."""
     step = rng.choice(STEPS)
     names = list(step.params.model_fields) or ["x"]
-    value = rng.choice((*TEXT, "[1, 2]", "{a = 1}", "'x'", "1979-05-27"))
+    value = rng.choice((*TEXTS, "[1, 2]", "{a = 1}", "'x'", "1979-05-27"))
     return f"{step.name}.{rng.choice(names)}={value}\n".encode("utf-8", "replace")
 
 
 def photos(folder: Path) -> list[Path]:
-    """A cloud, a CSV of photos, one of cameras."""
+    """Write a cloud, a photo, a CSV of photos and one of cameras."""
     cloud(folder / "c.laz")
     cv2.imwrite(str(folder / "1.png"), np.zeros((48, 64, 3), np.uint8))
     (folder / "photos.csv").write_text(
@@ -115,14 +115,14 @@ def photos(folder: Path) -> list[Path]:
 
 
 def read_photos(folder: Path) -> object:
-    """The tile of them."""
+    """Import the cloud and photos as a tile."""
     out = folder / "tile"
     photos, cameras = folder / "photos.csv", folder / "cameras.csv"
     return import_las([folder / "c.laz"], out, photos=photos, cameras=cameras, overwrite=out.exists())
 
 
 def trajectory(suffix: str) -> tuple[Make, Read]:
-    """A trajectory file, and its reader."""
+    """Trajectory file: writer and reader."""
 
     def make(folder: Path) -> list[Path]:
         trajectory_io.write(folder / f"t{suffix}", made_up(), UTM)
@@ -132,7 +132,7 @@ def trajectory(suffix: str) -> tuple[Make, Read]:
 
 
 def camera_file(folder: Path) -> list[Path]:
-    """Cameras alone, and extrinsics."""
+    """Write a camera file and extrinsics."""
     camera = {"id": "c", "model": "opencv", "size": [64, 48], "focal": [50.0, 50.0], "centre": [31.5, 23.5]}
     (folder / "cameras.toml").write_text(tomli_w.dumps({"cameras": [camera]}), encoding="utf-8")
     np.savetxt(folder / "T.txt", np.eye(4)[:3], "%.9f")
@@ -140,36 +140,36 @@ def camera_file(folder: Path) -> list[Path]:
 
 
 def read_camera_file(folder: Path) -> object:
-    """Both."""
+    """Read the camera and the extrinsics."""
     return sweeps.read_camera(folder / "cameras.toml", 64, 48), sweeps.read_extrinsics(folder / "T.txt")
 
 
 def track(name: str, text: str) -> tuple[Make, Read]:
-    """A GPS track, and its reader."""
+    """GPS track: writer and reader."""
     return written(name, text), lambda folder: gps_io.read(folder / name)
 
 
-def film(folder: Path) -> list[Path]:
-    """A GoPro's video."""
+def video(folder: Path) -> list[Path]:
+    """Write a GoPro video with GPS telemetry."""
     packets = [gps.gps5(0, stamp=7.0), gps.gps9(1), gps.gps5(2, stamp=9.0)]
     return [gps.film(folder / "g.mp4", packets, [0.0, 1.0, 2.0])]
 
 
 def telemetry(data: bytes, rng: Random) -> bytes:
-    """Damage within the telemetry, which is a small part of the file."""
+    """Damage bytes of the telemetry, which is a small part of the file."""
     at = data.find(b"DEVC", rng.randrange(len(data)))
     at = (at if at >= 0 else max(0, data.find(b"DEVC"))) + rng.randrange(700)
-    some = bytearray(data)
-    for i in range(at, min(at + rng.choice((1, 1, 4)), len(some))):
-        some[i] = rng.choice((0, 255, 63, rng.randrange(256)))
-    return bytes(some)
+    out = bytearray(data)
+    for i in range(at, min(at + rng.choice((1, 1, 4)), len(out))):
+        out[i] = rng.choice((0, 255, 63, rng.randrange(256)))
+    return bytes(out)
 
 
 def read_drive_file(folder: Path) -> object:
-    """The drive."""
+    """Read drive.toml."""
     return Drive.read(folder / "drive.toml")
 
 
 def read_survey_folder(folder: Path) -> object:
-    """The survey, and its tiles."""
+    """Read the survey and its tiles."""
     return [read_tile(path) for path in read_survey(folder).tiles.values()]

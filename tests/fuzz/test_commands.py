@@ -1,4 +1,4 @@
-"""Damaged files through the real command: exit code, words, no traceback, and what was there before as it was."""
+"""Commands with damaged files: exit code, error message without traceback, existing results unchanged."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from random import Random
 import pytest
 
 from tests.fuzz.damage import damaged
-from tests.fuzz.harness import CODES
+from tests.fuzz.harness import VALID_CODES
 from tests.fuzz.kinds import KINDS
 from tests.pipeline.io.test_tile import body, cloud, save
 
 SEEDS = range(12)
-IMPORTS = {
+COMMANDS = {
     "laz": ["import", "clouds", "{x}/c.laz", "--crs", "EPSG:32632"],
     "photos.csv": ["import", "clouds", "{x}/c.laz", "--photos", "{x}/photos.csv", "--cameras", "{x}/cameras.csv"],
     "colmap bin": ["import", "colmap", "{x}/bin", "{x}/images"],
@@ -31,19 +31,19 @@ IMPORTS = {
 
 
 def scan2sim(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """The command, in a process of its own."""
+    """Run the command in a process."""
     command = [sys.executable, "-m", "scan2sim.flows.cli", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=60)
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """Digest of every file below a folder, but for logs and locks."""
+    """Digests of all files below a folder, except logs and locks."""
     files = sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix not in (".log", ".lock"))
     return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
 
-def earlier(folder: Path) -> Path:
-    """A folder with a tile, a survey's mark, and results of an earlier run."""
+def earlier_results(folder: Path) -> Path:
+    """Create a folder with a tile, a survey.toml and results of an earlier run."""
     folder.mkdir()
     save(folder, body(folder, photos=[], cameras=[]))
     (folder / "survey.toml").write_text("# earlier", encoding="utf-8")
@@ -53,12 +53,12 @@ def earlier(folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("kind", IMPORTS)
-def test_the_command_says_what_is_wrong_and_leaves_what_was_there(kind: str, tmp_path: Path) -> None:
-    """The first few damages that the kind's reader refuses."""
-    x, out = tmp_path / "x", earlier(tmp_path / "out")
+@pytest.mark.parametrize("kind", COMMANDS)
+def test_a_damaged_file_is_reported_and_existing_results_are_kept(kind: str, tmp_path: Path) -> None:
+    """Tries the first two damages that the reader rejects."""
+    x, out = tmp_path / "x", earlier_results(tmp_path / "out")
     x.mkdir()
-    files, before, refused = KINDS[kind].make(x), contents(out), 0
+    files, before, rejected = KINDS[kind].make(x), contents(out), 0
     for seed in SEEDS:
         rng = Random(seed)
         path = rng.choice(files)
@@ -67,22 +67,22 @@ def test_the_command_says_what_is_wrong_and_leaves_what_was_there(kind: str, tmp
         try:
             KINDS[kind].read(x)
         except Exception:
-            arguments = [argument.format(x=x) for argument in IMPORTS[kind]]
-            more = ["--overwrite"] if "import" in arguments else []
-            done = scan2sim(*arguments, "--out", out, *more)
-            assert done.returncode in CODES - {0}, done.stderr
+            arguments = [argument.format(x=x) for argument in COMMANDS[kind]]
+            overwrite = ["--overwrite"] if "import" in arguments else []
+            done = scan2sim(*arguments, "--out", out, *overwrite)
+            assert done.returncode in VALID_CODES - {0}, done.stderr
             assert "error: " in done.stderr and "Traceback" not in done.stderr
             assert contents(out) | before == contents(out), f"seed {seed}"
-            refused += 1
+            rejected += 1
         path.write_bytes(good)
-        if refused == 2:
+        if rejected == 2:
             return
-    raise AssertionError(f"only {refused} of {len(SEEDS)} damages are refused")
+    raise AssertionError(f"only {rejected} of {len(SEEDS)} damages are rejected")
 
 
-def test_a_run_that_fails_on_the_way_leaves_the_world_of_before(tmp_path: Path) -> None:
-    """The tile can be read, but has too few points: known only once they are read."""
-    out = earlier(tmp_path / "out")
+def test_a_run_that_fails_midway_keeps_the_earlier_world(tmp_path: Path) -> None:
+    """The tile is valid, but has too few points, which is detected only when they are read."""
+    out = earlier_results(tmp_path / "out")
     before = {name: digest for name, digest in contents(out).items() if not name.startswith("steps")}
     (tmp_path / "tile").mkdir()
     save(tmp_path / "tile", body(tmp_path / "tile", photos=[], cameras=[]))

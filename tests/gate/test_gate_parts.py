@@ -10,7 +10,7 @@ import pytest
 from bench.consumers import Fault
 from bench.gate import drops, renderings
 from bench.gate.drive import Pose, drive
-from bench.gate.places import Places
+from bench.gate.places import WorldReference
 from bench.gate.renderings import Photo
 from scan2sim.pipeline.core.types import Camera
 from scan2sim.pipeline.simulation.robot import ROBOT
@@ -35,25 +35,25 @@ class Made:
         self.y += self.slip * speed * np.sin(self.heading) * seconds
 
 
-def street(bend: float = 0.0, half: float = 2.0) -> Places:
+def street(bend: float = 0.0, half: float = 2.0) -> WorldReference:
     """A road along x, and a way on it that bends to the left."""
     x, y = np.meshgrid(np.arange(-2, 30, 0.1), np.arange(-6, 6, 0.1))
     ground = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     along = np.arange(0.0, 28.0, 0.5)
     way = np.column_stack([along, bend * along**2, 0 * along])
-    return Places(NOWHERE, NOWHERE, ground, np.abs(ground[:, 1]) < half, (way,))
+    return WorldReference(NOWHERE, NOWHERE, ground, np.abs(ground[:, 1]) < half, (way,))
 
 
 def test_it_drives_20_m_and_comes_back_to_its_way() -> None:
-    figures = drive(Made(), street(0.003))
-    assert figures["robot_driven_m"] == pytest.approx(20, abs=0.1) and figures["robot_left_road"] == 0
-    assert figures["robot_off_way_max_m"] < 0.5 and figures["robot_above_max_m"] < 0.01
+    metrics = drive(Made(), street(0.003))
+    assert metrics["robot_driven_m"] == pytest.approx(20, abs=0.1) and metrics["robot_left_road"] == 0
+    assert metrics["robot_off_way_max_m"] < 0.5 and metrics["robot_above_max_m"] < 0.01
 
 
 def test_a_robot_that_leaves_the_road_is_a_fault() -> None:
     with pytest.raises(Fault) as caught:
         drive(Made(), street(0.01))
-    assert caught.value.figures["robot_left_road"] > 10
+    assert caught.value.metrics["robot_left_road"] > 10
 
 
 def test_a_robot_that_gets_stuck_is_a_fault() -> None:
@@ -62,13 +62,13 @@ def test_a_robot_that_gets_stuck_is_a_fault() -> None:
 
 
 def test_a_ball_that_lies_3_cm_too_low_is_a_fault() -> None:
-    places = street()
-    lying = np.array([[1.0, 0.0, drops.BALL + 0.005], [2.0, 0.0, drops.BALL - 0.005]])
-    assert drops.told(drops.gaps(lying, places))["drop_max_m"] == pytest.approx(0.005)
-    for z in (drops.BALL - 0.03, -50.0):
+    reference = street()
+    lying = np.array([[1.0, 0.0, drops.BALL_RADIUS_M + 0.005], [2.0, 0.0, drops.BALL_RADIUS_M - 0.005]])
+    assert drops.rest_metrics(drops.rest_gaps(lying, reference))["drop_max_m"] == pytest.approx(0.005)
+    for z in (drops.BALL_RADIUS_M - 0.03, -50.0):
         with pytest.raises(Fault) as caught:
-            drops.told(drops.gaps(np.array([[1.0, 0.0, z]]), places))
-        assert caught.value.figures["fell_through"] == (z < -1)
+            drops.rest_metrics(drops.rest_gaps(np.array([[1.0, 0.0, z]]), reference))
+        assert caught.value.metrics["fell_through"] == (z < -1)
 
 
 def test_a_picture_from_beside_the_photos_place_is_a_fault(tmp_path: Path) -> None:
@@ -82,4 +82,4 @@ def test_a_picture_from_beside_the_photos_place_is_a_fault(tmp_path: Path) -> No
     assert (tmp_path / "pictures" / "made.png").is_file()
     with pytest.raises(Fault) as caught:
         renderings.compare(export, "made", seen, scene[:, 40:], shown)
-    assert caught.value.figures["picture_off_px"] == pytest.approx(20, abs=1)
+    assert caught.value.metrics["picture_off_px"] == pytest.approx(20, abs=1)

@@ -1,4 +1,4 @@
-"""Gazebo's own readers and physics as a test's judge (`check_world.cpp`, `drive_world.cpp`)."""
+"""Check worlds with Gazebo's own libraries (`check_world.cpp`, `drive_world.cpp`, `load_meshes.cpp`)."""
 
 from __future__ import annotations
 
@@ -17,89 +17,92 @@ BUILD = HERE / "build"
 Body = tuple[str, tuple[float, float, float]]
 
 
-class Refused(Exception):
-    """Gazebo's readers find fault with a world; the text says which."""
+class WorldRejected(Exception):
+    """Gazebo's libraries reject a world; the message says why."""
 
 
 @functools.cache
-def built() -> str:
-    """Build the programs once; returns why they can't be, or an empty text."""
+def build() -> str:
+    """Build the programs once; returns the reason if that isn't possible, otherwise an empty string."""
     if shutil.which("cmake") is None:
         return "cmake is not installed (tests/gazebo/packages.txt)"
     BUILD.mkdir(exist_ok=True)
-    with open(BUILD / "lock", "w", encoding="utf-8") as lock:  # tests may run in several processes
+    with open(BUILD / "lock", "w", encoding="utf-8") as lock:  # tests may run in parallel processes
         fcntl.flock(lock, fcntl.LOCK_EX)
-        made = _run("cmake", "-S", HERE, "-B", BUILD, "-DCMAKE_BUILD_TYPE=Release")
-        if made.returncode:
-            return f"Gazebo's libraries are not installed (tests/gazebo/packages.txt): {made.stderr[:300]}"
-        done = _run("cmake", "--build", BUILD)
-        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+        configured = _run("cmake", "-S", HERE, "-B", BUILD, "-DCMAKE_BUILD_TYPE=Release")
+        if configured.returncode:
+            return f"Gazebo's libraries are not installed (tests/gazebo/packages.txt): {configured.stderr[:300]}"
+        built = _run("cmake", "--build", BUILD)
+        assert built.returncode == 0, built.stdout[-3000:] + built.stderr[-3000:]
     return ""
 
 
 def program(name: str) -> Path:
-    """One of the programs; the test is skipped where what it needs is not installed."""
-    if why := built():
-        pytest.skip(why)
+    """Path of one of the programs; skips the test if they can't be built."""
+    if reason := build():
+        pytest.skip(reason)
     return BUILD / name
 
 
 def check_world(world: Path, *bodies: Body) -> dict[str, Any]:
-    """What Gazebo reads of an exported world, and where bodies that are dropped in it come to rest.
+    """Load an exported world as Gazebo does, and drop bodies in it.
 
-    Triangles of every mesh file must be as many as `metadata.json` beside the world says.
+    Triangle counts of all mesh files must agree with `metadata.json` beside the world.
 
     Args:
-        world: its .sdf.
-        bodies: what is dropped, all at once, and from where, world coordinates: a "box" (40 cm), a "ball" (22 cm), a
-            "car" (a box of 4.2 x 1.8 x 1.4 m).
+        world: SDF file.
+        bodies: bodies dropped at the same time, and their initial positions, world coordinates: "box" (40 cm), "ball"
+            (22 cm), "car" (a box of 4.2 x 1.8 x 1.4 m).
 
     Returns:
-        `world`; `spherical` (latitude, longitude, elevation, heading, `at_y_100`: latitude and
-        longitude 100 m along y) or None; `meshes` (file, role, triangles, textures, low, high); `solids`: how many
-        shapes can be collided with; `bodies`: `rest` (x, y, z) of each one's centre, world coordinates, `lies`, the
-        quaternion (w, x, y, z) of its attitude, and `speed` m/s at the end.
+        `world`: name; `spherical`: None or latitude, longitude, elevation, heading, and `at_y_100`, the latitude and
+        longitude 100 m along y; `meshes`: file, role, triangles, textures, low, high; `solids`: number of collision
+        shapes; `bodies`: final position of the centre `rest` (x, y, z), world coordinates, orientation `lies`
+        (quaternion w, x, y, z) and `speed` in m/s.
 
     Raises:
-        Refused: with the first problem.
+        WorldRejected: with the first problem.
     """
     expected = json.loads((world.parent / "metadata.json").read_text(encoding="utf-8"))["triangles_by_file"]
     files = [f"{file}={count}" for file, count in expected.items() if file.startswith("models/")]
     dropped = [f"{kind}@{x:.4f},{y:.4f},{z:.4f}" for kind, (x, y, z) in bodies]
     done = _run(program("check_world"), world, *dropped, *files)
     if done.returncode:
-        raise Refused(done.stderr.strip() or f"exit code {done.returncode}")
+        raise WorldRejected(done.stderr.strip() or f"exit code {done.returncode}")
     return json.loads(done.stdout.splitlines()[-1])
 
 
 def load_meshes(*files: Path) -> dict[str, float]:
-    """`seconds` of the processor and `megabytes` at most that ignition-common takes to load meshes.
+    """CPU time (`seconds`) and peak memory (`megabytes`) to load meshes by ignition-common.
 
     Raises:
-        Refused: one can't be loaded.
+        WorldRejected: a mesh can't be loaded.
     """
     done = _run(program("load_meshes"), *files)
     if done.returncode:
-        raise Refused(done.stderr.strip() or f"exit code {done.returncode}")
+        raise WorldRejected(done.stderr.strip() or f"exit code {done.returncode}")
     return json.loads(done.stdout.splitlines()[-1])
 
 
-class Driven:
-    """The exported robot in Gazebo's physics, its wheels turned as told (`drive_world.cpp`); a context.
+class SimulatedRobot:
+    """Exported robot in Gazebo's physics with commanded wheel velocities (`drive_world.cpp`); a context manager.
 
     Args:
-        world: its .sdf.
-        name: of the robot's model.
-        joints: its left and its right one.
+        world: SDF file.
+        name: model name of the robot.
+        joints: names of the left and the right wheel joint.
+
+    Attributes:
+        pose: current `rest` and `lies`, as in `check_world`.
     """
 
     def __init__(self, world: Path, name: str, joints: tuple[str, str]) -> None:
         command = [str(part) for part in (program("drive_world"), world, name, *joints)]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
-        self.place = self._told()
+        self.pose = self._read_pose()
 
-    def __enter__(self) -> Driven:
+    def __enter__(self) -> SimulatedRobot:
         return self
 
     def __exit__(self, *raised: object) -> None:
@@ -107,21 +110,21 @@ class Driven:
         self._process.communicate()
 
     def turn(self, left: float, right: float, seconds: float) -> None:
-        """Have the wheels turn so fast, radians a second; then `place` tells `rest` and `lies`, as `check_world` does.
+        """Turn the wheels at these velocities (radians per second) for some time, and update `pose`.
 
         Raises:
-            Refused: the physics gave up.
+            WorldRejected: the simulation ended with an error.
         """
         assert self._process.stdin is not None
         self._process.stdin.write(f"{left:.9g} {right:.9g} {seconds:.9g}\n")
         self._process.stdin.flush()
-        self.place = self._told()
+        self.pose = self._read_pose()
 
-    def _told(self) -> dict[str, Any]:
+    def _read_pose(self) -> dict[str, Any]:
         assert self._process.stdout is not None and self._process.stderr is not None
         line = self._process.stdout.readline()
         if not line:
-            raise Refused(self._process.stderr.read().strip() or "it ended")
+            raise WorldRejected(self._process.stderr.read().strip() or "the simulation ended unexpectedly")
         return dict(json.loads(line))
 
 

@@ -1,4 +1,4 @@
-"""Builds the checker once for all tests here, or skips them."""
+"""Build the checker once for all tests of this folder, or skip them."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ from tests.gazebo import checker
 
 @pytest.fixture(scope="session", autouse=True)
 def built() -> None:
-    """Build before the first test, so that none is timed with the compiler."""
+    """Build before the first test, so that no test's time includes the build."""
     checker.program("check_world")

@@ -1,10 +1,10 @@
-// Drives a robot through a world as Gazebo's physics does.
+// Drives a robot through a world in Gazebo's physics.
 //
 //   drive_world WORLD.sdf MODEL LEFT_JOINT RIGHT_JOINT
 //
-// The world's static models are there to collide with; of the others only MODEL is. Reads lines "LEFT RIGHT SECONDS": how
-// fast its joints are to turn (radians a second) and for how long. Prints a line of JSON first, and one after each: where
-// the model's first link is. Ends where the input does, and returns 0; or prints the first problem, and returns 1.
+// Simulates the world's static models and MODEL. Reads lines "LEFT RIGHT SECONDS": joint velocities in radians per
+// second and their duration. Prints the pose of the model's first link as a line of JSON, at the start and after each
+// command. Returns 0 at the end of the input, or prints the first problem to stderr and returns 1.
 
 #include "world.hpp"
 
@@ -12,16 +12,16 @@ void drive(const fs::path &file, const std::string &name, const std::string &lef
 {
   const World world(file);
   const auto *model = world.Sdf().ModelByName(name);
-  check(model != nullptr && !model->Static(), "the world has no model " + name + " that moves");
-  Engine engine(world, solids(world, [](const common::Mesh &, const std::string &) {}));
+  check(model != nullptr && !model->Static(), "the world has no dynamic model " + name);
+  Engine engine(world, load_solids(world, [](const common::Mesh &, const std::string &) {}));
   const auto robot = engine.Add(*model);
-  check(robot != nullptr, "the physics engine takes no model " + name);
+  check(robot != nullptr, "the physics engine can't load model " + name);
   const auto joints = {robot->GetJoint(left), robot->GetJoint(right)};
-  for (const auto &joint : joints) check(joint != nullptr, name + " lacks a joint");
-  const auto tell = [&] {
-    std::cout << "{" << placed(robot->GetLink(0)->FrameDataRelativeToWorld()) << "}" << std::endl;
+  for (const auto &joint : joints) check(joint != nullptr, name + " has no joint " + left + " or " + right);
+  const auto print_pose = [&] {
+    std::cout << "{" << pose_members(robot->GetLink(0)->FrameDataRelativeToWorld()) << "}" << std::endl;
   };
-  tell();
+  print_pose();
   double speeds[2], seconds;
   while (std::cin >> speeds[0] >> speeds[1] >> seconds)
   {
@@ -31,7 +31,7 @@ void drive(const fs::path &file, const std::string &name, const std::string &lef
       for (const auto &joint : joints) joint->SetVelocityCommand(0, *speed++);
       engine.Step();
     }
-    tell();
+    print_pose();
   }
 }
 
@@ -42,8 +42,8 @@ int main(int argc, char **argv)
     std::cerr << "usage: drive_world WORLD.sdf MODEL LEFT_JOINT RIGHT_JOINT\n";
     return 2;
   }
-  std::signal(SIGSEGV, crashed);
-  std::signal(SIGABRT, crashed);
+  std::signal(SIGSEGV, report_crash);
+  std::signal(SIGABRT, report_crash);
   try
   {
     common::Console::SetVerbosity(2);

@@ -1,8 +1,8 @@
-// Loads meshes as Gazebo does, and says how long it took and how much memory.
+// Loads meshes as Gazebo does, and measures CPU time and memory.
 //
 //   load_meshes FILE ...
 //
-// Prints one line of JSON: the processor's seconds, and the megabytes by which the process grew at its largest.
+// Prints one line of JSON: CPU time in seconds, and increase of the process's peak memory in megabytes.
 
 #include <ctime>
 #include <fstream>
@@ -13,8 +13,8 @@
 #include <ignition/common/Mesh.hh>
 #include <ignition/common/MeshManager.hh>
 
-// The most memory that the process has had.
-double megabytes()
+// Peak memory of the process.
+double peak_megabytes()
 {
   std::ifstream status("/proc/self/status");
   for (std::string line; std::getline(status, line);)
@@ -25,15 +25,16 @@ double megabytes()
 int main(int argc, char **argv)
 {
   ignition::common::Console::SetVerbosity(1);
-  const double before = megabytes();
-  const auto began = std::clock();
+  const double initial_megabytes = peak_megabytes();
+  const auto start = std::clock();
   for (int i = 1; i < argc; ++i)
     if (ignition::common::MeshManager::Instance()->Load(argv[i]) == nullptr)
     {
       std::cerr << argv[i] << " can't be loaded" << std::endl;
       return 1;
     }
-  const double took = double(std::clock() - began) / CLOCKS_PER_SEC;
-  std::cout << "{\"seconds\": " << took << ", \"megabytes\": " << megabytes() - before << "}" << std::endl;
+  const double seconds = double(std::clock() - start) / CLOCKS_PER_SEC;
+  std::cout << "{\"seconds\": " << seconds << ", \"megabytes\": " << peak_megabytes() - initial_megabytes << "}"
+            << std::endl;
   return 0;
 }

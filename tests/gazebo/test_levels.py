@@ -1,4 +1,4 @@
-"""Gazebo's own readers and physics take a survey's world, with all its tiles at their places."""
+"""Gazebo's own libraries load the world of a survey, with all tiles at their positions."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from tests.gazebo.checker import check_world
 from tests.pipeline import synthetic
 from tests.present import present
 
-BOX = 0.2  # half the edge of the dropped box, metres
-EAST, DOWN = 25.0, 2.0  # metres from one tile to the next
+BOX_HALF_EDGE_M = 0.2
+EAST_M, DOWN_M = 25.0, 2.0
+"""Offset between successive tiles."""
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("survey")
     x, y, z = synthetic.UTM.origin
-    frames = [replace(synthetic.UTM, origin=(x + EAST * i, y, z - DOWN * i)) for i in range(3)]
+    frames = [replace(synthetic.UTM, origin=(x + EAST_M * i, y, z - DOWN_M * i)) for i in range(3)]
     tiles = [
         TileWorld(f"tile{i}", synthetic.world(folder / f"tile{i}", frame, f"tile{i}").files["world"], frame)
         for i, frame in enumerate(frames)
@@ -29,10 +30,10 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return assemble(folder, "town", tiles)
 
 
-def test_every_tiles_meshes_and_textures_load(world: Path) -> None:
-    seen = check_world(world)
-    assert seen["world"] == "town"
-    meshes = {mesh["file"]: mesh["role"] for mesh in seen["meshes"]}
+def test_meshes_and_textures_of_all_tiles_load(world: Path) -> None:
+    loaded = check_world(world)
+    assert loaded["world"] == "town"
+    meshes = {mesh["file"]: mesh["role"] for mesh in loaded["meshes"]}
     for i in range(3):
         folder = f"models/tile{i}/meshes"
         assert meshes[f"{folder}/terrain.obj"] == meshes[f"{folder}/building.obj"] == "visual"
@@ -40,17 +41,16 @@ def test_every_tiles_meshes_and_textures_load(world: Path) -> None:
     assert len(meshes) == 18
 
 
-@pytest.mark.parametrize("tile", [0, 2])  # the world's origin is the second tile's
+@pytest.mark.parametrize("tile", [0, 2])  # the world's origin is that of the second tile
 def test_a_box_comes_to_rest_on_the_roof_of_each_tile(world: Path, tile: int) -> None:
-    x, y = synthetic.HOUSE[0] + 1.5 + EAST * (tile - 1), synthetic.HOUSE[1] + 1
-    roof = 4.5 - DOWN * (tile - 1)
-    assert check_world(world, ("box", (x, y, roof + 1.5)))["bodies"][0]["rest"] == pytest.approx(
-        [x, y, roof + BOX], abs=0.02
-    )
+    x, y = synthetic.HOUSE[0] + 1.5 + EAST_M * (tile - 1), synthetic.HOUSE[1] + 1
+    roof = 4.5 - DOWN_M * (tile - 1)
+    (body,) = check_world(world, ("box", (x, y, roof + 1.5)))["bodies"]
+    assert body["rest"] == pytest.approx([x, y, roof + BOX_HALF_EDGE_M], abs=0.02)
 
 
-def test_the_world_stands_where_its_middle_tile_does(world: Path) -> None:
-    place = check_world(world)["spherical"]
-    assert [place["latitude"], place["longitude"]] == pytest.approx(
-        present(crs.to_wgs84(synthetic.UTM, (EAST, 0, 0)))[:2], abs=1e-8
+def test_the_worlds_origin_is_that_of_the_middle_tile(world: Path) -> None:
+    spherical = check_world(world)["spherical"]
+    assert [spherical["latitude"], spherical["longitude"]] == pytest.approx(
+        present(crs.to_wgs84(synthetic.UTM, (EAST_M, 0, 0)))[:2], abs=1e-8
     )

@@ -1,5 +1,5 @@
-// A world as Gazebo reads it: parsed with warnings as errors (libsdformat), its meshes loaded (ignition-common), what
-// bodies collide with put into DART (ignition-physics).
+// Loads a world as Gazebo does: parsed with warnings as errors (libsdformat), meshes by ignition-common, collision
+// shapes into DART (ignition-physics).
 
 #pragma once
 
@@ -75,20 +75,20 @@ inline void check(const sdf::Errors &errors)
   for (const auto &error : errors) fail("SDF: " + error.Message() + " (" + error.FilePath().value_or("") + ")");
 }
 
-// What the libraries write to stderr while it lives: they report a missing texture there, and go on.
-class Captured
+// Captures stderr during its lifetime: the libraries report e.g. a missing texture only there.
+class CapturedStderr
 {
  public:
-  Captured() : stream(std::tmpfile()), before(dup(STDERR_FILENO))
+  CapturedStderr() : stream(std::tmpfile()), original(dup(STDERR_FILENO))
   {
     std::fflush(stderr);
     dup2(fileno(this->stream), STDERR_FILENO);
   }
-  ~Captured()
+  ~CapturedStderr()
   {
     std::fflush(stderr);
-    dup2(this->before, STDERR_FILENO);
-    close(this->before);
+    dup2(this->original, STDERR_FILENO);
+    close(this->original);
     std::fclose(this->stream);
   }
   std::string Text() const
@@ -101,28 +101,28 @@ class Captured
 
  private:
   std::FILE *stream;
-  int before;
+  int original;
 };
 
-// Gazebo's readers crash on some damaged files: say on which.
-inline std::string at_work_on = "the world";
+// Gazebo's readers crash on some damaged files: the signal handler reports which.
+inline std::string current_input = "the world";
 inline const int true_stderr = dup(STDERR_FILENO);
 
-inline void crashed(int)
+inline void report_crash(int)
 {
-  dprintf(true_stderr, "%s makes Gazebo's readers crash\n", at_work_on.c_str());
+  dprintf(true_stderr, "Gazebo's readers crash on %s\n", current_input.c_str());
   _exit(1);
 }
 
-// What it wrote is an error, or a warning that isn't about a collision mesh's lack of a material.
-inline void check_silent(const Captured &said, const std::string &what)
+// Fails on captured errors and warnings, except that a collision mesh has no material.
+inline void check_silent(const CapturedStderr &captured, const std::string &what)
 {
-  std::istringstream lines(said.Text());
+  std::istringstream lines(captured.Text());
   for (std::string line; std::getline(lines, line);)
     if (line.find("Missing material for shape") == std::string::npos) fail(what + ": " + line);
 }
 
-// Resolves model://NAME/PATH and paths below the world's folder, as a resource path would.
+// A parsed world; resolves model://NAME/PATH to paths below the world's folder, as a resource path would.
 class World
 {
  public:
@@ -134,7 +134,7 @@ class World
     config.SetDeprecatedElementsPolicy(sdf::EnforcementPolicy::ERR);
     config.AddURIPath("model://", (this->folder / "models").string());
     check(this->root.Load(file.string(), config));
-    check(this->root.WorldCount() == 1, "the file holds " + std::to_string(this->root.WorldCount()) + " worlds");
+    check(this->root.WorldCount() == 1, "the file contains " + std::to_string(this->root.WorldCount()) + " worlds");
   }
 
   const sdf::World &Sdf() const { return *this->root.WorldByIndex(0); }
@@ -142,7 +142,7 @@ class World
   std::string File(const std::string &uri) const
   {
     const std::string scheme = "model://";
-    check(uri.rfind(scheme, 0) == 0, uri + " is no model:// address");
+    check(uri.rfind(scheme, 0) == 0, uri + " isn't a model:// URI");
     return "models/" + uri.substr(scheme.size());
   }
 
@@ -157,15 +157,15 @@ inline const common::Mesh &load(const World &world, const std::string &file)
 {
   const auto path = world.Path(file);
   check(fs::is_regular_file(path), path.string() + " is missing");
-  at_work_on = path.string();
-  const Captured said;
+  current_input = path.string();
+  const CapturedStderr captured;
   const auto *mesh = common::MeshManager::Instance()->Load(path.string());
-  check(mesh != nullptr, path.string() + " can't be loaded: " + said.Text());
-  check_silent(said, path.string());
+  check(mesh != nullptr, path.string() + " can't be loaded: " + captured.Text());
+  check_silent(captured, path.string());
   return *mesh;
 }
 
-// What is collided with, and its pose in the world: a mesh, or what SDF says of a simpler shape.
+// A collision shape and its pose in the world: a mesh, or the SDF of a primitive shape.
 struct Solid
 {
   const common::Mesh *mesh;
@@ -174,9 +174,9 @@ struct Solid
   math::Vector3d scale;
 };
 
-// All shapes of a world that bodies collide with and that don't move; `seen` is told of their meshes and files.
-inline std::vector<Solid> solids(const World &world,
-                                 const std::function<void(const common::Mesh &, const std::string &)> &seen)
+// Collision shapes of all static models of a world; calls `on_mesh` with each loaded mesh and its file.
+inline std::vector<Solid> load_solids(const World &world,
+                                      const std::function<void(const common::Mesh &, const std::string &)> &on_mesh)
 {
   std::vector<Solid> found;
   for (std::size_t m = 0; m < world.Sdf().ModelCount(); ++m)
@@ -190,19 +190,19 @@ inline std::vector<Solid> solids(const World &world,
         const auto &geometry = *collision.Geom();
         math::Pose3d pose;
         check(collision.SemanticPose().Resolve(pose, "__model__"));
-        const auto place = model.RawPose() * pose;
+        const auto world_pose = model.RawPose() * pose;
         if (geometry.Type() != sdf::GeometryType::MESH)
         {
-          found.push_back({nullptr, geometry.Element()->ToString(""), place, math::Vector3d::One});
+          found.push_back({nullptr, geometry.Element()->ToString(""), world_pose, math::Vector3d::One});
           continue;
         }
         const auto file = world.File(geometry.MeshShape()->Uri());
         const auto &mesh = load(world, file);
-        seen(mesh, file);
-        found.push_back({&mesh, "", place, geometry.MeshShape()->Scale()});
+        on_mesh(mesh, file);
+        found.push_back({&mesh, "", world_pose, geometry.MeshShape()->Scale()});
       }
   }
-  check(!found.empty(), "nothing to collide with");
+  check(!found.empty(), "the world has no static collision shapes");
   return found;
 }
 
@@ -213,7 +213,7 @@ inline sdf::Root model(const std::string &name, const std::string &content)
   return root;
 }
 
-// DART with what doesn't move in a world.
+// DART with the static collision shapes of a world.
 class Engine
 {
  public:
@@ -221,22 +221,22 @@ class Engine
 
   Engine(const World &world, const std::vector<Solid> &solids)
   {
-    at_work_on = "the collision meshes together";
+    current_input = "all collision meshes";
     const auto names = this->loader.LoadLib(DARTSIM_PLUGIN);
-    check(!names.empty(), std::string("no physics engine in ") + DARTSIM_PLUGIN);
+    check(!names.empty(), std::string("no physics engine found in ") + DARTSIM_PLUGIN);
     this->engine = physics::RequestEngine3d<Features>::From(this->loader.Instantiate(*names.begin()));
-    check(this->engine != nullptr, "the physics engine lacks a feature");
-    sdf::World empty;  // the models are added below: the engine takes no mesh from SDF
+    check(this->engine != nullptr, "the physics engine doesn't support a required feature");
+    sdf::World empty;  // models are added below: the engine doesn't load meshes from SDF
     empty.SetName("world");
     empty.SetGravity(world.Sdf().Gravity());
     this->scene = this->engine->ConstructWorld(empty);
     for (std::size_t i = 0; i < solids.size(); ++i) this->Add(solids[i], "solid" + std::to_string(i));
   }
 
-  // A model that moves.
+  // Adds a dynamic model.
   Model Add(const sdf::Model &model) { return this->scene->ConstructModel(model); }
 
-  // A millisecond passes.
+  // Advances the simulation by one millisecond.
   void Step() { this->scene->Step(this->output, this->state, this->input); }
 
  private:
@@ -248,10 +248,10 @@ class Engine
     text << "</link>";
     const auto link = this->Add(*model(name, text.str()).Model())->GetLink("link");
     if (solid.mesh == nullptr) return;
-    const Captured said;
+    const CapturedStderr captured;
     link->AttachMeshShape("mesh", *solid.mesh, Eigen::Isometry3d::Identity(),
                           Eigen::Vector3d(solid.scale.X(), solid.scale.Y(), solid.scale.Z()));
-    check_silent(said, "collision mesh");
+    check_silent(captured, "collision mesh");
   }
 
   ignition::plugin::Loader loader;
@@ -262,13 +262,14 @@ class Engine
   physics::ForwardStep::Output output;
 };
 
-// JSON of where a link is, and how it lies (a quaternion w, x, y, z).
-inline std::string placed(const physics::FrameData3d &frame)
+// JSON members of a link's pose: position `rest`, orientation `lies` (quaternion w, x, y, z).
+inline std::string pose_members(const physics::FrameData3d &frame)
 {
-  const Eigen::Vector3d at = frame.pose.translation();
-  const Eigen::Quaterniond lies(frame.pose.linear());
+  const Eigen::Vector3d position = frame.pose.translation();
+  const Eigen::Quaterniond orientation(frame.pose.linear());
   std::ostringstream text;
-  text << std::setprecision(9) << "\"rest\": " << numbers({at.x(), at.y(), at.z()}) << ", \"lies\": [" << lies.w()
-       << ", " << lies.x() << ", " << lies.y() << ", " << lies.z() << "]";
+  text << std::setprecision(9) << "\"rest\": " << numbers({position.x(), position.y(), position.z()})
+       << ", \"lies\": [" << orientation.w() << ", " << orientation.x() << ", " << orientation.y() << ", "
+       << orientation.z() << "]";
   return text.str();
 }

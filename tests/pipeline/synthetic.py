@@ -15,9 +15,9 @@ from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import Frame, Mesh, Trajectory, View
 from scan2sim.pipeline.geometry.primitives import tube
 from scan2sim.pipeline.io.geodata import geojson
-from scan2sim.pipeline.io.worlds.scene import PATH, Scene, describe, keep, read_scene
+from scan2sim.pipeline.io.worlds.scene import PATH_FILE, Scene, read_scene, save_tile, write_scene_file
 from scan2sim.pipeline.steps.collision import COLLISION, CollisionParams
-from scan2sim.pipeline.steps.decimate import with_things
+from scan2sim.pipeline.steps.decimate import with_furniture
 from scan2sim.pipeline.steps.export import EXPORT, ExportParams
 
 UTM = Frame("EPSG:32632", (690_000.0, 5_335_000.0, 500.0))
@@ -91,7 +91,7 @@ def world(folder: Path, frame: Frame = UTM, name: str = "street", things: Mesh |
     sources = {group: path / "mesh.npz" for group, path in inputs.items()}
     if things is not None:
         sources["building"] = folder / "furnished.npz"
-        with_things(replace(house(frame), uv=None, page=None), things).save(sources["building"])
+        with_furniture(replace(house(frame), uv=None, page=None), things).save(sources["building"])
     made = COLLISION.run(sources, CollisionParams(triangles=1000), solid, silent)
     out = folder / "export"
     out.mkdir()
@@ -138,9 +138,9 @@ def scene(folder: Path, frame: Frame = UTM, tiles: int = 2, apart: float = 25.0)
         lists = folder / f"tile{i}" / "plants.geojson"
         geojson.write_points(lists, frame.crs, [(here.to_crs((-5.0, -5.0, 0.0)).tolist(), {"height_m": 4.0})])
         photos = {group: np.zeros(len(mesh), np.int32) for group, mesh in meshes.items()}
-        keep(world, f"tile{i}", sources, solid, {"plants.geojson": lists}, 0.8, views=[view()], photos=photos)
+        save_tile(world, f"tile{i}", sources, solid, {"plants.geojson": lists}, 0.8, views=[view()], photos=photos)
         names.append(f"tile{i}")
-    describe(world, "town", frame, names)
+    write_scene_file(world, "town", frame, names)
     return read_scene(world)
 
 
@@ -149,5 +149,5 @@ def driven(out: Path) -> Scene:
     made = scene(out, tiles=1)
     x = np.linspace(-6.0, 8.0, 33)
     places = np.column_stack([x, np.full(33, -2.0), height(x, np.full(33, -2.0)) + 2])
-    Trajectory(np.arange(33.0), places).save(made.tiles[0].folder / PATH)
+    Trajectory(np.arange(33.0), places).save(made.tiles[0].folder / PATH_FILE)
     return made

@@ -1,4 +1,4 @@
-"""Classes from shape, on a made-up street whose classes are known, and on real ones where present."""
+"""Classification by shape on a synthetic street with known classes, and on real data if available."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def box(rng: np.random.Generator, n: int, low: list[float], size: list[float]) -
 
 
 def blob(rng: np.random.Generator, n: int, centre: list[float], radius: float) -> np.ndarray:
-    way = rng.normal(size=(n, 3))
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
-    return np.array(centre) + way * radius * rng.uniform(0.2, 1, (n, 1)) ** (1 / 3)
+    direction = rng.normal(size=(n, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return np.array(centre) + direction * radius * rng.uniform(0.2, 1, (n, 1)) ** (1 / 3)
 
 
 def street(slope: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -73,17 +73,17 @@ def recalls(classification: np.ndarray, truth: np.ndarray) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.06])
-def test_a_street_is_told_apart(slope: float) -> None:
+def test_street_is_classified_correctly(slope: float) -> None:
     xyz, truth = street(slope)
     classification = classify(PointCloud(Frame(), xyz))
     recall = recalls(classification, truth)
     bars = {"ground": 0.98, "building": 0.95, "plant": 0.9, "vehicle": 0.8, "pole": 0.8}
     assert all(recall[group] >= bar for group, bar in bars.items()), recall
-    predicted = recalls(truth, classification)  # the other way round: precision
+    predicted = recalls(truth, classification)  # with swapped arguments: precision
     assert all(predicted[group] >= 0.8 for group in bars), predicted
 
 
-def test_plants_are_classed_by_their_height() -> None:
+def test_vegetation_is_classified_by_height() -> None:
     xyz, truth = street()
     classification = classify(PointCloud(Frame(), xyz))
     tall, hedge = classification[(truth == 5) & (xyz[:, 2] > 3)], classification[(truth == 4) & (xyz[:, 2] > 0.7)]
@@ -91,12 +91,12 @@ def test_plants_are_classed_by_their_height() -> None:
     assert np.mean(hedge == CODE["mid_vegetation"]) > 0.8
 
 
-def test_the_same_cloud_gets_the_same_classes() -> None:
+def test_classification_is_deterministic() -> None:
     cloud = PointCloud(Frame(), street()[0])
     assert np.array_equal(classify(cloud), classify(cloud))
 
 
-def test_a_roof_with_nothing_around_it_is_no_ground() -> None:
+def test_isolated_roof_is_not_ground() -> None:
     rng = np.random.default_rng(0)
     ground = plane(rng, 8_000, [0, 0, 0], [10, 0, 0], [0, 40, 0])
     roof = plane(rng, 20_000, [25, 0, 9], [40, 0, 0], [0, 40, 0])
@@ -106,14 +106,14 @@ def test_a_roof_with_nothing_around_it_is_no_ground() -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 5, 50, 300])
-def test_tiny_clouds_get_classes_of_some_kind(n: int) -> None:
+def test_tiny_clouds_are_classified_without_error(n: int) -> None:
     rng = np.random.default_rng(n)
     for spread in ([5, 5, 5], [5, 5, 0], [0, 0, 5], [0, 0, 0]):
         xyz = (rng.uniform(size=(n, 3)) * spread).astype(np.float32)
         assert classify(PointCloud(Frame(), xyz)).shape == (n,)
 
 
-def test_a_cloud_keeps_its_own_classes_unless_told_otherwise(tmp_path: Path) -> None:
+def test_cloud_keeps_its_classes_unless_overwritten(tmp_path: Path) -> None:
     xyz, truth = street()
     cloud = PointCloud(Frame(), xyz, classification=truth.astype(np.uint8), time=np.arange(len(xyz), dtype=np.float64))
     cloud.save(tmp_path / "in.npz")
@@ -127,21 +127,21 @@ def test_a_cloud_keeps_its_own_classes_unless_told_otherwise(tmp_path: Path) -> 
     kept, facts = run("kept")
     assert np.array_equal(present(kept.classification), truth) and facts["source"] == "cloud"
     assert facts["points"]["terrain"] == int((truth == 2).sum())
-    anew, facts = run("anew", overwrite=True)
-    assert facts["source"] == "shape" and not np.array_equal(present(anew.classification), truth)
-    assert np.array_equal(present(anew.time), present(cloud.time)) and np.array_equal(anew.xyz, xyz)
+    replaced, facts = run("replaced", overwrite=True)
+    assert facts["source"] == "shape" and not np.array_equal(present(replaced.classification), truth)
+    assert np.array_equal(present(replaced.time), present(cloud.time)) and np.array_equal(replaced.xyz, xyz)
 
     replace(cloud, classification=np.where(np.arange(len(xyz)) % 10 == 0, truth, 1).astype(np.uint8)).save(
         inputs["cloud"]
     )
-    assert run("few")[1]["source"] == "shape"  # a tenth of the points is too little
+    assert run("few")[1]["source"] == "shape"  # classes of a tenth of the points are not enough
     assert run("enough", min_classified=0.05)[1]["source"] == "cloud"
     replace(cloud, classification=None).save(inputs["cloud"])
     assert run("none", min_classified=0.0)[1]["source"] == "shape"
     assert SEGMENT.name == "segment"
 
 
-def test_an_airborne_survey_agrees_with_its_own_classes(real_data: Path, tmp_path: Path) -> None:
+def test_classes_of_an_airborne_survey_agree_with_its_own(real_data: Path, tmp_path: Path) -> None:
     tile = read_tile(import_las(sorted((real_data / "las").glob("ign_77*.laz")), tmp_path / "tile"))
     cloud = PointCloud.join([clouds.read(path, tile.frame) for path in tile.clouds])
     assert cloud.classification is not None

@@ -1,4 +1,4 @@
-"""Vehicles and people are whole or not at all: on a made-up street whose classes are told badly."""
+"""Detection of complete vehicles and people on a synthetic street with partly wrong classes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import F32, Frame, PointCloud, Trajectory
 from scan2sim.segmentation.steps.instances import THINGS
-from scan2sim.segmentation.steps.segment import OWN, PHOTO
+from scan2sim.segmentation.steps.segment import SOURCE_CLOUD, SOURCE_PHOTO
 from tests.present import present
 
 FRAME = Frame("EPSG:25832", (500_000.0, 5_400_000.0, 100.0))
@@ -23,7 +23,7 @@ VEHICLE, BUILDING, ROAD, HEDGE = (CODE[n] for n in ("vehicle", "building", "road
 
 
 def shell(size: tuple[float, float, float], at: tuple[float, float], clear: float = 0.25, turn: float = 0.0) -> F32:
-    """Points every 7 cm on the sides and the top of a box (length, width, height) on the ground, `clear` above it."""
+    """Points every 7 cm on the sides and the top of a box (length, width, height), `clear` metres above the ground."""
     length, width, height = size
     u, v, w = (np.arange(0, s + 0.01, 0.07) for s in (length, width, height - clear))
     sides: list[tuple[npt.ArrayLike, npt.ArrayLike, npt.ArrayLike]] = [(u[:, None], v[None], height - clear)]
@@ -45,15 +45,15 @@ CAR = shell((4.4, 1.8, 1.5), (0, 4), turn=0.2)
 SCENE: dict[str, tuple[F32, int]] = {
     "ground": (ground(), ROAD),
     "car": (CAR, VEHICLE),
-    "hedge": (shell((6, 0.8, 1.3), (0.4, 5.75), 0.0, turn=0.2), HEDGE),  # touches the car's far side, all but
+    "hedge": (shell((6, 0.8, 1.3), (0.4, 5.75), 0.0, turn=0.2), HEDGE),  # almost touches the car's far side
     "container": (shell((4.4, 1.8, 1.7), (-12, 4), 0.0), BUILDING),
     "fence": (shell((8, 0.12, 1.4), (12, 6), 0.0), VEHICLE),
     "van": (shell((5.4, 2.0, 2.4), (9, -5)), VEHICLE),
 }
 
 
-def street(out: Path, wrong: dict[str, float] | None = None, kind: int = PHOTO, **more: F32) -> dict[str, Path]:
-    """The scene's inputs; of things in `wrong` that share of points, at one end, is told to be of a building."""
+def street(out: Path, wrong: dict[str, float] | None = None, kind: int = SOURCE_PHOTO, **more: F32) -> dict[str, Path]:
+    """Inputs of the step; of objects in `wrong` the given share of points, at one end, is classified as building."""
     parts = {**{name: xyz for name, (xyz, _) in SCENE.items()}, **more}
     classification = {
         name: np.full(len(xyz), SCENE.get(name, (None, HEDGE))[1], np.uint8) for name, xyz in parts.items()
@@ -71,13 +71,13 @@ def street(out: Path, wrong: dict[str, float] | None = None, kind: int = PHOTO, 
     return {"cloud": out / "in.npz", "confidence": out / "sure.npz", "path": out / "path.npz"}
 
 
-def go(inputs: dict[str, Path], out: Path, **params: Any) -> Done:
+def run(inputs: dict[str, Path], out: Path, **params: Any) -> Done:
     (out / "out").mkdir()
     return THINGS.run(inputs, THINGS.params(**params), out / "out", silent)
 
 
 def classified(done: Done, *more: F32) -> dict[str, np.ndarray]:
-    """Classes of every thing's points."""
+    """Classes of the points of every object."""
     classification = PointCloud.load(done.files["cloud"]).classification
     assert classification is not None
     ends = np.cumsum([len(xyz) for xyz, _ in SCENE.values()] + [len(xyz) for xyz in more])
@@ -92,26 +92,26 @@ def features(done: Done) -> list[dict[str, Any]]:
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
     out = tmp_path_factory.mktemp("things")
-    return go(street(out, {"car": 0.4, "van": 0.3}), out)
+    return run(street(out, {"car": 0.4, "van": 0.3}), out)
 
 
-def test_all_of_a_car_goes_though_photos_tell_only_the_half(done: Done) -> None:
+def test_partly_classified_vehicles_are_completed(done: Done) -> None:
     after = classified(done)
     assert (after["car"] == VEHICLE).mean() > 0.995 and (after["van"] == VEHICLE).mean() > 0.995
 
 
-def test_what_stands_beside_it_stays(done: Done) -> None:
+def test_objects_beside_a_vehicle_keep_their_classes(done: Done) -> None:
     after = classified(done)
     assert (after["hedge"] == HEDGE).mean() > 0.97
     assert (after["container"] == BUILDING).all()
     assert (after["ground"] == ROAD).mean() > 0.9999
 
 
-def test_a_fence_is_no_vehicle_whatever_photos_say(done: Done) -> None:
+def test_fence_classified_as_vehicle_is_rejected(done: Done) -> None:
     assert (classified(done)["fence"] != VEHICLE).mean() > 0.95
 
 
-def test_boxes_are_listed_where_the_vehicles_are(done: Done) -> None:
+def test_boxes_of_vehicles_are_listed(done: Done) -> None:
     found = {f["properties"]["kind"]: f for f in features(done)}
     assert set(found) == {"car", "van"} and done.facts["vehicles"] == 2
     car = found["car"]["properties"]
@@ -122,28 +122,28 @@ def test_boxes_are_listed_where_the_vehicles_are(done: Done) -> None:
     assert np.allclose(ring[:4].mean(axis=0), (500_000, 5_400_004), atol=0.1)
 
 
-def test_a_car_seen_from_one_side_reaches_behind_it(tmp_path: Path) -> None:
-    """The scanner passes at y = 0: the near side, and of the far one what shines through the windows."""
+def test_car_scanned_from_one_side_is_completed(tmp_path: Path) -> None:
+    """The scanner passes at y = 0: the near side is scanned, and the far one only through the windows."""
     near = CAR[(CAR[:, 1] < 3.6 + 0.2 * CAR[:, 0]) | (np.arange(len(CAR)) % 40 == 0)]
     old = SCENE["car"]
     SCENE["car"] = (near, VEHICLE)
     try:
-        after = classified(go(street(tmp_path), tmp_path))
+        after = classified(run(street(tmp_path), tmp_path))
     finally:
         SCENE["car"] = old
     assert (after["car"] == VEHICLE).mean() > 0.98 and (after["hedge"] == HEDGE).mean() > 0.95
 
 
-def test_the_middle_of_what_moved_goes(tmp_path: Path) -> None:
+def test_points_inside_a_carved_trail_become_vehicle(tmp_path: Path) -> None:
     rest = shell((3.0, 0.4, 1.2), (-6, -3))
     inputs = street(tmp_path, rest=rest)
     PointCloud(FRAME, rest[::2] + np.float32(0.1)).save(tmp_path / "moving.npz")
-    done = go(inputs | {"moving": tmp_path / "moving.npz"}, tmp_path)
+    done = run(inputs | {"moving": tmp_path / "moving.npz"}, tmp_path)
     assert (classified(done, rest)["0"] == VEHICLE).mean() > 0.95
 
 
-def test_the_end_of_a_trail_goes_with_it(tmp_path: Path) -> None:
-    """Where a van was last, no later ray passes: carve leaves it, as a moment's bush. A bush stands for longer."""
+def test_end_of_a_carved_trail_becomes_vehicle(tmp_path: Path) -> None:
+    """No ray passes through the last position of a van, so it isn't carved; unlike a bush, it is scanned briefly."""
     end, bush = shell((4.5, 2.0, 2.0), (-6, -3)), shell((4.5, 2.0, 2.0), (4, -1))
     inputs = street(tmp_path, end=end, bush=bush)
     cloud = PointCloud.load(inputs["cloud"])
@@ -152,19 +152,19 @@ def test_the_end_of_a_trail_goes_with_it(tmp_path: Path) -> None:
     replace(cloud, time=time).save(inputs["cloud"])
     before = [xyz[xyz[:, 0] < xyz[:, 0].min() + 0.1] - np.array([0.15, 0, 0], np.float32) for xyz in (end, bush)]
     PointCloud(FRAME, np.concatenate(before)).save(tmp_path / "moving.npz")
-    after = classified(go(inputs | {"moving": tmp_path / "moving.npz"}, tmp_path), end, bush)
+    after = classified(run(inputs | {"moving": tmp_path / "moving.npz"}, tmp_path), end, bush)
     assert (after["0"] == VEHICLE).mean() > 0.97 and (after["1"] == HEDGE).all()
 
 
-def test_classes_of_the_cloud_itself_stay_as_they_are(tmp_path: Path) -> None:
-    inputs = street(tmp_path, {"car": 0.2}, OWN)
-    done = go(inputs, tmp_path)
+def test_classes_of_the_input_cloud_are_kept(tmp_path: Path) -> None:
+    inputs = street(tmp_path, {"car": 0.2}, SOURCE_CLOUD)
+    done = run(inputs, tmp_path)
     before, after = (present(PointCloud.load(path).classification) for path in (inputs["cloud"], done.files["cloud"]))
     assert np.array_equal(before, after)
-    assert {f["properties"]["kind"] for f in features(done)} >= {"car", "van"}, "but its vehicles are listed"
+    assert {f["properties"]["kind"] for f in features(done)} >= {"car", "van"}, "vehicles are listed nevertheless"
 
 
-def test_people_are_whole(tmp_path: Path) -> None:
+def test_partly_classified_people_are_completed(tmp_path: Path) -> None:
     person = shell((0.5, 0.4, 1.75), (4, -3), 0.0)
     inputs = street(tmp_path, person=person)
     cloud = PointCloud.load(inputs["cloud"])
@@ -172,12 +172,12 @@ def test_people_are_whole(tmp_path: Path) -> None:
     classification = cloud.classification.copy()
     classification[len(classification) - len(person) + len(person) // 3 :] = CODE["person"]
     replace(cloud, classification=classification).save(inputs["cloud"])
-    done = go(inputs, tmp_path)
+    done = run(inputs, tmp_path)
     assert done.facts["people"] == 1
     assert (classified(done, person)["0"][person[:, 2] > 0.25] == CODE["person"]).mean() > 0.98
 
 
-def test_a_post_that_is_told_to_be_a_person_in_part_stays(tmp_path: Path) -> None:
+def test_post_partly_classified_as_person_is_rejected(tmp_path: Path) -> None:
     post = shell((0.4, 0.3, 1.05), (4, -3), 0.0)
     inputs = street(tmp_path, person=post)
     cloud = PointCloud.load(inputs["cloud"])
@@ -185,12 +185,12 @@ def test_a_post_that_is_told_to_be_a_person_in_part_stays(tmp_path: Path) -> Non
     classification = cloud.classification.copy()
     classification[-len(post) :][post[:, 2] > 0.7] = CODE["person"]
     replace(cloud, classification=classification).save(inputs["cloud"])
-    done = go(inputs, tmp_path)
+    done = run(inputs, tmp_path)
     assert done.facts["people"] == 0
     assert (classified(done, post)["0"] == HEDGE).mean() > 0.95
 
 
-def test_without_a_path_nothing_is_looked_at(tmp_path: Path) -> None:
+def test_cloud_is_unchanged_without_a_path(tmp_path: Path) -> None:
     inputs = street(tmp_path)
-    done = go({"cloud": inputs["cloud"], "confidence": inputs["confidence"]}, tmp_path)
+    done = run({"cloud": inputs["cloud"], "confidence": inputs["confidence"]}, tmp_path)
     assert done.facts["vehicles"] == 0 and done.files["cloud"].stat().st_ino == inputs["cloud"].stat().st_ino

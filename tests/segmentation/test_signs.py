@@ -1,4 +1,4 @@
-"""Signs by photos: plates are found, whole, where the scan ends or has nothing, and nowhere else."""
+"""Sign panels fitted to photos: found completely where the scan is incomplete or missing, and nowhere else."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ import pytest
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import F32, F64, U8, Camera, Frame, Mesh, View
-from scan2sim.pipeline.furniture.classify import sheet
-from scan2sim.pipeline.furniture.sign_panels import Plate, inside
+from scan2sim.pipeline.furniture.classify import panel_mesh
+from scan2sim.pipeline.furniture.sign_panels import SignPanel, inside
 from scan2sim.pipeline.geometry import primitives
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.tiling.voronoi_cell import Cell
 from scan2sim.segmentation.labels import CLASSES
-from scan2sim.segmentation.sign_panels.attach import cleared
+from scan2sim.segmentation.sign_panels.attach import without_smear
 from scan2sim.segmentation.steps.signs import SIGNS, SignsParams
 
 FRAME = Frame("EPSG:25832", (500_000.0, 5_400_000.0, 100.0))
 CAMERA = Camera("pinhole", 640, 240, 500, 500, 320, 120)
 NORMAL = np.array([-np.cos(0.25), np.sin(0.25), 0.0])
-SIGN = Plate(np.array([14.0, -3.0, 3.2]), NORMAL, "disc", 0.6, 0.6)
-BELOW = Plate(np.array([14.0, -3.0, 2.77]), NORMAL, "rectangle", 0.42, 0.22)
+SIGN = SignPanel(np.array([14.0, -3.0, 3.2]), NORMAL, "disc", 0.6, 0.6)
+BELOW = SignPanel(np.array([14.0, -3.0, 2.77]), NORMAL, "rectangle", 0.42, 0.22)
 WALL = 24.0
 """Metres ahead of the first photo."""
 
 
 def _views(folder: Path) -> list[View]:
-    """Photos on a drive towards the sign, each 1.3 m on."""
+    """Photos on a drive towards the sign, every 1.3 m."""
     R = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], float)
     views = []
     for i in range(8):
@@ -43,7 +43,7 @@ def _views(folder: Path) -> list[View]:
 
 
 def _colour(shown: str | None, flat: F64, noise: F64) -> F64:
-    """(N, 3) of places (N, 2) on a sign's face, or on the wall behind."""
+    """(N, 3) colours at points (N, 2) on a sign's face, or on the wall behind."""
     if shown is None:
         return noise[(flat[:, 0] * 12).astype(int) % 400, (flat[:, 1] * 12).astype(int) % 400]
     out = np.full((len(flat), 3), 240.0)
@@ -56,8 +56,8 @@ def _colour(shown: str | None, flat: F64, noise: F64) -> F64:
     return out
 
 
-def _photo(view: View, plates: list[Plate]) -> tuple[U8, U8]:
-    """A photo (H, W, 3), four rays a pixel, and a network's probabilities at a quarter of its size."""
+def _photo(view: View, panels: list[SignPanel]) -> tuple[U8, U8]:
+    """A photo (H, W, 3) with four rays per pixel, and a network's probabilities at a quarter of its size."""
     import cv2
 
     noise = np.random.default_rng(0).uniform(20, 130, (400, 400, 1)) * [0.6, 1.0, 0.5]
@@ -66,31 +66,31 @@ def _photo(view: View, plates: list[Plate]) -> tuple[U8, U8]:
     rays = rays.reshape(-1, 3) @ view.T_world_cam[:3, :3].T
     at = view.centre + rays * ((WALL - view.centre[0]) / rays[:, :1])
     rgb, sign = _colour(None, at[:, 1:] + 50, noise), np.zeros(len(rays), np.float32)
-    for plate in plates:
-        at = view.centre + rays * ((plate.centre - view.centre) @ plate.normal / (rays @ plate.normal))[:, None]
-        flat = np.column_stack([(at - plate.centre) @ plate.across, at[:, 2] - plate.centre[2]])
-        on = inside(flat, plate.outline, 0)
-        rgb[on], sign[on] = _colour(plate.shape, flat[on], noise), 255
+    for panel in panels:
+        at = view.centre + rays * ((panel.centre - view.centre) @ panel.normal / (rays @ panel.normal))[:, None]
+        flat = np.column_stack([(at - panel.centre) @ panel.across, at[:, 2] - panel.centre[2]])
+        on = inside(flat, panel.outline, 0)
+        rgb[on], sign[on] = _colour(panel.shape, flat[on], noise), 255
     size = (CAMERA.width, CAMERA.height)
     photo = cv2.resize(rgb.reshape(*row.shape, 3), size, interpolation=cv2.INTER_AREA)
     small = cv2.resize(sign.reshape(row.shape), (size[0] // 4, size[1] // 4), interpolation=cv2.INTER_AREA)
     return photo.round().astype(np.uint8), small.round().astype(np.uint8)
 
 
-def _run(folder: Path, plates: list[Plate], known: list[Plate], theirs: bool = False, **params: Any) -> Done:
-    """The step, on a street where `plates` hang and `known` were found among points, on a pole or on `theirs`."""
+def _run(folder: Path, panels: list[SignPanel], known: list[SignPanel], theirs: bool = False, **params: Any) -> Done:
+    """Run the step on a street with `panels`, of which `known` were found in points; the pole may be `theirs`."""
     views = _views(folder)
     labels = folder / "labels"
     labels.mkdir()
     for i, view in enumerate(views):
-        rgb, sign = _photo(view, plates)
+        rgb, sign = _photo(view, panels)
         image.write(view.photo, rgb)
         probabilities = np.zeros((*sign.shape, len(CLASSES)), np.uint8)
         probabilities[..., CLASSES.index("road_sign")] = sign
         np.save(labels / f"{i}.npy", probabilities)
     views_io.save(folder / "views.json", views, [i == 5 for i in range(len(views))])
     parts = [(primitives.tube([(14.05, -3, 0), (14.05, -3, 3)], [0.04, 0.04], 8), CODE["pole"])]
-    parts += [(sheet(plate), CODE["road_sign"]) for plate in known]
+    parts += [(panel_mesh(panel), CODE["road_sign"]) for panel in known]
     before = np.array([(13.8, -3.1, 3.1), (13.8, -2.9, 3.1), (13.8, -3, 3.3), (5, 9, 0), (5, 9, 3), (6, 9, 0)])
     parts += [((before, np.array([[0, 1, 2], [3, 4, 5]], np.int32)), 0)]
     vertices, faces = primitives.join([part for part, _ in parts])
@@ -98,7 +98,7 @@ def _run(folder: Path, plates: list[Plate], known: list[Plate], theirs: bool = F
     Mesh(FRAME, vertices.astype(np.float32), faces, classification=classification).save(folder / "building.npz")
     flat = np.array([(-20, -20, 0), (40, -20, 0), (40, 20, 0), (-20, 20, 0)], np.float32)
     Mesh(FRAME, flat, np.array([[0, 1, 2], [0, 2, 3]], np.int32)).save(folder / "terrain.npz")
-    (folder / "plates.json").write_text(json.dumps([plate.to_json() for plate in known]), encoding="utf-8")
+    (folder / "plates.json").write_text(json.dumps([panel.to_json() for panel in known]), encoding="utf-8")
     foot = (14.05, -3.0, 0.0)
     (folder / "beside.json").write_text(json.dumps([foot] if theirs else []), encoding="utf-8")
     place = FRAME.to_crs(foot).tolist()
@@ -114,34 +114,34 @@ def _run(folder: Path, plates: list[Plate], known: list[Plate], theirs: bool = F
     return SIGNS.run(inputs, SignsParams(**params), out, silent)
 
 
-def _hung(done: Done) -> list[F32]:
-    """Corners of each plate in the mesh, that of the highest first."""
-    from scan2sim.segmentation.sign_panels.attach import pieces
+def _panel_corners(done: Done) -> list[F32]:
+    """Corners of each panel in the mesh, the highest first."""
+    from scan2sim.segmentation.sign_panels.attach import components
 
     mesh = Mesh.load(done.files["building"])
-    corners = [mesh.vertices[np.unique(mesh.faces[piece])] for piece in pieces(mesh, CODE["road_sign"])]
+    corners = [mesh.vertices[np.unique(mesh.faces[piece])] for piece in components(mesh, CODE["road_sign"])]
     return sorted(corners, key=lambda c: -float(c[:, 2].mean()))
 
 
-HALF = Plate(np.array([14.1, -2.95, 3.05]), np.array([-1.0, 0, 0]), "rectangle", 0.55, 0.3)
-"""What a scan that ends at the sign's middle shows of it."""
+HALF = SignPanel(np.array([14.1, -2.95, 3.05]), np.array([-1.0, 0, 0]), "rectangle", 0.55, 0.3)
+"""The panel found in a scan that ends in the middle of the sign."""
 
 
 @pytest.mark.parametrize("known", [[], [HALF]], ids=["unscanned", "half scanned"])
-def test_a_sign_is_whole_where_photos_show_it(tmp_path: Path, known: list[Plate]) -> None:
+def test_sign_visible_in_photos_is_complete(tmp_path: Path, known: list[SignPanel]) -> None:
     done = _run(tmp_path, [SIGN, BELOW], known)
     assert done.facts == {"from_points": len(known), "fitted": 2, "new": 0 if known else 2}
-    for corners, plate in zip(_hung(done), [SIGN, BELOW], strict=True):
+    for corners, panel in zip(_panel_corners(done), [SIGN, BELOW], strict=True):
         front = corners[: len(corners) // 2]
-        assert front.mean(axis=0) == pytest.approx(plate.centre, abs=0.03)
-        assert np.ptp(front[:, 2]) == pytest.approx(plate.height, abs=0.03)
-        assert np.ptp(front @ plate.across) == pytest.approx(plate.width, abs=0.03)
-        assert np.ptp(front @ plate.normal) < 0.1
+        assert front.mean(axis=0) == pytest.approx(panel.centre, abs=0.03)
+        assert np.ptp(front[:, 2]) == pytest.approx(panel.height, abs=0.03)
+        assert np.ptp(front @ panel.across) == pytest.approx(panel.width, abs=0.03)
+        assert np.ptp(front @ panel.normal) < 0.1
     mesh = Mesh.load(done.files["building"])
     assert mesh.classification is not None
     pole = mesh.vertices[np.unique(mesh.faces[mesh.classification == CODE["pole"]])]
-    assert ((pole - SIGN.centre) @ SIGN.normal).max() < 0  # it stands behind its plate
-    assert (mesh.classification == 0).sum() == 1  # what points made before the plate is gone
+    assert ((pole - SIGN.centre) @ SIGN.normal).max() < 0  # the pole is behind its panel
+    assert (mesh.classification == 0).sum() == 1  # the surface in front of the panel is removed
     (feature,) = json.loads(done.files["geojson"].read_text(encoding="utf-8"))["features"]
     row = feature["properties"]
     assert row["kind"] == "sign" and row["shape"] == "disc" and row["radius_m"] == 0.04
@@ -149,7 +149,7 @@ def test_a_sign_is_whole_where_photos_show_it(tmp_path: Path, known: list[Plate]
 
 
 @pytest.mark.parametrize("theirs", [False, True])
-def test_plates_at_a_border_are_fitted_by_the_tile_of_their_pole(tmp_path: Path, theirs: bool) -> None:
+def test_panels_at_a_border_are_fitted_by_the_tile_of_their_pole(tmp_path: Path, theirs: bool) -> None:
     x, y, _ = FRAME.origin
     middle = x + SIGN.centre[0] + 0.2
     beside = {"seed": (middle - 5, y), "neighbours": {"other": (middle + 5, y)}}
@@ -157,7 +157,7 @@ def test_plates_at_a_border_are_fitted_by_the_tile_of_their_pole(tmp_path: Path,
     assert done.facts["fitted"] == (0 if theirs else 2)
 
 
-def test_edges_on_a_border_stay_where_a_plate_is_put_up() -> None:
+def test_edges_on_a_border_are_kept_near_a_panel() -> None:
     x, y, z = SIGN.centre
     corners = np.array(
         [(x - 0.1, y, z), (x, y, z), (x - 0.1, y, z + 0.1), (x, y, z + 0.1), (x - 0.2, y, z)], np.float32
@@ -165,13 +165,13 @@ def test_edges_on_a_border_stay_where_a_plate_is_put_up() -> None:
     mesh = Mesh(FRAME, corners, np.array([[0, 1, 2], [1, 3, 2], [4, 0, 2]], np.int32))
     middle = FRAME.origin[0] + float(corners[1, 0])
     cell = Cell((middle - 5, FRAME.origin[1]), {"other": (middle + 5, FRAME.origin[1])})
-    assert len(cleared(mesh, [SIGN])) == 0
-    left = cleared(mesh, [SIGN], cell)
+    assert len(without_smear(mesh, [SIGN])) == 0
+    left = without_smear(mesh, [SIGN], cell)
     assert len(left) == 1 and left.vertices[:, 0].max() == corners[1, 0]
 
 
-def test_where_photos_show_nothing_plates_stay_as_points_tell(tmp_path: Path) -> None:
+def test_panels_from_points_are_kept_if_photos_show_none(tmp_path: Path) -> None:
     done = _run(tmp_path, [], [HALF])
     assert done.facts["fitted"] == 0
-    (corners,) = _hung(done)
+    (corners,) = _panel_corners(done)
     assert corners.mean(axis=0) == pytest.approx(HALF.centre, abs=0.02)

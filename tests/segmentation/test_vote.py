@@ -1,4 +1,4 @@
-"""What photos say of points, against a slow reference: weights, and labels between pixels."""
+"""Votes of photos for points against a reference implementation: weights and bilinear interpolation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scan2sim.pipeline.camera.models import project
 from scan2sim.pipeline.camera.renderer import look_at
 from scan2sim.pipeline.core.types import Camera, Frame, PointCloud, View
 from scan2sim.segmentation.labels import CLASSES, SKY
-from scan2sim.segmentation.votes import NEAR, vote
+from scan2sim.segmentation.votes import HALF_WEIGHT_DISTANCE_M, vote
 
 CAMERAS = {
     "pinhole": Camera("pinhole", 320, 240, 200.0, 210.0, 150.0, 130.0),
@@ -19,8 +19,8 @@ CAMERAS = {
 }
 
 
-def between(labels: np.ndarray, camera: Camera, uv: np.ndarray) -> np.ndarray:
-    """(N, C) of labels (h, w, C), linearly between the centres of their pixels; panoramas close."""
+def interpolated(labels: np.ndarray, camera: Camera, uv: np.ndarray) -> np.ndarray:
+    """(N, C) bilinear interpolation of labels (h, w, C); panoramas wrap around."""
     rows, columns = labels.shape[:2]
     x, y = ((uv + 0.5) * [columns / camera.width, rows / camera.height] - 0.5).T
     out = np.zeros((len(uv), labels.shape[2]))
@@ -34,11 +34,11 @@ def between(labels: np.ndarray, camera: Camera, uv: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_votes_are_weighted_and_read_between_pixels(name: str, tmp_path: Path) -> None:
+def test_votes_are_weighted_and_interpolated(name: str, tmp_path: Path) -> None:
     camera, rng = CAMERAS[name], np.random.default_rng(2)
     pose = look_at((-4.0, 1.0, 2.0), (3.0, 0.0, 1.0))
     y, z = (part.ravel() for part in np.mgrid[-4:4:0.5, 0:3:0.5])
-    wall = np.stack([3 + 0.6 * y, y, z], axis=1)  # seen more and more aslant
+    wall = np.stack([3 + 0.6 * y, y, z], axis=1)  # with increasingly oblique incidence
     normal = np.tile([-1.0, 0.6, 0] / np.hypot(1, 0.6), (len(wall), 1))
     cloud = PointCloud(Frame(), wall.astype(np.float32), normal=normal.astype(np.float32))
     labels = rng.integers(0, 256, (30, 40, len(CLASSES)), dtype=np.uint8)
@@ -51,11 +51,11 @@ def test_votes_are_weighted_and_read_between_pixels(name: str, tmp_path: Path) -
     seen = ok & (
         (camera.model == "equirectangular") | ((uv >= 0) & (uv <= [camera.width - 1, camera.height - 1])).all(1)
     )
-    assert seen.sum() > 30 and ((found.weight > 0) == seen).all() and found.sky == 0
+    assert seen.sum() > 30 and ((found.weight > 0) == seen).all() and found.sky_share == 0
     far = np.linalg.norm(local, axis=1)
     cos = np.abs(np.einsum("ij,ij->i", wall - pose[:3, 3], normal)) / far
-    weight = (0.2 + 0.8 * cos) / (1 + (far / NEAR) ** 2)
-    probabilities = between(labels, camera, uv)
+    weight = (0.2 + 0.8 * cos) / (1 + (far / HALF_WEIGHT_DISTANCE_M) ** 2)
+    probabilities = interpolated(labels, camera, uv)
     expected = np.where(np.arange(len(CLASSES)) == SKY, 0, weight[:, None] * probabilities)
     assert np.allclose(found.score[seen], expected[seen], atol=1e-3)
     assert np.allclose(found.weight[seen], (weight * (1 - probabilities[:, SKY]))[seen], atol=1e-3)

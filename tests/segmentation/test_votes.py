@@ -1,4 +1,4 @@
-"""From pixels to points on the synthetic street, with photos labelled by its own truth."""
+"""Classification of points by photos on the synthetic street, with photos labelled by ground truth."""
 
 import json
 from pathlib import Path
@@ -24,7 +24,7 @@ from tests.present import present
 
 @pytest.fixture(scope="module")
 def labelled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, U8]:
-    """A street, its cloud without classes, its photos' true labels as probabilities; and the true classes."""
+    """Folder with a street's cloud without classes and its photos' true labels as probabilities; true point classes."""
     from scan2sim.data_samples.street import generate
 
     folder = tmp_path_factory.mktemp("labelled")
@@ -51,28 +51,28 @@ def segment(
     inputs = {"cloud": folder / "cloud.npz"} | {name: folder / files[name] for name in names}
     done = SEGMENT.run(inputs, SegmentParams(**params), out, silent)
 
-    with np.load(done.files["confidence"]) as beside:
-        return present(PointCloud.load(done.files["cloud"]).classification), dict(beside), done
+    with np.load(done.files["confidence"]) as point_confidence:
+        return present(PointCloud.load(done.files["cloud"]).classification), dict(point_confidence), done
 
 
-def test_photos_that_are_right_make_points_right(labelled: tuple[Path, U8], tmp_path: Path) -> None:
+def test_correctly_labelled_photos_give_correct_points(labelled: tuple[Path, U8], tmp_path: Path) -> None:
     folder, truth = labelled
     (tmp_path / "photos").mkdir()
     (tmp_path / "shape").mkdir()
-    predicted, beside, done = segment(folder, tmp_path / "photos")
+    predicted, point_confidence, done = segment(folder, tmp_path / "photos")
     found = confusion(truth, predicted)
     print(found.table())
     assert found.mean() > 0.85 and found.iou["road_sign"] > 0.6 and found.iou["road"] > 0.93
     shape, *_ = segment(folder, tmp_path / "shape", photos=False)
     assert found.mean() > confusion(truth, shape).mean() + 0.15
     assert done.facts["sky_share"] < 0.08 and done.facts["seen_share"] > 0.5
-    sure, source = beside["confidence"], beside["source"]
+    confidence, source = point_confidence["confidence"], point_confidence["source"]
     right = predicted == truth
-    assert sure[right].mean() > sure[~right].mean() + 20, "confidence tells right from wrong"
+    assert confidence[right].mean() > confidence[~right].mean() + 20, "confidence is higher where classes are right"
     assert set(np.unique(source)) <= {1, 2} and (right[source == 1].mean()) > right[source == 2].mean()
 
 
-def test_a_wrong_pose_shows_in_the_skys_share(labelled: tuple[Path, U8], tmp_path: Path) -> None:
+def test_wrong_poses_raise_the_sky_share(labelled: tuple[Path, U8], tmp_path: Path) -> None:
     folder, _ = labelled
     views = list(views_io.load(folder / "views.json"))
     for view in views:
@@ -85,9 +85,7 @@ def test_a_wrong_pose_shows_in_the_skys_share(labelled: tuple[Path, U8], tmp_pat
     assert done.facts["sky_share"] > 0.15 and any("poses" in w for w in done.warnings)
 
 
-def test_a_network_that_knows_only_vegetation_has_it_parted_by_height(
-    labelled: tuple[Path, U8], tmp_path: Path
-) -> None:
+def test_single_vegetation_class_is_split_by_height(labelled: tuple[Path, U8], tmp_path: Path) -> None:
     folder, truth = labelled
     labels = tmp_path / "labels"
     labels.mkdir()
@@ -106,7 +104,7 @@ def test_a_network_that_knows_only_vegetation_has_it_parted_by_height(
     assert iou["low_vegetation"] > 0.5 and iou["high_vegetation"] > 0.85
 
 
-def test_photos_without_overlap_leave_it_to_shape(labelled: tuple[Path, U8], tmp_path: Path) -> None:
+def test_points_are_classified_by_shape_without_labelled_photos(labelled: tuple[Path, U8], tmp_path: Path) -> None:
     folder, _ = labelled
     (tmp_path / "labels").mkdir()
     done = SEGMENT.run(
@@ -116,7 +114,7 @@ def test_photos_without_overlap_leave_it_to_shape(labelled: tuple[Path, U8], tmp
     assert done.facts["source"] == "shape" and any("shape alone" in w for w in done.warnings)
 
 
-def test_classes_that_are_there_are_kept_and_photos_not_looked_at(labelled: tuple[Path, U8], tmp_path: Path) -> None:
+def test_existing_classes_are_kept_and_photos_not_classified(labelled: tuple[Path, U8], tmp_path: Path) -> None:
     folder, truth = labelled
     cloud = PointCloud.load(folder / "cloud.npz")
     PointCloud(cloud.frame, cloud.xyz, classification=truth).save(tmp_path / "own.npz")
@@ -129,13 +127,13 @@ def test_classes_that_are_there_are_kept_and_photos_not_looked_at(labelled: tupl
     np.testing.assert_array_equal(PointCloud.load(kept.files["cloud"]).classification, truth)
 
 
-def test_ground_codes_and_vehicles_have_their_own_classes(labelled: tuple[Path, U8], tmp_path: Path) -> None:
+def test_ground_is_split_into_road_sidewalk_and_terrain(labelled: tuple[Path, U8], tmp_path: Path) -> None:
     folder, _ = labelled
     predicted, *_ = segment(folder, tmp_path)
     assert {CODE[n] for n in ("road", "sidewalk", "terrain", "building", "high_vegetation")} <= set(predicted.tolist())
 
 
-def test_weights_that_are_no_weights_are_named(tmp_path: Path) -> None:
+def test_missing_weights_are_named(tmp_path: Path) -> None:
     from scan2sim.segmentation.backends import load
 
     with pytest.raises(InputError, match=r"no\.safetensors"):

@@ -1,4 +1,4 @@
-"""Networks of their own for tests, and pythons with either transport."""
+"""Fixtures: an isolated DDS domain, and Python interpreters with each of the ROS 2 transports."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ Start = Callable[..., "subprocess.Popen[str]"]
 
 @pytest.fixture(scope="session")
 def domain() -> str:
-    """A DDS domain that no other process of any test run is in."""
+    """A DDS domain that no other process of any test run uses."""
     return str(free_dds_domain())
 
 
 @pytest.fixture(scope="session")
 def pythons() -> dict[str, str]:
-    """Pythons by the transport that they have."""
+    """Python interpreters by the transport that is installed for them."""
     found = {"cyclone": sys.executable}
     if ROS_PYTHON.exists():
         found["rclpy"] = str(ROS_PYTHON)
@@ -35,13 +35,13 @@ def pythons() -> dict[str, str]:
 
 @pytest.fixture
 def start(domain: str, pythons: dict[str, str], tmp_path: Path) -> Iterator[Start]:
-    """Starts a program under a transport: `start("rclpy", "program", "argument")`; all end with the test."""
+    """Starts a program with a transport: `start("rclpy", "program", "argument")`; all are killed after the test."""
     running: list[subprocess.Popen[str]] = []
 
     def started(transport: str, *arguments: str | Path, **environment: str) -> subprocess.Popen[str]:
         if transport not in pythons:
             pytest.skip("rclpy isn't installed (.venv-ros, tests/services/ros-requirements.txt)")
-        told = {
+        settings = {
             "SCAN2SIM_TRANSPORT": transport,
             "ROS_DOMAIN_ID": domain,
             "PYTHONPATH": str(ROOT),
@@ -50,7 +50,7 @@ def start(domain: str, pythons: dict[str, str], tmp_path: Path) -> Iterator[Star
         }
         process = subprocess.Popen(
             [pythons[transport], *map(str, arguments)],
-            env=os.environ | told,
+            env=os.environ | settings,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

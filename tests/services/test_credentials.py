@@ -1,4 +1,4 @@
-"""Credentials never leave in a URL, whatever the URL looks like; what holds none stays readable."""
+"""Credentials are redacted from URLs of any form; text without credentials is unchanged."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ CAMERA = "rtsp://***@camera.example:554/live"
         ),
     ],
 )
-def test_credentials_are_replaced(text: str, expected: str) -> None:
+def test_credentials_are_redacted(text: str, expected: str) -> None:
     assert redacted(text) == expected and "hunter" not in expected
     assert redacted(expected) == expected
 
@@ -49,5 +49,5 @@ def test_credentials_are_replaced(text: str, expected: str) -> None:
         "rtsp://[fe80::1]:554/live", "",
     ],
 )  # fmt: skip
-def test_what_holds_no_credentials_stays(text: str) -> None:
+def test_text_without_credentials_is_unchanged(text: str) -> None:
     assert redacted(text) == text

@@ -1,4 +1,4 @@
-"""Whatever listens where other machines reach it has a token, a key or a certificate, or refuses to start."""
+"""Servers refuse to listen on an address that other machines can reach without a token, key or certificate."""
 
 from __future__ import annotations
 
@@ -11,58 +11,60 @@ from typing import Any
 import pytest
 
 from scan2sim.pipeline.core.errors import SettingError
-from scan2sim.services.http.settings import Served
+from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.loopback import is_loopback, require_protection
 from scan2sim.services.monitoring.settings.dashboard import PageParams as MonitorPage
 from scan2sim.services.orchestration.settings import PageParams as OrchestrationPage
 from scan2sim.services.teleoperation.settings import GatewayParams, StationParams
-from scan2sim.services.teleoperation.vehicle.adapter import TranslateParams
+from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams
 from scan2sim.services.toolboxes.settings import ServeParams
 from tests.conftest import ROOT
 
 LOOPBACK = ("127.0.0.1", "127.1.2.3", "::1", "[::1]", "localhost", "LOCALHOST")
-BEYOND = ("0.0.0.0", "::", "", "192.0.2.1", "10.0.0.1", "::ffff:192.0.2.1", "robot.example", "127.robot.example")
+NOT_LOOPBACK = ("0.0.0.0", "::", "", "192.0.2.1", "10.0.0.1", "::ffff:192.0.2.1", "robot.example", "127.robot.example")
 
 
 @pytest.mark.parametrize("host", LOOPBACK)
-def test_the_loopback_needs_no_protection(host: str) -> None:
+def test_loopback_addresses_need_no_protection(host: str) -> None:
     assert is_loopback(host)
     require_protection(host, protected=False, options="--token FILE")
-    assert Served(host=host).is_local() and TranslateParams(host=host).key is None
+    assert ServerParams(host=host).is_local() and AdapterParams(host=host).key is None
 
 
-@pytest.mark.parametrize("host", BEYOND)
+@pytest.mark.parametrize("host", NOT_LOOPBACK)
 def test_other_addresses_need_protection(host: str) -> None:
     assert not is_loopback(host)
     require_protection(host, protected=True, options="--token FILE")
-    with pytest.raises(SettingError, match=r"--host: .* other machines.*Give --token FILE, or .*127\.0\.0\.1"):
+    with pytest.raises(SettingError, match=r"--host: other machines .*Give --token FILE, or .*127\.0\.0\.1"):
         require_protection(host, protected=False, options="--token FILE")
 
 
-FILE = Path("file")
+SOME_FILE = Path("file")
 LISTENERS: list[tuple[type[Any], dict[str, object]]] = [
-    (Served, {}),
+    (ServerParams, {}),
     (MonitorPage, {}),
-    (OrchestrationPage, {"packages": FILE}),
+    (OrchestrationPage, {"packages": SOME_FILE}),
     (ServeParams, {}),
-    (GatewayParams, {"certificates": FILE}),
-    (StationParams, {"certificates": FILE, "gateway": "gate.example"}),
-    (TranslateParams, {}),
+    (GatewayParams, {"certificates": SOME_FILE}),
+    (StationParams, {"certificates": SOME_FILE, "gateway": "gate.example"}),
+    (AdapterParams, {}),
 ]
-"""Parameters of everything that listens where its user says, and what each must be given."""
+"""Settings of every server with a `host` setting, and the settings that each requires."""
 
 
 @pytest.mark.parametrize(("kind", "given"), LISTENERS, ids=lambda value: getattr(value, "__name__", ""))
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1"])
-def test_no_listener_is_open(kind: type[Any], given: dict[str, object], host: str) -> None:
+def test_no_server_listens_unprotected_beyond_loopback(kind: type[Any], given: dict[str, object], host: str) -> None:
     kind(**given, host="127.0.0.1")
     with pytest.raises(SettingError, match="--key"):
         kind(**given, host=host)
-    for protection in ({"key": FILE},) if kind is TranslateParams else ({"token": FILE}, {"certificate": FILE}):
+    for protection in (
+        ({"key": SOME_FILE},) if kind is AdapterParams else ({"token": SOME_FILE}, {"certificate": SOME_FILE})
+    ):
         assert kind(**given, host=host, **protection).host == host
-    if kind is not TranslateParams:
+    if kind is not AdapterParams:
         with pytest.raises(SettingError, match="--token FILE, or --certificate and --key"):
-            kind(**given, host=host, key=FILE)  # of TLS, without its certificate
+            kind(**given, host=host, key=SOME_FILE)  # the key of TLS without its certificate
 
 
 def command(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -82,32 +84,32 @@ def command(*words: object, **environment: str) -> subprocess.CompletedProcess[s
     ],
     ids=lambda words: " ".join(words[:2]),
 )
-def test_commands_refuse_before_they_start_anything(words: tuple[str, ...]) -> None:
+def test_commands_refuse_unprotected_hosts_before_starting(words: tuple[str, ...]) -> None:
     done = command(*words, "--host", "0.0.0.0")
     assert done.returncode == 2, done.stderr
-    assert "0.0.0.0 is reached by other machines" in done.stderr
+    assert "other machines can reach 0.0.0.0" in done.stderr
     assert ("Give --key FILE" if "translate" in words else "Give --token FILE") in done.stderr
     assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("words", [("gateway",), ("station", "gate.example")], ids=lambda words: words[0])
-def test_vehicles_and_stations_are_listened_to_with_a_certificate_only(words: tuple[str, ...], tmp_path: Path) -> None:
-    """`--listening` defaults to all addresses, by TLS and DTLS that demand a certificate of both ends."""
+def test_gateway_and_station_listen_only_with_a_certificate(words: tuple[str, ...], tmp_path: Path) -> None:
+    """`--listening` defaults to all addresses; TLS and DTLS there require a certificate on both ends."""
     pytest.importorskip("OpenSSL", reason="the extra teleop isn't installed")
     role, *rest = words
     done = command("teleop", role, tmp_path / "none", *rest, "--port", "0")
     assert done.returncode == 3 and "certificate.pem" in done.stderr and "Traceback" not in done.stderr
 
 
-def test_figures_for_prometheus_stay_on_this_machine() -> None:
+def test_prometheus_metrics_listen_on_loopback_only() -> None:
     pytest.importorskip("prometheus_client", reason="the extra bus isn't installed")
-    from scan2sim.services.monitoring.export.sinks import Prometheus
+    from scan2sim.services.monitoring.export.sinks import PrometheusSink
 
-    shown = Prometheus(0)
+    sink = PrometheusSink(0)
     try:
-        assert is_loopback(str(shown._server.server_address[0]))
+        assert is_loopback(str(sink._server.server_address[0]))
     finally:
-        shown.close()
+        sink.close()
 
 
 LISTENING = """
@@ -122,7 +124,7 @@ if __name__ == "__main__":
 """
 
 
-def test_dasks_temporary_scheduler_and_workers_stay_on_this_machine(tmp_path: Path) -> None:
+def test_dask_temporary_cluster_listens_on_loopback_only(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="distributed isn't installed")
     (script := tmp_path / "listening.py").write_text(LISTENING, encoding="utf-8")
     environment = os.environ | {"PYTHONPATH": str(ROOT)}

@@ -59,7 +59,7 @@ class Follower:
     ) -> None:
         self.poses, self.points, self.count, self.noise, self.hide = poses, points, count, noise, hide
         self.tracks = Tracks()
-        self.pictures: list[np.ndarray] = [np.zeros((64, 64), np.uint8)]
+        self.images: list[np.ndarray] = [np.zeros((64, 64), np.uint8)]
         self._rng, self._frame, self._given, self._point = np.random.default_rng(seed), -1, 0, np.zeros(0, np.int64)
 
     def _seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,20 +11,20 @@ from PIL import Image
 from scan2sim.pipeline.camera.models import inside, project_exactly
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import Camera
-from scan2sim.slam.calibration.calibrate import calibrated, looked_for
-from scan2sim.slam.calibration.camera import Found, found
-from scan2sim.slam.calibration.lens import changed
-from scan2sim.slam.odometry.track_log import Recording
+from scan2sim.slam.calibration.calibrate import calibrated, calibrated_from_scratch
+from scan2sim.slam.calibration.camera import EstimatedCamera, estimated_camera
+from scan2sim.slam.calibration.lens import changed_lens
+from scan2sim.slam.odometry.track_log import TrackLog
 from scan2sim.slam.video import open_video
 from tests.present import present
 from tests.slam.synthetic import LENS, drive, scatter
 
 
-def seen(camera: Camera, turn: float = 0.3) -> Recording:
+def seen(camera: Camera, turn: float = 0.3) -> TrackLog:
     """What a camera sees of a turn."""
     times, poses = drive(7, turn=turn)
     rng, points = np.random.default_rng(0), scatter(poses, 3000)
-    out = Recording((camera.width, camera.height))
+    out = TrackLog((camera.width, camera.height))
     for time, pose in zip(times, poses, strict=True):
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         uv, valid = project_exactly(camera, local)
@@ -37,15 +37,15 @@ def seen(camera: Camera, turn: float = 0.3) -> Recording:
 
 @pytest.mark.slow
 def test_a_lens_of_which_nothing_is_known_is_found_in_a_turn() -> None:
-    cropped = changed(LENS, np.array([0, 0.15, 0, 0]))
-    known = present(looked_for(seen(cropped)))
+    cropped = changed_lens(LENS, np.array([0, 0.15, 0, 0]))
+    known = present(calibrated_from_scratch(seen(cropped)))
     assert abs(known.camera.fx / LENS.fx - 1) < 0.02
     assert abs(known.camera.cx - cropped.cx) < 10
 
 
 def test_a_lens_is_mended_over_the_whole_drive_and_the_next_command_is_told_how() -> None:
-    known = present(calibrated(seen(LENS), changed(LENS, np.array([-0.1, 0, 0, 0]))))
-    facts = Found.of(known, "self-calibration").facts()["lens"]
+    known = present(calibrated(seen(LENS), changed_lens(LENS, np.array([-0.1, 0, 0, 0]))))
+    facts = EstimatedCamera.of(known, "self-calibration").metrics()["lens"]
     assert abs(facts["focal"] - LENS.fx) < 3 * facts["focal_sigma"] < 60
     assert facts["options"].startswith(f"--focal {facts['focal']:.2f} --centre ")
 
@@ -63,12 +63,12 @@ def pictures(folder: Path, focal: int | None) -> Path:
 
 def test_a_focal_length_is_taken_from_exif(tmp_path: Path) -> None:
     video = open_video(pictures(tmp_path / "a", focal=28))
-    own = present(found(video, None, lambda: pytest.fail("not needed"), calibrate=False))
-    assert own.camera.fx == pytest.approx(28 / np.hypot(36, 24) * 200) and "EXIF" in own.told()
+    own = present(estimated_camera(video, None, lambda: pytest.fail("not needed"), calibrate=False))
+    assert own.camera.fx == pytest.approx(28 / np.hypot(36, 24) * 200) and "EXIF" in own.message()
 
 
 @pytest.mark.parametrize("said", [None, LENS])
 def test_straight_ahead_no_lens_is_guessed(tmp_path: Path, said: Camera | None) -> None:
     video = open_video(pictures(tmp_path / "a", focal=None))
     with pytest.raises(InputError, match="turns too little"):
-        found(video, said, lambda: seen(LENS, turn=0.0).part(0, 25), calibrate=True)
+        estimated_camera(video, said, lambda: seen(LENS, turn=0.0).part(0, 25), calibrate=True)

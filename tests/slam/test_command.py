@@ -19,9 +19,9 @@ import scan2sim.slam.odometry.video_odometry as tracking
 from scan2sim.flows.cli import app
 from scan2sim.flows.engine.planning import plan
 from scan2sim.flows.pipelines.settings import Settings
-from scan2sim.flows.pipelines.video import Video, recipe
+from scan2sim.flows.pipelines.video import Video, build_graph
 from scan2sim.pipeline.core.cache import Store
-from scan2sim.pipeline.core.errors import InputError, ScanError, UnsureError, exit_code
+from scan2sim.pipeline.core.errors import InputError, LowConfidenceError, ScanError, exit_code
 from scan2sim.pipeline.core.types import U8
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
@@ -56,7 +56,7 @@ def test_it_writes_the_trajectory_in_all_formats_and_says_that_there_is_no_gps(
     assert len(found) == len(corridor.truth)
     for name in ("trajectory.tum", "trajectory.kitti", "odometry.csv", "slam.json", "colmap/images.txt"):
         assert (out / name).is_file()
-    assert "there is no GPS" in said
+    assert "without GPS the scale is unknown" in said
     assert not (out / "trajectory.geojson").exists()
     assert json.loads((out / "slam.json").read_text(encoding="utf-8"))["frames"] == len(found)
     assert list((out / "steps").rglob("state*")) == []
@@ -67,9 +67,9 @@ def test_a_path_that_was_mostly_guessed_ends_with_a_code_of_its_own(corridor: Dr
     frames.mkdir()
     for k, grey in enumerate(corridor.greys[:12]):
         cv2.imwrite(str(frames / f"{k:03d}.png"), grey if k < 2 else np.full_like(grey, 9))
-    with pytest.raises(UnsureError, match="of the poses are unsure"):
+    with pytest.raises(LowConfidenceError, match="of the poses are extrapolated"):
         command("slam", frames, "--out", tmp_path / "out")
-    assert (tmp_path / "out" / "trajectory.csv").is_file() and exit_code(UnsureError("", "", "")) == 9
+    assert (tmp_path / "out" / "trajectory.csv").is_file() and exit_code(LowConfidenceError("", "", "")) == 9
 
 
 def test_what_was_tracked_is_kept_when_only_its_placing_changes(corridor: Drive, tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_evaluate_prints_the_missions_errors(done: tuple[Path, str], corridor: D
 def test_an_interrupted_run_goes_on_and_ends_the_same(
     corridor: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, features: str
 ) -> None:
-    monkeypatch.setattr(tracking, "KEEP_EVERY", 0.0)
+    monkeypatch.setattr(tracking, "CHECKPOINT_INTERVAL_S", 0.0)
     video, state = open_video(corridor.folder / "video.mp4"), tmp_path / "state.npz"
     params = TrackParams.model_validate({"count": 300, "features": features})
 
@@ -150,7 +150,7 @@ def damages(path: Path) -> dict[str, bytes]:
 def test_a_state_that_is_damaged_or_foreign_is_not_run_and_the_run_begins_anew(
     corridor: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tracking, "KEEP_EVERY", 0.0)
+    monkeypatch.setattr(tracking, "CHECKPOINT_INTERVAL_S", 0.0)
     video, state = open_video(corridor.folder / "video.mp4"), tmp_path / "state.npz"
     params = OdometryParams.model_validate({"count": 300})
 
@@ -161,7 +161,7 @@ def test_a_state_that_is_damaged_or_foreign_is_not_run_and_the_run_begins_anew(
     for name, damaged in damages(state).items():
         state.write_bytes(damaged)
         again = track(video, start, until=0.5, state=state)
-        assert [w for w in again.warnings if "damaged: begun anew" in w], name
+        assert [w for w in again.warnings if "damaged: starting from the beginning" in w], name
         assert again.names == whole.names and not (tmp_path / "trap").exists(), name
 
 
@@ -171,8 +171,8 @@ def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_sam
     video, mask = tmp_path / "video.mp4", tmp_path / "mask.png"
 
     def mark(**changes: object) -> str:
-        nodes = recipe(Video.model_validate({"video": video, "mask": mask} | changes), Settings())
-        return plan(nodes, Store(tmp_path / "steps"))[0].key
+        tasks = build_graph(Video.model_validate({"video": video, "mask": mask} | changes), Settings())
+        return plan(tasks, Store(tmp_path / "steps"))[0].key
 
     video.write_bytes(b"one")
     mask.write_bytes(b"mask")
@@ -192,12 +192,12 @@ def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_sam
 @pytest.mark.parametrize(
     ("change", "arguments", "text"),
     [
-        (lambda p: None, ("absent.mp4",), "is missing"),
-        (lambda p: (p / "v.mp4").write_bytes(b"no video"), ("v.mp4",), "no readable video"),
-        (lambda p: (p / "empty").mkdir(), ("empty",), "no pictures"),
-        (lambda p: None, ("VIDEO", "--backend", "magic"), "there is no 'magic'"),
+        (lambda p: None, ("absent.mp4",), "file not found"),
+        (lambda p: (p / "v.mp4").write_bytes(b"no video"), ("v.mp4",), "a readable video"),
+        (lambda p: (p / "empty").mkdir(), ("empty",), "holds no images"),
+        (lambda p: None, ("VIDEO", "--backend", "magic"), "unknown value 'magic'"),
         (lambda p: None, ("VIDEO", "--set", "track.windows=3"), "track.windows"),
-        (lambda p: None, ("VIDEO", "--camera", "pinhole", "--until", "1"), "nothing tells its focal length"),
+        (lambda p: None, ("VIDEO", "--camera", "pinhole", "--until", "1"), "focal length unknown"),
         (lambda p: (p / "m.png").write_bytes(b"x"), ("VIDEO", "--mask", "m.png"), "can't be read"),
         (lambda p: (p / "g.csv").write_text("a,b\n1,2\n", encoding="utf-8"), ("VIDEO", "--gps", "g.csv"), "g.csv"),
     ],
@@ -251,5 +251,5 @@ def test_frames_out_of_order_are_left_out_and_told(corridor: Drive, tmp_path: Pa
     frames = list(open_video(tmp_path, times=tmp_path / "times.txt").frames(warn=said.append))
     assert [f.name for f in frames] == ["0.png", "1.png", "3.png"] and "out of order" in said[0]
     (tmp_path / "times.txt").write_text("0\n0.1\n", encoding="utf-8")
-    with pytest.raises(InputError, match="2 times for 4 pictures"):
+    with pytest.raises(InputError, match="2 times for 4 images"):
         open_video(tmp_path, times=tmp_path / "times.txt")

@@ -10,8 +10,8 @@ from scan2sim.pipeline.camera.models import pixel_rays, project
 from scan2sim.pipeline.core.types import F32, F64, U8, Camera
 from scan2sim.slam.geometry import exp_so3, relative_pose, rigid
 from scan2sim.slam.odometry import exposure
-from scan2sim.slam.odometry.virtual_cameras import Facets
-from scan2sim.slam.trackers.corners import FINE, CornerTracker, flow
+from scan2sim.slam.odometry.virtual_cameras import VirtualViews
+from scan2sim.slam.trackers.corners import FINE_WINDOW_PX, CornerTracker, flow
 
 CAMERA = Camera("equirectangular", 768, 384)
 
@@ -44,20 +44,20 @@ def frame(world: Callable[[F64], F32], R: F64) -> U8:
 
 
 def test_charts_and_sphere_agree_everywhere() -> None:
-    facets, rng = Facets(CAMERA), np.random.default_rng(0)
+    views, rng = VirtualViews(CAMERA), np.random.default_rng(0)
     bearing = rng.normal(size=(3000, 3))
     bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
-    facet = facets.place(bearing)
-    assert set(facet) == {0, 1, 2}
+    view = views.view_of(bearing)
+    assert set(view) == {0, 1, 2}
     for k in range(3):
-        mine = bearing[facet == k]
-        assert np.abs(facets.bearings(k, facets.pixels(k, mine)) - mine).max() < 1e-5
+        mine = bearing[view == k]
+        assert np.abs(views.bearings(k, views.pixels(k, mine)) - mine).max() < 1e-5
 
 
 @pytest.mark.parametrize("axis", [[0, 1, 0], [1, 0, 0], [0, 0, 1]])
 def test_corners_are_followed_across_seam_and_poles(axis: list[int]) -> None:
-    world, facets = sphere(), Facets(CAMERA)
-    tracker = CornerTracker(facets, None, 500)
+    world, views = sphere(), VirtualViews(CAMERA)
+    tracker = CornerTracker(views, None, 500)
     tracker.track(frame(world, np.eye(3)))
     tracker.refill()
     first = tracker.tracks
@@ -81,20 +81,20 @@ def test_corners_are_followed_across_seam_and_poles(axis: list[int]) -> None:
 
 @pytest.mark.parametrize(("gain", "offset"), [(0.45, 0), (0.6, 30), (1.3, -20)])
 def test_a_change_of_exposure_is_told_and_loses_no_corner(gain: float, offset: float) -> None:
-    world, facets = sphere(), Facets(CAMERA)
+    world, views = sphere(), VirtualViews(CAMERA)
     pictures = [frame(world, exp_so3([0, 0.04 * k, 0])) // 2 + 60 for k in range(2)]
     lit = np.clip(gain * pictures[1].astype(np.float64) + offset, 0, 255).astype(np.uint8)
     followed = []
     for second in (pictures[1], lit):
-        tracker = CornerTracker(facets, None, 500)
+        tracker = CornerTracker(views, None, 500)
         tracker.track(pictures[0])
         tracker.refill()
-        there = facets.pixels(0, tracker.tracks.bearing)
-        now = facets.pixels(0, tracker.tracks.bearing @ exp_so3([0, 0.04, 0]))
-        first = tracker.pictures[0]
+        there = views.pixels(0, tracker.tracks.bearing)
+        now = views.pixels(0, tracker.tracks.bearing @ exp_so3([0, 0.04, 0]))
+        first = tracker.images[0]
         tracker.track(second)
         followed.append(len(tracker.tracks))
-    told = exposure.between(first, tracker.pictures[0], there, now)
+    told = exposure.estimate(first, tracker.images[0], there, now)
     assert told.gain == pytest.approx(gain, rel=0.03) and told.offset == pytest.approx(offset, abs=4)
     assert followed[1] > 0.95 * followed[0]
 
@@ -107,17 +107,17 @@ def test_a_change_of_light_that_is_told_wrongly_moves_no_corner(gain: float, off
     start = cv2.goodFeaturesToTrack(first, 200, 0.01, 12).reshape(-1, 2)
 
     def off(old: np.ndarray, new: np.ndarray) -> float:
-        there, found, _ = flow(old, new, start, start.copy(), FINE, 1)
+        there, found, _ = flow(old, new, start, start.copy(), FINE_WINDOW_PX, 1)
         return float(np.median(np.linalg.norm(there - start, axis=1)[found.ravel() > 0]))
 
-    assert off(exposure.level(first), exposure.level(second)) < 0.3 * off(first, second)
+    assert off(exposure.subtract_local_mean(first), exposure.subtract_local_mean(second)) < 0.3 * off(first, second)
 
 
 def test_nothing_is_found_or_followed_on_the_car() -> None:
-    world, facets = sphere(), Facets(CAMERA)
+    world, views = sphere(), VirtualViews(CAMERA)
     mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
     mask[300:] = 0
-    tracker = CornerTracker(facets, mask, 500)
+    tracker = CornerTracker(views, mask, 500)
     for k in range(3):
         tracker.track(frame(world, exp_so3([0, 0.05 * k, 0])))
         tracker.refill()
@@ -126,7 +126,7 @@ def test_nothing_is_found_or_followed_on_the_car() -> None:
 
 
 def test_corners_are_shared_out_over_the_sphere() -> None:
-    tracker = CornerTracker(Facets(CAMERA), None, 400)
+    tracker = CornerTracker(VirtualViews(CAMERA), None, 400)
     tracker.track(frame(sphere(), np.eye(3)))
     tracker.refill()
     octant = (tracker.tracks.bearing > 0) @ [1, 2, 4]
@@ -149,8 +149,8 @@ def test_a_relative_pose_is_found_among_outliers() -> None:
 
 def test_a_corner_stays_on_what_it_was_where_the_picture_turns() -> None:
     """Followed from each frame to the next alone, a cap's corners drift by .3 degrees while the car turns by 30."""
-    world, facets = sphere(), Facets(CAMERA)
-    tracker = CornerTracker(facets, None, 500)
+    world, views = sphere(), VirtualViews(CAMERA)
+    tracker = CornerTracker(views, None, 500)
     tracker.track(frame(world, np.eye(3)))
     tracker.refill()
     first = tracker.tracks

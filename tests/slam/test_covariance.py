@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from scan2sim.slam.mapping.covariance import covariances
-from scan2sim.slam.mapping.map_file import Mapped
-from scan2sim.slam.mapping.marginalization import Information, Tie
+from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.mapping.marginalization import Information, MotionSigma
 from tests.slam.synthetic import Follower, drive, inside, off, run, scatter
 
 
@@ -16,7 +16,7 @@ def test_ellipsoids_hold_errors_and_none_is_a_point() -> None:
     for seed in range(4):
         times, poses = drive(12, turn=0.05 * (1 + seed))
         odometry = run(times, Follower(poses, scatter(poses, seed=seed), seed=seed))
-        known = covariances(Mapped.of(odometry, ()), None)
+        known = covariances(MapCheckpoint.of(odometry, ()), None)
         assert (np.linalg.eigvalsh(known) > 0).all()
         held.append(inside(off(odometry, poses), known).mean())
     assert np.mean(held) > 0.85
@@ -28,7 +28,7 @@ def test_a_gap_stays_uncertain_after_it() -> None:
     black = (times >= 10) & (times < 12)
     hidden = Follower(poses, scatter(poses), hide=lambda frame, points: np.full(len(points), black[frame]))
     odometry = run(times, hidden)
-    known = np.sqrt(np.trace(covariances(Mapped.of(odometry, ()), None)[:, :3, :3], axis1=1, axis2=2))
+    known = np.sqrt(np.trace(covariances(MapCheckpoint.of(odometry, ()), None)[:, :3, :3], axis1=1, axis2=2))
     assert known[-1] > 10 * known[np.flatnonzero(black)[0] - 1]
     assert all(p.unsure for p in odometry.placed[100:])  # nothing ties what is seen afterwards to what was seen before
 
@@ -38,13 +38,13 @@ def test_a_band_is_inverted_as_a_whole_matrix_is() -> None:
     known, whole = Information(4), np.zeros((6 * count, 6 * count))
     for first in range(count - 3):
         J = rng.normal(size=(30, 24))
-        known.tell(range(first, first + 4), np.arange(3) + 3 * first, J.T @ J, np.ones(50))
+        known.add(range(first, first + 4), np.arange(3) + 3 * first, J.T @ J, np.ones(50))
         at = slice(6 * first, 6 * first + 24)
         whole[at, at] += J.T @ J
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, 3] = rng.normal(size=(count, 3))
-    far = Tie(1e6, 1e6)
-    found = known.covariance(poses, [Tie(1.0, 1.0), *[far] * (count - 1)], [], np.full(count, np.inf), 1.0)
+    far = MotionSigma(1e6, 1e6)
+    found = known.covariance(poses, [MotionSigma(1.0, 1.0), *[far] * (count - 1)], [], np.full(count, np.inf), 1.0)
     whole = whole / known.noise(1.0) ** 2
     whole[:6, :6] += np.eye(6)
     blocks = np.linalg.inv(whole).reshape(count, 6, count, 6)

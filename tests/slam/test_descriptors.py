@@ -13,11 +13,11 @@ from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.types import F64, U8, Camera
 from scan2sim.slam import features, matchers
-from scan2sim.slam.features import Found
+from scan2sim.slam.features import FeatureSet
 from scan2sim.slam.geometry import exp_so3
 from scan2sim.slam.odometry.checkpoint import load, save
 from scan2sim.slam.odometry.video_odometry import VALUES
-from scan2sim.slam.odometry.virtual_cameras import Facets
+from scan2sim.slam.odometry.virtual_cameras import VirtualViews
 from scan2sim.slam.trackers.descriptors import DescriptorTracker
 
 SPHERE = Camera("equirectangular", 512, 256)
@@ -47,7 +47,7 @@ def tracker(
     camera: Camera = SPHERE,
     mask: U8 | None = None,
     count: int = NUMBER,
-    bridge: bool = True,
+    flow_unmatched: bool = True,
     weights: Path | None = None,
 ) -> DescriptorTracker:
     if missing_packages := plugins.missing(features.__name__, name):
@@ -57,7 +57,9 @@ def tracker(
 
         torch.set_num_threads(1)
     found = features.named(name, weights, count=1500, device="cpu")
-    return DescriptorTracker(Facets(camera), mask, count, found, matchers.named("nearest"), bridge=bridge)
+    return DescriptorTracker(
+        VirtualViews(camera), mask, count, found, matchers.named("nearest"), flow_unmatched=flow_unmatched
+    )
 
 
 def followed(track: DescriptorTracker, frames: list[U8], turns: list[F64]) -> tuple[F64, F64, F64]:
@@ -87,7 +89,7 @@ def check_poles_and_seam(name: str, axes: tuple[tuple[int, int, int], ...], weig
     for axis in axes:
         base = exp_so3(np.multiply(axis, np.pi / 2))
         turns = [base, base @ exp_so3(np.radians([2.0, 4.0, 1.5]))]
-        track = tracker(name, bridge=False, weights=weights)
+        track = tracker(name, flow_unmatched=False, weights=weights)
         _, last, error = followed(track, [seen(SPHERE, R) for R in turns], turns)
         assert np.median(error) < 0.1 and (error < 0.5).mean() > 0.97
         counts.append(len(last))
@@ -103,14 +105,14 @@ def check_poles_and_seam(name: str, axes: tuple[tuple[int, int, int], ...], weig
 
 @pytest.mark.parametrize(("axis", "step"), [((1.0, 0.0, 0.0), 1.0), ((0.0, 1.0, 0.0), 5.0)])
 def test_tracks_go_on_across_seam_and_poles(axis: tuple[float, float, float], step: float) -> None:
-    """What was at the horizon comes into the facets of the poles, what was at a pole passes it, or the seam."""
+    """What was at the horizon comes into the views of the poles, what was at a pole passes it, or the seam."""
     turns = [exp_so3(np.radians(step * i) * np.array(axis)) for i in range(6)]
     camera = Camera("equirectangular", 640, 320)
     track = tracker("orb", camera=camera, count=700)
     first, last, error = followed(track, [seen(camera, R) for R in turns], turns)
     assert len(first) > 500
     if axis[0]:  # the elevation changes, or the side of a pole
-        moved = track.facets.place(first) != track.facets.place(last)
+        moved = track.views.view_of(first) != track.views.view_of(last)
         passed = (np.abs(first[:, 1]) > 0.9) & (first[:, 2] * last[:, 2] < 0)
         assert passed.sum() >= 2 and np.median(error[passed]) < 0.1
     else:
@@ -132,14 +134,14 @@ def test_real_panoramas_have_no_special_places(real_data: Path) -> None:
             uv, _ = project(source, pixel_rays(camera).reshape(-1, 3) @ R.T)
             x, y = uv.reshape(400, 800, 2).transpose(2, 0, 1)
             frames.append(cv2.remap(large, np.ascontiguousarray(x), np.ascontiguousarray(y), 1, borderMode=3))
-        first, _, error = followed(tracker("rootsift", camera=camera, bridge=False), frames, turns)
+        first, _, error = followed(tracker("rootsift", camera=camera, flow_unmatched=False), frames, turns)
         assert len(first) > 0.3 * NUMBER and np.median(error) < 0.1 and (error < 0.5).mean() > 0.9
 
 
 def test_leaps_that_lucas_kanade_cannot_follow_are_made() -> None:
     camera = Camera("pinhole", 480, 320, 400.0, 400.0, 239.5, 159.5)
     turns = [np.eye(3), exp_so3(np.radians([1.0, 12.0, 0.0]))]  # 85 pixels
-    track = tracker("rootsift", camera=camera, bridge=False)
+    track = tracker("rootsift", camera=camera, flow_unmatched=False)
     first, _, error = followed(track, [seen(camera, R) for R in turns], turns)
     assert len(first) > 40 and np.median(error) < 0.1 and (error < 0.3).mean() > 0.9
 
@@ -150,7 +152,7 @@ def test_wrong_matches_are_not_believed() -> None:
         takes: str | None = None
         dimension: int | None = None
 
-        def match(self, a: Found, b: Found, sizes: Any) -> Any:
+        def match(self, a: FeatureSet, b: FeatureSet, sizes: Any) -> Any:
             assert sizes[0] == sizes[1] and (a.uv[:, 0] < sizes[0][0]).all() and (a.uv[:, 1] < sizes[0][1]).all()
             n = min(len(a.uv), len(b.uv))
             return np.stack([np.arange(n), np.random.default_rng(0).permutation(n)], axis=1)
@@ -160,9 +162,9 @@ def test_wrong_matches_are_not_believed() -> None:
 
     turns = [np.eye(3), exp_so3(np.radians([0.0, 1.0, 0.0]))]
     frames = [seen(SPHERE, R) for R in turns]
-    track = DescriptorTracker(Facets(SPHERE), None, NUMBER, features.named("orb"), Wrong(), bridge=False)
+    track = DescriptorTracker(VirtualViews(SPHERE), None, NUMBER, features.named("orb"), Wrong(), flow_unmatched=False)
     assert len(followed(track, frames, turns)[0]) < 0.05 * NUMBER
-    track = DescriptorTracker(Facets(SPHERE), None, NUMBER, features.named("orb"), Wrong())
+    track = DescriptorTracker(VirtualViews(SPHERE), None, NUMBER, features.named("orb"), Wrong())
     first, _, error = followed(track, frames, turns)
     assert len(first) > 0.5 * NUMBER and np.median(error) < 0.1
 
@@ -171,7 +173,7 @@ def test_the_interface_of_a_tracker_whose_run_is_interrupted(tmp_path: Path) -> 
     mask = np.full((256, 512), 255, np.uint8)
     mask[180:] = 0
     track = tracker("orb", mask=mask)
-    assert track.track(seen(SPHERE, np.eye(3))) == 0.0 and len(track.tracks) == 0 and len(track.pictures) == 3
+    assert track.track(seen(SPHERE, np.eye(3))) == 0.0 and len(track.tracks) == 0 and len(track.images) == 3
     count = track.refill()
     ids = track.tracks.ids
     assert count == len(ids) == len(np.unique(ids)) > 0.5 * NUMBER and track.refill() < 0.2 * count
@@ -206,7 +208,7 @@ def test_a_matcher_made_for_other_features_is_refused() -> None:
         name, takes, dimension = "superglue", "superpoint", 256
 
     with pytest.raises(SettingError, match="'superglue' was made for superpoint of 256 numbers, not for orb of 32 by"):
-        DescriptorTracker(Facets(SPHERE), None, 100, features.named("orb"), Glue())  # type: ignore[arg-type]
+        DescriptorTracker(VirtualViews(SPHERE), None, 100, features.named("orb"), Glue())  # type: ignore[arg-type]
 
 
 def test_superpoint_and_superglue_run_together(tmp_path: Path) -> None:
@@ -217,7 +219,7 @@ def test_superpoint_and_superglue_run_together(tmp_path: Path) -> None:
 
     found = features.named("superpoint", saved(tmp_path / "superpoint_v1.pth", MODEL), count=100, device="cpu")
     matcher = matchers.named("superglue", saved(tmp_path / "superglue_outdoor.pth", GLUE), device="cpu")
-    track = DescriptorTracker(Facets(SPHERE), None, NUMBER, found, matcher)
+    track = DescriptorTracker(VirtualViews(SPHERE), None, NUMBER, found, matcher)
     turns = [np.eye(3), exp_so3(np.radians([0.0, 1.0, 0.0]))]
     first, _, error = followed(track, [seen(SPHERE, R) for R in turns], turns)
     assert len(first) > 20 and np.median(error) < 0.1

@@ -15,7 +15,7 @@ from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.optional_deps import missing
 from scan2sim.slam import features, matchers, weights
-from scan2sim.slam.features import Found
+from scan2sim.slam.features import FeatureSet
 
 SIZE = (240, 320)
 PUBLISHED_WEIGHTS = {"aliked": "aliked/aliked-t16.pth", "superpoint": "superpoint/superpoint_v1.pth"}
@@ -110,7 +110,7 @@ def check_mask_and_flat_image(backend: features.Features) -> None:
     assert len(found.uv) > 20 and found.uv[:, 0].max() < 161
     flat = backend.detect(np.full((40, 50), 90, np.uint8))
     assert flat.descriptors.shape == (0, backend.dimension)
-    assert matchers.named("nearest").match(found, Found(*(x[:0] for x in found)), (SIZE, SIZE)).shape == (0, 2)
+    assert matchers.named("nearest").match(found, FeatureSet(*(x[:0] for x in found)), (SIZE, SIZE)).shape == (0, 2)
 
 
 @pytest.mark.parametrize("name", plugins.names(features.__name__))
@@ -227,20 +227,20 @@ def test_superpoint_agrees_with_transformers(tmp_path: Path) -> None:
     assert np.allclose(ours.descriptors[order], out.descriptors[0].numpy()[other], atol=1e-4)
 
 
-def two_views(dimension: int, n: int = 120) -> tuple[Found, Found]:
+def two_views(dimension: int, n: int = 120) -> tuple[FeatureSet, FeatureSet]:
     """The same features in two pictures of 640 x 480, in another order, a little changed."""
     rng = np.random.default_rng(3)
     uv, what = rng.uniform((0, 0), (639, 479), (n, 2)), rng.normal(size=(n, dimension))
     order = rng.permutation(n)
 
-    def seen(uv: Any, what: Any) -> Found:
+    def seen(uv: Any, what: Any) -> FeatureSet:
         length = np.linalg.norm(what, axis=1, keepdims=True)
-        return Found(uv.astype(np.float32), (what / length).astype(np.float32), np.full(n, 0.5, np.float32))
+        return FeatureSet(uv.astype(np.float32), (what / length).astype(np.float32), np.full(n, 0.5, np.float32))
 
     return seen(uv, what), seen(uv[order] + (9, 2), what[order] + 0.2 * rng.normal(size=(n, dimension)))
 
 
-def theirs_of(model: Any, a: Found, b: Found, *scores: Any) -> tuple[Any, Any]:
+def theirs_of(model: Any, a: FeatureSet, b: FeatureSet, *scores: Any) -> tuple[Any, Any]:
     """What a matcher of transformers says: rows of b (N,), probabilities (N,)."""
     import torch
 
@@ -251,12 +251,12 @@ def theirs_of(model: Any, a: Found, b: Found, *scores: Any) -> tuple[Any, Any]:
     return tuple(x.reshape(-1, len(a.uv))[0].numpy() for x in out[:2])
 
 
-def agree(ours: Any, a: Found, b: Found, theirs: Any, share: Any) -> None:
+def agree(ours: Any, a: FeatureSet, b: FeatureSet, theirs: Any, share: Any) -> None:
     """Same partners and probabilities."""
     import torch
 
     with torch.inference_mode():
-        shares = ours.shares(a, b, ((640, 480), (640, 480)))
+        shares = ours.probabilities(a, b, ((640, 480), (640, 480)))
     pairs = matchers.mutual(shares, 0.0)
     mine = np.full(len(a.uv), -1)
     mine[pairs[:, 0]] = pairs[:, 1]
@@ -301,7 +301,7 @@ def test_superglue_agrees_with_transformers(tmp_path: Path) -> None:
     a, b = two_views(256)
     agree(ours, a, b, *theirs_of(theirs, a, b, torch.full((1, 2, len(a.uv)), 0.5)))
     sizes = (640, 480), (640, 480)
-    assert ours.match(a, Found(*(x[:0] for x in b)), sizes).shape == (0, 2)
+    assert ours.match(a, FeatureSet(*(x[:0] for x in b)), sizes).shape == (0, 2)
 
 
 def test_lightglue_agrees_with_transformers(tmp_path: Path) -> None:
@@ -394,10 +394,10 @@ def test_weights_of_another_shape_or_unknown(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"another network \(layer.weight .*expected SuperPoint"):
         features.named("superpoint", file)
     torch.save(tensors | {"convPb.bias": torch.full((65,), float("nan"))}, file)
-    with pytest.raises(InputError, match="aren't finite, in convPb.bias"):
+    with pytest.raises(InputError, match="NaN or infinite values in convPb.bias"):
         features.named("superpoint", file)
     torch.save([1, 2], file)
-    with pytest.raises(InputError, match="no tensors by name"):
+    with pytest.raises(InputError, match="no named tensors"):
         features.named("superpoint", file)
 
 
@@ -407,9 +407,9 @@ def test_damaged_missing_and_dangerous_files(tmp_path: Path) -> None:
 
     from scan2sim.slam.features.superpoint import MODEL
 
-    with pytest.raises(SettingError, match="comes without weights. Give Magic Leap's superpoint_v1.pth"):
+    with pytest.raises(SettingError, match="needs a weights file. Give Magic Leap's superpoint_v1.pth"):
         features.named("superpoint")
-    with pytest.raises(InputError, match="is no file.*nothing is downloaded"):
+    with pytest.raises(InputError, match="file not found.*weights aren't downloaded"):
         features.named("superpoint", tmp_path / "none.pth")
     whole = saved(tmp_path / "superpoint_v1.pth", MODEL)
     safe = tmp_path / "superpoint.safetensors"
@@ -418,13 +418,13 @@ def test_damaged_missing_and_dangerous_files(tmp_path: Path) -> None:
         half = tmp_path / f"half{file.suffix}"
         for size in (0, 100, file.stat().st_size // 2):
             half.write_bytes(file.read_bytes()[:size])
-            with pytest.raises(InputError, match="is no whole file of tensors alone"):
+            with pytest.raises(InputError, match="is damaged, or no file of tensors"):
                 features.named("superpoint", half)
     mark = tmp_path / "ran"
     torch.save({"conv1a.weight": Bomb(mark)}, tmp_path / "bomb.pth")
     (tmp_path / "bomb.pkl").write_bytes(pickle.dumps({"conv1a.weight": Bomb(mark)}, 2))
     for file in (tmp_path / "bomb.pth", tmp_path / "bomb.pkl"):
-        with pytest.raises(InputError, match="holds code or objects besides tensors; not run"):
+        with pytest.raises(InputError, match="holds code or objects besides tensors; not executed"):
             features.named("superpoint", file)
     assert not mark.exists()
 

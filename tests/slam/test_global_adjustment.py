@@ -7,29 +7,29 @@ import pytest
 
 from scan2sim.slam.geometry import exp_so3
 from scan2sim.slam.mapping import global_adjustment as module
-from scan2sim.slam.mapping.cross_validation import judge
+from scan2sim.slam.mapping.cross_validation import compare_paths
 from scan2sim.slam.mapping.global_adjustment import adjust
-from scan2sim.slam.mapping.local_map import WITNESSES
-from scan2sim.slam.mapping.map_file import Mapped
-from scan2sim.slam.mapping.sparse_model import kept
+from scan2sim.slam.mapping.local_map import HELD_OUT_EVERY
+from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.mapping.sparse_model import sparse_points
 from tests.slam.synthetic import Narrow, ate, drive, run, scatter
 
 pytest.importorskip("pycolmap")
 
 
 @pytest.fixture(scope="module")
-def winding() -> tuple[Mapped, np.ndarray]:
+def winding() -> tuple[MapCheckpoint, np.ndarray]:
     """What a drive of a perspective camera has left, and the truth."""
     times, poses = drive(6, turn=0.15)
     found = run(times, Narrow(poses, scatter(poses, 12000, 1), seed=1), keep=True, parallax=1.0)
-    return Mapped.of(found, []), poses[:, :3, 3]
+    return MapCheckpoint.of(found, []), poses[:, :3, 3]
 
 
-def error(mapped: Mapped, truth: np.ndarray) -> float:
+def error(mapped: MapCheckpoint, truth: np.ndarray) -> float:
     return ate(np.stack([mapped.pose_of(p)[:3, 3] for p in mapped.placed]), truth)
 
 
-def bend(mapped: Mapped) -> np.ndarray:
+def bend(mapped: MapCheckpoint) -> np.ndarray:
     """The keyframes' poses, along a path that slowly turns."""
     poses = mapped.map.poses(list(range(len(mapped.map.keyframes))))
     for k, pose in enumerate(poses):
@@ -37,15 +37,20 @@ def bend(mapped: Mapped) -> np.ndarray:
     return poses
 
 
-def test_witnesses_have_no_say_in_the_map_and_know_the_better_of_two_paths(winding: tuple[Mapped, np.ndarray]) -> None:
+def test_witnesses_have_no_say_in_the_map_and_know_the_better_of_two_paths(
+    winding: tuple[MapCheckpoint, np.ndarray],
+) -> None:
     mapped, _ = winding
     good, bent = mapped.map.poses(list(range(len(mapped.map.keyframes)))), bend(mapped)
-    assert (kept(mapped).ids % WITNESSES > 0).all()
-    assert judge(mapped.map, bent, good).better and not judge(mapped.map, good, bent).better
-    assert judge(mapped.map, good, bent).witnesses > 20
+    assert (sparse_points(mapped).ids % HELD_OUT_EVERY > 0).all()
+    assert (
+        compare_paths(mapped.map, bent, good).second_is_better
+        and not compare_paths(mapped.map, good, bent).second_is_better
+    )
+    assert compare_paths(mapped.map, good, bent).held_out > 20
 
 
-def test_a_path_that_drifted_is_adjusted(winding: tuple[Mapped, np.ndarray]) -> None:
+def test_a_path_that_drifted_is_adjusted(winding: tuple[MapCheckpoint, np.ndarray]) -> None:
     mapped, truth = winding
     straight = [keyframe.T_world_cam for keyframe in mapped.map.keyframes]
     for keyframe, pose in zip(mapped.map.keyframes, bend(mapped), strict=True):
@@ -60,13 +65,13 @@ def test_a_path_that_drifted_is_adjusted(winding: tuple[Mapped, np.ndarray]) -> 
 
 
 def test_an_adjustment_that_fits_worse_changes_nothing(
-    winding: tuple[Mapped, np.ndarray], monkeypatch: pytest.MonkeyPatch
+    winding: tuple[MapCheckpoint, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mapped, _ = winding
-    before, points = mapped.map.poses(list(range(len(mapped.map.keyframes)))), kept(mapped)
+    before, points = mapped.map.poses(list(range(len(mapped.map.keyframes)))), sparse_points(mapped)
     wrong = module.Adjusted(points, bend(mapped), points.xyz + 1, 0.2, 0.1)
-    monkeypatch.setattr(module, "adjusted", lambda _: wrong)
+    monkeypatch.setattr(module, "bundle_adjust", lambda _: wrong)
     facts = adjust(mapped)
     assert not facts["adjustment_kept"] and facts["witnesses_gain"] < 0
     assert np.array_equal(mapped.map.poses(list(range(len(before)))), before)
-    assert np.array_equal(kept(mapped).xyz, points.xyz)
+    assert np.array_equal(sparse_points(mapped).xyz, points.xyz)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scan2sim.slam.calibration.lens import better, changed, told
+from scan2sim.slam.calibration.lens import changed_lens, fit_lens, lens_warning
 from tests.present import present
 from tests.slam.synthetic import LENS, mistaken
 
@@ -21,16 +21,16 @@ from tests.slam.synthetic import LENS, mistaken
 def test_a_lens_that_is_wrong_is_noticed_in_a_turn_and_a_better_one_named(
     off: tuple[float, ...], said: str | None
 ) -> None:
-    given = changed(LENS, np.array(off))
+    given = changed_lens(LENS, np.array(off))
     misfits = mistaken(given, seed=1).map.misfits
-    text = told(given, better(given, misfits))
+    text = lens_warning(given, fit_lens(given, misfits))
     assert (text is None) == (said is None)
     assert said is None or said in present(text)
-    found = present(better(given, misfits))
+    found = present(fit_lens(given, misfits))
     wrong = np.array([np.log(found.camera.fx / LENS.fx), (found.camera.cx - LENS.cx) / LENS.fx])
     assert np.all(np.abs(wrong) < max(0.02, 0.4 * np.abs(off).max()))
 
 
 def test_straight_ahead_nothing_is_said_of_the_lens() -> None:
-    given = changed(LENS, np.array([0.3, 0, 0, 0]))
-    assert told(given, better(given, mistaken(given, seed=1, turn=0.0).map.misfits)) is None
+    given = changed_lens(LENS, np.array([0.3, 0, 0, 0]))
+    assert lens_warning(given, fit_lens(given, mistaken(given, seed=1, turn=0.0).map.misfits)) is None

@@ -18,10 +18,10 @@ from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.slam.geometry import inverse
-from scan2sim.slam.lidar_odometry import LidarOdometry, Matched, worst
+from scan2sim.slam.lidar_odometry import LidarOdometry, MatchedSweeps, worst_sigma
 from scan2sim.slam.steps import lidar as step
 from scan2sim.slam.steps.lidar import LidarParams, lidar
-from scan2sim.slam.trajectory.fusion import lidar_steps
+from scan2sim.slam.trajectory.fusion import lidar_motions
 
 pytest.importorskip("kiss_icp")
 SPEED, TURN, PERIOD = 8.0, 0.15, 0.1
@@ -98,10 +98,10 @@ def sweeps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("street") / "sweeps", 25)
 
 
-def matched(sweeps: Path, out: Path, **how: Any) -> Matched:
+def matched(sweeps: Path, out: Path, **how: Any) -> MatchedSweeps:
     out.mkdir(parents=True, exist_ok=True)
     done = lidar({"sweeps": sweeps}, LidarParams(**how), out, silent, out / "checkpoint")
-    return Matched.load(done.files["matched"])
+    return MatchedSweeps.load(done.files["matched"])
 
 
 def test_sweeps_tell_where_they_were_taken_and_how_surely(sweeps: Path, tmp_path: Path) -> None:
@@ -115,7 +115,7 @@ def test_sweeps_tell_where_they_were_taken_and_how_surely(sweeps: Path, tmp_path
 
 def test_an_interrupted_run_goes_on(sweeps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = matched(sweeps, tmp_path / "whole", deskew="times")
-    monkeypatch.setattr(step, "KEEP_EVERY", 0.0)
+    monkeypatch.setattr(step, "CHECKPOINT_INTERVAL_S", 0.0)
     seen: list[float] = []
 
     def stop(fraction: float, message: str = "") -> None:
@@ -131,13 +131,13 @@ def test_an_interrupted_run_goes_on(sweeps: Path, tmp_path: Path, monkeypatch: p
         tmp_path / "checkpoint",
     )  # fmt: skip
     assert len(again) == 25 - 11
-    np.testing.assert_allclose(Matched.load(done.files["matched"]).poses, whole.poses, atol=1e-6)
+    np.testing.assert_allclose(MatchedSweeps.load(done.files["matched"]).poses, whole.poses, atol=1e-6)
 
 
 def test_along_a_tunnel_nothing_is_sure(tmp_path: Path) -> None:
     found = matched(write(tmp_path / "tunnel", 8, tunnel=True, straight=True), tmp_path, deskew="times")
-    assert not found.sure.any() and (worst(found.covariance) > 0.5).all()
-    steps = lidar_steps(found)
+    assert not found.sure.any() and (worst_sigma(found.covariance) > 0.5).all()
+    steps = lidar_motions(found)
     along = np.sqrt(steps.covariance[:, 0, 0].sum())  # of the whole way
     assert along > 0.5 * SPEED * found.times[-1]
     across = np.sqrt(found.covariance[:, [1, 2], [1, 2]].max())
@@ -147,7 +147,7 @@ def test_along_a_tunnel_nothing_is_sure(tmp_path: Path) -> None:
 def test_sweeps_without_a_trajectory_become_a_tile(sweeps: Path, tmp_path: Path) -> None:
     result = CliRunner().invoke(app, f"import sweeps {sweeps} --deskew times --out {tmp_path}/tile --voxel 0.2")
     assert result.exit_code == 0, result.output
-    assert "placed by sweeps (100 % of the steps)" in result.output
+    assert "placed by sweeps (100 % of the motions)" in result.output
     tile = read_tile(tmp_path / "tile")
     assert tile.trajectory is not None
     found = trajectory_io.read(tmp_path / "tile-path" / "trajectory.csv")
@@ -163,14 +163,14 @@ def test_what_cannot_be_matched_is_told(sweeps: Path, tmp_path: Path) -> None:
         return str(result.exception)
 
     files = sorted(sweeps.iterdir())
-    assert "holds one sweep, and nothing to match it to" in run(files[0])
+    assert "holds only one sweep" in run(files[0])
     apart = tmp_path / "apart"
     apart.mkdir()
     rng = np.random.default_rng(0)
     for i in range(4):  # walls of other places, each
         xyz = rng.normal(0, 1.0, (2000, 3)) + 30 * np.array([np.cos(2 * i), np.sin(2 * i), 0])
         las.write(apart / f"{i}.laz", PointCloud(Frame(), xyz.astype(np.float32)))
-    assert "show too little of one another" in run(apart)
+    assert "overlap too little with each other" in run(apart)
     far = tmp_path / "far"
     far.mkdir()
     for i in range(3):
@@ -180,7 +180,7 @@ def test_what_cannot_be_matched_is_told(sweeps: Path, tmp_path: Path) -> None:
     assert "its sweeps have no times" in run(apart, "--gps", str(tmp_path / "gps.csv"))
     (tmp_path / "late.csv").write_text("time,x,y,z\n900,0,0,0\n901,8,0,0\n", encoding="utf-8")
     assert "spans 900.00 to 901.00 s" in run(sweeps, "--gps", str(tmp_path / "late.csv"))
-    assert "has no times of its points" in run(apart, "--deskew", "times")
+    assert "has no times for its points" in run(apart, "--deskew", "times")
     names = tmp_path / "times.txt"
     names.write_text("0\n2\n1\n", encoding="utf-8")
     assert "time doesn't follow" in run(far, "--times", str(names))
@@ -201,8 +201,8 @@ def test_an_empty_sweep_is_passed_over(sweeps: Path, tmp_path: Path) -> None:
 
 def test_results_that_are_none_are_refused(tmp_path: Path) -> None:
     (tmp_path / "matched.npz").write_bytes(b"nothing")
-    with pytest.raises(InputError, match="holds no matched sweeps"):
-        Matched.load(tmp_path / "matched.npz")
+    with pytest.raises(InputError, match="is no file of matched sweeps"):
+        MatchedSweeps.load(tmp_path / "matched.npz")
 
 
 def test_one_sweep_alone_stands_where_it_is() -> None:
@@ -213,5 +213,5 @@ def test_one_sweep_alone_stands_where_it_is() -> None:
 
 
 def test_a_step_says_what_is_missing(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="holds one sweep"):
+    with pytest.raises(DataError, match="holds only one sweep"):
         matched(write(tmp_path / "one", 1), tmp_path)

@@ -6,7 +6,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import F64
 from scan2sim.slam.geometry import exp_so3, inverse, rigid
-from scan2sim.slam.mapping.loop_closure import alike, pose_graph, thumbnail
+from scan2sim.slam.mapping.loop_closure import optimize_pose_graph, thumbnail, thumbnail_correlation
 
 
 def ring(n: int = 80, radius: float = 30.0) -> F64:
@@ -32,9 +32,9 @@ def test_a_loop_takes_most_of_the_drift_away_and_a_false_one_doesnt_harm() -> No
         return np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1)
 
     loops = [(j, k, inverse(truth[j]) @ truth[k]) for j, k in ((0, 73), (2, 75), (4, 77))]
-    assert off(pose_graph(path, way, loops)).max() < 0.35 * off(path).max()
+    assert off(optimize_pose_graph(path, way, loops)).max() < 0.35 * off(path).max()
     false = [(10, 40, np.eye(4))]
-    both = pose_graph(path, way, loops + false)
+    both = optimize_pose_graph(path, way, loops + false)
     assert off(both).max() < 0.5 * off(path).max()
 
 
@@ -45,6 +45,6 @@ def test_a_panorama_is_known_at_any_heading() -> None:
     panorama, other = (cv2.GaussianBlur(rng.integers(0, 255, (100, 640), np.uint8), (0, 0), 9) for _ in range(2))
     panorama, other = (cv2.normalize(p, None, 0, 255, cv2.NORM_MINMAX) for p in (panorama, other))
     turned = np.roll(panorama, 250, axis=1)
-    assert alike(thumbnail(panorama), thumbnail(turned), around=True) > 0.8
-    assert alike(thumbnail(panorama), thumbnail(turned), around=False) < 0.5
-    assert alike(thumbnail(panorama), thumbnail(other), around=True) < 0.6
+    assert thumbnail_correlation(thumbnail(panorama), thumbnail(turned), panoramic=True) > 0.8
+    assert thumbnail_correlation(thumbnail(panorama), thumbnail(turned), panoramic=False) < 0.5
+    assert thumbnail_correlation(thumbnail(panorama), thumbnail(other), panoramic=True) < 0.6

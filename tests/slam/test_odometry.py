@@ -6,9 +6,9 @@ import pytest
 
 from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.geometry.similarity import umeyama
-from scan2sim.slam.mapping.map_file import Mapped
+from scan2sim.slam.mapping.map_file import MapCheckpoint
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
-from scan2sim.slam.trajectory.align import finish
+from scan2sim.slam.trajectory.align import aligned_trajectory
 from tests.present import present
 from tests.slam.conftest import Drive
 from tests.slam.synthetic import LENS, Follower, Narrow, drive, gps_of, run, scatter
@@ -70,7 +70,7 @@ def test_a_perspective_cameras_narrow_view_is_enough() -> None:
 def test_gps_ties_the_scale_and_places_the_path() -> None:
     times, poses = drive(30)
     gps = gps_of(times, poses, sigma=0.5)
-    trajectory, _ = finish(Mapped.of(run(times, Follower(poses, scatter(poses)), gps=gps), ()), gps)
+    trajectory, _ = aligned_trajectory(MapCheckpoint.of(run(times, Follower(poses, scatter(poses)), gps=gps), ()), gps)
     off = np.linalg.norm((trajectory.positions - poses[:, :3, 3])[:, :2], axis=1)
     assert off.mean() < 1.0
     length = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum()
@@ -96,7 +96,7 @@ def test_a_black_stretch_is_bridged_marked_and_never_restarts_at_the_origin(seco
         return np.full(len(points), 10 <= times[frame] < 10 + seconds)
 
     odometry = run(times, Follower(poses, scatter(poses), hide=black), gps=gps, warn=said.append)
-    trajectory, _ = finish(Mapped.of(odometry, ()), gps)
+    trajectory, _ = aligned_trajectory(MapCheckpoint.of(odometry, ()), gps)
     off = np.linalg.norm(trajectory.positions - poses[:, :3, 3], axis=1)
     dark = (times >= 10) & (times < 10 + seconds)
     unsure = present(trajectory.unsure)
@@ -125,7 +125,7 @@ def test_a_bus_that_covers_all_is_noticed_by_gps() -> None:
             return super()._seen(points + carried[self._frame])
 
     odometry = run(times, Beside(poses, scatter(poses)), gps=gps, warn=said.append)
-    trajectory, _ = finish(Mapped.of(odometry, ()), gps)
+    trajectory, _ = aligned_trajectory(MapCheckpoint.of(odometry, ()), gps)
     off = np.linalg.norm(trajectory.positions - poses[:, :3, 3], axis=1)
     assert "lost" in said[0] and 10 < float(said[0].split()[0]) < 12
     unsure = present(trajectory.unsure)

@@ -9,7 +9,7 @@ from scan2sim.pipeline.core.plugins import names
 from scan2sim.pipeline.core.types import F64
 from scan2sim.slam import solvers
 from scan2sim.slam.geometry import exp_so3
-from scan2sim.slam.mapping.factor_graph import Chord, Factor, Graph, Solution, errors
+from scan2sim.slam.mapping.factor_graph import DistanceConstraint, Factor, Graph, Solution, errors
 from scan2sim.slam.solvers import lm
 
 
@@ -102,7 +102,7 @@ def test_outliers_and_points_behind_the_camera_dont_pull() -> None:
 def test_a_chord_sets_the_scale() -> None:
     poses, graph = street()
     length = float(np.linalg.norm(poses[-1, :3, 3] - poses[0, :3, 3]))
-    graph = replace(graph, fixed=np.arange(8) < 1, chords=(Chord(0, 7, 1.2 * length, 0.01),))
+    graph = replace(graph, fixed=np.arange(8) < 1, distances=(DistanceConstraint(0, 7, 1.2 * length, 0.01),))
     solved = lm.solve(graph, iterations=30)
     assert np.linalg.norm(positions(solved)[-1]) == pytest.approx(1.2 * length, rel=1e-3)
 
@@ -113,8 +113,9 @@ def test_the_gradient_is_half_the_costs_slope() -> None:
     rng = np.random.default_rng(4)
     wheels = Factor((3, 1), lambda a, b, m: (a[:3, :3].T @ (b[:3, 3] - a[:3, 3]) - m) / 0.5, np.array([1.0, 0, -4]))
     graph = replace(
-        graph, chords=(Chord(2, 4, 6.0, 0.8), Chord(0, 3, 8.0, 0.5)), factors=(wheels,), sigma=np.radians(2.0),
-        bend=rng.normal(0, 0.3, (len(graph.bearing), 2, 6)), shared=np.array([1e-3, -2e-3]),
+        graph, distances=(DistanceConstraint(2, 4, 6.0, 0.8), DistanceConstraint(0, 3, 8.0, 0.5)), factors=(wheels,),
+        sigma=np.radians(2.0),
+        shared_jacobian=rng.normal(0, 0.3, (len(graph.bearing), 2, 6)), shared=np.array([1e-3, -2e-3]),
         shared_sigma=np.array([0.02, 0.03]),
     )  # fmt: skip
     free = np.cumsum(~graph.fixed) - 1

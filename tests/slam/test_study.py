@@ -18,7 +18,7 @@ from scan2sim.flows.pipelines.study import segment_of
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.types import Camera, GpsTrack, Trajectory
 from scan2sim.pipeline.io import trajectory as trajectory_io
-from scan2sim.slam.steps.evaluate import lost
+from scan2sim.slam.steps.evaluate import lost_share
 from scan2sim.slam.video import open_video
 from scan2sim.slam.video_degradation import encode, scaled
 from tests.slam.conftest import Drive
@@ -83,7 +83,7 @@ def test_a_cell_that_sees_nothing_is_na_with_its_reason(corridor: Drive, drive: 
         cv2.imwrite(str(drive / f"{i}.png"), np.full((128, 256), 90, np.uint8))
     studied(drive, tmp_path / "out", "--heights", "64", "--bitrates", "1", "--rates", "5")
     row = rows_of(tmp_path / "out")["64", "1"]
-    assert row["reason"] == "lost for 100 % of the way" and row["frames"] == "10"
+    assert row["reason"] == "tracking lost on 100 % of the path" and row["frames"] == "10"
 
 
 def test_a_cell_that_fails_is_na_and_takes_no_other_with_it(drive: Path, tmp_path: Path) -> None:
@@ -127,7 +127,7 @@ def test_the_truth_decides_on_the_segments_and_on_what_was_lost() -> None:
     assert segment_of(video, truth) == 200
     assert segment_of(video, GpsTrack(truth.times[::10], truth.positions[::10])) == 200
     unsure = x >= 375
-    assert lost(replace(truth, unsure=unsure), truth) == pytest.approx(0.25, abs=0.003)
+    assert lost_share(replace(truth, unsure=unsure), truth) == pytest.approx(0.25, abs=0.003)
 
 
 def test_a_camera_is_scaled_with_its_frames() -> None:
@@ -146,6 +146,6 @@ def test_bad_numbers_and_what_is_missing_are_refused(drive: Path, tmp_path: Path
     ):
         with pytest.raises(SettingError, match=message):
             studied(drive, tmp_path / "out", *options)
-    with pytest.raises(InputError, match="is missing"):
+    with pytest.raises(InputError, match="file not found"):
         studied(tmp_path / "no.mp4", tmp_path / "out", "--truth", drive / "truth.csv")
     assert not (tmp_path / "out").exists()

@@ -12,7 +12,7 @@ import pytest
 from scan2sim.pipeline.core.types import Camera
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 from scan2sim.slam.odometry.video_odometry import track
-from scan2sim.slam.tracking_video import KNOWN, PATH, UNSURE, WIDTH, Recorder
+from scan2sim.slam.tracking_video import INLIER_BGR, MAX_WIDTH_PX, PATH_BGR, UNSURE_BGR, Recorder
 from scan2sim.slam.video import open_video
 from tests.present import present
 from tests.slam.conftest import FPS, Drive
@@ -47,10 +47,10 @@ def test_a_drive_is_recorded(corridor: Drive, tmp_path: Path) -> None:
     shown = frames_of(file)
     assert len(shown) == len(corridor.truth) // 2  # every other frame is enough
     height, width = shown[-1].shape[:2]
-    assert width <= WIDTH and height % 2 == 0 and width % 2 == 0
+    assert width <= MAX_WIDTH_PX and height % 2 == 0 and width % 2 == 0
     frame, ground = shown[-1][: width // 2], shown[-1][width // 2 :]
-    assert near(frame, KNOWN) > 100 and near(frame, (0, 230, 250)) > 30
-    assert near(ground, PATH) > 100 and near(ground, UNSURE) == 0
+    assert near(frame, INLIER_BGR) > 100 and near(frame, (0, 230, 250)) > 30
+    assert near(ground, PATH_BGR) > 100 and near(ground, UNSURE_BGR) == 0
     grey = shown[0][: width // 2].mean(axis=-1)[60:]
     assert (
         np.corrcoef(grey[::16, ::16].ravel(), enlarged(corridor.greys[0], width)[60:][::16, ::16].ravel())[0, 1] > 0.8
@@ -85,17 +85,17 @@ def lost() -> tuple[Odometry, list[np.ndarray]]:
 def test_being_lost_is_shown_and_stays_on_the_map_in_red(lost: tuple[Odometry, list[np.ndarray]]) -> None:
     _, pictures = lost
     top = pictures[0].shape[1] // 2
-    assert near(pictures[30][:top], UNSURE) == 0 and near(pictures[30][top:], UNSURE) == 0
-    assert near(pictures[38][:top], UNSURE) > 50  # it says so, over the frame
-    assert near(pictures[-1][:top], UNSURE) == 0 and near(pictures[-1][top:], UNSURE) > 20
+    assert near(pictures[30][:top], UNSURE_BGR) == 0 and near(pictures[30][top:], UNSURE_BGR) == 0
+    assert near(pictures[38][:top], UNSURE_BGR) > 50  # it says so, over the frame
+    assert near(pictures[-1][:top], UNSURE_BGR) == 0 and near(pictures[-1][top:], UNSURE_BGR) > 20
 
 
 def test_a_recorder_may_begin_in_the_middle(lost: tuple[Odometry, list[np.ndarray]]) -> None:
     odometry, pictures = lost
     late = Recorder(Path("nowhere.mp4"), 10.0).draw(odometry, np.zeros((4, 8), np.uint8))
     top = late.shape[1] // 2
-    assert near(late[top:], PATH) > 0.8 * near(pictures[-1][top:], PATH)
-    assert near(late[top:], UNSURE) > 0.8 * near(pictures[-1][top:], UNSURE)
+    assert near(late[top:], PATH_BGR) > 0.8 * near(pictures[-1][top:], PATH_BGR)
+    assert near(late[top:], UNSURE_BGR) > 0.8 * near(pictures[-1][top:], UNSURE_BGR)
 
 
 @pytest.mark.parametrize(
@@ -108,8 +108,8 @@ def test_the_layout_suits_the_frame(size: tuple[int, int], beside: bool) -> None
     odometry.add(0.0, grey)
     picture = Recorder(Path("nowhere.mp4"), 10.0).draw(odometry, grey)
     height, width = picture.shape[:2]
-    assert width <= WIDTH and height % 2 == 0 == width % 2
-    assert (width == WIDTH and height < 0.6 * WIDTH) == beside
+    assert width <= MAX_WIDTH_PX and height % 2 == 0 == width % 2
+    assert (width == MAX_WIDTH_PX and height < 0.6 * MAX_WIDTH_PX) == beside
 
 
 def test_an_interrupted_recording_can_be_played(corridor: Drive, tmp_path: Path) -> None:

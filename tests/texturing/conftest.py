@@ -1,4 +1,4 @@
-"""What tests of texturing share."""
+"""Fixtures of the texturing tests."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ from tests.texturing.corner import Street
 
 @pytest.fixture
 def street(tmp_path: Path) -> Street:
-    """A made-up street corner without photos and points; tests add theirs."""
+    """Synthetic street corner without photos and points; tests add them."""
     return Street(tmp_path)

@@ -1,4 +1,4 @@
-"""A made-up street corner: ground and a box with a known paint, photographed by any camera."""
+"""Synthetic street corner: ground and a box with known colours, photographed by any camera."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from scan2sim.texturing.view_selection.step import CHOOSE
 def grid(
     corner: tuple[float, float, float], along: tuple[float, float, float], up: tuple[float, float, float], n: int = 12
 ) -> tuple[F64, npt.NDArray[np.int64]]:
-    """A rectangle from `corner`, spanned by two vectors, of n x n cells; its front is where along x up points."""
+    """Rectangle of n x n cells from `corner`, spanned by two vectors; its front faces the direction along x up."""
     s, t = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1), indexing="ij")
     vertices = np.asarray(corner) + s.reshape(-1, 1) * np.asarray(along) + t.reshape(-1, 1) * np.asarray(up)
     i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
@@ -55,7 +55,7 @@ BOX = join(
 
 
 def paint(xyz: npt.ArrayLike) -> F64:
-    """(N, 3) colour of the surface: soft stripes; the box is red all over."""
+    """(N, 3) colour of the surface at points (N, 3): soft stripes on the ground, the box is red."""
     x, y, z = np.moveaxis(np.asarray(xyz, float), -1, 0)
     ground = np.stack([60 + 40 * np.sin(3 * x), 120 + 50 * np.sin(2.5 * y + x), 130 + 60 * np.cos(2 * x - y)], axis=-1)
     red = np.stack([220 + 20 * np.sin(4 * z + y), 40 + 20 * np.sin(3 * y + x), 40 + 0 * z], axis=-1)
@@ -63,7 +63,7 @@ def paint(xyz: npt.ArrayLike) -> F64:
 
 
 def photograph(camera: Camera, pose: F64, meshes: tuple[Mesh, ...] = (GROUND, BOX), gain: float = 1.0) -> U8:
-    """(H, W, 3) uint8: the paint as a camera sees it."""
+    """(H, W, 3) uint8 rendering of the surface colours from a camera."""
     from scan2sim.pipeline.camera.models import pixel_rays, ray_origins
 
     image = Renderer([Body(mesh) for mesh in meshes]).view(camera, pose)
@@ -85,7 +85,7 @@ POSES = [look_at((-4, y, 1.8), (0, y / 2, 0.6)) for y in (-3.0, -1.0, 1.0, 3.0)]
 
 @dataclass
 class Street:
-    """Everything that the step `texture` reads, in a folder; fields may be changed before `run`."""
+    """All inputs of the step `texture`, in a folder; fields may be changed before `run`."""
 
     folder: Path
     mesh: Mesh = GROUND
@@ -99,7 +99,7 @@ class Street:
     runs: int = 0
 
     def add(self, camera: Camera, pose: F64, image: U8 | None = None, mask: U8 | None = None) -> View:
-        """Take a photo (or put `image` in its place)."""
+        """Add a rendered photo, or `image` in its place."""
         name = f"photo{len(self.views)}"
         path = self.folder / f"{name}.png"
         cv2.imwrite(str(path), (photograph(camera, pose) if image is None else image)[..., ::-1])
@@ -117,16 +117,16 @@ class Street:
         choose: dict[str, Any] | None = None,
         **params: Any,
     ) -> tuple[Path, Done]:
-        """Unwrap and texture, settings by step; returns (folder of the textured mesh, what the steps said)."""
+        """Unwrap and texture with settings by step; returns (folder of the textured mesh, the steps' results)."""
         out = self.folder / f"run{self.runs}"
         self.runs += 1
         (out / "depth").mkdir(parents=True)
         self.mesh.save(out / "in.npz")
-        laid = UnwrapParams(backend="xatlas", texel=self.texel, page_size=self.page_size)
-        flat = unwrap({"mesh": out / "in.npz"}, laid, out, silent)
-        hides = scene(self.occluders)
+        settings = UnwrapParams(backend="xatlas", texel=self.texel, page_size=self.page_size)
+        flat = unwrap({"mesh": out / "in.npz"}, settings, out, silent)
+        occluders = scene(self.occluders)
         for i, view in enumerate(self.views):
-            np.save(out / "depth" / f"{i}.npy", depth_map(view.camera, view.T_world_cam, hides).range)
+            np.save(out / "depth" / f"{i}.npy", depth_map(view.camera, view.T_world_cam, occluders).range)
         views_io.save(out / "views.json", self.views, self.held_out)
         inputs = {**flat.files, "views": out / "views.json", "depth": out / "depth"}
         warnings: list[str] = []
@@ -143,7 +143,7 @@ class Street:
 
 
 def points(colour: bool = True, n: int = 40_000, rgb: tuple[int, int, int] | None = None) -> PointCloud:
-    """Points all over the ground with its paint (or one colour)."""
+    """Points all over the ground with its colours, or with one colour."""
     rng = np.random.default_rng(0)
     xyz = np.column_stack([rng.uniform(-5, 5, (n, 2)), np.zeros(n)]).astype(np.float32)
     colours = np.clip(paint(xyz), 0, 255).astype(np.uint8) if rgb is None else np.tile(np.array(rgb, np.uint8), (n, 1))

@@ -1,4 +1,4 @@
-"""The GPU's painting against the processors', on torch's own CPU."""
+"""Baking with torch (here on its CPU device) against baking with numba."""
 
 import numpy as np
 import pytest
@@ -12,53 +12,53 @@ from tests.texturing.corner import CAMERAS, POSES, Street, photograph, points
 pytest.importorskip("torch", reason="torch is not installed (pip install 'scan2sim[segmentation]')")
 
 
-WHOLE = [
+COMBINATIONS = [
     pytest.param(name, band, marks=() if (band, name) == (2, "pinhole") else pytest.mark.slow)
     for name in CAMERAS
     for band in (2, 0, -1)
 ]
-"""One of them at once, the rest when there is time: `test_torch_adds_the_same` has all, of the kernel alone."""
+"""One combination by default, the others only in slow runs: `test_torch_blends_equally` tests the kernel with all."""
 
 
-@pytest.mark.parametrize(("name", "band"), WHOLE)
-def test_torch_paints_the_same(street: Street, name: str, band: int) -> None:
+@pytest.mark.parametrize(("name", "band"), COMBINATIONS)
+def test_torch_bakes_equal_pages(street: Street, name: str, band: int) -> None:
     camera = CAMERAS[name]
     mask = np.full((camera.height, camera.width), 255, np.uint8)
     mask[: camera.height // 3, : camera.width // 4] = 0
     for i, pose in enumerate(POSES):
         street.add(camera, pose, photograph(camera, pose, gain=1 + 0.1 * i), mask if i == 1 else None)
     street.clouds["terrain"] = points()
-    mine, done = street.run(band=band, device="numba")
-    theirs, again = street.run(band=band, device="cpu")
+    by_numba, done = street.run(band=band, device="numba")
+    by_torch, done_torch = street.run(band=band, device="cpu")
     for page in range(done.facts["pages"]):
-        a, b = (image.read_rgb(folder / f"page_{page}.png").astype(int) for folder in (mine, theirs))
-        seen = [image.read_levels(folder / f"page_{page}_seen.png") for folder in (mine, theirs)]
+        a, b = (image.read_rgb(folder / f"page_{page}.png").astype(int) for folder in (by_numba, by_torch))
+        seen = [image.read_levels(folder / f"page_{page}_seen.png") for folder in (by_numba, by_torch)]
         assert (seen[0] == seen[1]).mean() > 0.99999
         assert (abs(a - b).max(axis=2) <= 1).mean() > 0.99999
-    assert again.facts["coverage"] == pytest.approx(done.facts["coverage"], abs=1e-4)
+    assert done_torch.facts["coverage"] == pytest.approx(done.facts["coverage"], abs=1e-4)
 
 
 @pytest.mark.parametrize("band", [2, 0, -1])
 @pytest.mark.parametrize("name", scattered.CAMERAS)
-def test_torch_adds_the_same(name: str, band: int) -> None:
-    from scan2sim.texturing.bake.blend_torch import TorchRows
+def test_torch_blends_equally(name: str, band: int) -> None:
+    from scan2sim.texturing.bake.blend_torch import TorchRowBlender
 
     camera, rng = scattered.CAMERAS[name], np.random.default_rng(7)
-    laid = scattered.scattered(rng, camera)
-    source, faces = scattered.taken(rng, camera, band), np.arange(len(laid.flat))
+    page_faces = scattered.random_squares(rng, camera)
+    source, faces = scattered.random_photo(rng, camera, band), np.arange(len(page_faces.flat))
     share = rng.choice([0, 1], (len(faces), 3)).astype(np.float32)
-    weighing = blend_numba.Weighing(bias=0.05, power=1.5, feather=9.0, min_cos=0.5, band=band)
+    settings = blend_numba.BlendSettings(bias=0.05, power=1.5, feather=9.0, min_cos=0.5, band=band)
     pages = []
-    for rows in (blend_numba.NumbaRows(laid), TorchRows(laid, "cpu")):
-        rgb, seen = np.zeros((*laid.owner.shape, 3), np.uint8), np.zeros(laid.owner.shape, np.uint8)
-        texels = rows.add(faces, share, source, weighing)
+    for rows in (blend_numba.NumbaRowBlender(page_faces), TorchRowBlender(page_faces, "cpu")):
+        rgb, seen = np.zeros((*page_faces.owner.shape, 3), np.uint8), np.zeros(page_faces.owner.shape, np.uint8)
+        texels = rows.add(faces, share, source, settings)
         rows.resolve(rgb, seen)
         assert texels == (seen == 255).sum() > 500
         pages.append(rgb.astype(int))
     assert abs(pages[0] - pages[1]).max() <= 1
 
 
-def test_a_device_that_is_not_there_is_named(street: Street) -> None:
+def test_unavailable_device_is_named(street: Street) -> None:
     street.add(CAMERAS["pinhole"], POSES[0])
     with pytest.raises(SettingError, match="xpu:7"):
         street.run(device="xpu:7")

@@ -1,4 +1,4 @@
-"""Exposures solved jointly, against those that photos were taken with."""
+"""Joint exposure calibration against the exposures with which photos were taken."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,7 +20,7 @@ STOPS = [0.5, -0.7, 0.2, 0.0]
 
 
 def exposed(image: U8, stops: float, tint: tuple[float, float, float] = (0, 0, 0), corners: float = 0.0) -> U8:
-    """A photo with its light times 2^stops (channels: times 2^tint), and 2^-corners times that in its corners."""
+    """A photo with its light multiplied by 2^stops (channels by 2^tint), and by 2^-corners in the corners."""
     x = image / 255.0
     light = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
     v, u = np.mgrid[-1 : 1 : image.shape[0] * 1j, -1 : 1 : image.shape[1] * 1j]
@@ -31,11 +31,11 @@ def exposed(image: U8, stops: float, tint: tuple[float, float, float] = (0, 0, 0
 
 
 def solved(street: Street, out: Path, prior: Path | None = None, **params: Any) -> tuple[Exposures, Mapping[str, Any]]:
-    """Run the step; the exposures it found, and its facts."""
-    hides = scene(street.occluders)
+    """Run the step; returns the estimated exposures, and its metrics."""
+    occluders = scene(street.occluders)
     (out / "depth").mkdir(parents=True)
     for i, view in enumerate(street.views):
-        np.save(out / "depth" / f"{i}.npy", depth_map(view.camera, view.T_world_cam, hides).range)
+        np.save(out / "depth" / f"{i}.npy", depth_map(view.camera, view.T_world_cam, occluders).range)
     views_io.save(out / "views.json", street.views, street.held_out)
     inputs = {"views": out / "views.json", "depth": out / "depth"}
     if prior is not None:
@@ -45,8 +45,8 @@ def solved(street: Street, out: Path, prior: Path | None = None, **params: Any) 
 
 
 @pytest.fixture
-def taken(street: Street) -> Street:
-    """Four photos of different exposure, one of them bluish."""
+def exposed_street(street: Street) -> Street:
+    """Street with four photos of different exposure, one of them bluish."""
     for pose, stops in zip(POSES, STOPS, strict=True):
         tint = (-0.1, 0, 0.1) if stops == 0.2 else (0, 0, 0)
         street.add(CAMERAS["pinhole"], pose, exposed(photograph(CAMERAS["pinhole"], pose), stops - 0.5, tint))
@@ -57,9 +57,9 @@ def stops_of(exposures: Exposures, street: Street) -> F64:
     return np.array([np.log2(exposures.gain[view.name]) for view in street.views])
 
 
-def test_exposures_and_tints_are_found(taken: Street, tmp_path: Path) -> None:
-    found, facts = solved(taken, tmp_path / "x")
-    relative = stops_of(found, taken)
+def test_exposures_and_tints_are_estimated(exposed_street: Street, tmp_path: Path) -> None:
+    found, facts = solved(exposed_street, tmp_path / "x")
+    relative = stops_of(found, exposed_street)
     relative -= relative.mean()
     true = -np.array([[s] * 3 for s in STOPS])
     true[2] += (0.1, 0, -0.1)
@@ -67,21 +67,21 @@ def test_exposures_and_tints_are_found(taken: Street, tmp_path: Path) -> None:
     assert facts["disagreement_after"] < 0.3 * facts["disagreement_before"]
 
 
-def test_the_whole_stays_as_bright_as_the_photos_are(taken: Street, tmp_path: Path) -> None:
-    found, _ = solved(taken, tmp_path / "x")
-    assert abs(stops_of(found, taken).mean()) < 0.05
+def test_mean_brightness_is_unchanged(exposed_street: Street, tmp_path: Path) -> None:
+    found, _ = solved(exposed_street, tmp_path / "x")
+    assert abs(stops_of(found, exposed_street).mean()) < 0.05
 
 
-def test_what_an_earlier_tile_found_stays(taken: Street, tmp_path: Path) -> None:
-    first, _ = solved(taken, tmp_path / "x")
-    r, g, b = first.gain[taken.views[1].name]
-    brighter = Exposures({taken.views[1].name: (2 * r, 2 * g, 2 * b)}, {})
+def test_prior_exposures_are_kept(exposed_street: Street, tmp_path: Path) -> None:
+    first, _ = solved(exposed_street, tmp_path / "x")
+    r, g, b = first.gain[exposed_street.views[1].name]
+    brighter = Exposures({exposed_street.views[1].name: (2 * r, 2 * g, 2 * b)}, {})
     brighter.save(tmp_path / "prior.json")
-    found, _ = solved(taken, tmp_path / "y", tmp_path / "prior.json")
-    np.testing.assert_allclose(stops_of(found, taken), stops_of(first, taken) + 1, atol=0.1)
+    found, _ = solved(exposed_street, tmp_path / "y", tmp_path / "prior.json")
+    np.testing.assert_allclose(stops_of(found, exposed_street), stops_of(first, exposed_street) + 1, atol=0.1)
 
 
-def test_vignetting_is_found_where_there_is_some(street: Street, tmp_path: Path) -> None:
+def test_vignetting_is_estimated(street: Street, tmp_path: Path) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose, exposed(photograph(CAMERAS["pinhole"], pose), -0.2, corners=0.8))
     found, _ = solved(street, tmp_path / "x")
@@ -89,20 +89,20 @@ def test_vignetting_is_found_where_there_is_some(street: Street, tmp_path: Path)
     assert (a + b) / np.log(2) == pytest.approx(0.8, abs=0.25)
 
 
-def test_photos_alike_are_left_alone(street: Street, tmp_path: Path) -> None:
+def test_equal_photos_are_unchanged(street: Street, tmp_path: Path) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
     found, _ = solved(street, tmp_path / "x")
     assert np.abs(stops_of(found, street)).max() < 0.02 and not found.vignetting
 
 
-def test_switched_off_or_alone_nothing_changes(taken: Street, tmp_path: Path) -> None:
-    assert not solved(taken, tmp_path / "x", solve=False)[0].gain
-    taken.views = taken.views[:1]
-    assert not solved(taken, tmp_path / "y")[0].gain
+def test_nothing_changes_if_disabled_or_with_one_photo(exposed_street: Street, tmp_path: Path) -> None:
+    assert not solved(exposed_street, tmp_path / "x", solve=False)[0].gain
+    exposed_street.views = exposed_street.views[:1]
+    assert not solved(exposed_street, tmp_path / "y")[0].gain
 
 
-def test_no_exposure_file_is_refused_by_name(tmp_path: Path) -> None:
+def test_invalid_exposure_file_is_rejected_and_named(tmp_path: Path) -> None:
     (tmp_path / "prior.json").write_text('{"gain": {"a": [1, 1]}}', encoding="utf-8")
     with pytest.raises(InputError, match=r"prior\.json"):
         Exposures.load(tmp_path / "prior.json")

@@ -1,11 +1,11 @@
-"""Holes of a picture of the ground, whose pattern is known all over."""
+"""Inpainting of holes in an image of the ground with a known pattern."""
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from scan2sim.pipeline.core.types import F32
-from scan2sim.texturing.inpainting.patch_offsets import FACTOR, continued
+from scan2sim.texturing.inpainting.patch_offsets import COARSE_FACTOR, inpaint
 
 
 def street(height: int = 360, width: int = 480) -> F32:
@@ -31,44 +31,45 @@ def error(rgb: F32, truth: F32, where: npt.NDArray[np.bool_]) -> float:
 
 
 @pytest.mark.parametrize("rows", [slice(60, 140), slice(150, 230), slice(230, 310)])
-def test_paving_kerb_and_line_go_on(rows: slice) -> None:
+def test_paving_kerb_and_line_are_continued(rows: slice) -> None:
     truth, wanted = street(), hole(rows, slice(200, 290))
-    rgb, filled = continued(np.where(wanted[..., None], 255, truth), ~wanted, wanted)
+    rgb, filled = inpaint(np.where(wanted[..., None], 255, truth), ~wanted, wanted)
     assert filled[wanted].all() and not filled[~wanted].any()
     assert error(rgb, truth, wanted) < 14  # two grains' difference is 7; flat grey is off by 30
     assert (rgb[~wanted] == truth[~wanted]).all()
 
 
-def test_shade_on_one_side_is_met_on_both() -> None:
+def test_tone_matches_both_sides_of_the_hole() -> None:
     truth = street() * np.linspace(0.4, 1.0, 480, dtype=np.float32)[None, :, None]
     wanted = hole(slice(60, 140), slice(200, 290))
-    rgb, _ = continued(truth, ~wanted, wanted)
+    rgb, _ = inpaint(truth, ~wanted, wanted)
     rims = [hole(slice(60, 140), columns) for columns in (slice(204, 214), slice(276, 286))]
-    for rim in rims:  # shade moves one side's grey by 18 against the other's
+    for rim in rims:  # shading changes the grey level by 18 from one side to the other
         assert abs(rgb[rim].mean() - truth[rim].mean()) < 6
 
 
-def test_other_kinds_of_ground_are_not_copied() -> None:
+def test_other_classes_of_ground_are_not_copied() -> None:
     truth, wanted = street(), hole(slice(160, 192), slice(180, 300))
-    kind = np.repeat(np.where(np.arange(360)[::FACTOR] < 200, 1, 2)[:, None], 480 // FACTOR, axis=1).astype(np.int32)
-    rgb, _ = continued(truth, ~wanted, wanted, kind)
-    assert (rgb[wanted].mean(axis=-1) < 75).mean() < 0.15  # the joints alone, no road
+    by_row = np.where(np.arange(360)[::COARSE_FACTOR] < 200, 1, 2)
+    classes = np.repeat(by_row[:, None], 480 // COARSE_FACTOR, axis=1).astype(np.int32)
+    rgb, _ = inpaint(truth, ~wanted, wanted, classes)
+    assert (rgb[wanted].mean(axis=-1) < 75).mean() < 0.15  # only the joints, no road
 
 
-def test_what_is_not_wanted_is_left_and_nothing_is_copied_from_it() -> None:
+def test_ignored_cells_are_neither_filled_nor_copied() -> None:
     truth, wanted = street(), hole(slice(60, 140), slice(200, 290))
     unknown = hole(slice(0, 50), slice(0, 480))
-    rgb, filled = continued(np.where(unknown[..., None], 255, truth), ~wanted & ~unknown, wanted)
+    rgb, filled = inpaint(np.where(unknown[..., None], 255, truth), ~wanted & ~unknown, wanted)
     assert not filled[unknown].any()
     assert rgb[wanted].max() < 230
 
 
-def test_a_picture_of_nothing_known_is_left_alone() -> None:
+def test_image_without_known_cells_is_unchanged() -> None:
     wanted = np.ones((64, 64), bool)
-    rgb, filled = continued(np.zeros((64, 64, 3), np.float32), ~wanted, wanted)
+    rgb, filled = inpaint(np.zeros((64, 64, 3), np.float32), ~wanted, wanted)
     assert not filled.any() and not rgb.any()
 
 
-def test_the_same_picture_is_filled_the_same() -> None:
+def test_inpainting_is_deterministic() -> None:
     truth, wanted = street(), hole(slice(150, 230), slice(200, 290))
-    assert (continued(truth, ~wanted, wanted)[0] == continued(truth, ~wanted, wanted)[0]).all()
+    assert (inpaint(truth, ~wanted, wanted)[0] == inpaint(truth, ~wanted, wanted)[0]).all()

@@ -1,4 +1,4 @@
-"""Charts cut out of photos: metric, without overlaps, on pages of the size asked for."""
+"""Charts by projection into photos: metric, without overlaps, on pages of the wanted size."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def both() -> tuple[Mesh, I32]:
     return mesh, view
 
 
-def test_charts_are_metric_and_seen_faces_are_laid() -> None:
+def test_charts_are_metric_and_contain_seen_faces() -> None:
     mesh, view = both()
     charts = photo_charts.cut(mesh, view, CENTRES, 0.02, 2000)
     assert len(charts.face) > 0.95 * (view >= 0).sum()
@@ -31,29 +31,29 @@ def test_charts_are_metric_and_seen_faces_are_laid() -> None:
     assert (view[charts.face] >= 0).all()
 
 
-def test_a_chart_belongs_to_one_photo() -> None:
+def test_each_chart_belongs_to_one_photo() -> None:
     mesh, view = both()
     charts = photo_charts.cut(mesh, view, CENTRES, 0.02, 2000)
     for k in np.unique(charts.chart):
         assert len(np.unique(view[charts.face[charts.chart == k]])) == 1
 
 
-def test_rectangles_never_meet_and_stay_on_their_page() -> None:
+def test_packed_rectangles_do_not_overlap_and_stay_on_their_page() -> None:
     rng = np.random.default_rng(0)
     size = rng.integers(1, 90, (300, 2))
-    place, page, pages = photo_charts.pack(size, 256, 3)
+    position, page, pages = photo_charts.pack(size, 256, 3)
     assert len(pages) > 1 and all(w <= 256 and h <= 256 for w, h in pages)
     for k, (width, height) in enumerate(pages):
-        taken = np.zeros((height, width), int)
+        cover_count = np.zeros((height, width), int)
         for i in np.flatnonzero(page == k):
-            (x, y), (w, h) = place[i], size[i]
+            (x, y), (w, h) = position[i], size[i]
             assert x >= 3 and y >= 3 and x + w + 3 <= width and y + h + 3 <= height
-            taken[y - 3 : y + h + 3, x - 3 : x + w + 3] += 1
-        assert taken.max() <= 2  # two gutters may share their room's border, no more
-        assert (place[page == k] >= 0).all()
+            cover_count[y - 3 : y + h + 3, x - 3 : x + w + 3] += 1
+        assert cover_count.max() <= 2  # at most two gutters may overlap at their borders
+        assert (position[page == k] >= 0).all()
 
 
-def test_faces_under_others_are_told() -> None:
+def test_faces_covered_by_others_are_detected() -> None:
     flat = np.array(
         [[[0, 0], [20, 0], [0, 20]], [[0, 0], [20, 0], [0, 20]], [[30, 30], [50, 30], [30, 50]]], np.float32
     )
@@ -61,7 +61,7 @@ def test_faces_under_others_are_told() -> None:
     assert covered.tolist() == [False, True, False]
 
 
-def test_no_seen_face_no_chart() -> None:
+def test_no_charts_without_seen_faces() -> None:
     mesh, view = both()
     charts = photo_charts.cut(mesh, np.full_like(view, -1), CENTRES, 0.02, 2000)
     assert len(charts.face) == 0 and photo_charts.pack(charts.size, 256, 3)[2] == []

@@ -1,4 +1,4 @@
-"""Photos that disagree with the rest: ghosts, wrong poses, blur, overexposure."""
+"""Photos that are inconsistent with the others: ghosts, wrong poses, blur, overexposure."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ POSES = [look_at((-4, y, 1.8), (0, y / 2, 0.6)) for y in (-3.0, -1.5, 0.0, 1.5, 
 
 
 def grainy(pose: F64) -> U8:
-    """A photo of the corner with a fine pattern on its ground: something to tell sharpness and displacement by."""
+    """A photo of the corner with a fine pattern on the ground, to measure sharpness and displacement."""
     from scan2sim.pipeline.camera.models import pixel_rays
 
     image = Renderer([Body(GROUND), Body(BOX)]).view(CAMERA, pose)
@@ -30,14 +30,14 @@ def grainy(pose: F64) -> U8:
 
 
 def rows_of(folder: Path) -> dict[str, Any]:
-    """What `agreement` said of each photo, by name."""
+    """Rows of `agreement.json` by name of the photo."""
     return {
         row["name"]: row
         for row in json.loads((folder.parent / "agreement" / "agreement.json").read_text(encoding="utf-8"))
     }
 
 
-def test_a_passing_car_leaves_no_ghost(street: Street) -> None:
+def test_passing_car_is_masked_as_ghost(street: Street) -> None:
     for i, pose in enumerate(POSES):
         image = photograph(CAMERA, pose)
         if i == 2:
@@ -57,7 +57,7 @@ def test_a_passing_car_leaves_no_ghost(street: Street) -> None:
 
 
 @pytest.mark.parametrize("turn, shift", [(0.5, 0.0), (0.0, 0.2)])
-def test_a_wrong_pose_is_named_and_left_out(street: Street, turn: float, shift: float) -> None:
+def test_photo_with_wrong_pose_is_excluded_and_named(street: Street, turn: float, shift: float) -> None:
     for i, pose in enumerate(POSES):
         true = pose.copy()
         if i == 3:
@@ -73,7 +73,7 @@ def test_a_wrong_pose_is_named_and_left_out(street: Street, turn: float, shift: 
     assert "photo3" not in done.facts["texels_by_photo"]
 
 
-def test_a_blurred_photo_gives_little(street: Street) -> None:
+def test_blurred_photo_is_down_weighted(street: Street) -> None:
     for i, pose in enumerate(POSES):
         image = grainy(pose)
         street.add(CAMERA, pose, cv2.GaussianBlur(image, (0, 0), 4) if i == 2 else image)
@@ -84,7 +84,7 @@ def test_a_blurred_photo_gives_little(street: Street) -> None:
     assert any("photo2" in warning and "blurred" in warning for warning in done.warnings)
 
 
-def test_an_overexposed_photo_is_left_out(street: Street) -> None:
+def test_overexposed_photo_is_excluded(street: Street) -> None:
     for i, pose in enumerate(POSES):
         street.add(CAMERA, pose, np.full((480, 640, 3), 255, np.uint8) if i == 1 else None)
     _, done = street.run()
@@ -92,7 +92,7 @@ def test_an_overexposed_photo_is_left_out(street: Street) -> None:
     assert "photo1" not in done.facts["texels_by_photo"]
 
 
-def test_photos_that_agree_are_all_used_whole(street: Street) -> None:
+def test_consistent_photos_are_used_without_masks(street: Street) -> None:
     for pose in POSES:
         street.add(CAMERA, pose)
     folder, done = street.run()
@@ -100,7 +100,7 @@ def test_photos_that_agree_are_all_used_whole(street: Street) -> None:
     assert max(row.get("ghost_share", 0) for row in rows_of(folder).values()) < 0.01
 
 
-def test_one_photo_alone_will_do(street: Street) -> None:
+def test_single_photo_is_used(street: Street) -> None:
     street.add(CAMERA, POSES[2])
     _, done = street.run()
     assert done.facts["photos"] == 1 and not done.warnings

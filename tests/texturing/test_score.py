@@ -1,4 +1,4 @@
-"""The step `score` on a made-up street corner: what it tells of held-out photos and of the truth."""
+"""Step `score` on a synthetic street corner: scores against held-out photos and ground truth."""
 
 import json
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ from tests.texturing.corner import CAMERAS, POSES, Street, paint, points
 
 
 def inputs_of(street: Street) -> dict[str, Path]:
-    """Texture the street and give what the step reads."""
+    """Texture the street and return the inputs of the step."""
     street.texel = 0.04
     folder, _ = street.run()
     return {"terrain": folder, "views": folder.parent / "views.json", "depth": folder.parent / "depth"}
@@ -26,7 +26,7 @@ def inputs_of(street: Street) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def textured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """What the step reads of a textured street of which the second of four photos is held out."""
+    """Inputs of the step: a textured street with the second of four photos held out."""
     street = Street(tmp_path_factory.mktemp("street"))
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
@@ -37,16 +37,16 @@ def textured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def scored(textured: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Done:
-    """What the step says of it."""
+    """Result of the step."""
     return score(textured, ScoreParams(), tmp_path_factory.mktemp("score"), silent)
 
 
 def strict(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """The facts as JSON keeps them, which knows no NaN."""
+    """The metrics after a round trip through JSON, which has no NaN."""
     return json.loads(json.dumps(facts, allow_nan=False))
 
 
-def test_a_held_out_photo_is_told_by_class_and_by_distance(scored: Done) -> None:
+def test_held_out_photo_is_scored_by_class_and_by_distance(scored: Done) -> None:
     facts = strict(scored.facts)
     assert facts["held_out"] == 1 and list(facts["photos"]) == ["photo1"]
     assert facts["psnr_db"] > 28 and facts["ssim"] > 0.85 and 0.7 < facts["sharpness"] < 1.1
@@ -59,7 +59,7 @@ def test_a_held_out_photo_is_told_by_class_and_by_distance(scored: Done) -> None
     assert not scored.warnings
 
 
-def test_every_held_out_photo_has_its_error_picture(scored: Done) -> None:
+def test_every_held_out_photo_has_an_error_image(scored: Done) -> None:
     folder = scored.files["error"]
     (entry,) = json.loads((folder / "index.json").read_text(encoding="utf-8"))
     assert (entry["role"], entry["title"]) == ("error", "photo1") and "dB" in entry["caption"]
@@ -67,7 +67,7 @@ def test_every_held_out_photo_has_its_error_picture(scored: Done) -> None:
     assert picture is not None and picture.shape[1] <= 1600
 
 
-def test_without_held_out_photos_figures_are_none(street: Street, tmp_path: Path) -> None:
+def test_scores_are_none_without_held_out_photos(street: Street, tmp_path: Path) -> None:
     street.add(CAMERAS["pinhole"], POSES[0])
     done = score(inputs_of(street), ScoreParams(), tmp_path, silent)
     facts = strict(done.facts)
@@ -75,9 +75,7 @@ def test_without_held_out_photos_figures_are_none(street: Street, tmp_path: Path
     assert json.loads((done.files["error"] / "index.json").read_text(encoding="utf-8")) == []
 
 
-def test_held_out_photos_of_what_the_world_lacks_count_and_those_that_cannot_be_read_are_named(
-    street: Street, tmp_path: Path
-) -> None:
+def test_photos_of_missing_surfaces_are_scored_and_unreadable_ones_are_named(street: Street, tmp_path: Path) -> None:
     away = look_at((-4, 0, 1.8), (-9, 0, 4))  # at the sky
     for pose in (POSES[0], POSES[1], away):
         street.add(CAMERAS["pinhole"], pose)
@@ -93,7 +91,7 @@ def test_held_out_photos_of_what_the_world_lacks_count_and_those_that_cannot_be_
     assert "photo1.png" in warning and "can't be read" in warning
 
 
-def test_cameras_beside_a_surface_are_told_and_how_near_they_are(street: Street, tmp_path: Path) -> None:
+def test_cameras_near_a_surface_are_reported_with_distance(street: Street, tmp_path: Path) -> None:
     low = POSES[1].copy()
     low[2, 3] = 0.4  # the ground is at 0
     for pose in (POSES[0], low):
@@ -102,11 +100,13 @@ def test_cameras_beside_a_surface_are_told_and_how_near_they_are(street: Street,
     assert cameras == {"count": 2, "near_m": {"photo1": pytest.approx(0.4, abs=0.05)}}
 
 
-def test_what_photos_saw_from_near_is_held_against_the_truth_apart(textured: dict[str, Path], tmp_path: Path) -> None:
-    """The truth is made wrong beyond 5 m of every photo that was not held out."""
+def test_surfaces_seen_from_near_are_compared_with_ground_truth_separately(
+    textured: dict[str, Path], tmp_path: Path
+) -> None:
+    """Ground truth is wrong beyond 5 m from every photo that was not held out."""
     truth = points()
-    eyes = np.array([pose[:3, 3] for i, pose in enumerate(POSES) if i != 1])
-    near = np.linalg.norm(truth.xyz[:, None] - eyes, axis=2).min(axis=1) <= 5
+    centres = np.array([pose[:3, 3] for i, pose in enumerate(POSES) if i != 1])
+    near = np.linalg.norm(truth.xyz[:, None] - centres, axis=2).min(axis=1) <= 5
     rgb = np.where(near[:, None], np.clip(paint(truth.xyz), 0, 255), 255).astype(np.uint8)
     las.write(tmp_path / "truth.laz", PointCloud(Frame(), truth.xyz, rgb))
     inputs = {**textured, "truth.points": tmp_path / "truth.laz"}

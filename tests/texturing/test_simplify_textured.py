@@ -1,4 +1,4 @@
-"""Textured meshes made smaller look as before, keep their classes, and still end where they ended."""
+"""Simplified textured meshes look as before and keep their classes and borders."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 
 from scan2sim.pipeline.camera import renderer
 from scan2sim.pipeline.core.step import silent
-from scan2sim.texturing.simplify_textured import reduced
+from scan2sim.texturing.simplify_textured import simplified_scene
 from tests.pipeline import synthetic
 
 TEXELS = 40_000
 
 
-def test_a_smaller_scene_looks_as_before(tmp_path: Path) -> None:
+def test_simplified_scene_meets_budget_and_looks_as_before(tmp_path: Path) -> None:
     scene = synthetic.scene(tmp_path / "town", tiles=1)
-    small = reduced(scene, 120, TEXELS, tmp_path / "small", silent)
+    small = simplified_scene(scene, 120, TEXELS, tmp_path / "small", silent)
     old, new = (s.tiles[0] for s in (scene, small))
     assert sum(g["triangles"] for g in new.groups.values()) <= 126 < sum(g["triangles"] for g in old.groups.values())
     pages = [page for shape in new.textured().values() for page in shape.pages]
@@ -25,19 +25,19 @@ def test_a_smaller_scene_looks_as_before(tmp_path: Path) -> None:
     assert {surface.code for surface in new.surfaces()} == {surface.code for surface in old.surfaces()}
     assert all(not np.any(shape.photo) for shape in new.textured().values()) and len(new.views()) == 1
     assert new.low == old.low and new.high[:2] == old.high[:2]
-    eye = renderer.look_at((-12, -9, 12), (0, 0, 0))
-    pictures = [
+    pose = renderer.look_at((-12, -9, 12), (0, 0, 0))
+    images = [
         renderer.Renderer([renderer.textured(tile.folder / group) for group in tile.groups])
-        .view(renderer.pinhole(160, 120), eye)
+        .view(renderer.pinhole(160, 120), pose)
         .rgb.astype(float)
         for tile in (old, new)
     ]
-    assert np.median(np.abs(pictures[0] - pictures[1])) < 3 and np.abs(pictures[0] - pictures[1]).mean() < 12
+    assert np.median(np.abs(images[0] - images[1])) < 3 and np.abs(images[0] - images[1]).mean() < 12
 
 
-def test_what_is_small_enough_stays_as_it_is(tmp_path: Path) -> None:
+def test_tiles_within_budget_are_unchanged(tmp_path: Path) -> None:
     scene = synthetic.scene(tmp_path / "town", tiles=2)
-    same = reduced(scene, 100_000, 1e9, tmp_path / "same", silent)
+    same = simplified_scene(scene, 100_000, 1e9, tmp_path / "same", silent)
     for old, new in zip(scene.tiles, same.tiles, strict=True):
         assert (new.offset, new.groups) == (old.offset, old.groups)
         assert (new.folder / "terrain/page_0.png").samefile(old.folder / "terrain/page_0.png")

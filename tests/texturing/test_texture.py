@@ -1,4 +1,4 @@
-"""Textures of a made-up street corner against its known paint."""
+"""Textures of a synthetic street corner against its known colours."""
 
 import json
 from pathlib import Path
@@ -20,14 +20,14 @@ LOW, HIGH = (-5, -5, 0), (5, 5, 3)
 
 
 def from_above(folder: Path, width: int = 200) -> tuple[F64, U8, F64, F64, F64]:
-    """The ground as textured, where it is, and its true paint: (H, W, 3), seen (H, W), (H, W, 3)."""
+    """Orthographic view of the textured ground: rgb (H, W, 3), seen (H, W), true colours (H, W, 3), x and y (H, W)."""
     image = Renderer([textured(folder)]).above(LOW, HIGH, width=width)
     x, y = np.meshgrid(-5 + (np.arange(width) + 0.5) * 10 / width, 5 - (np.arange(width) + 0.5) * 10 / width)
     return image.rgb.astype(float), image.seen, np.clip(paint(np.stack([x, y, 0 * x], axis=-1)), 0, 255), x, y
 
 
-def apart_from_the_box(x: F64, y: F64) -> npt.NDArray[np.bool_]:
-    """(H, W) where the box doesn't stand, nor is as near as the depth test's bias."""
+def away_from_the_box(x: F64, y: F64) -> npt.NDArray[np.bool_]:
+    """(H, W) ground outside the box and farther from it than the bias of the depth test."""
     return (abs(x - 0.5) > 0.65) | (abs(y) > 1.15)
 
 
@@ -36,20 +36,20 @@ def psnr(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> float:
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_photos_come_back_as_texture(street: Street, name: str) -> None:
+def test_texture_equals_the_true_colours(street: Street, name: str) -> None:
     for pose in POSES:
         street.add(CAMERAS[name], pose)
     street.clouds["terrain"] = points()
     folder, done = street.run()
     rgb, seen, truth, x, y = from_above(folder)
-    near = (seen == 255) & (x < 1) & apart_from_the_box(x, y) & (abs(y) < 4.9)
+    near = (seen == 255) & (x < 1) & away_from_the_box(x, y) & (abs(y) < 4.9)
     assert near.mean() > 0.2
     assert psnr(rgb[near], truth[near]) > 30
     assert done.facts["photos"] == 4
     assert done.facts["seen_m2"] == pytest.approx(100 * done.facts["coverage"], rel=0.02)
 
 
-def test_what_the_box_hides_is_not_painted_with_the_box(street: Street) -> None:
+def test_hidden_ground_does_not_get_the_colour_of_the_box(street: Street) -> None:
     street.add(CAMERAS["pinhole"], look_at((-4, 0, 1.2), (0, 0, 0.6)))
     street.clouds["terrain"] = points(rgb=(0, 255, 0))
     folder, done = street.run()
@@ -58,11 +58,11 @@ def test_what_the_box_hides_is_not_painted_with_the_box(street: Street) -> None:
     assert (seen[behind] == 128).mean() > 0.99
     assert (rgb[behind] == [0, 255, 0]).all(axis=-1).mean() > 0.99
     red = (rgb[..., 0] > 170) & (rgb[..., 1] < 90)
-    assert red[apart_from_the_box(x, y)].mean() < 0.003
+    assert red[away_from_the_box(x, y)].mean() < 0.003
     assert 0 < done.facts["coverage"] < 1
 
 
-def test_the_wall_is_painted_from_the_front_only(street: Street) -> None:
+def test_wall_is_textured_on_its_front_only(street: Street) -> None:
     street.mesh = BOX
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
@@ -75,7 +75,7 @@ def test_the_wall_is_painted_from_the_front_only(street: Street) -> None:
     assert (back.seen[back.hit] != 255).mean() > 0.9
 
 
-def test_the_nearer_photo_counts_more(street: Street) -> None:
+def test_nearer_photo_has_more_weight(street: Street) -> None:
     camera = CAMERAS["pinhole"]
     white, black = np.full((480, 640, 3), 220, np.uint8), np.full((480, 640, 3), 20, np.uint8)
     street.occluders = (GROUND,)
@@ -88,7 +88,7 @@ def test_the_nearer_photo_counts_more(street: Street) -> None:
     assert 60 < rgb[lit & (abs(x) < 0.1)].mean() < 180
 
 
-def test_more_power_is_sharper(street: Street) -> None:
+def test_higher_power_gives_sharper_transitions(street: Street) -> None:
     camera = CAMERAS["pinhole"]
     street.occluders = (GROUND,)
     street.add(camera, look_at((-4.5, 0, 2), (-2, 0, 0)), np.full((480, 640, 3), 220, np.uint8))
@@ -97,7 +97,7 @@ def test_more_power_is_sharper(street: Street) -> None:
     assert sharp.mean() > soft.mean() + 10
 
 
-def test_unseen_texels_get_the_colours_of_the_points(street: Street) -> None:
+def test_unseen_texels_take_point_colours(street: Street) -> None:
     street.clouds["terrain"] = points()
     folder, done = street.run()
     rgb, seen, truth, _, _ = from_above(folder)
@@ -106,7 +106,7 @@ def test_unseen_texels_get_the_colours_of_the_points(street: Street) -> None:
     assert done.facts["coverage"] == 0 and done.facts["coloured_m2"] == pytest.approx(100, rel=0.02)
 
 
-def test_points_without_a_colour_lend_none(street: Street) -> None:
+def test_grey_points_without_colour_are_not_used(street: Street) -> None:
     cloud = points()
     grey = cloud.xyz[:, 0] > 0.5
     present(cloud.rgb)[grey] = 128
@@ -114,11 +114,11 @@ def test_points_without_a_colour_lend_none(street: Street) -> None:
     rgb, seen, truth, x, _ = from_above(street.run()[0])
     assert (seen[x < 0] == 128).all() and (seen[x > 1] == 64).all()
     far = x > 1
-    assert (rgb[far] == 128).all(axis=-1).mean() < 0.01  # flat grey is what nothing at all is known of
+    assert (rgb[far] == 128).all(axis=-1).mean() < 0.01  # flat grey marks texels without any information
     assert abs(rgb[far].mean() - truth[x < 0].mean()) < 25
 
 
-def test_the_ground_goes_on_where_no_photo_saw_it(street: Street) -> None:
+def test_unseen_ground_is_inpainted(street: Street) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
     cloud = points()
@@ -127,23 +127,24 @@ def test_the_ground_goes_on_where_no_photo_saw_it(street: Street) -> None:
     flat, *_ = from_above(street.run()[0])
     folder, done = street.run(continued=True)
     rgb, seen, truth, x, y = from_above(folder)
-    unseen = (seen == 64) & apart_from_the_box(x, y)
+    unseen = (seen == 64) & away_from_the_box(x, y)
     assert unseen.mean() > 0.01 and done.facts["filled_m2"] > 1
 
-    def apart(image: F64) -> float:
+    def mean_error(image: F64) -> float:
         return float(np.abs(image - truth)[unseen].mean())
 
-    assert apart(rgb) < 0.8 * apart(flat) and apart(rgb) < 0.6 * np.abs(128 - truth)[unseen].mean()
-    assert (flat[seen == 255] == rgb[seen == 255]).all(axis=-1).mean() > 0.97  # but where lookups mix both
+    assert mean_error(rgb) < 0.8 * mean_error(flat) and mean_error(rgb) < 0.6 * np.abs(128 - truth)[unseen].mean()
+    # equal except where bilinear lookups mix seen and filled texels
+    assert (flat[seen == 255] == rgb[seen == 255]).all(axis=-1).mean() > 0.97
 
 
-def test_the_black_below_a_car_that_was_taken_out_is_painted_over(street: Street) -> None:
+def test_dark_ground_below_a_removed_car_is_inpainted(street: Street) -> None:
     camera, pose = CAMERAS["pinhole"], look_at((-4.5, 0, 3.0), (-1, 0, 0))
     street.occluders = (GROUND,)
     photo = photograph(camera, pose, meshes=(GROUND,))
     corners = (GROUND.vertices * [0.2, 0.1, 1] - [1.5, 0, 0]).astype(np.float32)
     below = photograph(camera, pose, meshes=(Mesh(Frame(), corners, GROUND.faces),))
-    photo[np.abs(below.astype(int) - [200, 214, 230]).sum(axis=-1) > 0] = 5  # the car's shade: 2 x 1 m
+    photo[np.abs(below.astype(int) - [200, 214, 230]).sum(axis=-1) > 0] = 5  # shadow of the car: 2 x 1 m
     street.add(camera, pose, photo)
     street.clouds["terrain"] = points()
 
@@ -163,13 +164,13 @@ def test_the_black_below_a_car_that_was_taken_out_is_painted_over(street: Street
     assert not (seen[(abs(x + 1.5) < 1.0) & (abs(y) < 0.5)] == 255).any()
 
 
-def test_the_classes_left_out_lend_no_colours(street: Street) -> None:
+def test_colours_of_the_rest_cloud_are_not_used(street: Street) -> None:
     street.clouds["terrain"], street.clouds["rest"] = points(rgb=(10, 200, 10)), points(rgb=(255, 0, 0))
     rgb, *_ = from_above(street.run()[0])
     assert (rgb == [10, 200, 10]).all()
 
 
-def test_points_without_colours_give_their_classes(street: Street) -> None:
+def test_points_without_colours_give_class_colours(street: Street) -> None:
     street.clouds["terrain"] = points(colour=False)
     folder, done = street.run()
     rgb, seen, *_ = from_above(folder)
@@ -180,7 +181,7 @@ def test_points_without_colours_give_their_classes(street: Street) -> None:
     assert done.facts["filled_m2"] == pytest.approx(100, rel=0.02)
 
 
-def test_without_coloured_points_what_is_unseen_takes_after_its_seen_neighbours(street: Street) -> None:
+def test_without_point_colours_unseen_texels_take_colours_of_seen_neighbours(street: Street) -> None:
     street.add(CAMERAS["pinhole"], POSES[1], np.full((480, 640, 3), (20, 90, 200), np.uint8))
     street.clouds["terrain"] = points(colour=False)
     rgb, seen, *_ = from_above(street.run()[0])
@@ -188,7 +189,7 @@ def test_without_coloured_points_what_is_unseen_takes_after_its_seen_neighbours(
     assert (rgb[seen == 64] == [20, 90, 200]).all(axis=1).mean() > 0.95
 
 
-def test_nothing_at_all_is_grey(street: Street) -> None:
+def test_texture_is_grey_without_photos_and_points(street: Street) -> None:
     rgb, seen, *_ = from_above(street.run()[0])
     assert (rgb == 128).all() and (seen == 64).all()
 
@@ -196,7 +197,7 @@ def test_nothing_at_all_is_grey(street: Street) -> None:
 def test_masked_pixels_are_not_used(street: Street) -> None:
     camera, pose = CAMERAS["pinhole"], POSES[1]
     image = photograph(camera, pose)
-    image[240:, :320] = (255, 0, 255)  # the recording car
+    image[240:, :320] = (255, 0, 255)  # ego vehicle
     mask = np.full((480, 640), 255, np.uint8)
     mask[240:, :320] = 0
     street.add(camera, pose, image, mask)
@@ -207,7 +208,7 @@ def test_masked_pixels_are_not_used(street: Street) -> None:
     assert magenta.sum() == 0
 
 
-def test_an_unreadable_photo_is_skipped_and_named(street: Street) -> None:
+def test_unreadable_photos_are_skipped_and_named(street: Street) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
     street.views[1].photo.write_bytes(b"broken")
@@ -218,7 +219,7 @@ def test_an_unreadable_photo_is_skipped_and_named(street: Street) -> None:
     assert any("photo2.png" in warning and "10 x 10" in warning for warning in done.warnings)
     assert done.facts["photos"] == 2
     rgb, seen, truth, x, y = from_above(folder)
-    near = (seen == 255) & (x < 1) & apart_from_the_box(x, y) & (abs(y) < 4.9)
+    near = (seen == 255) & (x < 1) & away_from_the_box(x, y) & (abs(y) < 4.9)
     assert psnr(rgb[near], truth[near]) > 30
 
 
@@ -242,7 +243,7 @@ def test_grey_and_sixteen_bit_photos_are_read(street: Street) -> None:
     assert np.ptp(rgb[seen == 255], axis=1).max() <= 1
 
 
-def test_the_same_again_byte_for_byte(street: Street) -> None:
+def test_results_are_byte_identical_when_repeated(street: Street) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
     street.clouds["terrain"] = points()
@@ -251,7 +252,7 @@ def test_the_same_again_byte_for_byte(street: Street) -> None:
         assert (one / name).read_bytes() == (two / name).read_bytes()
 
 
-def test_room_between_charts_carries_their_colours(street: Street) -> None:
+def test_charts_are_padded_with_their_colours(street: Street) -> None:
     street.mesh, street.clouds["terrain"] = BOX, points(rgb=(200, 10, 10))
     folder, _ = street.run()
     page = cv2.imread(str(folder / "page_0.png"))[..., ::-1]
@@ -260,14 +261,14 @@ def test_room_between_charts_carries_their_colours(street: Street) -> None:
     assert (abs(page.astype(int) - [200, 10, 10]) <= 1).all()
 
 
-def test_a_mesh_without_faces_passes(street: Street) -> None:
+def test_empty_mesh_is_accepted(street: Street) -> None:
     street.mesh = Mesh(Frame(), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     folder, done = street.run()
     assert len(Mesh.load(folder / "mesh.npz")) == 0
     assert done.facts["area_m2"] == 0
 
 
-def test_several_pages_meet_without_a_seam(street: Street) -> None:
+def test_no_seams_between_pages(street: Street) -> None:
     street.clouds["terrain"] = points()
     street.texel, street.page_size = 0.01, 512
     folder, done = street.run()
@@ -276,7 +277,7 @@ def test_several_pages_meet_without_a_seam(street: Street) -> None:
     assert np.abs(rgb - truth).max() < 12  # grey levels, at the seams, too
 
 
-def test_views_survive_their_json(street: Street, tmp_path: Path) -> None:
+def test_views_are_unchanged_by_saving_and_loading(street: Street, tmp_path: Path) -> None:
     view = street.add(CAMERAS["opencv"], POSES[0], mask=np.zeros((480, 640), np.uint8))
     views_io.save(tmp_path / "v.json", [view], [True])
     (read,) = views_io.load(tmp_path / "v.json")
@@ -287,7 +288,7 @@ def test_views_survive_their_json(street: Street, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["16 bit", "grey", "cmyk"])
-def test_photos_of_other_kinds_are_read(street: Street, kind: str) -> None:
+def test_photos_of_other_pixel_formats_are_read(street: Street, kind: str) -> None:
     for pose in POSES:
         view = street.add(CAMERAS["pinhole"], pose)
         photo = photograph(CAMERAS["pinhole"], pose)
@@ -299,21 +300,21 @@ def test_photos_of_other_kinds_are_read(street: Street, kind: str) -> None:
             Image.fromarray(photo).convert("CMYK").save(view.photo, "JPEG", quality=95)
     folder, done = street.run()
     rgb, seen, truth, x, y = from_above(folder)
-    near = (seen == 255) & (x < 1) & apart_from_the_box(x, y) & (abs(y) < 4.9)
+    near = (seen == 255) & (x < 1) & away_from_the_box(x, y) & (abs(y) < 4.9)
     if kind == "grey":
         truth = np.repeat((truth @ [0.299, 0.587, 0.114])[..., None], 3, axis=-1)
     assert near.mean() > 0.2 and done.facts["photos"] == 4
     assert psnr(rgb[near], truth[near]) > 28
 
 
-def test_an_orthophoto_drapes_what_it_sees_and_no_facade(street: Street) -> None:
+def test_orthophoto_textures_ground_and_roof_but_no_facade(street: Street) -> None:
     down = np.diag([1.0, -1, -1, 1])
     down[2, 3] = 30.0
     camera = Camera("orthographic", 480, 480, 40.0, 40.0, 239.5, 239.5)  # 12 m, 2.5 cm a pixel
     street.add(camera, down)
     folder, done = street.run()
     rgb, seen, truth, x, y = from_above(folder)
-    clear = apart_from_the_box(x, y) & (abs(x) < 4.9) & (abs(y) < 4.9)
+    clear = away_from_the_box(x, y) & (abs(x) < 4.9) & (abs(y) < 4.9)
     assert (seen[clear] == 255).mean() > 0.99
     assert psnr(rgb[clear], truth[clear]) > 30
     under = (abs(x - 0.5) < 0.3) & (abs(y) < 0.8)

@@ -1,4 +1,4 @@
-"""Unwrapping: charts don't overlap, density is as asked, pages are bounded, and the other backend steps in."""
+"""Unwrapping: charts don't overlap, texel density and page size are met, and the fallback backend is used."""
 
 import json
 from pathlib import Path
@@ -30,7 +30,7 @@ def hills(n: int = 24, cell: float = 0.25, seed: int = 0) -> Mesh:
 
 
 def with_fin(mesh: Mesh) -> Mesh:
-    """The mesh with a face standing on an inner edge (three faces there), a repeated face, and an empty one."""
+    """The mesh with an extra face on an inner edge (three faces there), a duplicate face, and a degenerate one."""
     a, b, c = mesh.faces[len(mesh) // 2]
     top = mesh.vertices[[a, b]].mean(axis=0) + np.array([0, 0, 0.4], np.float32)
     vertices = np.concatenate([mesh.vertices, top[None]])
@@ -44,8 +44,8 @@ def run(mesh: Mesh, tmp_path: Path, **params: Any) -> tuple[Mesh, list[dict[str,
     return Mesh.load(done.files["mesh"]), json.loads(done.files["pages"].read_text(encoding="utf-8")), done
 
 
-def owners(mesh: Mesh, pages: list[dict[str, int]], k: int) -> npt.NDArray[np.int64]:
-    """How many faces cover every texel centre of page k."""
+def cover_count(mesh: Mesh, pages: list[dict[str, int]], k: int) -> npt.NDArray[np.int64]:
+    """(H, W) number of faces that cover each texel centre of page k."""
     size = np.array([pages[k]["width"], pages[k]["height"]])
     count = np.zeros(size[::-1], int)
     for corner in present(mesh.uv)[mesh.page == k] * size - 0.5:
@@ -63,10 +63,10 @@ def owners(mesh: Mesh, pages: list[dict[str, int]], k: int) -> npt.NDArray[np.in
 
 
 @pytest.mark.parametrize("backend", ["uvatlas", "xatlas"])
-def test_charts_do_not_overlap_and_density_is_as_asked(backend: str, tmp_path: Path) -> None:
+def test_charts_do_not_overlap_and_have_the_wanted_density(backend: str, tmp_path: Path) -> None:
     mesh, pages, done = run(hills(), tmp_path, backend=backend, texel=0.02)
     assert mesh.uv is not None and mesh.uv.min() >= 0 and mesh.uv.max() <= 1
-    assert owners(mesh, pages, 0).max() == 1
+    assert cover_count(mesh, pages, 0).max() == 1
     assert done.facts["texel_m"] == pytest.approx(0.02, rel=0.1)
     assert done.facts["stretch_median"] < 1.2
     assert done.facts["utilisation"] > 0.3
@@ -78,12 +78,12 @@ def test_pages_stay_within_their_size_and_blocks_are_compact(backend: str, tmp_p
     mesh, pages, _ = run(hills(), tmp_path, backend=backend, texel=0.02, page_size=256)
     assert len(pages) > 1 and sorted(set(present(mesh.page).tolist())) == list(range(len(pages)))
     assert all(max(p.values()) <= 256 for p in pages)
-    assert all(owners(mesh, pages, k).max() == 1 for k in range(len(pages)))
+    assert all(cover_count(mesh, pages, k).max() == 1 for k in range(len(pages)))
     spread = [np.ptp(mesh.corners[mesh.page == k].reshape(-1, 3), axis=0)[:2].max() for k in range(len(pages))]
     assert np.median(spread) < 5  # of 6 m
 
 
-def test_a_mesh_that_is_no_manifold_is_mended_for_uvatlas(tmp_path: Path) -> None:
+def test_non_manifold_mesh_is_fixed_for_uvatlas(tmp_path: Path) -> None:
     mesh, _, done = run(with_fin(hills()), tmp_path, backend="uvatlas", texel=0.02)
     assert done.facts["fallbacks"] == 0
     flat = present(mesh.uv)[:-1]
@@ -92,7 +92,7 @@ def test_a_mesh_that_is_no_manifold_is_mended_for_uvatlas(tmp_path: Path) -> Non
     assert (area > 0).all()
 
 
-def test_cutting_leaves_every_edge_to_two_faces_at_most() -> None:
+def test_manifold_leaves_at_most_two_faces_per_edge() -> None:
     faces, old = manifold(with_fin(hills()).faces[:-1])
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     assert np.unique(edges, axis=0, return_counts=True)[1].max() <= 2
@@ -101,35 +101,35 @@ def test_cutting_leaves_every_edge_to_two_faces_at_most() -> None:
     assert len(same) == len(hills().vertices)  # a manifold stays in one piece
 
 
-def test_the_other_backend_steps_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = unwrap_module._in_child
+def test_failed_blocks_use_the_fallback_backend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = unwrap_module._unwrap_in_child
 
     def refuse(mesh: Mesh, blocks: list[npt.NDArray[np.int64]], backend: Backend, params: UnwrapParams) -> list[Any]:
         return ["refused"] * len(blocks) if backend == "uvatlas" else real(mesh, blocks, backend, params)
 
-    monkeypatch.setattr(unwrap_module, "_in_child", refuse)
+    monkeypatch.setattr(unwrap_module, "_unwrap_in_child", refuse)
     _, _, done = run(hills(), tmp_path, backend="uvatlas", texel=0.02)
     assert done.facts["fallbacks"] == 1
     assert "xatlas" in done.warnings[0]
 
 
-def test_a_mesh_without_faces_passes(tmp_path: Path) -> None:
+def test_empty_mesh_is_accepted(tmp_path: Path) -> None:
     mesh, pages, done = run(hills().keep(np.zeros(1152, bool)), tmp_path)
     assert len(mesh) == 0 and present(mesh.uv).shape == (0, 3, 2) and pages == []
     assert done.facts["pages"] == 0
 
 
-def test_the_same_again(tmp_path: Path) -> None:
+def test_xatlas_is_deterministic(tmp_path: Path) -> None:
     first, _, _ = run(hills(), tmp_path, backend="xatlas", texel=0.02)
     again, _, _ = run(hills(), tmp_path, backend="xatlas", texel=0.02)
     np.testing.assert_array_equal(first.uv, again.uv)
 
 
-def test_vegetation_is_textured_at_three_centimetres() -> None:
+def test_vegetation_has_texels_of_three_centimetres() -> None:
     assert UnwrapParams(**UNWRAP.class_defaults["vegetation"]).texel == 0.03
 
 
-def test_what_an_orthophoto_drapes_is_laid_flat_at_half_its_pixels(tmp_path: Path) -> None:
+def test_texels_from_an_orthophoto_are_half_its_pixels(tmp_path: Path) -> None:
     mesh = hills()
     down = np.diag([1.0, -1, -1, 1])
     down[:3, 3] = 0, 6, 12
@@ -140,9 +140,9 @@ def test_what_an_orthophoto_drapes_is_laid_flat_at_half_its_pixels(tmp_path: Pat
     mesh.save(tmp_path / "in.npz")
     inputs = {"mesh": tmp_path / "in.npz", "views": tmp_path / "views.json", "choice": tmp_path / "choice.npz"}
     done = unwrap(inputs, UnwrapParams(texel=0.01), tmp_path, silent)
-    laid, pages = Mesh.load(done.files["mesh"]), json.loads(done.files["pages"].read_text(encoding="utf-8"))
-    assert len(pages) == 1 and np.all(laid.page == 0)
+    unwrapped, pages = Mesh.load(done.files["mesh"]), json.loads(done.files["pages"].read_text(encoding="utf-8"))
+    assert len(pages) == 1 and np.all(unwrapped.page == 0)
     size = np.array([pages[0]["width"], pages[0]["height"]])
-    a, b, c = np.moveaxis(laid.uv * size, 1, 0)
+    a, b, c = np.moveaxis(unwrapped.uv * size, 1, 0)
     area = np.abs(np.cross(np.pad(b - a, ((0, 0), (0, 1))), np.pad(c - a, ((0, 0), (0, 1)))))[:, 2] / 2
-    assert np.sqrt(laid.face_area / area) == pytest.approx(0.1, rel=0.15)
+    assert np.sqrt(unwrapped.face_area / area) == pytest.approx(0.1, rel=0.15)

@@ -1,6 +1,7 @@
-"""`blend_numba.Rows` for a GPU: the same sums, every texel of a photo at once, by torch. Import late: loads torch.
+"""GPU version of `blend_numba.RowBlender` in torch: the same sums, for all texels of a photo at once.
 
-Line for line what `blend.accumulate` does to one texel; a test holds both to one grey level of each other.
+Mirrors `blend_numba.accumulate` line by line; a test checks that both agree within one grey level. Import late: loads
+torch.
 """
 
 from __future__ import annotations
@@ -13,71 +14,86 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from scan2sim.pipeline.camera.models import ALIKE, EQUIRECTANGULAR, FISHEYE, OPENCV, ORTHOGRAPHIC
-from scan2sim.pipeline.camera.projection import MAX_SLOPE, SLOPE_SHARE
+from scan2sim.pipeline.camera.models import EQUIRECTANGULAR, FISHEYE, OPENCV, ORTHO_EQUIVALENT_FOCAL_PX, ORTHOGRAPHIC
+from scan2sim.pipeline.camera.projection import MAX_SLOPE, SLOPE_BIAS_FACTOR
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.types import F32, F64, I64, U8
-from scan2sim.texturing.bake.blend_numba import EDGE, WHITE, Laid, Source, Weighing
-from scan2sim.texturing.photo_cache import OFFSET
+from scan2sim.texturing.bake.blend_numba import (
+    OVEREXPOSED_LEVEL,
+    UNRELIABLE_WEIGHT,
+    BlendSettings,
+    BlendSource,
+    PageFaces,
+)
+from scan2sim.texturing.photo_cache import SRGB_OFFSET
 
-CHUNK = 2_000_000
-"""Texels that are worked on at a time: some 500 MB."""
+CHUNK_TEXELS = 2_000_000
+"""Texels processed at a time: about 500 MB."""
 
 
-class TorchRows:
-    """Rows of a page that photos are added to; as `blend.Rows`.
+class TorchRowBlender:
+    """`blend_numba.RowBlender` on a torch device.
 
     Args:
-        laid: the faces on them.
-        device: of torch, as "cuda" or "cpu".
+        page_faces: faces on the rows.
+        device: torch device such as "cuda" or "cpu".
 
     Raises:
-        SettingError: this torch has no such device.
+        SettingError: torch can't use the device.
     """
 
-    def __init__(self, laid: Laid, device: str) -> None:
+    def __init__(self, page_faces: PageFaces, device: str) -> None:
         try:
             self._device = torch.zeros(1, device=device).device
         except (RuntimeError, AssertionError) as error:
             reason = str(error).splitlines()[0]
             raise SettingError(
-                "texture.device", f"torch can't use {device!r} ({reason})", 'Say "numba", or "auto"'
+                "texture.device", f"torch can't use {device!r} ({reason})", 'Set "numba" or "auto"'
             ) from None
-        self._shape = laid.owner.shape
-        owned = np.flatnonzero(laid.owner.ravel() >= 0)
+        owner = page_faces.owner
+        self._shape = owner.shape
+        owned = np.flatnonzero(owner.ravel() >= 0)
         self._texel = self._to(owned)
-        self._face = self._to(laid.owner.ravel()[owned].astype(np.int64))
-        self._flat, self._normal = self._to(laid.flat).double(), self._to(laid.normals).double()
-        self._origin, self._per_x, self._per_y, self._flat_enough = _frames(self._flat, self._to(laid.corners).double())
-        self._low, self._detail = (torch.zeros((laid.owner.size, 4), device=self._device) for _ in range(2))
+        self._face = self._to(owner.ravel()[owned].astype(np.int64))
+        self._flat, self._normal = self._to(page_faces.flat).double(), self._to(page_faces.normals).double()
+        corners = self._to(page_faces.corners).double()
+        self._origin, self._per_x, self._per_y, self._is_valid = _frames(self._flat, corners)
+        self._low, self._detail = (torch.zeros((owner.size, 4), device=self._device) for _ in range(2))
 
-    def add(self, faces: I64, share: F32, source: Source, weighing: Weighing) -> int:
-        """Add what one photo says of `faces` (N,), its share of their detail (N, 3); returns the texels it sees."""
+    def add(self, faces: I64, share: F32, source: BlendSource, settings: BlendSettings) -> int:
+        """See `blend_numba.RowBlender`."""
         which = torch.full((len(self._flat),), -1, dtype=torch.int64, device=self._device)
         which[self._to(faces)] = torch.arange(len(faces), device=self._device)
-        which[~self._flat_enough] = -1
-        mine = torch.nonzero(which[self._face] >= 0).ravel()
-        shares, photo = self._to(share).double(), Sampled(source, self._to)
-        seen = [self._add(part, which, shares, photo, source, weighing) for part in torch.split(mine, CHUNK)]
+        which[~self._is_valid] = -1
+        texels = torch.nonzero(which[self._face] >= 0).ravel()
+        shares, photo = self._to(share).double(), PhotoSampler(source, self._to)
+        seen = [self._add(part, which, shares, photo, source, settings) for part in torch.split(texels, CHUNK_TEXELS)]
         return sum(seen)
 
     def resolve(self, rgb: U8, seen: U8) -> None:
-        """Weighted means of both sums, added, into `rgb` (H, W, 3); `seen` is 255 where there is one."""
+        """See `blend_numba.RowBlender`."""
         low, detail = self._low, self._detail
         value = low[:, :3] / low[:, 3:] + torch.where(detail[:, 3:] > 0, detail[:, :3] / detail[:, 3:], 0.0)
-        there = (low[:, 3] > 0).reshape(self._shape).cpu().numpy()
+        has_colour = (low[:, 3] > 0).reshape(self._shape).cpu().numpy()
         colour = (value + 0.5).nan_to_num().clamp(0, 255).to(torch.uint8).reshape(*self._shape, 3).cpu().numpy()
-        rgb[there], seen[there] = colour[there], 255
+        rgb[has_colour], seen[has_colour] = colour[has_colour], 255
 
     def _to(self, array: npt.NDArray[Any]) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
 
     def _add(
-        self, part: Tensor, which: Tensor, share: Tensor, photo: Sampled, source: Source, weighing: Weighing
+        self,
+        part: Tensor,
+        which: Tensor,
+        share: Tensor,
+        photo: PhotoSampler,
+        source: BlendSource,
+        settings: BlendSettings,
     ) -> int:
-        eye, p, g = source.eye, source.eye.p, weighing
-        wide = eye.model == EQUIRECTANGULAR
-        T = self._to(eye.T)
+        """Add a photo to some texels and return how many it sees; `which` (F,): row of each face in `share`, or -1."""
+        camera, p, g = source.camera, source.camera.p, settings
+        wide = camera.model == EQUIRECTANGULAR
+        T = self._to(camera.T)
         R, t = T[:3, :3], T[:3, 3]
         texel, f = self._texel[part], self._face[part]
         tx, ty = (texel % self._shape[1]).double()[:, None], (texel // self._shape[1]).double()[:, None]
@@ -85,13 +101,13 @@ class TorchRows:
         at = (self._origin @ R.T + t)[f] + tx * per_x[f] + ty * per_y[f]
         normal = (self._normal @ R.T)[f]
         focal = p[12] / (2 * math.pi) if wide else min(p[0], p[1])
-        if eye.model == ORTHOGRAPHIC:  # how far away it is says nothing of how large its pixels are
+        if camera.model == ORTHOGRAPHIC:  # the ground sample distance doesn't depend on the distance
             distance, cos, far = at[:, 2], -normal[:, 2], torch.ones_like(at[:, 2])
-            alike = far * (ALIKE / focal)
+            equivalent_distance = far * (ORTHO_EQUIVALENT_FOCAL_PX / focal)
         else:
-            distance = alike = far = at.norm(dim=1)
+            distance = equivalent_distance = far = at.norm(dim=1)
             cos = -(at * normal).sum(dim=1) / distance
-        u, v, ok = _project(eye.model, p, at)
+        u, v, ok = _project(camera.model, p, at)
         ok &= (v >= -0.5) & (v < p[13] - 0.5) & (cos >= 0.5 * g.min_cos)
         if not wide:
             ok &= (u >= -0.5) & (u < p[12] - 0.5)
@@ -101,37 +117,42 @@ class TorchRows:
         column = ((u + 0.5) * (columns / p[12])).long().clamp(0, columns - 1)
         row = ((v + 0.5) * (rows / p[13])).long().clamp(0, rows - 1)
         lean = _slope(cos) * far * source.occlusion.pixel
-        ok &= distance <= photo.first[row, column] + g.bias + SLOPE_SHARE * lean
+        ok &= distance <= photo.first[row, column] + g.bias + SLOPE_BIAS_FACTOR * lean
         keep = torch.nonzero(ok).ravel()
         texel, f, tx, ty, u, v = (a[keep] for a in (texel, f, tx, ty, u, v))
-        row, column, lean, distance, cos, far, alike = (a[keep] for a in (row, column, lean, distance, cos, far, alike))
+        row, column, lean, distance, cos, far, equivalent_distance = (
+            a[keep] for a in (row, column, lean, distance, cos, far, equivalent_distance)
+        )
 
         border = torch.minimum(v + 0.5, p[13] - 0.5 - v)
         if not wide:
             border = torch.minimum(border, torch.minimum(u + 0.5, p[12] - 0.5 - u))
-        whole = (cos * cos / alike**2) ** g.power * (0.02 + 0.98 * (border / g.feather).clamp(max=1.0))
-        apart = distance > photo.apart[row, column] + g.bias + (source.occlusion.reach + 0.5) * lean
-        weight = torch.where(apart, whole * EDGE, whole)
-        factor = torch.exp(self._to(source.picture.exposure[:3])) * photo.vignette(u, v)[:, None]
-        if source.picture.warp.shape[0]:
+        base_weight = (cos * cos / equivalent_distance**2) ** g.power * (
+            0.02 + 0.98 * (border / g.feather).clamp(max=1.0)
+        )
+        occluded = distance > photo.around[row, column] + g.bias + (source.occlusion.radius + 0.5) * lean
+        weight = torch.where(occluded, base_weight * UNRELIABLE_WEIGHT, base_weight)
+        factor = torch.exp(self._to(source.photo.exposure[:3])) * photo.vignette(u, v)[:, None]
+        if source.photo.warp.shape[0]:
             u, v = photo.warped(u, v)
         size = torch.maximum((per_x**2).sum(dim=1), (per_y**2).sum(dim=1)).sqrt()[f]
         chosen = (share.sum(dim=1) > 0)[which[f]]
         colour = photo.colour(u, v, size * focal / far, chosen if g.band >= 0 else torch.ones_like(chosen))
-        burnt = colour.amax(dim=1) > WHITE
-        whole, weight = torch.where(burnt, whole * EDGE, whole), torch.where(burnt, weight * EDGE, weight)
+        overexposed = colour.amax(dim=1) > OVEREXPOSED_LEVEL
+        base_weight = torch.where(overexposed, base_weight * UNRELIABLE_WEIGHT, base_weight)
+        weight = torch.where(overexposed, weight * UNRELIABLE_WEIGHT, weight)
         coarse = colour if g.band < 0 else photo.coarse(u, v) if g.band > 0 else torch.zeros_like(colour)
-        detail = 1e-4 * whole + torch.where(chosen, self._share(share[which[f]], f, tx[:, 0], ty[:, 0]), 0.0)
+        detail = 1e-4 * base_weight + torch.where(chosen, self._share(share[which[f]], f, tx[:, 0], ty[:, 0]), 0.0)
         hidden = distance > photo.near[row, column] + g.bias + 1.5 * lean
-        detail = torch.where(hidden, detail * EDGE, detail)
-        base = (coarse + OFFSET) * factor - OFFSET if g.band != 0 else torch.zeros_like(colour)
-        fine = (colour + OFFSET) * factor - OFFSET - base
+        detail = torch.where(hidden, detail * UNRELIABLE_WEIGHT, detail)
+        base = (coarse + SRGB_OFFSET) * factor - SRGB_OFFSET if g.band != 0 else torch.zeros_like(colour)
+        fine = (colour + SRGB_OFFSET) * factor - SRGB_OFFSET - base
         self._low[texel] += torch.cat([weight[:, None] * base, weight[:, None]], dim=1).float()
         self._detail[texel] += torch.cat([detail[:, None] * fine, detail[:, None]], dim=1).float()
         return len(keep)
 
     def _share(self, share: Tensor, f: Tensor, tx: Tensor, ty: Tensor) -> Tensor:
-        """The corners' shares (M, 3), interpolated at texels of faces `f`."""
+        """(M,) share at texels of faces `f`, interpolated from the corners' shares (M, 3)."""
         a, b, c = self._flat[f].unbind(dim=1)
         (bx, by), (cx, cy) = (b - a).unbind(dim=1), (c - a).unbind(dim=1)
         x, y = tx - a[:, 0], ty - a[:, 1]
@@ -140,18 +161,18 @@ class TorchRows:
         return (share[:, 0] * (1 - s - q) + share[:, 1] * s + share[:, 2] * q).clamp(min=0.0)
 
 
-class Sampled:
-    """A photo on the device, and lookups in it by pixel (u, v)."""
+class PhotoSampler:
+    """A photo on the device, sampled at pixels (u, v)."""
 
-    def __init__(self, source: Source, to: Any) -> None:
-        picture, occlusion = source.picture, source.occlusion
-        self._p, self._wide, self._exposure = source.eye.p, source.eye.model == EQUIRECTANGULAR, picture.exposure
-        self._levels = [to(level) for level in (picture.whole, picture.half, picture.quarter)]
-        self._low, self._mask, self._warp = to(picture.low), to(picture.mask), to(picture.warp)
-        self.first, self.near, self.apart = to(occlusion.first), to(occlusion.near), to(occlusion.apart)
+    def __init__(self, source: BlendSource, to: Any) -> None:
+        photo, occlusion = source.photo, source.occlusion
+        self._p, self._wide, self._exposure = source.camera.p, source.camera.model == EQUIRECTANGULAR, photo.exposure
+        self._levels = [to(level) for level in (photo.full, photo.half, photo.quarter)]
+        self._low, self._mask, self._warp = to(photo.low), to(photo.mask), to(photo.warp)
+        self.first, self.near, self.around = to(occlusion.first), to(occlusion.near), to(occlusion.around)
 
     def allows(self, u: Tensor, v: Tensor) -> Tensor:
-        """As `sampling.allows`."""
+        """As `image_sampling.allows`."""
         rows, columns = self._mask.shape
         if not rows:
             return torch.ones_like(u, dtype=torch.bool)
@@ -160,13 +181,13 @@ class Sampled:
         return self._mask[row, column] != 0
 
     def vignette(self, u: Tensor, v: Tensor) -> Tensor:
-        """As `blend.vignette`."""
+        """As `blend_numba.vignette`."""
         cx, cy = 0.5 * (self._p[12] - 1), 0.5 * (self._p[13] - 1)
         q = ((u - cx) ** 2 + (v - cy) ** 2) / (cx * cx + cy * cy)
         return torch.exp(self._exposure[3] * q + self._exposure[4] * q * q)
 
     def warped(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """As `blend._displaced`."""
+        """As `blend_numba._warped`."""
         by = self._linear(self._warp, *self._rescaled(u, v, self._warp))
         return u + by[:, 0], v + by[:, 1]
 
@@ -175,7 +196,7 @@ class Sampled:
         return self._linear(self._low, *self._rescaled(u, v, self._low))
 
     def colour(self, u: Tensor, v: Tensor, ratio: Tensor, sharp: Tensor) -> Tensor:
-        """(M, 3) colours where a texel is `ratio` pixels wide: sharply sampled where asked, of a halving if wide."""
+        """As `blend_numba._colour`: (M, 3) colours for texels that are `ratio` pixels wide."""
         level = (ratio >= 1.6).long() + (ratio >= 3.2).long()
         out = torch.empty((len(u), 3), dtype=torch.float64, device=u.device)
         bicubic = (level == 0) & sharp
@@ -186,7 +207,7 @@ class Sampled:
         return out
 
     def _rescaled(self, u: Tensor, v: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
-        """As `sampling.rescaled`."""
+        """As `image_sampling.rescaled`."""
         height, width = image.shape[:2]
         return (u + 0.5) * (width / self._p[12]) - 0.5, (v + 0.5) * (height / self._p[13]) - 0.5
 
@@ -227,7 +248,7 @@ def _catmull_rom(f: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def _frames(flat: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """As `texels.frame`, of all faces: (F, 3) origin, per x, per y, and (F,) whether there is one."""
+    """As `texel_map.frame`, for all faces: (F, 3) origin, step per x, step per y, and (F,) whether they are valid."""
     a = flat[:, 0]
     (bx, by), (cx, cy) = ((flat[:, k] - a)[:, :, None].unbind(dim=1) for k in (1, 2))
     det = bx * cy - by * cx
@@ -237,13 +258,13 @@ def _frames(flat: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor, Tens
 
 
 def _slope(cos: Tensor) -> Tensor:
-    """The slope in `projection.range_pixel`."""
+    """Slope as in `projection.range_pixel`."""
     c = cos.clamp(max=1.0)
     return ((1 - c * c).sqrt() / c.clamp(min=1e-6)).clamp(max=MAX_SLOPE)
 
 
 def _project(model: int, p: F64, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """As `cameras.project_point`: u, v and whether there is a pixel, of (M, 3) points in camera axes."""
+    """As `models.project_point`, for (M, 3) points in camera axes: u, v and whether they are valid."""
     x, y, z = at.unbind(dim=1)
     if model == EQUIRECTANGULAR:
         r = at.norm(dim=1)

@@ -1,4 +1,4 @@
-"""Pages written beside the painting of the next."""
+"""Background writer of texture pages: a page is written while the next one is painted."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ if TYPE_CHECKING:  # it loads numba
     from scan2sim.texturing.inpainting.hole_filling import Page
 
 
-class Writer:
-    """Writes a page while the next one is painted: one at a time, so that memory holds two pages at most."""
+class PageWriter:
+    """Writes pages in a background thread, one at a time, so that at most two pages are in memory."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(1)
         self._last: Future[None] | None = None
 
     def write(self, path: Path, page: Page, compression: int = 2) -> None:
-        """Begin `path`.png and `path`_seen.png, once the page before is written."""
+        """Start writing `path`.png and `path`_seen.png once the previous page is written."""
         self.finish()
         self._last = self._pool.submit(_write, path, page.rgb, page.seen, compression)
 
     def finish(self) -> None:
-        """Wait; raises what went wrong."""
+        """Wait until the last page is written; raises the error if writing failed."""
         if self._last is not None:
             self._last.result()
 

@@ -1,6 +1,6 @@
-"""Which texel of a page shows which place of which face. Import late: it loads numba.
+"""Rasterisation of faces onto texture pages: maps texels to faces and to 3D points. Import late: it loads numba.
 
-Texel (x, y) of a page of W x H has its centre at u = (x + 0.5) / W, v = 1 - (y + 0.5) / H.
+The centre of texel (x, y) of a page of W x H texels is at u = (x + 0.5) / W, v = 1 - (y + 0.5) / H.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from numba import njit, prange
 
 from scan2sim.pipeline.core.types import F32, F64, I32, I64, U8
 
-BAND = 32
-"""Rows of a page that one thread finds the owners of."""
+BAND_ROWS = 32
+"""Rows of a page that one thread rasterises at a time."""
 
 
 def corners(uv: F32, width: int, height: int) -> F32:
-    """(F, 3, 2) float32 places of the corners on a page, in texels (x right, y down, centres at integers)."""
+    """(F, 3, 2) float32 positions of the faces' corners on a page, in texels (x right, y down, centres at integers)."""
     return np.stack([uv[..., 0] * width - 0.5, (1 - uv[..., 1]) * height - 0.5], axis=-1).astype(np.float32)
 
 
 def owners(flat: F32, width: int, height: int) -> I32:
-    """(H, W) int32: the face, index into `flat` (F, 3, 2), whose triangle covers the texel's centre; -1 where none."""
+    """(H, W) int32 face, index into `flat` (F, 3, 2), that covers each texel's centre; -1 where there is none."""
     out = np.full((height, width), -1, np.int32)
     _own(flat, out)
     return out
@@ -30,7 +30,7 @@ def owners(flat: F32, width: int, height: int) -> I32:
 
 @njit(cache=True)
 def box(flat: F32, f: int, width: int, height: int) -> tuple[int, int, int, int]:
-    """Texels whose centres may be in face f: x0, y0, x1, y1, inclusive."""
+    """Bounding box of face f in texels, clipped to the page: x0, y0, x1, y1, inclusive."""
     x0 = min(flat[f, 0, 0], flat[f, 1, 0], flat[f, 2, 0])
     x1 = max(flat[f, 0, 0], flat[f, 1, 0], flat[f, 2, 0])
     y0 = min(flat[f, 0, 1], flat[f, 1, 1], flat[f, 2, 1])
@@ -46,12 +46,12 @@ def box(flat: F32, f: int, width: int, height: int) -> tuple[int, int, int, int]
 @njit(cache=True, parallel=True)
 def _own(flat: F32, owner: I32) -> None:
     height, width = owner.shape
-    bands = (height + BAND - 1) // BAND
+    bands = (height + BAND_ROWS - 1) // BAND_ROWS
     rows = np.empty((len(flat), 2), np.int32)
     for f in prange(len(flat)):
         _, rows[f, 0], _, rows[f, 1] = box(flat, f, width, height)
-    for band in prange(bands):  # a thread a band: no two write one texel
-        first, last = band * BAND, min(height, (band + 1) * BAND) - 1
+    for band in prange(bands):  # one thread per band, so no two threads write the same texel
+        first, last = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS) - 1
         for f in range(len(flat)):
             if rows[f, 1] < first or rows[f, 0] > last:
                 continue
@@ -72,7 +72,7 @@ def _own(flat: F32, owner: I32) -> None:
 
 @njit(cache=True)
 def frame(flat: F32, corners: F32, f: int) -> tuple[F64, F64, F64, bool]:
-    """The affine map of a face from texels to space: (origin, per x, per y), each (3,); and whether it has one."""
+    """Affine map of face f from texels to 3D: origin, step per x and step per y, (3,) each; False if degenerate."""
     ax, ay = np.float64(flat[f, 0, 0]), np.float64(flat[f, 0, 1])
     bx, by = flat[f, 1, 0] - ax, flat[f, 1, 1] - ay
     cx, cy = flat[f, 2, 0] - ax, flat[f, 2, 1] - ay
@@ -91,7 +91,7 @@ def frame(flat: F32, corners: F32, f: int) -> tuple[F64, F64, F64, bool]:
 
 @njit(cache=True, parallel=True)
 def count(owner: I32, seen: U8, flat: F32) -> I64:
-    """(F, 4) texels of every face: all, seen by a photo (255), coloured from points (128), filled (64)."""
+    """(F, 4) texels per face: all, seen by a photo (255), coloured from points (128), filled (64)."""
     height, width = owner.shape
     out = np.zeros((len(flat), 4), np.int64)
     for f in prange(len(flat)):

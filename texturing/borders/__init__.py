@@ -1,1 +1,1 @@
-"""Where neighbouring tiles meet: the colours they show there, brought together and measured."""
+"""Tile borders: colour harmonization between neighbouring tiles, and its evaluation."""

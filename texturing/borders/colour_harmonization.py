@@ -1,12 +1,12 @@
-"""Level: the colours of neighbouring tiles, textured apart, meet at their border.
+"""Colour harmonization step (`level`): removes colour steps on the borders of tiles that were textured independently.
 
-Where tiles share vertices, the target of each is the mean of what all of them show there, so all compute the same.
-The change that takes a tile to its target is carried inwards as its mean over the border, weighted by 1 / distance^4.
-Along a straight border that is the biharmonic surface: a wave of length l fades as (1 + k d) exp(-k d) with the
-distance d, k = 2 pi / l, and without a crease. So fine differences end close to the border and wide ones far from it,
-as in multi-band blending (Burt and Adelson 1983), and where the nearest border changes there is no step. What is the
-same all along the border is faded out over `reach`. Levelled seams: Lempitsky and Ivanov 2007; colours carried
-inwards as weighted means: Farbman et al. 2009.
+Where tiles share vertices, the target colour of each is the mean of the colours of all of them, so all tiles compute
+the same target. The colour change that takes a tile to its target is extrapolated inwards as a mean over the border,
+weighted by 1 / distance^4. Along a straight border this is the biharmonic surface: a wave of length l fades as
+(1 + k d) exp(-k d) with the distance d, k = 2 pi / l, and without a crease. Fine differences therefore fade close to
+the border and wide ones far from it, as in multi-band blending (Burt and Adelson 1983), and there is no step where the
+nearest border changes. A constant difference along the border is faded out over `reach`. Seam levelling: Lempitsky and
+Ivanov 2007; inward extrapolation by weighted means: Farbman et al. 2009.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from pydantic import Field
 
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32
-from scan2sim.pipeline.io.file_checks import pass_on
+from scan2sim.pipeline.io.file_checks import link_or_copy
 from scan2sim.pipeline.io.images import image
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.io.worlds.textured_mesh import Textured
     from scan2sim.texturing.borders.correspondences import Border
 
-NEIGHBOUR = "neighbour."
+NEIGHBOUR_PREFIX = "neighbour."
 
 
 class LevelParams(Params):
-    """How colours are levelled.
+    """Settings of the colour harmonization.
 
     Attributes:
-        reach: metres from the border over which a step between tiles is faded out.
+        reach: metres from the border over which a colour step between tiles is faded out.
     """
 
     reach: float = Field(4.0, ge=0.01, le=1000)
 
 
 def level(inputs: Inputs, params: LevelParams, out: Path, report: Report) -> Done:
-    """Take a tile's colours at its border to the mean of the tiles that meet there, fading inwards.
+    """Change a tile's colours at its border to the mean of the tiles that meet there, fading inwards.
 
-    Inputs: `textured` (of the step `texture`) and `neighbour.*`, the same of the tiles around, before they are
-    levelled themselves.
-    File: `textured`, the same layout; what is not changed, masks included, is the same bytes.
+    Inputs: `textured` (of the step `texture`) and `neighbour.*`, the same of the neighbouring tiles, before their own
+    colour harmonization.
+    File: `textured`, with the same layout; unchanged files, including all masks, are byte-identical.
 
     Raises:
         InputError: a page can't be read.
@@ -56,29 +56,38 @@ def level(inputs: Inputs, params: LevelParams, out: Path, report: Report) -> Don
     folder = out / "textured"
     folder.mkdir()
     own = textured_mesh.read(inputs["textured"])
-    given = {name.removeprefix(NEIGHBOUR): path for name, path in sorted(inputs.items()) if name.startswith(NEIGHBOUR)}
-    others = {name: tile for name, path in given.items() if (tile := textured_mesh.read(path)) is not None}
-    facts: dict[str, Any] = {"border_m": 0.0, "step_before": 0.0, "step_after": 0.0, "step_p95_after": 0.0}
+    folders = {
+        name.removeprefix(NEIGHBOUR_PREFIX): path
+        for name, path in sorted(inputs.items())
+        if name.startswith(NEIGHBOUR_PREFIX)
+    }
+    others = {name: tile for name, path in folders.items() if (tile := textured_mesh.read(path)) is not None}
+    metrics: dict[str, Any] = {"border_m": 0.0, "step_before": 0.0, "step_after": 0.0, "step_p95_after": 0.0}
     if own is not None and others:
         tiles = (own, *others.values())
-        border = correspondences.shared_border([correspondences.rim(tile.mesh) for tile in tiles])
-        if len(border.samples[0].place):
+        border = correspondences.shared_border([correspondences.open_edges(tile.mesh) for tile in tiles])
+        if len(border.samples[0].point):
             pairs = zip(border.samples, tiles, strict=True)
-            shown = np.stack([sampling.colours(samples, tile.pages, len(border)) for samples, tile in pairs])
-            target = sampling.targets(border.xyz, shown, params.reach)
-            after = _level_pages(own, border, shown[0], target, params.reach, folder, report)
-            facts = _facts(border, list(others), shown, target, after)
-    _link_others(inputs["textured"], folder)
-    return Done({"textured": folder}, facts)
+            current = np.stack([sampling.colours(samples, tile.pages, len(border)) for samples, tile in pairs])
+            target = sampling.targets(border.xyz, current, params.reach)
+            after = _harmonize_pages(own, border, current[0], target, params.reach, folder, report)
+            metrics = _metrics(border, list(others), current, target, after)
+    _link_unchanged(inputs["textured"], folder)
+    return Done({"textured": folder}, metrics)
 
 
-def _level_pages(
-    own: Textured, border: Border, shown: F32, target: F32, reach: float, folder: Path, report: Report
+def _harmonize_pages(
+    own: Textured, border: Border, current: F32, target: F32, reach: float, folder: Path, report: Report
 ) -> F32:
-    """Write the pages that change; returns (P, 3) what the levelled mesh shows at the border's places.
+    """Write the pages that change; returns (P, 3) grey levels of the harmonized mesh at the border points.
 
     Args:
-        shown, target: (P, 3) grey levels of the places, as they are and as they are to be.
+        own: textured mesh of the tile.
+        border: border with its neighbours.
+        current, target: (P, 3) grey levels at the border points before and wanted after.
+        reach: fading distance in metres.
+        folder: folder of the pages.
+        report: progress callback.
     """
     from scan2sim.pipeline.camera.image_sampling import page_colours
     from scan2sim.texturing.bake import texel_map
@@ -86,32 +95,32 @@ def _level_pages(
 
     mesh, samples = own.mesh, border.samples[0]
     assert mesh.uv is not None and mesh.page is not None
-    mine = np.isfinite(shown[:, 0])
-    places = border.xyz[mine] - np.asarray(mesh.frame.origin)
-    corners, tree = mesh.corners, fading.changes(places, border.metres[mine], (target - shown)[mine])
+    has = np.isfinite(current[:, 0])
+    points = border.xyz[has] - np.asarray(mesh.frame.origin)
+    corners, tree = mesh.corners, fading.changes(points, border.metres[has], (target - current)[has])
     near = fading.within(tree, corners, reach)
-    after = np.empty((len(samples.place), 3), np.float32)
+    after = np.empty((len(samples.point), 3), np.float32)
     pages = np.unique(mesh.page[near]).tolist()
     for i, k in enumerate(pages):
         report(i / len(pages), f"page {i + 1} of {len(pages)}")
         faces = np.flatnonzero(mesh.page == k)
-        here = samples.page == k
+        on_page = samples.page == k
         before = image.read_rgb(own.pages[k])
         page, (height, width) = before.copy(), before.shape[:2]
         flat = texel_map.corners(mesh.uv[faces], width, height)
         owner = texel_map.owners(flat, width, height)
-        source = fading.sources(owner)
+        source = fading.padding_sources(owner)
         fading.fade(page, owner, flat, corners[faces], near[faces], tree, reach)
-        fading.settle(page, source, samples.uv[here], target[samples.place[here]])
-        fading.follow(before, page, owner, source)
-        after[here] = page_colours(page, samples.uv[here])
+        fading.match_samples(page, source, samples.uv[on_page], target[samples.point[on_page]])
+        fading.update_padding(before, page, owner, source)
+        after[on_page] = page_colours(page, samples.uv[on_page])
         image.write(folder / f"page_{k}.png", page)
-    return sampling.by_place(samples.place, after, len(border))
+    return sampling.mean_by_point(samples.point, after, len(border))
 
 
-def _facts(border: Border, names: Sequence[str], shown: F32, target: F32, after: F32) -> dict[str, Any]:
-    """Metres of border and the colour step there, grey levels, before and after (both tiles being levelled)."""
-    before, left = np.abs(shown[1:] - shown[0]), 2 * np.abs(after - target)
+def _metrics(border: Border, names: Sequence[str], current: F32, target: F32, after: F32) -> dict[str, Any]:
+    """Length of the border in metres, and the colour step in grey levels before and after (with both tiles changed)."""
+    before, left = np.abs(current[1:] - current[0]), 2 * np.abs(after - target)
     neighbours = {
         name: {
             "border_m": round(length, 2),
@@ -128,13 +137,13 @@ def _facts(border: Border, names: Sequence[str], shown: F32, target: F32, after:
     }
 
 
-def _link_others(source: Path, folder: Path) -> None:
-    """Put the files of `source` that `folder` has no own version of into it, as hard links where possible."""
+def _link_unchanged(source: Path, folder: Path) -> None:
+    """Hard-link or copy the files of `source` that are missing in `folder`."""
     for path in sorted(source.iterdir()):
-        place = folder / path.name
-        if place.exists():
+        target = folder / path.name
+        if target.exists():
             continue
-        pass_on(path, place)
+        link_or_copy(path, target)
 
 
 LEVEL = Step("level", 2, level, LevelParams, per_class=True, memory=(1.0, 3))

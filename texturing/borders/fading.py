@@ -1,4 +1,4 @@
-"""How a change of colours at a border fades inwards, and lands in texels.
+"""Extrapolation of colour changes from a border into the texels of a tile, by a Barnes-Hut style tree code.
 
 Import late: it loads numba.
 """
@@ -14,31 +14,32 @@ from numba import njit, prange
 from scan2sim.pipeline.camera.image_sampling import page_taps
 from scan2sim.pipeline.core.types import F32, F64, I32, I64, U8, Bools
 from scan2sim.texturing.bake.texel_map import box, frame
-from scan2sim.texturing.borders.correspondences import SOFT
+from scan2sim.texturing.borders.correspondences import SOFTENING_M
 
-LEAF = 8
-"""Places of a tree's leaf, at most."""
-DEPTH = 128
-"""Nodes that wait while a tree is walked, at most: twice its levels and more."""
-OPEN = 0.2
-"""A node whose radius is less than this share of its distance counts as one place."""
-FAR = 8.0
-"""Places so many times further away than the nearest one are left out: their weight is below 1 / 4000 of its."""
-ROUNDS = 4
-"""Of `settle`; later ones change next to nothing."""
-LIGHT = 0.01
-"""Texels that lookups read with less weight than this in all are left nearly as they are."""
+LEAF_POINTS_MAX = 8
+"""Points in a leaf of the tree."""
+STACK_SIZE = 128
+"""Nodes on the stack of a tree traversal: more than twice the depth of the tree."""
+OPENING_RATIO = 0.2
+"""A node whose radius is less than this share of its distance counts as one point (Barnes-Hut criterion)."""
+DISTANCE_RATIO_MAX = 8.0
+"""Points farther away than this multiple of the nearest distance are left out: their relative weight is < 1 / 4000."""
+MATCH_ITERATIONS = 4
+"""Iterations of `match_samples`; more change almost nothing."""
+MIN_TOTAL_WEIGHT = 0.01
+"""Texels with a smaller total weight in the samples are hardly changed."""
 
 
 class Changes(NamedTuple):
-    """Places and the change of colour at each, in a binary tree of balls.
+    """Border points with their colour changes, in a binary ball tree.
 
     Attributes:
-        first, last: (N,) the places of a node; node 0 holds all.
-        child: (N,) its first child, the other one follows; -1: none.
-        centre, radius: (N, 3) and (N,) metres, of the ball around its places.
-        length, mean: (N,) metres of border that they stand for, and (N, 3) the mean of their changes.
-        xyz, metres, change: (P, 3) metres, (P,) metres of border, and (P, 3) grey levels of the places.
+        first, last: (N,) range of the points of each node; node 0 has all.
+        child: (N,) first child of each node, the second one follows; -1: leaf.
+        centre, radius: (N, 3) and (N,) ball around the points of each node, metres.
+        length, mean: (N,) metres of border that the points represent, and (N, 3) mean of their changes.
+        xyz, metres, change: (P, 3) points in metres, (P,) metres of border that each represents, and (P, 3) colour
+            changes in grey levels.
     """
 
     first: I64
@@ -54,26 +55,26 @@ class Changes(NamedTuple):
 
 
 def changes(xyz: F64, metres: F64, change: F32) -> Changes:
-    """Arrange places (P, 3), P > 0, the metres of border that they stand for, and their changes (P, 3), in a tree."""
+    """Tree of border points (P, 3), P > 0, the metres of border (P,) they represent, and their changes (P, 3)."""
     order = np.arange(len(xyz))
     first, last = [0], [len(xyz)]
     child: list[int] = []
-    while len(child) < len(first):  # nodes are split in the order in which they were made
+    while len(child) < len(first):  # nodes are split in the order in which they were created
         a, b = first[len(child)], last[len(child)]
-        if b - a <= LEAF:
+        if b - a <= LEAF_POINTS_MAX:
             child.append(-1)
             continue
-        here, middle = order[a:b], (a + b) // 2
-        order[a:b] = here[np.argsort(xyz[here, np.ptp(xyz[here], axis=0).argmax()], kind="stable")]
+        points, middle = order[a:b], (a + b) // 2
+        order[a:b] = points[np.argsort(xyz[points, np.ptp(xyz[points], axis=0).argmax()], kind="stable")]
         child.append(len(first))
         first += [a, middle]
         last += [middle, b]
     xyz, metres, value = xyz[order], metres[order], change[order].astype(np.float64)
     spans = [slice(a, b) for a, b in zip(first, last, strict=True)]
-    length = np.array([metres[of].sum() for of in spans])
-    centre = np.array([metres[of] @ xyz[of] for of in spans]) / length[:, None]
-    mean = np.array([metres[of] @ value[of] for of in spans]) / length[:, None]
-    radius = np.array([((xyz[of] - c) ** 2).sum(axis=1).max() ** 0.5 for of, c in zip(spans, centre, strict=True)])
+    length = np.array([metres[span].sum() for span in spans])
+    centre = np.array([metres[span] @ xyz[span] for span in spans]) / length[:, None]
+    mean = np.array([metres[span] @ value[span] for span in spans]) / length[:, None]
+    radius = np.array([((xyz[span] - c) ** 2).sum(axis=1).max() ** 0.5 for span, c in zip(spans, centre, strict=True)])
     begin, end, below = np.array(first), np.array(last), np.array(child)
     return Changes(begin, end, below, centre, radius, length, mean, xyz, metres, value)
 
@@ -85,7 +86,7 @@ def _distance2(a: F64, x: float, y: float, z: float) -> float:
 
 @njit(cache=True)
 def _nearest(tree: Changes, x: float, y: float, z: float, limit: float, stack: I64) -> float:
-    """Metres to the nearest place; `limit` where none is nearer."""
+    """Distance in metres to the nearest border point; `limit` if none is nearer."""
     best = limit * limit
     stack[0] = 0
     top = 1
@@ -99,7 +100,7 @@ def _nearest(tree: Changes, x: float, y: float, z: float, limit: float, stack: I
         if child < 0:
             for i in range(tree.first[node], tree.last[node]):
                 best = min(best, _distance2(tree.xyz[i], x, y, z))
-        else:  # the nearer child is looked at first
+        else:  # the nearer child goes on top of the stack
             swap = _distance2(tree.centre[child], x, y, z) < _distance2(tree.centre[child + 1], x, y, z)
             stack[top], stack[top + 1] = (child + 1, child) if swap else (child, child + 1)
             top += 2
@@ -108,12 +109,13 @@ def _nearest(tree: Changes, x: float, y: float, z: float, limit: float, stack: I
 
 @njit(cache=True)
 def _change(tree: Changes, x: float, y: float, z: float, nearest: float, stack: I64) -> tuple[float, float, float]:
-    """The mean change of all places, weighted by metres / distance^4, less where the border is short as seen from here.
+    """Colour change at a position: mean over the border points, weighted by metres / distance^4.
 
-    A straight border weighs pi / 2 / nearest^3; what has at least half of that counts in full.
+    It is reduced where the border appears short from here: a straight border has the total weight
+    pi / 2 / nearest^3; the change is applied in full from half of that.
     """
-    soft = SOFT * SOFT
-    far = FAR * math.sqrt(nearest * nearest + soft)
+    soft = SOFTENING_M * SOFTENING_M
+    far = DISTANCE_RATIO_MAX * math.sqrt(nearest * nearest + soft)
     r = g = b = total = 0.0
     stack[0] = 0
     top = 1
@@ -124,7 +126,7 @@ def _change(tree: Changes, x: float, y: float, z: float, nearest: float, stack: 
         distance, child = math.sqrt(distance2), tree.child[node]
         if distance - tree.radius[node] > far:
             continue
-        if tree.radius[node] < OPEN * distance:
+        if tree.radius[node] < OPENING_RATIO * distance:
             w = tree.length[node] / (distance2 + soft) ** 2
             total += w
             r += w * tree.mean[node, 0]
@@ -146,7 +148,7 @@ def _change(tree: Changes, x: float, y: float, z: float, nearest: float, stack: 
 
 @njit(cache=True, parallel=True)
 def within(tree: Changes, corners: F32, reach: float) -> Bools:
-    """(F,) whether a face, `corners` (F, 3, 3), may have a part within `reach` metres of a place."""
+    """(F,) faces, `corners` (F, 3, 3), of which a part may be within `reach` metres of a border point."""
     out = np.zeros(len(corners), np.bool_)
     for f in prange(len(corners)):
         x = (corners[f, 0, 0] + corners[f, 1, 0] + corners[f, 2, 0]) / 3
@@ -155,20 +157,20 @@ def within(tree: Changes, corners: F32, reach: float) -> Bools:
         limit = reach
         for k in range(3):
             limit = max(limit, reach + math.sqrt(_distance2(corners[f, k], x, y, z)))
-        out[f] = _nearest(tree, x, y, z, limit, np.empty(DEPTH, np.int64)) < limit
+        out[f] = _nearest(tree, x, y, z, limit, np.empty(STACK_SIZE, np.int64)) < limit
     return out
 
 
 @njit(cache=True, parallel=True)
 def fade(rgb: U8, owner: I32, flat: F32, corners: F32, near: Bools, tree: Changes, reach: float) -> None:
-    """Add to every texel of the faces that are `near` the change of the places around, faded out over `reach`.
+    """Add the extrapolated colour change to every texel of the faces that are `near`, faded out over `reach`.
 
     Args:
         rgb: (H, W, 3) uint8, changed in place.
         owner: (H, W) face of each texel, index into the next three.
         flat, corners, near: (F, 3, 2) texels, (F, 3, 3) metres, (F,) bool.
-        tree: `Changes`.
-        reach: metres.
+        tree: colour changes of the border points.
+        reach: fading distance in metres.
     """
     height, width = owner.shape
     for f in prange(len(flat)):
@@ -177,7 +179,7 @@ def fade(rgb: U8, owner: I32, flat: F32, corners: F32, near: Bools, tree: Change
         origin, per_x, per_y, ok = frame(flat, corners, f)
         if not ok:
             continue
-        stack = np.empty(DEPTH, np.int64)
+        stack = np.empty(STACK_SIZE, np.int64)
         x0, y0, x1, y1 = box(flat, f, width, height)
         for ty in range(y0, y1 + 1):
             for tx in range(x0, x1 + 1):
@@ -196,8 +198,8 @@ def fade(rgb: U8, owner: I32, flat: F32, corners: F32, near: Bools, tree: Change
                     rgb[ty, tx, k] = min(255.0, max(0.0, rgb[ty, tx, k] + share * change[k] + 0.5))
 
 
-def sources(owner: I32) -> I32:
-    """(H, W) the texel, counted along the rows, that each takes its colour from: itself, or the nearest of a face.
+def padding_sources(owner: I32) -> I32:
+    """(H, W) flat index of the texel that each texel takes its colour from: itself, or the nearest texel of a face.
 
     Args:
         owner: (H, W) face of each texel, -1 where none.
@@ -212,37 +214,39 @@ def sources(owner: I32) -> I32:
     return texel[nearest]
 
 
-def settle(page: U8, source: I32, uv: F32, wanted: F32) -> None:
-    """Change the texels that lookups read until these give what is wanted: what texels' own places left over. In place.
+def match_samples(page: U8, source: I32, uv: F32, wanted: F32) -> None:
+    """Change texels so that bilinear samples of the page have the wanted colours, in place.
 
-    Least squares by a few rounds of simultaneous reconstruction (Andersen and Kak, 1984); a grey level or so.
+    Removes the remaining difference, about a grey level, that is due to texels not being at the sample points. Least
+    squares by a few iterations of SART, the simultaneous algebraic reconstruction technique (Andersen and Kak 1984).
 
     Args:
-        page: (H, W, 3).
-        source: (H, W) of `sources`.
-        uv, wanted: (L, 2) and (L, 3) grey levels, of the lookups.
+        page: (H, W, 3) page.
+        source: (H, W) from `padding_sources`.
+        uv: (L, 2) texture coordinates of the samples.
+        wanted: (L, 3) wanted grey levels of the samples.
     """
     read, weight = page_taps(page, uv)
     texel, index = np.unique(source.ravel()[read], return_inverse=True)
     index = index.reshape(-1, 4)
     value = page.reshape(-1, 3)[texel].astype(np.float32)
     total = np.bincount(index.ravel(), weight.ravel())[:, None]
-    for _ in range(ROUNDS):
-        lacking = wanted - np.einsum("lt,ltc->lc", weight, value[index])
-        share = weight[..., None] * lacking[:, None]
+    for _ in range(MATCH_ITERATIONS):
+        residual = wanted - np.einsum("lt,ltc->lc", weight, value[index])
+        share = weight[..., None] * residual[:, None]
         sums = [np.bincount(index.ravel(), share[..., k].ravel()) for k in range(3)]
-        value += (np.stack(sums, axis=1) / np.maximum(total, LIGHT)).astype(np.float32)
+        value += (np.stack(sums, axis=1) / np.maximum(total, MIN_TOTAL_WEIGHT)).astype(np.float32)
     page.reshape(-1, 3)[texel] = np.clip(np.round(value), 0, 255)
 
 
 @njit(cache=True, parallel=True)
-def follow(before: U8, after: U8, owner: I32, source: I32) -> None:
-    """Let texels around charts that showed the colour of the nearest one in a chart (`fill.pad`) do so again.
+def update_padding(before: U8, after: U8, owner: I32, source: I32) -> None:
+    """Update the padding around charts: texels that had the colour of the nearest chart texel take its new colour.
 
     Args:
-        before: (H, W, 3) uint8 as it was.
-        after: (H, W, 3) uint8 with charts changed; changed in place.
-        owner, source: (H, W) of `texels.owners` and `sources`.
+        before: (H, W, 3) uint8 page before the change.
+        after: (H, W, 3) uint8 page with changed charts; its padding is changed in place.
+        owner, source: (H, W) from `texel_map.owners` and `padding_sources`.
     """
     height, width = owner.shape
     for y in prange(height):

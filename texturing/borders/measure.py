@@ -1,4 +1,4 @@
-"""Borders: how well a tile meets its neighbours, walked along every border of every class."""
+"""Borders step: measures gaps, overlaps and colour steps between a tile and its neighbours, by class."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ from scan2sim.pipeline.tiling.voronoi_cell import Cell
 if TYPE_CHECKING:
     from scan2sim.pipeline.io.worlds.textured_mesh import Textured
 
-SPACING = 0.01
-"""Metres between the places of an edge where colours are compared: other places than those that are levelled."""
+SAMPLE_SPACING_M = 0.01
+"""Metres between the sample points along an edge: other points than those of the colour harmonization."""
 
 
 def borders(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Done:
     """Measure the borders of `textured.GROUP` with those of the neighbours, `textured.GROUP.NAME`.
 
-    Facts, by neighbour and class: `length_m` of border; `gap_m`, the farthest that a place of one mesh's border is
-    from the other's, where that goes on alongside (`gap_p99_m`: 99 of 100 places are nearer); `one_sided_m`, where it
-    doesn't; `shared`, of 1, the border edges that are the very same in both; `overlap_m` beyond the border;
-    `colour_step` and its 95th percentile, grey levels. Street furniture has no border.
+    Metrics, by neighbour and class: `length_m`, length of the border; `gap_m`, largest distance from a point on one
+    mesh's border to the other mesh's border where that runs alongside, and its 99th percentile `gap_p99_m`;
+    `one_sided_m`, length where it doesn't; `shared`, share (0 to 1) of border edges that are identical in both;
+    `overlap_m`, overlap beyond the border; `colour_step` and its 95th percentile, grey levels. Street furniture is
+    left out, as it has no border.
     """
     from scan2sim.pipeline.io.worlds import textured_mesh
 
@@ -57,22 +58,23 @@ def _measured(own: Textured, other: Textured, cell: Cell, name: str) -> dict[str
 
 
 def _surface(mesh: Mesh) -> Mesh:
-    """What of a mesh is no street furniture."""
+    """The mesh without street furniture."""
     return mesh if mesh.classification is None else mesh.keep(mesh.classification == 0)
 
 
 def colour_step(a: Textured, b: Textured) -> tuple[float, float, float]:
-    """The colour step between two textured meshes where they meet: (mean, 95th percentile, metres of border).
+    """Colour step between two textured meshes along their border: (mean, 95th percentile, length of border in metres).
 
-    Grey levels, absolute, over places (other ones than `level` works with) and channels; zero where they don't meet.
+    Absolute differences in grey levels over sample points (other points than those used by the colour harmonization)
+    and channels; zero if the meshes don't meet.
 
     Raises:
         InputError: a page can't be read.
     """
-    from scan2sim.texturing.borders.correspondences import rim, shared_border
+    from scan2sim.texturing.borders.correspondences import open_edges, shared_border
     from scan2sim.texturing.borders.sampling import colours
 
-    border = shared_border([rim(a.mesh), rim(b.mesh)], SPACING)
+    border = shared_border([open_edges(a.mesh), open_edges(b.mesh)], SAMPLE_SPACING_M)
     if not len(border):
         return 0.0, 0.0, 0.0
     one, two = (colours(samples, t.pages, len(border)) for samples, t in zip(border.samples, (a, b), strict=True))

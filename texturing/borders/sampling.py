@@ -1,4 +1,4 @@
-"""Colours that meshes show at places, sampled from their pages as a renderer does, and those wanted instead."""
+"""Colours of textured meshes at border points, sampled as a renderer does, and their target colours."""
 
 from __future__ import annotations
 
@@ -10,68 +10,69 @@ import numpy as np
 from scan2sim.pipeline.camera.image_sampling import page_colours
 from scan2sim.pipeline.core.types import F32, F64, I64
 from scan2sim.pipeline.io.images import image
-from scan2sim.texturing.borders.correspondences import SOFT, Samples
+from scan2sim.texturing.borders.correspondences import SOFTENING_M, Samples
 
-BLUR = 0.1
-"""Share of `reach` by which colours are averaged where more than two tiles meet (a Gaussian's sigma)."""
+CORNER_SIGMA_SHARE = 0.1
+"""Sigma of the Gaussian by which colours are averaged around corners of more than two tiles, as a share of `reach`."""
 
 
-def colours(samples: Samples, pages: Sequence[Path], places: int) -> F32:
-    """(P, 3) grey levels that a mesh shows at the places, as a renderer samples them; NaN where it has no such place.
+def colours(samples: Samples, pages: Sequence[Path], points: int) -> F32:
+    """(P, 3) grey levels of a mesh at the border points, sampled as a renderer does; NaN at points of other meshes.
 
     Args:
-        samples: of the mesh.
+        samples: samples of the mesh.
         pages: image file of every page; one is in memory at a time.
-        places: P.
+        points: number of border points, P.
 
     Raises:
         InputError: a page can't be read.
     """
-    shown = np.empty((len(samples.place), 3), np.float32)
+    sampled = np.empty((len(samples.point), 3), np.float32)
     for k in np.unique(samples.page).tolist():
-        here = samples.page == k
-        shown[here] = page_colours(image.read_rgb(pages[k]), samples.uv[here])
-    return by_place(samples.place, shown, places)
+        on_page = samples.page == k
+        sampled[on_page] = page_colours(image.read_rgb(pages[k]), samples.uv[on_page])
+    return mean_by_point(samples.point, sampled, points)
 
 
-def by_place(place: I64, shown: F32, places: int) -> F32:
-    """(P, 3) means of the samples (L, 3) at a place; NaN where there is none."""
-    total = np.stack([np.bincount(place, shown[:, k], places) for k in range(3)], axis=1)
-    count = np.bincount(place, minlength=places)[:, None]
-    return np.divide(total, count, out=np.full((places, 3), np.nan), where=count > 0).astype(np.float32)
+def mean_by_point(point: I64, sampled: F32, points: int) -> F32:
+    """(P, 3) mean of the samples (L, 3) at each point; NaN where there is none."""
+    total = np.stack([np.bincount(point, sampled[:, k], points) for k in range(3)], axis=1)
+    count = np.bincount(point, minlength=points)[:, None]
+    return np.divide(total, count, out=np.full((points, 3), np.nan), where=count > 0).astype(np.float32)
 
 
-def targets(xyz: F64, shown: F32, reach: float) -> F32:
-    """(P, 3) the colours that all meshes are to show at places: the mean of those that show them now.
+def targets(xyz: F64, current: F32, reach: float) -> F32:
+    """(P, 3) target colours of all meshes at the border points: the mean of their current colours.
 
-    Where more than two meet, say A, B and C, the mean of A and B along their border leads, over `reach` metres, to
-    that of all three: by how much C differs from A and B along its borders with them, close to the corner.
+    Around corners of more than two tiles, say A, B and C, the mean of A and B along their border blends, over `reach`
+    metres, into the mean of all three, using the mean difference of C to A and B along their borders near the corner.
 
     Args:
-        xyz: (P, 3) metres.
-        shown: (T, P, 3) grey levels that the meshes show, NaN where they don't have a place.
-        reach: metres.
+        xyz: (P, 3) border points, metres.
+        current: (T, P, 3) grey levels of the meshes, NaN at points that they don't have.
+        reach: blending distance in metres.
     """
-    target, has = np.nanmean(shown, axis=0), np.isfinite(shown[..., 0])
-    total, bent = np.zeros(len(xyz)), np.zeros_like(target)
+    target, has = np.nanmean(current, axis=0), np.isfinite(current[..., 0])
+    total, correction = np.zeros(len(xyz)), np.zeros_like(target)
     nearest = np.full(len(xyz), np.inf)
     for corner in np.flatnonzero(has.sum(axis=0) > 2):
-        here = has[:, corner]
+        meets = has[:, corner]
         distance = np.linalg.norm(xyz - xyz[corner], axis=1)
-        mine = (distance < reach) & ~has[~here].any(axis=0)  # all tiles there know all tiles of the corner
-        away = _away(shown[here][:, mine], np.exp(-0.5 * (distance[mine] / (reach * BLUR)) ** 2))
-        weight = 1 / (distance[mine] ** 2 + SOFT**2) ** 2
-        among = has[here][:, mine]
-        bent[mine] -= weight[:, None] * ((among / among.sum(axis=0)).T @ away)
-        total[mine] += weight
-        nearest[mine] = np.minimum(nearest[mine], distance[mine])
+        near_corner = (distance < reach) & ~has[~meets].any(axis=0)  # only between tiles that meet at the corner
+        gaussian = np.exp(-0.5 * (distance[near_corner] / (reach * CORNER_SIGMA_SHARE)) ** 2)
+        deviation = _deviations(current[meets][:, near_corner], gaussian)
+        weight = 1 / (distance[near_corner] ** 2 + SOFTENING_M**2) ** 2
+        sharing = has[meets][:, near_corner]
+        correction[near_corner] -= weight[:, None] * ((sharing / sharing.sum(axis=0)).T @ deviation)
+        total[near_corner] += weight
+        nearest[near_corner] = np.minimum(nearest[near_corner], distance[near_corner])
     near = np.maximum(0, 1 - nearest / reach)
     share = near**2 * (3 - 2 * near) / np.maximum(total, 1e-12)
-    return (target + share[:, None] * bent).astype(np.float32)
+    return (target + share[:, None] * correction).astype(np.float32)
 
 
-def _away(shown: F32, weight: F64) -> F64:
-    """(K, 3) how far each of K meshes is from their mean, by the places (K, P, 3) that they share two by two."""
-    apart = shown[:, None] - shown[None]
-    w = np.where(np.isfinite(apart), weight[:, None], 0)
-    return ((w * np.nan_to_num(apart)).sum(axis=2) / np.maximum(w.sum(axis=2), 1e-12)).mean(axis=1)
+def _deviations(current: F32, weight: F64) -> F64:
+    """(K, 3) deviation of each of K meshes from their mean, from points (K, P, 3) that pairs of them share."""
+    difference = current[:, None] - current[None]
+    w = np.where(np.isfinite(difference), weight[:, None], 0)
+    return ((w * np.nan_to_num(difference)).sum(axis=2) / np.maximum(w.sum(axis=2), 1e-12)).mean(axis=1)

@@ -1,7 +1,7 @@
-"""What no photo saw: colours from the points around, and the room between charts. Import late: it loads numba.
+"""Hole filling of texture pages: texels that no photo saw take point colours, and charts are padded.
 
-Points are about 10 cm apart and texels 1 cm: colours are asked for on a coarse lattice of texels on each
-face's plane, and interpolated in between.
+Points are about 10 cm apart and texels 1 cm, so colours are looked up on a coarse lattice of texels on each face, and
+interpolated bilinearly in between. Import late: it loads numba.
 """
 
 from __future__ import annotations
@@ -14,29 +14,30 @@ from numba import njit, prange
 
 from scan2sim.pipeline.core.classes import colour_of
 from scan2sim.pipeline.core.types import F32, I32, I64, U8, Bools
-from scan2sim.pipeline.geometry.height_map import spacing
+from scan2sim.pipeline.geometry.height_map import point_spacing
 from scan2sim.texturing.bake.texel_map import box, frame
 
-LATTICE = 0.08
-"""Metres between the places where points are asked for their colour."""
+LATTICE_SPACING_M = 0.08
+"""Metres between the lattice nodes at which point colours are looked up."""
 NEIGHBOURS = 4
-REACH = (0.25, 1.0)
-"""Metres beyond which a point's colour is no longer called the surface's own, at least and at most."""
-SPACINGS = 3.0
-"""In between it is so many times what points are apart."""
-FAR_NEIGHBOURS, FAR_STEP = 32, 8
-"""What is farther from every point takes the mean of so many of every so-manieth: one point's would be a flat patch."""
+"""Nearest points whose colours are averaged."""
+MAX_POINT_DISTANCE_M = (0.25, 1.0)
+"""Lower and upper bound of the distance up to which a point's colour counts as the surface's own (`FROM_POINTS`)."""
+MAX_POINT_DISTANCE_SPACINGS = 3.0
+"""That distance between the bounds, as a multiple of the point spacing."""
+FAR_NEIGHBOURS, FAR_STRIDE = 32, 8
+"""Farther away, colours are means of 32 points out of every 8th: a single point's colour would give a flat patch."""
 SEEN, FROM_POINTS, FILLED = 255, 128, 64
-"""Marks of texels: a photo saw them, points lent their colour, or neither."""
+"""Marks of texels: seen by a photo, coloured from points, or filled otherwise."""
 
 
-class Colours:
-    """Coloured points that can be asked for the colour at a place.
+class PointColours:
+    """Coloured points, with colour lookup at positions.
 
     Args:
         xyz: (N, 3) local metres, N > 0.
         rgb: (N, 3) uint8.
-        mark: (N,) uint8 or one for all, what texels coloured by them are marked with (`FROM_POINTS` or `FILLED`).
+        mark: (N,) uint8 or one value for all: mark of the texels coloured by them (`FROM_POINTS` or `FILLED`).
     """
 
     def __init__(self, xyz: F32, rgb: U8, mark: int | U8 = FROM_POINTS) -> None:
@@ -44,30 +45,30 @@ class Colours:
 
         self._tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
         self._rgb = rgb.astype(np.float32)
-        self._far = cKDTree(xyz[::FAR_STEP])
-        self._reach = float(np.clip(SPACINGS * spacing(xyz), *REACH))
+        self._far = cKDTree(xyz[::FAR_STRIDE])
+        self._max_distance = float(np.clip(MAX_POINT_DISTANCE_SPACINGS * point_spacing(xyz), *MAX_POINT_DISTANCE_M))
         self._mark = np.broadcast_to(np.asarray(mark, np.uint8), len(xyz))
 
-    def at(self, places: F32) -> tuple[F32, U8]:
-        """(M, 3) colours, the inverse-square mean of the nearest points, and (M,) the nearest one's mark.
+    def at(self, points: F32) -> tuple[F32, U8]:
+        """Colours (M, 3) at `points` (M, 3), inverse-square distance weighted, and the nearest point's mark (M,).
 
-        Where that is too far to be the surface's own it is `FILLED`.
+        The mark is `FILLED` where the nearest point is too far.
         """
         k = min(NEIGHBOURS, self._tree.n)
-        distance, index = self._tree.query(places, k=k, workers=-1)
-        distance, index = distance.reshape(len(places), k), index.reshape(len(places), k)
-        colour, far = _mean(distance, self._rgb[index]), distance[:, 0] > self._reach
+        distance, index = self._tree.query(points, k=k, workers=-1)
+        distance, index = distance.reshape(len(points), k), index.reshape(len(points), k)
+        colour, far = _mean(distance, self._rgb[index]), distance[:, 0] > self._max_distance
         if far.any():
             k = min(FAR_NEIGHBOURS, self._far.n)
-            distance_far, index_far = self._far.query(places[far], k=k, workers=-1)
+            distance_far, index_far = self._far.query(points[far], k=k, workers=-1)
             shape = (len(distance_far), k)
-            colour[far] = _mean(distance_far.reshape(shape), self._rgb[::FAR_STEP][index_far.reshape(shape)])
-        mark = np.where(distance[:, 0] <= self._reach, self._mark[index[:, 0]], FILLED)
+            colour[far] = _mean(distance_far.reshape(shape), self._rgb[::FAR_STRIDE][index_far.reshape(shape)])
+        mark = np.where(distance[:, 0] <= self._max_distance, self._mark[index[:, 0]], FILLED)
         return colour, mark.astype(np.uint8)
 
 
 def _mean(distance: npt.NDArray[np.floating], rgb: F32) -> F32:
-    """(M, 3) means of colours (M, K, 3), weighted by the inverse square of their distance (M, K)."""
+    """(M, 3) means of colours (M, K, 3), weighted by the inverse square of their distances (M, K)."""
     weight = (1.0 / (distance**2 + 1e-4)).astype(np.float32)
     mean: F32 = np.einsum("mk,mkc->mc", weight, rgb) / weight.sum(axis=1, keepdims=True)
     return mean
@@ -75,7 +76,14 @@ def _mean(distance: npt.NDArray[np.floating], rgb: F32) -> F32:
 
 @dataclass(frozen=True)
 class Page:
-    """A page while it is painted: `rgb` (H, W, 3), `seen` (H, W), `owner` (H, W), and its faces."""
+    """A texture page while it is painted.
+
+    Attributes:
+        rgb: (H, W, 3) colours.
+        seen: (H, W) marks (`SEEN`, `FROM_POINTS`, `FILLED`), 0 where there is no colour yet.
+        owner: (H, W) face of each texel, index into the other two; -1 where there is none.
+        flat, corners: (F, 3, 2) texels and (F, 3, 3) local metres of the faces' corners.
+    """
 
     rgb: U8
     seen: U8
@@ -84,34 +92,34 @@ class Page:
     corners: F32
 
 
-def fill(page: Page, colours: Colours, texel: float) -> None:
-    """Colour the texels of faces that have none yet (`seen` 0), in place; far from any point they are marked filled.
+def fill(page: Page, colours: PointColours, texel: float) -> None:
+    """Colour the texels of faces that have no colour yet (`seen` 0), in place; far from any point, mark them as filled.
 
     Args:
-        page: to be filled.
-        colours: of the points around.
-        texel: metres a texel spans.
+        page: page to be filled.
+        colours: colours of the points.
+        texel: texel size in metres.
     """
-    step = max(1, round(LATTICE / texel))
+    step = max(1, round(LATTICE_SPACING_M / texel))
     shape = _lattice(page.owner, page.seen, page.flat, step)
     start = np.concatenate([[0], np.cumsum(shape[:, 0].astype(np.int64) * shape[:, 1])])
     if start[-1] == 0:
         return
-    colour, mark = colours.at(_places(page.flat, page.corners, shape, start, step, page.owner.shape))
+    colour, mark = colours.at(_lattice_points(page.flat, page.corners, shape, start, step, page.owner.shape))
     _interpolate(page.rgb, page.seen, page.owner, page.flat, shape, start, step, colour, mark)
 
 
 def seen_points(page: Page, every: int) -> tuple[F32, U8]:
-    """Places (N, 3) and colours (N, 3) of every n-th texel each way that a photo saw."""
+    """Positions (N, 3) and colours (N, 3) of every Nth texel (in both directions) that a photo saw."""
     rows, columns = np.nonzero(page.seen[::every, ::every] == SEEN)
     rows, columns = rows * every, columns * every
-    return texel_places(page.owner, page.flat, page.corners, rows, columns), page.rgb[rows, columns]
+    return texel_points(page.owner, page.flat, page.corners, rows, columns), page.rgb[rows, columns]
 
 
-def pad(rgb: U8, seen: U8, reach: int) -> None:
-    """Carry colours outwards into the room between charts, `reach` texels far; beyond is their mean. In place.
+def pad(rgb: U8, seen: U8, padding: int) -> None:
+    """Extend the charts' colours outwards by `padding` texels (edge dilation); beyond, fill their mean. In place.
 
-    So neither bilinear lookups nor mip-maps draw the background into the surface.
+    This keeps the background out of bilinear lookups and mip-maps.
     """
     import cv2
 
@@ -123,16 +131,16 @@ def pad(rgb: U8, seen: U8, reach: int) -> None:
         (~coloured).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
     mean = rgb[::97, ::97][coloured[::97, ::97]].mean(axis=0) if coloured[::97, ::97].any() else np.full(3, 128.0)
-    _carry(rgb, coloured, distance, nearest, reach, np.round(mean).astype(np.uint8))
+    _dilate(rgb, coloured, distance, nearest, padding, np.round(mean).astype(np.uint8))
 
 
 @njit(cache=True, parallel=True)
-def _carry(rgb: U8, coloured: Bools, distance: F32, nearest: I32, reach: int, beyond: U8) -> None:
+def _dilate(rgb: U8, coloured: Bools, distance: F32, nearest: I32, padding: int, background: U8) -> None:
     height, width = coloured.shape
     row, column = np.zeros(nearest.max() + 1, np.int32), np.zeros(nearest.max() + 1, np.int32)
     for y in prange(height):
         for x in range(width):
-            if coloured[y, x]:  # every coloured texel has a number of its own
+            if coloured[y, x]:  # every coloured texel has its own label in `nearest`
                 row[nearest[y, x]], column[nearest[y, x]] = y, x
     for y in prange(height):
         for x in range(width):
@@ -140,32 +148,33 @@ def _carry(rgb: U8, coloured: Bools, distance: F32, nearest: I32, reach: int, be
                 continue
             for k in range(3):
                 rgb[y, x, k] = (
-                    rgb[row[nearest[y, x]], column[nearest[y, x]], k] if distance[y, x] <= reach else beyond[k]
+                    rgb[row[nearest[y, x]], column[nearest[y, x]], k] if distance[y, x] <= padding else background[k]
                 )
 
 
 @njit(cache=True, parallel=True)
 def _lattice(owner: I32, seen: U8, flat: F32, step: int) -> I32:
-    """(F, 2) int32 lattice nodes in x and y over every face that has an unseen texel; zero for the others."""
+    """(F, 2) int32 number of lattice nodes in x and y over every face with an unseen texel; zero for the others."""
     height, width = owner.shape
     shape = np.zeros((len(flat), 2), np.int32)
     for f in prange(len(flat)):
         x0, y0, x1, y1 = box(flat, f, width, height)
-        wanting = False
+        has_unseen = False
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
                 if owner[y, x] == f and seen[y, x] == 0:
-                    wanting = True
+                    has_unseen = True
                     break
-            if wanting:
+            if has_unseen:
                 break
-        if wanting:
+        if has_unseen:
             shape[f, 0], shape[f, 1] = (x1 - x0) // step + 2, (y1 - y0) // step + 2
     return shape
 
 
 @njit(cache=True, parallel=True)
-def _places(flat: F32, corners: F32, shape: I32, start: I64, step: int, size: tuple[int, int]) -> F32:
+def _lattice_points(flat: F32, corners: F32, shape: I32, start: I64, step: int, size: tuple[int, int]) -> F32:
+    """(N, 3) positions of the lattice nodes; those of face f begin at start[f]."""
     out = np.empty((start[-1], 3), np.float32)
     for f in prange(len(flat)):
         if shape[f, 0] == 0:
@@ -205,8 +214,8 @@ def _interpolate(
 
 
 @njit(cache=True, parallel=True)
-def texel_places(owner: I32, flat: F32, corners: F32, rows: I64, columns: I64) -> F32:
-    """(N, 3) local metres of texels at rows and columns (N,) of a page, on the faces that own them."""
+def texel_points(owner: I32, flat: F32, corners: F32, rows: I64, columns: I64) -> F32:
+    """(N, 3) positions, local metres, of the texels at rows and columns (N,) of a page, on the faces that own them."""
     out = np.empty((len(rows), 3), np.float32)
     for i in prange(len(rows)):
         f = owner[rows[i], columns[i]]
@@ -217,7 +226,7 @@ def texel_places(owner: I32, flat: F32, corners: F32, rows: I64, columns: I64) -
 
 
 def shaded(classification: U8, normal: npt.NDArray[np.floating] | None) -> U8:
-    """(N, 3) display colours of classes (N,), a little darker where normals (N, 3) turn from above."""
+    """(N, 3) display colours of classes (N,), slightly darker where normals (N, 3) don't point up."""
     rgb = colour_of()[classification].astype(np.float32)
     if normal is not None:
         rgb *= (0.75 + 0.25 * np.clip(normal @ np.array([0.3, 0.2, 0.93]), 0, 1))[:, None]

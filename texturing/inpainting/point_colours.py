@@ -1,4 +1,4 @@
-"""Colours that points lend to texels which no photo saw. Import late: it loads numba."""
+"""Colours of the point cloud for texels that no photo saw. Import late: it loads numba."""
 
 from __future__ import annotations
 
@@ -6,37 +6,37 @@ import numpy as np
 
 from scan2sim.pipeline.core.step import Inputs
 from scan2sim.pipeline.core.types import F32, U8, PointCloud
-from scan2sim.texturing.inpainting.ground import Plan
-from scan2sim.texturing.inpainting.hole_filling import FILLED, FROM_POINTS, Colours, shaded
+from scan2sim.texturing.inpainting.ground import GroundOrthophoto
+from scan2sim.texturing.inpainting.hole_filling import FILLED, FROM_POINTS, PointColours, shaded
 
 
-def colours_of(inputs: Inputs, plan: Plan | None) -> tuple[Colours | None, bool]:
-    """The points' colours, and whether they are their own (else their classes'); None where there are no points.
+def point_colours(inputs: Inputs, ground: GroundOrthophoto | None) -> tuple[PointColours | None, bool]:
+    """Colours of the points, and whether they were measured (else they are class colours); None if there are no points.
 
-    What is coloured by points that were made up (`made.*`) is marked as filled. Points lend none where something stood
-    on the `plan` that was taken out, or beside it: theirs is its shade, or its own.
+    Texels coloured by synthesized points (`made.*`) are marked as filled. Points at and beside removed vehicles and
+    people of the `ground` orthophoto are not used: they have the colour of the object or of its shadow.
     """
     names = sorted(name for name in inputs if name.startswith("cloud") and name != "cloud.rest")
-    made = sorted(name for name in inputs if name.startswith("made."))
-    clouds = [cloud for name in names + made if len(cloud := PointCloud.load(inputs[name]))]
+    synthesized = sorted(name for name in inputs if name.startswith("made."))
+    clouds = [cloud for name in names + synthesized if len(cloud := PointCloud.load(inputs[name]))]
     if not clouds:
         return None, False
     cloud = PointCloud.join(clouds)
     if cloud.rgb is None:
-        return Colours(cloud.xyz, shaded(classes_of(cloud), cloud.normal), FILLED), False
-    real = np.arange(len(cloud)) < len(cloud) - sum(len(PointCloud.load(inputs[name])) for name in made)
-    known = cloud.coloured
-    if plan is not None:
-        known &= ~plan.beside(cloud.xyz)
-    if not known.any():
+        return PointColours(cloud.xyz, shaded(classes_of(cloud), cloud.normal), FILLED), False
+    measured = np.arange(len(cloud)) < len(cloud) - sum(len(PointCloud.load(inputs[name])) for name in synthesized)
+    usable = cloud.coloured
+    if ground is not None:
+        usable &= ~ground.near_removed(cloud.xyz)
+    if not usable.any():
         return None, False
-    return Colours(
-        cloud.xyz[known], cloud.rgb[known], np.where(real, FROM_POINTS, FILLED)[known].astype(np.uint8)
+    return PointColours(
+        cloud.xyz[usable], cloud.rgb[usable], np.where(measured, FROM_POINTS, FILLED)[usable].astype(np.uint8)
     ), True
 
 
-def made_colours(inputs: Inputs) -> tuple[F32, U8]:
-    """Places (N, 3) and colours (N, 3), their classes', of points that were made up."""
+def synthesized_colours(inputs: Inputs) -> tuple[F32, U8]:
+    """Positions (N, 3) and class colours (N, 3) of synthesized points."""
     clouds = [PointCloud.load(inputs[name]) for name in sorted(inputs) if name.startswith("made.")]
     if not clouds:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
@@ -45,5 +45,5 @@ def made_colours(inputs: Inputs) -> tuple[F32, U8]:
 
 
 def classes_of(cloud: PointCloud) -> U8:
-    """(N,) codes of the points' classes; 1, unclassified, where they aren't known."""
+    """(N,) class codes of the points; 1 (unclassified) if the cloud has no classes."""
     return np.ones(len(cloud), np.uint8) if cloud.classification is None else cloud.classification

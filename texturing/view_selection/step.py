@@ -1,7 +1,7 @@
-"""Choose: which photos colour a face, and which one gives its detail.
+"""View selection step (`choose`): which photos colour a face, and which one gives its detail.
 
-Candidates are the best few that see a face; the one for the detail comes from a Markov random field over the
-faces (`texturing.view_selection.mrf`), so that neighbours share a photo where it costs little.
+The candidates of a face are the best few photos that see it. The photo for the detail is selected by a Markov random
+field over the faces (`texturing.view_selection.mrf`), so that neighbouring faces share a photo where it costs little.
 """
 
 from __future__ import annotations
@@ -15,48 +15,48 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.classes import CODE
-from scan2sim.pipeline.core.parameters import Cosine, Depth, Reach
+from scan2sim.pipeline.core.parameters import Cosine, Depth, Distance
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, I32, I64, U8, Mesh, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.texturing.photo_consistency import Agreement
+from scan2sim.texturing.photo_consistency import PhotoConsistency
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.camera.depth_map import DepthMap
 
 
-FLAT = 0.99
-"""cos of the angle between two faces of one side of a plate."""
-FINE_ENOUGH = 0.16
-"""Of the finest photo's pixels on a plate, those of the coarsest that it is painted from at least."""
+PANEL_SIDE_MIN_COS = 0.99
+"""Cosine of the angle between neighbouring faces on one side of a sign panel."""
+PIXEL_COUNT_RATIO_MIN = 0.16
+"""Smallest number of pixels that a photo has on a sign panel, relative to the photo with most pixels, to be used."""
 
 
 class ChooseParams(Params):
-    """How photos are chosen.
+    """Settings of the view selection.
 
     Attributes:
-        views_per_face: photos that a triangle's low frequencies are blended from, at most.
-        smoothness: price of a seam against a photo's quality; 0: each triangle its own best photo.
-        max_distance: metres beyond which a photo is not used.
-        min_cos: of the angle between surface normal and ray, below which a photo is not used.
-        bias: metres that a surface may lie behind what the depth map shows and still count as seen.
+        views_per_face: maximum number of photos from which the low frequencies of a triangle are blended.
+        smoothness: cost of a seam relative to a photo's quality; 0: each triangle uses its own best photo.
+        max_distance: metres from the camera beyond which a photo is not used.
+        min_cos: cosine of the angle between surface normal and viewing ray below which a photo is not used.
+        bias: metres that a surface may lie behind the depth map and still count as visible.
     """
 
     views_per_face: int = Field(8, ge=1, le=32)
     smoothness: float = Field(0.3, ge=0, le=1000)
-    max_distance: Reach = 100.0
+    max_distance: Distance = 100.0
     min_cos: Cosine = 0.02
     bias: Depth = 0.04
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Photos of faces.
+    """View selection of all faces of a mesh.
 
     Attributes:
-        view: (F, K) int32 candidates, best first, -1 where fewer see the face.
-        quality: (F, K) float32 of each, 1/m2 (cos / distance^2, where seen); 0 where there is none.
-        detail_view: (F,) int32, the view that gives the detail, -1 where none sees the face.
+        view: (F, K) int32 candidate views, best first, -1 where fewer see the face.
+        quality: (F, K) float32 quality of each candidate in 1/m2 (cos^2 / distance^2, where seen); 0 for none.
+        detail_view: (F,) int32 view that gives the detail, -1 where none sees the face.
     """
 
     view: I32
@@ -75,9 +75,9 @@ class Choice:
 
 
 def choose(inputs: Inputs, params: ChooseParams, out: Path, report: Report) -> Done:
-    """Choose the photos of every face of `mesh`.
+    """Select the photos of every face of `mesh`.
 
-    Inputs: `mesh`, `views`, `depth` (folder of depth maps), `agreement` (which views may be used, and where).
+    Inputs: `mesh`, `views`, `depth` (folder of depth maps), `agreement` (usable photos and their masks).
     File: `choice`, a `Choice`.
     """
     from scan2sim.pipeline.camera.depth_map import load_depth_map
@@ -85,14 +85,14 @@ def choose(inputs: Inputs, params: ChooseParams, out: Path, report: Report) -> D
 
     mesh = Mesh.load(inputs["mesh"])
     views = views_io.load(inputs["views"])
-    agreement = Agreement.load(inputs["agreement"])
+    consistency = PhotoConsistency.load(inputs["agreement"])
 
     def depth(i: int) -> DepthMap:
         return load_depth_map(inputs["depth"] / f"{i}.npy", views[i].camera, views[i].T_world_cam)
 
-    usable = [i for i in range(len(views)) if agreement.usable[i]]
-    choice, seams = choose_views(mesh, views, usable, depth, agreement.mask, agreement.sharpness, params, report)
-    choice = with_whole_signs(choice, mesh, [pixel_angle(view.camera) for view in views])
+    usable = [i for i in range(len(views)) if consistency.usable[i]]
+    choice, seams = choose_views(mesh, views, usable, depth, consistency.mask, consistency.sharpness, params, report)
+    choice = with_sign_panel_views(choice, mesh, [pixel_angle(view.camera) for view in views])
     choice.save(out / "choice.npz")
     seen = float((choice.detail_view >= 0).mean()) if len(mesh) else 0.0
     return Done({"choice": out / "choice.npz"}, {"faces": len(mesh), "seen": round(seen, 4), "seam_share": seams})
@@ -108,33 +108,33 @@ def choose_views(
     params: ChooseParams,
     report: Report,
 ) -> tuple[Choice, float]:
-    """The choice for all faces, and the share of the edges' length that is a seam."""
+    """View selection of all faces, and the share of the total edge length that is a seam."""
     from scan2sim.texturing.view_selection.candidates import Candidates
     from scan2sim.texturing.view_selection.mrf import detail_views
 
     best = Candidates(mesh.corners, mesh.face_normal, params.views_per_face)
     for done, i in enumerate(usable):
         report(0.7 * done / len(usable), views[i].name)
-        best.offer(
+        best.add_view(
             i, depth(i), bias=params.bias, max_distance=params.max_distance, min_cos=params.min_cos,
             mask=mask(i, views[i]), factor=sharpness(i),
         )  # fmt: skip
-    report(0.7, "seams")
-    pairs, length, price = seams(mesh, params.smoothness)
-    chosen = detail_views(best.view, best.quality, pairs, price)
-    apart = (chosen[pairs[:, 0]] != chosen[pairs[:, 1]]) & (chosen[pairs] >= 0).all(axis=1)
-    share = float(length[apart].sum() / max(float(length.sum()), 1e-9))
-    return Choice(best.view, best.quality, chosen), round(share, 4)
+    report(0.7, "optimizing seams")
+    pairs, length, seam_cost = seam_costs(mesh, params.smoothness)
+    selected = detail_views(best.view, best.quality, pairs, seam_cost)
+    is_seam = (selected[pairs[:, 0]] != selected[pairs[:, 1]]) & (selected[pairs] >= 0).all(axis=1)
+    share = float(length[is_seam].sum() / max(float(length.sum()), 1e-9))
+    return Choice(best.view, best.quality, selected), round(share, 4)
 
 
-def with_whole_signs(choice: Choice, mesh: Mesh, pixel: Sequence[float]) -> Choice:
-    """The choice with the same photos for all of each side of a sign's plate: those that see all of it finely.
+def with_sign_panel_views(choice: Choice, mesh: Mesh, pixel: Sequence[float]) -> Choice:
+    """View selection with the same photos for a whole side of each sign panel: those that see all of it in detail.
 
-    Plates hang where photos agree on them: their mean is as sharp as they are, and without their noise.
+    Sign panels were fitted so that the photos agree on them: the photos' mean is as sharp as they are, with less noise.
 
     Args:
-        choice: of all faces.
-        mesh: with their classes.
+        choice: view selection of all faces.
+        mesh: mesh with the classes of the faces.
         pixel: radians that a pixel of each view spans.
     """
     from scan2sim.texturing.view_selection.mrf import adjacent
@@ -143,33 +143,35 @@ def with_whole_signs(choice: Choice, mesh: Mesh, pixel: Sequence[float]) -> Choi
         return choice
     view, quality, detail_view = choice.view.copy(), choice.quality.copy(), choice.detail_view.copy()
     faces = np.flatnonzero(mesh.classification == CODE["road_sign"])
-    for side in _sides(mesh, faces, adjacent(mesh.faces[faces])[0]):
-        shown, good = view[side], quality[side]
+    for side in _panel_sides(mesh, faces, adjacent(mesh.faces[faces])[0]):
+        candidates, candidate_quality = view[side], quality[side]
         area = mesh.face_area[side][:, None]
-        whole = np.array([v for v in np.unique(shown[shown >= 0]) if (shown == v).any(axis=1).all()], np.int32)
-        if len(whole):
-            fineness = np.array([(good * area)[shown == v].sum() / pixel[v] ** 2 for v in whole])
-            used = whole[np.argsort(-fineness, kind="stable")][: (fineness >= FINE_ENOUGH * fineness.max()).sum()]
+        seen_whole = [v for v in np.unique(candidates[candidates >= 0]) if (candidates == v).any(axis=1).all()]
+        views = np.array(seen_whole, np.int32)
+        if len(views):
+            pixels = np.array([(candidate_quality * area)[candidates == v].sum() / pixel[v] ** 2 for v in views])
+            order = np.argsort(-pixels, kind="stable")
+            used = views[order][: (pixels >= PIXEL_COUNT_RATIO_MIN * pixels.max()).sum()]
             view[side], quality[side], detail_view[side] = -1, 0, used[0]
             for k, best in enumerate(used):
-                view[side, k], quality[side, k] = best, (good * (shown == best)).max(axis=1)
+                view[side, k], quality[side, k] = best, (candidate_quality * (candidates == best)).max(axis=1)
     return Choice(view, quality, detail_view)
 
 
-def _sides(mesh: Mesh, faces: I64, pairs: I32) -> list[I64]:
-    """Faces (N,) in connected pieces that look one way; `pairs` (E, 2) of neighbours, indices into them."""
+def _panel_sides(mesh: Mesh, faces: I64, pairs: I32) -> list[I64]:
+    """Connected components of `faces` (N,) that face the same way; `pairs` (E, 2): neighbours, indices into `faces`."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     normal = mesh.face_normal[faces]
-    p = pairs[np.einsum("ij,ij->i", normal[pairs[:, 0]], normal[pairs[:, 1]]) > FLAT]
+    p = pairs[np.einsum("ij,ij->i", normal[pairs[:, 0]], normal[pairs[:, 1]]) > PANEL_SIDE_MIN_COS]
     links = coo_array((np.ones(len(p), np.int8), (p[:, 0], p[:, 1])), shape=(len(faces), len(faces)))
     count, piece = connected_components(links, directed=False)
     return [faces[piece == k] for k in range(count)]
 
 
-def seams(mesh: Mesh, smoothness: float) -> tuple[I32, F32, F32]:
-    """Neighbouring faces (E, 2), the lengths (E,) of their edges in metres, and what a seam there costs (E,)."""
+def seam_costs(mesh: Mesh, smoothness: float) -> tuple[I32, F32, F32]:
+    """Neighbouring faces (E, 2), the lengths (E,) of their shared edges in metres, and seam costs (E,)."""
     from scan2sim.texturing.view_selection.mrf import adjacent
 
     pairs, edge = adjacent(mesh.faces)

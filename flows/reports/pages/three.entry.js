@@ -1,4 +1,4 @@
-// What the pages need of three.js (MIT, three-LICENSE.txt). Made anew, in a folder of its own:
+// Exports of three.js (MIT, three-LICENSE.txt) that the pages need. To rebuild three.js, in a separate folder:
 //   npm install three@0.187.0 esbuild@0.28.2
 //   npx esbuild three.entry.js --bundle --minify --format=iife --global-name=THREE --legal-comments=inline --outfile=three.js
 

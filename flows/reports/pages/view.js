@@ -1,15 +1,15 @@
-// A world tile by tile, the nearest first: coloured by photos, classes, or where colours are from. Classic scripts, so that
-// the page can be opened by a double click, too: each tile is a script that calls scan2simTile with a GLB as base64.
+// Viewer of a world: loads tiles by distance, coloured by photo, class, source or photo distance. Classic scripts, so that
+// the page can also be opened from a file: each tile is a script that calls scan2simTile with a GLB as base64.
 "use strict";
 
 (() => {
-  const TEXELS = 320e6; // of all tiles that are held at once; beyond it the farthest are dropped
-  const SCALE = [[0, "#30123b"], [5, "#4686fb"], [10, "#1ae4b6"], [20, "#a4fc3c"], [35, "#fb7e21"], [60, "#7a0403"]]; // metres
-  const NONE = "#8a8f96";
-  const FIRST = 3; // row of the first photo in a GLB's table: 0 is filled, 1 points, 2 and on photos
+  const MAX_TEXELS = 320e6; // texture memory of all loaded tiles; above it the farthest are unloaded
+  const DISTANCE_COLOURS = [[0, "#30123b"], [5, "#4686fb"], [10, "#1ae4b6"], [20, "#a4fc3c"], [35, "#fb7e21"], [60, "#7a0403"]]; // metres
+  const NO_PHOTO_COLOUR = "#8a8f96";
+  const FIRST_PHOTO_ROW = 3; // row of the first photo in a GLB's table; rows 0 to 2: inpainted, point cloud, unknown photo
   const { View, load, meshes } = window.scan2sim;
 
-  // A surface whose texture's brightness is kept under a colour of each vertex, where `tinted` is 1.
+  // Patch a material: where `tinted` is 1, each vertex has a colour that is modulated by the texture's brightness.
   function tintable(material, tinted) {
     material.onBeforeCompile = (shader) => {
       shader.uniforms.tinted = tinted;
@@ -27,10 +27,10 @@
 
   const linear = (colour) => new THREE.Color(colour).toArray();
 
-  function along(metres) {
-    const next = SCALE.findIndex(([at]) => at > metres);
-    if (next < 0) return linear(SCALE[SCALE.length - 1][1]);
-    const [[low, from], [high, to]] = [SCALE[next - 1], SCALE[next]];
+  function distanceColour(metres) {
+    const next = DISTANCE_COLOURS.findIndex(([at]) => at > metres);
+    if (next < 0) return linear(DISTANCE_COLOURS[DISTANCE_COLOURS.length - 1][1]);
+    const [[low, from], [high, to]] = [DISTANCE_COLOURS[next - 1], DISTANCE_COLOURS[next]];
     return new THREE.Color(from).lerp(new THREE.Color(to), (metres - low) / (high - low)).toArray();
   }
 
@@ -41,12 +41,12 @@
       this.tinted = { value: 0 };
       this.colours = "photo";
       this.shown = { wireframe: false, collision: false };
-      this.here = new Map(); // scripts that are loaded, to their meshes
+      this.loaded = new Map(); // script name to the meshes and state of what it loaded
       this.wires = new THREE.MeshBasicMaterial({ color: 0x0a1018, wireframe: true, transparent: true, opacity: 0.45, depthWrite: false });
       this.loop();
     }
 
-    // Tiles by how near they are to what is looked at.
+    // Tiles sorted by distance to the viewer, or to the orbit's centre.
     nearest() {
       const eye = this.walking ? this.camera.position : this.orbit.target;
       const away = ({ offset, low, high }) => Math.hypot(...[0, 1].map((k) => Math.max(0, offset[k] + low[k] - eye.getComponent(k), eye.getComponent(k) - offset[k] - high[k])));
@@ -62,17 +62,17 @@
       }
     }
 
-    // The script that is wanted most: of a tile, what is seen and, where it is asked for, what bodies collide with.
+    // Tile and name of the script to load next: visible meshes first, then collision meshes if they are shown.
     next() {
-      let room = TEXELS;
+      let budget = MAX_TEXELS;
       for (const tile of this.nearest()) {
-        const held = this.here.get(tile.name);
-        room -= held?.texels ?? 0;
-        if (room < 0) { this.drop(tile.name); continue; }
+        const held = this.loaded.get(tile.name);
+        budget -= held?.texels ?? 0;
+        if (budget < 0) { this.drop(tile.name); continue; }
         if (!held) return [tile, tile.name];
-        if (this.shown.collision && !this.here.has(`${tile.name}_collision`)) return [tile, `${tile.name}_collision`];
+        if (this.shown.collision && !this.loaded.has(`${tile.name}_collision`)) return [tile, `${tile.name}_collision`];
       }
-      this.say(this.here.size ? "" : "Loading …");
+      this.say(this.loaded.size ? "" : "Loading …");
       return null;
     }
 
@@ -88,15 +88,15 @@
       const found = await meshes(await got, tile.offset);
       const solid = name !== tile.name;
       const texels = found.reduce((sum, { material }) => sum + (material.map ? material.map.image.width * material.map.image.height : 0), 0);
-      for (const mesh of found) this.dress(mesh, solid);
-      this.here.set(name, { tile, solid, texels, meshes: found });
+      for (const mesh of found) this.prepare_mesh(mesh, solid);
+      this.loaded.set(name, { tile, solid, texels, meshes: found });
       if (solid) this.scene.add(...found);
       else this.put(name, found);
-      this.look_after(name);
+      this.update_tile(name);
       if (this.walking && !this.about.photos.length) this.stand();
     }
 
-    dress(mesh, solid) {
+    prepare_mesh(mesh, solid) {
       mesh.geometry.setAttribute("tint", new THREE.BufferAttribute(new Float32Array(3 * mesh.geometry.attributes.position.count).fill(1), 3));
       if (solid) {
         mesh.material = new THREE.MeshBasicMaterial({ color: 0xff8a1f, transparent: true, opacity: 0.3, side: THREE.DoubleSide, polygonOffset: true, polygonOffsetFactor: -2, polygonOffsetUnits: -8 });
@@ -111,7 +111,7 @@
 
     drop(name) {
       for (const of of [name, `${name}_collision`]) {
-        const held = this.here.get(of);
+        const held = this.loaded.get(of);
         if (!held) continue;
         for (const mesh of held.meshes) {
           this.scene.remove(mesh);
@@ -120,14 +120,14 @@
           mesh.material.dispose();
         }
         this.grounds.delete(of);
-        this.here.delete(of);
+        this.loaded.delete(of);
         this.stale = true;
       }
     }
 
-    // What is shown of a tile as the buttons say.
-    look_after(name) {
-      const { meshes: found, solid } = this.here.get(name);
+    // Update visibility and colours of a tile from the buttons.
+    update_tile(name) {
+      const { meshes: found, solid } = this.loaded.get(name);
       for (const mesh of found) {
         mesh.visible = !solid || this.shown.collision;
         mesh.wires.visible = solid || this.shown.wireframe;
@@ -139,11 +139,11 @@
     tint(mesh) {
       const { tint, _feature_id_0: row, _distance: far } = mesh.geometry.attributes;
       const own = this.rgb(this.about.colours[mesh.userData.class] ?? [138, 143, 150]);
-      const sources = this.about.sources.map(this.rgb), none = linear(NONE);
+      const sources = this.about.sources.map(this.rgb), none = linear(NO_PHOTO_COLOUR);
       const of = {
         class: () => own,
-        source: (i) => (row ? sources[Math.min(row.getX(i), FIRST - 1)] : none),
-        distance: (i) => (far && far.getX(i) >= 0 ? along(far.getX(i)) : none),
+        source: (i) => (row ? sources[Math.min(row.getX(i), FIRST_PHOTO_ROW - 1)] : none),
+        distance: (i) => (far && far.getX(i) >= 0 ? distanceColour(far.getX(i)) : none),
       }[this.colours];
       for (let i = 0; i < tint.count; i++) tint.setXYZ(i, ...of(i));
       tint.needsUpdate = true;
@@ -152,16 +152,16 @@
     colour(kind) {
       this.colours = kind;
       this.tinted.value = kind === "photo" ? 0 : 1;
-      for (const name of this.here.keys()) this.look_after(name);
+      for (const name of this.loaded.keys()) this.update_tile(name);
     }
 
     toggle(kind) {
       this.shown[kind] = !this.shown[kind];
-      for (const name of this.here.keys()) this.look_after(name);
+      for (const name of this.loaded.keys()) this.update_tile(name);
       return this.shown[kind];
     }
 
-    // Stand where a photo was taken: the same place, direction and angle of view.
+    // Move the camera to a photo: same position, direction and field of view.
     photo({ pose, field, aspect }) {
       const [right, down, ahead, eye] = [0, 1, 2, 3].map((k) => new THREE.Vector3(pose[k], pose[4 + k], pose[8 + k]));
       this.mode("walk");
@@ -169,7 +169,7 @@
       this.camera.up.copy(down.negate());
       this.camera.lookAt(ahead.add(eye));
       this.camera.up.set(0, 0, 1);
-      const wide = this.camera.aspect < aspect ? aspect / this.camera.aspect : 1; // all of the photo is in the window
+      const wide = this.camera.aspect < aspect ? aspect / this.camera.aspect : 1; // the whole photo fits into the window
       this.camera.fov = (2 * Math.atan(wide * Math.tan((field * Math.PI) / 360)) * 180) / Math.PI;
       this.camera.updateProjectionMatrix();
       this.face();
@@ -180,7 +180,7 @@
       if (this.walking && !this.about.photos.length) this.stand();
     }
 
-    // On the ground: where one begins to walk is known of photos alone.
+    // Put the viewer on the ground; only photos give a start position at the right height.
     stand() {
       const eye = this.camera.position, ground = this.height(eye.x, eye.y, Infinity);
       if (ground !== null) eye.z = ground + 1.6;
@@ -196,13 +196,13 @@
     const box = document.getElementById("legend");
     const key = (colour, text) => `<span><i style="background:${colour}"></i>${text}</span>`;
     const css = (rgb) => `rgb(${rgb.join(",")})`;
-    const last = SCALE[SCALE.length - 1][0];
+    const last = DISTANCE_COLOURS[DISTANCE_COLOURS.length - 1][0];
     box.hidden = kind === "photo";
     box.innerHTML = {
       photo: () => "",
       class: () => Object.entries(about.colours).map(([name, rgb]) => key(css(rgb), name.replace("_", " "))).join(""),
-      source: () => ["filled", "from points", "from a photo"].map((text, i) => key(css(about.sources[i]), text)).reverse().join(""),
-      distance: () => `<b style="background:linear-gradient(90deg, ${SCALE.map(([at, colour]) => `${colour} ${(100 * at) / last}%`)})"></b><span>0 to ${last} m to the photo</span>${key(NONE, "no photo")}`,
+      source: () => ["inpainted", "from the point cloud", "from a photo"].map((text, i) => key(css(about.sources[i]), text)).reverse().join(""),
+      distance: () => `<b style="background:linear-gradient(90deg, ${DISTANCE_COLOURS.map(([at, colour]) => `${colour} ${(100 * at) / last}%`)})"></b><span>0 to ${last} m to the photo</span>${key(NO_PHOTO_COLOUR, "no photo")}`,
     }[kind]();
   }
 
@@ -244,6 +244,6 @@
   try {
     open();
   } catch (error) {
-    document.querySelector("[role=status]").textContent = /webgl/i.test(error.message) ? "This browser has no WebGL to show the world with." : error.message;
+    document.querySelector("[role=status]").textContent = /webgl/i.test(error.message) ? "This browser has no WebGL, which the viewer needs." : error.message;
   }
 })();

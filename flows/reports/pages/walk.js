@@ -1,20 +1,20 @@
-// The world in the page: turned from above, walked through at eye height. Classic scripts, as a page that is opened by
-// a double click (file://) may load no modules and fetch nothing: world.js calls scan2simWorld with the GLB as base64.
-// Other pages make their own views of it: window.scan2sim.
+// 3D view of a world: orbit from above, or walk at eye height. Classic scripts, because a page opened from a file (file://)
+// can't load modules or fetch data: world.js calls scan2simWorld with the GLB as base64. Other pages build on
+// window.scan2sim.
 "use strict";
 
 (() => {
-  const EYE = 1.6; // metres above the ground
-  const CELL = 1; // metres: the ground's triangles are looked up in squares of it
-  const STEP = 0.6; // metres above the feet: what is higher is no ground to step onto
-  const SPEED = 3.5; // metres a second; with Shift four times as much
-  const SKY = 0xc8d6e6;
+  const EYE_HEIGHT = 1.6; // metres above the ground
+  const CELL_SIZE = 1; // metres: edge of the grid cells that index the ground's triangles
+  const MAX_STEP_HEIGHT = 0.6; // metres above the feet: higher surfaces are not walked onto
+  const WALK_SPEED = 3.5; // metres per second; four times as fast with Shift
+  const SKY_COLOUR = 0xc8d6e6;
   const MOVES = {
     KeyW: [0, 1], ArrowUp: [0, 1], KeyS: [0, -1], ArrowDown: [0, -1],
     KeyA: [-1, 0], ArrowLeft: [-1, 0], KeyD: [1, 0], ArrowRight: [1, 0],
   };
 
-  // Scripts that the world needs, beside the page; the page itself stays quick to load.
+  // Load scripts of a folder on demand, so that the page itself loads quickly.
   async function load(folder, names) {
     for (const name of names) {
       await new Promise((done, fail) => {
@@ -27,7 +27,7 @@
     }
   }
 
-  // Meshes of a GLB, z-up as in the simulator, in the photos' own light; moved by an offset, metres.
+  // Unlit meshes of a GLB, converted to z up as in the simulator and moved by an offset in metres.
   async function meshes(base64, offset = [0, 0, 0]) {
     const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
     const { scene } = await new THREE.GLTFLoader().parseAsync(bytes.buffer, "");
@@ -48,7 +48,7 @@
     return found;
   }
 
-  // Heights of the ground: its triangles by the squares that they touch.
+  // Height of the ground: index of its triangles by the grid cells that they touch.
   class Ground {
     constructor(all) {
       const terrain = all.filter((mesh) => mesh.name.startsWith("terrain"));
@@ -60,7 +60,7 @@
     }
 
     add(corners) {
-      const [low, high] = [Math.min, Math.max].map((end) => [0, 1].map((k) => Math.floor(end(...corners.map((c) => c[k])) / CELL)));
+      const [low, high] = [Math.min, Math.max].map((end) => [0, 1].map((k) => Math.floor(end(...corners.map((c) => c[k])) / CELL_SIZE)));
       for (let x = low[0]; x <= high[0]; x++) {
         for (let y = low[1]; y <= high[1]; y++) {
           const key = `${x},${y}`;
@@ -70,10 +70,10 @@
       }
     }
 
-    // The highest ground at a place that isn't above a height; the lowest where all is; null where there is none.
+    // Height of the highest ground at (x, y) up to `top`; the lowest ground if all is above; null if there is none.
     height(x, y, top) {
       let below = null, lowest = null;
-      for (const [a, b, c] of this.cells.get(`${Math.floor(x / CELL)},${Math.floor(y / CELL)}`) ?? []) {
+      for (const [a, b, c] of this.cells.get(`${Math.floor(x / CELL_SIZE)},${Math.floor(y / CELL_SIZE)}`) ?? []) {
         const area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
         const u = ((x - a[0]) * (c[1] - a[1]) - (y - a[1]) * (c[0] - a[0])) / area;
         const v = ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / area;
@@ -87,7 +87,7 @@
   }
 
   class View {
-    // box: the element that holds the world; about: `walk` and `turn`: [eye, target], metres; `start`: one of them
+    // box: element of the view; about: start poses `walk` and `turn` as [eye, target] in metres, `start`: one of the two
     constructor(box, all, about) {
       this.box = box;
       this.about = about;
@@ -95,10 +95,10 @@
       this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
       this.canvas = this.renderer.domElement;
       this.canvas.tabIndex = 0;
-      this.canvas.setAttribute("aria-label", "The world; W A S D or arrow keys walk, dragging looks around");
+      this.canvas.setAttribute("aria-label", "3D view of the world; W A S D or arrow keys walk, dragging looks around");
       box.prepend(this.canvas);
       this.scene = new THREE.Scene();
-      this.scene.background = new THREE.Color(SKY);
+      this.scene.background = new THREE.Color(SKY_COLOUR);
       this.grounds = new Map();
       if (all.length) this.put("world", all);
       this.camera = new THREE.PerspectiveCamera(65, 1, 0.05, 5000);
@@ -122,14 +122,14 @@
       requestAnimationFrame(frame);
     }
 
-    // Show meshes, and walk on them.
+    // Add meshes to the scene and to the ground.
     put(name, found) {
       this.scene.add(...found);
       this.grounds.set(name, new Ground(found));
       this.stale = true;
     }
 
-    // The highest ground at a place that isn't above a height, else the lowest; null where there is none.
+    // As Ground.height, over all meshes.
     height(x, y, top) {
       const found = [...this.grounds.values()].map((ground) => ground.height(x, y, top)).filter((z) => z !== null);
       const below = found.filter((z) => z <= top);
@@ -140,7 +140,7 @@
       const { clientWidth: width, clientHeight: height } = this.box;
       this.renderer.setSize(width, height, false);
       this.camera.aspect = width / Math.max(1, height);
-      this.camera.fov = this.camera.aspect > 1 ? 50 : 65; // degrees from top to bottom: phones are narrow
+      this.camera.fov = this.camera.aspect > 1 ? 50 : 65; // vertical degrees; phones are narrow
       this.camera.updateProjectionMatrix();
       this.stale = true;
     }
@@ -156,7 +156,7 @@
       this.face();
     }
 
-    // Walk on in the direction that is looked at.
+    // Take the walking direction from the camera.
     face() {
       const ahead = this.camera.getWorldDirection(new THREE.Vector3());
       this.turn = Math.atan2(ahead.y, ahead.x);
@@ -164,7 +164,7 @@
       this.stale = true;
     }
 
-    // Buttons within an element that walk while they are held.
+    // Connect the buttons in an element that walk while they are held.
     pads(within) {
       within.querySelectorAll("[data-key]").forEach((button) => {
         for (const kind of ["pointerdown", "pointerup", "pointerleave", "pointercancel"]) {
@@ -184,7 +184,7 @@
       this.canvas.addEventListener("keydown", (event) => keys(event, true));
       this.canvas.addEventListener("keyup", (event) => keys(event, false));
       this.canvas.addEventListener("blur", () => this.held.clear());
-      let finger = null; // the pointer that looks around, and where it was
+      let finger = null; // last event of the pointer that looks around
       this.canvas.addEventListener("pointerdown", (event) => {
         this.canvas.focus({ preventScroll: true });
         if (!this.walking || finger) return;
@@ -193,7 +193,7 @@
       });
       this.canvas.addEventListener("pointermove", (event) => {
         if (!this.walking || finger?.pointerId !== event.pointerId) return;
-        const pixel = (this.camera.fov * Math.PI) / 180 / this.box.clientHeight; // what is dragged stays under the finger
+        const pixel = (this.camera.fov * Math.PI) / 180 / this.box.clientHeight; // the dragged point stays under the finger
         this.turn += (event.clientX - finger.clientX) * pixel;
         this.tilt = THREE.MathUtils.clamp(this.tilt + (event.clientY - finger.clientY) * pixel, -1.5, 1.5);
         finger = event;
@@ -217,14 +217,14 @@
 
     move(seconds) {
       if (!this.walking || !this.held.size) return;
-      const way = SPEED * (this.fast ? 4 : 1) * seconds;
+      const way = WALK_SPEED * (this.fast ? 4 : 1) * seconds;
       let [right, ahead] = [0, 0];
       for (const code of this.held) [right, ahead] = [right + MOVES[code][0], ahead + MOVES[code][1]];
       const eye = this.camera.position, [cos, sin] = [Math.cos(this.turn), Math.sin(this.turn)];
       eye.x += way * (ahead * cos + right * sin);
       eye.y += way * (ahead * sin - right * cos);
-      const ground = this.height(eye.x, eye.y, eye.z - EYE + STEP);
-      if (ground !== null) eye.z += (ground + EYE - eye.z) * Math.min(1, 12 * seconds);
+      const ground = this.height(eye.x, eye.y, eye.z - EYE_HEIGHT + MAX_STEP_HEIGHT);
+      if (ground !== null) eye.z += (ground + EYE_HEIGHT - eye.z) * Math.min(1, 12 * seconds);
       this.stale = true;
     }
 
@@ -235,7 +235,7 @@
     }
   }
 
-  // What the page says of a box: `data-folder` of the scripts, `data-about` (see View).
+  // Load the world and open the view in `box`, with attributes `data-folder` (of the scripts) and `data-about` (see View).
   async function open(box) {
     const say = (text) => (box.querySelector("[role=status]").textContent = text);
     box.dataset.state = "loading";
@@ -256,7 +256,7 @@
       view.canvas.focus({ preventScroll: true });
     } catch (error) {
       box.dataset.state = "failed";
-      say(/webgl/i.test(error.message) ? "This browser has no WebGL to show the world with: here is its picture." : `The world can't be shown: ${error.message}.`);
+      say(/webgl/i.test(error.message) ? "This browser has no WebGL, which the 3D view needs; the image shows the world." : `The world can't be shown: ${error.message}.`);
     }
   }
 

@@ -1,7 +1,7 @@
-"""Point cloud files: a file a format (`pipeline.core.plugins`), found by the file's suffix.
+"""Point cloud readers: one module per format (`pipeline.core.plugins`), selected by the file's suffix.
 
 A format's module has `SUFFIXES`, `read_header(path) -> (count, low, high, crs[, notes])`, `read(path, frame)` and
-`chunks(path, frame, size)`, and, where classes have names in the file, `class_names(path) -> (ours, names)`.
+`chunks(path, frame, size)`, and, if its files name classes, `class_names(path) -> (ours, names)`.
 """
 
 from __future__ import annotations
@@ -13,25 +13,25 @@ from typing import Any, Protocol
 
 from scan2sim.pipeline.core import classes, plugins
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import F64, U8, Frame, PointCloud
 from scan2sim.pipeline.io import file_checks
 
-CHUNK = 2_000_000
-AS_THEY_ARE = (".las", ".laz", ".ply")
-"""What is taken into a tile as it is; clouds of other formats become LAZ there (`scan2sim import clouds`)."""
-KNOWN = "LAS, LAZ, COPC, PLY, E57, PCD, XYZ (.xyz .csv .txt .asc) or EPT (its ept.json)"
+CHUNK_POINTS = 2_000_000
+COPIED_SUFFIXES = (".las", ".laz", ".ply")
+"""Files that are copied into a tile unchanged; other formats are converted to LAZ (`scan2sim import clouds`)."""
+SUPPORTED_FORMATS = "LAS, LAZ, COPC, PLY, E57, PCD, XYZ (.xyz .csv .txt .asc) or EPT (its ept.json)"
 
 
 @dataclass(frozen=True)
 class Header:
-    """What is known of a cloud file.
+    """Header of a cloud file.
 
     Attributes:
         count: number of points.
         low, high: (3,) bounds, CRS units, float64.
         crs: as WKT, or None.
-        notes: what had to be assumed to read it, and what is wrong with it, for the user.
+        notes: warnings for the user: assumptions made to read the file, and tolerable errors in it.
     """
 
     count: int
@@ -42,16 +42,16 @@ class Header:
 
 
 class Format(Protocol):
-    """What a format's module has.
+    """Interface of a format's module.
 
     Attributes:
-        SUFFIXES: ends of its files' names, or whole names.
+        SUFFIXES: suffixes of its files, or whole file names.
     """
 
     SUFFIXES: tuple[str, ...]
 
     def read_header(self, path: Path) -> tuple[Any, ...]:
-        """What `Header` takes."""
+        """The fields of `Header`."""
 
     def read(self, path: Path, frame: Frame) -> PointCloud:
         """See `read`."""
@@ -61,11 +61,11 @@ class Format(Protocol):
 
 
 def formats() -> dict[str, str]:
-    """Suffixes of cloud files, and one name, to the formats that read them."""
+    """Suffixes of cloud files (and whole names) to the formats that read them."""
     return plugins.by_suffix(__name__)
 
 
-def known(path: Path) -> bool:
+def is_cloud(path: Path) -> bool:
     """Whether a file's name is that of a cloud."""
     return not {path.suffix.lower(), path.name}.isdisjoint(formats())
 
@@ -74,15 +74,16 @@ def _reader(path: Path) -> Any:
     found = formats()
     name = found.get(path.name) or found.get(path.suffix.lower())
     if name is None:
-        raise InputError(path, f"is no known cloud format ({path.suffix or 'no suffix'})", f"Use {KNOWN}")
+        cause = f"has an unknown cloud format ({path.suffix or 'no suffix'})"
+        raise InputError(path, cause, f"Use {SUPPORTED_FORMATS}")
     file_checks.check(path)
     reader = plugins.module(__name__, name)
-    need(str(path), *plugins.needs(reader))
+    require(str(path), *plugins.needs(reader))
     return reader
 
 
 def read_header(path: Path) -> Header:
-    """Number of points, bounds and CRS, without reading the points where the format allows it.
+    """Number of points, bounds and CRS; the points are read only if the format requires it.
 
     Raises:
         InputError: missing, truncated, or of an unknown format. UnavailableError: its library isn't installed.
@@ -91,7 +92,7 @@ def read_header(path: Path) -> Header:
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
-    """Read a cloud into `frame`'s local coordinates; its classes are the file's codes (see `meanings`).
+    """Read a cloud into `frame`'s local coordinates; classes are the file's own codes (see `code_table`).
 
     Raises:
         InputError: missing, truncated, or of an unknown format. UnavailableError: its library isn't installed.
@@ -100,24 +101,24 @@ def read(path: Path, frame: Frame) -> PointCloud:
     return cloud
 
 
-def meanings(path: Path, given: Mapping[int, int]) -> U8:
-    """Lookup table (256,) of what a cloud's class codes are here; `given` is the user's word (`pipeline.core.classes`).
+def code_table(path: Path, given: Mapping[int, int]) -> U8:
+    """Lookup table (256,) from a cloud's class codes to those of `pipeline.core.classes`; `given` overrides it.
 
     Raises:
         InputError: as `read`.
     """
     reader = _reader(path)
     ours, names = reader.class_names(path) if hasattr(reader, "class_names") else (False, {})
-    return classes.meanings(ours, names, given)
+    return classes.code_table(ours, names, given)
 
 
-def chunks(path: Path, frame: Frame, size: int = CHUNK) -> Iterator[PointCloud]:
-    """A cloud's points in their order, `size` at a time.
+def chunks(path: Path, frame: Frame, size: int = CHUNK_POINTS) -> Iterator[PointCloud]:
+    """A cloud's points in file order, `size` at a time.
 
     Args:
-        path: of the cloud.
-        frame: its CRS and unit count; each part is in a frame of its own, with its origin near its points.
-        size: points.
+        path: the cloud.
+        frame: only its CRS and unit are used; each chunk is in a frame of its own, with its origin near its points.
+        size: points per chunk.
 
     Raises:
         InputError: missing, truncated (on reaching the end), or of an unknown format.

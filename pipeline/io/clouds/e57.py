@@ -1,8 +1,8 @@
-"""E57 clouds (ASTM E2807), through pye57: all scans of a file, each moved by its own pose.
+"""E57 clouds (ASTM E2807), read with pye57: all scans of a file, each transformed by its own pose.
 
-Cartesian and spherical coordinates; colours and intensities by the limits that the scan names; times from
-`acquisitionStart` on; a field `classification`, where a writer has added one. The CRS is the file's
-`coordinateMetadata`, where that is one. Points that a scan marks as invalid are left out.
+Supported: Cartesian and spherical coordinates; colours and intensities, scaled by the scan's limits; times relative to
+`acquisitionStart`; a field `classification`, which some writers add. The CRS is read from `coordinateMetadata` if that
+contains one. Points that a scan marks as invalid are removed.
 
 Source: ASTM E2807-11, tables 1 to 20 (as in libE57Format's documentation, https://github.com/asmaloney/libE57Format).
 """
@@ -19,8 +19,8 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Frame, PointCloud
-from scan2sim.pipeline.io import point_chunks
-from scan2sim.pipeline.io.point_chunks import PART, Points
+from scan2sim.pipeline.io import file_checks, point_chunks
+from scan2sim.pipeline.io.point_chunks import READ_POINTS, Points
 
 SUFFIXES = (".e57",)
 NEEDS = ("pye57",)
@@ -28,7 +28,7 @@ CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 COLOURS = ("colorRed", "colorGreen", "colorBlue")
 INVALID = ("cartesianInvalidState", "sphericalInvalidState")
-OTHERS = ("intensity", "timeStamp", "classification")
+OPTIONAL_FIELDS = ("intensity", "timeStamp", "classification")
 
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
@@ -39,12 +39,12 @@ def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
 
 def read(path: Path, frame: Frame) -> PointCloud:
     """All scans' points in local coordinates."""
-    return point_chunks.whole(path, _parts(path), frame)
+    return point_chunks.read_all(path, _parts(path), frame)
 
 
 def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
-    """The points in their order, `size` at a time at most."""
-    return point_chunks.local(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
+    """The points in file order, at most `size` per chunk."""
+    return point_chunks.read_chunks(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
 
 
 def _parts(path: Path) -> Iterator[Points]:
@@ -55,18 +55,17 @@ def _parts(path: Path) -> Iterator[Points]:
                 yield from _scan(file, scans[i])
         except InputError:
             raise
-        except Exception as error:  # pye57's own kind, and whatever its bindings make of the damage
+        except Exception as error:  # pye57's own type, or any other that its bindings raise for damaged files
             raise _unreadable(path, error) from None
 
 
 def _open(path: Path) -> Any:
-    from pye57 import libe57  # its own class E57 deletes what it can't open
+    from pye57 import libe57  # pye57's class E57 deletes files that it can't open
 
-    if not path.is_file():
-        raise InputError(path, "is missing, or no file", "Put it there, or mend the name")
+    file_checks.check(path)
     try:
         return libe57.ImageFile(str(path), "r")
-    except Exception as error:  # pye57's own kind, and whatever its bindings make of the damage
+    except Exception as error:  # pye57's own type, or any other that its bindings raise for damaged files
         raise _unreadable(path, error) from None
 
 
@@ -75,28 +74,28 @@ def _scan(file: Any, node: Any) -> Iterator[Points]:
     from pye57.scan_header import ScanHeader
 
     header = ScanHeader(node)
-    there = set(header.point_fields)
-    places = next((names for names in (CARTESIAN, SPHERICAL) if set(names) <= there), None)
-    if places is None:
+    available = set(header.point_fields)
+    coordinates = next((names for names in (CARTESIAN, SPHERICAL) if set(names) <= available), None)
+    if coordinates is None:
         raise ValueError(f"a scan has neither {', '.join(CARTESIAN)} nor {', '.join(SPHERICAL)}")
-    wanted = [*places, *(name for name in (*COLOURS, *INVALID, *OTHERS) if name in there)]
-    values = {name: np.empty(PART) for name in wanted}
+    wanted = [*coordinates, *(name for name in (*COLOURS, *INVALID, *OPTIONAL_FIELDS) if name in available)]
+    values = {name: np.empty(READ_POINTS) for name in wanted}
     buffers = libe57.VectorSourceDestBuffer()
     for name, array in values.items():
-        buffers.append(libe57.SourceDestBuffer(file, name, array, PART, True, True))
+        buffers.append(libe57.SourceDestBuffer(file, name, array, READ_POINTS, True, True))
     pose = _pose(node)
     done = 0
     with closing(header.points.reader(buffers)) as reader:
         while n := reader.read():
             done += n
-            yield _points({name: array[:n].copy() for name, array in values.items()}, places, pose, node)
+            yield _points({name: array[:n].copy() for name, array in values.items()}, coordinates, pose, node)
     if done != header.point_count:
-        raise ValueError(f"{done:,} of {header.point_count:,} points can be read")
+        raise ValueError(f"{done:,} of {header.point_count:,} points of a scan can be read")
 
 
-def _points(values: dict[str, F64], places: tuple[str, ...], pose: F64, node: Any) -> Points:
-    xyz = np.column_stack([values[name] for name in places])
-    if places is SPHERICAL:
+def _points(values: dict[str, F64], coordinates: tuple[str, ...], pose: F64, node: Any) -> Points:
+    xyz = np.column_stack([values[name] for name in coordinates])
+    if coordinates is SPHERICAL:
         distance, azimuth, elevation = xyz.T
         flat = distance * np.cos(elevation)
         xyz = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)])
@@ -122,7 +121,7 @@ def _points(values: dict[str, F64], places: tuple[str, ...], pose: F64, node: An
 
 
 def _fraction(values: F64, node: Any, limits: str, name: str) -> F64:
-    """Values from 0 to 1 between the limits that a scan names; as they are where it names none."""
+    """Values scaled from the scan's limits to 0..1; unchanged if it declares no limits."""
     if not node.isDefined(f"{limits}/{name}Maximum") or not node.isDefined(f"{limits}/{name}Minimum"):
         return values
     low, high = (float(node[limits][f"{name}{end}"].value()) for end in ("Minimum", "Maximum"))
@@ -130,7 +129,7 @@ def _fraction(values: F64, node: Any, limits: str, name: str) -> F64:
 
 
 def _pose(node: Any) -> F64:
-    """(4, 4) scan to file coordinates; the identity where the scan has none."""
+    """Transform (4, 4) from scan to file coordinates; the identity if the scan has no pose."""
     from scipy.spatial.transform import Rotation
 
     pose = np.eye(4)
@@ -145,7 +144,7 @@ def _pose(node: Any) -> F64:
 
 
 def _crs(path: Path) -> str | None:
-    """Many writers put remarks, or nothing, where the standard wants WKT: that is no CRS."""
+    """CRS of `coordinateMetadata` as WKT; None if it is empty or, as many writers do, contains a remark instead."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
@@ -160,4 +159,4 @@ def _crs(path: Path) -> str | None:
 
 def _unreadable(path: Path, error: Exception) -> InputError:
     cause = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-    return InputError(path, f"is no readable E57 file ({cause[:160]})", "Export it again, or as LAZ")
+    return InputError(path, f"is not a readable E57 file ({cause[:160]})", "Export it again, or as LAZ")

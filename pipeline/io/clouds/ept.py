@@ -1,8 +1,8 @@
 """EPT clouds (Entwine Point Tiles 1.1) in a local folder: `ept.json`, `ept-hierarchy/`, `ept-data/`.
 
-The octree's nodes are read one after the other, coarse ones first, whatever their dataType: laszip, binary
-(the schema's dimensions, packed) or zstandard (the same, by zstd). A cloud is many files, so a tile can't name it:
-`scan2sim import clouds` makes one LAZ file of it.
+The nodes of the octree are read one after another, coarse ones first. Supported data types: laszip, binary (the
+schema's dimensions, packed) and zstandard (the same, compressed). A cloud is many files, so a tile can't use it
+directly: `scan2sim import clouds` converts it to one LAZ file.
 
 Source: https://entwine.io/en/latest/entwine-point-tile.html
 """
@@ -19,51 +19,54 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import F64, Frame, PointCloud
 from scan2sim.pipeline.io import file_checks, point_chunks
 from scan2sim.pipeline.io.clouds import las
-from scan2sim.pipeline.io.point_chunks import PART, Points
+from scan2sim.pipeline.io.point_chunks import READ_POINTS, Points
 
 Schema = tuple[np.dtype[Any], dict[str, tuple[float, float]]]
-"""A packed point, and scale and offset of each of its dimensions."""
+"""Layout of a packed point, and scale and offset of each dimension."""
 SUFFIXES = ("ept.json",)
-REMEDY = "Copy the whole folder again, or build it anew"
-PARTS = {"laszip": ".laz", "binary": ".bin", "zstandard": ".zst"}
-KINDS = {"signed": "i", "unsigned": "u", "float": "f"}
-LARGEST = 100 << 20
-"""Bytes of a JSON file; Entwine splits its hierarchy far below."""
-KEY = re.compile(r"\d{1,3}-\d{1,10}-\d{1,10}-\d{1,10}")
+REMEDY = "Copy the whole folder again, or rebuild it"
+NODE_SUFFIXES = {"laszip": ".laz", "binary": ".bin", "zstandard": ".zst"}
+DTYPE_KINDS = {"signed": "i", "unsigned": "u", "float": "f"}
+MAX_JSON_BYTES = 100 << 20
+"""Maximum size of a JSON file; Entwine splits its hierarchy into far smaller ones."""
+NODE_KEY = re.compile(r"\d{1,3}-\d{1,10}-\d{1,10}-\d{1,10}")
+"""Depth, x, y, z."""
 
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
-    """Number of points, low and high corner, of the points themselves; CRS as WKT or None."""
+    """Number of points, low and high corner of the points (not of the octree), CRS as WKT or None."""
     found = point_chunks.summary(path, _parts(path))
     return found.count, found.low, found.high, _crs(path, _json(path))
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
     """All nodes' points in local coordinates."""
-    return point_chunks.whole(path, _parts(path), frame)
+    return point_chunks.read_all(path, _parts(path), frame)
 
 
 def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
-    """The points, coarse nodes first, `size` at a time at most."""
-    return point_chunks.local(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
+    """The points, coarse nodes first, at most `size` per chunk."""
+    return point_chunks.read_chunks(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
 
 
 def _parts(path: Path) -> Iterator[Points]:
     info = _json(path)
     kind = info.get("dataType")
-    if kind not in PARTS:
-        raise InputError(path, f"has the dataType {str(kind)[:40]!r}", f"Build it with {', '.join(PARTS)}")
+    if kind not in NODE_SUFFIXES:
+        raise InputError(
+            path, f"has the unknown dataType {str(kind)[:40]!r}", f"Build it with {', '.join(NODE_SUFFIXES)}"
+        )
     if kind == "zstandard":
-        need(str(path), "zstandard")
+        require(str(path), "zstandard")
     schema = None if kind == "laszip" else _schema(path, info)
     for key, count in _nodes(path.parent):
-        tile = path.parent / "ept-data" / f"{key}{PARTS[kind]}"
+        tile = path.parent / "ept-data" / f"{key}{NODE_SUFFIXES[kind]}"
         if not tile.is_file():
-            raise InputError(tile, f"is missing ({count:,} points of {path.parent.name})", REMEDY)
+            raise InputError(tile, f"file not found ({count:,} points of {path.parent.name})", REMEDY)
         done = 0
         for part in _laszip(tile) if schema is None else _packed(tile, schema, count):
             done += len(part)
@@ -73,19 +76,19 @@ def _parts(path: Path) -> Iterator[Points]:
 
 
 def _nodes(folder: Path) -> Iterator[tuple[str, int]]:
-    """Keys (depth-x-y-z) and numbers of points of all nodes that have some, file after file of the hierarchy."""
+    """Key (depth-x-y-z) and number of points of all nodes with points, one hierarchy file after another."""
     waiting, seen = ["0-0-0-0"], set[str]()
     while waiting:
         file = folder / "ept-hierarchy" / f"{waiting.pop(0)}.json"
         entries = _json(file)
         for key, count in entries.items():
-            if not KEY.fullmatch(key) or not isinstance(count, int) or count < -1:
-                raise InputError(file, f"its entry {key[:40]!r} is no node of an octree", REMEDY)
+            if not NODE_KEY.fullmatch(key) or not isinstance(count, int) or count < -1:
+                raise InputError(file, f"its entry {key[:40]!r} is not an octree node", REMEDY)
         for key in sorted(entries, key=lambda key: [int(part) for part in key.split("-")]):
             count = entries[key]
             if count == -1:
                 if key in seen:
-                    raise InputError(file, f"leads to {key} a second time", REMEDY)
+                    raise InputError(file, f"refers to {key} a second time", REMEDY)
                 seen.add(key)
                 waiting.append(key)
             elif count > 0:
@@ -93,7 +96,7 @@ def _nodes(folder: Path) -> Iterator[tuple[str, int]]:
 
 
 def _laszip(tile: Path) -> Iterator[Points]:
-    for part in las.records(tile, PART):
+    for part in las.records(tile, READ_POINTS):
         names = set(part.point_format.dimension_names)
         yield Points(
             np.column_stack([part.x, part.y, part.z]),
@@ -107,7 +110,7 @@ def _laszip(tile: Path) -> Iterator[Points]:
 def _packed(tile: Path, schema: Schema, count: int) -> Iterator[Points]:
     row, scales = schema
     if tile.suffix == ".bin" and tile.stat().st_size != count * row.itemsize:
-        raise InputError(tile, f"is of {tile.stat().st_size:,} bytes, not {count * row.itemsize:,}", REMEDY)
+        raise InputError(tile, f"has {tile.stat().st_size:,} bytes, expected {count * row.itemsize:,}", REMEDY)
 
     def column(rows: npt.NDArray[Any], name: str) -> Any:
         if name not in scales:
@@ -129,7 +132,7 @@ def _packed(tile: Path, schema: Schema, count: int) -> Iterator[Points]:
 def _records(tile: Path, row: np.dtype[Any]) -> Iterator[npt.NDArray[Any]]:
     if tile.suffix == ".bin":
         with open(tile, "rb") as file:
-            while data := file.read(PART * row.itemsize):
+            while data := file.read(READ_POINTS * row.itemsize):
                 yield np.frombuffer(data, row)
         return
     import zstandard
@@ -137,38 +140,38 @@ def _records(tile: Path, row: np.dtype[Any]) -> Iterator[npt.NDArray[Any]]:
     rest = b""
     try:
         with open(tile, "rb") as file, zstandard.ZstdDecompressor().stream_reader(file) as reader:
-            while data := reader.read(PART * row.itemsize):
+            while data := reader.read(READ_POINTS * row.itemsize):
                 rest += data
                 n = len(rest) // row.itemsize
                 yield np.frombuffer(rest, row, n)
                 rest = rest[n * row.itemsize :]
     except zstandard.ZstdError as error:
-        raise InputError(tile, f"is no readable zstd file ({error})", REMEDY) from None
+        raise InputError(tile, f"is not a readable zstd file ({error})", REMEDY) from None
 
 
 def _schema(path: Path, info: dict[str, Any]) -> Schema:
     try:
         entries = [(str(entry["name"]), entry) for entry in info["schema"]]
-        row = np.dtype([(name, f"<{KINDS[entry['type']]}{int(entry['size'])}") for name, entry in entries])
+        row = np.dtype([(name, f"<{DTYPE_KINDS[entry['type']]}{int(entry['size'])}") for name, entry in entries])
         scales = {name: (float(entry.get("scale", 1)), float(entry.get("offset", 0))) for name, entry in entries}
         good = {"X", "Y", "Z"} <= scales.keys() and np.isfinite(list(scales.values())).all()
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
         good = False
     if not good:
-        raise InputError(path, "its schema describes no points with X, Y and Z", REMEDY)
+        raise InputError(path, "its schema has no valid dimensions X, Y and Z", REMEDY)
     return row, scales
 
 
 def _json(path: Path) -> dict[str, Any]:
     file_checks.check(path, REMEDY)
     try:
-        if path.stat().st_size > LARGEST:
+        if path.stat().st_size > MAX_JSON_BYTES:
             raise ValueError(f"{path.stat().st_size:,} bytes")
         body = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(body, dict):
-            raise ValueError("no object")
+            raise ValueError("not an object")
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(path, f"is no readable JSON ({str(error)[:100]})", REMEDY) from None
+        raise InputError(path, f"is not readable JSON ({str(error)[:100]})", REMEDY) from None
     return body
 
 
@@ -183,4 +186,4 @@ def _crs(path: Path, info: dict[str, Any]) -> str | None:
     try:
         return CRS.from_user_input(text).to_wkt()
     except CRSError as error:
-        raise InputError(path, f"its CRS can't be read ({str(error)[:100]})", "Mend `srs` in ept.json") from None
+        raise InputError(path, f"its CRS can't be read ({str(error)[:100]})", "Fix `srs` in ept.json") from None

@@ -1,4 +1,4 @@
-"""LAS, LAZ and COPC, through laspy."""
+"""LAS, LAZ and COPC clouds, read and written with laspy."""
 
 from __future__ import annotations
 
@@ -18,91 +18,98 @@ from scan2sim.pipeline.io import file_checks, las_header
 from scan2sim.pipeline.io.las_header import truncated
 
 SUFFIXES = (".las", ".laz")
-CHUNK = 2_000_000
-DAY = date(2000, 1, 1)
-"""Of creation, in every header: the same points are the same bytes on every day."""
-FEW = 50_000
-"""Points at a time, where the first ones mostly tell all; also those of most LAZ files' chunks."""
-PLACES, AT_EACH = 24, 500
-"""Where in a file, and how many points there, are held against its header's bounds."""
-SLACK = 0.1
-"""CRS units that points may be outside of their header's bounds, which writers round."""
-WIDE = 100.0
-"""CRS units by which bounds may be more than twice as wide as a sample of the points."""
+CHUNK_POINTS = 2_000_000
+CREATION_DATE = date(2000, 1, 1)
+"""Constant creation date in every header, so that the same points always give the same bytes."""
+PROBE_POINTS = 50_000
+"""Points per read where the first read mostly suffices; also the chunk size of most LAZ files."""
+SAMPLE_POSITIONS, SAMPLE_POINTS = 24, 500
+"""Positions in a file that are sampled to check its header's bounds, and points read at each."""
+BOUNDS_TOLERANCE = 0.1
+"""CRS units by which points may be outside of the header's bounds, which writers round."""
+BOUNDS_MARGIN = 100.0
+"""CRS units by which the header's bounds may exceed twice the extent of the sampled points."""
 SOFTWARE = "scan2sim"
-"""Who wrote a file, in its header: codes of 64 and up are of `pipeline.core.classes` then."""
+"""Generating software in the header of files of this project: codes from 64 on are `pipeline.core.classes` then."""
 
 
-def _open(path: Path, **options: Any) -> Any:
+def open_las(path: Path, **options: Any) -> Any:
+    """Open a file with laspy after checking its header.
+
+    Raises:
+        InputError: missing, or not a readable LAS file.
+    """
     import laspy
 
     las_header.check(file_checks.check(path))
     try:
         return laspy.open(path, **options)
-    except Exception as error:  # laspy's and the decompressors' parsers raise whatever the damage leads to
-        raise InputError(path, f"is no readable LAS file ({error})", las_header.AGAIN) from None
+    except Exception as error:  # damaged files make laspy and the decompressors raise any type of exception
+        raise InputError(path, f"is not a readable LAS file ({error})", las_header.COPY_AGAIN) from None
 
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
-    """Number of points, low and high corner (CRS units), CRS as WKT or None, and what is wrong with the header.
+    """Number of points, low and high corner (CRS units), CRS as WKT or None, and warnings about the header.
 
-    The corners are the header's where a sample of the points bears them out, else those of all points.
+    The corners are the header's if a sample of the points agrees with them, else those of all points.
     """
-    with _open(path) as reader:
+    with open_las(path) as reader:
         header = reader.header
         if header.point_count == 0:
-            raise InputError(path, "holds no points", "Leave it out of the tile")
+            raise InputError(path, "contains no points", "Remove it from the tile")
         notes, crs = las_header.check(path), _crs(path, header)
         low, high = np.array(header.mins), np.array(header.maxs)
-    if not _borne_out(path, low, high):
-        stated = low, high
+    if not _bounds_plausible(path, low, high):
+        declared = low, high
         stat = path.stat()
         low, high = _bounds(path, stat.st_size, stat.st_mtime_ns)
-        if not all(np.allclose(a, b, rtol=0, atol=SLACK) for a, b in zip(stated, (low, high), strict=True)):
-            notes = (*notes, "its header's bounding box is not that of its points, which is taken")
+        if not all(
+            np.allclose(a, b, rtol=0, atol=BOUNDS_TOLERANCE) for a, b in zip(declared, (low, high), strict=True)
+        ):
+            notes = (*notes, "its header's bounding box is wrong: that of the points is used")
     return header.point_count, low, high, crs, notes
 
 
-def _borne_out(path: Path, low: F64, high: F64) -> bool:
-    """Whether the header's corners may be relied on: a sample of the points is within, and not far within."""
+def _bounds_plausible(path: Path, low: F64, high: F64) -> bool:
+    """Whether the header's corners agree with a sample of the points: they contain it, and aren't much larger."""
     from laspy import LazBackend
 
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return False
-    places = []
-    with _open(path, laz_backend=LazBackend.Lazrs) as reader:  # decompresses what it is asked for, not whole chunks
-        last = reader.header.point_count - AT_EACH
-        if last < FEW:  # all are quickly read
+    samples = []
+    with open_las(path, laz_backend=LazBackend.Lazrs) as reader:  # decompresses only the requested points of a chunk
+        last = reader.header.point_count - SAMPLE_POINTS
+        if last < PROBE_POINTS:  # reading all points is fast
             return False
-        at = np.linspace(0, last, PLACES).astype(int)
+        at = np.linspace(0, last, SAMPLE_POSITIONS).astype(int)
         if reader.header.are_points_compressed:
-            at = np.unique(at // FEW * FEW)
+            at = np.unique(at // PROBE_POINTS * PROBE_POINTS)
         try:
             for first in at.tolist():
                 reader.seek(first)
-                places.append(_places(reader.read_points(AT_EACH)))
-        except Exception:  # no table of chunks, or damage, which reading all of it will name
+                samples.append(_coordinates(reader.read_points(SAMPLE_POINTS)))
+        except Exception:  # no chunk table, or damage, which is reported when all points are read
             return False
-    sample = np.concatenate(places)
-    least, most = sample.min(axis=0), sample.max(axis=0)
-    within = (least >= low - SLACK).all() and (most <= high + SLACK).all()
-    return bool(within and (high - low <= 2 * (most - least) + WIDE).all())
+    sample = np.concatenate(samples)
+    sample_low, sample_high = sample.min(axis=0), sample.max(axis=0)
+    within = (sample_low >= low - BOUNDS_TOLERANCE).all() and (sample_high <= high + BOUNDS_TOLERANCE).all()
+    return bool(within and (high - low <= 2 * (sample_high - sample_low) + BOUNDS_MARGIN).all())
 
 
 @functools.lru_cache(maxsize=256)
-def _bounds(path: Path, size: int, changed: int) -> tuple[F64, F64]:
-    """Low and high corner of all points of a file of that size and time of change."""
+def _bounds(path: Path, size: int, modified_ns: int) -> tuple[F64, F64]:
+    """Low and high corner of all points of a file; size and modification time are the cache key."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    with _open(path) as reader:
-        for part in _parts(path, reader, CHUNK):
-            places = _places(part)
-            low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
+    with open_las(path) as reader:
+        for part in read_parts(path, reader, CHUNK_POINTS):
+            xyz = _coordinates(part)
+            low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
     return low, high
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
-    """Read all points into local coordinates, chunk by chunk; colours of 16 bits become 8."""
-    with _open(path) as reader:
+    """Read all points into local coordinates, chunk by chunk; 16-bit colours become 8-bit ones."""
+    with open_las(path) as reader:
         n = reader.header.point_count
         names = set(reader.header.point_format.dimension_names)
         try:
@@ -112,58 +119,59 @@ def read(path: Path, frame: Frame) -> PointCloud:
             time = np.empty(n, np.float64) if "gps_time" in names else None
             rgb = np.empty((n, 3), np.uint16) if "red" in names else None
         except (MemoryError, ValueError):
-            raise InputError(path, f"says that it holds {n:,} points: more than fit here", "Cut it first") from None
+            cause = f"declares {n:,} points, which don't fit into memory"
+            raise InputError(path, cause, "Cut it into smaller files first") from None
         at = 0
-        for part in _parts(path, reader, CHUNK):
-            here = slice(at, at + len(part))
-            xyz[here] = frame.to_local(_places(part))
-            classification[here] = part.classification
-            intensity[here] = part.intensity
+        for part in read_parts(path, reader, CHUNK_POINTS):
+            rows = slice(at, at + len(part))
+            xyz[rows] = frame.to_local(_coordinates(part))
+            classification[rows] = part.classification
+            intensity[rows] = part.intensity
             if time is not None:
-                time[here] = part.gps_time
+                time[rows] = part.gps_time
             if rgb is not None:
-                rgb[here] = _colours(part)
+                rgb[rows] = _colours(part)
             at += len(part)
-    if time is not None and not time.any():  # a format with times that were never filled
+    if time is not None and not time.any():  # time fields that were never filled
         time = None
-    return PointCloud(frame, xyz, _eight_bits(rgb), classification=classification, time=time, intensity=intensity)
+    return PointCloud(frame, xyz, _to_uint8(rgb), classification=classification, time=time, intensity=intensity)
 
 
 def class_names(path: Path) -> tuple[bool, dict[int, str]]:
-    """Whether this project wrote a file, and what its lookup record calls its classes."""
-    with _open(path) as reader:
+    """Whether this project wrote a file, and the class names of its classification lookup record."""
+    with open_las(path) as reader:
         header = reader.header
         writers = f"{header.system_identifier} {header.generating_software}".lower()
         names = {c: n for record in header.vlrs.get("ClassificationLookupVlr") for c, n in record.lookups.items()}
     return SOFTWARE in writers, names
 
 
-def records(path: Path, size: int = CHUNK) -> Iterator[Any]:
-    """The points as laspy's records, `size` at a time.
+def records(path: Path, size: int = CHUNK_POINTS) -> Iterator[Any]:
+    """The points as laspy records, `size` at a time.
 
     Raises:
         InputError: missing, truncated or damaged.
     """
-    with _open(path) as reader:
-        yield from _parts(path, reader, size)
+    with open_las(path) as reader:
+        yield from read_parts(path, reader, size)
 
 
-def chunks(path: Path, frame: Frame, size: int = CHUNK) -> Iterator[PointCloud]:
-    """The points in their order, `size` at a time, as `read` reads them.
+def chunks(path: Path, frame: Frame, size: int = CHUNK_POINTS) -> Iterator[PointCloud]:
+    """The points in file order, `size` at a time, converted as by `read`.
 
-    Each part is in a frame of its own, with its origin near its points: over kilometres float32 would lose
+    Each chunk is in a frame of its own, with its origin near its points: over kilometres float32 would lose
     millimetres.
     """
     shift = _colour_shift(path)
-    with _open(path) as reader:
+    with open_las(path) as reader:
         timed = "gps_time" in set(reader.header.point_format.dimension_names)
-        for part in _parts(path, reader, size):
-            places = _places(part)
-            x, y, z = np.floor(places.mean(axis=0) * frame.unit).tolist()
+        for part in read_parts(path, reader, size):
+            xyz = _coordinates(part)
+            x, y, z = np.floor(xyz.mean(axis=0) * frame.unit).tolist()
             near = replace(frame, origin=(x, y, z))
             yield PointCloud(
                 near,
-                near.to_local(places).astype(np.float32),
+                near.to_local(xyz).astype(np.float32),
                 None if shift is None else (_colours(part) >> shift).astype(np.uint8),
                 classification=np.array(part.classification, np.uint8),
                 time=np.array(part.gps_time, np.float64) if timed else None,
@@ -172,17 +180,18 @@ def chunks(path: Path, frame: Frame, size: int = CHUNK) -> Iterator[PointCloud]:
 
 
 def write(path: Path, cloud: PointCloud, scale: float = 0.001) -> None:
-    """Write a LAS 1.4 file (LAZ by suffix), CRS and class names included; coordinates back in the CRS."""
+    """Write a LAS 1.4 file (LAZ by suffix) with its CRS; coordinates are transformed back to the CRS."""
     write_parts(path, [cloud], scale)
 
 
 def write_parts(path: Path, parts: Iterable[PointCloud], scale: float = 0.001, software: str = SOFTWARE) -> None:
-    """Write what `write` would of all parts together, which are in one frame and have the same attributes.
+    """Write chunks of one cloud, in the same frame and with the same attributes, as one file like `write`.
 
     Args:
-        parts: at least one; only one at a time is in memory.
-        scale: metres, the precision of coordinates.
-        software: that classes are of; another than `SOFTWARE` where they are as a survey has them.
+        path: LAS or LAZ file.
+        parts: at least one chunk; only one at a time is in memory.
+        scale: resolution of the coordinates, metres.
+        software: generating software; not `SOFTWARE` if class codes are those of the survey.
     """
     import laspy
 
@@ -195,9 +204,11 @@ def write_parts(path: Path, parts: Iterable[PointCloud], scale: float = 0.001, s
             try:
                 writer.write_points(_record(part, header))
             except OverflowError:
-                reach = 2**31 * scale / 1000
-                cause = f"its points are more than {reach:,.0f} km apart: LAS holds no more in steps of {scale:g} m"
-                raise DataError(path.name, cause, "Remove stray points, and check the unit") from None
+                extent_km = 2**31 * scale / 1000
+                cause = (
+                    f"its points are more than {extent_km:,.0f} km apart, LAS's limit at a resolution of {scale:g} m"
+                )
+                raise DataError(path.name, cause, "Remove outliers, and check the unit") from None
 
 
 def _header(cloud: PointCloud, scale: float) -> Any:
@@ -205,7 +216,7 @@ def _header(cloud: PointCloud, scale: float) -> Any:
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
     header = laspy.LasHeader(point_format=6 if cloud.rgb is None else 7, version="1.4")
-    header.creation_date = DAY
+    header.creation_date = CREATION_DATE
     header.scales = np.full(3, scale / cloud.frame.unit)
     header.offsets = np.floor(cloud.frame.to_crs(np.zeros(3)))
     if cloud.frame.crs != "local":
@@ -232,45 +243,49 @@ def _record(cloud: PointCloud, header: Any) -> Any:
     return record
 
 
-def _parts(path: Path, reader: Any, size: int) -> Iterator[Any]:
-    """All points of an open file, `size` at a time, in laspy's records; less than all is an error."""
+def read_parts(path: Path, reader: Any, size: int) -> Iterator[Any]:
+    """All points of an open file, `size` at a time, as laspy records.
+
+    Raises:
+        InputError: the file has fewer points than its header declares.
+    """
     at, n = 0, reader.header.point_count
     try:
         for part in reader.chunk_iterator(size):
             yield part
             at += len(part)
-    except Exception as error:  # the decompressors raise their own kinds, a panic among them
+    except Exception as error:  # the decompressors raise types of their own, Rust panics among them
         raise truncated(path, at, n, str(error)) from None
     if at < n:
         raise truncated(path, at, n, "end of file")
 
 
-def _places(part: Any) -> F64:
-    """(N, 3) CRS coordinates of a record."""
+def _coordinates(part: Any) -> F64:
+    """CRS coordinates (N, 3) of a record."""
     return np.column_stack([part.x, part.y, part.z])
 
 
 def _colours(part: Any) -> Any:
-    """(N, 3) uint16 of a record."""
+    """Colours (N, 3) uint16 of a record."""
     return np.column_stack([part.red, part.green, part.blue])
 
 
 def _colour_shift(path: Path) -> int | None:
-    """By how many bits colours must be shifted to be of 8; None without any. Mostly the first points tell it."""
-    with _open(path) as reader:
+    """Bits to shift colours right by to get 8-bit ones, None without colours; mostly the first points suffice."""
+    with open_las(path) as reader:
         if "red" not in set(reader.header.point_format.dimension_names):
             return None
         filled = False
-        for part in _parts(path, reader, FEW):
-            most = _colours(part).max()
-            if most > 255:
+        for part in read_parts(path, reader, PROBE_POINTS):
+            largest = _colours(part).max()
+            if largest > 255:
                 return 8
-            filled |= bool(most)
+            filled |= bool(largest)
     return 0 if filled else None
 
 
-def _eight_bits(rgb: Any) -> Any:
-    if rgb is None or not rgb.any():  # a format with colour fields that were never filled
+def _to_uint8(rgb: Any) -> Any:
+    if rgb is None or not rgb.any():  # colour fields that were never filled
         return None
     return (rgb >> 8).astype(np.uint8) if rgb.max() > 255 else rgb.astype(np.uint8)
 
@@ -280,6 +295,6 @@ def _crs(path: Path, header: Any) -> str | None:
         crs = las_header.parsed_crs(header)
     except ValueError as error:
         raise InputError(
-            path, f"its CRS can't be read ({error})", "Set `crs` in its header, or write it again"
+            path, f"its CRS can't be read ({error})", "Fix the CRS in its header, or export it again"
         ) from None
     return crs.to_wkt() if crs is not None else None

@@ -1,8 +1,8 @@
 """PCD clouds (Point Cloud Library, file format 0.6 and 0.7): ascii, binary and binary_compressed.
 
 A header of lines (VERSION, FIELDS, SIZE, TYPE, COUNT, WIDTH, HEIGHT, VIEWPOINT, POINTS, DATA), then the points.
-`binary_compressed` holds two sizes (uint32) and LZF data, in which each field's values stand together. VIEWPOINT, where
-the scanner stood, moves no points: PCL's readers give them as they are, too.
+`binary_compressed` data is two sizes (uint32) and LZF data, in which the values of each field are contiguous.
+VIEWPOINT, the pose of the scanner, is not applied to the points; PCL's readers don't apply it either.
 
 Source: https://pointclouds.org/documentation/tutorials/pcd_file_format.html; `rgb` is 0x00RRGGBB, in the bits of a
 float32 or as uint32.
@@ -21,16 +21,16 @@ from numba import njit
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, U8, Frame, PointCloud
-from scan2sim.pipeline.io import number_text, point_chunks
-from scan2sim.pipeline.io.point_chunks import PART, Points
+from scan2sim.pipeline.io import file_checks, number_text, point_chunks
+from scan2sim.pipeline.io.point_chunks import READ_POINTS, Points
 
 SUFFIXES = (".pcd",)
 REMEDY = "Copy it again, or write it as binary PCD or LAZ"
-KINDS = {"F": "f", "U": "u", "I": "i"}
-LONGEST = 10_000
-"""Bytes of a header's line."""
-LZF_RATIO = 100
-"""LZF packs 264 bytes into 3 at best: what claims to be packed more is damaged."""
+DTYPE_KINDS = {"F": "f", "U": "u", "I": "i"}
+MAX_LINE_BYTES = 10_000
+"""Maximum length of a header line, and of a point."""
+MAX_LZF_RATIO = 100
+"""LZF compresses at most 264 bytes into 3: a file that declares a higher ratio than this is damaged."""
 CLASSES = ("classification", "class", "label")
 INTENSITIES = ("intensity", "intensities", "reflectivity")
 TIMES = ("gps_time", "time", "timestamp")
@@ -41,23 +41,23 @@ class _Header:
     row: np.dtype[Any]
     count: int
     data: str
-    start: int  # of the points, bytes
+    start: int  # byte offset of the points
 
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
-    """Number of points that are finite, low and high corner; PCD has no CRS."""
+    """Number of finite points, low and high corner; PCD has no CRS."""
     found = point_chunks.summary(path, _parts(path))
     return found.count, found.low, found.high, None
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
-    """All points in local coordinates, with `rgb`, `intensity`, a class and times where there are fields of them."""
-    return point_chunks.whole(path, _parts(path), frame)
+    """All points in local coordinates, with colour, intensity, class and time if the file has such fields."""
+    return point_chunks.read_all(path, _parts(path), frame)
 
 
 def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
-    """The points in their order, `size` at a time at most."""
-    return point_chunks.local(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
+    """The points in file order, at most `size` per chunk."""
+    return point_chunks.read_chunks(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
 
 
 def _parts(path: Path) -> Iterator[Points]:
@@ -66,7 +66,7 @@ def _parts(path: Path) -> Iterator[Points]:
 
 
 def _rows(path: Path) -> Iterator[npt.NDArray[Any]]:
-    """All points as records; fewer than the header says is an error, and nothing is allocated on its word alone."""
+    """All points as structured arrays; fewer than declared is an error, and sizes are checked before allocation."""
     try:
         with open(path, "rb") as file:
             header = _header(path, file)
@@ -75,22 +75,22 @@ def _rows(path: Path) -> Iterator[npt.NDArray[Any]]:
                 yield from _ascii(path, file, header)
             elif header.data == "binary":
                 if left < header.count * header.row.itemsize:
-                    raise _short(path, left // header.row.itemsize, header.count)
-                for at in range(0, header.count, PART):
-                    n = min(PART, header.count - at)
+                    raise _truncated(path, left // header.row.itemsize, header.count)
+                for at in range(0, header.count, READ_POINTS):
+                    n = min(READ_POINTS, header.count - at)
                     yield np.frombuffer(file.read(n * header.row.itemsize), header.row, n)
             else:
                 yield _compressed(path, file, header, left)
     except FileNotFoundError:
-        raise InputError(path, "is missing", "Put it there, or mend the name") from None
+        raise InputError(path, file_checks.NOT_FOUND, file_checks.CHECK_PATH) from None
     except (OSError, ValueError) as error:
-        raise InputError(path, f"is no readable PCD cloud ({error})", REMEDY) from None
+        raise InputError(path, f"is not a readable PCD cloud ({error})", REMEDY) from None
 
 
 def _header(path: Path, file: BinaryIO) -> _Header:
     entries: dict[str, list[str]] = {}
     while "DATA" not in entries:
-        line = file.readline(LONGEST)
+        line = file.readline(MAX_LINE_BYTES)
         if not line.endswith(b"\n") or len(entries) > 20:
             raise ValueError("its header has no DATA line")
         key, *values = line.decode("ascii", "replace").partition("#")[0].split() or [""]
@@ -104,33 +104,33 @@ def _header(path: Path, file: BinaryIO) -> _Header:
         count = int(entries["POINTS"][0]) if "POINTS" in entries else width * height
         data = entries["DATA"][0].lower()
         shaped = [
-            # PCL names all its padding "_"
-            (f"_{i}" if name == "_" else name, f"<{KINDS[kind]}{size}", (n,) if n != 1 else ())
+            # PCL names all padding "_", but names in a dtype must be unique
+            (f"_{i}" if name == "_" else name, f"<{DTYPE_KINDS[kind]}{size}", (n,) if n != 1 else ())
             for i, (name, kind, size, n) in enumerate(zip(names, kinds, sizes, counts, strict=True))
         ]
         row = np.dtype(shaped)
     except (KeyError, IndexError, TypeError) as error:
-        raise ValueError(f"its header lacks or misstates {error}") from None
-    if min(counts) < 1 or count < 1 or row.itemsize > LONGEST:
-        raise ValueError(f"its header says {count} points of {row.itemsize} bytes")
+        raise ValueError(f"its header has no valid {error}") from None
+    if min(counts) < 1 or count < 1 or row.itemsize > MAX_LINE_BYTES:
+        raise ValueError(f"its header declares {count} points of {row.itemsize} bytes")
     if data not in ("ascii", "binary", "binary_compressed"):
-        raise ValueError(f"its DATA is {data[:40]!r}")
+        raise ValueError(f"its DATA is the unknown {data[:40]!r}")
     if not {"x", "y", "z"} <= set(names):
         raise ValueError(f"it has no x, y, z (its fields are {', '.join(names)})")
     return _Header(row, count, data, file.tell())
 
 
 def _ascii(path: Path, file: BinaryIO, header: _Header) -> Iterator[npt.NDArray[Any]]:
-    wide = sum(int(np.prod(header.row[name].shape)) for name in header.row.names or ())
+    width = sum(int(np.prod(header.row[name].shape)) for name in header.row.names or ())
     done = 0
     for block in number_text.blocks(path, file):
-        values = number_text.numbers(block, None, wide)
+        values = number_text.numbers(block, None, width)
         yield _records(values, header.row)
         done += len(values)
     if done < header.count:
-        raise _short(path, done, header.count)
+        raise _truncated(path, done, header.count)
     if done > header.count:
-        raise ValueError(f"it has {done:,} points, its header says {header.count:,}")
+        raise ValueError(f"it has {done:,} points, its header declares {header.count:,}")
 
 
 def _records(values: F64, row: np.dtype[Any]) -> npt.NDArray[Any]:
@@ -140,7 +140,7 @@ def _records(values: F64, row: np.dtype[Any]) -> npt.NDArray[Any]:
         n = int(np.prod(row[name].shape))
         column = values[:, at : at + n].reshape(len(values), *row[name].shape)
         packed = name in ("rgb", "rgba") and row[name].kind == "f" and bool((column > 1).any())
-        # newer writers print packed colours as whole numbers, older ones as the floats that their bits are
+        # newer writers print packed colours as integers, older ones as floats with the same bits
         out[name] = column.astype(np.uint32).view(np.float32) if packed else column
         at += n
     return out
@@ -149,11 +149,11 @@ def _records(values: F64, row: np.dtype[Any]) -> npt.NDArray[Any]:
 def _compressed(path: Path, file: BinaryIO, header: _Header, left: int) -> npt.NDArray[Any]:
     packed, size = (int(value) for value in np.frombuffer(file.read(8), "<u4", 2))
     if size != header.count * header.row.itemsize:
-        raise ValueError(f"it unpacks to {size:,} bytes, its header says {header.count * header.row.itemsize:,}")
+        raise ValueError(f"it unpacks to {size:,} bytes, its header declares {header.count * header.row.itemsize:,}")
     if packed > left - 8:
-        raise InputError(path, f"is truncated: {left - 8:,} of {packed:,} bytes are there", REMEDY)
-    if size > packed * LZF_RATIO:
-        raise ValueError(f"it claims to unpack {packed:,} bytes to {size:,}")
+        raise InputError(path, f"is truncated: it has {left - 8:,} of {packed:,} bytes", REMEDY)
+    if size > packed * MAX_LZF_RATIO:
+        raise ValueError(f"it declares {packed:,} packed bytes that unpack to {size:,}, which LZF can't do")
     plain = np.empty(size, np.uint8)
     if _unpack(np.frombuffer(file.read(packed), np.uint8), plain) != size:
         raise ValueError("its packed data is damaged")
@@ -168,7 +168,10 @@ def _compressed(path: Path, file: BinaryIO, header: _Header, left: int) -> npt.N
 
 @njit(cache=True)
 def _unpack(packed: U8, plain: U8) -> int:
-    """LZF (Lehmann's liblzf): a byte below 32 says how many follow as they are, others point back; -1: damaged."""
+    """Decompress LZF (Lehmann's liblzf) into `plain`; returns the number of bytes, -1 if damaged.
+
+    A control byte below 32 is the length of a literal run minus one, others are references to earlier output.
+    """
     i, o, n, size = 0, 0, len(packed), len(plain)
     while i < n:
         control = packed[i]
@@ -193,7 +196,7 @@ def _unpack(packed: U8, plain: U8) -> int:
             i += 1
             if back < 0 or o + length > size:
                 return -1
-            for k in range(length):  # byte by byte: it may overlap itself
+            for k in range(length):  # byte by byte: source and target may overlap
                 plain[o + k] = plain[back + k]
         o += length
     return o
@@ -217,5 +220,5 @@ def _points(path: Path, rows: npt.NDArray[Any]) -> Points:
     return Points(xyz, rgb, classification=first(CLASSES), time=first(TIMES), intensity=first(INTENSITIES))
 
 
-def _short(path: Path, there: int, count: int) -> InputError:
-    return InputError(path, f"is truncated or damaged: {there:,} of {count:,} points can be read", REMEDY)
+def _truncated(path: Path, available: int, count: int) -> InputError:
+    return InputError(path, f"is truncated or damaged: {available:,} of {count:,} points can be read", REMEDY)

@@ -1,6 +1,6 @@
-"""PLY clouds (Turk 1994): the vertices of an ASCII or binary file, float64 coordinates kept.
+"""PLY clouds (Turk 1994): the vertices of an ASCII or binary file, with float64 coordinates.
 
-A file must hold as many vertices as its header says: what a broken copy or a lying header leaves is no cloud.
+A file must have exactly the number of vertices that its header declares, otherwise it is refused as truncated.
 """
 
 from __future__ import annotations
@@ -16,35 +16,34 @@ import numpy.typing as npt
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Frame, PointCloud
 from scan2sim.pipeline.io import file_checks, number_text, point_chunks
-from scan2sim.pipeline.io.point_chunks import PART, Points
+from scan2sim.pipeline.io.point_chunks import READ_POINTS, Points
 
 SUFFIXES = (".ply",)
-AGAIN = "Export it again, or as LAZ"
+REMEDY = "Export it again, or as LAZ"
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
-ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 CLASSES = ("classification", "class", "label", "scalar_classification", "scalar_label")
 INTENSITIES = ("intensity", "intensities", "reflectivity", "scalar_intensity")
 TIMES = ("gps_time", "time", "timestamp", "scalar_gpstime")
-LONGEST = 100_000
-"""Bytes of a header that are looked at."""
+MAX_HEADER_BYTES = 100_000
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the vertices are.
+    """Layout of the vertices in a file.
 
     Attributes:
         form: "ascii", "binary_little_endian" or "binary_big_endian".
-        count: of vertices, as the header says.
-        row: a vertex's properties, names in lower case.
-        start: byte of the first element behind the header.
-        before: of elements before the vertices: lines (ASCII) or bytes.
-        last: whether nothing follows the vertices.
+        count: number of vertices that the header declares.
+        row: dtype of a vertex, property names in lower case.
+        start: byte offset of the first element after the header.
+        before: size of the elements before the vertices: lines (ASCII) or bytes.
+        last: whether the vertices are the last element.
     """
 
     form: str
@@ -56,39 +55,39 @@ class Layout:
 
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
-    """Number of points that are finite, low and high corner (CRS units), no CRS, and how many aren't finite."""
+    """Number of finite points, low and high corner (CRS units), no CRS, and a note on points that aren't finite."""
     found = point_chunks.summary(path, _parts(path))
-    lost = layout(path).count - found.count
-    notes = (f"{lost:,} points with NaN coordinates left out",) if lost else ()
+    removed = layout(path).count - found.count
+    notes = (f"{removed:,} points with NaN coordinates removed",) if removed else ()
     return found.count, found.low, found.high, None, notes
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
-    """All points in local coordinates, with colours, intensities and a class (`CLASSES`) where they have them."""
-    return point_chunks.whole(path, _parts(path), frame)
+    """All points in local coordinates, with colours, intensities and classes (`CLASSES`) if the file has them."""
+    return point_chunks.read_all(path, _parts(path), frame)
 
 
 def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
-    """The points in their order, `size` at a time at most, each part in a frame with its origin near its points."""
-    return point_chunks.local(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
+    """The points in file order, at most `size` per chunk, each chunk in a frame with its origin near its points."""
+    return point_chunks.read_chunks(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
 
 
 def layout(path: Path) -> Layout:
-    """What the header says.
+    """Parse the header.
 
     Raises:
-        InputError: it is none, has no vertices with x, y and z, or ones of varying length.
+        InputError: not a PLY header, no vertices with x, y and z, or vertices with list properties.
     """
     with file_checks.check(path).open("rb") as file:
-        head, found, _ = file.read(LONGEST).partition(b"end_header")
+        head, found, _ = file.read(MAX_HEADER_BYTES).partition(b"end_header")
         lines = [line.split() for line in head.decode("latin-1").splitlines()]
         if not head.startswith(b"ply") or not found:
             raise _bad(path, "it has no header")
         file.seek(len(head) + len(found))
         start = file.tell() + len(file.readline(3))  # \n or \r\n
     form = next((words[1] for words in lines if words[:1] == ["format"] and len(words) > 1), "")
-    if form not in ORDERS:
-        raise _bad(path, f"its format is {form[:40]!r}")
+    if form not in BYTE_ORDERS:
+        raise _bad(path, f"its format is the unknown {form[:40]!r}")
     before, elements = 0, _elements(path, lines)
     for i, (name, count, properties) in enumerate(elements):
         fixed = all(kind in TYPES for kind, _ in properties)
@@ -98,16 +97,17 @@ def layout(path: Path) -> Layout:
             continue
         names = [name.lower() for _, name in properties]
         if not fixed or name != "vertex" or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
-            raise _bad(path, f"its {name[:40]} elements have {', '.join(names)[:80] or 'nothing'}, some as lists")
-        row = np.dtype([(n, ORDERS[form] + TYPES[kind]) for (kind, _), n in zip(properties, names, strict=True)])
+            properties_text = ", ".join(names)[:80] or "none"
+            raise _bad(path, f"its {name[:40]} elements have unsupported properties: {properties_text}")
+        row = np.dtype([(n, BYTE_ORDERS[form] + TYPES[kind]) for (kind, _), n in zip(properties, names, strict=True)])
         if count == 0:
-            raise InputError(path, "holds no points", "Leave it out of the tile")
+            raise InputError(path, "contains no points", "Remove it from the tile")
         return Layout(form, count, row, start, before, i == len(elements) - 1)
-    raise _bad(path, "no vertices")
+    raise _bad(path, "it has no vertices")
 
 
 def _elements(path: Path, lines: list[list[str]]) -> list[tuple[str, int, list[tuple[str, str]]]]:
-    """Name, number and properties (type, name; of a list "list") of each element."""
+    """Name, count and properties (type, name; type "list" for lists) of each element."""
     found: list[tuple[str, int, list[tuple[str, str]]]] = []
     for words in lines:
         try:
@@ -116,47 +116,47 @@ def _elements(path: Path, lines: list[list[str]]) -> list[tuple[str, int, list[t
             elif words[:1] == ["property"]:
                 found[-1][2].append((words[1], words[-1]))
         except (IndexError, ValueError):
-            raise _bad(path, f"its header says {' '.join(words)[:80]!r}") from None
+            raise _bad(path, f"invalid header line {' '.join(words)[:80]!r}") from None
     if any(count < 0 for _, count, _ in found):
-        raise _bad(path, "a number of elements below 0")
+        raise _bad(path, "its header declares a negative number of elements")
     return found
 
 
 def _parts(path: Path) -> Iterator[Points]:
-    """The vertices, as many as the header says.
+    """The vertices, in chunks.
 
     Raises:
-        InputError: there are fewer, or more, or something else.
+        InputError: there are fewer or more vertices than declared, or they can't be parsed.
     """
     header = layout(path)
-    for rows in _of_text(path, header) if header.form == "ascii" else _of_bytes(path, header):
+    for rows in _ascii_rows(path, header) if header.form == "ascii" else _binary_rows(path, header):
         names = rows.dtype.names or ()
 
         def first(wanted: Sequence[str], rows: Any = rows, names: Sequence[str] = names) -> Any:
             return next((rows[name] for name in wanted if name in names), None)
 
-        three = next((three for three in COLOURS if set(three) <= set(names)), None)
+        rgb_names = next((three for three in COLOURS if set(three) <= set(names)), None)
         yield Points(
             np.column_stack([rows[axis].astype(np.float64) for axis in "xyz"]),
-            None if three is None else np.column_stack([rows[name] for name in three]),
+            None if rgb_names is None else np.column_stack([rows[name] for name in rgb_names]),
             classification=first(CLASSES),
             time=first(TIMES),
             intensity=first(INTENSITIES),
         )
 
 
-def _of_bytes(path: Path, header: Layout) -> Iterator[npt.NDArray[Any]]:
+def _binary_rows(path: Path, header: Layout) -> Iterator[npt.NDArray[Any]]:
     first = header.start + header.before
-    there = max(0, path.stat().st_size - first) // header.row.itemsize
-    if there < header.count or (header.last and there > header.count):
-        raise _other_count(path, header.count, there)
+    available = max(0, path.stat().st_size - first) // header.row.itemsize
+    if available < header.count or (header.last and available > header.count):
+        raise _wrong_count(path, header.count, available)
     with path.open("rb") as file:
         file.seek(first)
-        for at in range(0, header.count, PART):
-            yield np.fromfile(file, header.row, min(PART, header.count - at))
+        for at in range(0, header.count, READ_POINTS):
+            yield np.fromfile(file, header.row, min(READ_POINTS, header.count - at))
 
 
-def _of_text(path: Path, header: Layout) -> Iterator[npt.NDArray[Any]]:
+def _ascii_rows(path: Path, header: Layout) -> Iterator[npt.NDArray[Any]]:
     skip, at, names = header.before, 0, header.row.names or ()
     with path.open("rb") as file:
         file.seek(header.start)
@@ -164,28 +164,29 @@ def _of_text(path: Path, header: Layout) -> Iterator[npt.NDArray[Any]]:
             lines = block[skip:]
             skip = max(0, skip - len(block))
             if header.last and at + len(lines) > header.count:
-                raise _other_count(path, header.count, at + len(lines))
+                raise _wrong_count(path, header.count, at + len(lines))
             lines = lines[: header.count - at]
             try:
                 table = number_text.numbers(lines, None, len(names))
             except ValueError as error:
-                if lines and len(lines[-1].split()) < len(names):  # the last line of a broken copy
-                    raise _other_count(path, header.count, at + len(lines) - 1) from None
+                if lines and len(lines[-1].split()) < len(names):  # the last line of a truncated file
+                    raise _wrong_count(path, header.count, at + len(lines) - 1) from None
                 raise _bad(path, f"vertices {at + 1:,} to {at + len(lines):,}: {error}") from None
             rows = np.empty(len(table), header.row)
-            with np.errstate(invalid="ignore", over="ignore"):  # numbers that their type can't hold
+            with np.errstate(invalid="ignore", over="ignore"):  # values out of range of their type
                 for k, name in enumerate(names):
                     rows[name] = table[:, k]
             yield rows
             at += len(rows)
     if at < header.count:
-        raise _other_count(path, header.count, at)
+        raise _wrong_count(path, header.count, at)
 
 
-def _other_count(path: Path, declared: int, there: int) -> InputError:
-    some = f"{there:,}" if there < declared else f"{there:,} or more"
-    return InputError(path, f"is truncated or damaged: its header says {declared:,} vertices, there are {some}", AGAIN)
+def _wrong_count(path: Path, declared: int, available: int) -> InputError:
+    number = f"{available:,}" if available < declared else f"{available:,} or more"
+    cause = f"is truncated or damaged: its header declares {declared:,} vertices, there are {number}"
+    return InputError(path, cause, REMEDY)
 
 
 def _bad(path: Path, cause: str) -> InputError:
-    return InputError(path, f"is no readable PLY cloud ({cause})", AGAIN)
+    return InputError(path, f"is not a readable PLY cloud ({cause})", REMEDY)

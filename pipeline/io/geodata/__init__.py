@@ -1,4 +1,4 @@
 """Geographic formats: coordinate reference systems, GeoJSON, GeoTIFF, footprints, orthophotos, OpenDRIVE, STAC.
 
-Begin with `crs`.
+Start reading at `crs`.
 """

@@ -1,4 +1,4 @@
-"""Coordinate reference systems: which one a tile is in, and metres per unit of its axes."""
+"""Coordinate reference systems (CRS): the CRS of a tile, metres per unit of its axes, transformations to WGS 84."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ LOCAL = "local"
 def common(
     tile: Path, crs: str | None, units: str | None, clouds: Sequence[Path], headers: Sequence[Header]
 ) -> tuple[str, float]:
-    """The CRS of a tile and metres per unit: the tile's own word, else what its clouds agree on.
+    """The CRS of a tile and metres per unit: the CRS given in `tile.toml`, else the common CRS of its clouds.
 
     Raises:
-        InputError: no CRS at all, clouds in different ones, or one that isn't projected.
+        InputError: no CRS is known, the clouds have different ones, or the CRS isn't projected.
     """
-    own = [(path, h.crs) for path, h in zip(clouds, headers, strict=True)]
-    known = [(path, c) for path, c in own if c]
+    cloud_crs = [(path, h.crs) for path, h in zip(clouds, headers, strict=True)]
+    known = [(path, c) for path, c in cloud_crs if c]
     for path, other in known[1:]:
         if not same(known[0][1], other):
             raise InputError(
                 path,
                 f"is in {name(other)}, but {known[0][0].name} is in {name(known[0][1])}",
-                "Bring all clouds of a tile to one CRS first",
+                "Reproject all clouds of a tile to one CRS first",
             )
     if crs is None:
-        unknown = [path for path, c in own if not c]
+        unknown = [path for path, c in cloud_crs if not c]
         if unknown:
             raise InputError(
                 unknown[0],
-                "has no CRS, and the tile names none",
+                "has no CRS, and neither has the tile",
                 'Add crs = "EPSG:..." to tile.toml, or crs = "local" for metres without georeference',
             )
         crs = known[0][1] or LOCAL
@@ -51,7 +51,7 @@ def common(
         raise InputError(
             known[0][0],
             f"is in {name(known[0][1])}, but {tile.name} says {name(crs)}",
-            "Mend `crs` in tile.toml, or leave it out to take the cloud's",
+            "Fix `crs` in tile.toml, or remove it to use the cloud's",
         )
     if crs == LOCAL:
         return LOCAL, UNITS[units or "m"]
@@ -59,26 +59,26 @@ def common(
     if units and abs(UNITS[units] / unit - 1) > 1e-5:
         raise InputError(
             tile,
-            f"says units = {units!r}, but the axes of {name(crs)} are of {unit:g} m",
-            "Leave `units` out: a CRS has its own; it is for clouds without one",
+            f"says units = {units!r}, but the axes of {name(crs)} have a unit of {unit:g} m",
+            "Remove `units`: a CRS defines its own; the field is for clouds without a CRS",
         )
     return crs, unit
 
 
 def utm(latitude: float, longitude: float) -> str:
-    """The code of the UTM zone (WGS 84) of a place in degrees."""
+    """EPSG code of the UTM zone (WGS 84) that contains a position in degrees."""
     return utm_zone(min(int((longitude + 180) // 6) + 1, 60), north=latitude >= 0)
 
 
 def utm_zone(zone: int, *, north: bool) -> str:
-    """The code of a UTM zone (WGS 84), 1 to 60, of one hemisphere."""
+    """EPSG code of a UTM zone (WGS 84), 1 to 60, of one hemisphere."""
     return f"EPSG:{(32600 if north else 32700) + zone}"
 
 
 def to_wgs84(frame: Frame, xyz: npt.ArrayLike = (0.0, 0.0, 0.0)) -> tuple[float, float, float] | None:
     """(latitude deg, longitude deg, height m) of a local point; None for a local frame.
 
-    The height is the CRS's own (ellipsoidal or local, as it says); no vertical shift is applied.
+    The height is that of the CRS (ellipsoidal or orthometric); no vertical transformation is applied.
     """
     if frame.crs == LOCAL:
         return None
@@ -91,12 +91,12 @@ def to_wgs84(frame: Frame, xyz: npt.ArrayLike = (0.0, 0.0, 0.0)) -> tuple[float,
 
 
 def to_ecef(frame: Frame, xyz: npt.ArrayLike) -> F64:
-    """Local points (N, 3) as earth-centred WGS 84 metres (N, 3), EPSG:4978; heights as `to_wgs84` takes them."""
+    """Local points (N, 3) as earth-centred WGS 84 metres (N, 3), EPSG:4978; heights as in `to_wgs84`."""
     from pyproj import Transformer
 
     local = np.asarray(xyz, np.float64)
-    places = frame.to_crs(local)
-    lon, lat = Transformer.from_crs(_horizontal(frame.crs), "EPSG:4979", always_xy=True).transform(*places.T[:2])[:2]
+    projected = frame.to_crs(local)
+    lon, lat = Transformer.from_crs(_horizontal(frame.crs), "EPSG:4979", always_xy=True).transform(*projected.T[:2])[:2]
     to_centre = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
     return np.stack(to_centre.transform(lon, lat, local[:, 2] + frame.origin[2]), axis=1)
 
@@ -107,22 +107,22 @@ def convergence(frame: Frame) -> float:
         return 0.0
     from pyproj import Proj
 
-    here = to_wgs84(frame)
-    assert here is not None
-    return float(np.radians(Proj(_horizontal(frame.crs)).get_factors(here[1], here[0]).meridian_convergence))
+    origin = to_wgs84(frame)
+    assert origin is not None
+    return float(np.radians(Proj(_horizontal(frame.crs)).get_factors(origin[1], origin[0]).meridian_convergence))
 
 
 def has_heights(crs: str) -> bool:
-    """Whether a CRS says of its own what heights are above (a geoid, say)."""
+    """Whether a CRS is compound, that is, defines its vertical datum (such as a geoid)."""
     return crs != LOCAL and bool(_parsed(crs).is_compound)
 
 
 def proj_string(crs: str) -> str:
-    """A projected CRS as PROJ's text, in metres whatever its own units are; what it says of heights is left out."""
+    """PROJ string of a projected CRS, with metres as unit whatever its own are, without its vertical part."""
     import warnings
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # that PROJ's text says less than WKT: why formats want both
+        warnings.simplefilter("ignore", UserWarning)  # "a PROJ string loses information": output formats require it
         text = _horizontal(crs).to_proj4()
     return (
         " ".join(part for part in text.split() if not part.startswith(("+units", "+to_meter", "+type"))) + " +units=m"
@@ -137,7 +137,7 @@ def _parsed(crs: str) -> CRS:
         return CRS.from_user_input(crs)
     except CRSError as error:
         raise InputError(
-            "crs", f"{crs[:60]!r} is not a CRS ({error})", 'Give a code such as "EPSG:32633", or WKT'
+            "crs", f"{crs[:60]!r} is not a valid CRS ({error})", 'Give a code such as "EPSG:32633", or WKT'
         ) from None
 
 
@@ -147,7 +147,7 @@ def _horizontal(crs: str) -> CRS:
 
 
 def same(a: str | None, b: str | None) -> bool:
-    """Whether two codes or WKTs mean the same CRS, heights aside."""
+    """Whether two codes or WKT strings denote the same horizontal CRS."""
     if a == b:
         return True
     if not a or not b or LOCAL in (a, b):
@@ -157,7 +157,7 @@ def same(a: str | None, b: str | None) -> bool:
 
 
 def name(crs: str | None) -> str:
-    """How a person calls a CRS: its EPSG code, else its name."""
+    """Display name of a CRS: its EPSG code, else its name."""
     if not crs or crs == LOCAL:
         return "no CRS"
     parsed = _parsed(crs)
@@ -166,7 +166,7 @@ def name(crs: str | None) -> str:
 
 
 def short(crs: str) -> str:
-    """The authority's code where it says all that the CRS says, otherwise the CRS as it is."""
+    """The EPSG code if it identifies the CRS completely, otherwise the CRS unchanged."""
     if crs == LOCAL:
         return crs
     from pyproj import CRS
@@ -180,15 +180,15 @@ def _metres_per_unit(tile: Path, crs: str) -> float:
     if not horizontal.is_projected:
         raise InputError(
             tile,
-            f"its CRS {name(crs)} is not projected (degrees can't be meshed)",
-            "Reproject the clouds, to UTM for example",
+            f"its CRS {name(crs)} is not projected (meshes need metres, not degrees)",
+            "Reproject the clouds, for example to UTM",
         )
     factor = float(horizontal.axis_info[0].unit_conversion_factor)
     heights = [float(axis.unit_conversion_factor) for axis in _parsed(crs).axis_info[2:]]
     if any(abs(height / factor - 1) > 1e-5 for height in heights):
         raise InputError(
             tile,
-            f"in {name(crs)} heights are in units of {heights[0]:g} m, but positions of {factor:g} m",
-            "Bring the clouds to one unit first (a CRS with metres, or feet, for both)",
+            f"{name(crs)} has heights in units of {heights[0]:g} m, but horizontal units of {factor:g} m",
+            "Reproject the clouds to a CRS with the same unit (metres or feet) for both",
         )
     return factor

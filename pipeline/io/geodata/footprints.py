@@ -1,4 +1,4 @@
-"""Footprints of buildings: polygons of a GeoJSON or a GeoPackage (OGC 12-128r19), by what Python has itself."""
+"""Building footprints: polygons of a GeoJSON or GeoPackage (OGC 12-128r19), read with Python's standard library."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from scan2sim.pipeline.io.geodata.crs import LOCAL
 
 WGS84 = "OGC:CRS84"
 SUFFIXES = (".geojson", ".json", ".gpkg")
-MOST = 1_000_000  # rows of a table: a view's needn't end
-ENVELOPES = (0, 32, 48, 48, 64)  # bytes, by a GeoPackage geometry's flag
-POLYGON, MULTIPOLYGON = 3, 6
+MAX_ROWS = 1_000_000  # of a table; a view could return rows endlessly
+ENVELOPE_BYTES = (0, 32, 48, 48, 64)  # by the envelope flag of a GeoPackage geometry
+WKB_POLYGON, WKB_MULTIPOLYGON = 3, 6
 UNREADABLE = (
     OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError, struct.error,
     sqlite3.Error,
@@ -32,17 +32,17 @@ Ring = F64
 
 
 def read(path: Path, frame: Frame) -> list[F64]:
-    """Rings (K, 2) around what is built, in the frame's local metres, their inside to the left.
+    """Rings (K, 2) of building footprints in the frame's local metres, with the interior to the left.
 
-    Geometries other than polygons are passed over. GeoJSON without a `crs` of its own is in the tile's CRS where its
-    coordinates can't be degrees, else in WGS 84, as RFC 7946 says.
+    Geometries other than polygons are skipped. GeoJSON without a `crs` member is assumed to be in WGS 84, as RFC 7946
+    requires, or in the tile's CRS if its coordinates can't be degrees.
 
     Raises:
-        InputError: it can't be read, holds no polygon, or its CRS can't be brought to the tile's.
+        InputError: unreadable, no polygon in it, or its CRS can't be transformed to the tile's.
     """
     if path.suffix.lower() not in SUFFIXES:
-        raise InputError(path, "is no GeoJSON or GeoPackage", f"Footprints are {', '.join(SUFFIXES)} files")
-    file_checks.check(path, "Put it there, or leave the footprints out")
+        raise InputError(path, "is not GeoJSON or a GeoPackage", f"Footprints are {', '.join(SUFFIXES)} files")
+    file_checks.check(path, "Check the path, or leave the footprints out")
     try:
         found = list(_geopackage(path) if path.suffix.lower() == ".gpkg" else _geojson(path))
     except UNREADABLE as error:
@@ -55,12 +55,12 @@ def read(path: Path, frame: Frame) -> list[F64]:
             local = _local(path, xy[:-1, :2], crs, frame)
             rings.append(local if (signed_area(local) > 0) == (hole == 0) else local[::-1])
     if not rings:
-        raise InputError(path, "holds no polygon", "Footprints are polygons, one a building")
+        raise InputError(path, "contains no polygon", "Footprints are polygons, one per building")
     return rings
 
 
 def _geojson(path: Path) -> Iterator[tuple[str | None, list[Ring]]]:
-    """CRS and rings of each polygon; None: the file doesn't say."""
+    """CRS (None: not given) and rings of each polygon."""
     body = json.loads(path.read_text(encoding="utf-8-sig"))
     crs = ((body.get("crs") or {}).get("properties") or {}).get("name")
     for geometry in _geometries(body):
@@ -85,52 +85,54 @@ def _geometries(body: Any) -> Iterator[Any]:
 
 
 def _geopackage(path: Path) -> Iterator[tuple[str | None, list[Ring]]]:
-    """CRS and rings of each polygon of all tables of features."""
-    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as base:
-        tables = base.execute(
+    """CRS and rings of each polygon of all feature tables."""
+    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
+        tables = database.execute(
             "SELECT g.table_name, g.column_name, s.organization, s.organization_coordsys_id, s.definition "
             "FROM gpkg_geometry_columns g JOIN gpkg_spatial_ref_sys s ON g.srs_id = s.srs_id"
         ).fetchall()
         for table, column, organization, code, definition in tables:
             known = str(organization).upper() in ("EPSG", "ESRI", "OGC") and int(code) > 0
             crs = f"{organization}:{code}" if known else None if definition in (None, "undefined") else definition
-            name, what = (str(text).replace('"', '""') for text in (table, column))
-            for i, (blob,) in enumerate(base.execute(f'SELECT "{what}" FROM "{name}" LIMIT {MOST + 1}')):
-                if i == MOST:
-                    raise ValueError(f"{table} has more than {MOST:,} rows")
-                for polygon in _from_blob(blob):
+            table_sql, column_sql = (str(text).replace('"', '""') for text in (table, column))
+            for i, (blob,) in enumerate(
+                database.execute(f'SELECT "{column_sql}" FROM "{table_sql}" LIMIT {MAX_ROWS + 1}')
+            ):
+                if i == MAX_ROWS:
+                    raise ValueError(f"{table} has more than {MAX_ROWS:,} rows")
+                for polygon in _polygons_of_blob(blob):
                     yield crs, polygon
 
 
-def _from_blob(blob: bytes | None) -> Iterator[list[Ring]]:
-    """The polygons of a GeoPackage's geometry: a header, then well-known binary."""
+def _polygons_of_blob(blob: bytes | None) -> Iterator[list[Ring]]:
+    """The polygons of a GeoPackage geometry: a header, then well-known binary (WKB)."""
     if not blob:
         return
     if blob[:2] != b"GP":
-        raise ValueError("a geometry isn't a GeoPackage's")
-    yield from _well_known(blob, 8 + ENVELOPES[(blob[3] >> 1) & 7])[0]
+        raise ValueError("a geometry has no GeoPackage header")
+    yield from _parse_wkb(blob, 8 + ENVELOPE_BYTES[(blob[3] >> 1) & 7])[0]
 
 
-def _well_known(data: bytes, at: int) -> tuple[list[list[Ring]], int]:
-    """Polygons of the well-known binary at a place, and where it ends."""
+def _parse_wkb(data: bytes, at: int) -> tuple[list[list[Ring]], int]:
+    """Polygons of the well-known binary at offset `at`, and the offset after it."""
     order = "<" if data[at] == 1 else ">"
     kind = struct.unpack_from(f"{order}I", data, at + 1)[0]
     width = 2 + {0: 0, 1: 1, 2: 1, 3: 2}[kind % 10_000 // 1000] + bool(kind & 0x8000_0000) + bool(kind & 0x4000_0000)
     kind, at = (kind & 0xFFFF) % 1000, at + 5
-    if kind not in (POLYGON, MULTIPOLYGON):
+    if kind not in (WKB_POLYGON, WKB_MULTIPOLYGON):
         return [], len(data)
     count, at = struct.unpack_from(f"{order}I", data, at)[0], at + 4
-    if kind == MULTIPOLYGON:
+    if kind == WKB_MULTIPOLYGON:
         polygons: list[list[Ring]] = []
         for _ in range(count):
-            inner, at = _well_known(data, at)
+            inner, at = _parse_wkb(data, at)
             polygons += inner
         return polygons, at
     rings: list[Ring] = []
     for _ in range(count):
         n, at = struct.unpack_from(f"{order}I", data, at)[0], at + 4
         if at + 8 * width * n > len(data):
-            raise ValueError("a geometry ends too early")
+            raise ValueError("a geometry is truncated")
         values = np.frombuffer(data, f"{order}f8", width * n, at).reshape(n, width)
         rings.append(values[:, :2].astype(np.float64))
         at += 8 * width * n
@@ -138,7 +140,7 @@ def _well_known(data: bytes, at: int) -> tuple[list[list[Ring]], int]:
 
 
 def _local(path: Path, xy: F64, crs: str | None, frame: Frame) -> F64:
-    """(N, 2) local metres of places in a CRS; None: the tile's, or degrees."""
+    """Local metres (N, 2) of positions in a CRS; None: the tile's CRS, or degrees."""
     if crs is None and frame.crs != LOCAL and (np.abs(xy) <= (180, 90)).all():
         crs = WGS84
     if crs is not None and frame.crs != LOCAL:
@@ -150,7 +152,9 @@ def _local(path: Path, xy: F64, crs: str | None, frame: Frame) -> F64:
             if source != target:
                 xy = np.column_stack(Transformer.from_crs(source, target, always_xy=True).transform(*xy.T))
         except ProjError as error:
-            raise InputError(path, f"its CRS can't be brought to the tile's ({error})", "Reproject it first") from None
+            raise InputError(
+                path, f"its CRS can't be transformed to the tile's ({error})", "Reproject it first"
+            ) from None
         if not np.isfinite(xy).all():
             raise InputError(path, f"lies outside of the tile's CRS {frame.crs[:40]}", "Reproject it first")
     return frame.to_local(np.column_stack([xy, np.zeros(len(xy))]))[:, :2]

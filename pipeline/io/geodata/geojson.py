@@ -1,4 +1,4 @@
-"""GeoJSON: points, lines and polygons with properties, in a tile's CRS."""
+"""GeoJSON writer: points, lines and polygons with properties, in a tile's CRS."""
 
 from __future__ import annotations
 
@@ -7,38 +7,40 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-Place = Sequence[float]
+Position = Sequence[float]
 
 
-def write_points(path: Path, crs: str, features: Sequence[tuple[Place, Mapping[str, Any]]]) -> None:
-    """Write features, each its (x, y, z) in `crs` and its properties."""
-    _write(path, crs, [("Point", list(place), properties) for place, properties in features])
+def write_points(path: Path, crs: str, features: Sequence[tuple[Position, Mapping[str, Any]]]) -> None:
+    """Write points; a feature is its (x, y, z) in `crs` and its properties."""
+    _write(path, crs, [("Point", list(position), properties) for position, properties in features])
 
 
-def write_lines(path: Path, crs: str, features: Sequence[tuple[Sequence[Place], Mapping[str, Any]]]) -> None:
-    """Write features, each its places along the line in `crs` and its properties."""
-    _write(path, crs, [("LineString", [list(place) for place in line], properties) for line, properties in features])
+def write_lines(path: Path, crs: str, features: Sequence[tuple[Sequence[Position], Mapping[str, Any]]]) -> None:
+    """Write lines; a feature is its positions along the line in `crs` and its properties."""
+    lines = [("LineString", [list(position) for position in line], properties) for line, properties in features]
+    _write(path, crs, lines)
 
 
-def write_polygons(path: Path, crs: str, features: Sequence[tuple[Sequence[Place], Mapping[str, Any]]]) -> None:
-    """Write features, each its ring of places in `crs`, the first again at the end, and its properties."""
-    _write(path, crs, [("Polygon", [[list(place) for place in ring]], properties) for ring, properties in features])
+def write_polygons(path: Path, crs: str, features: Sequence[tuple[Sequence[Position], Mapping[str, Any]]]) -> None:
+    """Write polygons; a feature is a closed ring of positions in `crs` (the first repeated last) and its properties."""
+    polygons = [("Polygon", [[list(position) for position in ring]], properties) for ring, properties in features]
+    _write(path, crs, polygons)
 
 
 def _write(path: Path, crs: str, features: Sequence[tuple[str, Any, Mapping[str, Any]]]) -> None:
     body = {
         "type": "FeatureCollection",
-        "crs": member(crs),
+        "crs": crs_member(crs),
         "features": [
-            {"type": "Feature", "geometry": {"type": kind, "coordinates": places}, "properties": dict(properties)}
-            for kind, places, properties in features
+            {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": dict(properties)}
+            for kind, coordinates, properties in features
         ],
     }
     path.write_text(json.dumps({k: v for k, v in body.items() if v is not None}, indent=1), encoding="utf-8")
 
 
-def member(crs: str) -> dict[str, object] | None:
-    """The (pre-RFC 7946) member by which GIS programs know a GeoJSON file's CRS; None: they know none."""
+def crs_member(crs: str) -> dict[str, object] | None:
+    """The `crs` member (GeoJSON before RFC 7946) that GIS programs understand; None for a CRS without EPSG code."""
     if crs == "local":
         return None
     from pyproj import CRS

@@ -1,7 +1,7 @@
-"""Cloud-optimised GeoTIFF, through GDAL (rasterio): rasters that GIS tools read, whole or a part of them over HTTP.
+"""Cloud-optimised GeoTIFF (COG), written with GDAL (rasterio), so that GIS tools can read parts of it over HTTP.
 
-A tile's rasters are on the lattice of its CRS (multiples of a pixel), so that those of neighbours fit together without
-resampling; `write_vrt` shows them as one.
+A tile's rasters are aligned to the CRS (pixel borders at multiples of the pixel size), so that those of neighbours fit
+together without resampling; `write_vrt` combines them into a virtual mosaic.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from scan2sim.pipeline.core.types import F64, U8, Frame
 from scan2sim.pipeline.io.geodata.crs import LOCAL, _parsed
 
 NODATA = -9999.0
-"""Of heights: what GIS tools know as "nothing here"."""
-QUALITY = 90
-"""JPEG quality of colours."""
+"""No-data value of height rasters."""
+JPEG_QUALITY = 90
+"""JPEG quality of orthophotos."""
 KINDS = {
     "orthophoto": "Orthophoto",
     "dsm": "Heights of the highest surface",
     "dtm": "Heights of the ground",
 }
-"""Of rasters, as in their names, `<tile>_<kind>.tif`, to what they show."""
+"""Kind of a raster, as in its file name `<tile>_<kind>.tif`, to its title."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Where a raster's pixels are: row 0 is in the north.
+    """Pixel grid of a raster; row 0 is in the north.
 
     Attributes:
-        frame: of the tile.
-        column, row: of the upper left pixel, in pixels east and north of the CRS's zero.
-        width, height: pixels.
-        pixel: side of a pixel, CRS units.
+        frame: frame of the tile.
+        column, row: the upper left pixel, in pixels east and north of the CRS's origin.
+        width, height: size in pixels.
+        pixel: pixel size, CRS units.
     """
 
     frame: Frame
@@ -53,14 +53,14 @@ class Grid:
 
     @classmethod
     def around(cls, frame: Frame, low: npt.ArrayLike, high: npt.ArrayLike, metres: float) -> Self:
-        """The grid of pixels of `metres` that covers the box from `low` to `high` (3,), local metres."""
+        """The grid with pixels of `metres` that covers the box from `low` to `high` (3,), local metres."""
         pixel = metres / frame.unit
         west, south = np.floor(frame.to_crs(low)[:2] / pixel).astype(int).tolist()
         east, north = np.ceil(frame.to_crs(high)[:2] / pixel).astype(int).tolist()
         return cls(frame, west, north, max(1, east - west), max(1, north - south), pixel)
 
     def band(self, first: int, rows: int) -> tuple[F64, F64]:
-        """South-west and north-east corner (2,) of some rows, local metres."""
+        """South-west and north-east corner (2,) of a band of rows, local metres."""
         south, north = self.row - first - rows, self.row - first
         corners = np.array([[self.column, south, 0], [self.column + self.width, north, 0]], float)
         low, high = self.frame.to_local(corners * self.pixel)
@@ -68,28 +68,24 @@ class Grid:
 
 
 def write_colours(path: Path, grid: Grid, bands: Iterable[U8]) -> None:
-    """Write a picture; `bands` gives it from north to south, (rows, W, 4) RGB and alpha (0: nothing here).
-
-    JPEG with a mask.
+    """Write an orthophoto as JPEG with a mask; `bands` yields (rows, W, 4) RGBA from north to south, alpha 0: no data.
 
     Raises:
-        SpaceError: the disk is full or can't be written to.
+        SpaceError: the disk is full or not writable.
     """
     from rasterio.enums import ColorInterp
 
     interpretation = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
-    with _cog(path, grid, 4, "uint8", compress="JPEG", quality=QUALITY) as raster:
+    with _cog(path, grid, 4, "uint8", compress="JPEG", quality=JPEG_QUALITY) as raster:
         raster.colorinterp = interpretation
         _fill(raster, bands)
 
 
 def write_heights(path: Path, grid: Grid, bands: Iterable[F64]) -> None:
-    """Write heights; `bands` gives them from north to south, (rows, W) in CRS units, NaN where there is nothing.
-
-    Float32, lossless, `NODATA` where there is nothing.
+    """Write heights, float32 lossless; `bands` yields (rows, W) in CRS units from north to south, NaN: no data.
 
     Raises:
-        SpaceError: the disk is full or can't be written to.
+        SpaceError: the disk is full or not writable.
     """
     with _cog(path, grid, 1, "float32", compress="DEFLATE", predictor="FLOATING_POINT", nodata=NODATA) as raster:
         raster.units = ("metre" if grid.frame.unit == 1 else f"{grid.frame.unit:.9g} metre",)
@@ -98,9 +94,9 @@ def write_heights(path: Path, grid: Grid, bands: Iterable[F64]) -> None:
 
 @contextmanager
 def _cog(path: Path, grid: Grid, count: int, dtype: str, **creation: Any) -> Iterator[Any]:
-    """A raster to be filled, which becomes a cloud-optimised GeoTIFF at the end; nothing is there before.
+    """An open raster to write to; it is converted to a cloud-optimised GeoTIFF at `path` on exit.
 
-    It is filled on disk, so memory doesn't grow with it.
+    The pixels are written to a draft on disk, so that memory doesn't grow with the raster.
     """
     import rasterio
     import rasterio.shutil
@@ -120,7 +116,7 @@ def _cog(path: Path, grid: Grid, count: int, dtype: str, **creation: Any) -> Ite
         rasterio.shutil.copy(
             draft, path, driver="COG", bigtiff="IF_SAFER", num_threads="ALL_CPUS", **options, **creation
         )
-    except (OSError, RasterioError) as error:  # GDAL's own don't say why
+    except (OSError, RasterioError) as error:  # GDAL's errors don't name the cause
         path.unlink(missing_ok=True)
         raise from_os_error(error if isinstance(error, OSError) else OSError(str(error)), path) from error
     finally:
@@ -128,7 +124,7 @@ def _cog(path: Path, grid: Grid, count: int, dtype: str, **creation: Any) -> Ite
 
 
 def _fill(raster: Any, bands: Iterable[npt.NDArray[Any]]) -> None:
-    """Write (rows, W, count) after (rows, W, count)."""
+    """Write bands of rows, (rows, W, count) each, one below the other."""
     from rasterio.windows import Window
 
     first = 0
@@ -140,11 +136,11 @@ def _fill(raster: Any, bands: Iterable[npt.NDArray[Any]]) -> None:
 def _add_sources(
     band: ET.Element, folder: Path, sources: Sequence[Any], index: str, west: float, north: float, pixel: float
 ) -> None:
-    """Name where in each raster, and where in the whole, pixels of a band are."""
+    """Add the sources of a VRT band: source and target rectangle of each raster."""
     for path, profile, bounds, *_ in sources:
         size = {"xSize": str(profile["width"]), "ySize": str(profile["height"])}
         at = {"xOff": str(round((bounds.left - west) / pixel)), "yOff": str(round((north - bounds.top) / pixel))}
-        source = ET.SubElement(band, "ComplexSource")  # unlike a simple one, it leaves out what is nodata
+        source = ET.SubElement(band, "ComplexSource")  # unlike SimpleSource, it skips no-data pixels
         name = ET.SubElement(source, "SourceFilename", relativeToVRT="1")
         name.text = Path(os.path.relpath(path, folder)).as_posix()
         ET.SubElement(source, "SourceBand").text = index
@@ -159,16 +155,16 @@ def _add_sources(
 
 
 def find(folder: Path, name: str) -> dict[str, Path]:
-    """Kind to file of the rasters of a tile that are in `folder`."""
+    """The existing rasters of a tile in `folder`, file by kind."""
     files = {kind: folder / f"{name}_{kind}.tif" for kind in KINDS}
     return {kind: file for kind, file in files.items() if file.is_file()}
 
 
 def write_vrt(path: Path, rasters: Sequence[Path]) -> None:
-    """Show rasters of one lattice and kind as one: a virtual one, which names them relative to itself.
+    """Write a virtual mosaic (VRT) of aligned rasters of one kind, with paths relative to `path`.
 
     Raises:
-        SpaceError: the disk is full or can't be written to.
+        SpaceError: the disk is full or not writable.
     """
     import rasterio
 
@@ -195,13 +191,13 @@ def write_vrt(path: Path, rasters: Sequence[Path]) -> None:
             ET.SubElement(band, "NoDataValue").text = f"{profile['nodata']:g}"
         ET.SubElement(band, "ColorInterp").text = colours[index - 1].name.capitalize()
         _add_sources(band, path.parent, sources, str(index), west, north, pixel)
-    if count == 3:  # the mask that JPEG's alpha became
+    if count == 3:  # COG stores the alpha channel of JPEG as a mask
         band = ET.SubElement(ET.SubElement(root, "MaskBand"), "VRTRasterBand", dataType="Byte")
         _add_sources(band, path.parent, sources, "mask,1", west, north, pixel)
-    fresh = path.with_name(f".{path.name}")
+    temporary = path.with_name(f".{path.name}")
     try:
         ET.indent(root)
-        ET.ElementTree(root).write(fresh, encoding="utf-8")
-        fresh.replace(path)
+        ET.ElementTree(root).write(temporary, encoding="utf-8")
+        temporary.replace(path)
     except OSError as error:
         raise from_os_error(error, path) from None

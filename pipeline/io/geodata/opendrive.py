@@ -1,6 +1,6 @@
-"""OpenDRIVE 1.7 (ASAM): roads as reference lines of clothoids, lanes of cubics, painted lines with their dashes.
+"""OpenDRIVE 1.7 (ASAM) writer: reference lines as clothoids, lane widths as cubics, road marks with their dashes.
 
-Coordinates are local metres; the header's PROJ text and its offset, the frame's origin, put them on the map.
+Coordinates are local metres; the header georeferences them with a PROJ string and the frame's origin as offset.
 """
 
 from __future__ import annotations
@@ -18,41 +18,43 @@ from scan2sim.pipeline.roads.lanes import Border, Section, sections
 from scan2sim.pipeline.roads.model import Road
 from scan2sim.pipeline.roads.profile import Profile
 
-EXACT = 1e-4
-"""Metres by which a piece may miss a clothoid to be written as an arc, or an arc as a line."""
-SIDE = 50.0
-"""Metres to the right of the reference line from where the surface's slope is written."""
+GEOMETRY_TOLERANCE_M = 1e-4
+"""Deviation up to which a clothoid is written as an arc, and an arc as a line."""
+SHAPE_RIGHT_EXTENT_M = 50.0
+"""Distance to the right of the reference line at which the lateral shape starts."""
+MIN_MARK_LENGTH_M = 0.5
+"""Shorter marks, and shorter gaps between marks, are not written."""
 
 
 def write(path: Path, name: str, frame: Frame, roads: Sequence[Road]) -> int:
-    """Write the roads that have lanes; returns how many. Without any no file is written.
+    """Write the roads that have lanes; returns their number. Without any, no file is written.
 
     Raises:
-        SpaceError: the disk is full or can't be written to.
+        SpaceError: the disk is full or not writable.
     """
-    laned = [(road, parts) for road in roads if (parts := sections(road))]
-    if not laned:
+    roads_with_lanes = [(road, parts) for road in roads if (parts := sections(road))]
+    if not roads_with_lanes:
         return 0
     root = ET.Element("OpenDRIVE")
-    root.append(_header(name, frame, [road for road, _ in laned]))
-    for number, (road, parts) in enumerate(laned, start=1):
+    root.append(_header(name, frame, [road for road, _ in roads_with_lanes]))
+    for number, (road, parts) in enumerate(roads_with_lanes, start=1):
         root.append(_road(number, road, parts))
     try:
         ET.indent(root)
         ET.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
     except OSError as error:
         raise from_os_error(error, path) from None
-    return len(laned)
+    return len(roads_with_lanes)
 
 
 def _text(**values: object) -> dict[str, str]:
-    """Attributes: floats with all their digits, but no more than a micrometre needs."""
+    """XML attributes; floats with 12 significant digits."""
     return {k: f"{v:.12g}" if isinstance(v, float) else str(v) for k, v in values.items()}
 
 
 def _header(name: str, frame: Frame, roads: Sequence[Road]) -> ET.Element:
-    places = np.concatenate([road.line.places(np.linspace(0, road.line.length, 100)) for road in roads])
-    (west, south), (east, north) = places.min(axis=0).tolist(), places.max(axis=0).tolist()
+    points = np.concatenate([road.line.points(np.linspace(0, road.line.length, 100)) for road in roads])
+    (west, south), (east, north) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
     box = {"north": north, "south": south, "east": east, "west": west}
     header = ET.Element("header", _text(revMajor=1, revMinor=7, name=name, version=1.0, **box, vendor="scan2sim"))
     if frame.crs != LOCAL:
@@ -87,28 +89,32 @@ def _cubic(cubic: np.ndarray, **at: float) -> dict[str, str]:
 
 
 def _plan(plan: ET.Element, road: Road) -> None:
-    """The reference line: a geometry between two knots each."""
+    """Add the reference line: one geometry between each two knots."""
     line = road.line
-    places, headings = line.places(line.knots), line.headings(line.knots)
+    points, headings = line.points(line.knots), line.headings(line.knots)
     for i, length in enumerate(np.diff(line.knots).tolist()):
         begin, end = line.curvature[i : i + 2].tolist()
-        x, y = places[i].tolist()
+        x, y = points[i].tolist()
         at = _text(s=float(line.knots[i]), x=x, y=y, hdg=float(headings[i]), length=length)
         geometry = ET.SubElement(plan, "geometry", at)
-        if abs(end - begin) * length**2 > EXACT:
+        if abs(end - begin) * length**2 > GEOMETRY_TOLERANCE_M:
             ET.SubElement(geometry, "spiral", _text(curvStart=begin, curvEnd=end))
-        elif abs(begin + end) / 2 * length**2 > EXACT:
+        elif abs(begin + end) / 2 * length**2 > GEOMETRY_TOLERANCE_M:
             ET.SubElement(geometry, "arc", _text(curvature=(begin + end) / 2))
         else:
             ET.SubElement(geometry, "line")
 
 
 def _surface(lateral: ET.Element, road: Road) -> None:
-    """Slopes to both sides as shapes: straight lines that meet in the reference line."""
-    left, right = road.falls
+    """Add the cross slopes on both sides as shapes: straight lines that meet at the reference line."""
+    left, right = road.cross_slopes
     for s in left.knots.tolist():
         to_left, to_right = float(left.at(s)), float(right.at(s))
-        ET.SubElement(lateral, "shape", _text(s=s, t=-SIDE, a=SIDE * to_right, b=-to_right, c=0.0, d=0.0))
+        ET.SubElement(
+            lateral,
+            "shape",
+            _text(s=s, t=-SHAPE_RIGHT_EXTENT_M, a=SHAPE_RIGHT_EXTENT_M * to_right, b=-to_right, c=0.0, d=0.0),
+        )
         ET.SubElement(lateral, "shape", _text(s=s, t=0.0, a=0.0, b=to_left, c=0.0, d=0.0))
 
 
@@ -140,13 +146,13 @@ def _lane(section: Section, number: int, kind: str, inner: Profile, outer: Borde
 
 
 def _marks(lane: ET.Element, section: Section, border: Border) -> None:
-    """What is painted along a border, or that it is a kerb; nothing where it isn't told."""
+    """Add the road marks along a border: paint or kerb, and "none" where nothing was detected."""
     line = border.line
-    told = [] if line is None else [(max(a, section.first), min(b, section.last)) for a, b in line.told]
-    told = [(a, b) for a, b in told if b - a > 0.5]
+    marked = [] if line is None else [(max(a, section.first), min(b, section.last)) for a, b in line.ranges]
+    marked = [(a, b) for a, b in marked if b - a > MIN_MARK_LENGTH_M]
     at = section.first
-    for first, last in told:
-        if first - at > 0.5:
+    for first, last in marked:
+        if first - at > MIN_MARK_LENGTH_M:
             ET.SubElement(lane, "roadMark", _text(sOffset=at - section.first, type="none"))
         else:
             first = at
@@ -165,5 +171,5 @@ def _marks(lane: ET.Element, section: Section, border: Border) -> None:
                 dashes = _text(length=line.dash, space=line.gap, tOffset=0.0, sOffset=offset, rule="none")
                 ET.SubElement(kind, "line", dashes | _text(width=line.width))
         at = last
-    if section.last - at > 0.5:
+    if section.last - at > MIN_MARK_LENGTH_M:
         ET.SubElement(lane, "roadMark", _text(sOffset=at - section.first, type="none"))

@@ -1,8 +1,8 @@
-"""STAC: a survey as a catalogue that GIS tools and archives read; `.vpc`: its clouds as one layer.
+"""STAC catalogue of a survey for GIS tools and archives; virtual point cloud (`.vpc`) of its clouds.
 
-A tile is an item: where it is, when it was scanned, what was made of it. Paths are relative, so that the survey's
-folder can be moved. A virtual point cloud (`.vpc`) is one GeoJSON with an item a cloud, as QGIS and PDAL wrench read
-it: STAC 1.0.0, the cloud as first asset, a path that begins with `./`, and bounds in the cloud's own CRS.
+A tile is an item: its location, scan time and products. Paths are relative, so that the survey's folder can be moved.
+A virtual point cloud is one GeoJSON with one item per cloud, in the form that QGIS and PDAL wrench read: STAC 1.0.0,
+the cloud as first asset, a path that starts with `./`, and bounds in the cloud's own CRS.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from scan2sim.pipeline.io.worlds.merge import swap
 if TYPE_CHECKING:
     import pystac
 
-PROCESSING = "https://stac-extensions.github.io/processing/v1.1.0/schema.json"
+PROCESSING_EXTENSION = "https://stac-extensions.github.io/processing/v1.1.0/schema.json"
 VPC_EXTENSIONS = (
     "https://stac-extensions.github.io/pointcloud/v1.0.0/schema.json",
     "https://stac-extensions.github.io/projection/v1.1.0/schema.json",
 )
 LINEAGE = "Surfaces from lidar points, a class at a time, textured from posed photos"
-ANYWHERE = [-180.0, -90.0, 180.0, 90.0]
-SHA_256 = "1220"  # how a multihash says: SHA-256, 32 bytes
+WHOLE_EARTH_BBOX = [-180.0, -90.0, 180.0, 90.0]
+SHA_256_MULTIHASH = "1220"  # multihash prefix: SHA-256, 32 bytes
 MEDIA_TYPES = {
     ".copc.laz": "application/vnd.laszip+copc",
     ".laz": "application/vnd.laszip",
@@ -59,7 +59,8 @@ class Cloud:
     """A point cloud file.
 
     Attributes:
-        header: what the file says of itself, as `pipeline.io.clouds.read_header` gives it.
+        path: the file.
+        header: its header, as returned by `pipeline.io.clouds.read_header`.
         digest: SHA-256, hexadecimal, or None.
     """
 
@@ -70,17 +71,17 @@ class Cloud:
 
 @dataclass(frozen=True)
 class TileItem:
-    """A tile, as the catalogue tells of it.
+    """A tile as an item of the catalogue.
 
     Attributes:
         name: unique in the survey.
-        frame: of the tile; all that counts is its CRS and unit.
+        frame: frame of the tile; only its CRS and unit are used.
         clouds: at least one; the tile's bounds are theirs.
-        date: when it was scanned, where GPS times don't tell, with a time zone.
+        date: scan date with a time zone, used if the GPS times give none.
         times: first and last GPS time of its points, seconds, or None.
-        world, glb, report, thumbnail: what was made of it: its SDF, GLB, page and picture; None where there is none.
+        world, glb, report, thumbnail: products: SDF, GLB, report page and preview image; None if missing.
         rasters: kind ("orthophoto", "dsm", "dtm") to GeoTIFF.
-        lineage: how it was made.
+        lineage: description of the processing.
     """
 
     name: str
@@ -97,10 +98,10 @@ class TileItem:
 
 
 def write(out: Path, name: str, description: str, tiles: Sequence[TileItem]) -> Path:
-    """Write the catalogue `out/stac/`: `collection.json` and `<tile>/<tile>.json`; an earlier one stays until then.
+    """Write the catalogue `out/stac/`: `collection.json` and `<tile>/<tile>.json`; replaces an earlier one atomically.
 
-    Tiles in a local frame are nowhere on Earth: their items have no geometry and no bbox, and the collection's
-    extent, which must have a box, is the whole Earth.
+    Tiles in a local frame have no location on Earth: their items have no geometry and no bbox, and the collection's
+    extent, for which STAC requires a box, is the whole Earth.
 
     Returns:
         Path of `collection.json`.
@@ -108,61 +109,62 @@ def write(out: Path, name: str, description: str, tiles: Sequence[TileItem]) -> 
     Raises:
         DataError: there is no tile.
         InputError: a file of a tile is missing.
-        SpaceError: the disk is full or can't be written to.
+        SpaceError: the disk is full or not writable.
     """
     import pystac
 
     if not tiles:
-        raise DataError(name, "has no tile to tell of", "Add tiles to the survey")
-    fresh = out / ".stac"
+        raise DataError(name, "has no tiles", "Add tiles to the survey")
+    temporary = out / ".stac"
     try:
-        shutil.rmtree(fresh, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
         collection = _collection(name, description, tiles)
-        collection.normalize_hrefs(str(fresh.absolute()))
+        collection.normalize_hrefs(str(temporary.absolute()))
         for item in collection.get_items():
             item.make_asset_hrefs_relative()
         collection.save(catalog_type=pystac.CatalogType.SELF_CONTAINED)
-        swap(fresh, out / "stac")
+        swap(temporary, out / "stac")
     except OSError as error:
         raise from_os_error(error, out) from None
     finally:
-        shutil.rmtree(fresh, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
     return out / "stac" / "collection.json"
 
 
 def write_vpc(path: Path, tiles: Sequence[TileItem]) -> Path:
     """Write all tiles' clouds as one virtual point cloud; returns `path`.
 
-    Where tiles overlap, a reader sees the points of both.
+    Where tiles overlap, readers get the points of both.
 
     Raises:
-        SpaceError: the disk is full or can't be written to.
+        SpaceError: the disk is full or not writable.
     """
     features = []
     for tile in tiles:
         for i, cloud in enumerate(tile.clouds):
-            own = tile.name if len(tile.clouds) == 1 else f"{tile.name}_{i}"
-            features.append(_feature(own, tile, cloud, path.parent))
-    fresh = path.with_name(f".{path.name}")
+            feature_id = tile.name if len(tile.clouds) == 1 else f"{tile.name}_{i}"
+            features.append(_feature(feature_id, tile, cloud, path.parent))
+    temporary = path.with_name(f".{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        fresh.write_text(json.dumps({"type": "FeatureCollection", "features": features}, indent=1), encoding="utf-8")
-        fresh.replace(path)
+        body = {"type": "FeatureCollection", "features": features}
+        temporary.write_text(json.dumps(body, indent=1), encoding="utf-8")
+        temporary.replace(path)
     except OSError as error:
         raise from_os_error(error, path) from None
     return path
 
 
 def _collection(name: str, description: str, tiles: Sequence[TileItem]) -> pystac.Collection:
-    """The catalogue in memory, paths still absolute."""
+    """The catalogue in memory, with absolute paths."""
     import pystac
 
     items = [_item(tile) for tile in tiles]
     spans = [_span(tile) for tile in tiles]
-    boxes = np.array([item.bbox for item in items if item.bbox] or [ANYWHERE])
-    whole = [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()]
+    boxes = np.array([item.bbox for item in items if item.bbox] or [WHOLE_EARTH_BBOX])
+    total_bbox = [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()]
     extent = pystac.Extent(
-        pystac.SpatialExtent([whole]),
+        pystac.SpatialExtent([total_bbox]),
         pystac.TemporalExtent([[min(start for start, _ in spans), max(end for _, end in spans)]]),
     )
     collection = pystac.Collection(name, description or name, extent, license="other")
@@ -186,7 +188,7 @@ def _item(tile: TileItem) -> pystac.Item:
         {"processing:software": {"scan2sim": __version__}, "processing:lineage": tile.lineage},
         start_datetime=start,
         end_datetime=end,
-        stac_extensions=[PROCESSING],
+        stac_extensions=[PROCESSING_EXTENSION],
     )
     code, wkt = _crs(tile.frame.crs)
     ProjectionExtension.ext(item, add_if_missing=True).apply(
@@ -206,7 +208,7 @@ def _item(tile: TileItem) -> pystac.Item:
 
 
 def _add_assets(item: pystac.Item, tile: TileItem) -> None:
-    """Name the tile's files, with their sizes and, where known, checksums."""
+    """Add the tile's files as assets, with their sizes and, where known, checksums."""
     import pystac
     from pystac.extensions.file import FileExtension
 
@@ -220,14 +222,14 @@ def _add_assets(item: pystac.Item, tile: TileItem) -> None:
         files.append(
             (kind, raster, geotiff.KINDS[kind], ["data", "visual"] if kind == "orthophoto" else ["data"], None)
         )
-    for i, cloud in enumerate(tile.clouds):  # "data" is where PDAL's reader looks
+    for i, cloud in enumerate(tile.clouds):  # PDAL's reader expects the asset "data"
         files.append((f"data_{i}" if i else "data", cloud.path, "Lidar points", ["data"], cloud.digest))
     for key, path, title, roles, digest in files:
         if path is None:
             continue
         item.add_asset(key, pystac.Asset(str(path.absolute()), title, media_type=_media_type(path), roles=roles))
-        about = FileExtension.ext(item.assets[key], add_if_missing=True)
-        about.apply(size=path.stat().st_size, checksum=digest and SHA_256 + digest)
+        file_info = FileExtension.ext(item.assets[key], add_if_missing=True)
+        file_info.apply(size=path.stat().st_size, checksum=digest and SHA_256_MULTIHASH + digest)
 
 
 def _feature(name: str, tile: TileItem, cloud: Cloud, folder: Path) -> dict[str, Any]:
@@ -238,10 +240,10 @@ def _feature(name: str, tile: TileItem, cloud: Cloud, folder: Path) -> dict[str,
     start, end = _span(tile)
     return {
         "type": "Feature",
-        "stac_version": "1.0.0",  # readers refuse any other
+        "stac_version": "1.0.0",  # readers accept no other
         "stac_extensions": list(VPC_EXTENSIONS),
         "id": name,
-        "geometry": geometry or native,  # readers want one, be it nowhere on Earth
+        "geometry": geometry or native,  # readers require one, even without a location on Earth
         "bbox": bbox or [*low[:2].tolist(), *high[:2].tolist()],
         "properties": {
             "datetime": _iso(start),
@@ -267,10 +269,10 @@ def _feature(name: str, tile: TileItem, cloud: Cloud, folder: Path) -> dict[str,
 
 
 def schemas(path: Path) -> list[dict[str, Any]]:
-    """What is kept of each point: `name` (as PDAL calls it), `size` in bytes, `type`; of a PLY, positions alone."""
+    """Dimensions of a point: `name` (as in PDAL), `size` in bytes, `type`; for PLY only the coordinates."""
     found: list[dict[str, Any]] = [{"name": axis, "size": 8, "type": "floating"} for axis in "XYZ"]
     if path.suffix.lower() in (".las", ".laz"):
-        with las._open(path) as reader:
+        with las.open_las(path) as reader:
             for dimension in list(reader.header.point_format.dimensions)[3:]:
                 camel = "".join(word.capitalize() for word in dimension.name.split("_"))
                 kind = {"FloatingPoint": "floating", "SignedInteger": "signed"}.get(dimension.kind.name, "unsigned")
@@ -286,7 +288,7 @@ def _bounds(headers: Sequence[Header]) -> tuple[F64, F64]:
 
 
 def _ring(low: F64, high: F64) -> F64:
-    """(5, 2) corners of a rectangle, counter-clockwise, the first one again at the end."""
+    """Corners (5, 2) of a rectangle, counter-clockwise, the first one repeated at the end."""
     (x0, y0), (x1, y1) = low[:2], high[:2]
     return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)])
 
@@ -296,7 +298,7 @@ def _rectangle(ring: F64) -> dict[str, Any]:
 
 
 def _footprint(frame: Frame, low: F64, high: F64) -> tuple[dict[str, Any] | None, list[float] | None]:
-    """A box's polygon on Earth and its (west, south, east, north), degrees; (None, None) in a local frame."""
+    """Polygon of a box in degrees and its (west, south, east, north); (None, None) in a local frame."""
     if frame.crs == LOCAL:
         return None, None
     ring = np.column_stack(_to_degrees(frame.crs).transform(*_ring(low, high).T)).round(8)
@@ -305,7 +307,7 @@ def _footprint(frame: Frame, low: F64, high: F64) -> tuple[dict[str, Any] | None
 
 @functools.cache
 def _crs(crs: str) -> tuple[str | None, str | None]:
-    """A CRS's code, where it has one, and its WKT; (None, None) for "local"."""
+    """Code (if any) and WKT of a CRS; (None, None) for "local"."""
     if crs == LOCAL:
         return None, None
     authority = _parsed(crs).to_authority()
@@ -320,7 +322,7 @@ def _to_degrees(crs: str) -> Any:
 
 
 def _span(tile: TileItem) -> tuple[datetime, datetime]:
-    """When it was scanned: first and last instant, UTC."""
+    """Start and end of the scan, UTC."""
     start, end = (from_gps(time) for time in tile.times) if tile.times else (None, None)
     if start is None or end is None:
         return tile.date.astimezone(UTC), tile.date.astimezone(UTC)

@@ -1,4 +1,4 @@
-"""GPS tracks: a file a format (`pipeline.core.plugins`), found by the track's suffix.
+"""GPS track readers: one module per format (`pipeline.core.plugins`), selected by the file's suffix.
 
 A format's module has `SUFFIXES` and `read(path) -> GpsTrack`.
 """
@@ -10,16 +10,16 @@ from typing import Protocol
 
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.errors import InputError, from_os_error
-from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import GpsTrack
 from scan2sim.pipeline.io import file_checks
 
 
 class Format(Protocol):
-    """What a format's module has.
+    """Interface of a format's module.
 
     Attributes:
-        SUFFIXES: of its files.
+        SUFFIXES: suffixes of its files.
     """
 
     SUFFIXES: tuple[str, ...]
@@ -29,12 +29,12 @@ class Format(Protocol):
 
 
 def read(path: Path) -> GpsTrack:
-    """Read and tidy a track: sorted, each time once, without bad fixes and jumps.
+    """Read and clean a track: sorted, each time once, without poor fixes and outliers.
 
-    Times are UNIX seconds for GPX and NMEA, as the file says for CSV, and for a GoPro video seconds of the video.
+    Times are UNIX seconds for GPX and NMEA, the file's own for CSV, and seconds of the video for a GoPro video.
 
     Raises:
-        InputError: unreadable, or no fix in it.
+        InputError: unreadable, or without a usable fix.
         ScanError: as `reader`.
     """
     found = reader(path)
@@ -45,17 +45,17 @@ def read(path: Path) -> GpsTrack:
 
 
 def reader(path: Path) -> Format:
-    """What reads a track; the track itself isn't read.
+    """The format module for a track; the track isn't read yet.
 
     Raises:
-        InputError: there is no such file, or its suffix is unknown.
-        UnavailableError: a video, and PyAV isn't installed.
+        InputError: the file doesn't exist, or its suffix is unknown.
+        UnavailableError: it is a video, and PyAV isn't installed.
     """
     formats = plugins.by_suffix(__name__)
     name = formats.get(path.suffix.lower())
     if name is None:
-        raise InputError(path, "is no known GPS format", f"Give one of {', '.join(formats)}")
+        raise InputError(path, "has an unknown GPS format", f"Use one of {', '.join(formats)}")
     file_checks.check(path)
     found: Format = plugins.module(__name__, name)
-    need(str(path), *plugins.needs(found))
+    require(str(path), *plugins.needs(found))
     return found

@@ -1,4 +1,4 @@
-"""NMEA 0183: GGA and RMC."""
+"""GPS tracks as NMEA 0183 logs: GGA and RMC sentences."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import GpsTrack
-from scan2sim.pipeline.io.gps_fixes import RANGE_ERROR, located, number, sigma_of
+from scan2sim.pipeline.io.gps_fixes import RANGE_ERROR_M, sigma_from_dop, to_float, track_from_wgs84
 
 SUFFIXES = (".nmea", ".txt", ".log")
-QUALITY_ERROR = {2: 0.8, 4: 0.02, 5: 0.3}
-"""Metres of error for each unit of dilution of precision, by GGA's quality: differential, RTK fixed, RTK float."""
+RANGE_ERROR_BY_QUALITY_M = {2: 0.8, 4: 0.02, 5: 0.3}
+"""User equivalent range error by GGA's fix quality: differential, RTK fixed, RTK float."""
 
 
 def read(path: Path) -> GpsTrack:
-    """GGA sentences (position, quality, HDOP), dated by the RMC nearest in time; a wrong checksum drops a sentence."""
-    fixes: list[list[float]] = []  # the time still a time of day
-    clocks: list[float] = []  # the last RMC's UNIX time at each fix, NaN before the first
+    """GGA sentences (position, quality, HDOP), dated by the nearest RMC; sentences with wrong checksums are skipped."""
+    fixes: list[list[float]] = []  # their time is the time of day, seconds
+    clocks: list[float] = []  # UNIX time of the last RMC before each fix, NaN before the first
     clock, sentences = math.nan, 0
     for line in path.read_text(encoding="ascii", errors="replace").splitlines():
         fields = _sentence(line)
@@ -29,26 +29,26 @@ def read(path: Path) -> GpsTrack:
         if kind == "RMC" and len(fields) > 9 and fields[2] == "A":
             clock = _nmea_date(fields[9]) + _nmea_clock(fields[1])
         elif kind == "GGA" and len(fields) > 9 and fields[6].isdigit() and int(fields[6]) in (1, 2, 3, 4, 5):
-            sigma = sigma_of(number(fields[8]), QUALITY_ERROR.get(int(fields[6]), RANGE_ERROR))
-            place = _nmea_angle(fields[2], fields[3]), _nmea_angle(fields[4], fields[5])
-            fixes.append([_nmea_clock(fields[1]), *place, number(fields[9]), sigma])
+            sigma = sigma_from_dop(to_float(fields[8]), RANGE_ERROR_BY_QUALITY_M.get(int(fields[6]), RANGE_ERROR_M))
+            position = _nmea_angle(fields[2], fields[3]), _nmea_angle(fields[4], fields[5])
+            fixes.append([_nmea_clock(fields[1]), *position, to_float(fields[9]), sigma])
             clocks.append(clock)
     if not sentences:
-        raise InputError(path, "holds no NMEA sentence with a right checksum", "Give the receiver's log as it was")
+        raise InputError(path, "contains no NMEA sentence with a valid checksum", "Give the receiver's original log")
     if fixes and np.isnan(clocks).all():
         if math.isnan(clock):
-            raise InputError(path, "has fixes, but no date (no valid RMC sentence)", "Log RMC beside GGA")
+            raise InputError(path, "has fixes, but no date (no valid RMC sentence)", "Log RMC sentences besides GGA")
         clocks[-1] = clock  # a single RMC, after all fixes
-    rows, near = np.array(fixes).reshape(-1, 5), np.array(clocks)
+    rows, rmc_clock = np.array(fixes).reshape(-1, 5), np.array(clocks)
     if len(rows):
-        known = np.flatnonzero(~np.isnan(near))
-        near = near[known[np.maximum(np.searchsorted(known, np.arange(len(near)), side="right") - 1, 0)]]
-        rows[:, 0] += np.round((near - rows[:, 0]) / 86400) * 86400  # the day that brings it next to that RMC
-    return located(path, rows.tolist())
+        known = np.flatnonzero(~np.isnan(rmc_clock))
+        rmc_clock = rmc_clock[known[np.maximum(np.searchsorted(known, np.arange(len(rmc_clock)), side="right") - 1, 0)]]
+        rows[:, 0] += np.round((rmc_clock - rows[:, 0]) / 86400) * 86400  # the day that is nearest to that RMC
+    return track_from_wgs84(path, rows.tolist())
 
 
 def _sentence(line: str) -> list[str]:
-    """The fields of an NMEA sentence; none if its checksum is absent or wrong."""
+    """The fields of an NMEA sentence; empty if its checksum is missing or wrong."""
     body, star, given = line.strip().partition("$")[2].partition("*")
     total = 0
     for character in body:
@@ -58,14 +58,14 @@ def _sentence(line: str) -> list[str]:
 
 def _nmea_angle(text: str, side: str) -> float:
     """Degrees of (d)ddmm.mmmm."""
-    value = number(text)
+    value = to_float(text)
     degrees = value // 100
     return (degrees + (value - 100 * degrees) / 60) * (-1 if side in ("S", "W") else 1)
 
 
 def _nmea_clock(text: str) -> float:
     """Seconds of the day of hhmmss.ss."""
-    return 3600 * number(text[:2]) + 60 * number(text[2:4]) + number(text[4:])
+    return 3600 * to_float(text[:2]) + 60 * to_float(text[2:4]) + to_float(text[4:])
 
 
 def _nmea_date(text: str) -> float:

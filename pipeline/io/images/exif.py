@@ -1,4 +1,4 @@
-"""Where a photo's EXIF says that it was taken, and with what lens."""
+"""EXIF metadata of photos: GPS position and focal length."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import math
 from pathlib import Path
 from typing import Any
 
-GPS, EXIF = 0x8825, 0x8769
+GPS, EXIF = 0x8825, 0x8769  # tags of the two sub-directories (IFD)
 LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE = 1, 2, 3, 4, 5, 6
-FOCAL, FOCAL_35MM, WIDE, PLANE_X, PLANE_UNIT = 37386, 41989, 40962, 41486, 41488
-MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0}
-"""Of units in which EXIF gives a sensor's resolution."""
+FOCAL, FOCAL_35MM, ORIGINAL_WIDTH, FOCAL_PLANE_X, FOCAL_PLANE_UNIT = 37386, 41989, 40962, 41486, 41488
+UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0}
+"""Millimetres of the units in which EXIF gives the resolution of the focal plane."""
 
 
-def place(photo: Path) -> tuple[float, float, float | None] | None:
-    """Latitude and longitude (degrees), altitude (m, None where it isn't told); None without a usable position."""
+def gps_position(photo: Path) -> tuple[float, float, float | None] | None:
+    """Latitude and longitude (degrees), altitude (m, None if unknown); None without a usable position."""
     from PIL import Image
 
     try:
@@ -22,16 +22,16 @@ def place(photo: Path) -> tuple[float, float, float | None] | None:
             tags = image.getexif().get_ifd(GPS)
         latitude = _degrees(tags[LATITUDE]) * (-1 if str(tags.get(LATITUDE_REF, "N")).upper().startswith("S") else 1)
         longitude = _degrees(tags[LONGITUDE]) * (-1 if str(tags.get(LONGITUDE_REF, "E")).upper().startswith("W") else 1)
-    except Exception:  # Pillow's parsers raise whatever damage leads to; a photo without a position is no error
+    except Exception:  # damaged files make Pillow raise any type of exception; a photo may have no position
         return None
-    null = latitude == 0 and longitude == 0  # what devices write that have no fix
+    null = latitude == 0 and longitude == 0  # written by devices without a fix
     if null or not (abs(latitude) <= 84 and abs(longitude) <= 180):
         return None
     return latitude, longitude, _altitude(tags)
 
 
 def focal_35mm(photo: Path) -> float | None:
-    """Millimetres that a photo's focal length would be on film of 36 x 24 mm, by its diagonal; None without EXIF."""
+    """35 mm equivalent focal length (mm), by the diagonal of 36 x 24 mm; None if EXIF doesn't have it."""
     from PIL import Image
 
     try:
@@ -39,9 +39,10 @@ def focal_35mm(photo: Path) -> float | None:
             tags, size = image.getexif().get_ifd(EXIF), image.size
         focal = float(tags.get(FOCAL_35MM, 0))
         if not focal:
-            dense = float(tags[PLANE_X]) / MILLIMETRES[tags.get(PLANE_UNIT, 2)]  # pixels a millimetre, as it was taken
-            smaller = size[0] / float(tags.get(WIDE, size[0]))
-            focal = float(tags[FOCAL]) * dense * smaller / math.hypot(*size) * math.hypot(36, 24)
+            # resolution of the sensor, and by how much the image was downscaled since
+            pixels_per_mm = float(tags[FOCAL_PLANE_X]) / UNIT_MM[tags.get(FOCAL_PLANE_UNIT, 2)]
+            scale = size[0] / float(tags.get(ORIGINAL_WIDTH, size[0]))
+            focal = float(tags[FOCAL]) * pixels_per_mm * scale / math.hypot(*size) * math.hypot(36, 24)
     except Exception:  # as above
         return None
     return focal if 1 < focal < 5000 else None

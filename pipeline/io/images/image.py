@@ -1,6 +1,7 @@
-"""Photos and pictures as 8-bit sRGB, pixels as they lie in the file (docs/formats.md, "Photos").
+"""Reading of images as 8-bit sRGB, with pixels in file order (docs/reference/formats.md, "Photos").
 
-The camera's orientation flag is ignored: poses and sizes are of the pixels. `pipeline.io.images.decoders` decodes.
+EXIF's orientation flag is ignored: poses and sizes refer to the pixels as stored. The decoders are in
+`pipeline.io.images.decoders`.
 """
 
 from __future__ import annotations
@@ -14,28 +15,29 @@ import numpy as np
 
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import U8, View
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.images import colour, decoders
 from scan2sim.pipeline.io.images.decoders import Box, Decoder, Header
 
 MAX_PIXELS = 2**29
-"""That are decoded at once: 32,768 x 16,384. What says it has more is taken for a decompression bomb."""
+"""Maximum number of pixels decoded at once: 32,768 x 16,384. Larger images are refused as decompression bombs."""
 DECODERS = plugins.by_suffix(decoders.__name__)
 SUFFIXES = tuple(DECODERS)
-"""Ends of photos' names. OpenCV tries what is called otherwise."""
+"""Suffixes of photos. Files with other suffixes are decoded by OpenCV."""
 
 
 def size_of(path: Path, *, parts: bool = False) -> tuple[int, int]:
-    """Width and height of a photo, pixels, as its header says.
+    """Width and height of a photo in pixels, from its header.
 
     Args:
-        parts: only parts of it will be read; where its format allows that, it may be of any size.
+        path: image file.
+        parts: only parts of it will be read; it may be of any size if its format supports that.
 
     Raises:
-        InputError: it is missing, no file, no image, or larger than `MAX_PIXELS`.
-        UnavailableError: what decodes it isn't installed.
+        InputError: not found, not a file, not an image, or larger than `MAX_PIXELS`.
+        UnavailableError: its decoder isn't installed.
     """
     decoder = _decoder(path)
     width, height, _ = decoder.header(path)
@@ -45,7 +47,7 @@ def size_of(path: Path, *, parts: bool = False) -> tuple[int, int]:
 
 
 def check_decodes(path: Path) -> None:
-    """Look through a photo.
+    """Check that a photo can be decoded completely.
 
     Raises:
         InputError, UnavailableError: it can't be decoded, as `size_of`.
@@ -54,7 +56,7 @@ def check_decodes(path: Path) -> None:
 
 
 def read_rgb(path: Path, box: Box | None = None) -> U8:
-    """(H, W, 3) RGB of a photo, or of the part of it in a box.
+    """RGB (H, W, 3) of a photo, or of the part of it in a box.
 
     Raises:
         InputError, UnavailableError: it can't be read, as `size_of`.
@@ -71,7 +73,7 @@ def read_rgb(path: Path, box: Box | None = None) -> U8:
 
 
 def read_levels(path: Path) -> U8:
-    """(H, W) grey levels of a photo.
+    """Grey levels (H, W) of a photo.
 
     Raises:
         InputError, UnavailableError: it can't be read, as `size_of`.
@@ -84,25 +86,25 @@ def read_levels(path: Path) -> U8:
 
 
 def read_photo(view: View) -> U8:
-    """(H, W, 3) RGB of a view's photo.
+    """RGB (H, W, 3) of a view's photo.
 
     Raises:
-        InputError: it can't be read, or isn't of its camera's size.
+        InputError: it can't be read, or its size differs from its camera's.
     """
-    return _of_size(view, view.photo, read_rgb(view.photo))
+    return _check_camera_size(view, view.photo, read_rgb(view.photo))
 
 
 def usable_photo(view: View) -> U8 | None:
-    """`read_photo`; None of what can't be used, which `views` and the steps that paint tell."""
+    """RGB (H, W, 3) of a view's photo; None if it is unusable (the step `views` reports such photos)."""
     with suppress(InputError):
         return read_photo(view)
     return None
 
 
 def usable_levels(view: View) -> U8 | None:
-    """(H, W) grey levels of a view's photo; None likewise."""
+    """Grey levels (H, W) of a view's photo; None if it is unusable."""
     with suppress(InputError):
-        return _of_size(view, view.photo, read_levels(view.photo))
+        return _check_camera_size(view, view.photo, read_levels(view.photo))
     return None
 
 
@@ -110,16 +112,16 @@ def read_mask(view: View) -> U8 | None:
     """The view's mask (H, W), 0 where its photo must not be used; None if it has none.
 
     Raises:
-        InputError: it can't be read, or isn't of its camera's size.
+        InputError: it can't be read, or its size differs from its camera's.
     """
-    return None if view.mask is None else _of_size(view, view.mask, read_levels(view.mask))
+    return None if view.mask is None else _check_camera_size(view, view.mask, read_levels(view.mask))
 
 
 def write(path: Path, image: U8, *, quality: int = 90, compression: int = 2) -> None:
-    """Write (H, W, 3) RGB or (H, W) grey; `quality` is a JPEG's, `compression` a PNG's.
+    """Write (H, W, 3) RGB or (H, W) grey; `quality` applies to JPEG, `compression` to PNG.
 
     Raises:
-        OSError: nothing could be written; OpenCV doesn't say why, nearly always the disk is full.
+        OSError: nothing could be written; OpenCV doesn't give the cause, usually the disk is full.
     """
     import cv2
 
@@ -133,7 +135,7 @@ def write(path: Path, image: U8, *, quality: int = 90, compression: int = 2) -> 
 def _decoder(path: Path) -> Decoder:
     file_checks.check(path)
     decoder: Decoder = plugins.module(decoders.__name__, DECODERS.get(path.suffix.lower(), "opencv"))
-    need(str(path), *plugins.needs(decoder))
+    require(str(path), *plugins.needs(decoder))
     return decoder
 
 
@@ -149,13 +151,13 @@ def _opened(path: Path, box: Box | None) -> tuple[Decoder, Header]:
 
 def _check_size(path: Path, width: int, height: int) -> None:
     if width * height > MAX_PIXELS:
-        told = f"is of {width:,} x {height:,} pixels, more than {MAX_PIXELS:,}"
-        raise InputError(path, told, "Give a smaller one")
+        cause = f"has {width:,} x {height:,} pixels, more than {MAX_PIXELS:,}"
+        raise InputError(path, cause, "Give a smaller image")
 
 
-def _of_size(view: View, path: Path, pixels: U8) -> U8:
-    wanted, size = (view.camera.width, view.camera.height), pixels.shape[1::-1]
-    if size != wanted:
-        told = f"is {size[0]} x {size[1]} pixels, but its camera {wanted[0]} x {wanted[1]}"
-        raise InputError(path, told, "Mend the camera's `size` (and focal, centre), or resize the photo")
+def _check_camera_size(view: View, path: Path, pixels: U8) -> U8:
+    expected, size = (view.camera.width, view.camera.height), pixels.shape[1::-1]
+    if size != expected:
+        cause = f"is {size[0]} x {size[1]} pixels, but its camera {expected[0]} x {expected[1]}"
+        raise InputError(path, cause, "Fix the camera's `size` (and focal, centre), or resize the photo")
     return pixels

@@ -1,4 +1,4 @@
-"""Encode: frames to an H.264 video, one at a time, through PyAV."""
+"""H.264 video encoder (MP4), frame by frame, with PyAV."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Any, Self
 
 from scan2sim.pipeline.core.errors import from_os_error
-from scan2sim.pipeline.core.optional_deps import need
+from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import U8
 
-TICKS = 90_000
-"""A second of the video's clock."""
+TICKS_PER_SECOND = 90_000
+"""Time base of the video."""
 
 
 class Encoder:
-    """Write frames with `add`, then `close`; the file is there from the start, and whole after `close`."""
+    """Writes frames with `add`, then `close`; the file exists from the start and is complete after `close`."""
 
     def __init__(
         self,
@@ -27,21 +27,21 @@ class Encoder:
         container: dict[str, str] | None = None,
         **options: str,
     ) -> None:
-        """Begin.
+        """Create the file.
 
         Args:
-            file: its suffix doesn't matter, it is MP4.
+            file: MP4 file, whatever its suffix.
             size: width and height, both even.
-            fps: frames a second, which the bit rate counts on.
-            bitrate: bits a second that are aimed at.
-            container: options of the MP4.
-            options: of libx264: preset, crf, threads.
+            fps: nominal frame rate, which rate control assumes.
+            bitrate: target bit rate, bits per second.
+            container: options of the MP4 muxer.
+            options: options of libx264: preset, crf, threads.
 
         Raises:
             UnavailableError: PyAV isn't installed.
-            SpaceError: the file can't be written to.
+            SpaceError: the file isn't writable.
         """
-        need("a video", "av")
+        require("a video", "av")
         import av
 
         self.count, self.file, self._last = 0, file, -1
@@ -54,24 +54,24 @@ class Encoder:
         stream.pix_fmt = "yuv420p"
         if bitrate is not None:
             stream.bit_rate = round(bitrate)
-        stream.time_base = stream.codec_context.time_base = Fraction(1, TICKS)
+        stream.time_base = stream.codec_context.time_base = Fraction(1, TICKS_PER_SECOND)
         stream.codec_context.options = options
         self._stream, self._frame = stream, av.VideoFrame
 
     def add(self, picture: U8, time: float) -> None:
-        """A frame as `cv2.COLOR_BGR2YUV_I420` makes it, (H * 3 / 2, W), shown from `time` (seconds) on.
+        """Encode a frame, (H * 3 / 2, W) as converted by `cv2.COLOR_BGR2YUV_I420`, shown from `time` (seconds) on.
 
         Raises:
             SpaceError: the disk is full.
         """
         frame = self._frame.from_ndarray(picture, format="yuv420p")
-        self._last = max(self._last + 1, round(time * TICKS))
-        frame.pts, frame.time_base = self._last, Fraction(1, TICKS)
+        self._last = max(self._last + 1, round(time * TICKS_PER_SECOND))
+        frame.pts, frame.time_base = self._last, Fraction(1, TICKS_PER_SECOND)
         self.count += 1
         self._mux(frame)
 
     def close(self) -> None:
-        """Write what is still held back."""
+        """Flush the encoder and finish the file."""
         if self._container is None:
             return
         self._mux(None)

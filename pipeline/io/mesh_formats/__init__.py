@@ -1,6 +1,6 @@
-"""Formats of the meshes in Gazebo's models: a file a format (`pipeline.core.plugins`), named in `export.meshes`.
+"""Mesh formats of Gazebo models: one module per format (`pipeline.core.plugins`), selected by `export.meshes`.
 
-A format's module has `SUFFIX` and `write`: a file for each class, its texture pages beside it.
+A format's module has `SUFFIX` and `write`, which writes one file per class with its texture pages beside it.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PageNames:
-    """What the texture pages of a class are called in its files, and beside them.
+    """Names of the materials and images of a class's texture pages.
 
     Attributes:
         group: the class.
-        materials: name of every page's material.
-        images: name of every page's image, in the same folder.
-        used: pages that a face of the class lies on, ascending.
+        materials: material name of every page.
+        images: image file name of every page, in the same folder.
+        used: pages that have faces of the class, ascending.
     """
 
     group: str
@@ -31,13 +31,13 @@ class PageNames:
 
 
 class ModelFormat(Protocol):
-    """Of files for each class.
+    """Interface of a format's module.
 
     Attributes:
-        SUFFIX: of them, with its dot.
+        SUFFIX: suffix of its files, with the dot.
     """
 
     SUFFIX: str
 
     def write(self, path: Path, surface: Textured, names: PageNames) -> None:
-        """Write a class, or a part of it: local metres, z up."""
+        """Write a class, or a part of it, in local metres, z up."""

@@ -1,4 +1,4 @@
-"""Collada 1.4.1, through pycollada: Z_UP, metres.
+"""Collada 1.4.1 writer, with pycollada: Z_UP, metres.
 
 Gazebo's loader silently drops triangles whose semantics share an offset, so each of vertex, normal
 and texture coordinate gets its own (0, 1, 2). It ignores `up_axis` but honours `meter`; Blender
@@ -17,22 +17,22 @@ from scan2sim.pipeline.io.mesh_formats import PageNames
 from scan2sim.pipeline.io.worlds.textured_mesh import Textured, unique_uv
 
 SUFFIX = ".dae"
-EPOCH = datetime(2000, 1, 1)  # written for the time of making, so that the same mesh gives the same bytes
+CREATION_TIME = datetime(2000, 1, 1)  # constant, so that the same mesh gives the same bytes
 
 
 def write(path: Path, surface: Textured, names: PageNames) -> None:
-    """Write a textured mesh, one geometry and one material a page.
+    """Write a textured mesh with one geometry and one material per page.
 
     Args:
-        path: of the .dae.
-        surface: local metres, z up; seven significant digits are written (0.1 mm within 1 km).
+        path: the .dae file.
+        surface: local metres, z up; written with seven significant digits (0.1 mm within 1 km).
         names: names of materials and images.
     """
     import collada
     from collada import asset, scene, source
 
     document = collada.Collada()
-    document.assetInfo.created = document.assetInfo.modified = EPOCH
+    document.assetInfo.created = document.assetInfo.modified = CREATION_TIME
     document.assetInfo.upaxis = asset.UP_AXIS.Z_UP
     document.assetInfo.unitname, document.assetInfo.unitmeter = "meter", 1.0
     nodes = []
@@ -72,13 +72,13 @@ def _material(document: Any, name: str, texture: str) -> Any:
     image = material.CImage(f"{name}-image", texture)
     surface = material.Surface(f"{name}-surface", image)
     sampler = material.Sampler2D(f"{name}-sampler", surface)
-    picture = material.Map(sampler, "UV")
+    texture_map = material.Map(sampler, "UV")
     effect = material.Effect(
         f"{name}-effect", [surface, sampler], "lambert",
-        ambient=(1.0, 1.0, 1.0, 1.0), diffuse=picture, emission=(0.0, 0.0, 0.0, 1.0),
+        ambient=(1.0, 1.0, 1.0, 1.0), diffuse=texture_map, emission=(0.0, 0.0, 0.0, 1.0),
     )  # fmt: skip
-    made = material.Material(f"{name}-material", name, effect)
+    result = material.Material(f"{name}-material", name, effect)
     document.images.append(image)
     document.effects.append(effect)
-    document.materials.append(made)
-    return made
+    document.materials.append(result)
+    return result

@@ -1,4 +1,4 @@
-"""Wavefront OBJ and MTL: z-up, as every simulator takes OBJ raw.
+"""Wavefront OBJ and MTL writer: z up, as simulators read OBJ without converting axes.
 
 https://www.loc.gov/preservation/digital/formats/fdd/fdd000507.shtml
 """
@@ -16,16 +16,16 @@ from scan2sim.pipeline.io.mesh_formats import PageNames
 from scan2sim.pipeline.io.worlds.textured_mesh import Textured, unique_uv, vertex_normals
 
 SUFFIX = ".obj"
-CHUNK = 100_000  # rows formatted at once
+ROWS_PER_FORMAT = 100_000  # rows formatted at once
 
 
 def write(path: Path, surface: Textured, names: PageNames) -> None:
-    """Write a textured mesh, one `usemtl` a page, and its class's materials beside it.
+    """Write a textured mesh with one `usemtl` per page, and the materials of its class beside it.
 
     Args:
-        path: of the .obj.
-        surface: local metres, z up; its texture coordinates have their origin at the lower left, as OBJ's.
-        names: names of materials and images; the material file is called by the class.
+        path: the .obj file.
+        surface: local metres, z up; texture coordinates with the origin at the lower left, as in OBJ.
+        names: names of materials and images; the material file is named after the class.
     """
     mtl = path.with_name(f"{names.group}.mtl")
     _write_materials(mtl, names)
@@ -39,13 +39,13 @@ def write(path: Path, surface: Textured, names: PageNames) -> None:
         _rows(file, "vn %.3f %.3f %.3f\n", surface.normal)
         for page in surface.used_pages:
             file.write(f"usemtl {names.materials[page]}\n")
-            here = mesh.page == page
-            v, vt = mesh.faces[here] + 1, corner_uv[here] + 1
+            on_page = mesh.page == page
+            v, vt = mesh.faces[on_page] + 1, corner_uv[on_page] + 1
             _rows(file, "f %d/%d/%d %d/%d/%d %d/%d/%d\n", np.stack([v, vt, v], axis=2))
 
 
 def write_plain(path: Path, mesh: Mesh) -> None:
-    """Write a mesh without material, for collisions; with normals, as DART's mesh shape ignores one without."""
+    """Write a collision mesh, without material; with normals, as DART ignores meshes without them."""
     with open(path, "w", encoding="ascii") as file:
         _rows(file, "v %.4f %.4f %.4f\n", mesh.vertices)
         _rows(file, "vn %.3f %.3f %.3f\n", vertex_normals(mesh))
@@ -53,7 +53,7 @@ def write_plain(path: Path, mesh: Mesh) -> None:
 
 
 def _write_materials(path: Path, names: PageNames) -> None:
-    """Write matt materials of the pages that are used."""
+    """Write matt materials for the used pages."""
     lines = [
         f"newmtl {names.materials[page]}\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\nmap_Kd {names.images[page]}\n"
         for page in names.used
@@ -62,7 +62,7 @@ def _write_materials(path: Path, names: PageNames) -> None:
 
 
 def _rows(file: TextIO, row: str, values: npt.NDArray[Any]) -> None:
-    """Format `values` (N, ...) with `row`, many at once: Python's `%` runs in C, a loop over rows doesn't."""
-    for start in range(0, len(values), CHUNK):
-        part = values[start : start + CHUNK]
+    """Write `values` (N, ...) with the format `row`, many rows per `%`, which is faster than a loop over rows."""
+    for start in range(0, len(values), ROWS_PER_FORMAT):
+        part = values[start : start + ROWS_PER_FORMAT]
         file.write(row * len(part) % tuple(part.ravel().tolist()))

@@ -1,9 +1,9 @@
-"""Posed photos of other programs (COLMAP, OpenSfM, Metashape, Bundler, VisualSFM): a file a program.
+"""Readers of photogrammetry models (COLMAP, OpenSfM, Metashape, Bundler, VisualSFM): one module per program.
 
-A program's module has `read(model, photos) -> Model`: it alone knows the program's conventions. A `Model` has this
-project's own: cameras as in `pipeline.core.types`, poses camera to model with OpenCV's axes. Where it lies on the Earth
-comes from the program's own georeference (`Model.T_earth`), or from the photos' GPS
-(`pipeline.importers.georeference`), or is unknown. `pipeline.importers.photogrammetry` makes tiles of models.
+A program's module has `read(model, photos) -> Model` and converts the program's conventions to this project's: cameras
+as in `pipeline.core.types`, poses camera to model with OpenCV's axes. The georeference comes from the program
+(`Model.T_earth`), or from the photos' GPS (`pipeline.importers.georeference`), or is unknown.
+`pipeline.importers.photogrammetry` turns models into tiles.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from scan2sim.pipeline.io.images.image import SUFFIXES, size_of
 
 @dataclass(frozen=True)
 class Shot:
-    """A posed photo: its file's name as the program has it, its camera's, `pose` (4, 4) camera to model."""
+    """A posed photo: file name as stored by the program, name of its camera, `pose` (4, 4) camera to model."""
 
     file: str
     camera: str
@@ -34,17 +34,17 @@ class Shot:
 
 @dataclass(frozen=True)
 class Model:
-    """What a program has reconstructed.
+    """A reconstruction.
 
     Attributes:
-        cameras: by name.
+        cameras: cameras by name.
         shots: photos that have a pose.
         xyz: (N, 3) sparse points, model coordinates.
         rgb: (N, 3) their colours, or None.
-        T_earth: (4, 4) similarity from model coordinates to the Earth's (geocentric, WGS 84, metres), or None where
-            the model isn't georeferenced.
-        crs: projected CRS that the program names for it, or None.
-        notes: what was left out, for the user.
+        T_earth: (4, 4) similarity from model coordinates to geocentric ones (WGS 84, metres), or None if the model
+            isn't georeferenced.
+        crs: projected CRS of the program's project, or None.
+        notes: warnings for the user, such as photos that are left out.
     """
 
     cameras: dict[str, Camera]
@@ -57,11 +57,11 @@ class Model:
 
     @property
     def centres(self) -> F64:
-        """(P, 3) of the photos, model coordinates."""
+        """Camera centres (P, 3) of the photos, model coordinates."""
         return np.array([shot.pose[:3, 3] for shot in self.shots])
 
-    def moved(self, onto: Similarity) -> Model:
-        """The same photos and points after a similarity; its georeference is gone."""
+    def transformed(self, onto: Similarity) -> Model:
+        """The model transformed by a similarity, without its georeference."""
 
         def pose(shot: Shot) -> F64:
             out = np.eye(4)
@@ -73,7 +73,7 @@ class Model:
 
 
 class Photos:
-    """The photos of a folder, found by the names that programs have for them: path, file name, or no suffix."""
+    """Photos in a folder, looked up by the names that programs store: path, file name, or name without suffix."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -83,27 +83,27 @@ class Photos:
         """The file of a photo.
 
         Raises:
-            InputError: there is none, or more than one.
+            InputError: no photo of that name, or more than one.
         """
         name = name.replace("\\", "/")
         path = self.folder / without_parents(name)
         if name and path.is_file():
             return path
-        known = self._known()
+        known = self._by_name()
         found = (
             known.get(Path(name).name.lower()) or known.get(Path(name).stem.lower()) or known.get(name.lower()) or []
         )
         if len(found) == 1:
             return found[0]
         if found:
-            raise InputError(self.folder, f"has {len(found)} photos called {Path(name).name}", "Name a narrower folder")
-        raise InputError(path, "is missing", "Put it there, or name the folder of the photos")
+            raise InputError(self.folder, f"has {len(found)} photos named {Path(name).name}", "Give a narrower folder")
+        raise InputError(path, "file not found", "Check the path, or give the folder of the photos")
 
     def size(self, name: str) -> tuple[int, int]:
-        """Width and height of a photo, pixels as they lie in the file."""
+        """Width and height of a photo in pixels, without applying the EXIF orientation."""
         return size_of(self.find(name))
 
-    def _known(self) -> dict[str, list[Path]]:
+    def _by_name(self) -> dict[str, list[Path]]:
         if self._names is None:
             self._names = defaultdict(list)
             for path in sorted(p for p in self.folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file()):
@@ -113,24 +113,24 @@ class Photos:
 
 
 class Program(Protocol):
-    """What a program's module has."""
+    """Interface of a program's module."""
 
     def read(self, model: Path, photos: Photos) -> Model:
-        """What it has reconstructed: a file or folder of its own; `photos` are asked for their sizes."""
+        """Read a reconstruction from a file or folder of the program; `photos` gives sizes of images."""
 
 
 def read(kind: str, model: Path, images: Path) -> Model:
-    """What a program has reconstructed; `kind` is the name of one's file here.
+    """Read a reconstruction; `kind` is the name of a program's module in this package.
 
     Raises:
-        SettingError: there is no such program.
-        UnavailableError: its files can't be read here.
-        InputError: it can't be read, has no posed photo, or a camera that has no counterpart here.
+        SettingError: unknown program.
+        UnavailableError: a package that reads its files isn't installed.
+        InputError: it can't be read, has no posed photo, or a camera model that isn't supported.
     """
     program: Program = plugins.find(__name__, kind, "import")
     found = program.read(model, Photos(images))
     if not found.shots:
-        raise InputError(model, "has no posed photo", "Name a finished reconstruction")
+        raise InputError(model, "has no posed photo", "Give a finished reconstruction")
     for shot in found.shots:
         if not np.isfinite(shot.pose).all():
             raise InputError(model, f"the pose of {shot.file} is not finite", "Export it again without that photo")

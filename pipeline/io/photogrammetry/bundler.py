@@ -1,9 +1,9 @@
-"""Bundler's output (bundle.out, v0.3), with its list of photos.
+"""Bundler models (bundle.out, v0.3), with their list of photos.
 
-Cameras look along -z with y up; the picture's middle is the origin and its y goes up. With P = R X + t and
-p = -P / P.z, pixels are f (1 + k1 |p|2 + k2 |p|4) p. Turning P by 180 degrees about x gives OpenCV's axes,
+Cameras look along -z with y up; the origin is the middle of the image and its y axis points up. With P = R X + t and
+p = -P / P.z, pixels are f (1 + k1 |p|2 + k2 |p|4) p. Rotating P by 180 degrees about x gives OpenCV's axes,
 and the same coefficients.
-Bundler keeps no sizes: they are the photos'. A camera whose f is 0 was not placed.
+Bundler stores no image sizes: they are read from the photos. A camera with f = 0 has no pose.
 
 Source: Bundler v0.4 user's manual (https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.html)
 """
@@ -20,14 +20,14 @@ from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.photogrammetry import Model, Photos, Shot
 
-REMEDY = "Name Bundler's .out file (often bundle/bundle.out)"
+REMEDY = "Give Bundler's .out file (often bundle/bundle.out)"
 FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def read(model: Path, photos: Photos) -> Model:
-    """A .out file; its list of photos is `list.txt` or `<name>.txt` beside it, or one folder up."""
+    """Read a .out file; its list of photos is `list.txt` or `<name>.txt` beside it, or one folder up."""
     path = next((model / p for p in ("bundle.out", "bundle/bundle.out") if (model / p).is_file()), model)
-    lines = numbered(path)
+    lines = non_empty_lines(path)
     try:
         if not next(lines).startswith("# Bundle file"):
             raise ValueError("its first line is not `# Bundle file`")
@@ -37,35 +37,35 @@ def read(model: Path, photos: Photos) -> Model:
         names = _names(path)
         if len(names) != cameras:
             raise InputError(
-                path, f"has {cameras} cameras, its list {len(names)} photos", "Put its own list.txt beside it"
+                path, f"has {cameras} cameras, but its list has {len(names)} photos", "Put its own list.txt beside it"
             )
         shots: list[Shot] = []
         lenses: dict[Camera, str] = {}
         for name in names:
-            f, k1, k2 = row(next(lines), 3)
-            R = np.array([row(next(lines), 3) for _ in range(3)])
-            t = row(next(lines), 3)
+            f, k1, k2 = parse_row(next(lines), 3)
+            R = np.array([parse_row(next(lines), 3) for _ in range(3)])
+            t = parse_row(next(lines), 3)
             if f > 0:
-                key = named(lenses, _camera(photos.size(name), f, k1, k2))
+                key = camera_key(lenses, _camera(photos.size(name), f, k1, k2))
                 shots.append(Shot(name, key, _pose(R, t)))
         xyz, rgb = [], []
         for _ in range(points):
-            xyz.append(row(next(lines), 3))
-            rgb.append(row(next(lines), 3))
-            next(lines)  # who sees it
+            xyz.append(parse_row(next(lines), 3))
+            rgb.append(parse_row(next(lines), 3))
+            next(lines)  # its observations
     except StopIteration:
         raise InputError(path, "is truncated: it ends before its last camera or point", "Copy it again") from None
     except ValueError as error:
-        raise InputError(path, f"is no readable Bundler file ({str(error)[:100]})", REMEDY) from None
-    left = len(names) - len(shots)
-    note = (f"{left} photos without a pose are left out",) if left else ()
+        raise InputError(path, f"is not a readable Bundler file ({str(error)[:100]})", REMEDY) from None
+    unposed = len(names) - len(shots)
+    note = (f"{unposed} photos without a pose are left out",) if unposed else ()
     cameras_by_name = {key: camera for camera, key in lenses.items()}
     colours = np.reshape(rgb, (-1, 3)).astype(np.uint8)
     return Model(cameras_by_name, tuple(shots), np.reshape(xyz, (-1, 3)), colours, notes=note)
 
 
-def numbered(path: Path) -> Iterator[str]:
-    """The lines of a text that aren't empty, none of them endless."""
+def non_empty_lines(path: Path) -> Iterator[str]:
+    """The lines of a text file that aren't empty, cut to at most 1 MiB each."""
     file_checks.check(path)
     try:
         with open(path, encoding="utf-8", errors="replace") as file:
@@ -76,27 +76,29 @@ def numbered(path: Path) -> Iterator[str]:
         raise InputError(path, f"can't be read ({error.strerror})", REMEDY) from None
 
 
-def row(line: str, count: int) -> F64:
-    """(count,) the numbers of a line."""
+def parse_row(line: str, count: int) -> F64:
+    """Parse the `count` numbers of a line."""
     values = np.array(line.split(), np.float64)
     if len(values) != count or not np.isfinite(values).all():
-        raise ValueError(f"{count} numbers are expected in the line {line[:40]!r}")
+        raise ValueError(f"expected {count} numbers in the line {line[:40]!r}")
     return values
 
 
-def named(known: dict[Camera, str], camera: Camera) -> str:
-    """The name of a camera: of its equal among those known, or a new one, which is known then."""
+def camera_key(known: dict[Camera, str], camera: Camera) -> str:
+    """Key of a camera in `known`: of an equal camera, or a new key, which is added."""
     return known.setdefault(camera, f"camera_{len(known) + 1}")
 
 
 def _names(path: Path) -> list[str]:
-    places = [
+    candidates = [
         folder / name for folder in (path.parent, path.parent.parent) for name in ("list.txt", f"{path.stem}.txt")
     ]
-    found = next((place for place in places if place.is_file()), None)
+    found = next((candidate for candidate in candidates if candidate.is_file()), None)
     if found is None:
-        raise InputError(places[0], "is missing: Bundler's cameras have no names", "Put the list of photos there")
-    return [line.split()[0] for line in numbered(found)]
+        raise InputError(
+            candidates[0], "file not found: Bundler's cameras have no names", "Put the list of photos there"
+        )
+    return [line.split()[0] for line in non_empty_lines(found)]
 
 
 def _camera(size: tuple[int, int], f: float, k1: float, k2: float) -> Camera:
@@ -106,7 +108,7 @@ def _camera(size: tuple[int, int], f: float, k1: float, k2: float) -> Camera:
 
 def _pose(R: F64, t: F64) -> F64:
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-        raise ValueError("a rotation is none")
+        raise ValueError("a rotation matrix is invalid")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = (FLIP @ R).T, -R.T @ t
     return pose

@@ -1,7 +1,7 @@
 """COLMAP models (text or binary): cameras, images, points3D.
 
-COLMAP stores world-to-camera poses with OpenCV's axes and puts the centre of the top left pixel at
-(0.5, 0.5): poses are inverted, principal points move by half a pixel.
+COLMAP stores world-to-camera poses with OpenCV's axes, and the centre of its top left pixel is (0.5, 0.5): the reader
+inverts poses and shifts principal points by half a pixel.
 
 Source: https://colmap.github.io/format.html, https://colmap.github.io/cameras.html
 """
@@ -21,7 +21,7 @@ from scan2sim.pipeline.core.types import F64, Camera, CameraModel
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.photogrammetry import Model, Photos, Shot
 
-# COLMAP's model: ours, number of focal lengths, places of COLMAP's coefficients among ours
+# COLMAP's camera model: ours, number of focal lengths, indices of COLMAP's coefficients among ours
 MODELS: dict[str, tuple[CameraModel, int, tuple[int, ...]]] = {
     "SIMPLE_PINHOLE": ("pinhole", 1, ()),
     "PINHOLE": ("pinhole", 2, ()),
@@ -37,8 +37,8 @@ MODELS: dict[str, tuple[CameraModel, int, tuple[int, ...]]] = {
 }
 
 
-# what binary files call each camera model: a number, and how many parameters follow
-NUMBERS = (
+# camera models of binary files, indexed by their id: name and number of parameters
+BINARY_MODELS = (
     ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8), ("OPENCV_FISHEYE", 8),
     ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12),
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16), ("SIMPLE_DIVISION", 4), ("DIVISION", 5), ("SIMPLE_FISHEYE", 3), ("FISHEYE", 4),
@@ -46,8 +46,8 @@ NUMBERS = (
 )  # fmt: skip
 
 
-class Described(NamedTuple):
-    """A camera as COLMAP describes it."""
+class ColmapCamera(NamedTuple):
+    """A camera as stored by COLMAP."""
 
     camera_id: int
     model_name: str
@@ -56,8 +56,8 @@ class Described(NamedTuple):
     params: tuple[float, ...]
 
 
-class Posed(NamedTuple):
-    """A photo: its camera, and the quaternion (w first) and translation that take the world to it."""
+class ColmapImage(NamedTuple):
+    """A photo: its camera, and its pose, world to camera: quaternion (w first) and translation."""
 
     camera_id: int
     name: str
@@ -69,38 +69,38 @@ Point = tuple[int, tuple[float, ...], tuple[int, ...]]
 
 
 def read(model: Path, photos: Photos) -> Model:
-    """A folder of cameras, images and points3D, .bin or .txt (often `sparse/0`).
+    """Read a folder with cameras, images and points3D, .bin or .txt (often `sparse/0`).
 
     Raises:
-        InputError: a file is missing or damaged, or a camera's model has no counterpart here.
+        InputError: a file is missing or damaged, or a camera model isn't supported.
     """
     suffix = next((end for end in (".bin", ".txt") if (model / f"cameras{end}").is_file()), None)
     if suffix is None:
         raise InputError(
-            model, "holds no COLMAP model (no cameras.bin or cameras.txt)", "Name its folder, often sparse/0"
+            model, "contains no COLMAP model (no cameras.bin or cameras.txt)", "Give its folder, often sparse/0"
         )
     parsers: Any = (_cameras, _images, _points) if suffix == ".bin" else (_camera_lines, _image_lines, _point_lines)
     names = [model / f"{name}{suffix}" for name in ("cameras", "images", "points3D")]
-    described, posed, points = (_parsed(file, parse) for file, parse in zip(names, parsers, strict=True))
-    cameras = {camera.camera_id: camera for camera in described}
-    posed.sort(key=lambda image: image.name)
+    colmap_cameras, images, points = (_parsed(file, parse) for file, parse in zip(names, parsers, strict=True))
+    cameras = {camera.camera_id: camera for camera in colmap_cameras}
+    images.sort(key=lambda image: image.name)
     points.sort()
-    used = sorted({image.camera_id for image in posed})
+    used = sorted({image.camera_id for image in images})
     if not cameras.keys() >= set(used):
-        raise InputError(names[1], "names a camera that cameras.* lacks", "Export the model again")
+        raise InputError(names[1], "refers to a camera that is missing in cameras.*", "Export the model again")
     return Model(
         {f"camera_{key}": camera_of(model, cameras[key]) for key in used},
-        tuple(Shot(image.name, f"camera_{image.camera_id}", _camera_to_world(image.pose)) for image in posed),
+        tuple(Shot(image.name, f"camera_{image.camera_id}", _camera_to_world(image.pose)) for image in images),
         np.array([xyz for _, xyz, _ in points], np.float64).reshape(-1, 3),
         np.array([rgb for _, _, rgb in points], np.uint8).reshape(-1, 3),
     )
 
 
-def camera_of(model: Path, camera: Described) -> Camera:
-    """The counterpart of a camera of COLMAP's.
+def camera_of(model: Path, camera: ColmapCamera) -> Camera:
+    """Convert a camera of COLMAP.
 
     Raises:
-        InputError: naming the camera's model, where there is none.
+        InputError: its camera model isn't supported.
     """
     kind = camera.model_name
     if kind == "EQUIRECTANGULAR":
@@ -111,39 +111,39 @@ def camera_of(model: Path, camera: Described) -> Camera:
             f"camera {camera.camera_id} has the model {kind}, which is not supported",
             "Undistort the photos (`colmap image_undistorter`), or use one of " + ", ".join(MODELS),
         )
-    ours, focals, places = MODELS[kind]
+    ours, focals, indices = MODELS[kind]
     p = [float(value) for value in camera.params]
     fx, fy, cx, cy, *rest = [p[0], *p] if focals == 1 else p
-    size = 0 if ours == "pinhole" or not places else 8 if max(places) > 3 else 4
+    size = 0 if ours == "pinhole" or not indices else 8 if max(indices) > 3 else 4
     distortion = [0.0] * size
-    for at, value in zip(places, rest, strict=True):
+    for at, value in zip(indices, rest, strict=True):
         distortion[at] = value
     return Camera(ours, camera.width, camera.height, fx, fy, cx - 0.5, cy - 0.5, tuple(distortion))
 
 
 def _parsed(file: Path, parse: Callable[[Any], Iterator[Any]]) -> list[Any]:
-    """All records of a file; text as its lines."""
+    """All records of a file, binary or text."""
     try:
         data = file_checks.check(file, "Export the model again").read_bytes()
         return list(parse(data if file.suffix == ".bin" else data.decode().split("\n")))
     except OSError as error:
         raise InputError(file, f"can't be read ({error.strerror})", "Export the model again") from None
     except (ValueError, IndexError, OverflowError, struct.error) as error:
-        raise InputError(file, f"is no readable COLMAP model ({error})", "Export the model again") from None
+        raise InputError(file, f"is not a readable COLMAP model ({error})", "Export the model again") from None
 
 
-def _cameras(data: bytes) -> Iterator[Described]:
+def _cameras(data: bytes) -> Iterator[ColmapCamera]:
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         key, number, width, height = struct.unpack_from("<IiQQ", data, at)
-        if not 0 <= number < len(NUMBERS):
+        if not 0 <= number < len(BINARY_MODELS):
             raise ValueError(f"camera {key} has the unknown model {number}")
-        name, size = NUMBERS[number]
-        yield Described(key, name, width, height, struct.unpack_from(f"<{size}d", data, at + 24))
+        name, size = BINARY_MODELS[number]
+        yield ColmapCamera(key, name, width, height, struct.unpack_from(f"<{size}d", data, at + 24))
         at += 24 + 8 * size
 
 
-def _images(data: bytes) -> Iterator[Posed]:
+def _images(data: bytes) -> Iterator[ColmapImage]:
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         _, *pose, camera = struct.unpack_from("<I7dI", data, at)
@@ -152,7 +152,7 @@ def _images(data: bytes) -> Iterator[Posed]:
         (seen,) = struct.unpack_from("<Q", data, end + 1)  # observations: x, y, point
         at = end + 9 + 24 * seen
     if at > len(data):
-        raise ValueError("it ends too early")
+        raise ValueError("it is truncated")
 
 
 def _points(data: bytes) -> Iterator[Point]:
@@ -162,18 +162,18 @@ def _points(data: bytes) -> Iterator[Point]:
         yield key, (x, y, z), (r, g, b)
         at += 51 + 8 * seen  # the track: image, observation
     if at > len(data):
-        raise ValueError("it ends too early")
+        raise ValueError("it is truncated")
 
 
-def _camera_lines(lines: list[str]) -> Iterator[Described]:
+def _camera_lines(lines: list[str]) -> Iterator[ColmapCamera]:
     for line in _rows(lines):
         key, name, width, height, *params = line.split()
-        if len(params) != dict(NUMBERS).get(name, len(params)):
+        if len(params) != dict(BINARY_MODELS).get(name, len(params)):
             raise ValueError(f"camera {key} has {len(params)} parameters")
-        yield Described(int(key), name, int(width), int(height), tuple(map(float, params)))
+        yield ColmapCamera(int(key), name, int(width), int(height), tuple(map(float, params)))
 
 
-def _image_lines(lines: list[str]) -> Iterator[Posed]:
+def _image_lines(lines: list[str]) -> Iterator[ColmapImage]:
     rest = iter(lines)
     for line in _rows(rest):
         words = line.split(maxsplit=9)
@@ -187,10 +187,10 @@ def _point_lines(lines: list[str]) -> Iterator[Point]:
         yield int(key), (float(x), float(y), float(z)), tuple(bytes((int(r), int(g), int(b))))
 
 
-def _posed(camera: int, name: str, pose: tuple[float, ...]) -> Posed:
+def _posed(camera: int, name: str, pose: tuple[float, ...]) -> ColmapImage:
     if not 1e-6 < math.hypot(*pose[:4]) < 1e6:
         raise ValueError(f"{name} has no rotation")
-    return Posed(camera, name, pose)
+    return ColmapImage(camera, name, pose)
 
 
 def _rows(lines: Iterable[str]) -> Iterator[str]:

@@ -1,17 +1,17 @@
-"""Agisoft Metashape's `cameras.xml` (Export Cameras, Agisoft XML).
+"""Agisoft Metashape models, `cameras.xml` (Export Cameras, Agisoft XML).
 
-A camera's `transform` is camera to chunk, row by row, with OpenCV's axes. Its component's `transform` (rotation, scale,
-translation), or the chunk's where it has none, leads to geocentric coordinates where the chunk's `reference` is a CRS
-of the Earth, and to the reference's own coordinates where that is local. Of several components the largest is taken. Of
-a calibration:
+A camera's `transform` is camera to chunk, row-major, with OpenCV's axes. Its component's `transform` (rotation, scale,
+translation), or the chunk's if it has none, maps to geocentric coordinates if the chunk's `reference` is a CRS of the
+Earth, and to the reference's own coordinates if that is local. Only the largest of several components is read. The
+camera model:
 
     u = w/2 + cx + x' f + x' b1 + y' b2,  v = h/2 + cy + y' f
     x' = x (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p1 (r2 + 2 x2) + 2 p2 x y
     y' = y (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p2 (r2 + 2 y2) + 2 p1 x y
 
-so that its p1, p2 are OpenCV's p2, p1; the middle of the top left pixel is (0.5, 0.5). For `fisheye` (x, y) have the
-length of the angle to the axis instead of its tangent. OpenCV has no k4 of this kind: where there is one, OpenCV's
-k1...k6 are fitted to the same lens, and refused if they are more than 0.05 pixels off. b2 has no counterpart.
+so that its p1, p2 are OpenCV's p2, p1; the centre of the top left pixel is (0.5, 0.5). For `fisheye`, the length of
+(x, y) is the angle to the axis instead of its tangent. OpenCV has no such k4: if there is one, OpenCV's k1...k6 are
+fitted to the same distortion; the camera is refused if the fit error exceeds 0.05 pixels. b2 isn't supported.
 
 Source: Metashape Professional user manual 2.1, appendix D, Camera models.
 """
@@ -33,26 +33,28 @@ from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.photogrammetry import Model, Photos, Shot
 
 REMEDY = "Export it again (File > Export > Export Cameras, Agisoft XML)"
-UNDISTORT = "Undistort the photos in Metashape and export them with their cameras, or fit without it"
+UNDISTORT = "Undistort the photos in Metashape and export them with their cameras, or calibrate without that parameter"
 
 
 def read(model: Path, photos: Photos) -> Model:
-    """A cameras.xml of one chunk; disabled photos are left out, and such that are not aligned."""
+    """Read the cameras.xml of one chunk; photos that are disabled or not aligned are left out."""
     chunk = _chunk(model)
     try:
         sensors = {str(sensor.get("id")): sensor for sensor in chunk.iterfind("sensors/sensor")}
-        wanted = [camera for camera in chunk.iterfind("cameras//camera") if camera.get("enabled", "1") in ("1", "true")]
-        aligned = [camera for camera in wanted if camera.find("transform") is not None]
+        enabled = [
+            camera for camera in chunk.iterfind("cameras//camera") if camera.get("enabled", "1") in ("1", "true")
+        ]
+        aligned = [camera for camera in enabled if camera.find("transform") is not None]
         components = {c.get("id"): _similarity(c.find("transform")) for c in chunk.iterfind("components/component")}
-        together = Counter(camera.get("component_id") for camera in aligned)
-        largest = together.most_common(1)[0][0] if together else None
-        apart = [camera for camera in aligned if camera.get("component_id") != largest]
+        component_sizes = Counter(camera.get("component_id") for camera in aligned)
+        largest = component_sizes.most_common(1)[0][0] if component_sizes else None
+        in_smaller = [camera for camera in aligned if camera.get("component_id") != largest]
         aligned = [camera for camera in aligned if camera.get("component_id") == largest]
         cameras, shots = {}, []
         for camera in aligned:
             key = str(camera.get("sensor_id"))
             if key not in sensors:
-                raise ValueError(f"camera {camera.get('label')}: its sensor {key} is not described")
+                raise ValueError(f"camera {camera.get('label')}: its sensor {key} is missing")
             if f"sensor_{key}" not in cameras:
                 cameras[f"sensor_{key}"] = _camera(model, sensors[key])
             pose = np.array(_numbers(camera.find("transform"), 16)).reshape(4, 4)
@@ -61,17 +63,17 @@ def read(model: Path, photos: Photos) -> Model:
         onto = components.get(largest) or _similarity(chunk.find("transform"))
         reference = (chunk.findtext("reference") or "").strip()
     except (TypeError, ValueError, KeyError) as error:
-        raise InputError(model, f"lacks or misstates {str(error)[:120]}", REMEDY) from None
+        raise InputError(model, f"has missing or invalid values: {str(error)[:120]}", REMEDY) from None
     notes = []
-    if apart:
-        notes.append(f"{len(apart)} photos of {len(together) - 1} smaller components are left out")
-    if len(wanted) > len(aligned) + len(apart):
-        notes.append(f"{len(wanted) - len(aligned) - len(apart)} photos that have no pose of their own are left out")
+    if in_smaller:
+        notes.append(f"{len(in_smaller)} photos of {len(component_sizes) - 1} smaller components are left out")
+    if len(enabled) > len(aligned) + len(in_smaller):
+        notes.append(f"{len(enabled) - len(aligned) - len(in_smaller)} photos without a pose are left out")
     found = Model(cameras, tuple(shots), np.empty((0, 3)), notes=tuple(notes))
     if onto is None:
         return found
     if not reference or reference.startswith("LOCAL"):
-        return found.moved(onto)
+        return found.transformed(onto)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = onto.scale * onto.rotation, onto.translation
     return Model(cameras, found.shots, found.xyz, None, T, _projected(model, reference), found.notes)
@@ -80,7 +82,8 @@ def read(model: Path, photos: Photos) -> Model:
 def _chunk(model: Path) -> Element:
     chunks = [chunk for chunk in xml.root(model, REMEDY).iter("chunk") if chunk.find("cameras") is not None]
     if len(chunks) != 1:
-        raise InputError(model, f"holds {len(chunks)} chunks with cameras", "Export one chunk's cameras as Agisoft XML")
+        cause = f"contains {len(chunks)} chunks with cameras"
+        raise InputError(model, cause, "Export the cameras of one chunk as Agisoft XML")
     return chunks[0]
 
 
@@ -106,7 +109,7 @@ def _similarity(node: Element | None) -> Similarity | None:
 
 def _check_rotation(R: F64, where: str) -> None:
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-        raise ValueError(f"{where}: its rotation is none")
+        raise ValueError(f"{where}: its rotation matrix is invalid")
 
 
 def _camera(model: Path, sensor: Element) -> Camera:
@@ -135,11 +138,11 @@ def _camera(model: Path, sensor: Element) -> Camera:
     k1, k2, k3, k4, p1, p2, p3, p4, b2 = (
         value.get(n, 0.0) for n in ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b2")
     )
-    reach = distortion_fit.reach(width, height, fx, f, cx, cy)
-    lost = {"b2": b2 * max(cy, height - cy) / f, "p3, p4": f * max(abs(p3), abs(p4)) * reach**4}
+    max_radius = distortion_fit.max_distorted_radius(width, height, fx, f, cx, cy)
+    unsupported = {"b2": b2 * max(cy, height - cy) / f, "p3, p4": f * max(abs(p3), abs(p4)) * max_radius**4}
     if kind == "fisheye":
-        lost["p1, p2 of a fisheye"] = f * 3 * max(abs(p1), abs(p2)) * reach**2
-    for name, pixels in lost.items():
+        unsupported["p1, p2 of a fisheye"] = f * 3 * max(abs(p1), abs(p2)) * max_radius**2
+    for name, pixels in unsupported.items():
         if abs(pixels) > 0.01:
             raise InputError(
                 model, f"{title} has {name} (up to {abs(pixels):.2f} pixels), which is not supported", UNDISTORT
@@ -149,31 +152,33 @@ def _camera(model: Path, sensor: Element) -> Camera:
     k: tuple[float, ...] = (k3,)
     if k4:
         factor = np.polynomial.Polynomial([1, k1, k2, k3, k4])
-        fitted, off = distortion_fit.radial(lambda r: np.asarray(factor(r * r)), _undistorted(factor, reach), f)
-        if off > distortion_fit.EXACT:
-            raise InputError(model, f"{title}: k1 to k4 are {off:.3f} pixels off in OpenCV's model", UNDISTORT)
+        undistorted_radius = _undistorted(factor, max_radius)
+        fitted, fit_error = distortion_fit.fit_radial(lambda r: np.asarray(factor(r * r)), undistorted_radius, f)
+        if fit_error > distortion_fit.MAX_FIT_ERROR_PX:
+            cause = f"{title}: k1 to k4 fit OpenCV's model with an error of {fit_error:.3f} pixels"
+            raise InputError(model, cause, UNDISTORT)
         k1, k2, *rest = fitted.tolist()
         k = tuple(rest)
     return Camera("opencv", width, height, fx, f, cx, cy, (k1, k2, p2, p1, *k))
 
 
-def _undistorted(factor: np.polynomial.Polynomial, reach: float) -> float:
-    """The radius that a lens moves to `reach`; the radius where it folds back, if that is nearer."""
-    r = np.linspace(0, 3 * reach, 3000)
-    moved = r * np.asarray(factor(r * r))
-    beyond = np.flatnonzero((moved >= reach) | (np.gradient(moved, r) <= 0))
+def _undistorted(factor: np.polynomial.Polynomial, max_radius: float) -> float:
+    """Undistorted radius of the distorted `max_radius`, or where the distortion folds back, if that is smaller."""
+    r = np.linspace(0, 3 * max_radius, 3000)
+    distorted = r * np.asarray(factor(r * r))
+    beyond = np.flatnonzero((distorted >= max_radius) | (np.gradient(distorted, r) <= 0))
     return float(r[beyond[0]]) if len(beyond) else float(r[-1])
 
 
 def _projected(model: Path, reference: str) -> str | None:
-    """The chunk's CRS, where it is a projected one."""
+    """The chunk's CRS if it is projected, else None."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
     try:
         crs = CRS.from_user_input(reference)
     except CRSError as error:
-        raise InputError(model, f"its reference is no CRS ({str(error)[:80]})", REMEDY) from None
+        raise InputError(model, f"its reference is not a valid CRS ({str(error)[:80]})", REMEDY) from None
     if not crs.is_projected:
         return None
     return crs_io.short(crs.to_wkt())

@@ -1,8 +1,8 @@
-"""OpenSfM's and OpenDroneMap's `reconstruction.json`.
+"""OpenSfM and OpenDroneMap (ODM) models, `reconstruction.json`.
 
-Poses are world to camera (axis-angle and translation) with OpenCV's axes. Pixels are normalised: the picture's
-middle is the origin, its longer side has length 1. The world is topocentric: metres east, north and up of
-`reference_lla`, from which it is brought to a projected CRS: of ODM's project (`coords.txt`), or UTM.
+Poses are world to camera (axis-angle and translation) with OpenCV's axes. Pixels are normalised: the origin is the
+middle of the image, its longer side has length 1. The world is topocentric: metres east, north and up of
+`reference_lla`. It is transformed to a projected CRS: that of the ODM project (`coords.txt`), or UTM.
 
 Source: OpenSfM's documentation (https://opensfm.org/docs/geometry.html, dataset.html) and its
 `opensfm/src/geometry/camera_distortions_functions.h`; its Brown model has OpenCV's order of coefficients.
@@ -23,8 +23,8 @@ from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.geodata.crs import utm_zone
 from scan2sim.pipeline.io.photogrammetry import Model, Photos, Shot
 
-REMEDY = "Export it again, or name the reconstruction.json of a finished project"
-PLACES = ("reconstruction.json", "opensfm/reconstruction.json")
+REMEDY = "Export it again, or give the reconstruction.json of a finished project"
+FILES = ("reconstruction.json", "opensfm/reconstruction.json")
 # projection type: our model, and its coefficients in our order
 MODELS: dict[str, tuple[CameraModel, tuple[str, ...]]] = {
     "perspective": ("opencv", ("k1", "k2", "", "")),
@@ -37,8 +37,8 @@ MODELS: dict[str, tuple[CameraModel, tuple[str, ...]]] = {
 
 
 def read(model: Path, photos: Photos) -> Model:
-    """A reconstruction.json, or a folder of OpenSfM or ODM that holds one; of several parts the largest is taken."""
-    path = next((model / name for name in PLACES if (model / name).is_file()), model) if model.is_dir() else model
+    """Read the largest part of a reconstruction.json, or of the one in a project folder of OpenSfM or ODM."""
+    path = next((model / name for name in FILES if (model / name).is_file()), model) if model.is_dir() else model
     parts = _parts(path)
     part = max(parts, key=lambda part: len(part["shots"]))
     left = sum(len(other["shots"]) for other in parts) - len(part["shots"])
@@ -48,29 +48,29 @@ def read(model: Path, photos: Photos) -> Model:
         points = list(part.get("points", {}).values())
         xyz = np.array([point["coordinates"] for point in points], np.float64).reshape(-1, 3)
         rgb = np.array([point["color"] for point in points], np.float64).reshape(-1, 3)
-        earth = _earth(part.get("reference_lla"))
+        earth = _enu_to_geocentric(part.get("reference_lla"))
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise InputError(path, f"lacks or misstates {str(error)[:100]}", REMEDY) from None
+        raise InputError(path, f"has missing or invalid values: {str(error)[:100]}", REMEDY) from None
     for shot in shots:
         if shot.camera not in cameras:
-            raise InputError(path, f"{shot.file} has the camera {shot.camera!r}, which it doesn't describe", REMEDY)
+            raise InputError(path, f"{shot.file} has the unknown camera {shot.camera!r}", REMEDY)
     note = (f"{left} photos of {len(parts) - 1} smaller parts are left out",) if left else ()
     return Model(cameras, shots, xyz, np.clip(rgb, 0, 255).astype(np.uint8), earth, _crs(path), note)
 
 
 def _parts(path: Path) -> list[Any]:
-    file_checks.check(path, "Name a reconstruction.json, or the folder that holds it")
+    file_checks.check(path, "Give a reconstruction.json, or the folder that contains it")
     try:
         body = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(path, f"is no readable JSON ({str(error)[:100]})", REMEDY) from None
+        raise InputError(path, f"is not readable JSON ({str(error)[:100]})", REMEDY) from None
     parts = body if isinstance(body, list) else [body]
     good = bool(parts) and all(
         isinstance(part, dict) and isinstance(part.get("shots"), dict) and isinstance(part.get("cameras"), dict)
         for part in parts
     )
     if not good:
-        raise InputError(path, "is no reconstruction of OpenSfM (shots, cameras)", REMEDY)
+        raise InputError(path, "is not an OpenSfM reconstruction (no shots and cameras)", REMEDY)
     return parts
 
 
@@ -101,17 +101,17 @@ def _camera(path: Path, key: str, entry: dict[str, Any]) -> Camera:
 
 
 def _pose(shot: dict[str, Any]) -> F64:
-    """(4, 4) camera to world."""
+    """Pose (4, 4) camera to world."""
     from scipy.spatial.transform import Rotation
 
-    turn = Rotation.from_rotvec(np.array(shot["rotation"], np.float64).reshape(3)).as_matrix()
+    world_to_cam = Rotation.from_rotvec(np.array(shot["rotation"], np.float64).reshape(3)).as_matrix()
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn.T, -turn.T @ np.array(shot["translation"], np.float64).reshape(3)
+    pose[:3, :3], pose[:3, 3] = world_to_cam.T, -world_to_cam.T @ np.array(shot["translation"], np.float64).reshape(3)
     return pose
 
 
-def _earth(reference: Any) -> F64 | None:
-    """(4, 4) east, north, up of the reference to geocentric; None where there is none (all zero without GPS)."""
+def _enu_to_geocentric(reference: Any) -> F64 | None:
+    """Transform (4, 4) from east, north, up of the reference to geocentric; None without one (all zero without GPS)."""
     from pyproj import Transformer
 
     if not reference:
@@ -121,19 +121,19 @@ def _earth(reference: Any) -> F64 | None:
         return None
     if not (abs(lat) <= 84 and abs(lon) <= 180 and np.isfinite(height)):
         raise ValueError(f"reference_lla {lat}, {lon}, {height}")
-    a, b = np.radians([lat, lon])
+    phi, lam = np.radians([lat, lon])
     T = np.eye(4)
     T[:3, :3] = [
-        [-np.sin(b), -np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)],
-        [np.cos(b), -np.sin(a) * np.sin(b), np.cos(a) * np.sin(b)],
-        [0.0, np.cos(a), np.sin(a)],
+        [-np.sin(lam), -np.sin(phi) * np.cos(lam), np.cos(phi) * np.cos(lam)],
+        [np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi) * np.sin(lam)],
+        [0.0, np.cos(phi), np.sin(phi)],
     ]
     T[:3, 3] = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True).transform(lon, lat, height)
     return T
 
 
 def _crs(path: Path) -> str | None:
-    """What ODM says of its project: `WGS84 UTM 32N` in the first line of coords.txt."""
+    """CRS of an ODM project: `WGS84 UTM 32N` in the first line of coords.txt; None without one."""
     file = path.parent.parent / "odm_georeferencing" / "coords.txt"
     if not file.is_file():
         return None

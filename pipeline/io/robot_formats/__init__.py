@@ -1,4 +1,4 @@
-"""The robot (`pipeline.simulation.robot`) in formats of simulators: one file each, named as the world's format."""
+"""Writers of the robot (`pipeline.simulation.robot`) for simulators: one module each, named like the world format."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PACKAGE = "scan2sim.pipeline.io.robot_formats"
 
 
 class Format(Protocol):
-    """Of robots."""
+    """Interface of a format's module."""
 
     def write(self, robot: Robot, start: Start, folder: Path) -> None:
-        """Write a robot into `folder`, where the world is."""
+        """Write a robot into `folder`, which contains the world."""

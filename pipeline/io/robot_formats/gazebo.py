@@ -1,7 +1,7 @@
-"""Gazebo: `models/robot/`, a model with its drive and sensors; the world includes it.
+"""Robot for Gazebo: `models/robot/`, a model with its drive and sensors, which the world includes.
 
-It listens to `/cmd_vel` and tells `/odom`, `/tf`, `/joint_states`, `/camera`, `/labels`, `/lidar`, `/imu`. `/labels` is
-a segmentation camera in the camera's place: what it shows are the world's labels.
+It subscribes to `/cmd_vel` and publishes `/odom`, `/tf`, `/joint_states`, `/camera`, `/labels`, `/lidar`, `/imu`.
+`/labels` is a segmentation camera with the pose of the camera; its pixels are the labels of the world.
 """
 
 from __future__ import annotations
@@ -13,16 +13,18 @@ from scan2sim.pipeline.io.file_checks import make_folder
 from scan2sim.pipeline.io.worlds.sdf import numbers, write_config
 from scan2sim.pipeline.simulation.robot import Box, Link, Robot, Sphere, Start
 
-LABELS = 5.0
-"""Labelled pictures a second."""
+LABELS_RATE_HZ = 5.0
+"""Update rate of the segmentation camera."""
 
 
 def write(robot: Robot, start: Start, folder: Path) -> None:
-    """Write the model; the world places it."""
-    place = folder / "models" / robot.name
-    make_folder(place)
-    parts = "".join(_link(robot, link) for link in robot.links) + "".join(_joint(robot, link) for link in robot.joined)
-    (place / "model.sdf").write_text(
+    """Write the model; the world includes it with its start pose."""
+    model_folder = folder / "models" / robot.name
+    make_folder(model_folder)
+    parts = "".join(_link(robot, link) for link in robot.links) + "".join(
+        _joint(robot, link) for link in robot.attached
+    )
+    (model_folder / "model.sdf").write_text(
         f"""<?xml version="1.0"?>
 <sdf version="1.9">
   <model name="{robot.name}">
@@ -31,17 +33,17 @@ def write(robot: Robot, start: Start, folder: Path) -> None:
 """,
         encoding="ascii",
     )
-    write_config(place, robot.name, "A small robot with two driven wheels, camera, lidar and IMU.")
+    write_config(model_folder, robot.name, "A small robot with two driven wheels, camera, lidar and IMU.")
 
 
 def _link(robot: Robot, link: Link) -> str:
     frame = "" if link is robot.base else f"      <pose>{numbers(link.place)} 0 0 0</pose>\n"
-    middle = f"<pose>{numbers(robot.within(link))} 0 0 0</pose>"
+    mass_centre = f"<pose>{numbers(robot.centre_in_link(link))} 0 0 0</pose>"
     x, y, z = link.inertia
     red_green_blue = numbers(link.colour)
     return f"""    <link name="{link.name}">
 {frame}      <inertial>
-        {middle}
+        {mass_centre}
         <mass>{link.mass:g}</mass>
         <inertia><ixx>{x:.8f}</ixx><iyy>{y:.8f}</iyy><izz>{z:.8f}</izz></inertia>
       </inertial>
@@ -63,16 +65,16 @@ def _link(robot: Robot, link: Link) -> str:
 
 
 def _shape(robot: Robot, link: Link) -> str:
-    """Of a visual or a collision, and where it is in its link."""
-    shape, turned = link.shape, 0.0
+    """Pose and geometry of a visual or collision in its link."""
+    shape, roll = link.shape, 0.0
     if isinstance(shape, Box):
-        form = f"<box><size>{numbers(shape.size)}</size></box>"
+        geometry = f"<box><size>{numbers(shape.size)}</size></box>"
     elif isinstance(shape, Sphere):
-        form = f"<sphere><radius>{shape.radius:g}</radius></sphere>"
+        geometry = f"<sphere><radius>{shape.radius:g}</radius></sphere>"
     else:
-        form = f"<cylinder><radius>{shape.radius:g}</radius><length>{shape.length:g}</length></cylinder>"
-        turned = -pi / 2 if shape.axis == "y" else 0.0
-    return f"<pose>{numbers(robot.within(link))} {turned:.8g} 0 0</pose>\n        <geometry>{form}</geometry>"
+        geometry = f"<cylinder><radius>{shape.radius:g}</radius><length>{shape.length:g}</length></cylinder>"
+        roll = -pi / 2 if shape.axis == "y" else 0.0
+    return f"<pose>{numbers(robot.centre_in_link(link))} {roll:.8g} 0 0</pose>\n        <geometry>{geometry}</geometry>"
 
 
 def _joint(robot: Robot, link: Link) -> str:
@@ -90,14 +92,14 @@ def _joint(robot: Robot, link: Link) -> str:
 
 
 def _sensors(robot: Robot, link: Link) -> str:
-    """Those that a link carries."""
+    """Sensors mounted on a link."""
     if link is robot.base:
         return _sensor("imu", "imu", robot.imu_rate, "<imu/>")
     if link.name == robot.camera.link:
-        ahead = f"<pose>{robot.camera.ahead:g} 0 0 0 0 0</pose>\n        "
-        labelled = "<segmentation_type>semantic</segmentation_type>"
-        return _sensor("camera", "camera", robot.camera.rate, ahead + _camera(robot, "")) + _sensor(
-            "segmentation", "labels", LABELS, ahead + _camera(robot, labelled)
+        offset = f"<pose>{robot.camera.ahead:g} 0 0 0 0 0</pose>\n        "
+        segmentation = "<segmentation_type>semantic</segmentation_type>"
+        return _sensor("camera", "camera", robot.camera.rate, offset + _camera(robot, "")) + _sensor(
+            "segmentation", "labels", LABELS_RATE_HZ, offset + _camera(robot, segmentation)
         )
     return _sensor("gpu_lidar", "lidar", robot.lidar.rate, _lidar(robot)) if link.name == robot.lidar.link else ""
 
@@ -112,31 +114,31 @@ def _sensor(kind: str, topic: str, rate: float, content: str) -> str:
 """
 
 
-def _camera(robot: Robot, more: str) -> str:
-    own = robot.camera
+def _camera(robot: Robot, extra: str) -> str:
+    camera = robot.camera
     return f"""<camera>
-          {more}<horizontal_fov>{own.across:.8g}</horizontal_fov>
-          <image><width>{own.width}</width><height>{own.height}</height></image>
-          <clip><near>{own.nearest:g}</near><far>{own.farthest:g}</far></clip>
+          {extra}<horizontal_fov>{camera.horizontal_fov:.8g}</horizontal_fov>
+          <image><width>{camera.width}</width><height>{camera.height}</height></image>
+          <clip><near>{camera.min_range:g}</near><far>{camera.max_range:g}</far></clip>
         </camera>"""
 
 
 def _lidar(robot: Robot) -> str:
-    own = robot.lidar
-    half = pi - pi / own.around
+    lidar = robot.lidar
+    max_angle = pi - pi / lidar.rays_per_turn
     return f"""<lidar>
           <scan>
             <horizontal>
-              <samples>{own.around}</samples><resolution>1</resolution>
-              <min_angle>{-half:.8g}</min_angle><max_angle>{half:.8g}</max_angle>
+              <samples>{lidar.rays_per_turn}</samples><resolution>1</resolution>
+              <min_angle>{-max_angle:.8g}</min_angle><max_angle>{max_angle:.8g}</max_angle>
             </horizontal>
             <vertical>
-              <samples>{own.rings}</samples><resolution>1</resolution>
-              <min_angle>{own.lowest:.8g}</min_angle><max_angle>{own.highest:.8g}</max_angle>
+              <samples>{lidar.rings}</samples><resolution>1</resolution>
+              <min_angle>{lidar.min_elevation:.8g}</min_angle><max_angle>{lidar.max_elevation:.8g}</max_angle>
             </vertical>
           </scan>
-          <range><min>{own.nearest:g}</min><max>{own.farthest:g}</max><resolution>0.001</resolution></range>
-          <noise><type>gaussian</type><mean>0</mean><stddev>{own.noise:g}</stddev></noise>
+          <range><min>{lidar.min_range:g}</min><max>{lidar.max_range:g}</max><resolution>0.001</resolution></range>
+          <noise><type>gaussian</type><mean>0</mean><stddev>{lidar.noise:g}</stddev></noise>
         </lidar>"""
 
 

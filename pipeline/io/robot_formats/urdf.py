@@ -1,7 +1,7 @@
-"""URDF, for PyBullet and ROS: `robot.urdf`; motors turn `left_wheel_joint` and `right_wheel_joint`.
+"""Robot as URDF, for PyBullet and ROS: `robot.urdf`; the driven joints are `left_wheel_joint` and `right_wheel_joint`.
 
-PyBullet loads it beside the world, at the place and angles that `metadata.json` tells. Sensors are links, which look
-along their x axes; PyBullet's cameras and rays are asked for by what uses them.
+PyBullet loads it in addition to the world, at the position and angles in `metadata.json`. Sensors are links that point
+along their x axes; programs request PyBullet's cameras and rays themselves.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from scan2sim.pipeline.simulation.robot import Box, Link, Robot, Sphere, Start
 
 def write(robot: Robot, start: Start, folder: Path) -> None:
     """Write the robot, in its own frame."""
-    parts = "".join(_link(robot, link) for link in robot.links) + "".join(_joint(robot, link) for link in robot.joined)
+    parts = "".join(_link(robot, link) for link in robot.links) + "".join(
+        _joint(robot, link) for link in robot.attached
+    )
     text = f'<?xml version="1.0"?>\n<robot name="{robot.name}">\n{parts}</robot>\n'
     (folder / f"{robot.name}.urdf").write_text(text, encoding="ascii")
 
@@ -25,7 +27,7 @@ def _link(robot: Robot, link: Link) -> str:
     shape = _shape(robot, link)
     return f"""  <link name="{link.name}">
     <inertial>
-      <origin xyz="{numbers(robot.within(link))}"/>
+      <origin xyz="{numbers(robot.centre_in_link(link))}"/>
       <mass value="{link.mass:g}"/>
       <inertia ixx="{x:.8f}" ixy="0" ixz="0" iyy="{y:.8f}" iyz="0" izz="{z:.8f}"/>
     </inertial>
@@ -42,27 +44,27 @@ def _link(robot: Robot, link: Link) -> str:
 
 
 def _shape(robot: Robot, link: Link) -> str:
-    """Of a visual or a collision, and where it is in its link."""
-    shape, turned = link.shape, 0.0
+    """Origin and geometry of a visual or collision in its link."""
+    shape, roll = link.shape, 0.0
     if isinstance(shape, Box):
-        form = f'<box size="{numbers(shape.size)}"/>'
+        geometry = f'<box size="{numbers(shape.size)}"/>'
     elif isinstance(shape, Sphere):
-        form = f'<sphere radius="{shape.radius:g}"/>'
+        geometry = f'<sphere radius="{shape.radius:g}"/>'
     else:
-        form = f'<cylinder radius="{shape.radius:g}" length="{shape.length:g}"/>'
-        turned = -pi / 2 if shape.axis == "y" else 0.0
-    return f"""<origin xyz="{numbers(robot.within(link))}" rpy="{turned:.8g} 0 0"/>
-      <geometry>{form}</geometry>"""
+        geometry = f'<cylinder radius="{shape.radius:g}" length="{shape.length:g}"/>'
+        roll = -pi / 2 if shape.axis == "y" else 0.0
+    return f"""<origin xyz="{numbers(robot.centre_in_link(link))}" rpy="{roll:.8g} 0 0"/>
+      <geometry>{geometry}</geometry>"""
 
 
 def _joint(robot: Robot, link: Link) -> str:
-    turns = ""
+    axis = ""
     if link.driven:
-        fastest = robot.speed / robot.wheel_radius
-        turns = f'    <axis xyz="0 1 0"/>\n    <limit effort="{robot.torque:g}" velocity="{2 * fastest:.4g}"/>\n'
+        max_wheel_rate = robot.speed / robot.wheel_radius
+        axis = f'    <axis xyz="0 1 0"/>\n    <limit effort="{robot.torque:g}" velocity="{2 * max_wheel_rate:.4g}"/>\n'
     return f"""  <joint name="{link.name}_joint" type="{"continuous" if link.driven else "fixed"}">
     <parent link="{robot.base.name}"/>
     <child link="{link.name}"/>
     <origin xyz="{numbers(link.place)}" rpy="0 0 0"/>
-{turns}  </joint>
+{axis}  </joint>
 """

@@ -1,8 +1,7 @@
-"""Formats that worlds are exported in: a file a format (`pipeline.core.plugins`), named in `export.formats` and `--to`.
+"""Export formats of worlds: one module per format (`pipeline.core.plugins`), selected by `export.formats` and `--to`.
 
-A format's module has `write`; one that holds levels of detail (`Scene.coarse`) tells by `LEVELS` how many of each tile
-are made where nobody asks for a number. All files and folders that it makes have ASCII names, and name each other
-relatively.
+A format's module has `write`; one that supports levels of detail (`Scene.coarse`) has `LEVELS`, the default number of
+levels per tile. All files and folders that it writes have ASCII names and refer to each other by relative paths.
 """
 
 from __future__ import annotations
@@ -25,98 +24,107 @@ from scan2sim.pipeline.io.file_checks import make_folder
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.mesh_formats import PageNames, obj
 from scan2sim.pipeline.io.worlds import sdf
-from scan2sim.pipeline.io.worlds.glb import GlbParams, ways
+from scan2sim.pipeline.io.worlds.glb import GlbParams, find_encoders
 from scan2sim.pipeline.io.worlds.scene import Scene, SceneTile, by_class
 from scan2sim.pipeline.io.worlds.textured_mesh import Textured
 from scan2sim.pipeline.simulation.collision_shapes import Solid, solids
 from scan2sim.pipeline.simulation.robot import ROBOT
-from scan2sim.pipeline.simulation.spawn import find as find_start
+from scan2sim.pipeline.simulation.spawn import find_spawn_pose
 
 PACKAGE = "scan2sim.pipeline.io.world_formats"
-SHOWN = ("obj", "collada")
-"""Formats that Gazebo's model shows, the better one first."""
+GAZEBO_VISUAL_FORMATS = ("obj", "collada")
+"""Mesh formats that a Gazebo model can use as visuals, the preferred one first."""
 
 
 class SceneParams(GlbParams):
-    """How a scene is written.
+    """Settings of the scene writers.
 
     Attributes:
-        meshes: formats of the meshes in Gazebo's model, files of `pipeline/io/mesh_formats`; it shows the OBJ, which
-            Gazebo reads several times faster than Collada, or Collada where there is no OBJ.
-        max_visual_triangles: of one mesh that is shown; larger surfaces are written in parts.
-        pages: "png", lossless, or "jpeg", a sixth or so of its size, for texture pages that are files of their own.
-        source_pages: beside each of these, a page that says where each texel's colour is from: 255 a photo, 128 the
-            cloud's points, 64 filled, 0 no surface.
+        meshes: mesh formats of the Gazebo model, modules of `pipeline/io/mesh_formats`; its visuals are OBJ, which
+            Gazebo reads several times faster than Collada, or Collada if OBJ isn't selected.
+        max_visual_triangles: maximum number of triangles of a visual mesh; larger surfaces are split.
+        pages: format of texture pages in separate files: "png", lossless, or "jpeg", about a sixth of the size.
+        source_pages: write a mask for each of these pages with the source of each texel's colour: 255 a photo, 128
+            the cloud's points, 64 inpainted, 0 no surface.
     """
 
     meshes: tuple[str, ...] = Field(
-        SHOWN, description="Formats of the meshes in Gazebo's model.", json_schema_extra={"range": "a list of formats"}
+        GAZEBO_VISUAL_FORMATS,
+        description="Mesh formats of the Gazebo model.",
+        json_schema_extra={"range": "a list of formats"},
     )
     max_visual_triangles: int = Field(
-        200_000, ge=1_000, le=10_000_000, description="Of one mesh that is shown; larger surfaces come in parts."
+        200_000,
+        ge=1_000,
+        le=10_000_000,
+        description="Maximum number of triangles of a visual mesh; larger surfaces are split.",
     )
-    pages: Literal["png", "jpeg"] = Field("png", description="Texture pages that are files: lossless, or a sixth.")
-    source_pages: bool = Field(False, description="Beside texture pages, pages that say where colours are from.")
+    pages: Literal["png", "jpeg"] = Field(
+        "png", description="Format of separate texture pages: png (lossless), or jpeg (about a sixth of the size)."
+    )
+    source_pages: bool = Field(False, description="Write a mask for each texture page with the source of colours.")
 
 
 class Format(Protocol):
-    """Of whole scenes."""
+    """Interface of a format's module."""
 
     def write(self, scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
-        """Write a scene below `folder`; returns the triangles of every mesh file, by its path there."""
+        """Write a scene below `folder`; returns the number of triangles of every mesh file, by its path there."""
 
 
-def known() -> list[str]:
+def format_names() -> list[str]:
     """Names of all formats."""
     return names(PACKAGE)
 
 
 def levels(formats: Sequence[str]) -> int:
-    """Levels of detail that some formats want of each tile."""
+    """Number of levels of detail per tile that the given formats need by default."""
     return max((getattr(find(PACKAGE, name, "export.formats"), "LEVELS", 1) for name in formats), default=1)
 
 
 def check(formats: Sequence[str], params: SceneParams, setting: str, robot: bool = False) -> None:
-    """Refuse formats that there aren't, or that can't be written here, and a robot that none of them holds.
+    """Check that the formats exist, can be written on this machine, and support the robot.
 
     Raises:
-        SettingError: there is no such format, or nothing that Gazebo shows; or they hold no robot.
+        SettingError: unknown format, no mesh format that Gazebo can show, or no format that supports the robot.
         UnavailableError: a package is missing.
     """
     for name in formats:
         find(PACKAGE, name, setting)
     for name in params.meshes:
         find("scan2sim.pipeline.io.mesh_formats", name, "export.meshes")
-    ways(params)
-    if "gazebo" in formats and not set(SHOWN) & set(params.meshes):
-        raise SettingError("export.meshes", f"has nothing that Gazebo shows ({' or '.join(SHOWN)})", "Name one, too")
-    driven = names(robot_formats.PACKAGE)
-    if robot and not set(formats) & set(driven):
-        raise SettingError("--robot", f"is held by none of {', '.join(formats)}", f"Name one of: {', '.join(driven)}")
+    find_encoders(params)
+    if "gazebo" in formats and not set(GAZEBO_VISUAL_FORMATS) & set(params.meshes):
+        visual_formats = " or ".join(GAZEBO_VISUAL_FORMATS)
+        raise SettingError("export.meshes", "has no format that Gazebo can show", f"Add {visual_formats}")
+    with_robot = names(robot_formats.PACKAGE)
+    if robot and not set(formats) & set(with_robot):
+        cause = f"is not supported by {', '.join(formats)}"
+        raise SettingError("--robot", cause, f"Add one of: {', '.join(with_robot)}")
 
 
 def write(
     scene: Scene, formats: Sequence[str], folder: Path, params: SceneParams, report: Report, robot: bool = False
 ) -> None:
-    """Write a scene in some formats below `folder`, its lists and `metadata.json` beside them.
+    """Write a scene in the given formats below `folder`, with its lists and `metadata.json`.
 
-    With `robot`, a small one (`pipeline.simulation.robot`) stands on the road, in those formats that hold one.
+    With `robot`, formats that support it get a small robot (`pipeline.simulation.robot`) on the road.
 
     Raises:
-        ScanError: as `check`, or there is no place for the robot, before anything is written.
+        ScanError: as `check`, or there is no start pose for the robot; raised before anything is written.
     """
     check(formats, params, "export.formats", robot)
     if robot:
         _check_names(scene)
-        scene = replace(scene, start=find_start(scene))
+        scene = replace(scene, start=find_spawn_pose(scene))
     make_folder(folder)
     triangles: dict[str, int] = {}
     for i, name in enumerate(formats):
 
-        def part(fraction: float, message: str = "", begun: int = i, what: str = name) -> None:
-            report((begun + fraction) / len(formats), f"{what} {message}".strip())
+        def report_format(fraction: float, message: str = "", finished: int = i, format_name: str = name) -> None:
+            report((finished + fraction) / len(formats), f"{format_name} {message}".strip())
 
-        triangles |= find(PACKAGE, name, "export.formats").write(scene, folder, params, part)
+        triangles |= find(PACKAGE, name, "export.formats").write(scene, folder, params, report_format)
         if scene.start and name in names(robot_formats.PACKAGE):
             module(robot_formats.PACKAGE, name).write(ROBOT, scene.start, folder)
     for tile in scene.tiles:
@@ -127,30 +135,30 @@ def write(
 
 
 def _check_names(scene: Scene) -> None:
-    """Refuse a tile, or a world, that is called as the robot is."""
+    """Raise an error if a tile or the world has the robot's name."""
     if ROBOT.name in {scene.name, *(tile.name for tile in scene.tiles)}:
         raise DataError(
-            ROBOT.name, "is a tile's or the world's name, and the robot's", "Name it otherwise: export.name"
+            ROBOT.name, "is the name of the robot, and of a tile or the world", "Choose another name: export.name"
         )
 
 
 def metadata(scene: Scene, triangles: dict[str, int]) -> dict[str, Any]:
-    """What a reader needs to put a scene back on the map, and to check that it is whole."""
-    place = sdf.Georeference.of(scene.frame)
-    about = {"name": scene.name, "crs": scene.frame.crs, "unit_m": scene.frame.unit}
-    whole: dict[str, Any] = {
+    """Content of metadata.json: georeference of a scene, and its files to check that it is complete."""
+    georeference = sdf.Georeference.of(scene.frame)
+    common = {"name": scene.name, "crs": scene.frame.crs, "unit_m": scene.frame.unit}
+    rest: dict[str, Any] = {
         "world_origin_m": list(scene.origin),
-        "wgs84": place and place.facts(),
+        "wgs84": georeference and georeference.as_metadata(),
         "friction": scene.tiles[0].friction,
         "triangles_by_file": triangles,
     }
     if scene.start:
         start = {"position_m": list(scene.start.position), "angles_rad": list(scene.start.angles), "on": scene.start.by}
-        whole["robot"] = {"name": ROBOT.name, **start}
+        rest["robot"] = {"name": ROBOT.name, **start}
     if len(scene.tiles) == 1:
         tile = scene.tiles[0]
-        here = "crs = (local + origin_m) / unit_m; OBJ and Collada are local, z-up; GLB is local, y-up (x, z, -y)"
-        return {**about, "origin_m": list(tile.frame.origin), "to_crs": here, "groups": dict(tile.groups), **whole}
+        to_crs = "crs = (local + origin_m) / unit_m; OBJ and Collada are local, z-up; GLB is local, y-up (x, z, -y)"
+        return {**common, "origin_m": list(tile.frame.origin), "to_crs": to_crs, "groups": dict(tile.groups), **rest}
     tiles = {
         tile.name: {
             "origin_m": list(tile.frame.origin),
@@ -160,18 +168,18 @@ def metadata(scene: Scene, triangles: dict[str, int]) -> dict[str, Any]:
         }
         for tile in scene.tiles
     }
-    here = "crs = (world + world_origin_m) / unit_m; world = local + offset_m, local as in a tile's meshes"
-    return {**about, "to_crs": here, "tiles": tiles, **whole}
+    to_crs = "crs = (world + world_origin_m) / unit_m; world = local + offset_m, local as in a tile's meshes"
+    return {**common, "to_crs": to_crs, "tiles": tiles, **rest}
 
 
 def write_pages(folder: Path, group: str, shape: Textured, params: SceneParams) -> PageNames:
-    """Put a group's texture pages into `folder`; returns what they are called."""
+    """Write a group's texture pages into `folder`; returns their names."""
     make_folder(folder)
     materials = tuple(f"{group}_{page}" for page in range(len(shape.pages)))
     images = tuple(f"{name}.{'png' if params.pages == 'png' else 'jpg'}" for name in materials)
     for page in shape.used_pages:
         if params.pages == "png":
-            shutil.copyfile(shape.pages[page], folder / images[page])  # may be edited freely
+            shutil.copyfile(shape.pages[page], folder / images[page])  # a copy, not a link: users may edit it
         else:
             image.write(folder / images[page], image.read_rgb(shape.pages[page]), quality=params.jpeg_quality)
         if params.source_pages and len(shape.seen) == len(shape.pages):
@@ -180,7 +188,7 @@ def write_pages(folder: Path, group: str, shape: Textured, params: SceneParams) 
 
 
 def write_solids(folder: Path, tile: SceneTile) -> tuple[list[Solid], dict[str, int]]:
-    """What bodies collide with in a tile; meshes go into `folder` (`collision_<name>.obj`), with their triangles."""
+    """Write the collision meshes of a tile (`collision_<name>.obj`); returns all shapes and the triangle counts."""
     found = solids(tile.solid(), tile.friction)
     triangles = {}
     for solid in found:
@@ -191,15 +199,15 @@ def write_solids(folder: Path, tile: SceneTile) -> tuple[list[Solid], dict[str, 
 
 
 @dataclass(frozen=True)
-class Single:
-    """A mesh file with one material, which is all that some readers take.
+class SingleMaterialMesh:
+    """A mesh file with one material, for readers that don't support several.
 
     Attributes:
-        name: of the file, without its suffix, and of its material.
+        name: name of the file, without its suffix, and of its material.
         code: LAS code of its class.
-        label: its name.
-        image: name of its texture page's file, in the same folder.
-        triangles: how many.
+        label: name of its class.
+        image: file of its texture page, in the same folder.
+        triangles: number of triangles.
     """
 
     name: str
@@ -209,8 +217,8 @@ class Single:
     triangles: int
 
 
-def write_single(folder: Path, tile: SceneTile, params: SceneParams) -> Iterator[Single]:
-    """Write an OBJ for each class and page of a tile below `folder`, and its pages."""
+def write_single_material(folder: Path, tile: SceneTile, params: SceneParams) -> Iterator[SingleMaterialMesh]:
+    """Write an OBJ for each class and texture page of a tile, and the pages, below `folder`."""
     for group, shape in tile.textured().items():
         pages = write_pages(folder, group, shape, params)
         for surface in by_class(group, shape):
@@ -219,4 +227,4 @@ def write_single(folder: Path, tile: SceneTile, params: SceneParams) -> Iterator
                     name = f"{part.name}_{page}"
                     names = PageNames(name, pages.materials, pages.images, (page,))
                     obj.write(folder / f"{name}.obj", part.shape, names)
-                    yield Single(name, part.code, part.label, pages.images[page], len(part.shape))
+                    yield SingleMaterialMesh(name, part.code, part.label, pages.images[page], len(part.shape))

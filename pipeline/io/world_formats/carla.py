@@ -1,12 +1,13 @@
-"""CARLA: a package to import, with FBX, the roads as OpenDRIVE, and the JSON that describes it.
+"""CARLA package for import: FBX meshes, roads as OpenDRIVE, and a JSON description.
 
-Layout, as CARLA's documentation asks (0.9.16, "Manual package preparation", "Import/Package a Large Map", "Add new
-props"): `carla/<name>.json`; the ground as a map, `carla/<name>/<name>.fbx` and `.xodr`, its meshes named so that
-CARLA's importer tells roads, sidewalks and terrain (`<name>_Road_Road_<tile>`); all else as props with tags for its
-semantic camera, `carla/props/<prop>/<prop>.fbx`, one a tile and class. Ground that is longer than `SQUARE` comes as a
-large map, in squares `<name>_Tile_<x>_<y>.fbx`, y growing southwards, their texture pages in `.fbm` folders.
+Layout according to CARLA's documentation (0.9.16, "Manual package preparation", "Import/Package a Large Map", "Add new
+props"): `carla/<name>.json`; the ground as a map, `carla/<name>/<name>.fbx` and `.xodr`, with mesh names by which
+CARLA's importer distinguishes roads, sidewalks and terrain (`<name>_Road_Road_<tile>`); everything else as props with
+tags for its semantic camera, `carla/props/<prop>/<prop>.fbx`, one per tile and class. Ground larger than
+`LARGE_MAP_TILE_M` is written as a large map, in squares `<name>_Tile_<x>_<y>.fbx`, y growing southwards, with texture
+pages in `.fbm` folders.
 
-All coordinates are metres from the scene's origin, y to the north. CARLA turns y itself, of FBX and OpenDRIVE alike.
+All coordinates are metres from the scene's origin, y to the north. CARLA flips y on import of both FBX and OpenDRIVE.
 """
 
 from __future__ import annotations
@@ -30,21 +31,21 @@ from scan2sim.pipeline.io.worlds import fbx
 from scan2sim.pipeline.io.worlds.fbx import Part
 from scan2sim.pipeline.io.worlds.scene import Scene, SceneTile, Surface, by_class
 from scan2sim.pipeline.io.worlds.textured_mesh import Textured
-from scan2sim.pipeline.roads.scene_roads import drawn
+from scan2sim.pipeline.roads.scene_roads import roads_of
 
 FOLDER = "carla"
-SQUARE = 2000.0
-"""Metres a side of a large map's tile, CARLA's own default."""
-GROUND = {CODE["road"]: "Road_Road", CODE["bridge_deck"]: "Road_Road", CODE["sidewalk"]: "Road_Sidewalk"}
-"""What CARLA's importer calls classes of the ground; all others are terrain."""
-TERRAIN = "Terrain"
-TAGS = {
+LARGE_MAP_TILE_M = 2000.0
+"""Side length of a large map's tile, CARLA's default."""
+GROUND_NAMES = {CODE["road"]: "Road_Road", CODE["bridge_deck"]: "Road_Road", CODE["sidewalk"]: "Road_Sidewalk"}
+"""Mesh names by which CARLA's importer recognizes ground classes; all others are terrain."""
+TERRAIN_NAME = "Terrain"
+PROP_TAGS = {
     CODE["building"]: "Building", CODE["tower"]: "Building", CODE["wall_or_fence"]: "Wall", CODE["pole"]: "Pole",
     CODE["road_sign"]: "TrafficSign", CODE["low_vegetation"]: "Vegetation", CODE["mid_vegetation"]: "Vegetation",
     CODE["high_vegetation"]: "Vegetation", CODE["vehicle"]: "Vehicles",
 }  # fmt: skip
-"""Tags of props; CARLA labels what lies in a folder of that name."""
-OTHER = "Static"
+"""Semantic tags of props; CARLA labels assets by the folder of that name."""
+DEFAULT_TAG = "Static"
 
 
 def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
@@ -58,7 +59,7 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
 
 
 class _Package:
-    """What is written of a scene; `triangles` of all files."""
+    """The package of a scene; `triangles` counts those of each file."""
 
     def __init__(self, scene: Scene, folder: Path, params: SceneParams) -> None:
         self._scene, self._folder, self._params = scene, folder, params
@@ -68,105 +69,107 @@ class _Package:
         self.triangles: dict[str, int] = {}
 
     def add(self, tile: SceneTile) -> None:
-        """Take a tile's ground for the map, and write all else as props."""
+        """Add a tile's ground to the map, and write its other surfaces as props."""
         for group, shape in tile.textured().items():
             placed = _placed(shape, np.asarray(tile.offset))
             if group == "terrain":
-                self._take(tile, placed)
+                self._add_ground(tile, placed)
                 continue
             for surface in by_class(group, placed):
                 self._prop(tile, surface)
 
     def save(self) -> None:
-        """Write the map, its roads, and the description."""
+        """Write the map, its roads, and the JSON description."""
         name = self._scene.name
-        about: dict[str, Any] = {"name": name, "use_carla_materials": False}
+        map_entry: dict[str, Any] = {"name": name, "use_carla_materials": False}
         make_folder(self._folder / name)
-        if opendrive.write(self._folder / name / f"{name}.xodr", name, self._scene.frame, drawn(self._scene)):
-            about["xodr"] = f"./{name}/{name}.xodr"
+        if opendrive.write(self._folder / name / f"{name}.xodr", name, self._scene.frame, roads_of(self._scene)):
+            map_entry["xodr"] = f"./{name}/{name}.xodr"
         files = []
         for square, parts in sorted(self._ground.items()):
             files.append(f"{name}/{self._file(square)}.fbx")
             self._write(files[-1], parts)
         if self._squares > 1:
-            about |= {"tile_size": SQUARE, "tiles": [f"./{file}" for file in files]}
+            map_entry |= {"tile_size": LARGE_MAP_TILE_M, "tiles": [f"./{file}" for file in files]}
         elif files:  # a world without ground has no map
-            about["source"] = f"./{files[0]}"
-        text = json.dumps({"maps": [about] if files else [], "props": self._props}, indent=2)
+            map_entry["source"] = f"./{files[0]}"
+        text = json.dumps({"maps": [map_entry] if files else [], "props": self._props}, indent=2)
         (self._folder / f"{name}.json").write_text(text + "\n", encoding="ascii")
 
-    def _take(self, tile: SceneTile, ground: Textured) -> None:
+    def _add_ground(self, tile: SceneTile, ground: Textured) -> None:
         codes, squares = _codes(tile, ground), self._square(ground.mesh.corners.mean(axis=1))
         for square in np.unique(squares, axis=0).tolist():
-            here = (squares == square).all(axis=1)
+            in_square = (squares == square).all(axis=1)
             file = self._file((square[0], square[1]))
             pages = self._folder / self._scene.name / (f"{file}.fbm" if self._squares > 1 else "")
-            for kind in sorted({GROUND.get(code, TERRAIN) for code in np.unique(codes[here]).tolist()}):
-                own = here & np.isin(codes, [code for code in range(256) if GROUND.get(code, TERRAIN) == kind])
+            for kind in sorted({GROUND_NAMES.get(code, TERRAIN_NAME) for code in np.unique(codes[in_square]).tolist()}):
+                of_kind = in_square & np.isin(
+                    codes, [code for code in range(256) if GROUND_NAMES.get(code, TERRAIN_NAME) == kind]
+                )
                 name = f"{self._scene.name}_{kind}_{tile.name}"
-                parts = self._parts(name, f"{tile.name}_terrain", ground.keep(own), pages)
+                parts = self._parts(name, f"{tile.name}_terrain", ground.keep(of_kind), pages)
                 self._ground.setdefault((square[0], square[1]), []).extend(parts)
 
     def _prop(self, tile: SceneTile, surface: Surface) -> None:
         name = f"{self._scene.name}_{tile.name}_{surface.name}"
         file = f"props/{name}/{name}.fbx"
-        place = self._folder / "props" / name
-        self._write(file, list(self._parts(name, name, surface.shape, place)))
-        tag = TAGS.get(surface.code, OTHER)
+        prop_folder = self._folder / "props" / name
+        self._write(file, list(self._parts(name, name, surface.shape, prop_folder)))
+        tag = PROP_TAGS.get(surface.code, DEFAULT_TAG)
         self._props.append({"name": name, "size": "huge", "source": f"./{file}", "tag": tag})
 
     def _parts(self, name: str, group: str, shape: Textured, pages: Path) -> Iterator[Part]:
-        """A shape, an object a page; its pages go into a folder."""
+        """Split a shape into one object per texture page; writes the pages into a folder."""
         written = world_formats.write_pages(pages, group, shape, self._params)
         for page in written.used:
             image = written.images[page]
-            inside = f"{pages.name}/{image}" if pages.suffix == ".fbm" else image
-            yield Part(f"{name}_{page}", shape.on_page(page), inside)
+            image_path = f"{pages.name}/{image}" if pages.suffix == ".fbm" else image
+            yield Part(f"{name}_{page}", shape.on_page(page), image_path)
 
     def _write(self, file: str, parts: list[Part]) -> None:
         make_folder((self._folder / file).parent)
         fbx.write(self._folder / file, parts)
         self.triangles[file] = sum(len(part.shape) for part in parts)
 
-    def _square(self, places: F64) -> I64:
-        """(N, 2) the square that each place lies in."""
+    def _square(self, positions: F64) -> I64:
+        """Square (N, 2) of a large map that contains each position."""
         if self._squares == 1:
-            return np.zeros((len(places), 2), np.int64)
-        low, high = _plan(self._scene)
-        across, down = places[:, 0] - low[0], high[1] - places[:, 1]
-        return np.floor(np.column_stack([across, down]) / SQUARE).astype(np.int64)
+            return np.zeros((len(positions), 2), np.int64)
+        low, high = _bounds_xy(self._scene)
+        across, down = positions[:, 0] - low[0], high[1] - positions[:, 1]
+        return np.floor(np.column_stack([across, down]) / LARGE_MAP_TILE_M).astype(np.int64)
 
     def _file(self, square: tuple[int, int]) -> str:
         name = self._scene.name
         return name if self._squares == 1 else f"{name}_Tile_{square[0]}_{square[1]}"
 
 
-def _plan(scene: Scene) -> tuple[F64, F64]:
-    """Corners (2,) of the box around all tiles, metres from the scene's origin."""
+def _bounds_xy(scene: Scene) -> tuple[F64, F64]:
+    """Corners (2,) of the bounding box of all tiles, metres from the scene's origin."""
     low = np.min([np.add(tile.offset, tile.low) for tile in scene.tiles], axis=0)[:2]
     return low, np.max([np.add(tile.offset, tile.high) for tile in scene.tiles], axis=0)[:2]
 
 
 def _squares(scene: Scene) -> int:
-    """How many squares a map may take."""
-    low, high = _plan(scene)
-    return int(np.prod(np.maximum(np.ceil((high - low) / SQUARE), 1)))
+    """Maximum number of squares of the map."""
+    low, high = _bounds_xy(scene)
+    return int(np.prod(np.maximum(np.ceil((high - low) / LARGE_MAP_TILE_M), 1)))
 
 
 def _placed(shape: Textured, offset: F64) -> Textured:
-    """A shape in the scene, float64."""
+    """A shape in scene coordinates, float64."""
     vertices: Any = shape.mesh.vertices.astype(np.float64) + offset
     return replace(shape, mesh=replace(shape.mesh, vertices=vertices))
 
 
 def _codes(tile: SceneTile, ground: Textured) -> U8:
-    """(F,) the classes of the ground that bodies touch, nearest to each face."""
+    """Class (F,) of the nearest face of the ground's collision mesh for each face."""
     from scipy.spatial import cKDTree
 
     solid = tile.solid()
-    own = None if solid.classification is None else group_of()[solid.classification] == 0
-    if own is None or solid.classification is None or not own.any():
+    is_ground = None if solid.classification is None else group_of()[solid.classification] == 0
+    if is_ground is None or solid.classification is None or not is_ground.any():
         return np.full(len(ground), CODE_OF_SURFACE["terrain"], np.uint8)
-    touched = solid.corners[own].mean(axis=1) + np.asarray(tile.offset)
-    _, nearest = cKDTree(touched).query(ground.mesh.corners.mean(axis=1))
-    return np.asarray(solid.classification[own][nearest])
+    centres = solid.corners[is_ground].mean(axis=1) + np.asarray(tile.offset)
+    _, nearest = cKDTree(centres).query(ground.mesh.corners.mean(axis=1))
+    return np.asarray(solid.classification[is_ground][nearest])

@@ -1,4 +1,4 @@
-"""glTF: a GLB for each tile, in its place in the world, y-up, textures within; see `pipeline/io/worlds/glb.py`."""
+"""glTF: one GLB per tile, placed in the world, y up, with embedded textures; see `pipeline/io/worlds/glb.py`."""
 
 from __future__ import annotations
 

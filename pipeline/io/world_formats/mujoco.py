@@ -1,8 +1,8 @@
-"""MuJoCo (MJCF): the ground as a height field, walls as boxes, poles and trunks as cylinders, all else to be seen only.
+"""MuJoCo (MJCF): ground as a height field, walls as boxes, poles and trunks as cylinders, everything else visual only.
 
 Layout: `<name>.xml`, and for each tile `mujoco/<tile>/` with an OBJ for each class and texture page, the pages as PNG
-(MuJoCo reads no JPEG) and `heights.hf`. MuJoCo takes convex hulls of meshes, so none of them collides. Every geom that
-is seen carries its LAS code as `user`. Height fields of neighbouring tiles have common nodes and heights.
+(MuJoCo doesn't read JPEG) and `heights.hf`. Meshes don't collide, as MuJoCo would use their convex hulls. Every visual
+geom has its LAS code as `user`. Height fields of neighbouring tiles share nodes and heights at their borders.
 """
 
 from __future__ import annotations
@@ -28,29 +28,29 @@ from scan2sim.pipeline.simulation.collision_shapes import Solid, solids
 from scan2sim.pipeline.simulation.robot import ROBOT
 
 FOLDER = "mujoco"
-CELL = 0.1
-"""Metres between nodes of the height field."""
-COLUMN = 0.2
-"""Metres a side of the columns that walls are made of."""
-BELOW = 2.0
-"""Metres of ground below its lowest node."""
+HEIGHT_FIELD_CELL_M = 0.1
+"""Distance between nodes of the height field."""
+WALL_BOX_CELL_M = 0.2
+"""Horizontal cell size of the box decomposition of walls."""
+GROUND_THICKNESS_M = 2.0
+"""Thickness of the ground below its lowest node."""
 
 
 def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
-    """Write the model and its files."""
+    """Write the MJCF model and its files."""
     triangles: dict[str, int] = {}
     assets: list[str] = []
     bodies: list[str] = []
     ground = _Ground(scene)
     for i, tile in enumerate(scene.tiles):
         report(i / len(scene.tiles), tile.name)
-        place = folder / FOLDER / tile.name
-        make_folder(place)
-        shown = list(_shown(tile, place, params, triangles))
-        assets += [asset for asset, _ in shown]
-        hull, height = ground.field(tile, place)
-        assets.append(hull)
-        geoms = [geom for _, geom in shown] + [height, *_walls(solids(tile.solid(), tile.friction))]
+        tile_folder = folder / FOLDER / tile.name
+        make_folder(tile_folder)
+        visuals = list(_visuals(tile, tile_folder, params, triangles))
+        assets += [asset for asset, _ in visuals]
+        field_asset, field_geom = ground.field(tile, tile_folder)
+        assets.append(field_asset)
+        geoms = [geom for _, geom in visuals] + [field_geom, *_walls(solids(tile.solid(), tile.friction))]
         bodies.append(f'    <body name="{tile.name}" pos="{sdf.numbers(tile.offset)}">\n{"".join(geoms)}    </body>\n')
     (folder / f"{scene.name}.xml").write_text(_model(scene, assets, bodies), encoding="ascii")
     return triangles
@@ -59,9 +59,10 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
 def _model(scene: Scene, assets: list[str], bodies: list[str]) -> str:
     low = np.min([np.add(tile.offset, tile.low) for tile in scene.tiles], axis=0)
     high = np.max([np.add(tile.offset, tile.high) for tile in scene.tiles], axis=0)
-    about = {"crs": scene.frame.crs, "world_origin_m": scene.origin, "unit_m": scene.frame.unit}
+    georeference_entries = {"crs": scene.frame.crs, "world_origin_m": scene.origin, "unit_m": scene.frame.unit}
     georeference = "".join(
-        f"    <text name={quoteattr(name)} data={quoteattr(json.dumps(value))}/>\n" for name, value in about.items()
+        f"    <text name={quoteattr(name)} data={quoteattr(json.dumps(value))}/>\n"
+        for name, value in georeference_entries.items()
     )
     robot = f'  <include file="{ROBOT.name}.xml"/>\n' if scene.start else ""
     return f"""<mujoco model="{scene.name}">
@@ -84,9 +85,11 @@ def _model(scene: Scene, assets: list[str], bodies: list[str]) -> str:
 """
 
 
-def _shown(tile: SceneTile, folder: Path, params: SceneParams, triangles: dict[str, int]) -> Iterator[tuple[str, str]]:
-    """Assets and geom of each mesh that is seen; its triangles go into `triangles`."""
-    for part in world_formats.write_single(folder, tile, params.model_copy(update={"pages": "png"})):
+def _visuals(
+    tile: SceneTile, folder: Path, params: SceneParams, triangles: dict[str, int]
+) -> Iterator[tuple[str, str]]:
+    """Write the visual meshes; yields assets and geom of each, and adds their triangle counts to `triangles`."""
+    for part in world_formats.write_single_material(folder, tile, params.model_copy(update={"pages": "png"})):
         name = f"{tile.name}/{part.name}"
         triangles[f"{FOLDER}/{tile.name}/{part.name}.obj"] = part.triangles
         yield (
@@ -101,36 +104,36 @@ def _shown(tile: SceneTile, folder: Path, params: SceneParams, triangles: dict[s
 
 
 class _Ground:
-    """The ground of all tiles, as heights at nodes that lie on whole multiples of `CELL` of the scene."""
+    """Heights of the ground of all tiles, at nodes on multiples of `HEIGHT_FIELD_CELL_M` in scene coordinates."""
 
     def __init__(self, scene: Scene) -> None:
         import open3d as o3d
 
         self._rays = o3d.t.geometry.RaycastingScene()
         for tile in scene.tiles:
-            for mesh in self._of(tile):
+            for mesh in self._ground_meshes(tile):
                 xyz = (mesh.vertices + np.asarray(tile.offset)).astype(np.float32)
                 faces = mesh.faces.astype(np.uint32)
                 self._rays.add_triangles(o3d.core.Tensor.from_numpy(xyz), o3d.core.Tensor.from_numpy(faces))
 
-    def _of(self, tile: SceneTile) -> list[Mesh]:
-        """The ground of a tile, local metres."""
+    def _ground_meshes(self, tile: SceneTile) -> list[Mesh]:
+        """The ground meshes of a tile, local metres."""
         found = solids(tile.solid(), tile.friction)
         return [one.shape for one in found if isinstance(one.shape, Mesh) and _is_ground(one)]
 
     def field(self, tile: SceneTile, folder: Path) -> tuple[str, str]:
-        """Asset and geom of a tile's height field; both empty where it has no ground."""
-        ground = self._of(tile)
+        """Write a tile's height field; returns its asset and geom, both empty if the tile has no ground."""
+        ground = self._ground_meshes(tile)
         if not ground:
             return "", ""
         shift = np.asarray(tile.offset)
-        places = np.concatenate([mesh.vertices for mesh in ground]) + shift
-        low = np.floor(places.min(axis=0) / CELL)[:2] * CELL
-        high = np.ceil(places.max(axis=0) / CELL)[:2] * CELL
-        count = np.rint((high - low) / CELL).astype(int) + 1
-        x, y = (low[k] + CELL * np.arange(count[k]) for k in (0, 1))
+        vertices = np.concatenate([mesh.vertices for mesh in ground]) + shift
+        low = np.floor(vertices.min(axis=0) / HEIGHT_FIELD_CELL_M)[:2] * HEIGHT_FIELD_CELL_M
+        high = np.ceil(vertices.max(axis=0) / HEIGHT_FIELD_CELL_M)[:2] * HEIGHT_FIELD_CELL_M
+        count = np.rint((high - low) / HEIGHT_FIELD_CELL_M).astype(int) + 1
+        x, y = (low[k] + HEIGHT_FIELD_CELL_M * np.arange(count[k]) for k in (0, 1))
         heights = self._heights(x, y) - shift[2]
-        bottom, reach = heights.min(), max(np.ptp(heights), 0.001)
+        bottom, elevation_range = heights.min(), max(np.ptp(heights), 0.001)
         with open(folder / "heights.hf", "wb") as file:
             np.array(heights.shape, np.int32).tofile(file)
             heights.astype(np.float32).tofile(file)
@@ -139,7 +142,7 @@ class _Ground:
         name = f"{tile.name}/ground"
         return (
             f"""    <hfield name="{name}" file="{tile.name}/heights.hf"
-      size="{sdf.numbers((half[0], half[1], reach, BELOW))}"/>
+      size="{sdf.numbers((half[0], half[1], elevation_range, GROUND_THICKNESS_M))}"/>
 """,
             f"""      <geom name="{name}" type="hfield" hfield="{name}" pos="{sdf.numbers((*middle, bottom))}"
         group="3" friction="{tile.friction:g} 0.005 0.0001" rgba="0.5 0.5 0.5 1"/>
@@ -147,21 +150,21 @@ class _Ground:
         )
 
     def _heights(self, x: F64, y: F64) -> F64:
-        """(rows, columns) heights, y growing with the row; of the nearest node with ground where there is none."""
+        """Heights (rows, columns), y growing with the row; nodes without ground get that of the nearest with ground."""
         import open3d as o3d
         from scipy import ndimage
 
-        across, up = np.meshgrid(x, y)
+        grid_x, grid_y = np.meshgrid(x, y)
         top = 10_000.0
-        rays = np.zeros((*across.shape, 6), np.float32)
-        rays[..., 0], rays[..., 1], rays[..., 2], rays[..., 5] = across, up, top, -1
+        rays = np.zeros((*grid_x.shape, 6), np.float32)
+        rays[..., 0], rays[..., 1], rays[..., 2], rays[..., 5] = grid_x, grid_y, top, -1
         found = top - self._rays.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy().astype(np.float64)
         _, nearest = ndimage.distance_transform_edt(~np.isfinite(found), return_indices=True)
         return np.asarray(found[tuple(nearest)])
 
 
 def _walls(solids: Iterable[Solid]) -> Iterator[str]:
-    """What isn't ground, as boxes and cylinders."""
+    """Geoms of all collision shapes other than ground, as boxes and cylinders."""
     for solid in solids:
         shape, friction = solid.shape, f'group="3" friction="{solid.friction:g} 0.005 0.0001"'
         if isinstance(shape, Cylinder):
@@ -170,7 +173,7 @@ def _walls(solids: Iterable[Solid]) -> Iterator[str]:
                 f'size="{shape.radius:.4f} {shape.length / 2:.4f}" {friction} rgba="0.6 0.6 0.6 1"/>\n'
             )
         elif not _is_ground(solid):
-            for low, high in zip(*box_decomposition.boxes(shape.corners, COLUMN), strict=True):
+            for low, high in zip(*box_decomposition.boxes(shape.corners, WALL_BOX_CELL_M), strict=True):
                 yield (
                     f'      <geom type="box" pos="{sdf.numbers((low + high) / 2)}" '
                     f'size="{sdf.numbers((high - low) / 2)}" {friction} rgba="0.7 0.5 0.4 1"/>\n'

@@ -1,6 +1,6 @@
-"""OpenDRIVE: the roads that were driven as one network over all tiles, `<name>.xodr`, for CARLA and whatever drives.
+"""OpenDRIVE: one network of the driven roads of all tiles, `<name>.xodr`, for CARLA and other driving simulators.
 
-It has no meshes. Where there are several tiles, their roads as one are listed too: `<name>_roads.geojson`.
+It has no meshes. For several tiles, the combined roads are also listed: `<name>_roads.geojson`.
 """
 
 from __future__ import annotations
@@ -13,25 +13,25 @@ from scan2sim.pipeline.io.geodata import opendrive
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.scene import Scene
 from scan2sim.pipeline.roads import listed
-from scan2sim.pipeline.roads.scene_roads import drawn
+from scan2sim.pipeline.roads.scene_roads import roads_of
 
 
 def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
-    """Write the network; there are no triangles in it.
+    """Write the network, which has no triangles.
 
     Raises:
-        DataError: no lanes are told of.
+        DataError: no road has detected lanes.
     """
     if not write_roads(scene, folder):
         raise DataError(
-            "opendrive", f"of {scene.name} no road's lanes are told", "See in docs/roads.md what they are told by"
+            "opendrive", f"no road of {scene.name} has detected lanes", "docs/roads.md says how lanes are detected"
         )
     return {}
 
 
 def write_roads(scene: Scene, folder: Path) -> int:
-    """Write the network if any road has lanes; returns the number of roads that have."""
-    roads = drawn(scene)
+    """Write the network if any road has lanes; returns the number of roads with lanes."""
+    roads = roads_of(scene)
     count = opendrive.write(folder / f"{scene.name}.xodr", scene.name, scene.frame, roads)
     if count and len(scene.tiles) > 1:
         listed.write(folder / f"{scene.name}_roads.geojson", scene.frame, roads)

@@ -1,12 +1,12 @@
-"""3D Tiles 1.1 (OGC), for Cesium and what streams worlds as it does: `tileset.json` and a GLB a tile in `tiles3d/`.
+"""3D Tiles 1.1 (OGC), for streaming viewers such as Cesium: `tileset.json`, and one GLB per tile in `tiles3d/`.
 
-Each tile has a transform of its own onto the earth, taken at its middle, and its vertices are placed there one by one:
-scale and direction of the CRS's grid, and the earth's curvature, are right however far the survey reaches. Without a
-CRS tiles stay in metres around the scene's origin.
+Each tile has its own transform to earth-centred coordinates, computed at its centre, and each vertex is transformed
+exactly: scale and direction of the CRS's grid and the earth's curvature are correct for surveys of any extent. Without
+a CRS tiles stay in metres around the scene's origin.
 
-Where a scene has levels of detail (`Scene.coarse`), the coarsest is the root, and each level is replaced by the finer
-ones that it stands for: `tiles3d/level<n>/<tile>.glb`. Their geometric error is the measured distance from the scene's
-own tiles, or what the width of its texels asks for if that is more; both stand in the tile's `extras`.
+If a scene has levels of detail (`Scene.coarse`), the coarsest is the root, and each level is replaced by its finer
+ones: `tiles3d/level<n>/<tile>.glb`. Their geometric error is the measured distance from the scene's own tiles, or the
+error that corresponds to their texel size if that is larger; both are in the tile's `extras`.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ from scan2sim.pipeline.io.worlds import glb
 from scan2sim.pipeline.io.worlds.scene import Level, Scene, SceneTile, Surface
 
 FOLDER = "tiles3d"
-SPAN = 50.0
-"""Metres to each side by which the grid's scale and direction are taken."""
-PIXELS = 16.0
-"""Of the screen, that a geometric error may span before viewers ask for what is finer: Cesium's default."""
+DIFFERENCE_STEP_M = 50.0
+"""Step of the central differences that give the grid's scale and direction."""
+MAX_SCREEN_SPACE_ERROR_PX = 16.0
+"""Screen-space error at which viewers load finer levels: Cesium's default."""
 LEVELS = 3
-"""Of each tile, where nobody asks for another number."""
+"""Default number of levels of detail per tile."""
 
 
 def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
-    """Write the tileset, and the content of its tiles."""
-    made = _Made(scene, folder, params, report)
+    """Write the tileset and the content of its tiles."""
+    writer = _Writer(scene, folder, params, report)
     if scene.coarse is None:
-        root = made.above([made.node(Level(tile)) for tile in scene.tiles])
+        root = writer.parent([writer.node(Level(tile)) for tile in scene.tiles])
     else:
-        root = made.node(scene.coarse)
-    about = {"crs": scene.frame.crs, "world_origin_m": scene.origin, "unit_m": scene.frame.unit}
+        root = writer.node(scene.coarse)
+    extras = {"crs": scene.frame.crs, "world_origin_m": scene.origin, "unit_m": scene.frame.unit}
     tileset = {
         "asset": {"version": "1.1"},
         "geometricError": float(np.linalg.norm(root.high - root.low)),
-        "root": {"transform": root.place.T.ravel().tolist(), **root.json},
-        "extras": about,
+        "root": {"transform": root.transform.T.ravel().tolist(), **root.json},
+        "extras": extras,
     }
     (folder / "tileset.json").write_text(json.dumps(tileset, indent=1) + "\n", encoding="utf-8")
-    return made.triangles
+    return writer.triangles
 
 
 @dataclass(frozen=True)
@@ -59,101 +59,101 @@ class _Node:
     """A tile of the tileset.
 
     Attributes:
-        json: as the tileset has it, its transform left out.
-        place: (4, 4) from its metres to the earth's, or the scene's.
-        low, high: its box there, its own metres.
+        json: its entry in the tileset, without the transform.
+        transform: (4, 4) from its own coordinates to earth-centred ones, or to the scene's.
+        low, high: corners of its bounding box, own coordinates, metres.
     """
 
     json: dict[str, Any]
-    place: F64
+    transform: F64
     low: F64
     high: F64
 
 
-class _Made:
-    """What is written of a scene; `triangles` of all files."""
+class _Writer:
+    """Writes the tiles of a scene; `triangles` counts those of each file."""
 
     def __init__(self, scene: Scene, folder: Path, params: SceneParams, report: Report) -> None:
         self._scene, self._folder, self._params, self._report = scene, folder, params, report
         self.triangles: dict[str, int] = {}
 
     def node(self, level: Level) -> _Node:
-        """A level, and all that is finer."""
+        """Write a level and all finer ones."""
         self._report(len(self.triangles) / (len(self.triangles) + len(self._scene.tiles)), level.tile.name)
-        place = transform(self._scene, level.tile)
+        to_earth = transform(self._scene, level.tile)
         file = f"{FOLDER}/{f'level{level.height}/' if level.height else ''}{level.tile.name}.glb"
-        low, high = self._write(level.tile, place, file)
-        error = max(level.error, PIXELS * level.texel) if level.finer else 0.0
+        low, high = self._write(level.tile, to_earth, file)
+        error = max(level.error, MAX_SCREEN_SPACE_ERROR_PX * level.texel) if level.finer else 0.0
         node: dict[str, Any] = {"geometricError": round(error, 4), "content": {"uri": file}}
         if level.finer:
             node |= {"refine": "REPLACE", "extras": {"error_m": level.error, "texel_m": level.texel}}
-        return _with(_Node(node, place, low, high), [self.node(finer) for finer in level.finer])
+        return _with_children(_Node(node, to_earth, low, high), [self.node(finer) for finer in level.finer])
 
-    def above(self, nodes: list[_Node]) -> _Node:
-        """What holds several tiles and shows nothing itself."""
+    def parent(self, nodes: list[_Node]) -> _Node:
+        """A parent of several tiles without content of its own."""
         corners = np.concatenate(
-            [_corners(node.low, node.high) @ node.place[:3, :3].T + node.place[:3, 3] for node in nodes]
+            [_corners(node.low, node.high) @ node.transform[:3, :3].T + node.transform[:3, 3] for node in nodes]
         )
         low, high = corners.min(axis=0), corners.max(axis=0)
         error = float(np.linalg.norm(high - low))
-        return _with(_Node({"geometricError": error, "refine": "ADD"}, np.eye(4), low, high), nodes)
+        return _with_children(_Node({"geometricError": error, "refine": "ADD"}, np.eye(4), low, high), nodes)
 
-    def _write(self, tile: SceneTile, place: F64, file: str) -> tuple[F64, F64]:
-        """Write a tile's content; corners of its box."""
-        back = np.linalg.inv(place)
+    def _write(self, tile: SceneTile, to_earth: F64, file: str) -> tuple[F64, F64]:
+        """Write a tile's content; returns the corners of its bounding box."""
+        from_earth = np.linalg.inv(to_earth)
 
         def placed(surface: Surface) -> Surface:
             shape = surface.shape
-            there = on_earth(self._scene, tile, shape.mesh.vertices)
-            vertices = (there @ back[:3, :3].T + back[:3, 3]).astype(np.float32)
+            earth = on_earth(self._scene, tile, shape.mesh.vertices)
+            vertices = (earth @ from_earth[:3, :3].T + from_earth[:3, 3]).astype(np.float32)
             return replace(surface, shape=replace(shape, mesh=replace(shape.mesh, vertices=vertices)))
 
         surfaces = [placed(surface) for surface in tile.surfaces()]
         make_folder((self._folder / file).parent)
         glb.write(self._folder / file, surfaces, self._params, views=tile.views())
         self.triangles[file] = sum(len(surface.shape) for surface in surfaces)
-        every = np.concatenate([surface.shape.mesh.vertices for surface in surfaces]).astype(np.float64)
-        return every.min(axis=0), every.max(axis=0)
+        vertices = np.concatenate([surface.shape.mesh.vertices for surface in surfaces]).astype(np.float64)
+        return vertices.min(axis=0), vertices.max(axis=0)
 
 
-def _with(node: _Node, children: list[_Node]) -> _Node:
-    """A node with its children, in a box that holds them, too."""
-    back = np.linalg.inv(node.place)
-    low, high, inside = node.low, node.high, []
+def _with_children(node: _Node, children: list[_Node]) -> _Node:
+    """A node with its children, and a bounding box that contains theirs."""
+    inverse = np.linalg.inv(node.transform)
+    low, high, entries = node.low, node.high, []
     for child in children:
-        onto = back @ child.place
-        low, high = _around(low, high, child, onto)
-        inside.append({"transform": onto.T.ravel().tolist(), **child.json})
-    about = {"boundingVolume": {"box": _box(low, high)}, **node.json, **({"children": inside} if inside else {})}
-    return _Node(about, node.place, low, high)
+        relative = inverse @ child.transform
+        low, high = _extended(low, high, child, relative)
+        entries.append({"transform": relative.T.ravel().tolist(), **child.json})
+    body = {"boundingVolume": {"box": _box(low, high)}, **node.json, **({"children": entries} if entries else {})}
+    return _Node(body, node.transform, low, high)
 
 
-def _around(low: F64, high: F64, node: _Node, place: F64) -> tuple[F64, F64]:
-    """A box that holds a node's, too, which is placed in its metres."""
-    corners = _corners(node.low, node.high) @ place[:3, :3].T + place[:3, 3]
+def _extended(low: F64, high: F64, node: _Node, relative: F64) -> tuple[F64, F64]:
+    """A box extended by the box of a node, which `relative` (4, 4) transforms to its coordinates."""
+    corners = _corners(node.low, node.high) @ relative[:3, :3].T + relative[:3, 3]
     return np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
 
 
 def on_earth(scene: Scene, tile: SceneTile, local: npt.ArrayLike) -> F64:
-    """(N, 3) earth-centred metres of places in a tile; the scene's where it has no CRS."""
+    """Earth-centred coordinates (N, 3) of points in a tile, metres; scene coordinates without a CRS."""
     if scene.frame.crs == crs.LOCAL:
         return np.asarray(local, np.float64) + tile.offset
     return crs.to_ecef(tile.frame, local)
 
 
 def transform(scene: Scene, tile: SceneTile) -> F64:
-    """(4, 4) of a tile's local metres, z up, to earth-centred ones; to the scene's where it has no CRS."""
-    place = np.eye(4)
+    """Transform (4, 4) from a tile's local metres, z up, to earth-centred coordinates; to the scene's without a CRS."""
+    matrix = np.eye(4)
     middle = (np.asarray(tile.low) + np.asarray(tile.high)) / 2
-    steps = SPAN * np.concatenate([np.eye(3), -np.eye(3)])
+    steps = DIFFERENCE_STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
     around = on_earth(scene, tile, middle + np.concatenate([np.zeros((1, 3)), steps]))
-    place[:3, :3] = ((around[1:4] - around[4:]) / (2 * SPAN)).T
-    place[:3, 3] = around[0] - place[:3, :3] @ middle
-    return place
+    matrix[:3, :3] = ((around[1:4] - around[4:]) / (2 * DIFFERENCE_STEP_M)).T
+    matrix[:3, 3] = around[0] - matrix[:3, :3] @ middle
+    return matrix
 
 
 def _box(low: F64, high: F64) -> list[float]:
-    """A box as 3D Tiles have it: its middle and three half axes."""
+    """A bounding box of 3D Tiles: centre and three half axes."""
     half: Any = np.diag((high - low) / 2)
     return [*((low + high) / 2).tolist(), *half.ravel().tolist()]
 

@@ -1,8 +1,8 @@
-"""URDF, for PyBullet: a link a class, so that its segmentation camera tells them; concave meshes, cylinders to touch.
+"""URDF world for PyBullet: one link per class, for its segmentation camera; collision by concave meshes and cylinders.
 
 Layout: `<name>.urdf`, and for each tile `urdf/<tile>/` with an OBJ for each class and texture page, the pages, and
-`collision_<class>.obj`. Load it with `useFixedBase=True`; links are named `<tile>/<class>/<LAS code>`. The first
-class's link has what bodies collide with: PyBullet would draw that of a link that shows nothing.
+`collision_<class>.obj`. Load it with `useFixedBase=True`; links are named `<tile>/<class>/<LAS code>`. The collision
+shapes are in the link of the first class: PyBullet would draw them in a link without visuals.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from scan2sim.pipeline.core.step import Report
 from scan2sim.pipeline.geometry.cylinders import Cylinder
 from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.file_checks import make_folder
-from scan2sim.pipeline.io.world_formats import SceneParams, Single
+from scan2sim.pipeline.io.world_formats import SceneParams, SingleMaterialMesh
 from scan2sim.pipeline.io.worlds import sdf
 from scan2sim.pipeline.io.worlds.scene import Scene, SceneTile
 from scan2sim.pipeline.simulation.collision_shapes import Solid
@@ -23,26 +23,26 @@ STATIC = '<inertial><mass value="0"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iy
 
 
 def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
-    """Write the robot that is a world, and its meshes."""
+    """Write the world as a URDF robot, and its meshes."""
     triangles: dict[str, int] = {}
     links = [f'  <link name="world">\n    {STATIC}\n  </link>\n']
     for i, tile in enumerate(scene.tiles):
         report(i / len(scene.tiles), tile.name)
-        place = folder / FOLDER / tile.name
-        make_folder(place)
-        shown: dict[tuple[str, int], list[Single]] = {}
-        for part in world_formats.write_single(place, tile, params):
-            shown.setdefault((part.label, part.code), []).append(part)
+        tile_folder = folder / FOLDER / tile.name
+        make_folder(tile_folder)
+        visuals: dict[tuple[str, int], list[SingleMaterialMesh]] = {}
+        for part in world_formats.write_single_material(tile_folder, tile, params):
+            visuals.setdefault((part.label, part.code), []).append(part)
             triangles[f"{FOLDER}/{tile.name}/{part.name}.obj"] = part.triangles
-        solids, touched = world_formats.write_solids(place, tile)
-        triangles |= {f"{FOLDER}/{tile.name}/{file}": count for file, count in touched.items()}
-        solid = "".join([_friction(tile), *(_collision(tile, one) for one in solids)])
+        solids, solid_triangles = world_formats.write_solids(tile_folder, tile)
+        triangles |= {f"{FOLDER}/{tile.name}/{file}": count for file, count in solid_triangles.items()}
+        collision = "".join([_friction(tile), *(_collision(tile, one) for one in solids)])
         links.append(_link(tile.name, "") + _joint("world", tile.name, sdf.numbers(tile.offset)))
-        for (label, code), parts in shown.items():
+        for (label, code), parts in visuals.items():
             name = f"{tile.name}/{label}/{code}"
-            content = solid + "".join(_visual(tile, part) for part in parts)
+            content = collision + "".join(_visual(tile, part) for part in parts)
             links.append(_link(name, content) + _joint(tile.name, name, "0 0 0"))
-            solid = ""
+            collision = ""
     text = f'<?xml version="1.0"?>\n<robot name="{scene.name}">\n{"".join(links)}</robot>\n'
     (folder / f"{scene.name}.urdf").write_text(text, encoding="ascii")
     return triangles
@@ -61,7 +61,7 @@ def _joint(parent: str, child: str, offset: str) -> str:
 """
 
 
-def _visual(tile: SceneTile, part: Single) -> str:
+def _visual(tile: SceneTile, part: SingleMaterialMesh) -> str:
     return f"""    <visual name="{part.name}">
       <geometry><mesh filename="{FOLDER}/{tile.name}/{part.name}.obj"/></geometry>
     </visual>
@@ -69,7 +69,7 @@ def _visual(tile: SceneTile, part: Single) -> str:
 
 
 def _friction(tile: SceneTile) -> str:
-    """Of a whole link, as PyBullet has it: the roads'."""
+    """Friction, which in PyBullet applies to a whole link: that of the roads."""
     return f'    <contact><lateral_friction value="{tile.friction:g}"/></contact>\n'
 
 

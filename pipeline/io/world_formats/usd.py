@@ -1,9 +1,9 @@
-"""OpenUSD: crate files, Z-up, metres; a payload a tile, so that large worlds load by parts.
+"""OpenUSD: crate files, z up, metres; one payload per tile, so that large worlds can be loaded in parts.
 
 Layout: `<name>.usdc` places the tiles; `usd/<tile>.usdc` is a tile (`Looks`, `Visual`, `Collision`), with its texture
-pages in `usd/<tile>/`. Where a scene has levels of detail, coarser ones of a tile are variants of it (`levelOfDetail`):
-`usd/level<n>/<tile>.usdc`, with the same that bodies collide with. Labels are `UsdSemanticsLabelsAPI:class`. Where the
-world is on the map stands in the custom data of the root layer and of `/World`: USD has no schema for it.
+pages in `usd/<tile>/`. If a scene has levels of detail, coarser levels of a tile are variants of it (`levelOfDetail`):
+`usd/level<n>/<tile>.usdc`, with the same collision shapes. Labels are `UsdSemanticsLabelsAPI:class`. The georeference
+is in the custom data of the root layer and of `/World`, as USD has no schema for it.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from scan2sim.pipeline.simulation.collision_shapes import Solid, solids
 
 NEEDS = ("pxr",)
 FOLDER = "usd"
-VARIANTS, FINEST = "levelOfDetail", "finest"
-SKY = 1000.0
-"""Nits of an even sky: the photos hold the light of their day."""
+VARIANT_SET, FINEST_VARIANT = "levelOfDetail", "finest"
+SKY_INTENSITY_NITS = 1000.0
+"""Intensity of a uniform sky, as the textures contain the daylight of the photos."""
 
 
 def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
@@ -42,11 +42,11 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
     world = UsdGeom.Xform.Define(stage, "/World")
     stage.SetDefaultPrim(world.GetPrim())
     Usd.ModelAPI(world).SetKind(Kind.Tokens.assembly)
-    place = _georeference(scene)
-    stage.GetRootLayer().customLayerData = {"scan2sim": place}
-    world.GetPrim().SetCustomDataByKey("scan2sim", place)
+    georeference = _georeference(scene)
+    stage.GetRootLayer().customLayerData = {"scan2sim": georeference}
+    world.GetPrim().SetCustomDataByKey("scan2sim", georeference)
     UsdPhysics.Scene.Define(stage, "/World/Physics").CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
-    UsdLux.DomeLight.Define(stage, "/World/Sky").CreateIntensityAttr(SKY)
+    UsdLux.DomeLight.Define(stage, "/World/Sky").CreateIntensityAttr(SKY_INTENSITY_NITS)
     for i, tile in enumerate(scene.tiles):
         report(i / len(scene.tiles), tile.name)
         placed = UsdGeom.Xform.Define(stage, f"/World/{_prim(tile.name)}")
@@ -56,18 +56,18 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
             file = f"{FOLDER}/{f'level{level.height}/' if level.height else ''}{tile.name}.usdc"
             make_folder((folder / file).parent)
             triangles[file] = _write_tile(folder / file, level.tile, tile, params)
-            files[f"level{level.height}" if level.height else FINEST] = f"./{file}"
-        _load(placed.GetPrim(), files)
+            files[f"level{level.height}" if level.height else FINEST_VARIANT] = f"./{file}"
+        _add_payloads(placed.GetPrim(), files)
     stage.GetRootLayer().Save()
     return triangles
 
 
-def _load(prim: Any, files: dict[str, str]) -> None:
-    """Give a tile its payload; several are variants, of which the first is chosen."""
+def _add_payloads(prim: Any, files: dict[str, str]) -> None:
+    """Add a tile's payload; several payloads are variants, of which the first is selected."""
     if len(files) == 1:
         prim.GetPayloads().AddPayload(*files.values())
         return
-    variants = prim.GetVariantSets().AddVariantSet(VARIANTS)
+    variants = prim.GetVariantSets().AddVariantSet(VARIANT_SET)
     for name, file in files.items():
         variants.AddVariant(name)
         variants.SetVariantSelection(name)
@@ -76,14 +76,14 @@ def _load(prim: Any, files: dict[str, str]) -> None:
     variants.SetVariantSelection(next(iter(files)))
 
 
-def _write_tile(path: Path, tile: SceneTile, own: SceneTile, params: SceneParams) -> int:
-    """Write a tile's layer, local metres; how many triangles it shows.
+def _write_tile(path: Path, tile: SceneTile, source: SceneTile, params: SceneParams) -> int:
+    """Write a tile's layer in local metres; returns its number of visual triangles.
 
     Args:
-        path: of the layer.
-        tile: what is shown, at one of its levels.
-        own: the scene's own, which bodies collide with.
-        params: how it is written.
+        path: file of the layer.
+        tile: the tile at one of its levels of detail, for the visuals.
+        source: the scene's own tile, for the collision shapes.
+        params: settings.
     """
     from pxr import Kind, Usd, UsdGeom
 
@@ -97,22 +97,22 @@ def _write_tile(path: Path, tile: SceneTile, own: SceneTile, params: SceneParams
     _list_photos(UsdGeom.PrimvarsAPI(root), views)
     for group, shape in tile.textured().items():
         pages = world_formats.write_pages(path.with_suffix(""), group, shape, params)
-        looks = {
-            page: _look(stage, root, pages.materials[page], f"./{tile.name}/{pages.images[page]}")
+        materials = {
+            page: _add_material(stage, root, pages.materials[page], f"./{tile.name}/{pages.images[page]}")
             for page in pages.used
         }
         for surface in by_class(group, shape):
             for part in surface.parts(params.max_visual_triangles):
-                _show(stage, root, part, looks, views)
+                _add_visual(stage, root, part, materials, views)
                 triangles += len(part.shape)
-    for solid in solids(own.solid(), own.friction):
-        _collide(stage, root, solid)
+    for solid in solids(source.solid(), source.friction):
+        _add_collision(stage, root, solid)
     stage.GetRootLayer().Save()
     return triangles
 
 
-def _show(stage: Any, root: Any, surface: Surface, looks: dict[int, Any], views: Sequence[View]) -> None:
-    """A surface, a subset of its faces for each page, with its labels."""
+def _add_visual(stage: Any, root: Any, surface: Surface, materials: dict[int, Any], views: Sequence[View]) -> None:
+    """Add a surface with its labels, and one subset of faces per texture page."""
     from pxr import Sdf, UsdGeom, UsdSemantics, UsdShade, Vt
 
     shape = surface.shape
@@ -123,7 +123,7 @@ def _show(stage: Any, root: Any, surface: Surface, looks: dict[int, Any], views:
     st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
     st.Set(Vt.Vec2fArray.FromNumpy(uv))
     st.SetIndices(Vt.IntArray.FromNumpy(corner_uv.ravel()))
-    _origin(primvars, surface, views)
+    _add_provenance(primvars, surface, views)
     prim = mesh.GetPrim()
     for taxonomy, label in {"class": surface.label, "las_code": str(surface.code)}.items():
         UsdSemantics.LabelsAPI.Apply(prim, taxonomy).CreateLabelsAttr([label])
@@ -134,38 +134,40 @@ def _show(stage: Any, root: Any, surface: Surface, looks: dict[int, Any], views:
             mesh, f"page_{page}", UsdGeom.Tokens.face, Vt.IntArray.FromNumpy(faces),
             UsdShade.Tokens.materialBind, UsdGeom.Tokens.partition,
         )  # fmt: skip
-        UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(looks[page])
+        UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(materials[page])
 
 
 def _list_photos(primvars: Any, views: Sequence[View]) -> None:
-    """The photos that faces name by their numbers, and when each was taken, on all that is below a prim."""
+    """Add the photos to which faces refer by index, and their capture times, inherited by all prims below."""
     from pxr import Sdf, UsdGeom, Vt
 
-    rows = provenance.table(views)[provenance.FIRST :]
+    rows = provenance.table(views)[provenance.FIRST_VIEW_ROW :]
     for name, values in (("photos", [row.photo for row in rows]), ("taken", [row.taken for row in rows])):
         if any(values):
-            listed = primvars.CreatePrimvar(f"scan2sim:{name}", Sdf.ValueTypeNames.StringArray, UsdGeom.Tokens.constant)
-            listed.Set(Vt.StringArray(values))
+            primvar = primvars.CreatePrimvar(
+                f"scan2sim:{name}", Sdf.ValueTypeNames.StringArray, UsdGeom.Tokens.constant
+            )
+            primvar.Set(Vt.StringArray(values))
 
 
-def _origin(primvars: Any, surface: Surface, views: Sequence[View]) -> None:
-    """Where each face has its colour from, which photo gives its detail, and how far that was from its middle."""
+def _add_provenance(primvars: Any, surface: Surface, views: Sequence[View]) -> None:
+    """Add the provenance of each face's colour: source, photo, and distance of the photo from the face's centre."""
     from pxr import Sdf, UsdGeom, Vt
 
     seen, row = surface.seen(), provenance.rows(surface)
     if seen is None or row is None:
         return
-    far = provenance.distance(surface.shape.mesh.corners.mean(axis=1), row, views)
-    photo = np.maximum(row - provenance.FIRST, -1)
+    distance = provenance.distance(surface.shape.mesh.corners.mean(axis=1), row, views)
+    photo = np.maximum(row - provenance.FIRST_VIEW_ROW, -1)
     for name, values in (("seen", seen.astype(np.int32)), ("photo", photo.astype(np.int32))):
-        given = primvars.CreatePrimvar(f"scan2sim:{name}", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.uniform)
-        given.Set(Vt.IntArray.FromNumpy(values))
-    given = primvars.CreatePrimvar("scan2sim:distance", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.uniform)
-    given.Set(Vt.FloatArray.FromNumpy(far))
+        primvar = primvars.CreatePrimvar(f"scan2sim:{name}", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.uniform)
+        primvar.Set(Vt.IntArray.FromNumpy(values))
+    primvar = primvars.CreatePrimvar("scan2sim:distance", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.uniform)
+    primvar.Set(Vt.FloatArray.FromNumpy(distance))
 
 
-def _collide(stage: Any, root: Any, solid: Solid) -> None:
-    """What bodies collide with: static, as it is, with its friction, and not drawn."""
+def _add_collision(stage: Any, root: Any, solid: Solid) -> None:
+    """Add a collision shape: static, exact (no approximation), with its friction, invisible."""
     from pxr import Gf, UsdGeom, UsdPhysics, UsdShade
 
     path, shape = root.GetPath().AppendPath(f"Collision/{solid.name}"), solid.shape
@@ -191,36 +193,36 @@ def _collide(stage: Any, root: Any, solid: Solid) -> None:
 
 
 def _mesh(stage: Any, path: Any, mesh: Mesh, normal: F32) -> Any:
-    """Triangles as they are: no subdivision."""
+    """Add a triangle mesh without subdivision."""
     from pxr import UsdGeom, Vt
 
-    made = UsdGeom.Mesh.Define(stage, path)
-    made.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    made.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(mesh.vertices))
-    made.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normal))
-    made.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    made.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.ravel()))
-    made.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh), 3, np.int32)))
-    made.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(made.GetPointsAttr().Get()))
-    return made
+    usd_mesh = UsdGeom.Mesh.Define(stage, path)
+    usd_mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    usd_mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(mesh.vertices))
+    usd_mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normal))
+    usd_mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    usd_mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.ravel()))
+    usd_mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh), 3, np.int32)))
+    usd_mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(usd_mesh.GetPointsAttr().Get()))
+    return usd_mesh
 
 
-def _look(stage: Any, root: Any, name: str, image: str) -> Any:
-    """A matt material of a texture page."""
+def _add_material(stage: Any, root: Any, name: str, image: str) -> Any:
+    """Add a matt material with a texture page."""
     from pxr import Sdf, UsdShade
 
     path = root.GetPath().AppendPath(f"Looks/{name}")
     material = UsdShade.Material.Define(stage, path)
-    places = UsdShade.Shader.Define(stage, path.AppendChild("st"))
-    places.CreateIdAttr("UsdPrimvarReader_float2")
-    places.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
+    uv_reader = UsdShade.Shader.Define(stage, path.AppendChild("st"))
+    uv_reader.CreateIdAttr("UsdPrimvarReader_float2")
+    uv_reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
     page = UsdShade.Shader.Define(stage, path.AppendChild("page"))
     page.CreateIdAttr("UsdUVTexture")
     page.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(image)
     page.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
     page.CreateInput("wrapS", Sdf.ValueTypeNames.Token).Set("clamp")
     page.CreateInput("wrapT", Sdf.ValueTypeNames.Token).Set("clamp")
-    st = places.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+    st = uv_reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
     page.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(st)
     surface = UsdShade.Shader.Define(stage, path.AppendChild("surface"))
     surface.CreateIdAttr("UsdPreviewSurface")
@@ -228,18 +230,18 @@ def _look(stage: Any, root: Any, name: str, image: str) -> Any:
     surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
     colour = page.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
     surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
-    shown = surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
-    material.CreateSurfaceOutput().ConnectToSource(shown)
+    surface_output = surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
+    material.CreateSurfaceOutput().ConnectToSource(surface_output)
     return material
 
 
 def _georeference(scene: Scene) -> dict[str, Any]:
-    """Where the world is on the map, as numbers and text that USD keeps."""
+    """The world's georeference as custom data of USD."""
     from pxr import Gf
 
-    place = sdf.Georeference.of(scene.frame)
-    own = {"crs": scene.frame.crs, "worldOriginMetres": Gf.Vec3d(*scene.origin), "unitMetres": scene.frame.unit}
-    return own if place is None else {**own, "wgs84": place.facts()}
+    wgs84 = sdf.Georeference.of(scene.frame)
+    body = {"crs": scene.frame.crs, "worldOriginMetres": Gf.Vec3d(*scene.origin), "unitMetres": scene.frame.unit}
+    return body if wgs84 is None else {**body, "wgs84": wgs84.as_metadata()}
 
 
 def _stage(path: Path) -> Any:
@@ -253,5 +255,5 @@ def _stage(path: Path) -> Any:
 
 
 def _prim(name: str) -> str:
-    """A tile's name for a prim, which begins with no digit."""
+    """Prim name of a tile; a prim name can't start with a digit."""
     return f"tile_{name}" if name[0].isdigit() else name

@@ -1,5 +1,5 @@
-"""Finished worlds: the scene that exports are made from, and the writers of SDF, GLB and FBX.
+"""Finished worlds: the scene from which exports are written, and the writers of SDF, GLB and FBX.
 
-Begin with `scene` (what a finished world holds); `merge` puts the worlds of tiles into one.
-Formats that a user chooses are in `pipeline.io.world_formats`.
+Start reading at `scene` (content of a finished world); `merge` combines the worlds of tiles.
+The export formats that a user selects are in `pipeline.io.world_formats`.
 """

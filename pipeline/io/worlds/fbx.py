@@ -1,8 +1,8 @@
-"""FBX 7.4, binary: static meshes with normals, texture coordinates and textured materials, for Unreal and CARLA.
+"""FBX 7.4 writer (binary): static meshes with normals, texture coordinates, textured materials, for Unreal and CARLA.
 
-The format isn't published; what is written here is what Blender and assimp read alike: a tree of records, each with
-properties (arrays packed by zlib), objects with ids, and connections between them. Centimetres, z up, right handed:
-they are FBX's own unit, so readers that convert none have the right size, too.
+The format isn't published; this is the subset that both Blender and assimp read: a tree of records with properties
+(arrays compressed by zlib), objects with ids, and connections between them. Coordinates are centimetres, z up,
+right-handed; centimetres are FBX's native unit, so that the size is also right in readers that don't convert units.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import numpy as np
 from scan2sim.pipeline.io.worlds.textured_mesh import Textured, unique_uv
 
 VERSION = 7400
-HEAD = b"Kaydara FBX Binary  \x00\x1a\x00"
-TIME = "1970-01-01 10:00:00:000"
+MAGIC = b"Kaydara FBX Binary  \x00\x1a\x00"
+CREATION_TIME = "1970-01-01 10:00:00:000"
 FILE_ID = bytes.fromhex("28b32aebb624ccc2bfc8b02aa92bfcf1")
-FOOT_ID = bytes.fromhex("fabcab09d0c8d466b176fb831cf7267e")
-FOOT = bytes.fromhex("f85a8c6adef5d97eece90ce3758f290b")
-"""Readers hold these two ids against `TIME`."""
-CENTIMETRES = 100.0
+FOOTER_ID = bytes.fromhex("fabcab09d0c8d466b176fb831cf7267e")
+FOOTER = bytes.fromhex("f85a8c6adef5d97eece90ce3758f290b")
+"""`FILE_ID` and `FOOTER_ID` must match `CREATION_TIME`, which readers check."""
+CM_PER_M = 100.0
 AXES = {"UpAxis": 2, "UpAxisSign": 1, "FrontAxis": 1, "FrontAxisSign": -1, "CoordAxis": 0, "CoordAxisSign": 1}
 
 
@@ -34,9 +34,9 @@ class Part:
     """A mesh with one texture.
 
     Attributes:
-        name: of the object.
+        name: name of the object.
         shape: its faces, all on one page; metres, z up.
-        image: file of its texture, relative to the FBX.
+        image: texture file, relative to the FBX.
     """
 
     name: str
@@ -46,29 +46,29 @@ class Part:
 
 @dataclass
 class Record:
-    """A record of the tree: properties are int (64 bits), float, str, bytes and arrays of float64 or int32."""
+    """A record of the tree; properties are int (64 bits), float, str, bytes and arrays of float64 or int32."""
 
     name: str
     properties: Sequence[Any] = ()
     children: list[Record] = field(default_factory=list)
 
     def add(self, name: str, *properties: Any) -> Record:
-        """A child; returns it."""
+        """Add a child and return it."""
         self.children.append(Record(name, properties))
         return self.children[-1]
 
     def encoded(self, start: int) -> bytes:
-        """The record as it stands at a place of the file."""
-        own = b"".join(map(_property, self.properties))
+        """The bytes of the record at offset `start` of the file."""
+        properties = b"".join(map(_property, self.properties))
         head = 13 + len(self.name)
-        inside = b""
+        nested = b""
         for child in self.children:
-            inside += child.encoded(start + head + len(own) + len(inside))
+            nested += child.encoded(start + head + len(properties) + len(nested))
         if self.children:
-            inside += bytes(13)
-        end = start + head + len(own) + len(inside)
+            nested += bytes(13)
+        end = start + head + len(properties) + len(nested)
         name = self.name.encode("ascii")
-        return struct.pack("<IIIB", end, len(self.properties), len(own), len(name)) + name + own + inside
+        return struct.pack("<IIIB", end, len(self.properties), len(properties), len(name)) + name + properties + nested
 
 
 def write(path: Path, parts: Sequence[Part]) -> None:
@@ -78,7 +78,7 @@ def write(path: Path, parts: Sequence[Part]) -> None:
     header.add("FBXHeaderVersion", np.int32(1003))
     header.add("FBXVersion", np.int32(VERSION))
     top.add("FileId", FILE_ID)
-    top.add("CreationTime", TIME)
+    top.add("CreationTime", CREATION_TIME)
     top.add("Creator", "scan2sim")
     settings = top.add("GlobalSettings")
     settings.add("Version", np.int32(1000))
@@ -95,20 +95,20 @@ def write(path: Path, parts: Sequence[Part]) -> None:
 
 
 def _object(objects: Record, connections: Record, number: int, part: Part) -> None:
-    """A mesh: its geometry, place, material, texture and picture, which have the numbers from `number` on."""
+    """Add a mesh: its geometry, model, material, texture and video (image), with ids from `number` on."""
     geometry, model, material, texture, video = range(number, number + 5)
     _geometry(objects.add("Geometry", geometry, _named(part.name, "Geometry"), "Mesh"), part.shape)
-    placed = objects.add("Model", model, _named(part.name, "Model"), "Mesh")
-    placed.add("Version", np.int32(232))
-    look = objects.add("Material", material, _named(part.name, "Material"), "")
-    look.add("Version", np.int32(102))
-    look.add("ShadingModel", "lambert")
-    picture = objects.add("Texture", texture, _named(part.name, "Texture"), "")
+    node = objects.add("Model", model, _named(part.name, "Model"), "Mesh")
+    node.add("Version", np.int32(232))
+    material_record = objects.add("Material", material, _named(part.name, "Material"), "")
+    material_record.add("Version", np.int32(102))
+    material_record.add("ShadingModel", "lambert")
+    texture_record = objects.add("Texture", texture, _named(part.name, "Texture"), "")
     clip = objects.add("Video", video, _named(part.name, "Video"), "Clip")
-    for kind, one in (("TextureVideoClip", picture), ("Clip", clip)):
-        one.add("Type", kind)
-        one.add("FileName", part.image)
-        one.add("RelativeFilename", part.image)
+    for kind, record in (("TextureVideoClip", texture_record), ("Clip", clip)):
+        record.add("Type", kind)
+        record.add("FileName", part.image)
+        record.add("RelativeFilename", part.image)
     for child, parent in ((geometry, model), (model, 0), (material, model), (video, texture)):
         connections.add("C", "OO", child, parent)
     connections.add("C", "OP", texture, material, "DiffuseColor")
@@ -118,9 +118,9 @@ def _geometry(record: Record, shape: Textured) -> None:
     mesh = shape.mesh
     assert mesh.uv is not None
     record.add("GeometryVersion", np.int32(124))
-    record.add("Vertices", mesh.vertices.astype(np.float64).ravel() * CENTIMETRES)
+    record.add("Vertices", mesh.vertices.astype(np.float64).ravel() * CM_PER_M)
     ends = mesh.faces.astype(np.int32) * np.array([1, 1, -1], np.int32) - np.array([0, 0, 1], np.int32)
-    record.add("PolygonVertexIndex", ends.ravel())  # a polygon's last corner is told as -1 - index
+    record.add("PolygonVertexIndex", ends.ravel())  # the last corner of a polygon is encoded as -1 - index
     uv, corner_uv = unique_uv(mesh.uv)
     layer = record.add("Layer", np.int32(0))
     layer.add("Version", np.int32(100))
@@ -138,9 +138,9 @@ def _geometry(record: Record, shape: Textured) -> None:
         for name, values in arrays.items():
             element.add(name, values)
         record.children.insert(-1, element)
-        own = layer.add("LayerElement")
-        own.add("Type", f"LayerElement{kind}")
-        own.add("TypedIndex", np.int32(0))
+        entry = layer.add("LayerElement")
+        entry.add("Type", f"LayerElement{kind}")
+        entry.add("TypedIndex", np.int32(0))
 
 
 def _named(name: str, kind: str) -> str:
@@ -148,7 +148,7 @@ def _named(name: str, kind: str) -> str:
 
 
 def _properties(record: Record, values: dict[str, int | float]) -> None:
-    """Named properties: whole numbers and others."""
+    """Add named properties, integers and floats."""
     table = record.add("Properties70")
     for name, value in values.items():
         kind = ("int", "Integer") if isinstance(value, int) else ("double", "Number")
@@ -173,8 +173,8 @@ def _property(value: Any) -> bytes:
 def _save(path: Path, top: Record) -> None:
     """Write the tree below `top`, and the footer."""
     with open(path, "wb") as file:
-        file.write(HEAD + struct.pack("<I", VERSION))
+        file.write(MAGIC + struct.pack("<I", VERSION))
         for record in top.children:
             file.write(record.encoded(file.tell()))
-        file.write(bytes(13) + FOOT_ID + bytes(4))
-        file.write(bytes(16 - file.tell() % 16) + struct.pack("<I", VERSION) + bytes(120) + FOOT)
+        file.write(bytes(13) + FOOTER_ID + bytes(4))
+        file.write(bytes(16 - file.tell() % 16) + struct.pack("<I", VERSION) + bytes(120) + FOOTER)

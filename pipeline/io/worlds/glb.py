@@ -1,4 +1,4 @@
-"""GLB (glTF 2.0): Y-up, textures embedded, where colours are from told of each face (`pipeline/io/worlds/gltf`)."""
+"""GLB (glTF 2.0) writer: y up, embedded textures, provenance of each face's colour (`pipeline/io/worlds/gltf`)."""
 
 from __future__ import annotations
 
@@ -27,35 +27,37 @@ LINEAR, MIPMAPS, CLAMP = 9729, 9987, 33071
 
 
 class GlbParams(Params):
-    """How GLBs are written.
+    """Settings of the GLB writer.
 
     Attributes:
-        jpeg_quality: of the GLB's textures, and of JPEG pages.
-        glb_texture: a file of `pipeline/io/worlds/gltf/textures`.
-        glb_mesh: a file of `pipeline/io/worlds/gltf/geometry`.
-        glb_lit: have lights fall on the world, with normals. Else textures are shown as they are
-            (`KHR_materials_unlit`): the scan's daylight is in them, and a simulator's own would come on top.
-        glb_bare: don't tell of each face where its colour is from.
+        jpeg_quality: JPEG quality of GLB textures and of JPEG texture pages.
+        glb_texture: texture format, a module of `pipeline/io/worlds/gltf/textures`.
+        glb_mesh: geometry codec, a module of `pipeline/io/worlds/gltf/geometry`.
+        glb_lit: write lit materials and normals. Otherwise textures are shown unlit (`KHR_materials_unlit`): the
+            daylight of the photos is baked into them, and a simulator's lights would be added to it.
+        glb_bare: omit the provenance of each face's colour.
     """
 
-    jpeg_quality: int = Field(90, ge=1, le=100, description="Of the GLB's textures, and of JPEG pages.")
+    jpeg_quality: int = Field(90, ge=1, le=100, description="JPEG quality of GLB textures and of JPEG texture pages.")
     glb_texture: str = Field(
-        "jpeg", description="Textures in GLBs: jpeg, webp, ktx2.", json_schema_extra={"range": "jpeg, webp, ktx2"}
+        "jpeg", description="Texture format in GLBs: jpeg, webp, ktx2.", json_schema_extra={"range": "jpeg, webp, ktx2"}
     )
     glb_mesh: str = Field(
-        "plain", description="Geometry in GLBs: plain, meshopt, draco.",
+        "plain", description="Geometry codec of GLBs: plain, meshopt, draco.",
         json_schema_extra={"range": "plain, meshopt, draco"},
     )  # fmt: skip
-    glb_lit: bool = Field(False, description="GLBs are lit by a simulator's lights, not by those of the photos alone.")
-    glb_bare: bool = Field(False, description="GLBs don't tell of each face which photo its colour is from.")
+    glb_lit: bool = Field(
+        False, description="Write lit materials and normals to GLBs, so that a simulator's lights apply."
+    )
+    glb_bare: bool = Field(False, description="Omit from GLBs which photo each face has its colour from.")
 
 
-def ways(params: GlbParams) -> tuple[Texture, Codec]:
-    """How pages and geometry are kept.
+def find_encoders(params: GlbParams) -> tuple[Texture, Codec]:
+    """The texture format and the geometry codec of the settings.
 
     Raises:
-        SettingError: there is no such way.
-        UnavailableError: it can't be written here.
+        SettingError: unknown format or codec.
+        UnavailableError: its package or program isn't installed.
     """
     codec: Codec = plugins.find(geometry.__name__, params.glb_mesh, geometry.SETTING)
     return textures.find(params.glb_texture), codec
@@ -70,27 +72,30 @@ def write(
     offset: Vector = (0.0, 0.0, 0.0),
     scale: float = 1.0,
 ) -> None:
-    """Write surfaces into one file, each page's faces of each as a mesh of its own, its class among its `extras`.
+    """Write surfaces into one file, with one mesh per surface and texture page; its class is in its `extras`.
 
-    Local metres, turned from z-up to glTF's y-up: (x, y, z) becomes (x, z, -y). Materials are matt
-    (metallic 0, roughness 1) and single-sided. Pages are read and packed one at a time.
+    Local metres, rotated from z up to glTF's y up: (x, y, z) becomes (x, z, -y). Materials are matt
+    (metallic 0, roughness 1) and single-sided. Pages are read and encoded one at a time.
 
     Args:
-        views: the tile's photos, which surfaces name by their numbers.
-        offset: of the file's one root, metres, z up.
-        scale: of the pages' sides.
+        path: the .glb file.
+        surfaces: surfaces of a tile.
+        params: settings.
+        views: the tile's photos, to whose indices surfaces refer.
+        offset: translation of the root node, metres, z up.
+        scale: factor for width and height of texture pages.
 
     Raises:
-        ScanError: as `ways`; a page can't be read.
+        ScanError: as `find_encoders`, or a page can't be read.
     """
-    texture, codec = ways(params)
+    texture, codec = find_encoders(params)
     builder = Builder()
     rows = [] if params.glb_bare else provenance.table(views)
     if rows:
         metadata.describe(builder, rows)
     root: dict[str, Any] = {"name": path.stem, "translation": _y_up(np.array([offset]))[0].tolist(), "children": []}
     builder.add("nodes", root)
-    materials: dict[str, int] = {}  # several classes may lie on one page
+    materials: dict[str, int] = {}  # several classes may share a page
     for surface in surfaces:
         for page in surface.shape.used_pages:
             material = f"{surface.group}_{page}"
@@ -111,7 +116,7 @@ def write(
 
 
 def write_solid(path: Path, mesh: Mesh) -> None:
-    """Write what bodies collide with, a mesh a class, without any material; local metres, y up, as `write`."""
+    """Write the collision mesh, one mesh per class, without materials; local metres, y up, as `write`."""
     builder = Builder()
     codes = np.zeros(len(mesh), np.uint8) if mesh.classification is None else mesh.classification
     root: dict[str, Any] = {"name": path.stem, "children": []}
@@ -131,40 +136,40 @@ def _merged(primitive: dict[str, Any], extensions: dict[str, Any]) -> dict[str, 
 
 
 def _part(surface: Surface, params: GlbParams, views: Sequence[View], features: int) -> tuple[Part, dict[str, Any]]:
-    """Triangles and attributes of a surface that lies on one page, and the extensions that say what these mean."""
+    """Triangles and attributes of a surface on one page, and the glTF extensions that describe the attributes."""
     shape = surface.shape
     assert shape.mesh.uv is not None
     uv, corner_uv = unique_uv(shape.mesh.uv)
     row = provenance.rows(surface) if features else None
     of_face = np.zeros(len(shape), np.int64) if row is None else row.astype(np.int64)
-    # glTF has one index for all: a vertex is said again for each of its texture coordinates, and each photo
+    # glTF has one index for all attributes: a vertex is repeated for each texture coordinate and photo
     keys = (shape.mesh.faces.astype(np.int64) * len(uv) + corner_uv) * max(1, features) + of_face[:, None]
     unique, faces = np.unique(keys, return_inverse=True)
     pair, feature = np.divmod(unique, max(1, features))
     vertex, coordinate = np.divmod(pair, len(uv))
     attributes: dict[str, Array] = {
         "POSITION": _y_up(shape.mesh.vertices)[vertex],
-        "TEXCOORD_0": (uv[coordinate] * (1, -1) + (0, 1)).astype(np.float32),  # from the upper left
+        "TEXCOORD_0": (uv[coordinate] * (1, -1) + (0, 1)).astype(np.float32),  # origin at the upper left
     }
     if params.glb_lit:
         attributes["NORMAL"] = _y_up(shape.normal)[vertex]
     if row is not None:
         attributes[metadata.FEATURE] = feature.astype(np.uint16)
-        places = shape.mesh.vertices[vertex]
-        attributes[metadata.DISTANCE] = provenance.distance(places, feature.astype(np.int32), views)
+        positions = shape.mesh.vertices[vertex]
+        attributes[metadata.DISTANCE] = provenance.distance(positions, feature.astype(np.int32), views)
     return Part(faces.reshape(-1, 3), attributes), {} if row is None else metadata.of_primitive(features)
 
 
 def _material(builder: Builder, name: str, packed: bytes, texture: Texture, lit: bool) -> int:
-    """A matt material that shows a page."""
+    """Add a matt material with a page as texture; returns its index."""
     if not builder.tree["samplers"]:
         builder.add("samplers", {"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMP, "wrapT": CLAMP})
     source = builder.add("images", {"name": name, "bufferView": builder.view(packed), "mimeType": texture.MIME})
-    shown: dict[str, Any] = {"sampler": 0, "source": source}
+    texture_entry: dict[str, Any] = {"sampler": 0, "source": source}
     if texture.EXTENSION:
         builder.use(texture.EXTENSION, required=True)
-        shown = {"sampler": 0, "extensions": {texture.EXTENSION: {"source": source}}}
-    colour = {"index": builder.add("textures", shown)}
+        texture_entry = {"sampler": 0, "extensions": {texture.EXTENSION: {"source": source}}}
+    colour = {"index": builder.add("textures", texture_entry)}
     matt = {"baseColorTexture": colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
     material: dict[str, Any] = {"name": name, "pbrMetallicRoughness": matt}
     if not lit:
@@ -178,7 +183,7 @@ def _y_up(xyz: Array) -> Array:
 
 
 def _scaled(page: U8, scale: float) -> U8:
-    """A page with its sides scaled."""
+    """A page with width and height scaled."""
     if scale >= 1:
         return page
     import cv2

@@ -1,7 +1,7 @@
-"""The world of a survey: all its tiles' worlds in one, each in a level that a simulator loads by itself.
+"""The world of a survey: the worlds of all its tiles combined, each in a level that the simulator loads separately.
 
-Tiles keep their models as they are; where each is comes from its pose. Meshes and textures are hard links, so the
-survey's world takes hardly any room.
+The models of tiles are unchanged; the world places them by their poses. Meshes and textures are hard links, so that
+the survey's world takes hardly any disk space.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from scan2sim.pipeline.io.geodata import crs
 from scan2sim.pipeline.io.world_formats import opendrive
 from scan2sim.pipeline.io.worlds import scene, sdf
 
-EDITED = (".sdf", ".config", ".json", ".mtl", ".geojson", ".csv", ".xodr")
-"""Suffixes of what users change by hand: copied, never linked."""
-STAMP, ROADS_STAMP = ".result", ".roads"
+USER_EDITABLE_SUFFIXES = (".sdf", ".config", ".json", ".mtl", ".geojson", ".csv", ".xodr")
+"""Suffixes of files that users edit by hand: copied, never linked."""
+STAMP_FILE, ROADS_STAMP_FILE = ".result", ".roads"
 VERSION = 4
-"""Of what is written: another one makes worlds anew."""
+"""Version of the layout: when it changes, worlds are rebuilt."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class TileWorld:
     """A tile's exported world.
 
     Attributes:
-        name: of the tile and its model; unique in a survey.
+        name: name of the tile and its model; unique in a survey.
         world: folder that `pipeline.steps.export` wrote, with `metadata.json` and `models/<name>/`.
-        frame: of the tile.
+        frame: frame of the tile.
     """
 
     name: str
@@ -51,8 +51,8 @@ class TileWorld:
 
     @property
     def files(self) -> list[Path]:
-        """All files of the tile that go into the survey's world, relative to both worlds."""
-        folders = (self.model, self.world / scene.FOLDER / self.name)
+        """All files of the tile that the survey's world contains, relative to either world."""
+        folders = (self.model, self.world / scene.SCENE_FOLDER / self.name)
         return sorted(p.relative_to(self.world) for folder in folders for p in folder.rglob("*") if p.is_file())
 
 
@@ -61,84 +61,86 @@ def assemble(
     name: str,
     tiles: Sequence[TileWorld],
     *,
-    buffer: float = sdf.BUFFER,
-    performer: str = sdf.PERFORMER,
+    buffer: float = sdf.LEVEL_BUFFER_M,
+    performer: str = sdf.PERFORMER_NAME,
     warn: Callable[[str], None] = lambda _: None,
 ) -> Path:
-    """Put the worlds of all tiles into one, `out/world/`, unless it is there and nothing has changed.
+    """Combine the worlds of all tiles into `out/world/`, unless it exists and nothing has changed.
 
     Layout: `<name>.sdf`, `metadata.json`, `models/<tile>/` of every tile, and `scene/`, to export from. The world's
-    origin is that of the tile in the middle. An earlier world stays until the new one is complete.
+    origin is that of the tile in the middle. An earlier world is replaced once the new one is complete.
 
     Args:
-        name: of the world.
-        buffer: metres around a tile within which a performer has it loaded.
-        performer: name of the robot's model, which levels are loaded for.
-        warn: told of files that were changed since the world was made, by hand or by damage.
+        out: output folder of the survey.
+        name: name of the world.
+        tiles: worlds of the tiles.
+        buffer: distance (m) from a tile at which a performer loads it.
+        performer: name of the robot's model, for which levels are loaded.
+        warn: receives a warning for each file that has changed since the world was written, by hand or by damage.
 
     Returns:
         Path of the world's .sdf.
 
     Raises:
-        InputError: a tile's world is incomplete or in another CRS than the first's, or two have one name.
+        InputError: a tile's world is incomplete or its CRS differs from the first's, or two tiles have the same name.
         DataError: there is no tile.
-        SpaceError: the disk is full or can't be written to.
+        SpaceError: the disk is full or not writable.
     """
     if not tiles:
-        raise DataError(name, "no tile of the survey has a world", "See in its report why they failed")
+        raise DataError(name, "no tile of the survey has a world", "The survey's report says why they failed")
     _check(tiles)
     files = {tile.name: tile.files for tile in tiles}
     world = out / "world"
     stamp = _stamp(name, tiles, files, buffer, performer)
     if not _is_current(world, stamp, tiles, files):
-        fresh = out / ".world"
+        temporary = out / ".world"
         try:
-            shutil.rmtree(fresh, ignore_errors=True)
-            _write(fresh, name, tiles, buffer, performer)
-            (fresh / STAMP).write_text(stamp, encoding="utf-8")
-            swap(fresh, world)
+            shutil.rmtree(temporary, ignore_errors=True)
+            _write(temporary, name, tiles, buffer, performer)
+            (temporary / STAMP_FILE).write_text(stamp, encoding="utf-8")
+            swap(temporary, world)
         except OSError as error:
             raise from_os_error(error, out) from None
         finally:
-            shutil.rmtree(fresh, ignore_errors=True)
+            shutil.rmtree(temporary, ignore_errors=True)
     else:
         for path in _edited(world):
-            warn(f"{path} was changed since it was made, and stays so: remove {world} to have it made anew")
+            warn(f"{path} was changed since it was written and is kept: delete {world} to rebuild it")
     return world / f"{name}.sdf"
 
 
 def add_roads(out: Path) -> None:
-    """Write all tiles' roads as one into the world in `out`, once: `<name>.xodr` and `<name>_roads.geojson`.
+    """Write the combined roads of all tiles into the world in `out`, once: `<name>.xodr` and `<name>_roads.geojson`.
 
     Without lanes neither is written.
 
     Raises:
         InputError: the world is incomplete.
-        SpaceError: the disk is full or can't be written to.
+        SpaceError: the disk is full or not writable.
     """
     world = out / "world"
-    if (world / ROADS_STAMP).is_file():
+    if (world / ROADS_STAMP_FILE).is_file():
         return
     try:
         opendrive.write_roads(scene.read_scene(world), world)
-        (world / ROADS_STAMP).touch()
-        os.utime(world / STAMP)  # so that the roads don't count as users' edits
+        (world / ROADS_STAMP_FILE).touch()
+        os.utime(world / STAMP_FILE)  # so that the roads don't count as users' edits
     except OSError as error:
         raise from_os_error(error, world) from None
 
 
 def link(source: str, target: str) -> None:
-    """A hard link where that can be, else a copy; a copy of what users edit, so that no edit reaches the source."""
+    """Make `target` a hard link of `source`; a copy if that fails or users edit such files (edits stay in the copy)."""
     try:
-        if Path(source).suffix in EDITED:
-            raise OSError("users edit this")
+        if Path(source).suffix in USER_EDITABLE_SUFFIXES:
+            raise OSError("users edit this file")
         os.link(source, target)
     except OSError:
         shutil.copy2(source, target)
 
 
 def same_file(source: Path, copy: Path) -> bool:
-    """Whether a file is `link`'s of the source, and neither has been changed since."""
+    """Whether `copy` was made by `link` from the source, and neither has changed since."""
     try:
         a, b = source.stat(), copy.stat()
     except OSError:
@@ -147,17 +149,17 @@ def same_file(source: Path, copy: Path) -> bool:
 
 
 def same_unless_edited(source: Path, copy: Path) -> bool:
-    """`same_file`, but of what users edit only whether it is there."""
-    return copy.is_file() if copy.suffix in EDITED else same_file(source, copy)
+    """`same_file`; of files that users edit, only whether the copy exists."""
+    return copy.is_file() if copy.suffix in USER_EDITABLE_SUFFIXES else same_file(source, copy)
 
 
-def swap(fresh: Path, place: Path) -> None:
-    """Move a finished folder to its place; the one that is there goes only then."""
-    earlier = place.with_name(f".{place.name}-earlier")
+def swap(new: Path, target: Path) -> None:
+    """Rename a finished folder to `target`; an existing folder there is deleted afterwards."""
+    earlier = target.with_name(f".{target.name}-earlier")
     shutil.rmtree(earlier, ignore_errors=True)
-    if place.exists():
-        place.rename(earlier)
-    fresh.rename(place)
+    if target.exists():
+        target.rename(earlier)
+    new.rename(target)
     shutil.rmtree(earlier, ignore_errors=True)
 
 
@@ -165,23 +167,24 @@ def _check(tiles: Sequence[TileWorld]) -> None:
     first = tiles[0]
     names = set[str]()
     for tile in tiles:
-        for file in (tile.world / "metadata.json", tile.model / "model.sdf", tile.world / scene.FOLDER / scene.ABOUT):
+        scene_file = tile.world / scene.SCENE_FOLDER / scene.SCENE_FILE
+        for file in (tile.world / "metadata.json", tile.model / "model.sdf", scene_file):
             if not file.is_file():
-                raise InputError(file, "is missing", 'Make the tile\'s world again, with "gazebo" in export.formats')
+                raise InputError(file, "file not found", 'Export the tile again, with "gazebo" in export.formats')
         if tile.name in names:
-            raise InputError(tile.world, f"is a second tile of the name {tile.name}", "Give each tile its own name")
+            raise InputError(tile.world, f"is a second tile named {tile.name}", "Give each tile a unique name")
         if not _same_system(tile.frame, first.frame):
             raise InputError(
                 tile.world,
-                f"is in {crs.name(tile.frame.crs)} ({tile.frame.unit:g} m a unit), but {first.name} is in "
-                f"{crs.name(first.frame.crs)} ({first.frame.unit:g} m a unit)",
-                "Bring all tiles of a survey to one CRS first",
+                f"is in {crs.name(tile.frame.crs)} ({tile.frame.unit:g} m per unit), but {first.name} is in "
+                f"{crs.name(first.frame.crs)} ({first.frame.unit:g} m per unit)",
+                "Reproject all tiles of a survey to one CRS first",
             )
         names.add(tile.name)
 
 
 def _same_system(a: Frame, b: Frame) -> bool:
-    """Whether two frames are in one CRS, be it written as a code or as WKT."""
+    """Whether two frames have the same CRS, given as code or WKT, and unit."""
     if (a.crs, a.unit) == (b.crs, b.unit):
         return True
     name = crs.name(a.crs)
@@ -189,7 +192,7 @@ def _same_system(a: Frame, b: Frame) -> bool:
 
 
 def _stamp(name: str, tiles: Sequence[TileWorld], files: dict[str, list[Path]], buffer: float, performer: str) -> str:
-    """A digest of everything the world is made from; of files, their sizes and times of change."""
+    """Hash of all inputs of the world; files by their sizes and modification times."""
     parts: list[Any] = [VERSION, name, buffer, performer]
     for tile in tiles:
         paths = [tile.world / "metadata.json", *(tile.world / file for file in files[tile.name])]
@@ -199,9 +202,9 @@ def _stamp(name: str, tiles: Sequence[TileWorld], files: dict[str, list[Path]], 
 
 
 def _is_current(world: Path, stamp: str, tiles: Sequence[TileWorld], files: dict[str, list[Path]]) -> bool:
-    """Whether the world was made of these tiles, and its meshes and textures are theirs."""
+    """Whether the world was built from these tiles, and has their meshes and textures."""
     try:
-        same = (world / STAMP).read_text(errors="replace", encoding="utf-8") == stamp
+        same = (world / STAMP_FILE).read_text(errors="replace", encoding="utf-8") == stamp
     except OSError:
         return False
     pairs = [(tile.world / file, world / file) for tile in tiles for file in files[tile.name]]
@@ -209,29 +212,31 @@ def _is_current(world: Path, stamp: str, tiles: Sequence[TileWorld], files: dict
 
 
 def _edited(world: Path) -> list[Path]:
-    """Files that were written to after the world was finished: users' edits, or damage; nobody can tell which."""
-    finished = (world / STAMP).stat().st_mtime_ns
-    return [p for p in sorted(world.rglob("*")) if p.suffix in EDITED and p.stat().st_mtime_ns > finished]
+    """Files that were modified after the world was finished: edits of the user, or damage."""
+    finished = (world / STAMP_FILE).stat().st_mtime_ns
+    return [
+        p for p in sorted(world.rglob("*")) if p.suffix in USER_EDITABLE_SUFFIXES and p.stat().st_mtime_ns > finished
+    ]
 
 
 def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, performer: str) -> None:
     origin = _origin(tiles)
     first = tiles[0].frame
-    place = sdf.Georeference.of(Frame(first.crs, origin, first.unit))
+    georeference = sdf.Georeference.of(Frame(first.crs, origin, first.unit))
     metadata = {tile.name: _metadata(tile.world / "metadata.json") for tile in tiles}
     placed = [_place(tile, metadata[tile.name], origin) for tile in tiles]
     for tile in tiles:
-        for kept in (Path("models") / tile.name, Path(scene.FOLDER) / tile.name):
-            shutil.copytree(tile.world / kept, folder / kept, copy_function=link)
-    scene.describe(folder, name, Frame(first.crs, origin, first.unit), [tile.name for tile in tiles])
-    sdf.write_levels(folder / f"{name}.sdf", name, place, placed, buffer, performer)
-    about = {
+        for subfolder in (Path("models") / tile.name, Path(scene.SCENE_FOLDER) / tile.name):
+            shutil.copytree(tile.world / subfolder, folder / subfolder, copy_function=link)
+    scene.write_scene_file(folder, name, Frame(first.crs, origin, first.unit), [tile.name for tile in tiles])
+    sdf.write_levels(folder / f"{name}.sdf", name, georeference, placed, buffer, performer)
+    body = {
         "name": name,
         "crs": first.crs,
         "unit_m": first.unit,
         "to_crs": "crs = (world + world_origin_m) / unit_m; world = local + offset_m, local as in a tile's meshes",
         "world_origin_m": list(origin),
-        "wgs84": place and place.facts(),
+        "wgs84": georeference and georeference.as_metadata(),
         "buffer_m": buffer,
         "performer": performer,
         "tiles": {
@@ -243,35 +248,35 @@ def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, p
             }
             for tile, model in zip(tiles, placed, strict=True)
         },
-        "triangles_by_file": {file: n for one in metadata.values() for file, n in _of_models(one).items()},
+        "triangles_by_file": {file: n for one in metadata.values() for file, n in _model_triangles(one).items()},
     }
-    (folder / "metadata.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    (folder / "metadata.json").write_text(json.dumps(body, indent=2) + "\n", encoding="utf-8")
 
 
 def _metadata(path: Path) -> dict[str, Any]:
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except ValueError as error:
-        raise InputError(path, f"is not valid JSON ({error})", "Mend it, or make the tile's world again") from None
+        raise InputError(path, f"is not valid JSON ({error})", "Fix it, or export the tile again") from None
 
 
-def _of_models(metadata: dict[str, Any]) -> dict[str, int]:
-    """Triangles of the mesh files of a tile's model: the others stay with the tile."""
+def _model_triangles(metadata: dict[str, Any]) -> dict[str, int]:
+    """Number of triangles by mesh file of a tile's model; other files stay in the tile's world."""
     return {file: n for file, n in metadata["triangles_by_file"].items() if file.startswith("models/")}
 
 
 def _origin(tiles: Sequence[TileWorld]) -> sdf.Vector:
-    """Origin, in whole metres, of the tile that is nearest to the middle of all: coordinates stay small."""
+    """Origin, in whole metres, of the tile nearest to the middle of the survey, so that coordinates are small."""
     origins = np.array([tile.frame.origin for tile in tiles])
     middle = (origins.min(axis=0) + origins.max(axis=0)) / 2
     x, y, z = np.round(origins[np.argmin(np.linalg.norm(origins - middle, axis=1))]).tolist()
     return x, y, z
 
 
-def _place(tile: TileWorld, metadata: dict[str, Any], origin: sdf.Vector) -> sdf.Placed:
-    """Where a tile's model is in the world, and the box around all its groups."""
+def _place(tile: TileWorld, metadata: dict[str, Any], origin: sdf.Vector) -> sdf.PlacedModel:
+    """Position of a tile's model in the world, and the bounding box of all its groups."""
     groups = metadata["groups"].values()
     low = np.min([group["low_m"] for group in groups], axis=0).tolist()
     high = np.max([group["high_m"] for group in groups], axis=0).tolist()
     offset = np.subtract(tile.frame.origin, origin).tolist()
-    return sdf.Placed(tile.name, tuple(offset), tuple(low), tuple(high))
+    return sdf.PlacedModel(tile.name, tuple(offset), tuple(low), tuple(high))

@@ -1,4 +1,4 @@
-"""Where each face of a tile has its colour from: a photo (which, when, from how far), the cloud's points, or filled."""
+"""Provenance of each face's colour: a photo (which one, when, from what distance), the cloud's points, or inpainted."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from scan2sim.pipeline.io.worlds.scene import Surface
 
 FILLED, POINTS, PHOTO = 0, 1, 2
 SOURCES = ("filled", "points", "photo")
-LEVELS = {64: FILLED, 128: POINTS, 255: PHOTO}
-"""Of the step `texture`'s masks."""
-FIRST = 3
-"""Row of the first view; those before it stand for what is filled, for points, and for a photo that isn't known."""
-UNKNOWN = -1.0
-"""Metres, of what no photo shows."""
+SOURCE_OF_MASK_LEVEL = {64: FILLED, 128: POINTS, 255: PHOTO}
+"""Source for each level of the masks that the step `texture` writes."""
+FIRST_VIEW_ROW = 3
+"""Row of the first view in the table; the rows before it are: filled, points, and an unknown photo."""
+UNKNOWN_DISTANCE = -1.0
+"""Distance (m) of faces without a photo."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """Of the table that faces refer to.
+    """A row of the provenance table, to which faces refer.
 
     Attributes:
         source: one of `SOURCES`.
-        photo: its name, or "".
-        taken: when, ISO 8601 in UTC; "" where the photo's time doesn't tell its date.
+        photo: name of the photo, or "".
+        taken: capture time, ISO 8601 in UTC, or "" if the photo's time gives no date.
     """
 
     source: str
@@ -37,34 +37,37 @@ class Row:
 
 
 def table(views: Sequence[View]) -> list[Row]:
-    """What faces of a tile refer to, given its photos."""
+    """The provenance table of a tile with the given photos."""
     return [*map(Row, SOURCES), *(Row("photo", view.name, _taken(view)) for view in views)]
 
 
 def rows(surface: Surface) -> I32 | None:
-    """(F,) row in the table of each face; None: its texture doesn't tell."""
+    """Row (F,) of each face in the table; None if the texture has no provenance masks."""
     seen = surface.seen()
     if seen is None:
         return None
     lookup = np.zeros(256, np.int32)
-    lookup[list(LEVELS)] = list(LEVELS.values())
+    lookup[list(SOURCE_OF_MASK_LEVEL)] = list(SOURCE_OF_MASK_LEVEL.values())
     row = lookup[seen]
     photo = surface.shape.photo
     if photo is None:
         return row
-    named = (photo >= 0) & ((seen == 255) | (seen == 0))  # 0: too small for a texel
-    return np.where(named, photo + FIRST, row).astype(np.int32)
+    photo_known = (photo >= 0) & ((seen == 255) | (seen == 0))  # 0: too small for a texel
+    return np.where(photo_known, photo + FIRST_VIEW_ROW, row).astype(np.int32)
 
 
 def distance(xyz: F32, row: I32, views: Sequence[View]) -> F32:
-    """(N,) metres from places (N, 3) to the photos of their rows (N,); `UNKNOWN` where none is known, or from above."""
-    out = np.full(len(xyz), UNKNOWN, np.float32)
+    """Distance (N,) in metres from points (N, 3) to the cameras of their rows (N,).
+
+    `UNKNOWN_DISTANCE` without a known photo, and for orthophotos.
+    """
+    out = np.full(len(xyz), UNKNOWN_DISTANCE, np.float32)
     if not views:
         return out
     centre = np.array([view.centre for view in views])
-    of = np.where(row >= FIRST, row - FIRST, 0)
-    near = (row >= FIRST) & np.array([view.camera.model != "orthographic" for view in views])[of]
-    out[near] = np.linalg.norm(xyz[near] - centre[of[near]], axis=1)
+    index = np.where(row >= FIRST_VIEW_ROW, row - FIRST_VIEW_ROW, 0)
+    known = (row >= FIRST_VIEW_ROW) & np.array([view.camera.model != "orthographic" for view in views])[index]
+    out[known] = np.linalg.norm(xyz[known] - centre[index[known]], axis=1)
     return out
 
 

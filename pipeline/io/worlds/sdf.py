@@ -1,20 +1,20 @@
-"""SDF 1.9: a Gazebo world, the static model of a tile, and a world of many tiles in levels.
+"""SDF 1.9 writer: a Gazebo world, the static model of a tile, and a world of many tiles in levels.
 
-Choices, and why:
+Design decisions:
 
-- The world names its systems. A world that names none gets Gazebo's default ones, which leave out
-  the sensors; one that names any gets no default. The names are those of Garden and later; Fortress
-  takes them too since 6.16 (gz-sim #2275).
+- The world lists its systems. A world without any gets Gazebo's default ones, which don't include
+  the sensors; a world that lists any gets no default. The names are those of Garden and later; Fortress
+  accepts them since 6.16 (gz-sim #2275).
 - World axes are the CRS's grid axes, so that world coordinates plus the origin are CRS coordinates.
-  Grid north is not true north: `heading_deg` turns them back by the meridian convergence at the
-  world's origin. With 0 a NavSat sensor would be 3 m off at 100 m where the convergence is 2 degrees.
-- The photos hold the light and shadows of their day: the ambient light is strong, the sun weak, and
-  the tile's surfaces cast no shadow a second time; robots do.
+  Grid north is not true north: `heading_deg` compensates the meridian convergence at the world's
+  origin. With 0 a NavSat sensor would be 3 m off at 100 m where the convergence is 2 degrees.
+- The photos contain the light and shadows of their day: the ambient light is strong, the sun weak, and
+  the tile's surfaces don't cast shadows; robots do.
 - No `<material>`: it would replace the mesh's own textures.
-- Every visual carries its class's LAS code for Gazebo's segmentation cameras.
-- Gazebo loads a level when a performer's box meets the level's box, and unloads it when the performer
-  is `<buffer>` away from it (gz-sim #28: the buffer is no help on the way in). So a level's box is
-  larger than its tile, or a robot would see nothing until it stands on it.
+- Every visual has the LAS code of its class as label for Gazebo's segmentation cameras.
+- Gazebo loads a level when the performer's box intersects the level's box, and unloads it when the
+  performer is `<buffer>` away from it (gz-sim #28: the buffer has no effect on loading). Therefore a
+  level's box is larger than its tile; otherwise a robot would see a tile only when standing on it.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from scan2sim.pipeline.io.geodata import crs
 from scan2sim.pipeline.simulation.collision_shapes import Solid
 from scan2sim.pipeline.simulation.robot import ROBOT, Start
 
-HEADROOM = 500.0
-"""Metres that a level reaches above and below its tile: whatever flies over it sees it."""
-BUFFER = 20.0
-"""Metres around a tile within which a performer has it loaded."""
-PERFORMER = ROBOT.name
-"""Name of the model that levels are loaded for."""
+LEVEL_HEADROOM_M = 500.0
+"""Extent of a level above and below its tile, so that it is loaded for flying robots, too."""
+LEVEL_BUFFER_M = 20.0
+"""Distance from a tile at which a performer loads it."""
+PERFORMER_NAME = ROBOT.name
+"""Name of the model for which levels are loaded."""
 Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedModel:
     """A tile's model in a world.
 
     Attributes:
-        name: of the model.
+        name: name of the model.
         offset: metres from the world's origin to the model's.
-        low, high: corners of the box around its meshes, metres from the model's origin.
+        low, high: corners of the bounding box of its meshes, metres from the model's origin.
     """
 
     name: str
@@ -58,12 +58,12 @@ class Placed:
 
 @dataclass(frozen=True)
 class Georeference:
-    """Where a world's origin is on WGS 84, and how its axes lie.
+    """Position of a world's origin on WGS 84, and heading of its axes.
 
     Attributes:
         latitude, longitude: degrees.
-        elevation: metres, in the height system of the CRS (no vertical shift is applied).
-        heading: degrees counter-clockwise from east to the world's x axis, as SDF counts.
+        elevation: metres, in the height system of the CRS (no vertical transformation is applied).
+        heading: degrees counter-clockwise from east to the world's x axis, as defined by SDF.
     """
 
     latitude: float
@@ -74,11 +74,11 @@ class Georeference:
     @classmethod
     def of(cls, frame: Frame) -> Georeference | None:
         """The georeference of a frame's origin; None for a local frame."""
-        here = crs.to_wgs84(frame)
-        return None if here is None else cls(*here, -degrees(crs.convergence(frame)))
+        position = crs.to_wgs84(frame)
+        return None if position is None else cls(*position, -degrees(crs.convergence(frame)))
 
-    def facts(self) -> dict[str, float | str]:
-        """The same as metadata.json has it."""
+    def as_metadata(self) -> dict[str, float | str]:
+        """The entry `wgs84` of metadata.json."""
         return {
             "latitude_deg": self.latitude,
             "longitude_deg": self.longitude,
@@ -88,46 +88,48 @@ class Georeference:
         }
 
 
-def write_world(path: Path, name: str, place: Georeference | None, offset: Vector, start: Start | None = None) -> None:
+def write_world(
+    path: Path, name: str, georeference: Georeference | None, offset: Vector, start: Start | None = None
+) -> None:
     """Write a world that includes `model://<name>`.
 
     Args:
-        path: of the world's .sdf.
-        name: of the world and its model.
-        place: of the world's origin, or None.
+        path: the world's .sdf file.
+        name: name of the world and its model.
+        georeference: of the world's origin, or None.
         offset: metres from the world's origin to the model's.
-        start: of the robot, `model://robot`, where there is one.
+        start: start pose of the robot, `model://robot`; None: without a robot.
     """
-    path.write_text(_world(path, name, place, _include(name, offset) + _robot(start)), encoding="utf-8")
+    path.write_text(_world(path, name, georeference, _include(name, offset) + _robot(start)), encoding="utf-8")
 
 
 def write_levels(
     path: Path,
     name: str,
-    place: Georeference | None,
-    tiles: Sequence[Placed],
+    georeference: Georeference | None,
+    tiles: Sequence[PlacedModel],
     buffer: float,
     performer: str,
     start: Start | None = None,
 ) -> None:
-    """Write a world of many models, each in a level of its own, so that Gazebo can load those near a robot only.
+    """Write a world of many models, each in its own level, so that Gazebo can load only those near a robot.
 
-    Without Gazebo's option `--levels` all are loaded, whether there is a robot or not.
+    Without Gazebo's option `--levels` all models are loaded, with or without a robot.
 
     Args:
-        path: of the world's .sdf.
-        name: of the world.
-        place: of the world's origin, or None.
+        path: the world's .sdf file.
+        name: name of the world.
+        georeference: of the world's origin, or None.
         tiles: models, found as `model://<name>`.
-        buffer: metres around a tile within which a performer has it loaded; it is unloaded twice as far away.
-        performer: name of the model that levels are loaded for. It need not be there: Gazebo says so, and goes on.
-        start: of the robot, `model://robot`, where there is one.
+        buffer: distance (m) from a tile at which a performer loads it; it is unloaded at twice the distance.
+        performer: name of the model for which levels are loaded. If it doesn't exist, Gazebo only prints a warning.
+        start: start pose of the robot, `model://robot`; None: without a robot.
     """
     path.write_text(
         _world(
             path,
             name,
-            place,
+            georeference,
             "".join(_include(tile.name, tile.offset) for tile in tiles)
             + _robot(start)
             + _levels(tiles, buffer, performer),
@@ -145,20 +147,20 @@ def write_model(folder: Path, name: str, visuals: Mapping[str, int], solids: Seq
     """Write `model.sdf` and `model.config` of a static model.
 
     Args:
-        folder: of the model.
-        name: of the model; its meshes are found as `model://<name>/...`.
+        folder: folder of the model.
+        name: name of the model; its meshes are found as `model://<name>/...`.
         visuals: path of every visual mesh, relative to `folder`, to its label.
-        solids: what bodies collide with; meshes are found as `meshes/collision_<name>.obj`.
+        solids: collision shapes; meshes are found as `meshes/collision_<name>.obj`.
     """
-    shown = "".join(_visual(name, mesh, label) for mesh, label in visuals.items())
-    touched = "".join(_collision(name, solid) for solid in solids)
+    visual_elements = "".join(_visual(name, mesh, label) for mesh, label in visuals.items())
+    collision_elements = "".join(_collision(name, solid) for solid in solids)
     (folder / "model.sdf").write_text(
         f"""<?xml version="1.0"?>
 <sdf version="1.9">
   <model name="{name}">
     <static>true</static>
     <link name="link">
-{shown}{touched}    </link>
+{visual_elements}{collision_elements}    </link>
   </model>
 </sdf>
 """,
@@ -167,8 +169,8 @@ def write_model(folder: Path, name: str, visuals: Mapping[str, int], solids: Seq
     write_config(folder, name, "A street scanned by lidar and photos: textured surfaces, and what bodies collide with.")
 
 
-def write_config(folder: Path, name: str, about: str) -> None:
-    """Write what Gazebo finds a model by, `model.config`, beside its `model.sdf`."""
+def write_config(folder: Path, name: str, description: str) -> None:
+    """Write `model.config`, by which Gazebo finds a model, beside its `model.sdf`."""
     (folder / "model.config").write_text(
         f"""<?xml version="1.0"?>
 <model>
@@ -178,15 +180,15 @@ def write_config(folder: Path, name: str, about: str) -> None:
   <author>
     <name>scan2sim</name>
   </author>
-  <description>{about}</description>
+  <description>{description}</description>
 </model>
 """,
         encoding="utf-8",
     )
 
 
-def _world(path: Path, name: str, place: Georeference | None, content: str, note: str = "") -> str:
-    """A world's SDF: physics, systems and light, and what is in it."""
+def _world(path: Path, name: str, georeference: Georeference | None, content: str, note: str = "") -> str:
+    """SDF of a world: physics, systems, light and `content`; `note` is added to the leading comment."""
     return f"""<?xml version="1.0"?>
 <!-- Run in this folder: GZ_SIM_RESOURCE_PATH=$PWD/models gz sim {path.name}
      (Fortress: IGN_GAZEBO_RESOURCE_PATH=$PWD/models ign gazebo {path.name}){note} -->
@@ -206,7 +208,7 @@ def _world(path: Path, name: str, place: Georeference | None, content: str, note
     <plugin filename="gz-sim-sensors-system" name="gz::sim::systems::Sensors">
       <render_engine>ogre2</render_engine>
     </plugin>
-{_spherical(place)}    <scene>
+{_spherical_coordinates(georeference)}    <scene>
       <ambient>0.7 0.7 0.7 1</ambient>
       <background>0.7 0.8 0.9 1</background>
       <grid>false</grid>
@@ -235,8 +237,8 @@ def _robot(start: Start | None) -> str:
     return _include(ROBOT.name, start.position, start.angles) if start else ""
 
 
-def _levels(tiles: Sequence[Placed], buffer: float, performer: str) -> str:
-    """The plugin that Gazebo looks for by its name; there is no such file, and it needs none."""
+def _levels(tiles: Sequence[PlacedModel], buffer: float, performer: str) -> str:
+    """The plugin element that defines levels; Gazebo parses it by its name and loads no file."""
     return f"""    <plugin filename="dummy" name="gz::sim">
       <performer name="performer">
         <ref>{escape(performer)}</ref>
@@ -246,11 +248,11 @@ def _levels(tiles: Sequence[Placed], buffer: float, performer: str) -> str:
 """
 
 
-def _level(tile: Placed, buffer: float) -> str:
-    reach = (buffer, buffer, HEADROOM)
+def _level(tile: PlacedModel, buffer: float) -> str:
+    margin = (buffer, buffer, LEVEL_HEADROOM_M)
     corners = list(zip(tile.offset, tile.low, tile.high, strict=True))
     x, y, z = (offset + (low + high) / 2 for offset, low, high in corners)
-    dx, dy, dz = (high - low + 2 * r for (_, low, high), r in zip(corners, reach, strict=True))
+    dx, dy, dz = (high - low + 2 * r for (_, low, high), r in zip(corners, margin, strict=True))
     return f"""      <level name="{tile.name}_level">
         <pose>{numbers((x, y, z))} 0 0 0</pose>
         <geometry><box><size>{numbers((dx, dy, dz))}</size></box></geometry>
@@ -276,14 +278,14 @@ def _visual(name: str, mesh: str, label: int) -> str:
 def _collision(name: str, solid: Solid) -> str:
     shape = solid.shape
     if isinstance(shape, Cylinder):
-        place = f"        <pose>{numbers(shape.centre)} {numbers(shape.angles)}</pose>\n"
-        form = f"<cylinder><radius>{shape.radius:.4f}</radius><length>{shape.length:.4f}</length></cylinder>"
+        pose = f"        <pose>{numbers(shape.centre)} {numbers(shape.angles)}</pose>\n"
+        geometry = f"<cylinder><radius>{shape.radius:.4f}</radius><length>{shape.length:.4f}</length></cylinder>"
     else:
-        place, form = "", f"<mesh><uri>model://{name}/meshes/collision_{solid.name}.obj</uri></mesh>"
+        pose, geometry = "", f"<mesh><uri>model://{name}/meshes/collision_{solid.name}.obj</uri></mesh>"
     mu = f"{solid.friction:g}"
     return f"""      <collision name="collision_{solid.name}">
-{place}        <geometry>
-          {form}
+{pose}        <geometry>
+          {geometry}
         </geometry>
         <surface>
           <friction>
@@ -295,20 +297,20 @@ def _collision(name: str, solid: Solid) -> str:
 """
 
 
-def _spherical(place: Georeference | None) -> str:
-    if place is None:
+def _spherical_coordinates(georeference: Georeference | None) -> str:
+    if georeference is None:
         return ""
     return f"""    <spherical_coordinates>
       <surface_model>EARTH_WGS84</surface_model>
       <world_frame_orientation>ENU</world_frame_orientation>
-      <latitude_deg>{place.latitude:.9f}</latitude_deg>
-      <longitude_deg>{place.longitude:.9f}</longitude_deg>
-      <elevation>{place.elevation:.4f}</elevation>
-      <heading_deg>{place.heading:.7f}</heading_deg>
+      <latitude_deg>{georeference.latitude:.9f}</latitude_deg>
+      <longitude_deg>{georeference.longitude:.9f}</longitude_deg>
+      <elevation>{georeference.elevation:.4f}</elevation>
+      <heading_deg>{georeference.heading:.7f}</heading_deg>
     </spherical_coordinates>
 """
 
 
 def numbers(values: Iterable[float]) -> str:
-    """As XML has them, to a thousandth of a millimetre."""
+    """Numbers separated by spaces, as in XML attributes, with 6 decimals (micrometres)."""
     return " ".join(f"{value:.6f}".rstrip("0").rstrip(".") for value in values)

@@ -1,4 +1,4 @@
-"""A textured mesh on disk (a folder with `mesh.npz` and `page_<i>.png`), and what its writers share."""
+"""A textured mesh on disk (a folder with `mesh.npz` and `page_<i>.png`), and functions shared by its writers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F32, I32, Bools, Mesh
 
-PHOTO = "photo.npy"
+PHOTO_FILE = "photo.npy"
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Textured:
         mesh: with `uv` and `page`.
         normal: (V, 3) float32, unit vertex normals.
         pages: image file of every page, indexed by `mesh.page`.
-        photo: (F,) int32 the view that gives each face's detail, -1 where none does; None: not known.
+        photo: (F,) int32 index of the view that gives each face's detail, -1 without one; None: not known.
     """
 
     mesh: Mesh
@@ -35,13 +35,13 @@ class Textured:
 
     @property
     def seen(self) -> tuple[Path, ...]:
-        """Image of every page that says of each texel where its colour is from, where there is one."""
+        """Provenance mask of every page that has one; it gives the source of each texel's colour."""
         masks = (page.with_name(f"{page.stem}_seen.png") for page in self.pages)
         return tuple(mask for mask in masks if mask.is_file())
 
     @property
     def used_pages(self) -> list[int]:
-        """The pages that a face lies on, ascending."""
+        """The pages that have faces, ascending."""
         assert self.mesh.page is not None
         return np.unique(self.mesh.page).tolist()
 
@@ -51,20 +51,20 @@ class Textured:
         return self.keep(self.mesh.page == page)
 
     def keep(self, mask: Bools) -> Textured:
-        """The faces that `mask` (F,) selects; normals stay those of the whole, so no seam shows between parts."""
+        """The faces selected by `mask` (F,); normals stay those of the whole mesh, so that no seam shows."""
         used = np.unique(self.mesh.faces[mask])
         photo = None if self.photo is None else self.photo[mask]
         return replace(self, mesh=self.mesh.keep(mask), normal=self.normal[used], photo=photo)
 
     def parts(self, limit: int) -> list[Textured]:
-        """Spatially compact parts of at most `limit` triangles: halved across the longest side until small enough."""
+        """Spatially compact parts of at most `limit` triangles: halved along the longest side until small enough."""
         centre = self.mesh.corners.mean(axis=1)
 
         def halve(index: npt.NDArray[np.intp]) -> list[npt.NDArray[np.intp]]:
             if len(index) <= limit:
                 return [index]
-            across = np.ptp(centre[index], axis=0).argmax()
-            index = index[np.argsort(centre[index, across], kind="stable")]
+            longest_axis = np.ptp(centre[index], axis=0).argmax()
+            index = index[np.argsort(centre[index, longest_axis], kind="stable")]
             middle = len(index) // 2
             return halve(index[:middle]) + halve(index[middle:])
 
@@ -75,7 +75,7 @@ class Textured:
 
 
 def read(folder: Path) -> Textured | None:
-    """Read a textured mesh; None where it has no faces.
+    """Read a textured mesh; None if it has no faces.
 
     Raises:
         InputError: no texture coordinates, pages out of range, or a page's image is missing.
@@ -85,14 +85,16 @@ def read(folder: Path) -> Textured | None:
     if len(mesh) == 0:
         return None
     if mesh.uv is None or mesh.page is None:
-        raise InputError(path, "has no texture coordinates", "Give the mesh that the `texture` step wrote")
+        raise InputError(path, "has no texture coordinates", "Give the mesh that the step `texture` wrote")
     if mesh.page.min() < 0:
-        raise InputError(path, f"has a face on page {mesh.page.min()}", "Every face must lie on a page: texture again")
+        raise InputError(
+            path, f"has a face on page {mesh.page.min()}", "Every face must have a page: run the step `texture` again"
+        )
     pages = tuple(folder / f"page_{i}.png" for i in range(int(mesh.page.max()) + 1))
     for page in pages:
         if not page.is_file():
-            raise InputError(page, "is missing, and faces of mesh.npz lie on it", "Texture the mesh again")
-    return Textured(mesh, vertex_normals(mesh), pages, _photo(folder / PHOTO, len(mesh)))
+            raise InputError(page, "file not found, but mesh.npz has faces on it", "Run the step `texture` again")
+    return Textured(mesh, vertex_normals(mesh), pages, _photo(folder / PHOTO_FILE, len(mesh)))
 
 
 def _photo(path: Path, count: int) -> I32 | None:
@@ -100,12 +102,12 @@ def _photo(path: Path, count: int) -> I32 | None:
         return None
     photo = np.load(path)
     if photo.shape != (count,):
-        raise InputError(path, f"is of {photo.shape} faces, mesh.npz has {count}", "Export the world again")
+        raise InputError(path, f"has {photo.shape} faces, but mesh.npz has {count}", "Export the world again")
     return np.asarray(photo, np.int32)
 
 
 def vertex_normals(mesh: Mesh) -> F32:
-    """(V, 3) unit normals, the mean of the faces around a vertex weighted by area; upwards where there is none."""
+    """Unit vertex normals (V, 3), the area-weighted mean of adjacent faces; upwards where that is undefined."""
     c = mesh.corners
     cross = np.repeat(np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]), 3, axis=0)
     at, n = mesh.faces.ravel(), len(mesh.vertices)
@@ -117,7 +119,7 @@ def vertex_normals(mesh: Mesh) -> F32:
 
 
 def unique_uv(uv: F32) -> tuple[F32, I32]:
-    """Texture coordinates per corner (F, 3, 2), each said once: (T, 2) and indices (F, 3) into it."""
-    # a pair of float32 is one 64-bit word: sorting words is many times faster than sorting rows
+    """Index texture coordinates per corner (F, 3, 2): unique ones (T, 2) and indices (F, 3) into them."""
+    # a pair of float32 is one 64-bit word, and sorting words is many times faster than sorting rows
     words, index = np.unique(np.ascontiguousarray(uv, np.float32).view(np.uint64).ravel(), return_inverse=True)
     return words.view(np.float32).reshape(-1, 2), index.reshape(-1, 3).astype(np.int32)

@@ -1,1 +1,1 @@
-"""Borders: where tiles that were made apart meet, with the same vertices at the same height."""
+"""Borders between tiles that were built independently: clipping, matching and joining of meshes to shared vertices."""

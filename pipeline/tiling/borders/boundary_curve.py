@@ -1,4 +1,4 @@
-"""The edge that a mesh has on a border: a curve, its chains, and ways along it."""
+"""Boundary curve of a mesh on a tile border: extraction, chains of edges, and shortest paths along it."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ import numpy.typing as npt
 from scan2sim.pipeline.core.types import F64, I64, Bools
 from scan2sim.pipeline.tiling.borders.common_faces import directed_edges
 
-AGAINST = 4.0
-"""What a metre along the other's border costs in the wrong direction."""
-DETOUR, MORE = 3.0, 0.5
-"""What an edge may cost that is made to follow the other's border: so many times its length, and as much more."""
+REVERSE_COST = 4.0
+"""Cost factor for walking along the neighbour's curve against its direction."""
+MAX_DETOUR_RATIO, MAX_DETOUR_EXTRA_M = 3.0, 0.5
+"""Maximum cost of the path that replaces an edge: factor of its length, plus metres."""
 
 
 class Curve(NamedTuple):
-    """The edge that a mesh has on one of its borders.
+    """Boundary curve of a mesh on one of its borders.
 
     Attributes:
-        edges: (E, 2) directed as in their faces; into the mesh's vertices.
-        face: (E,) the face of each.
+        edges: (E, 2) vertex indices, directed as in their faces.
+        face: (E,) face of each edge.
     """
 
     edges: I64
@@ -32,22 +32,22 @@ class Curve(NamedTuple):
 
 
 def curve(faces: npt.NDArray[Any], on: Bools) -> Curve:
-    """The edges of one face alone whose both ends lie `on` (V,) a border."""
+    """The open edges (of a single face) with both ends `on` (V,) a border."""
     near = np.flatnonzero(on[faces].sum(axis=1) > 1)
     edges, face = directed_edges(faces[near]), np.tile(near, 3)
     along = on[edges].all(axis=1)
     edges, face = edges[along], face[along]
     _, index, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    alone = count[index.ravel()] == 1
-    return Curve(edges[alone], face[alone])
+    single = count[index.ravel()] == 1
+    return Curve(edges[single], face[single])
 
 
 def chains(edges: I64, ends: Iterable[int] = ()) -> list[list[int]]:
-    """Edges in a row, as lists of vertices; closed ones name their first vertex again at the end.
+    """Chains of consecutive edges, as lists of vertices; closed chains repeat their first vertex at the end.
 
     Args:
-        edges: (E, 2) directed.
-        ends: vertices where chains end even if they could go on.
+        edges: (E, 2) directed edges.
+        ends: vertices at which chains end even if they could continue.
     """
     after: dict[int, list[int]] = defaultdict(list)
     incoming: dict[int, int] = defaultdict(int)
@@ -56,7 +56,7 @@ def chains(edges: I64, ends: Iterable[int] = ()) -> list[list[int]]:
         incoming[b] += 1
     stops = {v for v in {*after, *incoming} if len(after.get(v, ())) != 1 or incoming.get(v, 0) != 1} | set(ends)
     found = []
-    for start in [*sorted(stops), *sorted(set(after) - stops)]:  # what is left after the open ones are loops
+    for start in [*sorted(stops), *sorted(set(after) - stops)]:  # edges that remain after the open chains are loops
         while after.get(start):
             chain = [start, after[start].pop()]
             while chain[-1] not in stops and after.get(chain[-1]):
@@ -66,10 +66,10 @@ def chains(edges: I64, ends: Iterable[int] = ()) -> list[list[int]]:
 
 
 class Graph:
-    """A neighbour's border curve to walk along.
+    """Graph of a neighbour's boundary curve, for shortest paths along it.
 
     Args:
-        edges: (E, 2) into `xyz`, directed as in the neighbour's faces: the own ones run against them.
+        edges: (E, 2) indices into `xyz`, directed as in the neighbour's faces, opposite to the own curve.
         xyz: (V, 3) metres.
     """
 
@@ -77,35 +77,35 @@ class Graph:
         self.xyz = xyz
         self.next: dict[int, dict[int, float]] = defaultdict(dict)
         length = np.linalg.norm(xyz[edges[:, 0]] - xyz[edges[:, 1]], axis=1)
-        for (a, b), far in zip(edges.tolist(), length.tolist(), strict=True):
-            self.next[b][a] = far
-            self.next[a].setdefault(b, AGAINST * far)
+        for (a, b), metres in zip(edges.tolist(), length.tolist(), strict=True):
+            self.next[b][a] = metres
+            self.next[a].setdefault(b, REVERSE_COST * metres)
 
-    def way(self, a: int, b: int) -> list[int] | None:
-        """Vertices of the cheapest way from a to b, without a; None where it is dear or there is none."""
-        limit = DETOUR * float(np.linalg.norm(self.xyz[a] - self.xyz[b])) + MORE
+    def shortest_path(self, a: int, b: int) -> list[int] | None:
+        """Vertices of the cheapest path from a to b, without a; None if it is too expensive or doesn't exist."""
+        limit = MAX_DETOUR_RATIO * float(np.linalg.norm(self.xyz[a] - self.xyz[b])) + MAX_DETOUR_EXTRA_M
         queue: list[tuple[float, list[int]]] = [(0.0, [a])]
         seen = set()
         while queue:
-            price, way = heappop(queue)
-            if way[-1] == b:
-                return way[1:]
-            if way[-1] in seen:
+            cost, path = heappop(queue)
+            if path[-1] == b:
+                return path[1:]
+            if path[-1] in seen:
                 continue
-            seen.add(way[-1])
-            for vertex, more in self.next[way[-1]].items():
-                if vertex not in seen and price + more <= limit:
-                    heappush(queue, (price + more, [*way, vertex]))
+            seen.add(path[-1])
+            for vertex, edge_cost in self.next[path[-1]].items():
+                if vertex not in seen and cost + edge_cost <= limit:
+                    heappush(queue, (cost + edge_cost, [*path, vertex]))
         return None
 
     def tail(self, last: int, before: int, limit: float) -> list[int]:
-        """Vertices from `last` to where the curve ends, coming from `before`; none where that is far."""
-        way, length = [last], 0.0
-        while len(self.next[way[-1]]) == 2:
-            (step,) = self.next[way[-1]].keys() - {before}
-            length += float(np.linalg.norm(self.xyz[step] - self.xyz[way[-1]]))
+        """Vertices after `last` to the end of the curve, coming from `before`; empty if farther than `limit` metres."""
+        path, length = [last], 0.0
+        while len(self.next[path[-1]]) == 2:
+            (step,) = self.next[path[-1]].keys() - {before}
+            length += float(np.linalg.norm(self.xyz[step] - self.xyz[path[-1]]))
             if length > limit or step == last:
                 return []
-            before = way[-1]
-            way.append(step)
-        return way[1:] if len(self.next[way[-1]]) == 1 else []
+            before = path[-1]
+            path.append(step)
+        return path[1:] if len(self.next[path[-1]]) == 1 else []

@@ -1,4 +1,4 @@
-"""Gap: what lies between two finished meshes at their border."""
+"""Measurement of the gap between two finished meshes at their common border."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from scan2sim.pipeline.tiling.borders.boundary_curve import curve
 from scan2sim.pipeline.tiling.borders.grid import world
 from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
-COUNTERPART = 0.3
-"""Metres within which two borders are parts of one, for the measure."""
-STEP = 0.01
-"""Metres between the places at which a gap is measured."""
+MAX_COUNTERPART_M = 0.3
+"""Distance up to which points of two boundary curves are counterparts."""
+SAMPLE_SPACING_M = 0.01
+"""Spacing of the points at which the gap is measured."""
 
 
 @dataclass(frozen=True)
 class Gap:
-    """What lies between two meshes at their border.
+    """Gap between two meshes at their border.
 
     Attributes:
-        length_m: of the border, the mean of both meshes'.
-        one_sided_m: of both, length without any counterpart within 0.3 m, or beyond the end of the other's border.
-        shared: share of both meshes' border edges that both have, vertex for vertex and bit for bit.
-        max_m, p99_m, mean_m: distance to the other's border, of what has a counterpart.
-        crack_m2: area between the two, of what has a counterpart.
-        overlap_m: how far one of them reaches beyond the border at most.
+        length_m: length of the border, mean of both meshes.
+        one_sided_m: length, of both meshes, without a counterpart within 0.3 m or beyond the end of the other's curve.
+        shared: share of both meshes' border edges that both have, bit-identical.
+        max_m, p99_m, mean_m: distance to the other's curve, where there is a counterpart.
+        crack_m2: area between both curves, where there is a counterpart.
+        overlap_m: maximum extent of a mesh beyond the border.
     """
 
     length_m: float
@@ -42,9 +42,9 @@ class Gap:
 
 
 def gap(a: Mesh, b: Mesh, cell: Cell, neighbour: str) -> Gap:
-    """Walk the border between the mesh `a` of a cell and `b` of its neighbour, every centimetre of both.
+    """Measure the gap between the mesh `a` of a cell and `b` of its neighbour, at every centimetre of both curves.
 
-    Edges of one face alone whose both ends lie within a millimetre of the border count.
+    The curves are the open edges with both ends within a millimetre of the border.
     """
     sides = []
     overlap = 0.0
@@ -56,9 +56,9 @@ def gap(a: Mesh, b: Mesh, cell: Cell, neighbour: str) -> Gap:
     known = [{frozenset((tuple(p), tuple(q))) for p, q in side.tolist()} for side in sides]
     lengths = [float(np.linalg.norm(side[:, 0] - side[:, 1], axis=1).sum()) for side in sides]
     distance, length = np.concatenate(
-        [_apart(sides[0], sides[1], known[1]), _apart(sides[1], sides[0], known[0])], axis=1
+        [_distances(sides[0], sides[1], known[1]), _distances(sides[1], sides[0], known[0])], axis=1
     )
-    paired = distance <= COUNTERPART
+    paired = distance <= MAX_COUNTERPART_M
     edges = len(sides[0]) + len(sides[1])
     return Gap(
         length_m=sum(lengths) / 2,
@@ -72,41 +72,41 @@ def gap(a: Mesh, b: Mesh, cell: Cell, neighbour: str) -> Gap:
     )
 
 
-def _apart(side: F64, other: F64, known: set[frozenset[Any]]) -> F64:
-    """(2, N) of places every centimetre along edges `side` (E, 2, 3): distance to edges `other`, length stood for.
+def _distances(side: F64, other: F64, known: set[frozenset[Any]]) -> F64:
+    """Distance to the edges `other` and represented length (2, N), of points every centimetre on `side` (E, 2, 3).
 
-    Edges among the `known` ones of the other are at no distance at all. Where the other's border ends, what goes on
-    has no counterpart: its distance is infinite.
+    Edges that are also among the `known` ones of the other have distance 0. Points beyond the end of the other's curve
+    have no counterpart: their distance is infinite.
     """
     from scipy.spatial import cKDTree
 
     same = np.array([frozenset((tuple(p), tuple(q))) in known for p, q in side.tolist()], bool)
-    places, length, edge = _along(side)
-    distance = np.zeros(len(places))
-    apart = np.flatnonzero(~same[edge])
+    points, length, edge = _sample_edges(side)
+    distance = np.zeros(len(points))
+    unshared = np.flatnonzero(~same[edge])
     if not len(other):
         distance[:] = np.inf
-    elif len(apart):
-        there, _, there_edge = _along(other)
-        k = min(8, len(there))
-        _, nearest = cKDTree(there).query(places[apart], k=k)
-        p, q = np.moveaxis(other[there_edge[nearest.reshape(-1, k)]], 2, 0)  # (N, k, 3) ends of the nearest edges
-        way = q - p
-        square = np.maximum(np.einsum("ijk,ijk->ij", way, way), 1e-30)
-        along = np.clip(np.einsum("ijk,ijk->ij", places[apart, None] - p, way) / square, 0, 1)
-        away = np.linalg.norm(places[apart, None] - p - along[..., None] * way, axis=2)
-        best = np.arange(len(apart)), away.argmin(axis=1)
+    elif len(unshared):
+        other_points, _, other_edge = _sample_edges(other)
+        k = min(8, len(other_points))
+        _, nearest = cKDTree(other_points).query(points[unshared], k=k)
+        p, q = np.moveaxis(other[other_edge[nearest.reshape(-1, k)]], 2, 0)  # (N, k, 3) ends of the nearest edges
+        direction = q - p
+        square = np.maximum(np.einsum("ijk,ijk->ij", direction, direction), 1e-30)
+        along = np.clip(np.einsum("ijk,ijk->ij", points[unshared, None] - p, direction) / square, 0, 1)
+        to_edge = np.linalg.norm(points[unshared, None] - p - along[..., None] * direction, axis=2)
+        best = np.arange(len(unshared)), to_edge.argmin(axis=1)
         _, node, degree = np.unique(other.reshape(-1, 3), axis=0, return_inverse=True, return_counts=True)
-        ends = (degree == 1)[node.reshape(-1, 2)[there_edge[nearest.reshape(-1, k)]]][best]  # (N, 2) of that edge
+        ends = (degree == 1)[node.reshape(-1, 2)[other_edge[nearest.reshape(-1, k)]]][best]  # (N, 2) of that edge
         past = (ends[:, 0] & (along[best] == 0)) | (ends[:, 1] & (along[best] == 1))
-        distance[apart] = np.where(past, np.inf, away[best])
+        distance[unshared] = np.where(past, np.inf, to_edge[best])
     return np.stack([distance, length])
 
 
-def _along(edges: F64) -> tuple[F64, F64, I64]:
-    """Places every centimetre along edges (E, 2, 3), the length that each stands for, and its edge."""
+def _sample_edges(edges: F64) -> tuple[F64, F64, I64]:
+    """Points every centimetre along edges (E, 2, 3), the length that each represents, and its edge."""
     length = np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1)
-    count = np.maximum(1, np.rint(length / STEP)).astype(np.int64)
+    count = np.maximum(1, np.rint(length / SAMPLE_SPACING_M)).astype(np.int64)
     edge = np.repeat(np.arange(len(edges)), count)
     order = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
     share = ((order + 0.5) / count[edge])[:, None]

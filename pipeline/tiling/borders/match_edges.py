@@ -1,4 +1,4 @@
-"""Follow: how a tile's border is to go along a neighbour's, vertex for vertex."""
+"""Matching of a tile's boundary curve to that of a neighbour, vertex by vertex."""
 
 from __future__ import annotations
 
@@ -14,89 +14,92 @@ from scan2sim.pipeline.tiling.borders.clip import Clipped
 from scan2sim.pipeline.tiling.borders.common_faces import normals
 from scan2sim.pipeline.tiling.borders.grid import world
 
-FACING = 0.1
-"""Metres that a normal's turn by 60 degrees counts for where the counterpart of a vertex is looked for."""
+NORMAL_WEIGHT_M = 0.1
+"""Weight of normals in the search for counterparts: metres that a difference of 60 degrees corresponds to."""
 
 
-class Follow(NamedTuple):
-    """How a border is to follow a neighbour's.
+class BorderMatch(NamedTuple):
+    """Changes that make a boundary curve coincide with a neighbour's.
 
     Attributes:
-        vertices: (M,) that move.
-        places: (M, 3) where to, world metres.
-        welds: (W, 2) vertices that become one.
-        inserts: (face, a, b, places (N, 3)): new vertices on the edge a-b of a face, in order.
-        facts: see `join.join`.
+        vertices: (M,) vertices that move.
+        positions: (M, 3) their new positions, world metres.
+        welds: (W, 2) pairs of vertices to weld.
+        inserts: (face, a, b, positions (N, 3)): new vertices on the edge a-b of a face, in order.
+        facts: metrics, see `join.join`.
     """
 
     vertices: I64
-    places: F64
+    positions: F64
     welds: I64
     inserts: list[tuple[int, int, int, F64]]
     facts: dict[str, float]
 
 
-def follow(name: str, own: Clipped, settled: F64, other: str, theirs: Clipped, there: F64, tolerance: float) -> Follow:
-    """How the tile `name` is to follow the border of the tile `other`.
+def match_border(
+    name: str, own: Clipped, own_xyz: F64, other: str, theirs: Clipped, their_xyz: F64, tolerance: float
+) -> BorderMatch:
+    """Match the boundary curve of the tile `name` to that of the tile `other`.
 
     Args:
         name, own: the tile.
-        settled: (V, 3) world places of its vertices, where those in corners have theirs already.
-        other, theirs, there: the same of the other tile.
-        tolerance: metres that a vertex may be moved.
+        own_xyz: (V, 3) world positions of its vertices, with final positions of vertices in corners.
+        other, theirs, their_xyz: the same of the other tile.
+        tolerance: maximum displacement of a vertex, metres.
     """
-    mine, yours = curve(own.mesh.faces, own.on[other]), curve(theirs.mesh.faces, theirs.on[name])
-    vertices, graph = np.unique(mine.edges), Graph(yours.edges, there)
-    partner, distance = _partners(own.mesh, vertices, theirs.mesh, np.unique(yours.edges), there, tolerance)
+    own_curve, their_curve = curve(own.mesh.faces, own.on[other]), curve(theirs.mesh.faces, theirs.on[name])
+    vertices, graph = np.unique(own_curve.edges), Graph(their_curve.edges, their_xyz)
+    their_vertices = np.unique(their_curve.edges)
+    partner, distance = _partners(own.mesh, vertices, theirs.mesh, their_vertices, their_xyz, tolerance)
     corner = vertices[np.sum([on[vertices] for on in own.on.values()], axis=0) > 1]
-    vertex_at = {tuple(there[v].tolist()): v for v in np.unique(yours.edges).tolist()}
-    for v, place in zip(corner.tolist(), settled[corner].tolist(), strict=True):
+    vertex_at = {tuple(their_xyz[v].tolist()): v for v in their_vertices.tolist()}
+    for v, position in zip(corner.tolist(), own_xyz[corner].tolist(), strict=True):
         partner.pop(v, None)
-        if tuple(place) in vertex_at:
-            partner[v] = vertex_at[tuple(place)]
-    face_of = {(a, b): f for (a, b), f in zip(mine.edges.tolist(), mine.face.tolist(), strict=True)}
+        if tuple(position) in vertex_at:
+            partner[v] = vertex_at[tuple(position)]
+    face_of = {(a, b): f for (a, b), f in zip(own_curve.edges.tolist(), own_curve.face.tolist(), strict=True)}
     target: dict[int, int] = {}
     welds, inserts, followed = [], [], 0
-    single, count = np.unique(mine.edges, return_counts=True)
+    single, count = np.unique(own_curve.edges, return_counts=True)
     ends = set(single[count == 1].tolist()) - set(corner.tolist())
-    for chain in chains(mine.edges, corner.tolist()):
+    for chain in chains(own_curve.edges, corner.tolist()):
         for found in _runs(chain, partner, distance, graph):
-            run, walk, at = _to_the_end(found, ends, graph, tolerance)
+            run, walk, at = _extend_to_ends(found, ends, graph, tolerance)
             target.update((vertex, walk[i]) for vertex, i in zip(run, at, strict=True))
             followed += len(walk) - 1
             for (a, i), (b, j) in pairwise(zip(run, at, strict=True)):
                 if i == j:
                     welds.append((a, b))
                 elif j > i + 1:
-                    inserts.append((face_of[a, b], a, b, there[walk[i + 1 : j]]))
-    moved, to = np.array(list(target), np.int64), there[np.array(list(target.values()), np.int64)]
+                    inserts.append((face_of[a, b], a, b, their_xyz[walk[i + 1 : j]]))
+    moved, to = np.array(list(target), np.int64), their_xyz[np.array(list(target.values()), np.int64)]
     shift = np.linalg.norm(to - world(own.mesh)[moved], axis=1)
     facts = {
         "matched": len(moved),
         "unmatched": len(vertices) - len(moved),
         "mean_m": round(float(shift.mean()), 4) if len(shift) else 0.0,
         "max_m": round(float(shift.max()), 4) if len(shift) else 0.0,
-        "edges": len(yours.edges),
+        "edges": len(their_curve.edges),
         "followed": followed,
     }
-    return Follow(moved, to, np.array(welds, np.int64).reshape(-1, 2), inserts, facts)
+    return BorderMatch(moved, to, np.array(welds, np.int64).reshape(-1, 2), inserts, facts)
 
 
 def _partners(
-    mesh: Mesh, vertices: I64, other: Mesh, others: I64, there: F64, tolerance: float
+    mesh: Mesh, vertices: I64, other: Mesh, others: I64, their_xyz: F64, tolerance: float
 ) -> tuple[dict[int, int], dict[int, float]]:
-    """The nearest of a neighbour's vertices for each, and how far it is; none where that is beyond `tolerance`.
+    """Nearest vertex of the neighbour for each vertex, and its distance; no entry beyond `tolerance`.
 
-    Nearest in place and normal: of a thin wall's two sides, the right one.
+    Nearest in position and normal, to match the correct side of a thin wall.
     """
     from scipy.spatial import cKDTree
 
     if not len(others) or not len(vertices):
         return {}, {}
     xyz = world(mesh)[vertices]
-    tree = cKDTree(np.column_stack([there[others], FACING * _vertex_normals(other, others)]))
-    _, nearest = tree.query(np.column_stack([xyz, FACING * _vertex_normals(mesh, vertices)]))
-    distance = np.linalg.norm(there[others[nearest]] - xyz, axis=1)
+    tree = cKDTree(np.column_stack([their_xyz[others], NORMAL_WEIGHT_M * _vertex_normals(other, others)]))
+    _, nearest = tree.query(np.column_stack([xyz, NORMAL_WEIGHT_M * _vertex_normals(mesh, vertices)]))
+    distance = np.linalg.norm(their_xyz[others[nearest]] - xyz, axis=1)
     close = distance <= tolerance
     v = vertices[close].tolist()
     return (
@@ -109,9 +112,9 @@ class Run(NamedTuple):
     """A part of a chain that follows the neighbour's curve.
 
     Attributes:
-        vertices: the own ones.
-        walk: the neighbour's, in a row.
-        at: each own one's place in the walk: never back.
+        vertices: own vertices.
+        walk: consecutive vertices of the neighbour.
+        at: index of each own vertex in the walk, ascending.
     """
 
     vertices: list[int]
@@ -120,23 +123,23 @@ class Run(NamedTuple):
 
 
 def _runs(chain: list[int], partner: dict[int, int], distance: dict[int, float], graph: Graph) -> Iterable[Run]:
-    """Parts of a chain that follow an edge or more of the neighbour's curve.
+    """Parts of a chain that follow at least one edge of the neighbour's curve.
 
-    Partners may lie back and forth; the walk goes on only: what it would take back is left out of it, and the
-    vertices that led there stay where it turned.
+    Partners may alternate back and forth, but the walk only advances: it omits detours that are walked back, and the
+    vertices of these get the position where the walk turned around.
     """
-    if chain[0] == chain[-1] and distance:  # a loop begins where it is surest
+    if chain[0] == chain[-1] and distance:  # a loop starts at its best match
         first = min(range(len(chain) - 1), key=lambda i: distance.get(chain[i], np.inf))
         chain = [*chain[first:-1], *chain[: first + 1]]
     run = Run([], [], [])
     for vertex in [*chain, -1]:
         to = partner.get(vertex)
-        way = graph.way(run.walk[-1], to) if run.walk and to is not None else None
-        if way is None:
+        path = graph.shortest_path(run.walk[-1], to) if run.walk and to is not None else None
+        if path is None:
             if len(run.walk) > 1:
                 yield run._replace(at=np.minimum.accumulate(run.at[::-1])[::-1].tolist())
             run = Run([], [] if to is None else [to], [])
-        for step in way or ():
+        for step in path or ():
             if run.walk[-2:-1] == [step]:
                 run.walk.pop()
             else:
@@ -146,8 +149,8 @@ def _runs(chain: list[int], partner: dict[int, int], distance: dict[int, float],
             run.at.append(len(run.walk) - 1)
 
 
-def _to_the_end(run: Run, ends: set[int], graph: Graph, limit: float) -> Run:
-    """A run, its walk continued to the ends of the neighbour's curve where it begins or stops at one of `ends`."""
+def _extend_to_ends(run: Run, ends: set[int], graph: Graph, limit: float) -> Run:
+    """Extend a run's walk to the ends of the neighbour's curve if the run starts or ends at one of `ends`."""
     vertices, walk, at = run
     if vertices[-1] in ends:
         walk = [*walk, *graph.tail(walk[-1], walk[-2], limit)]
@@ -160,7 +163,7 @@ def _to_the_end(run: Run, ends: set[int], graph: Graph, limit: float) -> Run:
 
 
 def _vertex_normals(mesh: Mesh, vertices: I64) -> F64:
-    """(N, 3) unit normals of some of a mesh's vertices."""
+    """Unit normals (N, 3) of the given vertices of a mesh."""
     chosen = np.zeros(len(mesh.vertices), bool)
     chosen[vertices] = True
     faces = mesh.faces[chosen[mesh.faces].any(axis=1)]

@@ -1,4 +1,4 @@
-"""Finds of neighbouring tiles made one list: what stands at a border is one thing, and the same one for all tiles."""
+"""Merging of detections of neighbouring tiles: an object at a border becomes one detection, identical in all tiles."""
 
 from __future__ import annotations
 
@@ -6,32 +6,34 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from scan2sim.pipeline.furniture.classify import Thing
+from scan2sim.pipeline.furniture.classify import Detection
 from scan2sim.pipeline.tiling.voronoi_cell import Seed, nearest
 
-NEAR = 2.0
-"""Metres between two feet beyond which nobody asks whether they are one's."""
+MAX_FOOT_DISTANCE_M = 2.0
+"""Distance between the feet of two detections up to which they are compared."""
 
 
-def agreed(finds: Mapping[str, Sequence[Thing]], seeds: Mapping[str, Seed]) -> list[tuple[str, Thing]]:
-    """Everything that tiles tell of, once, each with the tile in whose cell its foot stands, be it asked or not.
+def merged_detections(
+    detections: Mapping[str, Sequence[Detection]], seeds: Mapping[str, Seed]
+) -> list[tuple[str, Detection]]:
+    """All detections without duplicates, each with the name of the tile whose cell contains its foot.
 
-    Of doubles, the tile's word counts in whose cell the thing stands; where both or neither say so of themselves, that
-    of the tile whose name sorts first. So all tiles that know of the same finds come to the same things.
+    Of duplicates, that of the tile whose cell contains the object is kept; if that is both or neither, that of the
+    tile whose name sorts first. All tiles with the same detections therefore get the same result.
 
     Args:
-        finds: by the tile that tells of them, world metres.
-        seeds: of these tiles and all around them.
+        detections: detections of each tile, world metres.
+        seeds: seeds of these tiles and all around them.
     """
     names = sorted(seeds)
-    told = [(name, thing) for name in sorted(finds) for thing in finds[name]]
-    if not told:
+    found = [(name, detection) for name in sorted(detections) for detection in detections[name]]
+    if not found:
         return []
-    feet = np.array([thing.foot[:2] for _, thing in told])
+    feet = np.array([detection.foot[:2] for _, detection in found])
     owner = [names[i] for i in nearest(feet, [seeds[name] for name in names])]
     kept: list[int] = []
-    for i in sorted(range(len(told)), key=lambda i: owner[i] != told[i][0]):  # stable: by name, as told
-        near = [k for k in kept if told[k][0] != told[i][0] and np.hypot(*(feet[k] - feet[i])) < NEAR]
-        if not any(told[k][1].stem.covers(told[i][1].stem) for k in near):
+    for i in sorted(range(len(found)), key=lambda i: owner[i] != found[i][0]):  # stable: then by name and order
+        near = [k for k in kept if found[k][0] != found[i][0] and np.hypot(*(feet[k] - feet[i])) < MAX_FOOT_DISTANCE_M]
+        if not any(found[k][1].stem.covers(found[i][1].stem) for k in near):
             kept.append(i)
-    return [(owner[i], told[i][1]) for i in kept]
+    return [(owner[i], found[i][1]) for i in kept]

@@ -1,4 +1,4 @@
-"""What a rate will be in a while, from what it was: by its moving average, by its trend, by other days at that hour."""
+"""Forecasts of an event rate: moving average, exponentially smoothed trend, and daily profile."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from collections.abc import Callable, Iterable
 from typing import Literal, Protocol
 
 Kind = Literal["average", "trend"]
-"""Forecasts that need no history."""
+"""Forecasts that need no historical data."""
 HOUR, DAY = 3600.0, 86_400.0
 Profile = Callable[[float], float]
-"""A time in seconds to the rate that is usual then."""
+"""Function from a time in seconds to the usual rate at that time, events per second."""
 
 
 class Forecast(Protocol):
-    """Told of counts as time goes by; says rates to come."""
+    """Predicts the rate of events from past counts."""
 
     def observe(self, time: float, seconds: float, count: int) -> None:
-        """So many events came in the `seconds` that ended at `time`."""
+        """Add an observation: `count` events arrived in the `seconds` that ended at `time`."""
 
-    def ahead(self, seconds: float) -> float:
-        """Events a second that are to be expected so many seconds after the last observation."""
+    def predict(self, seconds: float) -> float:
+        """Predicted events per second, `seconds` after the last observation."""
 
 
 class MovingAverage:
-    """It goes on as it was over a window, of so many seconds (D3.2's figure 5, the blue curve)."""
+    """Mean rate over a window of seconds (D3.2's figure 5, the blue curve)."""
 
     def __init__(self, window: float) -> None:
         self._window = window
@@ -33,7 +33,7 @@ class MovingAverage:
         self._seconds, self._count = 0.0, 0
 
     def observe(self, time: float, seconds: float, count: int) -> None:
-        """Of a period."""
+        """Add an observation."""
         self._seen.append((seconds, count))
         self._seconds += seconds
         self._count += count
@@ -42,20 +42,20 @@ class MovingAverage:
             self._seconds -= oldest[0]
             self._count -= oldest[1]
 
-    def ahead(self, seconds: float) -> float:
-        """The mean; 0 before there is any."""
+    def predict(self, seconds: float) -> float:
+        """The mean; 0 before the first observation."""
         return self._count / self._seconds if self._seconds > 0 else 0.0
 
 
 class Trend:
-    """It rises or falls on as it did: level and slope, each smoothed exponentially.
+    """Linear extrapolation by double exponential smoothing of level and slope.
 
     Source: Holt, Forecasting seasonals and trends by exponentially weighted moving averages (1957, reprinted in
     International Journal of Forecasting 20, 2004), for periods of any length.
     """
 
-    SLOWER = 4.0
-    """The slope is smoothed over so many times the level's window: it is much the noisier."""
+    SLOPE_WINDOW_FACTOR = 4.0
+    """The slope is smoothed over this multiple of the level's window, because it is much noisier."""
 
     def __init__(self, window: float) -> None:
         self._window = window
@@ -63,7 +63,7 @@ class Trend:
         self._slope = 0.0
 
     def observe(self, time: float, seconds: float, count: int) -> None:
-        """Of a period."""
+        """Add an observation."""
         rate = count / seconds
         if self._level is None:
             self._level = rate
@@ -71,22 +71,23 @@ class Trend:
         expected = self._level + self._slope * seconds
         level = expected + (1 - math.exp(-2 * seconds / self._window)) * (rate - expected)
         slope = (level - self._level) / seconds
-        self._slope += (1 - math.exp(-2 * seconds / (self.SLOWER * self._window))) * (slope - self._slope)
+        slope_window = self.SLOPE_WINDOW_FACTOR * self._window
+        self._slope += (1 - math.exp(-2 * seconds / slope_window)) * (slope - self._slope)
         self._level = level
 
-    def ahead(self, seconds: float) -> float:
-        """The line, prolonged; never below nothing."""
+    def predict(self, seconds: float) -> float:
+        """Level and slope extrapolated linearly, at least 0."""
         return max(0.0, (self._level or 0.0) + self._slope * seconds)
 
 
-class Blend:
-    """As on other days at that hour, times what today has more or less of it.
+class ScaledProfile:
+    """Daily profile times the ratio of today's events to the profile.
 
-    That ratio is of the events that came within a window to those that were to be expected; as few say little, so many
-    of the profile's own are added to both (the mean of a gamma prior's posterior).
+    The ratio compares observed and expected events within a window. `PRIOR_EVENTS` are added to both, so that a few
+    events have little influence (posterior mean with a gamma prior).
     """
 
-    PRIOR = 20.0
+    PRIOR_EVENTS = 20.0
 
     def __init__(self, window: float, usual: Profile) -> None:
         self._usual, self._window = usual, window
@@ -94,7 +95,7 @@ class Blend:
         self._expected, self._count, self._now = 0.0, 0, 0.0
 
     def observe(self, time: float, seconds: float, count: int) -> None:
-        """Of a period."""
+        """Add an observation."""
         self._now = time
         expected = self._usual(time - seconds / 2) * seconds
         self._seen.append((expected, count))
@@ -105,18 +106,18 @@ class Blend:
             self._expected -= oldest[0]
             self._count -= oldest[1]
 
-    def ahead(self, seconds: float) -> float:
-        """The profile's rate then, times the ratio."""
-        ratio = (self._count + self.PRIOR) / (self._expected + self.PRIOR)
+    def predict(self, seconds: float) -> float:
+        """Rate of the profile at that time, times the ratio."""
+        ratio = (self._count + self.PRIOR_EVENTS) / (self._expected + self.PRIOR_EVENTS)
         return self._usual(self._now + seconds) * ratio
 
 
-def daily(history: Iterable[tuple[float, int]], first_day: int = 0, width: float = 300.0) -> Profile:
-    """The profile of a day, from what came on others: means over `width` seconds of the day, by straight lines.
+def daily_profile(history: Iterable[tuple[float, int]], first_day: int = 0, width: float = 300.0) -> Profile:
+    """Mean daily profile of past events, in bins of `width` seconds with linear interpolation.
 
     Args:
-        history: seconds from midnight of the first day, and events; of whole days.
-        first_day: of the week, 0 for Monday; days of the weekend count for themselves.
+        history: (seconds from midnight of the first day, number of events), covering whole days.
+        first_day: day of the week, 0 for Monday; weekends have a separate profile.
     """
     bins = round(DAY / width)
     counts = {weekend: [0.0] * bins for weekend in (False, True)}

@@ -1,4 +1,4 @@
-"""A node that asks for workers: of each queue that is told of on the bus, as many as it needs."""
+"""Autoscaler node: requests workers for every queue whose state is published on the bus."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import time
 from typing import Any
 
-from scan2sim.services.monitoring.autoscale.forecast import DAY, Blend, daily
+from scan2sim.services.monitoring.autoscale.forecast import DAY, ScaledProfile, daily_profile
 from scan2sim.services.monitoring.autoscale.policy import Scaler
 from scan2sim.services.monitoring.events.bus import Bus
 from scan2sim.services.monitoring.events.schema import QueueState, WorkersWanted
@@ -16,12 +16,13 @@ from scan2sim.services.monitoring.settings.bus import ScaleParams
 
 
 class ScalerNode(ros.Node):  # type: ignore[misc]
-    """Decides whenever a queue is told of."""
+    """Decides on the number of workers at every published state of a queue."""
 
     def __init__(self, params: ScaleParams, node_name: str = "scaler") -> None:
         self._params, self._scalers = params, dict[str, Scaler]()
-        self._usual = daily((seconds, 1) for seconds, _ in read_events(params.history)) if params.history else None
-        self._scaler()  # refuses limits that contradict each other, before anything is joined
+        history = ((seconds, 1) for seconds, _ in read_events(params.history)) if params.history else None
+        self._usual = daily_profile(history) if history else None
+        self._new_scaler()  # raises for contradictory limits, before the node is created
         super().__init__(node_name)
         if params.log_file:
             params.log_file.parent.mkdir(parents=True, exist_ok=True)
@@ -29,30 +30,30 @@ class ScalerNode(ros.Node):  # type: ignore[misc]
         self._bus = Bus(self, params)
         self._bus.events.on("queue", self._decide)
 
-    def _scaler(self) -> Scaler:
-        return Scaler(self._params, Blend(self._params.window, self._usual) if self._usual else None)
+    def _new_scaler(self) -> Scaler:
+        return Scaler(self._params, ScaledProfile(self._params.window, self._usual) if self._usual else None)
 
     def _decide(self, state: QueueState) -> None:
-        scaler = self._scalers.get(state.queue) or self._scalers.setdefault(state.queue, self._scaler())
-        wanted = scaler.decide(_local(), state.seconds, state.arrived, state.waiting)
-        rate = scaler.forecast.ahead(self._params.lead)
+        scaler = self._scalers.get(state.queue) or self._scalers.setdefault(state.queue, self._new_scaler())
+        wanted = scaler.decide(_seconds_since_monday(), state.seconds, state.arrived, state.waiting)
+        rate = scaler.forecast.predict(self._params.lead)
         if wanted != state.workers:
-            told = WorkersWanted(queue=state.queue, workers=wanted, rate=rate, waiting=state.waiting)
-            self._bus.events.send("workers", told)
+            request = WorkersWanted(queue=state.queue, workers=wanted, rate=rate, waiting=state.waiting)
+            self._bus.events.send("workers", request)
         if self._log:
             self._log.write(
                 json.dumps({"time": time.time(), "wanted": wanted, "rate": rate, **state.model_dump()}) + "\n"
             )
 
     def destroy_node(self) -> Any:
-        """Leave the bus, and end."""
+        """Leave the bus and destroy the node."""
         self._bus.close()
         if self._log:
             self._log.close()
         return super().destroy_node()
 
 
-def _local() -> float:
-    """Seconds since a Monday's midnight, by the clock on the wall here: 1970 began on a Thursday."""
+def _seconds_since_monday() -> float:
+    """Seconds since midnight of some Monday, local time: 1970 began on a Thursday."""
     now = time.time()
     return now + time.localtime(now).tm_gmtoff - 4 * DAY

@@ -1,4 +1,4 @@
-"""How many workers a stream of events needs: decided from its rate and from what waits, never beyond the limits."""
+"""Autoscaling policy: number of workers from the predicted rate and the queue length, within limits."""
 
 from __future__ import annotations
 
@@ -12,38 +12,42 @@ from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.step import Params
 from scan2sim.services.monitoring.autoscale.forecast import Forecast, Kind, MovingAverage, Trend
 
-MOST = 1000
-"""Workers, at most."""
+MAX_WORKERS = 1000
+"""Upper bound of the setting `max_workers`."""
 
 
 class ScalingParams(Params):
-    """When workers are asked for; capacity and delay are D3.2's (section 3.2, table 3)."""
+    """Settings of the autoscaling policy; the defaults of capacity and delay are D3.2's (section 3.2, table 3)."""
 
-    capacity: Annotated[float, Field(ge=0.001, le=1e6, description="Events a second that one worker does.")] = 2.0
+    capacity: Annotated[float, Field(ge=0.001, le=1e6, description="Events per second that one worker processes.")] = (
+        2.0
+    )
     utilisation: Annotated[
-        float, Field(ge=0.05, le=1, description="Share of its capacity that a worker is planned for.")
+        float, Field(ge=0.05, le=1, description="Target utilisation: fraction of its capacity planned per worker.")
     ] = 0.55
     delay: Annotated[
-        float, Field(ge=0.001, le=86_400, description="Seconds within which all that waits is to be done.")
+        float, Field(ge=0.001, le=86_400, description="Seconds within which the waiting events are to be processed.")
     ] = 4.0
-    min_workers: Annotated[int, Field(ge=0, le=MOST, description="Workers, at least.")] = 1
-    max_workers: Annotated[int, Field(ge=1, le=MOST, description="Workers, at most.")] = 5
+    min_workers: Annotated[int, Field(ge=0, le=MAX_WORKERS, description="Minimum number of workers.")] = 1
+    max_workers: Annotated[int, Field(ge=1, le=MAX_WORKERS, description="Maximum number of workers.")] = 5
     window: Annotated[float, Field(ge=0.01, le=86_400, description="Seconds over which the rate is averaged.")] = 300.0
     cool_down: Annotated[
-        float, Field(ge=0, le=86_400, description="Seconds for which fewer must have done before one is stopped.")
+        float, Field(ge=0, le=86_400, description="Scale down only if fewer workers sufficed for this many seconds.")
     ] = 300.0
-    forecast: Annotated[Kind, Field(description="How the rate is forecast: its average or its trend.")] = "average"
+    forecast: Annotated[Kind, Field(description="Rate forecast: moving average, or linear trend (Holt's method).")] = (
+        "average"
+    )
     lead: Annotated[
         float,
-        Field(ge=0, le=86_400, description="Seconds ahead that are forecast: those that a worker takes to start."),
+        Field(ge=0, le=86_400, description="Forecast horizon in seconds: the time that a worker takes to start."),
     ] = 0.0
 
 
 def workers_for(rate: float, waiting: int, params: ScalingParams) -> int:
-    """Workers for a rate, in events a second, and for all that waits to be done in time; within the limits.
+    """Workers needed for a rate in events per second and for processing the waiting events in time, within the limits.
 
-    A worker is planned for part of its capacity only: at 55 % one event in 20 000 waits over 4.5 s where one worker is
-    alone (M/D/1: Poisson arrivals, each served in the same time), and fewer where there are more.
+    Workers are planned at a target utilisation below 1: at 55 %, one event in 20 000 waits longer than 4.5 s with a
+    single worker (M/D/1 queue: Poisson arrivals, constant service time), and fewer with more workers.
     """
     by_rate = rate / (params.capacity * params.utilisation)
     by_queue = waiting / (params.capacity * params.delay)
@@ -51,10 +55,10 @@ def workers_for(rate: float, waiting: int, params: ScalingParams) -> int:
 
 
 class Scaler:
-    """Asks for more at once, for fewer only when fewer have done for a while."""
+    """Scales up at once, but down only after a cool-down (hysteresis)."""
 
     def __init__(self, params: ScalingParams, forecast: Forecast | None = None) -> None:
-        """`forecast` stands for the parameters' own, where it needs a history.
+        """`forecast` replaces the one of the parameters, for forecasts that need historical data.
 
         Raises:
             SettingError: the limits contradict each other.
@@ -68,16 +72,16 @@ class Scaler:
         self._needed: deque[tuple[float, int]] = deque()
 
     def decide(self, time: float, seconds: float, events: int, waiting: int) -> int:
-        """Workers that are to run now.
+        """Decide how many workers should run now.
 
         Args:
-            time: in seconds.
-            seconds: that ended then.
-            events: that came meanwhile.
-            waiting: events that wait.
+            time: end of the period, seconds.
+            seconds: length of the period.
+            events: number of events that arrived in the period.
+            waiting: number of waiting events.
         """
         self.forecast.observe(time, seconds, events)
-        needed = workers_for(self.forecast.ahead(self.params.lead), waiting, self.params)
+        needed = workers_for(self.forecast.predict(self.params.lead), waiting, self.params)
         self._needed.append((time, needed))
         while self._needed[0][0] < time - self.params.cool_down:
             self._needed.popleft()

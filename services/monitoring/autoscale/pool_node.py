@@ -1,4 +1,4 @@
-"""A node that has as many workers run as the bus asks for."""
+"""Node that keeps as many workers running as the autoscaler requests on the bus."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from scan2sim.services.monitoring.autoscale.actuators import Actuator
 from scan2sim.services.monitoring.events.bus import Bus
 from scan2sim.services.monitoring.events.schema import WorkersWanted
 from scan2sim.services.monitoring.node.monitor import ros
-from scan2sim.services.monitoring.settings.bus import FollowedParams
+from scan2sim.services.monitoring.settings.bus import WorkerPoolParams
 
 
 class PoolNode(ros.Node):  # type: ignore[misc]
-    """Does what events `workers` of one queue say, within its own limits."""
+    """Applies the `workers` events of one queue, within its own limits."""
 
-    def __init__(self, params: FollowedParams, queue: str, workers: Actuator, node_name: str = "pool") -> None:
-        """Start as many as there are to be at least.
+    def __init__(self, params: WorkerPoolParams, queue: str, workers: Actuator, node_name: str = "pool") -> None:
+        """Start the minimum number of workers.
 
         Args:
-            queue: whose events are followed.
-            workers: what starts and stops them; closed with the node.
+            queue: name of the queue whose events are applied.
+            workers: starts and stops the workers; closed with the node.
 
         Raises:
             SettingError: the limits contradict each other.
@@ -39,7 +39,7 @@ class PoolNode(ros.Node):  # type: ignore[misc]
             self._workers.scale(max(self._params.min_workers, min(self._params.max_workers, wanted.workers)))
 
     def destroy_node(self) -> Any:
-        """Stop all workers, and end."""
+        """Stop all workers and destroy the node."""
         self._bus.close()
         self._workers.close()
         return super().destroy_node()

@@ -1,4 +1,4 @@
-"""The live page of the event bus.
+"""Dashboard of the event bus: a live web page.
 
-Begin with `app`; `state` and `history` hold what the page shows.
+Begin with `app`; `state` and `history` hold the data that the page displays.
 """

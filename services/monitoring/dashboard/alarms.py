@@ -1,6 +1,6 @@
-"""Alarms as events of the bus say: what is raised now, and what was cleared lately.
+"""Alarms published on the bus: those that are raised now, and those that were cleared recently.
 
-Bounds: `RAISED` alarms that are raised (a new one is refused beyond), the last `CLEARED` that were cleared.
+Bounds: `MAX_RAISED` raised alarms (further ones are rejected) and the latest `MAX_CLEARED` cleared ones.
 """
 
 from __future__ import annotations
@@ -10,46 +10,50 @@ from collections import deque
 from typing import Any
 
 from scan2sim.pipeline.core.errors import printable
-from scan2sim.services.monitoring.dashboard.history import NAME, Refused
+from scan2sim.services.monitoring.dashboard.history import MAX_NAME_CHARS, RejectedError
 from scan2sim.services.monitoring.events.schema import Alarm
 
-RAISED, CLEARED = 256, 32
+MAX_RAISED, MAX_CLEARED = 256, 32
 
 
-class Raised:
-    """Takes alarms; may be used from any thread."""
+class AlarmStates:
+    """Current state of all alarms; thread-safe."""
 
     def __init__(self) -> None:
         self._raised: dict[tuple[str, str], dict[str, Any]] = {}
-        self._cleared: deque[dict[str, Any]] = deque(maxlen=CLEARED)
+        self._cleared: deque[dict[str, Any]] = deque(maxlen=MAX_CLEARED)
         self._lock = threading.Lock()
 
-    def take(self, alarm: Alarm, at: float) -> None:
-        """Keep what an alarm says at a time, seconds since the epoch.
+    def add(self, alarm: Alarm, at: float) -> None:
+        """Update the state by an alarm event received at a time, seconds since the epoch.
 
         Raises:
-            Refused: there is no room.
+            RejectedError: too many alarms are raised.
         """
-        place = alarm.rule, alarm.subject
+        key = alarm.rule, alarm.subject
         with self._lock:
-            known = self._raised.pop(place, None)
+            known = self._raised.pop(key, None)
             if alarm.state == "cleared":
-                self._cleared.appendleft((known or _shown(alarm) | {"since": None}) | {"until": at})
-            elif len(self._raised) >= RAISED:
-                raise Refused(f"of more than {RAISED} alarms: no room")
+                self._cleared.appendleft((known or _display(alarm) | {"since": None}) | {"until": at})
+            elif len(self._raised) >= MAX_RAISED:
+                raise RejectedError(f"over the limit of {MAX_RAISED} alarms: no room")
             else:
-                self._raised[place] = _shown(alarm) | {"since": known["since"] if known else alarm.since}
+                self._raised[key] = _display(alarm) | {"since": known["since"] if known else alarm.since}
 
     def state(self) -> dict[str, list[dict[str, Any]]]:
-        """Alarms, JSON-able, the latest first: `raised` and `cleared`.
+        """JSON-serializable lists `raised` and `cleared`, the latest first.
 
-        Each with `rule`, `subject`, `value` as it was raised last, `since` (null: before anybody listened) and, if it
-        is cleared, `until`; seconds since the epoch.
+        Each alarm has `rule`, `subject`, `value` when it was last raised, `since` (null: raised before the history of
+        the page) and, if it is cleared, `until`; times in seconds since the epoch.
         """
         with self._lock:
             latest_first = sorted(self._raised.values(), key=lambda one: -one["since"])
             return {"raised": latest_first, "cleared": list(self._cleared)}
 
 
-def _shown(alarm: Alarm) -> dict[str, Any]:
-    return {"rule": printable(alarm.rule)[:NAME], "subject": printable(alarm.subject)[:NAME], "value": alarm.value}
+def _display(alarm: Alarm) -> dict[str, Any]:
+    return {
+        "rule": printable(alarm.rule)[:MAX_NAME_CHARS],
+        "subject": printable(alarm.subject)[:MAX_NAME_CHARS],
+        "value": alarm.value,
+    }

@@ -1,4 +1,4 @@
-"""The live page of the event bus, in a browser: nodes as six plots, runs and alarms (D3.2, chapter 3)."""
+"""Web service of the dashboard: plots of nodes, runs, queues and alarms, live in a browser (D3.2, chapter 3)."""
 
 from __future__ import annotations
 
@@ -19,103 +19,106 @@ from prometheus_client import Gauge
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services import kafka
 from scan2sim.services.http import factory
-from scan2sim.services.monitoring.dashboard.history import History, grid
-from scan2sim.services.monitoring.dashboard.state import Noticed
+from scan2sim.services.monitoring.dashboard.history import History, bucket_edges
+from scan2sim.services.monitoring.dashboard.state import BusState
 from scan2sim.services.monitoring.settings.dashboard import PageParams
 
 log = logging.getLogger(__name__)
 
-TICK = 1.0
-"""Seconds between two messages to a live page."""
-TOLD_AGAIN = 15.0
-"""Seconds whose buckets a live page is told again: records come late."""
-EVENTS_BACK = 21_600.0
-"""Seconds before its start from which it shows runs and alarms, at least: they last."""
-LONGEST = 31 * 86_400
-"""Seconds of a window, at most."""
+UPDATE_INTERVAL_S = 1.0
+"""Pause between two server-sent events to a live page."""
+RESENT_WINDOW_S = 15.0
+"""Latest part of the window that is resent with every update, because records may arrive late."""
+MIN_EVENT_HISTORY_S = 21_600.0
+"""History of events that is read at least: runs and alarms last longer than records matter."""
+MAX_WINDOW_S = 31 * 86_400
+"""Longest time window of a request."""
 
 Time = Annotated[float, Query(ge=0, le=1e11)]
-Seconds = Annotated[float, Query(ge=1, le=LONGEST)]
+Seconds = Annotated[float, Query(ge=1, le=MAX_WINDOW_S)]
 Names = Annotated[list[str], Query(max_length=1000)]
 
 
-class Reader:
-    """Reads a topic of Kafka, in a thread of its own."""
+class TopicReader:
+    """Reads a Kafka topic in a background thread."""
 
-    def __init__(self, servers: str, topic: str, back: float, take: Callable[[bytes], None]) -> None:
-        """Have `take` called with what comes, and came in the last `back` seconds."""
-        self._servers, self._topic, self._back, self._take = servers, topic, back, take
+    def __init__(self, servers: str, topic: str, history_s: float, callback: Callable[[bytes], None]) -> None:
+        """`callback` is called with every message, beginning with those of the last `history_s` seconds."""
+        self._servers, self._topic, self._history_s, self._callback = servers, topic, history_s, callback
         self._thread = threading.Thread(target=self._read, name=f"{topic} for the page", daemon=True)
         self._ended = threading.Event()
         self._connected = False
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def close(self) -> None:
-        """End."""
+        """Stop the thread."""
         self._ended.set()
         self._thread.join(15.0)
 
     def is_alive(self) -> bool:
-        """Whether it goes on reading."""
+        """Whether the thread is running."""
         return self._thread.is_alive()
 
     def is_connected(self) -> bool:
-        """Whether Kafka has given it the topic."""
+        """Whether Kafka has assigned the topic to it."""
         return self._connected
 
     def _read(self) -> None:
-        since = time.time() - self._back
-        group = f"scan2sim-page-{uuid.uuid4().hex}"  # its own: every page reads all
-        read = kafka.read(self._servers, self._topic, group=group, since=since, connected=self._connect, wait=0.5)
-        for body in read:
+        since = time.time() - self._history_s
+        group = f"scan2sim-page-{uuid.uuid4().hex}"  # its own consumer group, so that every dashboard gets all messages
+        bodies = kafka.read(
+            self._servers, self._topic, group=group, since=since, connected=self._set_connected, wait=0.5
+        )
+        for body in bodies:
             if self._ended.is_set():
                 return
             if body is not None:
-                self._take(body)
+                self._callback(body)
 
-    def _connect(self, connected: bool) -> None:
+    def _set_connected(self, connected: bool) -> None:
         if connected != self._connected:
-            log.warning("Kafka at %s %s %s", self._servers, "gives" if connected else "no longer gives", self._topic)
+            change = "connected to" if connected else "lost the connection to"
+            log.warning("%s topic %s of Kafka at %s", change, self._topic, self._servers)
         self._connected = connected
 
 
 @dataclass(frozen=True)
 class Sources:
-    """What the page shows, and who reads it."""
+    """Data of the dashboard and the readers that fill it."""
 
     history: History
-    noticed: Noticed
-    records: Reader
-    events: Reader
+    bus_state: BusState
+    records: TopicReader
+    events: TopicReader
 
     @classmethod
     def of(cls, params: PageParams) -> Sources:
-        """Empty ones; `start` has them filled."""
+        """Create them empty; `start` starts the readers."""
         now, servers = time.time(), params.kafka_bootstrap_servers
-        history, noticed = History(now), Noticed(now)
-        events = Reader(servers, params.events_topic, max(EVENTS_BACK, params.back), noticed.take)
-        return cls(history, noticed, Reader(servers, params.topic, params.back, history.take), events)
+        history, bus_state = History(now), BusState(now)
+        events = TopicReader(servers, params.events_topic, max(MIN_EVENT_HISTORY_S, params.back), bus_state.add)
+        return cls(history, bus_state, TopicReader(servers, params.topic, params.back, history.add), events)
 
     def start(self) -> None:
-        """Begin to read."""
+        """Start both readers."""
         self.records.start()
         self.events.start()
 
     def close(self) -> None:
-        """Read no more."""
+        """Stop both readers."""
         self.records.close()
         self.events.close()
 
     def is_connected(self) -> bool:
-        """Whether Kafka has given one of the topics; the other comes with the first who sends to it."""
+        """Whether Kafka has assigned one of the topics; the other is created when something is published on it."""
         return self.records.is_connected() or self.events.is_connected()
 
 
 def application(params: PageParams, sources: Sources) -> FastAPI:
-    """The page, and what it asks for.
+    """Web application with the page and its API.
 
     Raises:
         InputError: the token can't be read.
@@ -128,7 +131,7 @@ def application(params: PageParams, sources: Sources) -> FastAPI:
         public=("/",),
     )
     history = sources.history
-    _count(app, sources)
+    _register_metrics(app, sources)
 
     def state() -> dict[str, Any]:
         now = time.time()
@@ -140,7 +143,7 @@ def application(params: PageParams, sources: Sources) -> FastAPI:
             "limits": params.limit.model_dump(exclude_none=True),
             "now": now,
             **history.state(),
-            **sources.noticed.state(now),
+            **sources.bus_state.state(now),
         }
 
     @app.get("/", include_in_schema=False)
@@ -153,14 +156,14 @@ def application(params: PageParams, sources: Sources) -> FastAPI:
         to: Time,
         nodes: Names = [],  # noqa: B006
     ) -> dict[str, Any]:
-        """What nodes did between two times, seconds since the epoch, in buckets (`History.window`)."""
-        if not 0 < to - begin <= LONGEST:
-            raise SettingError("from, to", f"must be in order, up to {LONGEST} s apart", "Choose another range")
-        return {"state": state(), **history.window(grid(begin, to), nodes)}
+        """Statistics of the nodes between two times, seconds since the epoch, in buckets (`History.window`)."""
+        if not 0 < to - begin <= MAX_WINDOW_S:
+            raise SettingError("from, to", f"must be in order, up to {MAX_WINDOW_S} s apart", "Choose another range")
+        return {"state": state(), **history.window(bucket_edges(begin, to), nodes)}
 
     @app.get("/api/live")
     def live(seconds: Seconds = 300.0, nodes: Names = []) -> StreamingResponse:  # noqa: B006
-        """The last so many seconds, then once a second what is new: server-sent events."""
+        """Server-sent events: the last `seconds`, then an update every second."""
         return StreamingResponse(_events(history, state, seconds, nodes), media_type="text/event-stream")
 
     return app
@@ -169,49 +172,49 @@ def application(params: PageParams, sources: Sources) -> FastAPI:
 async def _events(
     history: History, state: Callable[[], dict[str, Any]], seconds: float, nodes: list[str]
 ) -> AsyncIterator[str]:
-    """First all; then the window's last buckets, which replace those of the same times, and runs that have changed."""
+    """First the whole window; then its latest buckets, which replace those of the same times, and changed runs."""
     since, versions = 0.0, dict[str, int]()
     while True:
         now = time.time()
-        edges = grid(now - seconds, now)
+        edges = bucket_edges(now - seconds, now)
         step = edges[1] - edges[0]
         window = await asyncio.to_thread(history.window, edges[edges >= since], nodes)
-        told = state()
-        for run in told["runs"]:
+        current = state()
+        for run in current["runs"]:
             if versions.get(run["run"]) == run["version"]:
                 del run["details"]
-        versions = {run["run"]: run["version"] for run in told["runs"]}
-        yield f"data: {json.dumps({'state': told, 'begin': edges[0], **window})}\n\n"
-        since = edges[-1] - max(2 * step, TOLD_AGAIN) - step
-        await asyncio.sleep(TICK)
+        versions = {run["run"]: run["version"] for run in current["runs"]}
+        yield f"data: {json.dumps({'state': current, 'begin': edges[0], **window})}\n\n"
+        since = edges[-1] - max(2 * step, RESENT_WINDOW_S) - step
+        await asyncio.sleep(UPDATE_INTERVAL_S)
 
 
-def _count(app: FastAPI, sources: Sources) -> None:
+def _register_metrics(app: FastAPI, sources: Sources) -> None:
     registry, history = app.state.registry, sources.history
-    nodes = Gauge("scan2sim_page_nodes", "Nodes that the page shows", registry=registry)
+    nodes = Gauge("scan2sim_page_nodes", "Nodes on the dashboard", registry=registry)
     nodes.set_function(lambda: len(history.state()["nodes"]))
-    records = Gauge("scan2sim_page_records", "Records since the page began", ("shown",), registry=registry)
+    records = Gauge("scan2sim_page_records", "Records received since the start", ("shown",), registry=registry)
     records.labels("yes").set_function(lambda: history.counts["shown"])
     records.labels("no").set_function(lambda: history.counts.total() - history.counts["shown"])
-    refused = Gauge("scan2sim_page_events_refused", "Events since the page began that were none", registry=registry)
-    refused.set_function(sources.noticed.counts.total)
-    alarms = Gauge("scan2sim_page_alarms", "Alarms that are raised", registry=registry)
-    alarms.set_function(lambda: len(sources.noticed.alarms.state()["raised"]))
+    rejected = Gauge("scan2sim_page_events_refused", "Events rejected since the start", registry=registry)
+    rejected.set_function(sources.bus_state.counts.total)
+    alarms = Gauge("scan2sim_page_alarms", "Raised alarms", registry=registry)
+    alarms.set_function(lambda: len(sources.bus_state.alarms.state()["raised"]))
 
 
-def serve(params: PageParams, told: Callable[[str], None]) -> None:
-    """Serve the page until Ctrl-C; `told` is told what a user is to know.
+def serve(params: PageParams, notify: Callable[[str], None]) -> None:
+    """Serve the dashboard until Ctrl-C; `notify` is called with messages for the user.
 
     Raises:
-        SettingError: it can't listen where it is to.
-        InputError: token, certificate or key can't be read.
+        SettingError: it can't listen on the address or port.
+        InputError: the token, certificate or key can't be read.
     """
     sources = Sources.of(params)
     app = application(params, sources)
 
     def listening(address: str) -> None:
         topics = f"{params.topic} and {params.events_topic}"
-        told(f"{address} shows {topics} of {params.kafka_bootstrap_servers}; Ctrl-C ends it")
+        notify(f"dashboard of {topics} on {params.kafka_bootstrap_servers}: {address} (stop with Ctrl-C)")
 
     sources.start()
     try:

@@ -1,45 +1,46 @@
-"""How far a node's clock is off, by when its records come: for places in time, not for latencies (`clock_sync.py`).
+"""Clock skew of a node, estimated from the arrival of its records: to place them in time, not for latencies.
 
-Kafka's own times don't tell: a message bears its producer's, unless its topic is set up otherwise.
+Latencies use `clock_sync.py`. Kafka's timestamps are no help: by default they are the producer's.
 """
 
 from __future__ import annotations
 
 from collections import deque
 
-OFF = 2.0
-"""Seconds by which a clock must be off to be told from records that took a while."""
-RECORDS = 10
-"""Records from which that is told."""
-PACE = 0.5
-"""Share of their periods over which these must have come: what waited for a broker comes in a rush."""
+SKEW_THRESHOLD_S = 2.0
+"""Smaller skews are indistinguishable from transmission delays and count as 0."""
+SKEW_WINDOW = 10
+"""Number of latest records from which the skew is estimated."""
+MIN_ARRIVAL_PACE = 0.5
+"""The records of the window must arrive over this fraction of their periods: buffered ones arrive in a burst."""
 
 
-class Skew:
-    """Of one node.
+class ClockSkew:
+    """Clock skew of one node.
 
     Attributes:
-        behind: seconds by which its clock is behind this machine's; negative: ahead; 0 within `OFF`, or not known yet.
+        behind: seconds by which its clock is behind this machine's; negative: ahead; 0: below the threshold or unknown.
     """
 
     def __init__(self) -> None:
-        self._last: deque[tuple[float, float]] = deque(maxlen=RECORDS)
+        self._last: deque[tuple[float, float]] = deque(maxlen=SKEW_WINDOW)
         self.behind = 0.0
 
-    def add(self, came: float, told: float, period: float) -> float:
-        """Take a record into account: when it came, by this machine's clock, and when it was told, by the node's.
+    def add(self, arrived: float, created: float, period: float) -> float:
+        """Update the estimate by a record's arrival, by this machine's clock, and its creation, by the node's clock.
 
         Returns:
-            By how much `behind` has changed.
+            The change of `behind`.
         """
-        self._last.append((came, came - told))
-        least = min(delay for _, delay in self._last)  # what came fastest shows most of the clock
-        steady = len(self._last) == RECORDS and came - self._last[0][0] >= PACE * period * (RECORDS - 1)
+        self._last.append((arrived, arrived - created))
+        min_delay = min(delay for _, delay in self._last)  # closest to the skew alone
+        min_span = MIN_ARRIVAL_PACE * period * (SKEW_WINDOW - 1)
+        steady = len(self._last) == SKEW_WINDOW and arrived - self._last[0][0] >= min_span
         found = before = self.behind
-        if least < min(before, -OFF):  # nothing comes before it was told
-            found = least
+        if min_delay < min(before, -SKEW_THRESHOLD_S):  # nothing arrives before it was created
+            found = min_delay
         elif steady:
-            found = least if abs(least) > OFF else 0.0
-        if abs(found - before) > OFF / 2:
+            found = min_delay if abs(min_delay) > SKEW_THRESHOLD_S else 0.0
+        if abs(found - before) > SKEW_THRESHOLD_S / 2:
             self.behind = found
         return self.behind - before

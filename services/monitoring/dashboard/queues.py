@@ -1,6 +1,6 @@
-"""Queues as events of the bus say (`events.QueueState`): how each fared over its last period.
+"""Latest states of the queues that are published on the bus (`schema.QueueState`).
 
-Bounds: `QUEUES` queues; a new one takes the place of that which is silent the longest, and is refused where none is.
+Bound: `MAX_QUEUES`; a new queue replaces the one that has been silent for the longest, and is rejected if none is.
 """
 
 from __future__ import annotations
@@ -9,55 +9,55 @@ import threading
 from typing import Any
 
 from scan2sim.pipeline.core.errors import printable
-from scan2sim.services.monitoring.dashboard.history import NAME, Refused
+from scan2sim.services.monitoring.dashboard.history import MAX_NAME_CHARS, RejectedError
 from scan2sim.services.monitoring.events.schema import QueueState
 
-QUEUES = 128
-SILENT = 20.0
-"""Seconds beyond its period without a word after which a queue counts as silent."""
+MAX_QUEUES = 128
+SILENT_AFTER_S = 20.0
+"""A queue without a new state for so long, in addition to its period, counts as silent."""
 
 
 class Queues:
-    """Takes states of queues; may be used from any thread."""
+    """Latest state of each queue; thread-safe."""
 
     def __init__(self) -> None:
         self._queues: dict[str, tuple[float, QueueState]] = {}
         self._lock = threading.Lock()
 
-    def take(self, said: QueueState, at: float) -> None:
-        """Keep what a queue says at a time, seconds since the epoch.
+    def add(self, state: QueueState, at: float) -> None:
+        """Store the state of a queue received at a time, seconds since the epoch.
 
         Raises:
-            Refused: there is no room.
+            RejectedError: too many queues are active.
         """
         with self._lock:
-            self._queues.pop(said.queue, None)
-            if len(self._queues) >= QUEUES:
-                longest = next(iter(self._queues))
-                if not _is_silent(*self._queues[longest], at):
-                    raise Refused(f"of more than {QUEUES} queues: no room")
-                del self._queues[longest]
-            self._queues[said.queue] = at, said
+            self._queues.pop(state.queue, None)
+            if len(self._queues) >= MAX_QUEUES:
+                oldest = next(iter(self._queues))
+                if not _is_silent(*self._queues[oldest], at):
+                    raise RejectedError(f"over the limit of {MAX_QUEUES} queues: no room")
+                del self._queues[oldest]
+            self._queues[state.queue] = at, state
 
     def state(self, now: float) -> list[dict[str, Any]]:
-        """Queues by name, JSON-able.
+        """JSON-serializable states of the queues, sorted by name.
 
-        Each with `queue`, `silent`, per second `arrived`, `done` and `refused`, and what `QueueState` has of now:
+        Each has `queue`, `silent`, the rates per second `arrived`, `done` and `refused`, and as in `QueueState`
         `waiting`, `oldest_done` (seconds), `workers`.
         """
         with self._lock:
             known = sorted(self._queues.items())
-        return [_shown(said) | {"silent": _is_silent(at, said, now)} for _, (at, said) in known]
+        return [_display(state) | {"silent": _is_silent(at, state, now)} for _, (at, state) in known]
 
 
-def _is_silent(at: float, said: QueueState, now: float) -> bool:
-    return now - at > said.seconds + SILENT
+def _is_silent(at: float, state: QueueState, now: float) -> bool:
+    return now - at > state.seconds + SILENT_AFTER_S
 
 
-def _shown(said: QueueState) -> dict[str, Any]:
-    seconds = max(said.seconds, 1e-3)
+def _display(state: QueueState) -> dict[str, Any]:
+    seconds = max(state.seconds, 1e-3)
     return {
-        "queue": printable(said.queue)[:NAME],
-        **{name: getattr(said, name) / seconds for name in ("arrived", "done", "refused")},
-        **{name: getattr(said, name) for name in ("waiting", "oldest_done", "workers")},
+        "queue": printable(state.queue)[:MAX_NAME_CHARS],
+        **{name: getattr(state, name) / seconds for name in ("arrived", "done", "refused")},
+        **{name: getattr(state, name) for name in ("waiting", "oldest_done", "workers")},
     }

@@ -1,4 +1,4 @@
-"""Events of the bus: their schema, transport over ROS 2 and Kafka, alarm rules.
+"""Events of the bus: their schema, their transport over ROS 2 and Kafka, alarm rules.
 
-Begin with `schema`; `rules` raise alarms with hysteresis, `alarm_node` runs them.
+Begin with `schema`; `rules` defines alarms with hysteresis, `alarm_node` evaluates them.
 """

@@ -1,12 +1,12 @@
-"""Events of the bus: programs define kinds of messages of their own, send them, and attach actions to them.
+"""Events of the bus: programs define their own kinds of events, send them, and register callbacks for them.
 
     events = Events("counter")
-    events.define("count", Count)                     # a pydantic model: what isn't so is refused, here and elsewhere
+    events.define("count", Count)                     # a pydantic model: other bodies are rejected by all programs
     events.on("count", lambda count: print(count.vehicles))
     events.send("count", Count(vehicles=3))
 
-On the bus an event is JSON (`Event`), which programs in any language read from ROS 2 or Kafka (`bus.Bus` joins both);
-`python -m scan2sim.services.monitoring.events.schema` prints its JSON Schema, and those of the bus's own kinds.
+On the bus an event is JSON (`Event`), readable from ROS 2 or Kafka in any language (`bus.Bus` connects to both).
+`python -m scan2sim.services.monitoring.events.schema` prints its JSON Schema and those of the built-in kinds.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.monitoring.node import record
-from scan2sim.services.outbox import Once, new_ids
+from scan2sim.services.outbox import Deduplicator, new_ids
 
 log = logging.getLogger(__name__)
 
 RECORD = "record"
-"""The kind under which monitors' records come: as they are, a dict by D3.2's names."""
+"""Kind under which monitoring records are delivered: as a dict with the field names of D3.2."""
 
 
 class Body(BaseModel):
-    """What an event says; of other programs' kinds, too."""
+    """Base class of event bodies, also for the kinds of other programs."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Alarm(Body):
-    """A rule is broken, or kept again.
+    """A rule's alarm was raised or cleared.
 
     Attributes:
-        rule: its name.
-        subject: what it is about: a topic, a node, or both.
-        value: of the rule's metric, now.
-        since: seconds since the epoch, from when on it was so.
+        rule: name of the rule.
+        subject: topic, node, queue, or "topic at node".
+        value: current value of the rule's metric.
+        since: when the condition started to hold, seconds since the epoch.
     """
 
     state: Literal["raised", "cleared"]
@@ -55,16 +55,16 @@ class Alarm(Body):
 
 
 class QueueState(Body):
-    """What became of a queue of events over a period.
+    """Statistics of a queue of events over a period.
 
     Attributes:
-        queue: its name.
-        seconds: of the period.
-        arrived, done, refused: events that came, were done, and had no room, meanwhile.
-        waiting: events that wait or are worked on.
-        oldest: seconds since the longest waiting one was sent; 0 of none.
-        oldest_done: likewise, when it was done, the oldest of those done meanwhile.
-        workers: that run.
+        queue: name of the queue.
+        seconds: length of the period.
+        arrived, done, refused: number of events that arrived, were processed, and were rejected in the period.
+        waiting: events that wait or are being processed.
+        oldest: age of the oldest waiting event, seconds since it was sent; 0 without any.
+        oldest_done: largest age of an event at the time it was done in the period, seconds.
+        workers: running workers.
     """
 
     queue: str
@@ -79,7 +79,7 @@ class QueueState(Body):
 
 
 class WorkersWanted(Body):
-    """So many workers are to run for a queue, as its rate (events a second) and what waits ask for."""
+    """Autoscaler's request: number of workers for a queue, with its rate (events per second) and waiting events."""
 
     queue: str
     workers: int
@@ -93,17 +93,17 @@ Count = Annotated[int, Field(ge=0)]
 
 
 class RunState(Body):
-    """How a run of steps fares (`scan2sim run`, a survey): published as steps change, and every five seconds.
+    """Progress of a run (`scan2sim run`, a survey): published when its tasks change state, and every five seconds.
 
     Attributes:
-        run: its id, unlike any other's.
-        command: what runs, as "survey".
-        source: what of, as it was named: a tile, a survey, a drive.
-        host: the machine that it is run from.
-        state: "stopped" by its user.
-        steps: that it has, as far as they are known; of these `running`, `done`, `kept` from before, and `failed`.
-        seconds: since it began.
-        message: why it failed.
+        run: unique id.
+        command: command that runs, such as "survey".
+        source: its input as given by the user: a tile, a survey, a drive.
+        host: machine on which the command was started.
+        state: "stopped" if the user stopped it.
+        steps: number of tasks known so far; of these `running`, `done`, `kept` (cached) and `failed`.
+        seconds: elapsed time.
+        message: cause of a failure.
     """
 
     run: Name
@@ -121,17 +121,17 @@ class RunState(Body):
 
 
 class StepState(Body):
-    """How a step of a run fares: told once a second at most where it has come further, else every few seconds.
+    """Progress of a task of a run: published at most once per second on progress, else every few seconds.
 
     Attributes:
         run: id of its run.
-        tile: of a survey; "" where one tile is made for itself.
-        step: its name within the tile, as "poisson.terrain".
-        progress: share that is done, 0 to 1.
-        seconds: that it has run, or took; None: it hasn't run.
-        memory: peak of its processes, bytes; None: not known, as long as it runs.
-        message: what it is at, or why it failed.
-        host: the machine that it runs on; None: who tells doesn't know.
+        tile: tile of a survey; "" for a run on a single tile.
+        step: its name within the tile, such as "poisson.terrain".
+        progress: completed fraction, 0 to 1.
+        seconds: run time so far, or in total; None: it hasn't run.
+        memory: peak memory of its processes, bytes; None: unknown while it runs.
+        message: what it is working on, or the cause of a failure.
+        host: machine on which it runs; None: unknown to the publisher.
     """
 
     run: Name
@@ -149,16 +149,16 @@ class Event(BaseModel):
     """An event on the bus.
 
     Attributes:
-        id: unlike any other's: twice the same is the same event.
-        time: seconds since the epoch, when it was sent.
-        sender: a program's name.
-        kind: which schema its body has.
+        id: unique id; two events with the same id are duplicates.
+        time: when it was sent, seconds since the epoch.
+        sender: name of the sending program.
+        kind: determines the schema of the body.
     """
 
     model_config = ConfigDict(frozen=True, populate_by_name=True)
 
     schema_name: Literal["scan2sim-event-1"] = Field("scan2sim-event-1", alias="schema")
-    """Changes when a field does."""
+    """Schema identifier; changes whenever a field does."""
     id: str = Field(alias="record id")
     time: float
     sender: str
@@ -166,26 +166,26 @@ class Event(BaseModel):
     body: dict[str, Any]
 
     @property
-    def share(self) -> str:
-        """What it counts for in a spool, where room is short: a flood of one kind doesn't crowd out alarms."""
+    def category(self) -> str:
+        """Category in an outbox (`outbox.Outbox`): its kind, so that a flood of one kind doesn't displace alarms."""
         return self.kind
 
     def json_line(self) -> str:
-        """As one line of JSON."""
+        """Serialize as one line of JSON."""
         return self.model_dump_json(by_alias=True)
 
 
 class Outlet(Protocol):
-    """Takes events to others."""
+    """Publishes events to other programs."""
 
     def send(self, event: Event, /) -> None:
-        """Take one, at once."""
+        """Accept an event without blocking."""
 
     def close(self) -> None:
-        """Take no more."""
+        """Release all resources."""
 
 
-Action = Callable[[Any], None]
+Callback = Callable[[Any], None]
 KINDS: dict[str, type[BaseModel]] = {
     "alarm": Alarm,
     "queue": QueueState,
@@ -193,58 +193,59 @@ KINDS: dict[str, type[BaseModel]] = {
     "run": RunState,
     "step": StepState,
 }
-"""Those of the bus itself."""
+"""Built-in kinds."""
 
 
 class Events:
-    """Sends events, and does what is attached to them; may be used from any thread, actions are called one by one.
+    """Sends events and calls the callbacks registered for them; thread-safe, callbacks are called one at a time.
 
     Attributes:
-        malformed: messages that came, and are no events.
+        malformed: number of received messages that were not valid events.
     """
 
     def __init__(self, sender: str) -> None:
-        self._sender, self._next_id, self._once = sender, new_ids(), Once()
-        self._kinds, self._actions = dict(KINDS), defaultdict[str, list[Action]](list)
+        self._sender, self._next_id, self._deduplicator = sender, new_ids(), Deduplicator()
+        self._kinds, self._callbacks = dict(KINDS), defaultdict[str, list[Callback]](list)
         self._lock = threading.RLock()
         self.outlets: list[Outlet] = []
         self.malformed = 0
 
     def define(self, kind: str, schema: type[BaseModel]) -> None:
-        """Say what the body of a kind of events is.
+        """Define the body of a kind of events.
 
         Raises:
-            SettingError: that kind is another already.
+            SettingError: the kind is already defined with another body.
         """
         if self._kinds.setdefault(kind, schema) is not schema or kind == RECORD:
-            raise SettingError(kind, "is a kind of events already", "Choose another name")
+            raise SettingError(kind, "this kind of event is already defined", "Choose another name")
 
-    def on(self, kind: str, action: Action) -> None:
-        """Have `action(body)` called with every event of a kind, own ones too; of `RECORD` with monitors' records."""
+    def on(self, kind: str, callback: Callback) -> None:
+        """Register `callback(body)` for every event of a kind, own ones included; `RECORD`: monitoring records."""
         if kind != RECORD:
-            self._known(kind)
-        self._actions[kind].append(action)
+            self._schema(kind)
+        self._callbacks[kind].append(callback)
 
     def send(self, kind: str, body: BaseModel) -> Event:
-        """Send an event, and do what is attached to it here.
+        """Send an event and call the callbacks registered for it in this program.
 
         Raises:
-            SettingError: the kind isn't defined, or the body isn't of its schema.
+            SettingError: the kind isn't defined, or the body has another type.
         """
-        if not isinstance(body, self._known(kind)):
-            raise SettingError(kind, f"is no {type(body).__name__}", f"Send a {self._kinds[kind].__name__}")
+        if not isinstance(body, self._schema(kind)):
+            cause = f"events of this kind have no body of type {type(body).__name__}"
+            raise SettingError(kind, cause, f"Send a {self._kinds[kind].__name__}")
         event = Event(
             id=self._next_id(), time=time.time(), sender=self._sender, kind=kind, body=body.model_dump(mode="json")
         )
         for outlet in self.outlets:
             outlet.send(event)
         with self._lock:
-            self._once.new(event.id)
-            self._act(kind, body)
+            self._deduplicator.is_new(event.id)
+            self._dispatch(kind, body)
         return event
 
-    def take(self, line: str | bytes) -> None:
-        """Do what is attached to what came over the bus; twice the same is done once, what none defined is left."""
+    def receive(self, line: str | bytes) -> None:
+        """Call the callbacks for a message from the bus; duplicates and undefined kinds are ignored."""
         try:
             fields = json.loads(line)
             if fields.get("schema") == record.SCHEMA:
@@ -255,25 +256,25 @@ class Events:
                     return
                 kind, record_id, body = event.kind, event.id, self._kinds[event.kind].model_validate(event.body)
             with self._lock:
-                if self._once.new(record_id):
-                    self._act(kind, body)
-        except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:  # pydantic's, too
+                if self._deduplicator.is_new(record_id):
+                    self._dispatch(kind, body)
+        except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:  # incl. pydantic's
             self.malformed += 1
-            if str(self.malformed).strip("0") == "1":  # the 1st, 10th, 100th, ...: a flood of them fills no log
+            if str(self.malformed).strip("0") == "1":  # log only the 1st, 10th, 100th, ...
                 cause = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
-                log.warning("message %d that is no event was left: %s (%.100r)", self.malformed, cause, line)
+                log.warning("ignored malformed event number %d: %s (%.100r)", self.malformed, cause, line)
 
-    def _known(self, kind: str) -> type[BaseModel]:
+    def _schema(self, kind: str) -> type[BaseModel]:
         if kind not in self._kinds:
-            raise SettingError(kind, "there is no such kind of events", "Define it, as Events.define(kind, schema)")
+            raise SettingError(kind, "unknown kind of event", "Define it with Events.define(kind, schema)")
         return self._kinds[kind]
 
-    def _act(self, kind: str, body: Any) -> None:
-        for action in self._actions[kind]:
+    def _dispatch(self, kind: str, body: Any) -> None:
+        for callback in self._callbacks[kind]:
             try:
-                action(body)
-            except Exception:  # one program's action keeps no other from its own
-                log.exception("an action on %r failed", kind)
+                callback(body)
+            except Exception:  # the other callbacks must still be called
+                log.exception("a callback for events of kind %r failed", kind)
 
 
 if __name__ == "__main__":

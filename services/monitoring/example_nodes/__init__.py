@@ -1,1 +1,1 @@
-"""Nodes to try the bus with: who talks, who talks as a data set says, who listens (D3.2, section 3.1)."""
+"""Example nodes for trying out the event bus: talker, dataset talker, listener and worker (D3.2, section 3.1)."""

@@ -1,4 +1,4 @@
-"""Sends messages when, and as large as, a file says: a line of CSV each, seconds from the start and bytes."""
+"""Dataset talker: replays a CSV file of messages, one line each: seconds from the start and size in bytes."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from pathlib import Path
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.services.monitoring.node.monitor import STRING, Monitor, ros
-from scan2sim.services.monitoring.settings.monitor import LARGEST, DatasetParams
+from scan2sim.services.monitoring.settings.monitor import MAX_MESSAGE_BYTES, DatasetParams
 
-LATE = 0.001
-"""Seconds before its time from which on a message is due."""
+TIMER_TOLERANCE_S = 0.001
+"""A message is sent up to this long before it is due."""
 
 
 class DatasetTalker(Monitor):
-    """Replays a file."""
+    """Publishes messages at the times and with the sizes given in a CSV file."""
 
     def __init__(self, params: DatasetParams) -> None:
         self._events = read_events(params.data)
-        super().__init__(params.name, **params.monitored())
-        self._speed, self._field = params.speed, params.size_as_field
+        super().__init__(params.name, **params.monitor_settings())
+        self._speed, self._size_as_field = params.speed, params.size_as_field
         self._publisher = self.create_publisher(ros.message_type(STRING), params.topic, 100)
         self._subscribers = params.subscribers
         self._began: float | None = None
@@ -32,7 +32,7 @@ class DatasetTalker(Monitor):
 
     @property
     def finished(self) -> bool:
-        """Whether all is sent."""
+        """Whether all messages were sent."""
         return self._next is None
 
     def _send_due(self) -> None:
@@ -41,23 +41,23 @@ class DatasetTalker(Monitor):
                 return
             self._began = time.monotonic()
         now = (time.monotonic() - self._began) * self._speed
-        while self._next is not None and self._next[0] <= now + LATE:
+        while self._next is not None and self._next[0] <= now + TIMER_TOLERANCE_S:
             seconds, size = self._next
-            data = json.dumps({"time": seconds, "size": size}) if self._field else "x" * size
+            data = json.dumps({"time": seconds, "size": size}) if self._size_as_field else "x" * size
             self._publisher.publish(ros.message(STRING, data=data))
             self._next = next(self._events, None)
 
 
 def read_events(path: Path) -> Iterator[tuple[float, int]]:
-    """Seconds from the start and bytes, in order of time; a header line is skipped.
+    """Iterate over (seconds from the start, size in bytes) of a CSV file; a header line is skipped.
 
     Raises:
-        InputError: a line that isn't so.
+        InputError: the file can't be read, or a line is invalid or out of order.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, f"can't be read ({error})", "Give a CSV file: seconds, bytes") from None
+        raise InputError(path, f"can't be read ({error})", "Give a CSV file with lines seconds,bytes") from None
     before = 0.0
     events = []
     for number, row in enumerate(csv.reader(text.splitlines()), 1):
@@ -66,10 +66,10 @@ def read_events(path: Path) -> Iterator[tuple[float, int]]:
         except (ValueError, IndexError):
             if number == 1:
                 continue
-            raise InputError(path, f"line {number} is not 'seconds,bytes'", "Mend or delete it") from None
-        if not (math.isfinite(seconds) and seconds >= before and 0 <= size <= LARGEST):
-            remedy = f"Seconds must not go back, bytes are from 0 to {LARGEST}"
-            raise InputError(path, f"line {number} holds {seconds:g} s and {size} bytes", remedy)
+            raise InputError(path, f"line {number} is not 'seconds,bytes'", "Fix or delete the line") from None
+        if not (math.isfinite(seconds) and seconds >= before and 0 <= size <= MAX_MESSAGE_BYTES):
+            remedy = f"Seconds must not decrease, bytes must be from 0 to {MAX_MESSAGE_BYTES}"
+            raise InputError(path, f"line {number} has {seconds:g} s and {size} bytes", remedy)
         before = seconds
         events.append((seconds, size))
     return iter(events)

@@ -1,4 +1,4 @@
-"""Listens to a topic, and says what it heard."""
+"""Listener: subscribes to strings on a topic and logs each message's size."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from scan2sim.services.monitoring.settings.monitor import ListenerParams
 
 
 class Listener(Monitor):
-    """Hears strings."""
+    """Logs the size of each received string."""
 
     def __init__(self, params: ListenerParams, node_name: str = "listener") -> None:
-        super().__init__(node_name, **params.monitored())
-        self.create_subscription(ros.message_type(STRING), params.topic, self._hear, 10)
+        super().__init__(node_name, **params.monitor_settings())
+        self.create_subscription(ros.message_type(STRING), params.topic, self._on_message, 10)
 
-    def _hear(self, message: Any) -> None:
-        self.get_logger().info(f"I heard: {len(message.data)} chars")
+    def _on_message(self, message: Any) -> None:
+        self.get_logger().info(f"received {len(message.data)} characters")

@@ -1,4 +1,4 @@
-"""Sends messages of a size at an interval."""
+"""Talker: publishes strings of a fixed size at a fixed interval."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from scan2sim.services.monitoring.settings.monitor import TalkerParams
 
 
 class Talker(Monitor):
-    """Sends strings."""
+    """Publishes the same string periodically."""
 
     def __init__(self, params: TalkerParams) -> None:
-        super().__init__(params.name, **params.monitored())
+        super().__init__(params.name, **params.monitor_settings())
         self._message = ros.message(STRING, data="x" * params.size)
         self._publisher = self.create_publisher(ros.message_type(STRING), params.topic, 10)
-        self.create_timer(params.interval, self._talk)
+        self.create_timer(params.interval, self._publish)
 
-    def _talk(self) -> None:
+    def _publish(self) -> None:
         self._publisher.publish(self._message)

@@ -1,6 +1,6 @@
-"""A worker to try scaling with: takes a given time over each event. Reads a line, answers with a line.
+"""Example worker for autoscaling: takes a fixed time per event. Reads a line per event and replies with a line.
 
-Seconds an event are its argument: half a one is D3.2's worker, which does two events a second.
+Its argument is the time per event in seconds: 0.5 corresponds to D3.2's worker, which processes two events per second.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ import time
 
 
 def command(seconds: float) -> list[str]:
-    """That starts one; Python's libraries are left out, so it is there in a blink."""
+    """Command line that starts a worker; it skips `site` (-I -S), so that it starts fast."""
     return [sys.executable, "-I", "-S", __file__, repr(seconds)]
 
 
 def main() -> None:
-    """Work until there is no more input."""
+    """Process events until the end of the input."""
     for _ in sys.stdin:
         time.sleep(float(sys.argv[1]))
         print("done", flush=True)

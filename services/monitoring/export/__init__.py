@@ -1,4 +1,4 @@
-"""Where records go: Kafka, files, Prometheus, an archive in Parquet.
+"""Sinks of records: Kafka, log files, Prometheus, and an archive in Parquet.
 
 Begin with `sinks`.
 """

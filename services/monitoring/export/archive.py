@@ -1,8 +1,8 @@
-"""Records kept for analysis: Parquet by hour, and queries over them.
+"""Archive of records for analysis: Parquet files by hour, and aggregating queries.
 
-A row is a node's topic and direction over a period. What comes is written every minute as a part of its hour,
-DAY/HOUR/*.parquet; when the hour is over its parts become one file, DAY/HOUR.parquet. Who is started anew reads again
-from Kafka what the last one may not have written; rows that are there twice count once.
+A row is one topic and direction of a node over a period. Every minute the received records are written as a part of
+their hour, DAY/HOUR/*.parquet; when the hour is over, its parts are compacted into one file, DAY/HOUR.parquet. After a
+restart, the records that may not have been written are read from Kafka again; duplicate rows count once.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from scan2sim.services import kafka
 from scan2sim.services.monitoring.node.record import Record
 from scan2sim.services.monitoring.settings.archive import ArchiveParams, QueryParams
 
-WRITTEN = 60.0
-"""Seconds between two parts."""
-LATE = 300.0
-"""Seconds after its end for which an hour is left in parts: records come late."""
+WRITE_INTERVAL_S = 60.0
+"""Pause between writing two parts."""
+LATE_RECORDS_S = 300.0
+"""Delay after the end of an hour before its parts are compacted: records may arrive late."""
 SCHEMA = pa.schema(
     [
         ("time", pa.float64()), ("node", pa.string()), ("record_id", pa.string()), ("hostname", pa.string()),
@@ -38,28 +38,28 @@ SCHEMA = pa.schema(
         ("memory_percent", pa.float64()), ("record", pa.string()),
     ]
 )  # fmt: skip
-"""Times in seconds; `record` is the whole record as JSON, in the first of its rows."""
-ONE = ("record_id", "topic", "direction")
-"""What tells rows apart: two that have all three are the same."""
+"""Columns; times in seconds. `record` is the whole record as JSON, in the first row of the record."""
+ROW_KEY = ("record_id", "topic", "direction")
+"""Columns that identify a row: rows that agree in them are duplicates."""
 
 
 class Archive:
-    """Writes records below a folder."""
+    """Parquet files of records below a folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._rows: list[dict[str, Any]] = []
 
     def files(self) -> list[Path]:
-        """Whole hours, then parts."""
+        """Files of whole hours, then parts."""
         return sorted(self._folder.glob("*/*.parquet")) + sorted(self._folder.glob("*/*/*.parquet"))
 
     def add(self, record: Record) -> None:
-        """Keep a record until it is written."""
+        """Buffer a record until the next `write`."""
         self._rows += rows(record)
 
     def write(self) -> None:
-        """Write what was added as a part of its hours."""
+        """Write the buffered records as parts of their hours."""
         by_hour: dict[str, list[dict[str, Any]]] = {}
         for row in self._rows:
             by_hour.setdefault(datetime.fromtimestamp(row["time"], UTC).strftime("%Y-%m-%d/%H"), []).append(row)
@@ -67,21 +67,21 @@ class Archive:
             _save(pa.Table.from_pylist(found, SCHEMA), self._folder / hour / f"{uuid.uuid4().hex}.parquet")
         self._rows = []
 
-    def join(self, now: float) -> None:
-        """Make one file each of the hours that are over, `now` in seconds since the epoch."""
+    def compact(self, now: float) -> None:
+        """Merge the parts of each finished hour into one file; `now` in seconds since the epoch."""
         for hour in sorted(self._folder.glob("*/[0-2][0-9]")):
             began = datetime.strptime(f"{hour.parent.name} {hour.name}", "%Y-%m-%d %H").replace(tzinfo=UTC)
-            if now < began.timestamp() + 3600 + LATE:
+            if now < began.timestamp() + 3600 + LATE_RECORDS_S:
                 continue
             whole = hour.with_suffix(".parquet")
             parts = [*sorted(hour.glob("*.parquet")), *([whole] if whole.exists() else [])]
             if parts:
-                _save(_once(_read(parts)).sort_by("time"), whole)
+                _save(_without_duplicates(_read(parts)).sort_by("time"), whole)
             shutil.rmtree(hour)
 
 
 def rows(record: Record) -> list[dict[str, Any]]:
-    """A record's rows, by the columns of `SCHEMA`; one without a topic, where it tells of none."""
+    """Rows of a record by the columns of `SCHEMA`; a record without flows gives one row without a topic."""
     node = {
         "time": record.time,
         "node": record.node_namespace.rstrip("/") + "/" + record.node_name,
@@ -110,13 +110,13 @@ def rows(record: Record) -> list[dict[str, Any]]:
     return found
 
 
-def keep(params: ArchiveParams, ended: threading.Event, unread: Callable[[str], None]) -> None:
-    """Keep all records that come by Kafka, until told to end; `unread` is told what is none."""
+def archive_records(params: ArchiveParams, stop: threading.Event, warn: Callable[[str], None]) -> None:
+    """Archive all records from Kafka until `stop` is set; `warn` is called with a message for each invalid one."""
     archive = Archive(params.archive)
     written = max((file.stat().st_mtime for file in archive.files()), default=None)
-    since = None if written is None else written - WRITTEN - LATE
+    since = None if written is None else written - WRITE_INTERVAL_S - LATE_RECORDS_S
     group = f"scan2sim-archive-{uuid.uuid4().hex}"
-    due = time.monotonic() + WRITTEN
+    due = time.monotonic() + WRITE_INTERVAL_S
     for body in kafka.read(
         params.kafka_bootstrap_servers, params.topic, group=group, from_start=True, since=since, wait=0.5
     ):
@@ -124,25 +124,25 @@ def keep(params: ArchiveParams, ended: threading.Event, unread: Callable[[str], 
             try:
                 archive.add(Record.model_validate_json(body))
             except ValueError as error:
-                unread(f"a message that is no record ({str(error).splitlines()[0]})")
-        if time.monotonic() >= due or ended.is_set():
+                warn(f"skipped a message that is not a record ({str(error).splitlines()[0]})")
+        if time.monotonic() >= due or stop.is_set():
             archive.write()
-            archive.join(time.time())
-            due = time.monotonic() + WRITTEN
-        if ended.is_set():
+            archive.compact(time.time())
+            due = time.monotonic() + WRITE_INTERVAL_S
+        if stop.is_set():
             return
 
 
 def query(params: QueryParams) -> pa.Table:
-    """By node, topic, direction and span of time: messages, bandwidth, losses, latency, load.
+    """Aggregate messages, bandwidth, losses, latency and load by node, topic, direction and time interval.
 
     Raises:
-        InputError: there is no archive, or a file of it can't be read.
+        InputError: the archive is empty, or one of its files can't be read.
     """
     files = Archive(params.archive).files()
     if not files:
-        raise InputError(params.archive, "holds no records", "Name the folder that `scan2sim monitor archive` keeps")
-    found = _once(_read(files))
+        raise InputError(params.archive, "holds no records", "Name the folder that `scan2sim monitor archive` writes")
+    found = _without_duplicates(_read(files))
     for column, compare, value in (
         ("time", pc.greater_equal, params.begin),
         ("time", pc.less, params.end),
@@ -152,19 +152,20 @@ def query(params: QueryParams) -> pa.Table:
         if value is not None:
             found = found.filter(compare(found[column], value))
     begins = pc.multiply(pc.floor(pc.divide(found["time"], params.every)), params.every)
-    spans = found.append_column("begins", begins).group_by(["begins", "node", "topic", "direction"])
-    asked = {
+    intervals = found.append_column("begins", begins).group_by(["begins", "node", "topic", "direction"])
+    aggregates = {
         "messages": "sum", "bandwidth": "mean", "size": "mean", "published": "sum", "lost": "sum", "latency": "mean",
         "latency_p95": "max", "cpu_percent": "mean",
     }  # fmt: skip
-    told = spans.aggregate(list(asked.items())).rename_columns(["begins", "node", "topic", "direction", *asked])
-    when = pc.cast(pc.multiply(told["begins"], 1000), pa.int64()).cast(pa.timestamp("ms", "UTC"))
+    columns = ["begins", "node", "topic", "direction", *aggregates]
+    table = intervals.aggregate(list(aggregates.items())).rename_columns(columns)
+    begins_at = pc.cast(pc.multiply(table["begins"], 1000), pa.int64()).cast(pa.timestamp("ms", "UTC"))
     order = [(name, "ascending") for name in ("begins", "node", "topic", "direction")]
     return (
-        told.append_column("begins_at", when)
+        table.append_column("begins_at", begins_at)
         .sort_by(order)
         .drop_columns("begins")
-        .select(["begins_at", "node", "topic", "direction", *asked])
+        .select(["begins_at", "node", "topic", "direction", *aggregates])
     )
 
 
@@ -174,23 +175,23 @@ def _read(files: Iterable[Path]) -> pa.Table:
         try:
             tables.append(pq.read_table(file, schema=SCHEMA))
         except (OSError, pa.ArrowException) as error:
-            remedy = "Move it away; the rest can be read without it"
+            remedy = "Move the file away; the rest of the archive can be read without it"
             raise InputError(file, f"can't be read ({str(error).splitlines()[0]:.80})", remedy) from None
     return pa.concat_tables(tables)
 
 
-def _once(table: pa.Table) -> pa.Table:
-    """Without rows that are there twice, as when a reader was killed after it had written."""
-    taken: set[tuple[Any, ...]] = set()
-    keep = []
-    for key in zip(*(table[name].to_pylist() for name in ONE), strict=True):
-        keep.append(key not in taken)
-        taken.add(key)
-    return table.filter(pa.array(keep, pa.bool_()))
+def _without_duplicates(table: pa.Table) -> pa.Table:
+    """Drop duplicate rows, which occur when the archiver was killed after writing."""
+    seen: set[tuple[Any, ...]] = set()
+    is_first = []
+    for key in zip(*(table[name].to_pylist() for name in ROW_KEY), strict=True):
+        is_first.append(key not in seen)
+        seen.add(key)
+    return table.filter(pa.array(is_first, pa.bool_()))
 
 
 def _save(table: pa.Table, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    made = path.with_suffix(".making")
-    pq.write_table(table, made, compression="zstd")
-    made.replace(path)
+    temporary = path.with_suffix(".making")
+    pq.write_table(table, temporary, compression="zstd")
+    temporary.replace(path)

@@ -1,4 +1,4 @@
-"""Ways onto the bus for programs that only tell, and are no nodes: Kafka, a topic of ROS 2, or both."""
+"""Outlets for programs that publish events without being nodes: Kafka, a ROS 2 topic, or both (`--bus`)."""
 
 from __future__ import annotations
 
@@ -11,53 +11,57 @@ from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services import default_outbox, transport
 from scan2sim.services.kafka import Servers
 from scan2sim.services.monitoring.events.schema import Outlet
-from scan2sim.services.monitoring.export.sinks import Kafka
+from scan2sim.services.monitoring.export.sinks import KafkaSink
 
 ROS = "ros2"
-"""Stands among Kafka's servers for a topic of ROS 2."""
+"""Entry in the list of Kafka servers that selects the ROS 2 topic."""
 TOPIC = "bus_events"
 
 
-def check(where: str) -> None:
-    """See that events can be told there from here; nothing needs to answer yet.
+def check_address(where: str) -> None:
+    """Check that events can be published to an address; the brokers need not be reachable yet.
 
     Args:
-        where: Kafka's servers as "host:port,host:port", and "ros2" among them or alone.
+        where: Kafka servers as "host:port,host:port", with "ros2" among them or alone.
 
     Raises:
-        SettingError: it says something else.
-        UnavailableError: packages aren't installed.
+        SettingError: the address is malformed.
+        UnavailableError: a required package isn't installed.
     """
     servers = _servers(where)
     try:
         if where != ROS:
             TypeAdapter(Servers).validate_python(servers)
     except ValidationError:
-        cause = f"must be HOST:PORT, {ROS}, or several of them parted by commas (got {where!r:.60})"
-        raise SettingError("--bus", cause, "As localhost:9092") from None
+        cause = f"must be HOST:PORT, {ROS}, or several separated by commas (got {where!r:.60})"
+        raise SettingError("--bus", cause, "For example localhost:9092") from None
     if ROS in where.split(","):
         transport.load()
     if servers:
-        optional_deps.need("--bus", "confluent_kafka")
+        optional_deps.require("--bus", "confluent_kafka")
 
 
-def opened(where: str) -> list[Outlet]:
-    """Outlets to places as of `check`; what no broker takes, and the process leaves, the next one sends to the same."""
+def open_outlets(where: str) -> list[Outlet]:
+    """Open the outlets of an address (`check_address`); unsent events are sent by the next process that opens it."""
     servers = _servers(where)
-    found: list[Outlet] = [Kafka(servers, TOPIC, default_outbox.opened(f"run.{servers}", TOPIC))] if servers else []
-    return [*found, _ros()] if ROS in where.split(",") else found
+    outlets: list[Outlet] = []
+    if servers:
+        outlets.append(KafkaSink(servers, TOPIC, default_outbox.open_outbox(f"run.{servers}", TOPIC)))
+    if ROS in where.split(","):
+        outlets.append(_ros_outlet())
+    return outlets
 
 
 def _servers(where: str) -> str:
-    """Kafka's among the places; "" where there are none."""
+    """The Kafka servers of an address; "" without any."""
     return ",".join(place for place in where.split(",") if place != ROS)
 
 
 @cache
-def _ros() -> Outlet:
-    """A topic of ROS 2, of one hidden node a process: others need a moment to find it."""
-    from scan2sim.services.monitoring.events.bus import Topic
+def _ros_outlet() -> Outlet:
+    """Outlet to the ROS 2 topic through one hidden node per process, as discovery by other nodes takes a moment."""
+    from scan2sim.services.monitoring.events.bus import RosOutlet
     from scan2sim.services.monitoring.node.monitor import ros  # which loads the transport
 
     ros.init()
-    return Topic(ros.Node("_scan2sim", hidden=True), TOPIC)
+    return RosOutlet(ros.Node("_scan2sim", hidden=True), TOPIC)

@@ -1,4 +1,4 @@
-"""Where records go: Kafka, a file, the console, Prometheus. None of them keeps the node waiting."""
+"""Sinks of records: Kafka, a log file, the console, Prometheus. None of them blocks the node."""
 
 from __future__ import annotations
 
@@ -10,84 +10,84 @@ from typing import Protocol
 
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.services import default_outbox
-from scan2sim.services.kafka import Topic
+from scan2sim.services.kafka import TopicProducer
 from scan2sim.services.monitoring.node.record import Record
-from scan2sim.services.monitoring.settings.monitor import Watched
-from scan2sim.services.outbox import Sender, Spool
+from scan2sim.services.monitoring.settings.monitor import MonitorParams
+from scan2sim.services.outbox import Outbox, Sender
 
-LOG_BYTES, LOG_FILES = 16 * 2**20, 4
-"""Size of a log, and how many older ones are kept beside it."""
+MAX_LOG_BYTES, ROTATED_LOG_FILES = 16 * 2**20, 4
+"""Size at which a log file is rotated, and number of rotated files that are kept."""
 
 
 class Message(Protocol):
-    """What goes to Kafka: a record, an event."""
+    """Message for Kafka: a record or an event."""
 
     @property
     def id(self) -> str:
-        """Unlike any other's."""
+        """Globally unique id."""
 
     @property
-    def share(self) -> str:
-        """What it counts for, where room is short."""
+    def category(self) -> str:
+        """Category in an outbox (`outbox.Outbox`)."""
 
     def json_line(self) -> str:
-        """As one line of JSON."""
+        """Serialize as one line of JSON."""
 
 
 class Sink(Protocol):
-    """Takes records."""
+    """Destination of records."""
 
     @property
     def dropped(self) -> Mapping[str, int]:
-        """Messages that were given up, as there was no room for them, by their share."""
+        """Number of messages that were dropped because the outbox was full, by category."""
 
     def send(self, record: Record, /) -> None:
-        """Take one, at once."""
+        """Accept a record without blocking."""
 
     def close(self) -> None:
-        """Take no more."""
+        """Release all resources."""
 
 
-def opened(watched: Watched, node: str) -> list[Sink]:
-    """All that are set, of a node by its full name."""
-    found: list[Sink] = []
-    if watched.kafka_bootstrap_servers:
-        spool = Spool(watched.spool) if watched.spool else default_outbox.opened(node, watched.publisher_topic)
-        found.append(Kafka(watched.kafka_bootstrap_servers, watched.publisher_topic, spool))
-    if watched.log_file:
-        found.append(Lines.file(watched.log_file))
-    if watched.console:
-        found.append(Lines.console())
-    if watched.prometheus_port is not None:
-        found.append(Prometheus(watched.prometheus_port))
-    return found
+def open_sinks(params: MonitorParams, node: str) -> list[Sink]:
+    """Open all sinks that are configured for a node, given by its full name."""
+    sinks: list[Sink] = []
+    if params.kafka_bootstrap_servers:
+        outbox = Outbox(params.spool) if params.spool else default_outbox.open_outbox(node, params.publisher_topic)
+        sinks.append(KafkaSink(params.kafka_bootstrap_servers, params.publisher_topic, outbox))
+    if params.log_file:
+        sinks.append(JsonLinesSink.file(params.log_file))
+    if params.console:
+        sinks.append(JsonLinesSink.console())
+    if params.prometheus_port is not None:
+        sinks.append(PrometheusSink(params.prometheus_port))
+    return sinks
 
 
-class Kafka:
-    """A topic of Kafka, by way of the disk: what can't be sent now is sent later, in order."""
+class KafkaSink:
+    """Sends messages to a Kafka topic through an outbox on disk: unsent messages are retried, in order."""
 
-    def __init__(self, servers: str, topic: str, spool: Spool) -> None:
-        self._spool = spool
-        self._sender = Sender(self._spool, Topic(servers, topic).send)
+    def __init__(self, servers: str, topic: str, outbox: Outbox) -> None:
+        self._outbox = outbox
+        self._sender = Sender(self._outbox, TopicProducer(servers, topic).send)
 
     @property
     def dropped(self) -> Mapping[str, int]:
-        """Messages that were given up, as there was no room for them on disk, by their share."""
-        return self._spool.dropped
+        """Number of messages that were dropped because the outbox was full, by category."""
+        return self._outbox.dropped
 
     def send(self, message: Message) -> None:
-        """Keep it, to be sent."""
-        self._spool.append(message.id, message.json_line().encode(), message.share)
+        """Append a message to the outbox and wake its sender."""
+        self._outbox.append(message.id, message.json_line().encode(), message.category)
         self._sender.wake()
 
     def close(self) -> None:
-        """Send what can be sent soon."""
+        """Send pending messages within a few seconds and close the outbox."""
         self._sender.close()
-        self._spool.close()
+        self._outbox.close()
 
 
-class Lines:
-    """A line of JSON a record: in a file that is changed when it is full, or on the console."""
+class JsonLinesSink:
+    """Writes each record as a line of JSON to a rotating log file or to the console."""
 
     dropped: Mapping[str, int] = {}
 
@@ -95,18 +95,18 @@ class Lines:
         self._handler = handler
 
     @classmethod
-    def file(cls, path: Path) -> Lines:
-        """Into a file, with the last ones beside it."""
+    def file(cls, path: Path) -> JsonLinesSink:
+        """Sink to a rotating log file."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        return cls(logging.handlers.RotatingFileHandler(path, maxBytes=LOG_BYTES, backupCount=LOG_FILES))
+        return cls(logging.handlers.RotatingFileHandler(path, maxBytes=MAX_LOG_BYTES, backupCount=ROTATED_LOG_FILES))
 
     @classmethod
-    def console(cls) -> Lines:
-        """On standard error."""
+    def console(cls) -> JsonLinesSink:
+        """Sink to standard error."""
         return cls(logging.StreamHandler())
 
     def send(self, record: Record) -> None:
-        """Write it."""
+        """Write a record."""
         self._handler.emit(logging.makeLogRecord({"msg": record.json_line()}))
 
     def close(self) -> None:
@@ -114,13 +114,13 @@ class Lines:
         self._handler.close()
 
 
-class Prometheus:
-    """The last record's figures at http://127.0.0.1:PORT/metrics; it needs no token, so no other machine reaches it."""
+class PrometheusSink:
+    """Exports the latest record at http://127.0.0.1:PORT/metrics; without a token, hence on loopback only."""
 
     dropped: Mapping[str, int] = {}
 
     def __init__(self, port: int) -> None:
-        optional_deps.need("Prometheus", "prometheus_client")
+        optional_deps.require("Prometheus", "prometheus_client")
         from prometheus_client import CollectorRegistry, Gauge, start_http_server
 
         registry = CollectorRegistry()
@@ -128,24 +128,24 @@ class Prometheus:
         self._flows = {
             key: Gauge(f"scan2sim_{name}", help_, flow, registry=registry)
             for key, name, help_ in (
-                ("bandwidth", "bandwidth_bytes_per_second", "Bytes a second over the last period"),
+                ("bandwidth", "bandwidth_bytes_per_second", "Bytes per second over the last period"),
                 ("messages", "messages", "Messages over the last period"),
-                ("size", "message_size_bytes", "Mean size of messages"),
-                ("lost", "lost_messages", "Messages that their publisher sent and that didn't come"),
-                ("latency", "latency_nanoseconds", "Mean time from sending to receiving"),
-                ("latency_p95", "latency_p95_nanoseconds", "What 95 of 100 latencies don't exceed"),
+                ("size", "message_size_bytes", "Mean message size over the last period"),
+                ("lost", "lost_messages", "Messages published but not received in the last period"),
+                ("latency", "latency_nanoseconds", "Mean time from publishing to receiving"),
+                ("latency_p95", "latency_p95_nanoseconds", "95th percentile of the latency"),
             )
         }
-        self._cpu = Gauge("scan2sim_cpu_percent", "Load of the machine", ("node",), registry=registry)
+        self._cpu = Gauge("scan2sim_cpu_percent", "CPU load of the machine", ("node",), registry=registry)
         self._server, self._thread = start_http_server(port, "127.0.0.1", registry)
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """Port on which it listens."""
         return int(self._server.server_port)
 
     def send(self, record: Record) -> None:
-        """Show its figures."""
+        """Set the gauges to the values of a record."""
         node = record.node_namespace.rstrip("/") + "/" + record.node_name
         for flow in record.flows:
             for key, gauge in self._flows.items():
@@ -155,6 +155,6 @@ class Prometheus:
         self._cpu.labels(node).set(record.cpu_percent)
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop the HTTP server."""
         self._server.shutdown()
         self._server.server_close()

@@ -1,4 +1,4 @@
-"""Instrumented nodes: what passes their topics, measured and published as records.
+"""Instrumented nodes: statistics of their topics, measured and published as records.
 
 Begin with `monitor`; `topic_monitor` observes topics from outside, `record` defines the records.
 """

@@ -1,7 +1,8 @@
-"""How far other machines' clocks are from this one: without that, a latency between machines says nothing.
+"""Clock offsets between machines, which latencies between machines are corrected by.
 
-A node that hears from a process it doesn't know asks it for the time, on the bus itself, by four timestamps (RFC 5905,
-section 8); what tells most is the exchange that took least. Processes of one machine share a clock, and are asked once.
+A node that receives a message of an unknown process pings it on a ROS 2 topic and estimates the offset from four
+timestamps (RFC 5905, section 8); the exchange with the shortest round trip is the most accurate. Processes on one
+machine share a clock and are pinged once.
 """
 
 from __future__ import annotations
@@ -17,19 +18,19 @@ from pathlib import Path
 from typing import Any
 
 TOPIC = "monitor_clock"
-"""Of pings and their answers, as JSON in std_msgs/String."""
-PREFIX = 12
-"""Bytes of a GID that are the process's."""
-PING_EVERY = 5.0
-"""Seconds between two exchanges with another machine, once `KEPT` of them are known."""
-PING_AT_FIRST = 1.0
-"""Seconds until then, and between two tries."""
-TRIES = 10
-"""Pings without an answer after which a process counts as one that doesn't answer (it isn't watched)."""
-KEPT = 8
-"""Exchanges of which the quickest counts."""
-JUMP = 50_000_000
-"""Nanoseconds by which a clock may drift between two records; more is a jump."""
+"""Topic of pings and replies, JSON in std_msgs/String."""
+GID_PREFIX_BYTES = 12
+"""Leading bytes of a GID that identify the process (DDS participant)."""
+PING_INTERVAL_S = 5.0
+"""Pause between two exchanges with another machine, once `EXCHANGE_WINDOW` exchanges are known."""
+INITIAL_PING_INTERVAL_S = 1.0
+"""Pause until then, and between two unanswered pings."""
+MAX_UNANSWERED_PINGS = 10
+"""Unanswered pings after which a process counts as not instrumented and is no longer pinged."""
+EXCHANGE_WINDOW = 8
+"""Latest exchanges, of which the one with the shortest round trip counts."""
+CLOCK_JUMP_NS = 50_000_000
+"""A larger change of the clock between two records is a jump, a smaller one drift."""
 
 
 @dataclass
@@ -37,95 +38,97 @@ class _Peer:
     """Another process.
 
     Attributes:
-        host: the machine that it runs on, once it has said.
-        exchanges: nanoseconds that they took, and by which its clock is ahead.
-        best: nanoseconds by which it is ahead, and how far that may be off; None: unknown.
+        host: machine on which it runs; None until it replied.
+        exchanges: (round trip, offset of its clock) of the latest exchanges, nanoseconds.
+        best: (offset, uncertainty), nanoseconds; positive if its clock is ahead of this one; None: unknown.
     """
 
     host: str | None = None
     pinged: float = float("-inf")
-    tries: int = 0
-    exchanges: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=KEPT))
+    unanswered: int = 0
+    exchanges: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=EXCHANGE_WINDOW))
     best: tuple[int, int] | None = None
 
 
-class Clock:
-    """Exchanges with other processes; what is to be sent is returned."""
+class ClockSync:
+    """Clock exchange protocol with other processes; its methods return the message to send, if any."""
 
     def __init__(self, host: str | None = None) -> None:
-        """`host`: what machines differ by; None: this one's."""
+        """`host`: identifier of the machine; None: this machine's."""
         self._host = host or this_host()
         self._id = uuid.uuid4().hex
         self._own: bytes | None = None
         self._peers: dict[bytes, _Peer] = {}
-        self._ticked = time.time_ns() - time.monotonic_ns()
+        self._wall_minus_monotonic = time.time_ns() - time.monotonic_ns()
 
     def hello(self) -> dict[str, Any] | None:
-        """What to send so that this process hears by what prefix of GIDs it is known; None: it knows."""
+        """Message by whose arrival this process learns its own GID prefix; None: already known."""
         return None if self._own else {"to": "", "from": self._id, "sent": 0}
 
     def ping(self, publisher: bytes) -> dict[str, Any] | None:
-        """What to ask the process of a publisher that a message came from; None: nothing now."""
-        prefix = publisher[:PREFIX]
+        """Ping for the process of a publisher; None: no ping is due."""
+        prefix = publisher[:GID_PREFIX_BYTES]
         peer = self._peers.get(prefix)
         if peer is None:
             peer = self._peers[prefix] = _Peer()
-        if peer.host == self._host or (peer.host is None and peer.tries >= TRIES):
+        if peer.host == self._host or (peer.host is None and peer.unanswered >= MAX_UNANSWERED_PINGS):
             return None
-        if time.monotonic() - peer.pinged < (PING_EVERY if len(peer.exchanges) == KEPT else PING_AT_FIRST):
+        interval = PING_INTERVAL_S if len(peer.exchanges) == EXCHANGE_WINDOW else INITIAL_PING_INTERVAL_S
+        if time.monotonic() - peer.pinged < interval:
             return None
-        peer.pinged, peer.tries = time.monotonic(), peer.tries + 1
+        peer.pinged, peer.unanswered = time.monotonic(), peer.unanswered + 1
         return {"to": prefix.hex(), "from": self._id, "sent": time.time_ns()}
 
-    def heard(self, message: Mapping[str, Any], publisher: bytes, received: int) -> dict[str, Any] | None:
-        """Take a message of `TOPIC`; returns the answer, if one is to be sent.
+    def handle(self, message: Mapping[str, Any], publisher: bytes, received: int) -> dict[str, Any] | None:
+        """Process a message of `TOPIC` and return the reply to send, if any.
 
         Args:
-            message: what isn't one is left.
-            publisher: GID of who sent it.
-            received: nanoseconds since the epoch.
+            message: its fields; malformed messages are ignored.
+            publisher: GID of its publisher.
+            received: time of arrival, nanoseconds since the epoch.
         """
         try:
             if message["from"] == self._id:
-                self._own = publisher[:PREFIX]
+                self._own = publisher[:GID_PREFIX_BYTES]
             elif "host" in message and message["to"] == self._id:
-                self._exchanged(publisher, message, received)
+                self._add_exchange(publisher, message, received)
             elif self._own and message["to"] == self._own.hex():
                 times = {"sent": int(message["sent"]), "received": received, "answered": time.time_ns()}
                 return {"to": message["from"], "from": self._id, "host": self._host} | times
         except (KeyError, TypeError, ValueError, OverflowError):
-            pass  # somebody else's message
+            pass  # malformed, or another program's message
         return None
 
     def offset(self, publisher: bytes | None) -> tuple[int, int] | None:
-        """By how many nanoseconds a publisher's clock is ahead of this one, and how far that may be off.
+        """Offset of a publisher's clock from this one and its uncertainty in nanoseconds; positive: it is ahead.
 
-        None: unknown, as its process hasn't answered.
+        None: unknown, because its process hasn't replied.
         """
-        peer = self._peers.get(publisher[:PREFIX]) if publisher else None
+        peer = self._peers.get(publisher[:GID_PREFIX_BYTES]) if publisher else None
         return peer.best if peer else None
 
-    def jump(self) -> float:
-        """Seconds by which this machine's clock was set since the last call; what was exchanged is forgotten."""
-        ticked = time.time_ns() - time.monotonic_ns()
-        jumped, self._ticked = ticked - self._ticked, ticked
-        if abs(jumped) < JUMP:
+    def detect_jump(self) -> float:
+        """Seconds by which this machine's clock was set since the last call; a jump discards all known offsets."""
+        difference = time.time_ns() - time.monotonic_ns()
+        jump_ns, self._wall_minus_monotonic = difference - self._wall_minus_monotonic, difference
+        if abs(jump_ns) < CLOCK_JUMP_NS:
             return 0.0
         self._peers = {}
-        return jumped / 1e9
+        return jump_ns / 1e9
 
-    def _exchanged(self, publisher: bytes, message: Mapping[str, Any], back: int) -> None:
-        sent, there, answered = int(message["sent"]), int(message["received"]), int(message["answered"])
-        peer = self._peers.setdefault(publisher[:PREFIX], _Peer())
-        peer.host, peer.tries = str(message["host"]), 0
-        peer.exchanges.append(((back - sent) - (answered - there), ((there - sent) + (answered - back)) // 2))
-        delay, ahead = min(peer.exchanges)
-        peer.best = (0, 0) if peer.host == self._host else (ahead, delay // 2)
+    def _add_exchange(self, publisher: bytes, message: Mapping[str, Any], t4: int) -> None:
+        """Round trip and offset from the four timestamps t1 to t4 of RFC 5905."""
+        t1, t2, t3 = int(message["sent"]), int(message["received"]), int(message["answered"])
+        peer = self._peers.setdefault(publisher[:GID_PREFIX_BYTES], _Peer())
+        peer.host, peer.unanswered = str(message["host"]), 0
+        peer.exchanges.append(((t4 - t1) - (t3 - t2), ((t2 - t1) + (t3 - t4)) // 2))
+        round_trip, offset = min(peer.exchanges)
+        peer.best = (0, 0) if peer.host == self._host else (offset, round_trip // 2)
 
 
 @cache
 def this_host() -> str:
-    """What this machine, in this life of it, differs from others by."""
+    """Identifier of this machine since its last boot."""
     boot = Path("/proc/sys/kernel/random/boot_id")
     return boot.read_text(encoding="utf-8").strip() if boot.exists() else f"{uuid.getnode():x}"
 
@@ -147,7 +150,7 @@ def _libc() -> ctypes.CDLL:
 
 
 def synchronised() -> bool | None:
-    """Whether NTP (or PTP) keeps this machine's clock, as its kernel says; None: it says nothing."""
+    """Whether this machine's clock is synchronised by NTP or PTP according to the kernel; None: unknown."""
     try:
         return _libc().ntp_gettime(ctypes.byref(_NtpTime())) not in (-1, 5)  # TIME_ERROR
     except (AttributeError, OSError):

@@ -1,4 +1,4 @@
-"""What is to be known of the machine that a node runs on: its name, addresses and load (D3.2, section 3.1)."""
+"""Host metrics: name, addresses and load of the machine that a node runs on (D3.2, section 3.1)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 import psutil
 
-REFRESHED = 10.0
-"""Seconds for which addresses and disks are taken as they were."""
+REFRESH_INTERVAL_S = 10.0
+"""How long addresses and disk usage are cached."""
 
 
 @cache
@@ -19,27 +19,27 @@ def hostname() -> str:
     return socket.gethostname()
 
 
-class Machine:
-    """Reads the machine's load; what changes seldom is read seldom."""
+class HostMetrics:
+    """Reads the machine's load; values that change rarely are cached for `REFRESH_INTERVAL_S`."""
 
     def __init__(self) -> None:
-        self._read_at = -REFRESHED
-        self._seldom: dict[str, Any] = {}
-        psutil.cpu_percent()  # the first is of no period
+        self._refreshed_at = -REFRESH_INTERVAL_S
+        self._cached: dict[str, Any] = {}
+        psutil.cpu_percent()  # starts the first period of measurement
 
     def read(self) -> dict[str, Any]:
-        """By the names of D3.2's code snippet 4; percent of the processors since the last reading."""
-        if time.monotonic() - self._read_at >= REFRESHED:
-            self._read_at = time.monotonic()
+        """Metrics by the field names of D3.2's code snippet 4; CPU percent since the last call."""
+        if time.monotonic() - self._refreshed_at >= REFRESH_INTERVAL_S:
+            self._refreshed_at = time.monotonic()
             addresses = local_ips()
-            self._seldom = {
+            self._cached = {
                 "local ip": addresses[0] if addresses else "",
                 "local ips": addresses,
                 "disk usage": list(psutil.disk_usage("/")),
             }
         return {
             "hostname": hostname(),
-            **self._seldom,
+            **self._cached,
             "cpu times": psutil.cpu_times()._asdict(),
             "cpu percent": psutil.cpu_percent(),
             "virtual memory": psutil.virtual_memory()._asdict(),
@@ -47,8 +47,8 @@ class Machine:
 
 
 def local_ips() -> list[str]:
-    """Addresses of interfaces that are up, without loopback; IPv4 before IPv6."""
-    up = {name for name, told in psutil.net_if_stats().items() if told.isup}
+    """Addresses of the network interfaces that are up, without loopback; IPv4 before IPv6."""
+    up = {name for name, stats in psutil.net_if_stats().items() if stats.isup}
     found = [
         (address.family, address.address.partition("%")[0])
         for name, addresses in psutil.net_if_addrs().items()

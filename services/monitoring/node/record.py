@@ -1,6 +1,6 @@
-"""A record: what a monitor reports of a node or topic once a period, by the field names of D3.2's code snippet 4.
+"""Record: the statistics that a monitor publishes once per period, with the field names of D3.2's code snippet 4.
 
-`Record` is the schema, too: `python -m scan2sim.services.monitoring.node.record` prints it as JSON Schema.
+`Record` defines the schema: `python -m scan2sim.services.monitoring.node.record` prints it as JSON Schema.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scan2sim.services.monitoring.node.meter import Flow, Reading
 from scan2sim.services.transport.types import Endpoint
 
 SCHEMA = "scan2sim-monitor-1"
-"""Changes when a field does."""
+"""Schema identifier; changes whenever a field does."""
 
 
 class _Model(BaseModel):
@@ -23,7 +23,7 @@ class _Model(BaseModel):
 
 
 class Profile(_Model):
-    """A quality of service; durations in nanoseconds, 9223372036854775807 for never."""
+    """QoS profile; durations in nanoseconds, 9223372036854775807 for infinite."""
 
     reliability: str
     durability: str
@@ -45,7 +45,7 @@ class EndpointInfo(_Model):
 
 
 class TopicEndpoints(_Model):
-    """Who is on a topic."""
+    """Publishers and subscriptions of a topic."""
 
     topic_name: str = Field(alias="topic name")
     publishers: list[EndpointInfo] = Field(alias="publishers_info_by_topic")
@@ -56,12 +56,12 @@ class TopicFlow(_Model):
     """One direction of one topic over the period.
 
     Attributes:
-        bandwidth: bytes a second.
-        sent: messages that publishers sent meanwhile, by their numbers: more than came, where a subscriber is slow.
-        latency: nanoseconds, mean of the window, with the clocks' offset taken away; `latency_p95` likewise.
-        clock_offset: by which the sender's clock is ahead, nanoseconds; None: unknown, as it isn't watched.
-        clock_uncertainty: how far that may be off.
-        unreadable: messages that came, and weren't of the topic's type; unknown to rclpy.
+        bandwidth: bytes per second.
+        sent: messages published in the period by their sequence numbers; more than received if the subscriber is slow.
+        latency: nanoseconds, mean over the window, corrected for the clock offset; `latency_p95` likewise.
+        clock_offset: offset of the sender's clock, nanoseconds; positive: ahead; None: unknown, not instrumented.
+        clock_uncertainty: uncertainty of the offset, nanoseconds.
+        unreadable: received messages that could not be deserialized; always 0 with rclpy, which doesn't report them.
     """
 
     topic: str
@@ -80,20 +80,20 @@ class TopicFlow(_Model):
 
 
 class Record(_Model):
-    """What a node did over a period.
+    """Traffic and load of a node over a period.
 
     Attributes:
-        id: of the record, NODE:NUMBER with the node's own identity; twice the same is the same record.
-        time: seconds since the epoch, at the end of the period.
-        period: seconds that it covers.
-        node_id: unlike any other's, of this life of the node.
-        bandwidth: bytes a second, in and out; likewise `messages`, `size` (bytes).
-        lost: None where no publisher numbers its messages.
-        latency: mean of all that came (of the window); None where no message says when it was sent.
-        clock_synchronised: whether NTP keeps this machine's clock, as its kernel says; None: it says nothing.
-        remarks: what is wrong with the topics, in words: profiles that don't fit, nodes of one name.
-        dropped: records and events that were given up before this one, as the disk's share for them was full.
-        dropped_by: likewise, of records and of each kind of events.
+        id: unique id NODE_ID:NUMBER; two records with the same id are duplicates.
+        time: end of the period, seconds since the epoch.
+        period: its length, seconds.
+        node_id: unique for each start of the node.
+        bandwidth: bytes per second, in and out; likewise `messages` and `size` (bytes).
+        lost: None if no publisher numbers its messages.
+        latency: mean over all received messages (of the window); None if no message has a source timestamp.
+        clock_synchronised: whether NTP synchronises this machine's clock according to its kernel; None: unknown.
+        remarks: warnings for the user, such as incompatible QoS profiles or exceeded limits.
+        dropped: records and events dropped so far because the outbox was full.
+        dropped_by: the same for records and for each kind of events.
     """
 
     schema_name: str = Field(SCHEMA, alias="schema")
@@ -133,22 +133,22 @@ class Record(_Model):
     dropped_by: dict[str, int] = Field({}, alias="dropped by kind")
 
     @staticmethod
-    def machine(read: Mapping[str, Any]) -> dict[str, Any]:
-        """Fields of a machine's reading (`machine.Machine.read`), by their names here."""
+    def host_fields(read: Mapping[str, Any]) -> dict[str, Any]:
+        """Host metrics (`host.HostMetrics.read`) by the field names of this class."""
         return {name.replace(" ", "_"): value for name, value in read.items()}
 
     @property
-    def share(self) -> str:
-        """What it counts for in a spool, where room is short."""
+    def category(self) -> str:
+        """Category in an outbox (`outbox.Outbox`)."""
         return "records"
 
     def json_line(self) -> str:
-        """As one line of JSON."""
+        """Serialize as one line of JSON."""
         return self.model_dump_json(by_alias=True)
 
 
-def flows_of(reading: Reading, types: Mapping[str, str], period: float) -> list[TopicFlow]:
-    """A reading's flows; `types` are the names of topics' types, `period` is in seconds."""
+def topic_flows(reading: Reading, types: Mapping[str, str], period: float) -> list[TopicFlow]:
+    """Flows of a reading; `types` are the topics' type names, `period` is in seconds."""
     out = [
         TopicFlow(
             topic=topic,
@@ -181,10 +181,10 @@ def flows_of(reading: Reading, types: Mapping[str, str], period: float) -> list[
     return out + incoming
 
 
-def sums(reading: Reading, period: float) -> dict[str, Any]:
-    """A record's own figures: of all topics together."""
-    out = _all(reading.outgoing.values())
-    incoming = _all(found.flow for found in reading.incoming.values())
+def totals(reading: Reading, period: float) -> dict[str, Any]:
+    """Fields of a record that are totals over all topics."""
+    out = _total(reading.outgoing.values())
+    incoming = _total(found.flow for found in reading.incoming.values())
     both = Flow(out.messages + incoming.messages, out.size + incoming.size)
     latencies = [one for found in reading.incoming.values() for one in found.latencies]
     lost = [found.lost for found in reading.incoming.values() if found.lost is not None]
@@ -205,7 +205,7 @@ def sums(reading: Reading, period: float) -> dict[str, Any]:
 
 
 def endpoint_info(endpoint: Endpoint) -> EndpointInfo:
-    """An endpoint as it stands in records."""
+    """Convert an endpoint to its form in a record."""
     qos = endpoint.qos
     return EndpointInfo(
         node_name=endpoint.node_name,
@@ -225,16 +225,16 @@ def endpoint_info(endpoint: Endpoint) -> EndpointInfo:
 
 
 def mean(values: Any) -> int | None:
-    """Mean of some nanoseconds; None of none."""
+    """Rounded mean of values in nanoseconds; None without values."""
     return round(sum(values) / len(values)) if values else None
 
 
 def p95(values: Any) -> int | None:
-    """What 95 of 100 don't exceed; None of none."""
+    """95th percentile; None without values."""
     return sorted(values)[min(len(values) - 1, int(0.95 * len(values)))] if values else None
 
 
-def _all(flows: Any) -> Flow:
+def _total(flows: Any) -> Flow:
     found = list(flows)
     return Flow(sum(flow.messages for flow in found), sum(flow.size for flow in found))
 

@@ -1,4 +1,4 @@
-"""How records are kept for analysis, and asked for: what is told in code as on the command line."""
+"""Settings of the record archive and of queries, for code and command line."""
 
 from __future__ import annotations
 
@@ -12,37 +12,39 @@ from scan2sim.pipeline.core.step import Params
 from scan2sim.services.kafka import Servers
 
 
-def _seconds(given: Any) -> Any:
-    """Seconds since the epoch, of these or of a date and time as 2026-11-22T15:30 (UTC where it says no zone)."""
-    if not isinstance(given, str) or given.replace(".", "", 1).isdigit():
-        return given
-    when = datetime.fromisoformat(given)
+def _parse_time(value: Any) -> Any:
+    """Convert a date and time like 2026-11-22T15:30 (UTC without a zone) to seconds since the epoch; keep numbers."""
+    if not isinstance(value, str) or value.replace(".", "", 1).isdigit():
+        return value
+    when = datetime.fromisoformat(value)
     return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
 
 
 Time = Annotated[
     float,
-    BeforeValidator(_seconds),
-    Field(ge=0, le=1e11, json_schema_extra={"range": "a time as 2026-11-22T15:30, or seconds since 1970"}),
+    BeforeValidator(_parse_time),
+    Field(ge=0, le=1e11, json_schema_extra={"range": "a time like 2026-11-22T15:30, or seconds since 1970"}),
 ]
 
 
 class ArchiveParams(Params):
-    """Of who keeps records."""
+    """Settings of the process that archives records."""
 
-    archive: Annotated[Path, Field(description="Folder for them; it is made if it isn't there.")]
+    archive: Annotated[Path, Field(description="Folder of the archive; created if missing.")]
     kafka_bootstrap_servers: Annotated[
-        Servers, Field(description="Kafka with the records; it need not be there yet.")
+        Servers, Field(description="Kafka servers with the records, HOST:PORT,...; retried until reachable.")
     ] = "localhost:9092"
-    topic: Annotated[str, Field(description="Kafka's topic of records.")] = "monitor_data"
+    topic: Annotated[str, Field(description="Kafka topic of the records.")] = "monitor_data"
 
 
 class QueryParams(Params):
-    """What is asked of an archive."""
+    """Settings of a query of the archive."""
 
-    archive: Annotated[Path, Field(description="Folder that `monitor archive` keeps.")]
-    begin: Annotated[Time | None, Field(description="From when on, as 2026-11-22T15:30 (UTC); default: all.")] = None
-    end: Annotated[Time | None, Field(description="Until when.")] = None
-    node: Annotated[str | None, Field(description="Of one node, as /site/camera.")] = None
-    topic: Annotated[str | None, Field(description="Of one topic, as /camera/image.")] = None
-    every: Annotated[float, Field(ge=1, le=10**7, description="Seconds that a line is of.")] = 60.0
+    archive: Annotated[Path, Field(description="Folder written by `monitor archive`.")]
+    begin: Annotated[
+        Time | None, Field(description="Start time, such as 2026-11-22T15:30 (UTC); default: the first record.")
+    ] = None
+    end: Annotated[Time | None, Field(description="End time, exclusive; default: the last record.")] = None
+    node: Annotated[str | None, Field(description="Only this node, such as /site/camera; default: all.")] = None
+    topic: Annotated[str | None, Field(description="Only this topic, such as /camera/image; default: all.")] = None
+    every: Annotated[float, Field(ge=1, le=10**7, description="Length of the interval of a line, seconds.")] = 60.0

@@ -1,4 +1,4 @@
-"""How programs join the bus: their settings, in code as on the command line."""
+"""Settings of programs on the bus, for code and command line."""
 
 from __future__ import annotations
 
@@ -9,49 +9,51 @@ from pydantic import Field
 
 from scan2sim.pipeline.core.step import Params
 from scan2sim.services.kafka import Servers
-from scan2sim.services.monitoring.autoscale.policy import MOST, ScalingParams
+from scan2sim.services.monitoring.autoscale.policy import MAX_WORKERS, ScalingParams
 from scan2sim.services.transport.names import TopicName
 
 
 class BusParams(Params):
-    """Where events and records go and come from."""
+    """Topics and servers of events and records."""
 
     kafka_bootstrap_servers: Annotated[
-        Servers | None, Field(description="Kafka beside ROS 2, as host:port,host:port; it need not be there yet.")
+        Servers | None,
+        Field(description="Kafka servers in addition to ROS 2, HOST:PORT,...; retried until reachable."),
     ] = None
-    records_topic: Annotated[TopicName, Field(description="Topic of ROS 2 and of Kafka with records.")] = "monitor_data"
-    events_topic: Annotated[TopicName, Field(description="Topic of ROS 2 and of Kafka with events.")] = "bus_events"
+    records_topic: Annotated[TopicName, Field(description="ROS 2 and Kafka topic of records.")] = "monitor_data"
+    events_topic: Annotated[TopicName, Field(description="ROS 2 and Kafka topic of events.")] = "bus_events"
 
 
 class ScaleParams(BusParams, ScalingParams):
-    """Of a node that asks for workers."""
+    """Settings of the autoscaler node."""
 
     history: Annotated[
         Path | None,
         Field(
-            description="CSV of whole days, seconds from a Monday's midnight: forecast as on other days at that hour."
+            description="CSV file of past events, seconds from a Monday's midnight and bytes, whole days: forecast by"
+            " the daily profile instead of --forecast."
         ),
     ] = None
-    log_file: Annotated[Path | None, Field(description="File for what was decided, a line of JSON each time.")] = None
+    log_file: Annotated[Path | None, Field(description="Log file of the decisions, a line of JSON each.")] = None
 
 
-class FollowedParams(BusParams):
-    """Of a node that starts and stops workers."""
+class WorkerPoolParams(BusParams):
+    """Settings of a node that scales workers as the autoscaler requests."""
 
     queue: Annotated[
-        str | None, Field(description="Queue whose events are followed; default: called as what is scaled.")
+        str | None, Field(description="Queue whose worker requests are applied; default: the name of what is scaled.")
     ] = None
-    min_workers: Annotated[int, Field(ge=0, le=MOST, description="Workers, at least.")] = 1
-    max_workers: Annotated[int, Field(ge=1, le=MOST, description="Workers, at most.")] = 5
+    min_workers: Annotated[int, Field(ge=0, le=MAX_WORKERS, description="Minimum number of workers.")] = 1
+    max_workers: Annotated[int, Field(ge=1, le=MAX_WORKERS, description="Maximum number of workers.")] = 5
 
 
-class PoolParams(FollowedParams):
-    """Of a node that starts and stops workers of a Prefect pool."""
+class PoolParams(WorkerPoolParams):
+    """Settings of a node that scales the workers of a Prefect work pool."""
 
-    pool: Annotated[str, Field(description="Its name, as scan2sim-process; it must be there.")]
+    pool: Annotated[str, Field(description="Name of an existing Prefect work pool, such as scan2sim-process.")]
 
 
 class AlarmsParams(BusParams):
-    """Of a node that sends alarms."""
+    """Settings of the alarm node."""
 
-    rules: Annotated[Path, Field(description="TOML file of rules (docs/event-bus.md).")]
+    rules: Annotated[Path, Field(description="TOML file of alarm rules (docs/monitoring.md).")]

@@ -1,4 +1,4 @@
-"""What the live page shows, and where: what it is told in code as on the command line."""
+"""Settings of the monitoring dashboard, for code and command line."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ from typing import Annotated
 
 from pydantic import Field
 
-from scan2sim.services.http.settings import Served
+from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.kafka import Servers
 from scan2sim.services.monitoring.settings.limits import Limit, Limits
 
 
-class PageParams(Served):
-    """Of the live page."""
+class PageParams(ServerParams):
+    """Settings of the dashboard."""
 
     kafka_bootstrap_servers: Annotated[
-        Servers, Field(description="Kafka with the records; it need not be there yet.")
+        Servers, Field(description="Kafka servers with the records, HOST:PORT,...; retried until reachable.")
     ] = "localhost:9092"
-    topic: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,249}$", description="Kafka's topic of records.")] = (
+    topic: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,249}$", description="Kafka topic of records.")] = (
         "monitor_data"
     )
     events_topic: Annotated[
-        str, Field(pattern=r"^[A-Za-z0-9._-]{1,249}$", description="Kafka's topic of events: runs and alarms.")
+        str, Field(pattern=r"^[A-Za-z0-9._-]{1,249}$", description="Kafka topic of events: runs, queues and alarms.")
     ] = "bus_events"
     back: Annotated[
-        float, Field(ge=0, le=604_800, description="Seconds before its start from which the page shows records.")
+        float, Field(ge=0, le=604_800, description="Seconds of history before the start that are read from Kafka.")
     ] = 900.0
     limit: Limit = Limits()

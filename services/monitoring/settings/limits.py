@@ -1,4 +1,4 @@
-"""Limits of what goes through a node: on the page in red, in records as remarks."""
+"""Limits of a node's traffic: values above them are red on the dashboard and warnings in records."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from scan2sim.services.monitoring.node.record import TopicFlow
 
 
 class Limits(Params):
-    """Values that are not to be exceeded; None: there is no limit."""
+    """Upper limits; None: no limit."""
 
-    bandwidth: Annotated[float, Field(ge=0, le=1e12, description="Bytes a second, in and out.")] | None = None
-    latency: Annotated[float, Field(ge=0, le=86_400, description="Seconds.")] | None = None
-    lost: Annotated[float, Field(ge=0, le=1e9, description="Messages lost in a period.")] | None = None
-    messages: Annotated[float, Field(ge=0, le=1e9, description="Messages in a period.")] | None = None
-    size: Annotated[float, Field(ge=0, le=1e12, description="Mean bytes of a message.")] | None = None
+    bandwidth: Annotated[float, Field(ge=0, le=1e12, description="Bytes per second, in and out.")] | None = None
+    latency: Annotated[float, Field(ge=0, le=86_400, description="Mean latency, seconds.")] | None = None
+    lost: Annotated[float, Field(ge=0, le=1e9, description="Messages lost per period.")] | None = None
+    messages: Annotated[float, Field(ge=0, le=1e9, description="Messages per period.")] | None = None
+    size: Annotated[float, Field(ge=0, le=1e12, description="Mean message size, bytes.")] | None = None
 
     def exceeded(self, flows: Sequence[TopicFlow]) -> list[str]:
-        """What is over its limit, of one topic and direction each, in words."""
+        """Warnings for the values that exceed their limit, each for one topic and direction."""
         found = []
         for flow in flows:
             values = {
@@ -34,20 +34,21 @@ class Limits(Params):
             for name, limit in self.model_dump(exclude_none=True).items():
                 value = values[name]
                 if value is not None and value > limit:
-                    found.append(f"{flow.topic}: {flow.direction} {name} {value:.4g} is over its limit, {limit:.4g}")
+                    found.append(f"{flow.topic}: {flow.direction} {name} {value:.4g} exceeds the limit {limit:.4g}")
         return found
 
 
-def _assigned(given: Any) -> Any:
-    """Limits as they are given on the command line, KEY=VALUE each, by their names."""
-    return dict(text.partition("=")[::2] for text in given or ()) if not isinstance(given, (dict, Limits)) else given
+def _parse_assignments(value: Any) -> Any:
+    """Convert a list of KEY=VALUE from the command line to a dict."""
+    return dict(text.partition("=")[::2] for text in value or ()) if not isinstance(value, (dict, Limits)) else value
 
 
 Limit = Annotated[
     Limits,
-    BeforeValidator(_assigned),
+    BeforeValidator(_parse_assignments),
     Field(
-        description="Limits: bandwidth (bytes/s), latency (s), lost, messages, size (bytes); may be repeated.",
+        description="Upper limit of bandwidth (bytes/s), latency (s), lost or messages (per period), or size (bytes);"
+        " may be repeated.",
         json_schema_extra={"range": f"KEY=VALUE, with KEY one of {', '.join(Limits.model_fields)}"},
     ),
 ]

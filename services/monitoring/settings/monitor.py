@@ -1,4 +1,4 @@
-"""How a node is watched: a monitor's settings, in its constructor as on the command line."""
+"""Settings of instrumented nodes, for their constructors and the command line."""
 
 from __future__ import annotations
 
@@ -13,103 +13,116 @@ from scan2sim.services.monitoring.settings.limits import Limit, Limits
 from scan2sim.services.transport.names import TopicName
 
 WhenFull = Literal["newest", "oldest"]
-LARGEST = 16 * 2**20
-"""Bytes of a message of the test nodes, at most."""
+MAX_MESSAGE_BYTES = 16 * 2**20
+"""Largest message of the example nodes."""
 
 
-class Watched(Params):
-    """The names are D3.2's (code snippet 3), as far as it has them."""
+class MonitorParams(Params):
+    """Settings of a monitor, named as in D3.2 (code snippet 3) where it has them."""
 
-    period: Annotated[float, Field(ge=0.01, le=3600, description="Seconds between records.")] = 1.0
-    window_size: Annotated[int, Field(ge=1, le=1_000_000, description="Latencies that go into a record, at most.")] = (
-        100
-    )
+    period: Annotated[float, Field(ge=0.01, le=3600, description="Seconds between two records.")] = 1.0
+    window_size: Annotated[
+        int, Field(ge=1, le=1_000_000, description="Number of latest messages per topic whose latency is averaged.")
+    ] = 100
     kafka_bootstrap_servers: Annotated[
-        Servers | None, Field(description="Kafka for the records, as host:port,host:port; it need not be there yet.")
+        Servers | None,
+        Field(description="Kafka servers to send the records to, HOST:PORT,...; retried until reachable."),
     ] = None
-    publisher_topic: Annotated[TopicName, Field(description="Topic of ROS 2 and of Kafka for the records.")] = (
-        "monitor_data"
-    )
-    log_file: Annotated[Path | None, Field(description="File for the records, a line each.")] = None
-    console: Annotated[bool, Field(description="Write records to standard error, too.")] = False
+    publisher_topic: Annotated[TopicName, Field(description="ROS 2 and Kafka topic of the records.")] = "monitor_data"
+    log_file: Annotated[Path | None, Field(description="Log file of the records, a line of JSON each.")] = None
+    console: Annotated[bool, Field(description="Also write the records to standard error.")] = False
     prometheus_port: Annotated[
-        int | None, Field(ge=0, le=65535, description="Port where the last figures are shown to Prometheus.")
+        int | None, Field(ge=0, le=65535, description="Port on 127.0.0.1 that serves the metrics for Prometheus.")
     ] = None
     spool: Annotated[
-        Path | None, Field(description="File for records that wait for Kafka; default: in the user's state folder.")
+        Path | None,
+        Field(description="Outbox file for records not yet sent to Kafka; default: in the user's state folder."),
     ] = None
     limit: Limit = Limits()
 
-    def monitored(self) -> dict[str, Any]:
-        """What a monitor's constructor takes of it."""
-        return {name: getattr(self, name) for name in Watched.model_fields}
+    def monitor_settings(self) -> dict[str, Any]:
+        """Arguments of the constructor of `Monitor`."""
+        return {name: getattr(self, name) for name in MonitorParams.model_fields}
 
 
-Topic = Annotated[TopicName, Field(description="Its name, as /camera/image.")]
+Topic = Annotated[TopicName, Field(description="Name of the topic, such as /camera/image.")]
 NodeName = Annotated[
     str,
     Field(
         pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,254}$",
-        description="The node's name: each of several has its own.",
+        description="Name of the node; must be unique if several run.",
         json_schema_extra={"range": "letters, digits and underscores"},
     ),
 ]
 
 
-class TopicParams(Watched):
-    """Of a node that watches topics from outside."""
+class TopicParams(MonitorParams):
+    """Settings of a node that monitors topics of other nodes."""
 
-    topics: Annotated[list[TopicName], Field(min_length=1, description="Their names, as /camera/image.")]
-    type: Annotated[str | None, Field(description="Of their messages; default: as publishers say.")] = None
-    timeout: Annotated[float, Field(ge=0.1, le=86_400, description="Seconds to wait for a publisher.")] = 60.0
+    topics: Annotated[list[TopicName], Field(min_length=1, description="Names of the topics, such as /camera/image.")]
+    type: Annotated[
+        str | None, Field(description="Message type, such as std_msgs/msg/String; default: discovered from publishers.")
+    ] = None
+    timeout: Annotated[
+        float, Field(ge=0.1, le=86_400, description="Seconds to wait for the first publisher before giving up.")
+    ] = 60.0
     depth: Annotated[
-        int, Field(ge=1, le=100_000, description="Messages of a topic that may wait to be counted; then the oldest go.")
+        int,
+        Field(ge=1, le=100_000, description="QoS history depth: messages per topic that are queued before counting."),
     ] = 100
     best_effort: Annotated[
-        bool, Field(description="Ask for no lost message again: watching never slows who publishes.")
+        bool,
+        Field(description="Subscribe with best-effort reliability, which never slows down a publisher."),
     ] = False
 
 
-class TalkerParams(Watched):
-    """Of a node that sends messages of a size at an interval."""
+class TalkerParams(MonitorParams):
+    """Settings of the talker."""
 
     topic: Topic
     name: NodeName = "talker"
-    size: Annotated[int, Field(ge=0, le=LARGEST, description="Characters of a message.")] = 1000
-    interval: Annotated[float, Field(ge=0.0001, le=3600, description="Seconds between messages.")] = 1.0
+    size: Annotated[int, Field(ge=0, le=MAX_MESSAGE_BYTES, description="Characters per message.")] = 1000
+    interval: Annotated[float, Field(ge=0.0001, le=3600, description="Seconds between two messages.")] = 1.0
 
 
-class DatasetParams(Watched):
-    """Of a node that sends messages when, and as large as, a file says."""
+class DatasetParams(MonitorParams):
+    """Settings of the dataset talker."""
 
     topic: Topic
     name: NodeName = "dataset_talker"
-    data: Annotated[Path, Field(description="CSV: seconds from the start, bytes.")]
-    speed: Annotated[float, Field(ge=0.001, le=10_000, description="So many times as fast as the file says.")] = 1.0
-    subscribers: Annotated[int, Field(ge=0, le=1000, description="Subscriptions to wait for before it begins.")] = 0
-    size_as_field: Annotated[bool, Field(description="Send sizes as JSON, not so many bytes.")] = False
+    data: Annotated[Path, Field(description="CSV file with a line per message: seconds from the start, bytes.")]
+    speed: Annotated[
+        float, Field(ge=0.001, le=10_000, description="Playback speed: factor by which the times are shortened.")
+    ] = 1.0
+    subscribers: Annotated[int, Field(ge=0, le=1000, description="Start when there are this many subscribers.")] = 0
+    size_as_field: Annotated[
+        bool, Field(description="Send the size as a JSON field instead of a message of that size.")
+    ] = False
 
 
-class ListenerParams(Watched):
-    """Of a node that listens."""
+class ListenerParams(MonitorParams):
+    """Settings of the listener."""
 
     topic: Topic
 
 
-class WorkParams(Watched):
-    """Of a node that has events worked on."""
+class WorkParams(MonitorParams):
+    """Settings of a node that queues a topic's messages for worker processes."""
 
     topic: Topic
     command: Annotated[
-        str, Field(description="Worker: a program that reads a line of JSON an event, and answers it with a line.")
+        str,
+        Field(description="Worker program: reads a line of JSON per event and replies with a line when it is done."),
     ]
-    max_workers: Annotated[int, Field(ge=1, le=1000, description="Workers that it starts, at most.")] = 5
+    max_workers: Annotated[int, Field(ge=1, le=1000, description="Maximum number of worker processes.")] = 5
     deadline: Annotated[
-        float, Field(ge=0.01, le=86_400, description="Seconds for an event; then its worker is killed.")
+        float, Field(ge=0.01, le=86_400, description="Seconds per event; a worker that takes longer is killed.")
     ] = 60.0
-    with_text: Annotated[bool, Field(description="Tell workers messages' text as well as their size.")] = False
-    queue_length: Annotated[int, Field(ge=1, le=10_000_000, description="Events that wait, at most.")] = 100_000
+    with_text: Annotated[
+        bool, Field(description="Pass the text of the messages to the workers as well as their size.")
+    ] = False
+    queue_length: Annotated[int, Field(ge=1, le=10_000_000, description="Maximum number of waiting events.")] = 100_000
     when_full: Annotated[
-        WhenFull, Field(description="Which event is refused when as many wait: the newest, or the oldest.")
+        WhenFull, Field(description="Which event is dropped when the queue is full: the newest or the oldest.")
     ] = "newest"
-    events_topic: Annotated[TopicName, Field(description="Topic of ROS 2 and of Kafka with events.")] = "bus_events"
+    events_topic: Annotated[TopicName, Field(description="ROS 2 and Kafka topic of events.")] = "bus_events"

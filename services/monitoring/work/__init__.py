@@ -1,4 +1,4 @@
-"""Queues of events and the nodes that have workers process them.
+"""Event queues and the node whose worker processes handle them.
 
 Begin with `queue`.
 """

@@ -1,4 +1,4 @@
-"""Events that wait for workers: in order, within bounds, and none is gone until it is done."""
+"""Bounded, ordered event queue for workers; an event stays in the queue until it is done."""
 
 from __future__ import annotations
 
@@ -10,54 +10,54 @@ from dataclasses import dataclass
 from scan2sim.services.monitoring.events.schema import QueueState
 from scan2sim.services.monitoring.settings.monitor import WhenFull
 
-MOST = 100_000
-"""Events that wait, at most; what is refused is counted."""
-TRIES = 3
-"""Workers that may die or hang over an event, before it counts as refused."""
+MAX_WAITING = 100_000
+"""Default capacity; dropped events are counted as refused."""
+MAX_ATTEMPTS = 3
+"""An event at which this many workers died or hung is dropped and counted as refused."""
 
 
 @dataclass
-class Waiting:
-    """An event that waits or is worked on.
+class QueuedEvent:
+    """An event that waits or is being processed.
 
     Attributes:
-        line: that its worker reads.
-        sent: seconds since the epoch.
-        tries: workers that failed at it.
+        line: input line for its worker.
+        sent: when it was sent, seconds since the epoch.
+        attempts: number of workers that failed at it.
     """
 
     line: str
     sent: float
-    tries: int = 0
+    attempts: int = 0
 
 
 class EventQueue:
-    """Hands events to workers; may be used from any thread."""
+    """Distributes events to workers; thread-safe."""
 
-    def __init__(self, name: str, most: int = MOST, when_full: WhenFull = "newest") -> None:
-        """Of so many events at most; `when_full` says which one is refused then."""
-        self.name, self._most, self._when_full = name, most, when_full
-        self._waiting: deque[Waiting] = deque()
-        self._in_work: dict[int, Waiting] = {}
+    def __init__(self, name: str, capacity: int = MAX_WAITING, when_full: WhenFull = "newest") -> None:
+        """`capacity`: maximum of waiting events; `when_full`: which event is dropped beyond it."""
+        self.name, self._capacity, self._when_full = name, capacity, when_full
+        self._waiting: deque[QueuedEvent] = deque()
+        self._in_work: dict[int, QueuedEvent] = {}
         self._changed = threading.Condition()
         self._arrived = self._done = self._refused = 0
         self._oldest_done = 0.0
 
     def put(self, line: str, sent: float) -> bool:
-        """Have an event wait; False: there is no room."""
+        """Append an event; False if the queue is full and the event was dropped."""
         with self._changed:
             self._arrived += 1
-            if len(self._waiting) >= self._most:
+            if len(self._waiting) >= self._capacity:
                 self._refused += 1
                 if self._when_full == "newest":
                     return False
                 self._waiting.popleft()
-            self._waiting.append(Waiting(line, sent))
+            self._waiting.append(QueuedEvent(line, sent))
             self._changed.notify()
             return True
 
-    def take(self, timeout: float) -> Waiting | None:
-        """The one that waits longest, to be worked on; None: none came within so many seconds."""
+    def take(self, timeout: float) -> QueuedEvent | None:
+        """Take the oldest waiting event for processing; None if none arrives within `timeout` seconds."""
         with self._changed:
             if not self._waiting:
                 self._changed.wait(timeout)
@@ -67,31 +67,31 @@ class EventQueue:
             self._in_work[id(event)] = event
             return event
 
-    def done(self, event: Waiting) -> None:
-        """It is done."""
+    def done(self, event: QueuedEvent) -> None:
+        """Mark an event as done and remove it."""
         with self._changed:
             del self._in_work[id(event)]
             self._done += 1
             self._oldest_done = max(self._oldest_done, time.time() - event.sent)
 
-    def failed(self, event: Waiting) -> None:
-        """Its worker died: it is the next one's, unless too many have died over it."""
+    def failed(self, event: QueuedEvent) -> None:
+        """Requeue an event whose worker died, or drop it after `MAX_ATTEMPTS`."""
         with self._changed:
             del self._in_work[id(event)]
-            event.tries += 1
-            if event.tries >= TRIES:
+            event.attempts += 1
+            if event.attempts >= MAX_ATTEMPTS:
                 self._refused += 1
                 return
             self._waiting.appendleft(event)
             self._changed.notify()
 
     def __len__(self) -> int:
-        """Events that wait or are worked on."""
+        """Number of events that wait or are being processed."""
         with self._changed:
             return len(self._waiting) + len(self._in_work)
 
     def state(self, seconds: float, workers: int) -> QueueState:
-        """What became of it in the last so many seconds; counting begins anew."""
+        """Statistics of the last `seconds`; the counters restart at zero."""
         with self._changed:
             sent = min((one.sent for one in (*list(self._waiting)[:1], *self._in_work.values())), default=None)
             state = QueueState(

@@ -1,4 +1,4 @@
-"""A node that has events of a topic worked on: they wait in a queue, and workers are started as they are asked for."""
+"""Node that queues the events of a topic for local worker processes, scaled on request of the autoscaler."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import shlex
 import time
 from typing import Any
 
-from scan2sim.services.monitoring.autoscale.actuators.local_workers import Processes
+from scan2sim.services.monitoring.autoscale.actuators.local_workers import LocalWorkers
 from scan2sim.services.monitoring.events.bus import Bus
 from scan2sim.services.monitoring.events.schema import QueueState, WorkersWanted
 from scan2sim.services.monitoring.node.monitor import STRING, Monitor, ros
@@ -16,21 +16,21 @@ from scan2sim.services.monitoring.settings.monitor import WorkParams
 from scan2sim.services.monitoring.work.queue import EventQueue
 from scan2sim.services.transport import Arrival, QoS
 
-EVENTS = QoS(depth=1000)
+EVENTS_QOS = QoS(depth=1000)
 
 
-class Work(Monitor):
-    """Takes strings for events, and reports on its queue as often as on itself.
+class WorkerNode(Monitor):
+    """Treats the strings on a topic as events; publishes the state of its queue once per period.
 
     Attributes:
-        queue: of the topic's name.
+        queue: its event queue, named like the topic.
     """
 
     def __init__(self, params: WorkParams, node_name: str = "work") -> None:
-        super().__init__(node_name, **params.monitored())
+        super().__init__(node_name, **params.monitor_settings())
         self.queue = EventQueue(params.topic, params.queue_length, params.when_full)
-        self._workers = Processes(self.queue, shlex.split(params.command), params.deadline)
-        self._most, self._with_text = params.max_workers, params.with_text
+        self._workers = LocalWorkers(self.queue, shlex.split(params.command), params.deadline)
+        self._max_workers, self._with_text = params.max_workers, params.with_text
         self._sent: float | None = None
         self._bus = Bus(
             self,
@@ -42,24 +42,24 @@ class Work(Monitor):
         )
         self.drops.append(self._bus.dropped)
         self._bus.events.on("workers", self._scale)
-        self.create_subscription(ros.message_type(STRING), params.topic, self._take, EVENTS)
+        self.create_subscription(ros.message_type(STRING), params.topic, self._enqueue, EVENTS_QOS)
         self._reported = time.monotonic()
         self._workers.scale(1)
         self.create_timer(params.period, self._report_queue)
 
     def received(self, arrival: Arrival) -> None:
-        """Remember when the message that comes next was sent."""
+        """Store the source timestamp of the message that is passed to `_enqueue` next."""
         super().received(arrival)
         self._sent = arrival.sent / 1e9 if arrival.sent is not None else None
 
-    def _take(self, message: Any) -> None:
+    def _enqueue(self, message: Any) -> None:
         sent = self._sent if self._sent is not None else time.time()
         event = {"sent": sent, "size": len(message.data)} | ({"text": message.data} if self._with_text else {})
         self.queue.put(json.dumps(event), sent)
 
     def _scale(self, wanted: WorkersWanted) -> None:
         if wanted.queue == self.queue.name:
-            self._workers.scale(min(self._most, wanted.workers))
+            self._workers.scale(min(self._max_workers, wanted.workers))
 
     def _report_queue(self) -> None:
         now = time.monotonic()
@@ -68,7 +68,7 @@ class Work(Monitor):
         self._bus.events.send("queue", state)
 
     def destroy_node(self) -> Any:
-        """Stop the workers, and end."""
+        """Stop the workers and destroy the node."""
         self._workers.close()
         self._bus.close()
         return super().destroy_node()

@@ -1,4 +1,4 @@
-"""Networks between a robot and its services, by where those run (D3.2, section 2.2): a file each, of what it does."""
+"""Networks between a robot and its services for each environment (D3.2, section 2.2), one TOML file each."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from pydantic import ValidationError
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.io import toml
-from scan2sim.services.qos.link_profile import Shape
+from scan2sim.services.qos.link_profile import LinkProfile
 from scan2sim.services.qos.requirements import Environment
 
 FOLDER = Path(__file__).parent
 
 
 class Network(Params):
-    """Both directions between a robot and a service: from the robot, and back to it."""
+    """Link profiles from the robot to a service and back."""
 
-    there: Shape
-    back: Shape
+    there: LinkProfile
+    back: LinkProfile
 
 
 def network(environment: Environment, file: Path | None = None) -> Network | None:
-    """What lies between robot and service, as assumed or as a file says; None: nothing does, on the robot.
+    """Network of an environment, as assumed or from a file; None if the service runs on the robot.
 
     Raises:
-        InputError: the file can't be read, or says something else.
+        InputError: the file can't be read or is invalid.
     """
     if environment == Environment.ROBOT and file is None:
         return None
@@ -40,4 +40,4 @@ def network(environment: Environment, file: Path | None = None) -> Network | Non
         where = ".".join(map(str, first["loc"]))
         raise InputError(path, f"{where}: {first['msg']}", f"See {FOLDER / 'cloud.toml'}") from None
     except ValueError as error:
-        raise InputError(path, f"is no TOML ({error})", "Mend it") from None
+        raise InputError(path, f"invalid TOML ({error})", "Fix the file") from None

@@ -1,4 +1,4 @@
-"""What shapes a link: a file each, found by its name (`pipeline.core.plugins`)."""
+"""Backends that shape the traffic of a link, one module each (`pipeline.core.plugins`)."""
 
 from __future__ import annotations
 
@@ -7,49 +7,49 @@ from pathlib import Path
 from typing import Protocol
 
 from scan2sim.pipeline.core import plugins
-from scan2sim.pipeline.core.plugins import Lacking
-from scan2sim.services.qos.link_profile import Shape
-from scan2sim.services.qos.namespaces import WHAT, Namespace
+from scan2sim.pipeline.core.plugins import Unavailable
+from scan2sim.services.qos.link_profile import LinkProfile
+from scan2sim.services.qos.namespaces import FEATURE, Namespace
 
 
 class Wire(Protocol):
-    """A link that is there."""
+    """A connected link."""
 
-    def shape(self, there: Shape, back: Shape) -> None:
-        """Do so from now on, to packets from the near side and to it."""
+    def shape(self, there: LinkProfile, back: LinkProfile) -> None:
+        """Set the profiles of packets from the near side and back to it."""
 
 
 class Backend(Protocol):
-    """What a file here has.
+    """Interface of a backend module.
 
     Attributes:
-        RANK: the lower, the better is what it makes.
+        RANK: preference; the lowest is the best.
     """
 
     RANK: int
 
-    def lacking(self) -> Lacking | None:
-        """What isn't there; None: it can run here."""
+    def unavailable(self) -> Unavailable | None:
+        """Why it can't run here; None if it can."""
 
     def connect(self, near: Namespace, far: Namespace, folder: Path, wire: int) -> Wire:
-        """Make both interfaces of a wire, and join them; programs' files go to the folder."""
+        """Create and connect both interfaces of a wire; files of its programs are written to the folder."""
 
 
 def find(name: str | None = None) -> Backend:
-    """A backend that can run here: of that name, or the best.
+    """A backend that can run here: the named one, or the best.
 
     Raises:
-        SettingError: there is none of that name.
+        SettingError: unknown name.
         UnavailableError: it can't run here, or none can.
     """
-    found: Backend = plugins.best(__name__, name, "link", WHAT)
+    found: Backend = plugins.best(__name__, name, "link", FEATURE)
     return found
 
 
-def programs(**packages: str) -> Lacking | None:
-    """`Backend.lacking` of programs, given with the Debian packages that bring them."""
-    absent = [name for name in packages if shutil.which(name) is None]
-    if not absent:
+def programs(**packages: str) -> Unavailable | None:
+    """`Backend.unavailable` for required programs, given with the Debian packages that provide them."""
+    missing = [name for name in packages if shutil.which(name) is None]
+    if not missing:
         return None
-    wanted = " ".join(sorted({packages[name] for name in absent}))
-    return Lacking(f"needs {', '.join(absent)}, not installed here", f"apt-get install {wanted}")
+    debian_packages = " ".join(sorted({packages[name] for name in missing}))
+    return Unavailable(f"needs {', '.join(missing)}, not installed here", f"apt-get install {debian_packages}")

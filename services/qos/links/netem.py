@@ -1,6 +1,6 @@
-"""Links shaped by the kernel: netem (tc-netem(8)) on the two ends of a virtual Ethernet.
+"""Links shaped by the kernel's netem (tc-netem(8)) at both ends of a virtual Ethernet pair.
 
-It keeps times to the microsecond, and carries what the machine can. With jitter, packets may overtake each other.
+Delays are precise to the microsecond. With jitter, packets may be reordered.
 """
 
 from __future__ import annotations
@@ -9,63 +9,66 @@ import subprocess
 from pathlib import Path
 
 from scan2sim.pipeline.core.errors import UnavailableError
-from scan2sim.pipeline.core.plugins import Lacking
-from scan2sim.services.qos.link_profile import Shape
+from scan2sim.pipeline.core.plugins import Unavailable
+from scan2sim.services.qos.link_profile import LinkProfile
 from scan2sim.services.qos.links import programs
-from scan2sim.services.qos.namespaces import WHAT, Namespace, ip
+from scan2sim.services.qos.namespaces import FEATURE, Namespace, ip
 
 RANK = 1
-LARGEST = 1514
-"""Bytes of an Ethernet frame, as the kernel counts it."""
-MANY = 1_000_000
-"""Packets that may be on their way where the rate isn't bound."""
+ETHERNET_FRAME_BYTES = 1514
+"""Size of an Ethernet frame as counted by the kernel."""
+UNLIMITED_PACKETS = 1_000_000
+"""Queue limit without a rate."""
 
 
-def lacking() -> Lacking | None:
-    """Programs, and the kernel's module: tried in a namespace that is gone with the trial."""
-    absent = programs(tc="iproute2", unshare="util-linux")
-    if absent:
-        return absent
+def unavailable() -> Unavailable | None:
+    """Check for the programs and the kernel module, by using it in a temporary namespace."""
+    missing = programs(tc="iproute2", unshare="util-linux")
+    if missing:
+        return missing
     tried = subprocess.run(
         ["unshare", "--net", "tc", "qdisc", "add", "dev", "lo", "root", "netem"], capture_output=True, text=True
     )
     if tried.returncode == 0:
         return None
-    said = tried.stderr.strip().removeprefix("Error: ").rstrip(".")
-    return Lacking(f"needs the kernel's netem ({said})", "modprobe sch_netem")
+    message = tried.stderr.strip().removeprefix("Error: ").rstrip(".")
+    return Unavailable(f"needs the kernel's netem ({message})", "modprobe sch_netem")
 
 
 def connect(near: Namespace, far: Namespace, folder: Path, wire: int) -> Wire:
-    """A pair of interfaces, one in each namespace."""
+    """Create a pair of interfaces, one in each namespace."""
     name = near.interface(wire)
     ip("-n", near.name, "link", "add", "dev", name, "type", "veth", "peer", "name", name, "netns", far.name)
     return Wire(near, far, name)
 
 
 class Wire:
-    """Each direction is shaped where it leaves."""
+    """Link whose directions are shaped at their egress."""
 
     def __init__(self, near: Namespace, far: Namespace, interface: str) -> None:
         self._near, self._far, self._interface = near, far, interface
 
-    def shape(self, there: Shape, back: Shape) -> None:
-        """Replace both queueing disciplines; what they hold is dropped."""
-        for side, shape in ((self._near, there), (self._far, back)):
-            command = ("tc", "qdisc", "replace", "dev", self._interface, "root", "netem", *_settings(shape))
+    def shape(self, there: LinkProfile, back: LinkProfile) -> None:
+        """Replace both queueing disciplines; queued packets are dropped."""
+        for side, profile in ((self._near, there), (self._far, back)):
+            command = ("tc", "qdisc", "replace", "dev", self._interface, "root", "netem", *_settings(profile))
             done = side.run(*command, capture_output=True, text=True)
             if done.returncode:
-                raise UnavailableError(WHAT, f"{' '.join(command)} failed ({done.stderr.strip()})", "Update iproute2")
+                raise UnavailableError(
+                    FEATURE, f"{' '.join(command)} failed ({done.stderr.strip()})", "Update iproute2"
+                )
 
 
-def _settings(shape: Shape) -> list[str]:
-    """Arguments of tc-netem(8); Gilbert's model as p and r of its `gemodel`."""
-    told = ["limit", str(MANY if shape.backlog is None else max(1, shape.backlog // LARGEST))]
-    if shape.delay or shape.jitter:
-        told += ["delay", f"{shape.delay * 1e6:.0f}us", f"{shape.jitter * 1e6:.0f}us"]
-    if shape.loss and shape.burst > 1:
-        ends = 1 / shape.burst
-        begins = shape.loss * ends / (1 - shape.loss)
-        told += ["loss", "gemodel", f"{100 * begins:.6f}%", f"{100 * ends:.6f}%"]
-    elif shape.loss:
-        told += ["loss", "random", f"{100 * shape.loss:.6f}%"]
-    return [*told, "rate", f"{shape.rate:.0f}bit"] if shape.rate else told
+def _settings(profile: LinkProfile) -> list[str]:
+    """Arguments of tc-netem(8); bursts use the Gilbert model, with p and r of netem's `gemodel`."""
+    limit = UNLIMITED_PACKETS if profile.backlog is None else max(1, profile.backlog // ETHERNET_FRAME_BYTES)
+    arguments = ["limit", str(limit)]
+    if profile.delay or profile.jitter:
+        arguments += ["delay", f"{profile.delay * 1e6:.0f}us", f"{profile.jitter * 1e6:.0f}us"]
+    if profile.loss and profile.burst > 1:
+        ends = 1 / profile.burst
+        begins = profile.loss * ends / (1 - profile.loss)
+        arguments += ["loss", "gemodel", f"{100 * begins:.6f}%", f"{100 * ends:.6f}%"]
+    elif profile.loss:
+        arguments += ["loss", "random", f"{100 * profile.loss:.6f}%"]
+    return [*arguments, "rate", f"{profile.rate:.0f}bit"] if profile.rate else arguments

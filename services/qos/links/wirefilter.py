@@ -1,6 +1,7 @@
-"""Links shaped by wirefilter of Virtual Distributed Ethernet (vde2, Davoli 2005): a process, for kernels without netem.
+"""Links shaped by wirefilter of Virtual Distributed Ethernet (vde2, Davoli 2005), for kernels without netem.
 
-It keeps times to some tenths of a millisecond, packets in order, and up to some 10 000 packets a second.
+A user-space process: delays are precise to some tenths of a millisecond, packets are never reordered, and throughput is
+limited to some 10 000 packets per second.
 """
 
 from __future__ import annotations
@@ -11,89 +12,98 @@ import time
 from pathlib import Path
 
 from scan2sim.pipeline.core.errors import UnavailableError
-from scan2sim.pipeline.core.plugins import Lacking
-from scan2sim.services.qos.link_profile import Shape
+from scan2sim.pipeline.core.plugins import Unavailable
+from scan2sim.services.qos.link_profile import LinkProfile
 from scan2sim.services.qos.links import programs
-from scan2sim.services.qos.namespaces import WHAT, Namespace
+from scan2sim.services.qos.namespaces import FEATURE, Namespace
 
 RANK = 2
 PROMPT = b"VDEwf$ "
-STARTS_WITHIN = 5.0
-"""Seconds."""
-PRIORITY = 20
-"""A link keeps time, whatever else the processors have to do."""
+START_TIMEOUT_S = 5.0
+"""Seconds to wait for its start and for responses."""
+REALTIME_PRIORITY = 20
+"""Real-time priority, so that delays don't depend on other load."""
 
 
-def lacking() -> Lacking | None:
-    """Programs, and the kernel's taps."""
+def unavailable() -> Unavailable | None:
+    """Check for the programs and the kernel's TAP devices."""
     if not Path("/dev/net/tun").exists():
-        return Lacking("needs /dev/net/tun, not there", "modprobe tun (in a container: --device /dev/net/tun)")
+        return Unavailable(
+            "needs /dev/net/tun, which doesn't exist", "modprobe tun (in a container: --device /dev/net/tun)"
+        )
     return programs(vde_plug="vdeplug", wirefilter="vde-wirefilter")
 
 
 def connect(near: Namespace, far: Namespace, folder: Path, wire: int) -> Wire:
-    """A tap in each namespace, wirefilter between them."""
-    managed, log = folder / f"wirefilter{wire}", folder / f"wirefilter{wire}.log"
+    """Create a TAP device in each namespace and connect them with wirefilter."""
+    management, log = folder / f"wirefilter{wire}", folder / f"wirefilter{wire}.log"
     pipes = [os.pipe() for _ in range(4)]
     (to_near, from_near), (to_far, from_far) = pipes[:2], pipes[2:]
     ends = {"ALTERNATE_STDIN": from_far[0], "ALTERNATE_STDOUT": to_far[1]}
-    with log.open("w") as said:
+    with log.open("w") as log_file:
         for side, to, back in ((near, to_near, from_near), (far, to_far, from_far)):
             side.popen(
-                "vde_plug", f"tap://{side.interface(wire)}", stdin=to[0], stdout=back[1], stderr=said, priority=PRIORITY
+                "vde_plug",
+                f"tap://{side.interface(wire)}",
+                stdin=to[0],
+                stdout=back[1],
+                stderr=log_file,
+                priority=REALTIME_PRIORITY,
             )
         started = near.popen(
-            *("wirefilter", "-M", managed),
-            priority=PRIORITY,
-            **{"stdin": from_near[0], "stdout": to_near[1], "stderr": said},
+            *("wirefilter", "-M", management),
+            priority=REALTIME_PRIORITY,
+            **{"stdin": from_near[0], "stdout": to_near[1], "stderr": log_file},
             pass_fds=ends.values(),
             env=os.environ | {name: str(end) for name, end in ends.items()},
         )
     for end in (end for pipe in pipes for end in pipe):
         os.close(end)
-    limit = time.monotonic() + STARTS_WITHIN
-    while not (managed.exists() and near.ready(wire) and far.ready(wire)):
-        if started.poll() is not None or time.monotonic() > limit:
-            cause = f"wirefilter and its taps didn't start ({log.read_text().strip()[:200]})"
-            raise UnavailableError(WHAT, cause, "Look whether they start by hand (man wirefilter)")
+    deadline = time.monotonic() + START_TIMEOUT_S
+    while not (management.exists() and near.has_interface(wire) and far.has_interface(wire)):
+        if started.poll() is not None or time.monotonic() > deadline:
+            cause = f"wirefilter and its TAP devices didn't start ({log.read_text().strip()[:200]})"
+            raise UnavailableError(FEATURE, cause, "Check whether they start in a shell (man wirefilter)")
         time.sleep(0.01)
-    return Wire(managed)
+    return Wire(management)
 
 
 class Wire:
-    """Told what to do by its management socket."""
+    """Link controlled by wirefilter's management socket."""
 
-    def __init__(self, managed: Path) -> None:
+    def __init__(self, management: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX)
-        self._socket.settimeout(STARTS_WITHIN)
-        self._socket.connect(str(managed))
-        self._answer()
+        self._socket.settimeout(START_TIMEOUT_S)
+        self._socket.connect(str(management))
+        self._response()
 
-    def shape(self, there: Shape, back: Shape) -> None:
-        """One command a figure and direction."""
-        for way, shape in (("LR", there), ("RL", back)):
-            for name, value in _settings(shape).items():
+    def shape(self, there: LinkProfile, back: LinkProfile) -> None:
+        """Send one command per setting and direction."""
+        for way, profile in (("LR", there), ("RL", back)):
+            for name, value in _settings(profile).items():
                 self._socket.sendall(f"{name} {way}{value}\n".encode())
-                said = self._answer()
-                if "1000 Success" not in said:
-                    raise UnavailableError(WHAT, f"wirefilter refuses {name} {value}: {said}", "Report it")
+                response = self._response()
+                if "1000 Success" not in response:
+                    raise UnavailableError(
+                        FEATURE, f"wirefilter rejects {name} {value}: {response}", "Report it as a bug"
+                    )
 
-    def _answer(self) -> str:
-        said = b""
-        while not said.endswith(PROMPT):
-            read = self._socket.recv(4096)
-            if not read:
-                raise UnavailableError(WHAT, "wirefilter has ended", "Make the link anew")
-            said += read
-        return said.removesuffix(PROMPT).decode(errors="replace").strip()
+    def _response(self) -> str:
+        response = b""
+        while not response.endswith(PROMPT):
+            received = self._socket.recv(4096)
+            if not received:
+                raise UnavailableError(FEATURE, "wirefilter has ended", "Create the link again")
+            response += received
+        return response.removesuffix(PROMPT).decode(errors="replace").strip()
 
 
-def _settings(shape: Shape) -> dict[str, str]:
-    """In milliseconds, percent, bytes a second and bytes."""
+def _settings(profile: LinkProfile) -> dict[str, str]:
+    """Settings of wirefilter in ms, percent, bytes per second and bytes."""
     return {
-        "delay": f"{shape.delay * 1e3:g}+{shape.jitter * 1e3:g}U",
-        "loss": f"{shape.loss * 100:g}",
-        "lostburst": f"{shape.burst if shape.burst > 1 else 0:g}",
-        "bandwidth": f"{(shape.rate or 0) / 8:.0f}",
-        "chanbufsize": f"{shape.backlog or 0}",
+        "delay": f"{profile.delay * 1e3:g}+{profile.jitter * 1e3:g}U",
+        "loss": f"{profile.loss * 100:g}",
+        "lostburst": f"{profile.burst if profile.burst > 1 else 0:g}",
+        "bandwidth": f"{(profile.rate or 0) / 8:.0f}",
+        "chanbufsize": f"{profile.backlog or 0}",
     }

@@ -1,8 +1,8 @@
-"""Requirements on a service's quality, by where it runs: the metrics of D3.2's table 2, and its tables as files.
+"""Requirements on a service's quality of service and hardware for each environment, with the metrics of D3.2's table 2.
 
-A file is TOML: a `title`, a `description`, where it is from (`source`), the width and height of the images that it is
-for (`image`), and a table for each of `robot`, `edge` and `cloud` (section 2.2). A value is a bound ("< 2000", "> 20",
-"4" for at least so many cores), a preferred slice, or left out where nothing is asked.
+Files are TOML: `title`, `description`, `source`, width and height of the images (`image`), and one table for each of
+`robot`, `edge` and `cloud` (section 2.2). A value is a bound ("< 2000", "> 20", "4" for at least 4 cores) or a
+preferred slice; metrics without a requirement are omitted.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.io import toml
 
 FOLDER = Path(__file__).parent
-"""Of the files that come along: those of D3.2's tables 3, 6, 7, 8, 10 and 11."""
+"""Folder of the built-in files: D3.2's tables 3, 6, 7, 8, 10 and 11."""
 
 
 class Environment(StrEnum):
@@ -27,17 +27,17 @@ class Environment(StrEnum):
     ROBOT = "robot"
     """On the robot: no network between camera and model."""
     EDGE = "edge"
-    """On site, by Wi-Fi."""
+    """On site, connected by Wi-Fi."""
     CLOUD = "cloud"
-    """Off site, by a mobile network."""
+    """Off site, connected by a mobile network."""
 
 
 class Bound(BaseModel):
-    """What a value must be.
+    """Upper or lower bound of a metric.
 
     Attributes:
-        kind: at most, or at least, that much.
-        value: in its metric's unit.
+        kind: "<" for at most, ">" for at least.
+        value: limit in the metric's unit.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -46,7 +46,7 @@ class Bound(BaseModel):
     value: float = Field(ge=0)
 
     def met(self, value: float) -> bool:
-        """Whether a value is so."""
+        """Whether a value satisfies the bound."""
         return value <= self.value if self.kind == "<" else value >= self.value
 
     def __str__(self) -> str:
@@ -54,17 +54,17 @@ class Bound(BaseModel):
 
 
 def _bound(default: Literal["<", ">"]) -> BeforeValidator:
-    """Of a text as "< 5"; without a sign it is what the metric goes by."""
+    """Validator that parses text such as "< 5"; `default` is the sign if none is given."""
 
-    def parsed(given: Any) -> Any:
+    def parse(given: Any) -> Any:
         if isinstance(given, (Bound, dict)) or given is None:
             return given
         match = re.fullmatch(r"([<>]?)\s*(\d+(?:\.\d+)?)", str(given).strip())
         if not match:
-            raise ValueError(f'{given!r} is no bound as "< 5", "> 5" or 5')
+            raise ValueError(f'{given!r} isn\'t a bound such as "< 5", "> 5" or 5')
         return Bound(kind=match[1] or default, value=float(match[2]))
 
-    return BeforeValidator(parsed)
+    return BeforeValidator(parse)
 
 
 AtMost = Annotated[Bound | None, _bound("<")]
@@ -72,86 +72,88 @@ AtLeast = Annotated[Bound | None, _bound(">")]
 
 
 class Requirements(BaseModel):
-    """What is asked in one environment; None: nothing is. Names, units and meanings are those of D3.2's table 2."""
+    """Requirements in one environment; None: no requirement. Names, units and meanings are those of D3.2's table 2."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    response_time: AtMost = Field(None, description="ms from sending a request to the first response's coming")
-    delay: AtMost = Field(None, description="ms from a block's first bit's emission to its reception")
-    jitter: AtMost = Field(None, description="ms by which delays vary")
-    data_rate: AtMost = Field(None, description="Mbit/s of the data as encoded")
-    bandwidth: AtMost = Field(None, description="Mbit/s that are transferred, overhead and all")
-    loss_rate: AtMost = Field(None, description="share of what is sent that doesn't come")
-    error_rate: AtMost = Field(None, description="share of what comes that isn't as it was sent")
+    response_time: AtMost = Field(None, description="ms from sending a request to the first response")
+    delay: AtMost = Field(None, description="one-way delay in ms")
+    jitter: AtMost = Field(None, description="variation of the delay in ms")
+    data_rate: AtMost = Field(None, description="Mbit/s of encoded data")
+    bandwidth: AtMost = Field(None, description="Mbit/s on the network, including overhead")
+    loss_rate: AtMost = Field(None, description="share of sent data that is lost")
+    error_rate: AtMost = Field(None, description="share of received data that is corrupted")
     slice: Literal["eMBB", "mMTC", "URLLC"] | None = Field(None, description="preferred slice of a 5G network")
-    cpu_cores: AtLeast = Field(None, description="cores of the processor")
-    cpu_frequency: AtLeast = Field(None, description="MHz of the cores")
-    cpu_usage: AtMost = Field(None, description="percent of the processor's capacity")
-    gpu_cores: AtLeast = Field(None, description="cores of the graphics processor")
-    gpu_frequency: AtLeast = Field(None, description="MHz of the graphics processor")
-    gpu_memory: AtLeast = Field(None, description="MB of the graphics processor's memory")
-    gpu_usage: AtMost = Field(None, description="percent of the graphics processor's capacity")
-    memory: AtMost = Field(None, description="MB of memory that it takes")
+    cpu_cores: AtLeast = Field(None, description="number of CPU cores")
+    cpu_frequency: AtLeast = Field(None, description="clock of the CPU in MHz")
+    cpu_usage: AtMost = Field(None, description="percentage of the CPU's capacity")
+    gpu_cores: AtLeast = Field(None, description="number of GPU cores")
+    gpu_frequency: AtLeast = Field(None, description="clock of the GPU in MHz")
+    gpu_memory: AtLeast = Field(None, description="memory of the GPU in MB")
+    gpu_usage: AtMost = Field(None, description="percentage of the GPU's capacity")
+    memory: AtMost = Field(None, description="main memory in MB")
 
 
-NETWORK = ("response_time", "delay", "jitter", "data_rate", "bandwidth", "loss_rate", "error_rate")
-"""Metrics of the service over its network."""
-MACHINE = tuple(name for name in Requirements.model_fields if name not in (*NETWORK, "slice"))
-"""Metrics of the machine that it runs on."""
+NETWORK_METRICS = ("response_time", "delay", "jitter", "data_rate", "bandwidth", "loss_rate", "error_rate")
+"""Metrics of the service and its network."""
+MACHINE_METRICS = tuple(name for name in Requirements.model_fields if name not in (*NETWORK_METRICS, "slice"))
+"""Metrics of the machine it runs on."""
 UNITS = dict.fromkeys(("response_time", "delay", "jitter"), "ms")
 UNITS |= dict.fromkeys(("data_rate", "bandwidth"), "Mbit/s")
 UNITS |= dict.fromkeys(("cpu_frequency", "gpu_frequency"), "MHz")
 UNITS |= dict.fromkeys(("gpu_memory", "memory"), "MB")
 UNITS |= dict.fromkeys(("cpu_usage", "gpu_usage"), "%")
-"""Of the metrics that have one."""
+"""Units by metric."""
 
 
-class Service(BaseModel):
-    """A service's requirements, by environment."""
+class ServiceRequirements(BaseModel):
+    """Requirements of a service by environment."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     title: str
     description: str
     source: str
-    image: tuple[int, int] | None = Field(None, description="Width and height of the images that it is for, pixels.")
+    image: tuple[int, int] | None = Field(None, description="Width and height of its images in pixels.")
     robot: Requirements | None = None
     edge: Requirements | None = None
     cloud: Requirements | None = None
 
     def of(self, environment: Environment) -> Requirements:
-        """In an environment.
+        """Requirements in an environment.
 
         Raises:
-            SettingError: it isn't meant to run there.
+            SettingError: the service isn't meant for this environment.
         """
         found: Requirements | None = getattr(self, environment)
         if found is None:
-            there = [one for one in Environment if getattr(self, one)]
-            raise SettingError(environment, f"{self.title} has no requirements there", f"Choose {', '.join(there)}")
+            known = [one for one in Environment if getattr(self, one)]
+            raise SettingError(
+                environment, f"{self.title} has no requirements for it", f"Choose one of: {', '.join(known)}"
+            )
         return found
 
 
 def names() -> list[str]:
-    """Of the services whose requirements come along."""
+    """Names of the services with built-in requirements."""
     return sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 
-def read(which: str | Path) -> Service:
-    """The requirements of a service that comes along, or of a file.
+def read(which: str | Path) -> ServiceRequirements:
+    """Read built-in requirements or a file.
 
     Raises:
-        InputError: the file can't be read, or says something else.
+        InputError: the file can't be read or is invalid.
     """
     path = FOLDER / f"{which}.toml" if str(which) in names() else Path(which)
     try:
-        return Service.model_validate(toml.parse(path.read_text("utf-8")))
+        return ServiceRequirements.model_validate(toml.parse(path.read_text("utf-8")))
     except OSError as error:
         cause = f"can't be read ({error.strerror})"
         raise InputError(path, cause, f"Give a file, or one of: {', '.join(names())}") from None
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise InputError(path, f"{where}: {first['msg']}", "docs/toolboxes.md says what it may hold") from None
+        raise InputError(path, f"{where}: {first['msg']}", "See docs/toolboxes.md for the format") from None
     except ValueError as error:
-        raise InputError(path, f"is no TOML ({error})", "Mend it") from None
+        raise InputError(path, f"invalid TOML ({error})", "Fix the file") from None

@@ -1,4 +1,4 @@
-"""Where a vehicle's pictures come from: a file each, found by its name; each camera is read in a thread of its own."""
+"""Camera sources: one module for each kind of source, found by name; each camera is read in its own thread."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from scan2sim.pipeline.core.types import F64, U8
 from scan2sim.services.credentials import redacted
 from scan2sim.services.teleoperation.video import timecode
 
-SILENT = 1.0
-"""Seconds without a picture after which a camera counts as gone."""
-LONGEST_PAUSE = 5.0
-"""Seconds between two tries to open a camera, at most."""
+CAMERA_TIMEOUT_S = 1.0
+"""Seconds without a frame after which a camera counts as offline."""
+REOPEN_DELAY_MAX_S = 5.0
+"""Maximum delay between two attempts to open a camera, seconds."""
 
 
-class Picture(NamedTuple):
-    """What a camera saw.
+class CameraFrame(NamedTuple):
+    """A frame of a camera.
 
     Attributes:
-        image: (H, W, 3) RGB, which nobody else draws into.
-        captured: nanoseconds of this machine's monotonic clock, when it was exposed, or as soon after as is known.
+        image: (H, W, 3) RGB; the receiver owns it and may draw into it.
+        captured: exposure time, nanoseconds of this machine's monotonic clock; time of arrival where it is unknown.
     """
 
     image: U8
@@ -33,12 +33,12 @@ class Picture(NamedTuple):
 
 
 class Mount(NamedTuple):
-    """Where a simulated camera is on its vehicle, and what it sees of the world.
+    """Mounting pose and field of view of a simulated camera on its vehicle.
 
     Attributes:
-        x, y, z: metres ahead, to the left and above the vehicle's own place.
-        yaw, pitch: degrees to the left, and upwards.
-        field: degrees from the left to the right border of the picture.
+        x, y, z: metres ahead, to the left and above the vehicle's origin.
+        yaw, pitch: degrees, positive to the left and upwards.
+        field: horizontal field of view, degrees.
     """
 
     x: float = 1.2
@@ -50,115 +50,115 @@ class Mount(NamedTuple):
 
 
 class View(NamedTuple):
-    """What a camera is asked for; one that is real gives what it can, and may change its size.
+    """Requested view of a camera; a real camera may deliver another frame size or rate.
 
     Attributes:
-        where: which it is: what that means says each file here.
+        location: device, file, folder or address; each source defines its meaning.
         width, height: pixels.
-        fps: pictures a second.
-        marked: have the time drawn into each picture (`marks`).
+        fps: frames/s.
+        draw_timecode: draw the capture time into each frame (`timecode`).
         mount: of a simulated camera.
-        pose: (4, 4) of the simulated vehicle in the world, now: x ahead, y to the left, z up.
+        pose: returns the simulated vehicle's current pose (4, 4) in the world: x ahead, y left, z up.
     """
 
-    where: str = ""
+    location: str = ""
     width: int = 640
     height: int = 480
     fps: float = 30.0
-    marked: bool = False
+    draw_timecode: bool = False
     mount: Mount = Mount()
     pose: Callable[[], F64] = lambda: np.eye(4)
 
 
 class Backend(Protocol):
-    """What a file here has."""
+    """Interface of a camera source module."""
 
-    def pictures(self, view: View) -> Iterator[Picture]:
-        """Pictures in order, each as soon as it is there, until the camera is gone.
+    def frames(self, view: View) -> Iterator[CameraFrame]:
+        """Yield frames in order, each as soon as it is available, until the camera is lost.
 
         Raises:
-            ScanError: it can't be opened, or not any more.
+            ScanError: the camera cannot be opened, or was lost.
         """
 
 
-def pictures(source: str, view: View) -> Iterator[Picture]:
-    """Pictures of a camera, by the file's name that knows of such; see `Backend.pictures`.
+def frames(source: str, view: View) -> Iterator[CameraFrame]:
+    """Yield frames of a camera from the source module of that name; see `Backend.frames`.
 
     Raises:
-        SettingError: there is no such file.
+        SettingError: there is no such source.
         UnavailableError: it can't run here.
     """
     backend: Backend = plugins.find(__name__, source, "camera")
-    for picture in backend.pictures(view):
-        if view.marked:
-            timecode.mark(picture.image, picture.captured)
-        yield picture
+    for frame in backend.frames(view):
+        if view.draw_timecode:
+            timecode.draw(frame.image, frame.captured)
+        yield frame
 
 
 class Camera:
-    """Reads a camera; of its pictures only the newest waits. One that is gone is looked for again.
+    """Reads a camera in a thread and keeps only the newest frame; reopens the camera when it is lost.
 
     Attributes:
-        name: as drivers know it.
-        fault: why it is gone, in words; empty: it isn't.
-        count: pictures that came.
+        name: shown to drivers.
+        fault: why the camera is offline; empty: no fault.
+        count: frames received so far.
     """
 
-    def __init__(self, name: str, open_: Callable[[], Iterator[Picture]]) -> None:
-        """Of pictures, as `pictures` gives them; begins at once."""
+    def __init__(self, name: str, open_: Callable[[], Iterator[CameraFrame]]) -> None:
+        """Start reading at once; `open_` opens the camera and returns its frames (`frames`)."""
         self.name, self.fault, self.count = name, "", 0
         self._open = open_
-        self._newest: Picture | None = None
-        self._came = time.monotonic()
-        self._there = threading.Condition()
+        self._newest: CameraFrame | None = None
+        self._last_frame = time.monotonic()
+        self._frame_available = threading.Condition()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"camera {name}", daemon=True)
         self._thread.start()
 
-    def read(self, patience: float) -> Picture | None:
-        """The newest picture, once; None: none came within so many seconds."""
-        with self._there:
-            self._there.wait_for(lambda: self._newest is not None or self._closed.is_set(), patience)
+    def read(self, timeout_s: float) -> CameraFrame | None:
+        """Return the newest frame, each frame once; None: no frame arrived within the timeout."""
+        with self._frame_available:
+            self._frame_available.wait_for(lambda: self._newest is not None or self._closed.is_set(), timeout_s)
             newest, self._newest = self._newest, None
             return newest
 
     @property
-    def gone(self) -> bool:
-        """Whether pictures have stopped coming."""
-        return time.monotonic() > self._came + SILENT
+    def offline(self) -> bool:
+        """Whether no frame has arrived within `CAMERA_TIMEOUT_S`."""
+        return time.monotonic() > self._last_frame + CAMERA_TIMEOUT_S
 
     def close(self) -> None:
-        """Read no more."""
+        """Stop reading."""
         self._closed.set()
-        with self._there:
-            self._there.notify_all()
-        self._thread.join(LONGEST_PAUSE)
+        with self._frame_available:
+            self._frame_available.notify_all()
+        self._thread.join(REOPEN_DELAY_MAX_S)
 
     def _run(self) -> None:
         pause = 0.1
         while not self._closed.is_set():
             count = self.count
             try:
-                self._follow(self._open())
-                self.fault = "it gives no more pictures"
-            except Exception as error:  # of any library: it is told, and looked for again
+                self._read_frames(self._open())
+                self.fault = "the camera delivers no more frames"
+            except Exception as error:  # of any library: reported as the fault, then the camera is reopened
                 self.fault = redacted(str(error))
-            pause = 0.1 if self.count > count else min(LONGEST_PAUSE, 2 * pause)
+            pause = 0.1 if self.count > count else min(REOPEN_DELAY_MAX_S, 2 * pause)
             self._closed.wait(pause)
 
-    def _follow(self, pictures: Iterator[Picture]) -> None:
-        for picture in pictures:
+    def _read_frames(self, frames: Iterator[CameraFrame]) -> None:
+        for frame in frames:
             if self._closed.is_set():
                 return
             self.fault = ""
-            with self._there:
-                self._newest, self._came = picture, time.monotonic()
+            with self._frame_available:
+                self._newest, self._last_frame = frame, time.monotonic()
                 self.count += 1
-                self._there.notify_all()
+                self._frame_available.notify_all()
 
 
-def ticks(fps: float) -> Iterator[int]:
-    """Nanoseconds of the monotonic clock, so many times a second; those that come too late are left out."""
+def frame_times(fps: float) -> Iterator[int]:
+    """Yield capture times, nanoseconds of the monotonic clock, at a frame rate; missed frames are skipped."""
     step = 1e9 / fps
     due = float(time.monotonic_ns())
     while True:

@@ -1,4 +1,4 @@
-"""Real cameras, by PyAV: `where` is a device of Video4Linux (/dev/video0), or an address (rtsp://..., http://...)."""
+"""Real cameras, read by PyAV; location: a Video4Linux device (/dev/video0) or an address (rtsp://..., http://...)."""
 
 from __future__ import annotations
 
@@ -10,42 +10,46 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.services.credentials import redacted
-from scan2sim.services.teleoperation.cameras import Picture, View
+from scan2sim.services.teleoperation.cameras import CameraFrame, View
 
 NEEDS, EXTRA = ("av",), "teleop"
-PATIENCE = 5.0, 2.0
-"""Seconds for a camera to open, and for a picture to come."""
-PROMPT = {"fflags": "nobuffer", "flags": "low_delay", "rtsp_transport": "tcp", "probesize": "200000"}
-"""Of FFmpeg's readers: nothing is held back."""
-OLDEST = 1_000_000_000
-"""Nanoseconds before now that a device's own time is believed."""
+OPEN_AND_READ_TIMEOUTS_S = 5.0, 2.0
+"""Timeouts for opening a camera, and for its next frame."""
+LOW_LATENCY_OPTIONS = {"fflags": "nobuffer", "flags": "low_delay", "rtsp_transport": "tcp", "probesize": "200000"}
+"""FFmpeg demuxer options that disable buffering."""
+DEVICE_TIMESTAMP_MAX_AGE_NS = 1_000_000_000
+"""Timestamps of a device that are older than this are ignored."""
 
 
-def pictures(view: View) -> Iterator[Picture]:
-    """Until the camera is gone.
+def frames(view: View) -> Iterator[CameraFrame]:
+    """Yield frames until the camera is lost.
 
     Raises:
-        InputError: it can't be opened, or breaks off.
+        InputError: the camera cannot be opened, or its stream broke.
     """
     import av
 
-    local = view.where.startswith("/dev/")
-    asked = {"video_size": f"{view.width}x{view.height}", "framerate": f"{view.fps:g}"} if local else PROMPT
+    local = view.location.startswith("/dev/")
+    options = (
+        {"video_size": f"{view.width}x{view.height}", "framerate": f"{view.fps:g}"} if local else LOW_LATENCY_OPTIONS
+    )
     try:
-        with av.open(view.where, format="v4l2" if local else None, options=asked, timeout=PATIENCE) as camera:
+        with av.open(
+            view.location, format="v4l2" if local else None, options=options, timeout=OPEN_AND_READ_TIMEOUTS_S
+        ) as camera:
             stream = camera.streams.video[0]
-            stream.thread_type = "NONE"  # threads would hold pictures back
+            stream.thread_type = "NONE"  # decoding threads would delay frames
             for packet in camera.demux(stream):
-                came = time.monotonic_ns()
+                arrived = time.monotonic_ns()
                 for frame in packet.decode():
-                    captured = _captured(frame, came) if local else came
-                    yield Picture(np.asarray(frame.to_ndarray(format="rgb24"), np.uint8), captured)
+                    captured = _captured(frame, arrived) if local else arrived
+                    yield CameraFrame(np.asarray(frame.to_ndarray(format="rgb24"), np.uint8), captured)
     except (av.FFmpegError, OSError, IndexError) as error:
-        cause = f"gives no video ({redacted(str(error))})"
-        raise InputError(redacted(view.where), cause, "Check its address and that it runs") from None
+        cause = f"delivers no video ({redacted(str(error))})"
+        raise InputError(redacted(view.location), cause, "Check its address, and that the camera is on") from None
 
 
-def _captured(frame: Any, came: int) -> int:
-    """When a device says that it took a picture, if that is of the monotonic clock, as most say."""
-    stamp = came if frame.time is None else round(frame.time * 1e9)
-    return stamp if came - OLDEST < stamp <= came else came
+def _captured(frame: Any, arrived: int) -> int:
+    """Capture time by the device, if its timestamp is of the monotonic clock, as with most drivers; else arrival."""
+    stamp = arrived if frame.time is None else round(frame.time * 1e9)
+    return stamp if arrived - DEVICE_TIMESTAMP_MAX_AGE_NS < stamp <= arrived else arrived

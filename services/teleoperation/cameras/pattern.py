@@ -1,4 +1,4 @@
-"""A picture that moves, for tries without a camera: bars of colour and a ball."""
+"""Synthetic moving test pattern, for tests without a camera: colour bars and a ball."""
 
 from __future__ import annotations
 
@@ -7,34 +7,42 @@ from collections.abc import Iterator
 import numpy as np
 
 from scan2sim.pipeline.core.types import U8
-from scan2sim.services.teleoperation.cameras import Picture, View, ticks
+from scan2sim.services.teleoperation.cameras import CameraFrame, View, frame_times
 
-BARS = ((235, 235, 235), (235, 235, 16), (16, 235, 235), (16, 235, 16), (235, 16, 235), (235, 16, 16), (16, 16, 235))
+BAR_COLOURS = (
+    (235, 235, 235),
+    (235, 235, 16),
+    (16, 235, 235),
+    (16, 235, 16),
+    (235, 16, 235),
+    (235, 16, 16),
+    (16, 16, 235),
+)
 
 
-def pictures(view: View) -> Iterator[Picture]:
-    """Without end; `where` means nothing."""
+def frames(view: View) -> Iterator[CameraFrame]:
+    """Yield frames without end; the location is ignored."""
     still = bars(view.width, view.height)
-    for captured in ticks(view.fps):
-        yield Picture(at(still, captured / 1e9), captured)
+    for captured in frame_times(view.fps):
+        yield CameraFrame(draw_at(still, captured / 1e9), captured)
 
 
 def bars(width: int, height: int) -> U8:
-    """(H, W, 3): the bars alone, the lower half darker to the right."""
-    colours = np.array(BARS, np.uint8)[np.arange(width) * len(BARS) // width]
-    picture = np.broadcast_to(colours, (height, width, 3)).copy()
+    """Colour bars (H, W, 3); the lower half gets darker to the right."""
+    colours = np.array(BAR_COLOURS, np.uint8)[np.arange(width) * len(BAR_COLOURS) // width]
+    image = np.broadcast_to(colours, (height, width, 3)).copy()
     shade = np.linspace(1.0, 0.2, width)[:, None]
-    picture[height // 2 :] = (picture[height // 2 :] * shade).astype(np.uint8)
-    return picture
+    image[height // 2 :] = (image[height // 2 :] * shade).astype(np.uint8)
+    return image
 
 
-def at(still: U8, seconds: float) -> U8:
-    """The picture at a moment: the ball goes round in four seconds."""
+def draw_at(still: U8, seconds: float) -> U8:
+    """Test pattern at a time in seconds; the ball circles in four seconds."""
     import cv2
 
     height, width = still.shape[:2]
     angle = seconds * np.pi / 2
-    place = (round(width * (0.5 + 0.35 * np.cos(angle))), round(height * (0.5 + 0.35 * np.sin(angle))))
-    picture = still.copy()
-    cv2.circle(picture, place, height // 12, (255, 128, 0), -1)
-    return picture
+    centre = (round(width * (0.5 + 0.35 * np.cos(angle))), round(height * (0.5 + 0.35 * np.sin(angle))))
+    image = still.copy()
+    cv2.circle(image, centre, height // 12, (255, 128, 0), -1)
+    return image

@@ -1,4 +1,4 @@
-"""Pictures that were taken beforehand, again and again: `where` is a folder of pictures, or a video."""
+"""Recorded frames in a loop; location: a folder of images, or a video file."""
 
 from __future__ import annotations
 
@@ -12,42 +12,42 @@ import numpy as np
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.credentials import redacted
-from scan2sim.services.teleoperation.cameras import Picture, View, ticks
+from scan2sim.services.teleoperation.cameras import CameraFrame, View, frame_times
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
-KEPT = 256_000_000
-"""Bytes of pictures that are held in memory; longer ones are decoded in each round."""
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
+CACHE_MAX_BYTES = 256_000_000
+"""Decoded frames up to this size stay in memory; longer recordings are decoded again in each loop."""
 
 
-def pictures(view: View) -> Iterator[Picture]:
-    """Without end, of the size that is asked for.
+def frames(view: View) -> Iterator[CameraFrame]:
+    """Yield frames without end, resized to the requested size.
 
     Raises:
-        InputError: there are none.
+        InputError: there are no images.
     """
-    for captured, image in zip(ticks(view.fps), _rounds(view), strict=False):
-        yield Picture(image.copy(), captured)
+    for captured, image in zip(frame_times(view.fps), _loop(view), strict=False):
+        yield CameraFrame(image.copy(), captured)
 
 
-def _rounds(view: View) -> Iterator[U8]:
-    kept, bytes_ = list[U8](), 0
+def _loop(view: View) -> Iterator[U8]:
+    cache, bytes_ = list[U8](), 0
     for image in _images(view):
         yield image
         bytes_ += image.nbytes
-        if bytes_ <= KEPT:
-            kept.append(image)
+        if bytes_ <= CACHE_MAX_BYTES:
+            cache.append(image)
     if not bytes_:
-        remedy = f"Give a folder of {', '.join(SUFFIXES)}, or a video"
-        raise InputError(redacted(view.where), "holds no pictures", remedy)
+        remedy = f"Give a folder of images ({', '.join(IMAGE_SUFFIXES)}) or a video file"
+        raise InputError(redacted(view.location), "contains no images", remedy)
     while True:
-        yield from kept if bytes_ <= KEPT else _images(view)
+        yield from cache if bytes_ <= CACHE_MAX_BYTES else _images(view)
 
 
 def _images(view: View) -> Iterator[U8]:
     import cv2
 
     size = view.width, view.height
-    for bgr in _files(Path(view.where)) if Path(view.where).is_dir() else _video(view.where):
+    for bgr in _files(Path(view.location)) if Path(view.location).is_dir() else _video(view.location):
         image = bgr if bgr.shape[1::-1] == size else cv2.resize(bgr, size, interpolation=cv2.INTER_AREA)
         yield np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
@@ -55,10 +55,10 @@ def _images(view: View) -> Iterator[U8]:
 def _files(folder: Path) -> Iterator[Any]:
     import cv2
 
-    for file in sorted(one for one in folder.iterdir() if one.suffix.lower() in SUFFIXES):
+    for file in sorted(one for one in folder.iterdir() if one.suffix.lower() in IMAGE_SUFFIXES):
         image = cv2.imread(str(file))
         if image is None:
-            raise InputError(file, "can't be read as a picture", "Take it out of the folder")
+            raise InputError(file, "cannot be decoded as an image", "Remove it from the folder")
         yield image
 
 

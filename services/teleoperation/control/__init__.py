@@ -1,4 +1,4 @@
-"""Control of the vehicle: messages, controls, safety rules, the control lock of the driver.
+"""Control of the vehicle: messages, controls, safety rules, and the driver's control lock.
 
-Begin with `safety` (when a vehicle obeys and when it stops).
+Begin with `safety`: when a vehicle obeys, and when it stops.
 """

@@ -1,4 +1,4 @@
-"""What a driver asks of a vehicle, and what the vehicle tells of itself: the same for every vehicle."""
+"""Controls of a driver and state of a vehicle, the same for every kind of vehicle."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import IntEnum
 
 
 class Gear(IntEnum):
-    """Which way the throttle drives."""
+    """Direction in which the throttle drives."""
 
     REVERSE = -1
     NEUTRAL = 0
@@ -16,12 +16,12 @@ class Gear(IntEnum):
 
 @dataclass(frozen=True)
 class Controls:
-    """What a driver asks for at one moment.
+    """Controls of the driver at one moment.
 
     Attributes:
-        steering: -1 (full right) to 1 (full left), as angles about z are counted.
+        steering: -1 (full right) to 1 (full left), the sign of angles about z.
         throttle, brake: 0 to 1.
-        gear, horn, lights: see their names.
+        gear, horn, lights: requested gear; whether horn and lights are on.
     """
 
     steering: float = 0.0
@@ -31,25 +31,25 @@ class Controls:
     horn: bool = False
     lights: bool = False
 
-    def at_rest(self) -> bool:
-        """Whether nothing is asked that would move the vehicle."""
+    def throttle_released(self) -> bool:
+        """Whether the throttle is zero."""
         return self.throttle == 0.0
 
 
 STOP = Controls(brake=1.0)
-"""Stand, and stay so."""
+"""Full brake, no throttle, neutral gear."""
 
 
 @dataclass(frozen=True)
 class VehicleState:
-    """What a vehicle tells of itself.
+    """State of a vehicle, as the vehicle reports it.
 
     Attributes:
-        speed: metres a second along its x axis, negative backwards.
-        position: (x, y) metres east and north of a place of its own, or of its world; None: unknown.
+        speed: m/s along its x axis, negative backwards.
+        position: (x, y) metres east and north of an origin of its own, or of its world; None: unknown.
         heading: radians from east, anticlockwise; None: unknown.
-        gear: that is in.
-        faults: what isn't well, in words; nothing: all is.
+        gear: engaged gear.
+        faults: messages for the driver; empty: none.
     """
 
     speed: float = 0.0

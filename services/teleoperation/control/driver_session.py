@@ -1,7 +1,7 @@
-"""The wheel: who drives at a station, and what he asks for now.
+"""The driver session: the control lock of a station (which page drives), and that page's latest command.
 
-A page that has the wheel says so again and again. Where it falls silent - its tab is in the background, the gamepad is
-unplugged, the browser hangs - nothing is sent any more, and the vehicle stops.
+The page that holds the lock sends its controls repeatedly. When it falls silent (its tab is in the background, the
+gamepad is unplugged, the browser hangs), no commands are sent any more, and the vehicle stops.
 """
 
 from __future__ import annotations
@@ -12,63 +12,63 @@ from dataclasses import dataclass
 from scan2sim.pipeline.core.errors import BusyError
 from scan2sim.services.teleoperation.control.messages import Command
 
-FRESH = 0.2
-"""Seconds for which what a driver asked is sent on."""
-HELD = 5.0
-"""Seconds of silence after which another may take the wheel."""
+COMMAND_TIMEOUT_S = 0.2
+"""Maximum age of a driver's command; an older one is not sent."""
+LOCK_TIMEOUT_S = 5.0
+"""Silence of the driver's page after which another page may acquire the lock."""
 
 
 @dataclass
 class _Driver:
     name: str
     command: Command | None
-    heard: float
+    last_heard: float
 
 
-class Wheel:
-    """Times are seconds of any clock that only goes forward; methods may be called from any thread."""
+class DriverSession:
+    """Control lock and latest command. Times are seconds of any monotonic clock; methods are thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._driver: _Driver | None = None
-        self.told = ""
-        """Why nobody has the wheel any more."""
+        self.release_reason = ""
+        """Why the last driver lost the lock; empty while somebody holds it."""
 
-    def take(self, who: str, now: float) -> None:
-        """Have the wheel from now on.
+    def acquire(self, driver: str, now: float) -> None:
+        """Acquire the control lock.
 
         Raises:
-            BusyError: somebody else has it.
+            BusyError: another driver holds it.
         """
         with self._lock:
-            holds = self._driver
-            if holds is not None and holds.name != who and now - holds.heard < HELD:
-                raise BusyError("the wheel", "is held on another page", "Leave it there first")
-            self._driver, self.told = _Driver(who, None, now), ""
+            holder = self._driver
+            if holder is not None and holder.name != driver and now - holder.last_heard < LOCK_TIMEOUT_S:
+                raise BusyError("the controls", "are in use on another page", "Release them there first")
+            self._driver, self.release_reason = _Driver(driver, None, now), ""
 
-    def turn(self, who: str, command: Command, now: float) -> bool:
-        """What who has the wheel asks for; False: he hasn't."""
+    def update(self, driver: str, command: Command, now: float) -> bool:
+        """Set the latest command; False: this driver does not hold the lock."""
         with self._lock:
-            if self._driver is None or self._driver.name != who:
+            if self._driver is None or self._driver.name != driver:
                 return False
-            self._driver.command, self._driver.heard = command, now
+            self._driver.command, self._driver.last_heard = command, now
             return True
 
-    def leave(self, who: str, why: str) -> None:
-        """Let go of it, if he has it."""
+    def release(self, driver: str, reason: str) -> None:
+        """Release the lock, if this driver holds it."""
         with self._lock:
-            if self._driver is not None and self._driver.name == who:
-                self._driver, self.told = None, why
+            if self._driver is not None and self._driver.name == driver:
+                self._driver, self.release_reason = None, reason
 
-    def held_by(self) -> str | None:
-        """Who has it."""
+    def holder(self) -> str | None:
+        """Name of the driver who holds the lock; None: nobody."""
         with self._lock:
             return None if self._driver is None else self._driver.name
 
     def command(self, now: float) -> Command | None:
-        """What is asked for now; None: nothing that is fresh."""
+        """The command to send now; None: there is none within `COMMAND_TIMEOUT_S`."""
         with self._lock:
             driver = self._driver
-            if driver is None or driver.command is None or now - driver.heard > FRESH:
+            if driver is None or driver.command is None or now - driver.last_heard > COMMAND_TIMEOUT_S:
                 return None
             return driver.command

@@ -1,7 +1,8 @@
-"""What a vehicle and its station say to each other, as bytes; each message goes over all links (`bundle`).
+"""Messages between vehicle and station, as bytes; each message goes over all links (`transport.multipath`).
 
-A message is a header (kind, number, sending time) and a body by its kind. Times are nanoseconds of the sender's
-monotonic clock, which no NTP daemon sets back; `clocks` knows how far the two are apart. Numbers are little-endian.
+A message is a header (kind, number, sending time) and a body, whose layout depends on the kind. Times are nanoseconds
+of the sender's monotonic clock, which no NTP daemon sets back; `clock_sync` estimates the offset of the two clocks.
+Numbers are little-endian.
 """
 
 from __future__ import annotations
@@ -18,43 +19,43 @@ from scan2sim.services.teleoperation.control.controls import Controls, Gear, Veh
 
 
 class Kind(IntEnum):
-    """Of a message: to the vehicle, to the station, or either way."""
+    """Kind of a message, and the direction it is sent in."""
 
     COMMAND = 1
     """To the vehicle: `Command`."""
     TELEMETRY = 2
     """To the station: `Telemetry`."""
     PING = 3
-    """Either way: `clocks`."""
+    """Either way: measures clock offset and link quality (`clock_sync`)."""
     PONG = 4
-    """Either way: `clocks`."""
-    KEY = 5
-    """To the station: `Key` of the video's encryption."""
-    WANTED = 6
-    """To the vehicle: `Wanted`, a key frame."""
-    REPORT = 7
-    """To the vehicle: `Report` of how the video comes."""
+    """Either way: answer to a ping."""
+    VIDEO_KEY = 5
+    """To the station: `VideoKey`, a key of the video encryption."""
+    KEY_FRAME_REQUEST = 6
+    """To the vehicle: `KeyFrameRequest`."""
+    VIDEO_REPORT = 7
+    """To the vehicle: `VideoReport`, receiver statistics of a camera's video."""
     STREAMS = 8
-    """To the station: `Streams`, what cameras there are."""
-    LACKING = 9
-    """To the vehicle: `Lacking`, packets of video that are to be sent again."""
+    """To the station: `VideoStreams`, the list of cameras."""
+    NACK = 9
+    """To the vehicle: `Nack`, video packets to retransmit."""
 
 
 HEADER = struct.Struct("<BQq")
-LARGEST = 1100
-"""Bytes of a message with its header, so that with DTLS, UDP and IP it fits into any network's packet."""
+MESSAGE_MAX_BYTES = 1100
+"""Size of a message with its header, so that with DTLS, UDP and IP headers it fits the MTU of any network."""
 
 
 class Malformed(ValueError):
-    """Bytes that are no message."""
+    """Received bytes are not a valid message."""
 
 
 @dataclass(frozen=True)
 class Message:
-    """As it goes over the links.
+    """A message on the links.
 
     Attributes:
-        number: counts the sender's messages from 0, whatever their kind.
+        number: counts the sender's messages from 0, over all kinds.
         sent: nanoseconds of the sender's monotonic clock.
     """
 
@@ -64,15 +65,15 @@ class Message:
     body: bytes
 
     def pack(self) -> bytes:
-        """As bytes."""
+        """Encode the message."""
         return HEADER.pack(self.kind, self.number, self.sent) + self.body
 
     @staticmethod
     def unpack(data: bytes) -> Message:
-        """Of bytes.
+        """Decode a message.
 
         Raises:
-            Malformed: they are none.
+            Malformed: the bytes are not a message.
         """
         try:
             kind, number, sent = HEADER.unpack_from(data)
@@ -90,7 +91,7 @@ class Command:
     """A driver's controls.
 
     Attributes:
-        stop: number of the stop that the driver has seen last.
+        stop: number of the last stop that the driver has seen.
         agree: the driver confirms that the vehicle may leave that stop.
     """
 
@@ -99,105 +100,105 @@ class Command:
     agree: bool = False
 
     def pack(self) -> bytes:
-        """As a message's body."""
+        """Encode as a message body."""
         c = self.controls
         flags = _HORN * c.horn | _LIGHTS * c.lights | _AGREE * self.agree
         return _COMMAND.pack(c.steering, c.throttle, c.brake, c.gear, flags, self.stop)
 
     @staticmethod
     def unpack(body: bytes) -> Command:
-        """Of a message's body.
+        """Decode a message body.
 
         Raises:
-            Malformed: it is none, or asks for what can't be.
+            Malformed: the body is not a command, or a control is out of range.
         """
         try:
             steering, throttle, brake, gear, flags, stop = _COMMAND.unpack(body)
-            way = Gear(gear)
+            gear_ = Gear(gear)
         except (struct.error, ValueError) as error:
             raise Malformed(str(error)) from None
-        if not (abs(steering) <= 1 and 0 <= throttle <= 1 and 0 <= brake <= 1):  # refuses what is no number, too
-            raise Malformed("controls beyond their ranges")
-        controls = Controls(steering, throttle, brake, way, bool(flags & _HORN), bool(flags & _LIGHTS))
+        if not (abs(steering) <= 1 and 0 <= throttle <= 1 and 0 <= brake <= 1):  # rejects NaN as well
+            raise Malformed("controls out of range")
+        controls = Controls(steering, throttle, brake, gear_, bool(flags & _HORN), bool(flags & _LIGHTS))
         return Command(controls, stop, bool(flags & _AGREE))
 
 
-_KEY = struct.Struct("<I44s")
+_VIDEO_KEY = struct.Struct("<I44s")
 
 
 @dataclass(frozen=True)
-class Key:
-    """Of the video's encryption, from a generation on: 32 bytes of key and 12 of salt (RFC 7714)."""
+class VideoKey:
+    """Key of the video encryption, valid from a generation on: 32 bytes of key and 12 of salt (RFC 7714)."""
 
     generation: int
     secret: bytes
 
     def pack(self) -> bytes:
-        """As a message's body."""
-        return _KEY.pack(self.generation, self.secret)
+        """Encode as a message body."""
+        return _VIDEO_KEY.pack(self.generation, self.secret)
 
     @staticmethod
-    def unpack(body: bytes) -> Key:
-        """Of a message's body; raises Malformed."""
+    def unpack(body: bytes) -> VideoKey:
+        """Decode a message body; raises Malformed."""
         try:
-            return Key(*_KEY.unpack(body))
+            return VideoKey(*_VIDEO_KEY.unpack(body))
         except struct.error as error:
             raise Malformed(str(error)) from None
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """A key frame is wanted of a camera."""
+class KeyFrameRequest:
+    """Request for a key frame of a camera."""
 
     camera: int
 
     def pack(self) -> bytes:
-        """As a message's body."""
+        """Encode as a message body."""
         return struct.pack("<B", self.camera)
 
     @staticmethod
-    def unpack(body: bytes) -> Wanted:
-        """Of a message's body; raises Malformed."""
+    def unpack(body: bytes) -> KeyFrameRequest:
+        """Decode a message body; raises Malformed."""
         try:
-            return Wanted(*struct.unpack("<B", body))
+            return KeyFrameRequest(*struct.unpack("<B", body))
         except struct.error as error:
             raise Malformed(str(error)) from None
 
 
 @dataclass(frozen=True)
-class Lacking:
-    """Packets of a source of video (SSRC) that didn't come, by their sequence."""
+class Nack:
+    """Missing packets of a video source (SSRC), by sequence number."""
 
     source: int
     sequences: tuple[int, ...]
 
     def pack(self) -> bytes:
-        """As a message's body."""
+        """Encode as a message body."""
         return struct.pack(f"<I{len(self.sequences)}H", self.source, *self.sequences)
 
     @staticmethod
-    def unpack(body: bytes) -> Lacking:
-        """Of a message's body; raises Malformed."""
+    def unpack(body: bytes) -> Nack:
+        """Decode a message body; raises Malformed."""
         try:
             source, *sequences = struct.unpack(f"<I{(len(body) - 4) // 2}H", body)
         except struct.error as error:
             raise Malformed(str(error)) from None
-        return Lacking(source, tuple(sequences))
+        return Nack(source, tuple(sequences))
 
 
-class _Told:
-    """Said seldom, as JSON: easier to read in a capture, and to add to."""
+class _JsonBody:
+    """Body of a rare message, as JSON: readable in a packet capture, and easy to extend."""
 
     def pack(self) -> bytes:
-        """As a message's body."""
+        """Encode as a message body."""
         return json.dumps(asdict(self), separators=(",", ":")).encode()  # type: ignore[call-overload]
 
     @classmethod
     def unpack(cls, body: bytes) -> Self:
-        """Of a message's body.
+        """Decode a message body.
 
         Raises:
-            Malformed: it is none.
+            Malformed: the body is not valid.
         """
         try:
             found: Self = _adapter(cls).validate_python(json.loads(body, parse_constant=_refuse))
@@ -206,18 +207,18 @@ class _Told:
         return found
 
 
-_ADAPTERS: dict[type[_Told], TypeAdapter[Any]] = {}
+_ADAPTERS: dict[type[_JsonBody], TypeAdapter[Any]] = {}
 
 
-def _adapter(told: type[_Told]) -> TypeAdapter[Any]:
-    """What reads a body: to make it takes longer than a hundred readings."""
-    if told not in _ADAPTERS:
-        _ADAPTERS[told] = TypeAdapter(told)
-    return _ADAPTERS[told]
+def _adapter(body_type: type[_JsonBody]) -> TypeAdapter[Any]:
+    """Cached validator of a body: creating one takes longer than a hundred validations."""
+    if body_type not in _ADAPTERS:
+        _ADAPTERS[body_type] = TypeAdapter(body_type)
+    return _ADAPTERS[body_type]
 
 
 def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is no number")
+    raise ValueError(f"{constant} is not a number")
 
 
 Name = Annotated[str, Field(max_length=60)]
@@ -225,14 +226,14 @@ Count = Annotated[int, Field(ge=0)]
 
 
 @dataclass(frozen=True)
-class Telemetry(_Told):
-    """How the vehicle is.
+class Telemetry(_JsonBody):
+    """State of the vehicle and of its safety monitor.
 
     Attributes:
-        vehicle: what it tells of itself.
-        stop: number of its last stop; standing: whether it still stands for it; reason: why.
-        command: number of the last message that it obeyed; age: ms of that one when it was.
-        dropped: messages that were not obeyed so far, by why.
+        vehicle: state that the vehicle reports.
+        stop: number of its last stop; standing: whether it is still stopped for it; reason: of that stop.
+        command: number of the last obeyed message; age: age of that command when it was obeyed, ms.
+        dropped: number of messages that were not obeyed so far, by reason.
     """
 
     vehicle: VehicleState
@@ -245,13 +246,13 @@ class Telemetry(_Told):
 
 
 @dataclass(frozen=True)
-class Report(_Told):
-    """How a camera's video came over the last second.
+class VideoReport(_JsonBody):
+    """Receiver statistics of a camera's video over the last second.
 
     Attributes:
-        received, lost: packets; such that had to be sent again are among the lost.
-        delay: ms from the camera to here, the median; None: no picture was whole.
-        links: bytes a second that came by each link, by its name.
+        received, lost: packets; retransmitted packets count as lost.
+        delay: median delay from the camera to the station, ms; None: no frame was complete.
+        links: bytes/s received over each link, by its name.
     """
 
     camera: Count
@@ -262,8 +263,8 @@ class Report(_Told):
 
 
 @dataclass(frozen=True)
-class Stream:
-    """A camera's video; fps 0: the camera is gone."""
+class VideoStream:
+    """Video stream of a camera; fps 0: the camera is offline."""
 
     camera: Count
     name: Name
@@ -273,7 +274,7 @@ class Stream:
 
 
 @dataclass(frozen=True)
-class Streams(_Told):
-    """All cameras."""
+class VideoStreams(_JsonBody):
+    """Video streams of all cameras."""
 
-    cameras: tuple[Stream, ...]
+    cameras: tuple[VideoStream, ...]

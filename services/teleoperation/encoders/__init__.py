@@ -1,22 +1,22 @@
-"""VP8 encoders: a file each, found by its name (`pipeline.core.plugins`); and how a picture is decoded."""
+"""VP8 encoders: one module for each, found by name (`pipeline.core.plugins`); and the VP8 decoder."""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol
 
 from scan2sim.pipeline.core import plugins
-from scan2sim.pipeline.core.optional_deps import need
-from scan2sim.pipeline.core.plugins import Lacking
+from scan2sim.pipeline.core.optional_deps import require
+from scan2sim.pipeline.core.plugins import Unavailable
 from scan2sim.pipeline.core.types import U8
 
 
-class Settings(NamedTuple):
-    """Of an encoder; an encoder keeps them all its life.
+class EncoderSettings(NamedTuple):
+    """Settings of an encoder, fixed for its lifetime.
 
     Attributes:
         width, height: pixels, even.
-        fps: pictures a second.
-        bitrate: bits a second.
+        fps: frames/s.
+        bitrate: bit/s.
     """
 
     width: int
@@ -26,50 +26,50 @@ class Settings(NamedTuple):
 
 
 class Encoder(Protocol):
-    """Encodes a camera's pictures, each at once; its first is a key frame, later ones only where that is asked for."""
+    """Encodes a camera's frames without delay; the first is a key frame, later ones only on request."""
 
     def encode(self, planes: U8, captured: int, key: bool) -> bytes:
-        """A frame of VP8; empty: it was left out, for the rate.
+        """Encode a frame as VP8; empty: the frame was dropped to keep the bit rate.
 
         Args:
-            planes: (H * 3 / 2, W), the picture as I420.
-            captured: nanoseconds of any clock; the rate is held by it.
-            key: make it a key frame.
+            planes: (H * 3 / 2, W), the image as I420.
+            captured: capture time, nanoseconds of any clock; rate control uses it.
+            key: force a key frame.
         """
 
     def close(self) -> None:
-        """It isn't used any more."""
+        """Release the encoder."""
 
 
 class Backend(Protocol):
-    """What a file here has.
+    """Interface of an encoder module.
 
     Attributes:
-        RANK: the lower, the less it costs the processor.
+        RANK: processor cost; the available encoder of the lowest rank is chosen.
     """
 
     RANK: int
 
-    def lacking(self) -> Lacking | None:
-        """What isn't there; None: it can run here."""
+    def unavailable(self) -> Unavailable | None:
+        """Why the encoder can't run here; None: it can."""
 
-    def encoder(self, settings: Settings) -> Encoder:
-        """A new one."""
+    def encoder(self, settings: EncoderSettings) -> Encoder:
+        """Create an encoder."""
 
 
 def find(name: str | None = None) -> Backend:
-    """A backend that can run here: of that name, or the best.
+    """The encoder module of that name, or the available one of the lowest rank.
 
     Raises:
-        SettingError: there is none of that name.
+        SettingError: there is no encoder of that name.
         UnavailableError: it can't run here, or none can.
     """
     found: Backend = plugins.best(__name__, name, "encoder", "video")
     return found
 
 
-def planes(image: U8) -> U8:
-    """An (H, W, 3) RGB picture as I420 (H * 3 / 2, W), BT.601; an odd row or column at the end is cut off."""
+def to_i420(image: U8) -> U8:
+    """Convert an (H, W, 3) RGB image to I420 (H * 3 / 2, W), BT.601; an odd last row or column is cropped."""
     import cv2
 
     height, width = (side // 2 * 2 for side in image.shape[:2])
@@ -78,19 +78,19 @@ def planes(image: U8) -> U8:
 
 
 class Decoder:
-    """Decodes a camera's frames, each at once."""
+    """Decodes a camera's VP8 frames without delay."""
 
     def __init__(self) -> None:
-        """Raises UnavailableError where PyAV isn't there."""
-        need("VP8", "av", extra="teleop")
+        """Raises UnavailableError if PyAV is not installed."""
+        require("VP8", "av", extra="teleop")
         import av
 
         self._av = av
         self._codec = av.CodecContext.create("vp8", "r")
-        self._codec.thread_type = "NONE"  # threads would hold frames back
+        self._codec.thread_type = "NONE"  # decoding threads would delay frames
 
     def decode(self, data: bytes) -> U8 | None:
-        """(H, W, 3) RGB of a frame; None: it can't be decoded."""
+        """Decode a frame to (H, W, 3) RGB; None: it cannot be decoded."""
         import cv2
 
         try:

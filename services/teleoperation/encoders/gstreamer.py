@@ -1,4 +1,4 @@
-"""libvpx by GStreamer, where it is installed with its bindings to Python (Debian's, which its own Python sees)."""
+"""libvpx by GStreamer; needs GStreamer's Python bindings, which Debian installs for the system's Python."""
 
 from __future__ import annotations
 
@@ -6,44 +6,45 @@ import importlib.util
 from typing import Any
 
 from scan2sim.pipeline.core.errors import UnavailableError
-from scan2sim.pipeline.core.plugins import Lacking
+from scan2sim.pipeline.core.plugins import Unavailable
 from scan2sim.pipeline.core.types import U8
-from scan2sim.services.teleoperation.encoders import Settings
-from scan2sim.services.teleoperation.encoders.pyav import LARGEST_KEY
+from scan2sim.services.teleoperation.encoders import EncoderSettings
+from scan2sim.services.teleoperation.encoders.pyav import KEY_FRAME_MAX_PERCENT
 
 RANK = 4
-SLOWEST = 1_000_000_000
-"""Nanoseconds that a picture may take."""
+ENCODE_TIMEOUT_NS = 1_000_000_000
+"""Timeout for encoding one frame."""
 ELEMENT = (
     "vp8enc deadline=1 cpu-used=8 lag-in-frames=0 threads=1 keyframe-max-dist=9999 end-usage=cbr buffer-size=500 "
-    f"buffer-initial-size=375 buffer-optimal-size=400 max-intra-bitrate={LARGEST_KEY} target-bitrate={{bitrate}}"
+    "buffer-initial-size=375 buffer-optimal-size=400 "
+    f"max-intra-bitrate={KEY_FRAME_MAX_PERCENT} target-bitrate={{bitrate}}"
 )
 
 
-def lacking() -> Lacking | None:
-    """GStreamer, its bindings, and the element."""
-    return without("vp8enc", "gstreamer1.0-plugins-good")
+def unavailable() -> Unavailable | None:
+    """Whether GStreamer, its Python bindings or the element is missing."""
+    return missing_element("vp8enc", "gstreamer1.0-plugins-good")
 
 
-def encoder(settings: Settings) -> Encoder:
-    """In a thread of GStreamer's."""
+def encoder(settings: EncoderSettings) -> Encoder:
+    """Create an encoder, which runs in a GStreamer thread."""
     return Encoder(ELEMENT.format(bitrate=settings.bitrate), settings)
 
 
-def without(element: str, package: str) -> Lacking | None:
-    """`Backend.lacking` of an element, and the Debian package that brings it."""
+def missing_element(element: str, package: str) -> Unavailable | None:
+    """`Backend.unavailable` for a GStreamer element; `package`: Debian package that installs it."""
     if importlib.util.find_spec("gi") is None:
-        return Lacking("needs gi, not installed here", "apt-get install python3-gi gir1.2-gst-plugins-base-1.0")
-    gst = load()
+        return Unavailable("needs gi, not installed here", "apt-get install python3-gi gir1.2-gst-plugins-base-1.0")
+    gst = load_gstreamer()
     if gst is None or gst.ElementFactory.find("appsrc") is None:
-        return Lacking("needs GStreamer, not installed here", "apt-get install gir1.2-gst-plugins-base-1.0")
+        return Unavailable("needs GStreamer, not installed here", "apt-get install gir1.2-gst-plugins-base-1.0")
     if gst.ElementFactory.find(element) is None:
-        return Lacking(f"needs GStreamer's {element}, not there", f"apt-get install {package}")
+        return Unavailable(f"needs the GStreamer element {element}, not installed here", f"apt-get install {package}")
     return None
 
 
-def load() -> Any:
-    """GStreamer's bindings; None: they aren't there."""
+def load_gstreamer() -> Any:
+    """GStreamer's Python bindings, initialized; None: not installed."""
     import gi
 
     try:
@@ -58,10 +59,10 @@ def load() -> Any:
 
 
 class Encoder:
-    """A pipeline: appsrc, an element that encodes, appsink."""
+    """GStreamer pipeline: appsrc, encoder element, appsink."""
 
-    def __init__(self, element: str, settings: Settings) -> None:
-        self._gst = load()
+    def __init__(self, element: str, settings: EncoderSettings) -> None:
+        self._gst = load_gstreamer()
         raw = (
             f"video/x-raw,format=I420,width={settings.width},height={settings.height},"
             f"framerate={round(settings.fps * 1000)}/1000"
@@ -72,15 +73,15 @@ class Encoder:
         )
         self._source = self._pipeline.get_by_name("source")
         self._sink = self._pipeline.get_by_name("sink")
-        self._asked = self._pipeline.get_by_name("encoder").get_static_pad("src")
+        self._encoder_pad = self._pipeline.get_by_name("encoder").get_static_pad("src")
         self._pipeline.set_state(self._gst.State.PLAYING)
         self._first: int | None = None
 
     def encode(self, planes: U8, captured: int, key: bool) -> bytes:
-        """See `video.Encoder`.
+        """See `encoders.Encoder`.
 
         Raises:
-            UnavailableError: the element doesn't take pictures, or not in time.
+            UnavailableError: the element accepts no frames, or does not encode one in time.
         """
         from gi.repository import GstVideo
 
@@ -89,14 +90,16 @@ class Encoder:
         buffer = self._gst.Buffer.new_wrapped(planes.tobytes())
         buffer.pts = captured - self._first
         if key:
-            self._asked.send_event(GstVideo.video_event_new_upstream_force_key_unit(self._gst.CLOCK_TIME_NONE, True, 0))
+            self._encoder_pad.send_event(
+                GstVideo.video_event_new_upstream_force_key_unit(self._gst.CLOCK_TIME_NONE, True, 0)
+            )
         self._source.emit("push-buffer", buffer)
-        sample = self._sink.emit("try-pull-sample", SLOWEST)
+        sample = self._sink.emit("try-pull-sample", ENCODE_TIMEOUT_NS)
         if sample is None:
-            raise UnavailableError("GStreamer", "gives no frames", "Choose another encoder")
+            raise UnavailableError("GStreamer", "delivers no encoded frames", "Choose another encoder")
         made = sample.get_buffer()
         return bytes(made.extract_dup(0, made.get_size()))
 
     def close(self) -> None:
-        """Ends its threads."""
+        """Stop the pipeline and its threads."""
         self._pipeline.set_state(self._gst.State.NULL)

@@ -1,47 +1,47 @@
-"""libvpx by PyAV: its wheels bring it along."""
+"""libvpx by PyAV, whose wheels include it."""
 
 from __future__ import annotations
 
 from fractions import Fraction
 from typing import Any
 
-from scan2sim.pipeline.core.plugins import Lacking
+from scan2sim.pipeline.core.plugins import Unavailable
 from scan2sim.pipeline.core.types import U8
-from scan2sim.services.teleoperation.encoders import Settings
+from scan2sim.services.teleoperation.encoders import EncoderSettings
 
 NEEDS, EXTRA = ("av",), "teleop"
 RANK = 3
-CLOCK = 90_000
-LARGEST_KEY = 300
-"""Percent of a frame's share of the rate that a key frame may take: without a bound the first takes a second's."""
-SPEED = -8
-"""Of libvpx; a positive one changes with the machine's load, and takes more of an idle one."""
-LEAST_BUFFER = 10
-"""Percent of the rate's buffer below which a frame is left out, where even coarse ones are too large."""
+TIME_BASE_HZ = 90_000
+KEY_FRAME_MAX_PERCENT = 300
+"""Maximum size of a key frame, percent of the mean frame size; unlimited, the first one takes a second's bits."""
+CPU_USED = -8
+"""libvpx speed preset; positive values adapt to the machine's load, and cost more on an idle machine."""
+DROP_THRESHOLD_PERCENT = 10
+"""Fill level of the rate control buffer, percent, below which a frame is dropped."""
 OPTIONS = {
     "deadline": "realtime",
-    "cpu-used": str(SPEED),
+    "cpu-used": str(CPU_USED),
     "lag-in-frames": "0",
-    "max-intra-rate": str(LARGEST_KEY),
-    "drop-threshold": str(LEAST_BUFFER),
+    "max-intra-rate": str(KEY_FRAME_MAX_PERCENT),
+    "drop-threshold": str(DROP_THRESHOLD_PERCENT),
 }
 
 
-def lacking() -> Lacking | None:
-    """Nothing beyond the package."""
+def unavailable() -> Unavailable | None:
+    """None: PyAV is all it needs."""
     return None
 
 
-def encoder(settings: Settings) -> Encoder:
-    """In the thread that calls it; meanwhile others run."""
+def encoder(settings: EncoderSettings) -> Encoder:
+    """Create an encoder that runs in the calling thread, with the GIL released."""
     rate, half = str(settings.bitrate), str(settings.bitrate // 2)
     return Encoder("libvpx", settings, OPTIONS | {"minrate": rate, "maxrate": rate, "bufsize": half})
 
 
 class Encoder:
-    """One of FFmpeg's."""
+    """An FFmpeg encoder."""
 
-    def __init__(self, codec: str, settings: Settings, options: dict[str, str]) -> None:
+    def __init__(self, codec: str, settings: EncoderSettings, options: dict[str, str]) -> None:
         import av
         from av.video.frame import PictureType
 
@@ -50,7 +50,7 @@ class Encoder:
         self._codec = create(codec, "w")
         self._codec.width, self._codec.height, self._codec.pix_fmt = settings.width, settings.height, "yuv420p"
         self._codec.framerate = Fraction(settings.fps).limit_denominator(1001)
-        self._codec.time_base = Fraction(1, CLOCK)
+        self._codec.time_base = Fraction(1, TIME_BASE_HZ)
         self._codec.bit_rate, self._codec.gop_size = settings.bitrate, 9999
         self._codec.thread_count = 1
         self._codec.options = options
@@ -58,7 +58,7 @@ class Encoder:
         self._last = -1
 
     def encode(self, planes: U8, captured: int, key: bool) -> bytes:
-        """See `video.Encoder`."""
+        """See `encoders.Encoder`."""
         if self._first is None:
             self._first = captured
         frame = self._av.VideoFrame.from_ndarray(planes, format="yuv420p")
@@ -68,4 +68,4 @@ class Encoder:
         return b"".join(bytes(packet) for packet in self._codec.encode(frame))
 
     def close(self) -> None:
-        """FFmpeg frees it with the object."""
+        """Nothing to do: FFmpeg frees the encoder with the object."""

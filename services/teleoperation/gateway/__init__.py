@@ -1,4 +1,4 @@
-"""The gateway: who is connected, who may drive which vehicle, certificates, audit.
+"""The gateway: connected vehicles and stations, the pairs that drive, certificates, audit trail.
 
-Begin with `server`; `fleet` decides, `pki` issues certificates.
+Begin with `server`; `fleet` decides which station drives which vehicle, `pki` issues certificates.
 """

@@ -1,4 +1,4 @@
-"""A party's connection to its gateway: orders come in, how the party is goes out, once a second."""
+"""Connection of a vehicle or station to its gateway: receives orders, and sends the party's status once a second."""
 
 from __future__ import annotations
 
@@ -9,90 +9,90 @@ from typing import Protocol
 
 from scan2sim.services.teleoperation.control.messages import Malformed
 from scan2sim.services.teleoperation.gateway.identity import Identity
-from scan2sim.services.teleoperation.gateway.json_stream import Client, Stream, Told
+from scan2sim.services.teleoperation.gateway.json_stream import Client, Connection, JsonObject
 from scan2sim.services.teleoperation.gateway.protocol import (
     Address,
-    Ask,
+    DriverRequest,
     Hello,
     Join,
-    Refused,
     Release,
+    RequestRefused,
     Status,
     from_gateway,
 )
 
 log = logging.getLogger(__name__)
 
-EVERY = 1.0
-"""Seconds between two statuses."""
+STATUS_PERIOD_S = 1.0
+"""Interval between two status messages."""
 
 
 class Party(Protocol):
-    """What a vehicle or a station is to its connection."""
+    """Interface of a vehicle or station to its gateway connection."""
 
     def hello(self) -> Hello:
-        """What it says first."""
+        """First message to the gateway."""
 
     def status(self) -> Status:
-        """How it is now."""
+        """Current status."""
 
-    def obey(self, order: Join | Release | Refused) -> None:
-        """Do what the gateway says."""
+    def handle_order(self, order: Join | Release | RequestRefused) -> None:
+        """Carry out an order of the gateway."""
 
 
-class Membership:
-    """Connected, or about to be, from its making to `close`; a party's methods are called in its two threads."""
+class GatewayConnection:
+    """Connects, and reconnects, from creation to `close`; the party's methods are called in its two threads."""
 
     def __init__(
-        self, identity: Identity, gateway: Address, party: Party, say: Callable[[str], None] = log.warning
+        self, identity: Identity, gateway: Address, party: Party, notify: Callable[[str], None] = log.warning
     ) -> None:
-        """`say` is told, once each, when the gateway is reached, and when and why it isn't."""
-        self._party, self._say, self._lost = party, say, ""
+        """`notify` is called, once each, when the gateway is reached, and when and why it isn't."""
+        self._party, self._notify, self._reported_loss = party, notify, ""
         self._where = f"the gateway {gateway.host}:{gateway.port}"
         self._ended = threading.Event()
         self._client = Client(
             identity, gateway.host, gateway.port,
             opened=self._opened, received=self._received, closed=self._closed,
         )  # fmt: skip
-        self._teller = threading.Thread(target=self._tell, name="status for the gateway", daemon=True)
-        self._teller.start()
+        self._status_thread = threading.Thread(target=self._send_status, name="status for the gateway", daemon=True)
+        self._status_thread.start()
 
     def connected(self) -> bool:
-        """Whether the gateway is reached now."""
+        """Whether the gateway is connected."""
         return self._client.connected
 
     def alive(self) -> bool:
-        """Whether its threads live."""
-        return self._client.is_alive() and self._teller.is_alive()
+        """Whether its threads are alive."""
+        return self._client.is_alive() and self._status_thread.is_alive()
 
-    def ask(self, ask: Ask) -> bool:
-        """Ask the gateway; False: it isn't reached."""
-        return self._client.send(ask.wire())
+    def send_request(self, request: DriverRequest) -> bool:
+        """Send a driver's request to the gateway; False: it isn't connected."""
+        return self._client.send(request.wire())
 
     def close(self) -> None:
-        """End the connection."""
+        """Close the connection and end the threads."""
         self._ended.set()
         self._client.close()
-        self._teller.join(5.0)
+        self._status_thread.join(5.0)
 
-    def _opened(self, stream: Stream) -> None:
-        self._lost = ""
-        self._say(f"{self._where} is reached")
-        stream.send(self._party.hello().wire())
+    def _opened(self, connection: Connection) -> None:
+        self._reported_loss = ""
+        self._notify(f"connected to {self._where}")
+        connection.send(self._party.hello().wire())
 
-    def _received(self, stream: Stream, told: Told) -> None:
+    def _received(self, connection: Connection, data: JsonObject) -> None:
         try:
-            order = from_gateway(told)
+            order = from_gateway(data)
         except Malformed as error:
-            stream.close(f"it says what can't be understood ({error}): is it of another version?")
+            connection.close(f"sent a message that isn't understood ({error}); check that versions match")
         else:
-            self._party.obey(order)
+            self._party.handle_order(order)
 
-    def _closed(self, why: str) -> None:
-        if why != self._lost and not self._ended.is_set():
-            self._say(f"{self._where} isn't reached: {why}")
-        self._lost = why
+    def _closed(self, reason: str) -> None:
+        if reason != self._reported_loss and not self._ended.is_set():
+            self._notify(f"{self._where} can't be reached: {reason}")
+        self._reported_loss = reason
 
-    def _tell(self) -> None:
-        while not self._ended.wait(EVERY):
+    def _send_status(self) -> None:
+        while not self._ended.wait(STATUS_PERIOD_S):
             self._client.send(self._party.status().wire())

@@ -1,7 +1,7 @@
-"""The fleet: which vehicles and stations are there, who drives whom, and how that changes (D3.2, section 4.3).
+"""The fleet: connected vehicles and stations, which station drives which vehicle, and changes of it (D3.2, 4.3).
 
-Who is in a pair is decided here alone, kept on disk before anybody is told, and told again to whoever comes back: a
-gateway that starts anew finds its pairs driving. A vehicle is in one pair at most, a station too.
+Only the gateway decides on pairs. A pair is stored on disk before its parties are notified, and sent again to a party
+that reconnects; so a restarted gateway finds its pairs driving. A vehicle, and a station, is in one pair at most.
 """
 
 from __future__ import annotations
@@ -17,14 +17,23 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from scan2sim.pipeline.core.errors import BusyError, InputError, SettingError, from_os_error
-from scan2sim.services.teleoperation.gateway.audit import Audit
+from scan2sim.services.teleoperation.gateway.audit import AuditTrail
 from scan2sim.services.teleoperation.gateway.identity import Peer, Role
-from scan2sim.services.teleoperation.gateway.protocol import Ask, Driving, Hello, Join, Member, Refused, Release, Status
+from scan2sim.services.teleoperation.gateway.protocol import (
+    CurrentPair,
+    DriverRequest,
+    Hello,
+    Join,
+    PairMember,
+    Release,
+    RequestRefused,
+    Status,
+)
 
-Order = Join | Release | Refused
+Order = Join | Release | RequestRefused
 Send = Callable[[Order], None]
-GATEWAY = "gateway"
-"""Who changes a pair where nobody has asked for it."""
+GATEWAY_AUTHOR = "gateway"
+"""Author of a change that nobody requested."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +41,10 @@ class Pair:
     """A station that drives a vehicle.
 
     Attributes:
-        number: counts all pairs that ever were.
-        since: seconds since 1970.
-        by: who wanted it.
-        before: the station that had the vehicle before it was handed over.
+        number: counts all pairs that ever existed.
+        since: Unix time, seconds.
+        by: who requested it.
+        before: station that drove the vehicle before it was handed over.
     """
 
     number: int
@@ -48,7 +57,7 @@ class Pair:
 
 @dataclass
 class _Party:
-    """Who has been there since the gateway's start."""
+    """A party that has connected since the gateway's start."""
 
     peer: Peer
     hello: Hello
@@ -58,133 +67,134 @@ class _Party:
     status: Status = field(default_factory=Status)
 
 
-_KEPT = TypeAdapter(tuple[int, tuple[Pair, ...]])
+_STATE = TypeAdapter(tuple[int, tuple[Pair, ...]])
 
 
 class Fleet:
-    """See the module; all methods may be called from any thread."""
+    """Parties and pairs; all methods are thread-safe."""
 
     def __init__(self, folder: Path, *, now: Callable[[], float] = time.time) -> None:
-        """Go on from what is kept in a folder.
+        """Restore the pairs stored in a folder.
 
         Raises:
-            InputError: what is kept there is damaged. SpaceError: it can't be written to.
+            InputError: the stored state is damaged. SpaceError: the folder can't be written to.
         """
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise from_os_error(error, folder) from None
         self._file, self._now, self._lock = folder / "fleet.json", now, threading.RLock()
-        self.audit = Audit(folder / "audit.jsonl")
+        self.audit = AuditTrail(folder / "audit.jsonl")
         self._parties: dict[tuple[Role, str], _Party] = {}
-        self._last, self._pairs = self._read()
+        self._last_number, self._pairs = self._read()
 
-    # parties come, tell and go
+    # connections of parties
 
-    def came(self, peer: Peer, hello: Hello, address: str, send: Send) -> None:
-        """A party is connected; it is told the pair that it is to be in, or that it is in none.
+    def connected(self, peer: Peer, hello: Hello, address: str, send: Send) -> None:
+        """Register a party that connected, and send it its pair, or that it is in none.
 
         Args:
-            address: that it came from.
-            send: gives it an order; never blocks. Who was connected by its name before is sent no more.
+            address: address of the party.
+            send: sends it an order; must not block. Replaces that of an earlier connection of this party.
         """
         with self._lock:
             self._parties[peer.role, peer.name] = _Party(peer, hello, address, send, self._now())
-            self._adopt(peer, hello.driving)
-            pair = self._of(peer.role, peer.name)
+            self._restore(peer, hello.driving)
+            pair = self._pair_of(peer.role, peer.name)
             if pair is None:
                 send(Release(why="it is in no pair"))
             else:
-                self._tell(pair)
+                self._send_pair(pair)
 
-    def told(self, peer: Peer, status: Status) -> None:
-        """A party says how it is."""
+    def update_status(self, peer: Peer, status: Status) -> None:
+        """Store a party's status."""
         with self._lock:
             self._parties[peer.role, peer.name].status = status
 
-    def asked(self, peer: Peer, ask: Ask) -> None:
-        """A station's driver asks for itself; whoever else would be changed by it isn't."""
+    def handle_request(self, peer: Peer, request: DriverRequest) -> None:
+        """Carry out a request of a station's driver, for that station only."""
         if peer.role != Role.STATION:
-            raise SettingError(peer.name, "is no station, and asks for nothing", "Ask from a station, or the page")
-        if ask.what == "join":
-            self.join(ask.vehicle, peer.name, peer.name)
+            raise SettingError(peer.name, "is not a station", "Send requests from a station, or use the fleet page")
+        if request.what == "join":
+            self.join(request.vehicle, peer.name, peer.name)
             return
         with self._lock:
-            pair = self._pair(ask.vehicle)
+            pair = self._require_pair(request.vehicle)
             if pair.station != peer.name:
-                raise BusyError(ask.vehicle, f"is driven from {pair.station}", "Ask there, or on the gateway's page")
-            self.release(ask.vehicle, peer.name)
+                remedy = "Release it there, or on the fleet page"
+                raise BusyError(request.vehicle, f"is driven from {pair.station}", remedy)
+            self.release(request.vehicle, peer.name)
 
-    def left(self, peer: Peer, send: Send) -> None:
-        """A party's connection has ended; its pair stays."""
+    def disconnected(self, peer: Peer, send: Send) -> None:
+        """Unregister a party's connection; its pair stays."""
         with self._lock:
             party = self._parties.get((peer.role, peer.name))
             if party is not None and party.send is send:
                 party.send, party.since, party.status = None, self._now(), Status()
 
-    # pairs change
+    # changes of pairs
 
     def join(self, vehicle: str, station: str, by: str) -> Pair:
-        """Have a station drive a vehicle.
+        """Let a station drive a vehicle.
 
         Raises:
-            SettingError: one of them isn't there. BusyError: one of them is in a pair.
-            SpaceError: it can't be kept.
+            SettingError: one of them isn't connected. BusyError: one of them is in a pair.
+            SpaceError: the pair can't be stored.
         """
         with self._lock:
-            self._free(vehicle, station)
+            self._check_available(vehicle, station)
             if (pair := self._pairs.get(vehicle)) is not None:
                 raise BusyError(vehicle, f"is driven from {pair.station}", "Release it, or hand it over")
-            return self._change("join", Pair(self._last + 1, vehicle, station, self._now(), by))
+            return self._change("join", Pair(self._last_number + 1, vehicle, station, self._now(), by))
 
     def hand_over(self, vehicle: str, station: str, by: str) -> Pair:
-        """Have another station drive a vehicle; its driver has to confirm before it moves.
+        """Let another station drive a vehicle; its driver has to confirm before the vehicle moves.
 
         Raises:
-            SettingError: one of them isn't there, or the vehicle is in no pair.
-            BusyError: the station drives another. SpaceError: it can't be kept.
+            SettingError: one of them isn't connected, or the vehicle is in no pair.
+            BusyError: the station drives another vehicle. SpaceError: the pair can't be stored.
         """
         with self._lock:
-            before = self._pair(vehicle)
-            self._free(vehicle, station)
-            made = Pair(self._last + 1, vehicle, station, self._now(), by, before.station)
-            self._change("hand over", made)
-            self._order(Role.STATION, before.station, Release(why=f"{by} handed {vehicle} over to {station}"))
-            return made
+            before = self._require_pair(vehicle)
+            self._check_available(vehicle, station)
+            pair = Pair(self._last_number + 1, vehicle, station, self._now(), by, before.station)
+            self._change("hand over", pair)
+            self._send_order(Role.STATION, before.station, Release(why=f"{by} handed {vehicle} over to {station}"))
+            return pair
 
     def take_back(self, vehicle: str, by: str) -> Pair:
-        """Give a vehicle back to the station that handed it over; raises as `hand_over`."""
+        """Give a vehicle back to the station that drove it before the handover; raises as `hand_over`."""
         with self._lock:
-            before = self._pair(vehicle).before
+            before = self._require_pair(vehicle).before
             if before is None:
-                raise SettingError(vehicle, "wasn't handed over", "Hand it over to a station by name")
+                raise SettingError(vehicle, "was not handed over", "Hand it over to a station by name")
             return self.hand_over(vehicle, before, by)
 
     def release(self, vehicle: str, by: str) -> None:
-        """End a vehicle's pair: it stands.
+        """End a vehicle's pair; the vehicle stops.
 
         Raises:
-            SettingError: it is in none. SpaceError: that can't be kept.
+            SettingError: it is in no pair. SpaceError: the change can't be stored.
         """
         with self._lock:
-            pair = self._pair(vehicle)
-            self._note("release", pair, by)
-            self._keep(self._last, {k: v for k, v in self._pairs.items() if k != vehicle})
+            pair = self._require_pair(vehicle)
+            self._log("release", pair, by)
+            self._write(self._last_number, {k: v for k, v in self._pairs.items() if k != vehicle})
             for role, name in ((Role.VEHICLE, vehicle), (Role.STATION, pair.station)):
-                self._order(role, name, Release(why=f"{by} released {vehicle}"))
+                self._send_order(role, name, Release(why=f"{by} released {vehicle}"))
 
-    # what is shown
+    # state for the page
 
-    def facts(self) -> dict[str, Any]:
-        """All parties and pairs, for the page and its API."""
+    def snapshot(self) -> dict[str, Any]:
+        """All parties and their pairs, for the page and its API."""
         with self._lock:
             of_station = {pair.station: pair for pair in self._pairs.values()}
             parties = sorted(self._parties.values(), key=lambda one: one.peer.name)
-            found: dict[str, list[dict[str, Any]]] = {"vehicles": [], "stations": []}
+            result: dict[str, list[dict[str, Any]]] = {"vehicles": [], "stations": []}
             for one in parties:
                 pairs = self._pairs if one.peer.role == Role.VEHICLE else of_station
                 pair = pairs.get(one.peer.name)
-                found["vehicles" if one.peer.role == Role.VEHICLE else "stations"].append(
+                result["vehicles" if one.peer.role == Role.VEHICLE else "stations"].append(
                     {
                         "name": one.peer.name, "there": one.send is not None, "since": one.since,
                         "address": one.address, "cameras": one.hello.cameras,
@@ -194,85 +204,87 @@ class Fleet:
                         **one.status.model_dump(exclude={"kind", "pair"}),
                     }
                 )  # fmt: skip
-            return found
+            return result
 
-    # within
+    # internals
 
-    def _of(self, role: Role, name: str) -> Pair | None:
+    def _pair_of(self, role: Role, name: str) -> Pair | None:
         if role == Role.VEHICLE:
             return self._pairs.get(name)
         return next((pair for pair in self._pairs.values() if pair.station == name), None)
 
-    def _pair(self, vehicle: str) -> Pair:
+    def _require_pair(self, vehicle: str) -> Pair:
         if vehicle not in self._pairs:
-            raise SettingError(vehicle, "is driven by nobody", "Join it with a station first")
+            raise SettingError(vehicle, "is not driven by any station", "Join it with a station first")
         return self._pairs[vehicle]
 
-    def _free(self, vehicle: str, station: str) -> None:
-        """Both are there, and the station drives nobody."""
+    def _check_available(self, vehicle: str, station: str) -> None:
+        """Check that both are connected, and that the station drives no vehicle."""
         for role, name in ((Role.VEHICLE, vehicle), (Role.STATION, station)):
             party = self._parties.get((role, name))
             if party is None or party.send is None:
-                raise SettingError(name, f"is no {role} that is connected now", "Start it, and look at the page")
-        if (pair := self._of(Role.STATION, station)) is not None:
-            raise BusyError(station, f"drives {pair.vehicle}", "Release that first")
+                raise SettingError(name, f"is not a connected {role}", "Start it, and check that it connects")
+        if (pair := self._pair_of(Role.STATION, station)) is not None:
+            raise BusyError(station, f"drives {pair.vehicle}", "Release that vehicle first")
 
-    def _adopt(self, peer: Peer, driving: Driving | None) -> None:
-        """A vehicle that says that it is driven, where nothing is known of it, and the same from its station's side."""
+    def _restore(self, peer: Peer, driving: CurrentPair | None) -> None:
+        """Restore a pair unknown to the gateway, if vehicle and station both report that they are in it."""
         if driving is None:
             return
         role = Role.STATION if peer.role == Role.VEHICLE else Role.VEHICLE
         other = self._parties.get((role, driving.other))
-        agreed = None if other is None or other.send is None else other.hello.driving
-        if agreed is None or (agreed.pair, agreed.other) != (driving.pair, peer.name):
+        reported = None if other is None or other.send is None else other.hello.driving
+        if reported is None or (reported.pair, reported.other) != (driving.pair, peer.name):
             return
         vehicle, station = (peer.name, driving.other) if peer.role == Role.VEHICLE else (driving.other, peer.name)
-        if driving.pair > self._last and self._of(Role.VEHICLE, vehicle) is None is self._of(Role.STATION, station):
-            self._change("found driving", Pair(driving.pair, vehicle, station, self._now(), GATEWAY))
+        if driving.pair > self._last_number and self._pair_of(Role.VEHICLE, vehicle) is None is self._pair_of(
+            Role.STATION, station
+        ):
+            self._change("found driving", Pair(driving.pair, vehicle, station, self._now(), GATEWAY_AUTHOR))
 
     def _change(self, what: str, pair: Pair) -> Pair:
-        """Keep a pair, then tell both."""
-        self._note(what, pair, pair.by)
-        self._keep(pair.number, {**self._pairs, pair.vehicle: pair})
-        self._tell(pair)
+        """Store a pair, then notify both parties."""
+        self._log(what, pair, pair.by)
+        self._write(pair.number, {**self._pairs, pair.vehicle: pair})
+        self._send_pair(pair)
         return pair
 
-    def _tell(self, pair: Pair) -> None:
-        """Tell both of a pair, as far as they are there."""
+    def _send_pair(self, pair: Pair) -> None:
+        """Send a pair to both of its parties, if connected."""
         vehicle = self._parties.get((Role.VEHICLE, pair.vehicle))
         station = self._parties.get((Role.STATION, pair.station))
         for to, other in ((vehicle, station), (station, vehicle)):
             if to is not None and to.send is not None and other is not None:
-                member = Member(name=other.peer.name, fingerprint=other.peer.fingerprint)
+                member = PairMember(name=other.peer.name, fingerprint=other.peer.fingerprint)
                 to.send(Join(pair=pair.number, other=member, listening=other.hello.listening))
 
-    def _order(self, role: Role, name: str, order: Order) -> None:
+    def _send_order(self, role: Role, name: str, order: Order) -> None:
         party = self._parties.get((role, name))
         if party is not None and party.send is not None:
             party.send(order)
 
-    def _note(self, what: str, pair: Pair, by: str) -> None:
-        told = {"what": what, "vehicle": pair.vehicle, "station": pair.station, "pair": pair.number, "by": by}
-        self.audit.add({"time": round(self._now(), 3), **told})
+    def _log(self, what: str, pair: Pair, by: str) -> None:
+        entry = {"what": what, "vehicle": pair.vehicle, "station": pair.station, "pair": pair.number, "by": by}
+        self.audit.add({"time": round(self._now(), 3), **entry})
 
     def _read(self) -> tuple[int, dict[str, Pair]]:
         try:
-            last, pairs = _KEPT.validate_json(self._file.read_bytes())
+            last, pairs = _STATE.validate_json(self._file.read_bytes())
         except FileNotFoundError:
             return 0, {}
         except (OSError, ValidationError) as error:
-            remedy = "Delete it: pairs that drive are found again, as both of them tell"
+            remedy = "Delete it: pairs that are driving are restored when both parties reconnect"
             raise InputError(self._file, f"can't be read ({error!s:.100})", remedy) from None
         return last, {pair.vehicle: pair for pair in pairs}
 
-    def _keep(self, last: int, pairs: dict[str, Pair]) -> None:
-        fresh = self._file.with_suffix(".new")
+    def _write(self, last: int, pairs: dict[str, Pair]) -> None:
+        temporary = self._file.with_suffix(".new")
         try:
-            with fresh.open("wb") as file:
-                file.write(_KEPT.dump_json((last, tuple(pairs.values())), indent=1))
+            with temporary.open("wb") as file:
+                file.write(_STATE.dump_json((last, tuple(pairs.values())), indent=1))
                 file.flush()
                 os.fsync(file.fileno())
-            fresh.replace(self._file)
+            temporary.replace(self._file)
         except OSError as error:
             raise from_os_error(error, self._file) from None
-        self._last, self._pairs = last, pairs
+        self._last_number, self._pairs = last, pairs

@@ -1,7 +1,7 @@
-"""JSON lines over TLS between the gateway and those who connect to it: everything but driving.
+"""JSON lines over TLS between the gateway and vehicles and stations, for all messages except driving.
 
-One thread serves all connections of a `Server`, and one a `Client`, which connects again whenever its own breaks.
-Callbacks run in that thread, one at a time, and must not block. A blank line is a sign of life.
+One thread serves all connections of a `Server`; a `Client` has its own, and reconnects when its connection breaks.
+Callbacks run in that thread, one at a time, and must not block. A blank line is a heartbeat.
 """
 
 from __future__ import annotations
@@ -19,35 +19,35 @@ from typing import Any
 from scan2sim.pipeline.core.errors import BusyError, SettingError
 from scan2sim.services.teleoperation.gateway.identity import Identity, Peer, Role
 from scan2sim.services.teleoperation.transport import tls
-from scan2sim.services.teleoperation.transport.tls import Channel, Ended, Refused
+from scan2sim.services.teleoperation.transport.tls import Channel, TlsClosed, TlsError
 
 log = logging.getLogger(__name__)
 
-LONGEST = 2**16
-"""Bytes of a line."""
-WAITING = 2**20
-"""Bytes that may wait for a slow reader; then it is cut off."""
-CONNECTIONS, STRANGERS = 256, 64
-"""At once; of these, such whose handshake isn't done."""
-BEAT, SILENT, GREETED = 2.0, 8.0, 5.0
-"""Seconds: between signs of life, without any until the connection is given up, for its handshake."""
-AGAIN = (0.25, 5.0)
-"""Seconds until a client connects again: at first, and at most (it doubles)."""
+LINE_MAX_BYTES = 2**16
+"""Maximum length of a line."""
+SEND_QUEUE_MAX_BYTES = 2**20
+"""Maximum number of bytes queued for a slow reader, which is disconnected then."""
+CONNECTIONS_MAX, HANDSHAKES_MAX = 256, 64
+"""Maximum number of connections, and of those among them whose handshake isn't complete."""
+HEARTBEAT_S, IDLE_TIMEOUT_S, HANDSHAKE_TIMEOUT_S = 2.0, 8.0, 5.0
+"""Interval of heartbeats; silence after which a connection is closed; time allowed for a handshake."""
+RECONNECT_DELAYS_S = (0.25, 5.0)
+"""Delay before a client reconnects: initial and maximum; it doubles with each attempt."""
 
-Told = dict[str, Any]
+JsonObject = dict[str, Any]
 
 
-class Stream:
-    """A connection.
+class Connection:
+    """A connection of the gateway with a vehicle or station.
 
     Attributes:
-        peer: who is at the other end (once it is opened).
-        address: where that is, HOST:PORT.
+        peer: the remote party, once the connection is open.
+        address: HOST:PORT of the remote party.
     """
 
     def __init__(self, sock: socket.socket, channel: Channel, wake: Callable[[], None]) -> None:
         self.address = channel.address
-        self.since = self.heard = self.told = time.monotonic()
+        self.since = self.last_received = self.last_sent = time.monotonic()
         self.opened = False
         self._sock, self._channel, self._wake = sock, channel, wake
         self._lock = threading.Lock()
@@ -56,23 +56,23 @@ class Stream:
 
     @property
     def peer(self) -> Peer:
-        """Who is at the other end."""
+        """The remote party."""
         assert self._channel.peer is not None
         return self._channel.peer
 
     @property
-    def agreed(self) -> dict[str, str]:
+    def negotiated(self) -> dict[str, str]:
         """Version, cipher and group of the encryption."""
         with self._lock:
-            return self._channel.agreed()
+            return self._channel.negotiated()
 
-    def send(self, told: Mapping[str, Any]) -> bool:
-        """Queue a line, from any thread; False: the connection is over, or its reader too slow and now cut off."""
-        return self._send(json.dumps(told, separators=(",", ":"), allow_nan=False).encode() + b"\n")
+    def send(self, message: Mapping[str, Any]) -> bool:
+        """Queue a message; thread-safe. False: the connection is closed, or closes as its reader is too slow."""
+        return self._send(json.dumps(message, separators=(",", ":"), allow_nan=False).encode() + b"\n")
 
-    def close(self, why: str = "closed here") -> None:
-        """End it, once what waits is sent."""
-        self._closing = self._closing or why
+    def close(self, reason: str = "closed here") -> None:
+        """Close the connection after sending what is queued."""
+        self._closing = self._closing or reason
         self._wake()
 
     def _send(self, line: bytes) -> bool:
@@ -81,22 +81,22 @@ class Stream:
                 return False
             try:
                 self._channel.write(line)
-            except Refused as error:
+            except TlsError as error:
                 self._closing = str(error)
             else:
                 self._out += self._channel.take()
-                self.told = time.monotonic()
-                if len(self._out) > WAITING:
+                self.last_sent = time.monotonic()
+                if len(self._out) > SEND_QUEUE_MAX_BYTES:
                     self._out.clear()
-                    self._closing = "it reads too slowly"
+                    self._closing = "the remote end reads too slowly"
         self._wake()
         return not self._closing
 
     def _receive(self) -> list[bytes]:
-        """Lines of what has come."""
+        """Receive lines."""
         data = self._sock.recv(2**16)
         if not data:
-            raise Ended
+            raise TlsClosed
         with self._lock:
             self._channel.put(data)
             try:
@@ -106,14 +106,14 @@ class Stream:
             finally:
                 self._out += self._channel.take()
         *lines, rest = self._in.split(b"\n")
-        if len(rest) > LONGEST or any(len(line) > LONGEST for line in lines):
-            raise Refused("it sent a line that is too long")
+        if len(rest) > LINE_MAX_BYTES or any(len(line) > LINE_MAX_BYTES for line in lines):
+            raise TlsError(f"received a line longer than {LINE_MAX_BYTES} bytes")
         self._in = rest
         if lines:
-            self.heard = time.monotonic()
+            self.last_received = time.monotonic()
         return [bytes(line) for line in lines]
 
-    def _begin(self) -> None:
+    def _start_handshake(self) -> None:
         with self._lock:
             self._channel.handshake()
             self._out += self._channel.take()
@@ -135,135 +135,135 @@ class Stream:
 
 
 class _Connections(threading.Thread):
-    """All connections of a side, in one thread."""
+    """All connections of a server or client, served by one thread."""
 
     def __init__(
         self,
         name: str,
-        opened: Callable[[Stream], None],
-        received: Callable[[Stream, Told], None],
-        closed: Callable[[Stream, str], None],
+        opened: Callable[[Connection], None],
+        received: Callable[[Connection, JsonObject], None],
+        closed: Callable[[Connection, str], None],
     ) -> None:
         super().__init__(name=name, daemon=True)
-        self._tell = (opened, received, closed)
+        self._callbacks = (opened, received, closed)
         self._selector = selectors.DefaultSelector()
-        self._streams: dict[socket.socket, Stream] = {}
-        self._ends = threading.Event()
-        self._inner, self._outer = socket.socketpair()
-        self._inner.setblocking(False)
-        self._outer.setblocking(False)
-        self._selector.register(self._inner, selectors.EVENT_READ)
+        self._connections: dict[socket.socket, Connection] = {}
+        self._stopping = threading.Event()
+        self._wake_receiver, self._wake_sender = socket.socketpair()
+        self._wake_receiver.setblocking(False)
+        self._wake_sender.setblocking(False)
+        self._selector.register(self._wake_receiver, selectors.EVENT_READ)
 
     def wake(self) -> None:
-        """Look at once whether there is something to do."""
+        """Make the thread check at once for work."""
         try:
-            self._outer.send(b"\0")
-        except OSError:  # it is awake, or has ended
+            self._wake_sender.send(b"\0")
+        except OSError:  # it is awake already, or has ended
             pass
 
     def close(self) -> None:
-        """End all connections, and the thread."""
-        self._ends.set()
+        """Close all connections, and end the thread."""
+        self._stopping.set()
         self.wake()
         if threading.current_thread() is not self:
-            self.join(GREETED)
+            self.join(HANDSHAKE_TIMEOUT_S)
 
     def run(self) -> None:
         """Serve until closed."""
         try:
-            while not self._ends.is_set():
+            while not self._stopping.is_set():
                 for key, events in self._selector.select(self._pause()):
                     sock = key.fileobj
                     assert isinstance(sock, socket.socket)
-                    if sock is self._inner:
-                        self._inner.recv(4096)
-                    elif (stream := self._streams.get(sock)) is None:
+                    if sock is self._wake_receiver:
+                        self._wake_receiver.recv(4096)
+                    elif (connection := self._connections.get(sock)) is None:
                         self._accept()
                     elif events & selectors.EVENT_READ:
-                        self._read(stream)
-                self._look(time.monotonic())
+                        self._read(connection)
+                self._maintain(time.monotonic())
         finally:
-            for stream in list(self._streams.values()):
-                self._drop(stream, "closed here")
+            for connection in list(self._connections.values()):
+                self._drop(connection, "closed here")
             self._selector.close()
-            self._inner.close()
-            self._outer.close()
+            self._wake_receiver.close()
+            self._wake_sender.close()
 
     def _pause(self) -> float:
         return 0.5
 
     def _accept(self) -> None:
-        """Someone connects."""
+        """Accept a connection."""
 
-    def _add(self, sock: socket.socket, channel: Channel) -> Stream:
+    def _add(self, sock: socket.socket, channel: Channel) -> Connection:
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        stream = self._streams[sock] = Stream(sock, channel, self.wake)
+        connection = self._connections[sock] = Connection(sock, channel, self.wake)
         self._selector.register(sock, selectors.EVENT_READ)
-        return stream
+        return connection
 
-    def _look(self, now: float) -> None:
-        """Send what waits, end what is over."""
-        for stream in list(self._streams.values()):
-            if stream.opened and now - stream.told > BEAT:
-                stream._send(b"\n")
-            if stream._closing:
-                self._drop(stream, stream._closing)
-            elif now - stream.heard > (SILENT if stream.opened else GREETED):
-                self._drop(stream, "nothing more came")
+    def _maintain(self, now: float) -> None:
+        """Send heartbeats and queued data, and drop connections that are closed or timed out."""
+        for connection in list(self._connections.values()):
+            if connection.opened and now - connection.last_sent > HEARTBEAT_S:
+                connection._send(b"\n")
+            if connection._closing:
+                self._drop(connection, connection._closing)
+            elif now - connection.last_received > (IDLE_TIMEOUT_S if connection.opened else HANDSHAKE_TIMEOUT_S):
+                self._drop(connection, "timed out")
             else:
-                self._write(stream)
+                self._write(connection)
 
-    def _write(self, stream: Stream) -> None:
+    def _write(self, connection: Connection) -> None:
         try:
-            stream._flush()
+            connection._flush()
         except BlockingIOError:
             pass
         except OSError as error:
-            return self._drop(stream, str(error.strerror))
-        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if stream._out else 0)
-        if self._selector.get_key(stream._sock).events != wanted:
-            self._selector.modify(stream._sock, wanted)
+            return self._drop(connection, str(error.strerror))
+        events = selectors.EVENT_READ | (selectors.EVENT_WRITE if connection._out else 0)
+        if self._selector.get_key(connection._sock).events != events:
+            self._selector.modify(connection._sock, events)
 
-    def _read(self, stream: Stream) -> None:
+    def _read(self, connection: Connection) -> None:
         try:
-            lines = stream._receive()
-            if not stream.opened and self._ready(stream, lines):
-                stream.opened = True
-                self._tell[0](stream)
+            lines = connection._receive()
+            if not connection.opened and self._ready(connection, lines):
+                connection.opened = True
+                self._callbacks[0](connection)
             for line in filter(None, lines):
-                self._tell[1](stream, _parsed(line))
+                self._callbacks[1](connection, _parse(line))
         except BlockingIOError:
             pass
-        except Ended:
-            self._drop(stream, "the other end closed it")
-        except Refused as error:
-            self._drop(stream, str(error))
+        except TlsClosed:
+            self._drop(connection, "closed by the remote end")
+        except TlsError as error:
+            self._drop(connection, str(error))
         except OSError as error:
-            self._drop(stream, str(error.strerror))
+            self._drop(connection, str(error.strerror))
 
-    def _ready(self, stream: Stream, lines: list[bytes]) -> bool:
-        """Whether it is open now."""
-        return stream._channel.established
+    def _ready(self, connection: Connection, lines: list[bytes]) -> bool:
+        """Whether the connection is open now."""
+        return connection._channel.established
 
-    def _drop(self, stream: Stream, why: str) -> None:
-        if self._streams.pop(stream._sock, None) is not None:
-            self._selector.unregister(stream._sock)
-            stream._end()
-            self._tell[2](stream, why)
+    def _drop(self, connection: Connection, reason: str) -> None:
+        if self._connections.pop(connection._sock, None) is not None:
+            self._selector.unregister(connection._sock)
+            connection._end()
+            self._callbacks[2](connection, reason)
 
 
 class Server(_Connections):
     """The gateway's side.
 
     Args:
-        port: 0: any.
-        accepts: whether a party is let in, whose certificate holds; the gateway's own role never is.
-        opened, received, closed: told of each connection; `closed` of such, too, that weren't `opened`.
+        port: TCP port; 0: any free one.
+        accepts: whether to accept a party with a valid certificate; a party with the gateway role never is.
+        opened, received, closed: callbacks; `closed` is also called for connections that were never `opened`.
 
     Raises:
-        SettingError: it can't listen there.
-        BusyError: something else does.
+        SettingError: it can't listen on this address.
+        BusyError: the port is in use.
     """
 
     def __init__(
@@ -272,9 +272,9 @@ class Server(_Connections):
         host: str,
         port: int,
         *,
-        opened: Callable[[Stream], None],
-        received: Callable[[Stream, Told], None],
-        closed: Callable[[Stream, str], None],
+        opened: Callable[[Connection], None],
+        received: Callable[[Connection, JsonObject], None],
+        closed: Callable[[Connection, str], None],
         accepts: Callable[[Peer], bool] = lambda peer: True,
     ) -> None:
         super().__init__("teleop-server", opened, received, closed)
@@ -282,16 +282,16 @@ class Server(_Connections):
         self._accepts = accepts
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            self._listening = socket.create_server((host, port), family=family, backlog=STRANGERS)
+            self._listener = socket.create_server((host, port), family=family, backlog=HANDSHAKES_MAX)
         except OSError as error:
             if error.errno == 98:
                 raise BusyError(
-                    f"{host}:{port}", "another program listens there", "End it, or choose another"
+                    f"{host}:{port}", "is in use by another program", "End that program, or choose another port"
                 ) from None
-            raise SettingError(f"{host}:{port}", str(error.strerror), "Name an address of this machine") from None
-        self._listening.setblocking(False)
-        self.port: int = self._listening.getsockname()[1]
-        self._selector.register(self._listening, selectors.EVENT_READ)
+            raise SettingError(f"{host}:{port}", str(error.strerror), "Give an address of this machine") from None
+        self._listener.setblocking(False)
+        self.port: int = self._listener.getsockname()[1]
+        self._selector.register(self._listener, selectors.EVENT_READ)
         self.start()
 
     def run(self) -> None:
@@ -299,32 +299,32 @@ class Server(_Connections):
         try:
             super().run()
         finally:
-            self._listening.close()
+            self._listener.close()
 
     def _accept(self) -> None:
         try:
-            sock, (host, port, *_) = self._listening.accept()
+            sock, (host, port, *_) = self._listener.accept()
         except OSError:
             return
-        strangers = Counter(stream.opened for stream in self._streams.values())[False]
-        if strangers >= STRANGERS or len(self._streams) >= CONNECTIONS:
+        handshakes = Counter(connection.opened for connection in self._connections.values())[False]
+        if handshakes >= HANDSHAKES_MAX or len(self._connections) >= CONNECTIONS_MAX:
             sock.close()
             return
-        channel = Channel(self._context, client=False, accepts=self._let_in, address=f"{host}:{port}")
+        channel = Channel(self._context, client=False, accepts=self._accepts_peer, address=f"{host}:{port}")
         self._add(sock, channel)
 
-    def _let_in(self, peer: Peer) -> bool:
+    def _accepts_peer(self, peer: Peer) -> bool:
         return peer.role != Role.GATEWAY and self._accepts(peer)
 
-    def _ready(self, stream: Stream, lines: list[bytes]) -> bool:
-        return stream._channel.established and stream._send(b"\n")
+    def _ready(self, connection: Connection, lines: list[bytes]) -> bool:
+        return connection._channel.established and connection._send(b"\n")
 
 
 class Client(_Connections):
-    """A vehicle's or station's side: connects to the gateway, again and again.
+    """The side of a vehicle or station: connects to the gateway, and reconnects.
 
     Args:
-        closed: told why, also of attempts that failed; the next one follows by itself.
+        closed: called with the reason, also after failed attempts; the client then retries by itself.
     """
 
     def __init__(
@@ -333,69 +333,69 @@ class Client(_Connections):
         host: str,
         port: int,
         *,
-        opened: Callable[[Stream], None],
-        received: Callable[[Stream, Told], None],
+        opened: Callable[[Connection], None],
+        received: Callable[[Connection, JsonObject], None],
         closed: Callable[[str], None],
     ) -> None:
-        super().__init__("teleop-client", opened, received, lambda stream, why: self._lost(why))
+        super().__init__("teleop-client", opened, received, lambda connection, reason: self._lost(reason))
         self._context = tls.context(identity, datagrams=False)
-        self._place, self._closed = (host, port), closed
-        self._next, self._wait = 0.0, AGAIN[0]
+        self._gateway, self._closed = (host, port), closed
+        self._next, self._wait = 0.0, RECONNECT_DELAYS_S[0]
         self.start()
 
-    def send(self, told: Mapping[str, Any]) -> bool:
-        """Queue a line; False: it isn't connected."""
-        stream = next((one for one in list(self._streams.values()) if one.opened), None)
-        return stream is not None and stream.send(told)
+    def send(self, message: Mapping[str, Any]) -> bool:
+        """Queue a message; False: the client isn't connected."""
+        connection = next((one for one in list(self._connections.values()) if one.opened), None)
+        return connection is not None and connection.send(message)
 
     @property
     def connected(self) -> bool:
-        """Whether it is."""
-        return any(one.opened for one in list(self._streams.values()))
+        """Whether the client is connected."""
+        return any(one.opened for one in list(self._connections.values()))
 
     def _pause(self) -> float:
-        return 0.5 if self._streams else max(0.0, min(0.5, self._next - time.monotonic()))
+        return 0.5 if self._connections else max(0.0, min(0.5, self._next - time.monotonic()))
 
-    def _look(self, now: float) -> None:
-        super()._look(now)
-        if not self._streams and now >= self._next and not self._ends.is_set():
+    def _maintain(self, now: float) -> None:
+        super()._maintain(now)
+        if not self._connections and now >= self._next and not self._stopping.is_set():
             self._connect()
 
     def _connect(self) -> None:
-        host, port = self._place
+        host, port = self._gateway
         self._next = time.monotonic() + self._wait
         try:
-            sock = socket.create_connection((host, port), timeout=GREETED)
+            sock = socket.create_connection((host, port), timeout=HANDSHAKE_TIMEOUT_S)
         except OSError as error:
             return self._lost(f"{host}:{port}: {error.strerror or error}")
-        channel = Channel(self._context, client=True, accepts=self._expected, address=f"{host}:{port}")
-        stream = self._add(sock, channel)
-        stream._begin()
-        self._write(stream)
+        channel = Channel(self._context, client=True, accepts=self._is_gateway, address=f"{host}:{port}")
+        connection = self._add(sock, channel)
+        connection._start_handshake()
+        self._write(connection)
         return None
 
-    def _expected(self, peer: Peer) -> bool:
-        return peer.role == Role.GATEWAY and self._place[0] in peer.hosts
+    def _is_gateway(self, peer: Peer) -> bool:
+        return peer.role == Role.GATEWAY and self._gateway[0] in peer.hosts
 
-    def _ready(self, stream: Stream, lines: list[bytes]) -> bool:
-        if lines:  # in TLS 1.3 the server looks at our certificate after we are done
-            self._wait = AGAIN[0]
+    def _ready(self, connection: Connection, lines: list[bytes]) -> bool:
+        if lines:  # in TLS 1.3 the server checks our certificate after our side of the handshake is complete
+            self._wait = RECONNECT_DELAYS_S[0]
         return bool(lines)
 
-    def _lost(self, why: str) -> None:
+    def _lost(self, reason: str) -> None:
         self._next = time.monotonic() + self._wait
-        self._wait = min(2 * self._wait, AGAIN[1])
-        self._closed(why)
+        self._wait = min(2 * self._wait, RECONNECT_DELAYS_S[1])
+        self._closed(reason)
 
 
-def _parsed(line: bytes) -> Told:
+def _parse(line: bytes) -> JsonObject:
     try:
-        told = json.loads(line, parse_constant=_refuse)
+        message = json.loads(line, parse_constant=_refuse)
     except (ValueError, RecursionError):
-        told = None
-    if not isinstance(told, dict):
-        raise Refused("it sent a line that is no JSON object")
-    return told
+        message = None
+    if not isinstance(message, dict):
+        raise TlsError("received a line that is not a JSON object")
+    return message
 
 
 def _refuse(constant: str) -> None:

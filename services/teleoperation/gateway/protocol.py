@@ -1,6 +1,6 @@
-"""What parties and their gateway say to each other: JSON, a line a message (`stream`); never in the way of driving.
+"""Messages between parties and gateway: JSON, one message per line (`json_stream`); driving doesn't depend on them.
 
-To the gateway: `Hello`, `Status` once a second, `Ask`. From it: `Join`, `Release`, `Refused`.
+To the gateway: `Hello`, `Status` once a second, `DriverRequest`. From it: `Join`, `Release`, `RequestRefused`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from scan2sim.services.teleoperation.control.messages import Malformed
 
-VERSION = 1
+PROTOCOL_VERSION = 1
 T = TypeVar("T")
 Name = Annotated[str, Field(min_length=1, max_length=60)]
 Text = Annotated[str, Field(max_length=200)]
@@ -20,54 +20,54 @@ Count = Annotated[int, Field(ge=0, le=2**53)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class _Said(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore")  # newer parties may say more
+class _Message(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="ignore")  # newer versions may send more fields
 
     def wire(self) -> dict[str, Any]:
-        """As it is sent."""
+        """The message as it is sent."""
         return self.model_dump(mode="json")
 
 
-class Address(_Said):
-    """Where a station listens (UDP)."""
+class Address(_Message):
+    """UDP address that a station listens on."""
 
     host: Annotated[str, Field(min_length=1, max_length=255)]
     port: Annotated[int, Field(ge=1, le=65535)]
 
 
-class Member(_Said):
-    """Of a pair, as the other one is told: its name, and its certificate's SHA-256 (hexadecimal)."""
+class PairMember(_Message):
+    """Member of a pair, as sent to the other member: name, and SHA-256 of the certificate (hexadecimal)."""
 
     name: Name
     fingerprint: Annotated[str, Field(pattern="[0-9a-f]{64}")]
 
 
-class Driving(_Said):
-    """A pair that a party is in."""
+class CurrentPair(_Message):
+    """The pair that a party is in."""
 
     pair: Count
     other: Name
 
 
-class Hello(_Said):
-    """A party's first message; role and name are its certificate's.
+class Hello(_Message):
+    """First message of a party; role and name are those of its certificate.
 
     Attributes:
         version: of this protocol.
-        listening: where a station can be dialled.
-        cameras: a vehicle's, by name.
-        driving: the pair that it is in: it goes on while the gateway is away.
+        listening: addresses that vehicles can connect to, of a station.
+        cameras: names of a vehicle's cameras.
+        driving: the party's current pair, which keeps driving while the gateway is away.
     """
 
     kind: Literal["hello"] = "hello"
-    version: int = VERSION
+    version: int = PROTOCOL_VERSION
     listening: Annotated[tuple[Address, ...], Field(max_length=16)] = ()
     cameras: Annotated[tuple[Name, ...], Field(max_length=64)] = ()
-    driving: Driving | None = None
+    driving: CurrentPair | None = None
 
 
-class LinkStatus(_Said):
-    """How a link is; None: not known yet. Milliseconds there and back; share of packets lost; Mbit/s both ways."""
+class LinkStatus(_Message):
+    """State of a link: round-trip time in ms, share of packets lost, Mbit/s both ways; None: not known yet."""
 
     name: Name
     up: bool
@@ -76,16 +76,16 @@ class LinkStatus(_Said):
     rate: Finite = 0.0
 
 
-class Status(_Said):
-    """How a party is.
+class Status(_Message):
+    """Status of a party.
 
     Attributes:
-        pair: that it is in.
-        links: to the other of the pair.
+        pair: number of its pair.
+        links: to the other party of the pair.
         driving: whether somebody drives now.
-        told: what the driver or operator should know: why the vehicle stands, whose clock is wrong.
-        speed: m/s, a vehicle's.
-        age: ms, of the last command where it is a vehicle, of pictures where it is a station.
+        told: message for driver or operator: why the vehicle is stopped, or which clock is wrong.
+        speed: of a vehicle, m/s.
+        age: ms; of the last command for a vehicle, of the video for a station.
     """
 
     kind: Literal["status"] = "status"
@@ -97,63 +97,63 @@ class Status(_Said):
     age: Finite | None = None
 
 
-class Ask(_Said):
-    """A station's driver wants a vehicle, or has arrived."""
+class DriverRequest(_Message):
+    """Request of a station's driver to join or to release a vehicle."""
 
     kind: Literal["ask"] = "ask"
     what: Literal["join", "release"]
     vehicle: Name
 
 
-class Join(_Said):
-    """The party is to be in this pair, and in no other; to both, and again whenever they come back."""
+class Join(_Message):
+    """Order to join a pair and no other; sent to both parties, and again when one reconnects."""
 
     kind: Literal["join"] = "join"
     pair: Count
-    other: Member
+    other: PairMember
     listening: tuple[Address, ...] = ()
 
 
-class Release(_Said):
-    """The party is to be in no pair."""
+class Release(_Message):
+    """Order to leave the current pair."""
 
     kind: Literal["release"] = "release"
     why: Text = ""
 
 
-class Refused(_Said):
-    """What was asked isn't done."""
+class RequestRefused(_Message):
+    """The request was refused, or the message was not accepted."""
 
     kind: Literal["refused"] = "refused"
     cause: Text
 
 
-ToGateway = Annotated[Hello | Status | Ask, Field(discriminator="kind")]
-FromGateway = Annotated[Join | Release | Refused, Field(discriminator="kind")]
-_TO: TypeAdapter[Hello | Status | Ask] = TypeAdapter(ToGateway)
-_FROM: TypeAdapter[Join | Release | Refused] = TypeAdapter(FromGateway)
+ToGateway = Annotated[Hello | Status | DriverRequest, Field(discriminator="kind")]
+FromGateway = Annotated[Join | Release | RequestRefused, Field(discriminator="kind")]
+_TO_GATEWAY: TypeAdapter[Hello | Status | DriverRequest] = TypeAdapter(ToGateway)
+_FROM_GATEWAY: TypeAdapter[Join | Release | RequestRefused] = TypeAdapter(FromGateway)
 
 
-def to_gateway(told: Mapping[str, Any]) -> Hello | Status | Ask:
-    """What a party says.
-
-    Raises:
-        Malformed: it is nothing that it may say.
-    """
-    return _read(_TO, told)
-
-
-def from_gateway(told: Mapping[str, Any]) -> Join | Release | Refused:
-    """What the gateway says.
+def to_gateway(data: Mapping[str, Any]) -> Hello | Status | DriverRequest:
+    """Validate a message of a party.
 
     Raises:
-        Malformed: it is nothing that it may say.
+        Malformed: it is not a message that a party may send.
     """
-    return _read(_FROM, told)
+    return _read(_TO_GATEWAY, data)
 
 
-def _read(adapter: TypeAdapter[T], told: Mapping[str, Any]) -> T:
+def from_gateway(data: Mapping[str, Any]) -> Join | Release | RequestRefused:
+    """Validate a message of the gateway.
+
+    Raises:
+        Malformed: it is not a message that the gateway may send.
+    """
+    return _read(_FROM_GATEWAY, data)
+
+
+def _read(adapter: TypeAdapter[T], data: Mapping[str, Any]) -> T:
     try:
-        return adapter.validate_python(told)
+        return adapter.validate_python(data)
     except ValidationError as error:
         raise Malformed(str(error.errors()[0]["msg"])) from None

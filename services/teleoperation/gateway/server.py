@@ -1,4 +1,4 @@
-"""The gateway: vehicles and stations connect to it, prove who they are, tell how they are, and get orders."""
+"""The gateway server: authenticates vehicles and stations, receives their status, and sends them orders."""
 
 from __future__ import annotations
 
@@ -8,83 +8,90 @@ from scan2sim.pipeline.core.errors import ScanError
 from scan2sim.services.teleoperation.control.messages import Malformed
 from scan2sim.services.teleoperation.gateway.fleet import Fleet, Order
 from scan2sim.services.teleoperation.gateway.identity import Identity
-from scan2sim.services.teleoperation.gateway.json_stream import Server, Stream, Told
-from scan2sim.services.teleoperation.gateway.protocol import VERSION, Ask, Hello, Refused, Status, to_gateway
+from scan2sim.services.teleoperation.gateway.json_stream import Connection, JsonObject, Server
+from scan2sim.services.teleoperation.gateway.protocol import (
+    PROTOCOL_VERSION,
+    DriverRequest,
+    Hello,
+    RequestRefused,
+    Status,
+    to_gateway,
+)
 
-CAUSES = 200
-"""Characters of what a party is told, at most."""
+REASON_MAX_CHARS = 200
+"""Maximum length of a reason sent to a party."""
 
 
 class Gateway:
-    """Listens from its making to `close`; what is said goes to a `Fleet`."""
+    """Listens from creation to `close`, and passes messages to a `Fleet`."""
 
-    def __init__(self, identity: Identity, host: str, port: int, fleet: Fleet, say: Callable[[str], None]) -> None:
-        """Listen.
+    def __init__(self, identity: Identity, host: str, port: int, fleet: Fleet, notify: Callable[[str], None]) -> None:
+        """Start listening.
 
         Args:
-            identity: its own.
-            host, port: where; port 0 for any that is free.
-            fleet: who is there.
-            say: is told who comes and goes.
+            identity: the gateway's own.
+            host, port: address to listen on; port 0 for any free one.
+            fleet: parties and pairs.
+            notify: called with a message when a party connects or disconnects.
 
         Raises:
-            SettingError: it can't listen there. BusyError: something else does.
+            SettingError: it can't listen on this address. BusyError: the port is in use.
         """
-        self._fleet, self._say = fleet, say
-        self._sends: dict[Stream, Callable[[Order], None]] = {}  # of parties that have said hello
+        self._fleet, self._notify = fleet, notify
+        self._senders: dict[Connection, Callable[[Order], None]] = {}  # of parties that have sent `Hello`
         self._server = Server(
-            identity, host, port, opened=lambda party: None, received=self._received, closed=self._closed
+            identity, host, port, opened=lambda connection: None, received=self._received, closed=self._closed
         )
         self.port = self._server.port
 
     def alive(self) -> bool:
-        """Whether it listens."""
+        """Whether its thread is alive."""
         return self._server.is_alive()
 
     def close(self) -> None:
-        """End all connections; pairs go on driving."""
+        """Close all connections; pairs keep driving."""
         self._server.close()
 
-    def _received(self, party: Stream, told: Told) -> None:
+    def _received(self, connection: Connection, data: JsonObject) -> None:
         try:
-            said = to_gateway(told)
-            if party in self._sends:
-                self._obey(party, said)
+            message = to_gateway(data)
+            if connection in self._senders:
+                self._handle(connection, message)
             else:
-                self._greet(party, said)
+                self._greet(connection, message)
         except Malformed as error:
-            self._refuse(party, f"it says what can't be understood ({error})")
+            self._refuse(connection, f"it sent a message that isn't understood ({error})")
 
-    def _greet(self, party: Stream, said: Hello | Status | Ask) -> None:
-        if not isinstance(said, Hello) or said.version != VERSION:
-            self._refuse(party, f"it doesn't speak version {VERSION} of the protocol")
+    def _greet(self, connection: Connection, message: Hello | Status | DriverRequest) -> None:
+        if not isinstance(message, Hello) or message.version != PROTOCOL_VERSION:
+            self._refuse(connection, f"it doesn't support protocol version {PROTOCOL_VERSION}")
             return
 
         def send(order: Order) -> None:
-            party.send(order.wire())
+            connection.send(order.wire())
 
-        self._sends[party] = send
-        self._say(f"{party.peer} is there, from {party.address}")
-        self._fleet.came(party.peer, said, party.address, send)
+        self._senders[connection] = send
+        self._notify(f"{connection.peer} connected from {connection.address}")
+        self._fleet.connected(connection.peer, message, connection.address, send)
 
-    def _obey(self, party: Stream, said: Hello | Status | Ask) -> None:
-        if isinstance(said, Status):
-            self._fleet.told(party.peer, said)
-        elif isinstance(said, Ask):
+    def _handle(self, connection: Connection, message: Hello | Status | DriverRequest) -> None:
+        if isinstance(message, Status):
+            self._fleet.update_status(connection.peer, message)
+        elif isinstance(message, DriverRequest):
             try:
-                self._fleet.asked(party.peer, said)
+                self._fleet.handle_request(connection.peer, message)
             except ScanError as error:
-                party.send(Refused(cause=str(error)[:CAUSES]).wire())
+                connection.send(RequestRefused(cause=str(error)[:REASON_MAX_CHARS]).wire())
 
-    def _refuse(self, party: Stream, why: str) -> None:
-        self._say(f"{party.peer} is sent away: {why}")
-        party.send(Refused(cause=why[:CAUSES]).wire())
-        party.close(why)
+    def _refuse(self, connection: Connection, reason: str) -> None:
+        self._notify(f"{connection.peer} was refused: {reason}")
+        connection.send(RequestRefused(cause=reason[:REASON_MAX_CHARS]).wire())
+        connection.close(reason)
 
-    def _closed(self, party: Stream, why: str) -> None:
-        send = self._sends.pop(party, None)
+    def _closed(self, connection: Connection, reason: str) -> None:
+        send = self._senders.pop(connection, None)
         if send is None:
-            self._say(f"{party.address} is sent away: {why}")
+            self._notify(f"{connection.address} was refused: {reason}")
         else:
-            self._say(f"{party.peer} is gone: {why}")
-            self._fleet.left(party.peer, send)
+            self._notify(f"{connection.peer} disconnected: {reason}")
+            self._fleet.disconnected(connection.peer, send)

@@ -1,4 +1,4 @@
-"""Quality of service of teleoperation, measured by scripted drives.
+"""Quality of service of teleoperation, measured in scripted drives.
 
 Begin with `measure`.
 """

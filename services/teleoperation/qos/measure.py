@@ -1,6 +1,6 @@
-"""Teleoperation's quality of service, measured: a scripted drive over an environment's network (D3.2, 2.2, table 6).
+"""Measures quality of service of teleoperation: a scripted drive over an environment's network (D3.2, 2.2, table 6).
 
-Vehicle and station are processes at the ends of two wires alike, four cameras send pictures that tell their time.
+Vehicle and station are processes at the ends of two identical links; cameras send frames with a drawn timecode.
 """
 
 from __future__ import annotations
@@ -26,35 +26,35 @@ from scan2sim.pipeline.core.step import Report
 from scan2sim.services.qos.emulated_link import Link
 from scan2sim.services.qos.environments import network
 from scan2sim.services.qos.host_load import Machine, Usage, machine
-from scan2sim.services.qos.link_profile import Shape
-from scan2sim.services.qos.measure import FREE, STREET
+from scan2sim.services.qos.link_profile import LinkProfile
+from scan2sim.services.qos.measure import MAX_LINK_UTILIZATION, SAMPLE_IMAGES
 from scan2sim.services.qos.requirements import Requirements
 from scan2sim.services.teleoperation.control.messages import Kind
 from scan2sim.services.teleoperation.gateway.pki import certify
 from scan2sim.services.teleoperation.qos import scripted_drive
 from scan2sim.services.teleoperation.qos.scripted_drive import HEIGHT, WIDTH, Setup
 from scan2sim.services.teleoperation.settings import MeasureParams
-from scan2sim.services.teleoperation.sim.route import aside
+from scan2sim.services.teleoperation.sim.route import cross_track_error
 
-HERE = ("127.0.0.1", "127.0.0.2")
-CAR, DESK = "car", "desk"
-WIRES = 2
-MORE = 1.1
-"""Of a bit rate that is required, so much is asked of the encoders, which keep below it."""
-WIRED = 1.15
-"""Bytes on a wire for one of video: headers of RTP, SRTP, UDP, IP and Ethernet."""
-FRAMES, PAN, NOISE = 60, 8, 4.0
-"""Pictures that cameras show in turn, to and fro; pixels from one to the next; grey levels that a sensor is off by."""
+LOCAL_HOSTS = ("127.0.0.1", "127.0.0.2")
+VEHICLE_NAME, STATION_NAME = "car", "desk"
+WIRE_COUNT = 2
+BITRATE_MARGIN = 1.1
+"""Encoders are given this multiple of the required bit rate, since they stay below their target."""
+WIRE_OVERHEAD = 1.15
+"""Bytes on the wire for each byte of video: headers of RTP, SRTP, UDP, IP and Ethernet."""
+RECORDED_FRAMES, PAN_PX, NOISE_GREY_LEVELS = 60, 8, 4.0
+"""Number of camera frames, shown forwards and backwards; shift between two frames; standard deviation of the noise."""
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What was measured; times are ms.
+class Measurement:
+    """Results of a measurement; times are ms.
 
     Attributes:
-        vehicle, station: what the ends tell (`scripted`).
-        seconds: that it took; wire_bytes: that crossed the network, both ways, overhead and all; None: there is none.
-        usage: of the vehicle where it is measured on the robot, else of the station; machine: what that runs on.
+        vehicle, station: results of the two processes (`scripted_drive`).
+        seconds: duration; wire_bytes: transferred over the network, both ways, with overhead; None: no network.
+        usage: of the vehicle process if measured on the robot, else of the station; machine: the machine it runs on.
     """
 
     vehicle: Mapping[str, Any]
@@ -65,12 +65,12 @@ class Measured:
     machine: Machine
 
     def values(self) -> dict[str, float | None]:
-        """By the metrics of `requirements.Requirements`; None: there is no such thing here."""
-        ways = delays(self.vehicle["messages"], Kind.COMMAND)
+        """Values of the metrics of `requirements.Requirements`; None: not applicable."""
+        one_way = delays(self.vehicle["messages"], Kind.COMMAND)
         return {
-            "response_time": percentile(list(responses(self.vehicle["messages"], self.station["obeyed"])), 95),
-            "delay": percentile(ways, 95),
-            "jitter": jitter(ways),
+            "response_time": percentile(list(response_times(self.vehicle["messages"], self.station["obeyed"])), 95),
+            "delay": percentile(one_way, 95),
+            "jitter": jitter(one_way),
             "data_rate": self.station["seen"].get("bytes", 0) * 8e-6 / self.seconds,
             "bandwidth": None if self.wire_bytes is None else self.wire_bytes * 8e-6 / self.seconds,
             "loss_rate": self.loss_rate,
@@ -87,127 +87,131 @@ class Measured:
 
     @property
     def loss_rate(self) -> float:
-        """Share of all messages and packets of video that came by no link, or not before they were sent again."""
-        received, missed, mended = (self.station["frames"].get(what, 0) for what in ("received", "lost", "mended"))
-        came, lost = received - mended, missed + mended
+        """Share of all messages and video packets that arrived over no link, or only after retransmission."""
+        received, missed, retransmitted = (
+            self.station["frames"].get(what, 0) for what in ("received", "lost", "retransmitted")
+        )
+        received, lost = received - retransmitted, missed + retransmitted
         for end in (self.vehicle, self.station):
-            came, lost = came + len(end["messages"]), lost + missing(end["messages"])
-        return float(max(lost, 0) / max(came + lost, 1))
+            received, lost = received + len(end["messages"]), lost + count_missing(end["messages"])
+        return float(max(lost, 0) / max(received + lost, 1))
 
     @property
     def error_rate(self) -> float:
-        """Share of what came that isn't as it was sent: pictures whose time can't be read, and malformed messages."""
+        """Share of corrupted data: frames whose timecode can't be read, and malformed messages."""
         wrong = self.station["seen"].get("unreadable", 0)
         wrong += sum(end["counts"].get("malformed", 0) for end in (self.vehicle, self.station))
-        came = len(self.station["glass"]) + sum(len(end["messages"]) for end in (self.vehicle, self.station))
-        return float(wrong / max(came, 1))
+        received = len(self.station["glass"]) + sum(len(end["messages"]) for end in (self.vehicle, self.station))
+        return float(wrong / max(received, 1))
 
     @property
     def glass_to_glass(self) -> list[float]:
-        """From a picture's taking to its being decoded at the station, of each."""
-        return [(seen - taken) / 1e6 for _, taken, seen in self.station["glass"]]
+        """Latency of each frame from capture to decoding at the station, ms."""
+        return [(seen - captured) / 1e6 for _, captured, seen in self.station["glass"]]
 
     @property
     def lost_frames(self) -> float:
-        """Share of the frames that weren't shown."""
+        """Share of the frames that were not shown."""
         shown, broken = self.station["frames"].get("frames", 0), self.station["frames"].get("broken", 0)
         return float(broken / max(shown + broken, 1))
 
     @property
-    def aside(self) -> list[float]:
-        """How far off its way along a street the vehicle was, m, every 0.1 m of it; nothing: it drove on a plain."""
+    def cross_track_error(self) -> list[float]:
+        """Distance of the vehicle from its reference path, m, every 0.1 m; empty: it drove on a plain."""
         way = np.array(self.vehicle["way"])
-        return np.abs(aside(way, self.vehicle["driven"])).tolist() if len(way) else []
+        return np.abs(cross_track_error(way, self.vehicle["driven"])).tolist() if len(way) else []
 
     @property
     def command_gap(self) -> float:
-        """The longest time without a command, as the car unit saw it."""
-        return gap(self.vehicle["messages"], Kind.COMMAND)
+        """Longest interval without a command at the onboard unit, ms."""
+        return longest_gap(self.vehicle["messages"], Kind.COMMAND)
 
 
 Times = Sequence[Sequence[int]]
-"""Messages: kind, number, sent, came (ns)."""
+"""Messages as rows: kind, number, time sent, time received (ns)."""
 
 
 def delays(messages: Times, kind: Kind) -> list[float]:
-    """On the way, ms, in the order of their sending."""
-    return [(came - sent) / 1e6 for one, _, sent, came in sorted(messages, key=lambda each: each[1]) if one == kind]
+    """One-way delays, ms, in sending order."""
+    return [
+        (received - sent) / 1e6 for one, _, sent, received in sorted(messages, key=lambda each: each[1]) if one == kind
+    ]
 
 
-def jitter(ways: Sequence[float]) -> float:
-    """Mean difference of the delays of two in a row (RFC 3393)."""
-    return float(np.abs(np.diff(ways)).mean()) if len(ways) > 1 else math.nan
+def jitter(one_way: Sequence[float]) -> float:
+    """Mean absolute difference of successive delays (RFC 3393)."""
+    return float(np.abs(np.diff(one_way)).mean()) if len(one_way) > 1 else math.nan
 
 
-def gap(messages: Times, kind: Kind) -> float:
-    """The longest time between two, as they came, ms."""
-    came = sorted(each[3] for each in messages if each[0] == kind)
-    return float(np.diff(came).max()) / 1e6 if len(came) > 1 else math.inf
+def longest_gap(messages: Times, kind: Kind) -> float:
+    """Longest interval between two received messages, ms."""
+    received = sorted(each[3] for each in messages if each[0] == kind)
+    return float(np.diff(received).max()) / 1e6 if len(received) > 1 else math.inf
 
 
-def missing(messages: Times) -> int:
-    """Of those between the first and the last number, how many didn't come."""
+def count_missing(messages: Times) -> int:
+    """Number of messages between the first and the last number that were not received."""
     numbers = {each[1] for each in messages}
     return max(numbers) - min(numbers) + 1 - len(numbers) if numbers else 0
 
 
-def responses(messages: Times, obeyed: Sequence[tuple[int, int]]) -> Iterator[float]:
-    """From the sending of each command to the telemetry's coming that first tells of it, or of a later one, ms.
+def response_times(messages: Times, obeyed: Sequence[tuple[int, int]]) -> Iterator[float]:
+    """Times from sending each command to receiving the telemetry that first reports it, or a later one, ms.
 
     Args:
-        messages: that the vehicle heard.
-        obeyed: numbers of commands that telemetry tells of, and when it came.
+        messages: messages that the vehicle received.
+        obeyed: command numbers reported by telemetry, and when each arrived.
     """
-    told = iter(sorted(obeyed, key=lambda one: one[1]))
-    newest, came = -1, 0
+    reports = iter(sorted(obeyed, key=lambda one: one[1]))
+    newest, received = -1, 0
     for kind, number, sent, _ in sorted(messages, key=lambda each: each[1]):
         if kind != Kind.COMMAND:
             continue
         while newest < number:
             try:
-                newest, came = next(told)
+                newest, received = next(reports)
             except StopIteration:
                 return
-        yield max(0, came - sent) / 1e6
+        yield max(0, received - sent) / 1e6
 
 
 def percentile(values: Sequence[float], share: float) -> float:
-    """Of nothing, it is infinite: what never came is late."""
+    """Percentile; infinite for no values: what never arrived is late."""
     return float(np.percentile(values, share)) if len(values) else math.inf
 
 
-class End:
-    """A process of `scripted`."""
+class ScriptedProcess:
+    """A process of `scripted_drive`."""
 
     def __init__(self, role: str, setup: Setup, link: Link | None, log: Path) -> None:
-        """Starts; `link`: the vehicle is at its near end, the station at its far one."""
+        """Start the process; `link`: the vehicle is at its near end, the station at its far end."""
         command = [sys.executable, "-m", scripted_drive.__name__, role, json.dumps(asdict(setup))]
         self._log, self._role = log, role
         with log.open("wb") as errors:
-            named: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": errors}
-            named |= {"text": True, "env": os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}}
+            arguments: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": errors}
+            arguments |= {"text": True, "env": os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}}
             if link is None:
-                self.process: subprocess.Popen[str] = subprocess.Popen(command, **named)
+                self.process: subprocess.Popen[str] = subprocess.Popen(command, **arguments)
             else:
-                self.process = (link.near if role == "vehicle" else link.far).popen(*command, **named)
+                self.process = (link.near if role == "vehicle" else link.far).popen(*command, **arguments)
         self.port = int(self._answer())
 
-    def ask(self, word: str) -> Any:
-        """Have it do something.
+    def ask(self, request: str) -> Any:
+        """Send a request, and return the answer.
 
         Raises:
-            StepError: it has failed.
+            StepError: the process has failed.
         """
         assert self.process.stdin is not None
         try:
-            self.process.stdin.write(f"{word}\n")
+            self.process.stdin.write(f"{request}\n")
             self.process.stdin.flush()
         except OSError:
-            pass  # it has ended: so says its answer
+            pass  # the process has ended: reading its answer reports that
         return self._answer()
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         self.process.kill()
         self.process.wait()
 
@@ -215,136 +219,136 @@ class End:
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
-            said = self._log.read_text(errors="replace", encoding="utf-8").strip()[-600:]
-            raise StepError(f"the scripted {self._role}", f"has failed: {said}", "Report it")
+            errors_text = self._log.read_text(errors="replace", encoding="utf-8").strip()[-600:]
+            raise StepError(f"the scripted {self._role}", f"has failed: {errors_text}", "Report it")
         return json.loads(line)
 
 
-def quiet(fraction: float, message: str = "") -> None:
-    """A report that nobody reads."""
+def ignore_progress(fraction: float, message: str = "") -> None:
+    """Progress callback that does nothing."""
 
 
-class Pair:
-    """A vehicle and a station that are there, and what is between them; see `pair`."""
+class ScriptedPair:
+    """A running vehicle and station, and the link between them; see `scripted_pair`."""
 
-    def __init__(self, vehicle: End, station: End, link: Link | None) -> None:
+    def __init__(self, vehicle: ScriptedProcess, station: ScriptedProcess, link: Link | None) -> None:
         self.vehicle, self.station, self.link = vehicle, station, link
 
     def begin(self) -> None:
-        """Note from now on."""
+        """Start recording."""
         self.vehicle.ask("begin")
         self.station.ask("begin")
 
     def bytes(self) -> int | None:
-        """That went through the wires so far, both ways."""
+        """Bytes transferred over the wires so far, both ways; None: there is no emulated network."""
         if self.link is None:
             return None
-        counts = [self.link.near.counts(wire) for wire in range(WIRES)]
+        counts = [self.link.near.counts(wire) for wire in range(WIRE_COUNT)]
         return sum(one.sent_bytes + one.received_bytes for one in counts)
 
-    def measured(self, seconds: float, report: Report = quiet, *, robot: bool = False) -> Measured:
-        """What becomes of a drive from now on for so long; `robot`: it is the vehicle's machine that counts."""
+    def measured(self, seconds: float, report: Report = ignore_progress, *, robot: bool = False) -> Measurement:
+        """Measure from now on; `robot`: measure resource usage of the vehicle process instead of the station."""
         measured = self.vehicle if robot else self.station
         self.begin()
-        usage, before, began = Usage.of(psutil.Process(measured.process.pid)), self.bytes(), time.monotonic()
+        usage, before, began = Usage.start(psutil.Process(measured.process.pid)), self.bytes(), time.monotonic()
         while (took := time.monotonic() - began) < seconds:
-            report(took / seconds, "the vehicle is driven")
+            report(took / seconds, "driving")
             usage = usage.updated()
             time.sleep(min(0.1, seconds - took))
         usage, after, took = usage.updated(), self.bytes(), time.monotonic() - began
-        crossed = None if before is None or after is None else after - before
-        return Measured(self.vehicle.ask("told"), self.station.ask("told"), took, crossed, usage, machine())
+        transferred = None if before is None or after is None else after - before
+        return Measurement(
+            self.vehicle.ask("results"), self.station.ask("results"), took, transferred, usage, machine()
+        )
 
 
 @contextmanager
-def pair(
-    shapes: tuple[Shape, Shape] | None, setup: Setup, folder: Path, wires: Sequence[int] = range(WIRES)
-) -> Iterator[Pair]:
-    """A vehicle and a station that run, not yet joined.
+def scripted_pair(
+    shapes: tuple[LinkProfile, LinkProfile] | None, setup: Setup, folder: Path, wires: Sequence[int] = range(WIRE_COUNT)
+) -> Iterator[ScriptedPair]:
+    """Run a vehicle and a station that are not yet joined.
 
     Args:
-        shapes: of each wire, from the vehicle and to it; None: both ends are this machine, without a network.
+        shapes: of each wire, from and to the vehicle; None: both processes on this machine, without a network.
         setup: of both; host, port, links and folder are filled in.
         folder: for certificates, state and logs.
-        wires: that the vehicle has links by.
+        wires: wires that the vehicle has links over.
 
     Raises:
-        UnavailableError: no network can be made here (it takes root).
-        StepError: an end fails.
+        UnavailableError: no network can be emulated here (this needs root).
+        StepError: a process failed.
     """
     with ExitStack() as stack:
         link = None
         if shapes is not None:
-            link = stack.enter_context(Link(*shapes, beside=[shapes] * (WIRES - 1)))
-        host = HERE[0] if link is None else link.far.address
+            link = stack.enter_context(Link(*shapes, beside=[shapes] * (WIRE_COUNT - 1)))
+        host = LOCAL_HOSTS[0] if link is None else link.far.address
         parties = folder / "parties"
-        certify(parties, [host], [CAR], [DESK])
-        station = End("station", replace(setup, folder=str(parties), host=host), link, folder / "station.log")
+        certify(parties, [host], [VEHICLE_NAME], [STATION_NAME])
+        station = ScriptedProcess(
+            "station", replace(setup, folder=str(parties), host=host), link, folder / "station.log"
+        )
         stack.callback(station.close)
-        # by interface, not by address: all of them lead to the one address that the station listens on
-        ways = [f"wire{wire}={HERE[wire] if link is None else link.near.interface(wire)}" for wire in wires]
-        own = replace(
-            setup, folder=str(parties / f"vehicle-{CAR}"), host=host, port=station.port, links=tuple(ways)
+        # by interface, not by address: all of them lead to the same address of the station
+        one_way = [f"wire{wire}={LOCAL_HOSTS[wire] if link is None else link.near.interface(wire)}" for wire in wires]
+        vehicle_setup = replace(
+            setup, folder=str(parties / f"vehicle-{VEHICLE_NAME}"), host=host, port=station.port, links=tuple(one_way)
         )  # fmt: skip
-        vehicle = End("vehicle", own, link, folder / "vehicle.log")
+        vehicle = ScriptedProcess("vehicle", vehicle_setup, link, folder / "vehicle.log")
         stack.callback(vehicle.close)
-        yield Pair(vehicle, station, link)
+        yield ScriptedPair(vehicle, station, link)
 
 
-def measure(params: MeasureParams, required: Requirements, report: Report) -> Measured:
-    """Drive by script over the environment's network.
+def measure(params: MeasureParams, required: Requirements, report: Report) -> Measurement:
+    """Run a scripted drive over the environment's network.
 
     Raises:
-        UnavailableError: no network can be made here (it takes root).
-        StepError: an end fails, or they don't come together.
+        UnavailableError: no network can be emulated here (this needs root).
+        StepError: a process failed, or they can't connect.
     """
-    between = network(params.environment, params.network)
-    shapes = None if between is None else (between.there, between.back)
+    link_profile = network(params.environment, params.network)
+    shapes = None if link_profile is None else (link_profile.there, link_profile.back)
     with tempfile.TemporaryDirectory(prefix="scan2sim-teleop-") as name:
         folder = Path(name)
-        report(0.0, "pictures are made")
-        setup = planned(params, required, None if between is None else between.there.rate)
-        setup = replace(setup, pictures=str(film(folder / "pictures")))
-        with pair(shapes, setup, folder) as ends:
-            report(0.0, "vehicle and station are joined")
+        report(0.0, "rendering test images")
+        setup = plan_setup(params, required, None if link_profile is None else link_profile.there.rate)
+        setup = replace(setup, pictures=str(render_test_images(folder / "pictures")))
+        with scripted_pair(shapes, setup, folder) as ends:
+            report(0.0, "joining vehicle and station")
             ends.station.ask("join")
             ends.station.ask("drive")
             time.sleep(params.warm)
-            return ends.measured(params.seconds, report, robot=between is None)
+            return ends.measured(params.seconds, report, robot=link_profile is None)
 
 
-def planned(params: MeasureParams, required: Requirements, rate: float | None) -> Setup:
-    """How video is sent: with the bits that are required; over all links where each carries all of it, else in turn.
+def plan_setup(params: MeasureParams, required: Requirements, rate: float | None) -> Setup:
+    """Video settings: the required bit rate; over all links if each can carry all video, else shared between them.
 
     Args:
-        rate: bit/s from the vehicle, of each wire; None: any.
+        rate: bit/s of each wire from the vehicle; None: unlimited.
     """
-    asked = required.data_rate.value if required.data_rate is not None else 0.0
+    required_mbit = required.data_rate.value if required.data_rate is not None else 0.0
     bitrate = Setup.bitrate
     if params.bitrate is not None:
         bitrate = params.bitrate * 1e6
-    elif asked:
-        bitrate = MORE * asked * 1e6 / params.cameras
-    share = rate is not None and WIRED * bitrate * params.cameras > FREE * rate
+    elif required_mbit:
+        bitrate = BITRATE_MARGIN * required_mbit * 1e6 / params.cameras
+    share = rate is not None and WIRE_OVERHEAD * bitrate * params.cameras > MAX_LINK_UTILIZATION * rate
     world = "" if params.world is None else str(params.world)
     return Setup("", "", cameras=params.cameras, bitrate=bitrate, share=share, world=world)
 
 
-def film(folder: Path) -> Path:
-    """Pictures of the synthetic street, as a camera that is driven past it sees them.
-
-    Returns:
-        The folder.
-    """
+def render_test_images(folder: Path) -> Path:
+    """Write frames of the synthetic street as a camera driving past it sees them; returns the folder."""
     import cv2
 
     folder.mkdir(parents=True)
-    panorama = cv2.imread(str(sorted(STREET.rglob("*pano*.jpg"))[0]))
+    panorama = cv2.imread(str(sorted(SAMPLE_IMAGES.rglob("*pano*.jpg"))[0]))
     assert panorama is not None
-    scale, chance = HEIGHT / panorama.shape[0], np.random.default_rng(0)
+    scale, random = HEIGHT / panorama.shape[0], np.random.default_rng(0)
     wide = cv2.resize(panorama, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    for number in range(FRAMES):
-        left = PAN * min(number, FRAMES - number)
-        picture = wide[:HEIGHT, left : left + WIDTH] + chance.normal(0.0, NOISE, (HEIGHT, WIDTH, 1))
-        cv2.imwrite(str(folder / f"{number:03}.png"), picture.clip(0, 255).astype(np.uint8))
+    for number in range(RECORDED_FRAMES):
+        left = PAN_PX * min(number, RECORDED_FRAMES - number)
+        image = wide[:HEIGHT, left : left + WIDTH] + random.normal(0.0, NOISE_GREY_LEVELS, (HEIGHT, WIDTH, 1))
+        cv2.imwrite(str(folder / f"{number:03}.png"), image.clip(0, 255).astype(np.uint8))
     return folder

@@ -1,8 +1,8 @@
-"""Pictures of a finished world, many a second on one processor: triangles drawn into a depth buffer (no rays).
+"""Real-time rendering of a finished world on one CPU core: triangle rasterization with a depth buffer, no ray casting.
 
-What makes it fast: triangles lie in clusters, compact ones of some dozens, that are drawn from near to far; a cluster
-beside the picture, or behind what is drawn already, is left out whole. Textures have smaller copies of themselves
-(mip-maps), one of which is chosen for each triangle by how large it is in the picture.
+It is fast because triangles are grouped into compact clusters of some dozens, drawn front to back: clusters outside the
+view frustum, or occluded by what is already drawn, are skipped. Textures have mip maps; the level is chosen for each
+triangle by its size in the image.
 """
 
 from __future__ import annotations
@@ -21,35 +21,35 @@ from scan2sim.pipeline.core.types import F32, F64, I32, U8, Camera
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.worlds.textured_mesh import Textured
 
-CLUSTER = 64
-"""Triangles of a cluster, at most."""
-NEAR = 0.1
-"""Metres before the camera where the picture begins."""
-LEVELS = 6
-"""Sizes of a texture, each half the last."""
-EDGE = np.float32(1e-3)
-"""Pixels by which triangles are drawn wider, so that no gap is left between two."""
-SKY = (200, 214, 230)
+CLUSTER_TRIANGLES_MAX = 64
+"""Maximum number of triangles in a cluster."""
+NEAR_PLANE_M = 0.1
+"""Distance of the near clipping plane."""
+MIP_LEVELS = 6
+"""Number of mip map levels of a texture, each half the size of the one before."""
+EDGE_MARGIN_PX = np.float32(1e-3)
+"""Margin by which triangles are extended, so that no gap remains between neighbours."""
+SKY_RGB = (200, 214, 230)
 U16 = npt.NDArray[np.uint16]
 U32 = npt.NDArray[np.uint32]
 
 
 @dataclass(frozen=True)
 class World:
-    """Textured triangles in clusters; C clusters, F triangles, V vertices, P pages of textures.
+    """Textured triangles in clusters; C clusters, F triangles, V vertices, P texture pages.
 
     Attributes:
-        places: (V, 3) metres.
-        first_vertex, first_face: (C + 1,) where each cluster's begin.
-        corners: (F, 3) vertices, counted from the cluster's first.
+        positions: (V, 3) vertex positions, metres.
+        first_vertex, first_face: (C + 1,) offsets of each cluster.
+        corners: (F, 3) vertex indices within the cluster.
         texels: (F, 3, 2) columns and rows of the corners on their page.
-        page: (F,) which page.
-        spheres: (C, 4) around each cluster: middle and radius, metres.
-        pages: all pages in all sizes as 0xBBGGRR, one after the other.
-        sizes: (P, LEVELS, 3) where each size of a page begins, its columns and rows.
+        page: (F,) texture page.
+        spheres: (C, 4) bounding spheres: centre and radius, metres.
+        pages: all mip levels of all pages as 0xBBGGRR, concatenated.
+        sizes: (P, MIP_LEVELS, 3) offset into `pages`, columns and rows of each level.
     """
 
-    places: F32
+    positions: F32
     first_vertex: I32
     first_face: I32
     corners: U16
@@ -60,16 +60,16 @@ class World:
     sizes: I32
 
 
-def world(shapes: Iterable[tuple[Textured, tuple[float, float, float]]]) -> World:
-    """Of textured meshes, and how far each is from the world's origin, metres.
+def build_world(shapes: Iterable[tuple[Textured, tuple[float, float, float]]]) -> World:
+    """Build clusters from textured meshes and their offsets from the world's origin, metres.
 
     Raises:
-        InputError: a page can't be read.
+        InputError: a texture page can't be read.
     """
-    places, faces, uvs, pages, files, count = [], [], [], [], list[Path](), 0
+    positions, faces, uvs, pages, files, count = [], [], [], [], list[Path](), 0
     for shape, offset in shapes:
         assert shape.mesh.uv is not None and shape.mesh.page is not None
-        places.append(shape.mesh.vertices + np.asarray(offset, np.float32))
+        positions.append(shape.mesh.vertices + np.asarray(offset, np.float32))
         faces.append(shape.mesh.faces + count)
         uvs.append(shape.mesh.uv)
         pages.append(shape.mesh.page + len(files))
@@ -78,40 +78,42 @@ def world(shapes: Iterable[tuple[Textured, tuple[float, float, float]]]) -> Worl
     pixels, sizes = _pages(files)
     page, uv = np.concatenate(pages).astype(np.int32), np.concatenate(uvs).astype(np.float32)
     texels = np.stack([uv[..., 0], 1 - uv[..., 1]], axis=-1) * sizes[page, 0, 1:].astype(np.float32)[:, None]
-    return _clustered(np.concatenate(places).astype(np.float32), np.concatenate(faces), texels, page, pixels, sizes)
+    return _build_clusters(
+        np.concatenate(positions).astype(np.float32), np.concatenate(faces), texels, page, pixels, sizes
+    )
 
 
 def _pages(files: list[Path]) -> tuple[U32, I32]:
     """`World.pages` and `World.sizes`."""
     import cv2
 
-    parts, sizes, start = [], np.zeros((len(files), LEVELS, 3), np.int32), 0
+    parts, sizes, start = [], np.zeros((len(files), MIP_LEVELS, 3), np.int32), 0
     for i, file in enumerate(files):
         page = image.read_rgb(file)
-        for level in range(LEVELS):
+        for level in range(MIP_LEVELS):
             height, width = page.shape[:2]
             sizes[i, level] = start, width, height
-            parts.append(_packed(page).ravel())
+            parts.append(_pack_rgb(page).ravel())
             start += width * height
             half = max(1, width // 2), max(1, height // 2)
             page = np.asarray(cv2.resize(page, half, interpolation=cv2.INTER_AREA), np.uint8)
     return np.concatenate(parts), sizes
 
 
-def _packed(rgb: U8) -> U32:
-    """(H, W) of (H, W, 3)."""
-    wide = np.zeros((*rgb.shape[:2], 4), np.uint8)
-    wide[..., :3] = rgb
-    return wide.view("<u4")[..., 0]
+def _pack_rgb(rgb: U8) -> U32:
+    """Pack RGB (H, W, 3) into (H, W) integers 0xBBGGRR."""
+    packed = np.zeros((*rgb.shape[:2], 4), np.uint8)
+    packed[..., :3] = rgb
+    return packed.view("<u4")[..., 0]
 
 
-def _clustered(places: F32, faces: I32, texels: F32, page: I32, pages: U32, sizes: I32) -> World:
-    order, first_face = _halved(places[faces].mean(axis=1))
+def _build_clusters(positions: F32, faces: I32, texels: F32, page: I32, pages: U32, sizes: I32) -> World:
+    order, first_face = _split_clusters(positions[faces].mean(axis=1))
     faces, texels, page = faces[order], texels[order], page[order]
     vertices, corners, first_vertex, spheres = [], [], [0], []
     for a, b in pairwise(first_face):
         used, index = np.unique(faces[a:b], return_inverse=True)
-        own = places[used]
+        own = positions[used]
         middle = (own.min(axis=0) + own.max(axis=0)) / 2
         spheres.append((*middle, np.linalg.norm(own - middle, axis=1).max()))
         vertices.append(own)
@@ -124,35 +126,35 @@ def _clustered(places: F32, faces: I32, texels: F32, page: I32, pages: U32, size
     )  # fmt: skip
 
 
-def _halved(middles: F32) -> tuple[npt.NDArray[np.intp], I32]:
-    """Triangles in an order in which clusters lie together, and where these begin: halved across the longest side."""
+def _split_clusters(centroids: F32) -> tuple[npt.NDArray[np.intp], I32]:
+    """Order of triangles by cluster, and cluster offsets; clusters are halved across their longest side."""
     found: list[npt.NDArray[np.intp]] = []
-    left = [np.arange(len(middles))]
+    left = [np.arange(len(centroids))]
     while left:
         index = left.pop()
-        if len(index) <= CLUSTER:
+        if len(index) <= CLUSTER_TRIANGLES_MAX:
             found.append(index)
             continue
-        across = middles[index, np.ptp(middles[index], axis=0).argmax()]
+        across = centroids[index, np.ptp(centroids[index], axis=0).argmax()]
         half = len(index) // 2
-        parted = index[np.argpartition(across, half)]
-        left += [parted[half:], parted[:half]]
+        partitioned = index[np.argpartition(across, half)]
+        left += [partitioned[half:], partitioned[:half]]
     return np.concatenate(found), np.cumsum([0, *map(len, found)]).astype(np.int32)
 
 
-class Eye:
-    """Draws what a camera sees of a world; for one thread at a time."""
+class WorldRenderer:
+    """Renders views of a world; not thread-safe."""
 
     def __init__(self, seen: World, camera: Camera) -> None:
         """`camera`: a pinhole camera."""
         self._world, self._camera = seen, camera
         shape = camera.height, camera.width
         self._depth, self._colour = np.zeros(shape, np.float32), np.zeros(shape, np.uint32)
-        self._sky = int(_packed(np.array(SKY, np.uint8).reshape(1, 1, 3))[0, 0])
-        self._vertices = np.zeros((3 * CLUSTER, 6), np.float32)
+        self._sky = int(_pack_rgb(np.array(SKY_RGB, np.uint8).reshape(1, 1, 3))[0, 0])
+        self._vertices = np.zeros((3 * CLUSTER_TRIANGLES_MAX, 6), np.float32)
 
     def view(self, T_world_cam: F64) -> U8:
-        """(H, W, 3) RGB from a pose."""
+        """Render an image (H, W, 3), RGB, from a camera pose."""
         import cv2
 
         seen, camera = self._world, self._camera
@@ -161,18 +163,18 @@ class Eye:
         lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
         self._depth.fill(0)
         self._colour.fill(self._sky)
-        order = _in_sight(seen.spheres, matrix, lens, camera.width, camera.height)
+        order = _frustum_cull(seen.spheres, matrix, lens, camera.width, camera.height)
         _draw(
-            order, seen.places, seen.first_vertex, seen.first_face, seen.corners, seen.texels, seen.page, seen.spheres,
-            seen.pages, seen.sizes, matrix, lens, self._vertices, self._depth, self._colour,
+            order, seen.positions, seen.first_vertex, seen.first_face, seen.corners, seen.texels, seen.page,
+            seen.spheres, seen.pages, seen.sizes, matrix, lens, self._vertices, self._depth, self._colour,
         )  # fmt: skip
-        wide = self._colour.view(np.uint8).reshape(camera.height, camera.width, 4)
-        return np.asarray(cv2.cvtColor(wide, cv2.COLOR_RGBA2RGB), np.uint8)
+        packed = self._colour.view(np.uint8).reshape(camera.height, camera.width, 4)
+        return np.asarray(cv2.cvtColor(packed, cv2.COLOR_RGBA2RGB), np.uint8)
 
 
 @njit(cache=True, nogil=True)
-def _in_sight(spheres: F32, matrix: F32, lens: F32, width: int, height: int) -> I32:
-    """Clusters that may be in the picture, the nearest first."""
+def _frustum_cull(spheres: F32, matrix: F32, lens: F32, width: int, height: int) -> I32:
+    """Clusters that intersect the view frustum, nearest first."""
     fx, fy, cx, cy = lens
     left, right = -cx / fx, (width - 1 - cx) / fx
     top, bottom = -cy / fy, (height - 1 - cy) / fy
@@ -188,7 +190,7 @@ def _in_sight(spheres: F32, matrix: F32, lens: F32, width: int, height: int) -> 
         y = matrix[1, 0] * p[0] + matrix[1, 1] * p[1] + matrix[1, 2] * p[2] + matrix[1, 3]
         z = matrix[2, 0] * p[0] + matrix[2, 1] * p[1] + matrix[2, 2] * p[2] + matrix[2, 3]
         r = p[3]
-        if z + r < NEAR or x - left * z < -r * slants[0] or x - right * z > r * slants[1]:
+        if z + r < NEAR_PLANE_M or x - left * z < -r * slants[0] or x - right * z > r * slants[1]:
             continue
         if y - top * z < -r * slants[2] or y - bottom * z > r * slants[3]:
             continue
@@ -200,22 +202,22 @@ def _in_sight(spheres: F32, matrix: F32, lens: F32, width: int, height: int) -> 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _draw(
-    order: I32, places: F32, first_vertex: I32, first_face: I32, corners: U16, texels: F32, page: I32, spheres: F32,
+    order: I32, positions: F32, first_vertex: I32, first_face: I32, corners: U16, texels: F32, page: I32, spheres: F32,
     pages: U32, sizes: I32, matrix: F32, lens: F32, seen: F32, depth: F32, colour: U32,
 ) -> None:  # fmt: skip
-    """Draw clusters in their order; `depth` holds 1 / z, 0 where nothing is.
+    """Draw clusters in the given order; `depth` holds 1 / z, 0 where nothing is drawn.
 
-    `seen` is room for a cluster's vertices: x, y and z before the camera; column, row and 1 / z in the picture.
+    `seen` is a buffer for a cluster's vertices: x, y and z in the camera frame; column, row and 1 / z in the image.
     """
     fx, fy, cx, cy = lens
-    near = np.float32(NEAR)
+    near = np.float32(NEAR_PLANE_M)
     fan = np.empty((4, 5), np.float32)
     for cluster in order:
-        if _hidden(spheres[cluster], matrix, lens, depth):
+        if _occluded(spheres[cluster], matrix, lens, depth):
             continue
         first = first_vertex[cluster]
         for i in range(first, first_vertex[cluster + 1]):
-            p0, p1, p2, n = places[i, 0], places[i, 1], places[i, 2], i - first
+            p0, p1, p2, n = positions[i, 0], positions[i, 1], positions[i, 2], i - first
             x = matrix[0, 0] * p0 + matrix[0, 1] * p1 + matrix[0, 2] * p2 + matrix[0, 3]
             y = matrix[1, 0] * p0 + matrix[1, 1] * p1 + matrix[1, 2] * p2 + matrix[1, 3]
             z = matrix[2, 0] * p0 + matrix[2, 1] * p1 + matrix[2, 2] * p2 + matrix[2, 3]
@@ -226,36 +228,36 @@ def _draw(
             i, j, k = corners[f, 0], corners[f, 1], corners[f, 2]
             behind = (seen[i, 2] < near) + (seen[j, 2] < near) + (seen[k, 2] < near)
             if behind == 0:
-                _triangle(
+                _draw_triangle(
                     seen[i, 3], seen[i, 4], seen[i, 5], seen[j, 3], seen[j, 4], seen[j, 5],
                     seen[k, 3], seen[k, 4], seen[k, 5], texels[f, 0, 0], texels[f, 0, 1], texels[f, 1, 0],
                     texels[f, 1, 1], texels[f, 2, 0], texels[f, 2, 1], page[f], sizes, pages, depth, colour,
                 )  # fmt: skip
             elif behind < 3:
-                count = _clipped(seen, corners[f], texels[f], lens, near, fan)
+                count = _clip_near(seen, corners[f], texels[f], lens, near, fan)
                 a = fan[0]
                 for m in range(2, count):
                     b, c = fan[m - 1], fan[m]
-                    _triangle(
+                    _draw_triangle(
                         a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2], a[3], a[4], b[3], b[4], c[3], c[4],
                         page[f], sizes, pages, depth, colour,
                     )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _hidden(sphere: F32, matrix: F32, lens: F32, depth: F32) -> bool:
-    """Whether all that is drawn already where a cluster would be is nearer."""
+def _occluded(sphere: F32, matrix: F32, lens: F32, depth: F32) -> bool:
+    """Occlusion test: whether everything already drawn in the cluster's screen rectangle is nearer than the cluster."""
     x = matrix[0, 0] * sphere[0] + matrix[0, 1] * sphere[1] + matrix[0, 2] * sphere[2] + matrix[0, 3]
     y = matrix[1, 0] * sphere[0] + matrix[1, 1] * sphere[1] + matrix[1, 2] * sphere[2] + matrix[1, 3]
     z = matrix[2, 0] * sphere[0] + matrix[2, 1] * sphere[1] + matrix[2, 2] * sphere[2] + matrix[2, 3]
     front = z - sphere[3]
-    if front < NEAR:
+    if front < NEAR_PLANE_M:
         return False
     inverse = np.float32(1) / front
-    reach = sphere[3] * inverse
+    extent = sphere[3] * inverse
     height, width = depth.shape
-    left, right = min(x * inverse, x / z) - reach, max(x * inverse, x / z) + reach
-    top, bottom = min(y * inverse, y / z) - reach, max(y * inverse, y / z) + reach
+    left, right = min(x * inverse, x / z) - extent, max(x * inverse, x / z) + extent
+    top, bottom = min(y * inverse, y / z) - extent, max(y * inverse, y / z) + extent
     first, last = max(0, int(lens[0] * left + lens[2])), min(width - 1, int(lens[0] * right + lens[2]) + 1)
     for row in range(max(0, int(lens[1] * top + lens[3])), min(height, int(lens[1] * bottom + lens[3]) + 2)):
         for column in range(first, last + 1):
@@ -265,8 +267,8 @@ def _hidden(sphere: F32, matrix: F32, lens: F32, depth: F32) -> bool:
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _clipped(seen: F32, corners: U16, texels: F32, lens: F32, near: np.float32, fan: F32) -> int:
-    """The part of a triangle that is before the camera: how many corners, each as column, row, 1 / z and texel."""
+def _clip_near(seen: F32, corners: U16, texels: F32, lens: F32, near: np.float32, fan: F32) -> int:
+    """Clip a triangle at the near plane into `fan`: corners as column, row, 1 / z and texel; returns their number."""
     count = 0
     for k in range(3):
         m = (k + 1) % 3
@@ -286,12 +288,12 @@ def _clipped(seen: F32, corners: U16, texels: F32, lens: F32, near: np.float32, 
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _triangle(
+def _draw_triangle(
     ax: float, ay: float, az: float, bx: float, by: float, bz: float, cx: float, cy: float, cz: float,
     au: float, av: float, bu: float, bv: float, cu: float, cv: float,
     page: int, sizes: I32, pages: U32, depth: F32, colour: U32,
 ) -> None:  # fmt: skip
-    """Draw a triangle where it is the nearest so far: corners' columns, rows, 1 / z and texels."""
+    """Rasterize a triangle with depth test; corners are given as column, row, 1 / z and texel."""
     height, width = depth.shape
     low, high = min(ay, by, cy), max(ay, by, cy)
     west, east = min(ax, bx, cx), max(ax, bx, cx)
@@ -304,7 +306,7 @@ def _triangle(
     if area == 0:
         return
     one, far = np.float32(1), np.float32(1e9)
-    level = _level(abs((bu - au) * (cv - av) - (cu - au) * (bv - av)), abs(area))
+    level = _mip_level(abs((bu - au) * (cv - av) - (cu - au) * (bv - av)), abs(area))
     start, columns, rows = sizes[page, level, 0], sizes[page, level, 1], sizes[page, level, 2]
     shrink = np.float32(1.0 / (1 << level))
     au, av, bu, bv, cu, cv = au * az, av * az, bu * bz, bv * bz, cu * cz, cv * cz
@@ -313,7 +315,7 @@ def _triangle(
     z_x, z_y = (bz - az) * sy - (cz - az) * ty, (cz - az) * tx - (bz - az) * sx
     u_x, u_y = (bu - au) * sy - (cu - au) * ty, (cu - au) * tx - (bu - au) * sx
     v_x, v_y = (bv - av) * sy - (cv - av) * ty, (cv - av) * tx - (bv - av) * sx
-    # columns along the three sides: those of sides that don't reach a row are kept out of it
+    # change of the column per row along each side; sides that don't span a row are excluded from it
     ab, bc, ca = _slope(ax, ay, bx, by), _slope(bx, by, cx, cy), _slope(cx, cy, ax, ay)
     for row in range(first, last + 1):
         y = np.float32(row)
@@ -327,7 +329,7 @@ def _triangle(
         if min(cy, ay) <= y <= max(cy, ay):
             x = cx + (y - cy) * ca
             left, right = min(left, x), max(right, x)
-        begin, end = max(0, int(np.ceil(left - EDGE))), min(width - 1, int(np.floor(right + EDGE)))
+        begin, end = max(0, int(np.ceil(left - EDGE_MARGIN_PX))), min(width - 1, int(np.floor(right + EDGE_MARGIN_PX)))
         x, y = np.float32(begin) - ax, y - ay
         z = az + z_x * x + z_y * y
         u = au + u_x * x + u_y * y
@@ -346,15 +348,15 @@ def _triangle(
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
 def _slope(px: float, py: float, qx: float, qy: float) -> Any:
-    """Columns a row along a side; of one along a row: none."""
+    """Change of the column per row along a side; 0 for a horizontal side."""
     return (qx - px) / (qy - py) if qy != py else np.float32(0)
 
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _level(texels: Any, pixels: float) -> int:
-    """The size of the texture at which a texel is about as large as a pixel, of a triangle's areas in both."""
+def _mip_level(texels: Any, pixels: float) -> int:
+    """Mip level at which a texel is about as large as a pixel; from the triangle's areas in texels and in pixels."""
     level = 0
-    while level < LEVELS - 1 and texels > np.float32(2) * pixels:
+    while level < MIP_LEVELS - 1 and texels > np.float32(2) * pixels:
         texels *= np.float32(0.25)
         level += 1
     return level

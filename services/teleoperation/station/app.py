@@ -1,7 +1,7 @@
-"""The station: what comes from the vehicle that it is joined with, and what its driver asks of it.
+"""The station: video, telemetry and links of the joined vehicle, and the commands of its driver.
 
-Listens to vehicles, is a party of the gateway's, and hands pictures and facts to whoever watches (`cockpit`). What the
-driver asks goes to the vehicle fifty times a second, as long as the driver goes on asking (`wheel`).
+Accepts connections of vehicles, follows orders of the gateway, and passes frames and state to the driver page (`web`).
+Commands are sent to the vehicle fifty times a second while the driver's page keeps sending controls (`DriverSession`).
 """
 
 from __future__ import annotations
@@ -13,125 +13,133 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from scan2sim.services.teleoperation.control.driver_session import Wheel
+from scan2sim.services.teleoperation.control.driver_session import DriverSession
 from scan2sim.services.teleoperation.control.messages import (
-    Key,
+    KeyFrameRequest,
     Kind,
-    Lacking,
     Malformed,
     Message,
-    Report,
-    Streams,
+    Nack,
     Telemetry,
-    Wanted,
+    VideoKey,
+    VideoReport,
+    VideoStreams,
 )
-from scan2sim.services.teleoperation.gateway.client import Membership
+from scan2sim.services.teleoperation.gateway.client import GatewayConnection
 from scan2sim.services.teleoperation.gateway.identity import Identity, Peer, Role
 from scan2sim.services.teleoperation.gateway.protocol import (
     Address,
-    Ask,
-    Driving,
+    CurrentPair,
+    DriverRequest,
     Hello,
     Join,
-    Refused,
     Release,
+    RequestRefused,
     Status,
 )
-from scan2sim.services.teleoperation.transport.link_stats import Rates
-from scan2sim.services.teleoperation.transport.multipath import Bundle
+from scan2sim.services.teleoperation.transport.link_stats import LinkRates
+from scan2sim.services.teleoperation.transport.multipath import MultipathConnection
 from scan2sim.services.teleoperation.transport.station_side import Listener
-from scan2sim.services.teleoperation.video.jitter_buffer import Frame, Watcher
+from scan2sim.services.teleoperation.video.jitter_buffer import Frame, VideoReceiver
 
-RATE = 50.0
-"""Commands a second."""
-REPORTS = 1.0
-"""Seconds between two reports of how the video comes."""
-TRIP = 0.1
-"""Seconds to the vehicle and back, while nothing is known of it."""
+COMMAND_RATE_HZ = 50.0
+"""Rate at which commands are sent."""
+REPORT_PERIOD_S = 1.0
+"""Interval between two video reports to the vehicle."""
+DEFAULT_ROUND_TRIP_S = 0.1
+"""Assumed round-trip time to the vehicle until it is measured."""
 
 
-class Joined:
-    """A vehicle that the station is joined with: what it says, its video, its links.
+class JoinedVehicle:
+    """The vehicle that the station is joined with: telemetry, video, links.
 
     Attributes:
-        telemetry: the last, sent at `sent` (ns of the vehicle's monotonic clock).
-        streams: the vehicle's cameras; `reports`: how they came over the last second.
-        malformed: messages that can't be understood, so far.
+        telemetry: the latest, sent at `sent` (ns of the vehicle's monotonic clock).
+        streams: the vehicle's cameras; `reports`: receiver statistics of their video over the last second.
+        malformed: number of messages that could not be decoded.
     """
 
     def __init__(self, pair: int, vehicle: Peer, listener: Listener, show: Callable[[Frame], None]) -> None:
-        """`show` is handed frames, in the receiving thread."""
+        """`show` is called with each frame, in the receiving thread."""
         self.pair, self.vehicle = pair, vehicle
         self.telemetry: Telemetry | None = None
         self.sent = 0
-        self.streams: Streams = Streams(())
+        self.streams: VideoStreams = VideoStreams(())
         self.malformed = 0
-        self.reports: tuple[Report, ...] = ()
-        self.rates = Rates()
-        self.watcher = Watcher(frame=show, want=self.want, age=self.age, ask=self._ask, trip=self._trip)
+        self.reports: tuple[VideoReport, ...] = ()
+        self.rates = LinkRates()
+        self.receiver = VideoReceiver(
+            frame=show,
+            request_key_frame=self.request_key_frame,
+            age=self.age,
+            send_nack=self._send_nack,
+            round_trip=self._round_trip,
+        )
         self._listener = listener
-        self.bundle: Bundle = listener.expect(vehicle, received=self._received, media=self.watcher.feed)
+        self.connection: MultipathConnection = listener.expect(
+            vehicle, received=self._received, media=self.receiver.feed
+        )
 
     def age(self, captured: int) -> float:
-        """Milliseconds since a moment of the vehicle's monotonic clock (ns)."""
-        return self.bundle.clocks.age_ms(captured)
+        """Age of a time of the vehicle's monotonic clock (ns), milliseconds."""
+        return self.connection.clocks.age_ms(captured)
 
     def telemetry_age_ms(self) -> float | None:
-        """Milliseconds since the vehicle sent its telemetry, also where that lay in a queue; None: unknown."""
+        """Milliseconds since the vehicle sent its telemetry, time in queues included; None: unknown."""
         age = self.age(self.sent)
         return None if self.telemetry is None or math.isinf(age) else age
 
-    def want(self, camera: int) -> None:
-        """Ask for a key frame of a camera."""
-        self.bundle.send(Kind.WANTED, Wanted(camera).pack())
+    def request_key_frame(self, camera: int) -> None:
+        """Request a key frame of a camera."""
+        self.connection.send(Kind.KEY_FRAME_REQUEST, KeyFrameRequest(camera).pack())
 
-    def _ask(self, source: int, sequences: Sequence[int]) -> None:
-        self.bundle.send(Kind.LACKING, Lacking(source, tuple(sequences)).pack())
+    def _send_nack(self, source: int, sequences: Sequence[int]) -> None:
+        self.connection.send(Kind.NACK, Nack(source, tuple(sequences)).pack())
 
-    def _trip(self) -> float:
-        """Seconds to the vehicle and back."""
-        found = self.bundle.round_trip
-        return TRIP if math.isnan(found) else found
+    def _round_trip(self) -> float:
+        """Round-trip time to the vehicle, seconds."""
+        measured = self.connection.round_trip
+        return DEFAULT_ROUND_TRIP_S if math.isnan(measured) else measured
 
     def report(self) -> None:
-        """Tell how the video comes."""
-        self.reports = tuple(self.watcher.reports())
+        """Send video reports of all cameras to the vehicle."""
+        self.reports = tuple(self.receiver.reports())
         for one in self.reports:
-            self.bundle.send(Kind.REPORT, one.pack())
+            self.connection.send(Kind.VIDEO_REPORT, one.pack())
 
     def _received(self, message: Message) -> None:
         try:
             match message.kind:
                 case Kind.TELEMETRY:
                     self.telemetry, self.sent = Telemetry.unpack(message.body), message.sent
-                case Kind.KEY:
-                    self.watcher.learn(Key.unpack(message.body))
+                case Kind.VIDEO_KEY:
+                    self.receiver.add_key(VideoKey.unpack(message.body))
                 case Kind.STREAMS:
-                    self.streams = Streams.unpack(message.body)
+                    self.streams = VideoStreams.unpack(message.body)
                 case _:
                     self.malformed += 1
         except Malformed:
             self.malformed += 1
 
-    def hindrance(self) -> str:
-        """Why nobody may drive; nothing: one may."""
-        clocks = self.bundle.clocks
-        if not any(link.up for link in self.bundle.links):
+    def blocked_by(self) -> str:
+        """Why driving is not possible; empty: it is."""
+        clocks = self.connection.clocks
+        if not any(link.up for link in self.connection.links):
             return "no link to the vehicle is up"
         if not clocks.known:
-            return "the clocks haven't been compared yet"
+            return "the clocks have not been synchronized yet"
         if clocks.wall_wrong:
-            return f"the vehicle's clock is {clocks.wall_apart_s:+.1f} s off this one's: tie both to NTP"
+            return f"the vehicle's clock differs by {clocks.wall_apart_s:+.1f} s from this one: synchronize both by NTP"
         return ""
 
     def close(self) -> None:
-        """Let go of the vehicle."""
+        """Disconnect from the vehicle."""
         self._listener.forget(self.vehicle)
-        self.bundle.close()
+        self.connection.close()
 
 
 class Station:
-    """A party of the gateway's (see `membership.Party`); `wheel` is its driver's."""
+    """A station; implements `Party` for the gateway connection. `driver_session` is the control lock."""
 
     def __init__(
         self,
@@ -140,33 +148,33 @@ class Station:
         reached: Sequence[Address],
         show: Callable[[Frame], None],
     ) -> None:
-        """Begin; nothing happens before the gateway joins it with a vehicle.
+        """Start the threads; the station waits for the gateway to join it with a vehicle.
 
         Args:
-            identity: its own.
-            listener: where vehicles dial.
-            reached: the listener's addresses, as vehicles see them.
-            show: is handed frames.
+            identity: the station's own.
+            listener: accepts connections of vehicles.
+            reached: the listener's addresses, as vehicles reach them.
+            show: called with each frame.
         """
-        self.identity, self.wheel = identity, Wheel()
+        self.identity, self.driver_session = identity, DriverSession()
         self._listener, self._reached, self._show = listener, tuple(reached), show
         self._lock = threading.Lock()
-        self._joined: Joined | None = None
+        self._joined: JoinedVehicle | None = None
         self._why = "no vehicle is joined"
         self._ended = threading.Event()
         self._threads = [
             threading.Thread(target=self._drive, name="commands", daemon=True),
-            threading.Thread(target=self._report, name="reports of the video", daemon=True),
+            threading.Thread(target=self._report, name="video reports", daemon=True),
         ]
         for thread in self._threads:
             thread.start()
 
-    # as a party of the gateway's
+    # interface `Party` of the gateway connection
 
     def hello(self) -> Hello:
         """See `Party`."""
         joined = self.joined()
-        driving = None if joined is None else Driving(pair=joined.pair, other=joined.vehicle.name)
+        driving = None if joined is None else CurrentPair(pair=joined.pair, other=joined.vehicle.name)
         return Hello(listening=self._reached, driving=driving)
 
     def status(self) -> Status:
@@ -177,91 +185,91 @@ class Station:
         delays = [report.delay for report in joined.reports if report.delay is not None]
         return Status(
             pair=joined.pair,
-            links=joined.rates.links(joined.bundle),
-            driving=self.wheel.held_by() is not None,
-            told=joined.hindrance()[:200],
+            links=joined.rates.links(joined.connection),
+            driving=self.driver_session.holder() is not None,
+            told=joined.blocked_by()[:200],
             age=max(delays) if delays else None,
         )
 
-    def obey(self, order: Join | Release | Refused) -> None:
+    def handle_order(self, order: Join | Release | RequestRefused) -> None:
         """See `Party`."""
-        if isinstance(order, Refused):
+        if isinstance(order, RequestRefused):
             self._why = order.cause
             return
-        wanted = None
+        vehicle = None
         if isinstance(order, Join):
-            wanted = Peer(Role.VEHICLE, order.other.name, order.other.fingerprint)
+            vehicle = Peer(Role.VEHICLE, order.other.name, order.other.fingerprint)
         before = self.joined()
-        if before is not None and isinstance(order, Join) and (before.pair, before.vehicle) == (order.pair, wanted):
+        if before is not None and isinstance(order, Join) and (before.pair, before.vehicle) == (order.pair, vehicle):
             return
         with self._lock:
             self._joined = None
         if before is not None:
             before.close()
-            self.wheel.leave(self.wheel.held_by() or "", "the vehicle was released")
-        if isinstance(order, Join) and wanted is not None:
-            joined = Joined(order.pair, wanted, self._listener, self._show)
+            self.driver_session.release(self.driver_session.holder() or "", "the vehicle was released")
+        if isinstance(order, Join) and vehicle is not None:
+            joined = JoinedVehicle(order.pair, vehicle, self._listener, self._show)
             with self._lock:
                 self._joined = joined
         elif isinstance(order, Release):
             self._why = order.why
 
-    # for who watches and drives
+    # for the driver page
 
-    def joined(self) -> Joined | None:
-        """The vehicle that it is joined with."""
+    def joined(self) -> JoinedVehicle | None:
+        """The joined vehicle; None: there is none."""
         with self._lock:
             return self._joined
 
-    def facts(self) -> dict[str, Any]:
-        """What a driver is shown."""
+    def snapshot(self) -> dict[str, Any]:
+        """State of station and vehicle for the driver page."""
         joined = self.joined()
-        told: dict[str, Any] = {
+        state: dict[str, Any] = {
             "station": self.identity.me.name,
-            "driver": self.wheel.held_by(),
-            "left": self.wheel.told,
+            "driver": self.driver_session.holder(),
+            "left": self.driver_session.release_reason,
         }
         if joined is None:
-            return told | {"vehicle": None, "why": self._why}
-        clocks = joined.bundle.clocks
-        return told | {
+            return state | {"vehicle": None, "why": self._why}
+        clocks = joined.connection.clocks
+        return state | {
             "vehicle": joined.vehicle.name,
-            "why": joined.hindrance(),
+            "why": joined.blocked_by(),
             "telemetry": None if joined.telemetry is None else asdict(joined.telemetry),
             "telemetry_age_ms": joined.telemetry_age_ms(),
             "cameras": [asdict(one) for one in joined.streams.cameras],
-            "links": [one.model_dump() for one in joined.rates.links(joined.bundle)],
+            "links": [one.model_dump() for one in joined.rates.links(joined.connection)],
             "clocks": {"uncertainty_ms": clocks.uncertainty_ms, "wall_apart_s": clocks.wall_apart_s}
             if clocks.known
             else None,
         }
 
     def alive(self) -> bool:
-        """Whether its threads live."""
+        """Whether its threads are alive."""
         return all(thread.is_alive() for thread in self._threads)
 
     def close(self) -> None:
-        """End; the vehicle stops."""
+        """Stop sending commands, so that the vehicle stops, and disconnect."""
         self._ended.set()
         for thread in self._threads:
             thread.join(5.0)
-        self.obey(Release())
+        self.handle_order(Release())
 
     def _drive(self) -> None:
         due = time.monotonic()
         while not self._ended.is_set():
-            joined, command = self.joined(), self.wheel.command(time.monotonic())
-            if joined is not None and command is not None and not joined.hindrance():
-                joined.bundle.send(Kind.COMMAND, command.pack())
-            due = max(due + 1 / RATE, time.monotonic())
+            joined, command = self.joined(), self.driver_session.command(time.monotonic())
+            if joined is not None and command is not None and not joined.blocked_by():
+                joined.connection.send(Kind.COMMAND, command.pack())
+            due = max(due + 1 / COMMAND_RATE_HZ, time.monotonic())
             self._ended.wait(due - time.monotonic())
 
     def _report(self) -> None:
-        while not self._ended.wait(REPORTS):
+        while not self._ended.wait(REPORT_PERIOD_S):
             if (joined := self.joined()) is not None:
                 joined.report()
 
 
-def ask(membership: Membership, what: str, vehicle: str) -> bool:
-    """Ask the gateway for a vehicle, or to be rid of it; False: the gateway isn't reached."""
-    return membership.ask(Ask(what="join" if what == "join" else "release", vehicle=vehicle))
+def send_request(gateway_connection: GatewayConnection, what: str, vehicle: str) -> bool:
+    """Request the gateway to join or to release a vehicle; False: the gateway isn't connected."""
+    return gateway_connection.send_request(DriverRequest(what="join" if what == "join" else "release", vehicle=vehicle))

@@ -1,4 +1,4 @@
-"""The driver's page in a window of its own: a browser of Chromium's kind without its bars, with its own profile."""
+"""The driver page in its own window: a Chromium-based browser without toolbars, with a temporary profile."""
 
 from __future__ import annotations
 
@@ -13,50 +13,52 @@ from contextlib import contextmanager
 from scan2sim.pipeline.core.errors import UnavailableError
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "microsoft-edge", "brave-browser")
-SIZE = "1280,800"
-"""Pixels of the window at first."""
-ENDS = 5.0
-"""Seconds that it may take to close."""
+WINDOW_SIZE_PX = "1280,800"
+"""Initial width and height of the window."""
+CLOSE_TIMEOUT_S = 5.0
+"""Time the browser may take to exit before it is killed."""
 
 
 def browser() -> str:
-    """The program that shows it.
+    """Find a browser program.
 
     Raises:
-        UnavailableError: there is none, or no display.
+        UnavailableError: none is installed, or there is no display.
     """
     found = next(filter(None, map(shutil.which, BROWSERS)), None)
     if found is None:
-        cause = f"needs a browser that shows one page as a window: none of {', '.join(BROWSERS)} is installed here"
-        raise UnavailableError("--window", cause, "Install one, as chromium, or open the page in any browser")
+        cause = f"needs a browser that can show a page in its own window; none of {', '.join(BROWSERS)} is installed"
+        raise UnavailableError("--window", cause, "Install one, such as chromium, or open the page in any browser")
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        remedy = "Start it on a desktop, or open the page from a machine that has one"
-        raise UnavailableError("--window", "needs a display, and there is none here", remedy)
+        remedy = "Start the command on a desktop, or open the page from another machine"
+        raise UnavailableError("--window", "needs a display, and this machine has none", remedy)
     return found
 
 
 @contextmanager
 def window(url: str) -> Iterator[subprocess.Popen[bytes]]:
-    """A page's window, which is closed with the block; whoever closes it before leaves the wheel.
+    """Show a page in its own window, closed with the block; closing it earlier releases the control lock.
 
     Raises:
-        UnavailableError: there is no browser for it, or no display.
+        UnavailableError: no browser is installed, or there is no display.
     """
     program = browser()
     with tempfile.TemporaryDirectory(prefix="scan2sim-window-", ignore_cleanup_errors=True) as profile:
-        here = url.replace("//0.0.0.0:", "//127.0.0.1:").replace("//[::]:", "//[::1]:")  # of all addresses, one's own
-        flags = [f"--app={here}", f"--user-data-dir={profile}", f"--window-size={SIZE}", "--no-first-run"]
+        local_url = url.replace("//0.0.0.0:", "//127.0.0.1:").replace("//[::]:", "//[::1]:")  # wildcard to loopback
+        flags = [
+            f"--app={local_url}", f"--user-data-dir={profile}", f"--window-size={WINDOW_SIZE_PX}", "--no-first-run",
+        ]  # fmt: skip
         flags += ["--no-default-browser-check", "--disable-background-networking", "--disable-sync"]
         if hasattr(os, "geteuid") and os.geteuid() == 0:
-            flags.append("--no-sandbox")  # Chromium's can't be had by root
-        silent = subprocess.DEVNULL
-        process = subprocess.Popen([program, *flags], stdin=silent, stdout=silent, stderr=silent)
+            flags.append("--no-sandbox")  # Chromium's sandbox is not available to root
+        devnull = subprocess.DEVNULL
+        process = subprocess.Popen([program, *flags], stdin=devnull, stdout=devnull, stderr=devnull)
         try:
             yield process
         finally:
             process.terminate()
             try:
-                process.wait(ENDS)
+                process.wait(CLOSE_TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()

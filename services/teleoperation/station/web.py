@@ -1,10 +1,10 @@
-"""The station's page: pictures, how old they are, and the wheel; one WebSocket each (D3.2, section 4.3).
+"""The driver page of a station: video, its latency, and driving; one WebSocket for each page (D3.2, section 4.3).
 
-To the page: facts as JSON twenty times a second, and each picture as it came (VP8: browsers decode it) behind a header.
-From it: JSON, `{"do": "take" | "leave" | "turn" | "join" | "release" | "key" | "clock", ...}`.
+To the page: the state as JSON twenty times a second, and each frame behind a header (VP8, decoded by the browser).
+From the page: JSON, `{"do": "take" | "leave" | "turn" | "join" | "release" | "key" | "clock", ...}`.
 
-Pictures and facts carry a time of the station's monotonic clock, which the page compares with its own (`clock`): so the
-page knows the age of whatever arrives, also after it lay in a queue or in a process that was stopped.
+Frames and state carry a time of the station's monotonic clock, which the page compares with its own clock (`clock`). So
+the page knows the age of everything it receives, including time spent in queues or in a suspended process.
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from scan2sim.pipeline.core.errors import ScanError, SettingError
 from scan2sim.services.http import factory
-from scan2sim.services.http.settings import Served
+from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.control.controls import Controls, Gear
 from scan2sim.services.teleoperation.control.messages import Command
-from scan2sim.services.teleoperation.gateway.client import Membership
+from scan2sim.services.teleoperation.gateway.client import GatewayConnection
 from scan2sim.services.teleoperation.gateway.identity import Identity, Role
 from scan2sim.services.teleoperation.gateway.protocol import Address
-from scan2sim.services.teleoperation.settings import GATEWAY, STATION, StationParams, address
+from scan2sim.services.teleoperation.settings import GATEWAY_PORT, STATION_PORT, StationParams, parse_address
 from scan2sim.services.teleoperation.station import app_window
-from scan2sim.services.teleoperation.station.app import Station, ask
+from scan2sim.services.teleoperation.station.app import Station, send_request
 from scan2sim.services.teleoperation.transport.station_side import Listener
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame
 
 log = logging.getLogger(__name__)
 
-HEADER = struct.Struct("<BBHHd")
-"""Before a picture: camera, whether it is a key frame, width, height, time of capture (ms of the station's clock)."""
-FACTS = 0.05
-"""Seconds between two tellings of facts."""
-WAITING = 24
-"""Pictures that may wait for a page; one that falls behind is shown the newest key frame next."""
-_names = itertools.count(1)
+FRAME_HEADER = struct.Struct("<BBHHd")
+"""Header of a frame: camera, key frame flag, width, height, capture time (ms of the station's monotonic clock)."""
+STATUS_PERIOD_S = 0.05
+"""Interval between two state messages."""
+PAGE_QUEUE_MAX_FRAMES = 24
+"""Maximum number of frames queued for a page; a page that falls behind continues with the next key frame."""
+_page_numbers = itertools.count(1)
 
 
-class _Take(BaseModel):
+class _LockMessage(BaseModel):
     do: Literal["take", "leave"]
     why: Annotated[str, Field(max_length=100)] = ""
 
 
-class _Turn(BaseModel):
+class _ControlsMessage(BaseModel):
     do: Literal["turn"]
     steering: Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False)]
     throttle: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
@@ -73,98 +73,100 @@ class _Turn(BaseModel):
         return Command(controls, self.stop, self.agree)
 
 
-class _Fetch(BaseModel):
+class _PairMessage(BaseModel):
     do: Literal["join", "release"]
     vehicle: Annotated[str, Field(min_length=1, max_length=60)]
 
 
-class _Key(BaseModel):
+class _KeyFrameMessage(BaseModel):
     do: Literal["key"]
     camera: Annotated[int, Field(ge=0, le=255)]
 
 
-class _Clock(BaseModel):
+class _ClockMessage(BaseModel):
     do: Literal["clock"]
     sent: Annotated[float, Field(allow_inf_nan=False)]
-    """Time on the page's clock, which the answer returns."""
+    """Time of the page's clock, returned in the answer."""
 
 
-_Said = _Take | _Turn | _Fetch | _Key | _Clock
-_SAID: TypeAdapter[_Said] = TypeAdapter(Annotated[_Said, Field(discriminator="do")])
+_PageMessage = _LockMessage | _ControlsMessage | _PairMessage | _KeyFrameMessage | _ClockMessage
+_PAGE_MESSAGE: TypeAdapter[_PageMessage] = TypeAdapter(Annotated[_PageMessage, Field(discriminator="do")])
 
 
-class Screens:
-    """Pages that watch; frames are handed to it in any thread, each page takes them in the server's."""
+class PageHub:
+    """Distributes frames to all connected pages; thread-safe."""
 
     def __init__(self, age: Callable[[Frame], float]) -> None:
-        """`age`: of a frame in ms."""
+        """`age` returns the age of a frame, ms."""
         self._age, self._lock = age, threading.Lock()
         self._pages: tuple[_Page, ...] = ()
 
     def show(self, frame: Frame) -> None:
-        """Have all pages show it."""
+        """Queue a frame for all pages."""
         for page in self._pages:
             page.loop.call_soon_threadsafe(page.offer, frame)
 
     def add(self, page: _Page) -> None:
-        """A page watches from now on."""
+        """Add a page."""
         with self._lock:
             self._pages = (*self._pages, page)
 
     def remove(self, page: _Page) -> None:
-        """It watches no more."""
+        """Remove a page."""
         with self._lock:
             self._pages = tuple(one for one in self._pages if one is not page)
 
-    def packed(self, frame: Frame) -> bytes:
-        """As pages take it."""
+    def encode(self, frame: Frame) -> bytes:
+        """Encode a frame with its header."""
         captured = _now_ms() - self._age(frame)
-        return HEADER.pack(frame.camera, frame.key, frame.width, frame.height, captured) + frame.data
+        return FRAME_HEADER.pack(frame.camera, frame.key, frame.width, frame.height, captured) + frame.data
 
 
 def _now_ms() -> float:
-    """Milliseconds of the station's monotonic clock."""
+    """Time of the station's monotonic clock, ms."""
     return time.monotonic() * 1e3
 
 
 class _Page:
-    """One page: what waits to be sent to it."""
+    """A connected page, and its queue of frames."""
 
     def __init__(self) -> None:
-        self.name = f"page {next(_names)}"
+        self.name = f"page {next(_page_numbers)}"
         self.loop = asyncio.get_running_loop()
-        self._waiting: deque[Frame] = deque()
-        self._broken: set[int] = set()  # cameras of which a picture was left out: the next is no use before a key frame
-        self._some = asyncio.Event()
+        self._queue: deque[Frame] = deque()
+        self._broken: set[int] = set()  # cameras that dropped a frame: later ones can't be decoded before a key frame
+        self._frame_available = asyncio.Event()
 
     def offer(self, frame: Frame) -> None:
-        """Have it wait."""
-        if len(self._waiting) >= WAITING:
-            self._broken |= {one.camera for one in self._waiting}
-            self._waiting.clear()
+        """Queue a frame."""
+        if len(self._queue) >= PAGE_QUEUE_MAX_FRAMES:
+            self._broken |= {one.camera for one in self._queue}
+            self._queue.clear()
         if frame.key:
             self._broken.discard(frame.camera)
         if frame.camera in self._broken:
             return
-        self._waiting.append(frame)
-        self._some.set()
+        self._queue.append(frame)
+        self._frame_available.set()
 
     async def next(self) -> Frame:
-        """The one that has waited longest."""
-        while not self._waiting:
-            self._some.clear()
-            await self._some.wait()
-        return self._waiting.popleft()
+        """Wait for the next frame."""
+        while not self._queue:
+            self._frame_available.clear()
+            await self._frame_available.wait()
+        return self._queue.popleft()
 
 
-def application(served: Served, station: Station, screens: Screens, fetch: Callable[[str, str], bool]) -> FastAPI:
-    """The page, and what it talks to.
+def application(
+    served: ServerParams, station: Station, hub: PageHub, request_pair: Callable[[str, str], bool]
+) -> FastAPI:
+    """The driver page and its API.
 
     Args:
-        served: how it listens.
-        station: whose page it is.
-        screens: where the station's pictures go.
-        fetch: asks the gateway to join a vehicle, or to release it; False: it isn't reached.
+        served: server settings.
+        station: station of the page.
+        hub: distributes the station's frames.
+        request_pair: requests the gateway to join or to release a vehicle; False: the gateway isn't connected.
 
     Raises:
         InputError: the token can't be read.
@@ -176,117 +178,121 @@ def application(served: Served, station: Station, screens: Screens, fetch: Calla
         return FileResponse(factory.PAGES / "cockpit.html")
 
     @app.get("/api/station")
-    def facts() -> dict[str, Any]:
-        """How station and vehicle are."""
-        return station.facts()
+    def station_state() -> dict[str, Any]:
+        """State of station and vehicle."""
+        return station.snapshot()
 
     @app.websocket("/live")
     async def live(web: WebSocket) -> None:
         await web.accept(subprotocol=factory.chosen_protocol(web.scope))
-        watching = _Page()
-        screens.add(watching)
+        page = _Page()
+        hub.add(page)
         tasks = [
-            asyncio.create_task(_pictures(web, watching, screens)),
-            asyncio.create_task(_facts(web, watching, station)),
-            asyncio.create_task(_obey(web, watching, station, fetch)),
+            asyncio.create_task(_send_frames(web, page, hub)),
+            asyncio.create_task(_send_state(web, page, station)),
+            asyncio.create_task(_receive(web, page, station, request_pair)),
         ]
         try:
             if (joined := station.joined()) is not None:
                 for camera in joined.streams.cameras:
-                    joined.want(camera.camera)
+                    joined.request_key_frame(camera.camera)
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
             for task in tasks:
                 task.cancel()
             for ended in await asyncio.gather(*tasks, return_exceptions=True):
                 if isinstance(ended, Exception) and not isinstance(ended, WebSocketDisconnect):
-                    log.error("%s: %r", watching.name, ended, exc_info=ended)
-            screens.remove(watching)
-            station.wheel.leave(watching.name, "the page was closed")
+                    log.error("%s: %r", page.name, ended, exc_info=ended)
+            hub.remove(page)
+            station.driver_session.release(page.name, "the page was closed")
 
     return app
 
 
-async def _pictures(web: WebSocket, page: _Page, screens: Screens) -> None:
+async def _send_frames(web: WebSocket, page: _Page, hub: PageHub) -> None:
     while True:
-        await web.send_bytes(screens.packed(await page.next()))
+        await web.send_bytes(hub.encode(await page.next()))
 
 
-async def _facts(web: WebSocket, page: _Page, station: Station) -> None:
+async def _send_state(web: WebSocket, page: _Page, station: Station) -> None:
     while True:
-        await web.send_text(json.dumps({"now_ms": _now_ms()} | station.facts() | {"you": page.name}))
-        await asyncio.sleep(FACTS)
+        await web.send_text(json.dumps({"now_ms": _now_ms()} | station.snapshot() | {"you": page.name}))
+        await asyncio.sleep(STATUS_PERIOD_S)
 
 
-async def _obey(web: WebSocket, page: _Page, station: Station, fetch: Callable[[str, str], bool]) -> None:
+async def _receive(web: WebSocket, page: _Page, station: Station, request_pair: Callable[[str, str], bool]) -> None:
     while True:
         try:
             text = await web.receive_text()
         except WebSocketDisconnect:
             return
-        if (answer := _done(text, page, station, fetch)) is not None:
+        if (answer := _handle(text, page, station, request_pair)) is not None:
             await web.send_text(json.dumps(answer))
 
 
-def _done(text: str, page: _Page, station: Station, fetch: Callable[[str, str], bool]) -> dict[str, Any] | None:
-    """Do what a page wants; the answer: the time, or why it isn't done."""
+def _handle(
+    text: str, page: _Page, station: Station, request_pair: Callable[[str, str], bool]
+) -> dict[str, Any] | None:
+    """Carry out a message of a page; returns the answer: a time, or why the request was refused."""
     try:
-        said = _SAID.validate_json(text)
+        message = _PAGE_MESSAGE.validate_json(text)
     except ValidationError as error:
-        return {"fault": f"that can't be understood: {error.errors()[0]['msg']}"}
+        return {"fault": f"the message isn't valid: {error.errors()[0]['msg']}"}
     try:
-        match said:
-            case _Take(do="take"):
-                station.wheel.take(page.name, time.monotonic())
-            case _Take():
-                station.wheel.leave(page.name, said.why or "the driver left it")
-            case _Turn():
-                station.wheel.turn(page.name, said.command(), time.monotonic())
-            case _Fetch():
-                if not fetch(said.do, said.vehicle):
-                    return {"fault": "the gateway isn't reached"}
-            case _Key():
+        match message:
+            case _LockMessage(do="take"):
+                station.driver_session.acquire(page.name, time.monotonic())
+            case _LockMessage():
+                station.driver_session.release(page.name, message.why or "the driver released the controls")
+            case _ControlsMessage():
+                station.driver_session.update(page.name, message.command(), time.monotonic())
+            case _PairMessage():
+                if not request_pair(message.do, message.vehicle):
+                    return {"fault": "the gateway isn't connected"}
+            case _KeyFrameMessage():
                 if (joined := station.joined()) is not None:
-                    joined.want(said.camera)
-            case _Clock():
-                return {"clock": said.sent, "now_ms": _now_ms()}
+                    joined.request_key_frame(message.camera)
+            case _ClockMessage():
+                return {"clock": message.sent, "now_ms": _now_ms()}
     except ScanError as error:
         return {"fault": str(error)}
     return None
 
 
-def serve(params: StationParams, say: Callable[[str], None], window: bool = False) -> None:
-    """Be a station, and serve its page, until Ctrl-C; `say` is told what happens; `window`: the page has one.
+def serve(params: StationParams, notify: Callable[[str], None], window: bool = False) -> None:
+    """Run a station and its page until Ctrl-C; `notify` is called with progress messages; `window`: open a window.
 
     Raises:
-        ScanError: its certificate can't be read, it can't listen, or there can be no window.
+        ScanError: the certificate can't be read, the station can't listen, or no window can be opened.
     """
     if window:
         app_window.browser()
     identity = Identity.read(params.certificates, Role.STATION)
-    gateway = address("GATEWAY", params.gateway, GATEWAY)
-    listens = [address("--listening", text, STATION) for text in params.listening]
+    gateway = parse_address("GATEWAY", params.gateway, GATEWAY_PORT)
+    listens = [parse_address("--listening", text, STATION_PORT) for text in params.listening]
     listener = Listener(identity, [(one.host, one.port) for one in listens])
-    reached = [address("--reached", text, STATION) for text in params.reached] or _seen(listens, gateway)
-    screens = Screens(lambda frame: joined.age(frame.captured) if (joined := station.joined()) else 0.0)
-    station = Station(identity, listener, reached, screens.show)
-    membership = Membership(identity, gateway, station, say)
+    reached = [parse_address("--reached", text, STATION_PORT) for text in params.reached] or _reachable(
+        listens, gateway
+    )
+    hub = PageHub(lambda frame: joined.age(frame.captured) if (joined := station.joined()) else 0.0)
+    station = Station(identity, listener, reached, hub.show)
+    gateway_connection = GatewayConnection(identity, gateway, station, notify)
     with ExitStack() as stack:
-        for one in (listener, station, membership):
+        for one in (listener, station, gateway_connection):
             stack.callback(one.close)
 
         def listening(url: str) -> None:
-            say(f"the driver's page is {url}")
+            notify(f"the driver page is {url}")
             if window:
                 stack.enter_context(app_window.window(url))
 
-        app = application(params, station, screens, lambda what, vehicle: ask(membership, what, vehicle))
+        app = application(params, station, hub, lambda what, vehicle: send_request(gateway_connection, what, vehicle))
         factory.run(app, params, listening)
 
 
-def _seen(listens: list[Address], gateway: Address) -> list[Address]:
-    """Where it listens, as others see it: an address of any is the one that leads to the gateway."""
-    found = []
+def _reachable(listens: list[Address], gateway: Address) -> list[Address]:
+    """Listening addresses as others reach them; a wildcard becomes the address of the route to the gateway."""
+    addresses = []
     for one in listens:
         host = one.host
         if host in ("0.0.0.0", "::"):
@@ -295,7 +301,7 @@ def _seen(listens: list[Address], gateway: Address) -> list[Address]:
                     probe.connect((gateway.host, gateway.port))
                     host = probe.getsockname()[0]
                 except OSError as error:
-                    cause = f"isn't found from here ({error.strerror or error})"
-                    raise SettingError(f"{gateway.host}:{gateway.port}", cause, "Name the gateway's host") from None
-        found.append(Address(host=host, port=one.port))
-    return found
+                    cause = f"can't be resolved or reached ({error.strerror or error})"
+                    raise SettingError(f"{gateway.host}:{gateway.port}", cause, "Check the gateway's address") from None
+        addresses.append(Address(host=host, port=one.port))
+    return addresses

@@ -1,4 +1,4 @@
-"""Transport between vehicle and station: several links at once, DTLS, deduplication, clock offsets.
+"""Transport between vehicle and station: multipath over several links, DTLS, deduplication, clock synchronization.
 
 Begin with `multipath`; `vehicle_side` connects, `station_side` accepts.
 """

@@ -1,8 +1,8 @@
-"""How far a peer's clocks are off ours, by four timestamps: asked, noticed, answered, heard.
+"""Clock synchronization: offset of a peer's clocks, from the four timestamps of each ping and its answer (as in NTP).
 
-Stamps are of the monotonic clock, which nobody sets; the offset to a peer's is measured over all links, all the time,
-and the sample of least uncertainty wins: half its round trip, and what crystals may have drifted since. Wall clocks are
-compared beside that, since what they are wrong by tells of an NTP daemon that doesn't work.
+Timestamps are of the monotonic clock, which is never set. The offset is measured continuously over all links; the
+sample of least uncertainty is used: half its round trip, plus possible drift since. Wall clocks are compared as well,
+since a difference shows that an NTP daemon doesn't work.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-KEPT = 64
-"""Samples that are looked at."""
-DRIFT = 1e-4
-"""Seconds a second that two clocks may drift apart: twice what crystals are sold with."""
-APART = 1.0
-"""Seconds between wall clocks above which one of them is wrong."""
+SAMPLES_MAX = 64
+"""Number of samples kept."""
+DRIFT_MAX = 1e-4
+"""Maximum drift of two clocks, seconds per second: twice the tolerance of common crystals."""
+WALL_CLOCK_DIFFERENCE_MAX_S = 1.0
+"""Difference between wall clocks above which one of them is wrong."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class Sample:
     """One exchange; nanoseconds.
 
     Attributes:
-        offset: of the peer's monotonic clock from ours.
-        half: of the round trip without the peer's own time: what `offset` may be wrong by.
-        at: of our monotonic clock.
+        offset: peer's monotonic clock minus ours.
+        half: half the round trip, without the peer's processing time: maximum error of `offset`.
+        at: time of our monotonic clock.
     """
 
     offset: float
@@ -36,12 +36,12 @@ class Sample:
     at: int
 
     def uncertainty(self, now: int) -> float:
-        """Nanoseconds."""
-        return self.half + DRIFT * (now - self.at)
+        """Maximum error of the offset at a time, nanoseconds."""
+        return self.half + DRIFT_MAX * (now - self.at)
 
 
-class Clocks:
-    """Ours and a peer's.
+class ClockSync:
+    """Estimates the offset of a peer's clocks.
 
     Args:
         monotonic, wall: our clocks, nanoseconds.
@@ -51,65 +51,65 @@ class Clocks:
         self, monotonic: Callable[[], int] = time.monotonic_ns, wall: Callable[[], int] = time.time_ns
     ) -> None:
         self.monotonic, self.wall = monotonic, wall
-        self._samples: deque[Sample] = deque(maxlen=KEPT)
+        self._samples: deque[Sample] = deque(maxlen=SAMPLES_MAX)
         self._best: Sample | None = None
-        self._apart: float | None = None
+        self._wall_difference: float | None = None
 
-    def forget(self) -> None:
-        """The peer has started anew: its clock may be another machine's."""
+    def reset(self) -> None:
+        """Discard all samples: the peer has restarted, perhaps on another machine."""
         self._samples.clear()
-        self._best = self._apart = None
+        self._best = self._wall_difference = None
 
-    def exchanged(self, asked: int, noticed: int, answered: int, heard: int, wall: int) -> None:
-        """Learn from an exchange.
+    def add_exchange(self, ping_sent: int, ping_received: int, pong_sent: int, pong_received: int, wall: int) -> None:
+        """Add the timestamps of a ping and its answer.
 
         Args:
-            asked, heard: by our monotonic clock.
-            noticed, answered: by the peer's.
-            wall: the peer's wall clock when it answered.
+            ping_sent, pong_received: by our monotonic clock.
+            ping_received, pong_sent: by the peer's monotonic clock.
+            wall: the peer's wall clock when it sent the pong.
         """
-        trip = (heard - asked) - (answered - noticed)
-        if trip < 0 or answered < noticed:  # whatever that is, it is no time
+        round_trip = (pong_received - ping_sent) - (pong_sent - ping_received)
+        if round_trip < 0 or pong_sent < ping_received:  # not valid timestamps
             return
-        sample = Sample(((noticed - asked) + (answered - heard)) / 2, trip / 2, heard)
+        sample = Sample(((ping_received - ping_sent) + (pong_sent - pong_received)) / 2, round_trip / 2, pong_received)
         if self._best is not None and abs(sample.offset - self._best.offset) > sample.half + self._best.uncertainty(
-            heard
+            pong_received
         ):
-            self.forget()  # one machine slept meanwhile, which stops that clock
+            self.reset()  # one machine was suspended meanwhile, which stops its monotonic clock
         self._samples.append(sample)
-        self._best = min(self._samples, key=lambda one: one.uncertainty(heard))
-        ago = self.monotonic() - (answered - self._best.offset)
-        self._apart = (wall - (self.wall() - ago)) / 1e9
+        self._best = min(self._samples, key=lambda one: one.uncertainty(pong_received))
+        elapsed = self.monotonic() - (pong_sent - self._best.offset)
+        self._wall_difference = (wall - (self.wall() - elapsed)) / 1e9
 
     @property
     def known(self) -> bool:
-        """Whether there was an exchange."""
+        """Whether there is a sample."""
         return self._best is not None
 
     @property
     def offset(self) -> float:
-        """Seconds that the peer's monotonic clock is ahead of ours; NaN while unknown."""
+        """Peer's monotonic clock minus ours, seconds; NaN while unknown."""
         best = self._best
         return best.offset / 1e9 if best else math.nan
 
     @property
     def uncertainty_ms(self) -> float:
-        """Of `offset` and of ages; infinite while unknown."""
+        """Maximum error of `offset` and of ages, ms; infinite while unknown."""
         best = self._best
         return best.uncertainty(self.monotonic()) / 1e6 if best else math.inf
 
     @property
     def wall_apart_s(self) -> float:
-        """Seconds that the peer's wall clock is ahead of ours; NaN while unknown."""
-        apart = self._apart
-        return math.nan if apart is None else apart
+        """Peer's wall clock minus ours, seconds; NaN while unknown."""
+        difference = self._wall_difference
+        return math.nan if difference is None else difference
 
     @property
     def wall_wrong(self) -> bool:
-        """Whether one of the wall clocks is wrong; False while unknown."""
-        return abs(self.wall_apart_s) - self.uncertainty_ms / 1e3 > APART
+        """Whether one of the two wall clocks is wrong; False while unknown."""
+        return abs(self.wall_apart_s) - self.uncertainty_ms / 1e3 > WALL_CLOCK_DIFFERENCE_MAX_S
 
     def age_ms(self, sent: int) -> float:
-        """How old a stamp of the peer's monotonic clock is; infinite while the offset is unknown."""
+        """Age of a timestamp of the peer's monotonic clock, ms; infinite while the offset is unknown."""
         best = self._best
         return (self.monotonic() - sent + best.offset) / 1e6 if best else math.inf

@@ -1,27 +1,27 @@
-"""Which numbers have come: the first of each is taken, whatever link brings it."""
+"""Deduplication of message numbers: the first copy of each is accepted, whichever link it arrives over."""
 
 from __future__ import annotations
 
-SIZE = 4096
-"""Numbers that are remembered, from the highest back: over a minute of messages."""
-_ALL = (1 << SIZE) - 1
+WINDOW_SIZE = 4096
+"""Numbers remembered, back from the highest: over a minute of messages."""
+_MASK = (1 << WINDOW_SIZE) - 1
 
 
-class Window:
-    """Of one sender's numbers, from 0."""
+class DedupWindow:
+    """Window over the message numbers of one sender, from 0."""
 
     def __init__(self) -> None:
         self._next = 0
-        self._seen = 0  # bit k: the number k + 1 before the next
+        self._seen = 0  # bit k: whether number `_next` - 1 - k was received
 
-    def take(self, number: int) -> str:
-        """Note a number; empty: it is the first of its kind, else what it is."""
+    def add(self, number: int) -> str:
+        """Add a number; returns "" for its first copy, else why it is dropped: "doubles" or "late"."""
         ahead = number - self._next
         if ahead >= 0:
-            self._seen = ((self._seen << (ahead + 1)) | 1) & _ALL if ahead < SIZE else 1
+            self._seen = ((self._seen << (ahead + 1)) | 1) & _MASK if ahead < WINDOW_SIZE else 1
             self._next = number + 1
             return ""
-        if -ahead > SIZE:
+        if -ahead > WINDOW_SIZE:
             return "late"
         bit = 1 << (-ahead - 1)
         if self._seen & bit:

@@ -1,4 +1,4 @@
-"""How good links are, as gateway and pages are told: with how much goes through them now."""
+"""Link statistics for gateway and pages: round trip, loss, and current data rate."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import threading
 import time
 
 from scan2sim.services.teleoperation.gateway.protocol import LinkStatus
-from scan2sim.services.teleoperation.transport.multipath import Bundle
+from scan2sim.services.teleoperation.transport.multipath import MultipathConnection
 
-SHORTEST = 0.5
-"""Seconds that a rate is taken over, at least."""
+RATE_PERIOD_MIN_S = 0.5
+"""Minimum period over which a rate is measured."""
 
 
-class Rates:
-    """Remembers what went through links before; for any thread."""
+class LinkRates:
+    """Data rates of links, from byte counts; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._before: dict[str, tuple[float, int]] = {}
         self._rates: dict[str, float] = {}
 
-    def links(self, bundle: Bundle) -> tuple[LinkStatus, ...]:
-        """All of a bundle's."""
+    def links(self, connection: MultipathConnection) -> tuple[LinkStatus, ...]:
+        """Status of all links of a connection."""
         now = time.monotonic()
         with self._lock:
             return tuple(
@@ -33,14 +33,14 @@ class Rates:
                     loss=round(max(one.loss, one.loss_there), 4),
                     rate=self._rate(one.name, one.bytes_in + one.bytes_out, now),
                 )
-                for one in bundle.links
+                for one in connection.links
             )
 
-    def _rate(self, name: str, count: int, now: float) -> float:
-        """Mbit/s of a link by which so many bytes have gone."""
-        since, before = self._before.get(name, (now, count))
-        if name not in self._before or count < before or now - since >= SHORTEST:
-            self._before[name] = now, count
+    def _rate(self, name: str, bytes_total: int, now: float) -> float:
+        """Data rate of a link, Mbit/s, from its byte count."""
+        since, before = self._before.get(name, (now, bytes_total))
+        if name not in self._before or bytes_total < before or now - since >= RATE_PERIOD_MIN_S:
+            self._before[name] = now, bytes_total
             seconds = now - since
-            self._rates[name] = max(0, count - before) * 8e-6 / seconds if seconds > 0 else 0.0
+            self._rates[name] = max(0, bytes_total - before) * 8e-6 / seconds if seconds > 0 else 0.0
         return round(self._rates[name], 2)

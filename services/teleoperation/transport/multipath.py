@@ -1,8 +1,8 @@
-"""All links to a peer as one: every message goes over all of them, and the first of each is taken.
+"""Multipath connection: all links to a peer as one. Every message goes over all links; the first copy is accepted.
 
-A bundle knows no socket: `dialling` (the vehicle) and `listening` (the station) bring it carriers, one an association,
-and hand it what comes by them. In a datagram stands the sender's session, then the message: a peer that starts anew
-counts its messages from 0 again, and its session tells so.
+The connection uses no sockets: `vehicle_side` and `station_side` attach link sessions (one DTLS session each), and pass
+on what they receive. A datagram contains the sender's session, then the message: a peer that restarts counts its
+messages from 0 again, and has another session.
 """
 
 from __future__ import annotations
@@ -17,48 +17,48 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
-from scan2sim.services.teleoperation.control.messages import HEADER, LARGEST, Kind, Malformed, Message
-from scan2sim.services.teleoperation.transport.clock_sync import Clocks
-from scan2sim.services.teleoperation.transport.dedup_window import Window
-from scan2sim.services.teleoperation.transport.dtls_session import Association
+from scan2sim.services.teleoperation.control.messages import HEADER, MESSAGE_MAX_BYTES, Kind, Malformed, Message
+from scan2sim.services.teleoperation.transport.clock_sync import ClockSync
+from scan2sim.services.teleoperation.transport.dedup_window import DedupWindow
+from scan2sim.services.teleoperation.transport.dtls_session import DtlsSession
 
 log = logging.getLogger(__name__)
 
-SILENT, UNANSWERED = 1.0, 2.0
-"""Seconds without anything from the peer, and without an answer to a ping, until a link counts as down."""
-PING, QUICK, QUICKLY = 0.2, 0.05, 8
-"""Seconds between pings of a link; of its first ones, and how many these are."""
-NAMES = 16
-"""Links of a peer, at most."""
-SESSION = 4
-"""Bytes before each message that tell the sender's session."""
-_PONG = struct.Struct("<qqqf")  # ping's and its arrival's time, wall clock, loss
-_SHRINK, _GROW, _LEAST = 0.7, 1.05, 0.05
-_BAD_LOSS, _BAD_DELAY = 0.02, 0.1
+RECEIVE_TIMEOUT_S, PONG_TIMEOUT_S = 1.0, 2.0
+"""Silence of the peer, and time without an answer to pings, after which a link counts as down."""
+PING_PERIOD_S, FIRST_PING_PERIOD_S, FIRST_PINGS = 0.2, 0.05, 8
+"""Interval between pings of a link; interval of the first ones, and their number."""
+LINKS_MAX = 16
+"""Maximum number of links to a peer."""
+SESSION_BYTES = 4
+"""Length of the sender's session before each message."""
+_PONG = struct.Struct("<qqqf")  # times of sending and receiving the ping, wall clock, loss
+_SHARE_DECREASE, _SHARE_INCREASE, _SHARE_MIN = 0.7, 1.05, 0.05  # of a link's share of video, at each answered ping
+_CONGESTION_LOSS, _CONGESTION_DELAY_S = 0.02, 0.1  # thresholds of loss, and of delay above the minimum round trip
 
 
 class Policy(Enum):
-    """Which links a packet of video goes over."""
+    """Which links a video packet goes over."""
 
     COPY = "copy"
-    """All: what one loses, another brings."""
+    """All links, for redundancy."""
     SHARE = "share"
-    """One, in turn, as much as each carries: more bandwidth."""
+    """One link in turn, in proportion to what each carries, for bandwidth."""
 
 
 @dataclass(frozen=True)
 class LinkState:
-    """How a link is.
+    """State of a link.
 
     Attributes:
-        up: something came by it within the last second, and answers do.
+        up: something was received within the last second, and pings are answered.
         local, remote: addresses, HOST:PORT.
-        round_trip_ms: the last ones' mean; NaN: unknown.
-        loss, loss_there: of what was sent to us, and, as the peer tells, to it; 0 to 1.
-        bytes_in, bytes_out: messages and video, since the beginning.
-        handshake_s: how long the last handshake took; renewed: how many followed the first.
+        round_trip_ms: moving average; NaN: unknown.
+        loss, loss_there: share lost of what was sent to us, and, as the peer reports, to the peer; 0 to 1.
+        bytes_in, bytes_out: total of messages and video.
+        handshake_s: duration of the last handshake; renewed: number of handshakes after the first.
         cipher: version, cipher and group of the encryption.
-        why: it is down, as far as we know.
+        why: reason for which the link is down, if known.
     """
 
     name: str
@@ -77,11 +77,11 @@ class LinkState:
 
 
 @dataclass
-class Carrier:
-    """An association, and what carries its datagrams and video."""
+class LinkSession:
+    """A DTLS session on a link, with its ping state; `media` sends a video packet."""
 
     name: str
-    association: Association
+    dtls: DtlsSession
     media: Callable[[bytes], None]
     local: str
     remote: str
@@ -89,253 +89,262 @@ class Carrier:
     pings: int = 0
     cipher: str = ""
     next_ping: float = 0.0
-    answered: float = 0.0
-    trip: float = float("nan")
-    least: float = float("inf")
+    last_pong: float = 0.0
+    round_trip: float = float("nan")
+    min_round_trip: float = float("inf")
     loss_there: float = 0.0
     share: float = 1.0
-    used: float = 0.0
+    weighted_bytes: float = 0.0
 
     def up(self, now: float) -> bool:
-        """Whether it works, both ways."""
-        one = self.association
-        if one.ended or one.established is None or now - one.heard >= SILENT:
+        """Whether the link works in both directions."""
+        one = self.dtls
+        if one.ended or one.established is None or now - one.last_received >= RECEIVE_TIMEOUT_S:
             return False
-        return now - max(self.answered, one.established) < UNANSWERED
+        return now - max(self.last_pong, one.established) < PONG_TIMEOUT_S
 
 
 @dataclass
-class _Line:
-    """A link over its carriers' lives."""
+class _LinkHistory:
+    """State of a link over all of its sessions."""
 
-    carrier: Carrier | None = None
+    session: LinkSession | None = None
     bytes_in: int = 0
     bytes_out: int = 0
-    associations: int = 0
+    sessions: int = 0
     why: str = ""
 
 
-class Bundle:
-    """All links to a peer. `send`, `send_media`, `links`, `counts` and `close` are any thread's.
+class MultipathConnection:
+    """All links to a peer. `send`, `send_media`, `links`, `counts` and `close` are thread-safe.
 
     Args:
-        received: is given each message once, as it comes, in the receiving thread; must not block.
-        media: is given each packet of video with its link's name, likewise.
-        began: is told, likewise, that the peer has (re)started: its numbers begin at 0.
-        closing: what `close` does.
+        received: called once for each message, on arrival, in the receiving thread; must not block.
+        media: called likewise for each video packet, with the name of its link.
+        restarted: called likewise when the peer has started or restarted: its message numbers begin at 0.
+        on_close: called by `close`.
 
     Attributes:
-        clocks: the peer's against ours.
-        counter: what `counts` tells, as it grows.
+        clocks: offset of the peer's clocks.
+        counter: the counts of `counts`, as they grow.
     """
 
     def __init__(
         self,
         received: Callable[[Message], None],
         media: Callable[[bytes, str], None],
-        began: Callable[[], None] = lambda: None,
+        restarted: Callable[[], None] = lambda: None,
         *,
-        clocks: Clocks | None = None,
-        closing: Callable[[], None] = lambda: None,
+        clocks: ClockSync | None = None,
+        on_close: Callable[[], None] = lambda: None,
     ) -> None:
-        self.clocks = clocks or Clocks()
+        self.clocks = clocks or ClockSync()
         self.counter: Counter[str] = Counter()
-        self._received, self._media, self._began, self._closing = received, media, began, closing
-        self._session = secrets.token_bytes(SESSION)
+        self._received, self._media, self._restarted, self._on_close = received, media, restarted, on_close
+        self._session = secrets.token_bytes(SESSION_BYTES)
         self._lock = threading.Lock()
         self._number = 0
-        self._lines: dict[str, _Line] = {}
-        self._sending: tuple[Carrier, ...] = ()
-        self._window = Window()
-        self._theirs, self._since = b"", float("-inf")
+        self._links: dict[str, _LinkHistory] = {}
+        self._sending: tuple[LinkSession, ...] = ()
+        self._window = DedupWindow()
+        self._peer_session, self._peer_session_since = b"", float("-inf")
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What wasn't taken so far, by why."""
+        """Number of dropped messages and packets, by reason."""
         return dict(self.counter)
 
     @property
     def links(self) -> tuple[LinkState, ...]:
-        """All links, also those that are down."""
-        return tuple(self._state(name, line) for name, line in list(self._lines.items()))
+        """States of all links, including those that are down."""
+        return tuple(self._state(name, link) for name, link in list(self._links.items()))
 
     @property
     def round_trip(self) -> float:
-        """Seconds there and back by the quickest link that is up; NaN: unknown."""
+        """Round-trip time of the fastest link that is up, seconds; NaN: unknown."""
         now = time.monotonic()
-        return min((one.trip for one in self._sending if one.up(now) and one.trip == one.trip), default=float("nan"))
+        return min(
+            (one.round_trip for one in self._sending if one.up(now) and one.round_trip == one.round_trip),
+            default=float("nan"),
+        )
 
     def send(self, kind: Kind, body: bytes) -> int:
-        """A message to the peer, over all links there are; never blocks.
+        """Send a message over all links; never blocks.
 
         Returns:
-            Its number.
+            The message number.
 
         Raises:
-            ValueError: it is too long.
+            ValueError: the message is too long.
         """
-        if len(body) > LARGEST - HEADER.size:
-            raise ValueError(f"a message of {len(body)} bytes")
+        if len(body) > MESSAGE_MAX_BYTES - HEADER.size:
+            raise ValueError(f"a message body of {len(body)} bytes is too long")
         with self._lock:
             number, self._number = self._number, self._number + 1
-        data = self._packed(kind, number, body)
-        for carrier in self._sending:
-            self._put(carrier, data)
+        data = self._encode(kind, number, body)
+        for session in self._sending:
+            self._send(session, data)
         return number
 
     def send_media(self, packet: bytes, policy: Policy = Policy.COPY) -> None:
-        """A packet of video, over links that are up; never blocks."""
+        """Send a video packet over links that are up; never blocks."""
         now = time.monotonic()
-        carriers = [one for one in self._sending if one.up(now)]
-        if policy == Policy.SHARE and carriers:
-            carriers = [min(carriers, key=lambda one: one.used)]
-            carriers[0].used += len(packet) / carriers[0].share
-        for carrier in carriers:
-            carrier.media(packet)
-            self._lines[carrier.name].bytes_out += len(packet)
+        sessions = [one for one in self._sending if one.up(now)]
+        if policy == Policy.SHARE and sessions:
+            sessions = [min(sessions, key=lambda one: one.weighted_bytes)]
+            sessions[0].weighted_bytes += len(packet) / sessions[0].share
+        for session in sessions:
+            session.media(packet)
+            self._links[session.name].bytes_out += len(packet)
 
     def close(self) -> None:
-        """End all links."""
-        self._closing()
+        """Close all links."""
+        self._on_close()
 
-    # what follows is for `dialling` and `listening`, in the receiving thread
+    # for `vehicle_side` and `station_side`, in the receiving thread
 
-    def known(self, name: str, why: str = "") -> None:
-        """There is such a link; why it is down."""
-        self._lines.setdefault(name, _Line()).why = why
+    def report_down(self, name: str, why: str = "") -> None:
+        """Set why a link is down; adds the link if it is new."""
+        self._links.setdefault(name, _LinkHistory()).why = why
 
-    def attach(self, carrier: Carrier) -> Carrier | None:
-        """A link's newest carrier, which is sent over from now on; the one before it, if there was one."""
-        line = self._lines.setdefault(carrier.name, _Line())
-        before, line.carrier, line.why = line.carrier, carrier, ""
-        line.associations += 1
-        carrier.cipher = " ".join(carrier.association.agreed.values())
-        self._look()
+    def attach(self, session: LinkSession) -> LinkSession | None:
+        """Send over this session from now on; returns the link's previous session, if any."""
+        link = self._links.setdefault(session.name, _LinkHistory())
+        before, link.session, link.why = link.session, session, ""
+        link.sessions += 1
+        session.cipher = " ".join(session.dtls.negotiated.values())
+        self._update_sessions()
         return before
 
-    def detach(self, carrier: Carrier) -> None:
-        """A carrier has ended."""
-        line = self._lines.get(carrier.name)
-        if line is not None and line.carrier is carrier:
-            line.carrier, line.why = None, carrier.association.ended
-            self._look()
+    def detach(self, session: LinkSession) -> None:
+        """Stop using a session that has ended."""
+        link = self._links.get(session.name)
+        if link is not None and link.session is session:
+            link.session, link.why = None, session.dtls.ended
+            self._update_sessions()
 
-    def full(self, name: str) -> bool:
-        """Whether there are too many links for one of another name."""
-        return name not in self._lines and len(self._lines) >= NAMES
+    def is_full(self, name: str) -> bool:
+        """Whether there is no room for a link of another name."""
+        return name not in self._links and len(self._links) >= LINKS_MAX
 
-    def packet(self, carrier: Carrier, data: bytes) -> None:
-        """A packet of video came."""
-        self._came(carrier, data)
+    def receive_media(self, session: LinkSession, data: bytes) -> None:
+        """Process a video packet."""
+        self._count_received(session, data)
         try:
-            self._media(data, carrier.name)
-        except Exception:  # what handles video must not end the links
-            self._failed("video")
+            self._media(data, session.name)
+        except Exception:  # errors of the video callback must not end the links
+            self._log_failure("video")
 
-    def arrived(self, carrier: Carrier, data: bytes) -> None:
-        """A message came, as the association has opened it."""
-        self._came(carrier, data)
+    def receive_message(self, session: LinkSession, data: bytes) -> None:
+        """Process a decrypted message."""
+        self._count_received(session, data)
         try:
-            message = Message.unpack(data[SESSION:])
-            if not self._current(carrier, data[:SESSION]):
+            message = Message.unpack(data[SESSION_BYTES:])
+            if not self._is_current(session, data[:SESSION_BYTES]):
                 return
             if message.kind == Kind.PING:
-                self._answer(carrier, message)
+                self._answer_ping(session, message)
             elif message.kind == Kind.PONG:
-                self._answered(carrier, message)
-            elif refused := self._window.take(message.number):
-                self.counter[refused] += 1
+                self._handle_pong(session, message)
+            elif drop_reason := self._window.add(message.number):
+                self.counter[drop_reason] += 1
             else:
                 self._received(message)
         except Malformed:
             self.counter["malformed"] += 1
-        except Exception:  # what handles messages must not end the links
-            self._failed("a message")
+        except Exception:  # errors of the message callback must not end the links
+            self._log_failure("a message")
 
     def tick(self, now: float) -> None:
-        """Ping what is due, and weigh the links."""
-        for carrier in self._sending:
-            carrier.association.tick(now)
-            if now >= carrier.next_ping:
-                self._ping(carrier, now)
+        """Send pings that are due, and rebalance the links."""
+        for session in self._sending:
+            session.dtls.tick(now)
+            if now >= session.next_ping:
+                self._ping(session, now)
         if self._sending:
-            least = min(one.used for one in self._sending)
+            minimum = min(one.weighted_bytes for one in self._sending)
             for one in self._sending:
-                one.used -= least
+                one.weighted_bytes -= minimum
 
-    def _state(self, name: str, line: _Line) -> LinkState:
-        one, why = line.carrier, line.why
+    def _state(self, name: str, link: _LinkHistory) -> LinkState:
+        one, why = link.session, link.why
         if one is None:
-            return LinkState(name, bytes_in=line.bytes_in, bytes_out=line.bytes_out, why=why)
+            return LinkState(name, bytes_in=link.bytes_in, bytes_out=link.bytes_out, why=why)
         up = one.up(time.monotonic())
-        hand = (one.association.established or one.association.began) - one.association.began
+        handshake = (one.dtls.established or one.dtls.started) - one.dtls.started
         return LinkState(
-            name, up, one.local, one.remote, one.trip * 1e3, one.association.loss, one.loss_there, line.bytes_in,
-            line.bytes_out, hand, line.associations - 1, one.cipher, "" if up else why or "nothing comes",
+            name, up, one.local, one.remote, one.round_trip * 1e3, one.dtls.loss, one.loss_there, link.bytes_in,
+            link.bytes_out, handshake, link.sessions - 1, one.cipher, "" if up else why or "nothing is received",
         )  # fmt: skip
 
-    def _packed(self, kind: Kind, number: int, body: bytes) -> bytes:
+    def _encode(self, kind: Kind, number: int, body: bytes) -> bytes:
         return self._session + Message(kind, number, self.clocks.monotonic(), body).pack()
 
-    def _put(self, carrier: Carrier, data: bytes) -> None:
-        if carrier.association.send(data):
-            self._lines[carrier.name].bytes_out += len(data)
+    def _send(self, session: LinkSession, data: bytes) -> None:
+        if session.dtls.send(data):
+            self._links[session.name].bytes_out += len(data)
 
-    def _came(self, carrier: Carrier, data: bytes) -> None:
-        if (line := self._lines.get(carrier.name)) is not None:
-            line.bytes_in += len(data)
+    def _count_received(self, session: LinkSession, data: bytes) -> None:
+        if (link := self._links.get(session.name)) is not None:
+            link.bytes_in += len(data)
 
-    def _look(self) -> None:
-        self._sending = tuple(line.carrier for line in self._lines.values() if line.carrier is not None)
-        for one in self._sending:  # a new one takes its share of what follows, not all of it
-            one.used = max(each.used for each in self._sending)
+    def _update_sessions(self) -> None:
+        self._sending = tuple(link.session for link in self._links.values() if link.session is not None)
+        for one in self._sending:  # a new session gets a share of the traffic from now on, not all of it
+            one.weighted_bytes = max(each.weighted_bytes for each in self._sending)
 
-    def _current(self, carrier: Carrier, session: bytes) -> bool:
-        """Whether a message is of the peer's present session, which may have begun with it."""
-        if session == self._theirs:
+    def _is_current(self, session: LinkSession, peer_session: bytes) -> bool:
+        """Whether a message belongs to the peer's current session; a newer one replaces it."""
+        if peer_session == self._peer_session:
             return True
-        born = carrier.association.established or 0.0
-        if born <= self._since:
+        established = session.dtls.established or 0.0
+        if established <= self._peer_session_since:
             self.counter["stale"] += 1
             return False
-        self._theirs, self._since = session, born
-        self._window = Window()
-        self.clocks.forget()
-        self._began()
+        self._peer_session, self._peer_session_since = peer_session, established
+        self._window = DedupWindow()
+        self.clocks.reset()
+        self._restarted()
         return True
 
-    def _ping(self, carrier: Carrier, now: float) -> None:
-        carrier.next_ping = now + (QUICK if carrier.pings < QUICKLY else PING)
-        data = self._packed(Kind.PING, carrier.pings, carrier.name.encode())
-        carrier.pinged[carrier.pings] = Message.unpack(data[SESSION:]).sent
-        if len(carrier.pinged) > 64:
-            carrier.pinged.popitem(last=False)
-        carrier.pings += 1
-        self._put(carrier, data)
+    def _ping(self, session: LinkSession, now: float) -> None:
+        session.next_ping = now + (FIRST_PING_PERIOD_S if session.pings < FIRST_PINGS else PING_PERIOD_S)
+        data = self._encode(Kind.PING, session.pings, session.name.encode())
+        session.pinged[session.pings] = Message.unpack(data[SESSION_BYTES:]).sent
+        if len(session.pinged) > 64:
+            session.pinged.popitem(last=False)
+        session.pings += 1
+        self._send(session, data)
 
-    def _answer(self, carrier: Carrier, ping: Message) -> None:
-        noticed = self.clocks.monotonic()
-        body = _PONG.pack(ping.sent, noticed, self.clocks.wall(), carrier.association.loss)
-        self._put(carrier, self._packed(Kind.PONG, ping.number, body))
+    def _answer_ping(self, session: LinkSession, ping: Message) -> None:
+        ping_received = self.clocks.monotonic()
+        body = _PONG.pack(ping.sent, ping_received, self.clocks.wall(), session.dtls.loss)
+        self._send(session, self._encode(Kind.PONG, ping.number, body))
 
-    def _answered(self, carrier: Carrier, pong: Message) -> None:
-        heard = self.clocks.monotonic()
-        if (asked := carrier.pinged.pop(pong.number, None)) is None:
+    def _handle_pong(self, session: LinkSession, pong: Message) -> None:
+        pong_received = self.clocks.monotonic()
+        if (ping_sent := session.pinged.pop(pong.number, None)) is None:
             return
         try:
-            _, noticed, wall, loss = _PONG.unpack(pong.body)
+            _, ping_received, wall, loss = _PONG.unpack(pong.body)
         except struct.error as error:
             raise Malformed(str(error)) from None
-        self.clocks.exchanged(asked, noticed, pong.sent, heard, wall)
-        carrier.answered = time.monotonic()
-        trip = ((heard - asked) - (pong.sent - noticed)) / 1e9
-        carrier.trip = trip if carrier.trip != carrier.trip else 0.8 * carrier.trip + 0.2 * trip
-        carrier.least = min(carrier.least, carrier.trip)
-        carrier.loss_there = min(1.0, max(0.0, loss)) if loss == loss else 1.0
-        full = carrier.loss_there > _BAD_LOSS or carrier.trip > carrier.least + _BAD_DELAY
-        carrier.share = max(_LEAST, carrier.share * _SHRINK) if full else min(1.0, carrier.share * _GROW)
+        self.clocks.add_exchange(ping_sent, ping_received, pong.sent, pong_received, wall)
+        session.last_pong = time.monotonic()
+        round_trip = ((pong_received - ping_sent) - (pong.sent - ping_received)) / 1e9
+        session.round_trip = (
+            round_trip if session.round_trip != session.round_trip else 0.8 * session.round_trip + 0.2 * round_trip
+        )
+        session.min_round_trip = min(session.min_round_trip, session.round_trip)
+        session.loss_there = min(1.0, max(0.0, loss)) if loss == loss else 1.0
+        congested = (
+            session.loss_there > _CONGESTION_LOSS or session.round_trip > session.min_round_trip + _CONGESTION_DELAY_S
+        )
+        session.share = (
+            max(_SHARE_MIN, session.share * _SHARE_DECREASE) if congested else min(1.0, session.share * _SHARE_INCREASE)
+        )
 
-    def _failed(self, what: str) -> None:
+    def _log_failure(self, what: str) -> None:
         self.counter["failed"] += 1
         if self.counter["failed"] in (1, 10, 100, 1000):
             log.exception("%s could not be handled", what)

@@ -1,8 +1,8 @@
-"""The station's end of bundles: it listens, and takes up the links of the vehicles that it expects.
+"""The station's side of multipath connections: listens, and accepts the links of the vehicles that it expects.
 
-Whoever begins a handshake must first show that it gets what is sent to its address (DTLS's cookie); until then nothing
-is kept of it. A vehicle that isn't expected, by role, name and certificate, is refused in the handshake. Handshakes
-have bounds by host and altogether, so that a flood of them takes no more time than these allow.
+A client must first prove that it receives at its address (DTLS cookie); until then no state is kept for it. A vehicle
+that isn't expected, by role, name and certificate, is refused in the handshake. The number of handshakes is limited,
+for each host and in total, so that a flood of them costs only bounded time.
 """
 
 from __future__ import annotations
@@ -17,93 +17,93 @@ from scan2sim.pipeline.core.errors import BusyError, SettingError
 from scan2sim.services.teleoperation.control.messages import Kind, Malformed, Message
 from scan2sim.services.teleoperation.gateway.identity import Identity, Peer
 from scan2sim.services.teleoperation.transport import tls
-from scan2sim.services.teleoperation.transport.clock_sync import Clocks
-from scan2sim.services.teleoperation.transport.dtls_session import Association, is_hello
-from scan2sim.services.teleoperation.transport.multipath import SESSION, Bundle, Carrier
-from scan2sim.services.teleoperation.transport.tls import Channel, Refused
-from scan2sim.services.teleoperation.transport.udp_reactor import Reader, shown, udp
+from scan2sim.services.teleoperation.transport.clock_sync import ClockSync
+from scan2sim.services.teleoperation.transport.dtls_session import DtlsSession, is_hello
+from scan2sim.services.teleoperation.transport.multipath import SESSION_BYTES, LinkSession, MultipathConnection
+from scan2sim.services.teleoperation.transport.tls import Channel, TlsError
+from scan2sim.services.teleoperation.transport.udp_reactor import UdpReactor, format_address, udp_socket
 
-PENDING, OF_HOST, PATIENCE = 64, 16, 5.0
-"""Handshakes at once, of these by one host; seconds that one may take."""
-HELLOS, HOST_HELLOS = 500.0, 50.0
-"""First datagrams a second that are answered, of these from one host."""
-HOSTS = 1024
-"""Hosts whose rates are remembered."""
-CARRIERS = 32
-"""Associations of a peer at once."""
-KEEP, FORGET = 3.0, 30.0
-"""Seconds that an association is read after another took its place; seconds of silence until one is forgotten."""
+HANDSHAKES_MAX, HANDSHAKES_PER_HOST_MAX, HANDSHAKE_TIMEOUT_S = 64, 16, 5.0
+"""Maximum number of concurrent handshakes, of those from one host, and duration of one."""
+HELLO_RATE_MAX, HELLO_RATE_PER_HOST_MAX = 500.0, 50.0
+"""Maximum number of ClientHello datagrams answered per second, and of those from one host."""
+TRACKED_HOSTS_MAX = 1024
+"""Number of hosts whose rates are tracked."""
+SESSIONS_PER_PEER_MAX = 32
+"""Maximum number of DTLS sessions of one peer."""
+REPLACED_SESSION_LIFETIME_S, SESSION_TIMEOUT_S = 3.0, 30.0
+"""Time for which a replaced session is still read; silence after which a session is dropped."""
 
 Address = tuple[object, ...]
 
 
-class Bucket:
-    """A rate, and as much at once as a second brings."""
+class TokenBucket:
+    """Token bucket rate limit; bursts of up to one second's tokens."""
 
     def __init__(self, rate: float) -> None:
-        self._rate = self._left = rate
-        self._at = 0.0
+        self._rate = self._tokens = rate
+        self._updated = 0.0
 
     def take(self, now: float) -> bool:
-        """Whether one more is within the rate."""
-        self._left = min(self._rate, self._left + (now - self._at) * self._rate)
-        self._at = now
-        if self._left < 1:
+        """Take a token; returns whether there was one."""
+        self._tokens = min(self._rate, self._tokens + (now - self._updated) * self._rate)
+        self._updated = now
+        if self._tokens < 1:
             return False
-        self._left -= 1
+        self._tokens -= 1
         return True
 
 
 @dataclass
-class _Entry:
-    """What is at an address: a handshake, then a carrier of a bundle's."""
+class _RemoteSession:
+    """DTLS session with a remote address: a handshake, then a link session of a connection."""
 
     sock: socket.socket
     address: Address
-    association: Association
-    bundle: Bundle | None = None
-    carrier: Carrier | None = None
+    dtls: DtlsSession
+    connection: MultipathConnection | None = None
+    link_session: LinkSession | None = None
     until: float = float("inf")
 
 
 class Listener:
-    """Sockets that stay, while peers come and go.
+    """Accepts connections of peers on sockets that stay open.
 
     Args:
-        addresses: (host, port) to listen at; port 0: any. Name a machine's addresses one by one where it has several.
+        addresses: (host, port) to listen on; port 0: any free one. List the addresses of a multihomed machine.
 
     Attributes:
         addresses: where it listens.
 
     Raises:
-        SettingError: it can't listen there.
-        BusyError: something else does.
+        SettingError: it can't listen on an address.
+        BusyError: a port is in use.
     """
 
     def __init__(self, identity: Identity, addresses: Sequence[tuple[str, int]]) -> None:
         self._context = tls.context(identity, datagrams=True)
-        self._expected: dict[Peer, Bundle] = {}
-        self._at: dict[tuple[int, Address], _Entry] = {}
-        self._pending: dict[tuple[int, Address], _Entry] = {}
+        self._expected: dict[Peer, MultipathConnection] = {}
+        self._sessions: dict[tuple[int, Address], _RemoteSession] = {}
+        self._pending: dict[tuple[int, Address], _RemoteSession] = {}
         self._counts: Counter[str] = Counter()
-        self._hellos = Bucket(HELLOS)
-        self._hosts: OrderedDict[object, Bucket] = OrderedDict()
-        self._waiting = self._fresh()
-        self._reader = Reader(self._came, self._tick)
-        sockets = [_bound(*address) for address in addresses]
+        self._hellos = TokenBucket(HELLO_RATE_MAX)
+        self._hosts: OrderedDict[object, TokenBucket] = OrderedDict()
+        self._next_channel = self._new_channel()
+        self._reactor = UdpReactor(self._receive, self._tick)
+        sockets = [_bind(*address) for address in addresses]
         for sock in sockets:
-            self._reader.add(sock)
+            self._reactor.add(sock)
         self.addresses: tuple[tuple[str, int], ...] = tuple(sock.getsockname()[:2] for sock in sockets)
-        self._reader.start()
+        self._reactor.start()
 
     @property
     def port(self) -> int:
-        """Where it listens, of its first address."""
+        """Port of the first address."""
         return self.addresses[0][1]
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Of strangers' datagrams, why they weren't taken: strangers, malformed, flooded, refused, ..."""
+        """Number of dropped datagrams that belong to no connection, by reason: strangers, malformed, flooded, ..."""
         return dict(self._counts)
 
     def expect(
@@ -111,171 +111,178 @@ class Listener:
         peer: Peer,
         received: Callable[[Message], None],
         media: Callable[[bytes, str], None] = lambda packet, link: None,
-        began: Callable[[], None] = lambda: None,
+        restarted: Callable[[], None] = lambda: None,
         *,
-        clocks: Clocks | None = None,
-    ) -> Bundle:
-        """Let a peer in, as the gateway names it; the bundle has its links as they come."""
+        clocks: ClockSync | None = None,
+    ) -> MultipathConnection:
+        """Accept a peer, named by the gateway; its links are added to the connection as they come up."""
         self.forget(peer)
-        bundle = Bundle(received, media, began, clocks=clocks, closing=lambda: self._forget(peer, bundle))
-        self._expected[peer] = bundle
-        return bundle
+        connection = MultipathConnection(
+            received, media, restarted, clocks=clocks, on_close=lambda: self._forget(peer, connection)
+        )
+        self._expected[peer] = connection
+        return connection
 
     def forget(self, peer: Peer) -> None:
-        """Let a peer in no more, and end its links."""
-        if (bundle := self._expected.get(peer)) is not None:
-            bundle.close()
+        """Stop accepting a peer, and close its links."""
+        if (connection := self._expected.get(peer)) is not None:
+            connection.close()
 
     def close(self) -> None:
-        """End all."""
+        """Close all connections and sockets."""
         for peer in list(self._expected):
             self.forget(peer)
-        self._reader.end()
+        self._reactor.end()
 
-    def _forget(self, peer: Peer, bundle: Bundle) -> None:
-        if self._expected.get(peer) is bundle:
+    def _forget(self, peer: Peer, connection: MultipathConnection) -> None:
+        if self._expected.get(peer) is connection:
             del self._expected[peer]
-        self._reader.soon(lambda: self._drop_all(bundle))
+        self._reactor.call_soon(lambda: self._drop_all(connection))
 
-    def _drop_all(self, bundle: Bundle) -> None:
-        for key, entry in list(self._at.items()):
-            if entry.bundle is bundle:
+    def _drop_all(self, connection: MultipathConnection) -> None:
+        for key, entry in list(self._sessions.items()):
+            if entry.connection is connection:
                 self._drop(key, entry)
 
-    def _fresh(self) -> Channel:
+    def _new_channel(self) -> Channel:
         return Channel(self._context, client=False, accepts=lambda peer: peer in self._expected)
 
-    def _came(self, sock: socket.socket, data: bytes, address: Address) -> None:
+    def _receive(self, sock: socket.socket, data: bytes, address: Address) -> None:
         key = (sock.fileno(), address)
-        entry = self._at.get(key)
+        entry = self._sessions.get(key)
         if entry is None:
-            self._stranger(key, sock, data, address)
+            self._receive_hello(key, sock, data, address)
         elif data and 128 <= data[0] < 192:
-            if entry.bundle is not None and entry.carrier is not None:
-                entry.bundle.packet(entry.carrier, data)
+            if entry.connection is not None and entry.link_session is not None:
+                entry.connection.receive_media(entry.link_session, data)
         else:
-            for part in entry.association.receive(data, time.monotonic()):
-                self._said(key, entry, part)
+            for part in entry.dtls.receive(data, time.monotonic()):
+                self._receive_message(key, entry, part)
             if key in self._pending:
-                self._shaken(key, entry)
+                self._check_handshake(key, entry)
 
-    def _shaken(self, key: tuple[int, Address], entry: _Entry) -> None:
-        """A handshake has gone on: perhaps it is done."""
-        one = entry.association
+    def _check_handshake(self, key: tuple[int, Address], entry: _RemoteSession) -> None:
+        """Check whether a handshake has completed or failed."""
+        one = entry.dtls
         if one.ended:
             self._counts["refused"] += 1
             self._drop(key, entry)
         elif one.established is not None and one.peer is not None:
             del self._pending[key]
-            entry.bundle = self._expected.get(one.peer)
-            mine = [each for each in self._at.items() if each[1].bundle is entry.bundle]
-            if entry.bundle is None:
+            entry.connection = self._expected.get(one.peer)
+            mine = [each for each in self._sessions.items() if each[1].connection is entry.connection]
+            if entry.connection is None:
                 self._drop(key, entry)
-            elif len(mine) > CARRIERS:
-                self._drop(*min(mine, key=lambda each: each[1].association.heard))
+            elif len(mine) > SESSIONS_PER_PEER_MAX:
+                self._drop(*min(mine, key=lambda each: each[1].dtls.last_received))
 
-    def _said(self, key: tuple[int, Address], entry: _Entry, part: bytes) -> None:
-        """A message of a peer's; its first ping by an association names the link."""
-        if entry.bundle is None:
+    def _receive_message(self, key: tuple[int, Address], entry: _RemoteSession, part: bytes) -> None:
+        """Process a message of a peer; the first ping of a session names its link."""
+        if entry.connection is None:
             return
-        if entry.carrier is None:
+        if entry.link_session is None:
             try:
-                ping = Message.unpack(part[SESSION:])
+                ping = Message.unpack(part[SESSION_BYTES:])
                 name = ping.body.decode() if ping.kind == Kind.PING else ""
             except (Malformed, UnicodeDecodeError):
                 name = ""
-            if not name or len(name) > 60 or entry.bundle.full(name):
+            if not name or len(name) > 60 or entry.connection.is_full(name):
                 self._counts["unnamed"] += 1
                 return
-            self._take_up(entry, name)
-        assert entry.carrier is not None
-        entry.bundle.arrived(entry.carrier, part)
+            self._attach_link(entry, name)
+        assert entry.link_session is not None
+        entry.connection.receive_message(entry.link_session, part)
 
-    def _take_up(self, entry: _Entry, name: str) -> None:
-        put = self._putter(entry.sock, entry.address)
-        assert entry.bundle is not None
-        here = shown(entry.sock.getsockname())
-        entry.carrier = Carrier(name, entry.association, put, here, shown(entry.address))
-        entry.association.counts = entry.bundle.counter
-        before = entry.bundle.attach(entry.carrier)
-        for other in self._at.values():
-            if other.carrier is before and before is not None:
-                other.until = time.monotonic() + KEEP
+    def _attach_link(self, entry: _RemoteSession, name: str) -> None:
+        send = self._sender(entry.sock, entry.address)
+        assert entry.connection is not None
+        local = format_address(entry.sock.getsockname())
+        entry.link_session = LinkSession(name, entry.dtls, send, local, format_address(entry.address))
+        entry.dtls.counts = entry.connection.counter
+        before = entry.connection.attach(entry.link_session)
+        for other in self._sessions.values():
+            if other.link_session is before and before is not None:
+                other.until = time.monotonic() + REPLACED_SESSION_LIFETIME_S
 
-    def _stranger(self, key: tuple[int, Address], sock: socket.socket, data: bytes, address: Address) -> None:
+    def _receive_hello(self, key: tuple[int, Address], sock: socket.socket, data: bytes, address: Address) -> None:
         if not is_hello(data):
             self._counts["strangers"] += 1
             return
         now = time.monotonic()
-        if not self._within(address[0], now):
+        if not self._is_within_rate(address[0], now):
             self._counts["flooded"] += 1
             return
-        put, channel = self._putter(sock, address), self._waiting
-        channel.address = shown(address)
+        send, channel = self._sender(sock, address), self._next_channel
+        channel.address = format_address(address)
         try:
-            shows = channel.listen(data)
-        except Refused:
-            shows = False
-        if not shows:
+            proven = channel.listen(data)
+        except TlsError:
+            proven = False
+        if not proven:
             if answer := channel.take():
-                put(answer)
-            else:  # no hello after all, which it may have half kept
+                send(answer)
+            else:  # not a valid ClientHello; the channel may have kept part of it
                 self._counts["malformed"] += 1
-                self._waiting = self._fresh()
+                self._next_channel = self._new_channel()
             return
-        self._waiting = self._fresh()
-        of_host = sum(1 for each in self._pending.values() if each.address[0] == address[0])
-        if len(self._pending) >= PENDING or of_host >= OF_HOST:
+        self._next_channel = self._new_channel()
+        from_host = sum(1 for each in self._pending.values() if each.address[0] == address[0])
+        if len(self._pending) >= HANDSHAKES_MAX or from_host >= HANDSHAKES_PER_HOST_MAX:
             self._counts["flooded"] += 1
             return
-        association = Association(channel, put, self._counts, now)
-        self._at[key] = self._pending[key] = _Entry(sock, address, association)
-        association.dial(now)
-        self._shaken(key, self._at[key])
+        dtls = DtlsSession(channel, send, self._counts, now)
+        self._sessions[key] = self._pending[key] = _RemoteSession(sock, address, dtls)
+        dtls.start_handshake(now)
+        self._check_handshake(key, self._sessions[key])
 
-    def _within(self, host: object, now: float) -> bool:
-        bucket = self._hosts.setdefault(host, Bucket(HOST_HELLOS))
+    def _is_within_rate(self, host: object, now: float) -> bool:
+        bucket = self._hosts.setdefault(host, TokenBucket(HELLO_RATE_PER_HOST_MAX))
         self._hosts.move_to_end(host)
-        if len(self._hosts) > HOSTS:
+        if len(self._hosts) > TRACKED_HOSTS_MAX:
             self._hosts.popitem(last=False)
         return bucket.take(now) and self._hellos.take(now)
 
     def _tick(self, now: float) -> None:
-        for key, entry in list(self._at.items()):
-            one = entry.association
+        for key, entry in list(self._sessions.items()):
+            one = entry.dtls
             if key in self._pending:
                 one.tick(now)
-            late = now - one.began > PATIENCE if entry.carrier is None else now - one.heard > FORGET
-            if one.ended or late or now > entry.until:
+            timed_out = (
+                now - one.started > HANDSHAKE_TIMEOUT_S
+                if entry.link_session is None
+                else now - one.last_received > SESSION_TIMEOUT_S
+            )
+            if one.ended or timed_out or now > entry.until:
                 self._counts["refused"] += key in self._pending
                 self._drop(key, entry)
-        for bundle in list(self._expected.values()):
-            bundle.tick(now)
+        for connection in list(self._expected.values()):
+            connection.tick(now)
 
-    def _drop(self, key: tuple[int, Address], entry: _Entry) -> None:
-        self._at.pop(key, None)
+    def _drop(self, key: tuple[int, Address], entry: _RemoteSession) -> None:
+        self._sessions.pop(key, None)
         self._pending.pop(key, None)
-        entry.association.close()
-        if entry.bundle is not None and entry.carrier is not None:
-            entry.bundle.detach(entry.carrier)
+        entry.dtls.close()
+        if entry.connection is not None and entry.link_session is not None:
+            entry.connection.detach(entry.link_session)
 
-    def _putter(self, sock: socket.socket, address: Address) -> Callable[[bytes], None]:
-        def put(data: bytes) -> None:
+    def _sender(self, sock: socket.socket, address: Address) -> Callable[[bytes], None]:
+        def send(data: bytes) -> None:
             try:
                 sock.sendto(data, address)
-            except OSError:  # the queue is full, or there is no way at present: lost, as on any network
+            except OSError:  # the send queue is full, or there is no route at present: the datagram is lost
                 self._counts["unsent"] += 1
 
-        return put
+        return send
 
 
-def _bound(host: str, port: int) -> socket.socket:
-    sock = udp(socket.AF_INET6 if ":" in host else socket.AF_INET)
+def _bind(host: str, port: int) -> socket.socket:
+    sock = udp_socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     try:
         sock.bind((host, port))
     except OSError as error:
         sock.close()
         if error.errno == 98:
-            raise BusyError(f"{host}:{port}", "another program listens there", "End it, or choose another") from None
-        raise SettingError(f"{host}:{port}", str(error.strerror), "Name an address of this machine") from None
+            remedy = "End that program, or choose another port"
+            raise BusyError(f"{host}:{port}", "is in use by another program", remedy) from None
+        raise SettingError(f"{host}:{port}", str(error.strerror), "Give an address of this machine") from None
     return sock

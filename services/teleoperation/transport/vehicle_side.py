@@ -1,7 +1,7 @@
-"""The vehicle's end of a bundle: it dials the station, over every link to each of its addresses.
+"""The vehicle's side of a multipath connection: connects to the station over every link, to each of its addresses.
 
-Every association has a socket of its own. A link that is silent, or whose keys are to be renewed, is dialled again
-beside the old association, from whatever address it has by then; whichever attempt gets through first takes over.
+Every DTLS session has its own socket. A link that is silent, or whose keys are due for renewal, gets a new session from
+whatever local address it has by then, while the old one continues; the first handshake to complete replaces it.
 """
 
 from __future__ import annotations
@@ -17,38 +17,38 @@ from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.teleoperation.control.messages import Message
 from scan2sim.services.teleoperation.gateway.identity import Identity, Peer
 from scan2sim.services.teleoperation.transport import tls
-from scan2sim.services.teleoperation.transport.clock_sync import Clocks
-from scan2sim.services.teleoperation.transport.dtls_session import Association
-from scan2sim.services.teleoperation.transport.multipath import NAMES, Bundle, Carrier
+from scan2sim.services.teleoperation.transport.clock_sync import ClockSync
+from scan2sim.services.teleoperation.transport.dtls_session import DtlsSession
+from scan2sim.services.teleoperation.transport.multipath import LINKS_MAX, LinkSession, MultipathConnection
 from scan2sim.services.teleoperation.transport.tls import Channel
-from scan2sim.services.teleoperation.transport.udp_reactor import Reader, shown, udp
+from scan2sim.services.teleoperation.transport.udp_reactor import UdpReactor, format_address, udp_socket
 
-RENEW = 600.0
-"""Seconds until keys are renewed."""
-APART, ATTEMPTS, PATIENCE = 0.7, 4, 5.0
-"""Seconds between attempts to dial; how many at once; seconds that one lasts."""
-KEEP = 3.0
-"""Seconds that an association is read after another took its place."""
+REKEY_PERIOD_S = 600.0
+"""Age of a session after which its keys are renewed."""
+RECONNECT_PERIOD_S, ATTEMPTS_MAX, HANDSHAKE_TIMEOUT_S = 0.7, 4, 5.0
+"""Interval between attempts to connect, their maximum number at once, and duration of one."""
+REPLACED_SESSION_LIFETIME_S = 3.0
+"""Time for which a replaced session is still read."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """A way out of the vehicle.
+    """A network link of the vehicle.
 
     Attributes:
-        local: its address, or the interface's name, which may change its address; empty: as the system routes.
+        local: its IP address, or an interface name, whose address may change; empty: the system's default route.
     """
 
     name: str
     local: str = ""
 
     def socket(self, remote: tuple[str, int]) -> socket.socket:
-        """A new socket from here to there.
+        """Create a socket connected to a remote address.
 
         Raises:
-            OSError: there is no such way now.
+            OSError: there is no such route now.
         """
-        sock = udp(socket.AF_INET6 if ":" in remote[0] else socket.AF_INET)
+        sock = udp_socket(socket.AF_INET6 if ":" in remote[0] else socket.AF_INET)
         try:
             if self.local and _is_address(self.local):
                 sock.bind((self.local, 0))
@@ -62,20 +62,20 @@ class Link:
 
 
 @dataclass
-class _Way:
-    """A link to one of the station's addresses."""
+class _Path:
+    """A link to one of the station's addresses, with its sessions."""
 
     name: str
     link: Link
     remote: tuple[str, int]
-    carrier: Carrier | None = None
-    attempts: dict[socket.socket, Carrier] = field(default_factory=dict)
-    old: dict[socket.socket, tuple[Carrier, float]] = field(default_factory=dict)
+    session: LinkSession | None = None
+    attempts: dict[socket.socket, LinkSession] = field(default_factory=dict)
+    replaced: dict[socket.socket, tuple[LinkSession, float]] = field(default_factory=dict)
     sock: socket.socket | None = None
-    tried: float = float("-inf")
+    last_attempt: float = float("-inf")
 
 
-def dial(
+def connect_station(
     identity: Identity,
     peer: Peer,
     links: Sequence[Link],
@@ -83,29 +83,30 @@ def dial(
     *,
     received: Callable[[Message], None],
     media: Callable[[bytes, str], None] = lambda packet, link: None,
-    began: Callable[[], None] = lambda: None,
-    renew: float = RENEW,
-    clocks: Clocks | None = None,
-) -> Bundle:
-    """Dial a station until the bundle is closed.
+    restarted: Callable[[], None] = lambda: None,
+    renew: float = REKEY_PERIOD_S,
+    clocks: ClockSync | None = None,
+) -> MultipathConnection:
+    """Connect to a station until the connection is closed.
 
     Args:
-        peer: the station, as the gateway tells it.
-        addresses: of the station; hosts as numbers, so that nothing waits for a name.
+        peer: the station, named by the gateway.
+        addresses: of the station; IP addresses, to avoid name resolution.
 
     Raises:
-        SettingError: no links or addresses, too many, or a host that is none.
+        SettingError: no links or addresses, too many of them, or a host that isn't an IP address.
     """
-    if not 1 <= len(links) * len(addresses) <= NAMES:
-        ways = f"{len(links)} links to {len(addresses)} addresses"
-        raise SettingError("links", f"{ways} are none, or more than {NAMES} ways", "Name fewer links, or addresses")
+    if not 1 <= len(links) * len(addresses) <= LINKS_MAX:
+        combinations = f"{len(links)} links to {len(addresses)} addresses"
+        cause = f"{combinations} are no paths, or more than {LINKS_MAX}"
+        raise SettingError("links", cause, "Give fewer links or addresses, but at least one of each")
     if wrong := next((host for host, _ in addresses if not _is_address(host)), ""):
-        raise SettingError("addresses", f"{wrong!r} is no IP address", "Give the station's addresses as numbers")
-    return _Dialler(identity, peer, links, addresses, received, media, began, renew, clocks).bundle
+        raise SettingError("addresses", f"{wrong!r} is not an IP address", "Give the station's IP addresses")
+    return _Connector(identity, peer, links, addresses, received, media, restarted, renew, clocks).connection
 
 
-class _Dialler:
-    """Keeps all ways to a station dialled."""
+class _Connector:
+    """Keeps all paths to a station connected."""
 
     def __init__(
         self,
@@ -115,124 +116,125 @@ class _Dialler:
         addresses: Sequence[tuple[str, int]],
         received: Callable[[Message], None],
         media: Callable[[bytes, str], None],
-        began: Callable[[], None],
+        restarted: Callable[[], None],
         renew: float,
-        clocks: Clocks | None,
+        clocks: ClockSync | None,
     ) -> None:
         self._context = tls.context(identity, datagrams=True)
         self._peer, self._renew = peer, renew
-        several = len(addresses) > 1
-        self._ways = [
-            _Way(f"{link.name}>{shown(remote)}" if several else link.name, link, remote)
+        multiple_addresses = len(addresses) > 1
+        self._paths = [
+            _Path(f"{link.name}>{format_address(remote)}" if multiple_addresses else link.name, link, remote)
             for link in links
             for remote in addresses
         ]
-        self._of: dict[socket.socket, _Way] = {}
-        self.bundle = Bundle(received, media, began, clocks=clocks, closing=self._close)
-        for way in self._ways:
-            self.bundle.known(way.name, "is being dialled")
-        self._reader = Reader(self._came, self._tick)
-        self._reader.start()
+        self._path_of: dict[socket.socket, _Path] = {}
+        self.connection = MultipathConnection(received, media, restarted, clocks=clocks, on_close=self._close)
+        for path in self._paths:
+            self.connection.report_down(path.name, "connecting")
+        self._reactor = UdpReactor(self._receive, self._tick)
+        self._reactor.start()
 
-    def _came(self, sock: socket.socket, data: bytes, address: tuple[object, ...]) -> None:
-        way = self._of[sock]
-        attempt = way.attempts.get(sock)
-        carrier = attempt or (way.carrier if sock is way.sock else way.old[sock][0])
-        assert carrier is not None
+    def _receive(self, sock: socket.socket, data: bytes, address: tuple[object, ...]) -> None:
+        path = self._path_of[sock]
+        attempt = path.attempts.get(sock)
+        session = attempt or (path.session if sock is path.sock else path.replaced[sock][0])
+        assert session is not None
         if data and 128 <= data[0] < 192:
             if attempt is None:
-                self.bundle.packet(carrier, data)
+                self.connection.receive_media(session, data)
             return
-        for part in carrier.association.receive(data, time.monotonic()):
-            self.bundle.arrived(carrier, part)
-        if attempt is not None and carrier.association.established is not None:
-            self._through(way, sock, carrier)
-        elif attempt is not None and carrier.association.ended:
-            self._failed(way, sock, carrier.association.ended)
+        for part in session.dtls.receive(data, time.monotonic()):
+            self.connection.receive_message(session, part)
+        if attempt is not None and session.dtls.established is not None:
+            self._use_session(path, sock, session)
+        elif attempt is not None and session.dtls.ended:
+            self._abandon(path, sock, session.dtls.ended)
 
-    def _through(self, way: _Way, sock: socket.socket, carrier: Carrier) -> None:
-        """An attempt has become an association: it takes over."""
+    def _use_session(self, path: _Path, sock: socket.socket, session: LinkSession) -> None:
+        """Use a session whose handshake is complete."""
         now = time.monotonic()
-        del way.attempts[sock]
-        if way.sock is not None and way.carrier is not None:
-            way.old[way.sock] = (way.carrier, now + KEEP)
-        way.sock, way.carrier = sock, carrier
-        self.bundle.attach(carrier)
-        self.bundle.tick(now)  # a ping: the station takes the link up by its first message
-        for other in list(way.attempts):
-            self._shut(way, other, way.attempts.pop(other))
+        del path.attempts[sock]
+        if path.sock is not None and path.session is not None:
+            path.replaced[path.sock] = (path.session, now + REPLACED_SESSION_LIFETIME_S)
+        path.sock, path.session = sock, session
+        self.connection.attach(session)
+        self.connection.tick(now)  # sends a ping: the station attaches the link on its first message
+        for other in list(path.attempts):
+            self._close_session(path, other, path.attempts.pop(other))
 
-    def _failed(self, way: _Way, sock: socket.socket, why: str) -> None:
-        self._shut(way, sock, way.attempts.pop(sock))
-        if way.carrier is None:
-            self.bundle.known(way.name, why)
+    def _abandon(self, path: _Path, sock: socket.socket, reason: str) -> None:
+        self._close_session(path, sock, path.attempts.pop(sock))
+        if path.session is None:
+            self.connection.report_down(path.name, reason)
 
-    def _shut(self, way: _Way, sock: socket.socket, carrier: Carrier) -> None:
-        carrier.association.close()
-        del self._of[sock]
-        self._reader.remove(sock)
+    def _close_session(self, path: _Path, sock: socket.socket, session: LinkSession) -> None:
+        session.dtls.close()
+        del self._path_of[sock]
+        self._reactor.remove(sock)
 
     def _tick(self, now: float) -> None:
-        for way in self._ways:
-            for sock, carrier in list(way.attempts.items()):
-                carrier.association.tick(now)
-                if carrier.association.ended or now - carrier.association.began > PATIENCE:
-                    self._failed(way, sock, carrier.association.ended or "no answer")
-            for sock, (carrier, until) in list(way.old.items()):
+        for path in self._paths:
+            for sock, session in list(path.attempts.items()):
+                session.dtls.tick(now)
+                if session.dtls.ended or now - session.dtls.started > HANDSHAKE_TIMEOUT_S:
+                    self._abandon(path, sock, session.dtls.ended or "no answer")
+            for sock, (session, until) in list(path.replaced.items()):
                 if now > until:
-                    del way.old[sock]
-                    self._shut(way, sock, carrier)
-            if (current := way.carrier) is not None and current.association.ended and way.sock is not None:
-                self.bundle.detach(current)
-                self._shut(way, way.sock, current)
-                way.carrier = way.sock = None
-            if self._wanted(way, now):
-                self._attempt(way, now)
-        self.bundle.tick(now)
+                    del path.replaced[sock]
+                    self._close_session(path, sock, session)
+            if (current := path.session) is not None and current.dtls.ended and path.sock is not None:
+                self.connection.detach(current)
+                self._close_session(path, path.sock, current)
+                path.session = path.sock = None
+            if self._is_due(path, now):
+                self._start_attempt(path, now)
+        self.connection.tick(now)
 
-    def _wanted(self, way: _Way, now: float) -> bool:
-        """Whether a new association is to be tried for."""
-        if len(way.attempts) >= ATTEMPTS or now - way.tried < APART:
+    def _is_due(self, path: _Path, now: float) -> bool:
+        """Whether to attempt a new session."""
+        if len(path.attempts) >= ATTEMPTS_MAX or now - path.last_attempt < RECONNECT_PERIOD_S:
             return False
-        one = way.carrier
-        return one is None or not one.up(now) or now - one.association.began > self._renew
+        one = path.session
+        return one is None or not one.up(now) or now - one.dtls.started > self._renew
 
-    def _attempt(self, way: _Way, now: float) -> None:
-        way.tried = now
+    def _start_attempt(self, path: _Path, now: float) -> None:
+        path.last_attempt = now
         try:
-            sock = way.link.socket(way.remote)
+            sock = path.link.socket(path.remote)
         except OSError as error:
-            if way.carrier is None:
-                self.bundle.known(way.name, f"{way.link.local}: {os.strerror(error.errno or 0)}".removeprefix(": "))
+            if path.session is None:
+                reason = f"{path.link.local}: {os.strerror(error.errno or 0)}".removeprefix(": ")
+                self.connection.report_down(path.name, reason)
             return
-        put = _putter(sock, self.bundle)
-        channel = Channel(self._context, client=True, accepts=self._peer.__eq__, address=shown(way.remote))
-        association = Association(channel, put, self.bundle.counter, now)
-        carrier = Carrier(way.name, association, put, shown(sock.getsockname()), shown(way.remote))
-        self._of[sock], way.attempts[sock] = way, carrier
-        self._reader.add(sock)
-        association.dial(now)
+        send = _sender(sock, self.connection)
+        channel = Channel(self._context, client=True, accepts=self._peer.__eq__, address=format_address(path.remote))
+        dtls = DtlsSession(channel, send, self.connection.counter, now)
+        session = LinkSession(path.name, dtls, send, format_address(sock.getsockname()), format_address(path.remote))
+        self._path_of[sock], path.attempts[sock] = path, session
+        self._reactor.add(sock)
+        dtls.start_handshake(now)
 
     def _close(self) -> None:
-        def all_() -> None:
-            for way in self._ways:
-                for carrier in (way.carrier, *way.attempts.values(), *(one for one, _ in way.old.values())):
-                    if carrier is not None:
-                        carrier.association.close()
-                        self.bundle.detach(carrier)
+        def close_all() -> None:
+            for path in self._paths:
+                for session in (path.session, *path.attempts.values(), *(one for one, _ in path.replaced.values())):
+                    if session is not None:
+                        session.dtls.close()
+                        self.connection.detach(session)
 
-        self._reader.soon(all_)
-        self._reader.end()
+        self._reactor.call_soon(close_all)
+        self._reactor.end()
 
 
-def _putter(sock: socket.socket, bundle: Bundle) -> Callable[[bytes], None]:
-    def put(data: bytes) -> None:
+def _sender(sock: socket.socket, connection: MultipathConnection) -> Callable[[bytes], None]:
+    def send(data: bytes) -> None:
         try:
             sock.send(data)
-        except OSError:  # the queue is full, or there is no way at present: lost, as on any network
-            bundle.counter["unsent"] += 1
+        except OSError:  # the send queue is full, or there is no route at present: the datagram is lost
+            connection.counter["unsent"] += 1
 
-    return put
+    return send
 
 
 def _is_address(text: str) -> bool:

@@ -1,4 +1,4 @@
-"""A translator at work: orders come by UDP, the vehicle is told every period, and stands where no orders come."""
+"""Server of a vehicle adapter: receives orders over UDP, controls the vehicle each period, stops it without orders."""
 
 from __future__ import annotations
 
@@ -18,53 +18,64 @@ from scan2sim.pipeline.core.step import Params
 from scan2sim.services.loopback import require_protection
 from scan2sim.services.teleoperation.control.controls import STOP
 from scan2sim.services.teleoperation.control.messages import Malformed
-from scan2sim.services.teleoperation.control.safety import LIMIT_MS
-from scan2sim.services.teleoperation.vehicle.adapter_protocol import LARGEST, PERIOD_MS, PORT, Order, TranslatorEnd
-from scan2sim.services.teleoperation.vehicle.adapters import Unreachable, Vehicle
+from scan2sim.services.teleoperation.control.safety import COMMAND_MAX_AGE_MS
+from scan2sim.services.teleoperation.vehicle.adapter_protocol import (
+    ADAPTER_PERIOD_MS,
+    ADAPTER_PORT,
+    PACKET_MAX_BYTES,
+    AdapterEndpoint,
+    Order,
+)
+from scan2sim.services.teleoperation.vehicle.adapters import Vehicle, VehicleUnreachable
 
-AT_ONCE = 64
-"""Packets that are looked at in a period, at most: who floods the translator doesn't keep it from the vehicle."""
-SHORTEST_KEY = 16
-"""Bytes."""
+PACKETS_PER_PERIOD_MAX = 64
+"""Maximum number of packets processed in a period, so that a flood can't delay the vehicle's control."""
+KEY_MIN_BYTES = 16
+"""Minimum length of the shared key."""
 
 
 def read_key(path: Path | None) -> bytes:
-    """What car unit and translator both know; b"": they trust their wire.
+    """Key shared by onboard unit and adapter; b"": packets are not authenticated.
 
     Raises:
-        InputError: the file can't be read, or is too short.
+        InputError: the file can't be read, or the key is too short.
     """
     if path is None:
         return b""
     try:
         key = path.read_bytes().strip()
     except OSError as error:
-        raise InputError(path, str(error.strerror), "Make one for both: openssl rand -hex 32") from None
-    if len(key) < SHORTEST_KEY:
-        raise InputError(path, f"holds {len(key)} bytes", "Make one for both: openssl rand -hex 32")
+        raise InputError(path, str(error.strerror), "Create a key for both: openssl rand -hex 32") from None
+    if len(key) < KEY_MIN_BYTES:
+        cause = f"contains a key of only {len(key)} bytes; at least {KEY_MIN_BYTES} are needed"
+        raise InputError(path, cause, "Create a key for both: openssl rand -hex 32")
     return key
 
 
-class TranslateParams(Params):
-    """Options of every translator.
+class AdapterParams(Params):
+    """Settings common to all vehicle adapters.
 
     Raises:
-        SettingError: it would listen beyond the loopback without a key.
+        SettingError: it would listen on other than loopback addresses without a key.
     """
 
     host: Annotated[
-        str, Field(description="Address to listen on for the car unit; any but 127.0.0.1 and ::1 needs --key.")
+        str, Field(description="Address to listen on for the onboard unit; any but 127.0.0.1 and ::1 requires --key.")
     ] = "127.0.0.1"
-    port: Annotated[int, Field(ge=0, le=65535, description="UDP port to listen on; 0 for any that is free.")] = PORT
+    port: Annotated[int, Field(ge=0, le=65535, description="UDP port to listen on; 0: any free port.")] = ADAPTER_PORT
     key: Annotated[
-        File | None, Field(description="File with a key that car unit and translator share; a must off this machine.")
+        File | None,
+        Field(description="File with the key shared with the onboard unit; required when listening beyond loopback."),
     ] = None
     limit: Annotated[
-        float, Field(ge=20, le=5000, description="Milliseconds after which a command is old, and the vehicle stops.")
-    ] = LIMIT_MS
+        float,
+        Field(
+            ge=20, le=5000, description="Maximum age of a command, milliseconds; without a newer one the vehicle stops."
+        ),
+    ] = COMMAND_MAX_AGE_MS
     period: Annotated[
-        float, Field(ge=1, le=1000, description="Milliseconds from telling the vehicle what to do to the next time.")
-    ] = PERIOD_MS
+        float, Field(ge=1, le=1000, description="Interval at which controls are sent to the vehicle, milliseconds.")
+    ] = ADAPTER_PERIOD_MS
 
     @model_validator(mode="after")
     def _is_protected(self) -> Self:
@@ -72,19 +83,19 @@ class TranslateParams(Params):
         return self
 
 
-class Translating:
-    """Listens to a car unit, and tells a vehicle.
+class AdapterServer:
+    """Receives orders of an onboard unit, and controls a vehicle.
 
     Attributes:
-        end: what decides; address: where it listens.
-        malformed: packets that were no orders.
+        endpoint: decides which orders are obeyed; address: where it listens.
+        malformed: number of packets that were not orders.
 
     Raises:
-        SettingError: it can't listen there.
+        SettingError: it can't listen on this address.
     """
 
-    def __init__(self, vehicle: Vehicle, params: TranslateParams) -> None:
-        self.end = TranslatorEnd(params.limit)
+    def __init__(self, vehicle: Vehicle, params: AdapterParams) -> None:
+        self.endpoint = AdapterEndpoint(params.limit)
         self.malformed = 0
         self._vehicle, self._period, self._key = vehicle, params.period / 1000, read_key(params.key)
         family = socket.AF_INET6 if ":" in params.host else socket.AF_INET
@@ -93,60 +104,60 @@ class Translating:
             self._socket.bind((params.host, params.port))
         except OSError as error:
             self._socket.close()
-            where = f"{params.host}:{params.port}"
-            raise SettingError("--port", f"{where} can't be listened on: {error.strerror}", "Name another") from None
+            cause = f"can't listen on {params.host}:{params.port}: {error.strerror}"
+            raise SettingError("--port", cause, "Choose another host or port") from None
         self.address: tuple[str, int] = self._socket.getsockname()[:2]
 
-    def run(self, ended: threading.Event, say: Callable[[str], None] = lambda _: None) -> None:
-        """Work until it is ended; whatever happens, the vehicle is told to stand in the end.
+    def run(self, ended: threading.Event, notify: Callable[[str], None] = lambda _: None) -> None:
+        """Run until `ended` is set; stops the vehicle at the end, whatever happens.
 
         Args:
-            say: is told when the vehicle stops, and why, and when it drives.
+            notify: called when the vehicle stops, with the reason, and when it drives.
         """
-        told, due = "", time.monotonic()
+        reported, due = "", time.monotonic()
         try:
             while not ended.is_set():
                 due = max(due + self._period, time.monotonic())
                 self._listen(due)
-                self._tell()
-                safety = self.end.safety
-                news = f"stands: {safety.reason}" if safety.standing else "drives"
-                if news != told:
-                    say(told := news)
+                self._control()
+                safety = self.endpoint.safety
+                state = f"is stopped: {safety.reason}" if safety.standing else "drives"
+                if state != reported:
+                    notify(reported := state)
         finally:
-            with contextlib.suppress(Unreachable):
+            with contextlib.suppress(VehicleUnreachable):
                 self._vehicle.obey(STOP)
             self._vehicle.close()
             self._socket.close()
 
     def _listen(self, until: float) -> None:
-        """Take orders and answer them until the next period begins."""
-        for _ in range(AT_ONCE):
+        """Receive orders and answer them until the next period begins."""
+        for _ in range(PACKETS_PER_PERIOD_MAX):
             self._socket.settimeout(max(until - time.monotonic(), 0.0001))
             try:
-                packet, peer = self._socket.recvfrom(LARGEST + 1)
+                packet, peer = self._socket.recvfrom(PACKET_MAX_BYTES + 1)
             except TimeoutError:
                 return
-            except OSError:  # of an answer before, whom nobody took
+            except OSError:  # ICMP error after an earlier answer
                 continue
             try:
                 order = Order.unpack(packet, self._key)
             except Malformed:
                 self.malformed += 1
                 continue
-            self.end.hear(order, time.monotonic_ns())
-            answer = self.end.answer(self._vehicle.state(), time.monotonic_ns())
-            with contextlib.suppress(OSError):  # the car unit is gone: it is silent soon
+            self.endpoint.receive(order, time.monotonic_ns())
+            answer = self.endpoint.answer(self._vehicle.state(), time.monotonic_ns())
+            with contextlib.suppress(OSError):  # the onboard unit is gone; its orders time out
                 self._socket.sendto(answer.pack(self._key), peer)
         time.sleep(max(until - time.monotonic(), 0))
 
-    def _tell(self) -> None:
-        """Tell the vehicle; what can't be told is a stop, and the answers say so."""
-        safety = self.end.safety
+    def _control(self) -> None:
+        """Send controls to the vehicle; if it is unreachable this is a stop, which the answers report."""
+        safety = self.endpoint.safety
         try:
-            self._vehicle.obey(self.end.check(time.monotonic_ns()))
-        except Unreachable as error:
-            safety.hindrance = str(error)
+            self._vehicle.obey(self.endpoint.check(time.monotonic_ns()))
+        except VehicleUnreachable as error:
+            safety.blocked_by = str(error)
             safety.halt(str(error))
         else:
-            safety.hindrance = ""
+            safety.blocked_by = ""

@@ -1,4 +1,4 @@
-"""A vehicle: its car unit, its cameras and its links, as a party of the gateway's; `serve` is the command."""
+"""A vehicle: onboard unit, cameras and links, controlled by orders of the gateway; `serve` is the command."""
 
 from __future__ import annotations
 
@@ -12,101 +12,109 @@ from scan2sim.pipeline.io.worlds.scene import read_scene
 from scan2sim.services.credentials import redacted
 from scan2sim.services.teleoperation import cameras, encoders
 from scan2sim.services.teleoperation.cameras import Camera, Mount, View
-from scan2sim.services.teleoperation.control.messages import Kind, Message, Report, Stream
-from scan2sim.services.teleoperation.gateway.client import Membership
+from scan2sim.services.teleoperation.control.messages import Kind, Message, VideoReport, VideoStream
+from scan2sim.services.teleoperation.gateway.client import GatewayConnection
 from scan2sim.services.teleoperation.gateway.identity import Identity, Peer, Role
-from scan2sim.services.teleoperation.gateway.protocol import Driving, Hello, Join, Refused, Release, Status
-from scan2sim.services.teleoperation.settings import GATEWAY, VehicleParams, address
-from scan2sim.services.teleoperation.sim.bicycle import Ground, Place
-from scan2sim.services.teleoperation.transport.link_stats import Rates
-from scan2sim.services.teleoperation.transport.multipath import Bundle, Policy
-from scan2sim.services.teleoperation.transport.vehicle_side import Link, dial
-from scan2sim.services.teleoperation.vehicle.onboard_unit import CarParams, CarUnit
-from scan2sim.services.teleoperation.video.capture import Coder, Streamer
-from scan2sim.services.teleoperation.video.rate_control import Adapting, Bounds, Plan
-from scan2sim.services.teleoperation.video.srtp_session import Keys, lasting
+from scan2sim.services.teleoperation.gateway.protocol import CurrentPair, Hello, Join, Release, RequestRefused, Status
+from scan2sim.services.teleoperation.settings import GATEWAY_PORT, VehicleParams, parse_address
+from scan2sim.services.teleoperation.sim.bicycle import Ground, PoseTracker
+from scan2sim.services.teleoperation.transport.link_stats import LinkRates
+from scan2sim.services.teleoperation.transport.multipath import MultipathConnection, Policy
+from scan2sim.services.teleoperation.transport.vehicle_side import Link, connect_station
+from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardParams, OnboardUnit
+from scan2sim.services.teleoperation.video.capture import CameraEncoder, CameraStreamer
+from scan2sim.services.teleoperation.video.rate_control import BitrateBounds, EncodingPlan, RateController
+from scan2sim.services.teleoperation.video.srtp_session import KeySchedule, key_lifetime
 
-FASTEST = 60.0
-"""Pictures a second of a camera, at most."""
-TOLD = 0.5
-"""Seconds between two tellings of the video's keys, which may be lost."""
+CAMERA_FPS_MAX = 60.0
+"""Maximum frame rate of a camera."""
+KEY_PERIOD_S = 0.5
+"""Interval at which keys of the video encryption are sent; repeated since messages may be lost."""
 
 
-class Sent:
-    """A camera's video on its way to a station; see `car.Sender`."""
+class CameraSender:
+    """Sends a camera's video to a station; see `onboard_unit.VideoSender`."""
 
-    def __init__(self, number: int, camera: Camera, keys: Keys, bundle: Bundle, policy: Policy, bounds: Bounds) -> None:
-        """Begins at once."""
-        self._coder = Coder(number, keys, encoders.find())
-        self._adapting = Adapting(bounds, Plan(min(Plan().bitrate, bounds.highest)))
-        self._camera, self._bundle = camera, bundle
+    def __init__(
+        self,
+        number: int,
+        camera: Camera,
+        keys: KeySchedule,
+        connection: MultipathConnection,
+        policy: Policy,
+        bounds: BitrateBounds,
+    ) -> None:
+        """Start sending."""
+        self._encoder = CameraEncoder(number, keys, encoders.find())
+        self._rate_controller = RateController(bounds, EncodingPlan(min(EncodingPlan().bitrate, bounds.highest)))
+        self._camera, self._connection = camera, connection
 
-        def sent(packets: Sequence[bytes]) -> None:
+        def send(packets: Sequence[bytes]) -> None:
             for packet in packets:
-                bundle.send_media(packet, policy)
+                connection.send_media(packet, policy)
 
-        self._streamer = Streamer(number, camera, self._coder, sent, self._adapting.plan)
+        self._streamer = CameraStreamer(number, camera, self._encoder, send, self._rate_controller.plan)
 
     @property
-    def stream(self) -> Stream:
-        """What the station is told of it."""
+    def stream(self) -> VideoStream:
+        """Description of the stream for the station."""
         return self._streamer.stream
 
     @property
     def fault(self) -> str:
-        """Why there are no pictures; nothing: there are."""
-        return self._streamer.fault or (self._camera.fault if self._camera.gone else "")
+        """Why there is no video; empty: there is."""
+        return self._streamer.fault or (self._camera.fault if self._camera.offline else "")
 
-    def want_key(self) -> None:
-        """Send a key frame next."""
-        self._coder.want_key()
+    def request_key_frame(self) -> None:
+        """Make the next frame a key frame."""
+        self._encoder.request_key_frame()
 
-    def send_again(self, source: int, sequences: Sequence[int]) -> None:
-        """Send packets again that didn't come, over all links."""
-        for packet in self._coder.again(source, sequences):
-            self._bundle.send_media(packet)
+    def retransmit(self, source: int, sequences: Sequence[int]) -> None:
+        """Retransmit missing packets over all links."""
+        for packet in self._encoder.retransmit(source, sequences):
+            self._connection.send_media(packet)
 
-    def adapt(self, report: Report) -> None:
-        """Follow what the links carry."""
-        width, height = self._coder.size
-        self._streamer.plan = self._adapting.follow(report, width, height)
+    def adapt(self, report: VideoReport) -> None:
+        """Adapt the bit rate to what the links carry."""
+        width, height = self._encoder.size
+        self._streamer.plan = self._rate_controller.update(report, width, height)
 
     def close(self) -> None:
-        """Send no more."""
+        """Stop sending."""
         self._streamer.close()
 
 
 class Vehicle:
-    """A party of the gateway's (see `membership.Party`), from its making to `close`."""
+    """A vehicle; implements `Party` for the gateway connection, from creation to `close`."""
 
     def __init__(
         self,
         identity: Identity,
-        unit: CarUnit,
+        unit: OnboardUnit,
         links: Sequence[Link],
         cameras: Mapping[str, Camera],
         policy: Policy,
-        bounds: Bounds,
+        bounds: BitrateBounds,
     ) -> None:
-        """Of a car unit that runs.
+        """Start with a running onboard unit.
 
         Args:
-            links: that a station is dialled over.
-            cameras: by name; the first is what a driver sees largest.
-            policy: of the video: over all links, or in turn.
+            links: links to the station.
+            cameras: by name; the driver page shows the first one largest.
+            policy: whether video packets go over all links, or over one in turn.
             bounds: of each camera's bit rate.
         """
         self._identity, self._unit, self._links = identity, unit, tuple(links)
         self._cameras, self._policy, self._bounds = dict(cameras), policy, bounds
         self._lock = threading.Lock()
-        self._driving: Driving | None = None
-        self._bundle: Bundle | None = None
-        self._sent: list[Sent] = []
-        self._keys: Keys | None = None
-        self._rates = Rates()
+        self._driving: CurrentPair | None = None
+        self._connection: MultipathConnection | None = None
+        self._senders: list[CameraSender] = []
+        self._keys: KeySchedule | None = None
+        self._rates = LinkRates()
         self._ended = threading.Event()
-        self._teller = threading.Thread(target=self._tell_keys, name="keys of the video", daemon=True)
-        self._teller.start()
+        self._key_thread = threading.Thread(target=self._send_keys, name="video keys", daemon=True)
+        self._key_thread.start()
 
     def hello(self) -> Hello:
         """See `Party`."""
@@ -115,20 +123,20 @@ class Vehicle:
     def status(self) -> Status:
         """See `Party`."""
         with self._lock:
-            driving, bundle = self._driving, self._bundle
-        if driving is None or bundle is None:
+            driving, connection = self._driving, self._connection
+        if driving is None or connection is None:
             return Status(speed=self._unit.car.vehicle().speed)
-        told = self._unit.car.telemetry(time.monotonic_ns())
-        reason = told.reason if told.standing else "; ".join(told.vehicle.faults)
+        telemetry = self._unit.car.telemetry(time.monotonic_ns())
+        reason = telemetry.reason if telemetry.standing else "; ".join(telemetry.vehicle.faults)
         return Status(
-            pair=driving.pair, links=self._rates.links(bundle), driving=not told.standing, told=reason[:200],
-            speed=told.vehicle.speed, age=told.age,
+            pair=driving.pair, links=self._rates.links(connection), driving=not telemetry.standing, told=reason[:200],
+            speed=telemetry.vehicle.speed, age=telemetry.age,
         )  # fmt: skip
 
-    def obey(self, order: Join | Release | Refused) -> None:
+    def handle_order(self, order: Join | Release | RequestRefused) -> None:
         """See `Party`."""
         if isinstance(order, Join):
-            driving = Driving(pair=order.pair, other=order.other.name)
+            driving = CurrentPair(pair=order.pair, other=order.other.name)
             if driving != self._driving:
                 self._leave("another driver joins")
                 self._join(order, driving)
@@ -136,101 +144,104 @@ class Vehicle:
             self._leave(order.why or "it was released")
 
     def alive(self) -> bool:
-        """Whether its threads live."""
-        return self._teller.is_alive() and self._unit.failed is None
+        """Whether its threads are alive."""
+        return self._key_thread.is_alive() and self._unit.failed is None
 
     def close(self) -> None:
-        """Leave the station; the vehicle stands."""
+        """Disconnect from the station; the vehicle stops."""
         self._ended.set()
-        self._leave("the car unit ends")
-        self._teller.join(2.0)
+        self._leave("the onboard unit ends")
+        self._key_thread.join(2.0)
         self._unit.close()
         for camera in self._cameras.values():
             camera.close()
 
-    def _join(self, order: Join, driving: Driving) -> None:
+    def _join(self, order: Join, driving: CurrentPair) -> None:
         station = Peer(Role.STATION, order.other.name, order.other.fingerprint)
         addresses = [(one.host, one.port) for one in order.listening]
-        keys = Keys(time.monotonic(), lasting(self._bounds.highest, FASTEST))
+        keys = KeySchedule(time.monotonic(), key_lifetime(self._bounds.highest, CAMERA_FPS_MAX))
 
-        def dialled(received: Callable[[Message], None], began: Callable[[], None]) -> Bundle:
-            bundle = dial(self._identity, station, self._links, addresses, received=received, began=began)
-            self._sent = [
-                Sent(number, camera, keys, bundle, self._policy, self._bounds)
+        def connect(received: Callable[[Message], None], restarted: Callable[[], None]) -> MultipathConnection:
+            connection = connect_station(
+                self._identity, station, self._links, addresses, received=received, restarted=restarted
+            )
+            self._senders = [
+                CameraSender(number, camera, keys, connection, self._policy, self._bounds)
                 for number, camera in enumerate(self._cameras.values())
             ]
             with self._lock:
-                self._driving, self._bundle, self._keys = driving, bundle, keys
-            return bundle
+                self._driving, self._connection, self._keys = driving, connection, keys
+            return connection
 
-        self._unit.join(dialled, lambda _: self._sent)
+        self._unit.join(connect, lambda _: self._senders)
 
-    def _leave(self, why: str) -> None:
+    def _leave(self, reason: str) -> None:
         with self._lock:
-            self._driving = self._bundle = self._keys = None
-        self._unit.release(why)
-        for one in self._sent:
+            self._driving = self._connection = self._keys = None
+        self._unit.release(reason)
+        for one in self._senders:
             one.close()
-        self._sent = []
+        self._senders = []
 
-    def _tell_keys(self) -> None:
-        while not self._ended.wait(TOLD):
+    def _send_keys(self) -> None:
+        while not self._ended.wait(KEY_PERIOD_S):
             with self._lock:
-                bundle, keys = self._bundle, self._keys
-            if bundle is not None and keys is not None:
-                for key in keys.told(time.monotonic()):
-                    bundle.send(Kind.KEY, key.pack())
+                connection, keys = self._connection, self._keys
+            if connection is not None and keys is not None:
+                for key in keys.announced(time.monotonic()):
+                    connection.send(Kind.VIDEO_KEY, key.pack())
 
 
-def serve(params: VehicleParams, ended: threading.Event, say: Callable[[str], None]) -> None:
-    """Be a vehicle until that is ended; `say` is told what happens.
+def serve(params: VehicleParams, ended: threading.Event, notify: Callable[[str], None]) -> None:
+    """Run a vehicle until `ended` is set; `notify` is called with progress messages.
 
     Raises:
-        ScanError: its certificate can't be read, a link or camera is none, or a thread has failed.
+        ScanError: the certificate can't be read, a link or camera is not valid, or a thread has failed.
     """
     identity = Identity.read(params.certificates, Role.VEHICLE)
-    gateway = address("GATEWAY", params.gateway, GATEWAY)
-    links = [Link(*_named("--link", text)) for text in params.link] or [Link("one")]
-    unit = CarUnit(CarParams(translator=params.translator, key=params.key, limit=params.limit))
-    filmed = {name: _camera(name, source, params, unit) for name, source in _cameras(params)}
-    bounds = Bounds(highest=round(params.bitrate * 1e6))
+    gateway = parse_address("GATEWAY", params.gateway, GATEWAY_PORT)
+    links = [Link(*_parse_named("--link", text)) for text in params.link] or [Link("one")]
+    unit = OnboardUnit(OnboardParams(translator=params.translator, key=params.key, limit=params.limit))
+    cameras_by_name = {name: _camera(name, source, params, unit) for name, source in _cameras(params)}
+    bounds = BitrateBounds(highest=round(params.bitrate * 1e6))
     policy = Policy.SHARE if params.share else Policy.COPY
-    vehicle = Vehicle(identity, unit, links, filmed, policy, bounds)
-    membership = Membership(identity, gateway, vehicle, say)
-    say(f"{identity.me} drives by the translator at {params.translator}; Ctrl-C ends it")
+    vehicle = Vehicle(identity, unit, links, cameras_by_name, policy, bounds)
+    gateway_connection = GatewayConnection(identity, gateway, vehicle, notify)
+    notify(f"{identity.me} is controlled by the vehicle adapter at {params.translator}; Ctrl-C ends it")
     try:
         while not ended.wait(0.5):
             if not vehicle.alive():
-                raise StepError(str(identity.me), f"has failed ({unit.failed})", "It stands; start it again")
+                raise StepError(str(identity.me), f"has failed ({unit.failed})", "The vehicle is stopped; restart it")
     finally:
-        membership.close()
+        gateway_connection.close()
         vehicle.close()
 
 
-def _named(option: str, text: str) -> tuple[str, str]:
+def _parse_named(option: str, text: str) -> tuple[str, str]:
     name, _, rest = text.partition("=")
     if not name or not rest or len(name) > 60:
-        raise SettingError(option, f"{redacted(text):.80} is no NAME=VALUE", "`--help` says what it means")
+        raise SettingError(option, f"{redacted(text):.80} is not NAME=VALUE", "See `--help` for the format")
     return name, rest
 
 
 def _cameras(params: VehicleParams) -> list[tuple[str, str]]:
-    named = [_named("--camera", text) for text in params.camera]
+    named = [_parse_named("--camera", text) for text in params.camera]
     if len({name for name, _ in named}) < len(named):
-        raise SettingError("--camera", "names two alike", "Give each a name of its own")
+        raise SettingError("--camera", "two cameras have the same name", "Give each camera a unique name")
     return named
 
 
-def _camera(name: str, source: str, params: VehicleParams, unit: CarUnit) -> Camera:
-    """A camera of KIND:WHERE."""
-    kind, _, where = source.partition(":")
-    view = View(where, *params.size, params.rate)
+def _camera(name: str, source: str, params: VehicleParams, unit: OnboardUnit) -> Camera:
+    """Camera from KIND:WHERE."""
+    kind, _, location = source.partition(":")
+    view = View(location, *params.size, params.rate)
     if kind == "world":
-        where, _, turn = where.rpartition("@") if "@" in where else (where, "", "0")
+        location, _, yaw = location.rpartition("@") if "@" in location else (location, "", "0")
         try:
-            mount = Mount(yaw=float(turn))
+            mount = Mount(yaw=float(yaw))
         except ValueError:
-            raise SettingError("--camera", f"{turn!r} are no degrees", "Write it as left=world:DIR@90") from None
-        place = Place(Ground(read_scene(Path(where))))
-        view = view._replace(where=where, mount=mount, pose=lambda: place(unit.car.vehicle()))
-    return Camera(name, lambda: cameras.pictures(kind, view))
+            cause = f"{yaw!r} is not a number of degrees"
+            raise SettingError("--camera", cause, "Write it as left=world:DIR@90") from None
+        pose_tracker = PoseTracker(Ground(read_scene(Path(location))))
+        view = view._replace(location=location, mount=mount, pose=lambda: pose_tracker(unit.car.vehicle()))
+    return Camera(name, lambda: cameras.frames(kind, view))

@@ -1,7 +1,7 @@
-"""The car unit: obeys the joined station's commands by `safety`, tells the translator, and tells the station.
+"""The onboard unit: obeys the joined station's commands by the safety rules, controls the vehicle through its adapter.
 
-`Car` is what it knows and decides; `CarUnit` has the threads around it. The watchdog has one of its own, on the
-monotonic clock, in which nothing waits: neither for the network, nor for pictures.
+`OnboardController` has state and decisions; `OnboardUnit` has the threads around it, and sends telemetry to the
+station. The watchdog has its own thread, on the monotonic clock, in which nothing waits for network or video.
 """
 
 from __future__ import annotations
@@ -24,200 +24,215 @@ from scan2sim.pipeline.core.parameters import File
 from scan2sim.pipeline.core.step import Params
 from scan2sim.services.teleoperation.control.controls import VehicleState
 from scan2sim.services.teleoperation.control.messages import (
-    LARGEST,
+    MESSAGE_MAX_BYTES,
     Command,
+    KeyFrameRequest,
     Kind,
-    Lacking,
     Malformed,
     Message,
-    Report,
-    Stream,
-    Streams,
+    Nack,
     Telemetry,
-    Wanted,
+    VideoReport,
+    VideoStream,
+    VideoStreams,
 )
-from scan2sim.services.teleoperation.control.safety import LIMIT_MS, MS, Safety
+from scan2sim.services.teleoperation.control.safety import COMMAND_MAX_AGE_MS, NS_PER_MS, SafetyMonitor
 from scan2sim.services.teleoperation.vehicle.adapter import read_key
-from scan2sim.services.teleoperation.vehicle.adapter_protocol import LARGEST as LARGEST_ANSWER
-from scan2sim.services.teleoperation.vehicle.adapter_protocol import PERIOD_MS, PORT, Answer, CarEnd, Order
+from scan2sim.services.teleoperation.vehicle.adapter_protocol import (
+    ADAPTER_PERIOD_MS,
+    ADAPTER_PORT,
+    Answer,
+    OnboardEndpoint,
+    Order,
+)
+from scan2sim.services.teleoperation.vehicle.adapter_protocol import PACKET_MAX_BYTES as ANSWER_MAX_BYTES
 
-WATCHED, TOLD, LISTED = 0.005, 0.02, 1.0
-"""Seconds between looks of the watchdog, telemetries, and lists of the cameras."""
-ROOM = LARGEST - 64
-"""Bytes of a message's body: the rest is its header's, and the links'."""
-SILENT = "the translator is silent"
-NOBODY, UNTIED = "nobody has joined", "the clocks aren't tied yet"
-"""Why driving can't begin; the second also why commands are dropped."""
-MALFORMED = "malformed"
+WATCHDOG_PERIOD_S, TELEMETRY_PERIOD_S, STREAMS_PERIOD_S = 0.005, 0.02, 1.0
+"""Intervals of the watchdog, of telemetry, and of the list of cameras."""
+BODY_MAX_BYTES = MESSAGE_MAX_BYTES - 64
+"""Maximum size of a message body; the rest is for headers of message and link."""
+ADAPTER_SILENT = "the vehicle adapter does not respond"
+NO_STATION, CLOCKS_UNKNOWN = "no station is joined", "the clocks are not synchronized yet"
+"""Reasons for which driving can't begin."""
+DROP_CLOCKS_UNKNOWN, MALFORMED = "the clocks aren't tied yet", "malformed"
+"""Further reasons for which messages are dropped; keys of `Telemetry.dropped`."""
 
 
-class CarParams(Params):
-    """Of a car unit's way to its translator."""
+class OnboardParams(Params):
+    """Settings of an onboard unit's connection to its vehicle adapter."""
 
-    translator: Annotated[str, Field(description="Host and UDP port of the vehicle's translator.")] = (
-        f"127.0.0.1:{PORT}"
+    translator: Annotated[str, Field(description="HOST:PORT (UDP) of the vehicle adapter (`teleop translate`).")] = (
+        f"127.0.0.1:{ADAPTER_PORT}"
     )
-    key: Annotated[File | None, Field(description="File with the key that car unit and translator share.")] = None
+    key: Annotated[File | None, Field(description="File with the key shared with the vehicle adapter.")] = None
     limit: Annotated[
-        float, Field(ge=20, le=5000, description="Milliseconds after which a command is old, and the vehicle stops.")
-    ] = LIMIT_MS
+        float,
+        Field(
+            ge=20, le=5000, description="Maximum age of a command, milliseconds; without a newer one the vehicle stops."
+        ),
+    ] = COMMAND_MAX_AGE_MS
 
     def address(self) -> tuple[str, int]:
-        """Of the translator.
+        """Host and port of the adapter.
 
         Raises:
-            SettingError: it is none.
+            SettingError: the setting is not HOST:PORT.
         """
         host, colon, port = self.translator.rpartition(":")
         if not colon or not port.isdecimal() or not 0 < int(port) < 65536:
-            raise SettingError("translator", f"{self.translator!r} is no address", "Write it as 127.0.0.1:7447")
+            raise SettingError("translator", f"{self.translator!r} is not HOST:PORT", "Write it as 127.0.0.1:7447")
         return host.strip("[]"), int(port)
 
 
-class Clocks(Protocol):
-    """What is known of the station's clock (`clocks`)."""
+class StationClock(Protocol):
+    """Offset of the station's clocks (`clock_sync.ClockSync`)."""
 
     @property
     def known(self) -> bool:
-        """Whether there was an exchange."""
+        """Whether the offset is known."""
 
     @property
     def uncertainty_ms(self) -> float:
-        """Of what is known."""
+        """Maximum error of the offset, ms."""
 
     @property
     def wall_apart_s(self) -> float:
-        """Seconds between the wall clocks."""
+        """Station's wall clock minus ours, seconds."""
 
     @property
     def wall_wrong(self) -> bool:
-        """Whether one of those must be wrong."""
+        """Whether one of the wall clocks is wrong."""
 
     def age_ms(self, sent: int) -> float:
-        """Since a stamp of the station's; infinite while nothing is known."""
+        """Age of a timestamp of the station, ms; infinite while the offset is unknown."""
 
 
-class Bundle(Protocol):
-    """All links to the station (`bundle`)."""
+class StationConnection(Protocol):
+    """Connection to the station (`multipath.MultipathConnection`)."""
 
     @property
     def clocks(self) -> Any:
-        """`Clocks`."""
+        """`StationClock`."""
 
     def send(self, kind: Kind, body: bytes) -> int:
-        """Over all links; never waits."""
+        """Send over all links; never blocks."""
 
     def close(self) -> None:
-        """Hang up."""
+        """Disconnect."""
 
 
-class Sender(Protocol):
-    """Sends a camera's video."""
+class VideoSender(Protocol):
+    """Sends a camera's video to the station."""
 
     @property
-    def stream(self) -> Stream:
-        """What the station is told of it."""
+    def stream(self) -> VideoStream:
+        """Description of the stream for the station."""
 
     @property
     def fault(self) -> str:
-        """What is wrong with it, in words; "": nothing."""
+        """Why there is no video; "": there is."""
 
-    def want_key(self) -> None:
-        """Send a key frame next."""
+    def request_key_frame(self) -> None:
+        """Make the next frame a key frame."""
 
-    def send_again(self, source: int, sequences: Sequence[int]) -> None:
-        """Send packets again that didn't come."""
+    def retransmit(self, source: int, sequences: Sequence[int]) -> None:
+        """Retransmit missing packets."""
 
-    def adapt(self, report: Report) -> None:
-        """Follow what the links carry."""
+    def adapt(self, report: VideoReport) -> None:
+        """Adapt the bit rate to what the links carry."""
 
 
-class Car:
-    """What a car unit knows and decides; may be called from any thread. Times: nanoseconds of the monotonic clock.
+class OnboardController:
+    """State and decisions of an onboard unit; thread-safe. Times: nanoseconds of the monotonic clock.
 
-    Nothing foreign is called while the lock is held, so that nothing foreign keeps the watchdog waiting.
+    While the lock is held no code outside this module is called, since it could block the watchdog.
 
     Attributes:
-        safety: which commands are obeyed.
-        end: what is known of the translator.
+        safety: decides which commands are obeyed.
+        endpoint: endpoint of the protocol with the vehicle adapter.
     """
 
-    def __init__(self, limit_ms: float = LIMIT_MS) -> None:
-        self.safety, self.end = Safety(limit_ms), CarEnd(limit_ms)
+    def __init__(self, limit_ms: float = COMMAND_MAX_AGE_MS) -> None:
+        self.safety, self.endpoint = SafetyMonitor(limit_ms), OnboardEndpoint(limit_ms)
         self._lock = threading.Lock()
         self._session: object | None = None
-        self._bundle: Bundle | None = None
-        self._cameras: Sequence[Sender] = ()
-        self._doubt = NOBODY
+        self._connection: StationConnection | None = None
+        self._cameras: Sequence[VideoSender] = ()
+        self._blocked_by = NO_STATION
         self._counts: Counter[str] = Counter()
 
-    def join(self, session: object, bundle: Bundle, cameras: Sequence[Sender]) -> None:
-        """Obey a station's driver, and nobody else, once that one has confirmed."""
+    def join(self, session: object, connection: StationConnection, cameras: Sequence[VideoSender]) -> None:
+        """Obey the driver of this station only, once the driver has confirmed."""
         with self._lock:
-            self._session, self._bundle, self._cameras, self._doubt = session, bundle, cameras, UNTIED
+            self._session, self._connection, self._cameras, self._blocked_by = (
+                session,
+                connection,
+                cameras,
+                CLOCKS_UNKNOWN,
+            )
             self.safety.begin(session, "another driver has joined")
 
-    def began(self, session: object) -> None:
-        """A session's station has started anew, and counts its messages from 0 again."""
+    def station_restarted(self, session: object) -> None:
+        """Handle the restart of a session's station, which counts its messages from 0 again."""
         with self._lock:
             if session is self._session:
-                self.safety.begin(session, "the station has started anew")
+                self.safety.begin(session, "the station has restarted")
 
     def release(self, reason: str) -> None:
-        """Obey nobody."""
+        """Obey no station."""
         with self._lock:
-            self._session, self._bundle, self._cameras, self._doubt = None, None, (), NOBODY
+            self._session, self._connection, self._cameras, self._blocked_by = None, None, (), NO_STATION
             self.safety.end(reason)
 
-    def hear(self, session: object, message: Message, now: int) -> None:
-        """Take a message of a session's station; of any but the joined one's, none is obeyed."""
-        bundle, cameras = self._bundle, self._cameras
+    def receive(self, session: object, message: Message, now: int) -> None:
+        """Process a message of a session's station; commands of any but the joined station are dropped."""
+        connection, cameras = self._connection, self._cameras
         try:
             if message.kind == Kind.COMMAND:
-                self._command(session, bundle, message, now)
+                self._receive_command(session, connection, message, now)
             elif session is self._session:
-                _about_video(cameras, message)
+                _handle_video_message(cameras, message)
         except Malformed:
             self._counts[MALFORMED] += 1
 
-    def answered(self, answer: Answer, now: int) -> None:
-        """Take what the translator answered."""
+    def receive_answer(self, answer: Answer, now: int) -> None:
+        """Process an answer of the vehicle adapter."""
         with self._lock:
-            stopped = self.end.hear(answer, now)
+            stopped = self.endpoint.receive(answer, now)
             if stopped:
                 self.safety.halt(stopped)
 
-    def look(self, now: int) -> Order:
-        """The watchdog's look: what to tell the translator now."""
+    def watchdog_order(self, now: int) -> Order:
+        """Run the watchdog: the order to send to the vehicle adapter now."""
         with self._lock:
-            silent = self.end.silent(now)
-            self.safety.hindrance = SILENT if silent else self._doubt
+            silent = self.endpoint.silent(now)
+            self.safety.blocked_by = ADAPTER_SILENT if silent else self._blocked_by
             if silent:
-                self.safety.halt(SILENT)
+                self.safety.halt(ADAPTER_SILENT)
             controls = self.safety.check(now)
-            return self.end.order(controls, self.safety.old(now), not self.safety.standing, now)
+            return self.endpoint.order(controls, self.safety.command_age_ms(now), not self.safety.standing, now)
 
-    def doubt(self) -> None:
-        """Look at the clocks, without which driving can't begin."""
-        bundle = self._bundle
-        doubt = NOBODY if bundle is None else self._doubts(bundle.clocks)
+    def check_clocks(self) -> None:
+        """Check clock synchronization, without which driving can't begin."""
+        connection = self._connection
+        reason = NO_STATION if connection is None else self._clock_problem(connection.clocks)
         with self._lock:
-            if bundle is self._bundle:
-                self._doubt = doubt
+            if connection is self._connection:
+                self._blocked_by = reason
 
     def vehicle(self) -> VehicleState:
-        """What the vehicle told last."""
-        answer = self.end.answer
+        """Last reported state of the vehicle."""
+        answer = self.endpoint.answer
         return answer.vehicle if answer else VehicleState()
 
     def telemetry(self, now: int) -> Telemetry:
-        """How the vehicle is; among its faults are those of what it is reached and seen by."""
-        faults = [f"the camera {one.stream.name}: {one.fault}" for one in self._cameras if one.fault]
+        """State of the vehicle and its safety; faults include those of adapter and cameras."""
+        faults = [f"camera {one.stream.name}: {one.fault}" for one in self._cameras if one.fault]
         with self._lock:
             safety, vehicle = self.safety, self.vehicle()
-            if self.end.silent(now):
-                faults.insert(0, SILENT)
-            reason = "; ".join(dict.fromkeys(filter(None, (safety.reason, safety.hindrance))))
+            if self.endpoint.silent(now):
+                faults.insert(0, ADAPTER_SILENT)
+            reason = "; ".join(dict.fromkeys(filter(None, (safety.reason, safety.blocked_by))))
             return Telemetry(
                 replace(vehicle, faults=(*faults, *vehicle.faults)),
                 safety.stop,
@@ -228,61 +243,63 @@ class Car:
                 dict(safety.dropped + self._counts),
             )
 
-    def streams(self) -> Streams:
-        """The cameras."""
-        return Streams(tuple(one.stream for one in self._cameras))
+    def streams(self) -> VideoStreams:
+        """Streams of all cameras."""
+        return VideoStreams(tuple(one.stream for one in self._cameras))
 
-    def _command(self, session: object, bundle: Bundle | None, message: Message, now: int) -> None:
+    def _receive_command(
+        self, session: object, connection: StationConnection | None, message: Message, now: int
+    ) -> None:
         command, age = Command.unpack(message.body), 0.0
-        if session is self._session and bundle is not None:
-            age = bundle.clocks.age_ms(message.sent)
+        if session is self._session and connection is not None:
+            age = connection.clocks.age_ms(message.sent)
             if not isfinite(age):
-                self._counts[UNTIED] += 1
+                self._counts[DROP_CLOCKS_UNKNOWN] += 1
                 return
         with self._lock:
-            self.safety.hear(session, message.number, command, now - round(age * MS), now)
+            self.safety.receive(session, message.number, command, now - round(age * NS_PER_MS), now)
 
-    def _doubts(self, clocks: Clocks) -> str:
+    def _clock_problem(self, clocks: StationClock) -> str:
         """Why driving can't begin; "": it can."""
         if not clocks.known:
-            return UNTIED
+            return CLOCKS_UNKNOWN
         if clocks.uncertainty_ms > self.safety.limit_ms:
-            return f"the station's clock is known to {clocks.uncertainty_ms:.0f} ms only"
+            return f"the offset of the station's clock is uncertain by {clocks.uncertainty_ms:.0f} ms"
         if clocks.wall_wrong:
-            return f"vehicle's and station's clocks are {abs(clocks.wall_apart_s):.0f} s apart: does NTP run on both?"
+            return f"the clocks of vehicle and station differ by {abs(clocks.wall_apart_s):.0f} s: check NTP on both"
         return ""
 
 
-def _about_video(cameras: Sequence[Sender], message: Message) -> None:
-    if message.kind == Kind.WANTED:
-        camera = Wanted.unpack(message.body).camera
+def _handle_video_message(cameras: Sequence[VideoSender], message: Message) -> None:
+    if message.kind == Kind.KEY_FRAME_REQUEST:
+        camera = KeyFrameRequest.unpack(message.body).camera
         for one in cameras[camera : camera + 1]:
-            one.want_key()
-    elif message.kind == Kind.LACKING:
-        lacking = Lacking.unpack(message.body)
-        camera = lacking.source & 0xFF
+            one.request_key_frame()
+    elif message.kind == Kind.NACK:
+        nack = Nack.unpack(message.body)
+        camera = nack.source & 0xFF
         for one in cameras[camera : camera + 1]:
-            one.send_again(lacking.source, lacking.sequences)
-    elif message.kind == Kind.REPORT:
-        report = Report.unpack(message.body)
+            one.retransmit(nack.source, nack.sequences)
+    elif message.kind == Kind.VIDEO_REPORT:
+        report = VideoReport.unpack(message.body)
         for one in cameras[report.camera : report.camera + 1]:
             one.adapt(report)
 
 
-Dial = Callable[[Callable[[Message], None], Callable[[], None]], Bundle]
-"""Makes the links to a station: they hand messages to the first, and call the second when it has started anew."""
+Connect = Callable[[Callable[[Message], None], Callable[[], None]], StationConnection]
+"""Connects to a station; calls the first argument with each message, and the second when the station has restarted."""
 
 
-class CarUnit:
-    """A car unit at work: `watchdog`, `translator` (its answers) and `telemetry` are its threads.
+class OnboardUnit:
+    """A running onboard unit, with the threads `watchdog`, `adapter` (its answers) and `telemetry`.
 
     Attributes:
-        car: what it knows.
-        failed: what ended a thread that shouldn't have; the vehicle stands then, by its translator.
+        car: state and decisions.
+        failed: error that ended a thread; the adapter stops the vehicle then.
     """
 
-    def __init__(self, params: CarParams) -> None:
-        self.car = Car(params.limit)
+    def __init__(self, params: OnboardParams) -> None:
+        self.car = OnboardController(params.limit)
         self.failed: BaseException | None = None
         self._key = read_key(params.key)
         host, port = params.address()
@@ -295,45 +312,47 @@ class CarUnit:
                 "translator", f"{host} can't be reached: {error}", "Write it as 127.0.0.1:7447"
             ) from None
         self._socket.settimeout(0.2)
-        self._bundle: Bundle | None = None
+        self._connection: StationConnection | None = None
         self._ended = threading.Event()
-        jobs = {"watchdog": self._watch, "translator": self._listen, "telemetry": self._tell}
+        jobs = {"watchdog": self._watch, "adapter": self._receive_answers, "telemetry": self._send_telemetry}
         self._threads = [
             threading.Thread(target=self._guarded, args=(job,), name=name, daemon=True) for name, job in jobs.items()
         ]
         for thread in self._threads:
             thread.start()
 
-    def join(self, dial: Dial, cameras: Callable[[Bundle], Sequence[Sender]] = lambda _: ()) -> Bundle:
-        """Join a station in place of any other; cameras are sent over the bundle that is made."""
+    def join(
+        self, connect: Connect, cameras: Callable[[StationConnection], Sequence[VideoSender]] = lambda _: ()
+    ) -> StationConnection:
+        """Join a station in place of any other; `cameras` creates the senders of its connection."""
         self.release("another driver joins")
         session = object()
-        bundle = dial(partial(self._hear, session), partial(self.car.began, session))
-        self.car.join(session, bundle, cameras(bundle))
-        self._bundle = bundle
-        return bundle
+        connection = connect(partial(self._receive, session), partial(self.car.station_restarted, session))
+        self.car.join(session, connection, cameras(connection))
+        self._connection = connection
+        return connection
 
     def release(self, reason: str) -> None:
-        """Obey nobody, and hang up; the vehicle stands."""
+        """Obey no station, and disconnect; the vehicle stops."""
         self.car.release(reason)
-        bundle, self._bundle = self._bundle, None
-        if bundle is not None:
-            bundle.close()
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.close()
 
     def close(self) -> None:
-        """End; the vehicle stands."""
-        self.release("the car unit ends")
-        time.sleep(4 * WATCHED)  # the translator is told
+        """Stop the vehicle, and end all threads."""
+        self.release("the onboard unit ends")
+        time.sleep(4 * WATCHDOG_PERIOD_S)  # time to send the stop to the adapter
         self._ended.set()
         for thread in self._threads:
             thread.join()
         self._socket.close()
 
-    def _hear(self, session: object, message: Message) -> None:
-        self.car.hear(session, message, time.monotonic_ns())
+    def _receive(self, session: object, message: Message) -> None:
+        self.car.receive(session, message, time.monotonic_ns())
 
     def _guarded(self, job: Callable[[], None]) -> None:
-        """A thread that fails takes the others with it: the translator hears nothing more, and stops the vehicle."""
+        """Run a thread; if it fails all others end: the adapter gets no more orders, and stops the vehicle."""
         try:
             job()
         except BaseException as error:
@@ -342,41 +361,41 @@ class CarUnit:
             raise
 
     def _watch(self) -> None:
-        told, due = None, 0
-        while not self._ended.wait(WATCHED):
+        last_command, due = None, 0
+        while not self._ended.wait(WATCHDOG_PERIOD_S):
             now = time.monotonic_ns()
-            order = self.car.look(now)
-            if order.command != told or now >= due:
-                told, due = order.command, now + round(PERIOD_MS * MS)
-                with contextlib.suppress(OSError):  # nobody listens there: no answer comes, and that is told
+            order = self.car.watchdog_order(now)
+            if order.command != last_command or now >= due:
+                last_command, due = order.command, now + round(ADAPTER_PERIOD_MS * NS_PER_MS)
+                with contextlib.suppress(OSError):  # nobody listens there: reported since no answer arrives
                     self._socket.send(order.pack(self._key))
 
-    def _listen(self) -> None:
+    def _receive_answers(self) -> None:
         while not self._ended.is_set():
             try:
-                answer = Answer.unpack(self._socket.recv(LARGEST_ANSWER + 1), self._key)
+                answer = Answer.unpack(self._socket.recv(ANSWER_MAX_BYTES + 1), self._key)
             except (TimeoutError, Malformed):
                 continue
             except OSError:  # nobody listens there
-                self._ended.wait(WATCHED)
+                self._ended.wait(WATCHDOG_PERIOD_S)
                 continue
-            self.car.answered(answer, time.monotonic_ns())
+            self.car.receive_answer(answer, time.monotonic_ns())
 
-    def _tell(self) -> None:
-        streams, due = Streams(()), 0.0
-        while not self._ended.wait(TOLD):
-            self.car.doubt()
-            bundle = self._bundle
-            if bundle is None:
+    def _send_telemetry(self) -> None:
+        streams, due = VideoStreams(()), 0.0
+        while not self._ended.wait(TELEMETRY_PERIOD_S):
+            self.car.check_clocks()
+            connection = self._connection
+            if connection is None:
                 continue
-            bundle.send(Kind.TELEMETRY, fitting(self.car.telemetry(time.monotonic_ns())))
+            connection.send(Kind.TELEMETRY, pack_fitting(self.car.telemetry(time.monotonic_ns())))
             if (now := self.car.streams()) != streams or time.monotonic() > due:
-                streams, due = now, time.monotonic() + LISTED
-                bundle.send(Kind.STREAMS, streams.pack())
+                streams, due = now, time.monotonic() + STREAMS_PERIOD_S
+                connection.send(Kind.STREAMS, streams.pack())
 
 
-def fitting(telemetry: Telemetry) -> bytes:
-    """As a message's body, the last faults left out where it would be too long."""
-    while len(body := telemetry.pack()) > ROOM and telemetry.vehicle.faults:
+def pack_fitting(telemetry: Telemetry) -> bytes:
+    """Encode as a message body; the last faults are dropped if it would be too long."""
+    while len(body := telemetry.pack()) > BODY_MAX_BYTES and telemetry.vehicle.faults:
         telemetry = replace(telemetry, vehicle=replace(telemetry.vehicle, faults=telemetry.vehicle.faults[:-1]))
     return body

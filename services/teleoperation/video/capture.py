@@ -1,6 +1,6 @@
-"""A camera's pictures to encrypted packets: sized, encoded and sent in a thread of the camera's own.
+"""Video pipeline of a camera: scale, encode, encrypt and send its frames, in a thread for each camera.
 
-A picture is encoded at once or not at all: while one is encoded, newer ones replace each other in `cameras.Camera`.
+A frame is encoded at once or not at all: during encoding, `cameras.Camera` keeps only the newest frame.
 """
 
 from __future__ import annotations
@@ -13,95 +13,99 @@ from typing import Any
 
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.teleoperation import encoders
-from scan2sim.services.teleoperation.cameras import Camera, Picture
-from scan2sim.services.teleoperation.control.messages import Stream
-from scan2sim.services.teleoperation.video.rate_control import Plan
-from scan2sim.services.teleoperation.video.srtp_session import Keys, Sealer
+from scan2sim.services.teleoperation.cameras import Camera, CameraFrame
+from scan2sim.services.teleoperation.control.messages import VideoStream
+from scan2sim.services.teleoperation.video.rate_control import EncodingPlan
+from scan2sim.services.teleoperation.video.srtp_session import KeySchedule, PacketEncryptor
 
-KEY_PAUSE = 150_000_000
-"""Nanoseconds between two key frames that are wanted: what was wanted meanwhile, the last may have brought."""
-PAUSE = 0.5
-"""Seconds after an encoder failed, until another is tried."""
+KEY_FRAME_INTERVAL_MIN_NS = 150_000_000
+"""Minimum interval between requested key frames; an earlier request is satisfied by the last key frame."""
+ENCODER_RETRY_DELAY_S = 0.5
+"""Delay after an encoder failed until another one is created."""
 
 
-class Coder:
-    """A camera's pictures to packets; knows no threads.
+class CameraEncoder:
+    """Encodes and encrypts a camera's frames; has no thread.
 
     Attributes:
-        size: width and height of what was sent last.
-        counts: `pictures` that came, `skipped` for the rate, `frames`, `keys`, `packets`, `bytes`, `encoders` made;
-            packets that were sent `again`.
+        size: width and height of the last encoded frame.
+        counts: `pictures` received, `skipped` for the rate, `frames`, `keys`, `packets`, `bytes`, `encoders` created;
+            packets that were retransmitted (`again`).
     """
 
-    def __init__(self, camera: int, keys: Keys, backend: encoders.Backend) -> None:
-        """Of the camera's number, and the backend that encodes it."""
+    def __init__(self, camera: int, keys: KeySchedule, backend: encoders.Backend) -> None:
+        """`camera`: number of the camera; `backend`: encoder module."""
         self.size = (0, 0)
         self.counts: Counter[str] = Counter()
         self._backend, self._keys = backend, keys
-        self._sealer = Sealer(keys, camera)
+        self._encryptor = PacketEncryptor(keys, camera)
         self._encoder: encoders.Encoder | None = None
-        self._settings: encoders.Settings | None = None
-        self._wanted = False
-        self._last_key = 0
+        self._settings: encoders.EncoderSettings | None = None
+        self._key_frame_requested = False
+        self._last_key_frame = 0
         self._due = 0.0
 
-    def want_key(self) -> None:
-        """The next frame be a key frame, if the last one is some time ago. May be called in any thread."""
-        self._wanted = True
+    def request_key_frame(self) -> None:
+        """Make the next frame a key frame, unless the last one is recent; thread-safe."""
+        self._key_frame_requested = True
 
-    def again(self, source: int, sequences: Sequence[int]) -> list[bytes]:
-        """Packets that didn't come, as far as they are still kept. May be called in one other thread."""
-        packets = self._sealer.again(source, sequences)
+    def retransmit(self, source: int, sequences: Sequence[int]) -> list[bytes]:
+        """Packets to retransmit that are still buffered; may be called in one other thread."""
+        packets = self._encryptor.retransmit(source, sequences)
         self.counts["again"] += len(packets)
         return packets
 
-    def code(self, picture: Picture, plan: Plan, now: float) -> list[bytes]:
-        """Packets of a picture; none: the plan wants fewer pictures. `now`: the clock of `Keys`."""
+    def encode(self, frame: CameraFrame, plan: EncodingPlan, now: float) -> list[bytes]:
+        """Packets of a frame; none: the frame is dropped for the rate. `now`: clock of `KeySchedule`."""
         self.counts["pictures"] += 1
-        if self._skips(picture, plan):
+        if self._skips(frame, plan):
             self.counts["skipped"] += 1
             return []
-        planes = encoders.planes(scaled(picture.image, plan.scale))
-        encoder, made = self._encoder_for(planes, plan)
-        key = self._sealer.renew(now) or made or (self._wanted and picture.captured >= self._last_key + KEY_PAUSE)
-        data = encoder.encode(planes, picture.captured, key)
+        planes = encoders.to_i420(downscale(frame.image, plan.scale))
+        encoder, created = self._encoder_for(planes, plan)
+        key = (
+            self._encryptor.update_key(now)
+            or created
+            or (self._key_frame_requested and frame.captured >= self._last_key_frame + KEY_FRAME_INTERVAL_MIN_NS)
+        )
+        data = encoder.encode(planes, frame.captured, key)
         if not data:
-            self._wanted = self._wanted or key
+            self._key_frame_requested = self._key_frame_requested or key
             self.counts["skipped"] += 1
             return []
         if key:
-            self._wanted, self._last_key = False, picture.captured
-        packets = self._sealer.seal(data, picture.captured)
+            self._key_frame_requested, self._last_key_frame = False, frame.captured
+        packets = self._encryptor.encrypt(data, frame.captured)
         self.counts.update(frames=1, keys=key, packets=len(packets), bytes=sum(map(len, packets)))
         return packets
 
     def close(self) -> None:
-        """No more pictures come."""
+        """Release the encoder."""
         if self._encoder:
             self._encoder.close()
             self._encoder = None
 
-    def _skips(self, picture: Picture, plan: Plan) -> bool:
-        step = 1e9 / plan.fps
-        if picture.captured < self._due - step / 4:
+    def _skips(self, frame: CameraFrame, plan: EncodingPlan) -> bool:
+        interval = 1e9 / plan.fps
+        if frame.captured < self._due - interval / 4:
             return True
-        self._due = max(self._due, picture.captured - step / 2) + step
+        self._due = max(self._due, frame.captured - interval / 2) + interval
         return False
 
-    def _encoder_for(self, planes: U8, plan: Plan) -> tuple[encoders.Encoder, bool]:
-        """An encoder for pictures of that size and the plan; whether it is a new one."""
+    def _encoder_for(self, planes: U8, plan: EncodingPlan) -> tuple[encoders.Encoder, bool]:
+        """Encoder for this frame size and plan, and whether it is a new one."""
         width, height = planes.shape[1], planes.shape[0] * 2 // 3
-        asked = encoders.Settings(width, height, plan.fps, plan.bitrate)
-        if self._encoder and asked == self._settings:
+        settings = encoders.EncoderSettings(width, height, plan.fps, plan.bitrate)
+        if self._encoder and settings == self._settings:
             return self._encoder, False
         self.close()
-        self._encoder, self._settings, self.size = self._backend.encoder(asked), asked, (width, height)
+        self._encoder, self._settings, self.size = self._backend.encoder(settings), settings, (width, height)
         self.counts["encoders"] += 1
         return self._encoder, True
 
 
-def scaled(image: U8, scale: float) -> U8:
-    """A picture made smaller."""
+def downscale(image: U8, scale: float) -> U8:
+    """Scale an image down."""
     import cv2
 
     if scale == 1.0:
@@ -110,48 +114,53 @@ def scaled(image: U8, scale: float) -> U8:
     return smaller
 
 
-class Streamer:
-    """Sends a camera's pictures, in a thread of its own.
+class CameraStreamer:
+    """Sends a camera's video, in its own thread.
 
     Attributes:
-        plan: how they are sent; may be set at any time.
-        fault: what went wrong with the last picture, in words; empty: nothing.
+        plan: encoding parameters; may be set at any time.
+        fault: error with the last frame; empty: none.
     """
 
     def __init__(
-        self, number: int, camera: Camera, coder: Coder, send: Callable[[Sequence[bytes]], None], plan: Plan
+        self,
+        number: int,
+        camera: Camera,
+        encoder: CameraEncoder,
+        send: Callable[[Sequence[bytes]], None],
+        plan: EncodingPlan,
     ) -> None:
-        """`send` is given the packets of a frame at a time, in that thread; begins at once."""
-        self.number, self.camera, self.coder, self.plan, self.fault = number, camera, coder, plan, ""
+        """Start sending; `send` is called with the packets of each frame, in this thread."""
+        self.number, self.camera, self.encoder, self.plan, self.fault = number, camera, encoder, plan, ""
         self._send = send
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"video {camera.name}", daemon=True)
         self._thread.start()
 
     @property
-    def stream(self) -> Stream:
-        """What the station is told of it."""
-        gone = self.camera.gone or self.fault
-        return Stream(self.number, self.camera.name, *self.coder.size, 0.0 if gone else self.plan.fps)
+    def stream(self) -> VideoStream:
+        """Description of the stream for the station."""
+        offline = self.camera.offline or self.fault
+        return VideoStream(self.number, self.camera.name, *self.encoder.size, 0.0 if offline else self.plan.fps)
 
     def close(self) -> None:
-        """Send no more; the camera stays open."""
+        """Stop sending; the camera stays open."""
         self._closed.set()
         self._thread.join(1.0)
 
     def _run(self) -> None:
         while not self._closed.is_set():
-            picture = self.camera.read(0.5)
-            if picture is None:
+            frame = self.camera.read(0.5)
+            if frame is None:
                 continue
             try:
-                packets = self.coder.code(picture, self.plan, time.monotonic())
-            except Exception as error:  # of any library: the other cameras go on, and this one with another encoder
+                packets = self.encoder.encode(frame, self.plan, time.monotonic())
+            except Exception as error:  # of any library: other cameras continue, and this one with a new encoder
                 self.fault = str(error)
-                self.coder.close()
-                self._closed.wait(PAUSE)
+                self.encoder.close()
+                self._closed.wait(ENCODER_RETRY_DELAY_S)
                 continue
             self.fault = ""
             if packets:
                 self._send(packets)
-        self.coder.close()
+        self.encoder.close()

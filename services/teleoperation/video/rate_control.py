@@ -1,7 +1,7 @@
-"""How a camera's video follows what the links carry: additive increase, multiplicative decrease, report by report.
+"""Rate control of a camera's video: additive increase, multiplicative decrease (AIMD), with each video report.
 
-Late is as bad as lost: a queue that grows somewhere on the way shows in the delay before anything is dropped. Until
-that happens for the first time, the rate grows by half each report, as TCP's does in its slow start.
+Delay counts like loss: a growing queue on a link shows in the delay before packets are dropped. Until that happens for
+the first time, the rate grows by half with each report, as in TCP's slow start.
 """
 
 from __future__ import annotations
@@ -10,38 +10,38 @@ import math
 from collections import deque
 from typing import NamedTuple
 
-from scan2sim.services.teleoperation.control.messages import Report
+from scan2sim.services.teleoperation.control.messages import VideoReport
 
-LOSSY, LOSSLESS = 0.05, 0.02
-"""Parts of packets: where more are lost, less is sent; where fewer are, more. Radio links lose 1 % of any rate."""
-GROWN = 40.0
-"""Milliseconds over the least delay of late that a queue is taken for."""
-REPORTS = 30
-"""That the least delay is taken of: clocks drift, and links take other ways."""
-DECREASE = 0.75
-REST = 1
-"""Reports after a decrease that tell of what was before it."""
-INCREASE, SHARE = 10_000, 0.05
-"""Bits a second that are added, and the part of what is sent, so that few bits don't fill a narrow link in a second."""
-START = 1.5
-"""Times what is sent, in place of that, until a link was full for the first time."""
-STEP = 1.15
-"""From one bit rate that is planned to the next: another means another encoder, and a key frame."""
-BITS = 0.05
-"""A pixel's, with fewer of which a smaller picture, or fewer of them, show more."""
-LADDER = ((1.0, 1.0), (1.0, 2 / 3), (0.75, 2 / 3), (0.5, 2 / 3))
-"""Scale of the sides, part of the pictures: what is given up, first to last."""
-HIGHER = 1.25
-"""Times the bit rate that a rung needs, before it is climbed again."""
+DECREASE_LOSS, INCREASE_LOSS_MAX = 0.05, 0.02
+"""Packet loss above which the rate decreases, and below which it increases. Radio links lose 1 % at any rate."""
+QUEUE_DELAY_MS = 40.0
+"""Delay above the base delay that is attributed to a growing queue."""
+BASE_DELAY_REPORTS = 30
+"""Reports over which the base (minimum) delay is taken; it is limited as clocks drift and routes change."""
+DECREASE_FACTOR = 0.75
+REPORTS_IGNORED_AFTER_DECREASE = 1
+"""Reports after a decrease that are ignored, since they describe the time before it."""
+INCREASE_BPS, INCREASE_SHARE = 10_000, 0.05
+"""Increase per report: bit/s, and share of the current rate; small, so as not to fill a narrow link in a second."""
+SLOW_START_FACTOR = 1.5
+"""Growth per report in slow start, until a link is full for the first time."""
+BITRATE_STEP = 1.15
+"""Ratio between two planned bit rates; they are quantized since each change needs a new encoder and a key frame."""
+BITS_PER_PIXEL_MIN = 0.05
+"""Bits per pixel below which a smaller frame size or frame rate gives a better image."""
+QUALITY_LADDER = ((1.0, 1.0), (1.0, 2 / 3), (0.75, 2 / 3), (0.5, 2 / 3))
+"""Scale of the image sides and share of the frame rate, from best to worst quality."""
+STEP_UP_MARGIN = 1.25
+"""Multiple of the bit rate needed for a level at which quality steps up to it again."""
 
 
-class Plan(NamedTuple):
-    """How a camera's pictures are sent.
+class EncodingPlan(NamedTuple):
+    """Encoding parameters of a camera.
 
     Attributes:
-        bitrate: bits a second.
-        fps: pictures a second, at most.
-        scale: of the picture's sides, at most 1.
+        bitrate: bit/s.
+        fps: maximum frame rate, frames/s.
+        scale: of the image sides, at most 1.
     """
 
     bitrate: int = 1_500_000
@@ -49,71 +49,75 @@ class Plan(NamedTuple):
     scale: float = 1.0
 
 
-class Bounds(NamedTuple):
-    """Of a camera's bit rate, bits a second."""
+class BitrateBounds(NamedTuple):
+    """Bounds of a camera's bit rate, bit/s."""
 
     lowest: int = 150_000
     highest: int = 2_500_000
 
 
-class Adapting:
-    """A camera's plan, report by report.
+class RateController:
+    """Adapts a camera's encoding plan to its video reports.
 
     Attributes:
-        plan: from now on.
+        plan: current plan.
     """
 
-    def __init__(self, bounds: Bounds, start: Plan) -> None:
-        """`start`: at best so many pictures a second."""
+    def __init__(self, bounds: BitrateBounds, start: EncodingPlan) -> None:
+        """`start`: initial plan, with the maximum frame rate."""
         self.plan = start
         self._bounds, self._fps = bounds, start.fps
-        self._bitrate, self._filled = float(start.bitrate), False
-        self._delays: deque[float] = deque(maxlen=REPORTS)
-        self._rung = self._rests = 0
+        self._bitrate, self._slow_start_ended = float(start.bitrate), False
+        self._delays: deque[float] = deque(maxlen=BASE_DELAY_REPORTS)
+        self._level = self._ignored_reports = 0
 
-    def follow(self, report: Report, width: int, height: int) -> Plan:
-        """What is best after a report, for a camera of so many pixels."""
-        carried = self._carried(report)
-        if carried == self._bitrate:
+    def update(self, report: VideoReport, width: int, height: int) -> EncodingPlan:
+        """Plan after a report, for frames of this size."""
+        estimated = self._estimate(report)
+        if estimated == self._bitrate:
             return self.plan
-        self._bitrate, bitrate = carried, self._stepped(carried)
-        self._climb(bitrate, width * height * self._fps)
-        scale, part = LADDER[self._rung]
-        self.plan = Plan(bitrate, self._fps * part, scale)
+        self._bitrate, bitrate = estimated, self._quantize(estimated)
+        self._choose_level(bitrate, width * height * self._fps)
+        scale, share = QUALITY_LADDER[self._level]
+        self.plan = EncodingPlan(bitrate, self._fps * share, scale)
         return self.plan
 
-    def _stepped(self, bitrate: float) -> int:
-        """The next bit rate that is below the highest by whole steps."""
-        steps = math.ceil(math.log(self._bounds.highest / bitrate, STEP) - 1e-9)
-        return max(self._bounds.lowest, round(self._bounds.highest / STEP**steps))
+    def _quantize(self, bitrate: float) -> int:
+        """Quantize: the highest bit rate that is a whole number of steps below the maximum, and not above `bitrate`."""
+        steps = math.ceil(math.log(self._bounds.highest / bitrate, BITRATE_STEP) - 1e-9)
+        return max(self._bounds.lowest, round(self._bounds.highest / BITRATE_STEP**steps))
 
-    def _carried(self, report: Report) -> float:
-        """What links carry of this camera's, as a report tells."""
+    def _estimate(self, report: VideoReport) -> float:
+        """Estimate the bit rate that the links carry from a report."""
         sent = report.received + report.lost
         loss = report.lost / sent if sent else 0.0
-        grown = 0.0
+        queue_delay = 0.0
         if report.delay is not None:
             self._delays.append(report.delay)
-            grown = report.delay - min(self._delays)
-        if self._rests:
-            self._rests -= 1
-        elif loss > LOSSY or grown > GROWN:
-            self._rests, self._filled = REST, True
-            return max(self._bounds.lowest, DECREASE * self._bitrate)
-        elif report.delay is not None and loss < LOSSLESS and grown < GROWN / 2:
-            more = (1 + SHARE) * self._bitrate + INCREASE if self._filled else START * self._bitrate
-            return min(self._bounds.highest, more)
+            queue_delay = report.delay - min(self._delays)
+        if self._ignored_reports:
+            self._ignored_reports -= 1
+        elif loss > DECREASE_LOSS or queue_delay > QUEUE_DELAY_MS:
+            self._ignored_reports, self._slow_start_ended = REPORTS_IGNORED_AFTER_DECREASE, True
+            return max(self._bounds.lowest, DECREASE_FACTOR * self._bitrate)
+        elif report.delay is not None and loss < INCREASE_LOSS_MAX and queue_delay < QUEUE_DELAY_MS / 2:
+            increased = (
+                (1 + INCREASE_SHARE) * self._bitrate + INCREASE_BPS
+                if self._slow_start_ended
+                else SLOW_START_FACTOR * self._bitrate
+            )
+            return min(self._bounds.highest, increased)
         return self._bitrate
 
-    def _climb(self, bitrate: int, pixels: float) -> None:
-        """Down the ladder as far as the bit rate wants, and up again a rung at a time."""
-        while self._rung + 1 < len(LADDER) and bitrate < _needs(self._rung, pixels):
-            self._rung += 1
-        if self._rung and bitrate > HIGHER * _needs(self._rung - 1, pixels):
-            self._rung -= 1
+    def _choose_level(self, bitrate: int, pixels: float) -> None:
+        """Step down as far as the bit rate requires, or up by one level."""
+        while self._level + 1 < len(QUALITY_LADDER) and bitrate < _bitrate_needed(self._level, pixels):
+            self._level += 1
+        if self._level and bitrate > STEP_UP_MARGIN * _bitrate_needed(self._level - 1, pixels):
+            self._level -= 1
 
 
-def _needs(rung: int, pixels: float) -> float:
-    """Bits a second that a rung is good for, of so many pixels a second on the highest."""
-    scale, part = LADDER[rung]
-    return BITS * pixels * scale**2 * part
+def _bitrate_needed(level: int, pixels: float) -> float:
+    """Bit rate that a level needs, bit/s, for a number of pixels/s at full quality."""
+    scale, share = QUALITY_LADDER[level]
+    return BITS_PER_PIXEL_MIN * pixels * scale**2 * share

@@ -1,6 +1,6 @@
-"""Pictures as RTP packets (RFC 3550): VP8 by RFC 7741, the time of capture as a header extension (RFC 8285).
+"""RTP packets of video frames (RFC 3550): VP8 payload by RFC 7741, capture time in a header extension (RFC 8285).
 
-All packets have one layout, so that one call packs or unpacks a header: 32 bytes, then a part of the picture.
+All packets have the same layout, so that one call packs or unpacks the header: 32 bytes, then a part of the frame.
 """
 
 from __future__ import annotations
@@ -11,25 +11,25 @@ from typing import NamedTuple
 from scan2sim.services.teleoperation.control.messages import Malformed
 
 HEADER = struct.Struct(">BBHII HHBq3x BBH")
-"""RTP's 12 bytes, 16 of its extension (the time of capture), 4 of VP8's payload descriptor (the picture's number)."""
-LARGEST = 1150
-"""Bytes of a picture in a packet: with headers, SRTP, UDP and IP fewer than 1280, which IPv6 carries anywhere."""
-CLOCK = 90_000
-"""Hz of RTP's times of video."""
+"""RTP header (12 bytes), header extension with the capture time (16), VP8 payload descriptor (4)."""
+PAYLOAD_MAX_BYTES = 1150
+"""Maximum payload: with headers, SRTP, UDP and IP below 1280 bytes, the minimum MTU of IPv6."""
+RTP_CLOCK_HZ = 90_000
+"""Clock rate of RTP timestamps of video."""
 _VERSION, _TYPE, _LAST = 0x90, 96, 0x80
-_PROFILE, _WORDS, _STAMP = 0xBEDE, 3, 0x17
-_FIRST, _PLAIN, _NUMBERED, _LONG = 0x90, 0x80, 0x80, 0x8000
+_PROFILE, _EXTENSION_WORDS, _EXTENSION_ID = 0xBEDE, 3, 0x17
+_FIRST, _CONTINUATION, _NUMBERED, _LONG = 0x90, 0x80, 0x80, 0x8000
 
 
 class Packet(NamedTuple):
-    """A part of a picture.
+    """A part of a frame.
 
     Attributes:
-        sequence: of packets of a source, 16 bits.
+        sequence: packet number within its source, 16 bits.
         source: SSRC.
-        captured: nanoseconds of the sender's monotonic clock.
-        number: of the picture, 15 bits.
-        first, last: whether the picture begins or ends with it.
+        captured: capture time, nanoseconds of the sender's monotonic clock.
+        number: picture number, 15 bits.
+        first, last: whether it is the first or last packet of the frame.
     """
 
     sequence: int
@@ -42,54 +42,54 @@ class Packet(NamedTuple):
 
     @property
     def key(self) -> bool:
-        """Whether a key frame begins with it (RFC 6386, 9.1)."""
+        """Whether it is the first packet of a key frame (RFC 6386, 9.1)."""
         return self.first and not self.data[0] & 1
 
 
-def packets(data: bytes, source: int, sequence: int, number: int, captured: int) -> list[bytes]:
-    """A picture's packets; `sequence` is the first one's."""
+def packetize(data: bytes, source: int, sequence: int, number: int, captured: int) -> list[bytes]:
+    """Split a frame into packets; `sequence` is that of the first one."""
     stamp = captured * 9 // 100_000 & 0xFFFFFFFF
-    count = -(-len(data) // LARGEST)
+    count = -(-len(data) // PAYLOAD_MAX_BYTES)
     made = []
     for i in range(count):
         header = HEADER.pack(
             _VERSION, _TYPE | _LAST * (i == count - 1), sequence + i & 0xFFFF, stamp, source,
-            _PROFILE, _WORDS, _STAMP, captured,
-            _PLAIN if i else _FIRST, _NUMBERED, _LONG | number & 0x7FFF,
+            _PROFILE, _EXTENSION_WORDS, _EXTENSION_ID, captured,
+            _CONTINUATION if i else _FIRST, _NUMBERED, _LONG | number & 0x7FFF,
         )  # fmt: skip
-        made.append(header + data[i * LARGEST : (i + 1) * LARGEST])
+        made.append(header + data[i * PAYLOAD_MAX_BYTES : (i + 1) * PAYLOAD_MAX_BYTES])
     return made
 
 
 def parse(packet: bytes) -> Packet:
-    """A packet as `packets` makes them.
+    """Parse a packet created by `packetize`.
 
     Raises:
-        Malformed: it is none.
+        Malformed: it is not such a packet.
     """
     try:
-        version, kind, sequence, _, source, profile, words, stamp, captured, first, numbered, number = (
+        version, kind, sequence, _, source, profile, extension_words, stamp, captured, first, numbered, number = (
             HEADER.unpack_from(packet)
         )
     except struct.error as error:
         raise Malformed(str(error)) from None
-    fixed = (version, kind & 0x7F, profile, words, stamp, numbered)
-    if fixed != (_VERSION, _TYPE, _PROFILE, _WORDS, _STAMP, _NUMBERED):
-        raise Malformed("no packet of video")
-    if first not in (_FIRST, _PLAIN) or not number & _LONG or len(packet) == HEADER.size:
-        raise Malformed("no packet of VP8")
+    fixed = (version, kind & 0x7F, profile, extension_words, stamp, numbered)
+    if fixed != (_VERSION, _TYPE, _PROFILE, _EXTENSION_WORDS, _EXTENSION_ID, _NUMBERED):
+        raise Malformed("not a video packet")
+    if first not in (_FIRST, _CONTINUATION) or not number & _LONG or len(packet) == HEADER.size:
+        raise Malformed("not a VP8 packet")
     return Packet(
         sequence, source, captured, number & 0x7FFF, first == _FIRST, bool(kind & _LAST), packet[HEADER.size :]
     )
 
 
-def size(key_frame: bytes) -> tuple[int, int]:
-    """Width and height that a key frame tells (RFC 6386, 9.1).
+def key_frame_size(key_frame: bytes) -> tuple[int, int]:
+    """Width and height in the header of a key frame (RFC 6386, 9.1).
 
     Raises:
-        Malformed: it is none.
+        Malformed: it is not a key frame.
     """
     if len(key_frame) < 10 or key_frame[0] & 1 or key_frame[3:6] != b"\x9d\x01\x2a":
-        raise Malformed("no key frame")
+        raise Malformed("not a key frame")
     width, height = struct.unpack_from("<HH", key_frame, 6)
     return width & 0x3FFF, height & 0x3FFF

@@ -1,1 +1,1 @@
-"""The project's own networks for toolboxes: what they are, how they are trained and exported."""
+"""The project's own detection network: architecture, training, evaluation and export."""

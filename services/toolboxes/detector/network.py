@@ -1,8 +1,8 @@
-"""The project's own detector. Import late: loads torch.
+"""The project's own detection network. Import late: loads torch.
 
-The trunk of the segmentation network (`segmentation.network`), maps at strides 8 to 64, and at each of their places a
-box, whether there is a thing, and of which class: without anchors, as FCOS (Tian et al., ICCV 2019) and YOLOX (Ge et
-al., 2021).
+Backbone of the segmentation network (`segmentation.network`) with feature maps at strides 8 to 64; each cell of a map
+predicts a box, objectness and class scores: anchor-free, like FCOS (Tian et al., ICCV 2019) and YOLOX (Ge et al.,
+2021).
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from torch import Tensor, nn
 from scan2sim.segmentation.network import Convolution, Pyramid
 
 STRIDES = (8, 16, 32, 64)
-MOST = 6.0
-"""Logarithm of a box's side, in strides, at most."""
+MAX_LOG_SIDE = 6.0
+"""Upper bound of the logarithm of a box's side in strides."""
 
 
 class VehicleNet(Pyramid):
-    """(B, 3, H, W) colours in [0, 1], H and W multiples of 64, to (B, N, 5 + classes).
+    """Detector: images (B, 3, H, W) in [0, 1], H and W multiples of 64, to (B, N, 5 + classes).
 
-    N: the places of all strides. In training: how far a box's centre is off its place, logarithm of its width and
-    height (both in strides), logits of there being a thing and of its classes. Else: centre, width and height in
-    pixels, and probabilities.
+    N is the number of cells of all strides. Output in training: offset of the box's centre from the cell's centre and
+    logarithm of its width and height (both in strides), logits of objectness and classes. In evaluation: centre, width
+    and height in pixels, and probabilities.
 
     Args:
-        classes: number of them.
-        pyramid: channels of the maps.
+        classes: number of classes.
+        pyramid: channels of the feature maps.
     """
 
     def __init__(self, classes: int, pyramid: int = 64) -> None:
@@ -41,17 +41,17 @@ class VehicleNet(Pyramid):
         nn.init.constant_(self.classes.bias, -2.0)  # type: ignore[arg-type]
         nn.init.zeros_(self.box.bias)  # type: ignore[arg-type]
         with torch.no_grad():
-            self.box.bias[4] = -math.log(99.0)  # type: ignore[index]  # hardly ever there is one
+            self.box.bias[4] = -math.log(99.0)  # type: ignore[index]  # prior: 1 % of the cells have an object
             self.box.bias[2:4] = 1.0  # type: ignore[index]
 
     def forward(self, images: Tensor) -> Tensor:
-        """See the class."""
+        """Output as described at the class."""
         top, middle, fine = self.maps((images - self.mean) / self.spread)
         raw = [torch.cat([self.box(self.where(x)), self.classes(self.what(x))], dim=1) for x in
                (fine, middle, top, self.coarser(top))]  # fmt: skip
         if self.training:
             return torch.cat([x.flatten(2) for x in raw], dim=2).transpose(1, 2)
-        return torch.cat([decoded(x.flatten(2).transpose(1, 2), places(x.shape[2], x.shape[3], s).to(x), s)
+        return torch.cat([decode(x.flatten(2).transpose(1, 2), cell_centres(x.shape[2], x.shape[3], s).to(x), s)
                           for x, s in zip(raw, STRIDES, strict=True)], dim=1)  # fmt: skip
 
 
@@ -59,90 +59,96 @@ def _tower(channels: int) -> list[nn.Module]:
     return [Convolution(channels, channels, 5, groups=channels), Convolution(channels, channels)]
 
 
-def places(rows: int, columns: int, stride: int) -> Tensor:
-    """(rows * columns, 2) x and y of the middles of a map's cells, pixels."""
+def cell_centres(rows: int, columns: int, stride: int) -> Tensor:
+    """(rows * columns, 2) x and y of the centres of a feature map's cells, pixels."""
     y = (torch.arange(rows) + 0.5) * stride
     x = (torch.arange(columns) + 0.5) * stride
     return torch.stack([x[None].expand(rows, columns), y[:, None].expand(rows, columns)], dim=-1).flatten(0, 1)
 
 
-def decoded(raw: Tensor, at: Tensor, stride: int | Tensor) -> Tensor:
-    """(B, N, 5 + C) centre, width, height in pixels and probabilities, of what the network says at places (N, 2)."""
-    centre = at + raw[..., :2] * stride
-    size = torch.exp(raw[..., 2:4].clamp(-MOST, MOST)) * stride
+def decode(raw: Tensor, centres: Tensor, stride: int | Tensor) -> Tensor:
+    """Decode raw outputs of cells with centres (N, 2) to (B, N, 5 + C): box in pixels and probabilities."""
+    centre = centres + raw[..., :2] * stride
+    size = torch.exp(raw[..., 2:4].clamp(-MAX_LOG_SIDE, MAX_LOG_SIDE)) * stride
     return torch.cat([centre, size, torch.sigmoid(raw[..., 4:])], dim=-1)
 
 
-def grid(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """(N, 2) places and (N, 1) strides of a picture's maps, in the network's order."""
+def cells(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """(N, 2) centres and (N, 1) strides of all cells of an image, in the order of the network's output."""
     sizes = [(height // s, width // s, s) for s in STRIDES]
-    at = torch.cat([places(*size) for size in sizes])
-    return at, torch.cat([torch.full((rows * columns, 1), float(s)) for rows, columns, s in sizes])
+    centres = torch.cat([cell_centres(*size) for size in sizes])
+    return centres, torch.cat([torch.full((rows * columns, 1), float(s)) for rows, columns, s in sizes])
 
 
-def corners(boxes: Tensor) -> Tensor:
-    """(..., 4) x0, y0, x1, y1 of centre, width, height."""
+def box_corners(boxes: Tensor) -> Tensor:
+    """Convert boxes (..., 4) from centre, width, height to corners x0, y0, x1, y1."""
     return torch.cat([boxes[..., :2] - boxes[..., 2:] / 2, boxes[..., :2] + boxes[..., 2:] / 2], dim=-1)
 
 
-def overlap(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """(N,) intersection over union of boxes (N, 4) by corners, and its generalised form (Rezatofighi et al. 2019)."""
+def iou_and_giou(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """(N,) IoU of pairs of boxes (N, 4) given by corners, and generalized IoU (Rezatofighi et al., 2019)."""
     low, high = torch.maximum(a[:, :2], b[:, :2]), torch.minimum(a[:, 2:], b[:, 2:])
-    both = (high - low).clamp(min=0).prod(dim=1)
-    either = (a[:, 2:] - a[:, :2]).prod(dim=1) + (b[:, 2:] - b[:, :2]).prod(dim=1) - both
-    around = (torch.maximum(a[:, 2:], b[:, 2:]) - torch.minimum(a[:, :2], b[:, :2])).prod(dim=1)
-    iou = both / either.clamp(min=1e-6)
-    return iou, iou - (around - either) / around.clamp(min=1e-6)
+    intersection = (high - low).clamp(min=0).prod(dim=1)
+    union = (a[:, 2:] - a[:, :2]).prod(dim=1) + (b[:, 2:] - b[:, :2]).prod(dim=1) - intersection
+    hull = (torch.maximum(a[:, 2:], b[:, 2:]) - torch.minimum(a[:, :2], b[:, :2])).prod(dim=1)
+    iou = intersection / union.clamp(min=1e-6)
+    return iou, iou - (hull - union) / hull.clamp(min=1e-6)
 
 
-def weighed(raw: Tensor, truth: list[Tensor], ignored: list[Tensor], size: tuple[int, int]) -> dict[str, Tensor]:
-    """Losses of what the network says in training, by kind.
+def detection_losses(
+    raw: Tensor, truth: list[Tensor], ignored: list[Tensor], size: tuple[int, int]
+) -> dict[str, Tensor]:
+    """Weighted training losses of raw outputs: objectness, box (GIoU) and class.
 
     Args:
-        truth: of each picture (K, 5) x0, y0, x1, y1 and class.
-        ignored: of each picture (I, 4) boxes of which nothing is to be learnt.
-        size: height and width of the pictures.
+        raw: (B, N, 5 + C) output in training.
+        truth: for each image (K, 5) x0, y0, x1, y1 and class.
+        ignored: for each image (I, 4) boxes without a loss.
+        size: height and width of the images.
     """
-    at, stride = (x.to(raw) for x in grid(*size))
-    boxes = decoded(raw, at, stride)
-    there, care = torch.zeros_like(raw[..., 4]), torch.ones_like(raw[..., 4])
-    wide, named = raw.new_zeros(()), raw.new_zeros(())
+    centres, stride = (x.to(raw) for x in cells(*size))
+    boxes = decode(raw, centres, stride)
+    target, weight = torch.zeros_like(raw[..., 4]), torch.ones_like(raw[..., 4])
+    box_loss, class_loss = raw.new_zeros(()), raw.new_zeros(())
     count = 0
-    for i, (things, leave) in enumerate(zip(truth, ignored, strict=True)):
+    for i, (objects, leave) in enumerate(zip(truth, ignored, strict=True)):
         if len(leave):
-            inside = ((at[:, None] > leave[None, :, :2]) & (at[:, None] < leave[None, :, 2:])).all(dim=2).any(dim=1)
-            care[i] = (~inside).to(raw)
-        if not len(things):
+            inside = (centres[:, None] > leave[None, :, :2]) & (centres[:, None] < leave[None, :, 2:])
+            weight[i] = (~inside.all(dim=2).any(dim=1)).to(raw)
+        if not len(objects):
             continue
-        place, thing = assigned(at, stride[:, 0], things[:, :4])
-        iou, generalised = overlap(corners(boxes[i, place, :4]), things[thing, :4])
-        there[i, place], care[i, place] = iou.detach().clamp(min=0.1), 1.0
-        wide = wide + (1 - generalised).sum()
-        kind = F.one_hot(things[thing, 4].long(), raw.shape[2] - 5).to(raw)
-        named = named + F.binary_cross_entropy_with_logits(raw[i, place, 5:], kind, reduction="sum")
-        count += len(place)
-    said = torch.sigmoid(raw[..., 4])
-    focus = (said.detach() - there).abs() ** 2 * care
-    objects = (focus * F.binary_cross_entropy_with_logits(raw[..., 4], there, reduction="none")).sum()
+        cell, assigned = assign_targets(centres, stride[:, 0], objects[:, :4])
+        iou, giou = iou_and_giou(box_corners(boxes[i, cell, :4]), objects[assigned, :4])
+        target[i, cell], weight[i, cell] = iou.detach().clamp(min=0.1), 1.0
+        box_loss = box_loss + (1 - giou).sum()
+        one_hot = F.one_hot(objects[assigned, 4].long(), raw.shape[2] - 5).to(raw)
+        class_loss = class_loss + F.binary_cross_entropy_with_logits(raw[i, cell, 5:], one_hot, reduction="sum")
+        count += len(cell)
+    predicted = torch.sigmoid(raw[..., 4])
+    focus = (predicted.detach() - target).abs() ** 2 * weight
+    object_loss = (focus * F.binary_cross_entropy_with_logits(raw[..., 4], target, reduction="none")).sum()
     n = max(count, 1)
-    return {"there": 2.0 * objects / n, "box": 2.0 * wide / n, "class": 0.5 * named / n}
+    return {"objectness": 2.0 * object_loss / n, "box": 2.0 * box_loss / n, "class": 0.5 * class_loss / n}
 
 
-def assigned(at: Tensor, stride: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
-    """Which places (P,) are to find which boxes (P,): those near their centres, at strides that fit their size.
+def assign_targets(centres: Tensor, stride: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
+    """Assign true boxes to cells near their centres, at strides that fit the size of the box.
 
     Args:
-        at, stride: (N, 2), (N,) of the places.
-        boxes: (K, 4); of two that a place might find, it is to find the smaller one.
+        centres, stride: (N, 2), (N,) of the cells.
+        boxes: (K, 4); a cell with several candidates gets the smallest box.
+
+    Returns:
+        (P,) indices of the cells and (P,) indices of the boxes assigned to them.
     """
     middle, size = (boxes[:, :2] + boxes[:, 2:]) / 2, boxes[:, 2:] - boxes[:, :2]
     scale = size.prod(dim=1).sqrt()
     step = stride[:, None]
     fits = (scale[None] < 7 * step) | (step == STRIDES[-1])
     fits &= (scale[None] > 2.6 * step) | (step == STRIDES[0])
-    reach = torch.minimum(1.5 * step[..., None], (size / 2)[None].clamp(min=0)).maximum(0.71 * step[..., None])
-    near = ((at[:, None] - middle[None]).abs() < reach).all(dim=2) & fits
+    radius = torch.minimum(1.5 * step[..., None], (size / 2)[None].clamp(min=0)).maximum(0.71 * step[..., None])
+    near = ((centres[:, None] - middle[None]).abs() < radius).all(dim=2) & fits
     cost = torch.where(near, size.prod(dim=1)[None], torch.inf)
-    least, which = cost.min(dim=1)
-    place = torch.nonzero(torch.isfinite(least))[:, 0]
-    return place, which[place]
+    smallest, which = cost.min(dim=1)
+    cell = torch.nonzero(torch.isfinite(smallest))[:, 0]
+    return cell, which[cell]

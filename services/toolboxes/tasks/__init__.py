@@ -1,4 +1,4 @@
-"""Toolboxes behind one protocol: a file each, found by its name; what they share is in `services.toolboxes`."""
+"""Plugins of the toolboxes, one module per task, found by name; the shared code is in `services.toolboxes`."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from scan2sim.services.toolboxes.settings import ToolboxParams
 
 
 @dataclass(frozen=True)
-class Facts:
-    """What is known of a model.
+class ModelInfo:
+    """Description of a model.
 
     Attributes:
-        name: of its architecture or file.
+        name: name of its architecture or file.
         labels: names of its classes.
-        sha256: of the weights' file.
-        licence: of the weights, as far as the file or its package says.
+        sha256: SHA-256 of the weights file.
+        licence: licence of the weights, as far as the file or its package states it.
     """
 
     name: str
@@ -33,55 +33,55 @@ class Facts:
 
 
 class Model(Protocol):
-    """A model that is loaded."""
+    """A loaded model."""
 
-    facts: Facts
+    info: ModelInfo
 
     def __call__(self, images: Sequence[U8], /) -> list[Body]:
-        """What it says of each image (H, W, 3) uint8 RGB, of any size; several at once may be cheaper."""
+        """Run the model on images (H, W, 3) uint8 RGB of any size; a batch may be faster than single images."""
 
 
-Follow = Callable[[Frame, U8, Body], Body]
-"""What is done with the results of one source, in order: from a frame, its image and what the model said of it."""
+PostProcessor = Callable[[Frame, U8, Body], Body]
+"""Processes the results of one source in order: from a frame, its decoded image and the model's output."""
 
 
 class Toolbox(Protocol):
-    """What a toolbox's module has."""
+    """Interface of a toolbox's module."""
 
     Params: type[ToolboxParams]
 
     def check(self, params: Any) -> None:
-        """Refuse settings that it can't run with here; nothing heavy is loaded.
+        """Check that the toolbox can run here with these settings, without loading the model.
 
         Raises:
-            ScanError: a package or the weights are missing, or aren't what they should be.
+            ScanError: a package or the weights are missing or invalid.
         """
 
     def load(self, params: Any) -> Model:
-        """The model; called in the process that runs it.
+        """Load the model; called in the process that runs it.
 
         Raises:
-            ScanError: it can't run here, or its weights aren't what they should be.
+            ScanError: it can't run here, or its weights are invalid.
         """
 
-    def follow(self, params: Any) -> Follow | None:
-        """For one source; None: a model's results are the toolbox's."""
+    def post_processor(self, params: Any) -> PostProcessor | None:
+        """Create the post-processor of one source; None: the model's output is the final result."""
 
     def draw(self, image: U8, body: Body) -> U8:
-        """An image with what was said of it drawn on it."""
+        """Draw a result on a copy of an image."""
 
 
 def names() -> list[str]:
-    """Of all toolboxes."""
+    """Names of all toolboxes."""
     return plugins.names(__name__)
 
 
 def find(name: str) -> Toolbox:
-    """A toolbox that can run here; a name with dots is a module of the user's own that has what `Toolbox` lists.
+    """Find a toolbox by name; a name with dots is a user-defined module that implements `Toolbox`.
 
     Raises:
-        SettingError: there is none of that name.
-        UnavailableError: a package is missing.
+        SettingError: unknown name.
+        UnavailableError: a required package isn't installed.
     """
     if "." in name:
         return _module(name)
@@ -93,5 +93,6 @@ def _module(name: str) -> Toolbox:
     try:
         found: Toolbox = importlib.import_module(name)
     except ImportError as error:
-        raise SettingError("toolbox", f"{name!r} can't be imported ({error})", "Put it on PYTHONPATH") from None
+        cause = f"the module {name!r} can't be imported ({error})"
+        raise SettingError("toolbox", cause, "Check the name and PYTHONPATH") from None
     return found

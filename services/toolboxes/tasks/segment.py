@@ -1,4 +1,4 @@
-"""Semantic segmentation of images (D3.2, section 5.4): SegFormer, or the networks that `segmentation` has besides."""
+"""Semantic segmentation of images (D3.2, section 5.4): SegFormer or another network of the package `segmentation`."""
 
 from __future__ import annotations
 
@@ -19,55 +19,58 @@ from scan2sim.segmentation.photos import Classifier, class_map
 from scan2sim.services.toolboxes import models
 from scan2sim.services.toolboxes.results import Body, Segmentation
 from scan2sim.services.toolboxes.settings import ToolboxParams
-from scan2sim.services.toolboxes.tasks import Facts, Follow
+from scan2sim.services.toolboxes.tasks import ModelInfo, PostProcessor
 
 NEEDS = ("cv2", "onnxruntime")
-SHADE = 0.55
-"""Share of the classes' colours in what is drawn."""
-OWN = "street"
-"""The network that comes with weights."""
+OVERLAY_OPACITY = 0.55
+"""Opacity of the class colours in drawn results."""
+OWN_NETWORK = "street"
+"""Network with included weights."""
 
 
 class Params(ToolboxParams):
-    """Of semantic segmentation."""
+    """Settings of the semantic segmentation."""
 
     network: Annotated[
-        str, Field(pattern=r"^[a-z]{1,20}$", description="street (the project's own), segformer, onnx.")
-    ] = OWN
-    width: Annotated[int, Field(ge=32, le=8192, description="Pixels; wider images are made smaller.")] = 1920
+        str, Field(pattern=r"^[a-z]{1,20}$", description="Network: street (the project's own), segformer or onnx.")
+    ] = OWN_NETWORK
+    width: Annotated[
+        int, Field(ge=32, le=8192, description="Maximum width in pixels; wider images are downscaled to it.")
+    ] = 1920
     field_of_view: Annotated[
-        float, Field(ge=5, le=175, description="Degrees that images show from left to right (the own network alone).")
+        float,
+        Field(ge=5, le=175, description="Horizontal field of view of the images in degrees (network street only)."),
     ] = 80.0
 
 
 def check(params: Params) -> None:
-    """See `boxes.Toolbox`."""
+    """See `tasks.Toolbox`."""
     backends.check(params.network, _weights(params))
 
 
 def load(params: Params) -> Segmenter:
-    """The model (`boxes.Toolbox`)."""
+    """Load the model (`tasks.Toolbox`)."""
     return Segmenter(params)
 
 
-def follow(params: Params) -> Follow | None:
-    """Images are segmented one by one."""
+def post_processor(params: Params) -> PostProcessor | None:
+    """None: images are segmented independently."""
     return None
 
 
 def draw(image: U8, body: Body) -> U8:
-    """With its classes' colours over it."""
+    """Overlay the colours of the classes."""
     import cv2
 
     assert body.segmentation
     mask = cv2.resize(mask_of(body.segmentation), image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     codes = np.array([CODE.get(label, 0) for label in body.segmentation.labels], np.uint8)
-    shaded: U8 = cv2.addWeighted(image, 1 - SHADE, colour_of()[codes[mask]], SHADE, 0)
-    return shaded
+    overlay: U8 = cv2.addWeighted(image, 1 - OVERLAY_OPACITY, colour_of()[codes[mask]], OVERLAY_OPACITY, 0)
+    return overlay
 
 
 def mask_of(segmentation: Segmentation) -> U8:
-    """(H, W) classes' numbers of a result."""
+    """Class indices (H, W) of a result."""
     import cv2
 
     png = np.frombuffer(base64.b64decode(segmentation.mask), np.uint8)
@@ -76,25 +79,25 @@ def mask_of(segmentation: Segmentation) -> U8:
 
 
 def _weights(params: Params) -> Path | None:
-    """The user's; None: the project's own."""
-    own = params.network == OWN and params.weights is None
-    return None if own else models.chosen(params, None)
+    """The user's weights file; None: the included weights."""
+    uses_included = params.network == OWN_NETWORK and params.weights is None
+    return None if uses_included else models.weights_file(params, None)
 
 
 class Segmenter:
-    """See `boxes.Model`."""
+    """Semantic segmentation model (`tasks.Model`)."""
 
     def __init__(self, params: Params) -> None:
         path = _weights(params)
         network = backends.load(params.network, path, params.device)
-        self._classifier, self._params = Classifier(network, str(path or OWN)), params
-        self.facts = Facts(network.facts.name, CLASSES, network.facts.sha256, network.facts.licence)
+        self._classifier, self._params = Classifier(network, str(path or OWN_NETWORK)), params
+        self.info = ModelInfo(network.info.name, CLASSES, network.info.sha256, network.info.licence)
 
     def __call__(self, images: Sequence[U8]) -> list[Body]:
-        """Classes of each image's pixels; several at once gain nothing."""
-        return [Body(segmentation=self._segmented(image)) for image in images]
+        """Segment each image, one image at a time."""
+        return [Body(segmentation=self._segment(image)) for image in images]
 
-    def _segmented(self, image: U8) -> Segmentation:
+    def _segment(self, image: U8) -> Segmentation:
         import cv2
 
         width = min(image.shape[1], self._params.width)

@@ -1,4 +1,4 @@
-"""Prefect as it is deployed: servers, databases and workers, each a real process, stopped when the tests are done."""
+"""Real Prefect servers, databases and workers in processes of their own, stopped after the tests."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ QUIET = {
     "PREFECT_CLI_COLORS": "false",
     "PREFECT_CLI_WRAP_LINES": "false",
     "DO_NOT_TRACK": "1",
-    "PYTHONUTF8": "1",  # its command prints what other encodings cannot hold
-    # a new schedule's first runs are made by a service that runs once a minute, unless its deployment is seconds old
+    "PYTHONUTF8": "1",  # its command prints characters that other encodings lack
+    # by default, runs of a new schedule are created once per minute, except for new deployments
     "PREFECT_SERVER_SERVICES_SCHEDULER_LOOP_SECONDS": "2",
     "RAY_USAGE_STATS_ENABLED": "0",
 }
@@ -42,23 +42,23 @@ ENDED = ("COMPLETED", "FAILED", "CRASHED", "CANCELLED")
 
 
 def environment(home: Path) -> dict[str, str]:
-    """Ours, with settings of Prefect's that are the test's alone; no server is named."""
+    """This environment with test settings of Prefect only, without a configured server."""
     ours = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")}
     return ours | QUIET | {"PREFECT_HOME": str(home)}
 
 
-def wait_for(what: str, found: Callable[[], Any], seconds: float = 60.0) -> Any:
-    """Ask until the answer isn't false."""
+def wait_for(what: str, condition: Callable[[], Any], seconds: float = 60.0) -> Any:
+    """Poll a condition until it is true; returns its value."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
-        if answer := found():
+        if answer := condition():
             return answer
         time.sleep(0.1)
     raise TimeoutError(f"{what}: not within {seconds:.0f} s")
 
 
 def kill(process: subprocess.Popen[Any]) -> None:
-    """Kill a process that was started in a session of its own, and all that it started there."""
+    """Kill a process that was started in a session of its own, and its children."""
     try:
         os.killpg(process.pid, signal.SIGKILL)
     except ProcessLookupError:
@@ -67,22 +67,22 @@ def kill(process: subprocess.Popen[Any]) -> None:
 
 
 def processes(name: str, value: str) -> list[int]:
-    """Processes that have this in their environment: ours, by whatever they were started."""
+    """Ids of the processes with this environment variable, including indirect children."""
     found = []
     for path in Path("/proc").glob("[0-9]*/environ"):
         try:
             if f"{name}={value}" in path.read_bytes().decode(errors="replace").split("\0"):
                 found.append(int(path.parent.name))
         except OSError:
-            continue  # it has ended
+            continue  # the process has ended
     return found
 
 
 class Server:
-    """Prefect's server on a port of its own.
+    """A Prefect server on a free port.
 
     Args:
-        home: for its settings, logs, and its SQLite database.
+        home: folder of its settings, logs and SQLite database.
         database: URL of another database.
     """
 
@@ -96,7 +96,7 @@ class Server:
         self._process: subprocess.Popen[Any] | None = None
 
     def start(self) -> None:
-        """Start it, or start it again."""
+        """Start the server (again)."""
         with open(self.home / "server.log", "a", encoding="utf-8") as log:
             command = [sys.executable, "-m", "prefect", "server", "start", "--port", str(self.port)]
             self._process = subprocess.Popen(
@@ -109,12 +109,12 @@ class Server:
             raise RuntimeError((self.home / "server.log").read_text(encoding="utf-8")[-3000:]) from None
 
     def kill(self) -> None:
-        """As a power cut does."""
+        """Kill the server."""
         if self._process:
             kill(self._process)
 
     def close(self) -> None:
-        """End it, and all that was started with its address."""
+        """Kill the server and all processes that use its folder."""
         self.kill()
         for process in processes("PREFECT_HOME", str(self.home)):
             try:
@@ -140,11 +140,11 @@ class Server:
             except urllib.error.HTTPError as error:
                 if error.code != 503:
                     raise
-                time.sleep(1)  # SQLite is busy
+                time.sleep(1)  # the SQLite database is locked
             except TimeoutError:
                 if method != "GET":
                     raise
-        raise TimeoutError(f"{path}: the database is busy for good")
+        raise TimeoutError(f"{path}: the database stays locked")
 
     def cli(self, *args: str, **env: str) -> subprocess.CompletedProcess[str]:
         """Run `prefect ARGS` in the repository."""
@@ -177,22 +177,22 @@ class Server:
             kill(process)
 
     def deployment(self, flow: str, name: str) -> dict[str, Any]:
-        """A deployment as the server knows it."""
+        """A deployment from the server."""
         return self.api("GET", f"/deployments/name/{flow}/{name}")
 
     def run(self, deployment: dict[str, Any], **parameters: Any) -> str:
-        """Have a deployment run now; returns the run's id."""
+        """Start a run of a deployment; returns its id."""
         made = self.api("POST", f"/deployments/{deployment['id']}/create_flow_run", {"parameters": parameters})
         return made["id"]
 
     def runs(self, deployment: dict[str, Any], state: str) -> list[dict[str, Any]]:
-        """All runs of a deployment that are in this state."""
+        """All runs of a deployment in this state."""
         runs = self.api("POST", "/flow_runs/filter", {"deployments": {"id": {"any_": [deployment["id"]]}}})
         return [run for run in runs if run["state_type"] == state]
 
     @contextmanager
     def scheduled(self, deployment: dict[str, Any], parameters: dict[str, Any], **when: Any) -> Iterator[None]:
-        """A schedule of a deployment, as long as it is held."""
+        """Add a schedule to a deployment while the context is active."""
         path = f"/deployments/{deployment['id']}/schedules"
         made = self.api(
             "POST", path, [{"schedule": when, "active": True, "max_scheduled_runs": 5, "parameters": parameters}]
@@ -214,13 +214,13 @@ class Server:
 
 @contextmanager
 def postgres() -> Iterator[str]:
-    """A PostgreSQL of our own; yields its URL as Prefect wants it."""
-    debian = sorted(map(str, Path("/usr/lib/postgresql").glob("*/bin")), reverse=True)  # not on the PATH there
+    """A temporary PostgreSQL server; yields its URL for Prefect."""
+    debian = sorted(map(str, Path("/usr/lib/postgresql").glob("*/bin")), reverse=True)  # not on the PATH in Debian
     path = os.pathsep.join([*debian, os.environ.get("PATH", "")])
     initdb, serve = shutil.which("initdb", path=path), shutil.which("postgres", path=path)
     if not initdb or not serve:
         pytest.skip("PostgreSQL isn't installed (tests/flows/prefect/packages.txt)")
-    # it refuses to run as root
+    # PostgreSQL refuses to run as root
     drop = ["setpriv", "--reuid", "nobody", "--regid", "nogroup", "--clear-groups"] if os.getuid() == 0 else []
     data = Path(tempfile.mkdtemp(prefix="scan2sim-postgres-"))
     try:
@@ -253,7 +253,7 @@ def _listens(port: int) -> bool:
 
 @contextmanager
 def serving(database: str, home: Path) -> Iterator[Server]:
-    """A running server with the database of that name."""
+    """A running Prefect server with a database: "sqlite" or "postgres"."""
     with ExitStack() as stack:
         server = Server(home, stack.enter_context(postgres()) if database == "postgres" else None)
         stack.callback(server.close)
@@ -263,18 +263,18 @@ def serving(database: str, home: Path) -> Iterator[Server]:
 
 @pytest.fixture(scope="session")
 def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """A running server; tests say with which database (`on`). One at a time: pytest sorts tests by it."""
+    """A running server with the database selected by `on`; pytest groups tests by it, so one server runs at a time."""
     with serving(request.param, tmp_path_factory.mktemp(request.param)) as server:
         yield server
 
 
 def on(*databases: str | ParameterSet) -> pytest.MarkDecorator:
-    """Run a test with these databases."""
+    """Mark a test to run with these databases."""
     return pytest.mark.parametrize("server", databases, indirect=True, scope="session")
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """For a toy survey."""
+    """Folder of a toy survey."""
     (tmp_path / "source.txt").write_text("1", encoding="utf-8")
     return tmp_path

@@ -1,4 +1,4 @@
-"""Flows, and the command, of worlds whose side products failed; run as a script by `test_incomplete.py`."""
+"""Runs the flows and the command with failing side products; executed as a script by `test_incomplete.py`."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from scan2sim.flows.deployed.tile import tile
 from scan2sim.pipeline.core.errors import IncompleteError
 
 
-def made(*_: object, **__: object) -> Path:
-    """As `run_tile` and `make_survey` end where roads failed."""
+def incomplete(*_: object, **__: object) -> Path:
+    """Replacement of `run_tile` and `make_survey` that fails like with failed roads."""
     raise IncompleteError("out/world", "the world is finished, but a side product failed: roads")
 
 
 def main(out: str) -> None:
     """Print the final state of each flow; then run the command."""
-    here = "scan2sim.flows.deployed"
+    package = "scan2sim.flows.deployed"
     with (
-        patch(f"{here}.tile.run_tile", made),
-        patch(f"{here}.survey.make_survey", made),
-        patch(f"{here}.survey.survey_of", lambda source, *_, **__: source),
-        patch(f"{here}.reprocess.survey_of", lambda source, *_, **__: source),
-        patch(f"{here}.reprocess.changes", lambda *_: {"street": "roads: it was never run"}),
+        patch(f"{package}.tile.run_tile", incomplete),
+        patch(f"{package}.survey.make_survey", incomplete),
+        patch(f"{package}.survey.survey_of", lambda source, *_, **__: source),
+        patch(f"{package}.reprocess.survey_of", lambda source, *_, **__: source),
+        patch(f"{package}.reprocess.changes", lambda *_: {"street": "roads: never run before"}),
         patch.object(sys, "argv", ["scan2sim", "survey", "somewhere", "--out", out, "--runner", "threads"]),
     ):
         for flow in (tile, survey, reprocess):

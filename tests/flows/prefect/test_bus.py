@@ -1,4 +1,4 @@
-"""A flow and its workers tell the event bus how the steps of its run fare."""
+"""A flow and its workers publish the progress of a run on the event bus."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from scan2sim.services import kafka
-from scan2sim.services.monitoring.dashboard.state import Noticed
+from scan2sim.services.monitoring.dashboard.state import BusState
 from scan2sim.services.monitoring.events.schema import Event
 from tests.fakes.broker import Broker
 from tests.flows.prefect.conftest import Server, on
@@ -18,18 +18,18 @@ from tests.flows.prefect.toy_steps import STEPS
 
 @on("sqlite")
 @pytest.mark.parametrize("runner", ["threads", "dask"])
-def test_a_flow_and_its_workers_tell_of_one_run(runner: str, server: Server, folder: Path, broker: Broker) -> None:
+def test_flow_and_workers_publish_the_same_run(runner: str, server: Server, folder: Path, broker: Broker) -> None:
     arguments = ("-c", SCRIPT, str(folder), runner, broker.servers)
     process = server.spawn(*arguments, log=folder / "output", XDG_STATE_HOME=str(folder / "state"))
-    noticed, hosts = Noticed(time.time()), set[tuple[str, str]]()
+    bus_state, hosts = BusState(time.time()), set[tuple[str, str]]()
     end = time.monotonic() + 150
     for body in kafka.read(broker.servers, "bus_events", group="test", from_start=True, wait=0.5):
         if body is not None:
-            noticed.take(body)
-            told = Event.model_validate_json(body)
-            if told.kind == "step" and told.body["state"] == "done" and told.body["host"]:
-                hosts.add((told.body["tile"], told.body["step"]))
-        runs = noticed.state(time.time())["runs"]
+            bus_state.add(body)
+            event = Event.model_validate_json(body)
+            if event.kind == "step" and event.body["state"] == "done" and event.body["host"]:
+                hosts.add((event.body["tile"], event.body["step"]))
+        runs = bus_state.state(time.time())["runs"]
         ended = runs and runs[0]["details"]["last"] and runs[0]["details"]["last"]["state"] != "running"
         if (ended and len(hosts) == TILES * len(STEPS)) or time.monotonic() > end:
             break
@@ -39,4 +39,4 @@ def test_a_flow_and_its_workers_tell_of_one_run(runner: str, server: Server, fol
     assert (last["command"], last["source"], last["state"]) == ("survey", str(folder), "done")
     assert last["done"] == last["steps"] == len(hosts) == TILES * len(STEPS)
     assert all(step["state"] == "done" and step["seconds"] and step["memory"] for step in run["details"]["steps"])
-    assert not noticed.counts
+    assert not bus_state.counts

@@ -1,4 +1,4 @@
-"""Deployments on a real server, a real worker and a real schedule; what users are told when something's missing."""
+"""Deployments on a real server with a real worker and schedule; messages when something is missing."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DEPLOYED = ["reprocess", "survey", "tile"]
 
 @pytest.fixture(scope="session")
 def toys(server: Server) -> Iterator[Server]:
-    """A server that has the toy deployments, and a worker for them."""
+    """A server with the toy deployments and a worker."""
     assert server.cli("work-pool", "create", "toys", "--type", "process").returncode == 0
     deployed = server.cli("deploy", "--prefect-file", "tests/flows/prefect/toy.yaml", "--all")
     assert deployed.returncode == 0, deployed.stdout
@@ -34,8 +34,8 @@ def toys(server: Server) -> Iterator[Server]:
 
 
 @on("sqlite")
-def test_what_is_missing_is_named(server: Server) -> None:
-    """Here first: there is no pool yet."""
+def test_missing_work_pool_is_named(server: Server) -> None:
+    """Must be the first test: there is no pool yet."""
     deployed = server.cli("deploy", "-n", "tile")
     assert deployed.returncode != 0
     assert "work pool 'scan2sim-process' which does not exist" in deployed.stdout
@@ -45,7 +45,7 @@ def test_what_is_missing_is_named(server: Server) -> None:
 
 
 @on("sqlite")
-def test_all_deployments_and_automations_are_taken(server: Server) -> None:
+def test_server_accepts_all_deployments_and_automations(server: Server) -> None:
     pools = {kind: f"scan2sim-{kind}" for kind in ("process", "docker", "kubernetes")}
     template = ["--base-job-template", "deploy/kubernetes.json"]
     for command in (
@@ -75,15 +75,15 @@ def test_all_deployments_and_automations_are_taken(server: Server) -> None:
 
 
 @on("sqlite", pytest.param("postgres", marks=pytest.mark.slow))
-def test_a_schedule_fires_a_worker_runs_it_and_nothing_disturbs_it(toys: Server, folder: Path) -> None:
-    """What comes due meanwhile is cancelled; what is started past the limit finds the folder taken, and is skipped."""
+def test_scheduled_run_is_executed_without_overlap(toys: Server, folder: Path) -> None:
+    """Overlapping scheduled runs are cancelled; a run started manually finds the folder locked and is skipped."""
     nightly, other = toys.deployment("toy", "one-at-a-time"), toys.deployment("toy", "any")
     parameters = {"folder": str(folder), "gate": str(folder / "gate")}
     with toys.scheduled(nightly, parameters, interval=5.0):
         wait_for("its first step", (folder / "started").exists)
         (first,) = toys.runs(nightly, "RUNNING")
         state = toys.ended(toys.run(other, **parameters))
-        assert state["name"] == "Skipped" and "another run is writing here" in state["message"]
+        assert state["name"] == "Skipped" and "another run is using this folder" in state["message"]
         wait_for("a cancelled run", lambda: toys.runs(nightly, "CANCELLED"))
     (folder / "gate").touch()
     state = toys.ended(first["id"])
@@ -92,11 +92,11 @@ def test_a_schedule_fires_a_worker_runs_it_and_nothing_disturbs_it(toys: Server,
     assert len((folder / "log").read_text(encoding="utf-8").split()) == 3
 
     with toys.scheduled(nightly, parameters, cron="0 2 * * *", timezone="Etc/UTC"):
-        # with SQLAlchemy 2.1, PostgreSQL never got there
+        # with SQLAlchemy 2.1 and PostgreSQL, this run never appeared
         wait_for("a run at two", lambda: toys.runs(nightly, "SCHEDULED"))
 
 
-def test_a_server_that_is_away_is_named(tmp_path: Path) -> None:
+def test_unreachable_server_is_named(tmp_path: Path) -> None:
     url = f"http://127.0.0.1:{free_port()}/api"
     command = ["survey", "data_samples/tile", "--out", str(tmp_path / "out"), "--runner", "dask"]
     run = subprocess.run(
@@ -105,25 +105,25 @@ def test_a_server_that_is_away_is_named(tmp_path: Path) -> None:
         cwd=ROOT, capture_output=True, text=True,
     )  # fmt: skip
     assert run.returncode == exit_code(UnavailableError("", "", "")), run.stderr
-    assert f"{url}: Prefect's server doesn't answer" in run.stderr and "prefect server start" in run.stderr
+    assert f"{url}: the Prefect server doesn't answer" in run.stderr and "prefect server start" in run.stderr
 
 
-def test_other_versions_are_refused(folder: Path) -> None:
+def test_other_versions_are_rejected(folder: Path) -> None:
     item = planned(folder, 1)[0]
     check_version(item, versions())
-    with pytest.raises(UnavailableError, match=r"this worker has scan2sim \S+ instead of 9\.9.*same version on all"):
+    with pytest.raises(UnavailableError, match=r"this worker has scan2sim \S+ instead of 9\.9.*versions of the flow"):
         check_version(item, {**versions(), "scan2sim": "9.9"})
 
 
 @on("sqlite")
-def test_a_worker_of_another_version_says_so(toys: Server, folder: Path) -> None:
+def test_worker_with_another_version_fails_the_run(toys: Server, folder: Path) -> None:
     state = toys.ended(toys.run(toys.deployment("toy", "any"), folder=str(folder), pretend="9.9"))
     assert state["type"] == "FAILED" and "instead of 9.9" in state["message"]
     assert not (folder / "log").exists()
 
 
 @pytest.mark.slow
-def test_a_run_whose_worker_died_too_is_found_out_and_run_again(tmp_path: Path, folder: Path) -> None:
+def test_run_of_a_killed_worker_is_detected_and_rescheduled(tmp_path: Path, folder: Path) -> None:
     text = (ROOT / "deploy" / "automations.yaml").read_text(encoding="utf-8").replace("name: reprocess", "name: toy")
     (tmp_path / "automations.yaml").write_text(text, encoding="utf-8")
     with serving("sqlite", tmp_path) as server:
@@ -135,7 +135,7 @@ def test_a_run_whose_worker_died_too_is_found_out_and_run_again(tmp_path: Path, 
         with server.worker("toys") as worker:
             run = server.run(deployment, folder=str(folder), gate=str(folder / "gate"))
             wait_for("its first step", (folder / "started").exists)
-            time.sleep(3)  # its first heartbeat is on its way
+            time.sleep(3)  # until its first heartbeat is sent
             kill(worker)
         for pid in processes("PREFECT__FLOW_RUN_ID", run):
             os.kill(pid, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""A flow whose world is finished without side products that failed: it completes, and its state says so."""
+"""Flows whose world is finished but side products failed: final state of the flow and exit code of the command."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.flows.prefect.conftest import Server, on
 
 
 @on("sqlite")
-def test_flows_complete_with_warnings_and_the_command_has_its_exit_code(server: Server, tmp_path: Path) -> None:
+def test_incomplete_world_ends_with_a_warning_state_and_exit_code(server: Server, tmp_path: Path) -> None:
     done = server.script(sys.executable, "-m", "tests.flows.prefect.incomplete", str(tmp_path))
     assert done.returncode == exit_code(IncompleteError("", "")), done.stdout
     cause = "the world is finished, but a side product failed: roads"

@@ -1,4 +1,4 @@
-"""A survey on a cluster whose workers, flow or server are killed: it is finished, and nothing is done twice."""
+"""Surveys on a cluster whose workers, flow or server are killed: they finish, and finished steps don't run twice."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from scan2sim.flows.engine.dispatch import dispatch
-from scan2sim.flows.engine.execution import run_apart
-from scan2sim.flows.engine.planning import Planned
-from scan2sim.flows.pipelines.graph import NodeId
+from scan2sim.flows.engine.execution import run_in_subprocess
+from scan2sim.flows.engine.planning import PlannedTask
+from scan2sim.flows.pipelines.graph import TaskId
 from scan2sim.pipeline.core.cache import Store
 from tests.conftest import ROOT
 from tests.flows.prefect.conftest import Server, environment, kill, on, processes, wait_for
@@ -35,33 +35,33 @@ class Survey:
         self._outputs: list[Path] = []
 
     def start(self) -> subprocess.Popen[bytes]:
-        """Start it, or start it again; alone in its process group."""
+        """Start the script (again), in a process group of its own."""
         self._outputs.append(self.folder / f"output{len(self._outputs)}")
         arguments = ("-c", SCRIPT, str(self.folder), self._runner)
         return self._server.spawn(*arguments, log=self._outputs[-1], SURVEY=str(self.folder))
 
     def processes(self) -> list[int]:
-        """All that were started by it, or by what it started."""
+        """Ids of its processes and their descendants."""
         return processes("SURVEY", str(self.folder))
 
-    def under_way(self) -> dict[str, int]:
-        """Wait until some steps are done, and others are going on; returns those."""
+    def wait_until_running(self) -> dict[str, int]:
+        """Wait until some steps are done and others are running; returns the running ones."""
         try:
             wait_for("some steps", lambda: len(self.done()) >= 4, 120)
-            return wait_for("one more", self.going_on, 30)
+            return wait_for("one more", self.running_steps, 30)
         except TimeoutError as error:
             raise AssertionError(f"{error}; {len(self.done())} are done\n{self.output()}") from None
 
     def done(self) -> dict[str, int]:
-        """When each step that is kept was finished."""
+        """Time in ns when each step with a cached result was finished."""
         store = Store(self.folder / "steps")
-        kept = [p for p in planned(self.folder, TILES) if store.find(p.node.full_name, p.key)]
+        kept = [p for p in planned(self.folder, TILES) if store.find(p.task.full_name, p.key)]
         return {
-            p.node.full_name: (store.folder(p.node.full_name, p.key) / "manifest.json").stat().st_mtime_ns for p in kept
+            p.task.full_name: (store.folder(p.task.full_name, p.key) / "manifest.json").stat().st_mtime_ns for p in kept
         }
 
-    def going_on(self) -> dict[str, int]:
-        """Steps that have begun and not ended, and the worker that runs each."""
+    def running_steps(self) -> dict[str, int]:
+        """Running steps and the process ids of their workers."""
         if not (self.folder / "started").exists():
             return {}
         begun = dict(line.split()[::2] for line in (self.folder / "started").read_text(encoding="utf-8").splitlines())
@@ -69,30 +69,30 @@ class Survey:
         return {name: int(worker) for name, worker in begun.items() if name not in ended}
 
     def runs(self) -> Counter[str]:
-        """How often each step came to its end."""
+        """Number of times that each step has finished."""
         return Counter((self.folder / "log").read_text(encoding="utf-8").split())
 
     def finish(self, process: subprocess.Popen[bytes]) -> str:
-        """Wait for the end; returns what was printed."""
+        """Wait for the end of the process; returns its output."""
         process.wait(150)
         return self.output()
 
     def output(self) -> str:
-        """What was printed since it was last started."""
+        """Output since the last start."""
         return self._outputs[-1].read_text(encoding="utf-8")
 
 
 @pytest.fixture
 def survey(request: pytest.FixtureRequest, server: Server, folder: Path) -> Survey:
-    """On Dask, if the test doesn't say otherwise."""
+    """A survey on Dask, unless the test sets another runner."""
     return Survey(server, folder, getattr(request, "param", "dask"))
 
 
 @on("sqlite")
 @pytest.mark.parametrize("survey", ["dask", pytest.param("ray", marks=pytest.mark.slow)], indirect=True)
-def test_a_killed_worker_is_made_up_for(survey: Survey) -> None:
+def test_survey_finishes_after_a_worker_is_killed(survey: Survey) -> None:
     process = survey.start()
-    lost = survey.under_way()
+    lost = survey.wait_until_running()
     os.kill(next(iter(lost.values())), signal.SIGKILL)
     output = survey.finish(process)
     assert f"total {TILES * 4}" in output, output[-3000:]
@@ -102,13 +102,13 @@ def test_a_killed_worker_is_made_up_for(survey: Survey) -> None:
 
 @on("sqlite")
 @pytest.mark.parametrize("survey", ["dask", pytest.param("ray", marks=pytest.mark.slow)], indirect=True)
-def test_a_killed_flow_goes_on_where_it_was(survey: Survey) -> None:
+def test_killed_flow_resumes_with_finished_steps(survey: Survey) -> None:
     process = survey.start()
-    survey.under_way()
+    survey.wait_until_running()
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    wait_for("the end of all that it started", lambda: not survey.processes(), 30)
-    before, lost = survey.done(), set(survey.going_on())
+    wait_for("the end of all its processes", lambda: not survey.processes(), 30)
+    before, lost = survey.done(), set(survey.running_steps())
     assert 4 <= len(before) < len(ALL)
 
     output = survey.finish(survey.start())
@@ -120,21 +120,21 @@ def test_a_killed_flow_goes_on_where_it_was(survey: Survey) -> None:
 
 
 @on("sqlite")
-def test_a_killed_server_is_started_again_and_so_is_the_survey(survey: Survey, server: Server) -> None:
+def test_survey_resumes_after_the_server_is_killed(survey: Survey, server: Server) -> None:
     process = survey.start()
-    survey.under_way()
+    survey.wait_until_running()
     server.kill()
     before = survey.done()
     server.start()
-    survey.finish(process)  # whether it got over it or not
+    survey.finish(process)  # may succeed or fail
     output = survey.finish(survey.start())
     assert f"total {TILES * 4}" in output, output[-3000:]
     assert before.items() <= survey.done().items()
     assert survey.runs() == Counter(ALL)
 
 
-def test_ctrl_c_ends_a_run_and_the_server_that_it_started(tmp_path: Path) -> None:
-    """The terminal interrupts the server as well: Prefect can't be told any more."""
+def test_ctrl_c_stops_the_run_and_its_temporary_server(tmp_path: Path) -> None:
+    """The terminal also interrupts the server, so Prefect can't be notified."""
     out, log = tmp_path / "out", tmp_path / "log"
     command = [
         sys.executable,
@@ -155,13 +155,13 @@ def test_ctrl_c_ends_a_run_and_the_server_that_it_started(tmp_path: Path) -> Non
         wait_for("a finished step", lambda: list(out.glob("steps/*/*/*/manifest.json")), 150)
         os.killpg(process.pid, signal.SIGINT)
         assert process.wait(20) == 130
-        wait_for("the end of all that it started", lambda: not processes("PREFECT_HOME", str(tmp_path)), 30)
+        wait_for("the end of all its processes", lambda: not processes("PREFECT_HOME", str(tmp_path)), 30)
     finally:
         kill(process)
-    assert "the same command goes on from there" in log.read_text(encoding="utf-8")
+    assert "the same command resumes from there" in log.read_text(encoding="utf-8")
 
 
-def test_a_killed_command_takes_the_server_that_it_started_along(tmp_path: Path) -> None:
+def test_temporary_server_ends_with_a_killed_command(tmp_path: Path) -> None:
     out, log = tmp_path / "out", tmp_path / "log"
     command = [sys.executable, "-m", "scan2sim.flows.cli", "survey", "data_samples/tile", "--out", str(out)]
     with open(log, "w", encoding="utf-8") as file:
@@ -172,14 +172,14 @@ def test_a_killed_command_takes_the_server_that_it_started_along(tmp_path: Path)
     try:
         wait_for("its server", lambda: processes("PREFECT__SERVER_EPHEMERAL", "1"), 150)
         wait_for("a finished step", lambda: list(out.glob("steps/*/*/*/manifest.json")), 150)
-        process.kill()  # it alone
-        wait_for("the end of all that it started", lambda: not processes("PREFECT_HOME", str(tmp_path)), 30)
+        process.kill()  # only the command
+        wait_for("the end of all its processes", lambda: not processes("PREFECT_HOME", str(tmp_path)), 30)
     finally:
         kill(process)
 
 
-class GivenUp:
-    """A future as runners give it that have lost too many workers to a step (Dask: `KilledWorker`)."""
+class FailedFuture:
+    """A failed future of a runner that lost too many workers to a step (Dask: `KilledWorker`)."""
 
     def add_done_callback(self, fn: Callable[[Any], None]) -> None:
         fn(self)
@@ -188,21 +188,21 @@ class GivenUp:
         raise RuntimeError("three workers died of it")
 
 
-class Finished(GivenUp):
-    """A future of a step that was run at once."""
+class FinishedFuture(FailedFuture):
+    """A future of a step that has run synchronously."""
 
-    def __init__(self, item: Planned, store: Store) -> None:
-        run_apart(item, store, lambda *_: None)
+    def __init__(self, item: PlannedTask, store: Store) -> None:
+        run_in_subprocess(item, store, lambda *_: None)
 
     def result(self, *, raise_on_failure: bool) -> Any:
         return "its manifest's path"
 
 
-def test_a_step_that_takes_its_workers_along_fails_alone(folder: Path) -> None:
-    store, second = Store(folder / "steps"), NodeId("second", tile="0")
+def test_step_that_crashes_its_workers_fails_alone(folder: Path) -> None:
+    store, second = Store(folder / "steps"), TaskId("second", tile="0")
 
-    def submit(item: Planned) -> GivenUp:
-        return GivenUp() if item.node.id == second else Finished(item, store)
+    def submit(item: PlannedTask) -> FailedFuture:
+        return FailedFuture() if item.task.id == second else FinishedFuture(item, store)
 
     outcome = dispatch(planned(folder, 2), store, submit, 2, lambda *_: None)
     assert set(outcome.of_tile("0")) == {"first"} and set(outcome.of_tile("1")) == set(STEPS)

@@ -1,4 +1,4 @@
-"""Workers of a pool are started and stopped as the bus asks for them, and end with the command."""
+"""`monitor pool` starts and stops workers of a Prefect pool as requested on the bus; they end with the command."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ while time.monotonic() < end:
 
 @pytest.mark.slow
 @on("sqlite")
-def test_workers_of_a_pool_come_and_go(server: Server) -> None:
-    pytest.importorskip("cyclonedds", reason="no topics of ROS 2 here")
+def test_pool_starts_and_stops_workers_on_request(server: Server) -> None:
+    pytest.importorskip("cyclonedds", reason="cyclonedds isn't installed")
     server.api("POST", "/work_pools/", {"name": "elastic", "type": "process"})
     environment = server.env | {"PYTHONPATH": str(ROOT), "ROS_DOMAIN_ID": "103", MARK: "1"}
     environment["SCAN2SIM_TRANSPORT"] = "cyclone"
@@ -49,11 +49,13 @@ def test_workers_of_a_pool_come_and_go(server: Server) -> None:
     command = [sys.executable, "-m", "scan2sim.flows.cli", "monitor", "pool", "elastic", "--max-workers", "2"]
     with subprocess.Popen(command, env=environment) as pool:
         try:
-            wait_for("the least", lambda: online() == 1 and running() == 3, 120)  # the command, a keeper, a worker
+            wait_for(
+                "the minimum", lambda: online() == 1 and running() == 3, 120
+            )  # the command, a guard process, a worker
             ask(9)
-            wait_for("no more than the most", lambda: online() == 2 and running() == 5, 120)
+            wait_for("not more than the maximum", lambda: online() == 2 and running() == 5, 120)
             ask(0)
-            wait_for("no fewer than the least", lambda: running() == 3, 120)
+            wait_for("not fewer than the minimum", lambda: running() == 3, 120)
         finally:
             pool.kill()
-    wait_for("the end of all", lambda: not processes(MARK, "1"), 60)
+    wait_for("the end of all processes", lambda: not processes(MARK, "1"), 60)

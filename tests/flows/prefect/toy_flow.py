@@ -1,4 +1,4 @@
-"""The toy survey as a flow, through the same tasks as a real one; the kill tests run `main` as a script."""
+"""The toy survey as a Prefect flow, with the same tasks as a real one; the kill tests run `main` as a script."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from prefect import flow
 from prefect.client.schemas.objects import State
 from prefect.states import Completed
 
-from scan2sim.flows.deployed.tile import by_tasks
+from scan2sim.flows.deployed.tile import prefect_executor
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.progress import published
 from scan2sim.flows.engine.versions import versions
@@ -23,11 +23,11 @@ from tests.flows.prefect.toy_steps import STEPS, planned
 def toy_tiles(
     folder: str, tiles: int, gate: str | None, runner: str, pretend: str | None, bus: str | None
 ) -> int:  # fmt: skip
-    """All tiles; returns the sum of what came out."""
+    """Run all tiles; returns the sum of their results."""
     pretended = {**versions(), **({"scan2sim": pretend} if pretend else {})}
-    with published(bus, "survey", folder, here=False) as on_bus:
+    with published(bus, "survey", folder, local=False) as on_bus:
         with patch("scan2sim.flows.deployed.tile.versions", lambda: pretended):
-            run = by_tasks(runner, 2, bus=on_bus)
+            run = prefect_executor(runner, 2, bus=on_bus)
         outcome = run(planned(Path(folder), tiles, Path(gate) if gate else None), Store(Path(folder) / "steps"))
         outcome.check()
     return sum(outcome.of_tile(str(tile))[STEPS[-1]].facts["total"] for tile in range(tiles))
@@ -38,7 +38,7 @@ def toy_survey(
     folder: str, tiles: int = 1, gate: str | None = None, runner: str = "threads", pretend: str | None = None,
     bus: str | None = None,
 ) -> State:  # fmt: skip
-    """One run at a time, as `reprocess`; of a version of the project that it pretends to have."""
+    """One run at a time, like `reprocess`; `pretend` replaces the version of the project."""
     try:
         with locked(Path(folder)):
             total = toy_tiles(folder, tiles, gate, runner, pretend, bus)

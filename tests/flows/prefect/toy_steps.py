@@ -1,4 +1,4 @@
-"""A toy survey: tiles of three steps that take a moment. Without Prefect, which every step's process would import."""
+"""A toy survey: tiles of three slow steps. Doesn't import Prefect, which every task process would import, too."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import os
 import time
 from pathlib import Path
 
-from scan2sim.flows.engine.planning import Planned, plan
-from scan2sim.flows.pipelines.graph import Node, Output
+from scan2sim.flows.engine.planning import PlannedTask, plan
+from scan2sim.flows.pipelines.graph import Output, Task
 from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
 from tests.flows.toy import ToyParams, toy
@@ -17,14 +17,14 @@ STEPS = ("first", "second", "third")
 
 
 class SlowParams(ToyParams):
-    """A toy that takes a moment before it counts its run, and waits until `gate` is there."""
+    """A toy step that takes `seconds` and waits until the file `gate` exists before it logs its run."""
 
     seconds: float = 0.3
     gate: Path | None = None
 
 
 def slow(inputs: Inputs, params: SlowParams, out: Path, report: Report) -> Done:
-    """As `toy`, later; tells beside the log who runs it: its own process, and the worker that asked for it."""
+    """Like `toy`, but slower; logs its process id and that of its worker to the file `started`."""
     parent = multiprocessing.parent_process()
     with open(params.log.with_name("started"), "a", encoding="utf-8") as file:
         file.write(f"{params.name} {os.getpid()} {parent.pid if parent else 0}\n")
@@ -35,13 +35,13 @@ def slow(inputs: Inputs, params: SlowParams, out: Path, report: Report) -> Done:
     return toy(inputs, params, out, report)
 
 
-def planned(folder: Path, tiles: int, gate: Path | None = None) -> list[Planned]:
-    """What would run in `folder`: three steps, one after the other, of every tile."""
-    nodes = []
+def planned(folder: Path, tiles: int, gate: Path | None = None) -> list[PlannedTask]:
+    """The plan in `folder`: a chain of three steps for each tile."""
+    tasks = []
     for tile in range(tiles):
         before: Path | Output = folder / "source.txt"
         for name in STEPS:
             params = SlowParams(log=folder / "log", name=f"{tile}-{name}", value=1, gate=gate)
-            nodes.append(Node(Step(name, 1, slow, SlowParams), params, {"before": before}, tile=str(tile)))
-            before = Output(nodes[-1].id, "number")
-    return plan(nodes, Store(folder / "steps"))
+            tasks.append(Task(Step(name, 1, slow, SlowParams), params, {"before": before}, tile=str(tile)))
+            before = Output(tasks[-1].id, "number")
+    return plan(tasks, Store(folder / "steps"))

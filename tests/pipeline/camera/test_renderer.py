@@ -109,7 +109,7 @@ def test_more_rays_a_pixel_filter_what_is_finer_than_a_pixel(tmp_path: Path) -> 
 def test_a_picture_is_the_same_in_small_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     camera, pose = pinhole(60, 40, field=90), look_at((0, -6, 1), (0, 0, 1))  # its upper rows see nothing
     whole = Renderer([checkered(tmp_path)]).view(camera, pose, samples=3)
-    monkeypatch.setattr("scan2sim.pipeline.camera.renderer.CHUNK", 600)
+    monkeypatch.setattr("scan2sim.pipeline.camera.renderer.RAY_CHUNK", 600)
     pieces = Renderer([checkered(tmp_path)]).view(camera, pose, samples=3)
     np.testing.assert_array_equal(whole.rgb, pieces.rgb)
     np.testing.assert_array_equal(whole.face, pieces.face)
@@ -130,6 +130,6 @@ def test_nearest_places_lie_on_the_mesh(painted: Body) -> None:
     rgb, seen, distance = Renderer([painted]).nearest(points)
     assert rgb.tolist() == [[255, 0, 0], [255, 255, 255]] and seen.tolist() == [128, 255]
     np.testing.assert_allclose(distance, [0.3, 0.2], rtol=1e-5)
-    places, normals = Renderer([painted]).nearest_places(points)
+    places, normals = Renderer([painted]).closest_points(points)
     np.testing.assert_allclose(places, [[-1, 1, 0], [1, -1, 0]], atol=1e-6)
     np.testing.assert_allclose(abs(normals), [[0, 0, 1], [0, 0, 1]], atol=1e-6)

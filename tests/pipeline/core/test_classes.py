@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from laspy.vlrs.known import ClassificationLookupVlr
 
-from scan2sim.pipeline.core.classes import CODE, code_of, parse
+from scan2sim.pipeline.core.classes import CODE, code_of, parse_mapping
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Frame, PointCloud
@@ -46,7 +46,7 @@ def foreign(path: Path, software: str = "TerraScan", names: dict[int, str] | Non
 
 def taken(path: Path, given: dict[int, int] | None = None) -> list[int]:
     """What 2, 1, 31, 65 and 200 of a file are here."""
-    return clouds.meanings(path, given or {})[[2, 1, 31, 65, 200]].tolist()
+    return clouds.code_table(path, given or {})[[2, 1, 31, 65, 200]].tolist()
 
 
 def test_codes_of_the_survey_are_ours_only_where_the_file_says_so(tmp_path: Path) -> None:
@@ -66,12 +66,12 @@ def test_what_is_written_here_is_read_as_ours(tmp_path: Path) -> None:
 
 
 def test_classes_that_the_user_names(tmp_path: Path) -> None:
-    assert parse("65=noise, 200=5,31=Road sign") == {65: 7, 200: 5, 31: 64}
+    assert parse_mapping("65=noise, 200=5,31=Road sign") == {65: 7, 200: 5, 31: 64}
     assert code_of("ground") == CODE["terrain"]
     refused = {"65": "names no class", "5=noise,5=6": "5=6.*again", "65=x": "no class 'x'", "x=6": "no code"}
     for text, message in (refused | {"256=6": "no code"}).items():
         with pytest.raises(SettingError, match=message):
-            parse(text)
+            parse_mapping(text)
     (tmp_path / "tile.toml").write_text(
         'name = "t"\ncrs = "local"\nclouds = ["a.las"]\n[classes]\n65 = "fog"\n', encoding="utf-8"
     )
@@ -112,5 +112,5 @@ def test_tiles_of_a_survey_hold_codes_as_the_corridor_says(tmp_path: Path) -> No
     survey = read_survey(cut_survey(path, tmp_path / "survey", CutParams(length=100.0), warn=warned.append))
     assert len(warned) == 1 and warned[0].startswith("a.las: codes 200 (20.0%) are the survey's own")
     tile = read_tile(next(iter(survey.tiles.values())))
-    codes = clouds.meanings(tile.clouds[0], tile.classes)[clouds.read(tile.clouds[0], tile.frame).classification]
+    codes = clouds.code_table(tile.clouds[0], tile.classes)[clouds.read(tile.clouds[0], tile.frame).classification]
     assert np.unique(codes).tolist() == [1, 2, 31, 69]

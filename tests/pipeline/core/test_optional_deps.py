@@ -7,7 +7,6 @@ import re
 import sys
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -58,17 +57,9 @@ def test_a_setting_that_cannot_be_is_refused_before_anything_runs(
 
 def test_a_survey_is_refused_before_it_is_cut(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     without(monkeypatch, "transformers")
-    how: dict[str, Any] = dict.fromkeys(("length", "buffer", "memory", "address", "cores", "prefect"))
     for setting, error in (("label.network=segformer", UnavailableError), ("lable.network=segformer", SettingError)):
         with pytest.raises(error):
-            run_source(
-                str(TILE),
-                str(tmp_path),
-                Settings.read(None, [setting]),
-                jobs=1,
-                runner="processes",
-                **how,
-            )
+            run_source(str(TILE), str(tmp_path), Settings.read(None, [setting]), jobs=1)
     assert not list(tmp_path.iterdir())
 
 
@@ -148,7 +139,11 @@ def test_a_package_that_is_missing_ends_all_commands_alike(
     words = [{"TILE": str(TILE), "FRAMES": "frames"}.get(word, word) for word in command.split()]
     out = "weights.onnx" if "train" in words else "plot.png" if "evaluate" in words else "out"
     monkeypatch.setenv("SCAN2SIM_TRANSPORT", "cyclone")
-    error = CliRunner().invoke(app, [*words, *([] if words[0] in ("monitor", "teleop") else ["--out", out])]).exception
+    error = (
+        CliRunner()
+        .invoke(app, [*words, *([] if words[0] in ("monitor", "teleop", "orchestrate") else ["--out", out])])
+        .exception
+    )
     assert isinstance(error, UnavailableError) and exit_code(error) == 7
     assert package in error.cause and f"pip install 'scan2sim[{EXTRA_OF[package]}" in error.remedy
 

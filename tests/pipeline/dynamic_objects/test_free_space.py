@@ -135,7 +135,7 @@ def test_without_path_times_or_a_second_look_all_stays(street: PointCloud, tmp_p
     cases = (
         (street, None, "path"),
         (PointCloud(street.frame, street.xyz), path(), "times"),
-        (street, path(begin=5000.0), "another time"),
+        (street, path(begin=5000.0), "overlap in time"),
     )
     for i, (cloud, way, why) in enumerate(cases):
         done = carve(cloud, tmp_path / str(i), way, cameras=((0.0, 0.0, 30.0),))
@@ -143,7 +143,7 @@ def test_without_path_times_or_a_second_look_all_stays(street: PointCloud, tmp_p
         assert way is not None or len(PointCloud.load(done.files["cloud"])) == len(cloud)
     assert street.time is not None
     once = carve(street.take(street.time == 0.5), tmp_path / "once", path())
-    assert once.facts["moved"] == 0 and "seen once" in str(once.facts["rays"])
+    assert once.facts["moved"] == 0 and "observed only once" in str(once.facts["rays"])
 
 
 def test_a_profile_scanner_tells_nothing_in_one_pass(tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_a_profile_scanner_tells_nothing_in_one_pass(tmp_path: Path) -> None:
     y = np.where((x > 8) & (x < 12), 3.0, 6.0)
     xyz = np.column_stack([x, y, random.uniform(0, 2, len(x))]).astype(np.float32)
     done = carve(PointCloud(Frame(), xyz, time=x / SPEED), tmp_path, path())
-    assert done.facts["moved"] == 0 and "seen once" in str(done.facts["rays"])
+    assert done.facts["moved"] == 0 and "observed only once" in str(done.facts["rays"])
     assert len(PointCloud.load(done.files["cloud"])) == len(x)
 
 

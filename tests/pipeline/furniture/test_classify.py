@@ -15,7 +15,7 @@ from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import Mesh, PointCloud, Trajectory
 from scan2sim.pipeline.furniture.poles import Columns, stems
-from scan2sim.pipeline.furniture.sign_panels import OUTLINES, Shape, inside, plates
+from scan2sim.pipeline.furniture.sign_panels import OUTLINES, Shape, detect_panels, inside
 from scan2sim.pipeline.geometry import primitives
 from scan2sim.pipeline.steps.decimate import DECIMATE, DecimateParams
 from scan2sim.pipeline.steps.finds import FINDS, FindsParams
@@ -125,7 +125,7 @@ def test_a_plate_is_outlined_by_its_points(shape: Shape) -> None:
     flat = flat[inside(flat, OUTLINES[shape], 0)] * 0.35
     along = np.array([np.cos(0.5), np.sin(0.5)])
     xyz = np.column_stack([flat[:, :1] * along + (2, 1), flat[:, 1] + 2.4]) + rng.normal(0, 0.01, (len(flat), 3))
-    (plate,) = plates(xyz, np.ones(len(xyz), bool), np.array([10.0, -3]))
+    (plate,) = detect_panels(xyz, np.ones(len(xyz), bool), np.array([10.0, -3]))
     assert plate.shape == shape
     assert plate.centre == pytest.approx([2, 1, 2.4], abs=0.03)
     assert (plate.width, plate.height) == pytest.approx((0.7, 0.7), abs=0.05)

@@ -8,7 +8,7 @@ import pytest
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.geometry import primitives
-from scan2sim.pipeline.geometry.cylinders import told_apart
+from scan2sim.pipeline.geometry.cylinders import split_cylinders
 
 POLE = primitives.tube([(1, 2, -0.2), (1.1, 2, 1), (1.4, 2.2, 3.8)], [0.05, 0.05, 0.05], 8)
 TRUNK = primitives.tube([(5, 5, 0), (5.2, 5, 2)], [0.2, 0.18], 12)
@@ -23,7 +23,7 @@ def mesh(parts: list[tuple[primitives.Triangles, str]]) -> Mesh:
 
 
 def test_a_leaning_trunk_is_where_its_tube_is() -> None:
-    (one,), rest = told_apart(mesh([(TRUNK, "high_vegetation")]))
+    (one,), rest = split_cylinders(mesh([(TRUNK, "high_vegetation")]))
     assert len(rest) == 0 and one.code == CODE["high_vegetation"]
     assert one.centre == pytest.approx((5.1, 5, 1), abs=0.01) and one.radius == pytest.approx(0.19, abs=0.005)
     assert one.length == pytest.approx(np.hypot(2, 0.2), abs=0.05)
@@ -31,7 +31,7 @@ def test_a_leaning_trunk_is_where_its_tube_is() -> None:
 
 
 def test_its_angles_turn_the_upright_axis_onto_its_own() -> None:
-    (one,), _ = told_apart(mesh([(TRUNK, "high_vegetation")]))
+    (one,), _ = split_cylinders(mesh([(TRUNK, "high_vegetation")]))
     roll, pitch, yaw = one.angles
     turned = np.array([np.sin(pitch) * np.cos(yaw), np.sin(pitch) * np.sin(yaw), np.cos(pitch)])
     assert roll == 0 and turned == pytest.approx(one.axis)
@@ -39,14 +39,14 @@ def test_its_angles_turn_the_upright_axis_onto_its_own() -> None:
 
 def test_what_bends_or_is_flat_or_walls_stays_a_mesh() -> None:
     parts = [(POLE, "pole"), (ARM, "pole"), (PLATE, "road_sign"), (TRUNK, "building")]
-    found, rest = told_apart(mesh(parts))
+    found, rest = split_cylinders(mesh(parts))
     assert len(found) <= 1 and len(rest) >= sum(len(part[1]) for part, _ in parts[1:])
     straight = primitives.tube([(1, 2, 0), (1, 2, 3)], [0.05, 0.05], 8)
-    found, rest = told_apart(mesh([(straight, "pole"), (PLATE, "road_sign")]))
+    found, rest = split_cylinders(mesh([(straight, "pole"), (PLATE, "road_sign")]))
     assert [one.code for one in found] == [CODE["pole"]] and len(rest) == len(PLATE[1])
 
 
 def test_without_classes_nothing_is_told_apart() -> None:
     vertices, faces = TRUNK
     plain = Mesh(Frame(), vertices.astype(np.float32), faces)
-    assert told_apart(plain) == ([], plain)
+    assert split_cylinders(plain) == ([], plain)

@@ -104,15 +104,15 @@ ROW = "1.png,500010,5400005,102,1,0,0,0"
 @pytest.mark.parametrize(
     ("heading", "row", "message"),
     [
-        (f"file,x,y,qw,qx,qy,qz,{CAMERA}", f"1.png,1,2,1,0,0,0,{VALUES}", r"no column `z`.*Add it to the heading"),
-        (f"file,x,y,z,roll,{CAMERA}", f"1.png,1,2,3,0,{VALUES}", r"unknown column `roll`.*Known ones are file"),
+        (f"file,x,y,qw,qx,qy,qz,{CAMERA}", f"1.png,1,2,1,0,0,0,{VALUES}", r"no column `z`.*Add it to the header line"),
+        (f"file,x,y,z,roll,{CAMERA}", f"1.png,1,2,3,0,{VALUES}", r"unknown column `roll`.*Known columns are file"),
         (f"file,x,y,z,{CAMERA}", f"1.png,1,2,3,{VALUES}", r"row 2: no rotation.*omega,phi,kappa"),
-        (f"file,x,y,z,qw,qx,qy,qz,{CAMERA}", f"1.png,1,2,up,1,0,0,0,{VALUES}", r"row 2: `z` is 'up'.*Mend that cell"),
-        (f"file,x,y,z,qw,qx,qy,qz,{CAMERA}", f"1.png,1,2,3,2,0,0,0,{VALUES}", r"quaternion's length is not 1"),
-        (f"file,x,y,z,omega,phi,kappa,{CAMERA}", f"1.png,1,2,3,nan,0,0,{VALUES}", r"NaN or infinity.*Mend the pose"),
+        (f"file,x,y,z,qw,qx,qy,qz,{CAMERA}", f"1.png,1,2,up,1,0,0,0,{VALUES}", r"row 2: `z` is 'up'.*Fix that cell"),
+        (f"file,x,y,z,qw,qx,qy,qz,{CAMERA}", f"1.png,1,2,3,2,0,0,0,{VALUES}", r"quaternion is not normalized"),
+        (f"file,x,y,z,omega,phi,kappa,{CAMERA}", f"1.png,1,2,3,nan,0,0,{VALUES}", r"NaN or infinity.*Fix the pose"),
         ("file,x,y,z,qw,qx,qy,qz,model,width,height", f"{ROW},fish,64,48", r"unknown model `fish`.*Use pinhole"),
         ("file,x,y,z,qw,qx,qy,qz,width,height,fx,k1", f"{ROW},64,48,50,0.1", r"pinhole camera has no `k1`"),
-        ("file,x,y,z,qw,qx,qy,qz,width,height", f"{ROW},64,48", r"row 2: `fx` is ''.*Mend that cell"),
+        ("file,x,y,z,qw,qx,qy,qz,width,height", f"{ROW},64,48", r"row 2: `fx` is ''.*Fix that cell"),
     ],
 )
 def test_mistakes_in_the_csv_are_named(tmp_path: Path, heading: str, row: str, message: str) -> None:
@@ -127,7 +127,7 @@ def test_a_missing_photo_is_named_and_an_old_tile_stays_unless_told(tmp_path: Pa
     first = import_las([file], tmp_path / "tile", name="first")
     sheet = photos(tmp_path, f"file,x,y,z,qw,qx,qy,qz,{CAMERA}", f"{ROW},{VALUES}")
     (tmp_path / "1.png").unlink()
-    with pytest.raises(InputError, match=r"1\.png: is missing"):
+    with pytest.raises(InputError, match=r"1\.png: file not found"):
         import_las([file], tmp_path / "tile", photos=sheet, overwrite=True)
     assert read_tile(first).name == "first"
     with pytest.raises(SettingError, match="exists and is not empty"):
@@ -138,7 +138,7 @@ def test_a_missing_photo_is_named_and_an_old_tile_stays_unless_told(tmp_path: Pa
 
 def test_files_of_one_name_are_refused(tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
-    with pytest.raises(InputError, match=r"other/c\.laz: is the second file to be called c\.laz.*Rename"):
+    with pytest.raises(InputError, match=r"other/c\.laz: is the second file with the name c\.laz.*Rename"):
         import_las([cloud(tmp_path / "c.laz"), cloud(tmp_path / "other" / "c.laz")], tmp_path / "tile")
 
 

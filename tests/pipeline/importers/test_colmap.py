@@ -146,15 +146,15 @@ def test_an_unsupported_camera_model_is_named_with_a_remedy(tmp_path: Path) -> N
 
 def test_no_model_a_damaged_one_and_a_missing_photo_leave_nothing(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"empty: holds no COLMAP model.*sparse/0"):
+    with pytest.raises(InputError, match=r"empty: contains no COLMAP model.*sparse/0"):
         import_model("colmap", tmp_path / "empty", tmp_path, tmp_path / "tile")
     make_model(tmp_path, ["PINHOLE", "OPENCV"])
     (tmp_path / "images/cam/002.png").unlink()
-    with pytest.raises(InputError, match=r"002\.png: is missing"):
+    with pytest.raises(InputError, match=r"002\.png: file not found"):
         import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "tile")
     cameras = tmp_path / "bin" / "cameras.bin"
     cameras.write_bytes(cameras.read_bytes()[:20])
-    with pytest.raises(InputError, match="is no readable COLMAP model"):
+    with pytest.raises(InputError, match="is not a readable COLMAP model"):
         import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "tile")
     assert not (tmp_path / "tile").exists() and not list(tmp_path.glob(".tile*"))
 
@@ -258,7 +258,7 @@ def test_real_photos_are_placed_by_their_gps(real_data: Path, tmp_path: Path) ->
     tile = read_tile(
         import_model("colmap", tmp_path / "model", images, tmp_path / "tile", gps=True, warn=warned.append)
     )
-    assert tile.frame.crs == "EPSG:32633" and "placed by the GPS of" in warned[0]
+    assert tile.frame.crs == "EPSG:32633" and "georeferenced by the GPS of" in warned[0]
     poses = np.array([view.T_world_cam for view in tile.views])
     assert -poses[:, 2, 1].mean() > 0.9  # the phone was held upright, which GPS doesn't know
     assert 50 < np.ptp(poses[:, 1, 3]) < 250 and np.ptp(poses[:, 2, 3]) < 15  # a level street of 170 m to the north

@@ -98,12 +98,12 @@ def test_the_command_and_poses_of_ones_own(sequence: Path, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("file", "body", "cause"),
     [
-        ("calib.txt", "P2: 1 2 3\n", "has no `Tr` of 12 numbers"),
+        ("calib.txt", "P2: 1 2 3\n", "has no `Tr` with 12 numbers"),
         ("times.txt", "0\n1\n", "has 2 times, but sweep 3"),
-        ("times.txt", "0\n1\n1\n2\n", "don't ascend"),
-        ("times.txt", "none\n", "is no list of times"),
-        ("poses.txt", "1 2 3\n", "is no pose file"),
-        ("velodyne/000001.bin", "12345", "is no Velodyne sweep"),
+        ("times.txt", "0\n1\n1\n2\n", "are not ascending"),
+        ("times.txt", "none\n", "is not a list of times"),
+        ("poses.txt", "1 2 3\n", "is not a pose file"),
+        ("velodyne/000001.bin", "12345", "is not a Velodyne sweep"),
     ],
 )
 def test_a_damaged_sequence_is_refused(sequence: Path, tmp_path: Path, file: str, body: str, cause: str) -> None:

@@ -15,7 +15,7 @@ from scan2sim.pipeline.camera.models import project
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.types import UNCOLOURED as GREY
 from scan2sim.pipeline.importers.kitti_raw import import_kitti_raw
-from scan2sim.pipeline.importers.merge_sweeps import borrow_colours
+from scan2sim.pipeline.importers.merge_sweeps import fill_colours
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.tile import read_tile
 
@@ -177,7 +177,7 @@ def test_a_pose_file_gives_the_same_world(drive: Drive, tmp_path: Path) -> None:
 
 def test_without_oxts_a_pose_file_makes_a_local_tile(drive: Drive, tmp_path: Path) -> None:
     (drive.folder / "oxts").rename(tmp_path / "away")
-    with pytest.raises(InputError, match=r"oxts: is missing, and no pose file is given.*give poses"):
+    with pytest.raises(InputError, match=r"oxts: folder not found, and no pose file is given.*give poses"):
         import_kitti_raw(drive.folder, tmp_path / "tile")
     np.savetxt(tmp_path / "poses.txt", (np.linalg.inv(drive.T_velo[0]) @ drive.T_velo)[:, :3].reshape(FRAMES, 12))
     tile = read_tile(import_kitti_raw(drive.folder, tmp_path / "tile", poses=tmp_path / "poses.txt"))
@@ -188,18 +188,18 @@ def test_without_oxts_a_pose_file_makes_a_local_tile(drive: Drive, tmp_path: Pat
 def test_borrowed_colours_come_from_the_nearest_within_reach() -> None:
     xyz = np.array([[0, 0, 0], [10, 0, 0], [0.15, 0, 0], [10.1, 0, 0], [5, 0, 0]], np.float32)
     rgb = np.array([[1, 2, 3], [7, 8, 9], [0, 0, 0], [0, 0, 0], [0, 0, 0]], np.uint8)
-    out = borrow_colours(xyz, rgb, np.array([True, True, False, False, False]), np.ones(5, np.float32))
+    out = fill_colours(xyz, rgb, np.array([True, True, False, False, False]), np.ones(5, np.float32))
     assert out.tolist() == [[1, 2, 3], [7, 8, 9], [1, 2, 3], [7, 8, 9], [GREY] * 3]
 
 
 @pytest.mark.parametrize(
     ("harm", "message"),
     [
-        ("velodyne_points/data/0000000001.bin", r"0000000001\.bin: is no Velodyne sweep.*Copy it again"),
+        ("velodyne_points/data/0000000001.bin", r"0000000001\.bin: is not a Velodyne sweep.*Copy it again"),
         ("image_02/data/0000000002.png", r"0000000002\.png: can't be read.*Copy it again"),
-        ("oxts/data/0000000003.txt", r"0000000003\.txt: is no OXTS record.*or give poses"),
-        ("velodyne_points/timestamps.txt", r"timestamps\.txt: line 1 is no time stamp.*leave that frame out"),
-        ("../calib_velo_to_cam.txt", r"calib_velo_to_cam\.txt: has no `R` of 9 numbers.*calibration again"),
+        ("oxts/data/0000000003.txt", r"0000000003\.txt: is not an OXTS record.*or give poses"),
+        ("velodyne_points/timestamps.txt", r"timestamps\.txt: line 1 is not a time stamp.*exclude that frame"),
+        ("../calib_velo_to_cam.txt", r"calib_velo_to_cam\.txt: has no `R` with 9 numbers.*calibration again"),
     ],
 )
 def test_damaged_files_are_named_and_leave_nothing(drive: Drive, tmp_path: Path, harm: str, message: str) -> None:
@@ -214,11 +214,11 @@ def test_a_short_pose_file_no_drive_and_a_full_folder_are_refused(drive: Drive, 
     with pytest.raises(InputError, match=r"poses\.txt: has 1 poses, but sweep 3"):
         import_kitti_raw(drive.folder, tmp_path / "tile", poses=tmp_path / "poses.txt")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"empty: holds no KITTI raw drive.*_sync"):
+    with pytest.raises(InputError, match=r"empty: contains no KITTI raw drive.*_sync"):
         import_kitti_raw(tmp_path / "empty", tmp_path / "tile")
     (tmp_path / "tile").mkdir()
     (tmp_path / "tile" / "mine.txt").write_text("keep", encoding="utf-8")
-    with pytest.raises(SettingError, match=r"tile: exists and is not empty.*overwritten"):
+    with pytest.raises(SettingError, match=r"tile: exists and is not empty.*--overwrite"):
         import_kitti_raw(drive.folder, tmp_path / "tile")
     assert (tmp_path / "tile" / "mine.txt").read_text(encoding="utf-8") == "keep"
 

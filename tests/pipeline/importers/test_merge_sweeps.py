@@ -7,10 +7,10 @@ import pytest
 
 from scan2sim.pipeline.camera.models import pixel_angle
 from scan2sim.pipeline.core.types import Camera
-from scan2sim.pipeline.importers.merge_sweeps import BIN, _hidden
+from scan2sim.pipeline.importers.merge_sweeps import OCCLUSION_BIN_RAD, _occluded
 
 CAMERA = Camera("pinhole", 1200, 400, 700.0, 700.0, 599.5, 199.5)
-ACROSS, DOWN = BIN / pixel_angle(CAMERA)  # pixels
+ACROSS, DOWN = OCCLUSION_BIN_RAD / pixel_angle(CAMERA)  # pixels
 
 
 @pytest.mark.parametrize(
@@ -25,4 +25,4 @@ def test_what_is_nearer_hides_in_its_own_and_the_next_columns(
 ) -> None:
     middle = (np.floor(np.array([600.0, 200.0]) / [ACROSS, DOWN]) + 0.5) * [ACROSS, DOWN] - 0.5
     uv = np.stack([middle, middle + [columns * ACROSS, rows * DOWN]])
-    assert _hidden(uv, np.array([5.0, distance]), CAMERA).tolist() == [False, hidden]
+    assert _occluded(uv, np.array([5.0, distance]), CAMERA).tolist() == [False, hidden]

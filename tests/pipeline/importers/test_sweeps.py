@@ -18,8 +18,8 @@ from scan2sim.pipeline.camera.models import pixel_rays
 from scan2sim.pipeline.core.errors import DataError, InputError, ScanError, SettingError
 from scan2sim.pipeline.core.types import F64, Camera, Frame, PointCloud, Tile, Trajectory
 from scan2sim.pipeline.importers.sweeps import (
-    Pictures,
-    Placing,
+    PhotoInput,
+    PlacementParams,
     camera_of_photos,
     import_sweeps,
     photo_extrinsics,
@@ -117,8 +117,8 @@ class Drive:
         return {"sweeps": self.folder / "sweeps", "poses": self.folder / "camera.csv", "extrinsics": T_CAMERA_SCANNER}
 
     @property
-    def pictures(self) -> Pictures:
-        return Pictures(self.folder / "photos", CAMERA)
+    def pictures(self) -> PhotoInput:
+        return PhotoInput(self.folder / "photos", CAMERA)
 
 
 def make(
@@ -146,8 +146,8 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
 
 def imported(**arguments: Any) -> Path:
     """`import_sweeps`, its parameters and all else by their names."""
-    own = {name: arguments.pop(name) for name in Placing.model_fields.keys() & arguments.keys()}
-    return import_sweeps(**arguments, placing=Placing(**own))
+    own = {name: arguments.pop(name) for name in PlacementParams.model_fields.keys() & arguments.keys()}
+    return import_sweeps(**arguments, placing=PlacementParams(**own))
 
 
 def cloud_of(path: Path) -> tuple[Tile, PointCloud, np.ndarray]:
@@ -208,7 +208,7 @@ def test_a_mask_goes_with_the_photos_and_its_pixels_colour_nothing(drive: Drive,
     mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
     mask[128:] = 0
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
-    pictures = Pictures(drive.folder / "photos", CAMERA, mask=tmp_path / "mask.png")
+    pictures = PhotoInput(drive.folder / "photos", CAMERA, mask=tmp_path / "mask.png")
     tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", photos=pictures))
     assert cloud.rgb is not None and (cloud.rgb[xyz[:, 2] < 0.3] == 128).mean() > 0.8
     assert {view.mask for view in tile.views} == {tile.path.parent / "masks" / "mask.png"}
@@ -225,13 +225,13 @@ def test_what_is_unsure_is_left_out_and_told(drive: Drive, tmp_path: Path) -> No
     tile, _, xyz = cloud_of(imported(**arguments, out=tmp_path / "tile"))
     assert len(xyz) == (SWEEPS - 2) * 600 * 24 and walls(xyz)[0].max() < 0.003 and len(tile.views) == SWEEPS - 2
     assert [text.partition(":")[0] for text in notes] == [
-        f"2 of 6 {what} are left out" for what in ("sweeps", "photos")
+        f"2 of 6 {what} are excluded" for what in ("sweeps", "photos")
     ]
     notes.clear()
     tile, _, xyz = cloud_of(imported(**arguments, out=tmp_path / "all", keep_unsure=True))
     assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() > 0.3 and not notes
     trajectory_io.write(tmp_path / "lost.csv", Trajectory(drive.times, positions, rotations, ~np.zeros(SWEEPS, bool)))
-    with pytest.raises(DataError, match=r"none of 6 sweeps has a sure pose.*--keep-unsure"):
+    with pytest.raises(DataError, match=r"none of 6 sweeps has a reliable pose.*--keep-unsure"):
         imported(**arguments, out=tmp_path / "none")
 
 
@@ -261,10 +261,12 @@ def test_times_come_from_a_file_from_names_or_from_the_order(drive: Drive, tmp_p
     assert not notes
     with pytest.raises(InputError, match=r"few: has 2 sweeps for 6 poses.*Give their times"):
         imported(**arguments | {"sweeps": given(["a.bin", "b.bin"])})
-    with pytest.raises(InputError, match=r"camera.csv: spans 0.10 to 0.60 s, the 2 sweeps 70.20 to 70.40 s.*offset"):
+    with pytest.raises(
+        InputError, match=r"camera.csv: has times from 0.10 to 0.60 s, the 2 sweeps from 70.20 to 70.40 s.*offset"
+    ):
         imported(**arguments | {"sweeps": given(["70.2.bin", "70.4.bin"])})
     imported(**arguments | {"sweeps": given(["0.2.bin", "70.4.bin"]), "warn": notes.append})
-    assert notes == ["1 of 2 sweeps are left out: outside the trajectory's times"]
+    assert notes == ["1 of 2 sweeps are excluded: outside the trajectory's times"]
 
 
 def test_nothing_is_placed_within_a_gap_of_the_trajectory(drive: Drive, tmp_path: Path) -> None:
@@ -279,7 +281,7 @@ def test_nothing_is_placed_within_a_gap_of_the_trajectory(drive: Drive, tmp_path
         "warn": notes.append,
     }
     imported(**arguments, out=tmp_path / "tile")
-    assert notes == ["1 of 6 sweeps are left out: in gaps of the trajectory"]
+    assert notes == ["1 of 6 sweeps are excluded: in gaps of the trajectory"]
 
 
 def test_a_projected_crs_keeps_its_large_coordinates(tmp_path: Path) -> None:
@@ -292,7 +294,7 @@ def test_a_projected_crs_keeps_its_large_coordinates(tmp_path: Path) -> None:
 def test_thinning_keeps_a_point_a_voxel(drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = cloud_of(imported(**drive.arguments, out=tmp_path / "whole"))[2]
     thin = cloud_of(imported(**drive.arguments, out=tmp_path / "thin", voxel=0.37))[2]
-    monkeypatch.setattr("scan2sim.pipeline.importers.sweeps.PENDING", 20_000)  # the same on the way
+    monkeypatch.setattr("scan2sim.pipeline.importers.sweeps.MAX_PENDING_POINTS", 20_000)  # the same on the way
     often = cloud_of(imported(**drive.arguments, out=tmp_path / "often", voxel=0.37))[2]
     origin = np.floor(drive.camera.positions[0])
     cells = [np.unique(np.floor((xyz - origin) / 0.37), axis=0) for xyz in (whole, thin)]
@@ -312,7 +314,7 @@ def test_extrinsics_the_wrong_way_round_are_noticed(drive: Drive, tmp_path: Path
     notes: list[str] = []
     wrong = drive.arguments | {"extrinsics": np.linalg.inv(T_CAMERA_SCANNER)}
     imported(**wrong, out=tmp_path / "tile", warn=notes.append)
-    assert any("right way round" in text for text in notes)
+    assert any("direction of the extrinsics" in text for text in notes)
 
 
 @pytest.mark.parametrize("form", ["rows", "three", "velo_to_cam", "odometry"])
@@ -351,7 +353,7 @@ def test_photos_of_kittis_second_camera_stand_beside_the_first(drive: Drive, tmp
     beside = photo_extrinsics(calib, own)
     centres = []
     for i, extrinsics in enumerate((None, beside)):
-        pictures = Pictures(own, CAMERA, extrinsics=extrinsics)
+        pictures = PhotoInput(own, CAMERA, extrinsics=extrinsics)
         tile = read_tile(imported(**drive.arguments, out=tmp_path / str(i), photos=pictures, link=True))
         centres.append((tile.views[0].T_world_cam, tile.views[0].centre))
     moved = centres[0][0][:3, :3].T @ (centres[1][1] - centres[0][1])
@@ -359,17 +361,17 @@ def test_photos_of_kittis_second_camera_stand_beside_the_first(drive: Drive, tmp
     calib.write_text(
         "P2: 1 2 3\nTr: " + " ".join(f"{v:.9f}" for v in T_CAMERA_SCANNER[:3].ravel()) + "\n", encoding="utf-8"
     )
-    with pytest.raises(InputError, match="no sound `P2`"):
+    with pytest.raises(InputError, match="no valid `P2`"):
         photo_extrinsics(calib, own)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("1 0 0\n0 1 0\n", r"T\.txt: holds no 3x4 or 4x4 matrix \(2 rows\)"),
-        ("1 0 0 0\n0 1 0 zero\n0 0 1 0", r"T\.txt: holds no 3x4 or 4x4 matrix"),
-        ("1 0 0 0\n0 1 0 0\n0 0 -1 0", r"T\.txt: its left 3x3 is no rotation"),
-        ("2 0 0 0\n0 2 0 0\n0 0 2 0", r"T\.txt: its left 3x3 is no rotation"),
+        ("1 0 0\n0 1 0\n", r"T\.txt: contains no 3x4 or 4x4 matrix \(2 rows\)"),
+        ("1 0 0 0\n0 1 0 zero\n0 0 1 0", r"T\.txt: contains no 3x4 or 4x4 matrix"),
+        ("1 0 0 0\n0 1 0 0\n0 0 -1 0", r"T\.txt: its left 3x3 is not a rotation matrix"),
+        ("2 0 0 0\n0 2 0 0\n0 0 2 0", r"T\.txt: its left 3x3 is not a rotation matrix"),
     ],
 )
 def test_bad_extrinsics_are_named(tmp_path: Path, text: str, message: str) -> None:
@@ -396,7 +398,7 @@ def test_a_camera_of_a_file_or_of_numbers(drive: Drive, tmp_path: Path) -> None:
     assert camera_of_photos(drive.folder / "photos") == CAMERA
     pinhole = camera_of_photos(drive.folder / "photos", model="pinhole", focal=100.0)
     assert pinhole == Camera("pinhole", 512, 256, 100.0, 100.0, 255.5, 127.5)
-    with pytest.raises(InputError, match=r"photos: needs a camera.*--focal"):
+    with pytest.raises(InputError, match=r"photos: have no camera.*--focal"):
         camera_of_photos(drive.folder / "photos", model="pinhole")
 
 
@@ -409,25 +411,29 @@ def garbage(drive: Drive, name: str) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("change", "kind", "message"),
     [
-        (lambda d: garbage(d, "sweeps/000002.bin"), InputError, r"000002\.bin: is no Velodyne sweep"),
-        (lambda d: garbage(d, "sweeps/000009.pcd") | {"times": d.folder / "t7.txt"}, InputError, r"000009\.pcd: is no"),
+        (lambda d: garbage(d, "sweeps/000002.bin"), InputError, r"000002\.bin: is not a Velodyne sweep"),
+        (
+            lambda d: garbage(d, "sweeps/000009.pcd") | {"times": d.folder / "t7.txt"},
+            InputError,
+            r"000009\.pcd: is not",
+        ),
         (lambda d: garbage(d, "photos/000002.png"), InputError, r"000002\.png: can't be read"),
-        (lambda d: garbage(d, "camera.csv"), InputError, r"camera\.csv: is no trajectory"),
-        (lambda d: d.arguments | {"poses": d.folder / "flat.csv"}, InputError, r"flat\.csv: knows positions alone"),
-        (lambda d: d.arguments | {"sweeps": d.folder / "photos"}, InputError, r"photos: holds no sweeps.*\.bin"),
-        (lambda d: d.arguments | {"sweeps": d.folder / "no"}, InputError, r"no: is missing"),
+        (lambda d: garbage(d, "camera.csv"), InputError, r"camera\.csv: is not a trajectory"),
+        (lambda d: d.arguments | {"poses": d.folder / "flat.csv"}, InputError, r"flat\.csv: has only positions"),
+        (lambda d: d.arguments | {"sweeps": d.folder / "photos"}, InputError, r"photos: contains no sweeps.*\.bin"),
+        (lambda d: d.arguments | {"sweeps": d.folder / "no"}, InputError, r"no: folder not found"),
         (lambda d: d.arguments | {"times": d.folder / "t7.txt"}, InputError, r"t7\.txt: has 7 times for 6 sweeps"),
         (
             lambda d: d.arguments | {"extrinsics": None, "photos": d.pictures},
             SettingError,
-            "photos need the camera's place",
+            "photos need the extrinsics",
         ),
         (lambda d: d.arguments | {"crs": "EPSG:4326"}, InputError, "not projected"),
         (lambda d: d.arguments | {"min_range": 60.0}, SettingError, "max_range"),
         (
-            lambda d: d.arguments | {"photos": Pictures(d.folder / "photos", Camera("equirectangular", 64, 32))},
+            lambda d: d.arguments | {"photos": PhotoInput(d.folder / "photos", Camera("equirectangular", 64, 32))},
             InputError,
-            r"000000\.png: is 512x256, but its calibration says 64x32",
+            r"000000\.png: is 512x256, but its calibration is for 64x32",
         ),
     ],
 )
@@ -460,5 +466,5 @@ def test_the_command(drive: Drive, tmp_path: Path) -> None:
         f"--photos {folder}/photos --time-offset -0.15 --max-range 20 --voxel 0.1 --name hall",
     )
     assert result.exit_code == 0, result.output
-    assert "1 of 6 sweeps are left out: outside the trajectory's times" in result.output
+    assert "1 of 6 sweeps are excluded: outside the trajectory's times" in result.output
     assert read_tile(out).name == "hall" and len(read_tile(out).views) == SWEEPS - 1

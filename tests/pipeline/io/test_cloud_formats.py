@@ -380,7 +380,7 @@ def test_an_e57_count_that_lies_is_refused(tmp_path: Path, count: bytes) -> None
     write_e57(path, made(N))
     lie = b'recordCount="%s"' % count
     path.write_bytes(e57_changed(path.read_bytes(), lambda plain: plain.replace(b'recordCount="400"', lie)))
-    with pytest.raises(InputError, match=f"400 of {count.decode()} points can be read"):
+    with pytest.raises(InputError, match=f"400 of {count.decode()} points of a scan can be read"):
         clouds.read(tmp_path / "c.e57", FRAME)
 
 
@@ -405,9 +405,9 @@ def test_pcd_files_of_open3d(tmp_path: Path, compressed: bool) -> None:
 @pytest.mark.parametrize(
     ("lines", "note"),
     [
-        ("1 2 3\n4 5 6", "3 columns taken as x y z"),
-        ("# a remark\n1,2,3,0.5\n4,5,6,0.25", "4 columns taken as x y z intensity"),
-        ("1;2;3;0.5;6\n4;5;6;0.25;2", "5 columns taken as x y z intensity class"),
+        ("1 2 3\n4 5 6", "3 columns interpreted as x y z"),
+        ("# a remark\n1,2,3,0.5\n4,5,6,0.25", "4 columns interpreted as x y z intensity"),
+        ("1;2;3;0.5;6\n4;5;6;0.25;2", "5 columns interpreted as x y z intensity class"),
         ("z,y,x,range\n3,2,1,9\n6,5,4,9", "z y x; not read: range"),
         ("\ufeffX Y Z Scalar_Intensity\n1 2 3 7\n4 5 6 8", "x y z intensity"),
     ],
@@ -424,17 +424,17 @@ def test_columns_are_sniffed_and_what_was_assumed_is_told(tmp_path: Path, lines:
 @pytest.mark.parametrize(
     ("lines", "cause"),
     [
-        ("", "holds no points"),
-        ("1 2\n", "2 columns and no heading"),
-        ("1 2 3 4 5 6 7 8 9 10\n", "10 columns and no heading"),
-        ("x y z\n", "is no cloud: its first line is 'x y z'"),
-        ("1,5;2,5;3,5\n", "writes decimals with a comma"),
-        ("1 2 3\n4 5\n", "is no cloud of 3 columns"),
-        ("1 2 3\n4 five 6\n", "is no cloud of 3 columns"),
-        ("x,y,height,z\n1,2,3,4\n", "names z twice"),
-        ("1 2 3 1 300\n", "class 300, which is no LAS code"),
+        ("", "contains no points"),
+        ("1 2\n", "2 columns and no header line"),
+        ("1 2 3 4 5 6 7 8 9 10\n", "10 columns and no header line"),
+        ("x y z\n", "is not a cloud: its first line is 'x y z'"),
+        ("1,5;2,5;3,5\n", "has numbers with decimal commas"),
+        ("1 2 3\n4 5\n", "is not a cloud with 3 columns"),
+        ("1 2 3\n4 five 6\n", "is not a cloud with 3 columns"),
+        ("x,y,height,z\n1,2,3,4\n", "has two columns z"),
+        ("1 2 3 1 300\n", "class 300, which is not a LAS code"),
         ("nan nan nan\n", "no points with finite coordinates"),
-        ("hello\nworld\n", "is no cloud"),
+        ("hello\nworld\n", "is not a cloud"),
     ],
 )
 def test_a_text_that_is_no_cloud_is_refused(tmp_path: Path, lines: str, cause: str) -> None:
@@ -444,9 +444,9 @@ def test_a_text_that_is_no_cloud_is_refused(tmp_path: Path, lines: str, cause: s
 
 
 def test_a_line_that_never_ends_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scan2sim.pipeline.io.number_text.BLOCK", 1 << 10)
+    monkeypatch.setattr("scan2sim.pipeline.io.number_text.BLOCK_BYTES", 1 << 10)
     (tmp_path / "c.xyz").write_text("1 2 " + "3" * 5000, encoding="utf-8")
-    with pytest.raises(InputError, match="line of more than|is no cloud"):
+    with pytest.raises(InputError, match="line of more than|is not a cloud"):
         clouds.read(tmp_path / "c.xyz", Frame())
 
 
@@ -457,16 +457,16 @@ BINARY = """{"dataType": "binary", "schema": [{"name": "X", "type": "signed", "s
 @pytest.mark.parametrize(
     ("file", "body", "cause"),
     [
-        ("ept-hierarchy/0-0-0-0.json", '{"0-0-0-0": -1}', "leads to 0-0-0-0 a second time"),
-        ("ept-hierarchy/0-0-0-0.json", '{"../../x": 5}', "is no node of an octree"),
-        ("ept-hierarchy/0-0-0-0.json", '{"0-0-0-0": 1000000000000}', "is of .* bytes"),
-        ("ept-hierarchy/0-0-0-0.json", '{"3-0-0-0": 5}', "is missing"),
-        ("ept-hierarchy/0-0-0-0.json", "[" * 100_000, "is no readable JSON"),
-        ("ept.json", "{}", "has the dataType"),
-        ("ept.json", '{"dataType": "binary", "schema": [{"name": "X"}]}', "its schema describes no points"),
-        ("ept.json", BINARY % ("4", "NaN"), "its schema describes no points"),
-        ("ept.json", BINARY % ("4", "1" + 400 * "0"), "its schema describes no points"),
-        ("ept.json", BINARY % ("1e400", "1"), "its schema describes no points"),
+        ("ept-hierarchy/0-0-0-0.json", '{"0-0-0-0": -1}', "refers to 0-0-0-0 a second time"),
+        ("ept-hierarchy/0-0-0-0.json", '{"../../x": 5}', "is not an octree node"),
+        ("ept-hierarchy/0-0-0-0.json", '{"0-0-0-0": 1000000000000}', "has .* bytes"),
+        ("ept-hierarchy/0-0-0-0.json", '{"3-0-0-0": 5}', "file not found"),
+        ("ept-hierarchy/0-0-0-0.json", "[" * 100_000, "is not readable JSON"),
+        ("ept.json", "{}", "has the unknown dataType"),
+        ("ept.json", '{"dataType": "binary", "schema": [{"name": "X"}]}', "its schema has no valid dimensions"),
+        ("ept.json", BINARY % ("4", "NaN"), "its schema has no valid dimensions"),
+        ("ept.json", BINARY % ("4", "1" + 400 * "0"), "its schema has no valid dimensions"),
+        ("ept.json", BINARY % ("1e400", "1"), "its schema has no valid dimensions"),
     ],
 )
 def test_a_broken_ept_is_refused(tmp_path: Path, file: str, body: str, cause: str) -> None:

@@ -49,7 +49,7 @@ def test_las_without_crs_and_colours_says_so(tmp_path: Path) -> None:
 
 def test_an_empty_las_is_refused(tmp_path: Path) -> None:
     las.write(tmp_path / "c.las", PointCloud(Frame(), np.empty((0, 3), np.float32)))
-    with pytest.raises(InputError, match=r"c\.las: holds no points.*Leave it out"):
+    with pytest.raises(InputError, match=r"c\.las: contains no points.*Remove it"):
         clouds.read_header(tmp_path / "c.las")
 
 
@@ -81,7 +81,7 @@ def test_a_ply_without_colours_and_classes(tmp_path: Path) -> None:
 )
 def test_a_damaged_ply_is_named(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "c.ply").write_bytes(content)
-    with pytest.raises(InputError, match=r"c\.ply: is no readable PLY cloud.*Export it again"):
+    with pytest.raises(InputError, match=r"c\.ply: is not a readable PLY cloud.*Export it again"):
         clouds.read(tmp_path / "c.ply", Frame())
 
 

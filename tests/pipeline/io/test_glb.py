@@ -17,7 +17,7 @@ from scan2sim.pipeline.core.errors import SettingError, UnavailableError
 from scan2sim.pipeline.core.types import Camera, View
 from scan2sim.pipeline.io.worlds import glb, provenance, textured_mesh
 from scan2sim.pipeline.io.worlds.glb import GlbParams
-from scan2sim.pipeline.io.worlds.scene import Surface, whole
+from scan2sim.pipeline.io.worlds.scene import Surface, group_surface
 from tests.pipeline import synthetic
 from tests.present import present
 
@@ -29,7 +29,7 @@ EXTENSION = {"meshopt": "EXT_meshopt_compression", "draco": "KHR_draco_mesh_comp
 
 def surfaces(folder: Path) -> list[Surface]:
     return [
-        whole(group, present(textured_mesh.read(synthetic.textured(folder / group, mesh))))
+        group_surface(group, present(textured_mesh.read(synthetic.textured(folder / group, mesh))))
         for group, mesh in GROUPS.items()
     ]
 
@@ -177,18 +177,18 @@ def test_each_face_tells_its_photo_and_how_far_that_was(tmp_path: Path) -> None:
     assert file.view(table["properties"]["taken"]["values"]) == b"2018-06-01T00:00:00+00:00"
     part = file.mesh("terrain_0")
     row, far = part["_FEATURE_ID_0"][part["faces"]][..., 0], part["_DISTANCE"][part["faces"]][..., 0]
-    assert (row == row[:, :1]).all() and set(row.ravel()) == {provenance.PHOTO, provenance.FIRST}
+    assert (row == row[:, :1]).all() and set(row.ravel()) == {provenance.PHOTO, provenance.FIRST_VIEW_ROW}
     x, y, z = np.moveaxis(part["POSITION"][part["faces"]], -1, 0)
     true = np.linalg.norm([x - 1, -z - 2, y - 30], axis=0)
     np.testing.assert_allclose(far[row == 3], true[row == 3], atol=1e-3)
-    assert (far[row != 3] == provenance.UNKNOWN).all()
+    assert (far[row != 3] == provenance.UNKNOWN_DISTANCE).all()
     assert (file.mesh("building_1")["_FEATURE_ID_0"] == provenance.FILLED).all()
 
 
 def test_what_cannot_be_written_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for setting in ({"glb_texture": "bmp"}, {"glb_mesh": "zip"}):
         with pytest.raises(SettingError, match=r"export\.glb_"):
-            glb.ways(GlbParams(**setting))
+            glb.find_encoders(GlbParams(**setting))
     monkeypatch.setattr("shutil.which", lambda name: None)
     with pytest.raises(UnavailableError, match="basisu or toktx"):
-        glb.ways(GlbParams(glb_texture="ktx2"))
+        glb.find_encoders(GlbParams(glb_texture="ktx2"))

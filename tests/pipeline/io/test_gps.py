@@ -15,7 +15,7 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import Frame, GpsTrack
 from scan2sim.pipeline.io import gps
 from scan2sim.pipeline.io.gps.gopro import GPS_YEAR_2000, gpmf_fixes
-from scan2sim.pipeline.io.gps_fixes import without_jumps
+from scan2sim.pipeline.io.gps_fixes import reject_jumps
 from tests.present import present
 
 START = datetime(2023, 6, 1, 23, 59, 58, tzinfo=UTC).timestamp()  # midnight comes after two seconds
@@ -115,18 +115,18 @@ def test_date_of_fixes_before_the_only_rmc(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("a.gpx", "", r"a\.gpx: is no readable XML.*Export it again"),
+        ("a.gpx", "", r"a\.gpx: is not readable XML.*Export it again"),
         ("a.gpx", "<!DOCTYPE gpx [<!ENTITY a 'b'>]><gpx/>", r"declares a document type"),
         ("a.gpx", "<gpx/>", r"has no usable GPS fix \(0 points\)"),
         ("a.gpx", '<gpx><trkpt lat="1" lon="2"/></gpx>', r"no times"),
         ("a.gpx", '<gpx><trkpt lat="0" lon="0"><time>2023-01-01T00:00:00Z</time></trkpt></gpx>', r"no usable GPS fix"),
-        ("a.csv", "", r"lacks columns"),
-        ("a.csv", "time,height\n1,2\n", r"lacks columns \(it has time,height\).*time,x,y,z"),
+        ("a.csv", "", r"missing columns"),
+        ("a.csv", "time,height\n1,2\n", r"missing columns \(its header line: time,height\).*time,x,y,z"),
         ("a.csv", "time,lat,lon\n1,,\n", r"no usable GPS fix \(1 points\)"),
-        ("a.nmea", "$GPGGA,1,2,3*00\n", r"no NMEA sentence with a right checksum"),
+        ("a.nmea", "$GPGGA,1,2,3*00\n", r"no NMEA sentence with a valid checksum"),
         ("a.nmea", gga(START, LAT, LON, 1), r"no date.*Log RMC"),
-        ("a.mp4", "no video", r"a\.mp4: is no readable video"),
-        ("a.kml", "", r"no known GPS format.*\.gpx"),
+        ("a.mp4", "no video", r"a\.mp4: is not a readable video"),
+        ("a.kml", "", r"unknown GPS format.*\.gpx"),
     ],
 )
 def test_bad_files_are_refused(tmp_path: Path, name: str, text: str, message: str) -> None:
@@ -136,7 +136,7 @@ def test_bad_files_are_refused(tmp_path: Path, name: str, text: str, message: st
 
 
 def test_a_missing_file() -> None:
-    with pytest.raises(InputError, match=r"none\.gpx: is missing"):
+    with pytest.raises(InputError, match=r"none\.gpx: file not found"):
         gps.read(Path("none.gpx"))
 
 
@@ -152,8 +152,8 @@ def straight(seconds: float, rate: float = 10.0, speed: float = 15.0) -> tuple[n
 def test_jumps_are_dropped_wherever_they_are(bad: list[int]) -> None:
     times, positions = straight(10)
     positions[bad, 1] += 400
-    assert without_jumps(times, positions[:, :2]).tolist() == [i for i in range(100) if i not in bad]
-    assert without_jumps(times, positions[:, :2], reach=2).tolist() == [i for i in range(100) if i not in bad]
+    assert reject_jumps(times, positions[:, :2]).tolist() == [i for i in range(100) if i not in bad]
+    assert reject_jumps(times, positions[:, :2], lookback=2).tolist() == [i for i in range(100) if i not in bad]
 
 
 def test_gaps_stay_gaps() -> None:
@@ -264,7 +264,7 @@ def test_gps9_dates_every_fix(tmp_path: Path) -> None:
 
 
 def test_damaged_telemetry_and_films_without_any(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"cut short"):
+    with pytest.raises(ValueError, match=r"truncated"):
         gpmf_fixes(gps5(0)[:-40])
     with pytest.raises(InputError, match=r"a\.mp4: has damaged GoPro telemetry.*Copy it"):
         gps.read(film(tmp_path / "a.mp4", [gps5(0)[:-40]], [0.0]))

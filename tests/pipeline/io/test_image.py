@@ -181,7 +181,7 @@ def test_a_damaged_file_says_file_cause_and_remedy(tmp_path: Path, rgb: U8, name
 
 def test_what_is_no_picture_is_told(tmp_path: Path, rgb: U8) -> None:
     write(tmp_path / "depth.exr", linear(rgb)[..., :1], "float", channelnames="Z")
-    with pytest.raises(InputError, match=r"depth\.exr: has the channels Z\. Export the picture alone, as R, G, B"):
+    with pytest.raises(InputError, match=r"depth\.exr: has the unsupported channels Z\. Export it as R, G, B"):
         image.read_rgb(tmp_path / "depth.exr")
 
 

@@ -108,7 +108,7 @@ def test_what_users_edit_is_copied_and_the_rest_linked(tmp_path: Path, row: Sequ
     for tile in row:
         for path in (path for path in tile.model.rglob("*") if path.is_file()):
             twin = folder / "models" / tile.name / path.relative_to(tile.model)
-            assert path.samefile(twin) == (path.suffix not in merge.EDITED), path.name
+            assert path.samefile(twin) == (path.suffix not in merge.USER_EDITABLE_SUFFIXES), path.name
             assert path.read_bytes() == twin.read_bytes()
 
 
@@ -133,7 +133,7 @@ def test_nothing_is_done_where_nothing_has_changed(tmp_path: Path) -> None:
     warned: list[str] = []
     assemble(tmp_path, "town", row, warn=warned.append)
     assert _snapshot(folder) == before  # a user's edit stays
-    assert len(warned) == 1 and "tile0/model.sdf was changed since it was made" in warned[0]
+    assert len(warned) == 1 and "tile0/model.sdf was changed since it was written" in warned[0]
     assemble(tmp_path, "town", row, buffer=5)
     assert _snapshot(folder) != before and _root(folder / "town.sdf").findtext(".//level/buffer") == "5"
     (folder / "models/tile1/meshes/collision_terrain.obj").unlink()
@@ -177,9 +177,9 @@ def test_tiles_that_cannot_be_one_world_are_refused(tmp_path: Path, row: Sequenc
     away = replace(other, frame=Frame("EPSG:32633", other.frame.origin))
     with pytest.raises(InputError, match="EPSG:32633.*but tile0 is in EPSG:32632"):
         assemble(tmp_path, "town", [one, away])
-    with pytest.raises(InputError, match="second tile of the name tile0"):
+    with pytest.raises(InputError, match="second tile named tile0"):
         assemble(tmp_path, "town", [one, one])
-    with pytest.raises(InputError, match="is missing"):
+    with pytest.raises(InputError, match="file not found"):
         assemble(tmp_path, "town", [one, replace(other, world=tmp_path / "none")])
     with pytest.raises(DataError, match="no tile"):
         assemble(tmp_path, "town", [])

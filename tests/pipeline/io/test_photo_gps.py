@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from scan2sim.flows.cli import app
 from scan2sim.pipeline.core.errors import DataError, SettingError
 from scan2sim.pipeline.core.types import F64
-from scan2sim.pipeline.importers.georeference import by_photos
+from scan2sim.pipeline.importers.georeference import from_photo_gps
 from scan2sim.pipeline.importers.photogrammetry import import_model
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.images import exif
@@ -72,29 +72,29 @@ def photos(folder: Path, places: F64, altitude: bool = True) -> list[Path]:
 
 
 def test_exif_tells_places_and_their_lack(tmp_path: Path) -> None:
-    lat, lon, altitude = exif.place(photo(tmp_path / "a.jpg", AT)) or (0, 0, 0)
+    lat, lon, altitude = exif.gps_position(photo(tmp_path / "a.jpg", AT)) or (0, 0, 0)
     east, north = Transformer.from_crs("EPSG:4326", CRS, always_xy=True).transform(lon, lat)
     assert np.abs(np.array([east, north]) - AT[:2]).max() < 0.01 and altitude == 50
-    assert exif.place(photo(tmp_path / "b.jpg", None)) is None
-    assert (exif.place(photo(tmp_path / "c.jpg", AT, altitude=False)) or (0, 0, 0))[2] is None
+    assert exif.gps_position(photo(tmp_path / "b.jpg", None)) is None
+    assert (exif.gps_position(photo(tmp_path / "c.jpg", AT, altitude=False)) or (0, 0, 0))[2] is None
     (tmp_path / "d.jpg").write_bytes((tmp_path / "a.jpg").read_bytes()[:80])
-    assert exif.place(tmp_path / "d.jpg") is None
+    assert exif.gps_position(tmp_path / "d.jpg") is None
 
 
 def test_a_model_is_placed_in_spite_of_noise_and_wrong_fixes(tmp_path: Path) -> None:
     places, random = circle(40), np.random.default_rng(0)
     fixes = places + random.normal(0, 1.5, places.shape)
     fixes[[3, 17, 30]] += [120.0, -60.0, 10.0]
-    fit = by_photos(tmp_path, in_model(places), ups(40), photos(tmp_path, fixes), None)
+    fit = from_photo_gps(tmp_path, in_model(places), ups(40), photos(tmp_path, fixes), None)
     assert fit.crs == CRS and len(fit.used) == 37 and not {3, 17, 30} & set(fit.used)
     assert 1.5 < present(fit.rms) < 3.5  # 1.5 m in each of three directions
     assert np.abs(fit.onto.apply(in_model(places)) - places).max() < 2.0
     assert fit.onto.scale == pytest.approx(1 / SCALE, rel=0.02)
-    assert "37 of 40 photos" in fit.notes[0] and f"{fit.rms:.2f} m off" in fit.notes[0] and len(fit.notes) == 1
+    assert "37 of 40 photos" in fit.notes[0] and f"rms {fit.rms:.2f} m" in fit.notes[0] and len(fit.notes) == 1
 
 
 def test_exact_gps_places_exactly(tmp_path: Path) -> None:
-    fit = by_photos(tmp_path, in_model(circle()), ups(16), photos(tmp_path, circle()), CRS)
+    fit = from_photo_gps(tmp_path, in_model(circle()), ups(16), photos(tmp_path, circle()), CRS)
     assert np.abs(fit.onto.apply(in_model(circle())) - circle()).max() < 0.02 and present(fit.rms) < 0.01
     assert np.allclose(fit.onto.rotation @ TURN.as_matrix(), np.eye(3), atol=1e-3)
 
@@ -102,23 +102,23 @@ def test_exact_gps_places_exactly(tmp_path: Path) -> None:
 def test_a_crs_in_feet_is_placed_in_feet(tmp_path: Path) -> None:
     feet = "+proj=utm +zone=33 +datum=WGS84 +units=us-ft +type=crs"
     fixes = circle() + np.random.default_rng(0).normal(0, 1.5, (16, 3))
-    fit = by_photos(tmp_path, in_model(circle()), ups(16), photos(tmp_path, fixes), feet)
+    fit = from_photo_gps(tmp_path, in_model(circle()), ups(16), photos(tmp_path, fixes), feet)
     assert np.abs(fit.onto.apply(in_model(circle())) * 1200 / 3937 - circle()).max() < 3
     assert len(fit.used) == 16 and fit.rms is not None and fit.rms < 3.5
 
 
 def test_on_a_straight_track_the_photos_own_up_tells_the_roll(tmp_path: Path) -> None:
     fixes = line() + np.random.default_rng(0).normal(0, 1, (16, 3))
-    fit = by_photos(tmp_path, in_model(line()), ups(16), photos(tmp_path, fixes), CRS)
+    fit = from_photo_gps(tmp_path, in_model(line()), ups(16), photos(tmp_path, fixes), CRS)
     up = fit.onto.rotation @ TURN.apply([0.0, 0.0, 1.0])
     assert np.degrees(np.arccos(up[2])) < 3
-    assert "GPS can't tell the roll" in fit.notes[1]
+    assert "GPS doesn't determine the roll" in fit.notes[1]
 
 
 @pytest.mark.parametrize(
     ("places", "noise", "cause"),
     [
-        (line(16, 4.0), 2.0, "too little for GPS that is"),
+        (line(16, 4.0), 2.0, "too little for GPS with an error of"),
         (line(2), 0.0, "only 2 of 2 photos have GPS"),
         (np.tile(AT, (9, 1)), 0.0, "the photos' GPS doesn't fit"),
     ],
@@ -126,12 +126,12 @@ def test_on_a_straight_track_the_photos_own_up_tells_the_roll(tmp_path: Path) ->
 def test_a_track_that_tells_too_little_is_refused(tmp_path: Path, places: F64, noise: float, cause: str) -> None:
     fixes = places + np.random.default_rng(0).normal(0, 1, places.shape) * noise
     with pytest.raises(DataError, match=cause):
-        by_photos(tmp_path, in_model(places), ups(len(places)), photos(tmp_path, fixes), CRS)
+        from_photo_gps(tmp_path, in_model(places), ups(len(places)), photos(tmp_path, fixes), CRS)
 
 
 def test_photos_without_altitudes_are_told(tmp_path: Path) -> None:
     flat = circle() * [1, 1, 0]
-    fit = by_photos(tmp_path, in_model(flat), ups(16), photos(tmp_path, flat, altitude=False), CRS)
+    fit = from_photo_gps(tmp_path, in_model(flat), ups(16), photos(tmp_path, flat, altitude=False), CRS)
     assert "no altitudes" in fit.notes[1] and np.abs(fit.onto.apply(in_model(flat)) - flat).max() < 0.02
 
 
@@ -154,14 +154,14 @@ def test_the_command_places_model_and_cloud(tmp_path: Path) -> None:
     options = [str(tmp_path / "reconstruction.json"), str(tmp_path / "images"), "-o", str(tmp_path / "t")]
     options += ["--cloud", str(tmp_path / "dense.xyz"), "--gps"]
     done = CliRunner().invoke(app, ["import", "opensfm", *options])
-    assert done.exit_code == 0 and "placed by the GPS of 16 of 16 photos" in done.output.replace("\n", " ")
+    assert done.exit_code == 0 and "georeferenced by the GPS of 16 of 16 photos" in done.output.replace("\n", " ")
     tile = read_tile(tmp_path / "t")
     assert tile.frame.crs == CRS
     assert np.abs(np.array([tile.frame.to_crs(v.centre) for v in tile.views]) - places).max() < 0.03
     assert all(np.allclose(v.T_world_cam[:3, :3], axes.as_matrix(), atol=2e-3) for v in tile.views)
     cloud = clouds.read(tile.clouds[0], tile.frame)
     assert np.abs(tile.frame.to_crs(cloud.xyz) - points).max() < 0.03
-    with pytest.raises(SettingError, match="GPS tells them"):
+    with pytest.raises(SettingError, match="are determined by GPS"):
         import_model(
             "opensfm", tmp_path / "reconstruction.json", tmp_path / "images", tmp_path / "u", gps=True, scale=2.0
         )

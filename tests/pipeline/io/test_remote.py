@@ -13,7 +13,7 @@ from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.planning import plan
 from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.core.errors import InputError, UnavailableError
-from scan2sim.pipeline.io.remote import CACHE, Remote, is_remote, likeness
+from scan2sim.pipeline.io.remote import CACHE_VARIABLE, Remote, is_remote, local_copy
 from tests.flows.toy import chain
 
 
@@ -39,10 +39,10 @@ def s3() -> Iterator[str]:
 
 
 def test_a_place_is_itself_or_has_a_likeness(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv(CACHE, str(tmp_path))
-    assert not is_remote(tmp_path) and likeness(tmp_path) == tmp_path
-    assert is_remote("s3://a/b") and likeness("s3://a/b/").parent == tmp_path
-    assert likeness("s3://a/b") == likeness("s3://a/b/") != likeness("s3://c/b")
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    assert not is_remote(tmp_path) and local_copy(tmp_path) == tmp_path
+    assert is_remote("s3://a/b") and local_copy("s3://a/b/").parent == tmp_path
+    assert local_copy("s3://a/b") == local_copy("s3://a/b/") != local_copy("s3://c/b")
 
 
 def test_another_machine_goes_on_where_the_first_one_stopped(s3: str, tmp_path: Path) -> None:
@@ -51,8 +51,8 @@ def test_another_machine_goes_on_where_the_first_one_stopped(s3: str, tmp_path: 
 
     def machine(name: str, **changes: dict[str, object]) -> dict[str, object]:
         store = Store(tmp_path / name, Remote(f"{s3}/steps", tmp_path / name))
-        nodes = chain(tmp_path / "source.txt", log, **changes)
-        outcome = execute(plan(nodes, store), store, jobs=1, watch=lambda *_: None, to_the_end=True)
+        tasks = chain(tmp_path / "source.txt", log, **changes)
+        outcome = execute(plan(tasks, store), store, jobs=1, on_event=lambda *_: None, keep_going=True)
         return {name: manifest.facts["total"] for name, manifest in outcome.of_tile().items()}
 
     assert set(machine("first", c={"does": "fail"})) == {"a", "b"}
@@ -97,7 +97,7 @@ def test_what_was_damaged_here_is_fetched_again_and_there_is_made_anew(s3: str, 
     def machine(**changes: dict[str, object]) -> list[str]:
         store = Store(tmp_path / "here", remote)
         log.unlink(missing_ok=True)
-        execute(plan(chain(tmp_path / "source.txt", log, **changes), store), store, jobs=1, watch=lambda *_: None)
+        execute(plan(chain(tmp_path / "source.txt", log, **changes), store), store, jobs=1, on_event=lambda *_: None)
         return sorted(log.read_text(encoding="utf-8").split())
 
     assert machine() == ["a", "b", "c", "d"]
@@ -120,15 +120,15 @@ def test_a_key_that_leads_out_of_its_folder_is_refused(tmp_path: Path, monkeypat
         files.store[f"/survey/{key}"] = files.store["/survey/tile.toml"]
         if "link" in key:
             (here.local / "link").symlink_to(tmp_path)
-        with pytest.raises(InputError, match="leads out of its folder"):
+        with pytest.raises(InputError, match="points outside of its folder"):
             here.pull_all()
-        with pytest.raises(InputError, match="leads out of its folder"):
+        with pytest.raises(InputError, match="points outside of its folder"):
             here.pull([key])
     assert not list(tmp_path.rglob("escaped.txt")) and not Path("/etc/escaped.txt").exists()
 
 
 def test_what_is_not_there_or_can_not_be_read_is_told(s3: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="there is nothing"):
+    with pytest.raises(InputError, match="is empty"):
         Remote(f"{s3}/nothing", tmp_path).pull_all()
     with pytest.raises(UnavailableError, match="fsspec"):
         Remote("nosuch://bucket/x", tmp_path).pull_all()

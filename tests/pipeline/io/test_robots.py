@@ -18,9 +18,9 @@ from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Trajectory
 from scan2sim.pipeline.io import robot_formats, world_formats
 from scan2sim.pipeline.io.world_formats import SceneParams
-from scan2sim.pipeline.io.worlds.scene import PATH, Scene
+from scan2sim.pipeline.io.worlds.scene import PATH_FILE, Scene
 from scan2sim.pipeline.simulation.robot import ROBOT
-from scan2sim.pipeline.simulation.spawn import find
+from scan2sim.pipeline.simulation.spawn import find_spawn_pose
 from tests.pipeline import synthetic
 
 MASS = sum(link.mass for link in ROBOT.links)
@@ -32,7 +32,7 @@ def driven(scene: Scene) -> Scene:
     """The same scene, with the path of a scanner 2 m above the ground."""
     x = np.linspace(FIRST[0], LAST[0], 33)
     places = np.column_stack([x, np.full(33, FIRST[1]), synthetic.height(x, np.full(33, FIRST[1])) + 2])
-    Trajectory(np.arange(33.0), places).save(scene.tiles[0].folder / PATH)
+    Trajectory(np.arange(33.0), places).save(scene.tiles[0].folder / PATH_FILE)
     return scene
 
 
@@ -49,11 +49,11 @@ def exported(town: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_robot_has_a_world() -> None:
-    assert set(plugins.names(robot_formats.PACKAGE)) <= set(world_formats.known())
+    assert set(plugins.names(robot_formats.PACKAGE)) <= set(world_formats.format_names())
 
 
 def test_it_starts_on_the_ground_at_the_ways_beginning_and_faces_along_it(town: Scene, exported: Path) -> None:
-    start = find(town)
+    start = find_spawn_pose(town)
     x, y, z = start.position
     assert start.by == "path" and (x, y) == pytest.approx(FIRST, abs=0.6)
     assert z == pytest.approx(float(synthetic.height(np.array(x), np.array(y))), abs=0.06)
@@ -67,9 +67,9 @@ def test_it_keeps_away_from_what_stands_beside_the_way(tmp_path: Path) -> None:
     scene = synthetic.scene(tmp_path, tiles=1)
     x = np.linspace(-7.0, 9.0, 33)
     Trajectory(np.arange(33.0), np.column_stack([x, np.full(33, -5.3), np.full(33, 3.0)])).save(
-        scene.tiles[0].folder / PATH
+        scene.tiles[0].folder / PATH_FILE
     )
-    assert find(scene).position[0] > -5 + 0.5  # past the pole, which stands at (-5, -5)
+    assert find_spawn_pose(scene).position[0] > -5 + 0.5  # past the pole, which stands at (-5, -5)
 
 
 def test_without_a_road_or_a_path_there_is_no_robot(tmp_path: Path) -> None:
@@ -77,15 +77,15 @@ def test_without_a_road_or_a_path_there_is_no_robot(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="neither a road nor"):
         world_formats.write(scene, ["mujoco"], tmp_path / "out", SceneParams(), silent, robot=True)
     Trajectory(np.arange(9.0), np.column_stack([np.linspace(50, 60, 9), np.zeros(9), np.zeros(9)])).save(
-        scene.tiles[0].folder / PATH
+        scene.tiles[0].folder / PATH_FILE
     )
     with pytest.raises(DataError, match="no free ground"):
-        find(scene)
+        find_spawn_pose(scene)
     assert not (tmp_path / "out").exists()
 
 
 def test_formats_that_hold_no_robot_are_told(town: Scene, tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match=r"none of glb, usd\. Name one of: gazebo, mujoco, urdf"):
+    with pytest.raises(SettingError, match=r"not supported by glb, usd\. Add one of: gazebo, mujoco, urdf"):
         world_formats.check(["glb", "usd"], SceneParams(), "--to", robot=True)
     with pytest.raises(DataError, match="robot"):
         world_formats.write(
@@ -116,7 +116,7 @@ def of_urdf(folder: Path) -> Iterator[tuple[str, float, Any]]:
 def test_its_parts_are_the_same_everywhere(exported: Path, read: Any) -> None:
     found = {name: (mass, place) for name, mass, place in read(exported)}
     assert found.keys() == {link.name for link in ROBOT.links}
-    for link in ROBOT.joined:
+    for link in ROBOT.attached:
         assert found[link.name][0] == link.mass
         np.testing.assert_allclose(found[link.name][1], link.place, atol=1e-6)
 
@@ -143,7 +143,7 @@ def test_it_drives_ahead_in_mujoco(exported: Path) -> None:
     model = mujoco.MjModel.from_xml_path(str(exported / "town.xml"))
     assert model.body("robot").subtreemass[0] == pytest.approx(MASS)
     data = mujoco.MjData(model)
-    data.ctrl[:] = ROBOT.turning(1.0, 0.0)
+    data.ctrl[:] = ROBOT.wheel_speeds(1.0, 0.0)
     mujoco.mj_step(model, data, nstep=int(3 / model.opt.timestep))
     x, y, z = (
         data.body("robot").xpos
@@ -167,7 +167,7 @@ def test_it_drives_and_turns_in_pybullet(exported: Path) -> None:
         assert sum(masses) == pytest.approx(MASS)
 
         def drive(speed: float, turn: float, seconds: float) -> tuple[np.ndarray, float]:
-            for side, wheel in zip(ROBOT.turning(speed, turn), ("left", "right"), strict=True):
+            for side, wheel in zip(ROBOT.wheel_speeds(speed, turn), ("left", "right"), strict=True):
                 joint = joints[f"{wheel}_wheel_joint"]
                 bullet.setJointMotorControl2(robot, joint, bullet.VELOCITY_CONTROL, targetVelocity=side, force=10)
             for _ in range(int(seconds * 240)):

@@ -19,7 +19,7 @@ from scan2sim.pipeline.io.geodata import crs
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds import glb
 from scan2sim.pipeline.io.worlds.scene import Scene
-from scan2sim.texturing.levels_of_detail import detailed
+from scan2sim.texturing.levels_of_detail import with_levels
 from tests import cesium, threejs
 from tests.pipeline import synthetic
 from tests.present import present
@@ -137,7 +137,7 @@ def test_usd_tiles_have_their_coarser_levels_as_variants(town: Scene, tmp_path: 
     module("pxr")
     from pxr import Usd, UsdGeom, UsdValidation
 
-    levels = detailed(town, 2, tmp_path / "levels", silent)
+    levels = with_levels(town, 2, tmp_path / "levels", silent)
     stage = Usd.Stage.Open(str(export(levels, "usd", tmp_path / "out") / "town.usdc"))
     every = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert not [fault.GetErrorAsString() for fault in UsdValidation.ValidationContext(every).Validate(stage)]
@@ -194,7 +194,7 @@ def test_three_js_shows_all_tiles_as_the_projects_renderer_does(town: Scene, tmp
 def test_three_js_unpacks_what_is_packed(town: Scene, tmp_path: Path, params: dict[str, str]) -> None:
     package = cesium.node_module("three")
     try:
-        glb.ways(glb.GlbParams(**params))
+        glb.find_encoders(glb.GlbParams(**params))
     except UnavailableError as error:
         pytest.skip(str(error))
     if why := threejs.missing() or ("" if package else "three is not installed (npm install -g three)"):
@@ -234,7 +234,7 @@ def test_cesium_tells_of_what_is_picked_which_photo_it_is_from(town: Scene, tmp_
 
 
 def test_cesium_loads_finer_levels_as_it_comes_nearer(town: Scene, tmp_path: Path) -> None:
-    levels = detailed(town, 2, tmp_path / "levels", silent)
+    levels = with_levels(town, 2, tmp_path / "levels", silent)
     folder = export(levels, "tiles3d", tmp_path / "out")
     with cesium.viewer(folder, tmp_path / "view", (320, 240)) as view:
         far = view.look(*above(town, 400), focal=200)

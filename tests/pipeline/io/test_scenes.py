@@ -33,11 +33,11 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 @pytest.fixture(scope="module")
 def exported(town: Scene, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return {name: tmp_path_factory.mktemp(name) for name in world_formats.known()}
+    return {name: tmp_path_factory.mktemp(name) for name in world_formats.format_names()}
 
 
 def test_every_format_has_a_reader() -> None:
-    assert set(world_formats.known()) == READERS.keys() | WITHOUT_MESHES
+    assert set(world_formats.format_names()) == READERS.keys() | WITHOUT_MESHES
 
 
 def written(scene: Scene, name: str, folder: Path, **params: Any) -> Path:
@@ -127,7 +127,7 @@ def test_a_scene_is_read_from_a_run_or_its_world(tmp_path: Path) -> None:
 
 
 def test_worlds_that_keep_no_scene_are_told_of(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="holds no world"):
+    with pytest.raises(InputError, match="contains no world"):
         read_scene(tmp_path)
     world = synthetic.world(tmp_path).files["world"]
     about = world / "scene" / "scene.json"

@@ -87,11 +87,14 @@ def test_what_write_tile_writes_read_tile_reads(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"photo": {"position": [float("nan"), 0, 0]}}, r"photo 0 \(1\.jpg\): its pose holds NaN.*leave the photo out"),
-        ({"photo": {"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}}, r"1\.jpg.*is no rotation.*camera-to-world"),
-        ({"photo": {"rotation": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]}}, r"1\.jpg.*is no rotation.*determinant"),
-        ({"photo": {"camera": "back"}}, r"1\.jpg.*there is no camera `back`.*Cameras are: front"),
-        ({"photo": {"postion": [0, 0, 0]}}, r"field `photos\.0\.postion`.*docs/formats\.md"),
+        ({"photo": {"position": [float("nan"), 0, 0]}}, r"photo 0 \(1\.jpg\): its pose contains NaN.*remove the photo"),
+        (
+            {"photo": {"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}},
+            r"1\.jpg.*is not a rotation matrix.*camera-to-world",
+        ),
+        ({"photo": {"rotation": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]}}, r"1\.jpg.*is not a rotation matrix.*determinant"),
+        ({"photo": {"camera": "back"}}, r"1\.jpg.*unknown camera `back`.*Cameras are: front"),
+        ({"photo": {"postion": [0, 0, 0]}}, r"field `photos\.0\.postion`.*docs/reference/formats\.md"),
         ({"camera": {"model": "pinhole", "distortion": [0.1]}}, r"camera `front`: 1 distortion coef.*takes 0"),
         ({"camera": {"focal": [0.0, 0.0]}}, r"camera `front`: focal .* is not positive.*fx and fy"),
         ({"camera": {"focal": [float("nan"), 1.0]}}, r"camera `front`: focal .* is not positive"),
@@ -101,16 +104,16 @@ def test_what_write_tile_writes_read_tile_reads(tmp_path: Path) -> None:
         ({"camera": {"model": "opencv", "distortion": [float("nan"), 0, 0, 0]}}, r"camera `front`: distortion"),
         ({"camera": {"model": "opencv", "distortion": [0, -1e300, 0, 0]}}, r"camera `front`: distortion"),
         ({"camera": {"model": "fish"}}, r"field `cameras\.0\.model`"),
-        ({"units": "yards"}, r"field `units`.*docs/formats\.md"),
-        ({"crs": "EPSG:99999"}, r"EPSG:99999.* is not a CRS.*EPSG:32633"),
-        ({"crs": "EPSG:2154"}, r"cloud\.laz: is in EPSG:32632, but tile\.toml says EPSG:2154.*Mend `crs`"),
+        ({"units": "yards"}, r"field `units`.*docs/reference/formats\.md"),
+        ({"crs": "EPSG:99999"}, r"EPSG:99999.* is not a valid CRS.*EPSG:32633"),
+        ({"crs": "EPSG:2154"}, r"cloud\.laz: is in EPSG:32632, but tile\.toml says EPSG:2154.*Fix `crs`"),
         ({"crs": "EPSG:4326", "clouds": ["bare.laz"]}, r"is not projected.*UTM"),
-        ({"clouds": ["none.laz"]}, r"none\.laz: is missing.*Put it there, or mend the name"),
-        ({"clouds": ["bare.laz"]}, r'bare\.laz: has no CRS, and the tile names none.*crs = "local"'),
+        ({"clouds": ["none.laz"]}, r"none\.laz: file not found.*Check the path"),
+        ({"clouds": ["bare.laz"]}, r'bare\.laz: has no CRS, and neither has the tile.*crs = "local"'),
         ({"clouds": ["cloud.laz", "lambert.laz"]}, r"lambert\.laz: is in EPSG:2154, but cloud\.laz is in EPSG:32632"),
-        ({"clouds": ["cloud.shp"]}, r"cloud\.shp: is no known cloud format.*LAS, LAZ, COPC, PLY"),
-        ({"clouds": ["text.laz"]}, r"text\.laz: is no readable LAS file.*again"),
-        ({"trajectory": "bad.csv"}, r"bad\.csv: is no trajectory.*time,x,y,z"),
+        ({"clouds": ["cloud.shp"]}, r"cloud\.shp: has an unknown cloud format.*LAS, LAZ, COPC, PLY"),
+        ({"clouds": ["text.laz"]}, r"text\.laz: is not a readable LAS file.*again"),
+        ({"trajectory": "bad.csv"}, r"bad\.csv: is not a valid trajectory.*time,x,y,z"),
     ],
 )
 def test_bad_tiles_are_refused_by_name(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
@@ -126,15 +129,15 @@ def test_bad_tiles_are_refused_by_name(tmp_path: Path, changes: dict[str, Any], 
 def test_two_cameras_of_one_id_are_refused(tmp_path: Path) -> None:
     content = body(tmp_path)
     content["cameras"] *= 2
-    with pytest.raises(InputError, match=r"has two cameras `front`.*an id of its own"):
+    with pytest.raises(InputError, match=r"has two cameras `front`.*a unique id"):
         read_tile(save(tmp_path, content))
 
 
 def test_no_tile_and_bad_toml(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"tile\.toml: there is no tile here.*scan2sim import"):
+    with pytest.raises(InputError, match=r"tile\.toml: no tile found.*scan2sim import"):
         read_tile(tmp_path)
     (tmp_path / "tile.toml").write_text("name = \n", encoding="utf-8")
-    with pytest.raises(InputError, match=r"tile\.toml: is not valid TOML \(.*line 1.*Mend the line"):
+    with pytest.raises(InputError, match=r"tile\.toml: is not valid TOML \(.*line 1.*Fix the line"):
         read_tile(tmp_path)
 
 

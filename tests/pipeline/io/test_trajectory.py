@@ -65,7 +65,7 @@ def test_kitti_has_ten_poses_a_second(tmp_path: Path) -> None:
     assert np.allclose(trajectory.read(tmp_path / "a.kitti").times, np.arange(12) / 10)
     with pytest.raises(InputError, match=r"has 12 poses for 3 times"):
         trajectory.read(tmp_path / "a.kitti", times=np.arange(3.0))
-    with pytest.raises(InputError, match=r"no trajectory with times"):
+    with pytest.raises(InputError, match=r"has no times"):
         trajectory.read(tmp_path / "a.kitti", timed=True)
 
 
@@ -89,7 +89,9 @@ def test_partial_columns_in_any_order(tmp_path: Path) -> None:
 
 def test_times_out_of_order_are_refused_or_sorted(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("t,e,n,h\n2,5,0,0\n1,4,0,0\n", encoding="utf-8")
-    with pytest.raises(InputError, match=r"a\.csv: is no trajectory \(line 3: its time doesn't follow.*Sort it"):
+    with pytest.raises(
+        InputError, match=r"a\.csv: is not a valid trajectory \(line 3: its time is not after.*Sort by time"
+    ):
         trajectory.read(tmp_path / "a.csv")
     assert trajectory.read(tmp_path / "a.csv", ordered=False).positions[:, 0].tolist() == [4, 5]
 
@@ -97,19 +99,19 @@ def test_times_out_of_order_are_refused_or_sorted(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("a.csv", "", r"a\.csv: is no trajectory \(it holds no poses\).*time,x,y,z"),
-        ("a.csv", "time,x,y,z\n", r"holds no poses"),
-        ("a.csv", "1,2,3,4\n2,2,3,4\n", r"line 1: it has no heading.*a heading, then"),
+        ("a.csv", "", r"a\.csv: is not a trajectory \(it contains no poses\).*time,x,y,z"),
+        ("a.csv", "time,x,y,z\n", r"contains no poses"),
+        ("a.csv", "1,2,3,4\n2,2,3,4\n", r"line 1: it has no header line.*a header line, then"),
         ("a.csv", "time,x,y\n1,2,3\n", r"line 1: columns are time,x,y"),
         ("a.csv", "time,x,y,z\n1,2,3,4\n\n2,2,3\n", r"line 4: 3 columns, expected 4"),
-        ("a.csv", "time,x,y,z\n1,2,3,nan\n", r"line 2: holds NaN.*Leave out"),
+        ("a.csv", "time,x,y,z\n1,2,3,nan\n", r"line 2: contains NaN.*Remove"),
         ("a.csv", "time,x,y,z\n1,2,3,four\n", r"line 2: could not convert.*four"),
         ("a.csv", "time,x,y,z,qx,qy\n1,2,3,4,0,0\n", r"rotation needs all of qx,qy,qz,qw"),
-        ("a.tum", "0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 0.5\n", r"a\.tum.*line 2: its quaternion is not of length 1"),
-        ("a.tum", "0 1 2 3 0 0 0 1\n0 1 2 3 0 0 0 1\n", r"line 2: its time doesn't follow"),
-        ("a.kitti", "# c\n1 0 0 5 0 1 0 5 0 0 -1 5\n", r"a\.kitti.*line 2: its left 3x3 is no rotation"),
+        ("a.tum", "0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 0.5\n", r"a\.tum.*line 2: its quaternion is not normalized"),
+        ("a.tum", "0 1 2 3 0 0 0 1\n0 1 2 3 0 0 0 1\n", r"line 2: its time is not after"),
+        ("a.kitti", "# c\n1 0 0 5 0 1 0 5 0 0 -1 5\n", r"a\.kitti.*line 2: its left 3x3 is not a rotation matrix"),
         ("a.kitti", "1 0 0 5 0 1 0 5\n", r"line 1: 8 columns, expected 12.*row-major"),
-        ("a.geojson", "{}", r"only written"),
+        ("a.geojson", "{}", r"can only be written"),
     ],
 )
 def test_bad_files_are_refused_by_line(tmp_path: Path, name: str, text: str, message: str) -> None:
@@ -120,7 +122,7 @@ def test_bad_files_are_refused_by_line(tmp_path: Path, name: str, text: str, mes
 
 def test_unreadable_files(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(InputError, match=r"a\.csv: is no trajectory \(it is no text\)"):
+    with pytest.raises(InputError, match=r"a\.csv: is not a trajectory \(not a text file\)"):
         trajectory.read(tmp_path / "a.csv")
     with pytest.raises(InputError, match=r"none\.csv"):
         trajectory.read(tmp_path / "none.csv")
@@ -130,13 +132,13 @@ def test_what_cannot_be_written_leaves_the_old_file(tmp_path: Path) -> None:
     only_positions = Trajectory(np.arange(2.0), np.zeros((2, 3)))
     trajectory.write(tmp_path / "a.csv", only_positions)
     before = (tmp_path / "a.csv").read_text(encoding="utf-8")
-    with pytest.raises(DataError, match=r"holds NaN"):
+    with pytest.raises(DataError, match=r"contains NaN"):
         trajectory.write(tmp_path / "a.csv", Trajectory(np.arange(2.0), np.full((2, 3), np.nan)))
     with pytest.raises(SettingError, match=r"needs rotations"):
         trajectory.write(tmp_path / "a.tum", only_positions)
-    with pytest.raises(SettingError, match=r"no known trajectory format.*\.csv, \.tum"):
+    with pytest.raises(SettingError, match=r"unknown trajectory format.*\.csv, \.tum"):
         trajectory.write(tmp_path / "a.xyz", only_positions)
-    with pytest.raises(SettingError, match=r"its frame has no CRS"):
+    with pytest.raises(SettingError, match=r"GeoJSON needs a CRS"):
         trajectory.write(tmp_path / "a.geojson", only_positions)
     with pytest.raises((InputError, SpaceError)):
         trajectory.write(tmp_path / "none" / "a.csv", only_positions)

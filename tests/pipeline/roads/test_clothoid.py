@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.roads import clothoid, driven, profile
-from scan2sim.pipeline.roads.observed import Observed, joined
+from scan2sim.pipeline.roads.observed import Observed, join
 
 
 def arc(radius: float, length: float, step: float = 0.5) -> np.ndarray:
@@ -20,8 +20,8 @@ def test_an_arc_is_found_under_noise_and_outliers(radius: float) -> None:
     true = arc(radius, 100.0)
     seen = true + rng.normal(0, 0.05, true.shape)
     seen[::10] += rng.uniform(-3, 3, seen[::10].shape)
-    line = clothoid.fit(clothoid.through(true[::10] + rng.normal(0, 0.3, true[::10].shape)), seen)
-    found = line.places(np.linspace(1, line.length - 1, 200))
+    line = clothoid.fit(clothoid.approximate(true[::10] + rng.normal(0, 0.3, true[::10].shape)), seen)
+    found = line.points(np.linspace(1, line.length - 1, 200))
     away = np.abs(np.linalg.norm(found - [0, radius], axis=1) - abs(radius))
     assert away.max() < 0.06
     assert 1 / np.median(line.curvature) == pytest.approx(radius, rel=0.1)
@@ -31,16 +31,16 @@ def test_a_corner_is_turned() -> None:
     bend = arc(8.0, 4 * np.pi, 0.4)
     before, after = np.arange(-30.0, 0.0), np.arange(1.0, 31.0)
     way = np.concatenate([np.column_stack([before, 0 * before]), bend, np.column_stack([0 * after + 8, 8 + after])])
-    line = clothoid.fit(clothoid.through(way), way)
+    line = clothoid.fit(clothoid.approximate(way), way)
     assert np.abs(line.locate(way)[1]).max() < 0.3
 
 
 def test_places_are_located_again() -> None:
-    line = clothoid.fit(clothoid.through(arc(50.0, 80.0)), arc(50.0, 80.0))
+    line = clothoid.fit(clothoid.approximate(arc(50.0, 80.0)), arc(50.0, 80.0))
     s, t = np.array([-3.0, 0.5, 33.3, 79.0, 90.0]), np.array([1.0, -4.0, 8.0, 0.0, 2.0])
-    np.testing.assert_allclose(line.locate(line.places(s, t)), (s, t), atol=1e-3)
+    np.testing.assert_allclose(line.locate(line.points(s, t)), (s, t), atol=1e-3)
     part = line.part(10.2, 60.7)
-    np.testing.assert_allclose(part.places([0.0, 20.0, 50.5]), line.places([10.2, 30.2, 60.7]), atol=1e-9)
+    np.testing.assert_allclose(part.points([0.0, 20.0, 50.5]), line.points([10.2, 30.2, 60.7]), atol=1e-9)
 
 
 def test_a_profile_follows_most_of_what_is_seen() -> None:
@@ -78,20 +78,20 @@ def test_ways_that_go_on_are_joined_whichever_way_they_run() -> None:
     line = np.column_stack([np.arange(0.0, 120.0), np.zeros(120)])
     across = np.column_stack([np.full(30, 61.0), np.arange(5.0, 35.0)])
     parts = [seen_along(p) for p in (line[80:], line[40:79][::-1], across, line[:39])]
-    ways = sorted(joined(parts), key=lambda way: len(way.way))
+    ways = sorted(join(parts), key=lambda way: len(way.way))
     assert [len(way.way) for way in ways] == [30, 118]
     assert np.all(np.abs(np.diff(ways[1].way[:, 0])) < 3) and len(np.unique(np.sign(np.diff(ways[1].way[:, 0])))) == 1
     assert len(np.unique(ways[1].stroke)) == 3
     sides = {float(x): side for x, _, side, _ in ways[1].edge}
     assert len(set(sides.values())) == 2  # one of the three was driven the other way
-    assert joined([]) == []
+    assert join([]) == []
 
 
 def test_a_ring_is_cut_open_and_long_roads_are_told_in_pieces() -> None:
     angle = np.linspace(0, 2 * np.pi, 200)
     ring = 30 * np.column_stack([np.cos(angle), np.sin(angle)])
-    assert [len(way.way) for way in joined([seen_along(ring[:100]), seen_along(ring[100:])])] == [200]
+    assert [len(way.way) for way in join([seen_along(ring[:100]), seen_along(ring[100:])])] == [200]
     line = np.column_stack([np.arange(0.0, 2500.0), np.zeros(2500)])
     pieces = driven.ways(line, np.ones(len(line), bool))
-    assert len(pieces) == 3 and max(map(driven.length, pieces)) <= driven.LONGEST
-    assert len(joined([seen_along(piece) for piece in pieces])) == 3
+    assert len(pieces) == 3 and max(map(driven.length, pieces)) <= driven.MAX_LENGTH_M
+    assert len(join([seen_along(piece) for piece in pieces])) == 3

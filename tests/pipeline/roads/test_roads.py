@@ -19,7 +19,7 @@ from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.geodata import opendrive
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.world_formats import opendrive as opendrive_of_scenes
-from scan2sim.pipeline.io.worlds.scene import ROADS as SEEN
+from scan2sim.pipeline.io.worlds.scene import ROADS_FILE as SEEN
 from scan2sim.pipeline.roads import listed, model, observed, profile
 from scan2sim.pipeline.roads.course import course
 from scan2sim.pipeline.roads.lanes import sections
@@ -45,7 +45,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
 
 def drawn(done: Done, frame: Frame = STREET.frame) -> list[Road]:
     ways = [way.moved(-np.asarray(frame.origin)) for way in observed.load(done.files["seen"])]
-    return [road for road in map(model.drawn, observed.joined(ways)) if road]
+    return [road for road in map(model.build_road, observed.join(ways)) if road]
 
 
 def features(done: Done) -> list[dict[str, Any]]:
@@ -82,7 +82,7 @@ def test_lanes_and_slopes_of_the_road(done: Done) -> None:
     assert road.keeps_right and road.reference == "marking"
     (section,) = sections(road)
     assert section.kinds == ("shoulder", "driving", "driving", "shoulder") and section.centre == 2
-    assert np.abs([float(fall.at(25.0)) - FALL for fall in road.falls]).max() < 0.003
+    assert np.abs([float(fall.at(25.0)) - FALL for fall in road.cross_slopes]).max() < 0.003
 
 
 def test_opendrive_is_whole(done: Done, tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_without_a_texture_edges_are_told(tmp_path: Path) -> None:
     (inputs["textured"] / "mesh.npz").unlink()
     (road,) = drawn(run(tmp_path, inputs))
     s = np.linspace(0, road.line.length, 50)
-    assert np.abs(STREET.locate(road.line.places(s))[1]).max() < 0.05
+    assert np.abs(STREET.locate(road.line.points(s))[1]).max() < 0.05
 
 
 def test_without_a_kerb_the_road_ends_where_other_ground_begins(tmp_path: Path) -> None:
@@ -184,10 +184,10 @@ def test_bad_input_says_why_there_is_no_road(tmp_path: Path) -> None:
     cloud = STREET.cloud()
     grass = replace(cloud, classification=np.full(len(cloud), CODE["terrain"], np.uint8))
     nothing = run(tmp_path / "a", STREET.inputs(tmp_path / "a", cloud=grass))
-    assert nothing.facts["none"] == "no point is of a road's class" and features(nothing) == []
+    assert nothing.facts["none"] == "no point has a road class" and features(nothing) == []
     s, _ = STREET.locate(cloud.xyz[:, :2])
     short = run(tmp_path / "b", STREET.inputs(tmp_path / "b", cloud=cloud.take(np.abs(s) < 0.5)))
-    assert short.facts["none"] == "no line of a road is seen" and drawn(short) == []
+    assert short.facts["none"] == "no road line was detected" and drawn(short) == []
     empty = run(tmp_path / "c", STREET.inputs(tmp_path / "c", cloud=cloud.take(np.zeros(len(cloud), bool))))
     assert features(empty) == [] and opendrive.write(tmp_path / "x.xodr", "x", STREET.frame, drawn(empty)) == 0
     assert not (tmp_path / "x.xodr").exists()
@@ -196,7 +196,7 @@ def test_bad_input_says_why_there_is_no_road(tmp_path: Path) -> None:
 def test_a_road_without_points_of_its_surface_is_left_out_with_a_warning(tmp_path: Path) -> None:
     cloud = STREET.cloud()
     _, t = STREET.locate(cloud.xyz[:, :2])
-    done = run(tmp_path, STREET.inputs(tmp_path, cloud=cloud.take(np.abs(t) > model.NEAR + 0.2)))
+    done = run(tmp_path, STREET.inputs(tmp_path, cloud=cloud.take(np.abs(t) > model.MAX_SURFACE_DISTANCE_M + 0.2)))
     (warning,) = done.warnings
     assert warning.endswith("is left out: no point of its surface is within 3 m of its line")
     assert features(done) == [] and done.facts["roads"] == [] and "none" not in done.facts

@@ -11,7 +11,7 @@ from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.geometry import primitives
 from scan2sim.pipeline.geometry.cylinders import Cylinder
 from scan2sim.pipeline.simulation.collision_shapes import solids
-from scan2sim.pipeline.steps.decimate import with_things
+from scan2sim.pipeline.steps.decimate import with_furniture
 from tests.pipeline import synthetic
 
 
@@ -26,7 +26,7 @@ def test_each_class_has_its_mesh_and_friction_and_trunks_are_cylinders() -> None
         classification=np.full(len(faces), CODE["high_vegetation"], np.uint8),
     )
     whole = replace(
-        with_things(ground, trunk), classification=np.concatenate([codes, np.full(len(faces), 5, np.uint8)])
+        with_furniture(ground, trunk), classification=np.concatenate([codes, np.full(len(faces), 5, np.uint8)])
     )
     found = {one.name: one for one in solids(whole, 0.45)}
     assert set(found) == {"road", "terrain", "trunk_1"}

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from scan2sim.flows.pipelines.settings import Settings
-from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.flows.pipelines.tile import build_graph
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.errors import DataError, InputError
 from scan2sim.pipeline.core.step import Done, Step, silent
@@ -22,7 +22,7 @@ from scan2sim.pipeline.geometry.height_map import Raster
 from scan2sim.pipeline.io.geodata import footprints
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.geometry import GEOMETRY, distances
-from scan2sim.pipeline.steps.ground import GROUND, GroundParams, united
+from scan2sim.pipeline.steps.ground import GROUND, GroundParams, merge_neighbours
 from scan2sim.pipeline.steps.poisson import POISSON
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.voxel import VOXEL
@@ -226,7 +226,7 @@ def test_neighbours_fill_a_hole_on_their_border_alike(house: dict[str, Path], tm
                 inputs[key] = file
         cell = {"seed": seeds[own], "neighbours": {other: seeds[other]}, "name": own, "buffer": 2.0}
         cloud = PointCloud.load(go(GROUND, tmp_path / own, inputs, **cell).files["made"])
-        assert len(united(inputs, GroundParams(**cell), "terrain")) == len(PointCloud.load(house["terrain"]))
+        assert len(merge_neighbours(inputs, GroundParams(**cell), "terrain")) == len(PointCloud.load(house["terrain"]))
         made[own] = {tuple(xyz) for xyz in cloud.xyz.tolist() if abs(xyz[0]) < 2}
     assert len(made["a"]) > 300
     assert made["a"] == made["b"]
@@ -234,13 +234,13 @@ def test_neighbours_fill_a_hole_on_their_border_alike(house: dict[str, Path], tm
 
 def test_only_clouds_from_the_air_get_what_is_made_up(tmp_path: Path) -> None:
     tile = read_tile(SAMPLE)
-    nodes = {node.step.name: node for node in recipe(tile, Settings())}
-    assert "walls" not in nodes and "things" in nodes["ground"].inputs  # a street's: what vehicles hid
+    tasks = {task.step.name: task for task in build_graph(tile, Settings())}
+    assert "walls" not in tasks and "things" in tasks["ground"].inputs  # a street's: what vehicles hid
 
     bare = replace(tile, views=(), trajectory=None)
-    assert {"ground", "walls"} <= {node.step.name for node in recipe(bare, Settings())}
+    assert {"ground", "walls"} <= {task.step.name for task in build_graph(bare, Settings())}
     off = Settings({"ground": {"when": "never"}, "walls": {"when": "never"}})
-    assert {"ground", "walls"}.isdisjoint(node.step.name for node in recipe(bare, off))
+    assert {"ground", "walls"}.isdisjoint(task.step.name for task in build_graph(bare, off))
 
 
 def test_points_far_from_the_mesh_are_warned_of_and_made_up_area_is_told(

@@ -117,7 +117,7 @@ def test_formats_are_chosen(tmp_path: Path) -> None:
     world = synthetic.world(tmp_path, formats=("gazebo",), meshes=("collada",)).files["world"]
     assert not list(world.rglob("*.glb")) and all(p.name.startswith("collision_") for p in world.rglob("*.obj"))
     assert "terrain.dae" in (world / "models/street/model.sdf").read_text(encoding="utf-8")
-    with pytest.raises(SettingError, match=r"export.meshes: has nothing that Gazebo shows"):
+    with pytest.raises(SettingError, match=r"export.meshes: has no format that Gazebo can show"):
         EXPORT.run({}, ExportParams(meshes=()), tmp_path, silent)
 
 
@@ -128,7 +128,7 @@ def test_an_empty_group_is_left_out_and_nothing_at_all_is_refused(tmp_path: Path
     done = EXPORT.run(inputs, ExportParams(), tmp_path / "out", silent)
     assert set(done.facts["triangles"]) == {"building"}
     del inputs["building"]
-    with pytest.raises(DataError, match="every surface is empty"):
+    with pytest.raises(DataError, match="all surfaces are empty"):
         EXPORT.run(inputs, ExportParams(), tmp_path / "none", silent)
 
 
@@ -148,7 +148,7 @@ def test_what_does_not_fit_together_is_refused(tmp_path: Path) -> None:
         EXPORT.run(inputs, ExportParams(), tmp_path / "a", silent)
     inputs = _inputs(tmp_path, terrain=synthetic.ground())
     (inputs["terrain"] / "page_1.png").unlink()
-    with pytest.raises(InputError, match=r"page_1.png: is missing"):
+    with pytest.raises(InputError, match=r"page_1.png: file not found"):
         EXPORT.run(inputs, ExportParams(), tmp_path / "b", silent)
     bare = replace(synthetic.house(), uv=None, page=None)
     bare.save(inputs["terrain"] / "mesh.npz")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from scan2sim.flows.pipelines.settings import Settings
-from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.flows.pipelines.tile import build_graph
 from scan2sim.pipeline.buildings.facade_completion import Rays
 from scan2sim.pipeline.camera.models import unproject
 from scan2sim.pipeline.core.classes import CODE
@@ -184,7 +184,7 @@ def test_only_streets_with_rays_and_photos_have_the_step() -> None:
     tile, never = read_tile(SAMPLE / "tile.toml"), Settings({"facades": {"when": "never"}})
 
     def has(one: Tile, settings: Settings) -> bool:
-        return "facades" in {node.full_name for node in recipe(one, settings)}
+        return "facades" in {task.full_name for task in build_graph(one, settings)}
 
     assert has(tile, Settings())
     assert not has(tile, never)

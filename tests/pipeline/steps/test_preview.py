@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from scan2sim.pipeline.core.step import Done, silent
-from scan2sim.pipeline.steps.preview import CALL, PREVIEW, PreviewParams
+from scan2sim.pipeline.steps.preview import CALLBACK, PREVIEW, PreviewParams
 from tests.pipeline import synthetic
 
 
@@ -33,8 +33,8 @@ def made(tmp_path: Path) -> Any:
 def scene(done: Done) -> trimesh.Scene:
     """What is inside the script."""
     script = (done.files["preview"] / "world.js").read_bytes()
-    assert script.startswith(CALL + b'("') and script.endswith(b'");\n')
-    return trimesh.load_scene(io.BytesIO(base64.b64decode(script[len(CALL) + 2 : -4])), file_type="glb")
+    assert script.startswith(CALLBACK + b'("') and script.endswith(b'");\n')
+    return trimesh.load_scene(io.BytesIO(base64.b64decode(script[len(CALLBACK) + 2 : -4])), file_type="glb")
 
 
 @pytest.mark.parametrize(("megapixels", "side"), [(32, 256), (0.1, 158)])

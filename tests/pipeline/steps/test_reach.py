@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from scan2sim.flows.pipelines.settings import Settings
-from scan2sim.flows.pipelines.survey import survey_recipe
-from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.flows.pipelines.survey import build_survey_graph
+from scan2sim.flows.pipelines.tile import build_graph
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import F32, Camera, Frame, PointCloud, Tile, Trajectory, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.steps.reach import CELL, LANES, REACH
+from scan2sim.pipeline.steps.reach import CLOSING_CELL_M, REACH, ROADSIDE_M
 from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 CAMERA = Camera("pinhole", 1200, 400, 700.0, 700.0, 600.0, 200.0)
@@ -64,7 +64,7 @@ def test_what_photos_see_and_the_lane_stay_and_the_rest_goes(street: dict[str, P
     ground = cloud.classification == CODE["road"]
     assert ((x > 15) & (x < 25) & (abs(y) < 5) & ground).sum() > 0.97 * 100 * 100, "ahead"
     behind = ground & (x < -1)
-    assert behind.any() and np.hypot(x[behind], y[behind]).max() < LANES + 1.5 * CELL, (
+    assert behind.any() and np.hypot(x[behind], y[behind]).max() < ROADSIDE_M + 1.5 * CLOSING_CELL_M, (
         "behind the first photo the lane alone"
     )
     assert not (y > 9).any(), "no photo sees through the wall"
@@ -91,7 +91,7 @@ def test_metres_from_the_path(street: dict[str, Path], tmp_path: Path) -> None:
 def test_held_out_photos_dont_count(street: dict[str, Path], tmp_path: Path) -> None:
     views_io.save(tmp_path / "views.json", views_io.load(street["views"]), [True] * 6)
     x, y, _ = left(go(street | {"views": tmp_path / "views.json"}, tmp_path)).xyz.T
-    assert np.hypot(x - x.clip(0, 10), y).max() < LANES + 1.5 * CELL
+    assert np.hypot(x - x.clip(0, 10), y).max() < ROADSIDE_M + 1.5 * CLOSING_CELL_M
 
 
 def test_a_path_in_the_air_and_a_tile_without_photos_keep_all(street: dict[str, Path], tmp_path: Path) -> None:
@@ -107,15 +107,17 @@ def test_only_where_photos_are_taken_along_a_path_and_neighbours_read_it() -> No
     view = View("a", CAMERA, np.eye(4), Path("a.jpg"))
     bare = Tile(Path("tile.toml"), "a", Frame(), (Path("cloud.laz"),))
     street = replace(bare, views=(view,))
-    steps = {name: {node.step.name for node in recipe(tile, Settings())} for name, tile in (("b", bare), ("s", street))}
+    steps = {
+        name: {task.step.name for task in build_graph(tile, Settings())} for name, tile in (("b", bare), ("s", street))
+    }
     assert "reach" in steps["s"] and "reach" not in steps["b"]
-    off = {node.step.name for node in recipe(street, Settings({"reach": {"limit": "off"}}))}
+    off = {task.step.name for task in build_graph(street, Settings({"reach": {"limit": "off"}}))}
     assert "reach" not in off
     # a survey's tiles meet: what is beyond the border is kept or left out as the neighbour decides, photos or none
     tiles = [
         replace(street, name="a", cell=Cell((0, 0), {"b": (10, 0)})),
         replace(bare, name="b", cell=Cell((10, 0), {"a": (0, 0)})),
     ]
-    nodes = {node.full_name: node for node in survey_recipe(tiles, Settings())}
-    read = {(source.node.full_name, source.name) for source in nodes["a/overlap"].inputs.values()}  # type: ignore[union-attr]
+    tasks = {task.full_name: task for task in build_survey_graph(tiles, Settings())}
+    read = {(source.task.full_name, source.name) for source in tasks["a/overlap"].inputs.values()}  # type: ignore[union-attr]
     assert read == {("a/reach", "cloud"), ("b/reach", "cloud")}

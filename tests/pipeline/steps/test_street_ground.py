@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scan2sim.flows.pipelines.settings import Settings
-from scan2sim.flows.pipelines.tile import recipe
+from scan2sim.flows.pipelines.tile import build_graph
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import UNCOLOURED, Frame, PointCloud
@@ -91,5 +91,5 @@ def test_gaps_wider_than_asked_for_stay(tmp_path: Path) -> None:
 
 def test_the_step_is_left_out_where_asked() -> None:
     tile = read_tile(SAMPLE)
-    assert "ground" in {node.full_name for node in recipe(tile, Settings())}
-    assert "ground" not in {node.full_name for node in recipe(tile, Settings({"ground": {"when": "never"}}))}
+    assert "ground" in {task.full_name for task in build_graph(tile, Settings())}
+    assert "ground" not in {task.full_name for task in build_graph(tile, Settings({"ground": {"when": "never"}}))}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.core.types import Mesh
-from scan2sim.pipeline.terrain.ground_fit import fitted, off_ground
+from scan2sim.pipeline.terrain.ground_fit import fit_heights, heights_above_ground
 from tests.pipeline import synthetic
 
 KERB = 0.12
@@ -40,13 +40,13 @@ def error(mesh: Mesh) -> np.ndarray:
 
 
 def test_it_comes_nearer_to_the_true_surface_than_points_are(bumpy: Mesh) -> None:
-    smooth = fitted(bumpy, points(), np.zeros(len(bumpy.vertices), bool))
+    smooth = fit_heights(bumpy, points(), np.zeros(len(bumpy.vertices), bool))
     assert np.percentile(error(bumpy), 95) > 0.05 and np.percentile(error(smooth), 95) < 0.01
     assert np.array_equal(smooth.vertices[:, :2], bumpy.vertices[:, :2]) and smooth.faces is bumpy.faces
 
 
 def test_a_kerb_keeps_its_height(bumpy: Mesh) -> None:
-    smooth = fitted(bumpy, points(), np.zeros(len(bumpy.vertices), bool))
+    smooth = fit_heights(bumpy, points(), np.zeros(len(bumpy.vertices), bool))
     x, y, z = smooth.vertices.T
     level = z - 0.02 * y
     assert level[(x > 5.3) & (x < 5.7)].mean() - level[(x > 4.3) & (x < 4.7)].mean() == pytest.approx(KERB, abs=0.005)
@@ -55,13 +55,13 @@ def test_a_kerb_keeps_its_height(bumpy: Mesh) -> None:
 def test_a_few_points_of_something_else_do_not_lift_it(bumpy: Mesh) -> None:
     many = points()
     many[::20, 2] += 0.1
-    smooth = fitted(bumpy, many, np.zeros(len(bumpy.vertices), bool))
+    smooth = fit_heights(bumpy, many, np.zeros(len(bumpy.vertices), bool))
     assert np.percentile(error(smooth), 95) < 0.012
 
 
 def test_vertices_of_a_border_stay(bumpy: Mesh) -> None:
     fixed = bumpy.vertices[:, 0] < -9.9
-    smooth = fitted(bumpy, points(), fixed)
+    smooth = fit_heights(bumpy, points(), fixed)
     assert np.array_equal(smooth.vertices[fixed], bumpy.vertices[fixed])
     assert not np.array_equal(smooth.vertices[~fixed], bumpy.vertices[~fixed])
 
@@ -69,7 +69,7 @@ def test_vertices_of_a_border_stay(bumpy: Mesh) -> None:
 def test_where_nothing_was_seen_it_gets_smoother(bumpy: Mesh) -> None:
     seen = points()
     hole = np.linalg.norm(seen[:, :2] + 4, axis=1) > 2
-    smooth = fitted(bumpy, seen[hole], np.zeros(len(bumpy.vertices), bool))
+    smooth = fit_heights(bumpy, seen[hole], np.zeros(len(bumpy.vertices), bool))
     inside = np.linalg.norm(bumpy.vertices[:, :2] + 4, axis=1) < 1.5
     off = [m.vertices[inside, 2] - truth(*m.vertices[inside, :2].T) for m in (bumpy, smooth)]
     assert np.std(off[1]) < np.std(off[0]) / 2
@@ -77,9 +77,9 @@ def test_where_nothing_was_seen_it_gets_smoother(bumpy: Mesh) -> None:
 
 def test_no_points_no_change(bumpy: Mesh) -> None:
     fixed = np.zeros(len(bumpy.vertices), bool)
-    assert fitted(bumpy, np.zeros((0, 3), np.float32), fixed) is bumpy
-    assert fitted(bumpy, points(100) + np.float32(50), fixed).vertices.shape == bumpy.vertices.shape
-    assert fitted(bumpy, points(100), ~fixed) is bumpy
+    assert fit_heights(bumpy, np.zeros((0, 3), np.float32), fixed) is bumpy
+    assert fit_heights(bumpy, points(100) + np.float32(50), fixed).vertices.shape == bumpy.vertices.shape
+    assert fit_heights(bumpy, points(100), ~fixed) is bumpy
 
 
 def test_heights_above_a_slope_are_upright_ones() -> None:
@@ -88,5 +88,5 @@ def test_heights_above_a_slope_are_upright_ones() -> None:
     vertices[:, 2] = vertices[:, 0] * 0.5
     xy = np.array([[-3.3, 2.1], [7.7, -8.2], [30, 0]])
     above = np.column_stack([xy, xy[:, 0] * 0.5 + 0.1]).astype(np.float32)
-    face, shares, height = off_ground(replace(slope, vertices=vertices, uv=None, page=None), above)
+    face, shares, height = heights_above_ground(replace(slope, vertices=vertices, uv=None, page=None), above)
     assert len(face) == 2 and height == pytest.approx(0.1, abs=1e-5) and shares.sum(axis=1) == pytest.approx(1)

@@ -47,7 +47,7 @@ def test_trees_have_trunks_that_bodies_run_into_and_bushes_none(planted: Path) -
     names = [surface.name for surface in by_class("vegetation", shape)]
     assert names == ["vegetation", "vegetation_high_vegetation"]
     ((name, trunk),) = [(one.name, one.shape) for one in solids(shape.mesh, 0.9) if isinstance(one.shape, Cylinder)]
-    assert name == "trunk_1" and trunk.radius == pytest.approx(low_poly_plants.TRUNK * 8, rel=0.05)
+    assert name == "trunk_1" and trunk.radius == pytest.approx(low_poly_plants.TRUNK_RADIUS_FRACTION * 8, rel=0.05)
     assert trunk.centre[:2] == pytest.approx((0, 0), abs=0.01) and trunk.length > 4
 
 

@@ -29,7 +29,7 @@ from scan2sim.pipeline.steps.voxel import VOXEL, sample
 from scan2sim.pipeline.tiling.borders.boundary_curve import curve
 from scan2sim.pipeline.tiling.borders.clip import Clipped, clip
 from scan2sim.pipeline.tiling.borders.gap import Gap, gap
-from scan2sim.pipeline.tiling.borders.grid import GRID, world
+from scan2sim.pipeline.tiling.borders.grid import GRID_M, world
 from scan2sim.pipeline.tiling.borders.join import join
 from scan2sim.pipeline.tiling.borders.open_edges import on_border
 from scan2sim.pipeline.tiling.voronoi_cell import Cell
@@ -138,7 +138,7 @@ def test_clip_keeps_the_own_side_and_the_surface(two: Any) -> None:
         (on,) = cut.on.values()
         assert outside.max() < 2e-4 and on.sum() > 100
         assert np.abs(outside[on]).max() < 2e-4
-        assert (world(cut.mesh)[on] % GRID == 0).all()
+        assert (world(cut.mesh)[on] % GRID_M == 0).all()
         assert crowded(cut.mesh) == 0 and outward(cut.mesh).min() > 0
         assert cut.mesh.face_area.min() > 1e-7, "no degenerate faces"
 
@@ -216,7 +216,7 @@ def test_three_tiles_meet_where_the_first_has_a_hole() -> None:
 def test_a_missing_neighbour_leaves_the_border_as_cut(two: Any) -> None:
     _, clips, _ = two
     alone = join("west", {"west": clips["west"]}, 0.3, 0.5)
-    assert np.array_equal(alone.mesh.vertices, clips["west"].mesh.vertices) and alone.facts == {}
+    assert np.array_equal(alone.mesh.vertices, clips["west"].mesh.vertices) and alone.metrics == {}
 
 
 def test_nothing_meets_nothing(two: Any) -> None:

@@ -24,7 +24,7 @@ from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.survey import Survey, read_survey
 from scan2sim.pipeline.io.tile import read_tile, write_tile
 from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
-from scan2sim.pipeline.tiling.cut_plan import members, seeds
+from scan2sim.pipeline.tiling.cut_plan import seeds, tile_membership
 from tests.present import present
 
 UTM = Frame("EPSG:32632", (690_000.0, 5_335_000.0, 500.0))
@@ -246,7 +246,7 @@ def test_members_are_those_of_every_pair_of_seeds(buffer: float) -> None:
     source = np.zeros(len(xy), [("place", "f8", 3)])
     source["place"][:, :2] = xy * 1000
     nearest, holds = shares(source, places, 1.0, buffer)
-    own, also, others = members(xy, places, buffer)
+    own, also, others = tile_membership(xy, places, buffer)
     assert np.array_equal(own, nearest)
     mine = np.zeros_like(holds)
     mine[np.arange(len(xy)), own] = True
@@ -330,7 +330,7 @@ def test_photos_are_copied_where_asked_for(bend: Path, tmp_path: Path) -> None:
 def test_two_cuts_write_the_same_bytes(bend: Path, cut: Path) -> None:
     assert contents(cut_survey(bend, bend.parent / "again", CUT).parent) == contents(cut.parent)
     with laspy.open(cut.parent / "bend_0000/cloud.laz") as reader:
-        assert reader.header.creation_date == las.DAY == date(2000, 1, 1)
+        assert reader.header.creation_date == las.CREATION_DATE == date(2000, 1, 1)
 
 
 @pytest.mark.parametrize("frame", [FEET, Frame("local", (50.0, 60.0, 7.0)), Frame("local", (0.0, 0.0, 0.0), 0.3048)])
@@ -375,7 +375,7 @@ def test_clouds_of_all_kinds_join_as_in_a_tile(tmp_path: Path) -> None:
     (folder / "tile.toml").write_text(tomli_w.dumps(body), encoding="utf-8")
     warned: list[str] = []
     made = tiles(cut_survey(folder, tmp_path / "out", CUT, warn=warned.append))
-    assert "2.ply: 1 points with NaN coordinates left out" in warned
+    assert "2.ply: 1 points with NaN coordinates removed" in warned
     first, middle, last = (clouds.read(tile.clouds[0], tile.frame) for tile in made.values())
     assert first.time is not None and first.intensity is not None and np.any(first.rgb != 128)
     assert middle.rgb is not None and (middle.rgb == 128).all(axis=1).mean() > 0.5
@@ -436,12 +436,12 @@ def test_only_a_survey_is_overwritten_and_only_when_told(tmp_path: Path) -> None
     assert (
         len(tiles(cut_survey(folder, tmp_path / "out", CUT.model_copy(update={"length": 150.0}), overwrite=True))) == 2
     )
-    with pytest.raises(SettingError, match="holds the corridor"):
+    with pytest.raises(SettingError, match="contains the corridor"):
         cut_survey(folder, folder, CUT, overwrite=True)
     shutil.copytree(folder, tmp_path / "other")
-    with pytest.raises(SettingError, match="is no survey"):
+    with pytest.raises(SettingError, match="is not a survey"):
         cut_survey(folder, tmp_path / "other", CUT, overwrite=True)
-    with pytest.raises(InputError, match="was cut from a survey already"):
+    with pytest.raises(InputError, match="was already cut from a survey"):
         cut_survey(tmp_path / "out/bend_0000", tmp_path / "more", CUT)
 
 
@@ -472,7 +472,7 @@ def test_a_trajectory_elsewhere_is_told(tmp_path: Path) -> None:
     path = drive()
     path[:, 1] += 5000
     folder = corridor(tmp_path / "corridor", n=20_000, path=path)
-    with pytest.raises(DataError, match=r"only 0 points, and 20,000 further than 20 m.*one CRS"):
+    with pytest.raises(DataError, match=r"only 0 points, and 20,000 farther than 20 m.*one CRS"):
         cut_survey(folder, tmp_path / "out", CUT)
     assert left(tmp_path) == []
 
@@ -480,13 +480,13 @@ def test_a_trajectory_elsewhere_is_told(tmp_path: Path) -> None:
 def test_surveys_that_are_wrong_are_named(tmp_path: Path) -> None:
     out = cut_survey(corridor(tmp_path / "corridor", n=20_000), tmp_path / "out", CUT)
     text = out.read_text(encoding="utf-8")
-    with pytest.raises(InputError, match="there is no survey here"):
+    with pytest.raises(InputError, match="no survey found"):
         read_survey(tmp_path)
     for old, new, cause in (
         ("length = 100.0", "lenght = 100.0", "field `length`: Field required"),
         ("length = 100.0", "length = -1.0", "field `length`"),
         ("length = 100.0", "length = ", "is not valid TOML"),
-        ("bend_0001", "bend_0009", "bend_0009.*is missing"),
+        ("bend_0001", "bend_0009", "bend_0009.*file not found"),
         ("bend_0001", "bend_0000", "names two tiles bend_0000"),
     ):
         out.write_text(text.replace(old, new), encoding="utf-8")
@@ -505,7 +505,7 @@ def test_surveys_that_are_wrong_are_named(tmp_path: Path) -> None:
 def test_memory_does_not_grow_with_the_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = corridor(tmp_path / "corridor", n=6_000)
     part = points(20_000)
-    monkeypatch.setattr("scan2sim.pipeline.tiling.point_spool.CHUNK", 20_000)
+    monkeypatch.setattr("scan2sim.pipeline.tiling.point_spool.CHUNK_POINTS", 20_000)
 
     def peak(parts: int) -> int:
         monkeypatch.setattr(clouds, "chunks", lambda *_: iter([part] * parts))

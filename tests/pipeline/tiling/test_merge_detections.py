@@ -14,7 +14,7 @@ import pytest
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, Step, silent
 from scan2sim.pipeline.core.types import F64, Frame, Mesh, PointCloud, Trajectory
-from scan2sim.pipeline.furniture.classify import Thing
+from scan2sim.pipeline.furniture.classify import Detection
 from scan2sim.pipeline.steps.clip import CLIP
 from scan2sim.pipeline.steps.collision import COLLISION
 from scan2sim.pipeline.steps.decimate import DECIMATE
@@ -28,8 +28,8 @@ from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.voxel import VOXEL
 from scan2sim.pipeline.tiling.borders.gap import gap
-from scan2sim.pipeline.tiling.borders.grid import on_grid, world
-from scan2sim.pipeline.tiling.borders.merge_detections import agreed
+from scan2sim.pipeline.tiling.borders.grid import snap_to_grid, world
+from scan2sim.pipeline.tiling.borders.merge_detections import merged_detections
 from scan2sim.pipeline.tiling.voronoi_cell import Cell
 from tests.present import present
 
@@ -75,7 +75,7 @@ def street() -> tuple[F64, Any]:
     xyz = np.concatenate([np.concatenate(places) for places in parts.values()])
     xyz += random.normal(0, 0.004, xyz.shape)
     codes = [np.full(sum(map(len, places)), CODE[name], np.uint8) for name, places in parts.items()]
-    return on_grid(xyz + (X, Y, Z)), np.concatenate(codes)
+    return snap_to_grid(xyz + (X, Y, Z)), np.concatenate(codes)
 
 
 def go(step: Step, out: Path, inputs: Mapping[str, Path], **params: Any) -> Done:
@@ -250,20 +250,23 @@ def test_a_tile_whose_neighbour_is_not_made_shows_its_own(
 
 def test_all_agree_in_whatever_order_they_ask(tiles: dict[str, Tile]) -> None:
     finds = {
-        name: [Thing.from_json(row) for row in json.loads(tile.found.read_text(encoding="utf-8"))]
+        name: [Detection.from_json(row) for row in json.loads(tile.found.read_text(encoding="utf-8"))]
         for name, tile in tiles.items()
     }
     assert all(len(told) >= 3 for told in finds.values())  # both know of what stands on the border
     backwards = {name: finds[name] for name in reversed(finds)}
-    one, other = agreed(finds, SEEDS), agreed(backwards, {name: SEEDS[name] for name in reversed(SEEDS)})
+    one, other = (
+        merged_detections(finds, SEEDS),
+        merged_detections(backwards, {name: SEEDS[name] for name in reversed(SEEDS)}),
+    )
     assert len(one) == 4
     assert [(name, t.to_json()) for name, t in one] == [(name, t.to_json()) for name, t in other]
 
 
 def test_two_poles_side_by_side_on_a_border_stay_two(tiles: dict[str, Tile]) -> None:
-    told = [Thing.from_json(row) for row in json.loads(tiles["west"].found.read_text(encoding="utf-8"))]
+    told = [Detection.from_json(row) for row in json.loads(tiles["west"].found.read_text(encoding="utf-8"))]
     (sign,) = [thing for thing in told if thing.kind == "sign"]
     beside = sign.moved(np.array([-0.3, 0.0, 0.0]))
     jitter = np.array([0.02, -0.01, 0.0])
     both = {"west": [sign, beside], "east": [sign.moved(jitter), beside.moved(jitter)]}
-    assert sorted(name for name, _ in agreed(both, SEEDS)) == ["east", "west"]
+    assert sorted(name for name, _ in merged_detections(both, SEEDS)) == ["east", "west"]

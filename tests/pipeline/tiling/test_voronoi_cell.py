@@ -15,14 +15,14 @@ def scattered(n: int = 25, seed: int = 0) -> dict[str, tuple[float, float]]:
 
 
 def test_squares_that_meet_in_a_corner_are_neighbours() -> None:
-    made = cells(SQUARES, near=30.0)
+    made = cells(SQUARES, max_distance=30.0)
     for name, cell in made.items():
         assert cell.seed == SQUARES[name]
         assert list(cell.neighbours) == sorted(set(SQUARES) - {name})
 
 
 def test_neighbours_know_each_other() -> None:
-    made = cells(scattered(), near=1e4)
+    made = cells(scattered(), max_distance=1e4)
     for name, cell in made.items():
         for other, seed in cell.neighbours.items():
             assert made[other].seed == seed and made[other].neighbours[name] == cell.seed
@@ -30,7 +30,7 @@ def test_neighbours_know_each_other() -> None:
 
 def test_every_place_is_in_the_cell_of_its_nearest_seed_and_in_no_other() -> None:
     seeds = scattered()
-    made = cells(seeds, near=1e4)
+    made = cells(seeds, max_distance=1e4)
     xy = np.random.default_rng(1).uniform(690_000, 690_500, (2000, 2))
     nearest = np.argmin(np.linalg.norm(xy[:, None] - np.array(list(seeds.values())), axis=2), axis=1)
     for i, cell in enumerate(made.values()):
@@ -45,7 +45,7 @@ def test_both_sides_of_a_border_tell_the_same_distance_to_the_last_bit() -> None
 
 
 def test_outlines_are_counter_clockwise_and_fill_the_plane() -> None:
-    made = cells(SQUARES, near=30.0)
+    made = cells(SQUARES, max_distance=30.0)
     corners = outline(made["a"], np.subtract(made["a"].seed, 20.0), np.add(made["a"].seed, 20.0))
     x, y = corners.T
     area = np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) / 2
@@ -53,10 +53,10 @@ def test_outlines_are_counter_clockwise_and_fill_the_plane() -> None:
 
 
 def test_a_lonely_tile_owns_everything() -> None:
-    (cell,) = cells({"a": (1.0, 2.0)}, near=10.0).values()
+    (cell,) = cells({"a": (1.0, 2.0)}, max_distance=10.0).values()
     assert cell == Cell((1.0, 2.0)) and (cell.outside(np.zeros((3, 2))) == -np.inf).all()
-    assert cells({}, near=10.0) == {}
+    assert cells({}, max_distance=10.0) == {}
 
 
 def test_seeds_far_apart_are_no_neighbours() -> None:
-    assert not cells({"a": (0.0, 0.0), "b": (100.0, 0.0)}, near=99.0)["a"].neighbours
+    assert not cells({"a": (0.0, 0.0), "b": (100.0, 0.0)}, max_distance=99.0)["a"].neighbours

@@ -1,4 +1,4 @@
-"""SegFormer from files, against transformers itself, and what is no such file."""
+"""Backend "segformer": predictions compared with `transformers`, and rejection of invalid files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.segmentation.backends import load
-from scan2sim.segmentation.labels import CLASSES, mapped
+from scan2sim.segmentation.labels import CLASSES, map_labels
 
 torch = pytest.importorskip("torch", reason="SegFormer runs on torch")
 transformers = pytest.importorskip("transformers", reason="SegFormer is transformers'")
@@ -27,7 +27,7 @@ NVIDIA = "NVIDIA's SegFormer weights are for non-commercial use"
 
 
 def tiny() -> Any:
-    """A random SegFormer with statistics of its own, so that forgotten weights would show."""
+    """A random SegFormer whose normalisation statistics are not the defaults, so that missing weights are detected."""
     torch.manual_seed(3)
     config = transformers.SegformerConfig(
         depths=[1, 2, 1, 1], hidden_sizes=[8, 16, 16, 32], num_attention_heads=[1, 1, 2, 2], decoder_hidden_size=24,
@@ -43,7 +43,7 @@ def tiny() -> Any:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """As save_pretrained writes it."""
+    """Folder written by `save_pretrained`."""
     tiny().save_pretrained(tmp_path / "tiny-b0")
     return tmp_path / "tiny-b0"
 
@@ -67,28 +67,28 @@ def change(file: Path, **changes: object) -> None:
 
 
 def error_of(path: Path) -> InputError:
-    """The one error of a file that can't be used, which tells what to do."""
+    """The error raised for an invalid file; it has a remedy and is one line."""
     with pytest.raises(InputError) as caught:
         load("segformer", path, "cpu")
     assert caught.value.remedy and "\n" not in str(caught.value)
     return caught.value
 
 
-def test_it_tells_what_transformers_tells(folder: Path) -> None:
+def test_probabilities_equal_transformers(folder: Path) -> None:
     network = load("segformer", folder, "cpu")
     found = network.probabilities(photo())
     assert found.dtype == np.float32 and found.shape == (19, 18, 26)
     assert np.allclose(found.sum(axis=0), 1, atol=1e-5)
     assert np.abs(found - reference(photo())).max() < 1e-4
-    assert np.ptp(found, axis=(1, 2)).max() > 0.01, "the network should look at the photo at all"
-    facts = network.facts
-    assert facts.labels == CITYSCAPES and facts.name == "segformer (tiny-b0)" and facts.pixels_a_radian is None
-    assert facts.sha256 == hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
-    to = mapped(facts.labels, str(folder))
-    assert CLASSES[to[0]] == "road" and CLASSES[to[13]] == "vehicle" and CLASSES[to[10]] == "sky"
+    assert np.ptp(found, axis=(1, 2)).max() > 0.01, "the output should depend on the photo"
+    info = network.info
+    assert info.labels == CITYSCAPES and info.name == "segformer (tiny-b0)" and info.pixels_per_radian is None
+    assert info.sha256 == hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
+    index = map_labels(info.labels, str(folder))
+    assert CLASSES[index[0]] == "road" and CLASSES[index[13]] == "vehicle" and CLASSES[index[10]] == "sky"
 
 
-def test_names_of_old_and_of_new_transformers_are_both_read(folder: Path, tmp_path: Path) -> None:
+def test_weights_of_old_and_new_transformers_are_read(folder: Path, tmp_path: Path) -> None:
     from safetensors.torch import load_file
 
     old, new = load_file(folder / "model.safetensors"), tiny().state_dict()
@@ -105,7 +105,7 @@ def test_names_of_old_and_of_new_transformers_are_both_read(folder: Path, tmp_pa
 
 
 @pytest.mark.parametrize("kind", ["safetensors", "zip", "old pickle", "half precision"])
-def test_a_single_file_beside_its_config_will_do(folder: Path, kind: str) -> None:
+def test_single_file_next_to_its_config_is_loaded(folder: Path, kind: str) -> None:
     file = folder / "model.safetensors"
     if kind != "safetensors":
         file.unlink()
@@ -115,12 +115,12 @@ def test_a_single_file_beside_its_config_will_do(folder: Path, kind: str) -> Non
             state = {name: value.half() if value.is_floating_point() else value for name, value in state.items()}
         torch.save(state, file, _use_new_zipfile_serialization=kind != "old pickle")
     network = load("segformer", file, "cpu")
-    bar = 0.02 if kind == "half precision" else 1e-4
-    assert np.abs(network.probabilities(photo()) - reference(photo())).max() < bar
-    assert network.facts.name == f"segformer ({file.name})"
+    tolerance = 0.02 if kind == "half precision" else 1e-4
+    assert np.abs(network.probabilities(photo()) - reference(photo())).max() < tolerance
+    assert network.info.name == f"segformer ({file.name})"
 
 
-def test_photos_are_normalised_as_the_folder_tells(folder: Path) -> None:
+def test_photos_are_normalised_by_the_preprocessor_config(folder: Path) -> None:
     config = {"image_mean": [0.5, 0.4, 0.3], "image_std": [0.2, 0.3, 0.4], "do_normalize": True}
     (folder / "preprocessor_config.json").write_text(json.dumps(config), encoding="utf-8")
     found = load("segformer", folder, "cpu").probabilities(photo())
@@ -133,39 +133,39 @@ def test_photos_are_normalised_as_the_folder_tells(folder: Path) -> None:
         assert error_of(folder).where.endswith("preprocessor_config.json")
 
 
-def test_narrow_photos_are_looked_at_too(folder: Path) -> None:
+def test_narrow_photos_are_classified(folder: Path) -> None:
     assert load("segformer", folder, "cpu").probabilities(photo(9, 64)).shape == (19, 8, 16)
 
 
 @pytest.mark.parametrize(
     ("readme", "licence"),
     [
-        (None, f"not told; {NVIDIA}"),
+        (None, f"not stated; {NVIDIA}"),
         ("---\nlicense: other\ntags: [vision]\n---\n# B0\n", f"other; {NVIDIA}"),
         ("---\ntags:\n- vision\nlicense: 'apache-2.0'\n---\n", "apache-2.0"),
         ("---\nlicense: other\nlicense_name: our-own\n---\n", "other, our-own"),
-        ("# B0\nlicense: mit\n", f"not told; {NVIDIA}"),
+        ("# B0\nlicense: mit\n", f"not stated; {NVIDIA}"),
     ],
 )
-def test_the_licence_is_told_on(folder: Path, readme: str | None, licence: str) -> None:
+def test_licence_is_read_from_the_readme(folder: Path, readme: str | None, licence: str) -> None:
     if readme:
         (folder / "README.md").write_text(readme, encoding="utf-8")
-    assert load("segformer", folder, "cpu").facts.licence == licence
+    assert load("segformer", folder, "cpu").info.licence == licence
 
 
-def test_weights_must_be_given_and_be_there(folder: Path, tmp_path: Path) -> None:
+def test_missing_weights_are_rejected(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=r"label\.weights"):
         load("segformer", None, "cpu")
     assert "nothing is downloaded" in error_of(Path("nvidia/segformer-b0-finetuned-cityscapes-1024-1024")).remedy
     (tmp_path / "empty").mkdir()
-    assert "has no model.safetensors" in error_of(tmp_path / "empty").cause
+    assert "no model.safetensors" in error_of(tmp_path / "empty").cause
     (folder / "config.json").unlink()
     assert error_of(folder).where == str(folder / "config.json")
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])
 @pytest.mark.parametrize("name", ["model.safetensors", "pytorch_model.bin", "old.bin"])
-def test_half_a_file_is_refused(folder: Path, name: str, share: float) -> None:
+def test_truncated_file_is_rejected(folder: Path, name: str, share: float) -> None:
     if name != "model.safetensors":
         (folder / "model.safetensors").unlink()
         torch.save(tiny().state_dict(), folder / name, _use_new_zipfile_serialization=name != "old.bin")
@@ -176,7 +176,7 @@ def test_half_a_file_is_refused(folder: Path, name: str, share: float) -> None:
 
 
 class Trap:
-    """Makes a file when it is unpickled."""
+    """Creates a folder when it is unpickled."""
 
     def __init__(self, made: Path) -> None:
         self.made = made
@@ -186,33 +186,33 @@ class Trap:
 
 
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol")
-@pytest.mark.parametrize("way", ["torch", "old torch", "pickle", "new pickle"])
-def test_code_in_a_pickle_is_not_run(folder: Path, tmp_path: Path, way: str) -> None:
+@pytest.mark.parametrize("file_format", ["torch", "old torch", "pickle", "new pickle"])
+def test_code_in_a_pickle_is_not_run(folder: Path, tmp_path: Path, file_format: str) -> None:
     file, made = folder / "pytorch_model.bin", tmp_path / "made"
     (folder / "model.safetensors").unlink()
-    held = {**tiny().state_dict(), "trap": Trap(made)}
-    if way.endswith("pickle"):
-        file.write_bytes(pickle.dumps({"trap": Trap(made)}, 2 if way == "pickle" else 4))
+    content = {**tiny().state_dict(), "trap": Trap(made)}
+    if file_format.endswith("pickle"):
+        file.write_bytes(pickle.dumps({"trap": Trap(made)}, 2 if file_format == "pickle" else 4))
     else:
-        torch.save(held, file, _use_new_zipfile_serialization=way == "torch")
+        torch.save(content, file, _use_new_zipfile_serialization=file_format == "torch")
     error = error_of(folder)
     assert not made.exists()
     assert error.where == str(file) and "safetensors" in error.remedy
-    said = "tensors alone" if way == "new pickle" else "holds code or objects besides tensors; not run (posix.mkdir)"
-    assert said in error.cause
-    if way == "torch":  # the trap is one
+    code = "contains code or objects besides tensors; not run (posix.mkdir)"
+    assert ("only tensors" if file_format == "new pickle" else code) in error.cause
+    if file_format == "torch":  # the trap works if it is loaded unsafely
         torch.load(file, weights_only=False)
         assert made.exists()
 
 
-@pytest.mark.parametrize("held", [{"epoch": 3}, [1, 2], {"state_dict": {"a": 1}}])
-def test_a_pickle_of_something_else_is_refused(folder: Path, held: object) -> None:
-    torch.save(held, folder / "other.bin")
-    assert "holds no tensors by name" in error_of(folder / "other.bin").cause
+@pytest.mark.parametrize("content", [{"epoch": 3}, [1, 2], {"state_dict": {"a": 1}}])
+def test_pickle_of_other_objects_is_rejected(folder: Path, content: object) -> None:
+    torch.save(content, folder / "other.bin")
+    assert "not a dictionary of tensors" in error_of(folder / "other.bin").cause
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "expected"),
     [
         ({"architectures": ["BeitForSemanticSegmentation"], "model_type": "beit"}, "BeitForSemanticSegmentation"),
         ({"architectures": ["SegformerForImageClassification"]}, "SegformerForImageClassification"),
@@ -220,15 +220,15 @@ def test_a_pickle_of_something_else_is_refused(folder: Path, held: object) -> No
         ({"architectures": None, "model_type": None}, "another network"),
     ],
 )
-def test_another_architecture_is_named(folder: Path, changes: dict[str, object], said: str) -> None:
+def test_another_architecture_is_named(folder: Path, changes: dict[str, object], expected: str) -> None:
     change(folder / "config.json", **changes)
     error = error_of(folder)
     assert error.where == str(folder / "config.json")
-    assert said in error.cause and "SegformerForSemanticSegmentation" in error.cause
+    assert expected in error.cause and "SegformerForSemanticSegmentation" in error.cause
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", '"segformer"'])
-def test_a_config_that_is_none_is_refused(folder: Path, text: str) -> None:
+def test_invalid_config_is_rejected(folder: Path, text: str) -> None:
     (folder / "config.json").write_text(text, encoding="utf-8")
     assert error_of(folder).where == str(folder / "config.json")
 
@@ -254,13 +254,13 @@ def test_every_channel_needs_a_label(folder: Path, labels: object) -> None:
         {"id2label": {"0": "road", "1": "sky"}},
     ],
 )
-def test_weights_of_another_shape_are_refused(folder: Path, changes: dict[str, object]) -> None:
+def test_weights_of_another_shape_are_rejected(folder: Path, changes: dict[str, object]) -> None:
     change(folder / "config.json", **changes)
     error = error_of(folder)
-    assert error.where == str(folder / "model.safetensors") and "doesn't fit" in error.cause
+    assert error.where == str(folder / "model.safetensors") and "doesn't match" in error.cause
 
 
-def test_a_config_cannot_ask_for_code_from_elsewhere(folder: Path) -> None:
+def test_config_cannot_load_remote_code(folder: Path) -> None:
     change(
         folder / "config.json", attn_implementation="someone/kernel", _attn_implementation="someone/kernel",
         auto_map={"AutoModel": "someone/code--net.Net"}, quantization_config={"quant_method": "someone"},
@@ -270,11 +270,11 @@ def test_a_config_cannot_ask_for_code_from_elsewhere(folder: Path) -> None:
     assert np.abs(found - reference(photo())).max() < 1e-4
 
 
-def test_nothing_is_asked_of_the_net(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_network_connection_is_made(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import socket
 
     def connect(*_: object) -> None:
-        raise AssertionError("a connection was tried")
+        raise AssertionError("a network connection was attempted")
 
     monkeypatch.setattr(socket.socket, "connect", connect)
     monkeypatch.setattr(socket, "getaddrinfo", connect)
@@ -282,7 +282,7 @@ def test_nothing_is_asked_of_the_net(folder: Path, monkeypatch: pytest.MonkeyPat
     error_of(Path("nvidia/segformer-b0-finetuned-cityscapes-1024-1024"))
 
 
-def test_too_little_memory_on_the_device_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_insufficient_gpu_memory_raises_memory_error(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object, **__: object) -> None:
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")
 

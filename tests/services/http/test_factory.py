@@ -1,4 +1,4 @@
-"""Whatever is served: health by its workers, a token, errors by one table, limits, TLS, headers."""
+"""HTTP factory: health checks, token, error responses, limits, TLS, security headers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from scan2sim.pipeline.core.errors import EXIT_CODES, InputError, ScanError, SettingError
-from scan2sim.services.http.settings import Served
+from scan2sim.services.http.settings import ServerParams
 
 pytest.importorskip("fastapi", reason="the extra bus isn't installed")
 from fastapi import FastAPI, Request, WebSocket
@@ -28,7 +28,7 @@ TOKEN = "0123456789abcdef"
 
 
 class Worker:
-    """Lives until it is told not to."""
+    """Worker whose liveness the test sets."""
 
     alive = True
 
@@ -43,8 +43,8 @@ def token(tmp_path: Path) -> Path:
     return path
 
 
-def app_of(served: Served | None = None, **more: Any) -> FastAPI:
-    app = factory.application("a test", served or Served(), **({"alive": {}} | more))
+def app_of(params: ServerParams | None = None, **more: Any) -> FastAPI:
+    app = factory.application("a test", params or ServerParams(), **({"alive": {}} | more))
 
     @app.get("/number")
     def number(value: float = 0) -> float:
@@ -58,7 +58,7 @@ def app_of(served: Served | None = None, **more: Any) -> FastAPI:
     def fail(kind: str) -> None:
         for error in EXIT_CODES:
             if error.__name__ == kind and issubclass(error, ScanError):
-                raise error("tile.toml", "is wrong", "Mend it")
+                raise error("tile.toml", "is wrong", "Fix it")
         raise ZeroDivisionError("a secret")
 
     @app.websocket("/socket")
@@ -73,7 +73,7 @@ def client_of(app: FastAPI, host: str = "localhost") -> TestClient:
     return TestClient(app, base_url=f"http://{host}", raise_server_exceptions=False)
 
 
-def test_health_is_that_of_the_workers() -> None:
+def test_health_reflects_the_workers() -> None:
     worker, broker = Worker(), Worker()
     client = client_of(app_of(alive={"reader": worker.is_alive}, ready={"Kafka": broker.is_alive}))
     assert client.get("/health/live").status_code == client.get("/health/ready").status_code == 200
@@ -88,27 +88,27 @@ def test_health_is_that_of_the_workers() -> None:
 
 
 @pytest.mark.parametrize("kind", [kind for kind in EXIT_CODES if issubclass(kind, ScanError)])
-def test_errors_have_the_statuses_of_the_table(kind: type[ScanError]) -> None:
+def test_errors_have_the_http_status_of_their_class(kind: type[ScanError]) -> None:
     answer = client_of(app_of()).get(f"/fail/{kind.__name__}")
     assert answer.status_code == EXIT_CODES[kind][1]
-    assert answer.json() == {"where": "tile.toml", "cause": "is wrong", "remedy": "Mend it"}
+    assert answer.json() == {"where": "tile.toml", "cause": "is wrong", "remedy": "Fix it"}
 
 
 @pytest.mark.parametrize(("path", "status"), [("/nix", 404), ("/number?value=x", 422), ("/fail/other", 500)])
-def test_every_error_names_place_cause_and_remedy_alone(path: str, status: int) -> None:
+def test_error_responses_have_only_where_cause_and_remedy(path: str, status: int) -> None:
     answer = client_of(app_of()).get(path)
     assert answer.status_code == status and set(answer.json()) == {"where", "cause", "remedy"}
     assert "secret" not in answer.text
 
 
-def test_a_machine_is_asked_by_any_of_its_names_with_the_token(token: Path) -> None:
-    client = client_of(app_of(Served(host="0.0.0.0", token=token)), "robot.example")
+def test_any_host_name_is_accepted_with_the_token(token: Path) -> None:
+    client = client_of(app_of(ServerParams(host="0.0.0.0", token=token)), "robot.example")
     assert client.get("/number", headers={"Authorization": f"Bearer {TOKEN}"}).status_code == 200
     assert client.get("/number").status_code == 401
 
 
-def test_without_the_token_only_health_and_files_of_pages_are_shown(token: Path) -> None:
-    client = client_of(app_of(Served(token=token), public=("/",)))
+def test_only_health_and_static_files_are_public(token: Path) -> None:
+    client = client_of(app_of(ServerParams(token=token), public=("/",)))
     for path in ("/number", "/metrics", "/openapi.json", "/health", "/nix", "/pages/../number"):
         for given in ({}, {"Authorization": "Bearer 0123456789abcdeX"}, {"Authorization": TOKEN}):
             answer = client.get(path, headers=given)
@@ -119,7 +119,7 @@ def test_without_the_token_only_health_and_files_of_pages_are_shown(token: Path)
         pass
 
 
-def test_websites_whose_names_lead_here_read_nothing() -> None:
+def test_dns_rebinding_is_rejected() -> None:
     for host in ("localhost", "127.0.0.1:8080", "[::1]:8080", "LOCALHOST:80"):
         assert client_of(app_of(), host).get("/number").status_code == 200, host
     for host in ("evil.example", "localhost.evil.example", "127.0.0.1.evil.example:8080"):
@@ -128,27 +128,27 @@ def test_websites_whose_names_lead_here_read_nothing() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "short", "two words that are long", "ümläutümläutümläut"])
-def test_a_token_that_is_none_is_refused(text: str, token: Path) -> None:
+def test_invalid_tokens_are_rejected(text: str, token: Path) -> None:
     token.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match="openssl rand"):
-        Served(token=token).secret()
+        ServerParams(token=token).secret()
     with pytest.raises(InputError, match="can't be read"):
-        Served(token=token.parent / "nowhere").secret()
+        ServerParams(token=token.parent / "nowhere").secret()
 
 
-@pytest.mark.parametrize("told", [True, False], ids=["with a length", "in chunks"])
-def test_requests_that_are_too_large_are_refused(told: bool) -> None:
-    client = client_of(app_of(largest=1000))
+@pytest.mark.parametrize("with_length", [True, False], ids=["with a length", "in chunks"])
+def test_too_large_requests_are_rejected(with_length: bool) -> None:
+    client = client_of(app_of(max_body_bytes=1000))
 
-    def sent(size: int) -> Any:
+    def post(size: int) -> Any:
         chunks = (b"x" * 100 for _ in range(size // 100))
-        return client.post("/length", content=b"x" * size if told else chunks)
+        return client.post("/length", content=b"x" * size if with_length else chunks)
 
-    assert sent(1000).json() == 1000
-    assert sent(1100).status_code == 413 and "1000 bytes" in sent(1100).json()["cause"]
+    assert post(1000).json() == 1000
+    assert post(1100).status_code == 413 and "1000 bytes" in post(1100).json()["cause"]
 
 
-def test_answers_forbid_what_pages_do_not_need() -> None:
+def test_responses_have_security_headers() -> None:
     client = client_of(app_of())
     for path in ("/pages/style.css", "/nix", "/fail/other", "/health/live"):
         headers = client.get(path).headers
@@ -159,77 +159,77 @@ def test_answers_forbid_what_pages_do_not_need() -> None:
 
 @pytest.fixture
 def certificate(tmp_path: Path) -> tuple[Path, Path]:
-    """Of localhost, by nobody but itself."""
+    """Self-signed certificate of localhost and its key."""
     paths = tmp_path / "certificate.pem", tmp_path / "key.pem"
-    made = subprocess.run(
+    done = subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2",
          "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost", "-out", paths[0], "-keyout", paths[1]],
         capture_output=True, text=True,
     )  # fmt: skip
-    assert made.returncode == 0, made.stderr
+    assert done.returncode == 0, done.stderr
     return paths
 
 
 @pytest.fixture
-def served(certificate: tuple[Path, Path]) -> Iterator[str]:
-    """Address of a service that runs, by TLS."""
-    told: list[str] = []
-    served = Served(port=0, host="localhost", certificate=certificate[0], key=certificate[1])
-    thread = threading.Thread(target=factory.run, args=(app_of(served), served, told.append), daemon=True)
+def https_url(certificate: tuple[Path, Path]) -> Iterator[str]:
+    """URL of a running HTTPS service."""
+    addresses: list[str] = []
+    params = ServerParams(port=0, host="localhost", certificate=certificate[0], key=certificate[1])
+    thread = threading.Thread(target=factory.run, args=(app_of(params), params, addresses.append), daemon=True)
     thread.start()
     for _ in range(600):
-        if told:
+        if addresses:
             break
         time.sleep(0.05)
-    yield told[0]
+    yield addresses[0]
 
 
-def test_it_is_served_by_tls(served: str, certificate: tuple[Path, Path]) -> None:
+def test_service_uses_tls(https_url: str, certificate: tuple[Path, Path]) -> None:
     trusting = ssl.create_default_context(cafile=certificate[0])
-    with urllib.request.urlopen(f"{served}number?value=2", context=trusting, timeout=60) as answer:
+    with urllib.request.urlopen(f"{https_url}number?value=2", context=trusting, timeout=60) as answer:
         assert answer.read() == b"2.0"
-    with pytest.raises(OSError), urllib.request.urlopen(served.replace("https", "http"), timeout=60):
+    with pytest.raises(OSError), urllib.request.urlopen(https_url.replace("https", "http"), timeout=60):
         pass
 
 
-def test_what_can_not_be_served_is_told_before(certificate: tuple[Path, Path], tmp_path: Path) -> None:
+def test_invalid_server_settings_are_rejected(certificate: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="--key"):
-        Served(certificate=certificate[0]).check_tls()
+        ServerParams(certificate=certificate[0]).check_tls()
     (tmp_path / "other.pem").write_text("no key", encoding="utf-8")
     with pytest.raises(InputError, match=r"other\.pem"):
-        Served(certificate=certificate[0], key=tmp_path / "other.pem").check_tls()
-    with Served(port=0).listen() as taken, pytest.raises(SettingError, match="Choose another --port"):
-        Served(port=taken.getsockname()[1]).listen()
+        ServerParams(certificate=certificate[0], key=tmp_path / "other.pem").check_tls()
+    with ServerParams(port=0).listen() as taken, pytest.raises(SettingError, match="Choose another --port"):
+        ServerParams(port=taken.getsockname()[1]).listen()
     with pytest.raises(SettingError, match="192.0.2.1"):
-        Served(host="192.0.2.1", token=tmp_path / "token").listen()
+        ServerParams(host="192.0.2.1", token=tmp_path / "token").listen()
 
 
 @pytest.mark.parametrize(("host", "by_token"), [("0.0.0.0", False), ("0.0.0.0", True), ("127.0.0.1", False)])
-def test_tls_without_a_token_is_served_with_a_warning(
+def test_tls_without_a_token_logs_a_warning(
     host: str, by_token: bool, certificate: tuple[Path, Path], token: Path,
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.setattr("uvicorn.Server.run", lambda self, sockets: None)
     given = token if by_token else None
-    served = Served(port=0, host=host, token=given, certificate=certificate[0], key=certificate[1])
+    served = ServerParams(port=0, host=host, token=given, certificate=certificate[0], key=certificate[1])
     factory.run(app_of(served), served, lambda address: None)
     assert ("--token FILE" in caplog.text) == (host == "0.0.0.0" and not by_token)
 
 
 @pytest.fixture
 def plain(monkeypatch: pytest.MonkeyPatch) -> int:
-    """Port of a service that runs, and closes silent connections soon."""
-    monkeypatch.setattr(limits, "SILENT", 1.0)
-    monkeypatch.setattr(factory, "SENT_WITHIN", 0.5)
-    told: list[str] = []
-    served = Served(port=0)
-    threading.Thread(target=factory.run, args=(app_of(served), served, told.append), daemon=True).start()
-    while not told:
+    """Port of a running service with short timeouts."""
+    monkeypatch.setattr(limits, "FIRST_REQUEST_TIMEOUT_S", 1.0)
+    monkeypatch.setattr(factory, "BODY_TIMEOUT_S", 0.5)
+    addresses: list[str] = []
+    params = ServerParams(port=0)
+    threading.Thread(target=factory.run, args=(app_of(params), params, addresses.append), daemon=True).start()
+    while not addresses:
         time.sleep(0.05)
-    return int(told[0].rsplit(":")[-1].strip("/"))
+    return int(addresses[0].rsplit(":")[-1].strip("/"))
 
 
-def test_a_thousand_idle_connections_keep_nobody_out_and_are_closed(plain: int) -> None:
+def test_a_thousand_idle_connections_do_not_block_others_and_are_closed(plain: int) -> None:
     idle = [socket.create_connection(("127.0.0.1", plain)) for _ in range(1000)]
     with urllib.request.urlopen(f"http://127.0.0.1:{plain}/number?value=2", timeout=10) as answer:
         assert answer.read() == b"2.0"
@@ -239,14 +239,14 @@ def test_a_thousand_idle_connections_keep_nobody_out_and_are_closed(plain: int) 
         one.close()
 
 
-def test_a_body_that_never_comes_is_waited_for_in_bounds(plain: int) -> None:
+def test_missing_body_times_out(plain: int) -> None:
     with socket.create_connection(("127.0.0.1", plain), timeout=20) as half:
         half.sendall(b"POST /length HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10\r\n\r\nabc")
         assert b"408" in half.recv(100)
 
 
-def test_other_sites_pages_have_nothing_done() -> None:
-    """A visitor's browser would send their forms here; it says where they are from."""
+def test_cross_origin_requests_are_rejected() -> None:
+    """Browsers send the Origin header with cross-site forms (CSRF)."""
     client = TestClient(app_of(), base_url="http://localhost:8080")
     assert client.post("/length", content=b"abc", headers={"Origin": "http://evil.example"}).status_code == 403
     assert client.post("/length", content=b"abc", headers={"Origin": "null"}).status_code == 403

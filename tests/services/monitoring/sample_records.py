@@ -1,4 +1,4 @@
-"""Records as nodes would tell them, without nodes."""
+"""Sample records as nodes publish them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ IDENTITY = "0123456789abcdef"
 
 
 def record(name: str, time: float, **changed: Any) -> Record:
-    """A record of a period of a second, one a second of a node; `changed` by the names of `Record`'s fields."""
+    """A record with a period of one second; its id depends on the second. `changed`: fields of `Record`."""
     fields: dict[str, Any] = {
         "id": f"{name}-{IDENTITY}:{int(time)}", "time": time, "period": 1.0, "node_name": name,
         "node_namespace": "/", "node_id": f"{name}-{IDENTITY}", "bandwidth": 3000.0, "messages": 3, "size": 1000.0,
@@ -23,5 +23,5 @@ def record(name: str, time: float, **changed: Any) -> Record:
 
 
 def body(name: str, time: float, **changed: Any) -> bytes:
-    """A record as it comes from Kafka."""
+    """A serialized record, as read from Kafka."""
     return record(name, time, **changed).json_line().encode()

@@ -1,4 +1,4 @@
-"""A watched node that sends or hears streams: streams.py talk|hear SECONDS LOG TOPIC:BYTES:RATE ..."""
+"""Instrumented node that publishes or subscribes: streams.py talk|hear SECONDS LOG TOPIC:BYTES:RATE ..."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import Any
 from scan2sim.services.monitoring.node.monitor import Monitor, ros
 from scan2sim.services.transport import QoS
 
-LARGE = 100_000
+MAX_TEXT_BYTES = 100_000
+"""Larger messages are images."""
 IMAGE, TEXT = "sensor_msgs/msg/Image", "std_msgs/msg/String"
 
 
 def message(size: int) -> Any:
-    if size <= LARGE:
+    if size <= MAX_TEXT_BYTES:
         return ros.message(TEXT, data="x" * size)
     if ros.__name__.endswith("rclpy"):
         import array
@@ -31,7 +32,7 @@ def main() -> None:
     node = Monitor(role, period=0.5, log_file=log)
     for stream in streams:
         topic, size, rate = stream.split(":")
-        kind, qos = (IMAGE, QoS(depth=5)) if int(size) > LARGE else (TEXT, QoS(depth=50))
+        kind, qos = (IMAGE, QoS(depth=5)) if int(size) > MAX_TEXT_BYTES else (TEXT, QoS(depth=50))
         if role == "talk":
             publisher, sent = node.create_publisher(ros.message_type(kind), topic, qos), message(int(size))
             node.create_timer(1 / float(rate), lambda publisher=publisher, sent=sent: publisher.publish(sent))

@@ -1,4 +1,4 @@
-"""Records kept for analysis: Parquet by hour, none twice, and what is asked of them."""
+"""Archive: hourly Parquet files without duplicates, and queries."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from typer.testing import CliRunner
 from scan2sim.flows.cli import app
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.services import kafka
-from scan2sim.services.monitoring.export.archive import Archive, keep, query
+from scan2sim.services.monitoring.export.archive import Archive, archive_records, query
 from scan2sim.services.monitoring.node.record import Record, TopicFlow
 from scan2sim.services.monitoring.settings.archive import ArchiveParams, QueryParams
-from scan2sim.services.outbox import Kept
+from scan2sim.services.outbox import OutboxRecord
 from tests.fakes.broker import Broker
 
 NOON = 1_700_000_000 // 3600 * 3600
@@ -39,72 +39,72 @@ def record(number: int, when: float, *, node: str = "camera", lost: int = 0, lat
     )  # fmt: skip
 
 
-def asked(folder: Path, **what: Any) -> list[dict[str, Any]]:
-    return query(QueryParams.of("", {"archive": folder, **what})).to_pylist()
+def run_query(folder: Path, **settings: Any) -> list[dict[str, Any]]:
+    return query(QueryParams.of("", {"archive": folder, **settings})).to_pylist()
 
 
-def test_what_is_kept_is_told_by_span_node_and_topic(tmp_path: Path) -> None:
+def test_query_aggregates_by_interval_node_and_topic(tmp_path: Path) -> None:
     archive = Archive(tmp_path)
     for number in range(120):
         archive.add(record(number, NOON + number, lost=number % 2, latency=0.1 if number < 60 else 0.3))
         archive.add(record(number, NOON + number, node="lidar"))
     archive.write()
-    first, second = asked(tmp_path, node="/site/camera")
+    first, second = run_query(tmp_path, node="/site/camera")
     assert (first["messages"], first["lost"], first["published"], first["bandwidth"]) == (600, 30, 630, 1000.0)
     assert (first["latency"], second["latency"], second["latency_p95"]) == pytest.approx((0.1, 0.3, 0.6))
     assert first["begins_at"].timestamp() == NOON // 60 * 60 and first["topic"] == "/image"
-    assert len(asked(tmp_path)) == 4
-    assert len(asked(tmp_path, begin=NOON + 60, end=NOON + 90)) == 2
-    assert asked(tmp_path, topic="/other") == []
-    assert len(asked(tmp_path, every=3600)) == 2
+    assert len(run_query(tmp_path)) == 4
+    assert len(run_query(tmp_path, begin=NOON + 60, end=NOON + 90)) == 2
+    assert run_query(tmp_path, topic="/other") == []
+    assert len(run_query(tmp_path, every=3600)) == 2
 
 
-def test_an_hour_that_is_over_is_one_file_and_nothing_is_there_twice(tmp_path: Path) -> None:
-    for _ in range(2):  # a reader that was killed after it had written is given the same again
+def test_finished_hours_are_compacted_into_one_file_without_duplicates(tmp_path: Path) -> None:
+    for _ in range(2):  # an archiver that was killed after writing receives the same records again
         archive = Archive(tmp_path)
         for number in range(3600):
             if number % 60 == 0:
                 archive.add(record(number, NOON + number))
         archive.write()
-    archive.join(NOON + 3600)  # too soon: records may be late
+    archive.compact(NOON + 3600)  # too early: records may be late
     assert not list(tmp_path.glob("*/*.parquet"))
-    archive.join(NOON + 2 * 3600)
+    archive.compact(NOON + 2 * 3600)
     (whole,) = tmp_path.rglob("*.parquet")
     assert whole.parent.parent == tmp_path
     table = pq.read_table(whole)
     assert table.num_rows == 60
     assert json.loads(table["record"][0].as_py())["node name"] == "camera"
-    archive.add(record(9999, NOON + 10))  # later than late
+    archive.add(record(9999, NOON + 10))  # after the compaction
     archive.write()
-    archive.join(NOON + 2 * 3600)
-    assert sum(one["messages"] for one in asked(tmp_path)) == 610
+    archive.compact(NOON + 2 * 3600)
+    assert sum(one["messages"] for one in run_query(tmp_path)) == 610
 
 
-def test_an_archive_that_is_none_and_one_that_is_damaged_are_told(tmp_path: Path) -> None:
+def test_empty_and_damaged_archives_are_reported(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds no records"):
-        asked(tmp_path)
+        run_query(tmp_path)
     (tmp_path / "2026-11-22").mkdir()
     (tmp_path / "2026-11-22" / "15.parquet").write_bytes(b"PAR1 and no more")
     with pytest.raises(InputError, match=r"15\.parquet"):
-        asked(tmp_path)
+        run_query(tmp_path)
 
 
-def test_records_that_come_by_kafka_are_kept_and_can_be_asked_for(tmp_path: Path, broker: Broker) -> None:
-    told = [record(number, NOON + number) for number in range(1, 6)]
-    bodies = [Kept(number, one.id, one.json_line().encode()) for number, one in enumerate(told)]
-    kafka.Topic(broker.servers, "records").send([*bodies, Kept(9, "other:1", b"no record"), *bodies])
-    ended, unread = threading.Event(), list[str]()
+def test_records_from_kafka_are_archived_and_queried(tmp_path: Path, broker: Broker) -> None:
+    records = [record(number, NOON + number) for number in range(1, 6)]
+    bodies = [OutboxRecord(number, one.id, one.json_line().encode()) for number, one in enumerate(records)]
+    kafka.TopicProducer(broker.servers, "records").send([*bodies, OutboxRecord(9, "other:1", b"no record"), *bodies])
+    stop, warnings = threading.Event(), list[str]()
     params = ArchiveParams(archive=tmp_path / "kept", kafka_bootstrap_servers=broker.servers, topic="records")
-    keeping = threading.Thread(target=keep, args=(params, ended, unread.append))
-    keeping.start()
+    archiver = threading.Thread(target=archive_records, args=(params, stop, warnings.append))
+    archiver.start()
     until = time.monotonic() + 30
-    while not unread and time.monotonic() < until:
+    while not warnings and time.monotonic() < until:
         time.sleep(0.1)
     time.sleep(1.0)
-    ended.set()
-    keeping.join(30)
-    assert len(unread) == 1
-    out = tmp_path / "told.csv"
+    stop.set()
+    archiver.join(30)
+    assert len(warnings) == 1
+    out = tmp_path / "result.csv"
     arguments = ["monitor", "query", str(tmp_path / "kept"), "--from", "2023-11-14T22:00", "--out", str(out)]
     assert CliRunner().invoke(app, arguments).exit_code == 0
     (line,) = csv.DictReader(out.open())

@@ -1,4 +1,4 @@
-"""What is large, broken or unknown harms no node, and is told."""
+"""Robustness of nodes: large, malformed and unknown messages, clock jumps, unreachable brokers, invalid settings."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ import pytest
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services import kafka
 from scan2sim.services.monitoring.events.schema import Events
-from scan2sim.services.monitoring.settings.monitor import TopicParams, Watched
-from scan2sim.services.outbox import Kept
+from scan2sim.services.monitoring.settings.monitor import MonitorParams, TopicParams
+from scan2sim.services.outbox import OutboxRecord
 from tests.services.conftest import Start
 
 STREAMS = Path(__file__).with_name("streams.py")
 TOPIC = ("-m", "scan2sim.flows.cli", "monitor", "topic")
-WATCH = """
+MONITOR_TOPIC = """
 import sys, time
 from scan2sim.services.monitoring.node.monitor import ros
 from scan2sim.services.monitoring.node.topic_monitor import TopicMonitor
@@ -50,12 +50,12 @@ def flows(path: Path, topic: str, direction: str = "incoming") -> list[dict[str,
 
 
 @pytest.mark.parametrize("transport", ["cyclone", pytest.param("rclpy", marks=pytest.mark.slow)])
-def test_messages_of_ten_megabytes_are_watched_from_inside_and_outside(
+def test_messages_of_ten_megabytes_are_monitored_by_nodes_and_topic_monitor(
     transport: str, tmp_path: Path, start: Start
 ) -> None:
     talks, hears, seen = (tmp_path / name for name in ("talk", "hear", "topic"))
     heard = start(transport, STREAMS, "hear", "12", hears, "image:10000000:2")
-    watch = start(transport, "-c", WATCH, seen, "image")
+    watch = start(transport, "-c", MONITOR_TOPIC, seen, "image")
     said = start(transport, STREAMS, "talk", "10", talks, "image:10000000:2")
     for process in (said, heard, watch):
         _, errors = process.communicate(timeout=60)
@@ -72,11 +72,11 @@ def test_messages_of_ten_megabytes_are_watched_from_inside_and_outside(
     [
         ("cyclone", (STREAMS, "hear", "11")),
         pytest.param("rclpy", (STREAMS, "hear", "11"), marks=pytest.mark.slow),
-        pytest.param("cyclone", ("-c", WATCH), marks=pytest.mark.slow),
+        pytest.param("cyclone", ("-c", MONITOR_TOPIC), marks=pytest.mark.slow),
     ],
     ids=["inside", "inside rclpy", "outside"],
 )
-def test_a_large_topic_crowds_no_small_one_out(
+def test_large_topic_does_not_starve_a_small_one(
     transport: str, watching: tuple[str, ...], tmp_path: Path, start: Start
 ) -> None:
     streams = ("image:6220800:30", "small:100:10")
@@ -92,7 +92,7 @@ def test_a_large_topic_crowds_no_small_one_out(
     assert sum(flow["messages"] for flow in flows(tmp_path / "watch", "/image")) > 20
 
 
-JUMPS = """
+JUMPING_CLOCK = """
 import sys, time
 ahead, real, real_ns, began = [0], time.time, time.time_ns, time.monotonic()
 time.time = lambda: real() + ahead[0]
@@ -115,8 +115,8 @@ ros.shutdown()
 """
 
 
-def test_a_clock_that_jumps_is_told_and_latencies_are_right_again(tmp_path: Path, start: Start) -> None:
-    process = start("cyclone", "-c", JUMPS, tmp_path / "log")
+def test_clock_jump_is_reported_and_latencies_recover(tmp_path: Path, start: Start) -> None:
+    process = start("cyclone", "-c", JUMPING_CLOCK, tmp_path / "log")
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 0, errors
     found = records(tmp_path / "log")
@@ -130,17 +130,17 @@ def test_a_clock_that_jumps_is_told_and_latencies_are_right_again(tmp_path: Path
     assert sum(one["lost messages"] or 0 for one in found) == 0
 
 
-RUBBISH = r"""
+SEND_MALFORMED = r"""
 import contextlib, random, time
 from scan2sim.services.transport import QoS, load
-ros, drawn = load(), random.Random(1)
+ros, rng = load(), random.Random(1)
 ros.init()
 node = ros.Node("rubbish")
 publisher = node.create_publisher(ros.message_type("std_msgs/msg/String"), "chatter", QoS())
 clock = node.create_publisher(ros.message_type("std_msgs/msg/String"), "monitor_clock", QoS())
 while True:
-    for bad in (bytes.fromhex("00010000 05000000 fffefdfc 00000000"), b"\0\1\0\0" + drawn.randbytes(40), b"\0\1\0\0"):
-        with contextlib.suppress(Exception):  # some of it cyclonedds doesn't even send
+    for bad in (bytes.fromhex("00010000 05000000 fffefdfc 00000000"), b"\0\1\0\0" + rng.randbytes(40), b"\0\1\0\0"):
+        with contextlib.suppress(Exception):  # cyclonedds refuses to send some of them
             clock.publish(bad)
             publisher.publish(bad)
     for data in ("good", "[" * 20000, '{"to": "", "from": 1e999, "sent": 1e999}', '{"host": "h", "to": null}', "1"):
@@ -151,20 +151,20 @@ while True:
 
 
 @pytest.mark.parametrize("transport", ["cyclone", "rclpy"])
-def test_messages_that_cannot_be_read_harm_no_node(transport: str, tmp_path: Path, start: Start) -> None:
-    start("cyclone", "-c", RUBBISH)
+def test_malformed_messages_are_counted_and_harmless(transport: str, tmp_path: Path, start: Start) -> None:
+    start("cyclone", "-c", SEND_MALFORMED)
     hears = start(transport, STREAMS, "hear", "6", tmp_path / "log", "chatter:10:1")
     _, errors = hears.communicate(timeout=60)
     assert hears.returncode == 0, errors
     found = [one for one in records(tmp_path / "log") if one["messages"]]
     assert len(found) > 5
-    if transport == "cyclone":  # rclpy hands them on as if they were empty
+    if transport == "cyclone":  # rclpy passes them on as empty messages
         unreadable = sum(one["flows"][0]["unreadable messages"] for one in found)
         assert 10 < unreadable < sum(one["messages"] for one in found) - 10
-        assert any("messages are no std_msgs/msg/String" in text for one in found for text in one["remarks"])
+        assert any("messages are not valid std_msgs/msg/String" in text for one in found for text in one["remarks"])
 
 
-def test_a_topic_of_a_type_that_is_not_known_is_watched(tmp_path: Path, start: Start) -> None:
+def test_topic_of_an_unknown_type_is_monitored(tmp_path: Path, start: Start) -> None:
     own = (
         "from rosbags.typesys import get_types_from_msg\n"
         "from scan2sim.services.transport import idl\n"
@@ -188,11 +188,12 @@ def test_a_topic_of_a_type_that_is_not_known_is_watched(tmp_path: Path, start: S
     flow = found[-1]["flows"][0]
     assert (flow["type"], flow["lost messages"]) == ("my_msgs/msg/Own", 0)
     assert 24 < flow["message size mean"] < 50
-    assert [text for text in found[-1]["remarks"] if "is over its limit, 1" in text] == found[-1]["remarks"]
+    assert [text for text in found[-1]["remarks"] if "exceeds the limit 1" in text] == found[-1]["remarks"]
 
 
-def test_rclpy_says_what_to_do_about_a_type_that_is_not_known(tmp_path: Path, start: Start) -> None:
-    watch = start("rclpy", "-c", WATCH.replace("topics", "type='my_msgs/msg/Own', topics"), tmp_path / "log", "own")
+def test_unknown_type_with_rclpy_suggests_the_other_transport(tmp_path: Path, start: Start) -> None:
+    program = MONITOR_TOPIC.replace("topics", "type='my_msgs/msg/Own', topics")
+    watch = start("rclpy", "-c", program, tmp_path / "log", "own")
     _, errors = watch.communicate(timeout=60)
     assert watch.returncode != 0
     assert "SettingError" in errors and "my_msgs/msg/Own" in errors and "SCAN2SIM_TRANSPORT=cyclone" in errors
@@ -200,7 +201,7 @@ def test_rclpy_says_what_to_do_about_a_type_that_is_not_known(tmp_path: Path, st
 
 @pytest.fixture
 def no_kafka() -> Iterator[str]:
-    """The address of what answers, but is no Kafka."""
+    """Address of a server that isn't Kafka."""
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def answer() -> None:
@@ -217,41 +218,41 @@ def no_kafka() -> Iterator[str]:
         yield f"127.0.0.1:{server.getsockname()[1]}"
 
 
-def test_a_broker_that_is_none_is_told_by_cause(no_kafka: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kafka, "ACKNOWLEDGED_WITHIN", 2.0)
+def test_connection_errors_name_their_cause(no_kafka: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kafka, "ACKNOWLEDGE_TIMEOUT_S", 2.0)
     for servers, cause in (
-        (no_kafka, "what answers there is no Kafka"),
+        (no_kafka, "the server there isn't Kafka"),
         ("127.0.0.1:9", "Connection refused"),
         ("nowhere.invalid:9092", "Name or service not known|Temporary failure"),
     ):
         with pytest.raises(ConnectionError, match=rf"no Kafka at {servers} \(({cause})\); check the address"):
-            kafka.Topic(servers, "monitor_data").send([Kept(1, "a:1", b"body")])
+            kafka.TopicProducer(servers, "monitor_data").send([OutboxRecord(1, "a:1", b"body")])
 
 
 @pytest.mark.parametrize("servers", ["", "a b:9092", "http://127.0.0.1:9092", "127.0.0.1:port", "a:1,,b:2", "größe:1"])
-def test_an_address_that_can_be_none_is_refused(servers: str) -> None:
+def test_malformed_server_addresses_are_rejected(servers: str) -> None:
     with pytest.raises(SettingError, match="HOST:PORT"):
-        Watched.of("", {"kafka_bootstrap_servers": servers})
+        MonitorParams.of("", {"kafka_bootstrap_servers": servers})
 
 
 @pytest.mark.parametrize("topic", ["größe", "画像", "a b", "9a", "a//b", "", "/"])
-def test_names_that_ros_has_not_are_refused(topic: str) -> None:
+def test_invalid_topic_names_are_rejected(topic: str) -> None:
     for fields in ({"publisher_topic": topic}, {"topics": [topic]}):
-        model = TopicParams if "topics" in fields else Watched
+        model = TopicParams if "topics" in fields else MonitorParams
         with pytest.raises(SettingError, match="letters a to z"):
             model.of("", fields)
 
 
-def test_names_of_ros_are_names_in_kafka() -> None:
+def test_ros_topic_names_are_mapped_to_kafka() -> None:
     assert kafka.topic_name("/robot_1/records") == "robot_1.records"
 
 
-def test_what_is_no_event_is_counted_and_harms_nothing(caplog: pytest.LogCaptureFixture) -> None:
-    events, taken = Events("me"), list[Any]()
-    events.on("alarm", taken.append)
+def test_malformed_events_are_counted_and_logged_sparsely(caplog: pytest.LogCaptureFixture) -> None:
+    events, received = Events("me"), list[Any]()
+    events.on("alarm", received.append)
     bad = [b"\xff\xfe", b"", b"[]", b"1", b"no JSON", b"[" * 100_000, b'{"schema": "scan2sim-monitor-1"}',
            b'{"schema": "scan2sim-monitor-1", "record id": "x"}', b'{"schema": "scan2sim-event-1"}']  # fmt: skip
     for line in bad * 20:
-        events.take(line)
-    assert events.malformed == 180 and not taken
+        events.receive(line)
+    assert events.malformed == 180 and not received
     assert len(caplog.records) == 3  # the 1st, the 10th and the 100th

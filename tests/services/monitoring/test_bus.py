@@ -1,4 +1,4 @@
-"""Events cross by Kafka where ROS 2 doesn't reach, and are acted on once where both do."""
+"""Events reach programs by Kafka beyond ROS 2's network, and are processed once where both connect."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ ros.init()
 node = ros.Node(sys.argv[1])
 bus = Bus(node, BusParams(kafka_bootstrap_servers=sys.argv[2]))
 bus.events.define("count", Count)
-taken = []
-bus.events.on("count", lambda count: taken.append(count.vehicles))
-end, told = time.monotonic() + 16, 0
+received = []
+bus.events.on("count", lambda count: received.append(count.vehicles))
+end, sent = time.monotonic() + 16, 0
 while time.monotonic() < end:
     ros.spin_once(node, 0.1)
-    if sys.argv[1] == "counts" and time.monotonic() > end - 16 + 0.2 * told:
-        bus.events.send("count", Count(vehicles=told))
-        told += 1
+    if sys.argv[1] == "counts" and time.monotonic() > end - 16 + 0.2 * sent:
+        bus.events.send("count", Count(vehicles=sent))
+        sent += 1
 bus.close()
 node.destroy_node()
 ros.shutdown()
-print(taken)
+print(received)
 """
 
 
-def test_events_are_taken_once_by_kafka_and_ros(start: Start, broker: Broker) -> None:
+def test_events_over_kafka_and_ros_are_processed_once(start: Start, broker: Broker) -> None:
     counts = start("cyclone", "-c", PROGRAM, "counts", broker.servers)
     near = start("cyclone", "-c", PROGRAM, "near", broker.servers)
     far = start("cyclone", "-c", PROGRAM, "far", broker.servers, ROS_DOMAIN_ID=str(free_dds_domain()))
 
-    def taken(process: subprocess.Popen[str]) -> list[int]:
+    def received_by(process: subprocess.Popen[str]) -> list[int]:
         output, errors = process.communicate(timeout=90)
         assert process.returncode == 0, errors
         return json.loads(output)
 
-    sent = taken(counts)
-    for received in (taken(near), taken(far)):  # who joins late misses what was sent before
+    sent = received_by(counts)
+    for received in (received_by(near), received_by(far)):  # programs that start late miss earlier events
         assert len(received) > 5 and len(set(received)) == len(received) and set(received) <= set(sent)

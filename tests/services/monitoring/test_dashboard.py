@@ -1,4 +1,4 @@
-"""The live page: plots, runs and alarms by Kafka, in a browser, dark and light, on a telephone; names stay text."""
+"""Dashboard in a browser: plots, runs and alarms from Kafka; themes, phone layout, escaping of names."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ pytest.importorskip("fastapi", reason="the extra bus isn't installed")
 
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.http import factory
-from scan2sim.services.kafka import Topic
+from scan2sim.services.kafka import TopicProducer
 from scan2sim.services.monitoring.dashboard.app import Sources, application
 from scan2sim.services.monitoring.dashboard.history import History
 from scan2sim.services.monitoring.events.schema import Event
 from scan2sim.services.monitoring.settings.dashboard import PageParams
 from scan2sim.services.monitoring.settings.limits import Limits
-from scan2sim.services.outbox import Kept
+from scan2sim.services.outbox import OutboxRecord
 from tests.browser import Page, chromium
 from tests.fakes.broker import Broker
 from tests.services.monitoring.sample_records import record
@@ -38,8 +38,8 @@ NUMBERS = itertools.count(1)
 
 
 @dataclass
-class Shown:
-    """A page that is served."""
+class ServedPage:
+    """A running dashboard."""
 
     url: str
     sources: Sources
@@ -53,40 +53,40 @@ class Shown:
             return json.load(answer)
 
 
-def until(true: Callable[[], Any], seconds: float = 60) -> None:
+def wait_until(condition: Callable[[], Any], seconds: float = 60) -> None:
     end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end, "never true"
+    while not condition():
+        assert time.monotonic() < end, "timed out"
         time.sleep(0.05)
 
 
 @contextmanager
-def shown(params: PageParams, *, reading: bool = True) -> Iterator[Shown]:
-    """A page in a thread, of what comes from Kafka, or of what tests put into its sources."""
-    sources, told = Sources.of(params), list[str]()
+def serve_page(params: PageParams, *, reading: bool = True) -> Iterator[ServedPage]:
+    """Serve the dashboard in a thread; its data come from Kafka, or from the test if not `reading`."""
+    sources, addresses = Sources.of(params), list[str]()
     app = application(params, sources)
     if reading:
         sources.start()
-    threading.Thread(target=factory.run, args=(app, params, told.append), daemon=True).start()
-    until(lambda: told)
-    yield Shown(told[0], sources)
+    threading.Thread(target=factory.run, args=(app, params, addresses.append), daemon=True).start()
+    wait_until(lambda: addresses)
+    yield ServedPage(addresses[0], sources)
     if reading:
         sources.close()
 
 
 def fill(history: History, names: list[str], seconds: int = 60, **changed: Any) -> None:
-    """Records of the last so many seconds, a second each."""
+    """Add records of the last `seconds` seconds, one per second."""
     now = time.time()
     for name in names:
         for i in range(seconds):
-            history.take(record(name, now - seconds + i, **changed).json_line().encode())
+            history.add(record(name, now - seconds + i, **changed).json_line().encode())
 
 
-def records(names: list[str], seconds: int, **changed: Any) -> list[Kept]:
-    """Of the last so many seconds."""
+def records(names: list[str], seconds: int, **changed: Any) -> list[OutboxRecord]:
+    """Records of the last `seconds` seconds, one per second and node."""
     now = time.time()
-    told = [record(name, now - seconds + i, **changed) for i in range(seconds) for name in names]
-    return [Kept(i, one.id, one.json_line().encode()) for i, one in enumerate(told)]
+    made = [record(name, now - seconds + i, **changed) for i in range(seconds) for name in names]
+    return [OutboxRecord(i, one.id, one.json_line().encode()) for i, one in enumerate(made)]
 
 
 def open_page(page: Page, url: str, *, phone: bool = False, dark: bool = False) -> None:
@@ -106,9 +106,9 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 
 
 def event(kind: str, **body: Any) -> bytes:
-    """An event as it comes from Kafka."""
-    told = Event(id=f"0123:{next(NUMBERS)}", time=time.time(), sender="test", kind=kind, body=body)
-    return told.json_line().encode()
+    """A serialized event, as read from Kafka."""
+    made = Event(id=f"0123:{next(NUMBERS)}", time=time.time(), sender="test", kind=kind, body=body)
+    return made.json_line().encode()
 
 
 def a_run(run: str, **changed: Any) -> bytes:
@@ -130,12 +130,12 @@ def a_queue(name: str) -> bytes:
     return event("queue", queue=name, seconds=2.0, oldest=0.1, oldest_done=0.2, **counts)
 
 
-def red(picture: np.ndarray, rgb: tuple[int, int, int] = (0xC8, 0x1E, 0x1E)) -> int:
+def count_red_pixels(picture: np.ndarray, rgb: tuple[int, int, int] = (0xC8, 0x1E, 0x1E)) -> int:
     return int((np.abs(picture.astype(int) - rgb).max(axis=2) < 12).sum())
 
 
 def figure_of(page: Page, title: str) -> np.ndarray:
-    """(H, W, 3) of one plot, its caption left out."""
+    """(H, W, 3) image of a plot without its caption."""
     box = f"[...document.querySelectorAll('figure')].find(f => f.querySelector('b').textContent === {title!r})"
     x, y, width, height = page.value(
         f"(b => [b.x, b.y + scrollY, b.width, b.height])({box}.querySelector('.uplot').getBoundingClientRect())"
@@ -143,12 +143,12 @@ def figure_of(page: Page, title: str) -> np.ndarray:
     return page.picture()[round(y) : round(y + height), round(x) : round(x + width)]
 
 
-def test_records_come_from_kafka_to_the_page_once(broker: Broker, page: Page) -> None:
+def test_records_from_kafka_appear_once_on_the_page(broker: Broker, page: Page) -> None:
     params = PageParams(kafka_bootstrap_servers=broker.servers, port=0)
-    topic = Topic(broker.servers, params.topic)
-    topic.send(records(["early"], 30))  # before the page began
-    with shown(params) as served:
-        until(lambda: len(served.history.state()["nodes"]) == 1)
+    topic = TopicProducer(broker.servers, params.topic)
+    topic.send(records(["early"], 30))  # before the page was started
+    with serve_page(params) as served:
+        wait_until(lambda: len(served.history.state()["nodes"]) == 1)
         assert served.get("health/ready") == {"failing": []}
         open_page(page, served.url)
         twice = records(["camera", "lidar"], 20, latency=150_000_000)
@@ -156,45 +156,46 @@ def test_records_come_from_kafka_to_the_page_once(broker: Broker, page: Page) ->
         topic.send(twice)
         page.until("document.querySelectorAll('#nodes tbody tr').length === 3")
         assert page.value("[...document.querySelectorAll('figcaption b')].map(b => b.textContent)") == [
-            "Bandwidth by node", "Latency", "Sums", "Lost messages a period", "Messages a period",
-            "Mean size of messages",
+            "Bandwidth by node", "Latency", "Total bandwidth", "Lost messages per period", "Messages per period",
+            "Mean message size",
         ]  # fmt: skip
         assert "150 ms" in page.value("document.querySelector('#nodes tbody').textContent")
         page.until("document.getElementById('counts').textContent.startsWith('70 records')")
         broker.kill()
-        until(lambda: not served.sources.is_connected())
+        wait_until(lambda: not served.sources.is_connected())
         with pytest.raises(urllib.error.HTTPError, match="503"):
             served.get("health/ready")
         assert served.get("health/live") == {"failing": []}
-        page.until("document.getElementById('status').textContent === 'Kafka is gone'")
-        broker.start()  # which has forgotten all
-        Topic(broker.servers, params.topic).send(records(["late"], 5))
+        page.until("document.getElementById('status').textContent === 'Kafka is unreachable'")
+        broker.start()  # it has lost all records
+        TopicProducer(broker.servers, params.topic).send(records(["late"], 5))
         page.until("document.querySelectorAll('#nodes tbody tr').length === 4")
         page.until("document.getElementById('status').textContent === 'live'")
 
 
 @pytest.fixture(scope="module")
-def filled() -> Iterator[Shown]:
-    """A page of 20 nodes, of which one loses more than the limit, and one has a hostile name."""
-    with shown(PageParams(port=0, limit=Limits(lost=4)), reading=False) as served:
+def filled() -> Iterator[ServedPage]:
+    """Dashboard of 20 nodes; one loses more messages than the limit, and one has a hostile name."""
+    with serve_page(PageParams(port=0, limit=Limits(lost=4)), reading=False) as served:
         fill(served.history, [f"node_{i:02d}" for i in range(18)], lost=4)
         fill(served.history, ["lossy"], lost=5)
         fill(served.history, [HOSTILE], hostname=HOSTILE, remarks=[HOSTILE], topics=[HOSTILE])
-        served.history.take(json.dumps({"schema": HOSTILE}).encode())
+        served.history.add(json.dumps({"schema": HOSTILE}).encode())
         yield served
 
 
-def test_values_beyond_a_limit_are_red_dots(filled: Shown, page: Page) -> None:
+def test_values_above_a_limit_are_red_dots(filled: ServedPage, page: Page) -> None:
     open_page(page, filled.url)
     page.until("document.querySelectorAll('#nodes tbody tr').length === 20")
-    assert red(figure_of(page, "Lost messages a period")) > 300
-    assert red(figure_of(page, "Mean size of messages")) == red(figure_of(page, "Latency")) == 0
-    assert "beyond 4" in page.value("document.getElementById('plots').textContent")
+    assert count_red_pixels(figure_of(page, "Lost messages per period")) > 300
+    for title in ("Mean message size", "Latency"):
+        assert count_red_pixels(figure_of(page, title)) == 0
+    assert "above 4" in page.value("document.getElementById('plots').textContent")
 
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 @pytest.mark.parametrize("phone", [False, True], ids=["desk", "phone"])
-def test_it_fits_the_screen_in_both_themes(dark: bool, phone: bool, filled: Shown, page: Page) -> None:
+def test_page_fits_the_screen_in_both_themes(dark: bool, phone: bool, filled: ServedPage, page: Page) -> None:
     open_page(page, filled.url, phone=phone, dark=dark)
     page.until("document.querySelectorAll('#nodes tbody tr').length === 20")
     assert page.value("document.documentElement.scrollWidth <= innerWidth"), "no sideways scroll"
@@ -209,7 +210,7 @@ def test_it_fits_the_screen_in_both_themes(dark: bool, phone: bool, filled: Show
     page.value("document.getElementById('theme').click()")
 
 
-def test_names_never_become_html(filled: Shown, page: Page) -> None:
+def test_names_are_escaped(filled: ServedPage, page: Page) -> None:
     open_page(page, filled.url)
     page.until("document.getElementById('remarks').textContent.includes('onerror')")
     assert page.value("document.querySelectorAll('img').length") == 0
@@ -219,19 +220,19 @@ def test_names_never_become_html(filled: Shown, page: Page) -> None:
     assert page.value("fetch('https://example.org/').then(() => 'sent', () => 'refused')") == "refused"
 
 
-def test_a_node_is_chosen_and_a_range_is_picked(filled: Shown, page: Page) -> None:
+def test_user_selects_a_node_and_a_time_range(filled: ServedPage, page: Page) -> None:
     open_page(page, filled.url)
     page.until("document.querySelectorAll('#chips button').length === 20")
     page.value("[...document.querySelectorAll('#chips button')].find(b => b.textContent === '/lossy').click()")
-    page.until("held && held.nodes.length === 1")
-    assert {one for one in page.value("held.sums.in") if one is not None} == {2000}
+    page.until("shownWindow && shownWindow.nodes.length === 1")
+    assert {one for one in page.value("shownWindow.sums.in") if one is not None} == {2000}
     x, y, width, height = page.value(
         "(b => [b.x, b.y, b.width, b.height])(document.querySelector('.u-over').getBoundingClientRect())"
     )
     page.do("Input.dispatchMouseEvent", type="mouseMoved", x=x + 0.9 * width, y=y + 0.1 * height)
     page.until("document.querySelector('figcaption output').textContent.includes('/lossy · 3 kB/s')", 20)
     page.value("[...document.querySelectorAll('#chips button')].find(b => b.textContent === '/lossy').click()")
-    page.until("held && held.nodes.length === 20")
+    page.until("shownWindow && shownWindow.nodes.length === 20")
     x, y, width = page.value(
         "(b => [b.x, b.y + 60, b.width])(document.querySelector('.u-over').getBoundingClientRect())"
     )
@@ -239,21 +240,22 @@ def test_a_node_is_chosen_and_a_range_is_picked(filled: Shown, page: Page) -> No
     page.until("document.getElementById('status').textContent === 'past'")
     assert 25 < page.value("range.to - range.from") < 35
     page.value("document.querySelector('[data-seconds=\"900\"]').click()")
-    page.until("document.getElementById('status').textContent !== 'past' && held && held.step === 5")
+    page.until("document.getElementById('status').textContent !== 'past' && shownWindow && shownWindow.step === 5")
 
 
-def test_a_live_window_moves_on_whole(filled: Shown, page: Page) -> None:
+def test_live_window_advances_without_gaps(filled: ServedPage, page: Page) -> None:
     open_page(page, filled.url)
-    begin, end = page.value("[held.times[0], held.times.at(-1)]")
+    begin, end = page.value("[shownWindow.times[0], shownWindow.times.at(-1)]")
     fill(filled.history, ["late"], seconds=1)  # a 21st node
-    page.until(f"held.times.at(-1) > {end + 2} && held.nodes.some(node => node.name === '/late')")
-    times = page.value("held.times")
+    page.until(f"shownWindow.times.at(-1) > {end + 2} && shownWindow.nodes.some(node => node.name === '/late')")
+    times = page.value("shownWindow.times")
     assert times[0] > begin and set(np.diff(times)) == {1.0} and len(times) in (300, 301)
-    lengths = page.value("held.nodes.flatMap(n => METRICS.flatMap(m => Object.values(n[m]).map(list => list.length)))")
-    assert set(lengths) == {len(times)} == set(page.value("Object.values(held.sums).map(list => list.length)"))
+    of_node = "METRICS.flatMap(m => Object.values(n[m]).map(list => list.length))"
+    lengths = page.value(f"shownWindow.nodes.flatMap(n => {of_node})")
+    assert set(lengths) == {len(times)} == set(page.value("Object.values(shownWindow.sums).map(list => list.length)"))
 
 
-def test_the_stream_goes_on_where_the_window_ends(filled: Shown) -> None:
+def test_stream_updates_continue_the_initial_window(filled: ServedPage) -> None:
     with urllib.request.urlopen(f"{filled.url}api/live?seconds=300&nodes=/lossy", timeout=60) as stream:
         events: list[dict[str, Any]] = []
         while len(events) < 2:
@@ -262,7 +264,7 @@ def test_the_stream_goes_on_where_the_window_ends(filled: Shown) -> None:
                 events.append(json.loads(line[6:]))
     first, second = events
     assert len(first["times"]) in (300, 301) and len(second["times"]) < 30
-    assert second["times"][0] in first["times"], "the last buckets are told again"
+    assert second["times"][0] in first["times"], "the last buckets are resent"
     assert second["times"][-1] > first["times"][-1] and second["step"] == first["step"] == 1
 
 
@@ -270,31 +272,31 @@ def text(page: Page, place: str) -> str:
     return str(page.value(f"document.querySelector({place!r}).innerText"))
 
 
-def test_runs_and_alarms_come_from_kafka_to_the_page(broker: Broker, page: Page) -> None:
+def test_runs_and_alarms_from_kafka_appear_on_the_page(broker: Broker, page: Page) -> None:
     params = PageParams(kafka_bootstrap_servers=broker.servers, port=0, events_topic="happenings")
-    topic = Topic(broker.servers, params.events_topic)
+    topic = TopicProducer(broker.servers, params.events_topic)
 
     def send(*bodies: bytes) -> None:
-        topic.send([Kept(0, f"test:{next(NUMBERS)}", body) for body in bodies])
+        topic.send([OutboxRecord(0, f"test:{next(NUMBERS)}", body) for body in bodies])
 
     send(a_run("r1"), a_step("r1", "poisson.terrain", "running", progress=0.25, seconds=12.0, host="gpu-1"))
-    with shown(params) as served:
+    with serve_page(params) as served:
         page.do("Page.navigate", url=served.url)
         page.until("document.querySelector('.run')?.open")
-        assert "survey drive" in text(page, ".run summary") and "50 of 100 steps" in text(page, ".run summary")
+        assert "survey drive" in text(page, ".run summary") and "50 of 100 tasks" in text(page, ".run summary")
         assert "1:02 h on edge" in text(page, ".run summary") and "1 failed" in text(page, ".run summary")
         assert "street_1/poisson.terrain" in text(page, ".run table") and "gpu-1" in text(page, ".run table")
         assert page.value("document.querySelector('.run td progress').value") == 0.25
-        assert page.value("document.getElementById('plots').hidden"), "no node has told anything"
+        assert page.value("document.getElementById('plots').hidden"), "no records of nodes"
         send(a_step("r1", "poisson.terrain", "done", progress=1.0, seconds=30.0, memory=1_500_000_000),
              a_step("r1", "texture", "failed", message="ran out of memory"))  # fmt: skip
         page.until("document.querySelector('.run tr.failed')?.innerText.includes('ran out of memory')")
         assert "1.5 GB" in text(page, ".run table") and "30 s" in text(page, ".run table")
         assert page.value("document.getElementById('alarm').hidden") and "None" in text(page, "#calm")
-        send(an_alarm("raised", "images come late", time.time() - 5), b"no event")
+        send(an_alarm("raised", "images come late", time.time() - 5), b"not an event")
         page.until("!document.getElementById('alarm').hidden")
         assert "Alarm: images come late, /camera, since" in text(page, "#alarm")
-        page.until("document.getElementById('counts').innerText.includes('1 no event')")
+        page.until("document.getElementById('counts').innerText.includes('1 invalid event')")
         assert page.value("document.getElementById('queues').hidden")
         send(a_queue("detect"))
         page.until("!document.getElementById('queues').hidden")
@@ -306,14 +308,14 @@ def test_runs_and_alarms_come_from_kafka_to_the_page(broker: Broker, page: Page)
         page.until("document.querySelector('.run .failure').innerText === '1 of 7 tiles failed'")
 
 
-def test_runs_and_alarms_stay_text_and_fit_the_telephone(page: Page) -> None:
-    with shown(PageParams(port=0), reading=False) as served:
-        take = served.sources.noticed.take
-        take(a_run(HOSTILE, command=HOSTILE, source=HOSTILE * 4, host=HOSTILE, message=HOSTILE, state="failed"))
+def test_runs_and_alarms_are_escaped_and_fit_a_phone(page: Page) -> None:
+    with serve_page(PageParams(port=0), reading=False) as served:
+        add = served.sources.bus_state.add
+        add(a_run(HOSTILE, command=HOSTILE, source=HOSTILE * 4, host=HOSTILE, message=HOSTILE, state="failed"))
         for number in range(40):
-            take(a_step(HOSTILE, f"{HOSTILE}{number}", "failed", message=HOSTILE * 5, host=HOSTILE, tile=HOSTILE))
-            take(an_alarm("raised", HOSTILE, time.time(), HOSTILE * number))
-        take(a_queue(HOSTILE))
+            add(a_step(HOSTILE, f"{HOSTILE}{number}", "failed", message=HOSTILE * 5, host=HOSTILE, tile=HOSTILE))
+            add(an_alarm("raised", HOSTILE, time.time(), HOSTILE * number))
+        add(a_queue(HOSTILE))
         fill(served.history, ["node"])
         for phone, dark in ((True, True), (False, False)):
             open_page(page, served.url, phone=phone, dark=dark)
@@ -326,48 +328,48 @@ def test_runs_and_alarms_stay_text_and_fit_the_telephone(page: Page) -> None:
                 assert HOSTILE in text(page, place), place
         page.click(".run summary")
         page.until("!document.querySelector('.run').open")
-        take(a_step(HOSTILE, "one more", "running"))
+        add(a_step(HOSTILE, "one more", "running"))
         page.until("details.get(Object.keys(Object.fromEntries(details))[0]).known === 41")
         assert not page.value("document.querySelector('.run').open"), "it stays folded"
 
 
-def test_runs_that_have_not_changed_are_not_told_again() -> None:
-    with shown(PageParams(port=0), reading=False) as served:
-        served.sources.noticed.take(a_run("r1"))
+def test_details_of_unchanged_runs_are_not_resent() -> None:
+    with serve_page(PageParams(port=0), reading=False) as served:
+        served.sources.bus_state.add(a_run("r1"))
         with urllib.request.urlopen(f"{served.url}api/live", timeout=60) as stream:
-            told: list[dict[str, Any]] = []
-            while len(told) < 3:
+            sent: list[dict[str, Any]] = []
+            while len(sent) < 3:
                 line = stream.readline()
                 if line.startswith(b"data: "):
-                    told.append(json.loads(line[6:])["state"]["runs"][0])
-                    if len(told) == 2:
-                        served.sources.noticed.take(a_run("r1", done=41))
-    assert [run.get("details", {}).get("last", {}).get("done") for run in told] == [40, None, 41]
+                    sent.append(json.loads(line[6:])["state"]["runs"][0])
+                    if len(sent) == 2:
+                        served.sources.bus_state.add(a_run("r1", done=41))
+    assert [run.get("details", {}).get("last", {}).get("done") for run in sent] == [40, None, 41]
 
 
 @pytest.mark.parametrize(
     "query", ["from=5&to=4", "from=nan&to=4", "from=0&to=1e12", "from=0&to=1e10", "to=5", "from=0&to="]
 )
-def test_impossible_ranges_are_refused(query: str, filled: Shown) -> None:
+def test_invalid_ranges_are_rejected(query: str, filled: ServedPage) -> None:
     with pytest.raises(urllib.error.HTTPError, match="422") as caught:
         filled.get(f"api/history?{query}")
     assert set(json.load(caught.value)) == {"where", "cause", "remedy"}
 
 
-def test_it_asks_for_the_token(tmp_path: Path, page: Page) -> None:
+def test_page_prompts_for_the_token(tmp_path: Path, page: Page) -> None:
     (tmp_path / "token").write_text(TOKEN, encoding="utf-8")
-    with shown(PageParams(port=0, token=tmp_path / "token"), reading=False) as served:
+    with serve_page(PageParams(port=0, token=tmp_path / "token"), reading=False) as served:
         with pytest.raises(urllib.error.HTTPError, match="401"):
             served.get("api/history?from=0&to=5")
         page.do("Page.navigate", url=served.url)
-        page.until("document.getElementById('status')?.textContent === 'a token is wanted'")
+        page.until("document.getElementById('status')?.textContent === 'a token is required'")
         page.value(f"document.querySelector('#token input').value = {TOKEN!r}")
         page.value("document.querySelector('#token button').click()")
         page.until("document.querySelectorAll('figure canvas').length === 6")
 
 
 @pytest.mark.parametrize("given", [["lost"], ["lost=x"], ["lost=-1"], ["lots=4"], ["latency=nan"], ["="]])
-def test_limits_that_are_none_are_refused(given: list[str]) -> None:
+def test_malformed_limits_are_rejected(given: list[str]) -> None:
     with pytest.raises(SettingError, match="--limit: must be KEY=VALUE"):
         PageParams.of("", {"limit": given})
     assert PageParams.of("", {"limit": ["latency=0.1", "lost=4"]}).limit.model_dump(exclude_none=True) == {

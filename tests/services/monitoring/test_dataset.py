@@ -1,4 +1,4 @@
-"""Data sets of messages: what isn't one is told by its line."""
+"""Dataset files of messages: order, and errors by line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def test_events_are_read_in_order(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["1,2\nx,3\n", "1,2\n3\n", "5,1\n4,1\n", "1,-2\n", "nan,2\n", "1,99999999999\n"])
-def test_a_line_that_is_none_is_told(text: str, tmp_path: Path) -> None:
+def test_invalid_lines_are_reported_by_number(text: str, tmp_path: Path) -> None:
     (tmp_path / "data.csv").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=r"data\.csv: line \d"):
         read_events(tmp_path / "data.csv")

@@ -1,4 +1,4 @@
-"""Events: kinds of one's own, checked; what is attached to them is done once."""
+"""Events: custom kinds, validation, deduplicated callbacks."""
 
 from __future__ import annotations
 
@@ -18,55 +18,55 @@ def fail(_: object) -> None:
     raise OSError("no disk")
 
 
-class Wire:
+class RecordingOutlet:
     def __init__(self) -> None:
         self.lines: list[str] = []
 
-    def send(self, told: Event) -> None:
-        self.lines.append(told.json_line())
+    def send(self, event: Event) -> None:
+        self.lines.append(event.json_line())
 
     def close(self) -> None:
         pass
 
 
-def joined() -> tuple[Events, Wire, Events]:
-    """A sender, what it sent, and another program; both know of counts."""
-    sender, other, wire = Events("counter"), Events("other"), Wire()
-    sender.outlets.append(wire)
+def connected() -> tuple[Events, RecordingOutlet, Events]:
+    """A sender, its outlet, and another program; both define the kind "count"."""
+    sender, other, outlet = Events("counter"), Events("other"), RecordingOutlet()
+    sender.outlets.append(outlet)
     for one in (sender, other):
         one.define("count", Count)
-    return sender, wire, other
+    return sender, outlet, other
 
 
-def test_what_is_attached_to_a_kind_is_done_once_here_and_there() -> None:
-    sender, wire, other = joined()
+def test_callbacks_are_called_once_per_event_in_every_program() -> None:
+    sender, outlet, other = connected()
     here: list[Count] = []
     there: list[Count] = []
     sender.on("count", here.append)
     other.on("count", there.append)
     sender.send("count", Count(vehicles=3))
-    for _ in range(2):  # over ROS 2 and over Kafka
-        sender.take(wire.lines[0])
-        other.take(wire.lines[0].encode())
+    for _ in range(2):  # once over ROS 2, once over Kafka
+        sender.receive(outlet.lines[0])
+        other.receive(outlet.lines[0].encode())
     assert here == there == [Count(vehicles=3)]
 
 
-def test_what_is_not_of_a_schema_is_left(caplog: pytest.LogCaptureFixture) -> None:
-    sender, wire, other = joined()
+def test_events_that_violate_their_schema_are_ignored(caplog: pytest.LogCaptureFixture) -> None:
+    sender, outlet, other = connected()
     got: list[Count] = []
     other.on("count", got.append)
     sender.send("count", Count(vehicles=3))
     caplog.set_level(logging.WARNING)
-    wrong = (wire.lines[0].replace('"vehicles":3', '"vehicles":"many"'), "{", "3", '{"schema": "scan2sim-event-1"}')
+    wrong = (outlet.lines[0].replace('"vehicles":3', '"vehicles":"many"'), "{", "3", '{"schema": "scan2sim-event-1"}')
     for line in wrong:
-        other.take(line)
+        other.receive(line)
     assert got == [] and other.malformed == len(wrong) and len(caplog.records) == 1
-    other.take(wire.lines[0].replace('"count"', '"unheard of"'))
-    assert other.malformed == len(wrong)  # another program's
+    other.receive(outlet.lines[0].replace('"count"', '"unheard of"'))
+    assert other.malformed == len(wrong)  # a kind of another program isn't malformed
 
 
-def test_an_action_that_fails_keeps_no_other_from_its_own() -> None:
-    sender, _, _ = joined()
+def test_failing_callback_does_not_prevent_others() -> None:
+    sender, _, _ = connected()
     got: list[Alarm] = []
     sender.on("alarm", fail)
     sender.on("alarm", got.append)
@@ -75,8 +75,8 @@ def test_an_action_that_fails_keeps_no_other_from_its_own() -> None:
     assert got == [alarm]
 
 
-def test_kinds_are_defined_once() -> None:
-    sender, _, _ = joined()
+def test_redefined_unknown_and_mismatched_kinds_are_rejected() -> None:
+    sender, _, _ = connected()
     sender.define("count", Count)
     for wrong in (lambda: sender.define("count", Alarm), lambda: sender.define("record", Count),
                   lambda: sender.on("counts", print), lambda: sender.send("alarm", Count(vehicles=1))):  # fmt: skip

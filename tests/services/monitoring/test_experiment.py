@@ -1,4 +1,4 @@
-"""Real nodes, from cameras' events to workers that are asked for and done with them; alarms reach who listens."""
+"""End-to-end test of real nodes: camera events, queue, autoscaler, workers and alarms."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ CLI = ("cyclone", "-m", "scan2sim.flows.cli", "monitor")
 
 
 @pytest.mark.parametrize(
-    ("forecast", "workers"),  # other days were quiet, so less is expected of this one
+    ("forecast", "workers"),  # the history has quiet days only, so its profile predicts a lower rate
     [
         ((), 3),
         pytest.param(("--forecast", "trend", "--lead", "0.5"), 3, marks=pytest.mark.slow),
         (("--history", "days.csv"), 2),
     ],
 )
-def test_a_rush_is_given_workers_and_loses_nothing(
+def test_burst_of_events_is_scaled_up_without_losses(
     forecast: tuple[str, ...], workers: int, tmp_path: Path, start: Start
 ) -> None:
-    # a quiet second, three of 50 events a second, a quiet while: one worker does 20 a second
+    # a quiet second, three seconds at 50 events per second, then quiet: one worker processes 20 per second
     times = [0.1, *(1 + number / 50 for number in range(150)), 6.0]
     (tmp_path / "data.csv").write_text("".join(f"{seconds},100000\n" for seconds in times), encoding="utf-8")
     (tmp_path / "rules.toml").write_text(
         "[[rules]]\nname = 'queue'\nmetric = 'queue_length'\nabove = 5\n", encoding="utf-8"
     )
-    days = tmp_path / "days.csv"  # an event every ten seconds of a day
+    days = tmp_path / "days.csv"  # one day with an event every ten seconds
     days.write_text("".join(f"{seconds},1000\n" for seconds in range(0, 86_400, 10)), encoding="utf-8")
     options = [days if one == days.name else one for one in forecast]
     serve = shlex.join(worker.command(0.05))

@@ -1,4 +1,4 @@
-"""What a monitor tells is what the link did: by what was set, and by the kernel's counters."""
+"""Monitored latency, losses and bandwidth match an emulated link and the kernel's counters."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ import pytest
 from bench.bus import link as bus_link
 from scan2sim.services.qos.counters import Counter
 from scan2sim.services.qos.emulated_link import Link
-from scan2sim.services.qos.link_profile import Shape
+from scan2sim.services.qos.link_profile import LinkProfile
 from tests.services.qos.needed import need_link
 
 
 @pytest.mark.parametrize("transport", ["cyclone", "rclpy"])
-def test_latency_losses_and_bandwidth_are_those_of_the_link(transport: str) -> None:
+def test_monitored_latency_losses_and_bandwidth_match_the_link(transport: str) -> None:
     need_link(None, "nft")
     if not bus_link.PYTHONS[transport].exists():
         pytest.skip("rclpy isn't installed (.venv-ros, tests/services/ros-requirements.txt)")
     delay, rate = 0.05, 1e6
-    with Link(Shape(delay=delay)) as link:
-        left, came = (Counter(*side, *bus_link.PACKET) for side in ((link.near, "output"), (link.far, "input")))
-        with bus_link.watched(link, transport, 0.002) as watch:
-            link.shape(Shape(delay=delay, loss=0.1))  # once they know each other: before, who watches expects nothing
+    with Link(LinkProfile(delay=delay)) as link:
+        left, came = (Counter(*side, *bus_link.PACKET_BYTES) for side in ((link.near, "output"), (link.far, "input")))
+        with bus_link.monitored(link, transport, 0.002) as watch:
+            link.shape(LinkProfile(delay=delay, loss=0.1))  # after discovery: losses before it aren't counted
             time.sleep(1.5)
             changed = time.time()
-            link.shape(Shape(rate=rate))
+            link.shape(LinkProfile(rate=rate))
             time.sleep(1.0)
             packets, through = came.read().packets, link.far.counts().received_bytes
             time.sleep(2.5)
@@ -37,6 +37,6 @@ def test_latency_losses_and_bandwidth_are_those_of_the_link(transport: str) -> N
     assert median(late) / 1e9 == pytest.approx(delay, rel=0.05)
     assert sum(flow["lost messages"] for flow in watch.flows) == pytest.approx(lost, rel=0.02)
     narrow = [flow for flow in watch.flows if changed + 2 < flow["time"] < ended]
-    share = packets * bus_link.CDR / through
+    share = packets * bus_link.MESSAGE_BYTES / through
     assert median(flow["bandwidth"] for flow in narrow) == pytest.approx(rate / 8 * share, rel=0.05)
-    assert all(flow["published messages"] > 2 * flow["messages"] > 0 for flow in narrow)  # both rates are told
+    assert all(flow["published messages"] > 2 * flow["messages"] > 0 for flow in narrow)  # both rates are reported

@@ -1,4 +1,4 @@
-"""What is counted of messages that pass."""
+"""Traffic meter: messages, bytes, losses and latencies per period."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def arrival(
     return Arrival(topic="/t", size=size, received=1000, sent=sent, publisher=publisher, number=number)
 
 
-def test_flows_are_of_the_period_alone() -> None:
+def test_counters_restart_every_period() -> None:
     meter = Meter(window=10)
     meter.published("/out", 100)
     meter.published("/out", 300)
@@ -26,7 +26,7 @@ def test_flows_are_of_the_period_alone() -> None:
     assert second.incoming["/t"].latencies == ()
 
 
-def test_losses_are_counted_by_publisher_whatever_the_order() -> None:
+def test_losses_are_counted_per_publisher_in_any_order_of_arrival() -> None:
     meter = Meter(window=10)
     for publisher, numbers in ((b"a", [5, 6, 9, 8]), (b"b", [1, 4])):
         for number in numbers:
@@ -39,7 +39,7 @@ def test_losses_are_counted_by_publisher_whatever_the_order() -> None:
     assert (found.sent, found.lost) == (5, 3)  # over the border between two periods: 5, 6 and 7 of b
 
 
-def test_a_publisher_that_starts_anew_loses_nothing_by_it() -> None:
+def test_restarted_publisher_counts_no_losses() -> None:
     meter = Meter(window=10)
     for publisher, number in ((b"before", 5), (b"before", 6), (b"before", 9), (b"after", 1), (b"after", 2)):
         meter.received(arrival(number, publisher=publisher))
@@ -47,7 +47,7 @@ def test_a_publisher_that_starts_anew_loses_nothing_by_it() -> None:
     assert (found.flow.messages, found.sent, found.lost) == (5, 7, 2)
 
 
-def test_losses_are_unknown_where_a_publisher_numbers_nothing() -> None:
+def test_losses_are_unknown_without_sequence_numbers() -> None:
     meter = Meter(window=10)
     meter.received(arrival(1))
     meter.received(arrival(None, publisher=None))
@@ -55,14 +55,14 @@ def test_losses_are_unknown_where_a_publisher_numbers_nothing() -> None:
     assert (found.flow.messages, found.sent, found.lost) == (2, None, None)
 
 
-def test_latencies_are_the_windows_last() -> None:
+def test_latencies_are_those_of_the_latest_messages() -> None:
     meter = Meter(window=3)
     for sent in (0, 100, 200, 300, 400):
         meter.received(arrival(1, sent=sent))
     assert meter.read().incoming["/t"].latencies == (800, 700, 600)
 
 
-def test_a_time_of_sending_from_the_future_is_no_latency() -> None:
+def test_source_timestamps_far_in_the_future_are_discarded() -> None:
     meter = Meter(window=3)
     meter.received(arrival(1, sent=10**12))  # a clock that jumped
     meter.received(arrival(2, sent=None))

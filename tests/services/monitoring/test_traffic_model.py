@@ -1,4 +1,4 @@
-"""Traffic is drawn as the curve says, the same by the same seed."""
+"""Traffic model: daily curve, random events, reproducibility."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from typer.testing import CliRunner
 from scan2sim.flows.cli import app
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.monitoring.autoscale import traffic_model
-from scan2sim.services.monitoring.autoscale.traffic_model import TrafficParams, events, rate, share
+from scan2sim.services.monitoring.autoscale.traffic_model import TrafficParams, events, rate, traffic_share
 from scan2sim.services.monitoring.example_nodes.dataset_talker import read_events
 
 
-def test_a_weekday_has_two_rush_hours_and_a_weekend_none() -> None:
-    day = [share(0, hour / 10) for hour in range(240)]
+def test_weekdays_have_two_rush_hours_and_weekends_none() -> None:
+    day = [traffic_share(0, hour / 10) for hour in range(240)]
     tops = [i / 10 for i in range(1, 239) if day[i] >= day[i - 1] and day[i] > day[i + 1]]
     assert len(tops) == 2 and 7.5 < tops[0] < 8.5 and 17 < tops[1] < 18.5
     assert max(day) <= 1 and min(day) < 0.1 and max(day[:50]) < 0.15
-    assert max(share(6, hour / 10) for hour in range(240)) < 0.6
+    assert max(traffic_share(6, hour / 10) for hour in range(240)) < 0.6
 
 
 @pytest.mark.parametrize(("cameras", "above", "below"), [(10, 0.8, 2.0), (20, 1.6, 4.0), (50, 4.0, 10.0)])
-def test_peaks_are_those_of_the_missions_figure(cameras: int, above: float, below: float) -> None:
+def test_peak_rates_match_figure_5_of_d3_2(cameras: int, above: float, below: float) -> None:
     assert above < max(rate(cameras, 0, hour / 10) for hour in range(60, 100)) < below
 
 
-def test_events_come_at_the_curves_rate(tmp_path: Path) -> None:
+def test_random_events_follow_the_rate(tmp_path: Path) -> None:
     drawn = list(events(TrafficParams(out=tmp_path / "x", cameras=200)))
     for hour in (6, 7, 8, 9):
         count = sum(hour - 6 <= seconds / 3600 < hour - 5 for seconds, _ in drawn)
@@ -37,7 +37,7 @@ def test_events_come_at_the_curves_rate(tmp_path: Path) -> None:
     assert 50_000 <= min(sizes) < 51_000 and 499_000 < max(sizes) <= 500_000
 
 
-def test_the_command_writes_what_the_talker_reads(tmp_path: Path) -> None:
+def test_command_writes_a_file_that_the_dataset_talker_reads(tmp_path: Path) -> None:
     def made(name: str, seed: str) -> bytes:
         given = ["--cameras", "10", "--from", "7", "--to", "8", "--seed", seed]
         result = CliRunner().invoke(app, ["monitor", "traffic", str(tmp_path / name), *given])
@@ -48,6 +48,6 @@ def test_the_command_writes_what_the_talker_reads(tmp_path: Path) -> None:
     assert 1500 < len(list(read_events(tmp_path / "a.csv"))) < 3500
 
 
-def test_hours_that_end_before_they_begin_are_refused(tmp_path: Path) -> None:
+def test_end_before_start_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="must be after --from"):
         traffic_model.write(TrafficParams(out=tmp_path / "x", from_hour=10, to_hour=6))

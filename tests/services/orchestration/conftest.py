@@ -1,4 +1,4 @@
-"""An OSM to try things on: the stand-in, and a deployment for it."""
+"""Fixtures: a fake OSM, a client of it, and a deployment."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scan2sim.services.orchestration import lifecycle
 from scan2sim.services.orchestration import osm as osm_client
 from scan2sim.services.orchestration.osm import Osm
 from scan2sim.services.orchestration.settings import Connection
-from tests.fakes.osm import Fake, State
+from tests.fakes.osm import FakeOsm, OsmState
 
 TOWN = """
 deployment = "town"
@@ -30,21 +30,21 @@ replicas = 2
 
 
 @pytest.fixture(autouse=True)
-def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Waits of seconds take hundredths here."""
+def _short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorten waits of seconds to hundredths."""
     monkeypatch.setenv("OSM_PASSWORD", "admin")
-    for module, name in ((lifecycle, "POLL"), (osm_client, "PAUSE")):
+    for module, name in ((lifecycle, "POLL_INTERVAL_S"), (osm_client, "RETRY_DELAY_S")):
         monkeypatch.setattr(module, name, 0.01)
 
 
 @pytest.fixture
-def fake() -> Iterator[Fake]:
-    with Fake(State(seconds=0.02)) as made:
+def fake() -> Iterator[FakeOsm]:
+    with FakeOsm(OsmState(seconds=0.02)) as made:
         yield made
 
 
 @pytest.fixture
-def osm(fake: Fake) -> Iterator[Osm]:
+def osm(fake: FakeOsm) -> Iterator[Osm]:
     with Osm(Connection(osm=fake.address)) as made:
         yield made
 

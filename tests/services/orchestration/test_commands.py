@@ -1,4 +1,4 @@
-"""The commands by hand against a current OSM, which returns parameters of operations as JSON, and an earlier one."""
+"""Single commands against a newer OSM, which returns parameters of operations as JSON strings, and Release 8."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from typer.testing import CliRunner
 from scan2sim.flows.commands.orchestrate import app
 from scan2sim.pipeline.core.errors import StepError
 from scan2sim.services.orchestration import description, operations
-from scan2sim.services.orchestration.lifecycle import Patience
+from scan2sim.services.orchestration.lifecycle import WaitPolicy
 from scan2sim.services.orchestration.osm import Osm
 from scan2sim.services.orchestration.package import build
 from scan2sim.services.orchestration.settings import Connection
 from scan2sim.services.qos.requirements import Environment
-from tests.fakes.osm import Fake, State
+from tests.fakes.osm import FakeOsm, OsmState
 
 Command = Callable[..., str]
 
 
 @pytest.fixture(params=[True, False], ids=["current OSM", "OSM 8"])
-def fake(request: pytest.FixtureRequest) -> Iterator[Fake]:
-    with Fake(State(seconds=0.02, as_json=request.param)) as made:
+def fake(request: pytest.FixtureRequest) -> Iterator[FakeOsm]:
+    with FakeOsm(OsmState(seconds=0.02, as_json=request.param)) as made:
         yield made
 
 
@@ -37,7 +37,7 @@ def detect(osm: Osm) -> str:
 
 
 @pytest.fixture
-def command(fake: Fake) -> Command:
+def command(fake: FakeOsm) -> Command:
     """Runs `scan2sim orchestrate` and returns its output."""
 
     def run(*words: object) -> str:
@@ -55,8 +55,8 @@ def start(command: Command, detect: str) -> Callable[[], str]:
     return lambda: command(*words, "--wait")
 
 
-def sent(fake: Fake) -> list[tuple[str, Any]]:
-    """Kind and chart values of each operation, as this project sent them."""
+def sent(fake: FakeOsm) -> list[tuple[str, Any]]:
+    """Kind and chart values of each operation, as sent."""
     found = []
     for one in fake.state.operations.values():
         params = one["operationParams"]
@@ -68,33 +68,33 @@ def sent(fake: Fake) -> list[tuple[str, Any]]:
 VALUES = {"level": "info", "replicaCount": 2}
 
 
-def test_instantiate_waits_until_it_runs(fake: Fake, start: Callable[[], str]) -> None:
+def test_instantiate_waits_until_the_instance_runs(fake: FakeOsm, start: Callable[[], str]) -> None:
     assert "one runs" in start()
     assert sent(fake) == [("instantiate", VALUES)]
 
 
-def test_a_second_instantiate_changes_nothing(fake: Fake, start: Callable[[], str]) -> None:
+def test_repeated_instantiate_changes_nothing(fake: FakeOsm, start: Callable[[], str]) -> None:
     start()
     assert "one runs" in start()
     assert sent(fake) == [("instantiate", VALUES)]
 
 
-def test_a_second_instantiate_with_other_values_upgrades_the_chart(
-    fake: Fake, start: Callable[[], str], command: Command, detect: str
+def test_repeated_instantiate_with_other_values_upgrades_the_chart(
+    fake: FakeOsm, start: Callable[[], str], command: Command, detect: str
 ) -> None:
     start()
     command("instantiate", "one", detect, "--cluster", "edge-cluster", "--value", "level=debug", "--wait")
     assert sent(fake)[1:] == [("action", {"level": "debug", "replicaCount": 1})]
 
 
-def test_scale_keeps_the_other_values(fake: Fake, start: Callable[[], str], command: Command) -> None:
+def test_scale_keeps_the_other_values(fake: FakeOsm, start: Callable[[], str], command: Command) -> None:
     start()
     for count in (5, 5, 3):
         command("scale", "one", count, "--wait")
     assert sent(fake)[1:] == [("action", VALUES | {"replicaCount": 5}), ("action", VALUES | {"replicaCount": 3})]
 
 
-def test_heal_applies_the_last_values_again(fake: Fake, start: Callable[[], str], command: Command) -> None:
+def test_heal_applies_the_last_values_again(fake: FakeOsm, start: Callable[[], str], command: Command) -> None:
     start()
     command("heal", "one", "--wait")
     command("scale", "one", 4, "--wait")
@@ -103,17 +103,17 @@ def test_heal_applies_the_last_values_again(fake: Fake, start: Callable[[], str]
 
 
 @pytest.mark.parametrize("returned", ["{", "no JSON", "[1]", "[{}, 2]", '"text"', "3", 3, [3], {"replicaCount": 1}])
-def test_unreadable_parameters_are_an_error_and_can_be_removed(
-    fake: Fake, start: Callable[[], str], command: Command, monkeypatch: pytest.MonkeyPatch, returned: object
+def test_unreadable_parameters_are_an_error_and_the_instance_can_be_deleted(
+    fake: FakeOsm, start: Callable[[], str], command: Command, monkeypatch: pytest.MonkeyPatch, returned: object
 ) -> None:
     start()
     operation = next(iter(fake.state.operations.values()))
     broken = operation | {"operationParams": {"additionalParamsForVnf": returned, "secret": "hush"}}
     monkeypatch.setattr(fake.state, "returned_operations", lambda: {operation["_id"]: broken})
     with Osm(Connection(osm=fake.address)) as osm:
-        for act in (operations.heal, lambda *given: operations.resize(given[0], given[1], 3, *given[2:])):
+        for act in (operations.heal, lambda *given: operations.scale(given[0], given[1], 3, *given[2:])):
             with pytest.raises(StepError, match=r"one: .*additionalParamsForVnf.* can't be read") as caught:
-                act(osm, "one", Patience(10), lambda _: None)
+                act(osm, "one", WaitPolicy(10), lambda _: None)
             assert "scan2sim orchestrate delete" in caught.value.remedy and "hush" not in str(caught.value)
     monkeypatch.undo()
     monkeypatch.setenv("OSM_PASSWORD", "admin")
@@ -121,7 +121,7 @@ def test_unreadable_parameters_are_an_error_and_can_be_removed(
     assert not fake.state.instances
 
 
-def test_the_fake_returns_parameters_as_each_release_does(fake: Fake, start: Callable[[], str]) -> None:
+def test_the_fake_returns_parameters_like_each_release(fake: FakeOsm, start: Callable[[], str]) -> None:
     start()
     with Osm(Connection(osm=fake.address)) as osm:
         (operation,) = osm.operations(str(osm.instances()[0]["_id"]))

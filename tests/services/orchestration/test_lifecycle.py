@@ -1,4 +1,4 @@
-"""What runs is brought to what a file says, whatever OSM answers, and nothing is left over."""
+"""Reconciliation of OSM with `services.toml`, with all kinds of failures, leaves nothing behind."""
 
 from __future__ import annotations
 
@@ -14,264 +14,266 @@ import pytest
 
 from scan2sim.pipeline.core.errors import InputError, ScanError, SettingError, StepError, UnavailableError
 from scan2sim.services.orchestration import apply, deployment, operations
-from scan2sim.services.orchestration.apply import Applied, Change
-from scan2sim.services.orchestration.instance import Action, Instance, Wanted, next_action
-from scan2sim.services.orchestration.lifecycle import Patience
-from scan2sim.services.orchestration.osm import FAULTS, Osm
+from scan2sim.services.orchestration.apply import ApplyResult, Change
+from scan2sim.services.orchestration.instance import Action, DesiredInstance, Instance, next_action
+from scan2sim.services.orchestration.lifecycle import WaitPolicy
+from scan2sim.services.orchestration.osm import HTTP_ERRORS, Osm
 from scan2sim.services.orchestration.package import Packages, build
 from scan2sim.services.orchestration.settings import ApplyParams, Connection
 from scan2sim.services.qos.requirements import Environment
-from tests.fakes.osm import CUT_AFTER, CUT_BEFORE, Fake, State
+from tests.fakes.osm import CUT_AFTER, CUT_BEFORE, FakeOsm, OsmState
 from tests.services.orchestration.conftest import TOWN
 
 QUIET: Callable[[str], None] = lambda text: None  # noqa: E731
 
 
-def bring_about(fake: Fake, path: Path, *, timeout: float = 20.0, wait: bool = True) -> Applied:
+def apply_file(fake: FakeOsm, path: Path, *, timeout: float = 20.0, wait: bool = True) -> ApplyResult:
     params = ApplyParams(osm=fake.address, wait=wait, timeout=timeout)
     with Osm(params) as osm:
-        there = apply.target(osm, deployment.read(path), path.parent)
-        return apply.apply(osm, there, params, lambda fraction, message="": None)
+        state = apply.load_state(osm, deployment.read(path), path.parent)
+        return apply.apply(osm, state, params, lambda fraction, message="": None)
 
 
-def planned(fake: Fake, path: Path) -> list[Change]:
+def plan_changes(fake: FakeOsm, path: Path) -> list[Change]:
     with Osm(Connection(osm=fake.address)) as osm:
-        return apply.plan(apply.target(osm, deployment.read(path), path.parent))
+        return apply.plan(apply.load_state(osm, deployment.read(path), path.parent))
 
 
-def states(fake: Fake) -> dict[str, str]:
+def states(fake: FakeOsm) -> dict[str, str]:
     return {one["name"]: one["nsState"] for one in fake.state.instances.values()}
 
 
-WANTED = Wanted("a", "town", "detect", "container", "nsd", "vim")
+DESIRED = DesiredInstance("a", "town", "detect", "container", "nsd", "vim")
 
 
-def seen(state: str = "READY", instantiated: bool = True, mark: str = WANTED.mark, **operation: str) -> Instance:
+def observed(state: str = "READY", instantiated: bool = True, tag: str = DESIRED.tag, **operation: str) -> Instance:
     started = {
         "lcmOperationType": "instantiate",
         "operationState": "COMPLETED",
-        "operationParams": WANTED.request("record"),
+        "operationParams": DESIRED.request("record"),
     }
-    return Instance("1", "a", "nsd", mark, state, instantiated, (started, operation) if operation else (started,))
+    return Instance("1", "a", "nsd", tag, state, instantiated, (started, operation) if operation else (started,))
 
 
 @pytest.mark.parametrize(
-    ("wanted", "there", "action"),
+    ("desired", "found", "action"),
     [
         (None, None, None),
-        (WANTED, None, Action.CREATE),
-        (WANTED, seen(), None),
-        (WANTED, seen("NOT_INSTANTIATED", False), Action.INSTANTIATE),
-        (WANTED, seen("BUILDING", False, operationState="PROCESSING"), Action.FOLLOW),
-        (None, seen("BUILDING", False, operationState="PROCESSING"), Action.FOLLOW),
-        (WANTED, seen("BROKEN"), Action.TERMINATE),
-        (None, seen(), Action.TERMINATE),
-        (None, seen("NOT_INSTANTIATED", False), Action.DELETE),
-        (WANTED, seen(mark="scan2sim town 000000000000"), Action.TERMINATE),
-        (Wanted("a", "town", "detect", "container", "nsd", "vim", replicas=3), seen(), Action.UPGRADE),
+        (DESIRED, None, Action.CREATE),
+        (DESIRED, observed(), None),
+        (DESIRED, observed("NOT_INSTANTIATED", False), Action.INSTANTIATE),
+        (DESIRED, observed("BUILDING", False, operationState="PROCESSING"), Action.WAIT),
+        (None, observed("BUILDING", False, operationState="PROCESSING"), Action.WAIT),
+        (DESIRED, observed("BROKEN"), Action.TERMINATE),
+        (None, observed(), Action.TERMINATE),
+        (None, observed("NOT_INSTANTIATED", False), Action.DELETE),
+        (DESIRED, observed(tag="scan2sim town 000000000000"), Action.TERMINATE),
+        (DesiredInstance("a", "town", "detect", "container", "nsd", "vim", replicas=3), observed(), Action.UPGRADE),
     ],
 )
-def test_what_is_done_next_is_told_by_what_is_there(
-    wanted: Wanted | None, there: Instance | None, action: Action | None
+def test_next_action_depends_on_desired_and_observed_state(
+    desired: DesiredInstance | None, found: Instance | None, action: Action | None
 ) -> None:
-    assert next_action(wanted, there) == action
+    assert next_action(desired, found) == action
 
 
-def test_a_file_is_brought_about_once_changed_and_undone(fake: Fake, town: Path) -> None:
-    assert {one.what for one in planned(fake, town)} == {"onboard", "create"}
-    assert not bring_about(fake, town).failed
+def test_apply_creates_updates_and_removes_what_the_file_says(fake: FakeOsm, town: Path) -> None:
+    assert {one.action for one in plan_changes(fake, town)} == {"onboard", "create"}
+    assert not apply_file(fake, town).failed
     assert states(fake) == {"detect-north": "READY", "segment-south": "READY"} and fake.state.orphans() == []
-    assert planned(fake, town) == []
-    before = len([1 for _, method, path in fake.state.asked if method != "GET" and "tokens" not in path])
-    assert bring_about(fake, town) == Applied()
-    assert before == len([1 for _, method, path in fake.state.asked if method != "GET" and "tokens" not in path])
+    assert plan_changes(fake, town) == []
+    before = len([1 for _, method, path in fake.state.requests if method != "GET" and "tokens" not in path])
+    assert apply_file(fake, town) == ApplyResult()
+    assert before == len([1 for _, method, path in fake.state.requests if method != "GET" and "tokens" not in path])
 
     town.write_text(TOWN.replace("replicas = 2", "replicas = 3").replace('"detect"', '"classify"'), encoding="utf-8")
-    told = {(one.name, one.what) for one in planned(fake, town)}
-    assert ("detect-north", "make anew") in told and ("segment-south", "scale out") in told
-    assert not bring_about(fake, town).failed and planned(fake, town) == []
-    assert len(fake.state.functions) == 2  # the detector's is gone
+    changes = {(one.name, one.action) for one in plan_changes(fake, town)}
+    assert ("detect-north", "recreate") in changes and ("segment-south", "scale out") in changes
+    assert not apply_file(fake, town).failed and plan_changes(fake, town) == []
+    assert len(fake.state.functions) == 2  # the detector's package was removed
 
     town.write_text('deployment = "town"', encoding="utf-8")
-    assert not bring_about(fake, town).failed
+    assert not apply_file(fake, town).failed
     assert (fake.state.instances, fake.state.services, fake.state.functions) == ({}, {}, {})
     assert not fake.state.resources
 
 
-def test_what_isnt_the_deployments_stays(fake: Fake, osm: Osm, town: Path) -> None:
-    made = build_detect("mine")
+def test_instances_of_other_owners_are_not_touched(fake: FakeOsm, osm: Osm, town: Path) -> None:
+    made = build_detector("mine")
     operations.onboard(osm, [made.function, made.service])
-    hand = Patience(10)
-    operations.instantiate(osm, "by-hand", made.service.descriptor.id, osm.vim("edge-site"), patience=hand, say=QUIET)
-    bring_about(fake, town)
+    policy, nsd = WaitPolicy(10), made.service.descriptor.id
+    operations.instantiate(osm, "by-hand", nsd, osm.vim("edge-site"), wait_policy=policy, notify=QUIET)
+    apply_file(fake, town)
     town.write_text('deployment = "town"', encoding="utf-8")
-    bring_about(fake, town)
+    apply_file(fake, town)
     assert states(fake) == {"by-hand": "READY"} and len(fake.state.functions) == 1
     town.write_text(TOWN.replace("detect-north", "by-hand"), encoding="utf-8")
-    applied = bring_about(fake, town)
-    assert "isn't this deployment's" in applied.failed["by-hand"].cause and states(fake)["segment-south"] == "READY"
+    result = apply_file(fake, town)
+    assert "instance of another deployment" in result.failed["by-hand"].cause
+    assert states(fake)["segment-south"] == "READY"
 
 
-def build_detect(prefix: str) -> Packages:
+def build_detector(prefix: str) -> Packages:
     from scan2sim.services.orchestration import description
 
     return build(description.read("detect"), Environment.EDGE, "container", prefix)
 
 
-def test_an_operation_that_fails_is_told_and_leaves_nothing(fake: Fake, town: Path) -> None:
+def test_a_failed_instantiation_is_reported_and_removed(fake: FakeOsm, town: Path) -> None:
     fake.state.outcome = lambda kind, name: "FAILED" if (kind, name) == ("instantiate", "detect-north") else "COMPLETED"
-    applied = bring_about(fake, town)
-    error = applied.failed["detect-north"]
+    result = apply_file(fake, town)
+    error = result.failed["detect-north"]
     assert "FAILED: no quota" in error.cause and "run again" in error.remedy
     assert states(fake) == {"segment-south": "READY"} and fake.state.orphans() == []
     fake.state.outcome = lambda kind, name: "COMPLETED"
-    assert not bring_about(fake, town).failed and len(states(fake)) == 2
+    assert not apply_file(fake, town).failed and len(states(fake)) == 2
 
 
-def test_an_operation_that_never_ends_is_left_and_followed_by_the_next_run(fake: Fake, town: Path) -> None:
+def test_the_next_run_waits_for_an_operation_that_timed_out(fake: FakeOsm, town: Path) -> None:
     fake.state.outcome = lambda kind, name: "never" if name == "detect-north" else "COMPLETED"
-    applied = bring_about(fake, town, timeout=1.0)
-    assert "isn't over after 1 s" in applied.failed["detect-north"].cause
-    assert any((one.name, one.what) == ("detect-north", "follow") for one in planned(fake, town))
+    result = apply_file(fake, town, timeout=1.0)
+    assert "still running after 1 s" in result.failed["detect-north"].cause
+    assert any((one.name, one.action) == ("detect-north", "wait") for one in plan_changes(fake, town))
     fake.state.outcome = lambda kind, name: "COMPLETED"
-    assert not bring_about(fake, town).failed
+    assert not apply_file(fake, town).failed
     assert states(fake)["detect-north"] == "READY" and len(fake.state.instances) == 2
 
 
-def test_nothing_is_waited_for_unless_asked(fake: Fake, town: Path) -> None:
+def test_apply_without_wait_only_starts_operations(fake: FakeOsm, town: Path) -> None:
     fake.state.seconds = 3600
     begun = time.monotonic()
-    assert not bring_about(fake, town, wait=False).failed
+    assert not apply_file(fake, town, wait=False).failed
     assert time.monotonic() - begun < 10 and set(states(fake).values()) == {"BUILDING"}
 
 
-@pytest.mark.parametrize("status", sorted(FAULTS))
-def test_every_refusal_is_a_sentence_and_the_next_run_goes_on(fake: Fake, town: Path, status: int) -> None:
-    """At each kind of request in turn, again and again until the run ends."""
-    for refused in ("vnf_packages", "ns_descriptors", "ns_instances", "instantiate"):
-        fake.state.faults = lambda method, path, part=refused: status if method != "GET" and part in path else None  # type: ignore[misc]
+@pytest.mark.parametrize("status", sorted(HTTP_ERRORS))
+def test_every_error_status_has_a_message_and_the_next_run_recovers(fake: FakeOsm, town: Path, status: int) -> None:
+    """With each kind of request failing in turn, until the run ends."""
+    for failing in ("vnf_packages", "ns_descriptors", "ns_instances", "instantiate"):
+        fake.state.faults = lambda method, path, part=failing: status if method != "GET" and part in path else None  # type: ignore[misc]
         try:
-            applied = bring_about(fake, town)
-            errors: list[ScanError] = list(applied.failed.values())
+            result = apply_file(fake, town)
+            errors: list[ScanError] = list(result.failed.values())
         except ScanError as error:
             errors = [error]
-        assert errors and all(str(status) in str(e) and e.remedy for e in errors), refused
+        assert errors and all(str(status) in str(e) and e.remedy for e in errors), failing
         fake.state.faults = lambda method, path: None
-    assert not bring_about(fake, town).failed
+    assert not apply_file(fake, town).failed
     assert set(states(fake).values()) == {"READY"} and fake.state.orphans() == [] and len(fake.state.instances) == 2
 
 
 @pytest.mark.parametrize("fault", [CUT_BEFORE, CUT_AFTER, 504])
-def test_a_connection_cut_at_any_request_costs_nothing(town: Path, fault: str | int) -> None:
-    """Each request in turn is the one whose answer is lost: all ends as if none were, with nothing made twice."""
+def test_a_connection_cut_at_any_request_has_no_effect(town: Path, fault: str | int) -> None:
+    """The response of each request in turn is lost: the result is the same, with no duplicates."""
     for cut in range(100):
         count = itertools.count()
-        with Fake(State(seconds=0.01, faults=lambda method, path: fault if next(count) == cut else None)) as fake:  # noqa: B023
-            applied = bring_about(fake, town)
-            assert not applied.failed, (cut, applied.failed)
+        with FakeOsm(OsmState(seconds=0.01, faults=lambda method, path: fault if next(count) == cut else None)) as fake:  # noqa: B023
+            result = apply_file(fake, town)
+            assert not result.failed, (cut, result.failed)
             assert len(fake.state.instances) == 2 and set(states(fake).values()) == {"READY"}, cut
             assert fake.state.orphans() == [] and len(fake.state.functions) == len(fake.state.services) == 2, cut
         if next(count) <= cut:
             return
-    pytest.fail("there is no end of requests")
+    pytest.fail("more than 100 requests")
 
 
-def test_a_token_that_is_taken_back_is_renewed(fake: Fake, town: Path) -> None:
+def test_a_revoked_token_is_renewed(fake: FakeOsm, town: Path) -> None:
     count = itertools.count()
 
-    def forget(method: str, path: str) -> None:
+    def revoke(method: str, path: str) -> None:
         if next(count) % 7 == 0:
             fake.state.tokens.clear()
 
-    fake.state.faults = forget
-    assert not bring_about(fake, town).failed
-    assert sum(path.endswith("tokens") for _, _, path in fake.state.asked) > 3
+    fake.state.faults = revoke
+    assert not apply_file(fake, town).failed
+    assert sum(path.endswith("tokens") for _, _, path in fake.state.requests) > 3
 
 
-def test_stopped_at_any_moment_it_goes_on_to_the_same_end(town: Path) -> None:
-    """As Ctrl-C stops it: nothing more is begun, and what is begun stays as it is."""
+def test_an_interrupted_run_can_be_completed(town: Path) -> None:
+    """Like Ctrl-C: no further action is started, and running operations continue."""
     rng = random.Random(0)
-    with Fake(State(seconds=0.02)) as fake:
-        bring_about(fake, town)
+    with FakeOsm(OsmState(seconds=0.02)) as fake:
+        apply_file(fake, town)
         whole = fake.state.summary()
     for _ in range(8):
-        with Fake(State(seconds=0.05)) as fake:
+        with FakeOsm(OsmState(seconds=0.05)) as fake:
             stop = threading.Event()
             params = ApplyParams(osm=fake.address, wait=True)
             threading.Timer(rng.uniform(0, 0.4), stop.set).start()
             with Osm(params) as osm:
-                there = apply.target(osm, deployment.read(town), town.parent)
-                apply.apply(osm, there, params, lambda fraction, message="": None, stop)
-            bring_about(fake, town)
+                state = apply.load_state(osm, deployment.read(town), town.parent)
+                apply.apply(osm, state, params, lambda fraction, message="": None, stop)
+            apply_file(fake, town)
             assert fake.state.summary() == whole and fake.state.orphans() == []
 
 
-def test_scaling_healing_and_removing_by_hand(fake: Fake, osm: Osm) -> None:
-    patience, made = Patience(10), build_detect("mine")
+def test_scale_heal_terminate_and_delete(fake: FakeOsm, osm: Osm) -> None:
+    wait_policy, made = WaitPolicy(10), build_detector("mine")
     nsd = made.service.descriptor.id
     with pytest.raises(InputError, match="neither given nor in OSM"):
         operations.onboard(osm, [made.service])
     with pytest.raises(InputError, match="two packages"):
         operations.onboard(osm, [made.function, made.function])
     operations.onboard(osm, [made.service, made.function])
-    operations.instantiate(osm, "one", nsd, osm.cluster("edge-cluster"), replicas=2, patience=patience, say=QUIET)
-    operations.resize(osm, "one", 5, patience, QUIET)
+    site = osm.cluster("edge-cluster")
+    operations.instantiate(osm, "one", nsd, site, replicas=2, wait_policy=wait_policy, notify=QUIET)
+    operations.scale(osm, "one", 5, wait_policy, QUIET)
     kinds = [one["lcmOperationType"] for one in fake.state.operations.values()]
-    operations.resize(osm, "one", 5, patience, QUIET)  # nothing more
+    operations.scale(osm, "one", 5, wait_policy, QUIET)  # no change
     assert kinds == ["instantiate", "action"] and len(fake.state.operations) == 2
-    operations.heal(osm, "one", patience, QUIET)
-    operations.terminate(osm, "one", patience, QUIET)
-    with pytest.raises(SettingError, match="isn't running"):
-        operations.resize(osm, "one", 1, patience, QUIET)
-    operations.delete(osm, [made.function, made.service], patience, QUIET)
+    operations.heal(osm, "one", wait_policy, QUIET)
+    operations.terminate(osm, "one", wait_policy, QUIET)
+    with pytest.raises(SettingError, match="not running"):
+        operations.scale(osm, "one", 1, wait_policy, QUIET)
+    operations.delete(osm, [made.function, made.service], wait_policy, QUIET)
     assert not fake.state.instances and not fake.state.functions and not fake.state.services
     with pytest.raises(SettingError, match="no such"):
         operations.delete_packages(osm, ["gone"])
 
 
-def test_an_instance_is_deleted_only_when_its_operation_is_over(fake: Fake, osm: Osm) -> None:
-    """OSM would forget the operation, and what it makes would run on, nobody's."""
-    made = build_detect("mine")
+def test_an_instance_is_deleted_only_after_its_operation_has_ended(fake: FakeOsm, osm: Osm) -> None:
+    """Otherwise OSM would forget the operation, and its resources would become orphans."""
+    made = build_detector("mine")
     operations.onboard(osm, [made.service, made.function])
     nsd = made.service.descriptor.id
     fake.state.seconds = 0.5
-    operations.instantiate(osm, "one", nsd, osm.vim("edge-site"), patience=Patience(wait=False), say=QUIET)
-    operations.delete_instance(osm, "one", Patience(10), QUIET)
+    operations.instantiate(osm, "one", nsd, osm.vim("edge-site"), wait_policy=WaitPolicy(wait=False), notify=QUIET)
+    operations.delete_instance(osm, "one", WaitPolicy(10), QUIET)
     assert not fake.state.resources and fake.state.orphans() == []
 
 
-def test_sites_keys_and_names_that_arent_there_are_refused_before_anything_is_sent(fake: Fake, town: Path) -> None:
-    for old, new, said in (
-        ('"edge-cluster"', '"moon"', "There are: edge-cluster"),
-        ('"segment-south"', '"detect-north"', "two services are called"),
+def test_unknown_sites_keys_and_names_are_rejected_before_anything_is_sent(fake: FakeOsm, town: Path) -> None:
+    for old, new, expected in (
+        ('"edge-cluster"', '"moon"', "Available: edge-cluster"),
+        ('"segment-south"', '"detect-north"', "duplicate service name"),
         ('vim = "edge-site"', 'vim = "edge-site"\nssh_keys = ["gone.pub"]', "gone.pub"),
         ('service = "detect"', 'service = "../detect"', "one of: classify"),
         ('name = "detect-north"', 'name = "Nord Süd"', "name"),
         ('cluster = "edge-cluster"', "", "give `vim` or `cluster`"),
     ):
         town.write_text(TOWN.replace(old, new), encoding="utf-8")
-        with pytest.raises(ScanError, match=said.replace(".", r"\.")):
-            bring_about(fake, town)
+        with pytest.raises(ScanError, match=expected.replace(".", r"\.")):
+            apply_file(fake, town)
     assert not fake.state.functions and not fake.state.instances
     (town.parent / "id").write_text("-----BEGIN OPENSSH PRIVATE KEY-----", encoding="utf-8")
     town.write_text(TOWN.replace('vim = "edge-site"', 'vim = "edge-site"\nssh_keys = ["id"]'), encoding="utf-8")
     with pytest.raises(InputError, match="private key"):
-        bring_about(fake, town)
+        apply_file(fake, town)
 
 
-def test_secrets_are_never_told(
-    fake: Fake, town: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+def test_secrets_are_not_logged(
+    fake: FakeOsm, town: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     caplog.set_level(logging.DEBUG)
-    bring_about(fake, town)
+    apply_file(fake, town)
     monkeypatch.setenv("OSM_PASSWORD", "hush-hush-123")
     with pytest.raises(StepError) as caught:
-        bring_about(fake, town)
+        apply_file(fake, town)
     token = next(iter(fake.state.tokens))
     assert "hush-hush-123" not in caplog.text + str(caught.value) and token not in caplog.text
 
 
-def test_addresses_without_tls_are_refused() -> None:
+def test_addresses_without_tls_are_rejected() -> None:
     for address in (
         "http://osm.example.org",
         "http://user:hunter2@osm.example.org",
@@ -281,8 +283,8 @@ def test_addresses_without_tls_are_refused() -> None:
         "https://x/other",
     ):
         with pytest.raises(SettingError) as caught:
-            Connection(osm=address).northbound()
+            Connection(osm=address).northbound_url()
         assert "hunter2" not in str(caught.value)
-    assert Connection(osm="osm.example.org").northbound() == "https://osm.example.org:9999"
-    with Osm(Connection(osm="http://127.0.0.1:9")) as osm, pytest.raises(UnavailableError, match="can't be reached"):
+    assert Connection(osm="osm.example.org").northbound_url() == "https://osm.example.org:9999"
+    with Osm(Connection(osm="http://127.0.0.1:9")) as osm, pytest.raises(UnavailableError, match="can't connect"):
         osm.instances()

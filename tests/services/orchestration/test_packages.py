@@ -1,4 +1,4 @@
-"""Packages: what is written is right and repeatable, and what is read is not trusted."""
+"""Packages: written ones are valid and reproducible, read ones are validated."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import pytest
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.services.orchestration import chart, description, descriptor, package
 from scan2sim.services.orchestration.description import Description
-from scan2sim.services.orchestration.package import build, unpacked
-from scan2sim.services.orchestration.sol006 import Kind
+from scan2sim.services.orchestration.package import build, parse
+from scan2sim.services.orchestration.sol006 import FunctionKind
 from scan2sim.services.qos.requirements import Environment
 
 VNFD = """
@@ -48,7 +48,7 @@ nsd:
 
 
 def archive(files: dict[str, bytes], *, link: str = "", size: int = -1) -> bytes:
-    """A .tar.gz of files; with a link of that name, or a first file that says it is so large."""
+    """A .tar.gz of files; `link`: name of a symbolic link in it."""
     data = io.BytesIO()
     with tarfile.open(fileobj=data, mode="w:gz") as made:
         for path, content in files.items():
@@ -64,23 +64,23 @@ def archive(files: dict[str, bytes], *, link: str = "", size: int = -1) -> bytes
 
 @pytest.mark.parametrize("which", description.names())
 @pytest.mark.parametrize("kind", ["container", "machine"])
-def test_what_comes_along_is_packed_and_read_again(which: str, kind: Kind) -> None:
+def test_built_in_services_can_be_packaged_and_read_again(which: str, kind: FunctionKind) -> None:
     made = build(description.read(which), Environment.EDGE, kind)
-    function, service = (unpacked(one.data, one.name) for one in (made.function, made.service))
-    assert function.descriptor.sort == "vnfd" and service.descriptor.sort == "nsd"
+    function, service = (parse(one.data, one.name) for one in (made.function, made.service))
+    assert function.descriptor.type == "vnfd" and service.descriptor.type == "nsd"
     assert service.descriptor.functions == (function.descriptor.id,)
     again = build(description.read(which), Environment.EDGE, kind)
     assert again.function.data == made.function.data and again.service.data == made.service.data
 
 
-def test_ids_change_with_what_they_name() -> None:
+def test_ids_change_with_the_content() -> None:
     service = description.read("detect")
     edge, cloud = (build(service, where, "container").function.descriptor.id for where in ("edge", "cloud"))  # type: ignore[arg-type]
     other = build(service.model_copy(update={"port": 9090}), Environment.EDGE, "container").function.descriptor.id
     assert len({edge, cloud, other}) == 3
 
 
-def test_needs_of_the_mission_go_into_descriptors_and_chart() -> None:
+def test_requirements_are_written_into_descriptors_and_chart() -> None:
     made = build(description.read("detect"), Environment.EDGE, "machine")
     body = made.function.descriptor.body["vnfd"]
     assert body["virtual-compute-desc"][0]["virtual-cpu"]["num-virtual-cpu"] == 8  # D3.2, table 7
@@ -88,22 +88,22 @@ def test_needs_of_the_mission_go_into_descriptors_and_chart() -> None:
     link = made.service.descriptor.body["nsd"]["nsd"][0]["virtual-link-desc"][0]
     assert link["df"][0]["qos"] == {"latency": 100, "packet-delay-variation": 50, "packet-loss-ratio": 0.0001}
     service = description.read("detect")
-    values = json.loads(chart.files(service, service.needed(Environment.EDGE), "1.0.0")["values.yaml"])
+    values = json.loads(chart.files(service, service.requirements_in(Environment.EDGE), "1.0.0")["values.yaml"])
     assert values["resources"] == {"requests": {"cpu": "8"}, "limits": {"memory": "16384Mi"}}
 
 
 @pytest.mark.parametrize("which", description.names())
-def test_a_charts_templates_are_what_kubernetes_takes_once_values_are_in(which: str) -> None:
+def test_a_chart_is_valid_once_helm_has_inserted_the_values(which: str) -> None:
     service = description.read(which)
-    files = chart.files(service, service.needed(Environment.EDGE), "1.0.0")
+    files = chart.files(service, service.requirements_in(Environment.EDGE), "1.0.0")
     values = json.loads(files["values.yaml"])
 
-    def put(match: re.Match[str]) -> str:
+    def insert(match: re.Match[str]) -> str:
         return json.dumps(values[match[1]])
 
     made = {}
     for path, text in files.items():
-        filled = re.sub(r"\{\{ toJson \.Values\.(\w+) \}\}", put, text)
+        filled = re.sub(r"\{\{ toJson \.Values\.(\w+) \}\}", insert, text)
         made[path] = json.loads(re.sub(r"\{\{ .*? \}\}", "x", filled))
     spec = made["templates/deployment.yaml"]["spec"]
     pod = spec["template"]["spec"]
@@ -120,50 +120,53 @@ def test_a_charts_templates_are_what_kubernetes_takes_once_values_are_in(which: 
 
 
 @pytest.mark.parametrize("which", description.names())
-def test_what_listens_in_a_cluster_has_a_token(which: str) -> None:
-    """Pods are reached by others, and the services of this project refuse to listen there without a token."""
+def test_services_that_listen_in_a_cluster_have_a_token(which: str) -> None:
+    """Other pods can connect to them, and they refuse to listen there without a token."""
     service = description.read(which)
     words = (*service.command, *service.arguments)
-    if words[:1] == ("prefect",):  # a worker, which serves its health alone
+    if words[:1] == ("prefect",):  # a worker, which serves only its health check
         assert service.token is None
     else:
         assert service.token and words[words.index("--token") + 1] == service.token
 
 
-def test_a_package_is_known_by_what_it_holds_not_by_its_name(tmp_path: Path) -> None:
+def test_the_type_of_a_package_is_read_from_its_descriptor_not_its_name(tmp_path: Path) -> None:
     path = tmp_path / "my_nsd.tar.gz"
     path.write_bytes(archive({"x/anything.yaml": VNFD.encode()}))
-    assert package.read(path).descriptor.sort == "vnfd"
+    assert package.read(path).descriptor.type == "vnfd"
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "expected"),
     [
-        (archive({"/etc/x.yaml": VNFD.encode()}), "outside of itself"),
-        (archive({"x/../../x.yaml": VNFD.encode()}), "outside of itself"),
+        (archive({"/etc/x.yaml": VNFD.encode()}), "path traversal"),
+        (archive({"x/../../x.yaml": VNFD.encode()}), "path traversal"),
         (archive({"x/x.yaml": VNFD.encode()}, link="x/link"), "a link or a device"),
         (archive({"x/x.yaml": VNFD.encode(), "y/y.yaml": b""}), "one folder"),
         (archive({"x.yaml": VNFD.encode()}), "one folder"),
         (archive({"x/x.yaml": VNFD.encode(), "x/y.yaml": VNFD.encode()}), "2 descriptors"),
         (archive({"x/readme": b"nothing"}), "0 descriptors"),
-        (archive({"x/x.yaml": VNFD.encode(), "x/checksums.txt": b"00\tx.yaml\n"}), "isn't what checksums.txt says"),
-        (archive({"x/x.yaml": VNFD.encode(), "x/checksums.txt": b"00\tgone\n"}), "lacks gone"),
+        (archive({"x/x.yaml": VNFD.encode(), "x/checksums.txt": b"00\tx.yaml\n"}), "x.yaml doesn't match its checksum"),
+        (
+            archive({"x/x.yaml": VNFD.encode(), "x/checksums.txt": b"00\tgone\n"}),
+            "gone, listed in checksums.txt, is missing",
+        ),
         (archive({"x/x.yaml": b"\xff\xfe"}), "UTF-8"),
         (archive({f"x/{i}": b"" for i in range(1100)}), "more than 1,000 files"),
         (b"PK\x03\x04 and so on", "is a ZIP"),
-        (b"nothing of the kind", "is no .tar.gz"),
-        (archive({"x/x.yaml": VNFD.encode()})[:-40], "is no .tar.gz"),
-        (b"", "is no .tar.gz"),
+        (b"nothing of the kind", "not a readable .tar.gz"),
+        (archive({"x/x.yaml": VNFD.encode()})[:-40], "not a readable .tar.gz"),
+        (b"", "not a readable .tar.gz"),
     ],
 )
-def test_archives_that_mean_harm_or_are_none_are_refused(data: bytes, said: str) -> None:
-    with pytest.raises(InputError, match=re.escape(said)):
-        unpacked(data, "bad.tar.gz")
+def test_malicious_or_invalid_archives_are_rejected(data: bytes, expected: str) -> None:
+    with pytest.raises(InputError, match=re.escape(expected)):
+        parse(data, "bad.tar.gz")
 
 
 @pytest.mark.parametrize("kind", ["file", "header"])
-def test_a_bomb_is_refused_before_it_is_unpacked(kind: str) -> None:
-    """Of ten gigabytes: a file that says so, and a header of the archive's own that does."""
+def test_a_decompression_bomb_is_rejected(kind: str) -> None:
+    """A file of ten gigabytes, or an archive header of that size."""
     member = tarfile.TarInfo("x/x.yaml")
     member.size = 10 * 2**30
     member.type = tarfile.REGTYPE if kind == "file" else tarfile.XHDTYPE
@@ -172,49 +175,49 @@ def test_a_bomb_is_refused_before_it_is_unpacked(kind: str) -> None:
         packed.write(member.tobuf(tarfile.GNU_FORMAT))
         for _ in range(80):
             packed.write(bytes(2**20))
-    with pytest.raises(InputError, match="more than 67,108,864 bytes|is no .tar.gz"):
-        unpacked(data.getvalue(), "bomb.tar.gz")
+    with pytest.raises(InputError, match=r"more than 67,108,864 bytes|not a readable \.tar\.gz"):
+        parse(data.getvalue(), "bomb.tar.gz")
 
 
 BILLION = "\n".join(["a0: &a0 [x, x]", *(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]" for i in range(1, 40))])
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
-        (BILLION, "aliases are refused"),
-        ("vnfd: &a {b: 1}\nother: *a", "aliases are refused"),
+        (BILLION, "aliases aren't allowed"),
+        ("vnfd: &a {b: 1}\nother: *a", "aliases aren't allowed"),
         ("[" * 2000, "levels"),
-        ("a: " + "x" * 1_100_000, "1,000,000 bytes"),
+        ("a: " + "x" * 1_100_000, "1,000,000 characters"),
         ("vnfd:vnfd-catalog:\n  vnfd: []", "model before SOL006"),
         ("nsd-catalog: {nsd: []}", "model before SOL006"),
-        ("just text", "is no descriptor"),
-        ("other: 1", "is no descriptor"),
-        (VNFD + "  id: pong\n", "stands twice"),
+        ("just text", "not a descriptor"),
+        ("other: 1", "not a descriptor"),
+        (VNFD + "  id: pong\n", "duplicate key"),
         (VNFD.replace("mgmt-cp: mgmt-ext", "mgmt-interface: {cp: x}"), "mgmt"),
-        (NSD.replace("vnfd-id: ping\n        v", "vnfd-id: pong\n        v"), "doesn't list"),
-        (NSD.replace("virtual-link-desc: [{id: mgmtnet", "virtual-link-desc: [{id: other"), "is no link"),
-        ("vnfd: !!python/object/apply:os.system ['true']", "no YAML that is taken"),
+        (NSD.replace("vnfd-id: ping\n        v", "vnfd-id: pong\n        v"), "missing in `vnfd-id`"),
+        (NSD.replace("virtual-link-desc: [{id: mgmtnet", "virtual-link-desc: [{id: other"), "isn't defined"),
+        ("vnfd: !!python/object/apply:os.system ['true']", "invalid YAML"),
     ],
 )
-def test_descriptors_that_cant_be_are_refused_with_what_to_change(text: str, said: str) -> None:
-    with pytest.raises(InputError, match=re.escape(said)):
+def test_invalid_descriptors_are_rejected_with_a_reason(text: str, expected: str) -> None:
+    with pytest.raises(InputError, match=re.escape(expected)):
         descriptor.read(text, "vnfd.yaml")
 
 
 def test_unicode_is_kept() -> None:
     made = Description(name="gruss", title="Grüße, 你好", image="a/b:1", machine="b")
-    found = unpacked(build(made, Environment.EDGE, "container").function.data, "x").descriptor
+    found = parse(build(made, Environment.EDGE, "container").function.data, "x").descriptor
     assert found.body["vnfd"]["description"] == "Grüße, 你好"
 
 
-def test_descriptions_are_checked(tmp_path: Path) -> None:
+def test_invalid_descriptions_are_rejected(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text('name = "My Service"\ntitle = "x"\nimage = "a"\nmachine = "b"', encoding="utf-8")
     with pytest.raises(InputError, match="name"):
         description.read(path)
     with pytest.raises(InputError, match="one of: classify"):
         description.read("nothing")
-    elsewhere = description.read("worker").model_copy(update={"needs": None, "requirements": "traffic"})
-    with pytest.raises(SettingError, match="has no requirements there"):
-        build(elsewhere, Environment.ROBOT, "container")
+    traffic = description.read("worker").model_copy(update={"needs": None, "requirements": "traffic"})
+    with pytest.raises(SettingError, match="has no requirements for it"):
+        build(traffic, Environment.ROBOT, "container")

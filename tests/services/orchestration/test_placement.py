@@ -1,4 +1,4 @@
-"""Where a service may run, by what was measured there."""
+"""Placement of a service by measurements of sites."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scan2sim.services.orchestration import placement
 
 
 def measured(folder: Path, environment: str, toolbox: str = "detect", **failed: float | None) -> Path:
-    """A site's file, where some metrics fall short."""
+    """A site's measurement file; the given metrics fail."""
     rows: list[dict[str, Any]] = [{"metric": "delay", "required": "at most 100", "measured": 3.0, "passed": True}]
     for metric, value in failed.items():
         rows.append({"metric": metric, "required": "at least 8", "measured": value, "passed": False})
@@ -24,7 +24,7 @@ def measured(folder: Path, environment: str, toolbox: str = "detect", **failed: 
     return path
 
 
-def test_the_nearest_site_that_does_is_first_and_others_say_why_not(tmp_path: Path) -> None:
+def test_sites_are_ordered_by_distance_and_list_unmet_requirements(tmp_path: Path) -> None:
     sites = [
         placement.read(measured(tmp_path, "cloud")),
         placement.read(measured(tmp_path, "robot", cpu_cores=2, gpu_cores=None)),
@@ -32,17 +32,17 @@ def test_the_nearest_site_that_does_is_first_and_others_say_why_not(tmp_path: Pa
     ]
     found = placement.place("detect", sites)
     assert [(one.environment, one.fits) for one in found] == [("robot", False), ("edge", True), ("cloud", True)]
-    assert found[0].why == (
-        "cpu cores is 2, at least 8 is asked",
-        "gpu cores: there is none, at least 8 is asked",
+    assert found[0].unmet == (
+        "cpu cores: 2, required: at least 8",
+        "gpu cores: not available, required: at least 8",
     )
 
 
-def test_measurements_of_something_else_are_refused(tmp_path: Path) -> None:
+def test_measurements_of_another_service_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="measured with segment"):
         placement.place("detect", [placement.read(measured(tmp_path, "edge", "segment"))])
     bad = tmp_path / "bad.json"
     for text in ("{}", "[", "[" * 5000, '{"toolbox": "detect", "environment": "moon", "rows": []}'):
         bad.write_text(text, encoding="utf-8")
-        with pytest.raises(InputError, match="no measurement"):
+        with pytest.raises(InputError, match="not a measurement file"):
             placement.read(bad)

@@ -1,4 +1,4 @@
-"""The stand-in for OSM keeps to OSM's own OpenAPI file, whatever it is asked (schemathesis asks)."""
+"""The fake OSM conforms to OSM's own OpenAPI file (tested with schemathesis)."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.fakes.osm import Fake
+from tests.fakes.osm import FakeOsm
 
-ASKED = r"^/(vnfpkgm/v1/vnf_packages|nsd/v1/ns_descriptors|nslcm/v1/ns_(instances|lcm_op_occs)|admin/v1/(tokens|vim_accounts|k8sclusters))(/|$)"  # noqa: E501
-ARCHIVES = r"(package|nsd)_content$"  # which schemathesis can't make
+TESTED_PATHS = r"^/(vnfpkgm/v1/vnf_packages|nsd/v1/ns_descriptors|nslcm/v1/ns_(instances|lcm_op_occs)|admin/v1/(tokens|vim_accounts|k8sclusters))(/|$)"  # noqa: E501
+UPLOAD_PATHS = r"(package|nsd)_content$"  # schemathesis can't generate packages
 CHECKS = "not_a_server_error,status_code_conformance,content_type_conformance,response_headers_conformance,response_schema_conformance"  # noqa: E501
 
 
 @pytest.mark.parametrize("phases", ["fuzzing", pytest.param("coverage,fuzzing", marks=pytest.mark.slow)])
-def test_it_answers_as_osms_interface_is_described(fake: Fake, real_data: Path, tmp_path: Path, phases: str) -> None:
+def test_the_fake_conforms_to_the_openapi_file(fake: FakeOsm, real_data: Path, tmp_path: Path, phases: str) -> None:
     if importlib.util.find_spec("schemathesis") is None:
         pytest.skip("schemathesis isn't installed")
     fake.state.as_json = False  # the file describes Release 8
@@ -27,10 +27,10 @@ def test_it_answers_as_osms_interface_is_described(fake: Fake, real_data: Path, 
     with urllib.request.urlopen(f"{fake.address}/osm/admin/v1/tokens", given) as answer:
         token = json.load(answer)["id"]
     program = [sys.executable, "-c", "from schemathesis.cli import schemathesis; schemathesis()"]
-    asked = subprocess.run(
+    run = subprocess.run(
         [*program, "run", real_data / "osm" / "osm-openapi.yaml", "--url", f"{fake.address}/osm", "--phases", phases,
-         "--include-path-regex", ASKED, "--exclude-path-regex", ARCHIVES, "--checks", CHECKS, "-n", "5",
+         "--include-path-regex", TESTED_PATHS, "--exclude-path-regex", UPLOAD_PATHS, "--checks", CHECKS, "-n", "5",
          "-H", f"Authorization: Bearer {token}", "--seed", "1"],
         cwd=tmp_path, capture_output=True, text=True,
     )  # fmt: skip
-    assert asked.returncode == 0, asked.stdout[-5000:] + asked.stderr[-2000:]
+    assert run.returncode == 0, run.stdout[-5000:] + run.stderr[-2000:]

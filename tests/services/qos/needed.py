@@ -1,4 +1,4 @@
-"""Whether a shaped link can be made here."""
+"""Skips tests where no emulated link can be created."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from scan2sim.services.qos import links
 
 
 def need_link(backend: str | None = None, *programs: str) -> None:
-    """Skip the test where no shaped link can be made, or a program is missing."""
+    """Skip the test if no emulated link can be created here, or a program is missing."""
     if os.geteuid() != 0:
-        pytest.skip("only root may make network namespaces")
+        pytest.skip("only root may create network namespaces")
     try:
         links.find(backend)
     except UnavailableError as error:
         pytest.skip(str(error))
-    if absent := [name for name in programs if not shutil.which(name)]:
-        pytest.skip(f"no {', '.join(absent)} here (tests/services/packages.txt)")
+    if missing := [name for name in programs if not shutil.which(name)]:
+        pytest.skip(f"no {', '.join(missing)} here (tests/services/packages.txt)")

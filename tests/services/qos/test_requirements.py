@@ -1,4 +1,4 @@
-"""The mission's requirements as data: all its tables are there, and what is no requirement is refused."""
+"""Built-in requirements contain all tables of D3.2, and invalid files are rejected."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scan2sim.services.qos.requirements import Bound, Environment, read
 GOOD = 'title = "t"\ndescription = "d"\nsource = "s"\n[edge]\n'
 
 
-def test_all_tables_of_the_mission_come_along() -> None:
+def test_all_tables_of_d32_are_built_in() -> None:
     sources = {read(name).source.rpartition(" ")[2] for name in requirements.names()}
     assert sources == {"3", "6", "7", "8", "10", "11"}
 
@@ -29,7 +29,7 @@ def test_values_are_those_of_the_tables() -> None:
         read("traffic").of(Environment.ROBOT)
 
 
-def test_bounds() -> None:
+def test_bounds_include_their_value() -> None:
     assert Bound(kind="<", value=5).met(5) and not Bound(kind="<", value=5).met(6)
     assert Bound(kind=">", value=5).met(6) and not Bound(kind=">", value=5).met(4.9)
 
@@ -44,7 +44,7 @@ def test_bounds() -> None:
         ('title = "t"', "description"),
     ],
 )
-def test_what_is_no_requirement_names_the_file_and_the_field(tmp_path: Path, text: str, about: str) -> None:
+def test_errors_name_the_file_and_the_field(tmp_path: Path, text: str, about: str) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=about) as caught:
@@ -52,6 +52,6 @@ def test_what_is_no_requirement_names_the_file_and_the_field(tmp_path: Path, tex
     assert str(path) in str(caught.value)
 
 
-def test_a_file_that_isnt_there_is_told_with_those_that_come_along(tmp_path: Path) -> None:
+def test_a_missing_file_lists_built_in_requirements(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="classify, detect"):
         read(tmp_path / "nowhere.toml")

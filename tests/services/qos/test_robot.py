@@ -1,4 +1,4 @@
-"""A robot's requests, against a server of its own."""
+"""The robot's requests to a test server."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
-from scan2sim.services.qos.robot import CONNECTIONS, ask
+from scan2sim.services.qos.robot import MAX_CONNECTIONS, send_images
 
 
-class Impatient(BaseHTTPRequestHandler):
-    """Answers every image, and closes connections that lie idle for a moment."""
+class ImpatientServer(BaseHTTPRequestHandler):
+    """Responds to every image, and closes connections that are idle for a moment."""
 
     protocol_version = "HTTP/1.1"
     timeout = 0.2
@@ -26,23 +26,23 @@ class Impatient(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
 
 @pytest.fixture
 def address() -> Iterator[str]:
-    with ThreadingHTTPServer(("127.0.0.1", 0), Impatient) as server:
+    with ThreadingHTTPServer(("127.0.0.1", 0), ImpatientServer) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"
         server.shutdown()
 
 
-def test_images_that_come_seldom_are_answered_although_the_server_closes_idle_connections(address: str) -> None:
-    answers = ask(address, "classify", [b"an image"], rate=10, seconds=3.0)
-    assert answers.sent == 30 > 2 * CONNECTIONS
-    assert answers.states == {"done": 30}
+def test_requests_are_retried_when_the_server_closes_idle_connections(address: str) -> None:
+    stats = send_images(address, "classify", [b"an image"], rate=10, seconds=3.0)
+    assert stats.sent == 30 > 2 * MAX_CONNECTIONS
+    assert stats.states == {"done": 30}
 
 
-def test_a_server_that_is_not_there_is_told() -> None:
-    answers = ask("http://127.0.0.1:9", "classify", [b"an image"], rate=100, seconds=0.05)
-    assert answers.states == {"ConnectionRefusedError": 5} and answers.response_p95 == float("inf")
+def test_an_unreachable_server_is_reported_as_errors() -> None:
+    stats = send_images("http://127.0.0.1:9", "classify", [b"an image"], rate=100, seconds=0.05)
+    assert stats.states == {"ConnectionRefusedError": 5} and stats.response_p95 == float("inf")

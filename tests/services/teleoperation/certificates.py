@@ -1,4 +1,4 @@
-"""Certificates for tests, of one authority and of others."""
+"""Certificates for tests, issued by one authority and by others."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ OTHER = Authority.make()
 
 
 def identity(
-    role: Role, name: str = "one", *, authority: Authority = OWN, believes: Authority | None = None, days: float = 1
+    role: Role, name: str = "one", *, authority: Authority = OWN, trusts: Authority | None = None, days: float = 1
 ) -> Identity:
-    """A party; one that was expired long ago with negative days."""
+    """Identity of a party; negative days create an expired certificate."""
     hosts = ("localhost", "127.0.0.1") if role == Role.GATEWAY else ()
     now = datetime.now(UTC) + timedelta(days=min(days, 0) * 2)
     certificate, key = authority.certify(role, name, abs(days), hosts, now)
-    return Identity(Peer.of(certificate), certificate, key, (believes or authority).certificate)
+    return Identity(Peer.from_certificate(certificate), certificate, key, (trusts or authority).certificate)

@@ -1,4 +1,4 @@
-"""A gateway, a station and a vehicle on this machine, each as its command makes it, and a driver who is a script."""
+"""A gateway, a station and a vehicle on this machine, set up as by their commands, and a scripted driver."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 
 from scan2sim.services.teleoperation import cameras
-from scan2sim.services.teleoperation.cameras import Camera, Picture, View
+from scan2sim.services.teleoperation.cameras import Camera, CameraFrame, View
 from scan2sim.services.teleoperation.control.controls import Controls, Gear, VehicleState
-from scan2sim.services.teleoperation.control.messages import Command, Stream
-from scan2sim.services.teleoperation.gateway.client import Membership
+from scan2sim.services.teleoperation.control.messages import Command, VideoStream
+from scan2sim.services.teleoperation.gateway.client import GatewayConnection
 from scan2sim.services.teleoperation.gateway.fleet import Fleet
 from scan2sim.services.teleoperation.gateway.identity import Identity
 from scan2sim.services.teleoperation.gateway.pki import certify
@@ -24,30 +24,30 @@ from scan2sim.services.teleoperation.station.app import Station
 from scan2sim.services.teleoperation.transport.multipath import Policy
 from scan2sim.services.teleoperation.transport.station_side import Listener
 from scan2sim.services.teleoperation.transport.vehicle_side import Link
-from scan2sim.services.teleoperation.vehicle.adapter import TranslateParams, Translating
+from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
 from scan2sim.services.teleoperation.vehicle.app import Vehicle
-from scan2sim.services.teleoperation.vehicle.onboard_unit import CarParams, CarUnit
+from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardParams, OnboardUnit
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame
-from scan2sim.services.teleoperation.video.rate_control import Bounds
+from scan2sim.services.teleoperation.video.rate_control import BitrateBounds
 from tests.services.teleoperation.transport.relay import Relay
 
 HERE = "127.0.0.1"
 LIMIT = 1500.0
-"""Milliseconds: a machine that runs tests is busy."""
+"""Milliseconds; generous, since a machine that runs tests is busy."""
 SCRIPT = "script"
 AHEAD = Controls(throttle=0.5, gear=Gear.FORWARD)
 REST = Controls(gear=Gear.FORWARD)
 
 
-def until(true: Callable[[], object], seconds: float = 60) -> None:
+def until(condition: Callable[[], object], seconds: float = 60) -> None:
     end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end, "never true"
+    while not condition():
+        assert time.monotonic() < end, "timed out"
         time.sleep(0.01)
 
 
 class Wheels:
-    """A vehicle that remembers what it was told last."""
+    """A vehicle that keeps its last controls."""
 
     def __init__(self) -> None:
         self.controls = Controls()
@@ -63,7 +63,7 @@ class Wheels:
 
 
 class Desk:
-    """A station, as `teleop station` makes it; `frames` are what it was shown."""
+    """A station, set up as by `teleop station`; `frames` are the frames it received."""
 
     def __init__(self, folder: Path, gateway: int, port: int = 0, loss: float = 0.0) -> None:
         self.frames: list[Frame] = []
@@ -75,24 +75,26 @@ class Desk:
         self._relay.shapes[HERE].loss = loss
         reached = [Address(host=HERE, port=self._relay.address[1] if loss else self.port)]
         self.station = Station(identity, self._listener, reached, lambda frame: self.show(frame))
-        self.membership = Membership(identity, Address(host=HERE, port=gateway), self.station, lambda _: None)
-        self._asks: Callable[[], Command | None] = lambda: None
+        self.gateway_connection = GatewayConnection(
+            identity, Address(host=HERE, port=gateway), self.station, lambda _: None
+        )
+        self._command: Callable[[], Command | None] = lambda: None
         self._ended = threading.Event()
         self._driver = threading.Thread(target=self._drive, daemon=True)
         self._driver.start()
 
     def drive(self, controls: Controls | None, agree: bool = False) -> None:
-        """Ask for controls from now on; None: for nothing."""
+        """Send these controls from now on; None: none."""
         if controls is None:
-            self._asks = lambda: None
+            self._command = lambda: None
             return
-        self.station.wheel.take(SCRIPT, time.monotonic())
-        self._asks = lambda: Command(controls, self.stop(), agree)
+        self.station.driver_session.acquire(SCRIPT, time.monotonic())
+        self._command = lambda: Command(controls, self.stop(), agree)
 
     def start(self) -> None:
-        """Confirm the stop, as a driver does who sees it, and drive ahead."""
+        """Confirm the stop as a driver does, and drive ahead."""
         self.drive(REST)
-        until(lambda: self.telemetry() is not None and not self.hindered())
+        until(lambda: self.telemetry() is not None and not self.blocked_by())
         time.sleep(0.1)
         self.drive(REST, agree=True)
         until(lambda: not self.standing())
@@ -102,7 +104,7 @@ class Desk:
         joined = self.station.joined()
         return None if joined is None else joined.telemetry
 
-    def streams(self) -> tuple[Stream, ...]:
+    def streams(self) -> tuple[VideoStream, ...]:
         joined = self.station.joined()
         return () if joined is None else joined.streams.cameras
 
@@ -114,26 +116,26 @@ class Desk:
         joined = self.station.joined()
         return joined is None or joined.telemetry is None or joined.telemetry.standing
 
-    def hindered(self) -> str:
+    def blocked_by(self) -> str:
         joined = self.station.joined()
-        return "" if joined is None else joined.hindrance()
+        return "" if joined is None else joined.blocked_by()
 
     def close(self) -> None:
         self._ended.set()
         self._driver.join()
-        self.membership.close()
+        self.gateway_connection.close()
         self.station.close()
         self._listener.close()
         self._relay.close()
 
     def _drive(self) -> None:
         while not self._ended.wait(0.02):
-            if (command := self._asks()) is not None:
-                self.station.wheel.turn(SCRIPT, command, time.monotonic())
+            if (command := self._command()) is not None:
+                self.station.driver_session.update(SCRIPT, command, time.monotonic())
 
 
 class Street:
-    """All of it; `desks` are made as tests want them."""
+    """Gateway and vehicle; `desks` are created by the tests."""
 
     def __init__(self, folder: Path) -> None:
         self.parties = folder / "parties"
@@ -141,31 +143,33 @@ class Street:
         self._state = folder / "state"
         self.gateway, self.fleet = self._start(0)
         self.wheels, self._ended = Wheels(), threading.Event()
-        translating = Translating(self.wheels, TranslateParams(port=0, limit=LIMIT))
-        self._translator = threading.Thread(target=translating.run, args=(self._ended,), daemon=True)
-        self._translator.start()
-        where = f"{HERE}:{translating.address[1]}"
-        unit = CarUnit(CarParams(translator=where, limit=LIMIT))
+        adapter_server = AdapterServer(self.wheels, AdapterParams(port=0, limit=LIMIT))
+        self._adapter_thread = threading.Thread(target=adapter_server.run, args=(self._ended,), daemon=True)
+        self._adapter_thread.start()
+        address = f"{HERE}:{adapter_server.address[1]}"
+        unit = OnboardUnit(OnboardParams(translator=address, limit=LIMIT))
         self.size = 160, 120
-        front = Camera("front", self._pictures)
+        front = Camera("front", self._frames)
         links = [Link("one", HERE), Link("two", HERE)]
         identity = Identity.read(self.parties / "vehicle-car")
-        self.vehicle = Vehicle(identity, unit, links, {"front": front}, Policy.COPY, Bounds())
-        self._member = Membership(identity, Address(host=HERE, port=self.gateway.port), self.vehicle, lambda _: None)
+        self.vehicle = Vehicle(identity, unit, links, {"front": front}, Policy.COPY, BitrateBounds())
+        self._gateway_connection = GatewayConnection(
+            identity, Address(host=HERE, port=self.gateway.port), self.vehicle, lambda _: None
+        )
         self.desks: list[Desk] = []
 
-    def _pictures(self) -> Iterator[Picture]:
-        """A camera's, of the size that is asked for by then."""
-        for one in cameras.pictures("pattern", View(width=160, height=120, fps=10)):
-            yield Picture(np.ascontiguousarray(cv2.resize(one.image, self.size), np.uint8), one.captured)
+    def _frames(self) -> Iterator[CameraFrame]:
+        """Frames of a camera, in the current `size`."""
+        for one in cameras.frames("pattern", View(width=160, height=120, fps=10)):
+            yield CameraFrame(np.ascontiguousarray(cv2.resize(one.image, self.size), np.uint8), one.captured)
 
     def desk(self, name: str = "desk", port: int = 0, loss: float = 0.0) -> Desk:
-        """A station that is there; `loss`: of what is sent to it and from it."""
-        made = Desk(self.parties / f"station-{name}", self.gateway.port, port, loss)
-        self.desks.append(made)
-        until(lambda: any(one["name"] == name and one["there"] for one in self.fleet.facts()["stations"]))
-        until(lambda: any(one["there"] for one in self.fleet.facts()["vehicles"]))
-        return made
+        """Start a station and wait for it; `loss`: packet loss in both directions."""
+        desk = Desk(self.parties / f"station-{name}", self.gateway.port, port, loss)
+        self.desks.append(desk)
+        until(lambda: any(one["name"] == name and one["there"] for one in self.fleet.snapshot()["stations"]))
+        until(lambda: any(one["there"] for one in self.fleet.snapshot()["vehicles"]))
+        return desk
 
     def restart_gateway(self) -> None:
         port = self.gateway.port
@@ -179,8 +183,8 @@ class Street:
     def close(self) -> None:
         for desk in self.desks:
             desk.close()
-        self._member.close()
+        self._gateway_connection.close()
         self.vehicle.close()
         self._ended.set()
-        self._translator.join()
+        self._adapter_thread.join()
         self.gateway.close()

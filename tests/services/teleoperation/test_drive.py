@@ -1,4 +1,4 @@
-"""A drive from afar, whole: gateway, station, vehicle and translator, with what goes wrong on the way."""
+"""A complete drive: gateway, station, vehicle and adapter, with failures on the way."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from tests.services.teleoperation.street import AHEAD, REST, Street, until
 
 @pytest.fixture
 def street(tmp_path: Path) -> Iterator[Street]:
-    made = Street(tmp_path)
-    yield made
-    made.close()
+    street = Street(tmp_path)
+    yield street
+    street.close()
 
 
-def stands(controls: Controls) -> bool:
+def stopped(controls: Controls) -> bool:
     return controls.throttle == 0 and controls.brake == 1
 
 
-def test_a_driver_sees_what_the_vehicle_sees_confirms_and_drives(street: Street) -> None:
+def test_driver_sees_video_confirms_and_drives(street: Street) -> None:
     desk = street.desk()
-    assert stands(street.wheels.controls) or street.wheels.controls == Controls()
+    assert stopped(street.wheels.controls) or street.wheels.controls == Controls()
     street.fleet.join("car", "desk", "operator")
     until(lambda: len(desk.frames) > 10)
     assert desk.frames[0].key and (desk.frames[0].width, desk.frames[0].height) == (160, 120)
@@ -37,19 +37,19 @@ def test_a_driver_sees_what_the_vehicle_sees_confirms_and_drives(street: Street)
     assert desk.standing() and street.wheels.controls.throttle == 0, "nobody has confirmed"
     desk.start()
     until(lambda: street.wheels.controls.throttle == AHEAD.throttle)
-    until(lambda: any(link["up"] for link in street.fleet.facts()["vehicles"][0]["links"]))
+    until(lambda: any(link["up"] for link in street.fleet.snapshot()["vehicles"][0]["links"]))
     desk.drive(None)
-    until(lambda: stands(street.wheels.controls))
+    until(lambda: stopped(street.wheels.controls))
     desk.drive(AHEAD)
     time.sleep(1.0)
-    assert stands(street.wheels.controls), "it stopped by itself, and starts by nothing but a confirmation"
+    assert stopped(street.wheels.controls), "it stopped by itself, and starts only after a confirmation"
     desk.start()
     until(lambda: street.wheels.controls.throttle == AHEAD.throttle)
     street.fleet.release("car", "operator")
-    until(lambda: stands(street.wheels.controls))
+    until(lambda: stopped(street.wheels.controls))
 
 
-def test_pictures_that_both_links_lose_are_sent_again(street: Street) -> None:
+def test_packets_lost_on_both_links_are_retransmitted(street: Street) -> None:
     desk = street.desk(loss=0.2)
     street.fleet.join("car", "desk", "operator")
     until(lambda: desk.frames)
@@ -57,12 +57,12 @@ def test_pictures_that_both_links_lose_are_sent_again(street: Street) -> None:
     def frames() -> Counter[str]:
         joined = desk.station.joined()
         assert joined is not None
-        return joined.watcher.frames()[0]
+        return joined.receiver.frames()[0]
 
-    until(lambda: frames()["mended"] >= 4)
+    until(lambda: frames()["retransmitted"] >= 4)
 
 
-def test_a_camera_that_changes_its_size_is_seen_on_and_nobody_stops(street: Street) -> None:
+def test_camera_that_changes_its_frame_size_does_not_interrupt_the_drive(street: Street) -> None:
     desk = street.desk()
     street.fleet.join("car", "desk", "operator")
     desk.start()
@@ -78,35 +78,35 @@ def test_a_camera_that_changes_its_size_is_seen_on_and_nobody_stops(street: Stre
     assert desk.stop() == stop and street.wheels.controls.throttle == AHEAD.throttle
 
 
-def test_a_pair_drives_on_while_its_gateway_starts_anew(street: Street) -> None:
+def test_pair_keeps_driving_while_its_gateway_restarts(street: Street) -> None:
     desk = street.desk()
     street.fleet.join("car", "desk", "operator")
     desk.start()
     until(lambda: street.wheels.controls.throttle == AHEAD.throttle)
     stop = desk.stop()
     street.restart_gateway()
-    until(lambda: [one["there"] for kind in street.fleet.facts().values() for one in kind] == [True, True])
+    until(lambda: [one["there"] for kind in street.fleet.snapshot().values() for one in kind] == [True, True])
     assert desk.stop() == stop and street.wheels.controls.throttle == AHEAD.throttle
-    assert street.fleet.facts()["vehicles"][0]["other"] == "desk"
+    assert street.fleet.snapshot()["vehicles"][0]["other"] == "desk"
 
 
-def test_who_has_handed_over_drives_no_more_and_who_takes_over_confirms(street: Street) -> None:
+def test_handover_ends_the_first_drive_and_requires_a_confirmation(street: Street) -> None:
     desk, other = street.desk(), street.desk("other")
     street.fleet.join("car", "desk", "operator")
     desk.start()
     until(lambda: street.wheels.controls.throttle == AHEAD.throttle)
     street.fleet.hand_over("car", "other", "operator")
-    until(lambda: stands(street.wheels.controls))
+    until(lambda: stopped(street.wheels.controls))
     until(lambda: other.telemetry() is not None)
     desk.drive(AHEAD)
     other.drive(AHEAD)
     time.sleep(1.0)
-    assert stands(street.wheels.controls) and desk.station.joined() is None
+    assert stopped(street.wheels.controls) and desk.station.joined() is None
     other.start()
     until(lambda: street.wheels.controls.throttle == AHEAD.throttle)
 
 
-def test_a_station_that_starts_anew_gets_its_vehicle_back(street: Street) -> None:
+def test_restarted_station_gets_its_vehicle_back(street: Street) -> None:
     desk = street.desk()
     street.fleet.join("car", "desk", "operator")
     desk.start()
@@ -114,10 +114,10 @@ def test_a_station_that_starts_anew_gets_its_vehicle_back(street: Street) -> Non
     port = desk.port
     street.desks.remove(desk)
     desk.close()
-    until(lambda: stands(street.wheels.controls))
+    until(lambda: stopped(street.wheels.controls))
     again = street.desk(port=port)
     again.drive(REST)
     until(lambda: again.telemetry() is not None)
-    assert stands(street.wheels.controls)
+    assert stopped(street.wheels.controls)
     again.start()
     until(lambda: street.wheels.controls.throttle == AHEAD.throttle)

@@ -1,4 +1,4 @@
-"""A camera's node for tests: sends images, prints the results that come. Arguments: TOPIC RESULTS COUNT [PICTURE]."""
+"""Camera node for tests: publishes images and prints the received results. Arguments: TOPIC RESULTS COUNT [IMAGE]."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ def main() -> None:
     node = ros.Node("camera")
     kind = "sensor_msgs/msg/CompressedImage" if picture else "sensor_msgs/msg/Image"
     publisher = node.create_publisher(ros.message_type(kind), topic, QoS(reliability="BEST_EFFORT", depth=2))
-    came: list[str] = []
-    node.create_subscription(ros.message_type("std_msgs/msg/String"), results, lambda m: came.append(m.data), 10)
+    received: list[str] = []
+    node.create_subscription(ros.message_type("std_msgs/msg/String"), results, lambda m: received.append(m.data), 10)
     sent, end = 0, time.monotonic() + 40
-    while len(came) < count and time.monotonic() < end:
+    while len(received) < count and time.monotonic() < end:
         ros.spin_once(node, 0.05)
         if publisher.get_subscription_count():
             sent += 1
             publisher.publish(_message(ros, kind, sent, picture))
             time.sleep(0.05)
-    print("\n".join(came), flush=True)
+    print("\n".join(received), flush=True)
     node.destroy_node()
     ros.shutdown()
 

@@ -1,4 +1,4 @@
-"""A subscriber for tests: says what comes on a topic, a line of JSON each. Arguments: TOPIC TYPE COUNT."""
+"""Subscriber for tests: prints the messages of a topic, a line of JSON each. Arguments: TOPIC TYPE COUNT."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ def main() -> None:
     ros = transport.load()
     ros.init()
     node = ros.Node("hearing")
-    came: list[str] = []
+    received: list[str] = []
 
     def take(message: Any) -> None:
-        came.append(json.dumps(_image(message)) if kind == IMAGE else message.data)
+        received.append(json.dumps(_image(message)) if kind == IMAGE else message.data)
 
     node.create_subscription(ros.message_type(kind), topic, take, QoS(depth=100))
     end = time.monotonic() + 40
-    while len(came) < count and time.monotonic() < end:
+    while len(received) < count and time.monotonic() < end:
         ros.spin_once(node, 0.1)
-    print("\n".join(came), flush=True)
+    print("\n".join(received), flush=True)
     node.destroy_node()
     ros.shutdown()
 

@@ -1,4 +1,4 @@
-"""Patches that move before a background, under a camera that shakes."""
+"""Synthetic scene: textured patches that move in front of a background, with camera shake."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def detected(box: tuple[float, float, float, float], score: float = 0.9) -> Dete
 
 
 class Scene:
-    """Patches (left, top, width, height, pixels a second, growth a second); later ones are nearer."""
+    """Patches (left, top, width, height, speed in pixels/s, relative growth/s); later ones occlude earlier ones."""
 
     def __init__(self, *patches: tuple[float, float, int, int, float, float], shake: float = 0.0) -> None:
         self._patches, self._shake = patches, shake

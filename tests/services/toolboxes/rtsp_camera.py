@@ -1,4 +1,4 @@
-"""A camera of H.264 by RTSP for tests: `/usr/bin/python3 rtsp_camera.py PORT GREY` (Debian's GStreamer)."""
+"""RTSP camera with H.264 for tests: `/usr/bin/python3 rtsp_camera.py PORT GREY` (Debian's GStreamer)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gi.repository import GLib, Gst, GstRtspServer  # noqa: E402
 
 
 def main(port: str, grey: str) -> None:
-    """Serve pictures of one grey at rtsp://127.0.0.1:PORT/camera, 25 a second, 2 Mbit/s."""
+    """Serve images of a uniform grey at rtsp://127.0.0.1:PORT/camera, 25 per second, 2 Mbit/s."""
     Gst.init(None)
     colour = f"0xff{int(grey):02x}{int(grey):02x}{int(grey):02x}"
     factory = GstRtspServer.RTSPMediaFactory()

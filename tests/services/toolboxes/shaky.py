@@ -1,4 +1,4 @@
-"""A toolbox for tests: says an image's mean level; dies, hangs or fails at images of certain levels."""
+"""Toolbox for tests: returns the mean grey level of an image; dies, hangs or fails at certain levels."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from scan2sim.pipeline.core.errors import StepError
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.toolboxes.results import Body, Class
 from scan2sim.services.toolboxes.settings import ToolboxParams as Params
-from scan2sim.services.toolboxes.tasks import Facts, Follow
+from scan2sim.services.toolboxes.tasks import ModelInfo, PostProcessor
 
 NEEDS = ()
 DIES, HANGS, FAILS, RAISES, SLOW, SLOWER = 201, 202, 203, 204, 205, 206
 
-__all__ = ["NEEDS", "Params", "check", "draw", "follow", "image", "level_of", "load"]
+__all__ = ["NEEDS", "Params", "check", "draw", "image", "level_of", "load", "post_processor"]
 
 
 def image(level: int, shape: tuple[int, int] = (8, 8)) -> U8:
@@ -30,7 +30,7 @@ def level_of(body: Body | None) -> int:
 
 
 class _Model:
-    facts = Facts("shaky", ("level",), "0" * 64, "none")
+    info = ModelInfo("shaky", ("level",), "0" * 64, "none")
 
     def __call__(self, images: Sequence[U8]) -> list[Body]:
         return [self._one(one) for one in images]
@@ -60,7 +60,7 @@ def load(params: Params) -> _Model:
     return _Model()
 
 
-def follow(params: Params) -> Follow | None:
+def post_processor(params: Params) -> PostProcessor | None:
     return None
 
 

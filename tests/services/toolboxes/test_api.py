@@ -1,4 +1,4 @@
-"""A toolbox by HTTP, as the Open Inference Protocol says; what is no image, or no request, gets a plain answer."""
+"""HTTP API of a toolbox: Open Inference Protocol, error responses, access control."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from PIL import Image
 pytest.importorskip("fastapi", reason="the extra bus isn't installed")
 from fastapi.testclient import TestClient
 
-from scan2sim.services.http.settings import Served
-from scan2sim.services.toolboxes.api import LARGEST, application
+from scan2sim.services.http.settings import ServerParams
+from scan2sim.services.toolboxes.api import MAX_REQUEST_BYTES, application
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.settings import ToolboxParams
 from tests.services.toolboxes import shaky
 from tests.services.toolboxes.shaky import FAILS, image
 
-BOX = shaky.__name__
-INFER = f"/v2/models/{BOX}/infer"
+TASK = shaky.__name__
+INFER = f"/v2/models/{TASK}/infer"
 
 
 @pytest.fixture(scope="module")
 def engine() -> Iterator[Engine]:
-    made = Engine(BOX, ToolboxParams(waiting=100, deadline=10))
+    made = Engine(TASK, ToolboxParams(waiting=100, deadline=10))
     yield made
     made.close()
 
 
 @pytest.fixture(scope="module")
 def client(engine: Engine) -> TestClient:
-    return TestClient(application(engine, Served()), base_url="http://localhost")
+    return TestClient(application(engine, ServerParams()), base_url="http://localhost")
 
 
 def jpeg(level: int) -> bytes:
@@ -45,11 +45,11 @@ def jpeg(level: int) -> bytes:
     return out.getvalue()
 
 
-def asked(*tensors: dict[str, Any], **more: Any) -> dict[str, Any]:
+def request(*tensors: dict[str, Any], **more: Any) -> dict[str, Any]:
     return {"inputs": list(tensors), **more}
 
 
-def bytes_of(*pictures: bytes) -> dict[str, Any]:
+def bytes_tensor(*pictures: bytes) -> dict[str, Any]:
     data = [base64.b64encode(one).decode() for one in pictures]
     return {"name": "images", "datatype": "BYTES", "shape": [len(data)], "data": data}
 
@@ -58,7 +58,7 @@ def level(result: dict[str, Any]) -> int:
     return int(result["body"]["classes"][0]["label"])
 
 
-def test_an_image_is_posted_as_it_is(client: TestClient) -> None:
+def test_image_file_is_posted(client: TestClient) -> None:
     headers = {"Content-Type": "image/jpeg", "Frame-Id": "f7", "Source": "front", "Stamp": "123"}
     answer = client.post(INFER, content=jpeg(40), headers=headers)
     result = answer.json()
@@ -66,24 +66,24 @@ def test_an_image_is_posted_as_it_is(client: TestClient) -> None:
     assert (result["id"], result["source"], result["stamp"], result["size"]) == ("f7", "front", 123, [16, 16])
 
 
-def test_images_are_posted_as_the_protocol_says(client: TestClient) -> None:
+def test_images_are_posted_as_json_of_the_protocol(client: TestClient) -> None:
     raw = {"name": "raw", "datatype": "UINT8", "shape": [4, 4, 3], "data": image(9, (4, 4)).ravel().tolist()}
-    answer = client.post(INFER, json=asked(bytes_of(jpeg(10), jpeg(20)), raw, id="r1"))
-    told = answer.json()
-    assert answer.status_code == 200 and told["id"] == "r1" and told["model_name"] == BOX
-    (output,) = told["outputs"]
+    answer = client.post(INFER, json=request(bytes_tensor(jpeg(10), jpeg(20)), raw, id="r1"))
+    response = answer.json()
+    assert answer.status_code == 200 and response["id"] == "r1" and response["model_name"] == TASK
+    (output,) = response["outputs"]
     assert output["datatype"] == "BYTES" and output["shape"] == [3]
     assert [round(level(json.loads(one)), -1) for one in output["data"]] == [10, 20, 10]
 
 
-def test_the_models_facts_and_health(client: TestClient) -> None:
-    facts = client.get(f"/v2/models/{BOX}").json()
-    assert facts["parameters"]["licence"] == "none" and facts["inputs"][0]["datatype"] == "BYTES"
-    for path in ("/v2/health/live", "/v2/health/ready", f"/v2/models/{BOX}/ready", "/health/ready"):
+def test_model_metadata_and_health(client: TestClient) -> None:
+    metadata = client.get(f"/v2/models/{TASK}").json()
+    assert metadata["parameters"]["licence"] == "none" and metadata["inputs"][0]["datatype"] == "BYTES"
+    for path in ("/v2/health/live", "/v2/health/ready", f"/v2/models/{TASK}/ready", "/health/ready"):
         assert client.get(path).status_code == 200
     assert client.get("/v2").json()["name"] == "scan2sim"
     assert "scan2sim_frames_total" in client.get("/metrics").text
-    assert INFER.replace(BOX, "{name}") in client.get("/openapi.json").json()["paths"]
+    assert INFER.replace(TASK, "{name}") in client.get("/openapi.json").json()["paths"]
 
 
 @pytest.mark.parametrize(
@@ -96,49 +96,49 @@ def test_the_models_facts_and_health(client: TestClient) -> None:
         (b"x", "text/plain", 415),
         (b"{", "application/json", 422),
         (b"[]", "application/json", 422),
-        (json.dumps(asked()).encode(), "application/json", 422),
-        (json.dumps(asked(bytes_of(*[b"x"] * 65))).encode(), "application/json", 422),
-        (json.dumps(asked({**bytes_of(b"x"), "shape": [2]})).encode(), "application/json", 422),
-        (json.dumps(asked({**bytes_of(), "data": ["?"], "shape": [1]})).encode(), "application/json", 422),
-        (json.dumps(asked({**bytes_of(), "datatype": "FP32", "data": [1.0], "shape": [1]})).encode(),
+        (json.dumps(request()).encode(), "application/json", 422),
+        (json.dumps(request(bytes_tensor(*[b"x"] * 65))).encode(), "application/json", 422),
+        (json.dumps(request({**bytes_tensor(b"x"), "shape": [2]})).encode(), "application/json", 422),
+        (json.dumps(request({**bytes_tensor(), "data": ["?"], "shape": [1]})).encode(), "application/json", 422),
+        (json.dumps(request({**bytes_tensor(), "datatype": "FP32", "data": [1.0], "shape": [1]})).encode(),
          "application/json", 422),
-        (json.dumps(asked({"name": "i", "datatype": "UINT8", "shape": [20000, 20000, 3], "data": [1]})).encode(),
+        (json.dumps(request({"name": "i", "datatype": "UINT8", "shape": [20000, 20000, 3], "data": [1]})).encode(),
          "application/json", 422),
-        (json.dumps(asked({"name": "i", "datatype": "UINT8", "shape": [1, 1, 3], "data": [1, 2, 999]})).encode(),
+        (json.dumps(request({"name": "i", "datatype": "UINT8", "shape": [1, 1, 3], "data": [1, 2, 999]})).encode(),
          "application/json", 422),
-        (bytes(LARGEST + 1), "image/jpeg", 413),
+        (bytes(MAX_REQUEST_BYTES + 1), "image/jpeg", 413),
     ],
 )  # fmt: skip
-def test_what_is_no_image_is_refused(client: TestClient, content: bytes, kind: str, status: int) -> None:
+def test_invalid_requests_are_rejected(client: TestClient, content: bytes, kind: str, status: int) -> None:
     answer = client.post(INFER, content=content, headers={"Content-Type": kind})
     assert answer.status_code == status and "Traceback" not in answer.text
     assert client.post(INFER, content=jpeg(5), headers={"Content-Type": "image/jpeg"}).status_code == 200
 
 
 @pytest.mark.parametrize("name", ["other", "..%2F..%2Fetc%2Fpasswd", "%00", "a" * 3000])
-def test_a_model_of_another_name_isnt_there(client: TestClient, name: str) -> None:
+def test_unknown_model_is_not_found(client: TestClient, name: str) -> None:
     for answer in (client.get(f"/v2/models/{name}"), client.post(f"/v2/models/{name}/infer", content=b"")):
         assert answer.status_code in (404, 405)
 
 
-def test_a_model_that_fails_is_an_error_of_the_server(client: TestClient) -> None:
+def test_failing_model_is_a_server_error(client: TestClient) -> None:
     out = io.BytesIO()
     Image.fromarray(image(FAILS)).save(out, "PNG")
     answer = client.post(INFER, content=out.getvalue(), headers={"Content-Type": "image/png"})
     assert answer.status_code == 500 and answer.json()["state"] == "failed"
 
 
-def test_without_the_token_nothing_is_done(engine: Engine, tmp_path: Path) -> None:
+def test_requests_without_the_token_are_rejected(engine: Engine, tmp_path: Path) -> None:
     path = tmp_path / "token"
     path.write_text("0123456789abcdef", encoding="utf-8")
-    client = TestClient(application(engine, Served(token=path)), base_url="http://localhost")
+    client = TestClient(application(engine, ServerParams(token=path)), base_url="http://localhost")
     for headers in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": "0123456789abcdef"}):
         assert client.post(INFER, content=jpeg(1), headers=headers).status_code == 401
     good = {"Authorization": "Bearer 0123456789abcdef", "Content-Type": "image/jpeg"}
     assert client.post(INFER, content=jpeg(1), headers=good).status_code == 200
 
 
-def test_a_decompression_bomb_is_refused_by_its_header(client: TestClient) -> None:
+def test_decompression_bomb_is_rejected_by_its_header(client: TestClient) -> None:
     out = io.BytesIO()
     Image.fromarray(np.zeros((20_000, 20_000), np.uint8)).save(out, "PNG")
     answer = client.post(INFER, content=out.getvalue(), headers={"Content-Type": "image/png"})

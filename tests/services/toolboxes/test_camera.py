@@ -1,4 +1,4 @@
-"""A camera's node: images of files and cameras on a topic, in order, at a rate, stamped; and what comes of it."""
+"""Camera node: images of files and cameras on a topic, in order, at a rate, with time stamps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ STRING = "std_msgs/msg/String"
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A picture a level, by name."""
+    """Folder with one image per grey level, sorted by name."""
     made = tmp_path / "pictures"
     made.mkdir()
     for number, level in enumerate(LEVELS):
@@ -36,13 +36,13 @@ def folder(tmp_path: Path) -> Path:
 
 
 def lines(process: Any) -> list[dict[str, Any]]:
-    """What a subscriber has heard."""
-    heard, errors = process.communicate(timeout=60)
+    """Messages that a subscriber has received."""
+    output, errors = process.communicate(timeout=60)
     assert process.returncode == 0, errors
-    return [json.loads(line) for line in heard.splitlines()]
+    return [json.loads(line) for line in output.splitlines()]
 
 
-def test_a_folders_images_come_in_order_stamped_at_the_rate(start: Start, folder: Path) -> None:
+def test_images_of_a_folder_are_published_in_order_at_the_rate(start: Start, folder: Path) -> None:
     began = time.time()
     listener = start("cyclone", Path(hearing.__file__), "/front", IMAGE, "5")
     camera = start("cyclone", *COMMAND, "camera", folder, "/front", "--rate", "5", "--subscribers", "1")
@@ -52,10 +52,10 @@ def test_a_folders_images_come_in_order_stamped_at_the_rate(start: Start, folder
     stamps = np.array([one["stamp"] for one in heard])
     assert began < stamps[0] and stamps[-1] < time.time()
     assert np.median(np.diff(stamps)) == pytest.approx(0.2, abs=0.05)
-    assert camera.wait(20) == 0, "it ends with the folder"
+    assert camera.wait(20) == 0, "it exits at the end of the folder"
 
 
-def test_a_film_goes_round(start: Start, tmp_path: Path) -> None:
+def test_video_is_looped(start: Start, tmp_path: Path) -> None:
     listener = start("cyclone", Path(hearing.__file__), "/front", IMAGE, "8")
     start(
         "cyclone", *COMMAND, "camera", film(tmp_path / "f.avi", [20, 90, 160]), "/front", "--loop", "--subscribers", "1"
@@ -64,16 +64,16 @@ def test_a_film_goes_round(start: Start, tmp_path: Path) -> None:
     assert np.allclose(levels, [20, 90, 160, 20, 90, 160, 20, 90], atol=6)
 
 
-def test_a_stream_is_sent_at_the_rate_that_is_asked_for(start: Start, tmp_path: Path) -> None:
+def test_stream_is_published_at_the_given_rate(start: Start, tmp_path: Path) -> None:
     listener = start("cyclone", Path(hearing.__file__), "/front", IMAGE, "5")
-    stream = film(tmp_path / "f.avi", [20, 90, 160]).as_uri()  # comes as fast as it is read, and again
+    stream = film(tmp_path / "f.avi", [20, 90, 160]).as_uri()  # is read at full speed, and again after its end
     start("cyclone", *COMMAND, "camera", stream, "/front", "--rate", "5", "--subscribers", "1")
     heard = lines(listener)
     assert all(min(abs(one["level"] - known) for known in (20, 90, 160)) <= 6 for one in heard)
     assert np.median(np.diff([one["stamp"] for one in heard])) == pytest.approx(0.2, abs=0.08)
 
 
-def test_a_cameras_images_become_results(start: Start, folder: Path) -> None:
+def test_toolbox_node_processes_images_of_a_camera_node(start: Start, folder: Path) -> None:
     listener = start("cyclone", Path(hearing.__file__), "/seen", STRING, "6")
     node = ("node", shaky.__name__, "--images", "/front", "--results", "/seen", "--compressed")
     start("cyclone", *COMMAND, *node)
@@ -90,16 +90,16 @@ def test_records_and_logs_of_an_unreachable_camera_hold_no_credentials(start: St
     camera = start("cyclone", *COMMAND, "camera", address, "/front", "--console", "--period", "0.2")
     (limit := threading.Timer(60, camera.kill)).start()
     assert camera.stderr
-    said = ""
-    while "gives no images" not in said or said.count('"record id"') < 3:
+    output = ""
+    while "delivers no images" not in output or output.count('"record id"') < 3:
         line = camera.stderr.readline()
-        assert line, said
-        said += line
+        assert line, output
+        output += line
     limit.cancel()
-    assert "rtsp://***@127.0.0.1" in said and "hunter2" not in said and "s3cret" not in said
+    assert "rtsp://***@127.0.0.1" in output and "hunter2" not in output and "s3cret" not in output
 
 
-def test_a_folder_that_isnt_there_is_refused_at_once(start: Start, tmp_path: Path) -> None:
+def test_missing_folder_is_rejected_at_once(start: Start, tmp_path: Path) -> None:
     camera = start("cyclone", *COMMAND, "camera", tmp_path / "none", "/front")
     _, errors = camera.communicate(timeout=20)
-    assert camera.returncode and "is not there" in errors
+    assert camera.returncode and "not found" in errors

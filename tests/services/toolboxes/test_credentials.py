@@ -1,4 +1,4 @@
-"""A camera's user and password reach the camera, and nobody else: status, detections, results, logs, errors."""
+"""Camera credentials are sent to the camera only: not in status, detections, results, logs or errors."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from fastapi.testclient import TestClient
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.step import silent
-from scan2sim.services.http.settings import Served
+from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.toolboxes import offline, sources
 from scan2sim.services.toolboxes.api import application
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.frames import Frame
-from scan2sim.services.toolboxes.per_source_worker import Follower
+from scan2sim.services.toolboxes.per_source_worker import SourceWorker
 from scan2sim.services.toolboxes.results import Body, Result
 from scan2sim.services.toolboxes.settings import ToolboxParams
 from scan2sim.services.toolboxes.sources import Cameras
@@ -36,7 +36,7 @@ USER, PASSWORD, TOKEN = "admin", "hunter2", "s3cret"
 
 
 class _Camera(BaseHTTPRequestHandler):
-    """Sends JPEGs to whoever has the password and the token."""
+    """Camera that streams JPEGs to clients with the password and the token."""
 
     def do_GET(self) -> None:
         import cv2
@@ -65,14 +65,14 @@ class _Camera(BaseHTTPRequestHandler):
 
 @pytest.fixture(scope="module")
 def engine() -> Iterator[Engine]:
-    made = Engine(shaky.__name__, ToolboxParams(deadline=offline.PATIENT))
+    made = Engine(shaky.__name__, ToolboxParams(deadline=offline.OFFLINE_DEADLINE_S))
     yield made
     made.close()
 
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    """Port of a camera that demands user, password and token."""
+    """Port of a camera that requires user, password and token."""
     server = ThreadingHTTPServer(("127.0.0.1", 0), _Camera)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield server.server_port
@@ -84,18 +84,18 @@ def url(port: int, path: str = "live") -> str:
     return f"http://{USER}:{PASSWORD}@127.0.0.1:{port}/{path}?token={TOKEN}"
 
 
-def shown(port: int, path: str = "live") -> str:
+def redacted_url(port: int, path: str = "live") -> str:
     return f"http://***@127.0.0.1:{port}/{path}?token=***"
 
 
-def until(done: Callable[[], Any]) -> None:
+def wait_until(done: Callable[[], Any]) -> None:
     deadline = time.monotonic() + 60
     while not done():
         assert time.monotonic() < deadline
         time.sleep(0.05)
 
 
-def check(*texts: str) -> None:
+def check_no_secrets(*texts: str) -> None:
     for text in texts:
         assert not any(secret in text for secret in (PASSWORD, TOKEN)), text
 
@@ -105,78 +105,82 @@ def test_status_and_detections_name_a_camera_without_its_credentials(
 ) -> None:
     caplog.set_level(logging.DEBUG, logger="scan2sim")
     cameras = Cameras(engine, [url(port)])
-    client = TestClient(application(engine, Served(), cameras), base_url="http://localhost")
+    client = TestClient(application(engine, ServerParams(), cameras), base_url="http://localhost")
     try:
         started = client.post("/start").text
-        until(lambda: client.get("/detections").json())
+        wait_until(lambda: client.get("/detections").json())
         status, detections = client.get("/status"), client.get("/detections")
-        assert list(status.json()["cameras"]) == [shown(port)] and status.json()["cameras"][shown(port)]["there"]
-        assert [one["source"] for one in detections.json()] == [shown(port)]
-        assert 49 <= int(detections.json()[0]["body"]["classes"][0]["label"]) <= 51, "it got the real address"
-        for source in (shown(port), url(port)):
+        assert (
+            list(status.json()["cameras"]) == [redacted_url(port)]
+            and status.json()["cameras"][redacted_url(port)]["there"]
+        )
+        assert [one["source"] for one in detections.json()] == [redacted_url(port)]
+        label = detections.json()[0]["body"]["classes"][0]["label"]
+        assert 49 <= int(label) <= 51, "the reader uses the original address"
+        for source in (redacted_url(port), url(port)):
             assert len(client.get("/detections", params={"source": source}).json()) == 1
-        check(started, status.text, detections.text, client.get("/metrics").text)
-        check(" ".join(thread.name for thread in threading.enumerate()))
+        check_no_secrets(started, status.text, detections.text, client.get("/metrics").text)
+        check_no_secrets(" ".join(thread.name for thread in threading.enumerate()))
     finally:
         stopped = client.post("/stop").text
-    check(stopped, caplog.text, *capfd.readouterr())
+    check_no_secrets(stopped, caplog.text, *capfd.readouterr())
 
 
-def test_cameras_that_differ_by_their_credentials_alone_stay_apart(engine: Engine) -> None:
+def test_cameras_that_differ_only_in_credentials_have_separate_names(engine: Engine) -> None:
     addresses = [url(9), url(9).replace(PASSWORD, "other"), url(9, "rear"), "0"]
     cameras = Cameras(engine, addresses)
-    assert list(cameras.states()) == [shown(9), f"{shown(9)} (2)", shown(9, "rear"), "0"]
+    assert list(cameras.states()) == [redacted_url(9), f"{redacted_url(9)} (2)", redacted_url(9, "rear"), "0"]
 
 
 @pytest.mark.parametrize("scheme", ["http", "rtsp"])
-def test_an_unreachable_camera_is_logged_once_without_its_credentials(
+def test_unreachable_camera_is_logged_once_without_its_credentials(
     engine: Engine, scheme: str, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     closed = free_port()
     cameras = Cameras(engine, [url(closed).replace("http", scheme)])
-    name = shown(closed).replace("http", scheme)
+    name = redacted_url(closed).replace("http", scheme)
     cameras.start()
     try:
-        until(lambda: name in caplog.text)
-        time.sleep(1.0)  # tried again meanwhile
+        wait_until(lambda: name in caplog.text)
+        time.sleep(1.0)  # it is retried meanwhile
         assert cameras.states() == {name: {"there": False, "images": 0}}
     finally:
         cameras.stop()
-    assert caplog.text.count("gives no images") == 1
-    check(caplog.text, *capfd.readouterr())
+    assert caplog.text.count("delivers no images") == 1
+    check_no_secrets(caplog.text, *capfd.readouterr())
 
 
-def test_results_name_a_clients_source_without_its_credentials(engine: Engine) -> None:
-    client = TestClient(application(engine, Served()), base_url="http://localhost")
+def test_results_name_a_source_without_its_credentials(engine: Engine) -> None:
+    client = TestClient(application(engine, ServerParams()), base_url="http://localhost")
     headers = {"Content-Type": "image/jpeg", "Source": url(80)}
     refused = client.post(f"/v2/models/{engine.name}/infer", content=b"no image", headers=headers)
-    assert refused.status_code == 422 and refused.json()["source"] == shown(80)
+    assert refused.status_code == 422 and refused.json()["source"] == redacted_url(80)
     tensor = {"name": "i", "datatype": "UINT8", "shape": [1, 1, 3], "data": [7, 7, 7]}
     asked = {"inputs": [tensor], "parameters": {"source": url(80)}}
     (done,) = client.post(f"/v2/models/{engine.name}/infer", json=asked).json()["outputs"][0]["data"]
-    assert json.loads(done)["source"] == shown(80)
+    assert json.loads(done)["source"] == redacted_url(80)
 
 
-def test_a_results_file_holds_no_credentials(engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_file_holds_no_credentials(engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import cv2
 
-    folder = tmp_path / "http:" / f"{USER}:{PASSWORD}@camera"  # as a mirror of a camera's recordings is called
+    folder = tmp_path / "http:" / f"{USER}:{PASSWORD}@camera"  # like a mirror of a camera's recordings
     folder.mkdir(parents=True)
     cv2.imwrite(str(folder / "1.png"), shaky.image(10))
     monkeypatch.chdir(tmp_path)
-    offline.work_through(engine, folder.relative_to(tmp_path), tmp_path / "out", silent)
-    (line,) = (tmp_path / "out" / offline.RESULTS).read_text(encoding="utf-8").splitlines()
+    offline.process_files(engine, folder.relative_to(tmp_path), tmp_path / "out", silent)
+    (line,) = (tmp_path / "out" / offline.RESULTS_FILE).read_text(encoding="utf-8").splitlines()
     assert json.loads(line)["source"] == "http:/***@camera"
 
 
-@pytest.mark.parametrize("given", [sources.count, lambda path: list(sources.shots(path))])
-def test_an_address_in_place_of_a_file_is_refused_without_its_credentials(given: Callable[[Path], object]) -> None:
-    with pytest.raises(InputError, match="is not there") as caught:
-        given(Path(url(80)))
-    check(str(caught.value), repr(caught.value))
+@pytest.mark.parametrize("read", [sources.count, lambda path: list(sources.stored_images(path))])
+def test_address_instead_of_a_file_is_rejected_without_its_credentials(read: Callable[[Path], object]) -> None:
+    with pytest.raises(InputError, match="not found") as caught:
+        read(Path(url(80)))
+    check_no_secrets(str(caught.value), repr(caught.value))
 
 
-def test_a_follower_that_fails_logs_no_credentials(caplog: pytest.LogCaptureFixture) -> None:
+def test_failing_source_worker_logs_no_credentials(caplog: pytest.LogCaptureFixture) -> None:
     def fail(frame: Frame, image: object, body: Body) -> Body:
         raise ValueError("no features")
 
@@ -184,10 +188,10 @@ def test_a_follower_that_fails_logs_no_credentials(caplog: pytest.LogCaptureFixt
         pass
 
     ended: list[Body | str] = []
-    follower = Follower(url(80), fail)
+    worker = SourceWorker(url(80), fail)
     frame = Frame("1", url(80), None, shaky.image(1), ignore)
-    follower.put(frame, shaky.image(1), Body(), ended.append)
+    worker.put(frame, shaky.image(1), Body(), ended.append)
     names = " ".join(thread.name for thread in threading.enumerate())
-    follower.close()
-    assert ended and shown(80) in caplog.text and shown(80) in names
-    check(caplog.text, names)
+    worker.close()
+    assert ended and redacted_url(80) in caplog.text and redacted_url(80) in names
+    check_no_secrets(caplog.text, names)

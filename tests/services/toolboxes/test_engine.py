@@ -1,4 +1,4 @@
-"""Every frame gets one answer, whatever comes: floods, late ones, damaged ones, a model that fails, dies or hangs."""
+"""Every frame gets one answer: overload, missed deadlines, damaged images, a model that fails, dies or hangs."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from PIL import Image
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.toolboxes.engine import Engine
-from scan2sim.services.toolboxes.frames import LARGEST, Frame, Raw
+from scan2sim.services.toolboxes.frames import MAX_PIXELS, Frame, Raw
 from scan2sim.services.toolboxes.results import Result, State
 from scan2sim.services.toolboxes.settings import ToolboxParams
 from tests.services.toolboxes import shaky
 from tests.services.toolboxes.shaky import DIES, FAILS, HANGS, RAISES, SLOW, SLOWER, image, level_of
 
-BOX = shaky.__name__
+TASK = shaky.__name__
 
 
-class Sent:
-    """Sends frames, and waits for what became of them."""
+class Client:
+    """Submits frames and waits for their results."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine, self.results = engine, list[Result]()
-        self._came = threading.Condition()
+        self._changed = threading.Condition()
         self._sent = 0
 
     def send(self, picture: U8 | bytes | Raw, source: str = "camera", **more: float) -> None:
@@ -39,13 +39,13 @@ class Sent:
         self.engine.submit(Frame(str(self._sent), source, self._sent, picture, self._take, **more))
 
     def _take(self, result: Result) -> None:
-        with self._came:
+        with self._changed:
             self.results.append(result)
-            self._came.notify_all()
+            self._changed.notify_all()
 
     def wait(self) -> list[Result]:
-        with self._came:
-            assert self._came.wait_for(lambda: len(self.results) >= self._sent, 30)
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(self.results) >= self._sent, 30)
         return sorted(self.results, key=lambda one: int(one.id))
 
     def one(self, picture: U8 | bytes | Raw) -> Result:
@@ -55,14 +55,14 @@ class Sent:
 
 @pytest.fixture(scope="module")
 def engine() -> Iterator[Engine]:
-    made = Engine(BOX, ToolboxParams(waiting=4, deadline=10, hangs=1))
+    made = Engine(TASK, ToolboxParams(waiting=4, deadline=10, hangs=1))
     yield made
     made.close()
 
 
 @pytest.fixture
-def sent(engine: Engine) -> Sent:
-    return Sent(engine)
+def client(engine: Engine) -> Client:
+    return Client(engine)
 
 
 def encoded(kind: str, picture: U8) -> bytes:
@@ -71,15 +71,15 @@ def encoded(kind: str, picture: U8) -> bytes:
     return out.getvalue()
 
 
-def test_a_result_has_the_frames_id_stamp_source_and_size(sent: Sent) -> None:
-    result = sent.one(image(7, (4, 6)))
+def test_result_has_id_stamp_source_and_size_of_the_frame(client: Client) -> None:
+    result = client.one(image(7, (4, 6)))
     assert (result.id, result.stamp, result.source, result.size) == ("1", 1, "camera", (6, 4))
     assert result.state == State.DONE and level_of(result.body) == 7 and result.times and result.times.worked > 0
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])
-def test_encoded_images_are_decoded(sent: Sent, kind: str) -> None:
-    assert abs(level_of(sent.one(encoded(kind, image(90, (16, 16)))).body) - 90) <= 1
+def test_encoded_images_are_decoded(client: Client, kind: str) -> None:
+    assert abs(level_of(client.one(encoded(kind, image(90, (16, 16)))).body) - 90) <= 1
 
 
 @pytest.mark.parametrize(
@@ -89,119 +89,121 @@ def test_encoded_images_are_decoded(sent: Sent, kind: str) -> None:
         ("mono8", (50,), 50), ("mono16", (0, 50), 50), ("bayer_rggb8", (60,), 60),
     ],
 )  # fmt: skip
-def test_images_of_ros_are_converted(sent: Sent, encoding: str, pixel: tuple[int, ...], expected: int) -> None:
+def test_ros_image_encodings_are_converted(
+    client: Client, encoding: str, pixel: tuple[int, ...], expected: int
+) -> None:
     row = bytes(pixel) * 8 + b"padding"
-    assert level_of(sent.one(Raw(row * 8, 8, 8, encoding, len(row))).body) == expected
+    assert level_of(client.one(Raw(row * 8, 8, 8, encoding, len(row))).body) == expected
 
 
-def test_damaged_images_are_refused_and_the_next_is_worked_on(sent: Sent) -> None:
+def test_damaged_images_are_rejected_and_the_next_is_processed(client: Client) -> None:
     whole = encoded("JPEG", np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8))
     huge = encoded("PNG", np.zeros((20_000, 2_000, 3), np.uint8))
-    assert LARGEST < 20_000 * 2_000
+    assert MAX_PIXELS < 20_000 * 2_000
     bad: list[bytes | Raw] = [
         whole[: len(whole) // 2], b"", b"GIF89a", huge, Raw(b"", 0, 0, "rgb8", 0), Raw(b"12", 8, 8, "rgb8", 24),
         Raw(bytes(192), 8, 8, "32FC1", 32), Raw(b"", 20_000, 20_000, "rgb8", 60_000),
     ]  # fmt: skip
     for picture in bad:
-        result = sent.one(picture)
+        result = client.one(picture)
         assert result.state == State.REFUSED and result.error
-    assert sent.one(image(5)).state == State.DONE
+    assert client.one(image(5)).state == State.DONE
 
 
-def test_a_flood_drops_each_sources_oldest_alone(sent: Sent) -> None:
+def test_overload_drops_the_oldest_frames_of_that_source_only(client: Client) -> None:
     for _ in range(20):
-        sent.send(image(SLOW), "flooding")
-    sent.send(image(3), "quiet")
-    results = sent.wait()
+        client.send(image(SLOW), "flooding")
+    client.send(image(3), "quiet")
+    results = client.wait()
     assert results[-1].state == State.DONE
     states = [one.state for one in results[:-1]]
     assert State.DROPPED in states and states[-4:] == [State.DONE] * 4
 
 
-def test_a_frame_whose_deadline_has_passed_is_told_so(sent: Sent) -> None:
-    sent.send(image(3), received=time.monotonic() - 60)
-    assert sent.wait()[0].state == State.LATE
+def test_frame_past_its_deadline_is_late(client: Client) -> None:
+    client.send(image(3), received=time.monotonic() - 60)
+    assert client.wait()[0].state == State.LATE
 
 
-def test_a_model_that_was_slow_once_is_tried_again() -> None:
-    engine = Engine(BOX, ToolboxParams(deadline=0.5))
+def test_model_is_tried_again_after_a_slow_batch() -> None:
+    engine = Engine(TASK, ToolboxParams(deadline=0.5))
     try:
-        sent = Sent(engine)
-        assert sent.one(image(SLOWER)).state == State.DONE
-        assert State.DONE in [sent.one(image(1)).state for _ in range(20)]
+        client = Client(engine)
+        assert client.one(image(SLOWER)).state == State.DONE
+        assert State.DONE in [client.one(image(1)).state for _ in range(20)]
     finally:
         engine.close()
 
 
 @pytest.mark.parametrize("level", [FAILS, RAISES])
-def test_a_model_that_fails_says_why_and_goes_on(sent: Sent, level: int) -> None:
-    result = sent.one(image(level))
+def test_failure_of_the_model_is_reported_and_the_next_frame_processed(client: Client, level: int) -> None:
+    result = client.one(image(level))
     assert result.state == State.FAILED and result.error
-    assert sent.one(image(1)).state == State.DONE
+    assert client.one(image(1)).state == State.DONE
 
 
 @pytest.mark.parametrize("level", [DIES, HANGS])
-def test_a_model_that_dies_or_hangs_over_an_image_is_started_anew(sent: Sent, level: int) -> None:
-    restarts = sent.engine.counts["restarts"]
-    assert sent.one(image(level)).state == State.FAILED
-    assert sent.one(image(1)).state == State.DONE
-    assert sent.engine.counts["restarts"] > restarts
+def test_model_that_dies_or_hangs_is_restarted(client: Client, level: int) -> None:
+    restarts = client.engine.counts["restarts"]
+    assert client.one(image(level)).state == State.FAILED
+    assert client.one(image(1)).state == State.DONE
+    assert client.engine.counts["restarts"] > restarts
 
 
-def test_a_killed_model_isnt_ready_until_it_is_back_and_nothing_is_lost(sent: Sent) -> None:
-    assert sent.one(image(1)).state == State.DONE
-    pid = sent.engine.pid()
+def test_killed_model_is_not_ready_until_restarted_and_no_frame_is_lost(client: Client) -> None:
+    assert client.one(image(1)).state == State.DONE
+    pid = client.engine.pid()
     assert pid
     for _ in range(3):
-        sent.send(image(SLOW))
+        client.send(image(SLOW))
     os.kill(pid, signal.SIGKILL)
     deadline = time.monotonic() + 1
-    while sent.engine.is_ready() and time.monotonic() < deadline:
+    while client.engine.is_ready() and time.monotonic() < deadline:
         time.sleep(0.01)
-    assert not sent.engine.is_ready()
-    assert [one.state for one in sent.wait()] == [State.DONE] * 4 and sent.engine.is_ready()
+    assert not client.engine.is_ready()
+    assert [one.state for one in client.wait()] == [State.DONE] * 4 and client.engine.is_ready()
 
 
-def test_one_image_that_kills_spoils_no_other_of_its_batch() -> None:
-    engine = Engine(BOX, ToolboxParams(batch=4, linger=1, waiting=8, deadline=30))
+def test_fatal_image_does_not_affect_the_others_of_its_batch() -> None:
+    engine = Engine(TASK, ToolboxParams(batch=4, linger=1, waiting=8, deadline=30))
     try:
-        sent = Sent(engine)
+        client = Client(engine)
         for level in (1, DIES, 2, FAILS):
-            sent.send(image(level))
-        assert [one.state for one in sent.wait()] == [State.DONE, State.FAILED, State.DONE, State.FAILED]
+            client.send(image(level))
+        assert [one.state for one in client.wait()] == [State.DONE, State.FAILED, State.DONE, State.FAILED]
     finally:
         engine.close()
 
 
-def test_a_toolbox_that_ends_answers_what_waits() -> None:
-    engine = Engine(BOX, ToolboxParams(waiting=100, deadline=30))
-    sent = Sent(engine)
+def test_closing_the_engine_answers_waiting_frames() -> None:
+    engine = Engine(TASK, ToolboxParams(waiting=100, deadline=30))
+    client = Client(engine)
     for _ in range(30):
-        sent.send(image(SLOW))
+        client.send(image(SLOW))
     engine.close()
-    assert {one.state for one in sent.wait()} <= {State.DONE, State.DROPPED}
+    assert {one.state for one in client.wait()} <= {State.DONE, State.DROPPED}
 
 
-def test_a_model_that_hangs_holds_nobody_up_who_ends_the_toolbox() -> None:
-    engine = Engine(BOX, ToolboxParams(hangs=3600))
-    sent = Sent(engine)
-    sent.send(image(HANGS))
+def test_closing_the_engine_does_not_wait_for_a_hanging_model() -> None:
+    engine = Engine(TASK, ToolboxParams(hangs=3600))
+    client = Client(engine)
+    client.send(image(HANGS))
     time.sleep(0.5)
     began = time.monotonic()
     engine.close()
-    assert sent.wait()[0].state == State.FAILED and time.monotonic() - began < 20
+    assert client.wait()[0].state == State.FAILED and time.monotonic() - began < 20
 
 
-def test_there_is_no_such_toolbox() -> None:
-    with pytest.raises(SettingError, match="there is no 'paint'"):
+def test_unknown_toolbox_is_rejected() -> None:
+    with pytest.raises(SettingError, match="unknown value 'paint'"):
         Engine("paint", ToolboxParams())
 
 
-def test_weights_that_may_hold_code_are_refused(tmp_path: Path) -> None:
+def test_weights_that_may_contain_code_are_rejected(tmp_path: Path) -> None:
     from scan2sim.pipeline.core.errors import InputError
     from scan2sim.services.toolboxes.tasks import classify
 
     pickled = tmp_path / "model.pt"
     pickled.write_bytes(b"\x80\x04.")
-    with pytest.raises(InputError, match="may hold code"):
+    with pytest.raises(InputError, match="may contain code"):
         Engine("classify", classify.Params(weights=pickled))

@@ -1,4 +1,4 @@
-"""A toolbox as a node: images on a topic of ROS 2 in, results on a topic out, with rclpy's nodes and cyclonedds'."""
+"""Toolbox as a ROS 2 node: images on a topic in, results on a topic out, with both transports."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ pytest.importorskip("cyclonedds", reason="the extra bus isn't installed")
 from tests.services.conftest import Start
 from tests.services.toolboxes import camera, shaky
 
-BOX = shaky.__name__
+TASK = shaky.__name__
 
 
 @pytest.mark.parametrize("transport", ["cyclone", "rclpy"])
 @pytest.mark.parametrize("compressed", [False, True], ids=["raw", "compressed"])
-def test_images_of_a_topic_become_results_on_another(
+def test_node_publishes_results_for_images_of_a_topic(
     start: Start, transport: str, compressed: bool, tmp_path: Path
 ) -> None:
     picture = tmp_path / "picture.png"
     Image.fromarray(shaky.image(90, (12, 16))).save(picture)
-    command = ["-m", "scan2sim.flows.cli", "toolbox", "node", BOX, "--images", "/front", "--results", "/seen"]
+    command = ["-m", "scan2sim.flows.cli", "toolbox", "node", TASK, "--images", "/front", "--results", "/seen"]
     start("cyclone", *command, *(["--compressed"] if compressed else []))
     sender = start(transport, Path(camera.__file__), "/front", "/seen", "3", *([picture] if compressed else []))
     lines, errors = sender.communicate(timeout=90)
@@ -35,9 +35,9 @@ def test_images_of_a_topic_become_results_on_another(
         assert int(one["body"]["classes"][0]["label"]) == (90 if compressed else 10 * number % 200)
 
 
-def test_results_go_on_while_the_bus_watches_them(start: Start, tmp_path: Path) -> None:
+def test_node_is_monitored(start: Start, tmp_path: Path) -> None:
     log = tmp_path / "records.log"
-    command = ["-m", "scan2sim.flows.cli", "toolbox", "node", BOX, "--images", "/a", "--results", "/b"]
+    command = ["-m", "scan2sim.flows.cli", "toolbox", "node", TASK, "--images", "/a", "--results", "/b"]
     start("cyclone", *command, "--log", log, "--period", "0.5")
     sender = start("cyclone", Path(camera.__file__), "/a", "/b", "20")
     sender.communicate(timeout=90)

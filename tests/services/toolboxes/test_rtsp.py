@@ -1,4 +1,4 @@
-"""A real camera's link: H.264 by RTSP is read, its loss is noticed, and it is found again."""
+"""RTSP camera with H.264: reading, detection of its loss, reconnection."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import pytest
 from scan2sim.services.toolboxes import offline
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.settings import ToolboxParams
-from scan2sim.services.toolboxes.sources import SILENT, Cameras
+from scan2sim.services.toolboxes.sources import CAMERA_TIMEOUT_S, Cameras
 from tests.fakes.ports import free_port
 from tests.services.toolboxes import shaky
 
 PYTHON = "/usr/bin/python3"
-"""Debian's, whose packages GStreamer's bindings come as."""
+"""Debian's Python, for which GStreamer's bindings are packaged."""
 CAMERA = Path(__file__).with_name("rtsp_camera.py")
-LOADS = "import gi; gi.require_version('GstRtspServer', '1.0'); from gi.repository import GstRtspServer"
+IMPORT_TEST = "import gi; gi.require_version('GstRtspServer', '1.0'); from gi.repository import GstRtspServer"
 
 
 @contextmanager
@@ -40,12 +40,12 @@ def wait(done: Callable[[], bool], seconds: float) -> None:
         time.sleep(0.05)
 
 
-def test_a_camera_by_rtsp_is_read_missed_and_found_again() -> None:
-    if not Path(PYTHON).is_file() or subprocess.run([PYTHON, "-c", LOADS], capture_output=True).returncode:
-        pytest.skip("GStreamer's RTSP server isn't there (gir1.2-gst-rtsp-server-1.0)")
+def test_rtsp_camera_is_read_and_reconnected() -> None:
+    if not Path(PYTHON).is_file() or subprocess.run([PYTHON, "-c", IMPORT_TEST], capture_output=True).returncode:
+        pytest.skip("GStreamer's RTSP server isn't installed (gir1.2-gst-rtsp-server-1.0)")
     port = free_port()
     address = f"rtsp://127.0.0.1:{port}/camera"
-    engine = Engine(shaky.__name__, ToolboxParams(deadline=offline.PATIENT))
+    engine = Engine(shaky.__name__, ToolboxParams(deadline=offline.OFFLINE_DEADLINE_S))
     cameras = Cameras(engine, [address])
 
     def grey() -> int:
@@ -56,7 +56,7 @@ def test_a_camera_by_rtsp_is_read_missed_and_found_again() -> None:
             cameras.start()
             wait(lambda: abs(grey() - 120) < 5, 30)
             assert cameras.states()[address]["there"]
-        wait(lambda: not cameras.states()[address]["there"], SILENT + 10)
+        wait(lambda: not cameras.states()[address]["there"], CAMERA_TIMEOUT_S + 10)
         with camera(port, 60):
             wait(lambda: abs(grey() - 60) < 5, 30)
             assert cameras.states()[address]["there"]

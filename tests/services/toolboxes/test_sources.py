@@ -1,4 +1,4 @@
-"""Folders, videos and cameras as sources: in order, drawn, and a camera that vanishes comes back."""
+"""Image sources: folders, videos, cameras with reconnection; drawn results."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from scan2sim.services.toolboxes.settings import ToolboxParams
 from scan2sim.services.toolboxes.sources import Cameras
 from tests.services.toolboxes import shaky
 
-BOX = shaky.__name__
+TASK = shaky.__name__
 
 
 @pytest.fixture(scope="module")
 def engine() -> Iterator[Engine]:
-    made = Engine(BOX, ToolboxParams(deadline=offline.PATIENT))
+    made = Engine(TASK, ToolboxParams(deadline=offline.OFFLINE_DEADLINE_S))
     yield made
     made.close()
 
 
 def film(path: Path, levels: list[int]) -> Path:
-    """One frame a level, ten a second."""
+    """Video with one frame per grey level, ten per second."""
     import cv2
 
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (32, 24))
@@ -41,46 +41,47 @@ def film(path: Path, levels: list[int]) -> Path:
 
 
 def levels(out: Path) -> list[int]:
-    lines = [json.loads(line) for line in (out / offline.RESULTS).open()]
+    lines = [json.loads(line) for line in (out / offline.RESULTS_FILE).open()]
     return [round(int(one["body"]["classes"][0]["label"]), -1) for one in lines if one["state"] == "done"]
 
 
-def test_a_folders_pictures_are_worked_on_in_order_and_drawn(engine: Engine, tmp_path: Path) -> None:
+def test_images_of_a_folder_are_processed_in_order_and_drawn(engine: Engine, tmp_path: Path) -> None:
     for level in (30, 10, 20):
         Image.fromarray(shaky.image(level)).save(tmp_path / f"{level}.png")
     (tmp_path / "notes.txt").write_text("no picture", encoding="utf-8")
     (tmp_path / "25.jpg").write_bytes(b"broken")
-    ended = offline.work_through(engine, tmp_path, tmp_path / "out", silent)
+    ended = offline.process_files(engine, tmp_path, tmp_path / "out", silent)
     assert ended == {"done": 3, "refused": 1} and levels(tmp_path / "out") == [10, 20, 30]
-    assert sorted(one.name for one in (tmp_path / "out" / offline.PICTURES).iterdir()) == ["10.jpg", "20.jpg", "30.jpg"]
+    drawn = sorted(one.name for one in (tmp_path / "out" / offline.IMAGES_FOLDER).iterdir())
+    assert drawn == ["10.jpg", "20.jpg", "30.jpg"]
 
 
-def test_a_video_becomes_results_with_its_times_and_a_film(engine: Engine, tmp_path: Path) -> None:
-    wanted = [10 * i for i in range(15)]
-    path = film(tmp_path / "video.avi", wanted)
-    offline.work_through(engine, path, tmp_path / "out", silent)
-    assert levels(tmp_path / "out") == wanted
-    stamps = [json.loads(line)["stamp"] for line in (tmp_path / "out" / offline.RESULTS).open()]
+def test_video_gives_results_with_time_stamps_and_a_video(engine: Engine, tmp_path: Path) -> None:
+    expected = [10 * i for i in range(15)]
+    path = film(tmp_path / "video.avi", expected)
+    offline.process_files(engine, path, tmp_path / "out", silent)
+    assert levels(tmp_path / "out") == expected
+    stamps = [json.loads(line)["stamp"] for line in (tmp_path / "out" / offline.RESULTS_FILE).open()]
     assert np.allclose(np.diff(stamps), 1e8)
-    assert sources.count(tmp_path / "out" / offline.FILM) == 15
+    assert sources.count(tmp_path / "out" / offline.VIDEO_FILE) == 15
 
 
 @pytest.mark.parametrize("name", ["nowhere", "empty", "broken.mp4"])
-def test_what_holds_no_images_is_told(engine: Engine, tmp_path: Path, name: str) -> None:
+def test_sources_without_images_are_rejected(engine: Engine, tmp_path: Path, name: str) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "broken.mp4").write_bytes(b"no film")
     with pytest.raises(InputError, match=name):
-        offline.work_through(engine, tmp_path / name, tmp_path / "out", silent)
+        offline.process_files(engine, tmp_path / name, tmp_path / "out", silent)
 
 
-def test_a_camera_that_vanishes_comes_back_and_standby_reads_nothing(engine: Engine, tmp_path: Path) -> None:
+def test_camera_is_reconnected_and_not_read_in_standby(engine: Engine, tmp_path: Path) -> None:
     path = tmp_path / "camera.avi"
     cameras = Cameras(engine, [str(path)])
     cameras.start()
     try:
         time.sleep(0.5)
         assert cameras.running() and not cameras.states()[str(path)]["there"]
-        film(path, [50] * 5)  # a file that ends is a camera that is gone, and there again
+        film(path, [50] * 5)  # the end of the file acts as a lost camera, reading it again as a reconnection
 
         def images() -> int:
             return int(cameras.states()[str(path)]["images"])

@@ -1,4 +1,4 @@
-"""A node that sends messages of several types and counts what it hears of them: crossing.py NAME OTHER SECONDS."""
+"""Node that publishes messages of several types and counts those it receives: crossing.py NAME OTHER SECONDS."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ def main() -> None:
 
     class Node(ros.Node):  # type: ignore[misc, name-defined]
         def received(self, arrival: Arrival) -> None:
-            told = heard.setdefault(arrival.topic.split("/")[-1], {"count": 0, "numbered": True})
-            told["count"] += 1
-            told["numbered"] &= arrival.number is not None and arrival.publisher is not None
-            told["latency"] = (arrival.received - (arrival.sent or 0)) / 1e9
-            told["size"] = arrival.size
+            stats = heard.setdefault(arrival.topic.split("/")[-1], {"count": 0, "numbered": True})
+            stats["count"] += 1
+            stats["numbered"] &= arrival.number is not None and arrival.publisher is not None
+            stats["latency"] = (arrival.received - (arrival.sent or 0)) / 1e9
+            stats["size"] = arrival.size
 
     node = Node(f"node_{name}")
-    said: dict[str, Any] = {}
+    latest: dict[str, Any] = {}
     endpoints: list[dict[str, str]] = []
     publishers = {}
     for kind in TYPES:
         leaf = kind.split("/")[-1]
         publishers[kind] = node.create_publisher(ros.message_type(kind), f"{name}/{leaf}", QoS())
         node.create_subscription(
-            ros.message_type(kind), f"{other}/{leaf}", lambda message, leaf=leaf: said.update({leaf: message}), QoS()
+            ros.message_type(kind), f"{other}/{leaf}", lambda message, leaf=leaf: latest.update({leaf: message}), QoS()
         )
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -50,7 +50,7 @@ def main() -> None:
             endpoints = [{"node": one.node_name, "type": one.type_name} for one in found]
         for kind, publisher in publishers.items():
             publisher.publish(ros.message(kind, **FIELDS.get(kind, {})))
-    print(json.dumps({"heard": heard, "text": getattr(said.get("String"), "data", None), "endpoints": endpoints}))
+    print(json.dumps({"heard": heard, "text": getattr(latest.get("String"), "data", None), "endpoints": endpoints}))
     node.destroy_node()
     ros.shutdown()
 

@@ -1,5 +1,6 @@
-// A peer of another vendor, Fast DDS: publishes and hears std_msgs/String as ROS 2 does, and prints what it heard.
-// peer NAME OTHER SECONDS: sends on rt/NAME/String, hears on rt/OTHER/String. The domain is ROS_DOMAIN_ID's.
+// Peer that uses another vendor's DDS, Fast DDS: publishes and subscribes to std_msgs/String like ROS 2, and prints the
+// number of received messages and the last one. peer NAME OTHER SECONDS: publishes on rt/NAME/String, subscribes to
+// rt/OTHER/String. The domain is ROS_DOMAIN_ID.
 #include <atomic>
 #include <chrono>
 #include <cstdlib>
@@ -59,7 +60,7 @@ class StringType : public TopicDataType {
   bool getKey(void*, InstanceHandle_t*, bool) override { return false; }
 };
 
-class Heard : public DataReaderListener {
+class Received : public DataReaderListener {
  public:
   void on_data_available(DataReader* reader) override {
     std::string data;
@@ -90,15 +91,15 @@ int main(int argc, char** argv) {
                      ->create_datawriter(topic(argv[1]), DATAWRITER_QOS_DEFAULT);
   DataReaderQos reliable = DATAREADER_QOS_DEFAULT;
   reliable.reliability().kind = RELIABLE_RELIABILITY_QOS;
-  Heard heard;
-  participant->create_subscriber(SUBSCRIBER_QOS_DEFAULT)->create_datareader(topic(argv[2]), reliable, &heard);
+  Received received;
+  participant->create_subscriber(SUBSCRIBER_QOS_DEFAULT)->create_datareader(topic(argv[2]), reliable, &received);
   const auto end = std::chrono::steady_clock::now() + std::chrono::milliseconds(static_cast<int>(std::atof(argv[3]) * 1000));
-  std::string said = "Straße, 画像";
+  std::string text = "Straße, 画像";
   while (std::chrono::steady_clock::now() < end) {
-    writer->write(&said);
+    writer->write(&text);
     std::this_thread::sleep_for(std::chrono::milliseconds(100));
   }
-  std::lock_guard<std::mutex> lock(heard.mutex);
-  std::cout << "{\"count\": " << heard.count << ", \"text\": \"" << heard.text << "\"}" << std::endl;
+  std::lock_guard<std::mutex> lock(received.mutex);
+  std::cout << "{\"count\": " << received.count << ", \"text\": \"" << received.text << "\"}" << std::endl;
   std::_Exit(0);
 }

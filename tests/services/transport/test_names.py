@@ -1,4 +1,4 @@
-"""Names of ROS 2 on DDS."""
+"""Mapping of ROS 2 names to DDS."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.transport import names
 
 
-def test_names_are_mapped_as_ros_2_maps_them() -> None:
+def test_names_are_mapped_like_in_ros_2() -> None:
     assert names.qualified("image", "/robot") == "/robot/image"
     assert names.qualified("/image", "/robot") == "/image"
     assert names.dds_topic("/robot/image") == "rt/robot/image"
@@ -20,12 +20,12 @@ def test_names_are_mapped_as_ros_2_maps_them() -> None:
 
 
 @pytest.mark.parametrize("topic", ["straße", "", "/", "1st", "a b", "a//b", "a/", "~/x", "画像"])
-def test_a_topic_that_ros_2_cannot_have_is_told(topic: str) -> None:
+def test_invalid_topic_names_are_rejected(topic: str) -> None:
     with pytest.raises(SettingError, match="letters a to z"):
         names.qualified(topic)
 
 
 @pytest.mark.parametrize("name", ["String", "std_msgs/String", "std_msgs/msg/", "std_msgs/srv/Empty"])
-def test_a_type_that_is_none_is_told(name: str) -> None:
+def test_invalid_type_names_are_rejected(name: str) -> None:
     with pytest.raises(SettingError, match="PACKAGE/msg/NAME"):
         names.checked_type(name)

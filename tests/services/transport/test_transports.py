@@ -1,4 +1,4 @@
-"""Messages cross between nodes of both transports, each way, with what monitoring is to know of them."""
+"""Interoperability of both transports and of another DDS vendor, with the metadata that monitoring needs."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ SECONDS = "8"
 
 
 @pytest.mark.parametrize(("first", "second"), [("cyclone", "cyclone"), ("rclpy", "cyclone"), ("rclpy", "rclpy")])
-def test_messages_of_all_kinds_cross(first: str, second: str, start: Start) -> None:
+def test_messages_of_all_types_are_exchanged_between_transports(first: str, second: str, start: Start) -> None:
     running = [start(first, CROSSING, "one", "two", SECONDS), start(second, CROSSING, "two", "one", SECONDS)]
-    told = []
+    results = []
     for process in running:
         out, errors = process.communicate(timeout=60)
         assert process.returncode == 0, errors
-        told.append(json.loads(out.splitlines()[-1]))
-    for (me, other), found in zip([(first, second), (second, first)], told, strict=True):
+        results.append(json.loads(out.splitlines()[-1]))
+    for (me, other), found in zip([(first, second), (second, first)], results, strict=True):
         assert set(found["heard"]) == {"String", "Bool", "Image", "Imu", "PointCloud2", "Float64MultiArray"}
         assert min(one["count"] for one in found["heard"].values()) > 10
         assert found["text"] == "Straße, 画像"
-        assert all(abs(one["latency"]) < 5 for one in found["heard"].values())  # seconds: it is a time of sending
-        # rclpy numbers all messages for rclpy; cyclonedds those of any length, for both
+        assert all(abs(one["latency"]) < 5 for one in found["heard"].values())  # the source timestamp is valid
+        # rclpy numbers all messages for rclpy; cyclonedds those of unbounded types, for both
         numbered = {kind for kind, one in found["heard"].items() if one["numbered"]}
         if me == "rclpy":
             assert numbered == set(found["heard"])
@@ -39,13 +39,13 @@ def test_messages_of_all_kinds_cross(first: str, second: str, start: Start) -> N
             assert numbered == {"String", "Image", "Imu", "PointCloud2", "Float64MultiArray"}
         publishers = found["endpoints"]
         assert [one["type"] for one in publishers] == ["std_msgs/msg/String"]
-        if not (me == "rclpy" and other == "cyclone"):  # there, rclpy finds no name of the node
-            assert publishers[0]["node"] == ("node_two" if found is told[0] else "node_one")
+        if not (me == "rclpy" and other == "cyclone"):  # there, rclpy doesn't find the name of the node
+            assert publishers[0]["node"] == ("node_two" if found is results[0] else "node_one")
 
 
 @pytest.fixture(scope="module")
 def peer(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Another vendor's program, compiled."""
+    """Compiled program that uses another vendor's DDS."""
     program = tmp_path_factory.mktemp("peer") / "peer"
     if not shutil.which("g++") or not Path("/usr/include/fastdds").is_dir():
         pytest.skip("Fast DDS isn't installed (tests/services/packages.txt)")
@@ -55,7 +55,7 @@ def peer(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("transport", ["cyclone", "rclpy"])
-def test_messages_cross_to_another_vendor_and_back(transport: str, start: Start, peer: Path, domain: str) -> None:
+def test_messages_are_exchanged_with_another_dds_vendor(transport: str, start: Start, peer: Path, domain: str) -> None:
     node = start(transport, CROSSING, "one", "two", SECONDS)
     other = subprocess.run(
         [peer, "two", "one", SECONDS], env=os.environ | {"ROS_DOMAIN_ID": domain}, capture_output=True, timeout=60
@@ -66,14 +66,14 @@ def test_messages_cross_to_another_vendor_and_back(transport: str, start: Start,
     mine = json.loads(out.splitlines()[-1])
     assert theirs["text"] == mine["text"] == "Straße, 画像"
     assert theirs["count"] > 10 and mine["heard"]["String"]["count"] > 10
-    assert abs(mine["heard"]["String"]["latency"]) < 5  # seconds: it is a time of sending
+    assert abs(mine["heard"]["String"]["latency"]) < 5  # the source timestamp is valid
 
 
-def test_a_transport_that_is_none_is_told() -> None:
+def test_unknown_transport_lists_available_ones() -> None:
     with pytest.raises(SettingError, match="rclpy, cyclone"):
         load("carrier pigeon")
 
 
-def test_a_type_of_unknown_definition_is_told() -> None:
+def test_type_of_unknown_definition_is_rejected() -> None:
     with pytest.raises(SettingError, match="my_msgs/msg/Own"):
         load("cyclone").message_type("my_msgs/msg/Own")

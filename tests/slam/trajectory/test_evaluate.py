@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.types import F64, GpsTrack, Trajectory
 from scan2sim.pipeline.geometry.similarity import umeyama
-from scan2sim.slam.trajectory.evaluate import evaluate, local, plot, way
+from scan2sim.slam.trajectory.evaluate import distance_along, evaluate, plot, segment_errors
 
 
 def yaw(degrees: float | F64) -> F64:
@@ -98,7 +98,9 @@ def test_a_step_in_the_middle_of_a_segment() -> None:
     truth = straight()
     positions = truth.positions.copy()
     positions[495:506, 1] = 2
-    at, errors = local(positions[:, :2], truth.positions[:, :2], way(truth.positions[:, :2]), step=1.0)
+    at, errors = segment_errors(
+        positions[:, :2], truth.positions[:, :2], distance_along(truth.positions[:, :2]), step=1.0
+    )
     assert np.allclose(errors[(at > 494) & (at < 506)], 2) and np.allclose(errors[(at > 310) & (at < 490)], 0)
     assert np.median(errors) == pytest.approx(0, abs=1e-9)
     short = evaluate(replace(truth, positions=positions), truth, segment=100)
@@ -163,8 +165,8 @@ def test_gps_as_truth_tells_no_rotation_but_its_noise() -> None:
 
 def test_a_standing_receiver_does_not_travel() -> None:
     jitter = np.random.default_rng(0).normal(0, 0.1, (2000, 2))
-    assert way(jitter)[-1] < 1
-    assert way(winding().positions[:, :2])[-1] == pytest.approx(1500, rel=1e-9)
+    assert distance_along(jitter)[-1] < 1
+    assert distance_along(winding().positions[:, :2])[-1] == pytest.approx(1500, rel=1e-9)
 
 
 def test_short_and_broken_paths() -> None:
@@ -173,7 +175,7 @@ def test_short_and_broken_paths() -> None:
     assert result.figures()["kitti_percent"] is None
     with pytest.raises(DataError, match=r"doesn't move"):
         evaluate(replace(straight(), positions=np.zeros((1001, 3))), straight())
-    with pytest.raises(DataError, match=r"holds NaN"):
+    with pytest.raises(DataError, match=r"contains NaN"):
         evaluate(replace(straight(), positions=np.full((1001, 3), np.nan)), straight())
 
 

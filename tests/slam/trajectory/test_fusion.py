@@ -16,9 +16,18 @@ from scan2sim.pipeline.core.types import F64, Frame, PointCloud, Trajectory
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.slam.geometry import inverse
-from scan2sim.slam.lidar_odometry import Matched
+from scan2sim.slam.lidar_odometry import MatchedSweeps
 from scan2sim.slam.steps.fuse import FuseParams, fuse_path
-from scan2sim.slam.trajectory.fusion import SIZE, Fused, Steps, _marginals, _solved, camera_steps, fuse, lidar_steps
+from scan2sim.slam.trajectory.fusion import (
+    STATE_SIZE,
+    Fused,
+    RelativeMotions,
+    _marginals,
+    _solved,
+    camera_motions,
+    fuse,
+    lidar_motions,
+)
 from tests.present import present
 
 ALL = ("lidar", "camera", "gps")
@@ -86,11 +95,11 @@ def test_a_bridged_pose_of_the_camera_counts_by_its_covariance() -> None:
     n = len(drive.times)
     known = np.tile(np.diag([1e-4] * 3 + [1e-8] * 3), (n, 1, 1))
     known[200:] += np.diag([9.0] * 3 + [0.04] * 3)
-    steps = camera_steps(replace(drive.camera, covariance=known), drive.times)
+    steps = camera_motions(replace(drive.camera, covariance=known), drive.times)
     spread = np.sqrt(steps.covariance[:, 0, 0])
     assert spread[199] > 2.5 and spread[:199].max() < 0.1 and spread[200:].max() < 0.1
     assert not steps.sure[250:300].any() and steps.sure[:249].all()
-    late = camera_steps(replace(drive.camera, times=drive.times + 5.0), drive.times)
+    late = camera_motions(replace(drive.camera, times=drive.times + 5.0), drive.times)
     assert not late.sure[:50].any() and late.sure[60:200].all()
 
 
@@ -98,25 +107,25 @@ def test_errors_of_a_tunnel_are_one() -> None:
     poses = np.tile(np.eye(4), (6, 1, 1))
     covariance = np.tile(np.diag([1e-4] * 6), (5, 1, 1))
     covariance[1:4, 0, 0] = 1.0
-    steps = lidar_steps(Matched(np.arange(6.0), poses, covariance, np.ones(5)))
+    steps = lidar_motions(MatchedSweeps(np.arange(6.0), poses, covariance, np.ones(5)))
     assert list(steps.sure) == [True, False, False, False, True]
     assert steps.covariance[:, 0, 0] == pytest.approx([1e-4, 3, 3, 3, 1e-4])
 
 
 def test_the_banded_system_is_the_dense_one() -> None:
     rng, n = np.random.default_rng(0), 5
-    dense = rng.normal(size=(n * SIZE, n * SIZE))
-    dense = dense @ dense.T + 50 * np.eye(n * SIZE)
+    dense = rng.normal(size=(n * STATE_SIZE, n * STATE_SIZE))
+    dense = dense @ dense.T + 50 * np.eye(n * STATE_SIZE)
     for i in range(n):
         for j in range(n):
             if abs(i - j) > 1:
-                dense[i * SIZE : (i + 1) * SIZE, j * SIZE : (j + 1) * SIZE] = 0
-    dense += 200 * np.eye(n * SIZE)
-    blocks = dense.reshape(n, SIZE, n, SIZE).transpose(0, 2, 1, 3)
+                dense[i * STATE_SIZE : (i + 1) * STATE_SIZE, j * STATE_SIZE : (j + 1) * STATE_SIZE] = 0
+    dense += 200 * np.eye(n * STATE_SIZE)
+    blocks = dense.reshape(n, STATE_SIZE, n, STATE_SIZE).transpose(0, 2, 1, 3)
     D, above = blocks[np.arange(n), np.arange(n)], blocks[np.arange(n - 1), np.arange(1, n)]
-    b = rng.normal(size=(n, SIZE))
+    b = rng.normal(size=(n, STATE_SIZE))
     np.testing.assert_allclose(_solved(D, above, b).ravel(), np.linalg.solve(dense, b.ravel()), rtol=1e-9)
-    inverted = np.linalg.inv(dense).reshape(n, SIZE, n, SIZE).transpose(0, 2, 1, 3)
+    inverted = np.linalg.inv(dense).reshape(n, STATE_SIZE, n, STATE_SIZE).transpose(0, 2, 1, 3)
     np.testing.assert_allclose(_marginals(D, above), inverted[np.arange(n), np.arange(n)], rtol=1e-9, atol=1e-15)
 
 
@@ -132,7 +141,7 @@ def recorded(folder: Path, drive: Simulated) -> dict[str, Path]:
     for step in drive.lidar.T:
         poses.append(poses[-1] @ step)
     overlap = np.ones(len(drive.lidar.T))
-    Matched(drive.times, np.array(poses), drive.lidar.covariance, overlap).save(folder / "matched.npz")
+    MatchedSweeps(drive.times, np.array(poses), drive.lidar.covariance, overlap).save(folder / "matched.npz")
     trajectory_io.write(folder / "camera.csv", drive.camera)
     np.savetxt(folder / "T.txt", drive.T_camera_scanner[:3], "%.9f")
     table = np.column_stack([drive.times + 100, drive.gps])
@@ -156,13 +165,13 @@ def test_what_is_given_is_fused_and_told(tmp_path: Path) -> None:
         return np.linalg.norm(path.positions - truth, axis=1)
 
     alone, told = placed(files, tmp_path / "out", "matched")
-    assert told == "placed by sweeps (85 % of the steps)" and present(alone.unsure).mean() > 0.5
+    assert told == "placed by sweeps (85 % of the motions)" and present(alone.unsure).mean() > 0.5
     path, told = placed(files, tmp_path / "out", "matched", "poses", "extrinsics")
-    assert told == "placed by sweeps (85 % of the steps), trajectory (87 % of the steps)"
+    assert told == "placed by sweeps (85 % of the motions), trajectory (87 % of the motions)"
     assert error(path).max() < 5 and ate(path.positions, truth) < 1
     everything = ("matched", "poses", "extrinsics", "gps")
     path, told = placed(files, tmp_path / "out", *everything, gps_offset=-100.0)
-    places = re.search(r"GPS \((\d+) of 400 places\)", told)
+    places = re.search(r"GPS \((\d+) of 400 positions\)", told)
     assert places and int(places[1]) > 300 and ate(path.positions, truth) < 0.8 and error(path).max() < 6
     assert path.times == pytest.approx(drive.times)
     late, _ = placed(files, tmp_path / "late", *everything, gps_offset=-80.0, time_offset=20.0)
@@ -187,6 +196,6 @@ def test_a_camera_the_wrong_way_round_is_noticed(tmp_path: Path) -> None:
 
 def test_steps_alone_come_out_as_they_are() -> None:
     drive = simulated(9, tunnel=(0, 0))
-    exact = Steps(inverse(drive.truth[:-1]) @ drive.truth[1:], drive.lidar.covariance, drive.lidar.sure)
+    exact = RelativeMotions(inverse(drive.truth[:-1]) @ drive.truth[1:], drive.lidar.covariance, drive.lidar.sure)
     found = fuse(drive.times, lidar=exact).trajectory.poses
     np.testing.assert_allclose(found, inverse(drive.truth[0]) @ drive.truth, atol=1e-3)

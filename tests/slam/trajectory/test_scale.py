@@ -16,7 +16,7 @@ from tests.slam.synthetic import ate, drifting_turn
 def test_gps_of_ten_centimetres_halves_a_turns_error(seed: int) -> None:
     times, truth, found = drifting_turn()
     gps = smooth(GpsTrack(times, truth + np.random.default_rng(seed).normal(0, 0.1, truth.shape)))
-    factor = scale.factors(times, found, np.zeros(51, bool), gps, scale.AHEAD)
+    factor = scale.factors(times, found, np.zeros(51, bool), gps, scale.DRIFT_PERSPECTIVE)
     assert ate(scale.apply(found, factor), truth) < 0.5 * ate(found, truth)
 
 

@@ -1,6 +1,6 @@
-"""Decoders of photos: a file a library (`pipeline.core.plugins`), of the formats that it reads better than the others.
+"""Image decoders: one module per library (`pipeline.core.plugins`), for the formats that it reads best.
 
-Which is better, and by how much: `bench/images.py`, docs/formats.md.
+Comparison of the libraries: `bench/images.py`, docs/reference/formats.md.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from typing import Any, NamedTuple, Protocol
 import numpy.typing as npt
 
 Box = tuple[int, int, int, int]
-"""The first column and row of a part, and those after its last."""
-AGAIN = "Copy it again, or leave it out"
+"""Part of an image: first column and row, and column and row after the last (x0, y0, x1, y1)."""
+COPY_AGAIN = "Copy it again, or leave it out"
 
 
 class Header(NamedTuple):
-    """What a photo says of itself.
+    """Header of an image.
 
     Attributes:
         width, height: pixels.
-        profile: ICC, of its colours; None: it has none.
+        profile: ICC profile, or None.
     """
 
     width: int
@@ -29,28 +29,29 @@ class Header(NamedTuple):
 
 
 class Decoder(Protocol):
-    """What a library's module has. All raise InputError where a file can't be read.
+    """Interface of a decoder module. Its functions raise InputError if a file can't be read.
 
     Attributes:
-        SUFFIXES: ends of its files' names, in small letters.
-        PARTS: whether a part is read without the rest.
+        SUFFIXES: suffixes of its files, in lower case.
+        PARTS: whether it can read a part of an image without decoding the rest.
     """
 
     SUFFIXES: tuple[str, ...]
     PARTS: bool
 
     def header(self, path: Path) -> Header:
-        """Read without the pixels."""
+        """Read the header only."""
 
     def check(self, path: Path) -> None:
-        """Decode as much as it takes to know that the file is whole."""
+        """Decode as much as necessary to know that the file is complete."""
 
     def pixels(self, path: Path, grey: bool = False, box: Box | None = None) -> npt.NDArray[Any]:
-        """(H, W, 3) RGB, or (H, W) where that is all there is, turned as they lie in the file.
+        """Pixels (H, W, 3) RGB, or (H, W) of a grey image, without applying the EXIF orientation.
 
-        uint8 and uint16: encoded, as sRGB or as the profile says; float32: linear light in the primaries of sRGB.
+        uint8 and uint16 are encoded as sRGB, or as the profile says; float32 is linear light with sRGB primaries.
 
         Args:
-            grey: grey levels will do.
-            box: part to be read; None: the whole.
+            path: image file.
+            grey: grey levels are sufficient.
+            box: part to read; None: the whole image.
         """

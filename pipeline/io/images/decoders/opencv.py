@@ -1,4 +1,4 @@
-"""OpenCV: JPEG, PNG, WebP and BMP; headers, and a quick look through a JPEG, by Pillow."""
+"""OpenCV decoder: JPEG, PNG, WebP and BMP; headers and the quick check of a JPEG by Pillow."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.io.images.decoders import AGAIN, Box, Header
+from scan2sim.pipeline.io.images.decoders import COPY_AGAIN, Box, Header
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 PARTS = False
@@ -24,7 +24,7 @@ def header(path: Path) -> Header:
 
 
 def check(path: Path) -> None:
-    """See `pipeline.io.images.decoders.Decoder`; a JPEG at an eighth."""
+    """See `pipeline.io.images.decoders.Decoder`; a JPEG is decoded at 1/8 of its size."""
     with opened(path) as image:
         image.draft(None, (image.size[0] // 8, image.size[1] // 8))
         image.load()
@@ -34,13 +34,13 @@ def pixels(path: Path, grey: bool = False, box: Box | None = None) -> npt.NDArra
     """See `pipeline.io.images.decoders.Decoder`."""
     import cv2
 
-    how = (cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR) | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    flags = (cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR) | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        found = cv2.imread(str(path), how)
+        found = cv2.imread(str(path), flags)
     except cv2.error as error:
-        raise InputError(path, f"can't be read ({error.err})", AGAIN) from None
+        raise InputError(path, f"can't be read ({error.err})", COPY_AGAIN) from None
     if found is None:
-        raise InputError(path, "can't be read (no picture of a known kind, or damaged)", AGAIN)
+        raise InputError(path, "can't be read (unknown image format, or damaged)", COPY_AGAIN)
     x0, y0, x1, y1 = box or (0, 0, found.shape[1], found.shape[0])
     part = found[y0:y1, x0:x1]
     return np.ascontiguousarray(part if grey else part[..., ::-1])
@@ -48,18 +48,20 @@ def pixels(path: Path, grey: bool = False, box: Box | None = None) -> npt.NDArra
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """A photo by Pillow, its header read.
+    """Open an image with Pillow, which reads the header.
 
     Raises:
-        InputError: it can't be read, here or while it is open.
+        InputError: it can't be read, now or inside the `with` block.
     """
     from PIL import Image, UnidentifiedImageError
 
-    Image.MAX_IMAGE_PIXELS = None  # `image.MAX_PIXELS` is the limit: Pillow's own is below what 360 cameras make
+    Image.MAX_IMAGE_PIXELS = (
+        None  # `image.MAX_PIXELS` is the limit: Pillow's own is below the size of 360-degree photos
+    )
     try:
         with Image.open(path) as image:
             yield image
-    except UnidentifiedImageError:  # it cites the path alone
-        raise InputError(path, "can't be read (no picture of a known kind, or damaged)", AGAIN) from None
-    except Exception as error:  # its decoders raise whatever the damage leads to
-        raise InputError(path, f"can't be read ({error})", AGAIN) from None
+    except UnidentifiedImageError:  # its message is only the path
+        raise InputError(path, "can't be read (unknown image format, or damaged)", COPY_AGAIN) from None
+    except Exception as error:  # damaged files make its decoders raise any type of exception
+        raise InputError(path, f"can't be read ({error})", COPY_AGAIN) from None

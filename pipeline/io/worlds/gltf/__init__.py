@@ -1,1 +1,1 @@
-"""What glTF files are made of, which `pipeline/io/worlds/glb.py` writes: buffers, textures, geometry, metadata."""
+"""Parts of the glTF files that `pipeline/io/worlds/glb.py` writes: buffers, textures, geometry, metadata."""

@@ -1,4 +1,4 @@
-"""A GLB while it is put together: buffer views, accessors, extensions."""
+"""Builder of GLB files: buffer views, accessors, extensions."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from scan2sim.pipeline.core.errors import from_os_error
 
 Array = npt.NDArray[Any]
 
-ALIGNED = 8
-"""Bytes that buffer views begin at multiples of, as tables of properties must."""
+ALIGNMENT_BYTES = 8
+"""Alignment of buffer views, which property tables require."""
 VERTICES, INDICES = 34962, 34963
 """Targets of buffer views."""
-COMPONENT = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
-TYPE = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+COMPONENT_TYPES = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
+ACCESSOR_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 MAGIC, JSON, BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
 
 
 class Builder:
-    """A file with one binary buffer.
+    """A glTF file with one binary buffer.
 
     Attributes:
-        tree: the JSON; its lists may be empty, and are left out then.
+        tree: the JSON; empty lists are omitted from the file.
     """
 
     def __init__(self) -> None:
@@ -41,51 +41,53 @@ class Builder:
         self._fallback = 0
 
     def add(self, kind: str, entry: dict[str, Any]) -> int:
-        """Put an entry into a list of the tree; returns its index."""
+        """Append an entry to a list of the tree; returns its index."""
         self.tree[kind].append(entry)
         return len(self.tree[kind]) - 1
 
     def use(self, extension: str, *, required: bool = False) -> None:
-        """Name an extension; required: readers that don't know it can't show the file."""
+        """Declare an extension; required: readers that don't support it can't show the file."""
         for kind in ("extensionsUsed", *(["extensionsRequired"] if required else [])):
             if extension not in self.tree[kind]:
                 self.tree[kind].append(extension)
 
-    def view(self, data: bytes, **about: Any) -> int:
-        """A buffer view of some bytes; returns its index."""
-        return self.add("bufferViews", {"buffer": 0, **self.place(data), **about})
+    def view(self, data: bytes, **properties: Any) -> int:
+        """Add a buffer view of some bytes; returns its index."""
+        return self.add("bufferViews", {"buffer": 0, **self.append(data), **properties})
 
-    def place(self, data: bytes) -> dict[str, int]:
-        """Put bytes into the buffer; returns where they are."""
+    def append(self, data: bytes) -> dict[str, int]:
+        """Append bytes to the buffer; returns their offset and length."""
         at = self._length
-        self._parts += [data, b"\0" * (-len(data) % ALIGNED)]
+        self._parts += [data, b"\0" * (-len(data) % ALIGNMENT_BYTES)]
         self._length += len(self._parts[-2]) + len(self._parts[-1])
         return {"byteOffset": at, "byteLength": len(data)}
 
-    def unpacked(self, size: int) -> dict[str, int]:
-        """Room for bytes that are kept packed, in the buffer that readers unpack to; returns where it is."""
+    def reserve_decoded(self, size: int) -> dict[str, int]:
+        """Reserve bytes for compressed data in the buffer that readers decode to; returns offset and length."""
         at = self._fallback
-        self._fallback += size + -size % ALIGNED
+        self._fallback += size + -size % ALIGNMENT_BYTES
         return {"buffer": 1, "byteOffset": at, "byteLength": size}
 
     def accessor(self, values: Array, view: int | None, *, bounds: bool = False, normalized: bool = False) -> int:
-        """An accessor of rows (N,) or (N, k), which lie in a buffer view; None: in packed geometry.
+        """Add an accessor; returns its index.
 
         Args:
-            bounds: say the lowest and highest of each column, as positions must.
-            normalized: integers stand for 0 to 1, or -1 to 1.
+            values: rows (N,) or (N, k).
+            view: the buffer view that contains them; None: compressed geometry contains them.
+            bounds: write minimum and maximum of each column, which positions require.
+            normalized: integers represent 0 to 1, or -1 to 1.
         """
         columns = 1 if values.ndim == 1 else values.shape[1]
-        about: dict[str, Any] = {
-            "componentType": COMPONENT[str(values.dtype)], "count": len(values), "type": TYPE[columns],
+        accessor: dict[str, Any] = {
+            "componentType": COMPONENT_TYPES[str(values.dtype)], "count": len(values), "type": ACCESSOR_TYPES[columns],
         }  # fmt: skip
         if view is not None:
-            about["bufferView"] = view
+            accessor["bufferView"] = view
         if normalized:
-            about["normalized"] = True
+            accessor["normalized"] = True
         if bounds:
-            about |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
-        return self.add("accessors", about)
+            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+        return self.add("accessors", accessor)
 
     def save(self, path: Path) -> None:
         """Write the file.
@@ -95,15 +97,15 @@ class Builder:
         """
         buffers: list[dict[str, Any]] = [{"byteLength": self._length}]
         if self._fallback:
-            kept = {"EXT_meshopt_compression": {"fallback": True}}  # readers unpack to it, it is nowhere
-            buffers.append({"byteLength": self._fallback, "extensions": kept})
+            fallback = {"EXT_meshopt_compression": {"fallback": True}}  # has no data: readers decode to it
+            buffers.append({"byteLength": self._fallback, "extensions": fallback})
         tree = {name: value for name, value in self.tree.items() if value not in ([], {})} | {"buffers": buffers}
         text = json.dumps(tree, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
-        whole = 12 + 8 + len(text) + 8 + self._length
+        file_bytes = 12 + 8 + len(text) + 8 + self._length
         try:
             with path.open("wb") as file:
-                file.write(struct.pack("<5I", MAGIC, 2, whole, len(text), JSON) + text)
+                file.write(struct.pack("<5I", MAGIC, 2, file_bytes, len(text), JSON) + text)
                 file.write(struct.pack("<2I", self._length, BINARY))
                 file.writelines(self._parts)
         except OSError as error:
@@ -111,12 +113,12 @@ class Builder:
 
 
 def rows(values: Array) -> Array:
-    """(N, k) with rows of whole 4 bytes, as vertex attributes must have: filled up with zeros."""
+    """Rows (N, k) padded with zeros to a multiple of 4 bytes, which vertex attributes require."""
     table = values.reshape(len(values), -1)
     missing = -table.shape[1] * table.itemsize % 4 // table.itemsize
     return np.ascontiguousarray(np.pad(table, ((0, 0), (0, missing))))
 
 
 def indices(faces: Array, vertices: int) -> Array:
-    """(3F,) of faces (F, 3), in as few bytes as they fit in; the largest number is none."""
+    """Indices (3F,) of faces (F, 3) in the smallest type; its largest number is reserved (primitive restart)."""
     return faces.ravel().astype(np.uint16 if vertices < 65_535 else np.uint32)

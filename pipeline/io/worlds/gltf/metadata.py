@@ -1,7 +1,7 @@
-"""Where each face has its colour from, as glTF tells it: `EXT_mesh_features` and `EXT_structural_metadata`.
+"""Provenance of each face's colour in glTF: `EXT_mesh_features` and `EXT_structural_metadata`.
 
-`_FEATURE_ID_0` of a vertex is a row of a table (`pipeline.io.worlds.provenance`): `source`, and of photos `photo`,
-their name, and `taken`. `_DISTANCE` is how far the vertex lies from that photo's camera, metres.
+`_FEATURE_ID_0` of a vertex is a row of a table (`pipeline.io.worlds.provenance`): `source`, and for photos their name
+`photo` and capture time `taken`. `_DISTANCE` is the distance (m) of the vertex from that photo's camera.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.io.worlds.gltf.builder import Builder
-from scan2sim.pipeline.io.worlds.provenance import SOURCES, UNKNOWN, Row
+from scan2sim.pipeline.io.worlds.provenance import SOURCES, UNKNOWN_DISTANCE, Row
 
 FEATURES, METADATA = "EXT_mesh_features", "EXT_structural_metadata"
 FEATURE, DISTANCE = "_FEATURE_ID_0", "_DISTANCE"
@@ -36,7 +36,7 @@ SCHEMA: dict[str, Any] = {
         "place": {
             "properties": {
                 "distance": {
-                    "type": "SCALAR", "componentType": "FLOAT32", "noData": UNKNOWN,
+                    "type": "SCALAR", "componentType": "FLOAT32", "noData": UNKNOWN_DISTANCE,
                     "description": "Metres to the photo's camera",
                 }
             }
@@ -46,7 +46,7 @@ SCHEMA: dict[str, Any] = {
 
 
 def describe(builder: Builder, rows: Sequence[Row]) -> None:
-    """Put the table into a file."""
+    """Add the provenance table to a file."""
     builder.use(FEATURES)
     builder.use(METADATA)
     source = np.array([SOURCES.index(row.source) for row in rows], np.uint8)
@@ -66,7 +66,7 @@ def describe(builder: Builder, rows: Sequence[Row]) -> None:
 
 
 def of_primitive(rows: int) -> dict[str, Any]:
-    """The extensions of a primitive whose vertices refer to a table of so many rows."""
+    """The extensions of a primitive whose vertices refer to a table with `rows` rows."""
     return {
         FEATURES: {"featureIds": [{"featureCount": rows, "attribute": 0, "propertyTable": 0}]},
         METADATA: {"propertyAttributes": [0]},

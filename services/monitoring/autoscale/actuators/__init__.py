@@ -1,4 +1,4 @@
-"""What starts and stops workers, a file each: processes that take events from a queue, workers of a Prefect pool."""
+"""Actuators of the autoscaler: start and stop local worker processes, Prefect workers or replicas in OSM."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from typing import Protocol
 
 
 class Actuator(Protocol):
-    """Keeps so many workers running as it was told, whatever becomes of them."""
+    """Keeps the requested number of workers running and restarts those that die."""
 
     def scale(self, count: int) -> None:
-        """Start or stop workers until so many run; returns at once."""
+        """Set the number of workers; returns at once."""
 
     def workers(self) -> int:
-        """Workers that run."""
+        """Number of running workers."""
 
     def close(self) -> None:
-        """Stop all, and wait for their end."""
+        """Stop all workers and wait until they have ended."""

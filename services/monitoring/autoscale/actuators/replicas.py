@@ -1,4 +1,4 @@
-"""Workers that are programs which find their work themselves: so many copies of one, started anew where they die."""
+"""Actuator for replicas of a program that fetches its work itself; replicas that die are restarted."""
 
 from __future__ import annotations
 
@@ -9,37 +9,37 @@ from dataclasses import dataclass
 
 from scan2sim.services.monitoring.autoscale.actuators import supervise
 
-LOOKED_AT = 0.5
-"""Seconds between two looks at whether all run."""
-LONGEST_PAUSE = 60.0
-"""Seconds between two starts of a program that dies, at most."""
-LASTED = 60.0
-"""Seconds after which a program counts as one that runs."""
+CHECK_INTERVAL_S = 0.5
+"""Pause between two checks whether all replicas are running."""
+MAX_RESTART_PAUSE_S = 60.0
+"""Upper bound of the exponential backoff between restarts of a replica."""
+STABLE_AFTER_S = 60.0
+"""A replica that has run for so long restarts without backoff."""
 
 
 @dataclass
-class _Copy:
+class _Replica:
     process: subprocess.Popen[bytes]
     started: float
     pause: float = 1.0
 
 
-class Programs:
-    """So many copies of a program (`actuators.Actuator`); on Linux and other systems with sessions of processes."""
+class ProgramReplicas:
+    """Replicas of a program (`actuators.Actuator`); on Linux and other systems with process sessions."""
 
     def __init__(self, program: list[str]) -> None:
         self._program, self._lock = program, threading.Lock()
-        self._running: list[_Copy] = []
+        self._running: list[_Replica] = []
         self._ending: list[subprocess.Popen[bytes]] = []
         self._closed = threading.Event()
-        self._keeping = threading.Thread(target=self._keep, name="programs", daemon=True)
-        self._keeping.start()
+        self._supervisor = threading.Thread(target=self._supervise, name="programs", daemon=True)
+        self._supervisor.start()
 
     def scale(self, count: int) -> None:
-        """Start or stop copies."""
+        """Set the number of replicas."""
         with self._lock:
             while len(self._running) < count:
-                self._running.append(_Copy(self._start(), time.monotonic()))
+                self._running.append(_Replica(self._start(), time.monotonic()))
             while len(self._running) > count:
                 process = self._running.pop().process
                 _end(process)
@@ -47,14 +47,14 @@ class Programs:
             self._ending = [one for one in self._ending if one.poll() is None]
 
     def workers(self) -> int:
-        """Those that run."""
+        """Number of running replicas."""
         with self._lock:
             return sum(one.process.poll() is None for one in self._running)
 
     def close(self) -> None:
-        """Stop all."""
+        """Stop all replicas and wait until they have ended."""
         self._closed.set()
-        self._keeping.join()
+        self._supervisor.join()
         self.scale(0)
         for process in self._ending:
             process.wait()
@@ -62,14 +62,15 @@ class Programs:
     def _start(self) -> subprocess.Popen[bytes]:
         return subprocess.Popen(supervise.command(self._program), stdin=subprocess.PIPE)
 
-    def _keep(self) -> None:
-        while not self._closed.wait(LOOKED_AT):
+    def _supervise(self) -> None:
+        while not self._closed.wait(CHECK_INTERVAL_S):
             now = time.monotonic()
             with self._lock:
                 for one in self._running:
                     if one.process.poll() is not None and now - one.started > one.pause:
                         _end(one.process)
-                        one.pause = 1.0 if now - one.started > LASTED else min(LONGEST_PAUSE, 2 * one.pause)
+                        is_stable = now - one.started > STABLE_AFTER_S
+                        one.pause = 1.0 if is_stable else min(MAX_RESTART_PAUSE_S, 2 * one.pause)
                         one.process, one.started = self._start(), now
 
 

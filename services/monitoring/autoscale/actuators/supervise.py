@@ -1,6 +1,6 @@
-"""Runs a program for as long as this one's input is open: so none is left when the one that started it is killed.
+"""Runs a program while the supervisor's standard input is open, so that none is left when the parent is killed.
 
-The program is this one's arguments. It is asked to end (SIGTERM), and killed with all that it started if it doesn't.
+The arguments are the program's command line. It receives SIGTERM, and after a timeout its process group is killed.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ import subprocess
 import sys
 import threading
 
-ENDS_WITHIN = 20.0
-"""Seconds that a program has to end, once it is asked to."""
+STOP_TIMEOUT_S = 20.0
+"""Time that the program has to exit after SIGTERM."""
 
 
 def command(program: list[str]) -> list[str]:
-    """That keeps a program."""
+    """Command line that runs a program under supervision."""
     return [sys.executable, "-I", "-S", __file__, *program]
 
 
 def main() -> None:
-    """Run it to its end, or to that of the input."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for who started this one
+    """Run the program until it exits or the input ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent
     program = subprocess.Popen(sys.argv[1:], stdin=subprocess.DEVNULL, start_new_session=True)
     threading.Thread(target=_end_with_input, args=(program,), daemon=True).start()
     sys.exit(abs(program.wait()))
@@ -33,7 +33,7 @@ def _end_with_input(program: subprocess.Popen[bytes]) -> None:
     sys.stdin.buffer.read()
     program.terminate()
     with contextlib.suppress(subprocess.TimeoutExpired):
-        program.wait(ENDS_WITHIN)
+        program.wait(STOP_TIMEOUT_S)
     with contextlib.suppress(ProcessLookupError):
         os.killpg(program.pid, signal.SIGKILL)
     program.wait()

@@ -1,7 +1,7 @@
-"""Translators: how each kind of vehicle is told what to do; a file each, found by its name (`pipeline.core.plugins`).
+"""Vehicle adapters: one module for each kind of vehicle, found by name (`pipeline.core.plugins`).
 
-A new vehicle costs one file: its settings, and an object that takes controls and tells of the vehicle. The protocol of
-the car unit, the watchdog and the network are `translating`'s, the same for all.
+A new kind of vehicle needs one module: its settings, and an object that applies controls and reports the vehicle's
+state. Protocol, watchdog and network are common to all (`vehicle.adapter`).
 """
 
 from __future__ import annotations
@@ -12,55 +12,55 @@ from scan2sim.pipeline.core import plugins, step
 from scan2sim.services.teleoperation.control.controls import Controls, VehicleState
 
 
-class Unreachable(Exception):
-    """The vehicle can't be told anything now: it stands by the translator's stop until the driver confirms."""
+class VehicleUnreachable(Exception):
+    """The vehicle can't be controlled now; the adapter's stop holds until the driver confirms."""
 
 
 class Vehicle(Protocol):
-    """A vehicle, as its translator reaches it; all is called in one thread."""
+    """A vehicle, as its adapter controls it; all methods are called in one thread."""
 
     def obey(self, controls: Controls) -> None:
-        """Tell it what to do, within some milliseconds; called every period, also while it stands.
+        """Apply controls, within some milliseconds; called every period, also while the vehicle is stopped.
 
         Raises:
-            Unreachable: that is impossible now; it is tried again at the next call.
+            VehicleUnreachable: this is impossible now; the next call retries.
         """
 
     def state(self) -> VehicleState:
-        """How it is, as far as that is known; returns at once."""
+        """Last known state; returns at once."""
 
     def close(self) -> None:
-        """Leave it; it was told to stand before."""
+        """Disconnect; the vehicle was stopped before."""
 
 
-class Translator(Protocol):
-    """What a file here has.
+class VehicleAdapter(Protocol):
+    """Interface of an adapter module.
 
     Attributes:
-        Params: its settings.
+        Params: settings of the adapter.
     """
 
     Params: type[step.Params]
 
     def connect(self, params: Any) -> Vehicle:
-        """Reach the vehicle.
+        """Connect to the vehicle.
 
         Raises:
-            ScanError: its settings or files are wrong; not where the vehicle merely isn't there yet.
+            ScanError: settings or files are wrong; not raised if the vehicle merely isn't available yet.
         """
 
 
 def names() -> list[str]:
-    """Of all translators."""
+    """Names of all adapters."""
     return plugins.names(__name__)
 
 
-def find(name: str) -> Translator:
-    """A translator that can run here.
+def find(name: str) -> VehicleAdapter:
+    """An adapter that can run here.
 
     Raises:
-        SettingError: there is none of that name.
+        SettingError: there is no adapter of that name.
         UnavailableError: a package that it needs isn't installed.
     """
-    found: Translator = plugins.find(__name__, name, "translator")
+    found: VehicleAdapter = plugins.find(__name__, name, "adapter")
     return found

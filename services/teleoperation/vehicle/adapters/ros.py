@@ -1,7 +1,7 @@
-"""Vehicles of ROS 2: a `Twist`, `TwistStamped` or `AckermannDriveStamped` on a topic, their odometry from another.
+"""ROS 2 vehicles: publishes `Twist`, `TwistStamped` or `AckermannDriveStamped`, and subscribes to odometry.
 
-The throttle is the share of the greatest speed that is asked for, the brake takes from it: what moves such vehicles
-keeps a speed that it is told, and limits how fast it changes.
+The commanded speed is throttle times the maximum speed, reduced by the brake: controllers of such vehicles track a
+commanded speed and limit its rate of change.
 """
 
 from __future__ import annotations
@@ -14,48 +14,50 @@ from pydantic import Field
 
 from scan2sim.pipeline.core import step
 from scan2sim.services.teleoperation.control.controls import Controls, Gear, VehicleState
-from scan2sim.services.teleoperation.vehicle.adapters import Unreachable, Vehicle
+from scan2sim.services.teleoperation.vehicle.adapters import Vehicle, VehicleUnreachable
 from scan2sim.services.transport import QoS, load
 from scan2sim.services.transport.names import TopicName, qualified
 
-TYPES = {
+MESSAGE_TYPES = {
     "twist": "geometry_msgs/msg/Twist",
     "twist_stamped": "geometry_msgs/msg/TwistStamped",
     "ackermann": "ackermann_msgs/msg/AckermannDriveStamped",
 }
-ODOMETRY = "nav_msgs/msg/Odometry"
-NEWEST = QoS(depth=1)
-LISTENED = QoS(reliability="BEST_EFFORT", depth=1)
-"""From publishers of either reliability."""
-QUIET = 1.0
-"""Seconds without odometry until that is told."""
+ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
+COMMAND_QOS = QoS(depth=1)
+ODOMETRY_QOS = QoS(reliability="BEST_EFFORT", depth=1)
+"""Best effort, to match publishers of either reliability."""
+ODOMETRY_TIMEOUT_S = 1.0
+"""Silence of odometry after which it is reported as a fault."""
 
 
 class Params(step.Params):
-    """Of a vehicle of ROS 2."""
+    """Settings of a ROS 2 vehicle."""
 
-    topic: Annotated[TopicName, Field(description="Where it is told what to do.")] = "cmd_vel"
-    message: Annotated[Literal["twist", "twist_stamped", "ackermann"], Field(description="What it is told by.")] = (
-        "twist"
+    topic: Annotated[TopicName, Field(description="Topic on which commands are published.")] = "cmd_vel"
+    message: Annotated[
+        Literal["twist", "twist_stamped", "ackermann"], Field(description="Message type of the commands.")
+    ] = "twist"
+    odometry: Annotated[str, Field(description='Topic of the vehicle\'s odometry; "": none.')] = "odom"
+    speed: Annotated[float, Field(gt=0, le=60, description="Speed at full throttle, m/s.")] = 1.0
+    angle: Annotated[float, Field(gt=0, le=1.5, description="Angle of the front wheels at full steering, radians.")] = (
+        0.6
     )
-    odometry: Annotated[str, Field(description='Topic of its odometry; "": there is none.')] = "odom"
-    speed: Annotated[float, Field(gt=0, le=60, description="Metres a second at full throttle.")] = 1.0
-    angle: Annotated[float, Field(gt=0, le=1.5, description="Radians of the front wheels at full steering.")] = 0.6
     wheelbase: Annotated[
-        float, Field(gt=0, le=20, description="Metres between axles, which make of the angle a turn in a twist.")
+        float, Field(gt=0, le=20, description="Distance between the axles, metres; converts steering to a yaw rate.")
     ] = 0.5
 
 
 def connect(params: Params) -> Vehicle:
-    """See `translators.Translator`."""
+    """See `adapters.VehicleAdapter`."""
     return RosVehicle(params)
 
 
 class RosVehicle:
-    """See `translators.Vehicle`.
+    """See `adapters.Vehicle`.
 
     Raises:
-        SettingError: the type of its messages isn't known here.
+        SettingError: the transport doesn't know the message type.
         UnavailableError: there is no transport.
     """
 
@@ -64,30 +66,30 @@ class RosVehicle:
         self._ros.init()
         self._node = self._ros.Node("teleoperation")
         self._topic = qualified(params.topic)
-        self._type = TYPES[params.message]
-        self._out = self._node.create_publisher(self._ros.message_type(self._type), self._topic, NEWEST)
-        self._state, self._heard, self._gear = VehicleState(), time.monotonic(), Gear.NEUTRAL
+        self._type = MESSAGE_TYPES[params.message]
+        self._publisher = self._node.create_publisher(self._ros.message_type(self._type), self._topic, COMMAND_QOS)
+        self._state, self._last_odometry, self._gear = VehicleState(), time.monotonic(), Gear.NEUTRAL
         if params.odometry:
-            odometry = self._ros.message_type(ODOMETRY)
-            self._node.create_subscription(odometry, qualified(params.odometry), self._hear, LISTENED)
+            odometry = self._ros.message_type(ODOMETRY_TYPE)
+            self._node.create_subscription(odometry, qualified(params.odometry), self._receive_odometry, ODOMETRY_QOS)
 
     def obey(self, controls: Controls) -> None:
-        """Publish what is asked for, and take odometry."""
-        self._out.publish(self._message(controls))
+        """Publish the controls, and process odometry."""
+        self._publisher.publish(self._message(controls))
         self._gear = controls.gear
         self._ros.spin_once(self._node, 0.0)
-        if self._out.get_subscription_count() == 0:
-            raise Unreachable(f"nobody listens on {self._topic}")
+        if self._publisher.get_subscription_count() == 0:
+            raise VehicleUnreachable(f"nothing subscribes to {self._topic}")
 
     def state(self) -> VehicleState:
-        """As its odometry says."""
+        """State from the last odometry."""
         faults: tuple[str, ...] = ()
-        if self._params.odometry and time.monotonic() - self._heard > QUIET:
+        if self._params.odometry and time.monotonic() - self._last_odometry > ODOMETRY_TIMEOUT_S:
             faults = (f"no odometry on {qualified(self._params.odometry)}",)
         return VehicleState(self._state.speed, self._state.position, self._state.heading, self._gear, faults)
 
     def close(self) -> None:
-        """Leave ROS 2."""
+        """Shut down ROS 2."""
         self._node.destroy_node()
         self._ros.shutdown()
 
@@ -106,8 +108,8 @@ class RosVehicle:
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, 10**9)
         return message
 
-    def _hear(self, message: Any) -> None:
-        place, q = message.pose.pose.position, message.pose.pose.orientation
+    def _receive_odometry(self, message: Any) -> None:
+        position, q = message.pose.pose.position, message.pose.pose.orientation
         heading = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y**2 + q.z**2))
-        self._state = VehicleState(float(message.twist.twist.linear.x), (float(place.x), float(place.y)), heading)
-        self._heard = time.monotonic()
+        self._state = VehicleState(float(message.twist.twist.linear.x), (float(position.x), float(position.y)), heading)
+        self._last_odometry = time.monotonic()

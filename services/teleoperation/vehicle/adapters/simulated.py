@@ -1,4 +1,4 @@
-"""A car simulated in a world that this project made (`services.teleoperation.sim.bicycle`)."""
+"""A simulated car in a world created by this project (`services.teleoperation.sim.bicycle`)."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from scan2sim.services.teleoperation.vehicle.adapters import Vehicle
 
 
 class Params(step.Params):
-    """Of a car that is simulated."""
+    """Settings of a simulated car."""
 
-    world: Annotated[File, Field(description="Folder that was given to `run` or `survey` by --out.")]
+    world: Annotated[File, Field(description="Folder of a finished world, written by `run --out` or `survey --out`.")]
 
 
 def connect(params: Params) -> Vehicle:
-    """See `translators.Translator`."""
+    """See `adapters.VehicleAdapter`."""
     return SimulatedVehicle(SimulatedCar(Ground(read_scene(params.world))))
 
 
 class SimulatedVehicle:
-    """See `translators.Vehicle`; time goes on between calls."""
+    """See `adapters.Vehicle`; simulated time follows real time between calls."""
 
     def __init__(self, car: SimulatedCar) -> None:
         self.car = car
         self._last = time.monotonic()
 
     def obey(self, controls: Controls) -> None:
-        """Drive until now."""
+        """Apply the controls up to the present time."""
         now = time.monotonic()
-        self.car.go(controls, min(now - self._last, 1.0))
+        self.car.advance(controls, min(now - self._last, 1.0))
         self._last = now
 
     def state(self) -> VehicleState:
-        """Where it is."""
+        """Current state."""
         return self.car.state()
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Nothing to close."""

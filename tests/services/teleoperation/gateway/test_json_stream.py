@@ -1,4 +1,4 @@
-"""The gateway's connections: who gets in, and what comes of bad lines, slow readers and restarts."""
+"""Connections of the gateway: authentication, malformed lines, slow readers and restarts."""
 
 from __future__ import annotations
 
@@ -12,99 +12,99 @@ from typing import Any
 import pytest
 from OpenSSL import SSL
 
-from scan2sim.services.teleoperation.gateway import json_stream as stream
+from scan2sim.services.teleoperation.gateway import json_stream
 from scan2sim.services.teleoperation.gateway.identity import Identity, Role
-from scan2sim.services.teleoperation.gateway.json_stream import Client, Server, Stream
+from scan2sim.services.teleoperation.gateway.json_stream import Client, Connection, Server
 from scan2sim.services.teleoperation.transport import tls
-from scan2sim.services.teleoperation.transport.tls import Channel, Refused
+from scan2sim.services.teleoperation.transport.tls import Channel, TlsError
 from tests.services.teleoperation.certificates import OTHER, OWN, identity
 
 
-def until(said: Callable[[], Any], seconds: float = 60) -> None:
-    """Wait for it."""
+def until(condition: Callable[[], Any], seconds: float = 60) -> None:
+    """Wait for a condition."""
     end = time.monotonic() + seconds
-    while not said():
-        assert time.monotonic() < end, "it didn't come"
+    while not condition():
+        assert time.monotonic() < end, "timed out"
         time.sleep(0.005)
 
 
 class Side:
-    """What one side was told."""
+    """Records the callbacks of one side."""
 
     def __init__(self) -> None:
-        self.streams: list[Stream] = []
+        self.connections: list[Connection] = []
         self.lines: list[Any] = []
         self.ends: list[str] = []
 
-    def opened(self, stream: Stream) -> None:
-        self.streams.append(stream)
+    def opened(self, connection: Connection) -> None:
+        self.connections.append(connection)
 
-    def received(self, stream: Stream, told: Any) -> None:
-        self.lines.append(told)
+    def received(self, connection: Connection, message: Any) -> None:
+        self.lines.append(message)
 
-    def closed(self, *why: Any) -> None:
-        self.ends.append(str(why[-1]))
+    def closed(self, *arguments: Any) -> None:
+        self.ends.append(str(arguments[-1]))
 
     @property
-    def told(self) -> dict[str, Any]:
+    def callbacks(self) -> dict[str, Any]:
         return {"opened": self.opened, "received": self.received, "closed": self.closed}
 
 
 @pytest.fixture
 def gateway() -> Iterator[tuple[Server, Side]]:
     side = Side()
-    server = Server(identity(Role.GATEWAY), "127.0.0.1", 0, **side.told)
+    server = Server(identity(Role.GATEWAY), "127.0.0.1", 0, **side.callbacks)
     yield server, side
     server.close()
 
 
 @pytest.fixture
 def connect(gateway: tuple[Server, Side]) -> Iterator[Callable[..., tuple[Client, Side]]]:
-    made: list[Client] = []
+    clients: list[Client] = []
 
-    def client(who: Identity, host: str = "127.0.0.1") -> tuple[Client, Side]:
+    def client(party: Identity, host: str = "127.0.0.1") -> tuple[Client, Side]:
         side = Side()
-        made.append(Client(who, host, gateway[0].port, **side.told))
-        return made[-1], side
+        clients.append(Client(party, host, gateway[0].port, **side.callbacks))
+        return clients[-1], side
 
     yield client
-    for one in made:
+    for one in clients:
         one.close()
 
 
-def test_lines_go_both_ways_and_the_gateway_knows_who_sent_them(gateway: Any, connect: Any) -> None:
+def test_lines_go_both_ways_and_the_gateway_knows_the_sender(gateway: Any, connect: Any) -> None:
     car = identity(Role.VEHICLE, "car")
     client, mine = connect(car)
     until(lambda: client.connected)
     theirs = gateway[1]
-    until(lambda: theirs.streams)
-    assert theirs.streams[0].peer == car.me and mine.streams[0].peer.role == Role.GATEWAY
+    until(lambda: theirs.connections)
+    assert theirs.connections[0].peer == car.me and mine.connections[0].peer.role == Role.GATEWAY
     for number in range(500):
         assert client.send({"number": number, "text": "ü" * 200})
-        assert theirs.streams[0].send({"answer": number})
+        assert theirs.connections[0].send({"answer": number})
     until(lambda: len(theirs.lines) == 500 and len(mine.lines) == 500)
     assert [line["number"] for line in theirs.lines] == [line["answer"] for line in mine.lines] == list(range(500))
-    agreed = mine.streams[0].agreed
+    agreed = mine.connections[0].negotiated
     assert agreed["version"] == "TLSv1.3" and agreed["cipher"] == "TLS_CHACHA20_POLY1305_SHA256"
     assert agreed["group"] == "X25519MLKEM768"
 
 
 @pytest.mark.parametrize(
-    ("who", "why"),
+    ("party", "why"),
     [
         (identity(Role.VEHICLE, days=-1), "expired"),
-        (identity(Role.STATION, authority=OTHER, believes=OWN), "unknown ca|authority"),
+        (identity(Role.STATION, authority=OTHER, trusts=OWN), "unknown ca|authority"),
         (identity(Role.GATEWAY), "certificate|handshake"),
     ],
     ids=["expired", "another authority", "a gateway's"],
 )
-def test_who_is_no_party_gets_in_nowhere(gateway: Any, connect: Any, who: Identity, why: str) -> None:
-    client, mine = connect(who)
+def test_invalid_certificate_is_refused(gateway: Any, connect: Any, party: Identity, why: str) -> None:
+    client, mine = connect(party)
     until(lambda: mine.ends and gateway[1].ends)
-    assert not mine.streams and not gateway[1].streams and not client.send({"let": "me in"})
+    assert not mine.connections and not gateway[1].connections and not client.send({"let": "me in"})
 
 
-def test_nobody_gets_in_without_a_certificate(gateway: Any) -> None:
+def test_client_without_certificate_is_refused(gateway: Any) -> None:
     import ssl
 
     open_ = ssl.create_default_context()
@@ -116,24 +116,24 @@ def test_nobody_gets_in_without_a_certificate(gateway: Any) -> None:
             pass
         raise OSError("closed")
     until(lambda: gateway[1].ends)
-    assert not gateway[1].streams and not gateway[1].lines
+    assert not gateway[1].connections and not gateway[1].lines
 
 
-def test_a_client_talks_to_a_gateway_of_its_authority_and_host_alone(connect: Any) -> None:
+def test_client_accepts_only_a_gateway_of_its_authority_and_host(connect: Any) -> None:
     for false in (identity(Role.STATION), identity(Role.VEHICLE), identity(Role.GATEWAY, authority=OTHER)):
         theirs, mine = Side(), Side()
-        server = Server(false, "127.0.0.1", 0, **theirs.told)
-        client = Client(identity(Role.VEHICLE), "127.0.0.1", server.port, **mine.told)
+        server = Server(false, "127.0.0.1", 0, **theirs.callbacks)
+        client = Client(identity(Role.VEHICLE), "127.0.0.1", server.port, **mine.callbacks)
         until(partial(len, mine.ends))
         client.close()
         server.close()
-        assert not mine.streams and not theirs.streams
-    client, mine = connect(identity(Role.VEHICLE), "127.0.0.2")  # leads there, but isn't in its certificate
+        assert not mine.connections and not theirs.connections
+    client, mine = connect(identity(Role.VEHICLE), "127.0.0.2")  # reaches the gateway, but isn't in its certificate
     until(lambda: mine.ends)
-    assert not mine.streams
+    assert not mine.connections
 
 
-def test_tls_1_2_takes_the_missions_first_cipher() -> None:
+def test_tls_1_2_uses_the_first_cipher_of_the_list() -> None:
     server = tls.context(identity(Role.GATEWAY), datagrams=False)
     server.set_max_proto_version(SSL.TLS1_2_VERSION)
     ends = [
@@ -145,12 +145,12 @@ def test_tls_1_2_takes_the_missions_first_cipher() -> None:
             here.established or here.handshake()
             if data := here.take():
                 there.put(data)
-    assert ends[0].agreed()["cipher"] == "ECDHE-ECDSA-CHACHA20-POLY1305"
-    assert ends[0].agreed()["version"] == "TLSv1.2"
+    assert ends[0].negotiated()["cipher"] == "ECDHE-ECDSA-CHACHA20-POLY1305"
+    assert ends[0].negotiated()["version"] == "TLSv1.2"
 
 
 @pytest.mark.parametrize("sent", [b"hello\n", b"[1]\n", b'{"a": NaN}\n', b"[" * 5000 + b"\n", b"x" * 70000])
-def test_lines_that_are_none_end_the_connection(gateway: Any, sent: bytes) -> None:
+def test_malformed_lines_end_the_connection(gateway: Any, sent: bytes) -> None:
     channel = Channel(tls.context(identity(Role.VEHICLE), datagrams=False), client=True, accepts=lambda peer: True)
     with socket.create_connection(("127.0.0.1", gateway[0].port)) as sock:
         channel.handshake()
@@ -161,13 +161,13 @@ def test_lines_that_are_none_end_the_connection(gateway: Any, sent: bytes) -> No
         channel.write(sent)
         sock.sendall(channel.take())
         until(lambda: gateway[1].ends)
-    assert gateway[1].ends[0].startswith("it sent a line") and not gateway[1].lines
+    assert gateway[1].ends[0].startswith("received a line") and not gateway[1].lines
 
 
-def test_a_reader_that_is_too_slow_is_cut_off_and_nobody_else(gateway: Any, connect: Any) -> None:
+def test_only_a_slow_reader_is_disconnected(gateway: Any, connect: Any) -> None:
     gate, (server, theirs) = threading.Event(), gateway
 
-    def busy(*told: Any) -> None:
+    def busy(*arguments: Any) -> None:
         gate.wait(20)
 
     slow = Side()
@@ -175,13 +175,13 @@ def test_a_reader_that_is_too_slow_is_cut_off_and_nobody_else(gateway: Any, conn
         identity(Role.STATION), "127.0.0.1", server.port,
         opened=slow.opened, received=busy, closed=slow.closed,
     )  # fmt: skip
-    until(lambda: theirs.streams)
+    until(lambda: theirs.connections)
     _, mine = connect(identity(Role.VEHICLE))
-    until(lambda: len(theirs.streams) == 2)
-    first = theirs.streams[0]
+    until(lambda: len(theirs.connections) == 2)
+    first = theirs.connections[0]
     while first.send({"text": "x" * 50_000}):
         pass
-    assert theirs.streams[1].send({"still": "here"})
+    assert theirs.connections[1].send({"still": "here"})
     until(lambda: mine.lines)
     until(lambda: theirs.ends)
     assert "too slowly" in theirs.ends[0]
@@ -189,7 +189,7 @@ def test_a_reader_that_is_too_slow_is_cut_off_and_nobody_else(gateway: Any, conn
     client.close()
 
 
-def test_a_client_is_back_after_a_restart_of_the_gateway(gateway: Any, connect: Any) -> None:
+def test_client_reconnects_after_a_restart_of_the_gateway(gateway: Any, connect: Any) -> None:
     server, _ = gateway
     client, mine = connect(identity(Role.VEHICLE))
     until(lambda: client.connected)
@@ -197,37 +197,37 @@ def test_a_client_is_back_after_a_restart_of_the_gateway(gateway: Any, connect: 
     until(lambda: mine.ends)
     assert not client.connected and not client.send({})
     again = Side()
-    second = Server(identity(Role.GATEWAY), "127.0.0.1", server.port, **again.told)
-    until(lambda: again.streams and client.send({"back": 1}))
+    second = Server(identity(Role.GATEWAY), "127.0.0.1", server.port, **again.callbacks)
+    until(lambda: again.connections and client.send({"back": 1}))
     until(lambda: again.lines)
     second.close()
 
 
-def test_many_who_say_nothing_keep_nobody_out_for_long(
+def test_silent_connections_do_not_block_others_for_long(
     gateway: Any, connect: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stream, "GREETED", 0.5)
-    idle = [socket.create_connection(("127.0.0.1", gateway[0].port)) for _ in range(stream.STRANGERS + 20)]
+    monkeypatch.setattr(json_stream, "HANDSHAKE_TIMEOUT_S", 0.5)
+    idle = [socket.create_connection(("127.0.0.1", gateway[0].port)) for _ in range(json_stream.HANDSHAKES_MAX + 20)]
     client, _ = connect(identity(Role.VEHICLE))
     until(lambda: client.connected)
     for sock in idle:
         sock.close()
-    assert len(gateway[1].streams) == 1
+    assert len(gateway[1].connections) == 1
 
 
-def test_a_peer_that_vanishes_is_noticed(gateway: Any, connect: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream, "BEAT", 0.1)
-    monkeypatch.setattr(stream, "SILENT", 0.6)
+def test_lost_peer_is_detected(gateway: Any, connect: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(json_stream, "HEARTBEAT_S", 0.1)
+    monkeypatch.setattr(json_stream, "IDLE_TIMEOUT_S", 0.6)
     client, mine = connect(identity(Role.VEHICLE))
     until(lambda: client.connected)
     time.sleep(1)
-    assert client.connected and not mine.ends  # signs of life alone keep it
-    monkeypatch.setattr(Stream, "_send", lambda self, line: True)
-    until(lambda: "nothing more came" in gateway[1].ends)
+    assert client.connected and not mine.ends  # kept open by heartbeats alone
+    monkeypatch.setattr(Connection, "_send", lambda self, line: True)
+    until(lambda: "timed out" in gateway[1].ends)
 
 
-def test_what_is_put_in_wrongly_is_refused_not_raised_otherwise() -> None:
+def test_invalid_input_raises_tls_error() -> None:
     channel = Channel(tls.context(identity(Role.STATION), datagrams=False), client=False, accepts=lambda peer: True)
     channel.put(b"GET / HTTP/1.1\r\n\r\n")
-    with pytest.raises(Refused):
+    with pytest.raises(TlsError):
         channel.handshake()

@@ -1,4 +1,4 @@
-"""Vehicles and stations at a real gateway, over TLS: joined, told again, refused; the gateway starts anew meanwhile."""
+"""Vehicles and stations at a running gateway over TLS: joined, refused, and joined again after its restart."""
 
 from __future__ import annotations
 
@@ -10,40 +10,42 @@ import pytest
 
 pytest.importorskip("OpenSSL", reason="the extra teleop isn't installed")
 
-from scan2sim.services.teleoperation.gateway.client import Membership
+from scan2sim.services.teleoperation.gateway.client import GatewayConnection
 from scan2sim.services.teleoperation.gateway.fleet import Fleet
 from scan2sim.services.teleoperation.gateway.identity import Identity
 from scan2sim.services.teleoperation.gateway.pki import certify
 from scan2sim.services.teleoperation.gateway.protocol import (
     Address,
-    Ask,
-    Driving,
+    CurrentPair,
+    DriverRequest,
     Hello,
     Join,
     LinkStatus,
-    Refused,
     Release,
+    RequestRefused,
     Status,
 )
 from scan2sim.services.teleoperation.gateway.server import Gateway
 
 
-def until(true: Callable[[], object], seconds: float = 60) -> None:
+def until(condition: Callable[[], object], seconds: float = 60) -> None:
     end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end, "never true"
+    while not condition():
+        assert time.monotonic() < end, "timed out"
         time.sleep(0.02)
 
 
-class Told:
-    """A party that does what it is told."""
+class ObedientParty:
+    """A party that follows its orders."""
 
     def __init__(self, folder: Path, port: int, listening: tuple[Address, ...] = ()) -> None:
-        self.orders: list[Join | Release | Refused] = []
-        self.driving: Driving | None = None
+        self.orders: list[Join | Release | RequestRefused] = []
+        self.driving: CurrentPair | None = None
         self._listening = listening
         self.identity = Identity.read(folder)
-        self.membership = Membership(self.identity, Address(host="127.0.0.1", port=port), self, lambda _: None)
+        self.gateway_connection = GatewayConnection(
+            self.identity, Address(host="127.0.0.1", port=port), self, lambda _: None
+        )
 
     def hello(self) -> Hello:
         return Hello(listening=self._listening, driving=self.driving)
@@ -51,10 +53,10 @@ class Told:
     def status(self) -> Status:
         return Status(links=(LinkStatus(name="lte", up=True, round_trip=41.0),), speed=1.5)
 
-    def obey(self, order: Join | Release | Refused) -> None:
+    def handle_order(self, order: Join | Release | RequestRefused) -> None:
         self.orders.append(order)
         if isinstance(order, Join):
-            self.driving = Driving(pair=order.pair, other=order.other.name)
+            self.driving = CurrentPair(pair=order.pair, other=order.other.name)
         elif isinstance(order, Release):
             self.driving = None
 
@@ -68,53 +70,55 @@ def parties(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def gateway(parties: Path, tmp_path: Path) -> Iterator[Callable[[int], tuple[Gateway, Fleet]]]:
-    """Starts a gateway on a port, in place of the one before; all have one state."""
-    made: list[Gateway] = []
+    """Starts a gateway on a port in place of the previous one; all share one state."""
+    started: list[Gateway] = []
 
     def start(port: int) -> tuple[Gateway, Fleet]:
-        for one in made:
+        for one in started:
             one.close()
         fleet = Fleet(tmp_path / "state")
-        made.append(Gateway(Identity.read(parties / "gateway"), "127.0.0.1", port, fleet, lambda _: None))
-        return made[-1], fleet
+        started.append(Gateway(Identity.read(parties / "gateway"), "127.0.0.1", port, fleet, lambda _: None))
+        return started[-1], fleet
 
     yield start
-    for one in made:
+    for one in started:
         one.close()
 
 
-def test_a_pair_outlives_its_gateway(parties: Path, gateway: Callable[[int], tuple[Gateway, Fleet]]) -> None:
+def test_pair_survives_a_restart_of_the_gateway(parties: Path, gateway: Callable[[int], tuple[Gateway, Fleet]]) -> None:
     first, fleet = gateway(0)
     listening = (Address(host="192.0.2.1", port=7444),)
-    car = Told(parties / "vehicle-car", first.port)
-    desk = Told(parties / "station-desk", first.port, listening)
+    car = ObedientParty(parties / "vehicle-car", first.port)
+    desk = ObedientParty(parties / "station-desk", first.port, listening)
     try:
         until(lambda: car.orders and desk.orders)
-        desk.membership.ask(Ask(what="join", vehicle="car"))
+        desk.gateway_connection.send_request(DriverRequest(what="join", vehicle="car"))
         until(lambda: isinstance(car.orders[-1], Join) and isinstance(desk.orders[-1], Join))
-        told = car.orders[-1]
-        assert isinstance(told, Join) and told.listening == listening
-        assert told.other.fingerprint == desk.identity.me.fingerprint
-        until(lambda: fleet.facts()["vehicles"][0]["links"], 5)
-        assert fleet.facts()["vehicles"][0]["speed"] == 1.5
+        order = car.orders[-1]
+        assert isinstance(order, Join) and order.listening == listening
+        assert order.other.fingerprint == desk.identity.me.fingerprint
+        until(lambda: fleet.snapshot()["vehicles"][0]["links"], 5)
+        assert fleet.snapshot()["vehicles"][0]["speed"] == 1.5
         before = len(car.orders)
         _, again = gateway(first.port)
-        until(lambda: len(car.orders) > before and car.membership.connected())
-        assert car.orders[-1] == told and all(isinstance(one, Join) for one in car.orders[before:])
-        assert again.facts()["vehicles"][0]["other"] == "desk"
+        until(lambda: len(car.orders) > before and car.gateway_connection.connected())
+        assert car.orders[-1] == order and all(isinstance(one, Join) for one in car.orders[before:])
+        assert again.snapshot()["vehicles"][0]["other"] == "desk"
     finally:
-        car.membership.close()
-        desk.membership.close()
+        car.gateway_connection.close()
+        desk.gateway_connection.close()
 
 
-def test_what_is_not_done_is_told_to_who_asked(parties: Path, gateway: Callable[[int], tuple[Gateway, Fleet]]) -> None:
-    made, _ = gateway(0)
-    desk = Told(parties / "station-desk", made.port)
+def test_refused_request_is_reported_to_its_sender(
+    parties: Path, gateway: Callable[[int], tuple[Gateway, Fleet]]
+) -> None:
+    started, _ = gateway(0)
+    desk = ObedientParty(parties / "station-desk", started.port)
     try:
         until(lambda: desk.orders)
-        desk.membership.ask(Ask(what="join", vehicle="car"))
-        until(lambda: isinstance(desk.orders[-1], Refused))
+        desk.gateway_connection.send_request(DriverRequest(what="join", vehicle="car"))
+        until(lambda: isinstance(desk.orders[-1], RequestRefused))
         refused = desk.orders[-1]
-        assert isinstance(refused, Refused) and "no vehicle that is connected" in refused.cause
+        assert isinstance(refused, RequestRefused) and "not a connected vehicle" in refused.cause
     finally:
-        desk.membership.close()
+        desk.gateway_connection.close()

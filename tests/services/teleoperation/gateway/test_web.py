@@ -1,4 +1,4 @@
-"""Fleet management's API, and its page in a browser: what an operator sees and does."""
+"""API and page of fleet management: what an operator sees and does."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ pytest.importorskip("OpenSSL", reason="the extra teleop isn't installed")
 from fastapi.testclient import TestClient
 
 from scan2sim.services.http import factory
-from scan2sim.services.http.settings import Served
+from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.gateway.fleet import Fleet, Order
 from scan2sim.services.teleoperation.gateway.identity import Peer, Role
 from scan2sim.services.teleoperation.gateway.protocol import Hello, LinkStatus, Status
@@ -24,28 +24,28 @@ from tests.browser import chromium
 HOSTILE = "<img src=x onerror=document.title='hacked'>"
 
 
-class Listens:
+class FakeGateway:
     def alive(self) -> bool:
         return True
 
 
-def filled(tmp_path: Path) -> Fleet:
+def fleet_with_parties(tmp_path: Path) -> Fleet:
     fleet = Fleet(tmp_path)
     for role, name in ((Role.VEHICLE, "car"), (Role.VEHICLE, "van"), (Role.STATION, "desk"), (Role.STATION, "other")):
         orders: list[Order] = []
-        fleet.came(Peer(role, name, "0" * 64), Hello(cameras=("front",)), "10.0.0.1:5", orders.append)
+        fleet.connected(Peer(role, name, "0" * 64), Hello(cameras=("front",)), "10.0.0.1:5", orders.append)
     links = (LinkStatus(name="lte", up=True, round_trip=84.0, loss=0.01, rate=3.2), LinkStatus(name="wifi", up=False))
     status = Status(links=links, speed=2.5, age=48.0, told=HOSTILE)
-    fleet.told(Peer(Role.VEHICLE, "car", "0" * 64), status)
+    fleet.update_status(Peer(Role.VEHICLE, "car", "0" * 64), status)
     return fleet
 
 
-def app(fleet: Fleet, served: Served | None = None) -> Any:
-    return application(served or Served(), fleet, Listens())  # type: ignore[arg-type]
+def app(fleet: Fleet, served: ServerParams | None = None) -> Any:
+    return application(served or ServerParams(), fleet, FakeGateway())  # type: ignore[arg-type]
 
 
-def test_an_operator_joins_hands_over_takes_back_and_releases(tmp_path: Path) -> None:
-    client = TestClient(app(filled(tmp_path)), base_url="http://localhost")
+def test_operator_joins_hands_over_takes_back_and_releases(tmp_path: Path) -> None:
+    client = TestClient(app(fleet_with_parties(tmp_path)), base_url="http://localhost")
     assert client.post("/api/vehicles/car/join", json={"station": "desk"}).json() == {"pair": 1}
     refused = client.post("/api/vehicles/car/join", json={"station": "other"})
     assert refused.status_code == 409 and "driven from desk" in refused.json()["cause"]
@@ -57,19 +57,19 @@ def test_an_operator_joins_hands_over_takes_back_and_releases(tmp_path: Path) ->
     assert client.get("/api/fleet").json()["vehicles"][0]["pair"] is None
 
 
-def test_the_page_shows_who_is_there_and_joins_them(tmp_path: Path) -> None:
-    fleet, told = filled(tmp_path), list[str]()
-    served = Served(port=0)
-    threading.Thread(target=factory.run, args=(app(fleet, served), served, told.append), daemon=True).start()
+def test_page_lists_parties_and_joins_them(tmp_path: Path) -> None:
+    fleet, urls = fleet_with_parties(tmp_path), list[str]()
+    served = ServerParams(port=0)
+    threading.Thread(target=factory.run, args=(app(fleet, served), served, urls.append), daemon=True).start()
     end = time.monotonic() + 20
-    while not told and time.monotonic() < end:
+    while not urls and time.monotonic() < end:
         time.sleep(0.02)
     with chromium(tmp_path) as page:
-        page.do("Page.navigate", url=told[0])
+        page.do("Page.navigate", url=urls[0])
         page.until("document.querySelectorAll('#vehicles .run').length === 2")
         page.click("#vehicles .run button")
         page.until("document.querySelector('#vehicles').textContent.includes('driven from desk')")
         text = page.value("document.body.innerText")
         assert "84 ms 1.0 % lost" in text and "wifi down" in text and HOSTILE in text and "9.0 km/h" in text
         assert page.value("document.title") == "Fleet · scan2sim" and not page.errors
-    assert fleet.facts()["vehicles"][0]["other"] == "desk"
+    assert fleet.snapshot()["vehicles"][0]["other"] == "desk"

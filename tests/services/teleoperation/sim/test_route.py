@@ -1,4 +1,4 @@
-"""A drive along a street by script: its way lies on the lane, the car follows it, and how far off it was is told."""
+"""A scripted drive along a street: the reference path follows the lane, the car follows the path, within its error."""
 
 from __future__ import annotations
 
@@ -14,63 +14,70 @@ from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.io.worlds.scene import Scene
 from scan2sim.services.teleoperation.control.controls import VehicleState
 from scan2sim.services.teleoperation.control.messages import Telemetry
-from scan2sim.services.teleoperation.qos.scripted_drive import Route
+from scan2sim.services.teleoperation.qos.scripted_drive import ScriptedCommands
 from scan2sim.services.teleoperation.sim import route
 from scan2sim.services.teleoperation.sim.bicycle import Bicycle, Ground
-from scan2sim.services.teleoperation.sim.route import Driven, Pursuit
+from scan2sim.services.teleoperation.sim.route import LoopingVehicle, PurePursuit
 from tests.pipeline import synthetic
 
 STEP = 0.02
 
 
 def straight() -> F64:
-    return np.column_stack([np.arange(0.0, 30.0, route.SPACING), np.zeros(120)])
+    return np.column_stack([np.arange(0.0, 30.0, route.POINT_SPACING_M), np.zeros(120)])
 
 
-def told(vehicle: VehicleState) -> Telemetry:
+def telemetry(vehicle: VehicleState) -> Telemetry:
     return Telemetry(vehicle, 1, False, "", -1, 0.0, {})
 
 
-def test_how_far_aside_is_told_with_the_side() -> None:
-    driven = [(0, 3.1, 0.4), (0, 7.77, -0.2), (1, 3.0, 0.0)]
-    assert route.aside(straight(), driven) == pytest.approx([0.4, -0.2, 0.0])
+def test_cross_track_error_is_signed() -> None:
+    vehicle = [(0, 3.1, 0.4), (0, 7.77, -0.2), (1, 3.0, 0.0)]
+    assert route.cross_track_error(straight(), vehicle) == pytest.approx([0.4, -0.2, 0.0])
 
 
-@pytest.mark.parametrize("late", [0, 8])
-def test_a_car_that_begins_beside_the_way_comes_back_to_it_though_telemetry_is_late(late: int) -> None:
-    one, script, places = Bicycle(y=1.0), Route(lambda vehicle, _: Pursuit(straight()).steering(vehicle)), []
-    seen = deque[VehicleState](maxlen=late + 1)
+@pytest.mark.parametrize("delay", [0, 8])
+def test_car_beside_the_path_returns_to_it_even_with_delayed_telemetry(delay: int) -> None:
+    one, script, positions = (
+        Bicycle(y=1.0),
+        ScriptedCommands(lambda vehicle, _: PurePursuit(straight()).steering(vehicle)),
+        [],
+    )
+    states = deque[VehicleState](maxlen=delay + 1)
     for i in range(400):
-        seen.append(VehicleState(one.speed, (one.x, one.y), one.heading))
-        one.step(script.command(told(seen[0]), i * STEP).controls, STEP)
-        places.append((0, one.x, one.y))
-    off = route.aside(straight(), places)
-    assert np.abs(off[:10]).min() > 0.9 and np.abs(off[-100:]).max() < 0.1 and one.x > 25
+        states.append(VehicleState(one.speed, (one.x, one.y), one.heading))
+        one.step(script.command(telemetry(states[0]), i * STEP).controls, STEP)
+        positions.append((0, one.x, one.y))
+    error = route.cross_track_error(straight(), positions)
+    assert np.abs(error[:10]).min() > 0.9 and np.abs(error[-100:]).max() < 0.1 and one.x > 25
 
 
-def test_a_vehicle_that_does_not_tell_where_it_is_is_driven_straight_on() -> None:
-    assert Pursuit(straight()).steering(VehicleState(1.0)) == 0.0
+def test_vehicle_without_a_position_is_steered_straight() -> None:
+    assert PurePursuit(straight()).steering(VehicleState(1.0)) == 0.0
 
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    """A tile that was driven through."""
+    """A tile that was driven through while recording."""
     return synthetic.driven(tmp_path_factory.mktemp("street"))
 
 
-def test_a_car_is_driven_along_a_world_s_way_again_and_again(street: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_car_drives_along_the_reference_path_repeatedly(street: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     ground = Ground(street)
-    monkeypatch.setattr(route, "SWAY", 1.0)
-    way = route.way(street, ground)
-    assert way[0] == pytest.approx(ground.start[:2]) and len(way) > 10
+    monkeypatch.setattr(route, "LANE_OFFSET_M", 1.0)
+    path = route.reference_path(street, ground)
+    assert path[0] == pytest.approx(ground.start[:2]) and len(path) > 10
     now = [0.0]
     monkeypatch.setattr("scan2sim.services.teleoperation.vehicle.adapters.simulated.time.monotonic", lambda: now[0])
-    driven, script = Driven(ground, way), Route(lambda vehicle, _: Pursuit(way).steering(vehicle))
-    while driven.runs < 2 and now[0] < 60:
+    vehicle, script = (
+        LoopingVehicle(ground, path),
+        ScriptedCommands(lambda vehicle, _: PurePursuit(path).steering(vehicle)),
+    )
+    while vehicle.runs < 2 and now[0] < 60:
         now[0] += STEP
-        driven.obey(script.command(told(driven.state()), now[0]).controls)
-    assert driven.runs == 2 and not driven.state().faults
-    assert {run for run, _, _ in driven.places} == {0, 1}
-    assert np.abs(route.aside(way, driven.places)).max() < 0.4
-    driven.begin()
-    assert (driven.runs, driven.places) == (0, [])
+        vehicle.obey(script.command(telemetry(vehicle.state()), now[0]).controls)
+    assert vehicle.runs == 2 and not vehicle.state().faults
+    assert {run for run, _, _ in vehicle.positions} == {0, 1}
+    assert np.abs(route.cross_track_error(path, vehicle.positions)).max() < 0.4
+    vehicle.begin()
+    assert (vehicle.runs, vehicle.positions) == (0, [])

@@ -1,4 +1,4 @@
-"""The driver's page in a window of its own, on a display that nobody sees."""
+"""The driver page in its own window, on a virtual display."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytest.importorskip("fastapi", reason="the extra bus isn't installed")
 pytest.importorskip("websockets", reason="the extra teleop isn't installed")
 
 from scan2sim.pipeline.core.errors import UnavailableError
-from scan2sim.services.http.settings import Served
+from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.station import app_window
 from tests.services.teleoperation.pages import Cockpit, served
 from tests.services.teleoperation.street import until
@@ -23,7 +23,7 @@ from tests.services.teleoperation.street import until
 
 @pytest.fixture
 def display(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A display; the test is skipped where none can be made."""
+    """A virtual display; the test is skipped if none can be created."""
     for program, package in (("Xvfb", "xvfb"), ("xwininfo", "x11-utils"), ("chromium", "chromium")):
         if shutil.which(program) is None:
             pytest.skip(f"{program} isn't installed (apt-get install {package})")
@@ -31,8 +31,8 @@ def display(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1400x900x24", "-nolisten", "tcp"]
     with subprocess.Popen(command, pass_fds=[write], stderr=subprocess.DEVNULL) as process:
         os.close(write)
-        with os.fdopen(read) as told:
-            number = told.readline().strip()
+        with os.fdopen(read) as answer:
+            number = answer.readline().strip()
         assert number, "Xvfb doesn't start"
         monkeypatch.setenv("DISPLAY", f":{number}")
         monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
@@ -42,14 +42,14 @@ def display(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 @pytest.fixture
 def cockpit(tmp_path: Path) -> Iterator[Cockpit]:
-    with served(tmp_path, Served(port=0)) as made:
-        yield made
+    with served(tmp_path, ServerParams(port=0)) as running:
+        yield running
 
 
 @pytest.mark.slow
-def test_the_page_is_shown_in_a_window_and_closing_it_lets_go(cockpit: Cockpit, display: str) -> None:
+def test_page_opens_in_a_window_and_closing_it_disconnects(cockpit: Cockpit, display: str) -> None:
     def windows() -> str:
-        for _ in range(20):  # it fails where a window closes meanwhile
+        for _ in range(20):  # the command fails if a window closes meanwhile
             listed = subprocess.run(["xwininfo", "-root", "-tree"], capture_output=True, text=True)
             if listed.returncode == 0:
                 return listed.stdout
@@ -58,13 +58,13 @@ def test_the_page_is_shown_in_a_window_and_closing_it_lets_go(cockpit: Cockpit, 
     cockpit.street.fleet.join("car", "desk", "operator")
     with app_window.window(cockpit.url) as process:
         until(lambda: "Teleoperation" in windows())
-        until(lambda: cockpit.watched() == 1)
+        until(lambda: cockpit.connected_pages() == 1)
         assert process.poll() is None
-    until(lambda: cockpit.watched() == 0)
+    until(lambda: cockpit.connected_pages() == 0)
     assert "Teleoperation" not in windows()
 
 
-def test_without_a_display_or_a_browser_it_is_said_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_display_or_browser_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)

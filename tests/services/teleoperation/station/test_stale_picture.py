@@ -1,4 +1,4 @@
-"""The driver's page covers what is older than 300 ms, whatever stopped, and recovers by itself."""
+"""The driver page covers video older than 300 ms, whatever has stopped, and recovers by itself."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ pytest.importorskip("OpenSSL", reason="the extra teleop isn't installed")
 pytest.importorskip("fastapi", reason="the extra bus isn't installed")
 pytest.importorskip("websockets", reason="the extra teleop isn't installed")
 
-from scan2sim.services.http.settings import Served
+from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.control.controls import VehicleState
 from scan2sim.services.teleoperation.control.messages import Kind, Message, Telemetry
 from scan2sim.services.teleoperation.gateway.identity import Peer, Role
-from scan2sim.services.teleoperation.station.app import Joined
-from scan2sim.services.teleoperation.station.web import HEADER, Screens
-from scan2sim.services.teleoperation.transport.clock_sync import Clocks
+from scan2sim.services.teleoperation.station.app import JoinedVehicle
+from scan2sim.services.teleoperation.station.web import FRAME_HEADER, PageHub
+from scan2sim.services.teleoperation.transport.clock_sync import ClockSync
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame
 from tests.browser import Page, chromium
 from tests.services.teleoperation.pages import Cockpit, served, station_process
 from tests.services.teleoperation.street import Street, until
 
 SOON = 5.0
-"""Seconds within which the page must cover what is old; the limit is 0.3 s, and a machine that runs tests is busy."""
+"""Seconds within which the page must cover old video; the limit is 0.3 s, but a machine that runs tests is busy."""
 STATUS = "document.getElementById('status').textContent"
 SPEED = "document.getElementById('speed').textContent"
 LINKS = "document.getElementById('links').childElementCount"
@@ -47,33 +47,33 @@ BLANK = f"{NO_PICTURE} && {SPEED} === '-' && {LINKS} === 0"
 
 @pytest.fixture
 def cockpit(tmp_path: Path) -> Iterator[Cockpit]:
-    with served(tmp_path, Served(port=0)) as made:
-        made.street.fleet.join("car", "desk", "operator")
-        yield made
+    with served(tmp_path, ServerParams(port=0)) as running:
+        running.street.fleet.join("car", "desk", "operator")
+        yield running
 
 
-def opened(page: Page, url: str) -> None:
-    """Open the page of a station, and wait until it shows its vehicle live."""
+def open_page(page: Page, url: str) -> None:
+    """Open a station's page, and wait until it shows its vehicle live."""
     page.do("Page.navigate", url=url)
     page.until("document.querySelector('figure')?.dataset.shown > 3")
     page.until(LIVE)
 
 
-def seconds(page: Page) -> float:
-    """For which there is no picture, as the page's status says."""
+def seconds_without_video(page: Page) -> float:
+    """Seconds without video, from the page's status."""
     return float(page.value(f"{STATUS}.match(/since ([0-9.]+) s/)[1]"))
 
 
-def test_a_stopped_station_is_covered_and_shown_again_once_it_continues(tmp_path: Path) -> None:
+def test_page_covers_video_while_its_station_is_stopped(tmp_path: Path) -> None:
     street = Street(tmp_path)
     try:
         with station_process(street) as (station, url), chromium(tmp_path) as page:
-            until(lambda: any(one["there"] for one in street.fleet.facts()["stations"]))
+            until(lambda: any(one["there"] for one in street.fleet.snapshot()["stations"]))
             street.fleet.join("car", "desk", "operator")
-            opened(page, url)
+            open_page(page, url)
             station.send_signal(signal.SIGSTOP)  # its connections stay open
             page.until(BLANK, SOON)
-            since = seconds(page)
+            since = seconds_without_video(page)
             page.until(f"Number({STATUS}.match(/since ([0-9.]+) s/)[1]) > {since + 1}")
             assert page.value(BLANK) and page.value("socket.readyState === WebSocket.OPEN")
             assert "Nothing from the station since" in page.value("document.getElementById('standing').textContent")
@@ -81,49 +81,49 @@ def test_a_stopped_station_is_covered_and_shown_again_once_it_continues(tmp_path
             page.until(LIVE)
             station.kill()
             page.until(BLANK, SOON)
-            page.until(f'{STATUS}.includes("the station isn\'t reached")')
+            page.until(f"{STATUS}.includes('the station is not reachable')")
             assert not page.errors
     finally:
         street.close()
 
 
-def test_video_that_stops_is_covered_while_telemetry_goes_on(cockpit: Cockpit, tmp_path: Path) -> None:
+def test_stopped_video_is_covered_while_telemetry_continues(cockpit: Cockpit, tmp_path: Path) -> None:
     with chromium(tmp_path) as page:
-        opened(page, cockpit.url)
+        open_page(page, cockpit.url)
         cockpit.desk.show = lambda _: None
         page.until(NO_PICTURE, SOON)
         page.until(f"{NO_PICTURE} && {SPEED} !== '-' && {LINKS} === 2")
-        cockpit.desk.show = cockpit.screens.show
+        cockpit.desk.show = cockpit.hub.show
         page.until(LIVE)
         assert not page.errors
 
 
-def test_pictures_that_arrive_late_stay_covered(cockpit: Cockpit, tmp_path: Path) -> None:
-    """Late in the station, as after it was stopped; then on the way to the page."""
+def test_delayed_video_stays_covered(cockpit: Cockpit, tmp_path: Path) -> None:
+    """Delayed in the station, as after it was stopped; then on the way to the page."""
     shown = "Number(document.querySelector('figure').dataset.shown)"
     with chromium(tmp_path) as page:
-        opened(page, cockpit.url)
-        cockpit.desk.show = lambda frame: threading.Timer(0.6, cockpit.screens.show, [frame]).start()
+        open_page(page, cockpit.url)
+        cockpit.desk.show = lambda frame: threading.Timer(0.6, cockpit.hub.show, [frame]).start()
         page.until(NO_PICTURE, SOON)
         before = page.value(shown)
         page.until(f"{shown} > {before + 10}")
-        assert page.value(NO_PICTURE), "pictures are drawn, and old"
-        cockpit.desk.show = cockpit.screens.show
+        assert page.value(NO_PICTURE), "frames are drawn, but old"
+        cockpit.desk.show = cockpit.hub.show
         page.until(LIVE)
         page.value("received_now = socket.onmessage; socket.onmessage = (one) => setTimeout(received_now, 600, one); 0")
         page.until(BLANK, SOON)
         before = page.value(shown)
         page.until(f"{shown} > {before + 10}")
-        assert page.value(BLANK), "pictures and facts arrive, and are old"
+        assert page.value(BLANK), "frames and state arrive, but are old"
         page.value("socket.onmessage = received_now; 0")
         page.until(LIVE)
         assert not page.errors
 
 
-def test_a_page_that_falls_behind_continues_at_the_next_key_frame(cockpit: Cockpit, tmp_path: Path) -> None:
+def test_slow_page_continues_at_the_next_key_frame(cockpit: Cockpit, tmp_path: Path) -> None:
     decoder = "[...cameras.values()][0].decoder"
     with chromium(tmp_path) as page:
-        opened(page, cockpit.url)
+        open_page(page, cockpit.url)
         page.value(f"slow = {decoder}; Object.defineProperty(slow, 'decodeQueueSize', {{value: 100}}); 0")
         page.until(f"{decoder} !== slow")
         before = page.value("document.querySelector('figure').dataset.shown")
@@ -131,10 +131,10 @@ def test_a_page_that_falls_behind_continues_at_the_next_key_frame(cockpit: Cockp
         assert page.value("slow.state") == "closed" and not page.errors
 
 
-def test_a_page_that_hangs_is_covered(cockpit: Cockpit, tmp_path: Path) -> None:
-    """By what the browser's compositor draws, as no script runs."""
+def test_hanging_page_is_covered(cockpit: Cockpit, tmp_path: Path) -> None:
+    """Covered by the browser's compositor, since no script runs."""
     with chromium(tmp_path) as page:
-        opened(page, cockpit.url)
+        open_page(page, cockpit.url)
         page.do("Page.startScreencast", format="png")
         page.value(
             "setTimeout(() => { for (const end = performance.now() + 20000; performance.now() < end; ) ; }, 100)"
@@ -145,32 +145,34 @@ def test_a_page_that_hangs_is_covered(cockpit: Cockpit, tmp_path: Path) -> None:
 
 
 def _dark(page: Page) -> bool:
-    """Whether the next picture of the screencast is dark at its edges, where the page has none of its figures."""
-    while (said := json.loads(page._socket.recv(timeout=10))).get("method") != "Page.screencastFrame":
+    """Whether the next frame of the screencast is dark at its edges, where the page has no text or video."""
+    while (message := json.loads(page._socket.recv(timeout=10))).get("method") != "Page.screencastFrame":
         pass
     page._socket.send(
-        json.dumps({"id": 0, "method": "Page.screencastFrameAck", "params": {"sessionId": said["params"]["sessionId"]}})
+        json.dumps(
+            {"id": 0, "method": "Page.screencastFrameAck", "params": {"sessionId": message["params"]["sessionId"]}}
+        )
     )
-    image = np.asarray(Image.open(BytesIO(base64.b64decode(said["params"]["data"]))).convert("L"))
+    image = np.asarray(Image.open(BytesIO(base64.b64decode(message["params"]["data"]))).convert("L"))
     return bool(np.percentile(image, 90) < 20)
 
 
-def test_frames_carry_their_time_of_capture_on_the_stations_clock() -> None:
-    screens = Screens(lambda frame: 400.0)
+def test_frames_carry_their_capture_time_on_the_station_clock() -> None:
+    hub = PageHub(lambda frame: 400.0)
     frame = Frame(1, 0, True, b"data", 160, 120)
     before = time.monotonic()
-    packed = screens.packed(frame)
-    captured = HEADER.unpack_from(packed)[-1]
+    packed = hub.encode(frame)
+    captured = FRAME_HEADER.unpack_from(packed)[-1]
     assert before - 0.4 <= captured / 1e3 <= time.monotonic() - 0.4
-    assert packed[HEADER.size :] == b"data"
+    assert packed[FRAME_HEADER.size :] == b"data"
 
 
-def test_telemetry_that_waited_in_a_queue_is_old() -> None:
-    """As after the station was stopped: its age counts from the vehicle's sending."""
-    clocks, now = Clocks(), time.monotonic_ns()
-    clocks.exchanged(now, now, now, now, time.time_ns())
+def test_queued_telemetry_is_old() -> None:
+    """As after the station was stopped: its age counts from when the vehicle sent it."""
+    clocks, now = ClockSync(), time.monotonic_ns()
+    clocks.add_exchange(now, now, now, now, time.time_ns())
     listener: Any = SimpleNamespace(expect=lambda *_, **__: SimpleNamespace(clocks=clocks))
-    joined = Joined(1, Peer(Role.VEHICLE, "car", ""), listener, lambda _: None)
+    joined = JoinedVehicle(1, Peer(Role.VEHICLE, "car", ""), listener, lambda _: None)
     assert joined.telemetry_age_ms() is None
     telemetry = Telemetry(VehicleState(speed=5.0), 1, False, "", 0, 0.0, {})
     joined._received(Message(Kind.TELEMETRY, 1, now - 10**9, telemetry.pack()))

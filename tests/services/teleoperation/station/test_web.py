@@ -1,4 +1,4 @@
-"""The driver's page, in a browser: pictures with their age, the wheel, the confirmation; who leaves lets go."""
+"""The driver page in a browser: video with its age, control lock, confirmation; leaving the page releases the lock."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytest.importorskip("websockets", reason="the extra teleop isn't installed")
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from scan2sim.services.http.settings import Served
+from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.control.controls import Controls, Gear
 from scan2sim.services.teleoperation.control.messages import Command
 from tests.browser import Page, chromium
@@ -31,21 +31,21 @@ TOKEN = "0123456789abcdef/+="
 
 @pytest.fixture
 def cockpit(tmp_path: Path) -> Iterator[Cockpit]:
-    with served(tmp_path, Served(port=0)) as made:
-        yield made
+    with served(tmp_path, ServerParams(port=0)) as running:
+        yield running
 
 
 def live(cockpit: Cockpit, **more: Any) -> ClientConnection:
-    """The page's WebSocket."""
+    """The WebSocket of the page."""
     return connect(cockpit.url.replace("http", "ws") + "live", **more)
 
 
-def driving(page: Page, cockpit: Cockpit) -> None:
-    """From the page that was opened to a vehicle that drives."""
+def start_driving(page: Page, cockpit: Cockpit) -> None:
+    """Open the page, and operate it until the vehicle drives."""
     cockpit.street.fleet.join("car", "desk", "operator")
     page.do("Page.navigate", url=cockpit.url)
     page.until("document.querySelector('figure')?.dataset.shown > 3")
-    press(page, "#take", lambda: cockpit.desk.station.wheel.held_by() is not None)
+    press(page, "#take", lambda: cockpit.desk.station.driver_session.holder() is not None)
     press(page, "#agree", lambda: not cockpit.desk.standing())
 
 
@@ -61,7 +61,7 @@ TRIGGERS = {"right trigger": (0, 7), "left trigger": (0, 6), "other gamepad's le
 
 
 def hold(page: Page, control: str, down: bool) -> None:
-    """Press a control of keyboard, gamepad or page (its button, by mouse or finger), or release it."""
+    """Press or release a control of keyboard, gamepad or page (its button, by mouse or finger)."""
     if control in KEYS:
         page.do("Input.dispatchKeyEvent", type="rawKeyDown" if down else "keyUp", code=KEYS[control], key=control)
     elif control in TRIGGERS:
@@ -78,20 +78,20 @@ def hold(page: Page, control: str, down: bool) -> None:
 
 
 def press(page: Page, button: str, done: Callable[[], bool]) -> None:
-    """Press a button, again where a busy machine was too slow for what the driver asked."""
+    """Press a button, repeatedly in case a busy machine was too slow."""
     end = time.monotonic() + 120
     while not done():
         assert time.monotonic() < end, page.value("document.body.innerText")
         if page.value(f"!document.querySelector('{button}').disabled"):
             page.click(button)
-        again = time.monotonic() + 3
-        while not done() and time.monotonic() < again:
+        retry = time.monotonic() + 3
+        while not done() and time.monotonic() < retry:
             time.sleep(0.02)
 
 
-def test_a_driver_sees_how_old_the_picture_is_confirms_and_drives_by_keys(cockpit: Cockpit, tmp_path: Path) -> None:
+def test_driver_sees_the_video_age_confirms_and_drives_by_keyboard(cockpit: Cockpit, tmp_path: Path) -> None:
     with chromium(tmp_path) as page:
-        driving(page, cockpit)
+        start_driving(page, cockpit)
         age = page.value("Number(document.querySelector('figure').dataset.age)")
         assert 0 <= age < 5000 and page.value("Number(document.getElementById('age').textContent)") >= 0
         assert "front" in page.value("document.querySelector('figcaption').textContent")
@@ -99,25 +99,25 @@ def test_a_driver_sees_how_old_the_picture_is_confirms_and_drives_by_keys(cockpi
         until(lambda: cockpit.street.wheels.controls.throttle > 0.5)
         page.do("Input.dispatchKeyEvent", type="keyUp", code="ArrowUp", key="ArrowUp")
         until(lambda: cockpit.street.wheels.controls.throttle == 0 and not cockpit.desk.standing())
-        assert cockpit.street.wheels.controls.brake == 0, "it rolls: its driver still has the wheel"
+        assert cockpit.street.wheels.controls.brake == 0, "it rolls: its driver still holds the lock"
         shown = "[...document.querySelectorAll('#cameras b')].map((one) => one.textContent)"
         assert page.value(f"camera(2), camera(1), {shown}") == ["front", "camera 1", "camera 2"], "the first is largest"
         assert not page.errors
 
 
-def test_any_brake_stops_whatever_drives(cockpit: Cockpit, tmp_path: Path) -> None:
-    """Full throttle and a brake of the same device or another: at the vehicle, and in all that the page sends."""
+def test_any_brake_overrides_any_throttle(cockpit: Cockpit, tmp_path: Path) -> None:
+    """Full throttle and a brake on the same device or another: at the vehicle, and in all that the page sends."""
     throttles = ("up", "right trigger")
     brakes = ("space", "down", "S", "mouse", "finger", "left trigger", "other gamepad's left trigger")
     wheels = cockpit.street.wheels
     with chromium(tmp_path) as page:
-        driving(page, cockpit)
+        start_driving(page, cockpit)
         page.value(GAMEPADS)
         page.do("Emulation.setTouchEmulationEnabled", enabled=True)
         page.value("sent = []; sending = send; send = (one) => { sent.push(one); sending(one); }; 0")
         for throttle, brake in itertools.product(throttles, brakes):
             press(page, "#agree", lambda: not cockpit.desk.standing())
-            page.value("gamepad = null; 0")  # the next one of which a button is pressed drives
+            page.value("gamepad = null; 0")  # the next gamepad with a pressed button is used
             hold(page, throttle, True)
             until(lambda: wheels.controls.throttle > 0.9)
             hold(page, brake, True)
@@ -132,49 +132,49 @@ def test_any_brake_stops_whatever_drives(cockpit: Cockpit, tmp_path: Path) -> No
         assert not page.errors
 
 
-def test_a_brake_holds_beside_other_keys_and_presses_no_button(cockpit: Cockpit, tmp_path: Path) -> None:
+def test_brake_key_works_with_modifiers_and_presses_no_button(cockpit: Cockpit, tmp_path: Path) -> None:
     with chromium(tmp_path) as page:
-        driving(page, cockpit)
+        start_driving(page, cockpit)
         page.value("document.getElementById('leave').focus()")
         for ctrl in (0, 2):
             page.do("Input.dispatchKeyEvent", type="rawKeyDown", code="Space", key=" ", modifiers=ctrl)
             until(lambda: cockpit.street.wheels.controls.brake == 1 and not cockpit.desk.standing())
             page.do("Input.dispatchKeyEvent", type="keyUp", code="Space", key=" ", modifiers=ctrl)
             until(lambda: cockpit.street.wheels.controls.brake == 0)
-        assert cockpit.desk.station.wheel.held_by() is not None
+        assert cockpit.desk.station.driver_session.holder() is not None
 
 
-def test_a_brake_overrides_the_throttle_whatever_a_page_sends(cockpit: Cockpit) -> None:
-    wheel = cockpit.desk.station.wheel
+def test_brake_overrides_the_throttle_in_messages_of_a_page(cockpit: Cockpit) -> None:
+    session = cockpit.desk.station.driver_session
     with live(cockpit) as socket:
         socket.send('{"do": "take"}')
         socket.send('{"do": "turn", "steering": 0, "throttle": 1, "brake": 0.1, "gear": 1}')
-        until(lambda: wheel.command(0.0) is not None)
-        assert wheel.command(0.0) == Command(Controls(0.0, 0.0, 0.1, Gear.FORWARD))
+        until(lambda: session.command(0.0) is not None)
+        assert session.command(0.0) == Command(Controls(0.0, 0.0, 0.1, Gear.FORWARD))
 
 
-def test_a_page_in_the_background_lets_go_and_says_so(cockpit: Cockpit, tmp_path: Path) -> None:
+def test_page_in_the_background_releases_the_lock_and_reports_it(cockpit: Cockpit, tmp_path: Path) -> None:
     with chromium(tmp_path) as page:
-        driving(page, cockpit)
+        start_driving(page, cockpit)
         page.value(
             "Object.defineProperty(document, 'hidden', {value: true, configurable: true});"
             "document.dispatchEvent(new Event('visibilitychange'))"
         )
         until(cockpit.desk.standing)
-        assert cockpit.desk.station.wheel.held_by() is None
+        assert cockpit.desk.station.driver_session.holder() is None
         page.until("document.getElementById('standing').textContent.includes('in the background')")
 
 
-def test_a_page_that_is_closed_lets_go(cockpit: Cockpit, tmp_path: Path) -> None:
+def test_closed_page_releases_the_lock(cockpit: Cockpit, tmp_path: Path) -> None:
     with chromium(tmp_path) as page:
-        driving(page, cockpit)
+        start_driving(page, cockpit)
     until(cockpit.desk.standing)
-    assert cockpit.desk.station.wheel.held_by() is None
+    assert cockpit.desk.station.driver_session.holder() is None
 
 
-def test_pages_need_the_token_and_other_sites_are_kept_out(tmp_path: Path) -> None:
+def test_pages_need_the_token_and_other_origins_are_refused(tmp_path: Path) -> None:
     (tmp_path / "token").write_text(TOKEN, encoding="utf-8")
-    with served(tmp_path, Served(port=0, token=tmp_path / "token")) as cockpit:
+    with served(tmp_path, ServerParams(port=0, token=tmp_path / "token")) as cockpit:
         with pytest.raises(urllib.error.HTTPError, match="401"):
             urllib.request.urlopen(f"{cockpit.url}api/station", timeout=20)
         for protocols in (None, ["scan2sim"], ["scan2sim", "token.ff"], ["token.zz"]):
@@ -187,9 +187,9 @@ def test_pages_need_the_token_and_other_sites_are_kept_out(tmp_path: Path) -> No
             live(cockpit, subprotocols=named, origin="https://evil.example")
 
 
-def test_what_a_page_says_amiss_is_told_and_ends_nothing(cockpit: Cockpit) -> None:
+def test_invalid_page_messages_are_reported_and_the_connection_stays(cockpit: Cockpit) -> None:
     with live(cockpit) as socket:
-        for said in (
+        for message in (
             "",
             "[]",
             '{"do": "fly"}',
@@ -197,9 +197,9 @@ def test_what_a_page_says_amiss_is_told_and_ends_nothing(cockpit: Cockpit) -> No
             '{"do": "turn", "steering": 2}',
             "x" * 999,
         ):
-            socket.send(said)
-            while "fault" not in (told := json.loads(socket.recv())):
+            socket.send(message)
+            while "fault" not in (answer := json.loads(socket.recv())):
                 pass
-            assert "can't be understood" in told["fault"]
+            assert "isn't valid" in answer["fault"]
         socket.send('{"do": "take"}')
         until(lambda: "page" in (json.loads(socket.recv()).get("driver") or ""))

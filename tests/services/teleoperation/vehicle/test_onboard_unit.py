@@ -1,4 +1,4 @@
-"""The car unit obeys the station that it is joined to, tells what is wrong, and stands when anything is."""
+"""The onboard unit obeys the joined station, reports faults, and stops the vehicle if anything fails."""
 
 from __future__ import annotations
 
@@ -15,29 +15,30 @@ from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.teleoperation.control.controls import Controls, Gear, VehicleState
 from scan2sim.services.teleoperation.control.messages import (
     Command,
+    KeyFrameRequest,
     Kind,
-    Lacking,
     Message,
-    Report,
-    Stream,
-    Streams,
+    Nack,
     Telemetry,
-    Wanted,
+    VideoReport,
+    VideoStream,
+    VideoStreams,
 )
-from scan2sim.services.teleoperation.control.safety import MS, OTHER
-from scan2sim.services.teleoperation.vehicle.adapter import TranslateParams, Translating
+from scan2sim.services.teleoperation.control.safety import DROP_OTHER_SESSION, NS_PER_MS
+from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
 from scan2sim.services.teleoperation.vehicle.adapter_protocol import Answer
-from scan2sim.services.teleoperation.vehicle.adapters import Unreachable
+from scan2sim.services.teleoperation.vehicle.adapters import VehicleUnreachable
 from scan2sim.services.teleoperation.vehicle.onboard_unit import (
+    ADAPTER_SILENT,
+    BODY_MAX_BYTES,
+    CLOCKS_UNKNOWN,
+    DROP_CLOCKS_UNKNOWN,
     MALFORMED,
-    NOBODY,
-    ROOM,
-    SILENT,
-    UNTIED,
-    Car,
-    CarParams,
-    CarUnit,
-    fitting,
+    NO_STATION,
+    OnboardController,
+    OnboardParams,
+    OnboardUnit,
+    pack_fitting,
 )
 
 LIMIT = 200
@@ -47,7 +48,7 @@ REST = Controls(gear=Gear.FORWARD)
 
 @dataclass
 class FakeClocks:
-    """The station's clock is the vehicle's."""
+    """Clocks of a station that equal those of the vehicle."""
 
     known: bool = True
     uncertainty_ms: float = 5.0
@@ -59,11 +60,11 @@ class FakeClocks:
         return abs(self.wall_apart_s) > 1
 
     def age_ms(self, sent: int) -> float:
-        return (self.now() - sent) / MS if self.known else math.inf
+        return (self.now() - sent) / NS_PER_MS if self.known else math.inf
 
 
 @dataclass
-class FakeBundle:
+class FakeConnection:
     clocks: FakeClocks = field(default_factory=FakeClocks)
     sent: list[tuple[Kind, bytes]] = field(default_factory=list)
     closed: bool = False
@@ -81,202 +82,208 @@ class FakeBundle:
 
 @dataclass
 class FakeCamera:
-    stream: Stream
+    stream: VideoStream
     fault: str = ""
     keys: int = 0
-    reports: list[Report] = field(default_factory=list)
-    again: list[tuple[int, ...]] = field(default_factory=list)
+    reports: list[VideoReport] = field(default_factory=list)
+    retransmitted: list[tuple[int, ...]] = field(default_factory=list)
 
-    def want_key(self) -> None:
+    def request_key_frame(self) -> None:
         self.keys += 1
 
-    def send_again(self, source: int, sequences: Sequence[int]) -> None:
-        self.again.append((source, *sequences))
+    def retransmit(self, source: int, sequences: Sequence[int]) -> None:
+        self.retransmitted.append((source, *sequences))
 
-    def adapt(self, report: Report) -> None:
+    def adapt(self, report: VideoReport) -> None:
         self.reports.append(report)
 
 
 class Desk:
-    """A car with a station and a translator in step; times are milliseconds."""
+    """An onboard controller with a station and an adapter, in lockstep; times are milliseconds."""
 
     def __init__(self) -> None:
-        self.car, self.now, self.number = Car(LIMIT), 1000, 0
-        self.bundle = FakeBundle(FakeClocks(now=lambda: self.now * MS))
+        self.car, self.now, self.number = OnboardController(LIMIT), 1000, 0
+        self.connection = FakeConnection(FakeClocks(now=lambda: self.now * NS_PER_MS))
         self.answer = Answer(0, 1, False, "", VehicleState(2.0))
         self.session = object()
-        self.car.join(self.session, self.bundle, ())
+        self.car.join(self.session, self.connection, ())
 
-    def say(self, command: Command, age: float = 10, session: object = None) -> None:
+    def send(self, command: Command, age: float = 10, session: object = None) -> None:
         self.number += 1
-        message = Message(Kind.COMMAND, self.number, int((self.now - age) * MS), command.pack())
-        self.car.hear(session or self.session, message, self.now * MS)
+        message = Message(Kind.COMMAND, self.number, int((self.now - age) * NS_PER_MS), command.pack())
+        self.car.receive(session or self.session, message, self.now * NS_PER_MS)
 
-    def look(self, answered: bool = True) -> Command:
+    def step(self, answered: bool = True) -> Command:
         self.now += 5
-        self.car.doubt()
+        self.car.check_clocks()
         if answered:
             self.answer = Answer(
                 self.now, self.answer.stop, self.answer.standing, self.answer.reason, VehicleState(2.0)
             )
-            self.car.answered(self.answer, self.now * MS)
-        return self.car.look(self.now * MS).command
+            self.car.receive_answer(self.answer, self.now * NS_PER_MS)
+        return self.car.watchdog_order(self.now * NS_PER_MS).command
 
     def telemetry(self) -> Telemetry:
-        return self.car.telemetry(self.now * MS)
+        return self.car.telemetry(self.now * NS_PER_MS)
 
     def start(self, session: object = None) -> None:
-        self.look()
+        self.step()
         stop = self.car.safety.stop
-        self.say(Command(REST, stop), session=session)
-        self.say(Command(REST, stop, agree=True), session=session)
+        self.send(Command(REST, stop), session=session)
+        self.send(Command(REST, stop, agree=True), session=session)
 
 
-def test_a_driver_is_obeyed_once_everything_is_well() -> None:
+def test_driver_is_obeyed_once_all_conditions_are_met() -> None:
     desk = Desk()
-    assert desk.look().controls.brake == 1
+    assert desk.step().controls.brake == 1
     desk.start()
-    desk.say(Command(GO))
-    assert desk.look().controls == GO
-    told = desk.telemetry()
-    assert (told.standing, told.command, told.age, told.vehicle.speed) == (False, desk.number, 10.0, 2.0)
+    desk.send(Command(GO))
+    assert desk.step().controls == GO
+    telemetry = desk.telemetry()
+    assert (telemetry.standing, telemetry.command, telemetry.age) == (False, desk.number, 10.0)
+    assert telemetry.vehicle.speed == 2.0
     desk.now += LIMIT
-    assert desk.look().controls.brake == 1
+    assert desk.step().controls.brake == 1
     assert desk.telemetry().standing and "200 ms" in desk.telemetry().reason
 
 
 @pytest.mark.parametrize(
     ("clocks", "why"),
     [
-        ({"known": False}, UNTIED),
-        ({"uncertainty_ms": LIMIT + 1.0}, "known to 201 ms only"),
-        ({"wall_apart_s": -10.0}, "10 s apart: does NTP run"),
+        ({"known": False}, CLOCKS_UNKNOWN),
+        ({"uncertainty_ms": LIMIT + 1.0}, "uncertain by 201 ms"),
+        ({"wall_apart_s": -10.0}, "differ by 10 s: check NTP"),
     ],
 )
-def test_driving_does_not_begin_with_clocks_that_are_wrong(clocks: dict[str, Any], why: str) -> None:
+def test_wrong_clocks_block_driving(clocks: dict[str, Any], why: str) -> None:
     desk = Desk()
-    vars(desk.bundle.clocks).update(clocks)
+    vars(desk.connection.clocks).update(clocks)
     desk.start()
-    assert desk.look().controls.brake == 1 and desk.telemetry().standing
+    assert desk.step().controls.brake == 1 and desk.telemetry().standing
     assert why in desk.telemetry().reason
-    assert UNTIED not in desk.telemetry().dropped or desk.telemetry().dropped[UNTIED] == 2
-    vars(desk.bundle.clocks).update(vars(FakeClocks(now=desk.bundle.clocks.now)))
-    desk.look()
+    dropped = desk.telemetry().dropped
+    assert DROP_CLOCKS_UNKNOWN not in dropped or dropped[DROP_CLOCKS_UNKNOWN] == 2
+    vars(desk.connection.clocks).update(vars(FakeClocks(now=desk.connection.clocks.now)))
+    desk.step()
     desk.start()
     assert not desk.telemetry().standing
 
 
-def test_what_was_known_of_one_station_s_clock_says_nothing_of_another_s() -> None:
+def test_clock_offset_of_one_station_is_not_used_for_another() -> None:
     desk = Desk()
     desk.start()
     other = object()
-    desk.car.join(other, FakeBundle(FakeClocks(known=False)), ())
+    desk.car.join(other, FakeConnection(FakeClocks(known=False)), ())
     stop = desk.car.safety.stop
-    desk.car.look(desk.now * MS)
-    desk.say(Command(REST, stop), session=other)
-    desk.say(Command(REST, stop, agree=True), session=other)
+    desk.car.watchdog_order(desk.now * NS_PER_MS)
+    desk.send(Command(REST, stop), session=other)
+    desk.send(Command(REST, stop, agree=True), session=other)
     assert desk.telemetry().standing
 
 
-def test_a_station_that_was_started_anew_is_heard_and_its_driver_confirms_again() -> None:
+def test_restarted_station_must_confirm_again() -> None:
     desk = Desk()
     desk.start()
-    desk.say(Command(GO))
+    desk.send(Command(GO))
     desk.number = 0
-    desk.car.began(object())
-    assert desk.look().controls == GO
-    desk.car.began(desk.session)
-    desk.say(Command(GO, desk.car.safety.stop))
-    assert desk.look().controls.brake == 1
+    desk.car.station_restarted(object())
+    assert desk.step().controls == GO
+    desk.car.station_restarted(desk.session)
+    desk.send(Command(GO, desk.car.safety.stop))
+    assert desk.step().controls.brake == 1
     desk.start()
-    desk.say(Command(GO))
-    assert desk.look().controls == GO
+    desk.send(Command(GO))
+    assert desk.step().controls == GO
 
 
-def test_a_station_that_is_not_joined_does_not_drive() -> None:
+def test_station_that_is_not_joined_does_not_drive() -> None:
     desk = Desk()
     desk.start()
     other = object()
-    desk.say(Command(GO), session=other)
-    assert desk.look().controls == REST and desk.telemetry().dropped == {OTHER: 1}
-    desk.car.join(other, desk.bundle, ())
-    assert desk.look().controls.brake == 1
+    desk.send(Command(GO), session=other)
+    assert desk.step().controls == REST and desk.telemetry().dropped == {DROP_OTHER_SESSION: 1}
+    desk.car.join(other, desk.connection, ())
+    assert desk.step().controls.brake == 1
     desk.start()
     assert desk.telemetry().standing
     desk.start(other)
-    desk.say(Command(GO), session=other)
-    assert desk.look().controls == GO
+    desk.send(Command(GO), session=other)
+    assert desk.step().controls == GO
     desk.car.release("the driver has let go")
     desk.start(other)
-    assert desk.look().controls.brake == 1
-    assert desk.telemetry().reason == f"the driver has let go; {NOBODY}"
+    assert desk.step().controls.brake == 1
+    assert desk.telemetry().reason == f"the driver has let go; {NO_STATION}"
 
 
-def test_a_translator_that_is_gone_or_has_stopped_is_a_stop_that_the_driver_confirms() -> None:
+def test_silent_or_stopped_adapter_is_a_stop_that_the_driver_confirms() -> None:
     desk = Desk()
     desk.start()
     for _ in range(LIMIT // 5 + 1):
-        desk.say(Command(GO))
-        desk.look(answered=False)
-    told = desk.telemetry()
-    assert told.standing and told.reason == SILENT and told.vehicle.faults == (SILENT,)
-    stop = told.stop
-    desk.say(Command(REST, stop))
-    desk.say(Command(REST, stop, agree=True))  # too soon
-    desk.look(answered=False)
+        desk.send(Command(GO))
+        desk.step(answered=False)
+    telemetry = desk.telemetry()
+    assert telemetry.standing and telemetry.reason == ADAPTER_SILENT
+    assert telemetry.vehicle.faults == (ADAPTER_SILENT,)
+    stop = telemetry.stop
+    desk.send(Command(REST, stop))
+    desk.send(Command(REST, stop, agree=True))  # too soon
+    desk.step(answered=False)
     assert desk.telemetry().standing
     desk.start()
     assert not desk.telemetry().standing
     desk.answer = Answer(0, 2, True, "the plug is out", VehicleState())
-    desk.say(Command(GO))
-    assert desk.look().controls.brake == 1
-    assert desk.telemetry().reason == "the translator stopped: the plug is out"
-    assert not desk.look().agree
+    desk.send(Command(GO))
+    assert desk.step().controls.brake == 1
+    assert desk.telemetry().reason == "the vehicle adapter stopped: the plug is out"
+    assert not desk.step().agree
     desk.start()
-    desk.say(Command(GO))
-    agreed = desk.look()
+    desk.send(Command(GO))
+    agreed = desk.step()
     assert agreed.agree and agreed.stop == 2 and agreed.controls.throttle == 0
     desk.answer = Answer(0, 2, False, "", VehicleState())
-    assert desk.look().controls == GO
+    assert desk.step().controls == GO
 
 
-def test_cameras_hear_what_is_theirs_and_their_faults_are_told() -> None:
+def test_video_messages_reach_their_camera_and_camera_faults_are_reported() -> None:
     desk = Desk()
-    cameras = [FakeCamera(Stream(0, "front", 640, 480, 30.0)), FakeCamera(Stream(1, "back", 0, 0, 0.0), "unplugged")]
-    desk.car.join(desk.session, desk.bundle, cameras)
-    desk.look()
-    report = Report(1, 10, 0, 20.0, {})
+    cameras = [
+        FakeCamera(VideoStream(0, "front", 640, 480, 30.0)),
+        FakeCamera(VideoStream(1, "back", 0, 0, 0.0), "unplugged"),
+    ]
+    desk.car.join(desk.session, desk.connection, cameras)
+    desk.step()
+    report = VideoReport(1, 10, 0, 20.0, {})
     for kind, body in (
-        (Kind.WANTED, Wanted(0).pack()),
-        (Kind.WANTED, Wanted(9).pack()),
-        (Kind.REPORT, report.pack()),
-        (Kind.LACKING, Lacking(7 << 8 | 1, (5, 65_535)).pack()),
+        (Kind.KEY_FRAME_REQUEST, KeyFrameRequest(0).pack()),
+        (Kind.KEY_FRAME_REQUEST, KeyFrameRequest(9).pack()),
+        (Kind.VIDEO_REPORT, report.pack()),
+        (Kind.NACK, Nack(7 << 8 | 1, (5, 65_535)).pack()),
     ):
-        desk.car.hear(desk.session, Message(kind, 1, 0, body), 0)
-    desk.car.hear(object(), Message(Kind.WANTED, 1, 0, Wanted(0).pack()), 0)
+        desk.car.receive(desk.session, Message(kind, 1, 0, body), 0)
+    desk.car.receive(object(), Message(Kind.KEY_FRAME_REQUEST, 1, 0, KeyFrameRequest(0).pack()), 0)
     assert (cameras[0].keys, cameras[1].reports) == (1, [report])
-    assert (cameras[0].again, cameras[1].again) == ([], [(7 << 8 | 1, 5, 65_535)])
-    assert desk.telemetry().vehicle.faults == ("the camera back: unplugged",)
-    assert desk.car.streams() == Streams((cameras[0].stream, cameras[1].stream))
+    assert (cameras[0].retransmitted, cameras[1].retransmitted) == ([], [(7 << 8 | 1, 5, 65_535)])
+    assert desk.telemetry().vehicle.faults == ("camera back: unplugged",)
+    assert desk.car.streams() == VideoStreams((cameras[0].stream, cameras[1].stream))
 
 
-def test_what_is_no_message_is_counted() -> None:
+def test_malformed_messages_are_counted() -> None:
     desk = Desk()
-    for kind in (Kind.COMMAND, Kind.WANTED, Kind.REPORT, Kind.LACKING):
-        desk.car.hear(desk.session, Message(kind, 1, 0, b"rubbish"), 0)
+    for kind in (Kind.COMMAND, Kind.KEY_FRAME_REQUEST, Kind.VIDEO_REPORT, Kind.NACK):
+        desk.car.receive(desk.session, Message(kind, 1, 0, b"rubbish"), 0)
     assert desk.telemetry().dropped == {MALFORMED: 4}
 
 
-def test_a_telemetry_fits_into_a_packet_however_many_faults_there_are() -> None:
+def test_telemetry_fits_into_a_packet_with_any_number_of_faults() -> None:
     many = Telemetry(VehicleState(faults=tuple("ä" * 50 for _ in range(50))), 1, True, "x" * 200, 1, 1.0, {"old": 1})
-    body = fitting(many)
-    assert len(body) <= ROOM and Telemetry.unpack(body).vehicle.faults
+    body = pack_fitting(many)
+    assert len(body) <= BODY_MAX_BYTES and Telemetry.unpack(body).vehicle.faults
 
 
-def test_no_address_is_told() -> None:
+def test_invalid_adapter_address_is_reported() -> None:
     for wrong in ("localhost", "localhost:", ":x", "host:70000"):
         with pytest.raises(SettingError, match="translator"):
-            CarParams(translator=wrong).address()
+            OnboardParams(translator=wrong).address()
 
 
 class Vehicle:
@@ -286,7 +293,7 @@ class Vehicle:
 
     def obey(self, controls: Controls) -> None:
         if self.unreachable:
-            raise Unreachable("the plug is out")
+            raise VehicleUnreachable("the plug is out")
         self.controls.append(controls)
 
     def state(self) -> VehicleState:
@@ -297,77 +304,78 @@ class Vehicle:
 
 
 class Station:
-    """A driver at work, fifty commands a second."""
+    """A running driver, who sends fifty commands per second."""
 
-    def __init__(self, bundle: FakeBundle, received: Callable[[Message], None]) -> None:
-        self.bundle, self.received = bundle, received
+    def __init__(self, connection: FakeConnection, received: Callable[[Message], None]) -> None:
+        self.connection, self.received = connection, received
         self.controls, self.agree, self.number, self.ended = REST, False, 0, threading.Event()
         self.thread = threading.Thread(target=self.run)
         self.thread.start()
 
     def run(self) -> None:
         while not self.ended.wait(0.02):
-            told = self.bundle.telemetry() if any(kind == Kind.TELEMETRY for kind, _ in self.bundle.sent) else None
+            sent = any(kind == Kind.TELEMETRY for kind, _ in self.connection.sent)
+            telemetry = self.connection.telemetry() if sent else None
             self.number += 1
-            command = Command(self.controls, told.stop if told else 0, self.agree)
+            command = Command(self.controls, telemetry.stop if telemetry else 0, self.agree)
             self.received(Message(Kind.COMMAND, self.number, time.monotonic_ns(), command.pack()))
 
     def until(self, what: Callable[[], bool]) -> None:
         end = time.monotonic() + 20
         while not what():
-            assert time.monotonic() < end, self.bundle.telemetry()
+            assert time.monotonic() < end, self.connection.telemetry()
             time.sleep(0.005)
 
     def start(self) -> None:
-        """As drivers do: foot off, press the button until it drives, foot down."""
+        """Release the throttle, press the confirm button until the vehicle drives, press the throttle."""
         self.controls, self.agree = REST, False
         time.sleep(0.15)
         self.agree = True
-        self.until(lambda: not self.bundle.telemetry().standing)
+        self.until(lambda: not self.connection.telemetry().standing)
         self.controls, self.agree = GO, False
 
 
 @pytest.fixture
-def at_work() -> Iterator[tuple[Vehicle, CarUnit, Station, FakeBundle, threading.Event]]:
-    """A vehicle, its translator, its car unit and a station."""
-    vehicle, ended, bundle = Vehicle(), threading.Event(), FakeBundle()
-    translating = Translating(vehicle, TranslateParams(port=0, limit=LIMIT))
-    translator = threading.Thread(target=translating.run, args=(ended,))
-    translator.start()
-    unit = CarUnit(CarParams(translator=f"127.0.0.1:{translating.address[1]}", limit=LIMIT))
+def running() -> Iterator[tuple[Vehicle, OnboardUnit, Station, FakeConnection, threading.Event]]:
+    """A vehicle, its adapter, its onboard unit, and a station."""
+    vehicle, ended, connection = Vehicle(), threading.Event(), FakeConnection()
+    adapter_server = AdapterServer(vehicle, AdapterParams(port=0, limit=LIMIT))
+    adapter = threading.Thread(target=adapter_server.run, args=(ended,))
+    adapter.start()
+    unit = OnboardUnit(OnboardParams(translator=f"127.0.0.1:{adapter_server.address[1]}", limit=LIMIT))
     stations: list[Station] = []
 
-    def dial(received: Callable[[Message], None], began: Callable[[], None]) -> FakeBundle:
-        began()
-        stations.append(Station(bundle, received))
-        return bundle
+    def connect(received: Callable[[Message], None], restarted: Callable[[], None]) -> FakeConnection:
+        restarted()
+        stations.append(Station(connection, received))
+        return connection
 
-    unit.join(dial)
-    yield vehicle, unit, stations[0], bundle, ended
+    unit.join(connect)
+    yield vehicle, unit, stations[0], connection, ended
     stations[0].ended.set()
     stations[0].thread.join()
     unit.close()
     ended.set()
-    translator.join()
-    assert unit.failed is None and bundle.closed
+    adapter.join()
+    assert unit.failed is None and connection.closed
 
 
-def test_from_the_driver_to_the_vehicle_and_back(
-    at_work: tuple[Vehicle, CarUnit, Station, FakeBundle, threading.Event],
+def test_drive_from_the_driver_to_the_vehicle_and_back(
+    running: tuple[Vehicle, OnboardUnit, Station, FakeConnection, threading.Event],
 ) -> None:
-    vehicle, _, station, bundle, ended = at_work
+    vehicle, _, station, connection, ended = running
     station.start()
     station.until(lambda: vehicle.controls[-1] == GO)
-    assert bundle.telemetry().vehicle.speed == 3.0 and any(kind == Kind.STREAMS for kind, _ in bundle.sent)
+    assert connection.telemetry().vehicle.speed == 3.0 and any(kind == Kind.STREAMS for kind, _ in connection.sent)
 
     station.ended.set()  # the links are cut
     station.thread.join()
     cut = time.monotonic()
     station.until(lambda: vehicle.controls[-1].brake == 1)
     assert time.monotonic() - cut < LIMIT / 1000 + 0.1
-    station.until(lambda: bundle.telemetry().standing)
+    station.until(lambda: connection.telemetry().standing)
 
-    again = Station(bundle, station.received)
+    again = Station(connection, station.received)
     again.number, again.controls = station.number, GO
     time.sleep(0.2)
     assert vehicle.controls[-1].brake == 1  # not before the driver confirms
@@ -375,38 +383,38 @@ def test_from_the_driver_to_the_vehicle_and_back(
     again.until(lambda: vehicle.controls[-1] == GO)
 
     vehicle.unreachable = True
-    again.until(lambda: "the plug is out" in bundle.telemetry().reason)
+    again.until(lambda: "the plug is out" in connection.telemetry().reason)
     vehicle.unreachable = False
     time.sleep(0.1)
     assert vehicle.controls[-1].brake == 1
     again.start()
     again.until(lambda: vehicle.controls[-1] == GO)
 
-    ended.set()  # the translator ends
-    again.until(lambda: bundle.telemetry().reason == SILENT)
+    ended.set()  # the adapter ends
+    again.until(lambda: connection.telemetry().reason == ADAPTER_SILENT)
     assert vehicle.controls[-1].brake == 1
     again.ended.set()
     again.thread.join()
 
 
-def test_a_release_has_the_vehicle_stand_at_once(
-    at_work: tuple[Vehicle, CarUnit, Station, FakeBundle, threading.Event],
+def test_release_stops_the_vehicle_at_once(
+    running: tuple[Vehicle, OnboardUnit, Station, FakeConnection, threading.Event],
 ) -> None:
-    vehicle, unit, station, bundle, _ = at_work
+    vehicle, unit, station, connection, _ = running
     station.start()
     station.until(lambda: vehicle.controls[-1] == GO)
     unit.release("taken back")
-    assert bundle.closed
+    assert connection.closed
     station.until(lambda: vehicle.controls[-1].brake == 1)
     station.agree = True
     time.sleep(0.2)
     assert vehicle.controls[-1].brake == 1
 
 
-def test_a_watchdog_that_fails_is_noticed_and_the_vehicle_stands(
-    at_work: tuple[Vehicle, CarUnit, Station, FakeBundle, threading.Event], monkeypatch: pytest.MonkeyPatch
+def test_failed_watchdog_is_detected_and_the_vehicle_stops(
+    running: tuple[Vehicle, OnboardUnit, Station, FakeConnection, threading.Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    vehicle, unit, station, _, _ = at_work
+    vehicle, unit, station, _, _ = running
     station.start()
     station.until(lambda: vehicle.controls[-1] == GO)
     monkeypatch.setattr(threading, "excepthook", lambda _: None)
@@ -414,7 +422,7 @@ def test_a_watchdog_that_fails_is_noticed_and_the_vehicle_stands(
     def failing(now: int) -> Any:
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr(unit.car, "look", failing)
+    monkeypatch.setattr(unit.car, "watchdog_order", failing)
     station.until(lambda: vehicle.controls[-1].brake == 1)
     assert isinstance(unit.failed, RuntimeError)
     unit.failed = None

@@ -26,62 +26,62 @@ take = itertools.islice
 
 def write(folder: Path, count: int) -> list[U8]:
     folder.mkdir()
-    images = [picture.image for picture in take(scenery(160, 120), count)]
+    images = [frame.image for frame in take(scenery(160, 120), count)]
     for i, image in enumerate(images):
         cv2.imwrite(str(folder / f"{i:03}.png"), image[..., ::-1])
     return images
 
 
-def test_pictures_come_at_their_rate_with_the_time_they_were_taken() -> None:
-    times = [picture.captured for picture in take(cameras.pictures("pattern", View(width=64, height=48, fps=50.0)), 20)]
+def test_frames_arrive_at_their_rate_with_their_capture_time() -> None:
+    times = [frame.captured for frame in take(cameras.frames("pattern", View(width=64, height=48, fps=50.0)), 20)]
     assert times == sorted(times) and time.monotonic_ns() - times[-1] < 5e9
     assert (times[-1] - times[0]) / 1e9 >= 0.38
 
 
 @pytest.mark.parametrize("source", ["pattern", "replay"])
-def test_pictures_can_be_marked(source: str, tmp_path: Path) -> None:
+def test_timecode_is_drawn_on_request(source: str, tmp_path: Path) -> None:
     write(tmp_path / "pictures", 3)
-    view = View(str(tmp_path / "pictures"), 320, 240, marked=True)
-    for picture in take(cameras.pictures(source, view), 7):
-        read = timecode.read(picture.image, picture.captured + 10**9, 320)
-        assert read is not None and 0 <= picture.captured - read < timecode.STEP
+    view = View(str(tmp_path / "pictures"), 320, 240, draw_timecode=True)
+    for frame in take(cameras.frames(source, view), 7):
+        read = timecode.read(frame.image, frame.captured + 10**9, 320)
+        assert read is not None and 0 <= frame.captured - read < timecode.TICK_NS
 
 
-@pytest.mark.parametrize("kept", [10**9, 0], ids=["in memory", "decoded again"])
-def test_a_folder_is_replayed_again_and_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: int) -> None:
+@pytest.mark.parametrize("cache_bytes", [10**9, 0], ids=["in memory", "decoded again"])
+def test_folder_is_replayed_in_a_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cache_bytes: int) -> None:
     from scan2sim.services.teleoperation.cameras import replay
 
-    monkeypatch.setattr(replay, "KEPT", kept)
+    monkeypatch.setattr(replay, "CACHE_MAX_BYTES", cache_bytes)
     images = write(tmp_path / "pictures", 3)
     view = View(str(tmp_path / "pictures"), 160, 120, fps=500.0)
-    shown = [picture.image for picture in take(cameras.pictures("replay", view), 7)]
+    shown = [frame.image for frame in take(cameras.frames("replay", view), 7)]
     assert all(np.array_equal(image, images[i % 3]) for i, image in enumerate(shown))
 
 
-def test_a_video_is_replayed_in_the_size_that_is_asked_for(tmp_path: Path) -> None:
+def test_video_is_replayed_in_the_requested_size(tmp_path: Path) -> None:
     file = str(tmp_path / "drive.avi")
     writer = cv2.VideoWriter(file, cv2.VideoWriter.fourcc(*"MJPG"), 30, (160, 120))
-    images = [picture.image for picture in take(scenery(160, 120), 4)]
+    images = [frame.image for frame in take(scenery(160, 120), 4)]
     for image in images:
         writer.write(image[..., ::-1])
     writer.release()
-    shown = [picture.image for picture in take(cameras.pictures("replay", View(file, 80, 60, fps=500.0)), 9)]
+    shown = [frame.image for frame in take(cameras.frames("replay", View(file, 80, 60, fps=500.0)), 9)]
     for i, image in enumerate(shown):
         assert psnr(image, cv2.resize(images[i % 4], (80, 60), interpolation=cv2.INTER_AREA).astype(np.uint8)) > 25
 
 
-def test_what_is_no_camera_is_told(tmp_path: Path) -> None:
+def test_unreadable_sources_are_reported(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     for source, where in (("replay", "empty"), ("replay", "none.mp4"), ("device", "none.mp4"), ("world", "empty")):
         with pytest.raises(InputError) as caught:
-            next(cameras.pictures(source, View(str(tmp_path / where))))
+            next(cameras.frames(source, View(str(tmp_path / where))))
         assert caught.value.where.startswith(str(tmp_path / where))
-    with pytest.raises(SettingError, match="there is no 'lidar'"):
-        next(cameras.pictures("lidar", View()))
+    with pytest.raises(SettingError, match="unknown value 'lidar'"):
+        next(cameras.frames("lidar", View()))
 
 
 class _Server:
-    """A camera in the network that sends JPEGs, as cheap ones do, and breaks off after some."""
+    """A network camera that sends JPEGs over HTTP, and breaks its connection after some frames."""
 
     def __init__(self, sizes: Iterator[tuple[int, int]]) -> None:
         class Handler(http.server.BaseHTTPRequestHandler):
@@ -91,7 +91,7 @@ class _Server:
                 self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
                 self.end_headers()
                 for i in range(20):
-                    jpeg = cv2.imencode(".jpg", pattern.at(still, i / 30))[1].tobytes()
+                    jpeg = cv2.imencode(".jpg", pattern.draw_at(still, i / 30))[1].tobytes()
                     head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
                     self.wfile.write(head.encode() + jpeg + b"\r\n")
                     time.sleep(0.01)
@@ -104,15 +104,15 @@ class _Server:
         threading.Thread(target=self.server.serve_forever, daemon=True).start()
 
 
-def test_a_camera_in_the_network_is_read_and_found_again_with_another_size() -> None:
+def test_network_camera_is_reopened_with_another_frame_size() -> None:
     server = _Server(itertools.cycle([(160, 120), (320, 240)]))
-    camera = cameras.Camera("rear", lambda: cameras.pictures("device", View(server.address)))
+    camera = cameras.Camera("rear", lambda: cameras.frames("device", View(server.address)))
     seen, end = set[tuple[int, ...]](), time.monotonic() + 30
     while len(seen) < 2 and time.monotonic() < end:
-        picture = camera.read(1.0)
-        if picture:
-            assert time.monotonic_ns() - picture.captured < 10e9
-            seen.add(picture.image.shape)
+        frame = camera.read(1.0)
+        if frame:
+            assert time.monotonic_ns() - frame.captured < 10e9
+            seen.add(frame.image.shape)
     camera.close()
     server.server.shutdown()
     server.server.server_close()
@@ -121,13 +121,13 @@ def test_a_camera_in_the_network_is_read_and_found_again_with_another_size() -> 
 
 @pytest.mark.parametrize("kind", ["device", "replay"])
 @pytest.mark.parametrize("scheme", ["rtsp", "http"])
-def test_an_unreachable_camera_is_reported_without_its_credentials(kind: str, scheme: str) -> None:
-    """To the driver, whose page shows the fault, as to who starts the vehicle."""
+def test_unreachable_camera_is_reported_without_its_credentials(kind: str, scheme: str) -> None:
+    """Neither the command's error nor the fault on the driver page contains them."""
     address = f"{scheme}://admin:hunter2@127.0.0.1:{free_port()}/live?token=s3cret"
     expected = address.replace("admin:hunter2", "***").replace("s3cret", "***")
     with pytest.raises(InputError) as caught:
-        next(cameras.pictures(kind, View(address)))
-    camera = cameras.Camera("front", lambda: cameras.pictures(kind, View(address)))
+        next(cameras.frames(kind, View(address)))
+    camera = cameras.Camera("front", lambda: cameras.frames(kind, View(address)))
     end = time.monotonic() + 30
     while not camera.fault and time.monotonic() < end:
         time.sleep(0.02)
@@ -136,17 +136,17 @@ def test_an_unreachable_camera_is_reported_without_its_credentials(kind: str, sc
         assert expected in text and "hunter2" not in text and "s3cret" not in text
 
 
-def test_an_address_without_a_name_is_refused_without_its_credentials(tmp_path: Path) -> None:
+def test_camera_without_a_name_is_refused_without_its_credentials(tmp_path: Path) -> None:
     pytest.importorskip("OpenSSL", reason="the extra teleop isn't installed")
     from scan2sim.services.teleoperation.vehicle import app
 
     camera = "rtsp://admin:hunter2@192.0.2.1/live"
-    with pytest.raises(SettingError, match=r"--camera: rtsp://\*\*\*@192\.0\.2\.1/live is no NAME=VALUE"):
+    with pytest.raises(SettingError, match=r"--camera: rtsp://\*\*\*@192\.0\.2\.1/live is not NAME=VALUE"):
         app._cameras(VehicleParams(certificates=tmp_path, gateway="gate.example", camera=(camera,)))
 
 
-def test_an_error_of_a_library_is_reported_without_the_cameras_credentials() -> None:
-    def broken() -> Iterator[cameras.Picture]:
+def test_library_error_is_reported_without_the_credentials_of_the_camera() -> None:
+    def broken() -> Iterator[cameras.CameraFrame]:
         raise OSError("no route to rtsp://admin:hunter2@192.0.2.1/live")
 
     camera = cameras.Camera("front", broken)
@@ -157,17 +157,17 @@ def test_an_error_of_a_library_is_reported_without_the_cameras_credentials() -> 
     assert camera.fault == "no route to rtsp://***@192.0.2.1/live"
 
 
-def test_a_simulated_camera_sees_the_world_from_where_its_vehicle_is(tmp_path: Path) -> None:
+def test_simulated_camera_renders_the_world_from_its_vehicle(tmp_path: Path) -> None:
     folder = synthetic.world(tmp_path).files["world"]
     pose = np.eye(4)
     pose[:3, 3] = 0, 0, 1
     above = View(str(folder), 160, 120, mount=Mount(0, 0, 30, 0, -90), pose=lambda: pose)
-    down = next(cameras.pictures("world", above)).image
-    up = next(cameras.pictures("world", above._replace(mount=Mount(0, 0, 30, 0, 90)))).image
+    down = next(cameras.frames("world", above)).image
+    up = next(cameras.frames("world", above._replace(mount=Mount(0, 0, 30, 0, 90)))).image
     assert (up == up[0, 0]).all() and not (down == up[0, 0]).all(axis=-1).all()
 
 
-def test_mounts_look_where_they_are_told() -> None:
+def test_mount_pose_has_the_given_angles() -> None:
     for yaw, pitch, ahead in (
         (0, 0, (1, 0, 0)),
         (90, 0, (0, 1, 0)),
@@ -175,7 +175,7 @@ def test_mounts_look_where_they_are_told() -> None:
         (0, 90, (0, 0, 1)),
         (-90, 0, (0, -1, 0)),
     ):
-        pose = world.mount(Mount(1.0, 0.5, 1.5, yaw, pitch))
+        pose = world.mount_pose(Mount(1.0, 0.5, 1.5, yaw, pitch))
         assert np.allclose(pose[:3, 2], ahead, atol=1e-9) and np.allclose(pose[:3, 3], (1.0, 0.5, 1.5))
         assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
-    assert world.mount(Mount())[2, 1] < 0  # down in the picture is down
+    assert world.mount_pose(Mount())[2, 1] < 0  # down in the image is down in the world

@@ -10,47 +10,47 @@ import pytest
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.teleoperation import cameras, encoders
-from scan2sim.services.teleoperation.cameras import Camera, Picture, View
-from scan2sim.services.teleoperation.control.messages import Stream
-from scan2sim.services.teleoperation.video.capture import Coder, Streamer
-from scan2sim.services.teleoperation.video.jitter_buffer import Frame, Watcher
-from scan2sim.services.teleoperation.video.rate_control import Plan
-from scan2sim.services.teleoperation.video.srtp_session import Keys
-from tests.services.teleoperation.video.videos import STEP, Drive, scenery
+from scan2sim.services.teleoperation.cameras import Camera, CameraFrame, View
+from scan2sim.services.teleoperation.control.messages import VideoStream
+from scan2sim.services.teleoperation.video.capture import CameraEncoder, CameraStreamer
+from scan2sim.services.teleoperation.video.jitter_buffer import Frame, VideoReceiver
+from scan2sim.services.teleoperation.video.rate_control import EncodingPlan
+from scan2sim.services.teleoperation.video.srtp_session import KeySchedule
+from tests.services.teleoperation.video.videos import FRAME_INTERVAL_NS, Drive, scenery
 
 
-def wait(until: object, seconds: float = 20.0) -> None:
+def wait(condition: object, seconds: float = 20.0) -> None:
     end = time.monotonic() + seconds
-    while not until():  # type: ignore[operator]
+    while not condition():  # type: ignore[operator]
         assert time.monotonic() < end
         time.sleep(0.01)
 
 
-def test_cameras_are_sent_side_by_side() -> None:
-    keys, frames, threads = Keys(time.monotonic()), dict[int, list[Frame]](), set[str]()
-    watcher = Watcher(
+def test_cameras_are_sent_in_parallel_threads() -> None:
+    keys, frames, threads = KeySchedule(time.monotonic()), dict[int, list[Frame]](), set[str]()
+    receiver = VideoReceiver(
         lambda frame: frames.setdefault(frame.camera, []).append(frame),
         lambda camera: None,
         lambda sent: (time.monotonic_ns() - sent) / 1e6,
         lambda source, sequences: None,
         lambda: 0.1,
     )
-    for key in keys.told(time.monotonic()):
-        watcher.learn(key)
+    for key in keys.announced(time.monotonic()):
+        receiver.add_key(key)
 
     def send(packets: object) -> None:
         threads.add(threading.current_thread().name)
         for packet in packets:  # type: ignore[attr-defined]
-            watcher.feed(packet, "lo")
+            receiver.feed(packet, "lo")
 
     view = View(width=160, height=120)
-    opened = [Camera(name, lambda: cameras.pictures("pattern", view)) for name in ("front", "left", "right", "rear")]
+    opened = [Camera(name, lambda: cameras.frames("pattern", view)) for name in ("front", "left", "right", "rear")]
     streamers = [
-        Streamer(i, camera, Coder(i, keys, encoders.find("pyav")), send, Plan(bitrate=300_000))
+        CameraStreamer(i, camera, CameraEncoder(i, keys, encoders.find("pyav")), send, EncodingPlan(bitrate=300_000))
         for i, camera in enumerate(opened)
     ]
     wait(lambda: len(frames) == 4 and min(map(len, frames.values())) > 10)
-    assert streamers[2].stream == Stream(2, "right", 160, 120, 30.0)
+    assert streamers[2].stream == VideoStream(2, "right", 160, 120, 30.0)
     for streamer, camera in zip(streamers, opened, strict=True):
         streamer.close()
         camera.close()
@@ -60,112 +60,120 @@ def test_cameras_are_sent_side_by_side() -> None:
         assert sent[0].key and all(0 < now - frame.captured < 60e9 for frame in sent)
 
 
-def test_the_newest_picture_wins() -> None:
+def test_only_the_newest_frame_is_kept() -> None:
     go, images = threading.Event(), [np.full((2, 2, 3), i, np.uint8) for i in range(50)]
 
-    def pictures() -> Iterator[Picture]:
+    def frames() -> Iterator[CameraFrame]:
         for i, image in enumerate(images):
-            yield Picture(image, i)
+            yield CameraFrame(image, i)
         go.set()
         threading.Event().wait(0.5)
 
-    camera = Camera("front", pictures)
+    camera = Camera("front", frames)
     go.wait(5)
     newest = camera.read(5.0)
     assert newest and newest.captured == 49 and camera.count >= 50
     camera.close()
 
 
-def test_a_camera_that_vanishes_is_told_and_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cameras, "SILENT", 0.2)
-    there = threading.Event()
-    there.set()
+def test_lost_camera_is_reported_and_reopened(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cameras, "CAMERA_TIMEOUT_S", 0.2)
+    connected = threading.Event()
+    connected.set()
 
-    def pictures() -> Iterator[Picture]:
-        if not there.is_set():
+    def frames() -> Iterator[CameraFrame]:
+        if not connected.is_set():
             raise InputError("/dev/video0", "is gone", "Plug it in")
-        for picture in scenery(64, 48):
+        for frame in scenery(64, 48):
             time.sleep(0.01)
-            yield Picture(picture.image, time.monotonic_ns())
-            if not there.is_set():
+            yield CameraFrame(frame.image, time.monotonic_ns())
+            if not connected.is_set():
                 raise InputError("/dev/video0", "is gone", "Plug it in")
 
     sent: list[int] = []
-    camera = Camera("front", pictures)
-    streamer = Streamer(1, camera, Coder(1, Keys(0.0), encoders.find("pyav")), lambda p: sent.append(len(p)), Plan())
+    camera = Camera("front", frames)
+    streamer = CameraStreamer(
+        1,
+        camera,
+        CameraEncoder(1, KeySchedule(0.0), encoders.find("pyav")),
+        lambda p: sent.append(len(p)),
+        EncodingPlan(),
+    )
     wait(lambda: sent)
     assert streamer.stream.fps == 30.0
-    there.clear()
+    connected.clear()
     wait(lambda: streamer.stream.fps == 0.0)
     assert camera.fault == "/dev/video0: is gone. Plug it in"
-    there.set()
+    connected.set()
     before = len(sent)
     wait(lambda: len(sent) > before and streamer.stream.fps == 30.0 and not camera.fault)
     streamer.close()
     camera.close()
 
 
-def test_pictures_are_left_out_for_the_rate() -> None:
-    for fps, kept in ((30.0, 90), (20.0, 60), (15.0, 45), (7.5, 23)):
-        drive = Drive(plan=Plan(bitrate=500_000, fps=fps))
-        drive.send(picture for _, picture in zip(range(90), scenery(64, 48), strict=False))
-        assert len(drive.frames) == pytest.approx(kept, abs=1)
-        gaps = np.diff([frame.captured for frame in drive.frames]) / STEP
+def test_frames_are_dropped_to_the_planned_frame_rate() -> None:
+    for fps, expected in ((30.0, 90), (20.0, 60), (15.0, 45), (7.5, 23)):
+        drive = Drive(plan=EncodingPlan(bitrate=500_000, fps=fps))
+        drive.send(frame for _, frame in zip(range(90), scenery(64, 48), strict=False))
+        assert len(drive.frames) == pytest.approx(expected, abs=1)
+        gaps = np.diff([frame.captured for frame in drive.frames]) / FRAME_INTERVAL_NS
         assert gaps.max() <= 30 / fps + 1.01
 
 
-def test_a_frame_that_the_encoder_leaves_out_is_no_loss() -> None:
+def test_frame_dropped_by_the_encoder_is_not_counted_as_loss() -> None:
     chance = np.random.default_rng(0)
-    drive = Drive(plan=Plan(bitrate=100_000))
+    drive = Drive(plan=EncodingPlan(bitrate=100_000))
     noise = chance.integers(0, 255, (60, 240, 320, 3), np.uint8)
-    drive.send(Picture(image, i * STEP) for i, image in enumerate(noise))
-    counts = drive.watcher.frames()[3]
-    assert drive.coder.counts["skipped"] > 5 and len(drive.frames) == drive.coder.counts["frames"]
-    assert (counts["broken"], counts["lost"]) == (0, 0) and not drive.wanted and drive.in_order()
+    drive.send(CameraFrame(image, i * FRAME_INTERVAL_NS) for i, image in enumerate(noise))
+    counts = drive.receiver.frames()[3]
+    assert drive.encoder.counts["skipped"] > 5 and len(drive.frames) == drive.encoder.counts["frames"]
+    assert (counts["broken"], counts["lost"]) == (0, 0) and not drive.key_frame_requests and drive.in_order()
 
 
-def test_an_encoder_is_made_anew_where_the_rate_changes() -> None:
-    drive, pictures = Drive(plan=Plan(bitrate=1_000_000)), scenery(64, 48)
-    for bitrate, made in ((1_000_000, 1), (1_000_000, 1), (800_000, 2), (1_000_000, 3)):
-        drive.plan = Plan(bitrate=bitrate)
-        drive.send(next(pictures) for _ in range(5))
-        assert drive.coder.counts["encoders"] == made
-    assert len(drive.frames) == 20 and not drive.wanted
+def test_new_encoder_is_created_when_the_bit_rate_changes() -> None:
+    drive, frames = Drive(plan=EncodingPlan(bitrate=1_000_000)), scenery(64, 48)
+    for bitrate, created in ((1_000_000, 1), (1_000_000, 1), (800_000, 2), (1_000_000, 3)):
+        drive.plan = EncodingPlan(bitrate=bitrate)
+        drive.send(next(frames) for _ in range(5))
+        assert drive.encoder.counts["encoders"] == created
+    assert len(drive.frames) == 20 and not drive.key_frame_requests
 
 
-def test_an_encoder_that_fails_is_told_and_another_takes_over() -> None:
+def test_failed_encoder_is_reported_and_replaced() -> None:
     broken = threading.Event()
 
     class Backend:
         RANK = 0
 
-        def lacking(self) -> None:
+        def unavailable(self) -> None:
             return None
 
-        def encoder(self, settings: encoders.Settings) -> encoders.Encoder:
+        def encoder(self, settings: encoders.EncoderSettings) -> encoders.Encoder:
             if broken.is_set():
                 raise OSError("the encoder is hot")
-            made: encoders.Encoder = encoders.find("pyav").encoder(settings)
+            working: encoders.Encoder = encoders.find("pyav").encoder(settings)
 
-            class Breaks:
+            class FailingEncoder:
                 def encode(self, planes: U8, captured: int, key: bool) -> bytes:
                     if broken.is_set():
                         raise OSError("the encoder is hot")
-                    return made.encode(planes, captured, key)
+                    return working.encode(planes, captured, key)
 
                 def close(self) -> None:
-                    made.close()
+                    working.close()
 
-            return Breaks()
+            return FailingEncoder()
 
     sent: list[int] = []
-    camera = Camera("front", lambda: cameras.pictures("pattern", View(width=64, height=48)))
-    streamer = Streamer(0, camera, Coder(0, Keys(0.0), Backend()), lambda p: sent.append(len(p)), Plan())
+    camera = Camera("front", lambda: cameras.frames("pattern", View(width=64, height=48)))
+    streamer = CameraStreamer(
+        0, camera, CameraEncoder(0, KeySchedule(0.0), Backend()), lambda p: sent.append(len(p)), EncodingPlan()
+    )
     wait(lambda: sent)
     broken.set()
     wait(lambda: streamer.fault == "the encoder is hot" and streamer.stream.fps == 0.0)
     broken.clear()
     before = len(sent)
-    wait(lambda: len(sent) > before and not streamer.fault and streamer.coder.counts["encoders"] == 2)
+    wait(lambda: len(sent) > before and not streamer.fault and streamer.encoder.counts["encoders"] == 2)
     streamer.close()
     camera.close()

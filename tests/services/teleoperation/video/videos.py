@@ -1,4 +1,4 @@
-"""Video as tests send it: from a camera's coder over made-up links to a watcher, on a clock of their own."""
+"""Video for tests: from a camera's encoder over simulated links to a receiver, on a simulated clock."""
 
 from __future__ import annotations
 
@@ -9,91 +9,91 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.teleoperation import encoders
-from scan2sim.services.teleoperation.cameras import Picture, pattern
-from scan2sim.services.teleoperation.video.capture import Coder
-from scan2sim.services.teleoperation.video.jitter_buffer import Frame, Watcher
-from scan2sim.services.teleoperation.video.rate_control import Plan
-from scan2sim.services.teleoperation.video.srtp_session import Keys
+from scan2sim.services.teleoperation.cameras import CameraFrame, pattern
+from scan2sim.services.teleoperation.video.capture import CameraEncoder
+from scan2sim.services.teleoperation.video.jitter_buffer import Frame, VideoReceiver
+from scan2sim.services.teleoperation.video.rate_control import EncodingPlan
+from scan2sim.services.teleoperation.video.srtp_session import KeySchedule
 
-STEP = 33_333_333
-"""Nanoseconds between pictures."""
-TRIP = 0.09
-"""Seconds there and back."""
+FRAME_INTERVAL_NS = 33_333_333
+"""Interval between frames."""
+ROUND_TRIP_S = 0.09
+"""Round-trip time."""
 Link = Callable[[list[bytes]], Iterable[bytes]]
-"""What comes of packets that are sent."""
+"""Maps sent packets to received packets."""
 
 
-def scenery(width: int = 320, height: int = 240) -> Iterator[Picture]:
-    """Pictures 33 ms apart."""
+def scenery(width: int = 320, height: int = 240) -> Iterator[CameraFrame]:
+    """Synthetic frames 33 ms apart."""
     still = cv2.GaussianBlur(pattern.bars(width, height), (0, 0), 1.5).astype(np.uint8)
     for i in range(100_000):
-        yield Picture(pattern.at(still, i / 30), i * STEP)
+        yield CameraFrame(pattern.draw_at(still, i / 30), i * FRAME_INTERVAL_NS)
 
 
 def psnr(a: U8, b: U8) -> float:
-    """Peak signal to noise, dB."""
+    """Peak signal-to-noise ratio, dB."""
     return float(cv2.PSNR(a, b))
 
 
 class Drive:
-    """A camera's pictures, sent and watched; the station wants key frames as it does in earnest.
+    """A camera's frames, sent and received; key frame requests of the station are carried out.
 
     Attributes:
-        frames: that were given out; `pictures`: that were sent, by their time.
-        wanted: times at which key frames were; `asked`: times at which packets were asked for again.
+        frames: output by the receiver; `images`: sent, by capture time.
+        key_frame_requests: their times; `nacks`: times of NACKs.
     """
 
-    def __init__(self, every: float = 1e9, plan: Plan | None = None, mends: bool = False) -> None:
-        """`mends`: packets that are asked for are sent again."""
+    def __init__(self, key_lifetime: float = 1e9, plan: EncodingPlan | None = None, retransmits: bool = False) -> None:
+        """`retransmits`: NACKed packets are retransmitted."""
         self.now = 0.0
-        self.keys = Keys(self.now, every)
-        self.coder = Coder(3, self.keys, encoders.find("pyav"))
-        self.plan = plan or Plan(bitrate=800_000)
+        self.keys = KeySchedule(self.now, key_lifetime)
+        self.encoder = CameraEncoder(3, self.keys, encoders.find("pyav"))
+        self.plan = plan or EncodingPlan(bitrate=800_000)
         self.frames: list[Frame] = []
-        self.wanted: list[float] = []
-        self.pictures: dict[int, U8] = {}
-        self.watcher = Watcher(
+        self.key_frame_requests: list[float] = []
+        self.images: dict[int, U8] = {}
+        self.receiver = VideoReceiver(
             self.frames.append,
-            self._want,
+            self._request_key_frame,
             lambda sent: self.now * 1e3 - sent / 1e6,
-            self._ask,
-            lambda: TRIP,
+            self._send_nack,
+            lambda: ROUND_TRIP_S,
             lambda: self.now,
         )
-        self.asked: list[float] = []
-        self._mends, self._again = mends, list[tuple[float, list[bytes]]]()
+        self.nacks: list[float] = []
+        self._retransmits, self._retransmitted = retransmits, list[tuple[float, list[bytes]]]()
 
-    def _want(self, camera: int) -> None:
+    def _request_key_frame(self, camera: int) -> None:
         assert camera == 3
-        self.wanted.append(self.now)
-        self.coder.want_key()
+        self.key_frame_requests.append(self.now)
+        self.encoder.request_key_frame()
 
-    def _ask(self, source: int, sequences: Sequence[int]) -> None:
-        self.asked.append(self.now)
-        if self._mends:
-            self._again.append((self.now + TRIP, self.coder.again(source, sequences)))
+    def _send_nack(self, source: int, sequences: Sequence[int]) -> None:
+        self.nacks.append(self.now)
+        if self._retransmits:
+            self._retransmitted.append((self.now + ROUND_TRIP_S, self.encoder.retransmit(source, sequences)))
 
-    def send(self, pictures: Iterable[Picture], link: Link = lambda packets: packets, name: str = "lte") -> None:
-        """All pictures, one after the other."""
-        for picture in pictures:
-            self.now = picture.captured / 1e9
-            for key in self.keys.told(self.now):
-                self.watcher.learn(key)
-            self.pictures[picture.captured] = picture.image
-            packets = self.coder.code(picture, self.plan, self.now)
-            while self._again and self._again[0][0] <= self.now:
-                packets = [*self._again.pop(0)[1], *packets]
+    def send(self, frames: Iterable[CameraFrame], link: Link = lambda packets: packets, name: str = "lte") -> None:
+        """Send all frames."""
+        for frame in frames:
+            self.now = frame.captured / 1e9
+            for key in self.keys.announced(self.now):
+                self.receiver.add_key(key)
+            self.images[frame.captured] = frame.image
+            packets = self.encoder.encode(frame, self.plan, self.now)
+            while self._retransmitted and self._retransmitted[0][0] <= self.now:
+                packets = [*self._retransmitted.pop(0)[1], *packets]
             for packet in link(packets):
-                self.watcher.feed(packet, name)
+                self.receiver.feed(packet, name)
 
     def decoded(self) -> list[tuple[Frame, U8]]:
-        """All frames, with what is seen in them."""
+        """All frames, with their decoded images."""
         decoder = encoders.Decoder()
         seen = [(frame, decoder.decode(frame.data)) for frame in self.frames]
         assert all(image is not None for _, image in seen)
         return [(frame, image) for frame, image in seen if image is not None]
 
     def in_order(self) -> bool:
-        """Whether the frames came in the order of their pictures, each at most once."""
+        """Whether frames were output in capture order, each at most once."""
         times = [frame.captured for frame in self.frames]
         return times == sorted(set(times))

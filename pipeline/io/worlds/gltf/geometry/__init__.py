@@ -1,4 +1,4 @@
-"""How glTF keeps geometry: a file a codec (`pipeline.core.plugins`), named in `export.glb_mesh`."""
+"""Geometry codecs of glTF: one module per codec (`pipeline.core.plugins`), selected by `export.glb_mesh`."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Part:
     """Triangles of one material.
 
     Attributes:
-        faces: (F, 3) of vertices.
-        attributes: (V,) or (V, k) by their names in glTF; POSITION (metres, y up) is one of them.
+        faces: (F, 3) vertex indices.
+        attributes: (V,) or (V, k) by their glTF names; includes POSITION (metres, y up).
     """
 
     faces: I64
@@ -25,7 +25,7 @@ class Part:
 
 
 class Codec(Protocol):
-    """What a codec's module has."""
+    """Interface of a codec's module."""
 
     def primitive(self, builder: Builder, part: Part) -> dict[str, Any]:
-        """A part as a primitive of a mesh, whose data is put into the builder."""
+        """Add a part's data to the builder; returns the mesh primitive."""

@@ -1,4 +1,4 @@
-"""As it is: 32-bit floats, to the bit; read by everything."""
+"""Uncompressed geometry: 32-bit floats, lossless; read by every program."""
 
 from __future__ import annotations
 

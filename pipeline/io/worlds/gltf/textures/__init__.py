@@ -1,4 +1,4 @@
-"""How glTF keeps texture pages: a file a format (`pipeline.core.plugins`), named in `export.glb_texture`."""
+"""Texture formats of glTF: one module per format (`pipeline.core.plugins`), selected by `export.glb_texture`."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ SETTING = "export.glb_texture"
 
 
 class Texture(Protocol):
-    """What a format's module has.
+    """Interface of a format's module.
 
     Attributes:
-        MIME: type of its files.
-        EXTENSION: of glTF, by which textures name it; "": it is part of glTF.
-        PROGRAMS: one of which must be here.
+        MIME: MIME type of its files.
+        EXTENSION: glTF extension that textures need for it; "" for formats of core glTF.
+        PROGRAMS: programs of which one must be installed.
     """
 
     MIME: str
@@ -26,18 +26,19 @@ class Texture(Protocol):
     PROGRAMS: tuple[str, ...]
 
     def encode(self, page: U8, quality: int) -> bytes:
-        """A page (H, W, 3) RGB as a file; `quality` is from 1 to 100."""
+        """Encode a page (H, W, 3) RGB; `quality` is from 1 to 100."""
 
 
 def find(name: str) -> Texture:
-    """A format that can be written here.
+    """The module of a format.
 
     Raises:
-        SettingError: there is none of that name.
-        UnavailableError: its package or program isn't here.
+        SettingError: unknown format.
+        UnavailableError: its package or program isn't installed.
     """
     texture: Texture = plugins.find(__name__, name, SETTING)
     if texture.PROGRAMS and not any(map(shutil.which, texture.PROGRAMS)):
-        named = " or ".join(texture.PROGRAMS)
-        raise UnavailableError(f"{SETTING} {name}", f"needs the program {named}", f"Install {named}, or choose webp")
+        programs = " or ".join(texture.PROGRAMS)
+        cause = f"needs the program {programs}"
+        raise UnavailableError(f"{SETTING} {name}", cause, f"Install {programs}, or choose webp")
     return texture

@@ -1,4 +1,4 @@
-"""JPEG: read by everything."""
+"""JPEG textures: read by every program."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""KTX 2 with Basis Universal (ETC1S): stays packed in graphics cards; `KHR_texture_basisu`.
+"""KTX 2 textures with Basis Universal (ETC1S, `KHR_texture_basisu`): stay compressed in GPU memory.
 
-Encoded by Binomial's `basisu`, or by `toktx` of Khronos' KTX-Software, with mip-maps: none can be made of it later.
+Encoded by Binomial's `basisu`, or by `toktx` of Khronos' KTX-Software, with mipmaps, which readers can't generate.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from scan2sim.pipeline.io.images import image
 
 MIME, EXTENSION = "image/ktx2", "KHR_texture_basisu"
 PROGRAMS = ("basisu", "toktx")
-LIMIT = 1800.0
-"""Seconds for a page."""
+TIMEOUT_S = 1800.0
+"""Timeout of the encoder for one page."""
 
 
 def encode(page: U8, quality: int) -> bytes:
@@ -30,20 +30,30 @@ def encode(page: U8, quality: int) -> bytes:
     """
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "page.png", Path(folder) / "page.ktx2"
-        image.write(source, _in_fours(page), compression=1)
-        of255 = str(max(1, round(quality * 2.55)))
+        image.write(source, _multiple_of_four(page), compression=1)
+        quality_255 = str(max(1, round(quality * 2.55)))
         if shutil.which("basisu"):
-            command = ["basisu", "-ktx2", "-mipmap", "-q", of255, "-file", str(source), "-output_file", str(target)]
+            command = [
+                "basisu",
+                "-ktx2",
+                "-mipmap",
+                "-q",
+                quality_255,
+                "-file",
+                str(source),
+                "-output_file",
+                str(target),
+            ]
         else:
-            command = ["toktx", "--encode", "etc1s", "--genmipmap", "--qlevel", of255, str(target), str(source)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT)
+            command = ["toktx", "--encode", "etc1s", "--genmipmap", "--qlevel", quality_255, str(target), str(source)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S)
         if done.returncode or not target.is_file():
-            said = (done.stderr or done.stdout).strip().splitlines()[-1:]
-            raise UnavailableError(command[0], f"failed: {' '.join(said)}", "Choose export.glb_texture=webp or jpeg")
+            output = (done.stderr or done.stdout).strip().splitlines()[-1:]
+            raise UnavailableError(command[0], f"failed: {' '.join(output)}", "Choose export.glb_texture=webp or jpeg")
         return target.read_bytes()
 
 
-def _in_fours(page: U8) -> U8:
+def _multiple_of_four(page: U8) -> U8:
     import cv2
 
     height, width = (side + -side % 4 for side in page.shape[:2])

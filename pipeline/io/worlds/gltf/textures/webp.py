@@ -1,4 +1,4 @@
-"""WebP, smaller than JPEG: read by browsers, Cesium, Blender; `EXT_texture_webp`."""
+"""WebP textures (`EXT_texture_webp`): smaller than JPEG; read by browsers, Cesium, Blender."""
 
 from __future__ import annotations
 

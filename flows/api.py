@@ -1,0 +1,176 @@
+"""The public Python API: `scan2sim.run`, `survey`, `read_world` and the importers, for notebooks and scripts.
+
+The commands of the same names call the same functions. Everything else may change between minor versions.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from scan2sim.pipeline.core.errors import InputError, ScanError
+from scan2sim.pipeline.importers.clouds_and_photos import import_las as import_clouds
+from scan2sim.pipeline.importers.kitti_odometry import import_kitti_odometry
+from scan2sim.pipeline.importers.kitti_raw import import_kitti_raw
+from scan2sim.pipeline.importers.photogrammetry import import_model as import_photogrammetry
+
+if TYPE_CHECKING:
+    from scan2sim.flows.pipelines.settings import Settings
+    from scan2sim.pipeline.io.worlds.scene import Scene
+
+__all__ = [
+    "ScanError",
+    "World",
+    "import_clouds",
+    "import_kitti_odometry",
+    "import_kitti_raw",
+    "import_photogrammetry",
+    "read_world",
+    "run",
+    "survey",
+]
+
+
+@dataclass(frozen=True)
+class World:
+    """A finished world on disk, of one tile or of a survey.
+
+    Attributes:
+        folder: the output folder that was given to `run` or `survey`.
+    """
+
+    folder: Path
+
+    @cached_property
+    def scene(self) -> Scene:
+        """Name, coordinate frame (`scene.frame.crs`, `.origin`) and tiles, with their textured surfaces.
+
+        Example:
+            `for tile in world.scene.tiles: print(tile.name, tile.groups["building"]["triangles"])`
+        """
+        from scan2sim.pipeline.io.worlds.scene import read_scene
+
+        return read_scene(self.folder)
+
+    @property
+    def sdf(self) -> Path:
+        """The Gazebo world (SDF 1.9)."""
+        return self.folder / "world" / f"{self.scene.name}.sdf"
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """Metrics and warnings: the content of `report.json`, of a survey `survey.json`.
+
+        Raises:
+            InputError: the run wrote no report.
+        """
+        for name in ("report.json", "survey.json"):
+            if (self.folder / name).is_file():
+                return dict(json.loads((self.folder / name).read_text(encoding="utf-8")))
+        raise InputError(self.folder, "has no report.json and no survey.json", "Run the tile or the survey again")
+
+
+def run(
+    tile: str | Path,
+    out: str | Path,
+    settings: Mapping[str, Any] | None = None,
+    *,
+    hold_out: int = 0,
+    jobs: int = 0,
+    progress: bool = True,
+) -> World:
+    """Make the world of a tile; steps that an earlier run into the same folder has finished are not computed again.
+
+    Args:
+        tile: a `tile.toml`, or its folder.
+        out: folder for the world, the report and cached results; created if it does not exist.
+        settings: `{"decimate": {"target": 50000}}` or `{"decimate.building.target": 50000}`; all of them are in
+            docs/reference/settings.md.
+        hold_out: keep every Nth photo out of texturing, to measure quality against it; 0: none.
+        jobs: steps that run at the same time; 0: by the number of cores.
+        progress: show progress and results on the terminal.
+
+    Returns:
+        The finished world.
+
+    Raises:
+        IncompleteError: the world is finished, side products (roads, pictures, ...) failed.
+        ScanError: bad input or a failed step, with cause and remedy; results of earlier runs stay.
+    """
+    from scan2sim.flows.commands.run import run_tile
+
+    with _shown(progress):
+        run_tile(Path(tile), Path(out), _settings(settings, hold_out), jobs=jobs)
+    return read_world(out)
+
+
+def survey(
+    source: str | Path,
+    out: str | Path,
+    settings: Mapping[str, Any] | None = None,
+    *,
+    length: float | None = None,
+    buffer: float | None = None,
+    hold_out: int = 0,
+    jobs: int = 0,
+    progress: bool = True,
+) -> World:
+    """Make the worlds of all tiles of a survey, whose borders match, and one world of all of them.
+
+    Args:
+        source: a `survey.toml`, a `tile.toml` of a long road (it is cut into tiles), a `drive.toml`, or its folder.
+        out: folder for worlds, reports and cached results.
+        settings: as for `run`.
+        length: metres of road per tile, where the road is cut here; default: 100.
+        buffer: metres by which the clouds of tiles overlap, where the road is cut here; default: 5.
+        hold_out: as for `run`.
+        jobs: as for `run`.
+        progress: as for `run`.
+
+    Returns:
+        The finished world.
+
+    Raises:
+        StepError: tiles failed; all others are finished.
+        IncompleteError: the world is finished, side products failed.
+        ScanError: bad input, with cause and remedy; results of earlier runs stay.
+    """
+    from scan2sim.flows.commands.survey import run_source
+
+    with _shown(progress):
+        run_source(str(source), str(out), _settings(settings, hold_out), length=length, buffer=buffer, jobs=jobs)
+    return read_world(out)
+
+
+def read_world(folder: str | Path) -> World:
+    """Open a finished world: the output folder of `run` or `survey`, or of the commands of the same names.
+
+    Raises:
+        InputError: there is no finished world in the folder.
+    """
+    world = World(Path(folder))
+    _ = world.scene
+    return world
+
+
+def _settings(values: Mapping[str, Any] | None, hold_out: int) -> Settings:
+    from scan2sim.flows.pipelines.settings import Settings
+
+    return Settings.of({**(values or {}), **({"views.hold_out": hold_out} if hold_out else {})})
+
+
+@contextmanager
+def _shown(progress: bool) -> Iterator[None]:
+    """Show or hide the output of the command while the context is active."""
+    from scan2sim.flows.commands.display import console
+
+    before, console.quiet = console.quiet, not progress
+    try:
+        yield
+    finally:
+        console.quiet = before

@@ -1,0 +1,44 @@
+"""The public Python API, used as in a notebook."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import scan2sim
+from scan2sim.flows.pipelines.settings import Settings
+from tests.flows.tiny import COARSE, tiny
+
+
+def test_api_names_exist() -> None:
+    assert all(getattr(scan2sim, name) for name in scan2sim.__all__)
+    with pytest.raises(AttributeError, match="no_such_name"):
+        scan2sim.no_such_name  # noqa: B018
+
+
+def test_settings_may_be_nested_or_dotted() -> None:
+    nested = Settings.of({"decimate": {"target": 1, "building": {"target": 2}}})
+    assert Settings.of({"decimate.target": 1, "decimate.building.target": 2}).values == nested.values
+    with pytest.raises(scan2sim.ScanError, match=r"step\.param"):
+        Settings.of({"decimate.building.target.x": 1})
+
+
+def test_run_returns_a_readable_world(small_street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tile = tiny(small_street, tmp_path / "tile")
+    world = scan2sim.run(tile, tmp_path / "out", COARSE, progress=False)
+    assert capsys.readouterr().out == ""
+    assert (
+        world.sdf.is_file() and world.report["geometry"] and world.scene.tiles[0].groups["building"]["triangles"] > 10
+    )
+    assert scan2sim.read_world(str(tmp_path / "out")).sdf == world.sdf
+
+
+def test_errors_have_place_cause_and_remedy(tmp_path: Path) -> None:
+    with pytest.raises(scan2sim.ScanError) as caught:
+        scan2sim.run(tmp_path / "nothing", tmp_path / "out")
+    assert caught.value.where and caught.value.cause and caught.value.remedy
+    with pytest.raises(scan2sim.ScanError, match="there is no such step"):
+        scan2sim.survey(tmp_path, tmp_path / "out", {"carving.when": "never"})
+    with pytest.raises(scan2sim.ScanError):
+        scan2sim.read_world(tmp_path)
