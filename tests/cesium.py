@@ -62,7 +62,7 @@ async function look(position, direction, up, frustum) {
 
 
 def missing() -> str:
-    """Why it can't run here, or an empty text."""
+    """Reason why it can't run here, or an empty string."""
     if not any(map(shutil.which, browser.NAMES)):
         return "Chromium isn't installed (apt-get install chromium)"
     return "" if node_module(NAME) else f"{NAME} isn't installed (npm install -g {NAME})"

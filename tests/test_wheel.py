@@ -101,7 +101,7 @@ def test_it_holds_the_rooms_whole_and_nothing_else(wheel: Path) -> None:
         for path in (ROOT / room).rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }
-    pages = {f"scan2sim/docs/{path.name}" for path in (ROOT / "docs").glob("*.md")}
+    pages = {f"scan2sim/docs/{path.relative_to(ROOT / 'docs').as_posix()}" for path in (ROOT / "docs").rglob("*.md")}
     assert inside == rooms - {"scan2sim/data_samples/README.md"} | pages | {"scan2sim/__init__.py"}
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
     assert "License-Expression: Apache-2.0 AND MIT\n" in metadata and "Author: scan2sim contributors\n" in metadata

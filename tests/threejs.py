@@ -74,7 +74,7 @@ window.THREE = all;
 
 
 def missing() -> str:
-    """Why it can't run here, or an empty text."""
+    """Reason why it can't run here, or an empty string."""
     return "" if any(map(shutil.which, browser.NAMES)) else "Chromium isn't installed (apt-get install chromium)"
 
 

@@ -32,7 +32,7 @@ class Consumer(Protocol):
     FORMAT: str
 
     def missing(self) -> str:
-        """Why it can't run here, or an empty text."""
+        """Reason why it can't run here, or an empty string."""
 
     def check(self, export: Path, reference: WorldReference) -> dict[str, Any]:
         """Check an exported world and return metrics.

@@ -16,7 +16,7 @@ PROGRAM = ("blender", "--background", "--factory-startup", "--python-exit-code",
 
 
 def missing() -> str:
-    """Why it can't run here, or an empty text."""
+    """Reason why it can't run here, or an empty string."""
     return "" if shutil.which("blender") else "Blender isn't installed (apt-get install blender)"
 
 

@@ -12,7 +12,7 @@ FORMAT = "usd"
 
 
 def missing() -> str:
-    """Why it can't run here, or an empty text."""
+    """Reason why it can't run here, or an empty string."""
     return blender.module_missing()
 
 

@@ -23,7 +23,7 @@ MAX_HEIGHT_ERROR_M = 0.1
 
 
 def missing() -> str:
-    """Why it can't run here, or an empty text."""
+    """Reason why it can't run here, or an empty string."""
     return "" if importlib.util.find_spec("carla") else "CARLA's library isn't installed (pip install carla)"
 
 

@@ -28,7 +28,7 @@ COARSE_CONTENT = "/level"
 
 
 def missing() -> str:
-    """Why it can't run here, or an empty text."""
+    """Reason why it can't run here, or an empty string."""
     return cesium.missing()
 
 

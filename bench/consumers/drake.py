@@ -20,7 +20,7 @@ GAZEBO_ELEMENTS = ("plugin", "sensor", "cast_shadows")
 
 
 def missing() -> str:
-    """Why it can't run here, or an empty text."""
+    """Reason why it can't run here, or an empty string."""
     return "" if importlib.util.find_spec("pydrake") else "pydrake isn't installed (pip install drake)"
 
 

@@ -22,7 +22,7 @@ MAX_ROAD_DISTANCE_M = 0.1
 
 
 def missing() -> str:
-    """Why it can't run here, or an empty text."""
+    """Reason why it can't run here, or an empty string."""
     return "" if importlib.util.find_spec("assimp_py") else "assimp isn't installed (pip install assimp-py)"
 
 

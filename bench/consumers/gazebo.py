@@ -36,13 +36,13 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
     (world,) = export.glob("*.sdf")
     first, *others = _separate_groups(reference.road)
     bodies: list[checker.Body] = [("ball", (x, y, z)) for x, y, z in drops.start_positions(reference).tolist()]
-    seen = _checked(world, [*bodies, *(("car", _over(place, reference)) for place in first)])
-    cars = seen["bodies"][len(bodies) :]
+    loaded = _check_world(world, [*bodies, *(("car", _start_above(point, reference)) for point in first)])
+    cars = loaded["bodies"][len(bodies) :]
     for group in others:
-        cars += _checked(world, [("car", _over(place, reference)) for place in group])["bodies"]
-    balls = drops.rest_gaps(np.array([body["rest"] for body in seen["bodies"][: len(bodies)]]), reference)
-    off = np.concatenate([balls, [_car_off(car, reference) for car in cars]])
-    metrics = {"meshes": len(seen["meshes"]), "solids": seen["solids"], **drops.rest_metrics(off)}
+        cars += _check_world(world, [("car", _start_above(point, reference)) for point in group])["bodies"]
+    balls = drops.rest_gaps(np.array([body["rest"] for body in loaded["bodies"][: len(bodies)]]), reference)
+    gaps = np.concatenate([balls, [_car_gap(car, reference) for car in cars]])
+    metrics = {"meshes": len(loaded["meshes"]), "solids": loaded["solids"], **drops.rest_metrics(gaps)}
     left, right = (f"{wheel.name}_joint" for wheel in ROBOT.wheels)
     with checker.SimulatedRobot(world, ROBOT.name, (left, right)) as robot:
         return metrics | drive.drive(_Robot(robot), reference)
@@ -63,18 +63,18 @@ class _Robot:
         self._robot.turn(left, right, seconds)
 
 
-def _checked(world: Path, bodies: list[checker.Body]) -> dict[str, Any]:
+def _check_world(world: Path, bodies: list[checker.Body]) -> dict[str, Any]:
     try:
         return checker.check_world(world, *bodies)
-    except checker.WorldRejected as why:
-        raise Fault(str(why)) from None
+    except checker.WorldRejected as error:
+        raise Fault(str(error)) from None
 
 
-def _over(place: F64, reference: WorldReference) -> tuple[float, float, float]:
+def _start_above(point: F64, reference: WorldReference) -> tuple[float, float, float]:
     """Initial position of a car's box: above the highest ground below it."""
-    below = _underside()[:, :2] + place[:2]
-    highest = float(np.nanmax([place[2], *reference.heights(below)]))
-    return float(place[0]), float(place[1]), highest + CAR_SIZE_M[2] / 2 + drops.DROP_HEIGHT_M
+    below = _underside()[:, :2] + point[:2]
+    highest = float(np.nanmax([point[2], *reference.heights(below)]))
+    return float(point[0]), float(point[1]), highest + CAR_SIZE_M[2] / 2 + drops.DROP_HEIGHT_M
 
 
 def _underside() -> F64:
@@ -86,15 +86,15 @@ def _underside() -> F64:
 def _separate_groups(points: F64) -> list[list[F64]]:
     """Groups of points that are far from each other."""
     groups: list[list[F64]] = [[]]
-    for place in points:
-        group = next((g for g in groups if all(np.linalg.norm(place - p) > MIN_CAR_DISTANCE_M for p in g)), None)
+    for point in points:
+        group = next((g for g in groups if all(np.linalg.norm(point - p) > MIN_CAR_DISTANCE_M for p in g)), None)
         if group is None:
             groups.append(group := [])
-        group.append(place)
+        group.append(point)
     return groups
 
 
-def _car_off(body: dict[str, Any], reference: WorldReference) -> float:
+def _car_gap(body: dict[str, Any], reference: WorldReference) -> float:
     """Smallest gap in metres between a box' underside and the cloud's surface."""
     under = _rotation(body).apply(_underside()) + body["rest"]
     gap = under[:, 2] - reference.heights(under[:, :2])

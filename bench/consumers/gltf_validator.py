@@ -21,7 +21,7 @@ validateBytes(new Uint8Array(fs.readFileSync(process.argv[2]))).then((r) => cons
 
 
 def missing() -> str:
-    """Why it can't run here, or an empty text."""
+    """Reason why it can't run here, or an empty string."""
     if shutil.which("node") is None:
         return "Node.js isn't installed"
     return "" if node_module(NAME) else f"{NAME} isn't installed (npm install -g {NAME})"

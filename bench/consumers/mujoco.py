@@ -23,7 +23,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 
 
 def missing() -> str:
-    """Why it can't run here, or an empty text."""
+    """Reason why it can't run here, or an empty string."""
     if importlib.util.find_spec("mujoco") is None:
         return "mujoco isn't installed (pip install mujoco)"
     import mujoco

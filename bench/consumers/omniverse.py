@@ -17,7 +17,7 @@ FAILED = ("ERROR", "FAILURE")
 
 
 def missing() -> str:
-    """Why it can't run here, or an empty text."""
+    """Reason why it can't run here, or an empty string."""
     if importlib.util.find_spec("omni") and importlib.util.find_spec("omni.asset_validator"):
         return ""
     return "the asset validator isn't installed (pip install omniverse-asset-validator)"

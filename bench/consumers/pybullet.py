@@ -25,7 +25,7 @@ NEAR_PLANE_M, FAR_PLANE_M = 0.1, 300.0
 
 
 def missing() -> str:
-    """Why it can't run here, or an empty text."""
+    """Reason why it can't run here, or an empty string."""
     return "" if importlib.util.find_spec("pybullet") else "pybullet isn't installed (pip install pybullet)"
 
 

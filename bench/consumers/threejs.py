@@ -16,7 +16,7 @@ FORMAT = "glb"
 
 
 def missing() -> str:
-    """Why it can't run here, or an empty text."""
+    """Reason why it can't run here, or an empty string."""
     return threejs.missing()
 
 

@@ -17,7 +17,7 @@ NAME = "3d-tiles-validator"
 
 
 def missing() -> str:
-    """Why it can't run here, or an empty text."""
+    """Reason why it can't run here, or an empty string."""
     return "" if node_module(NAME) else f"{NAME} isn't installed (npm install -g {NAME})"
 
 

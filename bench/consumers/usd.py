@@ -13,7 +13,7 @@ FORMAT = "usd"
 
 
 def missing() -> str:
-    """Why it can't run here, or an empty text."""
+    """Reason why it can't run here, or an empty string."""
     return "" if importlib.util.find_spec("pxr") else "OpenUSD isn't installed (pip install usd-core)"
 
 

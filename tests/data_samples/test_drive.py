@@ -1,4 +1,4 @@
-"""The synthetic drive: what the video shows agrees with the poses that come with it."""
+"""The synthetic drive: video frames agree with their ground truth poses."""
 
 from __future__ import annotations
 
@@ -39,49 +39,50 @@ def camera(town: Town, trajectory: Trajectory) -> Panorama:
     return Panorama(town, Traffic(PATH, trajectory, 3), H, seed=3, radius=90.0)
 
 
-def light(image: np.ndarray, gain: float) -> np.ndarray:
-    """Linear light of 8-bit sRGB, without the exposure; NaN where it is clipped."""
-    shown = srgb(np.linspace(0, 1, 4096) ** 2)
-    linear = np.interp(image, shown, np.linspace(0, 1, 4096) ** 2) / gain
+def linear_light(image: np.ndarray, gain: float) -> np.ndarray:
+    """Linear light of 8-bit sRGB, compensated for exposure; NaN where clipped."""
+    encoded = srgb(np.linspace(0, 1, 4096) ** 2)
+    linear = np.interp(image, encoded, np.linspace(0, 1, 4096) ** 2) / gain
     return np.where(image > 250, np.nan, linear)
 
 
 def project(points: F64, pose: F64) -> tuple[np.ndarray, F64]:
-    """Pixels (N, 2) as whole numbers, and distances (N,), of world points."""
+    """Integer pixels (N, 2) and distances (N,) of world points."""
     d = (points - pose[:3, 3]) @ pose[:3, :3]
-    far = np.linalg.norm(d, axis=1)
+    distance = np.linalg.norm(d, axis=1)
     u = (np.arctan2(d[:, 0], d[:, 2]) / (2 * np.pi) + 0.5) * 2 * H - 0.5
-    v = (np.arcsin(d[:, 1] / far) / np.pi + 0.5) * H - 0.5
-    return np.stack([np.round(u).astype(int) % (2 * H), np.clip(np.round(v).astype(int), 0, H - 1)], axis=1), far
+    v = (np.arcsin(d[:, 1] / distance) / np.pi + 0.5) * H - 0.5
+    return np.stack([np.round(u).astype(int) % (2 * H), np.clip(np.round(v).astype(int), 0, H - 1)], axis=1), distance
 
 
-def points_of(picture: PanoramaImage, poses: F64) -> tuple[np.ndarray, F64]:
-    """(N, 2) pixels that see something that stands still, and where it is (N, 3)."""
-    seen = np.isfinite(picture.depth) & ~picture.moving & (picture.depth < 40)
-    v, u = np.nonzero(seen)
-    rays = directions(CAMERA, np.stack([u, v], axis=1)) * picture.depth[seen][:, None]
+def static_points(image: PanoramaImage, poses: F64) -> tuple[np.ndarray, F64]:
+    """Pixels (N, 2) that show static objects nearer than 40 m, and the points (N, 3) that they show."""
+    static = np.isfinite(image.depth) & ~image.moving & (image.depth < 40)
+    v, u = np.nonzero(static)
+    rays = directions(CAMERA, np.stack([u, v], axis=1)) * image.depth[static][:, None]
     rows = np.broadcast_to(poses, (H, 4, 4))[v]
     return np.stack([u, v], axis=1), np.einsum("nij,nj->ni", rows[:, :3, :3], rays) + rows[:, :3, 3]
 
 
-def agreement(a: PanoramaImage, poses_a: F64, b: PanoramaImage, poses_b: F64) -> tuple[float, float]:
-    """Share of a's still points that b sees too, and their median relative difference of light."""
-    pixels, points = points_of(a, poses_a)
+def photo_consistency(a: PanoramaImage, poses_a: F64, b: PanoramaImage, poses_b: F64) -> tuple[float, float]:
+    """Share of a's static points that are visible in b, and their median relative difference in linear light."""
+    pixels, points = static_points(a, poses_a)
     if poses_b.ndim == 2:
-        there, far = project(points, poses_b)
-    else:  # each row has its own pose: the row a point is seen in, by iteration
-        there, far = project(points, poses_b[H // 2])
+        projected, distance = project(points, poses_b)
+    else:  # rolling shutter, each row has its own pose: find a point's row iteratively
+        projected, distance = project(points, poses_b[H // 2])
         for _ in range(3):
-            found = [project(points[i : i + 1], poses_b[there[i, 1]]) for i in range(len(points))]
-            there, far = np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
-    u, v = there.T
-    seen = np.abs(b.depth[v, u] - far) < 0.05 * far
-    la, lb = light(a.rgb, a.gain)[pixels[seen, 1], pixels[seen, 0]], light(b.rgb, b.gain)[v[seen], u[seen]]
-    return float(seen.mean()), float(np.nanmedian(np.abs(la - lb) / (la + lb + 0.02)))
+            found = [project(points[i : i + 1], poses_b[projected[i, 1]]) for i in range(len(points))]
+            projected, distance = np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
+    u, v = projected.T
+    visible = np.abs(b.depth[v, u] - distance) < 0.05 * distance
+    light_a = linear_light(a.rgb, a.gain)[pixels[visible, 1], pixels[visible, 0]]
+    light_b = linear_light(b.rgb, b.gain)[v[visible], u[visible]]
+    return float(visible.mean()), float(np.nanmedian(np.abs(light_a - light_b) / (light_a + light_b + 0.02)))
 
 
 @pytest.mark.parametrize("file", ["town", "kitti"])
-def test_a_drive_is_smooth_and_starts_from_standing(tmp_path: Path, file: str) -> None:
+def test_a_drive_is_smooth_and_starts_from_rest(tmp_path: Path, file: str) -> None:
     if file == "kitti":
         angle = np.linspace(0, 3, 400)
         rows = np.tile(np.eye(4)[:3].ravel(), (400, 1))
@@ -98,14 +99,14 @@ def test_a_drive_is_smooth_and_starts_from_standing(tmp_path: Path, file: str) -
     assert np.linalg.norm(v, axis=1).max() < 12.2
     assert np.linalg.norm(np.diff(v[:, :2], axis=0) * 15, axis=1).max() < 4.5
     assert np.allclose(drive.rotations @ drive.rotations.transpose(0, 2, 1), np.eye(3), atol=1e-9)
-    going = np.linalg.norm(v, axis=1) > 1
-    ahead = np.einsum("ij,ij->i", v, drive.rotations[:-1, :, 2])[going] / np.linalg.norm(v, axis=1)[going]
-    assert ahead.min() > 0.97
+    moving = np.linalg.norm(v, axis=1) > 1
+    cosine = np.einsum("ij,ij->i", v, drive.rotations[:-1, :, 2])[moving] / np.linalg.norm(v, axis=1)[moving]
+    assert cosine.min() > 0.97  # the car faces its direction of motion
     assert drive.rotations[:, 2, 1].max() < -0.99  # y is down
     assert 0.002 < drive.positions[:, 2].std() < 0.06
 
 
-def test_nothing_stands_on_the_road(town: Town) -> None:
+def test_no_object_is_on_the_road(town: Town) -> None:
     houses = [t for t in town.placed if getattr(t.make, "func", t.make).__name__ == "house"]
     assert len(houses) > 10
     for t in houses:
@@ -118,14 +119,14 @@ def test_nothing_stands_on_the_road(town: Town) -> None:
 
 
 @pytest.mark.slow
-def test_pixels_agree_with_the_poses(camera: Panorama, trajectory: Trajectory) -> None:
+def test_frames_are_consistent_under_their_poses(camera: Panorama, trajectory: Trajectory) -> None:
     for i, j in ((60, 63), (150, 147)):
         a, b = (camera.render(trajectory.poses[k], float(trajectory.times[k])) for k in (i, j))
-        share, difference = agreement(a, trajectory.poses[i], b, trajectory.poses[j])
+        share, difference = photo_consistency(a, trajectory.poses[i], b, trajectory.poses[j])
         assert share > 0.8
         assert difference < 0.06
-        _, wrong = agreement(a, trajectory.poses[i], b, trajectory.poses[j + 3])
-        assert wrong > 1.5 * difference  # the measure notices a wrong pose
+        _, wrong = photo_consistency(a, trajectory.poses[i], b, trajectory.poses[j + 3])
+        assert wrong > 1.5 * difference  # the measure detects a wrong pose
 
 
 @pytest.mark.slow
@@ -139,16 +140,16 @@ def test_rows_of_a_rolling_shutter_have_their_own_poses(camera: Panorama, trajec
     still = camera.render(trajectory.poses[70], time)
     assert np.nanmedian(np.abs(still.depth[100] - rolling.depth[100])) > 0.001
     assert np.allclose(row_poses(trajectory, time, H, 0.0)[5], trajectory.poses[70], atol=1e-9)
-    share, difference = agreement(still, trajectory.poses[70], rolling, poses)
+    share, difference = photo_consistency(still, trajectory.poses[70], rolling, poses)
     assert share > 0.8
     assert difference < 0.06
 
 
-def filmed(town: Town, poses: F64, time: float, lens: float = 0.0) -> PanoramaImage:
+def render(town: Town, poses: F64, time: float, lens: float = 0.0) -> PanoramaImage:
     return Panorama(town, None, H, seed=3, radius=90.0, lens=lens).render(poses, time)
 
 
-def test_hills_lift_everything_and_tilt_the_car(trajectory: Trajectory) -> None:
+def test_hills_raise_everything_and_tilt_the_car(trajectory: Trajectory) -> None:
     waves = hills.draw(PATH, 0.08, 3)
     driven = hills.lifted(trajectory, waves)
     assert driven.rotations is not None
@@ -156,66 +157,68 @@ def test_hills_lift_everything_and_tilt_the_car(trajectory: Trajectory) -> None:
     climb = np.diff(hills.heights(driven.positions[20:-20, :2], waves)) / np.linalg.norm(move[:, :2], axis=1)
     assert 0.06 < np.abs(climb).max() < 0.085
     ahead = driven.rotations[20:-21, :, 2]
-    assert np.abs(ahead[:, 2] - climb).max() < 0.03  # the rest is the suspension's
+    assert np.abs(ahead[:, 2] - climb).max() < 0.03  # the rest is suspension motion
     steep = 20 + int(np.abs(climb).argmax())
     camera = Panorama(build(PATH, 3, hills=waves), None, H, seed=3, radius=90.0)
     for k in (steep, steep + 3):
-        picture = camera.render(driven.poses[k], k / 15)
-        pixels, points = points_of(picture, driven.poses[k])
+        image = camera.render(driven.poses[k], k / 15)
+        pixels, points = static_points(image, driven.poses[k])
         above = points[:, 2] - hills.heights(points[:, :2], waves)
         road = (camera.town.ground.at(points[:, :2]) < HALF_ROAD_M - 0.5) & (pixels[:, 1] > 0.6 * H)
         assert road.sum() > 500
-        assert np.quantile(np.abs(above[road]), 0.8) < 0.01  # what isn't the road is a parked car
+        assert np.quantile(np.abs(above[road]), 0.8) < 0.01  # the other points are on parked cars
         assert above.min() > -0.05
 
 
-def test_lenses_have_places_of_their_own(town: Town, trajectory: Trajectory) -> None:
+def test_both_lenses_have_their_own_positions(town: Town, trajectory: Trajectory) -> None:
     pose, time = trajectory.poses[70], float(trajectory.times[70])
-    both = filmed(town, pose, time, lens=0.5)
+    both = render(town, pose, time, lens=0.5)
     for side in (1, -1):
         moved = pose.copy()
         moved[:3, 3] += side * 0.5 * pose[:3, 2]
         columns = slice(H // 2 + 2, 3 * H // 2 - 2) if side == 1 else slice(0, H // 2 - 2)
-        alone = filmed(town, moved, time)
-        same = np.isclose(both.depth[:, columns], alone.depth[:, columns], rtol=1e-3, equal_nan=True)
+        single = render(town, moved, time)
+        same = np.isclose(both.depth[:, columns], single.depth[:, columns], rtol=1e-3, equal_nan=True)
         assert same.mean() > 0.995
 
 
-def test_an_exposure_blurs_what_passes_and_keeps_its_light(town: Town, trajectory: Trajectory) -> None:
+def test_motion_blur_keeps_the_mean_light(town: Town, trajectory: Trajectory) -> None:
     camera, i = Panorama(town, None, H, seed=3, samples=1, radius=90.0), 70
     sharp, blurred = (
-        light(render_exposed_frame(camera, trajectory, i, DriveConditions(exposure=s)), 1.0) for s in (0.0, 0.04)
+        linear_light(render_exposed_frame(camera, trajectory, i, DriveConditions(exposure=s)), 1.0) for s in (0.0, 0.04)
     )
     rows, beside = slice(H * 2 // 5, H * 3 // 5), np.r_[H // 2 - 10 : H // 2 + 10, 3 * H // 2 - 10 : 3 * H // 2 + 10]
-    edges = [np.nanmean(np.abs(np.diff(picture[rows], axis=1))[:, beside]) for picture in (sharp, blurred)]
+    edges = [np.nanmean(np.abs(np.diff(image[rows], axis=1))[:, beside]) for image in (sharp, blurred)]
     assert edges[1] < 0.9 * edges[0]
     assert np.nanmean(blurred[rows]) == pytest.approx(np.nanmean(sharp[rows]), rel=0.02)
 
 
-def test_a_low_sun_dazzles_unless_a_house_is_before_it(trajectory: Trajectory) -> None:
+def test_a_low_sun_overexposes_unless_a_house_hides_it(trajectory: Trajectory) -> None:
     camera = Panorama(build(PATH, 3, low_sun=True), None, H, seed=3, radius=90.0)
     assert np.degrees(np.arccos(camera.town.sun @ trajectory.poses[30, :3, 2])) < 25  # ahead, at first
     spots = []
     for k in range(15, 240, 15):
-        picture = camera.render(trajectory.poses[k], k / 15)
+        image = camera.render(trajectory.poses[k], k / 15)
         to = camera.town.sun @ trajectory.poses[k, :3, :3]
         column, row = (np.arctan2(to[0], to[2]) / np.pi + 1) * H, (np.arcsin(to[1]) / np.pi + 0.5) * H
-        spots.append(int(picture.rgb[int(row), int(column) % (2 * H)].min()))
+        spots.append(int(image.rgb[int(row), int(column) % (2 * H)].min()))
     assert max(spots) > 240 and min(spots) < 150
 
 
-def test_the_picture_closes_at_the_seam_and_hides_its_own_car(camera: Panorama, trajectory: Trajectory) -> None:
-    picture = camera.render(trajectory.poses[90], 6.0)
-    rgb = picture.rgb.astype(int)
+def test_panoramas_are_continuous_at_the_seam_and_mask_the_ego_vehicle(
+    camera: Panorama, trajectory: Trajectory
+) -> None:
+    image = camera.render(trajectory.poses[90], 6.0)
+    rgb = image.rgb.astype(int)
     seam = np.abs(rgb[:, 0] - rgb[:, -1]).mean()
     assert seam < 1.5 * np.abs(np.diff(rgb, axis=1)).mean() + 2
-    own = camera.mask == 0
-    assert 0.12 < own.mean() < 0.2
-    assert not own[: H * 8 // 10].any()
-    assert np.isnan(picture.depth[own]).all()
-    assert not np.isnan(picture.depth[~own]).any()
+    ego_vehicle = camera.mask == 0
+    assert 0.12 < ego_vehicle.mean() < 0.2
+    assert not ego_vehicle[: H * 8 // 10].any()
+    assert np.isnan(image.depth[ego_vehicle]).all()
+    assert not np.isnan(image.depth[~ego_vehicle]).any()
     other = camera.render(trajectory.poses[140], 9.0)
-    assert np.array_equal(picture.rgb[own], other.rgb[own])
+    assert np.array_equal(image.rgb[ego_vehicle], other.rgb[ego_vehicle])
 
 
 def test_exposure_changes_smoothly(camera: Panorama) -> None:
@@ -225,14 +228,14 @@ def test_exposure_changes_smoothly(camera: Panorama) -> None:
     assert np.abs(np.diff(gains)).max() < 0.06
 
 
-def test_the_same_seed_gives_the_same_picture(town: Town, trajectory: Trajectory) -> None:
-    def picture(seed: int) -> np.ndarray:
+def test_the_same_seed_gives_the_same_image(town: Town, trajectory: Trajectory) -> None:
+    def image(seed: int) -> np.ndarray:
         camera = Panorama(build(PATH, seed), Traffic(PATH, trajectory, seed), 64, seed, radius=45.0)
         return camera.render(trajectory.poses[100], float(trajectory.times[100])).rgb
 
-    first = picture(3)
-    assert np.array_equal(first, picture(3))
-    assert np.abs(first.astype(int) - picture(4)).mean() > 5
+    first = image(3)
+    assert np.array_equal(first, image(3))
+    assert np.abs(first.astype(int) - image(4)).mean() > 5
 
 
 def test_other_cars_move(camera: Panorama, trajectory: Trajectory) -> None:
@@ -245,8 +248,8 @@ def test_other_cars_move(camera: Panorama, trajectory: Trajectory) -> None:
         assert max(moves) > 1.0
         pose = trajectory.poses[round(time * 15)]
         for v, xy, _ in now:
-            near = pose[:2, 3] - xy
-            assert np.linalg.norm(near) > 2.5, v
+            offset = pose[:2, 3] - xy
+            assert np.linalg.norm(offset) > 2.5, v
     assert any(camera.render(trajectory.poses[k], k / 15).moving.any() for k in range(30, 180, 30))
 
 
@@ -258,7 +261,7 @@ def test_buses_can_block_the_view(town: Town, trajectory: Trajectory) -> None:
     assert shares[1] > 0.95
 
 
-def test_the_receiver_wanders_as_it_should() -> None:
+def test_gps_errors_have_the_specified_noise_gaps_and_jumps() -> None:
     n = 40_000
     still = Trajectory(np.arange(n, dtype=float), np.zeros((n, 3)))
     times, xyz = gps.receiver(still, 1.0, seed=1)
@@ -276,7 +279,7 @@ def test_the_receiver_wanders_as_it_should() -> None:
     assert len(gps.receiver(still, 5.0)[0]) == 5 * (n - 1) + 1
 
 
-def test_geographic_coordinates_are_metres_apart() -> None:
+def test_geographic_coordinates_agree_with_metres() -> None:
     lat, lon, up = gps.geographic(np.array([[0, 0, 0], [0, 100, 0], [100, 0, 5.0]])).T
     assert np.allclose([lat[0], lon[0], up[0]], gps.ORIGIN)
     assert abs((lat[1] - lat[0]) * 111_220 - 100) < 0.5
@@ -284,7 +287,7 @@ def test_geographic_coordinates_are_metres_apart() -> None:
     assert abs(up[2] - up[0] - 5) < 0.01
 
 
-def test_a_drive_is_written(tmp_path: Path) -> None:
+def test_a_drive_writes_video_truth_gps_and_mask(tmp_path: Path) -> None:
     import av
     import cv2
 

@@ -1,4 +1,4 @@
-"""The synthetic street is a valid tile, and its truth is true."""
+"""The synthetic street is a valid tile with correct ground truth."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from scan2sim.pipeline.core.types import Camera, Mesh, PointCloud, Tile
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.tile import read_tile
 
-LENGTH, POINTS, PHOTOS, WIDTH = 10.0, 20_000, 4, 320
+LENGTH_M, POINTS, PHOTOS, PHOTO_WIDTH_PX = 10.0, 20_000, 4, 320
 
 
 @dataclass(frozen=True)
 class Street:
-    """A generated street, read back."""
+    """A generated street, read from its files."""
 
     tile: Tile
     cloud: PointCloud
@@ -37,11 +37,11 @@ class Street:
 def _generate(out: Path, seed: int) -> Path:
     return generate(
         out,
-        length=LENGTH,
+        length=LENGTH_M,
         points=POINTS,
         photos=PHOTOS,
         seed=seed,
-        photo_width=WIDTH,
+        photo_width=PHOTO_WIDTH_PX,
         truth_density=25,
         photo_labels=True,
     )
@@ -60,7 +60,7 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Street:
     return Street(tile, clouds.read(tile.clouds[0], FRAME), truth, Mesh.load(tile.truth_mesh))
 
 
-def test_is_a_tile_in_a_projected_crs(street: Street) -> None:
+def test_the_street_is_a_tile_in_a_projected_crs(street: Street) -> None:
     assert street.tile.frame.crs == "EPSG:32633"
     assert min(street.tile.frame.origin[:2]) > 100_000
     assert street.tile.trajectory is not None
@@ -71,18 +71,18 @@ def test_is_a_tile_in_a_projected_crs(street: Street) -> None:
     assert {v.camera.model for v in street.tile.views} == {"opencv", "pinhole", "equirectangular"}
 
 
-def test_number_of_points(street: Street) -> None:
+def test_the_cloud_has_the_requested_number_of_points(street: Street) -> None:
     assert len(street.cloud) == pytest.approx(POINTS, rel=0.01)
 
 
-def test_same_seed_same_bytes_other_seed_other_street(street: Street, tmp_path: Path) -> None:
+def test_the_same_seed_gives_identical_files_and_another_seed_another_street(street: Street, tmp_path: Path) -> None:
     first = _digests(street.tile.path.parent)
     assert _digests(_generate(tmp_path / "same", 3).parent) == first
     other = _digests(_generate(tmp_path / "other", 4).parent)
     assert {name for name in first if other.get(name) == first[name]} <= {"trajectory.csv"}
 
 
-def test_points_lie_on_the_true_surface_and_carry_its_label(street: Street) -> None:
+def test_points_lie_on_the_true_surface_and_have_its_label(street: Street) -> None:
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
@@ -96,12 +96,12 @@ def test_points_lie_on_the_true_surface_and_carry_its_label(street: Street) -> N
     assert same.mean() > 0.97
 
 
-def test_photos_show_the_true_colours_where_they_should(street: Street) -> None:
-    """Truth points, projected into each photo and seen there, agree with the pixel, exposure removed."""
+def test_photos_show_the_true_colours(street: Street) -> None:
+    """Ground truth points visible in a photo agree with its pixels after exposure compensation."""
     import cv2
     import open3d as o3d
 
-    scene = Scene(lay_out(LENGTH, 3))
+    scene = Scene(lay_out(LENGTH_M, 3))
     folder = street.tile.path.parent
     everything = o3d.t.geometry.RaycastingScene()
     street_faces = scene.surface.faces[: scene._moving_at].astype(np.uint32)
@@ -133,22 +133,22 @@ def test_photos_show_the_true_colours_where_they_should(street: Street) -> None:
 
 
 @pytest.fixture(scope="module")
-def longer() -> tuple[Scene, PointCloud]:
+def long_street() -> tuple[Scene, PointCloud]:
     scene = Scene(lay_out(40.0, 0))
     return scene, scan(scene, plan_drive(scene.layout, 60_000), 60_000)
 
 
-def test_every_class_occurs_on_a_longer_street(longer: tuple[Scene, PointCloud]) -> None:
-    scene, cloud = longer
+def test_a_long_street_contains_all_classes(long_street: tuple[Scene, PointCloud]) -> None:
+    scene, cloud = long_street
     mesh = scene.truth_mesh()
     assert cloud.classification is not None and mesh.classification is not None and cloud.time is not None
     assert set(np.unique(cloud.classification)) == {2, 3, 5, 6, 11, 64, 65, 66, 68, 69}
-    assert set(np.unique(mesh.classification)) == {2, 3, 5, 6, 11, 64, 65, 68, 69}  # vehicles are left out of worlds
+    assert set(np.unique(mesh.classification)) == {2, 3, 5, 6, 11, 64, 65, 68, 69}  # worlds contain no vehicles
     assert len(mesh) < 6000 * 40
 
 
-def test_the_moving_car_leaves_a_trail(longer: tuple[Scene, PointCloud]) -> None:
-    scene, cloud = longer
+def test_the_moving_car_leaves_a_trail_of_points(long_street: tuple[Scene, PointCloud]) -> None:
+    scene, cloud = long_street
     assert cloud.classification is not None and cloud.time is not None
     layout = scene.layout
     s, t = layout.axis.locate(cloud.xyz[cloud.classification == CODE["vehicle"], :2].astype(np.float64))
@@ -157,8 +157,8 @@ def test_the_moving_car_leaves_a_trail(longer: tuple[Scene, PointCloud]) -> None
     assert np.ptp(s[in_lane]) > 12 and np.ptp(time) > 1
 
 
-def test_the_moving_car_can_be_left_out(longer: tuple[Scene, PointCloud]) -> None:
-    scene, cloud = longer
+def test_the_moving_car_can_be_omitted(long_street: tuple[Scene, PointCloud]) -> None:
+    scene, cloud = long_street
     without = Scene(lay_out(40.0, 0, Style(moving_car=False)))
     np.testing.assert_array_equal(without.truth_mesh().vertices, scene.truth_mesh().vertices)
     still = scan(without, plan_drive(without.layout, 60_000), 60_000)
@@ -180,8 +180,8 @@ def test_the_moving_car_can_be_left_out(longer: tuple[Scene, PointCloud]) -> Non
     np.testing.assert_array_equal(never, bare)
 
 
-def test_facades_are_seen_at_the_scanners_own_height_too(longer: tuple[Scene, PointCloud]) -> None:
-    scene, cloud = longer
+def test_facades_have_points_at_the_height_of_the_scanner(long_street: tuple[Scene, PointCloud]) -> None:
+    scene, cloud = long_street
     s, _ = scene.layout.axis.locate(cloud.xyz[cloud.classification == CODE["building"], :2].astype(np.float64))
     above = cloud.xyz[cloud.classification == CODE["building"], 2] - scene.layout.height(s, 0.0)
     counts, _ = np.histogram(above, np.arange(1.0, 3.0, 0.1))
@@ -200,14 +200,14 @@ def test_photo_stations_are_at_most_5_m_apart(length: float, count: int) -> None
 
 
 @pytest.mark.parametrize("camera", photo_module.cameras(400).values(), ids=photo_module.CAMERA_ORDER)
-def test_rays_go_through_the_pixels_that_they_project_to(camera: Camera) -> None:
+def test_ray_directions_invert_the_projection(camera: Camera) -> None:
     pixels = np.random.default_rng(0).uniform([0, 0], [camera.width - 1, camera.height - 1], (200, 2))
     back, ahead = _project(camera, directions(camera, pixels) * 7.0)
     assert ahead.all()
     np.testing.assert_allclose(back, pixels, atol=1e-4)
 
 
-def test_style_and_effects_change_the_looks() -> None:
+def test_style_and_effects_change_houses_and_exposures() -> None:
     plain = lay_out(40.0, 5)
     bricks = lay_out(40.0, 5, Style(brick_share=1.0, flat_roof_share=1.0))
     assert {h.roof for h in bricks.houses} == {"flat"} and all(h.brick for h in bricks.houses)
@@ -216,7 +216,7 @@ def test_style_and_effects_change_the_looks() -> None:
     assert 0.7 < max(abs(s.ev) for s in shots) <= 1.0
 
 
-def test_axis_places_and_locates() -> None:
+def test_locating_on_the_axis_inverts_placing() -> None:
     axis = lay_out(100.0, 2).axis
     s, t = np.meshgrid(np.linspace(0, 100, 11), np.linspace(-20, 20, 9))
     xy, _ = axis.place(s, t)
@@ -225,13 +225,13 @@ def test_axis_places_and_locates() -> None:
     np.testing.assert_allclose(found[1], t, atol=1e-6)
 
 
-def test_refuses_impossible_settings(tmp_path: Path) -> None:
+def test_impossible_settings_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="length"):
         generate(tmp_path, length=2.0)
 
 
 def _project(camera: Camera, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (N, 2) of points in camera axes, and whether they are in front."""
+    """Pixels (N, 2) of points in camera coordinates, and whether they are in front of the camera."""
     x, y, z = xyz.T
     if camera.model == "equirectangular":
         lon, lat = np.arctan2(x, z), np.arcsin(y / np.linalg.norm(xyz, axis=1))

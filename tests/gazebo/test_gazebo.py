@@ -91,10 +91,8 @@ def test_spherical_coordinates_agree_with_the_crs(world: Path) -> None:
 def test_a_tile_is_placed_relative_to_the_world_origin(tmp_path: Path) -> None:
     x, y, z = synthetic.UTM.origin
     world = synthetic.world(tmp_path, world_origin=(x - 100, y, z - 20)).files["world"] / "street.sdf"
-    rest = check_world(world, ("box", (100 + synthetic.HOUSE[0] + 1.5, synthetic.HOUSE[1] + 1, 26)))["bodies"][0][
-        "rest"
-    ]
-    assert rest[2] == pytest.approx(20 + 4.5 + BOX_HALF_EDGE_M, abs=0.02)
+    (body,) = check_world(world, ("box", (100 + synthetic.HOUSE[0] + 1.5, synthetic.HOUSE[1] + 1, 26)))["bodies"]
+    assert body["rest"][2] == pytest.approx(20 + 4.5 + BOX_HALF_EDGE_M, abs=0.02)
 
 
 def test_a_world_without_crs_with_split_collada_visuals_loads(tmp_path: Path) -> None:
