@@ -37,11 +37,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 def measure(scene: Scene, params: dict[str, Any]) -> dict[str, float]:
     """Megabytes of a world's GLBs and of their parts; seconds to write them."""
-    with tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryDirectory() as folder:
         begun = time.perf_counter()
-        world_formats.write(scene, ["glb"], Path(place), SceneParams(**params), silent)
+        world_formats.write(scene, ["glb"], Path(folder), SceneParams(**params), silent)
         seconds = time.perf_counter() - begun
-        files = sorted(Path(place).glob("*.glb"))
+        files = sorted(Path(folder).glob("*.glb"))
         whole, textures = sum(file.stat().st_size for file in files), sum(map(_textures, files))
     megabytes = {"mb": whole, "geometry_mb": whole - textures, "textures_mb": textures}
     return {name: round(size / 1e6, 2) for name, size in megabytes.items()} | {"seconds": round(seconds, 1)}
@@ -67,8 +67,8 @@ def main() -> None:
         try:
             result["ways"][variant] = found = measure(scene, VARIANTS[variant])
             print(f"{variant:24}", json.dumps(found), flush=True)
-        except UnavailableError as why:
-            result["skipped"].append(f"{variant}: {why}")
+        except UnavailableError as error:
+            result["skipped"].append(f"{variant}: {error}")
     print("RESULT", json.dumps(result))
 
 

@@ -110,9 +110,9 @@ def _across(line: F64, s: F64) -> F64:
     return np.interp(s, line[:, 0], line[:, 1], left=np.nan, right=np.nan)
 
 
-def layout_coordinates(layout: Layout, places: Any) -> F64:
+def layout_coordinates(layout: Layout, positions: Any) -> F64:
     """(N, 3) chainage, offset and height above the true ground of points (N, 3) in the CRS."""
-    xyz = FRAME.to_local(np.asarray(places, np.float64))
+    xyz = FRAME.to_local(np.asarray(positions, np.float64))
     s, t = layout.axis.locate(xyz[:, :2])
     on = np.sign(t) * np.minimum(np.abs(t), np.where(t > 0, layout.kerb(1), layout.kerb(-1)) - 1e-3)
     return np.column_stack([s, t, xyz[:, 2] - layout.height(s, on)])
@@ -131,10 +131,10 @@ def carla_errors(xodr: Path, layout: Layout) -> dict[str, F64]:
     assert offset is not None
     origin = np.array([float(offset.attrib[k]) for k in "xyz"])
     points = carla.Map("road", text).generate_waypoints(1.0)
-    places = np.array([(p.transform.location.x, -p.transform.location.y, p.transform.location.z) for p in points])
-    place = layout_coordinates(layout, places + origin)
+    positions = np.array([(p.transform.location.x, -p.transform.location.y, p.transform.location.z) for p in points])
+    coordinates = layout_coordinates(layout, positions + origin)
     middles = np.array([1, -1]) * (layout.lane - LINE_INSET_M) / 2
-    away = np.abs(place[:, 1:2] - middles)
+    away = np.abs(coordinates[:, 1:2] - middles)
     side = away.argmin(axis=1) == [int(p.lane_id > 0) for p in points]  # all alike, whatever the line's direction
     return {
         "carla_lane": away.min(axis=1),
@@ -162,14 +162,14 @@ def draw(run: Path) -> None:
     folder = max((run / "steps" / "texture.terrain").glob("*/textured"), key=lambda path: path.stat().st_mtime)
     body = textured(folder)
     low, high = body.mesh.vertices.min(axis=0).astype(float), body.mesh.vertices.max(axis=0).astype(float)
-    picture = Renderer([body]).above(low, high, width=int((high[0] - low[0]) / PIXEL_M)).rgb.copy()
+    orthophoto = Renderer([body]).above(low, high, width=int((high[0] - low[0]) / PIXEL_M)).rgb.copy()
     for feature in json.loads((run / "world" / "roads.geojson").read_text(encoding="utf-8"))["features"]:
         about = feature["properties"]
-        places = body.mesh.frame.to_local(feature["geometry"]["coordinates"])[:, :2] - low[:2]
-        pixels = np.column_stack([places[:, 0], high[1] - low[1] - places[:, 1]]) / PIXEL_M
+        line = body.mesh.frame.to_local(feature["geometry"]["coordinates"])[:, :2] - low[:2]
+        pixels = np.column_stack([line[:, 0], high[1] - low[1] - line[:, 1]]) / PIXEL_M
         colour = COLOURS[about.get("marking") or about["kind"]]
-        cv2.polylines(picture, [np.rint(pixels).astype(np.int32)], False, colour, 2, cv2.LINE_AA)
-    cv2.imwrite(str(run / "roads.png"), picture[..., ::-1])
+        cv2.polylines(orthophoto, [np.rint(pixels).astype(np.int32)], False, colour, 2, cv2.LINE_AA)
+    cv2.imwrite(str(run / "roads.png"), orthophoto[..., ::-1])
 
 
 if __name__ == "__main__":

@@ -157,8 +157,8 @@ def input_bytes(made: dict[str, Any], source: str) -> int:
 
 def photo(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
     """Change one photo in the middle of the street and report which results change."""
-    place = out / "street" / "photos"
-    changed = sorted(place.glob("*.jpg"))[len(list(place.glob("*.jpg"))) // 2]
+    photos = out / "street" / "photos"
+    changed = sorted(photos.glob("*.jpg"))[len(list(photos.glob("*.jpg"))) // 2]
     affected = [
         path.parent.name for path in survey.glob("*/tile.toml") if changed.name in path.read_text(encoding="utf-8")
     ]

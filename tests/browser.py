@@ -1,4 +1,4 @@
-"""Headless Chromium, driven over its DevTools protocol, for pages that tests look at as a reader does."""
+"""Headless Chromium, controlled by its DevTools protocol, for tests of web pages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FLAGS = (
     "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
     "--disable-sync", "--remote-debugging-port=0",
 )  # fmt: skip
-NAMES = ("chromium", "chromium-browser", "google-chrome")
+EXECUTABLES = ("chromium", "chromium-browser", "google-chrome")
 
 
 class Page:
@@ -35,19 +35,19 @@ class Page:
         self.errors: list[str] = []
 
     def do(self, method: str, **params: Any) -> dict[str, Any]:
-        """Call a method of the protocol; returns its result."""
+        """Call a method of the protocol and return its result; collects uncaught exceptions of the page in `errors`."""
         number = next(self._ids)
         self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
         while True:
-            said = json.loads(self._socket.recv(timeout=120))
-            if said.get("method") == "Runtime.exceptionThrown":
-                self.errors.append(json.dumps(said["params"])[:1000])
-            if said.get("id") == number:
-                assert "error" not in said, said
-                return dict(said["result"])
+            message = json.loads(self._socket.recv(timeout=120))
+            if message.get("method") == "Runtime.exceptionThrown":
+                self.errors.append(json.dumps(message["params"])[:1000])
+            if message.get("id") == number:
+                assert "error" not in message, message
+                return dict(message["result"])
 
     def open(self, path: Path, *, phone: bool = False, dark: bool = False) -> None:
-        """Open a file, as by a double click, and wait until it is loaded."""
+        """Open a file by its file:// URL, emulating a phone or a dark colour scheme, and wait until it is loaded."""
         width, height = (390, 844) if phone else (1280, 800)
         self.do("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
         self.do("Emulation.setTouchEmulationEnabled", enabled=phone)
@@ -57,22 +57,22 @@ class Page:
         self.until("document.readyState === 'complete'")
 
     def value(self, script: str) -> Any:
-        """What an expression gives."""
+        """Evaluate a JavaScript expression; waits for promises."""
         result = self.do("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
     def until(self, script: str, seconds: float = 120) -> None:
-        """Wait until an expression is true."""
+        """Wait until a JavaScript expression is true."""
         end = time.monotonic() + seconds
         while not self.value(script):
             if time.monotonic() > end:
                 shown = self.value("`${document.hidden ? 'hidden' : 'shown'}: ${document.body.innerText}`")
-                raise AssertionError(f"never true: {script}; errors: {self.errors}; the page, {shown}")
+                raise AssertionError(f"still false after {seconds} s: {script}; errors: {self.errors}; page {shown}")
             time.sleep(0.05)
 
     def click(self, selector: str) -> None:
-        """Click into the middle of an element."""
+        """Click the centre of an element."""
         box = f"document.querySelector({selector!r})"
         self.value(f"{box}.scrollIntoView({{block: 'nearest'}})")
         x, y = self.value(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box}.getBoundingClientRect())")
@@ -80,13 +80,13 @@ class Page:
             self.do("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
     def key(self, code: str, key: str, seconds: float) -> None:
-        """Hold a key down."""
+        """Hold a key down for some seconds."""
         for kind in ("rawKeyDown", "keyUp"):
             self.do("Input.dispatchKeyEvent", type=kind, code=code, key=key)
             time.sleep(seconds if kind == "rawKeyDown" else 0)
 
     def touch(self, selector: str, seconds: float, across: float = 0.0) -> None:
-        """Hold a finger in the middle of an element, and draw it across some pixels."""
+        """Hold a finger on the centre of an element, after moving it to the right by `across` pixels."""
         box = f"document.querySelector({selector!r}).getBoundingClientRect()"
         x, y = self.value(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
         self.do("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
@@ -96,23 +96,23 @@ class Page:
         self.do("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        """Drag with the left button, viewport pixels."""
+        """Drag with the left mouse button; viewport pixels."""
         self.do("Input.dispatchMouseEvent", type="mousePressed", x=start[0], y=start[1], button="left", clickCount=1)
         for share in (0.5, 1.0):
             x, y = (a + share * (b - a) for a, b in zip(start, end, strict=True))
             self.do("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, button="left", buttons=1)
         self.do("Input.dispatchMouseEvent", type="mouseReleased", x=end[0], y=end[1], button="left", clickCount=1)
 
-    def picture(self, *, whole: bool = False) -> np.ndarray:
-        """(H, W, 3) of what is seen, or of the whole page."""
+    def screenshot(self, *, whole: bool = False) -> np.ndarray:
+        """(H, W, 3) RGB of the viewport, or of the whole page."""
         data = self.do("Page.captureScreenshot", captureBeyondViewport=whole)["data"]
         return np.asarray(Image.open(BytesIO(base64.b64decode(data))).convert("RGB"))
 
 
 @contextmanager
 def chromium(folder: Path, *flags: str) -> Iterator[Page]:
-    """A page in a fresh browser, which is gone afterwards; the test is skipped where there is none."""
-    program = next(filter(None, map(shutil.which, NAMES)), None)
+    """A page in a new browser, which is closed afterwards; skips the test if Chromium isn't installed."""
+    program = next(filter(None, map(shutil.which, EXECUTABLES)), None)
     if program is None:
         pytest.skip("Chromium isn't installed (apt-get install chromium)")
     connect = pytest.importorskip("websockets.sync.client", reason="websockets isn't installed").connect
@@ -129,12 +129,12 @@ def chromium(folder: Path, *flags: str) -> Iterator[Page]:
                 time.sleep(0.05)
             time.sleep(0.1)
             port, path = (profile / "DevToolsActivePort").read_text(encoding="utf-8").split()
-            with connect(f"ws://127.0.0.1:{port}{path}", max_size=None) as whole:
-                browser = Page(whole)
+            with connect(f"ws://127.0.0.1:{port}{path}", max_size=None) as browser_socket:
+                browser = Page(browser_socket)
                 while not (targets := browser.do("Target.getTargets", filter=[{"type": "page"}])["targetInfos"]):
                     assert time.monotonic() < end, "Chromium opens no page"
                     time.sleep(0.05)
-                target = targets[0]["targetId"]  # others, of its own extensions, are never shown
+                target = targets[0]["targetId"]  # further targets are pages of extensions
             with connect(f"ws://127.0.0.1:{port}/devtools/page/{target}", max_size=None) as socket:
                 page = Page(socket)
                 page.do("Page.enable")

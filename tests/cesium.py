@@ -1,4 +1,4 @@
-"""Cesium in headless Chromium: a tileset is shown as whoever streams it would see it."""
+"""Cesium in headless Chromium: renders a 3D Tiles tileset as streaming clients do."""
 
 from __future__ import annotations
 
@@ -21,11 +21,10 @@ from tests import browser
 from tests.browser import Page
 from tests.conftest import ROOT
 
-NAME = "cesium"
-NEAR = 0.1
-"""Metres from the eye where a picture begins."""
+NPM_PACKAGE = "cesium"
+NEAR_PLANE_M = 0.1
 SKY = (255, 0, 255)
-"""The colour where nothing is."""
+"""Background colour."""
 PAGE = """<!DOCTYPE html><meta charset="utf-8"><body style="margin: 0"><div id="view"></div>
 <style>.cesium-widget, canvas { display: block; width: 100%; height: 100% }</style>
 <script>window.CESIUM_BASE_URL = "cesium/Build/Cesium/"</script><script src="cesium/Build/Cesium/Cesium.js"></script>
@@ -63,37 +62,37 @@ async function look(position, direction, up, frustum) {
 
 def missing() -> str:
     """Reason why it can't run here, or an empty string."""
-    if not any(map(shutil.which, browser.NAMES)):
+    if not any(map(shutil.which, browser.EXECUTABLES)):
         return "Chromium isn't installed (apt-get install chromium)"
-    return "" if node_module(NAME) else f"{NAME} isn't installed (npm install -g {NAME})"
+    return "" if node_module(NPM_PACKAGE) else f"{NPM_PACKAGE} isn't installed (npm install -g {NPM_PACKAGE})"
 
 
 def node_module(name: str) -> Path | None:
-    """The folder of a package of npm: installed for all, or in the project's folder."""
+    """Folder of an npm package, installed globally or in the project's folder."""
     if shutil.which("npm") is None:
         return None
-    everywhere = subprocess.run(["npm", "root", "-g"], capture_output=True, text=True).stdout.strip()
-    found = (folder / name for folder in (Path(everywhere), ROOT / "node_modules"))
+    global_folder = subprocess.run(["npm", "root", "-g"], capture_output=True, text=True).stdout.strip()
+    found = (folder / name for folder in (Path(global_folder), ROOT / "node_modules"))
     return next((folder for folder in found if folder.is_dir()), None)
 
 
 @contextmanager
 def viewer(world: Path, work: Path, size: tuple[int, int]) -> Iterator[Viewer]:
-    """A tileset's folder in Cesium; the test is skipped where it isn't installed.
+    """Open a tileset in Cesium; skips the test if Cesium isn't installed.
 
     Args:
-        world: holds `tileset.json`.
-        work: an empty folder, or none yet.
-        size: of pictures, pixels.
+        world: folder with `tileset.json`.
+        work: working folder, empty or new.
+        size: width and height of the canvas in pixels.
     """
-    package = node_module(NAME)
+    package = node_module(NPM_PACKAGE)
     if package is None:
         pytest.skip(missing())
     work.mkdir(exist_ok=True)
     (work / "cesium").symlink_to(package)
     (work / "world").symlink_to(world.resolve())
     (work / "page.html").write_text(PAGE, encoding="utf-8")
-    handler = functools.partial(_Quiet, directory=str(work))
+    handler = functools.partial(_QuietHandler, directory=str(work))
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, browser.chromium(work) as page:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         try:
@@ -106,7 +105,7 @@ def viewer(world: Path, work: Path, size: tuple[int, int]) -> Iterator[Viewer]:
 
 
 class Viewer:
-    """Cesium with a tileset in it."""
+    """Cesium showing a tileset."""
 
     def __init__(self, page: Page, size: tuple[int, int]) -> None:
         self.page, self._size = page, size
@@ -121,37 +120,39 @@ class Viewer:
         centre: tuple[float, float] | None = None,
         pixels: float = 16.0,
     ) -> list[str]:
-        """Look from somewhere until nothing more is loaded; returns the contents that are shown, by their paths.
+        """Move the camera and wait until all tiles are loaded; returns the paths of the visible contents.
 
         Args:
-            position, direction, up: earth-centred; metres.
-            focal: pixels.
-            centre: of the picture, pixels, as `Camera` has it; default: its middle.
-            pixels: that a level's error may span; 16 is Cesium's default.
+            position: camera position, earth-centred, metres.
+            direction: viewing direction, earth-centred.
+            up: up direction of the image, earth-centred.
+            focal: focal length in pixels.
+            centre: principal point in pixels, as in `Camera`; default: centre of the image.
+            pixels: maximum screen space error of levels of detail; Cesium's default is 16.
         """
         width, height = self._size
         x, y = centre or (width / 2 - 0.5, height / 2 - 0.5)
         frustum = {
             "fov": float(2 * np.arctan(max(self._size) / (2 * focal))),
             "aspectRatio": width / height,
-            "near": NEAR,
-            "xOffset": NEAR * (width / 2 - x - 0.5) / focal,
-            "yOffset": NEAR * (y + 0.5 - height / 2) / focal,
+            "near": NEAR_PLANE_M,
+            "xOffset": NEAR_PLANE_M * (width / 2 - x - 0.5) / focal,
+            "yOffset": NEAR_PLANE_M * (y + 0.5 - height / 2) / focal,
         }
-        told = ", ".join(map(json.dumps, (list(position), list(direction), list(up), frustum)))
+        arguments = ", ".join(map(json.dumps, (list(position), list(direction), list(up), frustum)))
         self.page.value(f"void (tiles.maximumScreenSpaceError = {pixels})")
-        shown: list[str] = self.page.value(f"look({told})")
+        visible: list[str] = self.page.value(f"look({arguments})")
         assert not self.page.errors, self.page.errors
-        return shown
+        return visible
 
-    def picture(self) -> np.ndarray:
-        """(H, W, 3) RGB of what was looked at; `SKY` where nothing is."""
+    def screenshot(self) -> np.ndarray:
+        """(H, W, 3) RGB of the current view; background is `SKY`."""
         data = self.page.value("widget.canvas.toDataURL('image/png')").partition(",")[2]
         image = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
         return np.asarray(image[..., ::-1])
 
 
-class _Quiet(SimpleHTTPRequestHandler):
+class _QuietHandler(SimpleHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:
-        """Nothing is told of requests."""
+        """Don't log requests."""

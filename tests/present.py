@@ -1,4 +1,4 @@
-"""Values that may be None in general, and are not where a test reads them."""
+"""Assertion that an optional value is present."""
 
 from __future__ import annotations
 
@@ -8,6 +8,6 @@ T = TypeVar("T")
 
 
 def present(value: T | None) -> T:
-    """`value`; the test fails where it is None."""
+    """Return `value`; fails the test if it is None."""
     assert value is not None
     return value

@@ -1,4 +1,4 @@
-"""One contract for all backends and formats, and one file is enough to add another."""
+"""All backends and formats implement their protocol; one file is enough to add another."""
 
 from __future__ import annotations
 
@@ -53,34 +53,38 @@ PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
     cameras: (cameras.Backend,),
     adapters: (adapters.VehicleAdapter,),
 }
-"""Packages of backends, and what their modules are: one of these."""
-ALL = [(package, name) for package in PROTOCOLS for name in plugins.names(package.__name__)]
-each = pytest.mark.parametrize(("package", "name"), ALL, ids=[f"{p.__name__.split('.', 1)[1]}-{n}" for p, n in ALL])
+"""Packages of backends, and protocols of which their modules implement one."""
+ALL_BACKENDS = [(package, name) for package in PROTOCOLS for name in plugins.names(package.__name__)]
+each_backend = pytest.mark.parametrize(
+    ("package", "name"), ALL_BACKENDS, ids=[f"{p.__name__.split('.', 1)[1]}-{n}" for p, n in ALL_BACKENDS]
+)
 
 
-def keeps(module: Any, protocol: type) -> bool:
-    """Whether a module has a protocol's constants, and its functions with their parameters in their order."""
+def implements(module: Any, protocol: type) -> bool:
+    """Whether a module has a protocol's constants, and its functions with the same leading parameters."""
     methods = {name: value for name, value in vars(protocol).items() if inspect.isfunction(value) and name[0] != "_"}
     for name, function in methods.items():
-        wanted = [parameter for parameter in inspect.signature(function).parameters if parameter != "self"]
-        own = list(inspect.signature(getattr(module, name, lambda: None)).parameters.values())
-        if [parameter.name for parameter in own[: len(wanted)]] != wanted:
+        required = [parameter for parameter in inspect.signature(function).parameters if parameter != "self"]
+        actual = list(inspect.signature(getattr(module, name, lambda: None)).parameters.values())
+        if [parameter.name for parameter in actual[: len(required)]] != required:
             return False
-        if any(parameter.default is inspect.Parameter.empty for parameter in own[len(wanted) :]):
+        if any(parameter.default is inspect.Parameter.empty for parameter in actual[len(required) :]):
             return False
     return all(hasattr(module, name) for name in protocol.__annotations__)
 
 
-@each
-def test_it_has_what_its_protocol_asks(package: ModuleType, name: str) -> None:
+@each_backend
+def test_a_backend_implements_its_protocol(package: ModuleType, name: str) -> None:
     module = plugins.module(package.__name__, name)
-    assert sum(keeps(module, protocol) for protocol in PROTOCOLS[package]) == 1
+    assert sum(implements(module, protocol) for protocol in PROTOCOLS[package]) == 1
 
 
-@each
-def test_it_says_what_it_needs(package: ModuleType, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@each_backend
+def test_a_missing_dependency_is_reported_with_its_extra(
+    package: ModuleType, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     backend = plugins.module(package.__name__, name)
-    needs, meant = plugins.needs(backend), getattr(backend, "EXTRA", "")
+    needs, preferred_extra = plugins.needs(backend), getattr(backend, "EXTRA", "")
     core = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
     extras = {EXTRA_OF[package] for package in needs if package in EXTRA_OF}
     assert extras or set(needs) <= {re.split(r"[^\w.-]", line)[0] for line in core}
@@ -91,28 +95,31 @@ def test_it_says_what_it_needs(package: ModuleType, name: str, monkeypatch: pyte
         with pytest.raises(UnavailableError) as caught:
             plugins.find(package.__name__, name, "a.setting")
         assert caught.value.where == f"a.setting {name}" and all(n in caught.value.cause for n in needs)
-        assert not extras or caught.value.remedy == f"pip install 'scan2sim[{meant or ','.join(sorted(extras))}]'"
+        assert (
+            not extras
+            or caught.value.remedy == f"pip install 'scan2sim[{preferred_extra or ','.join(sorted(extras))}]'"
+        )
 
 
 @pytest.mark.parametrize("package", PROTOCOLS, ids=lambda p: p.__name__)
-def test_an_unknown_name_tells_the_known_ones(package: ModuleType) -> None:
+def test_an_unknown_name_lists_the_available_ones(package: ModuleType) -> None:
     with pytest.raises(SettingError, match=r"a\.setting: unknown value 'surf'") as caught:
         plugins.find(package.__name__, "surf", "a.setting")
     assert all(name in caught.value.remedy for name in plugins.names(package.__name__))
 
 
 @pytest.mark.parametrize("package", [clouds, decoders, gps])
-def test_no_two_formats_read_the_same_files(package: ModuleType) -> None:
-    each = [plugins.module(package.__name__, name).SUFFIXES for name in plugins.names(package.__name__)]
-    assert sum(map(len, each)) == len(plugins.by_suffix(package.__name__))
+def test_formats_have_different_suffixes(package: ModuleType) -> None:
+    suffixes = [plugins.module(package.__name__, name).SUFFIXES for name in plugins.names(package.__name__)]
+    assert sum(map(len, suffixes)) == len(plugins.by_suffix(package.__name__))
 
 
 @pytest.fixture
 def add(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Adds a module to a package: a file in a folder of its own."""
+    """Function that adds a module to a package, as a file in another folder of its path."""
     added = []
 
-    def one(package: ModuleType, name: str, code: str) -> None:
+    def add_module(package: ModuleType, name: str, code: str) -> None:
         folder = tmp_path / package.__name__
         folder.mkdir()
         (folder / f"{name}.py").write_text(code, encoding="utf-8")
@@ -120,7 +127,7 @@ def add(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
         importlib.invalidate_caches()
         added.append((package, name))
 
-    yield one
+    yield add_module
     for package, name in added:
         sys.modules.pop(f"{package.__name__}.{name}", None)
         vars(package).pop(name, None)
@@ -129,7 +136,7 @@ def add(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 Add = Callable[[ModuleType, str, str], None]
 
 
-def test_a_network_is_one_file(add: Add) -> None:
+def test_a_network_is_added_by_one_file(add: Add) -> None:
     from scan2sim.segmentation.photos import Classifier, class_map
     from scan2sim.segmentation.steps.label import LABEL
 
@@ -157,7 +164,7 @@ def load(weights, device):
     assert best.shape == (48, 64) and len(np.unique(best)) == 1
 
 
-def test_a_feature_is_one_file(add: Add) -> None:
+def test_a_feature_detector_is_added_by_one_file(add: Add) -> None:
     from scan2sim.slam.steps.track import TrackParams, tracker_of
 
     add(features, "blobs", """
@@ -167,11 +174,11 @@ from scan2sim.slam.features import FeatureSet
 
 class Blobs:
     name, binary, dimension = "blobs", False, 25
-    def detect(self, picture, mask=None):
-        uv = cv2.goodFeaturesToTrack(picture, 300, 0.01, 5).reshape(-1, 2)
-        looks = np.stack([cv2.getRectSubPix(picture, (5, 5), tuple(map(float, at))).ravel() for at in uv])
-        looks = looks.astype(np.float32) / np.linalg.norm(looks, axis=1, keepdims=True)
-        return FeatureSet(uv, looks, np.linspace(1, 0, len(uv), dtype=np.float32))
+    def detect(self, grey, mask=None):
+        uv = cv2.goodFeaturesToTrack(grey, 300, 0.01, 5).reshape(-1, 2)
+        descriptors = np.stack([cv2.getRectSubPix(grey, (5, 5), tuple(map(float, at))).ravel() for at in uv])
+        descriptors = descriptors.astype(np.float32) / np.linalg.norm(descriptors, axis=1, keepdims=True)
+        return FeatureSet(uv, descriptors, np.linspace(1, 0, len(uv), dtype=np.float32))
     def describe(self):
         return "blobs"
 
@@ -186,7 +193,7 @@ def load(weights, count, upsample, device):
     assert tracker.track(grey) > 0.9
 
 
-def test_an_export_format_is_one_file(add: Add, tmp_path: Path) -> None:
+def test_an_export_format_is_added_by_one_file(add: Add, tmp_path: Path) -> None:
     add(mesh_formats, "off", """
 SUFFIX = ".off"
 

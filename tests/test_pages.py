@@ -1,4 +1,4 @@
-"""What pages name is there: options of commands, settings, fields of TOML files, files of the project, links."""
+"""Documentation is consistent with the code: options, settings, fields of TOML files, project files and links exist."""
 
 from __future__ import annotations
 
@@ -27,33 +27,34 @@ from scan2sim.services.monitoring.events.rules import Rule
 from scan2sim.services.orchestration.deployment import Deployment
 from tests.conftest import ROOT
 
-ROOMS = ("pipeline", "segmentation", "texturing", "slam", "flows", "services", "data_samples")
+PACKAGES = ("pipeline", "segmentation", "texturing", "slam", "flows", "services", "data_samples")
 PAGES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
     *sorted(ROOT.glob("docs/**/*.md")),
     ROOT / "data_samples/README.md",
 ]
-MODULES = sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
+MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 PARAMS: dict[str, type[BaseModel]] = {step.name: step.params for step in STEPS}
-OTHERS = re.compile(r"\b(prefect|docker|dask|ray|gz|pip|aws|curl|trtexec|export.py)\b")
-"""Other programs, whose options a page may name once it has shown them in a command."""
+OTHER_PROGRAMS = re.compile(r"\b(prefect|docker|dask|ray|gz|pip|aws|curl|trtexec|export.py)\b")
+"""Other programs, whose options a page may mention if it also shows them in a command."""
 SUFFIXES = {"py", "json", "geojson", "csv", "obj", "laz", "png", "npz", "toml", "sdf", "dae", "mtl", "glb", "jpg"}
 
 
-def about(page: Path) -> str:
-    """What a page says; of a module, its first docstring."""
+def text_of(page: Path) -> str:
+    """Text of a page, or the docstring of a module."""
     text = page.read_text(encoding="utf-8")
     return text if page.suffix == ".md" else ast.get_docstring(ast.parse(text)) or ""
 
 
-def named(pages: list[Path]) -> list[Any]:
-    some = [page for page in pages if page.suffix == ".md" or re.search(r"`|--|\.(py|md)", about(page))]
-    return [pytest.param(page, id=page.relative_to(ROOT).as_posix()) for page in some]
+def page_params(pages: list[Path]) -> list[Any]:
+    """Test parameters: pages, and modules whose docstring may mention options, code or files."""
+    relevant = [page for page in pages if page.suffix == ".md" or re.search(r"`|--|\.(py|md)", text_of(page))]
+    return [pytest.param(page, id=page.relative_to(ROOT).as_posix()) for page in relevant]
 
 
 def commands(group: Any, name: tuple[str, ...] = ("scan2sim",)) -> Iterator[tuple[tuple[str, ...], set[str]]]:
-    """Every command by its words, and its options."""
+    """Words and options of all commands of a group."""
     yield name, {option for param in group.params for option in (*param.opts, *param.secondary_opts)} | {"--help"}
     for word, below in getattr(group, "commands", {}).items():
         yield from commands(below, (*name, word))
@@ -62,72 +63,71 @@ def commands(group: Any, name: tuple[str, ...] = ("scan2sim",)) -> Iterator[tupl
 OPTIONS = dict(commands(typer.main.get_command(app)))
 for command in COMMANDS:
     OPTIONS |= dict(commands(loaded(command), ("scan2sim", command)))
-ALL = set().union(*OPTIONS.values())
+ALL_OPTIONS = set().union(*OPTIONS.values())
 
 
 @cache
 def source(module: str) -> str:
-    """Of `python -m MODULE`."""
+    """Source of a module or package that is run by `python -m MODULE`."""
     path = ROOT / module.removeprefix("scan2sim.").replace(".", "/")
     files = path.glob("*.py") if path.is_dir() else [path.with_suffix(".py")]
     return "".join(file.read_text(encoding="utf-8") for file in files)
 
 
-def lines(text: str) -> Iterator[str]:
-    """Lines of code and spans of code that show commands, those that are continued joined."""
+def code_lines(text: str) -> Iterator[str]:
+    """Lines of shell code blocks, with continuation lines joined, and inline code."""
     for block in re.findall(r"```(?:sh)?\n(.*?)```", text, re.DOTALL):
         yield from re.sub(r"\\\n\s*", "", block).splitlines()
     yield from re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
 
 
-def taken(line: str) -> tuple[str, set[str]]:
-    """The command of a line, and the options that it takes."""
+def accepted_options(line: str) -> tuple[str, set[str]]:
+    """The command of a line, and the options that it accepts."""
     words = shlex.split(line, comments=True) if line.count("'") % 2 == line.count('"') % 2 == 0 else line.split()
-    fits = [name for name in OPTIONS if tuple(words[: len(name)]) == name]
-    name = max(fits, key=len)
+    name = max((name for name in OPTIONS if tuple(words[: len(name)]) == name), key=len)
     first = next((below for below in OPTIONS if below[:-1] == name), name)  # `slam VIDEO` is `slam video VIDEO`
     return " ".join(name), OPTIONS[name] | (OPTIONS[first] if name[1:] in (("slam",), ("segment",)) else set())
 
 
-@pytest.mark.parametrize("page", named(PAGES + MODULES))
-def test_options_are_those_of_the_commands(page: Path) -> None:
-    text, option = about(page), re.compile(r"(?<![\w-])--[a-z][\w-]*")
+@pytest.mark.parametrize("page", page_params(PAGES + MODULES))
+def test_options_exist(page: Path) -> None:
+    text, option = text_of(page), re.compile(r"(?<![\w-])--[a-z][\w-]*")
     modules = "".join(source(module) for module in re.findall(r"python -m (\w+\.[\w.]+)", text))
-    others = {found for line in lines(text) if OTHERS.search(line) for found in option.findall(line)}
-    for line in lines(text):
+    others = {found for line in code_lines(text) if OTHER_PROGRAMS.search(line) for found in option.findall(line)}
+    for line in code_lines(text):
         options = set(option.findall(line))
         if line.startswith("scan2sim ") and "..." not in line.split()[:2]:
-            command, known = taken(line)
-            assert options <= known, f"{command} has no {options - known}"
+            command, known = accepted_options(line)
+            assert options <= known, f"{command} has no options {options - known}"
         else:
-            unknown = {name for name in options - ALL - others if f'"{name}"' not in modules}
-            assert not unknown, f"no command has {unknown}: {line}"
+            unknown = {name for name in options - ALL_OPTIONS - others if f'"{name}"' not in modules}
+            assert not unknown, f"no command has options {unknown}: {line}"
 
 
-@pytest.mark.parametrize("page", named(PAGES + MODULES))
-def test_settings_are_parameters_or_figures(page: Path) -> None:
+@pytest.mark.parametrize("page", page_params(PAGES + MODULES))
+def test_settings_and_metrics_exist(page: Path) -> None:
     names = "|".join(PARAMS)
     setting = re.compile(rf"(?<![\w/.-])({names})\.(?:(?:{'|'.join(SURFACES)})\.)?([a-z_0-9]+)")
-    for step, name in setting.findall(" ".join(lines(about(page)))):
+    for step, name in setting.findall(" ".join(code_lines(text_of(page)))):
         known = {*PARAMS[step].model_fields, *SURFACES, *SUFFIXES, "rest"}
         module = (ROOT / step / f"{name}.py").exists() or (ROOT / step / name).is_dir()
-        assert name in known or module or name in figures(), f"there is no {step}.{name}"
+        assert name in known or module or name in string_literals(), f"unknown setting or metric: {step}.{name}"
 
 
 @cache
-def figures() -> set[str]:
-    """Words that the code writes: names of figures among them."""
+def string_literals() -> set[str]:
+    """Lower-case string literals of the code, which include the names of metrics."""
     return set(re.findall(r'"([a-z_0-9]+)"', "".join(path.read_text(encoding="utf-8") for path in MODULES)))
 
 
 class RulesFile(Params):
-    """A file of alarms' rules."""
+    """File of alarm rules."""
 
     rules: list[Rule]
 
 
-def refused(model: type[BaseModel], table: dict[str, Any]) -> list[Any]:
-    """What a model refuses of a table, part of which may be missing."""
+def rejected(model: type[BaseModel], table: dict[str, Any]) -> list[Any]:
+    """Fields of an incomplete table that a model rejects."""
     try:
         model.model_validate(table)
     except ValidationError as error:
@@ -135,33 +135,33 @@ def refused(model: type[BaseModel], table: dict[str, Any]) -> list[Any]:
     return []
 
 
-FILES = (Drive, TileFile, SurveyFile, RulesFile, Deployment)
+FILE_MODELS = (Drive, TileFile, SurveyFile, RulesFile, Deployment)
 
 
-@pytest.mark.parametrize("page", named([page for page in PAGES + MODULES if "```toml" in about(page)]))
-def test_toml_has_the_fields_that_are_read(page: Path) -> None:
-    for block in re.findall(r"```toml\n(.*?)```", about(page), re.DOTALL):
+@pytest.mark.parametrize("page", page_params([page for page in PAGES + MODULES if "```toml" in text_of(page)]))
+def test_toml_examples_have_valid_fields(page: Path) -> None:
+    for block in re.findall(r"```toml\n(.*?)```", text_of(page), re.DOTALL):
         table = tomllib.loads(block)
-        models = [model for model in FILES if not refused(model, table)]
+        models = [model for model in FILE_MODELS if not rejected(model, table)]
         settings = [step for step in table if step in PARAMS and not isinstance(table[step], str)]
         if len(settings) == len(table) and not models:
             for step in settings:
                 values = {k: v for k, v in table[step].items() if k not in SURFACES}
-                assert not refused(PARAMS[step], values), f"there is no {step} with {values}"
+                assert not rejected(PARAMS[step], values), f"invalid settings of {step}: {values}"
         else:
-            assert models, f"no file has {[refused(model, table) for model in FILES]}"
+            assert models, f"fields of no file: {[rejected(model, table) for model in FILE_MODELS]}"
 
 
-def test_the_page_of_drives_names_all_their_fields_and_no_others() -> None:
+def test_the_survey_page_lists_exactly_the_fields_of_drive_toml() -> None:
     page = (ROOT / "docs" / "surveys.md").read_text(encoding="utf-8")
     block = next(b for b in re.findall(r"```toml\n(.*?)```", page, re.DOTALL) if "[sweeps]" in b)
     parts = {name: Drive.model_fields[name].annotation for name in ("slam", "sweeps", "tiles")}
     fields = {field for part in parts.values() for field in _model(part).model_fields}
     listed = set(re.findall(r"[a-z_0-9]+", " ".join(re.findall(r"\b[a-z_]+(?:, [a-z_0-9]+){2,}", block))))
-    assert listed <= fields, f"no drive has {listed - fields}"
+    assert listed <= fields, f"unknown fields of drive.toml: {listed - fields}"
     assert not (missing := {field for field in fields if not re.search(rf"\b{field}\b", block)}), missing
     tomls = {key for key, value in re.findall(r'^(\w+) = "(.*?)"', block, re.MULTILINE) if value.endswith(".toml")}
-    assert tomls <= {"camera", "corridor"}, f"{tomls} are no TOML files"
+    assert tomls <= {"camera", "corridor"}, f"not TOML files: {tomls}"
 
 
 def _model(annotation: Any) -> type[BaseModel]:
@@ -170,26 +170,26 @@ def _model(annotation: Any) -> type[BaseModel]:
 
 
 @cache
-def project() -> tuple[str, ...]:
-    """Files of the project."""
+def project_files() -> tuple[str, ...]:
+    """Paths of all files of the project."""
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
     if listed.returncode:
         return tuple(path.relative_to(ROOT).as_posix() for path in ROOT.rglob("*"))
     return tuple(listed.stdout.split())
 
 
-@pytest.mark.parametrize("page", named(PAGES + MODULES))
-def test_files_of_the_project_are_there(page: Path) -> None:
-    places = {name.split("/")[0] for name in project() if "/" in name}
-    for name in re.findall(r"(?<![\w/.-])(?:[\w.-]+/)*[\w-]+\.(?:py|md|txt|yaml|toml|j2)\b", about(page)):
-        ours = name.split("/")[0] in places if "/" in name else name.endswith(".py") and name != "random.py"
+@pytest.mark.parametrize("page", page_params(PAGES + MODULES))
+def test_project_files_exist(page: Path) -> None:
+    folders = {name.split("/")[0] for name in project_files() if "/" in name}
+    for name in re.findall(r"(?<![\w/.-])(?:[\w.-]+/)*[\w-]+\.(?:py|md|txt|yaml|toml|j2)\b", text_of(page)):
+        ours = name.split("/")[0] in folders if "/" in name else name.endswith(".py") and name != "random.py"
         if ours:
-            assert any(f"/{file}".endswith(f"/{name}") for file in project()), f"there is no {name}"
+            assert any(f"/{file}".endswith(f"/{name}") for file in project_files()), f"file not found: {name}"
 
 
-@pytest.mark.parametrize("page", named(PAGES))
-def test_links_lead_to_pages_and_headings(page: Path) -> None:
-    for link in re.findall(r"\]\(([^)\s]+)\)", about(page)):
+@pytest.mark.parametrize("page", page_params(PAGES))
+def test_links_have_existing_targets(page: Path) -> None:
+    for link in re.findall(r"\]\(([^)\s]+)\)", text_of(page)):
         path, _, heading = link.partition("#")
         if not link.startswith("http"):
             target = page.parent / path if path else page
@@ -198,6 +198,6 @@ def test_links_lead_to_pages_and_headings(page: Path) -> None:
 
 
 def headings(page: Path) -> set[str]:
-    """Anchors as GitHub makes them."""
+    """Anchors of headings, as created by GitHub."""
     found = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in found}

@@ -1,4 +1,4 @@
-"""docs/reference/third-party.md names what is installed: made again whenever the constraints change."""
+"""docs/reference/third-party.md is up to date with constraints.txt."""
 
 from __future__ import annotations
 
@@ -10,28 +10,24 @@ from bench.packaging.third_party import closure, page, project
 from tests.conftest import ROOT
 
 
-def test_the_page_names_every_pinned_package_of_the_core() -> None:
+def test_the_page_lists_all_pinned_core_packages() -> None:
     pins = dict(re.findall(r"^([\w.-]+)==(\S+)$", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE))
     pins = {canonicalize_name(name): version for name, version in pins.items()}
     core = [name for name in closure(project()["core"]) if name in pins]
-    page = (
-        (ROOT / "docs" / "reference" / "third-party.md")
-        .read_text(encoding="utf-8")
-        .split("## Core")[1]
-        .split("\n## ")[0]
-    )
+    text = (ROOT / "docs" / "reference" / "third-party.md").read_text(encoding="utf-8")
+    section = text.split("## Core")[1].split("\n## ")[0]
     assert len(core) > 20
     for name in core:
-        assert f"| {name} | {pins[name]} |" in page, (
-            f"{name}: python -m bench.packaging.third_party > docs/reference/third-party.md"
+        assert f"| {name} | {pins[name]} |" in section, (
+            f"{name} is outdated: python -m bench.packaging.third_party > docs/reference/third-party.md"
         )
 
 
-def test_every_library_that_wheels_bring_has_a_licence_there() -> None:
+def test_all_libraries_bundled_in_wheels_have_a_licence_entry() -> None:
     assert page()[1] == []
 
 
-def test_nothing_under_the_gpl_comes_with_the_core() -> None:
+def test_the_core_contains_no_gpl_packages() -> None:
     text = page()[0].split("## Core")[1].split("\n## ")[0]
     for line in text.splitlines():
         rest = re.sub(

@@ -1,4 +1,4 @@
-"""three.js in headless Chromium, as `scan2sim view` brings it, or npm's: GLBs are shown as a web viewer would."""
+"""three.js in headless Chromium, from `scan2sim view` or npm: renders GLBs as web viewers do."""
 
 from __future__ import annotations
 
@@ -22,9 +22,8 @@ from tests import browser
 from tests.browser import Page
 
 SKY = (255, 0, 255)
-"""The colour where nothing is."""
-NEAR, FAR = 0.05, 3000.0
-"""Metres from the eye."""
+"""Background colour."""
+NEAR_PLANE_M, FAR_PLANE_M = 0.05, 3000.0
 PAGE = """<!DOCTYPE html><meta charset="utf-8"><body style="margin: 0">HEAD
 <script>
 let renderer, scene, camera;
@@ -35,19 +34,19 @@ async function open(width, height, files) {
   camera.matrixAutoUpdate = false;
   renderer = new THREE.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
   renderer.setSize(width, height);
-  const told = { triangles: 0, textures: 0, features: 0 };
-  const loader = window.unpacking ? unpacking(renderer) : new THREE.GLTFLoader();
+  const statistics = { triangles: 0, textures: 0, features: 0 };
+  const loader = window.decodingLoader ? decodingLoader(renderer) : new THREE.GLTFLoader();
   for (const file of files) {
     const gltf = await loader.loadAsync("world/" + file);
     scene.add(gltf.scene);
     gltf.scene.traverse((node) => {
       if (!node.isMesh) return;
-      told.triangles += node.geometry.index.count / 3;
-      told.textures += node.material.map?.image.width > 0;
-      told.features += node.geometry.attributes._feature_id_0 !== undefined;
+      statistics.triangles += node.geometry.index.count / 3;
+      statistics.textures += node.material.map?.image.width > 0;
+      statistics.features += node.geometry.attributes._feature_id_0 !== undefined;
     });
   }
-  return told;
+  return statistics;
 }
 function look(pose, projection) {
   camera.matrix.fromArray(pose);
@@ -58,15 +57,16 @@ function look(pose, projection) {
   return renderer.domElement.toDataURL("image/png");
 }
 </script>"""
-OURS = '<script src="three.js"></script>'
-NPMS = """<script type="importmap">{"imports": {"three": "./npm/build/three.module.js", "three/": "./npm/"}}</script>
+BUNDLED_SCRIPT = '<script src="three.js"></script>'
+NPM_SCRIPT = """\
+<script type="importmap">{"imports": {"three": "./npm/build/three.module.js", "three/": "./npm/"}}</script>
 <script type="module">
 import * as all from "three";
 import { GLTFLoader } from "three/examples/jsm/loaders/GLTFLoader.js";
 import { DRACOLoader } from "three/examples/jsm/loaders/DRACOLoader.js";
 import { KTX2Loader } from "three/examples/jsm/loaders/KTX2Loader.js";
 import { MeshoptDecoder } from "three/examples/jsm/libs/meshopt_decoder.module.js";
-window.unpacking = (renderer) => new GLTFLoader().setMeshoptDecoder(MeshoptDecoder)
+window.decodingLoader = (renderer) => new GLTFLoader().setMeshoptDecoder(MeshoptDecoder)
   .setDRACOLoader(new DRACOLoader().setDecoderPath("npm/examples/jsm/libs/draco/gltf/"))
   .setKTX2Loader(new KTX2Loader().setTranscoderPath("npm/examples/jsm/libs/basis/").detectSupport(renderer));
 window.THREE = all;
@@ -75,25 +75,25 @@ window.THREE = all;
 
 def missing() -> str:
     """Reason why it can't run here, or an empty string."""
-    return "" if any(map(shutil.which, browser.NAMES)) else "Chromium isn't installed (apt-get install chromium)"
+    return "" if any(map(shutil.which, browser.EXECUTABLES)) else "Chromium isn't installed (apt-get install chromium)"
 
 
 class Viewer:
-    """GLBs in three.js.
+    """three.js showing GLBs.
 
     Attributes:
-        told: how many `triangles`, and meshes with a texture (`textures`) and with `features`, there are.
+        statistics: number of `triangles`, of meshes with a texture (`textures`) and of those with `features`.
     """
 
-    def __init__(self, page: Page, told: dict[str, Any]) -> None:
-        self._page, self.told = page, told
+    def __init__(self, page: Page, statistics: dict[str, Any]) -> None:
+        self._page, self.statistics = page, statistics
 
-    def picture(self, camera: Camera, pose: F64) -> np.ndarray:
-        """(H, W, 3) RGB from a pinhole camera's pose in the world, z up; `SKY` where nothing is."""
-        onto_gl = np.diag([1.0, -1, -1, 1])  # x right, y up, z backwards
+    def render(self, camera: Camera, pose: F64) -> np.ndarray:
+        """(H, W, 3) RGB from a pinhole camera's pose in the world, z up; background is `SKY`."""
+        camera_to_gl = np.diag([1.0, -1, -1, 1])  # x right, y up, z backwards
         y_up = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-        told = (y_up @ pose @ onto_gl).T.ravel().tolist(), _projection(camera).T.ravel().tolist()
-        data = self._page.value(f"look({json.dumps(told[0])}, {json.dumps(told[1])})").partition(",")[2]
+        matrices = (y_up @ pose @ camera_to_gl).T.ravel().tolist(), _projection(camera).T.ravel().tolist()
+        data = self._page.value(f"look({json.dumps(matrices[0])}, {json.dumps(matrices[1])})").partition(",")[2]
         assert not self._page.errors, self._page.errors
         image = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
@@ -104,22 +104,23 @@ class Viewer:
 def viewer(
     world: Path, files: Sequence[str], work: Path, size: tuple[int, int], package: Path | None = None
 ) -> Iterator[Viewer]:
-    """GLBs of a folder in three.js; the test is skipped where there is no Chromium.
+    """Open GLBs in three.js; skips the test if Chromium isn't installed.
 
     Args:
         world: folder of the files.
-        files: their names.
-        work: an empty folder, or none yet.
-        size: of pictures, pixels.
-        package: npm's three, which brings what unpacks geometry and textures.
+        files: names of the files.
+        work: working folder, empty or new.
+        size: width and height of the canvas in pixels.
+        package: folder of the npm package three, which has decoders of compressed geometry and textures; default: the
+            project's three.js.
     """
     work.mkdir(exist_ok=True)
     (work / "world").symlink_to(world.resolve())
     shutil.copyfile(PAGES / "three.js", work / "three.js")
     if package is not None:
         (work / "npm").symlink_to(package)
-    (work / "page.html").write_text(PAGE.replace("HEAD", NPMS if package is not None else OURS), encoding="utf-8")
-    handler = functools.partial(_Quiet, directory=str(work))
+    (work / "page.html").write_text(PAGE.replace("HEAD", NPM_SCRIPT if package else BUNDLED_SCRIPT), encoding="utf-8")
+    handler = functools.partial(_QuietHandler, directory=str(work))
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, browser.chromium(work) as page:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         try:
@@ -131,15 +132,16 @@ def viewer(
 
 
 def _projection(camera: Camera) -> F64:
-    """(4, 4) of a pinhole as OpenGL has it; its centre counts from the middle of the first pixel."""
+    """(4, 4) OpenGL projection matrix of a pinhole camera; its principal point counts from the first pixel's centre."""
     width, height = camera.width, camera.height
+    near, far = NEAR_PLANE_M, FAR_PLANE_M
     out = np.zeros((4, 4))
     out[0, 0], out[1, 1] = 2 * camera.fx / width, 2 * camera.fy / height
     out[0, 2], out[1, 2] = 1 - 2 * (camera.cx + 0.5) / width, 2 * (camera.cy + 0.5) / height - 1
-    out[2, 2], out[2, 3], out[3, 2] = -(FAR + NEAR) / (FAR - NEAR), -2 * FAR * NEAR / (FAR - NEAR), -1
+    out[2, 2], out[2, 3], out[3, 2] = -(far + near) / (far - near), -2 * far * near / (far - near), -1
     return out
 
 
-class _Quiet(SimpleHTTPRequestHandler):
+class _QuietHandler(SimpleHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:
-        """Nothing is told of requests."""
+        """Don't log requests."""

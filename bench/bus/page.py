@@ -61,7 +61,7 @@ def screenshot(page: Page, path: Path, size: tuple[int, int] = DESKTOP_PX, *, da
     scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
     page.do("Emulation.setEmulatedMedia", features=[scheme])
     time.sleep(1.5)  # until it is redrawn
-    Image.fromarray(page.picture(whole=True)).save(path, optimize=True)
+    Image.fromarray(page.screenshot(whole=True)).save(path, optimize=True)
     counts = "document.querySelectorAll('{}').length"
     selectors = {"nodes": "#nodes tbody tr", "runs": ".run", "queues": "#queues tbody tr", "alarms": "#alarms tbody tr"}
     return {name: page.value(counts.format(selector)) for name, selector in selectors.items()}

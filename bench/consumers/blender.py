@@ -84,8 +84,8 @@ def check(command: Sequence[str], export: Path, files: Sequence[Path], suffix: s
 
 
 def _imported(command: Sequence[str], files: Sequence[Path], suffix: str) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory() as place:
-        script = Path(place) / "import.py"
+    with tempfile.TemporaryDirectory() as work:
+        script = Path(work) / "import.py"
         names = json.dumps([str(file.resolve()) for file in files])
         script.write_text(SCRIPT.format(files=names, suffix=suffix, prefix=OUTPUT_PREFIX), encoding="utf-8")
         done = subprocess.run([*command, str(script)], capture_output=True, text=True, timeout=TIMEOUT_S)

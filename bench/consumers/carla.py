@@ -34,29 +34,29 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
     (path,) = export.glob("*.xodr")
     try:
         roads = carla.Map(path.stem, path.read_text(encoding="utf-8"))
-    except RuntimeError as why:
-        raise Fault(str(why)) from None
+    except RuntimeError as error:
+        raise Fault(str(error)) from None
     kinds = carla.LaneType.Driving, carla.LaneType.Bidirectional
-    asked = [carla.Location(x, -y, z) for x, y, z in reference.ways[0][::ROUTE_STRIDE].tolist()]  # CARLA is left-handed
-    lanes = [[roads.get_waypoint(at, project_to_road=False, lane_type=kind) for kind in kinds] for at in asked]
-    found = [next(filter(None, of_place), None) for of_place in lanes]
-    at = [waypoint.transform.location for waypoint in found if waypoint]
-    xyz = np.array([(one.x, -one.y, one.z) for one in at]).reshape(-1, 3)
+    route = [carla.Location(x, -y, z) for x, y, z in reference.ways[0][::ROUTE_STRIDE].tolist()]  # CARLA is left-handed
+    lanes = [[roads.get_waypoint(at, project_to_road=False, lane_type=kind) for kind in kinds] for at in route]
+    found = [next(filter(None, waypoints), None) for waypoints in lanes]
+    locations = [waypoint.transform.location for waypoint in found if waypoint]
+    xyz = np.array([(one.x, -one.y, one.z) for one in locations]).reshape(-1, 3)
     heights = reference.heights(xyz[:, :2])
-    seen = np.isfinite(heights)
+    known = np.isfinite(heights)
     metrics: dict[str, Any] = {
-        "places": len(asked),
+        "places": len(route),
         "without_lane": found.count(None),
         "driving": len(roads.generate_waypoints(1.0)),
-        "beside_road": int(np.sum(~reference.on_road(xyz[seen, :2]))),
-        "height_p95_m": round(float(np.percentile(np.abs(xyz[seen, 2] - heights[seen]), 95)), 3)
-        if seen.any()
+        "beside_road": int(np.sum(~reference.on_road(xyz[known, :2]))),
+        "height_p95_m": round(float(np.percentile(np.abs(xyz[known, 2] - heights[known]), 95)), 3)
+        if known.any()
         else None,
     }
     if (
         metrics["without_lane"]
         or metrics["beside_road"]
-        or not seen.any()
+        or not known.any()
         or metrics["height_p95_m"] > MAX_HEIGHT_ERROR_M
     ):
         raise Fault("its lanes don't match the road", metrics)

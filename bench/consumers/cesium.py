@@ -42,21 +42,21 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
     if about["crs"] == crs.LOCAL:
         raise Fault("a world without a CRS has no position on Cesium's globe")
     frame = Frame(about["crs"], tuple(about["world_origin_m"]), about["unit_m"])
-    seen = renderings.photo(reference)
-    focal, centre = seen.camera.fx, (seen.camera.cx, seen.camera.cy)
-    size = seen.camera.width, seen.camera.height
+    photo = renderings.photo(reference)
+    focal, centre = photo.camera.fx, (photo.camera.cx, photo.camera.cy)
+    size = photo.camera.width, photo.camera.height
     with tempfile.TemporaryDirectory() as work, cesium.viewer(export, Path(work), size) as view:
-        view.look(*_onto_earth(frame, seen.pose), focal=focal, centre=centre, pixels=FINEST_ERROR_PX)
-        finest = view.picture()
-        near = view.look(*_onto_earth(frame, seen.pose), focal=focal, centre=centre)
-        picture = view.picture()
+        view.look(*_onto_earth(frame, photo.pose), focal=focal, centre=centre, pixels=FINEST_ERROR_PX)
+        finest = view.screenshot()
+        near = view.look(*_onto_earth(frame, photo.pose), focal=focal, centre=centre)
+        rendering = view.screenshot()
         far = view.look(*_onto_earth(frame, _above(tileset, reference, focal)), focal=focal, centre=centre)
     if not any(COARSE_CONTENT not in content for content in near):
-        raise Fault(f"near by, the finest level isn't shown, but {near}")
+        raise Fault(f"near the ground, Cesium doesn't show the finest level, but {near}")
     if far != [tileset["root"]["content"]["uri"]]:
-        raise Fault(f"from afar, the coarsest level isn't shown, but {far}")
-    likeness = renderings.compare(export, "cesium", seen, picture, (picture != cesium.SKY).any(axis=2))
-    differ = round(float(np.abs(picture.astype(float) - finest).mean()), 2)
+        raise Fault(f"from above, Cesium doesn't show the coarsest level, but {far}")
+    likeness = renderings.compare(export, "cesium", photo, rendering, (rendering != cesium.SKY).any(axis=2))
+    differ = round(float(np.abs(rendering.astype(float) - finest).mean()), 2)
     return {"shown_near": len(near), "shown_far": len(far), "levels_differ": differ, **likeness}
 
 

@@ -30,8 +30,8 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
     from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
     from pydrake.systems.framework import DiagramBuilder
 
-    with tempfile.TemporaryDirectory() as place:
-        models = Path(place) / "models"
+    with tempfile.TemporaryDirectory() as work:
+        models = Path(work) / "models"
         shutil.copytree(export / "models", models, copy_function=lambda a, b: Path(b).symlink_to(Path(a).resolve()))
         plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.001)
         parser = Parser(plant)

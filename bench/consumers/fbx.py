@@ -34,9 +34,9 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
     for file, meshes in read.items():
         if sum(len(corners) for _, corners, *_ in meshes) != counts[file]:
             raise Fault(f"{file} has lost triangles: {counts[file]} expected")
-        for name, corners, _, picture in meshes:
-            if not picture.is_file():
-                raise Fault(f"{file}: texture {picture.name} is missing")
+        for name, corners, _, texture in meshes:
+            if not texture.is_file():
+                raise Fault(f"{file}: texture {texture.name} is missing")
             if ROAD in name:
                 road.append(Body(_mesh(corners)))
     nearest, _ = Renderer(road).closest_points(reference.road.astype(np.float32))

@@ -41,8 +41,8 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
     engine = _Engine(world, reference)
     metrics = drops.rest_metrics(drops.rest_gaps(engine.fallen(), reference))
     metrics |= drive.drive(engine, reference)
-    seen = renderings.photo(reference)
-    return metrics | renderings.compare(export, "mujoco", seen, *engine.picture(seen))
+    photo = renderings.photo(reference)
+    return metrics | renderings.compare(export, "mujoco", photo, *engine.render(photo))
 
 
 class _Engine:
@@ -54,21 +54,22 @@ class _Engine:
         self._mj = mujoco
         spec = mujoco.MjSpec.from_file(str(world))
         self._balls = len(drops.start_positions(reference))
-        for i, place in enumerate(drops.start_positions(reference)):
-            ball = spec.worldbody.add_body(name=f"ball{i}", pos=place)
+        for i, position in enumerate(drops.start_positions(reference)):
+            ball = spec.worldbody.add_body(name=f"ball{i}", pos=position)
             ball.add_freejoint()
             ball.add_geom(
                 name=f"ball{i}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[drops.BALL_RADIUS_M, 0, 0], mass=1, condim=6,
                 friction=[0.9, 0.01, 0.01],
             )  # fmt: skip
-        seen = renderings.photo(reference)
-        own = seen.camera
+        photo = renderings.photo(reference)
+        camera = photo.camera
         spec.worldbody.add_camera(
-            name="photo", pos=seen.pose[:3, 3], quat=_quaternion(seen.pose[:3, :3] * [1, -1, -1]),
-            resolution=[own.width, own.height], sensor_size=[own.width, own.height], focal_pixel=[own.fx, own.fy],
-            principal_pixel=[own.width / 2 - own.cx - 0.5, own.height / 2 - own.cy - 0.5],
+            name="photo", pos=photo.pose[:3, 3], quat=_quaternion(photo.pose[:3, :3] * [1, -1, -1]),
+            resolution=[camera.width, camera.height], sensor_size=[camera.width, camera.height],
+            focal_pixel=[camera.fx, camera.fy],
+            principal_pixel=[camera.width / 2 - camera.cx - 0.5, camera.height / 2 - camera.cy - 0.5],
         )  # fmt: skip
-        spec.visual.global_.offwidth, spec.visual.global_.offheight = own.width, own.height
+        spec.visual.global_.offwidth, spec.visual.global_.offheight = camera.width, camera.height
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         mujoco.mj_forward(self._model, self._data)
@@ -92,9 +93,9 @@ class _Engine:
             self._data.actuator(wheel.name).ctrl[:] = speed
         self._step(seconds)
 
-    def picture(self, seen: Photo) -> tuple[U8, Any]:
+    def render(self, photo: Photo) -> tuple[U8, Any]:
         """Image from the photo's pose, and mask of the pixels that show the world."""
-        with self._mj.Renderer(self._model, seen.camera.height, seen.camera.width) as renderer:
+        with self._mj.Renderer(self._model, photo.camera.height, photo.camera.width) as renderer:
             renderer.update_scene(self._data, "photo")
             taken = renderer.render().copy()
             renderer.enable_segmentation_rendering()

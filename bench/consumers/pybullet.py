@@ -38,8 +38,8 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
         engine = _Engine(export)
         metrics = drops.rest_metrics(drops.rest_gaps(engine.fallen(drops.start_positions(reference)), reference))
         metrics |= drive.drive(engine, reference)
-        seen = renderings.photo(reference)
-        return metrics | renderings.compare(export, "pybullet", seen, *engine.picture(seen))
+        photo = renderings.photo(reference)
+        return metrics | renderings.compare(export, "pybullet", photo, *engine.render(photo))
     finally:
         pybullet.disconnect(client)
 
@@ -63,7 +63,7 @@ class _Engine:
     def fallen(self, start_positions: F64) -> F64:
         """(N, 3) positions of the balls at rest; afterwards they are removed."""
         shape = self._p.createCollisionShape(self._p.GEOM_SPHERE, radius=drops.BALL_RADIUS_M)
-        balls = [self._p.createMultiBody(1, shape, basePosition=place) for place in start_positions.tolist()]
+        balls = [self._p.createMultiBody(1, shape, basePosition=position) for position in start_positions.tolist()]
         for ball in balls:
             self._p.changeDynamics(ball, -1, rollingFriction=0.01, spinningFriction=0.01)
         self._step(SETTLE_S)
@@ -74,9 +74,9 @@ class _Engine:
 
     def pose(self) -> Pose:
         """Pose of the robot; PyBullet reports the centre of mass of its base."""
-        place, quaternion = self._p.getBasePositionAndOrientation(self._robot)
+        position, quaternion = self._p.getBasePositionAndOrientation(self._robot)
         rotation = np.reshape(self._p.getMatrixFromQuaternion(quaternion), (3, 3))
-        return Pose(np.asarray(place) - rotation @ ROBOT.base.place, rotation)
+        return Pose(np.asarray(position) - rotation @ ROBOT.base.place, rotation)
 
     def turn(self, left: float, right: float, seconds: float) -> None:
         """Turn the wheels at the given velocities for some time."""
@@ -86,22 +86,22 @@ class _Engine:
             self._p.setJointMotorControl2(self._robot, joint, kind, targetVelocity=speed, force=ROBOT.torque)
         self._step(seconds)
 
-    def picture(self, seen: Photo) -> tuple[U8, Any]:
+    def render(self, photo: Photo) -> tuple[U8, Any]:
         """Image from the photo's pose, and mask of the pixels that show the world."""
-        own = seen.camera
-        left, top = -(own.cx + 0.5) / own.fx, (own.cy + 0.5) / own.fy
-        right, bottom = left + own.width / own.fx, top - own.height / own.fy
+        camera = photo.camera
+        left, top = -(camera.cx + 0.5) / camera.fx, (camera.cy + 0.5) / camera.fy
+        right, bottom = left + camera.width / camera.fx, top - camera.height / camera.fy
         lens = self._p.computeProjectionMatrix(
             *(NEAR_PLANE_M * side for side in (left, right, bottom, top)), NEAR_PLANE_M, FAR_PLANE_M
         )
-        centre, rotation = seen.pose[:3, 3], seen.pose[:3, :3]
+        centre, rotation = photo.pose[:3, 3], photo.pose[:3, :3]
         view = self._p.computeViewMatrix(centre, centre + rotation[:, 2], -rotation[:, 1])
         taken = self._p.getCameraImage(
-            own.width, own.height, view, lens, shadow=0, lightAmbientCoeff=1.0, lightDiffuseCoeff=0.0,
+            camera.width, camera.height, view, lens, shadow=0, lightAmbientCoeff=1.0, lightDiffuseCoeff=0.0,
             lightSpecularCoeff=0.0, renderer=self._p.ER_TINY_RENDERER,
         )  # fmt: skip
-        rgb = np.reshape(taken[2], (own.height, own.width, 4))[..., :3].astype(np.uint8)
-        return rgb, np.reshape(taken[4], (own.height, own.width)) >= 0
+        rgb = np.reshape(taken[2], (camera.height, camera.width, 4))[..., :3].astype(np.uint8)
+        return rgb, np.reshape(taken[4], (camera.height, camera.width)) >= 0
 
     def _step(self, seconds: float) -> None:
         for _ in range(round(seconds / TIME_STEP_S)):

@@ -49,9 +49,9 @@ def missing() -> str:
 def check(export: Path, reference: WorldReference) -> dict[str, Any]:
     """Measure all possible cracks, see the module's docstring."""
     root = json.loads((export / "tileset.json").read_text(encoding="utf-8"))["root"]
-    start = np.eye(4) if "content" in root else np.asarray(np.linalg.inv(_place(root["children"][0])))
-    shown = list(_shown(export, root, start))
-    fine = [one for one in shown if not one.finer]
+    start = np.eye(4) if "content" in root else np.asarray(np.linalg.inv(_node_transform(root["children"][0])))
+    contents = list(_tile_contents(export, root, start))
+    fine = [one for one in contents if not one.finer]
     ends = [_ends(one.mesh) for one in fine]
     borders, worst = 0.0, 0.0
     for (own, own_ends), (other, other_ends) in permutations(zip(fine, ends, strict=True), 2):
@@ -59,9 +59,9 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
         if len(edges):
             borders += float(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1).sum()) / 2
             between = np.linspace(edges[:, 0], edges[:, 1], SAMPLES_PER_EDGE).reshape(-1, 3)
-            worst = max([worst, *(_away(one.mesh, between) for one in shown if _beside(one, own, other))])
+            worst = max([worst, *(_away(one.mesh, between) for one in contents if _beside(one, own, other))])
     metrics = {
-        "tiles": len(shown),
+        "tiles": len(contents),
         "finest": len(fine),
         "borders_m": round(borders, 1),
         "crack_max_m": round(2 * worst, 6),
@@ -71,22 +71,22 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
     return metrics
 
 
-def _shown(export: Path, node: dict[str, Any], above: F64) -> Iterator[TileContent]:
+def _tile_contents(export: Path, node: dict[str, Any], above: F64) -> Iterator[TileContent]:
     """All tiles at and below a node; `above` transforms the node's frame to that of the measurements."""
     below = []
     for child in node.get("children", ()):
-        below += list(_shown(export, child, above @ _place(child)))
+        below += list(_tile_contents(export, child, above @ _node_transform(child)))
     yield from below
     if "content" in node:
         names = frozenset().union(*(one.tiles for one in below)) or frozenset({node["content"]["uri"]})
         yield TileContent(names, bool(below), _mesh(export / node["content"]["uri"], above))
 
 
-def _place(node: dict[str, Any]) -> F64:
+def _node_transform(node: dict[str, Any]) -> F64:
     return np.asarray(np.reshape(node["transform"], (4, 4)).T, np.float64)
 
 
-def _mesh(path: Path, place: F64) -> Mesh:
+def _mesh(path: Path, transform: F64) -> Mesh:
     """All meshes of a GLB as one with merged vertices, z up and transformed."""
     import trimesh
 
@@ -94,8 +94,8 @@ def _mesh(path: Path, place: F64) -> Mesh:
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in read.geometry.values()])
     vertices, faces = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     upright = np.column_stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]])
-    there = upright @ place[:3, :3].T + place[:3, 3]
-    return Mesh(Frame(), there.astype(np.float32), faces.reshape(-1, 3).astype(np.int32))
+    transformed = upright @ transform[:3, :3].T + transform[:3, 3]
+    return Mesh(Frame(), transformed.astype(np.float32), faces.reshape(-1, 3).astype(np.int32))
 
 
 def _ends(mesh: Mesh) -> F64:
@@ -115,7 +115,7 @@ def _shared(own: F64, other: F64) -> F64:
 
 
 def _beside(one: TileContent, own: TileContent, other: TileContent) -> bool:
-    """Whether a content can be shown on `own`'s side of the border to `other`."""
+    """Whether a content can be contents on `own`'s side of the border to `other`."""
     return own.tiles <= one.tiles and not other.tiles <= one.tiles
 
 

@@ -22,12 +22,12 @@ def missing() -> str:
 
 def check(export: Path, reference: WorldReference) -> dict[str, Any]:
     """Load all GLBs and render from a photo's pose."""
-    wanted = json.loads((export / "metadata.json").read_text(encoding="utf-8"))["triangles_by_file"]
-    seen = renderings.photo(reference)
-    size = seen.camera.width, seen.camera.height
-    with tempfile.TemporaryDirectory() as work, threejs.viewer(export, list(wanted), Path(work), size) as view:
-        picture = view.picture(seen.camera, seen.pose)
-    if view.told["triangles"] != sum(wanted.values()):
-        raise Fault(f"{view.told['triangles']} of {sum(wanted.values())} triangles are loaded", view.told)
-    likeness = renderings.compare(export, "threejs", seen, picture, (picture != threejs.SKY).any(axis=2))
-    return {**view.told, **likeness}
+    expected = json.loads((export / "metadata.json").read_text(encoding="utf-8"))["triangles_by_file"]
+    photo = renderings.photo(reference)
+    size = photo.camera.width, photo.camera.height
+    with tempfile.TemporaryDirectory() as work, threejs.viewer(export, list(expected), Path(work), size) as view:
+        rendering = view.render(photo.camera, photo.pose)
+    if view.statistics["triangles"] != sum(expected.values()):
+        raise Fault(f"{view.statistics['triangles']} of {sum(expected.values())} triangles are loaded", view.statistics)
+    likeness = renderings.compare(export, "threejs", photo, rendering, (rendering != threejs.SKY).any(axis=2))
+    return {**view.statistics, **likeness}

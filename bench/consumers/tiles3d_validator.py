@@ -26,8 +26,8 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
     package = node_module(NAME)
     assert package is not None
     program = package / next(iter(json.loads((package / "package.json").read_text(encoding="utf-8"))["bin"].values()))
-    with tempfile.TemporaryDirectory() as place:
-        report_path = Path(place) / "report.json"
+    with tempfile.TemporaryDirectory() as work:
+        report_path = Path(work) / "report.json"
         done = subprocess.run(
             ["node", program, "--tilesetFile", export / "tileset.json", "--reportFile", report_path],
             capture_output=True, text=True,

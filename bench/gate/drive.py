@@ -24,7 +24,7 @@ MIN_UPRIGHT = 0.9
 class Pose(NamedTuple):
     """Pose of the robot's base frame: position (3,) in the world, metres, and rotation (3, 3) to the world."""
 
-    place: F64
+    position: F64
     rotation: F64
 
 
@@ -49,57 +49,58 @@ def drive(engine: Engine, reference: WorldReference) -> dict[str, Any]:
         Fault: it left the road, fell over or got stuck.
     """
     pose = engine.pose()
-    way = min(reference.ways, key=lambda one: float(np.linalg.norm(one - pose.place, axis=1).min()))
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1))])
-    first = _chainage(way, along, pose.place)
-    far = min(DRIVE_DISTANCE_M, along[-1] - first - LOOKAHEAD_M)
-    left, aside, above, driven = 0, 0.0, 0.0, 0.0
-    for _ in range(int(3 * far / SPEED_M_S / CONTROL_PERIOD_S)):
-        engine.turn(*ROBOT.wheel_speeds(SPEED_M_S, _steering(way, along, pose)), CONTROL_PERIOD_S)
+    route = min(reference.ways, key=lambda one: float(np.linalg.norm(one - pose.position, axis=1).min()))
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(route[:, :2], axis=0), axis=1))])
+    first = _chainage(route, along, pose.position)
+    goal_distance = min(DRIVE_DISTANCE_M, along[-1] - first - LOOKAHEAD_M)
+    left, max_lateral, max_above, driven = 0, 0.0, 0.0, 0.0
+    for _ in range(int(3 * goal_distance / SPEED_M_S / CONTROL_PERIOD_S)):
+        engine.turn(*ROBOT.wheel_speeds(SPEED_M_S, _steering(route, along, pose)), CONTROL_PERIOD_S)
         pose = engine.pose()
         if pose.rotation[2, 2] < MIN_UPRIGHT:
-            raise Fault(f"the robot fell over after {driven:.1f} m at {np.round(pose.place, 2).tolist()}")
-        below = _wheels(pose)
-        left += not reference.on_road(below[:, :2]).all()
-        above = max(above, float(np.nanmax(np.abs(below[:, 2] - reference.heights(below[:, :2])), initial=0.0)))
-        at = _chainage(way, along, pose.place)
-        aside = max(aside, float(np.linalg.norm(_point_at(way, along, at) - pose.place[:2])))
-        driven = at - first
-        if driven >= far:
+            raise Fault(f"the robot fell over after {driven:.1f} m at {np.round(pose.position, 2).tolist()}")
+        wheels = _wheels(pose)
+        left += not reference.on_road(wheels[:, :2]).all()
+        gaps = np.abs(wheels[:, 2] - reference.heights(wheels[:, :2]))
+        max_above = max(max_above, float(np.nanmax(gaps, initial=0.0)))
+        chainage = _chainage(route, along, pose.position)
+        max_lateral = max(max_lateral, float(np.linalg.norm(_point_at(route, along, chainage) - pose.position[:2])))
+        driven = chainage - first
+        if driven >= goal_distance:
             break
     metrics = {
         "robot_driven_m": round(driven, 2),
-        "robot_off_way_max_m": round(aside, 3),
-        "robot_above_max_m": round(above, 3),
+        "robot_off_way_max_m": round(max_lateral, 3),
+        "robot_above_max_m": round(max_above, 3),
         "robot_left_road": left,
     }
-    if driven < far or left:
-        raise Fault(f"the robot didn't drive {far:.1f} m on the road", metrics)
+    if driven < goal_distance or left:
+        raise Fault(f"the robot didn't drive {goal_distance:.1f} m on the road", metrics)
     return metrics
 
 
-def _chainage(way: F64, along: F64, place: F64) -> float:
+def _chainage(route: F64, along: F64, position: F64) -> float:
     """Distance along a route (W, 2 or 3) to its point nearest to a position."""
-    i = int(np.linalg.norm(way[:, :2] - place[:2], axis=1)[:-1].argmin())
-    step = way[i + 1, :2] - way[i, :2]
-    share = float((place[:2] - way[i, :2]) @ step / max(float(step @ step), 1e-9))
+    i = int(np.linalg.norm(route[:, :2] - position[:2], axis=1)[:-1].argmin())
+    step = route[i + 1, :2] - route[i, :2]
+    share = float((position[:2] - route[i, :2]) @ step / max(float(step @ step), 1e-9))
     return float(along[i] + share * (along[i + 1] - along[i]))
 
 
-def _point_at(way: F64, along: F64, at: float) -> F64:
+def _point_at(route: F64, along: F64, chainage: float) -> F64:
     """(2,) point on a route at a distance along it."""
-    return np.array([np.interp(at, along, k) for k in way[:, :2].T])
+    return np.array([np.interp(chainage, along, k) for k in route[:, :2].T])
 
 
-def _steering(way: F64, along: F64, pose: Pose) -> float:
+def _steering(route: F64, along: F64, pose: Pose) -> float:
     """Yaw rate in rad/s, positive to the left."""
-    at = _chainage(way, along, pose.place) + LOOKAHEAD_M
-    goal = _point_at(way, along, at) - pose.place[:2]
-    aside = float(goal @ pose.rotation[:2, 1])
-    return 2 * SPEED_M_S * aside / max(float(goal @ goal), 1e-6)
+    ahead = _chainage(route, along, pose.position) + LOOKAHEAD_M
+    goal = _point_at(route, along, ahead) - pose.position[:2]
+    lateral = float(goal @ pose.rotation[:2, 1])
+    return 2 * SPEED_M_S * lateral / max(float(goal @ goal), 1e-6)
 
 
 def _wheels(pose: Pose) -> F64:
     """(3, 3) lowest points of the wheels and the caster."""
     touching = [(x, y, 0.0) for x, y, _ in (link.place for link in (*ROBOT.wheels, ROBOT.link("caster")))]
-    return np.asarray(touching) @ pose.rotation.T + pose.place
+    return np.asarray(touching) @ pose.rotation.T + pose.position

@@ -55,48 +55,49 @@ def photo(reference: WorldReference) -> Photo:
     most = max(float(view.T_world_cam[:3, 2] @ ahead) for view in flat)
     looking = [view for view in flat if view.T_world_cam[:3, 2] @ ahead >= min(most, MIN_ALONG_ROAD)]
     view = min(looking, key=lambda one: float(np.linalg.norm(one.centre - start)))
-    rgb, own = image.read_rgb(view.photo), view.camera
-    if own.distortion:
-        matrix = np.array([[own.fx, 0, own.cx], [0, own.fy, own.cy], [0, 0, 1.0]])
-        rgb = np.asarray(cv2.undistort(rgb, matrix, np.asarray(own.distortion)))
-    plain = Camera("pinhole", own.width, own.height, own.fx, own.fy, own.cx, own.cy)
+    rgb, camera = image.read_rgb(view.photo), view.camera
+    if camera.distortion:
+        matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+        rgb = np.asarray(cv2.undistort(rgb, matrix, np.asarray(camera.distortion)))
+    plain = Camera("pinhole", camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     return Photo(rgb, plain, np.asarray(view.T_world_cam))
 
 
-def compare(export: Path, name: str, seen: Photo, taken: U8, shown: Any) -> dict[str, Any]:
+def compare(export: Path, name: str, reference: Photo, rendering: U8, covered: Any) -> dict[str, Any]:
     """Compare an image (H, W, 3) rendered from a photo's pose with the photo, and write both side by side.
 
     Args:
         export: folder of the export; the image is written to `pictures/<name>.png` beside the folder of exports.
         name: name of the consumer.
-        seen, taken: the photo and the image.
-        shown: (H, W) pixels of the image that show the world, not the sky.
+        reference: the photo.
+        rendering: the image.
+        covered: (H, W) pixels of the image that show the world, not the sky.
 
     Returns:
         `picture_psnr_db` and `picture_ssim` of these pixels, after a gain per channel; `picture_off_px`: shift of the
         image in pixels.
 
     Raises:
-        Fault: it shows nothing, or something else than the photo.
+        Fault: the image shows nothing, or differs from the photo.
     """
     folder = export.parents[1] / "pictures"
     folder.mkdir(exist_ok=True)
-    side_by_side(folder, name, [("photo", seen.rgb), (name, taken)])
-    likeness = score(seen.rgb, taken, np.asarray(shown, bool))
+    side_by_side(folder, name, [("photo", reference.rgb), (name, rendering)])
+    likeness = score(reference.rgb, rendering, np.asarray(covered, bool))
     metrics = {
         "picture_psnr_db": round(likeness["psnr_gain_db"], 2),
         "picture_ssim": round(likeness["ssim"], 3),
-        "picture_off_px": round(_off(seen.rgb, taken), 2),
+        "picture_off_px": round(_shift(reference.rgb, rendering), 2),
     }
-    if not np.any(shown) or metrics["picture_off_px"] > MAX_SHIFT * seen.camera.width:
+    if not np.any(covered) or metrics["picture_off_px"] > MAX_SHIFT * reference.camera.width:
         raise Fault("its image differs from the photo", metrics)
     return metrics
 
 
-def _off(photo: U8, taken: U8) -> float:
+def _shift(photo: U8, rendering: U8) -> float:
     """Shift in pixels between two images, from the phase correlation of their edges."""
-    grey = [cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), BLUR_PX) for picture in (photo, taken)]
-    edges = [cv2.Laplacian(picture, cv2.CV_64F) for picture in grey]
+    grey = [cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (photo, rendering)]
+    edges = [cv2.Laplacian(cv2.GaussianBlur(one, (0, 0), BLUR_PX), cv2.CV_64F) for one in grey]
     window = cv2.createHanningWindow((photo.shape[1], photo.shape[0]), cv2.CV_64F)
     (x, y), _ = cv2.phaseCorrelate(edges[0], edges[1], window)
     return float(np.hypot(x, y))

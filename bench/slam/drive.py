@@ -15,7 +15,7 @@ from scan2sim.slam.trajectory.evaluate import Evaluation, evaluate, plot
 
 DATA = ROOT.parent / "shared" / "data"
 EXIT_MOSTLY_EXTRAPOLATED = 9
-"""Exit status if most of the path is extrapolated; its errors are reported all the same."""
+"""Exit status if most of the path is extrapolated; its errors are reported anyway."""
 
 
 def drive_of(out: Path, path: str, length: float) -> Path:

@@ -56,10 +56,10 @@ def boxes(labels: Path, photos: Mapping[int, Photo]) -> list[Box]:
         height, width, length, x, y, z, ry = (float(v) for v in row[10:17])
         # labels are in the rectified camera 0, photos in camera 2, 6 cm beside it
         T = photos[int(row[0])].T
-        place = T[:3, :3] @ (np.array([x, y, z]) + CAMERA_0) + T[:3, 3]
+        centre = T[:3, :3] @ (np.array([x, y, z]) + CAMERA_0) + T[:3, 3]
         along = T[:3, :3] @ np.array([np.cos(ry), 0, -np.sin(ry)])
         if np.hypot(x, z) < MAX_DISTANCE_M:
-            tracks.setdefault(int(row[1]), []).append((place, along, np.array([length, width, height])))
+            tracks.setdefault(int(row[1]), []).append((centre, along, np.array([length, width, height])))
     out = []
     for track, drawn in tracks.items():
         samples = np.array([d[0] for d in drawn])

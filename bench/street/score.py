@@ -114,32 +114,32 @@ def displacements(photo: U8, rgb: U8, line: Sequence[Sequence[float]]) -> tuple[
     """
     from scipy.ndimage import map_coordinates
 
-    places, ways = _along(np.array(line, np.float64) - 0.5)
-    shown = [_grey(photo), _grey(rgb)]
+    points, directions = _along(np.array(line, np.float64) - 0.5)
+    grey = [_grey(photo), _grey(rgb)]
     reach = np.arange(-PROFILE_PX - MAX_SHIFT_PX, PROFILE_PX + MAX_SHIFT_PX + STEP_PX / 2, STEP_PX)
     inner = slice(round(MAX_SHIFT_PX / STEP_PX), len(reach) - round(MAX_SHIFT_PX / STEP_PX))
     out, at = [], []
-    for place, way in zip(places, ways, strict=True):
-        normal = np.array([-way[1], way[0]])
-        strip = place + way * np.arange(-AVERAGE_PX, AVERAGE_PX + 1)[:, None, None] + normal * reach[:, None]
+    for point, direction in zip(points, directions, strict=True):
+        normal = np.array([-direction[1], direction[0]])
+        strip = point + direction * np.arange(-AVERAGE_PX, AVERAGE_PX + 1)[:, None, None] + normal * reach[:, None]
         if not _within(strip[:, inner], photo.shape):
             continue
-        across = [map_coordinates(g, strip[..., ::-1].reshape(-1, 2).T, order=1, mode="nearest") for g in shown]
+        across = [map_coordinates(g, strip[..., ::-1].reshape(-1, 2).T, order=1, mode="nearest") for g in grey]
         mine, other = (a.reshape(strip.shape[:2]).mean(axis=0) for a in across)
         out.append(_shift(mine[inner], other))
-        at.append(np.round(place).astype(np.int64))
+        at.append(np.round(point).astype(np.int64))
     return np.array(out), np.array(at, np.int64).reshape(-1, 2)
 
 
 def _along(line: F64) -> tuple[F64, F64]:
     """Samples every second pixel of a polyline, and its directions there."""
-    places, ways = [], []
+    points, directions = [], []
     for a, b in pairwise(line):
         length = float(np.linalg.norm(b - a))
         at = np.arange(1.0, max(length, 1.5), 2.0)
-        places.append(a + (b - a) / length * at[:, None])
-        ways.append(np.tile((b - a) / length, (len(at), 1)))
-    return np.concatenate(places), np.concatenate(ways)
+        points.append(a + (b - a) / length * at[:, None])
+        directions.append(np.tile((b - a) / length, (len(at), 1)))
+    return np.concatenate(points), np.concatenate(directions)
 
 
 def _within(strip: F64, shape: tuple[int, ...]) -> bool:

@@ -265,7 +265,7 @@ def _client(who: Identity, port: int) -> Client:
         stream.send(Hello(listening=(Address(host=HERE, port=7444),)).wire())
         stream.send(DriverRequest(what="join", vehicle="car").wire())
 
-    return Client(who, HERE, port, opened=opened, received=lambda stream, told: None, closed=lambda why: None)
+    return Client(who, HERE, port, opened=opened, received=lambda stream, message: None, closed=lambda reason: None)
 
 
 def datagrams(pair: AttackedPair, count: int, report: Report) -> float:

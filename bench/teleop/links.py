@@ -111,16 +111,16 @@ def main() -> None:
         certificate, key = authority.certify(role, "bench", 1)
         parties.append(Identity(Peer.from_certificate(certificate), certificate, key, authority.certificate))
     car, desk = parties
-    here, there = multiprocessing.Pipe()
+    parent_end, child_end = multiprocessing.Pipe()
     fork = multiprocessing.get_context("fork")
-    child = fork.Process(target=vehicle, args=(car, desk.me, given, there), daemon=True)
+    child = fork.Process(target=vehicle, args=(car, desk.me, given, child_end), daemon=True)
     child.start()
     receiver = Receiver()
     listener = Listener(desk, [("127.0.0.1", 0)])
     connection = listener.expect(car.me, receiver.received, receiver.media, clocks=receiver.clocks)
-    here.send(listener.port)
+    parent_end.send(listener.port)
     station = drive(connection, receiver, Kind.COMMAND, given, 0)
-    result = {"vehicle": here.recv(), "station": station, "links": [link.name for link in connection.links]}
+    result = {"vehicle": parent_end.recv(), "station": station, "links": [link.name for link in connection.links]}
     child.join()
     listener.close()
     print("RESULT", json.dumps(result))

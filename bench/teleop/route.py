@@ -85,13 +85,13 @@ def draw(found: dict[str, Measurement], picture: Path) -> None:
     above.plot(*((way - begin) @ turned).T, color="0.6", linewidth=6, label="intended", solid_capstyle="round")
     for (name, measured), colour in zip(found.items(), ("#2a6f97", "#e07a1f", "#b3261e"), strict=True):
         driven = np.array(measured.vehicle["driven"])
-        places = (driven[:, 1:] - begin) @ turned
+        positions = (driven[:, 1:] - begin) @ turned
         left = cross_track_error(way, measured.vehicle["driven"])
         for run in np.unique(driven[:, 0]):
             mine = driven[:, 0] == run
             label = name if run == driven[0, 0] else None
-            above.plot(*places[mine].T, color=colour, linewidth=1, label=label)
-            off.plot(places[mine, 0], left[mine], color=colour, linewidth=1)
+            above.plot(*positions[mine].T, color=colour, linewidth=1, label=label)
+            off.plot(positions[mine, 0], left[mine], color=colour, linewidth=1)
     above.set_aspect("equal")
     above.set_ylabel("m across the street")
     above.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, fontsize=9, frameon=False)

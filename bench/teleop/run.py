@@ -60,15 +60,15 @@ MIN_LIMIT_S = 150.0
 def run_part(name: str, part: Part, scale: float) -> dict[str, Any]:
     """Run a part in a process with a time limit; missing results are None."""
     spawn = multiprocessing.get_context("spawn")
-    here, there = spawn.Pipe(duplex=False)
-    process = spawn.Process(target=_run, args=(part, scale, there))
+    parent_end, child_end = spawn.Pipe(duplex=False)
+    process = spawn.Process(target=_run, args=(part, scale, child_end))
     began = time.monotonic()
     process.start()
-    there.close()
+    child_end.close()
     limit, found = max(MIN_LIMIT_S, part.limit * scale), dict[str, Any]()
     try:
-        if here.poll(limit):
-            found = here.recv()
+        if parent_end.poll(limit):
+            found = parent_end.recv()
         else:
             print(f"{name}: not finished after {limit:.0f} s", flush=True)
     except EOFError:

@@ -190,11 +190,11 @@ def stops(scale: float, report: Report) -> dict[str, Any]:
     spawn = multiprocessing.get_context("spawn")
     pipes, processes = list[multiprocessing.connection.Connection](), list[Any]()
     for number in range(PROCESSES):
-        here, there = spawn.Pipe(duplex=False)
-        processes.append(spawn.Process(target=_pairs, args=(each, number * 1000, there), daemon=True))
+        parent_end, child_end = spawn.Pipe(duplex=False)
+        processes.append(spawn.Process(target=_pairs, args=(each, number * 1000, child_end), daemon=True))
         processes[-1].start()
-        there.close()
-        pipes.append(here)
+        child_end.close()
+        pipes.append(parent_end)
     taken = list[float | None]()
     while pipes:
         for pipe in multiprocessing.connection.wait(pipes):

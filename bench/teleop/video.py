@@ -38,9 +38,9 @@ def street(folder: Path, count: int) -> list[F64]:
     """Vehicle poses (4, 4), evenly spaced along the path recorded with the first tile."""
     scene = read_scene(folder)
     with np.load(scene.tiles[0].extra_files[PATH_FILE]) as path:
-        places = path["positions"] + scene.tiles[0].offset
-    at = np.linspace(0, len(places) - 2, count)
-    along = np.column_stack([np.interp(at, np.arange(len(places)), places[:, k]) for k in range(3)])
+        positions = path["positions"] + scene.tiles[0].offset
+    at = np.linspace(0, len(positions) - 2, count)
+    along = np.column_stack([np.interp(at, np.arange(len(positions)), positions[:, k]) for k in range(3)])
     heading = np.unwrap(np.arctan2(*np.gradient(cv2.blur(along[:, :2].copy(), (1, 15)), axis=0).T[::-1]))
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 0, 0], poses[:, 0, 1] = np.cos(heading), -np.sin(heading)
@@ -101,10 +101,10 @@ def main() -> None:
                     receiver.feed(packet, "lo")
             if camera == 0:
                 with cpu_times.of("decode"):
-                    shown = decoder.decode(frames[0].data)
-                assert shown is not None
-                read += timecode.read(shown, captured, 640) is not None
-                quality.append(cv2.PSNR(shown, image))
+                    decoded = decoder.decode(frames[0].data)
+                assert decoded is not None
+                read += timecode.read(decoded, captured, 640) is not None
+                quality.append(cv2.PSNR(decoded, image))
     pictures = given.pictures * len(YAWS)
     each = {
         name: 1e3 * spent / (given.pictures if name == "decode" else pictures)

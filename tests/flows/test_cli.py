@@ -132,14 +132,14 @@ def test_report_has_a_3d_view_to_orbit_and_walk(world: Path, tmp_path: Path) -> 
         page.open(world / "report.html")
         page.click("[data-open]")
         page.until("document.querySelector('header').dataset.state == 'open' && document.querySelector('output').value")
-        street, start = page.picture()[50:450], eye()
+        street, start = page.screenshot()[50:450], eye()
         assert street.std() > 15, "the canvas shows more than one colour"
         while np.linalg.norm((eye() - start)[:2]) < 0.3:  # few frames per second without a GPU
             page.key("KeyW", "w", 0.3)
         assert abs((eye() - start)[2]) < 0.5, "it walks on the ground"
         page.drag((400, 300), (700, 300))
         page.until(NEXT_FRAME_DRAWN)
-        assert np.abs(page.picture()[50:450].astype(int) - street).mean() > 10
+        assert np.abs(page.screenshot()[50:450].astype(int) - street).mean() > 10
         page.click("[data-to=turn]")
         page.until(f"Number(document.querySelector('output').value.split('  ')[2]) > {start[2] + 5}")
         assert page.errors == []
@@ -147,10 +147,10 @@ def test_report_has_a_3d_view_to_orbit_and_walk(world: Path, tmp_path: Path) -> 
         page.click("[data-open]")
         page.until("document.querySelector('header').dataset.state == 'open'")
         page.until("document.querySelector('output').value")
-        street, start = page.picture()[50:560], eye()
+        street, start = page.screenshot()[50:560], eye()
         page.touch("canvas", 0.3, across=120)
         page.until(NEXT_FRAME_DRAWN)
-        assert np.abs(page.picture()[50:560].astype(int) - street).mean() > 2 and (eye() == start).all()
+        assert np.abs(page.screenshot()[50:560].astype(int) - street).mean() > 2 and (eye() == start).all()
         while np.linalg.norm((eye() - start)[:2]) < 0.3:
             page.touch(".pad [data-key=KeyW]", 0.3)
         page.open(Path(shutil.copy(world / "report.html", tmp_path)))  # without its scripts

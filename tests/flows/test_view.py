@@ -38,7 +38,7 @@ def run(*words: object) -> None:
 def canvas_pixels(page: Page) -> np.ndarray:
     """Pixels of the canvas below the buttons."""
     page.value(NEXT_FRAME_DRAWN)
-    return page.picture()[80:700, :900].astype(int)
+    return page.screenshot()[80:700, :900].astype(int)
 
 
 def test_viewer_shows_all_tiles_in_all_colour_modes(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def test_a_robot_that_leaves_the_road_is_a_fault() -> None:
 
 
 def test_a_robot_that_gets_stuck_is_a_fault() -> None:
-    with pytest.raises(Fault, match="was to drive 20"):
+    with pytest.raises(Fault, match="didn't drive 20"):
         drive(FakeRobot(slip=0.1), street())
 
 

@@ -47,7 +47,7 @@ def test_bodies_rest_and_the_robot_drives_on_the_clouds_surface(world: Path) -> 
 
 
 def test_ground_5_cm_off_the_cloud_is_a_fault(world: Path) -> None:
-    with pytest.raises(Fault, match="don't come to rest"):
+    with pytest.raises(Fault, match="don't rest on the cloud's surface"):
         gazebo.check(world, reference(0.05))
 
 

@@ -78,7 +78,7 @@ def test_what_was_tracked_is_kept_when_only_its_placing_changes(corridor: Drive,
     first = {path: path.stat().st_mtime_ns for path in tmp_path.glob("steps/track/*/*")}
     assert first and (tmp_path / "view.mp4").is_file()
     said = command(*options, "--view", "--local").output
-    assert "1 of 2 results kept" in said.replace("\n", " ")
+    assert "1 of 2 results reused" in said.replace("\n", " ")
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("steps/track/*/*")} == first
     command(*options)
     assert not (tmp_path / "view.mp4").exists(), "of an earlier run nothing stays"

@@ -183,7 +183,7 @@ def test_what_cannot_be_matched_is_told(sweeps: Path, tmp_path: Path) -> None:
     assert "has no times for its points" in run(apart, "--deskew", "times")
     names = tmp_path / "times.txt"
     names.write_text("0\n2\n1\n", encoding="utf-8")
-    assert "time doesn't follow" in run(far, "--times", str(names))
+    assert "time isn't later" in run(far, "--times", str(names))
 
 
 def test_an_empty_sweep_is_passed_over(sweeps: Path, tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def test_cells_are_measured_kept_and_not_run_again(corridor: Drive, drive: Path,
     assert not good["reason"] and float(good["global_mean_m"]) < 0.3 and int(good["frames"]) == len(corridor.truth)
     assert float(good["mbit_s"]) == pytest.approx(1.0, rel=0.5) and good["width"] == "256"
     assert float(poor["mbit_s"]) < 0.5 * float(good["mbit_s"])
-    assert "segments of 400 m: they are of 10 m" in text and "scale along the way by GPS" in text
+    assert "segments of 400 m: segments of 10 m are used" in text and "scale from GPS along the path" in text
     assert "| fps | Mbit/s | global, 128 px | global, 256 px | local, 128 px | local, 256 px |" in text
     line = next(line for line in text.splitlines() if line.startswith("| 10 | 1 |"))
     errors = [f"{float(good[key]):.2f}" for key in ("global_mean_m", "local_median_10_m")]
@@ -69,12 +69,12 @@ def test_cells_are_measured_kept_and_not_run_again(corridor: Drive, drive: Path,
     assert cv2.imread(str(out / "plot.png")) is not None
 
     assert (
-        "8 of 8 results kept" in studied(drive, out, *options)
+        "8 of 8 results reused" in studied(drive, out, *options)
         and (out / "table.md").read_text(encoding="utf-8") == text
     )
     next((out / "steps" / "evaluate.h128_b1_f10").rglob("manifest.json")).unlink()
-    assert "7 of 8 results kept" in studied(drive, out, *options)
-    assert "2 of 8 results kept" in studied(drive, out, *options, "--set", "track.count=60"), "videos are kept"
+    assert "7 of 8 results reused" in studied(drive, out, *options)
+    assert "2 of 8 results reused" in studied(drive, out, *options, "--set", "track.count=60"), "videos are kept"
 
 
 def test_a_cell_that_sees_nothing_is_na_with_its_reason(corridor: Drive, drive: Path, tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_a_cell_that_sees_nothing_is_na_with_its_reason(corridor: Drive, drive: 
 def test_a_cell_that_fails_is_na_and_takes_no_other_with_it(drive: Path, tmp_path: Path) -> None:
     (drive / "mask.png").write_bytes(b"no picture")
     said = studied(drive, tmp_path / "out", "--heights", "64", "--bitrates", "1,2", "--rates", "5")
-    assert "kind, or damaged): 64 px 1 Mbit/s 5 fps, 64 px 2 Mbit/s 5 fps" in said.replace("\n", "")
+    assert "format, or damaged): 64 px 1 Mbit/s 5 fps, 64 px 2 Mbit/s 5 fps" in said.replace("\n", "")
 
 
 def test_a_lower_rate_drops_frames_and_keeps_their_times(corridor: Drive, tmp_path: Path) -> None:

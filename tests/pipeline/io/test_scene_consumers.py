@@ -180,9 +180,9 @@ def test_three_js_shows_all_tiles_as_the_projects_renderer_does(town: Scene, tmp
     folder = export(town, "glb", tmp_path / "out")
     view = town.tiles[0].views()[0]
     with threejs.viewer(folder, ["tile0.glb", "tile1.glb"], tmp_path / "page", (640, 480)) as page:
-        picture = page.picture(view.camera, view.T_world_cam)
-    assert page.told == {"triangles": sum(len(surface.shape) for tile in town.tiles for surface in tile.surfaces()),
-                         "textures": 8, "features": 8}  # fmt: skip
+        picture = page.render(view.camera, view.T_world_cam)
+    triangles = sum(len(surface.shape) for tile in town.tiles for surface in tile.surfaces())
+    assert page.statistics == {"triangles": triangles, "textures": 8, "features": 8}
     bodies = [film.placed(tile.folder / group, tile.offset) for tile in town.tiles for group in tile.groups]
     own = renderer.Renderer(bodies).view(view.camera, view.T_world_cam, background=threejs.SKY, samples=2)
     both = own.hit & (picture != threejs.SKY).any(axis=2)
@@ -204,8 +204,8 @@ def test_three_js_unpacks_what_is_packed(town: Scene, tmp_path: Path, params: di
     for name, packed in (("plain", {}), ("packed", params)):
         folder = export(town, "glb", tmp_path / name, **packed)
         with threejs.viewer(folder, ["tile0.glb", "tile1.glb"], tmp_path / f"{name}-page", (640, 480), package) as page:
-            pictures.append(page.picture(view.camera, view.T_world_cam).astype(int))
-            assert page.told["textures"] == page.told["features"] == 8
+            pictures.append(page.render(view.camera, view.T_world_cam).astype(int))
+            assert page.statistics["textures"] == page.statistics["features"] == 8
     apart = np.abs(pictures[0] - pictures[1]).max(axis=2)
     assert (pictures[0] != threejs.SKY).any(axis=2).mean() > 0.3
     assert np.mean(apart > 40) < 0.01 and apart.mean() < 4
@@ -241,7 +241,7 @@ def test_cesium_loads_finer_levels_as_it_comes_nearer(town: Scene, tmp_path: Pat
         assert far == ["tiles3d/level2/tile0.glb"]
         near = view.look(*above(town, 40), focal=480)
         assert near == ["tiles3d/tile0.glb", "tiles3d/tile1.glb"]
-        picture = view.picture()
+        picture = view.screenshot()
         assert (picture[120, 40] != cesium.SKY).any() and (picture[120, 160] == cesium.SKY).all()
 
 

@@ -140,7 +140,7 @@ def figure_of(page: Page, title: str) -> np.ndarray:
     x, y, width, height = page.value(
         f"(b => [b.x, b.y + scrollY, b.width, b.height])({box}.querySelector('.uplot').getBoundingClientRect())"
     )
-    return page.picture()[round(y) : round(y + height), round(x) : round(x + width)]
+    return page.screenshot()[round(y) : round(y + height), round(x) : round(x + width)]
 
 
 def test_records_from_kafka_appear_once_on_the_page(broker: Broker, page: Page) -> None:
@@ -201,12 +201,12 @@ def test_page_fits_the_screen_in_both_themes(dark: bool, phone: bool, filled: Se
     assert page.value("document.documentElement.scrollWidth <= innerWidth"), "no sideways scroll"
     widths = page.value("[...document.querySelectorAll('.uplot canvas')].map(c => c.getBoundingClientRect().right)")
     assert len(widths) == 6 and max(widths) <= page.value("innerWidth")
-    background = page.picture()[4, 4].mean()
+    background = page.screenshot()[4, 4].mean()
     assert background < 60 if dark else background > 200
     page.value("document.getElementById('theme').click()")  # from the system's to light
-    assert page.picture()[4, 4].mean() > 200
+    assert page.screenshot()[4, 4].mean() > 200
     page.value("document.getElementById('theme').click()")  # to dark
-    assert page.picture()[4, 4].mean() < 60
+    assert page.screenshot()[4, 4].mean() < 60
     page.value("document.getElementById('theme').click()")
 
 

@@ -77,7 +77,7 @@ def test_next_action_depends_on_desired_and_observed_state(
     assert next_action(desired, found) == action
 
 
-def test_apply_creates_updates_and_removes_what_the_file_says(fake: FakeOsm, town: Path) -> None:
+def test_apply_creates_updates_and_removes_instances(fake: FakeOsm, town: Path) -> None:
     assert {one.action for one in plan_changes(fake, town)} == {"onboard", "create"}
     assert not apply_file(fake, town).failed
     assert states(fake) == {"detect-north": "READY", "segment-south": "READY"} and fake.state.orphans() == []

@@ -113,7 +113,11 @@ def test_parts_that_do_not_belong_together(tmp_path: Path) -> None:
     camera = CAMERAS["PINHOLE"]
     path, names, sparse = drive(camera)
     sparse.point[0] = 60
-    for wrong, message in ((names[:4], "4 names for 5 poses"), (["a"] * 5, "1 names"), (["a b", *names[1:]], "blanks")):
+    for wrong, message in (
+        (names[:4], "4 names for 5 poses"),
+        (["a"] * 5, "1 names"),
+        (["a b", *names[1:]], "contains spaces"),
+    ):
         with pytest.raises(DataError, match=message):
             write_colmap(tmp_path, path, camera, wrong)
     with pytest.raises(DataError, match=r"don't exist"):
