@@ -16,7 +16,7 @@ from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import F32, Camera, Frame, PointCloud, Tile, Trajectory, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.steps.reach import CLOSING_CELL_M, REACH, ROADSIDE_M
+from scan2sim.pipeline.steps.photo_coverage import CLOSING_CELL_M, PHOTO_COVERAGE, ROADSIDE_M
 from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 CAMERA = Camera("pinhole", 1200, 400, 700.0, 700.0, 600.0, 200.0)
@@ -54,7 +54,7 @@ def left(done: Done) -> PointCloud:
 
 
 def go(inputs: dict[str, Path], out: Path, **params: Any) -> Done:
-    return REACH.run(inputs, REACH.params(**params), out, silent)
+    return PHOTO_COVERAGE.run(inputs, PHOTO_COVERAGE.params(**params), out, silent)
 
 
 def test_what_photos_see_and_the_lane_stay_and_the_rest_goes(street: dict[str, Path], tmp_path: Path) -> None:
@@ -110,9 +110,9 @@ def test_only_where_photos_are_taken_along_a_path_and_neighbours_read_it() -> No
     steps = {
         name: {task.step.name for task in build_graph(tile, Settings())} for name, tile in (("b", bare), ("s", street))
     }
-    assert "reach" in steps["s"] and "reach" not in steps["b"]
-    off = {task.step.name for task in build_graph(street, Settings({"reach": {"limit": "off"}}))}
-    assert "reach" not in off
+    assert "photo_coverage" in steps["s"] and "photo_coverage" not in steps["b"]
+    off = {task.step.name for task in build_graph(street, Settings({"photo_coverage": {"limit": "off"}}))}
+    assert "photo_coverage" not in off
     # a survey's tiles meet: what is beyond the border is kept or left out as the neighbour decides, photos or none
     tiles = [
         replace(street, name="a", cell=Cell((0, 0), {"b": (10, 0)})),
@@ -120,4 +120,4 @@ def test_only_where_photos_are_taken_along_a_path_and_neighbours_read_it() -> No
     ]
     tasks = {task.full_name: task for task in build_survey_graph(tiles, Settings())}
     read = {(source.task.full_name, source.name) for source in tasks["a/overlap"].inputs.values()}  # type: ignore[union-attr]
-    assert read == {("a/reach", "cloud"), ("b/reach", "cloud")}
+    assert read == {("a/photo_coverage", "cloud"), ("b/photo_coverage", "cloud")}

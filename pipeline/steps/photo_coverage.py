@@ -1,4 +1,4 @@
-"""Photo coverage (step `reach`): removes points that no photo shows well and that are far from the scanner's path."""
+"""Photo coverage step: removes points that no photo shows well and that are far from the scanner's path."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ AERIAL_PATH_HEIGHT_M = 15.0
 """A path higher above the ground is not one of a street vehicle: all points are kept."""
 
 
-class ReachParams(Params):
+class PhotoCoverageParams(Params):
     """Which points are kept.
 
     Attributes:
@@ -43,7 +43,7 @@ class ReachParams(Params):
     voxel: Voxel = 0.10
 
 
-def reach(inputs: Inputs, params: ReachParams, out: Path, report: Report) -> Done:
+def photo_coverage(inputs: Inputs, params: PhotoCoverageParams, out: Path, report: Report) -> Done:
     """Remove the points of `cloud` that no photo of `views` covers well enough and that are far from the `path`.
 
     Held-out photos are ignored. Ground in between and margins of walls and plants are kept (`CLOSING_GAP_M`,
@@ -131,4 +131,4 @@ def _farthest(thin: PointCloud, kept: Bools, path: F64) -> float:
     return float(distance.max())
 
 
-REACH = Step("reach", 1, reach, ReachParams)
+PHOTO_COVERAGE = Step("photo_coverage", 1, photo_coverage, PhotoCoverageParams)

@@ -1,4 +1,4 @@
-"""Dynamic object removal (step `carve`): removes objects that moved during the scan, and returns of the ego vehicle."""
+"""Dynamic object removal step: removes objects that moved during the scan, and returns of the ego vehicle."""
 
 from __future__ import annotations
 
@@ -28,28 +28,28 @@ MOVING_FRACTION_WARNING = 0.2
 """Fraction of moving points above which the step warns."""
 
 
-class CarveParams(Params):
+class DynamicObjectsParams(Params):
     """Detection of moving objects by free space.
 
     Attributes:
         when: "auto": if the scanner's path and the points' times are known; "never".
         voxel: edge of the occupancy voxels in metres. A voxel is free only if all its neighbours are, so moving points
             within one voxel of a static surface are kept, and poses may be wrong by one voxel.
-        reach: maximum length of rays in metres; at 20 m, half a degree is one voxel.
+        max_range: maximum length of rays in metres; at 20 m, half a degree is one voxel.
         votes: number of moments (of 0.1 s; for a profile scanner, passes) at which rays must have crossed a voxel.
-        camera: radius in metres around every camera in which points are removed; 0: off.
+        camera_radius: radius in metres around every camera in which points are removed; 0: off.
         cameras: camera positions (x, y, z) in local metres; set by the pipeline.
     """
 
     when: Literal["auto", "never"] = "auto"
     voxel: float = Field(0.2, ge=0.02, le=5)
-    reach: float = Field(20.0, ge=1, le=500)
+    max_range: float = Field(20.0, ge=1, le=500)
     votes: int = Field(3, ge=1, le=1000)
-    camera: float = Field(1.0, ge=0, le=10)
+    camera_radius: float = Field(1.0, ge=0, le=10)
     cameras: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = ()
 
 
-def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Done:
+def dynamic_objects(inputs: Inputs, params: DynamicObjectsParams, out: Path, report: Report) -> Done:
     """Split `cloud` into static and moving points by the free space along the rays from the scanner's `path`.
 
     Files: `cloud`, without moving points, returns of the ego vehicle, and points next to a camera; `moving`, the moving
@@ -59,7 +59,7 @@ def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Don
     from scan2sim.pipeline.dynamic_objects.ego_vehicle_mask import in_swept_volume, near_cameras, swept_volume
 
     if params.when == "never" or not (params.cameras or "path" in inputs):
-        why = "carve.when=never" if params.when == "never" else "neither path nor cameras are known"
+        why = "dynamic_objects.when=never" if params.when == "never" else "neither path nor cameras are known"
         return _untouched(inputs["cloud"], out, why)
     report(0.0, "reading")
     cloud = PointCloud.load(inputs["cloud"])
@@ -77,7 +77,7 @@ def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Don
         report(0.2, "tracing rays")
         moved, seen_again = _moved(cloud, origins, path, params)
         why = "" if seen_again > MIN_REVISITED_FRACTION else "nearly all voxels were observed only once"
-    near = near_cameras(cloud.xyz, np.array(params.cameras, np.float64).reshape(-1, 3), params.camera, volume)
+    near = near_cameras(cloud.xyz, np.array(params.cameras, np.float64).reshape(-1, 3), params.camera_radius, volume)
     own = np.zeros(len(cloud), bool) if own is None else own & ~moved
     near &= ~moved & ~own
     moving_share = float(moved.mean())
@@ -86,8 +86,8 @@ def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Don
         "moved": int(moved.sum()),
         "moving_share": round(moving_share, 5),
         "own_volume": int(own.sum()),
-        "first_metre": int(near.sum()),
-        "looked_at_again": round(seen_again, 3),
+        "near_cameras": int(near.sum()),
+        "revisited": round(seen_again, 3),
         "rays": why or "followed",
     }
     gone = moved | own | near
@@ -111,7 +111,7 @@ def carve(inputs: Inputs, params: CarveParams, out: Path, report: Report) -> Don
         warnings.append(
             f"{moving_share:.0%} of the points were removed as moving objects, because other rays passed through them: "
             "check that path and points share a clock, and that poses are accurate to a voxel. "
-            "--set carve.when=never keeps all points"
+            "--set dynamic_objects.when=never keeps all points"
         )
     return Done(files, facts, warnings)
 
@@ -151,7 +151,9 @@ def _origins(cloud: PointCloud, path: Trajectory) -> tuple[F64, str]:
     return origins, ""
 
 
-def _moved(cloud: PointCloud, origins: F64, path: Trajectory | None, params: CarveParams) -> tuple[Bools, float]:
+def _moved(
+    cloud: PointCloud, origins: F64, path: Trajectory | None, params: DynamicObjectsParams
+) -> tuple[Bools, float]:
     """(N,) bool, True for points that other rays passed through; and the fraction of points in revisited voxels."""
     from scan2sim.pipeline.dynamic_objects.free_space import in_free_space
 
@@ -163,7 +165,7 @@ def _moved(cloud: PointCloud, origins: F64, path: Trajectory | None, params: Car
         origins[order].astype(np.float32),
         np.floor((time - time[0]) / SCAN_WINDOW_S + 0.5).astype(np.int64),
         voxel=params.voxel,
-        reach=params.reach,
+        max_range=params.max_range,
         votes=params.votes,
         high=float(path.positions[:, 2].max()) + MOVING_MAX_HEIGHT_M,
     )
@@ -172,4 +174,4 @@ def _moved(cloud: PointCloud, origins: F64, path: Trajectory | None, params: Car
     return out, seen_again
 
 
-CARVE = Step("carve", 3, carve, CarveParams, memory=(0.5, 6))
+DYNAMIC_OBJECTS = Step("dynamic_objects", 3, dynamic_objects, DynamicObjectsParams, memory=(0.5, 6))

@@ -1,4 +1,4 @@
-"""Furniture detection (step `finds`): signs, poles, lamps and trunks of a tile, before merging with its neighbours."""
+"""Furniture detection step: signs, poles, lamps and trunks of a tile, before merging with its neighbours."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_OUTSIDE_CELL_M = 0.5  # detections farther outside the tile's cell are left 
 KINDS = ("pole", "sign", "lamp", "trunk")
 
 
-class FindsParams(Params):
+class DetectFurnitureParams(Params):
     """The tile's cell within the survey.
 
     Attributes:
@@ -38,11 +38,11 @@ class FindsParams(Params):
     neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
 
 
-def finds(inputs: Inputs, params: FindsParams, out: Path, report: Report) -> Done:
+def detect_furniture(inputs: Inputs, params: DetectFurnitureParams, out: Path, report: Report) -> Done:
     """Detect street furniture (pole-like objects and sign panels) in the classified `cloud`, using the scanner `path`.
 
     Without a path, nothing is detected.
-    File: `finds`, JSON list of `Detection`s in world metres. Metrics: number of detections of each kind.
+    File: `detections`, JSON list of `Detection`s in world metres. Metrics: number of detections of each kind.
     """
     detections: list[Detection] = []
     if "path" in inputs:
@@ -58,8 +58,12 @@ def finds(inputs: Inputs, params: FindsParams, out: Path, report: Report) -> Don
             detections = [
                 detection for detection, far in zip(detections, outside, strict=True) if far <= MAX_OUTSIDE_CELL_M
             ]
-    (out / "finds.json").write_text(json.dumps([detection.to_json() for detection in detections]), encoding="utf-8")
-    return Done({"finds": out / "finds.json"}, {kind: sum(t.kind == kind for t in detections) for kind in KINDS})
+    (out / "detections.json").write_text(
+        json.dumps([detection.to_json() for detection in detections]), encoding="utf-8"
+    )
+    return Done(
+        {"detections": out / "detections.json"}, {kind: sum(t.kind == kind for t in detections) for kind in KINDS}
+    )
 
 
 def detect(cloud: PointCloud, path: Trajectory) -> list[Detection]:
@@ -89,4 +93,4 @@ def heights(ground: F32, xyz: F32) -> F32:
     return (xyz[:, 2] - smooth[raster.at(xyz)]).astype(np.float32)
 
 
-FINDS = Step("finds", 1, finds, FindsParams, side_product=True)
+DETECT_FURNITURE = Step("detect_furniture", 1, detect_furniture, DetectFurnitureParams, side_product=True)

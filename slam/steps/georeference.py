@@ -1,4 +1,4 @@
-"""Step `place`: aligns a video's poses (upright, scaled by GPS, georeferenced) and writes the trajectory."""
+"""Step `georeference`: aligns a video's poses (upright, scaled by GPS, georeferenced) and writes the trajectory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scan2sim.slam.trajectory import output
 from scan2sim.slam.trajectory.align import aligned_trajectory
 
 
-class PlaceParams(Params):
+class GeoreferenceParams(Params):
     """Settings of the trajectory's alignment and output.
 
     Attributes:
@@ -25,9 +25,9 @@ class PlaceParams(Params):
     colmap: bool = False
 
 
-def place(inputs: Inputs, params: PlaceParams, out: Path, report: Report) -> Done:
-    """Write the trajectory of `mapped` as `trajectory.csv`, `.tum`, `.kitti`, and `.geojson` if georeferenced."""
-    checkpoint = MapCheckpoint.read(inputs["mapped"])
+def georeference(inputs: Inputs, params: GeoreferenceParams, out: Path, report: Report) -> Done:
+    """Write the trajectory of `map` as `trajectory.csv`, `.tum`, `.kitti`, and `.geojson` if georeferenced."""
+    checkpoint = MapCheckpoint.read(inputs["map"])
     trajectory, alignment = aligned_trajectory(checkpoint, checkpoint.gps, georeference=params.georeference)
     folder = out / "path"
     sparse = sparse_map(checkpoint, alignment, trajectory) if params.colmap else None
@@ -43,4 +43,4 @@ def place(inputs: Inputs, params: PlaceParams, out: Path, report: Report) -> Don
     return Done({"path": folder, "trajectory": folder / "trajectory.csv"}, metrics, warnings)
 
 
-PLACE = Step("place", 2, place, PlaceParams)
+GEOREFERENCE = Step("georeference", 2, georeference, GeoreferenceParams)
