@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.camera.poses import interpolate
 from scan2sim.pipeline.core.parameters import Seed
+from scan2sim.pipeline.core.poses import interpolate
 from scan2sim.pipeline.core.types import F64, U8, Camera, GpsTrack
 from scan2sim.slam.geometry import exp_so3, inverse, log_so3, relative_pose, rigid
 from scan2sim.slam.mapping.local_map import Keyframe, LocalMap, MapParams, gps_distance

@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import F64, I32, Frame, Mesh
+from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.worlds import textured_mesh
-from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
 from scan2sim.texturing.bake.texel_map import corners as page_corners
 from scan2sim.texturing.bake.texel_map import owners
 from scan2sim.texturing.borders.colour_harmonization import LevelParams, level
