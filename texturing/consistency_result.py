@@ -5,16 +5,12 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F32, U8, View
 from scan2sim.pipeline.io.images import image
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,8 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
     warnings = []
     if fallbacks:
         warnings.append(
-            f"{fallbacks} of {len(pages)} blocks were unwrapped by {fallback_of(params)}, as {backend_of(params)} failed"
+            f"{fallbacks} of {len(pages)} blocks were unwrapped by {fallback_of(params)}, "
+            f"as {backend_of(params)} failed"
         )
     metrics = _metrics(done, pages) | {"charts": charts, "backend": params.backend, "fallbacks": fallbacks}
     return Done({"mesh": out / "mesh.npz", "pages": out / "pages.json"}, metrics, warnings)

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from scan2sim.pipeline.core.types import F32, I32
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)
