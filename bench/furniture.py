@@ -30,11 +30,11 @@ from scan2sim.pipeline.camera.renderer import Renderer, textured
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import F32, Mesh
+from scan2sim.pipeline.geometry.surface_distance import distances, sample_surface
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.detect_furniture import DETECT_FURNITURE, DetectFurnitureParams
 from scan2sim.pipeline.steps.furniture import FURNITURE, FurnitureParams
-from scan2sim.pipeline.steps.geometry import distances, sample_surface
 
 RECALL_DISTANCE_M, PRECISION_DISTANCE_M = 0.2, 0.3
 """Maximum distance of a detection from the truth for recall of poles, and for precision and trunks."""

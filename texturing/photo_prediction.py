@@ -29,7 +29,7 @@ from scan2sim.pipeline.camera.projection import (
     to_camera,
 )
 from scan2sim.pipeline.core.types import F32, F64, U8, Camera
-from scan2sim.texturing.bake.blend_numba import corrected, vignette
+from scan2sim.texturing.exposure_model import corrected, vignette
 from scan2sim.texturing.photo_cache import SRGB_OFFSET, Photo
 
 AGREEMENT_LEVELS = 28.0

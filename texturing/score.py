@@ -15,7 +15,7 @@ from scan2sim.pipeline.core.parameters import Distance
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, I64, Bools, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.steps.pictures import Album
+from scan2sim.pipeline.io.images.album import Album
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.camera.renderer import Renderer

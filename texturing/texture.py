@@ -24,13 +24,14 @@ from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, I64, U8, Bools, Mesh, PointCloud
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
-from scan2sim.texturing.photo_consistency import PhotoConsistency
-from scan2sim.texturing.view_selection.step import Choice
+from scan2sim.texturing.consistency_result import PhotoConsistency
+from scan2sim.texturing.texture_page import FILLED, Page
+from scan2sim.texturing.view_selection.choice import Choice
 
 if TYPE_CHECKING:
     from scan2sim.texturing.bake.bands import Baker
     from scan2sim.texturing.inpainting.ground import GroundOrthophoto
-    from scan2sim.texturing.inpainting.hole_filling import Page, PointColours
+    from scan2sim.texturing.inpainting.hole_filling import PointColours
 
 SEEN_TEXEL_STRIDE = 8
 """Where the points have no colours, every Nth seen texel (in both directions) is a colour sample for unseen texels."""
@@ -160,7 +161,7 @@ def _inpaint_pages(
     orthophoto: GroundOrthophoto, folder: Path, mesh: Mesh, has_filled: Bools, params: TextureParams
 ) -> None:
     """Paint the inpainted ground onto the pages of the faces with `has_filled` (F,), and pad their charts."""
-    from scan2sim.texturing.bake import texel_map as texels
+    from scan2sim.texturing import texel_map as texels
     from scan2sim.texturing.bake.page_writer import PageWriter
     from scan2sim.texturing.inpainting import hole_filling
 
@@ -174,9 +175,7 @@ def _inpaint_pages(
             image.read_levels(path.with_name(f"{path.name}_seen.png")),
         )
         flat = texels.corners(mesh.uv[faces], seen.shape[1], seen.shape[0])
-        page = hole_filling.Page(
-            rgb, seen, texels.owners(flat, seen.shape[1], seen.shape[0]), flat, mesh.corners[faces]
-        )
+        page = Page(rgb, seen, texels.owners(flat, seen.shape[1], seen.shape[0]), flat, mesh.corners[faces])
         if ground is not None:
             ground.fill(page)
         hole_filling.pad(page.rgb, page.seen, params.padding)
@@ -196,7 +195,7 @@ def _fill_unseen(
     Where the points have no measured colours, colours come from nearby seen texels and, at synthesized points, from
     `synthesized` (positions, colours); None: the points have measured colours.
     """
-    from scan2sim.texturing.bake import texel_map as texels
+    from scan2sim.texturing import texel_map as texels
     from scan2sim.texturing.inpainting import hole_filling
 
     area = float(mesh.face_area[faces].sum())
@@ -205,12 +204,12 @@ def _fill_unseen(
         positions, rgb = hole_filling.seen_points(page, SEEN_TEXEL_STRIDE)
         if len(positions):
             xyz, colour = np.concatenate([positions, synthesized[0]]), np.concatenate([rgb, synthesized[1]])
-            colours = hole_filling.PointColours(xyz, colour, hole_filling.FILLED)
+            colours = hole_filling.PointColours(xyz, colour, FILLED)
     if colours is not None:
         hole_filling.fill(page, colours, max(texel, 1e-6))
     else:
-        page.seen[(page.owner >= 0) & (page.seen == 0)] = hole_filling.FILLED
-        page.rgb[page.seen == hole_filling.FILLED] = 128
+        page.seen[(page.owner >= 0) & (page.seen == 0)] = FILLED
+        page.rgb[page.seen == FILLED] = 128
     return np.asarray(texels.count(page.owner, page.seen, page.flat))
 
 

@@ -15,7 +15,7 @@ from bench.consumers import Fault
 from bench.gate.places import WorldReference
 from scan2sim.pipeline.camera.renderer import Body, Renderer
 from scan2sim.pipeline.core.types import F64, Frame, Mesh
-from scan2sim.pipeline.tiling.borders.boundary_curve import curve
+from scan2sim.pipeline.geometry.boundary_curve import curve
 
 FORMAT = "tiles3d"
 VERTEX_TOLERANCE_M = 2e-3

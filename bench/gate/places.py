@@ -12,11 +12,11 @@ import numpy as np
 
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.types import F64, Bools, PointCloud, View
+from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.geometry.height_map import Raster, dilate
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.io.worlds.scene import Scene
-from scan2sim.pipeline.simulation.spawn import courses
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
+from scan2sim.pipeline.io.worlds.spawn import courses
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree

@@ -19,9 +19,9 @@ from bench.street.run import STREETS, build_world
 from bench.street.run import scan2sim as run
 from scan2sim.pipeline.core.classes import colour_of
 from scan2sim.pipeline.core.types import U8, PointCloud, View
+from scan2sim.pipeline.geometry.voxel_grid import sample
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.steps.voxel import sample
 from scan2sim.segmentation.backends import load
 from scan2sim.segmentation.labels import CLASSES, code_of_index, index_of_code
 from scan2sim.segmentation.metrics import Confusion, confusion

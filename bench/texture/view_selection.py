@@ -36,7 +36,8 @@ from scan2sim.texturing.photo_consistency import PHOTO_CONSISTENCY
 from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
 from scan2sim.texturing.view_selection import mrf
-from scan2sim.texturing.view_selection.step import VIEW_SELECTION, Choice, ViewSelectionParams, seam_costs
+from scan2sim.texturing.view_selection.choice import Choice
+from scan2sim.texturing.view_selection.step import VIEW_SELECTION, ViewSelectionParams, seam_costs
 
 MAX_SWEEPS = 3
 UNSEEN_COST = 1e3

@@ -13,7 +13,7 @@ from scan2sim.flows.engine.planning import STORE, PlannedTask, drop_damaged, pla
 from scan2sim.flows.pipelines.drive import Drive, build_graph
 from scan2sim.pipeline.core.cache import Digests, Manifest, Store
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.io.remote import is_remote, local_copy
+from scan2sim.pipeline.core.remote import is_remote, local_copy
 
 PREPARED, DRIVE = "prepared", "drive.toml"
 LINKED_OUTPUTS = {"import_sweeps": "corridor", "cut": "survey"}

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 STEPS = {
-    "carve": "dynamic_objects",
-    "things": "instances",
+    "dynamic_objects": "dynamic_objects",
+    "instances": "instances",
     "reach": "photo_coverage",
     "finds": "detect_furniture",
-    "refine": "pose_refinement",
-    "agreement": "photo_consistency",
-    "choose": "view_selection",
-    "level": "colour_harmonization",
+    "pose_refinement": "pose_refinement",
+    "photo_consistency": "photo_consistency",
+    "view_selection": "view_selection",
+    "colour_harmonization": "colour_harmonization",
     "place": "georeference",
 }
 """Earlier name of a step: its name."""

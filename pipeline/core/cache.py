@@ -30,8 +30,8 @@ from typing import Any
 
 from scan2sim.pipeline.core.errors import InputError, from_os_error
 from scan2sim.pipeline.core.paths import inside
+from scan2sim.pipeline.core.remote import Remote
 from scan2sim.pipeline.core.step import Done, Params, Step
-from scan2sim.pipeline.io.remote import Remote
 
 KEY_LENGTH = 24
 TEMPORARY_PREFIX, CHECKPOINT_PREFIX = ".tmp-", ".part-"

@@ -12,7 +12,7 @@ from pydantic import Field
 from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, Bools, PointCloud, Trajectory
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
+from scan2sim.pipeline.core.voronoi_cell import Cell
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.furniture.classify import Detection

@@ -15,9 +15,9 @@ from scan2sim.pipeline.core.classes import CODE, PHOTO_CLASSES
 from scan2sim.pipeline.core.parameters import PlanPoint, Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, I64, UNCOLOURED, Bools, PointCloud, Trajectory
+from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.buildings.facade_completion import Rays, Wall
@@ -62,8 +62,8 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
 
     from scan2sim.pipeline.buildings import facade_completion as kernels
     from scan2sim.pipeline.buildings.facade_stereo import WINDOW_M
+    from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid
     from scan2sim.pipeline.geometry.planes import detect
-    from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
 
     cloud = PointCloud.load(inputs["cloud"])
     whole = PointCloud.join([cloud, *(PointCloud.load(path) for name, path in inputs.items() if "other." in name)])

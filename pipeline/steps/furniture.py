@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,16 +13,15 @@ from pydantic import Field
 from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import I64, Bools, Frame, Mesh, PointCloud
+from scan2sim.pipeline.furniture.object_lists import sign_panel_columns, write_lists
 from scan2sim.pipeline.steps.detect_furniture import KINDS
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.furniture.classify import Detection
-    from scan2sim.pipeline.furniture.sign_panels import SignPanel
 
     Bools = Bools
 
 SEARCH_RADIUS_M = 4.0  # around the middle of a stem; contains all points of the object
-CSV_COLUMNS = ("x", "y", "z", "kind", "height_m", "radius_m", "heading_deg", "shape", "plate_width_m", "plate_height_m")
 
 
 class FurnitureParams(Params):
@@ -98,18 +97,6 @@ def _load_detections(inputs: Inputs, params: FurnitureParams, frame: Frame) -> t
     return own, [detection.moved(here) for name, detection in merged if name != params.name]
 
 
-def write_lists(out: Path, crs: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Path]:
-    """Write `furniture.csv` and `furniture.geojson`; `x`, `y` and `z` of each row are in the CRS."""
-    from scan2sim.pipeline.io.geodata import geojson
-
-    files = {"csv": out / "furniture.csv", "geojson": out / "furniture.geojson"}
-    text = "\n".join([",".join(CSV_COLUMNS), *(",".join(str(row.get(c, "")) for c in CSV_COLUMNS) for row in rows)])
-    files["csv"].write_text(text + "\n", encoding="utf-8")
-    features = [((r["x"], r["y"], r["z"]), {k: v for k, v in r.items() if k not in "xyz"}) for r in rows]
-    geojson.write_points(files["geojson"], crs, features)
-    return files
-
-
 def _points_of(cloud: PointCloud, own: Sequence[Detection], others: Sequence[Detection]) -> tuple[I64, Bools]:
     """Indices (N,) of the points of all objects, ascending; and (N,) bool, True for objects of this tile."""
     from scan2sim.pipeline.furniture.classify import eligible
@@ -150,13 +137,6 @@ def _row(detection: Detection, frame: Frame) -> dict[str, Any]:
     if detection.plates:
         row |= sign_panel_columns(max(detection.plates, key=lambda p: p.width * p.height))
     return row
-
-
-def sign_panel_columns(plate: SignPanel) -> dict[str, Any]:
-    """Columns of a sign panel in the CSV and GeoJSON lists."""
-    heading = float(np.degrees(np.arctan2(plate.normal[0], plate.normal[1]))) % 360
-    size = {"plate_width_m": round(plate.width, 2), "plate_height_m": round(plate.height, 2)}
-    return {"heading_deg": round(heading, 1), "shape": plate.shape, **size}
 
 
 FURNITURE = Step("furniture", 4, furniture, FurnitureParams, side_product=True)

@@ -11,8 +11,9 @@ from pydantic import Field
 from scan2sim.pipeline.core.classes import GROUPS, SURFACES, group_of
 from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.core.types import F32, Mesh, PointCloud
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
+from scan2sim.pipeline.core.types import Mesh, PointCloud
+from scan2sim.pipeline.core.voronoi_cell import Cell
+from scan2sim.pipeline.geometry.surface_distance import distances, sample_surface
 
 P95_DISTANCE_WARNING_M = 1.0  # the step warns if 5 % of the points are farther from the mesh
 
@@ -118,25 +119,6 @@ def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int, *, any_class:
     low, high = same.vertices.min(axis=0)[:2], same.vertices.max(axis=0)[:2]
     points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)]
     return float(np.mean(distances(points, truth.moved_to(mesh.frame) if any_class else same)))
-
-
-def distances(points: F32, mesh: Mesh) -> F32:
-    """Distance (N,) in metres from points (N, 3) to the nearest point of the mesh."""
-    import open3d as o3d
-
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces.astype(np.uint32)))
-    return scene.compute_distance(np.ascontiguousarray(points, np.float32)).numpy()
-
-
-def sample_surface(mesh: Mesh, count: int, seed: int = 0) -> F32:
-    """Points (count, 3) sampled uniformly from the mesh's surface."""
-    random = np.random.default_rng(seed)
-    area = np.cumsum(mesh.face_area, dtype=np.float64)
-    face = np.searchsorted(area, random.uniform(0, area[-1], count)).clip(max=len(mesh) - 1)
-    u, v = np.sqrt(random.uniform(size=(count, 1))), random.uniform(size=(count, 1))
-    a, b, c = np.moveaxis(mesh.corners[face], 1, 0)
-    return ((1 - u) * a + u * (1 - v) * b + u * v * c).astype(np.float32)
 
 
 GEOMETRY = Step("geometry", 4, geometry, GeometryParams, side_product=True)

@@ -13,7 +13,7 @@ from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import UNCOLOURED, Bools, Frame, PointCloud
-from scan2sim.pipeline.tiling.voronoi_cell import Cell, nearest
+from scan2sim.pipeline.core.voronoi_cell import Cell, nearest
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.geometry.height_map import Raster
@@ -67,8 +67,8 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
     neighbours, their clouds (`terrain.NAME` and so on) are used too: both tiles fill a hole on their border
     identically. File: `synthesized`, a `PointCloud` with normals, as dense as the ground's points.
     """
+    from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid
     from scan2sim.pipeline.geometry.height_map import Raster, close_gaps, dilate, fill_membrane, point_spacing
-    from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
 
     terrain = merge_neighbours(inputs, params, "terrain")
     above = [merge_neighbours(inputs, params, part) for part in ("building", "vegetation", "rest") if part in inputs]
@@ -155,7 +155,7 @@ def near_cell(xy: object, params: CompletionParams, cloud: PointCloud) -> object
 
 def merge_neighbours(inputs: Inputs, params: CompletionParams, part: str) -> PointCloud:
     """The cloud `part` merged with the neighbours' clouds `part.NAME` inside their own cells, in the tile's frame."""
-    from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
+    from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid
 
     own = PointCloud.load(inputs[part])
     given = sorted(name for name in params.neighbours if f"{part}.{name}" in inputs)

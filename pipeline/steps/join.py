@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import Field
 
 from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
-from scan2sim.pipeline.steps.clip import CellParams
+from scan2sim.pipeline.tiling.cell_params import CellParams
 
 
 class JoinParams(CellParams):

@@ -14,9 +14,9 @@ from scan2sim.pipeline.core.classes import GROUPS, group_of
 from scan2sim.pipeline.core.parameters import Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, Bools, PointCloud, Trajectory, View
+from scan2sim.pipeline.geometry.voxel_grid import sample, voxel_groups
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.file_checks import link_or_copy
-from scan2sim.pipeline.steps.voxel import sample, voxel_groups
 
 MAX_GSD_VOXELS = 2.0
 """Coarsest ground sample distance of a covered point, in voxels; a coarser texture is blurred even at voxel scale."""

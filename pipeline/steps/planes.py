@@ -11,7 +11,7 @@ from pydantic import Field
 from scan2sim.pipeline.core.parameters import PlanPoint, Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, Mesh, PointCloud
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
+from scan2sim.pipeline.core.voronoi_cell import Cell
 
 FIXED_VOXELS, BLENDED_VOXELS = 2.5, 5.0  # distance from a tile border up to which vertices are fixed, and blended
 
@@ -106,7 +106,7 @@ def snap_weights(mesh: Mesh, params: PlanesParams) -> F64:
 
     Planes of two tiles differ slightly, because a tile has no points beyond its buffer.
     """
-    from scan2sim.pipeline.tiling.borders.grid import world
+    from scan2sim.pipeline.geometry.coordinate_grid import world
 
     weight = np.ones(len(mesh.vertices))
     if params.seed is not None and params.neighbours:

@@ -58,9 +58,7 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
         group[parked(cloud, inputs["instances"])] = VEHICLE
         parts.append("vehicle")
     elif params.vehicles == "keep":
-        warnings.append(
-            "split.vehicles=keep has no effect: it needs instances.detect and a scanner's path"
-        )
+        warnings.append("split.vehicles=keep has no effect: it needs instances.detect and a scanner's path")
     number: dict[str, int] = {name: i for i, name in enumerate(GROUPS)}
     number |= {"furniture": FURNITURE, "vehicle": VEHICLE}
     for i, name in enumerate(parts):

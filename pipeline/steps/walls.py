@@ -172,7 +172,7 @@ def _cloud(xyz: F64, normal: F64, building: PointCloud, params: WallsParams) -> 
     """Synthesized points that are not near a scanned point of the building and belong to the tile."""
     from scipy.spatial import cKDTree
 
-    from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
+    from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid
 
     keep = ~np.isfinite(
         cKDTree(building.xyz).query(xyz, distance_upper_bound=SCANNED_WALL_SPACINGS * POINT_SPACING_M)[0]

@@ -21,17 +21,17 @@ from scan2sim.pipeline.core.errors import DataError, InputError, SettingError
 from scan2sim.pipeline.core.parameters import Buffer, Length, Metres, Stretch
 from scan2sim.pipeline.core.step import Params, Report, silent
 from scan2sim.pipeline.core.types import F64, Tile, Trajectory
-from scan2sim.pipeline.importers.tile_folder import add_file, tile_folder
+from scan2sim.pipeline.core.voronoi_cell import Cell, Seed, cells
+from scan2sim.pipeline.geometry.path_sampling import resample_path
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import orthophoto
 from scan2sim.pipeline.io.survey import read_survey, write_survey
-from scan2sim.pipeline.io.tile import TileFile, read_spec, read_tile, tile_name, write_tile
-from scan2sim.pipeline.steps.ingest import MIN_POINTS
-from scan2sim.pipeline.tiling.cut_plan import resample_path, seeds, sees, tile_membership
+from scan2sim.pipeline.io.tile import MIN_POINTS, TileFile, read_spec, read_tile, tile_name, write_tile
+from scan2sim.pipeline.io.tile_folder import add_file, tile_folder
+from scan2sim.pipeline.tiling.cut_plan import seeds, sees, tile_membership
 from scan2sim.pipeline.tiling.point_spool import COORDINATE_STEP, Spool
-from scan2sim.pipeline.tiling.voronoi_cell import Cell, Seed, cells
 
 VERSION = 1
 """Version of the cut: raised when the same corridor and options give other tiles."""

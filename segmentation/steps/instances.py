@@ -13,8 +13,8 @@ from scan2sim.pipeline.core.classes import CODE, group_of
 from scan2sim.pipeline.core.parameters import Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, F64, I64, U8, Frame, PointCloud, Trajectory
+from scan2sim.pipeline.geometry.voxel_grid import voxel_groups
 from scan2sim.pipeline.io.file_checks import link_or_copy
-from scan2sim.pipeline.steps.voxel import voxel_groups
 from scan2sim.segmentation.steps.segment import SOURCE_CLOUD, SOURCE_SHAPE
 
 if TYPE_CHECKING:

@@ -13,9 +13,9 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.parameters import Device, File, Fraction, Name, Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import U8, PointCloud
+from scan2sim.pipeline.geometry.voxel_grid import sample
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
-from scan2sim.pipeline.steps.voxel import sample
 
 if TYPE_CHECKING:
     from scan2sim.segmentation.project_scan import ScanProjector

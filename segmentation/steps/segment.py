@@ -13,9 +13,9 @@ from scan2sim.pipeline.core.classes import group_of, name_of
 from scan2sim.pipeline.core.parameters import Fraction, Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import U8, PointCloud, Trajectory
+from scan2sim.pipeline.geometry.voxel_grid import sample, voxel_groups
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.file_checks import link_or_copy
-from scan2sim.pipeline.steps.voxel import sample, voxel_groups
 from scan2sim.segmentation.steps.label import classified
 
 SOURCE_PHOTO, SOURCE_SHAPE, SOURCE_CLOUD = 1, 2, 3

@@ -14,10 +14,10 @@ from pydantic import Field
 from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Frame, Mesh, View
+from scan2sim.pipeline.core.voronoi_cell import Cell
+from scan2sim.pipeline.furniture.object_lists import sign_panel_columns, write_lists
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
-from scan2sim.pipeline.steps.furniture import sign_panel_columns, write_lists
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.furniture.sign_panels import SignPanel

@@ -13,10 +13,10 @@ from scan2sim.pipeline.core.parameters import Distance
 from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.core.types import F64, I32, I64, Bools, Camera, GpsTrack
 from scan2sim.slam import solvers
-from scan2sim.slam.calibration.lens import lens_information
+from scan2sim.slam.factor_graph import DistanceConstraint, Graph, errors
 from scan2sim.slam.geometry import angles, triangulate
+from scan2sim.slam.lens import lens_information
 from scan2sim.slam.mapping import rolling_shutter as shared
-from scan2sim.slam.mapping.factor_graph import DistanceConstraint, Graph, errors
 from scan2sim.slam.mapping.marginalization import Information
 from scan2sim.slam.solvers import lm
 
@@ -138,7 +138,7 @@ class LocalMap:
         retired: marginalized points, which have left the window; only with `keep`.
         part: index of the current map; a new map is started when tracking was lost.
         information: information matrix of all keyframes' poses, from marginalized points.
-        misfits: information on the lens from windows that turn (`slam.calibration.lens.lens_information`).
+        misfits: information on the lens from windows that turn (`slam.lens.lens_information`).
         pixel, sigma, gate: radians: a pixel, a bearing's standard deviation, and the inlier threshold.
         names, shared: names and values of the shared parameters (`slam.mapping.rolling_shutter`).
     """

@@ -15,16 +15,16 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.camera.poses import interpolate
 from scan2sim.pipeline.core.parameters import Seed
+from scan2sim.pipeline.core.poses import interpolate
 from scan2sim.pipeline.core.types import F64, U8, Camera, GpsTrack
 from scan2sim.slam.geometry import exp_so3, inverse, log_so3, relative_pose, rigid
 from scan2sim.slam.mapping.local_map import Keyframe, LocalMap, MapParams, gps_distance
 from scan2sim.slam.odometry.relocalization import KeyframeFeatures, detect_features, relocalize
 from scan2sim.slam.odometry.track_pose import PoseEstimate, estimate_pose
-from scan2sim.slam.odometry.virtual_cameras import VirtualViews
 from scan2sim.slam.trackers import Tracker, Tracks
 from scan2sim.slam.trackers import named as tracker_named
+from scan2sim.slam.virtual_cameras import VirtualViews
 
 KEYFRAME_PARALLAX_DEG = 3.0
 """Median parallax to the last keyframe that triggers a new one, for 360 cameras."""

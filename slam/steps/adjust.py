@@ -6,8 +6,8 @@ from pathlib import Path
 
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
-from scan2sim.slam.mapping.global_adjustment import adjust
-from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.global_map.global_adjustment import adjust
+from scan2sim.slam.global_map.map_file import MapCheckpoint
 
 
 def adjust_all(inputs: Inputs, params: Params, out: Path, report: Report) -> Done:

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.camera.poses import interpolate
 from scan2sim.pipeline.core.errors import DataError, InputError
 from scan2sim.pipeline.core.parameters import Shift
+from scan2sim.pipeline.core.poses import interpolate
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, Frame, GpsTrack, Trajectory
 from scan2sim.pipeline.importers import sweeps as io

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
-from scan2sim.slam.mapping.map_file import MapCheckpoint
-from scan2sim.slam.mapping.sparse_model import sparse_map
+from scan2sim.slam.global_map.map_file import MapCheckpoint
+from scan2sim.slam.global_map.sparse_model import sparse_map
 from scan2sim.slam.trajectory import output
 from scan2sim.slam.trajectory.align import aligned_trajectory
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from scan2sim.pipeline.core.parameters import Rate
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
-from scan2sim.slam.mapping.loop_closure import KeyframeIndex, correct_by_loops
-from scan2sim.slam.mapping.map_file import MapCheckpoint
-from scan2sim.slam.odometry.virtual_cameras import VirtualViews
+from scan2sim.slam.global_map.loop_closure import KeyframeIndex, correct_by_loops
+from scan2sim.slam.global_map.map_file import MapCheckpoint
 from scan2sim.slam.video import open_video
+from scan2sim.slam.virtual_cameras import VirtualViews
 
 
 class LoopsParams(Params):

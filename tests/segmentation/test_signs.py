@@ -12,12 +12,12 @@ import pytest
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import F32, F64, U8, Camera, Frame, Mesh, View
+from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.furniture.classify import panel_mesh
 from scan2sim.pipeline.furniture.sign_panels import SignPanel, inside
 from scan2sim.pipeline.geometry import primitives
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
 from scan2sim.segmentation.labels import CLASSES
 from scan2sim.segmentation.sign_panels.attach import without_smear
 from scan2sim.segmentation.steps.signs import SIGNS, SignsParams

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scan2sim.slam.calibration.lens import changed_lens, fit_lens, lens_warning
+from scan2sim.slam.lens import changed_lens, fit_lens, lens_warning
 from tests.present import present
 from tests.slam.synthetic import LENS, mistaken
 

@@ -6,7 +6,7 @@ import pytest
 
 from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.geometry.similarity import umeyama
-from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.global_map.map_file import MapCheckpoint
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 from scan2sim.slam.trajectory.align import aligned_trajectory
 from tests.present import present

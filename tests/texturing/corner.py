@@ -18,7 +18,8 @@ from scan2sim.pipeline.io import views as views_io
 from scan2sim.texturing.exposure import EXPOSURE
 from scan2sim.texturing.photo_consistency import PHOTO_CONSISTENCY
 from scan2sim.texturing.texture import TextureParams, texture
-from scan2sim.texturing.unwrap import UnwrapParams, unwrap
+from scan2sim.texturing.texture_layout import UnwrapParams
+from scan2sim.texturing.unwrap import unwrap
 from scan2sim.texturing.view_selection.step import VIEW_SELECTION
 
 

@@ -13,16 +13,16 @@ from scipy.spatial import cKDTree
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import F64, I32, Frame, Mesh
+from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.worlds import textured_mesh
-from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
-from scan2sim.texturing.bake.texel_map import corners as page_corners
-from scan2sim.texturing.bake.texel_map import owners
 from scan2sim.texturing.borders.colour_harmonization import ColourHarmonizationParams, colour_harmonization
 from scan2sim.texturing.borders.correspondences import open_edges, shared_border
 from scan2sim.texturing.borders.fading import changes, fade
 from scan2sim.texturing.borders.measure import colour_step
 from scan2sim.texturing.inpainting import hole_filling
+from scan2sim.texturing.texel_map import corners as page_corners
+from scan2sim.texturing.texel_map import owners
 from tests.present import present
 
 YS = np.append(np.arange(-3, 3, 0.3), 3)

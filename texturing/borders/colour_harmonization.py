@@ -90,7 +90,7 @@ def _harmonize_pages(
         report: progress callback.
     """
     from scan2sim.pipeline.camera.image_sampling import page_colours
-    from scan2sim.texturing.bake import texel_map
+    from scan2sim.texturing import texel_map
     from scan2sim.texturing.borders import fading, sampling
 
     mesh, samples = own.mesh, border.samples[0]

@@ -13,8 +13,8 @@ from numba import njit, prange
 
 from scan2sim.pipeline.camera.image_sampling import page_taps
 from scan2sim.pipeline.core.types import F32, F64, I32, I64, U8, Bools
-from scan2sim.texturing.bake.texel_map import box, frame
 from scan2sim.texturing.borders.correspondences import SOFTENING_M
+from scan2sim.texturing.texel_map import box, frame
 
 LEAF_POINTS_MAX = 8
 """Points in a leaf of the tree."""

@@ -7,7 +7,8 @@ import numpy as np
 from scan2sim.pipeline.core.step import Inputs
 from scan2sim.pipeline.core.types import F32, U8, PointCloud
 from scan2sim.texturing.inpainting.ground import GroundOrthophoto
-from scan2sim.texturing.inpainting.hole_filling import FILLED, FROM_POINTS, PointColours, shaded
+from scan2sim.texturing.inpainting.hole_filling import PointColours, shaded
+from scan2sim.texturing.texture_page import FILLED, FROM_POINTS
 
 
 def point_colours(inputs: Inputs, ground: GroundOrthophoto | None) -> tuple[PointColours | None, bool]:

@@ -7,7 +7,6 @@ field over the faces (`texturing.view_selection.mrf`), so that neighbouring face
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,8 @@ from scan2sim.pipeline.core.parameters import Cosine, Depth, Distance
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, I32, I64, U8, Mesh, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.texturing.photo_consistency import PhotoConsistency
+from scan2sim.texturing.consistency_result import PhotoConsistency
+from scan2sim.texturing.view_selection.choice import Choice
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.camera.depth_map import DepthMap
@@ -47,31 +47,6 @@ class ViewSelectionParams(Params):
     max_distance: Distance = 100.0
     min_cos: Cosine = 0.02
     bias: Depth = 0.04
-
-
-@dataclass(frozen=True)
-class Choice:
-    """View selection of all faces of a mesh.
-
-    Attributes:
-        view: (F, K) int32 candidate views, best first, -1 where fewer see the face.
-        quality: (F, K) float32 quality of each candidate in 1/m2 (cos^2 / distance^2, where seen); 0 for none.
-        detail_view: (F,) int32 view that gives the detail, -1 where none sees the face.
-    """
-
-    view: I32
-    quality: F32
-    detail_view: I32
-
-    def save(self, path: Path) -> None:
-        """Write as .npz."""
-        np.savez(path, view=self.view, quality=self.quality, label=self.detail_view)
-
-    @classmethod
-    def load(cls, path: Path) -> Choice:
-        """Read what `save` wrote."""
-        with np.load(path) as data:
-            return cls(data["view"], data["quality"], data["label"])
 
 
 def view_selection(inputs: Inputs, params: ViewSelectionParams, out: Path, report: Report) -> Done:

@@ -19,8 +19,8 @@ from scan2sim.pipeline.core.types import Trajectory
 from scan2sim.pipeline.io import robot_formats, world_formats
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.scene import PATH_FILE, Scene
+from scan2sim.pipeline.io.worlds.spawn import find_spawn_pose
 from scan2sim.pipeline.simulation.robot import ROBOT
-from scan2sim.pipeline.simulation.spawn import find_spawn_pose
 from tests.pipeline import synthetic
 
 MASS = sum(link.mass for link in ROBOT.links)

@@ -19,9 +19,10 @@ from scan2sim.pipeline.core.errors import DataError, InputError
 from scan2sim.pipeline.core.step import Done, Step, silent
 from scan2sim.pipeline.core.types import Frame, Mesh, PointCloud
 from scan2sim.pipeline.geometry.height_map import Raster
+from scan2sim.pipeline.geometry.surface_distance import distances
 from scan2sim.pipeline.io.geodata import footprints
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.steps.geometry import GEOMETRY, distances
+from scan2sim.pipeline.steps.geometry import GEOMETRY
 from scan2sim.pipeline.steps.ground import GROUND, GroundParams, merge_neighbours
 from scan2sim.pipeline.steps.poisson import POISSON
 from scan2sim.pipeline.steps.trim import TRIM

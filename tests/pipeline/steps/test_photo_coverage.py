@@ -15,9 +15,9 @@ from scan2sim.flows.pipelines.tile import build_graph
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import F32, Camera, Frame, PointCloud, Tile, Trajectory, View
+from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.steps.photo_coverage import CLOSING_CELL_M, PHOTO_COVERAGE, ROADSIDE_M
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 CAMERA = Camera("pinhole", 1200, 400, 700.0, 700.0, 600.0, 200.0)
 

@@ -14,7 +14,9 @@ import pytest
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, Step, silent
 from scan2sim.pipeline.core.types import F64, Frame, Mesh, PointCloud, Trajectory
+from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.furniture.classify import Detection
+from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid, world
 from scan2sim.pipeline.steps.clip import CLIP
 from scan2sim.pipeline.steps.collision import COLLISION
 from scan2sim.pipeline.steps.decimate import DECIMATE
@@ -28,9 +30,7 @@ from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.voxel import VOXEL
 from scan2sim.pipeline.tiling.borders.gap import gap
-from scan2sim.pipeline.tiling.borders.grid import snap_to_grid, world
 from scan2sim.pipeline.tiling.borders.merge_detections import merged_detections
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
 from tests.present import present
 
 X, Y, Z = 500_000.0, 5_400_000.0, 200.0

@@ -13,7 +13,7 @@ from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.planning import plan
 from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.core.errors import InputError, UnavailableError
-from scan2sim.pipeline.io.remote import CACHE_VARIABLE, Remote, is_remote, local_copy
+from scan2sim.pipeline.core.remote import CACHE_VARIABLE, Remote, is_remote, local_copy
 from tests.flows.toy import chain
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from scan2sim.pipeline.camera.poses import interpolate, nearest_rotation
+from scan2sim.pipeline.core.poses import interpolate, nearest_rotation
 from scan2sim.pipeline.core.types import Camera, Trajectory
 
 TIMES = np.array([0.0, 1.0, 1.0, 3.0])  # one of them twice

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from scan2sim.pipeline.core.classes import CODE
-from scan2sim.pipeline.terrain.friction import coefficient
+from scan2sim.pipeline.simulation.friction import coefficient
 
 GROUND = (CODE["road"], CODE["sidewalk"], CODE["terrain"])
 

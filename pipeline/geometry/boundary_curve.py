@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.core.types import F64, I64, Bools
-from scan2sim.pipeline.tiling.borders.common_faces import directed_edges
+from scan2sim.pipeline.geometry.common_faces import directed_edges
 
 REVERSE_COST = 4.0
 """Cost factor for walking along the neighbour's curve against its direction."""

@@ -19,11 +19,11 @@ from scan2sim.pipeline.core.types import F64, Trajectory
 from scan2sim.pipeline.geometry.similarity import umeyama
 from scan2sim.pipeline.io.colmap_writer import SparseMap
 from scan2sim.pipeline.io.colmap_writer import write as write_colmap
+from scan2sim.slam.factor_graph import Graph
 from scan2sim.slam.geometry import angles
+from scan2sim.slam.global_map.map_file import MapCheckpoint
+from scan2sim.slam.global_map.sparse_model import SparsePoints, sparse_points, update_map
 from scan2sim.slam.mapping.cross_validation import compare_paths, points_by_fixed_cameras
-from scan2sim.slam.mapping.factor_graph import Graph
-from scan2sim.slam.mapping.map_file import MapCheckpoint
-from scan2sim.slam.mapping.sparse_model import SparsePoints, sparse_points, update_map
 
 LOSS_SCALE = 3.0
 """Scale of the Cauchy loss, as a multiple of the median error: keeps most of the information of Gaussian errors."""

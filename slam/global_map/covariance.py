@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from scan2sim.pipeline.core.types import F64, GpsTrack
-from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.global_map.map_file import MapCheckpoint
 from scan2sim.slam.mapping.marginalization import MotionSigma
 
 ORIGIN_SIGMA = MotionSigma(1e-3, 1e-5)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scan2sim.pipeline.tiling.voronoi_cell import Cell, beyond, cells, outline
+from scan2sim.pipeline.core.voronoi_cell import Cell, beyond, cells, outline
 
 SQUARES = {"a": (0.0, 0.0), "b": (10.0, 0.0), "c": (0.0, 10.0), "d": (10.0, 10.0)}
 

@@ -10,9 +10,9 @@ from scan2sim.pipeline.core.classes import group_of
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.types import F64, Trajectory
 from scan2sim.pipeline.io.worlds.scene import PATH_FILE, Scene
+from scan2sim.pipeline.io.worlds.scene_roads import roads_of
 from scan2sim.pipeline.roads import driven
 from scan2sim.pipeline.roads.course import Course, course
-from scan2sim.pipeline.roads.scene_roads import roads_of
 from scan2sim.pipeline.simulation.robot import Start
 
 if TYPE_CHECKING:

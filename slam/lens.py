@@ -16,8 +16,8 @@ import numpy as np
 
 from scan2sim.pipeline.camera.models import project_exactly, unproject
 from scan2sim.pipeline.core.types import F64, Camera
+from scan2sim.slam.factor_graph import Graph, errors
 from scan2sim.slam.geometry import log_so3
-from scan2sim.slam.mapping.factor_graph import Graph, errors
 from scan2sim.slam.solvers import lm
 
 MODELS = ("pinhole", "opencv")

@@ -12,7 +12,7 @@ from scan2sim.pipeline.core.types import F64, Camera, Frame, GpsTrack
 from scan2sim.slam.mapping.local_map import Keyframe, Landmarks, LocalMap, MapParams
 from scan2sim.slam.odometry.checkpoint import InvalidCheckpoint, load, save
 from scan2sim.slam.odometry.odometry import Odometry, Placed
-from scan2sim.slam.odometry.virtual_cameras import VirtualViews
+from scan2sim.slam.virtual_cameras import VirtualViews
 
 VALUES = (Camera, Frame, GpsTrack, Keyframe, Landmarks, Placed)
 """Types that occur in the file. Their names and fields, and all names in `STATE`, are keys of the file format."""

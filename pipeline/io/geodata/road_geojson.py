@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.core.types import F64, Frame
+from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.io.geodata import geojson
 from scan2sim.pipeline.roads.lanes import sections
-from scan2sim.pipeline.roads.model import Line, Road
+from scan2sim.pipeline.roads.model import Line, Road, surface
 from scan2sim.pipeline.roads.profile import Profile
 
 STEP_M = 1.0
@@ -37,12 +37,6 @@ def write(path: Path, frame: Frame, roads: Sequence[Road]) -> None:
 def _line(frame: Frame, road: Road, offset: Profile, first: float, last: float) -> list[list[float]]:
     s = np.linspace(first, last, max(2, round((last - first) / STEP_M) + 1))
     return [[round(value, 3) for value in place] for place in frame.to_crs(surface(road, s, offset.at(s))).tolist()]
-
-
-def surface(road: Road, s: F64, t: F64) -> F64:
-    """Points (N, 3) on a road's surface, local metres."""
-    slope = np.where(t > 0, road.cross_slopes[0].at(s), road.cross_slopes[1].at(s))
-    return np.column_stack([road.line.points(s, t), road.height.at(s) + slope * np.abs(t)])
 
 
 def _properties(line: Line) -> dict[str, Any]:

@@ -12,10 +12,10 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64, U8
 from scan2sim.slam.geometry import exp_so3, inverse, log_so3
-from scan2sim.slam.mapping.map_file import MapCheckpoint
-from scan2sim.slam.mapping.sparse_model import sparse_points, update_map
+from scan2sim.slam.global_map.map_file import MapCheckpoint
+from scan2sim.slam.global_map.sparse_model import sparse_points, update_map
 from scan2sim.slam.odometry.relocalization import FrameFeatures, KeyframeFeatures, detect_features, relocalize
-from scan2sim.slam.odometry.virtual_cameras import VirtualViews
+from scan2sim.slam.virtual_cameras import VirtualViews
 
 THUMBNAIL_PX = 64, 12
 """Width and height."""
