@@ -12,7 +12,7 @@ from scan2sim.slam.mapping.global_adjustment import adjust
 from scan2sim.slam.mapping.local_map import HELD_OUT_EVERY
 from scan2sim.slam.mapping.map_file import MapCheckpoint
 from scan2sim.slam.mapping.sparse_model import sparse_points
-from tests.slam.synthetic import Narrow, ate, drive, run, scatter
+from tests.fakes.slam_drive import Narrow, ate, drive, run, scatter
 
 pytest.importorskip("pycolmap")
 

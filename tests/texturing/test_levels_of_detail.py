@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.consumers import Fault, seams
-from bench.gate.places import WorldReference
 from scan2sim.pipeline.camera import renderer
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Mesh
@@ -20,7 +18,10 @@ from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.scene import Level, Scene, read_scene, save_tile, write_scene_file
 from scan2sim.texturing import levels_of_detail as texturing_levels
 from scan2sim.texturing.levels_of_detail import shared_borders, with_levels
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
+from tests.fakes.consumers import seams
+from tests.fakes.world_checks import Fault
+from tests.fakes.world_checks.reference import WorldReference
 
 TILES, SIDE = 3, 20.0
 NOWHERE = WorldReference(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))

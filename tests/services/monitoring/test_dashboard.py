@@ -28,8 +28,8 @@ from scan2sim.services.monitoring.events.schema import Event
 from scan2sim.services.monitoring.settings.dashboard import PageParams
 from scan2sim.services.monitoring.settings.limits import Limits
 from scan2sim.services.outbox import OutboxRecord
-from tests.browser import Page, chromium
 from tests.fakes.broker import Broker
+from tests.fakes.browser import Page, chromium
 from tests.services.monitoring.sample_records import record
 
 HOSTILE = "<img src=x onerror=document.title='hacked'>"

@@ -29,7 +29,7 @@ from scan2sim.services.teleoperation.vehicle.app import Vehicle
 from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardParams, OnboardUnit
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame
 from scan2sim.services.teleoperation.video.rate_control import BitrateBounds
-from tests.services.teleoperation.transport.relay import Relay
+from tests.fakes.relay import Relay
 
 HERE = "127.0.0.1"
 LIMIT = 1500.0

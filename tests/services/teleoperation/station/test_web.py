@@ -22,7 +22,7 @@ from websockets.sync.client import ClientConnection, connect
 from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.control.controls import Controls, Gear
 from scan2sim.services.teleoperation.control.messages import Command
-from tests.browser import Page, chromium
+from tests.fakes.browser import Page, chromium
 from tests.services.teleoperation.pages import Cockpit, served
 from tests.services.teleoperation.street import until
 
