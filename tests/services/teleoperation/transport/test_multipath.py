@@ -26,7 +26,7 @@ from scan2sim.services.teleoperation.transport.station_side import Listener
 from scan2sim.services.teleoperation.transport.vehicle_side import Link, connect_station
 from tests.fakes.certificates import OTHER, OWN, identity
 from tests.fakes.relay import Relay
-from tests.services.teleoperation.gateway.test_json_stream import until
+from tests.waiting import until
 
 CAR, DESK = identity(Role.VEHICLE, "car"), identity(Role.STATION, "desk")
 A, B = Link("a", "127.0.0.1"), Link("b", "127.0.0.2")
