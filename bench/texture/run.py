@@ -187,7 +187,7 @@ class Bench:
                     (method, np.where(result.render.hit[..., None], result.render.rgb, np.uint8(255)))
                 )
         if self.pictures is not None:
-            from bench.texture.renderings import side_by_side
+            from tests.fakes.world_checks.side_by_side import side_by_side
 
             for name, images in shown.items():
                 side_by_side(self.pictures, f"{scene.folder.name}_{name}", images)

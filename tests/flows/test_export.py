@@ -14,7 +14,7 @@ from scan2sim.flows.commands.budget import parse_budget
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.io import world_formats
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 from tests.pipeline.io.test_robots import driven
 
 

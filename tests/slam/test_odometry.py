@@ -9,9 +9,9 @@ from scan2sim.pipeline.geometry.similarity import umeyama
 from scan2sim.slam.global_map.map_file import MapCheckpoint
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 from scan2sim.slam.trajectory.align import aligned_trajectory
+from tests.fakes.slam_drive import LENS, Follower, Narrow, drive, gps_of, run, scatter
 from tests.present import present
 from tests.slam.conftest import Drive
-from tests.slam.synthetic import LENS, Follower, Narrow, drive, gps_of, run, scatter
 
 
 def positions(odometry: Odometry) -> F64:
