@@ -29,6 +29,7 @@ from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.dynamic_objects import DYNAMIC_OBJECTS, SCAN_WINDOW_S
 from scan2sim.pipeline.steps.ingest import INGEST
 from scan2sim.pipeline.steps.path import PATH
+from tests.fakes.steps import step_params
 
 Bools = np.ndarray
 
@@ -107,8 +108,8 @@ def tile_of(folder: Path) -> tuple[PointCloud, Trajectory]:
         out = Path(temporary)
         frame = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
         files = {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}
-        cloud = INGEST.run(files, INGEST.params(**frame), out, silent).files["cloud"]
-        path = PATH.run({}, PATH.params(**scanner_path(tile)), out, silent).files["path"]
+        cloud = INGEST.run(files, step_params(INGEST.params, **frame), out, silent).files["cloud"]
+        path = PATH.run({}, step_params(PATH.params, **scanner_path(tile)), out, silent).files["path"]
         return PointCloud.load(cloud), Trajectory.load(path)
 
 

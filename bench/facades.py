@@ -34,6 +34,7 @@ from scan2sim.pipeline.steps.facades import FACADES
 from scan2sim.pipeline.steps.ingest import INGEST
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.voxel import VOXEL
+from tests.fakes.steps import step_params
 
 STREET: dict[str, Any] = {"length": 30.0, "points": 1.2e6, "photos": 24}
 MATCH_DISTANCE_M = 0.3
@@ -51,7 +52,7 @@ def evaluate(folder: Path, seed: int, degrees: float) -> dict[str, float]:
     def run_step(step: Step, inputs: dict[str, Path], name: str = "", **given: Any) -> Done:
         out = folder / (name or step.name)
         out.mkdir(exist_ok=True)
-        return step.run(inputs, step.params(**given), out, silent)
+        return step.run(inputs, step_params(step.params, **given), out, silent)
 
     frame: dict[str, Any] = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
     clouds = {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}

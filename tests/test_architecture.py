@@ -145,7 +145,7 @@ def test_every_setting_is_documented() -> None:
 
     text = (ROOT / "docs" / "reference" / "settings.md").read_text(encoding="utf-8")
     for step in STEPS:
-        for param in step.params.model_fields:
+        for param in step.params.settings():
             assert f"`{step.name}.{param}`" in text, f"docs/reference/settings.md lacks {step.name}.{param}"
 
 

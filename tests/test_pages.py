@@ -109,7 +109,7 @@ def test_settings_and_metrics_exist(page: Path) -> None:
     names = "|".join(PARAMS)
     setting = re.compile(rf"(?<![\w/.-])({names})\.(?:(?:{'|'.join(SURFACES)})\.)?([a-z_0-9]+)")
     for step, name in setting.findall(" ".join(code_lines(text_of(page)))):
-        known = {*PARAMS[step].model_fields, *SURFACES, *SUFFIXES, "rest"}
+        known = {*PARAMS[step].settings(), *SURFACES, *SUFFIXES, "rest"}
         module = (ROOT / step / f"{name}.py").exists() or (ROOT / step / name).is_dir()
         assert name in known or module or name in string_literals(), f"unknown setting or metric: {step}.{name}"
 

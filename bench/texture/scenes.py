@@ -28,6 +28,7 @@ from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.views import VIEWS
 from scan2sim.pipeline.steps.voxel import VOXEL
+from tests.fakes.steps import step_params
 
 KITTI = ROOT.parent / "shared" / "data" / "kitti_raw0009_f00-24"
 SCENES = ("kitti", "street_clean", "street_hard")
@@ -91,7 +92,7 @@ def fresh(folder: Path) -> Path:
 
 def run(step: Step, inputs: Mapping[str, Path], folder: Path, **given: Any) -> dict[str, Path]:
     """Run a step with default settings except the given ones; returns its files."""
-    return step.run(inputs, step.params(**given), fresh(folder), silent).files
+    return step.run(inputs, step_params(step.params, **given), fresh(folder), silent).files
 
 
 def available(name: str) -> bool:

@@ -77,7 +77,7 @@ class Settings:
                 raise SettingError(name, "there is no such step", _nearest(name, known))
             if not isinstance(table, Mapping):
                 raise SettingError(name, "must be a table of parameters", f"Write [{name}] or --set {name}.param=value")
-            fields = known[name].params.model_fields
+            fields = known[name].params.settings()
             for key, value in table.items():
                 special = key in SURFACES and isinstance(value, Mapping)
                 if special and not known[name].per_class:
@@ -88,11 +88,17 @@ class Settings:
                             raise SettingError(f"{name}.{param}", "this setting was renamed", f"Write `{new}`")
                         raise SettingError(f"{name}.{param}", "there is no such parameter", _nearest(param, fields))
 
-    def params(self, step: Step, group: str = "", **given: Any) -> Any:
-        """Parameters of a step: values `given` by the pipeline, defaults of the class, then the user's settings.
+    def params(self, step: Step, group: str = "", context: Mapping[str, Any] | None = None, **given: Any) -> Any:
+        """Parameters of a step: options `given` to a command, defaults of the class, then the user's settings.
+
+        Args:
+            step: the step.
+            group: class that it is run for, else "".
+            context: fields of its context, which users can't set.
+            given: settings that have an option of their own.
 
         Raises:
-            SettingError: a value out of range or of a wrong type, or one that only the pipeline sets.
+            SettingError: a value out of range or of a wrong type, or one given twice.
         """
         table = self.values.get(step.name, {})
         classes: dict[str, Mapping[str, Any]] = {
@@ -101,9 +107,9 @@ class Settings:
         general = {k: v for k, v in table.items() if k not in classes}
         special = classes.get(group, {})
         for name in {*general, *special} & set(given):
-            raise SettingError(f"{step.name}.{name}", "is derived from the tile or from other settings", "Leave it out")
+            raise SettingError(f"{step.name}.{name}", "the command's option sets it, too", "Give only one of them")
         merged = {**given, **step.class_defaults.get(group, {}), **general, **special}
-        return step.params.of(step.name, merged)
+        return step.params.of(step.name, merged | ({"context": context} if context else {}))
 
 
 def _assign(tables: dict[str, Any], path: str, value: object, where: str) -> None:

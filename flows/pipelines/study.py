@@ -129,17 +129,20 @@ def _cell_tasks(cell: Cell, study: Study, video: Video, segment: float, settings
         key: path for key, path in (("gps", study.gps), ("mask", study.mask)) if path
     }
 
-    def add(step: Step, inputs: Mapping[str, Path | Output], **given: Any) -> Task:
-        return Task(step, settings.params(step, name, **given), inputs, name)
+    def add(
+        step: Step, inputs: Mapping[str, Path | Output], context: dict[str, Any] | None = None, **given: Any
+    ) -> Task:
+        return Task(step, settings.params(step, name, context, **given), inputs, name)
 
     def output_of(step: Step, output: str) -> dict[str, Output]:
         return {output: Output(TaskId(step.name, name), output)}
 
+    encoded = {"size": size, "bitrate": cell.bitrate, "rate": cell.rate, "fps": video.fps}
     return [
-        add(ENCODE, {"video": video.path}, size=size, bitrate=cell.bitrate, rate=cell.rate, fps=video.fps),
-        add(TRACK, output_of(ENCODE, "video") | gps_and_mask, cameras=(asdict(camera),), gps_offset=0.0),
+        add(ENCODE, {"video": video.path}, encoded),
+        add(TRACK, output_of(ENCODE, "video") | gps_and_mask, {"cameras": (asdict(camera),)}, gps_offset=0.0),
         add(GEOREFERENCE, output_of(TRACK, "map"), georeference=False),
-        add(EVALUATE, output_of(GEOREFERENCE, "trajectory") | {"truth": study.truth}, segment=segment),
+        add(EVALUATE, output_of(GEOREFERENCE, "trajectory") | {"truth": study.truth}, {"segment": segment}),
     ]
 
 

@@ -104,7 +104,7 @@ class _GraphBuilder:
 
     Attributes:
         tasks: tasks added so far.
-        cell: parameters of the steps at borders; empty if the tile isn't part of a survey.
+        cell: name, seed, neighbours and buffer of the tile's cell; empty if the tile isn't part of a survey.
         neighbours: names of the neighbouring tiles that are built, too.
         border_owners: those neighbours that own the border with this tile.
         has_ground_photos: whether there are photos other than orthophotos.
@@ -125,7 +125,10 @@ class _GraphBuilder:
         self._name = "" if survey_tiles is None else tile.name
         self.cell: dict[str, Any] = {}
         if tile.cell:
-            self.cell = {"seed": tile.cell.seed, "neighbours": dict(tile.cell.neighbours)}
+            self.cell = {
+                "name": tile.name, "seed": tile.cell.seed, "neighbours": dict(tile.cell.neighbours),
+                "buffer": tile.cell.buffer,
+            }  # fmt: skip
         self.neighbours = [name for name in self.cell.get("neighbours", {}) if name in (survey_tiles or ())]
         self.border_owners = [name for name in self.neighbours if name < tile.name]
         self.has_ground_photos = any(view.camera.model != "orthographic" for view in tile.views)
@@ -145,10 +148,10 @@ class _GraphBuilder:
         """Whether a step of this tile, or of the neighbour `other`, is not among the failed side products."""
         return TaskId(step.name, tile=self._name if other is None else other) not in self._without
 
-    def add(self, step: Step, inputs: Mapping[str, Path | Output], group: str = "", **given: Any) -> None:
+    def add(self, step: Step, inputs: Mapping[str, Path | Output], group: str = "", **context: Any) -> None:
         """Add a task, unless it is a side product that failed."""
         if self.is_enabled(step):
-            self.tasks.append(Task(step, self.settings.params(step, group, **given), inputs, group, self._name))
+            self.tasks.append(Task(step, self.settings.params(step, group, context), inputs, group, self._name))
 
     def neighbour_outputs(self, step: Step, name: str, group: str = "", prefix: str | None = None) -> Sources:
         """An output of the tasks of all neighbours, as inputs `prefix.tile`; default prefix: the output's name."""
@@ -169,14 +172,14 @@ class _GraphBuilder:
             self.path if tile.trajectory is not None else {}
         )  # cameras are not at the scanner's position
         cameras = _position_rows([view.centre for view in tile.views if view.camera.model != "orthographic"])
-        add(DYNAMIC_OBJECTS, {"cloud": output(INGEST, "cloud")} | self.scanner_path, cameras=cameras)
+        add(DYNAMIC_OBJECTS, {"cloud": output(INGEST, "cloud")} | self.scanner_path, positions=cameras)
         whole: Sources = {"cloud": output(DYNAMIC_OBJECTS, "cloud")}
         photos: Sources = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
         masks: Sources = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
         add(VIEWS, photos | masks | whole, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
         evidence: Sources = {}
         if self.has_ground_photos:
-            add(LABEL, whole | self._views_input() | _weights_input(self.settings), **_label_params(self.settings))
+            add(LABEL, whole | self._views_input() | _weights_input(self.settings), **_segment_settings(self.settings))
             evidence = {**self._views_input(), **self._moving_input(), "labels": output(LABEL, "labels")}
         add(SEGMENT, whole | self.path | evidence)
         return evidence
@@ -204,8 +207,7 @@ class _GraphBuilder:
         if not (self.neighbours and self.tile.cell):
             return output(last, "cloud")
         others = self.neighbour_outputs(last, "cloud")
-        cell = self.tile.cell
-        add(OVERLAP, {"cloud": output(last, "cloud")} | others, name=self.tile.name, buffer=cell.buffer, **self.cell)
+        add(OVERLAP, {"cloud": output(last, "cloud")} | others, **self.cell)
         return output(OVERLAP, "cloud")
 
     def split_cloud(self, cloud: Output) -> None:
@@ -217,7 +219,7 @@ class _GraphBuilder:
             detections = {"detections": self.output(DETECT_FURNITURE, "detections")} | self.neighbour_outputs(
                 DETECT_FURNITURE, "detections"
             )
-            self.add(FURNITURE, {"cloud": cloud} | detections, name=self.tile.name, **self.cell)
+            self.add(FURNITURE, {"cloud": cloud} | detections, **self.cell)
             names = (*GROUPS[1:], "furniture_points", "sign_panels", "neighbour_poles", "geojson", "csv")
             self.furniture = {name: self.output(FURNITURE, name) for name in names}
         split_params = self.settings.params(SPLIT)
@@ -253,7 +255,7 @@ class _GraphBuilder:
             shown = {name: evidence[name] for name in ("views", "labels")}
             size = self.settings.params(VOXEL, "building").size
             clouds = {"cloud": self.output(VOXEL, "cloud", "building")} | self._other_clouds("building")
-            self.add(FACADES, clouds | self.scanner_path | shown, voxel=size, **self.cell)
+            self.add(FACADES, clouds | self.scanner_path | shown, voxel=size, cell=self.cell or None)
             synthesized["building"] = {"synthesized": self.output(FACADES, "synthesized")}
         return synthesized
 
@@ -266,9 +268,7 @@ class _GraphBuilder:
         inputs: Sources = {part: self.output(VOXEL, "cloud", part) for part in parts}
         for part in parts:
             inputs |= self.neighbour_outputs(VOXEL, "cloud", part, prefix=part)
-        cell = self.tile.cell
-        border = {"name": self.tile.name, "buffer": cell.buffer, **self.cell} if cell else {}
-        self.add(step, inputs | more, **border)
+        self.add(step, inputs | more, **self.cell)
         return {"synthesized": self.output(step, "synthesized")}
 
     def _other_clouds(self, group: str) -> Sources:
@@ -280,13 +280,13 @@ class _GraphBuilder:
         output, add, cell = self.output, self.add, self.cell
         cloud, size = output(VOXEL, "cloud", group), self.settings.params(VOXEL, group).size
         point_inputs: Sources = {"cloud": cloud, **synthesized}
-        add(POISSON, point_inputs, group, voxel=size, aligned=bool(cell))
+        add(POISSON, point_inputs, group, voxel=size, cell=cell or None)
         add(TRIM, {"mesh": output(POISSON, "mesh", group), **point_inputs}, group, voxel=size)
         surface = output(TRIM, "mesh", group)
         when = self.settings.params(PLANES).when
         if group == "building" and (when == "always" or (when == "auto" and self.path)):
             points = {**point_inputs, "points": output(SPLIT, group)}
-            add(PLANES, {"mesh": surface, **points, **self._other_clouds(group)}, voxel=size, **cell)
+            add(PLANES, {"mesh": surface, **points, **self._other_clouds(group)}, voxel=size, cell=cell or None)
             surface = output(PLANES, "mesh")
         add(ISLANDS, {"mesh": surface}, group)
         surface = output(ISLANDS, "mesh", group)
@@ -298,7 +298,7 @@ class _GraphBuilder:
             others = {
                 f"{name}.{tile}": output(CLIP, name, group, tile) for tile in self.border_owners for name in clipped
             }
-            add(JOIN, clipped | others, group, name=self.tile.name, **cell)
+            add(JOIN, clipped | others, group, **cell)
             surface = output(JOIN, "mesh", group)
         things = {"furniture": self.furniture[group]} if group in self.furniture else {}
         add(DECIMATE, {"mesh": surface, **things}, group, keep_border=bool(cell))
@@ -383,7 +383,7 @@ class _GraphBuilder:
             return self.path
         ground = {"cloud": self.output(SPLIT, "terrain"), "textured": textured["terrain"]}
         origin = self.settings.params(EXPORT).world_origin
-        self.add(ROADS, ground | self.path, name=self.tile.name, world_origin=origin, **self.cell)
+        self.add(ROADS, ground | self.path, name=self.tile.name, world_origin=origin, cell=self.cell or None)
         outputs = {"roads": "geojson", "roads_seen": "seen", "opendrive": "opendrive"}
         return self.path | {name: self.output(ROADS, output) for name, output in outputs.items()}
 
@@ -392,14 +392,13 @@ class _GraphBuilder:
     ) -> None:
         """Add the export of the world, rasters, metrics, images and previews."""
         output, add, tile = self.output, self.add, self.tile
-        cell = {"place": self.cell["seed"], "neighbours": self.cell["neighbours"]} if self.cell else {}
-        add(COLLISION, {**surfaces, **self.plant_models("mesh"), "cloud": output(SPLIT, "terrain")}, **cell)
+        add(COLLISION, {**surfaces, **self.plant_models("mesh"), "cloud": output(SPLIT, "terrain")}, **self.cell)
         planted = self.plant_models("textured")
         choice = {f"choice.{g}": output(VIEW_SELECTION, "choice", g) for g in self.groups}
         shown = {"views": seen["views"], "collision": output(COLLISION, "mesh")}
         add(EXPORT, textured | planted | choice | lists | self.instances | shown, name=tile.name)
         if self.settings.params(EXPORT).rasters:
-            add(RASTERS, textured, name=tile.name, **_raster_params(self.settings))
+            add(RASTERS, textured, name=tile.name, **_raster_context(self.settings))
         truth: Sources = {}
         if tile.truth_mesh and tile.truth_points:
             truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
@@ -449,8 +448,8 @@ def _weights_input(settings: Settings) -> dict[str, Path | Output]:
     return {"weights": weights} if weights and weights.is_file() else {}
 
 
-def _label_params(settings: Settings) -> dict[str, Any]:
-    """Parameters of step `label` that are settings of step `segment`: when photos are classified."""
+def _segment_settings(settings: Settings) -> dict[str, Any]:
+    """Settings of step `segment` that step `label` needs: when photos are classified."""
     segment_params = settings.params(SEGMENT)
     return {
         "overwrite": segment_params.overwrite,
@@ -459,8 +458,8 @@ def _label_params(settings: Settings) -> dict[str, Any]:
     }
 
 
-def _raster_params(settings: Settings) -> dict[str, Any]:
-    """Parameters of step `rasters` that are settings of `export` and `unwrap`."""
+def _raster_context(settings: Settings) -> dict[str, Any]:
+    """Settings of `export` and `unwrap` that step `rasters` needs."""
     wanted, texel = settings.params(EXPORT).rasters, settings.params(UNWRAP, "terrain").texel
     return {"pixel": texel if wanted is True else wanted, "texel": texel}
 

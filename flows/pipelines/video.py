@@ -64,8 +64,14 @@ def build_graph(video: Video, settings: Settings) -> list[Task]:
         gps_io.reader(video.gps)
     tasks: list[Task] = []
 
-    def add(step: Step, inputs: dict[str, Path | Output], group: str = "", **given: Any) -> Output:
-        tasks.append(Task(step, settings.params(step, group, **given), inputs, group))
+    def add(
+        step: Step,
+        inputs: dict[str, Path | Output],
+        group: str = "",
+        context: dict[str, Any] | None = None,
+        **given: Any,
+    ) -> Output:
+        tasks.append(Task(step, settings.params(step, group, context, **given), inputs, group))
         return Output(TaskId(step.name, group), "map")
 
     filmed = {name: getattr(video, name) for name in Filmed.model_fields.keys() & video.model_fields_set}
@@ -78,11 +84,13 @@ def build_graph(video: Video, settings: Settings) -> list[Task]:
     local: dict[str, Any] = {"georeference": False} if video.local else {}
     film: dict[str, Any] = {"view": True} if video.view else {}
     points: dict[str, Any] = {"colmap": True} if video.colmap else {}
-    mapped = add(TRACK, frames | files, keep=keep, cameras=_cameras(video.tile), **filmed, **film)
+    context = {"keep": keep, "cameras": _cameras(video.tile)}
+    mapped = add(TRACK, frames | files, context=context, **filmed, **film)
     if video.loops or video.adjust:
         add(GEOREFERENCE, {"map": mapped}, ODOMETRY_GROUP, **local)
     if video.loops:
-        mapped = add(LOOPS, {"map": mapped, **frames}, fps=settings.params(TRACK, **filmed).fps)
+        fps = settings.params(TRACK, **filmed).fps
+        mapped = add(LOOPS, {"map": mapped, **frames}, context={"fps": fps})
     if video.adjust:
         mapped = add(ADJUST, {"map": mapped})
     add(GEOREFERENCE, {"map": mapped}, **points, **local)

@@ -28,8 +28,6 @@ PUBLISHED_OUTPUTS = {"export": ("world", "world"), "rasters": ("rasters", "raste
 """Task to the output that is published, and its folder in the output folder."""
 REPORTED_TASKS = ("exposure", "pictures", "score")
 """Tasks whose files are read for the report."""
-OMITTED_PARAMS = ("poses", "positions", "times")
-"""Large parameters that repeat the tile, left out of config.json."""
 
 
 def publish(
@@ -66,7 +64,7 @@ def publish(
         "tile": str(tile.path),
         "versions": versions(),
         "set": settings.values,
-        "steps": {task: {k: v for k, v in m.params.items() if k not in OMITTED_PARAMS} for task, m in done.items()},
+        "steps": {task: {k: v for k, v in m.params.items() if k != "context"} for task, m in done.items()},
     }
     (out / "config.json").write_text(json.dumps(config, indent=1), encoding="utf-8")
     return [f"{path} was edited and is kept; delete it to have it rebuilt" for path in changed]

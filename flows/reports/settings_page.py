@@ -42,7 +42,7 @@ ATTRIBUTE_LINE = re.compile(r"^([a-z_0-9]+(?:, [a-z_0-9]+)*): (.*)$")
 
 
 def settings_page() -> str:
-    """The page as Markdown."""
+    """The page as Markdown; steps without settings are left out."""
     parts = [HEAD]
     seen: set[str] = set()
     for title, about, steps in PARTS:
@@ -50,24 +50,20 @@ def settings_page() -> str:
             parts.append(f"# {title}\n\n{about}\n")
         new = [step for step in steps if step.name not in seen]
         seen |= {step.name for step in new}
-        parts += [_section(step) for step in new]
+        parts += [_section(step) for step in new if step.params.settings()]
     return "\n".join(parts)
 
 
 def _section(step: Step) -> str:
     about = inspect.cleandoc(step.run.__doc__ or "").split("\n\n")[0].replace("\n", " ")
     rows = list(_rows(step))
-    table = (
-        ["", "| setting | default | range | meaning |", "| --- | --- | --- | --- |", *rows]
-        if rows
-        else ["", "No settings."]
-    )
+    table = ["", "| setting | default | range | meaning |", "| --- | --- | --- | --- |", *rows]
     return "\n".join([f"## {step.name}", "", about, *table, ""])
 
 
 def _rows(step: Step) -> Iterator[str]:
     meanings = attributes(step.params)
-    for name, field in step.params.model_fields.items():
+    for name, field in step.params.settings().items():
         default = "required" if field.is_required() else _value(field.get_default(call_default_factory=True))
         special = [f"{group} {_value(values[name])}" for group, values in step.class_defaults.items() if name in values]
         cells = "; ".join([default, *special]), described(field), meanings.get(name, "")

@@ -11,15 +11,30 @@ from pathlib import Path
 from typing import Any, Protocol, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic.fields import FieldInfo
 
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.parameters import described
 
 
-class Params(BaseModel):
-    """Base class of every step's parameters: frozen, unknown names are rejected."""
+class Context(BaseModel):
+    """Base class of what the pipeline passes to a step besides files: facts of the tile, and other steps' settings.
+
+    Parameters with a context have it as their field `context`; users can't set it.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Params(BaseModel):
+    """Base class of every step's parameters, the user's settings: frozen, unknown names are rejected."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @classmethod
+    def settings(cls) -> dict[str, FieldInfo]:
+        """Fields that the user can set, by name: all but `context`."""
+        return {name: field for name, field in cls.model_fields.items() if name != "context"}
 
     @classmethod
     def of(

@@ -12,8 +12,9 @@ from pydantic import Field
 
 from scan2sim.pipeline.core.classes import CODE, SURFACES, name_of
 from scan2sim.pipeline.core.errors import DataError, StepError
-from scan2sim.pipeline.core.parameters import PlanPoint, Seed
+from scan2sim.pipeline.core.parameters import Seed
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import TileCell
 from scan2sim.pipeline.core.types import F32, U8, Frame, Mesh, PointCloud
 from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.geometry.surface_distance import deviation, statistics
@@ -33,16 +34,13 @@ class CollisionParams(Params):
         triangles: maximum number of triangles; physics engines stay interactive up to about 50 thousand.
         vegetation: whether plants collide too; trunks always do, and plants do if there is no other surface.
         seed: random seed of the points at which the deviation is measured.
-        place: seed (x, y) of the tile's cell, world metres, if it has neighbours; borders with them are not
-            simplified; set by the pipeline.
-        neighbours: seeds of the tiles with adjacent cells, by name, world metres; set by the pipeline.
+        context: the tile's cell, if it has neighbours; borders with them are not simplified.
     """
 
     triangles: int = Field(50_000, ge=100, le=MAX_TRIANGLES)
     vegetation: bool = False
     seed: Seed = 0
-    place: PlanPoint | None = None
-    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
+    context: TileCell | None = None
 
 
 def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report) -> Done:
@@ -67,7 +65,7 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
 
     meshes = {group: Mesh.load(inputs[group]) for group in SURFACES if group in inputs}
     frame = next(iter(meshes.values())).frame
-    cell = None if params.place is None else Cell(params.place, params.neighbours)
+    cell = params.context.cell if params.context else None
     points = _ground_points(inputs, params.seed)
     terrain = meshes.pop("terrain", _joined(frame, []))
     separated = {group: _split_furniture(mesh, SURFACE_CLASS[group]) for group, mesh in meshes.items()}

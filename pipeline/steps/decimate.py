@@ -8,8 +8,14 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.parameters import Name
-from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import Mesh
+
+
+class TileBorder(Context):
+    """Whether open borders must not be simplified, even if that exceeds the target: where tiles meet."""
+
+    keep_border: bool = False
 
 
 class DecimateParams(Params):
@@ -19,12 +25,11 @@ class DecimateParams(Params):
         target: number of triangles; D3.2: 100 K for terrain and buildings, 300 K for vegetation; 50 K for vehicles.
         backend: simplification library, "pyfqmr", "fast_simplification", "pymeshlab" or "open3d" (which can't preserve
             borders); modules of `pipeline/decimation/`.
-        keep_border: never simplify open borders, even if that exceeds the target; set by the pipeline where tiles meet.
     """
 
     target: int = Field(100_000, ge=10_000, le=1_000_000)
     backend: Name = "pyfqmr"
-    keep_border: bool = False
+    context: TileBorder = TileBorder()
 
 
 def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) -> Done:
@@ -40,13 +45,13 @@ def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) 
     """
     from scan2sim.pipeline.decimation import find, simplify
 
-    border_kept = find(params.backend, keep_border=params.keep_border).KEEPS_BORDER
+    border_kept = find(params.backend, keep_border=params.context.keep_border).KEEPS_BORDER
 
     mesh = Mesh.load(inputs["mesh"])
     furniture = Mesh.load(inputs["furniture"]) if "furniture" in inputs else None
     target = params.target - len(furniture or ())
     small, warnings = simplify(mesh, target, keep_border=border_kept, backend=params.backend), []
-    if len(small) > target * 1.05 and params.keep_border:
+    if len(small) > target * 1.05 and params.context.keep_border:
         warnings.append(f"{len(small):,} triangles instead of {params.target:,}: tile borders can't be simplified")
     elif len(small) > target * 1.05 and border_kept:
         warnings.append(f"the border alone needs {len(small):,} triangles: it was simplified too, to {params.target:,}")
@@ -78,7 +83,7 @@ def can_decimate(params: DecimateParams) -> None:
     """
     from scan2sim.pipeline.decimation import find
 
-    find(params.backend, keep_border=params.keep_border)
+    find(params.backend, keep_border=params.context.keep_border)
 
 
 DECIMATE = Step(

@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import Field
 
-from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import TileCell
 from scan2sim.pipeline.core.types import F32, Bools, PointCloud, Trajectory
-from scan2sim.pipeline.core.voronoi_cell import Cell
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.furniture.classify import Detection
@@ -26,16 +24,9 @@ KINDS = ("pole", "sign", "lamp", "trunk")
 
 
 class DetectFurnitureParams(Params):
-    """The tile's cell within the survey.
+    """No settings: detections more than 0.5 m outside the tile's cell are discarded."""
 
-    Attributes:
-        seed: seed (x, y) of the tile's cell, world metres, if it has neighbours; detections more than 0.5 m outside
-            the cell are discarded; set by the pipeline.
-        neighbours: seeds of the tiles with adjacent cells, by name, world metres; set by the pipeline.
-    """
-
-    seed: PlanPoint | None = None
-    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
+    context: TileCell | None = None
 
 
 def detect_furniture(inputs: Inputs, params: DetectFurnitureParams, out: Path, report: Report) -> Done:
@@ -51,10 +42,8 @@ def detect_furniture(inputs: Inputs, params: DetectFurnitureParams, out: Path, r
         detections = detect(cloud, Trajectory.load(inputs["path"]))
         origin = np.asarray(cloud.frame.origin, np.float64)
         detections = [detection.moved(origin) for detection in detections]
-        if params.seed is not None and detections:
-            outside = Cell(params.seed, params.neighbours).outside(
-                np.array([detection.foot[:2] for detection in detections])
-            )
+        if params.context and detections:
+            outside = params.context.cell.outside(np.array([detection.foot[:2] for detection in detections]))
             detections = [
                 detection for detection, far in zip(detections, outside, strict=True) if far <= MAX_OUTSIDE_CELL_M
             ]

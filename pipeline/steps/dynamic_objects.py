@@ -10,7 +10,7 @@ from pydantic import Field
 
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.parameters import Coordinate
-from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, Bools, Frame, PointCloud, Trajectory
 from scan2sim.pipeline.io.file_checks import link_or_copy
 
@@ -28,6 +28,12 @@ MOVING_FRACTION_WARNING = 0.2
 """Fraction of moving points above which the step warns."""
 
 
+class Cameras(Context):
+    """Camera positions (x, y, z) in local metres."""
+
+    positions: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = ()
+
+
 class DynamicObjectsParams(Params):
     """Detection of moving objects by free space.
 
@@ -38,7 +44,6 @@ class DynamicObjectsParams(Params):
         max_range: maximum length of rays in metres; at 20 m, half a degree is one voxel.
         votes: number of moments (of 0.1 s; for a profile scanner, passes) at which rays must have crossed a voxel.
         camera_radius: radius in metres around every camera in which points are removed; 0: off.
-        cameras: camera positions (x, y, z) in local metres; set by the pipeline.
     """
 
     when: Literal["auto", "never"] = "auto"
@@ -46,7 +51,7 @@ class DynamicObjectsParams(Params):
     max_range: float = Field(20.0, ge=1, le=500)
     votes: int = Field(3, ge=1, le=1000)
     camera_radius: float = Field(1.0, ge=0, le=10)
-    cameras: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = ()
+    context: Cameras = Cameras()
 
 
 def dynamic_objects(inputs: Inputs, params: DynamicObjectsParams, out: Path, report: Report) -> Done:
@@ -58,7 +63,7 @@ def dynamic_objects(inputs: Inputs, params: DynamicObjectsParams, out: Path, rep
     """
     from scan2sim.pipeline.dynamic_objects.ego_vehicle_mask import in_swept_volume, near_cameras, swept_volume
 
-    if params.when == "never" or not (params.cameras or "path" in inputs):
+    if params.when == "never" or not (params.context.positions or "path" in inputs):
         why = "dynamic_objects.when=never" if params.when == "never" else "neither path nor cameras are known"
         return _untouched(inputs["cloud"], out, why)
     report(0.0, "reading")
@@ -77,7 +82,9 @@ def dynamic_objects(inputs: Inputs, params: DynamicObjectsParams, out: Path, rep
         report(0.2, "tracing rays")
         moved, seen_again = _moved(cloud, origins, path, params)
         why = "" if seen_again > MIN_REVISITED_FRACTION else "nearly all voxels were observed only once"
-    near = near_cameras(cloud.xyz, np.array(params.cameras, np.float64).reshape(-1, 3), params.camera_radius, volume)
+    near = near_cameras(
+        cloud.xyz, np.array(params.context.positions, np.float64).reshape(-1, 3), params.camera_radius, volume
+    )
     own = np.zeros(len(cloud), bool) if own is None else own & ~moved
     near &= ~moved & ~own
     moving_share = float(moved.mean())

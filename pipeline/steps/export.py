@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field
 from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.parameters import Coordinate, Name
-from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Report, Step
 from scan2sim.pipeline.core.types import I32
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io import world_formats
@@ -32,11 +32,16 @@ def _pixel_size(size: bool | float) -> bool | float:
     return size
 
 
+class ExportContext(Context):
+    """Name of the tile, its world and its model."""
+
+    name: Name = "tile"
+
+
 class ExportParams(SceneParams):
     """Formats and contents of the world.
 
     Attributes:
-        name: name of the tile, its world and its model; set by the pipeline.
         formats: modules of `pipeline/io/world_formats`; `scan2sim export` writes further formats later.
         friction: Coulomb friction coefficient of roads; 0.9 is rubber on dry asphalt. Other classes scale with it.
         world_origin: origin of the world in the CRS, metres; tiles with the same origin share their georeference.
@@ -45,13 +50,13 @@ class ExportParams(SceneParams):
             true: texel size of the ground's texture.
     """
 
-    name: Name = "tile"
     formats: tuple[str, ...] = Field(("gazebo", "glb"), json_schema_extra={"range": "a list of formats"})
     friction: float = Field(0.9, ge=0, le=10)
     world_origin: tuple[Coordinate, Coordinate, Coordinate] | None = None
     rasters: Annotated[bool | float, AfterValidator(_pixel_size)] = Field(
         False, json_schema_extra={"range": "true or false, or 0.001 to 100"}
     )
+    context: ExportContext = ExportContext()
 
 
 def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> Done:
@@ -78,7 +83,15 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
     surfaces = {str(group): inputs[group] for group in SURFACES if group in inputs}
     lists = {file: inputs[key] for key, file in LISTS.items() if key in inputs}
     scene = save_tile(
-        world, params.name, surfaces, inputs["collision"], lists, params.friction, params.world_origin, views, photos
+        world,
+        params.context.name,
+        surfaces,
+        inputs["collision"],
+        lists,
+        params.friction,
+        params.world_origin,
+        views,
+        photos,
     )
     world_formats.write(scene, params.formats, world, params, report)
     for file in inputs["opendrive"].iterdir() if "opendrive" in inputs else ():

@@ -12,10 +12,9 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.classes import CODE, PHOTO_CLASSES
-from scan2sim.pipeline.core.parameters import PlanPoint, Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import ThinnedCloud, TileCell
 from scan2sim.pipeline.core.types import F64, I64, UNCOLOURED, Bools, PointCloud, Trajectory
-from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
 
@@ -37,17 +36,12 @@ class FacadesParams(Params):
         when: "auto": if the scanner's path and photos from the ground are available; "never".
         max_height: height above the scanned part up to which walls are searched in the photos, metres.
         gap: metres; gaps in a wall narrower than twice this are closed unless a ray passed through; 0: off.
-        voxel: voxel size of the thinned cloud in metres; set by the pipeline.
-        seed: seed (x, y) of the tile's cell, world metres, if it has neighbours; set by the pipeline.
-        neighbours: seeds of the tiles with adjacent cells, by name, world metres; set by the pipeline.
     """
 
     when: Literal["auto", "never"] = "auto"
     max_height: float = Field(8.0, ge=0, le=100)
     gap: float = Field(0.5, ge=0, le=10)
-    voxel: Voxel = 0.10
-    seed: PlanPoint | None = None
-    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
+    context: ThinnedCloud = ThinnedCloud()
 
 
 def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) -> Done:
@@ -75,22 +69,22 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
             {"synthesized": out / "synthesized.npz"}, facts | {"why": "the points have no times: rays are unknown"}
         )
     assert cloud.normal is not None
-    planes, which, _ = detect(cloud.xyz, cloud.normal, params.voxel)
+    planes, which, _ = detect(cloud.xyz, cloud.normal, params.context.voxel)
     rays = kernels.Rays.of(Trajectory.load(inputs["path"]).at(whole.time), whole.xyz)
     photos = cache(lambda: load_photos(inputs, whole))
     numba.set_num_threads(1)  # many small images: starting threads would dominate
     tree, parts = cKDTree(cloud.xyz), []
-    for wall in kernels.walls(cloud.xyz, which, planes, params.voxel, params.max_height + WINDOW_M / 2):
+    for wall in kernels.walls(cloud.xyz, which, planes, params.context.voxel, params.max_height + WINDOW_M / 2):
         report(0.1 + 0.9 * wall.plane / len(planes), "walls")
         through = kernels.cells_passed_through(wall, rays)
         above = extend_upwards(wall, rays, np.flatnonzero(which == wall.plane), through, photos)
-        gaps = kernels.gap_cells(wall.known | above, through, round(params.gap / params.voxel))
+        gaps = kernels.gap_cells(wall.known | above, through, round(params.gap / params.context.voxel))
         facts["walls"] += 1
         for name, cells in (("above_m2", above), ("gaps_m2", gaps)):
             xyz = points_in_cells(wall, cells)
-            near = np.isfinite(tree.query(xyz, distance_upper_bound=MIN_DISTANCE_CELLS * params.voxel)[0])
-            xyz = xyz[~near & away_from_borders(xyz, cloud.frame.origin, params)]
-            facts[name] += len(xyz) * params.voxel**2 / POINTS_PER_CELL
+            near = np.isfinite(tree.query(xyz, distance_upper_bound=MIN_DISTANCE_CELLS * params.context.voxel)[0])
+            xyz = xyz[~near & away_from_borders(xyz, cloud.frame.origin, params.context.cell)]
+            facts[name] += len(xyz) * params.context.voxel**2 / POINTS_PER_CELL
             parts.append((xyz, np.tile(wall.normal, (len(xyz), 1))))
     if parts:
         xyz, normal = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
@@ -173,13 +167,11 @@ def points_in_cells(wall: Wall, cells: Bools) -> F64:
     return np.concatenate(quarters)
 
 
-def away_from_borders(xyz: F64, origin: tuple[float, ...], params: FacadesParams) -> Bools:
+def away_from_borders(xyz: F64, origin: tuple[float, ...], tile: TileCell | None) -> Bools:
     """(N,) bool, True for local points (N, 3) that are not near a border with another tile."""
-    if params.seed is None or not params.neighbours:
+    if tile is None or not tile.neighbours:
         return np.ones(len(xyz), bool)
-    return np.asarray(
-        Cell(params.seed, params.neighbours).outside(xyz[:, :2] + np.asarray(origin[:2])) < -BORDER_MARGIN_M
-    )
+    return np.asarray(tile.cell.outside(xyz[:, :2] + np.asarray(origin[:2])) < -BORDER_MARGIN_M)
 
 
 FACADES = Step("facades", 2, facades, FacadesParams)

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from pydantic import Field
 
-from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import TileCell
 from scan2sim.pipeline.core.types import I64, Bools, Frame, Mesh, PointCloud
 from scan2sim.pipeline.furniture.object_lists import sign_panel_columns, write_lists
 from scan2sim.pipeline.steps.detect_furniture import KINDS
@@ -30,16 +29,11 @@ class FurnitureParams(Params):
     Attributes:
         when: "auto": if the tile has a scanner's path, or photos from the ground; "never": signs, poles and trunks
             are meshed with the surfaces around them.
-        name: name of the tile; set by the pipeline.
-        seed: seed (x, y) of the tile's cell, world metres, if it has neighbours; objects outside the cell belong to
-            them; set by the pipeline.
-        neighbours: seeds of the tiles with adjacent cells, by name, world metres; set by the pipeline.
+        context: the tile's cell, if it has neighbours; objects outside it belong to them.
     """
 
     when: Literal["auto", "never"] = "auto"
-    name: str = ""
-    seed: PlanPoint | None = None
-    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
+    context: TileCell | None = None
 
 
 def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report) -> Done:
@@ -86,15 +80,15 @@ def _load_detections(inputs: Inputs, params: FurnitureParams, frame: Frame) -> t
     def read(path: Path) -> list[Detection]:
         return [Detection.from_json(row) for row in json.loads(path.read_text(encoding="utf-8"))]
 
-    finds = {params.name: read(inputs["detections"])}
-    finds |= {name: read(inputs[f"detections.{name}"]) for name in params.neighbours if f"detections.{name}" in inputs}
-    if params.seed is None:
-        merged = [(params.name, detection) for detection in finds[params.name]]
-    else:
-        merged = merged_detections(finds, {params.name: params.seed, **params.neighbours})
-    here = -np.asarray(frame.origin, np.float64)
-    own = [detection.moved(here) for name, detection in merged if name == params.name]
-    return own, [detection.moved(here) for name, detection in merged if name != params.name]
+    here, tile = -np.asarray(frame.origin, np.float64), params.context
+    detections = read(inputs["detections"])
+    if tile is None:
+        return [detection.moved(here) for detection in detections], []
+    neighbours = {name: inputs[f"detections.{name}"] for name in tile.neighbours if f"detections.{name}" in inputs}
+    found = {tile.name: detections} | {name: read(path) for name, path in neighbours.items()}
+    merged = merged_detections(found, {tile.name: tile.seed, **tile.neighbours})
+    own = [detection.moved(here) for name, detection in merged if name == tile.name]
+    return own, [detection.moved(here) for name, detection in merged if name != tile.name]
 
 
 def _points_of(cloud: PointCloud, own: Sequence[Detection], others: Sequence[Detection]) -> tuple[I64, Bools]:

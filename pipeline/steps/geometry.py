@@ -9,10 +9,9 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.classes import GROUPS, SURFACES, group_of
-from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import TileCell
 from scan2sim.pipeline.core.types import Mesh, PointCloud
-from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.geometry.surface_distance import distances, sample_surface
 
 P95_DISTANCE_WARNING_M = 1.0  # the step warns if 5 % of the points are farther from the mesh
@@ -23,14 +22,11 @@ class GeometryParams(Params):
 
     Attributes:
         samples: number of points per class, sampled from the cloud and from the mesh.
-        seed: seed (x, y) of the tile's cell, world metres, if it has neighbours; only points inside the cell, where
-            the mesh ends, are used; set by the pipeline.
-        neighbours: seeds of the tiles with adjacent cells, by name, world metres; set by the pipeline.
+        context: the tile's cell, if it has neighbours; only points inside it, where the mesh ends, are used.
     """
 
     samples: int = Field(200_000, ge=1000, le=10_000_000)
-    seed: PlanPoint | None = None
-    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
+    context: TileCell | None = None
 
 
 def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) -> Done:
@@ -48,10 +44,8 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
             continue
         report(i / len(SURFACES), group)
         mesh, cloud = Mesh.load(inputs[f"mesh.{group}"]), PointCloud.load(inputs[f"cloud.{group}"])
-        if params.seed is not None:
-            own = (
-                Cell(params.seed, params.neighbours).outside(cloud.xyz[:, :2] + np.asarray(cloud.frame.origin[:2])) <= 0
-            )
+        if params.context:
+            own = params.context.cell.outside(cloud.xyz[:, :2] + np.asarray(cloud.frame.origin[:2])) <= 0
             cloud = cloud.take(own)
         if len(mesh) == 0 and len(cloud) > 0:
             warnings.append(

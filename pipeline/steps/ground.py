@@ -10,10 +10,10 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.classes import CODE
-from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import TileCell
 from scan2sim.pipeline.core.types import UNCOLOURED, Bools, Frame, PointCloud
-from scan2sim.pipeline.core.voronoi_cell import Cell, nearest
+from scan2sim.pipeline.core.voronoi_cell import nearest
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.geometry.height_map import Raster
@@ -32,17 +32,11 @@ class CompletionParams(Params):
     Attributes:
         when: "auto": if the tile has neither a scanner's path nor photos with poses, and more points of its buildings
             are on roofs than on walls; "always"; "never".
-        seed: seed (x, y) of the tile's cell, world metres, if it has neighbours; set by the pipeline.
-        neighbours: seeds of the tiles with adjacent cells, by name, world metres; set by the pipeline.
-        name: name of the tile; set by the pipeline.
-        buffer: distance in metres by which the tile's cloud extends beyond its cell; set by the pipeline.
+        context: the tile's cell, if it has neighbours.
     """
 
     when: Literal["auto", "always", "never"] = "auto"
-    seed: PlanPoint | None = None
-    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
-    name: str = ""
-    buffer: float = Field(5.0, ge=0, le=1000)
+    context: TileCell | None = None
 
 
 class GroundParams(CompletionParams):
@@ -70,8 +64,10 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
     from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid
     from scan2sim.pipeline.geometry.height_map import Raster, close_gaps, dilate, fill_membrane, point_spacing
 
-    terrain = merge_neighbours(inputs, params, "terrain")
-    above = [merge_neighbours(inputs, params, part) for part in ("building", "vegetation", "rest") if part in inputs]
+    terrain = merge_neighbours(inputs, params.context, "terrain")
+    above = [
+        merge_neighbours(inputs, params.context, part) for part in ("building", "vegetation", "rest") if part in inputs
+    ]
     street = "instances" in inputs
     active = street or params.when == "always" or is_airborne(above[0])
     made = PointCloud(terrain.frame, np.zeros((0, 3), np.float32), normal=np.zeros((0, 3), np.float32))
@@ -91,8 +87,8 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
         report(0.3, "membrane")
         field = fill_membrane(known, np.asarray(wanted))
         new = np.isfinite(field[..., 0]) & ~dilate(has, 1.5)
-        if params.seed is not None:
-            new[new] = near_cell(raster.centres(new), params, terrain)
+        if params.context:
+            new[new] = near_cell(raster.centres(new), params.context, terrain)
         xyz = snap_to_grid(np.column_stack([raster.centres(new), field[new][:, 0]])).astype(np.float32)
         slope = np.gradient(np.where(np.isfinite(field[..., 0]), field[..., 0], np.nanmean(field[..., 0])), raster.cell)
         normal = np.column_stack([-slope[1][new], -slope[0][new], np.ones(len(xyz))])
@@ -146,25 +142,24 @@ def is_airborne(building: PointCloud) -> bool:
     return len(building) == 0 or float(np.mean(np.abs(building.normal[:, 2]) > ROOF_MIN_NORMAL_Z)) >= 0.5
 
 
-def near_cell(xy: object, params: CompletionParams, cloud: PointCloud) -> object:
+def near_cell(xy: object, tile: TileCell, cloud: PointCloud) -> object:
     """(N,) bool, True for local points (N, 2) in the tile's cell or within its buffer."""
-    assert params.seed is not None
     world = np.asarray(xy) + np.asarray(cloud.frame.origin[:2])
-    return Cell(params.seed, params.neighbours).outside(world) <= params.buffer
+    return tile.cell.outside(world) <= tile.buffer
 
 
-def merge_neighbours(inputs: Inputs, params: CompletionParams, part: str) -> PointCloud:
+def merge_neighbours(inputs: Inputs, tile: TileCell | None, part: str) -> PointCloud:
     """The cloud `part` merged with the neighbours' clouds `part.NAME` inside their own cells, in the tile's frame."""
     from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid
 
     own = PointCloud.load(inputs[part])
-    given = sorted(name for name in params.neighbours if f"{part}.{name}" in inputs)
-    if params.seed is None or not given:
+    given = sorted(name for name in (tile.neighbours if tile else ()) if f"{part}.{name}" in inputs)
+    if tile is None or not given:
         return own
-    seeds = dict(sorted({params.name: params.seed, **{name: params.neighbours[name] for name in given}}.items()))
+    seeds = dict(sorted({tile.name: tile.seed, **{name: tile.neighbours[name] for name in given}}.items()))
     parts = []
     for i, name in enumerate(seeds):  # in order of names, which is the same in every tile
-        cloud = own if name == params.name else PointCloud.load(inputs[f"{part}.{name}"])
+        cloud = own if name == tile.name else PointCloud.load(inputs[f"{part}.{name}"])
         world = snap_to_grid(cloud.xyz + np.asarray(cloud.frame.origin))
         mine = nearest(world[:, :2], list(seeds.values())) == i
         xyz = (world - np.asarray(own.frame.origin)).astype(np.float32)

@@ -11,7 +11,7 @@ from pydantic import Field
 from scan2sim.pipeline.core import classes
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.parameters import Coordinate
-from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import Frame, PointCloud
 from scan2sim.pipeline.io.tile import MIN_POINTS
 
@@ -19,13 +19,19 @@ MAX_EXTENT_M = 5000.0
 """Maximum extent of a tile: float32 still resolves half a millimetre there, and surfaces fit into memory."""
 
 
-class IngestParams(Params):
-    """Frame of the cloud and mapping of its classes; set by the pipeline from the tile."""
+class TileFrame(Context):
+    """Frame of the tile, and mapping of its class codes."""
 
     crs: str = "local"
     origin: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
     unit: float = Field(1.0, ge=1e-6, le=1000)
     classes: dict[int, int] = Field(default_factory=dict)
+
+
+class IngestParams(Params):
+    """No settings."""
+
+    context: TileFrame = TileFrame()
 
 
 def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> Done:
@@ -39,7 +45,7 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
     """
     from scan2sim.pipeline.io import clouds
 
-    frame = Frame(params.crs, params.origin, params.unit)
+    frame = Frame(params.context.crs, params.context.origin, params.context.unit)
     parts: list[PointCloud] = []
     warnings = []
     for i, name in enumerate(sorted(inputs)):
@@ -47,7 +53,7 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
         warnings += [f"{inputs[name].name}: {note}" for note in clouds.read_header(inputs[name]).notes]
         cloud = clouds.read(inputs[name], frame)
         if cloud.classification is not None and len(cloud):
-            table = clouds.code_table(inputs[name], params.classes)
+            table = clouds.code_table(inputs[name], params.context.classes)
             unmapped = classes.unmapped_codes_warning(np.bincount(cloud.classification, minlength=256), table)
             warnings += [f"{inputs[name].name}: {unmapped}"] if unmapped else []
             cloud = replace(cloud, classification=table[cloud.classification])

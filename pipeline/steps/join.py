@@ -6,23 +6,21 @@ from pathlib import Path
 
 from pydantic import Field
 
-from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
-from scan2sim.pipeline.tiling.cell_params import CellParams
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import TileCell
 
 
-class JoinParams(CellParams):
-    """How far a border may be moved to meet the neighbour's.
+class JoinParams(Params):
+    """How far a border may be moved to meet the neighbour's; of two tiles, the first by name keeps its border.
 
     Attributes:
-        name: name of the tile; set by the pipeline, as the cell is. Of two tiles, the one whose name sorts first
-            keeps its border.
         tolerance: maximum displacement of a vertex in metres; if the neighbour's border is farther away, it is kept.
         blend_distance: distance from the border in metres over which the surface is blended to the new height.
     """
 
-    name: str
     tolerance: float = Field(0.3, ge=0.001, le=10)
     blend_distance: float = Field(0.5, ge=0.001, le=100)
+    context: TileCell
 
 
 def join(inputs: Inputs, params: JoinParams, out: Path, report: Report) -> Done:
@@ -33,14 +31,14 @@ def join(inputs: Inputs, params: JoinParams, out: Path, report: Report) -> Done:
     from scan2sim.pipeline.tiling.borders.clip import Clipped
     from scan2sim.pipeline.tiling.borders.join import join as join_mesh
 
-    clips = {params.name: Clipped.load(inputs["mesh"], inputs["on"])}
-    for name in sorted(params.neighbours):
+    clips = {params.context.name: Clipped.load(inputs["mesh"], inputs["on"])}
+    for name in sorted(params.context.neighbours):
         if f"mesh.{name}" in inputs:
             clips[name] = Clipped.load(inputs[f"mesh.{name}"], inputs[f"on.{name}"])
-    joined = join_mesh(params.name, clips, params.tolerance, params.blend_distance)
+    joined = join_mesh(params.context.name, clips, params.tolerance, params.blend_distance)
     joined.mesh.save(out / "mesh.npz")
-    facts = {"faces_in": len(clips[params.name].mesh), "faces": len(joined.mesh), "turned": joined.turned}
-    missing = sorted(name for name in params.neighbours if name < params.name and name not in clips)
+    facts = {"faces_in": len(clips[params.context.name].mesh), "faces": len(joined.mesh), "turned": joined.turned}
+    missing = sorted(name for name in params.context.neighbours if name < params.context.name and name not in clips)
     return Done({"mesh": out / "mesh.npz"}, facts | {"borders": joined.metrics, "missing": missing})
 
 

@@ -6,24 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field
 
-from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import TileCell
 from scan2sim.pipeline.core.types import PointCloud
 from scan2sim.pipeline.core.voronoi_cell import nearest
-from scan2sim.pipeline.tiling.cell_params import CellParams
 
 
-class OverlapParams(CellParams):
-    """Which points of its neighbours a tile takes.
+class OverlapParams(Params):
+    """No settings: the cell decides which points of its neighbours a tile takes."""
 
-    Attributes:
-        name: name of the tile; set by the pipeline, as the cell is.
-        buffer: distance in metres beyond its cell within which a tile takes points; set by the pipeline.
-    """
-
-    name: str
-    buffer: float = Field(5.0, ge=0, le=1000)
+    context: TileCell
 
 
 def overlap(inputs: Inputs, params: OverlapParams, out: Path, report: Report) -> Done:
@@ -36,19 +29,20 @@ def overlap(inputs: Inputs, params: OverlapParams, out: Path, report: Report) ->
     """
     from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid
 
-    seeds = dict(sorted({params.name: params.seed, **params.neighbours}.items()))
-    given = [name for name in seeds if name == params.name or f"cloud.{name}" in inputs]
+    tile = params.context
+    seeds = dict(sorted({tile.name: tile.seed, **tile.neighbours}.items()))
+    given = [name for name in seeds if name == tile.name or f"cloud.{name}" in inputs]
     own = PointCloud.load(inputs["cloud"])
     parts = []
     for i, name in enumerate(given):  # same order in every tile: the first point of a voxel is the same
         report(i / len(given), name)
-        cloud = own if name == params.name else PointCloud.load(inputs[f"cloud.{name}"])
+        cloud = own if name == tile.name else PointCloud.load(inputs[f"cloud.{name}"])
         world = snap_to_grid(cloud.xyz + np.asarray(cloud.frame.origin))
         owner = np.array(list(seeds))[nearest(world[:, :2], list(seeds.values()))]
-        if name == params.name:
+        if name == tile.name:
             taken = (owner == name) | ~np.isin(owner, given)
         else:
-            taken = (owner == name) & (params.cell.outside(world[:, :2]) <= params.buffer)
+            taken = (owner == name) & (tile.cell.outside(world[:, :2]) <= tile.buffer)
         index = np.flatnonzero(taken)
         local = (world[index] - np.asarray(own.frame.origin)).astype(np.float32)
         parts.append(replace(cloud.take(index), frame=own.frame, xyz=local))

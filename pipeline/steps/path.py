@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 from pydantic import ConfigDict
 
-from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import Trajectory
 
 
-class PathParams(Params):
-    """The path, set by the pipeline: the tile's trajectory, or else its camera positions.
+class PathContext(Context):
+    """The tile's trajectory, or else its camera positions.
 
     Attributes:
         positions: (x, y, z) local metres.
@@ -25,13 +25,19 @@ class PathParams(Params):
     times: tuple[float, ...] | None = None
 
 
+class PathParams(Params):
+    """No settings."""
+
+    context: PathContext
+
+
 def path(inputs: Inputs, params: PathParams, out: Path, report: Report) -> Done:
     """Write the path as a `Trajectory`, ordered by time; times are NaN where unknown."""
-    positions = np.array(params.positions, np.float64)
-    times = np.full(len(positions), np.nan) if params.times is None else np.array(params.times)
+    positions = np.array(params.context.positions, np.float64)
+    times = np.full(len(positions), np.nan) if params.context.times is None else np.array(params.context.times)
     order = np.argsort(times, kind="stable")
     Trajectory(times[order], positions[order]).save(out / "path.npz")
-    length = float(np.linalg.norm(np.diff(positions[order], axis=0), axis=1).sum()) if params.times else None
+    length = float(np.linalg.norm(np.diff(positions[order], axis=0), axis=1).sum()) if params.context.times else None
     return Done({"path": out / "path.npz"}, {"positions": len(positions), "length_m": length})
 
 

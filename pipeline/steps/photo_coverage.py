@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.classes import GROUPS, group_of
-from scan2sim.pipeline.core.parameters import Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import ThinnedCloud
 from scan2sim.pipeline.core.types import F64, Bools, PointCloud, Trajectory, View
 from scan2sim.pipeline.geometry.voxel_grid import sample, voxel_groups
 from scan2sim.pipeline.io import views as views_io
@@ -36,11 +36,10 @@ class PhotoCoverageParams(Params):
     Attributes:
         limit: "auto": points with a ground sample distance of at most two voxels in a photo, and points beside the
             path; a number: points within this distance of the path in metres, seen or not; "off": all points.
-        voxel: sample spacing of the mesh in metres; set by the pipeline.
     """
 
     limit: Literal["auto", "off"] | Annotated[float, Field(ge=1, le=10_000)] = "auto"
-    voxel: Voxel = 0.10
+    context: ThinnedCloud = ThinnedCloud()
 
 
 def photo_coverage(inputs: Inputs, params: PhotoCoverageParams, out: Path, report: Report) -> Done:
@@ -57,7 +56,7 @@ def photo_coverage(inputs: Inputs, params: PhotoCoverageParams, out: Path, repor
         return Done({"cloud": file}, {"left_out": 0})
     report(0.0, "reading")
     cloud, path = PointCloud.load(inputs["cloud"]), Trajectory.load(inputs["path"])
-    cell_m = MAX_GSD_VOXELS * params.voxel
+    cell_m = MAX_GSD_VOXELS * params.context.voxel
     report(0.1, "thinning")
     order, starts = voxel_groups(cloud.xyz, cell_m)
     thin = sample(replace(cloud, rgb=None), cell_m, (order, starts))

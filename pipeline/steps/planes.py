@@ -6,12 +6,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
 
-from scan2sim.pipeline.core.parameters import PlanPoint, Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import ThinnedCloud
 from scan2sim.pipeline.core.types import F64, Mesh, PointCloud
-from scan2sim.pipeline.core.voronoi_cell import Cell
 
 FIXED_VOXELS, BLENDED_VOXELS = 2.5, 5.0  # distance from a tile border up to which vertices are fixed, and blended
 
@@ -23,16 +21,11 @@ class PlanesParams(Params):
 
     Attributes:
         when: "auto": if the tile has a scanner's path; "always"; "never".
-        voxel: voxel size of the thinned cloud in metres; set by the pipeline.
-        seed: seed (x, y) of the tile's cell, world metres, if it has neighbours; vertices at borders are not moved, so
-            that both tiles agree; set by the pipeline.
-        neighbours: seeds of the tiles with adjacent cells, by name, world metres; set by the pipeline.
+        context: the cloud's voxel size and the tile's cell; vertices at borders stay, so that both tiles agree.
     """
 
     when: Literal["auto", "always", "never"] = "auto"
-    voxel: Voxel = 0.10
-    seed: PlanPoint | None = None
-    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
+    context: ThinnedCloud = ThinnedCloud()
 
 
 def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> Done:
@@ -45,7 +38,7 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
     from scan2sim.pipeline.geometry import plane_boundaries, plane_snapping
     from scan2sim.pipeline.geometry.planes import Planes, detect
 
-    mesh, cloud, voxel = Mesh.load(inputs["mesh"]), PointCloud.load(inputs["cloud"]), params.voxel
+    mesh, cloud, voxel = Mesh.load(inputs["mesh"]), PointCloud.load(inputs["cloud"]), params.context.voxel
     assert cloud.normal is not None
     found, which, tolerance = detect(cloud.xyz, cloud.normal, voxel)
     facts: dict[str, Any] = {"faces_in": len(mesh), "planes": len(found)}
@@ -109,8 +102,9 @@ def snap_weights(mesh: Mesh, params: PlanesParams) -> F64:
     from scan2sim.pipeline.geometry.coordinate_grid import world
 
     weight = np.ones(len(mesh.vertices))
-    if params.seed is not None and params.neighbours:
-        away = np.abs(Cell(params.seed, params.neighbours).outside(world(mesh)[:, :2])) / params.voxel
+    tile = params.context.cell
+    if tile is not None and tile.neighbours:
+        away = np.abs(tile.cell.outside(world(mesh)[:, :2])) / params.context.voxel
         weight = np.clip((away - FIXED_VOXELS) / (BLENDED_VOXELS - FIXED_VOXELS), 0, 1)
     return weight
 

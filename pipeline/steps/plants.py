@@ -8,10 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import TileCell
 from scan2sim.pipeline.core.types import F32, F64, U8, PointCloud
-from scan2sim.pipeline.core.voronoi_cell import Cell
 
 CANOPY_CELL_M = 0.25
 
@@ -22,18 +21,15 @@ class PlantsParams(Params):
     Attributes:
         min_height: minimum height above the ground in metres.
         min_distance: minimum distance between the tops of two plants in metres.
-        seed: seed (x, y) of the tile's cell, world metres, if it has neighbours; plants outside the cell belong to
-            them; set by the pipeline.
-        neighbours: seeds of the tiles with adjacent cells, by name, world metres; set by the pipeline.
         models: whether the world shows low-poly trees and bushes if vegetation is only listed (`split.vegetation` is
             "locations").
+        context: the tile's cell, if it has neighbours; plants outside it belong to them.
     """
 
     min_height: float = Field(0.4, ge=0.01, le=100)
     min_distance: float = Field(1.5, ge=0.1, le=1000)
-    seed: PlanPoint | None = None
-    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
     models: bool = True
+    context: TileCell | None = None
 
 
 def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> Done:
@@ -50,8 +46,8 @@ def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> D
     cloud, ground = PointCloud.load(inputs["vegetation"]), PointCloud.load(inputs["terrain"])
     found, crown = crowns(cloud.xyz, ground.xyz, params) if len(cloud) else (np.empty((0, 5)), np.empty(0, int))
     colour = _colours(cloud, crown, len(found))
-    if params.seed is not None:
-        cell = Cell(params.seed, params.neighbours)
+    if params.context:
+        cell = params.context.cell
         own = cell.outside(found[:, :2] + np.asarray(cloud.frame.origin[:2])) <= 0
         found, colour = found[own], colour[own]
     places = cloud.frame.to_crs(found[:, :3])

@@ -9,8 +9,9 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.errors import StepError
-from scan2sim.pipeline.core.parameters import Seconds, Voxel
+from scan2sim.pipeline.core.parameters import Seconds
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import ThinnedCloud
 from scan2sim.pipeline.core.types import F32, I32, Mesh, PointCloud
 
 MIN_POINTS = 50
@@ -25,20 +26,18 @@ class PoissonParams(Params):
     Attributes:
         depth: depth of the octree; unset: chosen so that the finest cell is half a voxel for any length of the tile
             (11, as in D3.2, at 100 m and 10 cm).
-        voxel: voxel size of the input points in metres; set by the pipeline.
         point_weight: weight of the points' positions (screening); 0 is the unscreened method.
         threads: 1 is reproducible; 0 (all cores) is up to 1.4 times faster, but results differ from run to run.
         timeout: seconds after which the reconstruction is aborted.
-        aligned: align the octree to a multiple of its cells in the world, so that surfaces of neighbouring tiles agree
-            where they overlap; set by the pipeline where tiles meet.
+        context: the voxel size of the input points, and the tile's cell. With a cell, the octree is aligned to a
+            multiple of its cells in the world, so that surfaces of neighbouring tiles agree where they overlap.
     """
 
     depth: int | None = Field(None, ge=4, le=MAX_DEPTH)
-    voxel: Voxel = 0.10
     point_weight: float = Field(4.0, ge=0, le=1000)
     threads: int = Field(1, ge=0, le=256)
     timeout: Seconds = 3600.0
-    aligned: bool = False
+    context: ThinnedCloud = ThinnedCloud()
 
 
 def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) -> Done:
@@ -61,13 +60,15 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
         return Done({"mesh": out / "mesh.npz"}, {"points": len(cloud), "faces": 0}, warnings)
 
     xyz, normal = cloud.xyz, cloud.normal
-    if params.aligned:  # two points in opposite corners define the cube; surface near them is removed by `trim`
-        xyz = np.concatenate([xyz, bounds(xyz, cloud.frame.origin, ALIGNMENT_CELLS * params.voxel / 2)])
+    if params.context.cell:  # two points in opposite corners define the cube; surface near them is removed by `trim`
+        xyz = np.concatenate([xyz, bounds(xyz, cloud.frame.origin, ALIGNMENT_CELLS * params.context.voxel / 2)])
         normal = np.concatenate([normal, np.tile(np.array([0, 0, 1], np.float32), (2, 1))])
     length = float((xyz.max(axis=0) - xyz.min(axis=0)).max())
-    depth, scale = octree(length, params.voxel / 2) if params.depth is None else (params.depth, 1.1)
+    depth, scale = octree(length, params.context.voxel / 2) if params.depth is None else (params.depth, 1.1)
     cell = scale * length / 2**depth
-    summary = f"{length:.0f} m at a voxel of {params.voxel * 100:.0f} cm: depth {depth}, cell {cell * 100:.1f} cm"
+    summary = (
+        f"{length:.0f} m at a voxel of {params.context.voxel * 100:.0f} cm: depth {depth}, cell {cell * 100:.1f} cm"
+    )
     report(0.0, summary)
     warnings = []
     # attempts: as configured; on one thread (several race on some inputs); one level coarser

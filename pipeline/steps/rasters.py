@@ -12,7 +12,7 @@ from pydantic import Field
 from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.errors import DataError, SettingError
 from scan2sim.pipeline.core.parameters import Name, Texel
-from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, U8
 
 if TYPE_CHECKING:
@@ -26,8 +26,8 @@ MAX_SAMPLES = 4
 """Maximum number of rays per pixel in each direction."""
 
 
-class RastersParams(Params):
-    """Resolution of the rasters; set by the pipeline (enabled by `export.rasters`).
+class RastersContext(Context):
+    """Resolution of the rasters (`export.rasters`, `unwrap.texel`).
 
     Attributes:
         name: name of the tile.
@@ -38,6 +38,12 @@ class RastersParams(Params):
     name: Name = "tile"
     pixel: float = Field(0.05, ge=0.001, le=100)
     texel: Texel = 0.01
+
+
+class RastersParams(Params):
+    """No settings; enabled by `export.rasters`."""
+
+    context: RastersContext = RastersContext()
 
 
 def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) -> Done:
@@ -63,12 +69,13 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
     vertices = np.concatenate([body.mesh.vertices for body in bodies.values()])
     low, high = vertices.min(axis=0).astype(float), vertices.max(axis=0).astype(float)
     frame = next(iter(bodies.values())).mesh.frame
-    grid = geotiff.Grid.around(frame, low, high, params.pixel)
+    pixel = params.context.pixel
+    grid = geotiff.Grid.around(frame, low, high, pixel)
     if grid.width * grid.height > MAX_PIXELS:
         raise SettingError(
             "export.rasters",
-            f"{params.pixel:g} m per pixel would give {grid.width} x {grid.height} pixels",
-            f"Set export.rasters={params.pixel * (grid.width * grid.height / MAX_PIXELS) ** 0.5 * 1.1:.2g} or more",
+            f"{pixel:g} m per pixel would give {grid.width} x {grid.height} pixels",
+            f"Set export.rasters={pixel * (grid.width * grid.height / MAX_PIXELS) ** 0.5 * 1.1:.2g} or more",
         )
 
     def rendered(renderer: Renderer, samples: int = 1) -> Iterator[Image]:
@@ -85,7 +92,8 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
 
     def colours() -> Iterator[U8]:
         for image in rendered(
-            render.Renderer(list(bodies.values())), min(MAX_SAMPLES, round(params.pixel / params.texel)) or 1
+            render.Renderer(list(bodies.values())),
+            min(MAX_SAMPLES, round(params.context.pixel / params.context.texel)) or 1,
         ):
             yield np.dstack([image.rgb, image.hit * np.uint8(255)])
 
@@ -93,16 +101,18 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
     folder.mkdir()
     plain = {group: render.Body(body.mesh) for group, body in bodies.items()}
     report(0.0, "orthophoto")
-    geotiff.write_colours(folder / f"{params.name}_orthophoto.tif", grid, colours())
+    geotiff.write_colours(folder / f"{params.context.name}_orthophoto.tif", grid, colours())
     report(0.6, "DSM")
-    geotiff.write_heights(folder / f"{params.name}_dsm.tif", grid, heights(render.Renderer(list(plain.values()))))
+    geotiff.write_heights(
+        folder / f"{params.context.name}_dsm.tif", grid, heights(render.Renderer(list(plain.values())))
+    )
     report(0.8, "DTM")
     ground = [plain["terrain"]] if "terrain" in plain else []
-    geotiff.write_heights(folder / f"{params.name}_dtm.tif", grid, heights(render.Renderer(ground)))
+    geotiff.write_heights(folder / f"{params.context.name}_dtm.tif", grid, heights(render.Renderer(ground)))
     facts: dict[str, Any] = {
         "width": grid.width,
         "height": grid.height,
-        "pixel_m": params.pixel,
+        "pixel_m": params.context.pixel,
         "bytes": sum(file.stat().st_size for file in folder.iterdir()),
     }
     local = "the tile has no CRS, so its rasters have none: they are in the tile's local coordinates"

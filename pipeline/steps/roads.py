@@ -7,17 +7,30 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from scan2sim.pipeline.core.classes import CODE
-from scan2sim.pipeline.core.parameters import Coordinate, Name, PlanPoint
-from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.parameters import Coordinate, Name
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import TileCell
 from scan2sim.pipeline.core.types import F64, Bools, Frame, PointCloud, Trajectory
-from scan2sim.pipeline.core.voronoi_cell import Cell
 
 ROAD_CLASSES = ("road", "bridge_deck")
 MAX_ROAD_DISTANCE_M = 3.0
 """Largest distance in plan of road points from a path that was driven on a road."""
+
+
+class RoadsContext(Context):
+    """The tile.
+
+    Attributes:
+        name: name of the tile.
+        world_origin: origin of the OpenDRIVE file in the CRS, metres (`export.world_origin`); None: the tile's own.
+        cell: the tile's cell, if it has neighbours; observations outside it belong to them.
+    """
+
+    name: Name = "tile"
+    world_origin: tuple[Coordinate, Coordinate, Coordinate] | None = None
+    cell: TileCell | None = None
 
 
 class RoadsParams(Params):
@@ -25,19 +38,10 @@ class RoadsParams(Params):
 
     Attributes:
         when: "auto": if the tile has a scanner's path, or photos from the ground; "never".
-        name: name of the tile; set by the pipeline.
-        world_origin: origin of the OpenDRIVE file in the CRS, metres; default: the tile's own origin; set by the
-            pipeline (`export.world_origin`).
-        seed: seed (x, y) of the tile's cell, world metres, if it has neighbours; observations outside the cell belong
-            to them; set by the pipeline.
-        neighbours: seeds of the tiles with adjacent cells, by name, world metres; set by the pipeline.
     """
 
     when: Literal["auto", "never"] = "auto"
-    name: Name = "tile"
-    world_origin: tuple[Coordinate, Coordinate, Coordinate] | None = None
-    seed: PlanPoint | None = None
-    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
+    context: RoadsContext = RoadsContext()
 
 
 def roads(inputs: Inputs, params: RoadsParams, out: Path, report: Report) -> Done:
@@ -54,7 +58,7 @@ def roads(inputs: Inputs, params: RoadsParams, out: Path, report: Report) -> Don
     cloud, path = PointCloud.load(inputs["cloud"]), Trajectory.load(inputs["path"])
     assert cloud.classification is not None
     xyz = cloud.xyz.astype(np.float64)
-    own, origin = _own(params), np.asarray(cloud.frame.origin)
+    own, origin = _own(params.context.cell), np.asarray(cloud.frame.origin)
     on = np.isin(cloud.classification, [CODE[name] for name in ROAD_CLASSES])
     ways = driven.ways(path.positions, _over(path.positions, xyz[on]) & own(path.positions + origin))
     renderer = None
@@ -72,21 +76,21 @@ def roads(inputs: Inputs, params: RoadsParams, out: Path, report: Report) -> Don
     road_geojson.write(out / "roads.geojson", cloud.frame, drawn)
     observed.save(out / "seen.npz", seen, cloud.frame)
     (out / "opendrive").mkdir()
-    world = Frame(cloud.frame.crs, params.world_origin or cloud.frame.origin, cloud.frame.unit)
+    world = Frame(cloud.frame.crs, params.context.world_origin or cloud.frame.origin, cloud.frame.unit)
     network = model.network([one.moved(origin) for one in seen], world.origin)
-    opendrive.write(out / "opendrive" / f"{params.name}.xodr", params.name, world, network)
+    opendrive.write(out / "opendrive" / f"{params.context.name}.xodr", params.context.name, world, network)
     facts = {"points": int(on.sum()), "driven": len(ways), "roads": [road_geojson.facts(road) for road in drawn]}
     files = {"geojson": out / "roads.geojson", "seen": out / "seen.npz", "opendrive": out / "opendrive"}
     return Done(files, facts | _why_none(ways, on, [*drawn, *warnings]), warnings)
 
 
-def _own(params: RoadsParams) -> Callable[[F64], Bools]:
+def _own(tile: TileCell | None) -> Callable[[F64], Bools]:
     """Function that selects world positions (N, 3) inside the tile's cell."""
 
     def own(places: F64) -> Bools:
-        if params.seed is None:
+        if tile is None:
             return np.ones(len(places), bool)
-        return np.asarray(Cell(params.seed, params.neighbours).outside(places[:, :2]) <= 0)
+        return np.asarray(tile.cell.outside(places[:, :2]) <= 0)
 
     return own
 

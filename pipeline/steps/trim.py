@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scan2sim.pipeline.core.parameters import Distance, Voxel
+from scan2sim.pipeline.core.parameters import Distance
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import ThinnedCloud
 from scan2sim.pipeline.core.types import F32, Mesh, PointCloud
 
 if TYPE_CHECKING:
@@ -29,13 +30,12 @@ class TrimParams(Params):
         max_edge: maximum edge length of a triangle; D3.2: 50 cm for terrain (closes holes), 25 cm otherwise.
         max_distance: maximum distance of a vertex to the nearest point.
         max_spacing: maximum point spacing around a vertex, from the density of the Poisson reconstruction.
-        voxel: voxel size of the thinned cloud; set by the pipeline.
     """
 
     max_edge: Distance = 0.25
     max_distance: Distance = 0.25
     max_spacing: Distance = 0.8
-    voxel: Voxel = 0.10
+    context: ThinnedCloud = ThinnedCloud()
 
 
 def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
@@ -55,7 +55,7 @@ def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     long = edge > params.max_edge * widened
     # a density of d means that the samples fill cells of half a voxel times 2^(finest depth - d)
-    spacing = params.voxel / 2 * 2.0 ** (mesh.density.max() - mesh.density)
+    spacing = params.context.voxel / 2 * 2.0 ** (mesh.density.max() - mesh.density)
     sparse = (spacing > params.max_spacing * widened)[mesh.faces].any(axis=1)
     report(0.3, "distances")
     keep = mesh.keep(~(long | sparse))

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from scan2sim.pipeline.core.errors import DataError, InputError
-from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, PointCloud, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
@@ -28,18 +28,23 @@ def _not_all(every: int) -> int:
     return every
 
 
+class TileViews(Context):
+    """The tile's views as JSON (`pipeline.io.views`), file names without folders."""
+
+    poses: tuple[dict[str, Any], ...] = ()
+
+
 class ViewsParams(Params):
     """The photos.
 
     Attributes:
         hold_out: hold every Nth photo (of all cameras in turn) out of texturing, to score the texture; 0: none.
-        poses: the views as JSON (`pipeline.io.views`), file names without folders; set by the pipeline.
     """
 
     hold_out: Annotated[int, AfterValidator(_not_all)] = Field(
         0, ge=0, le=1_000_000, json_schema_extra={"range": "a whole number, 0 or 2 to 1,000,000"}
     )
-    poses: tuple[dict[str, Any], ...] = ()
+    context: TileViews = TileViews()
 
 
 def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Done:
@@ -56,8 +61,8 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
     points = points[:: max(1, len(points) // MAX_SAMPLED_POINTS)]
     kept: list[View] = []
     warnings, sees_nothing = [], []
-    for i, entry in enumerate(params.poses):
-        report(i / len(params.poses), entry["name"])
+    for i, entry in enumerate(params.context.poses):
+        report(i / len(params.context.poses), entry["name"])
         mask = inputs.get(f"mask.{i}")
         view = replace(views_io.from_json(entry), photo=inputs[f"photo.{i}"], mask=mask)
         problem = _problem(view)
@@ -78,7 +83,7 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
             f"none of the {len(sees_nothing)} photos sees a point of the cloud within {MAX_PHOTO_DISTANCE_M:.0f} m",
             "Check CRS, units and axes of the poses (camera to world; x right, y down, z forward)",
         )
-    if params.poses and not kept:
+    if params.context.poses and not kept:
         raise InputError(
             inputs["photo.0"], "no photo of the tile can be read", "Restore the photos, or remove them from the tile"
         )
@@ -90,7 +95,7 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
         warnings.append(f"{len(kept)} photos are too few to hold out every {params.hold_out}th: none is held out")
     views_io.save(out / "views.json", kept, held)
     # links: moving the tile breaks them, which only rebuilds this step, not the results that depend on the photos
-    facts = {"photos": len(params.poses), "usable": len(kept), "held_out": sum(held)}
+    facts = {"photos": len(params.context.poses), "usable": len(kept), "held_out": sum(held)}
     return Done({"views": out / "views.json"}, facts, warnings)
 
 

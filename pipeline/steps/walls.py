@@ -54,8 +54,8 @@ def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Don
     from scan2sim.pipeline.buildings.roof_outlines import OutlinePoints, rings, roofs
     from scan2sim.pipeline.geometry.height_map import Raster, point_spacing
 
-    building = merge_neighbours(inputs, params, "building")
-    floor = merge_neighbours(inputs, params, "terrain").xyz
+    building = merge_neighbours(inputs, params.context, "building")
+    floor = merge_neighbours(inputs, params.context, "terrain").xyz
     if "ground" in inputs:
         floor = np.concatenate([floor, PointCloud.load(inputs["ground"]).xyz])
     made = PointCloud(building.frame, np.zeros((0, 3), np.float32), normal=np.zeros((0, 3), np.float32))
@@ -177,8 +177,8 @@ def _cloud(xyz: F64, normal: F64, building: PointCloud, params: WallsParams) -> 
     keep = ~np.isfinite(
         cKDTree(building.xyz).query(xyz, distance_upper_bound=SCANNED_WALL_SPACINGS * POINT_SPACING_M)[0]
     )
-    if params.seed is not None:
-        keep &= np.asarray(near_cell(xyz[:, :2], params, building))
+    if params.context:
+        keep &= np.asarray(near_cell(xyz[:, :2], params.context, building))
     xyz, normal = snap_to_grid(xyz[keep]), normal[keep]
     light = 0.8 + 0.2 * np.clip(normal @ LIGHT_DIRECTION, 0, 1)  # shading makes corners visible
     rgb = None if building.rgb is None else (light[:, None] * _colour(building)).astype(np.uint8)

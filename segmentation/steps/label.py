@@ -11,7 +11,7 @@ import numpy as np
 from scan2sim.pipeline.core.classes import classified_codes
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.parameters import Device, File, Fraction, Name, Voxel
-from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import U8, PointCloud
 from scan2sim.pipeline.geometry.voxel_grid import sample
 from scan2sim.pipeline.io import views as views_io
@@ -24,6 +24,14 @@ MIN_POINTS = 30
 """Points below which a cloud is not projected into photos."""
 
 
+class SegmentSettings(Context):
+    """Settings of step `segment`: photos are not classified if the cloud keeps its own classes, or without photos."""
+
+    overwrite: bool = False
+    min_classified: Fraction = 0.2
+    photos: bool = True
+
+
 class LabelParams(Params):
     """Settings of the segmentation network.
 
@@ -32,17 +40,13 @@ class LabelParams(Params):
         weights: file or folder with the weights; default: the weights of "street" that come with the project.
         device: "cpu" or "cuda" (torch or onnxruntime); "auto": a GPU if one is available.
         size: voxel size in metres at which the cloud is projected into photos, for networks with scan channels.
-        overwrite, min_classified, photos: as in `segment`, set by the pipeline: photos are not classified if the cloud
-            keeps its own classes, or if photos are not used.
     """
 
     network: Name = "street"
     weights: File | None = None
     device: Device = "auto"
     size: Voxel = 0.1
-    overwrite: bool = False
-    min_classified: Fraction = 0.2
-    photos: bool = True
+    context: SegmentSettings = SegmentSettings()
 
 
 def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Done:
@@ -60,8 +64,8 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
     folder.mkdir()
     views = views_io.load(inputs["views"])
     cloud = PointCloud.load(inputs["cloud"])
-    kept = not params.overwrite and classified(cloud.classification) >= params.min_classified
-    if kept or not views or not params.photos:
+    kept = not params.context.overwrite and classified(cloud.classification) >= params.context.min_classified
+    if kept or not views or not params.context.photos:
         return Done(
             {"labels": folder}, {"photos": 0, "why": "the cloud keeps its classes" if kept else "photos are not used"}
         )
@@ -114,7 +118,7 @@ def can_label(params: LabelParams) -> None:
     """
     from scan2sim.segmentation.backends import check
 
-    if params.photos:
+    if params.context.photos:
         check(params.network, params.weights)
 
 

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from pydantic import Field
 
-from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import TileCell
 from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Frame, Mesh, View
 from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.furniture.object_lists import sign_panel_columns, write_lists
@@ -39,13 +38,12 @@ class SignsParams(Params):
 
     Attributes:
         when: "auto": if there are photos taken from the ground; "never": keep the panels from points.
-        seed, neighbours: as in `furniture`, set by the pipeline: panels on poles of a neighbouring tile belong to that
-            tile; panels without a pole within half a metre of a border belong to no tile.
+        context: the tile's cell, if it has neighbours; panels on poles of a neighbouring tile belong to that tile;
+            panels without a pole within half a metre of a border belong to no tile.
     """
 
     when: Literal["auto", "never"] = "auto"
-    seed: PlanPoint | None = None
-    neighbours: dict[str, PlanPoint] = Field(default_factory=dict)
+    context: TileCell | None = None
 
 
 def signs(inputs: Inputs, params: SignsParams, out: Path, report: Report) -> Done:
@@ -72,7 +70,7 @@ def signs(inputs: Inputs, params: SignsParams, out: Path, report: Report) -> Don
     rows = [f["properties"] | dict(zip("xyz", f["geometry"]["coordinates"], strict=True)) for f in features]
     views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
     used = [i for i, view in enumerate(views) if not held[i] and view.camera.model != "orthographic"]
-    cell = None if params.seed is None else Cell(params.seed, params.neighbours)
+    cell = params.context.cell if params.context else None
     poles = np.array([frame.to_local([row["x"], row["y"], row["z"]]) for row in rows if row["kind"] != "trunk"])
     others = np.array(json.loads(inputs["neighbour_poles"].read_text(encoding="utf-8")))
     own = partial(_own, frame, cell, poles.reshape(-1, 3), others.reshape(-1, 3))

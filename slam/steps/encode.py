@@ -9,15 +9,15 @@ from pydantic import Field
 
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.parameters import Rate
-from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.slam.video import open_video
 from scan2sim.slam.video_degradation import encode
 
 Pixels = Annotated[int, Field(ge=2, le=100_000, multiple_of=2)]
 
 
-class EncodeParams(Params):
-    """Settings of the encoded video; set by the pipeline.
+class EncodedVideo(Context):
+    """The encoded video: a cell of the study's tables.
 
     Attributes:
         size: width and height, even numbers of pixels.
@@ -32,12 +32,19 @@ class EncodeParams(Params):
     fps: Rate = 10.0
 
 
+class EncodeParams(Params):
+    """No settings."""
+
+    context: EncodedVideo = EncodedVideo()
+
+
 def encode_video(inputs: Inputs, params: EncodeParams, out: Path, report: Report) -> Done:
     """Re-encode `video` at a lower resolution, frame rate and bitrate."""
     file = out / "video.mp4"
-    video = open_video(inputs["video"], fps=params.fps)
-    seconds = encode(video, file, size=params.size, bitrate=params.bitrate, rate=params.rate)
-    metrics = {"width": params.size[0], "mbit_s": round(8e-6 * file.stat().st_size / seconds, 4)}
+    wanted = params.context
+    video = open_video(inputs["video"], fps=wanted.fps)
+    seconds = encode(video, file, size=wanted.size, bitrate=wanted.bitrate, rate=wanted.rate)
+    metrics = {"width": wanted.size[0], "mbit_s": round(8e-6 * file.stat().st_size / seconds, 4)}
     return Done({"video": file}, metrics)
 
 

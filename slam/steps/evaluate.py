@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import GpsTrack, Trajectory
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.slam.trajectory.evaluate import SEGMENT_M, evaluate, read_truth
@@ -17,14 +17,16 @@ LOST_SHARE_MAX = 0.5
 """Share of the path with lost tracking above which errors aren't evaluated."""
 
 
-class EvaluateParams(Params):
-    """Settings of the evaluation.
-
-    Attributes:
-        segment: length of the local error's segments, metres; set by the pipeline.
-    """
+class Segments(Context):
+    """Length of the local error's segments, metres."""
 
     segment: Annotated[float, Field(ge=1, le=1e7)] = SEGMENT_M
+
+
+class EvaluateParams(Params):
+    """No settings."""
+
+    context: Segments = Segments()
 
 
 def evaluate_path(inputs: Inputs, params: EvaluateParams, out: Path, report: Report) -> Done:
@@ -34,7 +36,7 @@ def evaluate_path(inputs: Inputs, params: EvaluateParams, out: Path, report: Rep
     metrics = {"lost_share": round(share, 4)}
     if share > LOST_SHARE_MAX:
         return Done({}, metrics | {"reason": f"tracking lost on {100 * share:.0f} % of the path"})
-    return Done({}, metrics | evaluate(path, truth, segment=params.segment).figures())
+    return Done({}, metrics | evaluate(path, truth, segment=params.context.segment).figures())
 
 
 def lost_share(estimate: Trajectory, truth: Trajectory | GpsTrack) -> float:

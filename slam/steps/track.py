@@ -13,7 +13,7 @@ from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.parameters import Focal, Pixels, Rate, Shift
-from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import U8, Camera, GpsTrack
 from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io.images import image
@@ -63,18 +63,27 @@ class Filmed(Params):
     matcher: str = Field("nearest", description="Matcher of features: nearest, superglue or lightglue.")
 
 
-class TrackParams(OdometryParams, Filmed):
-    """Settings of the step, besides those of `Filmed` and `OdometryParams`.
+class TrackContext(Context):
+    """What the video's other steps need.
 
     Attributes:
-        cameras: cameras of a tile, of which the one with the video's image size is used; set by the pipeline.
-        keep: keep all points and observations, for loop closure, global adjustment and COLMAP; set by the pipeline.
-        view: record a video of the tracked features and the path.
+        cameras: cameras of a tile, of which the one with the video's image size is used.
+        keep: keep all points and observations, for loop closure, global adjustment and COLMAP.
     """
 
     cameras: tuple[dict[str, Any], ...] = ()
     keep: bool = False
+
+
+class TrackParams(OdometryParams, Filmed):
+    """Settings of the step, besides those of `Filmed` and `OdometryParams`.
+
+    Attributes:
+        view: record a video of the tracked features and the path.
+    """
+
     view: bool = False
+    context: TrackContext = TrackContext()
 
 
 def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, checkpoint: Path) -> Done:
@@ -97,7 +106,14 @@ def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, 
 
     def start(warn: Callable[[str], None]) -> Odometry:
         return Odometry(
-            camera, params, mask=mask, gps=gps, backend=params.backend, keep=params.keep, warn=warn, tracker=tracker
+            camera,
+            params,
+            mask=mask,
+            gps=gps,
+            backend=params.backend,
+            keep=params.context.keep,
+            warn=warn,
+            tracker=tracker,
         )
 
     view = out / "view.mp4"
@@ -154,11 +170,11 @@ def video_camera(
 
 
 def _tile_camera(video: Video, params: TrackParams) -> Camera | None:
-    for given in params.cameras:
+    for given in params.context.cameras:
         camera = Camera(**given | {"distortion": tuple(given["distortion"])})
         if (camera.width, camera.height) == (video.width, video.height):
             return camera
-    if params.cameras:
+    if params.context.cameras:
         size = f"{video.width}x{video.height}"
         raise InputError(
             video.path, f"the tile has no camera with an image size of {size}", "Give --camera and --focal"

@@ -19,6 +19,7 @@ from scan2sim.pipeline.io.worlds.scene import PATH_FILE, Scene, read_scene, save
 from scan2sim.pipeline.steps.collision import COLLISION, CollisionParams
 from scan2sim.pipeline.steps.decimate import with_furniture
 from scan2sim.pipeline.steps.export import EXPORT, ExportParams
+from tests.fakes.steps import step_params
 
 UTM = Frame("EPSG:32632", (690_000.0, 5_335_000.0, 500.0))
 HOUSE = (4.0, 2.0)  # its corner of least x and y; it measures 3 x 2 x 5 m
@@ -95,7 +96,9 @@ def world(folder: Path, frame: Frame = UTM, name: str = "street", things: Mesh |
     made = COLLISION.run(sources, CollisionParams(triangles=1000), solid, silent)
     out = folder / "export"
     out.mkdir()
-    return EXPORT.run({**inputs, "collision": made.files["mesh"]}, ExportParams(name=name, **params), out, silent)
+    return EXPORT.run(
+        {**inputs, "collision": made.files["mesh"]}, step_params(ExportParams, name=name, **params), out, silent
+    )
 
 
 def by_page(mesh: Mesh) -> dict[int, tuple[np.ndarray, np.ndarray]]:

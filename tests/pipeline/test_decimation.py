@@ -13,6 +13,7 @@ from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.steps.decimate import DECIMATE, DecimateParams
+from tests.fakes.steps import step_params
 
 NAMES = plugins.names(decimation.__name__)
 SIDE = 120
@@ -82,7 +83,7 @@ def test_the_step_uses_the_library_that_is_set(tmp_path: Path, name: str) -> Non
         pytest.skip(f"needs {lacking}")
     hills().save(tmp_path / "mesh.npz")
     (tmp_path / "out").mkdir()
-    params = DecimateParams(target=10_000, backend=name)
+    params = step_params(DecimateParams, target=10_000, backend=name)
     done = DECIMATE.run({"mesh": tmp_path / "mesh.npz"}, params, tmp_path / "out", silent)
     small = Mesh.load(done.files["mesh"])
     same = simplified(hills(), name, 10_000, keep_border=done.facts["border_kept"])
@@ -93,4 +94,4 @@ def test_the_step_uses_the_library_that_is_set(tmp_path: Path, name: str) -> Non
 def test_a_library_that_loses_borders_is_refused_where_tiles_meet() -> None:
     assert DECIMATE.check is not None
     with pytest.raises(SettingError, match=r"decimate\.backend: 'open3d' can't keep borders"):
-        DECIMATE.check(DecimateParams(backend="open3d", keep_border=True))
+        DECIMATE.check(step_params(DecimateParams, backend="open3d", keep_border=True))

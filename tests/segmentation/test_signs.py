@@ -21,6 +21,7 @@ from scan2sim.pipeline.io.images import image
 from scan2sim.segmentation.labels import CLASSES
 from scan2sim.segmentation.sign_panels.attach import without_smear
 from scan2sim.segmentation.steps.signs import SIGNS, SignsParams
+from tests.fakes.steps import step_params
 
 FRAME = Frame("EPSG:25832", (500_000.0, 5_400_000.0, 100.0))
 CAMERA = Camera("pinhole", 640, 240, 500, 500, 320, 120)
@@ -111,7 +112,7 @@ def _run(folder: Path, panels: list[SignPanel], known: list[SignPanel], theirs: 
     inputs |= {"views": folder / "views.json", "labels": labels}
     out = folder / "out"
     out.mkdir()
-    return SIGNS.run(inputs, SignsParams(**params), out, silent)
+    return SIGNS.run(inputs, step_params(SignsParams, **params), out, silent)
 
 
 def _panel_corners(done: Done) -> list[F32]:

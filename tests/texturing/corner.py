@@ -21,6 +21,7 @@ from scan2sim.texturing.texture import TextureParams, texture
 from scan2sim.texturing.texture_layout import UnwrapParams
 from scan2sim.texturing.unwrap import unwrap
 from scan2sim.texturing.view_selection.step import VIEW_SELECTION
+from tests.fakes.steps import step_params
 
 
 def grid(
@@ -132,7 +133,7 @@ class Street:
         inputs = {**flat.files, "views": out / "views.json", "depth": out / "depth"}
         warnings: list[str] = []
         for step, given in ((EXPOSURE, exposure), (PHOTO_CONSISTENCY, agreement), (VIEW_SELECTION, choose)):
-            done = step.run(inputs, step.params(**(given or {})), out, silent)
+            done = step.run(inputs, step_params(step.params, **(given or {})), out, silent)
             inputs |= done.files
             warnings += done.warnings
         for name, cloud in self.clouds.items():

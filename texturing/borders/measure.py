@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scan2sim.pipeline.core.classes import SURFACES
-from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import TileCell
 from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.core.voronoi_cell import Cell
-from scan2sim.pipeline.tiling.cell_params import CellParams
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.io.worlds.textured_mesh import Textured
@@ -20,7 +20,13 @@ SAMPLE_SPACING_M = 0.01
 """Metres between the sample points along an edge: other points than those of the colour harmonization."""
 
 
-def borders(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Done:
+class BordersParams(Params):
+    """No settings: the cell decides where borders are."""
+
+    context: TileCell
+
+
+def borders(inputs: Inputs, params: BordersParams, out: Path, report: Report) -> Done:
     """Measure the borders of `textured.GROUP` with those of the neighbours, `textured.GROUP.NAME`.
 
     Metrics, by neighbour and class: `length_m`, length of the border; `gap_m`, largest distance from a point on one
@@ -41,7 +47,7 @@ def borders(inputs: Inputs, params: CellParams, out: Path, report: Report) -> Do
                     textured_mesh.read(inputs[key]) for key in (f"textured.{group}", f"textured.{group}.{name}")
                 )
                 if own is not None and other is not None:
-                    found.setdefault(name, {})[group] = _measured(own, other, params.cell, name)
+                    found.setdefault(name, {})[group] = _measured(own, other, params.context.cell, name)
     return Done({}, {"neighbours": found})
 
 
@@ -82,4 +88,4 @@ def colour_step(a: Textured, b: Textured) -> tuple[float, float, float]:
     return float(step.mean()), float(np.percentile(step, 95)), border.length[0]
 
 
-BORDERS = Step("borders", 3, borders, CellParams, side_product=True)
+BORDERS = Step("borders", 3, borders, BordersParams, side_product=True)

@@ -22,6 +22,7 @@ from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.ingest import IngestParams, ingest
 from scan2sim.pipeline.steps.split import SplitParams, split
 from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
+from tests.fakes.steps import step_params
 from tests.present import present
 
 N = 2000
@@ -83,7 +84,7 @@ def test_classes_that_the_user_names(tmp_path: Path) -> None:
 def test_points_that_vanish_are_named_with_their_share_and_what_to_do(tmp_path: Path) -> None:
     tile = read_tile(import_las([foreign(tmp_path / "a.las")], tmp_path / "tile", crs="local", classes={200: 5}))
     assert tile.classes == {200: 5}
-    params = IngestParams(origin=tile.frame.origin, classes=dict(tile.classes))
+    params = step_params(IngestParams, origin=tile.frame.origin, classes=dict(tile.classes))
     done = ingest({"cloud.0000": tile.clouds[0]}, params, tmp_path, silent)
     assert len(done.warnings) == 1 and "codes 65 (20.0%) are the survey's own" in done.warnings[0]
     assert "--classes 65=building" in done.warnings[0]

@@ -12,6 +12,7 @@ import pytest
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import Frame, PointCloud, Trajectory
 from scan2sim.pipeline.steps.dynamic_objects import DYNAMIC_OBJECTS
+from tests.fakes.steps import step_params
 
 SPEED, TURNS, SECONDS = 10.0, 10.0, 2.5
 HEIGHT = 1.8
@@ -97,7 +98,7 @@ def carve(cloud: PointCloud, out: Path, way: Trajectory | None, **params: Any) -
     if way is not None:
         way.save(out / "path.npz")
         inputs["path"] = out / "path.npz"
-    return DYNAMIC_OBJECTS.run(inputs, DYNAMIC_OBJECTS.params(**params), out, silent)
+    return DYNAMIC_OBJECTS.run(inputs, step_params(DYNAMIC_OBJECTS.params, **params), out, silent)
 
 
 def lost(cloud: PointCloud, done: Done) -> dict[int, float]:
@@ -138,7 +139,7 @@ def test_without_path_times_or_a_second_look_all_stays(street: PointCloud, tmp_p
         (street, path(begin=5000.0), "overlap in time"),
     )
     for i, (cloud, way, why) in enumerate(cases):
-        done = carve(cloud, tmp_path / str(i), way, cameras=((0.0, 0.0, 30.0),))
+        done = carve(cloud, tmp_path / str(i), way, positions=((0.0, 0.0, 30.0),))
         assert why in str(done.facts["rays"]) and not len(PointCloud.load(done.files["moving"]))
         assert way is not None or len(PointCloud.load(done.files["cloud"])) == len(cloud)
     assert street.time is not None

@@ -21,6 +21,7 @@ from scan2sim.pipeline.steps.decimate import DECIMATE, DecimateParams
 from scan2sim.pipeline.steps.detect_furniture import DETECT_FURNITURE, DetectFurnitureParams
 from scan2sim.pipeline.steps.furniture import FURNITURE, FurnitureParams
 from scan2sim.pipeline.steps.split import SPLIT, SplitParams
+from tests.fakes.steps import step_params
 
 
 @pytest.fixture(scope="module")
@@ -38,8 +39,8 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def _run(street: tuple[Path, Path], out: Path, **params: Any) -> tuple[list[dict[str, Any]], Done]:
     out.mkdir()
     cloud = {"cloud": street[0]}
-    found = DETECT_FURNITURE.run(cloud | {"path": street[1]}, DetectFurnitureParams(**params), out, silent)
-    done = FURNITURE.run(cloud | found.files, FurnitureParams(**params), out, silent)
+    found = DETECT_FURNITURE.run(cloud | {"path": street[1]}, step_params(DetectFurnitureParams, **params), out, silent)
+    done = FURNITURE.run(cloud | found.files, step_params(FurnitureParams, **params), out, silent)
     features = json.loads(done.files["geojson"].read_text(encoding="utf-8"))["features"]
     return [f["properties"] | {"at": np.array(f["geometry"]["coordinates"]) - FRAME.origin} for f in features], done
 

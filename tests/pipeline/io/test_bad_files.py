@@ -22,6 +22,7 @@ from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.ingest import IngestParams, ingest
 from scan2sim.pipeline.steps.views import _problem
+from tests.fakes.steps import step_params
 
 FRAME = Frame("local", (700_000.0, 5_400_000.0, 100.0))
 SIZES = {"bounds": "<6d", "count": "<Q", "vlrs": "<I", "extended": "<QI", "scale": "<d"}
@@ -52,7 +53,7 @@ def test_the_origin_is_the_points_whatever_the_header_says(
     (tmp_path / "tile.toml").write_text(f'name = "t"\ncrs = "local"\nclouds = ["{path.name}"]\n', encoding="utf-8")
     tile = read_tile(tmp_path)
     assert np.abs(np.subtract(tile.frame.origin, (700_010, 5_400_010, 100))).max() <= 1
-    params = IngestParams(crs=tile.frame.crs, origin=tile.frame.origin, unit=tile.frame.unit)
+    params = step_params(IngestParams, crs=tile.frame.crs, origin=tile.frame.origin, unit=tile.frame.unit)
     done = ingest({"cloud.0000": path}, params, tmp_path, silent)
     assert done.facts["points"] == n
     assert "its header's bounding box is wrong" in done.warnings[0]
@@ -81,7 +82,7 @@ def test_points_that_a_las_header_does_not_count_are_told_of(tmp_path: Path) -> 
 def test_points_over_a_thousand_kilometres_are_no_tile(tmp_path: Path) -> None:
     path = made(tmp_path / "c.las", reach=1e6)
     with pytest.raises(DataError, match=r"999\.\d km apart.*limit of a tile is 5 km.*scan2sim tile"):
-        ingest({"cloud.0000": path}, IngestParams(origin=FRAME.origin), tmp_path, silent)
+        ingest({"cloud.0000": path}, step_params(IngestParams, origin=FRAME.origin), tmp_path, silent)
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])

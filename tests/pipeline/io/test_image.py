@@ -18,6 +18,7 @@ from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.steps.views import ViewsParams, views
 from tests.fakes.photo_files import ADOBE, P3, SRGB, decoded, encoded, profile, to_xyz, write
+from tests.fakes.steps import step_params
 
 WIDTH, HEIGHT = 90, 70
 """No multiples of a tile's 16."""
@@ -150,7 +151,7 @@ def test_of_an_orthophoto_larger_than_can_be_decoded_a_tile_reads_its_part(
     with pytest.raises(InputError, match=r"6,?300|90 x 70"):
         image.size_of(view.photo)
     (tmp_path / "out").mkdir()
-    params = ViewsParams(poses=(views_io.to_json(view),))
+    params = step_params(ViewsParams, poses=(views_io.to_json(view),))
     done = views({"photo.0": view.photo, "cloud.0": cloud}, params, tmp_path / "out", silent)
     assert not done.warnings
     kept = views_io.load(done.files["views"])[0]

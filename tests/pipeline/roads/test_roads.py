@@ -26,6 +26,7 @@ from scan2sim.pipeline.roads.lanes import sections
 from scan2sim.pipeline.roads.model import Road
 from scan2sim.pipeline.steps.roads import ROADS, RoadsParams
 from tests.fakes import synthetic as worlds
+from tests.fakes.steps import step_params
 from tests.pipeline.roads.made_up import FALL, KERB, Street
 
 STREET = Street()
@@ -34,7 +35,7 @@ STREET = Street()
 def run(folder: Path, inputs: dict[str, Path], **params: Any) -> Done:
     out = folder / "out"
     out.mkdir(parents=True)
-    return ROADS.run(inputs, RoadsParams(**params), out, silent)
+    return ROADS.run(inputs, step_params(RoadsParams, **params), out, silent)
 
 
 @pytest.fixture(scope="module")

@@ -17,17 +17,19 @@ from scan2sim.flows.pipelines.tile import build_graph
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.errors import DataError, InputError
 from scan2sim.pipeline.core.step import Done, Step, silent
+from scan2sim.pipeline.core.tile_cell import TileCell
 from scan2sim.pipeline.core.types import Frame, Mesh, PointCloud
 from scan2sim.pipeline.geometry.height_map import Raster
 from scan2sim.pipeline.geometry.surface_distance import distances
 from scan2sim.pipeline.io.geodata import footprints
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.geometry import GEOMETRY
-from scan2sim.pipeline.steps.ground import GROUND, GroundParams, merge_neighbours
+from scan2sim.pipeline.steps.ground import GROUND, merge_neighbours
 from scan2sim.pipeline.steps.poisson import POISSON
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.voxel import VOXEL
 from scan2sim.pipeline.steps.walls import WALLS
+from tests.fakes.steps import step_params
 
 FRAME = Frame("EPSG:32633", (500000.0, 5400000.0, 200.0))
 HOUSE, ANNEX = (-6.0, -4.0, 4.0, 4.0, 6.0), (4.0, -4.0, 9.0, 4.0, 3.0)  # x0, y0, x1, y1, height of the roof
@@ -36,7 +38,7 @@ SAMPLE = Path(__file__).resolve().parents[3] / "data_samples" / "tile"
 
 def go(step: Step, out: Path, inputs: dict[str, Path], **params: Any) -> Done:
     out.mkdir(parents=True, exist_ok=True)
-    return step.run(inputs, step.params(**params), out, silent)
+    return step.run(inputs, step_params(step.params, **params), out, silent)
 
 
 def floor(xy: np.ndarray) -> np.ndarray:
@@ -227,7 +229,7 @@ def test_neighbours_fill_a_hole_on_their_border_alike(house: dict[str, Path], tm
                 inputs[key] = file
         cell = {"seed": seeds[own], "neighbours": {other: seeds[other]}, "name": own, "buffer": 2.0}
         cloud = PointCloud.load(go(GROUND, tmp_path / own, inputs, **cell).files["synthesized"])
-        assert len(merge_neighbours(inputs, GroundParams(**cell), "terrain")) == len(PointCloud.load(house["terrain"]))
+        assert len(merge_neighbours(inputs, TileCell(**cell), "terrain")) == len(PointCloud.load(house["terrain"]))
         made[own] = {tuple(xyz) for xyz in cloud.xyz.tolist() if abs(xyz[0]) < 2}
     assert len(made["a"]) > 300
     assert made["a"] == made["b"]

@@ -26,13 +26,14 @@ from scan2sim.pipeline.steps.poisson import POISSON, octree
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.voxel import VOXEL
+from tests.fakes.steps import step_params
 
 FRAME = Frame("EPSG:32633", (500000.0, 5400000.0, 200.0))
 
 
 def go(step: Step, out: Path, inputs: dict[str, Path], **params: Any) -> Done:
     out.mkdir(parents=True, exist_ok=True)
-    return step.run(inputs, step.params(**params), out, silent)
+    return step.run(inputs, step_params(step.params, **params), out, silent)
 
 
 def bumpy(n: int = 120_000, size: float = 12.0, seed: int = 0) -> PointCloud:

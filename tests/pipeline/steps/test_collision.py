@@ -13,6 +13,7 @@ from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import Mesh, PointCloud
 from scan2sim.pipeline.steps.collision import COLLISION, CollisionParams
 from tests.fakes import synthetic
+from tests.fakes.steps import step_params
 
 NONE = Mesh(synthetic.UTM, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
 
@@ -22,7 +23,7 @@ def _run(folder: Path, meshes: dict[str, Mesh], **params: object) -> tuple[Mesh,
     for group, mesh in meshes.items():
         inputs[group] = folder / f"{group}.npz"
         mesh.save(inputs[group])
-    done = COLLISION.run(inputs, CollisionParams(**params), folder, silent)
+    done = COLLISION.run(inputs, step_params(CollisionParams, **params), folder, silent)
     return Mesh.load(done.files["mesh"]), done
 
 

@@ -18,6 +18,7 @@ from scan2sim.pipeline.core.types import F32, Camera, Frame, PointCloud, Tile, T
 from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.steps.photo_coverage import CLOSING_CELL_M, PHOTO_COVERAGE, ROADSIDE_M
+from tests.fakes.steps import step_params
 
 CAMERA = Camera("pinhole", 1200, 400, 700.0, 700.0, 600.0, 200.0)
 
@@ -54,7 +55,7 @@ def left(done: Done) -> PointCloud:
 
 
 def go(inputs: dict[str, Path], out: Path, **params: Any) -> Done:
-    return PHOTO_COVERAGE.run(inputs, PHOTO_COVERAGE.params(**params), out, silent)
+    return PHOTO_COVERAGE.run(inputs, step_params(PHOTO_COVERAGE.params, **params), out, silent)
 
 
 def test_what_photos_see_and_the_lane_stay_and_the_rest_goes(street: dict[str, Path], tmp_path: Path) -> None:

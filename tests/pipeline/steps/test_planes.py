@@ -15,6 +15,7 @@ from scan2sim.pipeline.steps.planes import PLANES
 from scan2sim.pipeline.steps.poisson import POISSON
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.voxel import VOXEL
+from tests.fakes.steps import step_params
 
 NOISE = 0.01
 PATH = Trajectory(np.array([0.0, 1.0]), np.array([[-8.0, -8.0, 2.0], [-7.0, -9.0, 2.0]]))
@@ -23,7 +24,7 @@ PATH = Trajectory(np.array([0.0, 1.0]), np.array([[-8.0, -8.0, 2.0], [-7.0, -9.0
 def go(step: Step, folder: Path, inputs: dict[str, Path], **given: Any) -> Done:
     out = folder / step.name
     out.mkdir(exist_ok=True)
-    return step.run(inputs, step.params(**given), out, silent)
+    return step.run(inputs, step_params(step.params, **given), out, silent)
 
 
 def laid(

@@ -13,6 +13,7 @@ from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.io.geodata import geotiff
 from scan2sim.pipeline.steps.rasters import RASTERS, RastersParams
 from tests.fakes import synthetic
+from tests.fakes.steps import step_params
 
 rasterio = pytest.importorskip("rasterio", reason="rasterio isn't installed")
 FEET = Frame("EPSG:2263", (300_000.0, 60_000.0, 10.0), 1200 / 3937)
@@ -23,7 +24,7 @@ def made(folder: Path, frame: Frame = synthetic.UTM, **params: object) -> Done:
     meshes = {"terrain": synthetic.ground(frame=frame), "building": synthetic.house(frame)}
     inputs = {group: synthetic.textured(folder / group, mesh) for group, mesh in meshes.items()}
     (folder / "out").mkdir()
-    return RASTERS.run(inputs, RastersParams(name="street", pixel=0.1, **params), folder / "out", silent)
+    return RASTERS.run(inputs, step_params(RastersParams, name="street", pixel=0.1, **params), folder / "out", silent)
 
 
 def at(file: Path, frame: Frame, x: float, y: float) -> np.ndarray:
@@ -70,7 +71,7 @@ def test_where_nothing_is_they_say_so(tmp_path: Path) -> None:
     hole = np.abs(ground.corners.mean(axis=1)[:, :2]).max(axis=1) > 4
     inputs = {"terrain": synthetic.textured(tmp_path / "terrain", ground.keep(hole))}
     (tmp_path / "out").mkdir()
-    done = RASTERS.run(inputs, RastersParams(pixel=0.1), tmp_path / "out", silent)
+    done = RASTERS.run(inputs, step_params(RastersParams, pixel=0.1), tmp_path / "out", silent)
     for file in geotiff.find(done.files["rasters"], "tile").values():
         with rasterio.open(file) as raster:
             valid = raster.dataset_mask() > 0
@@ -97,4 +98,9 @@ def test_a_raster_beyond_bounds_is_refused_with_the_size_that_fits(tmp_path: Pat
     uv, page = np.zeros((1, 3, 2), np.float32), np.zeros(1, np.int16)
     far = Mesh(synthetic.UTM, corners, np.array([[0, 1, 2]], np.int32), uv=uv, page=page)
     with pytest.raises(SettingError, match=r"export.rasters=3\.1 or more"):
-        RASTERS.run({"terrain": synthetic.textured(tmp_path / "t", far)}, RastersParams(pixel=0.1), tmp_path, silent)
+        RASTERS.run(
+            {"terrain": synthetic.textured(tmp_path / "t", far)},
+            step_params(RastersParams, pixel=0.1),
+            tmp_path,
+            silent,
+        )

@@ -35,6 +35,7 @@ from scan2sim.pipeline.tiling.borders.gap import Gap, gap
 from scan2sim.pipeline.tiling.borders.join import join
 from scan2sim.pipeline.tiling.borders.open_edges import on_border
 from tests.conftest import ROOT
+from tests.fakes.steps import step_params
 from tests.present import present
 
 X, Y, Z = 500_000.0, 5_400_000.0, 200.0  # the middle of the made-up scenes
@@ -119,7 +120,7 @@ def crowded(mesh: Mesh) -> int:
 
 def go(step: Step, out: Path, inputs: Mapping[str, Path], **params: Any) -> Done:
     out.mkdir(parents=True, exist_ok=True)
-    return step.run(inputs, step.params(**params), out, silent)
+    return step.run(inputs, step_params(step.params, **params), out, silent)
 
 
 @pytest.fixture(scope="module")
@@ -270,7 +271,8 @@ def test_what_is_touched_meets_at_the_border_and_is_thinned_at_all_other_rims(tw
             out / "cloud.npz"
         )  # it is fitted to that
         inputs = {"terrain": out / "terrain.npz", "cloud": out / "cloud.npz"}
-        done = go(COLLISION, out, inputs, triangles=1000, place=cell.seed, neighbours=cell.neighbours)
+        tile_cell = {"name": "a", "seed": cell.seed, "neighbours": cell.neighbours}
+        done = go(COLLISION, out, inputs, triangles=1000, context=tile_cell)
         solid[name] = Mesh.load(done.files["mesh"])
         assert len(solid[name]) <= 1000 and not done.warnings
         before, after = (rim_edges(one, cell) for one in (mesh, solid[name]))
@@ -285,7 +287,7 @@ def test_a_border_that_needs_more_than_the_budget_is_kept_and_said(two: Any, tmp
     _, _, joined = two
     cell = cells(SEEDS)["west"]
     joined["west"].save(tmp_path / "terrain.npz")
-    given = {"place": cell.seed, "neighbours": cell.neighbours}
+    given = {"context": {"name": "a", "seed": cell.seed, "neighbours": cell.neighbours}}
     done = go(COLLISION, tmp_path / "solid", {"terrain": tmp_path / "terrain.npz"}, triangles=100, **given)
     assert done.facts["triangles"] > 100 and "borders" in done.warnings[0]
     between = gap(joined["east"], Mesh.load(done.files["mesh"]), cells(SEEDS)["east"], "west")

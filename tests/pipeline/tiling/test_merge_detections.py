@@ -31,6 +31,7 @@ from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.voxel import VOXEL
 from scan2sim.pipeline.tiling.borders.gap import gap
 from scan2sim.pipeline.tiling.borders.merge_detections import merged_detections
+from tests.fakes.steps import step_params
 from tests.present import present
 
 X, Y, Z = 500_000.0, 5_400_000.0, 200.0
@@ -80,7 +81,7 @@ def street() -> tuple[F64, Any]:
 
 def go(step: Step, out: Path, inputs: Mapping[str, Path], **params: Any) -> Done:
     out.mkdir(parents=True, exist_ok=True)
-    return step.run(inputs, step.params(**params), out, silent)
+    return step.run(inputs, step_params(step.params, **params), out, silent)
 
 
 def known(name: str) -> dict[str, Any]:
@@ -200,7 +201,7 @@ def test_surfaces_meet_vertex_for_vertex(tiles: dict[str, Tile], clouds: dict[st
         out = tmp_path / name
         seen = {"cloud": tile.split.files["building"], "path": clouds[f"{name}.path"]}
         thin = go(VOXEL, out / "1", seen).files["cloud"]
-        raw = go(POISSON, out / "2", {"cloud": thin}, aligned=True).files["mesh"]
+        raw = go(POISSON, out / "2", {"cloud": thin}, seed=(0, 0)).files["mesh"]
         trimmed = go(TRIM, out / "3", {"mesh": raw, "cloud": thin}).files["mesh"]
         kept = go(ISLANDS, out / "4", {"mesh": trimmed}).files["mesh"]
         clips[name] = go(CLIP, out / "5", {"mesh": kept}, **known(name)).files
@@ -220,7 +221,12 @@ def test_surfaces_meet_vertex_for_vertex(tiles: dict[str, Tile], clouds: dict[st
     # bodies touch the sign on both sides of the border, in the tile that has it
     (owner,) = [n for n, mesh in surfaces.items() if (present(mesh.classification) == CODE["road_sign"]).any()]
     file = tmp_path / owner / "7" / "mesh.npz"
-    done = go(COLLISION, tmp_path / "solid", {"building": file}, place=SEEDS[owner], neighbours=cell(owner).neighbours)
+    done = go(
+        COLLISION,
+        tmp_path / "solid",
+        {"building": file},
+        context={"name": owner, "seed": SEEDS[owner], "neighbours": cell(owner).neighbours},
+    )
     solid = Mesh.load(done.files["mesh"])
     plate = world(solid.keep(present(solid.classification) == CODE["road_sign"]))
     assert plate[:, 0].min() < X - 0.2 and plate[:, 0].max() > X + 0.2
