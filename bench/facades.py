@@ -73,7 +73,7 @@ def evaluate(folder: Path, seed: int, degrees: float) -> dict[str, float]:
     begin = time.process_time()
     done = run_step(FACADES, inputs | {f"other.{part}": path for part, path in thin.items()})
     seconds = time.process_time() - begin
-    made, truth = PointCloud.load(done.files["made"]), Mesh.load(tile.truth_mesh)
+    made, truth = PointCloud.load(done.files["synthesized"]), Mesh.load(tile.truth_mesh)
     off = distances(made.xyz, truth.moved_to(made.frame))
     walls = oriented_normals(
         sample(whole.take(~low & (whole.classification == CODE["building"])), 0.1), 16, tile.trajectory

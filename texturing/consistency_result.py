@@ -15,10 +15,10 @@ from scan2sim.pipeline.io.images import image
 
 @dataclass(frozen=True)
 class PhotoConsistency:
-    """Result of the step `agreement`, by index of view.
+    """Result of the step `photo_consistency`, by index of view.
 
     Attributes:
-        folder: contains `agreement.json`, masks and warps.
+        folder: contains `photo_consistency.json`, masks and warps.
         usable: whether the photo may be used for texture.
         quality_factors: factor on the photo's quality, below 1 if it is blurred.
     """
@@ -32,13 +32,13 @@ class PhotoConsistency:
         """Read the folder that the step wrote.
 
         Raises:
-            InputError: `agreement.json` is missing or damaged.
+            InputError: `photo_consistency.json` is missing or damaged.
         """
-        path = folder / "agreement.json"
+        path = folder / "photo_consistency.json"
         try:
             rows = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, json.JSONDecodeError) as error:
-            raise InputError(path, f"can't be read ({error})", "Run again with `--from agreement`") from None
+            raise InputError(path, f"can't be read ({error})", "Run again with `--from photo_consistency`") from None
         return cls(folder, tuple(row["usable"] for row in rows), tuple(row["sharpness_factor"] for row in rows))
 
     def sharpness(self, i: int) -> float:

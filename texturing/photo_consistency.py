@@ -1,4 +1,4 @@
-"""Photo consistency step (`agreement`): compares each photo with its neighbours and masks what is inconsistent.
+"""Photo consistency step (`photo_consistency`): compares each photo with its neighbours and masks what is inconsistent.
 
 Every photo is predicted from its neighbours (`texturing.photo_prediction`). Regions where at least two other photos
 agree and this one differs are ghosts (a moving car, a person, its shadow, a reflection) and are masked, as is sky that
@@ -58,7 +58,7 @@ SKY_OUTLINE_TOLERANCE_M = 0.5
 """Error of a surface's outline in metres: five voxels of the default size, as for foliage."""
 
 
-class AgreementParams(Params):
+class PhotoConsistencyParams(Params):
     """Settings of the photo consistency check.
 
     Attributes:
@@ -68,7 +68,7 @@ class AgreementParams(Params):
         neighbours: number of photos that each photo is compared with.
         max_shift: pixels (of a photo scaled to 0.25 MP) by which a photo may be shifted against the others; photos
             with a larger shift are excluded; 0: no limit.
-        max_distance, min_cos, bias: as in the step `choose`.
+        max_distance, min_cos, bias: as in the step `view_selection`.
     """
 
     ghosts: bool = True
@@ -81,17 +81,17 @@ class AgreementParams(Params):
     bias: Depth = 0.04
 
 
-def agreement(inputs: Inputs, params: AgreementParams, out: Path, report: Report) -> Done:
+def photo_consistency(inputs: Inputs, params: PhotoConsistencyParams, out: Path, report: Report) -> Done:
     """Compare every photo that is not held out with its neighbours.
 
     Inputs: `views`, `depth` (folder of depth maps), `exposures`.
-    Folder: `agreement`, with `agreement.json` (one row per view), `mask_<i>.png` for photos with masked pixels (own
-    mask, ghosts, sky), and `warp_<i>.npy` for photos that are warped.
+    Folder: `photo_consistency`, with `photo_consistency.json` (one row per view), `mask_<i>.png` for photos with
+    masked pixels (own mask, ghosts, sky), and `warp_<i>.npy` for photos that are warped.
     """
     from scan2sim.pipeline.camera.depth_map import load_depth_map
     from scan2sim.texturing.photo_cache import Exposures, PhotoCache, camera_of
 
-    folder = out / "agreement"
+    folder = out / "photo_consistency"
     folder.mkdir()
     views = views_io.load(inputs["views"])
     held = views_io.load_held_out(inputs["views"])
@@ -125,12 +125,14 @@ def agreement(inputs: Inputs, params: AgreementParams, out: Path, report: Report
         if params.align and compared.warp is not None:
             np.save(folder / f"warp_{i}.npy", compared.warp)
     _exclude_and_downweight(rows, params)
-    (folder / "agreement.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
-    return Done({"agreement": folder}, _metrics(rows, used), [str(row["reason"]) for row in rows if "reason" in row])
+    (folder / "photo_consistency.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    return Done(
+        {"photo_consistency": folder}, _metrics(rows, used), [str(row["reason"]) for row in rows if "reason" in row]
+    )
 
 
 def neighbours(
-    views: Sequence[View], used: Sequence[int], depth: Callable[[int], DepthMap], params: AgreementParams
+    views: Sequence[View], used: Sequence[int], depth: Callable[[int], DepthMap], params: PhotoConsistencyParams
 ) -> dict[int, list[int]]:
     """For each view the neighbours that see most of its surface at a similar resolution, best first."""
     from scan2sim.pipeline.camera.depth_map import visible
@@ -172,7 +174,7 @@ class Comparison:
     """A photo compared with its prediction.
 
     Attributes:
-        figures: columns of `agreement.json`.
+        figures: columns of `photo_consistency.json`.
         ghosts: (h, w) where the photo shows a ghost; None: unknown.
         warp: displacement field of `warp_of`; None: unknown.
     """
@@ -189,7 +191,7 @@ def compare(
     depth: Callable[[int], DepthMap],
     photos: PhotoCache,
     exposures: Exposures,
-    params: AgreementParams,
+    params: PhotoConsistencyParams,
 ) -> Comparison:
     """Predict photo `i` from the photos `others`, and compare it with the prediction."""
     import cv2
@@ -325,7 +327,7 @@ def combined(ghosts: Bools | None, mask: U8) -> U8 | None:
     return allowed
 
 
-def _exclude_and_downweight(rows: list[dict[str, Any]], params: AgreementParams) -> None:
+def _exclude_and_downweight(rows: list[dict[str, Any]], params: PhotoConsistencyParams) -> None:
     """Exclude overexposed and shifted photos, and set the weight of blurred ones, by their figures; in place."""
     for row in rows:
         if not row["usable"]:
@@ -345,7 +347,7 @@ def _exclude_and_downweight(rows: list[dict[str, Any]], params: AgreementParams)
             row |= {
                 "usable": False,
                 "reason": f"{row['name']}: excluded, it is shifted by {row['shift_px']:.1f} pixels against the other "
-                "photos: check its pose (`agreement.max_shift` is the limit)",
+                "photos: check its pose (`photo_consistency.max_shift` is the limit)",
             }
         elif row["sharpness_factor"] < 1:
             row["reason"] = (
@@ -367,4 +369,4 @@ def _metrics(rows: Sequence[dict[str, Any]], used: Sequence[int]) -> dict[str, A
     }
 
 
-AGREEMENT = Step("agreement", 3, agreement, AgreementParams)
+PHOTO_CONSISTENCY = Step("photo_consistency", 3, photo_consistency, PhotoConsistencyParams)

@@ -91,7 +91,7 @@ class Predictor:
     Args:
         surface: visible surface of the view.
         count: number of photos that will be added.
-        max_distance, min_cos, bias: as in `ChooseParams`.
+        max_distance, min_cos, bias: as in `ViewSelectionParams`.
     """
 
     def __init__(self, surface: Surface, count: int, *, max_distance: float, min_cos: float, bias: float) -> None:

@@ -49,7 +49,7 @@ class TextureParams(Params):
         bias: metres that a surface may lie behind the depth map and still count as visible.
         feather: share of a photo's width over which its weight fades towards the photo's border.
         padding: texels by which colours are extended beyond the charts, for mip-maps.
-        continued: inpaint surfaces for which neither a photo nor a point gives a colour, keeping the pattern around
+        inpaint: inpaint surfaces for which neither a photo nor a point gives a colour, keeping the pattern around
             them; for flat surfaces such as the ground.
         device: "numba": CPU; "cuda" or another torch device: GPU, equal to the CPU within one grey level; "auto": GPU
             if torch and a GPU are available.
@@ -62,7 +62,7 @@ class TextureParams(Params):
     bias: Depth = 0.04
     feather: float = Field(0.04, ge=0.0001, le=0.5)
     padding: int = Field(16, ge=2, le=256)
-    continued: bool = False
+    inpaint: bool = False
     device: Device = "auto"
 
 
@@ -70,9 +70,9 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     """Bake the texture pages of an unwrapped mesh.
 
     Inputs: `mesh` (with uv and page), `pages` (their sizes), `choice` (selected photos), `views`, `depth` (folder with
-    a depth map for every view), `exposures`, `agreement` (masks and warps of the photos), `cloud.*` (coloured points;
-    `cloud.rest`, the classes without a surface, is not used for colours), `made.*` (synthesized points, optional),
-    `things` (GeoJSON of the removed vehicles and people, optional).
+    a depth map for every view), `exposures`, `photo_consistency` (masks and warps of the photos), `cloud.*` (coloured
+    points; `cloud.rest`, the classes without a surface, is not used for colours), `synthesized.*` (synthesized points,
+    optional), `instances` (GeoJSON of the removed vehicles and people, optional).
     File: `textured`, a folder with `mesh.npz`, `page_<i>.png` and `page_<i>_seen.png` (255 seen by a photo,
     128 coloured from points, 64 filled from neighbours or by class, 0 no surface).
     """
@@ -89,7 +89,7 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     assert mesh.page is not None
     sizes = json.loads(inputs["pages"].read_text(encoding="utf-8"))
     baker = _baker(mesh, inputs, params)
-    ground = _ground_orthophoto(mesh, sizes, inputs) if params.continued else None
+    ground = _ground_orthophoto(mesh, sizes, inputs) if params.inpaint else None
     (colours, measured), synthesized = point_colours(inputs, ground), synthesized_colours(inputs)
     counts = np.zeros((len(mesh), 4), np.int64)
     writer = PageWriter()
@@ -130,7 +130,7 @@ def _baker(mesh: Mesh, inputs: Inputs, params: TextureParams) -> Baker:
         Choice.load(inputs["choice"]),
         lambda i: inputs["depth"] / f"{i}.npy",
         Exposures.load(inputs["exposures"]),
-        PhotoConsistency.load(inputs["agreement"]),
+        PhotoConsistency.load(inputs["photo_consistency"]),
         settings=BlendSettings(params.bias, params.power, params.feather, params.min_cos, params.band),
         fade=params.fade,
         device=best_device() if params.device == "auto" else params.device,
@@ -144,7 +144,7 @@ def _ground_orthophoto(mesh: Mesh, sizes: Sequence[dict[str, int]], inputs: Inpu
     from scan2sim.texturing.inpainting.point_colours import classes_of
 
     cloud = PointCloud.load(inputs["cloud.terrain"])
-    removed = parked_vehicle_outlines(inputs["things"], mesh.frame) if "things" in inputs else []
+    removed = parked_vehicle_outlines(inputs["instances"], mesh.frame) if "instances" in inputs else []
     return GroundOrthophoto(mesh, _texel_m(mesh, sizes), cloud.xyz, classes_of(cloud), removed)
 
 
@@ -249,7 +249,7 @@ TEXTURE = Step(
     7,
     texture,
     TextureParams,
-    class_defaults={"terrain": {"continued": True}},
+    class_defaults={"terrain": {"inpaint": True}},
     check=can_texture,
     per_class=True,
     memory=(1.2, 3),

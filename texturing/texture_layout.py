@@ -39,10 +39,10 @@ class UnwrapParams(Params):
         backend: "photo" (charts are projections into one photo), "xatlas" (deterministic) or "uvatlas" (fewer, larger
             charts, several times slower, not deterministic). "xatlas" and "uvatlas" are each other's fallback;
             "xatlas" unwraps what "photo" leaves.
-        unseen: factor on the texel size where no photo sees the surface, as point colours are coarser (only with
-            "photo").
+        unseen_texel_factor: factor on the texel size where no photo sees the surface, as point colours are coarser
+            (only with "photo").
         texel: texel size in metres; 1 cm, vegetation 3 cm.
-        signs: divisor of the texel size on sign panels, so that they can be read (only with "photo").
+        sign_texel_divisor: divisor of the texel size on sign panels, so that they can be read (only with "photo").
         page_size: largest width and height of a page in texels.
         gutter: texels between charts; 2 for vegetation, which has many small charts.
         block_faces: maximum number of triangles unwrapped at once.
@@ -50,9 +50,9 @@ class UnwrapParams(Params):
     """
 
     backend: Literal["photo", "xatlas", "uvatlas"] = "photo"
-    unseen: float = Field(4.0, ge=1, le=100)
+    unseen_texel_factor: float = Field(4.0, ge=1, le=100)
     texel: Texel = 0.01
-    signs: float = Field(2.5, ge=1, le=100)
+    sign_texel_divisor: float = Field(2.5, ge=1, le=100)
     page_size: int = Field(4096, ge=64, le=8192)
     gutter: int = Field(4, ge=1, le=64)
     block_faces: int = Field(60_000, ge=100, le=1_000_000)

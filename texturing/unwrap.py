@@ -55,10 +55,10 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
         if params.backend == "photo":
             detail_view, centres, pixel = _detail_views(inputs)
             orthophoto_pixel = np.append(pixel, 0.0)[detail_view]
-            unseen = params.model_copy(update={"texel": params.texel * params.unseen})
+            unseen = params.model_copy(update={"texel": params.texel * params.unseen_texel_factor})
             orthophoto_texel = max(params.texel, ORTHOPHOTO_TEXEL_PX * float(orthophoto_pixel.max()))
             orthophoto = params.model_copy(update={"texel": orthophoto_texel})
-            sign_panel = params.model_copy(update={"texel": params.texel / params.signs})
+            sign_panel = params.model_copy(update={"texel": params.texel / params.sign_texel_divisor})
             is_sign = (
                 np.zeros(len(mesh), bool) if mesh.classification is None else mesh.classification == CODE["road_sign"]
             )

@@ -66,7 +66,7 @@ def _labelled(name: str, folder: Path) -> Iterator[tuple[View, dict[str, U8]]]:
     path, _ = build_world(STREETS[name], folder, run=False)
     run("segment", path / "tile.toml", "--out", folder / "told")
     tile = read_tile(path / "tile.toml")
-    standing = next((folder / "told" / "steps" / "things").rglob("cloud.npz"))  # without moving objects
+    standing = next((folder / "told" / "steps" / "instances").rglob("cloud.npz"))  # without moving objects
     cloud = sample(PointCloud.load(standing), VOXEL_M)
     assert cloud.classification is not None
     scan, classifier = ScanProjector(cloud, VOXEL_M), Classifier(load("street", None), "street")

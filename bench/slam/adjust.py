@@ -21,7 +21,7 @@ from scan2sim.slam.global_map.sparse_model import update_map
 from scan2sim.slam.mapping.cross_validation import compare_paths
 from scan2sim.slam.odometry.odometry import Odometry
 from scan2sim.slam.video import open_video
-from tests.slam.synthetic import Follower, Narrow, ate, drive, run, scatter
+from tests.fakes.slam_drive import Follower, Narrow, ate, drive, run, scatter
 
 DRIVES, SECONDS = 20, 20.0
 FEATURE_COUNTS = 640, 700, 760

@@ -55,7 +55,7 @@ def survey_of(
         if drop_damaged(planned, store, {item.task.id.name for item in planned}):
             planned, store, digests = plan_drive(source, out, length=length, buffer=buffer)
         outcome = run(planned, store)
-        if "place" in outcome.of_tile():
+        if "georeference" in outcome.of_tile():
             publish_path(planned, outcome.of_tile(), store, out / "slam")
             _check_path(planned, outcome.of_tile(), out / "slam")
         outcome.check()
@@ -78,11 +78,11 @@ def _check_path(planned: list[PlannedTask], done: dict[str, Manifest], slam: Pat
     names = {item.task.id.name for item in planned}
     if "fuse" not in names and not any(getattr(item.task.params, "keep_unsure", False) for item in planned):
         remedy = "Add gps to [slam], fix the causes that slam.json lists, or set keep_unsure = true in [sweeps]"
-        check_sure(done["place"].facts["unsure_share"], slam, remedy)
+        check_sure(done["georeference"].facts["unsure_share"], slam, remedy)
 
 
 def found(place: Path) -> Path:
-    """The file of a source: `place` itself, or a survey.toml, drive.toml or tile.toml in that folder.
+    """The file of a source: `georeference` itself, or a survey.toml, drive.toml or tile.toml in that folder.
 
     Raises:
         InputError: there is none.
@@ -113,7 +113,7 @@ def plan_drive(
 
 
 def _link(folder: Path, place: Path) -> None:
-    """Create or update the symbolic link `place` to a result."""
+    """Create or update the symbolic link `georeference` to a result."""
     if place.is_symlink():
         place.unlink()
     if not place.exists():

@@ -23,7 +23,7 @@ def residue_areas(meshes: Sequence[Mesh], geojson: Path) -> list[float]:
 
     Args:
         meshes: meshes of the world, in one frame.
-        geojson: GeoJSON of boxes on the ground in the meshes' CRS, from the step `things`.
+        geojson: GeoJSON of boxes on the ground in the meshes' CRS, from the step `instances`.
     """
     out = []
     for feature in json.loads(geojson.read_text(encoding="utf-8"))["features"]:

@@ -14,7 +14,7 @@ from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import I64, Bools, Frame, Mesh, PointCloud
 from scan2sim.pipeline.furniture.object_lists import sign_panel_columns, write_lists
-from scan2sim.pipeline.steps.finds import KINDS
+from scan2sim.pipeline.steps.detect_furniture import KINDS
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.furniture.classify import Detection
@@ -43,23 +43,23 @@ class FurnitureParams(Params):
 
 
 def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report) -> Done:
-    """Model the detections `finds` of the tile and `finds.NAME` of its neighbours, and select their points in `cloud`.
+    """Model the `detections` of the tile and of its neighbours (`detections.NAME`); select their points in `cloud`.
 
     An object belongs to the tile whose cell contains its foot; its points are removed from the surfaces of all tiles.
     If that tile is not given, its points are removed nevertheless, and no tile has a mesh of it.
 
-    Files: `building` (signs, poles and lamps) and `vegetation` (trunks), meshes with a class code per face; `taken`,
-    .npz with `index` (N,) of the points of objects, and `own` (N,), True for objects of this tile; `geojson` and
-    `csv`: position in the tile's CRS, kind, height above the ground, radius, and heading of sign panels (of lamps: of
-    the arm), clockwise from the CRS's north; `plates`, JSON list of all sign panels, local metres; `beside`, JSON list
-    of the feet (x, y, z) of the neighbours' poles, local metres.
+    Files: `building` (signs, poles and lamps) and `vegetation` (trunks), meshes with a class code per face;
+    `furniture_points`, .npz with `index` (N,) of the points of objects, and `own` (N,), True for objects of this tile;
+    `geojson` and `csv`: position in the tile's CRS, kind, height above the ground, radius, and heading of sign panels
+    (of lamps: of the arm), clockwise from the CRS's north; `sign_panels`, JSON list of all sign panels, local metres;
+    `neighbour_poles`, JSON list of the feet (x, y, z) of the neighbours' poles, local metres.
     """
     cloud = PointCloud.load(inputs["cloud"])
     own, others = _load_detections(inputs, params, cloud.frame)
     report(0.5, "points")
     index, whose = _points_of(cloud, own, others)
-    np.savez(out / "taken.npz", index=index, own=whose)
-    files = {"taken": out / "taken.npz"}
+    np.savez(out / "furniture_points.npz", index=index, own=whose)
+    files = {"furniture_points": out / "furniture_points.npz"}
     faces = 0
     for group, trunks in (("building", False), ("vegetation", True)):
         mesh = _mesh(cloud.frame, [detection for detection in own if (detection.kind == "trunk") == trunks])
@@ -68,14 +68,14 @@ def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report
         faces += len(mesh)
     files |= write_lists(out, cloud.frame.crs, [_row(detection, cloud.frame) for detection in own])
     lists = {
-        "plates": [plate.to_json() for detection in own for plate in detection.plates],
-        "beside": [detection.foot.tolist() for detection in others if detection.kind != "trunk"],
+        "sign_panels": [plate.to_json() for detection in own for plate in detection.plates],
+        "neighbour_poles": [detection.foot.tolist() for detection in others if detection.kind != "trunk"],
     }
     for name, rows in lists.items():
         files[name] = out / f"{name}.json"
         files[name].write_text(json.dumps(rows), encoding="utf-8")
     kinds = {kind: sum(detection.kind == kind for detection in own) for kind in KINDS}
-    return Done(files, {**kinds, "points": len(index), "of_neighbours": int((~whose).sum()), "faces": faces})
+    return Done(files, {**kinds, "points": len(index), "neighbour_points": int((~whose).sum()), "faces": faces})
 
 
 def _load_detections(inputs: Inputs, params: FurnitureParams, frame: Frame) -> tuple[list[Detection], list[Detection]]:
@@ -86,8 +86,8 @@ def _load_detections(inputs: Inputs, params: FurnitureParams, frame: Frame) -> t
     def read(path: Path) -> list[Detection]:
         return [Detection.from_json(row) for row in json.loads(path.read_text(encoding="utf-8"))]
 
-    finds = {params.name: read(inputs["finds"])}
-    finds |= {name: read(inputs[f"finds.{name}"]) for name in params.neighbours if f"finds.{name}" in inputs}
+    finds = {params.name: read(inputs["detections"])}
+    finds |= {name: read(inputs[f"detections.{name}"]) for name in params.neighbours if f"detections.{name}" in inputs}
     if params.seed is None:
         merged = [(params.name, detection) for detection in finds[params.name]]
     else:

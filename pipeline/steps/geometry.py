@@ -37,8 +37,8 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
     """Measure `mesh.*` against `cloud.*`, and against `truth.mesh` of a generated tile.
 
     Metrics per class, in metres: `cloud_to_mesh_mean_m` and `cloud_to_mesh_p95_m` (from points to the nearest point of
-    the mesh); `truth_mean_m` (from the mesh to the ground-truth surface of its class). `made_up` is the fraction of the
-    mesh's area that is nearer to synthesized points (`made.*`) than to scanned ones.
+    the mesh); `truth_mean_m` (from the mesh to the ground-truth surface of its class). `synthesized` is the fraction
+    of the mesh's area that is nearer to synthesized points (`synthesized.*`) than to scanned ones.
     """
     facts: dict[str, dict[str, Any]] = {}
     warnings: list[str] = []
@@ -73,9 +73,9 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
                 f"{group}: 5 % of the points are further than {metrics['cloud_to_mesh_p95_m']:.1f} m from the mesh; "
                 "parts of the scan are missing in the world (too few points for a surface, or points of another class)"
             )
-        if f"made.{group}" in inputs:
-            synthesized = PointCloud.load(inputs[f"made.{group}"])
-            metrics["made_up"] = synthesized_fraction(
+        if f"synthesized.{group}" in inputs:
+            synthesized = PointCloud.load(inputs[f"synthesized.{group}"])
+            metrics["synthesized"] = synthesized_fraction(
                 mesh, PointCloud.load(inputs[f"cloud.{group}"]), synthesized, params.samples
             )
         if truth is not None and truth.classification is not None:

@@ -81,7 +81,7 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
         channels = scan.channels(view, classifier.size(view.camera)) if scan else None
         np.save(folder / f"{i}.npy", classifier.probabilities(rgb, view.camera, channels))
     info = network.info
-    about = {"network": info.name, "sha256": info.sha256, "licence": info.licence, "tells": classifier.classes}
+    about = {"network": info.name, "sha256": info.sha256, "licence": info.licence, "classes": classifier.classes}
     (folder / "network.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
     return Done(
         {"labels": folder},

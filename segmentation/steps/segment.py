@@ -46,7 +46,7 @@ def segment(inputs: Inputs, params: SegmentParams, out: Path, report: Report) ->
     """Keep the classes of `cloud`, or classify its points by `labels` (of the step `label`, for `views`) and shape.
 
     Inputs: `cloud`; `views` and `labels`; `path`, the scanner's path (optional); `moving`, moving points from the step
-    `carve`, which hide what is behind them in photos (optional).
+    `dynamic_objects`, which hide what is behind them in photos (optional).
     Files: `cloud`; `confidence`, .npz with `confidence` (N,) uint8, 255 is certain, and `source` (N,) uint8
     (`SOURCE_PHOTO`, `SOURCE_SHAPE` or `SOURCE_CLOUD`).
     """
@@ -141,7 +141,7 @@ def _from_photos(
         report=lambda f, m="": report(0.5 + 0.3 * f, m),
     )  # fmt: skip
     report(0.8, "smoothing")
-    predicted = json.loads((probabilities / "network.json").read_text(encoding="utf-8"))["tells"]
+    predicted = json.loads((probabilities / "network.json").read_text(encoding="utf-8"))["classes"]
     height, ground = split_ground(thin.xyz)
     moved = transient(thin, height, ground)
     best, probability = smooth_classes(

@@ -58,13 +58,14 @@ class OdometryParams(MapParams):
         count: number of features tracked at a time.
         parallax: degrees; a frame becomes a keyframe when its median parallax to the last keyframe, rotation
             compensated, exceeds this. None: 3 for a 360 camera, 1 for a perspective one, in whose view little moves.
-        survival: a frame also becomes a keyframe when less than this share of the last keyframe's features is tracked.
+        min_tracked_share: a frame also becomes a keyframe when less than this share of the last keyframe's features is
+        tracked.
         seed: seed of the random samples (RANSAC).
     """
 
     count: int = Field(700, ge=50, le=20_000)
     parallax: float | None = Field(None, ge=0.05, le=90)
-    survival: float = Field(0.65, ge=0.01, le=0.99)
+    min_tracked_share: float = Field(0.65, ge=0.01, le=0.99)
     seed: Seed = 0
 
 
@@ -232,7 +233,7 @@ class Odometry:
         """Whether the current frame should become a keyframe: too few common features, or enough parallax."""
         last = self.map.keyframes[-1]
         then, now = self._common_bearings(last)
-        if len(now) < self.params.survival * len(last.ids):
+        if len(now) < self.params.min_tracked_share * len(last.ids):
             return True
         turn = last.T_world_cam[:3, :3].T @ self._pose[:3, :3]
         return _median_angle(now @ turn.T, then) > self._parallax

@@ -98,7 +98,7 @@ def fuse_path(inputs: Inputs, params: FuseParams, out: Path, report: Report) -> 
     output.write(out / "path", replace(path, times=seconds), frame)
     return Done(
         {"path": out / "path", "trajectory": out / "path" / "trajectory.csv"},
-        {"told": summary, "unsure_share": round(float(path.unsure.mean()), 4)},
+        {"summary": summary, "unsure_share": round(float(path.unsure.mean()), 4)},
         warnings,
     )
 

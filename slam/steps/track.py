@@ -108,9 +108,9 @@ def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, 
         )  # fmt: skip
     wrong_lens = _lens_warning(camera, run.odometry, track_log)
     warnings += [] if wrong_lens is None or params.calibrate else [wrong_lens]
-    files = {"mapped": MapCheckpoint.of(run.odometry, run.names).write(out / "mapped.npz")}
+    files = {"map": MapCheckpoint.of(run.odometry, run.names).write(out / "map.npz")}
     views = {"view": view} if params.view else {}
-    metrics = run.metrics() | ({"told": description} if description else {})
+    metrics = run.metrics() | ({"summary": description} if description else {})
     return Done(
         files | views, metrics | (estimated.metrics() if estimated else {}), [*warnings, *dict.fromkeys(run.warnings)]
     )

@@ -12,7 +12,7 @@ from scan2sim.slam.global_map.map_file import MapCheckpoint
 from scan2sim.slam.global_map.sparse_model import sparse_points
 from scan2sim.slam.mapping.cross_validation import compare_paths
 from scan2sim.slam.mapping.local_map import HELD_OUT_EVERY
-from tests.slam.synthetic import Narrow, ate, drive, run, scatter
+from tests.fakes.slam_drive import Narrow, ate, drive, run, scatter
 
 pytest.importorskip("pycolmap")
 

@@ -1,4 +1,4 @@
-"""View selection step (`choose`): which photos colour a face, and which one gives its detail.
+"""View selection step (`view_selection`): which photos colour a face, and which one gives its detail.
 
 The candidates of a face are the best few photos that see it. The photo for the detail is selected by a Markov random
 field over the faces (`texturing.view_selection.mrf`), so that neighbouring faces share a photo where it costs little.
@@ -31,7 +31,7 @@ PIXEL_COUNT_RATIO_MIN = 0.16
 """Smallest number of pixels that a photo has on a sign panel, relative to the photo with most pixels, to be used."""
 
 
-class ChooseParams(Params):
+class ViewSelectionParams(Params):
     """Settings of the view selection.
 
     Attributes:
@@ -49,10 +49,10 @@ class ChooseParams(Params):
     bias: Depth = 0.04
 
 
-def choose(inputs: Inputs, params: ChooseParams, out: Path, report: Report) -> Done:
+def view_selection(inputs: Inputs, params: ViewSelectionParams, out: Path, report: Report) -> Done:
     """Select the photos of every face of `mesh`.
 
-    Inputs: `mesh`, `views`, `depth` (folder of depth maps), `agreement` (usable photos and their masks).
+    Inputs: `mesh`, `views`, `depth` (folder of depth maps), `photo_consistency` (usable photos and their masks).
     File: `choice`, a `Choice`.
     """
     from scan2sim.pipeline.camera.depth_map import load_depth_map
@@ -60,7 +60,7 @@ def choose(inputs: Inputs, params: ChooseParams, out: Path, report: Report) -> D
 
     mesh = Mesh.load(inputs["mesh"])
     views = views_io.load(inputs["views"])
-    consistency = PhotoConsistency.load(inputs["agreement"])
+    consistency = PhotoConsistency.load(inputs["photo_consistency"])
 
     def depth(i: int) -> DepthMap:
         return load_depth_map(inputs["depth"] / f"{i}.npy", views[i].camera, views[i].T_world_cam)
@@ -80,7 +80,7 @@ def choose_views(
     depth: Callable[[int], DepthMap],
     mask: Callable[[int, View], U8],
     sharpness: Callable[[int], float],
-    params: ChooseParams,
+    params: ViewSelectionParams,
     report: Report,
 ) -> tuple[Choice, float]:
     """View selection of all faces, and the share of the total edge length that is a seam."""
@@ -155,4 +155,4 @@ def seam_costs(mesh: Mesh, smoothness: float) -> tuple[I32, F32, F32]:
     return pairs, length, (smoothness * np.minimum(length / median, 4)).astype(np.float32)
 
 
-CHOOSE = Step("choose", 4, choose, ChooseParams, per_class=True)
+VIEW_SELECTION = Step("view_selection", 4, view_selection, ViewSelectionParams, per_class=True)

@@ -25,7 +25,7 @@ from scan2sim.pipeline.roads.course import course
 from scan2sim.pipeline.roads.lanes import sections
 from scan2sim.pipeline.roads.model import Road
 from scan2sim.pipeline.steps.roads import ROADS, RoadsParams
-from tests.pipeline import synthetic as worlds
+from tests.fakes import synthetic as worlds
 from tests.pipeline.roads.made_up import FALL, KERB, Street
 
 STREET = Street()

@@ -19,7 +19,7 @@ from scan2sim.services.teleoperation.gateway.fleet import Fleet, Order
 from scan2sim.services.teleoperation.gateway.web import application
 from scan2sim.services.teleoperation.gateway_protocol import Hello, LinkStatus, Status
 from scan2sim.services.teleoperation.identity import Peer, Role
-from tests.browser import chromium
+from tests.fakes.browser import chromium
 
 HOSTILE = "<img src=x onerror=document.title='hacked'>"
 

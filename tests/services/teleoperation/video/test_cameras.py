@@ -16,8 +16,8 @@ from scan2sim.pipeline.core.types import U8
 from scan2sim.services.teleoperation import cameras, timecode
 from scan2sim.services.teleoperation.cameras import Mount, View, pattern, world
 from scan2sim.services.teleoperation.settings import VehicleParams
+from tests.fakes import synthetic
 from tests.fakes.ports import free_port
-from tests.pipeline import synthetic
 from tests.services.teleoperation.video.videos import psnr, scenery
 
 take = itertools.islice
