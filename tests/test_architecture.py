@@ -85,6 +85,45 @@ def test_no_files_import_each_other() -> None:
     TopologicalSorter(arrows()).prepare()  # raises a CycleError that names them
 
 
+def package_arrows(room: str, depth: int) -> dict[str, set[str]]:
+    """Packages and modules `depth` levels below the root to those of the same room that they import."""
+    graph: dict[str, set[str]] = {}
+    for name, others in arrows().items():
+        if name.startswith(f"{room}."):
+            own = ".".join(name.split(".")[:depth])
+            found = {".".join(other.split(".")[:depth]) for other in others if other.startswith(f"{room}.")}
+            graph[own] = graph.get(own, set()) | found - {own}
+    return graph
+
+
+@pytest.mark.parametrize(("room", "depth"), [*((room, 2) for room in ROOMS), ("services", 3)])
+def test_no_packages_import_each_other(room: str, depth: int) -> None:
+    TopologicalSorter(package_arrows(room, depth)).prepare()  # raises a CycleError that names them
+
+
+def step_modules() -> set[str]:
+    """Modules of steps: those in a package `steps`, and others that assign a `Step(...)` at module level."""
+
+    def defines_step(file: Path) -> bool:
+        for statement in ast.parse(file.read_text(encoding="utf-8")).body:
+            if isinstance(statement, (ast.Assign, ast.AnnAssign)) and statement.value is not None:
+                calls = [node.func for node in ast.walk(statement.value) if isinstance(node, ast.Call)]
+                if any(isinstance(call, ast.Name) and call.id == "Step" for call in calls):
+                    return True
+        return False
+
+    return {name for name, file in project_files().items() if "steps" in name.split(".") or defines_step(file)}
+
+
+def test_steps_are_imported_by_steps_of_their_package_and_by_flows_alone() -> None:
+    steps = step_modules()
+    assert {"pipeline.steps.voxel", "texturing.unwrap", "slam.steps.track"} <= steps
+    for name, others in arrows().items():
+        if not name.startswith("flows."):
+            own = {step for step in steps if name in steps and step.split(".")[0] == name.split(".")[0]}
+            assert not others & steps - own, f"{name} imports {others & steps - own}"
+
+
 def test_imports_between_wings_run_one_way() -> None:
     wings = ["pipelines", "engine", "reports", "commands", "deployed", "cli", "api"]  # each may import those before it
     for name, others in arrows().items():

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
-from scan2sim.pipeline.core.types import F64, I32, I64, Mesh, View
+from scan2sim.pipeline.core.types import F64, I32, Mesh, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.texturing.texture_layout import (
     Layout,
@@ -29,9 +29,6 @@ from scan2sim.texturing.texture_layout import (
     unwrapped,
 )
 from scan2sim.texturing.view_selection.choice import Choice
-
-if TYPE_CHECKING:
-    Index = I64
 
 ORTHOPHOTO_CENTRE_HEIGHT_M = 1e5
 """Height at which the parallel rays of an orthophoto are taken to meet, metres."""

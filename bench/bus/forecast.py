@@ -20,8 +20,9 @@ from scan2sim.services.monitoring.autoscale.forecast import (
     Trend,
     daily_profile,
 )
-from scan2sim.services.monitoring.autoscale.policy import ScalingParams, workers_for
+from scan2sim.services.monitoring.autoscale.policy import workers_for
 from scan2sim.services.monitoring.autoscale.traffic_model import rate
+from scan2sim.services.monitoring.settings.scaling import ScalingParams
 
 CAMERAS, STEP_S, WINDOW_S = 50, 60.0, 300.0
 """Number of cameras, seconds of a count, seconds of the averages."""

@@ -25,10 +25,10 @@ import psutil
 
 from scan2sim.services.teleoperation.control.messages import Kind
 from scan2sim.services.teleoperation.gateway.fleet import Fleet
-from scan2sim.services.teleoperation.gateway.identity import Identity, Role
 from scan2sim.services.teleoperation.gateway.json_stream import Client, Connection
-from scan2sim.services.teleoperation.gateway.protocol import Address, DriverRequest, Hello
 from scan2sim.services.teleoperation.gateway.server import Gateway
+from scan2sim.services.teleoperation.gateway_protocol import Address, DriverRequest, Hello
+from scan2sim.services.teleoperation.identity import Identity, Role
 from scan2sim.services.teleoperation.qos.measure import count_missing, delays, longest_gap, percentile
 from scan2sim.services.teleoperation.qos.scripted_drive import MessageRecorder
 from scan2sim.services.teleoperation.transport.dtls_session import is_hello

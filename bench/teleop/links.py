@@ -15,8 +15,8 @@ import time
 from typing import Any
 
 from scan2sim.services.teleoperation.control.messages import Kind, Message
-from scan2sim.services.teleoperation.gateway.identity import Identity, Peer, Role
 from scan2sim.services.teleoperation.gateway.pki import Authority
+from scan2sim.services.teleoperation.identity import Identity, Peer, Role
 from scan2sim.services.teleoperation.transport.clock_sync import ClockSync
 from scan2sim.services.teleoperation.transport.multipath import MultipathConnection, Policy
 from scan2sim.services.teleoperation.transport.station_side import Listener

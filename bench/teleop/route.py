@@ -20,8 +20,8 @@ from bench.teleop.drives import MOBILE
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.services.qos.link_profile import LinkProfile
 from scan2sim.services.teleoperation.qos.measure import Measurement, percentile, render_test_images, scripted_pair
+from scan2sim.services.teleoperation.qos.route import cross_track_error
 from scan2sim.services.teleoperation.qos.scripted_drive import Setup
-from scan2sim.services.teleoperation.sim.route import cross_track_error
 
 Report = Callable[[str], None]
 NETWORKS: dict[str, LinkProfile | None] = {

@@ -17,14 +17,15 @@ from typing import Any
 from scan2sim.services.teleoperation.control.controls import Controls
 from scan2sim.services.teleoperation.control.messages import Kind, Message, Telemetry
 from scan2sim.services.teleoperation.control.safety import COMMAND_MAX_AGE_MS
-from scan2sim.services.teleoperation.gateway.identity import Role
+from scan2sim.services.teleoperation.identity import Role
 from scan2sim.services.teleoperation.qos.scripted_drive import COMMAND_PERIOD_S, PlainCar, ScriptedCommands
+from scan2sim.services.teleoperation.settings import OnboardParams
 from scan2sim.services.teleoperation.transport.clock_sync import ClockSync
 from scan2sim.services.teleoperation.transport.multipath import MultipathConnection
 from scan2sim.services.teleoperation.transport.station_side import Listener
 from scan2sim.services.teleoperation.transport.vehicle_side import Link, connect_station
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
-from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardParams, OnboardUnit
+from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardUnit
 from tests.fakes.certificates import identity
 from tests.fakes.relay import Relay
 

@@ -21,11 +21,10 @@ import numpy as np
 from scan2sim.pipeline.camera.renderer import pinhole
 from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.io.worlds.scene import PATH_FILE, read_scene
-from scan2sim.services.teleoperation import encoders
+from scan2sim.services.teleoperation import encoders, timecode
 from scan2sim.services.teleoperation.cameras import CameraFrame, Mount
 from scan2sim.services.teleoperation.cameras.world import mount_pose
 from scan2sim.services.teleoperation.sim.world_renderer import WorldRenderer, build_world
-from scan2sim.services.teleoperation.video import timecode
 from scan2sim.services.teleoperation.video.capture import CameraEncoder
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame, VideoReceiver
 from scan2sim.services.teleoperation.video.rate_control import EncodingPlan

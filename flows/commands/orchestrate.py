@@ -18,10 +18,10 @@ from scan2sim.flows.commands.options import options
 from scan2sim.flows.commands.ros_spin import spin, stop_on_signal
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.pipeline.core.errors import ScanError, SettingError
+from scan2sim.services.monitoring.settings.osm import AutoscaleParams
 from scan2sim.services.orchestration import description, placement
 from scan2sim.services.orchestration.settings import (
     ApplyParams,
-    AutoscaleParams,
     Connection,
     InstantiateParams,
     OperationParams,

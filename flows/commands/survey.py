@@ -115,7 +115,7 @@ def run_source(
         jobs: steps at a time; 0: by the number of cores.
         memory: limit of the memory of all running steps, "20GB".
         cores: CPU cores per step.
-        bus: where progress is published (`services.monitoring.export.event_publishers`).
+        bus: where progress is published (`services.monitoring.events.event_publishers`).
 
     Returns:
         The path of the report.

@@ -86,7 +86,7 @@ def survey(
         memory: limit of the memory of all steps on one machine, "20GB".
         cores: CPU cores per step; default: all.
         address: of a Dask scheduler or a Ray cluster; default: start one here.
-        bus: where the flow and its workers publish progress (`services.monitoring.export.event_publishers`).
+        bus: where the flow and its workers publish progress (`services.monitoring.events.event_publishers`).
     """
     try:
         with published(bus, "survey", source, local=False) as on_bus:

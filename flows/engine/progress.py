@@ -23,8 +23,8 @@ from scan2sim.flows.engine.ready_queue import Event, EventCallback, ignore_event
 from scan2sim.flows.pipelines.graph import Task, TaskId
 from scan2sim.pipeline.core.cache import Store, read_manifest
 from scan2sim.pipeline.core.errors import DamagedError, IncompleteError, ScanError, printable
+from scan2sim.services.monitoring.events import event_publishers
 from scan2sim.services.monitoring.events.schema import Events, Outlet, RunState, StepState
-from scan2sim.services.monitoring.export import event_publishers
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ class Channel:
     """Where the progress of a run's steps is published, for workers in other processes or on other machines.
 
     Attributes:
-        where: value of option `--bus` (`services.monitoring.export.event_publishers`).
+        where: value of option `--bus` (`services.monitoring.events.event_publishers`).
         run: id of the run.
     """
 

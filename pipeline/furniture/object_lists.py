@@ -8,12 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scan2sim.pipeline.core.types import Bools
-
 if TYPE_CHECKING:
     from scan2sim.pipeline.furniture.sign_panels import SignPanel
-
-    Bools = Bools
 
 CSV_COLUMNS = ("x", "y", "z", "kind", "height_m", "radius_m", "heading_deg", "shape", "plate_width_m", "plate_height_m")
 

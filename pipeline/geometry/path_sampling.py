@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from scan2sim.pipeline.core.types import F64
-
-if TYPE_CHECKING:
-    pass
 
 PATH_SPACING_M = 5.0
 """Spacing of the samples of a path for distance queries."""

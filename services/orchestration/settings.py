@@ -15,7 +15,6 @@ from scan2sim.pipeline.core.step import Params
 from scan2sim.services.credentials import redacted
 from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.loopback import is_loopback
-from scan2sim.services.monitoring.settings.bus import WorkerPoolParams
 
 
 class Connection(Params):
@@ -110,9 +109,3 @@ class PageParams(Connection, ServerParams):
     packages: Annotated[File, Field(description="Folder of packages; uploads are stored here too.")]
     vim: Annotated[str, Field(max_length=200, description="VIM account to instantiate services on.")] = ""
     cluster: Annotated[str, Field(max_length=200, description="Kubernetes cluster to instantiate services on.")] = ""
-
-
-class AutoscaleParams(WorkerPoolParams, Connection):
-    """Settings of the node that scales an instance according to queue load."""
-
-    instance: Annotated[str, Field(max_length=200, description="Name of the instance in OSM.")]

@@ -13,11 +13,13 @@ from scan2sim.pipeline.core.parameters import File
 from scan2sim.pipeline.core.step import Params
 from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.qos.requirements import Environment
-from scan2sim.services.teleoperation.gateway.protocol import Address
-from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardParams
+from scan2sim.services.teleoperation.control.safety import COMMAND_MAX_AGE_MS
+from scan2sim.services.teleoperation.gateway_protocol import Address
 
 GATEWAY_PORT, STATION_PORT = 7443, 7444
 """Default ports: TCP port of the gateway, UDP port of a station."""
+ADAPTER_PORT = 7447
+"""Default UDP port of an adapter."""
 
 ImageSide = Annotated[int, Field(ge=16, le=4096)]
 CertificateFolder = Annotated[
@@ -73,6 +75,32 @@ class StationParams(ServerParams):
             "router that forwards a port. Default: the listening address."
         ),
     ] = ()
+
+
+class OnboardParams(Params):
+    """Settings of an onboard unit's connection to its vehicle adapter."""
+
+    translator: Annotated[str, Field(description="HOST:PORT (UDP) of the vehicle adapter (`teleop translate`).")] = (
+        f"127.0.0.1:{ADAPTER_PORT}"
+    )
+    key: Annotated[File | None, Field(description="File with the key shared with the vehicle adapter.")] = None
+    limit: Annotated[
+        float,
+        Field(
+            ge=20, le=5000, description="Maximum age of a command, milliseconds; without a newer one the vehicle stops."
+        ),
+    ] = COMMAND_MAX_AGE_MS
+
+    def address(self) -> tuple[str, int]:
+        """Host and port of the adapter.
+
+        Raises:
+            SettingError: the setting is not HOST:PORT.
+        """
+        host, colon, port = self.translator.rpartition(":")
+        if not colon or not port.isdecimal() or not 0 < int(port) < 65536:
+            raise SettingError("translator", f"{self.translator!r} is not HOST:PORT", "Write it as 127.0.0.1:7447")
+        return host.strip("[]"), int(port)
 
 
 class VehicleParams(OnboardParams):

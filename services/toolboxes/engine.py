@@ -20,10 +20,10 @@ from scan2sim.services.credentials import redacted
 from scan2sim.services.toolboxes import frames, tasks
 from scan2sim.services.toolboxes.frame_queue import MAX_SOURCES, FrameQueue
 from scan2sim.services.toolboxes.frames import Frame
+from scan2sim.services.toolboxes.models import ModelInfo
 from scan2sim.services.toolboxes.per_source_worker import SourceWorker
 from scan2sim.services.toolboxes.results import Body, Result, State, Times
 from scan2sim.services.toolboxes.settings import ToolboxParams
-from scan2sim.services.toolboxes.tasks import ModelInfo
 from scan2sim.services.toolboxes.worker import ModelProcess, ModelProcessDied
 
 log = logging.getLogger(__name__)

@@ -1,8 +1,12 @@
-"""Weight files: the user's, or those included here; only formats that can't contain code, no pickles."""
+"""Models: their description, and their weight files.
+
+Weight files are the user's, or those included here; only formats that can't contain code, no pickles.
+"""
 
 from __future__ import annotations
 
 import hashlib
+from dataclasses import dataclass
 from pathlib import Path
 
 from scan2sim.pipeline.core.errors import InputError, SettingError
@@ -57,3 +61,20 @@ def _check_format(path: Path) -> None:
         raise InputError(path, "file not found", "Give a local file; weights are never downloaded")
     if path.is_file() and path.suffix not in SAFE_SUFFIXES:
         raise InputError(path, "may contain code, like pickled weights", f"Export it as {' or '.join(SAFE_SUFFIXES)}")
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """Description of a model.
+
+    Attributes:
+        name: name of its architecture or file.
+        labels: names of its classes.
+        sha256: SHA-256 of the weights file.
+        licence: licence of the weights, as far as the file or its package states it.
+    """
+
+    name: str
+    labels: tuple[str, ...]
+    sha256: str
+    licence: str

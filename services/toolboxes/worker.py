@@ -16,9 +16,9 @@ from scan2sim.pipeline.core.errors import ScanError, StepError
 from scan2sim.pipeline.core.sandbox import die_with_parent
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.toolboxes import tasks
+from scan2sim.services.toolboxes.models import ModelInfo
 from scan2sim.services.toolboxes.results import Body
 from scan2sim.services.toolboxes.settings import ToolboxParams
-from scan2sim.services.toolboxes.tasks import ModelInfo
 
 LOAD_TIMEOUT_S = 300.0
 """Time for a model to load and process the probe image."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
 
-from scan2sim.services.teleoperation.gateway.identity import Identity, Peer, Role
 from scan2sim.services.teleoperation.gateway.pki import Authority
+from scan2sim.services.teleoperation.identity import Identity, Peer, Role
 
 OWN = Authority.make()
 OTHER = Authority.make()

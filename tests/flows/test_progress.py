@@ -21,8 +21,8 @@ from scan2sim.flows.engine.versions import versions
 from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services import kafka
+from scan2sim.services.monitoring.events import event_publishers
 from scan2sim.services.monitoring.events.schema import Event, RunState, StepState
-from scan2sim.services.monitoring.export import event_publishers
 from tests.fakes.broker import Broker
 from tests.flows.toy import chain
 

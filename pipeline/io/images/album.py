@@ -5,13 +5,10 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from scan2sim.pipeline.core.types import U8
 from scan2sim.pipeline.io.images import image
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass

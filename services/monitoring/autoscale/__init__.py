@@ -1,4 +1,4 @@
 """Autoscaling: the number of workers that a queue needs, and the actuators that start them.
 
-Begin with `policy`; `actuators/` start workers as local processes, through Prefect or through OSM.
+Begin with `policy`; `actuators/` start workers through Prefect or through OSM.
 """

@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import Literal, Protocol
+from typing import Protocol
 
-Kind = Literal["average", "trend"]
-"""Forecasts that need no historical data."""
 HOUR, DAY = 3600.0, 86_400.0
 Profile = Callable[[float], float]
 """Function from a time in seconds to the usual rate at that time, events per second."""

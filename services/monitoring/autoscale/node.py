@@ -8,9 +8,9 @@ from typing import Any
 
 from scan2sim.services.monitoring.autoscale.forecast import DAY, ScaledProfile, daily_profile
 from scan2sim.services.monitoring.autoscale.policy import Scaler
+from scan2sim.services.monitoring.event_csv import read_events
 from scan2sim.services.monitoring.events.bus import Bus
 from scan2sim.services.monitoring.events.schema import QueueState, WorkersWanted
-from scan2sim.services.monitoring.example_nodes.dataset_talker import read_events
 from scan2sim.services.monitoring.node.monitor import ros
 from scan2sim.services.monitoring.settings.bus import ScaleParams
 

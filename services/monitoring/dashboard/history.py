@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from scan2sim.pipeline.core.errors import printable
 from scan2sim.services.monitoring.dashboard.clock_skew import ClockSkew
-from scan2sim.services.monitoring.node.record import SCHEMA, Record
+from scan2sim.services.monitoring.record import SCHEMA, Record
 
 MAX_RECORDS_PER_NODE = 21_600
 """Records of a node that are kept; up to a quarter more before the oldest are dropped."""

@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal, Protocol
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from scan2sim.pipeline.core.errors import SettingError
-from scan2sim.services.monitoring.node import record
+from scan2sim.services.monitoring import record
 from scan2sim.services.outbox import Deduplicator, new_ids
 
 log = logging.getLogger(__name__)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import math
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
-from scan2sim.pipeline.core.errors import InputError
+from scan2sim.services.monitoring.event_csv import read_events
 from scan2sim.services.monitoring.node.monitor import STRING, Monitor, ros
-from scan2sim.services.monitoring.settings.monitor import MAX_MESSAGE_BYTES, DatasetParams
+from scan2sim.services.monitoring.settings.monitor import DatasetParams
 
 TIMER_TOLERANCE_S = 0.001
 """A message is sent up to this long before it is due."""
@@ -46,30 +42,3 @@ class DatasetTalker(Monitor):
             data = json.dumps({"time": seconds, "size": size}) if self._size_as_field else "x" * size
             self._publisher.publish(ros.message(STRING, data=data))
             self._next = next(self._events, None)
-
-
-def read_events(path: Path) -> Iterator[tuple[float, int]]:
-    """Iterate over (seconds from the start, size in bytes) of a CSV file; a header line is skipped.
-
-    Raises:
-        InputError: the file can't be read, or a line is invalid or out of order.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, f"can't be read ({error})", "Give a CSV file with lines seconds,bytes") from None
-    before = 0.0
-    events = []
-    for number, row in enumerate(csv.reader(text.splitlines()), 1):
-        try:
-            seconds, size = float(row[0]), int(row[1])
-        except (ValueError, IndexError):
-            if number == 1:
-                continue
-            raise InputError(path, f"line {number} is not 'seconds,bytes'", "Fix or delete the line") from None
-        if not (math.isfinite(seconds) and seconds >= before and 0 <= size <= MAX_MESSAGE_BYTES):
-            remedy = f"Seconds must not decrease, bytes must be from 0 to {MAX_MESSAGE_BYTES}"
-            raise InputError(path, f"line {number} has {seconds:g} s and {size} bytes", remedy)
-        before = seconds
-        events.append((seconds, size))
-    return iter(events)

@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.services import kafka
-from scan2sim.services.monitoring.node.record import Record
+from scan2sim.services.monitoring.record import Record
 from scan2sim.services.monitoring.settings.archive import ArchiveParams, QueryParams
 
 WRITE_INTERVAL_S = 60.0

@@ -11,7 +11,7 @@ from typing import Protocol
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.services import default_outbox
 from scan2sim.services.kafka import TopicProducer
-from scan2sim.services.monitoring.node.record import Record
+from scan2sim.services.monitoring.record import Record
 from scan2sim.services.monitoring.settings.monitor import MonitorParams
 from scan2sim.services.outbox import Outbox, Sender
 

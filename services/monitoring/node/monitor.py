@@ -5,7 +5,7 @@
             super().__init__("talker", period=1.0, kafka_bootstrap_servers="localhost:9092")  # D3.2, code snippet 3
             self.publisher = self.create_publisher(String, "chatter", 10)
 
-Once per period its traffic is published as a record (`services.monitoring.node.record`) on a ROS 2 topic and, if
+Once per period its traffic is published as a record (`services.monitoring.record`) on a ROS 2 topic and, if
 configured, to Kafka, a file, the console and Prometheus. It runs on either transport (`services.transport`).
 """
 
@@ -22,10 +22,10 @@ from typing import Any
 
 from scan2sim.services import transport
 from scan2sim.services.monitoring.export import sinks
+from scan2sim.services.monitoring.meter import Meter
 from scan2sim.services.monitoring.node import clock_sync, qos_check
 from scan2sim.services.monitoring.node.host import HostMetrics
-from scan2sim.services.monitoring.node.meter import Meter
-from scan2sim.services.monitoring.node.record import (
+from scan2sim.services.monitoring.record import (
     Record,
     TopicEndpoints,
     TopicFlow,

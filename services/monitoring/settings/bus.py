@@ -9,7 +9,7 @@ from pydantic import Field
 
 from scan2sim.pipeline.core.step import Params
 from scan2sim.services.kafka import Servers
-from scan2sim.services.monitoring.autoscale.policy import MAX_WORKERS, ScalingParams
+from scan2sim.services.monitoring.settings.scaling import MAX_WORKERS, ScalingParams
 from scan2sim.services.transport.names import TopicName
 
 

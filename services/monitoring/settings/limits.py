@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field
 
 from scan2sim.pipeline.core.step import Params
-from scan2sim.services.monitoring.node.record import TopicFlow
+from scan2sim.services.monitoring.record import TopicFlow
 
 
 class Limits(Params):

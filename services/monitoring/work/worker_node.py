@@ -7,12 +7,12 @@ import shlex
 import time
 from typing import Any
 
-from scan2sim.services.monitoring.autoscale.actuators.local_workers import LocalWorkers
 from scan2sim.services.monitoring.events.bus import Bus
 from scan2sim.services.monitoring.events.schema import QueueState, WorkersWanted
 from scan2sim.services.monitoring.node.monitor import STRING, Monitor, ros
 from scan2sim.services.monitoring.settings.bus import BusParams
 from scan2sim.services.monitoring.settings.monitor import WorkParams
+from scan2sim.services.monitoring.work.local_workers import LocalWorkers
 from scan2sim.services.monitoring.work.queue import EventQueue
 from scan2sim.services.transport import Arrival, QoS
 

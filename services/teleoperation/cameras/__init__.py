@@ -12,7 +12,7 @@ import numpy as np
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.types import F64, U8
 from scan2sim.services.credentials import redacted
-from scan2sim.services.teleoperation.video import timecode
+from scan2sim.services.teleoperation import timecode
 
 CAMERA_TIMEOUT_S = 1.0
 """Seconds without a frame after which a camera counts as offline."""

@@ -8,9 +8,8 @@ from collections.abc import Callable
 from typing import Protocol
 
 from scan2sim.services.teleoperation.control.messages import Malformed
-from scan2sim.services.teleoperation.gateway.identity import Identity
 from scan2sim.services.teleoperation.gateway.json_stream import Client, Connection, JsonObject
-from scan2sim.services.teleoperation.gateway.protocol import (
+from scan2sim.services.teleoperation.gateway_protocol import (
     Address,
     DriverRequest,
     Hello,
@@ -20,6 +19,7 @@ from scan2sim.services.teleoperation.gateway.protocol import (
     Status,
     from_gateway,
 )
+from scan2sim.services.teleoperation.identity import Identity
 
 log = logging.getLogger(__name__)
 

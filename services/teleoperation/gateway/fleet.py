@@ -18,8 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from scan2sim.pipeline.core.errors import BusyError, InputError, SettingError, from_os_error
 from scan2sim.services.teleoperation.gateway.audit import AuditTrail
-from scan2sim.services.teleoperation.gateway.identity import Peer, Role
-from scan2sim.services.teleoperation.gateway.protocol import (
+from scan2sim.services.teleoperation.gateway_protocol import (
     CurrentPair,
     DriverRequest,
     Hello,
@@ -29,6 +28,7 @@ from scan2sim.services.teleoperation.gateway.protocol import (
     RequestRefused,
     Status,
 )
+from scan2sim.services.teleoperation.identity import Peer, Role
 
 Order = Join | Release | RequestRefused
 Send = Callable[[Order], None]

@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from scan2sim.pipeline.core.errors import BusyError, SettingError
-from scan2sim.services.teleoperation.gateway.identity import Identity, Peer, Role
+from scan2sim.services.teleoperation.identity import Identity, Peer, Role
 from scan2sim.services.teleoperation.transport import tls
 from scan2sim.services.teleoperation.transport.tls import Channel, TlsClosed, TlsError
 

@@ -25,7 +25,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from scan2sim.pipeline.core.errors import InputError, SettingError, from_os_error
-from scan2sim.services.teleoperation.gateway.identity import (
+from scan2sim.services.teleoperation.identity import (
     AUTHORITY_FILE,
     CERTIFICATE_FILE,
     KEY_FILE,

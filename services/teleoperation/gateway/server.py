@@ -7,9 +7,8 @@ from collections.abc import Callable
 from scan2sim.pipeline.core.errors import ScanError
 from scan2sim.services.teleoperation.control.messages import Malformed
 from scan2sim.services.teleoperation.gateway.fleet import Fleet, Order
-from scan2sim.services.teleoperation.gateway.identity import Identity
 from scan2sim.services.teleoperation.gateway.json_stream import Connection, JsonObject, Server
-from scan2sim.services.teleoperation.gateway.protocol import (
+from scan2sim.services.teleoperation.gateway_protocol import (
     PROTOCOL_VERSION,
     DriverRequest,
     Hello,
@@ -17,6 +16,7 @@ from scan2sim.services.teleoperation.gateway.protocol import (
     Status,
     to_gateway,
 )
+from scan2sim.services.teleoperation.identity import Identity
 
 REASON_MAX_CHARS = 200
 """Maximum length of a reason sent to a party."""

@@ -14,8 +14,8 @@ from fastapi.responses import FileResponse
 from scan2sim.services.http import factory
 from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.gateway.fleet import Fleet
-from scan2sim.services.teleoperation.gateway.identity import Identity, Role
 from scan2sim.services.teleoperation.gateway.server import Gateway
+from scan2sim.services.teleoperation.identity import Identity, Role
 from scan2sim.services.teleoperation.settings import GATEWAY_PORT, GatewayParams, parse_address
 
 AUDIT_AUTHOR = "fleet management"

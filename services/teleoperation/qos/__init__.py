@@ -1,4 +1,4 @@
 """Quality of service of teleoperation, measured in scripted drives.
 
-Begin with `measure`.
+Begin with `measure`; `route` is the reference path and its driver.
 """

@@ -32,9 +32,9 @@ from scan2sim.services.qos.requirements import Requirements
 from scan2sim.services.teleoperation.control.messages import Kind
 from scan2sim.services.teleoperation.gateway.pki import certify
 from scan2sim.services.teleoperation.qos import scripted_drive
+from scan2sim.services.teleoperation.qos.route import cross_track_error
 from scan2sim.services.teleoperation.qos.scripted_drive import HEIGHT, WIDTH, Setup
 from scan2sim.services.teleoperation.settings import MeasureParams
-from scan2sim.services.teleoperation.sim.route import cross_track_error
 
 LOCAL_HOSTS = ("127.0.0.1", "127.0.0.2")
 VEHICLE_NAME, STATION_NAME = "car", "desk"

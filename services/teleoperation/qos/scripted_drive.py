@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 from scan2sim.pipeline.core.errors import StepError
 from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.io.worlds.scene import read_scene
-from scan2sim.services.teleoperation import cameras
+from scan2sim.services.teleoperation import cameras, timecode
 from scan2sim.services.teleoperation.cameras import Camera, View
 from scan2sim.services.teleoperation.control.controls import Controls, Gear, VehicleState
 from scan2sim.services.teleoperation.control.messages import Command, Kind, Message, Telemetry
@@ -30,12 +30,13 @@ from scan2sim.services.teleoperation.control.safety import COMMAND_MAX_AGE_MS
 from scan2sim.services.teleoperation.encoders import Decoder
 from scan2sim.services.teleoperation.gateway.client import GatewayConnection
 from scan2sim.services.teleoperation.gateway.fleet import Fleet
-from scan2sim.services.teleoperation.gateway.identity import Identity, Peer
-from scan2sim.services.teleoperation.gateway.protocol import Address
 from scan2sim.services.teleoperation.gateway.server import Gateway
-from scan2sim.services.teleoperation.sim import route
+from scan2sim.services.teleoperation.gateway_protocol import Address
+from scan2sim.services.teleoperation.identity import Identity, Peer
+from scan2sim.services.teleoperation.qos import route
+from scan2sim.services.teleoperation.qos.route import LoopingVehicle, PurePursuit
+from scan2sim.services.teleoperation.settings import OnboardParams
 from scan2sim.services.teleoperation.sim.bicycle import STEP_MAX_S, Bicycle, Ground
-from scan2sim.services.teleoperation.sim.route import LoopingVehicle, PurePursuit
 from scan2sim.services.teleoperation.station.app import JoinedVehicle, Station
 from scan2sim.services.teleoperation.transport.clock_sync import ClockSync
 from scan2sim.services.teleoperation.transport.multipath import MultipathConnection, Policy
@@ -43,8 +44,7 @@ from scan2sim.services.teleoperation.transport.station_side import Listener
 from scan2sim.services.teleoperation.transport.vehicle_side import Link
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
 from scan2sim.services.teleoperation.vehicle.app import Vehicle
-from scan2sim.services.teleoperation.vehicle.onboard_unit import Connect, OnboardParams, OnboardUnit, VideoSender
-from scan2sim.services.teleoperation.video import timecode
+from scan2sim.services.teleoperation.vehicle.onboard_unit import Connect, OnboardUnit, VideoSender
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame
 from scan2sim.services.teleoperation.video.rate_control import BitrateBounds
 

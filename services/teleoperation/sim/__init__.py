@@ -1,4 +1,4 @@
-"""A simulated vehicle in a finished world: rendering, vehicle dynamics, a scripted route, the demo.
+"""A simulated vehicle in a finished world: rendering, vehicle dynamics, the demo.
 
 Begin with `demo`.
 """

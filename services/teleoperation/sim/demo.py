@@ -18,8 +18,7 @@ from pathlib import Path
 
 from scan2sim.pipeline.core.errors import StepError
 from scan2sim.services.teleoperation.gateway.pki import certify
-from scan2sim.services.teleoperation.settings import GATEWAY_PORT, STATION_PORT, DemoParams
-from scan2sim.services.teleoperation.vehicle.adapter_protocol import ADAPTER_PORT
+from scan2sim.services.teleoperation.settings import ADAPTER_PORT, GATEWAY_PORT, STATION_PORT, DemoParams
 
 LOCALHOST = "127.0.0.1"
 VEHICLE_NAME, STATION_NAME = "car", "desk"

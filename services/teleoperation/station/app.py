@@ -26,8 +26,7 @@ from scan2sim.services.teleoperation.control.messages import (
     VideoStreams,
 )
 from scan2sim.services.teleoperation.gateway.client import GatewayConnection
-from scan2sim.services.teleoperation.gateway.identity import Identity, Peer, Role
-from scan2sim.services.teleoperation.gateway.protocol import (
+from scan2sim.services.teleoperation.gateway_protocol import (
     Address,
     CurrentPair,
     DriverRequest,
@@ -37,6 +36,7 @@ from scan2sim.services.teleoperation.gateway.protocol import (
     RequestRefused,
     Status,
 )
+from scan2sim.services.teleoperation.identity import Identity, Peer, Role
 from scan2sim.services.teleoperation.transport.link_stats import LinkRates
 from scan2sim.services.teleoperation.transport.multipath import MultipathConnection
 from scan2sim.services.teleoperation.transport.station_side import Listener

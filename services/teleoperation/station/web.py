@@ -32,8 +32,8 @@ from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.control.controls import Controls, Gear
 from scan2sim.services.teleoperation.control.messages import Command
 from scan2sim.services.teleoperation.gateway.client import GatewayConnection
-from scan2sim.services.teleoperation.gateway.identity import Identity, Role
-from scan2sim.services.teleoperation.gateway.protocol import Address
+from scan2sim.services.teleoperation.gateway_protocol import Address
+from scan2sim.services.teleoperation.identity import Identity, Role
 from scan2sim.services.teleoperation.settings import GATEWAY_PORT, STATION_PORT, StationParams, parse_address
 from scan2sim.services.teleoperation.station import app_window
 from scan2sim.services.teleoperation.station.app import Station, send_request

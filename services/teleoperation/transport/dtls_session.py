@@ -10,7 +10,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 
-from scan2sim.services.teleoperation.gateway.identity import Peer
+from scan2sim.services.teleoperation.identity import Peer
 from scan2sim.services.teleoperation.transport.tls import DATAGRAM_MAX_BYTES, Channel, TlsClosed, TlsError, datagrams
 
 _RECORD_TYPES, _RECORD_VERSIONS = frozenset((20, 21, 22, 23)), (b"\xfe\xff", b"\xfe\xfd")

@@ -6,7 +6,7 @@ import math
 import threading
 import time
 
-from scan2sim.services.teleoperation.gateway.protocol import LinkStatus
+from scan2sim.services.teleoperation.gateway_protocol import LinkStatus
 from scan2sim.services.teleoperation.transport.multipath import MultipathConnection
 
 RATE_PERIOD_MIN_S = 0.5

@@ -15,7 +15,7 @@ from typing import Any
 from cryptography.hazmat.bindings.openssl.binding import Binding
 from OpenSSL import SSL, crypto
 
-from scan2sim.services.teleoperation.gateway.identity import Identity, InvalidCertificate, Peer
+from scan2sim.services.teleoperation.identity import Identity, InvalidCertificate, Peer
 
 CIPHERS = b"ECDHE-ECDSA-CHACHA20-POLY1305:ECDHE-ECDSA-AES256-GCM-SHA384:ECDHE-ECDSA-AES128-GCM-SHA256"
 CIPHERS_13 = b"TLS_CHACHA20_POLY1305_SHA256:TLS_AES_256_GCM_SHA384:TLS_AES_128_GCM_SHA256"

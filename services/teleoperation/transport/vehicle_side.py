@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.teleoperation.control.messages import Message
-from scan2sim.services.teleoperation.gateway.identity import Identity, Peer
+from scan2sim.services.teleoperation.identity import Identity, Peer
 from scan2sim.services.teleoperation.transport import tls
 from scan2sim.services.teleoperation.transport.clock_sync import ClockSync
 from scan2sim.services.teleoperation.transport.dtls_session import DtlsSession

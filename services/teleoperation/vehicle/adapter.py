@@ -19,9 +19,9 @@ from scan2sim.services.loopback import require_protection
 from scan2sim.services.teleoperation.control.controls import STOP
 from scan2sim.services.teleoperation.control.messages import Malformed
 from scan2sim.services.teleoperation.control.safety import COMMAND_MAX_AGE_MS
+from scan2sim.services.teleoperation.settings import ADAPTER_PORT
 from scan2sim.services.teleoperation.vehicle.adapter_protocol import (
     ADAPTER_PERIOD_MS,
-    ADAPTER_PORT,
     PACKET_MAX_BYTES,
     AdapterEndpoint,
     Order,

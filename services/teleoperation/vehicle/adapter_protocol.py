@@ -22,8 +22,6 @@ from scan2sim.services.teleoperation.control.controls import Controls, Gear, Veh
 from scan2sim.services.teleoperation.control.messages import Command, Malformed
 from scan2sim.services.teleoperation.control.safety import COMMAND_MAX_AGE_MS, NS_PER_MS, SafetyMonitor
 
-ADAPTER_PORT = 7447
-"""Default UDP port of an adapter."""
 ADAPTER_PERIOD_MS = 10.0
 """Interval at which an adapter processes orders and controls the vehicle."""
 PACKET_MAX_BYTES = 1400

@@ -14,14 +14,14 @@ from scan2sim.services.teleoperation import cameras, encoders
 from scan2sim.services.teleoperation.cameras import Camera, Mount, View
 from scan2sim.services.teleoperation.control.messages import Kind, Message, VideoReport, VideoStream
 from scan2sim.services.teleoperation.gateway.client import GatewayConnection
-from scan2sim.services.teleoperation.gateway.identity import Identity, Peer, Role
-from scan2sim.services.teleoperation.gateway.protocol import CurrentPair, Hello, Join, Release, RequestRefused, Status
-from scan2sim.services.teleoperation.settings import GATEWAY_PORT, VehicleParams, parse_address
+from scan2sim.services.teleoperation.gateway_protocol import CurrentPair, Hello, Join, Release, RequestRefused, Status
+from scan2sim.services.teleoperation.identity import Identity, Peer, Role
+from scan2sim.services.teleoperation.settings import GATEWAY_PORT, OnboardParams, VehicleParams, parse_address
 from scan2sim.services.teleoperation.sim.bicycle import Ground, PoseTracker
 from scan2sim.services.teleoperation.transport.link_stats import LinkRates
 from scan2sim.services.teleoperation.transport.multipath import MultipathConnection, Policy
 from scan2sim.services.teleoperation.transport.vehicle_side import Link, connect_station
-from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardParams, OnboardUnit
+from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardUnit
 from scan2sim.services.teleoperation.video.capture import CameraEncoder, CameraStreamer
 from scan2sim.services.teleoperation.video.rate_control import BitrateBounds, EncodingPlan, RateController
 from scan2sim.services.teleoperation.video.srtp_session import KeySchedule, key_lifetime

@@ -15,13 +15,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from math import isfinite
-from typing import Annotated, Any, Protocol
-
-from pydantic import Field
+from typing import Any, Protocol
 
 from scan2sim.pipeline.core.errors import SettingError
-from scan2sim.pipeline.core.parameters import File
-from scan2sim.pipeline.core.step import Params
 from scan2sim.services.teleoperation.control.controls import VehicleState
 from scan2sim.services.teleoperation.control.messages import (
     MESSAGE_MAX_BYTES,
@@ -37,14 +33,9 @@ from scan2sim.services.teleoperation.control.messages import (
     VideoStreams,
 )
 from scan2sim.services.teleoperation.control.safety import COMMAND_MAX_AGE_MS, NS_PER_MS, SafetyMonitor
+from scan2sim.services.teleoperation.settings import OnboardParams
 from scan2sim.services.teleoperation.vehicle.adapter import read_key
-from scan2sim.services.teleoperation.vehicle.adapter_protocol import (
-    ADAPTER_PERIOD_MS,
-    ADAPTER_PORT,
-    Answer,
-    OnboardEndpoint,
-    Order,
-)
+from scan2sim.services.teleoperation.vehicle.adapter_protocol import ADAPTER_PERIOD_MS, Answer, OnboardEndpoint, Order
 from scan2sim.services.teleoperation.vehicle.adapter_protocol import PACKET_MAX_BYTES as ANSWER_MAX_BYTES
 
 WATCHDOG_PERIOD_S, TELEMETRY_PERIOD_S, STREAMS_PERIOD_S = 0.005, 0.02, 1.0
@@ -56,32 +47,6 @@ NO_STATION, CLOCKS_UNKNOWN = "no station is joined", "the clocks are not synchro
 """Reasons for which driving can't begin."""
 DROP_CLOCKS_UNKNOWN, MALFORMED = "the clocks aren't tied yet", "malformed"
 """Further reasons for which messages are dropped; keys of `Telemetry.dropped`."""
-
-
-class OnboardParams(Params):
-    """Settings of an onboard unit's connection to its vehicle adapter."""
-
-    translator: Annotated[str, Field(description="HOST:PORT (UDP) of the vehicle adapter (`teleop translate`).")] = (
-        f"127.0.0.1:{ADAPTER_PORT}"
-    )
-    key: Annotated[File | None, Field(description="File with the key shared with the vehicle adapter.")] = None
-    limit: Annotated[
-        float,
-        Field(
-            ge=20, le=5000, description="Maximum age of a command, milliseconds; without a newer one the vehicle stops."
-        ),
-    ] = COMMAND_MAX_AGE_MS
-
-    def address(self) -> tuple[str, int]:
-        """Host and port of the adapter.
-
-        Raises:
-            SettingError: the setting is not HOST:PORT.
-        """
-        host, colon, port = self.translator.rpartition(":")
-        if not colon or not port.isdecimal() or not 0 < int(port) < 65536:
-            raise SettingError("translator", f"{self.translator!r} is not HOST:PORT", "Write it as 127.0.0.1:7447")
-        return host.strip("[]"), int(port)
 
 
 class StationClock(Protocol):

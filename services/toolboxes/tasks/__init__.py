@@ -4,32 +4,15 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.toolboxes.frames import Frame
+from scan2sim.services.toolboxes.models import ModelInfo
 from scan2sim.services.toolboxes.results import Body
 from scan2sim.services.toolboxes.settings import ToolboxParams
-
-
-@dataclass(frozen=True)
-class ModelInfo:
-    """Description of a model.
-
-    Attributes:
-        name: name of its architecture or file.
-        labels: names of its classes.
-        sha256: SHA-256 of the weights file.
-        licence: licence of the weights, as far as the file or its package states it.
-    """
-
-    name: str
-    labels: tuple[str, ...]
-    sha256: str
-    licence: str
 
 
 class Model(Protocol):

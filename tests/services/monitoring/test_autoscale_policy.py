@@ -8,8 +8,9 @@ import pytest
 
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.monitoring.autoscale.forecast import DAY, MovingAverage, ScaledProfile, Trend, daily_profile
-from scan2sim.services.monitoring.autoscale.policy import Scaler, ScalingParams, workers_for
+from scan2sim.services.monitoring.autoscale.policy import Scaler, workers_for
 from scan2sim.services.monitoring.autoscale.traffic_model import HOUR, rate
+from scan2sim.services.monitoring.settings.scaling import ScalingParams
 
 
 @pytest.mark.parametrize(

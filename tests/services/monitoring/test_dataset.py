@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.services.monitoring.example_nodes.dataset_talker import read_events
+from scan2sim.services.monitoring.event_csv import read_events
 
 
 def test_events_are_read_in_order(tmp_path: Path) -> None:

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import psutil
 
-from scan2sim.services.monitoring.autoscale.actuators.local_workers import LocalWorkers
 from scan2sim.services.monitoring.autoscale.actuators.replicas import ProgramReplicas
 from scan2sim.services.monitoring.example_nodes import worker
+from scan2sim.services.monitoring.work.local_workers import LocalWorkers
 from scan2sim.services.monitoring.work.queue import EventQueue
 from tests.conftest import ROOT
 from tests.waiting import until
@@ -81,7 +81,7 @@ def test_full_queue_drops_and_counts_events() -> None:
 
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     code = (
-        "import sys, time\nfrom scan2sim.services.monitoring.autoscale.actuators.local_workers import LocalWorkers\n"
+        "import sys, time\nfrom scan2sim.services.monitoring.work.local_workers import LocalWorkers\n"
         "from scan2sim.services.monitoring.work.queue import EventQueue\n"
         f"pool = LocalWorkers(EventQueue('q'), {WORKER!r})\npool.scale(2)\ntime.sleep(60)"
     )

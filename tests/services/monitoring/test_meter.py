@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from scan2sim.services.monitoring.node.meter import Flow, Meter
+from scan2sim.services.monitoring.meter import Flow, Meter
 from scan2sim.services.transport import Arrival
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from scan2sim.services import kafka
-from scan2sim.services.monitoring.node.record import Record
+from scan2sim.services.monitoring.record import Record
 from scan2sim.services.outbox import Outbox
 from tests.fakes.broker import Broker
 from tests.fakes.ports import free_port

@@ -11,7 +11,7 @@ from scan2sim.flows.cli import app
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.monitoring.autoscale import traffic_model
 from scan2sim.services.monitoring.autoscale.traffic_model import TrafficParams, events, rate, traffic_share
-from scan2sim.services.monitoring.example_nodes.dataset_talker import read_events
+from scan2sim.services.monitoring.event_csv import read_events
 
 
 def test_weekdays_have_two_rush_hours_and_weekends_none() -> None:

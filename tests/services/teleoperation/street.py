@@ -16,17 +16,18 @@ from scan2sim.services.teleoperation.control.controls import Controls, Gear
 from scan2sim.services.teleoperation.control.messages import Command, VideoStream
 from scan2sim.services.teleoperation.gateway.client import GatewayConnection
 from scan2sim.services.teleoperation.gateway.fleet import Fleet
-from scan2sim.services.teleoperation.gateway.identity import Identity
 from scan2sim.services.teleoperation.gateway.pki import certify
-from scan2sim.services.teleoperation.gateway.protocol import Address
 from scan2sim.services.teleoperation.gateway.server import Gateway
+from scan2sim.services.teleoperation.gateway_protocol import Address
+from scan2sim.services.teleoperation.identity import Identity
+from scan2sim.services.teleoperation.settings import OnboardParams
 from scan2sim.services.teleoperation.station.app import Station
 from scan2sim.services.teleoperation.transport.multipath import Policy
 from scan2sim.services.teleoperation.transport.station_side import Listener
 from scan2sim.services.teleoperation.transport.vehicle_side import Link
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
 from scan2sim.services.teleoperation.vehicle.app import Vehicle
-from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardParams, OnboardUnit
+from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardUnit
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame
 from scan2sim.services.teleoperation.video.rate_control import BitrateBounds
 from tests.fakes.relay import Relay

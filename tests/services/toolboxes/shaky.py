@@ -10,9 +10,10 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import StepError
 from scan2sim.pipeline.core.types import U8
+from scan2sim.services.toolboxes.models import ModelInfo
 from scan2sim.services.toolboxes.results import Body, Class
 from scan2sim.services.toolboxes.settings import ToolboxParams as Params
-from scan2sim.services.toolboxes.tasks import ModelInfo, PostProcessor
+from scan2sim.services.toolboxes.tasks import PostProcessor
 
 NEEDS = ()
 DIES, HANGS, FAILS, RAISES, SLOW, SLOWER = 201, 202, 203, 204, 205, 206

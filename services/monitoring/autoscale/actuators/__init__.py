@@ -1,4 +1,4 @@
-"""Actuators of the autoscaler: start and stop local worker processes, Prefect workers or replicas in OSM."""
+"""Actuators of the autoscaler: start and stop Prefect workers or replicas in OSM; `work.local_workers` is another."""
 
 from __future__ import annotations
 

@@ -11,8 +11,8 @@ import pytest
 
 from scan2sim.pipeline.core.errors import BusyError, InputError, ScanError, SettingError, SpaceError
 from scan2sim.services.teleoperation.gateway.fleet import Fleet, Order
-from scan2sim.services.teleoperation.gateway.identity import Peer, Role
-from scan2sim.services.teleoperation.gateway.protocol import CurrentPair, DriverRequest, Hello, Join, Release, Status
+from scan2sim.services.teleoperation.gateway_protocol import CurrentPair, DriverRequest, Hello, Join, Release, Status
+from scan2sim.services.teleoperation.identity import Peer, Role
 
 
 class Party:

@@ -13,8 +13,8 @@ import pytest
 from OpenSSL import SSL
 
 from scan2sim.services.teleoperation.gateway import json_stream
-from scan2sim.services.teleoperation.gateway.identity import Identity, Role
 from scan2sim.services.teleoperation.gateway.json_stream import Client, Connection, Server
+from scan2sim.services.teleoperation.identity import Identity, Role
 from scan2sim.services.teleoperation.transport import tls
 from scan2sim.services.teleoperation.transport.tls import Channel, TlsError
 from tests.fakes.certificates import OTHER, OWN, identity

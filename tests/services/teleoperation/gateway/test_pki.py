@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from scan2sim.flows.cli import app
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.services.teleoperation.gateway import pki
-from scan2sim.services.teleoperation.gateway.identity import Identity, Role
 from scan2sim.services.teleoperation.gateway.pki import certify
+from scan2sim.services.teleoperation.identity import Identity, Role
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ pytest.importorskip("OpenSSL", reason="the extra teleop isn't installed")
 
 from scan2sim.services.teleoperation.gateway.client import GatewayConnection
 from scan2sim.services.teleoperation.gateway.fleet import Fleet
-from scan2sim.services.teleoperation.gateway.identity import Identity
 from scan2sim.services.teleoperation.gateway.pki import certify
-from scan2sim.services.teleoperation.gateway.protocol import (
+from scan2sim.services.teleoperation.gateway.server import Gateway
+from scan2sim.services.teleoperation.gateway_protocol import (
     Address,
     CurrentPair,
     DriverRequest,
@@ -24,7 +24,7 @@ from scan2sim.services.teleoperation.gateway.protocol import (
     RequestRefused,
     Status,
 )
-from scan2sim.services.teleoperation.gateway.server import Gateway
+from scan2sim.services.teleoperation.identity import Identity
 from tests.waiting import until
 
 

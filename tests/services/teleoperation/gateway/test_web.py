@@ -16,9 +16,9 @@ from fastapi.testclient import TestClient
 from scan2sim.services.http import factory
 from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.gateway.fleet import Fleet, Order
-from scan2sim.services.teleoperation.gateway.identity import Peer, Role
-from scan2sim.services.teleoperation.gateway.protocol import Hello, LinkStatus, Status
 from scan2sim.services.teleoperation.gateway.web import application
+from scan2sim.services.teleoperation.gateway_protocol import Hello, LinkStatus, Status
+from scan2sim.services.teleoperation.identity import Peer, Role
 from tests.fakes.browser import chromium
 
 HOSTILE = "<img src=x onerror=document.title='hacked'>"

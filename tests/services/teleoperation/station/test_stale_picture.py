@@ -24,7 +24,7 @@ pytest.importorskip("websockets", reason="the extra teleop isn't installed")
 from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.control.controls import VehicleState
 from scan2sim.services.teleoperation.control.messages import Kind, Message, Telemetry
-from scan2sim.services.teleoperation.gateway.identity import Peer, Role
+from scan2sim.services.teleoperation.identity import Peer, Role
 from scan2sim.services.teleoperation.station.app import JoinedVehicle
 from scan2sim.services.teleoperation.station.web import FRAME_HEADER, PageHub
 from scan2sim.services.teleoperation.transport.clock_sync import ClockSync

@@ -17,7 +17,7 @@ import pytest
 
 from scan2sim.pipeline.core.errors import BusyError, SettingError
 from scan2sim.services.teleoperation.control.messages import Kind, Message
-from scan2sim.services.teleoperation.gateway.identity import Identity, Peer, Role
+from scan2sim.services.teleoperation.identity import Identity, Peer, Role
 from scan2sim.services.teleoperation.transport import multipath, station_side
 from scan2sim.services.teleoperation.transport.clock_sync import ClockSync
 from scan2sim.services.teleoperation.transport.dtls_session import count_records, is_hello

@@ -219,7 +219,8 @@ def test_new_vehicle_is_one_module_and_stops_when_its_onboard_unit_hangs(
     assert boat.stdout is not None
     port = int(boat.stdout.readline())
     hanging = f"""
-from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardParams, OnboardUnit
+from scan2sim.services.teleoperation.settings import OnboardParams
+from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardUnit
 from tests.fakes.driver import FakeConnection, ScriptedDriver
 unit, connection, stations = OnboardUnit(OnboardParams(translator="127.0.0.1:{port}")), FakeConnection(), []
 unit.join(lambda received, restarted: stations.append(ScriptedDriver(connection, received)) or connection)

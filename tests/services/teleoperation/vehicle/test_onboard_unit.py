@@ -24,6 +24,7 @@ from scan2sim.services.teleoperation.control.messages import (
     VideoStreams,
 )
 from scan2sim.services.teleoperation.control.safety import DROP_OTHER_SESSION, NS_PER_MS
+from scan2sim.services.teleoperation.settings import OnboardParams
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
 from scan2sim.services.teleoperation.vehicle.adapter_protocol import Answer
 from scan2sim.services.teleoperation.vehicle.onboard_unit import (
@@ -34,7 +35,6 @@ from scan2sim.services.teleoperation.vehicle.onboard_unit import (
     MALFORMED,
     NO_STATION,
     OnboardController,
-    OnboardParams,
     OnboardUnit,
     pack_fitting,
 )

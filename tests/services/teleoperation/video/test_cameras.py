@@ -13,10 +13,9 @@ import pytest
 
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.types import U8
-from scan2sim.services.teleoperation import cameras
+from scan2sim.services.teleoperation import cameras, timecode
 from scan2sim.services.teleoperation.cameras import Mount, View, pattern, world
 from scan2sim.services.teleoperation.settings import VehicleParams
-from scan2sim.services.teleoperation.video import timecode
 from tests.fakes import synthetic
 from tests.fakes.ports import free_port
 from tests.services.teleoperation.video.videos import psnr, scenery

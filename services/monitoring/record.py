@@ -1,6 +1,6 @@
 """Record: the statistics that a monitor publishes once per period, with the field names of D3.2's code snippet 4.
 
-`Record` defines the schema: `python -m scan2sim.services.monitoring.node.record` prints it as JSON Schema.
+`Record` defines the schema: `python -m scan2sim.services.monitoring.record` prints it as JSON Schema.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from scan2sim.services.monitoring.node.meter import Flow, Reading
+from scan2sim.services.monitoring.meter import Flow, Reading
 from scan2sim.services.transport.types import Endpoint
 
 SCHEMA = "scan2sim-monitor-1"

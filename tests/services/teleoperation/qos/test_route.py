@@ -14,10 +14,10 @@ from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.io.worlds.scene import Scene
 from scan2sim.services.teleoperation.control.controls import VehicleState
 from scan2sim.services.teleoperation.control.messages import Telemetry
+from scan2sim.services.teleoperation.qos import route
+from scan2sim.services.teleoperation.qos.route import LoopingVehicle, PurePursuit
 from scan2sim.services.teleoperation.qos.scripted_drive import ScriptedCommands
-from scan2sim.services.teleoperation.sim import route
 from scan2sim.services.teleoperation.sim.bicycle import Bicycle, Ground
-from scan2sim.services.teleoperation.sim.route import LoopingVehicle, PurePursuit
 from tests.fakes import synthetic
 
 STEP = 0.02

@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
+from scan2sim.services.teleoperation import timecode
 from scan2sim.services.teleoperation.cameras import CameraFrame
-from scan2sim.services.teleoperation.video import timecode
 from scan2sim.services.teleoperation.video.rate_control import EncodingPlan
 from tests.services.teleoperation.video.videos import Drive, scenery
 
