@@ -35,7 +35,7 @@ PAGES = [
     ROOT / "data_samples/README.md",
 ]
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-PARAMS: dict[str, type[BaseModel]] = {step.name: step.params for step in STEPS}
+PARAMS: dict[str, type[Params]] = {step.name: step.params for step in STEPS}
 OTHER_PROGRAMS = re.compile(r"\b(prefect|docker|dask|ray|gz|pip|aws|curl|trtexec|export.py)\b")
 """Other programs, whose options a page may mention if it also shows them in a command."""
 SUFFIXES = {"py", "json", "geojson", "csv", "obj", "laz", "png", "npz", "toml", "sdf", "dae", "mtl", "glb", "jpg"}

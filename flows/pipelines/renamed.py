@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 STEPS = {
-    "dynamic_objects": "dynamic_objects",
-    "instances": "instances",
+    "carve": "dynamic_objects",
+    "things": "instances",
     "reach": "photo_coverage",
     "finds": "detect_furniture",
-    "pose_refinement": "pose_refinement",
-    "photo_consistency": "photo_consistency",
-    "view_selection": "view_selection",
-    "colour_harmonization": "colour_harmonization",
+    "refine": "pose_refinement",
+    "agreement": "photo_consistency",
+    "choose": "view_selection",
+    "level": "colour_harmonization",
     "place": "georeference",
 }
 """Earlier name of a step: its name."""

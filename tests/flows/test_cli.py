@@ -275,7 +275,7 @@ def test_cloud_without_photos_colours_and_classes(street: Path, tmp_path: Path) 
 def test_truncated_cloud_is_an_input_error(damaged: Path, tmp_path: Path) -> None:
     data = (damaged / "cloud.laz").read_bytes()
     (damaged / "cloud.laz").write_bytes(data[: len(data) // 2])
-    assert_fails(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "cloud.laz", "Copy it again")
+    assert_fails(scan2sim("run", damaged, "--out", tmp_path / "out"), 3, "cloud.laz", "Copy or export the file again")
 
 
 def test_missing_crs_is_an_input_error(damaged: Path, tmp_path: Path) -> None:

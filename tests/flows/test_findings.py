@@ -80,7 +80,7 @@ def test_remains_of_removed_vehicles() -> None:
 
 
 def test_rejected_photos() -> None:
-    (one,) = findings(run_of(agreement={"left_out": ["a", "b", "c"]}))
+    (one,) = findings(run_of(photo_consistency={"left_out": ["a", "b", "c"]}))
     assert one.level == "unusable" and "3 of 8 photos" in one.text and "a, b, c" in one.text
 
 

@@ -91,13 +91,13 @@ def test_points_that_vanish_are_named_with_their_share_and_what_to_do(tmp_path: 
     (tmp_path / "split").mkdir()
     parted = split({"cloud": done.files["cloud"]}, SplitParams(), tmp_path / "split", silent)
     assert parted.facts["points"] == {"terrain": 400, "building": 0, "vegetation": 400, "rest": 1200}
-    warning = next(w for w in parted.warnings if "no class" in w and "%" in w)
+    warning = next(w for w in parted.warnings if "no known class" in w and "%" in w)
     assert warning.startswith("60.0% of the points") and "unclassified 40.0%, code_31 20.0%" in warning
     assert '31 = "building"' in warning and "segment.overwrite=true" in warning
     cloud = PointCloud.load(done.files["cloud"])
     cloud.take(np.flatnonzero(present(cloud.classification) != 31)).save(tmp_path / "rest.npz")
     parted = split({"cloud": tmp_path / "rest.npz"}, SplitParams(), tmp_path / "split", silent)
-    assert "Have all classes told anew" in parted.warnings[-1] and "[classes]" not in parted.warnings[-1]
+    assert "Classify the cloud again" in parted.warnings[-1] and "[classes]" not in parted.warnings[-1]
 
 
 def test_clouds_that_become_laz_keep_their_survey_s_codes_until_a_tile_says_what_they_are(tmp_path: Path) -> None:

@@ -165,7 +165,7 @@ def test_the_recording_vehicle_and_cameras_have_room(street: PointCloud, tmp_pat
         street.frame, places.astype(np.float32), classification=np.full(5, POLE, np.uint8), time=np.full(5, 1.0)
     )
     cloud = PointCloud.join([street, extra])
-    done = carve(cloud, tmp_path, path(), cameras=((9.0, 6.0, 8.0),))
+    done = carve(cloud, tmp_path, path(), positions=((9.0, 6.0, 8.0),))
     kept = np.load(done.files["dropped"]) == 0
     assert kept[-5:].tolist() == [False, False, False, False, True]
     assert cloud.classification is not None and kept[cloud.classification == GROUND].all()

@@ -247,7 +247,7 @@ def test_a_road_over_two_tiles_is_one(tmp_path: Path) -> None:
 
 
 def test_a_world_without_lanes_has_no_opendrive(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no road's lanes"):
+    with pytest.raises(DataError, match="no road of town has detected lanes"):
         world_formats.write(worlds.scene(tmp_path), ["opendrive"], tmp_path / "export", SceneParams(), silent)
 
 

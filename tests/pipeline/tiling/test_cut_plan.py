@@ -472,7 +472,7 @@ def test_a_trajectory_elsewhere_is_told(tmp_path: Path) -> None:
     path = drive()
     path[:, 1] += 5000
     folder = corridor(tmp_path / "corridor", n=20_000, path=path)
-    with pytest.raises(DataError, match=r"only 0 points, and 20,000 farther than 20 m.*one CRS"):
+    with pytest.raises(DataError, match=r"only 0 points, and 20,000 farther than 20 m.*CRS of clouds and trajectory"):
         cut_survey(folder, tmp_path / "out", CUT)
     assert left(tmp_path) == []
 
