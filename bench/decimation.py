@@ -25,8 +25,8 @@ import numpy as np
 from scan2sim.pipeline import decimation
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.types import Mesh
-from scan2sim.pipeline.steps.collision import deviation
-from scan2sim.pipeline.tiling.borders.boundary_curve import curve
+from scan2sim.pipeline.geometry.boundary_curve import curve
+from scan2sim.pipeline.geometry.surface_distance import deviation
 
 
 def read(out: Path, group: str) -> Mesh:

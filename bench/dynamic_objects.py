@@ -26,7 +26,7 @@ from scan2sim.pipeline.core.classes import CODE, name_of
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import PointCloud, Trajectory
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.steps.carve import CARVE, SCAN_WINDOW_S
+from scan2sim.pipeline.steps.dynamic_objects import DYNAMIC_OBJECTS, SCAN_WINDOW_S
 from scan2sim.pipeline.steps.ingest import INGEST
 from scan2sim.pipeline.steps.path import PATH
 
@@ -54,7 +54,9 @@ def remove_dynamic(cloud: PointCloud, path: Trajectory) -> tuple[Bools, float, d
         cloud.save(out / "in.npz")
         path.save(out / "path.npz")
         begin = time.perf_counter()
-        done = CARVE.run({"cloud": out / "in.npz", "path": out / "path.npz"}, CARVE.params(), out, silent)
+        done = DYNAMIC_OBJECTS.run(
+            {"cloud": out / "in.npz", "path": out / "path.npz"}, DYNAMIC_OBJECTS.params(), out, silent
+        )
         seconds = time.perf_counter() - begin
         dropped = np.load(done.files["dropped"])
         return (dropped > 0 if len(dropped) else np.zeros(len(cloud), bool)), seconds, done.facts

@@ -20,8 +20,9 @@ import open3d as o3d
 from scipy.spatial import cKDTree
 
 from scan2sim.pipeline.core.types import F32, F64, Mesh, PointCloud
+from scan2sim.pipeline.geometry.surface_distance import distances, sample_surface
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.steps.geometry import distances, sample_surface, truth_error
+from scan2sim.pipeline.steps.geometry import truth_error
 
 CREASE_COS = float(np.cos(np.radians(30.0)))
 BUILDING = 6

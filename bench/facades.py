@@ -26,13 +26,14 @@ from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, Step, silent
 from scan2sim.pipeline.core.types import Mesh, PointCloud
 from scan2sim.pipeline.geometry.normals import oriented_normals
+from scan2sim.pipeline.geometry.surface_distance import distances
+from scan2sim.pipeline.geometry.voxel_grid import sample
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.facades import FACADES
-from scan2sim.pipeline.steps.geometry import distances
 from scan2sim.pipeline.steps.ingest import INGEST
 from scan2sim.pipeline.steps.split import SPLIT
-from scan2sim.pipeline.steps.voxel import VOXEL, sample
+from scan2sim.pipeline.steps.voxel import VOXEL
 
 STREET: dict[str, Any] = {"length": 30.0, "points": 1.2e6, "photos": 24}
 MATCH_DISTANCE_M = 0.3
@@ -72,7 +73,7 @@ def evaluate(folder: Path, seed: int, degrees: float) -> dict[str, float]:
     begin = time.process_time()
     done = run_step(FACADES, inputs | {f"other.{part}": path for part, path in thin.items()})
     seconds = time.process_time() - begin
-    made, truth = PointCloud.load(done.files["made"]), Mesh.load(tile.truth_mesh)
+    made, truth = PointCloud.load(done.files["synthesized"]), Mesh.load(tile.truth_mesh)
     off = distances(made.xyz, truth.moved_to(made.frame))
     walls = oriented_normals(
         sample(whole.take(~low & (whole.classification == CODE["building"])), 0.1), 16, tile.trajectory

@@ -1,12 +1,12 @@
 """Street furniture and sky removal compared with the truth of synthetic streets.
 
 `python -m bench.furniture [--seeds 0 1 2] [--length 100 --points 4e6] [--parts shape sky] [--out bench-out/furniture]`
-- shape: streets are scanned, and the steps `finds` and `furniture` run on their labelled clouds. `pole_recall`: share
-  of lamps and signs with a detection other than a trunk within 20 cm; `trunk_recall` of trees; `pole_precision`: share
-  of detections within 30 cm of a lamp, sign or tree. `sign_plate_cm`, `pole_cm`: mean distance from true surface
-  samples of sign panels, and of poles below them, to the meshes.
-- sky: world of the small street with `agreement.sky` off and on: `sky_share`: share of the surface of crowns and
-  buildings that is far bluer and brighter than the truth; `truth_db`: PSNR of the true colours there.
+- shape: streets are scanned, and the steps `detect_furniture` and `furniture` run on their labelled clouds.
+  `pole_recall`: share of lamps and signs with a detection other than a trunk within 20 cm; `trunk_recall` of trees;
+  `pole_precision`: share of detections within 30 cm of a lamp, sign or tree. `sign_plate_cm`, `pole_cm`: mean distance
+  from true surface samples of sign panels, and of poles below them, to the meshes.
+- sky: world of the small street with `photo_consistency.sky` off and on: `sky_share`: share of the surface of crowns
+  and buildings that is far bluer and brighter than the truth; `truth_db`: PSNR of the true colours there.
 
 Ends with `RESULT {json}`.
 """
@@ -30,11 +30,11 @@ from scan2sim.pipeline.camera.renderer import Renderer, textured
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import F32, Mesh
+from scan2sim.pipeline.geometry.surface_distance import distances, sample_surface
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.steps.finds import FINDS, FindsParams
+from scan2sim.pipeline.steps.detect_furniture import DETECT_FURNITURE, DetectFurnitureParams
 from scan2sim.pipeline.steps.furniture import FURNITURE, FurnitureParams
-from scan2sim.pipeline.steps.geometry import distances, sample_surface
 
 RECALL_DISTANCE_M, PRECISION_DISTANCE_M = 0.2, 0.3
 """Maximum distance of a detection from the truth for recall of poles, and for precision and trunks."""
@@ -92,7 +92,7 @@ def _street(street: Path, seed: int, length: float) -> dict[str, list[Any]]:
         las.read(tile.clouds[0], tile.frame).save(folder / "cloud.npz")
         tile.trajectory.save(folder / "path.npz")
         cloud = {"cloud": folder / "cloud.npz"}
-        found = FINDS.run(cloud | {"path": folder / "path.npz"}, FindsParams(), folder, silent)
+        found = DETECT_FURNITURE.run(cloud | {"path": folder / "path.npz"}, DetectFurnitureParams(), folder, silent)
         done = FURNITURE.run(cloud | found.files, FurnitureParams(), folder, silent)
         features = json.loads(done.files["geojson"].read_text(encoding="utf-8"))["features"]
         mesh = Mesh.load(done.files["building"])
@@ -125,7 +125,7 @@ def _street(street: Path, seed: int, length: float) -> dict[str, list[Any]]:
 def sky(out: Path, on: bool) -> dict[str, float]:
     """Share of sky on crowns and buildings in the small street's world, and PSNR of their colours."""
     scan2sim = str(Path(sys.executable).parent / "scan2sim")
-    command = [scan2sim, "run", str(SMALL), "--out", str(out), "--set", f"agreement.sky={str(on).lower()}"]
+    command = [scan2sim, "run", str(SMALL), "--out", str(out), "--set", f"photo_consistency.sky={str(on).lower()}"]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     folders = {g: out / "steps" / f"texture.{g}" for g in ("building", "vegetation")}

@@ -230,7 +230,7 @@ def methods_of(made: Made) -> dict[str, Method]:
         f"boxes of points, {SPLAT_PX} px": lambda view: boxes(made.cloud, view),
         "discs of points": of(depth_map.scene([], made.cloud, radius=p.radius)),
         "mesh": of(depth_map.scene(meshes)),
-        OURS: of(depth_map.scene(meshes, made.cloud, radius=p.radius, mesh_distance=p.lacking)),
+        OURS: of(depth_map.scene(meshes, made.cloud, radius=p.radius, mesh_distance=p.mesh_distance)),
     }
 
 

@@ -71,7 +71,7 @@ def vote(
         views: all views, by index; views without a file have no vote.
         probabilities: folder of `<view index>.npy`, (h, w, C) uint8.
         radius: radius in metres of the discs by which points hide others: about the voxel size.
-        moving: moving points from the step `carve`, which hide others at the time of their scan.
+        moving: moving points from the step `dynamic_objects`, which hide others at the time of their scan.
         report: progress callback.
     """
     occluders = scene([], cloud, radius=radius, moving=moving)

@@ -191,7 +191,7 @@ class Recorder:
         placed, map_ = odometry.placed, odometry.map
         moving = np.array([odometry.pose_of(p)[[0, 2], 3] for p in placed[self._final :]]).reshape(-1, 2)
         self._path = np.concatenate([self._path[: self._final], moving])
-        fixed_keyframes = len(map_.keyframes) - map_.params.window - map_.params.anchors - 2
+        fixed_keyframes = len(map_.keyframes) - map_.params.window - map_.params.fixed_keyframes - 2
         while self._final < len(placed) and placed[self._final].keyframe < fixed_keyframes:
             self._final += 1
         if len(map_.keyframes) >= self._keyframes + 5 and len(map_.landmarks):

@@ -25,15 +25,20 @@ ROOMS = {
 HEAVY = ("open3d", "torch", "prefect", "numba", "cv2", "scipy", "trimesh", "pyproj", "pycolmap", "pymeshlab", "numpy")
 
 
-def imported(file: Path) -> set[str]:
-    """What a file imports, anywhere in it: rooms by their own names, other modules by their first."""
+def modules(file: Path) -> set[str]:
+    """Full names of the modules, or of objects in modules, that a file imports anywhere."""
     names = set()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return {name.removeprefix("scan2sim.").split(".")[0] for name in names}
+    return names
+
+
+def imported(file: Path) -> set[str]:
+    """What a file imports, anywhere in it: rooms by their own names, other modules by their first."""
+    return {name.removeprefix("scan2sim.").split(".")[0] for name in modules(file)}
 
 
 @pytest.mark.parametrize("room", ROOMS)
@@ -41,6 +46,17 @@ def test_imports_run_one_way(room: str) -> None:
     for file in (ROOT / room).rglob("*.py"):
         foreign = (imported(file) & set(ROOMS)) - {room} - ROOMS[room]
         assert not foreign, f"{file.relative_to(ROOT)} imports {foreign}"
+
+
+def test_tests_do_not_import_benchmarks() -> None:
+    for file in (ROOT / "tests").rglob("*.py"):
+        assert "bench" not in imported(file), f"{file.relative_to(ROOT)} imports bench: share code in tests/fakes"
+
+
+def test_benchmarks_import_only_fakes_from_tests() -> None:
+    for file in (ROOT / "bench").rglob("*.py"):
+        foreign = [name for name in modules(file) if f"{name}.".startswith("tests.")]
+        assert all(name.startswith("tests.fakes.") for name in foreign), f"{file.relative_to(ROOT)} imports {foreign}"
 
 
 def project_files() -> dict[str, Path]:

@@ -30,7 +30,7 @@ from scan2sim.services.teleoperation import cameras, encoders
 from scan2sim.services.teleoperation.vehicle import adapters
 from scan2sim.slam import features, matchers, solvers, trackers
 from tests.conftest import ROOT
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 
 PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
     networks: (networks.Backend,),

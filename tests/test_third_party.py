@@ -6,7 +6,7 @@ import re
 
 from packaging.utils import canonicalize_name
 
-from bench.packaging.third_party import closure, page, project
+from deploy.third_party import closure, page, project
 from tests.conftest import ROOT
 
 
@@ -19,7 +19,7 @@ def test_the_page_lists_all_pinned_core_packages() -> None:
     assert len(core) > 20
     for name in core:
         assert f"| {name} | {pins[name]} |" in section, (
-            f"{name} is outdated: python -m bench.packaging.third_party > docs/reference/third-party.md"
+            f"{name} is outdated: python -m deploy.third_party > docs/reference/third-party.md"
         )
 
 

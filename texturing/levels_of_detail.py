@@ -18,11 +18,11 @@ import numpy as np
 from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.step import Report
 from scan2sim.pipeline.core.types import F64, I64, Mesh
+from scan2sim.pipeline.geometry.boundary_curve import curve
 from scan2sim.pipeline.io.file_checks import link_or_copy
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.worlds import textured_mesh
 from scan2sim.pipeline.io.worlds.scene import Level, Scene, SceneTile, statistics
-from scan2sim.pipeline.tiling.borders.boundary_curve import curve
 from scan2sim.texturing.simplify_textured import WELD_DISTANCE_M, Share, simplify_group
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ def _welded(vertices: F64, more: F64) -> tuple[F64, I64]:
 
 def _geometric_error(fine: Mesh, coarse: Mesh) -> float:
     """95th percentile of the distance in metres from points on a mesh to a coarser mesh."""
-    from scan2sim.pipeline.steps.collision import deviation
+    from scan2sim.pipeline.geometry.surface_distance import deviation
 
     return deviation(fine, coarse, 0)["p95"]
 

@@ -132,7 +132,7 @@ def pack(size: I64, side: int, gutter: int) -> tuple[I64, I64, list[tuple[int, i
 
 def overlapping(flat: F32, page: I64, pages: list[tuple[int, int]]) -> Bools:
     """(N,) faces that own too few of their texels because others overlap them; `flat` (N, 3, 2) texels of the page."""
-    from scan2sim.texturing.bake.texel_map import owners
+    from scan2sim.texturing.texel_map import owners
 
     area = np.abs(_signed_area(flat))
     covered = np.zeros(len(flat), bool)

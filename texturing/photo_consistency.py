@@ -1,4 +1,4 @@
-"""Photo consistency step (`agreement`): compares each photo with its neighbours and masks what is inconsistent.
+"""Photo consistency step (`photo_consistency`): compares each photo with its neighbours and masks what is inconsistent.
 
 Every photo is predicted from its neighbours (`texturing.photo_prediction`). Regions where at least two other photos
 agree and this one differs are ghosts (a moving car, a person, its shadow, a reflection) and are masked, as is sky that
@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.parameters import Cosine, Depth, Distance
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, U8, Bools, View
@@ -59,7 +58,7 @@ SKY_OUTLINE_TOLERANCE_M = 0.5
 """Error of a surface's outline in metres: five voxels of the default size, as for foliage."""
 
 
-class AgreementParams(Params):
+class PhotoConsistencyParams(Params):
     """Settings of the photo consistency check.
 
     Attributes:
@@ -69,7 +68,7 @@ class AgreementParams(Params):
         neighbours: number of photos that each photo is compared with.
         max_shift: pixels (of a photo scaled to 0.25 MP) by which a photo may be shifted against the others; photos
             with a larger shift are excluded; 0: no limit.
-        max_distance, min_cos, bias: as in the step `choose`.
+        max_distance, min_cos, bias: as in the step `view_selection`.
     """
 
     ghosts: bool = True
@@ -82,60 +81,17 @@ class AgreementParams(Params):
     bias: Depth = 0.04
 
 
-@dataclass(frozen=True)
-class PhotoConsistency:
-    """Result of the step `agreement`, by index of view.
-
-    Attributes:
-        folder: contains `agreement.json`, masks and warps.
-        usable: whether the photo may be used for texture.
-        quality_factors: factor on the photo's quality, below 1 if it is blurred.
-    """
-
-    folder: Path
-    usable: tuple[bool, ...]
-    quality_factors: tuple[float, ...]
-
-    @classmethod
-    def load(cls, folder: Path) -> PhotoConsistency:
-        """Read the folder that the step wrote.
-
-        Raises:
-            InputError: `agreement.json` is missing or damaged.
-        """
-        path = folder / "agreement.json"
-        try:
-            rows = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, json.JSONDecodeError) as error:
-            raise InputError(path, f"can't be read ({error})", "Run again with `--from agreement`") from None
-        return cls(folder, tuple(row["usable"] for row in rows), tuple(row["sharpness_factor"] for row in rows))
-
-    def sharpness(self, i: int) -> float:
-        """Factor on the quality of view `i`, below 1 if it is blurred."""
-        return self.quality_factors[i]
-
-    def mask(self, i: int, view: View) -> U8:
-        """(h, w) uint8, 0 where photo `i` must not be used (its own mask, ghosts, sky); (0, 0): nothing is masked."""
-        path = self.folder / f"mask_{i}.png"
-        return image.read_levels(path) if path.is_file() else np.zeros((0, 0), np.uint8)
-
-    def warp(self, i: int) -> F32:
-        """(h, w, 2) float32 displacement in pixels, to be added to positions in photo `i`; (0, 0, 2): no warp."""
-        path = self.folder / f"warp_{i}.npy"
-        return np.load(path) if path.is_file() else np.zeros((0, 0, 2), np.float32)
-
-
-def agreement(inputs: Inputs, params: AgreementParams, out: Path, report: Report) -> Done:
+def photo_consistency(inputs: Inputs, params: PhotoConsistencyParams, out: Path, report: Report) -> Done:
     """Compare every photo that is not held out with its neighbours.
 
     Inputs: `views`, `depth` (folder of depth maps), `exposures`.
-    Folder: `agreement`, with `agreement.json` (one row per view), `mask_<i>.png` for photos with masked pixels (own
-    mask, ghosts, sky), and `warp_<i>.npy` for photos that are warped.
+    Folder: `photo_consistency`, with `photo_consistency.json` (one row per view), `mask_<i>.png` for photos with
+    masked pixels (own mask, ghosts, sky), and `warp_<i>.npy` for photos that are warped.
     """
     from scan2sim.pipeline.camera.depth_map import load_depth_map
     from scan2sim.texturing.photo_cache import Exposures, PhotoCache, camera_of
 
-    folder = out / "agreement"
+    folder = out / "photo_consistency"
     folder.mkdir()
     views = views_io.load(inputs["views"])
     held = views_io.load_held_out(inputs["views"])
@@ -169,12 +125,14 @@ def agreement(inputs: Inputs, params: AgreementParams, out: Path, report: Report
         if params.align and compared.warp is not None:
             np.save(folder / f"warp_{i}.npy", compared.warp)
     _exclude_and_downweight(rows, params)
-    (folder / "agreement.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
-    return Done({"agreement": folder}, _metrics(rows, used), [str(row["reason"]) for row in rows if "reason" in row])
+    (folder / "photo_consistency.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    return Done(
+        {"photo_consistency": folder}, _metrics(rows, used), [str(row["reason"]) for row in rows if "reason" in row]
+    )
 
 
 def neighbours(
-    views: Sequence[View], used: Sequence[int], depth: Callable[[int], DepthMap], params: AgreementParams
+    views: Sequence[View], used: Sequence[int], depth: Callable[[int], DepthMap], params: PhotoConsistencyParams
 ) -> dict[int, list[int]]:
     """For each view the neighbours that see most of its surface at a similar resolution, best first."""
     from scan2sim.pipeline.camera.depth_map import visible
@@ -216,7 +174,7 @@ class Comparison:
     """A photo compared with its prediction.
 
     Attributes:
-        figures: columns of `agreement.json`.
+        figures: columns of `photo_consistency.json`.
         ghosts: (h, w) where the photo shows a ghost; None: unknown.
         warp: displacement field of `warp_of`; None: unknown.
     """
@@ -233,7 +191,7 @@ def compare(
     depth: Callable[[int], DepthMap],
     photos: PhotoCache,
     exposures: Exposures,
-    params: AgreementParams,
+    params: PhotoConsistencyParams,
 ) -> Comparison:
     """Predict photo `i` from the photos `others`, and compare it with the prediction."""
     import cv2
@@ -369,7 +327,7 @@ def combined(ghosts: Bools | None, mask: U8) -> U8 | None:
     return allowed
 
 
-def _exclude_and_downweight(rows: list[dict[str, Any]], params: AgreementParams) -> None:
+def _exclude_and_downweight(rows: list[dict[str, Any]], params: PhotoConsistencyParams) -> None:
     """Exclude overexposed and shifted photos, and set the weight of blurred ones, by their figures; in place."""
     for row in rows:
         if not row["usable"]:
@@ -389,7 +347,7 @@ def _exclude_and_downweight(rows: list[dict[str, Any]], params: AgreementParams)
             row |= {
                 "usable": False,
                 "reason": f"{row['name']}: excluded, it is shifted by {row['shift_px']:.1f} pixels against the other "
-                "photos: check its pose (`agreement.max_shift` is the limit)",
+                "photos: check its pose (`photo_consistency.max_shift` is the limit)",
             }
         elif row["sharpness_factor"] < 1:
             row["reason"] = (
@@ -411,4 +369,4 @@ def _metrics(rows: Sequence[dict[str, Any]], used: Sequence[int]) -> dict[str, A
     }
 
 
-AGREEMENT = Step("agreement", 3, agreement, AgreementParams)
+PHOTO_CONSISTENCY = Step("photo_consistency", 3, photo_consistency, PhotoConsistencyParams)

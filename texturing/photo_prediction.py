@@ -29,7 +29,7 @@ from scan2sim.pipeline.camera.projection import (
     to_camera,
 )
 from scan2sim.pipeline.core.types import F32, F64, U8, Camera
-from scan2sim.texturing.bake.blend_numba import corrected, vignette
+from scan2sim.texturing.exposure_model import corrected, vignette
 from scan2sim.texturing.photo_cache import SRGB_OFFSET, Photo
 
 AGREEMENT_LEVELS = 28.0
@@ -91,7 +91,7 @@ class Predictor:
     Args:
         surface: visible surface of the view.
         count: number of photos that will be added.
-        max_distance, min_cos, bias: as in `ChooseParams`.
+        max_distance, min_cos, bias: as in `ViewSelectionParams`.
     """
 
     def __init__(self, surface: Surface, count: int, *, max_distance: float, min_cos: float, bias: float) -> None:

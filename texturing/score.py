@@ -15,7 +15,7 @@ from scan2sim.pipeline.core.parameters import Distance
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, I64, Bools, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.steps.pictures import Album
+from scan2sim.pipeline.io.images.album import Album
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.camera.renderer import Renderer
@@ -29,12 +29,12 @@ class ScoreParams(Params):
     """Settings of the evaluation.
 
     Attributes:
-        truth_reach: largest distance in metres between a ground-truth sample and the mesh for it to be compared.
+        truth_max_distance: largest distance in metres between a ground-truth sample and the mesh for it to be compared.
         truth_samples: maximum number of ground-truth samples that are compared.
         near: largest distance in metres between a ground-truth sample and a photo for `truth_psnr_near_db`.
     """
 
-    truth_reach: Distance = 0.1
+    truth_max_distance: Distance = 0.1
     truth_samples: int = Field(500_000, ge=1000, le=20_000_000)
     near: Distance = 15.0
 
@@ -52,7 +52,7 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     each photo, and `coverage`, 0 if no other photo saw what it shows; `by_class` and `by_distance`, the same over
     their pixels, without sharpness; `truth_psnr_db` and `truth_psnr_near_db` for generated tiles; `cameras`, their
     number (`count`) and the distance in metres to the nearest surface of those within `CAMERA_CLEARANCE_M` of one
-    (`near_m`). If `things` are given, `remains_m2`: surface left of each removed vehicle
+    (`near_m`). If `instances` are given, `residue_m2`: surface left of each removed vehicle
     (`pipeline.dynamic_objects.vehicle_residue`).
     """
     from scan2sim.pipeline.camera.renderer import Renderer, textured
@@ -96,10 +96,10 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
         report(0.9, "comparing with ground-truth colours")
         metrics |= _truth(inputs, world, params)
     metrics["cameras"] = _cameras(world, views)
-    if "things" in inputs:
+    if "instances" in inputs:
         others = [body.mesh for group, body in zip(groups, world.bodies, strict=True) if group != "vehicle"]
-        left = residue_areas(others, inputs["things"])
-        metrics["remains_m2"] = [round(area, 2) for area in left]
+        left = residue_areas(others, inputs["instances"])
+        metrics["residue_m2"] = [round(area, 2) for area in left]
     return Done({"error": album.folder}, metrics, warnings)
 
 
@@ -151,7 +151,7 @@ def _truth(inputs: Inputs, world: Renderer, params: ScoreParams) -> dict[str, fl
     assert truth.rgb is not None
     rgb, seen, distance = world.nearest(truth.xyz)
     squared = ((rgb.astype(np.float64) - truth.rgb) ** 2).mean(axis=1)
-    counted = (seen == 255) & (distance < params.truth_reach)
+    counted = (seen == 255) & (distance < params.truth_max_distance)
     near = counted.copy()
     near[counted] = _seen_from_near(inputs, *world.closest_points(truth.xyz[counted]), params.near)
 

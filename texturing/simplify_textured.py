@@ -7,7 +7,6 @@ several points where texels become wider. Edges on the borders of tiles are kept
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -17,6 +16,7 @@ from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F64, I64, U8, Bools, Frame, Mesh
 from scan2sim.pipeline.io.worlds import scene as scenes
 from scan2sim.pipeline.io.worlds.scene import Scene, Surface
+from scan2sim.texturing.texture_page import Page
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.io.worlds.textured_mesh import Textured
@@ -91,24 +91,24 @@ def simplify_group(group: str, shape: Textured, source: Path, share: Share, bord
             None: all open edges are kept.
         out: folder to be created.
     """
-    from scan2sim.texturing.unwrap import UNWRAP, UnwrapParams
+    from scan2sim.texturing.texture_layout import UnwrapParams, unwrapped
 
     out.mkdir(parents=True)
     frame, parts = shape.mesh.frame, scenes.by_class(group, shape)
     small = _joined(frame, [(part, _decimated(part.shape.mesh, share.triangles, borders)) for part in parts])
-    small.save(out / "small.npz")
     budget = share.texels * texel_count(shape)
     backend: Literal["xatlas", "uvatlas"] = "uvatlas" if len(small) <= UVATLAS_MAX_TRIANGLES else "xatlas"
     texel = float(np.sqrt(small.face_area.sum(dtype=np.float64) / (INITIAL_UTILISATION[backend] * budget)))
     for _ in range(MAX_UNWRAP_ATTEMPTS):  # the utilisation of the pages is known only after unwrapping
         params = UnwrapParams(backend=backend, texel=float(np.clip(texel, 0.0005, 10)), gutter=GUTTER_TEXELS)
-        flat = Mesh.load(UNWRAP.run({"mesh": out / "small.npz"}, params, out, silent).files["mesh"])
-        pages = json.loads((out / "pages.json").read_text(encoding="utf-8"))
-        count = sum(page["width"] * page["height"] for page in pages)
+        layout = unwrapped(small, params, silent)
+        count = sum(page["width"] * page["height"] for page in layout.pages)
         if count <= budget:
             break
         texel *= 1.05 * np.sqrt(count / budget)
-    _paint(flat, pages, source, out, int(np.clip(np.rint(share.texels**-0.5), 1, MAX_SUPERSAMPLING)))
+    flat = layout.applied_to(small)
+    flat.save(out / "mesh.npz")
+    _paint(flat, layout.pages, source, out, int(np.clip(np.rint(share.texels**-0.5), 1, MAX_SUPERSAMPLING)))
     return flat
 
 
@@ -154,7 +154,7 @@ def _joined(frame: Frame, parts: list[tuple[Surface, Mesh]]) -> Mesh:
 def _paint(mesh: Mesh, pages: list[dict[str, int]], source: Path, out: Path, samples: int) -> None:
     """Write a mesh's `pages` with texture from the textured mesh in `source`, with samples x samples per texel."""
     from scan2sim.pipeline.camera import renderer
-    from scan2sim.texturing.bake import texel_map as texels
+    from scan2sim.texturing import texel_map as texels
     from scan2sim.texturing.bake.page_writer import PageWriter
     from scan2sim.texturing.inpainting import hole_filling
 
@@ -174,7 +174,7 @@ def _paint(mesh: Mesh, pages: list[dict[str, int]], source: Path, out: Path, sam
             rgb[chunk], seen[chunk], _ = original.nearest(hole_filling.texel_points(owner, flat, corners, *chunk))
         rgb, seen = _downsampled(rgb, seen, samples)
         hole_filling.pad(rgb, seen, PADDING_TEXELS)
-        writer.write(out / f"page_{k}", hole_filling.Page(rgb, seen, owner, flat, corners))
+        writer.write(out / f"page_{k}", Page(rgb, seen, owner, flat, corners))
     writer.finish()
 
 

@@ -24,13 +24,14 @@ from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, I64, U8, Bools, Mesh, PointCloud
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
-from scan2sim.texturing.photo_consistency import PhotoConsistency
-from scan2sim.texturing.view_selection.step import Choice
+from scan2sim.texturing.consistency_result import PhotoConsistency
+from scan2sim.texturing.texture_page import FILLED, Page
+from scan2sim.texturing.view_selection.choice import Choice
 
 if TYPE_CHECKING:
     from scan2sim.texturing.bake.bands import Baker
     from scan2sim.texturing.inpainting.ground import GroundOrthophoto
-    from scan2sim.texturing.inpainting.hole_filling import Page, PointColours
+    from scan2sim.texturing.inpainting.hole_filling import PointColours
 
 SEEN_TEXEL_STRIDE = 8
 """Where the points have no colours, every Nth seen texel (in both directions) is a colour sample for unseen texels."""
@@ -48,7 +49,7 @@ class TextureParams(Params):
         bias: metres that a surface may lie behind the depth map and still count as visible.
         feather: share of a photo's width over which its weight fades towards the photo's border.
         padding: texels by which colours are extended beyond the charts, for mip-maps.
-        continued: inpaint surfaces for which neither a photo nor a point gives a colour, keeping the pattern around
+        inpaint: inpaint surfaces for which neither a photo nor a point gives a colour, keeping the pattern around
             them; for flat surfaces such as the ground.
         device: "numba": CPU; "cuda" or another torch device: GPU, equal to the CPU within one grey level; "auto": GPU
             if torch and a GPU are available.
@@ -61,7 +62,7 @@ class TextureParams(Params):
     bias: Depth = 0.04
     feather: float = Field(0.04, ge=0.0001, le=0.5)
     padding: int = Field(16, ge=2, le=256)
-    continued: bool = False
+    inpaint: bool = False
     device: Device = "auto"
 
 
@@ -69,9 +70,9 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     """Bake the texture pages of an unwrapped mesh.
 
     Inputs: `mesh` (with uv and page), `pages` (their sizes), `choice` (selected photos), `views`, `depth` (folder with
-    a depth map for every view), `exposures`, `agreement` (masks and warps of the photos), `cloud.*` (coloured points;
-    `cloud.rest`, the classes without a surface, is not used for colours), `made.*` (synthesized points, optional),
-    `things` (GeoJSON of the removed vehicles and people, optional).
+    a depth map for every view), `exposures`, `photo_consistency` (masks and warps of the photos), `cloud.*` (coloured
+    points; `cloud.rest`, the classes without a surface, is not used for colours), `synthesized.*` (synthesized points,
+    optional), `instances` (GeoJSON of the removed vehicles and people, optional).
     File: `textured`, a folder with `mesh.npz`, `page_<i>.png` and `page_<i>_seen.png` (255 seen by a photo,
     128 coloured from points, 64 filled from neighbours or by class, 0 no surface).
     """
@@ -88,7 +89,7 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     assert mesh.page is not None
     sizes = json.loads(inputs["pages"].read_text(encoding="utf-8"))
     baker = _baker(mesh, inputs, params)
-    ground = _ground_orthophoto(mesh, sizes, inputs) if params.continued else None
+    ground = _ground_orthophoto(mesh, sizes, inputs) if params.inpaint else None
     (colours, measured), synthesized = point_colours(inputs, ground), synthesized_colours(inputs)
     counts = np.zeros((len(mesh), 4), np.int64)
     writer = PageWriter()
@@ -129,7 +130,7 @@ def _baker(mesh: Mesh, inputs: Inputs, params: TextureParams) -> Baker:
         Choice.load(inputs["choice"]),
         lambda i: inputs["depth"] / f"{i}.npy",
         Exposures.load(inputs["exposures"]),
-        PhotoConsistency.load(inputs["agreement"]),
+        PhotoConsistency.load(inputs["photo_consistency"]),
         settings=BlendSettings(params.bias, params.power, params.feather, params.min_cos, params.band),
         fade=params.fade,
         device=best_device() if params.device == "auto" else params.device,
@@ -143,7 +144,7 @@ def _ground_orthophoto(mesh: Mesh, sizes: Sequence[dict[str, int]], inputs: Inpu
     from scan2sim.texturing.inpainting.point_colours import classes_of
 
     cloud = PointCloud.load(inputs["cloud.terrain"])
-    removed = parked_vehicle_outlines(inputs["things"], mesh.frame) if "things" in inputs else []
+    removed = parked_vehicle_outlines(inputs["instances"], mesh.frame) if "instances" in inputs else []
     return GroundOrthophoto(mesh, _texel_m(mesh, sizes), cloud.xyz, classes_of(cloud), removed)
 
 
@@ -160,7 +161,7 @@ def _inpaint_pages(
     orthophoto: GroundOrthophoto, folder: Path, mesh: Mesh, has_filled: Bools, params: TextureParams
 ) -> None:
     """Paint the inpainted ground onto the pages of the faces with `has_filled` (F,), and pad their charts."""
-    from scan2sim.texturing.bake import texel_map as texels
+    from scan2sim.texturing import texel_map as texels
     from scan2sim.texturing.bake.page_writer import PageWriter
     from scan2sim.texturing.inpainting import hole_filling
 
@@ -174,9 +175,7 @@ def _inpaint_pages(
             image.read_levels(path.with_name(f"{path.name}_seen.png")),
         )
         flat = texels.corners(mesh.uv[faces], seen.shape[1], seen.shape[0])
-        page = hole_filling.Page(
-            rgb, seen, texels.owners(flat, seen.shape[1], seen.shape[0]), flat, mesh.corners[faces]
-        )
+        page = Page(rgb, seen, texels.owners(flat, seen.shape[1], seen.shape[0]), flat, mesh.corners[faces])
         if ground is not None:
             ground.fill(page)
         hole_filling.pad(page.rgb, page.seen, params.padding)
@@ -196,7 +195,7 @@ def _fill_unseen(
     Where the points have no measured colours, colours come from nearby seen texels and, at synthesized points, from
     `synthesized` (positions, colours); None: the points have measured colours.
     """
-    from scan2sim.texturing.bake import texel_map as texels
+    from scan2sim.texturing import texel_map as texels
     from scan2sim.texturing.inpainting import hole_filling
 
     area = float(mesh.face_area[faces].sum())
@@ -205,12 +204,12 @@ def _fill_unseen(
         positions, rgb = hole_filling.seen_points(page, SEEN_TEXEL_STRIDE)
         if len(positions):
             xyz, colour = np.concatenate([positions, synthesized[0]]), np.concatenate([rgb, synthesized[1]])
-            colours = hole_filling.PointColours(xyz, colour, hole_filling.FILLED)
+            colours = hole_filling.PointColours(xyz, colour, FILLED)
     if colours is not None:
         hole_filling.fill(page, colours, max(texel, 1e-6))
     else:
-        page.seen[(page.owner >= 0) & (page.seen == 0)] = hole_filling.FILLED
-        page.rgb[page.seen == hole_filling.FILLED] = 128
+        page.seen[(page.owner >= 0) & (page.seen == 0)] = FILLED
+        page.rgb[page.seen == FILLED] = 128
     return np.asarray(texels.count(page.owner, page.seen, page.flat))
 
 
@@ -250,7 +249,7 @@ TEXTURE = Step(
     7,
     texture,
     TextureParams,
-    class_defaults={"terrain": {"continued": True}},
+    class_defaults={"terrain": {"inpaint": True}},
     check=can_texture,
     per_class=True,
     memory=(1.2, 3),

@@ -13,32 +13,18 @@ A monitored node publishes in one network namespace, a monitor subscribes in ano
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
 from typing import Any
 
-from bench.bus.overhead import ROS_PYTHON
-from bench.paths import ROOT
 from scan2sim.services.qos.counters import Counter
 from scan2sim.services.qos.emulated_link import Link
 from scan2sim.services.qos.link_profile import LinkProfile
-from scan2sim.services.qos.namespaces import Namespace
+from tests.fakes.interpreters import PYTHONS
+from tests.fakes.link_monitor import CLOCK_OFFSET_S, MESSAGE_BYTES, PACKET_BYTES, monitored
 
-PYTHONS = {"cyclone": Path(sys.executable), "rclpy": ROS_PYTHON}
-MESSAGE_CHARS = 1000
-"""Characters of a message, which fits into one packet."""
-MESSAGE_BYTES = MESSAGE_CHARS + 9
-"""Size of a serialized message: 4 bytes of encapsulation, 4 of length, the text and its terminator."""
-PACKET_BYTES = (MESSAGE_CHARS, MESSAGE_CHARS + 400)
-"""Minimum and maximum size of a packet with a message, including UDP and RTPS headers; other packets are smaller."""
 LINK_RATES_BPS = (1e6, 2e6, 8e6)
 OVERLOAD, OVERLOAD_S = 2.0, 10.0
 """Published rate as a multiple of the link's rate, and duration of the measurement."""
@@ -46,14 +32,8 @@ LOSSES = ((LinkProfile(loss=0.01), 100.0), (LinkProfile(loss=0.05), 40.0), (Link
 """Link profiles and durations in seconds, with a thousand messages per second."""
 DELAYS = ((0.005, False), (0.02, False), (0.1, False), (0.02, True))
 """Delays in seconds, and whether the ends act as two machines with separate clocks."""
-CLOCK_OFFSET_S = {"cyclone": 0.5, "rclpy": 0.0}
-"""Clock offset of the other machine; none for rclpy, which stamps messages in C++ code that can't be patched."""
 LATENCY_S = 15.0
 """Duration of a latency measurement."""
-NODE_PRIORITY = 10
-"""Real-time priority of the nodes, so that other load doesn't affect them; below the link's own priority."""
-DISCOVERY_TIMEOUT_S = 60.0
-"""Seconds within which nodes must discover each other."""
 
 
 @dataclass(frozen=True)
@@ -81,57 +61,6 @@ class Row:
         """Row of a table."""
         truth, measured = (f"{value:.6g}" for value in (self.truth, self.measured))
         return f"{self.what:<10} {self.transport:<8} {self.link:<48} {truth:>10} {measured:>10} {self.error:>8.2%}"
-
-
-class MonitorLog:
-    """Records of a monitor on the far side."""
-
-    def __init__(self, log: Path, process: subprocess.Popen[Any]) -> None:
-        self._log, self._process = log, process
-        self.flows: list[dict[str, Any]] = []
-
-    def read(self) -> None:
-        """Read all flows written so far, with the `time` and `period` of their records."""
-        lines = self._log.read_text(encoding="utf-8").splitlines(keepends=True) if self._log.exists() else []
-        records = [json.loads(line) for line in lines if line.endswith("\n")]
-        self.flows = [flow | {key: one[key] for key in ("time", "period")} for one in records for flow in one["flows"]]
-
-    def wait_for(self, condition: Callable[[dict[str, Any]], Any]) -> None:
-        """Wait until some flow meets a condition."""
-        end = time.monotonic() + DISCOVERY_TIMEOUT_S
-        while not any(map(condition, self.flows)):
-            if self._process.poll() is not None:
-                raise RuntimeError("the monitor has ended")
-            if time.monotonic() > end:
-                raise RuntimeError(f"nodes or clocks weren't synchronized within {DISCOVERY_TIMEOUT_S:g} s")
-            time.sleep(0.1)
-            self.read()
-
-
-@contextmanager
-def monitored(link: Link, transport: str, interval: float, machines: bool = False) -> Iterator[MonitorLog]:
-    """A talker on the near side and a monitor on the far side; at the end, records cover everything that was sent."""
-    with tempfile.TemporaryDirectory() as name:
-        path = Path(name) / "watch.log"
-        monitor = _start(link.far, transport, "watch", path, *(("--machine", "far") if machines else ()))
-        other = ("--machine", "near", "--ahead", CLOCK_OFFSET_S[transport]) if machines else ()
-        options = ("--size", MESSAGE_CHARS, "--interval", interval)
-        talker = _start(link.near, transport, "talk", Path(name) / "talk.log", *options, *other)
-        log = MonitorLog(path, monitor)
-        log.wait_for(lambda flow: flow["messages"])
-        yield log
-        for process, pause in ((talker, 1.5), (monitor, 0.0)):
-            process.terminate()
-            process.wait(DISCOVERY_TIMEOUT_S)
-            time.sleep(pause)
-        log.read()
-
-
-def _start(side: Namespace, transport: str, *arguments: object) -> subprocess.Popen[Any]:
-    variables = {"SCAN2SIM_TRANSPORT": transport, "PYTHONPATH": str(ROOT)}
-    variables |= {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}  # both ends could use this machine's shared memory
-    command = (PYTHONS[transport], "-m", "bench.bus.link_node", *arguments)
-    return side.popen(*command, priority=NODE_PRIORITY, env=os.environ | variables, cwd=ROOT)
 
 
 def bandwidth(transport: str, rate: float) -> Row:

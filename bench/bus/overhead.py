@@ -11,8 +11,8 @@ from pathlib import Path
 from statistics import median
 
 from bench.paths import ROOT
+from tests.fakes.interpreters import ROS_PYTHON
 
-ROS_PYTHON = ROOT / ".venv-ros" / "bin" / "python"
 LOADS = {"1kb": (1000, 1000.0, 5000), "6mb": (6_220_800, 30.0, 150)}
 """Message size in bytes, messages per second, number of messages."""
 ROUNDS = 3

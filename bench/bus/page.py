@@ -32,8 +32,8 @@ from PIL import Image
 from bench.bus import experiment
 from bench.bus.experiment import Outcome, Replay
 from bench.paths import ROOT
-from tests.browser import Page, chromium
 from tests.fakes.broker import Broker
+from tests.fakes.browser import Page, chromium
 
 PORT = 8097
 RULES = """

@@ -10,10 +10,10 @@ import numpy as np
 
 from scan2sim.pipeline.core.classes import group_of
 from scan2sim.pipeline.core.types import F64, Mesh
+from scan2sim.pipeline.geometry.boundary_curve import curve
+from scan2sim.pipeline.geometry.coordinate_grid import world
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.io.worlds.scene import Scene, SceneTile
-from scan2sim.pipeline.tiling.borders.boundary_curve import curve
-from scan2sim.pipeline.tiling.borders.grid import world
 
 SAMPLE_SPACING_M = 0.02
 """Distance along a border between two samples."""

@@ -13,8 +13,8 @@ from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.world_formats import SceneParams
-from tests.pipeline import synthetic
-from tests.pipeline.io.scene_readers import READERS, surveyed_off
+from tests.fakes import synthetic
+from tests.fakes.scene_readers import READERS, surveyed_off
 
 TILE_DISTANCE_M = 5000.1234567
 

@@ -20,7 +20,7 @@ from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.io.mesh_formats import PageNames, collada, obj
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.textured_mesh import Textured, vertex_normals
-from tests.gazebo import checker
+from tests.fakes.gazebo import checker
 
 SINGLE_MESH_TRIANGLES = 1_000_000
 TILE_TRIANGLES = {"terrain": 100_000, "building": 100_000, "vegetation": 300_000}

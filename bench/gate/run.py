@@ -2,10 +2,10 @@
 
 `make gate`, or `python -m bench.gate [--out bench-out/gate] [--worlds demo raw0009 survey] [--consumers gazebo ...]`.
 The demo tile, a real street and a world of ten tiles are built with default settings (the ten tiles coarser) if
-missing, exported in each consumer's format, and read, driven on or rendered by the consumer (`bench/consumers`, a file
-each). Further checks: height steps at tile borders, labels compared with the photos' true ones, roads compared with
-those of the generated streets, surveyed points through all formats, and Gazebo's loading cost (`bench/gate`).
-Consumers and worlds that aren't available are reported as skipped.
+missing, exported in each consumer's format, and read, driven on or rendered by the consumer (a file each in
+`tests/fakes/consumers`). Further checks: height steps at tile borders, labels compared with the photos' true ones,
+roads compared with those of the generated streets, surveyed points through all formats, and Gazebo's loading cost
+(`bench/gate`). Consumers and worlds that aren't available are reported as skipped.
 
 Ends with `RESULT {json}`: number of `consumers` without a fault on any world, `skipped`, `faults`, and metrics, the
 worst of all worlds. Exit status 1 if there is a fault.
@@ -20,19 +20,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from bench import consumers
-from bench.consumers import Fault
 from bench.gate.borders import border_steps
 from bench.gate.georeference import georeference
 from bench.gate.labels import label_agreement
 from bench.gate.load import load
-from bench.gate.places import find
 from bench.gate.worlds import WORLDS, GateWorld, WorldUnavailable, scan2sim
 from bench.paths import ROOT
 from bench.roads import line_errors, summary
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.io import robot_formats
 from scan2sim.pipeline.io.worlds.scene import read_scene
+from tests.fakes import consumers
+from tests.fakes.world_checks import Fault
+from tests.fakes.world_checks.reference import find
 
 MAX_METRICS = (
     "drop_max_m", "border_step_max_m", "robot_off_way_max_m", "picture_off_px", "road_centre_p95_m", "lane_edge_p95_m",

@@ -18,7 +18,7 @@ from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
 
 LENGTH, SEED = 100.0, 3
 STREET = {"length": LENGTH, "points": 8e5, "photos": 40, "seed": SEED, "photo_width": 640}
-CUT = {"length": 10.0, "buffer": 3.0, "reach": 20.0, "photo_reach": 8.0}
+CUT = {"length": 10.0, "buffer": 3.0, "max_distance": 20.0, "photo_distance": 8.0}
 COARSE_SETTINGS = ("voxel.size=0.15", "unwrap.texel=0.05", "visibility.pixels=200000", "pictures.width=320")
 """Settings of the ten tiles, with which they take a quarter of an hour instead of three quarters."""
 

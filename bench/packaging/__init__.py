@@ -1,1 +1,1 @@
-"""Content of an installation: licences, shared libraries, containers, size."""
+"""Size of an installation."""

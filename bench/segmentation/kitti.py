@@ -19,9 +19,9 @@ from bench.street.run import STREETS, build_world
 from bench.street.run import scan2sim as run
 from scan2sim.pipeline.core.classes import colour_of
 from scan2sim.pipeline.core.types import U8, PointCloud, View
+from scan2sim.pipeline.geometry.voxel_grid import sample
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.steps.voxel import sample
 from scan2sim.segmentation.backends import load
 from scan2sim.segmentation.labels import CLASSES, code_of_index, index_of_code
 from scan2sim.segmentation.metrics import Confusion, confusion
@@ -66,7 +66,7 @@ def _labelled(name: str, folder: Path) -> Iterator[tuple[View, dict[str, U8]]]:
     path, _ = build_world(STREETS[name], folder, run=False)
     run("segment", path / "tile.toml", "--out", folder / "told")
     tile = read_tile(path / "tile.toml")
-    standing = next((folder / "told" / "steps" / "things").rglob("cloud.npz"))  # without moving objects
+    standing = next((folder / "told" / "steps" / "instances").rglob("cloud.npz"))  # without moving objects
     cloud = sample(PointCloud.load(standing), VOXEL_M)
     assert cloud.classification is not None
     scan, classifier = ScanProjector(cloud, VOXEL_M), Classifier(load("street", None), "street")

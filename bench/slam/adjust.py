@@ -15,13 +15,13 @@ from bench.slam.world import DRIVE as STREET
 from bench.slam.world import prepare
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.importers import kitti_raw
+from scan2sim.slam.global_map.global_adjustment import bundle_adjust
+from scan2sim.slam.global_map.map_file import MapCheckpoint
+from scan2sim.slam.global_map.sparse_model import update_map
 from scan2sim.slam.mapping.cross_validation import compare_paths
-from scan2sim.slam.mapping.global_adjustment import bundle_adjust
-from scan2sim.slam.mapping.map_file import MapCheckpoint
-from scan2sim.slam.mapping.sparse_model import update_map
 from scan2sim.slam.odometry.odometry import Odometry
 from scan2sim.slam.video import open_video
-from tests.slam.synthetic import Follower, Narrow, ate, drive, run, scatter
+from tests.fakes.slam_drive import Follower, Narrow, ate, drive, run, scatter
 
 DRIVES, SECONDS = 20, 20.0
 FEATURE_COUNTS = 640, 700, 760

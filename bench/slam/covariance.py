@@ -7,12 +7,24 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.core.types import F64, GpsTrack
-from scan2sim.slam.calibration.lens import changed_lens, fit_lens, lens_warning
-from scan2sim.slam.mapping.covariance import covariances
-from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.global_map.covariance import covariances
+from scan2sim.slam.global_map.map_file import MapCheckpoint
+from scan2sim.slam.lens import changed_lens, fit_lens, lens_warning
 from scan2sim.slam.trajectory import scale
 from scan2sim.slam.trajectory.gps import smooth
-from tests.slam.synthetic import LENS, Follower, Narrow, ate, drifting_turn, drive, inside, mistaken, off, run, scatter
+from tests.fakes.slam_drive import (
+    LENS,
+    Follower,
+    Narrow,
+    ate,
+    drifting_turn,
+    drive,
+    inside,
+    mistaken,
+    off,
+    run,
+    scatter,
+)
 
 DRIVES, SECONDS = 20, 20.0
 

@@ -45,13 +45,13 @@ from bench.slam.solvers import solvers
 from scan2sim.pipeline.core.types import Camera
 from scan2sim.slam.calibration.calibrate import calibrated_from_scratch
 from scan2sim.slam.geometry import log_so3, relative_pose
-from scan2sim.slam.mapping.global_adjustment import adjust
-from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.global_map.global_adjustment import adjust
+from scan2sim.slam.global_map.map_file import MapCheckpoint
 from scan2sim.slam.odometry.relocalization import detect_features, match_descriptors
 from scan2sim.slam.odometry.track_log import record_tracks
-from scan2sim.slam.odometry.virtual_cameras import VirtualViews
 from scan2sim.slam.trackers import named
 from scan2sim.slam.video import open_video
+from scan2sim.slam.virtual_cameras import VirtualViews
 
 PARTS = ("drive", "hard", "kitti", "turn", "adjust", "trust", "solvers", "pano", "memory")
 DEFAULT_PARTS = ("drive", "kitti", "turn", "adjust", "trust", "pano")

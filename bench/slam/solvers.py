@@ -9,7 +9,7 @@ import numpy as np
 from scan2sim.pipeline.core.types import F64, Camera, GpsTrack
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 from scan2sim.slam.trajectory.gps import smooth
-from tests.slam.synthetic import Follower, ate, drive, scatter
+from tests.fakes.slam_drive import Follower, ate, drive, scatter
 
 SEEDS, SECONDS, TRACKS, PARALLAX_DEG = 10, 8.0, 150, 6.0
 GPS_DRIFT_M, GPS_DRIFT_S, GPS_NOISE_M = 1.5, 60.0, 0.15

@@ -1,6 +1,7 @@
 """Ablation on two real streets: their worlds without one part of the pipeline, score_world by `bench.street`.
 
-`python -m bench.street.ablation [--parts carve things ...] [--streets odo04 raw0009] [--out bench-out/street_ablation]`
+`python -m bench.street.ablation [--parts dynamic_objects instances ...] [--streets odo04 raw0009]
+[--out bench-out/street_ablation]`
 
 Vehicles are excluded from the metrics as in `bench.street`; `outline_px` is the median over all outlines, `remains_m2`
 the maximum over parked vehicles (only raw 0009 has their boxes). Ends with `RESULT {json}`: by part and street.
@@ -22,14 +23,14 @@ from bench.street.run import STREETS, Street, build_world, score_world
 
 WITHOUT: dict[str, tuple[str, ...]] = {
     "nothing": (),
-    "carve": ("carve.when=never",),
-    "things": ("things.find=false",),
-    "reach": ("reach.limit=off",),
-    "outlines": ("planes.when=never", "furniture.when=never", "agreement.sky=false"),
+    "dynamic_objects": ("dynamic_objects.when=never",),
+    "instances": ("instances.find=false",),
+    "photo_coverage": ("photo_coverage.limit=off",),
+    "outlines": ("planes.when=never", "furniture.when=never", "photo_consistency.sky=false"),
     "facades": ("facades.when=never",),
     "signs": ("signs.when=never",),
-    "filling": ("ground.when=never", "texture.continued=false"),
-    "refine": ("refine.when=never",),
+    "filling": ("ground.when=never", "texture.inpaint=false"),
+    "pose_refinement": ("pose_refinement.when=never",),
 }
 """Settings that switch off a part."""
 METRICS = ("psnr_db", "ssim", "sharpness", "outline_px", "inside_mesh", "corridor_m2", "remains_m2", "seen_share")

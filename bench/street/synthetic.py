@@ -33,11 +33,11 @@ def metrics(folder: Path, run: Callable[..., float]) -> dict[str, float]:
 
 
 def static_lost(out: Path) -> float:
-    """Share of the points other than vehicles and people that `carve` removed."""
+    """Share of the points other than vehicles and people that `dynamic_objects` removed."""
     from scan2sim.pipeline.core.classes import CODE
 
     classification = PointCloud.load(next((out / "steps" / "ingest").glob("*/cloud.npz"))).classification
-    dropped = np.load(next((out / "steps" / "carve").glob("*/dropped.npy")))
+    dropped = np.load(next((out / "steps" / "dynamic_objects").glob("*/dropped.npy")))
     assert classification is not None
     still = ~np.isin(classification, (CODE["vehicle"], CODE["person"]))
     return float((dropped[still] > 0).mean()) if len(dropped) else 0.0

@@ -149,7 +149,7 @@ def _sample(page: U8, uv: npt.NDArray[Any]) -> F64:
 def photos(tile: Path, run: Path, origin: F64) -> dict[int, Photo]:
     """All photos of an imported street by frame number, read from its `tile.toml`.
 
-    Poses refined by the run (step `refine`) are used if available, since the world is built in their frame.
+    Poses refined by the run (step `pose_refinement`) are used if available, since the world is built in their frame.
     """
     from PIL import Image
 
@@ -171,7 +171,7 @@ def photos(tile: Path, run: Path, origin: F64) -> dict[int, Photo]:
 def _refined(run: Path) -> dict[str, tuple[F64, F64]]:
     """Refined intrinsics and poses (local metres) by the photo's name; empty if the run has none."""
     out = {}
-    for path in sorted((run / "steps" / "refine").glob("*/views.json")):
+    for path in sorted((run / "steps" / "pose_refinement").glob("*/views.json")):
         for view in json.loads(path.read_text(encoding="utf-8")):
             fx, fy, cx, cy = (view["camera"][k] for k in ("fx", "fy", "cx", "cy"))
             K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)

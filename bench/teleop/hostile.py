@@ -37,8 +37,8 @@ from scan2sim.services.teleoperation.transport.station_side import Listener
 from scan2sim.services.teleoperation.transport.vehicle_side import Link, connect_station
 from scan2sim.services.teleoperation.video.jitter_buffer import VideoReceiver
 from scan2sim.services.teleoperation.video.srtp_session import KeySchedule, PacketEncryptor
-from tests.services.teleoperation.certificates import OTHER, OWN, identity
-from tests.services.teleoperation.transport.relay import Relay
+from tests.fakes.certificates import OTHER, OWN, identity
+from tests.fakes.relay import Relay
 
 Report = Callable[[str], None]
 HERE = "127.0.0.1"

@@ -25,8 +25,8 @@ from scan2sim.services.teleoperation.transport.station_side import Listener
 from scan2sim.services.teleoperation.transport.vehicle_side import Link, connect_station
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
 from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardParams, OnboardUnit
-from tests.services.teleoperation.certificates import identity
-from tests.services.teleoperation.transport.relay import Relay
+from tests.fakes.certificates import identity
+from tests.fakes.relay import Relay
 
 Report = Callable[[str], None]
 HOSTS = ("127.0.0.1", "127.0.0.2")

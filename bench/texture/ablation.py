@@ -16,17 +16,17 @@ import numpy as np
 from bench.paths import ROOT
 from bench.texture.scenes import Scene, available, fresh, run
 from scan2sim.texturing.exposure import EXPOSURE
-from scan2sim.texturing.photo_consistency import AGREEMENT
+from scan2sim.texturing.photo_consistency import PHOTO_CONSISTENCY
 from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
-from scan2sim.texturing.view_selection.step import CHOOSE
+from scan2sim.texturing.view_selection.step import VIEW_SELECTION
 
 OFF: dict[str, dict[str, dict[str, Any]]] = {
     "all parts on": {},
     "exposure": {"exposure": {"solve": False}},
-    "ghost masks": {"agreement": {"ghosts": False}},
-    "displacement": {"agreement": {"align": False}},
-    "smooth choice": {"choose": {"smoothness": 0}},
+    "ghost masks": {"photo_consistency": {"ghosts": False}},
+    "displacement": {"photo_consistency": {"align": False}},
+    "smooth choice": {"view_selection": {"smoothness": 0}},
     "blended low frequencies": {"texture": {"band": 0}},
     "one photo's detail": {"texture": {"band": -1}},
     "fading along seams": {"texture": {"fade": False}},
@@ -38,7 +38,7 @@ OFF: dict[str, dict[str, dict[str, Any]]] = {
 def paint(scene: Scene, given: dict[str, dict[str, Any]], folder: Path) -> Path:
     """Texture a scene with some parameters; returns the texture's folder."""
     files = {"mesh": scene.mesh, "views": scene.views, "depth": scene.depth} | scene.clouds
-    for step in (EXPOSURE, AGREEMENT, CHOOSE, UNWRAP, TEXTURE):
+    for step in (EXPOSURE, PHOTO_CONSISTENCY, VIEW_SELECTION, UNWRAP, TEXTURE):
         files |= run(step, files, fresh(folder / step.name), **given.get(step.name, {}))
     return files["textured"]
 

@@ -29,7 +29,7 @@ from scan2sim.pipeline.camera.projection import (
 )
 from scan2sim.pipeline.core.types import F32, I32, I64, U8, Mesh
 from scan2sim.pipeline.io.images import image
-from scan2sim.texturing.bake import texel_map
+from scan2sim.texturing import texel_map
 from scan2sim.texturing.inpainting import hole_filling
 
 OPEN3D_SIZE = 4096

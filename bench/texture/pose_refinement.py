@@ -6,8 +6,8 @@
   by 3 cm and 2 mrad each, and each camera by 5 cm and 5 mrad (lengths of random vectors). Errors in pixels: `absolute`,
   the displacement of surface points within 20 m relative to the truth; `between`, the relative displacement of the same
   point in two successive photos, which blurs textures. With true poses nothing may move.
-- raw0009, odo04: the real streets of `bench.street` without and with the step `refine`, scored by that benchmark:
-  held-out photos, and their outlines.
+- raw0009, odo04: the real streets of `bench.street` without and with the step `pose_refinement`, scored by that
+  benchmark: held-out photos, and their outlines.
 
 Ends with `RESULT {json}`.
 """
@@ -36,7 +36,7 @@ from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import F64, Mesh, PointCloud, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.texturing.photo_prediction import surface
-from scan2sim.texturing.pose_refinement.step import RefineParams, group_by_camera, refine
+from scan2sim.texturing.pose_refinement.step import PoseRefinementParams, group_by_camera, pose_refinement
 
 PARTS = ("synthetic", "raw0009", "odo04")
 PHOTO_ERROR, CAMERA_ERROR = (0.002, 0.03), (0.005, 0.05)
@@ -107,13 +107,13 @@ def synthetic(folder: Path) -> dict[str, Any]:
     maps = [depth_map(v.camera, v.T_world_cam, hides, time=v.time, pixels=DEPTH_MAP_PIXELS) for v in truth]
     scan = {"mesh.surface": made.mesh} | {k: path for k, path in made.clouds.items() if k == "cloud.rest"}
 
-    settings = RefineParams.of("refine", {})
+    settings = PoseRefinementParams.of("pose_refinement", {})
 
     def refined(views: Sequence[View]) -> tuple[tuple[View, ...], dict[str, Any], float]:
         out = fresh(folder / "refined")
         views_io.save(folder / "views.json", views, held)
         start = time.perf_counter()
-        done = refine({"views": folder / "views.json", **scan}, settings, out, silent)
+        done = pose_refinement({"views": folder / "views.json", **scan}, settings, out, silent)
         return views_io.load(done.files["views"]), done.facts, time.perf_counter() - start
 
     refined(truth)  # warm up: compile kernels
@@ -140,9 +140,9 @@ def real(name: str, folder: Path) -> dict[str, Any]:
         at = folder / name / when
         if when == "auto" and not at.is_dir():
             shutil.copytree(folder / name / "never", at, symlinks=True)  # reuse identical results
-        tile, run = street.build_world(street.STREETS[name], at, (f"refine.when={when}",))
+        tile, run = street.build_world(street.STREETS[name], at, (f"pose_refinement.when={when}",))
         metrics[when] = street.score_world(street.STREETS[name], tile, run, folder / "pictures" / f"{name}_{when}")
-    refined = json.loads((run / "report.json").read_text(encoding="utf-8"))["steps"]["refine"]
+    refined = json.loads((run / "report.json").read_text(encoding="utf-8"))["steps"]["pose_refinement"]
     return compare(name, metrics, refined)
 
 
@@ -171,7 +171,7 @@ def main() -> None:
     """Run the parts, print a line for each, and the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "refine")
+    parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "pose_refinement")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     found: dict[str, Any] = {}

@@ -7,10 +7,10 @@ Scenes (`bench.texture.scenes`) are created if missing: a KITTI street (skipped 
 without and with exposure changes and a moving car. Methods run one after another, each in separate processes;
 held-out photos are compared with each method's rendering on the pixels textured by the method.
 
-- Seconds and GB of ours are those of the steps visibility; exposure, agreement, choose and unwrap; texture: three
-  processes including imports (sum of seconds, maximum of memory). The baselines nearest and inverse_square are given
-  atlas and depth maps; Open3D is given the atlas, but time_ratio and memory_ratio add xatlas' plain unwrapping of the
-  whole mesh to its albedo projection.
+- Seconds and GB of ours are those of the steps visibility; exposure, photo_consistency, view_selection and unwrap;
+  texture: three processes including imports (sum of seconds, maximum of memory). The baselines nearest and
+  inverse_square are given atlas and depth maps; Open3D is given the atlas, but time_ratio and memory_ratio add xatlas'
+  plain unwrapping of the whole mesh to its albedo projection.
 - truth (streets): PSNR against the true surface colours where a photo saw them within 15 m, without and with one gain
   per channel for the whole street. truth_psnr_db of RESULT is street_clean's without gain, truth_hard_psnr_db
   street_hard's with gain, as photos with unknown exposure don't determine the overall brightness.
@@ -38,10 +38,10 @@ from bench.texture.scenes import KITTI, SCENES, WARM_UP, Scene, available, fresh
 from scan2sim.pipeline.core.sandbox import die_with_parent
 from scan2sim.pipeline.steps.visibility import VISIBILITY
 from scan2sim.texturing.exposure import EXPOSURE
-from scan2sim.texturing.photo_consistency import AGREEMENT
+from scan2sim.texturing.photo_consistency import PHOTO_CONSISTENCY
 from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
-from scan2sim.texturing.view_selection.step import CHOOSE
+from scan2sim.texturing.view_selection.step import VIEW_SELECTION
 
 METHODS = ("open3d", "nearest", "inverse_square", "ours")
 METRICS = ("psnr_db", "psnr_gain_db", "ssim", "sharpness", "coverage")
@@ -55,7 +55,7 @@ def visibility(scene: Scene, out: Path) -> None:
 def unwrap(scene: Scene, out: Path) -> None:
     """Atlas of ours, used by all methods; its charts are cut by the photos chosen by ours."""
     files = {"mesh": scene.mesh, "views": scene.views, "depth": scene.depth}
-    for step in (EXPOSURE, AGREEMENT, CHOOSE):
+    for step in (EXPOSURE, PHOTO_CONSISTENCY, VIEW_SELECTION):
         files |= run(step, files, scene.folder / "choice" / step.name)
     run(UNWRAP, files, out)
 
@@ -69,8 +69,8 @@ def ours(scene: Scene, out: Path) -> None:
         "views": scene.views,
         "depth": scene.depth,
         "exposures": choice / "exposure" / "exposures.json",
-        "agreement": choice / "agreement" / "agreement",
-        "choice": choice / "choose" / "choice.npz",
+        "photo_consistency": choice / "photo_consistency" / "photo_consistency",
+        "choice": choice / "view_selection" / "choice.npz",
     }
     files = run(TEXTURE, inputs | scene.clouds, out / "steps")
     for file in files["textured"].iterdir():
@@ -187,7 +187,7 @@ class Bench:
                     (method, np.where(result.render.hit[..., None], result.render.rgb, np.uint8(255)))
                 )
         if self.pictures is not None:
-            from bench.texture.renderings import side_by_side
+            from tests.fakes.world_checks.side_by_side import side_by_side
 
             for name, images in shown.items():
                 side_by_side(self.pictures, f"{scene.folder.name}_{name}", images)

@@ -32,11 +32,12 @@ from bench.texture.scenes import SCENES, WARM_UP, Scene, available, fresh, make,
 from scan2sim.pipeline.core.types import F32, F64, I32, Bools, Mesh
 from scan2sim.pipeline.steps.visibility import VISIBILITY
 from scan2sim.texturing.exposure import EXPOSURE
-from scan2sim.texturing.photo_consistency import AGREEMENT
+from scan2sim.texturing.photo_consistency import PHOTO_CONSISTENCY
 from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
 from scan2sim.texturing.view_selection import mrf
-from scan2sim.texturing.view_selection.step import CHOOSE, Choice, ChooseParams, seam_costs
+from scan2sim.texturing.view_selection.choice import Choice
+from scan2sim.texturing.view_selection.step import VIEW_SELECTION, ViewSelectionParams, seam_costs
 
 MAX_SWEEPS = 3
 UNSEEN_COST = 1e3
@@ -171,7 +172,7 @@ def prepare(scene: Scene, folder: Path) -> dict[str, Path]:
     if not scene.depth.is_dir():
         run(VISIBILITY, {"mesh.surface": scene.mesh, "views": scene.views} | scene.clouds, scene.depth.parent)
     files = {"mesh": scene.mesh, "views": scene.views, "depth": scene.depth} | scene.clouds
-    for step in (EXPOSURE, AGREEMENT, CHOOSE):
+    for step in (EXPOSURE, PHOTO_CONSISTENCY, VIEW_SELECTION):
         files |= run(step, files, fresh(folder / step.name))
     return files
 
@@ -188,10 +189,10 @@ def textured(files: dict[str, Path], choice: Choice, folder: Path) -> Path:
 def compare(scene: Scene, names: Sequence[str], *, textures: bool) -> dict[str, dict[str, Any]]:
     """Metrics of all solvers, printed as they are computed."""
     folder = scene.folder / "choices"
-    found = folder / "choose" / "choice.npz"
+    found = folder / "view_selection" / "choice.npz"
     files = prepare(scene, folder) if textures or not found.is_file() else {}
     choice, mesh = Choice.load(found), Mesh.load(scene.mesh)
-    pairs, length, price = seam_costs(mesh, ChooseParams.model_validate({}).smoothness)
+    pairs, length, price = seam_costs(mesh, ViewSelectionParams.model_validate({}).smoothness)
     problem = (choice.view, mrf.costs(choice.view, choice.quality), pairs, price)
     bound = mrf.solve(*problem).bound
     result: dict[str, dict[str, Any]] = {}

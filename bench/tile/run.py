@@ -33,7 +33,7 @@ STEPS = {
     "islands": ("islands",),
     "decimate": ("decimate",),
     "unwrap": ("unwrap",),
-    "texture": ("views", "visibility", "exposure", "agreement", "choose", "texture"),
+    "texture": ("views", "visibility", "exposure", "photo_consistency", "view_selection", "texture"),
     "(ours only)": ("collision", "export", "geometry", "score", "pictures"),
 }
 

@@ -28,8 +28,8 @@ from PIL import Image
 
 from bench.bus.page import PORT, open_page, running_command, screenshot
 from scan2sim.data_samples import crossing
-from tests.browser import chromium
 from tests.fakes.broker import Broker
+from tests.fakes.browser import chromium
 
 SEED, IMAGES, FIRST_IMAGE = 300, 60, 50
 CAMERAS = {"day": 2.0, "dusk": 1.0}

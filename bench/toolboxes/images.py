@@ -22,9 +22,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from bench.packaging.containers import FOLDER, entry_point, requirements
-from bench.packaging.libraries import ALWAYS, NEVER_LOADED, needed_libraries
 from bench.paths import ROOT
+from deploy.containers import FOLDER, entry_point, requirements
+from deploy.libraries import ALWAYS, NEVER_LOADED, needed_libraries
 from scan2sim.services.http import healthcheck
 from scan2sim.services.toolboxes import tasks
 

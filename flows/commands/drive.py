@@ -13,7 +13,7 @@ from scan2sim.flows.engine.planning import STORE, PlannedTask, drop_damaged, pla
 from scan2sim.flows.pipelines.drive import Drive, build_graph
 from scan2sim.pipeline.core.cache import Digests, Manifest, Store
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.io.remote import is_remote, local_copy
+from scan2sim.pipeline.core.remote import is_remote, local_copy
 
 PREPARED, DRIVE = "prepared", "drive.toml"
 LINKED_OUTPUTS = {"import_sweeps": "corridor", "cut": "survey"}
@@ -55,7 +55,7 @@ def survey_of(
         if drop_damaged(planned, store, {item.task.id.name for item in planned}):
             planned, store, digests = plan_drive(source, out, length=length, buffer=buffer)
         outcome = run(planned, store)
-        if "place" in outcome.of_tile():
+        if "georeference" in outcome.of_tile():
             publish_path(planned, outcome.of_tile(), store, out / "slam")
             _check_path(planned, outcome.of_tile(), out / "slam")
         outcome.check()
@@ -78,11 +78,11 @@ def _check_path(planned: list[PlannedTask], done: dict[str, Manifest], slam: Pat
     names = {item.task.id.name for item in planned}
     if "fuse" not in names and not any(getattr(item.task.params, "keep_unsure", False) for item in planned):
         remedy = "Add gps to [slam], fix the causes that slam.json lists, or set keep_unsure = true in [sweeps]"
-        check_sure(done["place"].facts["unsure_share"], slam, remedy)
+        check_sure(done["georeference"].facts["unsure_share"], slam, remedy)
 
 
 def found(place: Path) -> Path:
-    """The file of a source: `place` itself, or a survey.toml, drive.toml or tile.toml in that folder.
+    """The file of a source: `georeference` itself, or a survey.toml, drive.toml or tile.toml in that folder.
 
     Raises:
         InputError: there is none.
@@ -113,7 +113,7 @@ def plan_drive(
 
 
 def _link(folder: Path, place: Path) -> None:
-    """Create or update the symbolic link `place` to a result."""
+    """Create or update the symbolic link `georeference` to a result."""
     if place.is_symlink():
         place.unlink()
     if not place.exists():

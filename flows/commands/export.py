@@ -16,9 +16,9 @@ from scan2sim.flows.commands.display import console, progress, warn
 from scan2sim.flows.commands.options import options
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.step import Report
-from scan2sim.pipeline.importers.tile_folder import tile_folder
 from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.geodata.crs import LOCAL
+from scan2sim.pipeline.io.tile_folder import tile_folder
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.scene import Scene, read_scene
 

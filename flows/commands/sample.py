@@ -13,7 +13,7 @@ from scan2sim.data_samples.street import generate
 from scan2sim.flows.commands.app import App, Overwrite
 from scan2sim.flows.commands.display import progress
 from scan2sim.pipeline.core import system_libs
-from scan2sim.pipeline.importers.tile_folder import tile_folder
+from scan2sim.pipeline.io.tile_folder import tile_folder
 
 app = App()
 

@@ -31,7 +31,7 @@ from scan2sim.segmentation.backends import load
 from scan2sim.segmentation.labels import CLASSES, IGNORED, code_of_index
 from scan2sim.segmentation.metrics import confusion
 from scan2sim.segmentation.photos import Classifier, class_map
-from scan2sim.segmentation.steps.instances import THINGS
+from scan2sim.segmentation.steps.instances import INSTANCES
 from scan2sim.segmentation.steps.label import LABEL
 from scan2sim.segmentation.steps.segment import SOURCE_CLOUD, SOURCE_SHAPE
 from scan2sim.segmentation.training.dataset import pairs, read, read_channels
@@ -102,10 +102,10 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
     with locked(out):
         store = Store(out / STORE)
         tasks = build_graph(tile, settings)
-        last = "things" if any(task.step is THINGS for task in tasks) else "segment"
+        last = "instances" if any(task.step is INSTANCES for task in tasks) else "segment"
         log = Log(out / "run.log")
         log.write(f"segment {tile.path}, settings {json.dumps(settings.values)}")
-        read = {"ingest", "carve", "views", "label", "segment", "things"}
+        read = {"ingest", "dynamic_objects", "views", "label", "segment", "instances"}
         with log.errors(out):
             planned, done = plan_and_run(required_tasks(tasks, [TaskId(last)]), store, log, read)
         keys = {p.task.id.name: p.key for p in planned}
@@ -116,12 +116,12 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
         }
         predicted, own = (
             PointCloud.load(files[last, "cloud"]).classification,
-            PointCloud.load(files["carve", "cloud"]).classification,
+            PointCloud.load(files["dynamic_objects", "cloud"]).classification,
         )
         assert predicted is not None
         with np.load(files["segment", "confidence"]) as beside:
             columns = predicted, beside["confidence"], beside["source"]
-            dropped = np.load(files["carve", "dropped"])
+            dropped = np.load(files["dynamic_objects", "dropped"])
             if len(dropped):
                 kept = done["segment"].facts["source"] == "cloud"
                 whole = PointCloud.load(files["ingest", "cloud"]).classification if kept else None
@@ -137,10 +137,10 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
 
 
 def _with_dropped(dropped: U8, own: U8 | None, predicted: U8, confidence: U8, source: U8) -> tuple[U8, U8, U8]:
-    """Classes, confidences and sources (N,) of all points, including those that step `carve` has dropped.
+    """Classes, confidences and sources (N,) of all points, including those that step `dynamic_objects` has dropped.
 
     Args:
-        dropped: (N,) uint8, 0 for points that were kept, else the class that step `carve` gave them.
+        dropped: (N,) uint8, 0 for points that were kept, else the class that step `dynamic_objects` gave them.
         own: (N,) the cloud's own classes if they are kept, or None.
         predicted, confidence, source: (K,) values of the kept points.
     """

@@ -157,9 +157,9 @@ def publish_path(planned: Iterable[PlannedTask], done: Mapping[str, Manifest], s
     """Link the trajectory and related files into `out`, write `slam.json`, and remove files of earlier runs."""
     out.mkdir(exist_ok=True)
     folder = {item.task.id.name: store.folder(item.task.full_name, item.key) for item in planned}
-    sources = {path.name: path for path in (folder["place"] / "path").iterdir()}
-    if f"place.{ODOMETRY_GROUP}" in folder:
-        sources["odometry.csv"] = folder[f"place.{ODOMETRY_GROUP}"] / "path" / "trajectory.csv"
+    sources = {path.name: path for path in (folder["georeference"] / "path").iterdir()}
+    if f"georeference.{ODOMETRY_GROUP}" in folder:
+        sources["odometry.csv"] = folder[f"georeference.{ODOMETRY_GROUP}"] / "path" / "trajectory.csv"
     if "view" in done["track"].files:
         sources["view.mp4"] = folder["track"] / "view.mp4"
     for name in OUTPUTS:

@@ -35,8 +35,8 @@ from scan2sim.pipeline.core import system_libs
 from scan2sim.pipeline.core.cache import Digests, Manifest, Store
 from scan2sim.pipeline.core.errors import ScanError, SettingError, SpaceError, StepError
 from scan2sim.pipeline.core.optional_deps import require
+from scan2sim.pipeline.core.remote import Remote, is_remote, local_copy
 from scan2sim.pipeline.core.types import Tile
-from scan2sim.pipeline.io.remote import Remote, is_remote, local_copy
 from scan2sim.pipeline.io.survey import Survey, read_survey
 from scan2sim.pipeline.io.tile import read_tile
 
@@ -142,7 +142,7 @@ def run_source(
 def make_survey(place: str | Path, target: str | Path, settings: Settings, run: Executor) -> Path:
     """Build all worlds of the survey at `place` in the folder `target`; returns the report's path.
 
-    Both may be in object storage (`pipeline.io.remote`); the returned path is then that of the local copy.
+    Both may be in object storage (`pipeline.core.remote`); the returned path is then that of the local copy.
 
     The folder gets `survey.html`, `survey.json`, `world/` (all tiles in one), `stac/`, `tiles/NAME/` (as `scan2sim run`
     writes it) and `steps/` (cached results). A tile that fails is reported; its neighbours are built as if it did not

@@ -16,7 +16,7 @@ from scan2sim.flows.commands.options import options
 from scan2sim.flows.reports import film as films
 from scan2sim.flows.reports.view import INDEX, Pages, ViewParams, server
 from scan2sim.pipeline.core.optional_deps import require
-from scan2sim.pipeline.importers.tile_folder import tile_folder
+from scan2sim.pipeline.io.tile_folder import tile_folder
 from scan2sim.pipeline.io.worlds.scene import Scene, read_scene
 
 app = App()

@@ -25,7 +25,7 @@ from scan2sim.flows.engine.progress import published
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.reports.survey import PAGE, overview, rows
 from scan2sim.pipeline.core.errors import INTERRUPTED, IncompleteError, StepError, UnavailableError, exit_code
-from scan2sim.pipeline.io.remote import local_copy
+from scan2sim.pipeline.core.remote import local_copy
 
 
 def check_server() -> None:

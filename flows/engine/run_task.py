@@ -33,7 +33,7 @@ def run_task(item: PlannedTask, store: Store, inputs: dict[str, Path], report: R
             "version": task.step.version,
             "params": task.params.model_dump(mode="json"),
             "inputs": item.keys,
-            "fed": content_key,
+            "inputs_digest": content_key,
             "seconds": round(time.perf_counter() - start, 3),
             "peak_mb": _peak_mb(),
         }

@@ -64,7 +64,9 @@ def build_graph(drive: Drive, here: Path) -> list[Task]:
     corridor: dict[str, Any] = {}
     if drive.sweeps is not None:
         given = None if drive.sweeps.poses is None else here / drive.sweeps.poses
-        tasks += sweeps.build_graph(drive.sweeps, here, Output(TaskId("place"), "trajectory") if tasks else given)
+        tasks += sweeps.build_graph(
+            drive.sweeps, here, Output(TaskId("georeference"), "trajectory") if tasks else given
+        )
         corridor["corridor"] = Output(TaskId("import_sweeps"), "corridor")
     elif drive.corridor is not None:
         place = here / drive.corridor

@@ -20,7 +20,7 @@ from scan2sim.pipeline.core.types import GpsTrack, Trajectory
 from scan2sim.slam.calibration.camera import camera_of
 from scan2sim.slam.steps.encode import ENCODE
 from scan2sim.slam.steps.evaluate import EVALUATE
-from scan2sim.slam.steps.place import PLACE
+from scan2sim.slam.steps.georeference import GEOREFERENCE
 from scan2sim.slam.steps.track import TRACK
 from scan2sim.slam.trajectory.evaluate import SEGMENT_M, distance_along
 from scan2sim.slam.trajectory.gps import smooth
@@ -138,8 +138,8 @@ def _cell_tasks(cell: Cell, study: Study, video: Video, segment: float, settings
     return [
         add(ENCODE, {"video": video.path}, size=size, bitrate=cell.bitrate, rate=cell.rate, fps=video.fps),
         add(TRACK, output_of(ENCODE, "video") | gps_and_mask, cameras=(asdict(camera),), gps_offset=0.0),
-        add(PLACE, output_of(TRACK, "mapped"), georeference=False),
-        add(EVALUATE, output_of(PLACE, "trajectory") | {"truth": study.truth}, segment=segment),
+        add(GEOREFERENCE, output_of(TRACK, "map"), georeference=False),
+        add(EVALUATE, output_of(GEOREFERENCE, "trajectory") | {"truth": study.truth}, segment=segment),
     ]
 
 

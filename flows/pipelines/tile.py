@@ -14,13 +14,13 @@ from scan2sim.pipeline.core.classes import GROUPS
 from scan2sim.pipeline.core.step import Step
 from scan2sim.pipeline.core.types import Tile
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.steps.carve import CARVE
 from scan2sim.pipeline.steps.clip import CLIP
 from scan2sim.pipeline.steps.collision import COLLISION
 from scan2sim.pipeline.steps.decimate import DECIMATE
+from scan2sim.pipeline.steps.detect_furniture import DETECT_FURNITURE
+from scan2sim.pipeline.steps.dynamic_objects import DYNAMIC_OBJECTS
 from scan2sim.pipeline.steps.export import EXPORT
 from scan2sim.pipeline.steps.facades import FACADES
-from scan2sim.pipeline.steps.finds import FINDS
 from scan2sim.pipeline.steps.furniture import FURNITURE
 from scan2sim.pipeline.steps.geometry import GEOMETRY
 from scan2sim.pipeline.steps.ground import GROUND
@@ -29,13 +29,13 @@ from scan2sim.pipeline.steps.islands import ISLANDS
 from scan2sim.pipeline.steps.join import JOIN
 from scan2sim.pipeline.steps.overlap import OVERLAP
 from scan2sim.pipeline.steps.path import PATH
+from scan2sim.pipeline.steps.photo_coverage import PHOTO_COVERAGE
 from scan2sim.pipeline.steps.pictures import PICTURES
 from scan2sim.pipeline.steps.planes import PLANES
 from scan2sim.pipeline.steps.plants import PLANTS
 from scan2sim.pipeline.steps.poisson import POISSON
 from scan2sim.pipeline.steps.preview import PREVIEW
 from scan2sim.pipeline.steps.rasters import RASTERS
-from scan2sim.pipeline.steps.reach import REACH
 from scan2sim.pipeline.steps.roads import ROADS
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
@@ -43,24 +43,25 @@ from scan2sim.pipeline.steps.views import VIEWS
 from scan2sim.pipeline.steps.visibility import VISIBILITY
 from scan2sim.pipeline.steps.voxel import VOXEL
 from scan2sim.pipeline.steps.walls import WALLS
-from scan2sim.segmentation.steps.instances import THINGS
+from scan2sim.segmentation.steps.instances import INSTANCES
 from scan2sim.segmentation.steps.label import LABEL
 from scan2sim.segmentation.steps.segment import SEGMENT
 from scan2sim.segmentation.steps.signs import SIGNS
-from scan2sim.texturing.borders.colour_harmonization import LEVEL
+from scan2sim.texturing.borders.colour_harmonization import COLOUR_HARMONIZATION
 from scan2sim.texturing.borders.measure import BORDERS
 from scan2sim.texturing.exposure import EXPOSURE
-from scan2sim.texturing.photo_consistency import AGREEMENT
-from scan2sim.texturing.pose_refinement.step import REFINE
+from scan2sim.texturing.photo_consistency import PHOTO_CONSISTENCY
+from scan2sim.texturing.pose_refinement.step import POSE_REFINEMENT
 from scan2sim.texturing.score import SCORE
 from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
-from scan2sim.texturing.view_selection.step import CHOOSE
+from scan2sim.texturing.view_selection.step import VIEW_SELECTION
 
 STEPS: tuple[Step, ...] = (
-    INGEST, PATH, CARVE, VIEWS, LABEL, SEGMENT, THINGS, REACH, OVERLAP, FINDS, FURNITURE, SPLIT, VOXEL, GROUND, WALLS,
-    FACADES, POISSON, TRIM, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, REFINE, SIGNS, VISIBILITY, EXPOSURE,
-    AGREEMENT, CHOOSE, TEXTURE, LEVEL, ROADS, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
+    INGEST, PATH, DYNAMIC_OBJECTS, VIEWS, LABEL, SEGMENT, INSTANCES, PHOTO_COVERAGE, OVERLAP, DETECT_FURNITURE,
+    FURNITURE, SPLIT, VOXEL, GROUND, WALLS, FACADES, POISSON, TRIM, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS,
+    UNWRAP, POSE_REFINEMENT, SIGNS, VISIBILITY, EXPOSURE, PHOTO_CONSISTENCY, VIEW_SELECTION, TEXTURE,
+    COLOUR_HARMONIZATION, ROADS, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 
 
@@ -168,8 +169,8 @@ class _GraphBuilder:
             self.path if tile.trajectory is not None else {}
         )  # cameras are not at the scanner's position
         cameras = _position_rows([view.centre for view in tile.views if view.camera.model != "orthographic"])
-        add(CARVE, {"cloud": output(INGEST, "cloud")} | self.scanner_path, cameras=cameras)
-        whole: Sources = {"cloud": output(CARVE, "cloud")}
+        add(DYNAMIC_OBJECTS, {"cloud": output(INGEST, "cloud")} | self.scanner_path, cameras=cameras)
+        whole: Sources = {"cloud": output(DYNAMIC_OBJECTS, "cloud")}
         photos: Sources = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
         masks: Sources = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
         add(VIEWS, photos | masks | whole, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
@@ -184,22 +185,22 @@ class _GraphBuilder:
         return {"views": self.output(VIEWS, "views")}
 
     def _moving_input(self) -> Sources:
-        return {"moving": self.output(CARVE, "moving")}
+        return {"moving": self.output(DYNAMIC_OBJECTS, "moving")}
 
     def merge_neighbours(self) -> Output:
         """Add instances, photo coverage and the neighbours' points at borders; returns the resulting cloud."""
         output, add = self.output, self.add
         last = SEGMENT  # the step whose cloud is split; the same one in all tiles of a survey
-        if self.settings.params(THINGS).find and (self.path or self.neighbours):
+        if self.settings.params(INSTANCES).detect and (self.path or self.neighbours):
             classified: Sources = {name: output(SEGMENT, name) for name in ("cloud", "confidence")}
-            add(THINGS, classified | self._moving_input() | self.path)
-            last, self.instances = THINGS, {"things": output(THINGS, "things")} if self.path else {}
-        limit = self.settings.params(REACH).limit
+            add(INSTANCES, classified | self._moving_input() | self.path)
+            last, self.instances = INSTANCES, {"instances": output(INSTANCES, "instances")} if self.path else {}
+        limit = self.settings.params(PHOTO_COVERAGE).limit
         if limit != "off" and (self.neighbours or (self.path and (self.has_ground_photos or limit != "auto"))):
             shown = self._views_input() if self.has_ground_photos else {}
             size = self.settings.params(VOXEL, "terrain").size
-            add(REACH, {"cloud": output(last, "cloud")} | self.path | shown, voxel=size)
-            last = REACH
+            add(PHOTO_COVERAGE, {"cloud": output(last, "cloud")} | self.path | shown, voxel=size)
+            last = PHOTO_COVERAGE
         if not (self.neighbours and self.tile.cell):
             return output(last, "cloud")
         others = self.neighbour_outputs(last, "cloud")
@@ -211,15 +212,17 @@ class _GraphBuilder:
         """Add removal of street furniture from the cloud, its split by class, and the voxel filter of each part."""
         enabled = (self.path or self.neighbours) and self.settings.params(FURNITURE).when == "auto"
         if enabled:
-            self.add(FINDS, {"cloud": cloud} | self.path, **self.cell)
-        if enabled and self.is_enabled(FINDS) and self.is_enabled(FURNITURE):
-            detections = {"finds": self.output(FINDS, "finds")} | self.neighbour_outputs(FINDS, "finds")
+            self.add(DETECT_FURNITURE, {"cloud": cloud} | self.path, **self.cell)
+        if enabled and self.is_enabled(DETECT_FURNITURE) and self.is_enabled(FURNITURE):
+            detections = {"detections": self.output(DETECT_FURNITURE, "detections")} | self.neighbour_outputs(
+                DETECT_FURNITURE, "detections"
+            )
             self.add(FURNITURE, {"cloud": cloud} | detections, name=self.tile.name, **self.cell)
-            names = (*GROUPS[1:], "taken", "plates", "beside", "geojson", "csv")
+            names = (*GROUPS[1:], "furniture_points", "sign_panels", "neighbour_poles", "geojson", "csv")
             self.furniture = {name: self.output(FURNITURE, name) for name in names}
         split_params = self.settings.params(SPLIT)
         self.keep_vehicles = split_params.vehicles == "keep" and bool(self.instances)
-        removed_points = {name: self.furniture[name] for name in self.furniture if name == "taken"}
+        removed_points = {name: self.furniture[name] for name in self.furniture if name == "furniture_points"}
         self.add(SPLIT, {"cloud": cloud} | (self.instances if self.keep_vehicles else {}) | removed_points)
         vehicle = ("vehicle",) if self.keep_vehicles else ()
         self.groups = [g for g in (*GROUPS, *vehicle) if g != "vegetation" or split_params.vegetation != "locations"]
@@ -235,10 +238,10 @@ class _GraphBuilder:
         if hidden or self._runs_on_airborne(when):
             others: Sources = {}
             for name in hidden:
-                others |= self.neighbour_outputs(THINGS, name)
+                others |= self.neighbour_outputs(INSTANCES, name)
             synthesized["terrain"] = self._add_synthesis(GROUND, (*GROUPS, "rest"), {**hidden, **others})
         if self._runs_on_airborne(self.settings.params(WALLS).when):
-            below: Sources = {"ground": synthesized["terrain"]["made"]} if "terrain" in synthesized else {}
+            below: Sources = {"ground": synthesized["terrain"]["synthesized"]} if "terrain" in synthesized else {}
             below |= {"footprints": self.tile.footprints} if self.tile.footprints else {}
             synthesized["building"] = self._add_synthesis(WALLS, ("building", "terrain"), below)
         if (
@@ -251,7 +254,7 @@ class _GraphBuilder:
             size = self.settings.params(VOXEL, "building").size
             clouds = {"cloud": self.output(VOXEL, "cloud", "building")} | self._other_clouds("building")
             self.add(FACADES, clouds | self.scanner_path | shown, voxel=size, **self.cell)
-            synthesized["building"] = {"made": self.output(FACADES, "made")}
+            synthesized["building"] = {"synthesized": self.output(FACADES, "synthesized")}
         return synthesized
 
     def _runs_on_airborne(self, when: str) -> bool:
@@ -266,7 +269,7 @@ class _GraphBuilder:
         cell = self.tile.cell
         border = {"name": self.tile.name, "buffer": cell.buffer, **self.cell} if cell else {}
         self.add(step, inputs | more, **border)
-        return {"made": self.output(step, "made")}
+        return {"synthesized": self.output(step, "synthesized")}
 
     def _other_clouds(self, group: str) -> Sources:
         """The voxels of all other classes, as inputs."""
@@ -325,16 +328,19 @@ class _GraphBuilder:
         output, add = self.output, self.add
         surfaces: Sources = {group: output(DECIMATE, "mesh", group) for group in self.groups}
         seen, clouds = self._views_input(), self._cloud_inputs()
-        if self.has_ground_photos and self.settings.params(REFINE).when == "auto":
-            add(REFINE, _mesh_inputs(surfaces) | {"cloud.rest": clouds["cloud.rest"]} | self._moving_input() | seen)
-            seen = {"views": output(REFINE, "views")}
+        if self.has_ground_photos and self.settings.params(POSE_REFINEMENT).when == "auto":
+            add(
+                POSE_REFINEMENT,
+                _mesh_inputs(surfaces) | {"cloud.rest": clouds["cloud.rest"]} | self._moving_input() | seen,
+            )
+            seen = {"views": output(POSE_REFINEMENT, "views")}
         if (
             self.has_ground_photos
             and self.furniture
             and self.settings.params(SIGNS).when == "auto"
             and self.is_enabled(SIGNS)
         ):
-            plates = {name: self.furniture[name] for name in ("plates", "beside", "geojson")}
+            plates = {name: self.furniture[name] for name in ("sign_panels", "neighbour_poles", "geojson")}
             add(SIGNS, _mesh_inputs(surfaces) | plates | seen | {"labels": evidence["labels"]}, **self.cell)
             surfaces |= {group: output(SIGNS, group) for group in self.groups if group in ("building", "vegetation")}
             lists |= {"furniture": output(SIGNS, "geojson"), "furniture_csv": output(SIGNS, "csv")}
@@ -343,8 +349,8 @@ class _GraphBuilder:
         prior = self.settings.params(EXPOSURE).prior
         add(EXPOSURE, seen | ({"prior": Path(prior)} if prior else {}))
         seen = {**seen, "exposures": output(EXPOSURE, "exposures")}
-        add(AGREEMENT, seen)
-        return surfaces, {**seen, "agreement": output(AGREEMENT, "agreement")}
+        add(PHOTO_CONSISTENCY, seen)
+        return surfaces, {**seen, "photo_consistency": output(PHOTO_CONSISTENCY, "photo_consistency")}
 
     def _cloud_inputs(self) -> Sources:
         return {f"cloud.{part}": self.output(VOXEL, "cloud", part) for part in self.cloud_groups}
@@ -356,8 +362,8 @@ class _GraphBuilder:
         points = self._cloud_inputs() | own | _synthesized_inputs(synthesized)
         for group in self.groups:
             mesh = {"mesh": surfaces[group]}
-            add(CHOOSE, mesh | seen, group)
-            choice = {"choice": output(CHOOSE, "choice", group)}
+            add(VIEW_SELECTION, mesh | seen, group)
+            choice = {"choice": output(VIEW_SELECTION, "choice", group)}
             by_photo = {**choice, **seen} if self.settings.params(UNWRAP, group).backend == "photo" else {}
             add(UNWRAP, mesh | by_photo, group)
             unwrapped = {name: output(UNWRAP, name, group) for name in ("mesh", "pages")}
@@ -365,10 +371,10 @@ class _GraphBuilder:
             add(TEXTURE, {**unwrapped, **choice, **points, **seen, **occluders}, group)
         last = TEXTURE
         if self.neighbours:
-            last = LEVEL
+            last = COLOUR_HARMONIZATION
             for group in self.groups:
                 others = self.neighbour_outputs(TEXTURE, "textured", group, prefix="neighbour")
-                add(LEVEL, {"textured": output(TEXTURE, "textured", group)} | others, group)
+                add(COLOUR_HARMONIZATION, {"textured": output(TEXTURE, "textured", group)} | others, group)
         return {group: output(last, "textured", group) for group in self.groups}
 
     def add_roads(self, textured: Sources) -> Sources:
@@ -389,7 +395,7 @@ class _GraphBuilder:
         cell = {"place": self.cell["seed"], "neighbours": self.cell["neighbours"]} if self.cell else {}
         add(COLLISION, {**surfaces, **self.plant_models("mesh"), "cloud": output(SPLIT, "terrain")}, **cell)
         planted = self.plant_models("textured")
-        choice = {f"choice.{g}": output(CHOOSE, "choice", g) for g in self.groups}
+        choice = {f"choice.{g}": output(VIEW_SELECTION, "choice", g) for g in self.groups}
         shown = {"views": seen["views"], "collision": output(COLLISION, "mesh")}
         add(EXPORT, textured | planted | choice | lists | self.instances | shown, name=tile.name)
         if self.settings.params(EXPORT).rasters:
@@ -404,9 +410,11 @@ class _GraphBuilder:
         )
         add(SCORE, textured | {name: seen[name] for name in ("views", "depth")} | self.instances | truth)
         if self.neighbours:
-            mine = {f"textured.{g}": output(LEVEL, "textured", g) for g in self.groups}
+            mine = {f"textured.{g}": output(COLOUR_HARMONIZATION, "textured", g) for g in self.groups}
             theirs = {
-                f"textured.{g}.{n}": output(LEVEL, "textured", g, n) for g in self.groups for n in self.border_owners
+                f"textured.{g}.{n}": output(COLOUR_HARMONIZATION, "textured", g, n)
+                for g in self.groups
+                for n in self.border_owners
             }
             add(BORDERS, mine | theirs, **self.cell)
         add(PREVIEW, textured | planted | self.path)
@@ -419,7 +427,7 @@ def _mesh_inputs(surfaces: Sources) -> Sources:
 
 
 def _synthesized_inputs(synthesized: Mapping[str, Sources]) -> Sources:
-    return {f"made.{group}": points["made"] for group, points in synthesized.items()}
+    return {f"synthesized.{group}": points["synthesized"] for group, points in synthesized.items()}
 
 
 def check_here(settings: Settings) -> None:

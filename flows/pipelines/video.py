@@ -15,11 +15,11 @@ from scan2sim.pipeline.core.step import Step
 from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.slam.steps.adjust import ADJUST
+from scan2sim.slam.steps.georeference import GEOREFERENCE
 from scan2sim.slam.steps.loops import LOOPS
-from scan2sim.slam.steps.place import PLACE
 from scan2sim.slam.steps.track import TRACK, Filmed
 
-STEPS: tuple[Step, ...] = (TRACK, LOOPS, ADJUST, PLACE)
+STEPS: tuple[Step, ...] = (TRACK, LOOPS, ADJUST, GEOREFERENCE)
 ODOMETRY_GROUP = "odometry"
 """Group of the task that writes the trajectory without loop closures and bundle adjustment."""
 
@@ -66,7 +66,7 @@ def build_graph(video: Video, settings: Settings) -> list[Task]:
 
     def add(step: Step, inputs: dict[str, Path | Output], group: str = "", **given: Any) -> Output:
         tasks.append(Task(step, settings.params(step, group, **given), inputs, group))
-        return Output(TaskId(step.name, group), "mapped")
+        return Output(TaskId(step.name, group), "map")
 
     filmed = {name: getattr(video, name) for name in Filmed.model_fields.keys() & video.model_fields_set}
     frames: dict[str, Path | Output] = {"video": video.video}
@@ -74,18 +74,18 @@ def build_graph(video: Video, settings: Settings) -> list[Task]:
         frames["times"] = video.times
     beside = ("gps", "mask", "weights", "matcher_weights")
     files: dict[str, Path | Output] = {name: path for name in beside if (path := getattr(video, name)) is not None}
-    keep = video.colmap or video.loops or video.adjust or settings.params(PLACE).colmap
+    keep = video.colmap or video.loops or video.adjust or settings.params(GEOREFERENCE).colmap
     local: dict[str, Any] = {"georeference": False} if video.local else {}
     film: dict[str, Any] = {"view": True} if video.view else {}
     points: dict[str, Any] = {"colmap": True} if video.colmap else {}
     mapped = add(TRACK, frames | files, keep=keep, cameras=_cameras(video.tile), **filmed, **film)
     if video.loops or video.adjust:
-        add(PLACE, {"mapped": mapped}, ODOMETRY_GROUP, **local)
+        add(GEOREFERENCE, {"map": mapped}, ODOMETRY_GROUP, **local)
     if video.loops:
-        mapped = add(LOOPS, {"mapped": mapped, **frames}, fps=settings.params(TRACK, **filmed).fps)
+        mapped = add(LOOPS, {"map": mapped, **frames}, fps=settings.params(TRACK, **filmed).fps)
     if video.adjust:
-        mapped = add(ADJUST, {"mapped": mapped})
-    add(PLACE, {"mapped": mapped}, **points, **local)
+        mapped = add(ADJUST, {"map": mapped})
+    add(GEOREFERENCE, {"map": mapped}, **points, **local)
     return tasks
 
 

@@ -15,7 +15,7 @@ from scan2sim.pipeline.core.types import F64, Mesh
 from scan2sim.pipeline.io.images.video import Encoder
 from scan2sim.pipeline.io.trajectory import atomic_write
 from scan2sim.pipeline.io.worlds.scene import Scene
-from scan2sim.pipeline.simulation.spawn import courses
+from scan2sim.pipeline.io.worlds.spawn import courses
 
 FPS = 24
 """Frames per second of the video."""

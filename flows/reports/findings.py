@@ -25,7 +25,7 @@ class FindingLimits:
         min_seen_poor: share of the surface seen by photos below which the world is poor.
         min_seen: share of the surface seen by photos below which there is a note.
         max_moving: share of moving points above which there is a note.
-        max_remains_m2: area of surface that remains of a removed vehicle above which the place is poor (half a bonnet).
+        max_residue_m2: area of surface that remains of a removed vehicle above which the place is poor (half a bonnet).
         max_rejected: share of rejected photos above which the world is poor.
     """
 
@@ -35,7 +35,7 @@ class FindingLimits:
     min_seen_poor: float = 0.2
     min_seen: float = 0.6
     max_moving: float = 0.05
-    max_remains_m2: float = 0.5
+    max_residue_m2: float = 0.5
     max_rejected: float = 0.1
 
 
@@ -142,8 +142,8 @@ def _unseen(facts: Facts) -> Iterator[Finding]:
 
 
 def _remains(facts: Facts) -> Iterator[Finding]:
-    left = facts.get("score", {}).get("remains_m2", [])
-    bad = sorted((area for area in left if area > LIMITS.max_remains_m2), reverse=True)
+    left = facts.get("score", {}).get("residue_m2", [])
+    bad = sorted((area for area in left if area > LIMITS.max_residue_m2), reverse=True)
     if bad:
         yield Finding(
             "poor",
@@ -155,19 +155,21 @@ def _remains(facts: Facts) -> Iterator[Finding]:
 
 
 def _moved(facts: Facts) -> Iterator[Finding]:
-    share = max((facts.get(step, {}).get("moving_share", 0.0) for step in ("carve", "segment")), default=0.0)
+    share = max((facts.get(step, {}).get("moving_share", 0.0) for step in ("dynamic_objects", "segment")), default=0.0)
     if share > LIMITS.max_moving:
-        yield Finding("note", "carve", f"{share:.0%} of the points belong to moving objects and were removed", share)
+        yield Finding(
+            "note", "dynamic_objects", f"{share:.0%} of the points belong to moving objects and were removed", share
+        )
 
 
 def _disagreeing(facts: Facts) -> Iterator[Finding]:
-    about = facts.get("agreement", {})
+    about = facts.get("photo_consistency", {})
     out, count = about.get("left_out", []), about.get("photos", 0)
     if count and len(out) / count > LIMITS.max_rejected:
         share = len(out) / count
         yield Finding(
             "unusable" if share > LIMITS.max_bad_photos else "poor",
-            "agreement",
+            "photo_consistency",
             f"{_count_text(len(out), count)} rejected because the others contradict them "
             f"({_named(out)}): check their poses and times",
             share,

@@ -23,11 +23,11 @@ from scan2sim.flows.reports.tile import DATA, PAGE, failed_before, figures, writ
 from scan2sim.pipeline.core.cache import Digests, Manifest, Store
 from scan2sim.pipeline.core.errors import ScanError
 from scan2sim.pipeline.core.types import Tile
+from scan2sim.pipeline.core.voronoi_cell import outline
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.geodata import geotiff, stac
 from scan2sim.pipeline.io.survey import Survey
 from scan2sim.pipeline.io.worlds import merge
-from scan2sim.pipeline.tiling.voronoi_cell import outline
 
 TILES, PICTURE = "tiles", "picture.jpg"
 Warn = Callable[[str], None]

@@ -76,7 +76,7 @@ def _rows(step: Step) -> Iterator[str]:
 
 def _value(default: object) -> str:
     if default is None:
-        return "derived"
+        return "not set"
     return str(default).lower() if isinstance(default, bool) else str(default)
 
 

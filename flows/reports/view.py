@@ -24,7 +24,7 @@ from scan2sim.pipeline.io.worlds import glb
 from scan2sim.pipeline.io.worlds.glb import GlbParams
 from scan2sim.pipeline.io.worlds.provenance import SOURCES
 from scan2sim.pipeline.io.worlds.scene import Scene, SceneTile
-from scan2sim.pipeline.simulation.spawn import courses
+from scan2sim.pipeline.io.worlds.spawn import courses
 from scan2sim.pipeline.steps.pictures import DRIVER_EYE_HEIGHT_M, SEEN_RGB, bird_pose
 
 TEMPLATE, INDEX, TILES, COLLISION = "view.html.j2", "index.html", "tiles", "_collision"

@@ -7,9 +7,9 @@ intersections per pixel.
 Occluders are the mesh faces that are supported by points (a surface that Poisson inflates around thin structures has
 no points and occludes nothing), and those points of the cloud that no mesh represents (cars, people, trimmed
 surfaces), as discs with the points' normals. Objects that moved during the scan left trails of points, most of which
-`carve` has separated: such a point occludes only in photos taken at about the time when it was scanned. A point is
-visible if its range is at most that of the range image plus a bias that grows with the slope of the surface. Evaluated
-against ground truth by `bench/visibility.py`.
+`dynamic_objects` has separated: such a point occludes only in photos taken at about the time when it was scanned. A
+point is visible if its range is at most that of the range image plus a bias that grows with the slope of the surface.
+Evaluated against ground truth by `bench/visibility.py`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ SAME_PASS_MAX_S = 5.0
 MOVING_OCCLUSION_S = (-0.1, 0.4)
 """Time window around its scan in which a point of a moving object occludes: a car leaves its own length in 0.4 s."""
 CARVED_OCCLUSION_S = 0.1
-"""Half of that window for points that `carve` classified as moving: the scanner's next turn has new points."""
+"""Half of that window for points that step `dynamic_objects` classified as moving: the next turn has new points."""
 TIME_WEIGHT_M_PER_S = 20.0
 """Scale from time to distance in the neighbour search among moving points: only points of one moment are neighbours."""
 DISC_RADIUS_FRACTION = 0.7
@@ -117,7 +117,7 @@ def scene(
         cloud: cloud with normals; None: all faces of the meshes occlude, and nothing else.
         radius: radius of the discs in metres; about the cloud's voxel size.
         mesh_distance: points nearer than this to a mesh (metres) are represented by the mesh and get no disc.
-        moving: points that the step `carve` classified as moving, with normals and time.
+        moving: points that the step `dynamic_objects` classified as moving, with normals and time.
     """
     import open3d as o3d
 

@@ -89,7 +89,7 @@ def near_path(xyz: F32, path: F64, distance: float) -> Bools:
     """(N,) bool, True for points within `distance` metres of the path (M, 3), a polyline, in plan view."""
     from scipy.spatial import cKDTree
 
-    from scan2sim.pipeline.tiling.cut_plan import resample_path
+    from scan2sim.pipeline.geometry.path_sampling import resample_path
 
     nearest, _ = cKDTree(resample_path(path[:, :2])).query(xyz[:, :2], distance_upper_bound=distance, workers=-1)
     return np.isfinite(nearest)

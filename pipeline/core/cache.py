@@ -30,8 +30,8 @@ from typing import Any
 
 from scan2sim.pipeline.core.errors import InputError, from_os_error
 from scan2sim.pipeline.core.paths import inside
+from scan2sim.pipeline.core.remote import Remote
 from scan2sim.pipeline.core.step import Done, Params, Step
-from scan2sim.pipeline.io.remote import Remote
 
 KEY_LENGTH = 24
 TEMPORARY_PREFIX, CHECKPOINT_PREFIX = ".tmp-", ".part-"
@@ -44,7 +44,8 @@ class Manifest:
     Attributes:
         label: full name of its task (`poisson.terrain`).
         version, params, inputs: what the key was computed from; inputs are keys or digests by name.
-        fed: like the key, but computed from the contents of the inputs instead of their keys (cache hit by content).
+        inputs_digest: like the key, but computed from the contents of the inputs instead of their keys (cache hit by
+        content).
         content: digest of all output files.
         files: output name to path relative to the result's folder.
         sizes: bytes of every file below it.
@@ -57,7 +58,7 @@ class Manifest:
     version: int
     params: dict[str, Any]
     inputs: dict[str, str]
-    fed: str
+    inputs_digest: str
     content: str
     files: dict[str, str]
     sizes: dict[str, int]
@@ -278,7 +279,7 @@ class Store:
 
         Args:
             folder: the folder from `begin`, holding the outputs.
-            about: the manifest's version, params, inputs, fed, seconds and peak_mb.
+            about: the manifest's version, params, inputs, inputs_digest, seconds and peak_mb.
         """
         sizes = {p.relative_to(folder).as_posix(): p.stat().st_size for p in sorted(folder.rglob("*")) if p.is_file()}
         digests = {name: digest(folder / name) for name in sizes}
@@ -301,14 +302,14 @@ class Store:
         keys = (path.parent.name for path in (self.root / task).glob("*/manifest.json"))
         return {manifest.content for manifest in (self.find(task, key) for key in keys) if manifest is not None}
 
-    def reuse_same_content(self, task: str, key: str, fed: str, inputs: Mapping[str, str]) -> Manifest | None:
+    def reuse_same_content(self, task: str, key: str, inputs_digest: str, inputs: Mapping[str, str]) -> Manifest | None:
         """Cache hit by content: reuse a result of the same step on inputs with the same bytes; None if there is none.
 
         If an input was rebuilt with the same bytes, nothing that depends on it runs again (early cutoff).
         """
         for other in self.folder(task, key).parent.glob("*/manifest.json"):
             old = self.find(task, other.parent.name)
-            if old is not None and old.fed == fed:
+            if old is not None and old.inputs_digest == inputs_digest:
                 folder = self.begin(task)
                 try:
                     shutil.copytree(other.parent, folder, symlinks=True, copy_function=os.link, dirs_exist_ok=True)

@@ -1,6 +1,6 @@
 """System libraries (shared objects) that the wheels load, and the Debian packages that contain them.
 
-`python -m bench.packaging.libraries` compares this table with every shared object of every wheel; `packages.txt` lists
+`python -m deploy.libraries` compares this table with every shared object of every wheel; `packages.txt` lists
 the packages. Uses only the standard library: `deploy/install.py` imports it before anything is installed.
 """
 

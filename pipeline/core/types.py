@@ -15,8 +15,8 @@ from typing import Any, Literal, Self
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.camera.poses import interpolate
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
+from scan2sim.pipeline.core.poses import interpolate
+from scan2sim.pipeline.core.voronoi_cell import Cell
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -156,7 +156,7 @@ class Trajectory:
     def pose_at(self, times: npt.ArrayLike) -> F64:
         """(N, 4, 4) sensor to local coordinates at `times` (N,), constant beyond both ends; requires rotations.
 
-        Interpolated by `pipeline.camera.poses.interpolate`.
+        Interpolated by `pipeline.core.poses.interpolate`.
         """
         moments = np.clip(np.asarray(times, np.float64), self.times[0], self.times[-1])
         return interpolate(self.poses, self.times, moments)

@@ -6,7 +6,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import UnavailableError
 from scan2sim.pipeline.core.types import F64, I32, Bools
-from scan2sim.pipeline.tiling.borders.boundary_curve import curve
+from scan2sim.pipeline.geometry.boundary_curve import curve
 
 NEEDS = ("pymeshlab",)
 KEEPS_BORDER = True

@@ -1,5 +1,5 @@
 """Removal of dynamic objects: objects that moved during the scan, and the ego vehicle.
 
 Begin with `free_space` (voxels that later rays pass through); `ego_vehicle_mask` finds returns of the ego vehicle,
-`vehicle_residue` measures the surface that removed vehicles left behind. The step is `pipeline.steps.carve`.
+`vehicle_residue` measures the surface that removed vehicles left behind. The step is `pipeline.steps.dynamic_objects`.
 """

@@ -47,7 +47,7 @@ def in_free_space(
     windows: I64,
     *,
     voxel: float,
-    reach: float,
+    max_range: float,
     votes: int,
     low: float = -np.inf,
     high: float = np.inf,
@@ -59,7 +59,7 @@ def in_free_space(
         origins: (N, 3) position of the scanner at each point's time; NaN if unknown.
         windows: (N,) number of each point's time window, ascending.
         voxel: voxel size in metres; poses must be more accurate than this.
-        reach: maximum length of rays, metres: beyond it, angular errors may exceed a voxel.
+        max_range: maximum length of rays, metres: beyond it, angular errors may exceed a voxel.
         votes: number of windows in which a voxel must have been passed.
         low, high: heights (local z, metres) between which points are classified.
     """
@@ -70,12 +70,12 @@ def in_free_space(
     path = origins[np.isfinite(origins[:, 0])]
     if not len(path):
         return np.zeros(len(xyz), bool), 0.0
-    corner, far = path.min(axis=0) - reach, path.max(axis=0) + reach
+    corner, far = path.min(axis=0) - max_range, path.max(axis=0) + max_range
     candidates &= ((xyz > corner) & (xyz < far)).all(axis=1)
     if not candidates.any():
         return candidates, 0.0
     boxes = _boxes(xyz[candidates])
-    state = _in_free_space(xyz, origins, candidates, starts, new_pass, boxes, voxel, reach, votes)
+    state = _in_free_space(xyz, origins, candidates, starts, new_pass, boxes, voxel, max_range, votes)
     return _with_outer_layer(xyz, windows, state, OUTER_LAYER_VOXELS * voxel), float((state[candidates] > 0).mean())
 
 
@@ -115,16 +115,16 @@ def _in_free_space(
     new_pass: Bools,
     boxes: F64,
     voxel: float,
-    reach: float,
+    max_range: float,
     votes: int,
 ) -> U8:
     ends, spans = np.empty((len(starts) - 1, 6), np.float64), np.empty((len(starts) - 1, 6), np.float64)
     for w in prange(len(spans)):
         ends[w] = _span(xyz, starts[w], starts[w + 1], 0.0)
-        spans[w] = _span(origins, starts[w], starts[w + 1], reach)
+        spans[w] = _span(origins, starts[w], starts[w + 1], max_range)
     out = np.zeros(len(xyz), np.uint8)
     for b in prange(len(boxes)):
-        _carve(xyz, origins, candidates, starts, new_pass, ends, spans, boxes[b], voxel, reach, votes, out)
+        _carve(xyz, origins, candidates, starts, new_pass, ends, spans, boxes[b], voxel, max_range, votes, out)
     return out
 
 
@@ -151,7 +151,7 @@ def _carve(
     spans: F64,
     box: F64,
     voxel: float,
-    reach: float,
+    max_range: float,
     votes: int,
     out: U8,
 ) -> None:
@@ -177,7 +177,7 @@ def _carve(
         for i in range(starts[w], starts[w + 1] if _overlap(ends[w], corner, far) else starts[w]):
             _hit(xyz, i, corner, far, shape, voxel, w, hit_in, hits, inside_in, inside)
         for i in range(starts[w], starts[w + 1] if _overlap(spans[w], corner, far) else starts[w]):
-            _pass(xyz, origins, i, corner, far, shape, voxel, reach, w, hit_in, rays, passes, through)
+            _pass(xyz, origins, i, corner, far, shape, voxel, max_range, w, hit_in, rays, passes, through)
     _vote(xyz, candidates, box, corner, shape, voxel, votes, passes, hits, through, inside, out)
 
 
@@ -284,7 +284,7 @@ def _pass(
     far: F64,
     shape: I64,
     voxel: float,
-    reach: float,
+    max_range: float,
     window: int,
     hit_in: I32,
     rays: I32,
@@ -298,7 +298,7 @@ def _pass(
     o = origins[i, 0], origins[i, 1], origins[i, 2]
     dx, dy, dz = float(xyz[i, 0] - o[0]), float(xyz[i, 1] - o[1]), float(xyz[i, 2] - o[2])
     r = math.sqrt(dx * dx + dy * dy + dz * dz)
-    begin, end = 0.0, min(r - voxel, reach)
+    begin, end = 0.0, min(r - voxel, max_range)
     if not end > voxel:  # also False if the origin is NaN
         return
     direction = (dx / r, dy / r, dz / r)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64, Bools, Frame, Mesh
-from scan2sim.pipeline.steps.geometry import sample_surface
+from scan2sim.pipeline.geometry.surface_distance import sample_surface
 
 BOX_INSET_M = 0.1
 """A vehicle's box is reduced by this on each side: a wall that it touches is not residue."""
@@ -23,7 +23,7 @@ def residue_areas(meshes: Sequence[Mesh], geojson: Path) -> list[float]:
 
     Args:
         meshes: meshes of the world, in one frame.
-        geojson: GeoJSON of boxes on the ground in the meshes' CRS, from the step `things`.
+        geojson: GeoJSON of boxes on the ground in the meshes' CRS, from the step `instances`.
     """
     out = []
     for feature in json.loads(geojson.read_text(encoding="utf-8"))["features"]:

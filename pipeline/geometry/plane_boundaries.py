@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scan2sim.pipeline.core.types import F32, F64, I32, I64, Bools
 from scan2sim.pipeline.geometry.planes import Planes
 from scan2sim.pipeline.geometry.sorting import stable_argsort
-from scan2sim.pipeline.steps.voxel import voxel_groups
+from scan2sim.pipeline.geometry.voxel_grid import voxel_groups
 
 EMPTY_PROBES = ((1.9, 1.5, 1.2), (1.9, 0.0, 1.2), (1.9, -1.5, 1.2), (1.9, -3.0, 1.2),
           (0.0, 2.2, 1.2), (0.0, -2.2, 1.2), (0.0, -4.0, 1.2))  # fmt: skip

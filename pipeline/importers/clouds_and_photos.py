@@ -32,13 +32,13 @@ import numpy as np
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F64, Camera, CameraModel, Frame
-from scan2sim.pipeline.importers.tile_folder import add_file, tile_folder, without_parents
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.geodata import orthophoto as orthophoto_io
 from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
+from scan2sim.pipeline.io.tile_folder import add_file, tile_folder, without_parents
 
 Row = Mapping[str, str]
 MATRIX_COLUMNS = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))

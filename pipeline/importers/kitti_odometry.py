@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.camera.poses import nearest_rotation
 from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.poses import nearest_rotation
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.importers.kitti_raw import (

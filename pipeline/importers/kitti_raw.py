@@ -21,17 +21,17 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.camera.poses import interpolate, nearest_rotation
 from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.poses import interpolate, nearest_rotation
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F32, F64, Camera, Frame, PointCloud
 from scan2sim.pipeline.importers.merge_sweeps import colour_from_photo, fill_colours, read_bin, scan_phase
-from scan2sim.pipeline.importers.tile_folder import add_file, tile_folder
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.images.image import SUFFIXES
 from scan2sim.pipeline.io.tile import tile_name, write_tile
+from scan2sim.pipeline.io.tile_folder import add_file, tile_folder
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 # box that contains the recording car's own returns, scanner axes: (low, high) corner in metres

@@ -14,12 +14,12 @@ from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F64, Frame, PointCloud
 from scan2sim.pipeline.geometry.similarity import Similarity
 from scan2sim.pipeline.importers import georeference
-from scan2sim.pipeline.importers.tile_folder import add_file, tile_folder
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.photogrammetry import Model, Photos, read
 from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
+from scan2sim.pipeline.io.tile_folder import add_file, tile_folder
 
 MAX_CLOUD_DISTANCE = 500.0
 """CRS units between cloud and photos above which a warning suggests that their coordinates differ."""

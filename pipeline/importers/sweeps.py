@@ -21,13 +21,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, ValidationError
 
-from scan2sim.pipeline.camera.poses import interpolate, nearest_rotation
 from scan2sim.pipeline.core.errors import DataError, InputError, SettingError
 from scan2sim.pipeline.core.parameters import Metres, Range, Shift, Voxel
+from scan2sim.pipeline.core.poses import interpolate, nearest_rotation
 from scan2sim.pipeline.core.step import Params, Report, silent
 from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Camera, Frame, PointCloud, Trajectory
 from scan2sim.pipeline.importers.merge_sweeps import colour_from_photo, fill_colours, read_bin, scan_phase, thin_voxels
-from scan2sim.pipeline.importers.tile_folder import add_file, tile_folder
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import file_checks as files
 from scan2sim.pipeline.io import toml
@@ -37,6 +36,7 @@ from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.images.image import SUFFIXES, read_rgb, size_of
 from scan2sim.pipeline.io.point_chunks import to_uint16
 from scan2sim.pipeline.io.tile import DISTORTION_LENGTHS, CameraEntry, read_tile, tile_name, write_tile
+from scan2sim.pipeline.io.tile_folder import add_file, tile_folder
 
 VERSION = 1
 """Version of the importer: raised when the same input and options give another tile."""

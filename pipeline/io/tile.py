@@ -31,7 +31,7 @@ name = "photos/0001"        # optional: name of the view; default: the file with
 ```
 Paths are relative to the `tile.toml`. A tile that was cut from a survey also has its Voronoi cell:
 `[cell]` with `seed` (x, y in the CRS) and `[cell.neighbours]`, names of tiles to their seeds
-(`pipeline.tiling.voronoi_cell`). A generated tile also has its ground truth:
+(`pipeline.core.voronoi_cell`). A generated tile also has its ground truth:
 `[truth]` with `mesh` and `points`.
 """
 
@@ -44,17 +44,17 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from scan2sim.pipeline.camera.poses import nearest_rotation
 from scan2sim.pipeline.core.classes import mapping, name_of
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.parameters import Name
+from scan2sim.pipeline.core.poses import nearest_rotation
 from scan2sim.pipeline.core.types import Camera, CameraModel, Frame, Tile, Trajectory, View
+from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import file_checks, toml
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.geodata import orthophoto
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 Vector = tuple[float, float, float]
 MAX_PIXELS, MAX_DISTORTION = 1e6, 1e6
@@ -343,3 +343,6 @@ def _trajectory(tile: Path, spec: TileFile, frame: Frame) -> Trajectory | None:
     if spec.trajectory is None:
         return None
     return trajectory_io.read(_existing(tile, spec.trajectory, "trajectory"), frame, ordered=False, timed=True)
+
+
+MIN_POINTS = 1000

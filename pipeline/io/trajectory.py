@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.camera.poses import nearest_rotation
 from scan2sim.pipeline.core.errors import DataError, InputError, SettingError, from_os_error
+from scan2sim.pipeline.core.poses import nearest_rotation
 from scan2sim.pipeline.core.types import F64, Frame, Trajectory
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.geodata import crs as crs_io

@@ -8,8 +8,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.roads.lanes import Section, sections
-from scan2sim.pipeline.roads.listed import surface
-from scan2sim.pipeline.roads.model import Road
+from scan2sim.pipeline.roads.model import Road, surface
 
 STEP_M = 0.5
 """Spacing of the points of a course."""

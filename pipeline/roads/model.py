@@ -358,3 +358,9 @@ def _surface(line: Clothoids, ground: F64) -> tuple[Profile, tuple[Profile, Prof
         [LIMITS.line_bend_m, LIMITS.cross_slope_change, LIMITS.cross_slope_change],
     )
     return height, (left, right)
+
+
+def surface(road: Road, s: F64, t: F64) -> F64:
+    """Points (N, 3) on a road's surface, local metres."""
+    slope = np.where(t > 0, road.cross_slopes[0].at(s), road.cross_slopes[1].at(s))
+    return np.column_stack([road.line.points(s, t), road.height.at(s) + slope * np.abs(t)])

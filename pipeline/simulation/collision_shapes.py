@@ -9,7 +9,7 @@ import numpy as np
 from scan2sim.pipeline.core.classes import CODE, group_of, name_of
 from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.geometry.cylinders import Cylinder, split_cylinders
-from scan2sim.pipeline.terrain.friction import coefficient
+from scan2sim.pipeline.simulation.friction import coefficient
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ def solids(mesh: Mesh, paved: float) -> list[Solid]:
 
     Args:
         mesh: result of the step `collision`.
-        paved: friction coefficient of roads (`pipeline.terrain.friction`).
+        paved: friction coefficient of roads (`pipeline.simulation.friction`).
     """
     if mesh.classification is None or not len(mesh):
         return [Solid("ground", CODE["terrain"], paved, mesh)] if len(mesh) else []

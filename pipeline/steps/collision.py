@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from scan2sim.pipeline.core.classes import CODE, SURFACES, name_of
@@ -16,9 +15,9 @@ from scan2sim.pipeline.core.errors import DataError, StepError
 from scan2sim.pipeline.core.parameters import PlanPoint, Seed
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, U8, Frame, Mesh, PointCloud
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
+from scan2sim.pipeline.core.voronoi_cell import Cell
+from scan2sim.pipeline.geometry.surface_distance import deviation, statistics
 
-DEVIATION_SAMPLES = 100_000  # points at which the distance to the visual meshes is measured
 MAX_GROUND_POINTS = 1_000_000  # points of the cloud that the ground is fitted to
 MAX_TRIANGLES = 200_000  # limit that also includes what the tile borders need
 GROUND_FRACTION = 0.6  # largest part of the triangles that the ground gets
@@ -216,33 +215,7 @@ def _height_errors(ground: Mesh, points: F32) -> dict[str, float]:
     from scan2sim.pipeline.terrain.ground_fit import heights_above_ground
 
     _, _, above = heights_above_ground(ground, points)
-    return _statistics(np.abs(above)) if len(above) else {}
-
-
-def _statistics(distance: npt.NDArray[np.floating]) -> dict[str, float]:
-    return {
-        "mean": round(float(distance.mean()), 4),
-        "p95": round(float(np.percentile(distance, 95)), 4),
-        "max": round(float(distance.max()), 4),
-    }
-
-
-def deviation(source: Mesh, collision_mesh: Mesh, seed: int) -> dict[str, float]:
-    """Statistics of the distances from points sampled uniformly on `source` to `collision_mesh`, metres."""
-    import open3d as o3d
-
-    rng = np.random.default_rng(seed)
-    area = source.face_area.astype(np.float64)
-    face = rng.choice(len(source), DEVIATION_SAMPLES, p=area / area.sum())
-    r, s = np.sqrt(rng.random((DEVIATION_SAMPLES, 1))), rng.random((DEVIATION_SAMPLES, 1))
-    a, b, c = np.moveaxis(source.corners[face], 1, 0)
-    points = (1 - r) * a + r * (1 - s) * b + r * s * c  # uniform in a triangle: Osada et al. 2002
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor.from_numpy(collision_mesh.vertices),
-        o3d.core.Tensor.from_numpy(collision_mesh.faces.astype(np.uint32)),
-    )
-    return _statistics(scene.compute_distance(o3d.core.Tensor.from_numpy(points.astype(np.float32))).numpy())
+    return statistics(np.abs(above)) if len(above) else {}
 
 
 COLLISION = Step("collision", 3, collision, CollisionParams)

@@ -21,7 +21,7 @@ from scan2sim.pipeline.io.worlds.scene import PATH_FILE, ROADS_FILE, save_tile
 
 LISTS = {
     "plants": "plants.geojson", "plants_csv": "plants.csv",
-    "furniture": "furniture.geojson", "furniture_csv": "furniture.csv", "things": "things.geojson",
+    "furniture": "furniture.geojson", "furniture_csv": "furniture.csv", "instances": "instances.geojson",
     "roads": "roads.geojson", "roads_seen": ROADS_FILE, "path": PATH_FILE,
 }  # fmt: skip  # input to file in the world's folder
 

@@ -15,9 +15,9 @@ from scan2sim.pipeline.core.classes import CODE, PHOTO_CLASSES
 from scan2sim.pipeline.core.parameters import PlanPoint, Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, I64, UNCOLOURED, Bools, PointCloud, Trajectory
+from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.buildings.facade_completion import Rays, Wall
@@ -35,7 +35,7 @@ class FacadesParams(Params):
 
     Attributes:
         when: "auto": if the scanner's path and photos from the ground are available; "never".
-        rise: height above the scanned part up to which walls are searched in the photos, metres.
+        max_height: height above the scanned part up to which walls are searched in the photos, metres.
         gap: metres; gaps in a wall narrower than twice this are closed unless a ray passed through; 0: off.
         voxel: voxel size of the thinned cloud in metres; set by the pipeline.
         seed: seed (x, y) of the tile's cell, world metres, if it has neighbours; set by the pipeline.
@@ -43,7 +43,7 @@ class FacadesParams(Params):
     """
 
     when: Literal["auto", "never"] = "auto"
-    rise: float = Field(8.0, ge=0, le=100)
+    max_height: float = Field(8.0, ge=0, le=100)
     gap: float = Field(0.5, ge=0, le=10)
     voxel: Voxel = 0.10
     seed: PlanPoint | None = None
@@ -55,30 +55,32 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
 
     `path` is the scanner's path. The height of walls is estimated from `views` and `labels` (class probabilities of a
     network; may be empty). `other.*` is the rest of the cloud: occluders, and returns through openings of walls.
-    File: `made`, a `PointCloud` with normals and without colours.
+    File: `synthesized`, a `PointCloud` with normals and without colours.
     """
     import numba
     from scipy.spatial import cKDTree
 
     from scan2sim.pipeline.buildings import facade_completion as kernels
     from scan2sim.pipeline.buildings.facade_stereo import WINDOW_M
+    from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid
     from scan2sim.pipeline.geometry.planes import detect
-    from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
 
     cloud = PointCloud.load(inputs["cloud"])
     whole = PointCloud.join([cloud, *(PointCloud.load(path) for name, path in inputs.items() if "other." in name)])
     made = PointCloud(cloud.frame, np.zeros((0, 3), np.float32), normal=np.zeros((0, 3), np.float32))
     facts: dict[str, Any] = {"walls": 0, "above_m2": 0.0, "gaps_m2": 0.0}
     if whole.time is None or not len(cloud):
-        made.save(out / "made.npz")
-        return Done({"made": out / "made.npz"}, facts | {"why": "the points have no times: rays are unknown"})
+        made.save(out / "synthesized.npz")
+        return Done(
+            {"synthesized": out / "synthesized.npz"}, facts | {"why": "the points have no times: rays are unknown"}
+        )
     assert cloud.normal is not None
     planes, which, _ = detect(cloud.xyz, cloud.normal, params.voxel)
     rays = kernels.Rays.of(Trajectory.load(inputs["path"]).at(whole.time), whole.xyz)
     photos = cache(lambda: load_photos(inputs, whole))
     numba.set_num_threads(1)  # many small images: starting threads would dominate
     tree, parts = cKDTree(cloud.xyz), []
-    for wall in kernels.walls(cloud.xyz, which, planes, params.voxel, params.rise + WINDOW_M / 2):
+    for wall in kernels.walls(cloud.xyz, which, planes, params.voxel, params.max_height + WINDOW_M / 2):
         report(0.1 + 0.9 * wall.plane / len(planes), "walls")
         through = kernels.cells_passed_through(wall, rays)
         above = extend_upwards(wall, rays, np.flatnonzero(which == wall.plane), through, photos)
@@ -97,9 +99,9 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
         made = PointCloud(
             cloud.frame, snap_to_grid(xyz).astype(np.float32), rgb, normal.astype(np.float32), classification
         )
-    made.save(out / "made.npz")
+    made.save(out / "synthesized.npz")
     rounded = {name: round(value, 1) if isinstance(value, float) else value for name, value in facts.items()}
-    return Done({"made": out / "made.npz"}, rounded | {"points": len(made)})
+    return Done({"synthesized": out / "synthesized.npz"}, rounded | {"points": len(made)})
 
 
 def load_photos(inputs: Inputs, whole: PointCloud) -> list[Photo]:

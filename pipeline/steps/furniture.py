@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,16 +13,15 @@ from pydantic import Field
 from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import I64, Bools, Frame, Mesh, PointCloud
-from scan2sim.pipeline.steps.finds import KINDS
+from scan2sim.pipeline.furniture.object_lists import sign_panel_columns, write_lists
+from scan2sim.pipeline.steps.detect_furniture import KINDS
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.furniture.classify import Detection
-    from scan2sim.pipeline.furniture.sign_panels import SignPanel
 
     Bools = Bools
 
 SEARCH_RADIUS_M = 4.0  # around the middle of a stem; contains all points of the object
-CSV_COLUMNS = ("x", "y", "z", "kind", "height_m", "radius_m", "heading_deg", "shape", "plate_width_m", "plate_height_m")
 
 
 class FurnitureParams(Params):
@@ -44,23 +43,23 @@ class FurnitureParams(Params):
 
 
 def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report) -> Done:
-    """Model the detections `finds` of the tile and `finds.NAME` of its neighbours, and select their points in `cloud`.
+    """Model the `detections` of the tile and of its neighbours (`detections.NAME`); select their points in `cloud`.
 
     An object belongs to the tile whose cell contains its foot; its points are removed from the surfaces of all tiles.
     If that tile is not given, its points are removed nevertheless, and no tile has a mesh of it.
 
-    Files: `building` (signs, poles and lamps) and `vegetation` (trunks), meshes with a class code per face; `taken`,
-    .npz with `index` (N,) of the points of objects, and `own` (N,), True for objects of this tile; `geojson` and
-    `csv`: position in the tile's CRS, kind, height above the ground, radius, and heading of sign panels (of lamps: of
-    the arm), clockwise from the CRS's north; `plates`, JSON list of all sign panels, local metres; `beside`, JSON list
-    of the feet (x, y, z) of the neighbours' poles, local metres.
+    Files: `building` (signs, poles and lamps) and `vegetation` (trunks), meshes with a class code per face;
+    `furniture_points`, .npz with `index` (N,) of the points of objects, and `own` (N,), True for objects of this tile;
+    `geojson` and `csv`: position in the tile's CRS, kind, height above the ground, radius, and heading of sign panels
+    (of lamps: of the arm), clockwise from the CRS's north; `sign_panels`, JSON list of all sign panels, local metres;
+    `neighbour_poles`, JSON list of the feet (x, y, z) of the neighbours' poles, local metres.
     """
     cloud = PointCloud.load(inputs["cloud"])
     own, others = _load_detections(inputs, params, cloud.frame)
     report(0.5, "points")
     index, whose = _points_of(cloud, own, others)
-    np.savez(out / "taken.npz", index=index, own=whose)
-    files = {"taken": out / "taken.npz"}
+    np.savez(out / "furniture_points.npz", index=index, own=whose)
+    files = {"furniture_points": out / "furniture_points.npz"}
     faces = 0
     for group, trunks in (("building", False), ("vegetation", True)):
         mesh = _mesh(cloud.frame, [detection for detection in own if (detection.kind == "trunk") == trunks])
@@ -69,14 +68,14 @@ def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report
         faces += len(mesh)
     files |= write_lists(out, cloud.frame.crs, [_row(detection, cloud.frame) for detection in own])
     lists = {
-        "plates": [plate.to_json() for detection in own for plate in detection.plates],
-        "beside": [detection.foot.tolist() for detection in others if detection.kind != "trunk"],
+        "sign_panels": [plate.to_json() for detection in own for plate in detection.plates],
+        "neighbour_poles": [detection.foot.tolist() for detection in others if detection.kind != "trunk"],
     }
     for name, rows in lists.items():
         files[name] = out / f"{name}.json"
         files[name].write_text(json.dumps(rows), encoding="utf-8")
     kinds = {kind: sum(detection.kind == kind for detection in own) for kind in KINDS}
-    return Done(files, {**kinds, "points": len(index), "of_neighbours": int((~whose).sum()), "faces": faces})
+    return Done(files, {**kinds, "points": len(index), "neighbour_points": int((~whose).sum()), "faces": faces})
 
 
 def _load_detections(inputs: Inputs, params: FurnitureParams, frame: Frame) -> tuple[list[Detection], list[Detection]]:
@@ -87,8 +86,8 @@ def _load_detections(inputs: Inputs, params: FurnitureParams, frame: Frame) -> t
     def read(path: Path) -> list[Detection]:
         return [Detection.from_json(row) for row in json.loads(path.read_text(encoding="utf-8"))]
 
-    finds = {params.name: read(inputs["finds"])}
-    finds |= {name: read(inputs[f"finds.{name}"]) for name in params.neighbours if f"finds.{name}" in inputs}
+    finds = {params.name: read(inputs["detections"])}
+    finds |= {name: read(inputs[f"detections.{name}"]) for name in params.neighbours if f"detections.{name}" in inputs}
     if params.seed is None:
         merged = [(params.name, detection) for detection in finds[params.name]]
     else:
@@ -96,18 +95,6 @@ def _load_detections(inputs: Inputs, params: FurnitureParams, frame: Frame) -> t
     here = -np.asarray(frame.origin, np.float64)
     own = [detection.moved(here) for name, detection in merged if name == params.name]
     return own, [detection.moved(here) for name, detection in merged if name != params.name]
-
-
-def write_lists(out: Path, crs: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Path]:
-    """Write `furniture.csv` and `furniture.geojson`; `x`, `y` and `z` of each row are in the CRS."""
-    from scan2sim.pipeline.io.geodata import geojson
-
-    files = {"csv": out / "furniture.csv", "geojson": out / "furniture.geojson"}
-    text = "\n".join([",".join(CSV_COLUMNS), *(",".join(str(row.get(c, "")) for c in CSV_COLUMNS) for row in rows)])
-    files["csv"].write_text(text + "\n", encoding="utf-8")
-    features = [((r["x"], r["y"], r["z"]), {k: v for k, v in r.items() if k not in "xyz"}) for r in rows]
-    geojson.write_points(files["geojson"], crs, features)
-    return files
 
 
 def _points_of(cloud: PointCloud, own: Sequence[Detection], others: Sequence[Detection]) -> tuple[I64, Bools]:
@@ -150,13 +137,6 @@ def _row(detection: Detection, frame: Frame) -> dict[str, Any]:
     if detection.plates:
         row |= sign_panel_columns(max(detection.plates, key=lambda p: p.width * p.height))
     return row
-
-
-def sign_panel_columns(plate: SignPanel) -> dict[str, Any]:
-    """Columns of a sign panel in the CSV and GeoJSON lists."""
-    heading = float(np.degrees(np.arctan2(plate.normal[0], plate.normal[1]))) % 360
-    size = {"plate_width_m": round(plate.width, 2), "plate_height_m": round(plate.height, 2)}
-    return {"heading_deg": round(heading, 1), "shape": plate.shape, **size}
 
 
 FURNITURE = Step("furniture", 4, furniture, FurnitureParams, side_product=True)

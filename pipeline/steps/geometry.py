@@ -11,8 +11,9 @@ from pydantic import Field
 from scan2sim.pipeline.core.classes import GROUPS, SURFACES, group_of
 from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.core.types import F32, Mesh, PointCloud
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
+from scan2sim.pipeline.core.types import Mesh, PointCloud
+from scan2sim.pipeline.core.voronoi_cell import Cell
+from scan2sim.pipeline.geometry.surface_distance import distances, sample_surface
 
 P95_DISTANCE_WARNING_M = 1.0  # the step warns if 5 % of the points are farther from the mesh
 
@@ -36,8 +37,8 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
     """Measure `mesh.*` against `cloud.*`, and against `truth.mesh` of a generated tile.
 
     Metrics per class, in metres: `cloud_to_mesh_mean_m` and `cloud_to_mesh_p95_m` (from points to the nearest point of
-    the mesh); `truth_mean_m` (from the mesh to the ground-truth surface of its class). `made_up` is the fraction of the
-    mesh's area that is nearer to synthesized points (`made.*`) than to scanned ones.
+    the mesh); `truth_mean_m` (from the mesh to the ground-truth surface of its class). `synthesized` is the fraction
+    of the mesh's area that is nearer to synthesized points (`synthesized.*`) than to scanned ones.
     """
     facts: dict[str, dict[str, Any]] = {}
     warnings: list[str] = []
@@ -72,9 +73,9 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
                 f"{group}: 5 % of the points are further than {metrics['cloud_to_mesh_p95_m']:.1f} m from the mesh; "
                 "parts of the scan are missing in the world (too few points for a surface, or points of another class)"
             )
-        if f"made.{group}" in inputs:
-            synthesized = PointCloud.load(inputs[f"made.{group}"])
-            metrics["made_up"] = synthesized_fraction(
+        if f"synthesized.{group}" in inputs:
+            synthesized = PointCloud.load(inputs[f"synthesized.{group}"])
+            metrics["synthesized"] = synthesized_fraction(
                 mesh, PointCloud.load(inputs[f"cloud.{group}"]), synthesized, params.samples
             )
         if truth is not None and truth.classification is not None:
@@ -118,25 +119,6 @@ def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int, *, any_class:
     low, high = same.vertices.min(axis=0)[:2], same.vertices.max(axis=0)[:2]
     points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)]
     return float(np.mean(distances(points, truth.moved_to(mesh.frame) if any_class else same)))
-
-
-def distances(points: F32, mesh: Mesh) -> F32:
-    """Distance (N,) in metres from points (N, 3) to the nearest point of the mesh."""
-    import open3d as o3d
-
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces.astype(np.uint32)))
-    return scene.compute_distance(np.ascontiguousarray(points, np.float32)).numpy()
-
-
-def sample_surface(mesh: Mesh, count: int, seed: int = 0) -> F32:
-    """Points (count, 3) sampled uniformly from the mesh's surface."""
-    random = np.random.default_rng(seed)
-    area = np.cumsum(mesh.face_area, dtype=np.float64)
-    face = np.searchsorted(area, random.uniform(0, area[-1], count)).clip(max=len(mesh) - 1)
-    u, v = np.sqrt(random.uniform(size=(count, 1))), random.uniform(size=(count, 1))
-    a, b, c = np.moveaxis(mesh.corners[face], 1, 0)
-    return ((1 - u) * a + u * (1 - v) * b + u * v * c).astype(np.float32)
 
 
 GEOMETRY = Step("geometry", 4, geometry, GeometryParams, side_product=True)

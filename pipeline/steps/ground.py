@@ -13,7 +13,7 @@ from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import UNCOLOURED, Bools, Frame, PointCloud
-from scan2sim.pipeline.tiling.voronoi_cell import Cell, nearest
+from scan2sim.pipeline.core.voronoi_cell import Cell, nearest
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.geometry.height_map import Raster
@@ -49,30 +49,30 @@ class GroundParams(CompletionParams):
     """Which holes are closed; other settings as of `walls`, but "auto" also closes the holes of streets.
 
     Attributes:
-        reach: metres; gaps between ground, roofs and crowns narrower than twice this are closed as well.
+        cover_gap: metres; gaps between ground, roofs and crowns narrower than twice this are closed as well.
         gap: metres; with a scanner's path, gaps in the ground narrower than twice this are closed, as are holes up to
             25 m2 that are surrounded by ground, and the ground under removed vehicles.
     """
 
-    reach: float = Field(10.0, ge=0, le=50)
+    cover_gap: float = Field(10.0, ge=0, le=50)
     gap: float = Field(1.5, ge=0, le=50)
 
 
 def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> Done:
     """Synthesize ground points where `terrain` has holes under `building`, `vegetation` or `rest`.
 
-    With `things` (GeoJSON of removed vehicles), the tile is a street: only gaps (`gap`) and the ground under vehicles
-    are filled. Heights and colours are interpolated from the edges of a hole by a membrane (Laplace equation); points
-    synthesized in a street have no colour, because the texture is inpainted. If the tile has neighbours, their clouds
-    (`terrain.NAME` and so on) are used too: both tiles fill a hole on their border identically.
-    File: `made`, a `PointCloud` with normals, as dense as the ground's points.
+    With `instances` (GeoJSON of removed vehicles), the tile is a street: only gaps (`gap`) and the ground under
+    vehicles are filled. Heights and colours are interpolated from the edges of a hole by a membrane (Laplace
+    equation); points synthesized in a street have no colour, because the texture is inpainted. If the tile has
+    neighbours, their clouds (`terrain.NAME` and so on) are used too: both tiles fill a hole on their border
+    identically. File: `synthesized`, a `PointCloud` with normals, as dense as the ground's points.
     """
+    from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid
     from scan2sim.pipeline.geometry.height_map import Raster, close_gaps, dilate, fill_membrane, point_spacing
-    from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
 
     terrain = merge_neighbours(inputs, params, "terrain")
     above = [merge_neighbours(inputs, params, part) for part in ("building", "vegetation", "rest") if part in inputs]
-    street = "things" in inputs
+    street = "instances" in inputs
     active = street or params.when == "always" or is_airborne(above[0])
     made = PointCloud(terrain.frame, np.zeros((0, 3), np.float32), normal=np.zeros((0, 3), np.float32))
     area = 0.0
@@ -87,7 +87,7 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
             wanted = street_ground(has, vehicle_cells(inputs, raster, terrain.frame), raster.cell, params.gap)
         else:
             cover = np.any([close_gaps(raster.covered(cloud.xyz), COVER_GAP_CELLS) for cloud in above], axis=0)
-            wanted = ndimage.binary_fill_holes(close_gaps(has | cover, params.reach / raster.cell))
+            wanted = ndimage.binary_fill_holes(close_gaps(has | cover, params.cover_gap / raster.cell))
         report(0.3, "membrane")
         field = fill_membrane(known, np.asarray(wanted))
         new = np.isfinite(field[..., 0]) & ~dilate(has, 1.5)
@@ -103,8 +103,11 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
         classification = np.full(len(xyz), CODE["terrain"], np.uint8)
         made = PointCloud(terrain.frame, xyz, rgb, normal.astype(np.float32), classification)
         area = len(xyz) * raster.cell**2
-    made.save(out / "made.npz")
-    return Done({"made": out / "made.npz"}, {"from_above": active, "points": len(made), "made_up_m2": round(area, 1)})
+    made.save(out / "synthesized.npz")
+    return Done(
+        {"synthesized": out / "synthesized.npz"},
+        {"from_above": active, "points": len(made), "synthesized_m2": round(area, 1)},
+    )
 
 
 def street_ground(has: Bools, vehicles: Bools, cell: float, gap: float) -> Bools:
@@ -128,11 +131,11 @@ def street_ground(has: Bools, vehicles: Bools, cell: float, gap: float) -> Bools
 
 
 def vehicle_cells(inputs: Inputs, raster: Raster, frame: Frame) -> Bools:
-    """Raster cells under removed vehicles with a margin, from `things` and the neighbours' `things.NAME`."""
+    """Raster cells under removed vehicles with a margin, from `instances` and the neighbours' `instances.NAME`."""
     from scan2sim.pipeline.dynamic_objects.vehicle_residue import parked_vehicle_outlines
     from scan2sim.pipeline.geometry.height_map import dilate, rasterize_polygons
 
-    listed = [path for name, path in sorted(inputs.items()) if name.partition(".")[0] == "things"]
+    listed = [path for name, path in sorted(inputs.items()) if name.partition(".")[0] == "instances"]
     rings = [ring / raster.cell - raster.low for path in listed for ring in parked_vehicle_outlines(path, frame)]
     return np.asarray(dilate(rasterize_polygons(rings, raster.shape), VEHICLE_MARGIN_M / raster.cell), bool)
 
@@ -152,7 +155,7 @@ def near_cell(xy: object, params: CompletionParams, cloud: PointCloud) -> object
 
 def merge_neighbours(inputs: Inputs, params: CompletionParams, part: str) -> PointCloud:
     """The cloud `part` merged with the neighbours' clouds `part.NAME` inside their own cells, in the tile's frame."""
-    from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
+    from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid
 
     own = PointCloud.load(inputs[part])
     given = sorted(name for name in params.neighbours if f"{part}.{name}" in inputs)

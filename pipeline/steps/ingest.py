@@ -13,8 +13,8 @@ from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.parameters import Coordinate
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import Frame, PointCloud
+from scan2sim.pipeline.io.tile import MIN_POINTS
 
-MIN_POINTS = 1000
 MAX_EXTENT_M = 5000.0
 """Maximum extent of a tile: float32 still resolves half a millimetre there, and surfaces fit into memory."""
 

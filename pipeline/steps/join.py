@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import Field
 
 from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
-from scan2sim.pipeline.steps.clip import CellParams
+from scan2sim.pipeline.tiling.cell_params import CellParams
 
 
 class JoinParams(CellParams):
@@ -17,12 +17,12 @@ class JoinParams(CellParams):
         name: name of the tile; set by the pipeline, as the cell is. Of two tiles, the one whose name sorts first
             keeps its border.
         tolerance: maximum displacement of a vertex in metres; if the neighbour's border is farther away, it is kept.
-        reach: distance from the border in metres over which the surface is blended to the new height.
+        blend_distance: distance from the border in metres over which the surface is blended to the new height.
     """
 
     name: str
     tolerance: float = Field(0.3, ge=0.001, le=10)
-    reach: float = Field(0.5, ge=0.001, le=100)
+    blend_distance: float = Field(0.5, ge=0.001, le=100)
 
 
 def join(inputs: Inputs, params: JoinParams, out: Path, report: Report) -> Done:
@@ -37,7 +37,7 @@ def join(inputs: Inputs, params: JoinParams, out: Path, report: Report) -> Done:
     for name in sorted(params.neighbours):
         if f"mesh.{name}" in inputs:
             clips[name] = Clipped.load(inputs[f"mesh.{name}"], inputs[f"on.{name}"])
-    joined = join_mesh(params.name, clips, params.tolerance, params.reach)
+    joined = join_mesh(params.name, clips, params.tolerance, params.blend_distance)
     joined.mesh.save(out / "mesh.npz")
     facts = {"faces_in": len(clips[params.name].mesh), "faces": len(joined.mesh), "turned": joined.turned}
     missing = sorted(name for name in params.neighbours if name < params.name and name not in clips)

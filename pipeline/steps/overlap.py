@@ -10,8 +10,8 @@ from pydantic import Field
 
 from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.core.types import PointCloud
-from scan2sim.pipeline.steps.clip import CellParams
-from scan2sim.pipeline.tiling.voronoi_cell import nearest
+from scan2sim.pipeline.core.voronoi_cell import nearest
+from scan2sim.pipeline.tiling.cell_params import CellParams
 
 
 class OverlapParams(CellParams):
@@ -32,9 +32,9 @@ def overlap(inputs: Inputs, params: OverlapParams, out: Path, report: Report) ->
     A point belongs to the tile with the nearest seed (of equally near ones, the first by name) and is taken from that
     tile's cloud with its attributes, in particular its class, so that both tiles have the same points around their
     border. If that tile's cloud is not given, the tile's own points are used. Coordinates are rounded to
-    `pipeline.tiling.borders.grid.GRID_M`, which is the same in every tile.
+    `pipeline.geometry.coordinate_grid.GRID_M`, which is the same in every tile.
     """
-    from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
+    from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid
 
     seeds = dict(sorted({params.name: params.seed, **params.neighbours}.items()))
     given = [name for name in seeds if name == params.name or f"cloud.{name}" in inputs]

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +16,7 @@ from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, U8, Camera, Mesh, PointCloud, Trajectory
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
+from scan2sim.pipeline.io.images.album import Album
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.camera.renderer import Image
@@ -45,29 +44,6 @@ class PicturesParams(Params):
 
     width: int = Field(1280, ge=160, le=4096)
     compared: int = Field(3, ge=0, le=100)
-
-
-@dataclass
-class Album:
-    """Images with titles and captions for the report, in a folder with an index."""
-
-    folder: Path
-    index: list[dict[str, Any]] = field(default_factory=list)
-
-    def add(self, name: str, rgb: U8, role: str, title: str, caption: str, other: U8 | None = None) -> None:
-        """Add an image; `other` is the second image of a comparison."""
-        entry = {"file": self._write(name, rgb), "role": role, "title": title, "caption": caption}
-        if other is not None:
-            entry["other"] = self._write(f"{name}_other", other)
-        self.index.append(entry)
-
-    def save(self) -> None:
-        """Write `index.json` beside the images."""
-        (self.folder / "index.json").write_text(json.dumps(self.index, indent=1), encoding="utf-8")
-
-    def _write(self, name: str, rgb: U8) -> str:
-        image.write(self.folder / f"{name}.jpg", rgb, quality=88)
-        return f"{name}.jpg"
 
 
 def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) -> Done:

@@ -11,7 +11,7 @@ from pydantic import Field
 from scan2sim.pipeline.core.parameters import PlanPoint, Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, Mesh, PointCloud
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
+from scan2sim.pipeline.core.voronoi_cell import Cell
 
 FIXED_VOXELS, BLENDED_VOXELS = 2.5, 5.0  # distance from a tile border up to which vertices are fixed, and blended
 
@@ -38,9 +38,9 @@ class PlanesParams(Params):
 def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> Done:
     """Detect planes in `cloud` (the thinned `points`) and snap `mesh` to them.
 
-    Synthesized points on planes (`made`, optional) are used like scanned ones. Where two planes intersect, the mesh
-    gets a sharp edge; where one ends in front of a parallel one (a window reveal), the face between them; where one
-    ends with no points behind it (nor in `other.*`), a straight boundary.
+    Synthesized points on planes (`synthesized`, optional) are used like scanned ones. Where two planes intersect, the
+    mesh gets a sharp edge; where one ends in front of a parallel one (a window reveal), the face between them; where
+    one ends with no points behind it (nor in `other.*`), a straight boundary.
     """
     from scan2sim.pipeline.geometry import plane_boundaries, plane_snapping
     from scan2sim.pipeline.geometry.planes import Planes, detect
@@ -55,8 +55,8 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
     report(0.2, "boundaries")
     points = PointCloud.load(inputs["points"]).xyz
     point_plane = plane_boundaries.assign_points(points, found, cloud.xyz, which, voxel, tolerance)
-    if "made" in inputs:
-        made = PointCloud.load(inputs["made"])
+    if "synthesized" in inputs:
+        made = PointCloud.load(inputs["synthesized"])
         assert made.normal is not None
         made_plane = found.nearest(made.xyz, made.normal)
         points, point_plane = np.concatenate([points, made.xyz]), np.concatenate([point_plane, made_plane])
@@ -106,7 +106,7 @@ def snap_weights(mesh: Mesh, params: PlanesParams) -> F64:
 
     Planes of two tiles differ slightly, because a tile has no points beyond its buffer.
     """
-    from scan2sim.pipeline.tiling.borders.grid import world
+    from scan2sim.pipeline.geometry.coordinate_grid import world
 
     weight = np.ones(len(mesh.vertices))
     if params.seed is not None and params.neighbours:

@@ -11,7 +11,7 @@ from pydantic import Field
 from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, F64, U8, PointCloud
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
+from scan2sim.pipeline.core.voronoi_cell import Cell
 
 CANOPY_CELL_M = 0.25
 

@@ -42,7 +42,7 @@ class PoissonParams(Params):
 
 
 def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) -> Done:
-    """Reconstruct `cloud`, with synthesized points (`made`, optional), in a child process.
+    """Reconstruct `cloud`, with synthesized points (`synthesized`, optional), in a child process.
 
     After a crash, it is retried on one thread, then one octree level coarser.
 
@@ -52,7 +52,7 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
     from scan2sim.pipeline.core import sandbox
 
     cloud = PointCloud.load(inputs["cloud"])
-    if "made" in inputs and len(cloud) and len(made := PointCloud.load(inputs["made"])):
+    if "synthesized" in inputs and len(cloud) and len(made := PointCloud.load(inputs["synthesized"])):
         cloud = PointCloud.join([cloud, made])
     if len(cloud) < MIN_POINTS:
         empty = Mesh(cloud.frame, np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty(0, np.float32))
@@ -85,7 +85,7 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
         raise StepError(inputs["cloud"], "; ".join(warnings), "Use a smaller tile, or --set poisson.depth=9")
     Mesh(cloud.frame, vertices, faces, density).save(out / "mesh.npz")
     facts = {"points": len(cloud), "faces": len(faces), "depth": depth - coarser, "cell_m": round(cell * 2**coarser, 4)}
-    return Done({"mesh": out / "mesh.npz"}, facts | {"told": summary}, warnings)
+    return Done({"mesh": out / "mesh.npz"}, facts | {"summary": summary}, warnings)
 
 
 def bounds(xyz: F32, origin: tuple[float, float, float], block: float) -> F32:

@@ -13,7 +13,7 @@ from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.parameters import Coordinate, Name, PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, Bools, Frame, PointCloud, Trajectory
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
+from scan2sim.pipeline.core.voronoi_cell import Cell
 
 ROAD_CLASSES = ("road", "bridge_deck")
 MAX_ROAD_DISTANCE_M = 3.0
@@ -48,8 +48,8 @@ def roads(inputs: Inputs, params: RoadsParams, out: Path, report: Report) -> Don
     has lanes.
     """
     from scan2sim.pipeline.camera import renderer as render
-    from scan2sim.pipeline.io.geodata import opendrive
-    from scan2sim.pipeline.roads import driven, listed, model, observed
+    from scan2sim.pipeline.io.geodata import opendrive, road_geojson
+    from scan2sim.pipeline.roads import driven, model, observed
 
     cloud, path = PointCloud.load(inputs["cloud"]), Trajectory.load(inputs["path"])
     assert cloud.classification is not None
@@ -69,13 +69,13 @@ def roads(inputs: Inputs, params: RoadsParams, out: Path, report: Report) -> Don
         seen.append(one.kept(*(own(part + origin) for part in parts)))
     warnings: list[str] = []
     drawn = [road for one in seen if (road := model.build_road(one, warnings.append))]
-    listed.write(out / "roads.geojson", cloud.frame, drawn)
+    road_geojson.write(out / "roads.geojson", cloud.frame, drawn)
     observed.save(out / "seen.npz", seen, cloud.frame)
     (out / "opendrive").mkdir()
     world = Frame(cloud.frame.crs, params.world_origin or cloud.frame.origin, cloud.frame.unit)
     network = model.network([one.moved(origin) for one in seen], world.origin)
     opendrive.write(out / "opendrive" / f"{params.name}.xodr", params.name, world, network)
-    facts = {"points": int(on.sum()), "driven": len(ways), "roads": [listed.facts(road) for road in drawn]}
+    facts = {"points": int(on.sum()), "driven": len(ways), "roads": [road_geojson.facts(road) for road in drawn]}
     files = {"geojson": out / "roads.geojson", "seen": out / "seen.npz", "opendrive": out / "opendrive"}
     return Done(files, facts | _why_none(ways, on, [*drawn, *warnings]), warnings)
 

@@ -37,11 +37,11 @@ class SplitParams(Params):
 def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Done:
     """Split the classified `cloud` into `terrain`, `building`, `vegetation` and `rest`.
 
-    Signs and poles belong to `building`, except for points of street furniture listed in `taken` (optional .npz with
-    `index` and `own`): they become `furniture`, or `rest` if the object belongs to a neighbouring tile. To keep
-    vehicles, `things` (GeoJSON) lists their boxes: points of class vehicle in boxes of parked ones become `vehicle`.
-    Other vehicles, people, wires and unclassified points are not meshed (`rest`) but remain occluders; noise is
-    removed.
+    Signs and poles belong to `building`, except for points of street furniture listed in `furniture_points` (optional
+    .npz with `index` and `own`): they become `furniture`, or `rest` if the object belongs to a neighbouring tile. To
+    keep vehicles, `instances` (GeoJSON) lists their boxes: points of class vehicle in boxes of parked ones become
+    `vehicle`. Other vehicles, people, wires and unclassified points are not meshed (`rest`) but remain occluders;
+    noise is removed.
 
     Raises:
         DataError: no point belongs to any surface.
@@ -49,18 +49,16 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     cloud = PointCloud.load(inputs["cloud"])
     assert cloud.classification is not None
     group = group_of()[cloud.classification]
-    if "taken" in inputs:
-        with np.load(inputs["taken"]) as taken:
+    if "furniture_points" in inputs:
+        with np.load(inputs["furniture_points"]) as taken:
             group[taken["index"]] = np.where(taken["own"], FURNITURE, REST)
     files, counts, warnings = {}, {}, []
-    parts = [*GROUPS, "rest"] + (["furniture"] if "taken" in inputs else [])
-    if params.vehicles == "keep" and "things" in inputs:
-        group[parked(cloud, inputs["things"])] = VEHICLE
+    parts = [*GROUPS, "rest"] + (["furniture"] if "furniture_points" in inputs else [])
+    if params.vehicles == "keep" and "instances" in inputs:
+        group[parked(cloud, inputs["instances"])] = VEHICLE
         parts.append("vehicle")
     elif params.vehicles == "keep":
-        warnings.append(
-            "split.vehicles=keep has no effect: it needs a scanner's path (to detect parked vehicles) and things.find"
-        )
+        warnings.append("split.vehicles=keep has no effect: it needs instances.detect and a scanner's path")
     number: dict[str, int] = {name: i for i, name in enumerate(GROUPS)}
     number |= {"furniture": FURNITURE, "vehicle": VEHICLE}
     for i, name in enumerate(parts):
@@ -93,11 +91,11 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     return Done(files, {"points_in": len(cloud), "points": counts, "classes": classes}, warnings)
 
 
-def parked(cloud: PointCloud, things: Path) -> Bools:
-    """(N,) bool, True for points of class vehicle in the box of a parked vehicle in `things` (GeoJSON of that step)."""
+def parked(cloud: PointCloud, instances: Path) -> Bools:
+    """(N,) bool, True for points of class vehicle in the box of a parked vehicle in `instances` (GeoJSON)."""
     inside = np.zeros(len(cloud), bool)
     vehicle = np.flatnonzero(cloud.classification == CODE["vehicle"])
-    for feature in json.loads(things.read_text(encoding="utf-8"))["features"]:
+    for feature in json.loads(instances.read_text(encoding="utf-8"))["features"]:
         properties = feature["properties"]
         if properties["moved"] or properties["kind"] == "person":
             continue

@@ -39,7 +39,7 @@ class TrimParams(Params):
 
 
 def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
-    """Keep the triangles of `mesh` that are supported by points of `cloud` or synthesized points (`made`, optional)."""
+    """Keep the triangles of `mesh` that are supported by points of `cloud` or by `synthesized` points (optional)."""
     from scipy.spatial import cKDTree
 
     mesh, cloud = Mesh.load(inputs["mesh"]), PointCloud.load(inputs["cloud"])
@@ -49,8 +49,8 @@ def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
     assert mesh.density is not None
     tree = cKDTree(cloud.xyz)
     widened = max(1.0, _spacing(tree, cloud.xyz) / (FULL_SPACING_VOXELS * REFERENCE_VOXEL_M))
-    if "made" in inputs:
-        tree = cKDTree(np.concatenate([cloud.xyz, PointCloud.load(inputs["made"]).xyz]))
+    if "synthesized" in inputs:
+        tree = cKDTree(np.concatenate([cloud.xyz, PointCloud.load(inputs["synthesized"]).xyz]))
     corners = mesh.corners
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     long = edge > params.max_edge * widened

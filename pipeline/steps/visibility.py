@@ -19,12 +19,12 @@ class VisibilityParams(Params):
     Attributes:
         pixels: maximum number of pixels of a depth map.
         radius: radius in metres of the discs that represent points of the cloud.
-        lacking: points farther than this from every mesh (cars, people) occlude as discs, metres.
+        mesh_distance: points farther than this from every mesh (cars, people) occlude as discs, metres.
     """
 
     pixels: int = Field(2_000_000, ge=10_000, le=64_000_000)
     radius: float = Field(0.08, ge=0.001, le=10)
-    lacking: Distance = 0.2
+    mesh_distance: Distance = 0.2
 
 
 def visibility(inputs: Inputs, params: VisibilityParams, out: Path, report: Report) -> Done:
@@ -42,7 +42,7 @@ def visibility(inputs: Inputs, params: VisibilityParams, out: Path, report: Repo
     meshes = [Mesh.load(path) for name, path in inputs.items() if name.startswith("mesh.")]
     cloud = PointCloud.join([PointCloud.load(path) for name, path in inputs.items() if name.startswith("cloud.")])
     moving = PointCloud.load(inputs["moving"]) if "moving" in inputs else None
-    occluders = kernel.scene(meshes, cloud, radius=params.radius, mesh_distance=params.lacking, moving=moving)
+    occluders = kernel.scene(meshes, cloud, radius=params.radius, mesh_distance=params.mesh_distance, moving=moving)
     for i, view in enumerate(views):
         report(i / len(views), view.name)
         depth = kernel.depth_map(view.camera, view.T_world_cam, occluders, time=view.time, pixels=params.pixels)

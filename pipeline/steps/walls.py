@@ -30,15 +30,15 @@ class WallsParams(CompletionParams):
     """Which walls are synthesized; other settings as of `ground`.
 
     Attributes:
-        least_height: minimum height of a wall in metres; lower steps are left open.
-        least_area: minimum area of a roof in m2; smaller ones (chimneys) belong to the roof around them.
+        min_height: minimum height of a wall in metres; lower steps are left open.
+        min_area: minimum area of a roof in m2; smaller ones (chimneys) belong to the roof around them.
         step: height difference between neighbouring cells in metres above which they belong to different roofs.
         tolerance: maximum distance in metres between a straight side and the roof's outline (at least one cell of the
             point spacing).
     """
 
-    least_height: float = Field(0.5, ge=0.01, le=100)
-    least_area: float = Field(4.0, ge=0.01, le=10_000)
+    min_height: float = Field(0.5, ge=0.01, le=100)
+    min_area: float = Field(4.0, ge=0.01, le=10_000)
     step: float = Field(1.0, ge=0.01, le=100)
     tolerance: float = Field(0.5, ge=0.01, le=10)
 
@@ -49,7 +49,7 @@ def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Don
     Roofs are segmented by height, and their outlines straightened; `footprints` (GeoJSON or GeoPackage) replace
     detected outlines. No points are added where the wall was scanned. The ground is `terrain` with its synthesized
     points (`ground`); neighbours' clouds (`building.NAME` and so on) are used as in step `ground`.
-    File: `made`, a `PointCloud` with normals.
+    File: `synthesized`, a `PointCloud` with normals.
     """
     from scan2sim.pipeline.buildings.roof_outlines import OutlinePoints, rings, roofs
     from scan2sim.pipeline.geometry.height_map import Raster, point_spacing
@@ -60,13 +60,13 @@ def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Don
         floor = np.concatenate([floor, PointCloud.load(inputs["ground"]).xyz])
     made = PointCloud(building.frame, np.zeros((0, 3), np.float32), normal=np.zeros((0, 3), np.float32))
     active = params.when == "always" or is_airborne(building)
-    facts = {"from_above": active, "roofs": 0, "sides": 0, "footprints": 0, "points": 0, "made_up_m2": 0.0}
+    facts = {"from_above": active, "roofs": 0, "sides": 0, "footprints": 0, "points": 0, "synthesized_m2": 0.0}
     if active and len(building) and len(floor):
         assert building.normal is not None
         flat = building.xyz[np.abs(building.normal[:, 2]) > ROOF_MIN_NORMAL_Z]
         raster = Raster.over(point_spacing(flat), [building.xyz])
         top = raster.highest(flat)
-        component = roofs(top, raster.cell, max(params.step, 1.5 * raster.cell), params.least_area)
+        component = roofs(top, raster.cell, max(params.step, 1.5 * raster.cell), params.min_area)
         report(0.2, f"{component.max()} roofs")
         tolerance = max(params.tolerance, raster.cell)
         heights = WallHeights(raster, top, component, floor)
@@ -74,23 +74,23 @@ def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Don
         given = _footprints(inputs, building)
         if given:
             places = OutlinePoints.along(given, POINT_SPACING_M)
-            parts.append(heights.columns(places, 0, params.least_height))
+            parts.append(heights.columns(places, 0, params.min_height))
         count = 0
         for k in range(1, int(component.max()) + 1):
             report(0.2 + 0.6 * k / component.max(), f"roof {k} of {component.max()}")
-            found = rings(component == k, raster, tolerance, params.least_area)
+            found = rings(component == k, raster, tolerance, params.min_area)
             places = OutlinePoints.along(found, POINT_SPACING_M)
             if given:
                 places = _without_footprint(places, OutlinePoints.along(given, POINT_SPACING_M).xy)
             count += sum(map(len, found))
-            parts.append(heights.columns(places, k, params.least_height))
+            parts.append(heights.columns(places, k, params.min_height))
         xyz = np.concatenate([np.zeros((0, 3)), *(part[0] for part in parts)])
         normal = np.concatenate([np.zeros((0, 3)), *(part[1] for part in parts)])
         made = _cloud(xyz, normal, building, params)
         facts |= {"roofs": int(component.max()), "sides": count, "footprints": len(given)}
-        facts |= {"points": len(made), "made_up_m2": round(len(made) * POINT_SPACING_M**2, 1)}
-    made.save(out / "made.npz")
-    return Done({"made": out / "made.npz"}, facts)
+        facts |= {"points": len(made), "synthesized_m2": round(len(made) * POINT_SPACING_M**2, 1)}
+    made.save(out / "synthesized.npz")
+    return Done({"synthesized": out / "synthesized.npz"}, facts)
 
 
 class WallHeights:
@@ -172,7 +172,7 @@ def _cloud(xyz: F64, normal: F64, building: PointCloud, params: WallsParams) -> 
     """Synthesized points that are not near a scanned point of the building and belong to the tile."""
     from scipy.spatial import cKDTree
 
-    from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
+    from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid
 
     keep = ~np.isfinite(
         cKDTree(building.xyz).query(xyz, distance_upper_bound=SCANNED_WALL_SPACINGS * POINT_SPACING_M)[0]

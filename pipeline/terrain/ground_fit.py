@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64, I64, Bools, Mesh
-from scan2sim.pipeline.tiling.borders.common_faces import directed_edges
+from scan2sim.pipeline.geometry.common_faces import directed_edges
 
 POINT_SIGMA_M = 0.02
 """Standard deviation of points, and threshold of the Huber loss (Huber 1964)."""

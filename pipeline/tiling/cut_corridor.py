@@ -21,17 +21,17 @@ from scan2sim.pipeline.core.errors import DataError, InputError, SettingError
 from scan2sim.pipeline.core.parameters import Buffer, Length, Metres, Stretch
 from scan2sim.pipeline.core.step import Params, Report, silent
 from scan2sim.pipeline.core.types import F64, Tile, Trajectory
-from scan2sim.pipeline.importers.tile_folder import add_file, tile_folder
+from scan2sim.pipeline.core.voronoi_cell import Cell, Seed, cells
+from scan2sim.pipeline.geometry.path_sampling import resample_path
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import orthophoto
 from scan2sim.pipeline.io.survey import read_survey, write_survey
-from scan2sim.pipeline.io.tile import TileFile, read_spec, read_tile, tile_name, write_tile
-from scan2sim.pipeline.steps.ingest import MIN_POINTS
-from scan2sim.pipeline.tiling.cut_plan import resample_path, seeds, sees, tile_membership
+from scan2sim.pipeline.io.tile import MIN_POINTS, TileFile, read_spec, read_tile, tile_name, write_tile
+from scan2sim.pipeline.io.tile_folder import add_file, tile_folder
+from scan2sim.pipeline.tiling.cut_plan import seeds, sees, tile_membership
 from scan2sim.pipeline.tiling.point_spool import COORDINATE_STEP, Spool
-from scan2sim.pipeline.tiling.voronoi_cell import Cell, Seed, cells
 
 VERSION = 1
 """Version of the cut: raised when the same corridor and options give other tiles."""
@@ -52,8 +52,8 @@ class CutParams(Params):
 
     length: Length = Field(100.0, description="Length of a tile: metres of path.")
     buffer: Buffer = Field(5.0, description="Metres by which tiles' clouds extend beyond their borders.")
-    reach: Stretch = Field(60.0, description="Metres from the trajectory beyond which points are removed.")
-    photo_reach: Metres = Field(40.0, description="Metres beyond a tile's border up to which photos are used.")
+    max_distance: Stretch = Field(60.0, description="Metres from the trajectory beyond which points are removed.")
+    photo_distance: Metres = Field(40.0, description="Metres beyond a tile's border up to which photos are used.")
     copy_photos: bool = Field(False, description="Copy photos into the tiles instead of referring to them.")
 
     def check(self) -> None:
@@ -189,8 +189,9 @@ def _distribute(
         if not too_few:
             raise DataError(
                 tile.path,
-                f"only {spool.tiles[0].own:,} points, and {far:,} farther than {options.reach:g} m from the trajectory",
-                f"A tile needs {MIN_POINTS:,}; check that clouds and trajectory are in one CRS, or increase the reach",
+                f"only {spool.tiles[0].own:,} points, and {far:,} farther than {options.max_distance:g} m from the "
+                "trajectory",
+                f"A tile needs {MIN_POINTS:,}; check the CRS of clouds and trajectory, or increase --max-distance",
             )
         for i in range(len(tile_seeds)):
             spool.drop(i)
@@ -206,7 +207,10 @@ def _distribute(
     if spool.invalid:
         warn(f"{spool.invalid:,} points with NaN coordinates removed")
     if far > sum(corridor.counts) / 2:
-        warn(f"{far:,} of {sum(corridor.counts):,} points are farther than {options.reach:g} m from the trajectory")
+        warn(
+            f"{far:,} of {sum(corridor.counts):,} points are farther than {options.max_distance:g} m from "
+            "the trajectory"
+        )
     return tile_seeds, spool
 
 
@@ -232,7 +236,7 @@ def _assign(
             rows = spool.rows(part)
             xy = spool.world(rows)[:, :2]
             if path is not None:
-                near = np.isfinite(path.query(xy, distance_upper_bound=options.reach, workers=-1)[0])
+                near = np.isfinite(path.query(xy, distance_upper_bound=options.max_distance, workers=-1)[0])
                 far += len(near) - int(np.count_nonzero(near))
                 rows, xy = rows[near], xy[near]
             own, buffer_points, buffer_tiles = tile_membership(xy, seed_xy, options.buffer)
@@ -319,7 +323,7 @@ class _Writer:
         if path is None:
             return None
         low, high = (corner[:2] for corner in self._spool.bounds(index))
-        xy, reach = (path.positions + self._origin)[:, :2], self._options.reach
+        xy, reach = (path.positions + self._origin)[:, :2], self._options.max_distance
         near = ((xy >= low - reach) & (xy <= high + reach)).all(axis=1)
         parts = {f.name: getattr(path, f.name) for f in fields(path)}
         return replace(path, **{k: v[near] for k, v in parts.items() if v is not None}) if near.any() else None
@@ -330,7 +334,7 @@ class _Writer:
         if not views:
             return []
         own = self._spool.sample(index, VISIBILITY_SAMPLE_POINTS) - self._origin
-        near = np.flatnonzero(cell.outside(self._centres[:, :2]) <= self._options.photo_reach)
+        near = np.flatnonzero(cell.outside(self._centres[:, :2]) <= self._options.photo_distance)
         return [i for i in near.tolist() if sees(views[i], own)]
 
     def _photo(self, index: int, name: str) -> dict[str, Any]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +14,8 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.types import F64, I64, Frame, Trajectory, View
-from scan2sim.pipeline.tiling.voronoi_cell import Seed
+from scan2sim.pipeline.core.voronoi_cell import Seed
+from scan2sim.pipeline.geometry.path_sampling import thin_path
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -30,8 +30,6 @@ MAX_TILES = 100_000
 """Maximum number of tiles on a grid; more result from wrong coordinates."""
 MIN_SEED_SPACING = 0.75
 """Minimum distance between seeds in tile lengths, unless a part of the path would be farther than a length from any."""
-PATH_SPACING_M = 5.0
-"""Spacing of the samples of a path for distance queries."""
 MAX_SIGHT_M = 60.0
 """Distance from a photo up to which points count as visible."""
 MIN_VISIBLE_SHARE, MIN_VISIBLE_POINTS = 0.01, 50
@@ -72,16 +70,6 @@ def seeds(
     rounded = np.round(positions / frame.unit, 3)
     digits = max(4, len(str(len(rounded) - 1)))  # so that sorting by name keeps the order
     return {f"{name}_{i:0{digits}d}": (x * frame.unit, y * frame.unit) for i, (x, y) in enumerate(rounded.tolist())}
-
-
-def resample_path(xy: F64) -> F64:
-    """Resample a path (N, 2) to positions (M, 2) about `PATH_SPACING_M` apart; gaps are filled by straight lines."""
-    xy = _thin_path(xy, PATH_SPACING_M)
-    out = [xy[:1]]
-    for a, b in pairwise(xy):
-        steps = max(1, math.ceil(float(np.linalg.norm(b - a)) / PATH_SPACING_M - 0.5))
-        out.append(a + (b - a) * (np.arange(1, steps + 1) / steps)[:, None])
-    return np.concatenate(out)
 
 
 def tile_membership(xy: F64, seed_xy: F64, buffer: float) -> tuple[I64, I64, I64]:
@@ -170,7 +158,7 @@ def _seeds_along(parts: list[F64], length: float) -> F64:
     from scipy.spatial import cKDTree
 
     step = max(1.0, length / 20)
-    parts = [_thin_path(part, step) for part in parts]
+    parts = [thin_path(part, step) for part in parts]
     xy = np.concatenate(parts)
     arc_length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
     stretches = _first_visits(parts, xy, arc_length, max(10.0, length / 4), step)
@@ -220,18 +208,3 @@ def _first_visits(parts: list[F64], xy: F64, arc_length: F64, near: float, step:
                 stretches.append((int(stretch[0]), int(stretch[-1])))
         start += len(part)
     return stretches
-
-
-def _thin_path(xy: F64, step: float) -> F64:
-    """The samples of a path (N, 2) that are `step` metres from the previous kept one, and the last.
-
-    Removes the jitter of a standing vehicle, which would add to the arc length.
-    """
-    kept = [0]
-    x, y = xy.T.tolist()
-    for i in range(1, len(xy)):
-        if math.hypot(x[i] - x[kept[-1]], y[i] - y[kept[-1]]) >= step - 1e-6:
-            kept.append(i)
-    if kept[-1] != len(xy) - 1:
-        kept.append(len(xy) - 1)
-    return xy[kept]

@@ -11,11 +11,11 @@ from scipy.sparse.csgraph import connected_components
 
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.types import F64, I64, Bools, Mesh
+from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.furniture.classify import PANEL_THICKNESS_M, panel_mesh
 from scan2sim.pipeline.furniture.sign_panels import SignPanel, inside
 from scan2sim.pipeline.geometry import primitives
 from scan2sim.pipeline.tiling.borders.open_edges import on_border
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 SMEAR_FRONT_M, SMEAR_BACK_M, SMEAR_SIDE_M = 0.5, 0.05, 0.1
 """Metres in front of, behind and beside a panel within which surfaces are reconstructions of its own points."""

@@ -1,4 +1,4 @@
-"""Instances step (`things`): detects vehicles and people and classifies all points of each (`vehicle_boxes`)."""
+"""Instances step (`instances`): detects vehicles and people and classifies all points of each (`vehicle_boxes`)."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from scan2sim.pipeline.core.classes import CODE, group_of
 from scan2sim.pipeline.core.parameters import Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, F64, I64, U8, Frame, PointCloud, Trajectory
+from scan2sim.pipeline.geometry.voxel_grid import voxel_groups
 from scan2sim.pipeline.io.file_checks import link_or_copy
-from scan2sim.pipeline.steps.voxel import voxel_groups
 from scan2sim.segmentation.steps.segment import SOURCE_CLOUD, SOURCE_SHAPE
 
 if TYPE_CHECKING:
@@ -30,29 +30,29 @@ PROBABILITY_MIN, PROBABILITY_MAX = 0.67, 0.9
 """Bounds of the probability of a predicted class: likelier than the others, but never certain."""
 
 
-class ThingsParams(Params):
+class InstancesParams(Params):
     """Settings of the detection of vehicles and people.
 
     Attributes:
-        find: detect instances; False keeps the classes of the points.
+        detect: detect instances; False keeps the classes of the points.
         size: size in metres of the voxels that are classified.
     """
 
-    find: bool = True
+    detect: bool = True
     size: Voxel = 0.1
 
 
-def things(inputs: Inputs, params: ThingsParams, out: Path, report: Report) -> Done:
+def instances(inputs: Inputs, params: InstancesParams, out: Path, report: Report) -> Done:
     """Detect vehicles and people in the classified `cloud` and assign their class to all of their points.
 
     Inputs: `cloud`; `confidence` (of `segment`); `path`, the scanner's path (without it the cloud is kept); `moving`, a
     cloud of points that were dropped because they moved (optional). Classes that came with the cloud are kept.
-    Files: `cloud`; `things`, GeoJSON with the ground box of every instance in the tile's CRS, its `kind`, `length_m`,
-    `width_m`, `height_m`, `heading_deg` (from x, counter-clockwise), `ground_z`, `points`, `moved` and `confidence`.
-    Metrics: number of `vehicles`, of these `moved`, and of `people`; points `added` to instances, and points
-    `given_back` to other classes.
+    Files: `cloud`; `instances`, GeoJSON with the ground box of every instance in the tile's CRS, its `kind`,
+    `length_m`, `width_m`, `height_m`, `heading_deg` (from x, counter-clockwise), `ground_z`, `points`, `moved` and
+    `confidence`. Metrics: number of `vehicles`, of these `moved`, and of `people`; points `added` to instances, and
+    points `reassigned` to other classes.
     """
-    file, geojson_file = out / "cloud.npz", out / "things.geojson"
+    file, geojson_file = out / "cloud.npz", out / "instances.geojson"
     report(0.0, "reading")
     found: list[tuple[Instance, int]] = []
     cloud = PointCloud.load(inputs["cloud"]) if "path" in inputs else None
@@ -79,13 +79,13 @@ def things(inputs: Inputs, params: ThingsParams, out: Path, report: Report) -> D
         "moved": sum(instance.moved for instance in vehicles),
         "people": len(found) - len(vehicles),
         "added": added,
-        "given_back": back,
+        "reassigned": back,
     }
-    return Done({"cloud": file, "things": geojson_file}, metrics)
+    return Done({"cloud": file, "instances": geojson_file}, metrics)
 
 
 def detect(
-    cloud: PointCloud, inputs: Inputs, params: ThingsParams, report: Report
+    cloud: PointCloud, inputs: Inputs, params: InstancesParams, report: Report
 ) -> tuple[list[tuple[Instance, int]], U8]:
     """Instances with their numbers of points, and the class of every point (N,)."""
     from scan2sim.segmentation import vehicle_boxes
@@ -209,4 +209,4 @@ def _movable() -> tuple[int, int]:
     return CODE["vehicle"], CODE["person"]
 
 
-THINGS = Step("things", 3, things, ThingsParams)
+INSTANCES = Step("instances", 3, instances, InstancesParams)

@@ -13,9 +13,9 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.parameters import Device, File, Fraction, Name, Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import U8, PointCloud
+from scan2sim.pipeline.geometry.voxel_grid import sample
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
-from scan2sim.pipeline.steps.voxel import sample
 
 if TYPE_CHECKING:
     from scan2sim.segmentation.project_scan import ScanProjector
@@ -81,7 +81,7 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
         channels = scan.channels(view, classifier.size(view.camera)) if scan else None
         np.save(folder / f"{i}.npy", classifier.probabilities(rgb, view.camera, channels))
     info = network.info
-    about = {"network": info.name, "sha256": info.sha256, "licence": info.licence, "tells": classifier.classes}
+    about = {"network": info.name, "sha256": info.sha256, "licence": info.licence, "classes": classifier.classes}
     (folder / "network.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
     return Done(
         {"labels": folder},

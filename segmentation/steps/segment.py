@@ -13,9 +13,9 @@ from scan2sim.pipeline.core.classes import group_of, name_of
 from scan2sim.pipeline.core.parameters import Fraction, Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import U8, PointCloud, Trajectory
+from scan2sim.pipeline.geometry.voxel_grid import sample, voxel_groups
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.file_checks import link_or_copy
-from scan2sim.pipeline.steps.voxel import sample, voxel_groups
 from scan2sim.segmentation.steps.label import classified
 
 SOURCE_PHOTO, SOURCE_SHAPE, SOURCE_CLOUD = 1, 2, 3
@@ -46,7 +46,7 @@ def segment(inputs: Inputs, params: SegmentParams, out: Path, report: Report) ->
     """Keep the classes of `cloud`, or classify its points by `labels` (of the step `label`, for `views`) and shape.
 
     Inputs: `cloud`; `views` and `labels`; `path`, the scanner's path (optional); `moving`, moving points from the step
-    `carve`, which hide what is behind them in photos (optional).
+    `dynamic_objects`, which hide what is behind them in photos (optional).
     Files: `cloud`; `confidence`, .npz with `confidence` (N,) uint8, 255 is certain, and `source` (N,) uint8
     (`SOURCE_PHOTO`, `SOURCE_SHAPE` or `SOURCE_CLOUD`).
     """
@@ -141,7 +141,7 @@ def _from_photos(
         report=lambda f, m="": report(0.5 + 0.3 * f, m),
     )  # fmt: skip
     report(0.8, "smoothing")
-    predicted = json.loads((probabilities / "network.json").read_text(encoding="utf-8"))["tells"]
+    predicted = json.loads((probabilities / "network.json").read_text(encoding="utf-8"))["classes"]
     height, ground = split_ground(thin.xyz)
     moved = transient(thin, height, ground)
     best, probability = smooth_classes(

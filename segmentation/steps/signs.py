@@ -14,10 +14,10 @@ from pydantic import Field
 from scan2sim.pipeline.core.parameters import PlanPoint
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Frame, Mesh, View
+from scan2sim.pipeline.core.voronoi_cell import Cell
+from scan2sim.pipeline.furniture.object_lists import sign_panel_columns, write_lists
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
-from scan2sim.pipeline.steps.furniture import sign_panel_columns, write_lists
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.furniture.sign_panels import SignPanel
@@ -51,8 +51,8 @@ class SignsParams(Params):
 def signs(inputs: Inputs, params: SignsParams, out: Path, report: Report) -> Done:
     """Fit sign panels to photos: those detected in the points, and those detected in the photos.
 
-    Inputs: `mesh.terrain`, `mesh.building`, `mesh.vegetation` (optional); `plates`, `beside` and `geojson` of
-    `furniture`; `views`; `labels` (a network's classes; without them no signs are detected in photos).
+    Inputs: `mesh.terrain`, `mesh.building`, `mesh.vegetation` (optional); `sign_panels`, `neighbour_poles` and
+    `geojson` of `furniture`; `views`; `labels` (a network's classes; without them no signs are detected in photos).
     Files: `building` and `vegetation`, meshes with the panels and without the surfaces reconstructed from their points;
     `geojson` and `csv` as of `furniture`. Metrics: panels `from_points`; `fitted` to photos, of these `new`.
     """
@@ -67,14 +67,14 @@ def signs(inputs: Inputs, params: SignsParams, out: Path, report: Report) -> Don
     groups = [group for group in ("terrain", "building", "vegetation") if f"mesh.{group}" in inputs]
     meshes = {group: Mesh.load(inputs[f"mesh.{group}"]) for group in groups}
     frame = meshes["building"].frame
-    known = [SignPanel.from_json(row) for row in json.loads(inputs["plates"].read_text(encoding="utf-8"))]
+    known = [SignPanel.from_json(row) for row in json.loads(inputs["sign_panels"].read_text(encoding="utf-8"))]
     features = json.loads(inputs["geojson"].read_text(encoding="utf-8"))["features"]
     rows = [f["properties"] | dict(zip("xyz", f["geometry"]["coordinates"], strict=True)) for f in features]
     views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
     used = [i for i, view in enumerate(views) if not held[i] and view.camera.model != "orthographic"]
     cell = None if params.seed is None else Cell(params.seed, params.neighbours)
     poles = np.array([frame.to_local([row["x"], row["y"], row["z"]]) for row in rows if row["kind"] != "trunk"])
-    others = np.array(json.loads(inputs["beside"].read_text(encoding="utf-8")))
+    others = np.array(json.loads(inputs["neighbour_poles"].read_text(encoding="utf-8")))
     own = partial(_own, frame, cell, poles.reshape(-1, 3), others.reshape(-1, 3))
     found = _found(views, used, _probabilities(inputs, used), known, own, report)
     building = meshes["building"]

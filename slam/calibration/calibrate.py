@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from scan2sim.pipeline.core.types import Camera
-from scan2sim.slam.calibration.lens import SIGNIFICANT_CHANGE, LensEstimate, changed_lens, fit_lens, lens_difference
+from scan2sim.slam.lens import SIGNIFICANT_CHANGE, LensEstimate, changed_lens, fit_lens, lens_difference
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 from scan2sim.slam.odometry.track_log import TrackLog, centred_pinhole, replay
 

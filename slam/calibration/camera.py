@@ -15,7 +15,7 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.io.images import exif
 from scan2sim.slam.calibration.calibrate import calibrated, calibrated_from_scratch
-from scan2sim.slam.calibration.lens import LensEstimate, changed_lens
+from scan2sim.slam.lens import LensEstimate, changed_lens
 from scan2sim.slam.odometry.track_log import TrackLog, centred_pinhole
 from scan2sim.slam.video import Video
 

@@ -1,5 +1,5 @@
-"""The map: keyframes and points, the factor graph over them, loop closure and global bundle adjustment.
+"""The map that odometry works with: keyframes and points, and the optimized window over them.
 
-Start reading at `local_map` (keyframes and the optimized window) and `factor_graph` (the optimization problem; its
-solvers are in `slam.solvers`).
+Start reading at `local_map`. The optimization problem is in `slam.factor_graph`, its solvers are in `slam.solvers`;
+corrections of the finished map are in `slam.global_map`.
 """

@@ -15,8 +15,8 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import F64
 from scan2sim.slam import solvers
+from scan2sim.slam.factor_graph import Graph, errors
 from scan2sim.slam.geometry import triangulate
-from scan2sim.slam.mapping.factor_graph import Graph, errors
 from scan2sim.slam.mapping.local_map import HELD_OUT_EVERY, LocalMap
 
 OBSERVATIONS_MIN = 3

@@ -13,10 +13,10 @@ from scan2sim.pipeline.core.parameters import Distance
 from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.core.types import F64, I32, I64, Bools, Camera, GpsTrack
 from scan2sim.slam import solvers
-from scan2sim.slam.calibration.lens import lens_information
+from scan2sim.slam.factor_graph import DistanceConstraint, Graph, errors
 from scan2sim.slam.geometry import angles, triangulate
+from scan2sim.slam.lens import lens_information
 from scan2sim.slam.mapping import rolling_shutter as shared
-from scan2sim.slam.mapping.factor_graph import DistanceConstraint, Graph, errors
 from scan2sim.slam.mapping.marginalization import Information
 from scan2sim.slam.solvers import lm
 
@@ -31,12 +31,12 @@ class MapParams(Params):
 
     Attributes:
         window: number of keyframes optimized together (D3.2: 20).
-        anchors: number of fixed keyframes before the window.
+        fixed_keyframes: number of fixed keyframes before the window.
         sigma: standard deviation of a bearing, pixels.
-        below: metres; points farther below the camera are rejected (D3.2: 10).
-        beyond: metres; points farther away are rejected (D3.2: 500).
-        off: degrees; points whose median reprojection error is larger are rejected (D3.2: 0.7).
-        views: number of keyframes that must observe a point (D3.2: 3).
+        max_below_camera: metres; points farther below the camera are rejected (D3.2: 10).
+        max_distance: metres; points farther away are rejected (D3.2: 500).
+        max_error_deg: degrees; points whose median reprojection error is larger are rejected (D3.2: 0.7).
+        min_views: number of keyframes that must observe a point (D3.2: 3).
         gps_chords: relative distance constraints from GPS within the window: "long" ones, "adjacent" ones (D3.2), or
             "none".
         gps_sigma: standard deviation of a GPS distance, metres.
@@ -45,12 +45,12 @@ class MapParams(Params):
     """
 
     window: int = Field(20, ge=3, le=500)
-    anchors: int = Field(5, ge=1, le=500)
+    fixed_keyframes: int = Field(5, ge=1, le=500)
     sigma: float = Field(0.5, ge=0.01, le=50)
-    below: Distance = 10.0
-    beyond: float = Field(500.0, ge=1, le=1_000_000)
-    off: float = Field(0.7, ge=0.001, le=180)
-    views: int = Field(3, ge=2, le=100)
+    max_below_camera: Distance = 10.0
+    max_distance: float = Field(500.0, ge=1, le=1_000_000)
+    max_error_deg: float = Field(0.7, ge=0.001, le=180)
+    min_views: int = Field(3, ge=2, le=100)
     gps_chords: Literal["long", "adjacent", "none"] = "long"
     gps_sigma: float = Field(1.5, ge=0.001, le=10_000)
     rolling_shutter: bool = False
@@ -138,7 +138,7 @@ class LocalMap:
         retired: marginalized points, which have left the window; only with `keep`.
         part: index of the current map; a new map is started when tracking was lost.
         information: information matrix of all keyframes' poses, from marginalized points.
-        misfits: information on the lens from windows that turn (`slam.calibration.lens.lens_information`).
+        misfits: information on the lens from windows that turn (`slam.lens.lens_information`).
         pixel, sigma, gate: radians: a pixel, a bearing's standard deviation, and the inlier threshold.
         names, shared: names and values of the shared parameters (`slam.mapping.rolling_shutter`).
     """
@@ -156,7 +156,7 @@ class LocalMap:
         self.keyframes: list[Keyframe] = []
         self.landmarks = Landmarks()
         self.retired: list[Landmarks] = []
-        self.information = Information(params.window + params.anchors + 1)
+        self.information = Information(params.window + params.fixed_keyframes + 1)
         self.misfits: list[F64] = []
         self._others = 0  # number of entries in `retired` that belong to earlier maps
         self.part = 0
@@ -206,7 +206,7 @@ class LocalMap:
         """Add all current points' information on the keyframes to `information`; repeating it adds nothing."""
         if self.keyframes:
             part = self.keyframes[-1].part
-            first = max(0, len(self.keyframes) - self.params.window - self.params.anchors - 1)
+            first = max(0, len(self.keyframes) - self.params.window - self.params.fixed_keyframes - 1)
             for k in range(first, len(self.keyframes)):
                 if self.keyframes[k].part == part:
                     self._marginalize_points_of(k)
@@ -236,7 +236,7 @@ class LocalMap:
 
     def _leave_window(self) -> None:
         """Marginalize the points of the keyframe that just left the window, and free its observations."""
-        last = len(self.keyframes) - self.params.window - self.params.anchors - 1
+        last = len(self.keyframes) - self.params.window - self.params.fixed_keyframes - 1
         if last < 0:
             return
         if self.keyframes[last].part == self.part:
@@ -246,7 +246,7 @@ class LocalMap:
 
     def window(self) -> list[int]:
         """Indices of the current map's keyframes that are optimized or fixed in the optimization, oldest first."""
-        first = max(0, len(self.keyframes) - self.params.window - self.params.anchors)
+        first = max(0, len(self.keyframes) - self.params.window - self.params.fixed_keyframes)
         return [k for k in range(first, len(self.keyframes)) if self.keyframes[k].part == self.part]
 
     def poses(self, which: list[int]) -> F64:
@@ -294,7 +294,7 @@ class LocalMap:
         if self.keep:
             seen = seen.keep(seen.ids % HELD_OUT_EVERY > 0)
         point_ids, counts = np.unique(seen.ids, return_counts=True)
-        needed = min(len(window), self.params.views)
+        needed = min(len(window), self.params.min_views)
         point_ids = point_ids[(counts >= needed) & np.isin(point_ids, self.keyframes[-1].ids)]
         seen = seen.keep(np.isin(seen.ids, point_ids))
         if not len(point_ids):
@@ -312,7 +312,9 @@ class LocalMap:
         """(P,) whether points are neither too far below the newest camera nor too far away."""
         newest = self.keyframes[-1].T_world_cam
         seen = xyz - newest[:3, 3]
-        return (seen @ newest[:3, 1] < self.params.below) & (np.linalg.norm(seen, axis=1) < self.params.beyond)
+        return (seen @ newest[:3, 1] < self.params.max_below_camera) & (
+            np.linalg.norm(seen, axis=1) < self.params.max_distance
+        )
 
     def _optimize(self) -> None:
         """Optimize the window's keyframes and points; the oldest keyframes are fixed."""
@@ -379,7 +381,7 @@ class LocalMap:
         middle = np.cumsum(counts) - counts + counts // 2
         median = np.full(len(xyz), np.inf)
         median[counts > 0] = error[np.lexsort((error, rows))][middle[counts > 0]]
-        bad = (median > min(math.radians(self.params.off), 2 * self.gate)) | ~self._in_range(xyz)
+        bad = (median > min(math.radians(self.params.max_error_deg), 2 * self.gate)) | ~self._in_range(xyz)
         ids = self.landmarks.ids[bad & (counts > 0)]
         self._retire(self.landmarks.keep(counts > 0))
         self.landmarks.keep(~np.isin(self.landmarks.ids, ids))

@@ -15,16 +15,16 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.camera.poses import interpolate
 from scan2sim.pipeline.core.parameters import Seed
+from scan2sim.pipeline.core.poses import interpolate
 from scan2sim.pipeline.core.types import F64, U8, Camera, GpsTrack
 from scan2sim.slam.geometry import exp_so3, inverse, log_so3, relative_pose, rigid
 from scan2sim.slam.mapping.local_map import Keyframe, LocalMap, MapParams, gps_distance
 from scan2sim.slam.odometry.relocalization import KeyframeFeatures, detect_features, relocalize
 from scan2sim.slam.odometry.track_pose import PoseEstimate, estimate_pose
-from scan2sim.slam.odometry.virtual_cameras import VirtualViews
 from scan2sim.slam.trackers import Tracker, Tracks
 from scan2sim.slam.trackers import named as tracker_named
+from scan2sim.slam.virtual_cameras import VirtualViews
 
 KEYFRAME_PARALLAX_DEG = 3.0
 """Median parallax to the last keyframe that triggers a new one, for 360 cameras."""
@@ -58,13 +58,14 @@ class OdometryParams(MapParams):
         count: number of features tracked at a time.
         parallax: degrees; a frame becomes a keyframe when its median parallax to the last keyframe, rotation
             compensated, exceeds this. None: 3 for a 360 camera, 1 for a perspective one, in whose view little moves.
-        survival: a frame also becomes a keyframe when less than this share of the last keyframe's features is tracked.
+        min_tracked_share: a frame also becomes a keyframe when less than this share of the last keyframe's features is
+        tracked.
         seed: seed of the random samples (RANSAC).
     """
 
     count: int = Field(700, ge=50, le=20_000)
     parallax: float | None = Field(None, ge=0.05, le=90)
-    survival: float = Field(0.65, ge=0.01, le=0.99)
+    min_tracked_share: float = Field(0.65, ge=0.01, le=0.99)
     seed: Seed = 0
 
 
@@ -232,7 +233,7 @@ class Odometry:
         """Whether the current frame should become a keyframe: too few common features, or enough parallax."""
         last = self.map.keyframes[-1]
         then, now = self._common_bearings(last)
-        if len(now) < self.params.survival * len(last.ids):
+        if len(now) < self.params.min_tracked_share * len(last.ids):
             return True
         turn = last.T_world_cam[:3, :3].T @ self._pose[:3, :3]
         return _median_angle(now @ turn.T, then) > self._parallax

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from scan2sim.pipeline.core.types import F64, U8
+from scan2sim.slam.factor_graph import Graph
 from scan2sim.slam.geometry import angles, epipolar_errors, essential, inverse, relative_pose, rigid, triangulate
-from scan2sim.slam.mapping.factor_graph import Graph
-from scan2sim.slam.odometry.virtual_cameras import VirtualViews
 from scan2sim.slam.solvers import lm
+from scan2sim.slam.virtual_cameras import VirtualViews
 
 ORB_FEATURES = 2500
 """Per virtual view."""

@@ -14,9 +14,9 @@ from scan2sim.pipeline.camera.models import project_exactly, unproject
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F64, I64, U8, Camera
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
-from scan2sim.slam.odometry.virtual_cameras import VirtualViews
 from scan2sim.slam.trackers import Tracks, named
 from scan2sim.slam.video import Video
+from scan2sim.slam.virtual_cameras import VirtualViews
 
 CORNERS = 350
 """Number of corners tracked at a time: half of odometry's default, so that a lens is tested faster."""

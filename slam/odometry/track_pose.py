@@ -8,8 +8,8 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import F64, I64
 from scan2sim.slam import solvers
+from scan2sim.slam.factor_graph import Graph
 from scan2sim.slam.geometry import angles
-from scan2sim.slam.mapping.factor_graph import Graph
 from scan2sim.slam.mapping.local_map import LocalMap
 from scan2sim.slam.solvers import lm
 from scan2sim.slam.trackers import Tracks

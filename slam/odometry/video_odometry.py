@@ -16,8 +16,8 @@ from scan2sim.slam.features import FeatureSet
 from scan2sim.slam.mapping.local_map import Keyframe, Landmarks
 from scan2sim.slam.odometry.checkpoint import InvalidCheckpoint, load, save
 from scan2sim.slam.odometry.odometry import Odometry, Placed
-from scan2sim.slam.odometry.patch_alignment import Patches
 from scan2sim.slam.odometry.relocalization import FrameFeatures, KeyframeFeatures
+from scan2sim.slam.optical_flow.patch_alignment import Patches
 from scan2sim.slam.trackers import Tracks
 from scan2sim.slam.trackers.descriptors import ViewFeatures
 from scan2sim.slam.video import Video

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from scan2sim.pipeline.core import plugins
-from scan2sim.slam.mapping.factor_graph import Graph, Solution
+from scan2sim.slam.factor_graph import Graph, Solution
 
 
 class Solver(Protocol):

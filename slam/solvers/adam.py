@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from scan2sim.slam.factor_graph import Graph, Solution
 from scan2sim.slam.geometry import exp_so3
-from scan2sim.slam.mapping.factor_graph import Graph, Solution
 
 NEEDS = ("torch",)
 POSE_ITERATIONS, WINDOW_ITERATIONS = 20, 180

@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 
 from scan2sim.pipeline.core.types import F64, I32, I64, Bools
+from scan2sim.slam.factor_graph import Factor, Graph, Solution
 from scan2sim.slam.geometry import exp_so3
-from scan2sim.slam.mapping.factor_graph import Factor, Graph, Solution
 
 ITERATIONS_MAX = 8
 COST_DECREASE_MIN = 1e-4

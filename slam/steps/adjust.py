@@ -6,17 +6,17 @@ from pathlib import Path
 
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
-from scan2sim.slam.mapping.global_adjustment import adjust
-from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.global_map.global_adjustment import adjust
+from scan2sim.slam.global_map.map_file import MapCheckpoint
 
 
 def adjust_all(inputs: Inputs, params: Params, out: Path, report: Report) -> Done:
-    """Global bundle adjustment of all keyframes and points of `mapped`, kept if held-out features fit it better."""
-    checkpoint = MapCheckpoint.read(inputs["mapped"])
+    """Global bundle adjustment of all keyframes and points of `map`, kept if held-out features fit it better."""
+    checkpoint = MapCheckpoint.read(inputs["map"])
     metrics = adjust(checkpoint)
     rejected = f"the adjusted path doesn't fit {metrics['witnesses']} held-out features better: odometry's path is kept"
     warnings = [] if metrics["adjustment_kept"] else [rejected]
-    return Done({"mapped": checkpoint.write(out / "mapped.npz")}, metrics, warnings)
+    return Done({"map": checkpoint.write(out / "map.npz")}, metrics, warnings)
 
 
 def can_adjust(params: Params) -> None:

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.camera.poses import interpolate
 from scan2sim.pipeline.core.errors import DataError, InputError
 from scan2sim.pipeline.core.parameters import Shift
+from scan2sim.pipeline.core.poses import interpolate
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, Frame, GpsTrack, Trajectory
 from scan2sim.pipeline.importers import sweeps as io
@@ -98,7 +98,7 @@ def fuse_path(inputs: Inputs, params: FuseParams, out: Path, report: Report) -> 
     output.write(out / "path", replace(path, times=seconds), frame)
     return Done(
         {"path": out / "path", "trajectory": out / "path" / "trajectory.csv"},
-        {"told": summary, "unsure_share": round(float(path.unsure.mean()), 4)},
+        {"summary": summary, "unsure_share": round(float(path.unsure.mean()), 4)},
         warnings,
     )
 

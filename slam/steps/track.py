@@ -17,18 +17,18 @@ from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import U8, Camera, GpsTrack
 from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io.images import image
-from scan2sim.slam import features, matchers, solvers, trackers
-from scan2sim.slam.calibration import calibrate, lens
+from scan2sim.slam import features, lens, matchers, solvers, trackers
+from scan2sim.slam.calibration import calibrate
 from scan2sim.slam.calibration.camera import EstimatedCamera, camera_of, estimated_camera
-from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.global_map.map_file import MapCheckpoint
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 from scan2sim.slam.odometry.track_log import TrackLog, record_tracks
 from scan2sim.slam.odometry.video_odometry import VERSION, track
-from scan2sim.slam.odometry.virtual_cameras import VirtualViews
 from scan2sim.slam.trackers import Tracker
 from scan2sim.slam.tracking_video import Recorder
 from scan2sim.slam.trajectory.gps import smooth
 from scan2sim.slam.video import Video, open_video
+from scan2sim.slam.virtual_cameras import VirtualViews
 
 
 class Filmed(Params):
@@ -108,9 +108,9 @@ def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, 
         )  # fmt: skip
     wrong_lens = _lens_warning(camera, run.odometry, track_log)
     warnings += [] if wrong_lens is None or params.calibrate else [wrong_lens]
-    files = {"mapped": MapCheckpoint.of(run.odometry, run.names).write(out / "mapped.npz")}
+    files = {"map": MapCheckpoint.of(run.odometry, run.names).write(out / "map.npz")}
     views = {"view": view} if params.view else {}
-    metrics = run.metrics() | ({"told": description} if description else {})
+    metrics = run.metrics() | ({"summary": description} if description else {})
     return Done(
         files | views, metrics | (estimated.metrics() if estimated else {}), [*warnings, *dict.fromkeys(run.warnings)]
     )

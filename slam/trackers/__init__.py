@@ -11,7 +11,7 @@ from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.types import F64, I64, U8, Bools
 from scan2sim.slam.features import Features
 from scan2sim.slam.matchers import Matcher
-from scan2sim.slam.odometry.virtual_cameras import VirtualViews
+from scan2sim.slam.virtual_cameras import VirtualViews
 
 
 @dataclass

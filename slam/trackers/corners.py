@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64, I64, U8
-from scan2sim.slam.odometry import exposure
-from scan2sim.slam.odometry.patch_alignment import Patches
-from scan2sim.slam.odometry.virtual_cameras import VirtualViews
+from scan2sim.slam.optical_flow import exposure
+from scan2sim.slam.optical_flow.patch_alignment import Patches
 from scan2sim.slam.trackers import Tracks
+from scan2sim.slam.virtual_cameras import VirtualViews
 
 COARSE_WINDOW_PX, FINE_WINDOW_PX = 17, 9
 """Sides of the Lucas-Kanade windows. The large one survives large displacements; the small one is more accurate, as

@@ -17,8 +17,7 @@ from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.types import F32, F64, I64, U8, Bools
 from scan2sim.slam.features import Features, FeatureSet
 from scan2sim.slam.matchers import Matcher, check
-from scan2sim.slam.odometry import exposure
-from scan2sim.slam.odometry.virtual_cameras import VirtualViews
+from scan2sim.slam.optical_flow import exposure
 from scan2sim.slam.trackers import Tracker, Tracks
 from scan2sim.slam.trackers.corners import (
     COARSE_WINDOW_PX,
@@ -28,6 +27,7 @@ from scan2sim.slam.trackers.corners import (
     CornerTracker,
     flow,
 )
+from scan2sim.slam.virtual_cameras import VirtualViews
 
 REFINEMENT_MAX_PX = 4.0
 """Greatest distance between a matched feature and its refinement by Lucas-Kanade."""

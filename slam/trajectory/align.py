@@ -2,47 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from scan2sim.pipeline.core.types import F64, I64, Frame, GpsTrack, Trajectory
+from scan2sim.pipeline.core.types import F64, Frame, GpsTrack, Trajectory
 from scan2sim.slam.geometry import exp_so3
-from scan2sim.slam.mapping.covariance import covariances, transformed
-from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.global_map.covariance import covariances, transformed
+from scan2sim.slam.global_map.map_file import MapCheckpoint
+from scan2sim.slam.global_map.sparse_model import Alignment
 from scan2sim.slam.trajectory import scale
-
-
-@dataclass(frozen=True)
-class Alignment:
-    """Transform from odometry's world to that of the trajectory.
-
-    Attributes:
-        R: (3, 3) rotation, applied before `shift`.
-        shift: (3,) translation, metres.
-        factor: (T - 1,) scale factors of the motions between poses.
-        frame: coordinate frame of the result.
-    """
-
-    R: F64
-    shift: F64
-    factor: F64
-    frame: Frame
-
-    def points(self, xyz: F64, at: I64, before: F64, after: Trajectory) -> F64:
-        """Transform points; each moves with the pose that observed it.
-
-        Args:
-            xyz: (P, 3) points in odometry's world.
-            at: (P,) index of the pose that observed each point.
-            before: (T, 3) positions in odometry's world.
-            after: the finished trajectory.
-
-        Returns:
-            (P, 3) points in the trajectory's frame.
-        """
-        steps = np.append(self.factor, self.factor[-1:] if len(self.factor) else [1.0])
-        return (xyz - before[at]) * steps[at, None] @ self.R.T + after.positions[at]
 
 
 def aligned_trajectory(

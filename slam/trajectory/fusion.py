@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scan2sim.pipeline.camera.poses import interpolate, nearest_rotation
+from scan2sim.pipeline.core.poses import interpolate, nearest_rotation
 from scan2sim.pipeline.core.types import F64, I64, Bools, Trajectory
 from scan2sim.slam.geometry import exp_so3, inverse, log_so3
 from scan2sim.slam.lidar_odometry import MatchedSweeps

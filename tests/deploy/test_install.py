@@ -126,7 +126,7 @@ def test_packages_txt_contains_the_packages_of_all_libraries() -> None:
 
 def test_all_libraries_of_all_wheels_are_available() -> None:
     pytest.importorskip("elftools")
-    from bench.packaging.libraries import missing_libraries, needed_libraries
+    from deploy.libraries import missing_libraries, needed_libraries
 
     count, wanted = needed_libraries(Path(sys.prefix))
     assert count > 50 and "libusb-1.0.so.0" in wanted
@@ -134,7 +134,7 @@ def test_all_libraries_of_all_wheels_are_available() -> None:
 
 
 def test_a_library_that_only_this_machine_has_is_detected() -> None:
-    from bench.packaging.libraries import missing_libraries
+    from deploy.libraries import missing_libraries
 
     wanted = {"libusb-1.0.so.0": ["a.so"], "libc.so.6": ["a.so"], "libpython3.so": ["a.so"], "libcuda.so.1": ["b.so"]}
     assert missing_libraries(wanted) == {"libpython3.so": ["a.so"]}

@@ -18,8 +18,8 @@ import pytest
 from packaging.utils import canonicalize_name
 from PIL import Image
 
-from bench.packaging.containers import FOLDER, entry_point, image, requirements, stages
-from bench.packaging.third_party import closure
+from deploy.containers import FOLDER, entry_point, image, requirements, stages
+from deploy.third_party import closure
 from scan2sim.services.toolboxes import tasks
 from tests.conftest import ROOT
 from tests.fakes.ports import free_port

@@ -22,10 +22,10 @@ from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import geotiff
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.services import kafka
-from tests.browser import chromium
 from tests.conftest import ROOT
 from tests.fakes.broker import Broker
-from tests.gazebo.checker import check_world
+from tests.fakes.browser import chromium
+from tests.fakes.gazebo.checker import check_world
 
 NEXT_FRAME_DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
 SMALL = ["--set", "unwrap.texel=0.05", "--set", "decimate.target=10000"]

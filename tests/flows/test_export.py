@@ -14,7 +14,7 @@ from scan2sim.flows.commands.budget import parse_budget
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.io import world_formats
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 from tests.pipeline.io.test_robots import driven
 
 
@@ -99,7 +99,7 @@ def test_3d_tiles_have_levels_of_detail(tmp_path: Path) -> None:
     run(world, "--to", "tiles3d", "--out", tmp_path / "out", "--levels", 2)
     tileset = json.loads((tmp_path / "out" / "tileset.json").read_text(encoding="utf-8"))
     coarse, (fine,) = tileset["root"], tileset["root"]["children"]
-    assert (coarse["refine"], coarse["content"]["uri"]) == ("REPLACE", "tiles3d/level1/street.glb")
+    assert (coarse["pose_refinement"], coarse["content"]["uri"]) == ("REPLACE", "tiles3d/level1/street.glb")
     assert tileset["geometricError"] > coarse["geometricError"] > fine["geometricError"] == 0
     files = json.loads((tmp_path / "out" / "metadata.json").read_text(encoding="utf-8"))["triangles_by_file"]
     assert files[coarse["content"]["uri"]] < files[fine["content"]["uri"]] / 2

@@ -12,9 +12,9 @@ from scan2sim.pipeline.core.cache import Manifest
 
 GOOD: dict[str, dict[str, Any]] = {
     "views": {"usable": 10},
-    "carve": {"moving_share": 0.004},
+    "dynamic_objects": {"moving_share": 0.004},
     "segment": {"moving_share": 0.0},
-    "agreement": {"photos": 8, "left_out": []},
+    "photo_consistency": {"photos": 8, "left_out": []},
     "texture.terrain": {"area_m2": 100.0, "seen_m2": 85.0},
     "score": {
         "photos": {f"photo{i}": {"psnr_gain_db": 20.0 + i, "coverage": 0.95} for i in range(4)},
@@ -74,8 +74,8 @@ def test_tile_without_photos_has_no_finding_about_unseen_surface() -> None:
 
 
 def test_remains_of_removed_vehicles() -> None:
-    assert not findings(run_of(score={"remains_m2": [0.0, 0.3]}))
-    (one,) = findings(run_of(score={"remains_m2": [0.0, 2.53, 10.2]}))
+    assert not findings(run_of(score={"residue_m2": [0.0, 0.3]}))
+    (one,) = findings(run_of(score={"residue_m2": [0.0, 2.53, 10.2]}))
     assert one.level == "poor" and "2 of 3 vehicles" in one.text and "10.2 m2" in one.text
 
 

@@ -83,7 +83,7 @@ def test_new_step_versions_and_changed_files_rerun_steps_of_a_drive(
         known.update(keys)
         return others
 
-    assert changed() == {"track", "place", "import_sweeps", "cut"} and changed() == set()
+    assert changed() == {"track", "georeference", "import_sweeps", "cut"} and changed() == set()
     for step in (CUT, IMPORT_SWEEPS):
         pipeline = "drive" if step is CUT else "sweeps"
         monkeypatch.setattr(f"scan2sim.flows.pipelines.{pipeline}.{step.name.upper()}", replace(step, version=1000))
@@ -94,7 +94,7 @@ def test_new_step_versions_and_changed_files_rerun_steps_of_a_drive(
     (tmp_path / "velodyne/1.bin").write_text("one more", encoding="utf-8")
     assert changed() == {"import_sweeps", "cut"}
     (tmp_path / "video.mp4").write_text("another", encoding="utf-8")
-    assert changed() == {"track", "place", "import_sweeps", "cut"}
+    assert changed() == {"track", "georeference", "import_sweeps", "cut"}
 
 
 def test_plan_of_a_drive(corridor: Path, tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from tests.fakes.gazebo.checker import check_world
 from tests.flows.test_cli import scan2sim, stdout_of
-from tests.gazebo.checker import check_world
 
 pytestmark = pytest.mark.slow
 

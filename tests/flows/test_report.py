@@ -54,7 +54,7 @@ def report(tmp_path: Path) -> Any:
         for task, facts in {**FACTS, "score": scored}.items():
             folder = store.begin(task)
             files = {"error": album(folder, list(scored["photos"]))} if task == "score" else {}
-            about = {"version": 1, "params": {}, "inputs": {}, "fed": "", "seconds": 1.0, "peak_mb": 100.0}
+            about = {"version": 1, "params": {}, "inputs": {}, "inputs_digest": "", "seconds": 1.0, "peak_mb": 100.0}
             done[task] = store.commit(task, "key", folder, Done(files, facts), about)
             planned.append(PlannedTask(Task(Step(task, 1, no_step), Params(), {}), "key", {}, None))
         tile = Tile(tmp_path / "tile.toml", "made_up", Frame(), ())

@@ -36,7 +36,7 @@ from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams
 from scan2sim.services.toolboxes.settings import CameraParams, NodeParams, ServeParams
 from scan2sim.services.toolboxes.tasks import classify, detect, movement, segment
 from scan2sim.slam.steps.track import Filmed
-from scan2sim.texturing.unwrap import UnwrapParams, check_size
+from scan2sim.texturing.texture_layout import UnwrapParams, check_size
 from tests.conftest import ROOT
 
 

@@ -26,7 +26,7 @@ SIDE_PRODUCTS = tuple(step.name for step in STEPS if step.side_product)
 BORDER_SIDE_PRODUCT = "borders"
 """Runs only for tiles with neighbours."""
 TILE_SIDE_PRODUCTS = tuple(name for name in SIDE_PRODUCTS if name != BORDER_SIDE_PRODUCT)
-EARLY_SIDE_PRODUCTS = ("finds", "furniture", "signs")
+EARLY_SIDE_PRODUCTS = ("detect_furniture", "furniture", "signs")
 """Side products that most other steps depend on: without them nearly all steps run again."""
 SURVEY_PRODUCTS: dict[str, tuple[Any, str]] = {
     "report": (finish, "write_survey_report"),
@@ -140,7 +140,10 @@ def test_tile_is_built_if_all_side_products_fail(failing_run: tuple[Path, int, s
     assert code == INCOMPLETE
     loaded(out)
     report, log = read(out / "report.json"), (out / "run.log").read_text(encoding="utf-8")
-    expected = set(TILE_SIDE_PRODUCTS) - {"furniture", "signs"}  # they need the output of the failed step `finds`
+    expected = set(TILE_SIDE_PRODUCTS) - {
+        "furniture",
+        "signs",
+    }  # they need the output of the failed step `detect_furniture`
     assert report["failed"].keys() == expected
     for name in expected:
         assert f"warning: {name}: {FAILED_TEXT}: failed unexpectedly (ZeroDivisionError: a bug)" in printed
@@ -170,7 +173,7 @@ def test_failing_side_product_affects_only_itself(street: Path, completed_run: P
     assert report["failed"].keys() == {name} and "a bug" in report["failed"][name]["cause"]
     products = {"roads": "world/roads.geojson", "preview": "report_files/world.js", "plants": "world/plants.csv"}
     products |= {"furniture": "world/furniture.csv", "rasters": "rasters/street_dsm.tif"}
-    missing = {"furniture"} if name in ("finds", "furniture") else {name}
+    missing = {"furniture"} if name in ("detect_furniture", "furniture") else {name}
     assert {one for one, file in products.items() if not (out / file).is_file()} == missing & products.keys()
 
 

@@ -13,8 +13,8 @@ import pytest
 
 from scan2sim.flows.reports.survey import DATA, PAGE, TileState, overview, rows, write_survey_report
 from scan2sim.pipeline.core.errors import SpaceError
+from scan2sim.pipeline.core.voronoi_cell import cells, outline
 from scan2sim.pipeline.io.images import image
-from scan2sim.pipeline.tiling.voronoi_cell import cells, outline
 
 METRICS: dict[str, Any] = {
     "points": 4_000_000, "photos": 30, "coverage": 0.8, "psnr_db": 22.0, "cloud_to_mesh_m": {"terrain": 0.011},

@@ -17,8 +17,8 @@ from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
+from tests.fakes.gazebo.checker import check_world
 from tests.flows.test_cli import SMALL, assert_fails, scan2sim, stdout_of
-from tests.gazebo.checker import check_world
 
 
 @pytest.fixture(scope="module")

@@ -60,8 +60,8 @@ def test_parked_vehicles_are_kept_and_moving_ones_removed(tmp_path: Path) -> Non
         for name, (x, y) in positions.items()
         if name != "alone"  # classified as vehicle, but without a detected instance
     ]
-    (tmp_path / "things.geojson").write_text(json.dumps({"features": features}), encoding="utf-8")
-    inputs = {"cloud": tmp_path / "cloud.npz", "things": tmp_path / "things.geojson"}
+    (tmp_path / "instances.geojson").write_text(json.dumps({"features": features}), encoding="utf-8")
+    inputs = {"cloud": tmp_path / "cloud.npz", "instances": tmp_path / "instances.geojson"}
     (tmp_path / "out").mkdir()
     done = SPLIT.run(inputs, SplitParams(vehicles="keep"), tmp_path / "out", silent)
     kept = PointCloud.load(done.files["vehicle"]).xyz

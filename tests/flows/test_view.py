@@ -20,8 +20,8 @@ from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.io.worlds.scene import read_scene
-from tests.browser import Page, chromium
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
+from tests.fakes.browser import Page, chromium
 
 ALL_TILES_LOADED = (
     "world.loaded.size >= world.about.tiles.length && !document.querySelector('[role=status]').textContent"

@@ -23,7 +23,7 @@ from scan2sim.pipeline.core.types import Bools, PointCloud
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.io.worlds.scene import Scene, read_scene
-from tests.gazebo.checker import build, check_world
+from tests.fakes.gazebo.checker import build, check_world
 
 COARSE: dict[str, dict[str, Any]] = {
     "voxel": {"size": 0.3},

@@ -8,7 +8,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from bench.images import write
 from scan2sim.flows.commands.inspect import inspect_path
 from scan2sim.pipeline.core.types import Camera, View
 from scan2sim.pipeline.importers.kitti_odometry import import_kitti_odometry
@@ -19,7 +18,8 @@ from scan2sim.pipeline.importers.sweeps import PhotoInput, PlacementParams, impo
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.steps.views import _problem
 from scan2sim.slam.video import open_video
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
+from tests.fakes.photo_files import write
 from tests.pipeline.importers import test_sweeps as sweeps
 from tests.pipeline.importers.test_colmap import make_model
 from tests.pipeline.importers.test_kitti_odometry import make_sequence

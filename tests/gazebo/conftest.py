@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.gazebo import checker
+from tests.fakes.gazebo import checker
 
 
 @pytest.fixture(scope="session", autouse=True)

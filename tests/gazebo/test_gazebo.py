@@ -14,8 +14,8 @@ from scan2sim.pipeline.geometry import primitives
 from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.geodata import crs
 from scan2sim.pipeline.io.world_formats import SceneParams
-from tests.gazebo.checker import WorldRejected, check_world
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
+from tests.fakes.gazebo.checker import WorldRejected, check_world
 from tests.pipeline.io.test_robots import driven
 from tests.present import present
 

@@ -9,8 +9,8 @@ import pytest
 
 from scan2sim.pipeline.io.geodata import crs
 from scan2sim.pipeline.io.worlds.merge import TileWorld, assemble
-from tests.gazebo.checker import check_world
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
+from tests.fakes.gazebo.checker import check_world
 from tests.present import present
 
 BOX_HALF_EDGE_M = 0.2

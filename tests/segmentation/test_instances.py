@@ -14,7 +14,7 @@ import pytest
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import F32, Frame, PointCloud, Trajectory
-from scan2sim.segmentation.steps.instances import THINGS
+from scan2sim.segmentation.steps.instances import INSTANCES
 from scan2sim.segmentation.steps.segment import SOURCE_CLOUD, SOURCE_PHOTO
 from tests.present import present
 
@@ -73,7 +73,7 @@ def street(out: Path, wrong: dict[str, float] | None = None, kind: int = SOURCE_
 
 def run(inputs: dict[str, Path], out: Path, **params: Any) -> Done:
     (out / "out").mkdir()
-    return THINGS.run(inputs, THINGS.params(**params), out / "out", silent)
+    return INSTANCES.run(inputs, INSTANCES.params(**params), out / "out", silent)
 
 
 def classified(done: Done, *more: F32) -> dict[str, np.ndarray]:
@@ -85,13 +85,13 @@ def classified(done: Done, *more: F32) -> dict[str, np.ndarray]:
 
 
 def features(done: Done) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = json.loads(done.files["things"].read_text(encoding="utf-8"))["features"]
+    found: list[dict[str, Any]] = json.loads(done.files["instances"].read_text(encoding="utf-8"))["features"]
     return found
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
-    out = tmp_path_factory.mktemp("things")
+    out = tmp_path_factory.mktemp("instances")
     return run(street(out, {"car": 0.4, "van": 0.3}), out)
 
 

@@ -12,12 +12,12 @@ import pytest
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import F32, F64, U8, Camera, Frame, Mesh, View
+from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.furniture.classify import panel_mesh
 from scan2sim.pipeline.furniture.sign_panels import SignPanel, inside
 from scan2sim.pipeline.geometry import primitives
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
 from scan2sim.segmentation.labels import CLASSES
 from scan2sim.segmentation.sign_panels.attach import without_smear
 from scan2sim.segmentation.steps.signs import SIGNS, SignsParams
@@ -98,14 +98,14 @@ def _run(folder: Path, panels: list[SignPanel], known: list[SignPanel], theirs: 
     Mesh(FRAME, vertices.astype(np.float32), faces, classification=classification).save(folder / "building.npz")
     flat = np.array([(-20, -20, 0), (40, -20, 0), (40, 20, 0), (-20, 20, 0)], np.float32)
     Mesh(FRAME, flat, np.array([[0, 1, 2], [0, 2, 3]], np.int32)).save(folder / "terrain.npz")
-    (folder / "plates.json").write_text(json.dumps([panel.to_json() for panel in known]), encoding="utf-8")
+    (folder / "sign_panels.json").write_text(json.dumps([panel.to_json() for panel in known]), encoding="utf-8")
     foot = (14.05, -3.0, 0.0)
-    (folder / "beside.json").write_text(json.dumps([foot] if theirs else []), encoding="utf-8")
+    (folder / "neighbour_poles.json").write_text(json.dumps([foot] if theirs else []), encoding="utf-8")
     place = FRAME.to_crs(foot).tolist()
     pole = {"geometry": {"coordinates": place}, "properties": {"kind": "pole", "height_m": 3.0, "radius_m": 0.04}}
     (folder / "furniture.geojson").write_text(json.dumps({"features": [] if theirs else [pole]}), encoding="utf-8")
     inputs = {f"mesh.{group}": folder / f"{group}.npz" for group in ("terrain", "building")}
-    inputs |= {name: folder / f"{name}.json" for name in ("plates", "beside")} | {
+    inputs |= {name: folder / f"{name}.json" for name in ("sign_panels", "neighbour_poles")} | {
         "geojson": folder / "furniture.geojson"
     }
     inputs |= {"views": folder / "views.json", "labels": labels}

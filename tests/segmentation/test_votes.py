@@ -40,7 +40,7 @@ def labelled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, U8]:
         codes = cv2.imread(str(folder / "tile/truth/labels" / f"{view.photo.stem}.png"), cv2.IMREAD_GRAYSCALE)
         index = index_of_code()[codes[::2, ::2]]
         np.save(folder / "labels" / f"{i}.npy", np.uint8(255) * (index[..., None] == np.arange(len(CLASSES))))
-    (folder / "labels" / "network.json").write_text(json.dumps({"tells": CLASSES}), encoding="utf-8")
+    (folder / "labels" / "network.json").write_text(json.dumps({"classes": CLASSES}), encoding="utf-8")
     return folder, present(cloud.classification)
 
 
@@ -95,7 +95,7 @@ def test_single_vegetation_class_is_split_by_height(labelled: tuple[Path, U8], t
         p[..., high], p[..., low] = p[..., high] | p[..., low], 0
         np.save(labels / file.name, p)
     (labels / "network.json").write_text(
-        json.dumps({"tells": [c for c in CLASSES if c != "low_vegetation"]}), encoding="utf-8"
+        json.dumps({"classes": [c for c in CLASSES if c != "low_vegetation"]}), encoding="utf-8"
     )
     inputs = {"cloud": folder / "cloud.npz", "views": folder / "views.json", "labels": labels}
     done = SEGMENT.run(inputs, SEGMENT.params(), tmp_path, silent)

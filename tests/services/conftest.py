@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.fakes.interpreters import PYTHONS
 from tests.fakes.ports import free_dds_domain
 
 ROOT = Path(__file__).resolve().parents[2]
-ROS_PYTHON = ROOT / ".venv-ros" / "bin" / "python"
 
 Start = Callable[..., "subprocess.Popen[str]"]
 
@@ -27,10 +26,7 @@ def domain() -> str:
 @pytest.fixture(scope="session")
 def pythons() -> dict[str, str]:
     """Python interpreters by the transport that is installed for them."""
-    found = {"cyclone": sys.executable}
-    if ROS_PYTHON.exists():
-        found["rclpy"] = str(ROS_PYTHON)
-    return found
+    return {transport: str(python) for transport, python in PYTHONS.items() if python.exists()}
 
 
 @pytest.fixture

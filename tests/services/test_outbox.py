@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import pytest
 from scan2sim.pipeline.core.errors import BusyError, InputError, SpaceError
 from scan2sim.services import default_outbox
 from scan2sim.services.outbox import Deduplicator, Outbox, OutboxRecord, Sender, new_ids
+from tests.waiting import until
 
 APPEND_FOREVER = """
 import sys, itertools
@@ -42,22 +42,16 @@ class FakeBroker:
             self.received += [record.id for record in records]
 
 
-def wait(condition: object) -> None:
-    end = time.monotonic() + 20
-    while not condition() and time.monotonic() < end:  # type: ignore[operator]
-        time.sleep(0.01)
-
-
 def test_unsent_records_are_kept_and_sent_in_order(tmp_path: Path) -> None:
     outbox, broker = Outbox(tmp_path / "records"), FakeBroker(up=False)
     sender = Sender(outbox, broker)
     for number in range(1200):
         outbox.append(f"a:{number}", b"body")
     sender.wake()
-    wait(lambda: broker.attempts)
+    until(lambda: broker.attempts)
     assert len(outbox) == 1200
     broker.up = True
-    wait(lambda: not len(outbox))
+    until(lambda: not len(outbox))
     sender.close()
     assert broker.received == [f"a:{number}" for number in range(1200)]
 
@@ -101,14 +95,14 @@ def test_recently_acknowledged_records_are_resent_after_a_broker_restart(tmp_pat
     for number in range(1, 4):
         outbox.append(f"a:{number}", b"body")
     sender.wake()
-    wait(lambda: len(broker.received) == 3)
-    wait(lambda: not len(outbox))
+    until(lambda: len(broker.received) == 3)
+    until(lambda: not len(outbox))
     broker.up, broker.received = False, []  # it dies and loses what it received
     outbox.append("a:4", b"body")
     sender.wake()
-    wait(lambda: broker.attempts > 2)
+    until(lambda: broker.attempts > 2)
     broker.up = True
-    wait(lambda: not len(outbox))
+    until(lambda: not len(outbox))
     sender.close()
     assert broker.received == ["a:1", "a:2", "a:3", "a:4"]
 
@@ -142,7 +136,7 @@ def test_closing_the_outbox_stops_a_sender_that_waits_for_an_acknowledgement(tmp
     sender.close(0.05)
     outbox.close()
     answered.set()
-    wait(lambda: not any(thread.name == "records" for thread in threading.enumerate()))
+    until(lambda: not any(thread.name == "records" for thread in threading.enumerate()))
 
 
 def test_late_records_are_not_duplicates() -> None:

@@ -13,11 +13,11 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import Camera
 from scan2sim.slam.calibration.calibrate import calibrated, calibrated_from_scratch
 from scan2sim.slam.calibration.camera import EstimatedCamera, estimated_camera
-from scan2sim.slam.calibration.lens import changed_lens
+from scan2sim.slam.lens import changed_lens
 from scan2sim.slam.odometry.track_log import TrackLog
 from scan2sim.slam.video import open_video
+from tests.fakes.slam_drive import LENS, drive, scatter
 from tests.present import present
-from tests.slam.synthetic import LENS, drive, scatter
 
 
 def seen(camera: Camera, turn: float = 0.3) -> TrackLog:

@@ -9,9 +9,9 @@ import pytest
 from scan2sim.pipeline.camera.models import pixel_rays, project
 from scan2sim.pipeline.core.types import F32, F64, U8, Camera
 from scan2sim.slam.geometry import exp_so3, relative_pose, rigid
-from scan2sim.slam.odometry import exposure
-from scan2sim.slam.odometry.virtual_cameras import VirtualViews
+from scan2sim.slam.optical_flow import exposure
 from scan2sim.slam.trackers.corners import FINE_WINDOW_PX, CornerTracker, flow
+from scan2sim.slam.virtual_cameras import VirtualViews
 
 CAMERA = Camera("equirectangular", 768, 384)
 

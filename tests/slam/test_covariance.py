@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scan2sim.slam.mapping.covariance import covariances
-from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.global_map.covariance import covariances
+from scan2sim.slam.global_map.map_file import MapCheckpoint
 from scan2sim.slam.mapping.marginalization import Information, MotionSigma
-from tests.slam.synthetic import Follower, drive, inside, off, run, scatter
+from tests.fakes.slam_drive import Follower, drive, inside, off, run, scatter
 
 
 def test_ellipsoids_hold_errors_and_none_is_a_point() -> None:

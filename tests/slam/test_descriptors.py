@@ -17,8 +17,8 @@ from scan2sim.slam.features import FeatureSet
 from scan2sim.slam.geometry import exp_so3
 from scan2sim.slam.odometry.checkpoint import load, save
 from scan2sim.slam.odometry.video_odometry import VALUES
-from scan2sim.slam.odometry.virtual_cameras import VirtualViews
 from scan2sim.slam.trackers.descriptors import DescriptorTracker
+from scan2sim.slam.virtual_cameras import VirtualViews
 
 SPHERE = Camera("equirectangular", 512, 256)
 NUMBER = 400

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from scan2sim.slam.geometry import exp_so3
-from scan2sim.slam.mapping import global_adjustment as module
+from scan2sim.slam.global_map import global_adjustment as module
+from scan2sim.slam.global_map.global_adjustment import adjust
+from scan2sim.slam.global_map.map_file import MapCheckpoint
+from scan2sim.slam.global_map.sparse_model import sparse_points
 from scan2sim.slam.mapping.cross_validation import compare_paths
-from scan2sim.slam.mapping.global_adjustment import adjust
 from scan2sim.slam.mapping.local_map import HELD_OUT_EVERY
-from scan2sim.slam.mapping.map_file import MapCheckpoint
-from scan2sim.slam.mapping.sparse_model import sparse_points
-from tests.slam.synthetic import Narrow, ate, drive, run, scatter
+from tests.fakes.slam_drive import Narrow, ate, drive, run, scatter
 
 pytest.importorskip("pycolmap")
 

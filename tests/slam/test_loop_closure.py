@@ -6,7 +6,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import F64
 from scan2sim.slam.geometry import exp_so3, inverse, rigid
-from scan2sim.slam.mapping.loop_closure import optimize_pose_graph, thumbnail, thumbnail_correlation
+from scan2sim.slam.global_map.loop_closure import optimize_pose_graph, thumbnail, thumbnail_correlation
 
 
 def ring(n: int = 80, radius: float = 30.0) -> F64:

@@ -6,12 +6,12 @@ import pytest
 
 from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.geometry.similarity import umeyama
-from scan2sim.slam.mapping.map_file import MapCheckpoint
+from scan2sim.slam.global_map.map_file import MapCheckpoint
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 from scan2sim.slam.trajectory.align import aligned_trajectory
+from tests.fakes.slam_drive import LENS, Follower, Narrow, drive, gps_of, run, scatter
 from tests.present import present
 from tests.slam.conftest import Drive
-from tests.slam.synthetic import LENS, Follower, Narrow, drive, gps_of, run, scatter
 
 
 def positions(odometry: Odometry) -> F64:
@@ -153,7 +153,7 @@ def test_moving_cars_are_left_out() -> None:
 
 def test_what_left_the_window_is_forgotten_unless_it_is_to_be_kept() -> None:
     times, poses = drive(25)
-    odometry = run(times, Follower(poses, scatter(poses)), window=5, anchors=2)
+    odometry = run(times, Follower(poses, scatter(poses)), window=5, fixed_keyframes=2)
     held = [len(k.ids) > 0 for k in odometry.map.keyframes]
     assert len(held) > 12 and sum(held) <= 8 and not odometry.map.retired
 

@@ -10,7 +10,7 @@ import pytest
 
 from scan2sim.pipeline.core.types import F64
 from scan2sim.slam.geometry import log_so3
-from tests.slam.synthetic import Follower, ate, drive, gps_of, run, scatter
+from tests.fakes.slam_drive import Follower, ate, drive, gps_of, run, scatter
 
 READOUT, OFFSET = 0.03, 0.04
 """Seconds from the first row to the last; metres from the camera's place to either lens."""

@@ -8,8 +8,8 @@ import pytest
 from scan2sim.pipeline.core.plugins import names
 from scan2sim.pipeline.core.types import F64
 from scan2sim.slam import solvers
+from scan2sim.slam.factor_graph import DistanceConstraint, Factor, Graph, Solution, errors
 from scan2sim.slam.geometry import exp_so3
-from scan2sim.slam.mapping.factor_graph import DistanceConstraint, Factor, Graph, Solution, errors
 from scan2sim.slam.solvers import lm
 
 

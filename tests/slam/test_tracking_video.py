@@ -14,9 +14,9 @@ from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 from scan2sim.slam.odometry.video_odometry import track
 from scan2sim.slam.tracking_video import INLIER_BGR, MAX_WIDTH_PX, PATH_BGR, UNSURE_BGR, Recorder
 from scan2sim.slam.video import open_video
+from tests.fakes.slam_drive import Follower, drive, gps_of, scatter
 from tests.present import present
 from tests.slam.conftest import FPS, Drive
-from tests.slam.synthetic import Follower, drive, gps_of, scatter
 
 
 def near(picture: np.ndarray, colour: tuple[int, int, int] | np.ndarray) -> int:

@@ -16,10 +16,11 @@ from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import F64, U8, Camera, Frame, Mesh, PointCloud, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.texturing.exposure import EXPOSURE
-from scan2sim.texturing.photo_consistency import AGREEMENT
+from scan2sim.texturing.photo_consistency import PHOTO_CONSISTENCY
 from scan2sim.texturing.texture import TextureParams, texture
-from scan2sim.texturing.unwrap import UnwrapParams, unwrap
-from scan2sim.texturing.view_selection.step import CHOOSE
+from scan2sim.texturing.texture_layout import UnwrapParams
+from scan2sim.texturing.unwrap import unwrap
+from scan2sim.texturing.view_selection.step import VIEW_SELECTION
 
 
 def grid(
@@ -130,7 +131,7 @@ class Street:
         views_io.save(out / "views.json", self.views, self.held_out)
         inputs = {**flat.files, "views": out / "views.json", "depth": out / "depth"}
         warnings: list[str] = []
-        for step, given in ((EXPOSURE, exposure), (AGREEMENT, agreement), (CHOOSE, choose)):
+        for step, given in ((EXPOSURE, exposure), (PHOTO_CONSISTENCY, agreement), (VIEW_SELECTION, choose)):
             done = step.run(inputs, step.params(**(given or {})), out, silent)
             inputs |= done.files
             warnings += done.warnings

@@ -10,7 +10,8 @@ import numpy as np
 from scan2sim.pipeline.camera.models import pixel_angle, unproject
 from scan2sim.pipeline.camera.projection import posed_camera
 from scan2sim.pipeline.core.types import F32, Camera
-from scan2sim.texturing.bake import blend_numba, texel_map
+from scan2sim.texturing import texel_map
+from scan2sim.texturing.bake import blend_numba
 from scan2sim.texturing.photo_cache import downsampled, low_frequencies
 
 CAMERAS = {

@@ -11,8 +11,8 @@ from scan2sim.pipeline.camera.models import pixel_angle, project
 from scan2sim.pipeline.camera.projection import posed_camera
 from scan2sim.pipeline.camera.renderer import look_at
 from scan2sim.pipeline.core.types import U8, Camera
+from scan2sim.texturing import texel_map as texels
 from scan2sim.texturing.bake import blend_numba
-from scan2sim.texturing.bake import texel_map as texels
 from scan2sim.texturing.photo_cache import SRGB_OFFSET
 from tests.texturing import reference_blend
 from tests.texturing.scattered import CAMERAS, random_photo, random_squares

@@ -13,16 +13,16 @@ from scipy.spatial import cKDTree
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import F64, I32, Frame, Mesh
+from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.worlds import textured_mesh
-from scan2sim.pipeline.tiling.borders.grid import snap_to_grid
-from scan2sim.texturing.bake.texel_map import corners as page_corners
-from scan2sim.texturing.bake.texel_map import owners
-from scan2sim.texturing.borders.colour_harmonization import LevelParams, level
+from scan2sim.texturing.borders.colour_harmonization import ColourHarmonizationParams, colour_harmonization
 from scan2sim.texturing.borders.correspondences import open_edges, shared_border
 from scan2sim.texturing.borders.fading import changes, fade
 from scan2sim.texturing.borders.measure import colour_step
 from scan2sim.texturing.inpainting import hole_filling
+from scan2sim.texturing.texel_map import corners as page_corners
+from scan2sim.texturing.texel_map import owners
 from tests.present import present
 
 YS = np.append(np.arange(-3, 3, 0.3), 3)
@@ -131,7 +131,7 @@ def run(folder: Path, neighbours: Sequence[Path] = (), **params: Any) -> tuple[P
     out = folder.parent / f"level_{folder.name}_{len(list(folder.parent.iterdir()))}"
     out.mkdir()
     inputs = {"textured": folder, **{f"neighbour.{path.name}": path for path in neighbours}}
-    done = level(inputs, LevelParams(**params), out, silent)
+    done = colour_harmonization(inputs, ColourHarmonizationParams(**params), out, silent)
     return done.files["textured"], done.facts
 
 
@@ -174,7 +174,7 @@ def test_colour_step_between_two_tiles_disappears(pair: tuple[Path, Path]) -> No
 
 def test_texels_beyond_reach_are_unchanged(pair: tuple[Path, Path]) -> None:
     one, two = pair
-    harmonized, _ = run(one, [two], reach=1.5)
+    harmonized, _ = run(one, [two], fade_distance=1.5)
     added, points = change(one, harmonized)
     border = shared_border([open_edges(Mesh.load(folder / "mesh.npz")) for folder in pair]).xyz
     distance, _ = cKDTree(border).query(points)

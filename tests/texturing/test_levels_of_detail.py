@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.consumers import Fault, seams
-from bench.gate.places import WorldReference
 from scan2sim.pipeline.camera import renderer
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Mesh
@@ -20,7 +18,10 @@ from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.scene import Level, Scene, read_scene, save_tile, write_scene_file
 from scan2sim.texturing import levels_of_detail as texturing_levels
 from scan2sim.texturing.levels_of_detail import shared_borders, with_levels
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
+from tests.fakes.consumers import seams
+from tests.fakes.world_checks import Fault
+from tests.fakes.world_checks.reference import WorldReference
 
 TILES, SIDE = 3, 20.0
 NOWHERE = WorldReference(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))
@@ -134,12 +135,14 @@ def test_coarser_levels_look_as_the_finest(strip: Scene) -> None:
         assert np.median(np.abs(coarse - images[-1])) < 3 and np.abs(coarse - images[-1]).mean() < 12
 
 
-def test_gate_detects_cracks_in_exported_levels(strip: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_seam_check_detects_cracks_in_exported_levels(
+    strip: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     world_formats.write(strip, ["tiles3d"], tmp_path / "closed", SceneParams(), silent)
     figures = seams.check(tmp_path / "closed", NOWHERE)
     assert (figures["tiles"], figures["finest"]) == (10, 3) and figures["borders_m"] == pytest.approx(40, abs=1)
     monkeypatch.setattr(texturing_levels, "shared_borders", lambda scene: [])
     cracked = with_levels(row(tmp_path, 2), 2, tmp_path / "levels", silent)
     world_formats.write(cracked, ["tiles3d"], tmp_path / "open", SceneParams(), silent)
-    with pytest.raises(Fault, match="cracks open"):
+    with pytest.raises(Fault, match="cracks between levels"):
         seams.check(tmp_path / "open", NOWHERE)

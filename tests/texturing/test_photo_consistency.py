@@ -30,10 +30,12 @@ def grainy(pose: F64) -> U8:
 
 
 def rows_of(folder: Path) -> dict[str, Any]:
-    """Rows of `agreement.json` by name of the photo."""
+    """Rows of `photo_consistency.json` by name of the photo."""
     return {
         row["name"]: row
-        for row in json.loads((folder.parent / "agreement" / "agreement.json").read_text(encoding="utf-8"))
+        for row in json.loads(
+            (folder.parent / "photo_consistency" / "photo_consistency.json").read_text(encoding="utf-8")
+        )
     }
 
 

@@ -18,7 +18,7 @@ from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import F64, U8, Camera, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.texturing.pose_refinement.step import RefineParams, group_by_camera, refine
+from scan2sim.texturing.pose_refinement.step import PoseRefinementParams, group_by_camera, pose_refinement
 from tests.texturing.corner import CAMERAS, GROUND, grid, join
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -72,7 +72,7 @@ def step_inputs(folder: Path, camera: Camera, wrong: list[F64], held: tuple[int,
 def run(folder: Path, inputs: dict[str, Path], **params: Any) -> tuple[tuple[View, ...], Done]:
     out = folder / "out"
     out.mkdir()
-    done = refine(inputs, RefineParams(**params), out, silent)
+    done = pose_refinement(inputs, PoseRefinementParams(**params), out, silent)
     return views_io.load(done.files["views"]), done
 
 
@@ -136,7 +136,7 @@ def test_implausible_correction_is_rejected_and_named(tmp_path: Path) -> None:
     camera = CAMERAS["pinhole"]
     wrong = disturbed(np.random.default_rng(3))
     wrong[3] = turned(POSES[3], (0.0, 0.02, 0.0), (0, 0, 0))
-    views, done = run(tmp_path, step_inputs(tmp_path, camera, wrong), turn=2.0, wander=0.1)
+    views, done = run(tmp_path, step_inputs(tmp_path, camera, wrong), rotation=2.0, correlation_length=0.1)
     assert [warning.split(":")[0] for warning in done.warnings] == ["cam/3"]
     assert "implausibly large and was rejected" in done.warnings[0]
     assert displacement(camera, views[2].T_world_cam, POSES[2]) < 0.5 * displacement(camera, wrong[2], POSES[2])
@@ -166,7 +166,11 @@ def test_photos_without_matches_keep_their_poses(tmp_path: Path) -> None:
 def test_tiles_without_photos_have_no_refine_task() -> None:
     tile = read_tile(ROOT / "data_samples" / "tile" / "tile.toml")
     tasks = {task.id.name: task for task in build_graph(tile, Settings())}
-    assert tasks["visibility"].inputs["views"] == tasks["score"].inputs["views"] == Output(TaskId("refine"), "views")
+    assert (
+        tasks["visibility"].inputs["views"]
+        == tasks["score"].inputs["views"]
+        == Output(TaskId("pose_refinement"), "views")
+    )
     assert tasks["segment"].inputs["views"] == Output(TaskId("views"), "views")
-    for other, settings in ((replace(tile, views=()), {}), (tile, {"refine": {"when": "never"}})):
-        assert "refine" not in {task.step.name for task in build_graph(other, Settings(settings))}
+    for other, settings in ((replace(tile, views=()), {}), (tile, {"pose_refinement": {"when": "never"}})):
+        assert "pose_refinement" not in {task.step.name for task in build_graph(other, Settings(settings))}

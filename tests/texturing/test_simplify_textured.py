@@ -10,7 +10,7 @@ import numpy as np
 from scan2sim.pipeline.camera import renderer
 from scan2sim.pipeline.core.step import silent
 from scan2sim.texturing.simplify_textured import simplified_scene
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 
 TEXELS = 40_000
 

@@ -125,7 +125,7 @@ def test_unseen_ground_is_inpainted(street: Street) -> None:
     present(cloud.rgb)[:] = 128
     street.clouds["terrain"] = cloud
     flat, *_ = from_above(street.run()[0])
-    folder, done = street.run(continued=True)
+    folder, done = street.run(inpaint=True)
     rgb, seen, truth, x, y = from_above(folder)
     unseen = (seen == 64) & away_from_the_box(x, y)
     assert unseen.mean() > 0.01 and done.facts["filled_m2"] > 1
@@ -151,15 +151,15 @@ def test_dark_ground_below_a_removed_car_is_inpainted(street: Street) -> None:
     def black(rgb: F64) -> int:
         return int((rgb.max(axis=-1) < 30).sum())
 
-    before = black(from_above(street.run(continued=True, exposure={"solve": False})[0])[0])
+    before = black(from_above(street.run(inpaint=True, exposure={"solve": False})[0])[0])
     ring = [[-2.6, -0.6], [-0.4, -0.6], [-0.4, 0.6], [-2.6, 0.6], [-2.6, -0.6]]
     car = {"kind": "car", "moved": False}
     feature = {"type": "Feature", "properties": car, "geometry": {"type": "Polygon", "coordinates": [ring]}}
-    street.files["things"] = street.folder / "things.geojson"
-    street.files["things"].write_text(
+    street.files["instances"] = street.folder / "instances.geojson"
+    street.files["instances"].write_text(
         json.dumps({"type": "FeatureCollection", "features": [feature]}), encoding="utf-8"
     )
-    rgb, seen, _, x, y = from_above(street.run(continued=True, exposure={"solve": False})[0])
+    rgb, seen, _, x, y = from_above(street.run(inpaint=True, exposure={"solve": False})[0])
     assert before > 500 and black(rgb) < 0.02 * before
     assert not (seen[(abs(x + 1.5) < 1.0) & (abs(y) < 0.5)] == 255).any()
 

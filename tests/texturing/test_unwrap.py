@@ -11,10 +11,11 @@ import pytest
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import Camera, Frame, Mesh, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.texturing import unwrap as unwrap_module
+from scan2sim.texturing import texture_layout
 from scan2sim.texturing.atlas import Backend, manifold
-from scan2sim.texturing.unwrap import UNWRAP, UnwrapParams, unwrap
-from scan2sim.texturing.view_selection.step import Choice
+from scan2sim.texturing.texture_layout import UnwrapParams
+from scan2sim.texturing.unwrap import UNWRAP, unwrap
+from scan2sim.texturing.view_selection.choice import Choice
 from tests.present import present
 
 
@@ -102,12 +103,12 @@ def test_manifold_leaves_at_most_two_faces_per_edge() -> None:
 
 
 def test_failed_blocks_use_the_fallback_backend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = unwrap_module._unwrap_in_child
+    real = texture_layout._unwrap_in_child
 
     def refuse(mesh: Mesh, blocks: list[npt.NDArray[np.int64]], backend: Backend, params: UnwrapParams) -> list[Any]:
         return ["refused"] * len(blocks) if backend == "uvatlas" else real(mesh, blocks, backend, params)
 
-    monkeypatch.setattr(unwrap_module, "_unwrap_in_child", refuse)
+    monkeypatch.setattr(texture_layout, "_unwrap_in_child", refuse)
     _, _, done = run(hills(), tmp_path, backend="uvatlas", texel=0.02)
     assert done.facts["fallbacks"] == 1
     assert "xatlas" in done.warnings[0]

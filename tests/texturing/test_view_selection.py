@@ -7,7 +7,8 @@ import numpy as np
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.geometry import primitives
-from scan2sim.texturing.view_selection.step import Choice, with_sign_panel_views
+from scan2sim.texturing.view_selection.choice import Choice
+from scan2sim.texturing.view_selection.step import with_sign_panel_views
 
 
 def test_panel_side_uses_photos_that_see_all_of_it_in_detail() -> None:

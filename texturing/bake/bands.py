@@ -17,7 +17,7 @@ from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.optional_deps import missing
 from scan2sim.pipeline.core.step import Report
 from scan2sim.pipeline.core.types import F32, I32, I64, Mesh, View
-from scan2sim.texturing.bake import texel_map
+from scan2sim.texturing import texel_map
 from scan2sim.texturing.bake.blend_numba import (
     BlendSettings,
     BlendSource,
@@ -27,10 +27,10 @@ from scan2sim.texturing.bake.blend_numba import (
     PhotoData,
     RowBlender,
 )
-from scan2sim.texturing.inpainting.hole_filling import Page
+from scan2sim.texturing.consistency_result import PhotoConsistency
 from scan2sim.texturing.photo_cache import Exposures, PhotoCache
-from scan2sim.texturing.photo_consistency import PhotoConsistency
-from scan2sim.texturing.view_selection.step import Choice
+from scan2sim.texturing.texture_page import Page
+from scan2sim.texturing.view_selection.choice import Choice
 
 BAND_TEXELS = 6_000_000
 """Texels of a page that are baked at a time, in whole rows."""

@@ -21,8 +21,8 @@ from scan2sim.pipeline.camera.projection import (
     to_camera,
 )
 from scan2sim.pipeline.core.types import F32, F64, I32, I64, U8
-from scan2sim.texturing.bake.texel_map import box, frame
-from scan2sim.texturing.photo_cache import SRGB_OFFSET
+from scan2sim.texturing.exposure_model import corrected, vignette
+from scan2sim.texturing.texel_map import box, frame
 
 OVEREXPOSED_LEVEL = 251.0
 """Grey level above which a sample counts as overexposed."""
@@ -154,22 +154,6 @@ class NumbaRowBlender:
     def resolve(self, rgb: U8, seen: U8) -> None:
         """See `RowBlender`."""
         resolve(self._sums, rgb, seen)
-
-
-@njit(cache=True, inline="always")
-def vignette(exposure: F64, p: F64, u: float, v: float) -> float:
-    """Factor that corrects a photo's vignetting at a pixel; `exposure` from `photo_cache.Exposures.of`."""
-    if exposure[3] == 0.0 and exposure[4] == 0.0:
-        return 1.0
-    cx, cy = 0.5 * (p[12] - 1), 0.5 * (p[13] - 1)
-    q = ((u - cx) ** 2 + (v - cy) ** 2) / (cx * cx + cy * cy)
-    return math.exp(exposure[3] * q + exposure[4] * q * q)
-
-
-@njit(cache=True, inline="always")
-def corrected(value: float, factor: float) -> float:
-    """Encoded grey level after an exposure change by `factor`, a factor of (value + offset) in the power law."""
-    return (value + SRGB_OFFSET) * factor - SRGB_OFFSET
 
 
 @njit(cache=True, parallel=True)

@@ -181,7 +181,7 @@ class PhotoSampler:
         return self._mask[row, column] != 0
 
     def vignette(self, u: Tensor, v: Tensor) -> Tensor:
-        """As `blend_numba.vignette`."""
+        """As `exposure_model.vignette`."""
         cx, cy = 0.5 * (self._p[12] - 1), 0.5 * (self._p[13] - 1)
         q = ((u - cx) ** 2 + (v - cy) ** 2) / (cx * cx + cy * cy)
         return torch.exp(self._exposure[3] * q + self._exposure[4] * q * q)

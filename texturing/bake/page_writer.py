@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from scan2sim.pipeline.core.types import U8
 from scan2sim.pipeline.io.images import image
-
-if TYPE_CHECKING:  # it loads numba
-    from scan2sim.texturing.inpainting.hole_filling import Page
+from scan2sim.texturing.texture_page import Page
 
 
 class PageWriter:

@@ -1,12 +1,12 @@
-"""Colour harmonization step (`level`): removes colour steps on the borders of tiles that were textured independently.
+"""Colour harmonization step: removes colour steps on the borders of tiles that were textured independently.
 
 Where tiles share vertices, the target colour of each is the mean of the colours of all of them, so all tiles compute
 the same target. The colour change that takes a tile to its target is extrapolated inwards as a mean over the border,
 weighted by 1 / distance^4. Along a straight border this is the biharmonic surface: a wave of length l fades as
 (1 + k d) exp(-k d) with the distance d, k = 2 pi / l, and without a crease. Fine differences therefore fade close to
 the border and wide ones far from it, as in multi-band blending (Burt and Adelson 1983), and there is no step where the
-nearest border changes. A constant difference along the border is faded out over `reach`. Seam levelling: Lempitsky and
-Ivanov 2007; inward extrapolation by weighted means: Farbman et al. 2009.
+nearest border changes. A constant difference along the border is faded out over `fade_distance`. Seam levelling:
+Lempitsky and Ivanov 2007; inward extrapolation by weighted means: Farbman et al. 2009.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ if TYPE_CHECKING:
 NEIGHBOUR_PREFIX = "neighbour."
 
 
-class LevelParams(Params):
+class ColourHarmonizationParams(Params):
     """Settings of the colour harmonization.
 
     Attributes:
-        reach: metres from the border over which a colour step between tiles is faded out.
+        fade_distance: metres from the border over which a colour step between tiles is faded out.
     """
 
-    reach: float = Field(4.0, ge=0.01, le=1000)
+    fade_distance: float = Field(4.0, ge=0.01, le=1000)
 
 
-def level(inputs: Inputs, params: LevelParams, out: Path, report: Report) -> Done:
+def colour_harmonization(inputs: Inputs, params: ColourHarmonizationParams, out: Path, report: Report) -> Done:
     """Change a tile's colours at its border to the mean of the tiles that meet there, fading inwards.
 
     Inputs: `textured` (of the step `texture`) and `neighbour.*`, the same of the neighbouring tiles, before their own
@@ -69,15 +69,15 @@ def level(inputs: Inputs, params: LevelParams, out: Path, report: Report) -> Don
         if len(border.samples[0].point):
             pairs = zip(border.samples, tiles, strict=True)
             current = np.stack([sampling.colours(samples, tile.pages, len(border)) for samples, tile in pairs])
-            target = sampling.targets(border.xyz, current, params.reach)
-            after = _harmonize_pages(own, border, current[0], target, params.reach, folder, report)
+            target = sampling.targets(border.xyz, current, params.fade_distance)
+            after = _harmonize_pages(own, border, current[0], target, params.fade_distance, folder, report)
             metrics = _metrics(border, list(others), current, target, after)
     _link_unchanged(inputs["textured"], folder)
     return Done({"textured": folder}, metrics)
 
 
 def _harmonize_pages(
-    own: Textured, border: Border, current: F32, target: F32, reach: float, folder: Path, report: Report
+    own: Textured, border: Border, current: F32, target: F32, fade_distance: float, folder: Path, report: Report
 ) -> F32:
     """Write the pages that change; returns (P, 3) grey levels of the harmonized mesh at the border points.
 
@@ -85,12 +85,12 @@ def _harmonize_pages(
         own: textured mesh of the tile.
         border: border with its neighbours.
         current, target: (P, 3) grey levels at the border points before and wanted after.
-        reach: fading distance in metres.
+        fade_distance: fading distance in metres.
         folder: folder of the pages.
         report: progress callback.
     """
     from scan2sim.pipeline.camera.image_sampling import page_colours
-    from scan2sim.texturing.bake import texel_map
+    from scan2sim.texturing import texel_map
     from scan2sim.texturing.borders import fading, sampling
 
     mesh, samples = own.mesh, border.samples[0]
@@ -98,7 +98,7 @@ def _harmonize_pages(
     has = np.isfinite(current[:, 0])
     points = border.xyz[has] - np.asarray(mesh.frame.origin)
     corners, tree = mesh.corners, fading.changes(points, border.metres[has], (target - current)[has])
-    near = fading.within(tree, corners, reach)
+    near = fading.within(tree, corners, fade_distance)
     after = np.empty((len(samples.point), 3), np.float32)
     pages = np.unique(mesh.page[near]).tolist()
     for i, k in enumerate(pages):
@@ -110,7 +110,7 @@ def _harmonize_pages(
         flat = texel_map.corners(mesh.uv[faces], width, height)
         owner = texel_map.owners(flat, width, height)
         source = fading.padding_sources(owner)
-        fading.fade(page, owner, flat, corners[faces], near[faces], tree, reach)
+        fading.fade(page, owner, flat, corners[faces], near[faces], tree, fade_distance)
         fading.match_samples(page, source, samples.uv[on_page], target[samples.point[on_page]])
         fading.update_padding(before, page, owner, source)
         after[on_page] = page_colours(page, samples.uv[on_page])
@@ -146,4 +146,6 @@ def _link_unchanged(source: Path, folder: Path) -> None:
         link_or_copy(path, target)
 
 
-LEVEL = Step("level", 2, level, LevelParams, per_class=True, memory=(1.0, 3))
+COLOUR_HARMONIZATION = Step(
+    "colour_harmonization", 2, colour_harmonization, ColourHarmonizationParams, per_class=True, memory=(1.0, 3)
+)

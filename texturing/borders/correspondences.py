@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.core.types import F32, F64, I64, Mesh
-from scan2sim.pipeline.tiling.borders.grid import GRID_M, world
+from scan2sim.pipeline.geometry.coordinate_grid import GRID_M, world
 
 SAMPLE_SPACING_M = 0.015
 """Metres between the sample points along an edge: texels span a centimetre or more."""

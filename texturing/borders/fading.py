@@ -13,8 +13,8 @@ from numba import njit, prange
 
 from scan2sim.pipeline.camera.image_sampling import page_taps
 from scan2sim.pipeline.core.types import F32, F64, I32, I64, U8, Bools
-from scan2sim.texturing.bake.texel_map import box, frame
 from scan2sim.texturing.borders.correspondences import SOFTENING_M
+from scan2sim.texturing.texel_map import box, frame
 
 LEAF_POINTS_MAX = 8
 """Points in a leaf of the tree."""
@@ -147,30 +147,30 @@ def _change(tree: Changes, x: float, y: float, z: float, nearest: float, stack: 
 
 
 @njit(cache=True, parallel=True)
-def within(tree: Changes, corners: F32, reach: float) -> Bools:
-    """(F,) faces, `corners` (F, 3, 3), of which a part may be within `reach` metres of a border point."""
+def within(tree: Changes, corners: F32, fade_distance: float) -> Bools:
+    """(F,) faces, `corners` (F, 3, 3), of which a part may be within `fade_distance` metres of a border point."""
     out = np.zeros(len(corners), np.bool_)
     for f in prange(len(corners)):
         x = (corners[f, 0, 0] + corners[f, 1, 0] + corners[f, 2, 0]) / 3
         y = (corners[f, 0, 1] + corners[f, 1, 1] + corners[f, 2, 1]) / 3
         z = (corners[f, 0, 2] + corners[f, 1, 2] + corners[f, 2, 2]) / 3
-        limit = reach
+        limit = fade_distance
         for k in range(3):
-            limit = max(limit, reach + math.sqrt(_distance2(corners[f, k], x, y, z)))
+            limit = max(limit, fade_distance + math.sqrt(_distance2(corners[f, k], x, y, z)))
         out[f] = _nearest(tree, x, y, z, limit, np.empty(STACK_SIZE, np.int64)) < limit
     return out
 
 
 @njit(cache=True, parallel=True)
-def fade(rgb: U8, owner: I32, flat: F32, corners: F32, near: Bools, tree: Changes, reach: float) -> None:
-    """Add the extrapolated colour change to every texel of the faces that are `near`, faded out over `reach`.
+def fade(rgb: U8, owner: I32, flat: F32, corners: F32, near: Bools, tree: Changes, fade_distance: float) -> None:
+    """Add the extrapolated colour change to every texel of the faces that are `near`, faded out over `fade_distance`.
 
     Args:
         rgb: (H, W, 3) uint8, changed in place.
         owner: (H, W) face of each texel, index into the next three.
         flat, corners, near: (F, 3, 2) texels, (F, 3, 3) metres, (F,) bool.
         tree: colour changes of the border points.
-        reach: fading distance in metres.
+        fade_distance: fading distance in metres.
     """
     height, width = owner.shape
     for f in prange(len(flat)):
@@ -188,11 +188,11 @@ def fade(rgb: U8, owner: I32, flat: F32, corners: F32, near: Bools, tree: Change
                 x = origin[0] + tx * per_x[0] + ty * per_y[0]
                 y = origin[1] + tx * per_x[1] + ty * per_y[1]
                 z = origin[2] + tx * per_x[2] + ty * per_y[2]
-                nearest = _nearest(tree, x, y, z, reach, stack)
-                if nearest >= reach:
+                nearest = _nearest(tree, x, y, z, fade_distance, stack)
+                if nearest >= fade_distance:
                     continue
                 change = _change(tree, x, y, z, nearest, stack)
-                s = 1 - nearest / reach
+                s = 1 - nearest / fade_distance
                 share = s * s * (3 - 2 * s)
                 for k in range(3):
                     rgb[ty, tx, k] = min(255.0, max(0.0, rgb[ty, tx, k] + share * change[k] + 0.5))

@@ -10,8 +10,8 @@ import numpy as np
 from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.core.types import Mesh
-from scan2sim.pipeline.steps.clip import CellParams
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
+from scan2sim.pipeline.core.voronoi_cell import Cell
+from scan2sim.pipeline.tiling.cell_params import CellParams
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.io.worlds.textured_mesh import Textured

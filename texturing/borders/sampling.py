@@ -13,7 +13,7 @@ from scan2sim.pipeline.io.images import image
 from scan2sim.texturing.borders.correspondences import SOFTENING_M, Samples
 
 CORNER_SIGMA_SHARE = 0.1
-"""Sigma of the Gaussian by which colours are averaged around corners of more than two tiles, as a share of `reach`."""
+"""Sigma of the Gaussian by which colours are averaged around tile corners, as a share of `fade_distance`."""
 
 
 def colours(samples: Samples, pages: Sequence[Path], points: int) -> F32:
@@ -41,16 +41,17 @@ def mean_by_point(point: I64, sampled: F32, points: int) -> F32:
     return np.divide(total, count, out=np.full((points, 3), np.nan), where=count > 0).astype(np.float32)
 
 
-def targets(xyz: F64, current: F32, reach: float) -> F32:
+def targets(xyz: F64, current: F32, fade_distance: float) -> F32:
     """(P, 3) target colours of all meshes at the border points: the mean of their current colours.
 
-    Around corners of more than two tiles, say A, B and C, the mean of A and B along their border blends, over `reach`
-    metres, into the mean of all three, using the mean difference of C to A and B along their borders near the corner.
+    Around corners of more than two tiles, say A, B and C, the mean of A and B along their border blends, over
+    `fade_distance` metres, into the mean of all three, using the mean difference of C to A and B along their borders
+    near the corner.
 
     Args:
         xyz: (P, 3) border points, metres.
         current: (T, P, 3) grey levels of the meshes, NaN at points that they don't have.
-        reach: blending distance in metres.
+        fade_distance: blending distance in metres.
     """
     target, has = np.nanmean(current, axis=0), np.isfinite(current[..., 0])
     total, correction = np.zeros(len(xyz)), np.zeros_like(target)
@@ -58,15 +59,17 @@ def targets(xyz: F64, current: F32, reach: float) -> F32:
     for corner in np.flatnonzero(has.sum(axis=0) > 2):
         meets = has[:, corner]
         distance = np.linalg.norm(xyz - xyz[corner], axis=1)
-        near_corner = (distance < reach) & ~has[~meets].any(axis=0)  # only between tiles that meet at the corner
-        gaussian = np.exp(-0.5 * (distance[near_corner] / (reach * CORNER_SIGMA_SHARE)) ** 2)
+        near_corner = (distance < fade_distance) & ~has[~meets].any(
+            axis=0
+        )  # only between tiles that meet at the corner
+        gaussian = np.exp(-0.5 * (distance[near_corner] / (fade_distance * CORNER_SIGMA_SHARE)) ** 2)
         deviation = _deviations(current[meets][:, near_corner], gaussian)
         weight = 1 / (distance[near_corner] ** 2 + SOFTENING_M**2) ** 2
         sharing = has[meets][:, near_corner]
         correction[near_corner] -= weight[:, None] * ((sharing / sharing.sum(axis=0)).T @ deviation)
         total[near_corner] += weight
         nearest[near_corner] = np.minimum(nearest[near_corner], distance[near_corner])
-    near = np.maximum(0, 1 - nearest / reach)
+    near = np.maximum(0, 1 - nearest / fade_distance)
     share = near**2 * (3 - 2 * near) / np.maximum(total, 1e-12)
     return (target + share[:, None] * correction).astype(np.float32)
 

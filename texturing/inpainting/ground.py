@@ -13,9 +13,10 @@ from numba import njit
 
 from scan2sim.pipeline.core.types import F32, F64, I32, I64, U8, Bools, Mesh
 from scan2sim.pipeline.geometry.height_map import MAX_CELLS, dilate, rasterize_polygons
-from scan2sim.texturing.bake.texel_map import frame
-from scan2sim.texturing.inpainting.hole_filling import FILLED, FROM_POINTS, SEEN, Page, texel_points
+from scan2sim.texturing.inpainting.hole_filling import texel_points
 from scan2sim.texturing.inpainting.patch_offsets import COARSE_FACTOR, inpaint
+from scan2sim.texturing.texel_map import frame
+from scan2sim.texturing.texture_page import FILLED, FROM_POINTS, SEEN, Page
 
 CELL_M = 0.03
 """Smallest cell size of the orthophoto in metres: fine enough for grain, joints and markings, coarser than texels."""

@@ -6,8 +6,6 @@ interpolated bilinearly in between. Import late: it loads numba.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
@@ -15,7 +13,8 @@ from numba import njit, prange
 from scan2sim.pipeline.core.classes import colour_of
 from scan2sim.pipeline.core.types import F32, I32, I64, U8, Bools
 from scan2sim.pipeline.geometry.height_map import point_spacing
-from scan2sim.texturing.bake.texel_map import box, frame
+from scan2sim.texturing.texel_map import box, frame
+from scan2sim.texturing.texture_page import FILLED, FROM_POINTS, SEEN, Page
 
 LATTICE_SPACING_M = 0.08
 """Metres between the lattice nodes at which point colours are looked up."""
@@ -27,8 +26,6 @@ MAX_POINT_DISTANCE_SPACINGS = 3.0
 """That distance between the bounds, as a multiple of the point spacing."""
 FAR_NEIGHBOURS, FAR_STRIDE = 32, 8
 """Farther away, colours are means of 32 points out of every 8th: a single point's colour would give a flat patch."""
-SEEN, FROM_POINTS, FILLED = 255, 128, 64
-"""Marks of texels: seen by a photo, coloured from points, or filled otherwise."""
 
 
 class PointColours:
@@ -72,24 +69,6 @@ def _mean(distance: npt.NDArray[np.floating], rgb: F32) -> F32:
     weight = (1.0 / (distance**2 + 1e-4)).astype(np.float32)
     mean: F32 = np.einsum("mk,mkc->mc", weight, rgb) / weight.sum(axis=1, keepdims=True)
     return mean
-
-
-@dataclass(frozen=True)
-class Page:
-    """A texture page while it is painted.
-
-    Attributes:
-        rgb: (H, W, 3) colours.
-        seen: (H, W) marks (`SEEN`, `FROM_POINTS`, `FILLED`), 0 where there is no colour yet.
-        owner: (H, W) face of each texel, index into the other two; -1 where there is none.
-        flat, corners: (F, 3, 2) texels and (F, 3, 3) local metres of the faces' corners.
-    """
-
-    rgb: U8
-    seen: U8
-    owner: I32
-    flat: F32
-    corners: F32
 
 
 def fill(page: Page, colours: PointColours, texel: float) -> None:

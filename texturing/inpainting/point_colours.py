@@ -7,17 +7,18 @@ import numpy as np
 from scan2sim.pipeline.core.step import Inputs
 from scan2sim.pipeline.core.types import F32, U8, PointCloud
 from scan2sim.texturing.inpainting.ground import GroundOrthophoto
-from scan2sim.texturing.inpainting.hole_filling import FILLED, FROM_POINTS, PointColours, shaded
+from scan2sim.texturing.inpainting.hole_filling import PointColours, shaded
+from scan2sim.texturing.texture_page import FILLED, FROM_POINTS
 
 
 def point_colours(inputs: Inputs, ground: GroundOrthophoto | None) -> tuple[PointColours | None, bool]:
     """Colours of the points, and whether they were measured (else they are class colours); None if there are no points.
 
-    Texels coloured by synthesized points (`made.*`) are marked as filled. Points at and beside removed vehicles and
-    people of the `ground` orthophoto are not used: they have the colour of the object or of its shadow.
+    Texels coloured by synthesized points (`synthesized.*`) are marked as filled. Points at and beside removed vehicles
+    and people of the `ground` orthophoto are not used: they have the colour of the object or of its shadow.
     """
     names = sorted(name for name in inputs if name.startswith("cloud") and name != "cloud.rest")
-    synthesized = sorted(name for name in inputs if name.startswith("made."))
+    synthesized = sorted(name for name in inputs if name.startswith("synthesized."))
     clouds = [cloud for name in names + synthesized if len(cloud := PointCloud.load(inputs[name]))]
     if not clouds:
         return None, False
@@ -37,7 +38,7 @@ def point_colours(inputs: Inputs, ground: GroundOrthophoto | None) -> tuple[Poin
 
 def synthesized_colours(inputs: Inputs) -> tuple[F32, U8]:
     """Positions (N, 3) and class colours (N, 3) of synthesized points."""
-    clouds = [PointCloud.load(inputs[name]) for name in sorted(inputs) if name.startswith("made.")]
+    clouds = [PointCloud.load(inputs[name]) for name in sorted(inputs) if name.startswith("synthesized.")]
     if not clouds:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     cloud = PointCloud.join(clouds)

@@ -1,4 +1,4 @@
-"""Pose refinement step (`refine`): adjusts the poses of the photos to each other and to the surface.
+"""Pose refinement step (`pose_refinement`): adjusts the poses of the photos to each other and to the surface.
 
 Corners of every photo are matched in its neighbours via the surface of the meshes
 (`texturing.pose_refinement.matches`). All poses are then estimated by a bundle adjustment with one correction per
@@ -22,7 +22,7 @@ from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, I64, Bools, Camera, Mesh, PointCloud, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
-from scan2sim.texturing.photo_consistency import AgreementParams, neighbours
+from scan2sim.texturing.photo_consistency import PhotoConsistencyParams, neighbours
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.camera.depth_map import DepthMap, Scene
@@ -50,34 +50,34 @@ MOVABLE_MARGIN_PX, MOVABLE_DEPTH_TOLERANCE_M = 3, 0.5
 surface and still count as visible."""
 
 
-class RefineParams(Params):
+class PoseRefinementParams(Params):
     """Settings of the pose refinement: expected errors of the poses (standard deviations), and when to correct them.
 
     Attributes:
         when: "auto": if there are photos taken from the ground; "never": keep the given poses.
-        worth: smallest decrease of the photos' median displacement, in pixels of photos scaled to 0.5 MP, for poses to
-            be changed.
+        min_gain_px: smallest decrease of the photos' median displacement, in pixels of photos scaled to 0.5 MP, for
+            poses to be changed.
         shift: expected error of a photo's position in metres.
-        turn: expected error of a photo's rotation in milliradians.
+        rotation: expected error of a photo's rotation in milliradians.
         camera_shift: expected error of a camera's position on the vehicle in metres.
-        camera_turn: expected error of a camera's rotation on the vehicle in milliradians.
-        wander: metres of path over which the error of the photos' poses decorrelates.
+        camera_rotation: expected error of a camera's rotation on the vehicle in milliradians.
+        correlation_length: metres of path over which the error of the photos' poses decorrelates.
         corners: maximum number of corners of a photo that are matched in other photos.
         max_distance: metres from the camera beyond which surface points are not used.
     """
 
     when: Literal["auto", "never"] = "auto"
-    worth: float = Field(0.1, ge=0, le=100)
+    min_gain_px: float = Field(0.1, ge=0, le=100)
     shift: Distance = 0.05
-    turn: float = Field(3.0, gt=0, le=200)
+    rotation: float = Field(3.0, gt=0, le=200)
     camera_shift: Distance = 0.05
-    camera_turn: float = Field(5.0, gt=0, le=200)
-    wander: Distance = 10.0
+    camera_rotation: float = Field(5.0, gt=0, le=200)
+    correlation_length: Distance = 10.0
     corners: int = Field(600, ge=50, le=20_000)
     max_distance: Distance = 40.0
 
 
-def refine(inputs: Inputs, params: RefineParams, out: Path, report: Report) -> Done:
+def pose_refinement(inputs: Inputs, params: PoseRefinementParams, out: Path, report: Report) -> Done:
     """Refine the poses of `views` on the surface `mesh.*`, except where movable objects (`cloud.*`, `moving`) hide it.
 
     File: `views`, with refined poses, or unchanged if refinement gains too little. Metrics: `matches`, their number;
@@ -104,7 +104,7 @@ def refine(inputs: Inputs, params: RefineParams, out: Path, report: Report) -> D
         found = _matched(posed, cameras, grey_photos, surface, movable, params)
         before = bundle_adjustment.displacement(found, cameras, at)
         first = first or (found, before)
-        if len(before) < MIN_MATCHES or _median(before) <= params.worth:
+        if len(before) < MIN_MATCHES or _median(before) <= params.min_gain_px:
             break
         report((turn + 0.8) / MAX_ROUNDS, "solving")
         now = bundle_adjustment.solve(found, cameras, poses, now, camera, order, _priors(params))
@@ -116,7 +116,9 @@ def refine(inputs: Inputs, params: RefineParams, out: Path, report: Report) -> D
     at = now.apply(poses, camera)
     after = bundle_adjustment.displacement(found, cameras, at)
     moved = (
-        len(after) >= MIN_MATCHES and bool(np.any(at != poses)) and _median(first[1]) - _median(after) >= params.worth
+        len(after) >= MIN_MATCHES
+        and bool(np.any(at != poses))
+        and _median(first[1]) - _median(after) >= params.min_gain_px
     )
     if moved:
         for i, T in zip(index, at, strict=True):
@@ -153,10 +155,16 @@ def _median(values: F64) -> float:
     return float(np.nanmedian(values)) if len(values) else 0.0
 
 
-def _priors(params: RefineParams) -> Priors:
+def _priors(params: PoseRefinementParams) -> Priors:
     from scan2sim.texturing.pose_refinement.bundle_adjustment import Priors
 
-    return Priors(params.shift, params.turn / 1000, params.camera_shift, params.camera_turn / 1000, params.wander)
+    return Priors(
+        params.shift,
+        params.rotation / 1000,
+        params.camera_shift,
+        params.camera_rotation / 1000,
+        params.correlation_length,
+    )
 
 
 def _grey_photos(photos: Sequence[View], used: Sequence[int]) -> dict[int, GreyPhoto]:
@@ -192,7 +200,7 @@ def _matched(
     grey_photos: dict[int, GreyPhoto],
     surface: Scene,
     movable: Scene,
-    params: RefineParams,
+    params: PoseRefinementParams,
 ) -> Matches:
     """Matches between all photos at their current poses."""
     import cv2
@@ -215,7 +223,7 @@ def _matched(
             is_static = np.asarray(cv2.resize(dilated, size, interpolation=cv2.INTER_NEAREST)) == 0
             photo = replace(photo, usable=photo.usable & is_static)
         static[k] = photo
-    settings = AgreementParams(max_shift=0, neighbours=NEIGHBOUR_PHOTOS, max_distance=params.max_distance)
+    settings = PhotoConsistencyParams(max_shift=0, neighbours=NEIGHBOUR_PHOTOS, max_distance=params.max_distance)
     small_views = [replace(view, camera=camera) for view, camera in zip(photos, cameras, strict=True)]
     nearest = neighbours(small_views, list(grey_photos), maps.__getitem__, settings)
     return matches(
@@ -245,8 +253,8 @@ def _plausible(
             row = _magnitude(rows[k])
             warnings.append(
                 f"{names[k]}: estimated pose correction of {row['shift_cm']:.0f} cm and {row['turn_mrad']:.0f} mrad is "
-                f"implausibly large and was rejected; check the pose, or increase `refine.{prefix}shift` and "
-                f"`refine.{prefix}turn`"
+                f"implausibly large and was rejected; check the pose, or increase `pose_refinement.{prefix}shift` and "
+                f"`pose_refinement.{prefix}rotation`"
             )
     return Corrections(
         np.where(bad_photo[:, None], 0.0, found.photo), np.where(bad_camera[:, None], 0.0, found.camera)
@@ -293,4 +301,4 @@ def _correction_metrics(
     return {"largest_shift_cm": shift, "largest_turn_mrad": turn, "cameras": by_camera, "photos": rows}
 
 
-REFINE = Step("refine", 2, refine, RefineParams)
+POSE_REFINEMENT = Step("pose_refinement", 2, pose_refinement, PoseRefinementParams)

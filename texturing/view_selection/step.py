@@ -1,4 +1,4 @@
-"""View selection step (`choose`): which photos colour a face, and which one gives its detail.
+"""View selection step (`view_selection`): which photos colour a face, and which one gives its detail.
 
 The candidates of a face are the best few photos that see it. The photo for the detail is selected by a Markov random
 field over the faces (`texturing.view_selection.mrf`), so that neighbouring faces share a photo where it costs little.
@@ -7,7 +7,6 @@ field over the faces (`texturing.view_selection.mrf`), so that neighbouring face
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,8 @@ from scan2sim.pipeline.core.parameters import Cosine, Depth, Distance
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, I32, I64, U8, Mesh, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.texturing.photo_consistency import PhotoConsistency
+from scan2sim.texturing.consistency_result import PhotoConsistency
+from scan2sim.texturing.view_selection.choice import Choice
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.camera.depth_map import DepthMap
@@ -31,7 +31,7 @@ PIXEL_COUNT_RATIO_MIN = 0.16
 """Smallest number of pixels that a photo has on a sign panel, relative to the photo with most pixels, to be used."""
 
 
-class ChooseParams(Params):
+class ViewSelectionParams(Params):
     """Settings of the view selection.
 
     Attributes:
@@ -49,35 +49,10 @@ class ChooseParams(Params):
     bias: Depth = 0.04
 
 
-@dataclass(frozen=True)
-class Choice:
-    """View selection of all faces of a mesh.
-
-    Attributes:
-        view: (F, K) int32 candidate views, best first, -1 where fewer see the face.
-        quality: (F, K) float32 quality of each candidate in 1/m2 (cos^2 / distance^2, where seen); 0 for none.
-        detail_view: (F,) int32 view that gives the detail, -1 where none sees the face.
-    """
-
-    view: I32
-    quality: F32
-    detail_view: I32
-
-    def save(self, path: Path) -> None:
-        """Write as .npz."""
-        np.savez(path, view=self.view, quality=self.quality, label=self.detail_view)
-
-    @classmethod
-    def load(cls, path: Path) -> Choice:
-        """Read what `save` wrote."""
-        with np.load(path) as data:
-            return cls(data["view"], data["quality"], data["label"])
-
-
-def choose(inputs: Inputs, params: ChooseParams, out: Path, report: Report) -> Done:
+def view_selection(inputs: Inputs, params: ViewSelectionParams, out: Path, report: Report) -> Done:
     """Select the photos of every face of `mesh`.
 
-    Inputs: `mesh`, `views`, `depth` (folder of depth maps), `agreement` (usable photos and their masks).
+    Inputs: `mesh`, `views`, `depth` (folder of depth maps), `photo_consistency` (usable photos and their masks).
     File: `choice`, a `Choice`.
     """
     from scan2sim.pipeline.camera.depth_map import load_depth_map
@@ -85,7 +60,7 @@ def choose(inputs: Inputs, params: ChooseParams, out: Path, report: Report) -> D
 
     mesh = Mesh.load(inputs["mesh"])
     views = views_io.load(inputs["views"])
-    consistency = PhotoConsistency.load(inputs["agreement"])
+    consistency = PhotoConsistency.load(inputs["photo_consistency"])
 
     def depth(i: int) -> DepthMap:
         return load_depth_map(inputs["depth"] / f"{i}.npy", views[i].camera, views[i].T_world_cam)
@@ -105,7 +80,7 @@ def choose_views(
     depth: Callable[[int], DepthMap],
     mask: Callable[[int, View], U8],
     sharpness: Callable[[int], float],
-    params: ChooseParams,
+    params: ViewSelectionParams,
     report: Report,
 ) -> tuple[Choice, float]:
     """View selection of all faces, and the share of the total edge length that is a seam."""
@@ -180,4 +155,4 @@ def seam_costs(mesh: Mesh, smoothness: float) -> tuple[I32, F32, F32]:
     return pairs, length, (smoothness * np.minimum(length / median, 4)).astype(np.float32)
 
 
-CHOOSE = Step("choose", 4, choose, ChooseParams, per_class=True)
+VIEW_SELECTION = Step("view_selection", 4, view_selection, ViewSelectionParams, per_class=True)

@@ -14,11 +14,11 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Camera, Frame, View
-from scan2sim.pipeline.importers.tile_folder import add_file
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.images.decoders.opencv import opened
+from scan2sim.pipeline.io.tile_folder import add_file
 
 SCALE_TAG, TIEPOINT_TAG, TRANSFORM_TAG, KEYS_TAG = 33550, 33922, 34264, 34735
 RASTER_TYPE_KEY, PROJECTED_CRS_KEY = 1025, 3072  # GeoTIFF keys

@@ -19,8 +19,8 @@ from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, U8, Camera
 from scan2sim.pipeline.geometry.similarity import Similarity
-from scan2sim.pipeline.importers.tile_folder import without_parents
 from scan2sim.pipeline.io.images.image import SUFFIXES, size_of
+from scan2sim.pipeline.io.tile_folder import without_parents
 
 
 @dataclass(frozen=True)

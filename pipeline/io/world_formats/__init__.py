@@ -26,10 +26,10 @@ from scan2sim.pipeline.io.mesh_formats import PageNames, obj
 from scan2sim.pipeline.io.worlds import sdf
 from scan2sim.pipeline.io.worlds.glb import GlbParams, find_encoders
 from scan2sim.pipeline.io.worlds.scene import Scene, SceneTile, by_class
+from scan2sim.pipeline.io.worlds.spawn import find_spawn_pose
 from scan2sim.pipeline.io.worlds.textured_mesh import Textured
 from scan2sim.pipeline.simulation.collision_shapes import Solid, solids
 from scan2sim.pipeline.simulation.robot import ROBOT
-from scan2sim.pipeline.simulation.spawn import find_spawn_pose
 
 PACKAGE = "scan2sim.pipeline.io.world_formats"
 GAZEBO_VISUAL_FORMATS = ("obj", "collada")

@@ -30,8 +30,8 @@ from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds import fbx
 from scan2sim.pipeline.io.worlds.fbx import Part
 from scan2sim.pipeline.io.worlds.scene import Scene, SceneTile, Surface, by_class
+from scan2sim.pipeline.io.worlds.scene_roads import roads_of
 from scan2sim.pipeline.io.worlds.textured_mesh import Textured
-from scan2sim.pipeline.roads.scene_roads import roads_of
 
 FOLDER = "carla"
 LARGE_MAP_TILE_M = 2000.0

@@ -9,11 +9,10 @@ from pathlib import Path
 
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.step import Report
-from scan2sim.pipeline.io.geodata import opendrive
+from scan2sim.pipeline.io.geodata import opendrive, road_geojson
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.scene import Scene
-from scan2sim.pipeline.roads import listed
-from scan2sim.pipeline.roads.scene_roads import roads_of
+from scan2sim.pipeline.io.worlds.scene_roads import roads_of
 
 
 def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
@@ -34,5 +33,5 @@ def write_roads(scene: Scene, folder: Path) -> int:
     roads = roads_of(scene)
     count = opendrive.write(folder / f"{scene.name}.xodr", scene.name, scene.frame, roads)
     if count and len(scene.tiles) > 1:
-        listed.write(folder / f"{scene.name}_roads.geojson", scene.frame, roads)
+        road_geojson.write(folder / f"{scene.name}_roads.geojson", scene.frame, roads)
     return count

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.core.types import F64, I64, Bools, Mesh
-from scan2sim.pipeline.tiling.borders.common_faces import directed_edges, normals, weld_vertices
-from scan2sim.pipeline.tiling.borders.grid import local, snap_to_grid, world
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
+from scan2sim.pipeline.core.voronoi_cell import Cell
+from scan2sim.pipeline.geometry.common_faces import directed_edges, normals, weld_vertices
+from scan2sim.pipeline.geometry.coordinate_grid import local, snap_to_grid, world
 
 BORDER_TOLERANCE_M = 1e-4
 """Distance from a border up to which a vertex counts as lying on it."""

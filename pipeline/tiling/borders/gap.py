@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.core.types import F64, I64, Mesh
-from scan2sim.pipeline.tiling.borders.boundary_curve import curve
-from scan2sim.pipeline.tiling.borders.grid import world
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
+from scan2sim.pipeline.core.voronoi_cell import Cell
+from scan2sim.pipeline.geometry.boundary_curve import curve
+from scan2sim.pipeline.geometry.coordinate_grid import world
 
 MAX_COUNTERPART_M = 0.3
 """Distance up to which points of two boundary curves are counterparts."""

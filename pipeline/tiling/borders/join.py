@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.core.types import F64, I64, Bools, Mesh
+from scan2sim.pipeline.geometry.common_faces import directed_edges, normals, weld_vertices
+from scan2sim.pipeline.geometry.coordinate_grid import local, world
 from scan2sim.pipeline.tiling.borders.clip import Clipped, stacked
-from scan2sim.pipeline.tiling.borders.common_faces import directed_edges, normals, weld_vertices
-from scan2sim.pipeline.tiling.borders.grid import local, world
 from scan2sim.pipeline.tiling.borders.match_edges import match_border
 
 MAX_UNFLIP_ROUNDS = 30

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from scan2sim.pipeline.core.types import F64, I64, Mesh
-from scan2sim.pipeline.tiling.borders.boundary_curve import Graph, chains, curve
+from scan2sim.pipeline.geometry.boundary_curve import Graph, chains, curve
+from scan2sim.pipeline.geometry.common_faces import normals
+from scan2sim.pipeline.geometry.coordinate_grid import world
 from scan2sim.pipeline.tiling.borders.clip import Clipped
-from scan2sim.pipeline.tiling.borders.common_faces import normals
-from scan2sim.pipeline.tiling.borders.grid import world
 
 NORMAL_WEIGHT_M = 0.1
 """Weight of normals in the search for counterparts: metres that a difference of 60 degrees corresponds to."""

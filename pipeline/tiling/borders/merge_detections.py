@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from scan2sim.pipeline.core.voronoi_cell import Seed, nearest
 from scan2sim.pipeline.furniture.classify import Detection
-from scan2sim.pipeline.tiling.voronoi_cell import Seed, nearest
 
 MAX_FOOT_DISTANCE_M = 2.0
 """Distance between the feet of two detections up to which they are compared."""

@@ -13,11 +13,11 @@ from itertools import pairwise
 import numpy as np
 
 from scan2sim.pipeline.core.types import F64, I64, Bools, Mesh
+from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.decimation import simplify
-from scan2sim.pipeline.tiling.borders.boundary_curve import Curve, chains, curve
-from scan2sim.pipeline.tiling.borders.common_faces import normals
-from scan2sim.pipeline.tiling.borders.grid import world
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
+from scan2sim.pipeline.geometry.boundary_curve import Curve, chains, curve
+from scan2sim.pipeline.geometry.common_faces import normals
+from scan2sim.pipeline.geometry.coordinate_grid import world
 
 BORDER_TOLERANCE_M = 2e-3
 """Distance from a border up to which a vertex counts as lying on it."""

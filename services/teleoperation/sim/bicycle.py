@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scan2sim.pipeline.core.types import F64
+from scan2sim.pipeline.io.worlds import spawn
 from scan2sim.pipeline.io.worlds.scene import Scene
-from scan2sim.pipeline.simulation import spawn
 from scan2sim.services.teleoperation.control.controls import Controls, Gear, VehicleState
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.io.worlds.scene import Scene
-from scan2sim.pipeline.simulation.spawn import courses
+from scan2sim.pipeline.io.worlds.spawn import courses
 from scan2sim.services.teleoperation.control.controls import Controls, VehicleState
 from scan2sim.services.teleoperation.sim.bicycle import Car, Ground, SimulatedCar
 from scan2sim.services.teleoperation.vehicle.adapters.simulated import SimulatedVehicle

@@ -13,7 +13,7 @@ import tempfile
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from _pytest.mark import ParameterSet
 
 from tests.conftest import ROOT
 from tests.fakes.ports import free_port
+from tests.waiting import until
 
 pytest.importorskip("prefect")
 
@@ -45,16 +46,6 @@ def environment(home: Path) -> dict[str, str]:
     """This environment with test settings of Prefect only, without a configured server."""
     ours = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")}
     return ours | QUIET | {"PREFECT_HOME": str(home)}
-
-
-def wait_for(what: str, condition: Callable[[], Any], seconds: float = 60.0) -> Any:
-    """Poll a condition until it is true; returns its value."""
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        if answer := condition():
-            return answer
-        time.sleep(0.1)
-    raise TimeoutError(f"{what}: not within {seconds:.0f} s")
 
 
 def kill(process: subprocess.Popen[Any]) -> None:
@@ -103,7 +94,7 @@ class Server:
                 command, env=self.env, cwd=self.home, stdout=log, stderr=log, start_new_session=True
             )
         try:
-            wait_for("server", self._healthy, 120)
+            until(self._healthy, 120, what="server")
         except TimeoutError:
             self.kill()
             raise RuntimeError((self.home / "server.log").read_text(encoding="utf-8")[-3000:]) from None
@@ -209,7 +200,7 @@ class Server:
             now = self.api("GET", f"/flow_runs/{run}")["state"]
             return now if now["type"] in ENDED else None
 
-        return wait_for(f"run {run}", state, seconds)
+        return until(state, seconds, what=f"run {run}")
 
 
 @contextmanager
@@ -237,7 +228,7 @@ def postgres() -> Iterator[str]:
                 stdout=log, stderr=log, cwd=data, start_new_session=True,
             )  # fmt: skip
         try:
-            wait_for("PostgreSQL", lambda: _listens(port))
+            until(lambda: _listens(port), what="PostgreSQL")
             yield f"postgresql+asyncpg://prefect@127.0.0.1:{port}/postgres"
         finally:
             kill(process)

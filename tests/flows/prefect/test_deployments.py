@@ -17,8 +17,9 @@ from scan2sim.flows.engine.versions import check_version, versions
 from scan2sim.pipeline.core.errors import UnavailableError, exit_code
 from tests.conftest import ROOT
 from tests.fakes.ports import free_port
-from tests.flows.prefect.conftest import Server, kill, on, processes, serving, wait_for
+from tests.flows.prefect.conftest import Server, kill, on, processes, serving
 from tests.flows.prefect.toy_steps import planned
+from tests.waiting import until
 
 DEPLOYED = ["reprocess", "survey", "tile"]
 
@@ -41,7 +42,7 @@ def test_missing_work_pool_is_named(server: Server) -> None:
     assert "work pool 'scan2sim-process' which does not exist" in deployed.stdout
     with server.worker("scan2sim-process"):
         log = server.home / "scan2sim-process.log"
-        wait_for("a warning", lambda: "Work pool 'scan2sim-process' not found!" in log.read_text(encoding="utf-8"))
+        until(lambda: "Work pool 'scan2sim-process' not found!" in log.read_text(encoding="utf-8"), what="a warning")
 
 
 @on("sqlite")
@@ -69,7 +70,7 @@ def test_server_accepts_all_deployments_and_automations(server: Server) -> None:
     assert nightly["parameters"]["source"] == "/data/drive" and nightly["parameters"]["out"] == "/data/worlds"
     assert nightly["global_concurrency_limit"]["limit"] == 1
     assert nightly["concurrency_options"]["collision_strategy"] == "CANCEL_NEW"
-    due = wait_for("a run that is scheduled", lambda: server.runs(nightly, "SCHEDULED"), 30)
+    due = until(lambda: server.runs(nightly, "SCHEDULED"), 30, what="a run that is scheduled")
     assert {datetime.fromisoformat(run["expected_start_time"]).strftime("%H:%M %z") for run in due} == {"02:00 +0000"}
     assert len(server.api("POST", "/automations/filter", {})) == 2
 
@@ -80,11 +81,11 @@ def test_scheduled_run_is_executed_without_overlap(toys: Server, folder: Path) -
     nightly, other = toys.deployment("toy", "one-at-a-time"), toys.deployment("toy", "any")
     parameters = {"folder": str(folder), "gate": str(folder / "gate")}
     with toys.scheduled(nightly, parameters, interval=5.0):
-        wait_for("its first step", (folder / "started").exists)
+        until((folder / "started").exists, what="its first step")
         (first,) = toys.runs(nightly, "RUNNING")
         state = toys.ended(toys.run(other, **parameters))
         assert state["name"] == "Skipped" and "another run is using this folder" in state["message"]
-        wait_for("a cancelled run", lambda: toys.runs(nightly, "CANCELLED"))
+        until(lambda: toys.runs(nightly, "CANCELLED"), what="a cancelled run")
     (folder / "gate").touch()
     state = toys.ended(first["id"])
     assert (state["type"], state["message"]) == ("COMPLETED", "total 4")
@@ -93,7 +94,7 @@ def test_scheduled_run_is_executed_without_overlap(toys: Server, folder: Path) -
 
     with toys.scheduled(nightly, parameters, cron="0 2 * * *", timezone="Etc/UTC"):
         # with SQLAlchemy 2.1 and PostgreSQL, this run never appeared
-        wait_for("a run at two", lambda: toys.runs(nightly, "SCHEDULED"))
+        until(lambda: toys.runs(nightly, "SCHEDULED"), what="a run at two")
 
 
 def test_unreachable_server_is_named(tmp_path: Path) -> None:
@@ -134,13 +135,13 @@ def test_run_of_a_killed_worker_is_detected_and_rescheduled(tmp_path: Path, fold
         deployment = server.deployment("toy", "one-at-a-time")
         with server.worker("toys") as worker:
             run = server.run(deployment, folder=str(folder), gate=str(folder / "gate"))
-            wait_for("its first step", (folder / "started").exists)
+            until((folder / "started").exists, what="its first step")
             time.sleep(3)  # until its first heartbeat is sent
             kill(worker)
         for pid in processes("PREFECT__FLOW_RUN_ID", run):
             os.kill(pid, signal.SIGKILL)
         assert server.api("GET", f"/flow_runs/{run}")["state"]["type"] == "RUNNING"
         assert server.ended(run, 180)["type"] == "CRASHED"
-        (again,) = wait_for("a run in ten minutes", lambda: server.runs(deployment, "SCHEDULED"), 30)
+        (again,) = until(lambda: server.runs(deployment, "SCHEDULED"), 30, what="a run in ten minutes")
         ahead = datetime.fromisoformat(again["expected_start_time"]) - datetime.now().astimezone()
         assert timedelta(minutes=8) < ahead < timedelta(minutes=11)

@@ -19,8 +19,9 @@ from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.pipelines.graph import TaskId
 from scan2sim.pipeline.core.cache import Store
 from tests.conftest import ROOT
-from tests.flows.prefect.conftest import Server, environment, kill, on, processes, wait_for
+from tests.flows.prefect.conftest import Server, environment, kill, on, processes
 from tests.flows.prefect.toy_steps import STEPS, planned
+from tests.waiting import until
 
 SCRIPT = "from tests.flows.prefect.toy_flow import main; main()"
 TILES = 6
@@ -47,8 +48,8 @@ class Survey:
     def wait_until_running(self) -> dict[str, int]:
         """Wait until some steps are done and others are running; returns the running ones."""
         try:
-            wait_for("some steps", lambda: len(self.done()) >= 4, 120)
-            return wait_for("one more", self.running_steps, 30)
+            until(lambda: len(self.done()) >= 4, 120, what="some steps")
+            return until(self.running_steps, 30, what="one more")
         except TimeoutError as error:
             raise AssertionError(f"{error}; {len(self.done())} are done\n{self.output()}") from None
 
@@ -107,7 +108,7 @@ def test_killed_flow_resumes_with_finished_steps(survey: Survey) -> None:
     survey.wait_until_running()
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    wait_for("the end of all its processes", lambda: not survey.processes(), 30)
+    until(lambda: not survey.processes(), 30, what="the end of all its processes")
     before, lost = survey.done(), set(survey.running_steps())
     assert 4 <= len(before) < len(ALL)
 
@@ -152,10 +153,10 @@ def test_ctrl_c_stops_the_run_and_its_temporary_server(tmp_path: Path) -> None:
             command, env=environment(tmp_path), cwd=ROOT, stdout=file, stderr=file, start_new_session=True
         )
     try:
-        wait_for("a finished step", lambda: list(out.glob("steps/*/*/*/manifest.json")), 150)
+        until(lambda: list(out.glob("steps/*/*/*/manifest.json")), 150, what="a finished step")
         os.killpg(process.pid, signal.SIGINT)
         assert process.wait(20) == 130
-        wait_for("the end of all its processes", lambda: not processes("PREFECT_HOME", str(tmp_path)), 30)
+        until(lambda: not processes("PREFECT_HOME", str(tmp_path)), 30, what="the end of all its processes")
     finally:
         kill(process)
     assert "the same command resumes from there" in log.read_text(encoding="utf-8")
@@ -170,10 +171,10 @@ def test_temporary_server_ends_with_a_killed_command(tmp_path: Path) -> None:
             start_new_session=True,
         )  # fmt: skip
     try:
-        wait_for("its server", lambda: processes("PREFECT__SERVER_EPHEMERAL", "1"), 150)
-        wait_for("a finished step", lambda: list(out.glob("steps/*/*/*/manifest.json")), 150)
+        until(lambda: processes("PREFECT__SERVER_EPHEMERAL", "1"), 150, what="its server")
+        until(lambda: list(out.glob("steps/*/*/*/manifest.json")), 150, what="a finished step")
         process.kill()  # only the command
-        wait_for("the end of all its processes", lambda: not processes("PREFECT_HOME", str(tmp_path)), 30)
+        until(lambda: not processes("PREFECT_HOME", str(tmp_path)), 30, what="the end of all its processes")
     finally:
         kill(process)
 

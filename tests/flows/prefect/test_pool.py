@@ -8,7 +8,8 @@ import sys
 import pytest
 
 from tests.conftest import ROOT
-from tests.flows.prefect.conftest import Server, on, processes, wait_for
+from tests.flows.prefect.conftest import Server, on, processes
+from tests.waiting import until
 
 MARK = "SCAN2SIM_TEST_POOL"
 ASK = """
@@ -49,13 +50,12 @@ def test_pool_starts_and_stops_workers_on_request(server: Server) -> None:
     command = [sys.executable, "-m", "scan2sim.flows.cli", "monitor", "pool", "elastic", "--max-workers", "2"]
     with subprocess.Popen(command, env=environment) as pool:
         try:
-            wait_for(
-                "the minimum", lambda: online() == 1 and running() == 3, 120
-            )  # the command, a guard process, a worker
+            three = "the minimum: the command, a guard process and a worker"
+            until(lambda: online() == 1 and running() == 3, 120, what=three)
             ask(9)
-            wait_for("not more than the maximum", lambda: online() == 2 and running() == 5, 120)
+            until(lambda: online() == 2 and running() == 5, 120, what="not more than the maximum")
             ask(0)
-            wait_for("not fewer than the minimum", lambda: running() == 3, 120)
+            until(lambda: running() == 3, 120, what="not fewer than the minimum")
         finally:
             pool.kill()
-    wait_for("the end of all processes", lambda: not processes(MARK, "1"), 60)
+    until(lambda: not processes(MARK, "1"), 60, what="the end of all processes")

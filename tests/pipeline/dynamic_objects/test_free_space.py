@@ -11,7 +11,7 @@ import pytest
 
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import Frame, PointCloud, Trajectory
-from scan2sim.pipeline.steps.carve import CARVE
+from scan2sim.pipeline.steps.dynamic_objects import DYNAMIC_OBJECTS
 
 SPEED, TURNS, SECONDS = 10.0, 10.0, 2.5
 HEIGHT = 1.8
@@ -97,7 +97,7 @@ def carve(cloud: PointCloud, out: Path, way: Trajectory | None, **params: Any) -
     if way is not None:
         way.save(out / "path.npz")
         inputs["path"] = out / "path.npz"
-    return CARVE.run(inputs, CARVE.params(**params), out, silent)
+    return DYNAMIC_OBJECTS.run(inputs, DYNAMIC_OBJECTS.params(**params), out, silent)
 
 
 def lost(cloud: PointCloud, done: Done) -> dict[int, float]:

@@ -38,7 +38,7 @@ def boxes(path: Path, *kinds: str, heading: float = 0.0) -> Path:
 def test_a_shell_where_a_car_stood_is_measured(tmp_path: Path, heading: float) -> None:
     c, s = np.cos(heading), np.sin(heading)
     side = plate((1 * c - 1 * s, 1 * s + 1 * c, 0.5), (2 * c, 2 * s, 0), (0, 0, 0.8))  # 2 x 0.8 m along its middle
-    (left,) = residue_areas([side], boxes(tmp_path / "things.geojson", "car", heading=heading))
+    (left,) = residue_areas([side], boxes(tmp_path / "instances.geojson", "car", heading=heading))
     assert left == pytest.approx(1.6, rel=0.05)
 
 
@@ -46,4 +46,4 @@ def test_ground_walls_beside_it_and_people_are_nothing_of_a_car(tmp_path: Path) 
     ground = plate((-5, -5, 0.1), (20, 0, 0), (0, 20, 0))
     wall = plate((-5, 1.95, 0), (20, 0, 0), (0, 0, 4))
     crown = plate((-5, -5, 3), (20, 0, 0), (0, 20, 0))
-    assert residue_areas([ground, wall, crown], boxes(tmp_path / "things.geojson", "car", "person")) == [0]
+    assert residue_areas([ground, wall, crown], boxes(tmp_path / "instances.geojson", "car", "person")) == [0]

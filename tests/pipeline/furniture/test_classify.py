@@ -18,7 +18,7 @@ from scan2sim.pipeline.furniture.poles import Columns, stems
 from scan2sim.pipeline.furniture.sign_panels import OUTLINES, Shape, detect_panels, inside
 from scan2sim.pipeline.geometry import primitives
 from scan2sim.pipeline.steps.decimate import DECIMATE, DecimateParams
-from scan2sim.pipeline.steps.finds import FINDS, FindsParams
+from scan2sim.pipeline.steps.detect_furniture import DETECT_FURNITURE, DetectFurnitureParams
 from scan2sim.pipeline.steps.furniture import FURNITURE, FurnitureParams
 from scan2sim.pipeline.steps.split import SPLIT, SplitParams
 
@@ -38,7 +38,7 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def _run(street: tuple[Path, Path], out: Path, **params: Any) -> tuple[list[dict[str, Any]], Done]:
     out.mkdir()
     cloud = {"cloud": street[0]}
-    found = FINDS.run(cloud | {"path": street[1]}, FindsParams(**params), out, silent)
+    found = DETECT_FURNITURE.run(cloud | {"path": street[1]}, DetectFurnitureParams(**params), out, silent)
     done = FURNITURE.run(cloud | found.files, FurnitureParams(**params), out, silent)
     features = json.loads(done.files["geojson"].read_text(encoding="utf-8"))["features"]
     return [f["properties"] | {"at": np.array(f["geometry"]["coordinates"]) - FRAME.origin} for f in features], done
@@ -62,7 +62,12 @@ def test_what_stands_in_a_street_is_found_and_nothing_else(street: tuple[Path, P
     assert sum(thing["kind"] == "trunk" for thing in found) >= len(trees) - 1  # one is at the street's very end
     # their points are no surface's any more, and their meshes are the classes' own
     cloud = PointCloud.load(street[0])
-    done = SPLIT.run({"cloud": street[0], "taken": done.files["taken"]}, SplitParams(), tmp_path / "whole", silent)
+    done = SPLIT.run(
+        {"cloud": street[0], "furniture_points": done.files["furniture_points"]},
+        SplitParams(),
+        tmp_path / "whole",
+        silent,
+    )
     left = PointCloud.load(done.files["building"]).classification
     assert cloud.classification is not None and left is not None
     for code in (CODE["road_sign"], CODE["pole"]):

@@ -12,7 +12,7 @@ from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.io.mesh_formats import PageNames
 from scan2sim.pipeline.io.mesh_formats import collada as dae
 from scan2sim.pipeline.io.worlds import textured_mesh
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 from tests.present import present
 
 

@@ -18,7 +18,7 @@ from scan2sim.pipeline.core.types import Camera, View
 from scan2sim.pipeline.io.worlds import glb, provenance, textured_mesh
 from scan2sim.pipeline.io.worlds.glb import GlbParams
 from scan2sim.pipeline.io.worlds.scene import Surface, group_surface
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 from tests.present import present
 
 GROUPS = {"terrain": synthetic.ground(), "building": synthetic.house()}

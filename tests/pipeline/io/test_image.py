@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bench.images import ADOBE, P3, SRGB, decoded, encoded, profile, to_xyz, write
 from scan2sim.pipeline.core.errors import InputError, UnavailableError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import U8, Camera, Frame, PointCloud, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.steps.views import ViewsParams, views
+from tests.fakes.photo_files import ADOBE, P3, SRGB, decoded, encoded, profile, to_xyz, write
 
 WIDTH, HEIGHT = 90, 70
 """No multiples of a tile's 16."""

@@ -19,7 +19,7 @@ from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds import merge, sdf
 from scan2sim.pipeline.io.worlds.merge import TileWorld, assemble
 from scan2sim.pipeline.io.worlds.scene import read_scene
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 
 EAST = 25.0  # metres from one tile to the next
 

@@ -11,7 +11,7 @@ import pytest
 from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.io.mesh_formats import PageNames, obj
 from scan2sim.pipeline.io.worlds import textured_mesh
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 from tests.present import present
 
 NAMES = PageNames("a", ("m_0", "m_1"), ("m_0.png", "m_1.png"), (0, 1))

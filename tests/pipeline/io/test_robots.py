@@ -19,9 +19,9 @@ from scan2sim.pipeline.core.types import Trajectory
 from scan2sim.pipeline.io import robot_formats, world_formats
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.scene import PATH_FILE, Scene
+from scan2sim.pipeline.io.worlds.spawn import find_spawn_pose
 from scan2sim.pipeline.simulation.robot import ROBOT
-from scan2sim.pipeline.simulation.spawn import find_spawn_pose
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 
 MASS = sum(link.mass for link in ROBOT.links)
 FIRST, LAST = (-8.0, -7.0), (8.0, -7.0)

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench.consumers import gltf_validator, omniverse, usd
 from scan2sim.flows.reports import film
 from scan2sim.pipeline.camera import renderer
 from scan2sim.pipeline.core import plugins
@@ -20,8 +19,8 @@ from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds import glb
 from scan2sim.pipeline.io.worlds.scene import Scene
 from scan2sim.texturing.levels_of_detail import with_levels
-from tests import cesium, threejs
-from tests.pipeline import synthetic
+from tests.fakes import cesium, synthetic, threejs
+from tests.fakes.consumers import gltf_validator, omniverse, usd
 from tests.present import present
 
 RADIUS = 0.2  # of the ball that is dropped, metres

@@ -18,8 +18,8 @@ from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.scene import Level, Scene, read_scene
-from tests.pipeline import synthetic
-from tests.pipeline.io.scene_readers import READERS, Shown, fbx, image, surveyed_off
+from tests.fakes import synthetic
+from tests.fakes.scene_readers import READERS, Shown, fbx, image, surveyed_off
 
 WITHOUT_MESHES = {"opendrive"}
 each = pytest.mark.parametrize("name", READERS)

@@ -10,7 +10,7 @@ import pytest
 
 from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.io.worlds import sdf
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 from tests.present import present
 
 

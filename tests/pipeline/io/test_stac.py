@@ -21,7 +21,7 @@ from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import crs, stac
 from scan2sim.pipeline.io.geodata.stac import Cloud, TileItem
 from scan2sim.pipeline.io.gps_time import from_gps
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 
 DATE = datetime(2024, 5, 17, tzinfo=UTC)
 ADJUSTED = 399_970_000.0  # GPS seconds, less a billion: May 2024

@@ -16,16 +16,16 @@ from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.io import world_formats
-from scan2sim.pipeline.io.geodata import opendrive
+from scan2sim.pipeline.io.geodata import opendrive, road_geojson
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.world_formats import opendrive as opendrive_of_scenes
 from scan2sim.pipeline.io.worlds.scene import ROADS_FILE as SEEN
-from scan2sim.pipeline.roads import listed, model, observed, profile
+from scan2sim.pipeline.roads import model, observed, profile
 from scan2sim.pipeline.roads.course import course
 from scan2sim.pipeline.roads.lanes import sections
 from scan2sim.pipeline.roads.model import Road
 from scan2sim.pipeline.steps.roads import ROADS, RoadsParams
-from tests.pipeline import synthetic as worlds
+from tests.fakes import synthetic as worlds
 from tests.pipeline.roads.made_up import FALL, KERB, Street
 
 STREET = Street()
@@ -252,9 +252,9 @@ def test_a_world_without_lanes_has_no_opendrive(tmp_path: Path) -> None:
 
 def test_notes_name_what_is_missing(done: Done) -> None:
     (road,) = drawn(done)
-    assert "left edge isn't told" in " ".join(listed.notes(replace(road, left=None)))
+    assert "left edge isn't told" in " ".join(road_geojson.notes(replace(road, left=None)))
     bare = replace(road, left=None, right=None, markings=(), reference="way")
-    assert "no lanes" in " ".join(listed.notes(bare)) and sections(bare) == []
+    assert "no lanes" in " ".join(road_geojson.notes(bare)) and sections(bare) == []
 
 
 def test_one_drives_in_the_middle_of_the_lane_on_ones_own_side(done: Done) -> None:

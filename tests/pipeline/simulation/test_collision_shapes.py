@@ -12,7 +12,7 @@ from scan2sim.pipeline.geometry import primitives
 from scan2sim.pipeline.geometry.cylinders import Cylinder
 from scan2sim.pipeline.simulation.collision_shapes import solids
 from scan2sim.pipeline.steps.decimate import with_furniture
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 
 
 def test_each_class_has_its_mesh_and_friction_and_trunks_are_cylinders() -> None:

@@ -19,9 +19,10 @@ from scan2sim.pipeline.core.errors import DataError, InputError
 from scan2sim.pipeline.core.step import Done, Step, silent
 from scan2sim.pipeline.core.types import Frame, Mesh, PointCloud
 from scan2sim.pipeline.geometry.height_map import Raster
+from scan2sim.pipeline.geometry.surface_distance import distances
 from scan2sim.pipeline.io.geodata import footprints
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.steps.geometry import GEOMETRY, distances
+from scan2sim.pipeline.steps.geometry import GEOMETRY
 from scan2sim.pipeline.steps.ground import GROUND, GroundParams, merge_neighbours
 from scan2sim.pipeline.steps.poisson import POISSON
 from scan2sim.pipeline.steps.trim import TRIM
@@ -73,9 +74,9 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for part in ("vegetation", "rest"):
         empty.save(out / f"{part}.npz")
         files[part] = out / f"{part}.npz"
-    files["ground"] = go(GROUND, out / "ground", files).files["made"]
+    files["ground"] = go(GROUND, out / "ground", files).files["synthesized"]
     roofs = {name: files[name] for name in ("building", "terrain", "ground")}
-    files["walls"] = go(WALLS, out / "walls", roofs).files["made"]
+    files["walls"] = go(WALLS, out / "walls", roofs).files["synthesized"]
     return files
 
 
@@ -115,7 +116,7 @@ def test_walls_stand_where_the_truths_walls_are(house: dict[str, Path]) -> None:
 
 
 def test_the_house_is_closed_and_the_roof_stays(house: dict[str, Path], tmp_path: Path) -> None:
-    borne = {"cloud": house["building"], "made": house["walls"]}
+    borne = {"cloud": house["building"], "synthesized": house["walls"]}
     raw = go(POISSON, tmp_path / "poisson", borne).files["mesh"]
 
     mesh = Mesh.load(go(TRIM, tmp_path / "trim", {"mesh": raw, **borne}).files["mesh"])
@@ -139,7 +140,7 @@ def test_walls_that_were_seen_are_left_alone(house: dict[str, Path], tmp_path: P
     )  # fmt: skip
     PointCloud.join([building, wall]).save(tmp_path / "building.npz")
     inputs = {"building": tmp_path / "building.npz", "terrain": house["terrain"], "ground": house["ground"]}
-    x, y, z = PointCloud.load(go(WALLS, tmp_path / "walls", inputs).files["made"]).xyz.T
+    x, y, z = PointCloud.load(go(WALLS, tmp_path / "walls", inputs).files["synthesized"]).xyz.T
     assert not ((abs(x + 6) < 0.2) & (abs(y) < 3.8) & (z > 0.3)).any()
     assert (abs(x - 9) < 0.4).sum() > 200
 
@@ -152,7 +153,7 @@ def test_footprints_say_where_walls_stand(house: dict[str, Path], tmp_path: Path
     )
     inputs = {name: house[name] for name in ("building", "terrain", "ground")} | {"footprints": file}
     done = go(WALLS, tmp_path / "walls", inputs)
-    x, y, _ = PointCloud.load(done.files["made"]).xyz.T
+    x, y, _ = PointCloud.load(done.files["synthesized"]).xyz.T
     outer = (abs(x - 4) > 1) | (abs(y) > 3)
     to_side = np.min([abs(x - side) for side in (-5.5, 8.5)] + [abs(y - side) for side in (-3.5, 3.5)], axis=0)
     assert done.facts["footprints"] == 1
@@ -225,7 +226,7 @@ def test_neighbours_fill_a_hole_on_their_border_alike(house: dict[str, Path], tm
                 cloud.take(side).save(file)
                 inputs[key] = file
         cell = {"seed": seeds[own], "neighbours": {other: seeds[other]}, "name": own, "buffer": 2.0}
-        cloud = PointCloud.load(go(GROUND, tmp_path / own, inputs, **cell).files["made"])
+        cloud = PointCloud.load(go(GROUND, tmp_path / own, inputs, **cell).files["synthesized"])
         assert len(merge_neighbours(inputs, GroundParams(**cell), "terrain")) == len(PointCloud.load(house["terrain"]))
         made[own] = {tuple(xyz) for xyz in cloud.xyz.tolist() if abs(xyz[0]) < 2}
     assert len(made["a"]) > 300
@@ -235,7 +236,7 @@ def test_neighbours_fill_a_hole_on_their_border_alike(house: dict[str, Path], tm
 def test_only_clouds_from_the_air_get_what_is_made_up(tmp_path: Path) -> None:
     tile = read_tile(SAMPLE)
     tasks = {task.step.name: task for task in build_graph(tile, Settings())}
-    assert "walls" not in tasks and "things" in tasks["ground"].inputs  # a street's: what vehicles hid
+    assert "walls" not in tasks and "instances" in tasks["ground"].inputs  # a street's: what vehicles hid
 
     bare = replace(tile, views=(), trajectory=None)
     assert {"ground", "walls"} <= {task.step.name for task in build_graph(bare, Settings())}
@@ -252,11 +253,11 @@ def test_points_far_from_the_mesh_are_warned_of_and_made_up_area_is_told(
                 np.array([(0, 1, 2), (0, 2, 3), (4, 0, 7), (0, 3, 7)], np.int32))  # fmt: skip
     mesh.save(tmp_path / "mesh.npz")
     inputs = {"mesh.building": tmp_path / "mesh.npz", "cloud.building": house["building"]}
-    done = go(GEOMETRY, tmp_path / "geometry", inputs | {"made.building": house["walls"]})
+    done = go(GEOMETRY, tmp_path / "geometry", inputs | {"synthesized.building": house["walls"]})
     assert done.facts["building"]["cloud_to_mesh_p95_m"] > 2  # the annex lacks
     assert len(done.warnings) == 1 and "building" in done.warnings[0]
     west = 8 * 3 / (8 * 3 + 10 * 8)
-    assert done.facts["building"]["made_up"] == pytest.approx(west, abs=0.06)
+    assert done.facts["building"]["synthesized"] == pytest.approx(west, abs=0.06)
 
 
 def test_a_street_scanned_from_the_ground_gets_nothing_made_up_without_a_path_either(

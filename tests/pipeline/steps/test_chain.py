@@ -15,16 +15,17 @@ from scan2sim.pipeline.core.errors import DataError, StepError
 from scan2sim.pipeline.core.step import Done, Step, silent
 from scan2sim.pipeline.core.types import Frame, Mesh, PointCloud, Trajectory
 from scan2sim.pipeline.decimation import simplify
+from scan2sim.pipeline.geometry.surface_distance import distances
+from scan2sim.pipeline.geometry.voxel_grid import sample
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.steps.decimate import DECIMATE
-from scan2sim.pipeline.steps.geometry import distances
 from scan2sim.pipeline.steps.ingest import INGEST
 from scan2sim.pipeline.steps.islands import ISLANDS
 from scan2sim.pipeline.steps.plants import PLANTS
 from scan2sim.pipeline.steps.poisson import POISSON, octree
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
-from scan2sim.pipeline.steps.voxel import VOXEL, sample
+from scan2sim.pipeline.steps.voxel import VOXEL
 
 FRAME = Frame("EPSG:32633", (500000.0, 5400000.0, 200.0))
 

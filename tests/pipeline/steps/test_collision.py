@@ -12,7 +12,7 @@ from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import Mesh, PointCloud
 from scan2sim.pipeline.steps.collision import COLLISION, CollisionParams
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 
 NONE = Mesh(synthetic.UTM, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
 

@@ -15,7 +15,7 @@ from scan2sim.pipeline.core.errors import DataError, InputError, SettingError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.steps.export import EXPORT, ExportParams
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 from tests.present import present
 
 

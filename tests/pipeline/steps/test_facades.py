@@ -111,7 +111,7 @@ def built(
     inputs = {"cloud": files.pop("building")} | {f"other.{name}": file for name, file in files.items()}
     inputs |= {"path": folder / "path.npz", "views": folder / "views.json", "labels": folder / "labels"}
     done = FACADES.run(inputs, FACADES.params(), folder, silent)
-    return PointCloud.load(done.files["made"]), done
+    return PointCloud.load(done.files["synthesized"]), done
 
 
 def tops(made: PointCloud) -> F64:

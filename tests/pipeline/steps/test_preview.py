@@ -13,7 +13,7 @@ import trimesh
 
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.steps.preview import CALLBACK, PREVIEW, PreviewParams
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.io.geodata import geotiff
 from scan2sim.pipeline.steps.rasters import RASTERS, RastersParams
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 
 rasterio = pytest.importorskip("rasterio", reason="rasterio isn't installed")
 FEET = Frame("EPSG:2263", (300_000.0, 60_000.0, 10.0), 1200 / 3937)

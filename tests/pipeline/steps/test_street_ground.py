@@ -57,9 +57,9 @@ def closed(folder: Path, holes: tuple[tuple[float, ...], ...], *, moved: bool = 
     inputs = {name: folder / f"{name}.npz" for name in files}
     for name, part in files.items():
         part.save(inputs[name])
-    inputs["things"] = things(folder / "things.geojson", moved=moved)
+    inputs["instances"] = things(folder / "instances.geojson", moved=moved)
     done = GROUND.run(inputs, GroundParams(gap=gap), folder, silent)
-    return PointCloud.load(done.files["made"])
+    return PointCloud.load(done.files["synthesized"])
 
 
 def test_the_ground_goes_on_below_a_car_and_behind_a_wall(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.terrain.ground_fit import fit_heights, heights_above_ground
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 
 KERB = 0.12
 

@@ -13,7 +13,11 @@ import pytest
 from scan2sim.pipeline.core.classes import CODE, GROUPS, group_of
 from scan2sim.pipeline.core.step import Done, Step, silent
 from scan2sim.pipeline.core.types import Frame, Mesh, PointCloud
+from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.decimation import simplify
+from scan2sim.pipeline.geometry.boundary_curve import curve
+from scan2sim.pipeline.geometry.coordinate_grid import GRID_M, world
+from scan2sim.pipeline.geometry.voxel_grid import sample
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.steps.clip import CLIP
 from scan2sim.pipeline.steps.collision import COLLISION
@@ -25,14 +29,11 @@ from scan2sim.pipeline.steps.overlap import OVERLAP
 from scan2sim.pipeline.steps.plants import PLANTS
 from scan2sim.pipeline.steps.poisson import POISSON
 from scan2sim.pipeline.steps.trim import TRIM
-from scan2sim.pipeline.steps.voxel import VOXEL, sample
-from scan2sim.pipeline.tiling.borders.boundary_curve import curve
+from scan2sim.pipeline.steps.voxel import VOXEL
 from scan2sim.pipeline.tiling.borders.clip import Clipped, clip
 from scan2sim.pipeline.tiling.borders.gap import Gap, gap
-from scan2sim.pipeline.tiling.borders.grid import GRID_M, world
 from scan2sim.pipeline.tiling.borders.join import join
 from scan2sim.pipeline.tiling.borders.open_edges import on_border
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
 from tests.conftest import ROOT
 from tests.present import present
 

@@ -30,7 +30,7 @@ from tests.present import present
 UTM = Frame("EPSG:32632", (690_000.0, 5_335_000.0, 500.0))
 FEET = Frame("EPSG:2994", (200_000.0, 300_000.0, 30.0), 0.3048)
 RADIUS, ANGLE = 200.0, 1.5  # of the street, which bends to the left: 300 m of it
-CUT = CutParams(length=100, buffer=5, reach=20)
+CUT = CutParams(length=100, buffer=5, max_distance=20)
 CAMERA = Camera("pinhole", 64, 48, 32.0, 32.0, 31.5, 23.5)
 
 
@@ -448,7 +448,7 @@ def test_only_a_survey_is_overwritten_and_only_when_told(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("options", "field"),
     [({"length": 0}, "length"), ({"buffer": -1}, "buffer"), ({"length": 10, "buffer": 6}, "buffer"),
-     ({"reach": float("nan")}, "reach"), ({"photo_reach": -1}, "photo-reach")],
+     ({"max_distance": float("nan")}, "max-distance"), ({"photo_distance": -1}, "photo-distance")],
 )  # fmt: skip
 def test_options_out_of_range_are_refused(tmp_path: Path, options: dict[str, float], field: str) -> None:
     with pytest.raises(SettingError, match=field):

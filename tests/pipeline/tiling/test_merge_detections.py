@@ -14,11 +14,13 @@ import pytest
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, Step, silent
 from scan2sim.pipeline.core.types import F64, Frame, Mesh, PointCloud, Trajectory
+from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.furniture.classify import Detection
+from scan2sim.pipeline.geometry.coordinate_grid import snap_to_grid, world
 from scan2sim.pipeline.steps.clip import CLIP
 from scan2sim.pipeline.steps.collision import COLLISION
 from scan2sim.pipeline.steps.decimate import DECIMATE
-from scan2sim.pipeline.steps.finds import FINDS
+from scan2sim.pipeline.steps.detect_furniture import DETECT_FURNITURE
 from scan2sim.pipeline.steps.furniture import FURNITURE
 from scan2sim.pipeline.steps.islands import ISLANDS
 from scan2sim.pipeline.steps.join import JOIN
@@ -28,9 +30,7 @@ from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.voxel import VOXEL
 from scan2sim.pipeline.tiling.borders.gap import gap
-from scan2sim.pipeline.tiling.borders.grid import snap_to_grid, world
 from scan2sim.pipeline.tiling.borders.merge_detections import merged_detections
-from scan2sim.pipeline.tiling.voronoi_cell import Cell
 from tests.present import present
 
 X, Y, Z = 500_000.0, 5_400_000.0, 200.0
@@ -105,7 +105,7 @@ class Tile:
     @property
     def taken(self) -> F64:
         """(N, 3) world places of points that are furniture's."""
-        index = np.load(self.furniture.files["taken"])["index"]
+        index = np.load(self.furniture.files["furniture_points"])["index"]
         return self.cloud.xyz[index].astype(np.float64) + self.cloud.frame.origin
 
     def mesh(self, group: str) -> Mesh:
@@ -134,9 +134,9 @@ def clouds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def furnish(clouds: Mapping[str, Path], found: Mapping[str, Path], name: str, out: Path) -> Tile:
     """A tile with what some tiles told of."""
-    told = {"finds" if tile == name else f"finds.{tile}": path for tile, path in found.items()}
+    told = {"detections" if tile == name else f"detections.{tile}": path for tile, path in found.items()}
     done = go(FURNITURE, out / "furniture", {"cloud": clouds[name], **told}, name=name, **known(name))
-    split = go(SPLIT, out / "split", {"cloud": clouds[name], "taken": done.files["taken"]})
+    split = go(SPLIT, out / "split", {"cloud": clouds[name], "furniture_points": done.files["furniture_points"]})
     return Tile(PointCloud.load(clouds[name]), found[name], done, split)
 
 
@@ -147,7 +147,7 @@ def tiles(clouds: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> 
     found = {}
     for name in FRAMES:
         inputs = {"cloud": clouds[name], "path": clouds[f"{name}.path"]}
-        found[name] = go(FINDS, folder / name, inputs, **known(name)).files["finds"]
+        found[name] = go(DETECT_FURNITURE, folder / name, inputs, **known(name)).files["detections"]
     return {name: furnish(clouds, found, name, folder / name) for name in FRAMES}
 
 
@@ -189,7 +189,7 @@ def test_both_take_the_same_points(tiles: dict[str, Tile]) -> None:
     east, west = ({tuple(p) for p in tile.taken.tolist() if abs(p[0] - X) <= BUFFER} for tile in tiles.values())
     assert east == west and len(east) > 5000
     for tile in tiles.values():  # what is the neighbour's hides, and lends no colour
-        own = np.load(tile.furniture.files["taken"])["own"]
+        own = np.load(tile.furniture.files["furniture_points"])["own"]
         assert len(PointCloud.load(tile.split.files["furniture"])) == own.sum() > 0
         assert len(PointCloud.load(tile.split.files["rest"])) == (~own).sum() > 0
 
@@ -230,8 +230,10 @@ def test_surfaces_meet_vertex_for_vertex(tiles: dict[str, Tile], clouds: dict[st
 def test_what_one_tile_alone_finds_goes_from_both(
     silent_one: str, tiles: dict[str, Tile], clouds: dict[str, Path], tmp_path: Path
 ) -> None:
-    nothing = go(FINDS, tmp_path / "nothing", {"cloud": clouds[silent_one]}, **known(silent_one))  # it has no path
-    found = {name: tile.found for name, tile in tiles.items()} | {silent_one: nothing.files["finds"]}
+    nothing = go(
+        DETECT_FURNITURE, tmp_path / "nothing", {"cloud": clouds[silent_one]}, **known(silent_one)
+    )  # it has no path
+    found = {name: tile.found for name, tile in tiles.items()} | {silent_one: nothing.files["detections"]}
     made = {name: furnish(clouds, found, name, tmp_path / name) for name in FRAMES}
     east, west = ({tuple(p) for p in tile.taken.tolist() if abs(p[0] - X) <= BUFFER} for tile in made.values())
     assert east == west

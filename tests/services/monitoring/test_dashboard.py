@@ -8,7 +8,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,9 +28,10 @@ from scan2sim.services.monitoring.events.schema import Event
 from scan2sim.services.monitoring.settings.dashboard import PageParams
 from scan2sim.services.monitoring.settings.limits import Limits
 from scan2sim.services.outbox import OutboxRecord
-from tests.browser import Page, chromium
 from tests.fakes.broker import Broker
+from tests.fakes.browser import Page, chromium
 from tests.services.monitoring.sample_records import record
+from tests.waiting import until
 
 HOSTILE = "<img src=x onerror=document.title='hacked'>"
 TOKEN = "0123456789abcdef"
@@ -53,13 +54,6 @@ class ServedPage:
             return json.load(answer)
 
 
-def wait_until(condition: Callable[[], Any], seconds: float = 60) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "timed out"
-        time.sleep(0.05)
-
-
 @contextmanager
 def serve_page(params: PageParams, *, reading: bool = True) -> Iterator[ServedPage]:
     """Serve the dashboard in a thread; its data come from Kafka, or from the test if not `reading`."""
@@ -68,7 +62,7 @@ def serve_page(params: PageParams, *, reading: bool = True) -> Iterator[ServedPa
     if reading:
         sources.start()
     threading.Thread(target=factory.run, args=(app, params, addresses.append), daemon=True).start()
-    wait_until(lambda: addresses)
+    until(lambda: addresses)
     yield ServedPage(addresses[0], sources)
     if reading:
         sources.close()
@@ -148,7 +142,7 @@ def test_records_from_kafka_appear_once_on_the_page(broker: Broker, page: Page) 
     topic = TopicProducer(broker.servers, params.topic)
     topic.send(records(["early"], 30))  # before the page was started
     with serve_page(params) as served:
-        wait_until(lambda: len(served.history.state()["nodes"]) == 1)
+        until(lambda: len(served.history.state()["nodes"]) == 1)
         assert served.get("health/ready") == {"failing": []}
         open_page(page, served.url)
         twice = records(["camera", "lidar"], 20, latency=150_000_000)
@@ -162,7 +156,7 @@ def test_records_from_kafka_appear_once_on_the_page(broker: Broker, page: Page) 
         assert "150 ms" in page.value("document.querySelector('#nodes tbody').textContent")
         page.until("document.getElementById('counts').textContent.startsWith('70 records')")
         broker.kill()
-        wait_until(lambda: not served.sources.is_connected())
+        until(lambda: not served.sources.is_connected())
         with pytest.raises(urllib.error.HTTPError, match="503"):
             served.get("health/ready")
         assert served.get("health/live") == {"failing": []}

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import psutil
@@ -17,15 +16,9 @@ from scan2sim.services.monitoring.autoscale.actuators.replicas import ProgramRep
 from scan2sim.services.monitoring.example_nodes import worker
 from scan2sim.services.monitoring.work.queue import EventQueue
 from tests.conftest import ROOT
+from tests.waiting import until
 
 WORKER = worker.command(0.05)
-
-
-def wait_until(condition: Callable[[], bool], seconds: float = 30) -> bool:
-    end = time.monotonic() + seconds
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.02)
-    return condition()
 
 
 def running(command: list[str]) -> list[psutil.Process]:
@@ -43,10 +36,10 @@ def test_workers_scale_and_process_all_events() -> None:
     for number in range(60):
         assert queue.put(str(number), time.time())
     pool.scale(3)
-    assert wait_until(lambda: pool.workers() == 3 and len(running(WORKER)) == 3)
+    until(lambda: pool.workers() == 3 and len(running(WORKER)) == 3)
     pool.scale(1)
-    assert wait_until(lambda: len(running(WORKER)) == 1)
-    assert wait_until(lambda: len(queue) == 0)
+    until(lambda: len(running(WORKER)) == 1)
+    until(lambda: len(queue) == 0)
     state = queue.state(1.0, pool.workers())
     assert (state.arrived, state.done, state.refused, state.workers) == (60, 60, 0, 1)
     pool.close()
@@ -59,10 +52,10 @@ def test_killed_worker_is_replaced_and_its_event_retried() -> None:
     pool = LocalWorkers(queue, slow)
     pool.scale(1)
     queue.put("a", time.time())
-    assert wait_until(lambda: queue.state(1.0, 0).waiting == 1 and len(running(slow)) == 1)
+    until(lambda: queue.state(1.0, 0).waiting == 1 and len(running(slow)) == 1)
     time.sleep(0.2)
     running(slow)[0].kill()
-    assert wait_until(lambda: len(queue) == 0)
+    until(lambda: len(queue) == 0)
     assert queue.state(1.0, 0).refused == 0
     pool.close()
 
@@ -73,7 +66,7 @@ def test_hanging_worker_is_killed_and_its_event_dropped_after_retries() -> None:
     pool = LocalWorkers(queue, hanging, deadline=0.2)
     queue.put("hangs", time.time())
     pool.scale(1)
-    assert wait_until(lambda: len(queue) == 0)
+    until(lambda: len(queue) == 0)
     assert queue.state(1.0, 0).refused == 1
     pool.close()
     assert running(hanging) == []
@@ -94,22 +87,22 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     )
     parent = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)
     family = psutil.Process(parent.pid)
-    assert wait_until(lambda: len(family.children()) == 2)
+    until(lambda: len(family.children()) == 2)
     workers = family.children()
     parent.kill()
     parent.wait()
-    assert wait_until(lambda: not any(one.is_running() for one in workers))
+    until(lambda: not any(one.is_running() for one in workers))
 
 
 def test_replicas_scale_and_are_restarted() -> None:
     programs = ProgramReplicas(["sleep", "1234"])
     programs.scale(3)
-    assert wait_until(lambda: programs.workers() == 3 and len(running(["sleep", "1234"])) == 3)
+    until(lambda: programs.workers() == 3 and len(running(["sleep", "1234"])) == 3)
     first = running(["sleep", "1234"])[0]
     first.kill()
-    assert wait_until(lambda: not first.is_running() and len(running(["sleep", "1234"])) == 3)
+    until(lambda: not first.is_running() and len(running(["sleep", "1234"])) == 3)
     programs.scale(1)
-    assert wait_until(lambda: len(running(["sleep", "1234"])) == 1)
+    until(lambda: len(running(["sleep", "1234"])) == 1)
     programs.close()
     assert programs.workers() == 0 and running(["sleep", "1234"]) == []
 
@@ -120,8 +113,8 @@ def test_replicas_end_when_their_parent_is_killed() -> None:
         "programs = ProgramReplicas(['sh', '-c', 'trap \"\" TERM; sleep 4321'])\nprograms.scale(2)\ntime.sleep(60)"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)
-    assert wait_until(lambda: len(running(["sleep", "4321"])) == 2)
+    until(lambda: len(running(["sleep", "4321"])) == 2)
     left = running(["sleep", "4321"])
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    assert wait_until(lambda: not any(one.is_running() for one in left), 60)
+    until(lambda: not any(one.is_running() for one in left), 60)

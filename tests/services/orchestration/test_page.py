@@ -21,7 +21,7 @@ from scan2sim.services.orchestration.package import Packages, build
 from scan2sim.services.orchestration.page import application
 from scan2sim.services.orchestration.settings import PageParams
 from scan2sim.services.qos.requirements import Environment
-from tests.browser import Page, chromium
+from tests.fakes.browser import Page, chromium
 from tests.fakes.osm import FakeOsm
 
 ONBOARDED = "[...document.querySelectorAll('#services article')].some(one => !one.textContent.includes('not in OSM'))"

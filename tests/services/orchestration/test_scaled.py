@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-
 from scan2sim.services.monitoring.autoscale.actuators.osm import OsmReplicas
 from scan2sim.services.orchestration import description, operations
 from scan2sim.services.orchestration.lifecycle import WaitPolicy
@@ -13,13 +10,7 @@ from scan2sim.services.orchestration.package import build
 from scan2sim.services.orchestration.settings import Connection
 from scan2sim.services.qos.requirements import Environment
 from tests.fakes.osm import FakeOsm
-
-
-def wait_until(done: Callable[[], bool]) -> None:
-    end = time.monotonic() + 20
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.02)
+from tests.waiting import until
 
 
 def test_replicas_are_scaled_to_the_last_requested_count(fake: FakeOsm, osm: Osm) -> None:
@@ -32,11 +23,11 @@ def test_replicas_are_scaled_to_the_last_requested_count(fake: FakeOsm, osm: Osm
     try:
         for count in (2, 3, 5):
             workers.scale(count)
-        wait_until(lambda: workers.workers() == 5)
+        until(lambda: workers.workers() == 5)
         last = list(fake.state.operations.values())[-1]
         assert last["operationParams"]["primitive_params"]["replicaCount"] == 5
         workers.scale(1)
-        wait_until(lambda: workers.workers() == 1)
+        until(lambda: workers.workers() == 1)
     finally:
         workers.close()
     assert [one["nsState"] for one in fake.state.instances.values()] == ["READY"]

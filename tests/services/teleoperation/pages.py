@@ -15,7 +15,8 @@ from scan2sim.services.http import factory
 from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.station.web import PageHub, application
 from tests.fakes.ports import free_port
-from tests.services.teleoperation.street import HERE, Desk, Street, until
+from tests.services.teleoperation.street import HERE, Desk, Street
+from tests.waiting import until
 
 
 @dataclass

@@ -12,7 +12,7 @@ import numpy as np
 
 from scan2sim.services.teleoperation import cameras
 from scan2sim.services.teleoperation.cameras import Camera, CameraFrame, View
-from scan2sim.services.teleoperation.control.controls import Controls, Gear, VehicleState
+from scan2sim.services.teleoperation.control.controls import Controls, Gear
 from scan2sim.services.teleoperation.control.messages import Command, VideoStream
 from scan2sim.services.teleoperation.gateway.client import GatewayConnection
 from scan2sim.services.teleoperation.gateway.fleet import Fleet
@@ -29,7 +29,9 @@ from scan2sim.services.teleoperation.vehicle.app import Vehicle
 from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardParams, OnboardUnit
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame
 from scan2sim.services.teleoperation.video.rate_control import BitrateBounds
-from tests.services.teleoperation.transport.relay import Relay
+from tests.fakes.relay import Relay
+from tests.fakes.vehicle import RecordingVehicle
+from tests.waiting import until
 
 HERE = "127.0.0.1"
 LIMIT = 1500.0
@@ -37,29 +39,6 @@ LIMIT = 1500.0
 SCRIPT = "script"
 AHEAD = Controls(throttle=0.5, gear=Gear.FORWARD)
 REST = Controls(gear=Gear.FORWARD)
-
-
-def until(condition: Callable[[], object], seconds: float = 60) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "timed out"
-        time.sleep(0.01)
-
-
-class Wheels:
-    """A vehicle that keeps its last controls."""
-
-    def __init__(self) -> None:
-        self.controls = Controls()
-
-    def obey(self, controls: Controls) -> None:
-        self.controls = controls
-
-    def state(self) -> VehicleState:
-        return VehicleState(5.0 * self.controls.throttle, gear=self.controls.gear)
-
-    def close(self) -> None:
-        pass
 
 
 class Desk:
@@ -142,8 +121,8 @@ class Street:
         certify(self.parties, [HERE], ["car"], ["desk", "other"], 1, False)
         self._state = folder / "state"
         self.gateway, self.fleet = self._start(0)
-        self.wheels, self._ended = Wheels(), threading.Event()
-        adapter_server = AdapterServer(self.wheels, AdapterParams(port=0, limit=LIMIT))
+        self.car, self._ended = RecordingVehicle(), threading.Event()
+        adapter_server = AdapterServer(self.car, AdapterParams(port=0, limit=LIMIT))
         self._adapter_thread = threading.Thread(target=adapter_server.run, args=(self._ended,), daemon=True)
         self._adapter_thread.start()
         address = f"{HERE}:{adapter_server.address[1]}"

@@ -12,7 +12,8 @@ import pytest
 pytest.importorskip("OpenSSL", reason="the extra teleop isn't installed")
 
 from scan2sim.services.teleoperation.control.controls import Controls
-from tests.services.teleoperation.street import AHEAD, REST, Street, until
+from tests.services.teleoperation.street import AHEAD, REST, Street
+from tests.waiting import until
 
 
 @pytest.fixture
@@ -28,25 +29,25 @@ def stopped(controls: Controls) -> bool:
 
 def test_driver_sees_video_confirms_and_drives(street: Street) -> None:
     desk = street.desk()
-    assert stopped(street.wheels.controls) or street.wheels.controls == Controls()
+    assert stopped(street.car.controls) or street.car.controls == Controls()
     street.fleet.join("car", "desk", "operator")
     until(lambda: len(desk.frames) > 10)
     assert desk.frames[0].key and (desk.frames[0].width, desk.frames[0].height) == (160, 120)
     desk.drive(AHEAD)
     time.sleep(1.0)
-    assert desk.standing() and street.wheels.controls.throttle == 0, "nobody has confirmed"
+    assert desk.standing() and street.car.controls.throttle == 0, "nobody has confirmed"
     desk.start()
-    until(lambda: street.wheels.controls.throttle == AHEAD.throttle)
+    until(lambda: street.car.controls.throttle == AHEAD.throttle)
     until(lambda: any(link["up"] for link in street.fleet.snapshot()["vehicles"][0]["links"]))
     desk.drive(None)
-    until(lambda: stopped(street.wheels.controls))
+    until(lambda: stopped(street.car.controls))
     desk.drive(AHEAD)
     time.sleep(1.0)
-    assert stopped(street.wheels.controls), "it stopped by itself, and starts only after a confirmation"
+    assert stopped(street.car.controls), "it stopped by itself, and starts only after a confirmation"
     desk.start()
-    until(lambda: street.wheels.controls.throttle == AHEAD.throttle)
+    until(lambda: street.car.controls.throttle == AHEAD.throttle)
     street.fleet.release("car", "operator")
-    until(lambda: stopped(street.wheels.controls))
+    until(lambda: stopped(street.car.controls))
 
 
 def test_packets_lost_on_both_links_are_retransmitted(street: Street) -> None:
@@ -75,18 +76,18 @@ def test_camera_that_changes_its_frame_size_does_not_interrupt_the_drive(street:
         until(lambda: [(one.width, one.height) for one in desk.streams()] == [size])  # noqa: B023
     count = len(desk.frames)
     until(lambda: len(desk.frames) > count + 5)
-    assert desk.stop() == stop and street.wheels.controls.throttle == AHEAD.throttle
+    assert desk.stop() == stop and street.car.controls.throttle == AHEAD.throttle
 
 
 def test_pair_keeps_driving_while_its_gateway_restarts(street: Street) -> None:
     desk = street.desk()
     street.fleet.join("car", "desk", "operator")
     desk.start()
-    until(lambda: street.wheels.controls.throttle == AHEAD.throttle)
+    until(lambda: street.car.controls.throttle == AHEAD.throttle)
     stop = desk.stop()
     street.restart_gateway()
     until(lambda: [one["there"] for kind in street.fleet.snapshot().values() for one in kind] == [True, True])
-    assert desk.stop() == stop and street.wheels.controls.throttle == AHEAD.throttle
+    assert desk.stop() == stop and street.car.controls.throttle == AHEAD.throttle
     assert street.fleet.snapshot()["vehicles"][0]["other"] == "desk"
 
 
@@ -94,30 +95,30 @@ def test_handover_ends_the_first_drive_and_requires_a_confirmation(street: Stree
     desk, other = street.desk(), street.desk("other")
     street.fleet.join("car", "desk", "operator")
     desk.start()
-    until(lambda: street.wheels.controls.throttle == AHEAD.throttle)
+    until(lambda: street.car.controls.throttle == AHEAD.throttle)
     street.fleet.hand_over("car", "other", "operator")
-    until(lambda: stopped(street.wheels.controls))
+    until(lambda: stopped(street.car.controls))
     until(lambda: other.telemetry() is not None)
     desk.drive(AHEAD)
     other.drive(AHEAD)
     time.sleep(1.0)
-    assert stopped(street.wheels.controls) and desk.station.joined() is None
+    assert stopped(street.car.controls) and desk.station.joined() is None
     other.start()
-    until(lambda: street.wheels.controls.throttle == AHEAD.throttle)
+    until(lambda: street.car.controls.throttle == AHEAD.throttle)
 
 
 def test_restarted_station_gets_its_vehicle_back(street: Street) -> None:
     desk = street.desk()
     street.fleet.join("car", "desk", "operator")
     desk.start()
-    until(lambda: street.wheels.controls.throttle == AHEAD.throttle)
+    until(lambda: street.car.controls.throttle == AHEAD.throttle)
     port = desk.port
     street.desks.remove(desk)
     desk.close()
-    until(lambda: stopped(street.wheels.controls))
+    until(lambda: stopped(street.car.controls))
     again = street.desk(port=port)
     again.drive(REST)
     until(lambda: again.telemetry() is not None)
-    assert stopped(street.wheels.controls)
+    assert stopped(street.car.controls)
     again.start()
-    until(lambda: street.wheels.controls.throttle == AHEAD.throttle)
+    until(lambda: street.car.controls.throttle == AHEAD.throttle)

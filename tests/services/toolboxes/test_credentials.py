@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
@@ -31,6 +30,7 @@ from scan2sim.services.toolboxes.settings import ToolboxParams
 from scan2sim.services.toolboxes.sources import Cameras
 from tests.fakes.ports import free_port
 from tests.services.toolboxes import shaky
+from tests.waiting import until
 
 USER, PASSWORD, TOKEN = "admin", "hunter2", "s3cret"
 
@@ -88,13 +88,6 @@ def redacted_url(port: int, path: str = "live") -> str:
     return f"http://***@127.0.0.1:{port}/{path}?token=***"
 
 
-def wait_until(done: Callable[[], Any]) -> None:
-    deadline = time.monotonic() + 60
-    while not done():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-
-
 def check_no_secrets(*texts: str) -> None:
     for text in texts:
         assert not any(secret in text for secret in (PASSWORD, TOKEN)), text
@@ -108,7 +101,7 @@ def test_status_and_detections_name_a_camera_without_its_credentials(
     client = TestClient(application(engine, ServerParams(), cameras), base_url="http://localhost")
     try:
         started = client.post("/start").text
-        wait_until(lambda: client.get("/detections").json())
+        until(lambda: client.get("/detections").json())
         status, detections = client.get("/status"), client.get("/detections")
         assert (
             list(status.json()["cameras"]) == [redacted_url(port)]
@@ -141,7 +134,7 @@ def test_unreachable_camera_is_logged_once_without_its_credentials(
     name = redacted_url(closed).replace("http", scheme)
     cameras.start()
     try:
-        wait_until(lambda: name in caplog.text)
+        until(lambda: name in caplog.text)
         time.sleep(1.0)  # it is retried meanwhile
         assert cameras.states() == {name: {"there": False, "images": 0}}
     finally:

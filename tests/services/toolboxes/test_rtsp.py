@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import subprocess
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from scan2sim.services.toolboxes.settings import ToolboxParams
 from scan2sim.services.toolboxes.sources import CAMERA_TIMEOUT_S, Cameras
 from tests.fakes.ports import free_port
 from tests.services.toolboxes import shaky
+from tests.waiting import until
 
 PYTHON = "/usr/bin/python3"
 """Debian's Python, for which GStreamer's bindings are packaged."""
@@ -33,13 +33,6 @@ def camera(port: int, grey: int) -> Iterator[None]:
             served.kill()
 
 
-def wait(done: Callable[[], bool], seconds: float) -> None:
-    deadline = time.monotonic() + seconds
-    while not done():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-
-
 def test_rtsp_camera_is_read_and_reconnected() -> None:
     if not Path(PYTHON).is_file() or subprocess.run([PYTHON, "-c", IMPORT_TEST], capture_output=True).returncode:
         pytest.skip("GStreamer's RTSP server isn't installed (gir1.2-gst-rtsp-server-1.0)")
@@ -54,11 +47,11 @@ def test_rtsp_camera_is_read_and_reconnected() -> None:
     try:
         with camera(port, 120):
             cameras.start()
-            wait(lambda: abs(grey() - 120) < 5, 30)
+            until(lambda: abs(grey() - 120) < 5, 30)
             assert cameras.states()[address]["there"]
-        wait(lambda: not cameras.states()[address]["there"], CAMERA_TIMEOUT_S + 10)
+        until(lambda: not cameras.states()[address]["there"], CAMERA_TIMEOUT_S + 10)
         with camera(port, 60):
-            wait(lambda: abs(grey() - 60) < 5, 30)
+            until(lambda: abs(grey() - 60) < 5, 30)
             assert cameras.states()[address]["there"]
     finally:
         cameras.stop()

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.slam.lidar import Simulated, ate, simulated
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import F64, Frame, PointCloud, Trajectory
@@ -28,13 +27,15 @@ from scan2sim.slam.trajectory.fusion import (
     fuse,
     lidar_motions,
 )
+from tests.fakes.lidar_drive import Simulated, simulated
+from tests.fakes.slam_drive import ate
 from tests.present import present
 
 ALL = ("lidar", "camera", "gps")
 
 
 def off(fused: Fused, drive: Simulated) -> float:
-    return ate(fused.trajectory.positions, drive.truth[:, :3, 3])
+    return ate(fused.trajectory.positions, drive.truth[:, :3, 3], scaled=False)
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
@@ -154,7 +155,7 @@ def placed(files: dict[str, Path], out: Path, *names: str, **how: float | str) -
     (out / "-".join(names)).mkdir(parents=True)
     given = {name: files[name] for name in ("sweeps", *names)}
     done = fuse_path(given, FuseParams.model_validate(how), out / "-".join(names), silent)
-    return trajectory_io.read(done.files["trajectory"]), done.facts["told"]
+    return trajectory_io.read(done.files["trajectory"]), done.facts["summary"]
 
 
 def test_what_is_given_is_fused_and_told(tmp_path: Path) -> None:
@@ -168,11 +169,11 @@ def test_what_is_given_is_fused_and_told(tmp_path: Path) -> None:
     assert told == "placed by sweeps (85 % of the motions)" and present(alone.unsure).mean() > 0.5
     path, told = placed(files, tmp_path / "out", "matched", "poses", "extrinsics")
     assert told == "placed by sweeps (85 % of the motions), trajectory (87 % of the motions)"
-    assert error(path).max() < 5 and ate(path.positions, truth) < 1
+    assert error(path).max() < 5 and ate(path.positions, truth, scaled=False) < 1
     everything = ("matched", "poses", "extrinsics", "gps")
     path, told = placed(files, tmp_path / "out", *everything, gps_offset=-100.0)
     places = re.search(r"GPS \((\d+) of 400 positions\)", told)
-    assert places and int(places[1]) > 300 and ate(path.positions, truth) < 0.8 and error(path).max() < 6
+    assert places and int(places[1]) > 300 and ate(path.positions, truth, scaled=False) < 0.8 and error(path).max() < 6
     assert path.times == pytest.approx(drive.times)
     late, _ = placed(files, tmp_path / "late", *everything, gps_offset=-80.0, time_offset=20.0)
     assert late.times == pytest.approx(drive.times)  # in the sweeps' own clock

@@ -9,7 +9,7 @@ from scan2sim.data_samples.gps import receiver
 from scan2sim.pipeline.core.types import GpsTrack, Trajectory
 from scan2sim.slam.trajectory import scale
 from scan2sim.slam.trajectory.gps import smooth
-from tests.slam.synthetic import ate, drifting_turn
+from tests.fakes.slam_drive import ate, drifting_turn
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -17,15 +17,8 @@ from scan2sim.services.teleoperation.gateway.identity import Identity, Role
 from scan2sim.services.teleoperation.gateway.json_stream import Client, Connection, Server
 from scan2sim.services.teleoperation.transport import tls
 from scan2sim.services.teleoperation.transport.tls import Channel, TlsError
-from tests.services.teleoperation.certificates import OTHER, OWN, identity
-
-
-def until(condition: Callable[[], Any], seconds: float = 60) -> None:
-    """Wait for a condition."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "timed out"
-        time.sleep(0.005)
+from tests.fakes.certificates import OTHER, OWN, identity
+from tests.waiting import until
 
 
 class Side:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -26,13 +25,7 @@ from scan2sim.services.teleoperation.gateway.protocol import (
     Status,
 )
 from scan2sim.services.teleoperation.gateway.server import Gateway
-
-
-def until(condition: Callable[[], object], seconds: float = 60) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "timed out"
-        time.sleep(0.02)
+from tests.waiting import until
 
 
 class ObedientParty:

@@ -19,7 +19,7 @@ from scan2sim.services.teleoperation.gateway.fleet import Fleet, Order
 from scan2sim.services.teleoperation.gateway.identity import Peer, Role
 from scan2sim.services.teleoperation.gateway.protocol import Hello, LinkStatus, Status
 from scan2sim.services.teleoperation.gateway.web import application
-from tests.browser import chromium
+from tests.fakes.browser import chromium
 
 HOSTILE = "<img src=x onerror=document.title='hacked'>"
 

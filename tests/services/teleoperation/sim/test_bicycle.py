@@ -11,7 +11,7 @@ import pytest
 from scan2sim.pipeline.io.worlds.scene import Scene
 from scan2sim.services.teleoperation.control.controls import STOP, Controls, Gear, VehicleState
 from scan2sim.services.teleoperation.sim.bicycle import STEP_MAX_S, Bicycle, Car, Ground, PoseTracker, SimulatedCar
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 
 GO = Controls(throttle=1.0, gear=Gear.FORWARD)
 

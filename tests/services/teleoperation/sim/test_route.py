@@ -18,7 +18,7 @@ from scan2sim.services.teleoperation.qos.scripted_drive import ScriptedCommands
 from scan2sim.services.teleoperation.sim import route
 from scan2sim.services.teleoperation.sim.bicycle import Bicycle, Ground
 from scan2sim.services.teleoperation.sim.route import LoopingVehicle, PurePursuit
-from tests.pipeline import synthetic
+from tests.fakes import synthetic
 
 STEP = 0.02
 

@@ -18,7 +18,7 @@ from scan2sim.pipeline.core.errors import UnavailableError
 from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.station import app_window
 from tests.services.teleoperation.pages import Cockpit, served
-from tests.services.teleoperation.street import until
+from tests.waiting import until
 
 
 @pytest.fixture

@@ -29,9 +29,10 @@ from scan2sim.services.teleoperation.station.app import JoinedVehicle
 from scan2sim.services.teleoperation.station.web import FRAME_HEADER, PageHub
 from scan2sim.services.teleoperation.transport.clock_sync import ClockSync
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame
-from tests.browser import Page, chromium
+from tests.fakes.browser import Page, chromium
 from tests.services.teleoperation.pages import Cockpit, served, station_process
-from tests.services.teleoperation.street import Street, until
+from tests.services.teleoperation.street import Street
+from tests.waiting import until
 
 SOON = 5.0
 """Seconds within which the page must cover old video; the limit is 0.3 s, but a machine that runs tests is busy."""

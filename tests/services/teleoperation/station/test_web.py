@@ -22,9 +22,9 @@ from websockets.sync.client import ClientConnection, connect
 from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.control.controls import Controls, Gear
 from scan2sim.services.teleoperation.control.messages import Command
-from tests.browser import Page, chromium
+from tests.fakes.browser import Page, chromium
 from tests.services.teleoperation.pages import Cockpit, served
-from tests.services.teleoperation.street import until
+from tests.waiting import until
 
 TOKEN = "0123456789abcdef/+="
 
@@ -96,10 +96,10 @@ def test_driver_sees_the_video_age_confirms_and_drives_by_keyboard(cockpit: Cock
         assert 0 <= age < 5000 and page.value("Number(document.getElementById('age').textContent)") >= 0
         assert "front" in page.value("document.querySelector('figcaption').textContent")
         page.do("Input.dispatchKeyEvent", type="rawKeyDown", code="ArrowUp", key="ArrowUp")
-        until(lambda: cockpit.street.wheels.controls.throttle > 0.5)
+        until(lambda: cockpit.street.car.controls.throttle > 0.5)
         page.do("Input.dispatchKeyEvent", type="keyUp", code="ArrowUp", key="ArrowUp")
-        until(lambda: cockpit.street.wheels.controls.throttle == 0 and not cockpit.desk.standing())
-        assert cockpit.street.wheels.controls.brake == 0, "it rolls: its driver still holds the lock"
+        until(lambda: cockpit.street.car.controls.throttle == 0 and not cockpit.desk.standing())
+        assert cockpit.street.car.controls.brake == 0, "it rolls: its driver still holds the lock"
         shown = "[...document.querySelectorAll('#cameras b')].map((one) => one.textContent)"
         assert page.value(f"camera(2), camera(1), {shown}") == ["front", "camera 1", "camera 2"], "the first is largest"
         assert not page.errors
@@ -109,7 +109,7 @@ def test_any_brake_overrides_any_throttle(cockpit: Cockpit, tmp_path: Path) -> N
     """Full throttle and a brake on the same device or another: at the vehicle, and in all that the page sends."""
     throttles = ("up", "right trigger")
     brakes = ("space", "down", "S", "mouse", "finger", "left trigger", "other gamepad's left trigger")
-    wheels = cockpit.street.wheels
+    car = cockpit.street.car
     with chromium(tmp_path) as page:
         start_driving(page, cockpit)
         page.value(GAMEPADS)
@@ -119,14 +119,14 @@ def test_any_brake_overrides_any_throttle(cockpit: Cockpit, tmp_path: Path) -> N
             press(page, "#agree", lambda: not cockpit.desk.standing())
             page.value("gamepad = null; 0")  # the next gamepad with a pressed button is used
             hold(page, throttle, True)
-            until(lambda: wheels.controls.throttle > 0.9)
+            until(lambda: car.controls.throttle > 0.9)
             hold(page, brake, True)
-            until(lambda: wheels.controls.brake > 0.9)
-            assert wheels.controls.throttle == 0, f"{brake} while {throttle} is held"
+            until(lambda: car.controls.brake > 0.9)
+            assert car.controls.throttle == 0, f"{brake} while {throttle} is held"
             hold(page, brake, False)
-            until(lambda: wheels.controls.brake == 0)
+            until(lambda: car.controls.brake == 0)
             hold(page, throttle, False)
-            until(lambda: wheels.controls.throttle == 0)
+            until(lambda: car.controls.throttle == 0)
         braked = "sent.filter((one) => one.do === 'turn' && one.brake > 0)"
         assert page.value(f"{braked}.length") > 0 and page.value(f"{braked}.every((one) => one.throttle === 0)")
         assert not page.errors
@@ -138,9 +138,9 @@ def test_brake_key_works_with_modifiers_and_presses_no_button(cockpit: Cockpit, 
         page.value("document.getElementById('leave').focus()")
         for ctrl in (0, 2):
             page.do("Input.dispatchKeyEvent", type="rawKeyDown", code="Space", key=" ", modifiers=ctrl)
-            until(lambda: cockpit.street.wheels.controls.brake == 1 and not cockpit.desk.standing())
+            until(lambda: cockpit.street.car.controls.brake == 1 and not cockpit.desk.standing())
             page.do("Input.dispatchKeyEvent", type="keyUp", code="Space", key=" ", modifiers=ctrl)
-            until(lambda: cockpit.street.wheels.controls.brake == 0)
+            until(lambda: cockpit.street.car.controls.brake == 0)
         assert cockpit.desk.station.driver_session.holder() is not None
 
 

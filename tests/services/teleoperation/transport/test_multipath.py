@@ -24,9 +24,9 @@ from scan2sim.services.teleoperation.transport.dtls_session import count_records
 from scan2sim.services.teleoperation.transport.multipath import MultipathConnection, Policy
 from scan2sim.services.teleoperation.transport.station_side import Listener
 from scan2sim.services.teleoperation.transport.vehicle_side import Link, connect_station
-from tests.services.teleoperation.certificates import OTHER, OWN, identity
-from tests.services.teleoperation.gateway.test_json_stream import until
-from tests.services.teleoperation.transport.relay import Relay
+from tests.fakes.certificates import OTHER, OWN, identity
+from tests.fakes.relay import Relay
+from tests.waiting import until
 
 CAR, DESK = identity(Role.VEHICLE, "car"), identity(Role.STATION, "desk")
 A, B = Link("a", "127.0.0.1"), Link("b", "127.0.0.2")

@@ -30,32 +30,11 @@ from scan2sim.services.teleoperation.vehicle.adapters import VehicleUnreachable
 from scan2sim.services.teleoperation.vehicle.adapters.can import EXAMPLE_DBC
 from scan2sim.services.teleoperation.vehicle.adapters.ros import MESSAGE_TYPES, ODOMETRY_TYPE
 from tests.conftest import ROOT
+from tests.fakes.vehicle import RecordingVehicle
+from tests.waiting import until
 
 GO = Controls(0.5, throttle=1.0, gear=Gear.FORWARD, lights=True)
 LIMIT = 200
-
-
-class RecordingVehicle:
-    """A vehicle that records its controls, with their times."""
-
-    def __init__(self) -> None:
-        self.received: list[tuple[float, Controls]] = []
-        self.unreachable = ""
-        self.closed = False
-
-    def obey(self, controls: Controls) -> None:
-        if self.unreachable:
-            raise VehicleUnreachable(self.unreachable)
-        self.received.append((time.monotonic(), controls))
-
-    def state(self) -> VehicleState:
-        return VehicleState(1.0)
-
-    def close(self) -> None:
-        self.closed = True
-
-    def moves(self) -> bool:
-        return bool(self.received) and self.received[-1][1].throttle > 0
 
 
 class OnboardPeer:
@@ -184,13 +163,6 @@ def test_vehicle_is_stopped_when_its_adapter_ends() -> None:
     assert vehicle.received[-1][1] == STOP and vehicle.closed
 
 
-def until(what: Callable[[], bool]) -> None:
-    end = time.monotonic() + 20
-    while not what():
-        assert time.monotonic() < end
-        time.sleep(0.005)
-
-
 NEW = """
 from scan2sim.pipeline.core import step
 from scan2sim.services.teleoperation.control.controls import VehicleState
@@ -248,9 +220,9 @@ def test_new_vehicle_is_one_module_and_stops_when_its_onboard_unit_hangs(
     port = int(boat.stdout.readline())
     hanging = f"""
 from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardParams, OnboardUnit
-from tests.services.teleoperation.vehicle.test_onboard_unit import FakeConnection, Station
+from tests.fakes.driver import FakeConnection, ScriptedDriver
 unit, connection, stations = OnboardUnit(OnboardParams(translator="127.0.0.1:{port}")), FakeConnection(), []
-unit.join(lambda received, restarted: stations.append(Station(connection, received)) or connection)
+unit.join(lambda received, restarted: stations.append(ScriptedDriver(connection, received)) or connection)
 stations[0].start()
 print("drives", flush=True)
 """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -12,7 +11,7 @@ from typing import Any
 import pytest
 
 from scan2sim.pipeline.core.errors import SettingError
-from scan2sim.services.teleoperation.control.controls import Controls, Gear, VehicleState
+from scan2sim.services.teleoperation.control.controls import VehicleState
 from scan2sim.services.teleoperation.control.messages import (
     Command,
     KeyFrameRequest,
@@ -27,7 +26,6 @@ from scan2sim.services.teleoperation.control.messages import (
 from scan2sim.services.teleoperation.control.safety import DROP_OTHER_SESSION, NS_PER_MS
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
 from scan2sim.services.teleoperation.vehicle.adapter_protocol import Answer
-from scan2sim.services.teleoperation.vehicle.adapters import VehicleUnreachable
 from scan2sim.services.teleoperation.vehicle.onboard_unit import (
     ADAPTER_SILENT,
     BODY_MAX_BYTES,
@@ -40,44 +38,10 @@ from scan2sim.services.teleoperation.vehicle.onboard_unit import (
     OnboardUnit,
     pack_fitting,
 )
+from tests.fakes.driver import GO, REST, FakeClocks, FakeConnection, ScriptedDriver
+from tests.fakes.vehicle import RecordingVehicle
 
 LIMIT = 200
-GO = Controls(0.5, throttle=1.0, gear=Gear.FORWARD)
-REST = Controls(gear=Gear.FORWARD)
-
-
-@dataclass
-class FakeClocks:
-    """Clocks of a station that equal those of the vehicle."""
-
-    known: bool = True
-    uncertainty_ms: float = 5.0
-    wall_apart_s: float = 0.0
-    now: Callable[[], int] = time.monotonic_ns
-
-    @property
-    def wall_wrong(self) -> bool:
-        return abs(self.wall_apart_s) > 1
-
-    def age_ms(self, sent: int) -> float:
-        return (self.now() - sent) / NS_PER_MS if self.known else math.inf
-
-
-@dataclass
-class FakeConnection:
-    clocks: FakeClocks = field(default_factory=FakeClocks)
-    sent: list[tuple[Kind, bytes]] = field(default_factory=list)
-    closed: bool = False
-
-    def send(self, kind: Kind, body: bytes) -> int:
-        self.sent.append((kind, body))
-        return len(self.sent)
-
-    def close(self) -> None:
-        self.closed = True
-
-    def telemetry(self) -> Telemetry:
-        return next(Telemetry.unpack(body) for kind, body in reversed(self.sent) if kind == Kind.TELEMETRY)
 
 
 @dataclass
@@ -286,68 +250,19 @@ def test_invalid_adapter_address_is_reported() -> None:
             OnboardParams(translator=wrong).address()
 
 
-class Vehicle:
-    def __init__(self) -> None:
-        self.controls: list[Controls] = []
-        self.unreachable = False
-
-    def obey(self, controls: Controls) -> None:
-        if self.unreachable:
-            raise VehicleUnreachable("the plug is out")
-        self.controls.append(controls)
-
-    def state(self) -> VehicleState:
-        return VehicleState(3.0)
-
-    def close(self) -> None:
-        pass
-
-
-class Station:
-    """A running driver, who sends fifty commands per second."""
-
-    def __init__(self, connection: FakeConnection, received: Callable[[Message], None]) -> None:
-        self.connection, self.received = connection, received
-        self.controls, self.agree, self.number, self.ended = REST, False, 0, threading.Event()
-        self.thread = threading.Thread(target=self.run)
-        self.thread.start()
-
-    def run(self) -> None:
-        while not self.ended.wait(0.02):
-            sent = any(kind == Kind.TELEMETRY for kind, _ in self.connection.sent)
-            telemetry = self.connection.telemetry() if sent else None
-            self.number += 1
-            command = Command(self.controls, telemetry.stop if telemetry else 0, self.agree)
-            self.received(Message(Kind.COMMAND, self.number, time.monotonic_ns(), command.pack()))
-
-    def until(self, what: Callable[[], bool]) -> None:
-        end = time.monotonic() + 20
-        while not what():
-            assert time.monotonic() < end, self.connection.telemetry()
-            time.sleep(0.005)
-
-    def start(self) -> None:
-        """Release the throttle, press the confirm button until the vehicle drives, press the throttle."""
-        self.controls, self.agree = REST, False
-        time.sleep(0.15)
-        self.agree = True
-        self.until(lambda: not self.connection.telemetry().standing)
-        self.controls, self.agree = GO, False
-
-
 @pytest.fixture
-def running() -> Iterator[tuple[Vehicle, OnboardUnit, Station, FakeConnection, threading.Event]]:
+def running() -> Iterator[tuple[RecordingVehicle, OnboardUnit, ScriptedDriver, FakeConnection, threading.Event]]:
     """A vehicle, its adapter, its onboard unit, and a station."""
-    vehicle, ended, connection = Vehicle(), threading.Event(), FakeConnection()
+    vehicle, ended, connection = RecordingVehicle(VehicleState(3.0)), threading.Event(), FakeConnection()
     adapter_server = AdapterServer(vehicle, AdapterParams(port=0, limit=LIMIT))
     adapter = threading.Thread(target=adapter_server.run, args=(ended,))
     adapter.start()
     unit = OnboardUnit(OnboardParams(translator=f"127.0.0.1:{adapter_server.address[1]}", limit=LIMIT))
-    stations: list[Station] = []
+    stations: list[ScriptedDriver] = []
 
     def connect(received: Callable[[Message], None], restarted: Callable[[], None]) -> FakeConnection:
         restarted()
-        stations.append(Station(connection, received))
+        stations.append(ScriptedDriver(connection, received))
         return connection
 
     unit.join(connect)
@@ -361,68 +276,69 @@ def running() -> Iterator[tuple[Vehicle, OnboardUnit, Station, FakeConnection, t
 
 
 def test_drive_from_the_driver_to_the_vehicle_and_back(
-    running: tuple[Vehicle, OnboardUnit, Station, FakeConnection, threading.Event],
+    running: tuple[RecordingVehicle, OnboardUnit, ScriptedDriver, FakeConnection, threading.Event],
 ) -> None:
     vehicle, _, station, connection, ended = running
     station.start()
-    station.until(lambda: vehicle.controls[-1] == GO)
+    station.until(lambda: vehicle.controls == GO)
     assert connection.telemetry().vehicle.speed == 3.0 and any(kind == Kind.STREAMS for kind, _ in connection.sent)
 
     station.ended.set()  # the links are cut
     station.thread.join()
     cut = time.monotonic()
-    station.until(lambda: vehicle.controls[-1].brake == 1)
+    station.until(lambda: vehicle.controls.brake == 1)
     assert time.monotonic() - cut < LIMIT / 1000 + 0.1
     station.until(lambda: connection.telemetry().standing)
 
-    again = Station(connection, station.received)
+    again = ScriptedDriver(connection, station.received)
     again.number, again.controls = station.number, GO
     time.sleep(0.2)
-    assert vehicle.controls[-1].brake == 1  # not before the driver confirms
+    assert vehicle.controls.brake == 1  # not before the driver confirms
     again.start()
-    again.until(lambda: vehicle.controls[-1] == GO)
+    again.until(lambda: vehicle.controls == GO)
 
-    vehicle.unreachable = True
+    vehicle.unreachable = "the plug is out"
     again.until(lambda: "the plug is out" in connection.telemetry().reason)
-    vehicle.unreachable = False
+    vehicle.unreachable = ""
     time.sleep(0.1)
-    assert vehicle.controls[-1].brake == 1
+    assert vehicle.controls.brake == 1
     again.start()
-    again.until(lambda: vehicle.controls[-1] == GO)
+    again.until(lambda: vehicle.controls == GO)
 
     ended.set()  # the adapter ends
     again.until(lambda: connection.telemetry().reason == ADAPTER_SILENT)
-    assert vehicle.controls[-1].brake == 1
+    assert vehicle.controls.brake == 1
     again.ended.set()
     again.thread.join()
 
 
 def test_release_stops_the_vehicle_at_once(
-    running: tuple[Vehicle, OnboardUnit, Station, FakeConnection, threading.Event],
+    running: tuple[RecordingVehicle, OnboardUnit, ScriptedDriver, FakeConnection, threading.Event],
 ) -> None:
     vehicle, unit, station, connection, _ = running
     station.start()
-    station.until(lambda: vehicle.controls[-1] == GO)
+    station.until(lambda: vehicle.controls == GO)
     unit.release("taken back")
     assert connection.closed
-    station.until(lambda: vehicle.controls[-1].brake == 1)
+    station.until(lambda: vehicle.controls.brake == 1)
     station.agree = True
     time.sleep(0.2)
-    assert vehicle.controls[-1].brake == 1
+    assert vehicle.controls.brake == 1
 
 
 def test_failed_watchdog_is_detected_and_the_vehicle_stops(
-    running: tuple[Vehicle, OnboardUnit, Station, FakeConnection, threading.Event], monkeypatch: pytest.MonkeyPatch
+    running: tuple[RecordingVehicle, OnboardUnit, ScriptedDriver, FakeConnection, threading.Event],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     vehicle, unit, station, _, _ = running
     station.start()
-    station.until(lambda: vehicle.controls[-1] == GO)
+    station.until(lambda: vehicle.controls == GO)
     monkeypatch.setattr(threading, "excepthook", lambda _: None)
 
     def failing(now: int) -> Any:
         raise RuntimeError("a bug")
 
     monkeypatch.setattr(unit.car, "watchdog_order", failing)
-    station.until(lambda: vehicle.controls[-1].brake == 1)
+    station.until(lambda: vehicle.controls.brake == 1)
     assert isinstance(unit.failed, RuntimeError)
     unit.failed = None

@@ -17,8 +17,8 @@ from scan2sim.services.teleoperation import cameras
 from scan2sim.services.teleoperation.cameras import Mount, View, pattern, world
 from scan2sim.services.teleoperation.settings import VehicleParams
 from scan2sim.services.teleoperation.video import timecode
+from tests.fakes import synthetic
 from tests.fakes.ports import free_port
-from tests.pipeline import synthetic
 from tests.services.teleoperation.video.videos import psnr, scenery
 
 take = itertools.islice

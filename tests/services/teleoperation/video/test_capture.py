@@ -17,13 +17,7 @@ from scan2sim.services.teleoperation.video.jitter_buffer import Frame, VideoRece
 from scan2sim.services.teleoperation.video.rate_control import EncodingPlan
 from scan2sim.services.teleoperation.video.srtp_session import KeySchedule
 from tests.services.teleoperation.video.videos import FRAME_INTERVAL_NS, Drive, scenery
-
-
-def wait(condition: object, seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():  # type: ignore[operator]
-        assert time.monotonic() < end
-        time.sleep(0.01)
+from tests.waiting import until
 
 
 def test_cameras_are_sent_in_parallel_threads() -> None:
@@ -49,7 +43,7 @@ def test_cameras_are_sent_in_parallel_threads() -> None:
         CameraStreamer(i, camera, CameraEncoder(i, keys, encoders.find("pyav")), send, EncodingPlan(bitrate=300_000))
         for i, camera in enumerate(opened)
     ]
-    wait(lambda: len(frames) == 4 and min(map(len, frames.values())) > 10)
+    until(lambda: len(frames) == 4 and min(map(len, frames.values())) > 10)
     assert streamers[2].stream == VideoStream(2, "right", 160, 120, 30.0)
     for streamer, camera in zip(streamers, opened, strict=True):
         streamer.close()
@@ -99,14 +93,14 @@ def test_lost_camera_is_reported_and_reopened(monkeypatch: pytest.MonkeyPatch) -
         lambda p: sent.append(len(p)),
         EncodingPlan(),
     )
-    wait(lambda: sent)
+    until(lambda: sent)
     assert streamer.stream.fps == 30.0
     connected.clear()
-    wait(lambda: streamer.stream.fps == 0.0)
+    until(lambda: streamer.stream.fps == 0.0)
     assert camera.fault == "/dev/video0: is gone. Plug it in"
     connected.set()
     before = len(sent)
-    wait(lambda: len(sent) > before and streamer.stream.fps == 30.0 and not camera.fault)
+    until(lambda: len(sent) > before and streamer.stream.fps == 30.0 and not camera.fault)
     streamer.close()
     camera.close()
 
@@ -169,11 +163,11 @@ def test_failed_encoder_is_reported_and_replaced() -> None:
     streamer = CameraStreamer(
         0, camera, CameraEncoder(0, KeySchedule(0.0), Backend()), lambda p: sent.append(len(p)), EncodingPlan()
     )
-    wait(lambda: sent)
+    until(lambda: sent)
     broken.set()
-    wait(lambda: streamer.fault == "the encoder is hot" and streamer.stream.fps == 0.0)
+    until(lambda: streamer.fault == "the encoder is hot" and streamer.stream.fps == 0.0)
     broken.clear()
     before = len(sent)
-    wait(lambda: len(sent) > before and not streamer.fault and streamer.encoder.counts["encoders"] == 2)
+    until(lambda: len(sent) > before and not streamer.fault and streamer.encoder.counts["encoders"] == 2)
     streamer.close()
     camera.close()

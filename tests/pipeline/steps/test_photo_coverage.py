@@ -1,0 +1,123 @@
+"""What of a street is worth a surface: seen on a made-up one, where a camera drives and looks ahead."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.survey import build_survey_graph
+from scan2sim.flows.pipelines.tile import build_graph
+from scan2sim.pipeline.core.classes import CODE
+from scan2sim.pipeline.core.step import Done, silent
+from scan2sim.pipeline.core.types import F32, Camera, Frame, PointCloud, Tile, Trajectory, View
+from scan2sim.pipeline.core.voronoi_cell import Cell
+from scan2sim.pipeline.io import views as views_io
+from scan2sim.pipeline.steps.photo_coverage import CLOSING_CELL_M, PHOTO_COVERAGE, ROADSIDE_M
+
+CAMERA = Camera("pinhole", 1200, 400, 700.0, 700.0, 600.0, 200.0)
+
+
+def plane(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> F32:
+    """Points every decimetre of a rectangle that is flat along one axis."""
+    axes = [np.arange(low, high, 0.1) if high > low else np.array([low]) for low, high in (x, y, z)]
+    return np.stack([a.ravel() for a in np.meshgrid(*axes, indexing="ij")], axis=1).astype(np.float32)
+
+
+GROUND = plane((-30, 60), (-20, 20), (0, 0))
+WALL = plane((0, 40), (8, 8), (0, 3))  # along the street
+SCREEN = plane((12, 12), (-7, -6), (0, 1.2))  # small, across it: the ground behind is hidden
+PARTS = {"road": GROUND, "building": WALL, "wall_or_fence": SCREEN}
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A drive of 10 m along x, with a photo every 2 m that looks ahead."""
+    out = tmp_path_factory.mktemp("street")
+    classification = np.concatenate([np.full(len(xyz), CODE[name], np.uint8) for name, xyz in PARTS.items()])
+    PointCloud(Frame(), np.concatenate(list(PARTS.values())), classification=classification).save(out / "cloud.npz")
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    poses[:, :3, 3] = np.column_stack([np.arange(0, 12, 2), np.zeros(6), np.full(6, 1.7)])
+    views = [View(str(i), CAMERA, pose, Path(f"{i}.jpg")) for i, pose in enumerate(poses)]
+    views_io.save(out / "views.json", views, [False] * len(views))
+    Trajectory(np.arange(6.0), poses[:, :3, 3]).save(out / "path.npz")
+    return {"cloud": out / "cloud.npz", "views": out / "views.json", "path": out / "path.npz"}
+
+
+def left(done: Done) -> PointCloud:
+    return PointCloud.load(done.files["cloud"])
+
+
+def go(inputs: dict[str, Path], out: Path, **params: Any) -> Done:
+    return PHOTO_COVERAGE.run(inputs, PHOTO_COVERAGE.params(**params), out, silent)
+
+
+def test_what_photos_see_and_the_lane_stay_and_the_rest_goes(street: dict[str, Path], tmp_path: Path) -> None:
+    done = go(street, tmp_path)
+    cloud = left(done)
+    x, y, z = cloud.xyz.T
+    ground = cloud.classification == CODE["road"]
+    assert ((x > 15) & (x < 25) & (abs(y) < 5) & ground).sum() > 0.97 * 100 * 100, "ahead"
+    behind = ground & (x < -1)
+    assert behind.any() and np.hypot(x[behind], y[behind]).max() < ROADSIDE_M + 1.5 * CLOSING_CELL_M, (
+        "behind the first photo the lane alone"
+    )
+    assert not (y > 9).any(), "no photo sees through the wall"
+    assert ((x > 10) & (x < 25) & (y > 7.9) & (y < 8.1) & (z > 0.2)).sum() > 0.95 * 150 * 28, "the wall itself"
+    assert done.facts["left_out"] == done.facts["points_in"] - len(cloud) > 0
+    lost = len(np.concatenate(list(PARTS.values()))) - len(cloud)
+    assert done.facts["left_out_m2"] == pytest.approx(lost * 0.01, rel=0.1)
+
+
+def test_ground_hidden_behind_something_small_is_kept(street: dict[str, Path], tmp_path: Path) -> None:
+    cloud = left(go(street, tmp_path))
+    x, y, _ = cloud.xyz.T
+    shadow = (x > 12.1) & (x < 13.5) & (y > -7) & (y < -6) & (cloud.classification == CODE["road"])
+    assert shadow.sum() > 0.95 * 13 * 9
+
+
+def test_metres_from_the_path(street: dict[str, Path], tmp_path: Path) -> None:
+    done = go(street, tmp_path, limit=6.0)
+    x, y, _ = left(done).xyz.T
+    away = np.hypot(x - x.clip(0, 10), y)
+    assert 5.5 < away.max() < 6.6 and done.facts["far_m"] < 6.6
+
+
+def test_held_out_photos_dont_count(street: dict[str, Path], tmp_path: Path) -> None:
+    views_io.save(tmp_path / "views.json", views_io.load(street["views"]), [True] * 6)
+    x, y, _ = left(go(street | {"views": tmp_path / "views.json"}, tmp_path)).xyz.T
+    assert np.hypot(x - x.clip(0, 10), y).max() < ROADSIDE_M + 1.5 * CLOSING_CELL_M
+
+
+def test_a_path_in_the_air_and_a_tile_without_photos_keep_all(street: dict[str, Path], tmp_path: Path) -> None:
+    path = Trajectory.load(street["path"])
+    replace(path, positions=path.positions + [0, 0, 50]).save(tmp_path / "path.npz")
+    for i, inputs in enumerate((street | {"path": tmp_path / "path.npz"}, {"cloud": street["cloud"]})):
+        (tmp_path / str(i)).mkdir()
+        done = go(inputs, tmp_path / str(i))
+        assert done.facts["left_out"] == 0 and len(left(done)) == len(PointCloud.load(street["cloud"]))
+
+
+def test_only_where_photos_are_taken_along_a_path_and_neighbours_read_it() -> None:
+    view = View("a", CAMERA, np.eye(4), Path("a.jpg"))
+    bare = Tile(Path("tile.toml"), "a", Frame(), (Path("cloud.laz"),))
+    street = replace(bare, views=(view,))
+    steps = {
+        name: {task.step.name for task in build_graph(tile, Settings())} for name, tile in (("b", bare), ("s", street))
+    }
+    assert "photo_coverage" in steps["s"] and "photo_coverage" not in steps["b"]
+    off = {task.step.name for task in build_graph(street, Settings({"photo_coverage": {"limit": "off"}}))}
+    assert "photo_coverage" not in off
+    # a survey's tiles meet: what is beyond the border is kept or left out as the neighbour decides, photos or none
+    tiles = [
+        replace(street, name="a", cell=Cell((0, 0), {"b": (10, 0)})),
+        replace(bare, name="b", cell=Cell((10, 0), {"a": (0, 0)})),
+    ]
+    tasks = {task.full_name: task for task in build_survey_graph(tiles, Settings())}
+    read = {(source.task.full_name, source.name) for source in tasks["a/overlap"].inputs.values()}  # type: ignore[union-attr]
+    assert read == {("a/photo_coverage", "cloud"), ("b/photo_coverage", "cloud")}
