@@ -112,12 +112,13 @@ def _run_survey_with_prefect(*arguments: Any) -> None:
     Raises:
         IncompleteError: the world is finished, but side products failed.
     """
-    from scan2sim.flows.deployed.survey import check_server, survey
+    from scan2sim.flows.deployed.prefect_server import prefect_server
+    from scan2sim.flows.deployed.survey import survey
     from scan2sim.flows.deployed.tile import WITH_WARNINGS
 
-    check_server()
-    state: Any = survey(*arguments, return_state=True)
-    report = Path(state.result())
+    with prefect_server():
+        state: Any = survey(*arguments, return_state=True)
+        report = Path(state.result())
     if state.name == WITH_WARNINGS:
         raise IncompleteError(report.parent / "world", state.message or "")
 

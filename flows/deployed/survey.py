@@ -3,58 +3,23 @@
 from __future__ import annotations
 
 import base64
-import os
-import signal
-import sys
 from pathlib import Path
 from typing import Any
 
 import scan2sim.flows.deployed.prefect_settings  # noqa: F401  # isort: skip  # before prefect
 from prefect import flow
 from prefect.artifacts import create_image_artifact, create_markdown_artifact, create_table_artifact
-from prefect.client.orchestration import get_client
 from prefect.client.schemas.objects import State
-from prefect.settings import PREFECT_API_URL
 from prefect.states import Completed
 
 from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.survey import make_survey
-from scan2sim.flows.deployed.prefect_server_guard import kill_server_on_exit
 from scan2sim.flows.deployed.tile import artifact_key, prefect_executor, with_warnings
 from scan2sim.flows.engine.progress import published
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.reports.survey import PAGE, overview, rows
-from scan2sim.pipeline.core.errors import INTERRUPTED, IncompleteError, StepError, UnavailableError, exit_code
+from scan2sim.pipeline.core.errors import IncompleteError, StepError
 from scan2sim.pipeline.core.remote import local_copy
-
-
-def check_server() -> None:
-    """Check that the configured Prefect server answers; if none is configured, prepare for a temporary one.
-
-    Ctrl-C also interrupts the temporary server, and Prefect would retry for minutes to notify it: so on Ctrl-C the
-    process exits at once.
-
-    Raises:
-        UnavailableError: the configured server doesn't answer.
-    """
-    url = PREFECT_API_URL.value()
-    if url is None:
-        signal.signal(signal.SIGINT, _exit)
-        kill_server_on_exit()
-        return
-    with get_client(sync_client=True) as client:
-        problem = client.api_healthcheck()
-    if problem is not None:
-        remedy = "Start it (`prefect server start`), or unset PREFECT_API_URL to use a temporary server"
-        raise UnavailableError(url, f"the Prefect server doesn't answer ({problem})", remedy)
-
-
-def _exit(*_: object) -> None:
-    from prefect.server.api.server import SubprocessASGIServer  # slow to import; already imported if the server runs
-
-    SubprocessASGIServer().stop()
-    print(INTERRUPTED, file=sys.stderr, flush=True)
-    os._exit(exit_code(KeyboardInterrupt()))
 
 
 def publish(out: Path) -> None:

@@ -31,7 +31,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Gauge, gen
 from starlette.exceptions import HTTPException as StarletteHTTPException
 
 from scan2sim.pipeline.core.errors import ScanError, http_status, printable
-from scan2sim.services.http.limits import LimitedHttpProtocol, raise_file_limit
+from scan2sim.services.http.limits import LimitedEventLoop, raise_file_limit, request_in_progress
 from scan2sim.services.http.settings import ServerParams
 
 log = logging.getLogger(__name__)
@@ -120,7 +120,8 @@ def run(app: FastAPI, params: ServerParams, listening: Callable[[str], None]) ->
             server_header=False,
             ssl_certfile=params.certificate,
             ssl_keyfile=params.key,
-            http=LimitedHttpProtocol,
+            http="h11",
+            loop=f"{LimitedEventLoop.__module__}:{LimitedEventLoop.__name__}",
             timeout_graceful_shutdown=1,  # event streams of live pages never end by themselves
         )
         uvicorn.Server(config).run(sockets=[listener])
@@ -165,6 +166,10 @@ class _Guard:
         self._authorization = None if secret is None else f"Bearer {secret}".encode()
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
+        with request_in_progress():
+            await self._handle(scope, receive, send)
+
+    async def _handle(self, scope: Message, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
         elif (rejection := self._rejection(scope)) is not None:

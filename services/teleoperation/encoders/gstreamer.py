@@ -11,7 +11,7 @@ from scan2sim.pipeline.core.types import U8
 from scan2sim.services.teleoperation.encoders import EncoderSettings
 from scan2sim.services.teleoperation.encoders.pyav import KEY_FRAME_MAX_PERCENT
 
-RANK = 4
+RANK = 2
 ENCODE_TIMEOUT_NS = 1_000_000_000
 """Timeout for encoding one frame."""
 ELEMENT = (
@@ -23,24 +23,20 @@ ELEMENT = (
 
 def unavailable() -> Unavailable | None:
     """Whether GStreamer, its Python bindings or the element is missing."""
-    return missing_element("vp8enc", "gstreamer1.0-plugins-good")
-
-
-def encoder(settings: EncoderSettings) -> Encoder:
-    """Create an encoder, which runs in a GStreamer thread."""
-    return Encoder(ELEMENT.format(bitrate=settings.bitrate), settings)
-
-
-def missing_element(element: str, package: str) -> Unavailable | None:
-    """`Backend.unavailable` for a GStreamer element; `package`: Debian package that installs it."""
     if importlib.util.find_spec("gi") is None:
         return Unavailable("needs gi, not installed here", "apt-get install python3-gi gir1.2-gst-plugins-base-1.0")
     gst = load_gstreamer()
     if gst is None or gst.ElementFactory.find("appsrc") is None:
         return Unavailable("needs GStreamer, not installed here", "apt-get install gir1.2-gst-plugins-base-1.0")
-    if gst.ElementFactory.find(element) is None:
-        return Unavailable(f"needs the GStreamer element {element}, not installed here", f"apt-get install {package}")
+    if gst.ElementFactory.find("vp8enc") is None:
+        cause = "needs the GStreamer element vp8enc, not installed here"
+        return Unavailable(cause, "apt-get install gstreamer1.0-plugins-good")
     return None
+
+
+def encoder(settings: EncoderSettings) -> Encoder:
+    """Create an encoder, which runs in a GStreamer thread."""
+    return Encoder(settings)
 
 
 def load_gstreamer() -> Any:
@@ -61,7 +57,7 @@ def load_gstreamer() -> Any:
 class Encoder:
     """GStreamer pipeline: appsrc, encoder element, appsink."""
 
-    def __init__(self, element: str, settings: EncoderSettings) -> None:
+    def __init__(self, settings: EncoderSettings) -> None:
         self._gst = load_gstreamer()
         raw = (
             f"video/x-raw,format=I420,width={settings.width},height={settings.height},"
@@ -69,7 +65,7 @@ class Encoder:
         )
         self._pipeline = self._gst.parse_launch(
             f"appsrc name=source is-live=true format=time block=true max-buffers=1 caps={raw} ! "
-            f"{element} name=encoder ! appsink name=sink sync=false max-buffers=4"
+            f"{ELEMENT.format(bitrate=settings.bitrate)} name=encoder ! appsink name=sink sync=false max-buffers=4"
         )
         self._source = self._pipeline.get_by_name("source")
         self._sink = self._pipeline.get_by_name("sink")

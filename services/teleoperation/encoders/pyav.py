@@ -10,7 +10,7 @@ from scan2sim.pipeline.core.types import U8
 from scan2sim.services.teleoperation.encoders import EncoderSettings
 
 NEEDS, EXTRA = ("av",), "teleop"
-RANK = 3
+RANK = 1
 TIME_BASE_HZ = 90_000
 KEY_FRAME_MAX_PERCENT = 300
 """Maximum size of a key frame, percent of the mean frame size; unlimited, the first one takes a second's bits."""
@@ -34,26 +34,26 @@ def unavailable() -> Unavailable | None:
 
 def encoder(settings: EncoderSettings) -> Encoder:
     """Create an encoder that runs in the calling thread, with the GIL released."""
-    rate, half = str(settings.bitrate), str(settings.bitrate // 2)
-    return Encoder("libvpx", settings, OPTIONS | {"minrate": rate, "maxrate": rate, "bufsize": half})
+    return Encoder(settings)
 
 
 class Encoder:
-    """An FFmpeg encoder."""
+    """libvpx as an FFmpeg encoder, at a constant bit rate."""
 
-    def __init__(self, codec: str, settings: EncoderSettings, options: dict[str, str]) -> None:
+    def __init__(self, settings: EncoderSettings) -> None:
         import av
         from av.video.frame import PictureType
 
         self._av, self._key = av, PictureType.I
         create: Any = av.CodecContext.create
-        self._codec = create(codec, "w")
+        self._codec = create("libvpx", "w")
         self._codec.width, self._codec.height, self._codec.pix_fmt = settings.width, settings.height, "yuv420p"
         self._codec.framerate = Fraction(settings.fps).limit_denominator(1001)
         self._codec.time_base = Fraction(1, TIME_BASE_HZ)
         self._codec.bit_rate, self._codec.gop_size = settings.bitrate, 9999
         self._codec.thread_count = 1
-        self._codec.options = options
+        rate, half = str(settings.bitrate), str(settings.bitrate // 2)
+        self._codec.options = OPTIONS | {"minrate": rate, "maxrate": rate, "bufsize": half}
         self._first: int | None = None
         self._last = -1
 

@@ -2,6 +2,9 @@
 
 One thread serves all connections of a `Server`; a `Client` has its own, and reconnects when its connection breaks.
 Callbacks run in that thread, one at a time, and must not block. A blank line is a heartbeat.
+
+TLS is pyOpenSSL's (`transport.tls`): Python's `ssl`, on which WebSocket libraries build, can't set the ciphers of
+TLS 1.3 and the key exchange groups before Python 3.15, so D3.2's order of ciphers and X25519MLKEM768 would be lost.
 """
 
 from __future__ import annotations

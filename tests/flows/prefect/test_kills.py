@@ -6,11 +6,15 @@ import os
 import signal
 import subprocess
 import sys
+import urllib.request
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
+from http.client import HTTPException
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from scan2sim.flows.engine.dispatch import dispatch
@@ -171,12 +175,53 @@ def test_temporary_server_ends_with_a_killed_command(tmp_path: Path) -> None:
             start_new_session=True,
         )  # fmt: skip
     try:
-        until(lambda: processes("PREFECT__SERVER_EPHEMERAL", "1"), 150, what="its server")
+        server = until(lambda: temporary_servers(tmp_path), 150, what="its server")
         until(lambda: list(out.glob("steps/*/*/*/manifest.json")), 150, what="a finished step")
         process.kill()  # only the command
         until(lambda: not processes("PREFECT_HOME", str(tmp_path)), 30, what="the end of all its processes")
     finally:
         kill(process)
+    assert not any(answers(port) for port in server)
+
+
+def test_temporary_server_ends_with_its_context(tmp_path: Path) -> None:
+    """Even if the command fails; and another one may be started afterwards."""
+    script = (
+        "from prefect.settings import PREFECT_API_URL\n"
+        "from tests.flows.prefect.test_kills import answers\n"
+        "from scan2sim.flows.deployed.prefect_server import prefect_server\n"
+        "for _ in range(2):\n"
+        "    try:\n"
+        "        with prefect_server():\n"
+        "            port = int(PREFECT_API_URL.value().split(':')[-1].split('/')[0])\n"
+        "            assert answers(port)\n"
+        "            raise KeyError\n"
+        "    except KeyError:\n"
+        "        assert not answers(port) and PREFECT_API_URL.value() is None\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment(tmp_path), cwd=ROOT, capture_output=True, text=True, timeout=200
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def temporary_servers(home: Path) -> list[int]:
+    """Ports of the Prefect servers in the processes that use this folder."""
+    ports = []
+    for process in processes("PREFECT_HOME", str(home)):
+        with suppress(psutil.Error):
+            sockets = psutil.Process(process).net_connections("tcp")
+            ports += [one.laddr.port for one in sockets if one.status == psutil.CONN_LISTEN]
+    return [port for port in ports if answers(port)]
+
+
+def answers(port: int) -> bool:
+    """Whether a Prefect server answers on this port."""
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/api/health", timeout=10) as answer:
+            return bool(answer.status == 200)
+    except (OSError, HTTPException):
+        return False
 
 
 class FailedFuture:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import socket
 import ssl
 import subprocess
@@ -21,6 +23,7 @@ pytest.importorskip("fastapi", reason="the extra bus isn't installed")
 from fastapi import FastAPI, Request, WebSocket
 from fastapi.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
+from websockets.sync.client import connect
 
 from scan2sim.services.http import factory, limits
 
@@ -219,11 +222,23 @@ def test_tls_without_a_token_logs_a_warning(
 @pytest.fixture
 def plain(monkeypatch: pytest.MonkeyPatch) -> int:
     """Port of a running service with short timeouts."""
-    monkeypatch.setattr(limits, "FIRST_REQUEST_TIMEOUT_S", 1.0)
+    monkeypatch.setattr(limits, "REQUEST_TIMEOUT_S", 1.0)
     monkeypatch.setattr(factory, "BODY_TIMEOUT_S", 0.5)
     addresses: list[str] = []
     params = ServerParams(port=0)
-    threading.Thread(target=factory.run, args=(app_of(params), params, addresses.append), daemon=True).start()
+    app = app_of(params)
+
+    @app.get("/slow")
+    def slow(seconds: float) -> float:
+        time.sleep(seconds)
+        return seconds
+
+    @app.websocket("/echo")
+    async def echo(socket: WebSocket) -> None:
+        await socket.accept()
+        await socket.send_text(await socket.receive_text())
+
+    threading.Thread(target=factory.run, args=(app, params, addresses.append), daemon=True).start()
     while not addresses:
         time.sleep(0.05)
     return int(addresses[0].rsplit(":")[-1].strip("/"))
@@ -237,6 +252,52 @@ def test_a_thousand_idle_connections_do_not_block_others_and_are_closed(plain: i
         one.settimeout(20)
         assert one.recv(1) == b""
         one.close()
+
+
+def test_further_connections_are_closed_at_once(plain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "MAX_CONNECTIONS", 3)
+    monkeypatch.setattr(limits, "REQUEST_TIMEOUT_S", 60.0)
+    idle = [socket.create_connection(("127.0.0.1", plain), timeout=20) for _ in range(3)]
+    with socket.create_connection(("127.0.0.1", plain), timeout=20) as further:
+        assert further.recv(1) == b""
+    idle.pop().close()
+    wait_until_served(plain)
+    for one in idle:
+        one.close()
+
+
+def wait_until_served(port: int) -> None:
+    for _ in range(200):
+        with contextlib.suppress(OSError):
+            urllib.request.urlopen(f"http://127.0.0.1:{port}/health/live", timeout=10).close()
+            return
+        time.sleep(0.05)
+    raise AssertionError("requests are rejected")
+
+
+GET = b"GET /number?value=2 HTTP/1.1\r\nHost: localhost\r\n"
+POST = b"POST /nix HTTP/1.1\r\nHost: localhost\r\nContent-Length: 999\r\n"
+
+
+@pytest.mark.parametrize("first", [b"", GET + b"\r\n", POST + b"\r\n"], ids=["first", "second", "rejected body"])
+def test_slow_headers_time_out(plain: int, first: bytes) -> None:
+    """Slowloris: in the first header, in a later one, or in the body of a request that has been answered."""
+    with socket.create_connection(("127.0.0.1", plain), timeout=20) as slow:
+        if first:
+            slow.sendall(first)
+            assert slow.recv(2**16)
+        with pytest.raises(OSError):
+            for byte in itertools.islice(itertools.chain(GET, itertools.cycle(b"X-More: 1\r\n")), 100):
+                slow.sendall(bytes([byte]))
+                time.sleep(0.1)
+
+
+def test_slow_responses_and_silent_websockets_are_not_cut_off(plain: int) -> None:
+    with connect(f"ws://127.0.0.1:{plain}/echo") as silent:
+        with urllib.request.urlopen(f"http://127.0.0.1:{plain}/slow?seconds=2", timeout=20) as answer:
+            assert answer.read() == b"2.0"
+        silent.send("still here")
+        assert silent.recv(20) == "still here"
 
 
 def test_missing_body_times_out(plain: int) -> None:

@@ -73,8 +73,13 @@ def test_available_encoder_of_lowest_rank_is_chosen(monkeypatch: pytest.MonkeyPa
             with pytest.raises(UnavailableError) as caught:
                 encoders.find(name)
             assert caught.value.cause == f"{name} {reason.cause}" and caught.value.remedy == reason.remedy
-    with pytest.raises(SettingError, match="unknown value 'theora'"):
-        encoders.find("theora")
+
+
+@pytest.mark.parametrize("name", ["theora", "vaapi", "../pyav"])
+def test_unknown_encoder_lists_available_ones(name: str) -> None:
+    with pytest.raises(SettingError, match="unknown value") as caught:
+        encoders.find(name)
+    assert caught.value.remedy == "Choose one of: gstreamer, pyav"
 
 
 def test_invalid_data_decodes_to_none() -> None:
