@@ -85,7 +85,6 @@ USES = {
     "matplotlib": ["slam evaluate truth.csv truth.csv", "slam study FRAMES --truth truth.csv"],
     "pycolmap": ["slam FRAMES --adjust"],
     "kiss_icp": ["import sweeps FRAMES"],
-    "fast_simplification": ["run TILE --set decimate.backend=fast_simplification"],
     "pymeshlab": ["run TILE --set decimate.backend=pymeshlab"],
     "pye57": ["import clouds cloud.e57"],
     "zstandard": ["import clouds ept.json"],
