@@ -1,7 +1,8 @@
 """Compare decimation libraries on the meshes of a finished world.
 
-`python -m bench.decimation OUT [--classes terrain building] [--shares 0.5 0.15] [--only NAME ...]`: OUT is the output of
-`scan2sim run` (`make demo`: demo-out, the synthetic street). The input of `decimate`, which is the result of `islands`, is reduced to shares of its triangles by every available library, keeping borders.
+`python -m bench.decimation OUT [--classes terrain building] [--shares 0.5 0.15] [--only NAME ...]`: OUT is the output
+of `scan2sim run` (`make demo`: demo-out, the synthetic street). The input of `decimate`, which is the result of
+`islands`, is reduced to shares of its triangles by every available library, keeping borders.
 
 - seconds: time of the edge collapse alone, the better of two runs.
 - away: distances in metres from 100,000 points of the original mesh to the new one: mean, 95 %, maximum.
