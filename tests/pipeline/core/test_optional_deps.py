@@ -79,7 +79,11 @@ USES = {
         "slam study FRAMES --truth truth.csv --backend adam",
     ],
     "safetensors": ["segment train .", "slam FRAMES --features superpoint", "run TILE --set label.network=segformer"],
-    "transformers": ["run TILE --set label.network=segformer", "segment tile TILE --set label.network=segformer"],
+    "transformers": [
+        "run TILE --set label.network=segformer", "segment tile TILE --set label.network=segformer",
+        "slam FRAMES --features superpoint", "slam FRAMES --features orb --matcher superglue",
+        "slam FRAMES --features orb --matcher lightglue",
+    ],
     "onnx": ["segment train ."],
     "av": ["slam video.mp4", "slam FRAMES --view", "slam FRAMES --gps video.mp4", "view world --film flight.mp4"],
     "matplotlib": ["slam evaluate truth.csv truth.csv", "slam study FRAMES --truth truth.csv"],
