@@ -92,7 +92,7 @@ class LightGlue(NetworkMatcher):
 
 def _converted(state: dict[str, Any]) -> dict[str, Any]:
     """Tensors of LightGlue's .pth files by the names of `transformers`, which has a tensor each for q, k and v."""
-    out = {}
+    out: dict[str, Any] = {}
     for name, value in files.renamed(state, RENAMES).items():
         if ".Wqkv." in name:
             value = value.unflatten(0, (HEADS, -1, 3))

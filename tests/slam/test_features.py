@@ -275,7 +275,7 @@ def check_matches(matcher: matchers.Matcher, a: FeatureSet, b: FeatureSet) -> No
     assert np.array_equal(pairs, matcher.match(a, b, (size, size)))
     back = matcher.match(b, a, (size, size))[:, ::-1]
     assert np.array_equal(pairs, back[np.argsort(back[:, 0])])
-    assert np.array_equal(pairs, matcher.match(a, b._replace(uv=b.uv / 2), (size, (320, 240))))
+    assert np.array_equal(pairs, matcher.match(a, b._replace(uv=(b.uv / 2).astype(np.float32)), (size, (320, 240))))
     none = FeatureSet(*(x[:0] for x in b))
     assert matcher.match(a, none, (size, size)).shape == matcher.match(none, a, (size, size)).shape == (0, 2)
 
