@@ -1,8 +1,8 @@
 """Compare decimation libraries on the meshes of a finished world.
 
-`python -m bench.decimation OUT [--classes terrain building] [--shares 0.5 0.15] [--only pyfqmr ...]`: OUT is the output
+`python -m bench.decimation OUT [--classes terrain building] [--shares 0.5 0.15] [--only NAME ...]`: OUT is the output
 of `scan2sim run` (`make demo`: demo-out, the synthetic street). The input of `decimate`, which is the result of
-`islands`, is reduced to shares of its triangles by every available library, keeping borders where supported.
+`islands`, is reduced to shares of its triangles by every available library, keeping borders.
 
 - seconds: time of the edge collapse alone, the better of two runs.
 - away: distances in metres from 100,000 points of the original mesh to the new one: mean, 95 %, maximum.
@@ -57,11 +57,10 @@ def share_facing_away(small: Mesh, whole: Mesh) -> float:
 
 def metrics(whole: Mesh, name: str, target: int) -> dict[str, Any]:
     """Metrics of one library."""
-    keeps = plugins.module(decimation.__name__, name).KEEPS_BORDER
     took = []
     for _ in range(2):
         start = time.perf_counter()
-        small = decimation.simplify(whole, target, keep_border=keeps, backend=name)
+        small = decimation.simplify(whole, target, backend=name)
         took.append(time.perf_counter() - start)
     edges = border(whole)
     return {

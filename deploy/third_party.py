@@ -86,7 +86,7 @@ packages, too:
 {attention}
 
 The core has nothing under the GPL without an exception. To redistribute no GPL code at all, leave out the extra
-`meshlab`, one of four libraries for decimation, and the extras `slam`, `teleop` and `toolboxes`: they need PyAV to read
+`meshlab`, one of two libraries for decimation, and the extras `slam`, `teleop` and `toolboxes`: they need PyAV to read
 and write videos (built against an FFmpeg without x264 and x265, it still reads them, and encodes VP8), and pycolmap for
 `slam --adjust` only. Of the toolboxes' containers, only `movement` contains PyAV
 ([toolboxes.md](../toolboxes.md#containers)).
@@ -106,8 +106,8 @@ ATTENTION = (
      "library, Open3D's is linked in (scan2sim reads no video with either)"),
     ("libquadmath", "LGPL-2.1-or-later", "core: numpy, scipy, opencv-python-headless",
      "the licence's text and the source; a shared library"),
-    ("libgfortran, libgomp", "GPL-3.0 with the GCC Runtime Library Exception", "core: numpy, scipy",
-     "none: the exception allows any use in compiled programs"),
+    ("libgfortran, libgomp", "GPL-3.0 with the GCC Runtime Library Exception",
+     "core: numpy, scipy, fast-simplification", "none: the exception allows any use in compiled programs"),
     ("mp3lame, GnuTLS, nettle, GMP, libunistring, ALSA", "LGPL", "`slam`, `teleop`, `toolboxes`: av",
      "the licence's text and the source; shared libraries"),
     ("GEOS", "LGPL-2.1-or-later", "`rasters`: rasterio", "as above"),

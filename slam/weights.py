@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,17 +20,17 @@ Shape = tuple[int, ...]
 NEEDS = ("torch", "safetensors")
 """Packages that the networks need."""
 NETWORK_SIGNATURES = {
-    r"convPa\.weight": "SuperPoint",
-    r"bin_score": "SuperGlue",
-    r"log_assignment\.\d+\.matchability\.weight": "LightGlue",
+    r"convPa\.weight|keypoint_decoder\.conv_score_a\.weight": "SuperPoint",
+    r"keypoint_encoder\.encoder\.0\.linear\.weight": "SuperGlue",
+    r"kenc\.encoder\.0\.weight": "SuperGlue as Magic Leap publishes it",
+    r"(log_assignment|match_assignment_layers)\.\d+\.matchability\.weight": "LightGlue",
     r"desc_head\.agg_weights": "ALIKED",
-    r"keypoint_decoder\.conv_score_a\.weight": "SuperPoint as transformers writes it",
-    r"keypoint_encoder\.encoder\.0\.linear\.weight": "SuperGlue as transformers writes it",
-    r"match_assignment_layers\.0\.matchability\.weight": "LightGlue as transformers writes it",
     r"(matcher\.)?loftr_coarse\..*": "LoFTR",
     r"segformer\..*": "SegFormer",
 }
 """Patterns of tensor names that identify a network."""
+Renames = Sequence[tuple[str, str | Callable[[re.Match[str]], str]]]
+"""Patterns and replacements that convert names of tensors, applied in order."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Model:
         licence: licence of its published weights.
         published: names of published files by their SHA-256.
         optional: pattern of tensor names that may occur and are ignored.
-        renames: patterns and replacements that convert names in files to those in `shapes`.
+        convert: converts tensors as published to those in `shapes`, and leaves others as they are.
     """
 
     name: str
@@ -51,12 +51,12 @@ class Model:
     licence: str
     published: dict[str, str] = field(default_factory=dict)
     optional: str = r".*\.num_batches_tracked"
-    renames: tuple[tuple[str, str], ...] = ()
+    convert: Callable[[dict[str, Any]], dict[str, Any]] = dict
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of a model: float32 `tensors` by name, on a torch device."""
+    """Weights of a model: float32 `tensors` by name, on a torch device, from a file or folder `path`."""
 
     path: Path
     model: Model
@@ -64,11 +64,32 @@ class Weights:
     sha256: str
     tensors: dict[str, Any]
 
+    def set_in(self, network: Any) -> Any:
+        """Set the tensors in a torch module, without copying them, and prepare it for inference."""
+        network.load_state_dict(self.tensors, strict=False, assign=True)
+        return network.eval().requires_grad_(False).to(self.device)
+
     def describe(self) -> str:
         """Description for logs: file, model, hash, licence."""
         known = self.model.published.get(self.sha256)
         origin = f"as published ({known})" if known else "not a file known to the project"
         return f"{self.path.name}: {self.model.name}, SHA-256 {self.sha256}, {origin}; licence: {self.model.licence}"
+
+
+def shapes_of(network: Any, optional: str = "") -> dict[str, Shape]:
+    """Shapes of a torch module's tensors, without those whose names match a pattern."""
+    state = network.state_dict()
+    return {name: tuple(value.shape) for name, value in state.items() if not re.fullmatch(optional, name)}
+
+
+def renamed(state: dict[str, Any], renames: Renames) -> dict[str, Any]:
+    """Tensors by other names."""
+    out = {}
+    for name, value in state.items():
+        for pattern, replacement in renames:
+            name = re.sub(pattern, replacement, name)
+        out[name] = value
+    return out
 
 
 def torch_device(device: str) -> str:
@@ -84,7 +105,7 @@ def load(path: Path | None, models: Sequence[Model], *, hint: str, device: str =
     """Load the tensors of a safetensors file, or of a file written by `torch.save`.
 
     Args:
-        path: the user's file.
+        path: the user's file, or a folder with model.safetensors, as `save_pretrained` of `transformers` writes it.
         models: accepted models.
         hint: which file to supply, for error messages.
         device: torch device, or "auto".
@@ -94,35 +115,34 @@ def load(path: Path | None, models: Sequence[Model], *, hint: str, device: str =
         InputError: the file is missing, damaged, of another model, or contains more than tensors.
     """
     if path is None:
-        raise SettingError("track.weights", f"{models[0].name} needs a weights file", hint)
-    if not path.is_file():
-        raise InputError(path, "file not found", f"{hint}; weights aren't downloaded")
-    state = _tensors(path, hint)
+        raise SettingError("track.weights", f"{models[0].name} needs weights", hint)
+    file = path / "model.safetensors" if path.is_dir() else path
+    if not file.is_file():
+        raise InputError(file, "file not found", f"{hint}; weights aren't downloaded")
+    state = _tensors(file, hint)
     checks = [(_mismatches(state, model), model) for model in models]
     mismatches, model = min(checks, key=lambda check: len(check[0]))
     if mismatches:
-        raise _wrong_model(path, state, models, mismatches, hint)
-    renamed = _renamed(state, model)
+        raise _wrong_model(file, state, models, mismatches, hint)
+    converted = _converted(state, model)
     device = torch_device(device)
-    tensors = {name: renamed[name].float().to(device) for name in model.shapes}
+    tensors = {name: converted[name].float().to(device) for name in model.shapes}
     bad = next((name for name, value in tensors.items() if not bool(value.isfinite().all())), None)
     if bad:
-        raise InputError(path, f"contains NaN or infinite values in {bad}", "Copy or download it again")
-    return Weights(path, model, device, hashlib.sha256(path.read_bytes()).hexdigest(), tensors)
+        raise InputError(file, f"contains NaN or infinite values in {bad}", "Copy or download it again")
+    return Weights(path, model, device, hashlib.sha256(file.read_bytes()).hexdigest(), tensors)
 
 
-def _renamed(state: dict[str, Any], model: Model) -> dict[str, Any]:
-    out = {}
-    for name, value in state.items():
-        for pattern, replacement in model.renames:
-            name = re.sub(pattern, replacement, name)
-        out[name] = value
-    return out
+def _converted(state: dict[str, Any], model: Model) -> dict[str, Any]:
+    try:
+        return model.convert(state)
+    except (RuntimeError, IndexError):  # tensors of other shapes
+        return state
 
 
 def _mismatches(state: dict[str, Any], model: Model) -> list[str]:
     """Differences between a file's tensors and those of a model."""
-    shapes = {name: tuple(value.shape) for name, value in _renamed(state, model).items()}
+    shapes = {name: tuple(value.shape) for name, value in _converted(state, model).items()}
     mismatches = [f"{name} is missing" for name in model.shapes if name not in shapes]
     mismatches += [
         f"{name} is {_size(shapes[name])}, not {_size(shape)}"

@@ -39,9 +39,11 @@ class Video(Filmed):
     times: Path | None = Field(
         None, description="Text file with the times of a folder's images: seconds, one per line."
     )
-    weights: Path | None = Field(None, description="Weights file of the feature network (superpoint, aliked).")
+    weights: Path | None = Field(
+        None, description="Weights of the feature network: a file or folder (superpoint), a file (aliked)."
+    )
     matcher_weights: Path | None = Field(
-        None, description="Weights file of the matching network (superglue, lightglue)."
+        None, description="Weights of the matching network: a folder (superglue), a file or folder (lightglue)."
     )
     colmap: bool = Field(False, description="Write the map also as a COLMAP model.")
     loops: bool = Field(False, description="Detect loop closures: places that the video passes more than once.")

@@ -15,7 +15,6 @@ EXTRA_OF = {
     "matplotlib": "slam",
     "pycolmap": "slam",
     "kiss_icp": "lidar",
-    "fast_simplification": "decimation",
     "pymeshlab": "meshlab",
     "pye57": "e57",
     "zstandard": "ept",

@@ -9,7 +9,6 @@ from scan2sim.pipeline.core.types import F64, I32, Bools
 from scan2sim.pipeline.geometry.boundary_curve import curve
 
 NEEDS = ("pymeshlab",)
-KEEPS_BORDER = True
 
 
 def simplify(vertices: F64, faces: I32, target: int, keep_border: bool) -> tuple[F64, I32]:

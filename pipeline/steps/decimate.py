@@ -23,17 +23,16 @@ class DecimateParams(Params):
 
     Attributes:
         target: number of triangles; D3.2: 100 K for terrain and buildings, 300 K for vegetation; 50 K for vehicles.
-        backend: simplification library, "pyfqmr", "fast_simplification", "pymeshlab" or "open3d" (which can't preserve
-            borders); modules of `pipeline/decimation/`.
+        backend: simplification library, "fast_simplification" or "pymeshlab"; modules of `pipeline/decimation/`.
     """
 
     target: int = Field(100_000, ge=10_000, le=1_000_000)
-    backend: Name = "pyfqmr"
+    backend: Name = "fast_simplification"
     context: TileBorder = TileBorder()
 
 
 def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) -> Done:
-    """Simplify `mesh` by edge collapse to the target, preserving borders (of tiles and classes) if the library can.
+    """Simplify `mesh` by edge collapse to the target, preserving borders (of tiles and classes).
 
     `furniture` (optional) is added unsimplified, within the target; its faces keep their classes, all other faces then
     get class 0.
@@ -43,17 +42,15 @@ def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) 
     Raises:
         SettingError, UnavailableError: as `can_decimate`.
     """
-    from scan2sim.pipeline.decimation import find, simplify
-
-    border_kept = find(params.backend, keep_border=params.context.keep_border).KEEPS_BORDER
+    from scan2sim.pipeline.decimation import simplify
 
     mesh = Mesh.load(inputs["mesh"])
     furniture = Mesh.load(inputs["furniture"]) if "furniture" in inputs else None
     target = params.target - len(furniture or ())
-    small, warnings = simplify(mesh, target, keep_border=border_kept, backend=params.backend), []
+    small, warnings, border_kept = simplify(mesh, target, backend=params.backend), [], True
     if len(small) > target * 1.05 and params.context.keep_border:
         warnings.append(f"{len(small):,} triangles instead of {params.target:,}: tile borders can't be simplified")
-    elif len(small) > target * 1.05 and border_kept:
+    elif len(small) > target * 1.05:
         warnings.append(f"the border alone needs {len(small):,} triangles: it was simplified too, to {params.target:,}")
         small, border_kept = simplify(small, target, keep_border=False, backend=params.backend), False
     if furniture is not None and len(furniture):
@@ -78,12 +75,12 @@ def can_decimate(params: DecimateParams) -> None:
     """Check that the library can run on this machine.
 
     Raises:
-        SettingError: there is no backend of that name, or it can't preserve borders although `keep_border` is set.
+        SettingError: there is no backend of that name.
         UnavailableError: it isn't installed.
     """
     from scan2sim.pipeline.decimation import find
 
-    find(params.backend, keep_border=params.context.keep_border)
+    find(params.backend)
 
 
 DECIMATE = Step(

@@ -65,7 +65,7 @@ def named(
 
     Args:
         name: name of the backend's module in this package.
-        weights: the user's weights file, for networks.
+        weights: the user's file or folder of weights, for networks.
         count: maximum number of features per image.
         upsample: factor by which images are enlarged before detection; 2 gives RootSIFT 10 % more matches in twice the
             time.

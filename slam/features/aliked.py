@@ -10,7 +10,6 @@ import numpy as np
 from scan2sim.pipeline.core.types import U8
 from scan2sim.slam import weights as files
 from scan2sim.slam.features import FeatureSet, enlarged, reduced, unmasked
-from scan2sim.slam.features.superpoint import local_maxima, strongest
 
 SCORE_MIN, SUPPRESSION_RADIUS_PX, SOFTMAX_TEMPERATURE = 0.2, 2, 0.1
 """Least score, radius of non-maximum suppression, and temperature of the soft-argmax refinement, as published."""
@@ -91,10 +90,10 @@ class Aliked:
             x = pad(x, (0, -width % SIZE_MULTIPLE_PX, 0, -height % SIZE_MULTIPLE_PX), mode="replicate")
             scores, maps = self._maps(x.expand(-1, 3, -1, -1))
             scores, maps = scores[:height, :width], maps[:, :height, :width]
-            peaks = local_maxima(scores, SUPPRESSION_RADIUS_PX, SUPPRESSION_RADIUS_PX)
+            peaks = _local_maxima(scores, SUPPRESSION_RADIUS_PX, SUPPRESSION_RADIUS_PX)
             if where is not None:
                 peaks *= torch.from_numpy(where > 0).to(peaks.device)
-            uv, _ = strongest(peaks, SCORE_MIN, self.count)
+            uv, _ = _strongest(peaks, SCORE_MIN, self.count)
             uv, best = _refined_peaks(scores, uv)
             descriptors = self._describe(maps, uv)
         uv, descriptors, best = uv.cpu().numpy(), descriptors.cpu().numpy(), best.cpu().numpy()
@@ -212,3 +211,37 @@ def _refined_peaks(scores: Any, uv: Any) -> tuple[Any, Any]:
     at = uv / torch.tensor([width - 1, height - 1], device=uv.device) * 2 - 1
     best = grid_sample(scores[None, None], at[None, None], mode="bilinear", align_corners=True)
     return uv, best[0, 0, 0]
+
+
+def _local_maxima(scores: Any, radius: int, border: int) -> Any:
+    """Non-maximum suppression: (H, W) scores, 0 except at maxima within `radius` pixels, and in the border.
+
+    Two more rounds add maxima among the pixels that aren't near a maximum found before, so that of a chain of
+    increasing neighbours more than its end remains.
+    """
+    from torch.nn.functional import max_pool2d
+
+    def largest(x: Any) -> Any:
+        return max_pool2d(x, 2 * radius + 1, stride=1, padding=radius)
+
+    x = scores[None, None]
+    found = x == largest(x)
+    for _ in range(2):
+        near = largest(found.to(x)) > 0
+        rest = x.masked_fill(near, 0)
+        found = found | ((rest == largest(rest)) & ~near)
+    out = x.masked_fill(~found, 0)[0, 0]
+    out[:border], out[:, :border] = 0, 0
+    if border:
+        out[-border:], out[:, -border:] = 0, 0
+    return out
+
+
+def _strongest(scores: Any, threshold: float, count: int) -> tuple[Any, Any]:
+    """(N, 2) pixels and (N,) scores of the `count` largest scores (H, W) above a threshold, largest first."""
+    import torch
+
+    v, u = torch.nonzero(scores > threshold, as_tuple=True)
+    best, order = scores[v, u].sort(descending=True, stable=True)
+    order = order[:count]
+    return torch.stack([u[order], v[order]], dim=1).to(scores), best[:count]

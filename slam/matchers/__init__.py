@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.errors import SettingError
@@ -42,30 +42,45 @@ class Matcher(Protocol):
         """Description for logs, with hash and licence of the weights."""
 
 
-class NetworkMatcher(ABC):
-    """Base class of neural matchers: matches are mutual maxima of the match probability, above a threshold.
+class NetworkMatcher:
+    """Base class of the matchers of `transformers`; they match mutual maxima of the match probability.
 
     Attributes:
-        probability_min: least probability of a match, as published.
+        uses_scores: whether the network takes the scores of features.
     """
 
-    probability_min: float
+    uses_scores: bool
 
-    def __init__(self, weights: Weights) -> None:
-        self.weights = weights
-
-    @abstractmethod
-    def probabilities(self, a: FeatureSet, b: FeatureSet, sizes: Sizes) -> Any:
-        """Tensor (N, M) of match probabilities."""
+    def __init__(self, weights: Weights, network: Any) -> None:
+        self.weights, self.network = weights, weights.set_in(network)
 
     def match(self, a: FeatureSet, b: FeatureSet, sizes: Sizes) -> I64:
         """See `Matcher`."""
         import torch
+        from torch.nn.utils.rnn import pad_sequence
 
         if not len(a.uv) or not len(b.uv):
             return np.zeros((0, 2), np.int64)
+
+        def batch(*of_images: npt.NDArray[Any]) -> Any:
+            """(1, 2, N, ...) tensor of both images' values, with zeros after those of the image with fewer features."""
+            values = [torch.from_numpy(x) for x in of_images]
+            return pad_sequence(values, batch_first=True)[None].to(self.weights.device)
+
+        # both images are scaled to a square of 2 x 2, as the network takes one size for both
+        uv = [1 + (2 * x.uv - size) / max(size) for x, size in zip((a, b), sizes, strict=True)]
+        inputs = {
+            "keypoints": batch(*(x.astype(np.float32) for x in uv)),
+            "descriptors": batch(a.descriptors, b.descriptors),
+            "mask": batch(np.ones(len(a.uv), np.int32), np.ones(len(b.uv), np.int32)),
+        }
+        if self.uses_scores:
+            inputs["scores"] = batch(a.scores, b.scores)
         with torch.inference_mode():
-            return mutual(self.probabilities(a, b, sizes), self.probability_min)
+            # `forward` would detect features in both images again
+            partner = self.network._match_image_pair(**inputs, height=2, width=2)[0].reshape(2, -1)[0].cpu().numpy()
+        rows = np.flatnonzero(partner[: len(a.uv)] >= 0)
+        return np.stack([rows, partner[rows]], axis=1).astype(np.int64)
 
     def describe(self) -> str:
         """See `Matcher`."""
@@ -84,7 +99,7 @@ def named(name: str, weights: Path | None = None, *, device: str = "auto") -> Ma
 
     Args:
         name: name of the backend's module in this package.
-        weights: the user's weights file, for networks.
+        weights: the user's file or folder of weights, for networks.
         device: torch device, for networks.
 
     Raises:
@@ -106,14 +121,3 @@ def check(features: Features, matcher: Matcher) -> None:
             "track.matcher", f"{matcher.name!r} was made for {expected}, not for {given}",
             "Choose another matcher or other features; the matcher `nearest` takes any",
         )  # fmt: skip
-
-
-def mutual(scores: Any, score_min: float) -> I64:
-    """(M, 2) rows and columns of a score tensor (N, M) that are mutual maxima and above `score_min`."""
-    import torch
-
-    best, column_of = scores.max(dim=1)
-    row_of = scores.argmax(dim=0)
-    rows = torch.arange(len(column_of), device=scores.device)
-    good = (row_of[column_of] == rows) & (best > score_min)
-    return np.asarray(torch.stack([rows[good], column_of[good]], dim=1).cpu().numpy(), np.int64)

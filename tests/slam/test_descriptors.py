@@ -213,12 +213,12 @@ def test_a_matcher_made_for_other_features_is_refused() -> None:
 
 def test_superpoint_and_superglue_run_together(tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    from scan2sim.slam.features.superpoint import MODEL
-    from scan2sim.slam.matchers.superglue import MODEL as GLUE
-    from tests.slam.test_features import saved
+    hf = pytest.importorskip("transformers")
+    from tests.slam.test_features import SUPERPOINT, saved
 
-    found = features.named("superpoint", saved(tmp_path / "superpoint_v1.pth", MODEL), count=100, device="cpu")
-    matcher = matchers.named("superglue", saved(tmp_path / "superglue_outdoor.pth", GLUE), device="cpu")
+    found = features.named("superpoint", saved(tmp_path / "superpoint_v1.pth", SUPERPOINT), count=100, device="cpu")
+    hf.SuperGlueForKeypointMatching(hf.SuperGlueConfig()).save_pretrained(tmp_path / "superglue")
+    matcher = matchers.named("superglue", tmp_path / "superglue", device="cpu")
     track = DescriptorTracker(VirtualViews(SPHERE), None, NUMBER, found, matcher)
     turns = [np.eye(3), exp_so3(np.radians([0.0, 1.0, 0.0]))]
     first, _, error = followed(track, [seen(SPHERE, R) for R in turns], turns)

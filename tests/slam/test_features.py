@@ -1,4 +1,4 @@
-"""Features, matchers and weights: one contract for all backends, networks against transformers' own, bad files."""
+"""Features, matchers and weights: one contract for all backends, files and folders of weights, bad files."""
 
 from __future__ import annotations
 
@@ -20,6 +20,18 @@ from scan2sim.slam.features import FeatureSet
 SIZE = (240, 320)
 PUBLISHED_WEIGHTS = {"aliked": "aliked/aliked-t16.pth", "superpoint": "superpoint/superpoint_v1.pth"}
 """Files of networks' weights, in the folder `weights` of the real data."""
+SUPERPOINT_LAYERS = {
+    "conv1a": (64, 1, 3, 3), "conv1b": (64, 64, 3, 3),
+    "conv2a": (64, 64, 3, 3), "conv2b": (64, 64, 3, 3),
+    "conv3a": (128, 64, 3, 3), "conv3b": (128, 128, 3, 3),
+    "conv4a": (128, 128, 3, 3), "conv4b": (128, 128, 3, 3),
+    "convPa": (256, 128, 3, 3), "convPb": (65, 256, 1, 1),
+    "convDa": (256, 128, 3, 3), "convDb": (256, 256, 1, 1),
+}  # fmt: skip
+SUPERPOINT: dict[str, weights.Shape] = {f"{layer}.weight": shape for layer, shape in SUPERPOINT_LAYERS.items()} | {
+    f"{layer}.bias": shape[:1] for layer, shape in SUPERPOINT_LAYERS.items()
+}
+"""Shapes of the tensors in superpoint_v1.pth."""
 
 
 @pytest.fixture(autouse=True)
@@ -44,23 +56,23 @@ def picture(seed: int = 0, height: int = SIZE[0] + 32, width: int = SIZE[1] + 32
     return cv2.GaussianBlur(out, (0, 0), 1.0)
 
 
-def random_weights(model: weights.Model, seed: int = 0) -> dict[str, Any]:
-    """Tensors of a model's shapes, so that numbers neither vanish nor grow."""
+def random_weights(shapes: dict[str, weights.Shape], seed: int = 0) -> dict[str, Any]:
+    """Tensors of these shapes, so that numbers neither vanish nor grow."""
     import torch
 
     made = torch.Generator().manual_seed(seed)
     out = {}
-    for name, shape in model.shapes.items():
+    for name, shape in shapes.items():
         fan = int(np.prod(shape[1:])) if len(shape) > 1 else 1
         value = torch.randn(shape, generator=made) * (2 / fan) ** 0.5 * (1 if len(shape) > 1 else 0.1)
         out[name] = value.abs() + 0.5 if name.endswith(("running_var", "1.weight")) and len(shape) == 1 else value
     return out
 
 
-def saved(path: Path, model: weights.Model) -> Path:
+def saved(path: Path, shapes: dict[str, weights.Shape]) -> Path:
     import torch
 
-    torch.save(random_weights(model), path)
+    torch.save(random_weights(shapes), path)
     return path
 
 
@@ -70,10 +82,10 @@ def with_random_weights(name: str, folder: Path) -> features.Features:
         pytest.skip(f"{name} needs {missing_packages}")
     if name not in PUBLISHED_WEIGHTS:
         return features.named(name, count=500)
-    from scan2sim.slam.features import aliked, superpoint
+    from scan2sim.slam.features import aliked
 
-    model = {"aliked": aliked.MODELS[1], "superpoint": superpoint.MODEL}[name]
-    return features.named(name, saved(folder / f"{name}.pth", model), count=500, device="cpu")
+    shapes = {"aliked": aliked.MODELS[1].shapes, "superpoint": SUPERPOINT}[name]
+    return features.named(name, saved(folder / f"{name}.pth", shapes), count=500, device="cpu")
 
 
 def with_published_weights(name: str, real_data: Path) -> features.Features:
@@ -201,153 +213,150 @@ def test_deformed_convolution_is_a_plain_one_without_shifts() -> None:
     assert torch.allclose(deformed(x, shifts, kernel)[..., :-1], plain[..., 1:], atol=1e-4)
 
 
-# networks against transformers', which others wrote, with the same random weights
+# networks of transformers
 
 
-def test_superpoint_agrees_with_transformers(tmp_path: Path) -> None:
+def test_superpoint_file_and_folder_give_the_same_features(tmp_path: Path) -> None:
     torch, hf = pytest.importorskip("torch"), pytest.importorskip("transformers")
-    from scan2sim.slam.features.superpoint import MODEL
+    from scan2sim.slam.features.superpoint import RENAMES
 
-    tensors = random_weights(MODEL)
-    torch.save(tensors, tmp_path / "superpoint_v1.pth")
-    theirs = hf.SuperPointForKeypointDetection(hf.SuperPointConfig(keypoint_threshold=0.005, max_keypoints=-1)).eval()
-    names = {f"conv{i + 1}{x}": f"encoder.conv_blocks.{i}.conv_{x}" for i in range(4) for x in "ab"}
-    names |= {f"convP{x}": f"keypoint_decoder.conv_score_{x}" for x in "ab"}
-    names |= {f"convD{x}": f"descriptor_decoder.conv_descriptor_{x}" for x in "ab"}
-    theirs.load_state_dict({names[k.split(".")[0]] + "." + k.split(".")[1]: v for k, v in tensors.items()})
-    a = picture(2, 96, 128)
-    ours = features.named("superpoint", tmp_path / "superpoint_v1.pth", count=10**6, device="cpu").detect(a)
+    file = saved(tmp_path / "superpoint_v1.pth", SUPERPOINT)
+    network = hf.SuperPointForKeypointDetection(hf.SuperPointConfig(keypoint_threshold=0.5, max_keypoints=3)).eval()
+    network.load_state_dict(weights.renamed(random_weights(SUPERPOINT), RENAMES))
+    network.save_pretrained(tmp_path / "superpoint")
+    a = picture(2, 99, 128)
+    found, same = (
+        features.named("superpoint", path, count=10**6, device="cpu").detect(a)
+        for path in (file, tmp_path / "superpoint")
+    )
+    assert all(np.array_equal(x, y) for x, y in zip(found, same, strict=True))
+    few = features.named("superpoint", file, count=20, device="cpu").detect(a)
+    assert all(np.array_equal(x[:20], y) for x, y in zip(found, few, strict=True))
+    assert len(found.uv) > 50 and (np.diff(found.scores) <= 0).all()
+    assert found.uv.min() >= 4 and (found.uv < (124, 92)).all(), "none at the border, none in the last three rows"
+
+    network.keypoint_decoder.keypoint_threshold, network.keypoint_decoder.max_keypoints = 0.005, -1
     with torch.inference_mode():
-        out = theirs(torch.from_numpy(a)[None, None].float().expand(1, 3, -1, -1) / 255)
+        out = network(torch.from_numpy(a[:96])[None, None].float().expand(1, 3, -1, -1) / 255)
     uv = (out.keypoints[0] * torch.tensor([128, 96])).round().numpy()
-    inner = (uv < (124, 92)).all(axis=1)  # theirs keeps some that are nearer to the right and lower border
-    order, other = np.lexsort(ours.uv.T), np.flatnonzero(inner)[np.lexsort(uv[inner].T)]
-    assert len(order) > 50 and np.array_equal(ours.uv[order], uv[other])
-    assert np.allclose(ours.scores[order], out.scores[0].numpy()[other], atol=1e-5)
-    assert np.allclose(ours.descriptors[order], out.descriptors[0].numpy()[other], atol=1e-4)
+    inner = (uv < (124, 92)).all(axis=1)
+    order, other = np.lexsort(found.uv.T), np.flatnonzero(inner)[np.lexsort(uv[inner].T)]
+    assert np.array_equal(found.uv[order], uv[other])
+    assert np.allclose(found.scores[order], out.scores[0].numpy()[other], atol=1e-6)
+    assert np.allclose(found.descriptors[order], out.descriptors[0].numpy()[other], atol=1e-6)
 
 
 def two_views(dimension: int, n: int = 120) -> tuple[FeatureSet, FeatureSet]:
-    """The same features in two pictures of 640 x 480, in another order, a little changed."""
+    """The same features in two pictures of 640 x 480, in another order, a little changed; some only in the first."""
     rng = np.random.default_rng(3)
     uv, what = rng.uniform((0, 0), (639, 479), (n, 2)), rng.normal(size=(n, dimension))
-    order = rng.permutation(n)
+    order = rng.permutation(n)[: 3 * n // 4]
 
     def seen(uv: Any, what: Any) -> FeatureSet:
         length = np.linalg.norm(what, axis=1, keepdims=True)
-        return FeatureSet(uv.astype(np.float32), (what / length).astype(np.float32), np.full(n, 0.5, np.float32))
+        return FeatureSet(uv.astype(np.float32), (what / length).astype(np.float32), np.full(len(uv), 0.5, np.float32))
 
-    return seen(uv, what), seen(uv[order] + (9, 2), what[order] + 0.2 * rng.normal(size=(n, dimension)))
+    return seen(uv, what), seen(uv[order] + (9, 2), what[order] + 0.2 * rng.normal(size=(len(order), dimension)))
 
 
-def theirs_of(model: Any, a: FeatureSet, b: FeatureSet, *scores: Any) -> tuple[Any, Any]:
-    """What a matcher of transformers says: rows of b (N,), probabilities (N,)."""
+def with_all_matches(name: str, path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A matcher that also returns improbable matches, as random weights give."""
+    monkeypatch.setattr(plugins.module(matchers.__name__, name), "PROBABILITY_MIN", 0.0)
+    return matchers.named(name, path, device="cpu")
+
+
+def check_matches(matcher: matchers.Matcher, a: FeatureSet, b: FeatureSet) -> None:
+    """Matches are unique, symmetric and independent of the images' scale."""
+    size = (640, 480)
+    pairs = matcher.match(a, b, (size, size))
+    assert len(pairs) > 20 and pairs.dtype == np.int64
+    assert all(len(np.unique(column)) == len(pairs) for column in pairs.T)
+    assert pairs.min() >= 0 and (pairs.max(axis=0) < (len(a.uv), len(b.uv))).all()
+    assert np.array_equal(pairs, matcher.match(a, b, (size, size)))
+    back = matcher.match(b, a, (size, size))[:, ::-1]
+    assert np.array_equal(pairs, back[np.argsort(back[:, 0])])
+    assert np.array_equal(pairs, matcher.match(a, b._replace(uv=(b.uv / 2).astype(np.float32)), (size, (320, 240))))
+    none = FeatureSet(*(x[:0] for x in b))
+    assert matcher.match(a, none, (size, size)).shape == matcher.match(none, a, (size, size)).shape == (0, 2)
+
+
+def expected_matches(network: Any, a: FeatureSet, b: FeatureSet, *scores: Any) -> Any:
+    """(M, 2) matches that a network of transformers gives for equally many features."""
     import torch
 
     uv, what = (torch.from_numpy(np.stack([getattr(a, x), getattr(b, x)]))[None] for x in ("uv", "descriptors"))
     with torch.inference_mode():
-        seen = torch.ones(1, 2, len(a.uv), dtype=torch.int)
-        out = model._match_image_pair(uv, what, *scores, 480, 640, mask=seen)
-    return tuple(x.reshape(-1, len(a.uv))[0].numpy() for x in out[:2])
+        mask = torch.ones(1, 2, len(a.uv), dtype=torch.int)
+        partner = network._match_image_pair(uv, what, *scores, 480, 640, mask=mask)[0].reshape(2, -1)[0].numpy()
+    return np.stack([np.flatnonzero(partner >= 0), partner[partner >= 0]], axis=1)
 
 
-def agree(ours: Any, a: FeatureSet, b: FeatureSet, theirs: Any, share: Any) -> None:
-    """Same partners and probabilities."""
+def test_superglue_matches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch, hf = pytest.importorskip("torch"), pytest.importorskip("transformers")
+    network = hf.SuperGlueForKeypointMatching(hf.SuperGlueConfig(matching_threshold=0.0)).eval()
+    for value in network.state_dict().values():
+        if value.ndim == 1:  # biases and normalization
+            value.add_(0.05 * torch.rand_like(value))
+    network.save_pretrained(tmp_path / "superglue_outdoor")
+    matcher = with_all_matches("superglue", tmp_path / "superglue_outdoor", monkeypatch)
+    assert (matcher.takes, matcher.dimension) == ("superpoint", 256)
+    a, b = two_views(256)
+    check_matches(matcher, a, b)
+    a = FeatureSet(*(x[: len(b.uv)] for x in a))
+    scores = torch.full((1, 2, len(a.uv)), 0.5)
+    assert np.array_equal(matcher.match(a, b, ((640, 480),) * 2), expected_matches(network, a, b, scores))
+
+
+def published_lightglue(state: dict[str, Any]) -> dict[str, Any]:
+    """Tensors of a LightGlue of transformers by the names of the published .pth files."""
     import torch
 
-    with torch.inference_mode():
-        shares = ours.probabilities(a, b, ((640, 480), (640, 480)))
-    pairs = matchers.mutual(shares, 0.0)
-    mine = np.full(len(a.uv), -1)
-    mine[pairs[:, 0]] = pairs[:, 1]
-    assert (mine >= 0).sum() > 30 and np.array_equal(mine, theirs)
-    rows = np.flatnonzero(mine >= 0)
-    assert np.allclose(shares.numpy()[rows, mine[rows]], share[rows], rtol=2e-3, atol=1e-6)
-
-
-def test_superglue_agrees_with_transformers(tmp_path: Path) -> None:
-    torch, hf = pytest.importorskip("torch"), pytest.importorskip("transformers")
-    from scan2sim.slam.matchers.superglue import MODEL
-
-    theirs = hf.SuperGlueForKeypointMatching(hf.SuperGlueConfig(matching_threshold=0.0)).eval()
-    state = {k: v for k, v in theirs.state_dict().items() if not k.startswith("keypoint_detector")}
-    tensors = {"bin_score": state["bin_score"]}
-    for name, value in state.items():
-        if name.endswith("num_batches_tracked"):
-            continue
-        if value.ndim == 1:  # nothing that begins as 0 or 1 is to stay so
-            value.add_(0.05 * torch.rand_like(value))
-        part = name.split(".")
-        value = value[..., None] if value.ndim == 2 else value
-        if part[0] == "keypoint_encoder":
-            index = 3 * int(part[2]) + (part[3] == "batch_norm")
-            tensors[f"kenc.encoder.{index}.{part[-1]}"] = value
-        elif part[0] == "final_projection":
-            tensors[f"final_proj.{part[-1]}"] = value
-        elif part[0] == "gnn" and part[3] == "mlp":
-            index = 3 * int(part[4]) + (part[5] == "batch_norm")
-            tensors[f"gnn.layers.{part[2]}.mlp.{index}.{part[-1]}"] = value
-        elif part[0] == "gnn" and part[4] == "self":  # the published files count heads fastest
-            value = value.reshape(4, 64, *value.shape[1:]).transpose(0, 1).reshape(value.shape)
-            number = ("query", "key", "value").index(part[5])
-            tensors[f"gnn.layers.{part[2]}.attn.proj.{number}.{part[-1]}"] = value
-        elif part[0] == "gnn":
-            if value.ndim == 3:
-                value = value.reshape(256, 4, 64).transpose(1, 2).reshape(256, 256, 1)
-            tensors[f"gnn.layers.{part[2]}.attn.merge.{part[-1]}"] = value
-    assert set(tensors) == set(MODEL.shapes)
-    torch.save(tensors, tmp_path / "superglue_outdoor.pth")
-    ours = matchers.named("superglue", tmp_path / "superglue_outdoor.pth", device="cpu")
-    a, b = two_views(256)
-    agree(ours, a, b, *theirs_of(theirs, a, b, torch.full((1, 2, len(a.uv)), 0.5)))
-    sizes = (640, 480), (640, 480)
-    assert ours.match(a, FeatureSet(*(x[:0] for x in b)), sizes).shape == (0, 2)
-
-
-def test_lightglue_agrees_with_transformers(tmp_path: Path) -> None:
-    torch, hf = pytest.importorskip("torch"), pytest.importorskip("transformers")
-    from safetensors.torch import save_file
-
-    config = hf.LightGlueConfig(depth_confidence=-1.0, width_confidence=-1.0, filter_threshold=0.0)
-    theirs = hf.LightGlueForKeypointMatching(config).eval()
-    state = {k: v for k, v in theirs.state_dict().items() if not k.startswith("keypoint_detector")}
-    for value in state.values():
-        value.add_(0.02 * torch.randn_like(value))
     tensors = {"posenc.Wr.weight": state["positional_encoder.projector.weight"]}
+    tensors |= {name.replace("ection", ""): value for name, value in state.items() if name.startswith("input_proj")}
     for i in range(9):
         layer = f"transformer_layers.{i}"
         for x in ("weight", "bias"):
-            state[f"{layer}.cross_attention.k_proj.{x}"].copy_(state[f"{layer}.cross_attention.q_proj.{x}"])
             three = torch.stack([state[f"{layer}.self_attention.{c}_proj.{x}"] for c in "qkv"])
             rest = three.shape[2:]
             three = three.reshape(3, 4, 64, *rest).permute(1, 2, 0, *range(3, 3 + len(rest))).reshape(768, *rest)
-            tensors[f"self_attn.{i}.Wqkv.{x}"] = three  # names as in the published files
+            tensors[f"self_attn.{i}.Wqkv.{x}"] = three
             tensors[f"self_attn.{i}.out_proj.{x}"] = state[f"{layer}.self_attention.o_proj.{x}"]
-            for ours_, his in (("to_qk", "q_proj"), ("to_v", "v_proj"), ("to_out", "o_proj")):
-                tensors[f"cross_attn.{i}.{ours_}.{x}"] = state[f"{layer}.cross_attention.{his}.{x}"]
+            for theirs, name in (("to_qk", "q_proj"), ("to_v", "v_proj"), ("to_out", "o_proj")):
+                tensors[f"cross_attn.{i}.{theirs}.{x}"] = state[f"{layer}.cross_attention.{name}.{x}"]
             for kind in ("self", "cross"):
-                for number, his in ((0, "fc1"), (1, "layer_norm"), (3, "fc2")):
-                    tensors[f"{kind}_attn.{i}.ffn.{number}.{x}"] = state[f"{layer}.{kind}_mlp.{his}.{x}"]
-            for ours_, his in (("matchability", "matchability"), ("final_proj", "final_projection")):
-                tensors[f"log_assignment.{i}.{ours_}.{x}"] = state[f"match_assignment_layers.{i}.{his}.{x}"]
-    file = tmp_path / "superpoint_lightglue.safetensors"
-    save_file({name: value.clone().contiguous() for name, value in tensors.items()}, file)
-    ours = matchers.named("lightglue", file, device="cpu")
-    assert (ours.takes, ours.dimension) == ("superpoint", 256)
-    a, b = two_views(256)
-    agree(ours, a, b, *theirs_of(theirs, a, b))
+                for number, name in ((0, "fc1"), (1, "layer_norm"), (3, "fc2")):
+                    tensors[f"{kind}_attn.{i}.ffn.{number}.{x}"] = state[f"{layer}.{kind}_mlp.{name}.{x}"]
+            for theirs, name in (("matchability", "matchability"), ("final_proj", "final_projection")):
+                tensors[f"log_assignment.{i}.{theirs}.{x}"] = state[f"match_assignment_layers.{i}.{name}.{x}"]
+    return tensors
 
 
-def test_lightglue_for_aliked_takes_128_numbers(tmp_path: Path) -> None:
-    pytest.importorskip("torch")
-    from scan2sim.slam.matchers.lightglue import _ALIKED
-
-    ours = matchers.named("lightglue", saved(tmp_path / "aliked_lightglue.pth", _ALIKED), device="cpu")
-    assert (ours.takes, ours.dimension) == ("aliked", 128)
-    pairs = ours.match(*two_views(128), ((640, 480), (640, 480)))
-    assert pairs.ndim == 2 and pairs.shape[1] == 2
-    with pytest.raises(SettingError, match=r"aliked of 128 numbers, not for orb of 32 bytes"):
-        matchers.check(features.named("orb"), ours)
+@pytest.mark.parametrize(("detector", "dimension"), [("superpoint", 256), ("aliked", 128)])
+def test_lightglue_matches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, detector: str, dimension: int) -> None:
+    torch, hf = pytest.importorskip("torch"), pytest.importorskip("transformers")
+    point = hf.SuperPointConfig(descriptor_decoder_dim=dimension)
+    thresholds = {"depth_confidence": -1.0, "width_confidence": -1.0, "filter_threshold": 0.0}
+    config = hf.LightGlueConfig(keypoint_detector_config=point, **thresholds)
+    network = hf.LightGlueForKeypointMatching(config).eval()
+    state = network.state_dict()
+    for name, value in state.items():
+        value.add_(0.02 * torch.randn_like(value))
+        if ".cross_attention.k_proj." in name:  # the published files have one tensor for both
+            value.copy_(state[name.replace("k_proj", "q_proj")])
+    file = tmp_path / f"{detector}_lightglue.pth"
+    torch.save(published_lightglue(state), file)
+    matcher = with_all_matches("lightglue", file, monkeypatch)
+    assert (matcher.takes, matcher.dimension) == (detector, dimension)
+    a, b = two_views(dimension)
+    check_matches(matcher, a, b)
+    if detector == "superpoint":
+        network.save_pretrained(tmp_path / "lightglue_superpoint")
+        same = with_all_matches("lightglue", tmp_path / "lightglue_superpoint", monkeypatch)
+        assert np.array_equal(matcher.match(a, b, ((640, 480),) * 2), same.match(a, b, ((640, 480),) * 2))
+    a = FeatureSet(*(x[: len(b.uv)] for x in a))
+    assert np.array_equal(matcher.match(a, b, ((640, 480),) * 2), expected_matches(network, a, b))
+    with pytest.raises(SettingError, match=rf"{detector} of {dimension} numbers, not for orb of 32 bytes"):
+        matchers.check(features.named("orb"), matcher)
 
 
 # bad files
@@ -364,12 +373,16 @@ class Bomb:
 
 
 def test_weights_of_the_wrong_model_name_both(tmp_path: Path) -> None:
-    pytest.importorskip("torch")
-    from scan2sim.slam.features import aliked, superpoint
-    from scan2sim.slam.matchers import lightglue, superglue
+    pytest.importorskip("torch"), pytest.importorskip("transformers")
+    from safetensors.torch import save_file
 
-    point, glue = saved(tmp_path / "p.pth", superpoint.MODEL), saved(tmp_path / "g.pth", superglue.MODEL)
-    light, ali = saved(tmp_path / "l.pth", lightglue._SUPERPOINT), saved(tmp_path / "a.pth", aliked.MODELS[0])
+    from scan2sim.slam.features import aliked
+
+    point, ali = saved(tmp_path / "p.pth", SUPERPOINT), saved(tmp_path / "a.pth", aliked.MODELS[0].shapes)
+    light = saved(tmp_path / "l.pth", {"posenc.Wr.weight": (32, 2), "log_assignment.0.matchability.weight": (1, 256)})
+    glue, published = tmp_path / "superglue_outdoor", saved(tmp_path / "g.pth", {"kenc.encoder.0.weight": (32, 3, 1)})
+    glue.mkdir()
+    save_file(random_weights({"keypoint_encoder.encoder.0.linear.weight": (32, 3)}), glue / "model.safetensors")
     for file, found in ((glue, "SuperGlue"), (light, "LightGlue"), (ali, "ALIKED")):
         with pytest.raises(InputError, match=f"weights of {found}, expected SuperPoint.*superpoint_v1.pth"):
             features.named("superpoint", file)
@@ -377,24 +390,28 @@ def test_weights_of_the_wrong_model_name_both(tmp_path: Path) -> None:
         features.named("aliked", point)
     with pytest.raises(InputError, match="weights of LightGlue, expected SuperGlue"):
         matchers.named("superglue", light)
+    with pytest.raises(InputError, match="SuperGlue as Magic Leap publishes it, expected SuperGlue.*superglue_outdoor"):
+        matchers.named("superglue", published)
     with pytest.raises(InputError, match="weights of SuperPoint, expected LightGlue for SuperPoint or LightGlue"):
         matchers.named("lightglue", point)
+    with pytest.raises(InputError, match="weights of LightGlue of another shape"):
+        matchers.named(
+            "lightglue", saved(light, {"log_assignment.0.matchability.weight": (1, 256), "self_attn.0.Wqkv.x": (5,)})
+        )
 
 
 def test_weights_of_another_shape_or_unknown(tmp_path: Path) -> None:
-    torch = pytest.importorskip("torch")
-    from scan2sim.slam.features.superpoint import MODEL
-
+    torch, _ = pytest.importorskip("torch"), pytest.importorskip("transformers")
     file = tmp_path / "w.pth"
-    tensors = random_weights(MODEL)
+    tensors = random_weights(SUPERPOINT)
     torch.save(tensors | {"conv1a.weight": torch.zeros(32, 1, 3, 3)}, file)
-    with pytest.raises(InputError, match="SuperPoint of another shape.*conv1a.weight is 32 x 1 x 3 x 3, not 64 x 1"):
+    with pytest.raises(InputError, match="SuperPoint of another shape.*0.conv_a.weight is 32 x 1 x 3 x 3, not 64 x 1"):
         features.named("superpoint", file)
     torch.save({"layer.weight": torch.zeros(3)}, file)
     with pytest.raises(InputError, match=r"another network \(layer.weight .*expected SuperPoint"):
         features.named("superpoint", file)
     torch.save(tensors | {"convPb.bias": torch.full((65,), float("nan"))}, file)
-    with pytest.raises(InputError, match="NaN or infinite values in convPb.bias"):
+    with pytest.raises(InputError, match="NaN or infinite values in keypoint_decoder.conv_score_b.bias"):
         features.named("superpoint", file)
     torch.save([1, 2], file)
     with pytest.raises(InputError, match="no named tensors"):
@@ -402,18 +419,20 @@ def test_weights_of_another_shape_or_unknown(tmp_path: Path) -> None:
 
 
 def test_damaged_missing_and_dangerous_files(tmp_path: Path) -> None:
-    torch = pytest.importorskip("torch")
+    torch, _ = pytest.importorskip("torch"), pytest.importorskip("transformers")
     from safetensors.torch import save_file
 
-    from scan2sim.slam.features.superpoint import MODEL
-
-    with pytest.raises(SettingError, match="needs a weights file. Give Magic Leap's superpoint_v1.pth"):
+    with pytest.raises(
+        SettingError, match="needs weights. Give a folder .*superpoint, with model.safetensors; or .*superpoint_v1.pth"
+    ):
         features.named("superpoint")
     with pytest.raises(InputError, match="file not found.*weights aren't downloaded"):
         features.named("superpoint", tmp_path / "none.pth")
-    whole = saved(tmp_path / "superpoint_v1.pth", MODEL)
+    with pytest.raises(InputError, match="model.safetensors: file not found.*weights aren't downloaded"):
+        features.named("superpoint", tmp_path)
+    whole = saved(tmp_path / "superpoint_v1.pth", SUPERPOINT)
     safe = tmp_path / "superpoint.safetensors"
-    save_file(random_weights(MODEL), safe)
+    save_file(random_weights(SUPERPOINT), safe)
     for file in (whole, safe):
         half = tmp_path / f"half{file.suffix}"
         for size in (0, 100, file.stat().st_size // 2):
@@ -430,11 +449,8 @@ def test_damaged_missing_and_dangerous_files(tmp_path: Path) -> None:
 
 
 def test_what_is_told_of_weights(tmp_path: Path) -> None:
-    torch = pytest.importorskip("torch")
-
-    from scan2sim.slam.features.superpoint import MODEL
-
-    file = saved(tmp_path / "superpoint_v1.pth", MODEL)
+    torch, _ = pytest.importorskip("torch"), pytest.importorskip("transformers")
+    file = saved(tmp_path / "superpoint_v1.pth", SUPERPOINT)
     backend = features.named("superpoint", file, device="cpu")
     description = backend.describe()
     assert (
@@ -442,5 +458,5 @@ def test_what_is_told_of_weights(tmp_path: Path) -> None:
         and "not a file known to the project" in description
     )
     assert "Magic Leap" in description and "noncommercial" in description
-    torch.save({name: value.half() for name, value in random_weights(MODEL, 1).items()}, file)
+    torch.save({name: value.half() for name, value in random_weights(SUPERPOINT, 1).items()}, file)
     assert features.named("superpoint", file, device="cpu").detect(picture()).descriptors.dtype == np.float32
