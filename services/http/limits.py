@@ -25,7 +25,7 @@ SPARE_FILES = 200
 class LimitedEventLoop(asyncio.SelectorEventLoop):
     """Event loop whose servers limit their connections."""
 
-    async def create_server(self, protocol_factory: Callable[[], Any], *args: Any, **options: Any) -> Any:  # type: ignore[override]
+    async def create_server(self, protocol_factory: Callable[[], Any], *args: Any, **options: Any) -> Any:
         """See `asyncio.loop.create_server`."""
         open_connections: set[_Connection] = set()
         if options.get("ssl"):
