@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from scan2sim.flows.pipelines.graph import Output, Task, TaskId
 from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.pipelines.tile_graph import Sources, TileGraph
 from scan2sim.pipeline.core.classes import GROUPS
 from scan2sim.pipeline.core.step import Step
 from scan2sim.pipeline.core.types import Tile
@@ -65,8 +67,46 @@ STEPS: tuple[Step, ...] = (
 )  # fmt: skip
 
 
-Sources = dict[str, Path | Output]
-"""Inputs of a task by name: source files and outputs of other tasks."""
+@dataclass(frozen=True)
+class Scan:
+    """Inputs from the classified scan.
+
+    Attributes:
+        has_ground_photos: whether there are photos other than orthophotos.
+        path: path of the scanner or else of the cameras; empty if there is none.
+        scanner_path: the same, but only of the scanner, for rays to the points.
+        views: photos with poses.
+        moving: points of moving objects.
+        labels: classes in the photos; empty without photos from the ground.
+    """
+
+    has_ground_photos: bool
+    path: Sources
+    scanner_path: Sources
+    views: Sources
+    moving: Sources
+    labels: Sources
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The cloud split by class.
+
+    Attributes:
+        groups: classes that get a surface.
+        cloud_groups: classes that the cloud is split into.
+        furniture: outputs of step `furniture` by name.
+        instances: detected instances (vehicles, ...), as an input.
+        keep_vehicles: whether parked vehicles get a surface.
+        clouds: thinned points of each class, inputs `cloud.CLASS`.
+    """
+
+    groups: list[str]
+    cloud_groups: tuple[str, ...]
+    furniture: Sources
+    instances: Sources
+    keep_vehicles: bool
+    clouds: Sources
 
 
 def build_graph(
@@ -85,340 +125,295 @@ def build_graph(
         SettingError: a setting that doesn't exist or is out of range.
     """
     settings.check(STEPS)
-    graph = _GraphBuilder(tile, settings, survey_tiles, without)
-    evidence = graph.classify()
-    graph.split_cloud(graph.merge_neighbours())
-    synthesized = graph.synthesize_points(evidence)
-    for group in graph.groups:
-        graph.add_surface(group, synthesized.get(group, {}))
-    lists = graph.add_lists()
-    surfaces, seen = graph.analyse_photos(evidence, lists)
-    textured = graph.add_textures(surfaces, seen, synthesized)
-    lists |= graph.add_roads(textured)
-    graph.add_results(surfaces, textured, seen, lists, synthesized)
+    graph = TileGraph(tile, settings, survey_tiles, without)
+    scan = _classify(graph)
+    instances, cloud = _select_points(graph, scan)
+    furniture = _detect_furniture(graph, scan, cloud)
+    parts = _split(graph, scan, cloud, instances, furniture)
+    synthesized = _synthesize_points(graph, scan, parts)
+    for group in parts.groups:
+        _add_surface(graph, scan, parts, group, synthesized.get(group, {}))
+    lists = _list_objects(graph, scan, parts)
+    surfaces, photos, lists = _analyse_photos(graph, scan, parts, lists)
+    textured = _texture(graph, parts, surfaces, photos, synthesized)
+    roads = _add_roads(graph, scan, textured)
+    _export(graph, parts, surfaces, textured, photos, lists | roads)
+    _measure(graph, parts, surfaces, textured, photos, synthesized)
+    _show(graph, scan, parts, textured, photos)
     return graph.tasks
 
 
-class _GraphBuilder:
-    """Builds the task graph of a tile.
+def _classify(graph: TileGraph) -> Scan:
+    """Read the cloud, remove moving objects, and classify points by photos and shape."""
+    tile, output, add = graph.tile, graph.output, graph.add
+    frame: dict[str, Any] = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
+    add(INGEST, {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}, **frame, classes=dict(tile.classes))
+    path: Sources = {}
+    if positions := scanner_path(tile):
+        add(PATH, {}, **positions)
+        path = {"path": output(PATH, "path")}
+    rays = path if tile.trajectory is not None else {}  # cameras are not at the scanner's position
+    ground_views = [view for view in tile.views if view.camera.model != "orthographic"]
+    cameras = _position_rows([view.centre for view in ground_views])
+    add(DYNAMIC_OBJECTS, {"cloud": output(INGEST, "cloud")} | rays, positions=cameras)
+    cloud: Sources = {"cloud": output(DYNAMIC_OBJECTS, "cloud")}
+    photos: Sources = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
+    masks: Sources = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
+    add(VIEWS, photos | masks | cloud, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
+    views: Sources = {"views": output(VIEWS, "views")}
+    moving: Sources = {"moving": output(DYNAMIC_OBJECTS, "moving")}
+    labels: Sources = {}
+    if ground_views:
+        add(LABEL, cloud | views | _weights_input(graph.settings), **_segment_settings(graph.settings))
+        labels = {"labels": output(LABEL, "labels")}
+    add(SEGMENT, cloud | path | (views | moving | labels if ground_views else {}))
+    return Scan(bool(ground_views), path, rays, views, moving, labels)
 
-    Attributes:
-        tasks: tasks added so far.
-        cell: name, seed, neighbours and buffer of the tile's cell; empty if the tile isn't part of a survey.
-        neighbours: names of the neighbouring tiles that are built, too.
-        border_owners: those neighbours that own the border with this tile.
-        has_ground_photos: whether there are photos other than orthophotos.
-        path: path of the scanner or else of the cameras, as an input; empty if there is none.
-        scanner_path: the same, but only of the scanner, for rays to the points.
-        instances: detected instances (vehicles, ...), as an input.
-        furniture: outputs of step `furniture` by name.
-        keep_vehicles: whether parked vehicles get a surface.
-        groups: classes that get a surface.
-        cloud_groups: classes that the cloud is split into.
+
+def _select_points(graph: TileGraph, scan: Scan) -> tuple[Sources, Output]:
+    """Detect instances, remove points that photos don't cover, and take the neighbours' points at borders.
+
+    Returns:
+        The instances, as an input, and the resulting cloud.
     """
+    output, add, path = graph.output, graph.add, scan.path
+    last, instances = SEGMENT, {}  # the step whose cloud is split; the same one in all tiles of a survey
+    if graph.params(INSTANCES).detect and (path or graph.neighbours):
+        classified: Sources = {name: output(SEGMENT, name) for name in ("cloud", "confidence")}
+        add(INSTANCES, classified | scan.moving | path)
+        last, instances = INSTANCES, {"instances": output(INSTANCES, "instances")} if path else {}
+    limit = graph.params(PHOTO_COVERAGE).limit
+    if limit != "off" and (graph.neighbours or (path and (scan.has_ground_photos or limit != "auto"))):
+        views = scan.views if scan.has_ground_photos else {}
+        add(PHOTO_COVERAGE, {"cloud": output(last, "cloud")} | path | views, voxel=graph.params(VOXEL, "terrain").size)
+        last = PHOTO_COVERAGE
+    if graph.neighbours:
+        add(OVERLAP, {"cloud": output(last, "cloud")} | graph.neighbour_outputs(last, "cloud"), **graph.cell)
+        last = OVERLAP
+    return instances, output(last, "cloud")
 
-    def __init__(
-        self, tile: Tile, settings: Settings, survey_tiles: Collection[str] | None, without: Collection[TaskId]
-    ) -> None:
-        self.tasks: list[Task] = []
-        self.tile, self.settings, self._without = tile, settings, without
-        self._name = "" if survey_tiles is None else tile.name
-        self.cell: dict[str, Any] = {}
-        if tile.cell:
-            self.cell = {
-                "name": tile.name, "seed": tile.cell.seed, "neighbours": dict(tile.cell.neighbours),
-                "buffer": tile.cell.buffer,
-            }  # fmt: skip
-        self.neighbours = [name for name in self.cell.get("neighbours", {}) if name in (survey_tiles or ())]
-        self.border_owners = [name for name in self.neighbours if name < tile.name]
-        self.has_ground_photos = any(view.camera.model != "orthographic" for view in tile.views)
-        self.path: Sources = {}
-        self.scanner_path: Sources = {}
-        self.instances: Sources = {}
-        self.furniture: Sources = {}
-        self.keep_vehicles = False
-        self.groups: list[str] = []
-        self.cloud_groups: tuple[str, ...] = ()
 
-    def output(self, step: Step, name: str, group: str = "", other: str | None = None) -> Output:
-        """An output of a task of this tile, or of the neighbour `other`."""
-        return Output(TaskId(step.name, group, self._name if other is None else other), name)
+def _detect_furniture(graph: TileGraph, scan: Scan, cloud: Output) -> Sources:
+    """Detect street furniture and model it; returns the outputs of step `furniture`."""
+    if not (scan.path or graph.neighbours) or graph.params(FURNITURE).when != "auto":
+        return {}
+    graph.add(DETECT_FURNITURE, {"cloud": cloud} | scan.path, **graph.cell)
+    if not (graph.is_enabled(DETECT_FURNITURE) and graph.is_enabled(FURNITURE)):
+        return {}
+    detections = graph.neighbour_outputs(DETECT_FURNITURE, "detections")
+    own = {"cloud": cloud, "detections": graph.output(DETECT_FURNITURE, "detections")}
+    graph.add(FURNITURE, own | detections, **graph.cell)
+    names = (*GROUPS[1:], "furniture_points", "sign_panels", "neighbour_poles", "geojson", "csv")
+    return {name: graph.output(FURNITURE, name) for name in names}
 
-    def is_enabled(self, step: Step, other: str | None = None) -> bool:
-        """Whether a step of this tile, or of the neighbour `other`, is not among the failed side products."""
-        return TaskId(step.name, tile=self._name if other is None else other) not in self._without
 
-    def add(self, step: Step, inputs: Mapping[str, Path | Output], group: str = "", **context: Any) -> None:
-        """Add a task, unless it is a side product that failed."""
-        if self.is_enabled(step):
-            self.tasks.append(Task(step, self.settings.params(step, group, context), inputs, group, self._name))
+def _split(graph: TileGraph, scan: Scan, cloud: Output, instances: Sources, furniture: Sources) -> Parts:
+    """Split the cloud by class, and thin each part."""
+    params = graph.params(SPLIT)
+    keep_vehicles = params.vehicles == "keep" and bool(instances)
+    furniture_points = {name: furniture[name] for name in furniture if name == "furniture_points"}
+    graph.add(SPLIT, {"cloud": cloud} | (instances if keep_vehicles else {}) | furniture_points)
+    vehicle = ("vehicle",) if keep_vehicles else ()
+    groups = [group for group in (*GROUPS, *vehicle) if group != "vegetation" or params.vegetation != "locations"]
+    cloud_groups = (*GROUPS, "rest", *vehicle)
+    for part in cloud_groups:
+        graph.add(VOXEL, {"cloud": graph.output(SPLIT, part)} | scan.path, part)
+    clouds: Sources = {f"cloud.{part}": graph.output(VOXEL, "cloud", part) for part in cloud_groups}
+    return Parts(groups, cloud_groups, furniture, instances, keep_vehicles, clouds)
 
-    def neighbour_outputs(self, step: Step, name: str, group: str = "", prefix: str | None = None) -> Sources:
-        """An output of the tasks of all neighbours, as inputs `prefix.tile`; default prefix: the output's name."""
-        tiles = [tile for tile in self.neighbours if self.is_enabled(step, tile)]
-        return {f"{prefix or name}.{tile}": self.output(step, name, group, tile) for tile in tiles}
 
-    def classify(self) -> Sources:
-        """Add the classification of points by photos and shape; returns the inputs with the photos' classes."""
-        tile, output, add = self.tile, self.output, self.add
-        frame: dict[str, Any] = {"crs": tile.frame.crs, "origin": tile.frame.origin, "unit": tile.frame.unit}
-        files = {f"cloud.{i:04d}": path for i, path in enumerate(tile.clouds)}
-        add(INGEST, files, **frame, classes=dict(tile.classes))
-        path = scanner_path(tile)
-        if path:
-            add(PATH, {}, **path)
-            self.path = {"path": output(PATH, "path")}
-        self.scanner_path = (
-            self.path if tile.trajectory is not None else {}
-        )  # cameras are not at the scanner's position
-        cameras = _position_rows([view.centre for view in tile.views if view.camera.model != "orthographic"])
-        add(DYNAMIC_OBJECTS, {"cloud": output(INGEST, "cloud")} | self.scanner_path, positions=cameras)
-        whole: Sources = {"cloud": output(DYNAMIC_OBJECTS, "cloud")}
-        photos: Sources = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
-        masks: Sources = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
-        add(VIEWS, photos | masks | whole, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
-        evidence: Sources = {}
-        if self.has_ground_photos:
-            add(LABEL, whole | self._views_input() | _weights_input(self.settings), **_segment_settings(self.settings))
-            evidence = {**self._views_input(), **self._moving_input(), "labels": output(LABEL, "labels")}
-        add(SEGMENT, whole | self.path | evidence)
-        return evidence
+def _synthesize_points(graph: TileGraph, scan: Scan, parts: Parts) -> dict[str, Sources]:
+    """Add points that the scanner did not see: occluded ground, walls below roofs and above its view; by class."""
+    synthesized: dict[str, Sources] = {}
+    airborne = {"always": True, "never": False, "auto": not scan.path}  # whether steps for airborne clouds run
+    when = graph.params(GROUND).when
+    hidden = parts.instances if when == "auto" else {}
+    if hidden or airborne[when]:
+        others = graph.neighbour_outputs(INSTANCES, "instances") if hidden else {}
+        synthesized["terrain"] = _synthesize_from_voxels(graph, GROUND, (*GROUPS, "rest"), hidden | others)
+    if airborne[graph.params(WALLS).when]:
+        below: Sources = {"ground": synthesized["terrain"]["synthesized"]} if "terrain" in synthesized else {}
+        below |= {"footprints": graph.tile.footprints} if graph.tile.footprints else {}
+        synthesized["building"] = _synthesize_from_voxels(graph, WALLS, ("building", "terrain"), below)
+    elif scan.scanner_path and scan.has_ground_photos and graph.params(FACADES).when == "auto":
+        clouds = {"cloud": parts.clouds["cloud.building"]} | _other_clouds(parts, "building")
+        photos = scan.views | scan.labels
+        voxel = graph.params(VOXEL, "building").size
+        graph.add(FACADES, clouds | scan.scanner_path | photos, voxel=voxel, cell=graph.cell or None)
+        synthesized["building"] = {"synthesized": graph.output(FACADES, "synthesized")}
+    return synthesized
 
-    def _views_input(self) -> Sources:
-        return {"views": self.output(VIEWS, "views")}
 
-    def _moving_input(self) -> Sources:
-        return {"moving": self.output(DYNAMIC_OBJECTS, "moving")}
+def _synthesize_from_voxels(graph: TileGraph, step: Step, classes: Sequence[str], more: Sources) -> Sources:
+    """Add a step that synthesizes points from the voxels of some classes, including those of the neighbours."""
+    inputs: Sources = {part: graph.output(VOXEL, "cloud", part) for part in classes}
+    for part in classes:
+        inputs |= graph.neighbour_outputs(VOXEL, "cloud", part, prefix=part)
+    graph.add(step, inputs | more, **graph.cell)
+    return {"synthesized": graph.output(step, "synthesized")}
 
-    def merge_neighbours(self) -> Output:
-        """Add instances, photo coverage and the neighbours' points at borders; returns the resulting cloud."""
-        output, add = self.output, self.add
-        last = SEGMENT  # the step whose cloud is split; the same one in all tiles of a survey
-        if self.settings.params(INSTANCES).detect and (self.path or self.neighbours):
-            classified: Sources = {name: output(SEGMENT, name) for name in ("cloud", "confidence")}
-            add(INSTANCES, classified | self._moving_input() | self.path)
-            last, self.instances = INSTANCES, {"instances": output(INSTANCES, "instances")} if self.path else {}
-        limit = self.settings.params(PHOTO_COVERAGE).limit
-        if limit != "off" and (self.neighbours or (self.path and (self.has_ground_photos or limit != "auto"))):
-            shown = self._views_input() if self.has_ground_photos else {}
-            size = self.settings.params(VOXEL, "terrain").size
-            add(PHOTO_COVERAGE, {"cloud": output(last, "cloud")} | self.path | shown, voxel=size)
-            last = PHOTO_COVERAGE
-        if not (self.neighbours and self.tile.cell):
-            return output(last, "cloud")
-        others = self.neighbour_outputs(last, "cloud")
-        add(OVERLAP, {"cloud": output(last, "cloud")} | others, **self.cell)
-        return output(OVERLAP, "cloud")
 
-    def split_cloud(self, cloud: Output) -> None:
-        """Add removal of street furniture from the cloud, its split by class, and the voxel filter of each part."""
-        enabled = (self.path or self.neighbours) and self.settings.params(FURNITURE).when == "auto"
-        if enabled:
-            self.add(DETECT_FURNITURE, {"cloud": cloud} | self.path, **self.cell)
-        if enabled and self.is_enabled(DETECT_FURNITURE) and self.is_enabled(FURNITURE):
-            detections = {"detections": self.output(DETECT_FURNITURE, "detections")} | self.neighbour_outputs(
-                DETECT_FURNITURE, "detections"
-            )
-            self.add(FURNITURE, {"cloud": cloud} | detections, **self.cell)
-            names = (*GROUPS[1:], "furniture_points", "sign_panels", "neighbour_poles", "geojson", "csv")
-            self.furniture = {name: self.output(FURNITURE, name) for name in names}
-        split_params = self.settings.params(SPLIT)
-        self.keep_vehicles = split_params.vehicles == "keep" and bool(self.instances)
-        removed_points = {name: self.furniture[name] for name in self.furniture if name == "furniture_points"}
-        self.add(SPLIT, {"cloud": cloud} | (self.instances if self.keep_vehicles else {}) | removed_points)
-        vehicle = ("vehicle",) if self.keep_vehicles else ()
-        self.groups = [g for g in (*GROUPS, *vehicle) if g != "vegetation" or split_params.vegetation != "locations"]
-        self.cloud_groups = (*GROUPS, "rest", *vehicle)
-        for part in self.cloud_groups:
-            self.add(VOXEL, {"cloud": self.output(SPLIT, part)} | self.path, part)
+def _add_surface(graph: TileGraph, scan: Scan, parts: Parts, group: str, synthesized: Sources) -> None:
+    """The mesh of a class: reconstruct, trim, snap to planes, join with the neighbours' meshes, decimate."""
+    output, add, cell = graph.output, graph.add, graph.cell
+    voxel = graph.params(VOXEL, group).size
+    points: Sources = {"cloud": output(VOXEL, "cloud", group), **synthesized}
+    add(POISSON, points, group, voxel=voxel, cell=cell or None)
+    add(TRIM, {"mesh": output(POISSON, "mesh", group), **points}, group, voxel=voxel)
+    surface = output(TRIM, "mesh", group)
+    when = graph.params(PLANES).when
+    if group == "building" and (when == "always" or (when == "auto" and scan.path)):
+        clouds = {**points, "points": output(SPLIT, group), **_other_clouds(parts, group)}
+        add(PLANES, {"mesh": surface, **clouds}, voxel=voxel, cell=cell or None)
+        surface = output(PLANES, "mesh")
+    add(ISLANDS, {"mesh": surface}, group)
+    surface = output(ISLANDS, "mesh", group)
+    if cell:
+        add(CLIP, {"mesh": surface}, group, **cell)
+        surface = output(CLIP, "mesh", group)
+    if graph.neighbours:
+        clipped = {name: output(CLIP, name, group) for name in ("mesh", "on")}
+        others = {f"{name}.{tile}": output(CLIP, name, group, tile) for tile in graph.border_owners for name in clipped}
+        add(JOIN, clipped | others, group, **cell)
+        surface = output(JOIN, "mesh", group)
+    furniture = {"furniture": parts.furniture[group]} if group in parts.furniture else {}
+    add(DECIMATE, {"mesh": surface, **furniture}, group, keep_border=bool(cell))
 
-    def synthesize_points(self, evidence: Sources) -> dict[str, Sources]:
-        """Add points that the scanner did not see: occluded ground, walls below roofs and above its view; by class."""
-        synthesized: dict[str, Sources] = {}
-        when = self.settings.params(GROUND).when
-        hidden = self.instances if when == "auto" else {}
-        if hidden or self._runs_on_airborne(when):
-            others: Sources = {}
-            for name in hidden:
-                others |= self.neighbour_outputs(INSTANCES, name)
-            synthesized["terrain"] = self._add_synthesis(GROUND, (*GROUPS, "rest"), {**hidden, **others})
-        if self._runs_on_airborne(self.settings.params(WALLS).when):
-            below: Sources = {"ground": synthesized["terrain"]["synthesized"]} if "terrain" in synthesized else {}
-            below |= {"footprints": self.tile.footprints} if self.tile.footprints else {}
-            synthesized["building"] = self._add_synthesis(WALLS, ("building", "terrain"), below)
-        if (
-            self.scanner_path
-            and self.has_ground_photos
-            and "building" not in synthesized
-            and self.settings.params(FACADES).when == "auto"
-        ):
-            shown = {name: evidence[name] for name in ("views", "labels")}
-            size = self.settings.params(VOXEL, "building").size
-            clouds = {"cloud": self.output(VOXEL, "cloud", "building")} | self._other_clouds("building")
-            self.add(FACADES, clouds | self.scanner_path | shown, voxel=size, cell=self.cell or None)
-            synthesized["building"] = {"synthesized": self.output(FACADES, "synthesized")}
-        return synthesized
 
-    def _runs_on_airborne(self, when: str) -> bool:
-        """Whether a step for airborne clouds runs: always, or if there is no path on the ground."""
-        return when == "always" or (when == "auto" and not self.path)
+def _list_objects(graph: TileGraph, scan: Scan, parts: Parts) -> Sources:
+    """Lists of street furniture and plants, as inputs of the export."""
+    lists: Sources = {}
+    if parts.furniture and scan.path:
+        lists = {"furniture": parts.furniture["geojson"], "furniture_csv": parts.furniture["csv"]}
+    if graph.params(SPLIT).vegetation != "mesh" and graph.is_enabled(PLANTS):
+        clouds = {name: graph.output(VOXEL, "cloud", name) for name in ("vegetation", "terrain")}
+        graph.add(PLANTS, clouds, **graph.cell)
+        lists |= {"plants": graph.output(PLANTS, "geojson"), "plants_csv": graph.output(PLANTS, "csv")}
+    return lists
 
-    def _add_synthesis(self, step: Step, parts: Sequence[str], more: Sources) -> Sources:
-        """Add a step that synthesizes points from the voxels of some classes, including those of the neighbours."""
-        inputs: Sources = {part: self.output(VOXEL, "cloud", part) for part in parts}
-        for part in parts:
-            inputs |= self.neighbour_outputs(VOXEL, "cloud", part, prefix=part)
-        self.add(step, inputs | more, **self.cell)
-        return {"synthesized": self.output(step, "synthesized")}
 
-    def _other_clouds(self, group: str) -> Sources:
-        """The voxels of all other classes, as inputs."""
-        return {f"other.{part}": self.output(VOXEL, "cloud", part) for part in self.cloud_groups if part != group}
+def _plant_models(graph: TileGraph, output: str) -> Sources:
+    """Models of plants as an input, if there is no mesh of the vegetation."""
+    wanted = graph.params(PLANTS).models and graph.params(SPLIT).vegetation == "locations"
+    return {"vegetation": graph.output(PLANTS, output)} if wanted and graph.is_enabled(PLANTS) else {}
 
-    def add_surface(self, group: str, synthesized: Sources) -> None:
-        """Add the mesh of a class: reconstruct, trim, snap to planes, join with the neighbours' meshes, decimate."""
-        output, add, cell = self.output, self.add, self.cell
-        cloud, size = output(VOXEL, "cloud", group), self.settings.params(VOXEL, group).size
-        point_inputs: Sources = {"cloud": cloud, **synthesized}
-        add(POISSON, point_inputs, group, voxel=size, cell=cell or None)
-        add(TRIM, {"mesh": output(POISSON, "mesh", group), **point_inputs}, group, voxel=size)
-        surface = output(TRIM, "mesh", group)
-        when = self.settings.params(PLANES).when
-        if group == "building" and (when == "always" or (when == "auto" and self.path)):
-            points = {**point_inputs, "points": output(SPLIT, group)}
-            add(PLANES, {"mesh": surface, **points, **self._other_clouds(group)}, voxel=size, cell=cell or None)
-            surface = output(PLANES, "mesh")
-        add(ISLANDS, {"mesh": surface}, group)
-        surface = output(ISLANDS, "mesh", group)
-        if cell:
-            add(CLIP, {"mesh": surface}, group, **cell)
-            surface = output(CLIP, "mesh", group)
-        if self.neighbours:
-            clipped = {name: output(CLIP, name, group) for name in ("mesh", "on")}
-            others = {
-                f"{name}.{tile}": output(CLIP, name, group, tile) for tile in self.border_owners for name in clipped
-            }
-            add(JOIN, clipped | others, group, **cell)
-            surface = output(JOIN, "mesh", group)
-        things = {"furniture": self.furniture[group]} if group in self.furniture else {}
-        add(DECIMATE, {"mesh": surface, **things}, group, keep_border=bool(cell))
 
-    def add_lists(self) -> Sources:
-        """Add lists of street furniture and plants; returns them as inputs of the export."""
-        lists: Sources = {}
-        if self.furniture and self.path:
-            lists = {"furniture": self.furniture["geojson"], "furniture_csv": self.furniture["csv"]}
-        if self.settings.params(SPLIT).vegetation != "mesh" and self.is_enabled(PLANTS):
-            clouds = {name: self.output(VOXEL, "cloud", name) for name in ("vegetation", "terrain")}
-            self.add(PLANTS, clouds, **self.cell)
-            lists |= {"plants": self.output(PLANTS, "geojson"), "plants_csv": self.output(PLANTS, "csv")}
-        return lists
+def _analyse_photos(graph: TileGraph, scan: Scan, parts: Parts, lists: Sources) -> tuple[Sources, Sources, Sources]:
+    """Refine poses, fit signs to photos, and compute visibility, exposure and photo consistency.
 
-    def plant_models(self, output: str) -> Sources:
-        """Models of plants as an input, if there is no mesh of the vegetation."""
-        wanted = self.settings.params(PLANTS).models and self.settings.params(SPLIT).vegetation == "locations"
-        return {"vegetation": self.output(PLANTS, output)} if wanted and self.is_enabled(PLANTS) else {}
+    Returns:
+        The final mesh of each class, the inputs about photos, and the lists with the fitted signs.
+    """
+    output, add = graph.output, graph.add
+    surfaces: Sources = {group: output(DECIMATE, "mesh", group) for group in parts.groups}
+    photos = scan.views
+    if scan.has_ground_photos and graph.params(POSE_REFINEMENT).when == "auto":
+        rest = {"cloud.rest": parts.clouds["cloud.rest"]}
+        add(POSE_REFINEMENT, _mesh_inputs(surfaces) | rest | scan.moving | photos)
+        photos = {"views": output(POSE_REFINEMENT, "views")}
+    fits_signs = scan.has_ground_photos and parts.furniture and graph.params(SIGNS).when == "auto"
+    if fits_signs and graph.is_enabled(SIGNS):
+        known = {name: parts.furniture[name] for name in ("sign_panels", "neighbour_poles", "geojson")}
+        add(SIGNS, _mesh_inputs(surfaces) | known | photos | scan.labels, **graph.cell)
+        surfaces |= {group: output(SIGNS, group) for group in parts.groups if group in ("building", "vegetation")}
+        lists = lists | {"furniture": output(SIGNS, "geojson"), "furniture_csv": output(SIGNS, "csv")}
+    add(VISIBILITY, _mesh_inputs(surfaces) | parts.clouds | scan.moving | photos)
+    photos = {**photos, "depth": output(VISIBILITY, "depth")}
+    prior = graph.params(EXPOSURE).prior
+    add(EXPOSURE, photos | ({"prior": Path(prior)} if prior else {}))
+    photos = {**photos, "exposures": output(EXPOSURE, "exposures")}
+    add(PHOTO_CONSISTENCY, photos)
+    return surfaces, {**photos, "photo_consistency": output(PHOTO_CONSISTENCY, "photo_consistency")}, lists
 
-    def analyse_photos(self, evidence: Sources, lists: Sources) -> tuple[Sources, Sources]:
-        """Add pose refinement, sign fitting, visibility, exposure and photo consistency; adds signs to `lists`.
 
-        Returns:
-            The final mesh of each class, and the inputs about photos.
-        """
-        output, add = self.output, self.add
-        surfaces: Sources = {group: output(DECIMATE, "mesh", group) for group in self.groups}
-        seen, clouds = self._views_input(), self._cloud_inputs()
-        if self.has_ground_photos and self.settings.params(POSE_REFINEMENT).when == "auto":
-            add(
-                POSE_REFINEMENT,
-                _mesh_inputs(surfaces) | {"cloud.rest": clouds["cloud.rest"]} | self._moving_input() | seen,
-            )
-            seen = {"views": output(POSE_REFINEMENT, "views")}
-        if (
-            self.has_ground_photos
-            and self.furniture
-            and self.settings.params(SIGNS).when == "auto"
-            and self.is_enabled(SIGNS)
-        ):
-            plates = {name: self.furniture[name] for name in ("sign_panels", "neighbour_poles", "geojson")}
-            add(SIGNS, _mesh_inputs(surfaces) | plates | seen | {"labels": evidence["labels"]}, **self.cell)
-            surfaces |= {group: output(SIGNS, group) for group in self.groups if group in ("building", "vegetation")}
-            lists |= {"furniture": output(SIGNS, "geojson"), "furniture_csv": output(SIGNS, "csv")}
-        add(VISIBILITY, _mesh_inputs(surfaces) | clouds | self._moving_input() | seen)
-        seen = {**seen, "depth": output(VISIBILITY, "depth")}
-        prior = self.settings.params(EXPOSURE).prior
-        add(EXPOSURE, seen | ({"prior": Path(prior)} if prior else {}))
-        seen = {**seen, "exposures": output(EXPOSURE, "exposures")}
-        add(PHOTO_CONSISTENCY, seen)
-        return surfaces, {**seen, "photo_consistency": output(PHOTO_CONSISTENCY, "photo_consistency")}
+def _texture(
+    graph: TileGraph, parts: Parts, surfaces: Sources, photos: Sources, synthesized: Mapping[str, Sources]
+) -> Sources:
+    """Select views, unwrap and texture each class, and harmonize its colours with the neighbours'."""
+    output, add = graph.output, graph.add
+    furniture: Sources = {"cloud.furniture": output(SPLIT, "furniture")} if parts.furniture else {}
+    points = parts.clouds | furniture | _synthesized_inputs(synthesized)
+    for group in parts.groups:
+        mesh = {"mesh": surfaces[group]}
+        add(VIEW_SELECTION, mesh | photos, group)
+        choice = {"choice": output(VIEW_SELECTION, "choice", group)}
+        by_photo = {**choice, **photos} if graph.params(UNWRAP, group).backend == "photo" else {}
+        add(UNWRAP, mesh | by_photo, group)
+        unwrapped = {name: output(UNWRAP, name, group) for name in ("mesh", "pages")}
+        removed = parts.instances if group == "terrain" and not parts.keep_vehicles else {}
+        add(TEXTURE, {**unwrapped, **choice, **points, **photos, **removed}, group)
+    last = TEXTURE
+    if graph.neighbours:
+        last = COLOUR_HARMONIZATION
+        for group in parts.groups:
+            others = graph.neighbour_outputs(TEXTURE, "textured", group, prefix="neighbour")
+            add(COLOUR_HARMONIZATION, {"textured": output(TEXTURE, "textured", group)} | others, group)
+    return {group: output(last, "textured", group) for group in parts.groups}
 
-    def _cloud_inputs(self) -> Sources:
-        return {f"cloud.{part}": self.output(VOXEL, "cloud", part) for part in self.cloud_groups}
 
-    def add_textures(self, surfaces: Sources, seen: Sources, synthesized: Mapping[str, Sources]) -> Sources:
-        """Add view selection, unwrapping and texturing of each class, and colour harmonization with the neighbours."""
-        output, add = self.output, self.add
-        own: Sources = {"cloud.furniture": output(SPLIT, "furniture")} if self.furniture else {}
-        points = self._cloud_inputs() | own | _synthesized_inputs(synthesized)
-        for group in self.groups:
-            mesh = {"mesh": surfaces[group]}
-            add(VIEW_SELECTION, mesh | seen, group)
-            choice = {"choice": output(VIEW_SELECTION, "choice", group)}
-            by_photo = {**choice, **seen} if self.settings.params(UNWRAP, group).backend == "photo" else {}
-            add(UNWRAP, mesh | by_photo, group)
-            unwrapped = {name: output(UNWRAP, name, group) for name in ("mesh", "pages")}
-            occluders = self.instances if group == "terrain" and not self.keep_vehicles else {}
-            add(TEXTURE, {**unwrapped, **choice, **points, **seen, **occluders}, group)
-        last = TEXTURE
-        if self.neighbours:
-            last = COLOUR_HARMONIZATION
-            for group in self.groups:
-                others = self.neighbour_outputs(TEXTURE, "textured", group, prefix="neighbour")
-                add(COLOUR_HARMONIZATION, {"textured": output(TEXTURE, "textured", group)} | others, group)
-        return {group: output(last, "textured", group) for group in self.groups}
+def _add_roads(graph: TileGraph, scan: Scan, textured: Sources) -> Sources:
+    """Extract the roads; returns them and the path as inputs of the export."""
+    if not scan.path or graph.params(ROADS).when == "never" or not graph.is_enabled(ROADS):
+        return scan.path
+    ground = {"cloud": graph.output(SPLIT, "terrain"), "textured": textured["terrain"]}
+    origin = graph.params(EXPORT).world_origin
+    graph.add(ROADS, ground | scan.path, name=graph.tile.name, world_origin=origin, cell=graph.cell or None)
+    outputs = {"roads": "geojson", "roads_seen": "seen", "opendrive": "opendrive"}
+    return scan.path | {name: graph.output(ROADS, output) for name, output in outputs.items()}
 
-    def add_roads(self, textured: Sources) -> Sources:
-        """Add the roads; returns them and the path as inputs of the export."""
-        if not self.path or self.settings.params(ROADS).when == "never" or not self.is_enabled(ROADS):
-            return self.path
-        ground = {"cloud": self.output(SPLIT, "terrain"), "textured": textured["terrain"]}
-        origin = self.settings.params(EXPORT).world_origin
-        self.add(ROADS, ground | self.path, name=self.tile.name, world_origin=origin, cell=self.cell or None)
-        outputs = {"roads": "geojson", "roads_seen": "seen", "opendrive": "opendrive"}
-        return self.path | {name: self.output(ROADS, output) for name, output in outputs.items()}
 
-    def add_results(
-        self, surfaces: Sources, textured: Sources, seen: Sources, lists: Sources, synthesized: Mapping[str, Sources]
-    ) -> None:
-        """Add the export of the world, rasters, metrics, images and previews."""
-        output, add, tile = self.output, self.add, self.tile
-        add(COLLISION, {**surfaces, **self.plant_models("mesh"), "cloud": output(SPLIT, "terrain")}, **self.cell)
-        planted = self.plant_models("textured")
-        choice = {f"choice.{g}": output(VIEW_SELECTION, "choice", g) for g in self.groups}
-        shown = {"views": seen["views"], "collision": output(COLLISION, "mesh")}
-        add(EXPORT, textured | planted | choice | lists | self.instances | shown, name=tile.name)
-        if self.settings.params(EXPORT).rasters:
-            add(RASTERS, textured, name=tile.name, **_raster_context(self.settings))
-        truth: Sources = {}
-        if tile.truth_mesh and tile.truth_points:
-            truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
-        add(
-            GEOMETRY,
-            _mesh_inputs(surfaces) | self._cloud_inputs() | _synthesized_inputs(synthesized) | truth,
-            **self.cell,
-        )
-        add(SCORE, textured | {name: seen[name] for name in ("views", "depth")} | self.instances | truth)
-        if self.neighbours:
-            mine = {f"textured.{g}": output(COLOUR_HARMONIZATION, "textured", g) for g in self.groups}
-            theirs = {
-                f"textured.{g}.{n}": output(COLOUR_HARMONIZATION, "textured", g, n)
-                for g in self.groups
-                for n in self.border_owners
-            }
-            add(BORDERS, mine | theirs, **self.cell)
-        add(PREVIEW, textured | planted | self.path)
-        stages = {f"decimate.{g}": output(DECIMATE, "mesh", g) for g in self.groups}
-        add(PICTURES, textured | stages | self._cloud_inputs() | {"views": seen["views"]} | self.path)
+def _export(
+    graph: TileGraph, parts: Parts, surfaces: Sources, textured: Sources, photos: Sources, lists: Sources
+) -> None:
+    """The collision mesh, the world, and rasters."""
+    output, add, name = graph.output, graph.add, graph.tile.name
+    terrain = {"cloud": output(SPLIT, "terrain")}
+    add(COLLISION, {**surfaces, **_plant_models(graph, "mesh"), **terrain}, **graph.cell)
+    planted = textured | _plant_models(graph, "textured")
+    choice = {f"choice.{group}": output(VIEW_SELECTION, "choice", group) for group in parts.groups}
+    views = {"views": photos["views"], "collision": output(COLLISION, "mesh")}
+    add(EXPORT, planted | choice | lists | parts.instances | views, name=name)
+    if graph.params(EXPORT).rasters:
+        add(RASTERS, textured, name=name, **_raster_context(graph.settings))
+
+
+def _measure(
+    graph: TileGraph,
+    parts: Parts,
+    surfaces: Sources,
+    textured: Sources,
+    photos: Sources,
+    synthesized: Mapping[str, Sources],
+) -> None:
+    """Metrics of surfaces, textures and borders."""
+    output, add, tile = graph.output, graph.add, graph.tile
+    truth: Sources = {}
+    if tile.truth_mesh and tile.truth_points:
+        truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
+    clouds = parts.clouds | _synthesized_inputs(synthesized)
+    add(GEOMETRY, _mesh_inputs(surfaces) | clouds | truth, **graph.cell)
+    add(SCORE, textured | {name: photos[name] for name in ("views", "depth")} | parts.instances | truth)
+    if graph.neighbours:
+        step = COLOUR_HARMONIZATION
+        own = {f"textured.{group}": output(step, "textured", group) for group in parts.groups}
+        others = {
+            f"textured.{group}.{tile}": output(step, "textured", group, tile)
+            for group in parts.groups
+            for tile in graph.border_owners
+        }
+        add(BORDERS, own | others, **graph.cell)
+
+
+def _show(graph: TileGraph, scan: Scan, parts: Parts, textured: Sources, photos: Sources) -> None:
+    """The walkable preview and the pictures of the report."""
+    graph.add(PREVIEW, textured | _plant_models(graph, "textured") | scan.path)
+    stages = {f"decimate.{group}": graph.output(DECIMATE, "mesh", group) for group in parts.groups}
+    graph.add(PICTURES, textured | stages | parts.clouds | {"views": photos["views"]} | scan.path)
+
+
+def _other_clouds(parts: Parts, group: str) -> Sources:
+    """The voxels of all other classes, as inputs."""
+    return {f"other.{part}": parts.clouds[f"cloud.{part}"] for part in parts.cloud_groups if part != group}
 
 
 def _mesh_inputs(surfaces: Sources) -> Sources:
