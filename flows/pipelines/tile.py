@@ -177,7 +177,8 @@ def _select_points(graph: TileGraph, scan: Scan) -> tuple[Sources, Output]:
         The instances, as an input, and the resulting cloud.
     """
     output, add, path = graph.output, graph.add, scan.path
-    last, instances = SEGMENT, {}  # the step whose cloud is split; the same one in all tiles of a survey
+    instances: Sources = {}
+    last = SEGMENT  # the step whose cloud is split; the same one in all tiles of a survey
     if graph.params(INSTANCES).detect and (path or graph.neighbours):
         classified: Sources = {name: output(SEGMENT, name) for name in ("cloud", "confidence")}
         add(INSTANCES, classified | scan.moving | path)
