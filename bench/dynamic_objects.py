@@ -60,7 +60,7 @@ def remove_dynamic(cloud: PointCloud, path: Trajectory) -> tuple[Bools, float, d
         )
         seconds = time.perf_counter() - begin
         dropped = np.load(done.files["dropped"])
-        return (dropped > 0 if len(dropped) else np.zeros(len(cloud), bool)), seconds, done.facts
+        return (dropped > 0 if len(dropped) else np.zeros(len(cloud), bool)), seconds, done.metrics
 
 
 def dufomap(cloud: PointCloud, path: Trajectory) -> tuple[Bools, float]:

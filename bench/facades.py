@@ -88,7 +88,7 @@ def evaluate(folder: Path, seed: int, degrees: float) -> dict[str, float]:
         "met": covered,
         "seconds": seconds,
     }
-    print(f"seed {seed}: {done.facts}; {json.dumps({k: round(float(v), 3) for k, v in metrics.items()})}")
+    print(f"seed {seed}: {done.metrics}; {json.dumps({k: round(float(v), 3) for k, v in metrics.items()})}")
     return {name: float(value) for name, value in metrics.items()}
 
 

@@ -142,7 +142,7 @@ def one_tile(tile: Path, out: Path) -> dict[str, Any]:
         "gb_read": round((read + between) / 1e9, 2),
         "gb_written": round(sum(sum(m["sizes"].values()) for m in made.values()) / 1e9, 2),
         "gb_world": round(body["world"]["bytes"] / 1e9, 2),
-        "points": body["steps"]["ingest"]["facts"]["points"],
+        "points": body["steps"]["ingest"]["metrics"]["points"],
     }
 
 

@@ -34,12 +34,12 @@ def hard(out: Path) -> dict[str, float | None]:
         folder = render_drive(out / f"hard_{list(DRIVES).index(name)}", way, conditions)
         plain, _ = slam(folder, out / f"slam_{folder.name}")
         both = ("--set", "track.rolling_shutter=true", "--set", "track.lens_offset=true")
-        found, facts = slam(folder, out / f"slam_{folder.name}_shared", *both)
-        readout, offset = 1e3 * facts["readout"], 1e2 * facts["lens_offset"]
+        found, metrics = slam(folder, out / f"slam_{folder.name}_shared", *both)
+        readout, offset = 1e3 * metrics["readout"], 1e2 * metrics["lens_offset"]
         truth = 1e3 * conditions.rolling_shutter, 1e2 * conditions.lens_offset
         print(
             f"| {name} | {plain.drift_percent:.3f} | {found.drift_percent:.3f} | {readout:.1f} ({truth[0]:.0f}) "
-            f"| {offset:.2f} ({truth[1]:.0f}) | {facts['unsure_share']:.1%} |",
+            f"| {offset:.2f} ({truth[1]:.0f}) | {metrics['unsure_share']:.1%} |",
             flush=True,
         )
     return {"hard_drift_percent": found.drift_percent}

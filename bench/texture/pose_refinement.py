@@ -114,7 +114,7 @@ def synthetic(folder: Path) -> dict[str, Any]:
         views_io.save(folder / "views.json", views, held)
         start = time.perf_counter()
         done = pose_refinement({"views": folder / "views.json", **scan}, settings, out, silent)
-        return views_io.load(done.files["views"]), done.facts, time.perf_counter() - start
+        return views_io.load(done.files["views"]), done.metrics, time.perf_counter() - start
 
     refined(truth)  # warm up: compile kernels
     _, still, _ = refined(truth)
@@ -150,7 +150,7 @@ def compare(name: str, metrics: dict[str, dict[str, Any]], refined: dict[str, An
     """Metrics of both worlds of a street, and of the step."""
     never, auto = metrics["never"], metrics["auto"]
     outlines = {when: float(np.median(f["displacements_px"])) for when, f in metrics.items()}
-    facts = refined["facts"]
+    facts = refined["metrics"]
     print(
         f"{name}: matches {facts['displaced_px']:.2f} -> {facts.get('displaced_after_px')} pixels; held-out photos ",
         end="",

@@ -78,7 +78,7 @@ def _check_path(planned: list[PlannedTask], done: dict[str, Manifest], slam: Pat
     names = {item.task.id.name for item in planned}
     if "fuse" not in names and not any(getattr(item.task.params, "keep_unsure", False) for item in planned):
         remedy = "Add gps to [slam], fix the causes that slam.json lists, or set keep_unsure = true in [sweeps]"
-        check_sure(done["georeference"].facts["unsure_share"], slam, remedy)
+        check_sure(done["georeference"].metrics["unsure_share"], slam, remedy)
 
 
 def found(place: Path) -> Path:

@@ -44,7 +44,7 @@ def execute_with_progress(
         jobs = jobs or default_jobs()
         outcome = execute(planned, store, jobs=jobs, on_event=on_event, keep_going=keep_going, memory=memory)
     for task, manifest in outcome.done.items():
-        lines = [manifest.facts["summary"]] if "summary" in manifest.facts else []
+        lines = [manifest.metrics["summary"]] if "summary" in manifest.metrics else []
         for line in lines + [f"warning: {text}" for text in manifest.warnings]:
             log.write(f"{task}: {line}")
     return outcome

@@ -123,15 +123,15 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
             columns = predicted, beside["confidence"], beside["source"]
             dropped = np.load(files["dynamic_objects", "dropped"])
             if len(dropped):
-                kept = done["segment"].facts["source"] == "cloud"
+                kept = done["segment"].metrics["source"] == "cloud"
                 whole = PointCloud.load(files["ingest", "cloud"]).classification if kept else None
                 columns = _with_dropped(dropped, whole, *columns)
             _write_clouds(tile, out / "classified", *columns)
         if ("label", "labels") in files:
             _write_label_images(files["views", "views"], files["label", "labels"], out)
     show_warnings(done)
-    console.print(json.dumps(done["segment"].facts, indent=1), highlight=False, markup=False)
-    if own is not None and done["segment"].facts["source"] != "cloud" and done["segment"].facts["own_classes"] > 0:
+    console.print(json.dumps(done["segment"].metrics, indent=1), highlight=False, markup=False)
+    if own is not None and done["segment"].metrics["source"] != "cloud" and done["segment"].metrics["own_classes"] > 0:
         console.print(confusion(own, predicted).table(), highlight=False, markup=False, soft_wrap=True)
     console.print(f"Clouds: {out / 'classified'}", highlight=False, soft_wrap=True, markup=False)
 

@@ -180,7 +180,7 @@ def check_sure(unsure: float, out: Path, remedy: str) -> None:
 def _figures(done: Mapping[str, Manifest]) -> dict[str, Any]:
     """All metrics of a run, and its warnings."""
     steps = [done[step.name] for step in STEPS if step.name in done]
-    facts = {key: value for one in steps for key, value in one.facts.items()}
+    facts = {key: value for one in steps for key, value in one.metrics.items()}
     return facts | {"warnings": list(dict.fromkeys(text for one in steps for text in one.warnings))}
 
 

@@ -102,12 +102,12 @@ def _results(
         manifests = [store.find(task.full_name, key) for task, key in zip(cell_tasks, keys, strict=True)]
         done = [manifest for manifest in manifests if manifest is not None]
         error = next((failed[task.id] for task in cell_tasks if task.id in failed), None)
-        facts = {key: value for manifest in done for key, value in manifest.facts.items()}
+        metrics = {key: value for manifest in done for key, value in manifest.metrics.items()}
         if error is not None:
-            results[cell] = Result(facts, f"{error.where}: {error.cause}")
+            results[cell] = Result(metrics, f"{error.where}: {error.cause}")
         elif cell_tasks and len(done) == len(cell_tasks):
-            reason = facts.pop("reason", None)
-            results[cell] = Result(facts | {"seconds": round(sum(one.seconds for one in done), 1)}, reason)
+            reason = metrics.pop("reason", None)
+            results[cell] = Result(metrics | {"seconds": round(sum(one.seconds for one in done), 1)}, reason)
     return results
 
 

@@ -43,5 +43,5 @@ def scanner_path(tasks: list[Task], out: Path) -> Path:
     for manifest in done.values():
         for text in manifest.warnings:
             warn(text)
-    console.print(str(done["fuse"].facts["summary"]), highlight=False, soft_wrap=True, markup=False)
+    console.print(str(done["fuse"].metrics["summary"]), highlight=False, soft_wrap=True, markup=False)
     return out / "trajectory.csv"

@@ -35,7 +35,7 @@ WITH_WARNINGS = "CompletedWithWarnings"
 def run_step(name: str, work: Callable[[], Manifest], manifest: str) -> str:
     """Run a step on a worker and wait for it; returns the path of its manifest."""
     log, done = get_run_logger(), work()
-    for line in [done.facts["summary"]] if "summary" in done.facts else []:
+    for line in [done.metrics["summary"]] if "summary" in done.metrics else []:
         log.info(line)
     for line in done.warnings:
         log.warning(line)

@@ -68,7 +68,7 @@ def findings(done: Mapping[str, Manifest], failed: Mapping[str, ScanError] | Non
         done: results by task name.
         failed: errors of side products by name.
     """
-    facts = {task: manifest.facts for task, manifest in done.items()}
+    facts = {task: manifest.metrics for task, manifest in done.items()}
     checks = (_cameras, _held_out, _unseen, _remains, _moved, _disagreeing)
     found = [one for check in checks for one in check(facts)]
     found += [Finding("poor", name, failure_text(name, error)) for name, error in (failed or {}).items()]

@@ -195,7 +195,7 @@ def _figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
     return {
         "seconds": body["seconds"],
         "peak_mb": body["peak_mb"],
-        "points": done["ingest"].facts["points"],
+        "points": done["ingest"].metrics["points"],
         "photos": len(tile.views),
         "coverage": body["texture"]["coverage"],
         "psnr_db": body["texture"].get("psnr_db"),
@@ -208,7 +208,7 @@ def _figures(tile: Tile, done: Mapping[str, Manifest]) -> dict[str, Any]:
 
 def _borders(done: Mapping[str, Manifest]) -> list[dict[str, Any]]:
     """Metrics of a tile's borders with the neighbours that own them, over all classes."""
-    found = done["borders"].facts["neighbours"] if "borders" in done else {}
+    found = done["borders"].metrics["neighbours"] if "borders" in done else {}
     rows = []
     for name, classes in found.items():
         values = list(classes.values())

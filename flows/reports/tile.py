@@ -58,10 +58,10 @@ def write_report(
         if task in done:
             folder = store.folder(task, keys[task]) / done[task].files[name]
             entries = json.loads((folder / "index.json").read_text(encoding="utf-8"))
-            shown = representative(entries, done[task].facts["photos"]) if name == "error" else entries
+            shown = representative(entries, done[task].metrics["photos"]) if name == "error" else entries
             pictures += [_with_pixels(entry, folder) for entry in shown]
     page = out / PAGE
-    view = done["preview"].facts if "preview" in done and done["preview"].files else None
+    view = done["preview"].metrics if "preview" in done and done["preview"].files else None
     write_atomically(page, _render(body, pictures, view, gazebo.commands(out / "world" / f"{tile.name}.sdf")))
     return page
 
@@ -73,7 +73,7 @@ def failed_before(out: Path) -> set[str]:
 
 def figures(tile: Tile, done: Mapping[str, Manifest], failed: Mapping[str, ScanError] | None = None) -> dict[str, Any]:
     """All metrics of a run as a JSON document; docs/reference/formats.md describes the keys."""
-    facts = {task: manifest.facts for task, manifest in done.items()}
+    facts = {task: manifest.metrics for task, manifest in done.items()}
     geometry: dict[str, dict[str, float]] = {}
     for group, values in facts.get("geometry", {}).items():
         for name, value in values.items():
@@ -99,7 +99,7 @@ def figures(tile: Tile, done: Mapping[str, Manifest], failed: Mapping[str, ScanE
         "texture": texture | facts.get("score", {}),
         "world": facts["export"],
         "steps": {
-            task: {"seconds": m.seconds, "peak_mb": m.peak_mb, "facts": m.facts, "warnings": m.warnings}
+            task: {"seconds": m.seconds, "peak_mb": m.peak_mb, "metrics": m.metrics, "warnings": m.warnings}
             for task, m in done.items()
         },
     }

@@ -50,7 +50,7 @@ class Manifest:
         files: output name to path relative to the result's folder.
         sizes: bytes of every file below it.
         digests: SHA-256 of each of them.
-        facts, warnings: metrics and warnings of the step.
+        metrics, warnings: of the step.
         seconds, peak_mb: wall time and peak memory of the step's process and its children.
     """
 
@@ -63,7 +63,7 @@ class Manifest:
     files: dict[str, str]
     sizes: dict[str, int]
     digests: dict[str, str]
-    facts: dict[str, Any]
+    metrics: dict[str, Any]
     warnings: list[str]
     seconds: float
     peak_mb: float
@@ -289,7 +289,7 @@ class Store:
             files={name: path.relative_to(folder).as_posix() for name, path in done.files.items()},
             sizes=sizes,
             digests=digests,
-            facts=done.facts,
+            metrics=done.metrics,
             warnings=done.warnings,
             **about,
         )

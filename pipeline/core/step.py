@@ -18,7 +18,7 @@ from scan2sim.pipeline.core.parameters import described
 
 
 class Context(BaseModel):
-    """Base class of what the pipeline passes to a step besides files: facts of the tile, and other steps' settings.
+    """Base class of what the pipeline passes to a step besides files: data of the tile, and other steps' settings.
 
     Parameters with a context have it as their field `context`; users can't set it.
     """
@@ -84,12 +84,12 @@ class Done:
 
     Attributes:
         files: name to path of a file or folder inside the step's output folder.
-        facts: metrics for the report, JSON-serializable (counts in and out, errors, ...).
+        metrics: for the report, JSON-serializable (counts in and out, errors, ...).
         warnings: sentences for the user, printed and stored with the result.
     """
 
     files: dict[str, Path]
-    facts: dict[str, Any] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
 

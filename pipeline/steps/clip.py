@@ -23,8 +23,8 @@ def clip(inputs: Inputs, params: ClipParams, out: Path, report: Report) -> Done:
     clipped = clip_mesh(mesh, params.context.cell)
     clipped.save(out / "mesh.npz", out / "on.npz")
     on = {name: int(flags.sum()) for name, flags in clipped.on.items()}
-    facts = {"faces_in": len(mesh), "faces": len(clipped.mesh), "on_border": on}
-    return Done({"mesh": out / "mesh.npz", "on": out / "on.npz"}, facts)
+    metrics = {"faces_in": len(mesh), "faces": len(clipped.mesh), "on_border": on}
+    return Done({"mesh": out / "mesh.npz", "on": out / "on.npz"}, metrics)
 
 
 CLIP = Step("clip", 1, clip, ClipParams, per_class=True)

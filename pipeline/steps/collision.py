@@ -97,7 +97,7 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
         )
     report(0.8, "deviation")
     collision_mesh.save(out / "collision.npz")
-    facts: dict[str, Any] = {
+    metrics: dict[str, Any] = {
         "triangles_in": len(visual),
         "triangles": len(collision_mesh),
         "ground_triangles": len(ground),
@@ -107,7 +107,7 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
         "ground_m2": _areas(ground),
     }
     if points is not None and len(ground):
-        facts["ground_m"] = _height_errors(ground, points.xyz)
+        metrics["ground_m"] = _height_errors(ground, points.xyz)
     warnings = []
     if only_plants and not params.vegetation:
         warnings.append(
@@ -117,7 +117,7 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
         warnings.append(
             f"{len(collision_mesh):,} triangles instead of {params.triangles:,}: tile borders can't be simplified"
         )
-    return Done({"mesh": out / "collision.npz"}, facts, warnings)
+    return Done({"mesh": out / "collision.npz"}, metrics, warnings)
 
 
 def _ground_points(inputs: Inputs, seed: int) -> PointCloud | None:

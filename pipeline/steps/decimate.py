@@ -56,8 +56,8 @@ def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) 
     if furniture is not None and len(furniture):
         small = with_furniture(small, furniture)
     small.save(out / "mesh.npz")
-    facts = {"faces_in": len(mesh), "faces": len(small), "target": params.target, "border_kept": border_kept}
-    return Done({"mesh": out / "mesh.npz"}, facts, warnings)
+    metrics = {"faces_in": len(mesh), "faces": len(small), "target": params.target, "border_kept": border_kept}
+    return Done({"mesh": out / "mesh.npz"}, metrics, warnings)
 
 
 def with_furniture(mesh: Mesh, furniture: Mesh) -> Mesh:

@@ -88,7 +88,7 @@ def dynamic_objects(inputs: Inputs, params: DynamicObjectsParams, out: Path, rep
     own = np.zeros(len(cloud), bool) if own is None else own & ~moved
     near &= ~moved & ~own
     moving_share = float(moved.mean())
-    facts: dict[str, object] = {
+    metrics: dict[str, object] = {
         "points": len(cloud),
         "moved": int(moved.sum()),
         "moving_share": round(moving_share, 5),
@@ -99,7 +99,7 @@ def dynamic_objects(inputs: Inputs, params: DynamicObjectsParams, out: Path, rep
     }
     gone = moved | own | near
     if not gone.any():
-        return _untouched(inputs["cloud"], out, why, facts)
+        return _untouched(inputs["cloud"], out, why, metrics)
     report(0.9, "writing")
     cloud.take(~gone).save(out / "cloud.npz")
     dropped = np.where(moved, CODE["vehicle"], np.where(gone, CODE["low_noise"], 0)).astype(np.uint8)
@@ -120,17 +120,17 @@ def dynamic_objects(inputs: Inputs, params: DynamicObjectsParams, out: Path, rep
             "check that path and points share a clock, and that poses are accurate to a voxel. "
             "--set dynamic_objects.when=never keeps all points"
         )
-    return Done(files, facts, warnings)
+    return Done(files, metrics, warnings)
 
 
-def _untouched(cloud: Path, out: Path, why: str, facts: dict[str, object] | None = None) -> Done:
+def _untouched(cloud: Path, out: Path, why: str, metrics: dict[str, object] | None = None) -> Done:
     """Result without moving points: the input cloud, linked."""
     file, moving = out / "cloud.npz", out / "moving.npz"
     link_or_copy(cloud, file)
     none = np.zeros((0, 3), np.float32)
     PointCloud(Frame(), none, none.astype(np.uint8), none, np.zeros(0, np.uint8), np.zeros(0)).save(moving)
     np.save(out / "dropped.npy", np.zeros(0, np.uint8))
-    return Done({"cloud": file, "moving": moving, "dropped": out / "dropped.npy"}, facts or {"rays": why})
+    return Done({"cloud": file, "moving": moving, "dropped": out / "dropped.npy"}, metrics or {"rays": why})
 
 
 def _origins(cloud: PointCloud, path: Trajectory) -> tuple[F64, str]:

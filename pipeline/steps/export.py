@@ -97,13 +97,13 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
     for file in inputs["opendrive"].iterdir() if "opendrive" in inputs else ():
         shutil.copyfile(file, world / file.name)
     tile = scene.tiles[0]
-    facts = {
+    metrics = {
         "triangles": {group: figures["triangles"] for group, figures in tile.groups.items()},
         "pages": {group: figures["pages"] for group, figures in tile.groups.items()},
         "collision_triangles": len(tile.solid()),
         "bytes": sum({s.st_ino: s.st_size for s in (f.stat() for f in world.rglob("*") if f.is_file())}.values()),
     }
-    return Done({"world": world}, facts)
+    return Done({"world": world}, metrics)
 
 
 def _label_of_face(path: Path) -> I32:

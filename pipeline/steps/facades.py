@@ -62,11 +62,11 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
     cloud = PointCloud.load(inputs["cloud"])
     whole = PointCloud.join([cloud, *(PointCloud.load(path) for name, path in inputs.items() if "other." in name)])
     made = PointCloud(cloud.frame, np.zeros((0, 3), np.float32), normal=np.zeros((0, 3), np.float32))
-    facts: dict[str, Any] = {"walls": 0, "above_m2": 0.0, "gaps_m2": 0.0}
+    metrics: dict[str, Any] = {"walls": 0, "above_m2": 0.0, "gaps_m2": 0.0}
     if whole.time is None or not len(cloud):
         made.save(out / "synthesized.npz")
         return Done(
-            {"synthesized": out / "synthesized.npz"}, facts | {"why": "the points have no times: rays are unknown"}
+            {"synthesized": out / "synthesized.npz"}, metrics | {"why": "the points have no times: rays are unknown"}
         )
     assert cloud.normal is not None
     planes, which, _ = detect(cloud.xyz, cloud.normal, params.context.voxel)
@@ -79,12 +79,12 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
         through = kernels.cells_passed_through(wall, rays)
         above = extend_upwards(wall, rays, np.flatnonzero(which == wall.plane), through, photos)
         gaps = kernels.gap_cells(wall.known | above, through, round(params.gap / params.context.voxel))
-        facts["walls"] += 1
+        metrics["walls"] += 1
         for name, cells in (("above_m2", above), ("gaps_m2", gaps)):
             xyz = points_in_cells(wall, cells)
             near = np.isfinite(tree.query(xyz, distance_upper_bound=MIN_DISTANCE_CELLS * params.context.voxel)[0])
             xyz = xyz[~near & away_from_borders(xyz, cloud.frame.origin, params.context.cell)]
-            facts[name] += len(xyz) * params.context.voxel**2 / POINTS_PER_CELL
+            metrics[name] += len(xyz) * params.context.voxel**2 / POINTS_PER_CELL
             parts.append((xyz, np.tile(wall.normal, (len(xyz), 1))))
     if parts:
         xyz, normal = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
@@ -94,7 +94,7 @@ def facades(inputs: Inputs, params: FacadesParams, out: Path, report: Report) ->
             cloud.frame, snap_to_grid(xyz).astype(np.float32), rgb, normal.astype(np.float32), classification
         )
     made.save(out / "synthesized.npz")
-    rounded = {name: round(value, 1) if isinstance(value, float) else value for name, value in facts.items()}
+    rounded = {name: round(value, 1) if isinstance(value, float) else value for name, value in metrics.items()}
     return Done({"synthesized": out / "synthesized.npz"}, rounded | {"points": len(made)})
 
 

@@ -36,7 +36,7 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
     the mesh); `truth_mean_m` (from the mesh to the ground-truth surface of its class). `synthesized` is the fraction
     of the mesh's area that is nearer to synthesized points (`synthesized.*`) than to scanned ones.
     """
-    facts: dict[str, dict[str, Any]] = {}
+    by_class: dict[str, dict[str, Any]] = {}
     warnings: list[str] = []
     truth = Mesh.load(inputs["truth.mesh"]) if "truth.mesh" in inputs else None
     for i, group in enumerate(SURFACES):
@@ -75,8 +75,8 @@ def geometry(inputs: Inputs, params: GeometryParams, out: Path, report: Report) 
         if truth is not None and truth.classification is not None:
             error = truth_error(mesh, truth, group, params.samples)
             metrics |= {} if error is None else {"truth_mean_m": error}
-        facts[group] = {name: round(value, 4) for name, value in metrics.items()}
-    return Done({}, facts, warnings)
+        by_class[group] = {name: round(value, 4) for name, value in metrics.items()}
+    return Done({}, by_class, warnings)
 
 
 def synthesized_fraction(mesh: Mesh, cloud: PointCloud, synthesized: PointCloud, samples: int) -> float:

@@ -77,14 +77,14 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
         )
     report(0.9, "writing")
     cloud.save(out / "cloud.npz")
-    facts = {
+    metrics = {
         "points": len(cloud),
         "extent_m": (high - low).round(2).tolist(),
         "coloured": cloud.rgb is not None,
         "classified": bool(cloud.classification is not None and classes.classified_codes()[cloud.classification].any()),
         "timed": cloud.time is not None,
     }
-    return Done({"cloud": out / "cloud.npz"}, facts, warnings)
+    return Done({"cloud": out / "cloud.npz"}, metrics, warnings)
 
 
 INGEST = Step("ingest", 2, ingest, IngestParams, memory=(0.4, 12))

@@ -36,14 +36,14 @@ def islands(inputs: Inputs, params: IslandsParams, out: Path, report: Report) ->
     keep = mesh.keep((area >= params.min_area)[piece]) if len(mesh) else mesh
     keep.save(out / "mesh.npz")
     kept = int((area >= params.min_area).sum())
-    facts = {
+    metrics = {
         "faces_in": len(mesh),
         "faces": len(keep),
         "islands_removed": pieces - kept,
         "pieces": kept,
         "area_m2": round(float(keep.face_area.sum()), 2),
     }
-    return Done({"mesh": out / "mesh.npz"}, facts)
+    return Done({"mesh": out / "mesh.npz"}, metrics)
 
 
 ISLANDS = Step("islands", 1, islands, IslandsParams, class_defaults={"terrain": {"min_area": 2.0}}, per_class=True)

@@ -79,14 +79,14 @@ def photo_coverage(inputs: Inputs, params: PhotoCoverageParams, out: Path, repor
         voxel[order] = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(order))))
         cloud = cloud.take(kept[voxel])
         cloud.save(file)
-    facts = {
+    metrics = {
         "points_in": len(order),
         "points": len(cloud),
         "left_out": len(order) - len(cloud),
         "left_out_m2": round(float((~kept).sum() * cell_m**2)),
         "far_m": round(_farthest(thin, kept, path.positions), 1),
     }
-    return Done({"cloud": file}, facts)
+    return Done({"cloud": file}, metrics)
 
 
 def _covered(thin: PointCloud, views: Sequence[View], path: Trajectory, cell_m: float, report: Report) -> Bools:

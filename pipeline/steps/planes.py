@@ -41,10 +41,10 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
     mesh, cloud, voxel = Mesh.load(inputs["mesh"]), PointCloud.load(inputs["cloud"]), params.context.voxel
     assert cloud.normal is not None
     found, which, tolerance = detect(cloud.xyz, cloud.normal, voxel)
-    facts: dict[str, Any] = {"faces_in": len(mesh), "planes": len(found)}
+    metrics: dict[str, Any] = {"faces_in": len(mesh), "planes": len(found)}
     if not len(found) or not len(mesh):
         mesh.save(out / "mesh.npz")
-        return Done({"mesh": out / "mesh.npz"}, facts | {"faces": len(mesh), "on_planes": 0.0})
+        return Done({"mesh": out / "mesh.npz"}, metrics | {"faces": len(mesh), "on_planes": 0.0})
     report(0.2, "boundaries")
     points = PointCloud.load(inputs["points"]).xyz
     point_plane = plane_boundaries.assign_points(points, found, cloud.xyz, which, voxel, tolerance)
@@ -84,14 +84,14 @@ def planes(inputs: Inputs, params: PlanesParams, out: Path, report: Report) -> D
         mesh, edges, every_end, vertex_plane, near_edge, weight, len(every), voxel, tolerance
     )
     snapped.mesh.save(out / "mesh.npz")
-    facts |= {
+    metrics |= {
         "faces": len(snapped.mesh),
         "on_planes": round(float((snapped.which >= 0).mean()), 3) if len(snapped.which) else 0.0,
         "steps": len(faces),
         "straight_ends_m": round(len(ends) * voxel, 1),
         "tolerance_m": round(tolerance, 4),
     }
-    return Done({"mesh": out / "mesh.npz"}, facts)
+    return Done({"mesh": out / "mesh.npz"}, metrics)
 
 
 def snap_weights(mesh: Mesh, params: PlanesParams) -> F64:

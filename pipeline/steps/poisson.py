@@ -85,8 +85,13 @@ def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) ->
     else:
         raise StepError(inputs["cloud"], "; ".join(warnings), "Use a smaller tile, or --set poisson.depth=9")
     Mesh(cloud.frame, vertices, faces, density).save(out / "mesh.npz")
-    facts = {"points": len(cloud), "faces": len(faces), "depth": depth - coarser, "cell_m": round(cell * 2**coarser, 4)}
-    return Done({"mesh": out / "mesh.npz"}, facts | {"summary": summary}, warnings)
+    metrics = {
+        "points": len(cloud),
+        "faces": len(faces),
+        "depth": depth - coarser,
+        "cell_m": round(cell * 2**coarser, 4),
+    }
+    return Done({"mesh": out / "mesh.npz"}, metrics | {"summary": summary}, warnings)
 
 
 def bounds(xyz: F32, origin: tuple[float, float, float], block: float) -> F32:

@@ -67,7 +67,7 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     low, high = bounds([points])
     air = bird_pose(low, high) if driven else whole_pose(points.clip(low, high), renderer.pinhole(1280, 720))
     shapes = renderer.Renderer([renderer.Body(surface.mesh) for surface in surfaces.values()])
-    facts: dict[str, Any] = {
+    metrics: dict[str, Any] = {
         "triangles": triangles,
         "scale": round(scale, 4),
         "bytes": script.stat().st_size,
@@ -75,7 +75,7 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
         "walk": _position_and_target(driver_pose(path if driven else None, low, high, shapes), low),
         "turn": _position_and_target(air, low),
     }
-    return Done({"preview": folder}, facts)
+    return Done({"preview": folder}, metrics)
 
 
 def _texels(surfaces: dict[str, Textured]) -> int:

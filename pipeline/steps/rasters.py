@@ -109,14 +109,14 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
     report(0.8, "DTM")
     ground = [plain["terrain"]] if "terrain" in plain else []
     geotiff.write_heights(folder / f"{params.context.name}_dtm.tif", grid, heights(render.Renderer(ground)))
-    facts: dict[str, Any] = {
+    metrics: dict[str, Any] = {
         "width": grid.width,
         "height": grid.height,
         "pixel_m": params.context.pixel,
         "bytes": sum(file.stat().st_size for file in folder.iterdir()),
     }
     local = "the tile has no CRS, so its rasters have none: they are in the tile's local coordinates"
-    return Done({"rasters": folder}, facts, [local] if frame.crs == LOCAL else [])
+    return Done({"rasters": folder}, metrics, [local] if frame.crs == LOCAL else [])
 
 
 RASTERS = Step("rasters", 2, rasters, RastersParams, side_product=True, memory=(1.3, 3))

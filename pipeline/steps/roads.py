@@ -79,9 +79,9 @@ def roads(inputs: Inputs, params: RoadsParams, out: Path, report: Report) -> Don
     world = Frame(cloud.frame.crs, params.context.world_origin or cloud.frame.origin, cloud.frame.unit)
     network = model.network([one.moved(origin) for one in seen], world.origin)
     opendrive.write(out / "opendrive" / f"{params.context.name}.xodr", params.context.name, world, network)
-    facts = {"points": int(on.sum()), "driven": len(ways), "roads": [road_geojson.facts(road) for road in drawn]}
+    metrics = {"points": int(on.sum()), "driven": len(ways), "roads": [road_geojson.facts(road) for road in drawn]}
     files = {"geojson": out / "roads.geojson", "seen": out / "seen.npz", "opendrive": out / "opendrive"}
-    return Done(files, facts | _why_none(ways, on, [*drawn, *warnings]), warnings)
+    return Done(files, metrics | _why_none(ways, on, [*drawn, *warnings]), warnings)
 
 
 def _own(tile: TileCell | None) -> Callable[[F64], Bools]:

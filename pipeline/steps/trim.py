@@ -63,7 +63,7 @@ def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
     far = ~np.isfinite(distance)[keep.faces].all(axis=1)
     keep = keep.keep(~far)
     keep.save(out / "mesh.npz")
-    facts = {
+    metrics = {
         "faces_in": len(mesh),
         "faces": len(keep),
         "long_edges": int(long.sum()),
@@ -71,7 +71,7 @@ def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
         "far_from_points": int(far.sum()),
         "widened": round(widened, 2),
     }
-    return Done({"mesh": out / "mesh.npz"}, facts)
+    return Done({"mesh": out / "mesh.npz"}, metrics)
 
 
 def _spacing(tree: cKDTree, xyz: F32) -> float:

@@ -95,8 +95,8 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
         warnings.append(f"{len(kept)} photos are too few to hold out every {params.hold_out}th: none is held out")
     views_io.save(out / "views.json", kept, held)
     # links: moving the tile breaks them, which only rebuilds this step, not the results that depend on the photos
-    facts = {"photos": len(params.context.poses), "usable": len(kept), "held_out": sum(held)}
-    return Done({"views": out / "views.json"}, facts, warnings)
+    metrics = {"photos": len(params.context.poses), "usable": len(kept), "held_out": sum(held)}
+    return Done({"views": out / "views.json"}, metrics, warnings)
 
 
 def _crop(view: View, points: F32, folder: Path, index: int) -> View:

@@ -41,8 +41,8 @@ def voxel(inputs: Inputs, params: VoxelParams, out: Path, report: Report) -> Don
     thin = oriented_normals(thin, params.neighbours, path)
     thin.save(out / "cloud.npz")
     low, high = (thin.xyz.min(axis=0), thin.xyz.max(axis=0)) if n else (np.zeros(3), np.zeros(3))
-    facts = {"points_in": n, "points": len(thin), "extent_m": (high - low).round(2).tolist()}
-    return Done({"cloud": out / "cloud.npz"}, facts)
+    metrics = {"points_in": n, "points": len(thin), "extent_m": (high - low).round(2).tolist()}
+    return Done({"cloud": out / "cloud.npz"}, metrics)
 
 
 VOXEL = Step("voxel", 3, voxel, VoxelParams, per_class=True)

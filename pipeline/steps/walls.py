@@ -60,7 +60,7 @@ def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Don
         floor = np.concatenate([floor, PointCloud.load(inputs["ground"]).xyz])
     made = PointCloud(building.frame, np.zeros((0, 3), np.float32), normal=np.zeros((0, 3), np.float32))
     active = params.when == "always" or is_airborne(building)
-    facts = {"from_above": active, "roofs": 0, "sides": 0, "footprints": 0, "points": 0, "synthesized_m2": 0.0}
+    metrics = {"from_above": active, "roofs": 0, "sides": 0, "footprints": 0, "points": 0, "synthesized_m2": 0.0}
     if active and len(building) and len(floor):
         assert building.normal is not None
         flat = building.xyz[np.abs(building.normal[:, 2]) > ROOF_MIN_NORMAL_Z]
@@ -87,10 +87,10 @@ def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Don
         xyz = np.concatenate([np.zeros((0, 3)), *(part[0] for part in parts)])
         normal = np.concatenate([np.zeros((0, 3)), *(part[1] for part in parts)])
         made = _cloud(xyz, normal, building, params)
-        facts |= {"roofs": int(component.max()), "sides": count, "footprints": len(given)}
-        facts |= {"points": len(made), "synthesized_m2": round(len(made) * POINT_SPACING_M**2, 1)}
+        metrics |= {"roofs": int(component.max()), "sides": count, "footprints": len(given)}
+        metrics |= {"points": len(made), "synthesized_m2": round(len(made) * POINT_SPACING_M**2, 1)}
     made.save(out / "synthesized.npz")
-    return Done({"synthesized": out / "synthesized.npz"}, facts)
+    return Done({"synthesized": out / "synthesized.npz"}, metrics)
 
 
 class WallHeights:

@@ -19,15 +19,15 @@ def step_params(kind: type[Params], **given: Any) -> Any:
     if context is None or "context" in given:
         return kind(**given)
     settings = {name: value for name, value in given.items() if name in kind.settings()}
-    facts = {name: value for name, value in given.items() if name not in settings}
+    metrics = {name: value for name, value in given.items() if name not in settings}
     if context is not TileCell and "cell" in context.model_fields:
-        cell = {name: facts.pop(name) for name in ("seed", "neighbours", "buffer") if name in facts}
+        cell = {name: metrics.pop(name) for name in ("seed", "neighbours", "buffer") if name in metrics}
         if cell.get("seed") is not None:
-            name = facts.get("name", "tile") if "name" in context.model_fields else facts.pop("name", "tile")
-            facts["cell"] = {"name": name, **cell}
+            name = metrics.get("name", "tile") if "name" in context.model_fields else metrics.pop("name", "tile")
+            metrics["cell"] = {"name": name, **cell}
     elif context is TileCell:
-        facts = {"name": "tile", **facts} if facts.get("seed") is not None else {}
-    return kind(**settings, **({"context": facts} if facts else {}))
+        metrics = {"name": "tile", **metrics} if metrics.get("seed") is not None else {}
+    return kind(**settings, **({"context": metrics} if metrics else {}))
 
 
 def _context(kind: type[Params]) -> type[Context] | None:

@@ -269,7 +269,7 @@ def test_cloud_without_photos_colours_and_classes(street: Path, tmp_path: Path) 
     stdout_of(scan2sim("import", "las", tmp_path / "plain.laz", "--out", tmp_path / "tile"))
     stdout_of(scan2sim("run", tmp_path / "tile", "--out", tmp_path / "out", *SMALL))
     report = json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
-    assert report["texture"]["coverage"] == 0 and report["steps"]["segment"]["facts"]["source"] == "shape"
+    assert report["texture"]["coverage"] == 0 and report["steps"]["segment"]["metrics"]["source"] == "shape"
 
 
 def test_truncated_cloud_is_an_input_error(damaged: Path, tmp_path: Path) -> None:

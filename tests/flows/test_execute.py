@@ -72,9 +72,9 @@ def ran(tmp_path: Path) -> Callable[[], str]:
 
 
 def test_second_run_uses_the_cache(run: Run, ran: Callable[[], str]) -> None:
-    assert run()["d"].facts == {"total": 2}
+    assert run()["d"].metrics == {"total": 2}
     assert ran() == "abcd"
-    assert run()["d"].facts == {"total": 2}
+    assert run()["d"].metrics == {"total": 2}
     assert ran() == ""
 
 
@@ -100,7 +100,7 @@ def test_unchanged_output_cuts_off_dependent_tasks(run: Run, ran: Callable[[], s
     run()
     ran()
     source.write_text("1\n", encoding="utf-8")  # other bytes, the same number
-    assert run()["d"].facts == {"total": 2}
+    assert run()["d"].metrics == {"total": 2}
     assert ran() == "a"
     run()
     assert ran() == ""
@@ -165,10 +165,10 @@ def test_failed_side_product_is_left_out_and_its_readers_run_without_it(
     last, outcome = run_to_world(broken(), broken, store, run)
     assert ran() == "abcd", "each runs once, although forced"
     assert {item.task.step.name for item in last} == outcome.of_tile().keys() == {"a", "c", "d"}
-    assert outcome.of_tile()["d"].facts == {"total": 1} and not outcome.failed
+    assert outcome.of_tile()["d"].metrics == {"total": 1} and not outcome.failed
     assert "a bug" in outcome.side_failed[TaskId("b")].cause and not list((tmp_path / "store" / "b").glob("*"))
     _, outcome = run_to_world(planned(), planned, store, run)
-    assert outcome.of_tile()["d"].facts == {"total": 2} and not outcome.side_failed, "it is retried"
+    assert outcome.of_tile()["d"].metrics == {"total": 2} and not outcome.side_failed, "it is retried"
     with pytest.raises(DataError, match="to fail"):
         run_to_world(broken(d={"does": "fail"}), partial(broken, d={"does": "fail"}), store, run)
 
@@ -203,9 +203,9 @@ def test_killed_step_resumes_from_its_checkpoint_only_with_the_same_input(tmp_pa
 
     with pytest.raises(StepError, match="killed"):
         run()
-    assert run(above=-1).facts == {"began": 0}, "other parameters don't use the checkpoint"
+    assert run(above=-1).metrics == {"began": 0}, "other parameters don't use the checkpoint"
     assert len(list((store.root / "count").glob(".part-*"))) == 1
-    assert run().facts == {"began": 2} and not list((store.root / "count").glob(".part-*"))
+    assert run().metrics == {"began": 2} and not list((store.root / "count").glob(".part-*"))
     with pytest.raises(StepError, match="killed"):
         run(to=5)
     source.write_text("another", encoding="utf-8")
@@ -243,7 +243,7 @@ def test_changed_output_is_rebuilt_and_nothing_else(run: Run, ran: Callable[[], 
     run()
     ran()
     number(tmp_path, "b").write_text("7", encoding="utf-8")  # same number of bytes
-    assert run()["d"].facts == {"total": 2}
+    assert run()["d"].metrics == {"total": 2}
     assert ran() == "b" and number(tmp_path, "b").read_text(encoding="utf-8") == "1"
 
 
@@ -258,7 +258,7 @@ def test_damage_with_unchanged_size_and_time_is_found_when_read(
     os.utime(damaged, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     run()
     assert ran() == "", "results that aren't read are checked by size and time only"
-    assert run(c={"value": 5})["d"].facts == {"total": 7}
+    assert run(c={"value": 5})["d"].metrics == {"total": 7}
     assert ran() == "acd" and number(tmp_path, "a").read_text(encoding="utf-8") == "1"
 
 
@@ -279,7 +279,7 @@ def test_damaged_manifest_is_ignored(run: Run, ran: Callable[[], str], tmp_path:
     ran()
     path = number(tmp_path, "d").with_name("manifest.json")
     path.write_text(path.read_text(encoding="utf-8").replace('"total": 2', '"total": 3'), encoding="utf-8")
-    assert run()["d"].facts == {"total": 2}
+    assert run()["d"].metrics == {"total": 2}
     assert ran() == "d"
 
 
@@ -403,7 +403,7 @@ def test_sigkill_leaves_no_partial_result_and_no_process(tmp_path: Path, source:
     store = Store(tmp_path / "store")
     kept = {p.task.full_name: p.reason for p in plan(chain(source, log), store)}
     assert kept["a"] is None and kept["b"] is not None
-    assert run()["d"].facts == {"total": 2}
+    assert run()["d"].metrics == {"total": 2}
     pid = (tmp_path / "pid_b").read_text(encoding="utf-8")  # of the second run, which has ended
     assert hanging != pid
     while time.monotonic() < deadline and Path(f"/proc/{hanging}").exists():

@@ -99,7 +99,7 @@ def test_3d_tiles_have_levels_of_detail(tmp_path: Path) -> None:
     run(world, "--to", "tiles3d", "--out", tmp_path / "out", "--levels", 2)
     tileset = json.loads((tmp_path / "out" / "tileset.json").read_text(encoding="utf-8"))
     coarse, (fine,) = tileset["root"], tileset["root"]["children"]
-    assert (coarse["pose_refinement"], coarse["content"]["uri"]) == ("REPLACE", "tiles3d/level1/street.glb")
+    assert (coarse["refine"], coarse["content"]["uri"]) == ("REPLACE", "tiles3d/level1/street.glb")
     assert tileset["geometricError"] > coarse["geometricError"] > fine["geometricError"] == 0
     files = json.loads((tmp_path / "out" / "metadata.json").read_text(encoding="utf-8"))["triangles_by_file"]
     assert files[coarse["content"]["uri"]] < files[fine["content"]["uri"]] / 2

@@ -55,7 +55,7 @@ def test_custom_step_needs_one_file_and_one_line(
         planned = plan(required_tasks([*build_graph(tile, Settings()), line], [line.id]), store)
         outcome = execute(planned, store, jobs=1, on_event=lambda *_: None)
         outcome.check()
-        return outcome.of_tile()["lift"].facts["highest"], {item.task.full_name: item.reason for item in planned}
+        return outcome.of_tile()["lift"].metrics["highest"], {item.task.full_name: item.reason for item in planned}
 
     low, why = run()
     assert why == {"ingest": Reason.NEW, "lift": Reason.NEW}

@@ -1,4 +1,4 @@
-"""The report: what of the steps' facts and pictures reaches the page and the table of figures."""
+"""The report: what of the steps' metrics and pictures reaches the page and the table of figures."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ def report(tmp_path: Path) -> Any:
 
     def write(scored: dict[str, Any]) -> tuple[dict[str, Any], str]:
         store, done, planned = Store(tmp_path / "steps"), dict[str, Manifest](), []
-        for task, facts in {**FACTS, "score": scored}.items():
+        for task, metrics in {**FACTS, "score": scored}.items():
             folder = store.begin(task)
             files = {"error": album(folder, list(scored["photos"]))} if task == "score" else {}
             about = {"version": 1, "params": {}, "inputs": {}, "inputs_digest": "", "seconds": 1.0, "peak_mb": 100.0}
-            done[task] = store.commit(task, "key", folder, Done(files, facts), about)
+            done[task] = store.commit(task, "key", folder, Done(files, metrics), about)
             planned.append(PlannedTask(Task(Step(task, 1, no_step), Params(), {}), "key", {}, None))
         tile = Tile(tmp_path / "tile.toml", "made_up", Frame(), ())
         page = write_report(tile, planned, done, store, tmp_path, seconds=1.0).read_text(encoding="utf-8")

@@ -66,7 +66,7 @@ def test_parked_vehicles_are_kept_and_moving_ones_removed(tmp_path: Path) -> Non
     done = SPLIT.run(inputs, SplitParams(vehicles="keep"), tmp_path / "out", silent)
     kept = PointCloud.load(done.files["vehicle"]).xyz
     assert len(kept) == 500 and np.abs(kept[:, 0]).max() < 2.3
-    assert done.facts["points"]["rest"] == 1000
+    assert done.metrics["points"]["rest"] == 1000
 
 
 @pytest.mark.slow

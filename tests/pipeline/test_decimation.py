@@ -82,9 +82,9 @@ def test_the_step_uses_the_library_that_is_set(tmp_path: Path, name: str) -> Non
     params = step_params(DecimateParams, target=10_000, backend=name)
     done = DECIMATE.run({"mesh": tmp_path / "mesh.npz"}, params, tmp_path / "out", silent)
     small = Mesh.load(done.files["mesh"])
-    same = simplified(hills(), name, 10_000, keep_border=done.facts["border_kept"])
+    same = simplified(hills(), name, 10_000, keep_border=done.metrics["border_kept"])
     assert np.array_equal(small.vertices, same.vertices) and np.array_equal(small.faces, same.faces)
-    assert done.facts["border_kept"] and not done.warnings
+    assert done.metrics["border_kept"] and not done.warnings
 
 
 def test_unknown_library_lists_available_ones() -> None:

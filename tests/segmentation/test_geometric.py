@@ -122,13 +122,13 @@ def test_cloud_keeps_its_classes_unless_overwritten(tmp_path: Path) -> None:
     def run(name: str, **params: Any) -> tuple[PointCloud, dict[str, Any]]:
         (tmp_path / name).mkdir()
         done = segment(inputs, SegmentParams(**params), tmp_path / name, silent)
-        return PointCloud.load(done.files["cloud"]), done.facts
+        return PointCloud.load(done.files["cloud"]), done.metrics
 
-    kept, facts = run("kept")
-    assert np.array_equal(present(kept.classification), truth) and facts["source"] == "cloud"
-    assert facts["points"]["terrain"] == int((truth == 2).sum())
-    replaced, facts = run("replaced", overwrite=True)
-    assert facts["source"] == "shape" and not np.array_equal(present(replaced.classification), truth)
+    kept, metrics = run("kept")
+    assert np.array_equal(present(kept.classification), truth) and metrics["source"] == "cloud"
+    assert metrics["points"]["terrain"] == int((truth == 2).sum())
+    replaced, metrics = run("replaced", overwrite=True)
+    assert metrics["source"] == "shape" and not np.array_equal(present(replaced.classification), truth)
     assert np.array_equal(present(replaced.time), present(cloud.time)) and np.array_equal(replaced.xyz, xyz)
 
     replace(cloud, classification=np.where(np.arange(len(xyz)) % 10 == 0, truth, 1).astype(np.uint8)).save(

@@ -113,7 +113,7 @@ def test_fence_classified_as_vehicle_is_rejected(done: Done) -> None:
 
 def test_boxes_of_vehicles_are_listed(done: Done) -> None:
     found = {f["properties"]["kind"]: f for f in features(done)}
-    assert set(found) == {"car", "van"} and done.facts["vehicles"] == 2
+    assert set(found) == {"car", "van"} and done.metrics["vehicles"] == 2
     car = found["car"]["properties"]
     assert car["length_m"] == pytest.approx(4.4, abs=0.15) and car["width_m"] == pytest.approx(1.8, abs=0.15)
     assert car["height_m"] == pytest.approx(1.5, abs=0.1) and car["ground_z"] == pytest.approx(100, abs=0.1)
@@ -173,7 +173,7 @@ def test_partly_classified_people_are_completed(tmp_path: Path) -> None:
     classification[len(classification) - len(person) + len(person) // 3 :] = CODE["person"]
     replace(cloud, classification=classification).save(inputs["cloud"])
     done = run(inputs, tmp_path)
-    assert done.facts["people"] == 1
+    assert done.metrics["people"] == 1
     assert (classified(done, person)["0"][person[:, 2] > 0.25] == CODE["person"]).mean() > 0.98
 
 
@@ -186,11 +186,11 @@ def test_post_partly_classified_as_person_is_rejected(tmp_path: Path) -> None:
     classification[-len(post) :][post[:, 2] > 0.7] = CODE["person"]
     replace(cloud, classification=classification).save(inputs["cloud"])
     done = run(inputs, tmp_path)
-    assert done.facts["people"] == 0
+    assert done.metrics["people"] == 0
     assert (classified(done, post)["0"] == HEDGE).mean() > 0.95
 
 
 def test_cloud_is_unchanged_without_a_path(tmp_path: Path) -> None:
     inputs = street(tmp_path)
     done = run({"cloud": inputs["cloud"], "confidence": inputs["confidence"]}, tmp_path)
-    assert done.facts["vehicles"] == 0 and done.files["cloud"].stat().st_ino == inputs["cloud"].stat().st_ino
+    assert done.metrics["vehicles"] == 0 and done.files["cloud"].stat().st_ino == inputs["cloud"].stat().st_ino

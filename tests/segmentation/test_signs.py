@@ -131,7 +131,7 @@ HALF = SignPanel(np.array([14.1, -2.95, 3.05]), np.array([-1.0, 0, 0]), "rectang
 @pytest.mark.parametrize("known", [[], [HALF]], ids=["unscanned", "half scanned"])
 def test_sign_visible_in_photos_is_complete(tmp_path: Path, known: list[SignPanel]) -> None:
     done = _run(tmp_path, [SIGN, BELOW], known)
-    assert done.facts == {"from_points": len(known), "fitted": 2, "new": 0 if known else 2}
+    assert done.metrics == {"from_points": len(known), "fitted": 2, "new": 0 if known else 2}
     for corners, panel in zip(_panel_corners(done), [SIGN, BELOW], strict=True):
         front = corners[: len(corners) // 2]
         assert front.mean(axis=0) == pytest.approx(panel.centre, abs=0.03)
@@ -155,7 +155,7 @@ def test_panels_at_a_border_are_fitted_by_the_tile_of_their_pole(tmp_path: Path,
     middle = x + SIGN.centre[0] + 0.2
     beside = {"seed": (middle - 5, y), "neighbours": {"other": (middle + 5, y)}}
     done = _run(tmp_path, [SIGN, BELOW], [], theirs, **beside)
-    assert done.facts["fitted"] == (0 if theirs else 2)
+    assert done.metrics["fitted"] == (0 if theirs else 2)
 
 
 def test_edges_on_a_border_are_kept_near_a_panel() -> None:
@@ -173,6 +173,6 @@ def test_edges_on_a_border_are_kept_near_a_panel() -> None:
 
 def test_panels_from_points_are_kept_if_photos_show_none(tmp_path: Path) -> None:
     done = _run(tmp_path, [], [HALF])
-    assert done.facts["fitted"] == 0
+    assert done.metrics["fitted"] == 0
     (corners,) = _panel_corners(done)
     assert corners.mean(axis=0) == pytest.approx(HALF.centre, abs=0.02)

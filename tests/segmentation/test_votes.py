@@ -65,7 +65,7 @@ def test_correctly_labelled_photos_give_correct_points(labelled: tuple[Path, U8]
     assert found.mean() > 0.85 and found.iou["road_sign"] > 0.6 and found.iou["road"] > 0.93
     shape, *_ = segment(folder, tmp_path / "shape", photos=False)
     assert found.mean() > confusion(truth, shape).mean() + 0.15
-    assert done.facts["sky_share"] < 0.08 and done.facts["seen_share"] > 0.5
+    assert done.metrics["sky_share"] < 0.08 and done.metrics["seen_share"] > 0.5
     confidence, source = point_confidence["confidence"], point_confidence["source"]
     right = predicted == truth
     assert confidence[right].mean() > confidence[~right].mean() + 20, "confidence is higher where classes are right"
@@ -82,7 +82,7 @@ def test_wrong_poses_raise_the_sky_share(labelled: tuple[Path, U8], tmp_path: Pa
         {"cloud": folder / "cloud.npz", "views": tmp_path / "views.json", "labels": folder / "labels"},
         SEGMENT.params(), tmp_path, silent,
     )  # fmt: skip
-    assert done.facts["sky_share"] > 0.15 and any("poses" in w for w in done.warnings)
+    assert done.metrics["sky_share"] > 0.15 and any("poses" in w for w in done.warnings)
 
 
 def test_single_vegetation_class_is_split_by_height(labelled: tuple[Path, U8], tmp_path: Path) -> None:
@@ -111,7 +111,7 @@ def test_points_are_classified_by_shape_without_labelled_photos(labelled: tuple[
         {"cloud": folder / "cloud.npz", "views": folder / "views.json", "labels": tmp_path / "labels"},
         SEGMENT.params(), tmp_path, silent,
     )  # fmt: skip
-    assert done.facts["source"] == "shape" and any("shape alone" in w for w in done.warnings)
+    assert done.metrics["source"] == "shape" and any("shape alone" in w for w in done.warnings)
 
 
 def test_existing_classes_are_kept_and_photos_not_classified(labelled: tuple[Path, U8], tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_existing_classes_are_kept_and_photos_not_classified(labelled: tuple[Pat
         (tmp_path / name).mkdir()
     inputs = {"cloud": tmp_path / "own.npz", "views": folder / "views.json"}
     done = LABEL.run(inputs, LabelParams(network="nonsense"), tmp_path / "label", silent)
-    assert done.facts["photos"] == 0 and "classes" in done.facts["why"]
+    assert done.metrics["photos"] == 0 and "classes" in done.metrics["why"]
     kept = SEGMENT.run(inputs | {"labels": done.files["labels"]}, SEGMENT.params(), tmp_path / "kept", silent)
     np.testing.assert_array_equal(PointCloud.load(kept.files["cloud"]).classification, truth)
 

@@ -56,11 +56,11 @@ def test_a_path_that_drifted_is_adjusted(winding: tuple[MapCheckpoint, np.ndarra
     for keyframe, pose in zip(mapped.map.keyframes, bend(mapped), strict=True):
         keyframe.T_world_cam = pose
     before = error(mapped, truth)
-    facts = adjust(mapped)
+    metrics = adjust(mapped)
     after = error(mapped, truth)
     for keyframe, pose in zip(mapped.map.keyframes, straight, strict=True):
         keyframe.T_world_cam = pose
-    assert facts["adjustment_kept"] and facts["witnesses_gain"] > 0
+    assert metrics["adjustment_kept"] and metrics["witnesses_gain"] > 0
     assert after < before
 
 
@@ -71,7 +71,7 @@ def test_an_adjustment_that_fits_worse_changes_nothing(
     before, points = mapped.map.poses(list(range(len(mapped.map.keyframes)))), sparse_points(mapped)
     wrong = module.Adjusted(points, bend(mapped), points.xyz + 1, 0.2, 0.1)
     monkeypatch.setattr(module, "bundle_adjust", lambda _: wrong)
-    facts = adjust(mapped)
-    assert not facts["adjustment_kept"] and facts["witnesses_gain"] < 0
+    metrics = adjust(mapped)
+    assert not metrics["adjustment_kept"] and metrics["witnesses_gain"] < 0
     assert np.array_equal(mapped.map.poses(list(range(len(before)))), before)
     assert np.array_equal(sparse_points(mapped).xyz, points.xyz)

@@ -30,12 +30,12 @@ def test_torch_bakes_equal_pages(street: Street, name: str, band: int) -> None:
     street.clouds["terrain"] = points()
     by_numba, done = street.run(band=band, device="numba")
     by_torch, done_torch = street.run(band=band, device="cpu")
-    for page in range(done.facts["pages"]):
+    for page in range(done.metrics["pages"]):
         a, b = (image.read_rgb(folder / f"page_{page}.png").astype(int) for folder in (by_numba, by_torch))
         seen = [image.read_levels(folder / f"page_{page}_seen.png") for folder in (by_numba, by_torch)]
         assert (seen[0] == seen[1]).mean() > 0.99999
         assert (abs(a - b).max(axis=2) <= 1).mean() > 0.99999
-    assert done_torch.facts["coverage"] == pytest.approx(done.facts["coverage"], abs=1e-4)
+    assert done_torch.metrics["coverage"] == pytest.approx(done.metrics["coverage"], abs=1e-4)
 
 
 @pytest.mark.parametrize("band", [2, 0, -1])

@@ -132,7 +132,7 @@ def run(folder: Path, neighbours: Sequence[Path] = (), **params: Any) -> tuple[P
     out.mkdir()
     inputs = {"textured": folder, **{f"neighbour.{path.name}": path for path in neighbours}}
     done = colour_harmonization(inputs, ColourHarmonizationParams(**params), out, silent)
-    return done.files["textured"], done.facts
+    return done.files["textured"], done.metrics
 
 
 def step(*folders: Path) -> tuple[float, float, float]:

@@ -41,7 +41,7 @@ def solved(street: Street, out: Path, prior: Path | None = None, **params: Any) 
     if prior is not None:
         inputs["prior"] = prior
     done = exposure(inputs, ExposureParams(**params), out, silent)
-    return Exposures.load(done.files["exposures"]), done.facts
+    return Exposures.load(done.files["exposures"]), done.metrics
 
 
 @pytest.fixture

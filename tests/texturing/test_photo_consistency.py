@@ -54,7 +54,7 @@ def test_passing_car_is_masked_as_ghost(street: Street) -> None:
 
     without, done = magenta()
     assert without == 0
-    assert done.facts["coverage"] > 0.3
+    assert done.metrics["coverage"] > 0.3
     assert magenta(agreement={"ghosts": False})[0] > 50
 
 
@@ -72,7 +72,7 @@ def test_photo_with_wrong_pose_is_excluded_and_named(street: Street, turn: float
     assert [name for name, row in rows.items() if not row["usable"]] == ["photo3"]
     assert rows["photo3"]["shift_px"] > 2 and max(rows[f"photo{i}"]["shift_px"] for i in (0, 1, 2, 4)) < 1.5
     assert any("photo3" in warning and "pixels" in warning for warning in done.warnings)
-    assert "photo3" not in done.facts["texels_by_photo"]
+    assert "photo3" not in done.metrics["texels_by_photo"]
 
 
 def test_blurred_photo_is_down_weighted(street: Street) -> None:
@@ -91,18 +91,18 @@ def test_overexposed_photo_is_excluded(street: Street) -> None:
         street.add(CAMERA, pose, np.full((480, 640, 3), 255, np.uint8) if i == 1 else None)
     _, done = street.run()
     assert any("photo1" in warning and "overexposed" in warning for warning in done.warnings)
-    assert "photo1" not in done.facts["texels_by_photo"]
+    assert "photo1" not in done.metrics["texels_by_photo"]
 
 
 def test_consistent_photos_are_used_without_masks(street: Street) -> None:
     for pose in POSES:
         street.add(CAMERA, pose)
     folder, done = street.run()
-    assert not done.warnings and done.facts["photos"] == len(POSES)
+    assert not done.warnings and done.metrics["photos"] == len(POSES)
     assert max(row.get("ghost_share", 0) for row in rows_of(folder).values()) < 0.01
 
 
 def test_single_photo_is_used(street: Street) -> None:
     street.add(CAMERA, POSES[2])
     _, done = street.run()
-    assert done.facts["photos"] == 1 and not done.warnings
+    assert done.metrics["photos"] == 1 and not done.warnings

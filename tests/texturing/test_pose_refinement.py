@@ -108,14 +108,14 @@ def test_disturbed_poses_are_recovered(tmp_path: Path, model: str) -> None:
     views, done = run(tmp_path, step_inputs(tmp_path, camera, wrong))
     before = np.array([displacement(camera, pose, true) for pose, true in zip(wrong, POSES, strict=True)])
     after = np.array([displacement(camera, view.T_world_cam, true) for view, true in zip(views, POSES, strict=True)])
-    assert done.facts["moved"] and done.facts["displaced_after_px"] < 0.5 * done.facts["displaced_px"]
+    assert done.metrics["moved"] and done.metrics["displaced_after_px"] < 0.5 * done.metrics["displaced_px"]
     assert np.median(after) < 0.35 * np.median(before) and (after < before).all()
 
 
 def test_correct_poses_are_unchanged_bit_for_bit(tmp_path: Path) -> None:
     inputs = step_inputs(tmp_path, CAMERAS["pinhole"], POSES)
     views, done = run(tmp_path, inputs)
-    assert not done.facts["moved"] and done.facts["matches"] > 1000
+    assert not done.metrics["moved"] and done.metrics["matches"] > 1000
     assert all((view.T_world_cam == pose).all() for view, pose in zip(views, POSES, strict=True))
 
 
@@ -159,7 +159,7 @@ def test_photos_without_matches_keep_their_poses(tmp_path: Path) -> None:
         inputs = step_inputs(tmp_path, camera, POSES[:1])
         views_io.save(tmp_path / "views.json", views)
         refined, done = run(tmp_path / name, inputs)
-        assert not done.facts["moved"] and not done.warnings
+        assert not done.metrics["moved"] and not done.warnings
         assert all((a.T_world_cam == b.T_world_cam).all() for a, b in zip(refined, views, strict=True))
 
 

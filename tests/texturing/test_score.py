@@ -47,7 +47,7 @@ def strict(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def test_held_out_photo_is_scored_by_class_and_by_distance(scored: Done) -> None:
-    facts = strict(scored.facts)
+    facts = strict(scored.metrics)
     assert facts["held_out"] == 1 and list(facts["photos"]) == ["photo1"]
     assert facts["psnr_db"] > 28 and facts["ssim"] > 0.85 and 0.7 < facts["sharpness"] < 1.1
     assert facts["photos"]["photo1"]["psnr_db"] == facts["psnr_db"] == facts["by_class"]["terrain"]["psnr_db"]
@@ -70,7 +70,7 @@ def test_every_held_out_photo_has_an_error_image(scored: Done) -> None:
 def test_scores_are_none_without_held_out_photos(street: Street, tmp_path: Path) -> None:
     street.add(CAMERAS["pinhole"], POSES[0])
     done = score(inputs_of(street), ScoreParams(), tmp_path, silent)
-    facts = strict(done.facts)
+    facts = strict(done.metrics)
     assert facts["held_out"] == 0 and facts["psnr_db"] is None and facts["sharpness"] is None
     assert json.loads((done.files["error"] / "index.json").read_text(encoding="utf-8")) == []
 
@@ -83,7 +83,7 @@ def test_photos_of_missing_surfaces_are_scored_and_unreadable_ones_are_named(str
     inputs = inputs_of(street)
     Path(street.views[1].photo).write_bytes(b"no photo")
     done = score(inputs, ScoreParams(), tmp_path, silent)
-    facts = strict(done.facts)
+    facts = strict(done.metrics)
     assert facts["held_out"] == 1 and facts["psnr_db"] == facts["photos"]["photo2"]["psnr_db"] is not None
     assert facts["photos"]["photo2"]["coverage"] == 0
     assert sum(band["pixels"] for band in facts["by_distance"].values()) == 0
@@ -96,7 +96,7 @@ def test_cameras_near_a_surface_are_reported_with_distance(street: Street, tmp_p
     low[2, 3] = 0.4  # the ground is at 0
     for pose in (POSES[0], low):
         street.add(CAMERAS["pinhole"], pose)
-    cameras = strict(score(inputs_of(street), ScoreParams(), tmp_path, silent).facts)["cameras"]
+    cameras = strict(score(inputs_of(street), ScoreParams(), tmp_path, silent).metrics)["cameras"]
     assert cameras == {"count": 2, "near_m": {"photo1": pytest.approx(0.4, abs=0.05)}}
 
 
@@ -110,5 +110,5 @@ def test_surfaces_seen_from_near_are_compared_with_ground_truth_separately(
     rgb = np.where(near[:, None], np.clip(paint(truth.xyz), 0, 255), 255).astype(np.uint8)
     las.write(tmp_path / "truth.laz", PointCloud(Frame(), truth.xyz, rgb))
     inputs = {**textured, "truth.points": tmp_path / "truth.laz"}
-    facts = strict(score(inputs, ScoreParams(near=4.9), tmp_path, silent).facts)
+    facts = strict(score(inputs, ScoreParams(near=4.9), tmp_path, silent).metrics)
     assert facts["truth_psnr_near_db"] > 28 > 20 > facts["truth_psnr_db"]

@@ -45,8 +45,8 @@ def test_texture_equals_the_true_colours(street: Street, name: str) -> None:
     near = (seen == 255) & (x < 1) & away_from_the_box(x, y) & (abs(y) < 4.9)
     assert near.mean() > 0.2
     assert psnr(rgb[near], truth[near]) > 30
-    assert done.facts["photos"] == 4
-    assert done.facts["seen_m2"] == pytest.approx(100 * done.facts["coverage"], rel=0.02)
+    assert done.metrics["photos"] == 4
+    assert done.metrics["seen_m2"] == pytest.approx(100 * done.metrics["coverage"], rel=0.02)
 
 
 def test_hidden_ground_does_not_get_the_colour_of_the_box(street: Street) -> None:
@@ -59,7 +59,7 @@ def test_hidden_ground_does_not_get_the_colour_of_the_box(street: Street) -> Non
     assert (rgb[behind] == [0, 255, 0]).all(axis=-1).mean() > 0.99
     red = (rgb[..., 0] > 170) & (rgb[..., 1] < 90)
     assert red[away_from_the_box(x, y)].mean() < 0.003
-    assert 0 < done.facts["coverage"] < 1
+    assert 0 < done.metrics["coverage"] < 1
 
 
 def test_wall_is_textured_on_its_front_only(street: Street) -> None:
@@ -103,7 +103,7 @@ def test_unseen_texels_take_point_colours(street: Street) -> None:
     rgb, seen, truth, _, _ = from_above(folder)
     assert (seen == 128).all()
     assert psnr(rgb, truth) > 25  # of points 5 cm apart
-    assert done.facts["coverage"] == 0 and done.facts["coloured_m2"] == pytest.approx(100, rel=0.02)
+    assert done.metrics["coverage"] == 0 and done.metrics["coloured_m2"] == pytest.approx(100, rel=0.02)
 
 
 def test_grey_points_without_colour_are_not_used(street: Street) -> None:
@@ -128,7 +128,7 @@ def test_unseen_ground_is_inpainted(street: Street) -> None:
     folder, done = street.run(inpaint=True)
     rgb, seen, truth, x, y = from_above(folder)
     unseen = (seen == 64) & away_from_the_box(x, y)
-    assert unseen.mean() > 0.01 and done.facts["filled_m2"] > 1
+    assert unseen.mean() > 0.01 and done.metrics["filled_m2"] > 1
 
     def mean_error(image: F64) -> float:
         return float(np.abs(image - truth)[unseen].mean())
@@ -178,7 +178,7 @@ def test_points_without_colours_give_class_colours(street: Street) -> None:
     assert len(np.unique(rgb.reshape(-1, 3), axis=0)) == 1 and rgb[0, 0].tolist() == pytest.approx(
         [110, 110, 118], abs=4
     )
-    assert done.facts["filled_m2"] == pytest.approx(100, rel=0.02)
+    assert done.metrics["filled_m2"] == pytest.approx(100, rel=0.02)
 
 
 def test_without_point_colours_unseen_texels_take_colours_of_seen_neighbours(street: Street) -> None:
@@ -217,7 +217,7 @@ def test_unreadable_photos_are_skipped_and_named(street: Street) -> None:
     folder, done = street.run()
     assert any("photo1.png" in warning for warning in done.warnings)
     assert any("photo2.png" in warning and "10 x 10" in warning for warning in done.warnings)
-    assert done.facts["photos"] == 2
+    assert done.metrics["photos"] == 2
     rgb, seen, truth, x, y = from_above(folder)
     near = (seen == 255) & (x < 1) & away_from_the_box(x, y) & (abs(y) < 4.9)
     assert psnr(rgb[near], truth[near]) > 30
@@ -231,7 +231,7 @@ def test_held_out_photos_are_never_used(street: Street) -> None:
     folder, done = street.run()
     rgb, *_ = from_above(folder)
     assert not ((rgb[..., 0] > 200) & (rgb[..., 1] < 60)).any()
-    assert list(done.facts["texels_by_photo"]) == ["photo0"]
+    assert list(done.metrics["texels_by_photo"]) == ["photo0"]
 
 
 def test_grey_and_sixteen_bit_photos_are_read(street: Street) -> None:
@@ -265,14 +265,14 @@ def test_empty_mesh_is_accepted(street: Street) -> None:
     street.mesh = Mesh(Frame(), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     folder, done = street.run()
     assert len(Mesh.load(folder / "mesh.npz")) == 0
-    assert done.facts["area_m2"] == 0
+    assert done.metrics["area_m2"] == 0
 
 
 def test_no_seams_between_pages(street: Street) -> None:
     street.clouds["terrain"] = points()
     street.texel, street.page_size = 0.01, 512
     folder, done = street.run()
-    assert done.facts["pages"] > 3 and len(list(folder.glob("page_?.png"))) == done.facts["pages"]
+    assert done.metrics["pages"] > 3 and len(list(folder.glob("page_?.png"))) == done.metrics["pages"]
     rgb, _, truth, *_ = from_above(folder)
     assert np.abs(rgb - truth).max() < 12  # grey levels, at the seams, too
 
@@ -303,7 +303,7 @@ def test_photos_of_other_pixel_formats_are_read(street: Street, kind: str) -> No
     near = (seen == 255) & (x < 1) & away_from_the_box(x, y) & (abs(y) < 4.9)
     if kind == "grey":
         truth = np.repeat((truth @ [0.299, 0.587, 0.114])[..., None], 3, axis=-1)
-    assert near.mean() > 0.2 and done.facts["photos"] == 4
+    assert near.mean() > 0.2 and done.metrics["photos"] == 4
     assert psnr(rgb[near], truth[near]) > 28
 
 
@@ -319,7 +319,7 @@ def test_orthophoto_textures_ground_and_roof_but_no_facade(street: Street) -> No
     assert psnr(rgb[clear], truth[clear]) > 30
     under = (abs(x - 0.5) < 0.3) & (abs(y) < 0.8)
     assert not (seen[under] == 255).any()
-    assert done.facts["photos"] == 1
+    assert done.metrics["photos"] == 1
 
     street.mesh, street.folder = BOX, street.folder / "box"
     street.folder.mkdir()

@@ -68,9 +68,9 @@ def test_charts_do_not_overlap_and_have_the_wanted_density(backend: str, tmp_pat
     mesh, pages, done = run(hills(), tmp_path, backend=backend, texel=0.02)
     assert mesh.uv is not None and mesh.uv.min() >= 0 and mesh.uv.max() <= 1
     assert cover_count(mesh, pages, 0).max() == 1
-    assert done.facts["texel_m"] == pytest.approx(0.02, rel=0.1)
-    assert done.facts["stretch_median"] < 1.2
-    assert done.facts["utilisation"] > 0.3
+    assert done.metrics["texel_m"] == pytest.approx(0.02, rel=0.1)
+    assert done.metrics["stretch_median"] < 1.2
+    assert done.metrics["utilisation"] > 0.3
     assert not done.warnings
 
 
@@ -86,7 +86,7 @@ def test_pages_stay_within_their_size_and_blocks_are_compact(backend: str, tmp_p
 
 def test_non_manifold_mesh_is_fixed_for_uvatlas(tmp_path: Path) -> None:
     mesh, _, done = run(with_fin(hills()), tmp_path, backend="uvatlas", texel=0.02)
-    assert done.facts["fallbacks"] == 0
+    assert done.metrics["fallbacks"] == 0
     flat = present(mesh.uv)[:-1]
     a, b = (np.pad(flat[:, k] - flat[:, 0], ((0, 0), (0, 1))) for k in (1, 2))
     area = np.abs(np.cross(a, b))[:, 2]
@@ -110,14 +110,14 @@ def test_failed_blocks_use_the_fallback_backend(tmp_path: Path, monkeypatch: pyt
 
     monkeypatch.setattr(texture_layout, "_unwrap_in_child", refuse)
     _, _, done = run(hills(), tmp_path, backend="uvatlas", texel=0.02)
-    assert done.facts["fallbacks"] == 1
+    assert done.metrics["fallbacks"] == 1
     assert "xatlas" in done.warnings[0]
 
 
 def test_empty_mesh_is_accepted(tmp_path: Path) -> None:
     mesh, pages, done = run(hills().keep(np.zeros(1152, bool)), tmp_path)
     assert len(mesh) == 0 and present(mesh.uv).shape == (0, 3, 2) and pages == []
-    assert done.facts["pages"] == 0
+    assert done.metrics["pages"] == 0
 
 
 def test_xatlas_is_deterministic(tmp_path: Path) -> None:

@@ -75,7 +75,7 @@ def join(name: str, clips: Mapping[str, Clipped], tolerance: float, reach: float
     before = normals(start[own.mesh.faces[parent[left]]])
     xyz, turned = _unflip(xyz, faces, before, free)
     mesh = local(own.mesh.frame, xyz, faces).keep(np.ones(len(faces), bool))
-    return Joined(mesh, {other: match.facts for other, match in matches.items()}, turned)
+    return Joined(mesh, {other: match.metrics for other, match in matches.items()}, turned)
 
 
 def _with_corners(name: str, clips: Mapping[str, Clipped], tolerance: float) -> F64:

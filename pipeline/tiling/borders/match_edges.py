@@ -26,14 +26,14 @@ class BorderMatch(NamedTuple):
         positions: (M, 3) their new positions, world metres.
         welds: (W, 2) pairs of vertices to weld.
         inserts: (face, a, b, positions (N, 3)): new vertices on the edge a-b of a face, in order.
-        facts: metrics, see `join.join`.
+        metrics: see `join.join`.
     """
 
     vertices: I64
     positions: F64
     welds: I64
     inserts: list[tuple[int, int, int, F64]]
-    facts: dict[str, float]
+    metrics: dict[str, float]
 
 
 def match_border(

@@ -30,7 +30,7 @@ def toy_tiles(
             run = prefect_executor(runner, 2, bus=on_bus)
         outcome = run(planned(Path(folder), tiles, Path(gate) if gate else None), Store(Path(folder) / "steps"))
         outcome.check()
-    return sum(outcome.of_tile(str(tile))[STEPS[-1]].facts["total"] for tile in range(tiles))
+    return sum(outcome.of_tile(str(tile))[STEPS[-1]].metrics["total"] for tile in range(tiles))
 
 
 @flow(name="toy")

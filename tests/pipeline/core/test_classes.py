@@ -90,7 +90,7 @@ def test_points_that_vanish_are_named_with_their_share_and_what_to_do(tmp_path: 
     assert "--classes 65=building" in done.warnings[0]
     (tmp_path / "split").mkdir()
     parted = split({"cloud": done.files["cloud"]}, SplitParams(), tmp_path / "split", silent)
-    assert parted.facts["points"] == {"terrain": 400, "building": 0, "vegetation": 400, "rest": 1200}
+    assert parted.metrics["points"] == {"terrain": 400, "building": 0, "vegetation": 400, "rest": 1200}
     warning = next(w for w in parted.warnings if "no known class" in w and "%" in w)
     assert warning.startswith("60.0% of the points") and "unclassified 40.0%, code_31 20.0%" in warning
     assert '31 = "building"' in warning and "segment.overwrite=true" in warning

@@ -53,7 +53,7 @@ def test_another_machine_goes_on_where_the_first_one_stopped(s3: str, tmp_path: 
         store = Store(tmp_path / name, Remote(f"{s3}/steps", tmp_path / name))
         tasks = chain(tmp_path / "source.txt", log, **changes)
         outcome = execute(plan(tasks, store), store, jobs=1, on_event=lambda *_: None, keep_going=True)
-        return {name: manifest.facts["total"] for name, manifest in outcome.of_tile().items()}
+        return {name: manifest.metrics["total"] for name, manifest in outcome.of_tile().items()}
 
     assert set(machine("first", c={"does": "fail"})) == {"a", "b"}
     assert sorted(log.read_text(encoding="utf-8").split()) == ["a", "b", "c"]

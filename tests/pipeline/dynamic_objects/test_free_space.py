@@ -120,7 +120,7 @@ def test_what_moved_goes_and_what_stands_stays(street: PointCloud, tmp_path: Pat
     assert all(gone[kind] > 0.65 for kind in MOVES)
     assert all(share < 0.01 for kind, share in gone.items() if kind not in MOVES)
     moving = PointCloud.load(done.files["moving"])
-    assert len(moving) == done.facts["moved"] and moving.time is not None and moving.normal is not None
+    assert len(moving) == done.metrics["moved"] and moving.time is not None and moving.normal is not None
     dropped = np.load(done.files["dropped"])
     np.testing.assert_array_equal(street.xyz[dropped == 0], PointCloud.load(done.files["cloud"]).xyz)
 
@@ -140,21 +140,21 @@ def test_without_path_times_or_a_second_look_all_stays(street: PointCloud, tmp_p
     )
     for i, (cloud, way, why) in enumerate(cases):
         done = carve(cloud, tmp_path / str(i), way, positions=((0.0, 0.0, 30.0),))
-        assert why in str(done.facts["rays"]) and not len(PointCloud.load(done.files["moving"]))
+        assert why in str(done.metrics["rays"]) and not len(PointCloud.load(done.files["moving"]))
         assert way is not None or len(PointCloud.load(done.files["cloud"])) == len(cloud)
     assert street.time is not None
     once = carve(street.take(street.time == 0.5), tmp_path / "once", path())
-    assert once.facts["moved"] == 0 and "observed only once" in str(once.facts["rays"])
+    assert once.metrics["moved"] == 0 and "observed only once" in str(once.metrics["rays"])
 
 
 def test_a_profile_scanner_tells_nothing_in_one_pass(tmp_path: Path) -> None:
-    """It sees each place once, beside itself; the car that it passes stays, and the facts say why."""
+    """It sees each place once, beside itself; the car that it passes stays, and the metrics say why."""
     random = np.random.default_rng(3)
     x = random.uniform(0, 20, 60_000)
     y = np.where((x > 8) & (x < 12), 3.0, 6.0)
     xyz = np.column_stack([x, y, random.uniform(0, 2, len(x))]).astype(np.float32)
     done = carve(PointCloud(Frame(), xyz, time=x / SPEED), tmp_path, path())
-    assert done.facts["moved"] == 0 and "observed only once" in str(done.facts["rays"])
+    assert done.metrics["moved"] == 0 and "observed only once" in str(done.metrics["rays"])
     assert len(PointCloud.load(done.files["cloud"])) == len(x)
 
 

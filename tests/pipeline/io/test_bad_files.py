@@ -55,7 +55,7 @@ def test_the_origin_is_the_points_whatever_the_header_says(
     assert np.abs(np.subtract(tile.frame.origin, (700_010, 5_400_010, 100))).max() <= 1
     params = step_params(IngestParams, crs=tile.frame.crs, origin=tile.frame.origin, unit=tile.frame.unit)
     done = ingest({"cloud.0000": path}, params, tmp_path, silent)
-    assert done.facts["points"] == n
+    assert done.metrics["points"] == n
     assert "its header's bounding box is wrong" in done.warnings[0]
 
 

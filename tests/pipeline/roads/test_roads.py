@@ -74,7 +74,7 @@ def test_lines_lie_where_the_road_has_them(done: Done) -> None:
             assert about["dash_m"] == pytest.approx(3, abs=0.15) == about["gap_m"]
             assert about["paint_width_m"] == pytest.approx(0.12, abs=0.03)
     assert count == {"marking": 3, "edge": 2, "reference": 1}
-    (road,) = done.facts["roads"]
+    (road,) = done.metrics["roads"]
     assert road["width_m"] == pytest.approx(2 * STREET.edge, abs=0.1) and road["notes"] == []
 
 
@@ -141,7 +141,7 @@ def test_without_paint_only_edges_are_told(tmp_path: Path) -> None:
     assert road.reference == "middle" and not road.markings
     assert [section.kinds for section in sections(road)] == [("bidirectional",)]
     assert {f["properties"]["kind"] for f in features(done)} == {"reference", "edge"}
-    assert any("no painted line" in note for note in done.facts["roads"][0]["notes"])
+    assert any("no painted line" in note for note in done.metrics["roads"][0]["notes"])
 
 
 def test_without_a_texture_edges_are_told(tmp_path: Path) -> None:
@@ -178,17 +178,17 @@ def test_where_another_road_begins_no_edge_is_told(tmp_path: Path) -> None:
     for part in left:
         s, _ = STREET.locate(STREET.frame.to_local(part["geometry"]["coordinates"])[:, :2])
         assert np.abs(s).min() > 5
-    assert any("left edge isn't told from" in note for note in done.facts["roads"][0]["notes"])
+    assert any("left edge isn't told from" in note for note in done.metrics["roads"][0]["notes"])
 
 
 def test_bad_input_says_why_there_is_no_road(tmp_path: Path) -> None:
     cloud = STREET.cloud()
     grass = replace(cloud, classification=np.full(len(cloud), CODE["terrain"], np.uint8))
     nothing = run(tmp_path / "a", STREET.inputs(tmp_path / "a", cloud=grass))
-    assert nothing.facts["none"] == "no point has a road class" and features(nothing) == []
+    assert nothing.metrics["none"] == "no point has a road class" and features(nothing) == []
     s, _ = STREET.locate(cloud.xyz[:, :2])
     short = run(tmp_path / "b", STREET.inputs(tmp_path / "b", cloud=cloud.take(np.abs(s) < 0.5)))
-    assert short.facts["none"] == "no road line was detected" and drawn(short) == []
+    assert short.metrics["none"] == "no road line was detected" and drawn(short) == []
     empty = run(tmp_path / "c", STREET.inputs(tmp_path / "c", cloud=cloud.take(np.zeros(len(cloud), bool))))
     assert features(empty) == [] and opendrive.write(tmp_path / "x.xodr", "x", STREET.frame, drawn(empty)) == 0
     assert not (tmp_path / "x.xodr").exists()
@@ -200,7 +200,7 @@ def test_a_road_without_points_of_its_surface_is_left_out_with_a_warning(tmp_pat
     done = run(tmp_path, STREET.inputs(tmp_path, cloud=cloud.take(np.abs(t) > model.MAX_SURFACE_DISTANCE_M + 0.2)))
     (warning,) = done.warnings
     assert warning.endswith("is left out: no point of its surface is within 3 m of its line")
-    assert features(done) == [] and done.facts["roads"] == [] and "none" not in done.facts
+    assert features(done) == [] and done.metrics["roads"] == [] and "none" not in done.metrics
     assert not list(done.files["opendrive"].iterdir())
     scene = worlds.scene(tmp_path / "town", STREET.frame, tiles=1)
     (scene.tiles[0].folder / SEEN).write_bytes(done.files["seen"].read_bytes())
@@ -231,7 +231,7 @@ def test_a_road_over_two_tiles_is_one(tmp_path: Path) -> None:
     halves = []
     for tile, own, other in zip(scene.tiles, ("east", "west"), ("west", "east"), strict=True):
         half = run(tmp_path / own, inputs, seed=seeds[own], neighbours={other: seeds[other]})
-        length = half.facts["roads"][0]["length_m"]
+        length = half.metrics["roads"][0]["length_m"]
         assert length == pytest.approx(STREET.length / 2, abs=3)
         (tile.folder / SEEN).write_bytes(half.files["seen"].read_bytes())
         halves.append(half)

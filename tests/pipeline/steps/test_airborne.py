@@ -158,7 +158,7 @@ def test_footprints_say_where_walls_stand(house: dict[str, Path], tmp_path: Path
     x, y, _ = PointCloud.load(done.files["synthesized"]).xyz.T
     outer = (abs(x - 4) > 1) | (abs(y) > 3)
     to_side = np.min([abs(x - side) for side in (-5.5, 8.5)] + [abs(y - side) for side in (-3.5, 3.5)], axis=0)
-    assert done.facts["footprints"] == 1
+    assert done.metrics["footprints"] == 1
     assert to_side[outer].max() < 0.01
     assert (~outer).sum() > 100  # the step between the roofs
 
@@ -256,10 +256,10 @@ def test_points_far_from_the_mesh_are_warned_of_and_made_up_area_is_told(
     mesh.save(tmp_path / "mesh.npz")
     inputs = {"mesh.building": tmp_path / "mesh.npz", "cloud.building": house["building"]}
     done = go(GEOMETRY, tmp_path / "geometry", inputs | {"synthesized.building": house["walls"]})
-    assert done.facts["building"]["cloud_to_mesh_p95_m"] > 2  # the annex lacks
+    assert done.metrics["building"]["cloud_to_mesh_p95_m"] > 2  # the annex lacks
     assert len(done.warnings) == 1 and "building" in done.warnings[0]
     west = 8 * 3 / (8 * 3 + 10 * 8)
-    assert done.facts["building"]["synthesized"] == pytest.approx(west, abs=0.06)
+    assert done.metrics["building"]["synthesized"] == pytest.approx(west, abs=0.06)
 
 
 def test_a_street_scanned_from_the_ground_gets_nothing_made_up_without_a_path_either(
@@ -274,15 +274,15 @@ def test_a_street_scanned_from_the_ground_gets_nothing_made_up_without_a_path_ei
     PointCloud.join([ledge, seen]).save(tmp_path / "building.npz")
     inputs = {name: house[name] for name in ("terrain", "vegetation", "rest")} | {"building": tmp_path / "building.npz"}
     for step in (GROUND, WALLS):
-        assert go(step, tmp_path / step.name, inputs).facts["points"] == 0
-        assert go(step, tmp_path / f"{step.name}_asked", inputs, when="always").facts["points"] > 0
+        assert go(step, tmp_path / step.name, inputs).metrics["points"] == 0
+        assert go(step, tmp_path / f"{step.name}_asked", inputs, when="always").metrics["points"] > 0
 
 
 def test_points_that_became_no_surface_are_told(house: dict[str, Path], tmp_path: Path) -> None:
     nothing = Mesh(FRAME, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     nothing.save(tmp_path / "none.npz")
     done = go(GEOMETRY, tmp_path, {"mesh.building": tmp_path / "none.npz", "cloud.building": house["building"]})
-    assert done.facts == {} and "the world has no building" in done.warnings[0]
+    assert done.metrics == {} and "the world has no building" in done.warnings[0]
 
 
 def test_a_raster_that_no_memory_holds_is_refused() -> None:

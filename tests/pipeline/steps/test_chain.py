@@ -86,7 +86,7 @@ def test_split_puts_signs_with_buildings_and_leaves_vehicles_out(tmp_path: Path)
     classification = np.repeat([CODE[n] for n in names], 100).astype(np.uint8)
     replace(cloud, classification=classification).save(tmp_path / "cloud.npz")
     done = go(SPLIT, tmp_path / "out", {"cloud": tmp_path / "cloud.npz"})
-    assert done.facts["points"] == {"terrain": 200, "building": 200, "vegetation": 100, "rest": 200}
+    assert done.metrics["points"] == {"terrain": 200, "building": 200, "vegetation": 100, "rest": 200}
 
 
 def test_split_warns_of_an_empty_class_and_refuses_when_all_are(tmp_path: Path) -> None:
@@ -169,14 +169,14 @@ def test_poisson_falls_back_when_the_child_dies(
     monkeypatch.setattr(sandbox, "call", flaky)
     done = go(POISSON, tmp_path, {"cloud": ground["cloud"]}, depth=8)
     assert calls == [8, 8, 7]
-    assert done.facts["depth"] == 7 and len(done.warnings) == 2
+    assert done.metrics["depth"] == 7 and len(done.warnings) == 2
 
 
 def test_trim_removes_what_no_point_bears_out(ground: dict[str, Path], tmp_path: Path) -> None:
     done = go(TRIM, tmp_path, ground, max_edge=0.25)
     mesh, cloud = Mesh.load(done.files["mesh"]), PointCloud.load(ground["cloud"])
     side = np.linalg.norm(mesh.corners - np.roll(mesh.corners, 1, axis=1), axis=2)
-    assert side.max() <= 0.25 * done.facts["widened"] + 1e-6
+    assert side.max() <= 0.25 * done.metrics["widened"] + 1e-6
     low, high = cloud.xyz.min(axis=0) - 0.3, cloud.xyz.max(axis=0) + 0.3
     assert ((mesh.vertices >= low) & (mesh.vertices <= high)).all()
     assert 12**2 <= mesh.face_area.sum() <= 12.5**2 * 1.03  # waves make it 2 to 3 % larger than its plan
@@ -189,7 +189,7 @@ def test_islands_go_by_area(tmp_path: Path) -> None:
     Mesh(FRAME, vertices, np.concatenate([faces, faces + 4, faces + 8])).save(tmp_path / "mesh.npz")
     done = go(ISLANDS, tmp_path / "out", {"mesh": tmp_path / "mesh.npz"}, min_area=0.5)
     assert Mesh.load(done.files["mesh"]).face_area.sum() == pytest.approx(10.0)
-    assert done.facts["islands_removed"] == 1
+    assert done.metrics["islands_removed"] == 1
 
 
 def test_decimate_keeps_the_border_and_turns_no_face_over(ground: dict[str, Path], tmp_path: Path) -> None:
@@ -197,7 +197,7 @@ def test_decimate_keeps_the_border_and_turns_no_face_over(ground: dict[str, Path
     full = Mesh.load(trimmed.files["mesh"])
     done = go(DECIMATE, tmp_path / "out", {"mesh": trimmed.files["mesh"]}, target=10_000)
     small = Mesh.load(done.files["mesh"])
-    assert len(small) <= 10_000 and done.facts["border_kept"]
+    assert len(small) <= 10_000 and done.metrics["border_kept"]
     assert edges(small)[0] == edges(full)[0], "border edges are kept, and no new ones torn"
     assert edges(small)[1] == 0
     assert (small.face_normal[small.face_area > 1e-6, 2] > -0.01).all()

@@ -31,7 +31,7 @@ def test_the_budget_holds_and_the_deviation_is_told(tmp_path: Path) -> None:
     ground = synthetic.ground(100)
     mesh, done = _run(tmp_path, {"terrain": ground, "building": synthetic.house()}, triangles=1000)
     assert len(mesh) <= 1000 and mesh.uv is None and mesh.frame == synthetic.UTM
-    deviation = done.facts["deviation_m"]
+    deviation = done.metrics["deviation_m"]
     assert 0 < deviation["mean"] <= deviation["p95"] <= deviation["max"] < 0.05
     # the reported figure bears a check by the surface's formula
     gap = np.abs(mesh.vertices[:, 2] - synthetic.height(mesh.vertices[:, 0], mesh.vertices[:, 1]))
@@ -78,7 +78,7 @@ def test_points_of_the_ground_that_make_no_surface_do_no_harm(tmp_path: Path) ->
     NONE.save(inputs["terrain"])
     synthetic.house().save(inputs["building"])
     done = COLLISION.run({**inputs, "cloud": tmp_path / "cloud.npz"}, CollisionParams(), tmp_path, silent)
-    assert done.facts["ground_triangles"] == 0 and done.facts["ground_m2"] == {} and done.facts["triangles"] > 0
+    assert done.metrics["ground_triangles"] == 0 and done.metrics["ground_m2"] == {} and done.metrics["triangles"] > 0
 
 
 def _in_house(xyz: np.ndarray) -> np.ndarray:

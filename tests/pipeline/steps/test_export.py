@@ -126,7 +126,7 @@ def test_an_empty_group_is_left_out_and_nothing_at_all_is_refused(tmp_path: Path
     none = replace(house, faces=house.faces[:0], uv=None, page=None)
     inputs = _inputs(tmp_path, terrain=none, building=house)
     done = EXPORT.run(inputs, ExportParams(), tmp_path / "out", silent)
-    assert set(done.facts["triangles"]) == {"building"}
+    assert set(done.metrics["triangles"]) == {"building"}
     del inputs["building"]
     with pytest.raises(DataError, match="all surfaces are empty"):
         EXPORT.run(inputs, ExportParams(), tmp_path / "none", silent)

@@ -128,7 +128,7 @@ def test_a_wall_goes_on_to_where_photos_show_its_top(tmp_path: Path, height: flo
     assert np.ptp(tops(made)[1:-1]) < 0.25, "its top is no straight line"
     assert np.abs(made.xyz[:, 1] - WALL).max() < 0.03
     assert made.xyz[:, 0].min() > -0.1 and made.xyz[:, 0].max() < LONG + 0.1, "it goes on beside its ends"
-    assert done.facts["above_m2"] > 0.5 * LONG * (height - 2.0)
+    assert done.metrics["above_m2"] > 0.5 * LONG * (height - 2.0)
 
 
 def test_a_plain_wall_goes_on_while_it_looks_as_it_does_below(tmp_path: Path) -> None:
@@ -152,7 +152,7 @@ def test_a_gap_is_closed_where_no_ray_went_through(tmp_path: Path) -> None:
     hole = (5.0, 0.5, 5.6, 1.1)
     made, done = built(tmp_path, wall(1.9, hole), Scene(1.9))
     inside = (made.xyz[:, 0] > 5.1) & (made.xyz[:, 0] < 5.5) & (made.xyz[:, 2] > 0.6) & (made.xyz[:, 2] < 1.0)
-    assert inside.sum() >= 40 and done.facts["gaps_m2"] > 0.05
+    assert inside.sum() >= 40 and done.metrics["gaps_m2"] > 0.05
 
 
 def test_a_window_that_rays_went_through_stays_open(tmp_path: Path) -> None:

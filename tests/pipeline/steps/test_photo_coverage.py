@@ -70,9 +70,9 @@ def test_what_photos_see_and_the_lane_stay_and_the_rest_goes(street: dict[str, P
     )
     assert not (y > 9).any(), "no photo sees through the wall"
     assert ((x > 10) & (x < 25) & (y > 7.9) & (y < 8.1) & (z > 0.2)).sum() > 0.95 * 150 * 28, "the wall itself"
-    assert done.facts["left_out"] == done.facts["points_in"] - len(cloud) > 0
+    assert done.metrics["left_out"] == done.metrics["points_in"] - len(cloud) > 0
     lost = len(np.concatenate(list(PARTS.values()))) - len(cloud)
-    assert done.facts["left_out_m2"] == pytest.approx(lost * 0.01, rel=0.1)
+    assert done.metrics["left_out_m2"] == pytest.approx(lost * 0.01, rel=0.1)
 
 
 def test_ground_hidden_behind_something_small_is_kept(street: dict[str, Path], tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_metres_from_the_path(street: dict[str, Path], tmp_path: Path) -> None:
     done = go(street, tmp_path, limit=6.0)
     x, y, _ = left(done).xyz.T
     away = np.hypot(x - x.clip(0, 10), y)
-    assert 5.5 < away.max() < 6.6 and done.facts["far_m"] < 6.6
+    assert 5.5 < away.max() < 6.6 and done.metrics["far_m"] < 6.6
 
 
 def test_held_out_photos_dont_count(street: dict[str, Path], tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_a_path_in_the_air_and_a_tile_without_photos_keep_all(street: dict[str, 
     for i, inputs in enumerate((street | {"path": tmp_path / "path.npz"}, {"cloud": street["cloud"]})):
         (tmp_path / str(i)).mkdir()
         done = go(inputs, tmp_path / str(i))
-        assert done.facts["left_out"] == 0 and len(left(done)) == len(PointCloud.load(street["cloud"]))
+        assert done.metrics["left_out"] == 0 and len(left(done)) == len(PointCloud.load(street["cloud"]))
 
 
 def test_only_where_photos_are_taken_along_a_path_and_neighbours_read_it() -> None:

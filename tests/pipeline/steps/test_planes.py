@@ -30,7 +30,7 @@ def go(step: Step, folder: Path, inputs: dict[str, Path], **given: Any) -> Done:
 def laid(
     xyz: F64, folder: Path, *, others: F64 | None = None, noise: float = NOISE, **given: Any
 ) -> tuple[Mesh, Mesh, dict[str, Any]]:
-    """The mesh of points, what the step makes of it, and its facts."""
+    """The mesh of points, what the step makes of it, and its metrics."""
     noisy = (xyz + np.random.default_rng(1).normal(0, noise, xyz.shape)).astype(np.float32)
     points, path, other = (folder / f"{name}.npz" for name in ("points", "path", "other"))
     PointCloud(Frame(), noisy).save(points)
@@ -41,7 +41,7 @@ def laid(
     mesh = go(TRIM, folder, {"mesh": rough, "cloud": cloud}).files["mesh"]
     done = go(PLANES, folder, {"mesh": mesh, "cloud": cloud, "points": points, "other.terrain": other}, **given)
     pieces = go(ISLANDS, folder, {"mesh": done.files["mesh"]}).files["mesh"]
-    return Mesh.load(mesh), Mesh.load(pieces), done.facts
+    return Mesh.load(mesh), Mesh.load(pieces), done.metrics
 
 
 def wall(start: tuple[float, float], end: tuple[float, float], height: float = 3.0, density: int = 900) -> F64:
@@ -60,9 +60,9 @@ def reach(mesh: Mesh, way: tuple[float, float, float], low: float, high: float) 
 
 
 def test_a_corner_is_sharp(tmp_path: Path) -> None:
-    before, after, facts = laid(np.concatenate([wall((0, 0), (0, 4)), wall((0, 0), (4, 0))]), tmp_path)
+    before, after, metrics = laid(np.concatenate([wall((0, 0), (0, 4)), wall((0, 0), (4, 0))]), tmp_path)
     corner = np.array([-1.0, -1.0, 0.0]) / np.sqrt(2)  # it reaches to 0 in this direction
-    assert facts["planes"] == 2
+    assert metrics["planes"] == 2
     assert np.median(reach(before, tuple(corner), 0.5, 2.5)) < -0.02
     assert np.abs(reach(after, tuple(corner), 0.5, 2.5)).max() < 0.01
 
@@ -82,7 +82,7 @@ def test_a_wall_with_noise_and_boards_is_flat(tmp_path: Path) -> None:
     """As a lidar on a car sees it: 3 cm of noise, boards of 30 cm by turns 3 cm before and behind."""
     boards = wall((0, 0), (5, 0), density=400)
     boards[:, 1] += np.where(boards[:, 0] % 0.6 < 0.3, 0.015, -0.015)
-    before, after, facts = laid(boards, tmp_path, noise=0.03)
+    before, after, metrics = laid(boards, tmp_path, noise=0.03)
 
     def tilted(mesh: Mesh) -> float:
         """Share of the wall's area that looks away from its front by more than 20 degrees."""
@@ -91,7 +91,7 @@ def test_a_wall_with_noise_and_boards_is_flat(tmp_path: Path) -> None:
         away = np.abs(mesh.face_normal[:, 1]) < np.cos(np.radians(20))
         return float(mesh.face_area[inside & away].sum() / mesh.face_area[inside].sum())
 
-    assert facts["planes"] == 1
+    assert metrics["planes"] == 1
     assert tilted(before) > 0.2 and tilted(after) < 0.02
 
 
@@ -110,16 +110,16 @@ def test_a_window_has_reveals(tmp_path: Path) -> None:
     front = wall((0, 0), (4, 0))
     hole = (front[:, 0] > 1.5) & (front[:, 0] < 2.7) & (front[:, 2] > 0.8) & (front[:, 2] < 2.2)
     pane = front[hole] + [0, 0.15, 0]
-    _, after, facts = laid(np.concatenate([front[~hole], pane]), tmp_path)
+    _, after, metrics = laid(np.concatenate([front[~hole], pane]), tmp_path)
     middle = (np.abs(after.vertices[:, 2] - 1.5) < 0.4) & (np.abs(after.vertices[:, 0] - 2.1) < 0.8)
     between = after.vertices[middle & (after.vertices[:, 1] > 0.01) & (after.vertices[:, 1] < 0.14)]
-    assert facts["steps"] >= 4
+    assert metrics["steps"] >= 4
     assert np.quantile(np.minimum(np.abs(between[:, 0] - 1.5), np.abs(between[:, 0] - 2.7)), 0.75) < 0.03
 
 
 def test_what_is_round_stays_as_it_is(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     angle, z = random.uniform(0, 2 * np.pi, 12_000), random.uniform(0, 3, 12_000)
-    before, after, facts = laid(np.column_stack([0.6 * np.cos(angle), 0.6 * np.sin(angle), z]), tmp_path)
-    assert facts["planes"] == 0
+    before, after, metrics = laid(np.column_stack([0.6 * np.cos(angle), 0.6 * np.sin(angle), z]), tmp_path)
+    assert metrics["planes"] == 0
     assert np.array_equal(before.vertices, after.vertices) and np.array_equal(before.faces, after.faces)

@@ -42,21 +42,21 @@ def test_it_is_the_world_with_pages_within_bounds(made: Any, megapixels: float, 
     done = made(megapixels=megapixels)
     meshes = scene(done).geometry
     assert sorted(meshes) == ["building_0", "building_1", "terrain_0", "terrain_1"]
-    assert sum(len(mesh.faces) for mesh in meshes.values()) == done.facts["triangles"] == 3210
+    assert sum(len(mesh.faces) for mesh in meshes.values()) == done.metrics["triangles"] == 3210
     heights = np.concatenate([mesh.vertices[:, 1] for mesh in meshes.values()])  # y up
     assert heights.max() == pytest.approx(4.5)
     sizes = [mesh.visual.material.baseColorTexture.width for mesh in meshes.values()]
-    assert sizes == [side] * 4 and done.facts["scale"] == pytest.approx(side / 256, abs=0.01)
+    assert sizes == [side] * 4 and done.metrics["scale"] == pytest.approx(side / 256, abs=0.01)
 
 
 def test_one_starts_on_the_ground_and_above_it(made: Any) -> None:
-    facts = made().facts
-    (x, y, z), target = facts["walk"]
+    metrics = made().metrics
+    (x, y, z), target = metrics["walk"]
     assert z - synthetic.height(np.array(x), np.array(y)) == pytest.approx(1.6, abs=0.3)
-    assert np.linalg.norm(np.subtract(target, (x, y, z))) > 5 and facts["turn"][0][2] > 5
-    assert facts["start"] == "turn"  # nobody drove there
+    assert np.linalg.norm(np.subtract(target, (x, y, z))) > 5 and metrics["turn"][0][2] > 5
+    assert metrics["start"] == "turn"  # nobody drove there
 
 
 def test_a_world_of_too_many_triangles_has_none(made: Any) -> None:
     done = made(triangles=1000)
-    assert done.files == {} and done.facts == {"triangles": 3210}
+    assert done.files == {} and done.metrics == {"triangles": 3210}

@@ -28,7 +28,7 @@ def trimmed(
     done = trim({"mesh": folder / "in.npz", "cloud": folder / "points.npz"}, TrimParams(), folder, silent)
     left = Mesh.load(done.files["mesh"]).classification
     assert left is not None
-    return left.tolist(), done.facts
+    return left.tolist(), done.metrics
 
 
 def test_long_edges_sparse_samples_and_what_is_far_from_points_go(tmp_path: Path) -> None:
@@ -40,6 +40,6 @@ def test_long_edges_sparse_samples_and_what_is_far_from_points_go(tmp_path: Path
     dense, sparse = [10.0] * 3, [10.0, 10.0, 5.9]  # samples at one corner are 5 cm x 2^4.1 = 86 cm apart
     still = CORNERS + np.array([3, 0, 0], np.float32), [9.0, 8.0, 6.1]
     triangles = [CORNERS, CORNERS + np.array([1, 0, 0], np.float32), away, long, still[0]]
-    left, facts = trimmed(tmp_path, triangles, [dense, sparse, dense, dense, still[1]], points)
+    left, metrics = trimmed(tmp_path, triangles, [dense, sparse, dense, dense, still[1]], points)
     assert left == [0, 4]
-    assert [facts[name] for name in ("long_edges", "sparse", "far_from_points", "widened")] == [1, 1, 1, 1.0]
+    assert [metrics[name] for name in ("long_edges", "sparse", "far_from_points", "widened")] == [1, 1, 1, 1.0]

@@ -251,12 +251,12 @@ def test_the_steps_pass_it_on(two: Any, tmp_path: Path) -> None:
     inputs |= {name: path for name, path in clips.items() if name.endswith("east")}
     done = go(JOIN, tmp_path / "join", inputs, name="west", seed=cell.seed, neighbours=cell.neighbours)
     assert np.array_equal(Mesh.load(done.files["mesh"]).vertices, joined["west"].vertices)
-    facts = done.facts["borders"]["east"]
+    facts = done.metrics["borders"]["east"]
     assert facts["matched"] > 100 and facts["unmatched"] == 0 and 0.005 < facts["mean_m"] < facts["max_m"] < 0.12
-    assert facts["followed"] == facts["edges"] and done.facts["missing"] == []
+    assert facts["followed"] == facts["edges"] and done.metrics["missing"] == []
 
     thin = go(DECIMATE, tmp_path / "thin", {"mesh": done.files["mesh"]}, target=10_000, keep_border=True)
-    assert thin.facts["border_kept"] and not thin.warnings
+    assert thin.metrics["border_kept"] and not thin.warnings
 
 
 def test_what_is_touched_meets_at_the_border_and_is_thinned_at_all_other_rims(two: Any, tmp_path: Path) -> None:
@@ -289,7 +289,7 @@ def test_a_border_that_needs_more_than_the_budget_is_kept_and_said(two: Any, tmp
     joined["west"].save(tmp_path / "terrain.npz")
     given = {"context": {"name": "a", "seed": cell.seed, "neighbours": cell.neighbours}}
     done = go(COLLISION, tmp_path / "solid", {"terrain": tmp_path / "terrain.npz"}, triangles=100, **given)
-    assert done.facts["triangles"] > 100 and "borders" in done.warnings[0]
+    assert done.metrics["triangles"] > 100 and "borders" in done.warnings[0]
     between = gap(joined["east"], Mesh.load(done.files["mesh"]), cells(SEEDS)["east"], "west")
     assert between.shared == 1
 
@@ -306,7 +306,7 @@ def test_decimate_may_be_told_to_keep_the_border(tmp_path: Path) -> None:
     faces = np.arange(36_000, dtype=np.int32).reshape(-1, 3)
     Mesh(EAST, corners.reshape(-1, 3).astype(np.float32), faces).save(tmp_path / "mesh.npz")
     done = go(DECIMATE, tmp_path / "out", {"mesh": tmp_path / "mesh.npz"}, target=10_000, keep_border=True)
-    assert done.facts["faces"] == 12_000 and done.facts["border_kept"] and "12,000" in done.warnings[0]
+    assert done.metrics["faces"] == 12_000 and done.metrics["border_kept"] and "12,000" in done.warnings[0]
 
 
 # --- clouds ---
@@ -389,7 +389,7 @@ def test_points_on_a_border_are_the_first_tiles(tmp_path: Path) -> None:
         cell = cells(seeds)[name]
         inputs = {"cloud": tmp_path / f"{name}.npz", f"cloud.{other}": tmp_path / f"{other}.npz"}
         done = go(OVERLAP, tmp_path / name, inputs, name=name, seed=cell.seed, neighbours=cell.neighbours)
-        assert np.all(PointCloud.load(done.files["cloud"]).classification == 2) and done.facts["points"] == {
+        assert np.all(PointCloud.load(done.files["cloud"]).classification == 2) and done.metrics["points"] == {
             "a": 50,
             "b": 0,
         }
@@ -437,7 +437,7 @@ def test_geometry_asks_the_cells_own_points_alone(two: Any, tmp_path: Path) -> N
     cell = Cell((X - 1.0, Y - 0.4), {"east": (X + 1.0, Y + 0.4), "far": (X - 3.0, Y - 0.4)})
     whole = go(GEOMETRY, tmp_path / "whole", inputs)
     own = go(GEOMETRY, tmp_path / "own", inputs, seed=cell.seed, neighbours=cell.neighbours)
-    assert whole.facts["terrain"]["cloud_to_mesh_p95_m"] > 5 > own.facts["terrain"]["cloud_to_mesh_p95_m"]
+    assert whole.metrics["terrain"]["cloud_to_mesh_p95_m"] > 5 > own.metrics["terrain"]["cloud_to_mesh_p95_m"]
 
 
 # --- all of it ---

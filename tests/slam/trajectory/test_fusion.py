@@ -155,7 +155,7 @@ def placed(files: dict[str, Path], out: Path, *names: str, **how: float | str) -
     (out / "-".join(names)).mkdir(parents=True)
     given = {name: files[name] for name in ("sweeps", *names)}
     done = fuse_path(given, FuseParams.model_validate(how), out / "-".join(names), silent)
-    return trajectory_io.read(done.files["trajectory"]), done.facts["summary"]
+    return trajectory_io.read(done.files["trajectory"]), done.metrics["summary"]
 
 
 def test_what_is_given_is_fused_and_told(tmp_path: Path) -> None:
