@@ -144,12 +144,17 @@ def _connected_to_top(xyz: F64, top: F64) -> Bools:
     return np.isin(piece, piece[near])
 
 
-def _fit_arm_and_head(top: F64, along: F64, own: F64, length: float) -> Arm:
-    """Arm and lamp head fitted to points (N, 3): outwards, sideways and up from the top of the pole."""
+def _fit_arm_and_head(top: F64, along: F64, own: F64, length: float) -> Arm | None:
+    """Arm and lamp head fitted to points (N, 3): outwards, sideways and up from the top of the pole.
+
+    None if no section of the arm has enough points.
+    """
     count = max(2, int(length / LAMP.section_m))
     edges = np.linspace(0, length, count + 1)
     parts = [own[(own[:, 0] >= a) & (own[:, 0] <= b)] for a, b in pairwise(edges.tolist())]
     parts = [part for part in parts if len(part) >= 3]
+    if not parts:
+        return None
     middles = np.array([np.median(part, axis=0) for part in parts])
     across = np.array([np.ptp(np.percentile(part[:, 1], [10, 90])) for part in parts])
     wide = across > LAMP.min_head_width_m
