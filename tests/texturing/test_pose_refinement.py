@@ -100,7 +100,8 @@ def disturbed(
 
 
 @pytest.mark.parametrize(
-    "model", ["pinhole", "equirectangular", *(pytest.param(m, marks=pytest.mark.slow) for m in ("opencv", "fisheye"))]
+    "model",
+    ["pinhole", *(pytest.param(m, marks=pytest.mark.slow) for m in ("equirectangular", "opencv", "fisheye"))],
 )
 def test_disturbed_poses_are_recovered(tmp_path: Path, model: str) -> None:
     camera = CAMERAS[model]

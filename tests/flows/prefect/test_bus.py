@@ -17,7 +17,7 @@ from tests.flows.prefect.toy_steps import STEPS
 
 
 @on("sqlite")
-@pytest.mark.parametrize("runner", ["threads", "dask"])
+@pytest.mark.parametrize("runner", ["dask", pytest.param("threads", marks=pytest.mark.slow)])
 def test_flow_and_workers_publish_the_same_run(runner: str, server: Server, folder: Path, broker: Broker) -> None:
     arguments = ("-c", SCRIPT, str(folder), runner, broker.servers)
     process = server.spawn(*arguments, log=folder / "output", XDG_STATE_HOME=str(folder / "state"))
