@@ -96,8 +96,9 @@ def test_boxes_move_with_the_triangles_and_do_not_depend_on_their_order() -> Non
     corners = np.concatenate([wall(0.4), wall(1.9)])
     low, high = boxes(corners, 0.25)
     shift = np.array([12.5, -7.25, 3.75], np.float32)  # whole cells and steps, exact in binary
-    low_moved, high_moved = boxes(np.round(corners * 256) / 256 + shift, 0.25)
-    low_exact, high_exact = boxes(np.round(corners * 256) / 256, 0.25)
+    exact = (np.round(corners * 256) / 256).astype(np.float32)
+    low_moved, high_moved = boxes(exact + shift, 0.25)
+    low_exact, high_exact = boxes(exact, 0.25)
     np.testing.assert_array_equal(low_moved, low_exact + shift)
     np.testing.assert_array_equal(high_moved, high_exact + shift)
     np.testing.assert_array_equal(boxes(corners[::-1, [1, 2, 0]], 0.25)[0], low)
