@@ -121,6 +121,8 @@ def _lookup_nearest(xyz: F32, positions: F64, radius: float) -> tuple[I64, I64]:
     """
     from scipy.spatial import cKDTree
 
+    if not len(xyz):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
     side = int(np.ceil(radius / PATH_STEP_M)) + 1
     offset = np.stack(np.meshgrid(*2 * [np.arange(-side, side + 1)], indexing="ij"), -1).reshape(-1, 2)
     low = xyz[:, :2].min(axis=0).astype(np.float64)
