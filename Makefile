@@ -14,7 +14,7 @@ demo: .venv/.installed
 
 # without reordering, as the longest files, which have few tests, would run last
 test: .venv/.installed-dev .venv-ros
-	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile --no-loadscope-reorder $(PYTEST)
+	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile --no-loadscope-reorder $(PYTEST)
 
 test-all: .venv/.installed-dev .venv-ros
 	$(BIN)/python -m pytest
