@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.fakes.consumers import blender
+from tests.fakes import blender
 from tests.fakes.world_checks.reference import WorldReference
 
 FORMAT = "gazebo"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from tests.fakes.consumers import blender
+from tests.fakes import blender
 from tests.fakes.world_checks.reference import WorldReference
 
 FORMAT = "glb"
