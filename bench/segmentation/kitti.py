@@ -64,9 +64,9 @@ def mean(found: Confusion) -> float:
 def _labelled(name: str, folder: Path) -> Iterator[tuple[View, dict[str, U8]]]:
     """The photos with polygons, and by method the LAS codes (H, W) of their pixels, 0 for the sky."""
     path, _ = build_world(STREETS[name], folder, run=False)
-    run("segment", path / "tile.toml", "--out", folder / "told")
+    run("segment", path / "tile.toml", "--out", folder / "predicted")
     tile = read_tile(path / "tile.toml")
-    standing = next((folder / "told" / "steps" / "instances").rglob("cloud.npz"))  # without moving objects
+    standing = next((folder / "predicted" / "steps" / "instances").rglob("cloud.npz"))  # without moving objects
     cloud = sample(PointCloud.load(standing), VOXEL_M)
     assert cloud.classification is not None
     scan, classifier = ScanProjector(cloud, VOXEL_M), Classifier(load("street", None), "street")
@@ -76,7 +76,7 @@ def _labelled(name: str, folder: Path) -> Iterator[tuple[View, dict[str, U8]]]:
         rgb = image.read_rgb(view.photo)
         size = view.camera.width, view.camera.height
         alone = code_of_index()[class_map(classifier.probabilities(rgb, view.camera), size[::-1])[0]]
-        pixels = cv2.imread(str(folder / "told" / "labels" / f"{Path(view.name).stem}.png"), cv2.IMREAD_GRAYSCALE)
+        pixels = cv2.imread(str(folder / "predicted" / "labels" / f"{Path(view.name).stem}.png"), cv2.IMREAD_GRAYSCALE)
         nearest, _ = scan.nearest(view, size)
         points = np.where(nearest >= 0, cloud.classification[nearest], UNLABELLED).astype(np.uint8)
         points = cv2.resize(points, size, interpolation=cv2.INTER_NEAREST)

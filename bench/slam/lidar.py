@@ -82,7 +82,7 @@ class Recorded:
         poses = out / "slam" / "trajectory.csv"
         sources = {"matched": matched, "poses": poses, "extrinsics": self.extrinsics, "gps": self.gps}
         fused = fuse_path(given | sources, FuseParams(), out / "fused", silent)
-        print(f"{out.name}: {fused.metrics['told']}; unsure {fused.metrics['unsure_share']}")
+        print(f"{out.name}: {fused.metrics['summary']}; unsure {fused.metrics['unsure_share']}")
         truth = self.truth[:, :3, 3]
         fixes = np.loadtxt(self.gps, delimiter=",", skiprows=1)
         there = np.column_stack([np.interp(self.times, fixes[:, 0], fixes[:, k]) for k in (1, 2, 3)])

@@ -58,15 +58,15 @@ def notes(road: Road) -> list[str]:
     if not road.markings:
         found.append("no painted line is seen: its lanes aren't told, only its edges")
     elif road.reference != "marking":
-        found.append("no painted line is in its middle: which way its lanes go isn't told")
+        found.append("no painted line is in its middle: the direction of its lanes is unknown")
     for line, side in ((road.left, "left"), (road.right, "right")):
         if line is None:
-            found.append(f"its {side} edge isn't told: nothing steps up, and no other ground begins, along one line")
+            found.append(f"its {side} edge isn't detected: nothing steps up, and no other ground begins, along one line")
             continue
         gaps = [(a, b) for (_, a), (b, _) in zip(line.ranges, line.ranges[1:], strict=False)]
         if gaps:
             where = ", ".join(f"{a:.0f} to {b:.0f} m" for a, b in gaps)
-            found.append(f"its {side} edge isn't told from {where}: hidden, or other roads and drives begin there")
+            found.append(f"its {side} edge isn't detected from {where}: hidden, or other roads and drives begin there")
     if not sections(road):
         found.append("it has no two lines beside each other, and so no lanes in OpenDRIVE")
     return found

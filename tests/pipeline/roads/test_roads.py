@@ -178,7 +178,7 @@ def test_where_another_road_begins_no_edge_is_told(tmp_path: Path) -> None:
     for part in left:
         s, _ = STREET.locate(STREET.frame.to_local(part["geometry"]["coordinates"])[:, :2])
         assert np.abs(s).min() > 5
-    assert any("left edge isn't told from" in note for note in done.metrics["roads"][0]["notes"])
+    assert any("left edge isn't detected from" in note for note in done.metrics["roads"][0]["notes"])
 
 
 def test_bad_input_says_why_there_is_no_road(tmp_path: Path) -> None:
@@ -253,7 +253,7 @@ def test_a_world_without_lanes_has_no_opendrive(tmp_path: Path) -> None:
 
 def test_notes_name_what_is_missing(done: Done) -> None:
     (road,) = drawn(done)
-    assert "left edge isn't told" in " ".join(road_geojson.notes(replace(road, left=None)))
+    assert "left edge isn't detected" in " ".join(road_geojson.notes(replace(road, left=None)))
     bare = replace(road, left=None, right=None, markings=(), reference="way")
     assert "no lanes" in " ".join(road_geojson.notes(bare)) and sections(bare) == []
 

@@ -256,7 +256,7 @@ def test_points_far_from_the_mesh_are_warned_of_and_made_up_area_is_told(
     mesh.save(tmp_path / "mesh.npz")
     inputs = {"mesh.building": tmp_path / "mesh.npz", "cloud.building": house["building"]}
     done = go(GEOMETRY, tmp_path / "geometry", inputs | {"synthesized.building": house["walls"]})
-    assert done.metrics["building"]["cloud_to_mesh_p95_m"] > 2  # the annex lacks
+    assert done.metrics["building"]["cloud_to_mesh_p95_m"] > 2  # the annex is missing
     assert len(done.warnings) == 1 and "building" in done.warnings[0]
     west = 8 * 3 / (8 * 3 + 10 * 8)
     assert done.metrics["building"]["synthesized"] == pytest.approx(west, abs=0.06)

@@ -134,9 +134,9 @@ def clouds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def furnish(clouds: Mapping[str, Path], found: Mapping[str, Path], name: str, out: Path) -> Tile:
-    """A tile with what some tiles told of."""
-    told = {"detections" if tile == name else f"detections.{tile}": path for tile, path in found.items()}
-    done = go(FURNITURE, out / "furniture", {"cloud": clouds[name], **told}, name=name, **known(name))
+    """A tile with the detections of some tiles."""
+    detections = {"detections" if tile == name else f"detections.{tile}": path for tile, path in found.items()}
+    done = go(FURNITURE, out / "furniture", {"cloud": clouds[name], **detections}, name=name, **known(name))
     split = go(SPLIT, out / "split", {"cloud": clouds[name], "furniture_points": done.files["furniture_points"]})
     return Tile(PointCloud.load(clouds[name]), found[name], done, split)
 
@@ -261,7 +261,7 @@ def test_all_agree_in_whatever_order_they_ask(tiles: dict[str, Tile]) -> None:
         name: [Detection.from_json(row) for row in json.loads(tile.found.read_text(encoding="utf-8"))]
         for name, tile in tiles.items()
     }
-    assert all(len(told) >= 3 for told in finds.values())  # both know of what stands on the border
+    assert all(len(known) >= 3 for known in finds.values())  # both have the objects at the border
     backwards = {name: finds[name] for name in reversed(finds)}
     one, other = (
         merged_detections(finds, SEEDS),
