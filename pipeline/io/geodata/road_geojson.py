@@ -61,7 +61,9 @@ def notes(road: Road) -> list[str]:
         found.append("no painted line is in its middle: the direction of its lanes is unknown")
     for line, side in ((road.left, "left"), (road.right, "right")):
         if line is None:
-            found.append(f"its {side} edge isn't detected: nothing steps up, and no other ground begins, along one line")
+            found.append(
+                f"its {side} edge isn't detected: nothing steps up, and no other ground begins, along one line"
+            )
             continue
         gaps = [(a, b) for (_, a), (b, _) in zip(line.ranges, line.ranges[1:], strict=False)]
         if gaps:
