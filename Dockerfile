@@ -16,10 +16,10 @@ COPY . .
 
 # without torch, which installs gigabytes of CUDA: reconstruction, videos and surveys don't need it
 FROM code AS cpu-environment
-RUN pip install --no-cache-dir -c constraints.txt -e '.[slam,ray,s3]'
+RUN pip install --no-cache-dir -c constraints.txt -e '.[slam,ray,s3,bus]'
 
 FROM code AS gpu-environment
-RUN pip install --no-cache-dir -c constraints.txt -e '.[segmentation,slam,ray,s3]'
+RUN pip install --no-cache-dir -c constraints.txt -e '.[segmentation,slam,ray,s3,bus]'
 
 FROM system AS gpu
 ENV NVIDIA_VISIBLE_DEVICES=all NVIDIA_DRIVER_CAPABILITIES=compute,utility

@@ -9,14 +9,15 @@ OUT ?= demo-out
 
 .PHONY: demo test test-all lint docs bench gate sample-tile
 
+# the sample's points have their true classes, which are ignored to show the network's
 demo: .venv/.installed
 	$(BIN)/scan2sim run $(TILE) --out $(OUT) --hold-out 8 --set segment.overwrite=true
 
 # without reordering, as the longest files, which have few tests, would run last
-test: .venv/.installed-dev .venv-ros
+test: .venv/.installed-dev .venv-ros .venv-triton
 	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile --no-loadscope-reorder $(PYTEST)
 
-test-all: .venv/.installed-dev .venv-ros
+test-all: .venv/.installed-dev .venv-ros .venv-triton
 	$(BIN)/python -m pytest
 
 lint: .venv/.installed-dev
@@ -47,6 +48,12 @@ sample-tile: .venv/.installed
 .venv-ros: tests/services/ros-requirements.txt
 	@$(PYTHON) -m venv $@ && $@/bin/python -m pip install --quiet --disable-pip-version-check -r $< \
 	  || echo "No rclpy for this Python: tests between it and cyclonedds are skipped."
+	@touch $@
+
+# Triton's client in a separate environment: it needs older versions of protobuf and others
+.venv-triton: tests/services/toolboxes/triton-requirements.txt
+	@$(PYTHON) -m venv $@ && $@/bin/python -m pip install --quiet --disable-pip-version-check -r $< \
+	  || echo "Triton's client can't be installed here: tests with it are skipped."
 	@touch $@
 
 .venv/.installed-dev: .venv/.installed

@@ -26,7 +26,8 @@ from scan2sim.pipeline.core.classes import CODE, name_of
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import PointCloud, Trajectory
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.steps.dynamic_objects import DYNAMIC_OBJECTS, SCAN_WINDOW_S
+from scan2sim.pipeline.lidar.sweeps import SCAN_WINDOW_S
+from scan2sim.pipeline.steps.dynamic_objects import DYNAMIC_OBJECTS
 from scan2sim.pipeline.steps.ingest import INGEST
 from scan2sim.pipeline.steps.path import PATH
 from tests.fakes.steps import step_params

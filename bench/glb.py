@@ -25,6 +25,7 @@ from scan2sim.pipeline.io.worlds.scene import Scene, read_scene
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
+    "without reflectance": {"reflectance": False},
     "without provenance": {"glb_bare": True},
     "lit, without provenance": {"glb_bare": True, "glb_lit": True},
     "meshopt": {"glb_mesh": "meshopt"},

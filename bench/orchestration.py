@@ -1,7 +1,12 @@
-"""Orchestration of services with OSM: lifecycles, faults, killed runs, and a hundred services at once.
+"""Orchestration of services with OSM: operations, odd answers, lifecycles, faults, killed runs, a hundred services.
 
-`python -m bench.orchestration [--parts lifecycles faults kills hundred] [--kills 50]` runs against a fake OSM
-(`tests/fakes/osm.py`) that returns recorded responses and deploys nothing.
+`python -m bench.orchestration [--parts operations odd lifecycles faults kills hundred] [--kills 50]` runs against a
+fake OSM (`tests/fakes/osm.py`) that returns the responses recorded from OSM's own server and deploys nothing. `--osm
+URL` runs the operations against another server, whose password is in $OSM_PASSWORD.
+
+- operations: every command of `scan2sim orchestrate` that changes or reads OSM, for a container and a machine; after
+  `apply` the plan must be empty.
+- odd: every kind of odd or hostile answer (`tests/fakes/odd_answers.py`), during plan, apply, scale, heal and delete.
 
 - lifecycles: the four toolboxes and a survey worker are started, scaled and removed with `scan2sim orchestrate`.
 - faults: every error status of SOL005, revoked tokens, broken connections, operations that fail or never end: the
@@ -9,7 +14,8 @@
 - kills: `apply` is killed (SIGKILL) at random moments; the next run must reach the same final state.
 - hundred: a hundred services are started with one `apply`.
 
-Ends with `RESULT {json}`: completed `lifecycles`, `faults_tried`, `faults_clear` (clear message and recovery),
+Ends with `RESULT {json}`: `operations_failed` of `operations_tried`, `odd_answers_unexpected` (kinds that don't end in
+a message) of `odd_answers`, completed `lifecycles`, `faults_tried`, `faults_clear` (clear message and recovery),
 `orphans` left by all parts, `kills`, `kills_resumed`, `hundred_requests_per_second_max` (highest rate in any second of
 requests about instances and operations, per instance in parallel; packages are onboarded before, one by one).
 """
@@ -17,6 +23,7 @@ requests about instances and operations, per instance in parallel; packages are 
 from __future__ import annotations
 
 import argparse
+import copy
 import itertools
 import json
 import os
@@ -27,15 +34,20 @@ import sys
 import tempfile
 import time
 from bisect import bisect_left
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from scan2sim.pipeline.core.errors import ScanError
-from scan2sim.services.orchestration import apply, deployment
+from scan2sim.services.orchestration import apply, deployment, description, lifecycle, onboarding
+from scan2sim.services.orchestration import osm as osm_client
 from scan2sim.services.orchestration.apply import ApplyResult
 from scan2sim.services.orchestration.osm import HTTP_ERRORS, Osm
-from scan2sim.services.orchestration.settings import ApplyParams
+from scan2sim.services.orchestration.package import Packages, build
+from scan2sim.services.orchestration.settings import ApplyParams, Connection
+from scan2sim.services.orchestration.sol006 import FunctionKind
+from scan2sim.services.qos.requirements import Environment
+from tests.fakes import odd_answers
 from tests.fakes.osm import CUT_AFTER, CUT_BEFORE, FakeOsm, Fault, OsmState
 
 SERVICES = ("classify", "detect", "movement", "segment", "worker")
@@ -67,6 +79,95 @@ def apply_file(fake: FakeOsm, path: Path, timeout: float = 30.0) -> ApplyResult:
 def command(fake: FakeOsm, *arguments: object) -> list[str]:
     """Command line of `scan2sim orchestrate`."""
     return [sys.executable, "-m", "scan2sim.flows.cli", "orchestrate", *map(str, arguments), "--osm", fake.address]
+
+
+def operations(folder: Path, url: str) -> dict[str, Any]:
+    """Every command against a server; empty `url`: a fake."""
+    with FakeOsm(OsmState(seconds=0.5)) as fake:
+        failed = [words for words, expected in _commands(folder) if not _succeeds(words, expected, url or fake.address)]
+        left = len(fake.state.orphans()) + len(fake.state.instances) + len(fake.state.functions)
+    for words in failed:
+        print("FAILED:", *words)
+    return {"operations_tried": len(list(_commands(folder))), "operations_failed": len(failed), "orphans": left}
+
+
+def _commands(folder: Path) -> Iterator[tuple[list[object], str]]:
+    """Commands, and what each must print."""
+    password, kubeconfig, path = folder / "password", folder / "kubeconfig.yaml", folder / "bench.toml"
+    password.write_text("secret", encoding="utf-8")
+    kubeconfig.write_text("apiVersion: v1\nkind: Config\nclusters: []\n", encoding="utf-8")
+    one, two = build_packages("detect", "container"), build_packages("segment", "machine")
+    packages = [made.save(folder) for made in (one.service, one.function, two.function, two.service)]
+    yield (
+        ["vim", "add", "bench-site", "http://vim/v3", "--vim-user", "u", "--vim-password", password, "--wait"],
+        "added",
+    )
+    yield ["cluster", "add", "bench-cluster", kubeconfig, "--vim", "bench-site", "--wait"], "added"
+    yield ["repo", "add", "bench-charts", "https://charts.example.org", "--wait"], "added"
+    for kind, name in (("vim", "bench-site"), ("cluster", "bench-cluster"), ("repo", "bench-charts")):
+        yield [kind, "list"], name
+    for replicas, level in ((2, "info"), (3, "")):
+        text = 'deployment = "bench"\n[[service]]\nname = "one"\nservice = "detect"\ncluster = "bench-cluster"\n'
+        text += f"replicas = {replicas}\n" + (f'values = {{ variables = {{ LEVEL = "{level}" }} }}\n' if level else "")
+        text += '[[service]]\nname = "two"\nservice = "segment"\nkind = "machine"\nvim = "bench-site"\n'
+        path.write_text(text + f"replicas = {replicas}\n", encoding="utf-8")
+        yield ["plan", path], "one"
+        yield ["apply", path, "--wait"], "up to date"
+        yield ["plan", path], "nothing to do"
+    yield ["delete", path], "removed"
+    yield ["onboard", *packages], "onboarded"
+    for made, place in ((one, ("--cluster", "bench-cluster")), (two, ("--vim", "bench-site"))):
+        name, nsd = f"of-{made.function.name[-20:-5]}".lower().replace("_", "-"), made.service.descriptor.id
+        yield ["instantiate", name, nsd, *place, "--wait"], "runs"
+        yield ["instantiate", name, nsd, *place, "--wait"], "runs"
+        yield ["list"], nsd
+        yield ["scale", name, 3, "--wait"], "3 replicas"
+        yield ["heal", name, "--wait"], "healed"
+        yield ["terminate", name], "terminated"
+    yield ["delete", *packages], "deleted"
+    for kind, name in (("repo", "bench-charts"), ("cluster", "bench-cluster"), ("vim", "bench-site")):
+        yield [kind, "remove", name], "removed"
+
+
+def build_packages(service: str, kind: FunctionKind) -> Packages:
+    """Packages of a built-in service."""
+    return build(description.read(service), Environment.EDGE, kind)
+
+
+def _succeeds(words: list[object], expected: str, url: str) -> bool:
+    line = [sys.executable, "-m", "scan2sim.flows.cli", "orchestrate", *map(str, words), "--osm", url]
+    done = subprocess.run(line, capture_output=True, text=True)
+    well = done.returncode == 0 and expected in done.stdout
+    print(done.stdout if well else done.stdout + done.stderr, flush=True)
+    return well
+
+
+def odd(folder: Path) -> dict[str, Any]:
+    """Every kind of odd answer, on a server on which the services run."""
+    path, unexpected = services(folder), 0
+    osm_client.RETRY_DELAY_S, osm_client.MAX_ATTEMPTS, osm_client.MAX_RESPONSE_BYTES = 0.001, 2, 2**20
+    lifecycle.MAX_LOST_RESPONSES = 1
+    vars(onboarding)["MAX_LOST_RESPONSES"] = 1  # each kind of answer stays; no need to wait
+    new = '[[service]]\nname = "later"\nservice = "detect"\ncluster = "edge-cluster"\n'
+    with FakeOsm(OsmState(seconds=0.02)) as fake:
+        apply_file(fake, path)
+        running = odd_answers.stored(fake.state)
+    path.write_text(path.read_text("utf-8") + new, "utf-8")
+    for kind, answer in odd_answers.KINDS.items():
+        with FakeOsm(OsmState(seconds=0.02)) as fake, Osm(Connection(osm=fake.address)) as osm:
+            vars(fake.state).update(copy.deepcopy(running))
+            fake.state.answer = answer
+            messages = []
+            for name, call in odd_answers.calls(osm, path, "detect", "worker").items():
+                try:
+                    call()
+                except ScanError as error:
+                    messages.append(f"{name}: {error}")
+                except Exception as error:
+                    messages.append(f"{name}: UNEXPECTED {error!r}")
+        unexpected += any("UNEXPECTED" in message for message in messages)
+        print(f"{kind}: {messages[0] if messages else 'nothing'}", flush=True)
+    return {"odd_answers": len(odd_answers.KINDS), "odd_answers_unexpected": unexpected, "orphans": 0}
 
 
 def lifecycles(folder: Path) -> dict[str, Any]:
@@ -210,21 +311,24 @@ def hundred(folder: Path) -> dict[str, Any]:
 def main() -> None:
     """Run the parts and print their results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = ["lifecycles", "faults", "kills", "hundred"]
+    parts = ["operations", "odd", "lifecycles", "faults", "kills", "hundred"]
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
     parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--osm", default="", help="address of a server for `operations`; default: a fake")
     arguments = parser.parse_args()
-    os.environ["OSM_PASSWORD"] = "admin"
+    os.environ.setdefault("OSM_PASSWORD", "admin")
     result: dict[str, Any] = {"orphans": 0}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         made = {
+            "operations": lambda: operations(folder, arguments.osm),
+            "odd": lambda: odd(folder),
             "lifecycles": lambda: lifecycles(folder),
             "faults": lambda: faults(folder),
             "kills": lambda: kills(folder, arguments.kills),
             "hundred": lambda: hundred(folder),
         }
-        for part in arguments.parts:
+        for part in sorted(arguments.parts, key=lambda name: name == "odd"):  # last: it shortens waits for good
             found = made[part]()
             result |= found | {"orphans": result["orphans"] + found["orphans"]}
     print("RESULT", json.dumps(result))

@@ -8,7 +8,7 @@ builds each street's world with `scan2sim run`, including photos, and reads its 
   painted; `road_width_p95_m`: error of the width between the edges at each of these points.
 - `lane_edge_p95_m`: distance from points on markings and edges to the nearest true one.
 - `height_p95_m`: height error of all these points relative to the true ground.
-- `told`: share of the length of the street's lines (three markings, two kerbs) that was extracted.
+- `extracted`: share of the length of the street's lines (three markings, two kerbs) that was extracted.
 - `carla_lane_p95_m`, `carla_off_lane`: waypoints of `carla.Map` for the OpenDRIVE, a metre apart: distance from the
   centres of the true lanes, and share that is nearer to another lane; null without the package `carla`.
 - with `--tile METRES` each street is cut into tiles of this length and built as a survey, with the same metrics.
@@ -82,7 +82,7 @@ def line_errors(world: Path, layout: Layout) -> dict[str, F64]:
     kerbs = np.array([layout.kerb(1), -layout.kerb(-1)])
     s = np.arange(0.5, layout.axis.length, 1.0)
     found: dict[str, list[F64]] = {"centre": [], "lane_edge": [], "height": []}
-    told: dict[float, Bools] = {t: np.zeros(len(s), bool) for t in (*painted, *kerbs)}
+    extracted: dict[float, Bools] = {t: np.zeros(len(s), bool) for t in (*painted, *kerbs)}
     for kind, line in zip(kinds, lines, strict=True):
         found["height"].append(np.abs(line[:, 2]))
         if kind == "reference":
@@ -91,7 +91,7 @@ def line_errors(world: Path, layout: Layout) -> dict[str, F64]:
         true = painted if kind == "marking" else kerbs
         away = np.abs(line[:, 1:2] - true)
         found["lane_edge"].append(away.min(axis=1))
-        told[true[int(np.median(away.argmin(axis=1)))]] |= (s >= line[:, 0].min()) & (s <= line[:, 0].max())
+        extracted[true[int(np.median(away.argmin(axis=1)))]] |= (s >= line[:, 0].min()) & (s <= line[:, 0].max())
     errors = {name: np.concatenate([np.zeros(0), *values]) for name, values in found.items()}
     sides = [f["properties"].get("side") for f in features]
     left, right = (
@@ -100,7 +100,7 @@ def line_errors(world: Path, layout: Layout) -> dict[str, F64]:
     )
     width = np.abs(np.abs(left - right) - (layout.kerb(1) + layout.kerb(-1)))
     errors["width"] = width[np.isfinite(width)]
-    errors["told"] = np.concatenate(list(told.values())).astype(float)
+    errors["extracted"] = np.concatenate(list(extracted.values())).astype(float)
     return errors | carla_errors(next(world.glob("*.xodr")), layout)
 
 
@@ -150,7 +150,7 @@ def summary(errors: dict[str, F64]) -> dict[str, float | None]:
         f"{to}_p95_m": round(float(np.percentile(errors[name], 95)), 3) if len(errors.get(name, ())) else None
         for name, to in names.items()
     }
-    found["told"] = round(float(errors["told"].mean()), 3)
+    found["extracted"] = round(float(errors["extracted"].mean()), 3)
     found["carla_off_lane"] = float(errors["carla_off_lane"].sum()) if "carla_off_lane" in errors else None
     return found
 

@@ -1,10 +1,11 @@
-"""A survey of one kilometre in ten tiles: workers, rerun, borders, and Prefect's overhead.
+"""A survey of one kilometre in ten tiles: workers, rerun, borders, Prefect's overhead; and what a change costs.
 
-`python -m bench.survey [--out bench-out/survey] [--parts plain one two ray rerun photo] [--fine]`. The synthetic street
-is generated and cut once; every part runs the same survey into its own folder, each task on one core, so that two
-workers are two cores and one is one. Settings are coarser than the defaults (`COARSE_SETTINGS`), so that five runs of a
-kilometre take one hour instead of three (Prefect's share is larger then); `--fine` uses the defaults. Results of parts
-that aren't run are read from their last run. Ends with `RESULT {json}`.
+`python -m bench.survey [--out bench-out/survey] [--parts plain one two ray rerun photo tile plan] [--fine]`. The
+synthetic street is generated and cut once; every part runs the same survey into its own folder, each task on one core,
+so that two workers are two cores and one is one. Settings are coarser than the defaults (`COARSE_SETTINGS`), so that
+five runs of a kilometre take one hour instead of three (Prefect's share is larger then); `--fine` uses the defaults.
+Part `photo` has a street of its own, two tiles with 51 photos; `plan` plans a thousand tiles that don't exist. Results
+of parts that aren't run are read from their last run. Ends with `RESULT {json}`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ import json
 import os
 import shutil
 import sys
+import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +28,18 @@ from bench.measure import measure
 from bench.paths import ROOT
 from scan2sim.data_samples.photos import Effects
 from scan2sim.data_samples.street import generate
+from scan2sim.flows.commands import unchanged
+from scan2sim.flows.commands.survey import plan_survey
+from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.pipeline.core.cache import Digests, Store
+from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
 
-PARTS = ("plain", "one", "two", "ray", "rerun", "photo", "tile")
+PARTS = ("plain", "one", "two", "ray", "rerun", "photo", "tile", "plan")
+WITHOUT_STREET = ("photo", "plan")
 MIDDLE = "street_0004"
+PLANNED_TILES = 1000
 LENGTH, POINTS, PHOTOS, WIDTH, SEED = 1000.0, 1.0e7, 200, 800, 3
 RUNS = {  # part: options of `scan2sim survey`
     "plain": ("--runner", "processes", "--jobs", "1"),
@@ -54,7 +64,8 @@ def main() -> None:
     arguments = parser.parse_args()
     settings = () if arguments.fine else tuple(part for value in COARSE_SETTINGS for part in ("--set", value))
     out: Path = arguments.out
-    survey = street(out)
+    out.mkdir(parents=True, exist_ok=True)
+    survey = out / "tiles" if set(arguments.parts) <= set(WITHOUT_STREET) else street(out)
     notes = out / "notes.json"
     known: dict[str, dict[str, Any]] = json.loads(notes.read_text(encoding="utf-8")) if notes.is_file() else {}
     for part in (name for name in PARTS if name in arguments.parts):
@@ -63,7 +74,9 @@ def main() -> None:
         elif part == "rerun":
             known[part] = rerun(survey, out / "two", (*RUNS["two"], *settings))
         elif part == "photo":
-            known[part] = photo(survey, out, (*RUNS["two"], *settings))
+            known[part] = photo(out / "photo", settings)
+        elif part == "plan":
+            known[part] = plan_many(PLANNED_TILES)
         else:
             known[part] = one_tile(survey / MIDDLE, out / "tile")
         print(part, json.dumps(known[part]), flush=True)
@@ -112,10 +125,31 @@ def run_survey(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, A
 
 
 def rerun(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
-    """Run an unchanged survey again, and an empty flow."""
-    empty = measure([sys.executable, "-c", EMPTY_FLOW])
+    """Run an unchanged survey again: with the record of its last run, and without it, when all keys are compared."""
+    measure(command(survey, out, options))  # with the options of this part
     again = measure(command(survey, out, options))
-    return {"seconds": round(again.seconds, 1), "empty_flow_seconds": round(empty.seconds, 1)}
+    (out / unchanged.RECORD).unlink()
+    compared, empty = measure(command(survey, out, options)), measure([sys.executable, "-c", EMPTY_FLOW])
+    return {
+        "seconds": round(again.seconds, 2),
+        "compared_seconds": round(compared.seconds, 1),
+        "empty_flow_seconds": round(empty.seconds, 1),
+    }
+
+
+def plan_many(count: int) -> dict[str, Any]:
+    """Plan a survey of many tiles in a row, copies of the sample tile, none of which was run."""
+    first, names = read_tile(ROOT / "data_samples" / "tile"), [f"street_{i:04d}" for i in range(count)]
+    x, y, _ = first.frame.origin
+    seeds = [(x + 20.0 * i, y) for i in range(count)]
+    tiles = {}
+    for i, name in enumerate(names):
+        near = {names[k]: seeds[k] for k in (i - 1, i + 1) if 0 <= k < count}
+        tiles[name] = replace(first, name=name, cell=Cell(seeds[i], near))
+    with tempfile.TemporaryDirectory() as empty:
+        began = time.perf_counter()
+        planned = plan_survey(tiles, Store(Path(empty)), Settings(), Digests(Path(empty) / "digests.json"))
+        return {"seconds": round(time.perf_counter() - began, 1), "tasks": len(planned)}
 
 
 def one_tile(tile: Path, out: Path) -> dict[str, Any]:
@@ -155,34 +189,60 @@ def input_bytes(made: dict[str, Any], source: str) -> int:
     return sum(count for file, count in made[key]["sizes"].items() if file == path or file.startswith(f"{path}/"))
 
 
-def photo(survey: Path, out: Path, options: tuple[str, ...]) -> dict[str, Any]:
-    """Change one photo in the middle of the street and report which results change."""
-    photos = out / "street" / "photos"
-    changed = sorted(photos.glob("*.jpg"))[len(list(photos.glob("*.jpg"))) // 2]
-    affected = [
-        path.parent.name for path in survey.glob("*/tile.toml") if changed.name in path.read_text(encoding="utf-8")
-    ]
-    before, original, stat = contents(out / "two"), changed.read_bytes(), changed.stat()
-    try:
-        import cv2
+def photo(out: Path, options: tuple[str, ...]) -> dict[str, Any]:
+    """Change one of 51 photos of a survey of two tiles, and report what that costs beside the whole survey.
 
-        picture = cv2.imread(str(changed))
-        picture[: picture.shape[0] // 3] //= 2
-        cv2.imwrite(str(changed), picture)
-        ran = measure(command(survey, out / "two", options))
-        after = contents(out / "two")
+    Once a patch gets a little brighter (another exposure, a new JPEG encoder), once the photo shows something else.
+    """
+    corridor, survey, made = out / "street", out / "tiles", out / "made"
+    if not (survey / "survey.toml").is_file():
+        generate(
+            corridor, length=52.0, points=1.5e6, photos=51, seed=SEED, photo_width=WIDTH, truth_density=20.0,
+            effects=Effects(quality=90),
+        )  # fmt: skip
+        cut_survey(corridor, survey, CutParams.model_validate({"length": 26.0, "buffer": 5.0}))
+    run = command(survey, made, options)
+    shutil.rmtree(made, ignore_errors=True)
+    whole = measure(run).seconds
+    found: dict[str, Any] = {"whole_seconds": round(whole, 1)}
+    photos = sorted((corridor / "photos").glob("*.jpg"))
+    changed, other = photos[len(photos) // 2], photos[len(photos) // 2 + 4]
+    original, stat = changed.read_bytes(), changed.stat()
+    try:
+        for name, picture in {"brighter": _brighter(changed), "other": other.read_bytes()}.items():
+            changed.write_bytes(picture)
+            before = _results(made)
+            seconds = measure(run).seconds
+            after = _results(made)
+            found[f"{name}_seconds"], found[f"{name}_share"] = round(seconds, 1), round(seconds / whole, 3)
+            found[f"{name}_ran"] = sorted(task for task, one in after.items() if one[0] != before.get(task, ("",))[0])
+            found[f"{name}_changed"] = sum(before.get(task, ("", ""))[1] != one[1] for task, one in after.items())
+        found["results"] = len(after)
     finally:
         changed.write_bytes(original)
         os.utime(changed, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-    changed_results = sorted({node for node, content in after.items() if before.get(node) != content})
-    made = json.loads((out / "two" / "survey.json").read_text(encoding="utf-8"))["tiles"]
-    return {
-        "seconds": round(ran.seconds, 1),
-        "tiles_that_see_it": sorted(affected),
-        "tiles_made": sorted(name for name, tile in made.items() if tile["state"] == "done"),
-        "results_changed": len(changed_results),
-        "results": len(after),
-    }
+    return found
+
+
+def _brighter(path: Path) -> bytes:
+    """The photo as JPEG, with a patch of a tenth of its width brighter by two grey levels."""
+    import cv2
+
+    picture = cv2.imread(str(path))
+    size = picture.shape[1] // 10
+    patch = picture[-2 * size : -size, :size]
+    patch[...] = np.minimum(patch.astype(int) + 2, 255)
+    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 95])[1])
+
+
+def _results(out: Path) -> dict[str, tuple[str, str]]:
+    """When each result was computed (its files' inodes: a reused one keeps them), and its content, by tile and step."""
+    found = {}
+    for path in (out / "steps").glob("*/*/*/manifest.json"):
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        inodes = sorted((path.parent / name).stat().st_ino for name in manifest["sizes"])
+        found[manifest["label"]] = (json.dumps(inodes), manifest["content"])
+    return found
 
 
 def contents(out: Path) -> dict[str, str]:
@@ -216,7 +276,12 @@ def report(known: dict[str, dict[str, Any]], out: Path) -> None:
         result["speedup_ray"] = round(known["one"]["seconds"] / known["ray"]["seconds"], 2)
         result["same_bytes_ray"] = known["one"]["contents"] == known["ray"]["contents"]
     if "rerun" in known:
-        result["rerun_seconds"] = round(known["rerun"]["seconds"] - known["rerun"]["empty_flow_seconds"], 1)
+        result["rerun_seconds"] = known["rerun"]["seconds"]
+    if "photo" in known:
+        result["photo_changed_share"] = known["photo"]["other_share"]
+        result["photo_brighter_share"] = known["photo"]["brighter_share"]
+    if "plan" in known:
+        result["plan_1000_seconds"] = known["plan"]["seconds"]
     for part in RUNS:
         if part in known:
             result |= borders(out / part)

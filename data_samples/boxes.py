@@ -51,7 +51,7 @@ def place(out: Path, seed: int) -> list[str]:
             {"class": s.actor.label, "box": list(s.box), "visible": s.visible}
             for s in frame.visible if s.pixels >= VISIBLE_PIXELS_MIN
         ]  # fmt: skip
-        lines.append(json.dumps({"image": name, "things": labels}) + "\n")
+        lines.append(json.dumps({"image": name, "objects": labels}) + "\n")
     return lines
 
 

@@ -181,7 +181,7 @@ def film(out: Path, views: int = 10, frames: int = 1000, seed: int = 0, report: 
                     report((number + index / frames) / views, f"view {number}, frame {index}")
                     frame = current.frame(index)
                     line = {"view": number, "frame": index, "time": index / FPS, "light": current.light}
-                    file.write(json.dumps({**line, "things": labels(frame)}) + "\n")
+                    file.write(json.dumps({**line, "objects": labels(frame)}) + "\n")
                     yield frame.rgb
 
             encode(images(), out / f"view_{number:02d}.mp4", FPS, BITRATE_BPS, FRAME_SIZE_PX)

@@ -156,7 +156,7 @@ class Traffic:
         return self._count
 
     def _timetable(self, y: float) -> list[Train]:
-        """Trains of the track at `y`, in order: some pass, some stop; the first may stand there from the start."""
+        """Trains of the track at `y`, in order: some pass, some stop; the first may be stopped from the start."""
         rng, trains, free = self._rng, [], float(self._rng.uniform(0, self._density.trains))
         first = True
         while free < self.times[-1]:
@@ -278,7 +278,7 @@ def _train_motion(times: F64, start: float, cruise: float, kind: str, length: fl
         times: (T,) seconds.
         start: time when it appears.
         cruise: speed, m/s.
-        kind: "pass", "stop" (stops for a while) or "start" (stands there at first).
+        kind: "pass", "stop" (stops for a while) or "start" (stopped at first).
         length: metres.
         rng: random numbers.
     """

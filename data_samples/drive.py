@@ -22,7 +22,9 @@ from scan2sim.data_samples.traffic import Traffic
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F64, U8, Trajectory
+from scan2sim.pipeline.io.images.image import read_rgb
 from scan2sim.pipeline.io.images.video import Encoder
+from scan2sim.pipeline.io.trajectory import atomic_write
 
 EXPOSURE_SAMPLES = 6
 """Number of renderings that are averaged for motion blur."""
@@ -67,6 +69,7 @@ def generate_drive(
     samples: int = 3,
     lossless: bool = False,
     overwrite: bool = False,
+    resume: bool = False,
     report: Report = silent,
 ) -> Path:
     """Render a drive into the folder `out`, and return it.
@@ -93,6 +96,7 @@ def generate_drive(
         samples: rays per pixel at edges, see `panorama.Panorama`.
         lossless: also write the frames as `frames/000000.png` and so on.
         overwrite: replace an existing video.
+        resume: with `lossless`: keep the frames that an interrupted call with the same arguments wrote.
         report: receives progress.
 
     Raises:
@@ -127,19 +131,36 @@ def generate_drive(
         out / "gps.csv", table, ["%.3f", "%.8f", "%.8f", "%.3f"], delimiter=",",
         header="time,latitude,longitude,altitude", comments="",
     )  # fmt: skip
-    frames = _frames(camera, trajectory, conditions, report)
-    if lossless:
-        (out / "frames").mkdir(exist_ok=True)
-        frames = _saved(frames, out / "frames")
+    frames = _frames(camera, trajectory, conditions, report, out / "frames" if lossless else None, resume)
     encode(frames, out / "video.mp4", fps, bitrate, (2 * height, height))
     report(1.0, "done")
     return out
 
 
-def _frames(camera: Panorama, trajectory: Trajectory, conditions: DriveConditions, report: Report) -> Iterator[U8]:
+def _frames(
+    camera: Panorama,
+    trajectory: Trajectory,
+    conditions: DriveConditions,
+    report: Report,
+    saved: Path | None,
+    resume: bool,
+) -> Iterator[U8]:
+    """Frames (H, W, 3), written to the folder `saved`; with `resume`, those that are there already are read."""
+    import cv2
+
+    if saved:
+        saved.mkdir(exist_ok=True)
     for i in range(len(trajectory)):
         report(i / len(trajectory), f"frame {i + 1} of {len(trajectory)}")
-        yield render_exposed_frame(camera, trajectory, i, conditions)
+        file = saved / f"{i:06d}.png" if saved else None
+        if file and resume and file.is_file():
+            yield read_rgb(file)
+            continue
+        frame = render_exposed_frame(camera, trajectory, i, conditions)
+        if file:
+            with atomic_write(file) as fresh:
+                fresh.write_bytes(cv2.imencode(".png", frame[..., ::-1])[1].tobytes())
+        yield frame
 
 
 def render_exposed_frame(camera: Panorama, trajectory: Trajectory, i: int, conditions: DriveConditions) -> U8:
@@ -149,14 +170,6 @@ def render_exposed_frame(camera: Panorama, trajectory: Trajectory, i: int, condi
     poses = [row_poses(trajectory, moment, camera.height, conditions.rolling_shutter) for moment in moments]
     seen = [camera.render(rows, float(moment)).rgb for rows, moment in zip(poses, moments, strict=True)]
     return seen[0] if count == 1 else to_srgb(np.mean([linear_light(rgb) for rgb in seen], axis=0, dtype=np.float32))
-
-
-def _saved(frames: Iterable[U8], folder: Path) -> Iterator[U8]:
-    import cv2
-
-    for i, frame in enumerate(frames):
-        cv2.imwrite(str(folder / f"{i:06d}.png"), frame[..., ::-1])
-        yield frame
 
 
 def row_poses(trajectory: Trajectory, time: float, height: int, readout: float) -> F64:
@@ -240,6 +253,9 @@ def main() -> None:
     parser.add_argument("--no-traffic", dest="traffic", action="store_false", help="no other vehicles on the road")
     parser.add_argument("--lossless", action="store_true", help="also write the frames as PNG")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing video")
+    parser.add_argument(
+        "--resume", action="store_true", help="keep the PNGs that an interrupted run with the same options wrote"
+    )
     a = parser.parse_args()
     synthetic_paths: dict[str, Callable[[], F64]] = {
         "town": lambda: paths.town_path(a.seed, a.length or 600.0), "loop": paths.loop_path,
@@ -255,7 +271,8 @@ def main() -> None:
         a.out, path, seconds=a.seconds, length=a.length, speed=a.speed, fps=a.fps, height=a.height,
         bitrate=a.bitrate * 1e6, seed=a.seed, conditions=conditions, bus=tuple(a.bus) if a.bus else None,
         gps_rate=a.gps_rate, gps_gaps=[tuple(g) for g in a.gps_gap], gps_jumps=[tuple(j) for j in a.gps_jump],
-        traffic=a.traffic, samples=a.samples, lossless=a.lossless, overwrite=a.overwrite, report=report,
+        traffic=a.traffic, samples=a.samples, lossless=a.lossless, overwrite=a.overwrite,
+        resume=a.resume, report=report,
     )  # fmt: skip
     print()
 

@@ -61,10 +61,16 @@ def town_path(seed: int, length: float) -> F64:
     return path[chainage(path) <= length]
 
 
-def zigzag_path(length: float, block: float = 55.0) -> F64:
-    """(N, 2) path with a sharp right angle every `block` metres, alternately right and left, metres."""
+def zigzag_path(length: float, block: float = 55.0, rounded: float = 4.0) -> F64:
+    """(N, 2) path with a right angle every `block` metres, alternately right and left, metres.
+
+    Args:
+        length: of the path, metres.
+        block: metres between two corners.
+        rounded: standard deviation of the Gaussian that smooths the corners, metres; 4: sharp.
+    """
     corners = block * np.array([((k + 1) // 2, k // 2) for k in range(int(length / block) + 3)], float)
-    path = _rounded(corners, 4.0)
+    path = _rounded(corners, rounded)
     return path[chainage(path) <= length]
 
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scan2sim.data_samples.layout import FRAME, Layout
 from scan2sim.data_samples.paints import Material
 from scan2sim.data_samples.scene import TRUTH_FOOTPRINT_M, CarPoses, Scene, srgb
+from scan2sim.data_samples.shapes import Part
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F32, F64, I32, Bools, PointCloud, Trajectory
@@ -76,11 +77,17 @@ class Drive:
         return index, np.clip(since - index * (self.duration + PASS_BREAK_S), 0, self.duration) * SPEED_M_S
 
     def car(self, scene: Scene, time: F64) -> CarPoses:
-        """Pose of the moving car at `time` (N,): it approaches the vehicle in the other lane, once per pass."""
-        index, along = self._where(time)
-        way = np.where(index % 2 == 0, -1.0, 1.0)
-        position, heading, inside = scene.car_at(along / SPEED_M_S - self.duration / 2 - 0.15, way=way)
+        """Poses of all that moves at `time` (N,): a car approaches the vehicle in the other lane, once per pass."""
+        position, heading, inside = (np.stack(values, axis=1) for values in zip(*self.movers(scene, time), strict=True))
         return CarPoses(position.astype(np.float32), heading.astype(np.float32), inside)
+
+    def movers(self, scene: Scene, time: F64) -> list[tuple[F64, F64, Bools]]:
+        """Position (N, 3), heading (N,) and presence (N,) of the oncoming car and of each road user."""
+        index, along = self._where(time)
+        way = np.where(index % 2 == 0, 1.0, -1.0)
+        since = along / SPEED_M_S
+        oncoming = scene.car_at(since - self.duration / 2 - 0.15, way=-way)
+        return [oncoming, *(user.pose(self.layout, since, way) for user in scene.road_users)]
 
     def trajectory(self, step: float = 0.05) -> Trajectory:
         """Trajectory of the scanner during the passes; `step`: seconds between poses."""
@@ -189,11 +196,16 @@ def _returns(
 def _intensity(scene: Scene, face: I32, directions: F32, distance: F32) -> npt.NDArray[np.uint16]:
     """(N,) intensity: near-infrared reflectivity times incidence, partly corrected for range."""
     p = scene.surface
-    reflectivity = 0.15 + 0.75 * p.colour.mean(axis=1)
-    for material, value in REFLECTIVITY.items():
-        reflectivity[p.material == material] = value
     c = p.vertices[p.faces[face]]
     normal = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
     facing = np.abs(np.einsum("ij,ij->i", normal, directions)) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
-    value = reflectivity[face] * (0.25 + 0.75 * facing) * np.clip(18 / (distance + 8), 0, 1)
+    value = reflectivity(p)[face] * (0.25 + 0.75 * facing) * np.clip(18 / (distance + 8), 0, 1)
     return (np.clip(value, 0, 1) * 40_000).astype(np.uint16)
+
+
+def reflectivity(surface: Part) -> F32:
+    """(F,) near-infrared reflectivity of faces, 0 to 1."""
+    value = 0.15 + 0.75 * surface.colour.mean(axis=1)
+    for material, one in REFLECTIVITY.items():
+        value[surface.material == material] = one
+    return value.astype(np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy.typing as npt
 from scan2sim.data_samples import objects, paints, signs
 from scan2sim.data_samples.layout import FRAME, HALF_WIDTH, Layout
 from scan2sim.data_samples.paints import Material, Paint, linear
+from scan2sim.data_samples.road_users import RoadUser
 from scan2sim.data_samples.shapes import Part, join, sheet
 from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools, Mesh
 
@@ -139,7 +141,7 @@ class Hits:
         distance: (N,) float32 metres, infinite if nothing was hit.
         face: (N,) int32 index into `Scene.surface`, -1 if nothing was hit.
         bary: (N, 2) float32 barycentric weights of the face's second and third corner.
-        heading: (N,) float32 heading of the moving car if it was hit, radians; 0 for static surfaces.
+        heading: (N,) float32 heading of the road user that was hit, radians; 0 for static surfaces.
     """
 
     distance: F32
@@ -158,21 +160,24 @@ class Scene:
 
     Attributes:
         layout: the street.
-        surface: static street, then parked cars, then the moving car in its own coordinates.
+        road_users: those that move, besides the oncoming car.
+        surface: static street, then parked cars, then the moving car and road users in their own coordinates.
         static: number of faces of the static street.
     """
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: Layout, road_users: Sequence[RoadUser] = ()) -> None:
         self.layout = layout
-        static, parked, moving = build(layout)
+        self.road_users = tuple(road_users)
+        static, parked, car = build(layout)
         self.static = len(static.faces)
-        self._moving_at = self.static + len(parked.faces)
         both = join([static, parked])
+        movers = [car, *(user.mesh for user in road_users)]
+        self._first_face = np.cumsum([self.static + len(parked.faces), *(len(mesh.faces) for mesh in movers)])
         self._street = caster(both)
-        self._car = caster(moving)
+        self._movers = [caster(mesh) for mesh in movers]
         self._sign_images = signs.images()
-        car_sky = np.clip(0.55 + 0.4 * moving.normals[:, 2], 0, 1).astype(np.float32)
-        self.surface = join([replace(both, sky=self._openness(both)), replace(moving, sky=car_sky)])
+        lit = [replace(m, sky=np.clip(0.55 + 0.4 * m.normals[:, 2], 0, 1).astype(np.float32)) for m in movers]
+        self.surface = join([replace(both, sky=self._openness(both)), *lit])
 
     def truth_mesh(self) -> Mesh:
         """Labelled mesh of the static street, without vehicles."""
@@ -200,24 +205,26 @@ class Scene:
         return np.concatenate([xy, z[..., None]], axis=-1), heading + np.where(np.asarray(way) > 0, 0.0, np.pi), inside
 
     def cast(self, origins: F32, directions: F32, car: CarPoses | None = None) -> Hits:
-        """First hits of rays with origins (N, 3) and unit directions (N, 3); `car`: pose of the moving car per ray."""
+        """First hits of rays with origins (N, 3) and unit directions (N, 3); `car`: poses of all that moves per ray."""
         rays = np.concatenate([origins, directions], axis=1)
         answer = cast_rays(self._street, rays)
         heading = np.zeros(len(rays), np.float32)
-        if car is not None:
-            index, own = self._to_car(rays, car)
+        for k, mover in enumerate(self._movers if car is not None else []):
+            assert car is not None
+            pose = car.of(k)
+            index, own = self._to_mover(rays, pose)
             if len(index):
-                near = cast_rays(self._car, own)
+                near = cast_rays(mover, own)
                 closer = near.distance < answer.distance[index]
                 at = index[closer]
                 answer.distance[at] = near.distance[closer]
-                answer.face[at] = near.face[closer] + self._moving_at
+                answer.face[at] = near.face[closer] + self._first_face[k]
                 answer.bary[at] = near.bary[closer]
-                heading[at] = car.heading[at]
+                heading[at] = pose.heading[at]
         return replace(answer, heading=heading)
 
-    def _to_car(self, rays: F32, car: CarPoses) -> tuple[npt.NDArray[np.intp], F32]:
-        """Rays that may hit the moving car: their indices, and the rays (M, 6) in the car's coordinates."""
+    def _to_mover(self, rays: F32, car: CarPoses) -> tuple[npt.NDArray[np.intp], F32]:
+        """Rays that may hit what moves at one pose per ray: their indices, and the rays (M, 6) in its coordinates."""
         if not car.present.any():
             return np.zeros(0, np.intp), np.zeros((0, 6), np.float32)
         middle = car.position + np.array([0, 0, 0.7], np.float32)
@@ -246,7 +253,7 @@ class Scene:
             origins, directions: (N, 3) rays.
             hits: their hits.
             footprint: (N,) or scalar width of the pixel at the hit, metres.
-            car: the moving car, for its shadow; None: without its shadow.
+            car: poses of all that moves, for its shadows; None: without them.
         """
         light = np.zeros((len(directions), 3), np.float32)
         at = np.flatnonzero(hits.hit)
@@ -279,8 +286,9 @@ class Scene:
         rays[:, 3:] = sun
         shaded = occluded(self._street, rays)
         if car is not None:
-            index, own = self._to_car(rays, car.take(lit))
-            shaded[index] |= occluded(self._car, own)
+            for k, mover in enumerate(self._movers):
+                index, own = self._to_mover(rays, car.of(k).take(lit))
+                shaded[index] |= occluded(mover, own)
         facing[lit[shaded]] = 0
         return reflected_light(albedo, normal, sky, facing, self.layout.sun_strength, self.layout.sky_strength)
 
@@ -303,7 +311,13 @@ class Scene:
 
 @dataclass(frozen=True)
 class CarPoses:
-    """Pose of the moving car for each of N rays: position (N, 3) float32, heading (N,), presence (N,)."""
+    """Poses of K moving road users, the oncoming car first, for each of N rays.
+
+    Attributes:
+        position: (N, K, 3) float32.
+        heading: (N, K) float32, radians.
+        present: (N, K) whether it is in the street.
+    """
 
     position: F32
     heading: F32
@@ -314,12 +328,16 @@ class CarPoses:
         index = np.repeat(np.arange(len(self.heading)), times)
         return self.take(index)
 
+    def of(self, k: int) -> CarPoses:
+        """Poses (N, ...) of one road user."""
+        return CarPoses(self.position[:, k], self.heading[:, k], self.present[:, k])
+
     def take(self, index: npt.NDArray[Any]) -> CarPoses:
         """Poses of selected rays."""
         return CarPoses(self.position[index], self.heading[index], self.present[index])
 
 
-def caster(part: Part) -> Any:
+def caster(part: Part | Mesh) -> Any:
     """Open3D ray casting scene of a mesh."""
     import open3d as o3d
 

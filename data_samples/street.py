@@ -6,16 +6,22 @@ from pathlib import Path
 
 import numpy as np
 
+from scan2sim.data_samples import objects
 from scan2sim.data_samples.layout import FRAME, Layout, Style, lay_out
 from scan2sim.data_samples.photos import Effects, Shot, cameras, develop, plan_shots, render
+from scan2sim.data_samples.road_users import road_users
 from scan2sim.data_samples.scanner import Drive, plan_drive, scan
 from scan2sim.data_samples.scene import TRUTH_FOOTPRINT_M, Scene, srgb
+from scan2sim.data_samples.shapes import Part
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F64, Mesh, PointCloud, Trajectory
+from scan2sim.pipeline.tracking.tracks import Category, Track, write_tracks
 
 LENGTH_MIN_M = 8.0
+TRUTH_INTERVAL_S = 0.05
+"""Interval of the poses of true tracks."""
 
 
 def generate(
@@ -31,6 +37,7 @@ def generate(
     cloud_scale: float = 0.001,
     style: Style | None = None,
     effects: Effects | None = None,
+    traffic: bool = False,
     name: str = "street",
     report: Report = silent,
 ) -> Path:
@@ -49,6 +56,8 @@ def generate(
         cloud_scale: resolution of the LAZ coordinates, metres.
         style: ranges of the street's random parameters; the default is a European town.
         effects: camera effects: exposure changes, noise, vignetting, JPEG quality.
+        traffic: besides the oncoming car, there are a car ahead, a cyclist and a pedestrian; their paths, and the
+            parked cars, are written to `truth/tracks.json`.
         name: name of the tile.
         report: receives progress.
 
@@ -71,7 +80,7 @@ def generate(
     (out / "truth").mkdir(exist_ok=True)
     report(0.0, "building the street")
     layout = lay_out(length, seed, style)
-    scene = Scene(layout)
+    scene = Scene(layout, road_users(layout) if traffic else ())
     drive = plan_drive(layout, points)
 
     cloud = scan(scene, drive, points, lambda f, m="": report(0.05 + 0.25 * f, m))
@@ -85,6 +94,8 @@ def generate(
     )
     report(0.95, "writing the truth")
     _write_truth(out / "truth", scene, truth_density, cloud_scale)
+    if traffic:
+        write_tracks(out / "truth" / "tracks.json", true_tracks(scene, drive), FRAME)
     path = write_tile(
         out,
         name=name,
@@ -98,6 +109,34 @@ def generate(
     read_tile(path)  # validates the written tile
     report(1.0, "done")
     return path
+
+
+def true_tracks(scene: Scene, drive: Drive) -> list[Track]:
+    """True tracks: of each moving road user in each pass, and of the parked cars."""
+    layout = scene.layout
+    car: tuple[Category, tuple[float, float, float]] = "car", _size(objects.car(layout.moving))
+    kinds = [car, *((user.category, user.size) for user in scene.road_users)]
+    tracks: list[Track] = []
+    for i in range(drive.passes):
+        times = drive.start(i) + np.arange(0, drive.duration, TRUTH_INTERVAL_S)
+        for (category, size), (position, heading, inside) in zip(kinds, drive.movers(scene, times), strict=True):
+            if inside.sum() > 1:
+                poses = np.column_stack([position, heading])[inside]
+                tracks.append(
+                    Track(len(tracks), category, size, times[inside], poses, np.zeros((len(poses), 2)), True, None)
+                )
+    for parked in layout.parked:
+        xy, heading = layout.axis.place(parked.s, parked.t)
+        yaw = float(heading) + (0.0 if parked.towards == 1 else np.pi)
+        pose = np.array([[*xy, float(layout.height(parked.s, parked.t)), yaw]])
+        start = np.array([drive.start(0)])
+        tracks.append(Track(len(tracks), *car, start, pose, np.zeros((1, 2)), False, None))
+    return tracks
+
+
+def _size(mesh: Part) -> tuple[float, float, float]:
+    length, width, height = (float(value) for value in np.ptp(mesh.vertices, axis=0))
+    return length, width, height
 
 
 def _write_trajectory(path: Path, trajectory: Trajectory) -> None:

@@ -13,10 +13,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from scan2sim.flows.pipelines.assembled import import_clouds
+from scan2sim.flows.pipelines.kitti import import_kitti_odometry, import_kitti_raw
 from scan2sim.pipeline.core.errors import InputError, ScanError
-from scan2sim.pipeline.importers.clouds_and_photos import import_las as import_clouds
-from scan2sim.pipeline.importers.kitti_odometry import import_kitti_odometry
-from scan2sim.pipeline.importers.kitti_raw import import_kitti_raw
 from scan2sim.pipeline.importers.photogrammetry import import_model as import_photogrammetry
 
 if TYPE_CHECKING:
@@ -87,11 +86,12 @@ def run(
     """Make the world of a tile; steps that an earlier run into the same folder has finished are not computed again.
 
     Args:
-        tile: a `tile.toml`, or its folder.
+        tile: a `tile.toml`, or its folder; or a robot's map (a cloud, or a folder of clouds).
         out: folder for the world, the report and cached results; created if it does not exist.
         settings: `{"decimate": {"target": 50000}}` or `{"decimate.building.target": 50000}`; all of them are in
             docs/reference/settings.md.
-        hold_out: keep every Nth photo out of texturing, to measure quality against it; 0: none.
+        hold_out: keep every Nth photo out of texturing, and every Nth sweep of a lidar out of the cloud, to measure
+            quality against them; 0: none.
         jobs: steps that run at the same time; 0: by the number of cores.
         progress: show progress and results on the terminal.
 
@@ -102,10 +102,14 @@ def run(
         IncompleteError: the world is finished, side products (roads, pictures, ...) failed.
         ScanError: bad input or a failed step, with cause and remedy; results of earlier runs stay.
     """
+    from scan2sim.flows.commands.robot_map import is_map, tile_of_map
     from scan2sim.flows.commands.run import run_tile
+    from scan2sim.pipeline.importers.robot_map import MapParams
 
     with _shown(progress):
-        run_tile(Path(tile), Path(out), _settings(settings, hold_out), jobs=jobs)
+        path = Path(tile)
+        path = tile_of_map(path, Path(out), MapParams()) if is_map(path) else path
+        run_tile(path, Path(out), _settings(settings, hold_out), jobs=jobs)
     return read_world(out)
 
 
@@ -161,7 +165,8 @@ def read_world(folder: str | Path) -> World:
 def _settings(values: Mapping[str, Any] | None, hold_out: int) -> Settings:
     from scan2sim.flows.pipelines.settings import Settings
 
-    return Settings.of({**(values or {}), **({"views.hold_out": hold_out} if hold_out else {})})
+    held_out = {f"{step}.hold_out": hold_out for step in ("views", "sweeps")} if hold_out else {}
+    return Settings.of({**(values or {}), **held_out})
 
 
 @contextmanager

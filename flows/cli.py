@@ -7,6 +7,7 @@ import io
 import os
 import re
 import sys
+import time
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,21 +15,34 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from scan2sim import __version__
-from scan2sim.pipeline.core.errors import INTERRUPTED, IncompleteError, ScanError, exit_code, from_os_error
+from scan2sim.flows.commands import unchanged
+from scan2sim.flows.pipelines.renamed import OPTIONS
+from scan2sim.pipeline.core.errors import (
+    INTERRUPTED,
+    IncompleteError,
+    ScanError,
+    SettingError,
+    exit_code,
+    from_os_error,
+)
 
 PAGES = Path(__file__).parents[1] / "docs"
 """Folder of the pages that help and errors name as docs/NAME.md; part of the wheel."""
 COMMANDS = {
-    "run": ("run", "Build the world of a tile; steps that an earlier run has finished are not repeated."),
+    "run": (
+        "run",
+        "Build the world of a tile, or of a robot's map; steps that an earlier run has finished are not repeated.",
+    ),
     "plan": (
         "plan",
-        "List the steps that `run` would execute, and why (for a drive.toml: `survey`, before its tiles).",
+        "List the steps that `run` or `survey` with the same options would execute, why, and about how long they take.",
     ),
     "export": ("export", "Convert a finished world to other formats, for other simulators."),
     "view": ("view", "Open a finished world in the browser, or render a flight through it as a video."),
     "verify": ("verify", "Check all results against their checksums; the next run rebuilds the damaged ones."),
-    "inspect": ("inspect", "Show a summary of a point cloud, a tile, a mesh or a world."),
-    "import": ("imports", "Import recordings: create a tile from point clouds, photos, sweeps or data sets."),
+    "inspect": ("inspect", "Show a summary of a point cloud, a tile, a mesh, a world or a ROS bag."),
+    "scenario": ("scenario", "List and vary the recorded traffic of a finished world."),
+    "import": ("imports", "Import recordings: create a tile from point clouds, photos, sweeps, ROS bags or data sets."),
     "sample": ("sample", "Generate a synthetic street recording with ground truth, to try the program."),
     "segment": ("segment", "Classify the points and photos of a tile: `segment TILE --out DIR`."),
     "slam": ("slam", "Estimate the trajectory of a video's camera (visual SLAM): `slam VIDEO --out DIR`."),
@@ -39,13 +53,13 @@ COMMANDS = {
     ),
     "monitor": ("monitor", "Monitor ROS 2 topics and publish their statistics; alarms, archive, autoscaling."),
     "toolbox": ("toolbox", "Run ML toolboxes on images: detection, movement, classification, segmentation."),
-    "qos": ("qos", "Quality of service of the toolboxes: requirements, measurement, choice of the image encoding."),
+    "qos": ("qos", "Quality of service: requirements, measurement, choice of the image encoding."),
     "orchestrate": ("orchestrate", "Deploy services on edge and cloud through Open Source MANO (OSM)."),
     "teleop": ("teleop", "Drive vehicles remotely, over several network links at once."),
 }
 """Command name: its module in `flows.commands`, which has an `app`, and its help; in the order of `PANELS`."""
 PANELS = {
-    "Worlds": ("run", "plan", "export", "view", "verify", "inspect"),
+    "Worlds": ("run", "plan", "export", "view", "verify", "inspect", "scenario"),
     "Recordings": ("import", "sample", "segment", "slam"),
     "Surveys": ("tile", "survey"),
     "Services": ("monitor", "toolbox", "qos", "orchestrate", "teleop"),
@@ -71,6 +85,15 @@ class _LazyGroup(TyperGroup):
             return None
         panel = next(name for name, commands in PANELS.items() if cmd_name in commands)
         return _LazyCommand(cmd_name, help=COMMANDS[cmd_name][1], rich_help_panel=panel)
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except Exception as error:  # typer doesn't export NoSuchOption
+            option = getattr(error, "option_name", "")
+            if new := OPTIONS.get(ctx.invoked_subcommand, {}).get(option):
+                raise SettingError(option, "this option was renamed", f"Write `{new}`") from None
+            raise
 
 
 def loaded(name: str) -> Any:
@@ -124,7 +147,7 @@ def _run_survey_with_prefect(*arguments: Any) -> None:
 
 
 def replace_unencodable_characters() -> None:
-    """Print `?` for characters that the terminal's encoding (such as Latin-1) lacks, instead of failing."""
+    """Print `?` for characters that the terminal's encoding (such as Latin-1) doesn't have, instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -136,8 +159,14 @@ def main() -> None:
         "PYTHONSAFEPATH", "1"
     )  # or a random.py in the current folder would shadow the standard library in subprocesses
     replace_unencodable_characters()
+    unchanged.arguments = sys.argv[1:]
     try:
-        app()
+        began = time.perf_counter()
+        lines = unchanged.unchanged(sys.argv[1:])
+        if lines is None:
+            app()
+        else:
+            typer.echo("\n".join([*lines[:-1], f"{lines[-1]} ({time.perf_counter() - began:.1f} s)"]))
     except SystemExit as ended:
         if ended.code == exit_code(KeyboardInterrupt()):  # typer's exit code for Ctrl-C
             typer.echo(INTERRUPTED, err=True)
@@ -157,6 +186,8 @@ def main() -> None:
             typer.secho(f"error: unexpected {type(error).__name__}: {error}", fg="red", err=True)
             typer.echo(f"  The details are in {log_unexpected(error)}; please report them.", err=True)
         sys.exit(exit_code(error))
+    finally:
+        unchanged.arguments = None
 
 
 if __name__ == "__main__":

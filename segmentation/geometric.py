@@ -8,10 +8,12 @@ buildings, thin upright lines are poles, compact smooth components of a car's si
 rough components are vegetation.
 
 Points above ground are classified as centroids of voxels, and the classes are transferred back to the points.
+The lengths are those of dense clouds; given the point spacing of a sparse or noisy map, they are scaled (`Scale`).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,6 +47,44 @@ VEGETATION_MIN_VARIATION = 0.03
 VOTING_ROUNDS = 3
 
 
+# sparse and noisy maps
+SPARSE_CELL_SPACINGS = 2.0  # ground cell
+SPARSE_TOLERANCE_SPACINGS = 1.1  # points at the centres of voxels are up to one spacing above the ground's lowest ones
+THICKNESS_CELL_MIN_POINTS = 3
+THICKNESS_OPEN_MAX_M = 1.2  # columns without higher points show the ground alone
+THICKNESS_MAX_M = 0.45  # thicker columns are walls: the ground is missing
+TOLERANCE_THICKNESSES = 1.8
+NOISE_OF_THICKNESS = 0.4  # standard deviation of ground heights over their 90 % range
+VOXEL_NOISES = 4.0  # a neighbourhood is about five voxels wide
+SPARSE_MIN_POINTS = 8
+SPARSE_MAX_CURVED = 0.04  # smallest eigenvalue over the sum of a built surface's points; half a tree crown is above
+GRID_MAX_SPREAD = 0.02  # interquartile range of the distances to the nearest point, over their median, on a grid
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Lengths in metres, and limits, that depend on spacing and noise; the defaults are for dense clouds.
+
+    Attributes:
+        voxel: voxel size above ground.
+        cell: raster of the ground.
+        tolerance: minimum distance of ground points from the ground surface, where that is level.
+        min_points: number of points from which a component has a shape.
+        variation: surface variation that noise adds on a plane.
+    """
+
+    voxel: float = 0.2
+    cell: float = GROUND_CELL_M
+    tolerance: float = GROUND_TOLERANCE_M
+    min_points: int = MIN_POINTS
+    variation: float = 0.0
+
+    @property
+    def gap(self) -> float:
+        """Factor of gaps and widths of thin objects."""
+        return max(1.0, self.voxel / 0.2)
+
+
 @dataclass(frozen=True)
 class Shape:
     """Local shape of (M, 3) points, from their neighbourhoods.
@@ -66,7 +106,7 @@ class Shape:
     upright: F32
 
 
-def classify(cloud: PointCloud, report: Report = silent, *, voxel: float = 0.2) -> U8:
+def classify(cloud: PointCloud, report: Report = silent, *, voxel: float = 0.2, spacing: float | None = None) -> U8:
     """(N,) LAS codes: terrain, low/mid/high vegetation, building, wall_or_fence, vehicle, pole, unclassified.
 
     Args:
@@ -74,39 +114,97 @@ def classify(cloud: PointCloud, report: Report = silent, *, voxel: float = 0.2) 
         report: progress callback.
         voxel: voxel size in metres above ground. A neighbourhood, about five voxels wide, should be
             large compared to the noise of merged sweeps and small compared to a car.
+        spacing: typical distance of neighbouring points in metres, to scale all lengths of the method with it and with
+            the noise of the ground; None: a dense cloud.
     """
     xyz = cloud.xyz
     if len(xyz) < MIN_POINTS:
         return np.full(len(xyz), CODE["unclassified"], np.uint8)
     report(0.0, "ground")
-    height, ground = split_ground(xyz)
+    scale = Scale(voxel)
+    if spacing is None:
+        height, ground = split_ground(xyz)
+    else:
+        height, ground, scale = _split_sparse(xyz, voxel, spacing)
     classification = np.full(len(xyz), CODE["unclassified"], np.uint8)
     classification[ground] = CODE["terrain"]
     above = np.flatnonzero(~ground & (height > 0))
     del ground
     if len(above) >= MIN_POINTS:
         report(0.1, "voxels")
-        centre, voxel_index = _voxels(xyz[above], voxel)
+        centre, voxel_index = _voxels(xyz[above], scale.voxel)
         count = np.bincount(voxel_index)
         mean_height = (np.bincount(voxel_index, height[above]) / count).astype(np.float32)
         if len(centre) >= MIN_POINTS:
-            codes = _above_ground(centre, mean_height, count.astype(np.float64), report)
+            codes = _above_ground(centre, mean_height, count.astype(np.float64), scale, report)
             classification[above] = codes[voxel_index]
     report(1.0, "done")
     return classification
 
 
-def split_ground(xyz: F32) -> tuple[F32, Bools]:
+def _split_sparse(xyz: F32, voxel: float, spacing: float) -> tuple[F32, Bools, Scale]:
+    """As `split_ground` for points that are `spacing` metres apart; and the scale of the points above ground.
+
+    Merged sweeps with errors of their poses show the ground several times. The surface of its lowest points is below
+    most of them: the range of heights in columns with nothing but ground measures by how much.
+    """
+    cell = max(GROUND_CELL_M, SPARSE_CELL_SPACINGS * spacing)
+    tolerance = max(GROUND_TOLERANCE_M, SPARSE_TOLERANCE_SPACINGS * spacing)
+    height, ground = split_ground(xyz, cell, tolerance)
+    thickness = _ground_thickness(xyz, height, cell)
+    if thickness > THICKNESS_MAX_M:
+        thickness = 0.0
+    if TOLERANCE_THICKNESSES * thickness > tolerance:
+        tolerance = TOLERANCE_THICKNESSES * thickness
+        height, ground = split_ground(xyz, cell, tolerance)
+    noise = max(NOISE_OF_THICKNESS * thickness, _grid_noise(xyz))
+    size = max(voxel, spacing, VOXEL_NOISES * noise)
+    # NEIGHBOURS points, one per voxel, of a plane fill a disk; its variance along both axes is a quarter of r^2
+    spread = NEIGHBOURS * size**2 / np.pi / 4
+    few = max(SPARSE_MIN_POINTS, round(MIN_POINTS * (0.2 / size) ** 2)) if size > voxel else MIN_POINTS
+    return height, ground, Scale(size, cell, tolerance, few, noise**2 / (noise**2 + 2 * spread))
+
+
+def _grid_noise(xyz: F32) -> float:
+    """Standard deviation in metres of points at the centres of voxels from the surface; 0 if they are not."""
+    from scipy.spatial import cKDTree
+
+    distance = cKDTree(xyz).query(xyz[:: max(1, len(xyz) // 20_000)], k=2, workers=-1)[0][:, 1]
+    low, middle, high = np.percentile(distance, (25, 50, 75)).tolist()
+    return middle / math.sqrt(12) if high - low < GRID_MAX_SPREAD * middle else 0.0
+
+
+def _ground_thickness(xyz: F32, height: F32, cell: float) -> float:
+    """Median over columns without high points of the range between the lowest point and the 90th percentile, metres."""
+    at = np.floor((xyz[:, :2] - xyz[:, :2].min(axis=0)) / cell).astype(np.int64)
+    key = at[:, 0] * (at[:, 1].max() + 1) + at[:, 1]
+    order = np.lexsort((height, key))
+    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+    count = np.diff(np.append(starts, len(order)))
+    sorted_height = height[order]
+    is_open = (count >= THICKNESS_CELL_MIN_POINTS) & (sorted_height[starts + count - 1] < THICKNESS_OPEN_MAX_M)
+    if not is_open.any():
+        return 0.0
+    upper = starts + np.ceil(0.9 * (count - 1)).astype(np.int64)
+    return float(np.median((sorted_height[upper] - sorted_height[starts])[is_open]))
+
+
+def split_ground(xyz: F32, cell: float = GROUND_CELL_M, tolerance: float = GROUND_TOLERANCE_M) -> tuple[F32, Bools]:
     """Height above ground (N,) in metres, and whether each point is ground.
 
     SMRF on a grid of the lowest points, with two additions: points far below their surroundings are
     rejected (multipath), and wide gaps without points are filled with low heights, so that a roof
     without measured ground around it still stands out.
+
+    Args:
+        xyz: (N, 3) points.
+        cell: cell of the grid in metres.
+        tolerance: distance in metres of ground points from the ground surface, where that is level.
     """
     from scipy import ndimage
 
     low = xyz[:, :2].min(axis=0)
-    at = (xyz[:, :2] - low) / GROUND_CELL_M
+    at = (xyz[:, :2] - low) / cell
     index = at.astype(np.int64)
     shape = tuple(index.max(axis=0) + 1)
     flat = np.ravel_multi_index((index[:, 0], index[:, 1]), shape)
@@ -114,26 +212,24 @@ def split_ground(xyz: F32) -> tuple[F32, Bools]:
     np.minimum.at(lowest.reshape(-1), flat, xyz[:, 2])
     empty = ~np.isfinite(lowest)
     surface = _fill(lowest, empty)
-    pit = ndimage.grey_closing(surface, size=(3, 3)) - surface > 0.5 + 5 * GROUND_MAX_SLOPE * GROUND_CELL_M
-    in_gap = ndimage.distance_transform_edt(empty) * GROUND_CELL_M > GROUND_GAP_RADIUS_M if empty.any() else empty
-    floor = ndimage.minimum_filter(
-        ndimage.grey_closing(surface, size=(5, 5)), size=2 * int(GROUND_WINDOW_M / GROUND_CELL_M) + 1
-    )
+    pit = ndimage.grey_closing(surface, size=(3, 3)) - surface > 0.5 + 5 * GROUND_MAX_SLOPE * cell
+    in_gap = ndimage.distance_transform_edt(empty) * cell > GROUND_GAP_RADIUS_M if empty.any() else empty
+    floor = ndimage.minimum_filter(ndimage.grey_closing(surface, size=(5, 5)), size=2 * int(GROUND_WINDOW_M / cell) + 1)
     surface = np.where(in_gap, floor, _fill(surface, pit))
 
     not_ground = empty | pit
     opened = surface
-    for radius in _radii(round(GROUND_WINDOW_M / GROUND_CELL_M)):
+    for radius in _radii(round(GROUND_WINDOW_M / cell)):
         below = ndimage.grey_opening(opened, size=(2 * radius + 1,) * 2)
-        not_ground |= opened - below > GROUND_MAX_SLOPE * radius * GROUND_CELL_M
+        not_ground |= opened - below > GROUND_MAX_SLOPE * radius * cell
         opened = below
     if not_ground.all():
         return np.zeros(len(xyz), np.float32), np.ones(len(xyz), bool)
     ground = ndimage.gaussian_filter(_fill(surface, not_ground), 1.0)
-    rise = np.hypot(*(np.gradient(ground, GROUND_CELL_M, axis=k) if shape[k] > 1 else 0 * ground for k in (0, 1)))
+    rise = np.hypot(*(np.gradient(ground, cell, axis=k) if shape[k] > 1 else 0 * ground for k in (0, 1)))
     grid_position = (at - 0.5).T
     height = xyz[:, 2] - ndimage.map_coordinates(ground, grid_position, order=1, mode="nearest")
-    slack = GROUND_TOLERANCE_M + GROUND_CELL_M * ndimage.map_coordinates(rise, grid_position, order=1, mode="nearest")
+    slack = tolerance + cell * ndimage.map_coordinates(rise, grid_position, order=1, mode="nearest")
     return height.astype(np.float32), np.abs(height) < slack
 
 
@@ -166,18 +262,18 @@ def _voxels(xyz: F32, size: float) -> tuple[F32, I64]:
     return centre.astype(np.float32), index
 
 
-def _above_ground(xyz: F32, height: F32, weight: F64, report: Report) -> U8:
+def _above_ground(xyz: F32, height: F32, weight: F64, scale: Scale, report: Report) -> U8:
     report(0.2, "neighbourhoods")
     shape = describe(xyz, weight, NEIGHBOURS)
     report(0.6, "surfaces")
     classification = np.zeros(len(xyz), np.uint8)
-    _buildings(classification, xyz, height, shape)
+    _buildings(classification, xyz, height, shape, scale)
     report(0.8, "poles and vehicles")
     rough = _mean(shape.variation, shape)
-    _poles(classification, xyz, shape)
-    _vehicles(classification, xyz, height, shape, rough)
+    _poles(classification, xyz, shape, scale)
+    _vehicles(classification, xyz, height, shape, rough, scale)
     rest = classification == 0
-    classification[rest & (rough > VEGETATION_MIN_VARIATION)] = CODE["high_vegetation"]
+    classification[rest & (rough > VEGETATION_MIN_VARIATION + scale.variation)] = CODE["high_vegetation"]
     report(0.9, "votes")
     _vote(classification, shape)
     plant = classification == CODE["high_vegetation"]
@@ -281,10 +377,10 @@ def _edges(shape: Shape, member: Bools, k: int, distance: float) -> tuple[I64, I
     return rows[np.nonzero(close)[0]], near[close].astype(np.int64)
 
 
-def _buildings(classification: U8, xyz: F32, height: F32, shape: Shape) -> None:
+def _buildings(classification: U8, xyz: F32, height: F32, shape: Shape, scale: Scale) -> None:
     """Classify large smooth surfaces, in place: high ones are buildings, long low upright ones walls."""
-    smooth = shape.variation < SMOOTH_MAX_VARIATION
-    a, b = _edges(shape, smooth, 8, 0.3)
+    smooth = shape.variation < SMOOTH_MAX_VARIATION + scale.variation
+    a, b = _edges(shape, smooth, 8, 0.3 * scale.gap)
     same = np.abs(np.einsum("ni,ni->n", shape.normal[a], shape.normal[b])) > SURFACE_MIN_NORMAL_COS
     parts = _parts(xyz, smooth, a[same], b[same])
     k = shape.gap.shape[1]
@@ -292,26 +388,32 @@ def _buildings(classification: U8, xyz: F32, height: F32, shape: Shape) -> None:
     top = _top(parts, height)
     tilt = parts.mean(np.abs(shape.normal[:, 2]))
     length = np.hypot(parts.size[:, 0], parts.size[:, 1])
-    even = (parts.count >= MIN_POINTS) & (parts.mean(shape.variation) < BUILT_MAX_MEAN_VARIATION)
+    even = (parts.count >= scale.min_points) & (
+        parts.mean(shape.variation) < BUILT_MAX_MEAN_VARIATION + scale.variation
+    )
+    if scale.gap > 1:
+        even &= _curved(parts, xyz, scale.min_points) < SPARSE_MAX_CURVED + scale.variation
     building = even & (area > BUILDING_MIN_AREA_M2) & (top > BUILDING_MIN_HEIGHT_M)
     wall = even & (tilt < 0.3) & (length > WALL_MIN_LENGTH_M) & (top > WALL_MIN_HEIGHT_M) & ~building
     _assign(classification, parts, building, CODE["building"])
     _assign(classification, parts, wall, CODE["wall_or_fence"])
     # components attached to a building and to little else: edges, balconies, sparsely scanned walls
     attached = (classification[shape.near] == CODE["building"]).any(axis=1)
-    parts = _parts(xyz, classification == 0, *_edges(shape, classification == 0, 8, 0.3))
+    parts = _parts(
+        xyz, classification == 0, *_edges(shape, classification == 0, 8 if scale.gap == 1 else 4, 0.3 * scale.gap)
+    )
     _assign(classification, parts, parts.mean(attached) > 0.5, CODE["building"])
 
 
-def _poles(classification: U8, xyz: F32, shape: Shape) -> None:
+def _poles(classification: U8, xyz: F32, shape: Shape, scale: Scale) -> None:
     """Classify thin upright lines, including tree trunks, as poles, in place."""
     line = (classification == 0) & (shape.linearity > 0.6) & (shape.upright > 0.9)
-    parts = _parts(xyz, line, *_edges(shape, line, NEIGHBOURS, 0.4))
+    parts = _parts(xyz, line, *_edges(shape, line, NEIGHBOURS, 0.4 * scale.gap))
     thin = (np.hypot(parts.size[:, 0], parts.size[:, 1]) < POLE_MAX_WIDTH_M) & (parts.size[:, 2] > POLE_MIN_HEIGHT_M)
     _assign(classification, parts, thin, CODE["pole"])
 
 
-def _vehicles(classification: U8, xyz: F32, height: F32, shape: Shape, rough: F32) -> None:
+def _vehicles(classification: U8, xyz: F32, height: F32, shape: Shape, rough: F32, scale: Scale) -> None:
     """Classify compact components of a car's size that are smoother than bushes as vehicles, in place.
 
     Parked cars touch other objects near the ground, and tree crowns overhang them. They are separated
@@ -326,16 +428,20 @@ def _vehicles(classification: U8, xyz: F32, height: F32, shape: Shape, rough: F3
         return
     inside = np.zeros(len(classification), bool)
     inside[band] = True
-    part = _parts(xyz, inside, *_edges(shape, inside, NEIGHBOURS, 0.3)).part
+    part = _parts(xyz, inside, *_edges(shape, inside, NEIGHBOURS, 0.3 * scale.gap)).part
     rest = np.flatnonzero(free & ~inside & (height < VEHICLE_HEIGHT_M[1]))
-    gap, nearest = cKDTree(xyz[band, :2]).query(xyz[rest, :2], distance_upper_bound=0.3)
+    gap, nearest = cKDTree(xyz[band, :2]).query(xyz[rest, :2], distance_upper_bound=0.3 * scale.gap)
     close = np.isfinite(gap)
     part[rest[close]] = part[band[nearest[close]]]
     parts = _boxes(xyz, part)
-    length, width = _footprints(parts, xyz)
+    length, width = _footprints(parts, xyz, scale.min_points)
     top = _top(parts, height)
     car = (length > VEHICLE_LENGTH_M[0]) & (length < VEHICLE_LENGTH_M[1]) & (top > VEHICLE_HEIGHT_M[0])
-    car &= (width > VEHICLE_WIDTH_M[0]) & (width < VEHICLE_WIDTH_M[1]) & (parts.mean(rough) < VEHICLE_MAX_VARIATION)
+    car &= (
+        (width > VEHICLE_WIDTH_M[0])
+        & (width < VEHICLE_WIDTH_M[1])
+        & (parts.mean(rough) < VEHICLE_MAX_VARIATION + scale.variation)
+    )
     _assign(classification, parts, car, CODE["vehicle"])
 
 
@@ -347,18 +453,33 @@ def _top(parts: Parts, height: F32) -> F64:
     return top
 
 
-def _footprints(parts: Parts, xyz: F32) -> tuple[F64, F64]:
-    """(P,) length and width of each component in plan, along its principal axes."""
+def _footprints(parts: Parts, xyz: F32, min_points: int) -> tuple[F64, F64]:
+    """(P,) length and width in plan, along its principal axes, of each component of `min_points` or more."""
     length, width = np.zeros(len(parts.count)), np.zeros(len(parts.count))
     order = np.argsort(parts.part, kind="stable")
     ends = np.searchsorted(parts.part[order], np.arange(len(parts.count) + 1))
-    for i in np.flatnonzero(parts.count >= MIN_POINTS):
+    for i in np.flatnonzero(parts.count >= min_points):
         xy = xyz[order[ends[i] : ends[i + 1]], :2].astype(np.float64)
         xy -= xy.mean(axis=0)
         along = xy @ np.linalg.eigh(xy.T @ xy)[1]
         low, high = np.percentile(along, (3, 97), axis=0)  # mixed pixels are outliers
         width[i], length[i] = np.sort(high - low)
     return length, width
+
+
+def _curved(parts: Parts, xyz: F32, min_points: int) -> F64:
+    """(P,) smallest eigenvalue over the sum of the covariance of each component's points; 1 below `min_points`."""
+    curved = np.ones(len(parts.count))
+    mean = np.stack([parts.mean(xyz[:, k]) for k in range(3)], axis=1)
+    offset = xyz - mean[parts.part]
+    large = parts.count >= min_points
+    covariance = np.empty((len(parts.count), 3, 3))
+    for i in range(3):
+        for k in range(3):
+            covariance[:, i, k] = parts.mean(offset[:, i] * offset[:, k])
+    values = np.linalg.eigvalsh(covariance[large])
+    curved[large] = values[:, 0] / np.maximum(values.sum(axis=1), 1e-12)
+    return curved
 
 
 def _assign(classification: U8, parts: Parts, selected: Bools, code: int) -> None:

@@ -38,6 +38,8 @@ TRANSFER_WEIGHT, TRANSFER_NEIGHBOURS = 1.0, 8
 SEEN_THROUGH_MIN_HEIGHT_M = 0.4
 """Height above ground from which points of vehicle or unclassified shape that photos classify as ground are assumed to
 have been seen through: a moving vehicle."""
+MOVABLE_CLASSES = ("vehicle", "person", "sky")
+"""Classes that aren't alternatives to a vehicle that turns out to be none."""
 SHAPE_LIKELIHOODS: dict[str, dict[str, float]] = {
     # by shape class: how often each class has this shape, relative to the other classes; 0.05 for classes not listed
     "terrain": dict.fromkeys(GROUND_CLASSES, 1.0) | {"low_vegetation": 0.15, "vehicle": 0.08, "wall_or_fence": 0.08},
@@ -61,8 +63,8 @@ def smooth_classes(
     *,
     knows_low_vegetation: bool,
     normal_pull: float = 4.0,
-) -> tuple[U8, F32]:
-    """Class of each point, index into `CLASSES` (N,), and its probability (N,).
+) -> tuple[U8, F32, U8]:
+    """Class of each point, index into `CLASSES` (N,), its probability (N,), and its likeliest class if it stays (N,).
 
     Args:
         votes: votes of the photos.
@@ -92,7 +94,8 @@ def smooth_classes(
     confidence = probability[np.arange(len(best)), best]
     best = remove_specks(best, height, cloud.xyz, near[:, :8])
     best = correct_wall_feet(best, cloud.normal, near)
-    return correct_vegetation_height(best, height, cloud.xyz), confidence.astype(np.float32)
+    staying = np.where(np.isin(CLASSES, MOVABLE_CLASSES), 0, probability).argmax(axis=1).astype(np.uint8)
+    return correct_vegetation_height(best, height, cloud.xyz), confidence.astype(np.float32), staying
 
 
 def likelihood(shape: U8) -> F32:

@@ -66,10 +66,12 @@ END_OCCUPANCY = (0.15, 0.6)
 """Share of occupied cells at the ends of a box: of a free-standing vehicle, and of a piece of a wall."""
 PRIOR_LOG_ODDS = -3.0
 """Prior log odds that a cluster is a vehicle: bushes and bins are more frequent."""
-FENCE_MAX_WIDTH_M, FENCE_MIN_LENGTH_M = 0.5, 2.0
-"""Narrower and longer clusters are walls or fences."""
-VEHICLES_MAX_WIDTH_M = 6.0
-"""Wider clusters are neither a vehicle nor a row of vehicles side by side."""
+FENCE_MAX_WIDTH_M = 0.4
+"""Narrower clusters are wires of fences, and edges of what hides them."""
+PASSING_SWEEPS_MAX = 2.5
+"""Mean number of sweeps that see a place of something that drives by; what others hide is seen as often, or longer."""
+ROAD_MARGIN_M, ROAD_SHARE = 0.5, 0.9
+"""Margin of the ground around a cluster, and the share of it that is road from which the cluster stands on the road."""
 STATIC_CLASSES = (CODE["building"], CODE["pole"], CODE["road_sign"])
 """Classes that are never removed because something passed nearby."""
 TOUCHING_MOVED_SHARE = 0.02
@@ -114,10 +116,7 @@ class Instance:
     @property
     def corners(self) -> F64:
         """(4, 2) corners of the box, counter-clockwise, local metres."""
-        along = np.array([np.cos(self.heading), np.sin(self.heading)])
-        across = np.array([-along[1], along[0]])
-        half = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
-        return self.centre[:2] + half[:, :1] * self.length * along + half[:, 1:] * self.width * across
+        return self.box.corners
 
 
 class Rectangle(NamedTuple):
@@ -128,6 +127,14 @@ class Rectangle(NamedTuple):
     heading: float
     length: float
     width: float
+
+    @property
+    def corners(self) -> F64:
+        """(4, 2) corners, counter-clockwise, local metres."""
+        along = np.array([np.cos(self.heading), np.sin(self.heading)])
+        across = np.array([-along[1], along[0]])
+        half = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
+        return np.array([self.x, self.y]) + half[:, :1] * self.length * along + half[:, 1:] * self.width * across
 
     def inside(self, xy: npt.NDArray[np.floating], margin: float) -> Bools:
         """(N,) which points (N, 2) are within the rectangle, extended by `margin` metres on all sides."""
@@ -154,6 +161,7 @@ class Scan:
         weight: weight of the odds.
         moved: whether the point is near points that moved.
         brief: whether the point and its neighbours were scanned within a second; static objects are seen for longer.
+        seen, passed: numbers of sweeps that saw the point, and whose rays passed it (`pipeline.lidar.sightings`).
         path: (T, 3) path of the scanner.
     """
 
@@ -165,6 +173,8 @@ class Scan:
     weight: F32
     moved: Bools
     brief: Bools
+    seen: I64
+    passed: I64
     path: F64
 
 
@@ -190,41 +200,66 @@ def vehicles(scan: Scan) -> list[Instance]:
     return found
 
 
-def rejected_vehicle_points(scan: Scan, found: Sequence[Instance]) -> I64:
-    """Indices of points classified as vehicle on the ground, or in clusters that are not of a vehicle's shape.
+def loose_vehicle_points(scan: Scan, found: Sequence[Instance]) -> tuple[I64, list[I64]]:
+    """Points classified as vehicle that no instance contains.
 
-    Such points below the vehicles that were `found` are kept: they are wheels and sills.
+    Such points below the vehicles that were `found` are theirs: they are wheels and sills.
+
+    Returns:
+        Indices of points that are no vehicle, and clusters (indices) that are: they came or left while the scanner
+        passed. What stays, but doesn't have the shape of a vehicle, is none.
     """
     classified = scan.classification == CODE["vehicle"]
     if found:
         tree = cKDTree(scan.xyz[:, :2])
         for instance in found:
             near = np.array(tree.query_ball_point(instance.centre[:2], instance.length / 2 + 1.5), np.int64)
-            classified[near[instance.box.inside(scan.xyz[near, :2], BOX_MARGIN_M)]] = False
-    wrong = classified & (scan.ground | (scan.height < MIN_HEIGHT_M))
-    for cluster in clusters(scan.xyz, classified & ~wrong):
-        box = fit_rectangle(scan.xyz[cluster, :2])
-        is_fence = box.width < FENCE_MAX_WIDTH_M and box.length > FENCE_MIN_LENGTH_M
-        if is_fence or box.width > VEHICLES_MAX_WIDTH_M:
-            wrong[cluster] = True
-    return np.flatnonzero(wrong)
+            below = scan.height[near] < instance.height + BOX_MARGIN_M
+            classified[near[below & instance.box.inside(scan.xyz[near, :2], BOX_MARGIN_M)]] = False
+            classified[instance.index] = False
+    above = classified & ~scan.ground & _between(scan.height, (MIN_HEIGHT_M, MAX_HEIGHT_M))
+    still = classified & ~(above & (scan.moved | scan.brief | (scan.passed > scan.seen)))
+    passing = []
+    for cluster in clusters(scan.xyz, above):
+        still[cluster] = not _was_passing(scan, cluster)
+        if not still[cluster[0]]:
+            passing.append(cluster)
+    return np.flatnonzero(still), passing
 
 
-def uncarved_moving_points(scan: Scan) -> I64:
-    """Indices of points of moving objects that were not carved: at the ends of a trail, no ray passes through it.
+def _was_passing(scan: Scan, cluster: I64) -> bool:
+    """Whether a cluster classified as vehicle was there for a moment: rays say so, or it stands on the road."""
+    if scan.moved[cluster].mean() > MOVED_SHARE or scan.passed[cluster].mean() > scan.seen[cluster].mean():
+        return True
+    if scan.brief[cluster].mean() < 0.5 or scan.height[cluster].min() > VEHICLE_BAND_M[0] + ROOF_GAP_M:
+        return False
+    box = fit_rectangle(scan.xyz[cluster, :2])
+    low, high = scan.xyz[cluster, :2].min(axis=0) - ROAD_MARGIN_M, scan.xyz[cluster, :2].max(axis=0) + ROAD_MARGIN_M
+    ground = scan.ground & ((scan.xyz[:, :2] > low) & (scan.xyz[:, :2] < high)).all(axis=1)
+    ground = np.flatnonzero(ground)[box.inside(scan.xyz[ground, :2], ROAD_MARGIN_M)]
+    return bool(len(ground)) and float((scan.classification[ground] == CODE["road"]).mean()) > ROAD_SHARE
 
-    These are clusters above the ground, no wider than a lane, that touch carved points and were scanned only for a
-    moment. A garden seen through a gate is also scanned only for a moment, but it is wider.
+
+def passing_points(scan: Scan) -> list[I64]:
+    """Clusters (indices) of any class that were there for a moment, though the free space of voxels kept them.
+
+    These are clusters above the ground, no wider than a lane, that were scanned only for a moment, and either rays of
+    more sweeps passed their place than saw them, or they touch carved points: at the ends of a trail no ray passes. A
+    garden seen through a gate is also scanned only for a moment, but it is wider; wires of a fence are passed by most
+    rays, but they are thinner.
     """
     above = ~scan.ground & _between(scan.height, (MIN_HEIGHT_M, MAX_HEIGHT_M))
     above &= ~np.isin(scan.classification, STATIC_CLASSES)
-    near = [
-        c
-        for c in clusters(scan.xyz, above & scan.brief)
-        if scan.moved[c].mean() > TOUCHING_MOVED_SHARE and fit_rectangle(scan.xyz[c, :2]).width < LANE_WIDTH_M
-    ]
-    near += [c for c in clusters(scan.xyz, above) if scan.moved[c].mean() > 0.5]
-    return np.unique(np.concatenate([*near, np.zeros(0, np.int64)]))
+    found = [c for c in clusters(scan.xyz, above & scan.brief) if _was_brief(scan, c)]
+    return found + [c for c in clusters(scan.xyz, above) if scan.moved[c].mean() > 0.5]
+
+
+def _was_brief(scan: Scan, cluster: I64) -> bool:
+    box, seen = fit_rectangle(scan.xyz[cluster, :2]), float(scan.seen[cluster].mean())
+    passed = seen < PASSING_SWEEPS_MAX and float(scan.passed[cluster].mean()) > seen
+    if passed and FENCE_MAX_WIDTH_M < box.width < LANE_WIDTH_M:
+        return True
+    return scan.moved[cluster].mean() > TOUCHING_MOVED_SHARE and box.width < LANE_WIDTH_M
 
 
 def people(scan: Scan) -> list[Instance]:

@@ -22,7 +22,7 @@ def open_outbox(node: str, topic: str) -> Outbox:
         SpaceError: the state folder can't be created or written.
     """
     name = f"{node}.{topic}".replace("/", ".").strip(".")[:MAX_NAME_CHARS]
-    folder, number = _state_folder(), 1
+    folder, number = state_folder("spools"), 1
     while (own := _open_if_free(folder / f"{name}.{number}.spool")) is None:
         number += 1
     while (path := folder / f"{name}.{(number := number + 1)}.spool").exists():
@@ -40,14 +40,18 @@ def _open_if_free(path: Path) -> Outbox | None:
         return None
 
 
-def _state_folder() -> Path:
-    """Folder below the user's state folder (XDG Base Directory Specification 0.8), readable by the user only."""
+def state_folder(purpose: str) -> Path:
+    """Folder below the user's state folder (XDG Base Directory Specification 0.8), readable by the user only.
+
+    Raises:
+        SpaceError: it can't be created or written.
+    """
     try:
         state = os.environ.get("XDG_STATE_HOME")
-        path = (Path(state) if state else Path.home() / ".local" / "state") / "scan2sim" / "spools"
+        path = (Path(state) if state else Path.home() / ".local" / "state") / "scan2sim" / purpose
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
         path.chmod(0o700)
     except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home folder
-        remedy = "Set XDG_STATE_HOME to a writable folder, or name a file: --spool FILE"
-        raise SpaceError("folder for unsent records", f"can't be used ({error})", remedy) from None
+        remedy = "Set XDG_STATE_HOME to a writable folder, or name a file (--outbox, --state)"
+        raise SpaceError(f"folder for {purpose}", f"can't be used ({error})", remedy) from None
     return path

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field
 
 from scan2sim.pipeline.core import optional_deps
+from scan2sim.pipeline.core.errors import InputError
 from scan2sim.services.outbox import Deduplicator, OutboxRecord
 
 log = logging.getLogger(__name__)
@@ -23,12 +28,87 @@ Servers = Annotated[
     ),
 ]
 """Type of a setting: broker addresses (`bootstrap.servers`)."""
+ClientConfig = Annotated[
+    Path | None,
+    Field(
+        description="File with options of the Kafka client (librdkafka), KEY=VALUE per line, such as TLS and SASL"
+        " (docs/monitoring.md); default: $SCAN2SIM_KAFKA_CONFIG."
+    ),
+]
+"""Type of a setting: file with options of librdkafka."""
 ACKNOWLEDGE_TIMEOUT_S = 10.0
 """Time for a batch to be acknowledged; after that the broker counts as lost."""
 RECORD_ID_HEADER = "record id"
 """Message header with the id of the record."""
 MAX_RECORD_BYTES = 2**24
 """Largest record that is sent; the broker's own limit may be lower."""
+
+
+CONFIG_VARIABLE = "SCAN2SIM_KAFKA_CONFIG"
+"""Environment variable with the default of settings of type `ClientConfig`."""
+PROBE_TIMEOUT_S = 1.0
+"""Time for an idle broker to answer; after that it counts as unreachable."""
+FIRST_PROBE_PAUSE_S, MAX_PROBE_PAUSE_S = 0.5, 5.0
+"""Pause until an idle broker is probed again; doubled each time that it answers, up to a maximum."""
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """A Kafka cluster and how to connect to it.
+
+    Attributes:
+        servers: as "host:port,host:port"; they need not be reachable yet.
+        options: of librdkafka, in addition to those that this module sets.
+        config: file that `options` were read from, for messages.
+    """
+
+    servers: str
+    options: Mapping[str, str] = field(default_factory=dict)
+    config: Path | None = None
+
+    @classmethod
+    def read(cls, servers: str, config: Path | None) -> Cluster:
+        """Cluster with the options of a file; without `config`, of the one that `SCAN2SIM_KAFKA_CONFIG` names, if any.
+
+        Raises:
+            InputError: the file can't be read, or has a line that isn't KEY=VALUE.
+        """
+        named = os.environ.get(CONFIG_VARIABLE)
+        path = config or (Path(named) if named else None)
+        return cls(servers, _options(path) if path else {}, path)
+
+    def configured(self, client: Callable[[dict[str, Any]], Any], own: Mapping[str, Any]) -> Any:
+        """Create a client of confluent_kafka with the cluster's options; `own` has priority.
+
+        Raises:
+            InputError: librdkafka rejects an option.
+        """
+        from confluent_kafka import KafkaException
+
+        try:
+            return client({**self.options, "bootstrap.servers": self.servers, **own})
+        except KafkaException as error:
+            if self.config is None:
+                raise
+            remedy = "Its keys are those of librdkafka (CONFIGURATION.md), not of Kafka's Java client"
+            raise InputError(self.config, str(error.args[0].str()), remedy) from None
+
+
+def _options(path: Path) -> dict[str, str]:
+    """Options of a properties file: KEY=VALUE per line, `#` begins a comment line."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        cause = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise InputError(path, f"can't be read ({cause})", "Name a file with KEY=VALUE per line") from None
+    options = {}
+    for number, line in enumerate(lines, 1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            key, separator, value = line.partition("=")
+            if not separator:
+                raise InputError(path, f"line {number} isn't KEY=VALUE", "Write for example: security.protocol=SSL")
+            options[key.strip()] = value.strip()
+    return options
 
 
 def topic_name(topic: str) -> str:
@@ -39,17 +119,21 @@ def topic_name(topic: str) -> str:
 class TopicProducer:
     """Sends records to a topic; its `send` is the one of an `outbox.Sender`."""
 
-    def __init__(self, servers: str, topic: str) -> None:
-        """`servers` as "host:port,host:port"; they need not be reachable yet."""
+    def __init__(self, cluster: Cluster, topic: str) -> None:
+        """Create it; the cluster need not be reachable yet.
+
+        Raises:
+            InputError: librdkafka rejects one of the cluster's options.
+        """
         optional_deps.require("Kafka", "confluent_kafka")
         from confluent_kafka import KafkaError, KafkaException, Producer
 
-        self._servers, self._topic = servers, topic_name(topic)
+        self._servers, self._topic = cluster.servers, topic_name(topic)
         self._error_codes: Any = KafkaError
         self._exception: type[Exception] = KafkaException
-        self._producer = Producer(
+        self._producer = cluster.configured(
+            Producer,
             {
-                "bootstrap.servers": servers,
                 "acks": "all",
                 "max.in.flight.requests.per.connection": 1,  # keeps the order
                 "message.timeout.ms": int(1000 * ACKNOWLEDGE_TIMEOUT_S),
@@ -57,7 +141,7 @@ class TopicProducer:
                 "linger.ms": 5,
                 "logger": _silent_logger(),
                 "error_cb": self._on_error,
-            }
+            },
         )
         self._brokers_down, self._cause = False, ""
 
@@ -124,18 +208,22 @@ def _cause(error: Any) -> str:
     text = re.sub(r" \(after .*?\)", "", str(error.str()))
     if error.name() in ("_BAD_MSG", "_UNDERFLOW") or "ApiVersion" in text:
         return "the server there isn't Kafka"
+    if "OAUTHBEARER token" in text:
+        return f"the token endpoint answers {text.partition(': ')[2]}"
     return text.rpartition(": ")[2]
 
 
 def read(
-    servers: str,
+    cluster: Cluster,
     topic: str,
     *,
     group: str,
     from_start: bool = False,
     since: float | None = None,
     connected: Callable[[bool], None] = lambda _: None,
+    reached: Callable[[], None] = lambda: None,
     dropped: Callable[[str], None] = lambda _: None,
+    max_probe_pause: float = MAX_PROBE_PAUSE_S,
     wait: float = 1.0,
 ) -> Iterator[bytes | None]:
     """Iterate over the bodies of a topic's records without duplicates, forever; None after `wait` seconds without one.
@@ -143,26 +231,34 @@ def read(
     Messages without a record id (of other programs) are not deduplicated.
 
     Args:
-        servers: as "host:port,host:port"; they need not be reachable yet.
+        cluster: need not be reachable yet.
         topic: its name; created if it doesn't exist.
         group: consumer group, whose members share the topic's records.
         from_start: start with the oldest stored record if the group is new, else with new records only.
         since: start with the records that reached Kafka at or after this time, in seconds since the epoch.
-        connected: called with True when the broker has assigned the topic, with False when all brokers are down.
+        connected: called with True while the broker has assigned the topic and answers, otherwise with False; at once
+            if connections break, otherwise at the next probe.
+        reached: called at each sign that a broker is there: a message, or an answer while there are none.
+        max_probe_pause: longest pause in seconds between two probes of an idle broker, which take `PROBE_TIMEOUT_S` if
+            it hangs.
         dropped: called with the id of each duplicate.
         wait: seconds per poll.
+
+    Raises:
+        InputError: librdkafka rejects one of the cluster's options.
     """
     optional_deps.require("Kafka", "confluent_kafka")
     from confluent_kafka import Consumer, KafkaError, KafkaException
 
-    cause, warned = "", False
+    cause, warned, probe = "", False, _Probe(max_probe_pause)
 
     def on_error(error: Any) -> None:
         nonlocal cause, warned
         if error.code() == KafkaError._ALL_BROKERS_DOWN:
             connected(False)
+            probe.failed()
             if not warned:
-                log.warning("%s", no_broker_message(servers, cause))
+                log.warning("%s", no_broker_message(cluster.servers, cause))
                 warned = True
         else:
             cause = _cause(error)
@@ -179,9 +275,9 @@ def read(
             except KafkaException as error:
                 log.warning("%s: earlier records are unavailable, only new ones are read (%s)", topic, error)
 
-    consumer = Consumer(
+    consumer = cluster.configured(
+        Consumer,
         {
-            "bootstrap.servers": servers,
             "group.id": group,
             "auto.offset.reset": "earliest" if from_start else "latest",
             "session.timeout.ms": 6000,
@@ -190,7 +286,7 @@ def read(
             "topic.metadata.refresh.interval.ms": 1000,  # the topic may be created later
             "logger": _silent_logger(),
             "error_cb": on_error,
-        }
+        },
     )
     consumer.subscribe([topic_name(topic)], on_assign=on_assign)
     deduplicator = Deduplicator()
@@ -198,8 +294,17 @@ def read(
         while True:
             message = consumer.poll(wait)
             if message is None or message.error():
+                if probe.is_due():
+                    answers = _answers(consumer, topic_name(topic))
+                    if answers:
+                        reached()
+                        probe.succeeded()
+                    else:
+                        probe.failed()
+                    connected(answers and bool(consumer.assignment()))
                 yield None
                 continue
+            reached()
             connected(True)
             record_id = dict(message.headers() or ()).get(RECORD_ID_HEADER)
             if not isinstance(record_id, bytes) or deduplicator.is_new(record_id.decode()):
@@ -208,6 +313,38 @@ def read(
                 dropped(record_id.decode())
     finally:
         consumer.close()
+
+
+class _Probe:
+    """When an idle broker is to be asked whether it is there: at every poll, and less often while it answers."""
+
+    def __init__(self, max_pause: float) -> None:
+        """`max_pause`: seconds."""
+        self._max_pause, self._pause, self._due = max_pause, FIRST_PROBE_PAUSE_S, 0.0
+
+    def is_due(self) -> bool:
+        """Whether to ask now."""
+        return time.monotonic() >= self._due
+
+    def succeeded(self) -> None:
+        """It has answered."""
+        self._due = time.monotonic() + self._pause
+        self._pause = min(self._max_pause, 2 * self._pause)
+
+    def failed(self) -> None:
+        """It is unreachable."""
+        self._pause, self._due = FIRST_PROBE_PAUSE_S, 0.0
+
+
+def _answers(consumer: Any, topic: str) -> bool:
+    """Whether the broker of an idle consumer answers."""
+    from confluent_kafka import KafkaException
+
+    try:
+        consumer.list_topics(topic, timeout=PROBE_TIMEOUT_S)
+    except KafkaException:
+        return False
+    return True
 
 
 def _silent_logger() -> logging.Logger:

@@ -13,7 +13,7 @@ import threading
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -172,7 +172,7 @@ def _open_locked(path: Path) -> sqlite3.Connection:
             database.close()
         if error.sqlite_errorcode == sqlite3.SQLITE_BUSY:
             cause = "another process is using this outbox file"
-            raise BusyError(path, cause, "Give each process its own --spool FILE") from None
+            raise BusyError(path, cause, "Give each process its own --outbox FILE") from None
         raise InputError(path, f"not an outbox file ({error})", "Name another file, or move this one away") from None
     return database
 
@@ -245,6 +245,14 @@ class Deduplicator:
     def __init__(self) -> None:
         self._last: dict[str, int] = {}
         self._outstanding: dict[str, set[int]] = {}
+
+    def saved(self) -> dict[str, int]:
+        """JSON-serializable state that `restore` takes: the highest number seen by producer."""
+        return dict(self._last)
+
+    def restore(self, saved: Mapping[str, int]) -> None:
+        """Continue from the state of an earlier process; late numbers below those in it count as seen."""
+        self._last.update(saved)
 
     def is_new(self, record_id: str) -> bool:
         """Whether a record id was not seen before; from now on it counts as seen."""

@@ -59,9 +59,8 @@ class Graph:
         factors: other constraints.
         shared_jacobian: (O, S, 6) translation (m) and rotation (rad, about world axes) of an observation's camera per
             unit of each shared parameter: rolling shutter, lens offset.
-        shared: (S,) shared parameters.
+        shared: (S,) shared parameters, and mean of their prior.
         shared_sigma: (S,) standard deviations of their prior.
-        shared_prior: (S,) mean of their prior; None: `shared`.
     """
 
     poses: F64
@@ -76,7 +75,6 @@ class Graph:
     shared_jacobian: F64 = field(default_factory=lambda: np.zeros((0, 0, 6)))
     shared: F64 = field(default_factory=lambda: np.zeros(0))
     shared_sigma: F64 = field(default_factory=lambda: np.zeros(0))
-    shared_prior: F64 | None = None
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from numba import njit
 
 from scan2sim.pipeline.core.types import F64, I32, I64, Bools
+from scan2sim.pipeline.geometry.least_squares import skew
 
 
 def exp_so3(w: npt.ArrayLike) -> F64:
@@ -42,6 +43,39 @@ def inverse(T: F64) -> F64:
     out[..., :3, :3], out[..., 3, 3] = Rt, 1
     out[..., :3, 3] = -(Rt @ T[..., :3, 3:])[..., 0]
     return out
+
+
+def lever_arm_jacobian(arm: F64) -> F64:
+    """(..., 6, 6) Jacobian of a pose at offset `arm` (..., 3) from another one, by that other pose.
+
+    Of position (m) and rotation (rad) about world axes.
+    """
+    out = np.zeros((*arm.shape[:-1], 6, 6))
+    out[..., range(6), range(6)] = 1
+    out[..., :3, 3:] = -skew(arm)
+    return out
+
+
+def relative_pose_error(first: F64, second: F64, measured: F64) -> tuple[F64, F64]:
+    """Errors (K, 6) of relative poses, metres and radians in the second's measured axes, and their Jacobian.
+
+    Args:
+        first, second: (K, 4, 4) poses.
+        measured: (K, 4, 4) measured pose of the second in the first's axes.
+
+    Returns:
+        errors; (K, 2, 6, 6) derivatives by the first and the second pose, position and rotation about world axes.
+    """
+    R, between = second[:, :3, :3], second[:, :3, 3] - first[:, :3, 3]
+    to_first, to_second = first[:, :3, :3].transpose(0, 2, 1), measured[:, :3, :3].transpose(0, 2, 1)
+    A = to_second @ to_first
+    shift = np.einsum("kab,kb->ka", to_first, between) - measured[:, :3, 3]
+    error = np.concatenate([np.einsum("kab,kb->ka", to_second, shift), log_so3(A @ R)], axis=1)
+    J = np.zeros((len(R), 2, 6, 6))
+    J[:, 0, :3, :3], J[:, 1, :3, :3] = -A, A
+    J[:, 0, :3, 3:] = A @ skew(between)
+    J[:, 0, 3:, 3:], J[:, 1, 3:, 3:] = -R.transpose(0, 2, 1), R.transpose(0, 2, 1)
+    return error, J
 
 
 @njit(cache=True, nogil=True)
@@ -119,8 +153,7 @@ def epipolar_errors(E: F64, a: F64, b: F64) -> F64:
 
 def essential(T: F64) -> F64:
     """Essential matrix (3, 3) of the pose (4, 4) of camera a in the axes of camera b: b' E a = 0."""
-    x, y, z = T[:3, 3] / max(float(np.linalg.norm(T[:3, 3])), 1e-9)
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ T[:3, :3]
+    return skew(T[:3, 3] / max(float(np.linalg.norm(T[:3, 3])), 1e-9)) @ T[:3, :3]
 
 
 def relative_pose(

@@ -133,7 +133,7 @@ def test_imports_between_wings_run_one_way() -> None:
             assert not foreign, f"{name} imports {foreign}"
 
 
-def test_prefect_is_known_to_what_it_deploys_alone() -> None:
+def test_only_deployed_flows_import_prefect() -> None:
     for name, file in project_files().items():
         assert "prefect" not in imported(file) or name.startswith("flows.deployed."), file.relative_to(ROOT)
 
@@ -160,7 +160,7 @@ def test_the_command_starts_without_anything_heavy() -> None:
     assert loaded_by("import scan2sim.flows.cli") == set()
 
 
-def test_the_version_and_the_help_are_told_by_little() -> None:
+def test_version_and_help_import_no_heavy_package() -> None:
     code = (
         "import sys; sys.argv[1:] = ['{}']\nfrom scan2sim.flows.cli import main\ntry: main()\nexcept SystemExit: pass"
     )
@@ -169,7 +169,7 @@ def test_the_version_and_the_help_are_told_by_little() -> None:
     assert not loaded_by(code.format("--help"), (*HEAVY, *more)) & {*HEAVY, *more}
 
 
-def test_the_help_says_of_commands_what_they_say_themselves() -> None:
+def test_command_summaries_equal_the_commands_own_help() -> None:
     from scan2sim.flows.cli import COMMANDS, loaded
 
     assert {name: loaded(name).help for name in COMMANDS} == {name: about for name, (_, about) in COMMANDS.items()}
@@ -185,7 +185,7 @@ def test_every_setting_is_documented() -> None:
     text = (ROOT / "docs" / "reference" / "settings.md").read_text(encoding="utf-8")
     for step in STEPS:
         for param in step.params.settings():
-            assert f"`{step.name}.{param}`" in text, f"docs/reference/settings.md lacks {step.name}.{param}"
+            assert f"`{step.name}.{param}`" in text, f"not in docs/reference/settings.md: {step.name}.{param}"
 
 
 def test_every_exit_code_is_documented() -> None:
@@ -196,7 +196,7 @@ def test_every_exit_code_is_documented() -> None:
         assert f"| {code} |" in text and meaning in text
 
 
-def test_walks_stop_at_files_that_there_are_and_at_none_twice() -> None:
+def test_walks_in_the_docs_name_existing_files_once() -> None:
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split("## Three walks")[1].split("\n## ")[0]
     walks = [re.findall(r"`([\w/]+\.py)`", walk) for walk in text.split("\n\n")[2:] if walk.strip()]
     assert len(walks) == 3

@@ -23,6 +23,7 @@ from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.io.survey import SurveyFile
 from scan2sim.pipeline.io.tile import TileFile
+from scan2sim.services.monitoring.events.notify import NotifyParams
 from scan2sim.services.monitoring.events.rules import Rule
 from scan2sim.services.orchestration.deployment import Deployment
 from tests.conftest import ROOT
@@ -36,9 +37,10 @@ PAGES = [
 ]
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 PARAMS: dict[str, type[Params]] = {step.name: step.params for step in STEPS}
-OTHER_PROGRAMS = re.compile(r"\b(prefect|docker|dask|ray|gz|pip|aws|curl|trtexec|export.py)\b")
+OTHER_PROGRAMS = re.compile(r"\b(prefect|docker|dask|ray|gz|pip|aws|curl|kubectl|trtexec|esmini|ros2|export.py)\b")
 """Other programs, whose options a page may mention if it also shows them in a command."""
-SUFFIXES = {"py", "json", "geojson", "csv", "obj", "laz", "png", "npz", "toml", "sdf", "dae", "mtl", "glb", "jpg"}
+IMAGES, ARRAYS, MESHES = {"png", "jpg"}, {"npz", "npy", "laz", "csv"}, {"obj", "mtl", "dae", "glb", "sdf"}
+SUFFIXES = {"py", "json", "geojson", "toml", *IMAGES, *ARRAYS, *MESHES}
 
 
 def text_of(page: Path) -> str:
@@ -124,6 +126,7 @@ class RulesFile(Params):
     """File of alarm rules."""
 
     rules: list[Rule]
+    notify: NotifyParams = NotifyParams()
 
 
 def rejected(model: type[BaseModel], table: dict[str, Any]) -> list[Any]:
@@ -178,11 +181,15 @@ def project_files() -> tuple[str, ...]:
     return tuple(listed.stdout.split())
 
 
+OTHERS_FILES = ("random.py", "navigation_launch.py")
+"""Files of Python and of Nav2 that pages name."""
+
+
 @pytest.mark.parametrize("page", page_params(PAGES + MODULES))
 def test_project_files_exist(page: Path) -> None:
     folders = {name.split("/")[0] for name in project_files() if "/" in name}
     for name in re.findall(r"(?<![\w/.-])(?:[\w.-]+/)*[\w-]+\.(?:py|md|txt|yaml|toml|j2)\b", text_of(page)):
-        ours = name.split("/")[0] in folders if "/" in name else name.endswith(".py") and name != "random.py"
+        ours = name.split("/")[0] in folders if "/" in name else name.endswith(".py") and name not in OTHERS_FILES
         if ours:
             assert any(f"/{file}".endswith(f"/{name}") for file in project_files()), f"file not found: {name}"
 

@@ -1,9 +1,12 @@
-"""docs/reference/third-party.md is up to date with constraints.txt."""
+"""Pinned packages: docs/reference/third-party.md lists them, and they install on every supported Python."""
 
 from __future__ import annotations
 
+import importlib.metadata
 import re
+import sys
 
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 from deploy.third_party import closure, page, project
@@ -34,3 +37,14 @@ def test_the_core_contains_no_gpl_packages() -> None:
             r"L?GPL-[\d.]+-or-later WITH GCC-exception-3.1|LGPL-[\d.]+-or-later|FTL OR GPL-2.0-or-later", "", line
         )
         assert "GPL" not in rest and "GNU General" not in rest, line
+
+
+def test_pinned_packages_install_on_the_first_patch_release_of_this_python() -> None:
+    """Distributions keep early patch releases: Debian 12 has Python 3.11.2."""
+    first = f"{sys.version_info[0]}.{sys.version_info[1]}.0"
+    required = {
+        f"{package.metadata['Name']} {package.version}": python
+        for package in importlib.metadata.distributions()
+        if (python := package.metadata.get("Requires-Python"))  # type: ignore[attr-defined]
+    }
+    assert {name: python for name, python in required.items() if not SpecifierSet(python).contains(first)} == {}

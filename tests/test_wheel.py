@@ -13,6 +13,7 @@ import tarfile
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -41,12 +42,16 @@ def build(source: Path, kind: str, out: Path) -> Path:
     return next(out.iterdir())
 
 
+SAFE_EXTRACTION: dict[str, Any] = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}
+"""Python 3.11.2 (Debian 12) has no extraction filters."""
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Wheel built from the sdist, as installers do without a wheel for their platform."""
     folder = tmp_path_factory.mktemp("wheel")
     with tarfile.open(build(ROOT, "sdist", folder / "sdist")) as sdist:
-        sdist.extractall(folder / "source", filter="data")
+        sdist.extractall(folder / "source", **SAFE_EXTRACTION)
     return build(next((folder / "source").iterdir()), "wheel", folder / "wheel")
 
 

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.core.types import Camera
+from scan2sim.pipeline.core.types import Camera, Frame, Mesh
 from scan2sim.pipeline.simulation.robot import ROBOT
-from tests.fakes.world_checks import Fault, drops, renderings
+from tests.fakes.world_checks import Fault, drops, rays, renderings
 from tests.fakes.world_checks.drive import Pose, drive
-from tests.fakes.world_checks.reference import WorldReference
-from tests.fakes.world_checks.renderings import Photo
+from tests.fakes.world_checks.reference import Photo, Visible, WorldReference
 
 NO_POINTS = np.zeros((0, 3))
 
@@ -82,3 +81,24 @@ def test_an_image_from_another_position_than_the_photo_is_a_fault(tmp_path: Path
     with pytest.raises(Fault) as caught:
         renderings.compare(export, "synthesized", photo, scene[:, 40:], compared)
     assert caught.value.metrics["picture_off_px"] == pytest.approx(20, abs=1)
+
+
+def floor(z: float) -> Mesh:
+    corners = np.array([[-90, -90, z], [90, -90, z], [90, 90, z], [-90, 90, z]], np.float32)
+    return Mesh(Frame(), corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
+
+
+def test_ranges_of_a_lidar_that_are_3_cm_off_or_missing_and_absent_intensities_are_faults() -> None:
+    origins, directions = rays.rays(street())
+    visible = (Visible("terrain", floor(0), reflective=True),)
+    true = np.where(directions[:, 2] < 0, rays.LIDAR_HEIGHT_M / np.maximum(-directions[:, 2], 1e-9), np.inf)
+    true[np.abs(origins + np.where(np.isfinite(true), true, 0)[:, None] * directions)[:, :2].max(axis=1) > 90] = np.inf
+    retro = np.full(len(true), 100.0)
+    good = rays.compare(origins, directions, true + 0.01, retro, visible)
+    assert good["lidar_off_median_m"] == pytest.approx(0.01, abs=1e-4) and good["lidar_rays"]["terrain"] > 1000
+    with pytest.raises(Fault, match="terrain"):
+        rays.compare(origins, directions, true + 0.03, retro, visible)
+    with pytest.raises(Fault, match="here or there only"):
+        rays.compare(origins, directions, np.where(np.arange(len(true)) % 50, true, np.inf), retro, visible)
+    with pytest.raises(Fault, match="intensity"):
+        rays.compare(origins, directions, true, 0 * retro, visible)

@@ -95,9 +95,12 @@ def _score(pixel_errors: Errors, photo: U8, render: U8, mask: Bools) -> dict[str
     }
 
 
-def errors(photo: U8, render: U8, mask: Bools) -> Errors:
-    """Per-pixel errors of a rendering (H, W, 3) against a photo (H, W, 3), within `mask` (H, W)."""
-    like = matched(photo, render, mask)
+def errors(photo: U8, render: U8, mask: Bools, gain: F64 | None = None) -> Errors:
+    """Per-pixel errors of a rendering (H, W, 3) against a photo (H, W, 3), within `mask` (H, W).
+
+    `gain` (3,) is the gain of each channel; None: the least-squares gain within the mask.
+    """
+    like = apply_gain(render, solve_gain(photo, render, mask) if gain is None else gain)
     squared, squared_gain = (np.full(mask.shape, np.nan, np.float32) for _ in range(2))
     squared[mask] = ((photo[mask].astype(np.float64) - render[mask]) ** 2).mean(axis=1)
     squared_gain[mask] = ((photo[mask].astype(np.float64) - like[mask]) ** 2).mean(axis=1)
@@ -106,8 +109,17 @@ def errors(photo: U8, render: U8, mask: Bools) -> Errors:
 
 def matched(photo: U8, render: U8, mask: Bools) -> U8:
     """The rendering (H, W, 3) scaled by the least-squares gain of each channel to match the photo."""
+    return apply_gain(render, solve_gain(photo, render, mask))
+
+
+def solve_gain(photo: U8, render: U8, mask: Bools) -> F64:
+    """(3,) gain of each channel of the rendering with the least squared error within the mask; 1 if it is empty."""
     a, b = photo[mask].astype(np.float64), render[mask].astype(np.float64)
-    gain = (a * b).sum(axis=0) / np.maximum((b * b).sum(axis=0), 1.0)
+    return np.asarray((a * b).sum(axis=0) / np.maximum((b * b).sum(axis=0), 1.0)) if len(a) else np.ones(3)
+
+
+def apply_gain(render: U8, gain: F64) -> U8:
+    """The rendering (H, W, 3) times a gain (3,) per channel."""
     return np.clip(np.round(render * gain), 0, 255).astype(np.uint8)
 
 

@@ -5,6 +5,10 @@ exposure or white balance is a factor, so the logarithm of a sample is a sum: ga
 vignetting of the camera (a polynomial of the distance to the image centre) + colour of the point. Solved by robust
 least squares (Huber, iteratively reweighted) with the point colours eliminated (Schur complement), and with a prior
 towards no change, or towards the exposures of an earlier tile, so that neighbouring tiles agree.
+
+The prior weighs a share (`own_exposure`) of the photo's observations: photos that see the same surfaces agree, but over
+a long stretch the world follows the camera's automatic exposure, so that neither sun nor shade clips. What is still
+too bright is compressed by a tone curve (`exposure_model.compressed`), whose white point follows from the largest gain.
 """
 
 from __future__ import annotations
@@ -36,7 +40,9 @@ class ExposureParams(Params):
         prior: `exposure.json` of an earlier tile; photos and cameras that occur in it keep its values.
         samples: surface points sampled per photo.
         max_distance: metres from the camera beyond which a photo is not sampled.
-        spread: expected difference between exposures in stops (EV): standard deviation of the prior.
+        own_exposure: weight of a photo's own exposure relative to its agreement with other photos. Near 0, all photos
+            of a tile are brought to one exposure; higher, the world's brightness follows the camera's automatic
+            exposure along the path, which keeps highlights.
         tint: expected difference between a channel's gain and the other channels' in stops (EV).
     """
 
@@ -45,7 +51,7 @@ class ExposureParams(Params):
     prior: FileName = ""
     samples: int = Field(1500, ge=50, le=100_000)
     max_distance: Distance = 100.0
-    spread: ExposureStops = 1.0
+    own_exposure: float = Field(0.02, ge=0, le=10)
     tint: ExposureStops = 0.15
 
 
@@ -53,10 +59,10 @@ SAMPLING_PIXELS_MAX = 400_000
 """Points are sampled from depth maps of at most this many pixels."""
 HUBER_RESIDUAL = 0.06
 """Residual (logarithm of encoded values) beyond which an observation is down-weighted (Huber)."""
-GREY_LEVEL_MIN, GREY_LEVEL_MAX = 12, 243
-"""Grey levels outside of which an observation is rejected as under- or overexposed."""
 PRIOR_TOLERANCE_EV = 0.05
 """Stops by which a photo may depart from the exposure that an earlier tile estimated for it (standard deviation)."""
+MAX_GAIN_EV = 3.0
+"""Stops by which a photo's exposure may change (standard deviation), for photos with few observations."""
 IRLS_ITERATIONS = 8
 VIGNETTING_RESIDUAL_RATIO_MAX = 0.8
 """Vignetting is kept if it reduces the median residual below this share of the residual without it."""
@@ -91,6 +97,7 @@ def exposure(inputs: Inputs, params: ExposureParams, out: Path, report: Report) 
             "disagreement_before": round(spread[0], 4),
             "disagreement_after": round(spread[1], 4),
             "vignetting": {name: list(v) for name, v in solved.vignetting.items()},
+            "white_level": round(solved.white, 1),
             "cameras": len({camera_of(v) for v in views}),
         }
     solved.save(out / "exposures.json")
@@ -167,7 +174,7 @@ def _observe(
     from scan2sim.pipeline.camera.depth_map import DepthMap as Map
     from scan2sim.pipeline.camera.depth_map import visible
     from scan2sim.pipeline.camera.projection import pixels
-    from scan2sim.texturing.photo_cache import SRGB_OFFSET
+    from scan2sim.texturing.photo_cache import GREY_LEVEL_MAX, GREY_LEVEL_MIN, SRGB_OFFSET
 
     camera = view.camera
     to = view.centre - point
@@ -245,7 +252,7 @@ def _least_squares(
     owner = np.concatenate([channel * points + point for channel in range(3)])
     P = sp.csr_array((np.ones(3 * count), (np.arange(3 * count), owner)), (3 * count, 3 * points))
     y = -seen.value.T.ravel()  # gain minus the point's colour equals minus the observed value
-    centre, precision = _prior(views, photos, lenses, prior, params)
+    centre, precision = _prior(views, photos, np.bincount(own), lenses, prior, params)
     w = np.ones(3 * count)
     x, residual = centre, y
     for _ in range(IRLS_ITERATIONS):  # point colours eliminated by the Schur complement, outliers down-weighted
@@ -271,11 +278,15 @@ def _least_squares(
 def _prior(
     views: Sequence[View],
     photos: I64,
+    observations: I64,
     lenses: Sequence[str],
     prior: Exposures,
     params: ExposureParams,
 ) -> tuple[F64, F64]:
-    """Mean (U,) and precision (U, U) of the unknowns' prior, in units of one observation's precision."""
+    """Mean (U,) and precision (U, U) of the unknowns' prior, in units of one observation's precision.
+
+    `observations` (n,): number of observations of each of the `photos` (n,).
+    """
     from scan2sim.texturing.photo_cache import SRGB_GAMMA
 
     stop = np.log(2) / SRGB_GAMMA  # one stop, as logarithm of encoded values
@@ -290,8 +301,9 @@ def _prior(
             # the earlier tile observed the photo about as often as this one does
             weight[at, at] += noise / (PRIOR_TOLERANCE_EV * stop) ** 2 * 1e3
             continue
-        # mean gain (r + g + b) / 3 within `spread`; differences between channels within `tint`
-        weight[np.ix_(at, at)] += noise / (params.spread * stop) ** 2 / 9
+        # mean gain (r + g + b) / 3 by its share of three channels' observations; differences of channels within `tint`
+        mean = 3 * params.own_exposure * observations[k] + noise / (MAX_GAIN_EV * stop) ** 2
+        weight[np.ix_(at, at)] += mean / 9
         difference = np.eye(3) - 1 / 3
         weight[np.ix_(at, at)] += noise / (params.tint * stop) ** 2 * difference
     for k, name in enumerate(lenses):
@@ -301,4 +313,4 @@ def _prior(
     return centre, weight
 
 
-EXPOSURE = Step("exposure", 1, exposure, ExposureParams)
+EXPOSURE = Step("exposure", 2, exposure, ExposureParams)

@@ -17,7 +17,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.step import Report
-from scan2sim.pipeline.core.types import F64, I64, Mesh
+from scan2sim.pipeline.core.types import F32, F64, I64, Mesh
 from scan2sim.pipeline.geometry.boundary_curve import curve
 from scan2sim.pipeline.io.file_checks import link_or_copy
 from scan2sim.pipeline.io.images import image
@@ -156,6 +156,7 @@ def _join(tiles: Sequence[SceneTile], group: str, out: Path) -> None:
     """Write a group of several tiles as one textured mesh, local to the first tile, welded along their borders."""
     out.mkdir(parents=True)
     vertices, faces, uv, page, codes = np.zeros((0, 3)), [], [], [], []
+    reflectance: F32 | None = np.zeros(0, np.float32)
     pages = 0
     for tile in tiles:
         shape = textured_mesh.read(tile.folder / group) if group in tile.groups else None
@@ -166,6 +167,11 @@ def _join(tiles: Sequence[SceneTile], group: str, out: Path) -> None:
         vertices, index = _welded(
             vertices, mesh.vertices.astype(np.float64) + np.subtract(tile.offset, tiles[0].offset)
         )
+        if reflectance is not None and shape.reflectance is not None:
+            reflectance = np.resize(reflectance, len(vertices))
+            reflectance[index] = shape.reflectance
+        else:
+            reflectance = None
         faces.append(index[mesh.faces])
         uv.append(mesh.uv)
         page.append(mesh.page + pages)
@@ -183,6 +189,8 @@ def _join(tiles: Sequence[SceneTile], group: str, out: Path) -> None:
         page=np.concatenate(page).astype(np.int16),
         classification=np.concatenate(codes),
     ).save(out / "mesh.npz")
+    if reflectance is not None:
+        textured_mesh.save_reflectance(out, reflectance)
 
 
 def _welded(vertices: F64, more: F64) -> tuple[F64, I64]:

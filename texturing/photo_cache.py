@@ -14,12 +14,15 @@ import numpy as np
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, U8, View
 from scan2sim.pipeline.io.images import image
+from scan2sim.texturing.consistency_result import PhotoConsistency
 
 CACHE_MAX_BYTES = 300_000_000
 """Bytes of photos kept in memory between uses."""
 SRGB_OFFSET = 255 * 0.055
 """sRGB is a power law of (value + offset): a change of exposure is almost exactly a factor of that sum."""
 SRGB_GAMMA = 2.4
+GREY_LEVEL_MIN, GREY_LEVEL_MAX = 12, 243
+"""Grey levels outside of which a sample counts as under- or overexposed."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +43,17 @@ class Exposures:
         gain, vignetting = self.gain.get(view.name, (1.0, 1.0, 1.0)), self.vignetting.get(camera_of(view), (0.0, 0.0))
         return np.array([*(math.log(g) for g in gain), *vignetting]) / SRGB_GAMMA
 
+    @property
+    def white(self) -> float:
+        """Corrected level of a surface just below overexposure in the photo with the largest gain; at least 255."""
+        largest = max((g for gains in self.gain.values() for g in gains), default=1.0)
+        return max(255.0, (GREY_LEVEL_MAX + SRGB_OFFSET) * largest ** (1 / SRGB_GAMMA) - SRGB_OFFSET)
+
     def save(self, path: Path) -> None:
         """Write as JSON."""
-        body = {"gain": {k: list(v) for k, v in self.gain.items()}}
-        path.write_text(
-            json.dumps(body | {"vignetting": {k: list(v) for k, v in self.vignetting.items()}}, indent=1),
-            encoding="utf-8",
-        )
+        factors = {"gain": self.gain, "vignetting": self.vignetting}
+        body = {name: {k: list(v) for k, v in values.items()} for name, values in factors.items()}
+        path.write_text(json.dumps(body, indent=1), encoding="utf-8")
 
     @classmethod
     def load(cls, path: Path) -> Exposures:
@@ -69,9 +76,8 @@ class Exposures:
 
 
 def camera_of(view: View) -> str:
-    """Name of a view's camera, the same in all tiles: model, image size and focal length."""
-    c = view.camera
-    return f"{c.model}_{c.width}x{c.height}_{c.fx:.0f}"
+    """Name of a view's camera, the same in all tiles, which refine its lens separately: folder and image size."""
+    return f"{view.name.rpartition('/')[0]}_{view.camera.width}x{view.camera.height}"
 
 
 @dataclass(frozen=True)
@@ -100,13 +106,14 @@ class PhotoCache:
     Args:
         views: posed photos.
         band: wavelength in pixels of a photo; `Photo.low` contains what is coarser.
+        consistency: gives the masks; None: they are the photos' own.
 
     Attributes:
         skipped: index of a view to the reason why its photo can't be used.
     """
 
-    def __init__(self, views: Sequence[View], band: int = 8) -> None:
-        self._views, self._band = views, band
+    def __init__(self, views: Sequence[View], band: int = 8, consistency: PhotoConsistency | None = None) -> None:
+        self._views, self._band, self._consistency = views, band, consistency
         self._cached: OrderedDict[int, Photo] = OrderedDict()
         self.skipped: dict[int, str] = {}
 
@@ -123,6 +130,10 @@ class PhotoCache:
             while len(self._cached) > 1 and sum(p.bytes for p in self._cached.values()) > CACHE_MAX_BYTES:
                 self._cached.popitem(last=False)
         return photo
+
+    def clear(self) -> None:
+        """Free the memory of the photos."""
+        self._cached.clear()
 
     def mask(self, i: int) -> U8 | None:
         """Mask of view `i` at its photo's size, (0, 0) if it has none; None if the mask can't be used."""
@@ -141,7 +152,7 @@ class PhotoCache:
         except InputError as error:
             self.skipped[i] = f"{view.photo}: {error.cause}"
             return None
-        mask = self.mask(i)
+        mask = self.mask(i) if self._consistency is None else self._consistency.mask(i, view)
         if mask is None:
             return None
         half = downsampled(full, 2)

@@ -11,14 +11,16 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field
 
+from scan2sim.pipeline.core.classes import PHOTO_CLASSES
 from scan2sim.pipeline.core.parameters import Cosine, Depth, Distance
+from scan2sim.pipeline.core.parts import NO_PARTS, Parts, file_digest
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, U8, Bools, View
 from scan2sim.pipeline.io import views as views_io
@@ -46,6 +48,9 @@ GHOST_MIN_PIXELS = 60
 """Compared pixels of the smallest ghost."""
 GHOST_SHARE_MAX = 0.25
 """Share of a photo beyond which differences are not ghosts: the photo as a whole is displaced."""
+SIGN_EDGE_PX = 6
+"""Compared pixels around what is classified as a traffic sign that are no ghosts, either: its rim, and cells of the
+network's output."""
 OVEREXPOSED_LEVEL = 250
 """Grey level from which a pixel counts as overexposed."""
 OVEREXPOSED_SHARE_MAX = 0.6
@@ -81,10 +86,13 @@ class PhotoConsistencyParams(Params):
     bias: Depth = 0.04
 
 
-def photo_consistency(inputs: Inputs, params: PhotoConsistencyParams, out: Path, report: Report) -> Done:
+def photo_consistency(
+    inputs: Inputs, params: PhotoConsistencyParams, out: Path, report: Report, parts: Parts = NO_PARTS
+) -> Done:
     """Compare every photo that is not held out with its neighbours.
 
-    Inputs: `views`, `depth` (folder of depth maps), `exposures`.
+    Inputs: `views`, `depth` (folder of depth maps), `exposures`; `labels`, classes of the photos (optional): what is
+    classified as a traffic sign is no ghost.
     Folder: `photo_consistency`, with `photo_consistency.json` (one row per view), `mask_<i>.png` for photos with
     masked pixels (own mask, ghosts, sky), and `warp_<i>.npy` for photos that are warped.
     """
@@ -108,22 +116,48 @@ def photo_consistency(inputs: Inputs, params: PhotoConsistencyParams, out: Path,
         for view, out_ in zip(views, held, strict=True)
     ]
     nearest = neighbours(views, used, depth, params)
+
+    def row_of(i: int) -> tuple[dict[str, Any], list[Path]]:
+        """A photo's columns, and the files about it."""
+        photo, files = photos.get(i), []
+        if photo is None:
+            return {"usable": False, "reason": photos.skipped[i]}, []
+        compared = compare(i, nearest[i], views, depth, photos, exposures, params)
+        row, own = compared.figures, photo.mask
+        if params.sky:
+            own, row["sky_share"] = without_sky(views[i], photo.levels[0], own, depth(i))
+        ghosts = compared.ghosts if params.ghosts else None
+        if ghosts is not None and "labels" in inputs:
+            ghosts = ghosts & ~sign_pixels(inputs["labels"] / f"{i}.npy", ghosts.shape)
+        mask = combined(ghosts, own)
+        if mask is not None:
+            files.append(folder / f"mask_{i}.png")
+            image.write(files[-1], mask)
+        if params.align and compared.warp is not None:
+            files.append(folder / f"warp_{i}.npy")
+            np.save(files[-1], compared.warp)
+        return row, files
+
+    @cache
+    def made_from(i: int) -> list[Any]:
+        files = [path for path in (views[i].photo, views[i].mask, inputs["depth"] / f"{i}.npy") if path]
+        about = [views_io.to_json(views[i]), exposures.of(views[i]).tolist()]
+        return [i, *about, *map(file_digest, files)]
+
     for done, i in enumerate(used):
         report(done / len(used), views[i].name)
-        photo = photos.get(i)
-        if photo is None:
-            rows[i] |= {"usable": False, "reason": photos.skipped[i]}
-            continue
-        compared = compare(i, nearest[i], views, depth, photos, exposures, params)
-        rows[i] |= compared.figures
-        own = photo.mask
-        if params.sky:
-            own, rows[i]["sky_share"] = without_sky(views[i], photo.levels[0], own, depth(i))
-        mask = combined(compared.ghosts if params.ghosts else None, own)
-        if mask is not None:
-            image.write(folder / f"mask_{i}.png", mask)
-        if params.align and compared.warp is not None:
-            np.save(folder / f"warp_{i}.npy", compared.warp)
+        column = folder / f"row_{i}.json"
+
+        def compute(i: int = i, column: Path = column) -> list[Path]:
+            row, files = row_of(i)
+            column.write_text(json.dumps(row), encoding="utf-8")
+            return [column, *files]
+
+        labels = file_digest(inputs["labels"] / f"{i}.npy") if "labels" in inputs else ""
+        others = [made_from(j) for j in (i, *nearest[i])]
+        parts.provide(folder, [params.model_dump(mode="json"), labels, others], compute)
+        rows[i] |= json.loads(column.read_text(encoding="utf-8"))
+        column.unlink()
     _exclude_and_downweight(rows, params)
     (folder / "photo_consistency.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
     return Done(
@@ -300,6 +334,21 @@ def ghost_mask(mine: F32, predicted: Prediction, overexposed: Bools) -> Bools:
     return np.asarray(cv2.dilate(ghost.astype(np.uint8), np.ones((7, 7)))) > 0
 
 
+def sign_pixels(labels: Path, shape: tuple[int, ...]) -> Bools:
+    """(h, w) what a photo's classes say is a traffic sign, with its edge; none if the photo wasn't classified.
+
+    Signs don't move. They are small, flat and of strong colours: a photo from nearby, which shows a sign best, differs
+    from those from afar by more than a tolerance for outlines.
+    """
+    import cv2
+
+    if not labels.is_file():
+        return np.zeros(shape, bool)
+    sign = np.load(labels).argmax(axis=2) == PHOTO_CLASSES.index("road_sign")
+    large = cv2.resize(sign.astype(np.uint8), (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(cv2.dilate(large, np.ones((2 * SIGN_EDGE_PX + 1, 2 * SIGN_EDGE_PX + 1)))) > 0
+
+
 def without_sky(view: View, rgb: U8, mask: U8, depth: DepthMap) -> tuple[U8, float]:
     """A photo's mask with sky set to 0 as well ((0, 0): no mask), and the share of sky in the photo."""
     from scan2sim.pipeline.camera.models import pixel_angle, pixel_rays
@@ -369,4 +418,4 @@ def _metrics(rows: Sequence[dict[str, Any]], used: Sequence[int]) -> dict[str, A
     }
 
 
-PHOTO_CONSISTENCY = Step("photo_consistency", 3, photo_consistency, PhotoConsistencyParams)
+PHOTO_CONSISTENCY = Step("photo_consistency", 5, photo_consistency, PhotoConsistencyParams, parts=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,14 +13,18 @@ from pydantic import Field
 from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.parameters import Distance
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.core.types import F32, I64, Bools, View
+from scan2sim.pipeline.core.types import F32, I64, U8, Bools, View
+from scan2sim.pipeline.io import sky
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images.album import Album
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.camera.renderer import Renderer
+    from scan2sim.texturing.whole_frame import WholeFrame
 
 SCORE_KEYS = ("psnr_db", "psnr_gain_db", "ssim", "sharpness")
+FRAME_KEYS = ("psnr_db", "psnr_gain_db", "ssim", "ms_ssim", "excluded")
+"""Figures of whole frames: each photo's, with `frame_` before them, and their means in `frame`."""
 CAMERA_CLEARANCE_M = 1.0
 """Metres around a camera in which there can't have been a surface."""
 
@@ -46,28 +50,48 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     a person that the world leaves out (from the depth maps in the folder `depth`). Held-out photos without such pixels
     are scored as well, over other pixels (`evaluate.HeldOut.mask`).
 
-    File: `error`, a folder with an image of photo, rendering and difference for every held-out photo, and an
-    `index.json` of them. Metrics (None if no pixel is counted): `held_out`, number of photos; means over the photos of
-    `psnr_db` (as rendered), `psnr_gain_db` (after a gain per channel), `ssim` and `sharpness`; `photos`, the same for
-    each photo, and `coverage`, 0 if no other photo saw what it shows; `by_class` and `by_distance`, the same over
-    their pixels, without sharpness; `truth_psnr_db` and `truth_psnr_near_db` for generated tiles; `cameras`, their
-    number (`count`) and the distance in metres to the nearest surface of those within `CAMERA_CLEARANCE_M` of one
-    (`near_m`). If `instances` are given, `residue_m2`: surface left of each removed vehicle
-    (`pipeline.dynamic_objects.vehicle_residue`).
+    Whole frames are scored beside (`texturing.whole_frame`): all pixels of the held-out photos count except vehicles
+    and people that the world leaves out, `backdrop` (a textured mesh behind the surfaces) and `sky` (colour where
+    nothing is) are shown, and `labels` (classes of the photos) distinguish sky from missing surface.
+
+    Files: `error`, a folder with an image of photo, rendering and difference for every held-out photo, and an
+    `index.json` of them; `frames`, the same with photo and whole frame.
+
+    Metrics (None if no pixel is counted):
+        held_out: number of photos.
+        psnr_db (as rendered), psnr_gain_db (after a gain per channel), ssim, sharpness: means over the photos.
+        photos: the same for each photo; `coverage`, 0 if no other photo saw what it shows; `frame_...`, as in `frame`.
+        by_class, by_distance: the same over their pixels, without sharpness.
+        frame: `psnr_db`, `psnr_gain_db`, `ssim` and `ms_ssim` of whole frames, means over the photos; `excluded`, the
+            share of pixels that don't count; `by_class` and `by_distance`.
+        truth_psnr_db, truth_psnr_near_db: for generated tiles.
+        cameras: `count`, their number, and `near_m`, the distance in metres to the nearest surface of those within
+            `CAMERA_CLEARANCE_M` of one.
+        residue_m2: if `instances` are given, surface left of each removed vehicle
+            (`pipeline.dynamic_objects.vehicle_residue`).
     """
-    from scan2sim.pipeline.camera.renderer import Renderer, textured
+    from scan2sim.pipeline.camera.renderer import Body, Renderer, textured
     from scan2sim.pipeline.dynamic_objects.vehicle_residue import residue_areas
     from scan2sim.texturing import evaluate
+    from scan2sim.texturing.whole_frame import box_mesh, whole_frame
 
-    groups = [g for g in SURFACES if g in inputs]
-    world = Renderer([textured(inputs[g]) for g in groups])
+    groups, colour = [g for g in SURFACES if g in inputs], sky.read(inputs.get("sky"))
+    world = Renderer([textured(inputs[g]) for g in groups], colour)
+    backdrop = Renderer([textured(inputs["backdrop"])], colour) if "backdrop" in inputs else None
+    boxes = None
+    if "instances" in inputs and world.bodies:
+        left_out = box_mesh(inputs["instances"], world.bodies[0].mesh.frame, keep_vehicles="vehicle" in groups)
+        boxes = Renderer([Body(left_out)])
     views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
     index = [i for i, out_ in enumerate(held) if out_]
     depths = [inputs["depth"] / f"{i}.npy" for i in index]
-    album = Album(out / "error")
+    album, frames = Album(out / "error"), Frames(Album(out / "frames"), groups)
     album.folder.mkdir()
+    frames.album.folder.mkdir()
     photos: dict[str, dict[str, float | None]] = {}
     unread = {views[i].name: views[i].photo for i in index}
+    index_of = {views[i].name: i for i in index}
+    depth_of = dict(zip(index_of, depths, strict=True))
     warnings: list[str] = []
     by_class, by_distance = np.zeros((len(groups), 5)), np.zeros((len(evaluate.BAND_NAMES), 5))
     results = evaluate.held_out(world, [views[i] for i in index], depths) if index else ()
@@ -83,7 +107,13 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
         by_distance += evaluate.tally(result.errors, _band(result.render.range), len(by_distance))
         error_image, caption = evaluate.error_image(result), _caption(photos[name])
         album.add(f"{i:03d}_{Path(name).name}", error_image, "error", name, caption)
+        labels = inputs["labels"] / f"{index_of[name]}.npy" if "labels" in inputs else None
+        known = np.load(labels) if labels is not None and labels.is_file() else None
+        whole = whole_frame(result, len(groups), np.load(depth_of[name]), known, boxes, backdrop)
+        if whole is not None:
+            photos[name] |= frames.add(f"{i:03d}_{Path(name).name}", name, result.photo, whole)
     album.save()
+    frames.album.save()
     warnings += [f"{file}: held out, but not scored: the photo or its mask can't be read" for file in unread.values()]
     metrics: dict[str, Any] = {"held_out": len(photos)}
     metrics |= {key: _mean([figures[key] for figures in photos.values()]) for key in SCORE_KEYS}
@@ -92,6 +122,7 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     metrics["by_distance"] = {
         band: _rounded(evaluate.figures(sums)) for band, sums in zip(evaluate.BAND_NAMES, by_distance, strict=True)
     }
+    metrics["frame"] = frames.metrics(photos)
     if "truth.points" in inputs:
         report(0.9, "comparing with ground-truth colours")
         metrics |= _truth(inputs, world, params)
@@ -100,7 +131,47 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
         others = [body.mesh for group, body in zip(groups, world.bodies, strict=True) if group != "vehicle"]
         left = residue_areas(others, inputs["instances"])
         metrics["residue_m2"] = [round(area, 2) for area in left]
-    return Done({"error": album.folder}, metrics, warnings)
+    return Done({"error": album.folder, "frames": frames.album.folder}, metrics, warnings)
+
+
+class Frames:
+    """Whole frames of the held-out photos: their figures, and an album.
+
+    Args:
+        album: receives an image of each.
+        groups: names of the world's bodies.
+    """
+
+    def __init__(self, album: Album, groups: Sequence[str]) -> None:
+        from scan2sim.texturing.evaluate import BAND_NAMES
+        from scan2sim.texturing.whole_frame import NO_SURFACE
+
+        self.album = album
+        self._names = {"by_class": [*groups, *NO_SURFACE], "by_distance": [*BAND_NAMES, "no surface"]}
+        self._sums = {kind: np.zeros((len(names), 5)) for kind, names in self._names.items()}
+
+    def add(self, file: str, name: str, photo: U8, frame: WholeFrame) -> dict[str, float | None]:
+        """Add a photo's frame; returns its figures."""
+        from scan2sim.texturing import evaluate, whole_frame
+
+        for kind, sums in self._sums.items():
+            sums += evaluate.tally(frame.errors, getattr(frame, kind), len(sums))
+        whole = evaluate.figures(evaluate.tally(frame.errors, np.zeros(frame.mask.shape, np.int64), 1)[0])
+        own = {key: whole[key] for key in ("psnr_db", "psnr_gain_db", "ssim")}
+        own |= {"ms_ssim": frame.ms_ssim, "excluded": frame.excluded}
+        figures = _rounded({f"frame_{key}": value for key, value in own.items()})
+        self.album.add(file, whole_frame.picture(photo, frame), "frame", name, whole_frame.caption(figures))
+        return figures
+
+    def metrics(self, photos: Mapping[str, Mapping[str, float | None]]) -> dict[str, Any]:
+        """Means over the photos, and figures by class and by distance."""
+        from scan2sim.texturing import evaluate
+
+        means = {key: _mean([one.get(f"frame_{key}") for one in photos.values()]) for key in FRAME_KEYS}
+        return means | {
+            kind: {name: _rounded(evaluate.figures(row)) for name, row in zip(names, self._sums[kind], strict=True)}
+            for kind, names in self._names.items()
+        }
 
 
 def _rounded(figures: dict[str, Any]) -> dict[str, Any]:
@@ -176,4 +247,4 @@ def _seen_from_near(inputs: Inputs, points: F32, normals: F32, near: float) -> B
     return seen
 
 
-SCORE = Step("score", 4, score, ScoreParams, side_product=True, memory=(1.3, 3))
+SCORE = Step("score", 5, score, ScoreParams, memory=(1.3, 3))

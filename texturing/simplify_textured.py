@@ -7,6 +7,7 @@ several points where texels become wider. Edges on the borders of tiles are kept
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -16,6 +17,7 @@ from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F64, I64, U8, Bools, Frame, Mesh
 from scan2sim.pipeline.io.worlds import scene as scenes
 from scan2sim.pipeline.io.worlds.scene import Scene, Surface
+from scan2sim.pipeline.io.worlds.textured_mesh import save_reflectance
 from scan2sim.texturing.texture_page import Page
 
 if TYPE_CHECKING:
@@ -76,7 +78,7 @@ def simplified_scene(scene: Scene, triangles: int | None, texels: float | None, 
             views=tile.views(), photos=photos,
         )  # fmt: skip
     scenes.write_scene_file(world, scene.name, scene.frame, [tile.name for tile in scene.tiles])
-    return scenes.read_scene(world)
+    return replace(scenes.read_scene(world), dome=scene.dome)
 
 
 def simplify_group(group: str, shape: Textured, source: Path, share: Share, borders: F64 | None, out: Path) -> Mesh:
@@ -108,6 +110,8 @@ def simplify_group(group: str, shape: Textured, source: Path, share: Share, bord
         texel *= 1.05 * np.sqrt(count / budget)
     flat = layout.applied_to(small)
     flat.save(out / "mesh.npz")
+    if shape.reflectance is not None:
+        save_reflectance(out, shape.reflectance[_nearest_vertex(shape.mesh, flat)])
     _paint(flat, layout.pages, source, out, int(np.clip(np.rint(share.texels**-0.5), 1, MAX_SUPERSAMPLING)))
     return flat
 
@@ -117,6 +121,13 @@ def _nearest(mesh: Mesh, small: Mesh) -> I64:
     from scipy.spatial import cKDTree
 
     return np.asarray(cKDTree(mesh.corners.mean(axis=1)).query(small.corners.mean(axis=1))[1], np.int64)
+
+
+def _nearest_vertex(mesh: Mesh, small: Mesh) -> I64:
+    """(V,) for each vertex of `small`, the nearest vertex of `mesh`."""
+    from scipy.spatial import cKDTree
+
+    return np.asarray(cKDTree(mesh.vertices).query(small.vertices)[1], np.int64)
 
 
 def _decimated(mesh: Mesh, share: float, borders: F64 | None) -> Mesh:

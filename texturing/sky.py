@@ -76,8 +76,8 @@ def _seeded_components(mask: U8, seeds: U8) -> U8:
     return has_seed[part]
 
 
-def _sky_colour(rgb: U8, empty: U8) -> tuple[F32 | None, U8]:
-    """Sky colour around every pixel (H, W, 3) float32, None if the photo shows no sky; and its seeds (H, W)."""
+def sky_seeds(rgb: U8, empty: U8) -> U8:
+    """(H, W) 1 where a photo (H, W, 3) shows smooth, bright, bluish sky; `empty` (H, W) is 1 without a surface."""
     import cv2
 
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
@@ -88,7 +88,14 @@ def _sky_colour(rgb: U8, empty: U8) -> tuple[F32 | None, U8]:
     r, g, b = cv2.split(rgb)
     is_bluish = (cv2.add(b, SEED_BLUE_DEFICIT_LEVELS) >= cv2.max(r, g)) & (b > SEED_BLUE_MIN_LEVEL)
     seeds = ((inner > 0) & (variance < SEED_STD_LEVELS**2) & is_bluish).astype(np.uint8)
-    seeds = cv2.morphologyEx(seeds, cv2.MORPH_OPEN, np.ones((7, 7)))
+    return np.asarray(cv2.morphologyEx(seeds, cv2.MORPH_OPEN, np.ones((7, 7))), np.uint8)
+
+
+def _sky_colour(rgb: U8, empty: U8) -> tuple[F32 | None, U8]:
+    """Sky colour around every pixel (H, W, 3) float32, None if the photo shows no sky; and its seeds (H, W)."""
+    import cv2
+
+    seeds = sky_seeds(rgb, empty)
     small = (max(1, rgb.shape[1] // 8), max(1, rgb.shape[0] // 8))
     weight = cv2.resize(seeds.astype(np.float32), small, interpolation=cv2.INTER_AREA)
     if float(weight.sum()) * 64 < SEEDS_MIN_PIXELS:

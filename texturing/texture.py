@@ -11,6 +11,7 @@ and photos are read when needed, so memory is bounded by one band and a few phot
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,14 +23,15 @@ from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.parameters import Cosine, Depth, Device
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, I64, U8, Bools, Mesh, PointCloud
+from scan2sim.pipeline.geometry.coarse_surface import coarse_faces
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.io.images import image
 from scan2sim.texturing.consistency_result import PhotoConsistency
 from scan2sim.texturing.texture_page import FILLED, Page
 from scan2sim.texturing.view_selection.choice import Choice
 
 if TYPE_CHECKING:
     from scan2sim.texturing.bake.bands import Baker
+    from scan2sim.texturing.bake.source_texture import SourceTexture
     from scan2sim.texturing.inpainting.ground import GroundOrthophoto
     from scan2sim.texturing.inpainting.hole_filling import PointColours
 
@@ -69,15 +71,16 @@ class TextureParams(Params):
 def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) -> Done:
     """Bake the texture pages of an unwrapped mesh.
 
-    Inputs: `mesh` (with uv and page), `pages` (their sizes), `choice` (selected photos), `views`, `depth` (folder with
-    a depth map for every view), `exposures`, `photo_consistency` (masks and warps of the photos), `cloud.*` (coloured
-    points; `cloud.rest`, the classes without a surface, is not used for colours), `synthesized.*` (synthesized points,
-    optional), `instances` (GeoJSON of the removed vehicles and people, optional).
+    Inputs: `mesh` (with uv and page), `pages` (their sizes), `choice` (selected photos), `views`, `depth`
+    (folder with a depth map for every view), `exposures`, `photo_consistency` (masks and warps of the photos),
+    `cloud.*` (coloured points; `cloud.rest`, the classes without a surface, is not used for colours), `raw.*`
+    (points that `cloud.*` were thinned from, used instead if they are coloured; optional), `uncovered` (thinned points
+    that photos don't cover, optional), `synthesized.*` (synthesized points, optional), `instances` (GeoJSON of the
+    removed vehicles and people, optional),
+    `source_mesh` (the textured mesh that the tile was made from, optional: its texture counts as a photo).
     File: `textured`, a folder with `mesh.npz`, `page_<i>.png` and `page_<i>_seen.png` (255 seen by a photo,
     128 coloured from points, 64 filled from neighbours or by class, 0 no surface).
     """
-    from scan2sim.texturing.bake.page_writer import PageWriter
-    from scan2sim.texturing.inpainting import hole_filling
     from scan2sim.texturing.inpainting.point_colours import point_colours, synthesized_colours
 
     folder = out / "textured"
@@ -88,34 +91,45 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
         return Done({"textured": folder}, {"area_m2": 0.0, "seen_m2": 0.0, "coverage": 0.0, "pages": 0})
     assert mesh.page is not None
     sizes = json.loads(inputs["pages"].read_text(encoding="utf-8"))
+    coarse = coarse_faces(mesh, inputs)
     baker = _baker(mesh, inputs, params)
+    source = _source_texture(mesh, inputs)
     ground = _ground_orthophoto(mesh, sizes, inputs) if params.inpaint else None
     (colours, measured), synthesized = point_colours(inputs, ground), synthesized_colours(inputs)
     counts = np.zeros((len(mesh), 4), np.int64)
-    writer = PageWriter()
+    pages = Pages(folder, out / ".unfinished", params.padding)
     for k, size in enumerate(sizes):
         faces = np.flatnonzero(mesh.page == k)
         page = baker.bake(
             faces, size["width"], size["height"],
             lambda f, m="", k=k: report((k + f) / len(sizes), f"page {k + 1} of {len(sizes)} {m}"),
         )  # fmt: skip
+        if source is not None:
+            source.paint(page)
         if ground is not None:
             ground.clear_removed(page)
         counts[faces] = _fill_unseen(page, faces, mesh, colours, None if measured else synthesized)
         if ground is not None:
             ground.add(page)
-        is_provisional = ground is not None and bool(counts[faces, 3].any())
-        if not is_provisional:
-            hole_filling.pad(page.rgb, page.seen, params.padding)
-        writer.write(folder / f"page_{k}", page, compression=0 if is_provisional else 2)
+        if ground is not None and bool(counts[faces, 3].any()):
+            pages.keep(k, page)
+        else:
+            pages.finish(k, page)
         del page
-    writer.finish()
-    if ground is not None and counts[:, 3].any():
+    if ground is not None and pages.kept:
         report(1.0, "inpainting the ground")
-        _inpaint_pages(ground, folder, mesh, counts[:, 3] > 0, params)
+        baker.forget_photos()
+        del colours, synthesized
+        inpainted = ground.inpaint()
+        for k in pages.kept:
+            page = pages.load(k, mesh)
+            if inpainted is not None:
+                inpainted.fill(page)
+            pages.finish(k, page)
+    pages.close()
     skipped = sorted(baker.photos.skipped.values())
     warnings = [f"{reason}: not used for texture; other photos replace it" for reason in skipped]
-    return Done({"textured": folder}, _metrics(mesh, counts, sizes, baker), warnings)
+    return Done({"textured": folder}, _metrics(mesh, coarse, counts, sizes, baker), warnings)
 
 
 def _baker(mesh: Mesh, inputs: Inputs, params: TextureParams) -> Baker:
@@ -135,6 +149,16 @@ def _baker(mesh: Mesh, inputs: Inputs, params: TextureParams) -> Baker:
         fade=params.fade,
         device=best_device() if params.device == "auto" else params.device,
     )
+
+
+def _source_texture(mesh: Mesh, inputs: Inputs) -> SourceTexture | None:
+    """The texture of the mesh that the tile was made from, or None."""
+    if "source_mesh" not in inputs:
+        return None
+    from scan2sim.pipeline.io.source_mesh import SourceMesh
+    from scan2sim.texturing.bake.source_texture import SourceTexture
+
+    return SourceTexture(SourceMesh.load(inputs["source_mesh"]).moved_to(mesh.frame))
 
 
 def _ground_orthophoto(mesh: Mesh, sizes: Sequence[dict[str, int]], inputs: Inputs) -> GroundOrthophoto:
@@ -157,30 +181,56 @@ def _texel_m(mesh: Mesh, sizes: Sequence[dict[str, int]]) -> float:
     return float(np.percentile(np.sqrt(mesh.face_area / np.maximum(texels, 1e-9)), 25))
 
 
-def _inpaint_pages(
-    orthophoto: GroundOrthophoto, folder: Path, mesh: Mesh, has_filled: Bools, params: TextureParams
-) -> None:
-    """Paint the inpainted ground onto the pages of the faces with `has_filled` (F,), and pad their charts."""
-    from scan2sim.texturing import texel_map as texels
-    from scan2sim.texturing.bake.page_writer import PageWriter
-    from scan2sim.texturing.inpainting import hole_filling
+class Pages:
+    """Files of the texture pages.
 
-    ground = orthophoto.inpaint()
-    assert mesh.page is not None and mesh.uv is not None
-    writer = PageWriter()
-    for k in np.unique(mesh.page[has_filled]).tolist():
-        faces, path = np.flatnonzero(mesh.page == k), folder / f"page_{k}"
-        rgb, seen = (
-            image.read_rgb(path.with_name(f"{path.name}.png")),
-            image.read_levels(path.with_name(f"{path.name}_seen.png")),
+    Args:
+        folder: receives the finished pages.
+        unfinished: folder for those that wait for the inpainted ground; removed at the end.
+        padding: as in `TextureParams`.
+
+    Attributes:
+        kept: the pages that wait.
+    """
+
+    def __init__(self, folder: Path, unfinished: Path, padding: int) -> None:
+        from scan2sim.texturing.bake.page_writer import PageWriter
+
+        self._folder, self._unfinished, self._padding = folder, unfinished, padding
+        self._writer = PageWriter()
+        self.kept: list[int] = []
+
+    def keep(self, k: int, page: Page) -> None:
+        """Keep page `k` for later."""
+        self._unfinished.mkdir(exist_ok=True)
+        np.save(self._unfinished / f"{k}.npy", page.rgb)
+        np.save(self._unfinished / f"{k}_seen.npy", page.seen)
+        self.kept.append(k)
+
+    def load(self, k: int, mesh: Mesh) -> Page:
+        """Page `k` as it was kept."""
+        from scan2sim.texturing import texel_map
+
+        assert mesh.page is not None and mesh.uv is not None
+        faces, rgb, seen = (
+            np.flatnonzero(mesh.page == k),
+            np.load(self._unfinished / f"{k}.npy"),
+            np.load(self._unfinished / f"{k}_seen.npy"),
         )
-        flat = texels.corners(mesh.uv[faces], seen.shape[1], seen.shape[0])
-        page = Page(rgb, seen, texels.owners(flat, seen.shape[1], seen.shape[0]), flat, mesh.corners[faces])
-        if ground is not None:
-            ground.fill(page)
-        hole_filling.pad(page.rgb, page.seen, params.padding)
-        writer.write(path, page)
-    writer.finish()
+        flat = texel_map.corners(mesh.uv[faces], seen.shape[1], seen.shape[0])
+        return Page(rgb, seen, texel_map.owners(flat, seen.shape[1], seen.shape[0]), flat, mesh.corners[faces])
+
+    def finish(self, k: int, page: Page) -> None:
+        """Pad the charts of page `k`, and write it in the background."""
+        from scan2sim.texturing.inpainting import hole_filling
+
+        hole_filling.pad(page.rgb, page.seen, self._padding)
+        self._writer.write(self._folder / f"page_{k}", page)
+
+    def close(self) -> None:
+        """Wait until all pages are written."""
+        self._writer.finish()
+        shutil.rmtree(self._unfinished, ignore_errors=True)
 
 
 def _fill_unseen(
@@ -213,11 +263,14 @@ def _fill_unseen(
     return np.asarray(texels.count(page.owner, page.seen, page.flat))
 
 
-def _metrics(mesh: Mesh, texels: I64, sizes: Sequence[dict[str, int]], baker: Baker) -> dict[str, Any]:
-    """Metrics of a texture: areas (m2) by the source of their colour, photos used and texels from each."""
+def _metrics(mesh: Mesh, coarse: Bools, texels: I64, sizes: Sequence[dict[str, int]], baker: Baker) -> dict[str, Any]:
+    """Metrics of a texture: areas (m2) by the source of their colour, photos used and texels from each.
+
+    Coarse faces (F,), which photos don't cover, count as `coarse_m2` alone.
+    """
     area = mesh.face_area.astype(np.float64)
     share = texels[:, 1:] / np.maximum(texels[:, :1], 1)
-    has_texels = texels[:, 0] > 0  # faces smaller than a texel are not counted
+    has_texels = (texels[:, 0] > 0) & ~coarse  # faces smaller than a texel are not counted
     total = float(area[has_texels].sum())
     seen, coloured, filled = (float(v) for v in (area[has_texels, None] * share[has_texels]).sum(axis=0))
     return {
@@ -225,6 +278,7 @@ def _metrics(mesh: Mesh, texels: I64, sizes: Sequence[dict[str, int]], baker: Ba
         "seen_m2": round(seen, 2),
         "coloured_m2": round(coloured, 2),
         "filled_m2": round(filled, 2),
+        "coarse_m2": round(float(area[coarse].sum()), 2),
         "coverage": round(seen / total, 4) if total else 0.0,
         "pages": len(sizes),
         "texels": int(texels[:, 0].sum()),
@@ -246,7 +300,7 @@ def can_texture(params: TextureParams) -> None:
 
 TEXTURE = Step(
     "texture",
-    7,
+    10,
     texture,
     TextureParams,
     class_defaults={"terrain": {"inpaint": True}},

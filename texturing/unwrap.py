@@ -17,6 +17,7 @@ import numpy.typing as npt
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.core.types import F64, I32, Mesh, View
+from scan2sim.pipeline.geometry.coarse_surface import coarse_faces
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.texturing.texture_layout import (
     Layout,
@@ -39,7 +40,9 @@ ORTHOPHOTO_TEXEL_PX = 0.5
 def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> Done:
     """Assign texture coordinates and a page to every face of `mesh`.
 
-    Inputs: `mesh`; for the backend "photo" also `choice` and `views`.
+    Inputs: `mesh`; for the backend "photo" also `choice` and `views`, and `cloud` and `uncovered` (optional), points
+    that photos cover and others: surface at the latter gets the texels of unseen surface; `source_mesh`, a textured
+    mesh from which the texture will be baked (optional): texels are then at least as large as its pixels.
     Files: `mesh`, with `uv` and `page`; `pages`, JSON list of {"width", "height"} in texels.
 
     Raises:
@@ -49,7 +52,12 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
     mesh = Mesh.load(inputs["mesh"])
     layout = Layout.empty(len(mesh))
     if len(mesh):
-        if params.backend == "photo":
+        if "source_mesh" in inputs:
+            from scan2sim.pipeline.io.source_mesh import SourceMesh
+
+            resolution = SourceMesh.load(inputs["source_mesh"]).resolution_m()
+            layout = unwrapped(mesh, params.model_copy(update={"texel": max(params.texel, resolution)}), report)
+        elif params.backend == "photo":
             detail_view, centres, pixel = _detail_views(inputs)
             orthophoto_pixel = np.append(pixel, 0.0)[detail_view]
             unseen = params.model_copy(update={"texel": params.texel * params.unseen_texel_factor})
@@ -59,8 +67,10 @@ def unwrap(inputs: Inputs, params: UnwrapParams, out: Path, report: Report) -> D
             is_sign = (
                 np.zeros(len(mesh), bool) if mesh.classification is None else mesh.classification == CODE["road_sign"]
             )
+            coarse = coarse_faces(mesh, inputs)
             from_photo = (detail_view >= 0) & (orthophoto_pixel == 0)
-            parts = [(from_photo & ~is_sign, params), ((detail_view >= 0) & (orthophoto_pixel > 0), orthophoto)]
+            parts = [(from_photo & ~is_sign & ~coarse, params), (from_photo & ~is_sign & coarse, unseen)]
+            parts += [((detail_view >= 0) & (orthophoto_pixel > 0), orthophoto)]
             parts += [(from_photo & is_sign, sign_panel)] if is_sign.any() else []
             texel = np.select([faces for faces, _ in parts], [part.texel for _, part in parts], unseen.texel)
             check_size(float((mesh.face_area / texel**2).sum(dtype=np.float64)), params)
@@ -148,7 +158,7 @@ def stretch(corners: npt.NDArray[Any], flat: npt.NDArray[Any]) -> npt.NDArray[An
 
 UNWRAP = Step(
     "unwrap",
-    3,
+    4,
     unwrap,
     UnwrapParams,
     class_defaults={"vegetation": {"texel": 0.03, "gutter": 2}},

@@ -40,7 +40,7 @@ def broker_down(before: float = UP_S, down: float = DOWN_S, after: float = RECOV
             """Read with a new reader; records that an earlier one has received are duplicates."""
             end = time.monotonic() + seconds
             for body in kafka.read(
-                broker.servers, TOPIC, group="bench", from_start=True, wait=0.1, dropped=duplicates.append
+                broker.cluster, TOPIC, group="bench", from_start=True, wait=0.1, dropped=duplicates.append
             ):
                 if body:
                     record_id = json.loads(body)["record id"]
@@ -81,7 +81,7 @@ def _talker(folder: Path, number: int, servers: str) -> subprocess.Popen[bytes]:
         "0.01",
     ]
     command += ["--period", str(PERIOD_S), "--kafka", servers, "--to", TOPIC]
-    command += ["--log", str(folder / f"{number}.log"), "--spool", str(folder / f"{number}.spool")]
+    command += ["--log", str(folder / f"{number}.log"), "--outbox", str(folder / f"{number}.outbox")]
     environment = os.environ | {"ROS_DOMAIN_ID": "88", "SCAN2SIM_TRANSPORT": "cyclone", "PYTHONPATH": str(ROOT)}
     return subprocess.Popen(command, env=environment, cwd=ROOT, stderr=subprocess.DEVNULL)
 

@@ -1,6 +1,6 @@
 """Benchmarks of monitoring and autoscaling.
 
-`python -m bench.bus [--parts experiment sizes forecast overhead broker nodes link] [--speed 25] [--out DIR]`
+`python -m bench.bus [--parts experiment sizes forecast overhead broker alarms nodes link] [--speed 25] [--out DIR]`
 
 - experiment: D3.2, section 3.2 with real nodes (bench/bus/experiment.py): Monday from 6 to 10 h with 10, 20 and 50
   cameras at once, replayed at `--speed`, with message sizes sent as a field; plots are written to DIR.
@@ -9,6 +9,7 @@
 - forecast: error of forecasts on simulated Mondays (bench/bus/forecast.py).
 - overhead: a publisher and a subscriber, monitored and plain (bench/bus/overhead.py); needs an idle machine.
 - broker: records of ten nodes while the broker is down for a minute (bench/bus/broker_outage.py).
+- alarms: alarms of living nodes while the broker is down, and of one with a slow clock (bench/bus/alarms.py).
 - nodes: a hundred nodes on one machine, monitored by one page (bench/bus/many_nodes.py).
 - link: reported bandwidth, loss and latency, compared with emulated links (bench/bus/link.py); requires root.
 
@@ -24,7 +25,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.bus import broker_outage, link, many_nodes, overhead
+from bench.bus import alarms, broker_outage, link, many_nodes, overhead
 from bench.bus import experiment as bus_experiment
 from bench.bus import forecast as bus_forecast
 from bench.bus.experiment import MAX_AGE_S, Outcome, Replay
@@ -62,13 +63,15 @@ PARTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "forecast": forecast,
     "overhead": lambda _: overhead.overhead(),
     "broker": lambda _: broker_outage.broker_down(),
+    "alarms": lambda _: alarms.false_alarms(),
     "nodes": lambda _: many_nodes.nodes_watched(),
     "link": lambda _: link.link(),
 }
 KEYS = ("experiment", "overhead_p50_1kb", "overhead_throughput_1kb", "overhead_p50_6mb", "broker_down_lost",
-        "broker_down_doubles", "bandwidth_error", "loss_error", "latency_error", "nodes_watched")  # fmt: skip
+        "broker_down_doubles", "bandwidth_error", "loss_error", "latency_error", "nodes_watched", "false_alarms",
+        "flaps")  # fmt: skip
 """Keys that the result always has."""
-FLAT = ("overhead", "broker", "nodes", "link")
+FLAT = ("overhead", "broker", "alarms", "nodes", "link")
 """Parts whose results are merged into the top level."""
 
 

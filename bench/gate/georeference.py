@@ -14,7 +14,7 @@ from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.world_formats import SceneParams
 from tests.fakes import synthetic
-from tests.fakes.scene_readers import READERS, surveyed_off
+from tests.fakes.scene_readers import READERS, survey_error
 
 TILE_DISTANCE_M = 5000.1234567
 
@@ -33,7 +33,7 @@ def georeference(folder: Path) -> dict[str, Any]:
             continue
         world_formats.write(scene, [name], folder / name, SceneParams(), silent)
         try:
-            off[name] = round(surveyed_off(folder / name, scene, name), 6)
+            off[name] = round(survey_error(folder / name, scene, name), 6)
         except pytest.skip.Exception:  # its reader isn't installed
             continue
     print(f"{'all':8} {'surveyed':10} {json.dumps(off)}", flush=True)

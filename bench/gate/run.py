@@ -1,11 +1,11 @@
 """Acceptance gate: exported worlds are run in the programs that use them.
 
-`make gate`, or `python -m bench.gate [--out bench-out/gate] [--worlds demo raw0009 survey] [--consumers gazebo ...]`.
-The demo tile, a real street and a world of ten tiles are built with default settings (the ten tiles coarser) if
-missing, exported in each consumer's format, and read, driven on or rendered by the consumer (a file each in
-`tests/fakes/consumers`). Further checks: height steps at tile borders, labels compared with the photos' true ones,
-roads compared with those of the generated streets, surveyed points through all formats, and Gazebo's loading cost
-(`bench/gate`). Consumers and worlds that aren't available are reported as skipped.
+`make gate`, or `python -m bench.gate [--out bench-out/gate] [--worlds demo raw0009 ...] [--consumers gazebo ...]`.
+The demo tile, a real street, a world of ten tiles and a robot's map of a building are built with default settings (the
+ten tiles coarser) if missing, exported in each consumer's format, and read, driven on or rendered by the consumer (a
+file each in `tests/fakes/consumers`). Further checks: height steps at tile borders, labels compared with the photos'
+true ones, roads compared with those of the generated streets, surveyed points through all formats, and Gazebo's loading
+cost (`bench/gate`). Consumers and worlds that aren't available are reported as skipped.
 
 Ends with `RESULT {json}`: number of `consumers` without a fault on any world, `skipped`, `faults`, and metrics, the
 worst of all worlds. Exit status 1 if there is a fault.

@@ -1,4 +1,4 @@
-"""Worlds of the gate, built if missing: the demo tile, a real street, ten tiles."""
+"""Worlds of the gate, built if missing: the demo tile, a real street, ten tiles, a robot's map of a building."""
 
 from __future__ import annotations
 
@@ -7,13 +7,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from bench.maps.inputs import simulate
 from bench.measure import measure
 from bench.paths import ROOT
 from bench.street.run import STREETS
 from scan2sim.data_samples import make_tile
+from scan2sim.data_samples.building import Style
 from scan2sim.data_samples.layout import Layout, lay_out
 from scan2sim.data_samples.photos import Effects
+from scan2sim.data_samples.robot_map import Lidar, Mapping
 from scan2sim.data_samples.street import generate
+from scan2sim.flows.commands.robot_map import FOLDER
 from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
 
 LENGTH, SEED = 100.0, 3
@@ -81,7 +85,19 @@ def survey(folder: Path) -> GateWorld:
     return GateWorld("survey", folder / "run", parts, street, lay_out(LENGTH, SEED))
 
 
-WORLDS: dict[str, Callable[[Path], GateWorld]] = {"demo": demo, "raw0009": raw0009, "survey": survey}
+def building(folder: Path) -> GateWorld:
+    """A robot's map of a synthetic building."""
+    made = simulate("building", Style(), Lidar(), Mapping(), folder, seed=SEED)
+    scan2sim("run", made.path, "--out", folder / "run")
+    return GateWorld("building", folder / "run", (folder / "run" / FOLDER / "tile",))
+
+
+WORLDS: dict[str, Callable[[Path], GateWorld]] = {
+    "demo": demo,
+    "raw0009": raw0009,
+    "survey": survey,
+    "building": building,
+}
 
 
 def scan2sim(*arguments: object) -> None:

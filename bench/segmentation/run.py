@@ -146,7 +146,7 @@ def mesh(out: Path) -> None:
     tile = street(out, STREETS[0])
     truth = Mesh.load(tile / "truth" / "mesh.npz")
     whole: dict[str, float] = {}
-    for kind, settings in (("true", []), ("told", ["--set", "segment.overwrite=true"])):
+    for kind, settings in (("true", []), ("predicted", ["--set", "segment.overwrite=true"])):
         folder = out / f"world_{kind}"
         shutil.rmtree(folder, ignore_errors=True)
         scan2sim("run", tile, "--out", folder, "--set", "unwrap.texel=0.05", *settings)
@@ -159,8 +159,11 @@ def mesh(out: Path) -> None:
             total, area = total + any_class * square, area + square
             print(f"mesh to truth, {kind} classes, {group}: {own:.4f} m to its class, {any_class:.4f} m to any")
         whole[kind] = total / area
-    ratio = whole["told"] / whole["true"]
-    print(f"whole world to truth: {whole['true']:.4f} m, predicted {whole['told']:.4f} m: {ratio - 1:+.1%}", flush=True)
+    ratio = whole["predicted"] / whole["true"]
+    print(
+        f"whole world to truth: {whole['true']:.4f} m, predicted {whole['predicted']:.4f} m: {ratio - 1:+.1%}",
+        flush=True,
+    )
 
 
 def semkitti() -> Confusion:

@@ -21,7 +21,7 @@ from scan2sim.slam.global_map.sparse_model import update_map
 from scan2sim.slam.mapping.cross_validation import compare_paths
 from scan2sim.slam.odometry.odometry import Odometry
 from scan2sim.slam.video import open_video
-from tests.fakes.slam_drive import Follower, Narrow, ate, drive, run, scatter
+from tests.fakes.slam_drive import Follower, PerspectiveFollower, ate, drive, run, scatter
 
 DRIVES, SECONDS = 20, 20.0
 FEATURE_COUNTS = 640, 700, 760
@@ -76,7 +76,7 @@ def simulated() -> list[Outcome]:
     out = []
     for seed in range(DRIVES):
         times, poses = drive(SECONDS, turn=0.05 * (1 + seed % 4))
-        kind, count = ((Follower, 6000), (Narrow, 20000))[seed % 2]
+        kind, count = ((Follower, 6000), (PerspectiveFollower, 20000))[seed % 2]
         follower = kind(poses, scatter(poses, count, seed), seed=seed)
         found = run(times, follower, keep=True, parallax=(3.0, 1.0)[seed % 2])
         out.append(outcome(found, partial(ate, truth=poses[:, :3, 3])))

@@ -6,22 +6,23 @@ from pathlib import Path
 
 import numpy as np
 
+from scan2sim.pipeline.camera.lens import GIVEN_SIGMA, changed_lens
 from scan2sim.pipeline.core.types import F64, GpsTrack
 from scan2sim.slam.global_map.covariance import covariances
 from scan2sim.slam.global_map.map_file import MapCheckpoint
-from scan2sim.slam.lens import changed_lens, fit_lens, lens_warning
+from scan2sim.slam.lens import contradicts, fit_lens
 from scan2sim.slam.trajectory import scale
 from scan2sim.slam.trajectory.gps import smooth
 from tests.fakes.slam_drive import (
     LENS,
     Follower,
-    Narrow,
+    PerspectiveFollower,
     ate,
     drifting_turn,
     drive,
     inside,
-    mistaken,
-    off,
+    odometry_with_wrong_intrinsics,
+    position_errors,
     run,
     scatter,
 )
@@ -34,9 +35,9 @@ def covariance(out: Path) -> dict[str, float | None]:
     held = []
     for seed in range(DRIVES):
         times, poses = drive(SECONDS, turn=0.05 * (1 + seed % 4))
-        kind, count = ((Follower, 6000), (Narrow, 20000))[seed % 2]
+        kind, count = ((Follower, 6000), (PerspectiveFollower, 20000))[seed % 2]
         odometry = run(times, kind(poses, scatter(poses, count, seed), seed=seed), parallax=(3.0, 1.0)[seed % 2])
-        errors, known = off(odometry, poses), covariances(MapCheckpoint.of(odometry, ()), None)
+        errors, known = position_errors(odometry, poses), covariances(MapCheckpoint.of(odometry, ()), None)
         held.append(float(inside(errors, known).mean()))
         if seed < 2:
             found = np.stack([odometry.pose_of(p)[:3, 3] for p in odometry.placed])
@@ -70,9 +71,9 @@ def lens() -> dict[str, float | None]:
     """
 
     def alarms(*off: float) -> list[bool]:
-        cameras = [changed_lens(LENS, np.array([*off, 0, 0]) * (1, -1)[seed % 2]) for seed in range(10)]
+        cameras = [changed_lens(LENS, np.array([*off, 0, 0, 0]) * (1, -1)[seed % 2]) for seed in range(10)]
         return [
-            lens_warning(camera, fit_lens(camera, mistaken(camera, seed).map.misfits)) is not None
+            contradicts(fit_lens(camera, odometry_with_wrong_intrinsics(camera, seed).map.misfits, GIVEN_SIGMA))
             for seed, camera in enumerate(cameras)
         ]
 

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from bench.measure import measure
-from bench.paths import ROOT
+from bench.paths import DATA
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.slam.trajectory.evaluate import Evaluation, evaluate, plot
 
-DATA = ROOT.parent / "shared" / "data"
 EXIT_MOSTLY_EXTRAPOLATED = 9
 """Exit status if most of the path is extrapolated; its errors are reported anyway."""
 
@@ -48,7 +47,7 @@ def slam(drive: Path, out: Path, *options: object) -> tuple[Evaluation, dict[str
 def drive(out: Path, path: str, length: float, stretch: float) -> dict[str, float | None]:
     """Errors on the rendered drive; on its first `stretch` seconds with both solvers."""
     made = drive_of(out, path, length)
-    adjacent = ("--backend", "adam", "--set", "slam.gps_chords=adjacent")
+    adjacent = ("--backend", "adam", "--set", "track.gps_distances=adjacent")
     kinds: list[tuple[str, tuple[object, ...]]] = [("lm", ())]
     if stretch:
         kinds += [("lm_start", ("--until", stretch)), ("adam_start", ("--until", stretch, *adjacent))]

@@ -31,8 +31,8 @@ from scan2sim.data_samples.traffic import Traffic
 from scan2sim.pipeline.camera.models import pixel_rays
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import F64, Camera, Trajectory
-from scan2sim.pipeline.importers import sweeps as io
 from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.calibration import photo_extrinsics, read_extrinsics
 from scan2sim.slam.geometry import inverse
 from scan2sim.slam.steps.fuse import FuseParams, fuse_path
 from scan2sim.slam.steps.lidar import LidarParams, lidar
@@ -87,7 +87,7 @@ class Recorded:
         fixes = np.loadtxt(self.gps, delimiter=",", skiprows=1)
         there = np.column_stack([np.interp(self.times, fixes[:, 0], fixes[:, k]) for k in (1, 2, 3)])
         camera = trajectory_io.read(poses)
-        beside = (self.truth @ inverse(io.read_extrinsics(self.extrinsics)))[:, :3, 3]
+        beside = (self.truth @ inverse(read_extrinsics(self.extrinsics)))[:, :3, 3]
         return {
             "lidar": ate(trajectory_io.read(alone.files["trajectory"]).positions, truth, scaled=False),
             "visual": ate(camera.positions, beside),
@@ -108,12 +108,12 @@ def kitti(out: Path) -> Recorded:
     """KITTI odometry 04: the scanner's true poses are those of camera 0, transformed with `Tr`."""
     out.mkdir(parents=True, exist_ok=True)
     calib, photos = KITTI / "calib.txt", KITTI / "image_2"
-    T = io.read_extrinsics(calib)
+    T = read_extrinsics(calib)
     camera = np.tile(np.eye(4), (25, 1, 1))
     camera[:, :3] = np.loadtxt(KITTI / "poses.txt")[:25].reshape(-1, 3, 4)
     truth = inverse(T) @ camera @ T
     times = np.loadtxt(KITTI / "times.txt")[:25]
-    beside = io.photo_extrinsics(calib, photos)
+    beside = photo_extrinsics(calib, photos)
     assert beside is not None
     np.savetxt(out / "extrinsics.txt", beside[:3], "%.9f")
     np.savetxt(out / "times.txt", times, "%.6f")

@@ -1,6 +1,6 @@
 """Visual SLAM compared with the truth of a rendered drive and of KITTI, with pycolmap, and with the method of D3.2.
 
-`python -m bench.slam [--parts drive hard kitti turn adjust trust solvers pano memory] [--length 1500] [--out DIR]`
+`python -m bench.slam [--parts drive hard kitti real turn adjust trust solvers pano memory] [--length 1500] [--out DIR]`
 
 - drive: 360-degree video (1024 px high, 10 Mbit/s, 15 fps) along a real path (KITTI 00; without the data a generated
   one) through a synthetic town with traffic: odometry scaled by a consumer GPS receiver; D3.2's two errors; frames
@@ -9,6 +9,9 @@
   all together: drift, share of extrapolated frames, estimated and true rolling shutter and lens offset.
 - kitti: 51 frames of KITTI odometry 06 (perspective, real): ATE after a similarity alignment, for odometry alone and
   with global adjustment; pycolmap's incremental mapping of the same frames, and the ratio of the times.
+- real: KITTI odometry 00 (frames 60-179), 01, 04 and 06, and raw 0009 against its scan-matched poses, tracked by the
+  step `track` with the published lens: ATE, share of unsure poses, lens; pycolmap's mapping with its better lens (as
+  published, or focal length and k1 free), and the ratio of CPU times. `--reuse`: read pycolmap's earlier results.
 - turn: 51 frames of a rendered turn of 98 degrees (perspective, 52 m): ATE, alone and adjusted, and pycolmap's; the
   effect of dimming every other frame to 0.45 of its brightness, here and on KITTI; focal length from
   self-calibration.
@@ -34,13 +37,14 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.paths import ROOT
+from bench.paths import DATA, ROOT
 from bench.slam.adjust import chosen
 from bench.slam.covariance import covariance, gps_gain, lens
-from bench.slam.drive import DATA, drive
+from bench.slam.drive import drive
 from bench.slam.frames import Sequence, constant_light, odometry, positions, pycolmap
 from bench.slam.hard import hard
 from bench.slam.memory import memory
+from bench.slam.real import DRIVES, real
 from bench.slam.solvers import solvers
 from scan2sim.pipeline.core.types import Camera
 from scan2sim.slam.calibration.calibrate import calibrated_from_scratch
@@ -53,8 +57,8 @@ from scan2sim.slam.trackers import named
 from scan2sim.slam.video import open_video
 from scan2sim.slam.virtual_cameras import VirtualViews
 
-PARTS = ("drive", "hard", "kitti", "turn", "adjust", "trust", "solvers", "pano", "memory")
-DEFAULT_PARTS = ("drive", "kitti", "turn", "adjust", "trust", "pano")
+PARTS = ("drive", "hard", "kitti", "real", "turn", "adjust", "trust", "solvers", "pano", "memory")
+DEFAULT_PARTS = ("drive", "kitti", "real", "turn", "adjust", "trust", "pano")
 
 
 def kitti(out: Path) -> dict[str, float | None]:
@@ -189,6 +193,7 @@ def main() -> None:
     parser.add_argument("--path", default="00", help="name of the path in kitti_gt_poses")
     parser.add_argument("--length", type=float, default=1500.0)
     parser.add_argument("--adam", type=float, default=40.0, help="seconds for the method of D3.2; 0: skip it")
+    parser.add_argument("--reuse", action="store_true", help="read pycolmap's results of an earlier run of part real")
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "slam")
     arguments = parser.parse_args()
     out: Path = arguments.out
@@ -198,7 +203,7 @@ def main() -> None:
         "turn_ate_m", "turn_adjusted_m", "turn_pycolmap_ratio", "turn_pycolmap_time_ratio", "gain_ate_ratio",
         "adjust_right", "adjust_over_best", "covariance_95", "gps_gain", "focal_noticed",
         "centre_noticed", "focal_false_alarms", "hard_drift_percent", "adam_lm_p", "memory_10000_growth",
-        "calibrate_error_percent",
+        "calibrate_error_percent", "odo01_ate_m", "odo01_pycolmap_m", "odo01_unsure", "real_ratio_max", "cpu_ratio_min",
     )  # fmt: skip
     result: dict[str, float | None] = dict.fromkeys(keys)
     if "drive" in arguments.parts:
@@ -218,6 +223,12 @@ def main() -> None:
             result |= kitti(out)
         else:
             pano()
+    if "real" in arguments.parts:
+        missing = [folder for folder, _ in DRIVES.values() if not (DATA / folder).is_dir()]
+        if missing:
+            print(f"real: skipped, {DATA} has no {', '.join(missing)}")
+        else:
+            result |= real(out, reuse=arguments.reuse)
     if "hard" in arguments.parts:
         result |= hard(out)
     if "solvers" in arguments.parts:

@@ -35,7 +35,7 @@ def error(seed: int, backend: str, chords: DistanceConstraints) -> float:
     truth = poses[:, :3, 3]
     follower = Follower(poses, scatter(poses, 5000, seed), count=TRACKS, noise=np.radians(0.05), seed=seed)
     odometry = Odometry(
-        Camera("equirectangular", 2048, 1024), OdometryParams(gps_chords=chords, parallax=PARALLAX_DEG, seed=seed),
+        Camera("equirectangular", 2048, 1024), OdometryParams(gps_distances=chords, parallax=PARALLAX_DEG, seed=seed),
         tracker=follower,
         gps=receiver(times, truth, seed), backend=backend,
     )  # fmt: skip

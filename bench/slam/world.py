@@ -19,12 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.paths import ROOT
+from bench.paths import DATA, ROOT
 from bench.segmentation.run import scan2sim
 from scan2sim.pipeline.geometry.similarity import umeyama
 from scan2sim.pipeline.io.tile import read_tile
 
-DRIVE = ROOT.parent / "shared" / "data" / "kitti_raw0009_f00-24"
+DRIVE = DATA / "kitti_raw0009_f00-24"
 
 
 def seconds(file: Path, start: float) -> np.ndarray:

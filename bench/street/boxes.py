@@ -49,28 +49,41 @@ def mask(labels: Path, frame: int, shape: Sequence[int]) -> Bools:
 
 def boxes(labels: Path, photos: Mapping[int, Photo]) -> list[Box]:
     """Boxes of the parked vehicles in the world: medians over the frames; moving vehicles are excluded."""
-    tracks: dict[int, list[tuple[F64, F64, F64]]] = {}
+    tracks: dict[int, list[Box]] = {}
+    for frame, photo in photos.items():
+        for box in in_frame(labels, frame, photo):
+            if np.hypot(*(box.T[:2, 3] - photo.T[:2, 3])) < MAX_DISTANCE_M:
+                tracks.setdefault(box.track, []).append(box)
+    out = []
+    for track, drawn in tracks.items():
+        samples = np.array([box.T[:3, 3] for box in drawn])
+        if len(drawn) < MIN_FRAMES or np.ptp(samples[:, :2], axis=0).max() > 2.5:
+            continue
+        along, size = (np.median(values, axis=0) for values in ([b.T[:3, 0] for b in drawn], [b.size for b in drawn]))
+        out.append(Box(track, _upright(along, np.median(samples, axis=0)), size))
+    return out
+
+
+def in_frame(labels: Path, frame: int, photo: Photo) -> list[Box]:
+    """All boxes in a frame, of parked and moving objects."""
+    out = []
     for row in _rows(labels):
-        if row[2] == "DontCare" or int(row[0]) not in photos:
+        if row[2] == "DontCare" or int(row[0]) != frame:
             continue
         height, width, length, x, y, z, ry = (float(v) for v in row[10:17])
         # labels are in the rectified camera 0, photos in camera 2, 6 cm beside it
-        T = photos[int(row[0])].T
-        centre = T[:3, :3] @ (np.array([x, y, z]) + CAMERA_0) + T[:3, 3]
-        along = T[:3, :3] @ np.array([np.cos(ry), 0, -np.sin(ry)])
-        if np.hypot(x, z) < MAX_DISTANCE_M:
-            tracks.setdefault(int(row[1]), []).append((centre, along, np.array([length, width, height])))
-    out = []
-    for track, drawn in tracks.items():
-        samples = np.array([d[0] for d in drawn])
-        if len(drawn) < MIN_FRAMES or np.ptp(samples[:, :2], axis=0).max() > 2.5:
-            continue
-        along = np.median([d[1] for d in drawn], axis=0) * [1, 1, 0]
-        along /= np.linalg.norm(along)
-        T = np.eye(4)
-        T[:3, 0], T[:3, 1], T[:3, 3] = along, [-along[1], along[0], 0], np.median(samples, axis=0)
-        out.append(Box(track, T, np.median([d[2] for d in drawn], axis=0)))
+        centre = photo.T[:3, :3] @ (np.array([x, y, z]) + CAMERA_0) + photo.T[:3, 3]
+        along = photo.T[:3, :3] @ np.array([np.cos(ry), 0, -np.sin(ry)])
+        out.append(Box(int(row[1]), _upright(along, centre), np.array([length, width, height])))
     return out
+
+
+def _upright(along: F64, centre: F64) -> F64:
+    """Pose (4, 4) of an upright box, from its direction (3,) and the centre of its bottom (3,)."""
+    x = along * [1, 1, 0] / np.linalg.norm(along[:2])
+    T = np.eye(4)
+    T[:3, 0], T[:3, 1], T[:3, 3] = x, [-x[1], x[0], 0], centre
+    return T
 
 
 CAMERA_0 = np.array([0.0597, 0.0, 0.0])

@@ -1,22 +1,32 @@
-"""Two real streets from raw data to a scored world, with an independent renderer; OpenMVS' results beside.
+"""Real streets from raw data to a scored world, with an independent renderer; OpenMVS beside (`openmvs.py`).
 
-`python -m bench.street [--parts odo04 raw0009 keep synthetic time] [--out bench-out/street] [--score-only]
-[--set KEY=VALUE ...]`
+`python -m bench.street [--parts odo04 raw0009 raw0013 keep synthetic time] [--out bench-out/street] [--score-only]
+[--set KEY=VALUE ...] [--openmvs FOLDER] [--vertical-angle-offset DEGREES]`
 
-The streets are 25 frames each of KITTI odometry 04 (traffic) and of KITTI raw drive 0009 (parked cars); every 8th photo
-(frames 4, 12 and 20) is held out. The world is read from its exported files (OBJ and PNG) and rendered with 3 x 3 rays
-per pixel. A gain per channel is solved for each photo; metrics are means over the three photos, all of which count.
+The streets are 25 frames each of KITTI odometry 04 (traffic) and of KITTI raw drive 0009 (parked cars), and 22 frames
+of KITTI raw drive 0013 (verges, fences, trees; no outlines and signs are drawn on its photos); every 8th photo and
+every 8th sweep is held out. The world is read from its exported files (OBJ and PNG) and rendered with 3 x 3 rays per
+pixel. A gain per channel is solved for each photo; metrics are means over the three photos, all of which count.
 
-**Which pixels count**: those whose central ray hits the world, whether the surface is textured by a photo or not; not
-those that show moving objects or, if vehicles are removed, any vehicle: from KITTI's tracking boxes on raw 0009, drawn
-by hand on odometry 04 (`truth.json`). Sky and pixels without surface don't count; `uncovered` is the share of the
-held-out frame's own returns within 30 m that fall on such pixels, so that missing surface is visible.
+**Whole frames** (`bench/street/frame.py`): every pixel that shows neither a vehicle nor a person, sky, backdrop and
+missing surface, too, after the gain that was solved on the surfaces.
 
-- odo04, raw0009: the streets with default settings. keep: raw 0009 with `split.vehicles=keep`, counting all pixels.
+**Which pixels count** otherwise: those whose central ray hits the world, whether the surface is textured by a photo or
+not; not those that show moving objects or, if vehicles are removed, any vehicle: from KITTI's tracking boxes on raw
+0009, drawn by hand on the others (`truth.json`). Sky and pixels without surface don't count; `uncovered` is the share
+of the held-out frame's own returns within 30 m that fall on such pixels, so that missing surface is visible.
+
+**Sweeps**: every return of the held-out sweeps up to 80 m, except those of moving objects, people and removed vehicles,
+is compared with the first surface along its ray (`bench/street/lidar.py`); the `lidar_*` and `returns_*` results are
+those of the worst street.
+
+- odo04, raw0009, raw0013: the streets with default settings. keep: raw 0009 with `split.vehicles=keep`, counting all
+  pixels.
 - synthetic: metrics with ground truth on a synthetic street (`bench/street/synthetic.py`), and straightness of edges
   (`bench.edges`).
 - time: the street of nine million points with this checkout and with an older one (`--old FOLDER`).
 
+Keys of the result that name no street are those of the worst street (a gain over OpenMVS: the smallest).
 Results of a part are stored in its `figures.json` below `--out`; parts that aren't run again are read from there.
 Images of photo and rendering are written beside it. Ends with `RESULT {json}`; null, with a reason before it, without a
 result.
@@ -30,31 +40,36 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bench.measure import measure
-from bench.paths import ROOT
-from bench.street import boxes, score
+from bench.paths import DATA, ROOT
+from bench.street import boxes, frame, lidar, openmvs, score
 from bench.street import synthetic as street_synthetic
 from bench.street.world import BACKGROUND, Photo, Rendering, World, photos
 from scan2sim.pipeline.core.types import F64, I64, U8, Bools
+from scan2sim.pipeline.lidar.sweeps import every_nth
 
-DATA = ROOT.parent / "shared" / "data"
-HELD_OUT = (4, 12, 20)
+HOLD_OUT = 8
+"""Every Nth photo is held out."""
 MAX_RANGE_M, SWEEP_WINDOW_S = 30.0, 0.05
 """Range within which returns must be covered, and maximum time from the photo to the returns of its own sweep."""
 RETURN_RADIUS_PX = 3
 """Radius around a return that counts as reached by the lidar."""
-PARTS = ("odo04", "raw0009", "keep", "synthetic", "time")
+PARTS = ("odo04", "raw0009", "raw0013", "keep", "synthetic", "time")
 EDGES = "bench.edges"
 """Module that measures `edge_cm`."""
-OPENMVS = {"odo04": "17.6 / .63 / 1.20 (on a carved mesh)", "raw0009": "18.5 / .80 / 1.14 (on this chain's mesh)"}
-"""Results of OpenMVS' TextureMesh: dB, SSIM, sharpness; measured over 51 and 25 frames."""
+MEANS = (
+    "psnr_db", "nogain_psnr_db", "ssim", "sharpness", "counted", "frame_psnr_db", "frame_nogain_psnr_db", "frame_ssim",
+    "frame_msssim", "no_surface", "clipped_photo", "clipped_rendered",
+)  # fmt: skip
+"""Metrics of a street that are means over its held-out photos."""
 MIN_SIGN_PX = 12.0
 """Minimum size of a sign in which it must be readable."""
 NOTHING: dict[str, Any] = {}
@@ -62,24 +77,32 @@ NOTHING: dict[str, Any] = {}
 
 @dataclass(frozen=True)
 class Street:
-    """A real street: arguments of its import, and its vehicles' boxes (None: drawn by hand only)."""
+    """A real street: arguments of its import, and its vehicles' boxes (None: drawn by hand only).
+
+    `vertical_angle_offset` is that of the import, degrees; its sweeps are held out with the same.
+    """
 
     name: str
     data: Path
     importing: tuple[str, ...]
     labels: Path | None = None
+    vertical_angle_offset: float = 0.0
 
 
 RAW = DATA / "kitti_raw0009_f00-24"
+RAW_13 = DATA / "kitti_raw0013_f62-83"
 ODO = DATA / "kitti_odo04_f00-24"
+WHOLE_SWEEP = ("--max-range", "80")
+"""All returns that the measures of the literature count."""
 STREETS = {
-    "odo04": Street("odo04", ODO, ("kitti-odometry", str(ODO))),
+    "odo04": Street("odo04", ODO, ("kitti-odometry", str(ODO), *WHOLE_SWEEP)),
     "raw0009": Street(
         "raw0009",
         RAW,
-        ("kitti-raw", str(RAW), "--poses", str(RAW / "T_velo0_velo_icp_frames_0-24.txt")),
+        ("kitti-raw", str(RAW), "--poses", str(RAW / "T_velo0_velo_icp_frames_0-24.txt"), *WHOLE_SWEEP),
         RAW / "tracking_gt_0001_frames_0-24.txt",
     ),
+    "raw0013": Street("raw0013", RAW_13, ("kitti-raw", str(RAW_13), *WHOLE_SWEEP)),
 }
 
 
@@ -97,52 +120,70 @@ def build_world(street: Street, folder: Path, settings: tuple[str, ...] = (), *,
     """Import the street and build its world; returns the folders of tile and run. Existing results are reused."""
     tile, out = folder / "tile", folder / "run"
     if not (tile / "tile.toml").is_file():
-        scan2sim("import", *street.importing, "--out", tile)
+        offset = ("--vertical-angle-offset", street.vertical_angle_offset) if street.vertical_angle_offset else ()
+        scan2sim("import", *street.importing, *offset, "--out", tile)
     if run:
         scan2sim("run", tile, "--out", out, "--hold-out", 8, *(x for s in settings for x in ("--set", s)))
     return tile, out
 
 
-def score_world(street: Street, tile: Path, run: Path, pictures: Path, *, keep: bool = False) -> dict[str, Any]:
-    """All metrics of a street's world."""
+def score_world(
+    street: Street, tile: Path, run: Path, pictures: Path, *, keep: bool = False, mvs: Path | None = None
+) -> dict[str, Any]:
+    """All metrics of a street's world; `mvs` is the folder of OpenMVS."""
     import laspy
 
     world = World(run / "world")
     views = photos(tile, run, world.origin)
-    rows, shifts, scanned, signs = {}, [], [], {}
+    frames = sorted(views)
+    rows, shifts, scanned, signs, parts, shown = {}, [], [], {}, [], {}
     cloud = laspy.read(tile / "cloud.laz")
     returns = np.stack([cloud.x, cloud.y, cloud.z], axis=1) - world.origin
     times_of = np.asarray(cloud.gps_time)
-    for frame in HELD_OUT:
-        photo, drawn = views[frame], score.truth()[street.name][str(frame)]
+    for index in every_nth(len(frames), HOLD_OUT).tolist():
+        number = frames[index]
+        photo, drawn = views[number], score.truth()[street.name][str(number)]
         rendering = world.render(photo)
-        masked = np.zeros(photo.rgb.shape[:2], bool) if keep else _vehicles(street, frame, photo)
+        masked = np.zeros(photo.rgb.shape[:2], bool) if keep else vehicles(street, number, photo)
         counts = rendering.hit & ~masked
         own = np.abs(times_of - photo.time) < SWEEP_WINDOW_S
-        rows[frame] = score.similarity(photo.rgb, rendering.rgb, counts)
-        rows[frame] |= {
+        gain = score.solve_gain(photo.rgb, rendering.rgb, counts)
+        sky = frame.sky_pixels(run, index, photo.rgb.shape)
+        whole, part = frame.metrics(photo, rendering, world, ~masked, gain, sky)
+        parts.append(part)
+        shown[number] = (photo, rendering, counts)
+        rows[number] = score.similarity(photo.rgb, rendering.rgb, counts) | whole
+        rows[number] |= {
             "counted": float(counts.mean()),
             "uncovered": _uncovered(returns[own], photo, rendering, masked),
         }
         reached = _reached(returns, photo)
-        corrected = np.round(score.apply_gain(photo.rgb, rendering.rgb, counts)).astype(np.uint8)
+        corrected = np.round(score.apply_gain(rendering.rgb, gain)).astype(np.uint8)
         for kind, lines in drawn["outlines"].items():
             for i, line in enumerate(lines):
                 shift, (column, row) = _shifts(photo.rgb, corrected, line)
-                shifts.append((f"{frame} {kind} {i}", shift))
+                shifts.append((f"{number} {kind} {i}", shift))
                 scanned.append(reached[row, column])
         for name, polygon in drawn["signs"].items():
             if np.ptp(np.array(polygon), axis=0).max() >= MIN_SIGN_PX:
                 at = score.filled([polygon], photo.rgb.shape)
-                signs[f"{frame} {name}"] = score.psnr(score.squared_error(photo.rgb, corrected, at))
-        _picture(pictures / f"{street.name}_{frame:02d}.png", photo.rgb, corrected, counts)
+                signs[f"{number} {name}"] = score.psnr(score.squared_error(photo.rgb, corrected, at))
+        _picture(pictures / f"{street.name}_{number:02d}.png", photo.rgb, corrected, counts)
+        frame.picture(pictures / f"frame_{number:02d}.png", photo.rgb, rendering.whole, ~masked)
+    beside: dict[str, Any] = {}
+    if mvs:
+        others = {number: photo for number, photo in views.items() if number not in shown}
+        mesh = openmvs.textured_mesh(mvs, street.name, world.meshes, others, run.parent / "openmvs")
+        beside = {"openmvs": openmvs.compare(shown.values(), mesh)}
     parked = boxes.boxes(street.labels, views) if street.labels and not keep else []
     path = np.array([views[f].T[:3, 3] for f in sorted(views)])
     left = boxes.remains(world, parked)
-    together = np.concatenate([s for _, s in shifts])
+    together = np.concatenate([np.zeros(0), *(s for _, s in shifts)])
     return {
         "photos": rows,
-        **{k: float(np.mean([r[k] for r in rows.values()])) for k in ("psnr_db", "ssim", "sharpness", "counted")},
+        **{k: float(np.mean([r[k] for r in rows.values()])) for k in MEANS},
+        "frame_parts": frame.pooled(parts),
+        **beside,
         "psnr_pooled_db": score.psnr(
             sum(r["mse"] * r["pixels"] for r in rows.values()) / sum(r["pixels"] for r in rows.values())
         ),
@@ -153,17 +194,17 @@ def score_world(street: Street, tile: Path, run: Path, pictures: Path, *, keep: 
         "remains_m2": left,
         "outlines": {name: float(np.median(s)) for name, s in shifts if len(s)},
         "displacements_px": together.tolist(),
-        "displacements_scanned_px": together[np.concatenate(scanned)].tolist(),
+        "displacements_scanned_px": together[np.concatenate([np.zeros(0, bool), *scanned])].tolist(),
         "signs_db": signs,
         "seen_share": json.loads((run / "report.json").read_text(encoding="utf-8"))["texture"]["coverage"],
     }
 
 
-def _vehicles(street: Street, frame: int, photo: Photo) -> Bools:
-    """(H, W) pixels that show a vehicle."""
-    drawn = score.truth()[street.name][str(frame)]["vehicles"]
+def vehicles(street: Street, number: int, photo: Photo) -> Bools:
+    """(H, W) pixels of a held-out photo that show a vehicle or a person, by hand and from KITTI's tracking boxes."""
+    drawn = score.truth()[street.name][str(number)]["vehicles"]
     masked = score.filled(drawn, photo.rgb.shape)
-    return masked | boxes.mask(street.labels, frame, photo.rgb.shape) if street.labels else masked
+    return masked | boxes.mask(street.labels, number, photo.rgb.shape) if street.labels else masked
 
 
 def _shifts(photo: U8, rendering: U8, line: Sequence[Sequence[float]]) -> tuple[F64, I64]:
@@ -184,8 +225,8 @@ def _reached(returns: F64, photo: Photo) -> Bools:
 def _pixels(returns: F64, photo: Photo, far: float) -> tuple[I64, I64]:
     """Columns and rows of points (N, 3) in front of a photo, nearer than `far` metres, that project into it."""
     local = (returns - photo.T[:3, 3]) @ photo.T[:3, :3]
-    local = local[(local[:, 2] > 0.5) & (np.linalg.norm(local, axis=1) < far)] @ photo.K.T
-    column, row = np.round(local[:, :2] / local[:, 2:]).astype(np.int64).T
+    local = local[(local[:, 2] > 0.5) & (np.linalg.norm(local, axis=1) < far)]
+    column, row = np.round(photo.pixels(local)).astype(np.int64).T
     height, width = photo.rgb.shape[:2]
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     return column[inside], row[inside]
@@ -248,15 +289,18 @@ def times(folder: Path, old: Path | None) -> dict[str, Any]:
 
 def table(figures: Mapping[str, Mapping[str, Any]]) -> None:
     """Print the results."""
-    for name in ("odo04", "raw0009", "keep"):
+    for name in ("odo04", "raw0009", "raw0013", "keep"):
         one = figures.get(name)
+        if one and "lidar" in one:
+            print(f"\n{name}:")
+            lidar.table(one["lidar"])
         if not one or "psnr_db" not in one:
             continue
         print(f"\n{name}: {one['psnr_db']:.2f} dB / {one['ssim']:.3f} / sharpness {one['sharpness']:.2f}", end="")
-        print(f" (all pixels as one: {one['psnr_pooled_db']:.2f} dB); OpenMVS {OPENMVS.get(name, 'not measured')}")
-        for frame, row in one["photos"].items():
+        print(f" (all pixels as one: {one['psnr_pooled_db']:.2f} dB)")
+        for number, row in one["photos"].items():
             print(
-                f"  frame {frame}: {row['psnr_db']:.2f} dB / {row['ssim']:.3f} / {row['sharpness']:.2f}, "
+                f"  frame {number}: {row['psnr_db']:.2f} dB / {row['ssim']:.3f} / {row['sharpness']:.2f}, "
                 f"{row['counted']:.0%} of the pixels count, {row['uncovered']:.1%} of near returns without surface"
             )
         print(
@@ -268,7 +312,18 @@ def table(figures: Mapping[str, Mapping[str, Any]]) -> None:
         if one["remains_m2"]:
             left = {track: round(area, 2) for track, area in one["remains_m2"].items()}
             print(f"  surface remaining of vehicles, m2 by track: {left}")
+        if "wrongly_removed" in one:
+            frame.table(one)
+        if "openmvs" in one:
+            mvs = one["openmvs"]
+            print(
+                f"  same pixels as OpenMVS ({mvs['pixels']:.0%}), ours minus theirs: {mvs['gain_db']:+.2f} dB", end=""
+            )
+            print(f" (theirs {mvs['theirs_psnr_db']:.2f}), without gain {mvs['nogain_db']:+.2f} dB", end="")
+            print(f" (theirs {mvs['theirs_nogain_psnr_db']:.2f})")
         near = one["displacements_scanned_px"]
+        if not one["displacements_px"]:
+            continue
         print(f"  outlines that the lidar reached: median {np.median(near):.2f} px, {len(near)} of", end="")
         print(f" {len(one['displacements_px'])} places")
         print(f"  outlines, median px: { ({k: round(v, 2) for k, v in one['outlines'].items()}) }")
@@ -278,10 +333,14 @@ def table(figures: Mapping[str, Mapping[str, Any]]) -> None:
 
 def result(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Results that have targets."""
-    odo, raw, keep, synthetic_part, time = (figures.get(name, NOTHING) for name in PARTS)
+    odo, raw, keep, synthetic_part, time = (figures.get(name, NOTHING) for name in ("odo04", "raw0009", *PARTS[3:]))
     both = [part for part in (odo, raw) if part]
-    shifts = [s for part in both for s in part["displacements_px"]]
-    signs = [db for part in both for db in part["signs_db"].values()]
+    streets = [figures[name] for name in STREETS if "frame_psnr_db" in figures.get(name, NOTHING)]
+
+    def worst(values: Iterable[float | None], sign: int = 1) -> float | None:
+        """The smallest of the known values; with `sign` -1 the largest."""
+        return min((value for value in values if value is not None), key=lambda value: sign * value, default=None)
+
     found = {
         "odo04_psnr_db": odo.get("psnr_db"),
         "odo04_ssim": odo.get("ssim"),
@@ -294,12 +353,29 @@ def result(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         "static_lost": synthetic_part.get("static_lost"),
         "pole_recall": synthetic_part.get("pole_recall"),
         "seen_share_min": min((part["seen_share"] for part in both), default=None),
-        "outline_px": float(np.median(shifts)) if shifts else None,
-        "sign_psnr_db": float(np.mean(signs)) if signs else None,
         "edge_cm": synthetic_part.get("edge_cm"),
         "time_ratio": time.get("time_ratio"),
+        "frame_psnr_db": worst(street["frame_psnr_db"] for street in streets),
+        "frame_msssim": worst(street["frame_msssim"] for street in streets),
+        "nogain_psnr_db": worst(street["nogain_psnr_db"] for street in streets),
+        "clipped_share": worst((frame.clipped_share(street["photos"].values()) for street in streets), -1),
+        "outline_px": worst((_median(street["displacements_px"]) for street in streets), -1),
+        "sign_psnr_db": worst(_mean(street["signs_db"].values()) for street in streets),
+        "wrongly_removed": worst((street["wrongly_removed"] for street in streets), -1),
+        "openmvs_gain_db": worst(street["openmvs"]["gain_db"] for street in streets if "openmvs" in street),
+        "openmvs_nogain_db": worst(street["openmvs"]["nogain_db"] for street in streets if "openmvs" in street),
+        **lidar.result([street["lidar"] for street in streets]),
     }
-    return {k: round(v, 3) if isinstance(v, float) else v for k, v in found.items()}
+    return {k: round(v, 4) if isinstance(v, float) else v for k, v in found.items()}
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if values else None
+
+
+def _mean(values: Iterable[float]) -> float | None:
+    known = list(values)
+    return float(np.mean(known)) if known else None
 
 
 def main() -> None:
@@ -308,8 +384,10 @@ def main() -> None:
     parser.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "street")
     parser.add_argument("--old", type=Path, help="an older checkout, for `time`")
+    parser.add_argument("--openmvs", type=Path, help="folder of OpenMVS's programs, or of its results by street")
     parser.add_argument("--score-only", action="store_true", help="score existing worlds")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the real streets' runs")
+    parser.add_argument("--vertical-angle-offset", type=float, default=0.0, help="of the imports, degrees")
     arguments = parser.parse_args()
     out: Path = arguments.out.resolve()
     for part in arguments.parts:
@@ -323,9 +401,18 @@ def main() -> None:
             print("raw0009_keep_psnr_db: null, this version has no split.vehicles")
             continue
         if street:
+            street = replace(street, vertical_angle_offset=arguments.vertical_angle_offset)
             settings = (*arguments.set, *(("split.vehicles=keep",) if part == "keep" else ()))
             tile, run = build_world(street, folder, settings, run=not arguments.score_only)
-            found = score_world(street, tile, run, out / "pictures" / part, keep=part == "keep")
+            pictures = out / "pictures" / part
+            mvs = arguments.openmvs.resolve() if arguments.openmvs and part in STREETS else None
+            found = score_world(street, tile, run, pictures, keep=part == "keep", mvs=mvs)
+            if part in STREETS:
+                offset = street.vertical_angle_offset
+                found["lidar"] = lidar.metrics(street.data, tile, run, pictures, street.labels, offset)
+                found["wrongly_removed"] = lidar.wrongly_removed(
+                    street.data, tile, run, partial(vehicles, street), offset
+                )
         else:
             found = synthetic(folder) if part == "synthetic" else times(folder, arguments.old)
         (folder / "figures.json").write_text(json.dumps(found, indent=1), encoding="utf-8")

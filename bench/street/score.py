@@ -47,29 +47,35 @@ def similarity(photo: U8, rgb: U8, counts: Bools) -> dict[str, float]:
     """Similarity where `counts` (H, W), after a least-squares gain per channel.
 
     Returns:
-        psnr_db, mse, pixels; ssim (grey) over windows of 11 x 11 in which all pixels count; sharpness, the mean
-        absolute Laplacian relative to the photo's.
+        psnr_db, nogain_psnr_db (as rendered), mse, pixels; ssim (grey) over windows of 11 x 11 in which all pixels
+        count; sharpness, the mean absolute Laplacian relative to the photo's.
     """
     from scipy.ndimage import binary_erosion, laplace
 
-    like = apply_gain(photo, rgb, counts)
+    like = apply_gain(rgb, solve_gain(photo, rgb, counts))
     mse = squared_error(photo, like, counts)
     inner = binary_erosion(counts, np.ones((3, 3)))
     grey = [_grey(image) for image in (photo, like)]
     fine = [float(np.abs(laplace(image)[inner]).mean()) for image in grey]
     return {
         "psnr_db": psnr(mse),
-        "ssim": _ssim(grey[0], grey[1], counts),
+        "nogain_psnr_db": psnr(squared_error(photo, rgb, counts)),
+        "ssim": ssim(photo, like, counts),
         "sharpness": fine[1] / fine[0],
         "mse": mse,
         "pixels": int(counts.sum()),
     }
 
 
-def apply_gain(photo: U8, rgb: U8, counts: Bools) -> F64:
-    """The rendering with the gain per channel that minimizes the error to the photo where `counts`."""
+def solve_gain(photo: U8, rgb: U8, counts: Bools) -> F64:
+    """(3,) gain per channel of the rendering that minimizes the error to the photo where `counts`; 1 if nowhere."""
     a, b = photo[counts].astype(np.float64), rgb[counts].astype(np.float64)
-    return np.asarray(np.clip(rgb * ((a * b).sum(axis=0) / np.maximum((b * b).sum(axis=0), 1)), 0, 255))
+    return np.asarray((a * b).sum(axis=0) / np.maximum((b * b).sum(axis=0), 1)) if counts.any() else np.ones(3)
+
+
+def apply_gain(rgb: U8, gain: F64) -> F64:
+    """The rendering (H, W, 3) times a gain (3,) per channel, clipped to 0-255."""
+    return np.asarray(np.clip(rgb * gain, 0, 255))
 
 
 def squared_error(photo: U8, like: npt.NDArray[Any], counts: Bools) -> float:
@@ -86,8 +92,11 @@ def _grey(image: npt.NDArray[Any]) -> F64:
     return np.asarray(image @ np.array([0.299, 0.587, 0.114]), np.float64)
 
 
-def _ssim(a: F64, b: F64, counts: Bools) -> float:
+def ssim(photo: U8, like: npt.NDArray[Any], counts: Bools) -> float:
+    """Mean SSIM of the grey images over windows of 11 x 11 pixels in which all pixels count."""
     from scipy.ndimage import binary_erosion, gaussian_filter
+
+    a, b = _grey(photo), _grey(like)
 
     def mean(values: F64) -> F64:
         return np.asarray(gaussian_filter(values, SSIM_SIGMA_PX, truncate=3.5))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import random
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -12,6 +15,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from scan2sim.pipeline.core.types import F64
 from scan2sim.services.qos import requirements
 from scan2sim.services.qos.compare import compare_metrics, passed
 from scan2sim.services.qos.link_profile import LinkProfile
@@ -30,6 +36,7 @@ from scan2sim.services.teleoperation.qos.measure import (
 )
 from scan2sim.services.teleoperation.qos.scripted_drive import Setup
 from scan2sim.services.teleoperation.settings import MeasureParams
+from tests.fakes.video_link import SimulatedLink, SimulatedVideo
 
 Report = Callable[[str], None]
 MOBILE = LinkProfile(delay=0.04, jitter=0.01, loss=0.01)
@@ -74,6 +81,108 @@ def glass(scale: float, report: Report) -> dict[str, Any]:
         measured = ends.measured(max(5.0, 60.0 * scale))
     report_drive("glass", measured, report)
     return {"glass_to_glass_p95_ms": round(percentile(measured.glass_to_glass, 95), 1)}
+
+
+def _spin() -> None:
+    while True:
+        pass
+
+
+def busy(scale: float, report: Report) -> dict[str, Any]:
+    """Glass-to-glass latency while another process keeps each core busy."""
+    spawn = multiprocessing.get_context("spawn")
+    others = [spawn.Process(target=_spin, daemon=True) for _ in range(os.cpu_count() or 1)]
+    for one in others:
+        one.start()
+    try:
+        found = glass(scale, report)
+    finally:
+        for one in others:
+            one.kill()
+            one.join()
+    return {"glass_to_glass_busy_p95_ms": found["glass_to_glass_p95_ms"]}
+
+
+def two(scale: float, report: Report) -> dict[str, Any]:
+    """Video rate over two links that don't carry it alone."""
+    profile = LinkProfile(delay=0.01, rate=12e6)
+    with tempfile.TemporaryDirectory(prefix="bench-teleop-") as name:
+        folder = Path(name)
+        setup = replace(
+            Setup("", ""), cameras=4, bitrate=5e6, share=True, pictures=str(render_test_images(folder / "pictures"))
+        )
+        with scripted_pair((profile, LinkProfile(delay=0.01)), setup, folder) as ends:
+            ends.station.ask("join")
+            ends.station.ask("drive")
+            time.sleep(2 * RAMP_UP_S)
+            measured = ends.measured(max(5.0, 60.0 * scale))
+    report_drive("two links of 12 Mbit/s", measured, report)
+    return {"two_links_mbit": round(measured.station["seen"].get("bytes", 0) * 8e-6 / measured.seconds, 1)}
+
+
+FULL, NARROW = (LinkProfile(delay=0.03, rate=rate, queue=1.0) for rate in (20e6, 5e6))
+"""D3.2's data rate (table 6), and what remains of it; a second of queue, as mobile networks have it."""
+DROP_S, BEFORE_DROP_S, DROPS = 15.0, 5.0, 4
+"""Seconds for which the rate is low, and for which it is measured before; number of drops."""
+EXTRA_LATENCY_MS = 100.0
+"""Latency above that before the drop up to which the video's rate fits the link."""
+
+
+def picture_age(measured: Measurement, camera: int, times: F64) -> F64:
+    """Age in ms of a camera's newest decoded frame at times, seconds of the monotonic clock."""
+    frames = np.array(
+        sorted((decoded, captured) for one, captured, decoded in measured.station["glass"] if one == camera)
+    )
+    newest = np.maximum.accumulate(frames[:, 1])
+    return np.asarray(1e3 * times - newest[np.searchsorted(frames[:, 0], times * 1e9) - 1] / 1e6)
+
+
+def drop(scale: float, report: Report) -> dict[str, Any]:
+    """The only link's rate drops from 20 to 5 Mbit/s: extra picture age, and time until the video's rate fits."""
+    found = [_drop(report) for _ in range(max(1, round(DROPS * scale)))]
+    peak, settled = (median(one) for one in zip(*found, strict=True))
+    return {"drop_extra_latency_ms": round(peak), "drop_fits_s": round(settled, 1)}
+
+
+def _drop(report: Report) -> tuple[float, float]:
+    with tempfile.TemporaryDirectory(prefix="bench-teleop-") as name:
+        folder = Path(name)
+        setup = replace(Setup("", ""), cameras=4, bitrate=4.4e6, pictures=str(render_test_images(folder / "pictures")))
+        with scripted_pair((FULL, FULL), setup, folder, [0]) as ends:
+            assert ends.link is not None
+            ends.station.ask("join")
+            ends.station.ask("drive")
+            time.sleep(RAMP_UP_S)
+            began = time.monotonic()
+            timer = threading.Timer(BEFORE_DROP_S, ends.link.shape, (NARROW,))
+            timer.start()
+            measured = ends.measured(BEFORE_DROP_S + DROP_S)
+            timer.join()
+    report_drive("drop", measured, report)
+    dropped = began + BEFORE_DROP_S
+    before, after = np.arange(began + 1, dropped, 0.01), np.arange(dropped, dropped + DROP_S - 1, 0.01)
+    extra = np.max(
+        [picture_age(measured, n, after) - np.median(picture_age(measured, n, before)) for n in range(4)], axis=0
+    )
+    late = np.flatnonzero(extra > EXTRA_LATENCY_MS)
+    peak, settled = float(extra.max()), float(after[late[-1]] - dropped) if len(late) else 0.0
+    report(f"  at most {peak:.0f} ms older; older by {EXTRA_LATENCY_MS:.0f} ms until {settled:.1f} s after the drop")
+    return peak, settled
+
+
+def congestion(scale: float, report: Report) -> dict[str, Any]:
+    """The same in simulated time (`tests.fakes.video_link`), with reports of congestion and without."""
+    found = dict[str, float]()
+    for suffix, detect in (("_before", False), ("", True)):
+        link = SimulatedLink(lambda at: 20e6 if at < RAMP_UP_S + BEFORE_DROP_S else 5e6, queue=1.0)
+        video = SimulatedVideo(link, RAMP_UP_S + BEFORE_DROP_S + DROP_S, detect=detect)
+        peak, settled = video.peak(RAMP_UP_S + BEFORE_DROP_S, RAMP_UP_S)
+        rate = video.mean_rate(RAMP_UP_S + BEFORE_DROP_S + 5) / 1e6
+        report(
+            f"{'with' if detect else 'without'} reports: {peak:.0f} ms older, {settled:.1f} s; then {rate:.1f} Mbit/s"
+        )
+        found |= {f"simulated_drop_extra_latency_ms{suffix}": round(peak), f"simulated_drop_fits_s{suffix}": settled}
+    return found
 
 
 class Event(NamedTuple):

@@ -28,6 +28,7 @@ from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, Adapt
 from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardUnit
 from tests.fakes.certificates import identity
 from tests.fakes.relay import Relay
+from tests.fakes.vehicle import adapter_key_file
 
 Report = Callable[[str], None]
 HOSTS = ("127.0.0.1", "127.0.0.2")
@@ -48,7 +49,7 @@ class BrakeMonitor(PlainCar):
         self.drives, self.since = False, time.monotonic()
 
     def obey(self, controls: Controls) -> None:
-        """See `translators.Vehicle`."""
+        """See `adapters.Vehicle`."""
         super().obey(controls)
         drives = controls.brake < 1.0
         if drives != self.drives:
@@ -67,9 +68,9 @@ class InterruptedPair:
             shape = self._relay.shapes[host]
             shape.delay, shape.jitter, shape.loss = 0.03, 0.02, 0.01
         self._vehicle = BrakeMonitor()
-        adapter_server = AdapterServer(self._vehicle, AdapterParams(port=0))
+        adapter_server = AdapterServer(self._vehicle, AdapterParams(port=0, key=adapter_key_file()))
         host, port = adapter_server.address
-        self._unit = OnboardUnit(OnboardParams(translator=f"{host}:{port}"))
+        self._unit = OnboardUnit(OnboardParams(adapter=f"{host}:{port}", key=adapter_key_file()))
         links = [Link(host, host) for host in HOSTS]
         clocks = [ClockSync(wall=partial(_wall, wrong)) for wrong in clock_errors]
         self._connection = self._listener.expect(car.me, self._received, clocks=clocks[1])

@@ -58,8 +58,8 @@ class Scene:
 
     @property
     def views(self) -> Path:
-        """File `views.json`, including held-out views."""
-        return self.folder / "views" / "views.json"
+        """Folder with `views.json`, including held-out views."""
+        return self.folder / "views" / "views"
 
     @property
     def clouds(self) -> dict[str, Path]:
@@ -115,9 +115,10 @@ def _scan(name: str, tile: Path) -> None:
     if name == WARM_UP:
         tile.symlink_to(ROOT / "data_samples" / "tile")
     elif name == "kitti":
-        from scan2sim.pipeline.importers.kitti_raw import import_kitti_raw
+        from scan2sim.flows.pipelines.kitti import import_kitti_raw
 
-        import_kitti_raw(KITTI, tile, poses=KITTI / "T_velo0_velo_icp_frames_0-24.txt", link=True)
+        poses = KITTI / "T_velo0_velo_icp_frames_0-24.txt"
+        import_kitti_raw(KITTI, tile, poses=poses, pose_source="given", link=True)
     else:
         from scan2sim.data_samples.layout import Style
         from scan2sim.data_samples.photos import Effects

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from bench.measure import Measurement, measure
 from bench.paths import ROOT
+from bench.tile import poisson
 from scan2sim.pipeline.core.classes import GROUPS
 from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.io.tile import read_tile
@@ -89,6 +90,7 @@ def main() -> None:
         "memory_ratio": round(ours.peak_gb / naive.peak_gb, 2),
         "truth_ratio": ratios,
         "rerun_seconds": round(rerun.seconds, 2),
+        **poisson.compare(street, ours_out),
     }
     print("RESULT " + json.dumps(result))
 

@@ -1,6 +1,6 @@
 """The project's own detector, or another in YOLOv5's export format, on images with known boxes.
 
-`python -m bench.toolboxes.detect [--weights FILE.onnx] [--parts synthetic kitti time] [--out bench-out/toolbox_detect]`
+`python -m bench.toolboxes.detect [--weights FILE.onnx] [--parts synthetic kitti defaults time] [--out DIR]`
 
 - synthetic: 240 images of streets and crossings with seeds below those of training. detect_ap50_synthetic is the mean
   over classes of the average precision (VOC 2010) at an overlap of one half, ap50 by class. Objects occluded by more
@@ -8,6 +8,10 @@
 - kitti: frames 0-24 of KITTI raw 0009 (../shared/data); cars, vans and trucks as one class. Boxes that are largely
   occluded, truncated or DontCare are ignored. Recall by height in pixels, and precision, at a score of `--threshold`;
   kitti_ap50 over all boxes from 25 pixels.
+- defaults: `toolbox detect` with its default settings on frames of KITTI: kitti_vehicle_recall,
+  kitti_vehicle_precision of vehicles from 25 pixels of height on (raw 0009), at the thresholds by class of the network
+  (kitti_thresholds); people_false_per_photo: people and cyclists detected in 72 photos without any (raw 0009, raw 0013,
+  odometry 04).
 - time: CPU milliseconds per image on one thread, 640 x 384 and 384 x 256, and of pre- and postprocessing.
 
 `--pictures` writes images with detections into OUT. Ends with `RESULT {json}`; null for parts that were not run.
@@ -26,19 +30,29 @@ import cv2
 import numpy as np
 import onnxruntime
 
-from bench.paths import ROOT
+from bench.paths import DATA, ROOT
 from scan2sim.data_samples import boxes
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.toolboxes import yolo
 from scan2sim.services.toolboxes.detector.dataset import MIN_VISIBLE_SHARE, read, read_image
+from scan2sim.services.toolboxes.detector.evaluate import (
+    MIN_HEIGHT_PX,
+    PEOPLE,
+    VEHICLES,
+    curve,
+    vehicle_predictions,
+)
 from scan2sim.services.toolboxes.detector.metrics import GroundTruth, Predictions, average_precision, match
+from scan2sim.services.toolboxes.tasks import Model
+from scan2sim.services.toolboxes.tasks import detect as task
 
-DATA = ROOT.parent / "shared" / "data"
 OWN_WEIGHTS = ROOT / "services" / "toolboxes" / "weights" / "vehicles.onnx"
 SEED, IMAGES, MIN_SIDE_PX = 500, 240, 12.0
-VEHICLES = ("car", "van", "bus", "truck")
+RAW_0009 = "kitti_raw0009_f00-24"
+WITHOUT_PEOPLE = (RAW_0009, "kitti_raw0013_f62-83", "kitti_odo04_f00-24")
+"""Drives whose photos show nobody."""
 HEIGHTS = ((15, 25), (25, 40), (40, 80), (80, 1000))
-PARTS = ("synthetic", "kitti", "time")
+PARTS = ("synthetic", "kitti", "defaults", "time")
 
 
 class Detector:
@@ -82,7 +96,7 @@ def synthetic(detector: Detector, out: Path, size: int) -> dict[str, Any]:
 
 def kitti(detector: Detector, size: int, threshold: float) -> tuple[dict[str, Any], list[tuple[U8, Predictions]]]:
     """Recall by size, precision and average precision of vehicles; and the images with detections."""
-    folder, count = DATA / "kitti_raw0009_f00-24", {bounds: [0, 0] for bounds in HEIGHTS}
+    folder, count = DATA / RAW_0009, {bounds: [0, 0] for bounds in HEIGHTS}
     wanted, right, shown = 0, 0, []
     found, truth = [], []
     for rgb, true in kitti_pictures(folder):
@@ -107,6 +121,38 @@ def kitti(detector: Detector, size: int, threshold: float) -> tuple[dict[str, An
     precision = round(right / max(wanted, 1), 4)
     ap = round(average_precision(found, tall_ones, 0), 4)
     return {"kitti_recall": recall, "kitti_precision": precision, "kitti_ap50": ap}, shown
+
+
+def defaults(weights: Path) -> dict[str, Any]:
+    """Recall and precision of vehicles and false boxes of people, of `toolbox detect` with default settings."""
+    model = task.load(task.Params(weights=weights))
+    found, truth = vehicles(model)
+    _, right, total = curve(found, truth)
+    photos = [photo for name in WITHOUT_PEOPLE for photo in sorted((DATA / name).rglob("image_*2/**/*.png"))]
+    people, thresholds = 0, None
+    for photo in photos:
+        (body,) = model([np.ascontiguousarray(read_image(photo))])
+        people, thresholds = people + sum(one.label in PEOPLE for one in body.detections or ()), body.threshold
+    print(
+        f"{total} vehicles: {right.sum()} of {len(right)} detections are right; {people} people in {len(photos)} photos"
+    )
+    return {
+        "kitti_vehicle_recall": round(float(right.sum() / total), 3),
+        "kitti_vehicle_precision": round(float(right.mean()), 3),
+        "kitti_thresholds": thresholds,
+        "people_false_per_photo": round(people / max(len(photos), 1), 3),
+    }
+
+
+def vehicles(model: Model) -> tuple[list[Predictions], list[GroundTruth]]:
+    """Detected vehicles and KITTI's boxes in the photos of raw 0009, as one class."""
+    found, truth = [], []
+    for rgb, true in kitti_pictures(DATA / RAW_0009):
+        (body,) = model([np.ascontiguousarray(rgb)])
+        found.append(vehicle_predictions(body))
+        small = true.corners[:, 3] - true.corners[:, 1] < MIN_HEIGHT_PX
+        truth.append(GroundTruth(true.corners, true.labels, true.ignored | small))
+    return found, truth
 
 
 def kitti_pictures(folder: Path) -> Iterator[tuple[U8, GroundTruth]]:
@@ -165,17 +211,22 @@ def main() -> None:
     a = parser.parse_args()
     detector = Detector(a.weights)
     result: dict[str, Any] = dict.fromkeys(
-        ("detect_ap50_synthetic", "ap50", "kitti_recall", "kitti_precision", "kitti_ap50", "cpu_ms")
-    )
+        (
+            "detect_ap50_synthetic", "ap50", "kitti_recall", "kitti_precision", "kitti_ap50", "kitti_vehicle_recall",
+            "kitti_vehicle_precision", "kitti_thresholds", "people_false_per_photo", "cpu_ms",
+        )
+    )  # fmt: skip
     a.out.mkdir(parents=True, exist_ok=True)
     if "synthetic" in a.parts:
         result |= synthetic(detector, a.out / "synthetic", a.size)
-    if "kitti" in a.parts and (DATA / "kitti_raw0009_f00-24").is_dir():
+    if "kitti" in a.parts and (DATA / RAW_0009).is_dir():
         scores, shown = kitti(detector, a.kitti_size, a.threshold)
         result |= scores
         if a.pictures:
             for i, (rgb, found) in enumerate(shown):
                 cv2.imwrite(str(a.out / f"kitti_{i:02d}.jpg"), drawn(rgb, found))
+    if "defaults" in a.parts and (DATA / RAW_0009).is_dir():
+        result |= defaults(a.weights)
     if "time" in a.parts:
         result["cpu_ms"] = times(detector)
     print("RESULT", json.dumps(result))

@@ -59,7 +59,7 @@ def load(seconds: float = OVERLOAD_S) -> dict[str, float]:
         recovery_s: from the end of the overload until an image is processed as fast as before.
         ready_false_s, restart_s: from the model's death until it is reported, and until the model is back.
     """
-    images = _images()
+    images = sample_jpegs()
     engine = Engine(BOX, tasks.find(BOX).Params(deadline=DEADLINE))
     try:
         usual = _seconds_per_image(engine, images)
@@ -88,7 +88,7 @@ def load(seconds: float = OVERLOAD_S) -> dict[str, float]:
     return found
 
 
-def _images() -> list[bytes]:
+def sample_jpegs() -> list[bytes]:
     """JPEGs of a synthetic street, 1280 pixels wide."""
     import cv2
 

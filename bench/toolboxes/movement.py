@@ -75,18 +75,18 @@ def _of_film(film: Path, model: Any, view: int, truth: Sequence[dict[str, Any]])
         tracked = post_processor(
             Frame(shot.name, str(film), round(frame["time"] * 1e9), shot.image, lambda _: None), shot.image, body
         )
-        for thing in frame["things"]:
+        for label in frame["objects"]:
             if (
-                thing["class"] in FOLLOWED
-                and thing["visible"] >= MIN_VISIBLE_SHARE
-                and _side(thing["box"]) >= MIN_SIDE_PX
+                label["class"] in FOLLOWED
+                and label["visible"] >= MIN_VISIBLE_SHARE
+                and _side(label["box"]) >= MIN_SIDE_PX
             ):
-                past = history[thing["track"]]
-                past.append((frame["time"], abs(thing["speed"])))
+                past = history[label["track"]]
+                past.append((frame["time"], abs(label["speed"])))
                 if frame["time"] - past[0][0] >= HISTORY_S:
-                    yield _predict(view, thing, past, tracked)
+                    yield _predict(view, label, past, tracked)
             else:
-                history.pop(thing["track"], None)
+                history.pop(label["track"], None)
 
 
 def _detected(film: Path, model: Any, truth: Sequence[dict[str, Any]]) -> Iterator[tuple[Any, Body, dict[str, Any]]]:
@@ -101,14 +101,14 @@ def _detected(film: Path, model: Any, truth: Sequence[dict[str, Any]]) -> Iterat
             batch = []
 
 
-def _predict(view: int, thing: dict[str, Any], past: list[tuple[float, float]], body: Body) -> Prediction:
+def _predict(view: int, label: dict[str, Any], past: list[tuple[float, float]], body: Body) -> Prediction:
     recent = [speed for time, speed in past if past[-1][0] - time <= HISTORY_S]
-    things = body.detections or ()
-    shares = iou_matrix([one.box for one in things], [thing["box"]])[:, 0]
+    detections = body.detections or ()
+    shares = iou_matrix([one.box for one in detections], [label["box"]])[:, 0]
     found = bool((shares >= MIN_IOU).any())
-    best = things[int(shares.argmax())] if found else None
+    best = detections[int(shares.argmax())] if found else None
     predicted = best.moving if isinstance(best, Moving) else None
-    return Prediction(view, thing["class"], sum(recent) / len(recent) >= MOVING_SPEED_MIN, predicted, found)
+    return Prediction(view, label["class"], sum(recent) / len(recent) >= MOVING_SPEED_MIN, predicted, found)
 
 
 def _side(box: Sequence[float]) -> float:

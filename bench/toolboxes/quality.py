@@ -28,12 +28,15 @@ from typing import Any
 
 import numpy as np
 
-from bench.toolboxes.detect import DATA, MIN_SIDE_PX, OWN_WEIGHTS, VEHICLES, Detector, kitti_pictures
+from bench.paths import DATA
+from bench.toolboxes.detect import MIN_SIDE_PX, OWN_WEIGHTS, Detector, kitti_pictures
 from scan2sim.data_samples import crossing
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.qos import encoding
 from scan2sim.services.toolboxes import frames
+from scan2sim.services.toolboxes.detector.agreement import MIN_SCORE, agreement
 from scan2sim.services.toolboxes.detector.dataset import MIN_VISIBLE_SHARE
+from scan2sim.services.toolboxes.detector.evaluate import VEHICLES
 from scan2sim.services.toolboxes.detector.metrics import GroundTruth, Predictions, average_precision, match
 from scan2sim.services.toolboxes.frames import Frame
 
@@ -41,7 +44,7 @@ SEED, VIEWS, IMAGES, IMAGE_STRIDE = 300, 6, 60, 3
 FIRST_IMAGE = 50
 """First image of a view; there is traffic by then."""
 KITTI, KITTI_RATE = "kitti_raw0009_f00-24", 10.0
-MIN_SCORE, MIN_HEIGHT_PX, MAX_AGREEMENT_LOSS = 0.3, 25.0, 0.05
+MIN_HEIGHT_PX, MAX_AGREEMENT_LOSS = 25.0, 0.05
 QUALITIES = (95, 90, 80, 70, 60, 50, 40, 30, 20, 10)
 MEGABITS = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)
 
@@ -118,20 +121,6 @@ def _as_large(decoded: U8, image: U8) -> U8:
     return np.pad(decoded, more, "edge")
 
 
-def agreement(found: list[Predictions], plain: list[Predictions]) -> float:
-    """F1 of confident detections relative to those in the original images."""
-    right, total = 0, 0
-    for one, before in zip(map(_confident, found), map(_confident, plain), strict=True):
-        hit, _ = match(one, GroundTruth(before.corners, before.labels, np.zeros(len(before.labels), bool)))
-        right, total = right + int((hit >= 0).sum()), total + len(one.labels) + len(before.labels)
-    return 2 * right / max(1, total)
-
-
-def _confident(found: Predictions) -> Predictions:
-    sure = found.scores >= MIN_SCORE
-    return Predictions(found.corners[sure], found.scores[sure], found.labels[sure])
-
-
 def accuracy(found: list[Predictions], truth: list[GroundTruth]) -> float:
     """Average precision over all classes as one."""
     return average_precision([Predictions(f.corners, f.scores, 0 * f.labels) for f in found], truth, 0)
@@ -141,8 +130,8 @@ def recall(found: list[Predictions], truth: list[GroundTruth], names: list[str])
     """Share of KITTI's vehicles that are detected as any kind of vehicle."""
     own = [names.index(name) for name in VEHICLES]
     hits, known = 0, 0
-    for one, true in zip(map(_confident, found), truth, strict=True):
-        vehicle = np.isin(one.labels, own)
+    for one, true in zip(found, truth, strict=True):
+        vehicle = np.isin(one.labels, own) & (one.scores >= MIN_SCORE)
         hit, _ = match(Predictions(one.corners[vehicle], one.scores[vehicle], 0 * one.labels[vehicle]), true)
         hits, known = hits + int((hit >= 0).sum()), known + int((~true.ignored).sum())
     return hits / max(1, known)

@@ -1,13 +1,16 @@
 """Benchmarks of the ML toolboxes and their quality of service.
 
-`python -m bench.toolboxes [--parts tracks detect movement classes pixels batch load qos] [--out DIR]`
+`python -m bench.toolboxes [--parts tracks detect drives movement classes pixels batch clients load qos]
+[--out DIR]`
 
 - tracks: MOTA and IDF1 on degraded boxes of KITTI (bench/toolboxes/tracks.py).
-- detect: the detector on synthetic images (bench/toolboxes/detect.py has more).
+- detect: the detector on synthetic images and KITTI's photos (bench/toolboxes/detect.py has more).
+- drives: the detector trained on two real drives, on a third (bench/toolboxes/drives.py); three quarters of an hour.
 - movement: moving or standing, by frame, in ten films of 1000 frames (bench/toolboxes/movement.py); rendering them
   takes a quarter of an hour the first time.
 - classes, pixels: pretrained classification and segmentation (bench/toolboxes/classes.py).
 - batch: time per image alone relative to time per image of four at once, on one thread; above 1, batching gains.
+- clients: calls of Triton's client over HTTP and gRPC, and a slow-body attack (bench/toolboxes/clients.py).
 - load: ten minutes at five times a toolbox's capacity, then its model is killed (bench/toolboxes/load.py).
 - qos: all toolboxes in all environments; requires root.
 
@@ -27,14 +30,15 @@ from typing import Any
 
 import numpy as np
 
-from bench.toolboxes import classes, load, movement, tracks
+from bench.toolboxes import classes, clients, drives, load, movement, tracks
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.qos.requirements import Environment, read
 from scan2sim.services.toolboxes import tasks
 
 KEYS = (
     "moving", "standing", "mota", "idf1", "detect_ap50_synthetic", "classify_top1", "segment_miou", "qos", "batch_gain",
-    "overload_memory_growth", "recovery_s",
+    "kitti_vehicle_recall", "kitti_vehicle_precision", "people_false_per_photo", "drives_vehicle_recall",
+    "triton_calls", "triton_failed", "slow_bodies_served", "overload_memory_growth", "recovery_s",
 )  # fmt: skip
 BATCH, ROUNDS = 4, 5
 QOS_RATE, QOS_SECONDS = "1", "30"
@@ -42,9 +46,10 @@ Found = dict[str, Any]
 
 
 def detect(out: Path) -> Found:
-    """Result of bench.toolboxes.detect on synthetic images."""
-    result = _result_of("bench.toolboxes.detect", "--parts", "synthetic", "--out", str(out / "detect"))
-    return {"detect_ap50_synthetic": result["detect_ap50_synthetic"]}
+    """Result of bench.toolboxes.detect on synthetic images, and with default settings on KITTI's photos."""
+    result = _result_of("bench.toolboxes.detect", "--parts", "synthetic", "defaults", "--out", str(out / "detect"))
+    keys = ("detect_ap50_synthetic", "kitti_vehicle_recall", "kitti_vehicle_precision", "people_false_per_photo")
+    return {key: result[key] for key in keys}
 
 
 def _result_of(*module: str) -> Found:
@@ -100,10 +105,12 @@ def qos(out: Path) -> Found:
 PARTS: dict[str, Callable[[Path], Found | None]] = {
     "tracks": lambda _: tracks.tracks(),
     "detect": detect,
+    "drives": lambda out: drives.drives(out / "drives"),
     "movement": movement.movement_accuracy,
     "classes": lambda _: classes.classes(),
     "pixels": classes.pixels,
     "batch": lambda _: batch(),
+    "clients": lambda _: clients.clients(),
     "load": lambda _: load.load(),
     "qos": qos,
 }

@@ -41,6 +41,9 @@ class _DefaultCommandGroup(TyperGroup):
         return list(self.commands)
 
 
+DEFAULT_COMMAND = "The first command is the default and may be left out; its own --help lists its options."
+
+
 class App(typer.Typer):
     """A command, or a group of commands.
 
@@ -53,7 +56,10 @@ class App(typer.Typer):
     def __init__(self, help: str | None = None, *, first: bool = False, requirement: tuple[str, ...] = ()) -> None:
         self._requirement = requirement
         group = _DefaultCommandGroup if first else TyperGroup
-        super().__init__(cls=group, help=help, no_args_is_help=help is not None, add_completion=False)
+        super().__init__(
+            cls=group, help=help, epilog=DEFAULT_COMMAND if first else None, no_args_is_help=help is not None,
+            add_completion=False,
+        )  # fmt: skip
 
     def command(self, name: str | None = None, **options: Any) -> Any:
         """Decorator that declares a command, with the arguments of `Typer.command`."""
@@ -84,7 +90,8 @@ HoldOut = Annotated[
     typer.Option(
         "--hold-out",
         metavar="N",
-        help="Exclude every Nth photo from texturing, to measure the quality of the texture with it; default: none.",
+        help="Exclude every Nth photo from texturing, and every Nth sweep of a lidar from the cloud, to measure the "
+        "quality of the world with them; default: none.",
     ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Repeat all steps, even those with cached results.")]
@@ -126,5 +133,5 @@ def settings_of(set_: list[str] | None, config: Path | None, hold_out: int | Non
     Raises:
         SettingError: the file can't be read, or an assignment has a wrong form.
     """
-    held_out = [] if hold_out is None else [f"views.hold_out={hold_out}"]
+    held_out = [] if hold_out is None else [f"{step}.hold_out={hold_out}" for step in ("views", "sweeps")]
     return Settings.read(config, [*(set_ or []), *held_out])

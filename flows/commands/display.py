@@ -55,24 +55,30 @@ def warn(text: str) -> None:
 
 
 class RunDisplay:
-    """A progress bar for each running task and one for the whole run, and a line for each finished task."""
+    """A progress bar for each running task and one for the whole run, and a line for each finished task.
 
-    def __init__(self, task_count: int) -> None:
+    Args:
+        task_count: tasks of the run, cached ones included.
+        title: label of the whole run's bar.
+        lines: whether to print a line for each finished task; failed ones always have one.
+    """
+
+    def __init__(self, task_count: int, title: str = "tile", lines: bool = True) -> None:
         self._bars = _progress()
-        self._task_count = task_count
+        self._task_count, self._title, self._lines = task_count, title, lines
         self._bar_ids: dict[str, TaskID] = {}
         self._started: dict[str, float] = {}
-        self._done = self._kept = 0
+        self._done = self._cached = 0
 
     def __enter__(self) -> RunDisplay:
         self._bars.start()
-        self._whole = self._bars.add_task("[bold]tile", total=self._task_count, message="")
+        self._whole = self._bars.add_task(f"[bold]{self._title}", total=self._task_count, message="")
         return self
 
     def __exit__(self, *_: object) -> None:
         self._bars.stop()
-        if self._kept:
-            console.print(f"[dim]{self._kept} of {self._task_count} results reused from earlier runs")
+        if self._cached:
+            console.print(f"[dim]{self._cached} of {self._task_count} results reused from earlier runs")
 
     def on_event(self, task: Task, event: Event, fraction: float, message: str) -> None:
         """Show an event: an `EventCallback` of `execute`."""
@@ -84,18 +90,23 @@ class RunDisplay:
         elif event == "again":
             if task.full_name in self._bar_ids:
                 self._bars.remove_task(self._bar_ids.pop(task.full_name))
-            self._done, self._kept = self._done - 1, self._kept - 1
+            self._done, self._cached = self._done - 1, self._cached - 1
             console.print(f"[yellow]![/] {escape(message)}", highlight=False, soft_wrap=True)
         else:
             self._done += 1
-            self._kept += event == "kept"
+            self._cached += event == "cached"
             self._bars.update(self._whole, completed=self._done)
             if event in ("done", "failed"):
                 self._bars.remove_task(self._bar_ids.pop(task.full_name))
                 seconds = time.perf_counter() - self._started[task.full_name]
-                failed = "[yellow]✗[/]" if task.step.side_product else "[red]✗[/]"
+                failed = "[yellow]✗[/]" if task.side_product else "[red]✗[/]"
                 mark = "[green]✓[/]" if event == "done" else failed
-                console.print(f"{mark} {task.full_name:<22}[dim]{seconds:7.1f} s  {self._done}/{self._task_count}")
+                if self._lines or event == "failed":
+                    console.print(f"{mark} {task.full_name:<22}[dim]{seconds:7.1f} s  {self._done}/{self._task_count}")
+
+    def status(self, text: str) -> None:
+        """Set the message behind the whole run's bar."""
+        self._bars.update(self._whole, message=escape(text))
 
 
 def log_unexpected(error: BaseException) -> Path:

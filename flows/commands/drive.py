@@ -82,7 +82,7 @@ def _check_path(planned: list[PlannedTask], done: dict[str, Manifest], slam: Pat
 
 
 def found(place: Path) -> Path:
-    """The file of a source: `georeference` itself, or a survey.toml, drive.toml or tile.toml in that folder.
+    """The file of a source: `place` itself, or a survey.toml, drive.toml or tile.toml in that folder.
 
     Raises:
         InputError: there is none.

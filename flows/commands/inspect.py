@@ -1,4 +1,4 @@
-"""`scan2sim inspect`: prints a summary of a point cloud, a tile, a mesh or a world."""
+"""`scan2sim inspect`: prints a summary of a point cloud, a tile, a mesh, a world or a ROS bag."""
 
 from __future__ import annotations
 
@@ -14,31 +14,44 @@ from rich.table import Table
 
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console
+from scan2sim.flows.commands.inspect_bag import show_bag
 from scan2sim.pipeline.core.classes import name_of
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.types import Frame
+from scan2sim.pipeline.core.types import Frame, PointCloud
+from scan2sim.pipeline.importers.bag.reader import is_bag
 from scan2sim.pipeline.io import clouds, file_checks, xml
 from scan2sim.pipeline.io.geodata.crs import name as crs_name
-from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.io.tile import MIN_POINTS, read_tile
+from scan2sim.pipeline.pose_check.check import find_mistake
 
 Facts = list[tuple[str, str]]
+MAP_SAMPLES = 300_000
+"""Points of a robot's map that are inspected."""
 
 
 app = App()
 
 
 @app.command()
-def inspect(path: Annotated[Path, typer.Argument(metavar="PATH", help="A point cloud, tile, mesh or world.")]) -> None:
-    """Show a summary of a point cloud, a tile, a mesh or a world."""
-    inspect_path(path)
+def inspect(
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="A point cloud, tile, mesh, world or ROS bag.")],
+    urdf: Annotated[
+        Path | None, typer.Option(help="URDF file of the robot, whose fixed joints the import of a ROS bag would use.")
+    ] = None,
+) -> None:
+    """Show a summary of a point cloud, a tile, a mesh, a world or a ROS bag."""
+    inspect_path(path, urdf)
 
 
-def inspect_path(path: Path) -> None:
-    """Print a summary of `path`.
+def inspect_path(path: Path, urdf: Path | None = None) -> None:
+    """Print a summary of `path`; `urdf`: of the robot that recorded a bag.
 
     Raises:
         InputError: it doesn't exist, or is of an unknown kind.
     """
+    if is_bag(path) and not any((path / name).exists() for name in ("ept.json", "tile.toml", "world")):
+        show_bag(path, urdf)
+        return
     kind, facts = _reader(path)(path)
     table = Table(
         show_header=False, box=None, title=escape(f"{kind}: {path}"), title_justify="left", title_style="bold"
@@ -61,7 +74,7 @@ def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
         raise InputError(
             path,
             "contains neither a tile.toml nor a world",
-            "Name a cloud, a tile (or one of a survey), a mesh or a world",
+            "Name a cloud, a tile (or one of a survey), a mesh, a world or a ROS bag",
         )
     file_checks.check(path, "Check the path")
     readers = {
@@ -92,9 +105,11 @@ def _cloud(path: Path) -> tuple[str, Facts]:
         ("CRS", crs_name(header.crs)),
         ("extent", _bounds(header.low, header.high)),
         ("density", f"{header.count / area:,.1f} per square unit of its bounding box"),
-        ("colours", "yes" if cloud.rgb is not None else "no"),
+        ("colours", "yes" if cloud.rgb is not None else "intensity" if cloud.intensity is not None else "no"),
         *(("warning", note) for note in header.notes),
     ]
+    if header.crs is None and len(cloud) >= MIN_POINTS:
+        facts += _map_facts(cloud)
     if cloud.time is not None and len(cloud):
         facts.append(("GPS time", f"{cloud.time.min():.3f} to {cloud.time.max():.3f} s"))
     if cloud.classification is not None:
@@ -110,10 +125,49 @@ def _cloud(path: Path) -> tuple[str, Facts]:
     return "cloud", facts
 
 
+def _map_facts(cloud: PointCloud) -> Facts:
+    """What `scan2sim run` finds in a robot's map: unit, up axis and tilt, spacing, noise, scene."""
+    from scan2sim.pipeline.geometry.height_map import exact_point_spacing
+    from scan2sim.pipeline.geometry.upright import find_up, rotation_to_z
+    from scan2sim.pipeline.importers.robot_map import UNIT_M
+    from scan2sim.pipeline.robot_maps.describe import describe, guess_unit
+    from scan2sim.pipeline.robot_maps.outliers import far_outliers
+
+    some = cloud.take(np.arange(0, len(cloud), max(1, len(cloud) // MAP_SAMPLES)))
+    xyz = some.xyz[np.isfinite(some.xyz).all(axis=1)]
+    unit = guess_unit(xyz)
+    xyz, start = xyz * np.float32(UNIT_M[unit]), -np.asarray(cloud.frame.origin) * UNIT_M[unit]
+    outliers = far_outliers(xyz, exact_point_spacing(xyz))
+    xyz = xyz[~outliers]
+    facts = [("units", f"{unit} (assumed)"), ("outliers", f"{outliers.mean():.1%} isolated or far points")]
+    up = find_up(xyz, start)
+    if up is None:
+        return [*facts, ("up axis", "not found: no flat surfaces; name it with --up")]
+    axis = int(np.abs(up.up).argmax())
+    tilt = np.degrees(np.arccos(min(1.0, abs(float(up.up[axis])))))
+    doubt = ", ambiguous: check it, or name it with --up" if up.ambiguous else ""
+    sign = "-" if up.up[axis] < 0 else ""
+    R = rotation_to_z(up.up)
+    found = describe(xyz @ R.T.astype(np.float32), R @ start)
+    return [
+        *facts,
+        ("up axis", f"{sign}{'xyz'[axis]}, tilted by {tilt:.1f} degrees{doubt}"),
+        ("spacing", f"{100 * found.spacing:.1f} cm between neighbouring points"),
+        ("noise", f"{100 * found.noise:.1f} cm around planes"),
+        ("surfaces", f"{found.level_share:.0%} level (ground, floors), {found.upright_share:.0%} upright (walls)"),
+        (
+            "scene",
+            f"{found.scene} (walls in {found.enclosed_share:.0%} of the directions from the start, "
+            f"a ceiling above {found.ceiling_share:.0%} of the floor)",
+        ),
+    ]
+
+
 def _tile(path: Path) -> tuple[str, Facts]:
     tile = read_tile(path)
     count = sum(clouds.read_header(p).count for p in tile.clouds)
     missing = sum(not view.photo.is_file() for view in tile.views)
+    mistake = find_mistake(tile) if tile.views and not missing and tile.robot_map is None else None
     cameras = sorted({f"{v.camera.model} {v.camera.width}x{v.camera.height}" for v in tile.views})
     return "tile", [
         ("name", tile.name),
@@ -125,6 +179,7 @@ def _tile(path: Path) -> tuple[str, Facts]:
         ("masks", str(sum(v.mask is not None for v in tile.views))),
         ("trajectory", f"{len(tile.trajectory.times):,} positions" if tile.trajectory else "none"),
         ("ground truth", "yes" if tile.truth_mesh else "no"),
+        *([("warning", f"{mistake}: import it again with this option")] if mistake else []),
     ]
 
 

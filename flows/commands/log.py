@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 
 from scan2sim.flows.reports.side_products import SideProducts
@@ -21,7 +21,8 @@ class Log:
     def write(self, *lines: str) -> None:
         """Append lines; the first one gets a timestamp."""
         with open(self.path, "a", encoding="utf-8") as file:
-            file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} " + "".join(f"{line.rstrip()}\n" for line in lines))
+            now = datetime.now().isoformat(" ", "milliseconds")
+            file.write(f"{now} " + "".join(f"{line.rstrip()}\n" for line in lines))
 
     def write_failed(self, side: SideProducts) -> None:
         """Append the side products that failed, with their tracebacks."""

@@ -16,8 +16,17 @@ from scan2sim.flows.commands.options import options
 from scan2sim.flows.commands.ros_spin import spin
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.services.monitoring.autoscale.traffic_model import TrafficParams
+from scan2sim.services.monitoring.embedded_broker import BrokerParams
 from scan2sim.services.monitoring.settings.archive import ArchiveParams, QueryParams
-from scan2sim.services.monitoring.settings.bus import AlarmsParams, PoolParams, ScaleParams
+from scan2sim.services.monitoring.settings.bus import (
+    AcknowledgeParams,
+    AlarmCommandParams,
+    AlarmsParams,
+    MuteParams,
+    PoolParams,
+    RetireParams,
+    ScaleParams,
+)
 from scan2sim.services.monitoring.settings.dashboard import PageParams
 from scan2sim.services.monitoring.settings.monitor import (
     DatasetParams,
@@ -46,6 +55,19 @@ Limits = Annotated[
 BUS_OPTIONS = {"kafka_bootstrap_servers": "--kafka", "log_file": "--log"}
 
 
+@app.command("broker")
+@options(BrokerParams)
+def monitor_broker(params: BrokerParams) -> None:
+    """Run a Kafka broker on this machine to try the event bus; it keeps records in memory only."""
+    from scan2sim.services.monitoring.embedded_broker import serve
+
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
+    serve(params, lambda text: console.print(text, highlight=False, markup=False))
+
+
 @app.command("topic")
 @options(TopicParams, topics="TOPIC...", **NODE_OPTIONS)
 def monitor_topic(params: TopicParams, limit: Limits = None) -> None:
@@ -55,7 +77,11 @@ def monitor_topic(params: TopicParams, limit: Limits = None) -> None:
     def create() -> Any:
         node = TopicMonitor(params)
         if not params.type:
-            node.find(params.timeout, lambda text: console.print(text, highlight=False, markup=False))
+            try:
+                node.find(params.timeout, lambda text: console.print(text, highlight=False, markup=False))
+            except BaseException:
+                node.destroy_node()
+                raise
         return node
 
     spin(create)
@@ -131,11 +157,37 @@ def monitor_pool(params: PoolParams) -> None:
 def monitor_alarms(params: AlarmsParams) -> None:
     """Check the published statistics against alarm rules; publish and print the alarms."""
     from scan2sim.services.monitoring.events.alarm_node import AlarmsNode
+    from scan2sim.services.monitoring.events.notify import message
 
-    def print_alarm(alarm: Any) -> None:
-        console.print(f"{alarm.state} {alarm.rule}: {alarm.subject}, {alarm.value:.4g}", highlight=False, markup=False)
+    spin(lambda: AlarmsNode(params, lambda alarm: console.print(message(alarm), highlight=False, markup=False)))
 
-    spin(lambda: AlarmsNode(params, print_alarm))
+
+@app.command("acknowledge")
+@options(AcknowledgeParams, rule="RULE", subject="SUBJECT", kafka_bootstrap_servers="--kafka")
+def monitor_acknowledge(params: AcknowledgeParams) -> None:
+    """Acknowledge raised alarms: your name is published with them."""
+    _send_command(params)
+
+
+@app.command("mute")
+@options(MuteParams, rule="RULE", subject="SUBJECT", seconds="--for", kafka_bootstrap_servers="--kafka")
+def monitor_mute(params: MuteParams) -> None:
+    """Mute alarms for some time: they are published, but not printed or sent by webhook and e-mail."""
+    _send_command(params)
+
+
+@app.command("retire")
+@options(RetireParams, node="NODE", kafka_bootstrap_servers="--kafka")
+def monitor_retire(params: RetireParams) -> None:
+    """Clear all alarms of a node that is no longer in use, until it reports again."""
+    _send_command(params)
+
+
+def _send_command(params: AlarmCommandParams) -> None:
+    from scan2sim.services.monitoring.events.alarm_commands import send
+
+    send(params)
+    console.print("sent to the alarm node", highlight=False, markup=False)
 
 
 @app.command("page")

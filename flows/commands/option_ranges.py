@@ -24,8 +24,11 @@ class NumericOptions(Params):
     seed: Seed | None = None
     minutes: Annotated[float, Field(ge=0, le=100_000)] | None = None
     steps: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
+    synthetic: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
     segment: Annotated[float, Field(ge=1, le=1e7)] | None = None
     max_range: Range | None = None
+    vertical_angle_offset: Annotated[float, Field(ge=-5, le=5)] | None = None
+    count: Annotated[int, Field(ge=1, le=10_000)] | None = None
     levels: Annotated[int, Field(ge=1, le=6)] | None = None
     scale: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
     days: Annotated[float, Field(ge=0.01, le=3650)] | None = None

@@ -36,7 +36,12 @@ def options(model: type[P], **named: str) -> Callable[[Callable[..., None]], Cal
             values = {name: given[name] for name in fields}
             changed = {name: value for name, value in values.items() if value != fields[name].get_default()}
             rest = {name: value for name, value in given.items() if name in declared}
-            command(model.of("", changed, remedy="`--help` describes it"), **rest)
+            try:
+                params = model.of("", changed, remedy="`--help` describes it")
+            except SettingError as error:
+                field = str(error.where).removeprefix("--").replace("-", "_")
+                raise SettingError(named.get(field, error.where), error.cause, error.remedy) from None
+            command(params, **rest)
 
         parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (*generated, *own_parameters)]
         wrapper.__name__, wrapper.__doc__ = command.__name__, command.__doc__
@@ -72,8 +77,10 @@ def _parameter(name: str, field: FieldInfo, named: str | None) -> inspect.Parame
         declaration: Any = typer.Argument(help=field.description, metavar=named or name.upper())
         default = inspect.Parameter.empty
     else:
-        declaration = typer.Option(named or f"--{name.replace('_', '-')}", help=field.description)
         default = field.get_default()
+        option = name.replace("_", "-")
+        switch = f"--{option}/--no-{option}" if default is True else f"--{option}"
+        declaration = typer.Option(named or switch, help=field.description)
     return inspect.Parameter(
         name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, declaration]
     )

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,8 +11,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from scan2sim.flows.commands.app import App
-from scan2sim.flows.commands.display import console, progress
+from scan2sim.flows.commands.display import console
 from scan2sim.flows.commands.options import options
+from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, progress_lines, say
+from scan2sim.flows.commands.orchestrate_sites import cluster as cluster_commands
+from scan2sim.flows.commands.orchestrate_sites import repo as repo_commands
+from scan2sim.flows.commands.orchestrate_sites import vim as vim_commands
+from scan2sim.flows.commands.orchestrate_slices import app as slice_commands
 from scan2sim.flows.commands.ros_spin import spin, stop_on_signal
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.pipeline.core.errors import ScanError, SettingError
@@ -32,8 +35,6 @@ from scan2sim.services.qos.requirements import Environment
 
 if TYPE_CHECKING:
     from scan2sim.services.orchestration.apply import ApplyResult, Change
-    from scan2sim.services.orchestration.lifecycle import WaitPolicy
-    from scan2sim.services.orchestration.osm import Osm
 
 app = App(
     "Deploy services on edge and cloud through Open Source MANO (OSM).",
@@ -85,7 +86,7 @@ def orchestrate_package(
     packages = build(description.read(service), environment, "machine" if machine else "container", prefix, repository)
     out.mkdir(parents=True, exist_ok=True)
     for one in (packages.function, packages.service):
-        _say(str(one.save(out)))
+        say(str(one.save(out)))
 
 
 @app.command("list")
@@ -94,19 +95,17 @@ def orchestrate_list(params: Connection) -> None:
     """List the packages and instances in OSM."""
     from scan2sim.services.orchestration.osm import FUNCTIONS, SERVICES
 
-    with _osm(params) as osm:
+    with osm_client(params) as osm:
         packages = Table("package", "kind", "state", title="Packages", title_justify="left")
         for kind, collection in (("function", FUNCTIONS), ("network service", SERVICES)):
             for one in osm.packages(collection):
-                state = str((one.get("_admin") or {}).get("onboardingState", ""))
-                packages.add_row(escape(str(one.get("id") or one["_id"])), kind, state.lower())
+                packages.add_row(escape(one.name), kind, escape(one.admin.onboarding_state.lower()))
         instances = Table(
             "instance", "network service", "state", "description", title="Instances", title_justify="left"
         )
-        for one in osm.instances():
-            state = str(one.get("nsState", "")).lower().replace("_", " ")
-            facts = (one.get("name", ""), one.get("nsd-ref", ""), state, one.get("description") or "")
-            instances.add_row(*(escape(str(each)) for each in facts))
+        for found in osm.instances():
+            facts = (found.name, found.descriptor, found.state.lower().replace("_", " "), found.description)
+            instances.add_row(*map(escape, facts))
     console.print(packages)
     console.print(instances)
 
@@ -121,9 +120,9 @@ def orchestrate_onboard(
     from scan2sim.services.orchestration import operations, package
 
     packages = [package.read(path) for path in files]
-    with _osm(params) as osm:
+    with osm_client(params) as osm:
         for name in operations.onboard(osm, packages):
-            _say(f"{name} is onboarded")
+            say(f"{name} is onboarded")
 
 
 @app.command("instantiate")
@@ -155,13 +154,13 @@ def orchestrate_instantiate(
     if bool(vim) == bool(cluster):
         raise SettingError("--vim", "exactly one of --vim and --cluster is needed", "Give one of them")
     keys, values = tuple(read_key(path) for path in ssh_key or ()), _values(value or [])
-    with _operation(params, name) as (osm, wait_policy, notify):
+    with operation(params, name) as (osm, wait_policy, notify):
         site = osm.cluster(cluster) if cluster else osm.vim(vim)
         operations.instantiate(
             osm, name, nsd, site, replicas=params.replicas, keys=keys, values=values, namespace=namespace,
             wait_policy=wait_policy, notify=notify,
         )  # fmt: skip
-    _say(f"{name} {'runs' if params.wait else 'is being started'}")
+    say(f"{name} {'runs' if params.wait else 'is being started'}")
 
 
 @app.command("scale")
@@ -170,9 +169,9 @@ def orchestrate_scale(params: ScaleInstanceParams) -> None:
     """Set the number of replicas of an instance's function."""
     from scan2sim.services.orchestration import operations
 
-    with _operation(params, params.name) as (osm, wait_policy, notify):
+    with operation(params, params.name) as (osm, wait_policy, notify):
         operations.scale(osm, params.name, params.replicas, wait_policy, notify)
-    _say(f"{params.name}: {params.replicas} replicas")
+    say(f"{params.name}: {params.replicas} replicas")
 
 
 @app.command("heal")
@@ -181,9 +180,9 @@ def orchestrate_heal(params: OperationParams, name: Instance) -> None:
     """Heal an instance: recreate its virtual machines, apply its charts again."""
     from scan2sim.services.orchestration import operations
 
-    with _operation(params, name) as (osm, wait_policy, notify):
+    with operation(params, name) as (osm, wait_policy, notify):
         operations.heal(osm, name, wait_policy, notify)
-    _say(f"{name} {'is healed' if params.wait else 'is being healed'}")
+    say(f"{name} {'is healed' if params.wait else 'is being healed'}")
 
 
 @app.command("terminate")
@@ -192,9 +191,9 @@ def orchestrate_terminate(params: OperationParams, name: Instance) -> None:
     """Stop an instance; its record stays in OSM."""
     from scan2sim.services.orchestration import operations
 
-    with _operation(params, name) as (osm, wait_policy, notify):
+    with operation(params, name) as (osm, wait_policy, notify):
         operations.terminate(osm, name, wait_policy, notify)
-    _say(f"{name} is terminated")
+    say(f"{name} is terminated")
 
 
 @app.command("delete")
@@ -220,7 +219,7 @@ def orchestrate_delete(
         for path in files:
             _apply(params, path, delete=True)
         return
-    with _osm(params) as osm, progress("delete") as report:
+    with osm_client(params) as osm, progress_lines("delete") as report:
         wait_policy = WaitPolicy(params.timeout)
         if files:
             operations.delete(osm, [package.read(path) for path in files], wait_policy, lambda text: report(0.5, text))
@@ -230,7 +229,7 @@ def orchestrate_delete(
         if rest := [name for name in what if not files and name not in instances]:
             operations.delete_packages(osm, rest)
     for name in what:
-        _say(f"{name} is deleted")
+        say(f"{name} is deleted")
 
 
 @app.command("plan")
@@ -240,9 +239,9 @@ def orchestrate_plan(params: Connection, services: Services) -> None:
     from scan2sim.services.orchestration import apply, deployment
 
     requested = deployment.read(services)
-    with _osm(params) as osm:
+    with osm_client(params) as osm:
         changes = apply.plan(apply.load_state(osm, requested, services.parent))
-    console.print(_changes(changes)) if changes else _say("nothing to do: all services are as described")
+    console.print(_changes(changes)) if changes else say("nothing to do: all services are as described")
 
 
 @app.command("apply")
@@ -266,10 +265,12 @@ def orchestrate_place(
     table = Table("site", "", "why not", title=f"Placement of {service}", title_justify="left")
     placements = placement.place(service, [placement.read(path) for path in measured])
     for one in placements:
-        table.add_row(one.environment, "[green]fits" if one.fits else "[red]no", escape("\n".join(one.unmet)))
+        unknown = [f"not measured or decided: {', '.join(one.unknown)}"] if one.unknown else []
+        why = escape("\n".join([*one.unmet, *unknown]))
+        table.add_row(one.environment, "[green]fits" if one.fits else "[red]no", why)
     console.print(table)
     nearest = next((one for one in placements if one.fits), None)
-    _say(f"nearest to the robot: {nearest.environment}" if nearest else "no site meets the requirements")
+    say(f"nearest to the robot: {nearest.environment}" if nearest else "no site meets the requirements")
 
 
 @app.command("page")
@@ -279,7 +280,7 @@ def orchestrate_page(params: PageParams) -> None:
     optional_deps.require("the page", "fastapi", "uvicorn", "prometheus_client")
     from scan2sim.services.orchestration.page import serve
 
-    serve(params, _say)
+    serve(params, say)
 
 
 @app.command("pool")
@@ -304,29 +305,13 @@ def _apply(params: ApplyParams, path: Path, *, delete: bool = False) -> None:
     if delete:
         requested = deployment.Deployment(deployment=requested.deployment)
     stop, pacer = threading.Event(), apply.RequestPacer()
-    with _osm(params, pacer) as osm, progress(requested.deployment) as report, stop_on_signal(stop):
+    with osm_client(params, pacer) as osm, progress_lines(requested.deployment) as report, stop_on_signal(stop):
         result = apply.apply(osm, apply.load_state(osm, requested, path.parent), params, report, stop, pacer)
     _print_result(result)
     if stop.is_set():
         raise KeyboardInterrupt
     if (error := apply.failure(result)) is not None:
         raise error
-
-
-@contextmanager
-def _osm(params: Connection, pacer: Any = None) -> Iterator[Osm]:
-    from scan2sim.services.orchestration.osm import Osm
-
-    with Osm(params, before_request=pacer) as osm:
-        yield osm
-
-
-@contextmanager
-def _operation(params: OperationParams, name: str) -> Iterator[tuple[Osm, WaitPolicy, Any]]:
-    from scan2sim.services.orchestration.lifecycle import WaitPolicy
-
-    with _osm(params) as osm, progress(name) as report:
-        yield osm, WaitPolicy(params.timeout, params.wait), lambda text: report(0.5, text)
 
 
 def _values(given: list[str]) -> dict[str, str]:
@@ -338,7 +323,7 @@ def _values(given: list[str]) -> dict[str, str]:
 
 def _print_result(result: ApplyResult) -> None:
     if not result.done and not result.failed:
-        _say("nothing to do: all services are as described")
+        say("nothing to do: all services are as described")
         return
     table = Table("name", "", "")
     for change in result.done:
@@ -360,5 +345,10 @@ def _changes(changes: list[Change]) -> Table:
     return table
 
 
-def _say(text: str) -> None:
-    console.print(text, highlight=False, markup=False, soft_wrap=True)
+for _name, _group in (
+    ("vim", vim_commands),
+    ("cluster", cluster_commands),
+    ("repo", repo_commands),
+    ("slice", slice_commands),
+):
+    app.add_typer(_group, name=_name)

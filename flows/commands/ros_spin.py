@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from scan2sim.services import transport
@@ -19,8 +19,9 @@ def spin(create: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: 
     try:
         node = create()
         try:
-            while not finished(node):
-                ros.spin_once(node, 0.2)
+            with suppress(KeyboardInterrupt):
+                while not finished(node):
+                    ros.spin_once(node, 0.2)
         finally:
             node.destroy_node()
     finally:

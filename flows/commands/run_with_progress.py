@@ -30,13 +30,14 @@ def execute_with_progress(
     keep_going: bool = False,
     memory: float | None = None,
     bus: PublishedRun | None = None,
+    display: RunDisplay | None = None,
 ) -> Outcome:
-    """Run a plan by `execute`, with progress bars and log entries; publishes the progress if there is a `bus`."""
+    """Run a plan by `execute`, with progress bars (or another `display`) and log entries; published by the `bus`."""
     publish_event = bus.steps.track(planned, store) if bus else ignore_event
-    with RunDisplay(len(planned)) as display:
+    with display or RunDisplay(len(planned)) as shown:
 
         def on_event(task: Task, event: Event, fraction: float, message: str) -> None:
-            display.on_event(task, event, fraction, message)
+            shown.on_event(task, event, fraction, message)
             publish_event(task, event, fraction, message)
             if event != "progress":
                 log.write(f"{task.full_name}: {event}{': ' if message else ''}{message}")
@@ -82,21 +83,27 @@ def plan_and_run(
     return planned, outcome.of_tile()
 
 
-def show_results(world: Path, report: Path | None) -> None:
-    """Print the paths of world and report, and the commands that open the world."""
+def show_results(world: Path, report: Path | None) -> list[str]:
+    """Print the paths of world and report, and the commands that open the world; returns the lines."""
     lines = [*gazebo.lines(world), *([f"Report: {report}"] if report else [])]
     console.print("\n".join(lines), highlight=False, soft_wrap=True, markup=False)
+    return lines
 
 
-def show_findings(done: Mapping[str, Manifest]) -> None:
-    """Print the worst findings about the world; the report has all of them."""
-    all_findings = findings(done)
+def show_findings(done: Mapping[str, Manifest]) -> list[str]:
+    """Print the worst findings about the world; the report has all of them. Returns the lines, without colours."""
+    all_findings, lines = findings(done), []
     if all_findings and all_findings[0].level == "unusable":
-        console.print("[bold red]This world can't be used as it is:[/]")
+        lines.append("This world can't be used as it is:")
+        console.print(f"[bold red]{lines[-1]}[/]")
     for one in all_findings[:MAX_FINDINGS]:
-        warn(f"{one.about}: {one.text}")
+        text = f"{one.about}: {one.text}"
+        lines.append(f"warning: {text}")
+        warn(text)
     if len(all_findings) > MAX_FINDINGS:
-        console.print(f"[dim]{len(all_findings) - MAX_FINDINGS} more findings in the report")
+        lines.append(f"{len(all_findings) - MAX_FINDINGS} more findings in the report")
+        console.print(f"[dim]{lines[-1]}")
+    return lines
 
 
 def show_failed(side: SideProducts, log: Log) -> None:

@@ -31,6 +31,10 @@ def sample(
     points: Annotated[float, typer.Option(help="Number of points of the cloud.")] = 9e6,
     photos: Annotated[int, typer.Option(help="Number of photos.")] = 40,
     seed: Annotated[int, typer.Option(help="Random seed; each seed gives another street.")] = 0,
+    traffic: Annotated[
+        bool,
+        typer.Option("--traffic", help="Add a car ahead, a cyclist and a pedestrian, with ground-truth tracks."),
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Generate a synthetic street recording with ground truth, to try the program."""
@@ -39,5 +43,5 @@ def sample(
             shutil.copytree(SMALL, folder, dirs_exist_ok=True)
         else:
             system_libs.check()
-            generate(folder, length=length, points=points, photos=photos, seed=seed, report=report)
+            generate(folder, length=length, points=points, photos=photos, seed=seed, traffic=traffic, report=report)
     typer.echo(f"Tile: {out / 'tile.toml'}")

@@ -99,6 +99,7 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
         ScanError: see `pipeline.core.errors`; results of earlier runs stay.
     """
     tile = read_tile(path)
+    settings = Settings.of({**settings.values, "sweeps.hold_out": 0})  # every point gets a class
     with locked(out):
         store = Store(out / STORE)
         tasks = build_graph(tile, settings)

@@ -86,7 +86,7 @@ def slam_evaluate(
         Path | None, typer.Option("--out", "-o", help="PNG file for a plot of both paths and the errors.")
     ] = None,
 ) -> None:
-    """Print the errors of a trajectory against ground truth: global and local error (5G-ERA D3.2), ATE, RPE, drift."""
+    """Print the errors of a trajectory against ground truth: global and local error, ATE, RPE, drift."""
     evaluate_trajectory(trajectory, truth, segment=segment, alignment=alignment, out=out)
 
 
@@ -95,11 +95,17 @@ def slam_study(
     source: Annotated[
         Path,
         typer.Argument(
-            metavar="DRIVE", help="Folder of a drive (video.mp4, truth.csv, ...), a video, or a folder of its frames."
+            metavar="DRIVE",
+            help="Folder of a drive (video.mp4, truth.csv, ...), a 360-degree video, or a folder of its frames.",
         ),
     ],
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Output folder: table, plot, cached results of each cell of the table.")
+        Path,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Output folder: tables, plot, cached results; with the same folder, an interrupted study resumes.",
+        ),
     ],
     truth: Annotated[
         Path | None, typer.Option(help="Ground truth: a trajectory or GPS track; default: truth.csv of the drive.")
@@ -111,19 +117,22 @@ def slam_study(
         Path | None,
         typer.Option(help="Ego-vehicle mask: an image, 0 on the car; default: mask.png of the drive, if it has one."),
     ] = None,
-    heights: Annotated[str, typer.Option(help="Image heights to test, pixels, comma-separated.")] = "512,768,1024,1536",
-    bitrates: Annotated[str, typer.Option(help="Bit rates to test, Mbit/s, comma-separated.")] = "1,2,5,10,20,40",
-    rates: Annotated[str, typer.Option(help="Frame rates to test, frames per second, comma-separated.")] = "30,15",
-    jobs: Annotated[int, typer.Option(min=1, help="Cells of the table that are computed at the same time.")] = 1,
+    heights: Annotated[str, typer.Option(help="Image heights to test in pixels.")] = "512,768,1024,1536",
+    bitrates: Annotated[str, typer.Option(help="Bit rates to test in Mbit/s.")] = "1,2,5,10,20,40",
+    rates: Annotated[str, typer.Option(help="Frame rates to test in frames per second.")] = "30,15",
+    jobs: Annotated[int, typer.Option(min=1, help="Settings (cells of the table) tested at the same time.")] = 1,
     backend: Annotated[
         str | None,
-        typer.Option(help="Solver: lm (Levenberg-Marquardt), or adam (as in D3.2); default: setting track.backend."),
+        typer.Option(
+            help="Solver: lm (Levenberg-Marquardt), or adam (gradient descent by torch, slower); default: setting "
+            "track.backend."
+        ),
     ] = None,
     set_: Sets = None,
     config: Config = None,
     bus: Bus = None,
 ) -> None:
-    """Measure how resolution, bit rate and frame rate of the video affect the error (5G-ERA D3.2, tables 4 and 5)."""
+    """Error of the path by resolution, bit rate and frame rate of a 360-degree video (5G-ERA D3.2, tables 4, 5)."""
     study_compression(
         source, out, truth=truth, gps=gps, mask=mask, heights=heights, bitrates=bitrates, rates=rates, jobs=jobs,
         settings=settings_of([*(set_ or []), *([f"track.backend={backend}"] if backend else [])], config), bus=bus,

@@ -16,15 +16,16 @@ from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.run_with_progress import default_jobs, execute_with_progress, show_failed, show_results
+from scan2sim.flows.commands.unchanged import Watch
 from scan2sim.flows.engine import workers
 from scan2sim.flows.engine.execution import Executor, limit_cores
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.memory import parse_memory
-from scan2sim.flows.engine.planning import STORE, PlannedTask, Reason, drop_damaged, plan
+from scan2sim.flows.engine.planning import STORE, PlannedTask, Reason, collector_paused, drop_damaged, plan
 from scan2sim.flows.engine.progress import published
 from scan2sim.flows.engine.ready_queue import Outcome
 from scan2sim.flows.engine.versions import versions
-from scan2sim.flows.pipelines.graph import TaskId
+from scan2sim.flows.pipelines.graph import TaskId, source_paths
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.pipelines.survey import build_survey_graph
 from scan2sim.flows.pipelines.tile import check_here
@@ -38,7 +39,7 @@ from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.remote import Remote, is_remote, local_copy
 from scan2sim.pipeline.core.types import Tile
 from scan2sim.pipeline.io.survey import Survey, read_survey
-from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.io.tile import read_tile, source_files
 
 app = App()
 
@@ -162,8 +163,13 @@ def make_survey(place: str | Path, target: str | Path, settings: Settings, run: 
         log.write(f"survey {survey.path}, settings {json.dumps(settings.values)}, versions {json.dumps(versions())}")
         store = _store(place, target)
         digests = Digests(store.root / "digests.json")
-        tile_results = _run_tiles(survey, settings, store, run, digests, side)
-        report = finish(survey, tile_results, store, out, settings, digests, side, warn)
+        tiles, unread = read_tiles(survey)
+        watch = _watch(survey, tiles, settings)
+        tile_results = _run_tiles(survey, tiles, unread, settings, store, run, digests, side)
+        warnings: list[str] = []
+        report = finish(survey, tile_results, store, out, settings, digests, side, warnings.append)
+        for text in warnings:
+            warn(text)
         digests.save()
         log.write_failed(side)
         failed = [result for result in tile_results if result.error is not None]
@@ -172,9 +178,12 @@ def make_survey(place: str | Path, target: str | Path, settings: Settings, run: 
         if remote_target:
             files = (path.relative_to(out) for path in sorted(out.rglob("*")) if path.is_file())
             remote_target.push_all(file.as_posix() for file in files if file.parts[0] not in (STORE, ".lock"))
-    show_failed(side, log)
+        show_failed(side, log)
+        lines = show_results(out / "world" / f"{survey.name}.sdf", report)
+        made_here = remote_source or remote_target or survey.path.resolve().is_relative_to(out.resolve())
+        if not (made_here or failed or side.failed or warnings):
+            watch.record(out, [*lines, "nothing to do: all worlds are up to date"])
     up_to_date = all(result.up_to_date for result in tile_results)
-    show_results(out / "world" / f"{survey.name}.sdf", report)
     if up_to_date and not failed and not side.failed:
         console.print(f"[dim]nothing to do: all worlds are up to date ({time.perf_counter() - began:.1f} s)")
     if failed:
@@ -187,6 +196,12 @@ def make_survey(place: str | Path, target: str | Path, settings: Settings, run: 
     side.check()
     assert report is not None, "side.check() raises if there is no report"
     return report
+
+
+def _watch(survey: Survey, tiles: Mapping[str, Tile], settings: Settings) -> Watch:
+    """The status of all files that the tiles are made from."""
+    tasks = build_survey_graph(list(tiles.values()), settings)
+    return Watch([survey.path, *source_paths(tasks), *(file for t in tiles.values() for file in source_files(t.path))])
 
 
 def read_tiles(survey: Survey) -> tuple[dict[str, Tile], dict[str, ScanError]]:
@@ -209,16 +224,22 @@ def plan_survey(
     without: Collection[TaskId] = (),
 ) -> list[PlannedTask]:
     """The plan of all tiles, `without` side products that failed."""
-    return plan(build_survey_graph(list(tiles.values()), settings, without), store, digest=digest)
+    with collector_paused():
+        return plan(build_survey_graph(list(tiles.values()), settings, without), store, digest=digest)
 
 
 def _run_tiles(
-    survey: Survey, settings: Settings, store: Store, run: Executor, digests: Digests, side: SideProducts
+    survey: Survey,
+    tiles: dict[str, Tile],
+    unread: Mapping[str, ScanError],
+    settings: Settings,
+    store: Store,
+    run: Executor,
+    digests: Digests,
+    side: SideProducts,
 ) -> list[TileResult]:
     """Run all tiles; repeat without the tiles and side products that failed, until none fails."""
-    out = side.out
-    tiles, failed = read_tiles(survey)
-    unread = set(failed)
+    out, failed = side.out, dict(unread)
     side_failed: dict[TaskId, ScanError] = {}
     ran: dict[tuple[TaskId, str], Reason] = {}  # reasons of tasks that an earlier round of this run executed
     before: dict[TaskId, set[str]] = {}  # contents of the results that existed before each task ran
@@ -243,7 +264,7 @@ def _run_tiles(
         for task, error in outcome.failed.items():
             failed.setdefault(task.tile, error)
         tiles = {name: tile for name, tile in tiles.items() if name not in failed}
-    side.add({task: error for task, error in side_failed.items() if task.tile in tiles})
+    side.add({task: error for task, error in side_failed.items() if task.tile in tiles}, outcome.done)
     return [
         TileResult(name, None if name in unread else read_tile(path), error=failed[name])
         if name in failed
@@ -261,8 +282,10 @@ def _tile_result_parts(
     return own_tasks, outcome.of_tile(name), any(outcome.done[task].content not in before[task] for task in ran)
 
 
-def changes(place: str | Path, target: str | Path, settings: Settings) -> dict[str, str]:
-    """Reasons why tiles of a survey would be rebuilt, by tile name; empty if all are up to date.
+def planned_survey(
+    place: str | Path, target: str | Path, settings: Settings
+) -> tuple[list[PlannedTask], Store, dict[str, ScanError]]:
+    """The plan of a survey, the cache of its results, and the errors of tiles that can't be read.
 
     Raises:
         ScanError: see `pipeline.core.errors`.
@@ -270,8 +293,18 @@ def changes(place: str | Path, target: str | Path, settings: Settings) -> dict[s
     remote_source, store = _remote(place), _store(place, target)
     digests = Digests(store.root / "digests.json")
     tiles, failed = read_tiles(read_survey(remote_source.pull_all() if remote_source else Path(place)))
+    return plan_survey(tiles, store, settings, digests), store, failed
+
+
+def changes(place: str | Path, target: str | Path, settings: Settings) -> dict[str, str]:
+    """Reasons why tiles of a survey would be rebuilt, by tile name; empty if all are up to date.
+
+    Raises:
+        ScanError: see `pipeline.core.errors`.
+    """
+    planned, _, failed = planned_survey(place, target, settings)
     reasons = {name: str(error) for name, error in failed.items()}
-    for item in plan_survey(tiles, store, settings, digests):
+    for item in planned:
         if item.reason is not None:
             reasons.setdefault(item.task.tile, f"{item.task.step.name}: {item.reason.value}")
     return reasons

@@ -1,7 +1,9 @@
-"""Trajectory of a scanner whose sweeps are imported, by lidar odometry and fusion with GPS and poses."""
+"""Tasks that an import depends on: unpacking of a bag, lidar odometry, fusion, reconstruction of photos, ..."""
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from scan2sim.flows.commands.display import console, warn
@@ -9,39 +11,60 @@ from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.run_with_progress import plan_and_run
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import STORE
-from scan2sim.flows.pipelines.graph import Task
+from scan2sim.flows.pipelines.graph import Output, Task
 from scan2sim.pipeline.core.cache import Digests, Store
 from scan2sim.pipeline.io.worlds.merge import link
 
 
-def scanner_path(tasks: list[Task], out: Path) -> Path:
-    """Run the tasks of a scanner's trajectory (`pipelines.sweeps`), and print a summary; finished tasks are cached.
+def run_before_import(tasks: Sequence[Task], out: Path) -> dict[str, Path]:
+    """Run all tasks but the last, the import, and print a summary; finished tasks are cached.
 
     Args:
-        tasks: those to run.
-        out: folder for the trajectory in all formats, and for cached results.
+        tasks: those to run, in order.
+        out: folder for cached results, and for an estimated trajectory in all formats; unused if there is only the
+            import.
 
     Returns:
-        Path of the `trajectory.csv`.
+        Inputs of the import by name.
 
     Raises:
         ScanError: raised by a step.
     """
+    *before, last = tasks
+    return run_cached(before, last.inputs, out)
+
+
+def run_cached(tasks: Sequence[Task], wanted: Mapping[str, Path | Output], out: Path) -> dict[str, Path]:
+    """Run tasks as `run_before_import`; returns the paths of `wanted` files and outputs."""
+    found = {name: source for name, source in wanted.items() if isinstance(source, Path)}
+    if not tasks:
+        return found
     with locked(out):
         store = Store(out / STORE)
         digests = Digests(store.root / "digests.json")
         log = Log(out / "run.log")
         with log.errors(out):
-            planned, done = plan_and_run(tasks, store, log, {task.id.name for task in tasks}, digests)
-            folder = {item.task.id.name: store.folder(item.task.full_name, item.key) for item in planned}["fuse"]
-            for old in out.glob("trajectory.*"):
-                old.unlink()
-            for made in (folder / "path").iterdir():
-                link(str(made), str(out / made.name))
+            planned, done = plan_and_run(list(tasks), store, log, {task.id.name for task in tasks}, digests)
+        folders = {item.task.id: store.folder(item.task.full_name, item.key) for item in planned}
+        for name, source in wanted.items():
+            if isinstance(source, Output):
+                found[name] = folders[source.task] / done[source.task.full_name].files[source.name]
+        for old in (*out.glob("trajectory.*"), *out.glob("colmap/*")):
+            old.unlink()
+        for item in planned:
+            if "path" in done[item.task.full_name].files:
+                shutil.copytree(folders[item.task.id] / "path", out, copy_function=link, dirs_exist_ok=True)
         store.sweep({item.task.id.name: item.key for item in planned})
         digests.save()
     for manifest in done.values():
         for text in manifest.warnings:
             warn(text)
-    console.print(str(done["fuse"].metrics["summary"]), highlight=False, soft_wrap=True, markup=False)
-    return out / "trajectory.csv"
+        summary = manifest.metrics.get("summary")
+        if summary is not None and "check" not in manifest.files:  # that of a check is printed after the import
+            console.print(str(summary), highlight=False, soft_wrap=True, markup=False)
+    return found
+
+
+def cached_check(task: Task, out: Path) -> Path:
+    """Run a task that checks poses; returns the folder `check` of its result, cached beside the tile `out`."""
+    return run_cached([task], {"check": Output(task.id, "check")}, out.with_name(f"{out.name}-path"))["check"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import webbrowser
 from contextlib import ExitStack
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated
 
@@ -12,19 +13,23 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from scan2sim.flows.commands import qos_table
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import assigned, options
 from scan2sim.flows.commands.ros_spin import stop_on_signal
 from scan2sim.pipeline.core import optional_deps
-from scan2sim.pipeline.core.errors import SettingError, StepError
+from scan2sim.pipeline.core.errors import DataError, SettingError
 from scan2sim.services.teleoperation.settings import (
     DemoParams,
+    ExportParams,
     GatewayParams,
     MeasureParams,
+    ReplayParams,
     StationParams,
     VehicleParams,
 )
+from scan2sim.services.teleoperation.station.drivers import DriverRole
 from scan2sim.services.teleoperation.vehicle import adapters
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
 
@@ -89,7 +94,8 @@ def teleop_translate(
         typer.Option(
             "--set",
             metavar="PARAM=VALUE",
-            help="Setting of the adapter, such as channel=can0; repeatable (docs/teleoperation.md).",
+            help="Setting of the adapter, such as channel=can0; repeatable (docs/teleoperation.md, "
+            "docs/teleoperation-ros.md).",
         ),
     ] = None,
 ) -> None:
@@ -126,6 +132,68 @@ def teleop_station(
     serve(params, _say, window)
 
 
+@app.command("drivers")
+def teleop_drivers(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="File of a station's drivers (`teleop station --drivers`).")
+    ],
+    add: Annotated[
+        str, typer.Option(metavar="NAME", help="Add a driver, or give one a new token; the token is printed once.")
+    ] = "",
+    role: Annotated[DriverRole, typer.Option(help="Role of the added driver.")] = DriverRole.DRIVER,
+    days: Annotated[float | None, typer.Option(help="Days until the token expires. Default: never.")] = None,
+    revoke: Annotated[str, typer.Option(metavar="NAME", help="Remove a driver, who loses control at once.")] = "",
+) -> None:
+    """List, add and remove the named drivers of a station."""
+    from scan2sim.services.teleoperation.station import drivers
+
+    if revoke:
+        drivers.revoke(file, revoke)
+    if add:
+        expires = None if days is None else datetime.now(UTC) + timedelta(days=days)
+        _say(f"token of {add}: {drivers.add(file, add, role, expires)}")
+    table = Table("driver", "role", "token expires (UTC)")
+    for one in drivers.read(file):
+        table.add_row(escape(one.name), one.role, "never" if one.expires is None else f"{one.expires:%Y-%m-%d %H:%M}")
+    console.print(table)
+
+
+@app.command("replay")
+@options(ReplayParams, recording="RECORDING")
+def teleop_replay(params: ReplayParams) -> None:
+    """Replay a recorded drive (`teleop station --record`) on the driver page."""
+    _require("fastapi", "uvicorn", "rosbags")
+    from scan2sim.services.teleoperation.station.replay import serve
+
+    serve(params, _say)
+
+
+@app.command("export")
+@options(ExportParams, recording="RECORDING", out="OUT")
+def teleop_export(params: ExportParams) -> None:
+    """Export recorded drives as an MCAP bag with JPEG images, for Foxglove, RViz and others."""
+    _require("av", "rosbags")
+    from scan2sim.services.teleoperation.station.export import export
+
+    _say(f"{export(params)} images in {params.out}")
+
+
+@app.command("audit")
+def teleop_audit(
+    trail: Annotated[
+        Path, typer.Argument(metavar="STATE", help="Folder of the gateway's --state, or its audit.jsonl.")
+    ],
+) -> None:
+    """Verify the audit trail: whether an entry was changed, removed or inserted."""
+    from scan2sim.services.teleoperation.gateway.audit import verify
+
+    path = trail / "audit.jsonl" if trail.is_dir() else trail
+    found = verify(path)
+    if found.damage:
+        raise DataError(path, found.damage, "Compare it with a backup")
+    _say(f"{found.entries} entries, none was changed; SHA-256 of the newest: {found.head}")
+
+
 @app.command("vehicle")
 @options(VehicleParams, certificates="CERTIFICATES", gateway="GATEWAY")
 def teleop_vehicle(params: VehicleParams) -> None:
@@ -158,43 +226,58 @@ def teleop_demo(
             stack.enter_context(app_window.window(running.page))
         elif browse:
             webbrowser.open(running.page)
-        while not stop.wait(1.0):
-            if (why := running.ended()) is not None:
-                raise StepError("teleop demo", why, "Start it again; `--help` lists what can be changed")
+        while not stop.wait(0.5):
+            running.supervise(_say)
 
 
 @app.command("measure")
 @options(MeasureParams)
-def teleop_measure(params: MeasureParams) -> None:
+def teleop_measure(params: MeasureParams, as_json: qos_table.Json = False, out: qos_table.Out = None) -> None:
     """Measure latency, loss and driving of a scripted drive over an emulated network, against 5G-ERA D3.2, table 6."""
+    measure_drive(params, "teleoperation", as_json=as_json, out=out)
+
+
+def measure_drive(params: MeasureParams, requirements_of: str, *, as_json: bool, out: Path | None) -> None:
+    """Measure a scripted drive, and report it.
+
+    Args:
+        params: settings of the measurement.
+        requirements_of: name or file of the requirements.
+        as_json, out: see `qos_table.report`.
+    """
     _require("av", "psutil")
-    from scan2sim.flows.commands import qos_table
     from scan2sim.services.qos import requirements
-    from scan2sim.services.qos.compare import compare_metrics, passed
-    from scan2sim.services.qos.requirements import MACHINE_METRICS, NETWORK_METRICS
+    from scan2sim.services.qos.compare import compare_metrics
     from scan2sim.services.teleoperation.qos.measure import measure, percentile
 
-    service = requirements.read("teleoperation")
+    service = requirements.read(requirements_of)
     required = service.of(params.environment)
     with progress(f"teleoperation {params.environment}") as report:
         measured = measure(params, required, report)
     comparisons = compare_metrics(required, measured)
-    console.print(qos_table.table(f"{service.title}, {params.environment} ({service.source})", comparisons))
     times = measured.glass_to_glass
-    _say(
+    lines = [
         f"{len(times)} frames were shown; glass-to-glass latency: median {percentile(times, 50):.0f} ms, "
-        f"95th percentile {percentile(times, 95):.0f} ms; {measured.lost_frames:.2%} of the frames were lost"
-    )
-    _say(f"longest gap between commands: {measured.command_gap:.0f} ms")
+        f"95th percentile {percentile(times, 95):.0f} ms; {measured.lost_frames:.2%} of the frames were lost",
+        f"longest gap between commands: {measured.command_gap:.0f} ms",
+    ]
+    drive = {
+        "frames": len(times),
+        "glass_to_glass_p50": percentile(times, 50),
+        "glass_to_glass_p95": percentile(times, 95),
+        "lost_frames": measured.lost_frames,
+        "command_gap": measured.command_gap,
+    }
     if offsets := measured.cross_track_error:
         mean, p95 = sum(offsets) / len(offsets), percentile(offsets, 95)
         runs = measured.vehicle["runs"]
-        _say(
+        lines.append(
             f"driven {runs} times along the street; deviation from the path: mean {mean:.2f} m, "
             f"95th percentile {p95:.2f} m"
         )
-    for name, metrics in (("service", NETWORK_METRICS), ("machine", MACHINE_METRICS)):
-        _say(f"{name}: {'passed' if passed(comparisons, metrics) else 'FAILED'}")
+        drive |= {"deviation_mean": mean, "deviation_p95": p95}
+    title = f"{service.title}, {params.environment} ({service.source})"
+    qos_table.report("teleoperation", params, title, comparisons, lines, as_json=as_json, out=out, drive=drive)
 
 
 def _require(*packages: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Annotated
 
@@ -69,6 +69,49 @@ def toolbox_segment(params: segment.Params, images: Images, out: Out, draw: Draw
     _over_files("segment", params, images, out, draw)
 
 
+@app.command("train")
+def toolbox_train(
+    drives: Annotated[
+        list[Path],
+        typer.Option(
+            "--drives",
+            metavar="TILE",
+            help="Drive to learn from: a tile with a lidar's cloud and photos, its folder or tile.toml; repeatable.",
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Output folder: vehicles.onnx, labels, cached results. The same command resumes an interrupted run.",
+        ),
+    ],
+    held_out: Annotated[
+        list[Path] | None,
+        typer.Option("--held-out", metavar="TILE", help="Drive that is only used for the evaluation; repeatable."),
+    ] = None,
+    minutes: Annotated[float, typer.Option(min=0, help="Time limit of the training in minutes; 0: none.")] = 60,
+    steps: Annotated[int, typer.Option(min=1, help="Number of optimiser steps.")] = 3000,
+    synthetic: Annotated[
+        int,
+        typer.Option(help="Number of generated images beside the photos, so that other classes are not forgotten."),
+    ] = 900,
+    start: Annotated[
+        Path | None, typer.Option(help="Weights (.safetensors) to start from; default: those of the included network.")
+    ] = None,
+    threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
+    seed: Annotated[int, typer.Option(help="Random seed of crops and augmentation.")] = 0,
+) -> None:
+    """Train the detector on drives: the lidar's vehicles, projected into the photos, are the labels."""
+    from scan2sim.flows.commands.toolbox_train import train_on_drives
+
+    train_on_drives(
+        drives, out, held_out or [], minutes=minutes, steps=steps, synthetic=synthetic, start=start, threads=threads,
+        seed=seed,
+    )  # fmt: skip
+
+
 @app.command("serve")
 @options(ServeParams)
 def toolbox_serve(
@@ -79,23 +122,28 @@ def toolbox_serve(
         list[str] | None, typer.Option("--camera", help=ServeParams.model_fields["camera"].description)
     ] = None,
 ) -> None:
-    """Serve a toolbox by HTTP (Open Inference Protocol)."""
+    """Serve a toolbox by HTTP, and by gRPC if --grpc-port is given (Open Inference Protocol)."""
     optional_deps.require("a toolbox by HTTP", "fastapi", "uvicorn", "prometheus_client")
     from scan2sim.services.http import factory
     from scan2sim.services.toolboxes.api import application
     from scan2sim.services.toolboxes.sources import Cameras
 
     settings = _params(box, set_)
-    with closing(Engine(box, settings)) as engine:
+    if params.grpc_port is not None:
+        optional_deps.require("--grpc-port", "grpc")
+    with ExitStack() as stack:
+        engine = stack.enter_context(closing(Engine(box, settings)))
         cameras = Cameras(engine, camera) if camera else None
         served = application(engine, params, cameras)
+        if params.grpc_port is not None:
+            from scan2sim.services.toolboxes.inference import grpc_server
+
+            grpc_address = stack.enter_context(grpc_server.serving(engine, params, params.grpc_port))
+            _say(f"gRPC: {grpc_address}")
         if cameras:
+            stack.callback(cameras.stop)
             cameras.start()
-        try:
-            factory.run(served, params, lambda address: _say(f"{address}v2/models/{box}/infer; Ctrl-C stops it"))
-        finally:
-            if cameras:
-                cameras.stop()
+        factory.run(served, params, lambda address: _say(f"{address}v2/models/{box}/infer; Ctrl-C stops it"))
 
 
 @app.command("node")

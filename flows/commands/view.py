@@ -14,8 +14,11 @@ from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.reports import film as films
+from scan2sim.flows.reports.comparison_film import comparison_film
 from scan2sim.flows.reports.view import INDEX, Pages, ViewParams, server
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.optional_deps import require
+from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.io.tile_folder import tile_folder
 from scan2sim.pipeline.io.worlds.scene import Scene, read_scene
 
@@ -37,14 +40,30 @@ def view(
         Path | None,
         typer.Option("--film", metavar="FLIGHT.mp4", help="Render a flight through the world to this video."),
     ] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(
+            "--compare",
+            metavar="TILE",
+            help="With --film: instead of a flight, render the world with its recorded traffic at the poses and times "
+            "of the photos of this tile, beside the photos.",
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing page.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Serve the page without opening a browser.")] = False,
 ) -> None:
     """Open a finished world in the browser, or render a flight through it as a video."""
     if film is not None:
         require("--film", "av")
+    elif compare is not None:
+        raise SettingError("--compare", "needs a video to write", "Add --film FILM.mp4")
     scene = read_scene(world)
-    if film is not None:
+    if film is not None and compare is not None:
+        photos = {view.name: view.photo for view in read_tile(compare).views}
+        with progress("film") as report:
+            comparison_film(scene, photos, film, params.width, report)
+        console.print(f"Film: {film}", highlight=False, soft_wrap=True)
+    elif film is not None:
         with progress("flight") as report:
             films.film(scene, film, params.seconds, params.width, report)
         console.print(f"Flight: {film}", highlight=False, soft_wrap=True)

@@ -75,7 +75,7 @@ def execute(
                     queue.rebuild_damaged(item, error)
                 except ScanError as error:
                     queue.fail(item, error)
-                    if not (keep_going or item.task.step.side_product):
+                    if not (keep_going or item.task.side_product):
                         return queue.outcome
                 else:
                     if manifest is None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+import gc
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -16,12 +18,16 @@ STORE = "steps"
 """Name of the folder of cached results within an output folder."""
 
 
+UNLESS_SAME = "input may change: reused if it turns out the same"
+
+
 class Reason(Enum):
     """Reason why a task runs; the value is shown to the user."""
 
     NEW = "never run before"
     CHANGED = "input, settings or version changed"
     DAMAGED = "cached result damaged or deleted"
+    RETRIED = "a part of its result failed"
     FORCED = "requested by --force"
     REQUESTED = "requested by --from"
     FOLLOWS = "depends on the step of --from"
@@ -68,7 +74,7 @@ class PlannedTask:
         for name, source in self.task.inputs.items():
             if isinstance(source, Output):
                 manifest = self._found(store.find(source.task.full_name, self._key(name)), source)
-                contents[name] = f"{manifest.content}/{source.name}"
+                contents[name] = f"{manifest.content_of(source.name)}/{source.name}"
         return key_of(self.task.step, self.task.params, contents)
 
     def cached_result(self, store: Store) -> Manifest | None:
@@ -76,9 +82,10 @@ class PlannedTask:
         if self.ignores_cache:
             return None
         name = self.task.full_name
-        return store.find(name, self.key) or store.reuse_same_content(
-            name, self.key, self.content_key(store), self.keys
-        )
+        found = store.find(name, self.key)
+        if found is not None and found.failed and not store.is_verified(name, self.key):
+            return None
+        return found or store.reuse_same_content(name, self.key, self.content_key(store), self.keys)
 
     def inputs(self, store: Store) -> dict[str, Path]:
         """Paths of its input files by name.
@@ -131,6 +138,25 @@ def plan(
         start: name of a step to run, with all tasks that depend on it.
         digest: function that computes the digest of a source file.
     """
+    with collector_paused():
+        return _plan(tasks, store, force, start, digest)
+
+
+@contextmanager
+def collector_paused() -> Iterator[None]:
+    """Without the garbage collector, which scans the growing graph of a large survey again and again, for nothing."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def _plan(
+    tasks: Sequence[Task], store: Store, force: bool, start: str | None, digest: Callable[[Path], str]
+) -> list[PlannedTask]:
     planned: dict[TaskId, PlannedTask] = {}
     digests: dict[Path, str] = {}
     for task in tasks:
@@ -152,6 +178,30 @@ def plan(
             reason = Reason.FOLLOWS
         planned[task.id] = PlannedTask(task, key, keys, reason)
     return list(planned.values())
+
+
+def why(item: PlannedTask, store: Store) -> str:
+    """Why a task runs, or that its result is cached; of a change, what changed since its newest cached result."""
+    if item.reason is None:
+        return "cached: same input, settings and version"
+    if item.reason is not Reason.CHANGED:
+        return item.reason.value
+    task, last = item.task, store.newest(item.task.full_name)
+    if last is None:
+        return item.reason.value
+    if last.version != task.step.version:
+        return f"version of the step changed: {last.version} -> {task.step.version}"
+    params = task.params.model_dump(mode="json")
+    changed = sorted(name for name in params.keys() | last.params.keys() if params.get(name) != last.params.get(name))
+    if changed:
+        names = [name for name in changed if name != "context"]
+        texts = [f"{name} {last.params.get(name)} -> {params.get(name)}" for name in names]
+        return f"settings changed: {', '.join(texts)}" if texts else "settings of other steps changed"
+    files = {name for name, source in task.inputs.items() if not isinstance(source, Output)}
+    changed = sorted(name for name in files if item.keys[name] != last.inputs.get(name))
+    if changed:
+        return f"input files changed: {', '.join(changed)}"
+    return UNLESS_SAME
 
 
 def check(planned: Sequence[PlannedTask]) -> None:
@@ -179,9 +229,10 @@ def drop_damaged(planned: Sequence[PlannedTask], store: Store, names: Collection
 
 
 def _reason(task: Task, key: str, store: Store) -> Reason | None:
-    if store.find(task.full_name, key) is not None:
-        return None
-    if store.folder(task.full_name, key).exists():
+    found = store.find(task.full_name, key)
+    if found is not None:
+        return Reason.RETRIED if found.failed and not store.is_verified(task.full_name, key) else None
+    keys = store.keys(task.full_name)
+    if key in keys:
         return Reason.DAMAGED
-    others = [p for p in (store.root / task.full_name).glob("*") if not p.name.startswith(".")]
-    return Reason.CHANGED if others else Reason.NEW
+    return Reason.CHANGED if keys else Reason.NEW

@@ -37,12 +37,12 @@ CLOSE_TIMEOUT_S = 2.0
 MAX_MESSAGE_CHARS, MAX_NAME_CHARS = 400, 256
 """Maximum length of published messages and names."""
 
-State = Literal["waiting", "running", "done", "kept", "failed"]
+State = Literal["waiting", "running", "done", "cached", "failed"]
 STATES: dict[Event, State] = {
     "start": "running",
     "progress": "running",
     "done": "done",
-    "kept": "kept",
+    "cached": "cached",
     "failed": "failed",
     "again": "waiting",
 }
@@ -83,7 +83,7 @@ class Publisher:
         self,
         run: str,
         open_outlets: Callable[[], Sequence[Outlet]],
-        about: Callable[[Counter[State]], RunState] | None = None,
+        about: Callable[[Counter[State], bool], RunState] | None = None,
         host: str | None = None,
     ) -> None:
         """Start the background thread.
@@ -91,8 +91,8 @@ class Publisher:
         Args:
             run: id of the run.
             open_outlets: opens the outlets to the bus.
-            about: makes the state of the run from the number of its steps in each state; None: another process
-                publishes it.
+            about: makes the state of the run from the number of its steps in each state and whether the run has ended;
+                None: another process publishes it.
             host: name of the machine that runs the steps, if known.
         """
         self._run, self._open_outlets, self._run_state, self._host = run, open_outlets, about, host
@@ -115,7 +115,7 @@ class Publisher:
         now = time.monotonic()
         with self._lock:
             step = self._steps[task.id]
-            if event == "kept" and step.state == "done":
+            if event == "cached" and step.state == "done":
                 return  # an earlier round of this run computed it
             if event == "start":
                 step.began, step.ended = now, None
@@ -140,7 +140,7 @@ class Publisher:
                     events.send("step", self._state_of(step))
                 if self._run_state and (ended or changed or now - self._run_published >= HEARTBEAT_INTERVAL_S):
                     self._run_published = now
-                    events.send("run", self._run_state(self._count()))
+                    events.send("run", self._run_state(self._count(), ended))
             for outlet in outlets:
                 outlet.close()
         except Exception as error:  # a failure to publish must not stop the run
@@ -233,17 +233,17 @@ class PublishedRun:
         self._message, self._state = message, state
         self.steps.close()
 
-    def _run_state(self, steps: Counter[State]) -> RunState:
+    def _run_state(self, steps: Counter[State], ended: bool) -> RunState:
         return RunState(
             run=self.channel.run,
             command=self._command,
             source=printable(self._source)[-MAX_NAME_CHARS:],
             host=printable(self._host)[:MAX_NAME_CHARS],
-            state=self._state,
+            state=self._state if ended else "running",  # the final state is published once, as the last event
             steps=steps.total(),
             running=steps["running"],
             done=steps["done"],
-            kept=steps["kept"],
+            cached=steps["cached"],
             failed=steps["failed"],
             seconds=time.monotonic() - self._began,
             message=printable(self._message)[:MAX_MESSAGE_CHARS],

@@ -11,7 +11,7 @@ from scan2sim.flows.pipelines.graph import Task, TaskId
 from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.errors import DamagedError, ScanError
 
-Event = Literal["start", "progress", "done", "kept", "failed", "again"]
+Event = Literal["start", "progress", "done", "cached", "failed", "again"]
 EventCallback = Callable[[Task, Event, float, str], None]
 """Receives what happens to a task: task, event, fraction done, message."""
 
@@ -85,7 +85,7 @@ class ReadyQueue:
                 else:
                     self.take(item)
                     self.done[task] = cached
-                    self._watch(item.task, "kept", 1.0, "")
+                    self._watch(item.task, "cached", 1.0, "")
 
     def take(self, item: PlannedTask) -> None:
         """Record that a task was started."""
@@ -112,5 +112,5 @@ class ReadyQueue:
         """Record the error of a task; tasks that depend on it are dropped."""
         self.take(item)
         self._lost.add(item.task.id)
-        (self.side_failed if item.task.step.side_product else self.failed)[item.task.id] = error
+        (self.side_failed if item.task.side_product else self.failed)[item.task.id] = error
         self._watch(item.task, "failed", 1.0, error.cause)

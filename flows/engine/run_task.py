@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import shutil
 import time
 from pathlib import Path
+from typing import Any
 
 from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.pipeline.core.cache import Manifest, Store
@@ -24,10 +26,12 @@ def run_task(item: PlannedTask, store: Store, inputs: dict[str, Path], report: R
     item.check(store)
     content_key = item.content_key(store)
     folder = store.begin(task.full_name)
-    start = time.perf_counter()
+    start, cpu = time.perf_counter(), _cpu_seconds()
     _reset_peak_memory()
     try:
-        kept = {"checkpoint": store.checkpoint(task.full_name, item.key)} if task.step.resumes else {}
+        parts = store.parts(task.full_name, task.step)
+        kept: dict[str, Any] = {"parts": parts} if task.step.parts else {}
+        kept |= {"checkpoint": store.checkpoint(task.full_name, item.key)} if task.step.resumes else {}
         result = task.step.run(inputs, task.params, folder, report, **kept)
         about = {
             "version": task.step.version,
@@ -35,15 +39,23 @@ def run_task(item: PlannedTask, store: Store, inputs: dict[str, Path], report: R
             "inputs": item.keys,
             "inputs_digest": content_key,
             "seconds": round(time.perf_counter() - start, 3),
+            "cpu_seconds": round(_cpu_seconds() - cpu, 3),
             "peak_mb": _peak_mb(),
         }
-        return store.commit(task.full_name, item.key, folder, result, about)
+        manifest = store.commit(task.full_name, item.key, folder, result, about)
+        parts.sweep()
+        return manifest
     except ScanError:
         raise
     except Exception as error:
         raise from_exception(error, task.full_name, folder) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)  # already moved into the store, unless the step failed
+
+
+def _cpu_seconds() -> float:
+    """CPU time of this process and its ended children, seconds."""
+    return sum(os.times()[:4])
 
 
 def _reset_peak_memory() -> None:

@@ -15,7 +15,7 @@ from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.pipelines.steps import STEPS
 from scan2sim.pipeline.core.errors import UnavailableError
 
-EXTRAS_WITHOUT_STEPS = ("flows", "ray", "s3", "bus", "orchestration", "toolboxes", "teleop", "can", "dev")
+EXTRAS_WITHOUT_STEPS = ("flows", "ray", "s3", "bus", "broker", "orchestration", "toolboxes", "teleop", "can", "dev")
 """Extras for scheduling, transfer, monitoring, services and tests: no step depends on their packages."""
 
 

@@ -53,6 +53,7 @@ class Task:
         step, params: the step and its parameters.
         inputs: input name to a source file, or to the output of another task.
         group, tile: as in its `TaskId`.
+        side_product: whether the world is finished without its result if it fails.
     """
 
     step: Step
@@ -60,6 +61,7 @@ class Task:
     inputs: Mapping[str, Path | Output]
     group: str = ""
     tile: str = ""
+    side_product: bool = False
 
     @property
     def id(self) -> TaskId:
@@ -70,6 +72,11 @@ class Task:
     def full_name(self) -> str:
         """As `TaskId.full_name`."""
         return self.id.full_name
+
+
+def source_paths(tasks: Iterable[Task]) -> set[Path]:
+    """The source files and folders that tasks read."""
+    return {source for task in tasks for source in task.inputs.values() if not isinstance(source, Output)}
 
 
 def required_tasks(tasks: Sequence[Task], wanted: Iterable[TaskId]) -> list[Task]:

@@ -1,4 +1,4 @@
-"""Earlier names of steps and settings: the error about one of them names the new one."""
+"""Earlier names of steps, settings, fields of files and command line options: errors about one name the new one."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ STEPS = {
     "choose": "view_selection",
     "level": "colour_harmonization",
     "place": "georeference",
+    "slam": "track",
 }
 """Earlier name of a step: its name."""
 
@@ -40,16 +41,29 @@ SETTINGS = {
         "off": "max_error_deg",
         "views": "min_views",
         "survival": "min_tracked_share",
+        "gps_chords": "gps_distances",
     },
+    "slam": {"features": "count"},
     "cut": {"reach": "max_distance", "photo_reach": "photo_distance"},
 }
-"""By step: earlier name of a setting: its name."""
+"""By step (an earlier name if the setting had another name there): earlier name of a setting: its name."""
+
+DRIVE_FIELDS = {f"tiles.{old}": f"tiles.{new}" for old, new in SETTINGS["cut"].items()}
+"""Earlier name of a field of `drive.toml`: its name."""
+
+OPTIONS = {
+    "tile": {"--reach": "--max-distance", "--photo-reach": "--photo-distance"},
+    "monitor": {"--spool": "--outbox"},
+    "toolbox": {"--spool": "--outbox"},
+    "teleop": {"--translator": "--adapter"},
+}
+"""By command: earlier name of an option of it or of its subcommands: its name."""
 
 
 def current_name(path: str) -> str | None:
     """Today's name of the earlier `step` or `step.param`; None if it was never renamed."""
     step, _, param = path.partition(".")
     new_step = STEPS.get(step, step)
-    new_param = SETTINGS.get(new_step, {}).get(param, param)
+    new_param = (SETTINGS.get(new_step, {}) | SETTINGS.get(step, {})).get(param, param)
     new = f"{new_step}.{new_param}" if param else new_step
     return new if new != path else None

@@ -24,8 +24,16 @@ P = TypeVar("P", bound=Params)
 class Settings:
     """The user's settings by step and class; `params` merges them with the defaults of a step."""
 
-    def __init__(self, values: Mapping[str, Mapping[str, Any]] | None = None) -> None:
-        self.values = dict(values or {})
+    def __init__(
+        self,
+        values: Mapping[str, Mapping[str, Any]] | None = None,
+        defaults: Mapping[str, Mapping[str, Any]] | None = None,
+    ) -> None:
+        self.values, self.defaults = dict(values or {}), dict(defaults or {})
+
+    def with_defaults(self, defaults: Mapping[str, Mapping[str, Any]]) -> Settings:
+        """The same settings, with defaults of the tile that replace those of the steps."""
+        return Settings(self.values, defaults)
 
     @classmethod
     def read(cls, file: Path | None = None, assignments: Iterable[str] = ()) -> Settings:
@@ -86,7 +94,9 @@ class Settings:
                     if param not in fields:
                         if new := current_name(f"{name}.{param}"):
                             raise SettingError(f"{name}.{param}", "this setting was renamed", f"Write `{new}`")
-                        raise SettingError(f"{name}.{param}", "there is no such parameter", _nearest(param, fields))
+                        classes = SURFACES if known[name].per_class else ()
+                        remedy = _nearest(param, [*fields, *classes])
+                        raise SettingError(f"{name}.{param}", "there is no such parameter", remedy)
 
     def params(self, step: Step, group: str = "", context: Mapping[str, Any] | None = None, **given: Any) -> Any:
         """Parameters of a step: options `given` to a command, defaults of the class, then the user's settings.
@@ -100,16 +110,19 @@ class Settings:
         Raises:
             SettingError: a value out of range or of a wrong type, or one given twice.
         """
-        table = self.values.get(step.name, {})
-        classes: dict[str, Mapping[str, Any]] = {
-            k: v for k, v in table.items() if k in SURFACES and isinstance(v, Mapping)
-        }
-        general = {k: v for k, v in table.items() if k not in classes}
-        special = classes.get(group, {})
+        general, special = _split(self.values.get(step.name, {}), group)
+        tile_general, tile_special = _split(self.defaults.get(step.name, {}), group)
         for name in {*general, *special} & set(given):
             raise SettingError(f"{step.name}.{name}", "the command's option sets it, too", "Give only one of them")
-        merged = {**given, **step.class_defaults.get(group, {}), **general, **special}
+        defaults = {**given, **tile_general, **step.class_defaults.get(group, {}), **tile_special}
+        merged = {**defaults, **general, **special}
         return step.params.of(step.name, merged | ({"context": context} if context else {}))
+
+
+def _split(table: Mapping[str, Any], group: str) -> tuple[dict[str, Any], Mapping[str, Any]]:
+    """A step's settings for all classes, and those for the class `group`."""
+    classes: dict[str, Mapping[str, Any]] = {k: v for k, v in table.items() if k in SURFACES and isinstance(v, Mapping)}
+    return {k: v for k, v in table.items() if k not in classes}, classes.get(group, {})
 
 
 def _assign(tables: dict[str, Any], path: str, value: object, where: str) -> None:

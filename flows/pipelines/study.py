@@ -22,15 +22,18 @@ from scan2sim.slam.steps.encode import ENCODE
 from scan2sim.slam.steps.evaluate import EVALUATE
 from scan2sim.slam.steps.georeference import GEOREFERENCE
 from scan2sim.slam.steps.track import TRACK
-from scan2sim.slam.trajectory.evaluate import SEGMENT_M, distance_along
+from scan2sim.slam.trajectory.evaluate import distance_along
 from scan2sim.slam.trajectory.gps import smooth
 from scan2sim.slam.video import Video, open_video
 from scan2sim.slam.video_degradation import scaled
 
 STEPS: tuple[Step, ...] = (ENCODE, EVALUATE)
+SEGMENTS_M = (200.0, 400.0)
+"""Lengths of the local errors' segments; 400 as in D3.2."""
 MIN_TRUTH_SEGMENTS = 1.2
-"""Minimum length of the ground truth, in segments; if it is shorter, shorter segments are used."""
-SHORTER_SEGMENTS_M = (200.0, 100.0, 50.0, 20.0, 10.0)
+"""Minimum length of the ground truth, in segments; if it is shorter, the segments are left out."""
+SHORTER_SEGMENTS_M = (100.0, 50.0, 20.0, 10.0)
+"""Used for drives that are too short for any of `SEGMENTS_M`, the longest that fits."""
 
 
 def _even(height: int) -> int:
@@ -80,6 +83,16 @@ class Cell:
         """Group of its tasks: height, bit rate and frame rate."""
         return f"h{self.height}_b{self.bitrate:g}_f{self.rate:g}"
 
+    @property
+    def label(self) -> str:
+        """As users read it."""
+        return f"{self.height} px, {self.bitrate:g} Mbit/s, {self.rate:g} fps"
+
+    @property
+    def cost(self) -> float:
+        """Computing time relative to other cells of the same drive: linear in height, as measured from 256 to 768."""
+        return self.rate * (500 + self.height)
+
 
 def cells(study: Study) -> list[Cell]:
     """All cells of the tables, by descending frame rate, ascending height and bit rate."""
@@ -96,13 +109,15 @@ def rejection(cell: Cell, video: Video) -> str | None:
     return None
 
 
-def build_graph(study: Study, video: Video, segment: float, settings: Settings) -> list[Task]:
-    """The task graph of all cells that can be made from the video; the group of a task is the name of its cell.
+def build_graph(study: Study, video: Video, segments: tuple[float, ...], settings: Settings) -> list[Task]:
+    """The task graph of all cells that can be made from the video, those that take the least time first.
+
+    The group of a task is the name of its cell.
 
     Args:
         study: parameters of the study.
         video: its source.
-        segment: length of the segments of the local error in metres (`segment_of`).
+        segments: lengths of the segments of the local errors in metres (`segments_of`).
         settings: of the steps.
 
     Raises:
@@ -110,13 +125,13 @@ def build_graph(study: Study, video: Video, segment: float, settings: Settings) 
     """
     settings.check((*VIDEO, *STEPS))
     tasks: list[Task] = []
-    for cell in cells(study):
+    for cell in sorted(cells(study), key=lambda cell: cell.cost):
         if rejection(cell, video) is None:
-            tasks += _cell_tasks(cell, study, video, segment, settings)
+            tasks += _cell_tasks(cell, study, video, segments, settings)
     return tasks
 
 
-def _cell_tasks(cell: Cell, study: Study, video: Video, segment: float, settings: Settings) -> list[Task]:
+def _cell_tasks(cell: Cell, study: Study, video: Video, segments: tuple[float, ...], settings: Settings) -> list[Task]:
     """The tasks of a cell: encode the video, track it, place the trajectory, evaluate it against the ground truth."""
     camera = camera_of(video, "auto", None, None)
     if camera is None:
@@ -142,19 +157,22 @@ def _cell_tasks(cell: Cell, study: Study, video: Video, segment: float, settings
         add(ENCODE, {"video": video.path}, encoded),
         add(TRACK, output_of(ENCODE, "video") | gps_and_mask, {"cameras": (asdict(camera),)}, gps_offset=0.0),
         add(GEOREFERENCE, output_of(TRACK, "map"), georeference=False),
-        add(EVALUATE, output_of(GEOREFERENCE, "trajectory") | {"truth": study.truth}, {"segment": segment}),
+        add(EVALUATE, output_of(GEOREFERENCE, "trajectory") | {"truth": study.truth}, {"segments": segments}),
     ]
 
 
-def segment_of(video: Video, truth: Trajectory | GpsTrack) -> float:
-    """Length of the segments in metres: 400 as in D3.2, or less if the ground truth during the video is too short."""
+def truth_length(video: Video, truth: Trajectory | GpsTrack) -> float:
+    """Length of the ground truth's path during the video, metres."""
     times = truth.times
     if video.count:
         times = times[(times >= 0) & (times <= video.count / video.fps)]
     trajectory = smooth(truth, 2.0) if isinstance(truth, GpsTrack) else truth
     positions = trajectory.at(times)
     positions = positions[np.isfinite(positions).all(axis=1)]
-    length = float(distance_along(positions[:, :2])[-1]) if len(positions) else 0.0
-    return next(
-        (s for s in (SEGMENT_M, *SHORTER_SEGMENTS_M) if length >= MIN_TRUTH_SEGMENTS * s), SHORTER_SEGMENTS_M[-1]
-    )
+    return float(distance_along(positions[:, :2])[-1]) if len(positions) else 0.0
+
+
+def segments_of(length: float) -> tuple[float, ...]:
+    """Lengths of the local errors' segments on a path of a length, metres: 200 and 400, or one that is shorter."""
+    fitting = [s for s in (*SEGMENTS_M, *SHORTER_SEGMENTS_M) if length >= MIN_TRUTH_SEGMENTS * s]
+    return tuple(s for s in SEGMENTS_M if s in fitting) or (max(fitting, default=SHORTER_SEGMENTS_M[-1]),)

@@ -1,7 +1,8 @@
-"""Pipeline definition of lidar sweeps: lidar odometry, fusion with GPS and other poses, and import."""
+"""Pipeline definition of lidar sweeps: lidar odometry, fusion with GPS and poses, strip adjustment, and import."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +11,19 @@ from pydantic import Field
 from scan2sim.flows.pipelines.graph import Output, Task, TaskId
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.parameters import Shift
-from scan2sim.pipeline.core.step import Step
+from scan2sim.pipeline.core.step import Params, Step
 from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.steps.import_sweeps import IMPORT_SWEEPS, SweepsParams
 from scan2sim.slam.steps.fuse import FUSE, FuseParams
 from scan2sim.slam.steps.lidar import LIDAR, LidarParams
+from scan2sim.slam.steps.strip_adjustment import STRIP_ADJUSTMENT, PoseSourceParams, StripAdjustmentParams
+from scan2sim.slam.trajectory.strip_adjustment import PoseSource
 
-STEPS: tuple[Step, ...] = (LIDAR, FUSE, IMPORT_SWEEPS)
+STEPS: tuple[Step, ...] = (LIDAR, FUSE, STRIP_ADJUSTMENT, IMPORT_SWEEPS)
 
 
-class Sweeps(SweepsParams):
+class Sweeps(PoseSourceParams, SweepsParams):
     """Sweeps and related files: the options of `scan2sim import sweeps`, and table `[sweeps]` of a `drive.toml`."""
 
     folder: Path = Field(description="Folder of sweeps in scanner coordinates: .bin, .pcd, .ply, .las or .laz files.")
@@ -31,9 +34,9 @@ class Sweeps(SweepsParams):
         None, description="GPS track, to fuse and to georeference: GPX, NMEA, CSV, or a GoPro video."
     )
     gps_offset: Shift = Field(0.0, description="Seconds to add to the times of the GPS track.")
-    lidar: bool = Field(
+    lidar_odometry: bool = Field(
         False,
-        description="Run lidar odometry also if a trajectory is given; without one it always runs.",
+        description="Run lidar odometry also if a trajectory is given, and fuse both; always without one.",
     )
     extrinsics: Path | None = Field(
         None,
@@ -68,11 +71,11 @@ class Sweeps(SweepsParams):
 
 def uses_only_poses(sweeps: Sweeps, poses: bool) -> bool:
     """Whether only a given trajectory places the sweeps; `poses`: whether there is one."""
-    return poses and not sweeps.lidar and sweeps.gps is None
+    return poses and not sweeps.lidar_odometry and sweeps.gps is None
 
 
 def path(sweeps: Sweeps, here: Path, poses: Path | Output | None) -> list[Task]:
-    """The tasks that estimate the scanner's trajectory; none if a given trajectory suffices.
+    """The tasks that estimate the scanner's trajectory, or correct a given one; none if that is used as it is.
 
     Args:
         sweeps: sweeps and related files.
@@ -82,14 +85,19 @@ def path(sweeps: Sweeps, here: Path, poses: Path | Output | None) -> list[Task]:
     Raises:
         SettingError: `scanner_poses` without poses.
     """
-    if uses_only_poses(sweeps, poses is not None):
-        return []
     files: dict[str, Path | Output] = {"sweeps": here / sweeps.folder}
     if sweeps.times is not None:
         files["times"] = here / sweeps.times
+    if uses_only_poses(sweeps, poses is not None):
+        assert poses is not None
+        if sweeps.pose_source == "given":
+            return []
+        beside = {} if sweeps.extrinsics is None else {"extrinsics": here / sweeps.extrinsics}
+        own = {name: getattr(sweeps, name) for name in StripAdjustmentParams.model_fields}
+        return [Task(STRIP_ADJUSTMENT, StripAdjustmentParams(**own), {**files, **beside, "poses": poses})]
     fused = dict(files)
     tasks = []
-    if sweeps.lidar or poses is None:
+    if sweeps.lidar_odometry or poses is None:
         own = {name: getattr(sweeps, name) for name in LidarParams.model_fields}
         tasks.append(Task(LIDAR, LidarParams(**own), files))
         fused["matched"] = Output(TaskId("lidar"), "matched")
@@ -115,12 +123,16 @@ def placed(sweeps: Sweeps, here: Path, poses: Path | Output | None) -> tuple[dic
     if poses is not None:
         files["poses"] = poses
     if uses_only_poses(sweeps, poses is not None):
-        return files, sweeps.params()
+        if sweeps.pose_source == "given":
+            return files, sweeps.params()
+        adjusted = TaskId("strip_adjustment")
+        files |= {"poses": Output(adjusted, "trajectory"), "trajectory_check": Output(adjusted, "check")}
+        return files, sweeps.params().model_copy(update={"scanner_poses": True, "quaternions": "xyzw"})
     files["poses"] = Output(TaskId("fuse"), "trajectory")
     crs = sweeps.crs
     if crs == crs_io.LOCAL and sweeps.gps is not None:
         crs = gps_io.read(here / sweeps.gps).frame.crs
-    changed: dict[str, Any] = {"scanner_poses": True, "time_offset": 0.0, "crs": crs}
+    changed: dict[str, Any] = {"scanner_poses": True, "time_offset": 0.0, "crs": crs, "quaternions": "xyzw"}
     return files, sweeps.params().model_copy(update=changed)
 
 
@@ -128,3 +140,56 @@ def build_graph(sweeps: Sweeps, here: Path, poses: Path | Output | None) -> list
     """The task graph that makes a corridor of sweeps; arguments and errors as for `path`."""
     files, params = placed(sweeps, here, poses)
     return [*path(sweeps, here, poses), Task(IMPORT_SWEEPS, params, files)]
+
+
+def checked(
+    files: Mapping[str, Path | Output],
+    photos: Mapping[str, Path | Output],
+    poses: Path | Output,
+    placing: SweepsParams,
+    pose_source: PoseSource,
+) -> list[Task]:
+    """The tasks that check the scanner's poses, unless `pose_source` is "given", and import sweeps by them.
+
+    Args:
+        files: `sweeps`, and optionally their `times`.
+        photos: `photos`, if there are any.
+        poses: trajectory of the scanner.
+        placing: settings of the import.
+        pose_source: which poses are used.
+    """
+    if pose_source == "given":
+        return [Task(IMPORT_SWEEPS, placing, {**files, **photos, "poses": poses})]
+    own = StripAdjustmentParams(pose_source=pose_source, **_shared(StripAdjustmentParams, placing))
+    check = Task(STRIP_ADJUSTMENT, own, {**files, "poses": poses})
+    path, found = Output(check.id, "trajectory"), Output(check.id, "check")
+    return [check, Task(IMPORT_SWEEPS, placing, {**files, **photos, "poses": path, "trajectory_check": found})]
+
+
+def matched(
+    files: Mapping[str, Path | Output],
+    photos: Mapping[str, Path | Output],
+    poses: Path | Output | None,
+    placing: SweepsParams,
+    *,
+    gps: Path | Output | None = None,
+    crs: str,
+) -> list[Task]:
+    """The tasks that run lidar odometry, fuse it with poses and a GPS track (None: without), and import sweeps by it.
+
+    Args:
+        files, photos, poses, placing: as for `checked`.
+        gps: track of the receiver.
+        crs: CRS of the poses.
+    """
+    lidar = Task(LIDAR, LidarParams(**_shared(LidarParams, placing)), files)
+    given = {name: file for name, file in (("poses", poses), ("gps", gps)) if file is not None}
+    own = FuseParams(**_shared(FuseParams, placing) | {"crs": crs})
+    fuse = Task(FUSE, own, {**files, **given, "matched": Output(lidar.id, "matched")})
+    path = Output(fuse.id, "trajectory")
+    return [lidar, fuse, Task(IMPORT_SWEEPS, placing, {**files, **photos, "poses": path})]
+
+
+def _shared(model: type[Params], placing: SweepsParams) -> dict[str, Any]:
+    """Values of the fields that a step's parameters share with those of the import."""
+    return {name: getattr(placing, name) for name in model.model_fields if name in SweepsParams.model_fields}

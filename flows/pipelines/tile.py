@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from scan2sim.flows.pipelines.graph import Output, Task, TaskId
+from scan2sim.flows.pipelines.map_defaults import map_defaults
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.pipelines.tile_graph import Sources, TileGraph
-from scan2sim.pipeline.core.classes import GROUPS
+from scan2sim.pipeline.core.classes import GROUPS, INDOOR_GROUPS
 from scan2sim.pipeline.core.step import Step
 from scan2sim.pipeline.core.types import Tile
 from scan2sim.pipeline.io import views as views_io
@@ -23,12 +24,19 @@ from scan2sim.pipeline.steps.detect_furniture import DETECT_FURNITURE
 from scan2sim.pipeline.steps.dynamic_objects import DYNAMIC_OBJECTS
 from scan2sim.pipeline.steps.export import EXPORT
 from scan2sim.pipeline.steps.facades import FACADES
+from scan2sim.pipeline.steps.floor import FLOOR
+from scan2sim.pipeline.steps.foliage import FOLIAGE
+from scan2sim.pipeline.steps.free_space import FREE_SPACE
 from scan2sim.pipeline.steps.furniture import FURNITURE
 from scan2sim.pipeline.steps.geometry import GEOMETRY
+from scan2sim.pipeline.steps.ghosts import GHOSTS
 from scan2sim.pipeline.steps.ground import GROUND
 from scan2sim.pipeline.steps.ingest import INGEST
 from scan2sim.pipeline.steps.islands import ISLANDS
 from scan2sim.pipeline.steps.join import JOIN
+from scan2sim.pipeline.steps.lidar_score import LIDAR_SCORE
+from scan2sim.pipeline.steps.map_colours import MAP_COLOURS
+from scan2sim.pipeline.steps.navigation import NAVIGATION
 from scan2sim.pipeline.steps.overlap import OVERLAP
 from scan2sim.pipeline.steps.path import PATH
 from scan2sim.pipeline.steps.photo_coverage import PHOTO_COVERAGE
@@ -38,9 +46,16 @@ from scan2sim.pipeline.steps.plants import PLANTS
 from scan2sim.pipeline.steps.poisson import POISSON
 from scan2sim.pipeline.steps.preview import PREVIEW
 from scan2sim.pipeline.steps.rasters import RASTERS
+from scan2sim.pipeline.steps.reflectance import REFLECTANCE
 from scan2sim.pipeline.steps.roads import ROADS
+from scan2sim.pipeline.steps.rooms import ROOMS
 from scan2sim.pipeline.steps.split import SPLIT
+from scan2sim.pipeline.steps.split_mesh import SPLIT_MESH
+from scan2sim.pipeline.steps.sweeps import SWEEPS
+from scan2sim.pipeline.steps.tracks import FILES as TRACKS_FILES
+from scan2sim.pipeline.steps.tracks import TRACKS
 from scan2sim.pipeline.steps.trim import TRIM
+from scan2sim.pipeline.steps.vehicle_models import VEHICLE_MODELS
 from scan2sim.pipeline.steps.views import VIEWS
 from scan2sim.pipeline.steps.visibility import VISIBILITY
 from scan2sim.pipeline.steps.voxel import VOXEL
@@ -49,22 +64,37 @@ from scan2sim.segmentation.steps.instances import INSTANCES
 from scan2sim.segmentation.steps.label import LABEL
 from scan2sim.segmentation.steps.segment import SEGMENT
 from scan2sim.segmentation.steps.signs import SIGNS
+from scan2sim.texturing.backdrop.step import BACKDROP
 from scan2sim.texturing.borders.colour_harmonization import COLOUR_HARMONIZATION
 from scan2sim.texturing.borders.measure import BORDERS
 from scan2sim.texturing.exposure import EXPOSURE
 from scan2sim.texturing.photo_consistency import PHOTO_CONSISTENCY
 from scan2sim.texturing.pose_refinement.step import POSE_REFINEMENT
 from scan2sim.texturing.score import SCORE
+from scan2sim.texturing.sky_colour import SKY_COLOUR
 from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
 from scan2sim.texturing.view_selection.step import VIEW_SELECTION
 
 STEPS: tuple[Step, ...] = (
-    INGEST, PATH, DYNAMIC_OBJECTS, VIEWS, LABEL, SEGMENT, INSTANCES, PHOTO_COVERAGE, OVERLAP, DETECT_FURNITURE,
-    FURNITURE, SPLIT, VOXEL, GROUND, WALLS, FACADES, POISSON, TRIM, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS,
-    UNWRAP, POSE_REFINEMENT, SIGNS, VISIBILITY, EXPOSURE, PHOTO_CONSISTENCY, VIEW_SELECTION, TEXTURE,
-    COLOUR_HARMONIZATION, ROADS, COLLISION, EXPORT, RASTERS, GEOMETRY, SCORE, PICTURES, PREVIEW, BORDERS,
+    INGEST, PATH, DYNAMIC_OBJECTS, SWEEPS, VIEWS, LABEL, SEGMENT, INSTANCES, TRACKS, VEHICLE_MODELS, PHOTO_COVERAGE,
+    GHOSTS, MAP_COLOURS, OVERLAP, DETECT_FURNITURE, FURNITURE, SPLIT, SPLIT_MESH, VOXEL, FLOOR, GROUND, WALLS, FACADES,
+    ROOMS, POISSON, TRIM, FREE_SPACE, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, POSE_REFINEMENT, SIGNS,
+    FOLIAGE, VISIBILITY, EXPOSURE, PHOTO_CONSISTENCY, VIEW_SELECTION, TEXTURE, COLOUR_HARMONIZATION, ROADS,
+    SKY_COLOUR, BACKDROP, COLLISION, NAVIGATION, REFLECTANCE, EXPORT, RASTERS, GEOMETRY, SCORE, LIDAR_SCORE,
+    PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
+SIDE_PRODUCTS: tuple[Step, ...] = (
+    TRACKS, VEHICLE_MODELS,
+    GHOSTS, DETECT_FURNITURE, FURNITURE, SIGNS, PLANTS, ROADS, SKY_COLOUR, BACKDROP, NAVIGATION, REFLECTANCE,
+    RASTERS, GEOMETRY, SCORE, LIDAR_SCORE, PICTURES, PREVIEW, BORDERS,
+)  # fmt: skip
+"""Steps without which the world is finished if they fail, in tiles and in surveys. Optional parts of the step `export`
+are those of `pipeline.io.world_formats.write`; reports and the files of a whole survey are those of `flows.reports`."""
+
+
+MAX_OWN_COORDINATES_M = 10_000.0
+"""Largest coordinates of a robot's map that its world keeps; simulators render in float32."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +106,9 @@ class Scan:
         path: path of the scanner or else of the cameras; empty if there is none.
         scanner_path: the same, but only of the scanner, for rays to the points.
         views: photos with poses.
+        cameras: poses and lenses of the photos, without the photos: what depends on these alone.
         moving: points of moving objects.
+        sweeps: sweeps of the scanner to score the world by; empty without the scanner's path.
         labels: classes in the photos; empty without photos from the ground.
     """
 
@@ -84,7 +116,9 @@ class Scan:
     path: Sources
     scanner_path: Sources
     views: Sources
+    cameras: Sources
     moving: Sources
+    sweeps: Sources
     labels: Sources
 
 
@@ -99,6 +133,7 @@ class Parts:
         instances: detected instances (vehicles, ...), as an input.
         keep_vehicles: whether parked vehicles get a surface.
         clouds: thinned points of each class, inputs `cloud.CLASS`.
+        uncovered: points of each class that photos don't cover, inputs `uncovered`; empty if there are none.
     """
 
     groups: list[str]
@@ -107,6 +142,7 @@ class Parts:
     instances: Sources
     keep_vehicles: bool
     clouds: Sources
+    uncovered: Mapping[str, Sources]
 
 
 def build_graph(
@@ -125,21 +161,30 @@ def build_graph(
         SettingError: a setting that doesn't exist or is out of range.
     """
     settings.check(STEPS)
-    graph = TileGraph(tile, settings, survey_tiles, without)
+    settings = settings.with_defaults(map_defaults(tile.robot_map))
+    graph = TileGraph(tile, settings, survey_tiles, SIDE_PRODUCTS, without)
     scan = _classify(graph)
-    instances, cloud = _select_points(graph, scan)
+    instances, cloud, uncovered = _select_points(graph, scan)
     furniture = _detect_furniture(graph, scan, cloud)
-    parts = _split(graph, scan, cloud, instances, furniture)
-    synthesized = _synthesize_points(graph, scan, parts)
+    parts = _split(graph, scan, {"cloud": cloud, **uncovered}, instances, furniture)
+    source = _split_source_mesh(graph, scan, parts)
+    synthesized = {} if source else _synthesize_points(graph, scan, parts)
     for group in parts.groups:
-        _add_surface(graph, scan, parts, group, synthesized.get(group, {}))
-    lists = _list_objects(graph, scan, parts)
-    surfaces, photos, lists = _analyse_photos(graph, scan, parts, lists)
-    textured = _texture(graph, parts, surfaces, photos, synthesized)
+        if source:
+            _add_source_surface(graph, group)
+        else:
+            _add_surface(graph, scan, parts, group, synthesized.get(group, {}))
+    tracks = _add_tracks(graph, scan, instances)
+    parked = _model_vehicles(graph, tracks)
+    lists = _list_objects(graph, scan, parts) | tracks
+    closed, surfaces, photos, lists = _analyse_photos(graph, scan, parts, lists)
+    textured = _texture(graph, parts, surfaces, photos, synthesized, source)
     roads = _add_roads(graph, scan, textured)
-    _export(graph, parts, surfaces, textured, photos, lists | roads)
-    _measure(graph, parts, surfaces, textured, photos, synthesized)
-    _show(graph, scan, parts, textured, photos)
+    sky = _add_sky(graph, scan, photos)
+    backdrop = _add_backdrop(graph, scan, surfaces, photos)
+    _export(graph, scan, parts, closed, textured, photos, parked, lists | roads | sky | backdrop)
+    _measure(graph, scan, parts, surfaces, textured, photos, synthesized, sky | backdrop)
+    _show(graph, scan, parts, textured, photos, sky)
     return graph.tasks
 
 
@@ -157,27 +202,40 @@ def _classify(graph: TileGraph) -> Scan:
     cameras = _position_rows([view.centre for view in ground_views])
     add(DYNAMIC_OBJECTS, {"cloud": output(INGEST, "cloud")} | rays, positions=cameras)
     cloud: Sources = {"cloud": output(DYNAMIC_OBJECTS, "cloud")}
+    sweeps: Sources = {}
+    if rays:
+        add(SWEEPS, cloud | rays)
+        cloud, sweeps = {"cloud": output(SWEEPS, "cloud")}, {"sweeps": output(SWEEPS, "sweeps")}
     photos: Sources = {f"photo.{i}": view.photo for i, view in enumerate(tile.views)}
     masks: Sources = {f"mask.{i}": view.mask for i, view in enumerate(tile.views) if view.mask}
     add(VIEWS, photos | masks | cloud, poses=tuple(views_io.to_json(view, with_paths=False) for view in tile.views))
     views: Sources = {"views": output(VIEWS, "views")}
+    poses: Sources = {"views": output(VIEWS, "cameras")}
     moving: Sources = {"moving": output(DYNAMIC_OBJECTS, "moving")}
     labels: Sources = {}
     if ground_views:
         add(LABEL, cloud | views | _weights_input(graph.settings), **_segment_settings(graph.settings))
         labels = {"labels": output(LABEL, "labels")}
-    add(SEGMENT, cloud | path | (views | moving | labels if ground_views else {}))
-    return Scan(bool(ground_views), path, rays, views, moving, labels)
+    add(SEGMENT, cloud | path | (poses | moving | labels if ground_views else {}), **_spacing(tile))
+    return Scan(bool(ground_views), path, rays, views, poses, moving, sweeps, labels)
 
 
-def _select_points(graph: TileGraph, scan: Scan) -> tuple[Sources, Output]:
-    """Detect instances, remove points that photos don't cover, and take the neighbours' points at borders.
+def _spacing(tile: Tile) -> dict[str, Any]:
+    """Context of step `segment`: the point spacing of a robot's map; empty for other clouds."""
+    if tile.robot_map is None:
+        return {}
+    return {"spacing" if tile.robot_map.scene == "outdoor" else "indoor_spacing": tile.robot_map.spacing}
+
+
+def _select_points(graph: TileGraph, scan: Scan) -> tuple[Sources, Output, Sources]:
+    """Detect instances, separate points that photos don't cover, and take the neighbours' points at borders.
 
     Returns:
-        The instances, as an input, and the resulting cloud.
+        The instances, as an input, the resulting cloud, and the uncovered points, as an input.
     """
     output, add, path = graph.output, graph.add, scan.path
     instances: Sources = {}
+    uncovered: Sources = {}
     last = SEGMENT  # the step whose cloud is split; the same one in all tiles of a survey
     if graph.params(INSTANCES).detect and (path or graph.neighbours):
         classified: Sources = {name: output(SEGMENT, name) for name in ("cloud", "confidence")}
@@ -185,18 +243,30 @@ def _select_points(graph: TileGraph, scan: Scan) -> tuple[Sources, Output]:
         last, instances = INSTANCES, {"instances": output(INSTANCES, "instances")} if path else {}
     limit = graph.params(PHOTO_COVERAGE).limit
     if limit != "off" and (graph.neighbours or (path and (scan.has_ground_photos or limit != "auto"))):
-        views = scan.views if scan.has_ground_photos else {}
-        add(PHOTO_COVERAGE, {"cloud": output(last, "cloud")} | path | views, voxel=graph.params(VOXEL, "terrain").size)
+        views = scan.cameras if scan.has_ground_photos else {}
+        voxel = graph.params(VOXEL, "terrain").size
+        add(PHOTO_COVERAGE, {"cloud": output(last, "cloud")} | path | views, voxel=voxel, cell=graph.cell or None)
         last = PHOTO_COVERAGE
+        if graph.tile.robot_map is None:
+            uncovered = {"uncovered": output(PHOTO_COVERAGE, "uncovered")}
+    if graph.tile.robot_map is not None:
+        add(GHOSTS, {"cloud": output(last, "cloud")}, spacing=graph.tile.robot_map.spacing)
+        last = GHOSTS if graph.is_enabled(GHOSTS) else last
+        add(MAP_COLOURS, {"cloud": output(last, "cloud")} | path)
+        last = MAP_COLOURS
     if graph.neighbours:
+        if uncovered:
+            others = graph.neighbour_outputs(last, "uncovered", prefix="cloud")
+            add(OVERLAP, {"cloud": uncovered["uncovered"]} | others, "uncovered", **graph.cell)
+            uncovered = {"uncovered": output(OVERLAP, "cloud", "uncovered")}
         add(OVERLAP, {"cloud": output(last, "cloud")} | graph.neighbour_outputs(last, "cloud"), **graph.cell)
         last = OVERLAP
-    return instances, output(last, "cloud")
+    return instances, output(last, "cloud"), uncovered
 
 
 def _detect_furniture(graph: TileGraph, scan: Scan, cloud: Output) -> Sources:
     """Detect street furniture and model it; returns the outputs of step `furniture`."""
-    if not (scan.path or graph.neighbours) or graph.params(FURNITURE).when != "auto":
+    if not (scan.path or graph.neighbours) or graph.params(FURNITURE).when != "auto" or _is_indoor(graph):
         return {}
     graph.add(DETECT_FURNITURE, {"cloud": cloud} | scan.path, **graph.cell)
     if not (graph.is_enabled(DETECT_FURNITURE) and graph.is_enabled(FURNITURE)):
@@ -208,31 +278,37 @@ def _detect_furniture(graph: TileGraph, scan: Scan, cloud: Output) -> Sources:
     return {name: graph.output(FURNITURE, name) for name in names}
 
 
-def _split(graph: TileGraph, scan: Scan, cloud: Output, instances: Sources, furniture: Sources) -> Parts:
-    """Split the cloud by class, and thin each part."""
+def _split(graph: TileGraph, scan: Scan, clouds: Sources, instances: Sources, furniture: Sources) -> Parts:
+    """Split the covered and uncovered points by class, and thin each part."""
     params = graph.params(SPLIT)
     keep_vehicles = params.vehicles == "keep" and bool(instances)
     furniture_points = {name: furniture[name] for name in furniture if name == "furniture_points"}
-    graph.add(SPLIT, {"cloud": cloud} | (instances if keep_vehicles else {}) | furniture_points)
-    vehicle = ("vehicle",) if keep_vehicles else ()
-    groups = [group for group in (*GROUPS, *vehicle) if group != "vegetation" or params.vegetation != "locations"]
-    cloud_groups = (*GROUPS, "rest", *vehicle)
+    indoor: dict[str, Any] = {"indoor": True} if _is_indoor(graph) else {}
+    graph.add(SPLIT, clouds | (instances if keep_vehicles else {}) | furniture_points, **indoor)
+    more = (*(("vehicle",) if keep_vehicles else ()), *(INDOOR_GROUPS if indoor else ()))
+    groups = [group for group in (*GROUPS, *more) if group != "vegetation" or params.vegetation != "locations"]
+    cloud_groups = (*GROUPS, "rest", *more)
     for part in cloud_groups:
         graph.add(VOXEL, {"cloud": graph.output(SPLIT, part)} | scan.path, part)
-    clouds: Sources = {f"cloud.{part}": graph.output(VOXEL, "cloud", part) for part in cloud_groups}
-    return Parts(groups, cloud_groups, furniture, instances, keep_vehicles, clouds)
+    thinned: Sources = {f"cloud.{part}": graph.output(VOXEL, "cloud", part) for part in cloud_groups}
+    uncovered: dict[str, Sources] = {}
+    if "uncovered" in clouds:
+        uncovered = {group: {"uncovered": graph.output(SPLIT, f"uncovered_{group}")} for group in GROUPS}
+    return Parts(groups, cloud_groups, furniture, instances, keep_vehicles, thinned, uncovered)
 
 
 def _synthesize_points(graph: TileGraph, scan: Scan, parts: Parts) -> dict[str, Sources]:
     """Add points that the scanner did not see: occluded ground, walls below roofs and above its view; by class."""
     synthesized: dict[str, Sources] = {}
+    if graph.tile.robot_map is not None:
+        return {"terrain": _add_floor(graph, scan)}
     airborne = {"always": True, "never": False, "auto": not scan.path}  # whether steps for airborne clouds run
     when = graph.params(GROUND).when
     hidden = parts.instances if when == "auto" else {}
     if hidden or airborne[when]:
         others = graph.neighbour_outputs(INSTANCES, "instances") if hidden else {}
         synthesized["terrain"] = _synthesize_from_voxels(graph, GROUND, (*GROUPS, "rest"), hidden | others)
-    if airborne[graph.params(WALLS).when]:
+    if airborne[graph.params(WALLS).when] and not _is_indoor(graph):
         below: Sources = {"ground": synthesized["terrain"]["synthesized"]} if "terrain" in synthesized else {}
         below |= {"footprints": graph.tile.footprints} if graph.tile.footprints else {}
         synthesized["building"] = _synthesize_from_voxels(graph, WALLS, ("building", "terrain"), below)
@@ -245,6 +321,14 @@ def _synthesize_points(graph: TileGraph, scan: Scan, parts: Parts) -> dict[str, 
     return synthesized
 
 
+def _add_floor(graph: TileGraph, scan: Scan) -> Sources:
+    """The ground of a robot's map; returns the points of its assumed part."""
+    assert graph.tile.robot_map is not None
+    clouds: Sources = {part: graph.output(VOXEL, "cloud", part) for part in (*GROUPS, "rest")}
+    graph.add(FLOOR, clouds | scan.path, scene=graph.tile.robot_map.scene, spacing=graph.tile.robot_map.spacing)
+    return {"synthesized": graph.output(FLOOR, "synthesized")}
+
+
 def _synthesize_from_voxels(graph: TileGraph, step: Step, classes: Sequence[str], more: Sources) -> Sources:
     """Add a step that synthesizes points from the voxels of some classes, including those of the neighbours."""
     inputs: Sources = {part: graph.output(VOXEL, "cloud", part) for part in classes}
@@ -254,14 +338,48 @@ def _synthesize_from_voxels(graph: TileGraph, step: Step, classes: Sequence[str]
     return {"synthesized": graph.output(step, "synthesized")}
 
 
+def _split_source_mesh(graph: TileGraph, scan: Scan, parts: Parts) -> Sources:
+    """Split the textured mesh that the tile was made from by class; returns it as an input, empty if there is none.
+
+    Scans of rooms have holes: bodies collide with a floor without any.
+    """
+    if graph.tile.robot_map is None or graph.tile.robot_map.source_mesh is None:
+        return {}
+    source: Sources = {"source_mesh": graph.tile.robot_map.source_mesh}
+    clouds = {name: graph.output(SPLIT, name) for name in parts.cloud_groups}
+    target = {group: graph.params(DECIMATE, group).target for group in parts.groups}
+    min_area = {group: graph.params(ISLANDS, group).min_area for group in parts.groups}
+    graph.add(SPLIT_MESH, source | clouds, origin=graph.tile.frame.origin, target=target, min_area=min_area)
+    if _has_floor(graph):
+        _add_floor(graph, scan)
+    return source
+
+
+def _add_source_surface(graph: TileGraph, group: str) -> None:
+    """The mesh of a class from the textured mesh that the tile was made from: remove islands, decimate."""
+    graph.add(ISLANDS, {"mesh": graph.output(SPLIT_MESH, group)}, group)
+    graph.add(DECIMATE, {"mesh": graph.output(ISLANDS, "mesh", group)}, group, keep_border=True)
+
+
 def _add_surface(graph: TileGraph, scan: Scan, parts: Parts, group: str, synthesized: Sources) -> None:
     """The mesh of a class: reconstruct, trim, snap to planes, join with the neighbours' meshes, decimate."""
     output, add, cell = graph.output, graph.add, graph.cell
+    if _is_indoor(graph) and group in ("building", *INDOOR_GROUPS):
+        _add_rooms(graph, parts, group)
+        return
     voxel = graph.params(VOXEL, group).size
+    if group == "terrain" and graph.tile.robot_map is not None:
+        add(DECIMATE, {"mesh": output(FLOOR, "mesh")}, group)
+        return
     points: Sources = {"cloud": output(VOXEL, "cloud", group), **synthesized}
-    add(POISSON, points, group, voxel=voxel, cell=cell or None)
-    add(TRIM, {"mesh": output(POISSON, "mesh", group), **points}, group, voxel=voxel)
+    uncovered = parts.uncovered.get(group, {})
+    add(POISSON, points | uncovered, group, voxel=voxel, cell=cell or None)
+    add(TRIM, {"mesh": output(POISSON, "mesh", group)} | points | uncovered, group, voxel=voxel)
     surface = output(TRIM, "mesh", group)
+    if scan.scanner_path and graph.params(FREE_SPACE, group).when == "auto":
+        rays = {"cloud": output(SWEEPS, "cloud")} | scan.scanner_path
+        add(FREE_SPACE, {"mesh": surface} | rays, group, cell=cell or None)
+        surface = output(FREE_SPACE, "mesh", group)
     when = graph.params(PLANES).when
     if group == "building" and (when == "always" or (when == "auto" and scan.path)):
         clouds = {**points, "points": output(SPLIT, group), **_other_clouds(parts, group)}
@@ -278,19 +396,72 @@ def _add_surface(graph: TileGraph, scan: Scan, parts: Parts, group: str, synthes
         add(JOIN, clipped | others, group, **cell)
         surface = output(JOIN, "mesh", group)
     furniture = {"furniture": parts.furniture[group]} if group in parts.furniture else {}
-    add(DECIMATE, {"mesh": surface, **furniture}, group, keep_border=bool(cell))
+    coarse = uncovered | ({"cloud": points["cloud"]} if uncovered else {})
+    add(DECIMATE, {"mesh": surface} | coarse | furniture, group, keep_border=bool(cell))
+
+
+def _has_floor(graph: TileGraph) -> bool:
+    """Whether bodies collide with a floor map: in robots' maps, but not in meshes of terrain, which has no holes."""
+    return graph.tile.robot_map is not None and (graph.tile.robot_map.source_mesh is None or _is_indoor(graph))
+
+
+def _is_mesh(graph: TileGraph) -> bool:
+    """Whether the tile was made from a textured mesh."""
+    return graph.tile.robot_map is not None and graph.tile.robot_map.source_mesh is not None
+
+
+def _is_indoor(graph: TileGraph) -> bool:
+    """Whether the tile is a robot's map of rooms."""
+    return graph.tile.robot_map is not None and graph.tile.robot_map.scene == "indoor"
+
+
+def _has_rooms(graph: TileGraph) -> bool:
+    """Whether rooms are modelled: the tile is a robot's map of rooms, and a cloud."""
+    return _is_indoor(graph) and _has_floor(graph)
+
+
+def _add_rooms(graph: TileGraph, parts: Parts, group: str) -> None:
+    """Walls, ceilings or furniture of a robot's map of rooms, modelled instead of reconstructed."""
+    assert graph.tile.robot_map is not None
+    others: Sources = {
+        f"other.{part}": graph.output(SPLIT, part) for part in parts.cloud_groups if part not in (group, "rest")
+    }
+    cloud: Sources = {"cloud": graph.output(SPLIT, group)}
+    graph.add(ROOMS, cloud | others, group, surface=group, spacing=graph.tile.robot_map.spacing)
+    graph.add(DECIMATE, {"mesh": graph.output(ROOMS, "mesh", group)}, group)
 
 
 def _list_objects(graph: TileGraph, scan: Scan, parts: Parts) -> Sources:
-    """Lists of street furniture and plants, as inputs of the export."""
-    lists: Sources = {}
+    """Lists of ghosts, openings of rooms, street furniture and plants, as inputs of the export."""
+    lists: Sources = {"rooms": graph.output(ROOMS, "list", "building")} if _has_rooms(graph) else {}
+    if graph.tile.robot_map is not None and graph.is_enabled(GHOSTS):
+        lists["ghosts"] = graph.output(GHOSTS, "geojson")
     if parts.furniture and scan.path:
-        lists = {"furniture": parts.furniture["geojson"], "furniture_csv": parts.furniture["csv"]}
+        lists |= {"furniture_geojson": parts.furniture["geojson"], "furniture_csv": parts.furniture["csv"]}
     if graph.params(SPLIT).vegetation != "mesh" and graph.is_enabled(PLANTS):
         clouds = {name: graph.output(VOXEL, "cloud", name) for name in ("vegetation", "terrain")}
         graph.add(PLANTS, clouds, **graph.cell)
         lists |= {"plants": graph.output(PLANTS, "geojson"), "plants_csv": graph.output(PLANTS, "csv")}
     return lists
+
+
+def _add_tracks(graph: TileGraph, scan: Scan, instances: Sources) -> Sources:
+    """Follow road users through the sweeps; returns their tracks as inputs of the export."""
+    wanted = scan.scanner_path and instances and graph.tile.robot_map is None
+    if not wanted or graph.params(TRACKS).when == "never" or not graph.is_enabled(TRACKS):
+        return {}
+    classified: Sources = {"cloud": graph.output(INSTANCES, "cloud")}
+    views = scan.views if scan.has_ground_photos else {}
+    graph.add(TRACKS, classified | scan.moving | scan.scanner_path | instances | views)
+    return {name: graph.output(TRACKS, name) for name in TRACKS_FILES}
+
+
+def _model_vehicles(graph: TileGraph, tracks: Sources) -> dict[str, Sources]:
+    """Models of parked vehicles as inputs: their `mesh`, and their `textured` mesh; empty if they aren't wanted."""
+    if graph.params(SPLIT).vehicles != "assets" or not tracks or not graph.is_enabled(VEHICLE_MODELS):
+        return {"mesh": {}, "textured": {}}
+    graph.add(VEHICLE_MODELS, {"tracks": tracks["tracks"]}, **graph.cell)
+    return {name: {"vehicle": graph.output(VEHICLE_MODELS, name)} for name in ("mesh", "textured")}
 
 
 def _plant_models(graph: TileGraph, output: str) -> Sources:
@@ -299,50 +470,94 @@ def _plant_models(graph: TileGraph, output: str) -> Sources:
     return {"vegetation": graph.output(PLANTS, output)} if wanted and graph.is_enabled(PLANTS) else {}
 
 
-def _analyse_photos(graph: TileGraph, scan: Scan, parts: Parts, lists: Sources) -> tuple[Sources, Sources, Sources]:
-    """Refine poses, fit signs to photos, and compute visibility, exposure and photo consistency.
+def _analyse_photos(
+    graph: TileGraph, scan: Scan, parts: Parts, lists: Sources
+) -> tuple[Sources, Sources, Sources, Sources]:
+    """Refine poses, fit signs to photos, open foliage, and compute visibility, exposure and photo consistency.
 
     Returns:
-        The final mesh of each class, the inputs about photos, and the lists with the fitted signs.
+        The closed mesh of each class, the final one, the inputs about photos (`cameras`: poses and lenses of `views`),
+        and the lists with the fitted signs.
     """
     output, add = graph.output, graph.add
     surfaces: Sources = {group: output(DECIMATE, "mesh", group) for group in parts.groups}
-    photos = scan.views
+    photos, cameras = scan.views, scan.cameras
     if scan.has_ground_photos and graph.params(POSE_REFINEMENT).when == "auto":
         rest = {"cloud.rest": parts.clouds["cloud.rest"]}
         add(POSE_REFINEMENT, _mesh_inputs(surfaces) | rest | scan.moving | photos)
         photos = {"views": output(POSE_REFINEMENT, "views")}
+        cameras = {"views": output(POSE_REFINEMENT, "cameras")}
     fits_signs = scan.has_ground_photos and parts.furniture and graph.params(SIGNS).when == "auto"
     if fits_signs and graph.is_enabled(SIGNS):
         known = {name: parts.furniture[name] for name in ("sign_panels", "neighbour_poles", "geojson")}
         add(SIGNS, _mesh_inputs(surfaces) | known | photos | scan.labels, **graph.cell)
         surfaces |= {group: output(SIGNS, group) for group in parts.groups if group in ("building", "vegetation")}
-        lists = lists | {"furniture": output(SIGNS, "geojson"), "furniture_csv": output(SIGNS, "csv")}
-    add(VISIBILITY, _mesh_inputs(surfaces) | parts.clouds | scan.moving | photos)
+        lists = lists | {"furniture_geojson": output(SIGNS, "geojson"), "furniture_csv": output(SIGNS, "csv")}
+    closed = surfaces
+    surfaces = closed | _open_foliage(graph, scan, closed)
+    slim: Sources = {"furniture": output(SPLIT, "furniture")} if parts.furniture else {}
+    add(VISIBILITY, _mesh_inputs(surfaces) | parts.clouds | slim | scan.moving | cameras)
     photos = {**photos, "depth": output(VISIBILITY, "depth")}
     prior = graph.params(EXPOSURE).prior
     add(EXPOSURE, photos | ({"prior": Path(prior)} if prior else {}))
     photos = {**photos, "exposures": output(EXPOSURE, "exposures")}
-    add(PHOTO_CONSISTENCY, photos)
-    return surfaces, {**photos, "photo_consistency": output(PHOTO_CONSISTENCY, "photo_consistency")}, lists
+    add(PHOTO_CONSISTENCY, photos | scan.labels)
+    photos |= {"photo_consistency": output(PHOTO_CONSISTENCY, "photo_consistency"), "cameras": cameras["views"]}
+    return closed, surfaces, photos, lists
+
+
+def _open_foliage(graph: TileGraph, scan: Scan, surfaces: Sources) -> Sources:
+    """Replace vegetation that rays of the scanner pass through by leaf cards; returns its mesh, empty if it is kept."""
+    if "vegetation" not in surfaces or graph.params(FOLIAGE).when == "never":
+        return {}
+    rays = {"cloud": _classified(graph, scan)} | scan.scanner_path
+    graph.add(FOLIAGE, {"mesh": surfaces["vegetation"]} | rays, cell=graph.cell or None)
+    return {"vegetation": graph.output(FOLIAGE, "mesh")}
+
+
+def _classified(graph: TileGraph, scan: Scan) -> Output:
+    """The tile's own classified points, static and without held-out sweeps."""
+    detected = graph.params(INSTANCES).detect and (scan.path or graph.neighbours)
+    return graph.output(INSTANCES if detected else SEGMENT, "cloud")
+
+
+def _add_sky(graph: TileGraph, scan: Scan, photos: Sources) -> Sources:
+    """Colour of the sky in the photos; returns it as an input of what shows the world."""
+    if not scan.has_ground_photos or _is_indoor(graph) or not graph.is_enabled(SKY_COLOUR):
+        return {}
+    known = {name: photos[name] for name in ("views", "depth", "exposures")}
+    graph.add(SKY_COLOUR, known | scan.labels)
+    return {"sky": graph.output(SKY_COLOUR, "sky")}
 
 
 def _texture(
-    graph: TileGraph, parts: Parts, surfaces: Sources, photos: Sources, synthesized: Mapping[str, Sources]
+    graph: TileGraph,
+    parts: Parts,
+    surfaces: Sources,
+    photos: Sources,
+    synthesized: Mapping[str, Sources],
+    source: Sources,
 ) -> Sources:
     """Select views, unwrap and texture each class, and harmonize its colours with the neighbours'."""
     output, add = graph.output, graph.add
     furniture: Sources = {"cloud.furniture": output(SPLIT, "furniture")} if parts.furniture else {}
     points = parts.clouds | furniture | _synthesized_inputs(synthesized)
+    if graph.tile.robot_map is not None:  # points finer than the voxels show lane markings
+        points |= {"raw.terrain": output(SPLIT, "terrain")}
+    cameras: Sources = {"views": photos["cameras"]}
+    seen: Sources = cameras | {name: photos[name] for name in ("depth", "photo_consistency")}
+    corrected = {name: photos[name] for name in ("views", "depth", "exposures", "photo_consistency")}
     for group in parts.groups:
-        mesh = {"mesh": surfaces[group]}
-        add(VIEW_SELECTION, mesh | photos, group)
-        choice = {"choice": output(VIEW_SELECTION, "choice", group)}
-        by_photo = {**choice, **photos} if graph.params(UNWRAP, group).backend == "photo" else {}
-        add(UNWRAP, mesh | by_photo, group)
+        mesh: Sources = {"mesh": surfaces[group]}
+        add(VIEW_SELECTION, mesh | seen, group)
+        choice: Sources = {"choice": output(VIEW_SELECTION, "choice", group)}
+        by_photo = choice | cameras if graph.params(UNWRAP, group).backend == "photo" else {}
+        uncovered = parts.uncovered.get(group, {})
+        coarse = uncovered | ({"cloud": parts.clouds[f"cloud.{group}"]} if uncovered else {})
+        add(UNWRAP, mesh | by_photo | source | coarse, group)
         unwrapped = {name: output(UNWRAP, name, group) for name in ("mesh", "pages")}
         removed = parts.instances if group == "terrain" and not parts.keep_vehicles else {}
-        add(TEXTURE, {**unwrapped, **choice, **points, **photos, **removed}, group)
+        add(TEXTURE, {**unwrapped, **choice, **points, **corrected, **removed, **source, **uncovered}, group)
     last = TEXTURE
     if graph.neighbours:
         last = COLOUR_HARMONIZATION
@@ -352,39 +567,113 @@ def _texture(
     return {group: output(last, "textured", group) for group in parts.groups}
 
 
+def _add_backdrop(graph: TileGraph, scan: Scan, surfaces: Sources, photos: Sources) -> Sources:
+    """What cameras see beyond the scan; returns it as an input of the export and the score."""
+    if not scan.has_ground_photos or _is_indoor(graph) or graph.params(BACKDROP).when == "never":
+        return {}
+    known = {name: photos[name] for name in ("views", "depth", "exposures")} | scan.labels
+    meshes = _mesh_inputs(surfaces | _plant_models(graph, "mesh"))
+    graph.add(BACKDROP, known | meshes, cell=graph.cell or None)
+    return {"backdrop": graph.output(BACKDROP, "backdrop")} if graph.is_enabled(BACKDROP) else {}
+
+
 def _add_roads(graph: TileGraph, scan: Scan, textured: Sources) -> Sources:
     """Extract the roads; returns them and the path as inputs of the export."""
     if not scan.path or graph.params(ROADS).when == "never" or not graph.is_enabled(ROADS):
         return scan.path
     ground = {"cloud": graph.output(SPLIT, "terrain"), "textured": textured["terrain"]}
-    origin = graph.params(EXPORT).world_origin
+    origin = world_origin(graph.tile, graph.settings)
     graph.add(ROADS, ground | scan.path, name=graph.tile.name, world_origin=origin, cell=graph.cell or None)
     outputs = {"roads": "geojson", "roads_seen": "seen", "opendrive": "opendrive"}
     return scan.path | {name: graph.output(ROADS, output) for name, output in outputs.items()}
 
 
 def _export(
-    graph: TileGraph, parts: Parts, surfaces: Sources, textured: Sources, photos: Sources, lists: Sources
+    graph: TileGraph,
+    scan: Scan,
+    parts: Parts,
+    surfaces: Sources,
+    textured: Sources,
+    photos: Sources,
+    parked: Mapping[str, Sources],
+    lists: Sources,
 ) -> None:
     """The collision mesh, the world, and rasters."""
     output, add, name = graph.output, graph.add, graph.tile.name
-    terrain = {"cloud": output(SPLIT, "terrain")}
-    add(COLLISION, {**surfaces, **_plant_models(graph, "mesh"), **terrain}, **graph.cell)
-    planted = textured | _plant_models(graph, "textured")
+    # the floor of a robot's map is denoised already, and its assumed part must not follow points nearby
+    terrain: Sources = {} if _has_floor(graph) else {"cloud": output(SPLIT, "terrain")}
+    ground = {"terrain": output(FLOOR, "mesh")} if _has_floor(graph) and _is_mesh(graph) else {}
+    add(COLLISION, {**surfaces, **ground, **_plant_models(graph, "mesh"), **parked["mesh"], **terrain}, **graph.cell)
+    planted = textured | _plant_models(graph, "textured") | parked["textured"]
     choice = {f"choice.{group}": output(VIEW_SELECTION, "choice", group) for group in parts.groups}
-    views = {"views": photos["views"], "collision": output(COLLISION, "mesh")}
-    add(EXPORT, planted | choice | lists | parts.instances | views, name=name)
+    views = {"views": photos["cameras"], "collision": output(COLLISION, "mesh")}
+    floor = {"floor": output(FLOOR, "mask")} if _has_floor(graph) else {}
+    frames = _frames(graph.tile, graph.settings)
+    maps = _add_navigation(graph, scan, surfaces, frames)
+    more = maps | _add_reflectance(graph, scan, textured)
+    add(EXPORT, planted | choice | lists | parts.instances | views | floor | more, **_export_context(graph, frames))
     if graph.params(EXPORT).rasters:
         add(RASTERS, textured, name=name, **_raster_context(graph.settings))
 
 
+def _add_reflectance(graph: TileGraph, scan: Scan, textured: Sources) -> Sources:
+    """Reflectance of the textured surfaces; returns it as an input of the export."""
+    if not graph.params(EXPORT).reflectance or not graph.is_enabled(REFLECTANCE):
+        return {}
+    surfaces: Sources = {f"textured.{group}": folder for group, folder in textured.items()}
+    rays = scan.sweeps | scan.moving if scan.sweeps else {}
+    graph.add(REFLECTANCE, {"cloud": graph.output(SEGMENT, "cloud")} | scan.scanner_path | rays | surfaces)
+    return {"reflectance": graph.output(REFLECTANCE, "reflectance")}
+
+
+def _add_navigation(graph: TileGraph, scan: Scan, surfaces: Sources, frames: Mapping[str, Any]) -> Sources:
+    """Occupancy maps and points for localization; returns them as an input of the export."""
+    when, robot_map = graph.params(NAVIGATION).when, graph.tile.robot_map
+    wanted = when == "always" or (when == "auto" and robot_map is not None)
+    if graph.cell or not wanted or not graph.is_enabled(NAVIGATION):
+        return {}
+    cloud = {"cloud": graph.output(DYNAMIC_OBJECTS, "cloud")} if robot_map else {}
+    meshes = {"collision": graph.output(COLLISION, "mesh")} | _mesh_inputs(surfaces)
+    context = dict(frames) | ({"spacing": robot_map.spacing, "has_floor": _has_floor(graph)} if robot_map else {})
+    graph.add(NAVIGATION, meshes | cloud | scan.path, **context)
+    return {"navigation": graph.output(NAVIGATION, "navigation")}
+
+
+def _frames(tile: Tile, settings: Settings) -> dict[str, Any]:
+    """Contexts of `navigation` and `export`: origin of the world, and the transform from the robot's map."""
+    frames: dict[str, Any] = {"world_origin": world_origin(tile, settings)}
+    if tile.robot_map is not None:
+        rows = tuple(map(tuple, tile.robot_map.T_world_map.tolist()))
+        frames |= {"T_world_map": rows, "unit": tile.robot_map.unit}
+    return frames
+
+
+def _export_context(graph: TileGraph, frames: Mapping[str, Any]) -> dict[str, Any]:
+    """Context of `export`: name and frames, and whether the tile shows rooms."""
+    return {"name": graph.tile.name, **frames} | ({"indoor": True} if _is_indoor(graph) else {})
+
+
+def world_origin(tile: Tile, settings: Settings) -> tuple[float, float, float] | None:
+    """Origin of the simulator's world in the CRS, metres; None: the tile's own.
+
+    World coordinates of a robot's map are the map's, unless it has a CRS or is too far for float32.
+    """
+    chosen: tuple[float, float, float] | None = settings.params(EXPORT).world_origin
+    near = max(map(abs, tile.frame.origin)) <= MAX_OWN_COORDINATES_M
+    if chosen is None and tile.robot_map is not None and tile.frame.crs == "local" and near:
+        return 0.0, 0.0, 0.0
+    return chosen
+
+
 def _measure(
     graph: TileGraph,
+    scan: Scan,
     parts: Parts,
     surfaces: Sources,
     textured: Sources,
     photos: Sources,
     synthesized: Mapping[str, Sources],
+    sky: Sources,
 ) -> None:
     """Metrics of surfaces, textures and borders."""
     output, add, tile = graph.output, graph.add, graph.tile
@@ -393,7 +682,13 @@ def _measure(
         truth = {"truth.mesh": tile.truth_mesh, "truth.points": tile.truth_points}
     clouds = parts.clouds | _synthesized_inputs(synthesized)
     add(GEOMETRY, _mesh_inputs(surfaces) | clouds | truth, **graph.cell)
-    add(SCORE, textured | {name: photos[name] for name in ("views", "depth")} | parts.instances | truth)
+    seen: Sources = {name: photos[name] for name in ("views", "depth")}
+    add(SCORE, textured | seen | scan.labels | sky | parts.instances | truth)
+    if scan.sweeps:
+        cloud = {"cloud": _classified(graph, scan)}
+        meshes = _mesh_inputs(surfaces | _plant_models(graph, "mesh"))
+        found = scan.sweeps | scan.moving | meshes | cloud | parts.instances
+        add(LIDAR_SCORE, found, vehicles=parts.keep_vehicles, cell=graph.cell or None)
     if graph.neighbours:
         step = COLOUR_HARMONIZATION
         own = {f"textured.{group}": output(step, "textured", group) for group in parts.groups}
@@ -405,11 +700,11 @@ def _measure(
         add(BORDERS, own | others, **graph.cell)
 
 
-def _show(graph: TileGraph, scan: Scan, parts: Parts, textured: Sources, photos: Sources) -> None:
+def _show(graph: TileGraph, scan: Scan, parts: Parts, textured: Sources, photos: Sources, sky: Sources) -> None:
     """The walkable preview and the pictures of the report."""
     graph.add(PREVIEW, textured | _plant_models(graph, "textured") | scan.path)
     stages = {f"decimate.{group}": graph.output(DECIMATE, "mesh", group) for group in parts.groups}
-    graph.add(PICTURES, textured | stages | parts.clouds | {"views": photos["views"]} | scan.path)
+    graph.add(PICTURES, textured | stages | parts.clouds | {"views": photos["views"]} | sky | scan.path)
 
 
 def _other_clouds(parts: Parts, group: str) -> Sources:

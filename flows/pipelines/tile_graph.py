@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +28,16 @@ class TileGraph:
     """
 
     def __init__(
-        self, tile: Tile, settings: Settings, survey_tiles: Collection[str] | None, without: Collection[TaskId]
+        self,
+        tile: Tile,
+        settings: Settings,
+        survey_tiles: Collection[str] | None,
+        side_products: Sequence[Step],
+        without: Collection[TaskId],
     ) -> None:
         self.tasks: list[Task] = []
         self.tile, self.settings, self._without = tile, settings, without
+        self._side_products = {step.name for step in side_products}
         self._name = "" if survey_tiles is None else tile.name
         self.cell: dict[str, Any] = {}
         if tile.cell:
@@ -53,7 +59,8 @@ class TileGraph:
     def add(self, step: Step, inputs: Mapping[str, Path | Output], group: str = "", **context: Any) -> None:
         """Add a task, unless it is a side product that failed."""
         if self.is_enabled(step):
-            self.tasks.append(Task(step, self.settings.params(step, group, context), inputs, group, self._name))
+            params, side_product = self.settings.params(step, group, context), step.name in self._side_products
+            self.tasks.append(Task(step, params, inputs, group, self._name, side_product))
 
     def output(self, step: Step, name: str, group: str = "", other: str | None = None) -> Output:
         """An output of a task of this tile, or of the neighbour `other`."""

@@ -68,7 +68,8 @@ def film(scene: Scene, file: Path, seconds: float, width: int, report: Report) -
     size = width // 2 * 2, width * 9 // 32 * 2
     camera = renderer.pinhole(*size)
     world = renderer.Renderer(
-        [placed(tile.folder / group, tile.offset) for tile in scene.tiles for group in tile.groups]
+        [placed(tile.folder / group, tile.offset) for tile in scene.tiles for group in tile.groups],
+        scene.sky,
     )
     poses = flight(scene, round(seconds * FPS))
     with atomic_write(file) as fresh, Encoder(fresh, size, FPS, preset="medium", crf="20") as encoder:

@@ -27,6 +27,7 @@ class FindingLimits:
         max_moving: share of moving points above which there is a note.
         max_residue_m2: area of surface that remains of a removed vehicle above which the place is poor (half a bonnet).
         max_rejected: share of rejected photos above which the world is poor.
+        max_focal_change_percent: change of a focal length by pose refinement, in percent, above which there is a note.
     """
 
     min_psnr_db: float = 15.0
@@ -37,6 +38,7 @@ class FindingLimits:
     max_moving: float = 0.05
     max_residue_m2: float = 0.5
     max_rejected: float = 0.1
+    max_focal_change_percent: float = 0.3
 
 
 LIMITS = FindingLimits()
@@ -69,7 +71,7 @@ def findings(done: Mapping[str, Manifest], failed: Mapping[str, ScanError] | Non
         failed: errors of side products by name.
     """
     facts = {task: manifest.metrics for task, manifest in done.items()}
-    checks = (_cameras, _held_out, _unseen, _remains, _moved, _disagreeing)
+    checks = (_cameras, _held_out, _unseen, _remains, _moved, _disagreeing, _lenses)
     found = [one for check in checks for one in check(facts)]
     found += [Finding("poor", name, failure_text(name, error)) for name, error in (failed or {}).items()]
     found += [Finding("note", task, text) for task, manifest in done.items() for text in manifest.warnings]
@@ -171,9 +173,24 @@ def _disagreeing(facts: Facts) -> Iterator[Finding]:
             "unusable" if share > LIMITS.max_bad_photos else "poor",
             "photo_consistency",
             f"{_count_text(len(out), count)} rejected because the others contradict them "
-            f"({_named(out)}): check their poses and times",
+            f"({_named(out)}): check their poses and times; `scan2sim inspect TILE` recognizes usual mistakes",
             share,
         )
+
+
+def _lenses(facts: Facts) -> Iterator[Finding]:
+    for name, one in facts.get("pose_refinement", {}).get("cameras", {}).items():
+        change = one.get("focal_change_percent", 0.0)
+        if abs(change) > LIMITS.max_focal_change_percent:
+            yield Finding(
+                "note",
+                "pose_refinement",
+                f"{name}: the photos fit a focal length that is {abs(change):.1f} % "
+                f"{'longer' if change > 0 else 'shorter'} than the given one (k1 {one['k1_change']:+.3f}, k2 "
+                f"{one['k2_change']:+.3f}), and the world uses it: check the calibration, or keep it by "
+                "`pose_refinement.lens=false`",
+                abs(change),
+            )
 
 
 def _count_text(some: int, count: int, what: str = "photo") -> str:

@@ -28,6 +28,7 @@ from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.geodata import geotiff, stac
 from scan2sim.pipeline.io.survey import Survey
 from scan2sim.pipeline.io.worlds import merge
+from scan2sim.texturing.backdrop import dome
 
 TILES, PICTURE = "tiles", "picture.jpg"
 Warn = Callable[[str], None]
@@ -101,11 +102,11 @@ def _finish_tile(
     planned, done = list(result.planned), dict(result.done)
     keys = {item.task.id.name: item.key for item in planned}
     out.mkdir(parents=True, exist_ok=True)
-    failed = side.of_tile(result.name)
-    if not (result.up_to_date and is_finished(store, planned, out) and failed_before(out) == failed.keys()):
+    same_failed = (out / DATA).is_file() and failed_before(out) == side.of_tile(result.name).keys()
+    if not (result.up_to_date and is_finished(store, planned, out) and same_failed):
         for task in keys.keys() & to_read(store, planned, out):
             store.read(task, keys[task])
-        for warning in publish(store, planned, done, out, result.tile, settings):
+        for warning in publish(store, planned, done, out, result.tile, settings, side, f"{result.name}/"):
             warn(warning)
         seconds = sum(done[item.task.id.name].seconds for item in planned if item.reason is not None)
         (out / PICTURE).unlink(missing_ok=True)
@@ -113,7 +114,7 @@ def _finish_tile(
             if "pictures" in done:
                 album = store.folder("pictures", keys["pictures"]) / done["pictures"].files["pictures"]
                 shutil.copyfile(album / "hero.jpg", out / PICTURE)
-            write_report(result.tile, planned, done, store, out, seconds=seconds, failed=failed)
+            write_report(result.tile, planned, done, store, out, seconds=seconds, failed=side.of_tile(result.name))
     store.sweep(keys)
 
 
@@ -127,7 +128,7 @@ def _assemble(
 ) -> None:
     """Write the common world of all tiles with their roads, the STAC catalogue, the virtual point cloud and rasters."""
     tiles = [merge.TileWorld(one.name, out / TILES / one.name / "world", one.tile.frame) for one in done if one.tile]
-    merge.assemble(out, survey.name, tiles, warn=warn)
+    merge.assemble(out, survey.name, tiles, dome=dome.of_survey, warn=warn)
     with side.attempt("roads"):
         merge.add_roads(out)
     with side.attempt("catalogue"):
@@ -172,7 +173,7 @@ def _state(one: TileResult, out: Path, side: SideProducts) -> TileState:
     return TileState(
         name=one.name,
         outline=ring,
-        state="failed" if one.error else ("done" if one.changed else "kept"),
+        state="failed" if one.error else ("done" if one.changed else "cached"),
         reason=str(one.error) if one.error else None,
         figures=_figures(one.tile, done) if one.tile and done else {},
         report=f"{TILES}/{one.name}/{PAGE}" if done and (place / PAGE).is_file() else None,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 RELEASES = {
@@ -30,9 +31,17 @@ def commands(sdf: Path) -> dict[str, str]:
 
 
 def lines(sdf: Path) -> list[str]:
-    """Lines printed at the end of a run: path of the world, commands that open it in a browser and in Gazebo."""
+    """Lines printed at the end of a run: path of the world, commands that open it in a browser, Gazebo and ROS 2."""
     installed = "ign gazebo" if shutil.which("ign") else "gz sim"
     by_release = commands(sdf)
     folder = sdf.parent
-    world = [f"World:  {folder}", f"View:   scan2sim view {shlex.quote(str(folder))}"] if folder.is_dir() else []
-    return [*world, *([f"Gazebo: {by_release[RELEASES[installed][0]]}"] if by_release else [])]
+    world = [f"World:  {folder}", f"View:   {_command()} view {shlex.quote(str(folder))}"] if folder.is_dir() else []
+    launch = sdf.with_suffix(".launch.py")
+    ros = [f"ROS 2:  ros2 launch {shlex.quote(str(launch))}"] if launch.is_file() else []
+    return [*world, *([f"Gazebo: {by_release[RELEASES[installed][0]]}"] if by_release else []), *ros]
+
+
+def _command() -> str:
+    """The command of scan2sim: with its path if it is only found beside this Python (an inactive environment)."""
+    beside = Path(sys.executable).with_name("scan2sim")
+    return shlex.quote(str(beside)) if not shutil.which("scan2sim") and beside.is_file() else "scan2sim"

@@ -10,6 +10,7 @@ from pathlib import Path
 from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.flows.reports.side_products import SideProducts
 from scan2sim.flows.reports.tile import PAGES, SCRIPTS
 from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.errors import DamagedError
@@ -31,9 +32,25 @@ REPORTED_TASKS = ("exposure", "pictures", "score")
 
 
 def publish(
-    store: Store, planned: list[PlannedTask], done: dict[str, Manifest], out: Path, tile: Tile, settings: Settings
+    store: Store,
+    planned: list[PlannedTask],
+    done: dict[str, Manifest],
+    out: Path,
+    tile: Tile,
+    settings: Settings,
+    side: SideProducts,
+    prefix: str = "",
 ) -> list[str]:
     """Publish the world, rasters, exposures and resolved settings; what is up to date stays.
+
+    Args:
+        store: cache of the tile's results.
+        planned, done: its tasks, and results by name within the tile.
+        out: output folder of the tile.
+        tile: the tile.
+        settings: of the run.
+        side: records failures of everything but the world.
+        prefix: of the names of failures: `street_0001/` for a survey's tile.
 
     Returns:
         Warnings about files that the user has edited.
@@ -42,32 +59,40 @@ def publish(
         DamagedError: a cached result was deleted during the run.
     """
     keys = {p.task.id.name: p.key for p in planned}
-    changed: list[Path] = []
     folders = _published_folders(store, keys, out)
-    for task in PUBLISHED_OUTPUTS.keys() & done.keys():
-        if done[task].files and task not in folders:
-            raise DamagedError(task)
-    for task, (source, place) in folders.items():
-        if not _current(source, place, keys[task]):
-            _publish(source, place, keys[task])
-        changed += edited(source, place)
+    changed = _publish_output("export", folders, keys)
     for task, (_, name) in PUBLISHED_OUTPUTS.items():
-        if (
-            not (task in done and done[task].files) and (out / name / STAMP_FILE).is_file()
-        ):  # published from an earlier world
+        if task in done and done[task].files:
+            if task != "export":
+                with side.attempt(f"{prefix}{task}", out / name):
+                    changed += _publish_output(task, folders, keys)
+        elif (out / name / STAMP_FILE).is_file():  # published from an earlier world
             shutil.rmtree(out / name)
-    if "preview" in done and done["preview"].files:
-        shutil.copyfile(PAGES / THREE_JS, out / SCRIPTS / THREE_JS)
-    solved = store.folder("exposure", keys["exposure"]) / done["exposure"].files["exposures"]
-    shutil.copyfile(solved, out / "exposure.json")  # for setting `exposure.prior` of other tiles
-    config = {
-        "tile": str(tile.path),
-        "versions": versions(),
-        "set": settings.values,
-        "steps": {task: {k: v for k, v in m.params.items() if k != "context"} for task, m in done.items()},
-    }
-    (out / "config.json").write_text(json.dumps(config, indent=1), encoding="utf-8")
+    if (out / SCRIPTS).is_dir():
+        with side.attempt(f"{prefix}preview"):
+            shutil.copyfile(PAGES / THREE_JS, out / SCRIPTS / THREE_JS)
+    with side.attempt(f"{prefix}exposure.json", out / "exposure.json"):
+        solved = store.folder("exposure", keys["exposure"]) / done["exposure"].files["exposures"]
+        shutil.copyfile(solved, out / "exposure.json")  # for setting `exposure.prior` of other tiles
+    with side.attempt(f"{prefix}config.json", out / "config.json"):
+        config = {
+            "tile": str(tile.path),
+            "versions": versions(),
+            "set": settings.values,
+            "steps": {task: {k: v for k, v in m.params.items() if k != "context"} for task, m in done.items()},
+        }
+        (out / "config.json").write_text(json.dumps(config, indent=1), encoding="utf-8")
     return [f"{path} was edited and is kept; delete it to have it rebuilt" for path in changed]
+
+
+def _publish_output(task: str, folders: Mapping[str, tuple[Path, Path]], keys: Mapping[str, str]) -> list[Path]:
+    """Publish the output of a task, unless it is up to date; returns the files that the user has edited."""
+    if task not in folders:
+        raise DamagedError(task)
+    source, place = folders[task]
+    if not _current(source, place, keys[task]):
+        _publish(source, place, keys[task])
+    return edited(source, place)
 
 
 def to_read(store: Store, planned: Iterable[PlannedTask], out: Path) -> set[str]:

@@ -10,7 +10,7 @@ import inspect
 import re
 from collections.abc import Iterator
 
-from scan2sim.flows.pipelines import drive, study, tile, video
+from scan2sim.flows.pipelines import drive, images, study, tile, video
 from scan2sim.pipeline.core.parameters import described
 from scan2sim.pipeline.core.step import Params, Step
 
@@ -36,6 +36,8 @@ PARTS = (
      video.STEPS),
     ("A drive", "Steps that run before a survey's tiles ([surveys.md](../surveys.md#drives)); most settings are "
      "options of `scan2sim import sweeps` and `scan2sim tile`, or fields of `drive.toml`.", drive.STEPS),
+    ("Photos without poses", "Steps of `scan2sim import images` ([images.md](../images.md)); settings are options "
+     "of that command.", images.STEPS),
     ("The study of compression", "Steps of `scan2sim slam study`, for each cell of its tables.", study.STEPS),
 )  # fmt: skip
 ATTRIBUTE_LINE = re.compile(r"^([a-z_0-9]+(?:, [a-z_0-9]+)*): (.*)$")
@@ -66,12 +68,12 @@ def _rows(step: Step) -> Iterator[str]:
     for name, field in step.params.settings().items():
         default = "required" if field.is_required() else _value(field.get_default(call_default_factory=True))
         special = [f"{group} {_value(values[name])}" for group, values in step.class_defaults.items() if name in values]
-        cells = "; ".join([default, *special]), described(field), meanings.get(name, "")
+        cells = "; ".join([default, *special]), described(field), meanings.get(name) or field.description or ""
         yield f"| `{step.name}.{name}` | " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
 def _value(default: object) -> str:
-    if default is None:
+    if default is None or default == ():
         return "not set"
     return str(default).lower() if isinstance(default, bool) else str(default)
 

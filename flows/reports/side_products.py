@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -9,7 +10,8 @@ from pathlib import Path
 
 from scan2sim.flows.pipelines.graph import TaskId
 from scan2sim.flows.reports.findings import failure_text
-from scan2sim.pipeline.core.errors import IncompleteError, ScanError, from_exception
+from scan2sim.pipeline.core.cache import Manifest
+from scan2sim.pipeline.core.errors import IncompleteError, ScanError, StepError, from_exception
 
 
 class SideProducts:
@@ -24,20 +26,28 @@ class SideProducts:
         self.out = out
         self.failed: dict[str, ScanError] = {}
 
-    def add(self, failed: Mapping[TaskId, ScanError]) -> None:
-        """Add failed steps."""
+    def add(self, failed: Mapping[TaskId, ScanError], done: Mapping[TaskId, Manifest]) -> None:
+        """Add failed steps, and failed parts of results (`street_0001/export.usd`)."""
         self.failed |= {task.full_name: error for task, error in failed.items()}
+        for task, manifest in done.items():
+            for part, (where, cause, remedy, *notes) in manifest.failed.items():
+                error = self.failed[f"{task.full_name}.{part}"] = StepError(where, cause, remedy)
+                for note in notes:
+                    error.add_note(note)
 
     @contextmanager
     def attempt(self, name: str, *files: Path) -> Iterator[None]:
-        """Record an exception in the context as failure of `name`, and delete `files`, which an earlier run wrote."""
+        """Record an exception in the context as failure of `name`, and delete `files`, which an earlier run wrote.
+
+        Files may be folders.
+        """
         try:
             yield
         except Exception as error:
             self.failed[name] = from_exception(error, name, self.out)
             self.failed[name].add_note(traceback.format_exc())
             for file in files:
-                file.unlink(missing_ok=True)
+                shutil.rmtree(file, ignore_errors=True) if file.is_dir() else file.unlink(missing_ok=True)
 
     def of_tile(self, tile: str) -> dict[str, ScanError]:
         """Errors of a survey's tile by name within the tile; for "": errors that belong to no tile."""

@@ -23,8 +23,8 @@ from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.errors import ScanError, from_os_error
 from scan2sim.pipeline.core.types import F64
 
-State = Literal["done", "kept", "failed", "waiting"]
-STATES: tuple[State, ...] = ("failed", "waiting", "done", "kept")
+State = Literal["done", "cached", "failed", "waiting"]
+STATES: tuple[State, ...] = ("failed", "waiting", "done", "cached")
 TEMPLATE = "survey.html.j2"
 PAGE, DATA = "survey.html", "survey.json"
 MAP_WIDTH_PX, MAP_HEIGHT_PX, MAP_MARGIN_PX = 1100.0, 600.0, 24.0
@@ -50,7 +50,7 @@ class TileState:
     Attributes:
         name: unique in the survey.
         outline: (K, 2) outline of its cell in world metres; empty if unknown.
-        state: "done" in this run, "kept" (up to date before), "failed", or "waiting".
+        state: "done" in this run, "cached" (up to date before), "failed", or "waiting".
         reason: why it failed.
         figures: known ones of `points`, `photos`, `coverage` (share of the surface seen by a photo), `psnr_db` (None
             without held-out photos), `cloud_to_mesh_m` (mean, by class), `triangles`, `bytes` of its world,

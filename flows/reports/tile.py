@@ -13,12 +13,14 @@ from typing import Any
 from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.reports import gazebo
-from scan2sim.flows.reports.findings import findings
+from scan2sim.flows.reports.findings import Finding, findings
 from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.errors import ScanError
 from scan2sim.pipeline.core.types import Tile
+from scan2sim.pipeline.io import trajectory_check
 from scan2sim.pipeline.io.geodata import crs
+from scan2sim.pipeline.pose_check.check import read_check
 
 TEMPLATE = "tile.html.j2"
 PAGE, DATA = "report.html", "report.json"
@@ -26,6 +28,19 @@ PAGES = Path(__file__).parent / "pages"
 SCRIPTS = "report_files"
 """Folder next to the page with the scripts and data of its 3D view."""
 AREAS = ("area_m2", "seen_m2", "coloured_m2", "filled_m2")
+ALBUMS = (
+    ("pictures", "pictures", "", ""),
+    ("score", "frames", "", ""),
+    ("score", "error", "photos", "psnr_gain_db"),
+    ("lidar_score", "images", "sweeps", "f_score"),
+)
+"""Steps with images: step, output, and, if only the worst, median and best image is shown, the metric with the figures
+of each image, and the figure by which they are ordered."""
+FRAMES_MAX = 24
+"""Whole frames that the page shows, evenly over the held-out photos; all are in the results of the step `score`."""
+REMOVED_MAX = 40
+"""Removed objects that the page lists; report.json has all."""
+NO_SWEEPS = "the tile has no trajectory of a scanner, so it isn't known along which rays its points were measured"
 Picture = dict[str, Any]
 """An image in the index.json of an album: `file`, `role`, `title`, `caption`, and optionally `other`."""
 
@@ -54,11 +69,12 @@ def write_report(
     write_atomically(out / DATA, json.dumps(body, indent=1))
     keys = {p.task.id.name: p.key for p in planned}
     pictures: list[Picture] = []
-    for task, name in (("pictures", "pictures"), ("score", "error")):
+    for task, name, scores, key in ALBUMS:
         if task in done:
             folder = store.folder(task, keys[task]) / done[task].files[name]
             entries = json.loads((folder / "index.json").read_text(encoding="utf-8"))
-            shown = representative(entries, done[task].metrics["photos"]) if name == "error" else entries
+            shown = representative(entries, done[task].metrics[scores], key) if scores else entries
+            shown = evenly(shown, FRAMES_MAX) if name == "frames" else shown
             pictures += [_with_pixels(entry, folder) for entry in shown]
     page = out / PAGE
     view = done["preview"].metrics if "preview" in done and done["preview"].files else None
@@ -67,8 +83,11 @@ def write_report(
 
 
 def failed_before(out: Path) -> set[str]:
-    """Names of the failed side products according to the report in `out`."""
-    return set(json.loads((out / DATA).read_text(encoding="utf-8")).get("failed", {}))
+    """Names of the failed side products according to the report in `out`; the report itself if it is damaged."""
+    try:
+        return set(json.loads((out / DATA).read_text(encoding="utf-8"))["failed"])
+    except (ValueError, KeyError, TypeError):
+        return {"report"}
 
 
 def figures(tile: Tile, done: Mapping[str, Manifest], failed: Mapping[str, ScanError] | None = None) -> dict[str, Any]:
@@ -85,6 +104,13 @@ def figures(tile: Tile, done: Mapping[str, Manifest], failed: Mapping[str, ScanE
         "coverage_by_class": {g: s.get("coverage", 0.0) for g, s in seen.items()},
         "area_by_class": {g: {name: s.get(name, 0.0) for name in AREAS} for g, s in seen.items()},
     }
+    problems = findings(done, failed)
+    check = trajectory_check.read(tile.path.parent)
+    if check is not None:
+        problems += [Finding("note", "trajectory", str(text)) for text in check.get("warnings", [])]
+    photo_check = read_check(tile.path.parent)
+    if photo_check is not None:
+        problems += [Finding("note", "photos", str(text)) for text in photo_check.get("warnings", [])]
     return {
         "tile": tile.name,
         "crs": crs.name(tile.frame.crs),
@@ -93,10 +119,14 @@ def figures(tile: Tile, done: Mapping[str, Manifest], failed: Mapping[str, ScanE
         "versions": versions(),
         "seconds": round(sum(m.seconds for m in done.values()), 2),
         "peak_mb": max(m.peak_mb for m in done.values()),
-        "findings": [{"level": one.level, "about": one.about, "text": one.text} for one in findings(done, failed)],
+        "findings": [{"level": one.level, "about": one.about, "text": one.text} for one in problems],
+        "trajectory_check": check,
+        "photo_check": photo_check,
         "failed": {name: {"cause": error.cause, "remedy": error.remedy} for name, error in (failed or {}).items()},
         "geometry": geometry,
         "texture": texture | facts.get("score", {}),
+        "lidar": _lidar(facts),
+        "removed": _removed(facts),
         "world": facts["export"],
         "steps": {
             task: {"seconds": m.seconds, "peak_mb": m.peak_mb, "metrics": m.metrics, "warnings": m.warnings}
@@ -105,13 +135,42 @@ def figures(tile: Tile, done: Mapping[str, Manifest], failed: Mapping[str, ScanE
     }
 
 
-def representative(entries: Sequence[Picture], scores: Mapping[str, Mapping[str, float]]) -> list[Picture]:
-    """The worst, the median and the best error image by `psnr_gain_db`, which `scores` has by title."""
-    ordered = sorted(entries, key=lambda entry: scores[entry["title"]]["psnr_gain_db"])
+def _removed(facts: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """What step `instances` found and the world leaves out; parked vehicles aren't, if they are kept."""
+    kept = "vehicle" in facts.get("split", {}).get("points", {})
+    found = facts.get("instances", {}).get("removed", [])
+    return [one for one in found if one["moved"] or one["kind"] == "person" or not kept]
+
+
+def _lidar(facts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Score by sweeps: metrics of `lidar_score`; `held_out`, a number of sweeps; and `no_return_m2` of `reflectance`.
+
+    Or `reason`, why there is none.
+    """
+    scored, found = facts.get("lidar_score"), facts.get("sweeps")
+    if found is None or scored is None:
+        return {"reason": NO_SWEEPS if found is None else "the step lidar_score failed"}
+    if not scored["rays"]:
+        return {"reason": found["reason"] or "no return of its sweeps lies within the tile and 80 m of the scanner"}
+    unreturned: dict[str, float] | None = facts.get("reflectance", {}).get("no_return_m2")
+    known = {} if unreturned is None else {"no_return_m2": round(sum(unreturned.values()), 2)}
+    return {"held_out": found["held_out"], **scored, **known}
+
+
+def representative(
+    entries: Sequence[Picture], scores: Mapping[str, Mapping[str, float | None]], key: str = "psnr_gain_db"
+) -> list[Picture]:
+    """The worst, the median and the best image by `key`, which `scores` has by title."""
+    ordered = sorted(entries, key=lambda entry: scores[entry["title"]][key] or 0.0)
     if len(ordered) < 3:
         return ordered
     chosen = {"worst": ordered[0], "median": ordered[len(ordered) // 2], "best": ordered[-1]}
     return [entry | {"caption": f"({rank} of {len(ordered)}) {entry['caption']}"} for rank, entry in chosen.items()]
+
+
+def evenly(entries: Sequence[Picture], count: int) -> list[Picture]:
+    """At most `count` of the entries, evenly over all of them."""
+    return list(entries[:: -(-len(entries) // count)]) if entries else []
 
 
 def _with_pixels(entry: Picture, folder: Path) -> Picture:
@@ -126,13 +185,20 @@ def _render(
     from jinja2 import Environment, FileSystemLoader
     from markupsafe import Markup
 
+    sky = body["steps"].get("sky_colour", {}).get("metrics", {}).get("rgb")
     environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
     return environment.get_template(TEMPLATE).render(
         body=body,
         pictures=pictures,
         groups=SURFACES,
+        removed_max=REMOVED_MAX,
         gazebo=opened,
-        view=view and {**view, "folder": SCRIPTS, "about": {name: view[name] for name in ("start", "walk", "turn")}},
+        view=view
+        and {
+            **view,
+            "folder": SCRIPTS,
+            "about": {name: view[name] for name in ("start", "walk", "turn")} | {"sky": sky},
+        },
         script=Markup((PAGES / "walk.js").read_text(encoding="utf-8")),
     )
 

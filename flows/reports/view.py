@@ -70,7 +70,7 @@ class Pages:
 
     def __init__(self, scene: Scene, folder: Path, megapixels: float) -> None:
         self.folder = folder
-        self._tiles = {tile.name: tile for tile in scene.tiles}
+        self._tiles = {tile.name: tile for tile in scene.with_dome}
         self._megapixels = megapixels
         self._writing = threading.Lock()
         make_folder(folder / TILES)
@@ -80,8 +80,13 @@ class Pages:
 
     @property
     def scripts(self) -> list[str]:
-        """Names of the script files of all tiles, which `write` creates."""
-        return [f"{name}{kind}.js" for name in self._tiles for kind in ("", COLLISION)]
+        """Names of the script files of all tiles and the dome, which `write` creates."""
+        return [
+            f"{name}{kind}.js"
+            for name, tile in self._tiles.items()
+            for kind in ("", COLLISION)
+            if tile.groups or not kind
+        ]
 
     def write(self, script: str) -> None:
         """Create the script of a tile unless it exists; ignores unknown names."""
@@ -141,10 +146,11 @@ def server(pages: Pages, port: int) -> ThreadingHTTPServer:
 
 def _write_shown(path: Path, tile: SceneTile, megapixels: float) -> None:
     """Write the visible meshes of a tile as GLB, with its textures scaled down to `megapixels`."""
-    pages = [shape.pages[page] for shape in tile.textured().values() for page in shape.used_pages]
+    surfaces = [*tile.surfaces(), *tile.backdrop()]
+    pages = {surface.shape.pages[page] for surface in surfaces for page in surface.shape.used_pages}
     texels = sum(int(np.prod(image.size_of(page))) for page in pages)
     scale = min(1.0, (megapixels * 1e6 / texels) ** 0.5)
-    glb.write(path, tile.surfaces(), GlbParams(jpeg_quality=85), views=tile.views(), scale=scale)
+    glb.write(path, surfaces, GlbParams(jpeg_quality=85), views=tile.views(), scale=scale)
 
 
 def _page(scene: Scene) -> str:
@@ -169,9 +175,11 @@ def _about(scene: Scene) -> dict[str, Any]:
              "triangles": sum(group["triangles"] for group in tile.groups.values())}
             for tile in scene.tiles
         ],
+        "dome": scene.dome and {"name": scene.dome.name, "offset": scene.dome.offset, "far": scene.far},
         "photos": photos,
         "colours": {name_of(code): codes[code].tolist() for code in sorted(set(CODE_OF_SURFACE.values()) | {64, 65})},
         "sources": list(SOURCE_RGB.values()),
+        "sky": scene.sky,
         "start": "walk" if photos else "turn",
         "walk": walk,
         "turn": _ahead(air, (low[2] - air[2, 3]) / air[2, 2]),

@@ -15,6 +15,7 @@ from scan2sim.pipeline.core.types import F64, I64, Bools
 from scan2sim.pipeline.geometry.height_map import Raster, close_gaps, signed_area
 
 PIXELS_PER_CELL = 4  # of the image in which contours are traced
+MAIN_DIRECTION_ROUNDS = 5
 MAX_ALIGNMENT_RAD = np.radians(12.0)  # largest rotation of a side to a main direction
 MIN_CORNER_RAD = np.radians(20.0)  # sides that differ by less are connected by a step instead of a corner
 END_FRACTION = 0.15  # part of a side at each end, near corners, that is not used to fit its line
@@ -155,14 +156,29 @@ def regularize(contour: F64, tolerance: float) -> F64 | None:
     lines = [_line(run, contour[j % len(contour)] - contour[i]) for run, (i, j) in zip(runs, ends, strict=True)]
     length = np.array([len(run) for run in runs], float)
     angle = np.array([np.arctan2(d[1], d[0]) for _, d in lines])
-    main_direction = np.arctan2((length * np.sin(4 * angle)).sum(), (length * np.cos(4 * angle)).sum()) / 4
-    off = (angle - main_direction + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    off = _off_axis(angle - _main_direction(angle, length))
     angle = np.where(np.abs(off) < MAX_ALIGNMENT_RAD, angle - off, angle)
     lines = [(centre, np.array([np.cos(a), np.sin(a)])) for (centre, _), a in zip(lines, angle, strict=True)]
     corners: list[F64] = []
     for k, (i, _) in enumerate(ends):
         corners += _corner(contour[i], lines[k - 1], lines[k], tolerance)
     return np.array(corners)
+
+
+def _main_direction(angle: F64, length: F64) -> float:
+    """Direction (radians, modulo 90 degrees) of most sides (K,) by length; oblique sides have no influence."""
+    off = _off_axis(angle - angle[:, None])
+    weight = length * np.maximum(1 - np.abs(off) / MAX_ALIGNMENT_RAD, 0)
+    direction = float(angle[int(weight.sum(axis=1).argmax())])
+    for _ in range(MAIN_DIRECTION_ROUNDS):
+        off = _off_axis(angle - direction)
+        direction += float(np.average(off, weights=length * np.maximum(1 - np.abs(off) / MAX_ALIGNMENT_RAD, 0)))
+    return direction
+
+
+def _off_axis(angle: F64) -> F64:
+    """Smallest rotation (radians) of each direction from the axes of a right-angled cross."""
+    return (angle + np.pi / 4) % (np.pi / 2) - np.pi / 4
 
 
 def _line(run: F64, along: F64) -> tuple[F64, F64]:

@@ -7,8 +7,10 @@ intersections per pixel.
 Occluders are the mesh faces that are supported by points (a surface that Poisson inflates around thin structures has
 no points and occludes nothing), and those points of the cloud that no mesh represents (cars, people, trimmed
 surfaces), as discs with the points' normals. Objects that moved during the scan left trails of points, most of which
-`dynamic_objects` has separated: such a point occludes only in photos taken at about the time when it was scanned. A
-point is visible if its range is at most that of the range image plus a bias that grows with the slope of the surface.
+`dynamic_objects` has separated: such a point occludes only in photos taken at about the time when it was scanned.
+Posts are modelled more accurately than photos are posed, so a photo shows them beside their meshes: their points hide
+what is clearly behind them, too. A point is visible if its range is at most that of the range image plus a bias that
+grows with the slope of the surface.
 Evaluated against ground truth by `bench/visibility.py`.
 """
 
@@ -16,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +37,8 @@ MAX_PIXELS = 2_000_000
 """Maximum number of pixels of a range image."""
 MAX_UPSCALING = 2.0
 """Maximum width of a range image relative to the photo; smaller pixels reduce both leaking and false occlusion."""
+RAY_CHUNK = 500_000
+"""Number of rays cast at a time, to bound memory."""
 SUPPORT_DISTANCE_SPACINGS = 1.3
 """Mesh vertices farther from all points than this many median point spacings are unsupported and don't occlude."""
 FOLIAGE_DISTANCE_FACTOR = 2.5
@@ -57,6 +61,9 @@ DISC_RADIUS_FRACTION = 0.7
 """Disc radius of movable objects relative to the distance of the eighth neighbour; their points are sparse."""
 MAX_DISC_SCALE = 3.0
 """Upper limit of that radius, relative to the radius of other discs."""
+SLIM_MARGIN_M = 0.3
+"""Slim objects hide what is at least this far behind their points: neither their own meshes nor the ground at
+their foot."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +76,8 @@ class Scene:
         centres, normals: (N, 3) centres and unit normals of the discs.
         radii: (N,) radii of the discs, metres.
         spans: (N, 2) time span in which each disc occludes, seconds; NaN: always.
+        slim: (M, 3) points of slim objects.
+        slim_radius: radius of their discs, metres.
     """
 
     casting: Any
@@ -77,6 +86,8 @@ class Scene:
     normals: F32
     radii: F32
     spans: F64
+    slim: F32 = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    slim_radius: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -248,24 +259,34 @@ def depth_map(
     rays = pixel_rays(camera)
     T_world_cam = np.asarray(T_world_cam, np.float64)
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
-    if occluders.triangles:
-        cast = np.empty((camera.height, camera.width, 6), np.float32)
+    rows_at_once = max(1, RAY_CHUNK // camera.width)
+    for first in range(0, camera.height, rows_at_once) if occluders.triangles else ():
+        part = rays[first : first + rows_at_once]
+        cast = np.empty((*part.shape[:2], 6), np.float32)
         cast[..., :3], cast[..., 3:] = (
             T_world_cam[:3, 3],
-            np.nan_to_num(rays) @ T_world_cam[:3, :3].T.astype(np.float32),
+            np.nan_to_num(part) @ T_world_cam[:3, :3].T.astype(np.float32),
         )
         if camera.model == "orthographic":
-            v, u = np.mgrid[: camera.height, : camera.width]
+            v, u = np.mgrid[first : first + len(part), : camera.width]
             begin = ray_origins(camera, np.column_stack([u.ravel(), v.ravel()])).reshape(*u.shape, 3)
             cast[..., :3] += begin @ T_world_cam[:3, :3].T
         hit = occluders.casting.cast_rays(cast)["t_hit"].numpy()
-        depth = np.where(np.isfinite(rays[..., 0]), hit, np.inf).astype(np.float32)
+        depth[first : first + len(part)] = np.where(np.isfinite(part[..., 0]), hit, np.inf)
     active = np.ones(len(occluders.centres), bool)
     if time is not None:
         active = np.isnan(occluders.spans[:, 0]) | ((time > occluders.spans[:, 0]) & (time < occluders.spans[:, 1]))
     if active.any():
         centres, normals, radii = occluders.centres[active], occluders.normals[active], occluders.radii[active]
         disc_splatting.draw_discs(depth, rays, posed_camera(camera, T_world_cam), centres, normals, radii)
+    if len(occluders.slim) and camera.model != "orthographic":
+        facing = T_world_cam[:3, 3] - occluders.slim
+        facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-6)
+        silhouette, radii = np.full_like(depth, np.inf), np.full(len(facing), occluders.slim_radius, np.float32)
+        posed = posed_camera(camera, T_world_cam)
+        disc_splatting.draw_discs(silhouette, rays, posed, occluders.slim, facing.astype(np.float32), radii)
+        hides = np.isfinite(depth) & (silhouette < depth - SLIM_MARGIN_M)
+        depth[hides] = silhouette[hides]
     return DepthMap(camera, T_world_cam, depth)
 
 

@@ -8,6 +8,7 @@ Import this module lazily: it loads numba.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -41,17 +42,25 @@ def parameters(camera: Camera) -> F64:
     p[:4] = camera.fx, camera.fy, camera.cx, camera.cy
     p[4 : 4 + len(camera.distortion)] = camera.distortion
     p[_WIDTH], p[_HEIGHT] = camera.width, camera.height
-    p[_LIMIT] = np.inf
-    if camera.model == "opencv":
+    p[_LIMIT] = _validity_limit(camera.model, tuple(camera.distortion))
+    return p
+
+
+@lru_cache(1024)
+def _validity_limit(model: str, distortion: tuple[float, ...]) -> float:
+    """See `parameters`; infinite if the distortion has no limit."""
+    p = np.zeros(12)
+    p[4 : 4 + len(distortion)] = distortion
+    if model == "opencv":
         r = np.concatenate([np.linspace(0, 4, 4001), np.geomspace(4, 1e3, 1000)[1:]])
         r2 = r * r
         radial = r * (1 + r2 * (p[4] + r2 * (p[5] + r2 * p[8]))) / (1 + r2 * (p[9] + r2 * (p[10] + r2 * p[11])))
-        p[_LIMIT] = _first_fold(r, radial, np.inf)
-    elif camera.model == "fisheye":
+        return _first_fold(r, radial, np.inf)
+    if model == "fisheye":
         theta = np.linspace(0, np.pi, 4001)
         t2 = theta * theta
-        p[_LIMIT] = _first_fold(theta, theta * (1 + t2 * (p[4] + t2 * (p[5] + t2 * (p[6] + t2 * p[7])))), np.pi)
-    return p
+        return _first_fold(theta, theta * (1 + t2 * (p[4] + t2 * (p[5] + t2 * (p[6] + t2 * p[7])))), np.pi)
+    return np.inf
 
 
 def _first_fold(x: F64, y: F64, no_fold: float) -> float:
@@ -89,8 +98,16 @@ def unproject(camera: Camera, uv: npt.ArrayLike) -> F64:
 
 
 def pixel_rays(camera: Camera) -> F32:
-    """Unit rays (H, W, 3) in camera axes through the pixel centres; NaN outside the valid field of view."""
-    return _pixel_rays(MODEL_ID[camera.model], parameters(camera), camera.height, camera.width)
+    """Unit rays (H, W, 3) in camera axes through the pixel centres; NaN outside the valid field of view.
+
+    Photos of one camera share the array: don't change it.
+    """
+    return _shared_rays(MODEL_ID[camera.model], tuple(parameters(camera).tolist()), camera.height, camera.width)
+
+
+@lru_cache(4)
+def _shared_rays(model: int, p: tuple[float, ...], height: int, width: int) -> F32:
+    return _pixel_rays(model, np.array(p), height, width)
 
 
 def ray_origins(camera: Camera, uv: npt.ArrayLike) -> F64:

@@ -6,9 +6,9 @@ Used to score textures against held-out photos, and for the images of the report
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,11 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools, Camera, Mesh
+from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools, Camera, Colour, Mesh
 
 RAY_CHUNK = 500_000
 """Number of rays cast at a time, to bound memory."""
+PAGES_MAX_BYTES = 400_000_000
+"""Bytes of decoded pages kept in memory: a tile's pages are decoded once, not once per view."""
 SKY_RGB = (200, 214, 230)
+"""Colour of the sky of worlds without photos of it."""
 SUN_DIRECTION = np.array([0.45, 0.3, 0.84])
 
 Rays = Callable[[F64, F64], tuple[F64, F64]]
@@ -81,17 +84,29 @@ class _Hits(NamedTuple):
     barycentric: F32
 
 
+class _Page(NamedTuple):
+    """A texture page (H, W, 3), and its colour source mask (H, W) or None."""
+
+    rgb: U8
+    seen: U8 | None
+
+    @property
+    def bytes(self) -> int:
+        return self.rgb.nbytes + (0 if self.seen is None else self.seen.nbytes)
+
+
 class Renderer:
     """Renders a set of meshes from any number of cameras.
 
     Args:
         bodies: meshes to render.
+        sky: colour of the pixels of a camera's view without a hit; None: `SKY_RGB`.
     """
 
-    def __init__(self, bodies: Sequence[Body]) -> None:
+    def __init__(self, bodies: Sequence[Body], sky: Colour | None = None) -> None:
         import open3d as o3d
 
-        self.bodies = tuple(bodies)
+        self.bodies, self.sky = tuple(bodies), sky or SKY_RGB
         self._casting = o3d.t.geometry.RaycastingScene()
         self._body_of: dict[int, int] = {}
         for i, body in enumerate(self.bodies):
@@ -101,14 +116,14 @@ class Renderer:
                     _tensor(body.mesh.faces.astype(np.uint32)),
                 )
                 self._body_of[int(key)] = i
-        self._load_page = lru_cache(maxsize=16)(_read)
+        self._pages: OrderedDict[Path, _Page] = OrderedDict()
 
     def view(
         self,
         camera: Camera,
         T_world_cam: F64,
         *,
-        background: tuple[int, int, int] = SKY_RGB,
+        background: Colour | None = None,
         shaded: bool = False,
         wireframe: bool = False,
         samples: int = 1,
@@ -117,22 +132,23 @@ class Renderer:
 
         Args:
             camera, T_world_cam: intrinsics and pose.
-            background: colour of pixels without a hit.
+            background: colour of pixels without a hit; None: the sky's.
             shaded: apply Lambertian shading by a fixed sun (for plain colours; textures contain the real light).
             wireframe: draw the edges of triangles.
             samples: rays per pixel in each direction (supersampling); the colour of a pixel whose centre hits a mesh is
                 the mean of the rays that hit one. Simulators filter distant textures with mip-maps; one ray per pixel
                 would look sharper. All other outputs are those of the ray through the pixel's centre.
         """
-        from scan2sim.pipeline.camera.models import ray_origins, unproject
+        rays = _rays_of(camera, T_world_cam)
+        return self._cast(camera.width, camera.height, rays, background or self.sky, shaded, wireframe, samples)
 
-        rotation, centre = np.asarray(T_world_cam)[:3, :3], np.asarray(T_world_cam)[:3, 3]
-
-        def rays(column: F64, row: F64) -> tuple[F64, F64]:
-            uv = np.column_stack([column, row])
-            return centre + ray_origins(camera, uv) @ rotation.T, unproject(camera, uv) @ rotation.T
-
-        return self._cast(camera.width, camera.height, rays, background, shaded, wireframe, samples)
+    def covers(self, camera: Camera, T_world_cam: F64) -> float:
+        """Share of the pixels of a camera's view whose rays hit a mesh; reads no textures."""
+        rays, n, hits = _rays_of(camera, T_world_cam), camera.width * camera.height, 0
+        for first in range(0, n, RAY_CHUNK) if self._body_of else ():
+            row, column = np.divmod(np.arange(first, min(n, first + RAY_CHUNK), dtype=np.float64), camera.width)
+            hits += int((self._intersect(*rays(column, row)).body >= 0).sum())
+        return hits / n
 
     def above(
         self,
@@ -140,14 +156,15 @@ class Renderer:
         high: npt.ArrayLike,
         *,
         width: int = 1600,
-        background: tuple[int, int, int] = (255, 255, 255),
+        background: Colour = (255, 255, 255),
         shaded: bool = False,
         wireframe: bool = False,
         samples: int = 1,
     ) -> Image:
         """Render an orthographic map of the box from `low` to `high` (3,), x to the right and y up.
 
-        `range` is measured from 1 m above the box; other arguments are as in `view`.
+        Pixels without a hit get the colour `background`; `range` is measured from 1 m above the box; other arguments
+        are as in `view`.
         """
         low, high = np.asarray(low, float), np.asarray(high, float)
         pixel_m = max(high[0] - low[0], 1e-3) / width
@@ -203,7 +220,7 @@ class Renderer:
         width: int,
         height: int,
         rays: Rays,
-        background: tuple[int, int, int],
+        background: Colour,
         shaded: bool,
         wireframe: bool,
         samples: int,
@@ -278,11 +295,19 @@ class Renderer:
         uv = corners[:, 0] * (1 - b.sum(axis=1, keepdims=True)) + corners[:, 1] * b[:, :1] + corners[:, 2] * b[:, 1:]
         page = body.mesh.page[face]
         rgb, seen = np.empty((len(face), 3), np.uint8), np.empty(len(face), np.uint8)
-        for k in np.unique(page).tolist():
+        # pages in memory come first: in a fixed order, each would be evicted just before its next use
+        for k in sorted(np.unique(page).tolist(), key=lambda k: body.pages[k] not in self._pages):
             on = np.flatnonzero(page == k)
-            texture, mask = self._load_page(body.pages[k])
-            rgb[on], seen[on] = _sample(texture, mask, uv[on])
+            rgb[on], seen[on] = _sample(*self._page(body.pages[k]), uv[on])
         return rgb, seen
+
+    def _page(self, path: Path) -> _Page:
+        """A page, read or from memory; the least recently used ones are evicted."""
+        page = self._pages.pop(path, None) or _read(path)
+        self._pages[path] = page
+        while len(self._pages) > 1 and sum(p.bytes for p in self._pages.values()) > PAGES_MAX_BYTES:
+            self._pages.popitem(last=False)
+        return page
 
     def _edge_distance(self, which: npt.NDArray[np.int16], face: I32, barycentric: F32) -> F32:
         """Distance (N,) in metres from a hit to the nearest edge of its triangle."""
@@ -318,17 +343,31 @@ def _tensor(array: npt.NDArray[Any]) -> Any:
     return o3d.core.Tensor(np.ascontiguousarray(array))  # Open3D's stubs don't accept typed arrays
 
 
-def _read(path: Path) -> tuple[U8, U8 | None]:
-    """Read a page (H, W, 3) RGB, and its colour source mask (H, W) or None."""
+def _rays_of(camera: Camera, T_world_cam: F64) -> Rays:
+    """Rays of a posed camera's pixels."""
+    from scan2sim.pipeline.camera.models import ray_origins, unproject
+
+    rotation, centre = np.asarray(T_world_cam)[:3, :3], np.asarray(T_world_cam)[:3, 3]
+
+    def rays(column: F64, row: F64) -> tuple[F64, F64]:
+        uv = np.column_stack([column, row])
+        return centre + ray_origins(camera, uv) @ rotation.T, unproject(camera, uv) @ rotation.T
+
+    return rays
+
+
+def _read(path: Path) -> _Page:
+    """Read a page and its colour source mask."""
     import cv2
 
     page = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if page is None:
         raise InputError(path, "can't be read as an image", "Run again with `--from texture`")
-    mask: Any = cv2.imread(str(path.with_name(f"{path.stem}_seen.png")), cv2.IMREAD_GRAYSCALE)
+    seen = path.with_name(f"{path.stem}_seen.png")
+    mask: Any = cv2.imread(str(seen), cv2.IMREAD_GRAYSCALE) if seen.is_file() else None
     if mask is not None:  # the nearest texel of a hit on a chart's border may lie in the padding around the chart
         mask = np.where(mask == 0, cv2.dilate(mask, np.ones((3, 3), np.uint8)), mask)
-    return np.ascontiguousarray(page[..., ::-1]).astype(np.uint8, copy=False), mask
+    return _Page(np.asarray(cv2.cvtColor(page, cv2.COLOR_BGR2RGB, page), np.uint8), mask)
 
 
 def _sample(page: U8, mask: U8 | None, uv: F32) -> tuple[U8, U8]:

@@ -3,6 +3,7 @@
 ```
 ROOT/poisson.terrain/3f9a.../manifest.json   step, inputs, run time, outputs and metrics
                             /mesh.npz        the outputs
+ROOT/label/.parts/17be.../                   results of single photos, for the next run (`pipeline.core.parts`)
 ROOT/track/.part-81c2.../                    checkpoint of a step that can resume after it was killed
 ```
 A result is written to a temporary folder and moved into place, so that a killed run leaves no partial result. A cached
@@ -23,18 +24,19 @@ import shutil
 import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from stat import S_ISREG
 from typing import Any
 
 from scan2sim.pipeline.core.errors import InputError, from_os_error
-from scan2sim.pipeline.core.paths import inside
+from scan2sim.pipeline.core.parts import Parts
+from scan2sim.pipeline.core.paths import check_inside
 from scan2sim.pipeline.core.remote import Remote
 from scan2sim.pipeline.core.step import Done, Params, Step
 
 KEY_LENGTH = 24
-TEMPORARY_PREFIX, CHECKPOINT_PREFIX = ".tmp-", ".part-"
+TEMPORARY_PREFIX, CHECKPOINT_PREFIX, PARTS = ".tmp-", ".part-", ".parts"
 
 
 @dataclass(frozen=True)
@@ -44,14 +46,17 @@ class Manifest:
     Attributes:
         label: full name of its task (`poisson.terrain`).
         version, params, inputs: what the key was computed from; inputs are keys or digests by name.
-        inputs_digest: like the key, but computed from the contents of the inputs instead of their keys (cache hit by
-        content).
-        content: digest of all output files.
+        inputs_digest: like the key, but computed from the contents of the inputs (files of the outputs that it reads)
+            instead of their keys (cache hit by content).
+        content: digest of all files.
         files: output name to path relative to the result's folder.
         sizes: bytes of every file below it.
         digests: SHA-256 of each of them.
         metrics, warnings: of the step.
-        seconds, peak_mb: wall time and peak memory of the step's process and its children.
+        seconds, cpu_seconds, peak_mb: wall time, CPU time of all its threads, and peak memory of the step's process and
+            its children.
+        failed: parts of the result that failed, by name: where, cause, remedy, and the traceback if there is one. Only
+            the run that made such a result uses it.
     """
 
     label: str
@@ -67,6 +72,24 @@ class Manifest:
     warnings: list[str]
     seconds: float
     peak_mb: float
+    failed: dict[str, list[str]] = field(default_factory=dict)
+    cpu_seconds: float = 0.0
+
+    def content_of(self, output: str) -> str:
+        """Digest of the files of one output, and of those that belong to no output."""
+        paths = self.files.values()
+        own = self.files[output]
+        return content_of(
+            {
+                file: found
+                for file, found in self.digests.items()
+                if _is_at(file, own) or not any(_is_at(file, path) for path in paths)
+            }
+        )
+
+
+def _is_at(file: str, path: str) -> bool:
+    return file == path or file.startswith(f"{path}/")
 
 
 def digest(path: Path) -> str:
@@ -144,10 +167,10 @@ def read_manifest(path: Path) -> Manifest | None:
         manifest = Manifest(**body)
         if manifest.sizes.keys() != manifest.digests.keys():
             return None
-        for name in (*manifest.sizes, *manifest.files.values()):
-            inside(path.parent, name)
-        outputs = [(path.parent / name).resolve() for name in manifest.files.values()]
-        return manifest if all(file.is_relative_to(path.parent.resolve()) for file in outputs) else None
+        check_inside(path.parent, [*manifest.sizes, *manifest.files.values()])
+        outputs = [path.parent / name for name in manifest.files.values()]
+        links = [output.resolve() for output in outputs if output.is_symlink()]
+        return manifest if all(file.is_relative_to(path.parent.resolve()) for file in links) else None
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, InputError):
         return None
 
@@ -193,6 +216,18 @@ class Store:
             return manifest
         return manifest if self.remote is not None else None  # `read` fetches its files
 
+    def keys(self, task: str) -> list[str]:
+        """Keys of the task's results on this machine, valid or not."""
+        try:
+            return [path.name for path in (self.root / task).iterdir() if not path.name.startswith(".")]
+        except OSError:
+            return []
+
+    def newest(self, task: str) -> Manifest | None:
+        """The manifest of the task's newest result on this machine; None if there is none."""
+        keys = self.keys(task)
+        return self._manifest(task, max(keys, key=lambda k: self.folder(task, k).stat().st_mtime)) if keys else None
+
     def read(self, task: str, key: str) -> Manifest | None:
         """As `find`, and fetch its files to this machine."""
         manifest = self.find(task, key)
@@ -217,6 +252,10 @@ class Store:
     def mark_verified(self, task: str, key: str) -> None:
         """Skip further integrity checks of a result: it was made in this run, or has been hashed."""
         self._verified.add(self.folder(task, key))
+
+    def is_verified(self, task: str, key: str) -> bool:
+        """Whether `mark_verified` was called for a result."""
+        return self.folder(task, key) in self._verified
 
     def discard(self, task: str, key: str) -> None:
         """Remove a result, from remote storage as well."""
@@ -274,12 +313,16 @@ class Store:
             raise from_os_error(error, self.root) from None
         return target
 
+    def parts(self, task: str, step: Step) -> Parts:
+        """Parts of the task's earlier results, on this machine."""
+        return Parts(self.root / task / PARTS, step.name, step.version)
+
     def commit(self, task: str, key: str, folder: Path, done: Done, about: Mapping[str, Any]) -> Manifest:
         """Move a finished result into place, replacing an incomplete one of the same key.
 
         Args:
             folder: the folder from `begin`, holding the outputs.
-            about: the manifest's version, params, inputs, inputs_digest, seconds and peak_mb.
+            about: the manifest's version, params, inputs, inputs_digest, seconds, cpu_seconds and peak_mb.
         """
         sizes = {p.relative_to(folder).as_posix(): p.stat().st_size for p in sorted(folder.rglob("*")) if p.is_file()}
         digests = {name: digest(folder / name) for name in sizes}
@@ -291,6 +334,10 @@ class Store:
             digests=digests,
             metrics=done.metrics,
             warnings=done.warnings,
+            failed={
+                name: [error.where, error.cause, error.remedy, *getattr(error, "__notes__", ())]
+                for name, error in done.failed.items()
+            },
             **about,
         )
         self._place(manifest, key, folder)
@@ -309,7 +356,7 @@ class Store:
         """
         for other in self.folder(task, key).parent.glob("*/manifest.json"):
             old = self.find(task, other.parent.name)
-            if old is not None and old.inputs_digest == inputs_digest:
+            if old is not None and not old.failed and old.inputs_digest == inputs_digest:
                 folder = self.begin(task)
                 try:
                     shutil.copytree(other.parent, folder, symlinks=True, copy_function=os.link, dirs_exist_ok=True)
@@ -343,7 +390,7 @@ class Store:
     def sweep(self, used: Mapping[str, str]) -> None:
         """Remove all results that `used` (task to key) does not name, and what killed runs left behind."""
         for path in self.root.glob("*/*"):
-            if used.get(path.parent.name) != path.name:
+            if path.name not in (used.get(path.parent.name), PARTS):
                 shutil.rmtree(path, ignore_errors=True)
         for path in self.root.glob("*"):
             if path.name not in used and path.is_dir():

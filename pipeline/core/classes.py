@@ -8,19 +8,21 @@ meshed, but still occlude what is behind them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.core.errors import SettingError
-from scan2sim.pipeline.core.types import U8, Bools
+from scan2sim.pipeline.core.types import I64, U8, Bools
 
-Group = Literal["terrain", "building", "vegetation", "vehicle"]
+Group = Literal["terrain", "building", "vegetation", "vehicle", "ceiling", "furniture"]
 GROUPS: tuple[Group, ...] = ("terrain", "building", "vegetation")
-SURFACES: tuple[Group, ...] = (*GROUPS, "vehicle")
-"""All surfaces of a world: the groups, and parked vehicles if `split.vehicles` keeps them."""
+INDOOR_GROUPS: tuple[Group, ...] = ("ceiling", "furniture")
+"""Further surfaces of an indoor map; in other clouds their classes have no surface."""
+SURFACES: tuple[Group, ...] = (*GROUPS, "vehicle", *INDOOR_GROUPS)
+"""All surfaces of a world: the groups, parked vehicles if `split.vehicles` keeps them, and those of indoor maps."""
 
 
 class PointClass(NamedTuple):
@@ -57,14 +59,21 @@ CLASSES: tuple[PointClass, ...] = (
     PointClass(67, "person", None, (230, 120, 30)),
     PointClass(68, "wall_or_fence", "building", (170, 130, 160)),
     PointClass(69, "sidewalk", "terrain", (200, 180, 190)),
+    PointClass(70, "floor", "terrain", (176, 152, 124)),
+    PointClass(71, "wall", "building", (214, 206, 192)),
+    PointClass(72, "ceiling", None, (236, 236, 232)),
+    PointClass(73, "stairs", "terrain", (150, 140, 150)),
+    PointClass(74, "furniture", None, (120, 148, 176)),
 )
 CODE: dict[str, int] = {c.name: c.code for c in CLASSES}
 CODE_OF_SURFACE: dict[str, int] = {
     "terrain": CODE["terrain"], "building": CODE["building"], "vegetation": CODE["high_vegetation"],
-    "vehicle": CODE["vehicle"],
+    "vehicle": CODE["vehicle"], "ceiling": CODE["ceiling"], "furniture": CODE["furniture"],
 }  # fmt: skip
 """Class of a surface's faces that have none of their own."""
-SYNONYMS = {"ground": 2, "vegetation": 5, "noise": 7, "bridge": 17, "sign": 64, "car": 66, "wall": 68, "fence": 68}
+CODE_OF_ROOMS: dict[str, int] = {"terrain": CODE["floor"], "building": CODE["wall"]}
+"""The same in maps of rooms, where it differs."""
+SYNONYMS = {"ground": 2, "vegetation": 5, "noise": 7, "bridge": 17, "sign": 64, "car": 66, "fence": 68}
 PHOTO_CLASSES = (
     "road", "sidewalk", "terrain", "building", "road_sign", "pole", "low_vegetation", "high_vegetation", "vehicle",
     "person", "wall_or_fence", "sky",
@@ -190,6 +199,18 @@ def group_of() -> npt.NDArray[np.int8]:
     for c in CLASSES:
         if c.group is not None:
             table[c.code] = GROUPS.index(c.group)
+    return table
+
+
+def surface_of(names: Sequence[Group]) -> I64:
+    """Lookup table (256,) from a class code to the index of its surface in `names`, -1 without one."""
+    table = np.full(256, -1, np.int64)
+    groups = group_of()
+    for i, name in enumerate(names):
+        if name in GROUPS:
+            table[groups == GROUPS.index(name)] = i
+        else:
+            table[CODE[name]] = i
     return table
 
 

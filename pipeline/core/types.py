@@ -24,6 +24,8 @@ U8 = npt.NDArray[np.uint8]
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
+Colour = tuple[int, int, int]
+"""sRGB, 0 to 255."""
 
 CameraModel = Literal["pinhole", "opencv", "fisheye", "equirectangular", "orthographic"]
 
@@ -402,6 +404,25 @@ class Mesh:
 
 
 @dataclass(frozen=True)
+class RobotMap:
+    """What a tile keeps of the robot's map that it was made from (`pipeline.importers.robot_map`).
+
+    Attributes:
+        scene: whether it shows rooms or streets.
+        spacing: typical distance of neighbouring points, metres.
+        unit: metres per unit of the map's coordinates.
+        T_world_map: (4, 4) float64, the map's frame (in metres) to the level world.
+        source_mesh: textured mesh that the map was made from (`pipeline.io.source_mesh`), or None.
+    """
+
+    scene: Literal["indoor", "outdoor"]
+    spacing: float
+    unit: float
+    T_world_map: F64
+    source_mesh: Path | None = None
+
+
+@dataclass(frozen=True)
 class Tile:
     """Validated contents of a `tile.toml` (`pipeline.io.tile`).
 
@@ -417,6 +438,7 @@ class Tile:
         footprints: file of building footprint polygons (GeoJSON, GeoPackage), or None.
         truth_mesh: ground-truth surface (.npz `Mesh` with its classes), for generated tiles, or None.
         truth_points: ground-truth coloured surface samples (LAZ), for generated tiles, or None.
+        robot_map: properties of the robot's map that the tile was made from, or None.
     """
 
     path: Path
@@ -430,3 +452,4 @@ class Tile:
     footprints: Path | None = None
     truth_mesh: Path | None = None
     truth_points: Path | None = None
+    robot_map: RobotMap | None = None

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scan2sim.pipeline.core.classes import CODE, NOISE, group_of
 from scan2sim.pipeline.core.types import F32, F64, I64, Bools, PointCloud, Trajectory
 from scan2sim.pipeline.furniture.lamps import Arm, fit_arm
-from scan2sim.pipeline.furniture.poles import STEM, Columns, Stem, refine_circle, stems
+from scan2sim.pipeline.furniture.poles import STEM, Beams, Columns, Stem, refine_circle, stems
 from scan2sim.pipeline.furniture.sign_panels import SignPanel, detect_panels
 from scan2sim.pipeline.geometry import primitives
 from scan2sim.pipeline.geometry.primitives import Triangles
@@ -29,6 +29,8 @@ PANEL_SEARCH_RADIUS_M = 0.9
 PANEL_THICKNESS_M = 0.02
 FOOT_DEPTH_M = 0.1
 """Meshes of poles extend this far into the ground, so that no gap is visible."""
+GRAZING_M = 0.05
+"""Further distance from a stem of returns of beams that only graze it: they would become a shell around it."""
 TUBE_SIDES = {"pole": 8, "sign": 8, "lamp": 8, "trunk": 10}
 
 
@@ -37,6 +39,12 @@ class ClassifyLimits:
     """Thresholds of the classification."""
 
     min_stem_length_m: float = 1.25  # of the isolated part of a pole or trunk
+    min_post_length_m: float = 0.6  # of the isolated part of a low post: a delineator in grass
+    max_post_height_m: float = 1.35  # of a low post: a bollard
+    max_post_foot_height_m: float = 0.5  # height of the lowest visible point of a low post
+    max_post_radius_m: float = 0.15
+    post_clearance_m: tuple[float, float] = (0.6, 1.5)  # beside and above a low post
+    min_post_own_fraction: float = 0.8  # of the points in that clearance
     crown_radius_m: float = 1.5  # around the top of a trunk, for `min_leafy_fraction`
     min_leafy_fraction: float = 0.5  # vegetation among the points of the crown, or of the trunk
     min_trunk_radius_m: float = 0.05
@@ -44,6 +52,9 @@ class ClassifyLimits:
     lamp_search_radius_m: float = 3.6  # distance of a lamp from its pole
     min_panel_height_m: float = 0.8  # above the ground
     max_panel_offset_m: float = 0.2  # distance of a sign panel in front of or behind its pole
+    max_panel_pole_radius_m: float = 0.13  # what is flat beside thicker stems is foliage or a wall behind a trunk
+    max_panel_overlap: float = 0.3  # of the heights of two panels that aren't parallel
+    min_parallel_cosine: float = 0.9  # between the normals of parallel panels: front and back of a sign
     retroreflective_factor: float = 2.0  # intensity relative to the 90th percentile; above that of any matt surface
     sign_pole_radius_m: tuple[float, float] = (0.02, 0.09)
 
@@ -58,13 +69,13 @@ class Detection:
     Attributes:
         kind: its kind.
         stem: its pole or trunk, from the ground up.
-        plates: its sign panels.
+        panels: its sign panels.
         arm: its lamp arm, or None.
     """
 
     kind: Kind
     stem: Stem
-    plates: tuple[SignPanel, ...] = ()
+    panels: tuple[SignPanel, ...] = ()
     arm: Arm | None = None
 
     @property
@@ -75,33 +86,33 @@ class Detection:
     @property
     def height(self) -> float:
         """Height of its highest point above the ground, metres."""
-        tops = [self.stem.centre[-1, 2], *(plate.centre[2] + plate.height / 2 for plate in self.plates)]
+        tops = [self.stem.centre[-1, 2], *(panel.centre[2] + panel.height / 2 for panel in self.panels)]
         return float(max(tops) - self.foot[2])
 
     def moved(self, by: F64) -> Detection:
         """The detection translated by (3,) metres, into another frame."""
-        plates = tuple(plate.moved(by) for plate in self.plates)
-        return Detection(self.kind, self.stem.moved(by), plates, None if self.arm is None else self.arm.moved(by))
+        panels = tuple(panel.moved(by) for panel in self.panels)
+        return Detection(self.kind, self.stem.moved(by), panels, None if self.arm is None else self.arm.moved(by))
 
     def to_json(self) -> dict[str, Any]:
         """JSON object, the inverse of `from_json`."""
-        plates = [plate.to_json() for plate in self.plates]
+        panels = [panel.to_json() for panel in self.panels]
         arm = None if self.arm is None else self.arm.to_json()
-        return {"kind": self.kind, "stem": self.stem.to_json(), "plates": plates, "arm": arm}
+        return {"kind": self.kind, "stem": self.stem.to_json(), "panels": panels, "arm": arm}
 
     @classmethod
     def from_json(cls, row: Mapping[str, Any]) -> Detection:
         """Read the result of `to_json`."""
-        plates = tuple(SignPanel.from_json(plate) for plate in row["plates"])
-        return cls(row["kind"], Stem.from_json(row["stem"]), plates, Arm.from_json(row["arm"]) if row["arm"] else None)
+        panels = tuple(SignPanel.from_json(panel) for panel in row["panels"])
+        return cls(row["kind"], Stem.from_json(row["stem"]), panels, Arm.from_json(row["arm"]) if row["arm"] else None)
 
     def contains(self, xyz: npt.NDArray[np.floating]) -> Bools:
         """(N,) bool, True for points (N, 3) that belong to it, including measurement noise around it."""
         low, high = self.stem.centre[[0, -1], 2]
         margin = max(0.06, 3 * self.stem.spread)
-        own = (self.stem.distance(xyz) < margin) & (xyz[:, 2] > low) & (xyz[:, 2] < high)
-        for plate in self.plates:
-            own |= plate.contains(xyz, margin=margin, max_distance=margin + 0.04)
+        own = (self.stem.distance(xyz) < margin + GRAZING_M) & (xyz[:, 2] > low) & (xyz[:, 2] < high)
+        for panel in self.panels:
+            own |= panel.contains(xyz, margin=margin, max_distance=margin + 0.04)
         return own if self.arm is None else own | self.arm.contains(xyz, margin)
 
     def meshes(self) -> list[tuple[Triangles, int]]:
@@ -110,22 +121,25 @@ class Detection:
         path[0, 2] -= FOOT_DEPTH_M
         pole = primitives.tube(path, self.stem.radius, TUBE_SIDES[self.kind])
         parts = [(pole, CODE["high_vegetation"] if self.kind == "trunk" else CODE["pole"])]
-        for plate in self.plates:
-            parts.append((panel_mesh(plate), CODE["road_sign"]))
+        for panel in self.panels:
+            parts.append((panel_mesh(panel), CODE["road_sign"]))
         return parts + [(part, CODE["pole"]) for part in (self.arm.meshes() if self.arm else [])]
 
 
-def panel_mesh(plate: SignPanel) -> Triangles:
+def panel_mesh(panel: SignPanel) -> Triangles:
     """Mesh of a sign panel."""
-    corners = plate.centre + plate.outline[:, :1] * plate.across + plate.outline[:, 1:] * (0, 0, 1)
-    return primitives.plate(corners, -PANEL_THICKNESS_M * plate.normal)
+    corners = panel.centre + panel.outline[:, :1] * panel.across + panel.outline[:, 1:] * (0, 0, 1)
+    return primitives.plate(corners, -PANEL_THICKNESS_M * panel.normal)
 
 
 def eligible(cloud: PointCloud) -> tuple[Bools, I64]:
-    """Ground points (N,) bool, and indices of points that may be furniture, by their classes."""
+    """Ground points (N,) bool, and indices of points that may be furniture, by their classes.
+
+    Photos often give a trunk the class of the cars behind it; cars have no isolated parts.
+    """
     assert cloud.classification is not None
     ground = group_of()[cloud.classification] == 0
-    excluded = np.isin(cloud.classification, [*NOISE, CODE["vehicle"], CODE["person"]])
+    excluded = np.isin(cloud.classification, [*NOISE, CODE["person"]])
     return ground, np.flatnonzero(~ground & ~excluded)
 
 
@@ -133,28 +147,55 @@ def detect_furniture(cloud: PointCloud, columns: Columns, height: F32, path: Tra
     """Detect all street furniture of a cloud.
 
     Args:
-        cloud: N classified points above the ground; only the class vegetation is used.
+        cloud: N classified points above the ground; only the classes vegetation and vehicle are used.
         columns: index of its points.
         height: (N,) metres above the ground.
         path: path of the scanner.
     """
     xyz = cloud.xyz
     assert cloud.classification is not None
-    leafy = group_of()[cloud.classification] == 2
+    leafy, vehicle = group_of()[cloud.classification] == 2, cloud.classification == CODE["vehicle"]
     detections = []
-    for stem in stems(columns, height, LIMITS.min_stem_length_m):
+    for stem in stems(columns, height, LIMITS.min_post_length_m, _beams(cloud, path)):
         n = columns.near(stem.middle, LIMITS.crown_radius_m)
+        if stem.length < LIMITS.min_stem_length_m and not _is_low_post(stem, xyz[n], height[n], vehicle[n]):
+            continue
         ground = float(np.median(xyz[n, 2] - height[n]))
         grounded = _extend_to_ground(stem, ground)
         if _is_trunk(stem, xyz[n], leafy[n]):
             detections.append(Detection("trunk", grounded))
         else:
+            n = n[~vehicle[n]]
             panels = _panels_on(grounded, xyz[n], height[n])
             around = columns.near(stem.middle, LIMITS.lamp_search_radius_m)
+            around = around[~vehicle[around]]
             lamp = fit_arm(grounded, ground, xyz[around].astype(np.float64), leafy[around])
             kind: Kind = "lamp" if lamp else "sign" if panels else "pole"
             detections.append(Detection(kind, _extend_to_panels(grounded, panels), tuple(panels), lamp))
     return detections + _retroreflective_signs(cloud, columns, height, path, detections)
+
+
+def _beams(cloud: PointCloud, path: Trajectory) -> Beams | None:
+    """Time and place of the scanner of each point; None if the times or the path's are unknown."""
+    if cloud.time is None or len(path.times) < 2 or not np.isfinite(path.times).all():
+        return None
+    return Beams(cloud.time, path.at(cloud.time)[:, :2])
+
+
+def _is_low_post(stem: Stem, xyz: F32, height: F32, vehicle: Bools) -> bool:
+    """Whether a short stem is a delineator or a bollard: no part of a vehicle, nothing else beside or above it."""
+    beside, above = LIMITS.post_clearance_m
+    off = stem.distance(xyz)
+    margin = max(0.03, 2 * stem.spread)
+    ground = float(np.median(xyz[:, 2] - height))
+    near = (off < beside) & (xyz[:, 2] > stem.centre[0, 2] + STEM.slab_m / 2) & (xyz[:, 2] < stem.centre[-1, 2] + above)
+    own = (np.abs(off) < margin) & (xyz[:, 2] < stem.centre[-1, 2] + STEM.slab_m)
+    return bool(
+        stem.thickness < LIMITS.max_post_radius_m
+        and stem.centre[-1, 2] - ground < LIMITS.max_post_height_m
+        and stem.centre[0, 2] - ground < LIMITS.max_post_foot_height_m
+        and (near & own & ~vehicle).sum() > LIMITS.min_post_own_fraction * near.sum()
+    )
 
 
 def _extend_to_ground(stem: Stem, ground: float) -> Stem:
@@ -169,7 +210,7 @@ def _extend_to_ground(stem: Stem, ground: float) -> Stem:
 
 def _extend_to_panels(stem: Stem, panels: list[SignPanel]) -> Stem:
     """The stem extended up to the centre of the highest sign panel."""
-    top = max((plate.centre[2] for plate in panels), default=-np.inf)
+    top = max((panel.centre[2] for panel in panels), default=-np.inf)
     if top <= stem.centre[-1, 2]:
         return stem
     xy, radius = stem.at([top])
@@ -196,25 +237,39 @@ def _is_trunk(stem: Stem, xyz: F32, leafy: Bools) -> bool:
 
 def _panels_on(stem: Stem, xyz: F32, height: F32) -> list[SignPanel]:
     """Sign panels on a pole, facing away from it."""
+    if stem.thickness > LIMITS.max_panel_pole_radius_m:
+        return []
     off = stem.distance(xyz)
     near = (height > LIMITS.min_panel_height_m) & (off < PANEL_SEARCH_RADIUS_M)
     beside = xyz[near].astype(np.float64)
     good: list[SignPanel] = []
-    for plate in detect_panels(beside, off[near] > max(0.03, 2 * stem.spread), stem.middle):
-        (axis,), (radius,) = stem.at([plate.centre[2]])
-        d = axis - plate.centre[:2]
-        if d @ plate.normal[:2] > 0:
-            plate = replace(plate, normal=-plate.normal)
-        before, aside = abs(d @ plate.normal[:2]), abs(d @ plate.across[:2])
-        near_top = plate.centre[2] - plate.height / 2 < stem.centre[-1, 2] + STEM.slab_m
+    for panel in detect_panels(beside, off[near] > max(0.03, 2 * stem.spread), stem.middle):
+        (axis,), (radius,) = stem.at([panel.centre[2]])
+        d = axis - panel.centre[:2]
+        if d @ panel.normal[:2] > 0:
+            panel = replace(panel, normal=-panel.normal)
+        before, aside = abs(d @ panel.normal[:2]), abs(d @ panel.across[:2])
+        near_top = panel.centre[2] - panel.height / 2 < stem.centre[-1, 2] + STEM.slab_m
         if (
             before < radius + LIMITS.max_panel_offset_m
-            and aside < plate.width / 2
+            and aside < panel.width / 2
             and near_top
-            and plate.width > 3 * radius
+            and panel.width > max(3 * radius, 2 * (radius + 2 * stem.spread))
         ):
-            good.append(plate)
-    return good
+            good.append(panel)
+    return _not_crossing(good)
+
+
+def _not_crossing(panels: list[SignPanel]) -> list[SignPanel]:
+    """Panels without those that cross another one at the same height: they are no sheets, but blurred posts."""
+
+    def cross(a: SignPanel, b: SignPanel) -> bool:
+        overlap = (a.height + b.height) / 2 - abs(a.centre[2] - b.centre[2])
+        return overlap > LIMITS.max_panel_overlap * min(a.height, b.height) and (
+            abs(float(a.normal @ b.normal)) < LIMITS.min_parallel_cosine
+        )
+
+    return [a for a in panels if not any(cross(a, b) for b in panels)]
 
 
 def _retroreflective_signs(
@@ -232,6 +287,7 @@ def _retroreflective_signs(
         (intensity > LIMITS.retroreflective_factor * np.percentile(intensity, 90))
         & (height > LIMITS.min_panel_height_m)
         & (height < 6)
+        & (cloud.classification != CODE["vehicle"])
     )
     for detection in detections:
         bright = bright[~detection.contains(xyz[bright])]

@@ -22,6 +22,7 @@ class LampLimits:
 
     min_pole_height_m: float = 3.5
     arm_length_m: tuple[float, float] = (0.4, 3.5)  # minimum and maximum
+    max_excess_m: float = 0.5  # beyond the maximum length: points that show that something longer is no arm
     max_below_top_m: float = 1.0  # arm relative to the top of the pole
     max_above_top_m: float = 1.5
     max_point_gap_m: float = 0.2  # between points of the arm
@@ -109,7 +110,8 @@ def fit_arm(stem: Stem, ground: float, xyz: F64, leafy: Bools) -> Arm | None:
         return None
     d = xyz - top
     off = np.hypot(*d[:, :2].T)
-    near = (off < LAMP.arm_length_m[1]) & (d[:, 2] > -LAMP.max_below_top_m) & (d[:, 2] < LAMP.max_above_top_m) & ~leafy
+    max_off = LAMP.arm_length_m[1] + LAMP.max_excess_m
+    near = (off < max_off) & (d[:, 2] > -LAMP.max_below_top_m) & (d[:, 2] < LAMP.max_above_top_m) & ~leafy
     near &= stem.distance(xyz) > max(0.04, 3 * stem.spread)
     piece = _connected_to_top(xyz[near], top)
     own = d[near][piece]

@@ -11,7 +11,7 @@ import numpy as np
 if TYPE_CHECKING:
     from scan2sim.pipeline.furniture.sign_panels import SignPanel
 
-CSV_COLUMNS = ("x", "y", "z", "kind", "height_m", "radius_m", "heading_deg", "shape", "plate_width_m", "plate_height_m")
+CSV_COLUMNS = ("x", "y", "z", "kind", "height_m", "radius_m", "heading_deg", "shape", "panel_width_m", "panel_height_m")
 
 
 def write_lists(out: Path, crs: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Path]:
@@ -26,8 +26,8 @@ def write_lists(out: Path, crs: str, rows: Sequence[Mapping[str, Any]]) -> dict[
     return files
 
 
-def sign_panel_columns(plate: SignPanel) -> dict[str, Any]:
+def sign_panel_columns(panel: SignPanel) -> dict[str, Any]:
     """Columns of a sign panel in the CSV and GeoJSON lists."""
-    heading = float(np.degrees(np.arctan2(plate.normal[0], plate.normal[1]))) % 360
-    size = {"plate_width_m": round(plate.width, 2), "plate_height_m": round(plate.height, 2)}
-    return {"heading_deg": round(heading, 1), "shape": plate.shape, **size}
+    heading = float(np.degrees(np.arctan2(panel.normal[0], panel.normal[1]))) % 360
+    size = {"panel_width_m": round(panel.width, 2), "panel_height_m": round(panel.height, 2)}
+    return {"heading_deg": round(heading, 1), "shape": panel.shape, **size}

@@ -2,8 +2,12 @@
 
 The cloud above the ground is cut into horizontal slabs; in each slab, a small isolated cluster is a disc. Discs above
 one another form a stem (after Brenner 2009, "Extraction of Features from Mobile Laser Scanning Data for Future Driver
-Assistance Systems"). Circles are fitted by least squares to the points near the axis, per section if there are enough
-points. Point classes and photos are not used.
+Assistance Systems"). Point classes and photos are not used.
+
+The radius comes from the width of the stem in each sweep of the scanner: across the line of sight, the returns of a
+cylinder are uniformly distributed over its diameter, and neither the range noise nor errors of the poses between sweeps
+change that width. The sweeps are registered on the stem, since pose errors of a few centimetres thicken a post
+severalfold. Without times and a path of the scanner, circles are fitted to the points by least squares.
 """
 
 from __future__ import annotations
@@ -45,6 +49,10 @@ class StemLimits:
     min_points_per_slab: int = 6  # with fewer points, round stems and edges of walls look alike
     min_points: int = 20
     prior_points: float = 40.0  # weight of the whole stem's circle when the circle of a section is fitted
+    sweep_gap_s: float = 0.02  # pause without returns from the stem between two sweeps
+    sweep_max_s: float = 0.1  # longest time during which poses are taken as consistent, and the line of sight as fixed
+    max_slope: float = 0.7  # of the depth across the line of sight, within sweeps: larger for walls seen at an angle
+    min_sweep_width_points: int = 20  # minimum degrees of freedom of the width within sweeps
 
 
 STEM = StemLimits()
@@ -118,17 +126,27 @@ class Stem:
         return cls(np.array(row["centre"], np.float64), np.array(row["radius"]), row["spread"], row["wobble"])
 
 
-def stems(columns: Columns, height: F32, min_length: float) -> list[Stem]:
+@dataclass(frozen=True)
+class Beams:
+    """Time (N,) in seconds at which each point of a cloud was measured, and position (N, 2) of the scanner then."""
+
+    time: F64
+    scanner: F64
+
+
+def stems(columns: Columns, height: F32, min_length: float, beams: Beams | None = None) -> list[Stem]:
     """Detect all stems of a cloud.
 
     Args:
         columns: index of its N points.
         height: (N,) metres above the ground.
         min_length: minimum length of a stem, metres.
+        beams: of the N points; None: unknown.
     """
     xyz, found = columns.xyz, []
     for chain in _chains(_discs(columns.xyz, height), min_length):
-        stem = _fit(xyz[_points_of(columns, chain)], chain)
+        own = _points_of(columns, chain)
+        stem = _fit(xyz[own], chain, beams and Beams(beams.time[own], beams.scanner[own]))
         if stem is not None:
             near = columns.near(stem.middle, 2 * STEM.clearance_m)
             if _is_stem(stem, xyz[near], height[near]):
@@ -140,11 +158,12 @@ def _is_stem(stem: Stem, xyz: F32, height: F32) -> bool:
     """Whether a tube is a stem: smooth, slender, near the ground, with dense points, and isolated."""
     if stem.length < STEM.min_slenderness * 2 * stem.thickness or stem.wobble > STEM.max_wobble_m:
         return False
-    if stem.spread > min(STEM.max_spread_m, 0.6 * stem.thickness + 0.015):
-        return False
+    residual = stem.distance(xyz)
+    margin = max(0.03, 2 * stem.spread)
+    foot = height[(np.abs(residual) < margin) & (xyz[:, 2] < stem.centre[-1, 2])].min(initial=np.inf)
     at = (xyz[:, 2] > stem.centre[0, 2]) & (xyz[:, 2] < stem.centre[-1, 2])
-    residual = stem.distance(xyz[at])
-    on = np.abs(residual) < max(0.03, 2 * stem.spread)
+    residual = residual[at]
+    on = np.abs(residual) < margin
     slab = np.floor((xyz[at, 2] - stem.centre[0, 2]) / STEM.slab_m).astype(np.int64)
     count = int(slab.max(initial=0)) + 1
     own, around = (
@@ -153,9 +172,7 @@ def _is_stem(stem: Stem, xyz: F32, height: F32) -> bool:
     )
     dense = own.sum() > STEM.min_points_per_slab * count
     return bool(
-        dense
-        and np.median(own / np.maximum(around, 1)) > STEM.min_own_fraction
-        and height[at][on].min() < STEM.max_foot_height_m
+        dense and np.median(own / np.maximum(around, 1)) > STEM.min_own_fraction and foot < STEM.max_foot_height_m
     )
 
 
@@ -203,6 +220,7 @@ class Chain:
         low, high: z of the lowest and the highest disc's edge, metres.
         free: (S,) z of the disc centres, metres.
         wobble: standard deviation of the disc centres from the line through their neighbours, metres.
+        width: median diameter of the discs, metres.
     """
 
     foot: F64
@@ -211,6 +229,7 @@ class Chain:
     high: float
     free: F64
     wobble: float
+    width: float
 
     def at(self, z: npt.NDArray[np.floating]) -> F64:
         """Axis positions (N, 2) at heights (N,)."""
@@ -246,7 +265,9 @@ def _chains(discs: F64, min_length: float) -> list[Chain]:
                 low, high = run[:, 2].min() - STEM.slab_m / 2, run[:, 2].max() + STEM.slab_m / 2
                 if high - low >= min_length:
                     along = np.array([np.polyfit(run[:, 2], run[:, k], 1) for k in (0, 1)])
-                    chains.append(Chain(along[:, 1], along[:, 0], float(low), float(high), run[:, 2], _wobble(run)))
+                    width = float(np.median(run[:, 4]))
+                    ends = float(low), float(high)
+                    chains.append(Chain(along[:, 1], along[:, 0], *ends, run[:, 2], _wobble(run), width))
             left = left[~on]
     return sorted(chains, key=lambda chain: chain.low - chain.high)
 
@@ -299,7 +320,7 @@ def _points_of(columns: Columns, chain: Chain) -> I64:
     level = np.searchsorted(chain.free, z).clip(1, len(chain.free) - 1)
     apart = np.minimum(np.abs(z - chain.free[level - 1]), np.abs(z - chain.free[level]))
     aside = np.hypot(*(columns.xyz[near, :2] - chain.at(z)).T)
-    return near[(apart <= STEM.slab_m / 2) & (aside < STEM.max_disc_m / 2 + STEM.max_axis_offset_m)]
+    return near[(apart <= STEM.slab_m / 2) & (aside < chain.width / 2 + STEM.cell_m)]
 
 
 class Columns:
@@ -326,28 +347,152 @@ class Columns:
         return index[(np.abs(self.xyz[index, :2] - place) <= radius).all(axis=1)]
 
 
-def _fit(xyz: F32, chain: Chain) -> Stem | None:
+def _fit(xyz: F32, chain: Chain, beams: Beams | None) -> Stem | None:
     """Fit a tube to the points of a chain; None if they are too few or not round."""
     if len(xyz) < STEM.min_points:
         return None
-    xyz = xyz.astype(np.float64)
     flat = xyz[:, :2] - chain.at(xyz[:, 2])  # projected along the axis
-    slab = np.unique(np.floor((xyz[:, 2] - chain.low) / STEM.slab_m), return_inverse=True)[1]
-    held = np.bincount(slab)
-    weight = 1.0 / held[slab]  # equal weight of all slabs: one that includes a sign panel has many more points
+    sections = np.linspace(chain.low, chain.high, max(2, round((chain.high - chain.low) / STEM.section_m) + 1))
+    near = [np.abs(xyz[:, 2] - z) < STEM.section_m for z in sections]
+    middle = chain.at(np.array([(chain.low + chain.high) / 2]))
+    fitted = None if beams is None else _fit_sweeps(flat, near, replace(beams, scanner=beams.scanner - middle))
+    fitted = fitted or _fit_circles(flat, np.floor((xyz[:, 2] - chain.low) / STEM.slab_m), near)
+    if fitted is None or fitted.spread > max_spread(float(np.median(fitted.radius))):
+        return None
+    radius = np.clip(fitted.radius, *STEM.radius_range_m)
+    axis = np.column_stack([chain.at(sections) + fitted.centre, sections])
+    return Stem(axis, radius, fitted.smear, chain.wobble)
+
+
+def max_spread(radius: float) -> float:
+    """Maximum standard deviation in metres of the points of a stem from its surface."""
+    return min(STEM.max_spread_m, 0.6 * radius + 0.015)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Circles of the sections of a stem.
+
+    Attributes:
+        centre: (K, 2) relative to the axis of the chain, metres.
+        radius: (K,) metres.
+        spread: standard deviation of the registered points from the surface, metres.
+        smear: the same of the points as they are in the cloud.
+    """
+
+    centre: F64
+    radius: F64
+    spread: float
+    smear: float
+
+
+def _fit_sweeps(flat: F64, near: list[Bools], beams: Beams) -> Fitted | None:
+    """Circles from the widths within the sweeps; None if they have too few points, or the width is out of range.
+
+    Args:
+        flat: (N, 2) points, projected along the axis.
+        near: of each section, its points (N,).
+        beams: of the points; the scanner's positions relative to the axis.
+    """
+    sweep, count = _sweeps(beams.time)
+    away = -np.column_stack([np.bincount(sweep, beams.scanner[:, k]) for k in (0, 1)]) / count[:, None]
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    axes = np.stack([np.column_stack([-away[:, 1], away[:, 0]]), away], axis=1)  # of a sweep: across, and away
+    seen = np.einsum("nij,nj->ni", axes[sweep], flat)
+    offset = seen[:, 0] - _medians(seen[:, 0], sweep)[sweep]
+    radius, on = 2 * float(np.median(np.abs(offset[count[sweep] > 2]))) if (count > 2).any() else 0.0, count[sweep] > 0
+    for _ in range(4):  # uniformly distributed: the standard deviation is the radius over the root of 3
+        on = np.abs(offset) < 1.25 * radius + 0.02
+        n = np.bincount(sweep[on], minlength=len(count))
+        offset = seen[:, 0] - (np.bincount(sweep[on], seen[on, 0], len(count)) / np.maximum(n, 1))[sweep]
+        freedom = int(np.maximum(n - 1, 0).sum())
+        if freedom < STEM.min_sweep_width_points:
+            return None
+        radius = math.sqrt(3 * float((offset[on] ** 2)[n[sweep[on]] > 1].sum()) / freedom)
+    behind = seen[:, 1] - _medians(seen[:, 1], sweep)[sweep]
+    slope = float((offset * behind)[on].sum() / max((offset**2)[on].sum(), 1e-12))
+    is_post = STEM.radius_range_m[0] / 2 <= radius <= STEM.radius_range_m[1] and abs(slope) < STEM.max_slope
+    if not is_post or on.mean() < 0.5:
+        return None
+    # the median point of half a cylinder is at this depth in front of the axis
+    depth = _medians(seen[on, 1], sweep[on], len(count)) + math.sqrt(3) / 2 * radius
+    across = np.bincount(sweep[on], seen[on, 0], len(count)) / np.maximum(n, 1)
+    target, weight = np.stack([across, depth], axis=1), n.astype(np.float64)
+    A = np.einsum("n,nij,nik->jk", weight, axes, axes) + 1e-9 * np.eye(2)
+    middle = np.linalg.solve(A, np.einsum("n,nij,ni->j", weight, axes, target))
+    error = target - axes @ middle
+    shift = _shrunk(error, weight, (radius / math.sqrt(3), 0.02))
+    registered = flat - middle - np.einsum("nij,ni->nj", axes, shift)[sweep]
+
+    def spread(points: F64) -> float:
+        return 1.48 * float(np.median(np.abs(np.hypot(*points.T) - radius)))
+
+    centres, radii = np.empty((len(near), 2)), np.empty(len(near))
+    for i, section in enumerate(near):
+        here = section & on
+        part = axes[sweep[here]]
+        u = np.einsum("nij,nj->ni", part, registered[here])
+        u[:, 1] += np.sqrt(np.maximum(radius**2 - u[:, 0] ** 2, 0))
+        A = np.einsum("nij,nik->jk", part, part) + STEM.prior_points * np.eye(2)
+        centres[i] = middle + np.linalg.solve(A, np.einsum("nij,ni->j", part, u))
+        square = 3 * float((offset[here] ** 2).sum()) * on.sum() / freedom + STEM.prior_points * radius**2
+        radii[i] = math.sqrt(square / (here.sum() + STEM.prior_points))
+    return Fitted(centres, radii, spread(registered[on]), spread(flat[on] - middle))
+
+
+def _sweeps(time: F64) -> tuple[I64, I64]:
+    """Number of the sweep of each point (N,), and number of points of each sweep."""
+    order = np.argsort(time, kind="stable")
+    ordered = time[order]
+    start = np.concatenate([[True], np.diff(ordered) > STEM.sweep_gap_s])
+    since = ordered - ordered[start][np.cumsum(start) - 1]
+    key = (np.cumsum(start) - 1) * 1e6 + np.floor(since / STEM.sweep_max_s)
+    sweep = np.empty(len(time), np.int64)
+    sweep[order] = np.unique(key, return_inverse=True)[1]
+    return sweep, np.bincount(sweep)
+
+
+def _medians(values: F64, group: I64, count: int | None = None) -> F64:
+    """Median of the values (N,) of each group; 0 for empty ones."""
+    out = np.zeros(int(group.max(initial=-1)) + 1 if count is None else count)
+    order = np.lexsort((values, group))
+    first = np.searchsorted(group[order], np.arange(len(out) + 1))
+    held = np.diff(first) > 0
+    middle = (first[:-1] + first[1:] - 1) / 2
+    low, high = np.floor(middle[held]).astype(int), np.ceil(middle[held]).astype(int)
+    out[held] = (values[order[low]] + values[order[high]]) / 2
+    return out
+
+
+def _shrunk(error: F64, weight: F64, noise: tuple[float, float]) -> F64:
+    """Pose errors (K, 2) of sweeps: measured ones, reduced by the share that noise explains.
+
+    Args:
+        error: (K, 2) measured offsets of the sweeps, across and along the line of sight, metres.
+        weight: (K,) number of points.
+        noise: standard deviation of one point in each direction, metres.
+    """
+    variance = np.average(error**2, axis=0, weights=weight)
+    random = np.array(noise) ** 2 / np.maximum(weight, 1)[:, None]
+    pose = np.maximum(variance - np.average(random, axis=0, weights=weight), 0)
+    return np.asarray(error * pose / np.maximum(pose + random, 1e-12))
+
+
+def _fit_circles(flat: F64, slab: F64, near: list[Bools]) -> Fitted | None:
+    """Circles fitted to points (N, 2) of all sweeps together, in slabs (N,); None if they are not round.
+
+    `near`: of each section, its points (N,).
+    """
+    level = np.unique(slab, return_inverse=True)[1]
+    weight = 1.0 / np.bincount(level)[level]  # equal weight of all slabs: one with a sign panel has many more points
     middle, radius = fit_circle(flat, weight / weight.mean())
     residual = np.abs(np.hypot(*(flat - middle).T) - radius)
     spread = 1.48 * float(np.median(residual))
     on = residual < max(3 * spread, 0.02)
     if not STEM.radius_range_m[0] <= radius <= STEM.radius_range_m[1] or on.mean() < 0.5:
         return None
-    count = max(2, round((chain.high - chain.low) / STEM.section_m) + 1)
-    z = np.linspace(chain.low, chain.high, count)
-    centres, radii = np.empty((count, 2)), np.empty(count)
-    for i, level in enumerate(z):
-        here = on & (np.abs(xyz[:, 2] - level) < STEM.section_m)
-        centres[i], radii[i] = refine_circle(flat[here], np.ones(here.sum()), middle, radius, 8, STEM.prior_points)
-    return Stem(np.column_stack([chain.at(z) + centres, z]), np.clip(radii, *STEM.radius_range_m), spread, chain.wobble)
+    fits = [refine_circle(flat[s & on], np.ones((s & on).sum()), middle, radius, 8, STEM.prior_points) for s in near]
+    return Fitted(np.array([c for c, _ in fits]), np.array([r for _, r in fits]), spread, spread)
 
 
 def fit_circle(xy: F64, weight: F64) -> tuple[F64, float]:

@@ -11,15 +11,18 @@ import numpy as np
 from scan2sim.pipeline.core.types import F32, F64, I64
 
 HEIGHT_STEP_M = 0.25
-"""Bottoms and tops of columns are rounded down and up to multiples of this."""
+"""Bottoms and tops of columns are rounded down and up to multiples of this by default."""
+ROUNDING_TOLERANCE_M = 1e-3
+"""Heights that exceed a multiple by less, such as by rounding errors of samples, are rounded to it."""
 
 
-def boxes(corners: F32, cell: float) -> tuple[F64, F64]:
-    """Lowest and highest corners, (B, 3) each, of boxes that contain the triangles (F, 3, 3), local metres.
+def boxes(corners: F32, cell: float, height_step: float = HEIGHT_STEP_M) -> tuple[F64, F64]:
+    """Lowest and highest corners, (B, 3) each, of boxes that contain the triangles (F, 3, 3) to 1 mm, local metres.
 
     Args:
         corners: corners of the triangles.
         cell: side of a column in metres: the largest distance by which a box may extend beyond the surface.
+        height_step: bottoms and tops are rounded down and up to multiples of it, metres.
     """
     points = samples(corners, cell / 2)
     if not len(points):
@@ -29,14 +32,15 @@ def boxes(corners: F32, cell: float) -> tuple[F64, F64]:
     low, high = np.full(len(cells), np.inf), np.full(len(cells), -np.inf)
     np.minimum.at(low, column_of.ravel(), points[:, 2])
     np.maximum.at(high, column_of.ravel(), points[:, 2])
-    bottom = np.floor(low / HEIGHT_STEP_M)
-    height_range = np.column_stack([bottom, np.maximum(np.ceil(high / HEIGHT_STEP_M), bottom + 1)]).astype(np.int64)
+    bottom = np.floor((low + ROUNDING_TOLERANCE_M) / height_step)
+    top = np.maximum(np.ceil((high - ROUNDING_TOLERANCE_M) / height_step), bottom + 1)
+    height_range = np.column_stack([bottom, top]).astype(np.int64)
     runs = _merge(np.column_stack([cells, cells, height_range]), 0)
     merged = _merge(runs, 1)
     size = np.array([cell, cell])
     return (
-        np.column_stack([merged[:, :2] * size, merged[:, 4] * HEIGHT_STEP_M]),
-        np.column_stack([(merged[:, 2:4] + 1) * size, merged[:, 5] * HEIGHT_STEP_M]),
+        np.column_stack([merged[:, :2] * size, merged[:, 4] * height_step]),
+        np.column_stack([(merged[:, 2:4] + 1) * size, merged[:, 5] * height_step]),
     )
 
 

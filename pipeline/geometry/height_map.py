@@ -85,6 +85,10 @@ class Raster:
         np.maximum.at(out, self.at(xyz), xyz[:, 2].astype(np.float64))
         return np.where(np.isfinite(out), out, np.nan)
 
+    def lowest(self, xyz: F32) -> F64:
+        """Minimum height of the points (N, 3) in each cell; NaN in empty cells."""
+        return -self.highest(xyz * np.array([1, 1, -1], np.float32))
+
     def mean(self, xyz: F32, values: npt.NDArray[Any]) -> F64:
         """Means (rows, columns, K) of the values (N, K) of the points in each cell; NaN in empty cells."""
         row, column = self.at(xyz)
@@ -97,13 +101,20 @@ class Raster:
 
 def point_spacing(xyz: F32) -> float:
     """Typical spacing of points (N, 3) in metres, rounded to `CELL_SIZES_M`, so that similar clouds have the same."""
+    if len(xyz) < 7:
+        return CELL_SIZES_M[-1]
+    found = exact_point_spacing(xyz)
+    return min(CELL_SIZES_M, key=lambda size: abs(np.log(size / max(found, 1e-6))))
+
+
+def exact_point_spacing(xyz: F32) -> float:
+    """Typical distance of neighbouring points (N, 3) in the unit of the coordinates; 0 for fewer than 7 points."""
     from scipy.spatial import cKDTree
 
     if len(xyz) < 7:
-        return CELL_SIZES_M[-1]
+        return 0.0
     distance, _ = cKDTree(xyz).query(xyz[:: max(1, len(xyz) // SPACING_SAMPLES)], k=7, workers=-1)
-    found = float(np.median(distance[:, 1:].mean(axis=1))) / LATTICE_SPACING_CELLS
-    return min(CELL_SIZES_M, key=lambda size: abs(np.log(size / max(found, 1e-6))))
+    return float(np.median(distance[:, 1:].mean(axis=1))) / LATTICE_SPACING_CELLS
 
 
 def rasterize_polygons(rings: Sequence[npt.NDArray[np.floating]], shape: tuple[int, int]) -> Bools:

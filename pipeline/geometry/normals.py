@@ -26,7 +26,7 @@ def oriented_normals(cloud: PointCloud, neighbours: int, path: Trajectory | None
     if len(cloud) < 3:
         return replace(cloud, normal=np.tile(np.array([0, 0, 1], np.float32), (len(cloud), 1)))
     normal = normals(cloud.xyz, neighbours)
-    toward = _away_from_mass(cloud.xyz, normal) if path is None else _scanner_positions(cloud, path) - cloud.xyz
+    toward = _away_from_mass(cloud.xyz, normal) if path is None else scanner_positions(cloud, path) - cloud.xyz
     normal[np.einsum("ij,ij->i", normal, toward) < 0] *= -1
     return replace(cloud, normal=normal)
 
@@ -38,8 +38,8 @@ def normals(xyz: F32, neighbours: int) -> F32:
     return np.asarray(points.normals).astype(np.float32)
 
 
-def _scanner_positions(cloud: PointCloud, path: Trajectory) -> F64:
-    """Scanner position (N, 3) for each point."""
+def scanner_positions(cloud: PointCloud, path: Trajectory) -> F64:
+    """Scanner position (N, 3) at each point's time, or else the position of the path that is nearest to it."""
     times = cloud.time
     if times is not None and len(path.times) > 1:
         inside = (times >= path.times[0] - 1) & (times <= path.times[-1] + 1)

@@ -1,10 +1,11 @@
-"""Voxel grid: points grouped by voxel, and one sample per voxel."""
+"""Voxel grid: points grouped by voxel, and one sample or point per voxel."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from scan2sim.pipeline.core.types import F32, I64, PointCloud
 
@@ -60,3 +61,12 @@ def voxel_groups(xyz: F32, size: float) -> Groups:
     order, code = stable_argsort(code)
     starts = np.flatnonzero(first_of_each(code))
     return order, starts
+
+
+def thin_voxels(xyz: F32, size: float, rank: npt.NDArray[np.floating]) -> npt.NDArray[np.intp]:
+    """Indices of one point per voxel of `size` metres: the one with the smallest `rank` (N,)."""
+    order = np.argsort(rank, kind="stable")
+    cells = np.floor(xyz[order] / size).astype(np.int64)
+    cells -= cells.min(axis=0)
+    _, first = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), return_index=True)
+    return order[first]

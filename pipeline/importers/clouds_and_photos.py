@@ -1,4 +1,4 @@
-"""Importer of point clouds (in any format of `pipeline.io.clouds`) with a CSV of posed photos.
+"""Importer of point clouds (in any format of `pipeline.io.clouds`) with a CSV of posed photos, or those inside an E57.
 
 The photos' CSV has a header line, one row per photo, columns in any order, separated by commas:
 
@@ -17,13 +17,14 @@ The photos' CSV has a header line, one row per photo, columns in any order, sepa
 The camera's columns are either in the photos' CSV or in a second one with one row per camera and
 the column `camera`. `model` is pinhole (default), opencv, fisheye or equirectangular; `fy` defaults
 to `fx`, `cx` and `cy` to the middle of the photo, coefficients to 0; the centre of the top left
-pixel is (0, 0).
+pixel is (0, 0). Other conventions are converted as named (`pipeline.pose_check.conventions`).
 """  # noqa: E501
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -31,14 +32,19 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.step import Report, silent
-from scan2sim.pipeline.core.types import F64, Camera, CameraModel, Frame
+from scan2sim.pipeline.core.types import F64, Camera, CameraModel, Frame, Trajectory
+from scan2sim.pipeline.importers.path_correction import PathCorrection, read_correction, write_corrected
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import file_checks
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io import trajectory_check as check_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.geodata import orthophoto as orthophoto_io
+from scan2sim.pipeline.io.images import e57 as e57_images
 from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
 from scan2sim.pipeline.io.tile_folder import add_file, tile_folder, without_parents
+from scan2sim.pipeline.pose_check.conventions import PhotoConventions, PosedPhotos, converted
 
 Row = Mapping[str, str]
 MATRIX_COLUMNS = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))
@@ -67,11 +73,14 @@ def import_las(
     photos: Path | None = None,
     cameras: Path | None = None,
     images: Path | None = None,
+    embedded_images: bool = True,
     crs: str | None = None,
     units: str | None = None,
     trajectory: Path | None = None,
+    trajectory_check: Path | None = None,
     orthophoto: Path | None = None,
     footprints: Path | None = None,
+    conventions: PhotoConventions | None = None,
     link: bool = False,
     overwrite: bool = False,
     name: str | None = None,
@@ -88,16 +97,20 @@ def import_las(
         photos: CSV of posed photos, see the module's docstring.
         cameras: CSV of cameras, if the photos' rows don't contain them.
         images: folder of the photos; default: that of the CSV.
+        embedded_images: whether images with poses inside E57 files become photos of the tile.
         crs: code or WKT, "local" without georeference; default: the clouds' own.
         units: "m", "ft" or "us-ft", for local coordinates.
-        trajectory: CSV of the scanner's path: a header line, then time,x,y,z per line.
+        trajectory: the scanner's path: .csv (a header line, then time,x,y,z per line) or .tum.
+        trajectory_check: folder of a check of the trajectory (`pipeline.io.trajectory_check`); if it has a correction,
+            points, photos and trajectory are corrected.
         orthophoto: GeoTIFF, or an image with a world file, in the clouds' CRS.
         footprints: building footprints, GeoJSON or GeoPackage.
+        conventions: in which the CSV gives poses and cameras; default: as documented.
         link: symlink clouds and photos instead of copying them.
         overwrite: replace an existing tile.
         name: name of the tile; default: that of its folder.
         classes: mapping of class codes of the clouds to those of `pipeline.core.classes`, where they differ.
-        warn: receives assumptions made about the clouds.
+        warn: receives assumptions made about the clouds, and images of E57 files that are left out.
         report: receives progress.
 
     Returns:
@@ -108,27 +121,30 @@ def import_las(
         UnavailableError: a format's library isn't installed.
     """
     headers = [cloud_io.read_header(Path(cloud)) for cloud in clouds]
-    if crs is None and any(h.crs is None for h in headers):
-        without_crs = next(cloud for cloud, h in zip(clouds, headers, strict=True) if h.crs is None)
-        raise InputError(
-            without_crs, "has no CRS", "Give it, for example --crs EPSG:32633, or --crs local without georeference"
-        )
-    known, unit = crs_io.common(Path("tile.toml"), crs, units, clouds, headers)
+    known, unit = _common_crs(clouds, headers, crs, units)
     for cloud, header in zip(clouds, headers, strict=True):
         for note in header.notes:
             warn(f"{cloud}: {note}")
     shots, rigs = read_photos(photos, cameras) if photos else ([], {})
+    if shots and conventions is not None:
+        shots, rigs = _converted(shots, rigs, conventions, Frame(known, unit=unit), warn)
     base = images or (photos.parent if photos else Path())
+    path, correction = _corrected_path(trajectory, trajectory_check, Frame(known, unit=unit))
     with tile_folder(out, overwrite) as folder:
         cloud_names = []
         for i, cloud in enumerate(clouds):
             report(0.5 * i / len(clouds), f"cloud {Path(cloud).name}")
-            cloud_names.append(_add_cloud(Path(cloud), folder, Frame(known, unit=unit), link))
+            cloud_names.append(_add_cloud(Path(cloud), folder, Frame(known, unit=unit), link, correction))
         for i, shot in enumerate(shots):
             report(0.5 + 0.5 * i / len(shots), f"photo {shot['file']}")
             for key, subfolder in (("file", "photos"), ("mask", "masks")):
                 if shot.get(key):
                     shot[key] = add_file(base / shot[key], folder, f"{subfolder}/{without_parents(shot[key])}", link)
+        if embedded_images:
+            embedded, lenses = e57_images.extract_all(map(Path, clouds), folder, warn, report)
+            shots, rigs = shots + embedded, rigs | lenses
+        if correction is not None:
+            shots = _corrected_photos(shots, correction, unit, warn)
         write_tile(
             folder,
             name=tile_name(name or Path(out).name),
@@ -136,19 +152,114 @@ def import_las(
             clouds=cloud_names,
             cameras=rigs,
             photos=shots,
-            trajectory=add_file(trajectory, folder, "trajectory.csv", link) if trajectory else None,
+            trajectory=_add_trajectory(trajectory, path, folder, Frame(known, unit=unit), link) if trajectory else None,
             ortho=orthophoto_io.copy_to_tile(orthophoto, folder, link) if orthophoto else None,
             footprints=add_file(footprints, folder, footprints.name, link) if footprints else None,
             units=units,
             classes=classes,
         )
+        if trajectory_check is not None:
+            check_io.copy(trajectory_check, folder)
         read_tile(folder)  # an invalid tile is an error here, before its folder appears
     report(1.0, "done")
     return Path(out) / "tile.toml"
 
 
-def _add_cloud(cloud: Path, folder: Path, frame: Frame, link: bool) -> str:
-    """Copy, link or convert (to LAZ) a cloud into the tile's folder; returns its name there."""
+def common_crs(clouds: Sequence[Path], crs: str | None, units: str | None) -> tuple[str, float]:
+    """CRS of clouds and metres per unit; arguments and errors as `import_las`."""
+    return _common_crs(clouds, [cloud_io.read_header(Path(cloud)) for cloud in clouds], crs, units)
+
+
+def _common_crs(
+    clouds: Sequence[Path], headers: Sequence[cloud_io.Header], crs: str | None, units: str | None
+) -> tuple[str, float]:
+    if crs is None and any(h.crs is None for h in headers):
+        without_crs = next(cloud for cloud, h in zip(clouds, headers, strict=True) if h.crs is None)
+        raise InputError(
+            without_crs, "has no CRS", "Give it, for example --crs EPSG:32633, or --crs local without georeference"
+        )
+    return crs_io.common(Path("tile.toml"), crs, units, clouds, headers)
+
+
+def _converted(
+    shots: list[dict[str, Any]],
+    rigs: dict[str, Camera],
+    conventions: PhotoConventions,
+    frame: Frame,
+    warn: Callable[[str], None],
+) -> tuple[list[dict[str, Any]], dict[str, Camera]]:
+    """Photos and cameras by name in the conventions of a tile; photos without a pose are left out."""
+    T = np.tile(np.eye(4), (len(shots), 1, 1))
+    T[:, :3, :3] = [shot["rotation"] for shot in shots]
+    T[:, :3, 3] = np.array([shot["position"] for shot in shots]) * frame.unit
+    given = PosedPhotos(T, tuple(rigs[shot["camera"]] for shot in shots), frame)
+    photos, known = converted(given, conventions)
+    if not known.all():
+        warn(f"{int((~known).sum())} photos are left out: there is no row with their pose (--pose-shift)")
+    moved = [
+        shot | {"position": pose[:3, 3] / frame.unit, "rotation": pose[:3, :3]}
+        for shot, pose, found in zip(shots, photos.T, known, strict=True)
+        if found
+    ]
+    return moved, {shot["camera"]: camera for shot, camera in zip(shots, photos.cameras, strict=True)}
+
+
+def _corrected_path(
+    trajectory: Path | None, check: Path | None, frame: Frame
+) -> tuple[Trajectory | None, PathCorrection | None]:
+    """The trajectory (metres), if it differs from its file: in the clouds' clock, corrected; and its correction."""
+    if trajectory is None or check is None:
+        return None, None
+    found = check_io.read(check) or {}
+    offset = float(found.get("clock_offset_s", 0.0))
+    path = trajectory_io.read(trajectory, frame, ordered=False, timed=True)
+    path = replace(path, times=path.times + offset)
+    correction = read_correction(check, path)
+    if correction is not None:
+        return correction.trajectory(), correction
+    return (path if offset else None), None
+
+
+def _add_trajectory(trajectory: Path, path: Trajectory | None, folder: Path, frame: Frame, link: bool) -> str:
+    """Copy or link a trajectory into the tile's folder, or write `path` instead; returns its name there."""
+    if path is None:
+        return add_file(trajectory, folder, "trajectory.tum" if trajectory.suffix == ".tum" else "trajectory.csv", link)
+    trajectory_io.write(folder / "trajectory.csv", path, frame)
+    return "trajectory.csv"
+
+
+def _corrected_photos(
+    shots: list[dict[str, Any]], correction: PathCorrection, unit: float, warn: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Photos with the poses of the corrected path: at their times or, without any, where the path is nearest."""
+    if not shots:
+        return shots
+    T = np.tile(np.eye(4), (len(shots), 1, 1))
+    T[:, :3, :3] = [shot["rotation"] for shot in shots]
+    T[:, :3, 3] = np.array([shot["position"] for shot in shots]) * unit
+    times = np.array([np.nan if shot.get("time") is None else shot["time"] for shot in shots], np.float64)
+    timed = correction.covers(times)
+    times[~timed] = correction.nearest_times(T[~timed, :3, 3])
+    if not timed.all():
+        warn(
+            f"{int((~timed).sum())} photos have no time within the trajectory's: their poses are corrected as the "
+            "nearest position of the trajectory"
+        )
+    return [
+        shot | {"position": pose[:3, 3] / unit, "rotation": pose[:3, :3]}
+        for shot, pose in zip(shots, correction.poses(T, times), strict=True)
+    ]
+
+
+def _add_cloud(cloud: Path, folder: Path, frame: Frame, link: bool, correction: PathCorrection | None) -> str:
+    """Copy, link, correct or convert (to LAZ) a cloud into the tile's folder; returns its name there."""
+    if correction is not None:
+        name = cloud.name if cloud.suffix.lower() in las.SUFFIXES else f"{cloud.stem}.laz"
+        name = name.replace(".copc.", ".")
+        if (folder / name).exists():
+            raise InputError(cloud, f"is the second cloud with the name {name} in the tile", "Rename one of them")
+        write_corrected(cloud, folder / name, correction, frame)
+        return name
     if cloud.suffix.lower() in cloud_io.COPIED_SUFFIXES:
         return add_file(cloud, folder, cloud.name, link)
     name = f"{cloud.resolve().parent.name if cloud.name == 'ept.json' else cloud.stem}.laz"

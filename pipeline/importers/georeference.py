@@ -8,7 +8,7 @@ mean are scaled by the same factor.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -85,10 +85,29 @@ def from_photo_gps(model: Path, centres: F64, ups: F64, photos: Sequence[Path], 
     Raises:
         DataError: fewer than three photos have consistent GPS, or the track is too short for the error of the GPS.
     """
+    crs, positions, unit, notes = photo_positions(model, photos, crs)
+    fit = from_positions(model, centres, ups, positions, crs, unit)
+    return replace(fit, notes=(fit.notes[0], *notes, *fit.notes[1:]))
+
+
+def photo_positions(model: Path, photos: Sequence[Path], crs: str | None) -> tuple[str, F64, float, list[str]]:
+    """Positions by the GPS in the photos' EXIF.
+
+    Args:
+        model: file or folder, for messages.
+        photos: files.
+        crs: projected CRS; None: UTM.
+
+    Returns:
+        The CRS, positions (P, 3) in metres along its axes (NaN where unknown), metres per unit, notes for the user.
+
+    Raises:
+        DataError: fewer than three photos have GPS. InputError: they are outside of the area of the CRS.
+    """
     notes: list[str] = []
-    positions = [exif.gps_position(photo) for photo in photos]
-    located = [i for i, position in enumerate(positions) if position is not None]
-    with_altitude = [i for i, position in enumerate(positions) if position is not None and position[2] is not None]
+    found = [exif.gps_position(photo) for photo in photos]
+    located = [i for i, position in enumerate(found) if position is not None]
+    with_altitude = [i for i, position in enumerate(found) if position is not None and position[2] is not None]
     if len(with_altitude) >= 3:
         located = with_altitude
     elif located:
@@ -97,9 +116,41 @@ def from_photo_gps(model: Path, centres: F64, ups: F64, photos: Sequence[Path], 
         raise DataError(
             model, f"only {len(located)} of {len(photos)} photos have GPS", "Give --upright and --scale instead"
         )
-    rows: Any = [positions[i] for i in located]
+    rows: Any = [found[i] for i in located]
     crs, target, unit = _projected(model, crs, np.array([(lat, lon, height or 0.0) for lat, lon, height in rows]))
-    source, target = centres[located], target * unit  # metres, the unit of the limits
+    positions = np.full((len(photos), 3), np.nan)
+    positions[located] = target * unit  # metres, the unit of the limits
+    return crs, positions, unit, notes
+
+
+def from_positions(
+    model: Path,
+    centres: F64,
+    ups: F64,
+    positions: F64,
+    crs: str,
+    unit: float = 1.0,
+    *,
+    max_angle: float = MAX_ANGLE_SIGMA_RAD,
+    remedy: str = "or give --upright and --scale",
+) -> Fit:
+    """Georeference by the photos' approximate positions.
+
+    Args:
+        model: the model's file, for messages.
+        centres, ups: as of `from_photo_gps`.
+        positions: (P, 3) metres along the axes of the CRS; NaN where unknown.
+        crs: their CRS.
+        unit: metres per unit of the CRS.
+        max_angle: standard deviation of the heading (rad) above which the positions don't determine it.
+        remedy: end of the remedy in messages.
+
+    Raises:
+        DataError: fewer than three positions are consistent, or the track is too short for their error.
+    """
+    notes: list[str] = []
+    located = np.flatnonzero(np.isfinite(positions).all(axis=1)).tolist()
+    source, target = centres[located], positions[located]
     try:
         onto, inlier = fit_robust(source, target, MAX_GPS_RESIDUAL_M)
     except DataError as error:
@@ -109,13 +160,13 @@ def from_photo_gps(model: Path, centres: F64, ups: F64, photos: Sequence[Path], 
     rms = float(np.sqrt((residual**2).sum(axis=1).mean()))
     along, across = _spread(onto.apply(source[inlier]))
     count = np.sqrt(len(used))
-    if not np.arctan2(rms, along * count) < MAX_ANGLE_SIGMA_RAD:
+    if not np.arctan2(rms, along * count) < max_angle:
         raise DataError(
             model,
             f"its photos extend over {2 * along:.1f} m, too little for GPS with an error of {rms:.1f} m",
-            "Take more photos, further apart, or give --upright and --scale",
+            f"Take more photos, further apart, {remedy}",
         )
-    notes.insert(0, f"georeferenced by the GPS of {len(used)} of {len(photos)} photos, rms {rms:.2f} m, in {crs}")
+    notes.insert(0, f"georeferenced by the GPS of {len(used)} of {len(centres)} photos, rms {rms:.2f} m, in {crs}")
     if not np.arctan2(rms, across * count) < MAX_ANGLE_SIGMA_RAD:
         onto = _with_roll(model, onto, source[inlier], ups)
         notes.append(

@@ -13,31 +13,31 @@ up to 20 ms later than the sweep of the same number, so poses are interpolated t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.poses import interpolate, nearest_rotation
-from scan2sim.pipeline.core.step import Report, silent
-from scan2sim.pipeline.core.types import F32, F64, Camera, Frame, PointCloud
-from scan2sim.pipeline.importers.merge_sweeps import colour_from_photo, fill_colours, read_bin, scan_phase
+from scan2sim.pipeline.core.step import Report
+from scan2sim.pipeline.core.types import F32, F64, Camera, Frame, Trajectory, View
+from scan2sim.pipeline.importers.deskew import scan_phase
+from scan2sim.pipeline.importers.place_sweeps import PLACED, PlacedPoints, merge, place, write_placed
+from scan2sim.pipeline.importers.scanner_path import ScannerPath
 from scan2sim.pipeline.io import file_checks
-from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.calibration import read_entry
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.images.image import SUFFIXES
-from scan2sim.pipeline.io.tile import tile_name, write_tile
-from scan2sim.pipeline.io.tile_folder import add_file, tile_folder
+from scan2sim.pipeline.io.sweep_files import Sweep, read_bin
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 # box that contains the recording car's own returns, scanner axes: (low, high) corner in metres
 EGO_VEHICLE_BOX: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-3.2, -1.3, -2.0), (2.8, 1.3, 0.3))
 MAX_COORDINATE_M = 1e8
-"""Plausibility limit of poses and calibration values."""
+"""Plausibility limit of poses."""
 SAME_DAY = "Use the synced and rectified photos with the calibration of the same day"
 
 
@@ -72,54 +72,25 @@ class Drive:
     crs: str
 
 
-def import_kitti_raw(
+def read_drive(
     drive: Path,
-    out: Path,
     *,
     poses: Path | None = None,
     cameras: Sequence[str] = ("image_02",),
     frames: tuple[int, int] | None = None,
-    max_range: float = 50.0,
-    deskew: bool = True,
-    link: bool = False,
-    overwrite: bool = False,
     name: str | None = None,
-    report: Report = silent,
-) -> Path:
-    """Create a tile from a KITTI raw drive (synced and rectified).
-
-    Points get the colour of the photo of their own frame, otherwise that of the nearest coloured
-    point nearby (`merge_sweeps.fill_colours`), otherwise grey. Times are seconds since 1980-01-06,
-    from the drive's time stamps.
-
-    Args:
-        drive: the `..._sync` folder, or a folder that contains exactly one; calibration files are
-            searched in it and in its parent.
-        out: folder of the tile to create.
-        poses: row-major 3x4 matrices, one per line, scanner of sweep i to scanner of sweep 0;
-            default: OXTS poses.
-        cameras: folders of photos.
-        frames: first and last frame number; default: all frames.
-        max_range: metres; farther returns are removed (a pose error of 0.1 degrees is 9 cm at 50 m).
-        deskew: transform each point by the pose of its own time; disable for sweeps that are already
-            motion-compensated (such as those of KITTI odometry).
-        link: symlink photos instead of copying them.
-        overwrite: replace an existing tile.
-        name: name of the tile; default: that of the drive.
-        report: receives progress.
-
-    Returns:
-        Path of the `tile.toml`.
+) -> Drive:
+    """Files, calibration and poses of a drive; arguments as of `flows.pipelines.kitti.import_kitti_raw`.
 
     Raises:
-        InputError: a file is missing or damaged. SettingError: `out` is not empty, or no frame is selected.
+        InputError: a file is missing or damaged. SettingError: no frame is selected.
     """
-    drive = _find_drive(drive)
+    drive = find_drive(drive)
     sweeps = select_frames(files_by_frame(drive / "velodyne_points" / "data", ".bin"), frames, drive)
     numbers = list(sweeps)
     spans = _spans(drive, numbers)
     T_velo, crs = _poses(drive, poses, numbers, spans[:, 1])
-    parsed = Drive(
+    return Drive(
         name or drive.name,
         sweeps,
         {folder: _rig(drive, folder) for folder in cameras},
@@ -128,89 +99,68 @@ def import_kitti_raw(
         T_velo,
         crs,
     )
-    return write_drive_tile(
-        parsed, out, max_range=max_range, deskew=deskew, link=link, overwrite=overwrite, report=report
-    )
 
 
 def write_drive_tile(
-    drive: Drive, out: Path, *, max_range: float, deskew: bool, link: bool, overwrite: bool, report: Report
+    drive: Drive,
+    out: Path,
+    *,
+    max_range: float,
+    deskew: bool,
+    vertical_angle_offset: float = 0.0,
+    link: bool,
+    overwrite: bool,
+    report: Report,
 ) -> Path:
-    """Create a tile from a drive: merge sweeps, colour points by the photos of their frames; see `import_kitti_raw`."""
-    numbers, sweeps, rigs, photos, spans = list(drive.sweeps), drive.sweeps, drive.rigs, drive.photos, drive.spans
-    T_velo, crs = drive.T_velo.copy(), drive.crs
-    if (np.diff(spans[:, 1]) <= 0).any():
-        late = numbers[int(np.argmax(np.diff(spans[:, 1]) <= 0)) + 1]
+    """Create a tile from a drive: merge sweeps, colour points by the photos of their frames.
+
+    Arguments and results are those of `flows.pipelines.kitti.import_kitti_raw`.
+
+    Raises:
+        InputError: a file is damaged. SettingError: `out` is not empty. DataError: no points are within range.
+    """
+    numbers, middles = list(drive.sweeps), drive.spans[:, 1]
+    late = np.flatnonzero(np.diff(middles) <= 0)
+    if len(late):
         raise InputError(
-            sweeps[late], "its time stamp is not after that of the previous sweep", "Unpack the sweeps again"
+            drive.sweeps[numbers[late[0] + 1]],
+            "its time stamp is not after that of the previous sweep",
+            "Unpack the sweeps again",
         )
-    frame = Frame(crs, (0.0, 0.0, 0.0) if crs == "local" else tuple(np.floor(T_velo[0, :3, 3]).tolist()))
+    x, y, z = (0.0, 0.0, 0.0) if drive.crs == "local" else np.floor(drive.T_velo[0, :3, 3]).tolist()
+    frame, T_velo = Frame(drive.crs, (x, y, z)), drive.T_velo.copy()
     T_velo[:, :3, 3] -= frame.origin
-
-    parts: list[dict[str, Any]] = []
-    for i, number in enumerate(numbers):
-        report(0.7 * i / len(numbers), f"sweep {number}")
-        xyz, reflectance = _read_sweep(sweeps[number], max_range)
-        phase = scan_phase(xyz) if deskew else np.full(len(xyz), 0.5)
-        times = spans[i, 0] + phase * (spans[i, 2] - spans[i, 0])
-        poses = interpolate(T_velo, spans[:, 1], times)
-        world = np.einsum("nij,nj->ni", poses[:, :3, :3], xyz) + poses[:, :3, 3]
-        rgb = np.zeros((len(xyz), 3), np.uint8)
-        seen = np.zeros(len(xyz), bool)
-        for folder, rig in rigs.items():
-            if number in photos[folder]:
-                pose = T_velo[i] @ rig.T_velo_cam
-                colour_from_photo(world, pose, rig.camera, photos[folder][number], rgb, seen, remedy=SAME_DAY)
-        parts.append(
-            {
-                "xyz": world.astype(np.float32),
-                "rgb": rgb,
-                "seen": seen,
-                "time": times,
-                "intensity": np.round(reflectance * 65535).astype(np.uint16),
-                "range": np.linalg.norm(xyz, axis=1).astype(np.float32),
-            }
-        )
-    whole = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    report(0.7, "colours")
-    rgb = fill_colours(whole["xyz"], whole["rgb"], whole["seen"], whole["range"])
-    cloud = PointCloud(frame, whole["xyz"], rgb, time=whole["time"], intensity=whole["intensity"])
-    report(0.85, "writing")
-
-    with tile_folder(out, overwrite) as work:
-        las.write(work / "cloud.laz", cloud)
-        entries = []
-        for key, rig in rigs.items():
-            for i, number in enumerate(numbers):
-                if number not in photos[key]:
-                    continue
-                pose = T_velo[i] @ rig.T_velo_cam
-                source = photos[key][number]
-                entries.append(
-                    {
-                        "file": add_file(source, work, f"photos/{key}/{source.name}", link),
-                        "camera": key,
-                        "position": frame.to_crs(pose[:3, 3]),
-                        "rotation": pose[:3, :3],
-                        "time": float(spans[i, 1]),
-                    }
+    path = ScannerPath(middles, T_velo)
+    views = {folder: dict[int, View]() for folder in drive.rigs}
+    for folder, rig in drive.rigs.items():
+        for T, number, middle in zip(T_velo, numbers, middles.tolist(), strict=True):
+            photo = drive.photos[folder].get(number)
+            if photo is not None:
+                views[folder][number] = View(
+                    f"{folder}/{photo.name}", rig.camera, T @ rig.T_velo_cam, photo, time=middle
                 )
-        rows = np.column_stack([spans[:, 1], frame.to_crs(T_velo[:, :3, 3])])
-        np.savetxt(work / "trajectory.csv", rows, "%.6f", delimiter=",", header="time,x,y,z", comments="")
-        write_tile(
-            work,
-            name=tile_name(drive.name),
-            crs=frame.crs,
-            clouds=["cloud.laz"],
-            cameras={key: rig.camera for key, rig in rigs.items()},
-            photos=entries,
-            trajectory="trajectory.csv",
-        )
-    report(1.0, "done")
-    return Path(out) / "tile.toml"
+
+    def placed() -> Iterator[PlacedPoints]:
+        for i, (number, (start, _, end)) in enumerate(zip(numbers, drive.spans, strict=True)):
+            report(PLACED * i / len(numbers), f"sweep {number}")
+            sweep = read_drive_sweep(drive.sweeps[number], max_range, vertical_angle_offset)
+            beside = [(own[number], None) for own in views.values() if number in own]
+            yield place(sweep, point_times(sweep, start, end, deskew), path, beside, remedy=SAME_DAY)
+
+    return write_placed(
+        out, merge(placed()), frame, Trajectory(middles, T_velo[:, :3, 3]),
+        {folder: list(own.values()) for folder, own in views.items()},
+        {folder: rig.camera for folder, rig in drive.rigs.items()}, sweeps=next(iter(drive.sweeps.values())).parent,
+        name=drive.name, crs=frame.crs, link=link, overwrite=overwrite, report=report,
+    )  # fmt: skip
 
 
-def _find_drive(folder: Path) -> Path:
+def find_drive(folder: Path) -> Path:
+    """The folder of a drive, `folder` itself or the only one in it.
+
+    Raises:
+        InputError: there is none, or more than one.
+    """
     if (folder / "velodyne_points").is_dir():
         return folder
     found = sorted(path.parent for path in folder.glob("**/velodyne_points") if path.is_dir())
@@ -243,16 +193,14 @@ def files_by_frame(folder: Path, suffixes: str | tuple[str, ...]) -> dict[int, P
     return {int(path.stem): path for path in found}
 
 
-def _calibration(drive: Path, name: str) -> dict[str, F64]:
-    path = next((f / name for f in (drive, drive.parent) if (f / name).is_file()), drive.parent / name)
-    text = file_checks.lines(path, "Unpack the calibration of the drive's day beside the drive")
-    entries = {}
-    for key, _, rest in (line.partition(":") for line in text):
-        try:
-            entries[key.strip()] = np.array(rest.split(), np.float64)
-        except ValueError:
-            continue  # calib_time is a date
-    return entries
+def calibration_files(drive: Path) -> dict[str, Path]:
+    """The calibration files of a drive that exist, in its folder or the parent folder, by name."""
+    names = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
+    return {name: path for name in names if (path := _calibration_file(drive, name)).is_file()}
+
+
+def _calibration_file(drive: Path, name: str) -> Path:
+    return next((f / name for f in (drive, drive.parent) if (f / name).is_file()), drive.parent / name)
 
 
 def calibration_entry(drive: Path, name: str, key: str, size: int) -> F64:
@@ -261,10 +209,8 @@ def calibration_entry(drive: Path, name: str, key: str, size: int) -> F64:
     Raises:
         InputError: the file is missing, or has no such entry.
     """
-    values = _calibration(drive, name).get(key)
-    if values is None or values.size != size or not (np.abs(values) < MAX_COORDINATE_M).all():
-        raise InputError(drive.parent / name, f"has no `{key}` with {size} numbers", "Unpack the calibration again")
-    return values
+    remedy = "Unpack the calibration of the drive's day beside the drive"
+    return read_entry(_calibration_file(drive, name), key, size, remedy)
 
 
 def _rigid(drive: Path, name: str) -> F64:
@@ -391,9 +337,32 @@ def _read_oxts(drive: Path, numbers: list[int]) -> tuple[F64, str]:
     return T, crs
 
 
-def _read_sweep(path: Path, max_range: float) -> tuple[F32, F32]:
-    """Points (N, 3) in scanner axes and reflectance (N,), without returns from the car and beyond `max_range`."""
+def point_times(sweep: Sweep, start: float, end: float, deskew: bool) -> F64:
+    """(N,) seconds at which the points of a sweep were measured; without `deskew` all in its middle."""
+    phase = scan_phase(sweep.xyz) if deskew else np.full(len(sweep.xyz), 0.5)
+    return start + phase * (end - start)
+
+
+def read_drive_sweep(path: Path, max_range: float, vertical_angle_offset: float = 0.0) -> Sweep:
+    """A sweep without returns from the car and beyond `max_range`; its beams raised by the offset, degrees."""
     xyz, reflectance = read_bin(path)
     low, high = np.array(EGO_VEHICLE_BOX, np.float32)
-    keep = ~((xyz > low) & (xyz < high)).all(axis=1) & (np.linalg.norm(xyz, axis=1) <= max_range)
-    return xyz[keep], reflectance[keep]
+    # float32, unlike `read_sweep`: a reflectance of 0.3 or 0.9 is rounded to the level next to that of float64
+    sweep = Sweep(raise_beams(xyz, vertical_angle_offset), np.round(reflectance * 65535).astype(np.uint16))
+    return sweep.take(~((xyz > low) & (xyz < high)).all(axis=1)).between(0.0, max_range)
+
+
+def raise_beams(xyz: F32, offset_deg: float) -> F32:
+    """Returns (N, 3) in the scanner's axes (z up) with their vertical angles raised by `offset_deg`, ranges unchanged.
+
+    Corrects a constant error of the beams' vertical angles, for KITTI .205 degrees in Deschaud, "IMLS-SLAM:
+    scan-to-model matching based on 3D data", ICRA 2018.
+    """
+    if not offset_deg:
+        return xyz
+    across = np.hypot(xyz[:, 0], xyz[:, 1]).astype(np.float64)
+    cos, sin = np.cos(np.radians(offset_deg)), np.sin(np.radians(offset_deg))
+    out = xyz.astype(np.float64)
+    out[:, :2] *= np.divide(cos * across - sin * xyz[:, 2], across, out=np.ones_like(across), where=across > 0)[:, None]
+    out[:, 2] = cos * xyz[:, 2] + sin * across
+    return out.astype(np.float32)

@@ -13,7 +13,7 @@ from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F64, Frame, PointCloud
 from scan2sim.pipeline.geometry.similarity import Similarity
-from scan2sim.pipeline.importers import georeference
+from scan2sim.pipeline.importers import depth_images, georeference
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import crs as crs_io
@@ -29,7 +29,7 @@ Up = tuple[float, float, float] | Literal["photos"]
 def import_model(
     kind: str,
     model: Path,
-    images: Path,
+    images: Path | None,
     out: Path,
     *,
     cloud: Path | None = None,
@@ -49,13 +49,14 @@ def import_model(
     Args:
         kind: the program, a module name of `pipeline.io.photogrammetry`.
         model: the program's file or folder.
-        images: folder of the photos.
+        images: folder of the photos; default: that of the model.
         out: folder of the tile to create.
-        cloud: point cloud; default: the model's sparse points. A cloud without a CRS is in the model's coordinates and
-            is transformed with it; a cloud with a CRS stays, and the model must fit it.
+        cloud: point cloud; default: the model's points, or those of its depth images. A cloud without a CRS is in the
+            model's coordinates and is transformed with it; a cloud with a CRS stays, and the model must fit it.
         crs: target CRS of a georeferenced model (default: the cloud's, the program's, or UTM); for other models, the
             CRS of their coordinates (default: "local").
-        up: direction of the model that becomes +z, or "photos" for the mean up direction of the photos.
+        up: direction of the model that becomes +z, or "photos" for the mean up direction of the photos; default: the
+            model's own, if its CRS isn't known.
         scale: metres per unit of the model.
         gps: georeference the model by the GPS positions in the photos' EXIF.
         link: symlink photos and cloud instead of copying them.
@@ -73,6 +74,7 @@ def import_model(
         DataError: the GPS is insufficient to georeference the model.
     """
     header = None if cloud is None else cloud_io.read_header(cloud)  # fails early if it isn't a cloud
+    images = images or (model if model.is_dir() else model.parent)
     found = read(kind, model, images)
     for note in found.notes:
         warn(f"{model}: {note}")
@@ -82,11 +84,14 @@ def import_model(
             f"would move the photos relative to {cloud}, which has a CRS",
             "Align model and cloud first",
         )
-    files = [Photos(images).find(shot.file) for shot in found.shots] if gps else []
+    photos = Photos(images)
+    files = [photos.find(shot.file) for shot in found.shots] if gps else []
     cloud_crs = crs_io.short(header.crs) if header is not None and header.crs else None
     onto, tile_crs = _model_to_tile(model, found, cloud_crs, files, crs, up, scale, gps, warn)
+    if cloud is None and not len(found.xyz) and any(shot.depth for shot in found.shots):
+        xyz, rgb = depth_images.fuse(found, photos, warn, report)
+        found = replace(found, xyz=xyz, rgb=rgb)
     placed = found.transformed(onto)
-    photos = Photos(images)
     with tile_folder(out, overwrite) as folder:
         if cloud is None:
             las.write(folder / "cloud.laz", _sparse(model, placed, tile_crs))
@@ -96,15 +101,19 @@ def import_model(
             in_model = _in_model_coordinates(cloud, header, found, onto, warn)
             file = _add_cloud(cloud, folder, onto if in_model else None, tile_crs, link)
         entries: list[dict[str, Any]] = []
+        masks: dict[Path, str] = {}
         for i, shot in enumerate(placed.shots):
             report(i / len(placed.shots), shot.file)
             source = photos.find(shot.file)
+            if shot.mask is not None and shot.mask not in masks:  # several photos may share one
+                masks[shot.mask] = add_file(shot.mask, folder, f"masks/{len(masks)}/{shot.mask.name}", link)
             entries.append(
                 {
                     "file": add_file(source, folder, f"photos/{source.relative_to(images).as_posix()}", link),
                     "camera": shot.camera,
                     "position": shot.pose[:3, 3],
                     "rotation": shot.pose[:3, :3],
+                    "mask": masks[shot.mask] if shot.mask is not None else None,
                 }
             )
         used = {shot.camera for shot in placed.shots}
@@ -144,6 +153,8 @@ def _model_to_tile(
         for line in fit.notes:
             warn(f"{model}: {line}")
         return fit.onto, fit.crs
+    if up is None and (crs or cloud_crs or crs_io.LOCAL) == crs_io.LOCAL:
+        up = found.up
     return Similarity(scale, _upright(_ups(found), up), np.zeros(3)), crs or cloud_crs or crs_io.LOCAL
 
 

@@ -15,8 +15,10 @@ from scan2sim.pipeline.core.types import U8
 from scan2sim.pipeline.io import las_header
 from scan2sim.pipeline.io.clouds.las import CHUNK_POINTS, open_las, read_parts
 
-EXTRA_DIMENSIONS = {"confidence": "255: sure", "told_from": "1 photos 2 shape 3 own"}
+EXTRA_DIMENSIONS = {"confidence": "255: sure", "class_source": "1 photos 2 shape 3 own"}
 """Extra-byte dimensions that are added (uint8 each): name and description, as written into the file."""
+RENAMED_DIMENSIONS = ("told_from",)
+"""Earlier names of these dimensions; a copy of a file that has one doesn't keep it."""
 MODERN_FORMAT = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10}
 """Legacy point format (5-bit classes) to the format with 8-bit classes and the same fields."""
 LEGACY_FLAGS = (
@@ -32,7 +34,7 @@ WKT_RECORD, GEOTIFF_RECORDS = 2112, (34735, 34736, 34737)  # record ids of PROJE
 PROJECTED_KEY, VERTICAL_KEY = 3072, 4096  # GeoTIFF keys
 
 
-def write_classified(source: Path, out: Path, code: U8, confidence: U8, told_from: U8) -> None:
+def write_classified(source: Path, out: Path, code: U8, confidence: U8, class_source: U8) -> None:
     """Copy a LAS, LAZ or COPC file with new classes and everything else unchanged.
 
     The copy is a LAZ file of LAS 1.4 (1.5 if the source is) with point format 6 or above, which codes over 31
@@ -47,7 +49,7 @@ def write_classified(source: Path, out: Path, code: U8, confidence: U8, told_fro
         out: LAZ file to write; an existing one is replaced once the new one is complete. May be `source`.
         code: (N,) LAS codes, in the order of the file's points.
         confidence: (N,) 0 to 255 (certain), stored as extra bytes; replaces a dimension of that name.
-        told_from: (N,) source of the class (1 photos, 2 shape, 3 the file's own class), stored the same way.
+        class_source: (N,) source of the class (1 photos, 2 shape, 3 the file's own class), stored the same way.
 
     Raises:
         DataError: an array isn't as long as the file.
@@ -59,14 +61,14 @@ def write_classified(source: Path, out: Path, code: U8, confidence: U8, told_fro
 
     with open_las(source) as reader:
         n = reader.header.point_count
-        for name, values in {"code": code, "confidence": confidence, "told_from": told_from}.items():
+        for name, values in {"code": code, "confidence": confidence, "class_source": class_source}.items():
             if values.shape != (n,) or values.dtype != np.uint8:
                 given = f"{name} is {values.dtype} of shape {values.shape}"
                 raise DataError(source, f"has {n:,} points, but {given}", "Classify this file again: it has changed")
         temporary = out.with_name(f".{out.name}-{os.getpid()}")
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
-            _copy(source, reader, temporary, code, (confidence, told_from))
+            _copy(source, reader, temporary, code, (confidence, class_source))
             temporary.replace(out)
         except OSError as error:
             raise from_os_error(error, out) from error
@@ -181,7 +183,7 @@ def _extra_bytes(header: Any) -> tuple[list[tuple[int, int]], list[Any]]:
             described, size = [], 1
             described_byte = ExtraBytesStruct(b"ExtraBytes", 1)
             described_byte.options = 0
-        if described_byte.name.decode() not in EXTRA_DIMENSIONS:
+        if described_byte.name.decode() not in (*EXTRA_DIMENSIONS, *RENAMED_DIMENSIONS):
             stem, i = described_byte.name[:27], 1
             while described_byte.name in taken:
                 described_byte.name, i = stem + b"_%d" % i, i + 1

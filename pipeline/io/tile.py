@@ -32,7 +32,9 @@ name = "photos/0001"        # optional: name of the view; default: the file with
 Paths are relative to the `tile.toml`. A tile that was cut from a survey also has its Voronoi cell:
 `[cell]` with `seed` (x, y in the CRS) and `[cell.neighbours]`, names of tiles to their seeds
 (`pipeline.core.voronoi_cell`). A generated tile also has its ground truth:
-`[truth]` with `mesh` and `points`.
+`[truth]` with `mesh` and `points`. A tile of a robot's map has `[robot_map]` with `scene` (indoor or outdoor),
+`spacing` of its points (m), the map's `unit` (m), and `T_world_map`, from the map's frame to the level world; of a
+textured mesh, `source_mesh` is its file in the world's axes.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ from scan2sim.pipeline.core.classes import mapping, name_of
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.parameters import Name
 from scan2sim.pipeline.core.poses import nearest_rotation
-from scan2sim.pipeline.core.types import Camera, CameraModel, Frame, Tile, Trajectory, View
+from scan2sim.pipeline.core.types import Camera, CameraModel, Frame, RobotMap, Tile, Trajectory, View
 from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import file_checks, toml
@@ -106,6 +108,16 @@ class CellEntry(_Strict):
     buffer: float = Field(5.0, ge=0)
 
 
+class RobotMapEntry(_Strict):
+    """The `[robot_map]` entry of a tile that was made from a robot's map; lengths in metres."""
+
+    scene: Literal["indoor", "outdoor"]
+    spacing: float = Field(gt=0, le=100)
+    unit: float = Field(1.0, gt=0, le=1000)
+    T_world_map: tuple[tuple[float, float, float, float], ...] = Field(min_length=4, max_length=4)
+    source_mesh: str | None = None
+
+
 class TileFile(_Strict):
     """Schema of `tile.toml`."""
 
@@ -121,6 +133,7 @@ class TileFile(_Strict):
     photos: tuple[PhotoEntry, ...] = ()
     cell: CellEntry | None = None
     truth: TruthEntry | None = None
+    robot_map: RobotMapEntry | None = None
 
 
 def read_tile(path: Path) -> Tile:
@@ -141,7 +154,7 @@ def read_tile(path: Path) -> Tile:
     high = np.max([h.high for h in headers], axis=0) * unit
     x, y, z = np.floor([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]).tolist()
     frame = Frame(crs, (x, y, z), unit)
-    cameras = {entry.id: _camera(path, entry) for entry in spec.cameras}
+    cameras = {entry.id: camera_of(path, entry) for entry in spec.cameras}
     if len(cameras) < len(spec.cameras):
         duplicate = next(c.id for i, c in enumerate(spec.cameras) if c.id in {other.id for other in spec.cameras[:i]})
         raise InputError(path, f"has two cameras `{duplicate}`", "Give each camera a unique id")
@@ -160,6 +173,7 @@ def read_tile(path: Path) -> Tile:
         footprints=_existing(path, spec.footprints, "footprints") if spec.footprints else None,
         truth_mesh=_existing(path, spec.truth.mesh, "truth.mesh") if spec.truth else None,
         truth_points=_existing(path, spec.truth.points, "truth.points") if spec.truth else None,
+        robot_map=_robot_map(path, spec.robot_map),
     )
 
 
@@ -178,6 +192,7 @@ def write_tile(
     cell: dict[str, Any] | None = None,
     truth: dict[str, str] | None = None,
     classes: Mapping[int, int] | None = None,
+    robot_map: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write `folder/tile.toml` and return its path.
 
@@ -203,7 +218,9 @@ def write_tile(
         body["cell"] = cell
     if classes:
         body["classes"] = {str(code): name_of(meant) for code, meant in classes.items()}
-    body["cameras"] = [_camera_entry(key, camera) for key, camera in cameras.items()]
+    if robot_map:
+        body["robot_map"] = dict(robot_map)
+    body["cameras"] = [camera_entry(key, camera) for key, camera in cameras.items()]
     body["photos"] = [
         {k: (v.tolist() if isinstance(v, np.ndarray) else v) for k, v in photo.items() if v is not None}
         for photo in photos
@@ -257,7 +274,12 @@ def _cloud(tile: Path, name: str) -> Path:
     return path
 
 
-def _camera(tile: Path, entry: CameraEntry) -> Camera:
+def camera_of(tile: Path, entry: CameraEntry) -> Camera:
+    """The camera of an entry in the file `tile`.
+
+    Raises:
+        InputError: a number is out of range.
+    """
     where = f"camera `{entry.id}`"
     if min(entry.size) < 1:
         raise InputError(
@@ -287,7 +309,8 @@ def _camera(tile: Path, entry: CameraEntry) -> Camera:
     return Camera(entry.model, *entry.size, *entry.focal, *entry.centre, entry.distortion)
 
 
-def _camera_entry(key: str, camera: Camera) -> dict[str, Any]:
+def camera_entry(key: str, camera: Camera) -> dict[str, Any]:
+    """The table of a camera in a `tile.toml`."""
     entry: dict[str, Any] = {"id": key, "model": camera.model, "size": [camera.width, camera.height]}
     if camera.model != "equirectangular":
         entry |= {"focal": [camera.fx, camera.fy], "centre": [camera.cx, camera.cy]}
@@ -337,6 +360,17 @@ def _cell(entry: CellEntry | None, unit: float) -> Cell | None:
 
     neighbours = {name: metres(seed) for name, seed in entry.neighbours.items()}
     return Cell(metres(entry.seed), neighbours, entry.buffer)
+
+
+def _robot_map(tile: Path, entry: RobotMapEntry | None) -> RobotMap | None:
+    if entry is None:
+        return None
+    T = np.array(entry.T_world_map)
+    R = T[:3, :3]
+    if not np.isfinite(T).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        raise InputError(tile, "field `robot_map.T_world_map`: not a rigid transform", "Import the map again")
+    source = None if entry.source_mesh is None else _existing(tile, entry.source_mesh, "robot_map.source_mesh")
+    return RobotMap(entry.scene, entry.spacing, entry.unit, T, source)
 
 
 def _trajectory(tile: Path, spec: TileFile, frame: Frame) -> Trajectory | None:

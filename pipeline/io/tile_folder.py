@@ -12,14 +12,30 @@ from typing import Literal
 from scan2sim.pipeline.core.errors import InputError, SettingError, from_os_error
 from scan2sim.pipeline.io import file_checks
 
-MARKER_FILE = {"tile": "tile.toml", "survey": "survey.toml", "world": "metadata.json", "page": "view.js"}
+MARKER_FILE = {"tile": "tile.toml", "survey": "survey.toml", "world": "metadata.json", "page": "view.js",
+               "set of variations": "variations.json"}  # fmt: skip
 """File by which a folder of each kind is recognized."""
 
 
+Kind = Literal["tile", "survey", "world", "page", "set of variations"]
+
+
+def check_target(out: Path, overwrite: bool = False, kind: Kind = "tile") -> None:
+    """Check that `tile_folder` may create a folder, before a long computation.
+
+    Raises:
+        SettingError: `out` is a file, or a folder that isn't empty and may not be overwritten.
+    """
+    if out.exists() and not out.is_dir():
+        raise SettingError(out, "is a file, not a folder", "Choose another folder")
+    if out.is_dir() and any(out.iterdir()) and not overwrite:
+        raise SettingError(out, "exists and is not empty", "Choose a new folder, or replace it with --overwrite")
+    if out.is_dir() and any(out.iterdir()) and not (out / MARKER_FILE[kind]).is_file():
+        raise SettingError(out, f"is not a {kind}, so it is not overwritten", f"Choose a new folder, or a {kind}'s")
+
+
 @contextmanager
-def tile_folder(
-    out: Path, overwrite: bool = False, kind: Literal["tile", "survey", "world", "page"] = "tile"
-) -> Iterator[Path]:
+def tile_folder(out: Path, overwrite: bool = False, kind: Kind = "tile") -> Iterator[Path]:
     """Temporary folder beside `out`: renamed to `out` when the block succeeds, deleted when it raises.
 
     Args:
@@ -28,16 +44,11 @@ def tile_folder(
         kind: kind of content; only folders with its marker file are overwritten.
 
     Raises:
-        SettingError: `out` is a file, or a folder that isn't empty and may not be overwritten.
+        SettingError: as `check_target`.
         SpaceError: the disk is full or not writable.
     """
     out = Path.cwd() / out
-    if out.exists() and not out.is_dir():
-        raise SettingError(out, "is a file, not a folder", "Choose another folder")
-    if out.is_dir() and any(out.iterdir()) and not overwrite:
-        raise SettingError(out, "exists and is not empty", "Choose a new folder, or replace it with --overwrite")
-    if out.is_dir() and any(out.iterdir()) and not (out / MARKER_FILE[kind]).is_file():
-        raise SettingError(out, f"is not a {kind}, so it is not overwritten", f"Choose a new folder, or a {kind}'s")
+    check_target(out, overwrite, kind)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))

@@ -17,8 +17,9 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -39,6 +40,8 @@ REMEDIES = {
 KITTI_RATE_HZ = 10.0  # KITTI's cameras: 10 poses per second
 MAX_COORDINATE_M = 1e9
 """Plausibility limit: no position is farther from the origin of a CRS."""
+QuaternionOrder = Literal["xyzw", "wxyz"]
+QUATERNIONS_HELP = "Order of the trajectory's quaternions: xyzw as documented, or wxyz."
 Lines = list[tuple[int, list[str]]]  # line number in the file, from 1 on, and cells
 
 
@@ -79,6 +82,37 @@ def read(
             path, kind, number, "its time is not after that of the previous line", "Sort by time, without duplicates"
         )
     return trajectory if ordered else _select(trajectory, order)
+
+
+def read_local(path: Path, crs: str, quaternions: QuaternionOrder = "xyzw") -> tuple[Trajectory, Frame]:
+    """Read a trajectory, local to a frame with its origin near the first pose.
+
+    Args:
+        path: trajectory file.
+        crs: CRS of its positions.
+        quaternions: order of its quaternions.
+
+    Raises:
+        InputError: it can't be read, has no rotations, or `crs` is not a projected CRS.
+    """
+    file_checks.check(path)
+    known, unit = crs_io.common(path, crs, None, (), ())
+    poses = read(path, Frame(known, unit=unit))
+    if poses.rotations is None:
+        raise InputError(path, "has only positions", "Give a trajectory with rotations: time,x,y,z,qx,qy,qz,qw")
+    x, y, z = np.floor(poses.positions[0]).tolist()
+    frame = Frame(known, (x, y, z), unit)
+    local = Trajectory(poses.times, poses.positions - frame.origin, poses.rotations, poses.unsure)
+    return (local if quaternions == "xyzw" else reordered(local, "wxyz")), frame
+
+
+def reordered(path: Trajectory, order: QuaternionOrder) -> Trajectory:
+    """The trajectory whose quaternions were read in the other order than `order`, read in `order`."""
+    from scipy.spatial.transform import Rotation
+
+    assert path.rotations is not None
+    rolled = np.roll(Rotation.from_matrix(path.rotations).as_quat(), -1 if order == "wxyz" else 1, axis=1)
+    return replace(path, rotations=Rotation.from_quat(rolled).as_matrix())
 
 
 def write(path: Path, trajectory: Trajectory, frame: Frame | None = None) -> None:

@@ -57,6 +57,29 @@ def with_links(view: View, folder: Path, index: int) -> View:
     return replace(view, photo=link(view.photo, "photos"), mask=link(view.mask, "masks") if view.mask else None)
 
 
+def save_linked(out: Path, views: Sequence[View], held_out: Sequence[bool]) -> dict[str, Path]:
+    """Write the outputs of a step that passes on views: `views`, with links to photos and masks, and `cameras`.
+
+    Steps that need poses and lenses alone read `cameras`: it stays the same when a photo changes.
+
+    Args:
+        out: the step's output folder.
+        views: photos below `out/views` stay where they are, others are linked into it.
+        held_out: as in `save`.
+    """
+    folder = out / "views"
+    folder.mkdir(exist_ok=True)
+    linked = [
+        replace(view, photo=view.photo.relative_to(folder))
+        if view.photo.is_relative_to(folder)
+        else with_links(view, folder, i)
+        for i, view in enumerate(views)
+    ]
+    save(folder / "views.json", linked, held_out)
+    save(out / "cameras.json", [replace(view, photo=Path(view.photo.name), mask=None) for view in linked], held_out)
+    return {"views": folder, "cameras": out / "cameras.json"}
+
+
 def save(path: Path, views: Sequence[View], held_out: Sequence[bool] = ()) -> None:
     """Write views, and which of them are held out from texturing (default: none)."""
     held = list(held_out) or [False] * len(views)
@@ -65,10 +88,14 @@ def save(path: Path, views: Sequence[View], held_out: Sequence[bool] = ()) -> No
 
 
 def load(path: Path) -> tuple[View, ...]:
-    """Read the views that `save` wrote, in order; photo paths are relative to the file, links are followed."""
+    """Read the views that `save` or `save_linked` wrote, in order, from the file or its folder.
+
+    Photo paths are relative to the file, links are followed.
+    """
+    folder = path if path.is_dir() else path.parent
 
     def absolute(file: Path) -> Path:
-        return (path.parent / file).resolve()
+        return (folder / file).resolve()
 
     views = (from_json(row) for row in _rows(path))
     return tuple(replace(v, photo=absolute(v.photo), mask=absolute(v.mask) if v.mask else None) for v in views)
@@ -80,6 +107,7 @@ def load_held_out(path: Path) -> tuple[bool, ...]:
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:
+    path = path / "views.json" if path.is_dir() else path
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, json.JSONDecodeError) as error:

@@ -195,7 +195,7 @@ class Start:
     Attributes:
         position: position of its frame, world metres.
         angles: roll, pitch and yaw (fixed axes x, y, z), radians.
-        by: what its heading follows: "lane", "road" or "path".
+        by: what its heading follows: "lane", "road" or "path"; "floor": it is in free space.
     """
 
     position: Vector
@@ -215,7 +215,7 @@ ROBOT = Robot(
         Link("camera_link", Box((0.04, 0.12, 0.04)), (0.09, 0.0, 0.58), 0.2, BLACK),
         Link("lidar_link", Cylinder(0.05, 0.08, "z"), (0.05, 0.0, 0.68), 0.8, BLACK),
     ),
-    camera=Camera("camera_link", 0.021, 640, 480, radians(80.0), 0.05, 200.0, 15.0),
+    camera=Camera("camera_link", 0.021, 640, 480, radians(80.0), 0.05, 1000.0, 15.0),
     lidar=Lidar("lidar_link", 900, 16, radians(-15.0), radians(15.0), 0.3, 100.0, 0.01, 10.0),
     imu_rate=100.0,
     speed=2.0,

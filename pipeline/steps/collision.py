@@ -17,6 +17,7 @@ from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.tile_cell import TileCell
 from scan2sim.pipeline.core.types import F32, U8, Frame, Mesh, PointCloud
 from scan2sim.pipeline.core.voronoi_cell import Cell
+from scan2sim.pipeline.geometry.rectilinear_solids import is_rectilinear
 from scan2sim.pipeline.geometry.surface_distance import deviation, statistics
 
 MAX_GROUND_POINTS = 1_000_000  # points of the cloud that the ground is fitted to
@@ -24,7 +25,11 @@ MAX_TRIANGLES = 200_000  # limit that also includes what the tile borders need
 GROUND_FRACTION = 0.6  # largest part of the triangles that the ground gets
 MAX_TRIANGLES_PER_M2 = 10  # smaller triangles would follow the points' noise
 CLASS_NEIGHBOURS = 9  # nearest points that vote for a triangle's class
-SURFACE_CLASS = {"building": CODE["building"], "vegetation": CODE["high_vegetation"], "vehicle": CODE["vehicle"]}
+SURFACE_CLASS = {
+    "building": CODE["building"], "vegetation": CODE["high_vegetation"], "vehicle": CODE["vehicle"],
+    "furniture": CODE["furniture"],
+}  # fmt: skip
+"""Class of each surface beside the ground; ceilings don't collide."""
 
 
 class CollisionParams(Params):
@@ -49,9 +54,9 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
     The ground (`terrain`) is decimated, and its heights are fitted to the points of `cloud` (scanned ground points;
     optional): it is smooth, and nearer to the measurement than the visual mesh. `building` and `vehicle` (and
     `vegetation`, if enabled) share the remaining triangles. Open edges on borders with other tiles are kept vertex for
-    vertex; all others are simplified. Street furniture is not simplified, so that its poles and trunks can be replaced
-    by cylinders (`pipeline.geometry.cylinders`), unless it takes more than half the budget. If neither ground nor
-    building has a face, plants collide, with a warning.
+    vertex; all others are simplified. Ceilings don't collide. Street furniture is not simplified, so that its poles
+    and trunks can be replaced by cylinders (`pipeline.geometry.cylinders`), unless it takes more than half the budget.
+    If neither ground nor building has a face, plants collide, with a warning.
 
     File: `mesh`, with a class code per face (ground: class of the nearest points). Metrics in metres: `ground_m`,
     height differences between the cloud and the ground; `deviation_m`, from the visual meshes to the collision mesh.
@@ -63,7 +68,7 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
     from scan2sim.pipeline.geometry.cylinders import split_cylinders
     from scan2sim.pipeline.tiling.borders.open_edges import on_border
 
-    meshes = {group: Mesh.load(inputs[group]) for group in SURFACES if group in inputs}
+    meshes = {group: Mesh.load(inputs[group]) for group in SURFACES if group in inputs and group != "ceiling"}
     frame = next(iter(meshes.values())).frame
     cell = params.context.cell if params.context else None
     points = _ground_points(inputs, params.seed)
@@ -156,7 +161,9 @@ def _walls(surfaces: Sequence[Mesh], budget: int, cell: Cell | None) -> list[Mes
 
 
 def _triangles_needed(mesh: Mesh) -> int:
-    """Number of triangles that represent a surface well enough."""
+    """Number of triangles that represent a surface well enough; slabs and boxes need all that they have."""
+    if is_rectilinear(mesh):
+        return len(mesh)
     return max(100, round(MAX_TRIANGLES_PER_M2 * float(mesh.face_area.sum())))
 
 
@@ -216,4 +223,4 @@ def _height_errors(ground: Mesh, points: F32) -> dict[str, float]:
     return statistics(np.abs(above)) if len(above) else {}
 
 
-COLLISION = Step("collision", 3, collision, CollisionParams)
+COLLISION = Step("collision", 4, collision, CollisionParams)

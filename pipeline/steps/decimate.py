@@ -10,10 +10,14 @@ from pydantic import Field
 from scan2sim.pipeline.core.parameters import Name
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import Mesh
+from scan2sim.pipeline.geometry.coarse_surface import coarse_faces
+
+COARSE_SHARE_MAX = 0.2
+"""Largest number of triangles of coarse surface over that of all others; they come in addition to the target."""
 
 
 class TileBorder(Context):
-    """Whether open borders must not be simplified, even if that exceeds the target: where tiles meet."""
+    """Whether open borders must not be simplified, even if that exceeds the target: where tiles or classes meet."""
 
     keep_border: bool = False
 
@@ -23,6 +27,7 @@ class DecimateParams(Params):
 
     Attributes:
         target: number of triangles; D3.2: 100 K for terrain and buildings, 300 K for vegetation; 50 K for vehicles.
+            Coarse surface (`photo_coverage.uncovered`) comes in addition, up to 20 %.
         backend: simplification library, "fast_simplification" or "pymeshlab"; modules of `pipeline/decimation/`.
     """
 
@@ -35,7 +40,7 @@ def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) 
     """Simplify `mesh` by edge collapse to the target, preserving borders (of tiles and classes).
 
     `furniture` (optional) is added unsimplified, within the target; its faces keep their classes, all other faces then
-    get class 0.
+    get class 0. Points of `cloud` and `uncovered` (optional) show which part is coarse.
 
     If the border alone exceeds the target, it is simplified as well (unless `keep_border`), with a warning.
 
@@ -46,17 +51,20 @@ def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) 
 
     mesh = Mesh.load(inputs["mesh"])
     furniture = Mesh.load(inputs["furniture"]) if "furniture" in inputs else None
-    target = params.target - len(furniture or ())
+    coarse = int(coarse_faces(mesh, inputs).sum())
+    detailed = min(params.target, len(mesh) - coarse)
+    allowed = detailed + min(coarse, round(COARSE_SHARE_MAX * detailed)) if coarse else params.target
+    target = allowed - len(furniture or ())
     small, warnings, border_kept = simplify(mesh, target, backend=params.backend), [], True
     if len(small) > target * 1.05 and params.context.keep_border:
-        warnings.append(f"{len(small):,} triangles instead of {params.target:,}: tile borders can't be simplified")
+        warnings.append(f"{len(small):,} triangles instead of {allowed:,}: common borders can't be simplified")
     elif len(small) > target * 1.05:
         warnings.append(f"the border alone needs {len(small):,} triangles: it was simplified too, to {params.target:,}")
         small, border_kept = simplify(small, target, keep_border=False, backend=params.backend), False
     if furniture is not None and len(furniture):
         small = with_furniture(small, furniture)
     small.save(out / "mesh.npz")
-    metrics = {"faces_in": len(mesh), "faces": len(small), "target": params.target, "border_kept": border_kept}
+    metrics = {"faces_in": len(mesh), "faces": len(small), "target": allowed, "border_kept": border_kept}
     return Done({"mesh": out / "mesh.npz"}, metrics, warnings)
 
 
@@ -85,7 +93,7 @@ def can_decimate(params: DecimateParams) -> None:
 
 DECIMATE = Step(
     "decimate",
-    2,
+    3,
     decimate,
     DecimateParams,
     class_defaults={"vegetation": {"target": 300_000}, "vehicle": {"target": 50_000}},

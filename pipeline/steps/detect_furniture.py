@@ -82,4 +82,4 @@ def heights(ground: F32, xyz: F32) -> F32:
     return (xyz[:, 2] - smooth[raster.at(xyz)]).astype(np.float32)
 
 
-DETECT_FURNITURE = Step("detect_furniture", 1, detect_furniture, DetectFurnitureParams, side_product=True)
+DETECT_FURNITURE = Step("detect_furniture", 3, detect_furniture, DetectFurnitureParams)

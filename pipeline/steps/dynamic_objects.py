@@ -13,15 +13,10 @@ from scan2sim.pipeline.core.parameters import Coordinate
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, Bools, Frame, PointCloud, Trajectory
 from scan2sim.pipeline.io.file_checks import link_or_copy
+from scan2sim.pipeline.lidar.sweeps import SCAN_WINDOW_S, scanner_origins
 
-SCAN_WINDOW_S = 0.1
-"""Duration of one turn of most spinning scanners."""
-MAX_PATH_GAP_S = 1.0
-"""Longest gap in the path (or three times the median interval) over which the position is interpolated."""
 MOVING_MAX_HEIGHT_M = 4.0
 """Height above the path beyond which nothing is moving: lorries are no higher above the ground."""
-AIRBORNE_RANGE_M = 60.0
-"""Median range from which a scanner is airborne: its rays don't cross a location from several sides."""
 MIN_REVISITED_FRACTION = 0.1
 """Minimum fraction of points whose voxel was crossed by rays at `votes` moments; below, rays decide almost nothing."""
 MOVING_FRACTION_WARNING = 0.2
@@ -74,7 +69,7 @@ def dynamic_objects(inputs: Inputs, params: DynamicObjectsParams, out: Path, rep
     volume = own = None
     if path is not None:
         report(0.1, "ego vehicle")
-        origins, why = _origins(cloud, path)
+        origins, why = scanner_origins(cloud, path)
         if not why.startswith("the scanner is airborne"):
             volume = swept_volume(cloud.xyz, path)
             own = in_swept_volume(cloud.xyz, volume)
@@ -131,31 +126,6 @@ def _untouched(cloud: Path, out: Path, why: str, metrics: dict[str, object] | No
     PointCloud(Frame(), none, none.astype(np.uint8), none, np.zeros(0, np.uint8), np.zeros(0)).save(moving)
     np.save(out / "dropped.npy", np.zeros(0, np.uint8))
     return Done({"cloud": file, "moving": moving, "dropped": out / "dropped.npy"}, metrics or {"rays": why})
-
-
-def _origins(cloud: PointCloud, path: Trajectory) -> tuple[F64, str]:
-    """Scanner positions (N, 3) at each point's time, NaN where unknown; and the reason if rays can't be used, or ""."""
-    if cloud.time is None:
-        return np.zeros((0, 3)), "the points have no times"
-    known = np.isfinite(path.times)
-    times, positions = path.times[known], path.positions[known]
-    if len(times) < 2:
-        return np.zeros((0, 3)), "the path has no times"
-    origins = np.stack([np.interp(cloud.time, times, positions[:, k]) for k in range(3)], axis=1)
-    after = np.clip(np.searchsorted(times, cloud.time), 1, len(times) - 1)
-    span = np.diff(times)
-    max_gap = max(MAX_PATH_GAP_S, 3 * float(np.median(span)))
-    unknown = span[after - 1] > max_gap
-    unknown &= np.minimum(np.abs(cloud.time - times[after - 1]), np.abs(times[after] - cloud.time)) > SCAN_WINDOW_S
-    unknown |= (cloud.time < times[0] - SCAN_WINDOW_S) | (cloud.time > times[-1] + SCAN_WINDOW_S)
-    origins[unknown] = np.nan
-    if unknown.all():
-        return origins, "path and points don't overlap in time"
-    sample = slice(None, None, max(1, len(cloud) // 100_000))
-    ranges = np.linalg.norm(cloud.xyz[sample] - origins[sample], axis=1)
-    if np.nanmedian(ranges) > AIRBORNE_RANGE_M:
-        return origins, f"the scanner is airborne: points are {np.nanmedian(ranges):.0f} m away"
-    return origins, ""
 
 
 def _moved(

@@ -62,7 +62,7 @@ def furniture(inputs: Inputs, params: FurnitureParams, out: Path, report: Report
         faces += len(mesh)
     files |= write_lists(out, cloud.frame.crs, [_row(detection, cloud.frame) for detection in own])
     lists = {
-        "sign_panels": [plate.to_json() for detection in own for plate in detection.plates],
+        "sign_panels": [panel.to_json() for detection in own for panel in detection.panels],
         "neighbour_poles": [detection.foot.tolist() for detection in others if detection.kind != "trunk"],
     }
     for name, rows in lists.items():
@@ -128,9 +128,9 @@ def _row(detection: Detection, frame: Frame) -> dict[str, Any]:
     row |= {"height_m": round(detection.height, 2), "radius_m": round(detection.stem.thickness, 3)}
     if detection.arm is not None:
         row["heading_deg"] = round(float(np.degrees(np.arctan2(*detection.arm.direction))) % 360, 1)
-    if detection.plates:
-        row |= sign_panel_columns(max(detection.plates, key=lambda p: p.width * p.height))
+    if detection.panels:
+        row |= sign_panel_columns(max(detection.panels, key=lambda p: p.width * p.height))
     return row
 
 
-FURNITURE = Step("furniture", 4, furniture, FurnitureParams, side_product=True)
+FURNITURE = Step("furniture", 6, furniture, FurnitureParams)

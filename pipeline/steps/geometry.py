@@ -115,4 +115,4 @@ def truth_error(mesh: Mesh, truth: Mesh, group: str, samples: int, *, any_class:
     return float(np.mean(distances(points, truth.moved_to(mesh.frame) if any_class else same)))
 
 
-GEOMETRY = Step("geometry", 4, geometry, GeometryParams, side_product=True)
+GEOMETRY = Step("geometry", 4, geometry, GeometryParams)

@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.parameters import Focal, Pixels
 from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
-from scan2sim.pipeline.importers import sweeps as io
+from scan2sim.pipeline.importers import sweeps
+from scan2sim.pipeline.io import trajectory_check
+from scan2sim.pipeline.io.calibration import camera_of_photos, photo_extrinsics, read_extrinsics
+from scan2sim.pipeline.io.rig import RIG, read_rig
+from scan2sim.pipeline.pose_check.check import check_photos
 
 
-class SweepsParams(io.PlacementParams):
+class SweepsParams(sweeps.PlacementParams):
     """How sweeps are registered, and photos are added."""
 
     camera: str = Field(
@@ -45,32 +50,49 @@ def build_tile(
     link: bool = False,
     overwrite: bool = False,
     name: str | None = None,
+    conventions: bool = True,
 ) -> Path:
     """Build the tile in the folder `out`; returns its `tile.toml`.
 
     Args:
-        inputs: `sweeps` and `poses`; optional `extrinsics`, `times`, `photos`, `photo_times`, `mask`, and `camera`, a
-            file with the photos' camera.
+        inputs: `sweeps` and `poses`; optional `extrinsics`, `times`, `photos` (a folder of photos, or of a rig of
+            cameras), `photo_times`, `mask`, `camera`, a file with the photos' camera, and `trajectory_check`, the
+            folder of a check of the poses.
         params: settings.
         warn, report, link, overwrite, name: see `pipeline.importers.sweeps.import_sweeps`.
+        conventions: look for usual mistakes in the photos' poses; without, only for offsets.
 
     Raises:
         ScanError: as `pipeline.importers.sweeps.import_sweeps`.
     """
     extrinsics, photos = inputs.get("extrinsics"), inputs.get("photos")
-    pictures = None
-    if photos is not None:
+    pictures = list[sweeps.PhotoInput]()
+    is_rig = photos is not None and (photos / RIG).is_file()
+    if photos is not None and is_rig:
+        for one in read_rig(photos):
+            T = one.T_camera_scanner
+            T = np.linalg.inv(T).astype(np.float64) if params.invert_extrinsics else T
+            pictures.append(sweeps.PhotoInput(photos / one.id, one.camera, extrinsics=T, id=one.id, subfolder=True))
+    elif photos is not None:
         file = inputs.get("camera")
-        camera = io.camera_of_photos(
+        camera = camera_of_photos(
             photos, model="auto" if file else params.camera, focal=params.focal, centre=params.centre, file=file
         )
-        beside = None if extrinsics is None else io.photo_extrinsics(extrinsics, photos)
-        pictures = io.PhotoInput(photos, camera, inputs.get("photo_times"), inputs.get("mask"), beside)
-    return io.import_sweeps(
+        beside = None if extrinsics is None else photo_extrinsics(extrinsics, photos)
+        pictures.append(sweeps.PhotoInput(photos, camera, inputs.get("photo_times"), inputs.get("mask"), beside))
+    tile = sweeps.import_sweeps(
         inputs["sweeps"], inputs["poses"], out, params, photos=pictures, times=inputs.get("times"),
-        extrinsics=None if extrinsics is None else io.read_extrinsics(extrinsics), link=link, overwrite=overwrite,
+        extrinsics=None if extrinsics is None else read_extrinsics(extrinsics), checked="trajectory_check" in inputs,
+        link=link, overwrite=overwrite,
         name=name, warn=warn, report=report,
     )  # fmt: skip
+    if photos is not None:
+        report(1.0, "checking the photos against the cloud")
+        for warning in check_photos(tile, conventions=conventions):
+            warn(warning)
+    if "trajectory_check" in inputs:
+        trajectory_check.copy(inputs["trajectory_check"], tile.parent)
+    return tile
 
 
-IMPORT_SWEEPS = Step("import_sweeps", io.VERSION, import_sweeps, SweepsParams)
+IMPORT_SWEEPS = Step("import_sweeps", sweeps.VERSION, import_sweeps, SweepsParams)

@@ -1,4 +1,4 @@
-"""Photo coverage step: removes points that no photo shows well and that are far from the scanner's path."""
+"""Photo coverage step: separates points that no photo shows well and that are far from the scanner's path."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.core.classes import GROUPS, group_of
+from scan2sim.pipeline.core.classes import GROUPS, colour_of, group_of
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.tile_cell import ThinnedCloud
 from scan2sim.pipeline.core.types import F64, Bools, PointCloud, Trajectory, View
+from scan2sim.pipeline.geometry.coarse_surface import coarse_spacing
 from scan2sim.pipeline.geometry.voxel_grid import sample, voxel_groups
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.file_checks import link_or_copy
@@ -28,32 +29,40 @@ CLOSING_CELL_M, CLOSING_GAP_M = 0.5, 2.0
 """Uncovered ground between covered ground is kept up to this width (the far side of a car); closing on a grid."""
 AERIAL_PATH_HEIGHT_M = 15.0
 """A path higher above the ground is not one of a street vehicle: all points are kept."""
+NORMAL_NEIGHBOURS = 12
+BORDER_STRIP_M = 0.5
+"""Distance from the border of a tile within which there is no coarse surface: sparse points don't define where two
+meshes meet."""
 
 
 class PhotoCoverageParams(Params):
-    """Which points are kept.
+    """Which points get a detailed surface, and what becomes of the others.
 
     Attributes:
         limit: "auto": points with a ground sample distance of at most two voxels in a photo, and points beside the
-            path; a number: points within this distance of the path in metres, seen or not; "off": all points.
+            path; a number: points within this distance of the path in metres, seen or not, and no others; "off": all.
+        uncovered: with "auto": other points get a coarse surface, which a lidar sees ("coarse"), or none ("remove").
     """
 
     limit: Literal["auto", "off"] | Annotated[float, Field(ge=1, le=10_000)] = "auto"
+    uncovered: Literal["coarse", "remove"] = "coarse"
     context: ThinnedCloud = ThinnedCloud()
 
 
 def photo_coverage(inputs: Inputs, params: PhotoCoverageParams, out: Path, report: Report) -> Done:
-    """Remove the points of `cloud` that no photo of `views` covers well enough and that are far from the `path`.
+    """Separate points of `cloud` that no photo of `views` covers well enough and that are far from the `path`.
 
-    Held-out photos are ignored. Ground in between and margins of walls and plants are kept (`CLOSING_GAP_M`,
-    `MARGIN_M`). A tile without photos or path keeps its whole cloud, as does one with an aerial path
-    (`AERIAL_PATH_HEIGHT_M`). Metrics: `points` kept, `left_out` points removed, their approximate surface
-    `left_out_m2`, and `far_m`, distance from the path to the farthest kept point.
+    Held-out photos are ignored. Ground in between and margins of walls and plants count as covered (`CLOSING_GAP_M`,
+    `MARGIN_M`), as does the whole cloud of a tile without photos or path, or with an aerial path
+    (`AERIAL_PATH_HEIGHT_M`). Files: `cloud`, the covered points; `uncovered`, the others, thinned, with normals.
+    Metrics: `points` covered, `left_out` others, their approximate surface `left_out_m2`, points `coarse` that they
+    were thinned to, and `far_m`, distance from the path to the farthest covered point.
     """
     file = out / "cloud.npz"
     if "path" not in inputs or (params.limit == "auto" and "views" not in inputs):
         link_or_copy(inputs["cloud"], file)
-        return Done({"cloud": file}, {"left_out": 0})
+        _empty(PointCloud.load(inputs["cloud"])).save(out / "uncovered.npz")
+        return Done({"cloud": file, "uncovered": out / "uncovered.npz"}, {"left_out": 0, "coarse": 0})
     report(0.0, "reading")
     cloud, path = PointCloud.load(inputs["cloud"]), Trajectory.load(inputs["path"])
     cell_m = MAX_GSD_VOXELS * params.context.voxel
@@ -72,21 +81,29 @@ def photo_coverage(inputs: Inputs, params: PhotoCoverageParams, out: Path, repor
         used = [v for v, out_ in zip(views, held, strict=True) if v.camera.model != "orthographic" and not out_]
         kept = _covered(thin, used, path, cell_m, report)
     report(0.9, "writing")
-    if kept.all():
+    voxel = np.empty(len(cloud), np.int64)
+    voxel[order] = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(order))))
+    covered = kept[voxel]
+    is_coarse = ~covered if params.limit == "auto" and params.uncovered == "coarse" else np.zeros(len(cloud), bool)
+    coarse = _coarse(cloud, is_coarse, path, coarse_spacing(params.context.voxel))
+    if params.context.cell is not None:
+        world = coarse.xyz[:, :2] + np.asarray(coarse.frame.origin)[:2]
+        coarse = coarse.take(np.abs(params.context.cell.cell.outside(world)) > BORDER_STRIP_M)
+    coarse.save(out / "uncovered.npz")
+    if covered.all():
         link_or_copy(inputs["cloud"], file)
     else:
-        voxel = np.empty(len(cloud), np.int64)
-        voxel[order] = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(order))))
-        cloud = cloud.take(kept[voxel])
+        cloud = cloud.take(covered)
         cloud.save(file)
     metrics = {
         "points_in": len(order),
         "points": len(cloud),
         "left_out": len(order) - len(cloud),
         "left_out_m2": round(float((~kept).sum() * cell_m**2)),
+        "coarse": len(coarse),
         "far_m": round(_farthest(thin, kept, path.positions), 1),
     }
-    return Done({"cloud": file}, metrics)
+    return Done({"cloud": file, "uncovered": out / "uncovered.npz"}, metrics)
 
 
 def _covered(thin: PointCloud, views: Sequence[View], path: Trajectory, cell_m: float, report: Report) -> Bools:
@@ -111,6 +128,38 @@ def _covered(thin: PointCloud, views: Sequence[View], path: Trajectory, cell_m: 
     return kept
 
 
+def _coarse(cloud: PointCloud, chosen: Bools, path: Trajectory, size: float) -> PointCloud:
+    """One of the `chosen` (N,) points of the cloud per class and voxel of `size` metres, with normals.
+
+    Points that no photo coloured get the colour of their class in this cloud, shaded by intensity.
+    """
+    from scan2sim.pipeline.geometry.normals import oriented_normals
+    from scan2sim.pipeline.lidar.intensity import has_intensity
+    from scan2sim.pipeline.lidar.intensity_colours import intensity_colours
+
+    assert cloud.classification is not None
+    code = cloud.classification
+    parts = [sample(cloud.take(chosen & (code == one)), size) for one in np.unique(code[chosen])]
+    thin = PointCloud.join(
+        [oriented_normals(part, NORMAL_NEIGHBOURS, path) for part in parts if len(part) > NORMAL_NEIGHBOURS]
+        or [_empty(cloud)]
+    )
+    if cloud.rgb is None or not (coloured := cloud.coloured).any() or thin.coloured.all():
+        return thin
+    tint = colour_of().copy()
+    for one in np.unique(code[chosen]):
+        if (own := coloured & (code == one)).any():
+            tint[one] = np.median(cloud.rgb[own], axis=0)
+    assert thin.rgb is not None and thin.classification is not None
+    other = intensity_colours(thin, path, tint) if has_intensity(thin) else tint[thin.classification]
+    return replace(thin, rgb=np.where(thin.coloured[:, None], thin.rgb, other))
+
+
+def _empty(cloud: PointCloud) -> PointCloud:
+    """The cloud without its points, with normals."""
+    return replace(cloud.take(slice(0)), normal=np.empty((0, 3), np.float32))
+
+
 def _path_height(thin: PointCloud, path: F64) -> float:
     """Median height of the path above the ground below it, metres."""
     from scipy.spatial import cKDTree
@@ -130,4 +179,4 @@ def _farthest(thin: PointCloud, kept: Bools, path: F64) -> float:
     return float(distance.max())
 
 
-PHOTO_COVERAGE = Step("photo_coverage", 1, photo_coverage, PhotoCoverageParams)
+PHOTO_COVERAGE = Step("photo_coverage", 3, photo_coverage, PhotoCoverageParams)

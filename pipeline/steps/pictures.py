@@ -14,6 +14,7 @@ from pydantic import Field
 from scan2sim.pipeline.core.classes import SURFACES, colour_of
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, U8, Camera, Mesh, PointCloud, Trajectory
+from scan2sim.pipeline.io import sky
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.images.album import Album
@@ -26,6 +27,8 @@ GROUP_RGB = {
     "building": (206, 160, 132),
     "vegetation": (126, 172, 104),
     "vehicle": (120, 140, 190),
+    "ceiling": (220, 220, 214),
+    "furniture": (120, 148, 176),
 }
 SEEN_RGB = {255: (92, 160, 96), 128: (222, 170, 70), 64: (196, 84, 76)}
 DRIVER_EYE_HEIGHT_M = 1.6  # above the ground
@@ -61,7 +64,7 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
     path = Trajectory.load(inputs["path"]) if "path" in inputs else None
     groups = [g for g in SURFACES if g in inputs]
     plain = render.Renderer([render.Body(Mesh.load(inputs[f"decimate.{g}"]), colour=GROUP_RGB[g]) for g in groups])
-    world = render.Renderer([render.textured(inputs[g]) for g in groups])
+    world = render.Renderer([render.textured(inputs[g]) for g in groups], sky.read(inputs.get("sky")))
     low, high = bounds([body.mesh.vertices for body in world.bodies if len(body.mesh)] or [cloud.xyz])
     camera = render.pinhole(params.width, params.width * 9 // 16, field=75)
     shown = np.concatenate([body.mesh.vertices for body in world.bodies if len(body.mesh)] or [cloud.xyz])
@@ -122,8 +125,7 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
 
     views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
     coverage = [
-        world.view(view.camera.scaled(COVERAGE_WIDTH_PX / view.camera.width), view.T_world_cam).hit.mean()
-        for view in views
+        world.covers(view.camera.scaled(COVERAGE_WIDTH_PX / view.camera.width), view.T_world_cam) for view in views
     ]
     for i in _compared(held, coverage, params.compared):
         report(0.7 + 0.3 * i / max(1, len(views)), views[i].name)
@@ -264,4 +266,4 @@ def _compared(held: Sequence[bool], coverage: Sequence[float], count: int) -> li
     return sorted(range(len(held)), key=lambda i: (not held[i], -coverage[i]))[:count]
 
 
-PICTURES = Step("pictures", 4, pictures, PicturesParams, side_product=True, memory=(1.3, 3))
+PICTURES = Step("pictures", 5, pictures, PicturesParams, memory=(1.3, 3))

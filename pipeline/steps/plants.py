@@ -125,4 +125,4 @@ def crowns(xyz: F32, ground: F32, params: PlantsParams) -> tuple[F64, npt.NDArra
     return found, np.maximum(crown[cell[:, 0], cell[:, 1]], 0) - 1
 
 
-PLANTS = Step("plants", 3, plants, PlantsParams, side_product=True)
+PLANTS = Step("plants", 3, plants, PlantsParams)

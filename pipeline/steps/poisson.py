@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -12,91 +15,180 @@ from scan2sim.pipeline.core.errors import StepError
 from scan2sim.pipeline.core.parameters import Seconds
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.tile_cell import ThinnedCloud
-from scan2sim.pipeline.core.types import F32, I32, Mesh, PointCloud
+from scan2sim.pipeline.core.types import F32, F64, Mesh, PointCloud
+from scan2sim.pipeline.tiling.surface_blocks import Block, Surface, crop, partition, stitch
 
 MIN_POINTS = 50
 CUBE_SCALE = 1.02  # the octree's cube must be a little larger than the cloud
 MAX_DEPTH = 16
-ALIGNMENT_CELLS = 128  # octrees aligned to multiples of this many finest cells agree where tiles overlap
+ALIGNMENT_CELLS = 128  # octrees aligned to multiples of this many finest cells agree where tiles and blocks overlap
+MARGIN_CELLS = 48  # by which a block's points extend beyond it: 2.4 m at a voxel of 10 cm
 
 
 class PoissonParams(Params):
     """Resolution of the surface.
 
     Attributes:
-        depth: depth of the octree; unset: chosen so that the finest cell is half a voxel for any length of the tile
-            (11, as in D3.2, at 100 m and 10 cm).
+        cell: finest cell of the octree, in voxels. The ground of synthetic streets is more accurate with cells of a
+            voxel than with the half voxels of D3.2, in half the time.
+        depth: depth of the octree; unset: chosen so that the finest cell has the size `cell` for any length of the tile
+            (11, as in D3.2, at 100 m and 5 cm).
         point_weight: weight of the points' positions (screening); 0 is the unscreened method.
-        threads: 1 is reproducible; 0 (all cores) is up to 1.4 times faster, but results differ from run to run.
+        block_points: number of points up to which the surface is reconstructed as a whole, by default any; larger
+            clouds are divided into blocks that don't have more points, if they extend far enough.
+        threads: number of blocks that are solved at the same time, each on one thread; 0: one per core. The result is
+            the same with any number.
         timeout: seconds after which the reconstruction is aborted.
-        context: the voxel size of the input points, and the tile's cell. With a cell, the octree is aligned to a
-            multiple of its cells in the world, so that surfaces of neighbouring tiles agree where they overlap.
+        context: the voxel size of the input points, and the tile's cell.
     """
 
+    cell: float = Field(0.5, ge=0.1, le=10)
     depth: int | None = Field(None, ge=4, le=MAX_DEPTH)
     point_weight: float = Field(4.0, ge=0, le=1000)
-    threads: int = Field(1, ge=0, le=256)
+    block_points: int = Field(1_000_000_000, ge=1000, le=1_000_000_000)
+    threads: int = Field(0, ge=0, le=256)
     timeout: Seconds = 3600.0
     context: ThinnedCloud = ThinnedCloud()
 
 
 def poisson(inputs: Inputs, params: PoissonParams, out: Path, report: Report) -> Done:
-    """Reconstruct `cloud`, with synthesized points (`synthesized`, optional), in a child process.
+    """Reconstruct `cloud`, with synthesized and with uncovered, thinned points (optional), in child processes.
 
-    After a crash, it is retried on one thread, then one octree level coarser.
+    Large clouds are reconstructed in blocks that overlap. After a crash, each block of the process is retried, then one
+    octree level coarser.
 
     Raises:
         StepError: all three attempts failed.
     """
-    from scan2sim.pipeline.core import sandbox
-
     cloud = PointCloud.load(inputs["cloud"])
-    if "synthesized" in inputs and len(cloud) and len(made := PointCloud.load(inputs["synthesized"])):
-        cloud = PointCloud.join([cloud, made])
+    for name in ("synthesized", "uncovered"):
+        if name in inputs and (len(cloud) or name == "uncovered") and len(more := PointCloud.load(inputs[name])):
+            cloud = PointCloud.join([cloud, more]) if len(cloud) else more
     if len(cloud) < MIN_POINTS:
         empty = Mesh(cloud.frame, np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty(0, np.float32))
         empty.save(out / "mesh.npz")
         warnings = [f"only {len(cloud)} points: no surface"] if len(cloud) else []
         return Done({"mesh": out / "mesh.npz"}, {"points": len(cloud), "faces": 0}, warnings)
 
-    xyz, normal = cloud.xyz, cloud.normal
-    if params.context.cell:  # two points in opposite corners define the cube; surface near them is removed by `trim`
-        xyz = np.concatenate([xyz, bounds(xyz, cloud.frame.origin, ALIGNMENT_CELLS * params.context.voxel / 2)])
-        normal = np.concatenate([normal, np.tile(np.array([0, 0, 1], np.float32), (2, 1))])
-    length = float((xyz.max(axis=0) - xyz.min(axis=0)).max())
-    depth, scale = octree(length, params.context.voxel / 2) if params.depth is None else (params.depth, 1.1)
-    cell = scale * length / 2**depth
-    summary = (
-        f"{length:.0f} m at a voxel of {params.context.voxel * 100:.0f} cm: depth {depth}, cell {cell * 100:.1f} cm"
-    )
+    summary, depth, cell, problems = _blocks(cloud, params)
     report(0.0, summary)
-    warnings = []
-    # attempts: as configured; on one thread (several race on some inputs); one level coarser
-    for threads, coarser in ((params.threads, 0), (1, 0), (1, 1)):
-        try:
-            vertices, faces, density = sandbox.call(
-                "scan2sim.pipeline.steps.poisson:reconstruct",
-                *(xyz, normal, depth - coarser, scale, params.point_weight, threads),
-                timeout=params.timeout,
-            )
-            break
-        except StepError as error:
-            warnings.append(f"Poisson at depth {depth - coarser}, threads {threads or 'all'}: {error.cause}")
-    else:
-        raise StepError(inputs["cloud"], "; ".join(warnings), "Use a smaller tile, or --set poisson.depth=9")
-    Mesh(cloud.frame, vertices, faces, density).save(out / "mesh.npz")
+    surfaces, coarser, warnings = _solve(problems, params, inputs["cloud"], report)
+    surface = surfaces[0] if len(surfaces) == 1 else stitch(surfaces, [p.block for p in problems], cell)
+    Mesh(cloud.frame, *surface).save(out / "mesh.npz")
     metrics = {
         "points": len(cloud),
-        "faces": len(faces),
+        "faces": len(surface.faces),
         "depth": depth - coarser,
         "cell_m": round(cell * 2**coarser, 4),
+        "blocks": len(problems),
+        "summary": summary,
     }
-    return Done({"mesh": out / "mesh.npz"}, metrics | {"summary": summary}, warnings)
+    return Done({"mesh": out / "mesh.npz"}, metrics, warnings)
 
 
-def bounds(xyz: F32, origin: tuple[float, float, float], block: float) -> F32:
+class Problem(NamedTuple):
+    """The points of one block, with those around it, and its octree.
+
+    Attributes:
+        block: part of the plane whose surface is wanted.
+        xyz, normal: (N, 3) points and their normals.
+        depth, scale: depth of the octree, and side of its cube over the largest extent of the points.
+        finer: depth of a finest cell in the octree of the whole cloud minus that in this octree.
+    """
+
+    block: Block
+    xyz: F32
+    normal: F32
+    depth: int
+    scale: float
+    finer: int = 0
+
+
+def _blocks(cloud: PointCloud, params: PoissonParams) -> tuple[str, int, float, list[Problem]]:
+    """Description, depth and finest cell in metres of the whole octree, and the blocks.
+
+    The blocks depend on nothing but the points and the settings of the surface. Octrees are aligned to multiples of
+    their cells in the world, so that surfaces agree where tiles or blocks overlap; and to the voxels, where cells are
+    as large. Other octrees enclose the points.
+    """
+    assert cloud.normal is not None
+    voxel = params.context.voxel
+    length = float((cloud.xyz.max(axis=0) - cloud.xyz.min(axis=0)).max())
+    cell = voxel * params.cell if params.depth is None else 1.1 * length / 2**params.depth
+    depth, scale = octree(length, cell) if params.depth is None else (params.depth, 1.1)
+    unit = voxel / 2 if params.depth is None else cell
+    # cells as large as voxels agree with them; voxels are centred at multiples of their height
+    offset = (0, 0, voxel / 2 if params.depth is None and params.cell >= 1 else 0)
+    grid, margin = ALIGNMENT_CELLS * unit, MARGIN_CELLS * unit
+    origin = np.asarray(cloud.frame.origin) + offset
+    walls = -np.mod(origin[:2], grid)
+    blocks = partition(cloud.xyz[:, :2].astype(np.float64), grid, walls, margin, params.block_points)
+    summary = f"{length:.0f} m at a voxel of {voxel * 100:.0f} cm: depth {depth}, cell {cell * 100:.1f} cm"
+    if len(blocks) == 1 and params.context.cell is None and cell < voxel:
+        return summary, depth, cell, [Problem(Block(), cloud.xyz, cloud.normal, depth, scale)]
+    problems = []
+    for block in blocks:
+        own = block.inside(cloud.xyz[:, :2], margin)
+        xyz, normal = cloud.xyz[own], cloud.normal[own]
+        # two points in opposite corners define the cube; surface near them is cropped, or removed by `trim`
+        corners = bounds(xyz, origin, grid)
+        xyz, normal = np.concatenate([xyz, corners]), np.concatenate([normal, np.array([[0, 0, 1]] * 2, np.float32)])
+        own_depth, scale = octree(float((corners[1] - corners[0]).max()), cell)
+        problems.append(Problem(block, xyz, normal, own_depth, scale, depth - own_depth))
+    return f"{summary}, {len(blocks)} blocks" if len(blocks) > 1 else summary, depth, cell, problems
+
+
+def _solve(
+    problems: list[Problem], params: PoissonParams, path: Path, report: Report
+) -> tuple[list[Surface], int, list[str]]:
+    """Surfaces, the levels by which the coarsest is coarser than asked for, and warnings.
+
+    Blocks whose process fails are repeated one by one, then one level coarser.
+    """
+    from scan2sim.pipeline.core import sandbox
+
+    def solve(numbers: list[int], coarser: int) -> list[Surface] | StepError:
+        chosen = [problems[i]._replace(depth=problems[i].depth - coarser) for i in numbers]
+        try:
+            target = "scan2sim.pipeline.steps.poisson:reconstruct"
+            found: list[Surface] = sandbox.call(target, chosen, params.point_weight, timeout=params.timeout, threads=1)
+        except StepError as error:
+            return error
+        return found
+
+    processes = min(params.threads or cores(), len(problems))
+    shares: list[list[int]] = [[] for _ in range(processes)]
+    for i in sorted(
+        range(len(problems)), key=lambda i: -len(problems[i].xyz)
+    ):  # the largest first, to the least loaded
+        min(shares, key=lambda share: sum(len(problems[k].xyz) for k in share)).append(i)
+    surfaces: dict[int, Surface] = {}
+    warnings, levels = [], 0
+    with ThreadPoolExecutor(processes) as pool:
+        attempts = [
+            (share, result) for share, result in zip(shares, pool.map(lambda s: solve(s, 0), shares), strict=True)
+        ]
+    for share, result in attempts:
+        if not isinstance(result, StepError):
+            surfaces |= zip(share, result, strict=True)
+            report(len(surfaces) / len(problems))
+            continue
+        warnings.append(f"Poisson at depth {problems[share[0]].depth}: {result.cause}")
+        for i in share:
+            for coarser in (0, 1):
+                result = solve([i], coarser)
+                if not isinstance(result, StepError):
+                    surfaces[i], levels = result[0], max(levels, coarser)
+                    break
+                warnings.append(f"Poisson at depth {problems[i].depth - coarser}: {result.cause}")
+            else:
+                raise StepError(path, "; ".join(warnings), "Use a smaller tile, or --set poisson.depth=9")
+    return [surfaces[i] for i in range(len(problems))], levels, warnings
+
+
+def bounds(xyz: F32, origin: F64, block: float) -> F32:
     """Opposite corners (2, 3) of a cube around the points, centred at a multiple of `block` in the world."""
-    low, high = xyz.min(axis=0) + np.asarray(origin), xyz.max(axis=0) + np.asarray(origin)
+    low, high = xyz.min(axis=0) + origin, xyz.max(axis=0) + origin
     middle = np.rint((low + high) / 2 / block) * block
     half = np.maximum(high - middle, middle - low).max()
     return np.array([middle - half - origin, middle + half - origin], np.float32)
@@ -108,19 +200,33 @@ def octree(length: float, cell: float) -> tuple[int, float]:
     return min(depth, MAX_DEPTH), max(CUBE_SCALE, cell * 2**depth / length)
 
 
-def reconstruct(
-    xyz: F32, normal: F32, depth: int, scale: float, point_weight: float, threads: int
-) -> tuple[F32, I32, F32]:
-    """Screened Poisson by Open3D: vertices (V, 3), faces (F, 3), density (V,) as octree depth; 0 threads: all cores."""
+def cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def reconstruct(problems: list[Problem], point_weight: float) -> list[Surface]:
+    """Screened Poisson surface of each block by Open3D, on one thread: several threads give results that vary."""
     import open3d as o3d
 
-    points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz.astype(np.float64)))
-    points.normals = o3d.utility.Vector3dVector(normal.astype(np.float64))
-    mesh, density = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
-        points, depth=depth, scale=scale, point_weight=point_weight, n_threads=threads or -1
-    )
-    vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.triangles, np.int32)
-    return vertices, faces, np.asarray(density, np.float32)
+    surfaces = []
+    for problem in problems:
+        points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(problem.xyz.astype(np.float64)))
+        points.normals = o3d.utility.Vector3dVector(problem.normal.astype(np.float64))
+        mesh, density = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+            points, depth=problem.depth, scale=problem.scale, point_weight=point_weight, n_threads=1
+        )
+        vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.triangles, np.int32)
+        surface = Surface(vertices, faces, np.asarray(density, np.float32) + problem.finer)
+        surfaces.append(surface if problem.block == Block() else crop(surface, problem.block))
+    return surfaces
 
 
-POISSON = Step("poisson", 1, poisson, PoissonParams, per_class=True, memory=(0.4, 70))
+POISSON = Step(
+    "poisson",
+    3,
+    poisson,
+    PoissonParams,
+    per_class=True,
+    memory=(0.4, 35.0 * min(max(cores(), 2), 6)),  # GB of a block's process, of which one runs on each core
+)

@@ -56,7 +56,7 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     folder.mkdir()
     packed = out / "world.glb"
     shown = [group_surface(group, surface) for group, surface in surfaces.items()]
-    glb.write(packed, shown, GlbParams(jpeg_quality=params.jpeg_quality, glb_bare=True), scale=scale)
+    glb.write(packed, shown, GlbParams(jpeg_quality=params.jpeg_quality, glb_bare=True, reflectance=False), scale=scale)
     report(0.7, "camera poses")
     script = folder / "world.js"
     script.write_bytes(CALLBACK + b'("' + base64.b64encode(packed.read_bytes()) + b'");\n')
@@ -97,4 +97,4 @@ def _position_and_target(pose: F64, low: F64) -> list[list[float]]:
     return [position.round(3).tolist(), (position + ahead * distance).round(3).tolist()]
 
 
-PREVIEW = Step("preview", 3, preview, PreviewParams, side_product=True)
+PREVIEW = Step("preview", 3, preview, PreviewParams)

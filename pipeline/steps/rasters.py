@@ -119,4 +119,4 @@ def rasters(inputs: Inputs, params: RastersParams, out: Path, report: Report) ->
     return Done({"rasters": folder}, metrics, [local] if frame.crs == LOCAL else [])
 
 
-RASTERS = Step("rasters", 2, rasters, RastersParams, side_product=True, memory=(1.3, 3))
+RASTERS = Step("rasters", 2, rasters, RastersParams, memory=(1.3, 3))

@@ -113,4 +113,4 @@ def _why_none(ways: Sequence[F64], on: Bools, drawn: Sequence[object]) -> dict[s
     return {"none": "no road line was detected" if ways else "the path is not on a road"}
 
 
-ROADS = Step("roads", 3, roads, RoadsParams, side_product=True)
+ROADS = Step("roads", 3, roads, RoadsParams)

@@ -2,23 +2,37 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from scan2sim.pipeline.core.classes import CODE, GROUPS, NOISE, UNKNOWN, classified_codes, group_of, name_of
+from scan2sim.pipeline.core.classes import (
+    CODE,
+    GROUPS,
+    INDOOR_GROUPS,
+    NOISE,
+    UNKNOWN,
+    classified_codes,
+    group_of,
+    name_of,
+)
 from scan2sim.pipeline.core.errors import DataError
-from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import Bools, PointCloud
+from scan2sim.pipeline.dynamic_objects.instance_boxes import in_boxes
 
-REST, FURNITURE, VEHICLE = -1, len(GROUPS) + 1, len(GROUPS) + 2
-"""Numbers of further parts beside those of the groups: no surface, street furniture, parked vehicle."""
+REST, FURNITURE, VEHICLE, CEILING = -1, len(GROUPS) + 1, len(GROUPS) + 2, len(GROUPS) + 3
+"""Numbers of further parts beside those of the groups: no surface, furniture, parked vehicle, ceiling."""
 UNCLASSIFIED_FRACTION_WARNING = 0.01
 """Fraction of unclassified points above which the step warns."""
-VEHICLE_BOX_MARGIN_M = 0.4
-"""Margin around a vehicle's box for points of the class vehicle: mirrors, antennas."""
+
+
+class SplitContext(Context):
+    """Whether the cloud is a robot's map of rooms: ceilings and furniture then have surfaces."""
+
+    indoor: bool = False
 
 
 class SplitParams(Params):
@@ -26,12 +40,15 @@ class SplitParams(Params):
 
     Attributes:
         vegetation: "mesh" (as in D3.2), "locations" (a list of plants with positions instead of a mesh), or "both".
-        vehicles: "remove", or "keep" parked vehicles as a separate surface (requires a scanner's path); moving
+        vehicles: parked vehicles: "remove"; "keep" as a separate surface; or "assets", simple closed models of their
+            size and colour in their place (step `vehicle_models`). The latter two require a scanner's path. Moving
             vehicles are always removed.
+        context: whether the cloud shows rooms.
     """
 
     vegetation: Literal["mesh", "locations", "both"] = "mesh"
-    vehicles: Literal["remove", "keep"] = "remove"
+    vehicles: Literal["remove", "keep", "assets"] = "remove"
+    context: SplitContext = SplitContext()
 
 
 def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Done:
@@ -40,8 +57,9 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     Signs and poles belong to `building`, except for points of street furniture listed in `furniture_points` (optional
     .npz with `index` and `own`): they become `furniture`, or `rest` if the object belongs to a neighbouring tile. To
     keep vehicles, `instances` (GeoJSON) lists their boxes: points of class vehicle in boxes of parked ones become
-    `vehicle`. Other vehicles, people, wires and unclassified points are not meshed (`rest`) but remain occluders;
-    noise is removed.
+    `vehicle`. Of a map of rooms, `ceiling` and `furniture` are parts of their own. Other vehicles, people, wires and
+    unclassified points are not meshed (`rest`) but remain occluders; noise is removed. Points that photos don't cover
+    (`uncovered`, optional) become `uncovered_terrain`, `uncovered_building` and `uncovered_vegetation`.
 
     Raises:
         DataError: no point belongs to any surface.
@@ -60,7 +78,10 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
     elif params.vehicles == "keep":
         warnings.append("split.vehicles=keep has no effect: it needs instances.detect and a scanner's path")
     number: dict[str, int] = {name: i for i, name in enumerate(GROUPS)}
-    number |= {"furniture": FURNITURE, "vehicle": VEHICLE}
+    number |= {"furniture": FURNITURE, "vehicle": VEHICLE, "ceiling": CEILING}
+    for indoor_group in INDOOR_GROUPS if params.context.indoor else ():
+        group[cloud.classification == CODE[indoor_group]] = number[indoor_group]
+        parts.append(indoor_group)
     for i, name in enumerate(parts):
         report(i / len(parts), name)
         chosen = (group == REST) & ~np.isin(cloud.classification, NOISE) if name == "rest" else group == number[name]
@@ -68,14 +89,20 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
         part.save(out / f"{name}.npz")
         files[name] = out / f"{name}.npz"
         counts[name] = len(part)
-        if name in GROUPS and len(part) == 0:
+        if name in (GROUPS[:2] if params.context.indoor else GROUPS) and len(part) == 0:
             warnings.append(f"no point is of class {name}: the world will have no {name}")
-    if sum(counts[name] for name in GROUPS) == 0:
+    if sum(counts[name] for name in counts if name != "rest") == 0:
         raise DataError(
             "classes",
             "no point belongs to terrain, building or vegetation",
             "Check the cloud's classes, or classify it again with --set segment.overwrite=true",
         )
+    if "uncovered" in inputs:
+        coarse = PointCloud.load(inputs["uncovered"])
+        assert coarse.classification is not None
+        for i, name in enumerate(GROUPS):
+            files[f"uncovered_{name}"] = out / f"uncovered_{name}.npz"
+            coarse.take(group_of()[coarse.classification] == i).save(files[f"uncovered_{name}"])
     codes, numbers = np.unique(cloud.classification, return_counts=True)
     classes = {name_of(int(c)): int(n) for c, n in zip(codes, numbers, strict=True)}
     unmeshed = {int(c): int(n) for c, n in zip(codes, numbers, strict=True) if not classified_codes()[c]}
@@ -93,21 +120,13 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
 
 def parked(cloud: PointCloud, instances: Path) -> Bools:
     """(N,) bool, True for points of class vehicle in the box of a parked vehicle in `instances` (GeoJSON)."""
-    inside = np.zeros(len(cloud), bool)
-    vehicle = np.flatnonzero(cloud.classification == CODE["vehicle"])
-    for feature in json.loads(instances.read_text(encoding="utf-8"))["features"]:
-        properties = feature["properties"]
-        if properties["moved"] or properties["kind"] == "person":
-            continue
-        ring = np.array(feature["geometry"]["coordinates"][0][:4])
-        corners = cloud.frame.to_local(np.column_stack([ring, np.full(4, properties["ground_z"])]))
-        offset = cloud.xyz[vehicle] - corners.mean(axis=0)
-        own = np.abs(offset[:, 2] - properties["height_m"] / 2) < properties["height_m"] / 2 + VEHICLE_BOX_MARGIN_M
-        for side in (corners[0] - corners[1], corners[1] - corners[2]):
-            length = np.linalg.norm(side)
-            own &= np.abs(offset @ side) < length * (length / 2 + VEHICLE_BOX_MARGIN_M)
-        inside[vehicle[own]] = True
+
+    def still(instance: Mapping[str, Any]) -> bool:
+        return not instance["moved"] and instance["kind"] != "person"
+
+    inside = np.asarray(cloud.classification == CODE["vehicle"])
+    inside[inside] = in_boxes(cloud.xyz[inside], cloud.frame, instances, still)
     return inside
 
 
-SPLIT = Step("split", 5, split, SplitParams)
+SPLIT = Step("split", 6, split, SplitParams)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,10 +10,7 @@ from scan2sim.pipeline.core.parameters import Distance
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.tile_cell import ThinnedCloud
 from scan2sim.pipeline.core.types import F32, Mesh, PointCloud
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
-
+from scan2sim.pipeline.geometry.coarse_surface import coarse_spacing
 
 REFERENCE_VOXEL_M = 0.10  # voxel size that the limits are made for (D3.2)
 FULL_SPACING_VOXELS = 1.4  # mean distance to six neighbours on a surface with a point in every voxel
@@ -24,7 +20,7 @@ class TrimParams(Params):
     """Limits for faces, in metres.
 
     The limits are for a cloud with a point in every 10 cm voxel, as from a mobile scanner. For sparser clouds or larger
-    voxels, they are scaled up in proportion (metric `widened`).
+    voxels, they are scaled up in proportion (metric `widened`); so they are near uncovered points, which are thinned.
 
     Attributes:
         max_edge: maximum edge length of a triangle; D3.2: 50 cm for terrain (closes holes), 25 cm otherwise.
@@ -39,7 +35,11 @@ class TrimParams(Params):
 
 
 def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
-    """Keep the triangles of `mesh` that are supported by points of `cloud` or by `synthesized` points (optional)."""
+    """Keep the triangles of `mesh` that are supported by points of `cloud`, or by optional points.
+
+    These are `synthesized` ones, and `uncovered` ones, which are thinned: near those, the limits are scaled up, except
+    for the distance, which is at most their spacing.
+    """
     from scipy.spatial import cKDTree
 
     mesh, cloud = Mesh.load(inputs["mesh"]), PointCloud.load(inputs["cloud"])
@@ -47,21 +47,26 @@ def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
         mesh.save(out / "mesh.npz")
         return Done({"mesh": out / "mesh.npz"}, {"faces_in": 0, "faces": 0})
     assert mesh.density is not None
-    tree = cKDTree(cloud.xyz)
-    widened = max(1.0, _spacing(tree, cloud.xyz) / (FULL_SPACING_VOXELS * REFERENCE_VOXEL_M))
-    if "synthesized" in inputs:
-        tree = cKDTree(np.concatenate([cloud.xyz, PointCloud.load(inputs["synthesized"]).xyz]))
+    voxel = params.context.voxel
+    widened = max(1.0, _spacing(cloud.xyz) / (FULL_SPACING_VOXELS * REFERENCE_VOXEL_M))
+    report(0.1, "distances")
+    distance, scale = np.full(len(mesh.vertices), np.inf), np.full(len(mesh.vertices), widened)
+    coarse = coarse_spacing(voxel)
+    limits = dict.fromkeys(("cloud", "synthesized"), (params.max_distance * widened, widened))
+    limits["uncovered"] = max(params.max_distance * widened, coarse), max(widened, coarse / REFERENCE_VOXEL_M)
+    for name, (max_distance, own_scale) in limits.items():
+        if name in inputs and len(points := PointCloud.load(inputs[name])):
+            to_points, _ = cKDTree(points.xyz).query(mesh.vertices, distance_upper_bound=max_distance, workers=-1)
+            scale[to_points < distance] = own_scale
+            distance = np.minimum(distance, to_points)
     corners = mesh.corners
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    long = edge > params.max_edge * widened
+    long = edge > params.max_edge * scale[mesh.faces].max(axis=1)
     # a density of d means that the samples fill cells of half a voxel times 2^(finest depth - d)
-    spacing = params.context.voxel / 2 * 2.0 ** (mesh.density.max() - mesh.density)
-    sparse = (spacing > params.max_spacing * widened)[mesh.faces].any(axis=1)
-    report(0.3, "distances")
-    keep = mesh.keep(~(long | sparse))
-    distance, _ = tree.query(keep.vertices, distance_upper_bound=params.max_distance * widened, workers=-1)
-    far = ~np.isfinite(distance)[keep.faces].all(axis=1)
-    keep = keep.keep(~far)
+    spacing = voxel / 2 * 2.0 ** (mesh.density.max() - mesh.density)
+    sparse = (spacing > params.max_spacing * scale)[mesh.faces].any(axis=1)
+    far = ~np.isfinite(distance)[mesh.faces].all(axis=1) & ~long & ~sparse
+    keep = mesh.keep(~(long | sparse | far))
     keep.save(out / "mesh.npz")
     metrics = {
         "faces_in": len(mesh),
@@ -74,16 +79,19 @@ def trim(inputs: Inputs, params: TrimParams, out: Path, report: Report) -> Done:
     return Done({"mesh": out / "mesh.npz"}, metrics)
 
 
-def _spacing(tree: cKDTree, xyz: F32) -> float:
+def _spacing(xyz: F32) -> float:
     """Median over points of the mean distance to six neighbours, metres, from a sample of the points."""
-    sample = xyz[:: max(1, len(xyz) // 20_000)]
-    distance, _ = tree.query(sample, k=min(7, len(xyz)), workers=-1)
+    from scipy.spatial import cKDTree
+
+    if len(xyz) < 2:
+        return 0.0
+    distance, _ = cKDTree(xyz).query(xyz[:: max(1, len(xyz) // 20_000)], k=min(7, len(xyz)), workers=-1)
     return float(np.median(distance[:, 1:].mean(axis=1)))
 
 
 TRIM = Step(
     "trim",
-    2,
+    3,
     trim,
     TrimParams,
     class_defaults={"terrain": {"max_edge": 0.5, "max_distance": 0.5, "max_spacing": 1.6}},

@@ -50,7 +50,8 @@ class ViewsParams(Params):
 def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Done:
     """Check that photos can be opened, have the size of their camera, and see the cloud; skip those that don't.
 
-    Inputs are `photo.N` and `mask.N` by index of the view, and the cloud.
+    Inputs are `photo.N` and `mask.N` by index of the view, and the cloud. Outputs: `views` and `cameras`
+    (`pipeline.io.views.save_linked`).
 
     Raises:
         InputError: a photo's size differs from its camera's; no photo can be read at all.
@@ -72,11 +73,11 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
             sees_nothing.append(view.name)
         elif view.camera.model == "orthographic":
             try:
-                kept.append(_crop(view, points, out / "photos", i))
+                kept.append(_crop(view, points, out / "views" / "photos", i))
             except InputError as error:
                 warnings.append(f"{view.photo} {error.cause}: {NOT_USED}")
         else:
-            kept.append(views_io.with_links(view, out, i))
+            kept.append(view)
     if sees_nothing and not kept:
         raise DataError(
             inputs["photo.0"].parent,
@@ -93,10 +94,10 @@ def views(inputs: Inputs, params: ViewsParams, out: Path, report: Report) -> Don
     held = held_out(kept, params.hold_out)
     if params.hold_out and kept and not any(held):
         warnings.append(f"{len(kept)} photos are too few to hold out every {params.hold_out}th: none is held out")
-    views_io.save(out / "views.json", kept, held)
+    files = views_io.save_linked(out, kept, held)
     # links: moving the tile breaks them, which only rebuilds this step, not the results that depend on the photos
     metrics = {"photos": len(params.context.poses), "usable": len(kept), "held_out": sum(held)}
-    return Done({"views": out / "views.json"}, metrics, warnings)
+    return Done(files, metrics, warnings)
 
 
 def _crop(view: View, points: F32, folder: Path, index: int) -> View:
@@ -109,12 +110,12 @@ def _crop(view: View, points: F32, folder: Path, index: int) -> View:
     low = np.clip(np.floor(uv.min(axis=0)) - ORTHOPHOTO_MARGIN_PX, 0, size - 1).astype(int)
     high = np.clip(np.ceil(uv.max(axis=0)) + ORTHOPHOTO_MARGIN_PX, low + 1, size).astype(int)
     rgb = image.read_rgb(view.photo, (*low.tolist(), *high.tolist()))
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(exist_ok=True, parents=True)
     file = folder / f"{index:05d}_{view.photo.stem}.png"
     image.write(file, rgb)
     width, height = (high - low).tolist()
     part = replace(camera, width=width, height=height, cx=camera.cx - float(low[0]), cy=camera.cy - float(low[1]))
-    return replace(view, camera=part, photo=file.relative_to(folder.parent))
+    return replace(view, camera=part, photo=file)
 
 
 def held_out(views: Sequence[View], every: int) -> list[bool]:
@@ -164,4 +165,4 @@ def _sees(view: View, points: F32) -> bool:
     return bool(shown.any())
 
 
-VIEWS = Step("views", 2, views, ViewsParams)
+VIEWS = Step("views", 3, views, ViewsParams)

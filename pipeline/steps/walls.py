@@ -193,4 +193,4 @@ def _colour(building: PointCloud) -> F64:
     return np.median(building.rgb[steep], axis=0) if steep.sum() >= 100 else np.array(DEFAULT_WALL_RGB, np.float64)
 
 
-WALLS = Step("walls", 1, walls, WallsParams)
+WALLS = Step("walls", 2, walls, WallsParams)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,8 +12,9 @@ import numpy as np
 from scan2sim.pipeline.core.classes import classified_codes
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.parameters import Device, File, Fraction, Name, Voxel
+from scan2sim.pipeline.core.parts import NO_PARTS, Parts, file_digest
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.core.types import U8, PointCloud
+from scan2sim.pipeline.core.types import U8, PointCloud, View
 from scan2sim.pipeline.geometry.voxel_grid import sample
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
@@ -49,10 +51,10 @@ class LabelParams(Params):
     context: SegmentSettings = SegmentSettings()
 
 
-def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Done:
+def label(inputs: Inputs, params: LabelParams, out: Path, report: Report, parts: Parts = NO_PARTS) -> Done:
     """Classify every photo of `views`, with channels of `cloud` if the network takes them.
 
-    Nothing is done if the cloud keeps its own classes.
+    Nothing is done if the cloud keeps its own classes. Photos that an earlier run classified are not classified again.
 
     Folder: `labels`, with `<view index>.npy`: (h, w, C) uint8 probabilities by class of `segmentation.labels`, and
     `network.json`: name, checksum, licence and classes of the network.
@@ -71,20 +73,27 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report) -> Don
         )
     network = load(params.network, params.weights, params.device)
     classifier = Classifier(network, str(params.weights or network.info.name))
-    scan = scan_projector(cloud, params.size, report) if classifier.takes_channels else None
+    projector = cache(lambda: scan_projector(cloud, params.size, report) if classifier.takes_channels else None)
+    info = network.info
+    own = [info.name, info.sha256, *([file_digest(inputs["cloud"]), params.size] if classifier.takes_channels else [])]
     warnings = []
     for i, view in enumerate(views):
         report(0.2 + 0.8 * i / len(views), view.name)
         if view.camera.model == "orthographic":  # networks were trained on photos taken from the street
             continue
+
+        def classify(file: Path = folder / f"{i}.npy", view: View = view) -> list[Path]:
+            rgb, scan = image.read_photo(view), projector()
+            channels = scan.channels(view, classifier.size(view.camera)) if scan else None
+            np.save(file, classifier.probabilities(rgb, view.camera, channels))
+            return [file]
+
         try:
-            rgb = image.read_photo(view)
+            parts.provide(
+                folder, [*own, i, file_digest(view.photo), views_io.to_json(view, with_paths=False)], classify
+            )
         except InputError as error:
             warnings.append(f"{view.photo}: {error.cause}: not classified")
-            continue
-        channels = scan.channels(view, classifier.size(view.camera)) if scan else None
-        np.save(folder / f"{i}.npy", classifier.probabilities(rgb, view.camera, channels))
-    info = network.info
     about = {"network": info.name, "sha256": info.sha256, "licence": info.licence, "classes": classifier.classes}
     (folder / "network.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
     return Done(
@@ -122,4 +131,4 @@ def can_label(params: LabelParams) -> None:
         check(params.network, params.weights)
 
 
-LABEL = Step("label", 5, label, LabelParams, check=can_label, memory=(1.5, 3))
+LABEL = Step("label", 5, label, LabelParams, check=can_label, parts=True, memory=(1.5, 3))

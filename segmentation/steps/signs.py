@@ -184,4 +184,4 @@ def _ground_z(vertices: F32, position: F64) -> float:
     return float(vertices[np.hypot(*(vertices[:, :2] - position[:2]).T).argmin(), 2])
 
 
-SIGNS = Step("signs", 4, signs, SignsParams, side_product=True)
+SIGNS = Step("signs", 4, signs, SignsParams)

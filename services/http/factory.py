@@ -7,18 +7,18 @@
     factory.run(app, params, listening=print)
 
 `/health/live` and `/health/ready` are liveness and readiness probes, `/metrics` exports `app.state.registry` to
-Prometheus. Errors are JSON, {where, cause, remedy}, with the status of
-`pipeline.core.errors.EXIT_CODES`.
+Prometheus. Errors are JSON, {where, cause, remedy, error}, with the status of `pipeline.core.errors.EXIT_CODES`;
+`error` is the whole message, for clients of the Open Inference Protocol.
 """
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import hmac
 import logging
 import re
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +29,10 @@ from fastapi.responses import JSONResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Gauge, generate_latest
 from starlette.exceptions import HTTPException as StarletteHTTPException
+from starlette.requests import ClientDisconnect
 
 from scan2sim.pipeline.core.errors import ScanError, http_status, printable
+from scan2sim.services.http.bodies import Bodies, Receive
 from scan2sim.services.http.limits import LimitedEventLoop, raise_file_limit, request_in_progress
 from scan2sim.services.http.settings import ServerParams
 
@@ -43,11 +45,11 @@ PUBLIC_PATHS = ("/health/", "/pages/")
 MAX_BODY_BYTES = 2**20
 """Default limit of the size of a request's body."""
 MAX_CONCURRENT_REQUESTS = 256
-"""Further requests are rejected with status 503."""
+"""Requests whose bodies are complete; further ones are rejected with status 503."""
+HEALTH_PATHS = ("/health/",)
+"""Prefixes of the paths that are always served, whatever the number of requests."""
 PROTOCOL, TOKEN_PROTOCOL = "scan2sim", "token."
 """WebSocket subprotocols that the pages offer: the one that is spoken, and the prefix of the token in hexadecimal."""
-BODY_TIMEOUT_S = 30.0
-"""Longest pause between two parts of a request's body."""
 LOOPBACK_HOST = re.compile(r"(localhost|127(\.\d{1,3}){3}|\[::1\])(:\d+)?", re.IGNORECASE)
 """Valid Host headers of a server on loopback; others may be a DNS rebinding attack by another website."""
 SECURITY_HEADERS = {
@@ -60,7 +62,6 @@ SECURITY_HEADERS = {
 """Headers of every response: pages load resources only from here and can't be embedded in other pages."""
 
 Message = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 Check = Callable[[], bool]
 
@@ -72,7 +73,9 @@ def application(
     alive: Mapping[str, Check],
     ready: Mapping[str, Check] | None = None,
     public: tuple[str, ...] = (),
+    health: tuple[str, ...] = (),
     max_body_bytes: int = MAX_BODY_BYTES,
+    accepts: Callable[[str], bool] | None = None,
 ) -> FastAPI:
     """Create the application of a service, without the paths of the service itself.
 
@@ -82,14 +85,22 @@ def application(
         alive: liveness checks of its worker threads by name; a failure is permanent and requires a restart.
         ready: further checks for readiness.
         public: paths that need no token in addition to `PUBLIC_PATHS`: pages that hold no data.
+        health: prefixes of its health paths in addition to `HEALTH_PATHS`.
         max_body_bytes: limit of the size of a request's body.
+        accepts: whether a token is valid, for a service whose users have their own, instead of the token of `params`.
 
     Raises:
         InputError: the token can't be read.
     """
+    secret = params.secret()
     app = FastAPI(title=name, docs_url=None, redoc_url=None)
     app.add_middleware(
-        _Guard, secret=params.secret(), local=params.is_local(), public=public, max_body_bytes=max_body_bytes
+        _Guard,
+        accepts=accepts or (None if secret is None else partial(hmac.compare_digest, secret)),
+        local=params.is_local(),
+        public=public,
+        health=HEALTH_PATHS + health,
+        max_body_bytes=max_body_bytes,
     )
     app.add_exception_handler(ScanError, _scan_error_response)
     app.add_exception_handler(StarletteHTTPException, _http_error_response)
@@ -159,11 +170,18 @@ class _Guard:
     """ASGI middleware: security headers, access control, request limits, unexpected errors."""
 
     def __init__(
-        self, app: Any, *, secret: str | None, local: bool, public: tuple[str, ...], max_body_bytes: int
+        self,
+        app: Any,
+        *,
+        accepts: Callable[[str], bool] | None,
+        local: bool,
+        public: tuple[str, ...],
+        health: tuple[str, ...],
+        max_body_bytes: int,
     ) -> None:
-        self._app, self._local, self._public, self._max_body_bytes = app, local, public, max_body_bytes
-        self._requests = 0
-        self._authorization = None if secret is None else f"Bearer {secret}".encode()
+        self._app, self._local, self._public, self._health = app, local, public, health
+        self._bodies, self._requests = Bodies(max_body_bytes), 0
+        self._accepts = accepts
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
         with request_in_progress():
@@ -175,11 +193,7 @@ class _Guard:
         elif (rejection := self._rejection(scope)) is not None:
             await self._reject(rejection, scope, receive, send)
         elif scope["type"] == "http":
-            self._requests += 1
-            try:
-                await self._answer(scope, self._limited(receive), _with_headers(send))
-            finally:
-                self._requests -= 1
+            await self._receive(scope, receive, _with_headers(send))
         else:
             await self._app(scope, receive, send)
 
@@ -189,12 +203,10 @@ class _Guard:
         if _is_cross_origin(scope.get("method", "POST"), headers):  # a WebSocket has no method and may change state
             cause = "cross-origin request: the page is on another site"
             return _error_response(403, path, cause, "Use the service's own page, or a program")
-        if self._requests >= MAX_CONCURRENT_REQUESTS and not path.startswith("/health/"):
-            return _error_response(503, path, "too many concurrent requests", "Retry later")
         if path in self._public or path.startswith(PUBLIC_PATHS):
             return None
-        if self._authorization is not None:
-            if hmac.compare_digest(headers.get(b"authorization", b"") or _bearer(scope), self._authorization):
+        if self._accepts is not None:
+            if (token := sent_token(scope)) is not None and self._accepts(token):
                 return None
             response = _error_response(401, path, "requires a token", "Send the header Authorization: Bearer TOKEN")
             response.headers["WWW-Authenticate"] = "Bearer"
@@ -211,6 +223,25 @@ class _Guard:
         else:
             await rejection(scope, receive, _with_headers(send))
 
+    async def _receive(self, scope: Message, receive: Receive, send: Send) -> None:
+        """Receive the body of a request, then handle it."""
+        where = printable(scope["path"])
+        try:
+            async with self._bodies.receive(receive, dict(scope["headers"])) as body:
+                if self._requests >= MAX_CONCURRENT_REQUESTS and not scope["path"].startswith(self._health):
+                    raise HTTPException(503, "too many concurrent requests", {"Retry-After": "1"})
+                self._requests += 1
+                try:
+                    await self._answer(scope, _replayed(body, receive), send)
+                finally:
+                    self._requests -= 1
+        except HTTPException as error:
+            response = _error_response(error.status_code, where, str(error.detail), "Retry, or send less at once")
+            response.headers.update(error.headers or {})
+            await response(scope, receive, send)
+        except ClientDisconnect:
+            log.info("%s %s: the client has disconnected", scope["method"], where)
+
     async def _answer(self, scope: Message, receive: Receive, send: Send) -> None:
         begun = False
 
@@ -221,6 +252,8 @@ class _Guard:
 
         try:
             await self._app(scope, receive, send_and_note)
+        except ClientDisconnect:
+            raise
         except Exception:
             log.exception("%s %s", scope["method"], printable(scope["path"]))
             if begun:
@@ -228,23 +261,15 @@ class _Guard:
             response = _error_response(500, scope["path"], "internal error", "See the service's log")
             await response(scope, receive, send)
 
-    def _limited(self, receive: Receive) -> Receive:
-        """Limit the body's actual size, whatever its Content-Length is, and the time between its parts."""
-        received_bytes, complete = 0, False
 
-        async def limited() -> Message:
-            nonlocal received_bytes, complete
-            try:
-                message = await asyncio.wait_for(receive(), None if complete else BODY_TIMEOUT_S)
-            except TimeoutError:
-                raise HTTPException(408, f"no data for {BODY_TIMEOUT_S:g} s") from None
-            complete = not message.get("more_body", False)
-            received_bytes += len(message.get("body", b""))
-            if received_bytes > self._max_body_bytes:
-                raise HTTPException(413, f"the body is larger than {self._max_body_bytes} bytes")
-            return message
+def _replayed(body: bytes, receive: Receive) -> Receive:
+    """Return a received body as one message; later ones are those of the server."""
+    messages = iter([{"type": "http.request", "body": body, "more_body": False}])
 
-        return limited
+    async def replayed() -> Message:
+        return next(messages, None) or await receive()
+
+    return replayed
 
 
 def _is_cross_origin(method: str, headers: Mapping[bytes, bytes]) -> bool:
@@ -255,13 +280,19 @@ def _is_cross_origin(method: str, headers: Mapping[bytes, bytes]) -> bool:
     return origin.partition(b"://")[2] != headers.get(b"host", b"")
 
 
-def _bearer(scope: Message) -> bytes:
-    """Authorization header from a WebSocket's subprotocols: browsers can't set other headers of a WebSocket."""
+def sent_token(scope: Message) -> str | None:
+    """Token of a request, ASCII; None: it has none.
+
+    It is in the Authorization header, or in a WebSocket's subprotocols: browsers can't set a WebSocket's headers.
+    """
+    header = dict(scope["headers"]).get(b"authorization", b"").decode("latin-1")
+    if header.startswith("Bearer ") and header.isascii():
+        return str(header.removeprefix("Bearer "))
     for name in scope.get("subprotocols", ()):
         if name.startswith(TOKEN_PROTOCOL):
             with contextlib.suppress(ValueError):
-                return b"Bearer " + bytes.fromhex(name.removeprefix(TOKEN_PROTOCOL))
-    return b""
+                return bytes.fromhex(name.removeprefix(TOKEN_PROTOCOL)).decode("ascii")
+    return None
 
 
 def chosen_protocol(scope: Message) -> str | None:
@@ -282,7 +313,8 @@ def _with_headers(send: Send) -> Send:
 
 
 def _error_response(status: int, where: str, cause: str, remedy: str) -> JSONResponse:
-    return JSONResponse({"where": where, "cause": cause, "remedy": remedy}, status)
+    message = {"where": where, "cause": cause, "remedy": remedy, "error": f"{where}: {cause}. {remedy}"}
+    return JSONResponse(message, status)
 
 
 def _scan_error_response(_: Request, error: Exception) -> Response:
@@ -292,8 +324,10 @@ def _scan_error_response(_: Request, error: Exception) -> Response:
 
 def _http_error_response(request: Request, error: Exception) -> Response:
     assert isinstance(error, StarletteHTTPException)
-    path = printable(request.url.path)
-    return _error_response(error.status_code, path, str(error.detail), "/openapi.json lists the paths of this service")
+    remedy = "/openapi.json lists the paths of this service"
+    response = _error_response(error.status_code, printable(request.url.path), str(error.detail), remedy)
+    response.headers.update(error.headers or {})
+    return response
 
 
 def _validation_error_response(_: Request, error: Exception) -> Response:

@@ -42,9 +42,14 @@ class ServerParams(Params):
 
     @model_validator(mode="after")
     def _is_protected(self) -> Self:
-        protected = self.token is not None or self.certificate is not None
-        require_protection(self.host, protected=protected, options="--token FILE, or --certificate and --key")
+        require_protection(
+            self.host, protected=self.has_protection(), options="--token FILE, or --certificate and --key"
+        )
         return self
+
+    def has_protection(self) -> bool:
+        """Whether a token or a certificate is given."""
+        return self.token is not None or self.certificate is not None
 
     def secret(self) -> str | None:
         """Read the token; None: no token is required.

@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
 from scan2sim.services.monitoring.meter import Flow, Reading
 from scan2sim.services.transport.types import Endpoint
@@ -91,7 +91,7 @@ class Record(_Model):
         lost: None if no publisher numbers its messages.
         latency: mean over all received messages (of the window); None if no message has a source timestamp.
         clock_synchronised: whether NTP synchronises this machine's clock according to its kernel; None: unknown.
-        remarks: warnings for the user, such as incompatible QoS profiles or exceeded limits.
+        warnings: warnings for the user, such as incompatible QoS profiles or exceeded limits.
         dropped: records and events dropped so far because the outbox was full.
         dropped_by: the same for records and for each kind of events.
     """
@@ -128,7 +128,7 @@ class Record(_Model):
     cpu_percent: float = Field(alias="cpu percent")
     virtual_memory: dict[str, float] = Field(alias="virtual memory")
     disk_usage: list[float] = Field(alias="disk usage")
-    remarks: list[str] = []
+    warnings: list[str] = Field([], validation_alias=AliasChoices("warnings", "remarks"))  # earlier name
     dropped: int = Field(0, alias="dropped records")
     dropped_by: dict[str, int] = Field({}, alias="dropped by kind")
 

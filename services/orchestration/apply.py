@@ -13,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from scan2sim.pipeline.core.errors import ScanError, StepError
 from scan2sim.pipeline.core.step import Report
@@ -22,7 +21,7 @@ from scan2sim.services.orchestration.deployment import Deployment, ServiceEntry
 from scan2sim.services.orchestration.instance import OWNER_TAG, DesiredInstance, Instance, next_action
 from scan2sim.services.orchestration.lifecycle import WaitPolicy, find_owned, load_instance, reconcile
 from scan2sim.services.orchestration.lifecycle import find as find_by_id
-from scan2sim.services.orchestration.onboarding import onboard, record_of, tags_of
+from scan2sim.services.orchestration.onboarding import onboard, record_of
 from scan2sim.services.orchestration.osm import (
     FUNCTIONS,
     SERVICES,
@@ -31,6 +30,7 @@ from scan2sim.services.orchestration.osm import (
     collection_of,
 )
 from scan2sim.services.orchestration.package import Package, Packages
+from scan2sim.services.orchestration.records import PackageRecord
 from scan2sim.services.orchestration.settings import ApplyParams
 
 REQUEST_INTERVAL_S = 1.0
@@ -81,7 +81,7 @@ class DeploymentState:
     name: str
     packages: Mapping[str, Package]
     desired: Mapping[str, DesiredInstance]
-    records: Mapping[str, list[dict[str, Any]]]
+    records: Mapping[str, list[PackageRecord]]
     instances: Mapping[str, Instance]
     obsolete: Mapping[str, str]
 
@@ -109,19 +109,19 @@ def load_state(osm: Osm, requested: Deployment, folder: Path) -> DeploymentState
     packages = {f"{FUNCTIONS} {key}": one for key, one in functions.items()}
     packages |= {f"{SERVICES} {key}": one for key, one in services.items()}
     records = {
-        collection: [one for one in osm.packages(collection) if tags_of(one).get(OWNER_TAG) == requested.deployment]
+        collection: [one for one in osm.packages(collection) if one.tags.get(OWNER_TAG) == requested.deployment]
         for collection in (FUNCTIONS, SERVICES)
     }
     ours = [one for one in osm.instances() if Instance.of(one, ()).belongs_to(requested.deployment)]
-    ours.sort(key=lambda one: one.get("create-time", 0))
+    ours.sort(key=lambda one: one.created)
     instances: dict[str, Instance] = {}
     obsolete: dict[str, str] = {}
     for one in ours:
-        name = str(one.get("name"))
+        name = one.name
         if name in desired and name not in instances:
             instances[name] = load_instance(osm, one)
         else:
-            obsolete[name if name not in instances else f"{name} ({one['_id']})"] = str(one["_id"])
+            obsolete[name if name not in instances else f"{name} ({one.record})"] = one.record
     return DeploymentState(requested.deployment, packages, desired, records, instances, obsolete)
 
 
@@ -130,7 +130,7 @@ def plan(state: DeploymentState) -> list[Change]:
     changes = []
     for package in state.packages.values():
         record = record_of(package, state.records[collection_of(package)])
-        if record is None or not record.get("id"):
+        if record is None or not record.id:
             changes.append(Change(package.name, "onboard", "its upload is incomplete" if record else "not in OSM"))
     changes += [Change(name, "remove", "not in services.toml") for name in state.obsolete]
     for name, desired in state.desired.items():
@@ -144,13 +144,13 @@ def plan(state: DeploymentState) -> list[Change]:
             changes.append(Change(name, "recreate", "its package, site or key changed"))
         else:
             changes.append(Change(name, str(action), _reason(instance, desired)))
-    changes += [Change(str(one.get("id") or one["_id"]), "remove", "unused") for _, one in _unused(state)]
+    changes += [Change(one.name, "remove", "unused") for _, one in _unused(state)]
     return changes
 
 
 def _reason(instance: Instance, desired: DesiredInstance) -> str:
     if instance.running_operation:
-        return f"its {instance.running_operation.get('lcmOperationType')} is running"
+        return f"its {instance.running_operation.kind} is running"
     if not instance.instantiated:
         return "created but not instantiated"
     if instance.state == "BROKEN":
@@ -241,8 +241,8 @@ def _onboard(
         if rejected & set(package.descriptor.functions):
             continue
         known = record_of(package, state.records[collection_of(package)])
-        if known and known.get("id"):
-            record = str(known["_id"])
+        if known and known.id:
+            record = known.record
         else:
             report(0.0, f"onboarding {package.name}")
             try:
@@ -260,9 +260,9 @@ def _onboard(
 def _prune(osm: Osm, state: DeploymentState, result: ApplyResult) -> None:
     """Remove the deployment's unused packages: network services before their functions."""
     for collection, record in _unused(state):
-        name = str(record.get("id") or record["_id"])
+        name = record.name
         try:
-            osm.remove(collection, str(record["_id"]))
+            osm.remove(collection, record.record)
         except ScanError as error:
             # 409: an instance whose removal failed still uses it
             if not (isinstance(error, OsmError) and error.status == 409):
@@ -271,14 +271,14 @@ def _prune(osm: Osm, state: DeploymentState, result: ApplyResult) -> None:
         result.done.append(Change(name, "removed"))
 
 
-def _unused(state: DeploymentState) -> list[tuple[str, dict[str, Any]]]:
+def _unused(state: DeploymentState) -> list[tuple[str, PackageRecord]]:
     """Package records that are unused or duplicates, with their collections; network services first."""
     found = []
     for collection in (SERVICES, FUNCTIONS):
         records = state.records[collection]
         needed = [record_of(one, records) for one in state.packages.values() if collection_of(one) == collection]
-        keep = {str(one["_id"]) for one in needed if one}
-        found += [(collection, one) for one in records if str(one["_id"]) not in keep]
+        keep = {one.record for one in needed if one}
+        found += [(collection, one) for one in records if one.record not in keep]
     return found
 
 

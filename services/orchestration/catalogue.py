@@ -14,10 +14,10 @@ from typing import Any
 
 from scan2sim.pipeline.core.errors import BusyError, InputError, ScanError, SettingError
 from scan2sim.services.orchestration import operations, package
-from scan2sim.services.orchestration.instance import Instance
 from scan2sim.services.orchestration.lifecycle import WaitPolicy
 from scan2sim.services.orchestration.osm import FUNCTIONS, SERVICES, Osm
 from scan2sim.services.orchestration.package import Package
+from scan2sim.services.orchestration.records import InstanceRecord
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ class Catalogue:
         self._read: dict[Path, tuple[int, Package | None]] = {}
         self._jobs: dict[str, str] = {}
         self._failed: dict[str, str] = {}
-        self._osm_cache: tuple[float, list[dict[str, Any]], set[str]] = (0.0, [], set())
+        self._osm_cache: tuple[float, list[InstanceRecord], set[str]] = (0.0, [], set())
         self._closing = threading.Event()
 
     def close(self) -> None:
@@ -96,7 +96,6 @@ class Catalogue:
             found = one.descriptor
             if found.type != "nsd":
                 continue
-            observed = [Instance.of(record, ()) for record in instances]
             statuses.append(
                 ServiceStatus(
                     id=found.id,
@@ -104,7 +103,7 @@ class Catalogue:
                     functions=found.functions,
                     missing=tuple(name for name in found.functions if name not in functions | onboarded),
                     onboarded={f"nsd {found.id}", *found.functions} <= onboarded,
-                    instances=tuple((each.name, each.state) for each in observed if each.nsd == found.id),
+                    instances=tuple((each.name, each.state) for each in instances if each.descriptor == found.id),
                     doing=self._jobs.get(found.id, ""),
                     failed=self._failed.get(found.id, ""),
                 )
@@ -178,14 +177,14 @@ class Catalogue:
                 found.append(one)
         return found
 
-    def _osm_state(self) -> tuple[list[dict[str, Any]], set[str]]:
+    def _osm_state(self) -> tuple[list[InstanceRecord], set[str]]:
         """Instances and ids of packages in OSM; those of network services have the prefix `nsd `."""
         with self._lock:
             fetched, instances, ids = self._osm_cache
             if time.monotonic() > fetched + CACHE_LIFETIME_S:
                 instances = self._osm.instances()
-                ids = {str(one.get("id")) for one in self._osm.packages(FUNCTIONS)}
-                ids |= {f"nsd {one.get('id')}" for one in self._osm.packages(SERVICES)}
+                ids = {one.id for one in self._osm.packages(FUNCTIONS)}
+                ids |= {f"nsd {one.id}" for one in self._osm.packages(SERVICES)}
                 self._osm_cache = time.monotonic(), instances, ids
             return instances, ids
 

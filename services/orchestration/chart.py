@@ -6,6 +6,7 @@ Templates are written as JSON, a subset of YAML that needs no quoting rules, aro
 from __future__ import annotations
 
 import json
+import re
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -19,6 +20,9 @@ TOKEN_TEMPLATE = (
     "{{ dig `data` `token` (randAlphaNum 32 | b64enc) (lookup `v1` `Secret` .Release.Namespace .Release.Name) }}"
 )
 """Helm expression for a random token (base64); upgrades keep the token of the installed release."""
+
+
+IMAGE_TEMPLATE = "{{ with .Values.registry }}{{ . }}/{{ end }}{{ .Values.image }}"
 
 
 def files(service: Description, needs: Requirements, version: str) -> dict[str, str]:
@@ -54,12 +58,18 @@ def files(service: Description, needs: Requirements, version: str) -> dict[str, 
 
 
 def _values(service: Description, needs: Requirements) -> dict[str, Any]:
-    """Default values; GPUs are requested with `resources.limits`, for example `nvidia.com/gpu`."""
+    """Default values, documented in docs/orchestration.md; GPUs are requested with `resources.limits`."""
     requests = {"cpu": f"{needs.cpu_cores.value:g}"} if needs.cpu_cores else {}
     limits = {"memory": f"{needs.memory.value:g}Mi"} if needs.memory else {}
     return {
         REPLICA_COUNT_KEY: 1,
+        "registry": "",
         "image": service.image,
+        "imagePullSecrets": [],
+        "nodeSelector": {},
+        "tolerations": [],
+        "volumes": [],
+        "volumeMounts": [],
         "hostNetwork": service.host_network,
         "variables": service.variables,
         "resources": {"requests": requests, "limits": limits},
@@ -69,7 +79,7 @@ def _values(service: Description, needs: Requirements) -> dict[str, Any]:
 def _deployment(service: Description, labels: dict[str, str]) -> dict[str, Any]:
     container: dict[str, Any] = {
         "name": service.name,
-        "image": "{{ .Values.image }}",
+        "image": IMAGE_TEMPLATE,
         "envFrom": [{"configMapRef": {"name": RELEASE_NAME}}],
         "resources": _placeholder(".Values.resources"),
     }
@@ -82,18 +92,26 @@ def _deployment(service: Description, labels: dict[str, str]) -> dict[str, Any]:
     if service.port and service.ready:
         probe = {"httpGet": {"path": service.ready, "port": "http"}}
         container |= {"readinessProbe": probe, "startupProbe": probe | {"failureThreshold": 60, "periodSeconds": 5}}
-    volumes = []
+    volumes: Any = _placeholder(".Values.volumes")
+    container["volumeMounts"] = _placeholder(".Values.volumeMounts")
     if service.token:
         path = PurePosixPath(service.token)
-        container["volumeMounts"] = [{"name": "token", "mountPath": str(path.parent), "readOnly": True}]
-        volumes = [
-            {"name": "token", "secret": {"secretName": RELEASE_NAME, "items": [{"key": "token", "path": path.name}]}}
-        ]
+        secret = {"secretName": RELEASE_NAME, "items": [{"key": "token", "path": path.name}]}
+        mount = {"name": "token", "mountPath": str(path.parent), "readOnly": True}
+        volumes = [{"name": "token", "secret": secret}, _further(".Values.volumes")]
+        container["volumeMounts"] = [mount, _further(".Values.volumeMounts")]
     # the checksum restarts pods when variables change
     annotations = {"scan2sim/variables": "{{ toJson .Values.variables | sha256sum }}"}
     pod = {
         "metadata": {"labels": labels, "annotations": annotations},
-        "spec": {"hostNetwork": _placeholder(".Values.hostNetwork"), "containers": [container], "volumes": volumes},
+        "spec": {
+            "hostNetwork": _placeholder(".Values.hostNetwork"),
+            "imagePullSecrets": _placeholder(".Values.imagePullSecrets"),
+            "nodeSelector": _placeholder(".Values.nodeSelector"),
+            "tolerations": _placeholder(".Values.tolerations"),
+            "containers": [container],
+            "volumes": volumes,
+        },
     }
     return {
         "apiVersion": "apps/v1",
@@ -112,6 +130,12 @@ def _placeholder(value: str) -> str:
     return f"@{value}@"
 
 
+def _further(value: str) -> str:
+    """Placeholder at the end of a list that `_text` replaces by the items of another list."""
+    return f"@+{value}+@"
+
+
 def _text(content: dict[str, Any]) -> str:
     text = json.dumps(content, indent=1) + "\n"
+    text = re.sub(r',\s*"@\+(.*?)\+@"', r"{{ range \1 }}, {{ toJson . }}{{ end }}", text)
     return text.replace('"@', "{{ toJson ").replace('@"', " }}")

@@ -1,6 +1,7 @@
 """Parser of descriptors: safe against malicious YAML, validated against JSON Schemas before anything is sent to OSM.
 
-SOL006's YANG modules depend on modules that aren't available, so `schemas/` covers the subset that is used here.
+SOL006's YANG modules aren't part of this project, so `schemas/` covers the subset that is used here;
+`tests/services/orchestration/test_yang.py` validates packages by the modules themselves.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from scan2sim.pipeline.core.errors import StepError
 from scan2sim.services.orchestration.chart import REPLICA_COUNT_KEY
+from scan2sim.services.orchestration.records import InstanceRecord, OperationRecord
 from scan2sim.services.orchestration.sol006 import MEMBER_INDEX, SCALING_ASPECT, FunctionKind
 
 OWNER_TAG = "scan2sim"
@@ -21,6 +22,17 @@ RUNNING = ("PROCESSING", "ROLLING_BACK", "STARTING", "FAILED_TEMP")
 """States of a running operation."""
 DONE = ("COMPLETED", "PARTIALLY_COMPLETED")
 """States of a successful operation."""
+RESET_VALUES_KEY = "kdu_reset_values"
+"""Option of an upgrade: replace all values. Without it OSM merges the new values into those of the release
+(`helm upgrade --reuse-values`), so that a value that was removed would stay."""
+UPGRADE_OPTIONS = (
+    RESET_VALUES_KEY,
+    "kdu_reuse_values",
+    "kdu_reset_then_reuse_values",
+    "kdu_model",
+    "kdu_atomic_upgrade",
+)
+"""Parameters of an upgrade that OSM's lifecycle manager takes for itself; all others are values of the chart."""
 
 
 class Action(StrEnum):
@@ -108,12 +120,12 @@ class DesiredInstance:
 
 
 def upgrade_request(function: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Body of the request that changes a chart's values."""
+    """Body of the request that replaces a chart's values."""
     return {
         "member_vnf_index": MEMBER_INDEX,
         "kdu_name": function,
         "primitive": "upgrade",
-        "primitive_params": dict(values),
+        "primitive_params": dict(values) | {RESET_VALUES_KEY: "true"},  # OSM expects a string here
     }
 
 
@@ -159,52 +171,68 @@ class Instance:
     tag: str
     state: str
     instantiated: bool
-    operations: tuple[Mapping[str, Any], ...]
+    operations: tuple[OperationRecord, ...]
 
     @classmethod
-    def of(cls, record: Mapping[str, Any], operations: Sequence[Mapping[str, Any]]) -> Instance:
+    def of(cls, record: InstanceRecord, operations: Sequence[OperationRecord]) -> Instance:
         """Instance from OSM's record."""
         return cls(
-            id=str(record["_id"]),
-            name=str(record.get("name", "")),
-            nsd=str(record.get("nsd-ref") or (record.get("nsd") or {}).get("id", "")),
-            tag=str(record.get("description") or ""),
-            state=str(record.get("nsState", "")),
-            instantiated=(record.get("_admin") or {}).get("nsState") == "INSTANTIATED",
+            id=record.record,
+            name=record.name,
+            nsd=record.descriptor,
+            tag=record.description,
+            state=record.state,
+            instantiated=record.admin.state == "INSTANTIATED",
             operations=tuple(operations),
         )
 
     @property
-    def running_operation(self) -> Mapping[str, Any] | None:
+    def running_operation(self) -> OperationRecord | None:
         """The operation in progress; None if there is none."""
-        return next((one for one in reversed(self.operations) if one.get("operationState") in RUNNING), None)
+        return next((one for one in reversed(self.operations) if one.state in RUNNING), None)
+
+    @property
+    def condition(self) -> tuple[object, ...]:
+        """What a successful action changes, except the values of a chart."""
+        running = self.running_operation
+        return self.id, self.state, self.instantiated, running and running.record, self.machine_count
 
     def belongs_to(self, deployment: str) -> bool:
         """Whether a deployment created it."""
         return self.tag.split(" ")[:2] == [OWNER_TAG, deployment]
 
     @property
+    def _completed(self) -> list[OperationRecord]:
+        """Successful operations since it was last instantiated."""
+        done = [one for one in self.operations if one.state in DONE]
+        starts = [i for i, one in enumerate(done) if one.kind == "instantiate"]
+        return done[starts[-1] :] if starts else done
+
+    @property
     def values(self) -> dict[str, Any]:
-        """Values of its chart as last set.
+        """Values of its chart that run: those at instantiation, changed by each upgrade as OSM does.
 
         Raises:
             StepError: the parameters that OSM returns can't be read.
         """
-        for one in reversed(self.operations):
-            if one.get("operationState") not in DONE:
+        first: dict[str, Any] = {}
+        running: dict[str, Any] = {}
+        for one in self._completed:
+            if one.params is None:
                 continue
-            params = one.get("operationParams") or {}
-            if one.get("lcmOperationType") == "action" and params.get("primitive") == "upgrade":
-                return self._parameter(params, "primitive_params", _VALUES) or {}
-            if one.get("lcmOperationType") == "instantiate":
-                functions = self._parameter(params, "additionalParamsForVnf", _FUNCTIONS)
+            if one.kind == "instantiate":
+                functions = self._parameter(one.params.functions, "additionalParamsForVnf", _FUNCTIONS)
                 charts = functions[0].charts if functions else None
-                return (charts[0].values if charts else None) or {}
-        return {}
+                first = running = (charts[0].values if charts else None) or {}
+            elif one.kind == "action" and one.params.primitive == "upgrade":
+                given = self._parameter(one.params.primitive_params, "primitive_params", _VALUES) or {}
+                values = {name: value for name, value in given.items() if name not in UPGRADE_OPTIONS}
+                reset = str(given.get(RESET_VALUES_KEY, "")).lower() in ("yes", "true", "1")
+                running = values if reset else _merged(running, first | values)
+        return running
 
-    def _parameter(self, params: Mapping[str, Any], name: str, kind: TypeAdapter[T]) -> T | None:
+    def _parameter(self, value: Any, name: str, kind: TypeAdapter[T]) -> T | None:
         """A parameter of an operation; newer releases return a JSON string, Release 8 the object that was sent."""
-        value = params.get(name)
         if not value:
             return None
         try:
@@ -218,11 +246,24 @@ class Instance:
     def machine_count(self) -> int:
         """Number of machines of its function."""
         count = 1
-        for one in self.operations:
-            data = (one.get("operationParams") or {}).get("scaleVnfData") or {}
-            if one.get("lcmOperationType") == "scale" and one.get("operationState") in DONE:
-                count += 1 if data.get("scaleVnfType") == "SCALE_OUT" else -1
+        for one in self._completed:
+            if one.kind == "scale" and one.params and one.params.scaling:
+                count += 1 if one.params.scaling.direction == "SCALE_OUT" else -1
         return count
+
+
+def _merged(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+    """Values after `helm upgrade --reuse-values`: objects are merged, null removes."""
+    result = dict(old)
+    for name, value in new.items():
+        if value is None:
+            result.pop(name, None)
+        elif isinstance(value, Mapping):
+            before = result.get(name)
+            result[name] = _merged(before if isinstance(before, Mapping) else {}, value)
+        else:
+            result[name] = value
+    return result
 
 
 def next_action(desired: DesiredInstance | None, observed: Instance | None) -> Action | None:

@@ -6,13 +6,21 @@ No state is kept on this side, so that a run after a crash or a lost response co
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from scan2sim.pipeline.core.errors import StepError
 from scan2sim.services.orchestration.instance import DONE, RUNNING, Action, DesiredInstance, Instance, next_action
-from scan2sim.services.orchestration.osm import INSTANCES, TRANSIENT_STATUSES, Osm, OsmError, ResponseLost, back_off
+from scan2sim.services.orchestration.osm import (
+    INSTANCES,
+    OPERATIONS,
+    Osm,
+    OsmError,
+    ResponseLost,
+    back_off,
+    is_transient,
+)
+from scan2sim.services.orchestration.records import InstanceRecord
 
 Notify = Callable[[str], None]
 """Called with progress messages."""
@@ -66,9 +74,9 @@ def find(osm: Osm, name: str) -> Instance | None:
     Raises:
         StepError: more than one instance has this name.
     """
-    found = [one for one in osm.instances() if name in (one.get("name"), one.get("_id"))]
+    found = [one for one in osm.instances() if name in (one.name, one.record)]
     if len(found) > 1:
-        ids = ", ".join(str(one["_id"]) for one in found)
+        ids = ", ".join(one.record for one in found)
         raise StepError(name, f"{len(found)} instances have this name", f"Choose one by its id: {ids}")
     return load_instance(osm, found[0]) if found else None
 
@@ -79,21 +87,21 @@ def find_owned(osm: Osm, name: str, deployment: str) -> Instance | None:
     Raises:
         StepError: an instance of another owner has this name.
     """
-    found = [one for one in osm.instances() if one.get("name") == name]
+    found = [one for one in osm.instances() if one.name == name]
     own = [one for one in found if Instance.of(one, ()).belongs_to(deployment)]
     if found and not own:
         cause = "the name belongs to an instance of another deployment"
         raise StepError(name, cause, "Choose another name, or delete it: scan2sim orchestrate delete")
-    return load_instance(osm, min(own, key=lambda one: one.get("create-time", 0))) if own else None
+    return load_instance(osm, min(own, key=lambda one: one.created)) if own else None
 
 
-def load_instance(osm: Osm, record: Mapping[str, Any]) -> Instance:
+def load_instance(osm: Osm, record: InstanceRecord) -> Instance:
     """An instance with its operations, from an entry of a list.
 
     Its record is read after the operations: if one of them ended in between, its effect would be missed otherwise.
     """
-    operations = osm.operations(str(record["_id"]))
-    return Instance.of(osm.instance(str(record["_id"])), operations)
+    operations = osm.operations(record.record)
+    return Instance.of(osm.instance(record.record), operations)
 
 
 def reconcile(
@@ -115,15 +123,20 @@ def reconcile(
         OsmError: see `Osm`.
     """
     failure: OperationFailed | None = None
-    lost = 0
+    lost, done = 0, set[tuple[object, ...]]()
     while not wait_policy.stop():
         try:
             found = find_instance()
             action = next_action(None if failure else desired, found)
             if action is None:
                 break
+            step = (action, *(found.condition if found else ()))
+            if step in done:
+                cause = f"OSM reported the success of `{action}`, but the instance is as before"
+                raise StepError(found.name if found else record, cause, "See the log of OSM's lifecycle manager")
             notify(_progress_message(action, found, desired))
             _act(osm, action, found, desired, record, wait_policy)
+            done.add(step)
             lost = 0
             if not wait_policy.wait and action in ASYNC_ACTIONS:
                 break
@@ -134,8 +147,9 @@ def reconcile(
             notify(f"{error.cause}; removing the incomplete instance")
         except (ResponseLost, OsmError) as error:
             lost += 1
-            if lost > MAX_LOST_RESPONSES or (isinstance(error, OsmError) and error.status not in TRANSIENT_STATUSES):
+            if lost > MAX_LOST_RESPONSES or not is_transient(error):
                 raise
+            notify(f"{error.cause}; trying again")
             back_off(lost - 1)
     if failure:
         raise failure
@@ -143,7 +157,7 @@ def reconcile(
 
 def _progress_message(action: Action, observed: Instance | None, desired: DesiredInstance | None) -> str:
     if action == Action.WAIT and observed and observed.running_operation:
-        return f"waiting for its {observed.running_operation.get('lcmOperationType')}"
+        return f"waiting for its {observed.running_operation.kind}"
     recreated = observed is not None and desired is not None and action in (Action.TERMINATE, Action.DELETE)
     return f"{action}{', to recreate it' if recreated else ''}"
 
@@ -164,7 +178,7 @@ def _act(
     assert observed
     if action == Action.WAIT:
         assert observed.running_operation
-        wait_for_operation(osm, observed.name, str(observed.running_operation["_id"]), wait_policy)
+        wait_for_operation(osm, observed.name, observed.running_operation.record, wait_policy)
     elif action == Action.DELETE:
         osm.remove(INSTANCES, observed.id)
     elif action == Action.TERMINATE:
@@ -179,28 +193,41 @@ def _act(
 
 
 def wait_for_operation(
-    osm: Osm, name: str, operation: str, wait_policy: WaitPolicy, notify: Notify = lambda _: None
+    osm: Osm,
+    name: str,
+    operation: str,
+    wait_policy: WaitPolicy,
+    notify: Notify = lambda _: None,
+    collection: str = OPERATIONS,
 ) -> None:
-    """Wait until an operation has ended.
+    """Wait until an operation in a collection has ended.
 
     Raises:
         OperationFailed: it failed. StepError: it exceeds `wait_policy.timeout`.
     """
-    ends, interval = time.monotonic() + wait_policy.timeout, POLL_INTERVAL_S
+    ends, interval, lost = time.monotonic() + wait_policy.timeout, POLL_INTERVAL_S, 0
     while not wait_policy.stop():
-        record = osm.operation(operation)
-        kind, state = str(record.get("lcmOperationType")), str(record.get("operationState"))
-        if state in DONE:
+        try:
+            record = osm.operation(operation, collection)
+            lost = 0
+        except (ResponseLost, OsmError) as error:
+            lost += 1
+            if lost > MAX_LOST_RESPONSES or not is_transient(error):
+                raise
+            notify(f"{error.cause}; trying again")
+            back_off(lost - 1)
+            continue
+        if record.state in DONE:
             return
-        detail = str(record.get("errorMessage") or record.get("detailed-status") or "")[:300]
-        if state not in RUNNING:
-            cause = f"OSM's {kind} failed ({state}: {detail or 'no reason given'})"
+        detail = (record.error or record.status)[:300]
+        if record.state not in RUNNING:
+            cause = f"OSM's {record.kind} failed ({record.state or 'no state'}: {detail or 'no reason given'})"
             raise OperationFailed(
-                name, cause, "See the log of OSM's lifecycle manager; fix the cause and run again", kind
+                name, cause, "See the log of OSM's lifecycle manager; fix the cause and run again", record.kind
             )
-        notify(f"{kind} {detail}".strip())
+        notify(f"{record.kind} {detail}".strip())
         if time.monotonic() > ends:
-            cause = f"{kind} still running after {wait_policy.timeout:g} s{f' ({detail})' if detail else ''}"
+            cause = f"{record.kind} still running after {wait_policy.timeout:g} s{f' ({detail})' if detail else ''}"
             raise StepError(name, cause, "Run again to continue waiting; nothing was undone")
         time.sleep(interval)
         interval = min(MAX_POLL_INTERVAL_S, 1.2 * interval)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from scan2sim.services.orchestration.instance import OWNER_TAG
 from scan2sim.services.orchestration.lifecycle import MAX_LOST_RESPONSES
-from scan2sim.services.orchestration.osm import TRANSIENT_STATUSES, Osm, OsmError, ResponseLost, back_off, collection_of
+from scan2sim.services.orchestration.osm import Osm, OsmError, ResponseLost, back_off, collection_of, is_transient
 from scan2sim.services.orchestration.package import Package
+from scan2sim.services.orchestration.records import PackageRecord
 
 
 def onboard(osm: Osm, package: Package, deployment: str) -> str:
@@ -26,23 +26,18 @@ def onboard(osm: Osm, package: Package, deployment: str) -> str:
             record = record_of(package, osm.packages(collection))
             if record is None:
                 return osm.onboard(package, tags)
-            if not record.get("id"):
-                osm.fill(package, str(record["_id"]))
-            return str(record["_id"])
+            if not record.id:
+                osm.fill(package, record.record)
+            return record.record
         except (ResponseLost, OsmError) as error:
-            if lost == MAX_LOST_RESPONSES or (isinstance(error, OsmError) and error.status not in TRANSIENT_STATUSES):
+            if lost == MAX_LOST_RESPONSES or not is_transient(error):
                 raise
             back_off(lost)
     raise AssertionError
 
 
-def record_of(package: Package, records: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+def record_of(package: Package, records: Sequence[PackageRecord]) -> PackageRecord | None:
     """A package's record: the one with its descriptor's id, else an empty one that was created for it."""
-    uploaded = next((one for one in records if one.get("id") == package.descriptor.id), None)
-    empty = (one for one in records if not one.get("id") and tags_of(one).get("package") == package.name)
+    uploaded = next((one for one in records if one.id == package.descriptor.id), None)
+    empty = (one for one in records if not one.id and one.tags.get("package") == package.name)
     return uploaded or next(empty, None)
-
-
-def tags_of(record: Mapping[str, Any]) -> Mapping[str, Any]:
-    """User-defined data that were stored with a record."""
-    return (record.get("_admin") or {}).get("userDefinedData") or {}

@@ -25,6 +25,7 @@ from scan2sim.services.orchestration.lifecycle import (
 )
 from scan2sim.services.orchestration.osm import FUNCTIONS, SERVICES, Osm, collection_of
 from scan2sim.services.orchestration.package import Package
+from scan2sim.services.orchestration.records import PackageRecord
 
 NO_DEPLOYMENT = "-"
 """Takes the place of the deployment's name for instances and packages that were created by a single command."""
@@ -55,7 +56,7 @@ def onboard(osm: Osm, packages: Sequence[Package]) -> dict[str, str]:
     duplicate = next((one for one in ids if ids.count(one) > 1), None)
     if duplicate is not None:
         raise InputError(duplicate[1], f"two packages ({duplicate[0]}) have this id", "Give each descriptor its own id")
-    known = {str(one.get("id")) for one in osm.packages(FUNCTIONS)} | {
+    known = {one.id for one in osm.packages(FUNCTIONS)} | {
         one.descriptor.id for one in packages if one.descriptor.type == "vnfd"
     }
     for one in ordered:
@@ -109,7 +110,7 @@ def instantiate(
         values,
         namespace,
     )
-    reconcile(osm, partial(find_owned, osm, name, NO_DEPLOYMENT), desired, str(record["_id"]), wait_policy, notify)
+    reconcile(osm, partial(find_owned, osm, name, NO_DEPLOYMENT), desired, record.record, wait_policy, notify)
 
 
 def scale(osm: Osm, name: str, replicas: int, wait_policy: WaitPolicy, notify: Notify) -> None:
@@ -141,8 +142,8 @@ def heal(osm: Osm, name: str, wait_policy: WaitPolicy, notify: Notify) -> None:
     if function.container:
         _run(osm, instance, "action", upgrade_request(function.name, instance.values), wait_policy, notify)
         return
-    record = next(one for one in osm.instances() if one["_id"] == instance.id)
-    broken = [{"vnfInstanceId": key, "cause": "asked for"} for key in record.get("constituent-vnfr-ref", ())]
+    functions = osm.instance(instance.id).functions or ()
+    broken = [{"vnfInstanceId": key, "cause": "asked for"} for key in functions]
     _run(osm, instance, "heal", {"healVnfData": broken}, wait_policy, notify)
 
 
@@ -154,7 +155,7 @@ def terminate(osm: Osm, name: str, wait_policy: WaitPolicy, notify: Notify) -> N
     """
     instance = _find(osm, name)
     if instance.running_operation:
-        wait_for_operation(osm, instance.name, str(instance.running_operation["_id"]), wait_policy, notify)
+        wait_for_operation(osm, instance.name, instance.running_operation.record, wait_policy, notify)
         instance = _find(osm, name)
     if instance.instantiated:
         _run(osm, instance, "terminate", {}, WaitPolicy(wait_policy.timeout, True, wait_policy.stop), notify)
@@ -176,25 +177,25 @@ def delete_packages(osm: Osm, ids: Sequence[str]) -> None:
     Raises:
         SettingError: an id doesn't exist. OsmError: a package is still in use.
     """
-    found = [(where, one) for where in (SERVICES, FUNCTIONS) for one in osm.packages(where) if one.get("id") in ids]
-    missing = set(ids) - {str(one.get("id")) for _, one in found}
+    found = [(where, one) for where in (SERVICES, FUNCTIONS) for one in osm.packages(where) if one.id in ids]
+    missing = set(ids) - {one.id for _, one in found}
     if missing:
         raise SettingError(min(missing), *NOT_FOUND)
     for where, one in found:
-        osm.remove(where, str(one["_id"]))
+        osm.remove(where, one.record)
 
 
 def delete(osm: Osm, packages: Sequence[Package], wait_policy: WaitPolicy, notify: Notify) -> None:
     """Delete all that belongs to the given packages: instances, network services, functions."""
     services = {one.descriptor.id for one in packages if one.descriptor.type == "nsd"}
     for running in osm.instances():
-        if Instance.of(running, ()).nsd in services:
-            delete_instance(osm, str(running["_id"]), wait_policy, notify)
+        if running.descriptor in services:
+            delete_instance(osm, running.record, wait_policy, notify)
     for one in sorted(packages, key=lambda one: one.descriptor.type):
         record = onboarding.record_of(one, osm.packages(collection_of(one)))
         if record:
             notify(f"removing {one.descriptor.id}")
-            osm.remove(collection_of(one), str(record["_id"]))
+            osm.remove(collection_of(one), record.record)
 
 
 def function_of(osm: Osm, nsd: str) -> Function:
@@ -203,14 +204,16 @@ def function_of(osm: Osm, nsd: str) -> Function:
     Raises:
         SettingError: OSM doesn't have the package.
     """
-    names = _record(osm, SERVICES, nsd).get("vnfd-id") or [""]
-    record = _record(osm, FUNCTIONS, str(names[0]))
-    units = record.get("kdu") or record.get("vdu") or [{}]
-    return Function(str(units[0].get("name") or units[0].get("id")), bool(record.get("kdu")))
+    names = _record(osm, SERVICES, nsd).functions or ("",)
+    record = _record(osm, FUNCTIONS, names[0])
+    units = record.charts or record.machines
+    if not units:
+        raise SettingError(nsd, "its function has neither a chart nor a machine", "Deploy another network service")
+    return Function(units[0].name or units[0].id, bool(record.charts))
 
 
-def _record(osm: Osm, collection: str, name: str) -> Mapping[str, Any]:
-    found = next((one for one in osm.packages(collection) if name in (one.get("id"), one["_id"])), None)
+def _record(osm: Osm, collection: str, name: str) -> PackageRecord:
+    found = next((one for one in osm.packages(collection) if name in (one.id, one.record)), None)
     if found is None:
         raise SettingError(name, "OSM has no such package", "Onboard it: scan2sim orchestrate onboard")
     return found

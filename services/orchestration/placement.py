@@ -1,6 +1,6 @@
 """Compare measured sites with a service's requirements to find where it may run (D3.2, section 2.2).
 
-A site is a file written by `scan2sim qos measure TOOLBOX --environment ... --out FILE`, which ran the toolbox there.
+A site is a file written by `scan2sim qos measure SERVICE --environment ... --out FILE`, which ran the toolbox there.
 """
 
 from __future__ import annotations
@@ -48,11 +48,13 @@ class Placement:
         environment: environment of the site.
         fits: whether all requirements are met.
         unmet: unmet requirements, one sentence each.
+        unknown: required metrics that weren't measured or decided.
     """
 
     environment: Environment
     fits: bool
     unmet: tuple[str, ...]
+    unknown: tuple[str, ...] = ()
 
 
 def read(path: Path) -> Site:
@@ -61,7 +63,7 @@ def read(path: Path) -> Site:
     Raises:
         InputError: not a measurement file.
     """
-    remedy = "Create one: scan2sim qos measure TOOLBOX --environment edge --out FILE"
+    remedy = "Create one: scan2sim qos measure SERVICE --environment edge --out FILE"
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise InputError(path, "too large for a measurement file", remedy)
@@ -89,14 +91,15 @@ def place(service: str, sites: Sequence[Site]) -> list[Placement]:
 
 def _compare(site: Site) -> Placement:
     unmet = tuple(_unmet(row) for row in site.rows if row.passed is False)
-    return Placement(site.environment, not unmet, unmet)
+    unknown = tuple(row.metric.replace("_", " ") for row in site.rows if row.required and row.passed is None)
+    return Placement(site.environment, not unmet, unmet, unknown)
 
 
 def _unmet(row: _Row) -> str:
     unit = UNITS.get(row.metric, "")
     name = row.metric.replace("_", " ")
+    if row.metric == "response_time" and (row.measured is None or row.required is None):
+        return f"{name}: some requests were not answered"
     if row.measured is None:
         return f"{name}: not available, required: {row.required} {unit}".rstrip()
-    if row.required is None:
-        return f"{name}: some requests were not answered"
     return f"{name}: {row.measured:.4g} {unit}".rstrip() + f", required: {row.required}"

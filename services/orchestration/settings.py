@@ -15,6 +15,9 @@ from scan2sim.pipeline.core.step import Params
 from scan2sim.services.credentials import redacted
 from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.loopback import is_loopback
+from scan2sim.services.orchestration import certificates
+
+EXAMPLE = "Give https://HOST:9999"
 
 
 class Connection(Params):
@@ -31,6 +34,14 @@ class Connection(Params):
     ca: Annotated[
         File | None, Field(description="CA certificate (PEM) to trust, if OSM's isn't signed by a public authority.")
     ] = None
+    fingerprint: Annotated[
+        str,
+        Field(
+            max_length=200,
+            description="SHA-256 fingerprint of OSM's certificate, to trust it though no authority signed it or it has"
+            " expired. Needed once: it is stored for this address.",
+        ),
+    ] = ""
 
     def northbound_url(self) -> str:
         """URL of the northbound interface: https://HOST:PORT.
@@ -40,13 +51,17 @@ class Connection(Params):
         """
         given = self.osm or os.environ.get("OSM_HOSTNAME", "")
         if not given:
-            raise SettingError("--osm", "missing, and $OSM_HOSTNAME isn't set", "Give https://HOST:9999")
-        parts = urlsplit(given if "://" in given else f"https://{given}")
+            raise SettingError("--osm", "missing, and $OSM_HOSTNAME isn't set", EXAMPLE)
+        try:
+            parts = urlsplit(given if "://" in given else f"https://{given}")
+            port = parts.port
+        except ValueError as error:
+            raise SettingError("--osm", f"{redacted(given):.100} isn't an address ({error})", EXAMPLE) from None
         if parts.scheme != "https" and not (is_loopback(parts.hostname or "") and parts.scheme == "http"):
-            raise SettingError("--osm", f"{redacted(given):.100} doesn't use TLS", "Give https://HOST:9999")
+            raise SettingError("--osm", f"{redacted(given):.100} doesn't use TLS", EXAMPLE)
         if not parts.hostname or "@" in parts.netloc or parts.path not in ("", "/", "/osm", "/osm/"):
-            raise SettingError("--osm", f"{redacted(given):.100} isn't an address of OSM", "Give https://HOST:9999")
-        return f"{parts.scheme}://{parts.netloc}" + ("" if parts.port else ":9999")
+            raise SettingError("--osm", f"{redacted(given):.100} isn't an address of OSM", EXAMPLE)
+        return f"{parts.scheme}://{parts.netloc}" + ("" if port else ":9999")
 
     def read_password(self) -> str:
         """The password, from its file or $OSM_PASSWORD.
@@ -64,11 +79,18 @@ class Connection(Params):
         return os.environ["OSM_PASSWORD"]
 
     def ssl_context(self) -> ssl.SSLContext:
-        """TLS context that trusts the given CA certificate, or public authorities.
+        """TLS context that trusts the given certificate authority, the fingerprint, or public authorities.
 
         Raises:
-            InputError: the certificate file can't be read.
+            InputError: the certificate file or the file of fingerprints can't be read. SettingError: no fingerprint.
         """
+        if self.northbound_url().startswith("http:"):
+            return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # isn't used
+        if self.fingerprint and self.ca:
+            raise SettingError("--fingerprint", "given together with --ca", "Give one of them")
+        trusted = certificates.parse(self.fingerprint) if self.fingerprint else None
+        if not self.ca and (trusted := trusted or certificates.known(self.northbound_url())):
+            return certificates.PinnedContext.of(self.northbound_url(), trusted)
         try:
             return ssl.create_default_context(cafile=self.ca)
         except (OSError, ssl.SSLError) as error:

@@ -2,13 +2,17 @@
 "use strict";
 
 const PLOTS = [
-  { key: "bandwidth", title: "Bandwidth by node", unit: "rate" },
+  { key: "bandwidth", title: "Bandwidth", unit: "rate" },
   { key: "latency", title: "Latency", unit: "seconds" },
   { key: "sums", title: "Total bandwidth", unit: "rate", legend: true },
-  { key: "lost", title: "Lost messages per period", unit: "count" },
-  { key: "messages", title: "Messages per period", unit: "count" },
+  { key: "lost", title: "Lost messages", unit: "count" },
+  { key: "messages", title: "Messages", unit: "count" },
   { key: "size", title: "Mean message size", unit: "bytes" },
 ];
+const TITLES = {
+  node: { bandwidth: "Bandwidth by node", lost: "Lost messages per period", messages: "Messages per period" },
+  topic: { bandwidth: "Bandwidth by topic", lost: "Lost messages per second", messages: "Messages per second" },
+};
 const METRICS = ["bandwidth", "latency", "lost", "messages", "size"],
   KINDS = ["mean", "min", "max"];
 const SUMS = [
@@ -17,7 +21,8 @@ const SUMS = [
   ["difference", 3],
 ];
 
-const chosen = new Set(); // names of the selected nodes; empty: all
+let by = "node"; // or "topic": what a line of the plots stands for
+const selected = { node: new Set(), topic: new Set() }; // names of the selected nodes and topics; empty: all
 let range = { seconds: 300 }; // or {from, to}
 let shownWindow = null; // time window that is displayed, as /api/history returns it
 let plots = null;
@@ -65,13 +70,11 @@ function draw(from, to) {
 }
 
 function applyUpdate(update) {
+  update.nodes ??= update.topics; // lines of the plots
   showState(update.state);
-  if (!plots) {
-    plots = PLOTS.map((one) => ({
-      key: one.key,
-      plot: new Plot(byId("plots"), { ...one, limit: update.state.limits[one.key], ranged: showPast }),
-    }));
-  }
+  plots ??= PLOTS.map((one) => ({ ...one, plot: new Plot(byId("plots"), { ...one, ranged: showPast }) }));
+  for (const { key, title, plot } of plots)
+    plot.describe(TITLES[by][key] ?? title, by === "node" ? update.state.limits[key] : undefined);
   if (range.seconds) {
     shownWindow = merged(shownWindow, update, update.begin);
     draw(update.state.now - range.seconds, update.state.now);
@@ -84,7 +87,7 @@ function applyUpdate(update) {
 // ---- tables and messages
 
 function showState(state) {
-  const { topic, servers, connected, limits, nodes, runs, counts, last_refused, events_topic, events_refused } = state;
+  const { topic, servers, connected, limits, nodes, runs, counts, last_rejected, events_topic, events_rejected } = state;
   byId("topic").textContent = `${topic} and ${events_topic} on ${servers}`;
   showAlarms(state.alarms, events_topic);
   showRuns(runs, state.now);
@@ -97,21 +100,26 @@ function showState(state) {
   empty.textContent = connected
     ? `No records on topic ${topic} yet.`
     : `Kafka at ${servers} doesn't answer; retrying.`;
-  showChips(nodes);
-  byId("nodes").tBodies[0].replaceChildren(...nodes.map((node) => row(node, limits)));
+  showChips(by === "node" ? nodes : state.topics.map(({ topic, number }) => ({ name: topic, number, gone: false })));
+  byId("nodes").tBodies[0].replaceChildren(...nodes.filter((node) => !node.gone).map((node) => row(node, limits)));
+  showGone(
+    nodes.filter((node) => node.gone),
+    limits,
+  );
+  showTopics(state.topics);
   const warnings = nodes.flatMap((node) => [
-    ...node.remarks.map((text) => `${node.name}: ${text}`),
+    ...node.warnings.map((text) => `${node.name}: ${text}`),
     ...(node.dropped ? [`${node.name}: ${node.dropped} records were dropped because the outbox was full`] : []),
   ]);
-  byId("remarks").replaceChildren(
+  byId("warnings").replaceChildren(
     ...(warnings.length ? [...new Set(warnings)] : ["none"]).map((text) => element("li", text)),
   );
   const { shown, ...rejected } = counts;
   byId("counts").textContent =
     `${shown ?? 0} records shown` +
-    (Object.keys(rejected).length ? `; rejected: ${listed(rejected)} (last: ${last_refused})` : "") +
-    (Object.keys(events_refused.counts).length
-      ? `; rejected events: ${listed(events_refused.counts)} (last: ${events_refused.last})`
+    (Object.keys(rejected).length ? `; rejected: ${listed(rejected)} (last: ${last_rejected})` : "") +
+    (Object.keys(events_rejected.counts).length
+      ? `; rejected events: ${listed(events_rejected.counts)} (last: ${events_rejected.last})`
       : "");
 }
 
@@ -121,30 +129,53 @@ function listed(counts) {
     .join(", ");
 }
 
-function showChips(nodes) {
+// Nodes that are silent, folded away, with their last values.
+function showGone(gone, limits) {
+  const folded = byId("gone"),
+    table = folded.querySelector("table");
+  folded.hidden = !gone.length;
+  folded.querySelector("summary").textContent = `${gone.length} gone`;
+  if (!table.tHead) table.prepend(byId("nodes").tHead.cloneNode(true));
+  table.tBodies[0].replaceChildren(...gone.map((node) => row(node, limits)));
+}
+
+// Buttons that select nodes or topics; nodes that are silent are folded away.
+function showChips(lines) {
   const chips = byId("chips"),
+    chosen = selected[by],
     shown = JSON.stringify([
-      nodes.map(({ name, gone }) => [name, gone]),
+      by,
+      lines.map(({ name, number, gone }) => [name, number, gone]),
       [...chosen],
       document.documentElement.dataset.theme,
     ]);
   if (chips.dataset.shown === shown) return; // don't replace elements that may be about to be clicked
   chips.dataset.shown = shown;
   chips.classList.toggle("some", chosen.size > 0);
-  chips.replaceChildren(
-    ...nodes.map(({ name, number, gone }) => {
-      const chip = element("button", undefined, gone ? "gone" : "");
-      chip.type = "button";
-      chip.title = chosen.has(name) ? `${name}: deselect` : `${name}: show only selected nodes`;
-      chip.setAttribute("aria-pressed", chosen.has(name));
-      chip.append(key(number), element("span", name));
-      chip.addEventListener("click", () => {
-        if (!chosen.delete(name)) chosen.add(name);
-        begin();
-      });
-      return chip;
-    }),
-  );
+  const open = chips.querySelector("details")?.open,
+    gone = lines.filter((one) => one.gone);
+  chips.replaceChildren(...lines.filter((one) => !one.gone).map(chip));
+  if (!gone.length) return;
+  const folded = element("details"),
+    inside = element("div", undefined, "choice");
+  inside.append(...gone.map(chip));
+  folded.append(element("summary", `${gone.length} gone`, "soft"), inside);
+  folded.open = open ?? gone.some((one) => chosen.has(one.name));
+  chips.append(folded);
+}
+
+function chip({ name, number, gone }) {
+  const chosen = selected[by],
+    made = element("button", undefined, gone ? "gone" : "");
+  made.type = "button";
+  made.title = chosen.has(name) ? `${name}: deselect` : `${name}: show only selected ${by}s`;
+  made.setAttribute("aria-pressed", chosen.has(name));
+  made.append(key(number), element("span", name));
+  made.addEventListener("click", () => {
+    if (!chosen.delete(name)) chosen.add(name);
+    begin();
+  });
+  return made;
 }
 
 function row(node, limits) {
@@ -155,7 +186,7 @@ function row(node, limits) {
     name,
     element(
       "td",
-      node.gone ? `gone, silent for ${Math.round(node.silent)} s` : `every ${+node.period.toPrecision(3)} s`,
+      node.gone ? `gone, silent for ${duration(node.silent)}` : `every ${+node.period.toPrecision(3)} s`,
       node.gone ? "bad" : "",
     ),
   );
@@ -187,7 +218,6 @@ function row(node, limits) {
 }
 
 function showQueues(queues) {
-  const perSecond = (value) => `${+value.toPrecision(2)}/s`;
   const rows = queues.map((one) => {
     const made = element("tr"),
       name = element("td");
@@ -216,7 +246,7 @@ function status(state, text) {
 // ---- requests
 
 function query(values) {
-  return new URLSearchParams([...Object.entries(values), ...[...chosen].map((name) => ["nodes", name])]);
+  return new URLSearchParams([...Object.entries({ ...values, by }), ...[...selected[by]].map((name) => [`${by}s`, name])]);
 }
 
 async function begin() {
@@ -273,13 +303,22 @@ function fill(from, to) {
     byId("range").elements[name].value = local(1000 * seconds);
 }
 
+function showBy(kind) {
+  by = kind;
+  press();
+  begin();
+}
+
 function press() {
   for (const button of document.querySelectorAll("[data-seconds]"))
     button.setAttribute("aria-pressed", Number(button.dataset.seconds) === range.seconds);
+  for (const button of document.querySelectorAll("[data-by]")) button.setAttribute("aria-pressed", button.dataset.by === by);
 }
 
 for (const button of document.querySelectorAll("[data-seconds]"))
   button.addEventListener("click", () => showLive(Number(button.dataset.seconds)));
+for (const button of document.querySelectorAll("[data-by]"))
+  button.addEventListener("click", () => showBy(button.dataset.by));
 byId("range").addEventListener("submit", (event) => {
   event.preventDefault();
   const at = (name) => new Date(event.target.elements[name].value).getTime() / 1000;

@@ -1,23 +1,24 @@
-// Driver page of a station: decodes video, shows its age, covers what is outdated, and sends the driver's commands.
+// Driver page of a station: sends the driver's commands, and shows the state of vehicle and station. Its worker
+// (cockpit-view.js) holds the connection, and decodes, draws and covers the video.
 "use strict";
 
-const MAX_AGE = 300; // age in ms above which video, or the state of vehicle or station, is covered
-const WATCHDOG_PERIOD = 25, // interval of the watchdog, ms
-  AGES_PERIOD = 100, // interval at which displayed ages are updated, ms
-  CLOCK_PERIOD = 200; // interval of clock synchronization, ms
-const HEADER_BYTES = 14; // length of a frame's header
+const WATCHDOG_PERIOD = 10, // interval of the watchdog, ms
+  AGES_PERIOD = 100; // interval at which displayed ages are updated, ms
 const GEARS = { "-1": "reverse", 0: "neutral", 1: "forwards" };
-const DECODE_QUEUE_MAX = 8; // frames that may wait for decoding; a page that falls behind continues at the next key frame
 const COMMANDS_SEEN = 5, // commands that name a stop without agreeing, which the vehicle requires first
   COMMANDS_AGREED = 10; // commands that agree
+const RELEASE_HOLD = 1000; // time for which the button that ends an emergency stop is held, ms
 
-let socket = null,
-  connection = "waiting", // why there is no connection; "": there is one
+let connection = "waiting", // why there is no connection; "": there is one
   state = {}, // last state from the station
   lights = false,
   gear = 1,
-  agreeing = 0;
+  agreeing = 0,
+  stood = true, // whether the vehicle was stopped at the last update
+  stopping = false; // the driver has demanded an emergency stop that the station has not reported yet
 const cameras = new Map();
+const sentAt = { station: -Infinity, vehicle: -Infinity, worker: -Infinity }; // when they sent what is displayed
+const worker = new Worker("/pages/cockpit-view.js");
 
 // Sets a text only if it has changed, which avoids layout and repeated announcements by screen readers.
 function write(node, text) {
@@ -29,41 +30,12 @@ function strip(id, text) {
   write(byId(id), text ?? "");
 }
 
+// Sends a message to the station; replaces the function of the same name in stream.js.
 function send(message) {
-  if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
+  worker.postMessage({ send: message });
 }
 
 const driving = () => state.driver !== undefined && state.driver === state.you;
-
-// ---- ages: capture and sending times are of this page's clock (ms), -Infinity where unknown
-
-// Converts times of the station's clock to this page's clock. The station reads its clock after the page has sent its own
-// time, so each difference is a lower bound, and the largest is the closest: ages are never too small, whatever the delay.
-class Clock {
-  static KEPT = 16; // differences kept: those of the last 3 s
-
-  constructor() {
-    this.differences = [];
-  }
-
-  synchronize() {
-    send({ do: "clock", sent: performance.now() });
-  }
-
-  addAnswer(sent, station) {
-    this.differences = [...this.differences, sent - station].slice(-Clock.KEPT);
-  }
-
-  toPage(station) {
-    return station + Math.max(...this.differences);
-  }
-}
-
-let clock = new Clock();
-
-const sentAt = { station: -Infinity, vehicle: -Infinity }; // when station and vehicle sent their displayed state
-const age = (since) => performance.now() - since;
-const sinceText = (since) => (Number.isFinite(since) ? ` since ${(age(since) / 1000).toFixed(1)} s` : "");
 
 // ---- video
 
@@ -72,56 +44,27 @@ class Camera {
     this.number = number;
     this.figure = element("figure");
     this.canvas = element("canvas");
-    this.cover = element("p", "no picture", "cover");
+    this.cover = element("p", "no picture", "cover"); // for a worker that doesn't draw one
     this.caption = element("figcaption");
     this.name = element("b", `camera ${number}`);
     this.age = element("output", "-");
     this.caption.append(this.name, this.age);
     this.figure.append(this.canvas, this.cover, this.caption);
     this.captured = -Infinity;
-    this.shown = 0;
-    this.begin();
     const later = [...cameras.values()].find((one) => one.number > number); // the first camera is the largest
     byId("cameras").insertBefore(this.figure, later?.figure ?? null);
-  }
-
-  begin() {
-    this.started = false;
-    this.decoder = new VideoDecoder({ output: (frame) => this.draw(frame), error: () => this.begin() });
-    this.decoder.configure({ codec: "vp8", optimizeForLatency: true });
-  }
-
-  // `captured`: time of the station's clock, ms; the decoder passes it on as the frame's timestamp
-  decode(key, captured, data) {
-    if (this.decoder.decodeQueueSize > DECODE_QUEUE_MAX) this.decoder.close();
-    if (this.decoder.state !== "configured") this.begin();
-    const hasTime = Number.isFinite(captured); // else the station has not synchronized with the vehicle's clock yet
-    this.started = hasTime && (key || this.started);
-    if (!this.started) return send({ do: "key", camera: this.number });
-    this.decoder.decode(new EncodedVideoChunk({ type: key ? "key" : "delta", timestamp: Math.round(captured * 1000), data }));
-  }
-
-  draw(frame) {
-    if (this.canvas.width !== frame.displayWidth || this.canvas.height !== frame.displayHeight) {
-      this.canvas.width = frame.displayWidth;
-      this.canvas.height = frame.displayHeight;
-    }
-    const context = this.canvas.getContext("2d");
-    this.captured = clock.toPage(frame.timestamp / 1000);
-    context.drawImage(frame, 0, 0);
-    frame.close();
-    this.shown += 1;
-    this.figure.dataset.shown = this.shown;
-    context.font = "600 20px system-ui, sans-serif";
-    context.fillStyle = "rgba(0, 0, 0, .55)";
-    context.fillRect(this.canvas.width - 96, 8, 88, 28);
-    context.fillStyle = "#fff";
-    context.textAlign = "right";
-    context.fillText(`${Math.round(age(this.captured))} ms`, this.canvas.width - 14, 29);
+    const canvas = this.canvas.transferControlToOffscreen();
+    worker.postMessage({ canvas, camera: number }, [canvas]);
   }
 
   get outdated() {
     return age(this.captured) > MAX_AGE;
+  }
+
+  update({ captured, shown, coveredAt }) {
+    this.captured = captured;
+    this.figure.dataset.shown = shown;
+    this.figure.dataset.covered = coveredAt ?? "";
   }
 
   updateCover() {
@@ -144,23 +87,28 @@ function camera(number) {
     all = [...cameras.values(), created].sort((one, other) => one.number - other.number);
   cameras.clear();
   for (const one of all) cameras.set(one.number, one);
+  byId("cameras").dataset.count = cameras.size;
   return created;
 }
 
-function receiveFrame(buffer) {
-  const view = new DataView(buffer);
-  camera(view.getUint8(0)).decode(view.getUint8(1) === 1, view.getFloat64(6, true), buffer.slice(HEADER_BYTES));
+function removeCameras() {
+  for (const one of cameras.values()) one.figure.remove();
+  if (cameras.size) worker.postMessage({ remove: true });
+  cameras.clear();
 }
 
 // ---- commands
 
 function sendCommand() {
+  if (stopping) send({ do: "stop" });
+  const current = controls();
+  sendOverlay(current);
+  if (emergency()) demandStop();
   if (!driving()) return;
-  const now = controls();
-  if (now === null) return releaseControl("the gamepad was unplugged");
-  const agree = agreeing > 0 && agreeing <= COMMANDS_AGREED && now.throttle === 0;
+  if (current === null) return releaseControl("the gamepad was unplugged");
+  const agree = agreeing > 0 && agreeing <= COMMANDS_AGREED && current.throttle === 0;
   send({
-    do: "turn", ...now, throttle: agreeing > 0 ? 0 : now.throttle, gear, horn: any("KeyH"), lights,
+    do: "turn", ...current, throttle: agreeing > 0 ? 0 : current.throttle, gear, horn: any("KeyH"), lights,
     stop: state.telemetry?.stop ?? 0, agree,
   });
   if (agreeing > 0) agreeing -= 1;
@@ -171,14 +119,34 @@ function releaseControl(why) {
   send({ do: "leave", why });
 }
 
+// Latches an emergency stop, whoever drives: it is repeated until the station reports it.
+function demandStop() {
+  if (!state.vehicle) return;
+  stopping = true;
+  agreeing = 0;
+  send({ do: "stop" });
+}
+
 addEventListener("keydown", (event) => {
-  const brake = driving() && BRAKES.includes(event.code); // with any modifiers, and wherever the focus is
-  if (!brake && (event.target instanceof HTMLInputElement || event.ctrlKey || event.metaKey || event.altKey)) return;
-  if (driving() && (brake || event.code.startsWith("Arrow"))) event.preventDefault();
-  if (!event.repeat && event.code === "KeyR" && Math.abs(state.telemetry?.vehicle.speed ?? 0) < 0.3) gear = -gear;
-  if (!event.repeat && event.code === "KeyL") lights = !lights;
+  const brake = driving() && BRAKES.includes(event.code), // with any modifiers, and wherever the focus is
+    typing = event.target instanceof HTMLInputElement,
+    stop = STOPS.includes(event.code) && !(typing && event.code === "Backspace");
+  if (stop && !event.repeat) demandStop();
+  if (!brake && !stop && (typing || event.ctrlKey || event.metaKey || event.altKey)) return;
+  if (driving() && (brake || stop || event.code.startsWith("Arrow"))) event.preventDefault();
+  if (!event.repeat) pressedOnce(event);
   pressed.add(event.code);
 });
+
+function pressedOnce({ code, key }) {
+  if (code === "KeyR" && Math.abs(state.telemetry?.vehicle.speed ?? 0) < 0.3) gear = -gear;
+  if (code === "KeyL") lights = !lights;
+  if (code === "KeyF") toggleFullScreen();
+  if (code === "KeyN") toggleNight();
+  if (code === "KeyP") geometry("shown").click();
+  if (key === "?") toggleHelp();
+}
+
 addEventListener("keyup", (event) => {
   if (driving() && event.code === "Space") event.preventDefault(); // space is a brake and must not press a button
 });
@@ -188,6 +156,28 @@ byId("brake").addEventListener("pointerdown", (event) => {
 });
 byId("brake").addEventListener("lostpointercapture", () => pressed.delete("Button")); // also when released outside
 byId("brake").addEventListener("contextmenu", (event) => event.preventDefault());
+byId("stop").addEventListener("pointerdown", demandStop); // when pressed, not when released
+byId("stop").addEventListener("click", demandStop); // from the keyboard and by assistive technology
+
+// The emergency stop ends only when this button is held, by pointer or by Enter: a touch alone isn't deliberate.
+let held = null;
+function hold(event) {
+  if (held !== null || (event.type === "keydown" && event.code !== "Enter")) return;
+  held = setTimeout(() => {
+    stopping = false;
+    send({ do: "unlatch" });
+  }, RELEASE_HOLD);
+  byId("unlatch").dataset.held = "";
+}
+function letGo() {
+  clearTimeout(held);
+  held = null;
+  delete byId("unlatch").dataset.held;
+}
+for (const type of ["pointerdown", "keydown"]) byId("unlatch").addEventListener(type, hold);
+for (const type of ["pointerup", "pointerleave", "pointercancel", "keyup", "blur"]) byId("unlatch").addEventListener(type, letGo);
+byId("unlatch").addEventListener("contextmenu", (event) => event.preventDefault());
+
 addEventListener("gamepaddisconnected", (event) => {
   if (event.gamepad.index === gamepad && driving()) releaseControl("the gamepad was unplugged");
 });
@@ -195,13 +185,78 @@ document.addEventListener("visibilitychange", () => {
   if (document.hidden && driving()) releaseControl("control was released since the page was in the background");
 });
 
+// ---- screen
+
+let leavingFullScreen = false;
+
+async function toggleFullScreen() {
+  leavingFullScreen = Boolean(document.fullscreenElement);
+  if (leavingFullScreen) return document.exitFullscreen();
+  await document.documentElement.requestFullscreen();
+  await navigator.keyboard?.lock?.(STOPS).catch(() => {}); // so that the page sees Escape before the browser does
+}
+
+document.addEventListener("fullscreenchange", () => {
+  if (document.fullscreenElement) return;
+  if (!leavingFullScreen && driving()) demandStop(); // the browser took Escape for itself
+  leavingFullScreen = false;
+});
+byId("full").addEventListener("click", toggleFullScreen);
+
+function toggleNight() {
+  document.body.toggleAttribute("data-night");
+}
+
+// Geometry of the predicted path, stored for each vehicle.
+const geometry = (name) => document.querySelector(`#geometry [name=${name}]`);
+let path = null; // null: the path isn't drawn
+
+function loadGeometry(vehicle) {
+  const stored = { ...PATH, shown: false, ...JSON.parse(localStorage.getItem(`path ${vehicle}`) ?? "{}") };
+  for (const name of Object.keys(PATH)) geometry(name).value = stored[name];
+  geometry("shown").checked = stored.shown;
+  path = stored.shown ? stored : null;
+}
+
+byId("geometry").addEventListener("change", ({ target }) => {
+  if (!target.checkValidity()) return target.reportValidity();
+  const values = Object.fromEntries(Object.keys(PATH).map((name) => [name, Number(geometry(name).value)]));
+  localStorage.setItem(`path ${state.vehicle}`, JSON.stringify({ ...values, shown: geometry("shown").checked }));
+  loadGeometry(state.vehicle);
+});
+
+let history = []; // the latest steering, [time, value]
+
+// Sends the worker what it draws into the first picture; speed and gear only if they are not outdated.
+function sendOverlay(current) {
+  const { steering = 0, throttle = 0, brake = 0 } = (driving() && current) || {},
+    at = now(),
+    vehicle = freshVehicle();
+  history = [...history.filter(([when]) => when > at - 1000), [at, steering]];
+  worker.postMessage({
+    overlay: {
+      at, steering, throttle, brake, history, path,
+      speed: vehicle?.speed ?? null, gear: vehicle ? GEARS[driving() ? gear : vehicle.gear] : "",
+      standing: Boolean(vehicle && state.telemetry.standing),
+    },
+  });
+}
+
+function toggleHelp() {
+  byId("help").hidden = !byId("help").hidden;
+  byId("keys").ariaExpanded = String(!byId("help").hidden);
+}
+byId("keys").addEventListener("click", toggleHelp);
+
 // ---- display
 
 function linkPill(link) {
   const trip = link.round_trip === null ? "" : ` ${Math.round(link.round_trip)} ms`;
   const loss = link.loss ? ` ${(100 * link.loss).toFixed(1)} % lost` : "";
-  const made = element("span", `${link.name}${link.up ? `${trip}${loss} ${link.rate.toFixed(1)} Mbit/s` : " down"}`, "pill");
-  made.dataset.state = link.up ? "running" : "failed";
+  const up = link.up && !(link.silent_ms > MAX_AGE),
+    why = link.up ? ` silent since ${(link.silent_ms / 1000).toFixed(1)} s` : " down";
+  const made = element("span", `${link.name}${up ? `${trip}${loss} ${link.rate.toFixed(1)} Mbit/s` : why}`, "pill");
+  made.dataset.state = up ? "running" : "failed";
   return made;
 }
 
@@ -210,44 +265,57 @@ function showLinks(links) {
   if (byId("links").innerHTML !== pills.map((one) => one.outerHTML).join("")) byId("links").replaceChildren(...pills);
 }
 
-function received(message) {
+function received(message, sent, vehicle) {
   if (message.fault) return strip("fault", message.fault);
-  if (message.clock !== undefined) return clock.addAnswer(message.clock, message.now_ms);
   state = message;
-  sentAt.station = clock.toPage(state.now_ms);
-  sentAt.vehicle = state.telemetry && state.telemetry_age_ms !== null ? sentAt.station - state.telemetry_age_ms : -Infinity;
+  sentAt.station = sent;
+  sentAt.vehicle = vehicle;
+  if (state.latched) stopping = false; // the station has it
+  if (state.vehicle && byId("vehicle").textContent !== state.vehicle) loadGeometry(state.vehicle);
   write(byId("vehicle"), state.vehicle ?? "no vehicle");
   write(byId("station"), state.station);
   byId("fetch").hidden = Boolean(state.vehicle);
   byId("wheel").hidden = byId("drive").hidden = !state.vehicle;
   write(byId("why"), state.vehicle ? "" : state.why);
   if (state.vehicle) for (const one of state.cameras) write(camera(one.camera).name, one.fps ? one.name : `${one.name}: offline`);
-  else {
-    for (const one of cameras.values()) one.figure.remove();
-    cameras.clear();
-  }
+  else removeCameras();
 }
 
 // A cover over the whole page, which appears when the watchdog hasn't run for too long: the browser's compositor animates
-// it even while this page's scripts hang.
+// it even while this page's scripts hang; the worker draws its text.
 const hung = byId("hung").animate({ opacity: [0, 0, 1, 1], offset: [0, 0.001, 0.001, 1] }, { duration: 1000 * MAX_AGE, fill: "both" });
+const noticeCanvas = byId("hung").firstElementChild.transferControlToOffscreen();
+worker.postMessage({ notice: noticeCanvas }, [noticeCanvas]);
+
+// Last reported state of the vehicle; undefined: it is outdated.
+function freshVehicle() {
+  const { telemetry } = state;
+  if (age(sentAt.station) > MAX_AGE || !telemetry || age(sentAt.vehicle - telemetry.vehicle_age_ms) > MAX_AGE) return;
+  return telemetry.vehicle;
+}
 
 // Updates the display, and covers what is outdated. It computes ages from the current time, so that a failure of anything
 // is detected without being reported.
 function watchdog() {
   hung.currentTime = 0;
+  worker.postMessage({ alive: now() });
   for (const one of cameras.values()) one.updateCover();
   const station = age(sentAt.station) <= MAX_AGE ? state : {},
-    telemetry = age(sentAt.vehicle) <= MAX_AGE ? station.telemetry : undefined;
-  write(byId("speed"), telemetry ? (3.6 * telemetry.vehicle.speed).toFixed(1) : "-");
-  write(byId("gear"), telemetry ? GEARS[driving() ? gear : telemetry.vehicle.gear] : "-");
+    telemetry = age(sentAt.vehicle) <= MAX_AGE ? station.telemetry : undefined,
+    vehicle = freshVehicle();
+  write(byId("speed"), Number.isFinite(vehicle?.speed) ? (3.6 * vehicle.speed).toFixed(1) : "-");
+  write(byId("gear"), vehicle ? GEARS[driving() ? gear : vehicle.gear] : "-");
   write(byId("command"), Number.isFinite(telemetry?.age) ? `${Math.round(telemetry.age)}` : "-");
-  showLinks(station.links ?? []);
+  showLinks(telemetry ? station.links : []);
   byId("take").disabled = station.driver !== null;
   byId("leave").disabled = !driving();
-  byId("agree").disabled = !driving() || !telemetry?.standing || station.why !== "";
-  write(byId("input"), gamepad === null ? "" : "The gamepad is in use.");
-  showStatus(station === state, telemetry !== undefined);
+  byId("agree").disabled = !driving() || !telemetry?.standing || station.why !== "" || Boolean(station.latched);
+  byId("latched").hidden = !(station.latched || stopping);
+  write(byId("latched").firstElementChild, station.latched ? `Emergency stop, pressed by ${station.latched}.` : "Emergency stop.");
+  write(byId("input"), inputText());
+  if (telemetry?.standing && !stood && driving()) rumble(gamepads());
+  stood = telemetry?.standing ?? stood;
+  showStatus(station === state, vehicle !== undefined);
   strip("standing", [...messages(station, telemetry)].map((one) => `${one}. `).join(""));
 }
 
@@ -280,6 +348,8 @@ function showStatus(station, vehicle) {
   if (state.vehicle && outdated.length === cameras.size)
     faults.push(`no picture${sinceText(Math.max(...outdated.map((one) => one.captured)))}`);
   else if (outdated.length) faults.push(`no picture: ${outdated.map((one) => one.name.textContent).join(", ")}`);
+  if (faults.length === 0) delete byId("status").dataset.lost;
+  else byId("status").dataset.lost ??= now(); // when it ceased to be live
   write(byId("status"), faults.join(", ") || (state.vehicle ? "live" : "connected"));
   byId("status").dataset.state = faults.length ? "lost" : state.vehicle ? "live" : "waiting";
 }
@@ -302,6 +372,20 @@ byId("token").addEventListener("submit", (event) => {
   byId("token").hidden = true;
 });
 
+// ---- connection, held by the worker
+
+let closed = () => {};
+worker.onmessage = ({ data }) => {
+  if (data.opened) connection = "";
+  if (data.closed) closed();
+  if (data.camera !== undefined) camera(data.camera);
+  if (data.message) received(data.message, data.sent, data.vehicle);
+  if (data.status) {
+    sentAt.worker = data.at;
+    for (const one of data.status) cameras.get(one.number)?.update(one);
+  }
+};
+
 const hex = (text) => [...new TextEncoder().encode(text)].map((one) => one.toString(16).padStart(2, "0")).join("");
 
 async function connect() {
@@ -311,25 +395,17 @@ async function connect() {
     byId("token").hidden = !(error instanceof NoToken);
     throw error instanceof NoToken ? new Error("a token is required") : error;
   }
-  const token = sessionStorage.getItem("token");
-  socket = new WebSocket(`/live`.replace(/^/, location.origin.replace(/^http/, "ws")), ["scan2sim", ...(token ? [`token.${hex(token)}`] : [])]);
-  socket.binaryType = "arraybuffer";
-  socket.onopen = () => {
-    connection = "";
-    clock = new Clock();
-    clock.synchronize();
-    for (const one of cameras.values()) one.started = false; // frames are missing: continue at a key frame
-  };
-  socket.onmessage = (event) =>
-    typeof event.data === "string" ? received(JSON.parse(event.data)) : receiveFrame(event.data);
-  await new Promise((done) => (socket.onclose = done));
+  const token = sessionStorage.getItem("token"),
+    url = `${location.origin.replace(/^http/, "ws")}/live`;
+  const ended = new Promise((done) => (closed = done));
+  worker.postMessage({ open: { url, protocols: ["scan2sim", ...(token ? [`token.${hex(token)}`] : [])] } });
+  await ended;
   throw new Error("the station is not reachable");
 }
 
 (async () => {
   if (!("VideoDecoder" in window)) return strip("fault", "This browser decodes no video here: it needs WebCodecs, and a page from localhost or by https.");
   setInterval(sendCommand, PERIOD);
-  setInterval(() => clock.synchronize(), CLOCK_PERIOD);
   setInterval(showAges, AGES_PERIOD);
   setInterval(() => {
     if (driving()) chooseGamepad();

@@ -1,7 +1,10 @@
 // Fleet page: vehicles, stations and their links; joins, hands over, takes back and releases vehicles.
 "use strict";
 
-const REFRESH_PERIOD = 1000; // ms
+const REFRESH_PERIOD = 1000, // ms
+  SPEEDS_PERIOD = 100, // interval at which speeds are requested, ms
+  WATCHDOG_PERIOD = 20; // interval at which speeds that are too old are removed, ms
+let speeds = {}; // {speed, at} by vehicle: m/s, and when it was reported
 
 function showError(error) {
   byId("fault").hidden = !error;
@@ -35,24 +38,24 @@ const time = (seconds) => new Date(1000 * seconds).toLocaleTimeString();
 function card(one, pairText) {
   const made = element("article", undefined, "run"),
     line = element("div", undefined, "bar");
-  const speed = one.speed === null ? "" : `${(3.6 * one.speed).toFixed(1)} km/h`;
   const latency = one.age === null ? "" : `${Math.round(one.age)} ms`;
   line.append(
     element("b", one.name),
     pill(one.there ? "connected" : `disconnected since ${time(one.since)}`, one.there),
     element("span", one.address, "soft"),
     element("span", pairText, "soft"),
-    element("span", [speed, latency].filter(Boolean).join(", ")),
+    element("span", latency),
     ...one.links.map(linkPill),
   );
   made.append(line);
-  if (one.told) made.append(element("p", one.told, "failure"));
+  if (one.message) made.append(element("p", one.message, "failure"));
   return [made, line];
 }
 
 function vehicle(one, stations) {
   const [made, line] = card(one, one.other ? `driven from ${one.other}` : "no station");
   const choice = element("span", undefined, "choice"),
+    speed = element("output"),
     select = element("select");
   const free = stations.filter((station) => station.there && station.pair === null);
   select.ariaLabel = `station for ${one.name}`;
@@ -65,7 +68,8 @@ function vehicle(one, stations) {
     if (one.before) choice.append(button(`Back to ${one.before}`, false, () => act(one.name, "take-back")));
     choice.append(button("Release", false, () => act(one.name, "release")));
   }
-  line.append(choice);
+  speed.dataset.vehicle = one.name;
+  line.append(speed, choice);
   return made;
 }
 
@@ -76,6 +80,22 @@ function auditRow(one) {
   for (const text of [new Date(1000 * one.time).toLocaleString(), one.what, one.vehicle, one.station, one.by]) made.append(element("td", text));
   return made;
 }
+
+async function refreshSpeeds() {
+  const sent = now(),
+    found = await (await request("/api/speeds", AbortSignal.timeout(5000))).json();
+  speeds = Object.fromEntries(Object.entries(found).map(([name, one]) => [name, { speed: one.speed, at: sent - one.reported_ms }]));
+}
+
+// Writes speeds, and removes those that are too old, whatever the cause: ages are counted from the present.
+function showSpeeds() {
+  for (const output of document.querySelectorAll("[data-vehicle]")) {
+    const found = speeds[output.dataset.vehicle],
+      text = found && age(found.at) <= MAX_AGE ? `${(3.6 * found.speed).toFixed(1)} km/h` : "";
+    if (output.textContent !== text) output.textContent = text;
+  }
+}
+setInterval(showSpeeds, WATCHDOG_PERIOD);
 
 let shown = "";
 
@@ -108,9 +128,11 @@ byId("token").addEventListener("submit", (event) => {
   refresh();
 });
 
-(async () => {
+async function repeat(action, period) {
   for (;;) {
-    if (!document.hidden) await refresh();
-    await new Promise((done) => setTimeout(done, REFRESH_PERIOD));
+    if (!document.hidden) await action();
+    await new Promise((done) => setTimeout(done, period));
   }
-})();
+}
+repeat(refresh, REFRESH_PERIOD);
+repeat(() => refreshSpeeds().catch(() => {}), SPEEDS_PERIOD); // failures are reported by `refresh`

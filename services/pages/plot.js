@@ -4,6 +4,10 @@
 const HUES = [212, 32, 140, 275, 182, 55, 318, 95, 245],
   DASHES = [[], [7, 4], [2, 4], [10, 4, 2, 4]];
 
+// Values that the crosshair lists in the plot under the pointer, and in the others.
+const MAX_VALUES = 24,
+  MAX_VALUES_ASIDE = 8;
+
 function lineStyle(number) {
   return { hue: HUES[number % HUES.length], dash: DASHES[Math.floor(number / HUES.length) % DASHES.length] };
 }
@@ -74,26 +78,33 @@ const UNITS = {
 };
 
 class Plot {
-  // `unit`: a key of UNITS; `limit`: optional upper limit; `ranged(from, to)`: called with seconds when the user selects
-  // a range; `legend`: whether the lines are named beside the title.
-  constructor(place, { title, unit, limit, ranged, legend }) {
+  // `unit`: a key of UNITS; `ranged(from, to)`: called with seconds when the user selects a range; `legend`: whether the
+  // lines are named beside the title.
+  constructor(place, { unit, ranged, legend }) {
     this.unit = UNITS[unit];
-    this.limit = limit;
     this.ranged = ranged;
     this.legend = legend;
     this.figure = document.createElement("figure");
-    const caption = document.createElement("figcaption"),
-      name = document.createElement("b");
-    name.textContent = title;
+    const caption = document.createElement("figcaption");
+    this.title = document.createElement("b");
     this.readout = document.createElement("output");
-    caption.append(name, this.readout);
+    caption.append(this.title, this.readout);
     this.box = document.createElement("div");
-    this.figure.append(caption, this.box);
+    this.values = document.createElement("div");
+    this.values.className = "values";
+    this.values.hidden = true;
+    this.figure.append(caption, this.box, this.values);
     place.append(this.figure);
     new ResizeObserver(() => this.chart?.setSize(this.size())).observe(this.box);
     addEventListener("theme", () => this.rebuild());
     this.times = [];
     this.series = [];
+  }
+
+  // Sets the title, and the upper limit, if there is one.
+  describe(title, limit) {
+    this.limit = limit;
+    this.title.textContent = title;
   }
 
   size() {
@@ -131,7 +142,6 @@ class Plot {
         sync: { key: "time", setSeries: false },
         drag: { x: true, y: false, setScale: false },
         focus: { prox: 24 },
-        y: false,
       },
       focus: { alpha: 0.25 },
       scales: { x: { time: true, range: () => this.window }, y: { range: () => this.range() } },
@@ -231,15 +241,14 @@ class Plot {
     return found;
   }
 
-  // Text beside the title: the value under the pointer, else how often the limit is exceeded.
+  // Text beside the title: the time under the pointer, else how often the limit is exceeded.
   updateReadout() {
-    const { idx, left } = this.chart.cursor;
+    const { idx, left } = this.chart.cursor,
+      pointed = left >= 0 && idx !== null && idx !== undefined && idx < this.times.length;
     this.readout.className = "";
-    if (left >= 0 && idx !== null && idx !== undefined) {
-      const one = this.series[this.focused - 1],
-        value = one?.mean[idx];
-      const shown = one ? ` · ${one.name} · ${value === null ? "–" : this.unit(value)}` : "";
-      this.readout.textContent = new Date(1000 * this.times[idx]).toLocaleTimeString([], { hour12: false }) + shown;
+    this.showValues(pointed ? idx : null, left);
+    if (pointed) {
+      this.readout.textContent = new Date(1000 * this.times[idx]).toLocaleTimeString([], { hour12: false });
     } else if (this.limit !== undefined) {
       const count = this.exceeded().length;
       this.readout.className = count ? "bad" : "";
@@ -247,6 +256,38 @@ class Plot {
     } else if (this.legend) {
       this.readout.replaceChildren(...this.series.flatMap((one) => [key(one.number), ` ${one.name} `]));
     } else this.readout.textContent = "";
+  }
+
+  // List of all values at the crosshair, the largest first, on its free side; `index` null: none.
+  showValues(index, left) {
+    const known = index === null ? [] : this.series.filter((one) => one.mean[index] !== null);
+    this.values.hidden = !known.length;
+    if (!known.length) return;
+    known.sort((a, b) => b.mean[index] - a.mean[index]);
+    const nearest = this.series[this.focused - 1],
+      room = this.figure.matches(":hover") ? MAX_VALUES : MAX_VALUES_ASIDE;
+    const rows = known.slice(0, room).map((one) => {
+      const row = document.createElement("div"),
+        name = document.createElement("span"),
+        value = document.createElement("b");
+      [name.textContent, value.textContent] = [one.name, this.unit(one.mean[index])];
+      row.className = one === nearest ? "nearest" : "";
+      row.append(key(one.number), name, value);
+      return row;
+    });
+    if (known.length > room) {
+      const more = document.createElement("div");
+      more.textContent = `and ${known.length - room} lower ones`;
+      rows.push(more);
+    }
+    this.values.replaceChildren(...rows);
+    const over = this.chart.over,
+      isRight = left < over.clientWidth / 2,
+      gap = 14;
+    const start = over.getBoundingClientRect().left - this.figure.getBoundingClientRect().left;
+    this.values.style.left = isRight ? `${start + left + gap}px` : "";
+    this.values.style.right = isRight ? "" : `${this.figure.clientWidth - start - left + gap}px`;
+    this.values.style.maxWidth = `${Math.max(left, over.clientWidth - left) - gap}px`;
   }
 }
 

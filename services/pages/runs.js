@@ -1,4 +1,4 @@
-// Runs and alarms on the dashboard of the event bus, from the state in /api/live (services/monitoring/dashboard/state.py).
+// Runs on the dashboard of the event bus, from the state in /api/live (services/monitoring/dashboard/state.py).
 "use strict";
 
 const details = new Map(); // by run: details, which the service sends only when they have changed
@@ -28,8 +28,6 @@ function progressBar(fraction, label) {
   made.setAttribute("aria-label", label);
   return made;
 }
-
-// ---- runs
 
 function showRuns(runs, now) {
   for (const run of runs) if (run.details) details.set(run.run, run.details);
@@ -64,8 +62,8 @@ function fillCard(made, { run, silent, version, came }, now) {
   const fingerprint = `${version} ${label}`;
   if (made.dataset.shown === fingerprint) return; // don't replace elements that may be selected or about to be clicked
   made.dataset.shown = fingerprint;
-  const done = steps.filter((step) => step.state === "done").length + (others.done ?? 0) + (others.kept ?? 0);
-  const finished = last ? last.done + last.kept : done,
+  const done = steps.filter((step) => step.state === "done").length + (others.done ?? 0) + (others.cached ?? 0);
+  const finished = last ? last.done + last.cached : done,
     all = last ? last.steps : known;
   const pill = element("output", label, "pill");
   pill.dataset.state = state;
@@ -73,7 +71,7 @@ function fillCard(made, { run, silent, version, came }, now) {
     pill,
     element("b", last ? `${last.command} ${last.source}` : "unknown run"),
     ...(all ? [progressBar(finished / all, "Tasks done")] : []),
-    element("span", !all ? "" : `${finished} of ${all} tasks${last?.kept ? `, ${last.kept} cached` : ""}`, "soft"),
+    element("span", !all ? "" : `${finished} of ${all} tasks${last?.cached ? `, ${last.cached} cached` : ""}`, "soft"),
     element("span", last?.failed ? `${last.failed} failed` : "", "bad"),
     element("span", last ? `${duration(last.seconds)} on ${last.host}` : "", "soft"),
   );
@@ -81,9 +79,9 @@ function fillCard(made, { run, silent, version, came }, now) {
   failure.hidden = !failure.textContent;
   scroll.replaceChildren(table(steps, state));
   scroll.hidden = !steps.length;
-  const counted = ["failed", "done", "kept", "waiting"]
+  const counted = ["failed", "done", "cached", "waiting"]
     .filter((one) => others[one])
-    .map((one) => `${others[one]} ${one === "kept" ? "cached" : one}`);
+    .map((one) => `${others[one]} ${one}`);
   rest.textContent = counted.length ? `${steps.length ? "and " : ""}${counted.join(", ")}` : "";
   rest.hidden = !rest.textContent;
 }
@@ -115,39 +113,4 @@ function table(steps, state) {
     }),
   );
   return made;
-}
-
-// ---- alarms
-
-const NAMED_ALARMS = 3; // alarms that are named in the strip at the top
-
-function showAlarms({ raised, cleared }, events_topic) {
-  const strip = byId("alarm");
-  strip.hidden = !raised.length;
-  const text = raised.length
-    ? `${raised.length === 1 ? "Alarm" : `${raised.length} alarms`}: ` +
-      raised
-        .slice(0, NAMED_ALARMS)
-        .map((one) => `${one.rule}, ${one.subject}, since ${moment(one.since)}`)
-        .join("; ") +
-      (raised.length > NAMED_ALARMS ? `; and ${raised.length - NAMED_ALARMS} more` : "")
-    : "";
-  if (strip.textContent !== text) strip.textContent = text; // so that a screen reader announces it once
-  const rows = [...raised, ...cleared].map((one) => {
-    const row = element("tr"),
-      rule = element("td");
-    rule.append(element("span", one.rule));
-    row.append(
-      rule,
-      element("td", one.until === undefined ? "raised" : "cleared", one.until === undefined ? "bad" : ""),
-      element("td", one.subject),
-      element("td", +one.value.toPrecision(4), "n"),
-      element("td", one.since === null ? "–" : moment(one.since), "n"),
-      element("td", one.until === undefined ? "" : moment(one.until), "n"),
-    );
-    return row;
-  });
-  byId("alarms").tBodies[0].replaceChildren(...rows);
-  byId("alarms").parentElement.hidden = !rows.length;
-  byId("calm").textContent = rows.length ? "" : `None on ${events_topic}.`;
 }

@@ -11,18 +11,31 @@ from scan2sim.services.qos.requirements import MACHINE_METRICS, NETWORK_METRICS,
 
 IMAGE_RATES = (1.0, 2.0, 5.0, 10.0, 25.0)
 """Image rates (images per second) for which resource needs are printed."""
+NOT_MEASURED, NOT_DECIDED = "not measured", "not decided"
+"""Notes on metrics that can't be measured here, and on shares whose confidence bounds contain the limit."""
 MAX_CPU_LOAD = 0.7
 """Maximum share of CPU time; above it, images queue for long."""
 
 
 @dataclass(frozen=True)
 class MetricComparison:
-    """Comparison of one metric; `passed` is None if it isn't required or can't be measured."""
+    """Comparison of one metric.
+
+    Attributes:
+        metric: its name.
+        required: limit; None: not required.
+        measured: value; None: not measured; infinite: some requests had no response.
+        passed: None: not required, not measured or not decided.
+        bounds: confidence bounds of a measured share.
+        note: why a required metric neither passed nor failed.
+    """
 
     metric: str
     required: Bound | None
     measured: float | None
     passed: bool | None
+    bounds: tuple[float, float] | None = None
+    note: str = ""
 
 
 class MetricSource(Protocol):
@@ -31,30 +44,46 @@ class MetricSource(Protocol):
     def values(self) -> dict[str, float | None]:
         """Values of the metrics of `Requirements`; None: not applicable."""
 
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Confidence bounds of metrics that are shares, by name."""
+
 
 def compare_metrics(required: Requirements, measured: MetricSource) -> list[MetricComparison]:
     """Compare all metrics that are required or measured.
 
-    Network requirements pass if there is no network. A request without a response fails the response time, even if none
-    is required.
+    What can't be measured here, such as a GPU, neither passes nor fails. A share passes or fails if its confidence
+    bounds are on one side of the limit, unless that is zero. A request without a response fails the response time, even
+    if none is required.
     """
-    values = measured.values()
+    values, bounds = measured.values(), measured.bounds()
     found = []
     for metric in (*NETWORK_METRICS, *MACHINE_METRICS):
         bound, value = getattr(required, metric), values[metric]
         if bound is None and value is None:
             continue
-        found.append(MetricComparison(metric, bound, value, _met(metric, bound, value)))
+        found.append(_compared(metric, bound, value, bounds.get(metric)))
     return found
 
 
-def _met(metric: str, bound: Bound | None, value: float | None) -> bool | None:
+def _compared(
+    metric: str, required: Bound | None, value: float | None, bounds: tuple[float, float] | None
+) -> MetricComparison:
     if value is None:
-        unused = metric.endswith("_usage")  # of a processor that doesn't exist
-        return None if bound is None or unused else False
-    if bound is None:
-        return False if math.isinf(value) else None
-    return bound.met(value)
+        return MetricComparison(metric, required, None, None, note=NOT_MEASURED)
+    if required is None:
+        return MetricComparison(metric, None, value, False if math.isinf(value) else None, bounds)
+    if bounds is None or required.value == 0 or required.met(bounds[0]) == required.met(bounds[1]):
+        return MetricComparison(metric, required, value, required.met(value), bounds)
+    return MetricComparison(metric, required, value, None, bounds, NOT_DECIDED)
+
+
+def summary(found: list[MetricComparison], metrics: tuple[str, ...]) -> str:
+    """Outcome of the given metrics in words."""
+    outcome = "passed" if passed(found, metrics) else "FAILED"
+    for note in (NOT_MEASURED, NOT_DECIDED):
+        names = [row.metric.replace("_", " ") for row in found if row.note == note and row.metric in metrics]
+        outcome += f"; {note}: {', '.join(names)}" if names else ""
+    return outcome
 
 
 def passed(found: list[MetricComparison], metrics: tuple[str, ...]) -> bool:

@@ -15,8 +15,8 @@ from scan2sim.services.qos.emulated_link import Link
 from scan2sim.services.qos.environments import Network
 from scan2sim.services.qos.probe import ProbeResult
 
-PROBE_RATE, PROBE_PORT = 200.0, 9100
-"""Packets per second that probe the network, and the UDP port that receives them."""
+PROBE_RATE, MAX_PROBE_RATE, PROBE_PORT = 200.0, 1000.0, 9100
+"""Packets per second that probe the network, usually and at most, and the UDP port that receives them."""
 PROBE_TIMEOUT_S = 60.0
 
 
@@ -41,8 +41,8 @@ class Hosts(Protocol):
     def probe_result(self, probe: Any) -> ProbeResult | None:
         """Wait for a probe and return its result; None: no network."""
 
-    def start_probe(self, seconds: float) -> Any:
-        """Start probing the network for a number of seconds."""
+    def start_probe(self, seconds: float, rate: float = PROBE_RATE) -> Any:
+        """Start probing the network for a number of seconds, with `rate` packets per second."""
 
 
 class SameHost:
@@ -60,7 +60,7 @@ class SameHost:
         """Always 0."""
         return 0
 
-    def start_probe(self, seconds: float) -> None:
+    def start_probe(self, seconds: float, rate: float = PROBE_RATE) -> None:
         """No network, no probe."""
 
     def probe_result(self, probe: None) -> None:
@@ -86,13 +86,13 @@ class LinkedHosts:
         counts = self._link.near.counts()
         return counts.sent_bytes + counts.received_bytes
 
-    def start_probe(self, seconds: float) -> subprocess.Popen[str]:
+    def start_probe(self, seconds: float, rate: float = PROBE_RATE) -> subprocess.Popen[str]:
         """See `Hosts`."""
         command = (sys.executable, "-m", probe_module.__name__)
         receiver = self.start_service(*command, "receive", PROBE_PORT, stdout=subprocess.PIPE, text=True)
         assert receiver.stdout
         receiver.stdout.readline()
-        self.start_robot(*command, "send", self.address, PROBE_PORT, PROBE_RATE, seconds)
+        self.start_robot(*command, "send", self.address, PROBE_PORT, rate, seconds)
         return receiver
 
     def probe_result(self, probe: subprocess.Popen[str]) -> ProbeResult:

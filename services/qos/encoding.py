@@ -42,6 +42,10 @@ class ChoiceParams(Params):
     budget: Annotated[
         float, Field(ge=0.01, le=10_000, description="Available bandwidth in Mbit/s, including overhead.")
     ] = 5.0
+    weights: Annotated[
+        File | None,
+        Field(description="ONNX file of the detector that measures the accuracy. Default: the project's own."),
+    ] = None
 
 
 @dataclass(frozen=True)

@@ -119,3 +119,17 @@ def _cpu_seconds(process: psutil.Process) -> float:
             continue
         found += times.user + times.system
     return found
+
+
+def host_values(host: Machine, usage: Usage) -> dict[str, float | None]:
+    """Values of the metrics of `requirements.Requirements` that describe a machine and its usage."""
+    return {
+        "cpu_cores": host.cpu_cores,
+        "cpu_frequency": host.cpu_frequency,
+        "cpu_usage": usage.cpu_percent,
+        "gpu_cores": host.gpu_cores,
+        "gpu_frequency": host.gpu_frequency,
+        "gpu_memory": host.gpu_memory,
+        "gpu_usage": usage.gpu_percent,
+        "memory": usage.memory_mb,
+    }

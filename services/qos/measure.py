@@ -24,10 +24,11 @@ from scan2sim.pipeline.core.parameters import File
 from scan2sim.pipeline.core.step import Params, Report
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.qos import deployment, encoding, robot
-from scan2sim.services.qos.deployment import Hosts
+from scan2sim.services.qos.confidence import trials_needed
+from scan2sim.services.qos.deployment import MAX_PROBE_RATE, PROBE_RATE, Hosts
 from scan2sim.services.qos.encoding import Jpeg
 from scan2sim.services.qos.environments import Network, network
-from scan2sim.services.qos.host_load import Machine, Usage, machine
+from scan2sim.services.qos.host_load import Machine, Usage, host_values, machine
 from scan2sim.services.qos.probe import ProbeResult
 from scan2sim.services.qos.requirements import Environment, Requirements, ServiceRequirements
 from scan2sim.services.qos.robot import RequestStats
@@ -42,6 +43,8 @@ WARM_UP_S = 3.0
 """Seconds of requests before the measurement, as the first ones are slow."""
 MAX_IMAGES = 16
 """Maximum number of different images to send."""
+MIN_SECONDS, MAX_SECONDS = 30.0, 3600.0
+"""Shortest and longest default duration of a measurement."""
 MAX_LINK_UTILIZATION = 0.8
 """Maximum share of the network's rate used for images; above it, images queue for each other."""
 
@@ -49,10 +52,29 @@ MAX_LINK_UTILIZATION = 0.8
 class MeasureParams(Params):
     """Settings of `scan2sim qos measure`."""
 
-    toolbox: Annotated[str, Field(description="Toolbox to measure: detect, movement, classify or segment.")]
-    environment: Annotated[Environment, Field(description="Where it runs: robot, edge or cloud.")] = Environment.EDGE
-    rate: Annotated[float, Field(ge=0.01, le=1000, description="Images per second sent by the robot.")] = 2.0
-    seconds: Annotated[float, Field(ge=1, le=86_400, description="Duration of the measurement in seconds.")] = 30.0
+    service: Annotated[
+        str,
+        Field(
+            description="Service to measure: detect, movement, classify, segment, teleoperation, or traffic (the event"
+            " bus)."
+        ),
+    ]
+    environment: Annotated[Environment, Field(description="Where the service runs: robot, edge or cloud.")] = (
+        Environment.EDGE
+    )
+    rate: Annotated[float, Field(ge=0.01, le=1000, description="Images or events per second.")] = 2.0
+    event_bytes: Annotated[
+        int, Field(ge=100, le=10_000_000, description="Size of an event in bytes (traffic only; D3.2: about 1 MB).")
+    ] = 1_000_000
+    seconds: Annotated[
+        float | None,
+        Field(
+            ge=1,
+            le=86_400,
+            description="Duration of the measurement in seconds. Default: 30, or as long as required loss and error"
+            " rates need to be shown, up to an hour.",
+        ),
+    ] = None
     images: Annotated[
         File | None, Field(description="Folder of images to send. Default: photos of the synthetic street.")
     ] = None
@@ -67,7 +89,7 @@ class MeasureParams(Params):
         None
     )
     requirements: Annotated[
-        str | None, Field(description="TOML file or name of built-in requirements. Default: the toolbox's own.")
+        str | None, Field(description="TOML file or name of built-in requirements. Default: the service's own.")
     ] = None
 
 
@@ -91,6 +113,10 @@ class Measurement:
     wire_bytes: int
     encoding: Jpeg
 
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Confidence bounds of metrics that are shares of the packets."""
+        return self.probe.bounds() if self.probe else {}
+
     def values(self) -> dict[str, float | None]:
         """Values of the metrics of `requirements.Requirements`; None: not applicable."""
         requests, probe = self.requests, self.probe
@@ -102,15 +128,23 @@ class Measurement:
             "bandwidth": self.wire_bytes * 8e-6 / requests.seconds if probe else None,
             "loss_rate": probe.loss_rate if probe else None,
             "error_rate": probe.error_rate if probe else None,
-            "cpu_cores": self.machine.cpu_cores,
-            "cpu_frequency": self.machine.cpu_frequency,
-            "cpu_usage": self.usage.cpu_percent,
-            "gpu_cores": self.machine.gpu_cores,
-            "gpu_frequency": self.machine.gpu_frequency,
-            "gpu_memory": self.machine.gpu_memory,
-            "gpu_usage": self.usage.gpu_percent,
-            "memory": self.usage.memory_mb,
+            **host_values(self.machine, self.usage),
         }
+
+
+def duration(params: MeasureParams, required: Requirements) -> tuple[float, float]:
+    """Duration in seconds, and packets per second that probe the network.
+
+    By default both are such that the confidence bounds of the loss and the error rate are on one side of their limits.
+    """
+    link = network(params.environment, params.network)
+    packets = 0.0
+    if link:
+        limits = ((required.loss_rate, link.there.loss), (required.error_rate, 0.0))
+        needed = [trials_needed(limit.value, expected) for limit, expected in limits if limit]
+        packets = max((one for one in needed if math.isfinite(one)), default=0.0)
+    rate = min(max(PROBE_RATE, packets / (params.seconds or MIN_SECONDS)), MAX_PROBE_RATE)
+    return params.seconds or min(max(MIN_SECONDS, math.ceil(packets / rate)), MAX_SECONDS), rate
 
 
 def measure(params: MeasureParams, service: ServiceRequirements, report: Report) -> Measurement:
@@ -124,17 +158,18 @@ def measure(params: MeasureParams, service: ServiceRequirements, report: Report)
     import psutil
 
     link = network(params.environment, params.network)
+    seconds, probe_rate = duration(params, service.of(params.environment))
     with tempfile.TemporaryDirectory(prefix="scan2sim-qos-") as folder, deployment.open_hosts(link) as hosts:
         chosen = _write_images(params, service, link, Path(folder))
         report(0.0, "starting the toolbox")
-        with _toolbox(hosts, params.toolbox, Path(folder)) as (server, port):
+        with _toolbox(hosts, params.service, Path(folder)) as (server, port):
             _robot_stats(_start_robot(hosts, params, folder, port, WARM_UP_S))
             usage, before = Usage.start(psutil.Process(server.pid)), hosts.wire_bytes()
-            running_probe = hosts.start_probe(params.seconds)
-            running_robot = _start_robot(hosts, params, folder, port, params.seconds)
+            running_probe = hosts.start_probe(seconds, probe_rate)
+            running_robot = _start_robot(hosts, params, folder, port, seconds)
             began = time.monotonic()
             while running_robot.poll() is None:
-                report(min(1.0, (time.monotonic() - began) / params.seconds), "the robot sends images")
+                report(min(1.0, (time.monotonic() - began) / seconds), f"the robot sends images for {seconds:.0f} s")
                 usage = usage.updated()
                 time.sleep(0.2)
             requests, usage, probe = _robot_stats(running_robot), usage.updated(), hosts.probe_result(running_probe)
@@ -203,7 +238,7 @@ def _toolbox(hosts: Hosts, toolbox: str, folder: Path) -> Iterator[tuple[subproc
     command += ["--token", str(token)]
     with (folder / "toolbox.log").open("w+") as log:
         port = 0 if local else TOOLBOX_PORT
-        server = hosts.start_service(*command, "--port", port, stdout=log, stderr=log, env=_environment())
+        server = hosts.start_service(*command, "--port", port, stdout=log, stderr=log, env=module_environment())
         try:
             yield server, _port(server, folder / "toolbox.log")
         finally:
@@ -224,9 +259,15 @@ def _port(server: subprocess.Popen[Any], log: Path) -> int:
 
 
 def _start_robot(hosts: Hosts, params: MeasureParams, folder: str, port: int, seconds: float) -> subprocess.Popen[Any]:
-    command = (sys.executable, "-m", robot.__name__, f"http://{hosts.address}:{port}", params.toolbox, folder)
+    command = (sys.executable, "-m", robot.__name__, f"http://{hosts.address}:{port}", params.service, folder)
     return hosts.start_robot(
-        *command, params.rate, seconds, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=_environment()
+        *command,
+        params.rate,
+        seconds,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=module_environment(),
     )
 
 
@@ -237,6 +278,6 @@ def _robot_stats(process: subprocess.Popen[Any]) -> RequestStats:
     return RequestStats(**json.loads(line))
 
 
-def _environment() -> dict[str, str]:
+def module_environment() -> dict[str, str]:
     """Environment with this program's search path for Python modules."""
     return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

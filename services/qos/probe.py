@@ -16,6 +16,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from scan2sim.services.qos.confidence import share_bounds
+
 PACKET_FORMAT = struct.Struct("!QQI")
 """Sequence number, send time in ns, CRC-32 of the payload."""
 PAYLOAD = bytes(range(64))
@@ -44,6 +46,15 @@ class ProbeResult:
     delay: float
     jitter: float
     bytes: int
+
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Confidence bounds of the loss rate and the error rate."""
+        lost = round(self.loss_rate * self.sent)
+        received = self.sent - lost
+        return {
+            "loss_rate": share_bounds(lost, self.sent),
+            "error_rate": share_bounds(round(self.error_rate * received), max(1, received)),
+        }
 
 
 HEADER_BYTES = 14 + 20 + 8

@@ -1,10 +1,12 @@
 """Messages between parties and gateway: JSON, one message per line (`json_stream`); driving doesn't depend on them.
 
-To the gateway: `Hello`, `Status` once a second, `DriverRequest`. From it: `Join`, `Release`, `RequestRefused`.
+To the gateway: `Hello`, `Status` once a second, `DriverRequest`, `DriverEvent`. From it: `Join`, `Release`,
+`RequestRefused`.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -13,6 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from scan2sim.services.teleoperation.control.messages import Malformed
 
 PROTOCOL_VERSION = 1
+NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,59}")
+"""Name of a vehicle, station or driver; it becomes part of paths, pages and logs."""
 T = TypeVar("T")
 Name = Annotated[str, Field(min_length=1, max_length=60)]
 Text = Annotated[str, Field(max_length=200)]
@@ -67,13 +71,18 @@ class Hello(_Message):
 
 
 class LinkStatus(_Message):
-    """State of a link: round-trip time in ms, share of packets lost, Mbit/s both ways; None: not known yet."""
+    """State of a link: round-trip time in ms, share of packets lost, Mbit/s both ways; None: not known yet.
+
+    Attributes:
+        silent_ms: time since anything was received over it.
+    """
 
     name: Name
     up: bool
     round_trip: Finite | None = None
     loss: Finite | None = None
     rate: Finite = 0.0
+    silent_ms: Finite | None = None
 
 
 class Status(_Message):
@@ -83,7 +92,7 @@ class Status(_Message):
         pair: number of its pair.
         links: to the other party of the pair.
         driving: whether somebody drives now.
-        told: message for driver or operator: why the vehicle is stopped, or which clock is wrong.
+        message: for driver or operator: why the vehicle is stopped, or which clock is wrong.
         speed: of a vehicle, m/s.
         age: ms; of the last command for a vehicle, of the video for a station.
     """
@@ -92,17 +101,27 @@ class Status(_Message):
     pair: Count | None = None
     links: Annotated[tuple[LinkStatus, ...], Field(max_length=64)] = ()
     driving: bool = False
-    told: Text = ""
+    message: Text = ""
     speed: Finite | None = None
     age: Finite | None = None
 
 
 class DriverRequest(_Message):
-    """Request of a station's driver to join or to release a vehicle."""
+    """Request of a station's driver to join or to release a vehicle; `driver`: who, if the station knows."""
 
     kind: Literal["ask"] = "ask"
     what: Literal["join", "release"]
     vehicle: Name
+    driver: Text = ""
+
+
+class DriverEvent(_Message):
+    """What a station's driver did, for the audit trail; `time`: Unix time of the station, seconds."""
+
+    kind: Literal["event"] = "event"
+    what: Text
+    driver: Text
+    time: Finite
 
 
 class Join(_Message):
@@ -128,13 +147,14 @@ class RequestRefused(_Message):
     cause: Text
 
 
-ToGateway = Annotated[Hello | Status | DriverRequest, Field(discriminator="kind")]
+_ToGateway = Hello | Status | DriverRequest | DriverEvent
+ToGateway = Annotated[_ToGateway, Field(discriminator="kind")]
 FromGateway = Annotated[Join | Release | RequestRefused, Field(discriminator="kind")]
-_TO_GATEWAY: TypeAdapter[Hello | Status | DriverRequest] = TypeAdapter(ToGateway)
+_TO_GATEWAY: TypeAdapter[_ToGateway] = TypeAdapter(ToGateway)
 _FROM_GATEWAY: TypeAdapter[Join | Release | RequestRefused] = TypeAdapter(FromGateway)
 
 
-def to_gateway(data: Mapping[str, Any]) -> Hello | Status | DriverRequest:
+def to_gateway(data: Mapping[str, Any]) -> _ToGateway:
     """Validate a message of a party.
 
     Raises:

@@ -7,7 +7,6 @@ The certificate contains role and name as the URI `urn:scan2sim:ROLE:NAME`.
 from __future__ import annotations
 
 import ipaddress
-import re
 import stat
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -22,8 +21,6 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from scan2sim.pipeline.core.errors import InputError
 
 CERTIFICATE_FILE, KEY_FILE, AUTHORITY_FILE = "certificate.pem", "key.pem", "authority.pem"
-NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,59}")
-"""Name of a vehicle or station; it becomes part of paths, pages and logs."""
 NO_EXPIRY = datetime.max.replace(tzinfo=UTC)
 _URN = "urn:scan2sim:"
 _RENEW_REMEDY = "Create it again: `scan2sim teleop certificates` (docs/teleoperation.md)"

@@ -68,6 +68,20 @@ class StationParams(ServerParams):
         tuple[str, ...],
         Field(description="HOST:PORT (UDP) on which the station accepts vehicles; repeat for several addresses."),
     ] = (f"0.0.0.0:{STATION_PORT}",)
+    drivers: Annotated[
+        File | None,
+        Field(
+            description="File of named drivers with their roles and tokens, written by `teleop drivers`; replaces "
+            "--token. Default: anybody who has the page drives."
+        ),
+    ] = None
+    record: Annotated[
+        File | None,
+        Field(description="Folder to record drives in, as MCAP. Default: drives are not recorded."),
+    ] = None
+    record_limit: Annotated[
+        float, Field(ge=0.01, le=10_000, description="Maximum size of all recorded drives, GB; the oldest are deleted.")
+    ] = 20.0
     reached: Annotated[
         tuple[str, ...],
         Field(
@@ -76,14 +90,45 @@ class StationParams(ServerParams):
         ),
     ] = ()
 
+    def has_protection(self) -> bool:
+        """Whether a token, a certificate, or named drivers are given."""
+        return self.drivers is not None or super().has_protection()
+
+    def is_open(self) -> bool:
+        """See `ServerParams`."""
+        return self.drivers is None and super().is_open()
+
+
+class ReplayParams(ServerParams):
+    """Settings of the replay of a recorded drive; `ServerParams` has those of its page."""
+
+    recording: Annotated[File, Field(description="Folder of `teleop station --record`, or one drive in it.")]
+    speed: Annotated[float, Field(ge=0.1, le=20, description="Speed of the replay; 1: as recorded.")] = 1.0
+
+
+class ExportParams(Params):
+    """Settings of the export of recorded drives."""
+
+    recording: Annotated[File, Field(description="Folder of `teleop station --record`, or one drive in it.")]
+    out: Annotated[Path, Field(description="Folder of the bag to write; must not exist.")]
+    rate: Annotated[float, Field(ge=0.1, le=60, description="Maximum number of images of each camera, per second.")] = (
+        10.0
+    )
+
 
 class OnboardParams(Params):
     """Settings of an onboard unit's connection to its vehicle adapter."""
 
-    translator: Annotated[str, Field(description="HOST:PORT (UDP) of the vehicle adapter (`teleop translate`).")] = (
+    adapter: Annotated[str, Field(description="HOST:PORT (UDP) of the vehicle adapter (`teleop translate`).")] = (
         f"127.0.0.1:{ADAPTER_PORT}"
     )
-    key: Annotated[File | None, Field(description="File with the key shared with the vehicle adapter.")] = None
+    key: Annotated[
+        File | None,
+        Field(
+            description="File with the key shared with the vehicle adapter. Default: adapter.key in the folder of the "
+            "vehicle's certificate."
+        ),
+    ] = None
     limit: Annotated[
         float,
         Field(
@@ -97,9 +142,9 @@ class OnboardParams(Params):
         Raises:
             SettingError: the setting is not HOST:PORT.
         """
-        host, colon, port = self.translator.rpartition(":")
+        host, colon, port = self.adapter.rpartition(":")
         if not colon or not port.isdecimal() or not 0 < int(port) < 65536:
-            raise SettingError("translator", f"{self.translator!r} is not HOST:PORT", "Write it as 127.0.0.1:7447")
+            raise SettingError("adapter", f"{self.adapter!r} is not HOST:PORT", "Write it as 127.0.0.1:7447")
         return host.strip("[]"), int(port)
 
 

@@ -1,62 +1,39 @@
 """HTTP API of a toolbox: the Open Inference Protocol (KServe, version 2), and endpoints to start and stop cameras.
 
-Images are posted as files (`Content-Type: image/jpeg` etc.), or in the protocol's JSON: an input of datatype BYTES
-holds encoded images in base64, one of UINT8 an RGB image of shape [height, width, 3]. The response to a file is a
-result (`results.Result`), to JSON an output of datatype BYTES with one serialized result per image.
+Images are posted as files (`Content-Type: image/jpeg` etc.), or in the protocol's JSON, with or without binary tensor
+data (`inference.tensors`). The response to a file is a result (`results.Result`), to the protocol an output of datatype
+BYTES with one serialized result per image.
 """
 
 from __future__ import annotations
 
 import asyncio
-import base64
-import binascii
-from collections.abc import Callable
-from typing import Annotated, Any, Literal
+import json
+import zlib
+from collections.abc import Coroutine, Sequence
+from typing import Annotated, Any, TypeVar
 
-import numpy as np
-from fastapi import FastAPI, Header, HTTPException, Request, Response
+from fastapi import Depends, FastAPI, Header, HTTPException, Request, Response
 from fastapi.responses import JSONResponse
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
-from pydantic import BaseModel, Field, ValidationError
+from starlette.requests import ClientDisconnect
 
-from scan2sim import __version__
-from scan2sim.pipeline.core.errors import InputError, SettingError, printable
-from scan2sim.pipeline.core.types import U8
+from scan2sim.pipeline.core.errors import SettingError, printable
 from scan2sim.services.http import factory
 from scan2sim.services.http.settings import ServerParams
-from scan2sim.services.toolboxes import frames
 from scan2sim.services.toolboxes.engine import Engine
-from scan2sim.services.toolboxes.frames import Frame
+from scan2sim.services.toolboxes.inference import metadata, requests, tensors
+from scan2sim.services.toolboxes.inference.tensors import MAX_REQUEST_BYTES
 from scan2sim.services.toolboxes.results import Result, State
 from scan2sim.services.toolboxes.sources import Cameras
 
-MAX_REQUEST_BYTES = 2**25
-"""Limit of the size of a request, equal to the number of pixels of the largest image."""
-MAX_IMAGES = 64
-"""Limit of images per request."""
 IMAGE_TYPES = ("image/jpeg", "image/png", "image/webp", "application/octet-stream")
+JSON = "application/json"
+JSON_SIZE_HEADER = "Inference-Header-Content-Length"
+"""Header with the size of the JSON in a body that has binary tensor data behind it."""
 HTTP_STATUS = {State.DONE: 200, State.DROPPED: 503, State.LATE: 504, State.REFUSED: 422, State.FAILED: 500}
-DEFAULT_SOURCE = "http"
-"""Source of images whose sender doesn't name one."""
 
-Text = Annotated[str, Field(max_length=200)]
-
-
-class Tensor(BaseModel):
-    """Input tensor of the protocol."""
-
-    name: Text
-    shape: Annotated[list[Annotated[int, Field(ge=1, le=MAX_REQUEST_BYTES)]], Field(min_length=1, max_length=4)]
-    datatype: Literal["BYTES", "UINT8"]
-    data: list[Any]
-
-
-class InferRequest(BaseModel):
-    """Inference request of the protocol; further fields are ignored."""
-
-    id: Text = ""
-    parameters: dict[str, Any] = {}
-    inputs: Annotated[list[Tensor], Field(min_length=1, max_length=MAX_IMAGES)]
+T = TypeVar("T")
 
 
 def application(engine: Engine, params: ServerParams, cameras: Cameras | None = None) -> FastAPI:
@@ -75,6 +52,7 @@ def application(engine: Engine, params: ServerParams, cameras: Cameras | None = 
         params,
         alive={"dispatcher": engine.is_alive},
         ready={"model": engine.is_ready},
+        health=("/v2/health/",),
         max_body_bytes=MAX_REQUEST_BYTES,
     )
     app.state.registry.register(_EngineMetrics(engine))
@@ -87,143 +65,185 @@ def application(engine: Engine, params: ServerParams, cameras: Cameras | None = 
 
 def _add_metadata(app: FastAPI, engine: Engine) -> None:
     @app.get("/v2")
-    def server() -> dict[str, Any]:
+    @app.get("/v2/", include_in_schema=False)
+    async def server() -> dict[str, Any]:
         """Server metadata of the protocol."""
-        return {"name": "scan2sim", "version": __version__, "extensions": []}
+        return metadata.server()
 
     @app.get("/v2/health/live")
-    def live() -> Response:
+    async def live() -> Response:
         """Liveness: whether the dispatcher is running."""
         return JSONResponse({"live": engine.is_alive()}, 200 if engine.is_alive() else 503)
 
     @app.get("/v2/health/ready")
-    def ready() -> Response:
+    async def ready() -> Response:
         """Readiness: whether the model is loaded and responds."""
         return JSONResponse({"ready": engine.is_ready()}, 200 if engine.is_ready() else 503)
 
-    @app.get("/v2/models/{name}")
-    def model(name: str) -> dict[str, Any]:
-        """Model metadata of the protocol."""
-        _check_model(engine, name)
-        info = engine.info
-        return {
-            "name": engine.name,
-            "versions": [info.sha256[:12]],
-            "platform": info.name,
-            "inputs": [{"name": "images", "datatype": "BYTES", "shape": [-1]}],
-            "outputs": [{"name": "results", "datatype": "BYTES", "shape": [-1]}],
-            "parameters": {"labels": info.labels, "sha256": info.sha256, "licence": info.licence},
-        }
+    @app.get("/v2/models/stats")
+    async def all_statistics() -> dict[str, Any]:
+        """Statistics of all models, which is one (Triton's extension)."""
+        return {"model_stats": [metadata.statistics(engine)]}
 
-    @app.get("/v2/models/{name}/ready")
-    def model_ready(name: str) -> Response:
-        """Whether the model is loaded and responds."""
-        _check_model(engine, name)
-        return ready()
+    for path, known in _model_paths(engine):
+
+        @app.get(path, dependencies=known)
+        async def model() -> dict[str, Any]:
+            """Model metadata of the protocol."""
+            return metadata.model(engine)
+
+        @app.get(f"{path}/ready", dependencies=known)
+        async def model_ready() -> Response:
+            """Whether the model is loaded and responds."""
+            return await ready()
+
+        @app.get(f"{path}/config", dependencies=known)
+        async def config() -> dict[str, Any]:
+            """Model configuration (Triton's extension)."""
+            return metadata.config(engine)
+
+        @app.get(f"{path}/stats", dependencies=known)
+        async def statistics() -> dict[str, Any]:
+            """Statistics of the model (Triton's extension)."""
+            return {"model_stats": [metadata.statistics(engine)]}
+
+    @app.post("/v2/repository/index")
+    async def index() -> list[dict[str, Any]]:
+        """Index of the models, which is one (Triton's extension)."""
+        return metadata.index(engine)
+
+
+def _model_paths(engine: Engine) -> list[tuple[str, Sequence[Any]]]:
+    """Paths of the model without and with a version, each with the check that it is the toolbox's model."""
+
+    def check(name: str, version: str = "") -> None:
+        if error := metadata.unknown_model(engine, name, version):
+            raise HTTPException(404, error)
+
+    def known_model(name: str) -> None:
+        check(name)
+
+    def known_version(name: str, version: str) -> None:
+        check(name, version)
+
+    path = "/v2/models/{name}"
+    return [(path, [Depends(known_model)]), (f"{path}/versions/{{version}}", [Depends(known_version)])]
 
 
 def _add_inference(app: FastAPI, engine: Engine) -> None:
-    @app.post("/v2/models/{name}/infer")
+    parsing = asyncio.Semaphore(1)  # JSON is parsed without releasing the interpreter to other requests
+
     async def infer(
-        name: str,
         request: Request,
         content_type: Annotated[str, Header()] = "",
+        content_encoding: Annotated[str, Header(max_length=20)] = "identity",
+        inference_header_content_length: Annotated[int | None, Header(ge=1)] = None,
         frame_id: Annotated[str, Header(max_length=200)] = "",
-        source: Annotated[str, Header(max_length=200)] = DEFAULT_SOURCE,
+        source: Annotated[str, Header(max_length=200)] = requests.DEFAULT_SOURCE,
         stamp: Annotated[int | None, Header(ge=0, lt=2**63)] = None,
     ) -> Response:
         """Run the model on images; a single image may have the headers `Frame-Id`, `Source` and `Stamp`."""
-        _check_model(engine, name)
+        body = _decompressed(await request.body(), content_encoding)
         media_type = content_type.partition(";")[0].strip().lower()
-        body = await request.body()
-        if media_type in IMAGE_TYPES:
-            (result,) = await _results(engine, [(frame_id or "image", source, stamp, body)])
-            return Response(result.json_line(), HTTP_STATUS[result.state], media_type="application/json")
-        if media_type != "application/json":
-            received = printable(media_type)[:40] or "missing"
-            raise HTTPException(415, f"Content-Type is {received}; send JSON or {', '.join(IMAGE_TYPES)}")
-        return await _infer_protocol(engine, body)
+        json_bytes = inference_header_content_length
+        is_protocol = json_bytes is not None or media_type == JSON or (not media_type and body[:1] in (b"{", b""))
+        if is_protocol:
+            async with parsing:
+                parsed, images = await asyncio.to_thread(tensors.parse, body, json_bytes)
+            source = str(parsed.parameters.get("source", source))[:200]
+            timeout = requests.timeout_s(parsed.parameters)
+            return _protocol_response(
+                engine, parsed, await results(request, source, requests.named(parsed.id, images), timeout)
+            )
+        if media_type and media_type not in IMAGE_TYPES:
+            cause = f"Content-Type is {printable(media_type)[:40]}; send JSON or {', '.join(IMAGE_TYPES)}"
+            raise HTTPException(415, cause)
+        (result,) = await results(request, source, [(frame_id or "image", stamp, body)], None)
+        return Response(result.json_line(), HTTP_STATUS[result.state], media_type=JSON)
 
-    async def _infer_protocol(engine: Engine, body: bytes) -> Response:
+    async def results(
+        request: Request, source: str, images: list[requests.Named], timeout: float | None
+    ) -> list[Result]:
+        client = request.client.host if request.client else "unknown"
         try:
-            infer_request = InferRequest.model_validate_json(body)
-        except ValidationError as error:
-            first = error.errors()[0]
-            where = printable(".".join(map(str, first["loc"]))) or "body"
-            raise SettingError(where[:200], first["msg"], "See the Open Inference Protocol, version 2") from None
-        images = [image for tensor in infer_request.inputs for image in _images(tensor)]
-        if len(images) > MAX_IMAGES:
-            raise SettingError("inputs", f"contains {len(images)} images", f"Send at most {MAX_IMAGES}")
-        source = str(infer_request.parameters.get("source", DEFAULT_SOURCE))[:200]
-        name = infer_request.id or "image"
-        results = await _results(engine, [(f"{name}:{i}", source, None, image) for i, image in enumerate(images)])
-        worst = max(results, key=lambda one: HTTP_STATUS[one.state])
-        output = {
-            "name": "results",
-            "datatype": "BYTES",
-            "shape": [len(results)],
-            "data": [one.json_line() for one in results],
-        }
-        response: dict[str, Any] = {"model_name": engine.name, "id": infer_request.id, "outputs": [output]}
-        if worst.error:
-            response["error"] = worst.error
-        return JSONResponse(response, HTTP_STATUS[worst.state])
+            return await _while_connected(request, requests.results(engine, client, source, images, timeout))
+        except requests.TooManyRequests as error:
+            raise HTTPException(429, str(error), {"Retry-After": str(error.retry_after)}) from None
+
+    for path, known in _model_paths(engine):
+        app.post(f"{path}/infer", dependencies=known)(infer)
 
 
-def _images(tensor: Tensor) -> list[bytes | U8]:
-    """Images of an input tensor.
+def _protocol_response(engine: Engine, request: tensors.InferRequest, results: list[Result]) -> Response:
+    output: dict[str, Any] = {"name": tensors.OUTPUT, "datatype": "BYTES", "shape": [len(results)]}
+    message: dict[str, Any] = {
+        "model_name": engine.name,
+        "model_version": metadata.VERSION,
+        "id": request.id,
+        "outputs": [output],
+    }
+    worst = max(results, key=lambda one: HTTP_STATUS[one.state])
+    status = HTTP_STATUS[worst.state]
+    if worst.error:
+        message["error"] = f"{worst.id}: {worst.error}"
+    if not request.wants_binary() or worst.error:  # clients expect errors in JSON
+        output["data"] = [one.json_line() for one in results]
+        return JSONResponse(message, status)
+    data = tensors.binary(results)
+    output["parameters"] = {"binary_data_size": len(data)}
+    text = json.dumps(message).encode()
+    return Response(text + data, status, {JSON_SIZE_HEADER: str(len(text))}, media_type="application/octet-stream")
+
+
+def _decompressed(body: bytes, encoding: str) -> bytes:
+    """Body of a request without its Content-Encoding; decompression bombs are refused.
 
     Raises:
-        InputError: the tensor holds no valid images.
+        HTTPException: unknown encoding.
+        SettingError: the body is damaged or too large.
     """
-    remedy = "BYTES: base64 of encoded images, shape [N]; UINT8: RGB, shape [height, width, 3]"
+    if encoding in ("", "identity"):
+        return body
+    if encoding not in ("gzip", "deflate"):
+        raise HTTPException(415, f"Content-Encoding is {printable(encoding)}; send gzip, deflate or identity")
+    decompressor = zlib.decompressobj(zlib.MAX_WBITS + (16 if encoding == "gzip" else 0))
     try:
-        if tensor.datatype == "BYTES":
-            found: list[bytes | U8] = [base64.b64decode(text, validate=True) for text in tensor.data]
-            if len(found) != np.prod(tensor.shape):
-                raise ValueError(f"{len(found)} values for shape {tensor.shape}")
-            return found
-        height, width, channels = tensor.shape
-        frames.check_size(tensor.name, width, height)
-        if channels != 3:
-            raise ValueError(f"{channels} channels instead of 3")
-        return [np.array(tensor.data, np.uint8).reshape(height, width, channels)]
-    except (ValueError, TypeError, OverflowError, binascii.Error) as error:
-        raise InputError(printable(tensor.name), f"not an image ({error})", remedy) from None
+        decoded = decompressor.decompress(body, MAX_REQUEST_BYTES)
+    except zlib.error as error:
+        raise SettingError("body", f"can't be decompressed ({error})", f"Send valid {encoding}") from None
+    if not decompressor.eof:
+        cause = f"is incomplete or has more than {MAX_REQUEST_BYTES} bytes when decompressed"
+        raise SettingError("body", cause, "Send fewer images")
+    return decoded
 
 
-def _set(future: asyncio.Future[Result], result: Result) -> None:
-    if not future.done():  # it was cancelled if the client is gone
-        future.set_result(result)
+async def _while_connected(request: Request, work: Coroutine[Any, Any, T]) -> T:
+    """Result of a coroutine, which is cancelled if the client disconnects.
 
+    Raises:
+        ClientDisconnect: the client has disconnected.
+    """
 
-async def _results(engine: Engine, images: list[tuple[str, str, int | None, bytes | U8]]) -> list[Result]:
-    """Results of images, given with their ids, sources and stamps, in order."""
-    loop = asyncio.get_running_loop()
+    async def disconnected() -> None:
+        while (await request.receive())["type"] != "http.disconnect":
+            pass
 
-    def setter(future: asyncio.Future[Result]) -> Callable[[Result], None]:
-        def set_result(result: Result) -> None:
-            loop.call_soon_threadsafe(_set, future, result)
-
-        return set_result
-
-    futures: list[asyncio.Future[Result]] = []
-    for frame_id, source, stamp, image in images:
-        futures.append(loop.create_future())
-        engine.submit(Frame(frame_id, source, stamp, image, setter(futures[-1])))
-    return await asyncio.gather(*futures)
-
-
-def _check_model(engine: Engine, name: str) -> None:
-    if name != engine.name:
-        raise HTTPException(404, f"unknown model {printable(name)[:100]!r}; the model here is {engine.name!r}")
+    task, connection = asyncio.ensure_future(work), asyncio.ensure_future(disconnected())
+    try:
+        await asyncio.wait((task, connection), return_when=asyncio.FIRST_COMPLETED)
+        if not task.done():
+            raise ClientDisconnect
+        return task.result()
+    finally:
+        task.cancel()
+        connection.cancel()
 
 
 def _add_cameras(app: FastAPI, engine: Engine, cameras: Cameras) -> None:
     @app.get("/detections")
     def detections(source: str | None = None) -> list[dict[str, Any]]:
         """Latest result of each camera, or of one."""
-        return [one.model_dump(mode="json", exclude_none=True) for one in cameras.last(source)]
+        return [one.model_dump(mode="json", by_alias=True, exclude_none=True) for one in cameras.last(source)]
 
     @app.post("/start")
     def start() -> dict[str, Any]:
@@ -254,11 +274,12 @@ class _EngineMetrics:
         outcomes = CounterMetricFamily("scan2sim_frames", "Frames by final state", labels=["state"])
         for state in State:
             outcomes.add_metric([state], self._engine.counts[state])
-        received = self._engine.counts["received"]
+        received, rejected = self._engine.counts["received"], self._engine.counts["rejected"]
         waiting, oldest = self._engine.waiting()
         return [
             outcomes,
             CounterMetricFamily("scan2sim_frames_received", "Received frames", received),
+            CounterMetricFamily("scan2sim_frames_rejected", "Frames beyond a client's queue", rejected),
             CounterMetricFamily("scan2sim_model_restarts", "Restarts of the model", self._engine.counts["restarts"]),
             GaugeMetricFamily("scan2sim_frames_waiting", "Waiting frames", waiting),
             GaugeMetricFamily("scan2sim_oldest_waiting_seconds", "Waiting time of the oldest frame", oldest),

@@ -98,8 +98,9 @@ class Detector:
             sized.tolist(), rows[:, 2].tolist(), numbers.tolist(), self._threshold, self._overlap
         )
         return Body(
+            threshold=self._threshold,
             detections=tuple(
                 Detection(label=LABELS[numbers[i]], score=round(float(rows[i, 2]), 4), box=tuple(boxes[i].round(1)))
                 for i in np.ravel(kept).astype(int)
-            )
+            ),
         )

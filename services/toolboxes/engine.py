@@ -2,7 +2,8 @@
 
     reader -> FrameQueue -> dispatcher (batches, decodes) -> ModelProcess -> SourceWorker of the source -> answer
 
-All queues are bounded: when frames arrive faster than they can be processed, the oldest of each source are dropped.
+All queues are bounded: when frames arrive faster than they can be processed, the oldest of each source are dropped;
+requests of clients are accepted as a whole or not at all.
 Every frame gets exactly one answer, whatever happens to it.
 """
 
@@ -12,6 +13,7 @@ import logging
 import threading
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from scan2sim.pipeline.core.errors import ScanError, UnavailableError
@@ -55,7 +57,10 @@ class Engine:
     Attributes:
         name: name of the toolbox.
         info: description of its model.
-        counts: frames by final `State`; "received": all frames; "restarts": restarts of the model.
+        deadline: seconds from a frame's arrival to its result.
+        counts: frames by final `State`; "received": all frames; "rejected": frames of requests that found their queue
+            full; "executions": batches; "restarts": restarts of the model.
+        seconds: total times of the frames with results: "waited", "worked".
     """
 
     def __init__(self, task: str, params: ToolboxParams) -> None:
@@ -66,7 +71,10 @@ class Engine:
         """
         self.name, self._params, self._task = task, params, tasks.find(task)
         self._task.check(params)
+        self.deadline = params.deadline
         self.counts: Counter[str] = Counter()
+        self.seconds: dict[str, float] = {"waited": 0.0, "worked": 0.0}
+        self._last_done = time.monotonic()
         self._counts_lock, self._closed = threading.Lock(), threading.Event()
         self._queue = FrameQueue(params.waiting)
         self._source_workers: dict[str, SourceWorker] = {}
@@ -92,6 +100,20 @@ class Engine:
         if queued:
             self._count("received")
         return queued
+
+    def submit_request(self, request: Sequence[Frame], maximum: int) -> bool:
+        """Queue all frames of a request; False, and none is, if more than `maximum` would wait in its queue."""
+        queued = self._queue.put_request(request, maximum)
+        self._count("received" if queued else "rejected", len(request))
+        return queued
+
+    def predicted_wait_s(self) -> float:
+        """Predicted time in seconds until the frames that wait now are processed."""
+        return len(self._queue) * self._mean_batch_s / self._params.batch
+
+    def idle_s(self) -> float:
+        """Seconds since the last frame was processed."""
+        return time.monotonic() - self._last_done
 
     def is_alive(self) -> bool:
         """Whether frames are processed, now or after a restart of the model."""
@@ -141,11 +163,15 @@ class Engine:
 
     def _decode(self, frame: Frame) -> _DecodedFrame | None:
         """Decode a frame; None if it would miss its deadline or can't be decoded."""
+        if not frame.is_wanted():
+            self._answer(frame, State.DROPPED, "nobody waits for the result")
+            return None
+        deadline = self._params.deadline if frame.deadline is None else frame.deadline
         predicted_s = self._mean_batch_s + DEVIATION_FACTOR * self._batch_deviation_s
-        if frame.age() + predicted_s > self._params.deadline:
+        if frame.age() + predicted_s > deadline:
             self._mean_batch_s *= 1 - SMOOTHING  # decay, so that the model is tried again soon
             self._batch_deviation_s *= 1 - SMOOTHING
-            cause = f"waited {frame.age():.2f} s, the deadline is {self._params.deadline:g} s"
+            cause = f"waited {frame.age():.2f} s, the deadline is {deadline:g} s"
             self._answer(frame, State.LATE, cause)
             return None
         begun = time.monotonic()
@@ -182,6 +208,7 @@ class Engine:
             raise ModelProcessDied("the model is not running")
         begun = time.monotonic()
         bodies = self._model.infer([one.image for one in batch])
+        self._count("executions")
         took, mean = time.monotonic() - begun, self._mean_batch_s
         if mean:
             self._batch_deviation_s += SMOOTHING * (abs(took - mean) - self._batch_deviation_s)
@@ -241,6 +268,11 @@ class Engine:
         times = None
         if decoded:
             times = Times(waited=decoded.begun - frame.received, worked=time.monotonic() - decoded.begun)
+        if times and state == State.DONE:
+            self._last_done = time.monotonic()
+            with self._counts_lock:
+                self.seconds["waited"] += times.waited
+                self.seconds["worked"] += times.worked
         self._count(state)
         result = Result(
             toolbox=self.name,
@@ -259,6 +291,6 @@ class Engine:
         except Exception:  # a client that is gone must not stop the others
             log.exception("%s: the result of %s could not be delivered", self.name, frame.id)
 
-    def _count(self, key: str) -> None:
+    def _count(self, key: str, number: int = 1) -> None:
         with self._counts_lock:
-            self.counts[key] += 1
+            self.counts[key] += number

@@ -21,7 +21,12 @@ FORMATS = ("JPEG", "PNG", "WEBP")
 """Accepted formats of encoded images; decoders of others are poorly maintained and thus a security risk."""
 MAX_PIXELS = 2**25
 """Largest image, such as 8192 x 4096; the header is checked before decoding (decompression bombs)."""
-REMEDY = f"Send a complete {', '.join(FORMATS)} or an uncompressed image of at most {MAX_PIXELS:,} pixels"
+MAX_ASPECT = 100
+"""Largest ratio of the sides of an image; scaled to a network's input, longer ones vanish."""
+REMEDY = (
+    f"Send a complete {', '.join(FORMATS)} or an uncompressed image of at most {MAX_PIXELS:,} pixels, "
+    f"and sides of at most {MAX_ASPECT} : 1"
+)
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,10 @@ class Frame:
         stamp: time of capture according to the sender, nanoseconds since the epoch; None: unknown.
         image: a `Raw` image, the bytes of an encoded one, or (H, W, 3) uint8 RGB.
         answer: called exactly once with the result, from any thread.
+        queue: name of the queue in which it waits; "": that of its source.
+        request: request that it is a part of; the requests in a queue are served in turn.
+        deadline: seconds from its arrival to its result; None: the toolbox's.
+        is_wanted: whether somebody still waits for its result; frames that nobody does are dropped.
         received: monotonic time of arrival, seconds.
     """
 
@@ -62,6 +71,10 @@ class Frame:
     stamp: int | None
     image: Raw | bytes | U8
     answer: Callable[[Result], None]
+    queue: str = ""
+    request: object = None
+    deadline: float | None = None
+    is_wanted: Callable[[], bool] = lambda: True
     received: float = field(default_factory=time.monotonic)
 
     def age(self) -> float:
@@ -81,12 +94,13 @@ def rgb(frame: Frame) -> U8:
 
 
 def check_size(where: str, width: int, height: int) -> None:
-    """Check that an image isn't empty and not too large.
+    """Check that an image isn't empty, too large or too long.
 
     Raises:
         InputError: it is.
     """
-    if width < 1 or height < 1 or width * height > MAX_PIXELS:
+    too_long = max(width, height) > MAX_ASPECT * min(width, height)
+    if min(width, height) < 1 or width * height > MAX_PIXELS or too_long:
         raise InputError(where, f"has {width} x {height} pixels", REMEDY)
 
 

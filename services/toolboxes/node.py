@@ -41,6 +41,7 @@ class ToolboxNode(Monitor):
             self,
             BusParams(
                 kafka_bootstrap_servers=params.kafka_bootstrap_servers,
+                kafka_config=params.kafka_config,
                 records_topic=params.publisher_topic,
                 events_topic=params.events_topic,
             ),

@@ -8,7 +8,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-SCHEMA = "scan2sim-result-1"
+SCHEMA = "scan2sim-result-2"
 """Schema identifier; changes whenever a field does."""
 
 
@@ -69,6 +69,9 @@ class Body(ResultModel):
     """Output of a model for an image; the toolbox determines which field is set."""
 
     detections: tuple[Moving | Detection, ...] | None = None
+    threshold: float | dict[str, float] | None = Field(
+        None, description="Minimum score of a detection; by class if classes differ."
+    )
     classes: tuple[Class, ...] | None = None
     segmentation: Segmentation | None = None
 
@@ -89,7 +92,7 @@ class Result(ResultModel):
         error: cause if there is no output.
     """
 
-    schema_name: Literal["scan2sim-result-1"] = Field("scan2sim-result-1", alias="schema")
+    schema_name: Literal["scan2sim-result-2"] = Field("scan2sim-result-2", alias="schema")
     toolbox: str
     model: str
     id: str

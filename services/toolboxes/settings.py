@@ -90,6 +90,10 @@ class CameraParams(MonitorParams):
 class ServeParams(ServerParams):
     """Settings of a toolbox as an HTTP service."""
 
+    grpc_port: Annotated[
+        int | None,
+        Field(ge=0, le=65535, description="Port for gRPC, in addition to HTTP; 0: any free port."),
+    ] = None
     camera: Annotated[
         list[Annotated[str, Field(min_length=1, max_length=2000)]] | None,
         Field(

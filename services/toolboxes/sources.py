@@ -241,5 +241,5 @@ class _Camera(CameraReader):
         self._engine.submit(Frame(f"{self.count}", self.name, time.time_ns(), image, self._set_last))
 
     def _set_last(self, result: Result) -> None:
-        if result.body is not None:
+        if result.body is not None and self.running():  # results of queued images may come after `stop`
             self.last = result

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from scan2sim.pipeline.camera.lens import changed_lens, lens_difference
 from scan2sim.pipeline.core.types import Camera
-from scan2sim.slam.lens import SIGNIFICANT_CHANGE, LensEstimate, changed_lens, fit_lens, lens_difference
+from scan2sim.slam.lens import LensEstimate, fit_lens
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 from scan2sim.slam.odometry.track_log import TrackLog, centred_pinhole, replay
 
@@ -20,6 +21,8 @@ INITIAL_LENSES = ((0.45, 0.0), (0.45, -0.15), (0.9, 0.0), (1.8, 0.0))
 """Starting focal lengths, in widths of the image, and k1."""
 LOST_SHARE_MAX = 0.3
 """Share of unsure frames above which odometry counts as lost."""
+CONVERGED_SIGMAS = 0.3
+"""Change of every lens parameter, in standard deviations, below which a lens has converged."""
 FOCAL_SIGMA_MAX = 0.05
 """Greatest accepted relative standard deviation of the focal length."""
 SEARCH_FRAMES = 60
@@ -36,7 +39,7 @@ def calibrated(log: TrackLog, camera: Camera) -> LensEstimate | None:
         found = fit_lens(camera, odometry.map.misfits)
         if found is None or not 0.1 < found.camera.fx / log.size[0] < 10:
             return None
-        if np.all(np.abs(lens_difference(camera, found.camera)) < 0.1 * SIGNIFICANT_CHANGE):
+        if np.all(np.abs(lens_difference(camera, found.camera)) < CONVERGED_SIGMAS * found.sigma):
             return found if found.sigma[0] < FOCAL_SIGMA_MAX and lost_share(odometry) < LOST_SHARE_MAX else None
         camera = found.camera
     return None
@@ -51,7 +54,7 @@ def calibrated_from_scratch(log: TrackLog) -> LensEstimate | None:
     """Lens of a track log without any prior knowledge; None if it can't be determined."""
     part = most_turning_part(log)
     for widths, k1 in INITIAL_LENSES:
-        start = changed_lens(centred_pinhole(*log.size, widths * log.size[0]), np.array([0, 0, 0, k1]))
+        start = changed_lens(centred_pinhole(*log.size, widths * log.size[0]), np.array([0, 0, 0, k1, 0]))
         found = calibrated(part, start)
         if found is not None:
             whole = None if len(part.times) == len(log.times) else calibrated(log, found.camera)

@@ -11,17 +11,18 @@ from typing import Any, Self
 
 import numpy as np
 
+from scan2sim.pipeline.camera.lens import changed_lens
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.io.images import exif
 from scan2sim.slam.calibration.calibrate import calibrated, calibrated_from_scratch
-from scan2sim.slam.lens import LensEstimate, changed_lens
+from scan2sim.slam.lens import LensEstimate
 from scan2sim.slam.odometry.track_log import TrackLog, centred_pinhole
 from scan2sim.slam.video import Video
 
-EXIF_SIGMA = np.array([0.05, 0.05, 0.05, 0.0])
-"""Standard deviation of a lens from EXIF, in the parameters of `lens.PRIOR_SIGMA`: it is in whole millimetres, and
-videos show only a part of the sensor."""
+EXIF_SIGMA = np.array([0.05, 0.05, 0.05, 0.1, 0.03])
+"""Standard deviation of a lens from EXIF, in the parameters of `lens.UNKNOWN_SIGMA`: it is in whole millimetres,
+videos show only a part of the sensor, and distortion isn't known."""
 FILM_DIAGONAL_MM = math.hypot(36, 24)
 """Diagonal of the film that "35 mm equivalent" refers to (CIPA DCG-001)."""
 
@@ -32,13 +33,15 @@ class EstimatedCamera:
 
     Attributes:
         camera: the camera.
-        sigma: (4,) standard deviations of the parameters of `lens.PRIOR_SIGMA`.
+        sigma: (5,) standard deviations of the parameters of `lens.UNKNOWN_SIGMA`.
         how: source of the estimate, for messages.
+        final: it comes from the drive itself, which therefore can't improve it.
     """
 
     camera: Camera
     sigma: F64
     how: str
+    final: bool = True
 
     @classmethod
     def of(cls, estimate: LensEstimate, how: str) -> Self:
@@ -48,13 +51,15 @@ class EstimatedCamera:
     def metrics(self) -> dict[str, Any]:
         """Entry for `slam.json`: values in pixels, their standard deviations, and the equivalent options."""
         camera, pixels = self.camera, np.round(self.sigma[:3] * self.camera.fx, 1).tolist()
-        k1 = (camera.distortion or (0.0,))[0]
+        distortion = {name: value for name, value in zip(("k1", "k2"), camera.distortion, strict=False) if value}
         options = f"--focal {camera.fx:.2f} --centre {camera.cx:.2f} {camera.cy:.2f}"
+        options += "".join(f" --{name} {value:.4f}" for name, value in distortion.items())
         lens = {
             "focal": round(camera.fx, 2), "focal_sigma": pixels[0],
             "centre": [round(camera.cx, 2), round(camera.cy, 2)], "centre_sigma": pixels[1:],
-            **({"k1": round(k1, 4), "k1_sigma": round(float(self.sigma[3]), 4)} if k1 else {}),
-            "how": self.how, "options": options + (f" --k1 {k1:.4f}" if k1 else ""),
+            **{name: round(value, 4) for name, value in distortion.items()},
+            **{f"{name}_sigma": round(float(self.sigma[3 + (name == "k2")]), 4) for name in distortion},
+            "how": self.how, "options": options,
         }  # fmt: skip
         return {"lens": lens}
 
@@ -68,9 +73,9 @@ class EstimatedCamera:
     def write(self, path: Path) -> None:
         """Write as JSON."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(
-            json.dumps({"camera": asdict(self.camera), "sigma": self.sigma.tolist(), "how": self.how}), encoding="utf-8"
-        )
+        work = path.with_suffix(".part")
+        work.write_text(json.dumps(asdict(self) | {"sigma": self.sigma.tolist()}), encoding="utf-8")
+        work.replace(path)
 
     @classmethod
     def read(cls, path: Path) -> Self | None:
@@ -78,13 +83,18 @@ class EstimatedCamera:
         try:
             tree = json.loads(path.read_text(encoding="utf-8"))
             camera = Camera(**tree["camera"] | {"distortion": tuple(tree["camera"]["distortion"])})
-            return cls(camera, np.array(tree["sigma"], np.float64), str(tree["how"]))
+            return cls(camera, np.array(tree["sigma"], np.float64), str(tree["how"]), bool(tree["final"]))
         except (OSError, ValueError, KeyError, TypeError):
             return None
 
 
 def camera_of(
-    video: Video, model: str, focal: float | None, centre: tuple[float, float] | None, k1: float | None = None
+    video: Video,
+    model: str,
+    focal: float | None,
+    centre: tuple[float, float] | None,
+    k1: float | None = None,
+    k2: float | None = None,
 ) -> Camera | None:
     """Camera of a video from the options; "auto" is equirectangular if the frames have an aspect ratio of 2:1.
 
@@ -107,7 +117,7 @@ def camera_of(
     if focal is None:
         return None
     cx, cy = centre or ((w - 1) / 2, (h - 1) / 2)
-    return changed_lens(Camera("pinhole", w, h, focal, focal, cx, cy), np.array([0, 0, 0, k1 or 0.0]))
+    return changed_lens(Camera("pinhole", w, h, focal, focal, cx, cy), np.array([0, 0, 0, k1 or 0.0, k2 or 0.0]))
 
 
 def estimated_camera(
@@ -133,7 +143,7 @@ def estimated_camera(
     from_metadata = metadata_focal(video) if camera is None else None
     if from_metadata is not None and not calibrate:
         focal, source = from_metadata
-        return EstimatedCamera(centred_pinhole(video.width, video.height, focal), EXIF_SIGMA, source)
+        return EstimatedCamera(centred_pinhole(video.width, video.height, focal), EXIF_SIGMA, source, final=False)
     log = record()
     start = centred_pinhole(video.width, video.height, from_metadata[0]) if from_metadata else camera
     estimate = None if start is None else calibrated(log, start)

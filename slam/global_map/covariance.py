@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from scan2sim.pipeline.core.types import F64, GpsTrack
+from scan2sim.slam.geometry import lever_arm_jacobian
 from scan2sim.slam.global_map.map_file import MapCheckpoint
 from scan2sim.slam.mapping.marginalization import MotionSigma
 
@@ -67,14 +68,6 @@ def dead_reckoning_sigma(distance: float, seconds: float) -> MotionSigma:
     """Standard deviation of a pose that was dead-reckoned over a distance in metres and a time in seconds."""
     metres = DEAD_RECKONING_DRIFT * distance + ORIGIN_SIGMA.metres
     return MotionSigma(metres, DEAD_RECKONING_TURN * seconds + ORIGIN_SIGMA.radians)
-
-
-def lever_arm_jacobian(arm: F64) -> F64:
-    """(6, 6) Jacobian of a pose at offset `arm` (3,) from another one, by that other pose (metres, rad, world axes)."""
-    x, y, z = arm
-    out = np.eye(6)
-    out[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
-    return out
 
 
 def _covariance(sigma: MotionSigma) -> F64:

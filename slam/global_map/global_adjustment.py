@@ -67,7 +67,7 @@ def adjust(checkpoint: MapCheckpoint) -> dict[str, Any]:
         update_map(checkpoint, new.known, new.poses, new.xyz)
     return {
         "adjustment_kept": comparison.second_is_better,
-        "witnesses": comparison.held_out, "witnesses_gain": round(comparison.gain, 4),
+        "held_out_features": comparison.held_out, "held_out_gain": round(comparison.gain, 4),
         "adjusted_keyframes": len(new.poses), "adjusted_points": len(new.xyz),
         "reprojection_before_px": round(new.before, 4), "reprojection_after_px": round(new.after, 4),
     }  # fmt: skip

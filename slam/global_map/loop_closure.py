@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64, U8
-from scan2sim.slam.geometry import exp_so3, inverse, log_so3
+from scan2sim.pipeline.geometry.least_squares import block_jacobian, cauchy_weights, moved
+from scan2sim.slam.geometry import inverse, relative_pose_error
 from scan2sim.slam.global_map.map_file import MapCheckpoint
 from scan2sim.slam.global_map.sparse_model import sparse_points, update_map
 from scan2sim.slam.odometry.relocalization import FrameFeatures, KeyframeFeatures, detect_features, relocalize
@@ -31,6 +32,8 @@ ODOMETRY_SIGMA = (0.01, 2e-4)
 """Standard deviation of the motion between keyframes: metres, and radians, each per square root of a metre driven."""
 LOOP_SIGMA = (0.1, 2e-3)
 """Standard deviation of a relocalized pose: metres and radians."""
+LOOP_CAUCHY_SCALE = 1e4
+"""Squared scale of the Cauchy loss, which down-weights false loops."""
 
 
 class KeyframeIndex:
@@ -124,48 +127,23 @@ def optimize_pose_graph(poses: F64, travelled: F64, loops: list[tuple[int, int, 
         loops: (earlier pose, later pose, pose (4, 4) of the later in the earlier's axes).
         rounds: maximum number of Gauss-Newton iterations.
     """
-    from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve
 
     n = len(poses)
+    pairs = np.array([*zip(range(n - 1), range(1, n), strict=True), *((a, b) for a, b, _ in loops)])
+    measured = np.stack([*(inverse(poses[:-1]) @ poses[1:]), *(T for _, _, T in loops)])
     lengths = np.maximum(np.diff(travelled), 0.1)
-    first = np.concatenate([np.arange(n - 1), [a for a, _, _ in loops]]).astype(int)
-    second = np.concatenate([np.arange(1, n), [b for _, b, _ in loops]]).astype(int)
-    measured = np.concatenate([inverse(poses[:-1]) @ poses[1:], np.array([T for _, _, T in loops]).reshape(-1, 4, 4)])
-    sigma_t = np.concatenate([ODOMETRY_SIGMA[0] * np.sqrt(lengths), np.full(len(loops), LOOP_SIGMA[0])])
-    sigma_r = np.concatenate([ODOMETRY_SIGMA[1] * np.sqrt(lengths), np.full(len(loops), LOOP_SIGMA[1])])
-    is_loop = np.arange(len(first)) >= n - 1
+    sigma = np.concatenate([np.outer(np.sqrt(lengths), ODOMETRY_SIGMA), np.tile(LOOP_SIGMA, (len(loops), 1))])
+    whiten = np.repeat(1 / sigma, 3, axis=1)
+    is_loop = np.arange(len(pairs)) >= n - 1
     poses = poses.copy()
     for _ in range(rounds):
-        Ri, Rj = poses[first, :3, :3], poses[second, :3, :3]
-        between = poses[second, :3, 3] - poses[first, :3, 3]
-        RiT = Ri.transpose(0, 2, 1)
-        r_t = (RiT @ between[:, :, None])[:, :, 0] - measured[:, :3, 3]
-        r_r = log_so3(measured[:, :3, :3].transpose(0, 2, 1) @ RiT @ Rj)
-        residual = np.concatenate([r_t / sigma_t[:, None], r_r / sigma_r[:, None]], axis=1)
-        weight = np.where(is_loop, 1 / (1 + (residual**2).sum(axis=1) / 1e4), 1.0)  # down-weights false loops
-        J_i, J_j = np.zeros((len(first), 6, 6)), np.zeros((len(first), 6, 6))
-        J_i[:, :3, :3], J_j[:, :3, :3] = -RiT, RiT
-        J_i[:, :3, 3:] = RiT @ _cross(between)
-        J_i[:, 3:, 3:], J_j[:, 3:, 3:] = -Rj.transpose(0, 2, 1), Rj.transpose(0, 2, 1)
-        scale = np.repeat(np.stack([1 / sigma_t, 1 / sigma_r], axis=1), 3, axis=1) * np.sqrt(weight)[:, None]
-        J_i, J_j = J_i * scale[:, :, None], J_j * scale[:, :, None]
-        residual = residual * np.sqrt(weight)[:, None]
-        rows = np.arange(6 * len(first)).reshape(-1, 6)
-        at = np.concatenate([np.repeat(rows, 6, axis=1).ravel()] * 2)
-        columns = np.concatenate([np.tile(6 * of[:, None] + np.arange(6), (1, 6)).ravel() for of in (first, second)])
-        J = coo_matrix((np.concatenate([J_i.ravel(), J_j.ravel()]), (at, columns)), shape=(6 * len(first), 6 * n))
-        J = J.tocsc()[:, 6:]
-        step = -spsolve((J.T @ J).tocsc(), J.T @ residual.ravel()).reshape(-1, 6)
-        poses[1:, :3, 3] += step[:, :3]
-        poses[1:, :3, :3] = exp_so3(step[:, 3:]) @ poses[1:, :3, :3]
+        residual, J = relative_pose_error(poses[pairs[:, 0]], poses[pairs[:, 1]], measured)
+        residual = residual * whiten
+        root = np.sqrt(np.where(is_loop, cauchy_weights(residual, LOOP_CAUCHY_SCALE), 1.0))[:, None]
+        jacobian = block_jacobian(J * (whiten * root)[:, None, :, None], pairs, n).tocsc()[:, 6:]
+        step = -spsolve((jacobian.T @ jacobian).tocsc(), jacobian.T @ (residual * root).ravel()).reshape(-1, 6)
+        poses[1:] = moved(poses[1:], step)
         if np.abs(step).max() < 1e-6:
             break
     return poses
-
-
-def _cross(v: F64) -> F64:
-    """(N, 3, 3) cross-product matrices of vectors v (N, 3): [v] w = v x w."""
-    out = np.zeros((len(v), 3, 3))
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    return out - out.transpose(0, 2, 1)

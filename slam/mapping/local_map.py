@@ -22,6 +22,8 @@ from scan2sim.slam.solvers import lm
 
 HELD_OUT_EVERY = 10
 """With `keep`, one in this number of features is held out: it never becomes a point, and serves cross-validation."""
+TRIANGULATION_SIGMAS = 10
+"""Least parallax of a new point, in standard deviations of a bearing."""
 GPS_DISTANCE_MIN_M = 20
 """Shorter "long" GPS distances aren't used as constraints."""
 
@@ -37,7 +39,7 @@ class MapParams(Params):
         max_distance: metres; points farther away are rejected (D3.2: 500).
         max_error_deg: degrees; points whose median reprojection error is larger are rejected (D3.2: 0.7).
         min_views: number of keyframes that must observe a point (D3.2: 3).
-        gps_chords: relative distance constraints from GPS within the window: "long" ones, "adjacent" ones (D3.2), or
+        gps_distances: relative distance constraints from GPS within the window: "long" ones, "adjacent" ones (D3.2), or
             "none".
         gps_sigma: standard deviation of a GPS distance, metres.
         rolling_shutter: estimate the readout time, one value for all frames.
@@ -51,7 +53,7 @@ class MapParams(Params):
     max_distance: float = Field(500.0, ge=1, le=1_000_000)
     max_error_deg: float = Field(0.7, ge=0.001, le=180)
     min_views: int = Field(3, ge=2, le=100)
-    gps_chords: Literal["long", "adjacent", "none"] = "long"
+    gps_distances: Literal["long", "adjacent", "none"] = "long"
     gps_sigma: float = Field(1.5, ge=0.001, le=10_000)
     rolling_shutter: bool = False
     lens_offset: bool = False
@@ -151,6 +153,7 @@ class LocalMap:
     ) -> None:
         """`pixel`: radians; `backend`: a solver in `slam.solvers`; `keep`: keep points and observations of all time."""
         self.camera, self.params, self.gps, self.backend, self.keep = camera, params, gps, backend, keep
+        self.solver = solvers.named(backend)
         self.pixel, self.sigma = pixel, params.sigma * pixel
         self.gate = 4 * self.sigma
         self.keyframes: list[Keyframe] = []
@@ -176,12 +179,14 @@ class LocalMap:
     def add(self, keyframe: Keyframe) -> I64:
         """Add a keyframe: triangulate new points, optimize, reject outliers; returns ids of features to drop."""
         self.keyframes.append(keyframe)
-        self._triangulate_new_points()
-        self._optimize()
+        window = self.window()
+        seen = self.observations(window)
+        self._triangulate_new_points(window, seen)
+        self._optimize(window, seen)
         if self.camera.model != "equirectangular" and len(self.keyframes) % (self.params.window // 2) == 0:
-            self._check_lens()
+            self._check_lens(window, seen)
         self._leave_window()
-        return self._reject_outliers()
+        return self._reject_outliers(window, seen)
 
     def add_observations(self, ids: I64, bearing: F64) -> None:
         """Add newly detected features (N,), with bearings (N, 3), to the newest keyframe."""
@@ -286,10 +291,8 @@ class LocalMap:
             return np.zeros((0, 0, 6))
         return shared.shared_jacobian(self.camera, self.names, poses, velocity, camera_of, bearing)
 
-    def _triangulate_new_points(self) -> None:
+    def _triangulate_new_points(self, window: list[int], seen: Observations) -> None:
         """Triangulate tracks that enough keyframes observe, with enough parallax."""
-        window = self.window()
-        seen = self.observations(window)
         seen = seen.keep(~self.landmarks.find(seen.ids)[1])
         if self.keep:
             seen = seen.keep(seen.ids % HELD_OUT_EVERY > 0)
@@ -301,7 +304,7 @@ class LocalMap:
             return
         starts = np.append(np.searchsorted(seen.ids, point_ids), len(seen.ids))
         xyz, angle = triangulate(self.poses(window), starts, seen.camera_of, seen.bearing)
-        good = np.isfinite(xyz[:, 0]) & (angle > 10 * self.sigma)
+        good = np.isfinite(xyz[:, 0]) & (angle > TRIANGULATION_SIGMAS * self.sigma)
         graph = self.graph(window, seen, point_ids, xyz, np.zeros(len(window), bool))
         with np.errstate(invalid="ignore"):
             worst = np.maximum.reduceat(errors(graph, graph.poses, xyz, self.shared), starts[:-1])
@@ -316,10 +319,8 @@ class LocalMap:
             np.linalg.norm(seen, axis=1) < self.params.max_distance
         )
 
-    def _optimize(self) -> None:
+    def _optimize(self, window: list[int], seen: Observations) -> None:
         """Optimize the window's keyframes and points; the oldest keyframes are fixed."""
-        window = self.window()
-        seen = self.observations(window)
         seen = seen.keep(self.landmarks.find(seen.ids)[1])
         point_ids, counts = np.unique(seen.ids, return_counts=True)
         point_ids = point_ids[counts >= 2]
@@ -333,16 +334,14 @@ class LocalMap:
             length = max(float(np.linalg.norm(end - start)), 1e-6)
             distances = (DistanceConstraint(0, 1, length, 1e-3 * length),)
         xyz = self.landmarks.xyz[self.landmarks.find(point_ids)[0]]
-        solved = solvers.named(self.backend).solve(self.graph(window, seen, point_ids, xyz, fixed, distances))
+        solved = self.solver.solve(self.graph(window, seen, point_ids, xyz, fixed, distances))
         for k, pose in zip(window, solved.poses, strict=True):
             self.keyframes[k].T_world_cam = pose
         self.landmarks.put(point_ids, solved.points)
         self.shared = solved.shared
 
-    def _check_lens(self) -> None:
+    def _check_lens(self, window: list[int], seen: Observations) -> None:
         """Collect the window's information on the lens."""
-        window = self.window()
-        seen = self.observations(window)
         seen = seen.keep(self.landmarks.find(seen.ids)[1])
         point_ids, rows, counts = np.unique(seen.ids, return_inverse=True, return_counts=True)
         point_ids, seen = point_ids[counts > 2], seen.keep(counts[rows] > 2)
@@ -355,9 +354,9 @@ class LocalMap:
 
     def _gps_constraints(self, window: list[int]) -> tuple[DistanceConstraint, ...]:
         """Relative distance constraints from GPS within the window."""
-        if self.gps is None or self.params.gps_chords == "none" or len(window) < 3:
+        if self.gps is None or self.params.gps_distances == "none" or len(window) < 3:
             return ()
-        adjacent = self.params.gps_chords == "adjacent"
+        adjacent = self.params.gps_distances == "adjacent"
         n = len(window)
         pairs = [(i, i + 1) for i in range(n - 1)] if adjacent else [(0, j) for j in range(n // 2, n)]
         constraints = []
@@ -368,10 +367,8 @@ class LocalMap:
                 constraints.append(DistanceConstraint(i, j, metres, sigma))
         return tuple(constraints)
 
-    def _reject_outliers(self) -> I64:
+    def _reject_outliers(self, window: list[int], seen: Observations) -> I64:
         """Remove points by the criteria of D3.2, and retire those that left the window; returns the removed ids."""
-        window = self.window()
-        seen = self.observations(window)
         rows, known = self.landmarks.find(seen.ids)
         seen, rows = seen.keep(known), rows[known]
         xyz = self.landmarks.xyz

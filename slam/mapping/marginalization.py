@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from scan2sim.pipeline.core.types import F64, I64
+from scan2sim.pipeline.geometry.least_squares import block_tridiagonal_marginals
+from scan2sim.slam.geometry import lever_arm_jacobian
 
 
 class MotionSigma(NamedTuple):
@@ -105,9 +107,7 @@ class Information:
                 A.add(0, 0, weight)
                 continue
             # a rotation of the previous keyframe also moves this one, by the lever arm
-            lever = np.eye(6)
-            x, y, z = poses[k, :3, 3] - poses[k - 1, :3, 3]
-            lever[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+            lever = lever_arm_jacobian(poses[k, :3, 3] - poses[k - 1, :3, 3])
             A.couple(k, k - 1, np.eye(6), -lever, weight)
         for k, share in baselines:
             baseline = poses[k + 1, :3, 3] - poses[k, :3, 3]
@@ -148,15 +148,7 @@ class _Band:
         parts, size = self.diagonal.shape[:2]
         padding = np.arange(6 * self.count - (parts - 1) * size, size)
         self.diagonal[-1][padding, padding] = 1.0
-        inverses = [np.linalg.inv(self.diagonal[0])]
-        for a in range(1, parts):
-            inverses.append(np.linalg.inv(self.diagonal[a] - self.below[a] @ inverses[-1] @ self.below[a].T))
-        known = inverses[-1]
-        out = [known]
-        for a in range(parts - 1, 0, -1):
-            back = inverses[a - 1] @ self.below[a].T
-            known = inverses[a - 1] + back @ known @ back.T
-            out.append(known)
-        blocks = np.stack(out[::-1]).reshape(parts, self.width, 6, self.width, 6)
+        known = block_tridiagonal_marginals(self.diagonal, self.below[1:].transpose(0, 2, 1))
+        blocks = known.reshape(parts, self.width, 6, self.width, 6)
         own = np.einsum("piajb->piajb", blocks)[:, np.arange(self.width), :, np.arange(self.width)]
         return np.ascontiguousarray(own.transpose(1, 0, 2, 3).reshape(-1, 6, 6)[: self.count])

@@ -11,15 +11,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.parameters import Seed
 from scan2sim.pipeline.core.poses import interpolate
-from scan2sim.pipeline.core.types import F64, U8, Camera, GpsTrack
+from scan2sim.pipeline.core.types import F64, U8, Bools, Camera, GpsTrack
 from scan2sim.slam.geometry import exp_so3, inverse, log_so3, relative_pose, rigid
-from scan2sim.slam.mapping.local_map import Keyframe, LocalMap, MapParams, gps_distance
+from scan2sim.slam.mapping.local_map import (
+    TRIANGULATION_SIGMAS,
+    Keyframe,
+    LocalMap,
+    MapParams,
+    gps_distance,
+)
 from scan2sim.slam.odometry.relocalization import KeyframeFeatures, detect_features, relocalize
 from scan2sim.slam.odometry.track_pose import PoseEstimate, estimate_pose
 from scan2sim.slam.trackers import Tracker, Tracks
@@ -49,6 +56,8 @@ INLIERS_MIN, INLIER_SHARE_MIN = 20, 0.3
 """Inliers, and their share of the known points, that a pose needs to be plausible."""
 MAP_FEATURES_MIN = 30
 """Features that a map's first keyframe needs, and points that its second one needs."""
+INIT_TRACKED_SHARE_MIN = 0.2
+"""Share of the features of a map's first keyframe that must still be tracked when its second one is added."""
 
 
 class OdometryParams(MapParams):
@@ -67,6 +76,46 @@ class OdometryParams(MapParams):
     parallax: float | None = Field(None, ge=0.05, le=90)
     min_tracked_share: float = Field(0.65, ge=0.01, le=0.99)
     seed: Seed = 0
+
+
+class Failure(NamedTuple):
+    """Why tracking was lost: a measured number that is too small, or out of range.
+
+    Attributes:
+        what: what was measured.
+        measured: its value.
+        needed: least value; None if a greatest value was exceeded.
+        allowed: greatest value; None if there is none.
+    """
+
+    what: str
+    measured: float
+    needed: float | None = None
+    allowed: float | None = None
+
+    def __str__(self) -> str:
+        limits = [f"at least {self.needed:.4g}"] if self.needed is not None else []
+        limits += [f"at most {self.allowed:.4g}"] if self.allowed is not None else []
+        return f"{self.what}: {self.measured:.4g}, expected {' and '.join(limits)}"
+
+
+@dataclass
+class Loss:
+    """A loss of tracking.
+
+    Attributes:
+        time: seconds.
+        frame: index of the frame among the processed ones.
+        failure: what failed.
+        new_maps: number of maps that were started until tracking resumed.
+        resumed: seconds of the first frame that was tracked again; None if there is none.
+    """
+
+    time: float
+    frame: int
+    failure: Failure
+    new_maps: int = 0
+    resumed: float | None = None
 
 
 @dataclass
@@ -90,11 +139,11 @@ class Placed:
 
 
 class Odometry:
-    """Visual odometry: pass frames to `add`; `placed` holds their poses, `map` the local map."""
+    """Visual odometry: pass frames to `add`; `placed` holds their poses, `map` the local map, `losses` what failed."""
 
     STATE = (
         "placed", "_rng", "_pose", "_time", "_velocity", "_initialized", "_featureless", "_pending_tracks", "_rescaled",
-        "_unanchored", "_lost_at", "_recent_keyframes", "_relocalization",
+        "_unanchored", "_lost_at", "_recent_keyframes", "_relocalization", "losses",
     )  # fmt: skip
     PARTS = ("map", "tracker")
 
@@ -127,6 +176,7 @@ class Odometry:
         self.tracker = tracker or tracker_named("corners", self.views, mask, params.count)
         self.map = LocalMap(camera, params, self.views.pixel, gps=gps, backend=backend, keep=keep)
         self.placed: list[Placed] = []
+        self.losses: list[Loss] = []
         self._rng = np.random.default_rng(params.seed)
         self._masks = None if mask is None else self.views.images(mask)
         self._pose, self._time = np.eye(4), 0.0
@@ -152,7 +202,7 @@ class Odometry:
             self._time = time
             self._first_keyframe(time, np.eye(4))
         elif self._featureless:
-            self._start_new_map(time, guess)
+            self._start_new_map(time, guess, None)
         elif not self._initialized:
             self._initialize(time, guess)
         else:
@@ -198,30 +248,38 @@ class Odometry:
         """Estimate a frame's pose by the map, or dead-reckon it; make the frame a keyframe if one is needed."""
         found = estimate_pose(self.map, self.tracker.tracks, guess, self._velocity)
         self.tracker.drop(found.outliers)
-        if not self._is_plausible(time, found):
-            self._dead_reckon(time, guess)
+        failure = self._failure(time, found)
+        if failure is not None:
+            self._dead_reckon(time, guess, failure)
             return
         if self._lost_at is not None:
             self.warn(f"{time:.2f} s: tracking resumed, {time - self._lost_at:.2f} s after it was lost")
+            self.losses[-1].resumed = time
             self._lost_at = None
         self._append_pose(time, found.pose, unsure=False, covariance=found.covariance)
         if self._needs_keyframe():
             self._add_keyframe(time)
 
-    def _is_plausible(self, time: float, found: PoseEstimate) -> bool:
-        """Whether a pose has enough inliers, and a displacement over `GPS_CHECK_S` that fits GPS's."""
-        if found.inliers < INLIERS_MIN or found.inliers < INLIER_SHARE_MIN * found.known:
-            return False
+    def _failure(self, time: float, found: PoseEstimate) -> Failure | None:
+        """What makes a pose implausible: too few inliers, or a displacement over `GPS_CHECK_S` that contradicts GPS."""
+        needed = max(INLIERS_MIN, math.ceil(INLIER_SHARE_MIN * found.known))
+        if found.inliers < needed:
+            tracked = len(self.tracker.tracks)
+            what = f"inliers among {found.known} map points observed by {tracked} tracked features"
+            return Failure(what, found.inliers, needed)
         if self.gps is None:
-            return True
+            return None
         since = time - GPS_CHECK_S
         gps_metres = gps_distance(self.gps, since, time)
         back = next((p for p in reversed(self.placed) if p.time <= since), None)
         if gps_metres is None or back is None or back.unsure:
-            return True
+            return None
         moved = float(np.linalg.norm(found.pose[:3, 3] - self.pose_of(back)[:3, 3]))
         below, above = GPS_DISTANCE_SLACK_M
-        return GPS_DISTANCE_RATIO_MIN * gps_metres - below < moved < GPS_DISTANCE_RATIO_MAX * gps_metres + above
+        least, most = GPS_DISTANCE_RATIO_MIN * gps_metres - below, GPS_DISTANCE_RATIO_MAX * gps_metres + above
+        if least < moved < most:
+            return None
+        return Failure(f"metres over {GPS_CHECK_S:.0f} s, where GPS measured {gps_metres:.1f}", moved, least, most)
 
     def _common_bearings(self, keyframe: Keyframe) -> tuple[F64, F64]:
         """Bearings (M, 3) of a keyframe's features that are still tracked: in the keyframe, and now."""
@@ -275,6 +333,8 @@ class Odometry:
         """Add a map's first keyframe, unless the image has too few features; `tied`: its pose was relocalized."""
         found = self.tracker.refill()
         tracks = self.tracker.tracks
+        if found < MAP_FEATURES_MIN and not self._featureless:
+            self._record_loss(time, Failure("features detected in the image", found, MAP_FEATURES_MIN))
         self._featureless = found < MAP_FEATURES_MIN
         self._initialized, self._pending_tracks, self._rescaled = False, [], 0
         if not self.map.keyframes or not self._featureless:
@@ -286,21 +346,42 @@ class Odometry:
         """Add a map's second keyframe once there is enough parallax to the first; until then keep the tracks."""
         first = self.map.keyframes[-1]
         then, now = self._common_bearings(first)
-        if len(now) < max(MAP_FEATURES_MIN, 0.2 * len(first.ids)):
-            self._start_new_map(time, guess)
-            return
         moved, found = _median_angle(then, now), None
-        if not self.map.part and moved < self.map.gate:  # the car stands still
+        if not self.map.part and len(now) >= MAP_FEATURES_MIN and moved < self.map.gate:  # the car does not move
             self._pending_tracks = []
             self._append_pose(time, first.T_world_cam, unsure=False, covariance=STANDSTILL_COVARIANCE)
             return
         if moved > math.radians(0.5):
             found = relative_pose(then, now, threshold=self.map.gate, rng=self._rng)
-        if found is None or _median_angle(now @ found[0][:3, :3].T, then) < self._init_parallax:
-            self._pending_tracks.append(self.tracker.tracks)
-            self._append_pose(time, guess if self.map.part else first.T_world_cam, unsure=self.map.part > 0)
+        tracked_share = len(now) / max(len(first.ids), 1)
+        if found is not None and self._has_parallax(then, now, *found, tracked_share):
+            self._two_view_init(time, found[0], self._baseline(first, time, guess))
             return
-        self._two_view_init(time, found[0], self._baseline(first, time, guess))
+        needed = max(MAP_FEATURES_MIN, math.ceil(INIT_TRACKED_SHARE_MIN * len(first.ids)))
+        if len(now) < needed:
+            what = f"features still tracked of the {len(first.ids)} in the map's first keyframe"
+            self._start_new_map(time, guess, Failure(what, len(now), needed))
+            return
+        self._pending_tracks.append(self.tracker.tracks)
+        self._append_pose(time, guess if self.map.part else first.T_world_cam, unsure=self.map.part > 0)
+
+    def _has_parallax(self, then: F64, now: F64, T: F64, inlier: Bools, tracked_share: float) -> bool:
+        """Whether two views suffice to start a map: enough median parallax.
+
+        In sharp turns, near features leave the view before the median, that of far features, has grown. So when
+        features run out as for any keyframe, twice the points that a map needs suffice, with triangulable parallax.
+
+        Args:
+            then, now: (N, 3) bearings of common features in both views.
+            T: (4, 4) pose of the second view in the first one's axes.
+            inlier: (N,) features that fit it.
+            tracked_share: share of the first view's features that are common.
+        """
+        parallax = _angles(now @ T[:3, :3].T, then)
+        if np.median(parallax) >= self._init_parallax:
+            return True
+        triangulable = inlier & (parallax > TRIANGULATION_SIGMAS * self.map.sigma)
+        return tracked_share < self.params.min_tracked_share and int(triangulable.sum()) >= 2 * MAP_FEATURES_MIN
 
     def _two_view_init(self, time: float, T: F64, baseline: float) -> None:
         """Add the second keyframe, and estimate the pending frames' poses by the points of both keyframes.
@@ -316,11 +397,13 @@ class Odometry:
         self._velocity = np.concatenate([T[:3, 3], log_so3(T[:3, :3])]) / (time - since)
         self._initialized = True
         self._add_keyframe(time)
-        if self.map.landmarks.find(self.tracker.tracks.ids)[1].sum() < MAP_FEATURES_MIN:
+        points = int(self.map.landmarks.find(self.tracker.tracks.ids)[1].sum())
+        if points < MAP_FEATURES_MIN:
             self.map.keyframes.pop()
             self.placed.pop()
             self._time = self.placed[-1].time
-            self._start_new_map(time, self._pose)
+            failure = Failure("points triangulated from the map's first two keyframes", points, MAP_FEATURES_MIN)
+            self._start_new_map(time, self._pose, failure)
             return
         between, ends = self.placed[-1 - len(self._pending_tracks) : -1], self.map.poses([-2, -1])
         guesses = interpolate(ends, np.array([since, time]), np.array([p.time for p in between]))
@@ -337,22 +420,28 @@ class Odometry:
         moved = float(np.linalg.norm(guess[:3, 3] - first.T_world_cam[:3, 3]))
         return moved if self.map.part and moved > 0 else 1.0
 
-    def _dead_reckon(self, time: float, guess: F64) -> None:
+    def _dead_reckon(self, time: float, guess: F64, failure: Failure) -> None:
         """Extrapolate the pose of a frame that can't be tracked; after `NEW_MAP_AFTER_S` start a new map."""
         if self._lost_at is None:
-            self._lost_at = time
             self._relocalization = None
-            self.warn(f"{time:.2f} s: tracking lost, poses are dead-reckoned")
-        if time - self._lost_at > NEW_MAP_AFTER_S:
-            self._start_new_map(time, guess)
+            self._record_loss(time, failure)
+        if self._lost_at is not None and time - self._lost_at > NEW_MAP_AFTER_S:
+            self._start_new_map(time, guess, failure)
         else:
             self._append_pose(time, guess, unsure=True)
 
-    def _start_new_map(self, time: float, guess: F64) -> None:
-        """Start a map at the relocalized pose, or else at the dead-reckoned one."""
+    def _record_loss(self, time: float, failure: Failure) -> None:
+        """Store why tracking was lost, and warn, unless it was lost before."""
         if self._lost_at is None:
             self._lost_at = time
-            self.warn(f"{time:.2f} s: tracking lost, poses are dead-reckoned")
+            self.losses.append(Loss(time, len(self.placed), failure))
+            self.warn(f"{time:.2f} s: tracking lost, poses are dead-reckoned ({failure})")
+
+    def _start_new_map(self, time: float, guess: F64, failure: Failure | None) -> None:
+        """Start a map at the relocalized pose, or else at the dead-reckoned one; `failure`: of the last map."""
+        if failure is not None:
+            self._record_loss(time, failure)
+        self.losses[-1].new_maps += 1
         self.map.part += 1
         self.tracker.tracks = Tracks()
         found = self._relocalized_pose(time)
@@ -380,6 +469,11 @@ class Odometry:
         return found
 
 
+def _angles(a: F64, b: F64) -> F64:
+    """(N,) angles between unit vectors a and b (N, 3), radians."""
+    return np.arccos(np.clip(np.einsum("ij,ij->i", a, b), -1, 1))
+
+
 def _median_angle(a: F64, b: F64) -> float:
     """Median angle between unit vectors a and b (N, 3), radians; 0 if there are none."""
-    return float(np.median(np.arccos(np.clip(np.einsum("ij,ij->i", a, b), -1, 1)))) if len(a) else 0.0
+    return float(np.median(_angles(a, b))) if len(a) else 0.0

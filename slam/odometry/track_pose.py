@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from scan2sim.pipeline.core.types import F64, I64
-from scan2sim.slam import solvers
 from scan2sim.slam.factor_graph import Graph
 from scan2sim.slam.geometry import angles
 from scan2sim.slam.mapping.local_map import LocalMap
@@ -58,7 +57,7 @@ def estimate_pose(points: LocalMap, tracks: Tracks, guess: F64, velocity: F64) -
         shared_jacobian=points.shared_jacobian(guess[None], velocity[None], camera_of, bearing), shared=points.shared,
         shared_sigma=np.full(len(points.shared), 1e-9),
     )  # fmt: skip
-    pose = solvers.named(points.backend).solve(graph, points=False).poses[0]
+    pose = points.solver.solve(graph, points=False).poses[0]
     error = angles(pose, xyz, bearing)
     inlier = error < points.gate
     covariance = _covariance(pose, xyz[inlier], bearing[inlier], error[inlier]) if inlier.sum() >= POINTS_MIN else None

@@ -15,18 +15,22 @@ from scan2sim.pipeline.core.types import U8
 from scan2sim.slam.features import FeatureSet
 from scan2sim.slam.mapping.local_map import Keyframe, Landmarks
 from scan2sim.slam.odometry.checkpoint import InvalidCheckpoint, load, save
-from scan2sim.slam.odometry.odometry import Odometry, Placed
+from scan2sim.slam.odometry.odometry import Failure, Loss, Odometry, Placed
 from scan2sim.slam.odometry.relocalization import FrameFeatures, KeyframeFeatures
+from scan2sim.slam.odometry.track_log import TrackLog
 from scan2sim.slam.optical_flow.patch_alignment import Patches
 from scan2sim.slam.trackers import Tracks
 from scan2sim.slam.trackers.descriptors import ViewFeatures
 from scan2sim.slam.video import Video
 
-VERSION = 11
+VERSION = 13
 """Version of the step's result. Increased whenever the same video and options give another trajectory: checkpoints and
 cached trajectories of an older version are then discarded and computed again."""
 CHECKPOINT_INTERVAL_S = 60.0
-VALUES = (FeatureSet, Keyframe, Landmarks, Patches, Placed, KeyframeFeatures, FrameFeatures, ViewFeatures, Tracks)
+VALUES = (
+    FeatureSet, Keyframe, Landmarks, Patches, Placed, Loss, Failure, KeyframeFeatures, FrameFeatures, ViewFeatures,
+    Tracks,
+)  # fmt: skip
 """Types that occur in a checkpoint."""
 
 
@@ -59,7 +63,18 @@ class Run:
             "seconds": round(self.seconds, 2),
             "fps": round(len(self.names) / max(self.seconds, 1e-9), 2),
             **dict(zip(local_map.names, np.round(local_map.shared, 5).tolist(), strict=True)),
+            "losses": [self._loss(loss) for loss in self.odometry.losses],
         }
+
+    def _loss(self, loss: Loss) -> dict[str, Any]:
+        """A loss of tracking for `slam.json`."""
+        what, measured, needed, allowed = loss.failure
+        limits = {"needed": needed, "allowed": allowed}
+        return {
+            "frame": self.names[loss.frame], "time": round(loss.time, 3), "failed": what,
+            "measured": round(measured, 3), **{key: round(v, 3) for key, v in limits.items() if v is not None},
+            "new_maps": loss.new_maps, "resumed": None if loss.resumed is None else round(loss.resumed, 3),
+        }  # fmt: skip
 
 
 def track(
@@ -68,6 +83,7 @@ def track(
     *,
     every: int = 1,
     until: float | None = None,
+    log: TrackLog | None = None,
     state: Path | None = None,
     watch: Callable[[Odometry, U8], None] | None = None,
     report: Report = silent,
@@ -79,6 +95,7 @@ def track(
         start: creates the odometry; its argument receives warnings.
         every: process every Nth frame.
         until: seconds of the video after which to stop.
+        log: frames whose features were tracked before, and are replayed: images are only read for `watch`.
         state: checkpoint file, written every minute; if it exists, the run resumes from it.
         watch: called with odometry and image after each frame.
         report: receives progress.
@@ -89,7 +106,10 @@ def track(
     run = _new_or_resumed(start, state)
     began, saved = clock.perf_counter() - run.seconds, clock.perf_counter()
     last = run.odometry.placed[-1].time if run.odometry.placed else -np.inf
-    for frame in video.frames(every=every, warn=run.warnings.append):
+    if log is not None:
+        run.warnings.extend(log.warnings)
+    read = video.frames(every=every, warn=run.warnings.append)
+    for frame in read if log is None or watch is not None else log.frames():
         if frame.time <= last:
             continue
         if until is not None and frame.time > until:

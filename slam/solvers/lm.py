@@ -9,37 +9,89 @@ decoded in parallel.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from scan2sim.pipeline.core.types import F64, I32, I64, Bools
+from scan2sim.pipeline.geometry.least_squares import moved
 from scan2sim.slam.factor_graph import Factor, Graph, Solution
-from scan2sim.slam.geometry import exp_so3
 
 ITERATIONS_MAX = 8
 COST_DECREASE_MIN = 1e-4
 """Relative decrease of the cost below which the iteration stops."""
+WINDOW_COST_DECREASE_MIN = 1e-3
+"""The same of a window, by default: it is optimized again with each of the next keyframes."""
+
+
+class Normal(NamedTuple):
+    """Normal equations.
+
+    Attributes:
+        H, g: (N, N), (N,) of free cameras and shared parameters.
+        V, gp: (P, 3, 3), (P, 3) of points.
+        W: (O, D, 3) coupling of each observation's point with its camera and the shared parameters.
+        starts: (P + 1,) observations of point p are starts[p] to starts[p + 1].
+        columns: (O, D) columns of H of these parameters; -1: fixed.
+    """
+
+    H: F64
+    g: F64
+    V: F64
+    gp: F64
+    W: F64
+    starts: I64
+    columns: I64
 
 
 def solve(graph: Graph, *, iterations: int | None = None, points: bool = True) -> Solution:
     """See `slam.solvers.Solver`."""
-    poses, xyz, shared = graph.poses.copy(), graph.points.copy(), graph.shared.copy()
-    free = np.cumsum(~graph.fixed).astype(np.int64) - 1
-    free[graph.fixed] = -1
-    starts = np.searchsorted(graph.point_of, np.arange(len(xyz) + 1))
-    size = 6 * int((~graph.fixed).sum()) + len(shared)
-    if not size and not points:
-        return Solution(poses, xyz, shared)
-    damping, cost = 1e-4, _cost(graph, poses, xyz, shared)
+    start = Solution(graph.poses, graph.points, graph.shared)
+    if graph.fixed.all() and not len(graph.shared) and not points:
+        return start
+    known = layout(graph.point_of, graph.camera_of, graph.fixed, len(graph.points), len(graph.shared))
+    normal_of = partial(_normal, graph, known)
+    return minimize(
+        start, graph.fixed, partial(_cost, graph), normal_of, iterations, points=points,
+        decrease_min=WINDOW_COST_DECREASE_MIN if points and iterations is None else COST_DECREASE_MIN,
+    )  # fmt: skip
+
+
+def minimize(
+    start: Solution,
+    fixed: Bools,
+    cost_of: Callable[[F64, F64, F64], float],
+    normal_of: Callable[[F64, F64, F64], Normal],
+    iterations: int | None = None,
+    *,
+    points: bool = True,
+    decrease_min: float = COST_DECREASE_MIN,
+) -> Solution:
+    """Minimize a cost of poses, points and shared parameters by Levenberg-Marquardt.
+
+    Args:
+        start: initial values.
+        fixed: (C,) whether a camera is fixed.
+        cost_of: cost of poses (C, 4, 4), points (P, 3) and shared parameters (S,).
+        normal_of: normal equations at such values.
+        iterations: greatest number of iterations; default: `ITERATIONS_MAX`.
+        points: optimize the points, too.
+        decrease_min: relative decrease of the cost below which the iteration stops.
+    """
+    poses, xyz, shared = start.poses.copy(), start.points.copy(), start.shared.copy()
+    damping, cost = 1e-4, cost_of(poses, xyz, shared)
     for _ in range(ITERATIONS_MAX if iterations is None else iterations):
-        H, g, V, gp, W = _normal(graph, poses, xyz, shared, free, starts, size, points)
+        normal = normal_of(poses, xyz, shared)
         better = False
         for _ in range(6):
-            step, moved = _step(H, g, V, gp, W, graph, free, starts, size, damping, points)
-            new_poses, new_shared = _moved(poses, shared, step, graph.fixed)
-            new_xyz = xyz + moved
-            new_cost = _cost(graph, new_poses, new_xyz, new_shared)
+            step, point_step = _step(normal, damping, points)
+            new_poses, new_shared = _moved(poses, shared, step, fixed)
+            new_xyz = xyz + point_step
+            new_cost = cost_of(new_poses, new_xyz, new_shared)
             if new_cost <= cost:
                 better = True
                 break
@@ -49,7 +101,7 @@ def solve(graph: Graph, *, iterations: int | None = None, points: bool = True) -
         decrease = (cost - new_cost) / max(cost, 1e-30)
         poses, xyz, shared, cost = new_poses, new_xyz, new_shared, new_cost
         damping = max(damping / 10, 1e-9)
-        if decrease < COST_DECREASE_MIN:
+        if decrease < decrease_min:
             break
     return Solution(poses, xyz, shared)
 
@@ -59,45 +111,40 @@ def information(graph: Graph, *, points: bool = True) -> F64:
 
     Points are eliminated; with `points` False, they are fixed instead.
     """
-    count = len(graph.poses)
-    free, starts = np.arange(count), np.searchsorted(graph.point_of, np.arange(len(graph.points) + 1))
-    none = np.zeros((0, 0, 6)), np.zeros(0)
-    H, g, V, gp, W = _accumulate(
-        graph.poses, graph.points, starts, graph.camera_of, graph.bearing, *none, free, 6 * count, 1.0
-    )
-    return _reduce(H, g, V, gp, W, starts, graph.camera_of, free, 0, 0.0)[0] if points else H
+    bare = replace(graph, fixed=np.zeros(len(graph.poses), bool), shared_jacobian=np.zeros((0, 0, 6)), sigma=1.0)
+    known = layout(bare.point_of, bare.camera_of, bare.fixed, len(bare.points), 0)
+    normal = _observations(bare, known, graph.poses, graph.points, np.zeros(0))
+    return _reduce(normal, 0.0)[0] if points else normal.H
 
 
-def information_of_shared(graph: Graph) -> F64:
-    """(S, S) information matrix of the shared parameters from the observations, for a sigma of 1.
+def information_of_shared(normal: Normal, count: int) -> F64:
+    """(S, S) information matrix of the last `count` parameters; points and cameras are eliminated."""
+    H = _reduce(normal, 0.0)[0]
+    between = H[:-count, -count:]
+    rest = np.linalg.pinv(H[:-count, :-count], rcond=1e-9, hermitian=True)
+    return np.asarray(H[-count:, -count:] - between.T @ rest @ between, np.float64)
 
-    Points and cameras are eliminated.
+
+def layout(point_of: I32, camera_of: I32, fixed: Bools, points: int, shared: int) -> tuple[I64, I64, int]:
+    """Layout of the normal equations: `Normal.starts`, `Normal.columns`, and the number of columns of H.
+
+    Args:
+        point_of, camera_of: (O,) point and camera of each observation, sorted by point.
+        fixed: (C,) whether a camera is fixed.
+        points: number of points.
+        shared: number of shared parameters.
     """
-    S = graph.shared_jacobian.shape[1]
-    size = 6 * len(graph.poses) + S
-    free, starts = np.arange(len(graph.poses)), np.searchsorted(graph.point_of, np.arange(len(graph.points) + 1))
-    H, g, V, gp, W = _accumulate(
-        graph.poses, graph.points, starts, graph.camera_of, graph.bearing, graph.shared_jacobian, graph.shared, free,
-        size, graph.sigma,
-    )  # fmt: skip
-    H = _reduce(H, g, V, gp, W, starts, graph.camera_of, free, S, 0.0)[0] * graph.sigma**2
-    between = H[:-S, -S:]
-    out = H[-S:, -S:] - between.T @ np.linalg.pinv(H[:-S, :-S], rcond=1e-9, hermitian=True) @ between
-    return np.asarray(out, np.float64)
+    first = 6 * _free(fixed)[camera_of, None]
+    size = 6 * int((~fixed).sum()) + shared
+    of_shared = np.tile(np.arange(size - shared, size), (len(first), 1))
+    columns = np.concatenate([np.where(first < 0, -1, first + np.arange(6)), of_shared], axis=1)
+    return np.searchsorted(point_of, np.arange(points + 1)), columns, size
 
 
 def _moved(poses: F64, shared: F64, step: F64, fixed: Bools) -> tuple[F64, F64]:
-    out = poses.copy()
-    n = int((~fixed).sum())
-    by = step[: 6 * n].reshape(n, 6)
-    out[~fixed, :3, 3] += by[:, :3]
-    out[~fixed, :3, :3] = exp_so3(by[:, 3:]) @ out[~fixed, :3, :3]
-    return out, shared + step[6 * n :]
-
-
-def _prior_residual(graph: Graph, shared: F64) -> F64:
-    """(S,) difference of the shared parameters from the mean of their prior."""
-    return shared - (graph.shared if graph.shared_prior is None else graph.shared_prior)
+    out, end = poses.copy(), len(step) - len(shared)
+    out[~fixed] = moved(out[~fixed], step[:end].reshape(-1, 6))
+    return out, shared + step[end:]
 
 
 def _cost(graph: Graph, poses: F64, xyz: F64, shared: F64) -> float:
@@ -107,23 +154,34 @@ def _cost(graph: Graph, poses: F64, xyz: F64, shared: F64) -> float:
     for known in graph.distances:
         r = (np.linalg.norm(poses[known.second, :3, 3] - poses[known.first, :3, 3]) - known.distance) / known.sigma
         total += math.log1p(r * r)
-    total += float(((_prior_residual(graph, shared) / graph.shared_sigma) ** 2).sum())
+    total += float((((shared - graph.shared) / graph.shared_sigma) ** 2).sum())
     for factor in graph.factors:
         residual = np.asarray(factor.residual(*(poses[c] for c in factor.cameras), factor.measured))
         total += float((residual**2).sum())
     return float(total)
 
 
-def _normal(
-    graph: Graph, poses: F64, xyz: F64, shared: F64, free: I64, starts: I64, size: int, points: bool
-) -> tuple[F64, F64, F64, F64, F64]:
-    """Normal equations: H, g of cameras and shared parameters; V, gp of points; W couples both."""
-    H, g, V, gp, W = _accumulate(
-        poses, xyz, starts, graph.camera_of, graph.bearing, graph.shared_jacobian, shared, free, size, graph.sigma
+def _free(fixed: Bools) -> I64:
+    """(C,) indices of the free cameras; -1 for fixed ones."""
+    return np.where(fixed, -1, np.cumsum(~fixed) - 1)
+
+
+def _observations(graph: Graph, known: tuple[I64, I64, int], poses: F64, xyz: F64, shared: F64) -> Normal:
+    """Normal equations of the observations alone; `known`: their `layout`."""
+    starts, columns, size = known
+    equations = _accumulate(
+        poses, xyz, starts, graph.camera_of, graph.bearing, graph.shared_jacobian, shared, columns, size, graph.sigma
     )
+    return Normal(*equations, starts, columns)
+
+
+def _normal(graph: Graph, arranged: tuple[I64, I64, int], poses: F64, xyz: F64, shared: F64) -> Normal:
+    """Normal equations of all factors; `arranged`: the `layout` of the observations."""
+    normal, free = _observations(graph, arranged, poses, xyz, shared), _free(graph.fixed)
+    H, g, size = normal.H, normal.g, len(normal.g)
     last = np.arange(size - len(shared), size)
     H[last, last] += 1 / graph.shared_sigma**2
-    g[last] += _prior_residual(graph, shared) / graph.shared_sigma**2
+    g[last] += (shared - graph.shared) / graph.shared_sigma**2
     for known in graph.distances:
         between = poses[known.second, :3, 3] - poses[known.first, :3, 3]
         length = max(float(np.linalg.norm(between)), 1e-9)
@@ -139,7 +197,7 @@ def _normal(
         J, residual = _numeric_jacobian(factor, poses, free, size)
         H += J.T @ J
         g += J.T @ residual
-    return H, g, V, gp, W
+    return normal
 
 
 def _numeric_jacobian(factor: Factor, poses: F64, free: I64, size: int) -> tuple[F64, F64]:
@@ -155,51 +213,32 @@ def _numeric_jacobian(factor: Factor, poses: F64, free: I64, size: int) -> tuple
             for h in (1e-6, -1e-6):
                 step = np.zeros((1, 6))
                 step[0, d] = h
-                moved, _ = _moved(involved[k][None], np.zeros(0), step.ravel(), np.zeros(1, bool))
-                ends.append(np.asarray(factor.residual(*involved[:k], moved[0], *involved[k + 1 :], factor.measured)))
+                other = moved(involved[k][None], step)[0]
+                ends.append(np.asarray(factor.residual(*involved[:k], other, *involved[k + 1 :], factor.measured)))
             J[:, 6 * free[camera] + d] = (ends[0] - ends[1]) / 2e-6
     return J, residual
 
 
-def _step(
-    H: F64,
-    g: F64,
-    V: F64,
-    gp: F64,
-    W: F64,
-    graph: Graph,
-    free: I64,
-    starts: I64,
-    size: int,
-    damping: float,
-    points: bool,
-) -> tuple[F64, F64]:
-    """Update of cameras and shared parameters (size,), and of points (P, 3)."""
-    from scipy.linalg import LinAlgError, cho_factor, cho_solve
+def _step(normal: Normal, damping: float, points: bool) -> tuple[F64, F64]:
+    """Update of cameras and shared parameters (N,), and of points (P, 3)."""
+    from scipy.linalg.lapack import dposv  # without the checks of scipy.linalg, which cost as much
 
-    fixed_points, n_shared = np.zeros((len(V), 3)), graph.shared_jacobian.shape[1]
-    if points:
-        reduced, right = _reduce(H, g, V, gp, W, starts, graph.camera_of, free, n_shared, damping)
-    else:
-        reduced, right = H.copy(), g.copy()
-    if not size:
-        return np.zeros(0), _back_substitute(np.zeros(0), V, gp, W, starts, graph.camera_of, free, n_shared, damping)
-    diagonal = np.diag_indices(size)
-    reduced[diagonal] += damping * H[diagonal] + 1e-12
-    try:
-        step = -cho_solve(cho_factor(reduced), right)
-    except (LinAlgError, ValueError):
-        return np.zeros(size), fixed_points
-    if not points:
-        return step, fixed_points
-    return step, _back_substitute(step, V, gp, W, starts, graph.camera_of, free, n_shared, damping)
+    H, g, V, gp, W, starts, columns = normal
+    step, fixed_points = np.zeros(len(g)), np.zeros((len(V), 3))
+    if len(g):
+        reduced, right = _reduce(normal, damping) if points else (H.copy(), g)
+        reduced[np.diag_indices(len(g))] += damping * np.diagonal(H) + 1e-12
+        _, solution, failed = dposv(reduced, right)
+        if failed:
+            return step, fixed_points
+        step = -solution
+    return step, _back_substitute(step, V, gp, W, starts, columns, damping) if points else fixed_points
 
 
-def _reduce(
-    H: F64, g: F64, V: F64, gp: F64, W: F64, starts: I64, camera_of: I32, free: I64, n_shared: int, damping: float
-) -> tuple[F64, F64]:
+def _reduce(normal: Normal, damping: float) -> tuple[F64, F64]:
     """H and g of cameras and shared parameters with the points eliminated (Schur complement)."""
-    less, less_g = _schur(V, gp, W, starts, camera_of, free, n_shared, len(g), damping)
+    H, g, V, gp, W, starts, columns = normal
+    less, less_g = _schur(V, gp, W, starts, columns, len(g), damping)
     return H - less, g - less_g
 
 
@@ -243,9 +282,8 @@ def _robust_cost(
 ) -> F64:
     """(O,) Cauchy cost of every observation; for points behind the camera, that of a right angle."""
     out = np.empty(len(point_of))
-    none = np.zeros((0, 6))
+    none, R = np.zeros((0, 6)), np.empty((3, 3))
     for o in range(len(point_of)):
-        R = np.empty((3, 3))
         b = shared_jacobian[o] if shared.shape[0] > 0 else none
         x, y, z, _, _, _ = _transformed(poses[camera_of[o]], xyz[point_of[o]], b, shared, R)
         p, q, s = bearing[o, 0], bearing[o, 1], bearing[o, 2]
@@ -267,7 +305,7 @@ def _accumulate(
     bearing: F64,
     shared_jacobian: F64,
     shared: F64,
-    free: I64,
+    columns: I64,
     size: int,
     sigma: float,
 ) -> tuple[F64, F64, F64, F64, F64]:
@@ -326,19 +364,17 @@ def _accumulate(
                 gp[p, i] += w * (Jp[0, i] * r[0] + Jp[1, i] * r[1])
                 for j in range(3):
                     V[p, i, j] += w * (Jp[0, i] * Jp[0, j] + Jp[1, i] * Jp[1, j])
-            at = free[camera]
             for i in range(D):
-                row = 6 * at + i if i < 6 else size - S + i - 6
-                if i < 6 and at < 0:
+                row = columns[o, i]
+                if row < 0:
                     continue
                 g[row] += w * (J[0, i] * r[0] + J[1, i] * r[1])
                 for j in range(3):
                     W[o, i, j] = w * (J[0, i] * Jp[0, j] + J[1, i] * Jp[1, j])
                 for j in range(D):
-                    if j < 6 and at < 0:
-                        continue
-                    column = 6 * at + j if j < 6 else size - S + j - 6
-                    H[row, column] += w * (J[0, i] * J[0, j] + J[1, i] * J[1, j])
+                    column = columns[o, j]
+                    if column >= 0:
+                        H[row, column] += w * (J[0, i] * J[0, j] + J[1, i] * J[1, j])
     return H, g, V, gp, W
 
 
@@ -356,50 +392,65 @@ def _inverse3(A: F64, damping: float, out: F64) -> None:
     out[2, 0], out[2, 1], out[2, 2] = out[0, 2], out[1, 2], (a * d - b * b) / det
 
 
-@njit(cache=True, nogil=True)
-def _schur(
-    V: F64, gp: F64, W: F64, starts: I64, camera_of: I32, free: I64, S: int, size: int, damping: float
-) -> tuple[F64, F64]:
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _schur(V: F64, gp: F64, W: F64, starts: I64, columns: I64, size: int, damping: float) -> tuple[F64, F64]:
     """Schur complement: the terms that eliminating the points subtracts from H and g."""
-    n = len(starts) - 1
-    D = 6 + S
-    H = np.zeros((size, size))
+    n, S, most = len(starts) - 1, columns.shape[1] - 6, 0
+    half = np.zeros((size, size))  # of pairs of observations, each once: H is this plus its transpose
     g = np.zeros(size)
-    inverse = np.empty((3, 3))
-    WV = np.empty((D, 3))
+    for p in range(n):
+        most = max(most, starts[p + 1] - starts[p])
+    # of a point's observations by free cameras: W inverse(V), the transpose of W, and the camera's first column
+    left, right, column = np.empty((most, 6, 3)), np.empty((most, 3, 6)), np.empty(most, np.int64)
+    inverse, shared, weighted = np.empty((3, 3)), np.empty((S, 3)), np.empty((S, 3))
     for p in range(n):
         _inverse3(V[p], damping, inverse)
-        for a in range(starts[p], starts[p + 1]):
-            at = free[camera_of[a]]
-            for i in range(D):
-                if i < 6 and at < 0:
-                    continue
-                row = 6 * at + i if i < 6 else size - S + i - 6
+        m = 0
+        shared[:] = 0.0  # sum of W of the shared parameters
+        for o in range(starts[p], starts[p + 1]):
+            for s in range(S):
+                for k in range(3):
+                    shared[s, k] += W[o, 6 + s, k]
+            if columns[o, 0] < 0:  # a fixed camera has no columns
+                continue
+            column[m] = columns[o, 0]
+            for i in range(6):
+                x, y, z, product = W[o, i, 0], W[o, i, 1], W[o, i, 2], 0.0
+                right[m, 0, i], right[m, 1, i], right[m, 2, i] = x, y, z
                 for j in range(3):
-                    WV[i, j] = W[a, i, 0] * inverse[0, j] + W[a, i, 1] * inverse[1, j] + W[a, i, 2] * inverse[2, j]
-                g[row] += WV[i, 0] * gp[p, 0] + WV[i, 1] * gp[p, 1] + WV[i, 2] * gp[p, 2]
-            for o in range(starts[p], starts[p + 1]):
-                to = free[camera_of[o]]
-                for i in range(D):
-                    if i < 6 and at < 0:
-                        continue
-                    row = 6 * at + i if i < 6 else size - S + i - 6
-                    for j in range(D):
-                        if j < 6 and to < 0:
-                            continue
-                        column = 6 * to + j if j < 6 else size - S + j - 6
-                        H[row, column] += WV[i, 0] * W[o, j, 0] + WV[i, 1] * W[o, j, 1] + WV[i, 2] * W[o, j, 2]
-    return H, g
+                    left[m, i, j] = x * inverse[0, j] + y * inverse[1, j] + z * inverse[2, j]
+                    product += left[m, i, j] * gp[p, j]
+                g[column[m] + i] += product
+            m += 1
+        for a in range(m):
+            for o in range(a, m):
+                weight = 0.5 if o == a else 1.0
+                X, Y, Z = right[o, 0], right[o, 1], right[o, 2]
+                for i in range(6):
+                    row = half[column[a] + i, column[o] : column[o] + 6]
+                    x, y, z = weight * left[a, i, 0], weight * left[a, i, 1], weight * left[a, i, 2]
+                    for j in range(6):
+                        row[j] += x * X[j] + y * Y[j] + z * Z[j]
+            for i in range(6):
+                for s in range(S):
+                    for k in range(3):
+                        half[column[a] + i, size - S + s] += left[a, i, k] * shared[s, k]
+        for s in range(S):
+            weighted[s] = 0.0
+            for j in range(3):
+                for k in range(3):
+                    weighted[s, j] += shared[s, k] * inverse[k, j]
+                g[size - S + s] += weighted[s, j] * gp[p, j]
+            for t in range(S):
+                for k in range(3):
+                    half[size - S + s, size - S + t] += 0.5 * weighted[s, k] * shared[t, k]
+    return half + half.T, g
 
 
 @njit(cache=True, nogil=True)
-def _back_substitute(
-    step: F64, V: F64, gp: F64, W: F64, starts: I64, camera_of: I32, free: I64, S: int, damping: float
-) -> F64:
+def _back_substitute(step: F64, V: F64, gp: F64, W: F64, starts: I64, columns: I64, damping: float) -> F64:
     """(P, 3) update of the points from that of the cameras."""
-    n = len(starts) - 1
-    size = len(step)
-    D = 6 + S
+    n, D = len(starts) - 1, columns.shape[1]
     out = np.zeros((n, 3))
     for p in range(n):
         inverse = np.empty((3, 3))
@@ -407,13 +458,11 @@ def _back_substitute(
         for j in range(3):
             right[j] = gp[p, j]
         for o in range(starts[p], starts[p + 1]):
-            at = free[camera_of[o]]
             for i in range(D):
-                if i < 6 and at < 0:
-                    continue
-                row = 6 * at + i if i < 6 else size - S + i - 6
-                for j in range(3):
-                    right[j] += W[o, i, j] * step[row]
+                row = columns[o, i]
+                if row >= 0:
+                    for j in range(3):
+                        right[j] += W[o, i, j] * step[row]
         _inverse3(V[p], damping, inverse)
         for i in range(3):
             out[p, i] = -(inverse[i, 0] * right[0] + inverse[i, 1] * right[1] + inverse[i, 2] * right[2])

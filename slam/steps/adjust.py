@@ -14,7 +14,8 @@ def adjust_all(inputs: Inputs, params: Params, out: Path, report: Report) -> Don
     """Global bundle adjustment of all keyframes and points of `map`, kept if held-out features fit it better."""
     checkpoint = MapCheckpoint.read(inputs["map"])
     metrics = adjust(checkpoint)
-    rejected = f"the adjusted path doesn't fit {metrics['witnesses']} held-out features better: odometry's path is kept"
+    held_out = metrics["held_out_features"]
+    rejected = f"the adjusted path doesn't fit {held_out} held-out features better: odometry's path is kept"
     warnings = [] if metrics["adjustment_kept"] else [rejected]
     return Done({"map": checkpoint.write(out / "map.npz")}, metrics, warnings)
 
@@ -24,4 +25,4 @@ def can_adjust(params: Params) -> None:
     require("--adjust", "pycolmap")
 
 
-ADJUST = Step("adjust", 4, adjust_all, Params, check=can_adjust)
+ADJUST = Step("adjust", 5, adjust_all, Params, check=can_adjust)

@@ -10,6 +10,7 @@ from pydantic import Field
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.parameters import Rate
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.io.images.video import check_encoder
 from scan2sim.slam.video import open_video
 from scan2sim.slam.video_degradation import encode
 
@@ -49,8 +50,9 @@ def encode_video(inputs: Inputs, params: EncodeParams, out: Path, report: Report
 
 
 def can_encode(params: Any) -> None:
-    """Raise UnavailableError if PyAV or matplotlib isn't installed."""
+    """Raise UnavailableError if PyAV or matplotlib isn't installed, or H.264 can't be encoded."""
     require("slam study", "av", "matplotlib")
+    check_encoder("slam study")
 
 
 ENCODE = Step("encode", 1, encode_video, EncodeParams, check=can_encode)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -18,9 +18,9 @@ LOST_SHARE_MAX = 0.5
 
 
 class Segments(Context):
-    """Length of the local error's segments, metres."""
+    """Lengths of the local error's segments, metres."""
 
-    segment: Annotated[float, Field(ge=1, le=1e7)] = SEGMENT_M
+    segments: tuple[Annotated[float, Field(ge=1, le=1e7)], ...] = Field((SEGMENT_M,), min_length=1)
 
 
 class EvaluateParams(Params):
@@ -33,10 +33,12 @@ def evaluate_path(inputs: Inputs, params: EvaluateParams, out: Path, report: Rep
     """Errors of `trajectory` against `truth`, a trajectory or a GPS track; none if tracking was mostly lost."""
     path, truth = trajectory_io.read(inputs["trajectory"]), read_truth(inputs["truth"])
     share = lost_share(path, truth)
-    metrics = {"lost_share": round(share, 4)}
+    metrics: dict[str, Any] = {"lost_share": round(share, 4)}
     if share > LOST_SHARE_MAX:
         return Done({}, metrics | {"reason": f"tracking lost on {100 * share:.0f} % of the path"})
-    return Done({}, metrics | evaluate(path, truth, segment=params.context.segment).figures())
+    for segment in params.context.segments:
+        metrics |= evaluate(path, truth, segment=segment).figures()
+    return Done({}, metrics)
 
 
 def lost_share(estimate: Trajectory, truth: Trajectory | GpsTrack) -> float:
@@ -49,4 +51,4 @@ def lost_share(estimate: Trajectory, truth: Trajectory | GpsTrack) -> float:
     return float(steps[estimate.unsure[known][1:]].sum()) / whole if whole > 0 else 1.0
 
 
-EVALUATE = Step("evaluate", 1, evaluate_path, EvaluateParams)
+EVALUATE = Step("evaluate", 2, evaluate_path, EvaluateParams)

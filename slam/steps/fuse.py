@@ -14,8 +14,11 @@ from scan2sim.pipeline.core.parameters import Shift
 from scan2sim.pipeline.core.poses import interpolate
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, Frame, GpsTrack, Trajectory
-from scan2sim.pipeline.importers import sweeps as io
+from scan2sim.pipeline.importers.scanner_path import MAX_POSE_GAP_S
 from scan2sim.pipeline.io import gps as gps_io
+from scan2sim.pipeline.io import sweep_files
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.calibration import read_extrinsics
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.slam.lidar_odometry import MatchedSweeps
 from scan2sim.slam.trajectory import output
@@ -49,12 +52,14 @@ class FuseParams(Params):
         time_offset: seconds to add to the times of sweeps and photos.
         gps_offset: seconds to add to GPS times, to convert them to the clock of the trajectory, or of the sweeps.
         crs: projected CRS of the poses, such as "EPSG:32633"; "local" if they aren't georeferenced.
+        quaternions: order of the poses' quaternions.
     """
 
     scanner_poses: bool = Field(False, description="Treat the poses as scanner poses even if extrinsics are given.")
     time_offset: Shift = Field(0.0, description="Seconds to add to the times of sweeps and photos.")
     gps_offset: Shift = Field(0.0, description="Seconds to add to GPS times.")
     crs: str = Field("local", description='CRS of the poses: "EPSG:32633", or "local".')
+    quaternions: trajectory_io.QuaternionOrder = Field("xyzw", description=trajectory_io.QUATERNIONS_HELP)
 
 
 def fuse_path(inputs: Inputs, params: FuseParams, out: Path, report: Report) -> Done:
@@ -66,8 +71,8 @@ def fuse_path(inputs: Inputs, params: FuseParams, out: Path, report: Report) -> 
         InputError: a file is damaged, or the times of the inputs don't overlap.
         DataError: the pose of no sweep can be determined.
     """
-    files = io.list_files(inputs["sweeps"])
-    given = io.read_poses(inputs["poses"], params.crs) if "poses" in inputs else None
+    files = sweep_files.list_files(inputs["sweeps"])
+    given = trajectory_io.read_local(inputs["poses"], params.crs, params.quaternions) if "poses" in inputs else None
     matched = MatchedSweeps.load(inputs["matched"]) if "matched" in inputs else None
     seconds = _seconds(inputs, files, None if given is None else given[0], matched)
     times = seconds + params.time_offset
@@ -75,7 +80,7 @@ def fuse_path(inputs: Inputs, params: FuseParams, out: Path, report: Report) -> 
     if given is not None:
         path, frame = given
         if "extrinsics" in inputs and not params.scanner_poses:
-            T_camera_scanner = io.read_extrinsics(inputs["extrinsics"])
+            T_camera_scanner = read_extrinsics(inputs["extrinsics"])
         camera = _camera(path, times, inputs["poses"])
         first = interpolate(path.poses, path.times, times[:1])[0] @ T_camera_scanner
     fixes = None
@@ -109,9 +114,9 @@ def _seconds(inputs: Inputs, files: list[Path], path: Trajectory | None, matched
     Raises:
         InputError: times are needed but unknown, or they don't increase.
     """
-    seconds = io.file_times(files, inputs.get("times"))
+    seconds = sweep_files.file_times(files, inputs.get("times"))
     if seconds is None and path is not None:
-        seconds = io.timestamps(files, None, path, inputs["sweeps"])
+        seconds = sweep_files.timestamps(files, None, path, inputs["sweeps"])
     if seconds is None and "gps" in inputs:
         remedy = "Give a file with their times: seconds, one per line"
         raise InputError(inputs["sweeps"], "its sweeps have no times, which GPS needs", remedy)
@@ -134,7 +139,7 @@ def _camera(path: Trajectory, times: F64, file: Path) -> RelativeMotions:
         InputError: its times don't overlap with those of the sweeps.
     """
     interval = float(np.median(np.diff(path.times))) if len(path) > 1 else 0.0
-    motions = camera_motions(path, times, max(io.MAX_POSE_GAP_S, POSE_GAP_FACTOR * interval))
+    motions = camera_motions(path, times, max(MAX_POSE_GAP_S, POSE_GAP_FACTOR * interval))
     if times[-1] < path.times[0] or times[0] > path.times[-1]:
         raise _no_time_overlap(file, path.times, times, "--time-offset")
     return motions

@@ -13,7 +13,8 @@ from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.parameters import Metres
 from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.core.types import F64
-from scan2sim.pipeline.importers import sweeps as io
+from scan2sim.pipeline.importers.deskew import DeskewParams, half_scan_period, point_time_offsets
+from scan2sim.pipeline.io.sweep_files import DEFAULT_RATE_HZ, file_times, list_files, read_sweep
 from scan2sim.slam.lidar_odometry import (
     MODEL,
     LidarOdometry,
@@ -25,7 +26,7 @@ from scan2sim.slam.odometry.checkpoint import InvalidCheckpoint, load, save
 CHECKPOINT_INTERVAL_S = 60.0
 
 
-class LidarParams(io.DeskewParams):
+class LidarParams(DeskewParams):
     """Settings of the sweeps' registration."""
 
     min_range: Metres = Field(1.0, description="Ignore returns nearer than this, which hit the car itself; metres.")
@@ -38,16 +39,16 @@ def lidar(inputs: Inputs, params: LidarParams, out: Path, report: Report, checkp
         InputError: a sweep can't be read, or the times don't increase.
         DataError: there is only one sweep, or all are empty.
     """
-    files = io.list_files(inputs["sweeps"])
+    files = list_files(inputs["sweeps"])
     if len(files) < 2:
         raise DataError(inputs["sweeps"], "holds only one sweep: lidar odometry needs two", "Give a trajectory")
     times, known = _times(inputs, files)
-    half = io.half_scan_period(params, times, times)
+    half = half_scan_period(params, times, times)
 
     def read(i: int) -> Measured:
-        sweep = io.read_sweep(files[i]).between(params.min_range, MODEL.max_range_m)
+        sweep = read_sweep(files[i]).between(params.min_range, MODEL.max_range_m)
         return Measured(
-            float(times[i]), sweep.xyz, io.point_time_offsets(sweep, float(times[i]), half, params.deskew, files[i])
+            float(times[i]), sweep.xyz, point_time_offsets(sweep, float(times[i]), half, params.deskew, files[i])
         )
 
     state, saved = checkpoint / "state.npz", clock.perf_counter()
@@ -64,7 +65,7 @@ def lidar(inputs: Inputs, params: LidarParams, out: Path, report: Report, checkp
     if not len(odometry.map_points):
         raise DataError(inputs["sweeps"], "has no points within range", "Check the files and --min-range")
     matched = odometry.matched()
-    warnings = [] if known else [f"the sweeps have no times: {io.DEFAULT_RATE_HZ:g} sweeps per second are assumed"]
+    warnings = [] if known else [f"the sweeps have no times: {DEFAULT_RATE_HZ:g} sweeps per second are assumed"]
     apart = int((matched.overlap < MODEL.overlap_min).sum())
     if apart:
         warnings.append(f"{apart} of {len(files)} sweeps hardly overlap with the previous sweep")
@@ -78,9 +79,9 @@ def _times(inputs: Inputs, files: list[Path]) -> tuple[F64, bool]:
     Raises:
         InputError: the times don't increase.
     """
-    times = io.file_times(files, inputs.get("times"))
+    times = file_times(files, inputs.get("times"))
     if times is None:
-        return np.arange(len(files)) / io.DEFAULT_RATE_HZ, False
+        return np.arange(len(files)) / DEFAULT_RATE_HZ, False
     late = np.flatnonzero(np.diff(times) <= 0)
     if len(late):
         file = files[late[0] + 1]

@@ -9,7 +9,9 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from scan2sim.pipeline.camera.lens import GIVEN_SIGMA, LENS_MODELS
 from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.blas_threads import one_blas_thread
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.parameters import Focal, Pixels, Rate, Shift
@@ -22,13 +24,18 @@ from scan2sim.slam.calibration import calibrate
 from scan2sim.slam.calibration.camera import EstimatedCamera, camera_of, estimated_camera
 from scan2sim.slam.global_map.map_file import MapCheckpoint
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
-from scan2sim.slam.odometry.track_log import TrackLog, record_tracks
-from scan2sim.slam.odometry.video_odometry import VERSION, track
+from scan2sim.slam.odometry.track_log import RecordingTracker, Replay, TrackLog, record_tracks
+from scan2sim.slam.odometry.video_odometry import VERSION, Run, track
 from scan2sim.slam.trackers import Tracker
 from scan2sim.slam.tracking_video import Recorder
 from scan2sim.slam.trajectory.gps import smooth
 from scan2sim.slam.video import Video, open_video
 from scan2sim.slam.virtual_cameras import VirtualViews
+
+REFINEMENTS_MAX = 3
+"""Greatest number of times odometry is repeated with a refined lens, over the features tracked the first time. Drives
+that fit their lens aren't repeated, others once; more if the lens is so wrong that many features seemed to be outliers.
+"""
 
 
 class Filmed(Params):
@@ -44,8 +51,14 @@ class Filmed(Params):
     k1: Annotated[float, Field(ge=-1, le=1)] | None = Field(
         None, description="Radial distortion k1 of a pinhole camera (OpenCV model); default: none."
     )
+    k2: Annotated[float, Field(ge=-1, le=1)] | None = Field(
+        None, description="Radial distortion k2 of a pinhole camera (OpenCV model); default: none."
+    )
     calibrate: bool = Field(
-        False, description="Estimate focal length, principal point and k1 by self-calibration over the whole video."
+        False, description="Estimate focal length, principal point, k1 and k2 by self-calibration over the whole video."
+    )
+    fixed_lens: bool = Field(
+        False, description="Keep the given intrinsics even if the video clearly contradicts them; default: refine them."
     )
     fps: Rate = Field(10.0, description="Frames per second of a folder of images without times.")
     every: Annotated[int, Field(ge=1, le=1_000_000)] = Field(1, description="Process every Nth frame.")
@@ -56,7 +69,9 @@ class Filmed(Params):
         None,
         description="Seconds to add to GPS times, so that they count from the first frame; default: by the clocks.",
     )
-    backend: str = Field("lm", description="Solver: lm (Levenberg-Marquardt), or adam (as in D3.2).")
+    backend: str = Field(
+        "lm", description="Solver: lm (Levenberg-Marquardt), or adam (gradient descent by torch, slower)."
+    )
     features: str = Field(
         "corners", description="Features: corners (optical flow), orb, rootsift, superpoint or aliked."
     )
@@ -86,6 +101,7 @@ class TrackParams(OdometryParams, Filmed):
     context: TrackContext = TrackContext()
 
 
+@one_blas_thread()
 def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, checkpoint: Path) -> Done:
     """Visual odometry over `video` (a file, or a folder of images with `times`), with optional `gps`, `mask`, weights.
 
@@ -100,30 +116,60 @@ def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, 
         return record_tracks(video, mask, every=params.every, until=params.until or None, report=report)
 
     camera, estimated = video_camera(video, params, track_log, checkpoint / "lens.json")
-    warnings: list[str] = [estimated.message()] if estimated is not None else []
+    warnings: list[str] = []
     gps = read_gps(video, inputs.get("gps"), params.gps_offset, warnings.append)
-    tracker, description = tracker_of(camera, mask, params, inputs)
+    description, view = "", out / "view.mp4"
 
-    def start(warn: Callable[[str], None]) -> Odometry:
-        return Odometry(
-            camera,
-            params,
-            mask=mask,
-            gps=gps,
-            backend=params.backend,
-            keep=params.context.keep,
-            warn=warn,
-            tracker=tracker,
-        )
+    log_file, refinement = checkpoint / "tracks.bin", checkpoint / "refined.json"
+    refine = camera.model in LENS_MODELS and not params.fixed_lens and (estimated is None or not estimated.final)
 
-    view = out / "view.mp4"
-    with Recorder(view, fps=video.fps / params.every) if params.view else nullcontext() as recorder:
-        run = track(
-            video, start, every=params.every, until=params.until or None, state=checkpoint / "state.npz",
-            watch=recorder, report=report,
-        )  # fmt: skip
-    wrong_lens = _lens_warning(camera, run.odometry, track_log)
-    warnings += [] if wrong_lens is None or params.calibrate else [wrong_lens]
+    def tracked(camera: Camera, log: TrackLog | None, *, record: bool = False) -> Run:
+        nonlocal description
+        tracker, description = tracker_of(camera, mask, params, inputs)
+        if log is not None:
+            tracker = Replay(log, camera)
+        recorder = RecordingTracker(tracker, camera, log_file) if record else None
+
+        def start(warn: Callable[[str], None]) -> Odometry:
+            return Odometry(
+                camera, params, mask=mask if log is None else None, gps=gps, backend=params.backend,
+                keep=params.context.keep, warn=warn, tracker=recorder or tracker,
+            )  # fmt: skip
+
+        with Recorder(view, fps=video.fps / params.every) if params.view else nullcontext() as film:
+            run = track(
+                video, start, every=params.every, until=params.until or None, log=log, state=checkpoint / "state.npz",
+                watch=film, report=report,
+            )  # fmt: skip
+        if recorder is not None and not run.odometry.losses:  # tracks end where tracking is lost
+            recorder.finish([p.time for p in run.odometry.placed], run.names, run.warnings)
+        return run
+
+    def tracked_again(camera: Camera) -> Run:
+        log = TrackLog.read(log_file)
+        run = tracked(camera, log)
+        if log is None or not run.odometry.losses:
+            return run
+        (checkpoint / "state.npz").unlink(missing_ok=True)
+        log_file.unlink()
+        return tracked(camera, None)
+
+    given, refined = estimated, EstimatedCamera.read(refinement) if refine else None
+    if refined is None:
+        run = tracked(camera, None, record=refine)
+    else:
+        run, estimated = tracked_again(refined.camera), refined
+    for _ in range(REFINEMENTS_MAX - (refined is not None) if refine else 0):
+        refined = refined_camera(camera, given, run.odometry)
+        if refined is None:
+            break
+        (checkpoint / "state.npz").unlink(missing_ok=True)
+        refined.write(refinement)
+        estimated, seconds = refined, run.seconds
+        run = tracked_again(refined.camera)
+        run.seconds += seconds
+    wrong_lens = None if params.calibrate else _lens_warning(estimated, run.odometry, track_log)
+    warnings = [*([estimated.message()] if estimated else []), *warnings, *([wrong_lens] if wrong_lens else [])]
     files = {"map": MapCheckpoint.of(run.odometry, run.names).write(out / "map.npz")}
     views = {"view": view} if params.view else {}
     metrics = run.metrics() | ({"summary": description} if description else {})
@@ -132,14 +178,36 @@ def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, 
     )
 
 
-def _lens_warning(camera: Camera, odometry: Odometry, track_log: Callable[[], TrackLog]) -> str | None:
-    """Warning if the lens doesn't fit the turns; if tracking was lost too often, after calibration from scratch."""
-    if camera.model not in lens.MODELS:
+def refined_camera(camera: Camera, given: EstimatedCamera | None, odometry: Odometry) -> EstimatedCamera | None:
+    """Lens of an odometry refined by its drive, within the prior of the given one; None if the drive fits it.
+
+    Args:
+        camera: the given camera, mean of the prior.
+        given: its source, if it comes from metadata.
+        odometry: odometry over the drive, with this camera or one refined before.
+    """
+    sigma = GIVEN_SIGMA if given is None else given.sigma
+    found = lens.fit_lens(odometry.map.camera, odometry.map.misfits, sigma, prior=camera)
+    if found is None or not lens.contradicts(found):
         return None
-    warning = lens.lens_warning(camera, lens.fit_lens(camera, odometry.map.misfits))
-    if calibrate.lost_share(odometry) < calibrate.LOST_SHARE_MAX:
-        return warning
-    return lens.lens_warning(camera, calibrate.calibrated_from_scratch(track_log())) or warning
+    source = "the given lens" if given is None else f"the lens from {given.how}"
+    fits = lens.lens_changes(camera, found) or "another lens better"
+    return EstimatedCamera.of(found, f"refinement of {source}: the images fit {fits} (--fixed-lens keeps it)")
+
+
+def _lens_warning(
+    estimated: EstimatedCamera | None, odometry: Odometry, track_log: Callable[[], TrackLog]
+) -> str | None:
+    """Warning if the lens doesn't fit the turns; if tracking was lost too often, after calibration from scratch."""
+    camera, from_drive = odometry.map.camera, estimated is not None and estimated.final
+    if camera.model not in LENS_MODELS:
+        return None
+    warning = None
+    if calibrate.lost_share(odometry) >= calibrate.LOST_SHARE_MAX:
+        warning = lens.lens_warning(camera, calibrate.calibrated_from_scratch(track_log()))
+    if warning is None and not from_drive:
+        warning = lens.lens_warning(camera, lens.fit_lens(camera, odometry.map.misfits, GIVEN_SIGMA))
+    return warning
 
 
 def can_track(params: TrackParams) -> None:
@@ -160,7 +228,9 @@ def video_camera(
     Raises:
         InputError: the camera is unknown.
     """
-    given = _tile_camera(video, params) or camera_of(video, params.camera, params.focal, params.centre, params.k1)
+    given = _tile_camera(video, params) or camera_of(
+        video, params.camera, params.focal, params.centre, params.k1, params.k2
+    )
     estimated = EstimatedCamera.read(cache) or estimated_camera(video, given, track_log, calibrate=params.calibrate)
     if estimated is not None:
         estimated.write(cache)

@@ -2,9 +2,10 @@
 
 The graph is a chain of states, one per sweep: the scanner's pose, the logarithm of the camera's scale, and GPS's slow
 error (bias). Factors between neighbours are the lidar's relative motion with its covariance, the camera's relative
-motion (in its drifting scale), and the random walks of scale and bias; GPS fixes are factors of one state. The Cauchy
+motion (in its drifting scale), an INS's relative motion, and the random walks of scale and bias; GPS fixes and an INS's
+attitude are factors of one state. Links are factors between any two states, such as two passes of one place. The Cauchy
 loss down-weights factors that contradict the others. Gauss-Newton over a banded system takes time and memory linear in
-the length of the drive, and its blocks give the covariance of every pose.
+the length of the drive, and its blocks give the covariance of every pose (links only make it smaller).
 """
 
 from __future__ import annotations
@@ -17,7 +18,13 @@ import numpy as np
 
 from scan2sim.pipeline.core.poses import interpolate, nearest_rotation
 from scan2sim.pipeline.core.types import F64, I64, Bools, Trajectory
-from scan2sim.slam.geometry import exp_so3, inverse, log_so3
+from scan2sim.pipeline.geometry.least_squares import (
+    block_tridiagonal_marginals,
+    cauchy_weights,
+    moved,
+    solve_block_tridiagonal,
+)
+from scan2sim.slam.geometry import inverse, lever_arm_jacobian, log_so3, relative_pose_error
 from scan2sim.slam.lidar_odometry import MatchedSweeps
 from scan2sim.slam.trajectory.align import align_to_gps
 
@@ -32,17 +39,17 @@ class FusionModel:
     """Noise model and limits of the fusion; standard deviations unless noted otherwise."""
 
     camera_sigma: tuple[float, float, float] = (0.005, 0.01, 0.0007)
-    """Of a camera's relative motion: metres, plus a share of its length; radians."""
+    """Standard deviation of a camera's relative motion: metres, plus a share of its length; radians."""
     scale_drift: float = 0.02
-    """Of a camera's scale over ten metres (`scale.DRIFT_PERSPECTIVE` allows more, in turns)."""
+    """Standard deviation of a camera's scale over ten metres (`scale.DRIFT_PERSPECTIVE` allows more, in turns)."""
     initial_scale_sigma: float = 1.0
-    """Of the logarithm of a camera's initial scale: without GPS its unit is arbitrary."""
+    """Standard deviation of the logarithm of a camera's initial scale: without GPS its unit is arbitrary."""
     origin_sigma: tuple[float, float] = (1e-3, 1e-4)
-    """Of the first pose if it is the world's origin: metres, radians."""
+    """Standard deviation of the first pose if it is the world's origin: metres, radians."""
     upright_sigma: float = 0.02
-    """Of the first pose's roll and pitch if GPS places the path, radians."""
+    """Standard deviation of the first pose's roll and pitch if GPS places the path, radians."""
     unknown_sigma: float = 1e3
-    """Of the first pose's position (m) and heading (rad) if GPS places the path."""
+    """Standard deviation of the first pose's position (m) and heading (rad) if GPS places the path."""
     speed_sigma: tuple[float, float] = (300.0, 10.0)
     """Metres and radians per second, faster than any vehicle: prior for motions that no sensor measured."""
     height_factor: float = 2.0
@@ -54,8 +61,12 @@ class FusionModel:
     """Gauss-Newton stops at a smaller update (m, rad) of all poses."""
     trust_min: float = 0.2
     """Weight of a factor below which it contradicts the others."""
+    attitude_sigma: tuple[float, float] = (0.01, 0.03)
+    """Standard deviation of an INS's tilt and heading, radians; errors of its poses are correlated."""
+    attitude_time: float = 60.0
+    """Correlation time of the error of an INS's attitude, seconds."""
     unsure_sigma: tuple[float, float] = (2.5, 0.02)
-    """Of a position above which it is unsure: metres, plus a share of the distance driven."""
+    """Standard deviation of a position above which it is unsure: metres, plus a share of the distance driven."""
 
 
 MODEL = FusionModel()
@@ -89,6 +100,21 @@ class GpsFixes(NamedTuple):
     scatter: float
     bias: float
     bias_time: float
+
+
+class Links(NamedTuple):
+    """Measured relative poses of any two states, such as registered pairs of sweeps.
+
+    Attributes:
+        first, second: (K,) indices of the states.
+        T: (K, 4, 4) pose of the second state in the first's axes.
+        covariance: (K, 6, 6) of position (m) and rotation (rad), in the second's axes.
+    """
+
+    first: I64
+    second: I64
+    T: F64
+    covariance: F64
 
 
 @dataclass(frozen=True)
@@ -165,23 +191,29 @@ def fuse(
     lidar: RelativeMotions | None = None,
     camera: RelativeMotions | None = None,
     T_camera_scanner: F64 | None = None,
+    ins: RelativeMotions | None = None,
+    attitude: F64 | None = None,
     fixes: GpsFixes | None = None,
+    links: Links | None = None,
     first: F64 | None = None,
 ) -> Fused:
-    """The scanner's path from all given sensors; `lidar` or `camera` is required.
+    """The scanner's path from all given sensors; `lidar`, `camera` or `ins` is required.
 
     Args:
         times: (N,) seconds of the states.
         lidar: relative motions of the scanner.
         camera: relative motions of the camera, in an arbitrary unit.
         T_camera_scanner: (4, 4) scanner to camera.
+        ins: relative motions of the scanner by an INS, metric.
+        attitude: (N, 3, 3) rotation of the scanner to the world by an INS, whose tilt and heading are known roughly.
         fixes: GPS positions.
+        links: relative poses of states, such as registered pairs of sweeps.
         first: (4, 4) the scanner's first pose in a z-up world; by default, the world's axes are those of this pose.
     """
     mount = np.eye(4) if T_camera_scanner is None else inverse(T_camera_scanner)
-    sensors = {"lidar": (lidar, np.eye(4)), "camera": (camera, mount)}
+    sensors = {"lidar": (lidar, np.eye(4)), "camera": (camera, mount), "ins": (ins, np.eye(4))}
     given = {name: (motions, own) for name, (motions, own) in sensors.items() if motions is not None}
-    graph = _Graph(times, given, fixes)
+    graph = _Graph(times, given, fixes, attitude, links)
     starts = [graph.initial(name, np.eye(4) if first is None else first) for name in given]
     solved = min((graph.solve(start) for start in starts), key=graph.cost)
     return graph.finished(solved)
@@ -197,10 +229,7 @@ class _States:
 
     def moved(self, by: F64) -> _States:
         """States after an update (N, STATE_SIZE)."""
-        poses = self.poses.copy()
-        poses[:, :3, 3] += by[:, :3]
-        poses[:, :3, :3] = exp_so3(by[:, 3:6]) @ poses[:, :3, :3]
-        return _States(poses, self.scale + by[:, 6], self.bias + by[:, BIAS])
+        return _States(moved(self.poses, by[:, POSE]), self.scale + by[:, 6], self.bias + by[:, BIAS])
 
 
 class _Block(NamedTuple):
@@ -209,8 +238,8 @@ class _Block(NamedTuple):
     Attributes:
         residual: (K, M) whitened residuals.
         J: (K, M, STATE_SIZE) Jacobian by the states `at`.
-        K: (K, M, STATE_SIZE) Jacobian by the states after them, or None.
-        at: (K,) indices of the states.
+        K: (K, M, STATE_SIZE) Jacobian by the states after them (of links: by their second states), or None.
+        at: (K,) indices of the states, each at most once (except those of links).
         weight: (K,) robust weights.
         cost: (K,) costs.
     """
@@ -226,8 +255,15 @@ class _Block(NamedTuple):
 class _Graph:
     """Chain of states and their factors; `sensors`: relative motions, and pose of the sensor in scanner axes."""
 
-    def __init__(self, times: F64, sensors: Mapping[str, tuple[RelativeMotions, F64]], fixes: GpsFixes | None) -> None:
-        self.times, self.sensors, self.fixes = times, sensors, fixes
+    def __init__(
+        self,
+        times: F64,
+        sensors: Mapping[str, tuple[RelativeMotions, F64]],
+        fixes: GpsFixes | None,
+        attitude: F64 | None,
+        links: Links | None,
+    ) -> None:
+        self.times, self.sensors, self.fixes, self.attitude, self.links = times, sensors, fixes, attitude, links
         self.seconds = np.diff(times)
         self._whiten = {
             name: np.linalg.inv(np.linalg.cholesky(motions.covariance)) for name, (motions, _) in sensors.items()
@@ -289,8 +325,7 @@ class _Graph:
     def solve(self, states: _States) -> _States:
         """Optimized states, by Gauss-Newton."""
         for _ in range(MODEL.iterations_max):
-            D, above, g = self._normal(states)
-            step = _solved(D, above, -g)
+            step = self._step(states)
             states = states.moved(step)
             if np.abs(step[:, POSE]).max() < MODEL.step_min:
                 break
@@ -298,13 +333,40 @@ class _Graph:
 
     def cost(self, states: _States) -> float:
         """Sum of the costs of all factors."""
-        return float(sum(block.cost.sum() for block in self._blocks(states).values()))
+        blocks = [*self._blocks(states).values(), *([] if self.links is None else [self._links(states, self.links)])]
+        return float(sum(block.cost.sum() for block in blocks))
+
+    def _step(self, states: _States) -> F64:
+        """Gauss-Newton update (N, STATE_SIZE)."""
+        D, above, g = self._normal(states)
+        if self.links is None:
+            return solve_block_tridiagonal(D, above, -g)
+        from scipy.sparse import coo_array
+        from scipy.sparse.linalg import spsolve
+
+        block = self._links(states, self.links)
+        assert block.K is not None
+        first, second = self.links.first, self.links.second
+        Jw, Kw = ((part * block.weight[:, None, None]).transpose(0, 2, 1) for part in (block.J, block.K))
+        np.add.at(g, first, np.einsum("kam,km->ka", Jw, block.residual))
+        np.add.at(g, second, np.einsum("kam,km->ka", Kw, block.residual))
+        n = np.arange(len(D))
+        blocks = [D, above, above.transpose(0, 2, 1), Jw @ block.J, Kw @ block.K, Jw @ block.K, Kw @ block.J]
+        rows = np.concatenate([n, n[:-1], n[1:], first, second, first, second])
+        columns = np.concatenate([n, n[1:], n[:-1], first, second, second, first])
+        row, column = np.indices((STATE_SIZE, STATE_SIZE))
+        at = (
+            (STATE_SIZE * rows[:, None, None] + row).ravel(),
+            (STATE_SIZE * columns[:, None, None] + column).ravel(),
+        )
+        normal = coo_array((np.concatenate(blocks).ravel(), at), (g.size, g.size)).tocsc()
+        return np.asarray(spsolve(normal, -g.ravel())).reshape(g.shape)
 
     def finished(self, states: _States) -> Fused:
         """Trajectory of optimized states, with covariance and unsure poses."""
         blocks = self._blocks(states)
         D, above, _ = self._normal(states)
-        covariance = _marginals(D, above)[:, POSE, POSE]
+        covariance = block_tridiagonal_marginals(D, above)[:, POSE, POSE]
         measured = np.zeros(len(self.seconds), bool)
         for name, (motions, _) in self.sensors.items():
             measured |= motions.sure & (blocks[name].weight > MODEL.trust_min)
@@ -325,13 +387,14 @@ class _Graph:
         D, above = np.zeros((n, STATE_SIZE, STATE_SIZE)), np.zeros((n - 1, STATE_SIZE, STATE_SIZE))
         g = np.zeros((n, STATE_SIZE))
         for r, J, K, at, weight, _ in self._blocks(states).values():
-            Jw = J * weight[:, None, None]
-            np.add.at(D, at, np.einsum("kma,kmb->kab", Jw, J))
-            np.add.at(g, at, np.einsum("kma,km->ka", Jw, r))
+            Jw = (J * weight[:, None, None]).transpose(0, 2, 1)
+            D[at] += Jw @ J
+            g[at] += np.einsum("kam,km->ka", Jw, r)
             if K is not None:
-                np.add.at(D, at + 1, np.einsum("kma,kmb->kab", K * weight[:, None, None], K))
-                np.add.at(g, at + 1, np.einsum("kma,km->ka", K * weight[:, None, None], r))
-                np.add.at(above, at, np.einsum("kma,kmb->kab", Jw, K))
+                Kw = (K * weight[:, None, None]).transpose(0, 2, 1)
+                D[at + 1] += Kw @ K
+                g[at + 1] += np.einsum("kam,km->ka", Kw, r)
+                above[at] += Jw @ K
         return D, above, g
 
     def _blocks(self, states: _States) -> dict[str, _Block]:
@@ -352,32 +415,42 @@ class _Graph:
         blocks["bias.first"] = _squared(states.bias[:1] / sigma, _jacobian_of(BIAS, 1 / sigma)[None], None, only_first)
         if self.fixes is not None:
             blocks["gps"] = self._gps_fixes(states, self.fixes)
+        if self.attitude is not None:
+            blocks["attitude"] = self._attitude(states, self.attitude)
         return blocks
+
+    def _links(self, states: _States, links: Links) -> _Block:
+        """Relative poses of any two states."""
+        r, by_pose = relative_pose_error(states.poses[links.first], states.poses[links.second], links.T)
+        W = np.linalg.inv(np.linalg.cholesky(links.covariance))
+        J, K = np.zeros((2, len(r), 6, STATE_SIZE))
+        J[:, :, POSE], K[:, :, POSE] = W @ by_pose[:, 0], W @ by_pose[:, 1]
+        return _robust(np.einsum("kab,kb->ka", W, r), J, K, links.first)
+
+    def _attitude(self, states: _States, rotations: F64) -> _Block:
+        """An INS's attitude: each pose counts as a share of one measurement per correlation time."""
+        correlated = min(len(rotations), MODEL.attitude_time / max(float(np.median(self.seconds)), 1e-9))
+        sigma = np.sqrt(max(correlated, 1.0)) * np.array(MODEL.attitude_sigma)[[0, 0, 1]]
+        r = log_so3(states.poses[:, :3, :3] @ rotations.transpose(0, 2, 1)) / sigma
+        J = np.zeros((len(r), 3, STATE_SIZE))
+        J[:, np.arange(3), np.arange(3, 6)] = 1 / sigma
+        return _squared(r, J, None, np.arange(len(r)))
 
     def _relative_motions(self, name: str, states: _States) -> _Block:
         """Relative motions of a sensor mounted beside the scanner."""
         motions, own = self.sensors[name]
-        R, t = states.poses[:, :3, :3], states.poses[:, :3, 3]
-        lever = R @ own[:3, 3]
-        S, c = R @ own[:3, :3], t + lever
-        StT, ZT = S[:-1].transpose(0, 2, 1), motions.T[:, :3, :3].transpose(0, 2, 1)
-        between = c[1:] - c[:-1]
-        scale = np.exp(states.scale[:-1]) if name == "camera" else np.ones(len(between))
-        measured = scale[:, None] * motions.T[:, :3, 3]
-        r = np.concatenate([
-            np.einsum("kab,kb->ka", ZT, np.einsum("kab,kb->ka", StT, between) - measured),
-            log_so3(ZT @ StT @ S[1:]),
-        ], axis=1)  # fmt: skip
-        J, K = np.zeros((len(r), 6, STATE_SIZE)), np.zeros((len(r), 6, STATE_SIZE))
-        A = ZT @ StT
-        J[:, :3, :3], K[:, :3, :3] = -A, A
-        J[:, :3, 3:6], K[:, :3, 3:6] = A @ (_cross(between) + _cross(lever[:-1])), -A @ _cross(lever[1:])
-        J[:, 3:, 3:6], K[:, 3:, 3:6] = -S[1:].transpose(0, 2, 1), S[1:].transpose(0, 2, 1)
+        sensor, measured = states.poses @ own, motions.T.copy()
         if name == "camera":
-            J[:, :3, SCALE] = -np.einsum("kab,kb->ka", ZT, measured)[:, :, None]
+            measured[:, :3, 3] *= np.exp(states.scale[:-1, None])
+        r, by_sensor = relative_pose_error(sensor[:-1], sensor[1:], measured)
+        lever = lever_arm_jacobian(sensor[:, :3, 3] - states.poses[:, :3, 3])
+        J, K = np.zeros((2, len(r), 6, STATE_SIZE))
+        J[:, :, POSE], K[:, :, POSE] = by_sensor[:, 0] @ lever[:-1], by_sensor[:, 1] @ lever[1:]
+        if name == "camera":
+            J[:, :3, 6] = -np.einsum("kba,kb->ka", measured[:, :3, :3], measured[:, :3, 3])
         W = self._whiten[name]
         block = _robust(np.einsum("kab,kb->ka", W, r), W @ J, W @ K, np.arange(len(r)))
-        if name == "camera":  # unsure motions of the camera are extrapolated: they don't count
+        if name != "lidar":  # unsure motions of other sensors are extrapolated: they don't count
             block = block._replace(weight=block.weight * motions.sure, cost=block.cost * motions.sure)
         return block
 
@@ -394,7 +467,7 @@ class _Graph:
         """Prior of the first pose: fixed; with GPS, only upright."""
         T, origin = states.poses[0], self._origin
         sigma = np.repeat(MODEL.origin_sigma, 3)
-        if self.fixes is not None:
+        if self.fixes is not None or self.attitude is not None:
             sigma = np.array(
                 [*3 * [MODEL.unknown_sigma], MODEL.upright_sigma, MODEL.upright_sigma, MODEL.unknown_sigma]
             )
@@ -428,8 +501,8 @@ def _squared(residual: F64, J: F64, K: F64 | None, at: I64) -> _Block:
 def _robust(residual: F64, J: F64, K: F64 | None, at: I64) -> _Block:
     """Factors with a Cauchy loss, which down-weights those that contradict the others."""
     scale = MODEL.cauchy_scale * residual.shape[1]
-    excess = (residual**2).sum(axis=1) / scale
-    return _Block(residual, J, K, at, 1 / (1 + excess), scale * np.log1p(excess))
+    weight = cauchy_weights(residual, scale)
+    return _Block(residual, J, K, at, weight, -scale * np.log(weight))
 
 
 def _jacobian_of(part: slice, value: F64 | float) -> F64:
@@ -437,37 +510,3 @@ def _jacobian_of(part: slice, value: F64 | float) -> F64:
     out = np.zeros((part.stop - part.start, STATE_SIZE))
     out[:, part] = np.eye(part.stop - part.start) * value
     return out
-
-
-def _solved(D: F64, above: F64, b: F64) -> F64:
-    """(N, STATE_SIZE) solution of the block-tridiagonal system of `_Graph._normal`, by a banded Cholesky solver."""
-    from scipy.linalg import solveh_banded
-
-    n, size = len(D), STATE_SIZE
-    band = np.zeros((2 * size, n * size))
-    row, column = np.indices((size, size))
-    upper = row <= column
-    first = size * np.arange(n)[:, None]
-    band[(2 * size - 1 + row - column)[upper], first + column[upper]] = D[:, row[upper], column[upper]]
-    band[(size - 1 + row - column).ravel(), first[1:] + column.ravel()] = above.reshape(n - 1, -1)
-    return np.asarray(solveh_banded(band, b.ravel())).reshape(-1, size)
-
-
-def _marginals(D: F64, above: F64) -> F64:
-    """(N, STATE_SIZE, STATE_SIZE) blocks on the diagonal of the inverse (marginal covariances)."""
-    left = np.empty_like(D)
-    left[0] = D[0]
-    for k in range(1, len(D)):
-        left[k] = D[k] - above[k - 1].T @ np.linalg.solve(left[k - 1], above[k - 1])
-    out = np.asarray(np.linalg.inv(left), np.float64)
-    for k in range(len(D) - 2, -1, -1):
-        G = out[k] @ above[k]
-        out[k] += G @ out[k + 1] @ G.T
-    return out
-
-
-def _cross(v: F64) -> F64:
-    """(N, 3, 3) cross-product matrices of vectors v (N, 3): [v] w = v x w."""
-    out = np.zeros((len(v), 3, 3))
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    return out - out.transpose(0, 2, 1)

@@ -104,7 +104,7 @@ def test_videos_are_written_with_ground_truth_per_frame(tmp_path: Path) -> None:
         assert len(frames) == 6 and frames[0].shape == (360, 640, 3)
         brightness.append(np.mean(frames))
     assert brightness[1] < 0.8 * brightness[0]
-    for label in (t for line in lines for t in line["things"]):
+    for label in (t for line in lines for t in line["objects"]):
         x0, y0, x1, y1 = label["box"]
         assert 0 <= x0 < x1 <= 640 and 0 <= y0 < y1 <= 360 and 0 <= label["visible"] <= 1
         assert label["moving"] == (label["speed"] >= MOVING_SPEED_MIN)

@@ -322,3 +322,28 @@ def test_a_drive_writes_video_truth_gps_and_mask(tmp_path: Path) -> None:
     ]
     with pytest.raises(SettingError):
         generate_drive(out, PATH, seconds=1.0, height=64)
+
+
+def test_an_interrupted_drive_resumes_with_the_frames_that_it_has(tmp_path: Path) -> None:
+    import cv2
+
+    def render(stop_at: float = 2.0, resume: bool = True) -> None:
+        def report(fraction: float, message: str = "") -> None:
+            if fraction >= stop_at:
+                raise KeyboardInterrupt
+
+        generate_drive(
+            tmp_path, PATH, seconds=0.6, height=64, fps=10, seed=3, lossless=True, resume=resume, overwrite=True,
+            report=report,
+        )  # fmt: skip
+
+    with pytest.raises(KeyboardInterrupt):
+        render(stop_at=0.5)
+    frames = [tmp_path / "frames" / f"{i:06d}.png" for i in range(6)]
+    assert [file.is_file() for file in frames] == [True] * 3 + [False] * 3 and not (tmp_path / "video.mp4").exists()
+    cv2.imwrite(str(frames[0]), np.full((64, 128, 3), 77, np.uint8))
+    render()
+    assert (cv2.imread(str(frames[0])) == 77).all() and all(file.is_file() for file in frames)
+    assert (tmp_path / "video.mp4").is_file()
+    render(resume=False)
+    assert not (cv2.imread(str(frames[0])) == 77).all(), "rendered again"

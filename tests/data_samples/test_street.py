@@ -104,7 +104,7 @@ def test_photos_show_the_true_colours(street: Street) -> None:
     scene = Scene(lay_out(LENGTH_M, 3))
     folder = street.tile.path.parent
     everything = o3d.t.geometry.RaycastingScene()
-    street_faces = scene.surface.faces[: scene._moving_at].astype(np.uint32)
+    street_faces = scene.surface.faces[: scene._first_face[0]].astype(np.uint32)
     everything.add_triangles(o3d.core.Tensor(scene.surface.vertices), o3d.core.Tensor(street_faces))
     lines = (folder / "truth/exposures.csv").read_text(encoding="utf-8").splitlines()[1:]
     ev = dict(line.split(",") for line in lines)

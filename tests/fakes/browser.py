@@ -33,15 +33,23 @@ class Page:
         self._socket = socket
         self._ids = itertools.count(1)
         self.errors: list[str] = []
+        self._worker = ""
 
-    def do(self, method: str, **params: Any) -> dict[str, Any]:
-        """Call a method of the protocol and return its result; collects uncaught exceptions of the page in `errors`."""
+    def do(self, method: str, *, session: str = "", **params: Any) -> dict[str, Any]:
+        """Call a method of the protocol and return its result; collects uncaught exceptions of the page in `errors`.
+
+        Args:
+            session: of a worker of the page; empty: the page itself.
+        """
         number = next(self._ids)
-        self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
+        to = {"sessionId": session} if session else {}
+        self._socket.send(json.dumps({"id": number, "method": method, "params": params, **to}))
         while True:
             message = json.loads(self._socket.recv(timeout=120))
             if message.get("method") == "Runtime.exceptionThrown":
                 self.errors.append(json.dumps(message["params"])[:1000])
+            if message.get("method") == "Target.attachedToTarget":
+                self._worker = message["params"]["sessionId"]
             if message.get("id") == number:
                 assert "error" not in message, message
                 return dict(message["result"])
@@ -56,9 +64,17 @@ class Page:
         self.do("Page.navigate", url=path.resolve().as_uri())
         self.until("document.readyState === 'complete'")
 
-    def value(self, script: str) -> Any:
-        """Evaluate a JavaScript expression; waits for promises."""
-        result = self.do("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+    def worker_value(self, script: str) -> Any:
+        """Evaluate a JavaScript expression in the page's worker; waits for the worker."""
+        end = time.monotonic() + 60
+        while not self._worker:
+            self.do("Target.setAutoAttach", autoAttach=True, waitForDebuggerOnStart=False, flatten=True)
+            assert time.monotonic() < end, "the page has no worker"
+        return self.value(script, self._worker)
+
+    def value(self, script: str, session: str = "") -> Any:
+        """Evaluate a JavaScript expression; waits for promises; `session`: of a worker."""
+        result = self.do("Runtime.evaluate", session=session, expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 

@@ -9,3 +9,4 @@ from tests.conftest import ROOT
 
 ROS_PYTHON = ROOT / ".venv-ros" / "bin" / "python"
 PYTHONS = {"cyclone": Path(sys.executable), "rclpy": ROS_PYTHON}
+TRITON_PYTHON = ROOT / ".venv-triton" / "bin" / "python"

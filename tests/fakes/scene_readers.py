@@ -34,7 +34,7 @@ class Shown:
 
 
 def image(path: Path) -> np.ndarray:
-    """Of a file whose name is ASCII and without spaces."""
+    """Name of a file, ASCII and without spaces."""
     assert path.name.isascii() and " " not in path.name
     read = cv2.imread(str(path))
     assert read is not None, path
@@ -70,13 +70,13 @@ def gazebo(folder: Path, scene: Scene) -> Iterator[Shown]:
         for visual in ET.parse(folder / "models" / name / "model.sdf").getroot().iter("visual"):
             file = folder / "models" / visual.findtext("geometry/mesh/uri", "").removeprefix("model://")
             for corners, uv, picture in obj(file):
-                yield Shown(int(visual.findtext("plugin/label", "")), corners + offset, uv, picture)
+                yield Shown(int(visual.findtext("plugin/label", "0")), corners + offset, uv, picture)
 
 
 def glb(folder: Path, scene: Scene) -> Iterator[Shown]:
     import trimesh
 
-    for tile in scene.tiles:
+    for tile in scene.with_dome:
         read = trimesh.load_scene(folder / f"{tile.name}.glb", process=False)
         for node in read.graph.nodes_geometry:
             transform, name = read.graph[node]
@@ -196,8 +196,8 @@ READERS: dict[str, Reader] = {
 }  # fmt: skip
 
 
-def surveyed_off(folder: Path, scene: Scene, name: str) -> float:
-    """Metres between a corner of the made-up scene's last house, as surveyed, and where a format's reader finds it."""
+def survey_error(folder: Path, scene: Scene, name: str) -> float:
+    """Metres between a corner of the synthetic scene's last house, as surveyed and as read from a format."""
     about = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
     x, y = synthetic.HOUSE
     surveyed = scene.tiles[-1].frame.to_crs((x, y, 4.5))  # of the roof

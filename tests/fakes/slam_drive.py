@@ -22,7 +22,7 @@ CAMERA_TO_WORLD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # looks along
 def drive(
     seconds: float, *, fps: float = 10.0, speed: float = 10.0, turn: float = 0.05
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times (T,) and poses (T, 4, 4) of a camera 2 m above a road that winds; stands still in its first second."""
+    """Times (T,) and poses (T, 4, 4) of a camera 2 m above a winding road; it does not move in the first second."""
     times = np.arange(0, seconds, 1 / fps)
     rate = np.clip(times - 1, 0, 1) * speed
     heading = np.cumsum(turn * np.sin(times / 3) * (rate > 0)) / fps * 3
@@ -45,7 +45,7 @@ def scatter(poses: np.ndarray, count: int = 6000, seed: int = 0) -> np.ndarray:
 
 
 class Follower:
-    """A tracker that knows the points; `hide(frame, points)` says what can't be seen, and how what is seen moves."""
+    """Tracker of known points; `hide(frame, points)` returns which are hidden, and how others are displaced."""
 
     def __init__(
         self,
@@ -99,8 +99,8 @@ class Follower:
         return len(chosen)
 
 
-class Narrow(Follower):
-    """Sees what a perspective camera does: 45 degrees about its axis."""
+class PerspectiveFollower(Follower):
+    """Follower with the field of view of a perspective camera: 45 degrees about its axis."""
 
     def _seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         bearing, seen = super()._seen(points)
@@ -131,7 +131,7 @@ def run(
     return odometry
 
 
-def off(odometry: Odometry, poses: F64) -> F64:
+def position_errors(odometry: Odometry, poses: F64) -> F64:
     """(T, 3) errors of positions against poses (T, 4, 4) at 10 Hz that begin where the odometry's do, at its scale."""
     first, second = odometry.map.keyframes[:2]
     a, b = (poses[round(10 * k.time)] for k in (first, second))
@@ -143,12 +143,12 @@ def off(odometry: Odometry, poses: F64) -> F64:
 
 
 def inside(errors: F64, covariance: F64) -> Bools:
-    """(T,) whether 95 % ellipsoids hold the errors."""
+    """(T,) bool, True where the 95 % ellipsoid contains the error."""
     return np.einsum("ti,tij,tj->t", errors, np.linalg.inv(covariance[:, :3, :3]), errors) < INSIDE
 
 
 def drifting_turn() -> tuple[F64, F64, F64]:
-    """Times, true places and found ones of 52 m with a turn of 98 degrees, whose scale drifts as it does in KITTI's."""
+    """Times, true and estimated positions of 52 m with a turn of 98 degrees, whose scale drifts as in KITTI."""
     heading = np.radians(98) / (1 + np.exp(-(np.arange(51) - 25) / 4))
     step = 1.02 * np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=1)
     drift = np.interp(np.arange(51), [5, 25, 45], [0.885, 1.001, 1.048])
@@ -165,10 +165,10 @@ def ate(found: F64, truth: F64, *, scaled: bool = True) -> float:
 LENS = Camera("pinhole", 1240, 1240, 700.0, 700.0, 619.5, 619.5)
 
 
-def mistaken(given: Camera, seed: int, turn: float = 0.3) -> Odometry:
-    """Odometry in a turn of a camera that is `LENS`, and is said to be `given`."""
+def odometry_with_wrong_intrinsics(given: Camera, seed: int, turn: float = 0.3) -> Odometry:
+    """Odometry in a turn with a camera whose intrinsics are `LENS`, given the intrinsics `given`."""
 
-    class Mistaken(Narrow):
+    class Mistaken(PerspectiveFollower):
         def _seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             bearing, seen = super()._seen(points)
             return unproject(given, project_exactly(LENS, bearing)[0]), seen

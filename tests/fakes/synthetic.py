@@ -16,17 +16,20 @@ from scan2sim.pipeline.core.types import Frame, Mesh, Trajectory, View
 from scan2sim.pipeline.geometry.primitives import tube
 from scan2sim.pipeline.io.geodata import geojson
 from scan2sim.pipeline.io.worlds.scene import PATH_FILE, Scene, read_scene, save_tile, write_scene_file
+from scan2sim.pipeline.io.worlds.textured_mesh import save_reflectance
 from scan2sim.pipeline.steps.collision import COLLISION, CollisionParams
 from scan2sim.pipeline.steps.decimate import with_furniture
 from scan2sim.pipeline.steps.export import EXPORT, ExportParams
 from tests.fakes.steps import step_params
 
 UTM = Frame("EPSG:32632", (690_000.0, 5_335_000.0, 500.0))
+REFLECTANCE = {"terrain": 0.2, "building": 0.6}
+"""Reflectance of the surfaces of a scene; multiples of 1/255."""
 HOUSE = (4.0, 2.0)  # its corner of least x and y; it measures 3 x 2 x 5 m
 
 
 def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Of the ground, metres."""
+    """Height of the ground at (x, y), metres."""
     return 0.3 * np.sin(x / 3) * np.cos(y / 4)
 
 
@@ -128,7 +131,7 @@ def view() -> View:
 
 
 def scene(folder: Path, frame: Frame = UTM, tiles: int = 2, apart: float = 25.0) -> Scene:
-    """Tiles in a row, so many metres apart, around the first one's origin: ground, a house with a sign for a roof."""
+    """Tiles in a row, `apart` in metres, around the first one's origin: ground, a house with a sign as its roof."""
     world, names = folder / "world", []
     for i in range(tiles):
         x, y, z = frame.origin
@@ -136,6 +139,8 @@ def scene(folder: Path, frame: Frame = UTM, tiles: int = 2, apart: float = 25.0)
         roof = np.where(house().page == 1, CODE["road_sign"], 0).astype(np.uint8)
         meshes = {"terrain": ground(10, here), "building": replace(house(here), classification=roof)}
         sources = {group: textured(folder / f"tile{i}" / group, mesh) for group, mesh in meshes.items()}
+        for group, level in REFLECTANCE.items():
+            save_reflectance(sources[group], np.full(len(meshes[group].vertices), level, np.float32))
         solid = folder / f"tile{i}" / "collision.npz"
         collided(here).save(solid)
         lists = folder / f"tile{i}" / "plants.geojson"

@@ -75,7 +75,9 @@ def test_world_is_built_from_the_remaining_classes(tile: Path, tmp_path: Path, h
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CLASSES)
 @pytest.mark.parametrize("how", ["without", "alone", "few"])
-def test_survey_is_built_if_a_tile_lacks_a_class(small_street: Path, tmp_path: Path, how: str, name: str) -> None:
+def test_survey_is_built_if_a_class_is_missing_in_a_tile(
+    small_street: Path, tmp_path: Path, how: str, name: str
+) -> None:
     corridor = tiny(small_street, tmp_path / "corridor")
     cut_survey(corridor, tmp_path / "survey", CutParams(length=6.0, buffer=3.0))
     last = [*read_survey(tmp_path / "survey" / "survey.toml").tiles.values()][-1].parent

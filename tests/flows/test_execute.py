@@ -22,7 +22,7 @@ import scan2sim
 from scan2sim.flows.engine.dispatch import dispatch
 from scan2sim.flows.engine.execution import execute, run_to_world
 from scan2sim.flows.engine.lock import locked
-from scan2sim.flows.engine.planning import PlannedTask, Reason, plan
+from scan2sim.flows.engine.planning import PlannedTask, Reason, plan, why
 from scan2sim.flows.engine.ready_queue import Outcome
 from scan2sim.flows.engine.run_task import run_task
 from scan2sim.flows.engine.versions import EXTRAS_WITHOUT_STEPS, check_version, versions
@@ -142,6 +142,35 @@ class FinishedFuture:
         return self._outcome
 
 
+def test_result_with_a_failed_part_is_used_once_and_made_again_by_the_next_run(
+    tmp_path: Path, source: Path, ran: Callable[[], str]
+) -> None:
+    broken = tmp_path / "broken"
+    broken.touch()
+
+    def run() -> tuple[dict[TaskId, Reason | None], Outcome]:
+        store = Store(tmp_path / "store")
+
+        def planned(without: Collection[TaskId] = ()) -> list[PlannedTask]:
+            left_out = {*without, TaskId("d")} if without else set()
+            tasks = chain(source, tmp_path / "log", b={"does": "part"}, c={"does": "bug"})
+            kept = [replace(task, side_product=task.id.name in "cd") for task in tasks if task.id not in left_out]
+            return plan(kept, store)
+
+        first = planned()
+        _, outcome = run_to_world(first, planned, store, partial(execute, jobs=1, on_event=lambda *_: None))
+        return {item.task.id: item.reason for item in first}, outcome
+
+    for _ in range(2):
+        reasons, outcome = run()
+        assert list(outcome.done[TaskId("b")].failed) == ["part"]
+        assert ran().count("b") == 1, "once in a run, although it is planned again without a side product"
+    assert reasons[TaskId("a")] is None and reasons[TaskId("b")] is Reason.RETRIED
+    broken.unlink()
+    assert not run()[1].done[TaskId("b")].failed and ran() == "bc"
+    assert run()[0][TaskId("b")] is None and ran() == "c"
+
+
 @pytest.mark.parametrize("how", ["processes", "dispatched"])
 def test_failed_side_product_is_left_out_and_its_readers_run_without_it(
     tmp_path: Path, source: Path, ran: Callable[[], str], how: str
@@ -153,7 +182,7 @@ def test_failed_side_product_is_left_out_and_its_readers_run_without_it(
         for task in chain(source, tmp_path / "log", **changes):
             kept = {name: at for name, at in task.inputs.items() if not (isinstance(at, Output) and at.task in without)}
             if task.id not in without:
-                tasks.append(replace(task, inputs=kept, step=replace(task.step, side_product=task.step.name == "b")))
+                tasks.append(replace(task, inputs=kept, side_product=task.step.name == "b"))
         return plan(tasks, store, force=True)
 
     def run(planned: list[PlannedTask], store: Store) -> Outcome:
@@ -377,6 +406,21 @@ def test_plan_has_reasons(tmp_path: Path, source: Path, run: Run) -> None:
     changed = reasons(b={"value": 1})
     assert changed["a"] is None and changed["c"] is None
     assert changed["b"] is Reason.CHANGED
+
+
+def test_plan_names_what_changed(tmp_path: Path, source: Path, run: Run) -> None:
+    run()
+    store = Store(tmp_path / "store")
+
+    def texts(**changes: dict[str, object]) -> dict[str, str]:
+        return {p.task.full_name: why(p, store) for p in plan(chain(source, tmp_path / "log", **changes), store)}
+
+    assert set(texts().values()) == {"cached: same input, settings and version"}
+    changed = texts(a={"value": 7})
+    assert changed["a"] == "settings changed: value 0 -> 7"
+    assert changed["b"] == "input may change: reused if it turns out the same"
+    source.write_text("other", encoding="utf-8")
+    assert texts()["a"].startswith("input files changed: ")
 
 
 def test_second_run_in_the_same_folder_is_a_busy_error(tmp_path: Path) -> None:

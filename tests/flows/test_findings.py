@@ -57,6 +57,14 @@ def test_held_out_photos_with_low_psnr(db: tuple[float, ...], level: str) -> Non
     assert one.level == level and "less than 15 dB" in one.text and "photo1" in one.text and "photo0" not in one.text
 
 
+def test_clearly_different_lenses_are_noted() -> None:
+    def lens(change: float) -> dict[str, float]:
+        return {"focal_change_percent": change, "k1_change": 0.01, "k2_change": 0.0}
+
+    (one,) = findings(run_of(pose_refinement={"cameras": {"left": lens(-0.9), "right": lens(0.1)}}))
+    assert one.level == "note" and one.text.startswith("left: ") and "0.9 % shorter" in one.text
+
+
 def test_held_out_photos_of_unseen_surfaces() -> None:
     (one,) = findings(run_of(score=scored(21, 22, coverage=0.0)))
     assert one.level == "poor" and "2 of 2" in one.text

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -30,7 +32,16 @@ def test_command_passes_world_and_models_of_any_folder_name(tmp_path: Path, prog
     assert printed == [str(world / "street.sdf"), f"{world / 'models'}:/robots"]
 
 
-def test_missing_world_has_no_commands(tmp_path: Path) -> None:
+def test_missing_world_has_no_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "which", lambda name: name)
     assert gazebo.commands(tmp_path / "street.sdf") == {}
     shown = f"View:   scan2sim view {shlex.quote(str(tmp_path))}"
     assert gazebo.lines(tmp_path / "street.sdf") == [f"World:  {tmp_path}", shown]
+
+
+def test_command_of_an_inactive_environment_has_its_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    (tmp_path / "scan2sim").touch()
+    view = f"View:   {shlex.quote(str(tmp_path / 'scan2sim'))} view {shlex.quote(str(tmp_path))}"
+    assert gazebo.lines(tmp_path / "street.sdf")[1] == view

@@ -83,18 +83,19 @@ def test_new_step_versions_and_changed_files_rerun_steps_of_a_drive(
         known.update(keys)
         return others
 
-    assert changed() == {"track", "georeference", "import_sweeps", "cut"} and changed() == set()
+    assert changed() == {"track", "georeference", "strip_adjustment", "import_sweeps", "cut"} and changed() == set()
     for step in (CUT, IMPORT_SWEEPS):
         pipeline = "drive" if step is CUT else "sweeps"
         monkeypatch.setattr(f"scan2sim.flows.pipelines.{pipeline}.{step.name.upper()}", replace(step, version=1000))
         assert changed() == ({"cut"} if step is CUT else {"import_sweeps", "cut"})
     for name in ("camera.toml", "velodyne/0.bin", "image/0.png"):
         (tmp_path / name).write_text("another", encoding="utf-8")
-        assert changed() == {"import_sweeps", "cut"}, name
+        checked = {"strip_adjustment"} if name.startswith("velodyne") else set()
+        assert changed() == {"import_sweeps", "cut"} | checked, name
     (tmp_path / "velodyne/1.bin").write_text("one more", encoding="utf-8")
-    assert changed() == {"import_sweeps", "cut"}
+    assert changed() == {"strip_adjustment", "import_sweeps", "cut"}
     (tmp_path / "video.mp4").write_text("another", encoding="utf-8")
-    assert changed() == {"track", "georeference", "import_sweeps", "cut"}
+    assert changed() == {"track", "georeference", "strip_adjustment", "import_sweeps", "cut"}
 
 
 def test_plan_of_a_drive(corridor: Path, tmp_path: Path) -> None:
@@ -134,6 +135,7 @@ def test_mostly_extrapolated_trajectory_is_rejected(tmp_path: Path) -> None:
         ("", "must have either"),
         ('corridor = "a"\n[sweeps]\nfolder = "b"\nposes = "c"', "must have either"),
         ('corridor = "a"\nspeed = 3', "`speed`"),
+        ('corridor = "a"\n[tiles]\nreach = 30.0', "`tiles.reach` was renamed.*`tiles.max_distance`"),
         ("corridor = [", "TOML"),
     ],
 )

@@ -95,17 +95,17 @@ def test_run_and_steps_are_published(run: Run, outlet: RecordingOutlet) -> None:
     assert (ended.command, ended.source, ended.state, ended.steps, ended.done) == ("run", "toys", "done", 4, 4)
 
 
-def test_cached_steps_are_published_as_kept(run: Run, outlet: RecordingOutlet) -> None:
+def test_cached_steps_are_published_as_cached(run: Run, outlet: RecordingOutlet) -> None:
     run(NO_BROKER)
     outlet.events.clear()
     run(NO_BROKER, c={"value": 5})
     assert {name: step.state for name, step in outlet.last().items()} == {
-        "a": "kept",
-        "b": "kept",
+        "a": "cached",
+        "b": "cached",
         "c": "done",
         "d": "done",
     }
-    assert outlet.last()["a"].seconds is None and outlet.runs()[-1].kept == 2
+    assert outlet.last()["a"].seconds is None and outlet.runs()[-1].cached == 2
 
 
 def test_failure_is_published_with_its_cause(run: Run, outlet: RecordingOutlet) -> None:
@@ -199,7 +199,7 @@ def test_run_is_published_to_kafka(run: Run, broker: Broker) -> None:
     run(broker.servers)
     outlet = RecordingOutlet()
     end = time.monotonic() + 30
-    for body in kafka.read(broker.servers, event_publishers.TOPIC, group="test", from_start=True, wait=0.2):
+    for body in kafka.read(broker.cluster, event_publishers.TOPIC, group="test", from_start=True, wait=0.2):
         if body is not None:
             outlet.events.append(Event.model_validate_json(body))
         if time.monotonic() > end or (outlet.runs() and outlet.runs()[-1].state == "done"):
@@ -216,13 +216,13 @@ def test_unsent_events_are_sent_by_the_next_run(run: Run, broker: Broker, tmp_pa
     run(broker.servers)
     outlet = RecordingOutlet()
     end = time.monotonic() + 30
-    for body in kafka.read(broker.servers, event_publishers.TOPIC, group="test", from_start=True, wait=0.2):
+    for body in kafka.read(broker.cluster, event_publishers.TOPIC, group="test", from_start=True, wait=0.2):
         if body is not None:
             outlet.events.append(Event.model_validate_json(body))
-        if time.monotonic() > end or {one.kept for one in outlet.runs() if one.state == "done"} == {0, 4}:
+        if time.monotonic() > end or {one.cached for one in outlet.runs() if one.state == "done"} == {0, 4}:
             break
     assert len({one.run for one in outlet.steps()}) == 2
-    assert {one.state for one in outlet.steps() if one.step == "a"} >= {"done", "kept"}
+    assert {one.state for one in outlet.steps() if one.step == "a"} >= {"done", "cached"}
 
 
 def test_failing_bus_does_not_fail_the_run(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -11,6 +12,8 @@ from typer.testing import CliRunner
 from scan2sim.flows.cli import COMMANDS, app, loaded
 from scan2sim.flows.commands.option_ranges import NumericOptions
 from scan2sim.flows.pipelines import renamed
+from scan2sim.flows.pipelines.bag import BagSource
+from scan2sim.flows.pipelines.images import Images
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.pipelines.steps import STEPS
 from scan2sim.flows.reports.settings_page import __doc__ as settings_page_module
@@ -20,20 +23,27 @@ from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.parameters import described
 from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.io.world_formats import SceneParams
+from scan2sim.pipeline.pose_check.conventions import PhotoConventions
 from scan2sim.pipeline.steps.decimate import DECIMATE
 from scan2sim.pipeline.steps.import_sweeps import SweepsParams
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.tiling.cut_corridor import CutParams
 from scan2sim.services.monitoring.autoscale.traffic_model import TrafficParams
+from scan2sim.services.monitoring.embedded_broker import BrokerParams
 from scan2sim.services.monitoring.settings.archive import QueryParams
-from scan2sim.services.monitoring.settings.bus import ScaleParams
+from scan2sim.services.monitoring.settings.bus import MuteParams, ScaleParams
 from scan2sim.services.monitoring.settings.dashboard import PageParams
 from scan2sim.services.monitoring.settings.monitor import DatasetParams, TalkerParams, TopicParams, WorkParams
 from scan2sim.services.orchestration.settings import ApplyParams, ScaleInstanceParams
 from scan2sim.services.qos.encoding import ChoiceParams
 from scan2sim.services.qos.measure import MeasureParams
-from scan2sim.services.teleoperation.settings import DemoParams, VehicleParams
+from scan2sim.services.teleoperation.settings import (
+    DemoParams,
+    ReplayParams,
+    StationParams,
+    VehicleParams,
+)
 from scan2sim.services.teleoperation.settings import MeasureParams as DrivenParams
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams
 from scan2sim.services.toolboxes.settings import CameraParams, NodeParams, ServeParams
@@ -100,6 +110,8 @@ def test_values_out_of_range_are_rejected(text: str) -> None:
         ("agreement.sky=false", "photo_consistency.sky"),
         ("visibility.lacking=0.3", "visibility.mesh_distance"),
         ("choose.building.max_distance=20", "view_selection.building"),
+        ("slam.features=300", "track.count"),
+        ("slam.gps_chords='none'", "track.gps_distances"),
     ],
 )
 def test_an_earlier_name_is_rejected_with_the_new_one(text: str, name: str, tmp_path: Path) -> None:
@@ -116,6 +128,9 @@ def test_every_current_name_of_the_table_exists() -> None:
     fields = {step.name: step.params.settings() for step in STEPS}
     assert set(renamed.STEPS.values()) <= set(fields) and not set(renamed.STEPS) & set(fields)
     for step, names in renamed.SETTINGS.items():
+        if step in renamed.STEPS:
+            assert set(names.values()) <= set(fields[renamed.STEPS[step]])
+            continue
         assert set(names.values()) <= set(fields[step]) and not set(names) & set(fields[step])
 
 
@@ -177,19 +192,40 @@ def test_settings_page_is_up_to_date() -> None:
     assert page.read_text(encoding="utf-8") == settings_page(), settings_page_module
 
 
+def leaves(command: Any) -> Iterator[Any]:
+    """The commands of a group and of the groups in it; a command itself."""
+    if hasattr(command, "commands"):
+        for one in command.commands.values():
+            yield from leaves(one)
+    else:
+        yield command
+
+
 def test_every_numeric_option_has_a_range() -> None:
-    found = [loaded(name) for name in COMMANDS]
-    single = [one for some in found for one in getattr(some, "commands", {"": some}).values()]
-    hints = [get_type_hints(one.callback) for one in single]
-    shown = (SceneParams, ViewParams)
+    hints = [get_type_hints(one.callback) for name in COMMANDS for one in leaves(loaded(name))]
+    shown = (SceneParams, ViewParams, PhotoConventions)
     boxes = (detect.Params, movement.Params, classify.Params, segment.Params, ServeParams, NodeParams, CameraParams)
-    bus = (QueryParams, TopicParams, TalkerParams, DatasetParams, TrafficParams, WorkParams, ScaleParams, PageParams)
+    nodes = (TopicParams, TalkerParams, DatasetParams, WorkParams, ScaleParams, MuteParams, BrokerParams)
+    bus = (QueryParams, TrafficParams, PageParams, *nodes)
     osm, qos = (ApplyParams, ScaleInstanceParams), (MeasureParams, ChoiceParams)
-    driven = (VehicleParams, DemoParams, AdapterParams, DrivenParams)
+    driven = (VehicleParams, DemoParams, AdapterParams, DrivenParams, StationParams, ReplayParams)
     numbers = {name for of in hints for name, kind in of.items() if {int, float} & {kind, *get_args(kind)}}
     assert len(numbers) > 15 and numbers <= {
         name
-        for model in (NumericOptions, Filmed, CutParams, SweepsParams, *shown, *qos, *osm, *bus, *boxes, *driven)
+        for model in (
+            NumericOptions,
+            Filmed,
+            CutParams,
+            SweepsParams,
+            BagSource,
+            Images,
+            *shown,
+            *qos,
+            *osm,
+            *bus,
+            *boxes,
+            *driven,
+        )
         for name in model.model_fields
     }
 
@@ -204,7 +240,7 @@ def test_every_numeric_option_has_a_range() -> None:
         (("slam", "v.mp4", "--centre", "nan", "3"), "--centre"),
         (("slam", "v.mp4", "--fps", "0"), "--fps"),
         (("slam", "v.mp4", "--set", "track.sigma=nan"), "track.sigma"),
-        (("run", "tile", "--hold-out", "1"), "views.hold_out"),
+        (("run", "tile", "--hold-out", "1"), "sweeps.hold_out"),
         (("run", "data_samples/tile", "--set", "export.world_origin=[nan, 0, 0]"), "export.world_origin"),
         (("run", "data_samples/tile", "--set", "export.world_origin=[1e300, 0, 0]"), "export.world_origin"),
         (("run", "data_samples/tile", "--set", "poisson.threads=100000"), "poisson.threads"),

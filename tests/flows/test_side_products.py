@@ -4,28 +4,45 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from scan2sim.flows.commands import run as run_command
+from scan2sim.flows.pipelines import tile as tile_pipeline
 from scan2sim.flows.pipelines.graph import Output, Task, TaskId
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.pipelines.survey import build_survey_graph
-from scan2sim.flows.pipelines.tile import STEPS, build_graph
-from scan2sim.flows.reports import finish
+from scan2sim.flows.pipelines.tile import build_graph
+from scan2sim.flows.reports import finish, publish
+from scan2sim.pipeline.core.types import RobotMap
 from scan2sim.pipeline.io.geodata import stac
 from scan2sim.pipeline.io.survey import read_survey
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.io.worlds import merge
 from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
-from tests.flows.tiny import COARSE, loaded, scan2sim, tiny
+from tests.flows.tiny import COARSE, loaded, tiny
+from tests.flows.tiny import scan2sim as run_scan2sim
 
-SIDE_PRODUCTS = tuple(step.name for step in STEPS if step.side_product)
+SETTINGS = COARSE | {
+    "navigation": {"when": "always"}, "split": {"vegetation": "locations", "vehicles": "assets"},
+}  # fmt: skip
+scan2sim = partial(run_scan2sim, settings=SETTINGS)
+SIDE_PRODUCTS = tuple(step.name for step in tile_pipeline.SIDE_PRODUCTS)
 BORDER_SIDE_PRODUCT = "borders"
 """Runs only for tiles with neighbours."""
-TILE_SIDE_PRODUCTS = tuple(name for name in SIDE_PRODUCTS if name != BORDER_SIDE_PRODUCT)
+MAP_SIDE_PRODUCT = "ghosts"
+"""Runs only for robots' maps."""
+TILE_SIDE_PRODUCTS = tuple(name for name in SIDE_PRODUCTS if name not in (BORDER_SIDE_PRODUCT, MAP_SIDE_PRODUCT))
+SURVEY_SIDE_PRODUCTS = tuple(name for name in SIDE_PRODUCTS if name not in ("navigation", MAP_SIDE_PRODUCT))
+"""Those of tiles of a survey."""
+EXPORT_PARTS = ("export.glb", "export.lists", "export.navigation")
+"""Optional parts of the step `export`."""
+ALL = (*SIDE_PRODUCTS, *EXPORT_PARTS)
 EARLY_SIDE_PRODUCTS = ("detect_furniture", "furniture", "signs")
 """Side products that most other steps depend on: without them nearly all steps run again."""
 SURVEY_PRODUCTS: dict[str, tuple[Any, str]] = {
@@ -64,7 +81,7 @@ def survey(street: Path) -> Path:
 def failing_run(street: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, str]:
     """A first run in which all side products fail: its folder, exit code and output."""
     out = tmp_path_factory.mktemp("failing_run") / "out"
-    return out, *scan2sim("run", street, "--out", out, failing=SIDE_PRODUCTS)
+    return out, *scan2sim("run", street, "--out", out, failing=ALL)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +97,7 @@ def completed_run(street: Path, failing_run: tuple[Path, int, str], tmp_path_fac
 def failing_survey(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, str]:
     """Like `failing_run`, for the survey."""
     out = tmp_path_factory.mktemp("failing_run") / "out"
-    return out, *scan2sim("survey", survey, "--out", out, failing=SIDE_PRODUCTS)
+    return out, *scan2sim("survey", survey, "--out", out, failing=ALL)
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +135,7 @@ def is_topologically_sorted(tasks: list[Task]) -> bool:
 
 @pytest.mark.parametrize("name", SIDE_PRODUCTS)
 def test_graph_without_a_side_product_has_all_main_steps(street: Path, survey: Path, name: str) -> None:
-    tile, settings = read_tile(street), Settings(COARSE)
+    tile, settings = read_tile(street), Settings(SETTINGS)
     whole = build_graph(tile, settings)
     rest = build_graph(tile, settings, without=[TaskId(name)])
     lost = names(whole) - names(rest)
@@ -135,20 +152,30 @@ def test_graph_without_a_side_product_has_all_main_steps(street: Path, survey: P
     assert {task.id for task in rest if task.tile == second} == {task.id for task in whole if task.tile == second}
 
 
+def test_graph_of_a_robot_map_without_a_side_product_has_all_main_steps(street: Path) -> None:
+    tile = replace(read_tile(street), robot_map=RobotMap("outdoor", 0.1, 1.0, np.eye(4)))
+    whole = build_graph(tile, Settings(SETTINGS))
+    assert TaskId(MAP_SIDE_PRODUCT) in names(whole)
+    for name in SIDE_PRODUCTS:
+        rest = build_graph(tile, Settings(SETTINGS), without=[TaskId(name)])
+        assert is_topologically_sorted(rest) and {task.step for task in names(whole) - names(rest)} <= set(
+            SIDE_PRODUCTS
+        )
+
+
 def test_tile_is_built_if_all_side_products_fail(failing_run: tuple[Path, int, str]) -> None:
     out, code, printed = failing_run
     assert code == INCOMPLETE
     loaded(out)
     report, log = read(out / "report.json"), (out / "run.log").read_text(encoding="utf-8")
-    expected = set(TILE_SIDE_PRODUCTS) - {
-        "furniture",
-        "signs",
-    }  # they need the output of the failed step `detect_furniture`
+    missing = {"furniture", "signs", "vehicle_models"}  # they need the outputs of failed steps
+    expected = {*TILE_SIDE_PRODUCTS, *EXPORT_PARTS} - missing
     assert report["failed"].keys() == expected
     for name in expected:
         assert f"warning: {name}: {FAILED_TEXT}: failed unexpectedly (ZeroDivisionError: a bug)" in printed
         assert ("poor", name) in [(one["level"], one["about"]) for one in report["findings"]]
         assert not list((out / "steps").glob(f"{name}/*"))
+    assert not list(out.rglob("half.txt")) and not list((out / "world").glob("*.glb")), "nothing is half-written"
     assert "Traceback" not in printed and printed.count(f"(details: {out / 'run.log'})") == len(expected)
     assert log.count('raise ZeroDivisionError("a bug")') == len(expected)
     assert f"the world is finished, but {len(expected)} side products failed: " in printed
@@ -159,7 +186,7 @@ def test_next_run_retries_failed_side_products(completed_run: Path) -> None:
     loaded(completed_run)
     assert read(completed_run / "report.json")["failed"] == {}
     assert (completed_run / "world" / "roads.geojson").is_file() and list((completed_run / "rasters").glob("*.tif"))
-    assert (completed_run / "report_files" / "world.js").is_file()
+    assert (completed_run / "report_files" / "world.js").is_file() and list((completed_run / "world").glob("*.glb"))
 
 
 @for_each_side_product
@@ -194,6 +221,25 @@ def test_failing_report_affects_only_itself(
     assert scan2sim("run", street, "--out", out)[0] == 0 and (out / "report.html").is_file()
 
 
+def test_failing_copies_and_damaged_reports_affect_only_themselves(
+    street: Path, completed_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = shutil.copytree(completed_run, tmp_path / "out")
+    for name in ("rasters", "exposure.json"):
+        shutil.rmtree(out / name) if (out / name).is_dir() else (out / name).unlink()
+    copy = publish._publish
+    with monkeypatch.context() as patch:
+        patch.setattr(publish, "_publish", lambda *args: raising() if args[1].name == "rasters" else copy(*args))
+        patch.setattr(publish, "THREE_JS", "missing.js")
+        patch.setattr(publish, "versions", raising)
+        code, printed = scan2sim("run", street, "--out", out)
+    assert code == INCOMPLETE and "Traceback" not in printed
+    assert read(out / "report.json")["failed"].keys() == {"rasters", "preview", "config.json"}
+    loaded(out)
+    assert (out / "exposure.json").is_file() and not (out / "config.json").exists()
+    assert scan2sim("run", street, "--out", out)[0] == 0 and (out / "rasters" / "street_dsm.tif").is_file()
+
+
 def test_failing_main_step_fails_the_run(street: Path, completed_run: Path, tmp_path: Path) -> None:
     out = shutil.copytree(completed_run, tmp_path / "out")
     for name in ("export", "roads"):
@@ -221,13 +267,13 @@ def test_survey_is_built_if_all_side_products_fail(failing_survey: tuple[Path, i
     tiles, log = read(out / "survey.json")["tiles"], (out / "run.log").read_text(encoding="utf-8")
     for tile in (first, second):
         loaded(out / "tiles" / tile)
-        expected = set(SIDE_PRODUCTS) - {"furniture", "signs"}
+        expected = {*SURVEY_SIDE_PRODUCTS, *EXPORT_PARTS} - {"furniture", "signs", "vehicle_models"}
         assert tiles[tile]["state"] == "done"
         assert read(out / "tiles" / tile / "report.json")["failed"].keys() == expected
         for name in expected:
             assert f"warning: {tile}/{name}: {FAILED_TEXT}" in printed
             assert any(text.startswith(f"{name}: failed") for text in tiles[tile]["warnings"])
-            assert f"{tile}/{name}: failed: " in log
+            assert f"{tile}/{name}: failed" in log
     assert "ZeroDivisionError: a bug" in log and FAILED_TEXT in (out / "survey.html").read_text(encoding="utf-8")
 
 
@@ -249,7 +295,7 @@ def test_failing_survey_product_affects_only_itself(
     with monkeypatch.context() as patch:
         for name in names:
             patch.setattr(*SURVEY_PRODUCTS[name], raising)
-        code, printed = scan2sim("survey", survey, "--out", out, failing=SIDE_PRODUCTS)
+        code, printed = scan2sim("survey", survey, "--out", out, failing=ALL)
     assert code == INCOMPLETE
     assert {name for name in SURVEY_PRODUCTS if f"warning: {name.replace('TILE', tile)}: {FAILED_TEXT}" in printed} == {
         *names
@@ -258,14 +304,14 @@ def test_failing_survey_product_affects_only_itself(
     loaded(out)
     if "report" not in names:
         assert read(out / "survey.json")["failed"].keys() == {*names} & {"roads", "catalogue"}
-    code, printed = scan2sim("survey", survey, "--out", out, failing=SIDE_PRODUCTS)
+    code, printed = scan2sim("survey", survey, "--out", out, failing=ALL)
     assert code == INCOMPLETE, "steps still fail"
     assert not any(f"warning: {name.replace('TILE', tile)}: failed" in printed for name in names), "it is retried"
     assert all(file.is_file() for file in reports.values())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SIDE_PRODUCTS)
+@pytest.mark.parametrize("name", SURVEY_SIDE_PRODUCTS)
 def test_failing_side_product_of_a_survey_tile_affects_only_itself(
     survey: Path, completed_survey: Path, tmp_path: Path, name: str
 ) -> None:

@@ -28,9 +28,9 @@ def tiles(count: int = 6, length: float = 50.0) -> list[TileState]:
     seeds = {f"town_{i}": tuple((ORIGIN + [length * i, 0]).tolist()) for i in range(count)}
     made = []
     for i, (name, cell) in enumerate(cells(seeds, 3 * length).items()):
-        state = {1: "failed", 2: "kept", count - 1: "waiting"}.get(i, "done")
+        state = {1: "failed", 2: "cached", count - 1: "waiting"}.get(i, "done")
         borders = [{"neighbour": n, "gap_m": 0.001 * i, "colour_step": 2.0} for n in cell.neighbours]
-        known = state in ("done", "kept")
+        known = state in ("done", "cached")
         made.append(
             TileState(
                 name,
@@ -61,7 +61,7 @@ def drawn(page: str) -> ET.Element:
 def test_totals_include_all_tiles(tmp_path: Path) -> None:
     body, page = written(tmp_path, tiles(), path=ORIGIN + np.column_stack([np.linspace(0, 300, 3001), np.zeros(3001)]))
     totals = body["totals"]
-    assert [totals[s] for s in ("tiles", "done", "kept", "failed", "waiting")] == [6, 3, 1, 1, 1]
+    assert [totals[s] for s in ("tiles", "done", "cached", "failed", "waiting")] == [6, 3, 1, 1, 1]
     assert totals["points"] == 16_000_000 and totals["photos"] == 120 and totals["seconds"] == 2400
     assert totals["peak_mb"] == 2048 and totals["psnr_db"] == pytest.approx((20 + 23 + 24) / 3)
     assert totals["length_m"] == pytest.approx(300) and totals["area_m2"] == pytest.approx(6 * 50 * 50)
@@ -116,7 +116,7 @@ def test_rows_and_overview(tmp_path: Path) -> None:
     }
     assert lines[1] == {"tile": "town_1", "state": "failed"}
     assert overview(tmp_path).splitlines() == [
-        "**town**: 1 failed, 1 waiting, 3 done, 1 kept",
+        "**town**: 1 failed, 1 waiting, 3 done, 1 cached",
         "- town_1: cloud.laz: is <truncated>",
     ]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,17 @@ import pytest
 from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
+from scan2sim.flows.reports.comparison_film import comparison_film
 from scan2sim.flows.reports.film import film, flight
 from scan2sim.flows.reports.view import Pages, server
 from scan2sim.pipeline.camera.renderer import Image, Renderer
-from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.errors import DataError, SettingError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import F64, Camera
-from scan2sim.pipeline.io.worlds.scene import read_scene
-from tests.fakes import synthetic
+from scan2sim.pipeline.io.images import image
+from scan2sim.pipeline.io.worlds.scene import TRACKS_FILE, read_scene
+from scan2sim.pipeline.tracking.tracks import write_tracks
+from tests.fakes import synthetic, traffic
 from tests.fakes.browser import Page, chromium
 
 ALL_TILES_LOADED = (
@@ -154,3 +158,31 @@ def test_flight_without_road_circles_around_the_world(tmp_path: Path) -> None:
     away = np.linalg.norm(poses[:, :2, 3], axis=1)
     assert np.ptp(away) < 1 and away.min() > 14 and (poses[:, 2, 3] > 5).all()
     assert (poses[:, :3, 2] * poses[:, :3, 3] < 1).all() and (poses[:, 2, 2] < 0).all()  # they look at the middle
+
+
+def test_comparison_film_shows_the_traffic_beside_the_photos(tmp_path: Path) -> None:
+    scene = synthetic.scene(tmp_path, tiles=1)
+    tile = scene.tiles[0]
+    van = traffic.drive(2, "van", (5.0, 2.0, 2.2), (-4.0, 4.0), -1.0, 0.0, 4.0)
+    start = synthetic.view().time
+    assert start is not None
+    track = replace(van, times=van.times - van.times[0] + start, colour=(230, 30, 30))
+    write_tracks(
+        tile.folder / TRACKS_FILE, [replace(track, poses=track.poses - (0, 0, traffic.HEIGHT_M, 0))], tile.frame
+    )
+    photo = tmp_path / "front.png"
+    image.write(photo, np.full((480, 640, 3), (20, 20, 200), np.uint8))
+    file = tmp_path / "film.mp4"
+    comparison_film(read_scene(tmp_path / "world"), {"front": photo}, file, 160, silent)
+    import av
+
+    with av.open(str(file)) as container:
+        (frame,) = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
+    assert frame.shape == (240, 160, 3)
+    recorded, shown = frame[:120], frame[120:]
+    assert np.abs(recorded - (20, 20, 200)).max() < 20
+    red = (shown[..., 0] > 120) & (shown[..., 1] < 80) & (shown[..., 2] < 80)
+    assert 0.02 < red.mean() < 0.6
+    with pytest.raises(DataError, match="--compare"):
+        comparison_film(scene, {"other": photo}, tmp_path / "none.mp4", 160, silent)
+    assert not (tmp_path / "none.mp4").exists()

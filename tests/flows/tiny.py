@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Collection
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,14 @@ import pytest
 
 from scan2sim.flows import cli
 from scan2sim.flows.pipelines import tile as tile_pipeline
+from scan2sim.pipeline.core.plugins import find
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report
 from scan2sim.pipeline.core.types import Bools, PointCloud
+from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.io.worlds.scene import Scene, read_scene
+from scan2sim.pipeline.steps.export import EXPORT, export
 from tests.fakes.gazebo.checker import build, check_world
 
 COARSE: dict[str, dict[str, Any]] = {
@@ -60,9 +64,28 @@ def broken(inputs: Inputs, params: Params, out: Path, report: Report) -> Done:
     raise ZeroDivisionError("a bug")
 
 
+def broken_part(scene: Scene, folder: Path, *_: object) -> dict[str, int]:
+    """A part of the export with a programming error, raised after half of it is written."""
+    (folder / "half.txt").write_text("half", encoding="utf-8")
+    raise ZeroDivisionError("a bug")
+
+
+def export_without(parts: Collection[str], inputs: Inputs, params: Any, out: Path, report: Report) -> Done:
+    """The step `export` with failing parts: formats, "lists", "navigation"."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in parts:
+            own = name in ("lists", "navigation")
+            module = world_formats if own else find(world_formats.PACKAGE, name, "")
+            patch.setattr(module, f"_write_{name}" if own else "write", broken_part)
+        return export(inputs, params, out, report)
+
+
 def fail(patch: pytest.MonkeyPatch, steps: Collection[str]) -> None:
-    """Make the steps of these names fail."""
-    for name in steps:
+    """Make the steps of these names fail, and parts of the export such as "export.glb"."""
+    parts = [name.removeprefix("export.") for name in steps if name.startswith("export.")]
+    if parts:
+        patch.setattr(tile_pipeline, "EXPORT", replace(EXPORT, run=partial(export_without, parts)))
+    for name in set(steps) - {f"export.{part}" for part in parts}:
         step = getattr(tile_pipeline, name.upper())
         patch.setattr(tile_pipeline, name.upper(), replace(step, run=broken))
 

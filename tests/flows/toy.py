@@ -11,16 +11,19 @@ from pathlib import Path
 from typing import Any, Literal
 
 from scan2sim.flows.pipelines.graph import Output, Task, TaskId
-from scan2sim.pipeline.core.errors import DataError
+from scan2sim.pipeline.core.errors import DataError, ScanError, StepError
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 
 
 class ToyParams(Params):
-    """What the toy step does: work, fail, crash, hang, or die with open locks and output; `log` lists its runs."""
+    """What the toy step does: work, fail, crash, hang, or die with open locks and output; `log` lists its runs.
+
+    With "part", an optional part of its result fails as long as there is a file `broken` beside the log.
+    """
 
     log: Path
     name: str
-    does: Literal["work", "fail", "bug", "die", "hang", "litter"] = "work"
+    does: Literal["work", "fail", "bug", "die", "hang", "litter", "part"] = "work"
     value: int = 0
 
 
@@ -45,7 +48,9 @@ def toy(inputs: Inputs, params: ToyParams, out: Path, report: Report) -> Done:
     if params.does == "hang":
         time.sleep(60)
     report(1.0, "done")
-    return Done({"number": out / "number.txt"}, {"total": total})
+    part_fails = params.does == "part" and params.log.with_name("broken").exists()
+    failed: dict[str, ScanError] = {"part": StepError("part", "fails", "Delete `broken`")} if part_fails else {}
+    return Done({"number": out / "number.txt"}, {"total": total}, failed=failed)
 
 
 TOY = Step("toy", 1, toy, ToyParams)

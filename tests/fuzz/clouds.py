@@ -7,10 +7,16 @@ from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
+import cv2
+import numpy as np
+
 from scan2sim.flows.commands.inspect import inspect_path
 from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.importers.clouds_and_photos import import_las
 from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.images.e57 import CYLINDRICAL, PINHOLE, SPHERICAL
+from tests.fakes import e57_files
+from tests.fakes.e57_files import Image2D
 from tests.fuzz.damage import FLOATS, INTEGERS
 from tests.pipeline.io.test_cloud_formats import Format, e57_changed
 from tests.pipeline.io.test_clouds import FRAME, made
@@ -44,6 +50,28 @@ def reader(form: Format) -> Callable[[Path], None]:
         import_las([path], out, crs=FRAME.crs, overwrite=out.exists())
 
     return read
+
+
+def e57_images(folder: Path) -> list[Path]:
+    """Write an E57 file with images of all representations, one with a mask."""
+    blobs = {"jpegImage": cv2.imencode(".jpg", np.full((40, 80, 3), 90, np.uint8))[1].tobytes()}
+    mask = {"imageMask": cv2.imencode(".png", np.full((40, 80), 255, np.uint8))[1].tobytes()}
+    lens = {"focalLength": 0.02, "pixelWidth": 5e-4, "pixelHeight": 5e-4, "principalPointX": 40, "principalPointY": 20}
+    ball, part = {"pixelWidth": np.pi / 40, "pixelHeight": np.pi / 40}, {"pixelWidth": 0.05, "pixelHeight": 0.05}
+    images = [
+        Image2D(PINHOLE, lens, blobs | mask, (80, 40), name="pinhole"),
+        Image2D(SPHERICAL, ball, blobs, (80, 40), rotation=None, associated=True),
+        Image2D(SPHERICAL, part, blobs | mask, (80, 40), time=9.0),
+        Image2D(CYLINDRICAL, part | {"radius": 1.0, "principalPointY": 15}, blobs, (80, 40)),
+    ]
+    cloud = made(1000)
+    return [e57_files.write(folder / "images.e57", cloud.frame.to_crs(cloud.xyz), images)]
+
+
+def read_e57_images(folder: Path) -> None:
+    """Import an E57 file with its images."""
+    out = folder / "tile"
+    import_las([folder / "images.e57"], out, crs=FRAME.crs, overwrite=out.exists())
 
 
 def e57_content(data: bytes, rng: Random) -> bytes:

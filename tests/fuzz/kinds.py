@@ -14,7 +14,8 @@ import tomli_w
 from scan2sim.flows.commands.inspect import inspect_path
 from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io.tile import read_tile
-from tests.fuzz import clouds, models, tables
+from tests.fakes.bags import FORMATS as BAG_FORMATS
+from tests.fuzz import bags, clouds, datasets, models, tables
 from tests.fuzz.damage import Damage
 from tests.pipeline.importers.test_photogrammetry import WRITERS
 from tests.pipeline.io import test_gps as gps
@@ -40,6 +41,7 @@ SPECIAL: dict[str, Damage] = {**dict.fromkeys(("las", "laz", "copc"), clouds.las
 SET_OPTIONS = "decimate.target=50000\nsplit.vegetation=both\ndecimate.building.target=2e4\nvoxel.size=0.1\n"
 KINDS: dict[str, Kind] = {
     **{n: Kind(clouds.writer(f), clouds.reader(f), SPECIAL.get(n)) for n, f in FORMATS.items()},
+    "e57 images": Kind(clouds.e57_images, clouds.read_e57_images, clouds.e57_content),
     "photo jpg": Kind(*models.photo(".jpg")),
     "photo png": Kind(*models.photo(".png")),
     "photo tif": Kind(*models.photo(".tif")),
@@ -62,6 +64,9 @@ KINDS: dict[str, Kind] = {
     "colmap txt": Kind(*models.colmap("txt")),
     "colmap bin": Kind(*models.colmap("bin")),
     **{name: Kind(*models.model(name)) for name in WRITERS},
+    **{f"bag {form}": Kind(*bags.bag(form)) for form in BAG_FORMATS},
+    "nuscenes": Kind(datasets.scene, datasets.read_scene),
+    "pandaset": Kind(datasets.sequence, datasets.read_sequence),
     "kitti odometry": Kind(models.odometry, models.read_odometry),
     "kitti raw": Kind(models.kitti, models.read_kitti),
     "sweeps": Kind(models.drive, models.read_drive),

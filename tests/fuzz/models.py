@@ -9,13 +9,12 @@ from typing import TypeAlias
 import numpy as np
 
 from scan2sim.flows.commands.inspect import inspect_path
+from scan2sim.flows.pipelines.kitti import import_kitti_odometry, import_kitti_raw
 from scan2sim.pipeline.core.types import Camera, View
-from scan2sim.pipeline.importers.kitti_odometry import import_kitti_odometry
-from scan2sim.pipeline.importers.kitti_raw import import_kitti_raw
-from scan2sim.pipeline.importers.merge_sweeps import read_bin
 from scan2sim.pipeline.importers.photogrammetry import import_model
-from scan2sim.pipeline.importers.sweeps import PhotoInput, PlacementParams, import_sweeps, read_sweep
+from scan2sim.pipeline.importers.sweeps import PhotoInput, PlacementParams, import_sweeps
 from scan2sim.pipeline.io.images import image
+from scan2sim.pipeline.io.sweep_files import read_bin, read_sweep
 from scan2sim.pipeline.steps.views import _problem
 from scan2sim.slam.video import open_video
 from tests.fakes import synthetic
@@ -110,7 +109,7 @@ def drive(folder: Path) -> list[Path]:
 def read_drive(folder: Path) -> object:
     """Import the sweeps and photos as a tile."""
     out = folder / "tile"
-    photos = PhotoInput(folder / "photos", sweeps.CAMERA)
+    photos = [PhotoInput(folder / "photos", sweeps.CAMERA)]
     return import_sweeps(
         folder / "sweeps", folder / "camera.csv", out, PlacementParams(), extrinsics=sweeps.T_CAMERA_SCANNER,
         photos=photos, overwrite=out.exists(),

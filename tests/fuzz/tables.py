@@ -14,17 +14,17 @@ import tomli_w
 from scan2sim.flows.pipelines.drive import Drive
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.pipelines.steps import STEPS
-from scan2sim.pipeline.importers import sweeps
 from scan2sim.pipeline.importers.clouds_and_photos import import_las
 from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.calibration import read_camera, read_extrinsics
 from scan2sim.pipeline.io.survey import read_survey, write_survey
 from scan2sim.pipeline.io.tile import read_tile
 from tests.fuzz.damage import TEXTS
 from tests.pipeline.importers.test_clouds_and_photos import cloud
 from tests.pipeline.io import test_gps as gps
 from tests.pipeline.io.test_tile import body, save
-from tests.pipeline.io.test_trajectory import UTM, made_up
+from tests.pipeline.io.test_trajectory import UTM, sample_trajectory
 
 Make: TypeAlias = Callable[[Path], list[Path]]
 Read: TypeAlias = Callable[[Path], object]
@@ -125,7 +125,7 @@ def trajectory(suffix: str) -> tuple[Make, Read]:
     """Trajectory file: writer and reader."""
 
     def make(folder: Path) -> list[Path]:
-        trajectory_io.write(folder / f"t{suffix}", made_up(), UTM)
+        trajectory_io.write(folder / f"t{suffix}", sample_trajectory(), UTM)
         return [folder / f"t{suffix}"]
 
     return make, lambda folder: trajectory_io.read(folder / f"t{suffix}", UTM)
@@ -141,7 +141,7 @@ def camera_file(folder: Path) -> list[Path]:
 
 def read_camera_file(folder: Path) -> object:
     """Read the camera and the extrinsics."""
-    return sweeps.read_camera(folder / "cameras.toml", 64, 48), sweeps.read_extrinsics(folder / "T.txt")
+    return read_camera(folder / "cameras.toml", 64, 48), read_extrinsics(folder / "T.txt")
 
 
 def track(name: str, text: str) -> tuple[Make, Read]:

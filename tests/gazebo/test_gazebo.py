@@ -48,6 +48,16 @@ def test_all_meshes_and_textures_load(world: Path) -> None:
         assert mesh["high"][: len(high)] == pytest.approx(high, abs=1e-3)
 
 
+def test_visuals_with_reflectance_load(tmp_path: Path) -> None:
+    scene = synthetic.scene(tmp_path, tiles=1)
+    world_formats.write(scene, ["gazebo"], tmp_path / "out", SceneParams(), silent)
+    model = (tmp_path / "out" / "models" / "tile0" / "model.sdf").read_text(encoding="utf-8")
+    assert model.count("<laser_retro>153</laser_retro>") == 2 and model.count("<laser_retro>51</laser_retro>") == 1
+    loaded = check_world(tmp_path / "out" / "town.sdf")
+    visuals = {Path(mesh["file"]).name for mesh in loaded["meshes"] if mesh["role"] == "visual"}
+    assert visuals == {"terrain.obj", "building.obj", "building_road_sign.obj"}
+
+
 def test_a_box_comes_to_rest_on_the_ground(world: Path) -> None:
     (body,) = check_world(world, ("box", (-4.7, 0.3, 1.5)))["bodies"]  # over a depression
     x, y, z = body["rest"]

@@ -46,8 +46,8 @@ def off(small: Mesh) -> float:
 
 
 def simplified(mesh: Mesh, name: str, target: int, *, keep_border: bool) -> Mesh:
-    if lacking := plugins.missing(decimation.__name__, name):
-        pytest.skip(f"needs {lacking}")
+    if missing := plugins.missing(decimation.__name__, name):
+        pytest.skip(f"needs {missing}")
     return decimation.simplify(mesh, target, keep_border=keep_border, backend=name)
 
 
@@ -75,8 +75,8 @@ def test_what_is_small_enough_stays(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_step_uses_the_library_that_is_set(tmp_path: Path, name: str) -> None:
-    if lacking := plugins.missing(decimation.__name__, name):
-        pytest.skip(f"needs {lacking}")
+    if missing := plugins.missing(decimation.__name__, name):
+        pytest.skip(f"needs {missing}")
     hills().save(tmp_path / "mesh.npz")
     (tmp_path / "out").mkdir()
     params = step_params(DecimateParams, target=10_000, backend=name)

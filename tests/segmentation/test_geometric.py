@@ -151,3 +151,45 @@ def test_classes_of_an_airborne_survey_agree_with_its_own(real_data: Path, tmp_p
         codes = [code for code, name in GROUPS.items() if name == group]
         predicted, true = np.isin(classification, codes), np.isin(truth, codes)
         assert (predicted & true).sum() / (predicted | true).sum() > bar, group
+
+
+def on_grid(xyz: np.ndarray, truth: np.ndarray, size: float, noise: float, how: str) -> tuple[np.ndarray, np.ndarray]:
+    """One noisy point, or the centre, of every voxel; voxels with several classes are left out of the truth (0)."""
+    rng = np.random.default_rng(1)
+    xyz = xyz + rng.normal(0, noise, xyz.shape)
+    cells, index = np.unique(np.floor(xyz / size).astype(np.int64), axis=0, return_inverse=True)
+    index = index.ravel()
+    first, low, high = (np.zeros(len(cells), np.int64) for _ in range(3))
+    order = rng.permutation(len(xyz))
+    first[index[order]] = order
+    low[:], high[:] = 255, 0
+    np.minimum.at(low, index, truth)
+    np.maximum.at(high, index, truth)
+    points = (cells + 0.5) * size if how == "centres" else xyz[first]
+    return points.astype(np.float32), np.where(low == high, truth[first], 0)
+
+
+@pytest.mark.parametrize(
+    ("size", "noise", "how"),
+    [(0.5, 0.0, "points"), (0.5, 0.1, "points"), (0.5, 0.0, "centres"), (0.2, 0.1, "points"), (0.1, 0.03, "points")],
+)
+@pytest.mark.parametrize("slope", [0.0, 0.06])
+def test_sparse_and_noisy_maps_keep_ground_and_buildings(size: float, noise: float, how: str, slope: float) -> None:
+    xyz, truth = on_grid(*street(slope), size, noise, how)
+    classification = classify(PointCloud(Frame(), xyz), spacing=size)
+    standing = ~np.isin(classification, (CODE["terrain"], CODE["unclassified"]))
+    assert standing[truth == CODE["terrain"]].mean() < 0.03
+    recall = recalls(classification, truth)
+    assert recall["ground"] > 0.95
+    if how == "points":
+        assert recall["building"] > 0.7
+        assert recall["plant"] > 0.6
+
+
+def test_low_walls_of_a_map_without_ground_are_no_thick_ground() -> None:
+    """Ground points were removed from the map: its columns are walls from 20 cm to 1 m, not noisy ground."""
+    rng = np.random.default_rng(0)
+    walls = [plane(rng, 6000, [0, y, 0.2], [60, 0, 0], [0, 0, 0.8]) for y in (0.0, 8.0)]
+    xyz = (np.concatenate(walls) + rng.normal(0, 0.05, (12_000, 3))).astype(np.float32)
+    ground = classify(PointCloud(Frame(), xyz), spacing=0.15) == CODE["terrain"]
+    assert (xyz[ground, 2] < 0.6).all() and ground.mean() < 0.5

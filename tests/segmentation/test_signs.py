@@ -146,7 +146,7 @@ def test_sign_visible_in_photos_is_complete(tmp_path: Path, known: list[SignPane
     (feature,) = json.loads(done.files["geojson"].read_text(encoding="utf-8"))["features"]
     row = feature["properties"]
     assert row["kind"] == "sign" and row["shape"] == "disc" and row["radius_m"] == 0.04
-    assert row["height_m"] == pytest.approx(3.5, abs=0.03) and row["plate_width_m"] == pytest.approx(0.6, abs=0.03)
+    assert row["height_m"] == pytest.approx(3.5, abs=0.03) and row["panel_width_m"] == pytest.approx(0.6, abs=0.03)
 
 
 @pytest.mark.parametrize("theirs", [False, True])

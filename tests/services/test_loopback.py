@@ -28,7 +28,7 @@ NOT_LOOPBACK = ("0.0.0.0", "::", "", "192.0.2.1", "10.0.0.1", "::ffff:192.0.2.1"
 def test_loopback_addresses_need_no_protection(host: str) -> None:
     assert is_loopback(host)
     require_protection(host, protected=False, options="--token FILE")
-    assert ServerParams(host=host).is_local() and AdapterParams(host=host).key is None
+    assert ServerParams(host=host).is_local()
 
 
 @pytest.mark.parametrize("host", NOT_LOOPBACK)
@@ -47,9 +47,8 @@ LISTENERS: list[tuple[type[Any], dict[str, object]]] = [
     (ServeParams, {}),
     (GatewayParams, {"certificates": SOME_FILE}),
     (StationParams, {"certificates": SOME_FILE, "gateway": "gate.example"}),
-    (AdapterParams, {}),
 ]
-"""Settings of every server with a `host` setting, and the settings that each requires."""
+"""Settings of every server with a web page or API, and the settings that each requires."""
 
 
 @pytest.mark.parametrize(("kind", "given"), LISTENERS, ids=lambda value: getattr(value, "__name__", ""))
@@ -58,13 +57,18 @@ def test_no_server_listens_unprotected_beyond_loopback(kind: type[Any], given: d
     kind(**given, host="127.0.0.1")
     with pytest.raises(SettingError, match="--key"):
         kind(**given, host=host)
-    for protection in (
-        ({"key": SOME_FILE},) if kind is AdapterParams else ({"token": SOME_FILE}, {"certificate": SOME_FILE})
-    ):
+    for protection in ({"token": SOME_FILE}, {"certificate": SOME_FILE}):
         assert kind(**given, host=host, **protection).host == host
-    if kind is not AdapterParams:
-        with pytest.raises(SettingError, match="--token FILE, or --certificate and --key"):
-            kind(**given, host=host, key=SOME_FILE)  # the key of TLS without its certificate
+    with pytest.raises(SettingError, match="--token FILE, or --certificate and --key"):
+        kind(**given, host=host, key=SOME_FILE)  # the key of TLS without its certificate
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "0.0.0.0", "192.0.2.1"])
+def test_adapter_requires_its_key_everywhere(host: str) -> None:
+    """On loopback as well: any program of the machine could drive the vehicle otherwise."""
+    with pytest.raises(SettingError, match="--key: is missing: any program"):
+        AdapterParams(host=host)
+    assert AdapterParams(host=host, key=SOME_FILE).host == host
 
 
 def command(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -80,7 +84,6 @@ def command(*words: object, **environment: str) -> subprocess.CompletedProcess[s
         ("orchestrate", "page", "packages", "--cluster", "edge"),
         ("teleop", "gateway", "certificates"),
         ("teleop", "station", "certificates", "gate.example"),
-        ("teleop", "translate", "ros"),
     ],
     ids=lambda words: " ".join(words[:2]),
 )
@@ -88,8 +91,13 @@ def test_commands_refuse_unprotected_hosts_before_starting(words: tuple[str, ...
     done = command(*words, "--host", "0.0.0.0")
     assert done.returncode == 2, done.stderr
     assert "other machines can reach 0.0.0.0" in done.stderr
-    assert ("Give --key FILE" if "translate" in words else "Give --token FILE") in done.stderr
+    assert "Give --token FILE" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_adapter_command_refuses_to_start_without_key() -> None:
+    done = command("teleop", "translate", "ros")
+    assert done.returncode == 2 and "--key: is missing" in done.stderr and "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("words", [("gateway",), ("station", "gate.example")], ids=lambda words: words[0])

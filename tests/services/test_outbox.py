@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -154,6 +155,13 @@ def test_duplicates_are_detected_per_producer_identity() -> None:
     ]  # fmt: skip
 
 
+def test_records_that_are_delivered_again_after_a_restart_are_duplicates() -> None:
+    before, after = Deduplicator(), Deduplicator()
+    assert before.is_new("a:1") and before.is_new("a:3") and before.is_new("b:1")
+    after.restore(json.loads(json.dumps(before.saved())))
+    assert [after.is_new(one) for one in ("a:1", "a:3", "b:1", "a:4", "c:1")] == [False, False, False, True, True]
+
+
 def test_flood_of_one_category_drops_only_its_own_records(tmp_path: Path) -> None:
     outbox = Outbox(tmp_path / "records", max_bytes=10_000)
     for number in range(5):
@@ -170,7 +178,7 @@ def test_flood_of_one_category_drops_only_its_own_records(tmp_path: Path) -> Non
 
 def test_outbox_file_is_locked_while_open(tmp_path: Path) -> None:
     first = Outbox(tmp_path / "records")
-    with pytest.raises(BusyError, match="--spool"):
+    with pytest.raises(BusyError, match="--outbox"):
         Outbox(tmp_path / "records")
     first.close()
     Outbox(tmp_path / "records").close()

@@ -17,6 +17,7 @@ from tests.present import present
 
 HEIGHT, FPS, SECONDS, SPEED = 128, 10.0, 3.6, 6.0
 WIDE, LOW, HIGH = 4.0, -2.0, 5.0  # metres: half a corridor's width, its floor and its ceiling
+PERSPECTIVE = Camera("pinhole", 320, 160, 180.0, 180.0, 159.5, 79.5)
 AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # camera to world: looks along +x, z up
 
 
@@ -78,3 +79,13 @@ def corridor(tmp_path_factory: pytest.TempPathFactory) -> Drive:
             yuv = cv2.cvtColor(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), cv2.COLOR_BGR2YUV_I420)
             encoder.add(yuv, float(time))
     return Drive(folder, camera, truth, greys)
+
+
+@pytest.fixture(scope="session")
+def turn() -> tuple[Trajectory, np.ndarray]:
+    """A path of 16 m that turns by 60 degrees, and what a perspective camera sees of it."""
+    heading = np.radians(60) * np.clip((np.arange(40) - 5) / 30, 0, 1)
+    steps = 0.4 * np.stack([np.cos(heading), 0.15 * np.sin(heading), 0 * heading], axis=1)
+    rotations = exp_so3(np.stack([0 * heading, 0 * heading, heading], axis=1)) @ AHEAD
+    truth = Trajectory(np.arange(40) / 10, np.cumsum(steps, axis=0), rotations)
+    return truth, film(PERSPECTIVE, truth)

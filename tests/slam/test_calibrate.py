@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from scan2sim.pipeline.camera.lens import changed_lens
 from scan2sim.pipeline.camera.models import inside, project_exactly
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import Camera
 from scan2sim.slam.calibration.calibrate import calibrated, calibrated_from_scratch
 from scan2sim.slam.calibration.camera import EstimatedCamera, estimated_camera
-from scan2sim.slam.lens import changed_lens
 from scan2sim.slam.odometry.track_log import TrackLog
 from scan2sim.slam.video import open_video
 from tests.fakes.slam_drive import LENS, drive, scatter
@@ -36,15 +36,15 @@ def seen(camera: Camera, turn: float = 0.3) -> TrackLog:
 
 
 @pytest.mark.slow
-def test_a_lens_of_which_nothing_is_known_is_found_in_a_turn() -> None:
-    cropped = changed_lens(LENS, np.array([0, 0.15, 0, 0]))
+def test_unknown_intrinsics_are_calibrated_in_a_turn() -> None:
+    cropped = changed_lens(LENS, np.array([0, 0.15, 0, 0, 0]))
     known = present(calibrated_from_scratch(seen(cropped)))
     assert abs(known.camera.fx / LENS.fx - 1) < 0.02
     assert abs(known.camera.cx - cropped.cx) < 10
 
 
-def test_a_lens_is_mended_over_the_whole_drive_and_the_next_command_is_told_how() -> None:
-    known = present(calibrated(seen(LENS), changed_lens(LENS, np.array([-0.1, 0, 0, 0]))))
+def test_calibration_over_the_whole_drive_suggests_options() -> None:
+    known = present(calibrated(seen(LENS), changed_lens(LENS, np.array([-0.1, 0, 0, 0, 0]))))
     facts = EstimatedCamera.of(known, "self-calibration").metrics()["lens"]
     assert abs(facts["focal"] - LENS.fx) < 3 * facts["focal_sigma"] < 60
     assert facts["options"].startswith(f"--focal {facts['focal']:.2f} --centre ")

@@ -48,9 +48,7 @@ def done(corridor: Drive, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     return out, result.output
 
 
-def test_it_writes_the_trajectory_in_all_formats_and_says_that_there_is_no_gps(
-    done: tuple[Path, str], corridor: Drive
-) -> None:
+def test_trajectory_is_written_in_all_formats_and_missing_gps_reported(done: tuple[Path, str], corridor: Drive) -> None:
     out, said = done
     found = trajectory_io.read(out / "trajectory.csv")
     assert len(found) == len(corridor.truth)
@@ -62,7 +60,7 @@ def test_it_writes_the_trajectory_in_all_formats_and_says_that_there_is_no_gps(
     assert list((out / "steps").rglob("state*")) == []
 
 
-def test_a_path_that_was_mostly_guessed_ends_with_a_code_of_its_own(corridor: Drive, tmp_path: Path) -> None:
+def test_mostly_unsure_path_has_its_own_exit_code(corridor: Drive, tmp_path: Path) -> None:
     frames = tmp_path / "frames"
     frames.mkdir()
     for k, grey in enumerate(corridor.greys[:12]):
@@ -70,9 +68,12 @@ def test_a_path_that_was_mostly_guessed_ends_with_a_code_of_its_own(corridor: Dr
     with pytest.raises(LowConfidenceError, match="of the poses are extrapolated"):
         command("slam", frames, "--out", tmp_path / "out")
     assert (tmp_path / "out" / "trajectory.csv").is_file() and exit_code(LowConfidenceError("", "", "")) == 9
+    losses = json.loads((tmp_path / "out" / "slam.json").read_text(encoding="utf-8"))["losses"]
+    assert losses[0]["frame"] == "002.png" and losses[0]["measured"] < losses[0]["needed"]
+    assert "tracked features" in losses[0]["failed"] and losses[0]["resumed"] is None
 
 
-def test_what_was_tracked_is_kept_when_only_its_placing_changes(corridor: Drive, tmp_path: Path) -> None:
+def test_changed_georeferencing_reuses_cached_tracking(corridor: Drive, tmp_path: Path) -> None:
     options = ("slam", corridor.folder / "video.mp4", "--out", tmp_path, "--set", "track.count=300", "--until", "0.5")
     command(*options, "--view")
     first = {path: path.stat().st_mtime_ns for path in tmp_path.glob("steps/track/*/*")}
@@ -100,7 +101,7 @@ def test_evaluate_prints_the_missions_errors(done: tuple[Path, str], corridor: D
 
 
 @pytest.mark.parametrize("features", ["corners", "orb"])
-def test_an_interrupted_run_goes_on_and_ends_the_same(
+def test_resumed_run_has_the_same_result(
     corridor: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, features: str
 ) -> None:
     monkeypatch.setattr(tracking, "CHECKPOINT_INTERVAL_S", 0.0)
@@ -147,7 +148,7 @@ def damages(path: Path) -> dict[str, bytes]:
     }  # fmt: skip
 
 
-def test_a_state_that_is_damaged_or_foreign_is_not_run_and_the_run_begins_anew(
+def test_damaged_or_foreign_checkpoint_is_ignored(
     corridor: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tracking, "CHECKPOINT_INTERVAL_S", 0.0)
@@ -165,9 +166,7 @@ def test_a_state_that_is_damaged_or_foreign_is_not_run_and_the_run_begins_anew(
         assert again.names == whole.names and not (tmp_path / "trap").exists(), name
 
 
-def test_an_interrupted_run_goes_on_only_from_what_the_same_code_made_of_the_same_contents(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_checkpoint_of_other_code_or_other_input_is_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     video, mask = tmp_path / "video.mp4", tmp_path / "mask.png"
 
     def mark(**changes: object) -> str:
@@ -214,7 +213,7 @@ def test_bad_input_is_named(
     assert text in str(error.value)
 
 
-def test_a_video_that_ends_early_and_frames_of_another_size_are_told(corridor: Drive, tmp_path: Path) -> None:
+def test_truncated_video_and_changed_frame_size_are_reported(corridor: Drive, tmp_path: Path) -> None:
     for i in range(12):
         size = (256, 128) if i < 8 else (128, 64)
         cv2.imwrite(str(tmp_path / f"{i:03d}.png"), cv2.resize(corridor.greys[i], size))
@@ -226,7 +225,7 @@ def test_a_video_that_ends_early_and_frames_of_another_size_are_told(corridor: D
         list(open_video(tmp_path).frames())
 
 
-def test_half_a_video_file_is_read_as_far_as_it_goes(corridor: Drive, tmp_path: Path) -> None:
+def test_truncated_video_is_read_up_to_its_end(corridor: Drive, tmp_path: Path) -> None:
     av = pytest.importorskip("av")
     assert av
     whole = tmp_path / "whole.ts"
@@ -243,7 +242,7 @@ def test_half_a_video_file_is_read_as_far_as_it_goes(corridor: Drive, tmp_path: 
     shutil.rmtree(tmp_path, ignore_errors=True)
 
 
-def test_frames_out_of_order_are_left_out_and_told(corridor: Drive, tmp_path: Path) -> None:
+def test_frames_out_of_order_are_skipped_and_reported(corridor: Drive, tmp_path: Path) -> None:
     for i in range(4):
         cv2.imwrite(str(tmp_path / f"{i}.png"), corridor.greys[i])
     (tmp_path / "times.txt").write_text("0\n0.1\n0.05\n0.2\n", encoding="utf-8")

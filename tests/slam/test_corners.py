@@ -80,7 +80,7 @@ def test_corners_are_followed_across_seam_and_poles(axis: list[int]) -> None:
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(0.45, 0), (0.6, 30), (1.3, -20)])
-def test_a_change_of_exposure_is_told_and_loses_no_corner(gain: float, offset: float) -> None:
+def test_exposure_change_is_estimated_and_no_corner_lost(gain: float, offset: float) -> None:
     world, views = sphere(), VirtualViews(CAMERA)
     pictures = [frame(world, exp_so3([0, 0.04 * k, 0])) // 2 + 60 for k in range(2)]
     lit = np.clip(gain * pictures[1].astype(np.float64) + offset, 0, 255).astype(np.uint8)
@@ -94,13 +94,13 @@ def test_a_change_of_exposure_is_told_and_loses_no_corner(gain: float, offset: f
         first = tracker.images[0]
         tracker.track(second)
         followed.append(len(tracker.tracks))
-    told = exposure.estimate(first, tracker.images[0], there, now)
-    assert told.gain == pytest.approx(gain, rel=0.03) and told.offset == pytest.approx(offset, abs=4)
+    estimated = exposure.estimate(first, tracker.images[0], there, now)
+    assert estimated.gain == pytest.approx(gain, rel=0.03) and estimated.offset == pytest.approx(offset, abs=4)
     assert followed[1] > 0.95 * followed[0]
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.0, 12), (0.9, 0), (1.1, 0)])
-def test_a_change_of_light_that_is_told_wrongly_moves_no_corner(gain: float, offset: float) -> None:
+def test_wrong_exposure_estimate_does_not_shift_corners(gain: float, offset: float) -> None:
     first = frame(sphere(), np.eye(3))
     second = np.clip(gain * (first.astype(np.float64) // 2 + 60) + offset, 0, 255).astype(np.uint8)
     first = first // 2 + 60
@@ -113,7 +113,7 @@ def test_a_change_of_light_that_is_told_wrongly_moves_no_corner(gain: float, off
     assert off(exposure.subtract_local_mean(first), exposure.subtract_local_mean(second)) < 0.3 * off(first, second)
 
 
-def test_nothing_is_found_or_followed_on_the_car() -> None:
+def test_no_features_on_the_masked_ego_vehicle() -> None:
     world, views = sphere(), VirtualViews(CAMERA)
     mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
     mask[300:] = 0
@@ -147,7 +147,7 @@ def test_a_relative_pose_is_found_among_outliers() -> None:
     assert relative_pose(a, rng.permutation(b), threshold=np.radians(0.2), rng=rng) is None
 
 
-def test_a_corner_stays_on_what_it_was_where_the_picture_turns() -> None:
+def test_corners_do_not_drift_in_rotating_images() -> None:
     """Followed from each frame to the next alone, a cap's corners drift by .3 degrees while the car turns by 30."""
     world, views = sphere(), VirtualViews(CAMERA)
     tracker = CornerTracker(views, None, 500)

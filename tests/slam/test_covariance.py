@@ -8,7 +8,7 @@ import pytest
 from scan2sim.slam.global_map.covariance import covariances
 from scan2sim.slam.global_map.map_file import MapCheckpoint
 from scan2sim.slam.mapping.marginalization import Information, MotionSigma
-from tests.fakes.slam_drive import Follower, drive, inside, off, run, scatter
+from tests.fakes.slam_drive import Follower, drive, inside, position_errors, run, scatter
 
 
 def test_ellipsoids_hold_errors_and_none_is_a_point() -> None:
@@ -18,7 +18,7 @@ def test_ellipsoids_hold_errors_and_none_is_a_point() -> None:
         odometry = run(times, Follower(poses, scatter(poses, seed=seed), seed=seed))
         known = covariances(MapCheckpoint.of(odometry, ()), None)
         assert (np.linalg.eigvalsh(known) > 0).all()
-        held.append(inside(off(odometry, poses), known).mean())
+        held.append(inside(position_errors(odometry, poses), known).mean())
     assert np.mean(held) > 0.85
     assert np.degrees(odometry.map.information.noise(0.0)) == pytest.approx(0.03, rel=0.1)
 
@@ -33,7 +33,7 @@ def test_a_gap_stays_uncertain_after_it() -> None:
     assert all(p.unsure for p in odometry.placed[100:])  # nothing ties what is seen afterwards to what was seen before
 
 
-def test_a_band_is_inverted_as_a_whole_matrix_is() -> None:
+def test_band_inverse_equals_the_dense_inverse() -> None:
     rng, count = np.random.default_rng(0), 9
     known, whole = Information(4), np.zeros((6 * count, 6 * count))
     for first in range(count - 3):

@@ -5,22 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.core.types import Camera, Trajectory
-from scan2sim.slam.geometry import exp_so3
+from scan2sim.pipeline.core.types import Trajectory
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
-from tests.slam.conftest import AHEAD, film
-
-WIDE = Camera("pinhole", 320, 160, 180.0, 180.0, 159.5, 79.5)
-
-
-@pytest.fixture(scope="module")
-def turn() -> tuple[Trajectory, np.ndarray]:
-    """A path of 16 m that turns by 60 degrees, and what a perspective camera sees of it."""
-    heading = np.radians(60) * np.clip((np.arange(40) - 5) / 30, 0, 1)
-    steps = 0.4 * np.stack([np.cos(heading), 0.15 * np.sin(heading), 0 * heading], axis=1)
-    rotations = exp_so3(np.stack([0 * heading, 0 * heading, heading], axis=1)) @ AHEAD
-    truth = Trajectory(np.arange(40) / 10, np.cumsum(steps, axis=0), rotations)
-    return truth, film(WIDE, truth)
+from tests.slam.conftest import PERSPECTIVE
 
 
 @pytest.mark.parametrize(
@@ -28,11 +15,11 @@ def turn() -> tuple[Trajectory, np.ndarray]:
     [list(range(40)), [*range(10), *range(25, 40)], list(range(0, 40, 5))],
     ids=("whole", "fifteen cut out", "every fifth"),
 )
-def test_what_is_wrong_after_frames_that_are_missing_is_marked(
+def test_wrong_poses_after_missing_frames_are_marked_unsure(
     turn: tuple[Trajectory, np.ndarray], rows: list[int]
 ) -> None:
     truth, greys = turn
-    odometry = Odometry(WIDE, OdometryParams())
+    odometry = Odometry(PERSPECTIVE, OdometryParams())
     for at, row in enumerate(rows):  # as if they followed each other
         odometry.add(at / 10, greys[row])
     found = np.stack([odometry.pose_of(placed)[:3, 3] for placed in odometry.placed])

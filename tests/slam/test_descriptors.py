@@ -104,7 +104,7 @@ def check_poles_and_seam(name: str, axes: tuple[tuple[int, int, int], ...], weig
 
 
 @pytest.mark.parametrize(("axis", "step"), [((1.0, 0.0, 0.0), 1.0), ((0.0, 1.0, 0.0), 5.0)])
-def test_tracks_go_on_across_seam_and_poles(axis: tuple[float, float, float], step: float) -> None:
+def test_tracks_continue_across_seam_and_poles(axis: tuple[float, float, float], step: float) -> None:
     """What was at the horizon comes into the views of the poles, what was at a pole passes it, or the seam."""
     turns = [exp_so3(np.radians(step * i) * np.array(axis)) for i in range(6)]
     camera = Camera("equirectangular", 640, 320)

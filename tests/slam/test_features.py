@@ -448,7 +448,7 @@ def test_damaged_missing_and_dangerous_files(tmp_path: Path) -> None:
     assert not mark.exists()
 
 
-def test_what_is_told_of_weights(tmp_path: Path) -> None:
+def test_description_names_the_weights_and_their_licence(tmp_path: Path) -> None:
     torch, _ = pytest.importorskip("torch"), pytest.importorskip("transformers")
     file = saved(tmp_path / "superpoint_v1.pth", SUPERPOINT)
     backend = features.named("superpoint", file, device="cpu")

@@ -12,7 +12,7 @@ from scan2sim.slam.global_map.map_file import MapCheckpoint
 from scan2sim.slam.global_map.sparse_model import sparse_points
 from scan2sim.slam.mapping.cross_validation import compare_paths
 from scan2sim.slam.mapping.local_map import HELD_OUT_EVERY
-from tests.fakes.slam_drive import Narrow, ate, drive, run, scatter
+from tests.fakes.slam_drive import PerspectiveFollower, ate, drive, run, scatter
 
 pytest.importorskip("pycolmap")
 
@@ -21,7 +21,7 @@ pytest.importorskip("pycolmap")
 def winding() -> tuple[MapCheckpoint, np.ndarray]:
     """What a drive of a perspective camera has left, and the truth."""
     times, poses = drive(6, turn=0.15)
-    found = run(times, Narrow(poses, scatter(poses, 12000, 1), seed=1), keep=True, parallax=1.0)
+    found = run(times, PerspectiveFollower(poses, scatter(poses, 12000, 1), seed=1), keep=True, parallax=1.0)
     return MapCheckpoint.of(found, []), poses[:, :3, 3]
 
 
@@ -37,7 +37,7 @@ def bend(mapped: MapCheckpoint) -> np.ndarray:
     return poses
 
 
-def test_witnesses_have_no_say_in_the_map_and_know_the_better_of_two_paths(
+def test_held_out_observations_identify_the_better_path(
     winding: tuple[MapCheckpoint, np.ndarray],
 ) -> None:
     mapped, _ = winding
@@ -60,11 +60,11 @@ def test_a_path_that_drifted_is_adjusted(winding: tuple[MapCheckpoint, np.ndarra
     after = error(mapped, truth)
     for keyframe, pose in zip(mapped.map.keyframes, straight, strict=True):
         keyframe.T_world_cam = pose
-    assert metrics["adjustment_kept"] and metrics["witnesses_gain"] > 0
+    assert metrics["adjustment_kept"] and metrics["held_out_gain"] > 0
     assert after < before
 
 
-def test_an_adjustment_that_fits_worse_changes_nothing(
+def test_worse_adjustment_is_rejected(
     winding: tuple[MapCheckpoint, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mapped, _ = winding
@@ -72,6 +72,6 @@ def test_an_adjustment_that_fits_worse_changes_nothing(
     wrong = module.Adjusted(points, bend(mapped), points.xyz + 1, 0.2, 0.1)
     monkeypatch.setattr(module, "bundle_adjust", lambda _: wrong)
     metrics = adjust(mapped)
-    assert not metrics["adjustment_kept"] and metrics["witnesses_gain"] < 0
+    assert not metrics["adjustment_kept"] and metrics["held_out_gain"] < 0
     assert np.array_equal(mapped.map.poses(list(range(len(before)))), before)
     assert np.array_equal(sparse_points(mapped).xyz, points.xyz)

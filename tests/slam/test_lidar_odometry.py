@@ -104,7 +104,7 @@ def matched(sweeps: Path, out: Path, **how: Any) -> MatchedSweeps:
     return MatchedSweeps.load(done.files["matched"])
 
 
-def test_sweeps_tell_where_they_were_taken_and_how_surely(sweeps: Path, tmp_path: Path) -> None:
+def test_registration_estimates_sweep_poses_and_covariances(sweeps: Path, tmp_path: Path) -> None:
     found = matched(sweeps, tmp_path, deskew="times")
     assert off(found.poses, found.times).max() < 0.25 and found.sure.all() and found.overlap.min() > 0.6
     kitti = matched(sweeps, tmp_path / "kitti", deskew="kitti")
@@ -113,7 +113,7 @@ def test_sweeps_tell_where_they_were_taken_and_how_surely(sweeps: Path, tmp_path
     assert off(rigid.poses, rigid.times).max() > off(found.poses, found.times).max()
 
 
-def test_an_interrupted_run_goes_on(sweeps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_run_resumes(sweeps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = matched(sweeps, tmp_path / "whole", deskew="times")
     monkeypatch.setattr(step, "CHECKPOINT_INTERVAL_S", 0.0)
     seen: list[float] = []
@@ -156,7 +156,7 @@ def test_sweeps_without_a_trajectory_become_a_tile(sweeps: Path, tmp_path: Path)
     assert again.exit_code == 0 and (tmp_path / "b-path").is_dir()
 
 
-def test_what_cannot_be_matched_is_told(sweeps: Path, tmp_path: Path) -> None:
+def test_unmatched_sweeps_are_reported(sweeps: Path, tmp_path: Path) -> None:
     def run(folder: Path, *options: str) -> str:
         result = CliRunner().invoke(app, ["import", "sweeps", str(folder), "--out", str(tmp_path / "tile"), *options])
         assert isinstance(result.exception, ScanError) and not (tmp_path / "tile").exists(), result.output
@@ -186,7 +186,7 @@ def test_what_cannot_be_matched_is_told(sweeps: Path, tmp_path: Path) -> None:
     assert "time isn't later" in run(far, "--times", str(names))
 
 
-def test_an_empty_sweep_is_passed_over(sweeps: Path, tmp_path: Path) -> None:
+def test_empty_sweep_is_skipped(sweeps: Path, tmp_path: Path) -> None:
     folder = tmp_path / "some"
     folder.mkdir()
     for i, file in enumerate(sorted(sweeps.iterdir())[:8]):
@@ -205,13 +205,13 @@ def test_results_that_are_none_are_refused(tmp_path: Path) -> None:
         MatchedSweeps.load(tmp_path / "matched.npz")
 
 
-def test_one_sweep_alone_stands_where_it_is() -> None:
+def test_single_sweep_has_the_identity_pose() -> None:
     odometry = LidarOdometry()
     xyz, since = sweep(0.0, np.random.default_rng(0))
     odometry.add(0.0, xyz.astype(np.float32), since)
     assert np.array_equal(odometry.matched().poses, [np.eye(4)]) and len(odometry.matched().covariance) == 0
 
 
-def test_a_step_says_what_is_missing(tmp_path: Path) -> None:
+def test_single_sweep_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="holds only one sweep"):
         matched(write(tmp_path / "one", 1), tmp_path)

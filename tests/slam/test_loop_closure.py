@@ -23,7 +23,7 @@ def drifted(truth: F64, turn: float = 0.002, stretch: float = 1.01) -> F64:
     return np.stack(out)
 
 
-def test_a_loop_takes_most_of_the_drift_away_and_a_false_one_doesnt_harm() -> None:
+def test_loop_closure_reduces_drift_and_false_loops_are_rejected() -> None:
     truth = ring()
     path = drifted(truth)
     way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path[:, :3, 3], axis=0), axis=1))])
@@ -38,7 +38,7 @@ def test_a_loop_takes_most_of_the_drift_away_and_a_false_one_doesnt_harm() -> No
     assert off(both).max() < 0.5 * off(path).max()
 
 
-def test_a_panorama_is_known_at_any_heading() -> None:
+def test_place_recognition_of_panoramas_is_independent_of_heading() -> None:
     rng = np.random.default_rng(0)
     import cv2
 

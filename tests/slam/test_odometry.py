@@ -9,7 +9,7 @@ from scan2sim.pipeline.geometry.similarity import umeyama
 from scan2sim.slam.global_map.map_file import MapCheckpoint
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 from scan2sim.slam.trajectory.align import aligned_trajectory
-from tests.fakes.slam_drive import LENS, Follower, Narrow, drive, gps_of, run, scatter
+from tests.fakes.slam_drive import LENS, Follower, PerspectiveFollower, drive, gps_of, run, scatter
 from tests.present import present
 from tests.slam.conftest import Drive
 
@@ -35,7 +35,7 @@ def test_a_drive_is_found_up_to_scale_and_a_standing_car_stands() -> None:
     assert not any(p.unsure for p in odometry.placed)
 
 
-def test_a_car_that_stands_before_it_drives_begins_where_it_stood(corridor: Drive) -> None:
+def test_trajectory_starts_where_the_car_stood_before_driving(corridor: Drive) -> None:
     still, first = 20, corridor.greys[0]
     odometry = Odometry(corridor.camera, OdometryParams(count=400))
     for frame, grey in enumerate([*[first] * still, *corridor.greys[1:]]):
@@ -61,9 +61,9 @@ def test_light_that_flickers_or_falls_costs_at_most_a_fifth(corridor: Drive) -> 
     assert max(off) < 1.2 * off[0]
 
 
-def test_a_perspective_cameras_narrow_view_is_enough() -> None:
+def test_odometry_works_with_a_perspective_camera() -> None:
     times, poses = drive(10)
-    odometry = run(times, Narrow(poses, scatter(poses, 20000)), parallax=1.0)
+    odometry = run(times, PerspectiveFollower(poses, scatter(poses, 20000)), parallax=1.0)
     assert error(positions(odometry), poses) < 0.6
 
 
@@ -82,12 +82,12 @@ def test_gps_ties_the_scale_and_places_the_path() -> None:
 def test_adjacent_gps_distances_work_too() -> None:
     times, poses = drive(15)
     gps = gps_of(times, poses, sigma=0.3)
-    odometry = run(times, Follower(poses, scatter(poses)), gps=gps, gps_chords="adjacent")
+    odometry = run(times, Follower(poses, scatter(poses)), gps=gps, gps_distances="adjacent")
     assert error(positions(odometry), poses) < 1.0
 
 
 @pytest.mark.parametrize("seconds", [0.3, 2.0])
-def test_a_black_stretch_is_bridged_marked_and_never_restarts_at_the_origin(seconds: float) -> None:
+def test_black_frames_are_dead_reckoned_and_marked_unsure(seconds: float) -> None:
     times, poses = drive(20)
     gps = gps_of(times, poses, sigma=0.2)
     said: list[str] = []
@@ -111,7 +111,7 @@ def test_a_black_stretch_is_bridged_marked_and_never_restarts_at_the_origin(seco
     assert seconds < 1 or sigma[-1] > before + 0.3
 
 
-def test_a_bus_that_covers_all_is_noticed_by_gps() -> None:
+def test_gps_rejects_poses_that_follow_a_bus_covering_the_view() -> None:
     times, poses = drive(20)
     gps = gps_of(times, poses, sigma=0.2)
     said: list[str] = []
@@ -128,6 +128,9 @@ def test_a_bus_that_covers_all_is_noticed_by_gps() -> None:
     trajectory, _ = aligned_trajectory(MapCheckpoint.of(odometry, ()), gps)
     off = np.linalg.norm(trajectory.positions - poses[:, :3, 3], axis=1)
     assert "lost" in said[0] and 10 < float(said[0].split()[0]) < 12
+    loss = odometry.losses[0]
+    assert "where GPS measured" in loss.failure.what and loss.failure.measured < present(loss.failure.needed)
+    assert loss.frame == round(10 * loss.time) and present(loss.resumed) > loss.time
     unsure = present(trajectory.unsure)
     assert unsure[(times >= 12) & (times < 14)].all() and not unsure[-1]
     assert off.max() < 20  # of the 36 m that weren't seen
@@ -151,16 +154,16 @@ def test_moving_cars_are_left_out() -> None:
     assert error(positions(run(times, Traffic(poses, still))), poses) < 0.6
 
 
-def test_what_left_the_window_is_forgotten_unless_it_is_to_be_kept() -> None:
+def test_marginalized_points_are_stored_only_with_keep() -> None:
     times, poses = drive(25)
     odometry = run(times, Follower(poses, scatter(poses)), window=5, fixed_keyframes=2)
     held = [len(k.ids) > 0 for k in odometry.map.keyframes]
     assert len(held) > 12 and sum(held) <= 8 and not odometry.map.retired
 
 
-def test_a_perspective_map_begins_straight_ahead_however_far_keyframes_are_to_be_apart() -> None:
+def test_perspective_map_initializes_when_driving_straight_with_large_parallax() -> None:
     times, poses = drive(5, turn=0.0)
-    tracker = Narrow(poses, scatter(poses, 8000), noise=np.radians(0.01))
+    tracker = PerspectiveFollower(poses, scatter(poses, 8000), noise=np.radians(0.01))
     odometry = Odometry(LENS, OdometryParams(parallax=20.0), tracker=tracker)
     for time in times:
         odometry.add(float(time), np.zeros((4, 8), np.uint8))

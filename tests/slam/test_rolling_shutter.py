@@ -53,7 +53,7 @@ def test_both_are_estimated(readout: float, offset: float) -> None:
     assert odometry.map.shared[1] == pytest.approx(offset, abs=0.001)
 
 
-def test_what_is_estimated_costs_no_accuracy() -> None:
+def test_estimating_rolling_shutter_does_not_reduce_accuracy() -> None:
     times, poses = drive(12, speed=12, turn=0.1)
 
     def error(**wanted: Any) -> float:

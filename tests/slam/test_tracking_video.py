@@ -90,7 +90,7 @@ def test_being_lost_is_shown_and_stays_on_the_map_in_red(lost: tuple[Odometry, l
     assert near(pictures[-1][:top], UNSURE_BGR) == 0 and near(pictures[-1][top:], UNSURE_BGR) > 20
 
 
-def test_a_recorder_may_begin_in_the_middle(lost: tuple[Odometry, list[np.ndarray]]) -> None:
+def test_recording_can_start_at_any_frame(lost: tuple[Odometry, list[np.ndarray]]) -> None:
     odometry, pictures = lost
     late = Recorder(Path("nowhere.mp4"), 10.0).draw(odometry, np.zeros((4, 8), np.uint8))
     top = late.shape[1] // 2

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scan2sim.pipeline.camera.depth_map import depth_map, scene
 from scan2sim.pipeline.camera.renderer import Body, Renderer, look_at, pinhole
 from scan2sim.pipeline.core.step import Done, silent
-from scan2sim.pipeline.core.types import F64, U8, Camera, Frame, Mesh, PointCloud, View
+from scan2sim.pipeline.core.types import F32, F64, U8, Camera, Frame, Mesh, PointCloud, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.texturing.exposure import EXPOSURE
 from scan2sim.texturing.photo_consistency import PHOTO_CONSISTENCY
@@ -95,7 +95,9 @@ class Street:
     views: list[View] = field(default_factory=list)
     held_out: tuple[bool, ...] = ()
     clouds: dict[str, PointCloud] = field(default_factory=dict)
+    slim: F32 = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     files: dict[str, Path] = field(default_factory=dict)
+    labels: Path | None = None
     texel: float = 0.02
     page_size: int = 4096
     runs: int = 0
@@ -126,11 +128,12 @@ class Street:
         self.mesh.save(out / "in.npz")
         settings = UnwrapParams(backend="xatlas", texel=self.texel, page_size=self.page_size)
         flat = unwrap({"mesh": out / "in.npz"}, settings, out, silent)
-        occluders = scene(self.occluders)
+        occluders = replace(scene(self.occluders), slim=self.slim, slim_radius=0.05)
         for i, view in enumerate(self.views):
             np.save(out / "depth" / f"{i}.npy", depth_map(view.camera, view.T_world_cam, occluders).range)
         views_io.save(out / "views.json", self.views, self.held_out)
         inputs = {**flat.files, "views": out / "views.json", "depth": out / "depth"}
+        inputs |= {"labels": self.labels} if self.labels else {}
         warnings: list[str] = []
         for step, given in ((EXPOSURE, exposure), (PHOTO_CONSISTENCY, agreement), (VIEW_SELECTION, choose)):
             done = step.run(inputs, step_params(step.params, **(given or {})), out, silent)

@@ -13,7 +13,8 @@ from scan2sim.pipeline.camera.projection import MAX_SLOPE, SLOPE_BIAS_FACTOR
 from scan2sim.pipeline.core.types import F32, F64, Camera
 from scan2sim.texturing.bake import blend_numba
 from scan2sim.texturing.bake.blend_numba import OVEREXPOSED_LEVEL, UNRELIABLE_WEIGHT
-from scan2sim.texturing.photo_cache import SRGB_OFFSET
+from scan2sim.texturing.exposure_model import OVEREXPOSED_POWER
+from scan2sim.texturing.photo_cache import SRGB_GAMMA, SRGB_OFFSET
 
 
 def accumulate(
@@ -79,7 +80,8 @@ def accumulate(
     border_distance = np.min(border[:2] if camera.model == "equirectangular" else border, axis=0)
     feather = 0.02 + 0.98 * np.minimum(1, border_distance / settings.feather)
     weight = (cos / equivalent_distance) ** (2 * settings.power) * feather
-    weight = np.where(rgb.max(axis=1) > OVEREXPOSED_LEVEL, UNRELIABLE_WEIGHT, 1) * weight
+    overexposed = min(1.0, float(np.exp(OVEREXPOSED_POWER * SRGB_GAMMA * photo.exposure[:3].mean())))
+    weight = np.where(rgb.max(axis=1) > OVEREXPOSED_LEVEL, overexposed, 1) * weight
     beside_edge = distance > nearest(occlusion.around, uv, camera) + settings.bias + (occlusion.radius + 0.5) * lean
     low = np.where(beside_edge, UNRELIABLE_WEIGHT, 1) * weight
     beside_edge = distance > nearest(occlusion.near, uv, camera) + settings.bias + 1.5 * lean

@@ -57,7 +57,7 @@ def test_texels_have_the_colour_of_the_photo(size: int, warp: tuple[float, float
     settings = blend_numba.BlendSettings(bias=0.1, power=1.0, feather=4.0, min_cos=0.1, band=-1)
     rows.add(np.arange(2), np.zeros((2, 3), np.float32), source, settings)
     rgb, seen = np.zeros((size, size, 3), np.uint8), np.zeros((size, size), np.uint8)
-    rows.resolve(rgb, seen)
+    rows.resolve(rgb, seen, 255.0)
     assert (seen == 255).all()
 
     row, column = np.mgrid[:size, :size] + 0.5

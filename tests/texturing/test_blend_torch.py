@@ -52,7 +52,7 @@ def test_torch_blends_equally(name: str, band: int) -> None:
     for rows in (blend_numba.NumbaRowBlender(page_faces), TorchRowBlender(page_faces, "cpu")):
         rgb, seen = np.zeros((*page_faces.owner.shape, 3), np.uint8), np.zeros(page_faces.owner.shape, np.uint8)
         texels = rows.add(faces, share, source, settings)
-        rows.resolve(rgb, seen)
+        rows.resolve(rgb, seen, 340.0)
         assert texels == (seen == 255).sum() > 500
         pages.append(rgb.astype(int))
     assert abs(pages[0] - pages[1]).max() <= 1

@@ -10,9 +10,10 @@ import pytest
 from scan2sim.pipeline.camera.depth_map import depth_map, scene
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.step import silent
-from scan2sim.pipeline.core.types import F64, U8
+from scan2sim.pipeline.core.types import F64, U8, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.texturing.exposure import ExposureParams, exposure
+from scan2sim.texturing.exposure_model import compressed, overexposed_weight
 from scan2sim.texturing.photo_cache import Exposures, camera_of
 from tests.texturing.corner import CAMERAS, POSES, Street, photograph
 
@@ -70,6 +71,36 @@ def test_exposures_and_tints_are_estimated(exposed_street: Street, tmp_path: Pat
 def test_mean_brightness_is_unchanged(exposed_street: Street, tmp_path: Path) -> None:
     found, _ = solved(exposed_street, tmp_path / "x")
     assert abs(stops_of(found, exposed_street).mean()) < 0.05
+
+
+def test_own_exposures_are_kept_as_far_as_wanted(exposed_street: Street, tmp_path: Path) -> None:
+    shares = (0.0, 0.3, 10.0)
+    found = [solved(exposed_street, tmp_path / str(share), own_exposure=share)[0] for share in shares]
+    spread = [np.ptp(stops_of(one, exposed_street).mean(axis=1)) for one in found]
+    assert spread[0] == pytest.approx(np.ptp(STOPS), abs=0.08)
+    assert 0.2 * spread[0] < spread[1] < 0.9 * spread[0] and spread[2] < 0.15 * spread[0]
+
+
+def test_white_point_follows_from_the_largest_gain() -> None:
+    assert Exposures().white == Exposures({"dark": (0.5, 0.6, 0.5)}).white == 255
+    brightened = Exposures({"a": (1.0, 1.0, 1.0), "b": (2.0, 3.0, 2.0)})
+    assert brightened.white == pytest.approx((243 + 14.025) * 3 ** (1 / 2.4) - 14.025)
+
+
+def test_tone_curve_keeps_highlights_and_everything_below() -> None:
+    levels = np.linspace(0, 400, 401)
+    by_white = {white: np.array([compressed(level, white) for level in levels]) for white in (255.0, 320.0, 400.0)}
+    assert np.allclose(by_white[255.0], levels)
+    for white, curve in by_white.items():
+        assert np.allclose(curve[levels <= 230], levels[levels <= 230]) and (np.diff(curve) > 0).all()
+        assert curve[levels == white] == pytest.approx(255)
+
+
+def test_overexposed_pixels_count_less_in_darkened_photos() -> None:
+    gains = {"darkened": (0.5, 0.5, 0.5), "kept": (1.0, 1.0, 1.0), "brightened": (2.0, 2.0, 2.0)}
+    exposures, camera = Exposures(gains), CAMERAS["pinhole"]
+    weight = {n: overexposed_weight(exposures.of(View(n, camera, np.eye(4), Path("a.png")))) for n in gains}
+    assert weight["darkened"] == pytest.approx(0.5**4) and weight["kept"] == weight["brightened"] == 1
 
 
 def test_prior_exposures_are_kept(exposed_street: Street, tmp_path: Path) -> None:

@@ -16,12 +16,14 @@ from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.scene import Level, Scene, read_scene, save_tile, write_scene_file
+from scan2sim.pipeline.io.worlds.textured_mesh import save_reflectance
 from scan2sim.texturing import levels_of_detail as texturing_levels
 from scan2sim.texturing.levels_of_detail import shared_borders, with_levels
 from tests.fakes import synthetic
 from tests.fakes.consumers import seams
 from tests.fakes.world_checks import Fault
 from tests.fakes.world_checks.reference import WorldReference
+from tests.present import present
 
 TILES, SIDE = 3, 20.0
 NOWHERE = WorldReference(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))
@@ -44,11 +46,17 @@ def row(folder: Path, tiles: int) -> Scene:
         vertices = mesh.vertices.copy()
         vertices[:, 2] = synthetic.height(vertices[:, 0] + SIDE * i, vertices[:, 1])
         source = synthetic.textured(folder / f"tile{i}", replace(mesh, vertices=vertices))
+        save_reflectance(source, ramp(vertices[:, 0] + SIDE * i))
         synthetic.collided(frame).save(folder / f"solid{i}.npz")
         save_tile(folder / "world", f"tile{i}", {"terrain": source}, folder / f"solid{i}.npz", {}, 0.8)
         names.append(f"tile{i}")
     write_scene_file(folder / "world", "strip", synthetic.UTM, names)
     return read_scene(folder)
+
+
+def ramp(x: np.ndarray) -> np.ndarray:
+    """Reflectance along the strip: from 0 in the west to 1 in the east."""
+    return ((x + SIDE / 2) / (TILES * SIDE)).astype(np.float32)
 
 
 def every(level: Level) -> Iterator[Level]:
@@ -95,6 +103,13 @@ def test_stated_error_bounds_the_distance_to_the_surface(strip: Scene) -> None:
         true = np.column_stack([x + shift, y, synthetic.height(x + shift, y)])
         assert np.percentile(distance_to_mesh(mesh(level), true), 95) < level.error + 0.01
         assert level.error > max((finer.error for finer in level.finer), default=-1)
+
+
+def test_levels_keep_the_reflectance(strip: Scene) -> None:
+    for level in levels(strip):
+        shape = level.tile.textured()["terrain"]
+        expected = ramp(shape.mesh.vertices[:, 0] + level.tile.offset[0])
+        assert np.abs(present(shape.reflectance) - expected).max() < 0.03
 
 
 def test_no_cracks_between_neighbouring_levels(strip: Scene) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.camera.renderer import Body, Renderer, look_at
+from scan2sim.pipeline.core.classes import PHOTO_CLASSES
 from scan2sim.pipeline.core.step import Done
 from scan2sim.pipeline.core.types import F64, U8
 from tests.texturing.corner import BOX, CAMERAS, GROUND, Street, photograph, points
@@ -56,6 +57,26 @@ def test_passing_car_is_masked_as_ghost(street: Street) -> None:
     assert without == 0
     assert done.metrics["coverage"] > 0.3
     assert magenta(agreement={"ghosts": False})[0] > 50
+
+
+def test_traffic_sign_is_no_ghost(street: Street, tmp_path: Path) -> None:
+    """A panel that the nearest photo shows, and others elsewhere, because it isn't quite where the surface is."""
+    for i, pose in enumerate(POSES):
+        image = photograph(CAMERA, pose)
+        if i == 2:
+            image[310:390, 260:400] = (255, 0, 255)
+        street.add(CAMERA, pose, image)
+    panel = np.zeros((60, 80, len(PHOTO_CLASSES)), np.uint8)
+    panel[..., PHOTO_CLASSES.index("road")] = 255
+    rows, columns = 60 / CAMERA.height, 80 / CAMERA.width
+    panel[round(310 * rows) : round(390 * rows), round(260 * columns) : round(400 * columns)] = np.where(
+        np.arange(len(PHOTO_CLASSES)) == PHOTO_CLASSES.index("road_sign"), 255, 0
+    )
+    np.save(tmp_path / "2.npy", panel)
+    street.labels = tmp_path
+    folder, _ = street.run(band=0)
+    rgb, *_ = from_above(folder)
+    assert ((rgb[..., 0] > 150) & (rgb[..., 1] < 90) & (rgb[..., 2] > 150)).sum() > 50
 
 
 @pytest.mark.parametrize("turn, shift", [(0.5, 0.0), (0.0, 0.2)])

@@ -12,6 +12,7 @@ import pytest
 from scan2sim.flows.pipelines.graph import Output, TaskId
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.pipelines.tile import build_graph
+from scan2sim.pipeline.camera.lens import changed_lens, lens_difference
 from scan2sim.pipeline.camera.models import inside, pixel_rays, project
 from scan2sim.pipeline.camera.renderer import Body, Renderer, look_at
 from scan2sim.pipeline.core.step import Done, silent
@@ -52,13 +53,15 @@ def turned(pose: F64, turn: npt.ArrayLike, shift: npt.ArrayLike) -> F64:
     return out
 
 
-def step_inputs(folder: Path, camera: Camera, wrong: list[F64], held: tuple[int, ...] = ()) -> dict[str, Path]:
-    """Inputs of the step: photos taken at `POSES`, with the poses `wrong`."""
+def step_inputs(
+    folder: Path, camera: Camera, wrong: list[F64], held: tuple[int, ...] = (), given: Camera | None = None
+) -> dict[str, Path]:
+    """Inputs of the step: photos taken at `POSES` by `camera`, with the poses `wrong` and the camera `given`."""
     views = []
     for i, (true, pose) in enumerate(zip(POSES, wrong, strict=False)):
         path = folder / f"{i}.png"
         cv2.imwrite(str(path), marbled(camera, true))
-        views.append(View(f"cam/{i}", camera, pose, path, time=float(i)))
+        views.append(View(f"cam/{i}", given or camera, pose, path, time=float(i)))
     views_io.save(folder / "views.json", views, [i in held for i in range(len(views))])
     GROUND.save(folder / "ground.npz")
     WALLS.save(folder / "walls.npz")
@@ -76,10 +79,10 @@ def run(folder: Path, inputs: dict[str, Path], **params: Any) -> tuple[tuple[Vie
     return views_io.load(done.files["views"]), done
 
 
-def displacement(camera: Camera, pose: F64, true: F64) -> float:
+def displacement(camera: Camera, pose: F64, true: F64, true_camera: Camera | None = None) -> float:
     """Median displacement in pixels of the surface's vertices, projected with a pose and with the true pose."""
     x = np.concatenate([GROUND.vertices, WALLS.vertices])
-    there, a = project(camera, (x - true[:3, 3]) @ true[:3, :3])
+    there, a = project(true_camera or camera, (x - true[:3, 3]) @ true[:3, :3])
     here, b = project(camera, (x - pose[:3, 3]) @ pose[:3, :3])
     seen = a & b & inside(camera, there)
     return float(np.median(np.linalg.norm(here[seen] - there[seen], axis=1)))
@@ -111,6 +114,30 @@ def test_disturbed_poses_are_recovered(tmp_path: Path, model: str) -> None:
     after = np.array([displacement(camera, view.T_world_cam, true) for view, true in zip(views, POSES, strict=True)])
     assert done.metrics["moved"] and done.metrics["displaced_after_px"] < 0.5 * done.metrics["displaced_px"]
     assert np.median(after) < 0.35 * np.median(before) and (after < before).all()
+
+
+def test_focal_length_and_distortion_are_estimated(tmp_path: Path) -> None:
+    true = changed_lens(CAMERAS["pinhole"], np.array([0, 0, 0, 0.01, 0]))
+    given = changed_lens(CAMERAS["pinhole"], np.array([0.01, 0, 0, 0, 0]))
+    inputs = step_inputs(tmp_path, true, POSES, given=given)
+    views, done = run(tmp_path, inputs)
+    difference = lens_difference(true, views[0].camera)
+    assert abs(difference[0]) < 0.001 and abs(difference[3]) < 0.001 and abs(difference[4]) < 0.001
+    assert all(view.camera == views[0].camera for view in views)
+    found = done.metrics["cameras"]["cam"]
+    assert found["focal_change_percent"] == pytest.approx(-1, abs=0.1)
+    assert found["k1_change"] == pytest.approx(0.01, abs=0.001)
+    before, after = (displacement(camera, POSES[0], POSES[0], true) for camera in (given, views[0].camera))
+    assert after < 0.2 * before
+    (tmp_path / "off").mkdir()
+    kept, _ = run(tmp_path / "off", inputs, lens=False)
+    assert all(view.camera == given for view in kept)
+
+
+def test_implausible_lens_is_rejected_and_named(tmp_path: Path) -> None:
+    given = changed_lens(CAMERAS["pinhole"], np.array([0.08, 0, 0, 0, 0]))
+    views, done = run(tmp_path, step_inputs(tmp_path, CAMERAS["pinhole"], POSES, given=given))
+    assert done.warnings and done.warnings[0].startswith("cam: estimated lens") and views[0].camera == given
 
 
 def test_correct_poses_are_unchanged_bit_for_bit(tmp_path: Path) -> None:
@@ -167,11 +194,8 @@ def test_photos_without_matches_keep_their_poses(tmp_path: Path) -> None:
 def test_tiles_without_photos_have_no_refine_task() -> None:
     tile = read_tile(ROOT / "data_samples" / "tile" / "tile.toml")
     tasks = {task.id.name: task for task in build_graph(tile, Settings())}
-    assert (
-        tasks["visibility"].inputs["views"]
-        == tasks["score"].inputs["views"]
-        == Output(TaskId("pose_refinement"), "views")
-    )
-    assert tasks["segment"].inputs["views"] == Output(TaskId("views"), "views")
+    assert tasks["score"].inputs["views"] == Output(TaskId("pose_refinement"), "views")
+    assert tasks["visibility"].inputs["views"] == Output(TaskId("pose_refinement"), "cameras")
+    assert tasks["segment"].inputs["views"] == Output(TaskId("views"), "cameras")
     for other, settings in ((replace(tile, views=()), {}), (tile, {"pose_refinement": {"when": "never"}})):
         assert "pose_refinement" not in {task.step.name for task in build_graph(other, Settings(settings))}

@@ -11,6 +11,7 @@ import pytest
 from scan2sim.pipeline.camera.renderer import look_at
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import Frame, PointCloud
+from scan2sim.pipeline.io import sky
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.images import image
 from scan2sim.texturing.score import ScoreParams, score
@@ -112,3 +113,27 @@ def test_surfaces_seen_from_near_are_compared_with_ground_truth_separately(
     inputs = {**textured, "truth.points": tmp_path / "truth.laz"}
     facts = strict(score(inputs, ScoreParams(near=4.9), tmp_path, silent).metrics)
     assert facts["truth_psnr_near_db"] > 28 > 20 > facts["truth_psnr_db"]
+
+
+def test_whole_frames_are_scored_by_what_the_world_shows(scored: Done) -> None:
+    facts = strict(scored.metrics)
+    frame = facts["frame"]
+    assert list(frame["by_class"]) == ["terrain", "no surface: sky", "no surface: other"]
+    assert list(frame["by_distance"])[-1] == "no surface"
+    pixels = 640 * 480
+    counted = sum(part["pixels"] for part in frame["by_class"].values())
+    assert counted == sum(part["pixels"] for part in frame["by_distance"].values())
+    assert counted == pytest.approx(pixels * (1 - frame["excluded"]), abs=100)
+    assert facts["photos"]["photo1"]["frame_psnr_db"] == frame["psnr_db"] > 25  # the photo's sky is that of the world
+    assert frame["ms_ssim"] > 0.9
+    (entry,) = json.loads((scored.files["frames"] / "index.json").read_text(encoding="utf-8"))
+    assert (entry["role"], entry["title"]) == ("frame", "photo1") and "MS-SSIM" in entry["caption"]
+
+
+def test_wrong_sky_costs_the_whole_frame_but_not_the_surfaces(
+    textured: dict[str, Path], scored: Done, tmp_path: Path
+) -> None:
+    sky.write(tmp_path / "sky.json", (20, 60, 20))
+    facts = strict(score({**textured, "sky": tmp_path / "sky.json"}, ScoreParams(), tmp_path, silent).metrics)
+    assert facts["frame"]["psnr_db"] < scored.metrics["frame"]["psnr_db"] - 5
+    assert facts["psnr_db"] == scored.metrics["psnr_db"] and facts["ssim"] == scored.metrics["ssim"]

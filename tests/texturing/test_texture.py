@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numba
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -13,6 +14,7 @@ from PIL import Image
 from scan2sim.pipeline.camera.renderer import Renderer, look_at, textured
 from scan2sim.pipeline.core.types import F64, U8, Camera, Frame, Mesh
 from scan2sim.pipeline.io import views as views_io
+from scan2sim.texturing.inpainting import hole_filling
 from tests.present import present
 from tests.texturing.corner import BOX, CAMERAS, GROUND, POSES, Street, paint, photograph, points
 
@@ -243,13 +245,34 @@ def test_grey_and_sixteen_bit_photos_are_read(street: Street) -> None:
     assert np.ptp(rgb[seen == 255], axis=1).max() <= 1
 
 
-def test_results_are_byte_identical_when_repeated(street: Street) -> None:
+def test_results_are_byte_identical_on_any_number_of_threads(street: Street) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
-    street.clouds["terrain"] = points()
-    one, two = street.run()[0], street.run()[0]
+    cloud = points()
+    present(cloud.rgb)[len(cloud) // 2 :] = 128  # no colour: inpainted
+    street.clouds["terrain"] = cloud
+    one = street.run(inpaint=True)[0]
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        two = street.run(inpaint=True)[0]
+    finally:
+        numba.set_num_threads(threads)
     for name in ("page_0.png", "page_0_seen.png"):
         assert (one / name).read_bytes() == (two / name).read_bytes()
+
+
+def test_pages_are_padded_in_parts_as_they_are_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    seen = np.where(rng.random((300, 200)) < 0.003, 255, 0).astype(np.uint8)
+    seen[120:200] = 0
+    whole = np.where(seen[..., None] > 0, rng.integers(1, 255, (300, 200, 3)), 0).astype(np.uint8)
+    parts = whole.copy()
+    hole_filling.pad(whole, seen, 12)
+    monkeypatch.setattr(hole_filling, "PADDING_ROWS", 32)
+    hole_filling.pad(parts, seen, 12)
+    assert (parts == whole).all()
+    assert (whole[seen == 0] > 0).any(axis=1).all()
 
 
 def test_charts_are_padded_with_their_colours(street: Street) -> None:

@@ -32,9 +32,9 @@ from scan2sim.texturing.photo_cache import Exposures, PhotoCache
 from scan2sim.texturing.texture_page import Page
 from scan2sim.texturing.view_selection.choice import Choice
 
-BAND_TEXELS = 6_000_000
+BAND_TEXELS = 3_000_000
 """Texels of a page that are baked at a time, in whole rows."""
-DEPTH_MAPS_CACHED = 8
+DEPTH_MAPS_CACHED = 4
 """Depth maps kept in memory."""
 
 
@@ -74,13 +74,13 @@ class Baker:
         self._settings, self._fade, self._device = settings, fade, device
         self._corners, self._normals = mesh.corners, mesh.face_normal
         self._choice, self._depth_file, self._exposures = choice, depth_file, exposures
-        self._mask, self._warp = consistency.mask, consistency.warp
+        self._warp = consistency.warp
         self._share = detail_shares(mesh.faces, choice.detail_view, len(mesh.vertices), len(views))
         classification = mesh.classification
         self._sign = np.zeros(len(mesh), bool) if classification is None else classification == CODE["road_sign"]
         self._backwards = True
         self._occlusion = lru_cache(maxsize=DEPTH_MAPS_CACHED)(self._read_occlusion)
-        self.photos = PhotoCache(views, max(1, settings.band))
+        self.photos = PhotoCache(views, max(1, settings.band), consistency)
         self.used: dict[int, int] = {}
 
     def bake(self, faces: I64, width: int, height: int, report: Report) -> Page:
@@ -120,7 +120,7 @@ class Baker:
             seen = self._add_photo(i, blender, page_faces, faces[page_faces])
             if seen:
                 self.used[i] = self.used.get(i, 0) + seen
-        blender.resolve(page.rgb[rows], page.seen[rows])
+        blender.resolve(page.rgb[rows], page.seen[rows], self._exposures.white)
 
     def _row_blender(self, page_faces: PageFaces) -> RowBlender:
         """Blender on the GPU or the CPU, according to the device."""
@@ -138,10 +138,15 @@ class Baker:
         view = self._views[i]
         share = self._share(i)[self._mesh.faces[faces]] if self._fade else self._share_without_fade(i, faces)
         share[self._sign[faces]] = 1.0  # the photos of a sign panel were selected to agree: all give its detail
-        data = PhotoData(*photo.levels, photo.low, self._mask(i, view), self._warp(i), self._exposures.of(view))
+        data = PhotoData(*photo.levels, photo.low, photo.mask, self._warp(i), self._exposures.of(view))
         source = BlendSource(data, posed_camera(view.camera, view.T_world_cam), self._occlusion(i))
         settings = self._settings._replace(feather=self._settings.feather * view.camera.width)
         return blender.add(page_faces, np.ascontiguousarray(share, np.float32), source, settings)
+
+    def forget_photos(self) -> None:
+        """Free the memory of the photos and depth maps; they are read again when they are needed."""
+        self.photos.clear()
+        self._occlusion.cache_clear()
 
     def name(self, i: int) -> str:
         """Name of view `i`."""

@@ -21,13 +21,13 @@ from scan2sim.pipeline.camera.projection import (
     to_camera,
 )
 from scan2sim.pipeline.core.types import F32, F64, I32, I64, U8
-from scan2sim.texturing.exposure_model import corrected, vignette
+from scan2sim.texturing.exposure_model import compressed, corrected, overexposed_weight, vignette
 from scan2sim.texturing.texel_map import box, frame
 
 OVEREXPOSED_LEVEL = 251.0
 """Grey level above which a sample counts as overexposed."""
 UNRELIABLE_WEIGHT = 0.01
-"""Factor on a photo's weight beside depth edges (occlusion) and where it is overexposed."""
+"""Factor on a photo's weight beside depth edges (occlusion)."""
 
 
 class PhotoData(NamedTuple):
@@ -136,8 +136,11 @@ class RowBlender(Protocol):
             settings: settings of its weights.
         """
 
-    def resolve(self, rgb: U8, seen: U8) -> None:
-        """Write weighted means into `rgb` (H, W, 3), and 255 into `seen` (H, W) where there is one."""
+    def resolve(self, rgb: U8, seen: U8, white: float) -> None:
+        """Write weighted means into `rgb` (H, W, 3), and 255 into `seen` (H, W) where there is one.
+
+        `white` is the white point of the tone curve, `photo_cache.Exposures.white`.
+        """
 
 
 class NumbaRowBlender:
@@ -151,12 +154,12 @@ class NumbaRowBlender:
         """See `RowBlender`."""
         return int(accumulate(self._sums, self._page_faces, faces, share, *source, settings))
 
-    def resolve(self, rgb: U8, seen: U8) -> None:
+    def resolve(self, rgb: U8, seen: U8, white: float) -> None:
         """See `RowBlender`."""
-        resolve(self._sums, rgb, seen)
+        resolve(self._sums, rgb, seen, white)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, error_model="numpy")
 def accumulate(
     sums: Sums,
     page_faces: PageFaces,
@@ -174,7 +177,7 @@ def accumulate(
     return used.sum()
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _add_face(
     sums: Sums,
     page_faces: PageFaces,
@@ -204,6 +207,7 @@ def _add_face(
     focal = p[12] / (2 * math.pi) if wrap else min(p[0], p[1])
     wanted = focal * math.sqrt(max(dx[0] ** 2 + dx[1] ** 2 + dx[2] ** 2, dy[0] ** 2 + dy[1] ** 2 + dy[2] ** 2))
     factors = (math.exp(exposure[0]), math.exp(exposure[1]), math.exp(exposure[2]))
+    overexposed_factor = overexposed_weight(exposure)
     chosen = share[0] + share[1] + share[2] > 0
     used = 0
     x0, y0, x1, y1 = box(page_faces.flat, f, owner.shape[1], owner.shape[0])
@@ -227,7 +231,7 @@ def _add_face(
             weight = (cos * cos / (ORTHO_EQUIVALENT_FOCAL_PX / focal if parallel else r) ** 2) ** settings.power
             weight *= 0.02 + 0.98 * min(1.0, _border_distance(camera, u, v) / settings.feather)
             if max(rgb) > OVEREXPOSED_LEVEL:
-                weight *= UNRELIABLE_WEIGHT
+                weight *= overexposed_factor
             beside_edge = is_occluded(r, around[row, column], lean, radius + 0.5, bias)
             low = weight * UNRELIABLE_WEIGHT if beside_edge else weight
             # detail comes from the selected photo; where it can't see a texel, from the best others
@@ -290,8 +294,11 @@ def _share_at(flat: F32, f: int, share: F32, x: float, y: float) -> float:
 
 
 @njit(cache=True, parallel=True)
-def resolve(sums: Sums, rgb: U8, seen: U8) -> None:
-    """Write low frequencies plus detail (weighted means) into `rgb` (H, W, 3) uint8; `seen` is 255 where defined."""
+def resolve(sums: Sums, rgb: U8, seen: U8, white: float) -> None:
+    """Write low frequencies plus detail (weighted means) into `rgb` (H, W, 3) uint8; `seen` is 255 where defined.
+
+    `white` is the white point of the tone curve.
+    """
     height, width = seen.shape
     for y in prange(height):
         for x in range(width):
@@ -300,4 +307,4 @@ def resolve(sums: Sums, rgb: U8, seen: U8) -> None:
                 seen[y, x] = 255
                 for k in range(3):
                     value = sums.low[y, x, k] / w + (sums.detail[y, x, k] / d if d > 0 else 0.0)
-                    rgb[y, x, k] = min(255.0, max(0.0, value + 0.5))
+                    rgb[y, x, k] = min(255.0, max(0.0, compressed(value, white) + 0.5))

@@ -25,6 +25,7 @@ from scan2sim.texturing.bake.blend_numba import (
     BlendSource,
     PageFaces,
 )
+from scan2sim.texturing.exposure_model import TONE_KNEE_LEVEL, overexposed_weight
 from scan2sim.texturing.photo_cache import SRGB_OFFSET
 
 CHUNK_TEXELS = 2_000_000
@@ -70,10 +71,13 @@ class TorchRowBlender:
         seen = [self._add(part, which, shares, photo, source, settings) for part in torch.split(texels, CHUNK_TEXELS)]
         return sum(seen)
 
-    def resolve(self, rgb: U8, seen: U8) -> None:
+    def resolve(self, rgb: U8, seen: U8, white: float) -> None:
         """See `blend_numba.RowBlender`."""
         low, detail = self._low, self._detail
         value = low[:, :3] / low[:, 3:] + torch.where(detail[:, 3:] > 0, detail[:, :3] / detail[:, 3:], 0.0)
+        above = (value - TONE_KNEE_LEVEL).clamp(min=0)
+        slope = 1 / (255 - TONE_KNEE_LEVEL) - 1 / (white - TONE_KNEE_LEVEL)
+        value = torch.where(above > 0, TONE_KNEE_LEVEL + above / (1 + above * slope), value)
         has_colour = (low[:, 3] > 0).reshape(self._shape).cpu().numpy()
         colour = (value + 0.5).nan_to_num().clamp(0, 255).to(torch.uint8).reshape(*self._shape, 3).cpu().numpy()
         rgb[has_colour], seen[has_colour] = colour[has_colour], 255
@@ -139,8 +143,9 @@ class TorchRowBlender:
         chosen = (share.sum(dim=1) > 0)[which[f]]
         colour = photo.colour(u, v, size * focal / far, chosen if g.band >= 0 else torch.ones_like(chosen))
         overexposed = colour.amax(dim=1) > OVEREXPOSED_LEVEL
-        base_weight = torch.where(overexposed, base_weight * UNRELIABLE_WEIGHT, base_weight)
-        weight = torch.where(overexposed, weight * UNRELIABLE_WEIGHT, weight)
+        overexposed_factor = overexposed_weight(source.photo.exposure)
+        base_weight = torch.where(overexposed, base_weight * overexposed_factor, base_weight)
+        weight = torch.where(overexposed, weight * overexposed_factor, weight)
         coarse = colour if g.band < 0 else photo.coarse(u, v) if g.band > 0 else torch.zeros_like(colour)
         detail = 1e-4 * base_weight + torch.where(chosen, self._share(share[which[f]], f, tx[:, 0], ty[:, 0]), 0.0)
         hidden = distance > photo.near[row, column] + g.bias + 1.5 * lean

@@ -17,10 +17,10 @@ class PageWriter:
         self._pool = ThreadPoolExecutor(1)
         self._last: Future[None] | None = None
 
-    def write(self, path: Path, page: Page, compression: int = 2) -> None:
+    def write(self, path: Path, page: Page) -> None:
         """Start writing `path`.png and `path`_seen.png once the previous page is written."""
         self.finish()
-        self._last = self._pool.submit(_write, path, page.rgb, page.seen, compression)
+        self._last = self._pool.submit(_write, path, page.rgb, page.seen)
 
     def finish(self) -> None:
         """Wait until the last page is written; raises the error if writing failed."""
@@ -28,6 +28,6 @@ class PageWriter:
             self._last.result()
 
 
-def _write(path: Path, rgb: U8, seen: U8, compression: int) -> None:
-    image.write(path.with_name(f"{path.name}.png"), rgb, compression=compression)
-    image.write(path.with_name(f"{path.name}_seen.png"), seen, compression=min(1, compression))
+def _write(path: Path, rgb: U8, seen: U8) -> None:
+    image.write(path.with_name(f"{path.name}.png"), rgb)
+    image.write(path.with_name(f"{path.name}_seen.png"), seen)

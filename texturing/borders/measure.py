@@ -88,4 +88,4 @@ def colour_step(a: Textured, b: Textured) -> tuple[float, float, float]:
     return float(step.mean()), float(np.percentile(step, 95)), border.length[0]
 
 
-BORDERS = Step("borders", 3, borders, BordersParams, side_product=True)
+BORDERS = Step("borders", 3, borders, BordersParams)

@@ -42,7 +42,8 @@ class GroundOrthophoto:
         low, high = mesh.vertices[:, :2].min(axis=0), mesh.vertices[:, :2].max(axis=0)
         self.cell = max(CELL_M, texel, float(np.sqrt(np.prod(high - low + 1) / MAX_CELLS)))
         self.low, self._xyz, self._classification = low.astype(np.float64), xyz, classification
-        columns, rows = (np.ceil((high - low) / self.cell).astype(int) + 1).tolist()
+        sides = np.ceil((high - low) / self.cell).astype(int) + 1
+        columns, rows = (COARSE_FACTOR * -(-sides // COARSE_FACTOR)).tolist()  # so that `inpaint` works in place
         self._sum, self._count = np.zeros((rows, columns, 3), np.float32), np.zeros((rows, columns), np.float32)
         self._holes, self._from_points = np.zeros((rows, columns), bool), np.zeros((rows, columns), bool)
         self._removed = rasterize_polygons([(ring - self.low) / self.cell for ring in removed], (rows, columns))
@@ -65,12 +66,13 @@ class GroundOrthophoto:
         )  # fmt: skip
 
     def inpaint(self) -> InpaintedGround | None:
-        """Inpaint the holes; None if there are no holes, or no photo saw the ground."""
+        """Inpaint the holes; None if there are no holes, or no photo saw the ground. Once, after all pages."""
         known = self._count > 0
         self._holes &= ~known
         if not self._holes.any() or not known.any():
             return None
-        rgb = (self._sum / np.maximum(self._count, 1)[..., None]).astype(np.float32)
+        rgb, self._sum = self._sum, np.zeros((0, 0, 3), np.float32)
+        rgb /= np.maximum(self._count, 1)[..., None]
         rim = self._from_points & ~known & dilate(self._holes, POINT_COLOUR_MARGIN_M / self.cell)
         image, filled = inpaint(rgb, known, _without_pinholes(self._holes | rim, known), self._classes())
         return InpaintedGround(self, image.astype(np.uint8), filled)

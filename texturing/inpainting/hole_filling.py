@@ -11,7 +11,7 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from scan2sim.pipeline.core.classes import colour_of
-from scan2sim.pipeline.core.types import F32, I32, I64, U8, Bools
+from scan2sim.pipeline.core.types import F32, F64, I32, I64, U8, Bools
 from scan2sim.pipeline.geometry.height_map import point_spacing
 from scan2sim.texturing.texel_map import box, frame
 from scan2sim.texturing.texture_page import FILLED, FROM_POINTS, SEEN, Page
@@ -28,6 +28,12 @@ FAR_NEIGHBOURS, FAR_STRIDE = 32, 8
 """Farther away, colours are means of 32 points out of every 8th: a single point's colour would give a flat patch."""
 
 
+POINTS_CHUNK = 100_000
+"""Points whose neighbours are looked up at a time, to bound memory."""
+PADDING_ROWS = 512
+"""Rows of a page that are padded at a time, to bound memory."""
+
+
 class PointColours:
     """Coloured points, with colour lookup at positions.
 
@@ -35,15 +41,18 @@ class PointColours:
         xyz: (N, 3) local metres, N > 0.
         rgb: (N, 3) uint8.
         mark: (N,) uint8 or one value for all: mark of the texels coloured by them (`FROM_POINTS` or `FILLED`).
+        spacing: (N,) metres, spacing of points that were thinned more than others, else 0; None: of none.
     """
 
-    def __init__(self, xyz: F32, rgb: U8, mark: int | U8 = FROM_POINTS) -> None:
+    def __init__(self, xyz: F32, rgb: U8, mark: int | U8 = FROM_POINTS, spacing: F32 | None = None) -> None:
         from scipy.spatial import cKDTree
 
         self._tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
-        self._rgb = rgb.astype(np.float32)
+        self._rgb = rgb
         self._far = cKDTree(xyz[::FAR_STRIDE])
-        self._max_distance = float(np.clip(MAX_POINT_DISTANCE_SPACINGS * point_spacing(xyz), *MAX_POINT_DISTANCE_M))
+        usual = float(np.clip(MAX_POINT_DISTANCE_SPACINGS * point_spacing(xyz), *MAX_POINT_DISTANCE_M))
+        thinned = np.zeros(len(xyz), np.float32) if spacing is None else spacing
+        self._max_distance = np.maximum(usual, MAX_POINT_DISTANCE_SPACINGS * thinned)
         self._mark = np.broadcast_to(np.asarray(mark, np.uint8), len(xyz))
 
     def at(self, points: F32) -> tuple[F32, U8]:
@@ -51,23 +60,39 @@ class PointColours:
 
         The mark is `FILLED` where the nearest point is too far.
         """
+        colour, mark = np.empty((len(points), 3), np.float32), np.empty(len(points), np.uint8)
+        for first in range(0, len(points), POINTS_CHUNK):
+            part = slice(first, first + POINTS_CHUNK)
+            colour[part], mark[part] = self._at(points[part])
+        return colour, mark
+
+    def _at(self, points: F32) -> tuple[F32, U8]:
         k = min(NEIGHBOURS, self._tree.n)
         distance, index = self._tree.query(points, k=k, workers=-1)
         distance, index = distance.reshape(len(points), k), index.reshape(len(points), k)
-        colour, far = _mean(distance, self._rgb[index]), distance[:, 0] > self._max_distance
+        colour, far = _mean(distance, index, self._rgb), distance[:, 0] > self._max_distance[index[:, 0]]
         if far.any():
             k = min(FAR_NEIGHBOURS, self._far.n)
             distance_far, index_far = self._far.query(points[far], k=k, workers=-1)
             shape = (len(distance_far), k)
-            colour[far] = _mean(distance_far.reshape(shape), self._rgb[::FAR_STRIDE][index_far.reshape(shape)])
-        mark = np.where(distance[:, 0] <= self._max_distance, self._mark[index[:, 0]], FILLED)
+            colour[far] = _mean(distance_far.reshape(shape), FAR_STRIDE * index_far.reshape(shape), self._rgb)
+        mark = np.where(far, FILLED, self._mark[index[:, 0]])
         return colour, mark.astype(np.uint8)
 
 
-def _mean(distance: npt.NDArray[np.floating], rgb: F32) -> F32:
-    """(M, 3) means of colours (M, K, 3), weighted by the inverse square of their distances (M, K)."""
-    weight = (1.0 / (distance**2 + 1e-4)).astype(np.float32)
-    mean: F32 = np.einsum("mk,mkc->mc", weight, rgb) / weight.sum(axis=1, keepdims=True)
+@njit(cache=True, parallel=True)
+def _mean(distance: F64, index: I64, rgb: U8) -> F32:
+    """(M, 3) means of the colours at `index` (M, K), weighted by the inverse square of their distances (M, K)."""
+    mean = np.empty((len(distance), 3), np.float32)
+    for i in prange(len(distance)):
+        total, r, g, b = 0.0, 0.0, 0.0, 0.0
+        for k in range(distance.shape[1]):
+            weight, at = 1 / (distance[i, k] ** 2 + 1e-4), index[i, k]
+            total += weight
+            r += weight * rgb[at, 0]
+            g += weight * rgb[at, 1]
+            b += weight * rgb[at, 2]
+        mean[i, 0], mean[i, 1], mean[i, 2] = r / total, g / total, b / total
     return mean
 
 
@@ -84,7 +109,10 @@ def fill(page: Page, colours: PointColours, texel: float) -> None:
     start = np.concatenate([[0], np.cumsum(shape[:, 0].astype(np.int64) * shape[:, 1])])
     if start[-1] == 0:
         return
-    colour, mark = colours.at(_lattice_points(page.flat, page.corners, shape, start, step, page.owner.shape))
+    points = _lattice_points(page.flat, page.corners, shape, start, step, page.owner.shape)
+    used = _used_nodes(page.seen, page.owner, page.flat, shape, start, step)
+    colour, mark = np.zeros(points.shape, np.float32), np.zeros(len(points), np.uint8)
+    colour[used], mark[used] = colours.at(points[used])
     _interpolate(page.rgb, page.seen, page.owner, page.flat, shape, start, step, colour, mark)
 
 
@@ -100,35 +128,44 @@ def pad(rgb: U8, seen: U8, padding: int) -> None:
 
     This keeps the background out of bilinear lookups and mip-maps.
     """
-    import cv2
-
-    coloured = seen > 0
-    if not coloured.any():
+    if not seen.any():
         rgb[:] = 128
         return
+    sample = rgb[::97, ::97][seen[::97, ::97] > 0]
+    background = np.round(sample.mean(axis=0) if len(sample) else np.full(3, 128.0)).astype(np.uint8)
+    height = len(seen)
+    for first in range(0, height, PADDING_ROWS):
+        last = min(height, first + PADDING_ROWS)
+        rows = slice(max(0, first - padding - 1), min(height, last + padding + 1))
+        _pad_rows(rgb[rows], seen[rows], first - rows.start, last - rows.start, padding, background)
+
+
+def _pad_rows(rgb: U8, seen: U8, first: int, last: int, padding: int, background: U8) -> None:
+    """`pad` the rows from `first` to `last`; the others, within the padding, give colours only."""
+    import cv2
+
+    if not seen.any():
+        rgb[first:last] = background
+        return
     distance, nearest = cv2.distanceTransformWithLabels(
-        (~coloured).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        (seen == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    mean = rgb[::97, ::97][coloured[::97, ::97]].mean(axis=0) if coloured[::97, ::97].any() else np.full(3, 128.0)
-    _dilate(rgb, coloured, distance, nearest, padding, np.round(mean).astype(np.uint8))
+    _dilate(rgb, np.flatnonzero(seen), distance[first:last], nearest[first:last], first, padding, background)
 
 
 @njit(cache=True, parallel=True)
-def _dilate(rgb: U8, coloured: Bools, distance: F32, nearest: I32, padding: int, background: U8) -> None:
-    height, width = coloured.shape
-    row, column = np.zeros(nearest.max() + 1, np.int32), np.zeros(nearest.max() + 1, np.int32)
+def _dilate(rgb: U8, coloured: I64, distance: F32, nearest: I32, first: int, padding: int, background: U8) -> None:
+    """Colour the texels without a colour in rows from `first` on; label k of `nearest` is texel `coloured[k - 1]`."""
+    height, width = distance.shape
     for y in prange(height):
         for x in range(width):
-            if coloured[y, x]:  # every coloured texel has its own label in `nearest`
-                row[nearest[y, x]], column[nearest[y, x]] = y, x
-    for y in prange(height):
-        for x in range(width):
-            if coloured[y, x]:
-                continue
-            for k in range(3):
-                rgb[y, x, k] = (
-                    rgb[row[nearest[y, x]], column[nearest[y, x]], k] if distance[y, x] <= padding else background[k]
-                )
+            if distance[y, x] > padding:
+                for k in range(3):
+                    rgb[first + y, x, k] = background[k]
+            elif distance[y, x] > 0:
+                row, column = divmod(coloured[nearest[y, x] - 1], width)
+                for k in range(3):
+                    rgb[first + y, x, k] = rgb[row, column, k]
 
 
 @njit(cache=True, parallel=True)
@@ -166,6 +203,28 @@ def _lattice_points(flat: F32, corners: F32, shape: I32, start: I64, step: int, 
                 for k in range(3):
                     out[start[f] + j * shape[f, 0] + i, k] = origin[k] + x * per_x[k] + y * per_y[k]
     return out
+
+
+@njit(cache=True, parallel=True)
+def _used_nodes(seen: U8, owner: I32, flat: F32, shape: I32, start: I64, step: int) -> Bools:
+    """(N,) which lattice nodes `_interpolate` reads: those around unseen texels, not in the corners beside a face."""
+    used = np.zeros(start[-1], np.bool_)
+    height, width = owner.shape
+    for f in prange(len(flat)):
+        if shape[f, 0] == 0:
+            continue
+        x0, y0, x1, y1 = box(flat, f, width, height)
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
+                if owner[y, x] == f and seen[y, x] == 0:
+                    i, j = (x - x0) // step, (y - y0) // step
+                    a = start[f] + j * shape[f, 0] + i
+                    right, below = (x - x0) % step > 0, (y - y0) % step > 0
+                    used[a] = True
+                    used[a + 1] |= right
+                    used[a + shape[f, 0]] |= below
+                    used[a + shape[f, 0] + 1] |= right and below
+    return used
 
 
 @njit(cache=True, parallel=True)

@@ -10,11 +10,12 @@ passing on a coarse image. The copied colours are then corrected to match the bo
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+from numba import njit, prange
 
 from scan2sim.pipeline.core.types import F32, F64, I32, Bools
 
@@ -47,7 +48,7 @@ def inpaint(rgb: F32, known: Bools, wanted: Bools, classes: I32 | None = None) -
     """Image with its holes inpainted.
 
     Args:
-        rgb: (H, W, 3) colours, 0 to 255; read where `known`.
+        rgb: (H, W, 3) colours, 0 to 255; read where `known`. Changed in place, if possible, to save memory.
         known: (H, W) cells with a colour.
         wanted: (H, W) cells to be filled; cells that are neither known nor wanted are ignored.
         classes: surface class of every coarse cell (`COARSE_FACTOR` cells in each direction), negative where unknown;
@@ -57,10 +58,13 @@ def inpaint(rgb: F32, known: Bools, wanted: Bools, classes: I32 | None = None) -
         rgb (H, W, 3) float32, and (H, W) which cells were filled: not those that are too far from known cells.
     """
     height, width = known.shape
-    rgb, out = np.where(known[..., None], rgb, 0).astype(np.float32), np.zeros(known.shape, bool)
     pad = ((0, -height % COARSE_FACTOR), (0, -width % COARSE_FACTOR))
-    rgb, known = np.pad(rgb, (*pad, (0, 0))), np.pad(known, pad)
+    if pad != ((0, 0), (0, 0)):
+        rgb = np.pad(rgb, (*pad, (0, 0)))
+    known = np.pad(known, pad)
     wanted = np.pad(wanted, pad) & ~known
+    rgb[~known] = 0
+    out = np.zeros(known.shape, bool)
     if classes is None:
         classes = np.full((known.shape[0] // COARSE_FACTOR, known.shape[1] // COARSE_FACTOR), -1, np.int32)
     offsets = np.zeros((0, 2), np.int32)
@@ -74,21 +78,33 @@ def inpaint(rgb: F32, known: Bools, wanted: Bools, classes: I32 | None = None) -
             break
         selected = select_offsets(coarse, fully_known, hole, classes, offsets)
         tone = tone_correction(coarse, fully_known, hole, offsets, selected)
-        filled = _copy(rgb, known, wanted, offsets, selected, tone)
-        if not filled.any():
+        if not _copy(rgb, known, wanted, out, offsets, selected, tone):
             break
-        known, wanted = known | filled, wanted & ~filled
-        out |= filled[:height, :width]
-    return np.ascontiguousarray(rgb[:height, :width]), out
+    return rgb[:height, :width], out[:height, :width]
 
 
+@njit(cache=True, parallel=True)
 def _coarse(rgb: F32, known: Bools, wanted: Bools) -> tuple[F32, Bools, Bools]:
     """Mean colours of coarse cells, which of them are wholly known, and which have cells to be filled."""
-    blocks = (rgb.shape[0] // COARSE_FACTOR, COARSE_FACTOR, rgb.shape[1] // COARSE_FACTOR, COARSE_FACTOR)
-    count = np.asarray(known.reshape(blocks).sum(axis=(1, 3)))
-    mean = rgb.reshape(*blocks, 3).sum(axis=(1, 3)) / np.maximum(count, 1)[..., None]
-    fully_known, hole = count == COARSE_FACTOR**2, np.asarray(wanted.reshape(blocks).any(axis=(1, 3)), bool)
-    return mean.astype(np.float32), fully_known, hole & ~fully_known
+    height, width = rgb.shape[0] // COARSE_FACTOR, rgb.shape[1] // COARSE_FACTOR
+    mean = np.zeros((height, width, 3), np.float32)
+    fully_known, hole = np.zeros((height, width), np.bool_), np.zeros((height, width), np.bool_)
+    for y in prange(height):
+        for x in range(width):
+            count, has_wanted, r, g, b = 0, False, 0.0, 0.0, 0.0
+            for row in range(y * COARSE_FACTOR, (y + 1) * COARSE_FACTOR):
+                for column in range(x * COARSE_FACTOR, (x + 1) * COARSE_FACTOR):
+                    has_wanted |= wanted[row, column]
+                    if known[row, column]:
+                        count += 1
+                        r += rgb[row, column, 0]
+                        g += rgb[row, column, 1]
+                        b += rgb[row, column, 2]
+            if count > 0:
+                mean[y, x, 0], mean[y, x, 1], mean[y, x, 2] = r / count, g / count, b / count
+            fully_known[y, x] = count == COARSE_FACTOR**2
+            hole[y, x] = has_wanted and not fully_known[y, x]
+    return mean, fully_known, hole
 
 
 def _nearest(hole: Bools, fully_known: Bools, limit: int) -> Bools:
@@ -275,20 +291,36 @@ def _source_gradient(
     return np.where(inside[:, None], coarse[u, v] - copied, 0.0)
 
 
-def _copy(rgb: F32, known: Bools, wanted: Bools, offsets: I32, selected: I32, tone: F32) -> Bools:
-    """Copy cells by their offsets into `rgb`, in place; returns (H, W) which cells were filled."""
-    import cv2
+@njit(cache=True, parallel=True)
+def _copy(rgb: F32, known: Bools, wanted: Bools, out: Bools, offsets: I32, selected: I32, tone: F32) -> int:
+    """Copy cells by their offsets into `rgb`, and mark them in the masks, all in place; returns their number.
 
-    f = COARSE_FACTOR
-    y, x = np.nonzero(wanted & np.repeat(np.repeat(selected >= 0, f, axis=0), f, axis=1))
-    offset = f * offsets[selected[y // f, x // f]]
-    smooth = np.asarray(cv2.resize(tone, rgb.shape[1::-1], interpolation=cv2.INTER_LINEAR))
-    # normalised interpolation: cells without a tone are left out, instead of counting as zero
-    weight = np.asarray(
-        cv2.resize((selected >= 0).astype(np.float32), rgb.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-    )
-    add = smooth[y, x] / np.maximum(weight[y, x], 1e-3)[:, None]
-    rgb[y, x] = np.clip(rgb[y + offset[:, 0], x + offset[:, 1]] + add, 0, 255)
-    filled = np.zeros(known.shape, bool)
-    filled[y, x] = True
-    return filled
+    The tone is interpolated between the coarse cells that have one.
+    """
+    height, width = selected.shape
+    total = 0
+    for row in prange(rgb.shape[0]):
+        for column in range(rgb.shape[1]):
+            k = selected[row // COARSE_FACTOR, column // COARSE_FACTOR]
+            if k < 0 or not wanted[row, column]:
+                continue
+            y, x = (row + 0.5) / COARSE_FACTOR - 0.5, (column + 0.5) / COARSE_FACTOR - 0.5
+            y0, x0 = math.floor(y), math.floor(x)
+            weight, r, g, b = 0.0, 0.0, 0.0, 0.0
+            for down in range(2):
+                for right in range(2):
+                    i, j = min(max(y0 + down, 0), height - 1), min(max(x0 + right, 0), width - 1)
+                    if selected[i, j] >= 0:
+                        share = (y - y0 if down else 1 - y + y0) * (x - x0 if right else 1 - x + x0)
+                        weight += share
+                        r += share * tone[i, j, 0]
+                        g += share * tone[i, j, 1]
+                        b += share * tone[i, j, 2]
+            weight = max(weight, 1e-3)
+            source = rgb[row + COARSE_FACTOR * offsets[k, 0], column + COARSE_FACTOR * offsets[k, 1]]
+            rgb[row, column, 0] = min(255.0, max(0.0, source[0] + r / weight))
+            rgb[row, column, 1] = min(255.0, max(0.0, source[1] + g / weight))
+            rgb[row, column, 2] = min(255.0, max(0.0, source[2] + b / weight))
+            known[row, column], wanted[row, column], out[row, column] = True, False, True
+            total += 1
+    return total

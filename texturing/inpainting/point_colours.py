@@ -6,6 +6,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.step import Inputs
 from scan2sim.pipeline.core.types import F32, U8, PointCloud
+from scan2sim.pipeline.geometry.height_map import exact_point_spacing
 from scan2sim.texturing.inpainting.ground import GroundOrthophoto
 from scan2sim.texturing.inpainting.hole_filling import PointColours, shaded
 from scan2sim.texturing.texture_page import FILLED, FROM_POINTS
@@ -14,12 +15,14 @@ from scan2sim.texturing.texture_page import FILLED, FROM_POINTS
 def point_colours(inputs: Inputs, ground: GroundOrthophoto | None) -> tuple[PointColours | None, bool]:
     """Colours of the points, and whether they were measured (else they are class colours); None if there are no points.
 
-    Texels coloured by synthesized points (`synthesized.*`) are marked as filled. Points at and beside removed vehicles
+    Points of `uncovered` are sparser than others. Texels coloured by synthesized points (`synthesized.*`) are marked as
+    filled. Points at and beside removed vehicles
     and people of the `ground` orthophoto are not used: they have the colour of the object or of its shadow.
     """
     names = sorted(name for name in inputs if name.startswith("cloud") and name != "cloud.rest")
     synthesized = sorted(name for name in inputs if name.startswith("synthesized."))
-    clouds = [cloud for name in names + synthesized if len(cloud := PointCloud.load(inputs[name]))]
+    sparse = ["uncovered"] if "uncovered" in inputs else []
+    clouds = [cloud for name in names + sparse + synthesized if len(cloud := _finest(inputs, name))]
     if not clouds:
         return None, False
     cloud = PointCloud.join(clouds)
@@ -31,9 +34,19 @@ def point_colours(inputs: Inputs, ground: GroundOrthophoto | None) -> tuple[Poin
         usable &= ~ground.near_removed(cloud.xyz)
     if not usable.any():
         return None, False
-    return PointColours(
-        cloud.xyz[usable], cloud.rgb[usable], np.where(measured, FROM_POINTS, FILLED)[usable].astype(np.uint8)
-    ), True
+    mark = np.where(measured, FROM_POINTS, FILLED)[usable].astype(np.uint8)
+    spacing = np.zeros(len(cloud), np.float32)
+    if sparse and (n := len(uncovered := PointCloud.load(inputs["uncovered"]))):
+        start = int(measured.sum()) - n
+        spacing[start : start + n] = exact_point_spacing(uncovered.xyz)
+    return PointColours(cloud.xyz[usable], cloud.rgb[usable], mark, spacing[usable]), True
+
+
+def _finest(inputs: Inputs, name: str) -> PointCloud:
+    """The cloud `cloud.CLASS`, or the points that it was thinned from (`raw.CLASS`) if they are given and coloured."""
+    raw = name.replace("cloud.", "raw.", 1)
+    cloud = PointCloud.load(inputs[raw if raw in inputs else name])
+    return cloud if raw not in inputs or cloud.coloured.any() else PointCloud.load(inputs[name])
 
 
 def synthesized_colours(inputs: Inputs) -> tuple[F32, U8]:

@@ -1,10 +1,10 @@
-"""Pose refinement step (`pose_refinement`): adjusts the poses of the photos to each other and to the surface.
+"""Pose refinement step (`pose_refinement`): adjusts poses and lenses of the photos to each other and to the surface.
 
 Corners of every photo are matched in its neighbours via the surface of the meshes
 (`texturing.pose_refinement.matches`). All poses are then estimated by a bundle adjustment with one correction per
-photo and one per camera, constrained by the surface and by the expected errors of the poses
-(`texturing.pose_refinement.bundle_adjustment`). Photos held out of texturing don't contribute: they get their camera's
-correction, and one interpolated between the neighbouring photos.
+photo, one per camera and the lens of each camera, constrained by the surface and by the expected errors of poses and
+calibration (`texturing.pose_refinement.bundle_adjustment`). Photos held out of texturing don't contribute: they get
+their camera's correction, and one interpolated between the neighbouring photos.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from scan2sim.pipeline.camera.lens import GIVEN_SIGMA
 from scan2sim.pipeline.core.parameters import Distance
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, I64, Bools, Camera, Mesh, PointCloud, View
@@ -61,6 +62,7 @@ class PoseRefinementParams(Params):
         rotation: expected error of a photo's rotation in milliradians.
         camera_shift: expected error of a camera's position on the vehicle in metres.
         camera_rotation: expected error of a camera's rotation on the vehicle in milliradians.
+        lens: also estimate focal length and radial distortion (k1, k2) of each camera with a pinhole or OpenCV model.
         correlation_length: metres of path over which the error of the photos' poses decorrelates.
         corners: maximum number of corners of a photo that are matched in other photos.
         max_distance: metres from the camera beyond which surface points are not used.
@@ -72,6 +74,7 @@ class PoseRefinementParams(Params):
     rotation: float = Field(3.0, gt=0, le=200)
     camera_shift: Distance = 0.05
     camera_rotation: float = Field(5.0, gt=0, le=200)
+    lens: bool = True
     correlation_length: Distance = 10.0
     corners: int = Field(600, ge=50, le=20_000)
     max_distance: Distance = 40.0
@@ -80,9 +83,9 @@ class PoseRefinementParams(Params):
 def pose_refinement(inputs: Inputs, params: PoseRefinementParams, out: Path, report: Report) -> Done:
     """Refine the poses of `views` on the surface `mesh.*`, except where movable objects (`cloud.*`, `moving`) hide it.
 
-    File: `views`, with refined poses, or unchanged if refinement gains too little. Metrics: `matches`, their number;
-    `displaced_px` and `displaced_after_px`, median displacements; `moved`, whether poses were changed; `cameras` and
-    `photos`, the correction of each.
+    Files: `views` and `cameras`, with refined poses and lenses, or unchanged if refinement gains too little. Metrics:
+    `matches`, their number; `displaced_px` and `displaced_after_px`, median displacements; `moved`, whether poses were
+    changed; `cameras` and `photos`, the correction of each.
     """
     from scan2sim.texturing.pose_refinement import bundle_adjustment
 
@@ -91,47 +94,71 @@ def pose_refinement(inputs: Inputs, params: PoseRefinementParams, out: Path, rep
     photos = [views[i] for i in index]
     names, camera = group_by_camera(photos)
     poses = np.array([view.T_world_cam for view in photos], np.float64).reshape(-1, 4, 4)  # also for no photos
-    cameras = [compared_camera(view.camera) for view in photos]
     grey_photos = _grey_photos(photos, [k for k, i in enumerate(index) if not held[i]])
     surface, movable = _surface(inputs)
-    order = bundle_adjustment.capture_order(poses[:, :3, 3], [view.time for view in photos])
-    now = bundle_adjustment.Corrections(np.zeros((len(photos), 6)), np.zeros((len(names), 6)))
-    first: tuple[Matches, F64] | None = None
-    for turn in range(MAX_ROUNDS):
-        at = now.apply(poses, camera)
-        posed = [replace(view, T_world_cam=T) for view, T in zip(photos, at, strict=True)]
-        report(turn / MAX_ROUNDS, "matching")
-        found = _matched(posed, cameras, grey_photos, surface, movable, params)
-        before = bundle_adjustment.displacement(found, cameras, at)
-        first = first or (found, before)
-        if len(before) < MIN_MATCHES or _median(before) <= params.min_gain_px:
-            break
-        report((turn + 0.8) / MAX_ROUNDS, "solving")
-        now = bundle_adjustment.solve(found, cameras, poses, now, camera, order, _priors(params))
-        after = bundle_adjustment.displacement(found, cameras, now.apply(poses, camera))
-        if _median(before) - _median(after) < ROUND_GAIN_MIN_PX:
-            break
-    assert first is not None
-    now, warnings = _plausible(now, names, [view.name for view in photos], _priors(params))
+    cameras = [compared_camera(view.camera) for view in photos]
+    priors = _priors(params)
+    now, first, found = _refined(photos, camera, grey_photos, surface, movable, params, priors, report)
+    warnings = _implausible_lenses(now, names)
+    if warnings:
+        priors = replace(priors, lens=np.zeros(5))
+        now, first, found = _refined(photos, camera, grey_photos, surface, movable, params, priors, report)
+    now, more_warnings = _plausible(now, names, [view.name for view in photos], priors)
     at = now.apply(poses, camera)
-    after = bundle_adjustment.displacement(found, cameras, at)
+    after = bundle_adjustment.displacement(found, now.lenses(cameras, camera), at)
     moved = (
         len(after) >= MIN_MATCHES
         and bool(np.any(at != poses))
         and _median(first[1]) - _median(after) >= params.min_gain_px
     )
     if moved:
-        for i, T in zip(index, at, strict=True):
-            views = (*views[:i], replace(views[i], T_world_cam=T), *views[i + 1 :])
-    links = [views_io.with_links(view, out, i) for i, view in enumerate(views)]
-    views_io.save(out / "views.json", links, held)
+        lenses = now.lenses([view.camera for view in photos], camera)
+        for i, T, lens in zip(index, at, lenses, strict=True):
+            views = (*views[:i], replace(views[i], T_world_cam=T, camera=lens), *views[i + 1 :])
+    files = views_io.save_linked(out, views, held)
     metrics: dict[str, Any] = {"photos": len(photos), "matches": len(first[1]), "moved": moved}
     if len(first[1]):
         metrics |= {"displaced_px": round(_median(first[1]), 3)}
     if moved:
         metrics |= {"displaced_after_px": round(_median(after), 3)}
         metrics |= _correction_metrics(now, names, photos, *_by_photo(first, (found, after), photos, cameras))
-    return Done({"views": out / "views.json"}, metrics, warnings if moved else [])
+    return Done(files, metrics, [*warnings, *more_warnings] if moved else warnings)
+
+
+def _refined(
+    photos: Sequence[View],
+    camera: Numbers,
+    grey_photos: dict[int, GreyPhoto],
+    surface: Scene,
+    movable: Scene,
+    params: PoseRefinementParams,
+    priors: Priors,
+    report: Report,
+) -> tuple[Corrections, tuple[Matches, F64], Matches]:
+    """Corrections, the first matches with their displacements (N,), and the last matches."""
+    from scan2sim.texturing.pose_refinement import bundle_adjustment
+
+    poses = np.array([view.T_world_cam for view in photos], np.float64).reshape(-1, 4, 4)  # also for no photos
+    given = [compared_camera(view.camera) for view in photos]
+    order = bundle_adjustment.capture_order(poses[:, :3, 3], [view.time for view in photos])
+    now = bundle_adjustment.Corrections.none(len(photos), int(camera.max(initial=-1)) + 1)
+    first: tuple[Matches, F64] | None = None
+    for turn in range(MAX_ROUNDS):
+        at, lenses = now.apply(poses, camera), now.lenses(given, camera)
+        posed = [replace(view, T_world_cam=T) for view, T in zip(photos, at, strict=True)]
+        report(turn / MAX_ROUNDS, "matching")
+        found = _matched(posed, lenses, grey_photos, surface, movable, params)
+        before = bundle_adjustment.displacement(found, lenses, at)
+        first = first or (found, before)
+        if len(before) < MIN_MATCHES or _median(before) <= params.min_gain_px:
+            break
+        report((turn + 0.8) / MAX_ROUNDS, "solving")
+        now = bundle_adjustment.solve(found, given, poses, now, camera, order, priors)
+        after = bundle_adjustment.displacement(found, now.lenses(given, camera), now.apply(poses, camera))
+        if _median(before) - _median(after) < ROUND_GAIN_MIN_PX:
+            break
+    assert first is not None
+    return now, first, found
 
 
 def group_by_camera(views: Sequence[View]) -> tuple[list[str], Numbers]:
@@ -164,6 +191,7 @@ def _priors(params: PoseRefinementParams) -> Priors:
         params.camera_shift,
         params.camera_rotation / 1000,
         params.correlation_length,
+        GIVEN_SIGMA if params.lens else np.zeros(5),
     )
 
 
@@ -222,7 +250,7 @@ def _matched(
             size = (cameras[k].width, cameras[k].height)
             is_static = np.asarray(cv2.resize(dilated, size, interpolation=cv2.INTER_NEAREST)) == 0
             photo = replace(photo, usable=photo.usable & is_static)
-        static[k] = photo
+        static[k] = replace(photo, camera=cameras[k])
     settings = PhotoConsistencyParams(max_shift=0, neighbours=NEIGHBOUR_PHOTOS, max_distance=params.max_distance)
     small_views = [replace(view, camera=camera) for view, camera in zip(photos, cameras, strict=True)]
     nearest = neighbours(small_views, list(grey_photos), maps.__getitem__, settings)
@@ -231,11 +259,20 @@ def _matched(
     )
 
 
+def _implausible_lenses(found: Corrections, cameras: Sequence[str]) -> list[str]:
+    """Warnings about lenses that changed implausibly much."""
+    bad = (np.abs(found.lens) > MAX_CORRECTION_SIGMAS * GIVEN_SIGMA).any(axis=1)
+    return [
+        f"{cameras[k]}: estimated lens, with a focal length changed by {100 * np.expm1(found.lens[k, 0]):.1f} %, is "
+        "implausibly different from the given one and was rejected; check the camera's calibration"
+        for k in np.flatnonzero(bad).tolist()
+    ]
+
+
 def _plausible(
     found: Corrections, cameras: Sequence[str], photos: Sequence[str], priors: Priors
 ) -> tuple[Corrections, list[str]]:
     """Corrections with implausibly large ones set to zero, and warnings about those."""
-    from scan2sim.texturing.pose_refinement.bundle_adjustment import Corrections
 
     def beyond(rows: F64, turn: float, shift: float) -> Bools:
         turned, shifted = np.linalg.norm(rows[:, :3], axis=1), np.linalg.norm(rows[:, 3:], axis=1)
@@ -256,8 +293,10 @@ def _plausible(
                 f"implausibly large and was rejected; check the pose, or increase `pose_refinement.{prefix}shift` and "
                 f"`pose_refinement.{prefix}rotation`"
             )
-    return Corrections(
-        np.where(bad_photo[:, None], 0.0, found.photo), np.where(bad_camera[:, None], 0.0, found.camera)
+    return replace(
+        found,
+        photo=np.where(bad_photo[:, None], 0.0, found.photo),
+        camera=np.where(bad_camera[:, None], 0.0, found.camera),
     ), warnings
 
 
@@ -287,18 +326,24 @@ def _correction_metrics(
     before: dict[int, float],
     after: dict[int, float],
 ) -> dict[str, Any]:
-    """Metrics: corrections of the cameras (right, down, forward) and magnitudes of the photos' corrections."""
+    """Metrics: corrections of the cameras (right, down, forward; lens) and magnitudes of the photos' corrections."""
     rows = {}
     for k, view in enumerate(photos):
         rows[view.name] = _magnitude(applied.photo[k])
         if k in before and k in after:
             rows[view.name] |= {"displaced_px": round(before[k], 2), "displaced_after_px": round(after[k], 2)}
     by_camera = {
-        name: {"shift_cm": (100 * row[3:]).round(2).tolist(), "turn_mrad": (1000 * row[:3]).round(2).tolist()}
-        for name, row in zip(cameras, applied.camera, strict=True)
+        name: {
+            "shift_cm": (100 * row[3:]).round(2).tolist(),
+            "turn_mrad": (1000 * row[:3]).round(2).tolist(),
+            "focal_change_percent": round(100 * float(np.expm1(lens[0])), 3),
+            "k1_change": round(float(lens[3]), 4),
+            "k2_change": round(float(lens[4]), 4),
+        }
+        for name, row, lens in zip(cameras, applied.camera, applied.lens, strict=True)
     }
     shift, turn = (max(row[key] for row in rows.values()) for key in ("shift_cm", "turn_mrad"))
     return {"largest_shift_cm": shift, "largest_turn_mrad": turn, "cameras": by_camera, "photos": rows}
 
 
-POSE_REFINEMENT = Step("pose_refinement", 2, pose_refinement, PoseRefinementParams)
+POSE_REFINEMENT = Step("pose_refinement", 4, pose_refinement, PoseRefinementParams)

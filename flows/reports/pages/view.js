@@ -37,6 +37,8 @@
   class World extends View {
     constructor(box, about) {
       super(box, [], about);
+      this.camera.far = Math.max(this.camera.far, about.dome?.far ?? 0);
+      this.camera.updateProjectionMatrix();
       this.rgb = (of) => linear(`rgb(${of.join(",")})`);
       this.tinted = { value: 0 };
       this.colours = "photo";
@@ -46,11 +48,11 @@
       this.loop();
     }
 
-    // Tiles sorted by distance to the viewer, or to the orbit's centre.
+    // A survey's sky, and the tiles sorted by distance to the viewer, or to the orbit's centre.
     nearest() {
       const eye = this.walking ? this.camera.position : this.orbit.target;
       const away = ({ offset, low, high }) => Math.hypot(...[0, 1].map((k) => Math.max(0, offset[k] + low[k] - eye.getComponent(k), eye.getComponent(k) - offset[k] - high[k])));
-      return [...this.about.tiles].sort((a, b) => away(a) - away(b));
+      return [...(this.about.dome ? [this.about.dome] : []), ...[...this.about.tiles].sort((a, b) => away(a) - away(b))];
     }
 
     async loop() {
@@ -70,7 +72,7 @@
         budget -= held?.texels ?? 0;
         if (budget < 0) { this.drop(tile.name); continue; }
         if (!held) return [tile, tile.name];
-        if (this.shown.collision && !this.loaded.has(`${tile.name}_collision`)) return [tile, `${tile.name}_collision`];
+        if (this.shown.collision && tile !== this.about.dome && !this.loaded.has(`${tile.name}_collision`)) return [tile, `${tile.name}_collision`];
       }
       this.say(this.loaded.size ? "" : "Loading …");
       return null;
@@ -90,7 +92,7 @@
       const texels = found.reduce((sum, { material }) => sum + (material.map ? material.map.image.width * material.map.image.height : 0), 0);
       for (const mesh of found) this.prepare_mesh(mesh, solid);
       this.loaded.set(name, { tile, solid, texels, meshes: found });
-      if (solid) this.scene.add(...found);
+      if (solid || tile === this.about.dome) this.scene.add(...found);
       else this.put(name, found);
       this.update_tile(name);
       if (this.walking && !this.about.photos.length) this.stand();

@@ -87,7 +87,8 @@
   }
 
   class View {
-    // box: element of the view; about: start poses `walk` and `turn` as [eye, target] in metres, `start`: one of the two
+    // box: element of the view; about: start poses `walk` and `turn` as [eye, target] in metres, `start`: one of the two,
+    // `sky`: colour of the background, sRGB 0 to 255, or null
     constructor(box, all, about) {
       this.box = box;
       this.about = about;
@@ -98,7 +99,7 @@
       this.canvas.setAttribute("aria-label", "3D view of the world; W A S D or arrow keys walk, dragging looks around");
       box.prepend(this.canvas);
       this.scene = new THREE.Scene();
-      this.scene.background = new THREE.Color(SKY_COLOUR);
+      this.scene.background = new THREE.Color(about.sky ? `rgb(${about.sky.join(",")})` : SKY_COLOUR);
       this.grounds = new Map();
       if (all.length) this.put("world", all);
       this.camera = new THREE.PerspectiveCamera(65, 1, 0.05, 5000);

@@ -48,7 +48,7 @@ def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
 
 
 def _parts(path: Path) -> Iterator[Points]:
-    with closing(_open(path)) as file:
+    with closing(open_file(path)) as file:
         try:
             scans = file.root()["data3D"]
             for i in range(len(scans)):
@@ -59,7 +59,12 @@ def _parts(path: Path) -> Iterator[Points]:
             raise _unreadable(path, error) from None
 
 
-def _open(path: Path) -> Any:
+def open_file(path: Path) -> Any:
+    """Open an E57 file: a libe57 `ImageFile`.
+
+    Raises:
+        InputError: it doesn't exist, or isn't an E57 file.
+    """
     from pye57 import libe57  # pye57's class E57 deletes files that it can't open
 
     file_checks.check(path)
@@ -83,7 +88,7 @@ def _scan(file: Any, node: Any) -> Iterator[Points]:
     buffers = libe57.VectorSourceDestBuffer()
     for name, array in values.items():
         buffers.append(libe57.SourceDestBuffer(file, name, array, READ_POINTS, True, True))
-    pose = _pose(node)
+    pose = pose_of(node)
     done = 0
     with closing(header.points.reader(buffers)) as reader:
         while n := reader.read():
@@ -128,8 +133,12 @@ def _fraction(values: F64, node: Any, limits: str, name: str) -> F64:
     return (values - low) / (high - low) if high > low else values
 
 
-def _pose(node: Any) -> F64:
-    """Transform (4, 4) from scan to file coordinates; the identity if the scan has no pose."""
+def pose_of(node: Any) -> F64:
+    """Transform (4, 4) of a scan or image to file coordinates; the identity if it has no pose.
+
+    Raises:
+        ValueError: the pose contains NaN or infinity, or a quaternion of zeros.
+    """
     from scipy.spatial.transform import Rotation
 
     pose = np.eye(4)
@@ -139,7 +148,7 @@ def _pose(node: Any) -> F64:
     if node.isDefined("pose/translation"):
         pose[:3, 3] = [float(node["pose"]["translation"][key].value()) for key in "xyz"]
     if not np.isfinite(pose).all():
-        raise ValueError("the pose of a scan is not finite")
+        raise ValueError("a pose is not finite")
     return pose
 
 
@@ -148,7 +157,7 @@ def _crs(path: Path) -> str | None:
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
-    with closing(_open(path)) as file:
+    with closing(open_file(path)) as file:
         root = file.root()
         text = str(root["coordinateMetadata"].value()) if root.isDefined("coordinateMetadata") else ""
     try:

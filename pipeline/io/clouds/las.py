@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from datetime import date
 from itertools import chain
@@ -209,6 +209,34 @@ def write_parts(path: Path, parts: Iterable[PointCloud], scale: float = 0.001, s
                     f"its points are more than {extent_km:,.0f} km apart, LAS's limit at a resolution of {scale:g} m"
                 )
                 raise DataError(path.name, cause, "Remove outliers, and check the unit") from None
+
+
+def rewrite(path: Path, out: Path, moved: Callable[[F64, F64], F64]) -> None:
+    """Write a file with other coordinates; all attributes, the CRS and other records of the header remain.
+
+    Args:
+        path: file with GPS times.
+        out: LAS or LAZ file to write.
+        moved: function of coordinates (N, 3), CRS units, and times (N,) that returns new coordinates.
+
+    Raises:
+        InputError: missing, truncated or damaged.
+    """
+    import laspy
+
+    with open_las(path) as reader:
+        header = laspy.LasHeader(version=reader.header.version, point_format=reader.header.point_format)
+        header.scales, header.offsets = reader.header.scales, reader.header.offsets
+        header.vlrs.extend(vlr for vlr in reader.header.vlrs if vlr.user_id not in ("copc", "laszip encoded"))
+        header.global_encoding = reader.header.global_encoding
+        header.system_identifier = reader.header.system_identifier
+        header.generating_software = reader.header.generating_software
+        header.creation_date = reader.header.creation_date
+        with laspy.open(out, mode="w", header=header) as writer:
+            for part in read_parts(path, reader, CHUNK_POINTS):
+                xyz = moved(_coordinates(part), np.asarray(part.gps_time, np.float64))
+                part.x, part.y, part.z = xyz.T
+                writer.write_points(part)
 
 
 def _header(cloud: PointCloud, scale: float) -> Any:

@@ -8,26 +8,29 @@ from pathlib import Path
 from typing import Any
 
 Position = Sequence[float]
+Feature = tuple[str, Any, Mapping[str, Any]]
+"""Type of geometry, its coordinates in the file's CRS, and properties."""
 
 
 def write_points(path: Path, crs: str, features: Sequence[tuple[Position, Mapping[str, Any]]]) -> None:
     """Write points; a feature is its (x, y, z) in `crs` and its properties."""
-    _write(path, crs, [("Point", list(position), properties) for position, properties in features])
+    write(path, crs, [("Point", list(position), properties) for position, properties in features])
 
 
 def write_lines(path: Path, crs: str, features: Sequence[tuple[Sequence[Position], Mapping[str, Any]]]) -> None:
     """Write lines; a feature is its positions along the line in `crs` and its properties."""
     lines = [("LineString", [list(position) for position in line], properties) for line, properties in features]
-    _write(path, crs, lines)
+    write(path, crs, lines)
 
 
 def write_polygons(path: Path, crs: str, features: Sequence[tuple[Sequence[Position], Mapping[str, Any]]]) -> None:
     """Write polygons; a feature is a closed ring of positions in `crs` (the first repeated last) and its properties."""
     polygons = [("Polygon", [[list(position) for position in ring]], properties) for ring, properties in features]
-    _write(path, crs, polygons)
+    write(path, crs, polygons)
 
 
-def _write(path: Path, crs: str, features: Sequence[tuple[str, Any, Mapping[str, Any]]]) -> None:
+def write(path: Path, crs: str, features: Sequence[Feature]) -> None:
+    """Write features of any types."""
     body = {
         "type": "FeatureCollection",
         "crs": crs_member(crs),

@@ -153,14 +153,16 @@ def _marks(lane: ET.Element, section: Section, border: Border) -> None:
     at = section.first
     for first, last in marked:
         if first - at > MIN_MARK_LENGTH_M:
-            ET.SubElement(lane, "roadMark", _text(sOffset=at - section.first, type="none"))
+            ET.SubElement(lane, "roadMark", _text(sOffset=at - section.first, type="none", color="standard"))
         else:
             first = at
         assert line is not None
         begin = _text(sOffset=first - section.first)
         if line.kind != "marking":
             kerb = {} if line.kerb is None else _text(height=line.kerb)
-            ET.SubElement(lane, "roadMark", begin | {"type": "none" if line.kerb is None else "curb"} | kerb)
+            ET.SubElement(
+                lane, "roadMark", begin | {"type": "none" if line.kerb is None else "curb", "color": "standard"} | kerb
+            )
         else:
             assert line.marking is not None and line.width is not None
             paint = _text(type=line.marking, weight="standard", color="white", width=line.width)
@@ -172,4 +174,4 @@ def _marks(lane: ET.Element, section: Section, border: Border) -> None:
                 ET.SubElement(kind, "line", dashes | _text(width=line.width))
         at = last
     if section.last - at > MIN_MARK_LENGTH_M:
-        ET.SubElement(lane, "roadMark", _text(sOffset=at - section.first, type="none"))
+        ET.SubElement(lane, "roadMark", _text(sOffset=at - section.first, type="none", color="standard"))

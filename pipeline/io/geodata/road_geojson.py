@@ -56,7 +56,7 @@ def notes(road: Road) -> list[str]:
     """Notes on missing information about a road."""
     found = []
     if not road.markings:
-        found.append("no painted line is seen: its lanes aren't told, only its edges")
+        found.append("no painted line is seen: only its edges are extracted, no lanes")
     elif road.reference != "marking":
         found.append("no painted line is in its middle: the direction of its lanes is unknown")
     for line, side in ((road.left, "left"), (road.right, "right")):

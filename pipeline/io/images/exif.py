@@ -1,14 +1,16 @@
-"""EXIF metadata of photos: GPS position and focal length."""
+"""EXIF metadata of photos: GPS position, focal length and time."""
 
 from __future__ import annotations
 
 import math
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 GPS, EXIF = 0x8825, 0x8769  # tags of the two sub-directories (IFD)
 LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE = 1, 2, 3, 4, 5, 6
 FOCAL, FOCAL_35MM, ORIGINAL_WIDTH, FOCAL_PLANE_X, FOCAL_PLANE_UNIT = 37386, 41989, 40962, 41486, 41488
+TAKEN, OFFSET, FRACTION = 36867, 36881, 37521  # DateTimeOriginal, OffsetTimeOriginal, SubSecTimeOriginal
 UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0}
 """Millimetres of the units in which EXIF gives the resolution of the focal plane."""
 
@@ -46,6 +48,22 @@ def focal_35mm(photo: Path) -> float | None:
     except Exception:  # as above
         return None
     return focal if 1 < focal < 5000 else None
+
+
+def time_taken(photo: Path) -> tuple[float, bool] | None:
+    """UNIX time at which a photo was taken, and whether its time zone is known (else UTC is assumed), or None."""
+    from PIL import Image
+
+    try:
+        with Image.open(photo) as image:
+            tags = image.getexif().get_ifd(EXIF)
+        zone = str(tags.get(OFFSET, "")).strip()
+        digits = str(tags.get(FRACTION, "")).strip()
+        taken = datetime.strptime(str(tags[TAKEN]).strip(), "%Y:%m:%d %H:%M:%S")
+        moment = taken.replace(tzinfo=datetime.strptime(zone, "%z").tzinfo if zone else UTC)
+        return moment.timestamp() + (float(f"0.{digits}") if digits.isdigit() else 0.0), bool(zone)
+    except Exception:  # as above
+        return None
 
 
 def _degrees(value: Any) -> float:

@@ -6,12 +6,32 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self
 
-from scan2sim.pipeline.core.errors import from_os_error
+from scan2sim.pipeline.core.errors import UnavailableError, from_os_error
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import U8
 
 TICKS_PER_SECOND = 90_000
 """Time base of the video."""
+CODEC = "libx264"
+
+
+def check_encoder(what: str = "a video") -> None:
+    """Check that H.264 can be encoded here; `what` needs it.
+
+    Raises:
+        UnavailableError: PyAV isn't installed, or its FFmpeg was built without libx264.
+    """
+    require(what, "av")
+    import av
+
+    try:
+        av.codec.Codec(CODEC, "w")
+    except ValueError:  # PyAV's UnknownCodecError
+        raise UnavailableError(
+            what,
+            f"needs the encoder {CODEC}, which the FFmpeg of this PyAV doesn't have",
+            "Install PyAV's own build: pip install --force-reinstall --only-binary av av",
+        ) from None
 
 
 class Encoder:
@@ -38,10 +58,10 @@ class Encoder:
             options: options of libx264: preset, crf, threads.
 
         Raises:
-            UnavailableError: PyAV isn't installed.
+            UnavailableError: PyAV isn't installed, or has no libx264.
             SpaceError: the file isn't writable.
         """
-        require("a video", "av")
+        check_encoder()
         import av
 
         self.count, self.file, self._last = 0, file, -1
@@ -49,7 +69,7 @@ class Encoder:
             self._container: Any = av.open(str(file), "w", format="mp4", options=container or {})
         except OSError as error:
             raise from_os_error(error, file) from error
-        stream = self._container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
+        stream: Any = self._container.add_stream(CODEC, rate=Fraction(fps).limit_denominator(1001))
         stream.width, stream.height = size
         stream.pix_fmt = "yuv420p"
         if bitrate is not None:

@@ -1,4 +1,4 @@
-"""Readers of photogrammetry models (COLMAP, OpenSfM, Metashape, Bundler, VisualSFM): one module per program.
+"""Readers of photogrammetry models (COLMAP, OpenSfM, Metashape, nerfstudio, ...): one module per program.
 
 A program's module has `read(model, photos) -> Model` and converts the program's conventions to this project's: cameras
 as in `pipeline.core.types`, poses camera to model with OpenCV's axes. The georeference comes from the program
@@ -25,11 +25,21 @@ from scan2sim.pipeline.io.tile_folder import without_parents
 
 @dataclass(frozen=True)
 class Shot:
-    """A posed photo: file name as stored by the program, name of its camera, `pose` (4, 4) camera to model."""
+    """A posed photo.
+
+    Attributes:
+        file: file name as stored by the program.
+        camera: name of its camera.
+        pose: (4, 4) camera to model.
+        mask: image that is 0 where the photo must not be used, or None.
+        depth: depth image, see `pipeline.importers.depth_images`, or None.
+    """
 
     file: str
     camera: str
     pose: F64
+    mask: Path | None = None
+    depth: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -39,12 +49,13 @@ class Model:
     Attributes:
         cameras: cameras by name.
         shots: photos that have a pose.
-        xyz: (N, 3) sparse points, model coordinates.
+        xyz: (N, 3) points, model coordinates: sparse ones, or a cloud of the program.
         rgb: (N, 3) their colours, or None.
         T_earth: (4, 4) similarity from model coordinates to geocentric ones (WGS 84, metres), or None if the model
             isn't georeferenced.
         crs: projected CRS of the program's project, or None.
         notes: warnings for the user, such as photos that are left out.
+        up: direction of the model that becomes +z if its CRS isn't known and the user gives none; None for +z.
     """
 
     cameras: dict[str, Camera]
@@ -54,6 +65,7 @@ class Model:
     T_earth: F64 | None = None
     crs: str | None = None
     notes: tuple[str, ...] = ()
+    up: tuple[float, float, float] | None = None
 
     @property
     def centres(self) -> F64:
@@ -69,7 +81,7 @@ class Model:
             return out
 
         shots = tuple(replace(shot, pose=pose(shot)) for shot in self.shots)
-        return replace(self, shots=shots, xyz=onto.apply(self.xyz), T_earth=None)
+        return replace(self, shots=shots, xyz=onto.apply(self.xyz), T_earth=None, up=None)
 
 
 class Photos:

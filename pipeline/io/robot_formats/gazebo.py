@@ -10,7 +10,7 @@ from math import pi
 from pathlib import Path
 
 from scan2sim.pipeline.io.file_checks import make_folder
-from scan2sim.pipeline.io.worlds.sdf import numbers, write_config
+from scan2sim.pipeline.io.worlds.sdf import WITHOUT_BACKDROP, numbers, write_config
 from scan2sim.pipeline.simulation.robot import Box, Link, Robot, Sphere, Start
 
 LABELS_RATE_HZ = 5.0
@@ -139,6 +139,7 @@ def _lidar(robot: Robot) -> str:
           </scan>
           <range><min>{lidar.min_range:g}</min><max>{lidar.max_range:g}</max><resolution>0.001</resolution></range>
           <noise><type>gaussian</type><mean>0</mean><stddev>{lidar.noise:g}</stddev></noise>
+          <visibility_mask>{WITHOUT_BACKDROP}</visibility_mask>
         </lidar>"""
 
 

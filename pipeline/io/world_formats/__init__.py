@@ -7,15 +7,19 @@ levels per tile. All files and folders that it writes have ASCII names and refer
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import traceback
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from math import ceil
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from pydantic import Field
 
-from scan2sim.pipeline.core.errors import DataError, SettingError
+from scan2sim.pipeline.core.errors import DataError, ScanError, SettingError, SpaceError, from_exception
 from scan2sim.pipeline.core.plugins import find, module, names
 from scan2sim.pipeline.core.step import Report
 from scan2sim.pipeline.core.types import Mesh
@@ -23,13 +27,14 @@ from scan2sim.pipeline.io import robot_formats
 from scan2sim.pipeline.io.file_checks import make_folder
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.mesh_formats import PageNames, obj
+from scan2sim.pipeline.io.navigation import ros_launch
 from scan2sim.pipeline.io.worlds import sdf
 from scan2sim.pipeline.io.worlds.glb import GlbParams, find_encoders
-from scan2sim.pipeline.io.worlds.scene import Scene, SceneTile, by_class
-from scan2sim.pipeline.io.worlds.spawn import find_spawn_pose
+from scan2sim.pipeline.io.worlds.scene import BACKDROP, Scene, SceneTile, by_class
+from scan2sim.pipeline.io.worlds.spawn import find_spawn_pose, free_space_pose
 from scan2sim.pipeline.io.worlds.textured_mesh import Textured
 from scan2sim.pipeline.simulation.collision_shapes import Solid, solids
-from scan2sim.pipeline.simulation.robot import ROBOT
+from scan2sim.pipeline.simulation.robot import ROBOT, Robot
 
 PACKAGE = "scan2sim.pipeline.io.world_formats"
 GAZEBO_VISUAL_FORMATS = ("obj", "collada")
@@ -46,6 +51,7 @@ class SceneParams(GlbParams):
         pages: format of texture pages in separate files: "png", lossless, or "jpeg", about a sixth of the size.
         source_pages: write a mask for each of these pages with the source of each texel's colour: 255 a photo, 128
             the cloud's points, 64 inpainted, 0 no surface.
+        ceiling: ceilings of indoor maps: a model of their own, or left out.
     """
 
     meshes: tuple[str, ...] = Field(
@@ -61,6 +67,11 @@ class SceneParams(GlbParams):
     )
     pages: Literal["png", "jpeg"] = Field(
         "png", description="Format of separate texture pages: png (lossless), or jpeg (about a sixth of the size)."
+    )
+    ceiling: Literal["model", "hidden"] = Field(
+        "model",
+        description="Ceilings of a robot's map of rooms: model (in Gazebo's world a model of its own, which can be "
+        "removed), or hidden.",
     )
     source_pages: bool = Field(False, description="Write a mask for each texture page with the source of colours.")
 
@@ -104,39 +115,133 @@ def check(formats: Sequence[str], params: SceneParams, setting: str, robot: bool
 
 
 def write(
-    scene: Scene, formats: Sequence[str], folder: Path, params: SceneParams, report: Report, robot: bool = False
+    scene: Scene,
+    formats: Sequence[str],
+    folder: Path,
+    params: SceneParams,
+    report: Report,
+    robot: bool = False,
+    failed: dict[str, ScanError] | None = None,
 ) -> None:
     """Write a scene in the given formats below `folder`, with its lists and `metadata.json`.
 
-    With `robot`, formats that support it get a small robot (`pipeline.simulation.robot`) on the road.
+    Args:
+        scene: the scene.
+        formats: names of the formats.
+        folder: the world's folder.
+        params: settings of the writers.
+        report: receives the progress.
+        robot: formats that support it get a small robot (`pipeline.simulation.robot`) on the road.
+        failed: receives the errors of optional parts by name, and nothing of them is written: formats other than the
+            world's own (Gazebo, or else the first one), lists, files for navigation. None: their errors are raised.
 
     Raises:
         ScanError: as `check`, or there is no start pose for the robot; raised before anything is written.
     """
     check(formats, params, "export.formats", robot)
+    if params.ceiling == "hidden":
+        scene = replace(scene, tiles=tuple(map(_without_ceiling, scene.tiles)))
     if robot:
         _check_names(scene)
         scene = replace(scene, start=find_spawn_pose(scene))
     make_folder(folder)
     triangles: dict[str, int] = {}
+    main = "gazebo" if "gazebo" in formats else next(iter(formats), "")
     for i, name in enumerate(formats):
 
         def report_format(fraction: float, message: str = "", finished: int = i, format_name: str = name) -> None:
             report((finished + fraction) / len(formats), f"{format_name} {message}".strip())
 
-        triangles |= find(PACKAGE, name, "export.formats").write(scene, folder, params, report_format)
-        if scene.start and name in names(robot_formats.PACKAGE):
-            module(robot_formats.PACKAGE, name).write(ROBOT, scene.start, folder)
+        with _part(name, folder, None if name == main else failed) as place:
+            triangles |= find(PACKAGE, name, "export.formats").write(scene, place, params, report_format)
+            if scene.start and name in names(robot_formats.PACKAGE):
+                module(robot_formats.PACKAGE, name).write(_robot_for(scene), scene.start, place)
+    with _part("lists", folder, failed) as place:
+        _write_lists(scene, place)
+    navigation: dict[str, Any] = {}
+    if len(scene.tiles) == 1:
+        with _part("navigation", folder, failed) as place:
+            navigation = _write_navigation(scene, place, formats)
+    text = json.dumps(metadata(scene, triangles) | navigation, indent=2)
+    (folder / "metadata.json").write_text(text + "\n", encoding="utf-8")
+
+
+@contextmanager
+def _part(name: str, folder: Path, failed: dict[str, ScanError] | None) -> Iterator[Path]:
+    """A folder to write a part of the world into, moved to `folder` when complete; its error is added to `failed`.
+
+    Without `failed` it is `folder` itself, and errors are raised; so are those about a full disk.
+    """
+    if failed is None:
+        yield folder
+        return
+    temporary = folder / f".{name}"
+    try:
+        make_folder(temporary)
+        yield temporary
+        shutil.copytree(temporary, folder, dirs_exist_ok=True, copy_function=os.replace)
+    except Exception as error:
+        failed[name] = from_exception(error, name, folder)
+        if isinstance(failed[name], SpaceError):
+            raise failed[name] from error
+        failed[name].add_note(traceback.format_exc())
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _write_lists(scene: Scene, folder: Path) -> None:
+    """Write the lists of detected objects of all tiles."""
     for tile in scene.tiles:
         for file, path in tile.lists.items():
             shutil.copyfile(path, folder / (file if len(scene.tiles) == 1 else f"{tile.name}_{file}"))
-    text = json.dumps(metadata(scene, triangles), indent=2)
-    (folder / "metadata.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _write_navigation(scene: Scene, folder: Path, formats: Sequence[str]) -> dict[str, Any]:
+    """Write the files for navigation of a world that has any: occupancy maps, points, with Gazebo a launch file.
+
+    Returns:
+        The entry about navigation in metadata.json, if there is one.
+    """
+    files, start = scene.tiles[0].navigation_files, scene.start or free_space_pose(scene)
+    about = scene.tiles[0].navigation()
+    entry = {} if about is None else {"navigation": about}
+    for name, path in files.items():
+        shutil.copyfile(path, folder / name)
+    if "gazebo" not in formats or (start is None and scene.robot_map is None):
+        return entry
+    spawn = scene.start is None and start is not None and not _is_robot_name(scene)
+    if spawn and start is not None:
+        module(robot_formats.PACKAGE, "gazebo").write(ROBOT, start, folder)
+    ros_launch.write(
+        folder / f"{scene.name}.launch.py", f"{scene.name}.sdf", ROBOT, start, spawn=spawn,
+        occupancy="map.yaml" in files, T_world_map=scene.robot_map.T_world_map if scene.robot_map else None,
+    )  # fmt: skip
+    return entry
+
+
+def _is_robot_name(scene: Scene) -> bool:
+    """Whether a tile or the world has the robot's name."""
+    return ROBOT.name in {scene.name, *(tile.name for tile in scene.tiles)}
+
+
+def _robot_for(scene: Scene) -> Robot:
+    """The robot, with a camera that sees as far as the sky."""
+    return replace(ROBOT, camera=replace(ROBOT.camera, max_range=max(ROBOT.camera.max_range, ceil(scene.far or 0))))
+
+
+def _without_ceiling(tile: SceneTile) -> SceneTile:
+    """The tile without its ceilings, unless it consists of nothing else."""
+    groups = {group: figures for group, figures in tile.groups.items() if group != CEILING}
+    return replace(tile, groups=groups) if groups else tile
+
+
+CEILING = "ceiling"
+"""Surface that Gazebo's world has as a model of its own."""
 
 
 def _check_names(scene: Scene) -> None:
     """Raise an error if a tile or the world has the robot's name."""
-    if ROBOT.name in {scene.name, *(tile.name for tile in scene.tiles)}:
+    if _is_robot_name(scene):
         raise DataError(
             ROBOT.name, "is the name of the robot, and of a tile or the world", "Choose another name: export.name"
         )
@@ -152,12 +257,17 @@ def metadata(scene: Scene, triangles: dict[str, int]) -> dict[str, Any]:
         "friction": scene.tiles[0].friction,
         "triangles_by_file": triangles,
     }
+    rest |= sky_metadata(scene)
     if scene.start:
         start = {"position_m": list(scene.start.position), "angles_rad": list(scene.start.angles), "on": scene.start.by}
         rest["robot"] = {"name": ROBOT.name, **start}
+    if scene.robot_map:
+        rest |= {"T_world_map": scene.robot_map.T_world_map.tolist(), "map_unit_m": scene.robot_map.unit}
     if len(scene.tiles) == 1:
         tile = scene.tiles[0]
         to_crs = "crs = (local + origin_m) / unit_m; OBJ and Collada are local, z-up; GLB is local, y-up (x, z, -y)"
+        backdrop = sorted(file for file in triangles if Path(file).name.startswith(BACKDROP))
+        rest |= {"backdrop": [file for file in backdrop if file.endswith(".obj")]} if backdrop else {}
         return {**common, "origin_m": list(tile.frame.origin), "to_crs": to_crs, "groups": dict(tile.groups), **rest}
     tiles = {
         tile.name: {
@@ -170,6 +280,12 @@ def metadata(scene: Scene, triangles: dict[str, int]) -> dict[str, Any]:
     }
     to_crs = "crs = (world + world_origin_m) / unit_m; world = local + offset_m, local as in a tile's meshes"
     return {**common, "to_crs": to_crs, "tiles": tiles, **rest}
+
+
+def sky_metadata(scene: Scene) -> dict[str, Any]:
+    """Entries of metadata.json: colour of the sky, and the far clipping distance that cameras need for a dome."""
+    colour = {"sky_rgb": list(scene.sky)} if scene.sky else {}
+    return colour | ({"camera_far_m": ceil(scene.far)} if scene.far else {})
 
 
 def write_pages(folder: Path, group: str, shape: Textured, params: SceneParams) -> PageNames:

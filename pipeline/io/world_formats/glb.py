@@ -11,11 +11,11 @@ from scan2sim.pipeline.io.worlds.scene import Scene
 
 
 def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
-    """Write `<tile>.glb` for each tile."""
+    """Write `<tile>.glb` for each tile, and `<name>_sky.glb` if a survey has a sky dome."""
     triangles = {}
-    for i, tile in enumerate(scene.tiles):
-        report(i / len(scene.tiles), tile.name)
-        surfaces = tile.surfaces()
+    for i, tile in enumerate(scene.with_dome):
+        report(i / len(scene.with_dome), tile.name)
+        surfaces = [*tile.surfaces(), *tile.backdrop()]
         glb.write(folder / f"{tile.name}.glb", surfaces, params, views=tile.views(), offset=tile.offset)
         triangles[f"{tile.name}.glb"] = sum(len(surface.shape) for surface in surfaces)
     return triangles

@@ -1,8 +1,10 @@
 """OpenUSD: crate files, z up, metres; one payload per tile, so that large worlds can be loaded in parts.
 
-Layout: `<name>.usdc` places the tiles; `usd/<tile>.usdc` is a tile (`Looks`, `Visual`, `Collision`), with its texture
-pages in `usd/<tile>/`. If a scene has levels of detail, coarser levels of a tile are variants of it (`levelOfDetail`):
-`usd/level<n>/<tile>.usdc`, with the same collision shapes. Labels are `UsdSemanticsLabelsAPI:class`. The georeference
+Layout: `<name>.usdc` places the tiles; `usd/<tile>.usdc` is a tile (`Looks`, `Visual`, `Backdrop`, `Collision`); its
+texture pages are in `usd/<tile>/`. If a scene has levels of detail, coarser levels of a tile are variants of it
+(`levelOfDetail`): `usd/level<n>/<tile>.usdc`, with the same collision shapes. Labels are `UsdSemanticsLabelsAPI:class`.
+`Backdrop` is what only cameras see: deactivate it for sensors that measure distances; the sky of a survey is a tile
+of its own, `<name>_sky`, with nothing else. The georeference
 is in the custom data of the root layer and of `/World`, as USD has no schema for it.
 """
 
@@ -21,7 +23,7 @@ from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.file_checks import make_folder
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds import provenance, sdf
-from scan2sim.pipeline.io.worlds.scene import Scene, SceneTile, Surface, by_class
+from scan2sim.pipeline.io.worlds.scene import BACKDROP, Scene, SceneTile, Surface, by_class
 from scan2sim.pipeline.io.worlds.textured_mesh import unique_uv, vertex_normals
 from scan2sim.pipeline.simulation.collision_shapes import Solid, solids
 
@@ -47,8 +49,8 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
     world.GetPrim().SetCustomDataByKey("scan2sim", georeference)
     UsdPhysics.Scene.Define(stage, "/World/Physics").CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
     UsdLux.DomeLight.Define(stage, "/World/Sky").CreateIntensityAttr(SKY_INTENSITY_NITS)
-    for i, tile in enumerate(scene.tiles):
-        report(i / len(scene.tiles), tile.name)
+    for i, tile in enumerate(scene.with_dome):
+        report(i / len(scene.with_dome), tile.name)
         placed = UsdGeom.Xform.Define(stage, f"/World/{_prim(tile.name)}")
         placed.AddTranslateOp().Set(Gf.Vec3d(*tile.offset))
         files = {}
@@ -91,19 +93,21 @@ def _write_tile(path: Path, tile: SceneTile, source: SceneTile, params: ScenePar
     root = UsdGeom.Xform.Define(stage, f"/{_prim(tile.name)}")
     stage.SetDefaultPrim(root.GetPrim())
     Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
-    for scope in ("Looks", "Visual", "Collision"):
+    for scope in ("Looks", "Visual", "Backdrop", "Collision"):
         UsdGeom.Scope.Define(stage, root.GetPath().AppendChild(scope))
     triangles, views = 0, tile.views()
     _list_photos(UsdGeom.PrimvarsAPI(root), views)
-    for group, shape in tile.textured().items():
+    shown = {group: (shape, by_class(group, shape)) for group, shape in tile.textured().items()}
+    shown |= {surface.name: (surface.shape, [surface]) for surface in tile.backdrop()}
+    for group, (shape, surfaces) in shown.items():
         pages = world_formats.write_pages(path.with_suffix(""), group, shape, params)
         materials = {
             page: _add_material(stage, root, pages.materials[page], f"./{tile.name}/{pages.images[page]}")
             for page in pages.used
         }
-        for surface in by_class(group, shape):
+        for surface in surfaces:
             for part in surface.parts(params.max_visual_triangles):
-                _add_visual(stage, root, part, materials, views)
+                _add_visual(stage, root, part, materials, views, params.reflectance)
                 triangles += len(part.shape)
     for solid in solids(source.solid(), source.friction):
         _add_collision(stage, root, solid)
@@ -111,19 +115,24 @@ def _write_tile(path: Path, tile: SceneTile, source: SceneTile, params: ScenePar
     return triangles
 
 
-def _add_visual(stage: Any, root: Any, surface: Surface, materials: dict[int, Any], views: Sequence[View]) -> None:
-    """Add a surface with its labels, and one subset of faces per texture page."""
+def _add_visual(
+    stage: Any, root: Any, surface: Surface, materials: dict[int, Any], views: Sequence[View], reflectance: bool
+) -> None:
+    """Add a surface with its labels, its `reflectance` if known, and one subset of faces per texture page."""
     from pxr import Sdf, UsdGeom, UsdSemantics, UsdShade, Vt
 
     shape = surface.shape
     assert shape.mesh.uv is not None and shape.mesh.page is not None
-    mesh = _mesh(stage, root.GetPath().AppendPath(f"Visual/{surface.name}"), shape.mesh, shape.normal)
+    mesh = _mesh(stage, root.GetPath().AppendPath(f"{_scope(surface)}/{surface.name}"), shape.mesh, shape.normal)
     uv, corner_uv = unique_uv(shape.mesh.uv)
     primvars = UsdGeom.PrimvarsAPI(mesh)
     st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
     st.Set(Vt.Vec2fArray.FromNumpy(uv))
     st.SetIndices(Vt.IntArray.FromNumpy(corner_uv.ravel()))
     _add_provenance(primvars, surface, views)
+    if reflectance and shape.reflectance is not None:
+        primvar = primvars.CreatePrimvar("reflectance", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex)
+        primvar.Set(Vt.FloatArray.FromNumpy(shape.reflectance))
     prim = mesh.GetPrim()
     for taxonomy, label in {"class": surface.label, "las_code": str(surface.code)}.items():
         UsdSemantics.LabelsAPI.Apply(prim, taxonomy).CreateLabelsAttr([label])
@@ -135,6 +144,10 @@ def _add_visual(stage: Any, root: Any, surface: Surface, materials: dict[int, An
             UsdShade.Tokens.materialBind, UsdGeom.Tokens.partition,
         )  # fmt: skip
         UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(materials[page])
+
+
+def _scope(surface: Surface) -> str:
+    return "Backdrop" if surface.group == BACKDROP else "Visual"
 
 
 def _list_photos(primvars: Any, views: Sequence[View]) -> None:

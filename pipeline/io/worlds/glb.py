@@ -23,6 +23,7 @@ from scan2sim.pipeline.io.worlds.scene import Surface, Vector
 from scan2sim.pipeline.io.worlds.textured_mesh import unique_uv
 
 UNLIT = "KHR_materials_unlit"
+REFLECTANCE = "_REFLECTANCE"
 LINEAR, MIPMAPS, CLAMP = 9729, 9987, 33071
 
 
@@ -36,6 +37,8 @@ class GlbParams(Params):
         glb_lit: write lit materials and normals. Otherwise textures are shown unlit (`KHR_materials_unlit`): the
             daylight of the photos is baked into them, and a simulator's lights would be added to it.
         glb_bare: omit the provenance of each face's colour.
+        reflectance: write the relative reflectance of surfaces for lidar, if the cloud has intensities: Gazebo's
+            `laser_retro`, the attribute `_REFLECTANCE` in GLBs, the primvar `reflectance` in USD.
     """
 
     jpeg_quality: int = Field(90, ge=1, le=100, description="JPEG quality of GLB textures and of JPEG texture pages.")
@@ -50,6 +53,10 @@ class GlbParams(Params):
         False, description="Write lit materials and normals to GLBs, so that a simulator's lights apply."
     )
     glb_bare: bool = Field(False, description="Omit from GLBs which photo each face has its colour from.")
+    reflectance: bool = Field(
+        True,
+        description="Write the reflectance of surfaces for lidar (Gazebo, GLB, USD), if the cloud has intensities.",
+    )
 
 
 def find_encoders(params: GlbParams) -> tuple[Texture, Codec]:
@@ -75,7 +82,8 @@ def write(
     """Write surfaces into one file, with one mesh per surface and texture page; its class is in its `extras`.
 
     Local metres, rotated from z up to glTF's y up: (x, y, z) becomes (x, z, -y). Materials are matt
-    (metallic 0, roughness 1) and single-sided. Pages are read and encoded one at a time.
+    (metallic 0, roughness 1) and single-sided. Pages are read and encoded one at a time. Vertices have
+    `_REFLECTANCE` (0 to 1) if it is known.
 
     Args:
         path: the .glb file.
@@ -153,6 +161,8 @@ def _part(surface: Surface, params: GlbParams, views: Sequence[View], features: 
     }
     if params.glb_lit:
         attributes["NORMAL"] = _y_up(shape.normal)[vertex]
+    if params.reflectance and shape.reflectance is not None:
+        attributes[REFLECTANCE] = shape.reflectance[vertex]
     if row is not None:
         attributes[metadata.FEATURE] = feature.astype(np.uint16)
         positions = shape.mesh.vertices[vertex]

@@ -19,15 +19,20 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import DataError, InputError, from_os_error
 from scan2sim.pipeline.core.types import Frame
+from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.geodata import crs
-from scan2sim.pipeline.io.world_formats import opendrive
+from scan2sim.pipeline.io.world_formats import SceneParams, gazebo, opendrive
 from scan2sim.pipeline.io.worlds import scene, sdf
+from scan2sim.pipeline.io.worlds.scene_traffic import scenario_of
 
-USER_EDITABLE_SUFFIXES = (".sdf", ".config", ".json", ".mtl", ".geojson", ".csv", ".xodr")
+USER_EDITABLE_SUFFIXES = (".sdf", ".world", ".config", ".json", ".mtl", ".geojson", ".csv", ".xodr", ".yaml", ".py")
 """Suffixes of files that users edit by hand: copied, never linked."""
-STAMP_FILE, ROADS_STAMP_FILE = ".result", ".roads"
-VERSION = 4
+STAMP_FILE, ROADS_STAMP_FILE, DOME_STAMP_FILE = ".result", ".roads", ".dome"
+VERSION = 5
 """Version of the layout: when it changes, worlds are rebuilt."""
+
+
+MakeDome = Callable[[scene.Scene, Path], None]
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,7 @@ def assemble(
     *,
     buffer: float = sdf.LEVEL_BUFFER_M,
     performer: str = sdf.PERFORMER_NAME,
+    dome: MakeDome = lambda scene, folder: None,
     warn: Callable[[str], None] = lambda _: None,
 ) -> Path:
     """Combine the worlds of all tiles into `out/world/`, unless it exists and nothing has changed.
@@ -76,6 +82,7 @@ def assemble(
         tiles: worlds of the tiles.
         buffer: distance (m) from a tile at which a performer loads it.
         performer: name of the robot's model, for which levels are loaded.
+        dome: writes the sky dome of all tiles, as of `scene.add_dome`; the same for the same tiles.
         warn: receives a warning for each file that has changed since the world was written, by hand or by damage.
 
     Returns:
@@ -96,7 +103,7 @@ def assemble(
         temporary = out / ".world"
         try:
             shutil.rmtree(temporary, ignore_errors=True)
-            _write(temporary, name, tiles, buffer, performer)
+            _write(temporary, name, tiles, buffer, performer, dome)
             (temporary / STAMP_FILE).write_text(stamp, encoding="utf-8")
             swap(temporary, world)
         except OSError as error:
@@ -208,7 +215,26 @@ def _is_current(world: Path, stamp: str, tiles: Sequence[TileWorld], files: dict
     except OSError:
         return False
     pairs = [(tile.world / file, world / file) for tile in tiles for file in files[tile.name]]
-    return same and all(same_unless_edited(file, copy) for file, copy in pairs)
+    return same and _has_dome(world) and all(same_unless_edited(file, copy) for file, copy in pairs)
+
+
+def _stamp_dome(world: Path, dome: scene.SceneTile | None) -> None:
+    """Record the files of the sky dome, which are no copies of a tile's: sizes and modification times by path."""
+    folders = (dome.folder, world / "models" / dome.name) if dome else ()
+    files = sorted(path for folder in folders for path in folder.rglob("*") if path.is_file())
+    stats = {p.relative_to(world).as_posix(): p.stat() for p in files if p.suffix not in USER_EDITABLE_SUFFIXES}
+    text = json.dumps({path: [s.st_size, s.st_mtime_ns] for path, s in stats.items()})
+    (world / DOME_STAMP_FILE).write_text(text, encoding="utf-8")
+
+
+def _has_dome(world: Path) -> bool:
+    """Whether all files of the sky dome are as they were written."""
+    try:
+        made = json.loads((world / DOME_STAMP_FILE).read_text(encoding="utf-8"))
+        stats = {path: (world / path).stat() for path in made}
+    except (OSError, ValueError):
+        return False
+    return all(made[path] == [s.st_size, s.st_mtime_ns] for path, s in stats.items())
 
 
 def _edited(world: Path) -> list[Path]:
@@ -219,7 +245,7 @@ def _edited(world: Path) -> list[Path]:
     ]
 
 
-def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, performer: str) -> None:
+def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, performer: str, dome: MakeDome) -> None:
     origin = _origin(tiles)
     first = tiles[0].frame
     georeference = sdf.Georeference.of(Frame(first.crs, origin, first.unit))
@@ -229,7 +255,12 @@ def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, p
         for subfolder in (Path("models") / tile.name, Path(scene.SCENE_FOLDER) / tile.name):
             shutil.copytree(tile.world / subfolder, folder / subfolder, copy_function=link)
     scene.write_scene_file(folder, name, Frame(first.crs, origin, first.unit), [tile.name for tile in tiles])
-    sdf.write_levels(folder / f"{name}.sdf", name, georeference, placed, buffer, performer)
+    whole = scene.add_dome(scene.read_scene(folder), folder, dome)
+    sky = gazebo.write_dome(folder, whole, SceneParams())
+    _stamp_dome(folder, whole.dome)
+    shown = {whole.dome.name: whole.dome.offset} if whole.dome else {}
+    sdf.write_levels(folder / f"{name}.sdf", name, georeference, placed, buffer, performer, None, whole.sky, shown)
+    gazebo.write_traffic(whole, scenario_of(whole), folder)
     body = {
         "name": name,
         "crs": first.crs,
@@ -239,6 +270,7 @@ def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, p
         "wgs84": georeference and georeference.as_metadata(),
         "buffer_m": buffer,
         "performer": performer,
+        **world_formats.sky_metadata(whole),
         "tiles": {
             tile.name: {
                 "origin_m": list(tile.frame.origin),
@@ -248,7 +280,7 @@ def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, p
             }
             for tile, model in zip(tiles, placed, strict=True)
         },
-        "triangles_by_file": {file: n for one in metadata.values() for file, n in _model_triangles(one).items()},
+        "triangles_by_file": {file: n for one in metadata.values() for file, n in _model_triangles(one).items()} | sky,
     }
     (folder / "metadata.json").write_text(json.dumps(body, indent=2) + "\n", encoding="utf-8")
 

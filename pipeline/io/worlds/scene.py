@@ -6,19 +6,25 @@ in `scene/` of the world's folder (files of earlier steps as hard links, so that
     scene/scene.json                name, origin and tiles
     scene/<tile>/tile.json          frame, friction, and statistics of each surface
     scene/<tile>/<group>/           a textured mesh (`pipeline.io.worlds.textured_mesh`); its `photo.npy` is the index
-                                    of the photo in views.json that gives each face its detail
+                                    of the photo in views.json that gives each face its detail, its `reflectance.npy`
+                                    that of the vertices (step `reflectance`), 255 is 1
+    scene/<tile>/backdrop/          what only cameras see (step `backdrop`), a textured mesh, if there is one
+    scene/sky-dome/                 sky of a survey's world: `tile.json` without groups, `backdrop/` and an empty
+                                    `collision.npz`
     scene/<tile>/views.json         the photos' poses, if there are photos
     scene/<tile>/collision.npz      collision mesh
     scene/<tile>/*.geojson, *.csv   lists of detected objects and their positions
     scene/<tile>/roads.npz          observed roads (`pipeline.roads.observed`), if the step `roads` was run
     scene/<tile>/path.npz           trajectory of the recording device, local metres, if known
+    scene/<tile>/tracks.json        tracks of road users in local metres (`pipeline.tracking.tracks`), if there are any
+    scene/<tile>/navigation.json    spawn pose and storeys (step `navigation`), and its files map*.yaml, .pgm, .pcd
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +32,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.classes import CODE_OF_SURFACE, SURFACES, name_of
 from scan2sim.pipeline.core.errors import DataError, InputError
-from scan2sim.pipeline.core.types import I32, U8, Frame, Mesh, View
+from scan2sim.pipeline.core.types import F64, I32, U8, Colour, Frame, Mesh, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.file_checks import link_or_copy, make_folder
 from scan2sim.pipeline.io.images import image
@@ -35,7 +41,16 @@ from scan2sim.pipeline.io.worlds.textured_mesh import Textured
 from scan2sim.pipeline.simulation.robot import Start
 
 SCENE_FOLDER, SCENE_FILE, TILE_FILE, COLLISION_FILE = "scene", "scene.json", "tile.json", "collision.npz"
-ROADS_FILE, PATH_FILE, VIEWS_FILE = "roads.npz", "path.npz", "views.json"
+ROADS_FILE, PATH_FILE, VIEWS_FILE, TRACKS_FILE = "roads.npz", "path.npz", "views.json", "tracks.json"
+LIST_SUFFIXES, TRACK_FILES = (".geojson", ".csv"), (TRACKS_FILE, "tracks_kitti.txt", "tracks_nuscenes.json")
+NAVIGATION_FILE, NAVIGATION_SUFFIXES = "navigation.json", (".yaml", ".pgm", ".pcd")
+BACKDROP, BACKDROP_PARTS = "backdrop", ("backdrop", "backdrop_sky")
+"""Folder and group of the backdrop, and names of its parts: page 0 are layers of scenery, page 1 is the sky dome."""
+LAYERS_PAGE, SKY_PAGE = range(len(BACKDROP_PARTS))
+DOME_FOLDER = "sky-dome"
+"""Folder of a survey's sky dome; a tile can't have this name."""
+BACKDROP_CODE = 0
+"""Label of the backdrop: that of the background in segmentation cameras."""
 VERSION = 1
 """Version of the files' format."""
 Vector = tuple[float, float, float]
@@ -60,7 +75,7 @@ class Surface:
     @property
     def label(self) -> str:
         """Name of its class, for example "pole"."""
-        return name_of(self.code)
+        return BACKDROP if self.group == BACKDROP else name_of(self.code)
 
     def on_page(self, page: int) -> Surface:
         """The faces on a texture page."""
@@ -104,6 +119,8 @@ class SceneTile:
         friction: Coulomb friction coefficient of its ground.
         groups: statistics of each surface: `triangles`, `vertices`, `pages`, `low_m` and `high_m` (local).
         folder: folder with its files.
+        codes: LAS code of the faces of a group that have none of their own, where it isn't that of the group.
+        sky: colour of what its photos show where it has nothing, sRGB 0 to 255, or None.
     """
 
     name: str
@@ -112,19 +129,34 @@ class SceneTile:
     friction: float
     groups: Mapping[str, Mapping[str, Any]]
     folder: Path
+    codes: Mapping[str, int] = field(default_factory=dict)
+    sky: Colour | None = None
 
     def textured(self) -> dict[str, Textured]:
         """Its complete surfaces, by group."""
         read = {group: textured.read(self.folder / group) for group in self.groups}
-        return {group: shape for group, shape in read.items() if shape is not None}
+        shapes = {group: shape for group, shape in read.items() if shape is not None}
+        return shapes | {
+            group: replace(shapes[group], mesh=_with_code(shapes[group].mesh, 0, code))
+            for group, code in self.codes.items() if group in shapes
+        }  # fmt: skip
 
     def surfaces(self) -> list[Surface]:
         """Its surfaces by class."""
         return [surface for group, shape in self.textured().items() for surface in by_class(group, shape)]
 
+    def backdrop(self) -> list[Surface]:
+        """What only cameras see beyond its surfaces: `BACKDROP_PARTS`, empty without a backdrop."""
+        shape = textured.read(self.folder / BACKDROP) if (self.folder / BACKDROP).is_dir() else None
+        pages = shape.used_pages if shape else []
+        return [Surface(BACKDROP_PARTS[k], BACKDROP, BACKDROP_CODE, shape.on_page(k)) for k in pages if shape]
+
     def solid(self) -> Mesh:
         """The collision mesh."""
-        return Mesh.load(self.folder / COLLISION_FILE)
+        mesh = Mesh.load(self.folder / COLLISION_FILE)
+        for group, code in self.codes.items():
+            mesh = _with_code(mesh, CODE_OF_SURFACE[group], code)
+        return mesh
 
     def views(self) -> tuple[View, ...]:
         """Its photos' poses in local metres, with bare file names; empty for worlds of earlier versions."""
@@ -132,15 +164,26 @@ class SceneTile:
 
     @property
     def lists(self) -> dict[str, Path]:
-        """Lists of detected objects (plants, furniture, instances), by file name; positions are in the CRS."""
-        return {path.name: path for path in sorted(self.folder.iterdir()) if path.suffix in (".geojson", ".csv")}
+        """Lists of detected objects (plants, furniture, instances) in the CRS, and files of tracks, by file name."""
+        files = {path.name: path for path in sorted(self.folder.iterdir())}
+        return {name: path for name, path in files.items() if path.suffix in LIST_SUFFIXES or name in TRACK_FILES}
+
+    @property
+    def navigation_files(self) -> dict[str, Path]:
+        """Occupancy maps and points for localization, by file name."""
+        return {path.name: path for path in sorted(self.folder.iterdir()) if path.suffix in NAVIGATION_SUFFIXES}
+
+    def navigation(self) -> dict[str, Any] | None:
+        """Spawn pose and storeys in world coordinates; None: the step `navigation` wasn't run, or failed."""
+        path = self.folder / NAVIGATION_FILE
+        return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else None
 
     @property
     def extra_files(self) -> dict[str, Path]:
-        """All files besides its meshes, by file name: lists, roads, the path."""
-        return self.lists | {
-            name: self.folder / name for name in (ROADS_FILE, PATH_FILE) if (self.folder / name).is_file()
-        }
+        """All files besides its meshes, by file name: lists, roads, the path, files for navigation."""
+        names = (ROADS_FILE, PATH_FILE, NAVIGATION_FILE, TRACKS_FILE)
+        others = {name: self.folder / name for name in names if (self.folder / name).is_file()}
+        return self.lists | self.navigation_files | others
 
     @property
     def low(self) -> Vector:
@@ -153,6 +196,12 @@ class SceneTile:
         """Highest corner of the bounding box of all surfaces, local metres."""
         x, y, z = np.max([group["high_m"] for group in self.groups.values()], axis=0).tolist()
         return x, y, z
+
+
+def _with_code(mesh: Mesh, old: int, new: int) -> Mesh:
+    """The mesh with another code for its faces of code `old`."""
+    codes = np.zeros(len(mesh), np.uint8) if mesh.classification is None else mesh.classification
+    return replace(mesh, classification=np.where(codes == old, new, codes).astype(np.uint8))
 
 
 @dataclass(frozen=True)
@@ -179,6 +228,19 @@ class Level:
 
 
 @dataclass(frozen=True)
+class RobotMapFrame:
+    """Frame of the robot's map that a world was made from.
+
+    Attributes:
+        T_world_map: (4, 4) rigid transform from the map, in metres, to the simulator's world.
+        unit: metres per unit of the map: world = T_world_map · (unit · map).
+    """
+
+    T_world_map: F64
+    unit: float = 1.0
+
+
+@dataclass(frozen=True)
 class Scene:
     """A finished world.
 
@@ -188,6 +250,8 @@ class Scene:
         tiles: ordered by name.
         coarse: root of the levels of detail of all tiles, or None.
         start: start pose of the robot, if it is exported.
+        robot_map: frame of the robot's map that it was made from, or None.
+        dome: sky of a survey's world, a tile with nothing but a backdrop; None: tiles have their own, or none.
     """
 
     name: str
@@ -195,6 +259,8 @@ class Scene:
     tiles: tuple[SceneTile, ...]
     coarse: Level | None = None
     start: Start | None = None
+    robot_map: RobotMapFrame | None = None
+    dome: SceneTile | None = None
 
     def levels(self, tile: SceneTile) -> list[Level]:
         """All levels of detail that contain only this tile, the finest first."""
@@ -205,6 +271,31 @@ class Scene:
                 found.insert(1, level)
             pending += level.finer
         return found
+
+    @property
+    def with_dome(self) -> tuple[SceneTile, ...]:
+        """All tiles, and the dome, if there is one: what cameras see."""
+        return self.tiles if self.dome is None else (*self.tiles, self.dome)
+
+    @property
+    def far(self) -> float | None:
+        """Distance in metres to the farthest place of the dome from any tile; None without a dome."""
+        if self.dome is None:
+            return None
+        (sky,) = self.dome.backdrop()
+        low = np.min([np.add(tile.low, tile.offset) for tile in self.tiles], axis=0)
+        high = np.max([np.add(tile.high, tile.offset) for tile in self.tiles], axis=0)
+        places = sky.shape.mesh.vertices + np.asarray(self.dome.offset)
+        return float(np.linalg.norm(np.maximum(np.abs(places - low), np.abs(places - high)), axis=1).max())
+
+    @property
+    def sky(self) -> Colour | None:
+        """Median of its tiles' `sky`; None if none is known."""
+        known = [tile.sky for tile in self.tiles if tile.sky is not None]
+        if not known:
+            return None
+        red, green, blue = np.median(known, axis=0).round().astype(int).tolist()
+        return red, green, blue
 
     @property
     def origin(self) -> Vector:
@@ -239,6 +330,11 @@ def save_tile(
     origin: Vector | None = None,
     views: Sequence[View] = (),
     photos: Mapping[str, I32] | None = None,
+    robot_map: RobotMapFrame | None = None,
+    codes: Mapping[str, int] | None = None,
+    reflectance: Path | None = None,
+    sky: Colour | None = None,
+    backdrop: Path | None = None,
 ) -> Scene:
     """Save a tile's results as a scene below `world`.
 
@@ -252,6 +348,12 @@ def save_tile(
         origin: origin of the scene, metres in the CRS; default: the tile's own.
         views: the tile's photos.
         photos: by group, (F,) index of the photo that gives each face its detail, -1: none.
+        robot_map: frame of the robot's map in the CRS (not relative to `origin`), or None.
+        codes: as in `SceneTile`.
+        reflectance: folder with the results of step `reflectance`, `GROUP/reflectance.npy`; None: they are in the
+            folders of the textured meshes, if there are any.
+        sky: as in `SceneTile`.
+        backdrop: folder of a textured mesh that only cameras see, or None.
 
     Raises:
         DataError: no group has faces.
@@ -274,28 +376,62 @@ def save_tile(
         make_folder(folder / group)
         for file in ("mesh.npz", *(page.name for page in shape.pages), *(page.name for page in shape.seen)):
             link_or_copy(surfaces[group] / file, folder / group / file)
+        known = (surfaces[group] if reflectance is None else reflectance / group) / textured.REFLECTANCE_FILE
+        if known.is_file():
+            link_or_copy(known, folder / group / textured.REFLECTANCE_FILE)
         if photos is not None and group in photos:
             np.save(folder / group / textured.PHOTO_FILE, photos[group])
+    for path in backdrop.iterdir() if backdrop else ():
+        make_folder(folder / BACKDROP)
+        link_or_copy(path, folder / BACKDROP / path.name)
     if views:
         views_io.save(folder / VIEWS_FILE, [replace(view, photo=Path(view.photo.name), mask=None) for view in views])
     link_or_copy(solid, folder / COLLISION_FILE)
     for file, path in extra_files.items():
         link_or_copy(path, folder / file)
-    body = {
-        "version": VERSION,
-        **_frame_as_json(frame),
-        "friction": friction,
-        "groups": {group: statistics(shape) for group, shape in shapes.items()},
-    }
+    body = (
+        {
+            "version": VERSION,
+            **_frame_as_json(frame),
+            "friction": friction,
+            "groups": {group: statistics(shape) for group, shape in shapes.items()},
+        }
+        | ({"codes": dict(codes)} if codes else {})
+        | ({"sky_rgb": list(sky)} if sky else {})
+    )
     _write(folder / TILE_FILE, body)
-    write_scene_file(world, name, Frame(frame.crs, origin or frame.origin, frame.unit), [name])
+    write_scene_file(world, name, Frame(frame.crs, origin or frame.origin, frame.unit), [name], robot_map)
     return read_scene(world)
 
 
-def write_scene_file(world: Path, name: str, frame: Frame, tiles: list[str]) -> None:
-    """Write `scene.json` below `world`: name, origin and CRS (`frame`), and names of the tiles."""
+def write_scene_file(
+    world: Path, name: str, frame: Frame, tiles: list[str], robot_map: RobotMapFrame | None = None
+) -> None:
+    """Write `scene.json` below `world`: name, origin and CRS (`frame`), names of the tiles, frame of a robot's map."""
     body = {"version": VERSION, "name": name, **_frame_as_json(frame), "tiles": tiles}
+    if robot_map is not None:
+        T = robot_map.T_world_map.copy()
+        T[:3, 3] -= frame.origin
+        body["robot_map"] = {"T_world_map": T.round(9).tolist(), "unit_m": robot_map.unit}
     _write(world / SCENE_FOLDER / SCENE_FILE, body)
+
+
+def add_dome(scene: Scene, world: Path, make: Callable[[Scene, Path], None]) -> Scene:
+    """Add the sky dome of all tiles to a scene that was saved below `world`; returns the scene with it.
+
+    Args:
+        scene: the scene.
+        world: the world's folder.
+        make: writes the dome into a folder, a textured mesh in metres from the scene's origin, or nothing.
+    """
+    folder = world / SCENE_FOLDER / DOME_FOLDER
+    make(scene, folder / BACKDROP)
+    if not (folder / BACKDROP).is_dir():
+        return scene
+    frame = scene.frame
+    Mesh(frame, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)).save(folder / COLLISION_FILE)
+    _write(folder / TILE_FILE, {"version": VERSION, **_frame_as_json(frame), "friction": 0.0, "groups": {}})
+    return read_scene(world)
 
 
 def read_scene(world: Path) -> Scene:
@@ -309,7 +445,12 @@ def read_scene(world: Path) -> Scene:
     frame = _frame(folder / SCENE_FILE, body)
     try:
         tiles = tuple(_tile(folder / name, frame) for name in body["tiles"])
-        return Scene(body["name"], frame, tiles)
+        frame_of_map = body.get("robot_map")
+        robot_map = frame_of_map and RobotMapFrame(np.array(frame_of_map["T_world_map"]), frame_of_map["unit_m"])
+        dome = None
+        if (folder / DOME_FOLDER).is_dir():
+            dome = replace(_tile(folder / DOME_FOLDER, frame), name=f"{body['name']}_sky")
+        return Scene(body["name"], frame, tiles, robot_map=robot_map, dome=dome)
     except (KeyError, TypeError) as error:
         raise InputError(folder / SCENE_FILE, f"has no valid {error}", EXPORT_AGAIN) from None
 
@@ -332,7 +473,8 @@ def _tile(folder: Path, frame: Frame) -> SceneTile:
     body = _read(folder / TILE_FILE)
     tile_frame = _frame(folder / TILE_FILE, body)
     x, y, z = (tile - scene for tile, scene in zip(tile_frame.origin, frame.origin, strict=True))
-    return SceneTile(folder.name, tile_frame, (x, y, z), body["friction"], body["groups"], folder)
+    codes, sky = body.get("codes", {}), tuple(body["sky_rgb"]) if "sky_rgb" in body else None
+    return SceneTile(folder.name, tile_frame, (x, y, z), body["friction"], body["groups"], folder, codes, sky)
 
 
 def statistics(shape: Textured) -> dict[str, Any]:

@@ -10,8 +10,13 @@ Design decisions:
   origin. With 0 a NavSat sensor would be 3 m off at 100 m where the convergence is 2 degrees.
 - The photos contain the light and shadows of their day: the ambient light is strong, the sun weak, and
   the tile's surfaces don't cast shadows; robots do.
+- `<background>` is the mean colour of what the photos show where the world has nothing (step `sky_colour`), sRGB.
 - No `<material>`: it would replace the mesh's own textures.
 - Every visual has the LAS code of its class as label for Gazebo's segmentation cameras.
+- `<laser_retro>` of a visual is what the sensor `gpu_lidar` returns as intensity, at every range and angle: 255 times
+  the reflectance, the scale of 8-bit lidars (Gazebo accepts 0 to 2000). Without it intensities are 0.
+- The backdrop is what only cameras see. Its visuals have the visibility flag `BACKDROP_FLAG`; lidars and depth cameras
+  need the mask `WITHOUT_BACKDROP`, which the robot's lidar has.
 - Gazebo loads a level when the performer's box intersects the level's box, and unloads it when the
   performer is `<buffer>` away from it (gz-sim #28: the buffer has no effect on loading). Therefore a
   level's box is larger than its tile; otherwise a robot would see a tile only when standing on it.
@@ -23,9 +28,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import degrees
 from pathlib import Path
+from types import MappingProxyType
 from xml.sax.saxutils import escape
 
-from scan2sim.pipeline.core.types import Frame
+from scan2sim.pipeline.core.types import Colour, Frame
 from scan2sim.pipeline.geometry.cylinders import Cylinder
 from scan2sim.pipeline.io.geodata import crs
 from scan2sim.pipeline.simulation.collision_shapes import Solid
@@ -33,10 +39,18 @@ from scan2sim.pipeline.simulation.robot import ROBOT, Start
 
 LEVEL_HEADROOM_M = 500.0
 """Extent of a level above and below its tile, so that it is loaded for flying robots, too."""
+BACKDROP_FLAG = 2
+"""`<visibility_flags>` of the backdrop; sensors with a `<visibility_mask>` without this bit do not see it."""
+WITHOUT_BACKDROP = 0xFFFFFFFF & ~BACKDROP_FLAG
+"""`<visibility_mask>` of sensors that must not see the backdrop."""
+LASER_RETRO_FULL = 255
+"""`<laser_retro>` of reflectance 1."""
 LEVEL_BUFFER_M = 20.0
 """Distance from a tile at which a performer loads it."""
 PERFORMER_NAME = ROBOT.name
 """Name of the model for which levels are loaded."""
+BACKGROUND_RGB = (179, 204, 230)
+"""Background of worlds without photos of the sky, sRGB."""
 Vector = tuple[float, float, float]
 
 
@@ -89,18 +103,27 @@ class Georeference:
 
 
 def write_world(
-    path: Path, name: str, georeference: Georeference | None, offset: Vector, start: Start | None = None
+    path: Path,
+    names: Sequence[str],
+    georeference: Georeference | None,
+    offset: Vector,
+    start: Start | None = None,
+    sky: Colour | None = None,
+    actors: str = "",
 ) -> None:
-    """Write a world that includes `model://<name>`.
+    """Write a world that includes `model://<name>` for each name.
 
     Args:
         path: the world's .sdf file.
-        name: name of the world and its model.
+        names: names of its models; the first is also that of the world.
         georeference: of the world's origin, or None.
-        offset: metres from the world's origin to the model's.
+        offset: metres from the world's origin to the models'.
         start: start pose of the robot, `model://robot`; None: without a robot.
+        sky: colour of the background, sRGB 0 to 255; None: `BACKGROUND_RGB`.
+        actors: further elements of the world.
     """
-    path.write_text(_world(path, name, georeference, _include(name, offset) + _robot(start)), encoding="utf-8")
+    included = "".join(_include(name, offset) for name in names)
+    path.write_text(_world(path, names[0], georeference, included + _robot(start) + actors, sky), encoding="utf-8")
 
 
 def write_levels(
@@ -111,6 +134,9 @@ def write_levels(
     buffer: float,
     performer: str,
     start: Start | None = None,
+    sky: Colour | None = None,
+    everywhere: Mapping[str, Vector] = MappingProxyType({}),
+    actors: str = "",
 ) -> None:
     """Write a world of many models, each in its own level, so that Gazebo can load only those near a robot.
 
@@ -124,6 +150,9 @@ def write_levels(
         buffer: distance (m) from a tile at which a performer loads it; it is unloaded at twice the distance.
         performer: name of the model for which levels are loaded. If it doesn't exist, Gazebo only prints a warning.
         start: start pose of the robot, `model://robot`; None: without a robot.
+        sky: as in `write_world`.
+        everywhere: models that are loaded wherever the performer is: metres from the world's origin, by name.
+        actors: further elements of the world.
     """
     path.write_text(
         _world(
@@ -131,8 +160,11 @@ def write_levels(
             name,
             georeference,
             "".join(_include(tile.name, tile.offset) for tile in tiles)
+            + "".join(_include(*model) for model in everywhere.items())
             + _robot(start)
+            + actors
             + _levels(tiles, buffer, performer),
+            sky,
             f"""
      All tiles are loaded then. With the option "levels" (two dashes before it, which XML forbids here) only those
      near a performer are: the model that <performer> names below, if it is in this file when Gazebo starts, and
@@ -143,16 +175,31 @@ def write_levels(
     )
 
 
-def write_model(folder: Path, name: str, visuals: Mapping[str, int], solids: Sequence[Solid]) -> None:
+@dataclass(frozen=True)
+class Visual:
+    """A visual of a model.
+
+    Attributes:
+        label: LAS code of its class.
+        reflectance: 0 to 1, relative reflectance for lidar; None: not known.
+        is_backdrop: whether it is part of the backdrop: only sensors that don't mask it see it, and it has no label.
+    """
+
+    label: int
+    reflectance: float | None = None
+    is_backdrop: bool = False
+
+
+def write_model(folder: Path, name: str, visuals: Mapping[str, Visual], solids: Sequence[Solid]) -> None:
     """Write `model.sdf` and `model.config` of a static model.
 
     Args:
         folder: folder of the model.
         name: name of the model; its meshes are found as `model://<name>/...`.
-        visuals: path of every visual mesh, relative to `folder`, to its label.
+        visuals: by the path of each visual mesh, relative to `folder`.
         solids: collision shapes; meshes are found as `meshes/collision_<name>.obj`.
     """
-    visual_elements = "".join(_visual(name, mesh, label) for mesh, label in visuals.items())
+    visual_elements = "".join(_visual(name, mesh, visual) for mesh, visual in visuals.items())
     collision_elements = "".join(_collision(name, solid) for solid in solids)
     (folder / "model.sdf").write_text(
         f"""<?xml version="1.0"?>
@@ -187,7 +234,9 @@ def write_config(folder: Path, name: str, description: str) -> None:
     )
 
 
-def _world(path: Path, name: str, georeference: Georeference | None, content: str, note: str = "") -> str:
+def _world(
+    path: Path, name: str, georeference: Georeference | None, content: str, sky: Colour | None, note: str = ""
+) -> str:
     """SDF of a world: physics, systems, light and `content`; `note` is added to the leading comment."""
     return f"""<?xml version="1.0"?>
 <!-- Run in this folder: GZ_SIM_RESOURCE_PATH=$PWD/models gz sim {path.name}
@@ -210,7 +259,7 @@ def _world(path: Path, name: str, georeference: Georeference | None, content: st
     </plugin>
 {_spherical_coordinates(georeference)}    <scene>
       <ambient>0.7 0.7 0.7 1</ambient>
-      <background>0.7 0.8 0.9 1</background>
+      <background>{unit_colour(sky or BACKGROUND_RGB)} 1</background>
       <grid>false</grid>
     </scene>
     <light name="sun" type="directional">
@@ -262,14 +311,25 @@ def _level(tile: PlacedModel, buffer: float) -> str:
 """
 
 
-def _visual(name: str, mesh: str, label: int) -> str:
-    return f"""      <visual name="{Path(mesh).stem}">
+def _visual(name: str, mesh: str, visual: Visual) -> str:
+    if visual.is_backdrop:
+        return f"""      <visual name="{Path(mesh).stem}">
         <cast_shadows>false</cast_shadows>
+        <visibility_flags>{BACKDROP_FLAG}</visibility_flags>
         <geometry>
           <mesh><uri>model://{name}/{mesh}</uri></mesh>
         </geometry>
+      </visual>
+"""
+    level = visual.reflectance
+    retro = "" if level is None else f"        <laser_retro>{LASER_RETRO_FULL * level:.0f}</laser_retro>\n"
+    return f"""      <visual name="{Path(mesh).stem}">
+        <cast_shadows>false</cast_shadows>
+{retro}        <geometry>
+          <mesh><uri>model://{name}/{mesh}</uri></mesh>
+        </geometry>
         <plugin filename="gz-sim-label-system" name="gz::sim::systems::Label">
-          <label>{label}</label>
+          <label>{visual.label}</label>
         </plugin>
       </visual>
 """
@@ -309,6 +369,11 @@ def _spherical_coordinates(georeference: Georeference | None) -> str:
       <heading_deg>{georeference.heading:.7f}</heading_deg>
     </spherical_coordinates>
 """
+
+
+def unit_colour(colour: Colour) -> str:
+    """Levels from 0 to 1, separated by spaces."""
+    return " ".join(f"{level / 255:.3g}" for level in colour)
 
 
 def numbers(values: Iterable[float]) -> str:

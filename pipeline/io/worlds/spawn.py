@@ -1,4 +1,4 @@
-"""Spawn pose of the robot in a scene: on a road, facing along it, or else on the path of the recording vehicle."""
+"""Spawn pose of the robot in a scene: in the free space of its map, on a road, or on the recording vehicle's path."""
 
 from __future__ import annotations
 
@@ -36,11 +36,13 @@ def courses(scene: Scene) -> list[Course]:
 
 
 def find_spawn_pose(scene: Scene) -> Start:
-    """Start of the longest section of a course that a robot can drive over, facing along it.
+    """Pose in the free space of a robot's map, or start of the longest section of a course that a robot can drive over.
 
     Raises:
         DataError: no road and no path is known, or no free ground was found along them.
     """
+    if (start := free_space_pose(scene)) is not None:
+        return start
     ways = courses(scene)
     if not ways:
         raise DataError(
@@ -64,6 +66,15 @@ def find_spawn_pose(scene: Scene) -> Start:
             "Check the collision mesh, or export without the robot",
         )
     return best[1]
+
+
+def free_space_pose(scene: Scene) -> Start | None:
+    """Pose that the step `navigation` found, in world coordinates; None without it."""
+    about = scene.tiles[0].navigation() if len(scene.tiles) == 1 else None
+    if about is None:
+        return None
+    (x, y, z), (roll, pitch, yaw) = about["spawn"]["position_m"], about["spawn"]["angles_rad"]
+    return Start((x, y, z), (roll, pitch, yaw), "floor")
 
 
 def _paths(scene: Scene) -> list[Course]:

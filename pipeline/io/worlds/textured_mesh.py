@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +12,7 @@ import numpy.typing as npt
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F32, I32, Bools, Mesh
 
-PHOTO_FILE = "photo.npy"
+PHOTO_FILE, REFLECTANCE_FILE = "photo.npy", "reflectance.npy"
 
 
 @dataclass(frozen=True)
@@ -23,12 +24,14 @@ class Textured:
         normal: (V, 3) float32, unit vertex normals.
         pages: image file of every page, indexed by `mesh.page`.
         photo: (F,) int32 index of the view that gives each face's detail, -1 without one; None: not known.
+        reflectance: (V,) float32 in [0, 1], relative reflectance for lidar, in steps of 1/255; None: not known.
     """
 
     mesh: Mesh
     normal: F32
     pages: tuple[Path, ...]
     photo: I32 | None = None
+    reflectance: F32 | None = None
 
     def __len__(self) -> int:
         return len(self.mesh)
@@ -54,7 +57,17 @@ class Textured:
         """The faces selected by `mask` (F,); normals stay those of the whole mesh, so that no seam shows."""
         used = np.unique(self.mesh.faces[mask])
         photo = None if self.photo is None else self.photo[mask]
-        return replace(self, mesh=self.mesh.keep(mask), normal=self.normal[used], photo=photo)
+        reflectance = None if self.reflectance is None else self.reflectance[used]
+        return replace(self, mesh=self.mesh.keep(mask), normal=self.normal[used], photo=photo, reflectance=reflectance)
+
+    def median_reflectance(self) -> float | None:
+        """Median reflectance of the surface, each face by its area; None: not known."""
+        if self.reflectance is None:
+            return None
+        of_face = self.reflectance[self.mesh.faces].mean(axis=1)
+        order = np.argsort(of_face, kind="stable")
+        area = np.cumsum(self.mesh.face_area[order], dtype=np.float64)
+        return float(of_face[order[min(np.searchsorted(area, area[-1] / 2), len(order) - 1)]])
 
     def parts(self, limit: int) -> list[Textured]:
         """Spatially compact parts of at most `limit` triangles: halved along the longest side until small enough."""
@@ -94,16 +107,30 @@ def read(folder: Path) -> Textured | None:
     for page in pages:
         if not page.is_file():
             raise InputError(page, "file not found, but mesh.npz has faces on it", "Run the step `texture` again")
-    return Textured(mesh, vertex_normals(mesh), pages, _photo(folder / PHOTO_FILE, len(mesh)))
+    photo = _column(folder / PHOTO_FILE, len(mesh), "faces")
+    level = _column(folder / REFLECTANCE_FILE, len(mesh.vertices), "vertices")
+    return Textured(
+        mesh,
+        vertex_normals(mesh),
+        pages,
+        None if photo is None else np.asarray(photo, np.int32),
+        None if level is None else (level / np.float32(255)).astype(np.float32),
+    )
 
 
-def _photo(path: Path, count: int) -> I32 | None:
+def save_reflectance(folder: Path, reflectance: F32) -> None:
+    """Write the reflectance of vertices (V,), 0 to 1, of the textured mesh in a folder."""
+    np.save(folder / REFLECTANCE_FILE, np.rint(255 * reflectance).astype(np.uint8))
+
+
+def _column(path: Path, count: int, of: str) -> npt.NDArray[Any] | None:
+    """The values of all faces or vertices in a file; None if it doesn't exist."""
     if not path.is_file():
         return None
-    photo = np.load(path)
-    if photo.shape != (count,):
-        raise InputError(path, f"has {photo.shape} faces, but mesh.npz has {count}", "Export the world again")
-    return np.asarray(photo, np.int32)
+    values: npt.NDArray[Any] = np.load(path)
+    if values.shape != (count,):
+        raise InputError(path, f"has {values.shape} {of}, but mesh.npz has {count}", "Export the world again")
+    return values
 
 
 def vertex_normals(mesh: Mesh) -> F32:

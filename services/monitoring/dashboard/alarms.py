@@ -38,13 +38,16 @@ class AlarmStates:
             elif len(self._raised) >= MAX_RAISED:
                 raise RejectedError(f"over the limit of {MAX_RAISED} alarms: no room")
             else:
-                self._raised[key] = _display(alarm) | {"since": known["since"] if known else alarm.since}
+                by = printable(alarm.acknowledged_by)[:MAX_NAME_CHARS]
+                handled = {"acknowledged_by": by, "muted_until": alarm.muted_until}
+                self._raised[key] = _display(alarm) | handled | {"since": known["since"] if known else alarm.since}
 
     def state(self) -> dict[str, list[dict[str, Any]]]:
         """JSON-serializable lists `raised` and `cleared`, the latest first.
 
         Each alarm has `rule`, `subject`, `value` when it was last raised, `since` (null: raised before the history of
-        the page) and, if it is cleared, `until`; times in seconds since the epoch.
+        the page) and, if it is cleared, `until`; a raised one who acknowledged it (`acknowledged_by`, "" nobody), and
+        until when it is muted (`muted_until`, 0: not); times in seconds since the epoch.
         """
         with self._lock:
             latest_first = sorted(self._raised.values(), key=lambda one: -one["since"])

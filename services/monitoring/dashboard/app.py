@@ -10,17 +10,23 @@ import time
 import uuid
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from fastapi import FastAPI, Query
+import numpy as np
+from fastapi import FastAPI, HTTPException, Query
 from fastapi.responses import FileResponse, StreamingResponse
+from numpy.typing import NDArray
 from prometheus_client import Gauge
+from pydantic import Field
 
-from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.errors import SettingError, UnavailableError
 from scan2sim.services import kafka
 from scan2sim.services.http import factory
-from scan2sim.services.monitoring.dashboard.history import History, bucket_edges
+from scan2sim.services.monitoring.dashboard.history import By, History, bucket_edges
 from scan2sim.services.monitoring.dashboard.state import BusState
+from scan2sim.services.monitoring.events import alarm_commands
+from scan2sim.services.monitoring.events.schema import AlarmCommand, Body
+from scan2sim.services.monitoring.settings.bus import RuleName, Subject
 from scan2sim.services.monitoring.settings.dashboard import PageParams
 
 log = logging.getLogger(__name__)
@@ -39,12 +45,21 @@ Seconds = Annotated[float, Query(ge=1, le=MAX_WINDOW_S)]
 Names = Annotated[list[str], Query(max_length=1000)]
 
 
+class AlarmTarget(Body):
+    """An alarm that someone acknowledges, or mutes for some seconds; 0 ends the muting."""
+
+    rule: RuleName
+    subject: Subject
+    by: Annotated[str, Field(min_length=1, max_length=100)]
+    seconds: Annotated[float, Field(ge=0, le=MAX_WINDOW_S)] = 3600.0
+
+
 class TopicReader:
     """Reads a Kafka topic in a background thread."""
 
-    def __init__(self, servers: str, topic: str, history_s: float, callback: Callable[[bytes], None]) -> None:
+    def __init__(self, cluster: kafka.Cluster, topic: str, history_s: float, callback: Callable[[bytes], None]) -> None:
         """`callback` is called with every message, beginning with those of the last `history_s` seconds."""
-        self._servers, self._topic, self._history_s, self._callback = servers, topic, history_s, callback
+        self._cluster, self._topic, self._history_s, self._callback = cluster, topic, history_s, callback
         self._thread = threading.Thread(target=self._read, name=f"{topic} for the page", daemon=True)
         self._ended = threading.Event()
         self._connected = False
@@ -70,7 +85,7 @@ class TopicReader:
         since = time.time() - self._history_s
         group = f"scan2sim-page-{uuid.uuid4().hex}"  # its own consumer group, so that every dashboard gets all messages
         bodies = kafka.read(
-            self._servers, self._topic, group=group, since=since, connected=self._set_connected, wait=0.5
+            self._cluster, self._topic, group=group, since=since, connected=self._set_connected, wait=0.5
         )
         for body in bodies:
             if self._ended.is_set():
@@ -81,7 +96,7 @@ class TopicReader:
     def _set_connected(self, connected: bool) -> None:
         if connected != self._connected:
             change = "connected to" if connected else "lost the connection to"
-            log.warning("%s topic %s of Kafka at %s", change, self._topic, self._servers)
+            log.warning("%s topic %s of Kafka at %s", change, self._topic, self._cluster.servers)
         self._connected = connected
 
 
@@ -97,10 +112,10 @@ class Sources:
     @classmethod
     def of(cls, params: PageParams) -> Sources:
         """Create them empty; `start` starts the readers."""
-        now, servers = time.time(), params.kafka_bootstrap_servers
+        now, cluster = time.time(), kafka.Cluster.read(params.kafka_bootstrap_servers, params.kafka_config)
         history, bus_state = History(now), BusState(now)
-        events = TopicReader(servers, params.events_topic, max(MIN_EVENT_HISTORY_S, params.back), bus_state.add)
-        return cls(history, bus_state, TopicReader(servers, params.topic, params.back, history.add), events)
+        events = TopicReader(cluster, params.events_topic, max(MIN_EVENT_HISTORY_S, params.back), bus_state.add)
+        return cls(history, bus_state, TopicReader(cluster, params.topic, params.back, history.add), events)
 
     def start(self) -> None:
         """Start both readers."""
@@ -154,23 +169,47 @@ def application(params: PageParams, sources: Sources) -> FastAPI:
     def past(
         begin: Annotated[float, Query(alias="from", ge=0, le=1e11)],
         to: Time,
+        by: By = "node",
         nodes: Names = [],  # noqa: B006
+        topics: Names = [],  # noqa: B006
     ) -> dict[str, Any]:
-        """Statistics of the nodes between two times, seconds since the epoch, in buckets (`History.window`)."""
+        """Statistics by node or topic between two times, seconds since the epoch, in buckets (`History.window`)."""
         if not 0 < to - begin <= MAX_WINDOW_S:
             raise SettingError("from, to", f"must be in order, up to {MAX_WINDOW_S} s apart", "Choose another range")
-        return {"state": state(), **history.window(bucket_edges(begin, to), nodes)}
+        return {"state": state(), **history.window(bucket_edges(begin, to), nodes if by == "node" else topics, by)}
 
     @app.get("/api/live")
-    def live(seconds: Seconds = 300.0, nodes: Names = []) -> StreamingResponse:  # noqa: B006
+    def live(
+        seconds: Seconds = 300.0,
+        by: By = "node",
+        nodes: Names = [],  # noqa: B006
+        topics: Names = [],  # noqa: B006
+    ) -> StreamingResponse:
         """Server-sent events: the last `seconds`, then an update every second."""
-        return StreamingResponse(_events(history, state, seconds, nodes), media_type="text/event-stream")
+
+        def window(edges: NDArray[np.float64]) -> dict[str, Any]:
+            return history.window(edges, nodes if by == "node" else topics, by)
+
+        return StreamingResponse(_events(window, state, seconds), media_type="text/event-stream")
+
+    @app.post("/api/alarms/{action}")
+    def command(action: Literal["acknowledge", "mute"], given: AlarmTarget) -> dict[str, str]:
+        """Send a command about an alarm to the alarm node; answers when Kafka has taken it."""
+        if params.is_open():
+            raise HTTPException(403, "alarms are handled only with a token: start the page with --token FILE")
+        until = time.time() + given.seconds if action == "mute" else 0.0
+        order = AlarmCommand(action=action, rule=given.rule, subject=given.subject, by=given.by, until=until)
+        cluster = kafka.Cluster.read(params.kafka_bootstrap_servers, params.kafka_config)
+        if not alarm_commands.send_by_kafka(cluster, params.events_topic, order):
+            cause = f"Kafka at {params.kafka_bootstrap_servers} doesn't take the command"
+            raise UnavailableError(given.rule, cause, "Try again when the page is live")
+        return {"sent": action}
 
     return app
 
 
 async def _events(
-    history: History, state: Callable[[], dict[str, Any]], seconds: float, nodes: list[str]
+    history_window: Callable[[NDArray[np.float64]], dict[str, Any]], state: Callable[[], dict[str, Any]], seconds: float
 ) -> AsyncIterator[str]:
     """First the whole window; then its latest buckets, which replace those of the same times, and changed runs."""
     since, versions = 0.0, dict[str, int]()
@@ -178,7 +217,7 @@ async def _events(
         now = time.time()
         edges = bucket_edges(now - seconds, now)
         step = edges[1] - edges[0]
-        window = await asyncio.to_thread(history.window, edges[edges >= since], nodes)
+        window = await asyncio.to_thread(history_window, edges[edges >= since])
         current = state()
         for run in current["runs"]:
             if versions.get(run["run"]) == run["version"]:
@@ -196,7 +235,7 @@ def _register_metrics(app: FastAPI, sources: Sources) -> None:
     records = Gauge("scan2sim_page_records", "Records received since the start", ("shown",), registry=registry)
     records.labels("yes").set_function(lambda: history.counts["shown"])
     records.labels("no").set_function(lambda: history.counts.total() - history.counts["shown"])
-    rejected = Gauge("scan2sim_page_events_refused", "Events rejected since the start", registry=registry)
+    rejected = Gauge("scan2sim_page_events_rejected", "Events rejected since the start", registry=registry)
     rejected.set_function(sources.bus_state.counts.total)
     alarms = Gauge("scan2sim_page_alarms", "Raised alarms", registry=registry)
     alarms.set_function(lambda: len(sources.bus_state.alarms.state()["raised"]))

@@ -22,7 +22,7 @@ MAX_LISTED_STEPS = 16
 SILENT_AFTER_S = 20.0
 """A run without an event for so long counts as silent; an active one publishes every five seconds."""
 LISTED_STATES = ("running", "failed", "done")
-FINAL_STATES = ("done", "kept", "failed")
+FINAL_STATES = ("done", "cached", "failed")
 
 
 @dataclass

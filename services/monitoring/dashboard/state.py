@@ -22,7 +22,7 @@ class BusState:
     Attributes:
         runs, queues, alarms: their current states.
         counts: number of rejected events, by reason.
-        last_refused: reason of the last rejection.
+        last_rejected: reason of the last rejection.
     """
 
     def __init__(self, began: float) -> None:
@@ -30,7 +30,7 @@ class BusState:
         self._began = began
         self.runs, self.queues, self.alarms = Runs(), Queues(), AlarmStates()
         self.counts: Counter[str] = Counter()
-        self.last_refused = ""
+        self.last_rejected = ""
 
     def add(self, body: bytes) -> None:
         """Update the state by an event; invalid events and those beyond a bound are only counted."""
@@ -46,16 +46,16 @@ class BusState:
         except RejectedError as error:
             reason, _, detail = str(error).partition(": ")
             self.counts[reason] += 1
-            self.last_refused = printable(f"{reason}: {detail}"[:MAX_WARNING_CHARS])
+            self.last_rejected = printable(f"{reason}: {detail}"[:MAX_WARNING_CHARS])
 
     def state(self, now: float) -> dict[str, Any]:
         """JSON-serializable state; `now` in seconds since the epoch."""
-        rejected = {"counts": dict(self.counts), "last": self.last_refused}
+        rejected = {"counts": dict(self.counts), "last": self.last_rejected}
         return {
             "runs": self.runs.state(now),
             "queues": self.queues.state(now),
             "alarms": self.alarms.state(),
-            "events_refused": rejected,
+            "events_rejected": rejected,
         }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from scan2sim.services import default_outbox, kafka
@@ -12,14 +12,32 @@ from scan2sim.services.monitoring.export.sinks import KafkaSink
 from scan2sim.services.monitoring.node.monitor import RECORDS_QOS, STRING, ros
 from scan2sim.services.monitoring.settings.bus import BusParams
 
+REACHED_INTERVAL_S = 1.0
+"""Longest pause between two probes of an idle broker, if the caller waits for its signs."""
+
 
 class Bus:
     """Connects a node to the bus; an event that arrives over both ROS 2 and Kafka is processed once."""
 
-    def __init__(self, node: Any, params: BusParams, *, records: bool = False) -> None:
-        """`records`: whether to receive monitoring records as well as events."""
+    def __init__(
+        self, node: Any, params: BusParams, *, records: bool = False, reached: Callable[[], None] | None = None,
+        seen: Mapping[str, int] | None = None,
+    ) -> None:  # fmt: skip
+        """Connect the node.
+
+        Args:
+            node: a node of the transport.
+            params: topics and Kafka servers.
+            records: whether to receive monitoring records as well as events.
+            reached: called at each sign that Kafka is there (`kafka.read`), at least every `REACHED_INTERVAL_S`, in a
+                thread.
+            seen: state of the deduplicator of an earlier process, so that what Kafka delivers again is ignored.
+        """
+        self._reached = reached or (lambda: None)
+        self._probe_pause = REACHED_INTERVAL_S if reached else kafka.MAX_PROBE_PAUSE_S
         name = node.get_name()
         self.events = Events(name)
+        self.events.deduplicator.restore(seen or {})
         self.events.outlets.append(RosOutlet(node, params.events_topic))
         topics = [params.events_topic, *([params.records_topic] if records else [])]
         for topic in topics:
@@ -29,10 +47,11 @@ class Bus:
         self._kafka: KafkaSink | None = None
         if servers := params.kafka_bootstrap_servers:
             outbox = default_outbox.open_outbox(f"{node.get_namespace()}/{name}", params.events_topic)
-            self._kafka = KafkaSink(servers, params.events_topic, outbox)
+            cluster = kafka.Cluster.read(servers, params.kafka_config)
+            self._kafka = KafkaSink(cluster, params.events_topic, outbox)
             self.events.outlets.append(self._kafka)
             for topic in topics:
-                arguments = (servers, topic, f"scan2sim-{name}")
+                arguments = (cluster, topic, f"scan2sim-{name}")
                 reader = threading.Thread(target=self._read_kafka, args=arguments, daemon=True)
                 reader.start()
                 self._readers.append(reader)
@@ -40,8 +59,10 @@ class Bus:
     def _on_ros_message(self, message: Any) -> None:
         self.events.receive(message.data)
 
-    def _read_kafka(self, servers: str, topic: str, group: str) -> None:
-        for body in kafka.read(servers, topic, group=group, wait=0.5):
+    def _read_kafka(self, cluster: kafka.Cluster, topic: str, group: str) -> None:
+        pause = self._probe_pause
+        bodies = kafka.read(cluster, topic, group=group, wait=0.5, reached=self._reached, max_probe_pause=pause)
+        for body in bodies:
             if self._closed.is_set():
                 return
             if body is not None:
@@ -70,6 +91,10 @@ class RosOutlet:
     def send(self, event: Event) -> None:
         """Publish an event."""
         self._publisher.publish(ros.message(STRING, data=event.json_line()))
+
+    def is_heard(self) -> bool:
+        """Whether another node subscribes to the topic."""
+        return bool(self._publisher.get_subscription_count())
 
     def close(self) -> None:
         """Nothing to release: the node destroys its publishers."""

@@ -9,7 +9,7 @@ from pydantic import TypeAdapter, ValidationError
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services import default_outbox, transport
-from scan2sim.services.kafka import Servers
+from scan2sim.services.kafka import Cluster, Servers
 from scan2sim.services.monitoring.events.schema import Outlet
 from scan2sim.services.monitoring.export.sinks import KafkaSink
 
@@ -26,6 +26,7 @@ def check_address(where: str) -> None:
 
     Raises:
         SettingError: the address is malformed.
+        InputError: the file that SCAN2SIM_KAFKA_CONFIG names is invalid.
         UnavailableError: a required package isn't installed.
     """
     servers = _servers(where)
@@ -39,6 +40,7 @@ def check_address(where: str) -> None:
         transport.load()
     if servers:
         optional_deps.require("--bus", "confluent_kafka")
+        Cluster.read(servers, None)
 
 
 def open_outlets(where: str) -> list[Outlet]:
@@ -46,7 +48,9 @@ def open_outlets(where: str) -> list[Outlet]:
     servers = _servers(where)
     outlets: list[Outlet] = []
     if servers:
-        outlets.append(KafkaSink(servers, TOPIC, default_outbox.open_outbox(f"run.{servers}", TOPIC)))
+        outlets.append(
+            KafkaSink(Cluster.read(servers, None), TOPIC, default_outbox.open_outbox(f"run.{servers}", TOPIC))
+        )
     if ROS in where.split(","):
         outlets.append(_ros_outlet())
     return outlets

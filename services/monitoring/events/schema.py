@@ -38,13 +38,15 @@ class Body(BaseModel):
 
 
 class Alarm(Body):
-    """A rule's alarm was raised or cleared.
+    """A rule's alarm was raised or cleared, or a raised one was acknowledged or muted.
 
     Attributes:
         rule: name of the rule.
         subject: topic, node, queue, or "topic at node".
         value: current value of the rule's metric.
         since: when the condition started to hold, seconds since the epoch.
+        acknowledged_by: name of the person that has acknowledged it; "" if nobody has.
+        muted_until: until when nobody is notified of it, seconds since the epoch.
     """
 
     state: Literal["raised", "cleared"]
@@ -52,6 +54,26 @@ class Alarm(Body):
     subject: str
     value: float
     since: float
+    acknowledged_by: str = ""
+    muted_until: float = 0.0
+
+
+class AlarmCommand(Body):
+    """A person's command to the alarm node.
+
+    Attributes:
+        action: "acknowledge" a raised alarm; "mute" alarms until a time; "retire" a node, whose alarms end.
+        rule: name of the rule; patterns like "*" are allowed, as in `subject`.
+        subject: of the alarm; to retire, the full name of a node.
+        by: name of the person that gives the command.
+        until: end of muting, seconds since the epoch; 0 ends it now.
+    """
+
+    action: Literal["acknowledge", "mute", "retire"]
+    rule: Annotated[str, Field(max_length=100)] = "*"
+    subject: Annotated[str, Field(min_length=1, max_length=1000)]
+    by: Annotated[str, Field(max_length=100)] = ""
+    until: Annotated[float, Field(ge=0, le=1e11)] = 0.0
 
 
 class QueueState(Body):
@@ -101,7 +123,7 @@ class RunState(Body):
         source: its input as given by the user: a tile, a survey, a drive.
         host: machine on which the command was started.
         state: "stopped" if the user stopped it.
-        steps: number of tasks known so far; of these `running`, `done`, `kept` (cached) and `failed`.
+        steps: number of tasks known so far; of these `running`, `done`, `cached` and `failed`.
         seconds: elapsed time.
         message: cause of a failure.
     """
@@ -114,7 +136,7 @@ class RunState(Body):
     steps: Count
     running: Count
     done: Count
-    kept: Count
+    cached: Count
     failed: Count
     seconds: Annotated[float, Field(ge=0)]
     message: Text = ""
@@ -137,7 +159,7 @@ class StepState(Body):
     run: Name
     tile: Name
     step: Name
-    state: Literal["waiting", "running", "done", "kept", "failed"]
+    state: Literal["waiting", "running", "done", "cached", "failed"]
     progress: Annotated[float, Field(ge=0, le=1)] = 0.0
     seconds: Annotated[float, Field(ge=0)] | None = None
     memory: Count | None = None
@@ -188,6 +210,7 @@ class Outlet(Protocol):
 Callback = Callable[[Any], None]
 KINDS: dict[str, type[BaseModel]] = {
     "alarm": Alarm,
+    "alarm_command": AlarmCommand,
     "queue": QueueState,
     "workers": WorkersWanted,
     "run": RunState,
@@ -200,11 +223,12 @@ class Events:
     """Sends events and calls the callbacks registered for them; thread-safe, callbacks are called one at a time.
 
     Attributes:
+        deduplicator: of what is received.
         malformed: number of received messages that were not valid events.
     """
 
     def __init__(self, sender: str) -> None:
-        self._sender, self._next_id, self._deduplicator = sender, new_ids(), Deduplicator()
+        self._sender, self._next_id, self.deduplicator = sender, new_ids(), Deduplicator()
         self._kinds, self._callbacks = dict(KINDS), defaultdict[str, list[Callback]](list)
         self._lock = threading.RLock()
         self.outlets: list[Outlet] = []
@@ -240,7 +264,7 @@ class Events:
         for outlet in self.outlets:
             outlet.send(event)
         with self._lock:
-            self._deduplicator.is_new(event.id)
+            self.deduplicator.is_new(event.id)
             self._dispatch(kind, body)
         return event
 
@@ -256,7 +280,7 @@ class Events:
                     return
                 kind, record_id, body = event.kind, event.id, self._kinds[event.kind].model_validate(event.body)
             with self._lock:
-                if self._deduplicator.is_new(record_id):
+                if self.deduplicator.is_new(record_id):
                     self._dispatch(kind, body)
         except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:  # incl. pydantic's
             self.malformed += 1

@@ -117,9 +117,8 @@ def archive_records(params: ArchiveParams, stop: threading.Event, warn: Callable
     since = None if written is None else written - WRITE_INTERVAL_S - LATE_RECORDS_S
     group = f"scan2sim-archive-{uuid.uuid4().hex}"
     due = time.monotonic() + WRITE_INTERVAL_S
-    for body in kafka.read(
-        params.kafka_bootstrap_servers, params.topic, group=group, from_start=True, since=since, wait=0.5
-    ):
+    cluster = kafka.Cluster.read(params.kafka_bootstrap_servers, params.kafka_config)
+    for body in kafka.read(cluster, params.topic, group=group, from_start=True, since=since, wait=0.5):
         if body is not None:
             try:
                 archive.add(Record.model_validate_json(body))

@@ -10,7 +10,7 @@ from typing import Protocol
 
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.services import default_outbox
-from scan2sim.services.kafka import TopicProducer
+from scan2sim.services.kafka import Cluster, TopicProducer
 from scan2sim.services.monitoring.record import Record
 from scan2sim.services.monitoring.settings.monitor import MonitorParams
 from scan2sim.services.outbox import Outbox, Sender
@@ -52,8 +52,9 @@ def open_sinks(params: MonitorParams, node: str) -> list[Sink]:
     """Open all sinks that are configured for a node, given by its full name."""
     sinks: list[Sink] = []
     if params.kafka_bootstrap_servers:
-        outbox = Outbox(params.spool) if params.spool else default_outbox.open_outbox(node, params.publisher_topic)
-        sinks.append(KafkaSink(params.kafka_bootstrap_servers, params.publisher_topic, outbox))
+        outbox = Outbox(params.outbox) if params.outbox else default_outbox.open_outbox(node, params.publisher_topic)
+        cluster = Cluster.read(params.kafka_bootstrap_servers, params.kafka_config)
+        sinks.append(KafkaSink(cluster, params.publisher_topic, outbox))
     if params.log_file:
         sinks.append(JsonLinesSink.file(params.log_file))
     if params.console:
@@ -66,9 +67,9 @@ def open_sinks(params: MonitorParams, node: str) -> list[Sink]:
 class KafkaSink:
     """Sends messages to a Kafka topic through an outbox on disk: unsent messages are retried, in order."""
 
-    def __init__(self, servers: str, topic: str, outbox: Outbox) -> None:
+    def __init__(self, cluster: Cluster, topic: str, outbox: Outbox) -> None:
         self._outbox = outbox
-        self._sender = Sender(self._outbox, TopicProducer(servers, topic).send)
+        self._sender = Sender(self._outbox, TopicProducer(cluster, topic).send)
 
     @property
     def dropped(self) -> Mapping[str, int]:
@@ -121,7 +122,7 @@ class PrometheusSink:
 
     def __init__(self, port: int) -> None:
         optional_deps.require("Prometheus", "prometheus_client")
-        from prometheus_client import CollectorRegistry, Gauge, start_http_server
+        from prometheus_client import CollectorRegistry, Counter, Gauge, start_http_server
 
         registry = CollectorRegistry()
         flow = ("node", "topic", "direction")
@@ -129,11 +130,19 @@ class PrometheusSink:
             key: Gauge(f"scan2sim_{name}", help_, flow, registry=registry)
             for key, name, help_ in (
                 ("bandwidth", "bandwidth_bytes_per_second", "Bytes per second over the last period"),
-                ("messages", "messages", "Messages over the last period"),
+                ("messages", "messages_in_period", "Messages over the last period"),
                 ("size", "message_size_bytes", "Mean message size over the last period"),
-                ("lost", "lost_messages", "Messages published but not received in the last period"),
+                ("lost", "lost_messages_in_period", "Messages published but not received in the last period"),
                 ("latency", "latency_nanoseconds", "Mean time from publishing to receiving"),
                 ("latency_p95", "latency_p95_nanoseconds", "95th percentile of the latency"),
+            )
+        }
+        self._totals = {
+            key: Counter(f"scan2sim_{name}", help_, flow, registry=registry)
+            for key, name, help_ in (
+                ("messages", "messages", "Messages since the start"),
+                ("bytes", "bytes", "Bytes since the start"),
+                ("lost", "lost_messages", "Messages published but not received since the start"),
             )
         }
         self._cpu = Gauge("scan2sim_cpu_percent", "CPU load of the machine", ("node",), registry=registry)
@@ -145,13 +154,16 @@ class PrometheusSink:
         return int(self._server.server_port)
 
     def send(self, record: Record) -> None:
-        """Set the gauges to the values of a record."""
+        """Set the gauges to the values of a record, and add them to the totals."""
         node = record.node_namespace.rstrip("/") + "/" + record.node_name
         for flow in record.flows:
             for key, gauge in self._flows.items():
                 value = getattr(flow, key)
                 if value is not None:
                     gauge.labels(node, flow.topic, flow.direction).set(value)
+            added = {"messages": flow.messages, "bytes": flow.bandwidth * record.period, "lost": flow.lost or 0}
+            for key, counter in self._totals.items():
+                counter.labels(node, flow.topic, flow.direction).inc(max(0.0, added[key]))
         self._cpu.labels(node).set(record.cpu_percent)
 
     def close(self) -> None:

@@ -1,8 +1,7 @@
 """Clock offsets between machines, which latencies between machines are corrected by.
 
-A node that receives a message of an unknown process pings it on a ROS 2 topic and estimates the offset from four
-timestamps (RFC 5905, section 8); the exchange with the shortest round trip is the most accurate. Processes on one
-machine share a clock and are pinged once.
+A node that receives a message of an unknown process pings it on a ROS 2 topic and estimates the offset
+(`services.clock_filter`). Processes on one machine share a clock and are pinged once.
 """
 
 from __future__ import annotations
@@ -10,12 +9,13 @@ from __future__ import annotations
 import ctypes
 import time
 import uuid
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+from scan2sim.services.clock_filter import ClockFilter, Exchange
 
 TOPIC = "monitor_clock"
 """Topic of pings and replies, JSON in std_msgs/String."""
@@ -39,15 +39,13 @@ class _Peer:
 
     Attributes:
         host: machine on which it runs; None until it replied.
-        exchanges: (round trip, offset of its clock) of the latest exchanges, nanoseconds.
-        best: (offset, uncertainty), nanoseconds; positive if its clock is ahead of this one; None: unknown.
+        exchanges: the latest exchanges with it.
     """
 
     host: str | None = None
     pinged: float = float("-inf")
     unanswered: int = 0
-    exchanges: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=EXCHANGE_WINDOW))
-    best: tuple[int, int] | None = None
+    exchanges: ClockFilter = field(default_factory=lambda: ClockFilter(EXCHANGE_WINDOW))
 
 
 class ClockSync:
@@ -73,7 +71,7 @@ class ClockSync:
             peer = self._peers[prefix] = _Peer()
         if peer.host == self._host or (peer.host is None and peer.unanswered >= MAX_UNANSWERED_PINGS):
             return None
-        interval = PING_INTERVAL_S if len(peer.exchanges) == EXCHANGE_WINDOW else INITIAL_PING_INTERVAL_S
+        interval = PING_INTERVAL_S if peer.exchanges.full else INITIAL_PING_INTERVAL_S
         if time.monotonic() - peer.pinged < interval:
             return None
         peer.pinged, peer.unanswered = time.monotonic(), peer.unanswered + 1
@@ -105,7 +103,10 @@ class ClockSync:
         None: unknown, because its process hasn't replied.
         """
         peer = self._peers.get(publisher[:GID_PREFIX_BYTES]) if publisher else None
-        return peer.best if peer else None
+        if peer and peer.host == self._host:
+            return 0, 0
+        best = peer.exchanges.best if peer else None
+        return (best.offset, best.round_trip // 2) if best else None
 
     def detect_jump(self) -> float:
         """Seconds by which this machine's clock was set since the last call; a jump discards all known offsets."""
@@ -116,14 +117,12 @@ class ClockSync:
         self._peers = {}
         return jump_ns / 1e9
 
-    def _add_exchange(self, publisher: bytes, message: Mapping[str, Any], t4: int) -> None:
-        """Round trip and offset from the four timestamps t1 to t4 of RFC 5905."""
-        t1, t2, t3 = int(message["sent"]), int(message["received"]), int(message["answered"])
+    def _add_exchange(self, publisher: bytes, message: Mapping[str, Any], arrived: int) -> None:
+        exchange = Exchange.of(int(message["sent"]), int(message["received"]), int(message["answered"]), arrived)
         peer = self._peers.setdefault(publisher[:GID_PREFIX_BYTES], _Peer())
         peer.host, peer.unanswered = str(message["host"]), 0
-        peer.exchanges.append(((t4 - t1) - (t3 - t2), ((t2 - t1) + (t3 - t4)) // 2))
-        round_trip, offset = min(peer.exchanges)
-        peer.best = (0, 0) if peer.host == self._host else (offset, round_trip // 2)
+        if exchange is not None:
+            peer.exchanges.add(exchange)
 
 
 @cache

@@ -211,7 +211,7 @@ class Monitor(ros.Node):  # type: ignore[misc]
                 )
                 for topic, found in endpoints.items()
             ],
-            remarks=[
+            warnings=[
                 *_clock_warnings(clock_jump_s),
                 *_unreadable_warnings(flows),
                 *self._limits.exceeded(flows),

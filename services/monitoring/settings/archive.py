@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field
 
 from scan2sim.pipeline.core.step import Params
-from scan2sim.services.kafka import Servers
+from scan2sim.services.kafka import ClientConfig, Servers
 
 
 def _parse_time(value: Any) -> Any:
@@ -34,6 +34,7 @@ class ArchiveParams(Params):
     kafka_bootstrap_servers: Annotated[
         Servers, Field(description="Kafka servers with the records, HOST:PORT,...; retried until reachable.")
     ] = "localhost:9092"
+    kafka_config: ClientConfig = None
     topic: Annotated[str, Field(description="Kafka topic of the records.")] = "monitor_data"
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field
 
 from scan2sim.pipeline.core.step import Params
-from scan2sim.services.kafka import Servers
+from scan2sim.services.kafka import ClientConfig, Servers
 from scan2sim.services.monitoring.settings.scaling import MAX_WORKERS, ScalingParams
 from scan2sim.services.transport.names import TopicName
 
@@ -20,6 +20,7 @@ class BusParams(Params):
         Servers | None,
         Field(description="Kafka servers in addition to ROS 2, HOST:PORT,...; retried until reachable."),
     ] = None
+    kafka_config: ClientConfig = None
     records_topic: Annotated[TopicName, Field(description="ROS 2 and Kafka topic of records.")] = "monitor_data"
     events_topic: Annotated[TopicName, Field(description="ROS 2 and Kafka topic of events.")] = "bus_events"
 
@@ -57,3 +58,52 @@ class AlarmsParams(BusParams):
     """Settings of the alarm node."""
 
     rules: Annotated[Path, Field(description="TOML file of alarm rules (docs/monitoring.md).")]
+    state: Annotated[
+        Path | None,
+        Field(description="File with the raised alarms, read after a restart; default: in ~/.local/state/scan2sim."),
+    ] = None
+
+
+class AlarmCommandParams(Params):
+    """Where a command to the alarm node goes, and from whom."""
+
+    kafka_bootstrap_servers: Annotated[
+        Servers | None, Field(description="Kafka servers of `monitor alarms`, HOST:PORT,...; default: ROS 2.")
+    ] = None
+    kafka_config: ClientConfig = None
+    events_topic: Annotated[TopicName, Field(description="ROS 2 and Kafka topic of events.")] = "bus_events"
+    by: Annotated[
+        str | None, Field(min_length=1, max_length=100, description="Your name; default: your login name.")
+    ] = None
+
+
+RuleName = Annotated[
+    str, Field(min_length=1, max_length=100, description="Name of the alarm rule, or a pattern like '*'.")
+]
+Subject = Annotated[
+    str,
+    Field(min_length=1, max_length=1000, description="Subject of the alarm as printed, or a pattern like '/camera*'."),
+]
+
+
+class AcknowledgeParams(AlarmCommandParams):
+    """Settings of the acknowledgement of raised alarms."""
+
+    rule: RuleName
+    subject: Subject
+
+
+class MuteParams(AlarmCommandParams):
+    """Settings of the muting of alarms."""
+
+    rule: RuleName
+    subject: Subject
+    seconds: Annotated[
+        float, Field(ge=0, le=31_536_000, description="Seconds for which nobody is notified; 0 ends it.")
+    ] = 3600.0
+
+
+class RetireParams(AlarmCommandParams):
+    """Settings of the retirement of a node."""
+
+    node: Annotated[str, Field(min_length=1, max_length=1000, description="Full name of the node, such as /camera.")]

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from scan2sim.services.http.settings import ServerParams
-from scan2sim.services.kafka import Servers
+from scan2sim.services.kafka import ClientConfig, Servers
 from scan2sim.services.monitoring.settings.limits import Limit, Limits
 
 
@@ -17,6 +17,7 @@ class PageParams(ServerParams):
     kafka_bootstrap_servers: Annotated[
         Servers, Field(description="Kafka servers with the records, HOST:PORT,...; retried until reachable.")
     ] = "localhost:9092"
+    kafka_config: ClientConfig = None
     topic: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,249}$", description="Kafka topic of records.")] = (
         "monitor_data"
     )

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from scan2sim.pipeline.core.step import Params
-from scan2sim.services.kafka import Servers
+from scan2sim.services.kafka import ClientConfig, Servers
 from scan2sim.services.monitoring.settings.limits import Limit, Limits
 from scan2sim.services.transport.names import TopicName
 
@@ -28,13 +28,14 @@ class MonitorParams(Params):
         Servers | None,
         Field(description="Kafka servers to send the records to, HOST:PORT,...; retried until reachable."),
     ] = None
+    kafka_config: ClientConfig = None
     publisher_topic: Annotated[TopicName, Field(description="ROS 2 and Kafka topic of the records.")] = "monitor_data"
     log_file: Annotated[Path | None, Field(description="Log file of the records, a line of JSON each.")] = None
     console: Annotated[bool, Field(description="Also write the records to standard error.")] = False
     prometheus_port: Annotated[
         int | None, Field(ge=0, le=65535, description="Port on 127.0.0.1 that serves the metrics for Prometheus.")
     ] = None
-    spool: Annotated[
+    outbox: Annotated[
         Path | None,
         Field(description="Outbox file for records not yet sent to Kafka; default: in the user's state folder."),
     ] = None

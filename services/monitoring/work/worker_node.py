@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 import time
 from typing import Any
 
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.monitoring.events.bus import Bus
 from scan2sim.services.monitoring.events.schema import QueueState, WorkersWanted
 from scan2sim.services.monitoring.node.monitor import STRING, Monitor, ros
@@ -27,15 +29,22 @@ class WorkerNode(Monitor):
     """
 
     def __init__(self, params: WorkParams, node_name: str = "work") -> None:
+        """Create the node and start the first worker.
+
+        Raises:
+            SettingError: there is no such worker program.
+        """
+        command = _command(params.command)
         super().__init__(node_name, **params.monitor_settings())
         self.queue = EventQueue(params.topic, params.queue_length, params.when_full)
-        self._workers = LocalWorkers(self.queue, shlex.split(params.command), params.deadline)
+        self._workers = LocalWorkers(self.queue, command, params.deadline)
         self._max_workers, self._with_text = params.max_workers, params.with_text
         self._sent: float | None = None
         self._bus = Bus(
             self,
             BusParams(
                 kafka_bootstrap_servers=params.kafka_bootstrap_servers,
+                kafka_config=params.kafka_config,
                 records_topic=params.publisher_topic,
                 events_topic=params.events_topic,
             ),
@@ -72,3 +81,19 @@ class WorkerNode(Monitor):
         self._workers.close()
         self._bus.close()
         return super().destroy_node()
+
+
+def _command(text: str) -> list[str]:
+    """Program and arguments of a worker.
+
+    Raises:
+        SettingError: the quotes aren't closed, or there is no such program.
+    """
+    remedy = "Name a program by its path, or one that is on the PATH, with its arguments"
+    try:
+        command = shlex.split(text)
+    except ValueError as error:
+        raise SettingError("WORKER", f"{text!r:.80} can't be read ({error})", remedy) from None
+    if not command or shutil.which(command[0]) is None:
+        raise SettingError("WORKER", f"there is no program {text!r:.80}", remedy)
+    return command

@@ -45,14 +45,14 @@ class VehicleState:
     """State of a vehicle, as the vehicle reports it.
 
     Attributes:
-        speed: m/s along its x axis, negative backwards.
+        speed: m/s along its x axis, negative backwards; None: unknown.
         position: (x, y) metres east and north of an origin of its own, or of its world; None: unknown.
         heading: radians from east, anticlockwise; None: unknown.
         gear: engaged gear.
         faults: messages for the driver; empty: none.
     """
 
-    speed: float = 0.0
+    speed: float | None = 0.0
     position: tuple[float, float] | None = None
     heading: float | None = None
     gear: Gear = Gear.NEUTRAL

@@ -39,6 +39,8 @@ class Kind(IntEnum):
     """To the station: `VideoStreams`, the list of cameras."""
     NACK = 9
     """To the vehicle: `Nack`, video packets to retransmit."""
+    CONGESTION = 10
+    """To the vehicle: `CongestionReport`, a queue grows on the links."""
 
 
 HEADER = struct.Struct("<BQq")
@@ -83,7 +85,7 @@ class Message:
 
 
 _COMMAND = struct.Struct("<fffbBI")
-_HORN, _LIGHTS, _AGREE = 1, 2, 4
+_HORN, _LIGHTS, _AGREE, _EMERGENCY = 1, 2, 4, 8
 
 
 @dataclass(frozen=True)
@@ -93,16 +95,18 @@ class Command:
     Attributes:
         stop: number of the last stop that the driver has seen.
         agree: the driver confirms that the vehicle may leave that stop.
+        emergency: the vehicle stops, and leaves this stop only after another confirmation.
     """
 
     controls: Controls
     stop: int = 0
     agree: bool = False
+    emergency: bool = False
 
     def pack(self) -> bytes:
         """Encode as a message body."""
         c = self.controls
-        flags = _HORN * c.horn | _LIGHTS * c.lights | _AGREE * self.agree
+        flags = _HORN * c.horn | _LIGHTS * c.lights | _AGREE * self.agree | _EMERGENCY * self.emergency
         return _COMMAND.pack(c.steering, c.throttle, c.brake, c.gear, flags, self.stop)
 
     @staticmethod
@@ -120,7 +124,7 @@ class Command:
         if not (abs(steering) <= 1 and 0 <= throttle <= 1 and 0 <= brake <= 1):  # rejects NaN as well
             raise Malformed("controls out of range")
         controls = Controls(steering, throttle, brake, gear_, bool(flags & _HORN), bool(flags & _LIGHTS))
-        return Command(controls, stop, bool(flags & _AGREE))
+        return Command(controls, stop, bool(flags & _AGREE), bool(flags & _EMERGENCY))
 
 
 _VIDEO_KEY = struct.Struct("<I44s")
@@ -234,6 +238,7 @@ class Telemetry(_JsonBody):
         stop: number of its last stop; standing: whether it is still stopped for it; reason: of that stop.
         command: number of the last obeyed message; age: age of that command when it was obeyed, ms.
         dropped: number of messages that were not obeyed so far, by reason.
+        vehicle_age_ms: time since the vehicle adapter sent `vehicle`, ms; large if it never did.
     """
 
     vehicle: VehicleState
@@ -243,6 +248,7 @@ class Telemetry(_JsonBody):
     command: int
     age: float
     dropped: dict[Name, Count]
+    vehicle_age_ms: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -260,6 +266,21 @@ class VideoReport(_JsonBody):
     lost: Count
     delay: float | None
     links: dict[Name, float]
+
+
+@dataclass(frozen=True)
+class CongestionReport(_JsonBody):
+    """A queue grows on the links.
+
+    Attributes:
+        rate: at which video arrives, bit/s for each camera.
+        share: of the rate at which it was sent.
+        queue_ms: delay in the queue, ms.
+    """
+
+    rate: Count
+    share: float
+    queue_ms: float
 
 
 @dataclass(frozen=True)

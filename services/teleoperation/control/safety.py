@@ -21,6 +21,7 @@ from scan2sim.services.teleoperation.control.messages import Command
 COMMAND_MAX_AGE_MS = 200.0
 """Latency of a mobile link (100 ms and 50 ms of jitter: D3.2, table 6), and two lost commands at fifty per second."""
 NS_PER_MS = 10**6
+EMERGENCY_STOP = "the emergency stop was pressed"
 DROP_OTHER_SESSION, DROP_DUPLICATE, DROP_OUT_OF_ORDER, DROP_TOO_OLD, DROP_FROM_FUTURE = (
     "of another session",
     "double",
@@ -83,7 +84,9 @@ class SafetyMonitor:
             self.dropped[reason] += 1
             return False
         self._newest, self._created = number, min(created, now)
-        if self.standing:
+        if command.emergency:
+            self.halt(EMERGENCY_STOP)
+        elif self.standing:
             self._confirm(command)
         if not self.standing:
             self._controls, self.command, self.age = command.controls, number, (now - created) / NS_PER_MS

@@ -1,9 +1,10 @@
-"""Connection of a vehicle or station to its gateway: receives orders, and sends the party's status once a second."""
+"""Connection of a vehicle or station to its gateway: receives orders, and sends the party's status."""
 
 from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
@@ -11,6 +12,7 @@ from scan2sim.services.teleoperation.control.messages import Malformed
 from scan2sim.services.teleoperation.gateway.json_stream import Client, Connection, JsonObject
 from scan2sim.services.teleoperation.gateway_protocol import (
     Address,
+    DriverEvent,
     DriverRequest,
     Hello,
     Join,
@@ -23,8 +25,10 @@ from scan2sim.services.teleoperation.identity import Identity
 
 log = logging.getLogger(__name__)
 
-STATUS_PERIOD_S = 1.0
-"""Interval between two status messages."""
+STATUS_PERIOD_S = 0.1
+"""Interval between two status messages: the fleet page shows no speed that is older than 0.3 s."""
+EVENTS_MAX = 1000
+"""Maximum number of events that wait for the gateway; the oldest are dropped."""
 
 
 class Party(Protocol):
@@ -50,6 +54,7 @@ class GatewayConnection:
         self._party, self._notify, self._reported_loss = party, notify, ""
         self._where = f"the gateway {gateway.host}:{gateway.port}"
         self._ended = threading.Event()
+        self._events: deque[DriverEvent] = deque(maxlen=EVENTS_MAX)
         self._client = Client(
             identity, gateway.host, gateway.port,
             opened=self._opened, received=self._received, closed=self._closed,
@@ -68,6 +73,10 @@ class GatewayConnection:
     def send_request(self, request: DriverRequest) -> bool:
         """Send a driver's request to the gateway; False: it isn't connected."""
         return self._client.send(request.wire())
+
+    def report_event(self, event: DriverEvent) -> None:
+        """Send an event with the next status; while the gateway isn't connected the latest ones are kept."""
+        self._events.append(event)
 
     def close(self) -> None:
         """Close the connection and end the threads."""
@@ -95,4 +104,6 @@ class GatewayConnection:
 
     def _send_status(self) -> None:
         while not self._ended.wait(STATUS_PERIOD_S):
+            while self._events and self._client.send(self._events[0].wire()):
+                self._events.popleft()
             self._client.send(self._party.status().wire())

@@ -6,6 +6,7 @@ that reconnects; so a restarted gateway finds its pairs driving. A vehicle, and 
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import time
@@ -20,6 +21,7 @@ from scan2sim.pipeline.core.errors import BusyError, InputError, SettingError, f
 from scan2sim.services.teleoperation.gateway.audit import AuditTrail
 from scan2sim.services.teleoperation.gateway_protocol import (
     CurrentPair,
+    DriverEvent,
     DriverRequest,
     Hello,
     Join,
@@ -65,6 +67,7 @@ class _Party:
     send: Send | None
     since: float
     status: Status = field(default_factory=Status)
+    status_at: float = -math.inf  # when it arrived, seconds of the monotonic clock
 
 
 _STATE = TypeAdapter(tuple[int, tuple[Pair, ...]])
@@ -109,21 +112,37 @@ class Fleet:
     def update_status(self, peer: Peer, status: Status) -> None:
         """Store a party's status."""
         with self._lock:
-            self._parties[peer.role, peer.name].status = status
+            party = self._parties[peer.role, peer.name]
+            party.status, party.status_at = status, time.monotonic()
 
     def handle_request(self, peer: Peer, request: DriverRequest) -> None:
         """Carry out a request of a station's driver, for that station only."""
         if peer.role != Role.STATION:
             raise SettingError(peer.name, "is not a station", "Send requests from a station, or use the fleet page")
+        by = f"{request.driver} at {peer.name}" if request.driver else peer.name
         if request.what == "join":
-            self.join(request.vehicle, peer.name, peer.name)
+            self.join(request.vehicle, peer.name, by)
             return
         with self._lock:
             pair = self._require_pair(request.vehicle)
             if pair.station != peer.name:
                 remedy = "Release it there, or on the fleet page"
                 raise BusyError(request.vehicle, f"is driven from {pair.station}", remedy)
-            self.release(request.vehicle, peer.name)
+            self.release(request.vehicle, by)
+
+    def log_event(self, peer: Peer, event: DriverEvent) -> None:
+        """Log what a station's driver did; events of other parties are ignored."""
+        if peer.role != Role.STATION:
+            return
+        with self._lock:
+            pair = self._pair_of(Role.STATION, peer.name)
+            entry = {
+                "what": event.what,
+                "vehicle": pair.vehicle if pair else "",
+                "station": peer.name,
+                "by": event.driver,
+            }
+            self.audit.add({"time": round(self._now(), 3), "happened": event.time, **entry})
 
     def disconnected(self, peer: Peer, send: Send) -> None:
         """Unregister a party's connection; its pair stays."""
@@ -201,10 +220,21 @@ class Fleet:
                         "pair": None if pair is None else pair.number,
                         "other": None if pair is None else pair.station if pairs is self._pairs else pair.vehicle,
                         "before": None if pair is None else pair.before,
-                        **one.status.model_dump(exclude={"kind", "pair"}),
+                        **one.status.model_dump(exclude={"kind", "pair", "speed"}),
                     }
                 )  # fmt: skip
             return result
+
+    def speeds(self) -> dict[str, dict[str, float | None]]:
+        """Speed (m/s) of each vehicle and time since its report arrived (`reported_ms`, ms); None: unknown."""
+        now = time.monotonic()
+        with self._lock:
+            vehicles = [one for one in self._parties.values() if one.peer.role == Role.VEHICLE and one.send is not None]
+            return {
+                one.peer.name: {"speed": one.status.speed, "reported_ms": round(1e3 * (now - one.status_at), 1)}
+                for one in vehicles
+                if one.status.speed is not None
+            }
 
     # internals
 

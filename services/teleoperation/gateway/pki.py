@@ -2,7 +2,7 @@
 
     DIR/authority/          certificate.pem and key.pem of the authority: must not be copied to a vehicle
     DIR/gateway/            certificate.pem, key.pem, authority.pem: all that a party needs
-    DIR/vehicle-NAME/       likewise
+    DIR/vehicle-NAME/       likewise, and adapter.key, shared with the vehicle adapter
     DIR/station-NAME/       likewise
 
 Whoever has the authority's key can impersonate any party; any other key proves the identity of one party only.
@@ -25,11 +25,13 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from scan2sim.pipeline.core.errors import InputError, SettingError, from_os_error
+from scan2sim.services.teleoperation import adapter_key
+from scan2sim.services.teleoperation.adapter_key import ADAPTER_KEY_FILE
+from scan2sim.services.teleoperation.gateway_protocol import NAME_PATTERN
 from scan2sim.services.teleoperation.identity import (
     AUTHORITY_FILE,
     CERTIFICATE_FILE,
     KEY_FILE,
-    NAME_PATTERN,
     Identity,
     Role,
     host,
@@ -187,6 +189,9 @@ def _keep_or_renew(
     """Keep a party's certificate, or replace it."""
     party_folder = folder / (role if role == Role.GATEWAY else f"{role}-{name}")
     existing = None if renew else _read_existing(party_folder, authority)
+    if role == Role.VEHICLE:
+        party_folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        adapter_key.create(party_folder / ADAPTER_KEY_FILE)
     unchanged = existing is not None and (existing.me.name, set(existing.me.hosts)) == (name, set(hosts))
     if existing is not None and unchanged and existing.remaining() > timedelta(days=days) / 3:
         return CertifiedParty(party_folder, str(existing.me), False, existing.me.expires)

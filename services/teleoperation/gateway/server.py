@@ -10,6 +10,7 @@ from scan2sim.services.teleoperation.gateway.fleet import Fleet, Order
 from scan2sim.services.teleoperation.gateway.json_stream import Connection, JsonObject, Server
 from scan2sim.services.teleoperation.gateway_protocol import (
     PROTOCOL_VERSION,
+    DriverEvent,
     DriverRequest,
     Hello,
     RequestRefused,
@@ -62,7 +63,7 @@ class Gateway:
         except Malformed as error:
             self._refuse(connection, f"it sent a message that isn't understood ({error})")
 
-    def _greet(self, connection: Connection, message: Hello | Status | DriverRequest) -> None:
+    def _greet(self, connection: Connection, message: Hello | Status | DriverRequest | DriverEvent) -> None:
         if not isinstance(message, Hello) or message.version != PROTOCOL_VERSION:
             self._refuse(connection, f"it doesn't support protocol version {PROTOCOL_VERSION}")
             return
@@ -74,9 +75,11 @@ class Gateway:
         self._notify(f"{connection.peer} connected from {connection.address}")
         self._fleet.connected(connection.peer, message, connection.address, send)
 
-    def _handle(self, connection: Connection, message: Hello | Status | DriverRequest) -> None:
+    def _handle(self, connection: Connection, message: Hello | Status | DriverRequest | DriverEvent) -> None:
         if isinstance(message, Status):
             self._fleet.update_status(connection.peer, message)
+        elif isinstance(message, DriverEvent):
+            self._fleet.log_event(connection.peer, message)
         elif isinstance(message, DriverRequest):
             try:
                 self._fleet.handle_request(connection.peer, message)

@@ -6,6 +6,7 @@ Lists vehicles, stations, pairs and link quality; joins, hands over, takes back 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Annotated, Any
 
 from fastapi import Body, FastAPI, Query
@@ -40,6 +41,16 @@ def application(served: ServerParams, fleet: Fleet, gateway: Gateway) -> FastAPI
     def fleet_state() -> dict[str, Any]:
         """All vehicles and stations, with their status."""
         return fleet.snapshot()
+
+    @app.get("/api/speeds")
+    def speeds() -> dict[str, dict[str, float | None]]:
+        """Speed of each vehicle that reports one, m/s, and how long ago it reported, milliseconds."""
+        return fleet.speeds()
+
+    @app.get("/api/audit/verification")
+    def audit_verification() -> dict[str, Any]:
+        """Number of entries of the audit trail, hash of the newest, and what is wrong with the chain."""
+        return asdict(fleet.audit.verification)
 
     @app.get("/api/audit")
     def audit(count: Annotated[int, Query(ge=1, le=500)] = 50) -> list[dict[str, Any]]:
@@ -78,6 +89,10 @@ def serve(params: GatewayParams, notify: Callable[[str], None]) -> None:
     """
     identity = Identity.read(params.certificates, Role.GATEWAY)
     fleet = Fleet(params.state)
+    trail = fleet.audit.verification
+    notify(f"the audit trail has {trail.entries} entries, SHA-256 of the newest: {trail.head}")
+    if trail.damage:
+        notify(f"THE AUDIT TRAIL WAS CHANGED: {trail.damage}")
     address = parse_address("--listening", params.listening, GATEWAY_PORT)
     gateway = Gateway(identity, address.host, address.port, fleet, notify)
     notify(f"the gateway accepts vehicles and stations on {address.host}:{gateway.port}")

@@ -23,9 +23,10 @@ import psutil
 
 from scan2sim.pipeline.core.errors import StepError
 from scan2sim.pipeline.core.step import Report
+from scan2sim.services.qos.confidence import share_bounds
 from scan2sim.services.qos.emulated_link import Link
 from scan2sim.services.qos.environments import network
-from scan2sim.services.qos.host_load import Machine, Usage, machine
+from scan2sim.services.qos.host_load import Machine, Usage, host_values, machine
 from scan2sim.services.qos.link_profile import LinkProfile
 from scan2sim.services.qos.measure import MAX_LINK_UTILIZATION, SAMPLE_IMAGES
 from scan2sim.services.qos.requirements import Requirements
@@ -75,34 +76,42 @@ class Measurement:
             "bandwidth": None if self.wire_bytes is None else self.wire_bytes * 8e-6 / self.seconds,
             "loss_rate": self.loss_rate,
             "error_rate": self.error_rate,
-            "cpu_cores": self.machine.cpu_cores,
-            "cpu_frequency": self.machine.cpu_frequency,
-            "cpu_usage": self.usage.cpu_percent,
-            "gpu_cores": self.machine.gpu_cores,
-            "gpu_frequency": self.machine.gpu_frequency,
-            "gpu_memory": self.machine.gpu_memory,
-            "gpu_usage": self.usage.gpu_percent,
-            "memory": self.usage.memory_mb,
+            **host_values(self.machine, self.usage),
         }
+
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Confidence bounds of the loss rate and the error rate."""
+        counts = {"loss_rate": self._lost, "error_rate": self._corrupted}
+        return {name: share_bounds(events, max(1, trials)) for name, (events, trials) in counts.items()}
 
     @property
     def loss_rate(self) -> float:
         """Share of all messages and video packets that arrived over no link, or only after retransmission."""
+        return self._lost[0] / max(self._lost[1], 1)
+
+    @property
+    def _lost(self) -> tuple[int, int]:
+        """Number of messages and packets that were lost, and of all."""
         received, missed, retransmitted = (
             self.station["frames"].get(what, 0) for what in ("received", "lost", "retransmitted")
         )
         received, lost = received - retransmitted, missed + retransmitted
         for end in (self.vehicle, self.station):
             received, lost = received + len(end["messages"]), lost + count_missing(end["messages"])
-        return float(max(lost, 0) / max(received + lost, 1))
+        return max(lost, 0), received + max(lost, 0)
 
     @property
     def error_rate(self) -> float:
         """Share of corrupted data: frames whose timecode can't be read, and malformed messages."""
+        return self._corrupted[0] / max(self._corrupted[1], 1)
+
+    @property
+    def _corrupted(self) -> tuple[int, int]:
+        """Number of corrupted frames and messages, and of all."""
         wrong = self.station["seen"].get("unreadable", 0)
         wrong += sum(end["counts"].get("malformed", 0) for end in (self.vehicle, self.station))
         received = len(self.station["glass"]) + sum(len(end["messages"]) for end in (self.vehicle, self.station))
-        return float(wrong / max(received, 1))
+        return wrong, max(received, wrong)
 
     @property
     def glass_to_glass(self) -> list[float]:

@@ -63,7 +63,9 @@ class PurePursuit:
         to = self._points - vehicle.position
         distance = np.hypot(*to.T)
         nearest = int(distance.argmin())
-        target = nearest + int((distance[nearest:] >= max(LOOKAHEAD_MIN_M, LOOKAHEAD_S * vehicle.speed)).argmax())
+        target = nearest + int(
+            (distance[nearest:] >= max(LOOKAHEAD_MIN_M, LOOKAHEAD_S * (vehicle.speed or 0.0))).argmax()
+        )
         left = cos(vehicle.heading) * to[target, 1] - sin(vehicle.heading) * to[target, 0]
         turn = atan(self._car.wheelbase * 2 * left / distance[target] ** 2)
         return float(np.clip(turn / self._car.steering, -1.0, 1.0))

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 from scan2sim.pipeline.core.errors import StepError
 from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.io.worlds.scene import read_scene
-from scan2sim.services.teleoperation import cameras, timecode
+from scan2sim.services.teleoperation import adapter_key, cameras, timecode
 from scan2sim.services.teleoperation.cameras import Camera, View
 from scan2sim.services.teleoperation.control.controls import Controls, Gear, VehicleState
 from scan2sim.services.teleoperation.control.messages import Command, Kind, Message, Telemetry
@@ -249,7 +249,7 @@ class ScriptedCommands:
             self._stop, self._since = telemetry.stop, seconds
         if telemetry.standing:
             return Command(Controls(gear=Gear.FORWARD), telemetry.stop, seconds > self._since + CONFIRM_DELAY_S)
-        speed_error = TARGET_SPEED_MPS - telemetry.vehicle.speed
+        speed_error = TARGET_SPEED_MPS - (telemetry.vehicle.speed or 0.0)
         controls = Controls(
             steering=self._steering(telemetry.vehicle, seconds),
             throttle=min(max(0.5 * speed_error, 0.0), 1.0),
@@ -291,10 +291,12 @@ class VehicleEnd:
         if setup.world:
             ground, self._path = setup.street()
             self._looping_vehicle = LoopingVehicle(ground, self._path)
-        adapter_server = AdapterServer(self._looping_vehicle or PlainCar(), AdapterParams(port=0, limit=setup.limit))
+        key = adapter_key.create(Path(setup.folder) / adapter_key.ADAPTER_KEY_FILE)
+        params = AdapterParams(port=0, limit=setup.limit, key=key)
+        adapter_server = AdapterServer(self._looping_vehicle or PlainCar(), params)
         threading.Thread(target=adapter_server.run, args=(ended,), name="translating", daemon=True).start()
         host, port = adapter_server.address
-        self._unit = RecordingOnboardUnit(OnboardParams(translator=f"{host}:{port}", limit=setup.limit), recorder)
+        self._unit = RecordingOnboardUnit(OnboardParams(adapter=f"{host}:{port}", limit=setup.limit, key=key), recorder)
         self._recorder = recorder
         links = [Link(*text.split("=", 1)) for text in setup.links]
         bounds = BitrateBounds(highest=round(setup.bitrate))

@@ -15,6 +15,8 @@ from typing import Any
 
 from scan2sim.services.teleoperation.control.driver_session import DriverSession
 from scan2sim.services.teleoperation.control.messages import (
+    Command,
+    CongestionReport,
     KeyFrameRequest,
     Kind,
     Malformed,
@@ -29,6 +31,7 @@ from scan2sim.services.teleoperation.gateway.client import GatewayConnection
 from scan2sim.services.teleoperation.gateway_protocol import (
     Address,
     CurrentPair,
+    DriverEvent,
     DriverRequest,
     Hello,
     Join,
@@ -44,8 +47,11 @@ from scan2sim.services.teleoperation.video.jitter_buffer import Frame, VideoRece
 
 COMMAND_RATE_HZ = 50.0
 """Rate at which commands are sent."""
-REPORT_PERIOD_S = 1.0
-"""Interval between two video reports to the vehicle."""
+REPORT_PERIOD_S, REPORT_SPREAD_S = 1.0, 0.8
+"""Interval between two video reports to the vehicle, and time over which those of its cameras are spread: each may
+change a rate, which costs a key frame."""
+STATE_MAX_AGE_MS = 275.0
+"""Age above which the vehicle's state is not passed to pages any more; `MAX_AGE` of the page."""
 DEFAULT_ROUND_TRIP_S = 0.1
 """Assumed round-trip time to the vehicle until it is measured."""
 
@@ -74,6 +80,7 @@ class JoinedVehicle:
             age=self.age,
             send_nack=self._send_nack,
             round_trip=self._round_trip,
+            congested=self._send_congestion,
         )
         self._listener = listener
         self.connection: MultipathConnection = listener.expect(
@@ -96,16 +103,21 @@ class JoinedVehicle:
     def _send_nack(self, source: int, sequences: Sequence[int]) -> None:
         self.connection.send(Kind.NACK, Nack(source, tuple(sequences)).pack())
 
+    def _send_congestion(self, report: CongestionReport) -> None:
+        self.connection.send(Kind.CONGESTION, report.pack())
+
     def _round_trip(self) -> float:
         """Round-trip time to the vehicle, seconds."""
         measured = self.connection.round_trip
         return DEFAULT_ROUND_TRIP_S if math.isnan(measured) else measured
 
-    def report(self) -> None:
-        """Send video reports of all cameras to the vehicle."""
+    def report(self, wait: Callable[[float], bool]) -> None:
+        """Send video reports of all cameras to the vehicle; `wait` pauses in between, and returns whether to end."""
         self.reports = tuple(self.receiver.reports())
         for one in self.reports:
             self.connection.send(Kind.VIDEO_REPORT, one.pack())
+            if wait(REPORT_SPREAD_S / len(self.reports)):
+                return
 
     def _received(self, message: Message) -> None:
         try:
@@ -139,7 +151,13 @@ class JoinedVehicle:
 
 
 class Station:
-    """A station; implements `Party` for the gateway connection. `driver_session` is the control lock."""
+    """A station; implements `Party` for the gateway connection.
+
+    Attributes:
+        driver_session: the control lock.
+        report_event: called with what drivers do, for the gateway's audit trail.
+        record_command: called with each command that is sent.
+    """
 
     def __init__(
         self,
@@ -156,7 +174,9 @@ class Station:
             reached: the listener's addresses, as vehicles reach them.
             show: called with each frame.
         """
-        self.identity, self.driver_session = identity, DriverSession()
+        self.identity, self.driver_session = identity, DriverSession(self._log_event)
+        self.report_event: Callable[[DriverEvent], None] = lambda event: None
+        self.record_command: Callable[[Command], None] = lambda command: None
         self._listener, self._reached, self._show = listener, tuple(reached), show
         self._lock = threading.Lock()
         self._joined: JoinedVehicle | None = None
@@ -181,13 +201,13 @@ class Station:
         """See `Party`."""
         joined = self.joined()
         if joined is None:
-            return Status(told=self._why)
+            return Status(message=self._why)
         delays = [report.delay for report in joined.reports if report.delay is not None]
         return Status(
             pair=joined.pair,
             links=joined.rates.links(joined.connection),
             driving=self.driver_session.holder() is not None,
-            told=joined.blocked_by()[:200],
+            message=joined.blocked_by()[:200],
             age=max(delays) if delays else None,
         )
 
@@ -228,21 +248,29 @@ class Station:
             "station": self.identity.me.name,
             "driver": self.driver_session.holder(),
             "left": self.driver_session.release_reason,
+            "latched": self.driver_session.latched,
         }
         if joined is None:
             return state | {"vehicle": None, "why": self._why}
-        clocks = joined.connection.clocks
+        clocks, age = joined.connection.clocks, joined.telemetry_age_ms()
+        outdated = age is None or age > STATE_MAX_AGE_MS
         return state | {
             "vehicle": joined.vehicle.name,
             "why": joined.blocked_by(),
-            "telemetry": None if joined.telemetry is None else asdict(joined.telemetry),
-            "telemetry_age_ms": joined.telemetry_age_ms(),
+            "telemetry": None if joined.telemetry is None or outdated else asdict(joined.telemetry),
+            "telemetry_age_ms": age,
             "cameras": [asdict(one) for one in joined.streams.cameras],
             "links": [one.model_dump() for one in joined.rates.links(joined.connection)],
             "clocks": {"uncertainty_ms": clocks.uncertainty_ms, "wall_apart_s": clocks.wall_apart_s}
             if clocks.known
             else None,
         }
+
+    def request_key_frames(self) -> None:
+        """Request a key frame of each camera."""
+        if (joined := self.joined()) is not None:
+            for camera in joined.streams.cameras:
+                joined.request_key_frame(camera.camera)
 
     def alive(self) -> bool:
         """Whether its threads are alive."""
@@ -255,21 +283,29 @@ class Station:
             thread.join(5.0)
         self.handle_order(Release())
 
+    def _log_event(self, what: str, driver: str) -> None:
+        self.report_event(DriverEvent(what=what[:200], driver=driver[:200], time=round(time.time(), 3)))
+
     def _drive(self) -> None:
         due = time.monotonic()
         while not self._ended.is_set():
             joined, command = self.joined(), self.driver_session.command(time.monotonic())
             if joined is not None and command is not None and not joined.blocked_by():
                 joined.connection.send(Kind.COMMAND, command.pack())
+                self.record_command(command)
             due = max(due + 1 / COMMAND_RATE_HZ, time.monotonic())
             self._ended.wait(due - time.monotonic())
 
     def _report(self) -> None:
-        while not self._ended.wait(REPORT_PERIOD_S):
+        due = time.monotonic()
+        while not self._ended.wait(due - time.monotonic()):
+            due = max(due + REPORT_PERIOD_S, time.monotonic())
             if (joined := self.joined()) is not None:
-                joined.report()
+                joined.report(self._ended.wait)
 
 
-def send_request(gateway_connection: GatewayConnection, what: str, vehicle: str) -> bool:
+def send_request(gateway_connection: GatewayConnection, what: str, vehicle: str, driver: str) -> bool:
     """Request the gateway to join or to release a vehicle; False: the gateway isn't connected."""
-    return gateway_connection.send_request(DriverRequest(what="join" if what == "join" else "release", vehicle=vehicle))
+    return gateway_connection.send_request(
+        DriverRequest(what="join" if what == "join" else "release", vehicle=vehicle, driver=driver)
+    )

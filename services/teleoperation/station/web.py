@@ -1,7 +1,8 @@
 """The driver page of a station: video, its latency, and driving; one WebSocket for each page (D3.2, section 4.3).
 
 To the page: the state as JSON twenty times a second, and each frame behind a header (VP8, decoded by the browser).
-From the page: JSON, `{"do": "take" | "leave" | "turn" | "join" | "release" | "key" | "clock", ...}`.
+From the page: JSON, `{"do": "take" | "leave" | "turn" | "stop" | "unlatch" | "join" | "release" | "key" | "clock",
+...}`.
 
 Frames and state carry a time of the station's monotonic clock, which the page compares with its own clock (`clock`). So
 the page knows the age of everything it receives, including time spent in queues or in a suspended process.
@@ -20,6 +21,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from typing import Annotated, Any, Literal
 
 from fastapi import FastAPI, WebSocket, WebSocketDisconnect
@@ -32,11 +34,13 @@ from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.control.controls import Controls, Gear
 from scan2sim.services.teleoperation.control.messages import Command
 from scan2sim.services.teleoperation.gateway.client import GatewayConnection
-from scan2sim.services.teleoperation.gateway_protocol import Address
+from scan2sim.services.teleoperation.gateway_protocol import Address, DriverEvent
 from scan2sim.services.teleoperation.identity import Identity, Role
 from scan2sim.services.teleoperation.settings import GATEWAY_PORT, STATION_PORT, StationParams, parse_address
 from scan2sim.services.teleoperation.station import app_window
 from scan2sim.services.teleoperation.station.app import Station, send_request
+from scan2sim.services.teleoperation.station.drivers import Driver, DriverRole, Drivers
+from scan2sim.services.teleoperation.station.recorder import Recorder
 from scan2sim.services.teleoperation.transport.station_side import Listener
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame
 
@@ -46,6 +50,8 @@ FRAME_HEADER = struct.Struct("<BBHHd")
 """Header of a frame: camera, key frame flag, width, height, capture time (ms of the station's monotonic clock)."""
 STATUS_PERIOD_S = 0.05
 """Interval between two state messages."""
+REVOCATION_PERIOD_S = 0.1
+"""Interval at which a page's driver is checked."""
 PAGE_QUEUE_MAX_FRAMES = 24
 """Maximum number of frames queued for a page; a page that falls behind continues with the next key frame."""
 _page_numbers = itertools.count(1)
@@ -54,6 +60,10 @@ _page_numbers = itertools.count(1)
 class _LockMessage(BaseModel):
     do: Literal["take", "leave"]
     why: Annotated[str, Field(max_length=100)] = ""
+
+
+class _StopMessage(BaseModel):
+    do: Literal["stop", "unlatch"]
 
 
 class _ControlsMessage(BaseModel):
@@ -89,7 +99,7 @@ class _ClockMessage(BaseModel):
     """Time of the page's clock, returned in the answer."""
 
 
-_PageMessage = _LockMessage | _ControlsMessage | _PairMessage | _KeyFrameMessage | _ClockMessage
+_PageMessage = _LockMessage | _StopMessage | _ControlsMessage | _PairMessage | _KeyFrameMessage | _ClockMessage
 _PAGE_MESSAGE: TypeAdapter[_PageMessage] = TypeAdapter(Annotated[_PageMessage, Field(discriminator="do")])
 
 
@@ -128,10 +138,11 @@ def _now_ms() -> float:
 
 
 class _Page:
-    """A connected page, and its queue of frames."""
+    """A connected page, and its queue of frames; `driver`: who uses it, None: drivers have no names here."""
 
-    def __init__(self) -> None:
-        self.name = f"page {next(_page_numbers)}"
+    def __init__(self, driver: Driver | None) -> None:
+        self.driver, number = driver, next(_page_numbers)
+        self.name = f"page {number}" if driver is None else f"{driver.name} (page {number})"
         self.loop = asyncio.get_running_loop()
         self._queue: deque[Frame] = deque()
         self._broken: set[int] = set()  # cameras that dropped a frame: later ones can't be decoded before a key frame
@@ -149,6 +160,16 @@ class _Page:
         self._queue.append(frame)
         self._frame_available.set()
 
+    def require(self, role: DriverRole) -> None:
+        """Check that its driver has a role.
+
+        Raises:
+            SettingError: the driver has not.
+        """
+        if self.driver is not None and not self.driver.role.includes(role):
+            cause = f"has the role {self.driver.role}; this requires {role}"
+            raise SettingError(self.driver.name, cause, "Ask whoever manages the station's drivers (`teleop drivers`)")
+
     async def next(self) -> Frame:
         """Wait for the next frame."""
         while not self._queue:
@@ -158,7 +179,11 @@ class _Page:
 
 
 def application(
-    served: ServerParams, station: Station, hub: PageHub, request_pair: Callable[[str, str], bool]
+    served: ServerParams,
+    station: Station,
+    hub: PageHub,
+    request_pair: Callable[[str, str, str], bool],
+    drivers: Drivers | None = None,
 ) -> FastAPI:
     """The driver page and its API.
 
@@ -166,12 +191,14 @@ def application(
         served: server settings.
         station: station of the page.
         hub: distributes the station's frames.
-        request_pair: requests the gateway to join or to release a vehicle; False: the gateway isn't connected.
+        request_pair: requests the gateway to join or to release a vehicle for a driver; False: it isn't connected.
+        drivers: named drivers, who each have a token; None: anybody with the server's token.
 
     Raises:
         InputError: the token can't be read.
     """
-    app = factory.application("Teleoperation", served, alive={"station": station.alive}, public=("/",))
+    accepts = None if drivers is None else lambda token: drivers.identify(token) is not None
+    app = factory.application("Teleoperation", served, alive={"station": station.alive}, public=("/",), accepts=accepts)
 
     @app.get("/", include_in_schema=False)
     def page() -> FileResponse:
@@ -184,19 +211,25 @@ def application(
 
     @app.websocket("/live")
     async def live(web: WebSocket) -> None:
+        driver = None if drivers is None else drivers.identify(factory.sent_token(web.scope) or "")
         await web.accept(subprotocol=factory.chosen_protocol(web.scope))
-        page = _Page()
+        page = _Page(driver)
         hub.add(page)
         tasks = [
             asyncio.create_task(_send_frames(web, page, hub)),
             asyncio.create_task(_send_state(web, page, station)),
             asyncio.create_task(_receive(web, page, station, request_pair)),
         ]
+        if drivers is not None:
+            tasks.append(asyncio.create_task(_until_revoked(driver, drivers)))
+        why = "the page was closed"
         try:
-            if (joined := station.joined()) is not None:
-                for camera in joined.streams.cameras:
-                    joined.request_key_frame(camera.camera)
+            station.request_key_frames()
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            if drivers is not None and tasks[-1].done():
+                why = "the driver's access was revoked"
+                station.driver_session.release(page.name, why)
+                await web.close(1008)
         finally:
             for task in tasks:
                 task.cancel()
@@ -204,9 +237,15 @@ def application(
                 if isinstance(ended, Exception) and not isinstance(ended, WebSocketDisconnect):
                     log.error("%s: %r", page.name, ended, exc_info=ended)
             hub.remove(page)
-            station.driver_session.release(page.name, "the page was closed")
+            station.driver_session.release(page.name, why)
 
     return app
+
+
+async def _until_revoked(driver: Driver | None, drivers: Drivers) -> None:
+    """Return when a driver is no longer valid."""
+    while driver is not None and drivers.is_current(driver):
+        await asyncio.sleep(REVOCATION_PERIOD_S)
 
 
 async def _send_frames(web: WebSocket, page: _Page, hub: PageHub) -> None:
@@ -215,12 +254,15 @@ async def _send_frames(web: WebSocket, page: _Page, hub: PageHub) -> None:
 
 
 async def _send_state(web: WebSocket, page: _Page, station: Station) -> None:
+    you = {"you": page.name, "role": None if page.driver is None else page.driver.role}
     while True:
-        await web.send_text(json.dumps({"now_ms": _now_ms()} | station.snapshot() | {"you": page.name}))
+        await web.send_text(json.dumps({"now_ms": _now_ms()} | station.snapshot() | you))
         await asyncio.sleep(STATUS_PERIOD_S)
 
 
-async def _receive(web: WebSocket, page: _Page, station: Station, request_pair: Callable[[str, str], bool]) -> None:
+async def _receive(
+    web: WebSocket, page: _Page, station: Station, request_pair: Callable[[str, str, str], bool]
+) -> None:
     while True:
         try:
             text = await web.receive_text()
@@ -231,7 +273,7 @@ async def _receive(web: WebSocket, page: _Page, station: Station, request_pair: 
 
 
 def _handle(
-    text: str, page: _Page, station: Station, request_pair: Callable[[str, str], bool]
+    text: str, page: _Page, station: Station, request_pair: Callable[[str, str, str], bool]
 ) -> dict[str, Any] | None:
     """Carry out a message of a page; returns the answer: a time, or why the request was refused."""
     try:
@@ -241,13 +283,20 @@ def _handle(
     try:
         match message:
             case _LockMessage(do="take"):
+                page.require(DriverRole.DRIVER)
                 station.driver_session.acquire(page.name, time.monotonic())
             case _LockMessage():
                 station.driver_session.release(page.name, message.why or "the driver released the controls")
+            case _StopMessage(do="stop"):
+                station.driver_session.latch(page.name)
+            case _StopMessage():
+                page.require(DriverRole.DRIVER)
+                station.driver_session.unlatch(page.name)
             case _ControlsMessage():
                 station.driver_session.update(page.name, message.command(), time.monotonic())
             case _PairMessage():
-                if not request_pair(message.do, message.vehicle):
+                page.require(DriverRole.OPERATOR)
+                if not request_pair(message.do, message.vehicle, page.name):
                     return {"fault": "the gateway isn't connected"}
             case _KeyFrameMessage():
                 if (joined := station.joined()) is not None:
@@ -267,6 +316,7 @@ def serve(params: StationParams, notify: Callable[[str], None], window: bool = F
     """
     if window:
         app_window.browser()
+    drivers = None if params.drivers is None else Drivers(params.drivers)
     identity = Identity.read(params.certificates, Role.STATION)
     gateway = parse_address("GATEWAY", params.gateway, GATEWAY_PORT)
     listens = [parse_address("--listening", text, STATION_PORT) for text in params.listening]
@@ -274,20 +324,45 @@ def serve(params: StationParams, notify: Callable[[str], None], window: bool = F
     reached = [parse_address("--reached", text, STATION_PORT) for text in params.reached] or _reachable(
         listens, gateway
     )
+    recorder: Recorder | None = None
+
+    def show(frame: Frame) -> None:
+        hub.show(frame)
+        if recorder is not None and (joined := station.joined()) is not None:
+            names = {one.camera: one.name for one in joined.streams.cameras}
+            recorder.frame(names.get(frame.camera, ""), frame, joined.age(frame.captured))
+
     hub = PageHub(lambda frame: joined.age(frame.captured) if (joined := station.joined()) else 0.0)
-    station = Station(identity, listener, reached, hub.show)
+    station = Station(identity, listener, reached, show)
     gateway_connection = GatewayConnection(identity, gateway, station, notify)
+    station.report_event = gateway_connection.report_event
     with ExitStack() as stack:
         for one in (listener, station, gateway_connection):
             stack.callback(one.close)
+        if params.record is not None:
+            recorder = Recorder(params.record, params.record_limit * 1e9, station.snapshot, station.request_key_frames)
+            record(station, recorder)
+            stack.callback(recorder.close)
+            notify(f"drives are recorded in {params.record}")
 
         def listening(url: str) -> None:
             notify(f"the driver page is {url}")
             if window:
                 stack.enter_context(app_window.window(url))
 
-        app = application(params, station, hub, lambda what, vehicle: send_request(gateway_connection, what, vehicle))
+        app = application(params, station, hub, partial(send_request, gateway_connection), drivers)
         factory.run(app, params, listening)
+
+
+def record(station: Station, recorder: Recorder) -> None:
+    """Record a station's commands and events, in addition to reporting them."""
+    report = station.report_event
+
+    def report_and_record(event: DriverEvent) -> None:
+        report(event)
+        recorder.event(event.what, event.driver)
+
+    station.report_event, station.record_command = report_and_record, recorder.command
 
 
 def _reachable(listens: list[Address], gateway: Address) -> list[Address]:

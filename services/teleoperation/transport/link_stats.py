@@ -32,6 +32,7 @@ class LinkRates:
                     round_trip=None if math.isnan(one.round_trip_ms) else round(one.round_trip_ms, 1),
                     loss=round(max(one.loss, one.loss_there), 4),
                     rate=self._rate(one.name, one.bytes_in + one.bytes_out, now),
+                    silent_ms=None if math.isnan(one.silent_s) else round(one.silent_s * 1e3),
                 )
                 for one in connection.links
             )

@@ -59,6 +59,7 @@ class LinkState:
         handshake_s: duration of the last handshake; renewed: number of handshakes after the first.
         cipher: version, cipher and group of the encryption.
         why: reason for which the link is down, if known.
+        silent_s: seconds since anything was received over it; NaN: it has no session.
     """
 
     name: str
@@ -74,6 +75,7 @@ class LinkState:
     renewed: int = 0
     cipher: str = ""
     why: str = ""
+    silent_s: float = float("nan")
 
 
 @dataclass
@@ -270,11 +272,13 @@ class MultipathConnection:
         one, why = link.session, link.why
         if one is None:
             return LinkState(name, bytes_in=link.bytes_in, bytes_out=link.bytes_out, why=why)
-        up = one.up(time.monotonic())
+        now = time.monotonic()
+        up = one.up(now)
         handshake = (one.dtls.established or one.dtls.started) - one.dtls.started
         return LinkState(
             name, up, one.local, one.remote, one.round_trip * 1e3, one.dtls.loss, one.loss_there, link.bytes_in,
             link.bytes_out, handshake, link.sessions - 1, one.cipher, "" if up else why or "nothing is received",
+            now - one.dtls.last_received,
         )  # fmt: skip
 
     def _encode(self, kind: Kind, number: int, body: bytes) -> bytes:

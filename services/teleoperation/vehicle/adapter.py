@@ -7,15 +7,14 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.parameters import File
 from scan2sim.pipeline.core.step import Params
-from scan2sim.services.loopback import require_protection
+from scan2sim.services.teleoperation import adapter_key
 from scan2sim.services.teleoperation.control.controls import STOP
 from scan2sim.services.teleoperation.control.messages import Malformed
 from scan2sim.services.teleoperation.control.safety import COMMAND_MAX_AGE_MS
@@ -30,42 +29,28 @@ from scan2sim.services.teleoperation.vehicle.adapters import Vehicle, VehicleUnr
 
 PACKETS_PER_PERIOD_MAX = 64
 """Maximum number of packets processed in a period, so that a flood can't delay the vehicle's control."""
-KEY_MIN_BYTES = 16
-"""Minimum length of the shared key."""
-
-
-def read_key(path: Path | None) -> bytes:
-    """Key shared by onboard unit and adapter; b"": packets are not authenticated.
-
-    Raises:
-        InputError: the file can't be read, or the key is too short.
-    """
-    if path is None:
-        return b""
-    try:
-        key = path.read_bytes().strip()
-    except OSError as error:
-        raise InputError(path, str(error.strerror), "Create a key for both: openssl rand -hex 32") from None
-    if len(key) < KEY_MIN_BYTES:
-        cause = f"contains a key of only {len(key)} bytes; at least {KEY_MIN_BYTES} are needed"
-        raise InputError(path, cause, "Create a key for both: openssl rand -hex 32")
-    return key
 
 
 class AdapterParams(Params):
     """Settings common to all vehicle adapters.
 
     Raises:
-        SettingError: it would listen on other than loopback addresses without a key.
+        SettingError: there is no key.
     """
 
     host: Annotated[
-        str, Field(description="Address to listen on for the onboard unit; any but 127.0.0.1 and ::1 requires --key.")
+        str,
+        Field(
+            description="Address to listen on for the onboard unit; others than 127.0.0.1 for one on another machine."
+        ),
     ] = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535, description="UDP port to listen on; 0: any free port.")] = ADAPTER_PORT
     key: Annotated[
         File | None,
-        Field(description="File with the key shared with the onboard unit; required when listening beyond loopback."),
+        Field(
+            description="File with the key shared with the onboard unit, DIR/vehicle-NAME/adapter.key of `teleop "
+            "certificates`; required: only orders signed with it are obeyed."
+        ),
     ] = None
     limit: Annotated[
         float,
@@ -79,7 +64,7 @@ class AdapterParams(Params):
 
     @model_validator(mode="after")
     def _is_protected(self) -> Self:
-        require_protection(self.host, protected=self.key is not None, options="--key FILE")
+        adapter_key.require(self.key)
         return self
 
 
@@ -92,12 +77,13 @@ class AdapterServer:
 
     Raises:
         SettingError: it can't listen on this address.
+        InputError: the key can't be read.
     """
 
     def __init__(self, vehicle: Vehicle, params: AdapterParams) -> None:
         self.endpoint = AdapterEndpoint(params.limit)
         self.malformed = 0
-        self._vehicle, self._period, self._key = vehicle, params.period / 1000, read_key(params.key)
+        self._vehicle, self._period, self._key = vehicle, params.period / 1000, adapter_key.read(params.key)
         family = socket.AF_INET6 if ":" in params.host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         try:

@@ -26,13 +26,15 @@ ADAPTER_PERIOD_MS = 10.0
 """Interval at which an adapter processes orders and controls the vehicle."""
 PACKET_MAX_BYTES = 1400
 """Maximum size of a packet."""
+NEVER_MS = 1e9
+"""Age of an answer that never arrived, ms."""
 TAG_BYTES = 16
 """Length of a packet's HMAC."""
 _ORDER = struct.Struct("<2sIIqIf")
 _ANSWER = struct.Struct("<2sqIBfBddfb")
 _ORDER_MAGIC, _ANSWER_MAGIC = b"O1", b"A1"
 _STOPPED_FLAG = 1
-_POSITION_KNOWN, _HEADING_KNOWN = 1, 2
+_POSITION_KNOWN, _HEADING_KNOWN, _SPEED_KNOWN = 1, 2, 4
 
 
 @dataclass(frozen=True)
@@ -97,13 +99,14 @@ class Answer:
         """Encode as a packet; faults that exceed the packet size are truncated."""
         v = self.vehicle
         known = _POSITION_KNOWN * (v.position is not None) | _HEADING_KNOWN * (v.heading is not None)
+        known |= _SPEED_KNOWN * (v.speed is not None)
         x, y = v.position or (0.0, 0.0)
         head = _ANSWER.pack(
             _ANSWER_MAGIC,
             self.stamp,
             self.stop,
             _STOPPED_FLAG * self.standing,
-            v.speed,
+            v.speed or 0.0,
             known,
             x,
             y,
@@ -131,7 +134,13 @@ class Answer:
             raise Malformed("not an answer")
         reason, *faults = data[_ANSWER.size :].decode(errors="replace").split("\n")
         position = (x, y) if known & _POSITION_KNOWN else None
-        vehicle = VehicleState(speed, position, heading if known & _HEADING_KNOWN else None, gear_, tuple(faults))
+        vehicle = VehicleState(
+            speed if known & _SPEED_KNOWN else None,
+            position,
+            heading if known & _HEADING_KNOWN else None,
+            gear_,
+            tuple(faults),
+        )
         return Answer(stamp, stop, bool(flags & _STOPPED_FLAG), reason, vehicle)
 
 
@@ -195,7 +204,11 @@ class OnboardEndpoint:
 
     def silent(self, now: int) -> bool:
         """Whether no answer has arrived within the limit."""
-        return self.answer is None or now - self._last_received > self._limit_ms * NS_PER_MS
+        return self.answer_age_ms(now) > self._limit_ms
+
+    def answer_age_ms(self, now: int) -> float:
+        """Time since the last answer was received, ms; `NEVER_MS` if there was none."""
+        return NEVER_MS if self.answer is None else (now - self._last_received) / NS_PER_MS
 
     def order(self, controls: Controls, age: float, driven: bool, now: int) -> Order:
         """Order to send now.

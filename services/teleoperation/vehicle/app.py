@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -11,8 +12,9 @@ from scan2sim.pipeline.core.errors import SettingError, StepError
 from scan2sim.pipeline.io.worlds.scene import read_scene
 from scan2sim.services.credentials import redacted
 from scan2sim.services.teleoperation import cameras, encoders
+from scan2sim.services.teleoperation.adapter_key import ADAPTER_KEY_FILE
 from scan2sim.services.teleoperation.cameras import Camera, Mount, View
-from scan2sim.services.teleoperation.control.messages import Kind, Message, VideoReport, VideoStream
+from scan2sim.services.teleoperation.control.messages import CongestionReport, Kind, Message, VideoReport, VideoStream
 from scan2sim.services.teleoperation.gateway.client import GatewayConnection
 from scan2sim.services.teleoperation.gateway_protocol import CurrentPair, Hello, Join, Release, RequestRefused, Status
 from scan2sim.services.teleoperation.identity import Identity, Peer, Role
@@ -28,8 +30,19 @@ from scan2sim.services.teleoperation.video.srtp_session import KeySchedule, key_
 
 CAMERA_FPS_MAX = 60.0
 """Maximum frame rate of a camera."""
+PAUSE_MAX_S, SHARE_MIN = 0.4, 0.25
+"""Maximum time without frames in which a queue drains, seconds; least share of the sent rate that is believed."""
 KEY_PERIOD_S = 0.5
 """Interval at which keys of the video encryption are sent; repeated since messages may be lost."""
+
+
+def drain_s(report: CongestionReport, round_trip: float) -> float:
+    """Time without video in which the queue drains, seconds; `round_trip`: without the queue, seconds.
+
+    The queue has grown since the reported packet was sent: all that time `1 / share` of what the links carry was sent.
+    """
+    queue = report.queue_ms / 1e3
+    return min(queue + (queue + round_trip) * (1 / max(report.share, SHARE_MIN) - 1), PAUSE_MAX_S)
 
 
 class CameraSender:
@@ -79,6 +92,13 @@ class CameraSender:
         width, height = self._encoder.size
         self._streamer.plan = self._rate_controller.update(report, width, height)
 
+    def relieve(self, report: CongestionReport) -> None:
+        """Reduce the bit rate at once, and let the queue drain."""
+        width, height = self._encoder.size
+        self._streamer.plan = self._rate_controller.relieve(report, width, height)
+        round_trip = self._connection.round_trip
+        self._streamer.pause(drain_s(report, 0.0 if math.isnan(round_trip) else round_trip))
+
     def close(self) -> None:
         """Stop sending."""
         self._streamer.close()
@@ -124,13 +144,15 @@ class Vehicle:
         """See `Party`."""
         with self._lock:
             driving, connection = self._driving, self._connection
+        now = time.monotonic_ns()
+        speed = self._unit.car.speed(now)
         if driving is None or connection is None:
-            return Status(speed=self._unit.car.vehicle().speed)
-        telemetry = self._unit.car.telemetry(time.monotonic_ns())
+            return Status(speed=speed)
+        telemetry = self._unit.car.telemetry(now)
         reason = telemetry.reason if telemetry.standing else "; ".join(telemetry.vehicle.faults)
         return Status(
-            pair=driving.pair, links=self._rates.links(connection), driving=not telemetry.standing, told=reason[:200],
-            speed=telemetry.vehicle.speed, age=telemetry.age,
+            pair=driving.pair, links=self._rates.links(connection), driving=not telemetry.standing,
+            message=reason[:200], speed=speed, age=telemetry.age,
         )  # fmt: skip
 
     def handle_order(self, order: Join | Release | RequestRefused) -> None:
@@ -201,13 +223,14 @@ def serve(params: VehicleParams, ended: threading.Event, notify: Callable[[str],
     identity = Identity.read(params.certificates, Role.VEHICLE)
     gateway = parse_address("GATEWAY", params.gateway, GATEWAY_PORT)
     links = [Link(*_parse_named("--link", text)) for text in params.link] or [Link("one")]
-    unit = OnboardUnit(OnboardParams(translator=params.translator, key=params.key, limit=params.limit))
+    key = params.key or params.certificates / ADAPTER_KEY_FILE
+    unit = OnboardUnit(OnboardParams(adapter=params.adapter, key=key, limit=params.limit))
     cameras_by_name = {name: _camera(name, source, params, unit) for name, source in _cameras(params)}
     bounds = BitrateBounds(highest=round(params.bitrate * 1e6))
     policy = Policy.SHARE if params.share else Policy.COPY
     vehicle = Vehicle(identity, unit, links, cameras_by_name, policy, bounds)
     gateway_connection = GatewayConnection(identity, gateway, vehicle, notify)
-    notify(f"{identity.me} is controlled by the vehicle adapter at {params.translator}; Ctrl-C ends it")
+    notify(f"{identity.me} is controlled by the vehicle adapter at {params.adapter}; Ctrl-C ends it")
     try:
         while not ended.wait(0.5):
             if not vehicle.alive():

@@ -18,10 +18,12 @@ from math import isfinite
 from typing import Any, Protocol
 
 from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.services.teleoperation import adapter_key
 from scan2sim.services.teleoperation.control.controls import VehicleState
 from scan2sim.services.teleoperation.control.messages import (
     MESSAGE_MAX_BYTES,
     Command,
+    CongestionReport,
     KeyFrameRequest,
     Kind,
     Malformed,
@@ -34,7 +36,6 @@ from scan2sim.services.teleoperation.control.messages import (
 )
 from scan2sim.services.teleoperation.control.safety import COMMAND_MAX_AGE_MS, NS_PER_MS, SafetyMonitor
 from scan2sim.services.teleoperation.settings import OnboardParams
-from scan2sim.services.teleoperation.vehicle.adapter import read_key
 from scan2sim.services.teleoperation.vehicle.adapter_protocol import ADAPTER_PERIOD_MS, Answer, OnboardEndpoint, Order
 from scan2sim.services.teleoperation.vehicle.adapter_protocol import PACKET_MAX_BYTES as ANSWER_MAX_BYTES
 
@@ -42,6 +43,8 @@ WATCHDOG_PERIOD_S, TELEMETRY_PERIOD_S, STREAMS_PERIOD_S = 0.005, 0.02, 1.0
 """Intervals of the watchdog, of telemetry, and of the list of cameras."""
 BODY_MAX_BYTES = MESSAGE_MAX_BYTES - 64
 """Maximum size of a message body; the rest is for headers of message and link."""
+SPEED_MAX_AGE_MS = 300.0
+"""Age of the adapter's answer above which the fleet page gets no speed, ms."""
 ADAPTER_SILENT = "the vehicle adapter does not respond"
 NO_STATION, CLOCKS_UNKNOWN = "no station is joined", "the clocks are not synchronized yet"
 """Reasons for which driving can't begin."""
@@ -105,6 +108,9 @@ class VideoSender(Protocol):
 
     def adapt(self, report: VideoReport) -> None:
         """Adapt the bit rate to what the links carry."""
+
+    def relieve(self, report: CongestionReport) -> None:
+        """Reduce the bit rate at once, and let the queue drain."""
 
 
 class OnboardController:
@@ -190,6 +196,10 @@ class OnboardController:
         answer = self.endpoint.answer
         return answer.vehicle if answer else VehicleState()
 
+    def speed(self, now: int) -> float | None:
+        """Speed that the vehicle reported, m/s; None: it is unknown, or older than `SPEED_MAX_AGE_MS`."""
+        return self.vehicle().speed if self.endpoint.answer_age_ms(now) <= SPEED_MAX_AGE_MS else None
+
     def telemetry(self, now: int) -> Telemetry:
         """State of the vehicle and its safety; faults include those of adapter and cameras."""
         faults = [f"camera {one.stream.name}: {one.fault}" for one in self._cameras if one.fault]
@@ -206,6 +216,7 @@ class OnboardController:
                 safety.command,
                 round(safety.age, 1),
                 dict(safety.dropped + self._counts),
+                round(self.endpoint.answer_age_ms(now), 1),
             )
 
     def streams(self) -> VideoStreams:
@@ -249,6 +260,10 @@ def _handle_video_message(cameras: Sequence[VideoSender], message: Message) -> N
         report = VideoReport.unpack(message.body)
         for one in cameras[report.camera : report.camera + 1]:
             one.adapt(report)
+    elif message.kind == Kind.CONGESTION:
+        congestion = CongestionReport.unpack(message.body)
+        for one in cameras:
+            one.relieve(congestion)
 
 
 Connect = Callable[[Callable[[Message], None], Callable[[], None]], StationConnection]
@@ -266,16 +281,14 @@ class OnboardUnit:
     def __init__(self, params: OnboardParams) -> None:
         self.car = OnboardController(params.limit)
         self.failed: BaseException | None = None
-        self._key = read_key(params.key)
+        self._key = adapter_key.read(params.key)
         host, port = params.address()
         self._socket = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.connect((host, port))
         except OSError as error:
             self._socket.close()
-            raise SettingError(
-                "translator", f"{host} can't be reached: {error}", "Write it as 127.0.0.1:7447"
-            ) from None
+            raise SettingError("adapter", f"{host} can't be reached: {error}", "Write it as 127.0.0.1:7447") from None
         self._socket.settimeout(0.2)
         self._connection: StationConnection | None = None
         self._ended = threading.Event()

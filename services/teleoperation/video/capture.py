@@ -20,6 +20,8 @@ from scan2sim.services.teleoperation.video.srtp_session import KeySchedule, Pack
 
 KEY_FRAME_INTERVAL_MIN_NS = 150_000_000
 """Minimum interval between requested key frames; an earlier request is satisfied by the last key frame."""
+PAUSE_INTERVAL_MIN_S = 0.3
+"""Minimum time from the end of a pause to the next: until then reports may be about the time before."""
 ENCODER_RETRY_DELAY_S = 0.5
 """Delay after an encoder failed until another one is created."""
 
@@ -132,7 +134,7 @@ class CameraStreamer:
     ) -> None:
         """Start sending; `send` is called with the packets of each frame, in this thread."""
         self.number, self.camera, self.encoder, self.plan, self.fault = number, camera, encoder, plan, ""
-        self._send = send
+        self._send, self._paused_until = send, -PAUSE_INTERVAL_MIN_S
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"video {camera.name}", daemon=True)
         self._thread.start()
@@ -143,6 +145,11 @@ class CameraStreamer:
         offline = self.camera.offline or self.fault
         return VideoStream(self.number, self.camera.name, *self.encoder.size, 0.0 if offline else self.plan.fps)
 
+    def pause(self, seconds: float) -> None:
+        """Send no frames for some time, so that a queue drains; ignored shortly after the last pause."""
+        if (now := time.monotonic()) > self._paused_until + PAUSE_INTERVAL_MIN_S:
+            self._paused_until = now + seconds
+
     def close(self) -> None:
         """Stop sending; the camera stays open."""
         self._closed.set()
@@ -151,7 +158,7 @@ class CameraStreamer:
     def _run(self) -> None:
         while not self._closed.is_set():
             frame = self.camera.read(0.5)
-            if frame is None:
+            if frame is None or time.monotonic() < self._paused_until:
                 continue
             try:
                 packets = self.encoder.encode(frame, self.plan, time.monotonic())

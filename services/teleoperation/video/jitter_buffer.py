@@ -6,6 +6,7 @@ delays suggest, then NACKed. If it isn't retransmitted in time, later frames are
 
 from __future__ import annotations
 
+import math
 import statistics
 import threading
 import time
@@ -14,8 +15,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from scan2sim.services.teleoperation.control.messages import Malformed, VideoKey, VideoReport
+from scan2sim.services.teleoperation.control.messages import CongestionReport, Malformed, VideoKey, VideoReport
 from scan2sim.services.teleoperation.video import rtp_packets
+from scan2sim.services.teleoperation.video.congestion import CongestionDetector
 from scan2sim.services.teleoperation.video.srtp_session import PacketDecryptor
 
 REORDER_TIMEOUT_MIN_S, REORDER_TIMEOUT_INITIAL_S, REORDER_TIMEOUT_MAX_S = 0.015, 0.04, 0.15
@@ -309,6 +311,7 @@ class VideoReceiver:
         send_nack: Callable[[int, Sequence[int]], None],
         round_trip: Callable[[], float],
         clock: Callable[[], float] = time.monotonic,
+        congested: Callable[[CongestionReport], None] = lambda report: None,
     ) -> None:
         """Callbacks are called in the thread that calls `feed`, and must return at once.
 
@@ -319,9 +322,11 @@ class VideoReceiver:
             send_nack: called with a source, and its packets to retransmit.
             round_trip: returns the round-trip time, seconds.
             clock: returns the current time, seconds.
+            congested: called when a queue grows on the links.
         """
         self._frame, self._request_key_frame, self._age, self._clock = frame, request_key_frame, age, clock
-        self._send_nack, self._round_trip = send_nack, round_trip
+        self._send_nack, self._round_trip, self._congested = send_nack, round_trip, congested
+        self._congestion_detector = CongestionDetector()
         self._decryptor = PacketDecryptor()
         self._cameras: dict[int, _CameraReceiver] = {}
         self._last_report = clock()
@@ -366,6 +371,10 @@ class VideoReceiver:
         except Malformed:
             self._decryptor.counts["malformed"] += 1
             return
+        if math.isfinite(age := self._age(packet.sent)):
+            report = self._congestion_detector.add(now, age, len(plain), camera)
+            if report is not None:
+                self._congested(report)
         for source, sequences in camera_receiver.due_nacks(now):
             self._send_nack(source, sequences)
         if camera_receiver.key_frame_due(now):

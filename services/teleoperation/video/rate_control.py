@@ -1,7 +1,8 @@
 """Rate control of a camera's video: additive increase, multiplicative decrease (AIMD), with each video report.
 
-Delay counts like loss: a growing queue on a link shows in the delay before packets are dropped. Until that happens for
-the first time, the rate grows by half with each report, as in TCP's slow start.
+A queue that begins to grow is reported at once (`congestion`), with the rate that the links carry; the rate follows.
+Between such reports delay counts like loss: a growing queue shows in it before packets are dropped. Until that happens
+for the first time, the rate grows by half with each report, as in TCP's slow start.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import math
 from collections import deque
 from typing import NamedTuple
 
-from scan2sim.services.teleoperation.control.messages import VideoReport
+from scan2sim.services.teleoperation.control.messages import CongestionReport, VideoReport
 
 DECREASE_LOSS, INCREASE_LOSS_MAX = 0.05, 0.02
 """Packet loss above which the rate decreases, and below which it increases. Radio links lose 1 % at any rate."""
@@ -21,6 +22,14 @@ BASE_DELAY_REPORTS = 30
 DECREASE_FACTOR = 0.75
 REPORTS_IGNORED_AFTER_DECREASE = 1
 """Reports after a decrease that are ignored, since they describe the time before it."""
+RELIEF_FACTOR = 0.85
+"""Share of the rate that the links carry which is used once a queue grows (Google congestion control)."""
+RELIEF_MIN = 0.25
+"""Least share of the present rate that remains after a report; a lower rate needs another report."""
+HOLD_REPORTS, AGAIN_SHARE = (2, 16), 0.8
+"""Reports without an increase after relief, at first and at most: doubled if a queue grows again at about that rate."""
+REPORTS_IGNORED_AFTER_RELIEF = 2
+"""Reports after that which are ignored, since their delays are those of the queue."""
 INCREASE_BPS, INCREASE_SHARE = 10_000, 0.05
 """Increase per report: bit/s, and share of the current rate; small, so as not to fill a narrow link in a second."""
 SLOW_START_FACTOR = 1.5
@@ -69,18 +78,33 @@ class RateController:
         self._bounds, self._fps = bounds, start.fps
         self._bitrate, self._slow_start_ended = float(start.bitrate), False
         self._delays: deque[float] = deque(maxlen=BASE_DELAY_REPORTS)
-        self._level = self._ignored_reports = 0
+        self._level = self._ignored_reports = self._held = 0
+        self._relieved, self._hold = math.inf, HOLD_REPORTS[0]
 
     def update(self, report: VideoReport, width: int, height: int) -> EncodingPlan:
         """Plan after a report, for frames of this size."""
         estimated = self._estimate(report)
-        if estimated == self._bitrate:
-            return self.plan
-        self._bitrate, bitrate = estimated, self._quantize(estimated)
-        self._choose_level(bitrate, width * height * self._fps)
-        scale, share = QUALITY_LADDER[self._level]
-        self.plan = EncodingPlan(bitrate, self._fps * share, scale)
+        if estimated != self._bitrate:
+            self._replan(estimated, width, height)
         return self.plan
+
+    def relieve(self, report: CongestionReport, width: int, height: int) -> EncodingPlan:
+        """Plan for links that carry `report.rate`: at once below it, so that the queue drains."""
+        share = max(report.share, RELIEF_MIN) * self._bitrate  # a camera that sends little now doesn't get less
+        lowered = max(self._bounds.lowest, RELIEF_FACTOR * max(report.rate, share))
+        self._ignored_reports, self._slow_start_ended = REPORTS_IGNORED_AFTER_RELIEF, True
+        if lowered < self._bitrate:
+            again = lowered > AGAIN_SHARE * self._relieved
+            self._hold = min(2 * self._hold, HOLD_REPORTS[1]) if again else HOLD_REPORTS[0]
+            self._relieved, self._held = lowered, self._hold
+            self._replan(lowered, width, height)
+        return self.plan
+
+    def _replan(self, bitrate: float, width: int, height: int) -> None:
+        self._bitrate, quantized = bitrate, self._quantize(bitrate)
+        self._choose_level(quantized, width * height * self._fps)
+        scale, share = QUALITY_LADDER[self._level]
+        self.plan = EncodingPlan(quantized, self._fps * share, scale)
 
     def _quantize(self, bitrate: float) -> int:
         """Quantize: the highest bit rate that is a whole number of steps below the maximum, and not above `bitrate`."""
@@ -100,6 +124,8 @@ class RateController:
         elif loss > DECREASE_LOSS or queue_delay > QUEUE_DELAY_MS:
             self._ignored_reports, self._slow_start_ended = REPORTS_IGNORED_AFTER_DECREASE, True
             return max(self._bounds.lowest, DECREASE_FACTOR * self._bitrate)
+        elif self._held:
+            self._held -= 1
         elif report.delay is not None and loss < INCREASE_LOSS_MAX and queue_delay < QUEUE_DELAY_MS / 2:
             increased = (
                 (1 + INCREASE_SHARE) * self._bitrate + INCREASE_BPS

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import secrets
 import threading
+import time
 from collections import Counter
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -101,7 +102,7 @@ class PacketEncryptor:
         """Encrypted packets of a frame; `captured`: nanoseconds of the vehicle's monotonic clock."""
         assert self._key and self._session, "update_key() must be called first"
         source = self._key.generation << 8 | self._camera
-        plain = rtp_packets.packetize(data, source, self._sequence, self._number, captured)
+        plain = rtp_packets.packetize(data, source, self._sequence, self._number, captured, time.monotonic_ns())
         encrypted = [self._session.protect(packet) for packet in plain]
         for i, packet in enumerate(encrypted, self._sequence):
             self._buffer[source, i & 0xFFFF] = packet

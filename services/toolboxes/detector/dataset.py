@@ -1,6 +1,6 @@
 """Training data of the detector: images with labelled boxes, and their augmentation.
 
-A dataset is a folder with `images/`, `boxes.jsonl` (one line per image: {"image": NAME, "things": [{"class",
+A dataset is a folder with `images/`, `boxes.jsonl` (one line per image: {"image": NAME, "objects": [{"class",
 "box": [x0, y0, x1, y1], "visible"}]}, pixels) and `classes.json` (names, in order), as `data_samples.boxes` writes it.
 """
 
@@ -54,7 +54,7 @@ def read(folder: Path) -> tuple[list[LabelledImage], list[str]]:
 
 
 def _labelled(folder: Path, line: dict[str, object], names: list[str]) -> LabelledImage:
-    objects = line["things"]
+    objects = line["objects"]
     assert isinstance(objects, list)
     boxes = np.array([one["box"] for one in objects], np.float32).reshape(-1, 4)
     classes = np.array([names.index(one["class"]) for one in objects], np.float32)

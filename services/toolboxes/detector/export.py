@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,23 @@ def write_onnx(
         )  # fmt: skip
     model = onnx.load(path)
     onnx.helper.set_model_props(model, _as_strings(metadata))
+    onnx.save(model, path)
+
+
+def read_thresholds(path: Path) -> dict[str, float]:
+    """Minimum score by class in the metadata of an ONNX file; empty if it has none."""
+    import onnx
+
+    found: dict[str, float] = json.loads(read_metadata(onnx.load(path)).get("thresholds", "{}"))
+    return found
+
+
+def write_thresholds(path: Path, thresholds: Mapping[str, float]) -> None:
+    """Set the minimum score by class in the metadata of an ONNX file, by which `toolbox detect` reports detections."""
+    import onnx
+
+    model = onnx.load(path)
+    onnx.helper.set_model_props(model, read_metadata(model) | {"thresholds": json.dumps(dict(thresholds))})
     onnx.save(model, path)
 
 

@@ -45,14 +45,41 @@ class VehicleNet(Pyramid):
             self.box.bias[2:4] = 1.0  # type: ignore[index]
 
     def forward(self, images: Tensor) -> Tensor:
-        """Output as described at the class."""
-        top, middle, fine = self.maps((images - self.mean) / self.spread)
-        raw = [torch.cat([self.box(self.where(x)), self.classes(self.what(x))], dim=1) for x in
-               (fine, middle, top, self.coarser(top))]  # fmt: skip
+        """Output as described at the class; in evaluation the mean of those for the images and their mirror images."""
+        seen = (images - self.mean) / self.spread
         if self.training:
-            return torch.cat([x.flatten(2) for x in raw], dim=2).transpose(1, 2)
-        return torch.cat([decode(x.flatten(2).transpose(1, 2), cell_centres(x.shape[2], x.shape[3], s).to(x), s)
-                          for x, s in zip(raw, STRIDES, strict=True)], dim=1)  # fmt: skip
+            return torch.cat([x.flatten(2) for x in self._raw(seen)], dim=2).transpose(1, 2)
+        return torch.cat(
+            [
+                _mean(_decoded(plain, s), _decoded(_mirrored(mirrored), s))
+                for plain, mirrored, s in zip(self._raw(seen), self._raw(seen.flip(3)), STRIDES, strict=True)
+            ],
+            dim=1,
+        )
+
+    def _raw(self, seen: Tensor) -> list[Tensor]:
+        """Raw outputs (B, 5 + classes, H / s, W / s) for each stride s."""
+        top, middle, fine = self.maps(seen)
+        levels = (fine, middle, top, self.coarser(top))
+        return [torch.cat([self.box(self.where(x)), self.classes(self.what(x))], dim=1) for x in levels]
+
+
+def _decoded(raw: Tensor, stride: int) -> Tensor:
+    """(B, h * w, 5 + C) boxes and probabilities of a raw map (B, 5 + C, h, w)."""
+    centres = cell_centres(raw.shape[2], raw.shape[3], stride).to(raw)
+    return decode(raw.flatten(2).transpose(1, 2), centres, stride)
+
+
+def _mirrored(raw: Tensor) -> Tensor:
+    """Raw map of the mirror image, mirrored back."""
+    back = raw.flip(3)
+    return torch.cat([-back[:, :1], back[:, 1:]], dim=1)
+
+
+def _mean(a: Tensor, b: Tensor) -> Tensor:
+    """Mean of two decoded outputs; boxes are weighted by their objectness."""
+    share = a[..., 4:5] / (a[..., 4:5] + b[..., 4:5] + 1e-9)
+    return torch.cat([a[..., :4] * share + b[..., :4] * (1 - share), (a[..., 4:] + b[..., 4:]) / 2], dim=-1)
 
 
 def _tower(channels: int) -> list[nn.Module]:

@@ -37,6 +37,7 @@ class Params(detect.Params):
     batch: Batch = 4
     waiting: Waiting = 8
     deadline: Deadline = 5.0
+    threshold: Annotated[float, Field(ge=0.01, le=1, description="Minimum score of a track's first detection.")] = 0.25
     rate: Annotated[float, Field(ge=0.1, le=1000, description="Approximate frame rate of a source in Hz.")] = 25.0
     faint: Annotated[
         float,
@@ -80,6 +81,7 @@ class _MovementTracker:
     """Tracks the objects of one source and detects whether they move."""
 
     def __init__(self, params: Params) -> None:
+        self._threshold = params.threshold
         self._tracker = Tracker(params.threshold, params.lost, params.rate)
         self._motion_detector = MotionDetector(params.lost)
         self._known: dict[int, Detection] = {}
@@ -98,6 +100,7 @@ class _MovementTracker:
             track: one for track, one in missed.items() if not (iou_matrix([one.box], boxes) > TAKEN_OVER_IOU).any()
         }
         return Body(
+            threshold=self._threshold,
             detections=tuple(
                 Moving(
                     **one.model_dump(),
@@ -107,7 +110,7 @@ class _MovementTracker:
                     detected=track not in missed,
                 )
                 for track, one in tracked.items()
-            )
+            ),
         )
 
     def _missed(self, track: int, image: U8) -> Detection:

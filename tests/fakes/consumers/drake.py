@@ -16,7 +16,7 @@ from tests.fakes.world_checks import Fault
 from tests.fakes.world_checks.reference import WorldReference
 
 FORMAT = "gazebo"
-GAZEBO_ELEMENTS = ("plugin", "sensor", "cast_shadows")
+GAZEBO_ELEMENTS = ("plugin", "sensor", "cast_shadows", "laser_retro", "visibility_flags")
 
 
 def missing() -> str:

@@ -13,8 +13,7 @@ from scan2sim.pipeline.core.types import F64, U8
 from scan2sim.pipeline.simulation.robot import ROBOT
 from tests.fakes.world_checks import drive, drops, renderings
 from tests.fakes.world_checks.drive import Pose
-from tests.fakes.world_checks.reference import WorldReference
-from tests.fakes.world_checks.renderings import Photo
+from tests.fakes.world_checks.reference import Photo, WorldReference
 
 FORMAT = "urdf"
 TIME_STEP_S = 1 / 240

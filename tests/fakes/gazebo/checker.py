@@ -1,4 +1,4 @@
-"""Check worlds with Gazebo's own libraries (`check_world.cpp`, `drive_world.cpp`, `load_meshes.cpp`)."""
+"""Check worlds with Gazebo's own libraries: `check_world`, `drive_world`, `cast_rays` and `load_meshes` (.cpp)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+
+from scan2sim.pipeline.core.types import F64
 
 HERE = Path(__file__).resolve().parent
 BUILD = HERE / "build"
@@ -82,6 +85,27 @@ def load_meshes(*files: Path) -> dict[str, float]:
     if done.returncode:
         raise WorldRejected(done.stderr.strip() or f"exit code {done.returncode}")
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def cast_rays(world: Path, origins: F64, directions: F64) -> tuple[F64, F64]:
+    """Ranges (N,) of rays through the visuals of a world, inf without a hit, and `laser_retro` of what they hit.
+
+    Args:
+        world: SDF file.
+        origins: (N, 3) world coordinates, metres.
+        directions: (N, 3) unit vectors.
+
+    Raises:
+        WorldRejected: a visual can't be loaded.
+    """
+    rays = "\n".join(" ".join(f"{value:.9g}" for value in ray) for ray in np.hstack([origins, directions]).tolist())
+    command = [str(program("cast_rays")), str(world)]
+    done = subprocess.run(command, input=rays, capture_output=True, text=True, timeout=900)
+    if done.returncode:
+        raise WorldRejected(done.stderr.strip() or f"exit code {done.returncode}")
+    hits = [line.split() for line in done.stdout.splitlines()]
+    ranges = np.array([float(hit[0]) if len(hit) > 1 else np.inf for hit in hits])
+    return ranges, np.array([float(hit[-1]) if len(hit) > 1 else 0.0 for hit in hits])
 
 
 class SimulatedRobot:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 
-from scan2sim.pipeline.core.types import F64, U8, Camera
+from scan2sim.pipeline.core.types import U8, Camera
 from scan2sim.pipeline.io.images import image
 from scan2sim.texturing.evaluate import score
 from tests.fakes.world_checks import Fault
-from tests.fakes.world_checks.reference import WorldReference
+from tests.fakes.world_checks.reference import Photo, WorldReference
 from tests.fakes.world_checks.side_by_side import side_by_side
 
 MIN_ALONG_ROAD = 0.9
@@ -26,26 +26,14 @@ BLUR_PX = 2.0
 """Blur before edge detection, pixels."""
 
 
-class Photo(NamedTuple):
-    """A photo without lens distortion.
-
-    Attributes:
-        rgb: (H, W, 3).
-        camera: pinhole camera.
-        pose: (4, 4) camera to world; x right, y down, z forward.
-    """
-
-    rgb: U8
-    camera: Camera
-    pose: F64
-
-
 def photo(reference: WorldReference) -> Photo:
-    """A photo along the road, with much of the road in view.
+    """A photo along the road, with much of the road in view; without photos, the renderer's view from the robot.
 
     Raises:
         Fault: there is no perspective photo.
     """
+    if reference.rendered is not None:
+        return reference.rendered
     way = reference.ways[0]
     start, ahead = way[int(ROUTE_SHARE * len(way))], way[-1] - way[0]
     ahead = ahead / np.linalg.norm(ahead)

@@ -34,7 +34,7 @@ QUIET = {
     "PREFECT_CLI_COLORS": "false",
     "PREFECT_CLI_WRAP_LINES": "false",
     "DO_NOT_TRACK": "1",
-    "PYTHONUTF8": "1",  # its command prints characters that other encodings lack
+    "PYTHONUTF8": "1",  # its command prints characters that other encodings can't represent
     # by default, runs of a new schedule are created once per minute, except for new deployments
     "PREFECT_SERVER_SERVICES_SCHEDULER_LOOP_SECONDS": "2",
     "RAY_USAGE_STATS_ENABLED": "0",

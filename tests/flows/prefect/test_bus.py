@@ -23,7 +23,7 @@ def test_flow_and_workers_publish_the_same_run(runner: str, server: Server, fold
     process = server.spawn(*arguments, log=folder / "output", XDG_STATE_HOME=str(folder / "state"))
     bus_state, hosts = BusState(time.time()), set[tuple[str, str]]()
     end = time.monotonic() + 150
-    for body in kafka.read(broker.servers, "bus_events", group="test", from_start=True, wait=0.5):
+    for body in kafka.read(broker.cluster, "bus_events", group="test", from_start=True, wait=0.5):
         if body is not None:
             bus_state.add(body)
             event = Event.model_validate_json(body)

@@ -54,6 +54,19 @@ def test_outline_of_an_l_shaped_building(heading: float) -> None:
     assert np.abs((side * np.roll(side, 1, axis=0)).sum(axis=1)).max() < 1e-6, "its corners are right angles"
 
 
+@pytest.mark.parametrize("heading", [0.0, 0.3, 0.78, -1.2])
+@pytest.mark.parametrize("cut", [2.0, 4.0, 7.0])
+def test_an_oblique_side_does_not_turn_the_others(heading: float, cut: float) -> None:
+    """A rectangle of 14 m by 8 m with a corner cut off at 30 degrees."""
+    true = np.array([[0, 0], [14, 0], [14, 8 - cut / np.sqrt(3)], [14 - cut, 8], [0, 8]])
+    (ring,) = rings(mask_of(turned(true, heading)), RASTER, TOLERANCE, 4.0)
+    side = turned(np.roll(ring, -1, axis=0) - ring, -heading)
+    angle = np.degrees(np.arctan2(side[:, 1], side[:, 0]))[np.linalg.norm(side, axis=1) > 2]
+    off = np.abs((angle + 45) % 90 - 45)
+    assert (off < 0.5).sum() >= 4 and (off[off >= 0.5] > 28).all(), off
+    assert farthest(ring, turned(true, heading)) < 0.35
+
+
 def test_holes_run_clockwise_and_small_ones_are_closed() -> None:
     true, hole = turned(L_SHAPE, 0.3), turned(COURTYARD, 0.3)
     mask = mask_of(true, hole)

@@ -122,7 +122,7 @@ ON_WALL = np.array([[8.0, 0.0, 1.5], [8.0, 1.9, 1.5]])
 FACING = np.tile([-1.0, 0, 0], (2, 1))
 
 
-def test_points_without_a_mesh_hide_what_is_behind_them() -> None:
+def test_points_without_a_mesh_occlude() -> None:
     pose, camera = forward_pose(), CAMERAS["pinhole"]
     car = side_of(4.0, -1, 0.5, 0.5, 2.5)
     before_wall = side_of(7.95, -2, 2.05, 0, 3.05)  # the mesh has it already
@@ -133,7 +133,20 @@ def test_points_without_a_mesh_hide_what_is_behind_them() -> None:
     assert visible(depth_map(camera, pose, hides), car, np.tile([-1.0, 0, 0], (len(car), 1))).all()
 
 
-def test_the_trail_of_what_drove_past_hides_only_while_it_was_there() -> None:
+def test_points_of_a_post_hide_what_is_clearly_behind_them() -> None:
+    pose, camera = forward_pose(), CAMERAS["pinhole"]
+    post = side_of(5.0, -0.02, 0.03, 0.0, 4.0)
+    corners = np.array([[5.1, 0.1, 0], [5.1, 0.2, 0], [5.1, 0.2, 4]], np.float32)
+    own = Mesh(Frame(), corners, np.array([[0, 2, 1]], np.int32))
+    hides = replace(scene([WALL, own]), slim=post, slim_radius=0.05)
+    depth = depth_map(camera, pose, hides)
+    assert visible(depth, ON_WALL, FACING).tolist() == [False, True]
+    assert visible(depth, np.array([[5.1, 0.12, 0.5]]), FACING[:1]).all()  # its own mesh, beside its points
+    above = depth.range[: camera.height // 8]
+    assert np.isinf(above).all()  # no surface is behind: nothing to hide
+
+
+def test_trail_of_a_passing_object_occludes_only_at_its_time() -> None:
     wall, trail = side_of(8.0, -2, 2.05, 0, 3.05), side_of(4.0, -1, 0.5, 0.5, 2.5)
     classification = np.repeat(np.array([6, 66], np.uint8), [len(wall), len(trail)])
     passed = np.concatenate([np.full(len(wall), 100.0), np.linspace(100.0, 100.2, len(trail))])
@@ -152,7 +165,7 @@ def test_the_trail_of_what_drove_past_hides_only_while_it_was_there() -> None:
     assert not sees_wall(parked, 110.0)
 
 
-def test_what_was_carved_as_moving_hides_only_at_its_own_moment() -> None:
+def test_removed_moving_points_occlude_only_at_their_time() -> None:
     wall, car = side_of(8.0, -2, 2.05, 0, 3.05), side_of(4.0, -1, 0.5, 0.5, 2.5)
     moving = cloud_of(car, time=np.full(len(car), 100.0))
     hides = scene([WALL], cloud_of(wall), moving=moving)
@@ -164,7 +177,7 @@ def test_what_was_carved_as_moving_hides_only_at_its_own_moment() -> None:
     assert [sees_wall(time) for time in (99.8, 100.0, 100.2)] == [True, False, True]
 
 
-def test_a_bulge_that_no_point_bears_out_hides_nothing() -> None:
+def test_surface_without_supporting_points_does_not_occlude() -> None:
     wall, sign = side_of(8.0, -2, 2.05, 0, 3.05), side_of(4.0, -0.3, 0.35, 1.5, 2.1)
     flat = grid(20, 11, 0.1, (0, 1.8, 0))
     bulge = Mesh(Frame(), np.roll(flat.vertices, 1, axis=1) + np.array([4, 0, 0], np.float32), flat.faces)
@@ -173,7 +186,7 @@ def test_a_bulge_that_no_point_bears_out_hides_nothing() -> None:
     assert visible(depth, behind, FACING).tolist() == [False, True]
 
 
-def test_things_of_their_own_hide_though_their_points_are_in_no_surfaces_cloud() -> None:
+def test_furniture_occludes_without_points_in_surface_clouds() -> None:
     pole, ground = box((3, -0.2, 0), (3.1, 0.2, 4)), grid(40, 20, 0.5, (10, 0, 0))
     cloud = PointCloud(
         Frame(), ground.vertices, normal=np.tile(np.array([0, 0, 1], np.float32), (len(ground.vertices), 1))
@@ -186,7 +199,7 @@ def test_things_of_their_own_hide_though_their_points_are_in_no_surfaces_cloud()
         assert visible(depth, behind).tolist() == [not hidden]
 
 
-def test_what_is_out_of_the_image_is_not_seen(street: list[Mesh]) -> None:
+def test_points_outside_the_image_are_not_visible(street: list[Mesh]) -> None:
     depth = depth_map(CAMERAS["pinhole"], forward_pose(), scene(street))
     assert not visible(depth, [[-5.0, 0, 1], [5.0, 60, 1]]).any()
 

@@ -29,7 +29,7 @@ def test_places_are_shown_where_the_camera_at_its_pose_has_them(name: str) -> No
     assert shown.any() and (name == "equirectangular" or not shown.all())
 
 
-def test_a_panorama_shows_what_is_right_behind_it() -> None:
+def test_panorama_projects_points_behind_the_camera() -> None:
     camera = Camera("equirectangular", 400, 200)
     behind = np.array([[0.0, 0.3, -5.0], [-0.0, -1.0, -2.0], [1e-9, 0.0, -1.0]])
     uv, shown = pixels(camera, np.eye(4), behind)
@@ -60,7 +60,7 @@ def test_masks_hold_up_to_the_photos_border() -> None:
     assert not allows(mask, p, 96.49, -0.5) and allows(np.zeros((0, 0), np.uint8), p, 3.0, 3.0)
 
 
-def test_pages_are_read_from_their_lower_left_corner_and_go_on_beyond_their_borders() -> None:
+def test_texture_origin_is_lower_left_and_borders_are_clamped() -> None:
     rng = np.random.default_rng(0)
     page = rng.integers(0, 256, (5, 7, 3), np.uint8)
     uv = rng.uniform(-0.2, 1.2, (200, 2)).astype(np.float32)

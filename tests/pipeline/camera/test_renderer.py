@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from scan2sim.pipeline.camera import renderer
 from scan2sim.pipeline.camera.models import project
 from scan2sim.pipeline.camera.renderer import Body, Renderer, look_at, pinhole
 from scan2sim.pipeline.core.errors import InputError
@@ -43,6 +44,25 @@ def test_map_shows_the_texture_the_right_way_round(painted: Body) -> None:
     assert image.seen[30, 30] == 128 and image.seen[50, 30] == 255 and image.seen[0, 0] == 0
 
 
+def test_pages_are_the_same_with_little_memory(painted: Body, monkeypatch: pytest.MonkeyPatch) -> None:
+    pages = [painted.pages[0]]
+    for k in (1, 2):
+        for end in ("", "_seen"):
+            image = cv2.imread(str(pages[0].with_name(f"page_0{end}.png")), cv2.IMREAD_UNCHANGED)
+            cv2.imwrite(str(pages[0].with_name(f"page_{k}{end}.png")), image // (k + 1))
+        pages.append(pages[0].with_name(f"page_{k}.png"))
+    mesh = square()
+    mesh = Mesh(mesh.frame, mesh.vertices, mesh.faces, uv=mesh.uv, page=np.array([1, 2], np.int16))
+    pose = look_at((0, -3, 3), (0, 0, 0))
+    known = Renderer([Body(mesh, tuple(pages)), painted])
+    expected = known.view(pinhole(160, 120), pose, samples=2)
+    monkeypatch.setattr(renderer, "PAGES_MAX_BYTES", 1)
+    monkeypatch.setattr(renderer, "RAY_CHUNK", 5000)
+    poor = Renderer([Body(mesh, tuple(pages)), painted])
+    np.testing.assert_array_equal(poor.view(pinhole(160, 120), pose, samples=2).rgb, expected.rgb)
+    assert poor.covers(pinhole(160, 120), pose) == expected.hit.mean()
+
+
 @pytest.mark.parametrize(
     "camera", [pinhole(160, 120), Camera("fisheye", 120, 120, 60, 60, 59.5, 59.5), Camera("equirectangular", 200, 100)]
 )
@@ -59,7 +79,7 @@ def test_a_camera_sees_colours_where_it_projects_them(painted: Body, camera: Cam
     np.testing.assert_allclose(image.range[at[:, 1], at[:, 0]], distance, rtol=0.03)
 
 
-def test_nearest_body_is_in_front_and_faces_are_told_apart(painted: Body) -> None:
+def test_nearest_mesh_occludes_others_and_faces_are_numbered(painted: Body) -> None:
     cover = Body(square(1.0, 1.0), colour=np.array([[10, 20, 30], [40, 50, 60]], np.uint8))
     image = Renderer([painted, Body(square(0.5, 5.0).keep(np.zeros(2, bool))), cover]).above(
         (-2, -2, 0), (2, 2, 2), width=80
@@ -96,7 +116,7 @@ def checkered(folder: Path, texels: int = 256) -> Body:
     return Body(square(), (folder / "page_0.png",))
 
 
-def test_more_rays_a_pixel_filter_what_is_finer_than_a_pixel(tmp_path: Path) -> None:
+def test_supersampling_filters_detail_finer_than_a_pixel(tmp_path: Path) -> None:
     renderer = Renderer([checkered(tmp_path)])
     camera, pose = pinhole(60, 40, field=40), look_at((0, -6, 5), (0, 0, 0))
     coarse, fine = renderer.view(camera, pose), renderer.view(camera, pose, samples=6)
@@ -106,7 +126,7 @@ def test_more_rays_a_pixel_filter_what_is_finer_than_a_pixel(tmp_path: Path) -> 
         np.testing.assert_array_equal(getattr(coarse, name), getattr(fine, name))
 
 
-def test_a_picture_is_the_same_in_small_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rendering_in_parts_is_identical(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     camera, pose = pinhole(60, 40, field=90), look_at((0, -6, 1), (0, 0, 1))  # its upper rows see nothing
     whole = Renderer([checkered(tmp_path)]).view(camera, pose, samples=3)
     monkeypatch.setattr("scan2sim.pipeline.camera.renderer.RAY_CHUNK", 600)

@@ -1,4 +1,4 @@
-"""Codes of other surveys: what they are here, and what is said of those that mean nothing."""
+"""Codes of other surveys: their classes here, and warnings about unknown ones."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def taken(path: Path, given: dict[int, int] | None = None) -> list[int]:
     return clouds.code_table(path, given or {})[[2, 1, 31, 65, 200]].tolist()
 
 
-def test_codes_of_the_survey_are_ours_only_where_the_file_says_so(tmp_path: Path) -> None:
+def test_survey_codes_are_ours_only_if_the_file_declares_it(tmp_path: Path) -> None:
     assert taken(foreign(tmp_path / "a.las")) == [2, 1, 31, 1, 1]
     assert taken(foreign(tmp_path / "b.las", "made by SCAN2SIM 0.1")) == [2, 1, 31, 65, 1]
     assert taken(foreign(tmp_path / "c.las", names={65: "Pole", 200: "Road sign", 31: "fence"})) == [2, 1, 68, 65, 64]
@@ -58,7 +58,7 @@ def test_codes_of_the_survey_are_ours_only_where_the_file_says_so(tmp_path: Path
     assert taken(foreign(tmp_path / "e.las"), {65: 7, 200: 5, 2: 11}) == [11, 1, 31, 7, 5]
 
 
-def test_what_is_written_here_is_read_as_ours(tmp_path: Path) -> None:
+def test_written_codes_are_read_as_our_classes(tmp_path: Path) -> None:
     las.write(tmp_path / "own.laz", PointCloud(Frame(), np.zeros((5, 3), np.float32), classification=LABEL[:5]))
     assert taken(tmp_path / "own.laz")[3] == 65
     code = np.full(N, 65, np.uint8)
@@ -100,14 +100,14 @@ def test_points_that_vanish_are_named_with_their_share_and_what_to_do(tmp_path: 
     assert "Classify the cloud again" in parted.warnings[-1] and "[classes]" not in parted.warnings[-1]
 
 
-def test_clouds_that_become_laz_keep_their_survey_s_codes_until_a_tile_says_what_they_are(tmp_path: Path) -> None:
+def test_conversion_to_laz_keeps_survey_codes(tmp_path: Path) -> None:
     rows = np.column_stack([np.random.default_rng(0).uniform(0, 30, (N, 3)), LABEL])
     np.savetxt(tmp_path / "a.csv", rows, "%.3f,%.3f,%.3f,%d", header="x,y,z,classification", comments="")
     tile = read_tile(import_las([tmp_path / "a.csv"], tmp_path / "tile", crs="local", classes={65: 64}))
     assert taken(tile.clouds[0], dict(tile.classes)) == [2, 1, 31, 64, 1]
 
 
-def test_tiles_of_a_survey_hold_codes_as_the_corridor_says(tmp_path: Path) -> None:
+def test_tiles_keep_the_class_mapping_of_the_corridor(tmp_path: Path) -> None:
     path = import_las([foreign(tmp_path / "a.las")], tmp_path / "tile", crs="local", classes={65: 69})
     warned: list[str] = []
     survey = read_survey(cut_survey(path, tmp_path / "survey", CutParams(length=100.0), warn=warned.append))

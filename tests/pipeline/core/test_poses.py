@@ -26,7 +26,7 @@ def test_between_poses_it_moves_straight_and_turns_evenly() -> None:
     assert np.allclose(found[:, :3, 3], places)
 
 
-def test_beyond_its_ends_a_motion_goes_on_and_a_trajectory_is_held() -> None:
+def test_motion_is_extrapolated_and_trajectory_clamped_at_its_ends() -> None:
     poses, path = some(), Trajectory(TIMES, some()[:, :3, 3], some()[:, :3, :3])
     assert np.allclose(interpolate(poses, TIMES, np.array([-1.0, 5.0]))[:, :3, 3], [[-1, -2, 0], [9, 2, 8]])
     assert np.allclose(path.pose_at([-1.0, 0.5, 5.0]), interpolate(poses, TIMES, np.array([0.0, 0.5, 3.0])))

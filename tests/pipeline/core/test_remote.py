@@ -38,14 +38,14 @@ def s3() -> Iterator[str]:
     server.stop()
 
 
-def test_a_place_is_itself_or_has_a_likeness(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_remote_path_has_a_local_copy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     assert not is_remote(tmp_path) and local_copy(tmp_path) == tmp_path
     assert is_remote("s3://a/b") and local_copy("s3://a/b/").parent == tmp_path
     assert local_copy("s3://a/b") == local_copy("s3://a/b/") != local_copy("s3://c/b")
 
 
-def test_another_machine_goes_on_where_the_first_one_stopped(s3: str, tmp_path: Path) -> None:
+def test_another_machine_continues_the_run(s3: str, tmp_path: Path) -> None:
     (tmp_path / "source.txt").write_text("1", encoding="utf-8")
     log = tmp_path / "log"
 
@@ -63,7 +63,7 @@ def test_another_machine_goes_on_where_the_first_one_stopped(s3: str, tmp_path: 
     assert not list((tmp_path / "third").rglob("number.txt"))
 
 
-def test_a_likeness_follows_what_it_is_like(s3: str, tmp_path: Path) -> None:
+def test_local_copy_follows_the_remote_file(s3: str, tmp_path: Path) -> None:
     here, there = Remote(f"{s3}/tiles", tmp_path / "here"), Remote(f"{s3}/tiles", tmp_path / "there")
     (here.local / "a").mkdir(parents=True)
     (here.local / "a" / "one.txt").write_text("1", encoding="utf-8")
@@ -81,7 +81,7 @@ def test_a_likeness_follows_what_it_is_like(s3: str, tmp_path: Path) -> None:
     assert (there.local / "two.txt").stat().st_mtime_ns == untouched
 
 
-def test_a_source_that_is_not_here_is_fetched(s3: str, tmp_path: Path) -> None:
+def test_remote_source_is_fetched(s3: str, tmp_path: Path) -> None:
     first, second = Remote(f"{s3}/src", tmp_path / "a"), Remote(f"{s3}/src", tmp_path / "b")
     first.local.mkdir()
     (first.local / "cloud.laz").write_text("points", encoding="utf-8")
@@ -90,7 +90,7 @@ def test_a_source_that_is_not_here_is_fetched(s3: str, tmp_path: Path) -> None:
     assert store.source(second.local / "cloud.laz").read_text(encoding="utf-8") == "points"
 
 
-def test_what_was_damaged_here_is_fetched_again_and_there_is_made_anew(s3: str, tmp_path: Path) -> None:
+def test_damaged_local_copy_is_fetched_and_damaged_remote_result_rebuilt(s3: str, tmp_path: Path) -> None:
     (tmp_path / "source.txt").write_text("1", encoding="utf-8")
     log, remote = tmp_path / "log", Remote(f"{s3}/damaged", tmp_path / "here")
 
@@ -127,7 +127,7 @@ def test_a_key_that_leads_out_of_its_folder_is_refused(tmp_path: Path, monkeypat
     assert not list(tmp_path.rglob("escaped.txt")) and not Path("/etc/escaped.txt").exists()
 
 
-def test_what_is_not_there_or_can_not_be_read_is_told(s3: str, tmp_path: Path) -> None:
+def test_missing_or_unreadable_remote_files_are_reported(s3: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is empty"):
         Remote(f"{s3}/nothing", tmp_path).pull_all()
     with pytest.raises(UnavailableError, match="fsspec"):

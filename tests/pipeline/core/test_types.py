@@ -21,7 +21,7 @@ def test_frame_there_and_back_in_feet() -> None:
     assert np.allclose(frame.to_local([[0, 0, 0]]), [[-100, -200, -3]])
 
 
-def test_what_is_saved_comes_back(tmp_path: Path) -> None:
+def test_save_and_load_round_trip(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     cloud = PointCloud(
         FRAME, random.random((5, 3), np.float32), time=random.random(5), classification=np.arange(5, dtype=np.uint8)
@@ -55,7 +55,7 @@ def test_numbers_of_numpy_are_saved_and_loaded(tmp_path: Path, kind: type) -> No
     assert views.load(tmp_path / "views.json")[0].camera == camera
 
 
-def test_join_fills_what_some_clouds_lack() -> None:
+def test_join_fills_missing_attributes() -> None:
     a = PointCloud(FRAME, np.zeros((2, 3), np.float32), rgb=np.zeros((2, 3), np.uint8), time=np.zeros(2))
     b = PointCloud(FRAME, np.ones((3, 3), np.float32), classification=np.full(3, 6, np.uint8))
     both = PointCloud.join([a, b])

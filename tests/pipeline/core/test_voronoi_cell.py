@@ -1,4 +1,4 @@
-"""Cells: every place is one tile's own, and neighbours tell the same border."""
+"""Cells: every position belongs to one tile, and neighbours compute the same border."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_every_place_is_in_the_cell_of_its_nearest_seed_and_in_no_other() -> Non
         assert np.array_equal(cell.outside(xy) < 0, nearest == i)
 
 
-def test_both_sides_of_a_border_tell_the_same_distance_to_the_last_bit() -> None:
+def test_border_distance_is_identical_from_both_sides() -> None:
     a, b = (690_012.345, 5_335_000.1), (690_100.777, 5_335_031.9)
     xy = np.random.default_rng(2).uniform(-100, 100, (100, 2)) + a
     assert np.array_equal(beyond(a, b, xy), -beyond(b, a, xy))

@@ -114,7 +114,7 @@ def street() -> PointCloud:
     return survey()
 
 
-def test_what_moved_goes_and_what_stands_stays(street: PointCloud, tmp_path: Path) -> None:
+def test_moving_objects_are_removed_and_static_ones_kept(street: PointCloud, tmp_path: Path) -> None:
     done = carve(street, tmp_path, path())
     gone = lost(street, done)
     assert all(gone[kind] > 0.65 for kind in MOVES)
@@ -132,7 +132,7 @@ def test_poses_may_be_off_by_centimetres(tmp_path: Path) -> None:
     assert all(share < 0.02 for kind, share in gone.items() if kind not in MOVES)
 
 
-def test_without_path_times_or_a_second_look_all_stays(street: PointCloud, tmp_path: Path) -> None:
+def test_nothing_is_removed_without_path_times_or_second_view(street: PointCloud, tmp_path: Path) -> None:
     cases = (
         (street, None, "path"),
         (PointCloud(street.frame, street.xyz), path(), "times"),
@@ -147,7 +147,7 @@ def test_without_path_times_or_a_second_look_all_stays(street: PointCloud, tmp_p
     assert once.metrics["moved"] == 0 and "observed only once" in str(once.metrics["rays"])
 
 
-def test_a_profile_scanner_tells_nothing_in_one_pass(tmp_path: Path) -> None:
+def test_profile_scanner_removes_nothing_in_one_pass(tmp_path: Path) -> None:
     """It sees each place once, beside itself; the car that it passes stays, and the metrics say why."""
     random = np.random.default_rng(3)
     x = random.uniform(0, 20, 60_000)
@@ -171,7 +171,7 @@ def test_the_recording_vehicle_and_cameras_have_room(street: PointCloud, tmp_pat
     assert cloud.classification is not None and kept[cloud.classification == GROUND].all()
 
 
-def test_what_stood_in_one_pass_and_not_in_the_next_goes(tmp_path: Path) -> None:
+def test_objects_absent_in_a_later_pass_are_removed(tmp_path: Path) -> None:
     """A survey of hours: the car that is parked in the first pass has left by the second."""
     cloud = PointCloud.join([survey(1.5), survey(1.5, begin=7200.0, left=PARKED)])
     both = path(1.5), path(1.5, begin=7200.0)

@@ -42,7 +42,7 @@ def test_a_shell_where_a_car_stood_is_measured(tmp_path: Path, heading: float) -
     assert left == pytest.approx(1.6, rel=0.05)
 
 
-def test_ground_walls_beside_it_and_people_are_nothing_of_a_car(tmp_path: Path) -> None:
+def test_ground_walls_and_people_are_not_vehicle_residue(tmp_path: Path) -> None:
     ground = plate((-5, -5, 0.1), (20, 0, 0), (0, 20, 0))
     wall = plate((-5, 1.95, 0), (20, 0, 0), (0, 0, 4))
     crown = plate((-5, -5, 3), (20, 0, 0), (0, 20, 0))

@@ -45,7 +45,7 @@ def _run(street: tuple[Path, Path], out: Path, **params: Any) -> tuple[list[dict
     return [f["properties"] | {"at": np.array(f["geometry"]["coordinates"]) - FRAME.origin} for f in features], done
 
 
-def test_what_stands_in_a_street_is_found_and_nothing_else(street: tuple[Path, Path], tmp_path: Path) -> None:
+def test_street_furniture_is_detected_without_false_positives(street: tuple[Path, Path], tmp_path: Path) -> None:
     found, done = _run(street, tmp_path / "whole")
     layout = lay_out(26.0, 5)
     places, kinds = [], []
@@ -75,7 +75,7 @@ def test_what_stands_in_a_street_is_found_and_nothing_else(street: tuple[Path, P
         assert (left == code).sum() < 0.25 * (cloud.classification == code).sum()  # the lamp's arm is left
 
 
-def test_signs_look_where_they_look_in_their_size(street: tuple[Path, Path], tmp_path: Path) -> None:
+def test_signs_have_their_heading_and_size(street: tuple[Path, Path], tmp_path: Path) -> None:
     found, _ = _run(street, tmp_path / "signs")
     layout = lay_out(26.0, 5)
     for post in layout.posts:
@@ -87,11 +87,11 @@ def test_signs_look_where_they_look_in_their_size(street: tuple[Path, Path], tmp
         off = (float(sign["heading_deg"]) - (90 - faces) + 180) % 360 - 180
         assert abs(off) < 3
         assert sign["shape"] == "rectangle"
-        assert sign["plate_width_m"] == pytest.approx(0.72, abs=0.04)
-        assert sign["plate_height_m"] == pytest.approx(0.72, abs=0.04)
+        assert sign["panel_width_m"] == pytest.approx(0.72, abs=0.04)
+        assert sign["panel_height_m"] == pytest.approx(0.72, abs=0.04)
 
 
-def test_things_keep_their_triangles_and_classes_within_the_target(tmp_path: Path) -> None:
+def test_furniture_keeps_triangles_and_classes_in_decimation(tmp_path: Path) -> None:
     n = 120
     x, y = np.meshgrid(np.arange(n) / 10, np.arange(n) / 10)
     vertices = np.column_stack([x.ravel(), y.ravel(), np.sin(x.ravel())]).astype(np.float32)

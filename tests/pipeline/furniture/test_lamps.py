@@ -162,6 +162,14 @@ def test_only_the_arm_of_a_tall_pole_is_a_lamp() -> None:
     assert fit(np.concatenate([pole_points(rng), crown])) is None, "wider than an arm"
 
 
+@pytest.mark.parametrize(("length", "is_lamp"), [(3.2, True), (3.7, False), (6.0, False)])
+def test_an_arm_longer_than_the_maximum_is_no_lamp(length: float, is_lamp: bool) -> None:
+    """A wire or a bridge that begins at a pole must not become an arm of the maximum length."""
+    rng = np.random.default_rng(0)
+    bar = TOP + rng.uniform((0, -0.04, -0.04), (length, 0.04, 0.04), (int(1000 * length), 3))
+    assert (fit(np.concatenate([pole_points(rng), bar])) is not None) == is_lamp
+
+
 def test_too_few_or_degenerate_points_are_no_lamp() -> None:
     rng = np.random.default_rng(0)
     assert fit(np.zeros((0, 3))) is None

@@ -68,6 +68,13 @@ def test_a_wall_along_an_axis_is_one_box() -> None:
     assert low == pytest.approx(np.array([[0.0, 0.0, 0.0]])) and high == pytest.approx(np.array([[4.2, 0.2, 3.0]]))
 
 
+@pytest.mark.parametrize("heading", [0.0, 0.4, 1.1])
+@pytest.mark.parametrize(("bottom", "top"), [(0.0, 3.0), (0.25, 2.5), (-1.75, 1.0)])
+def test_heights_at_multiples_of_the_step_are_kept(heading: float, bottom: float, top: float) -> None:
+    low, high = boxes(wall(heading, 3.7, bottom, top), CELL)
+    assert set(low[:, 2]) == {bottom} and set(high[:, 2]) == {top}
+
+
 def test_a_plate_is_one_box_as_thick_as_a_height_step() -> None:
     low, high = boxes(quad((0.1, 0.1, 0.6), (2.1, 0.1, 0.6), (2.1, 1.1, 0.6)), CELL)
     assert low == pytest.approx(np.array([[0.0, 0.0, 0.5]]))

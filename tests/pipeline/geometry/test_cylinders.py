@@ -30,14 +30,14 @@ def test_a_leaning_trunk_is_where_its_tube_is() -> None:
     assert one.axis == pytest.approx(np.array([0.2, 0, 2]) / np.hypot(2, 0.2), abs=0.01)
 
 
-def test_its_angles_turn_the_upright_axis_onto_its_own() -> None:
+def test_angles_rotate_the_z_axis_onto_the_cylinder_axis() -> None:
     (one,), _ = split_cylinders(mesh([(TRUNK, "high_vegetation")]))
     roll, pitch, yaw = one.angles
     turned = np.array([np.sin(pitch) * np.cos(yaw), np.sin(pitch) * np.sin(yaw), np.cos(pitch)])
     assert roll == 0 and turned == pytest.approx(one.axis)
 
 
-def test_what_bends_or_is_flat_or_walls_stays_a_mesh() -> None:
+def test_bent_and_flat_shapes_and_walls_stay_meshes() -> None:
     parts = [(POLE, "pole"), (ARM, "pole"), (PLATE, "road_sign"), (TRUNK, "building")]
     found, rest = split_cylinders(mesh(parts))
     assert len(found) <= 1 and len(rest) >= sum(len(part[1]) for part, _ in parts[1:])
@@ -46,7 +46,7 @@ def test_what_bends_or_is_flat_or_walls_stays_a_mesh() -> None:
     assert [one.code for one in found] == [CODE["pole"]] and len(rest) == len(PLATE[1])
 
 
-def test_without_classes_nothing_is_told_apart() -> None:
+def test_without_classes_no_cylinders_are_detected() -> None:
     vertices, faces = TRUNK
     plain = Mesh(Frame(), vertices.astype(np.float32), faces)
     assert split_cylinders(plain) == ([], plain)

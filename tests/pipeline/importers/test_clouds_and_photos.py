@@ -122,7 +122,7 @@ def test_mistakes_in_the_csv_are_named(tmp_path: Path, heading: str, row: str, m
     assert not (tmp_path / "tile").exists() and not list(tmp_path.glob(".tile*"))
 
 
-def test_a_missing_photo_is_named_and_an_old_tile_stays_unless_told(tmp_path: Path) -> None:
+def test_missing_photo_is_named_and_existing_tile_is_kept_without_overwrite(tmp_path: Path) -> None:
     file = cloud(tmp_path / "c.laz")
     first = import_las([file], tmp_path / "tile", name="first")
     sheet = photos(tmp_path, f"file,x,y,z,qw,qx,qy,qz,{CAMERA}", f"{ROW},{VALUES}")

@@ -183,7 +183,7 @@ def test_damaged_models_are_refused_or_read(tmp_path: Path, form: str) -> None:
 def fused(folder: Path) -> Path:
     """COLMAP's own stereo fusion of six photos of a wall 5 m away, red left of x = 0, green right of it.
 
-    Its depth maps, which need a GPU to be computed, are made up; what is fused and written is COLMAP's.
+    Its depth maps, which need a GPU to be computed, are synthetic; what is fused and written is COLMAP's.
     """
     width, height, f, n = 64, 48, 60.0, 6
     for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps", "stereo/consistency_graphs"):
@@ -244,7 +244,7 @@ def test_real_photos_are_placed_by_their_gps(real_data: Path, tmp_path: Path) ->
     pycolmap.set_random_seed(0)
     mapping.num_threads, mapping.random_seed = 1, 0  # on several threads no two maps are the same
     mapping.mapper.num_threads, mapping.mapper.random_seed = 1, 0
-    mapping.ba_refine_extra_params = False  # a straight walk doesn't tell a lens's distortion: the map would bend
+    mapping.ba_refine_extra_params = False  # distortion isn't observable on a straight walk: the map would bend
     pycolmap.extract_features(database, images, camera_mode=pycolmap.CameraMode.SINGLE, extraction_options=extraction)
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = 1

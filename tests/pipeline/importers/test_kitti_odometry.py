@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
+from scan2sim.flows.pipelines.kitti import import_kitti_odometry
 from scan2sim.pipeline.camera.models import project
-from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.errors import DataError, InputError
 from scan2sim.pipeline.core.types import UNCOLOURED as GREY
-from scan2sim.pipeline.importers.kitti_odometry import import_kitti_odometry
+from scan2sim.pipeline.importers.kitti_raw import raise_beams
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.tile import read_tile
 
@@ -86,6 +87,22 @@ def test_sweeps_lie_on_each_other_and_photos_show_them(sequence: Path, tmp_path:
         assert np.abs(uv - expected).max() < 0.01  # the files have ten digits
 
 
+def test_beam_angles_are_corrected(sequence: Path, tmp_path: Path) -> None:
+    """A scanner whose beams point half a degree higher than its calibration says: 14 cm at 16 m."""
+    for file in (sequence / "velodyne").iterdir():
+        sweep = np.fromfile(file, np.float32).reshape(-1, 4)
+        sweep[:, :3] = raise_beams(sweep[:, :3], -0.5)
+        sweep.tofile(file)
+    wall, found = np.load(tmp_path / "wall.npy"), {}
+    for offset in ("0", "0.5"):
+        options = ["--vertical-angle-offset", offset, "-o", str(tmp_path / offset), "--pose-source", "given"]
+        assert CliRunner().invoke(app, ["import", "kitti-odometry", str(sequence), *options]).exit_code == 0
+        tile = read_tile(tmp_path / offset)
+        xyz = tile.frame.to_crs(clouds.read(tile.clouds[0], tile.frame).xyz).reshape(FRAMES, len(wall), 3)
+        found[offset] = np.linalg.norm(xyz - wall, axis=2).max()
+    assert found["0"] > 0.1 and found["0.5"] < 2e-3
+
+
 def test_the_command_and_poses_of_ones_own(sequence: Path, tmp_path: Path) -> None:
     (tmp_path / "poses" / "31.txt").rename(tmp_path / "mine.txt")
     options = ["import", "kitti-odometry", str(sequence), "-o", str(tmp_path / "tile")]
@@ -110,6 +127,12 @@ def test_a_damaged_sequence_is_refused(sequence: Path, tmp_path: Path, file: str
     (sequence / file).write_text(body, encoding="utf-8")
     with pytest.raises(InputError, match=cause):
         import_kitti_odometry(sequence, tmp_path / "tile")
+    assert not (tmp_path / "tile").exists()
+
+
+def test_range_without_points_is_an_error(sequence: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="velodyne: has no points within range"):
+        import_kitti_odometry(sequence, tmp_path / "tile", max_range=0.1)
     assert not (tmp_path / "tile").exists()
 
 

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from pyproj import Geod, Transformer
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
+from scan2sim.flows.cli import app
+from scan2sim.flows.pipelines.kitti import import_kitti_raw
 from scan2sim.pipeline.camera.models import project
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.types import UNCOLOURED as GREY
-from scan2sim.pipeline.importers.kitti_raw import import_kitti_raw
-from scan2sim.pipeline.importers.merge_sweeps import fill_colours
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.tile import read_tile
 
@@ -185,13 +186,6 @@ def test_without_oxts_a_pose_file_makes_a_local_tile(drive: Drive, tmp_path: Pat
     assert np.abs(tile.frame.to_crs(clouds.read(tile.clouds[0], tile.frame).xyz)[0] - [16, -5, -1.5]).max() < 0.005
 
 
-def test_borrowed_colours_come_from_the_nearest_within_reach() -> None:
-    xyz = np.array([[0, 0, 0], [10, 0, 0], [0.15, 0, 0], [10.1, 0, 0], [5, 0, 0]], np.float32)
-    rgb = np.array([[1, 2, 3], [7, 8, 9], [0, 0, 0], [0, 0, 0], [0, 0, 0]], np.uint8)
-    out = fill_colours(xyz, rgb, np.array([True, True, False, False, False]), np.ones(5, np.float32))
-    assert out.tolist() == [[1, 2, 3], [7, 8, 9], [1, 2, 3], [7, 8, 9], [GREY] * 3]
-
-
 @pytest.mark.parametrize(
     ("harm", "message"),
     [
@@ -251,3 +245,18 @@ def test_cloud_and_photos_of_a_real_drive_agree(real_data: Path, tmp_path: Path)
         return float(edges[v[inside], u[inside]].mean())
 
     assert sharpness(0.0) > 1.15 * max(sharpness(-0.3), sharpness(0.3))
+
+
+def test_the_check_of_the_poses_is_cached_until_they_change(drive: Drive, tmp_path: Path) -> None:
+    def imported() -> list[Path]:
+        command = f"import kitti-raw {drive.folder.parent} --out {tmp_path}/tile --overwrite"
+        result = CliRunner().invoke(app, command)
+        assert result.exit_code == 0 and "Poses as given" in result.output, result.output
+        return sorted(tmp_path.glob("tile-path/steps/adjust_kitti/*/manifest.json"))
+
+    (first,) = imported()
+    written = first.stat().st_mtime_ns
+    assert imported() == [first] and first.stat().st_mtime_ns == written
+    oxts = next((drive.folder / "oxts" / "data").glob("*.txt"))
+    oxts.write_text(oxts.read_text().replace(" ", "  ", 1))
+    assert imported() != [first]

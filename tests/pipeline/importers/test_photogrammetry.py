@@ -154,7 +154,7 @@ def on_earth(xyz: F64, crs: str = "EPSG:32633") -> F64:
 
 
 @pytest.mark.parametrize("crs", [None, "EPSG:25833", "odm"])
-def test_opensfm_lies_where_its_reference_says(tmp_path: Path, crs: str | None) -> None:
+def test_opensfm_model_is_placed_by_its_reference(tmp_path: Path, crs: str | None) -> None:
     """Centres to a centimetre of the exact conversion, angles to a hundredth of a degree, photos to the pixel."""
     path = tmp_path / "opensfm" / "reconstruction.json"
     path.parent.mkdir()
@@ -250,7 +250,7 @@ def similarity(scale: float, R: F64, t: F64) -> str:
     return f"<transform>{''.join(f'<{tag}>{row}</{tag}>' for tag, row in parts)}</transform>"
 
 
-def test_of_metashapes_components_the_largest_is_taken(tmp_path: Path) -> None:
+def test_largest_metashape_component_is_imported(tmp_path: Path) -> None:
     moved = similarity(3.0, np.eye(3), np.array([1.0, 2, 3]))
     parts = f'<components><component id="0">{moved}</component><component id="1"/></components>'
     path = metashape(tmp_path / "cameras.xml", "frame", BROWN, f"{parts}{similarity(9.0, np.eye(3), np.zeros(3))}")
@@ -263,7 +263,7 @@ def test_of_metashapes_components_the_largest_is_taken(tmp_path: Path) -> None:
 
 
 def test_a_cloud_without_a_crs_is_where_the_photos_are(tmp_path: Path) -> None:
-    """Beside a georeferenced model it may be in the model's coordinates, or in the CRS: which, is told."""
+    """Beside a georeferenced model it may be in the model's coordinates, or in the CRS; the note states which."""
     path = opensfm(tmp_path / "reconstruction.json", "brown", REFERENCE)
     near = np.array([pose[:3, 3] for _, pose in shots()]) + [1.0, 2.0, 0.0]
     for name, points, where in (("model", near, "model coordinates"), ("crs", on_earth(near), "the CRS already")):
@@ -284,7 +284,7 @@ def test_a_cloud_without_a_crs_is_where_the_photos_are(tmp_path: Path) -> None:
     assert any("units away from the photos: check that both are in the same coordinates" in line for line in warned)
 
 
-def test_metashape_chunks_lie_where_their_transform_says(tmp_path: Path) -> None:
+def test_metashape_chunks_are_placed_by_their_transform(tmp_path: Path) -> None:
     """Geocentric where the reference is a CRS of the Earth, local coordinates where it is local."""
     turn = Rotation.from_rotvec([0.4, -0.2, 1.1]).as_matrix()
     path = metashape(
@@ -383,11 +383,22 @@ def test_visualsfm_sees_the_same_pixels(tmp_path: Path, r: float) -> None:
 # --- all of them
 
 
+def nerfstudio(path: Path) -> Path:
+    frames = []
+    for name, pose in shots():
+        matrix = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": name, "transform_matrix": matrix.tolist()})
+    values = {"fl_x": 496.0, "cx": 408.0, "cy": 284.0, "k1": -0.12, "w": W, "h": H, "frames": frames}
+    path.write_text(json.dumps(values), encoding="utf-8")
+    return path
+
+
 WRITERS: dict[str, Callable[[Path], Path]] = {
     "opensfm": lambda folder: opensfm(folder / "reconstruction.json", "brown"),
     "metashape": lambda folder: metashape(folder / "cameras.xml", "frame", BROWN),
     "bundler": lambda folder: bundler(folder / "bundle", 500.0, -0.11, 0.02),
     "nvm": lambda folder: nvm(folder / "m.nvm", 500.0, 0.05),
+    "nerfstudio": lambda folder: nerfstudio(folder / "transforms.json"),
 }
 
 

@@ -20,16 +20,13 @@ from scan2sim.pipeline.core.types import F64, Camera, Frame, PointCloud, Tile, T
 from scan2sim.pipeline.importers.sweeps import (
     PhotoInput,
     PlacementParams,
-    camera_of_photos,
     import_sweeps,
-    photo_extrinsics,
-    read_camera,
-    read_extrinsics,
-    read_sweep,
 )
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.calibration import photo_extrinsics
 from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.sweep_files import read_sweep
 from scan2sim.pipeline.io.tile import read_tile
 from tests.present import present
 
@@ -117,8 +114,8 @@ class Drive:
         return {"sweeps": self.folder / "sweeps", "poses": self.folder / "camera.csv", "extrinsics": T_CAMERA_SCANNER}
 
     @property
-    def pictures(self) -> PhotoInput:
-        return PhotoInput(self.folder / "photos", CAMERA)
+    def pictures(self) -> list[PhotoInput]:
+        return [PhotoInput(self.folder / "photos", CAMERA)]
 
 
 def make(
@@ -204,17 +201,17 @@ def test_points_take_the_colour_of_their_wall_and_photos_their_pose(drive: Drive
     assert np.allclose(view.T_world_cam[:3, :3], pose[:3, :3], atol=1e-6) and view.time == pytest.approx(0.3)
 
 
-def test_a_mask_goes_with_the_photos_and_its_pixels_colour_nothing(drive: Drive, tmp_path: Path) -> None:
+def test_mask_is_imported_and_masked_pixels_give_no_colour(drive: Drive, tmp_path: Path) -> None:
     mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
     mask[128:] = 0
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
-    pictures = PhotoInput(drive.folder / "photos", CAMERA, mask=tmp_path / "mask.png")
+    pictures = [PhotoInput(drive.folder / "photos", CAMERA, mask=tmp_path / "mask.png")]
     tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", photos=pictures))
     assert cloud.rgb is not None and (cloud.rgb[xyz[:, 2] < 0.3] == 128).mean() > 0.8
     assert {view.mask for view in tile.views} == {tile.path.parent / "masks" / "mask.png"}
 
 
-def test_what_is_unsure_is_left_out_and_told(drive: Drive, tmp_path: Path) -> None:
+def test_unsure_sections_are_removed_and_reported(drive: Drive, tmp_path: Path) -> None:
     positions, unsure = drive.camera.positions.copy(), np.zeros(SWEEPS, bool)
     positions[2:4] += [0.7, 0.4, 0.0]
     unsure[2:4] = True
@@ -269,7 +266,7 @@ def test_times_come_from_a_file_from_names_or_from_the_order(drive: Drive, tmp_p
     assert notes == ["1 of 2 sweeps are excluded: outside the trajectory's times"]
 
 
-def test_nothing_is_placed_within_a_gap_of_the_trajectory(drive: Drive, tmp_path: Path) -> None:
+def test_sweeps_in_trajectory_gaps_are_removed(drive: Drive, tmp_path: Path) -> None:
     t = drive.camera
     late = Trajectory(np.where(t.times > 0.35, t.times + 5, t.times), t.positions, t.rotations)
     trajectory_io.write(tmp_path / "gap.csv", late)
@@ -294,7 +291,7 @@ def test_a_projected_crs_keeps_its_large_coordinates(tmp_path: Path) -> None:
 def test_thinning_keeps_a_point_a_voxel(drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = cloud_of(imported(**drive.arguments, out=tmp_path / "whole"))[2]
     thin = cloud_of(imported(**drive.arguments, out=tmp_path / "thin", voxel=0.37))[2]
-    monkeypatch.setattr("scan2sim.pipeline.importers.sweeps.MAX_PENDING_POINTS", 20_000)  # the same on the way
+    monkeypatch.setattr("scan2sim.pipeline.importers.place_sweeps.MAX_PENDING_POINTS", 20_000)  # the same on the way
     often = cloud_of(imported(**drive.arguments, out=tmp_path / "often", voxel=0.37))[2]
     origin = np.floor(drive.camera.positions[0])
     cells = [np.unique(np.floor((xyz - origin) / 0.37), axis=0) for xyz in (whole, thin)]
@@ -314,30 +311,15 @@ def test_extrinsics_the_wrong_way_round_are_noticed(drive: Drive, tmp_path: Path
     notes: list[str] = []
     wrong = drive.arguments | {"extrinsics": np.linalg.inv(T_CAMERA_SCANNER)}
     imported(**wrong, out=tmp_path / "tile", warn=notes.append)
-    assert any("direction of the extrinsics" in text for text in notes)
+    assert any("with `--invert-extrinsics`" in text for text in notes)
+    notes.clear()
+    right = imported(**wrong, invert_extrinsics=True, out=tmp_path / "right", warn=notes.append)
+    expected = cloud_of(imported(**drive.arguments, out=tmp_path / "expected"))[2]
+    assert not notes and np.allclose(cloud_of(right)[2], expected, atol=2e-3)
 
 
-@pytest.mark.parametrize("form", ["rows", "three", "velo_to_cam", "odometry"])
-def test_extrinsics_of_all_kinds_of_files(tmp_path: Path, form: str) -> None:
-    T, file = T_CAMERA_SCANNER, tmp_path / "T.txt"
-
-    def text(values: F64) -> str:
-        return " ".join(f"{v:.9f}" for v in values.ravel())
-
-    file.write_text(
-        {
-            "rows": "# camera, scanner\n" + "\n".join(map(text, T)),
-            "three": "\n".join(map(text, T[:3])).replace(" ", ", "),
-            "velo_to_cam": f"calib_time: 15-Mar-2012 11:37:16\nR: {text(T[:3, :3])}\nT: {text(T[:3, 3])}\n",
-            "odometry": f"P0: 1 2 3\nTr: {text(T[:3])}\n",
-        }[form],
-        encoding="utf-8",
-    )
-    assert np.allclose(read_extrinsics(file), T, atol=1e-8)
-
-
-def test_photos_of_kittis_second_camera_stand_beside_the_first(drive: Drive, tmp_path: Path) -> None:
-    """`Tr` is of camera 0; P2 tells that camera 2 sees what is 6 cm to the left of it."""
+def test_kitti_camera_2_is_offset_from_camera_0(drive: Drive, tmp_path: Path) -> None:
+    """`Tr` is of camera 0; P2 gives camera 2 an offset of 6 cm."""
     K, offset = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]]), np.array([0.0613, -0.001, 0.003])
     P2 = np.column_stack([K, K @ offset])
     calib = tmp_path / "calib.txt"
@@ -353,7 +335,7 @@ def test_photos_of_kittis_second_camera_stand_beside_the_first(drive: Drive, tmp
     beside = photo_extrinsics(calib, own)
     centres = []
     for i, extrinsics in enumerate((None, beside)):
-        pictures = PhotoInput(own, CAMERA, extrinsics=extrinsics)
+        pictures = [PhotoInput(own, CAMERA, extrinsics=extrinsics)]
         tile = read_tile(imported(**drive.arguments, out=tmp_path / str(i), photos=pictures, link=True))
         centres.append((tile.views[0].T_world_cam, tile.views[0].centre))
     moved = centres[0][0][:3, :3].T @ (centres[1][1] - centres[0][1])
@@ -363,43 +345,6 @@ def test_photos_of_kittis_second_camera_stand_beside_the_first(drive: Drive, tmp
     )
     with pytest.raises(InputError, match="no valid `P2`"):
         photo_extrinsics(calib, own)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("1 0 0\n0 1 0\n", r"T\.txt: contains no 3x4 or 4x4 matrix \(2 rows\)"),
-        ("1 0 0 0\n0 1 0 zero\n0 0 1 0", r"T\.txt: contains no 3x4 or 4x4 matrix"),
-        ("1 0 0 0\n0 1 0 0\n0 0 -1 0", r"T\.txt: its left 3x3 is not a rotation matrix"),
-        ("2 0 0 0\n0 2 0 0\n0 0 2 0", r"T\.txt: its left 3x3 is not a rotation matrix"),
-    ],
-)
-def test_bad_extrinsics_are_named(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "T.txt").write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=message):
-        read_extrinsics(tmp_path / "T.txt")
-
-
-def test_a_camera_of_a_file_or_of_numbers(drive: Drive, tmp_path: Path) -> None:
-    file = tmp_path / "camera.toml"
-    file.write_text(
-        '[[cameras]]\nid = "a"\nmodel = "pinhole"\nsize = [100, 50]\nfocal = [80.0, 80.0]\ncentre = [49.5, 24.5]\n'
-        '[[cameras]]\nid = "b"\nmodel = "opencv"\n'
-        "size = [512, 256]\nfocal = [90.0, 91.0]\ndistortion = [0.1, 0, 0, 0]\n",
-        encoding="utf-8",
-    )
-    camera = Camera("opencv", 512, 256, 90.0, 91.0, 0.0, 0.0, (0.1, 0.0, 0.0, 0.0))
-    assert camera_of_photos(drive.folder / "photos", file=file) == read_camera(file, 512, 256) == camera
-    with pytest.raises(InputError, match=r"has no camera of 64x64 \(it has 100x50, 512x256\)"):
-        read_camera(file, 64, 64)
-    file.write_text('[[cameras]]\nid = "a"\nmodel = "spherical"\nsize = [100, 50]\n', encoding="utf-8")
-    with pytest.raises(InputError, match=r"camera\.toml: field `cameras\.model`"):
-        read_camera(file, 100, 50)
-    assert camera_of_photos(drive.folder / "photos") == CAMERA
-    pinhole = camera_of_photos(drive.folder / "photos", model="pinhole", focal=100.0)
-    assert pinhole == Camera("pinhole", 512, 256, 100.0, 100.0, 255.5, 127.5)
-    with pytest.raises(InputError, match=r"photos: have no camera.*--focal"):
-        camera_of_photos(drive.folder / "photos", model="pinhole")
 
 
 def garbage(drive: Drive, name: str) -> dict[str, Any]:
@@ -431,7 +376,7 @@ def garbage(drive: Drive, name: str) -> dict[str, Any]:
         (lambda d: d.arguments | {"crs": "EPSG:4326"}, InputError, "not projected"),
         (lambda d: d.arguments | {"min_range": 60.0}, SettingError, "max_range"),
         (
-            lambda d: d.arguments | {"photos": PhotoInput(d.folder / "photos", Camera("equirectangular", 64, 32))},
+            lambda d: d.arguments | {"photos": [PhotoInput(d.folder / "photos", Camera("equirectangular", 64, 32))]},
             InputError,
             r"000000\.png: is 512x256, but its calibration is for 64x32",
         ),
@@ -468,3 +413,14 @@ def test_the_command(drive: Drive, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "1 of 6 sweeps are excluded: outside the trajectory's times" in result.output
     assert read_tile(out).name == "hall" and len(read_tile(out).views) == SWEEPS - 1
+
+
+def test_long_recordings_become_several_clouds(drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = cloud_of(imported(**drive.arguments, out=tmp_path / "whole", photos=drive.pictures))[1]
+    monkeypatch.setattr("scan2sim.pipeline.importers.place_sweeps.MAX_PENDING_POINTS", 20_000)
+    tile = read_tile(imported(**drive.arguments, out=tmp_path / "blocks", photos=drive.pictures))
+    parts = [clouds.read(path, tile.frame) for path in tile.clouds]
+    assert len(parts) > 2 and max(map(len, parts)) < 40_000
+    joined = PointCloud.join(parts)
+    assert np.array_equal(joined.xyz, whole.xyz) and np.array_equal(present(joined.time), present(whole.time))
+    assert (present(joined.rgb) == present(whole.rgb)).all(axis=1).mean() > 0.95

@@ -43,10 +43,10 @@ def patch(path: Path, field: str, *values: float) -> Path:
     return path
 
 
-@pytest.mark.parametrize("n", [3000, 120_000])  # all points are looked at, or some
+@pytest.mark.parametrize("n", [3000, 120_000])  # all points are checked, or a sample
 @pytest.mark.parametrize("bounds", [[0.0] * 6, [1e7, 0.0] * 3, [float("nan")] * 6])
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_the_origin_is_the_points_whatever_the_header_says(
+def test_origin_is_computed_from_points_not_from_the_header(
     tmp_path: Path, suffix: str, bounds: list[float], n: int
 ) -> None:
     path = patch(made(tmp_path / f"c{suffix}", n), "bounds", *bounds)
@@ -59,7 +59,7 @@ def test_the_origin_is_the_points_whatever_the_header_says(
     assert "its header's bounding box is wrong" in done.warnings[0]
 
 
-def test_a_true_header_is_believed(tmp_path: Path) -> None:
+def test_valid_header_is_used(tmp_path: Path) -> None:
     assert clouds.read_header(made(tmp_path / "c.laz", 120_000)).notes == ()
 
 
@@ -74,7 +74,7 @@ def test_a_las_header_must_fit_into_its_file(tmp_path: Path, suffix: str, field:
         clouds.read_header(path)
 
 
-def test_points_that_a_las_header_does_not_count_are_told_of(tmp_path: Path) -> None:
+def test_points_beyond_the_las_header_count_are_reported(tmp_path: Path) -> None:
     path = patch(made(tmp_path / "c.las"), "count", 12)
     assert "declares 12 points, but the file has 3,000" in clouds.read_header(path).notes[0]
 
@@ -175,7 +175,7 @@ def test_a_large_panorama_is_read_and_a_bomb_is_not(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kept", [0.1, 0.5, 0.9, 0.99])
-def test_a_truncated_result_is_no_surprise_to_inspect(tmp_path: Path, kept: float) -> None:
+def test_inspect_reports_a_truncated_result(tmp_path: Path, kept: float) -> None:
     np.savez(tmp_path / "r.npz", a=np.arange(1000), b=np.zeros((3, 4)))
     data = (tmp_path / "r.npz").read_bytes()
     (tmp_path / "r.npz").write_bytes(data[: int(kept * len(data))])

@@ -261,7 +261,7 @@ def written(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Format, Pat
 
 
 def same(form: Format, read: PointCloud, cloud: PointCloud, precision: float) -> None:
-    """Points come in the order of writing, but for those of an octree, which are told by their times."""
+    """Points come in the order of writing, except in an octree, where times identify them."""
     assert len(read) == len(cloud)
     if not form.ordered:
         read, cloud = read.take(np.argsort(present(read.time))), cloud.take(np.argsort(present(cloud.time)))
@@ -347,7 +347,7 @@ def test_a_file_whose_reader_is_missing_is_named(monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("data", ["binary", "binary_compressed", "ascii"])
 @pytest.mark.parametrize("count", [10**15, 2000, -1, 0])
-def test_a_pcd_header_that_lies_is_refused(tmp_path: Path, data: str, count: int) -> None:
+def test_pcd_with_a_wrong_header_is_rejected(tmp_path: Path, data: str, count: int) -> None:
     rows = np.ones(1000, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
     write_pcd(tmp_path / "c.pcd", rows, data, count)
     with pytest.raises(InputError, match=r"c\.pcd: is "):
@@ -375,7 +375,7 @@ def e57_changed(data: bytes, change: Callable[[bytes], bytes]) -> bytes:
 
 
 @pytest.mark.parametrize("count", [b"401", b"999"])
-def test_an_e57_count_that_lies_is_refused(tmp_path: Path, count: bytes) -> None:
+def test_e57_with_a_wrong_count_is_rejected(tmp_path: Path, count: bytes) -> None:
     path = tmp_path / "c.e57"
     write_e57(path, made(N))
     lie = b'recordCount="%s"' % count
@@ -412,7 +412,7 @@ def test_pcd_files_of_open3d(tmp_path: Path, compressed: bool) -> None:
         ("\ufeffX Y Z Scalar_Intensity\n1 2 3 7\n4 5 6 8", "x y z intensity"),
     ],
 )
-def test_columns_are_sniffed_and_what_was_assumed_is_told(tmp_path: Path, lines: str, note: str) -> None:
+def test_columns_are_detected_and_assumptions_reported(tmp_path: Path, lines: str, note: str) -> None:
     (tmp_path / "c.txt").write_text(lines, encoding="utf-8")
     assert note in clouds.read_header(tmp_path / "c.txt").notes[0]
     assert clouds.read(tmp_path / "c.txt", Frame()).xyz.tolist() == [[1, 2, 3], [4, 5, 6]]

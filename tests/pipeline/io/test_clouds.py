@@ -41,7 +41,7 @@ def test_las_keeps_places_classes_colours_times_and_crs(tmp_path: Path, suffix: 
     assert np.abs(header.low - FRAME.to_crs(cloud.xyz).min(axis=0)).max() < 1e-3
 
 
-def test_las_without_crs_and_colours_says_so(tmp_path: Path) -> None:
+def test_las_without_crs_and_colours_has_none(tmp_path: Path) -> None:
     las.write(tmp_path / "c.las", PointCloud(Frame(), np.ones((5, 3), np.float32)))
     assert clouds.read_header(tmp_path / "c.las").crs is None
     assert clouds.read(tmp_path / "c.las", Frame()).rgb is None

@@ -80,7 +80,10 @@ class File:
         of = {attribute["unique_id"]: attribute["data"] for attribute in read.attributes}
         found = {key: of[packed["attributes"][key]] for key in one["attributes"]}
         for key, index in one["attributes"].items():
-            assert self.tree["accessors"][index]["count"] == len(found[key])
+            about = self.tree["accessors"][index]
+            assert about["count"] == len(found[key])
+            assert not about.get("normalized") or found[key].dtype == np.uint8
+            found[key] = found[key] / 255 if about.get("normalized") else found[key]
         return {**found, "faces": read.faces}
 
     def page(self, name: str) -> np.ndarray:
@@ -149,7 +152,7 @@ def test_pictures_are_the_right_way_up_by_the_specification(tmp_path: Path, text
     assert np.abs(image[v, u].astype(int) - (220, 40, 40)).max() < 20  # red: its upper left
 
 
-def test_photos_colours_are_shown_as_they_are_unless_it_is_to_be_lit(tmp_path: Path) -> None:
+def test_materials_are_unlit_by_default(tmp_path: Path) -> None:
     shown = File(written(tmp_path / "shown"))
     lit = File(written(tmp_path / "lit", glb_lit=True))
     assert all(material["extensions"] == {"KHR_materials_unlit": {}} for material in shown.tree["materials"])
@@ -157,7 +160,7 @@ def test_photos_colours_are_shown_as_they_are_unless_it_is_to_be_lit(tmp_path: P
     assert "NORMAL" not in shown.mesh("terrain_0")
 
 
-def test_each_face_tells_its_photo_and_how_far_that_was(tmp_path: Path) -> None:
+def test_each_face_has_its_photo_and_distance(tmp_path: Path) -> None:
     ground, house = surfaces(tmp_path)
     photo = np.where(np.arange(len(ground.shape)) % 2, 0, -1).astype(np.int32)  # every other face was seen by the first
     ground = replace(ground, shape=replace(ground.shape, photo=photo))
@@ -185,7 +188,24 @@ def test_each_face_tells_its_photo_and_how_far_that_was(tmp_path: Path) -> None:
     assert (file.mesh("building_1")["_FEATURE_ID_0"] == provenance.FILLED).all()
 
 
-def test_what_cannot_be_written_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("codec", ["plain", "meshopt", "draco"])
+def test_vertices_have_their_reflectance(tmp_path: Path, codec: str) -> None:
+    if codec != "plain":
+        pytest.importorskip({"meshopt": "meshopt", "draco": "DracoPy"}[codec], reason="scan2sim[gltf] isn't installed")
+    ground, house = surfaces(tmp_path)
+    level = ((ground.shape.mesh.vertices[:, 0] + 10) / 20).astype(np.float32)  # 0 in the west, 1 in the east
+    ground = replace(ground, shape=replace(ground.shape, reflectance=level))
+    glb.write(tmp_path / "a.glb", [ground, house], GlbParams(glb_mesh=codec))
+    file = File(tmp_path / "a.glb")
+    for page in (0, 1):
+        part = file.mesh(f"terrain_{page}")
+        assert np.abs(part["_REFLECTANCE"].ravel() - (part["POSITION"][:, 0] + 10) / 20).max() < 0.003
+    assert "_REFLECTANCE" not in file.mesh("building_0")
+    glb.write(tmp_path / "b.glb", [ground], GlbParams(reflectance=False))
+    assert "_REFLECTANCE" not in File(tmp_path / "b.glb").mesh("terrain_0")
+
+
+def test_unavailable_encoders_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for setting in ({"glb_texture": "bmp"}, {"glb_mesh": "zip"}):
         with pytest.raises(SettingError, match=r"export\.glb_"):
             glb.find_encoders(GlbParams(**setting))

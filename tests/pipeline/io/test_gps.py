@@ -85,7 +85,7 @@ def table(heading: str, delimiter: str = ",") -> str:
         ("b.csv", table("Time (s); Latitude; Longitude; Altitude (m)", ";").replace(",", "."), None),
     ],
 )
-def test_all_formats_say_the_same(tmp_path: Path, name: str, text: str, sigma: float | None) -> None:
+def test_all_formats_give_the_same_track(tmp_path: Path, name: str, text: str, sigma: float | None) -> None:
     (tmp_path / name).write_text(text, encoding="utf-8")
     track = gps.read(tmp_path / name)
     assert np.allclose(track.times, START + np.arange(8), atol=1e-3)
@@ -248,7 +248,7 @@ def test_telemetry_without_a_fix_is_dropped(tmp_path: Path) -> None:
         gps.read(film(tmp_path / "b.mp4", [gps5(0, fix=0)], [0.0]))
 
 
-def test_the_cameras_stamps_tell_when_gps_began(tmp_path: Path) -> None:
+def test_camera_timestamps_give_the_start_of_gps(tmp_path: Path) -> None:
     """The accelerometer's first sample is at the video's start, the GPS's 0.2 s later."""
     packets = [gps5(i, stamp=7.2 + i) for i in range(3)]
     track = gps.read(film(tmp_path / "a.mp4", packets, [0.0, 1.0, 2.1]))

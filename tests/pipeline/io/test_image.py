@@ -1,4 +1,4 @@
-"""Photos of every format against what was written, as 8-bit sRGB; and what is said of those that can't be read."""
+"""Photos of every format against what was written, as 8-bit sRGB; and the errors of unreadable ones."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_16_bits_are_scaled_and_linear_light_gets_the_curve(
     image.check_decodes(tmp_path / name)
     away = np.abs(image.read_rgb(tmp_path / name).astype(int) - rgb)
     assert (away.mean() if name == "a.hdr" else away.max()) <= 1  # Radiance's channels share an exponent
-    if name != "a.png":  # libpng makes grey of light, not of levels, where the file tells its gamma
+    if name != "a.png":  # libpng makes grey of linear light if the file has a gamma
         assert np.abs(image.read_levels(tmp_path / name) - rgb @ [0.299, 0.587, 0.114]).mean() <= 1
 
 
@@ -86,7 +86,7 @@ def test_exr_of_other_primaries_comes_in_srgb(tmp_path: Path, rgb: U8) -> None:
 
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "a.webp"])
 @pytest.mark.parametrize(("primaries", "gamma"), [(P3, None), (ADOBE, 563 / 256)])
-def test_a_profile_tells_the_colours(tmp_path: Path, rgb: U8, name: str, primaries: Any, gamma: float | None) -> None:
+def test_colour_profile_is_applied(tmp_path: Path, rgb: U8, name: str, primaries: Any, gamma: float | None) -> None:
     Image.fromarray(rgb).save(tmp_path / name, icc_profile=profile(primaries, gamma), lossless=True)
     light = linear(rgb) if gamma is None else (rgb / 255) ** gamma
     truth = encoded(light @ (np.linalg.inv(to_xyz(SRGB)) @ to_xyz(primaries)).T) * 255
@@ -102,7 +102,7 @@ def test_profiles_of_srgb_and_of_inks_change_no_byte(tmp_path: Path, rgb: U8) ->
     assert np.abs(image.read_rgb(tmp_path / "a.jpg").astype(int) - rgb).mean() <= 2
 
 
-def test_a_damaged_profile_is_told(tmp_path: Path, rgb: U8) -> None:
+def test_damaged_colour_profile_is_reported(tmp_path: Path, rgb: U8) -> None:
     Image.fromarray(rgb).save(tmp_path / "a.png", icc_profile=b"none at all" * 20)
     with pytest.raises(InputError, match=r"a\.png: has a colour profile that can't be read .*\. Save it as sRGB"):
         image.read_rgb(tmp_path / "a.png")
@@ -123,7 +123,7 @@ def test_the_fourth_channel_darkens_nothing_and_grey_is_grey(tmp_path: Path, rgb
 
 
 @pytest.mark.parametrize("tile", [0, 16])
-def test_a_part_is_what_the_whole_shows_there(tmp_path: Path, rgb: U8, tile: int) -> None:
+def test_cropped_reading_equals_the_full_image(tmp_path: Path, rgb: U8, tile: int) -> None:
     write(tmp_path / "a.tif", rgb, "uint8", tile)
     cv2.imwrite(str(tmp_path / "a.png"), rgb[..., ::-1])
     for box in ((0, 0, WIDTH, HEIGHT), (5, 17, 40, 18), (80, 64, 90, 70)):
@@ -143,9 +143,7 @@ def orthophoto(folder: Path, name: str, rgb: U8) -> tuple[View, Path]:
     return view, folder / "c.npz"
 
 
-def test_of_an_orthophoto_larger_than_can_be_decoded_a_tile_reads_its_part(
-    tmp_path: Path, rgb: U8, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tile_reads_its_part_of_a_huge_orthophoto(tmp_path: Path, rgb: U8, monkeypatch: pytest.MonkeyPatch) -> None:
     view, cloud = orthophoto(tmp_path, "o.tif", rgb)
     monkeypatch.setattr(image, "MAX_PIXELS", 40 * 40)
     with pytest.raises(InputError, match=r"6,?300|90 x 70"):
@@ -163,7 +161,7 @@ def test_of_an_orthophoto_larger_than_can_be_decoded_a_tile_reads_its_part(
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.webp", "a.tif", "a.exr", "a.hdr"])
 @pytest.mark.parametrize("kept", [0.0, 0.01, 0.5])
-def test_a_damaged_file_says_file_cause_and_remedy(tmp_path: Path, rgb: U8, name: str, kept: float) -> None:
+def test_error_of_a_damaged_file_has_cause_and_remedy(tmp_path: Path, rgb: U8, name: str, kept: float) -> None:
     path = tmp_path / name
     write(path, linear(rgb), "float") if name in ("a.exr", "a.hdr") else write(
         path, rgb, "uint8", 16 * (name == "a.tif")
@@ -174,13 +172,13 @@ def test_a_damaged_file_says_file_cause_and_remedy(tmp_path: Path, rgb: U8, name
         found = image.read_rgb(path)
     except InputError as error:
         assert error.where == str(path) and "can't be read (" in error.cause and "Copy it again" in error.remedy
-    else:  # some decoders make up what is missing; `views` looks through it
+    else:  # some decoders fill missing rows; `views` detects it
         assert found.shape == rgb.shape
         with pytest.raises(InputError, match="can't be read"):
             image.check_decodes(path)
 
 
-def test_what_is_no_picture_is_told(tmp_path: Path, rgb: U8) -> None:
+def test_file_that_is_no_image_is_reported(tmp_path: Path, rgb: U8) -> None:
     write(tmp_path / "depth.exr", linear(rgb)[..., :1], "float", channelnames="Z")
     with pytest.raises(InputError, match=r"depth\.exr: has the unsupported channels Z\. Export it as R, G, B"):
         image.read_rgb(tmp_path / "depth.exr")

@@ -59,7 +59,7 @@ def answers(n: int = N) -> tuple[U8, U8, U8]:
 
 
 def check(source: Path, out: Path, columns: tuple[U8, U8, U8]) -> Any:
-    """Compare what both files have, and the classes with what was told; returns the copy."""
+    """Compare all common dimensions, and the classes with the given ones; returns the copy."""
     old, new = laspy.read(source), laspy.read(out)
     assert str(new.header.version) == "1.4" and new.header.are_points_compressed
     assert new.header.point_format.id == {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10}.get(
@@ -85,10 +85,10 @@ def check(source: Path, out: Path, columns: tuple[U8, U8, U8]) -> Any:
     if "scan_angle_rank" in old.point_format.dimension_names:
         assert np.abs(np.array(new.scan_angle) * 0.006 - old.scan_angle_rank).max() <= 0.003 + 1e-9
         assert np.array_equal(np.array(new.overlap) == 1, np.array(old.classification) == 12)
-    for name, values in zip(("classification", "confidence", "told_from"), columns, strict=True):
+    for name, values in zip(("classification", "confidence", "class_source"), columns, strict=True):
         assert np.array_equal(np.array(new[name]), values), name
     extra = list(new.point_format.extra_dimension_names)
-    assert len(extra) == len(set(extra)) and extra[-2:] == ["confidence", "told_from"]
+    assert len(extra) == len(set(extra)) and extra[-2:] == ["confidence", "class_source"]
     return new
 
 
@@ -115,7 +115,7 @@ def test_the_classes_are_named(tmp_path: Path) -> None:
     write_classified(tmp_path / "b.laz", tmp_path / "c.laz", *answers())  # one lookup, not two
     (lookup,) = laspy.read(tmp_path / "c.laz").vlrs.get("ClassificationLookupVlr")
     assert len(lookup.lookups) == 256
-    assert (lookup[64], lookup[69], lookup[70]) == ("roadsign", "sidewalk", "")  # laspy reads letters and digits only
+    assert (lookup[64], lookup[69], lookup[90]) == ("roadsign", "sidewalk", "")  # laspy reads letters and digits only
     content = (tmp_path / "c.laz").read_bytes()
     assert all(struct.pack("<B15s", c.code, c.name.encode()) in content for c in CLASSES)
 
@@ -135,7 +135,7 @@ def test_the_pipeline_reads_the_same_cloud(tmp_path: Path, point_format: int) ->
     assert las.read_header(source)[0] == las.read_header(tmp_path / "b.laz")[0]
 
 
-def test_it_goes_chunk_by_chunk_and_in_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_is_classified_in_chunks_and_in_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source, columns = made(tmp_path / "a.laz", 3), answers()
     before = tmp_path / "before.laz"
     before.write_bytes(source.read_bytes())
@@ -170,13 +170,13 @@ def test_geotiff_keys_become_wkt_with_their_heights(tmp_path: Path) -> None:
     assert not header.global_encoding.wkt
 
 
-def test_former_answers_are_replaced_and_names_that_clash_are_not(tmp_path: Path) -> None:
-    for extra in ("confidence", "gps_time"):
+def test_earlier_results_are_replaced_and_clashing_names_are_changed(tmp_path: Path) -> None:
+    for extra in ("confidence", "told_from", "gps_time"):
         source = made(tmp_path / f"{extra}.las", 2, extra=extra)
         write_classified(source, tmp_path / "b.laz", *answers())
         new, old = laspy.read(tmp_path / "b.laz"), laspy.read(source)
         names = list(new.point_format.extra_dimension_names)
-        assert names[-2:] == ["confidence", "told_from"] and len(names) == (2 if extra == "confidence" else 3)
+        assert names[-2:] == ["confidence", "class_source"] and len(names) == (3 if extra == "gps_time" else 2)
         assert np.array_equal(np.array(new.confidence), answers()[1])
         if extra == "gps_time":
             assert np.array_equal(np.array(new[names[0]]), np.array(old["gps_time"]))
@@ -199,14 +199,14 @@ def test_extra_bytes_of_two_records_and_of_none(tmp_path: Path) -> None:
         writer.close()
     write_classified(tmp_path / "a.las", tmp_path / "b.laz", *answers())
     new = laspy.read(tmp_path / "b.laz")
-    assert list(new.point_format.extra_dimension_names) == ["first", "ExtraBytes", "confidence", "told_from"]
+    assert list(new.point_format.extra_dimension_names) == ["first", "ExtraBytes", "confidence", "class_source"]
     assert np.array_equal(new["first"], cloud.points.array["first"])
     assert np.array_equal(new["ExtraBytes"], cloud.points.array["third"])
     assert np.array_equal(new["confidence"], answers()[1])
 
 
-def test_what_a_file_says_of_its_extra_bytes_is_kept(tmp_path: Path) -> None:
-    """No-data values and ranges of the descriptions too, which laspy would forget or count anew."""
+def test_extra_bytes_descriptions_are_kept(tmp_path: Path) -> None:
+    """No-data values and ranges of the descriptions too, which laspy drops or recomputes."""
     source = made(tmp_path / "a.las", 6)
     with laspy.open(source) as reader:
         (one,) = reader.header.vlrs.get("ExtraBytesVlr")[0].extra_bytes_structs
@@ -242,7 +242,7 @@ def test_waveforms_of_several_channels_are_refused(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.las"]
 
 
-def test_a_full_disk_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from lazrs import LazrsError
 
     def full(*_: object) -> None:
@@ -290,18 +290,18 @@ def test_real_files(real_data: Path, tmp_path: Path, name: str) -> None:
 def test_failures_leave_an_earlier_copy_untouched(tmp_path: Path) -> None:
     source, out = made(tmp_path / "a.laz", 3), tmp_path / "b.laz"
     out.write_bytes(b"earlier")
-    code, confidence, told_from = answers()
+    code, confidence, class_source = answers()
     with pytest.raises(DataError, match=r"a\.laz: has 1,000 points, but confidence is uint8 of shape \(999,\)"):
-        write_classified(source, out, code, confidence[:-1], told_from)
+        write_classified(source, out, code, confidence[:-1], class_source)
     for damaged in (source.read_bytes()[:-9000], source.read_bytes()[:100], b""):
         (tmp_path / "cut.laz").write_bytes(damaged)
         with pytest.raises(InputError, match=r"cut\.laz: is "):
-            write_classified(tmp_path / "cut.laz", out, code, confidence, told_from)
+            write_classified(tmp_path / "cut.laz", out, code, confidence, class_source)
     las_file = made(tmp_path / "cut.las", 3)
     las_file.write_bytes(las_file.read_bytes()[:-2000])
     with pytest.raises(InputError, match=r"cut\.las: is truncated"):
-        write_classified(las_file, out, code, confidence, told_from)
+        write_classified(las_file, out, code, confidence, class_source)
     with pytest.raises(InputError, match="file not found"):
-        write_classified(tmp_path / "none.laz", out, code, confidence, told_from)
+        write_classified(tmp_path / "none.laz", out, code, confidence, class_source)
     assert out.read_bytes() == b"earlier"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.laz", "b.laz", "cut.las", "cut.laz"]

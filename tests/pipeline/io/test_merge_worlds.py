@@ -54,7 +54,7 @@ def _snapshot(folder: Path) -> dict[str, int]:
     return {path.relative_to(folder).as_posix(): path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
-def test_all_tiles_are_there_at_their_places(tmp_path: Path, row: Sequence[TileWorld]) -> None:
+def test_all_tiles_are_included_at_their_positions(tmp_path: Path, row: Sequence[TileWorld]) -> None:
     path = assemble(tmp_path, "town", row)
     world = _root(path)
     assert path == tmp_path / "world" / "town.sdf" and world.get("name") == "town"
@@ -92,7 +92,7 @@ def test_levels_contain_their_models(tmp_path: Path, row: Sequence[TileWorld]) -
         assert tile["low_m"] == pytest.approx([-10, -10, -0.5]) and tile["high_m"] == pytest.approx([10, 10, 4.5])
 
 
-def test_metadata_tells_of_all_files_and_places(tmp_path: Path, row: Sequence[TileWorld]) -> None:
+def test_metadata_lists_all_files_and_positions(tmp_path: Path, row: Sequence[TileWorld]) -> None:
     folder = assemble(tmp_path, "town", row).parent
     metadata = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
     assert metadata["world_origin_m"] == list(row[1].frame.origin) and metadata["crs"] == "EPSG:32632"
@@ -103,7 +103,7 @@ def test_metadata_tells_of_all_files_and_places(tmp_path: Path, row: Sequence[Ti
     assert counted["models/tile2/meshes/terrain.obj"] == 3200
 
 
-def test_what_users_edit_is_copied_and_the_rest_linked(tmp_path: Path, row: Sequence[TileWorld]) -> None:
+def test_editable_files_are_copied_and_others_linked(tmp_path: Path, row: Sequence[TileWorld]) -> None:
     folder = assemble(tmp_path, "town", row).parent
     for tile in row:
         for path in (path for path in tile.model.rglob("*") if path.is_file()):
@@ -124,7 +124,7 @@ def test_a_surveys_world_can_be_exported_whole(tmp_path: Path, row: Sequence[Til
         assert (tmp_path / "out" / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
 
 
-def test_nothing_is_done_where_nothing_has_changed(tmp_path: Path) -> None:
+def test_unchanged_world_is_not_merged_again(tmp_path: Path) -> None:
     row = tiles(tmp_path, 2)
     folder = assemble(tmp_path, "town", row).parent
     edited = folder / "models/tile0/model.sdf"
@@ -153,7 +153,9 @@ def test_nothing_is_done_where_nothing_has_changed(tmp_path: Path) -> None:
     assert (folder / "models/tile0/meshes/terrain.obj").read_text(encoding="utf-8").startswith("# new")
 
 
-def test_an_earlier_world_stays_until_the_new_one_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_earlier_world_is_replaced_only_when_the_new_one_is_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     row = tiles(tmp_path, 2)
     folder = assemble(tmp_path, "town", row).parent
     before = _snapshot(folder)

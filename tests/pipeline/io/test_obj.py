@@ -34,7 +34,7 @@ def test_triangles_uv_and_pages_survive(tmp_path: Path, make: Callable[[], Mesh]
         assert part.visual.material.image.size == (256, 256)
 
 
-def test_texture_coordinates_are_said_once_and_v_goes_up(tmp_path: Path) -> None:
+def test_texture_coordinates_are_unique_with_v_upwards(tmp_path: Path) -> None:
     surface = present(textured_mesh.read(synthetic.textured(tmp_path / "in", synthetic.house())))
     obj.write(tmp_path / "a.obj", surface, NAMES)
     lines = (tmp_path / "a.obj").read_text(encoding="utf-8").splitlines()

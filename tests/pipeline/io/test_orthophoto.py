@@ -60,14 +60,14 @@ def test_a_geotiffs_tags(raster: int, shift: float, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["", "1 2 3", "a b c d e f", "0 0 0 0 1 2", "1 1 0 -1 5 5", "1 0 0 1 5 5",
                                   "nan 0 0 -1 0 0"])  # fmt: skip
-def test_world_files_that_say_nothing_are_named(text: str, tmp_path: Path) -> None:
+def test_invalid_world_files_are_named(text: str, tmp_path: Path) -> None:
     file = picture(tmp_path / "map.png")
     (tmp_path / "map.pgw").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match="map.pgw"):
         read_view(file, FEET, highest=1.0)
 
 
-def test_a_picture_that_says_not_where_it_is(tmp_path: Path) -> None:
+def test_orthophoto_without_georeference_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="world file"):
         read_view(picture(tmp_path / "map.png"), FEET, highest=1.0)
     (tmp_path / "torn.tif").write_bytes(b"II*\0")

@@ -71,7 +71,7 @@ def photos(folder: Path, places: F64, altitude: bool = True) -> list[Path]:
     return [photo(folder / f"{i:03d}.jpg", place, altitude) for i, place in enumerate(places)]
 
 
-def test_exif_tells_places_and_their_lack(tmp_path: Path) -> None:
+def test_exif_positions_and_missing_ones_are_read(tmp_path: Path) -> None:
     lat, lon, altitude = exif.gps_position(photo(tmp_path / "a.jpg", AT)) or (0, 0, 0)
     east, north = Transformer.from_crs("EPSG:4326", CRS, always_xy=True).transform(lon, lat)
     assert np.abs(np.array([east, north]) - AT[:2]).max() < 0.01 and altitude == 50
@@ -107,7 +107,7 @@ def test_a_crs_in_feet_is_placed_in_feet(tmp_path: Path) -> None:
     assert len(fit.used) == 16 and fit.rms is not None and fit.rms < 3.5
 
 
-def test_on_a_straight_track_the_photos_own_up_tells_the_roll(tmp_path: Path) -> None:
+def test_roll_on_a_straight_track_comes_from_the_photos_up_axis(tmp_path: Path) -> None:
     fixes = line() + np.random.default_rng(0).normal(0, 1, (16, 3))
     fit = from_photo_gps(tmp_path, in_model(line()), ups(16), photos(tmp_path, fixes), CRS)
     up = fit.onto.rotation @ TURN.apply([0.0, 0.0, 1.0])
@@ -123,13 +123,13 @@ def test_on_a_straight_track_the_photos_own_up_tells_the_roll(tmp_path: Path) ->
         (np.tile(AT, (9, 1)), 0.0, "the photos' GPS doesn't fit"),
     ],
 )
-def test_a_track_that_tells_too_little_is_refused(tmp_path: Path, places: F64, noise: float, cause: str) -> None:
+def test_track_that_is_too_short_is_rejected(tmp_path: Path, places: F64, noise: float, cause: str) -> None:
     fixes = places + np.random.default_rng(0).normal(0, 1, places.shape) * noise
     with pytest.raises(DataError, match=cause):
         from_photo_gps(tmp_path, in_model(places), ups(len(places)), photos(tmp_path, fixes), CRS)
 
 
-def test_photos_without_altitudes_are_told(tmp_path: Path) -> None:
+def test_photos_without_altitude_are_reported(tmp_path: Path) -> None:
     flat = circle() * [1, 1, 0]
     fit = from_photo_gps(tmp_path, in_model(flat), ups(16), photos(tmp_path, flat, altitude=False), CRS)
     assert "no altitudes" in fit.notes[1] and np.abs(fit.onto.apply(in_model(flat)) - flat).max() < 0.02

@@ -52,18 +52,18 @@ def test_every_robot_has_a_world() -> None:
     assert set(plugins.names(robot_formats.PACKAGE)) <= set(world_formats.format_names())
 
 
-def test_it_starts_on_the_ground_at_the_ways_beginning_and_faces_along_it(town: Scene, exported: Path) -> None:
+def test_robot_starts_at_the_beginning_of_the_path_facing_along_it(town: Scene, exported: Path) -> None:
     start = find_spawn_pose(town)
     x, y, z = start.position
     assert start.by == "path" and (x, y) == pytest.approx(FIRST, abs=0.6)
     assert z == pytest.approx(float(synthetic.height(np.array(x), np.array(y))), abs=0.06)
     roll, pitch, yaw = start.angles
     assert yaw == pytest.approx(0, abs=0.05) and abs(roll) < 0.15 and abs(pitch) < 0.15
-    told = json.loads((exported / "metadata.json").read_text(encoding="utf-8"))["robot"]
-    assert told == {"name": "robot", "position_m": [x, y, z], "angles_rad": [roll, pitch, yaw], "on": "path"}
+    robot = json.loads((exported / "metadata.json").read_text(encoding="utf-8"))["robot"]
+    assert robot == {"name": "robot", "position_m": [x, y, z], "angles_rad": [roll, pitch, yaw], "on": "path"}
 
 
-def test_it_keeps_away_from_what_stands_beside_the_way(tmp_path: Path) -> None:
+def test_robot_starts_clear_of_obstacles(tmp_path: Path) -> None:
     scene = synthetic.scene(tmp_path, tiles=1)
     x = np.linspace(-7.0, 9.0, 33)
     Trajectory(np.arange(33.0), np.column_stack([x, np.full(33, -5.3), np.full(33, 3.0)])).save(
@@ -84,7 +84,7 @@ def test_without_a_road_or_a_path_there_is_no_robot(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_formats_that_hold_no_robot_are_told(town: Scene, tmp_path: Path) -> None:
+def test_formats_without_robots_are_reported(town: Scene, tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=r"not supported by glb, usd\. Add one of: gazebo, mujoco, urdf"):
         world_formats.check(["glb", "usd"], SceneParams(), "--to", robot=True)
     with pytest.raises(DataError, match="robot"):
@@ -126,9 +126,9 @@ def test_gazebos_world_has_the_systems_that_its_sensors_and_drive_need(exported:
     systems = {plugin.attrib["name"].split("::")[-1] for plugin in world.iter("plugin")}
     assert systems >= {"Physics", "Sensors", "SceneBroadcaster", "UserCommands", "Imu"}
     (include,) = (one for one in world.iter("include") if one.findtext("uri") == "model://robot")
-    told = json.loads((exported / "metadata.json").read_text(encoding="utf-8"))["robot"]
+    robot = json.loads((exported / "metadata.json").read_text(encoding="utf-8"))["robot"]
     pose = np.array(include.findtext("pose", "").split(), float)
-    np.testing.assert_allclose(pose, [*told["position_m"], *told["angles_rad"]], atol=1e-6)
+    np.testing.assert_allclose(pose, [*robot["position_m"], *robot["angles_rad"]], atol=1e-6)
     assert world.findtext(".//performer/ref") == "robot"  # levels load around it
     model = ET.parse(exported / "models/robot/model.sdf").getroot()
     assert {s.attrib["type"] for s in model.iter("sensor")} == {"camera", "segmentation", "gpu_lidar", "imu"}
@@ -138,7 +138,7 @@ def test_gazebos_world_has_the_systems_that_its_sensors_and_drive_need(exported:
     assert float(drive.findtext("wheel_separation", "")) == pytest.approx(ROBOT.track)
 
 
-def test_it_drives_ahead_in_mujoco(exported: Path) -> None:
+def test_robot_drives_ahead_in_mujoco(exported: Path) -> None:
     mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed")
     model = mujoco.MjModel.from_xml_path(str(exported / "town.xml"))
     assert model.body("robot").subtreemass[0] == pytest.approx(MASS)
@@ -153,7 +153,7 @@ def test_it_drives_ahead_in_mujoco(exported: Path) -> None:
     assert data.camera("camera").xmat.reshape(3, 3)[0, 2] < -0.9  # it looks along x
 
 
-def test_it_drives_and_turns_in_pybullet(exported: Path) -> None:
+def test_robot_drives_and_turns_in_pybullet(exported: Path) -> None:
     bullet = pytest.importorskip("pybullet", reason="pybullet is not installed")
     client = bullet.connect(bullet.DIRECT)
     try:

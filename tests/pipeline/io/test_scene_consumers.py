@@ -48,7 +48,7 @@ def ground(x: float, y: float) -> float:
     return float(synthetic.height(np.array(x - 25 * tile), np.array(y - 3 * tile))) - tile
 
 
-def test_a_ball_rests_on_mujocos_ground_and_none_falls_through(town: Scene, tmp_path: Path) -> None:
+def test_balls_rest_on_the_ground_in_mujoco(town: Scene, tmp_path: Path) -> None:
     mujoco = module("mujoco")
     path = export(town, "mujoco", tmp_path) / "town.xml"
     spec = mujoco.MjSpec.from_file(str(path))
@@ -64,7 +64,7 @@ def test_a_ball_rests_on_mujocos_ground_and_none_falls_through(town: Scene, tmp_
         assert data.body(f"ball{i}").xpos[2] == pytest.approx(ground(x, y) + RADIUS, abs=0.12)
 
 
-def test_mujocos_walls_and_poles_are_solid_where_they_stand(town: Scene, tmp_path: Path) -> None:
+def test_walls_and_poles_are_solid_in_mujoco(town: Scene, tmp_path: Path) -> None:
     mujoco = module("mujoco")
     model = mujoco.MjModel.from_xml_path(str(export(town, "mujoco", tmp_path) / "town.xml"))
     data = mujoco.MjData(model)
@@ -81,7 +81,7 @@ def test_mujocos_walls_and_poles_are_solid_where_they_stand(town: Scene, tmp_pat
     assert reach((-7, -5, 2), (1, 0, 0)) == pytest.approx(1.9, abs=0.01)  # the pole
 
 
-def test_a_ball_rests_on_pybullets_ground_and_its_camera_tells_classes(town: Scene, tmp_path: Path) -> None:
+def test_ball_rests_and_camera_returns_classes_in_pybullet(town: Scene, tmp_path: Path) -> None:
     bullet = module("pybullet")
     path = export(town, "urdf", tmp_path) / "town.urdf"
     client = bullet.connect(bullet.DIRECT)
@@ -165,9 +165,9 @@ PACKED = [{}, {"glb_lit": True}, {"glb_texture": "webp"}, {"glb_mesh": "meshopt"
 @pytest.mark.parametrize("params", PACKED, ids=lambda params: "_".join(map(str, params.values())) or "plain")
 def test_khronos_validator_finds_nothing_in_glbs(town: Scene, tmp_path: Path, params: dict[str, Any]) -> None:
     why = gltf_validator.missing()
-    lacking = plugins.missing("scan2sim.pipeline.io.worlds.gltf.geometry", params.get("glb_mesh", "plain"))
-    if why or lacking:
-        pytest.skip(why or f"{lacking} is not installed (pip install 'scan2sim[gltf]')")
+    missing = plugins.missing("scan2sim.pipeline.io.worlds.gltf.geometry", params.get("glb_mesh", "plain"))
+    if why or missing:
+        pytest.skip(why or f"{missing} is not installed (pip install 'scan2sim[gltf]')")
     for path in export(town, "glb", tmp_path, **params).glob("*.glb"):
         issues = gltf_validator.issues(path)
         assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
@@ -190,7 +190,7 @@ def test_three_js_shows_all_tiles_as_the_projects_renderer_does(town: Scene, tmp
 
 
 @pytest.mark.parametrize("params", [{"glb_mesh": "meshopt"}, {"glb_mesh": "draco"}, {"glb_texture": "ktx2"}], ids=str)
-def test_three_js_unpacks_what_is_packed(town: Scene, tmp_path: Path, params: dict[str, str]) -> None:
+def test_three_js_reads_compressed_files(town: Scene, tmp_path: Path, params: dict[str, str]) -> None:
     package = cesium.node_module("three")
     try:
         glb.find_encoders(glb.GlbParams(**params))
@@ -223,16 +223,16 @@ def test_cesium_shows_all_tiles_where_they_are_on_the_earth(town: Scene, tmp_pat
         assert np.degrees([latitude, longitude]) == pytest.approx(here[:2], abs=5e-4)
 
 
-def test_cesium_tells_of_what_is_picked_which_photo_it_is_from(town: Scene, tmp_path: Path) -> None:
+def test_cesium_returns_the_photo_of_a_picked_face(town: Scene, tmp_path: Path) -> None:
     folder = export(town, "tiles3d", tmp_path / "out")
     with cesium.viewer(folder, tmp_path / "view", (320, 240)) as view:
         view.look(*above(town, 60), focal=200)
-        told = "['source', 'photo', 'taken'].map((name) => picked.getProperty(name))"
-        found = view.page.value(f"(picked => {told})(widget.scene.pick(new Cesium.Cartesian2(100, 120)))")
+        properties = "['source', 'photo', 'taken'].map((name) => picked.getProperty(name))"
+        found = view.page.value(f"(picked => {properties})(widget.scene.pick(new Cesium.Cartesian2(100, 120)))")
         assert found == ["photo", "front", "2018-06-01T00:00:00+00:00"]
 
 
-def test_cesium_loads_finer_levels_as_it_comes_nearer(town: Scene, tmp_path: Path) -> None:
+def test_cesium_loads_finer_levels_when_closer(town: Scene, tmp_path: Path) -> None:
     levels = with_levels(town, 2, tmp_path / "levels", silent)
     folder = export(levels, "tiles3d", tmp_path / "out")
     with cesium.viewer(folder, tmp_path / "view", (320, 240)) as view:
@@ -245,7 +245,7 @@ def test_cesium_loads_finer_levels_as_it_comes_nearer(town: Scene, tmp_path: Pat
 
 
 def above(scene: Scene, height: float) -> np.ndarray:
-    """Where an eye is so many metres above a scene, where it looks, and what is up in its picture; earth-centred."""
+    """Position of a camera above a scene, viewing direction, and up direction of its image, (3, 3), earth-centred."""
     middle = np.mean([tile.offset for tile in scene.tiles], axis=0) + (0, 0, height)
     places = crs.to_ecef(scene.frame, middle + np.array([(0, 0, 0), (0, 0, -1), (0, 1, 0)]))
     return places - np.array([[0, 0, 0], places[0], places[0]])

@@ -19,9 +19,9 @@ from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.scene import Level, Scene, read_scene
 from tests.fakes import synthetic
-from tests.fakes.scene_readers import READERS, Shown, fbx, image, surveyed_off
+from tests.fakes.scene_readers import READERS, Shown, fbx, image, survey_error
 
-WITHOUT_MESHES = {"opendrive"}
+WITHOUT_MESHES = {"opendrive", "openscenario"}
 each = pytest.mark.parametrize("name", READERS)
 LABELS = {"terrain": 2, "building": 6, "road_sign": 64}
 
@@ -42,9 +42,9 @@ def test_every_format_has_a_reader() -> None:
 
 def written(scene: Scene, name: str, folder: Path, **params: Any) -> Path:
     """An export; the test is skipped where it can't be written here."""
-    lacking = plugins.missing(world_formats.PACKAGE, name)
-    if lacking:
-        pytest.skip(f"{lacking} is not installed")
+    missing = plugins.missing(world_formats.PACKAGE, name)
+    if missing:
+        pytest.skip(f"{missing} is not installed")
     world_formats.write(scene, [name], folder, SceneParams(**params), silent)
     return folder
 
@@ -63,7 +63,7 @@ def expected(scene: Scene) -> list[Shown]:
 
 
 def faces(shown: list[Shown]) -> np.ndarray:
-    """Of all meshes: label, middle, corners, colour in the middle; (F, 16), in one order whatever theirs was."""
+    """Faces of all meshes (F, 16): class, centre, corners, colour at the centre; sorted."""
     rows = []
     for one in shown:
         label = one.label if isinstance(one.label, int) else CODE[one.label]
@@ -91,6 +91,24 @@ def test_everything_is_shown_in_its_place_and_colours(town: Scene, exported: dic
     assert np.abs(seen[:, 10:] - own[:, 10:]).mean() < 3 and np.percentile(np.abs(seen[:, 10:] - own[:, 10:]), 95) < 20
 
 
+def test_usd_has_the_reflectance_of_vertices(town: Scene, tmp_path: Path) -> None:
+    folder = written(town, "usd", tmp_path)
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(folder / "usd" / "tile0.usdc"))
+    found = {}
+    for name in ("terrain", "building"):
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/tile0/Visual/{name}"))
+        primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("reflectance")
+        assert primvar.GetInterpolation() == UsdGeom.Tokens.vertex
+        assert len(primvar.Get()) == len(mesh.GetPointsAttr().Get())
+        found[name] = float(np.median(primvar.Get()))
+    assert found == pytest.approx(synthetic.REFLECTANCE)
+    written(town, "usd", tmp_path / "without", reflectance=False)
+    stage = Usd.Stage.Open(str(tmp_path / "without" / "usd" / "tile0.usdc"))
+    assert not UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/tile0/Visual/terrain")).HasPrimvar("reflectance")
+
+
 @each
 def test_a_scene_without_a_crs_has_no_georeference(tmp_path: Path, name: str) -> None:
     scene = synthetic.scene(tmp_path, Frame(), tiles=1)
@@ -100,7 +118,7 @@ def test_a_scene_without_a_crs_has_no_georeference(tmp_path: Path, name: str) ->
 
 
 @each
-def test_a_scene_without_ground_shows_all_else(tmp_path: Path, name: str) -> None:
+def test_scene_without_ground_contains_the_other_surfaces(tmp_path: Path, name: str) -> None:
     scene = synthetic.scene(tmp_path, tiles=1)
     (tile,) = scene.tiles
     solid = tile.solid()
@@ -116,7 +134,7 @@ def test_surveyed_points_are_where_they_were_surveyed_5_km_away(tmp_path: Path, 
     scene = synthetic.scene(tmp_path, tiles=2, apart=5000.0)
     folder = written(scene, name, tmp_path / "out")
     assert json.loads((folder / "metadata.json").read_text(encoding="utf-8"))["crs"] == "EPSG:32632"
-    assert surveyed_off(folder, scene, name) < 0.01
+    assert survey_error(folder, scene, name) < 0.01
 
 
 def test_a_scene_is_read_from_a_run_or_its_world(tmp_path: Path) -> None:
@@ -126,7 +144,21 @@ def test_a_scene_is_read_from_a_run_or_its_world(tmp_path: Path) -> None:
     assert {surface.label for surface in scene.tiles[0].surfaces()} == set(LABELS)
 
 
-def test_worlds_that_keep_no_scene_are_told_of(tmp_path: Path) -> None:
+def test_background_is_the_median_of_the_tiles_and_stored(tmp_path: Path) -> None:
+    scene = synthetic.scene(tmp_path, tiles=3)
+    assert scene.sky is None and "sky_rgb" not in world_formats.metadata(scene, {})
+    for tile, level in zip(scene.tiles, (100, 250, 110), strict=True):
+        file = tile.folder / "tile.json"
+        body = json.loads(file.read_text(encoding="utf-8"))
+        file.write_text(json.dumps(body | {"sky_rgb": [level, 0, 0]}), encoding="utf-8")
+    again = read_scene(tmp_path)
+    assert again.sky == (110, 0, 0) and world_formats.metadata(again, {})["sky_rgb"] == [110, 0, 0]
+    world_formats.write(again, ["gazebo", "mujoco"], tmp_path / "out", SceneParams(), silent)
+    assert "<background>0.431 0 0 1</background>" in (tmp_path / "out" / "town.sdf").read_text(encoding="utf-8")
+    assert 'builtin="flat" rgb1="0.431 0 0"' in (tmp_path / "out" / "town.xml").read_text(encoding="utf-8")
+
+
+def test_worlds_without_a_scene_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="contains no world"):
         read_scene(tmp_path)
     world = synthetic.world(tmp_path).files["world"]
@@ -166,7 +198,7 @@ def test_boxes_of_levels_hold_what_they_show_and_finer_ones(tmp_path: Path) -> N
     assert apart[0] == pytest.approx(45, abs=0.1)  # two tiles of 20 m, 25 m apart
 
 
-def test_carla_tells_road_from_terrain_and_all_else_by_its_tag(tmp_path: Path) -> None:
+def test_carla_names_carry_semantic_tags(tmp_path: Path) -> None:
     town = synthetic.scene(tmp_path, tiles=1)
     solid = town.tiles[0].solid()
     assert solid.classification is not None
@@ -193,7 +225,7 @@ def test_ground_too_long_for_a_carla_map_comes_in_squares_from_the_north_west(tm
     assert picture.parent.name == "town_Tile_1_0.fbm" and picture.is_file()
 
 
-def test_usd_tells_of_each_face_its_photo_and_how_far_that_was(town: Scene, exported: dict[str, Path]) -> None:
+def test_usd_contains_photo_and_distance_of_each_face(town: Scene, exported: dict[str, Path]) -> None:
     pytest.importorskip("pxr", reason="usd-core is not installed")
     from pxr import Usd, UsdGeom
 
@@ -211,7 +243,7 @@ def test_usd_tells_of_each_face_its_photo_and_how_far_that_was(town: Scene, expo
 
 
 @each
-def test_folders_may_have_any_name_and_tiles_may_lack_a_class(tmp_path: Path, name: str) -> None:
+def test_any_folder_name_and_tiles_without_a_class_are_exported(tmp_path: Path, name: str) -> None:
     scene = synthetic.scene(tmp_path / "Straße mit Bäumen")
     bare = replace(scene.tiles[1], groups={"terrain": scene.tiles[1].groups["terrain"]})
     scene = replace(scene, tiles=(scene.tiles[0], bare))

@@ -17,7 +17,7 @@ from tests.present import present
 def _world(
     path: Path, place: sdf.Georeference | None, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> ET.Element:
-    sdf.write_world(path, "street", place, offset)
+    sdf.write_world(path, ["street"], place, offset)
     root = ET.parse(path).getroot()
     assert root.get("version") == "1.9"
     return present(root.find("world"))
@@ -61,3 +61,9 @@ def test_the_offset_is_in_the_pose(tmp_path: Path) -> None:
     world = _world(tmp_path / "a.sdf", None, (100.25, -3.0, 1e-3))
     assert world.findtext("include/uri") == "model://street"
     assert world.findtext("include/pose") == "100.25 -3 0.001 0 0 0"
+
+
+def test_background_is_the_colour_of_the_sky(tmp_path: Path) -> None:
+    sdf.write_world(tmp_path / "a.sdf", ["street"], None, (0.0, 0.0, 0.0), sky=(102, 153, 255))
+    world = present(ET.parse(tmp_path / "a.sdf").getroot().find("world"))
+    assert world.findtext("scene/background") == "0.4 0.6 1 1"

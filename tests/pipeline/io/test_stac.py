@@ -86,7 +86,7 @@ def test_the_catalogue_is_read_back_and_finds_every_file(tmp_path: Path) -> None
     assert str(tmp_path) not in "".join(path.read_text(encoding="utf-8") for path in moved.glob("stac/**/*.json"))
 
 
-def test_an_item_says_where_its_data_is(tmp_path: Path) -> None:
+def test_item_has_geometry_and_bounds(tmp_path: Path) -> None:
     tiles = survey(tmp_path)
     collection, items = read(stac.write(tmp_path, "town", "A town.", tiles))
     corners = [crs.to_wgs84(tiles[0].frame, (x, y, 0)) for x in (-10, 10) for y in (-5, 5)]
@@ -106,7 +106,7 @@ def test_an_item_says_where_its_data_is(tmp_path: Path) -> None:
     assert np.all(box[:2] == boxes[:, :2].min(axis=0)) and np.all(box[2:] == boxes[:, 2:].max(axis=0))
 
 
-def test_an_item_tells_of_points_software_and_sizes(tmp_path: Path) -> None:
+def test_item_has_point_count_software_and_sizes(tmp_path: Path) -> None:
     tiles = survey(tmp_path)
     one = read(stac.write(tmp_path, "town", "A town.", tiles))[1][0]
     about = one.properties
@@ -156,7 +156,7 @@ def test_gps_times() -> None:
     assert from_gps(3600.0) is None and from_gps(1.7e9) is None
 
 
-def test_a_crs_without_a_code_is_told_as_wkt(tmp_path: Path) -> None:
+def test_crs_without_a_code_is_written_as_wkt(tmp_path: Path) -> None:
     from pyproj import CRS
 
     own = CRS.from_proj4("+proj=tmerc +lat_0=48 +lon_0=11.5 +x_0=600000 +y_0=5300000 +ellps=GRS80 +units=m").to_wkt()
@@ -171,7 +171,7 @@ def test_feet(tmp_path: Path) -> None:
     assert one.properties["proj:bbox"][0] == pytest.approx((300_000 - 10) * 3937 / 1200, abs=0.1)
 
 
-def test_a_local_survey_is_nowhere_on_earth(tmp_path: Path) -> None:
+def test_local_survey_has_no_geographic_position(tmp_path: Path) -> None:
     collection, items = read(stac.write(tmp_path, "town", "A town.", survey(tmp_path, Frame())))
     assert all(one.geometry is None and one.bbox is None for one in items)
     assert items[0].properties["proj:code"] is None

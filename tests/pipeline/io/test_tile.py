@@ -1,4 +1,4 @@
-"""`tile.toml`: what is read from it, and what is said about bad ones."""
+"""`tile.toml`: reading, and errors of invalid ones."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def save(folder: Path, content: dict[str, Any]) -> Path:
     return folder
 
 
-def test_a_tile_says_what_was_written_and_photos_may_be_missing_still(tmp_path: Path) -> None:
+def test_written_tile_is_read_back_before_its_photos_exist(tmp_path: Path) -> None:
     tile = read_tile(save(tmp_path, body(tmp_path)))
     assert (tile.name, tile.frame.crs, tile.frame.unit) == ("t", read_tile(tmp_path).frame.crs, 1.0)
     assert np.allclose(tile.frame.to_crs(tile.views[0].centre), [500_010, 5_400_010, 102])
@@ -60,7 +60,7 @@ def test_a_tile_says_what_was_written_and_photos_may_be_missing_still(tmp_path: 
     assert np.abs(xyz).max() < 30  # local: near the origin
 
 
-def test_what_write_tile_writes_read_tile_reads(tmp_path: Path) -> None:
+def test_tile_round_trip(tmp_path: Path) -> None:
     cloud(tmp_path / "cloud.laz")
     (tmp_path / "path.csv").write_text("time,x,y,z\n2,500001,5400000,101\n1,500000,5400000,101\n", encoding="utf-8")
     camera = Camera("opencv", 64, 48, 50.0, 51.0, 31.0, 23.0, (0.1, 0.0, 0.0, 0.0))

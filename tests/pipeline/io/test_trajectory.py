@@ -19,7 +19,7 @@ UTM = Frame("EPSG:32633", (500_000.0, 5_400_000.0, 200.0))
 FEET = Frame("EPSG:2994", (200_000.0, 250_000.0, 100.0), 0.3048)
 
 
-def made_up(n: int = 12) -> Trajectory:
+def sample_trajectory(n: int = 12) -> Trajectory:
     """A random path; poses 3 to 5 and 9 are unsure."""
     random = np.random.default_rng(1)
     unsure = np.isin(np.arange(n), (3, 4, 5, 9))
@@ -36,8 +36,8 @@ def made_up(n: int = 12) -> Trajectory:
 
 @pytest.mark.parametrize("frame", [Frame(), UTM, FEET])
 @pytest.mark.parametrize("suffix", [".csv", ".tum", ".kitti"])
-def test_what_is_written_comes_back(tmp_path: Path, suffix: str, frame: Frame) -> None:
-    path = made_up()
+def test_trajectory_round_trip(tmp_path: Path, suffix: str, frame: Frame) -> None:
+    path = sample_trajectory()
     file = tmp_path / f"a{suffix}"
     trajectory.write(file, path, frame)
     back = trajectory.read(file, frame, times=path.times if suffix == ".kitti" else None)
@@ -61,7 +61,7 @@ def test_files_hold_coordinates_of_the_crs(tmp_path: Path) -> None:
 
 
 def test_kitti_has_ten_poses_a_second(tmp_path: Path) -> None:
-    trajectory.write(tmp_path / "a.kitti", made_up())
+    trajectory.write(tmp_path / "a.kitti", sample_trajectory())
     assert np.allclose(trajectory.read(tmp_path / "a.kitti").times, np.arange(12) / 10)
     with pytest.raises(InputError, match=r"has 12 poses for 3 times"):
         trajectory.read(tmp_path / "a.kitti", times=np.arange(3.0))
@@ -69,12 +69,12 @@ def test_kitti_has_ten_poses_a_second(tmp_path: Path) -> None:
         trajectory.read(tmp_path / "a.kitti", timed=True)
 
 
-def test_other_suffixes_are_told_by_their_first_line(tmp_path: Path) -> None:
+def test_format_of_other_suffixes_is_detected_by_the_first_line(tmp_path: Path) -> None:
     for suffix in (".csv", ".tum", ".kitti"):
-        trajectory.write(tmp_path / f"a{suffix}", made_up())
+        trajectory.write(tmp_path / f"a{suffix}", sample_trajectory())
         text = tmp_path / f"{suffix[1:]}.txt"
         text.write_text((tmp_path / f"a{suffix}").read_text(encoding="utf-8"), encoding="utf-8")
-        assert np.allclose(trajectory.read(text).positions, made_up().positions)
+        assert np.allclose(trajectory.read(text).positions, sample_trajectory().positions)
 
 
 def test_partial_columns_in_any_order(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_unreadable_files(tmp_path: Path) -> None:
         trajectory.read(tmp_path / "none.csv")
 
 
-def test_what_cannot_be_written_leaves_the_old_file(tmp_path: Path) -> None:
+def test_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
     only_positions = Trajectory(np.arange(2.0), np.zeros((2, 3)))
     trajectory.write(tmp_path / "a.csv", only_positions)
     before = (tmp_path / "a.csv").read_text(encoding="utf-8")
@@ -145,8 +145,8 @@ def test_what_cannot_be_written_leaves_the_old_file(tmp_path: Path) -> None:
     assert (tmp_path / "a.csv").read_text(encoding="utf-8") == before and len(list(tmp_path.iterdir())) == 1
 
 
-def test_geojson_shows_the_path_and_where_it_is_unsure(tmp_path: Path) -> None:
-    path = made_up()
+def test_geojson_contains_the_path_with_unsure_sections(tmp_path: Path) -> None:
+    path = sample_trajectory()
     trajectory.write(tmp_path / "a.geojson", path, UTM)
     whole, *stretches = json.loads((tmp_path / "a.geojson").read_text(encoding="utf-8"))["features"]
     lat, lon, height = present(crs.to_wgs84(UTM, path.positions[7]))
@@ -161,7 +161,7 @@ def test_geojson_shows_the_path_and_where_it_is_unsure(tmp_path: Path) -> None:
 
 
 def test_poses_between_poses_turn_evenly_and_are_held_at_the_ends() -> None:
-    path = made_up()
+    path = sample_trajectory()
     assert path.rotations is not None
     times = np.linspace(path.times[0], path.times[-1], 40)
     poses = path.pose_at(times)

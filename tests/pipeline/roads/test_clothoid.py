@@ -43,7 +43,7 @@ def test_places_are_located_again() -> None:
     np.testing.assert_allclose(part.points([0.0, 20.0, 50.5]), line.points([10.2, 30.2, 60.7]), atol=1e-9)
 
 
-def test_a_profile_follows_most_of_what_is_seen() -> None:
+def test_elevation_profile_is_robust_to_outliers() -> None:
     rng = np.random.default_rng(1)
     s = np.linspace(0, 100, 400)
     values = 0.2 * np.sin(s / 17) + rng.normal(0, 0.02, 400)
@@ -56,7 +56,7 @@ def test_a_profile_follows_most_of_what_is_seen() -> None:
         np.testing.assert_allclose(cubic @ x ** np.arange(4)[:, None], found.at(begin + x), atol=1e-9)
 
 
-def test_what_is_driven_again_is_one_way() -> None:
+def test_repeated_passes_become_one_road() -> None:
     there = np.column_stack([np.arange(0.0, 60.0), np.zeros(60)])
     back = there[::-1] + [0.0, 3.4]
     across = np.column_stack([np.full(40, 30.0), np.arange(-20.0, 20.0)])
@@ -74,7 +74,7 @@ def seen_along(way: np.ndarray) -> Observed:
     return Observed(way, way + [0, 1], np.zeros(len(way), np.int64), one, edge, np.zeros((0, 3)))
 
 
-def test_ways_that_go_on_are_joined_whichever_way_they_run() -> None:
+def test_consecutive_paths_are_joined_in_either_direction() -> None:
     line = np.column_stack([np.arange(0.0, 120.0), np.zeros(120)])
     across = np.column_stack([np.full(30, 61.0), np.arange(5.0, 35.0)])
     parts = [seen_along(p) for p in (line[80:], line[40:79][::-1], across, line[:39])]
@@ -87,7 +87,7 @@ def test_ways_that_go_on_are_joined_whichever_way_they_run() -> None:
     assert join([]) == []
 
 
-def test_a_ring_is_cut_open_and_long_roads_are_told_in_pieces() -> None:
+def test_rings_are_opened_and_long_roads_split() -> None:
     angle = np.linspace(0, 2 * np.pi, 200)
     ring = 30 * np.column_stack([np.cos(angle), np.sin(angle)])
     assert [len(way.way) for way in join([seen_along(ring[:100]), seen_along(ring[100:])])] == [200]

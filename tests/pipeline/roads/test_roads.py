@@ -27,7 +27,7 @@ from scan2sim.pipeline.roads.model import Road
 from scan2sim.pipeline.steps.roads import ROADS, RoadsParams
 from tests.fakes import synthetic as worlds
 from tests.fakes.steps import step_params
-from tests.pipeline.roads.made_up import FALL, KERB, Street
+from tests.pipeline.roads.sample_street import FALL, KERB, Street
 
 STREET = Street()
 
@@ -135,7 +135,7 @@ def test_surveyed_points_come_back_from_its_georeference(done: Done, tmp_path: P
     np.testing.assert_allclose(local[:, 2] + offset[2], frame.to_crs(local)[:, 2] * unit)
 
 
-def test_without_paint_only_edges_are_told(tmp_path: Path) -> None:
+def test_unpainted_roads_have_only_edges(tmp_path: Path) -> None:
     done = run(tmp_path, STREET.inputs(tmp_path, paint=False))
     (road,) = drawn(done)
     assert road.reference == "middle" and not road.markings
@@ -144,7 +144,7 @@ def test_without_paint_only_edges_are_told(tmp_path: Path) -> None:
     assert any("no painted line" in note for note in done.metrics["roads"][0]["notes"])
 
 
-def test_without_a_texture_edges_are_told(tmp_path: Path) -> None:
+def test_edges_are_extracted_without_texture(tmp_path: Path) -> None:
     inputs = STREET.inputs(tmp_path)
     (inputs["textured"] / "mesh.npz").unlink()
     (road,) = drawn(run(tmp_path, inputs))
@@ -165,7 +165,7 @@ def test_without_a_kerb_the_road_ends_where_other_ground_begins(tmp_path: Path) 
         assert np.abs(np.abs(t) - STREET.edge).max() < 0.15
 
 
-def test_where_another_road_begins_no_edge_is_told(tmp_path: Path) -> None:
+def test_no_edge_at_junctions(tmp_path: Path) -> None:
     cloud = STREET.cloud()
     s, t = STREET.locate(cloud.xyz[:, :2])
     assert cloud.classification is not None
@@ -181,7 +181,7 @@ def test_where_another_road_begins_no_edge_is_told(tmp_path: Path) -> None:
     assert any("left edge isn't detected from" in note for note in done.metrics["roads"][0]["notes"])
 
 
-def test_bad_input_says_why_there_is_no_road(tmp_path: Path) -> None:
+def test_missing_road_is_reported_with_its_reason(tmp_path: Path) -> None:
     cloud = STREET.cloud()
     grass = replace(cloud, classification=np.full(len(cloud), CODE["terrain"], np.uint8))
     nothing = run(tmp_path / "a", STREET.inputs(tmp_path / "a", cloud=grass))
@@ -258,7 +258,7 @@ def test_notes_name_what_is_missing(done: Done) -> None:
     assert "no lanes" in " ".join(road_geojson.notes(bare)) and sections(bare) == []
 
 
-def test_one_drives_in_the_middle_of_the_lane_on_ones_own_side(done: Done) -> None:
+def test_driving_path_is_the_centre_of_the_own_lane(done: Done) -> None:
     (road,) = drawn(done)
     for keeps_right, side in ((True, -1), (False, 1)):
         way = course(replace(road, keeps_right=keeps_right))

@@ -18,5 +18,5 @@ def test_a_wet_road_scales_all() -> None:
     assert coefficient(CODE["terrain"], GROUND, 0.45) == 0.34
 
 
-def test_ground_that_nobody_told_apart_counts_as_paved() -> None:
+def test_unclassified_ground_counts_as_paved() -> None:
     assert coefficient(CODE["terrain"], (CODE["terrain"],), 0.8) == 0.8

@@ -1,4 +1,4 @@
-"""What an airborne scanner doesn't see, made up, against a house that is known."""
+"""Completion of airborne scans, compared with a known house."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def scanned(name: str, rgb: tuple[int, int, int], seed: int = 0) -> PointCloud:
 
 @pytest.fixture(scope="module")
 def house(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Voxels of ground and roofs, and what is made up of both."""
+    """Voxels of ground and roofs, and what is synthesized from both."""
     out = tmp_path_factory.mktemp("house")
     files: dict[str, Path] = {}
     for part in ("terrain", "building"):
@@ -82,10 +82,10 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return files
 
 
-def test_the_ground_is_closed_under_roofs_as_it_slopes(house: dict[str, Path]) -> None:
+def test_ground_under_roofs_follows_the_slope(house: dict[str, Path]) -> None:
     made = PointCloud.load(house["ground"])
     below = within(made.xyz[:, :2], HOUSE) | within(made.xyz[:, :2], ANNEX)
-    assert below.mean() > 0.9  # nowhere else is anything made up
+    assert below.mean() > 0.9  # nothing is synthesized elsewhere
     x, y = np.meshgrid(np.arange(-5.5, 9, 0.5), np.arange(-3.5, 4, 0.5))
     places = np.column_stack([x.ravel(), y.ravel(), floor(np.column_stack([x.ravel(), y.ravel()]))])
     gaps = np.linalg.norm(places[:, None] - made.xyz[None], axis=2).min(axis=1)
@@ -95,7 +95,7 @@ def test_the_ground_is_closed_under_roofs_as_it_slopes(house: dict[str, Path]) -
     assert made.normal is not None and (made.normal[:, 2] > 0.95).all()
 
 
-def test_walls_stand_where_the_truths_walls_are(house: dict[str, Path]) -> None:
+def test_walls_are_at_their_true_positions(house: dict[str, Path]) -> None:
     made = PointCloud.load(house["walls"])
     x, y, z = made.xyz.T
     to_side = np.min([abs(x - side) for side in (-6, 4, 9)] + [abs(y - side) for side in (-4, 4)], axis=0)
@@ -147,7 +147,7 @@ def test_walls_that_were_seen_are_left_alone(house: dict[str, Path], tmp_path: P
     assert (abs(x - 9) < 0.4).sum() > 200
 
 
-def test_footprints_say_where_walls_stand(house: dict[str, Path], tmp_path: Path) -> None:
+def test_footprints_determine_wall_positions(house: dict[str, Path], tmp_path: Path) -> None:
     ring = np.array([(-5.5, -3.5), (8.5, -3.5), (8.5, 3.5), (-5.5, 3.5), (-5.5, -3.5)]) + FRAME.origin[:2]
     file = tmp_path / "houses.geojson"
     file.write_text(
@@ -235,7 +235,7 @@ def test_neighbours_fill_a_hole_on_their_border_alike(house: dict[str, Path], tm
     assert made["a"] == made["b"]
 
 
-def test_only_clouds_from_the_air_get_what_is_made_up(tmp_path: Path) -> None:
+def test_only_airborne_clouds_are_completed(tmp_path: Path) -> None:
     tile = read_tile(SAMPLE)
     tasks = {task.step.name: task for task in build_graph(tile, Settings())}
     assert "walls" not in tasks and "instances" in tasks["ground"].inputs  # a street's: what vehicles hid
@@ -246,9 +246,7 @@ def test_only_clouds_from_the_air_get_what_is_made_up(tmp_path: Path) -> None:
     assert {"ground", "walls"}.isdisjoint(task.step.name for task in build_graph(bare, off))
 
 
-def test_points_far_from_the_mesh_are_warned_of_and_made_up_area_is_told(
-    house: dict[str, Path], tmp_path: Path
-) -> None:
+def test_points_far_from_the_mesh_and_synthesized_area_are_reported(house: dict[str, Path], tmp_path: Path) -> None:
     x0, y0, x1, y1, top = HOUSE
     roof = np.array([(x0, y0, top), (x1, y0, top), (x1, y1, top), (x0, y1, top)], np.float32)
     mesh = Mesh(FRAME, np.concatenate([roof, roof - np.array([0, 0, 3], np.float32)]),
@@ -262,9 +260,7 @@ def test_points_far_from_the_mesh_are_warned_of_and_made_up_area_is_told(
     assert done.metrics["building"]["synthesized"] == pytest.approx(west, abs=0.06)
 
 
-def test_a_street_scanned_from_the_ground_gets_nothing_made_up_without_a_path_either(
-    house: dict[str, Path], tmp_path: Path
-) -> None:
+def test_ground_scan_without_a_path_is_not_completed(house: dict[str, Path], tmp_path: Path) -> None:
     building = PointCloud.load(house["building"])
     y, z = (a.ravel() for a in np.meshgrid(np.arange(-4, 4, 0.1), np.arange(0, 6, 0.1)))
     wall = np.column_stack([np.full(len(y), -6.0), y, z]).astype(np.float32)
@@ -278,14 +274,14 @@ def test_a_street_scanned_from_the_ground_gets_nothing_made_up_without_a_path_ei
         assert go(step, tmp_path / f"{step.name}_asked", inputs, when="always").metrics["points"] > 0
 
 
-def test_points_that_became_no_surface_are_told(house: dict[str, Path], tmp_path: Path) -> None:
+def test_points_without_a_surface_are_reported(house: dict[str, Path], tmp_path: Path) -> None:
     nothing = Mesh(FRAME, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     nothing.save(tmp_path / "none.npz")
     done = go(GEOMETRY, tmp_path, {"mesh.building": tmp_path / "none.npz", "cloud.building": house["building"]})
     assert done.metrics == {} and "the world has no building" in done.warnings[0]
 
 
-def test_a_raster_that_no_memory_holds_is_refused() -> None:
+def test_raster_exceeding_memory_is_rejected() -> None:
     corners = np.array([[0, 0, 0], [5000, 5000, 0]], np.float32)
     assert Raster.over(0.5, [corners]).shape[0] > 10_000
     with pytest.raises(DataError, match="too many"):

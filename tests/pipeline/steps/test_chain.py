@@ -22,7 +22,7 @@ from scan2sim.pipeline.steps.decimate import DECIMATE
 from scan2sim.pipeline.steps.ingest import INGEST
 from scan2sim.pipeline.steps.islands import ISLANDS
 from scan2sim.pipeline.steps.plants import PLANTS
-from scan2sim.pipeline.steps.poisson import POISSON, octree
+from scan2sim.pipeline.steps.poisson import POISSON, Problem, octree
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
 from scan2sim.pipeline.steps.voxel import VOXEL
@@ -109,7 +109,7 @@ def test_voxel_matches_a_plain_implementation() -> None:
     assert np.abs(thin.xyz - expected).max() < 1e-3
 
 
-def test_normals_look_to_the_scanner_even_under_a_bridge(tmp_path: Path) -> None:
+def test_normals_point_to_the_scanner_even_under_a_bridge(tmp_path: Path) -> None:
     floor = bumpy(20_000)
     ceiling = replace(floor, xyz=floor.xyz + np.array([0, 0, 4], np.float32))
     PointCloud.join([floor, ceiling]).save(tmp_path / "cloud.npz")
@@ -121,7 +121,7 @@ def test_normals_look_to_the_scanner_even_under_a_bridge(tmp_path: Path) -> None
     assert (thin.normal[below, 2] > 0).mean() > 0.999 and (thin.normal[~below, 2] < 0).mean() > 0.999
 
 
-def test_normals_of_an_airborne_cloud_look_up_and_out(tmp_path: Path) -> None:
+def test_normals_of_an_airborne_cloud_point_up_and_out(tmp_path: Path) -> None:
     random = np.random.default_rng(1)
     wall = random.uniform(0, 1, (20_000, 3)) * (4, 0, 3)  # a wall to the south of its roof
     roof = random.uniform(0, 1, (20_000, 3)) * (4, 4, 0) + (0, 0, 3)
@@ -160,15 +160,15 @@ def test_poisson_falls_back_when_the_child_dies(
     calls = []
     real = sandbox.call
 
-    def flaky(*args: Any, **kwargs: Any) -> Any:
-        calls.append(args[3])
+    def flaky(target: str, problems: list[Problem], *args: Any, **kwargs: Any) -> Any:
+        calls.append(problems[0].depth)
         if len(calls) < 3:
             raise StepError("poisson", "crashed (exit status -11)", "")
-        return real(*args, **kwargs)
+        return real(target, problems, *args, **kwargs)
 
     monkeypatch.setattr(sandbox, "call", flaky)
     done = go(POISSON, tmp_path, {"cloud": ground["cloud"]}, depth=8)
-    assert calls == [8, 8, 7]
+    assert calls == [calls[0], calls[0], calls[0] - 1]
     assert done.metrics["depth"] == 7 and len(done.warnings) == 2
 
 
@@ -182,7 +182,7 @@ def test_trim_removes_what_no_point_bears_out(ground: dict[str, Path], tmp_path:
     assert 12**2 <= mesh.face_area.sum() <= 12.5**2 * 1.03  # waves make it 2 to 3 % larger than its plan
 
 
-def test_islands_go_by_area(tmp_path: Path) -> None:
+def test_small_islands_are_removed(tmp_path: Path) -> None:
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     vertices = np.concatenate([square, square * 0.5 + 5, square * 3 + 10])
@@ -211,7 +211,7 @@ def test_decimate_reaches_its_target_even_where_borders_are_long() -> None:
     assert len(simplify(mesh, 10_000)) == 30_000  # nothing but borders
 
 
-def test_plants_are_found_where_they_stand(tmp_path: Path) -> None:
+def test_plants_are_detected_at_their_positions(tmp_path: Path) -> None:
     random = np.random.default_rng(3)
     trees = [(2.0, 3.0, 6.0, 1.5), (9.0, 3.0, 8.0, 2.0), (5.0, 10.0, 3.0, 1.0)]
     points = []

@@ -11,6 +11,7 @@ from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import Mesh, PointCloud
+from scan2sim.pipeline.geometry.fitted_boxes import Box, mesh_of
 from scan2sim.pipeline.steps.collision import COLLISION, CollisionParams
 from tests.fakes import synthetic
 from tests.fakes.steps import step_params
@@ -27,7 +28,7 @@ def _run(folder: Path, meshes: dict[str, Mesh], **params: object) -> tuple[Mesh,
     return Mesh.load(done.files["mesh"]), done
 
 
-def test_the_budget_holds_and_the_deviation_is_told(tmp_path: Path) -> None:
+def test_triangle_limit_is_met_and_deviation_reported(tmp_path: Path) -> None:
     ground = synthetic.ground(100)
     mesh, done = _run(tmp_path, {"terrain": ground, "building": synthetic.house()}, triangles=1000)
     assert len(mesh) <= 1000 and mesh.uv is None and mesh.frame == synthetic.UTM
@@ -43,6 +44,15 @@ def test_the_house_keeps_its_shape(tmp_path: Path) -> None:
     mesh, _ = _run(tmp_path, {"terrain": synthetic.ground(100), "building": synthetic.house()}, triangles=500)
     inside = _in_house(mesh.vertices)
     assert mesh.vertices[inside, 2].max() == pytest.approx(4.5, abs=0.01)
+
+
+def test_modelled_boxes_are_not_simplified(tmp_path: Path) -> None:
+    """Simplified, small furniture would no longer be what occupancy maps and simulators take it for."""
+    made = [Box(0.3 * i, np.array([i, 0, 0.0]), np.array([i + 0.2, 0.2, 0.3])) for i in range(40)]
+    vertices, faces = mesh_of(made)
+    furniture = Mesh(synthetic.UTM, vertices, faces)
+    mesh, _ = _run(tmp_path, {"terrain": synthetic.ground(10), "furniture": furniture})
+    assert np.count_nonzero(mesh.classification == CODE["furniture"]) == len(furniture)
 
 
 def test_a_surface_in_crumbs_keeps_to_the_budget_too(tmp_path: Path) -> None:
@@ -64,7 +74,7 @@ def test_plants_are_solid_where_nothing_else_is(tmp_path: Path) -> None:
     assert mesh.classification is not None and set(mesh.classification.tolist()) == {CODE["high_vegetation"]}
 
 
-def test_nothing_solid_is_refused(tmp_path: Path) -> None:
+def test_world_without_solid_surfaces_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="terrain, building and vegetation are empty"):
         _run(tmp_path, {"terrain": NONE, "vegetation": NONE})
 

@@ -142,7 +142,7 @@ def test_lists_of_plants_are_put_beside_the_world(tmp_path: Path) -> None:
     assert (world / "plants.csv").read_text(encoding="utf-8") == "plants_csv"
 
 
-def test_what_does_not_fit_together_is_refused(tmp_path: Path) -> None:
+def test_inconsistent_inputs_are_rejected(tmp_path: Path) -> None:
     inputs = _inputs(tmp_path, building=synthetic.house(Frame("EPSG:32632", (1.0, 2.0, 3.0))))
     with pytest.raises(InputError, match="origin"):
         EXPORT.run(inputs, ExportParams(), tmp_path / "a", silent)

@@ -82,7 +82,7 @@ def wall(height: float, hole: tuple[float, float, float, float] | None = None, d
 def built(
     folder: Path, points: tuple[F64, F64], scene: Scene, others: tuple[F64, F64] | None = None
 ) -> tuple[PointCloud, Done]:
-    """What the step makes up of a scan and photos."""
+    """Points that the step synthesizes from a scan and photos."""
     PATH.save(folder / "path.npz")
     random, files = np.random.default_rng(6), {}
     x, y = (random.uniform(-15, 25, 60_000), random.uniform(-5, 6, 60_000))
@@ -115,29 +115,29 @@ def built(
 
 
 def tops(made: PointCloud) -> F64:
-    """(C,) metres: how high what was made up reaches, every half metre along the wall; 0 where it isn't."""
+    """(C,) metres: height of the synthesized wall every half metre along it; 0 without."""
     bins = np.floor(made.xyz[:, 0] / 0.5).astype(int)
     return np.array([made.xyz[bins == k, 2].max(initial=0.0) for k in range(int(LONG / 0.5))])
 
 
 @pytest.mark.parametrize("height", [3.4, 5.0])
 @pytest.mark.parametrize("behind", [0.0, 9.0])
-def test_a_wall_goes_on_to_where_photos_show_its_top(tmp_path: Path, height: float, behind: float) -> None:
+def test_wall_is_extended_to_its_top_in_photos(tmp_path: Path, height: float, behind: float) -> None:
     made, done = built(tmp_path, wall(height), Scene(height, behind))
     assert np.abs(tops(made)[1:-1] - height).max() < 0.3
     assert np.ptp(tops(made)[1:-1]) < 0.25, "its top is no straight line"
     assert np.abs(made.xyz[:, 1] - WALL).max() < 0.03
-    assert made.xyz[:, 0].min() > -0.1 and made.xyz[:, 0].max() < LONG + 0.1, "it goes on beside its ends"
+    assert made.xyz[:, 0].min() > -0.1 and made.xyz[:, 0].max() < LONG + 0.1, "it extends beyond its ends"
     assert done.metrics["above_m2"] > 0.5 * LONG * (height - 2.0)
 
 
-def test_a_plain_wall_goes_on_while_it_looks_as_it_does_below(tmp_path: Path) -> None:
+def test_plain_wall_is_extended_while_its_appearance_continues(tmp_path: Path) -> None:
     made, _ = built(tmp_path, wall(4.0), Scene(4.0, plain=True))
     assert np.median(tops(made)) == pytest.approx(4.0, abs=0.2) and tops(made).max() < 4.3
 
 
 @pytest.mark.parametrize("behind", [0.0, 9.0])
-def test_nothing_is_built_where_photos_show_the_sky_or_another_wall(tmp_path: Path, behind: float) -> None:
+def test_walls_are_not_extended_into_sky_or_other_walls(tmp_path: Path, behind: float) -> None:
     made, _ = built(tmp_path, wall(1.9), Scene(1.9, behind))
     assert tops(made).max() < 2.25
 

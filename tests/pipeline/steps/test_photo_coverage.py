@@ -14,7 +14,7 @@ from scan2sim.flows.pipelines.survey import build_survey_graph
 from scan2sim.flows.pipelines.tile import build_graph
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.step import Done, silent
-from scan2sim.pipeline.core.types import F32, Camera, Frame, PointCloud, Tile, Trajectory, View
+from scan2sim.pipeline.core.types import F32, UNCOLOURED, Camera, Frame, PointCloud, Tile, Trajectory, View
 from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.steps.photo_coverage import CLOSING_CELL_M, PHOTO_COVERAGE, ROADSIDE_M
@@ -58,7 +58,7 @@ def go(inputs: dict[str, Path], out: Path, **params: Any) -> Done:
     return PHOTO_COVERAGE.run(inputs, step_params(PHOTO_COVERAGE.params, **params), out, silent)
 
 
-def test_what_photos_see_and_the_lane_stay_and_the_rest_goes(street: dict[str, Path], tmp_path: Path) -> None:
+def test_covered_points_and_the_lane_are_kept_and_others_removed(street: dict[str, Path], tmp_path: Path) -> None:
     done = go(street, tmp_path)
     cloud = left(done)
     x, y, z = cloud.xyz.T
@@ -75,6 +75,43 @@ def test_what_photos_see_and_the_lane_stay_and_the_rest_goes(street: dict[str, P
     assert done.metrics["left_out_m2"] == pytest.approx(lost * 0.01, rel=0.1)
 
 
+def test_uncovered_points_are_thinned_by_class(street: dict[str, Path], tmp_path: Path) -> None:
+    done = go(street, tmp_path)
+    covered, thin = left(done), PointCloud.load(done.files["uncovered"])
+    removed = sum(map(len, PARTS.values())) - len(covered)
+    assert removed / 12 < len(thin) == done.metrics["coarse"] < removed / 6
+    x, y, z = thin.xyz.T
+    assert thin.classification is not None and thin.normal is not None
+    assert (thin.classification[(y > 7.5) & (y < 8.5) & (z > 0.5)] == CODE["building"]).all()
+    ground = thin.classification == CODE["road"]
+    assert (thin.normal[ground, 2] > 0.99).all()
+    behind = ground & (x > -29) & (x < -5) & (abs(y) < 19)
+    cells = np.unique(np.floor(np.column_stack([x, y])[behind]), axis=0)
+    assert len(cells) > 0.98 * 24 * 38, "the street behind the first photo is there"
+
+
+def test_uncovered_points_can_be_removed(street: dict[str, Path], tmp_path: Path) -> None:
+    (tmp_path / "coarse").mkdir()
+    done, coarse = go(street, tmp_path, uncovered="remove"), go(street, tmp_path / "coarse")
+    assert len(PointCloud.load(done.files["uncovered"])) == 0
+    np.testing.assert_array_equal(left(done).xyz, left(coarse).xyz)
+
+
+def test_uncovered_points_without_colours_get_those_of_their_class(street: dict[str, Path], tmp_path: Path) -> None:
+    cloud = PointCloud.load(street["cloud"])
+    x = cloud.xyz[:, 0]
+    rgb = np.where((x > 0)[:, None], [90, 100, 110], UNCOLOURED).astype(np.uint8)
+    intensity = (1000 + 100 * (np.arange(len(x)) % 7)).astype(np.uint16)
+    for name, one in (("classes", None), ("intensity", intensity)):
+        (tmp_path / name).mkdir()
+        replace(cloud, rgb=rgb, intensity=one).save(tmp_path / name / "in.npz")
+        done = go(street | {"cloud": tmp_path / name / "in.npz"}, tmp_path / name)
+        thin = PointCloud.load(done.files["uncovered"])
+        assert thin.coloured.all() and thin.rgb is not None
+        behind = thin.rgb[thin.xyz[:, 0] < -10].astype(float)
+        np.testing.assert_allclose(np.median(behind, axis=0), [90, 100, 110], atol=15)
+
+
 def test_ground_hidden_behind_something_small_is_kept(street: dict[str, Path], tmp_path: Path) -> None:
     cloud = left(go(street, tmp_path))
     x, y, _ = cloud.xyz.T
@@ -84,6 +121,7 @@ def test_ground_hidden_behind_something_small_is_kept(street: dict[str, Path], t
 
 def test_metres_from_the_path(street: dict[str, Path], tmp_path: Path) -> None:
     done = go(street, tmp_path, limit=6.0)
+    assert len(PointCloud.load(done.files["uncovered"])) == 0
     x, y, _ = left(done).xyz.T
     away = np.hypot(x - x.clip(0, 10), y)
     assert 5.5 < away.max() < 6.6 and done.metrics["far_m"] < 6.6
@@ -95,7 +133,7 @@ def test_held_out_photos_dont_count(street: dict[str, Path], tmp_path: Path) -> 
     assert np.hypot(x - x.clip(0, 10), y).max() < ROADSIDE_M + 1.5 * CLOSING_CELL_M
 
 
-def test_a_path_in_the_air_and_a_tile_without_photos_keep_all(street: dict[str, Path], tmp_path: Path) -> None:
+def test_airborne_paths_and_tiles_without_photos_keep_all_points(street: dict[str, Path], tmp_path: Path) -> None:
     path = Trajectory.load(street["path"])
     replace(path, positions=path.positions + [0, 0, 50]).save(tmp_path / "path.npz")
     for i, inputs in enumerate((street | {"path": tmp_path / "path.npz"}, {"cloud": street["cloud"]})):
@@ -104,7 +142,7 @@ def test_a_path_in_the_air_and_a_tile_without_photos_keep_all(street: dict[str, 
         assert done.metrics["left_out"] == 0 and len(left(done)) == len(PointCloud.load(street["cloud"]))
 
 
-def test_only_where_photos_are_taken_along_a_path_and_neighbours_read_it() -> None:
+def test_step_exists_only_with_photos_along_a_path() -> None:
     view = View("a", CAMERA, np.eye(4), Path("a.jpg"))
     bare = Tile(Path("tile.toml"), "a", Frame(), (Path("cloud.laz"),))
     street = replace(bare, views=(view,))
@@ -122,3 +160,5 @@ def test_only_where_photos_are_taken_along_a_path_and_neighbours_read_it() -> No
     tasks = {task.full_name: task for task in build_survey_graph(tiles, Settings())}
     read = {(source.task.full_name, source.name) for source in tasks["a/overlap"].inputs.values()}  # type: ignore[union-attr]
     assert read == {("a/photo_coverage", "cloud"), ("b/photo_coverage", "cloud")}
+    coarse = tasks["a/overlap.uncovered"].inputs.values()
+    assert {source.task.full_name for source in coarse} == {"a/photo_coverage", "b/photo_coverage"}  # type: ignore[union-attr]

@@ -67,7 +67,7 @@ def test_a_corner_is_sharp(tmp_path: Path) -> None:
     assert np.abs(reach(after, tuple(corner), 0.5, 2.5)).max() < 0.01
 
 
-def test_a_wall_ends_where_its_points_end_but_goes_on_into_the_ground(tmp_path: Path) -> None:
+def test_wall_ends_with_its_points_and_extends_into_the_ground(tmp_path: Path) -> None:
     x, y = np.meshgrid(np.arange(-1, 5, 0.1), np.arange(-2, 2, 0.1))
     ground = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     before, after, _ = laid(wall((0, 0), (4, 0)), tmp_path, others=ground)
@@ -95,7 +95,7 @@ def test_a_wall_with_noise_and_boards_is_flat(tmp_path: Path) -> None:
     assert tilted(before) > 0.2 and tilted(after) < 0.02
 
 
-def test_a_border_with_another_tile_stays_as_it_was(tmp_path: Path) -> None:
+def test_tile_borders_are_not_moved(tmp_path: Path) -> None:
     """The neighbour's planes aren't the same, what both made of the points is."""
     corner = np.concatenate([wall((0, 0), (0, 4)), wall((0, 0), (4, 0))])
     before, after, _ = laid(corner, tmp_path, seed=(-1.0, 1.0), neighbours={"east": (5.0, 1.0)})
@@ -117,7 +117,7 @@ def test_a_window_has_reveals(tmp_path: Path) -> None:
     assert np.quantile(np.minimum(np.abs(between[:, 0] - 1.5), np.abs(between[:, 0] - 2.7)), 0.75) < 0.03
 
 
-def test_what_is_round_stays_as_it_is(tmp_path: Path) -> None:
+def test_round_surfaces_are_unchanged(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     angle, z = random.uniform(0, 2 * np.pi, 12_000), random.uniform(0, 3, 12_000)
     before, after, metrics = laid(np.column_stack([0.6 * np.cos(angle), 0.6 * np.sin(angle), z]), tmp_path)

@@ -38,7 +38,7 @@ def scene(done: Done) -> trimesh.Scene:
 
 
 @pytest.mark.parametrize(("megapixels", "side"), [(32, 256), (0.1, 158)])
-def test_it_is_the_world_with_pages_within_bounds(made: Any, megapixels: float, side: int) -> None:
+def test_preview_contains_the_world_within_the_size_limits(made: Any, megapixels: float, side: int) -> None:
     done = made(megapixels=megapixels)
     meshes = scene(done).geometry
     assert sorted(meshes) == ["building_0", "building_1", "terrain_0", "terrain_1"]
@@ -49,7 +49,7 @@ def test_it_is_the_world_with_pages_within_bounds(made: Any, megapixels: float, 
     assert sizes == [side] * 4 and done.metrics["scale"] == pytest.approx(side / 256, abs=0.01)
 
 
-def test_one_starts_on_the_ground_and_above_it(made: Any) -> None:
+def test_preview_camera_starts_on_the_ground(made: Any) -> None:
     metrics = made().metrics
     (x, y, z), target = metrics["walk"]
     assert z - synthetic.height(np.array(x), np.array(y)) == pytest.approx(1.6, abs=0.3)

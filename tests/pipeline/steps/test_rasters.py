@@ -66,7 +66,7 @@ def test_gdal_reads_them_as_cloud_optimised(tmp_path: Path) -> None:
             assert raster.res == pytest.approx((0.1, 0.1)) and raster.bounds.left == 689_990
 
 
-def test_where_nothing_is_they_say_so(tmp_path: Path) -> None:
+def test_rasters_have_nodata_without_points(tmp_path: Path) -> None:
     ground = synthetic.ground()
     hole = np.abs(ground.corners.mean(axis=1)[:, :2]).max(axis=1) > 4
     inputs = {"terrain": synthetic.textured(tmp_path / "terrain", ground.keep(hole))}

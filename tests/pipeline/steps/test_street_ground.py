@@ -62,7 +62,7 @@ def closed(folder: Path, holes: tuple[tuple[float, ...], ...], *, moved: bool = 
     return PointCloud.load(done.files["synthesized"])
 
 
-def test_the_ground_goes_on_below_a_car_and_behind_a_wall(tmp_path: Path) -> None:
+def test_ground_is_extended_below_cars_and_behind_walls(tmp_path: Path) -> None:
     made = closed(tmp_path, (CAR, SHADOW))
     for hole in (CAR, SHADOW):
         there = within(made.xyz[:, :2], hole)
@@ -78,8 +78,13 @@ def test_courtyards_and_what_lies_beyond_the_scan_stay_open(tmp_path: Path) -> N
     assert within(made, COURT, -1.0).sum() == 0 and within(made, EDGE, -1.0).sum() == 0  # corners alone are rounded
 
 
-def test_where_something_drove_nothing_is_made_up(tmp_path: Path) -> None:
-    wide = (CAR[0] - 20, CAR[1] - 3, CAR[2] + 20, CAR[3] + 3)  # a street's width that the scan lacks, through the tile
+def test_no_ground_is_synthesized_where_vehicles_drove(tmp_path: Path) -> None:
+    wide = (
+        CAR[0] - 20,
+        CAR[1] - 3,
+        CAR[2] + 20,
+        CAR[3] + 3,
+    )  # a street's width that is missing in the scan, through the tile
     assert len(closed(tmp_path, (wide,), moved=True)) == 0
 
 

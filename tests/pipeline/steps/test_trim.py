@@ -17,7 +17,7 @@ CORNERS = np.array([[0, 0, 0], [0.15, 0, 0], [0, 0.15, 0]], np.float32)
 def trimmed(
     folder: Path, triangles: list[F32], density: list[list[float]], points: F32
 ) -> tuple[list[int], dict[str, Any]]:
-    """Which of the triangles stay, and what is told."""
+    """Which triangles are kept, and the metrics."""
     vertices = np.concatenate(triangles).astype(np.float32)
     faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
     classification = np.arange(len(faces), dtype=np.uint8)
@@ -31,7 +31,7 @@ def trimmed(
     return left.tolist(), done.metrics
 
 
-def test_long_edges_sparse_samples_and_what_is_far_from_points_go(tmp_path: Path) -> None:
+def test_long_edges_sparse_samples_and_surface_far_from_points_are_removed(tmp_path: Path) -> None:
     x, y = np.mgrid[0:40, 0:6]
     points = np.stack([x.ravel() * 0.1, y.ravel() * 0.1, 0.0 * x.ravel()], axis=1).astype(np.float32)
     shift = np.array([3.5, 0, 0], np.float32)
@@ -43,3 +43,20 @@ def test_long_edges_sparse_samples_and_what_is_far_from_points_go(tmp_path: Path
     left, metrics = trimmed(tmp_path, triangles, [dense, sparse, dense, dense, still[1]], points)
     assert left == [0, 4]
     assert [metrics[name] for name in ("long_edges", "sparse", "far_from_points", "widened")] == [1, 1, 1, 1.0]
+
+
+def test_near_uncovered_points_limits_follow_their_spacing(tmp_path: Path) -> None:
+    x, y = np.mgrid[0:80, 0:12]
+    covered = np.stack([x.ravel() * 0.1, y.ravel() * 0.1, 0.0 * x.ravel()], axis=1).astype(np.float32)
+    x, y = np.mgrid[0:20, 0:4]
+    uncovered = np.stack([20 + x.ravel() * 0.3, y.ravel() * 0.3, 0.0 * x.ravel()], axis=1).astype(np.float32)
+    big = CORNERS * 3.5  # edges of 53 and 74 cm
+    vertices = np.concatenate([big, big + [21, 0, 0], big * 2 + [22, 0, 0]]).astype(np.float32)
+    faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
+    Mesh(Frame(), vertices, faces, np.full(9, 10, np.float32)).save(tmp_path / "mesh.npz")
+    PointCloud(Frame(), covered).save(tmp_path / "cloud.npz")
+    PointCloud(Frame(), uncovered).save(tmp_path / "uncovered.npz")
+    inputs = {name: tmp_path / f"{name}.npz" for name in ("mesh", "cloud", "uncovered")}
+    done = trim(inputs, TrimParams(), tmp_path, silent)
+    left = Mesh.load(done.files["mesh"])
+    assert len(left) == 1 and 20 < left.vertices[:, 0].min() < left.vertices[:, 0].max() < 22

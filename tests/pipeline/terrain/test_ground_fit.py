@@ -39,7 +39,7 @@ def error(mesh: Mesh) -> np.ndarray:
     return np.asarray(np.abs(z - truth(x, y)))
 
 
-def test_it_comes_nearer_to_the_true_surface_than_points_are(bumpy: Mesh) -> None:
+def test_fitted_ground_is_closer_to_the_truth_than_the_points(bumpy: Mesh) -> None:
     smooth = fit_heights(bumpy, points(), np.zeros(len(bumpy.vertices), bool))
     assert np.percentile(error(bumpy), 95) > 0.05 and np.percentile(error(smooth), 95) < 0.01
     assert np.array_equal(smooth.vertices[:, :2], bumpy.vertices[:, :2]) and smooth.faces is bumpy.faces
@@ -52,7 +52,7 @@ def test_a_kerb_keeps_its_height(bumpy: Mesh) -> None:
     assert level[(x > 5.3) & (x < 5.7)].mean() - level[(x > 4.3) & (x < 4.7)].mean() == pytest.approx(KERB, abs=0.005)
 
 
-def test_a_few_points_of_something_else_do_not_lift_it(bumpy: Mesh) -> None:
+def test_ground_fit_is_robust_to_outliers(bumpy: Mesh) -> None:
     many = points()
     many[::20, 2] += 0.1
     smooth = fit_heights(bumpy, many, np.zeros(len(bumpy.vertices), bool))
@@ -66,7 +66,7 @@ def test_vertices_of_a_border_stay(bumpy: Mesh) -> None:
     assert not np.array_equal(smooth.vertices[~fixed], bumpy.vertices[~fixed])
 
 
-def test_where_nothing_was_seen_it_gets_smoother(bumpy: Mesh) -> None:
+def test_ground_without_points_is_smoother(bumpy: Mesh) -> None:
     seen = points()
     hole = np.linalg.norm(seen[:, :2] + 4, axis=1) > 2
     smooth = fit_heights(bumpy, seen[hole], np.zeros(len(bumpy.vertices), bool))

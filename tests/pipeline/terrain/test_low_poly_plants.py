@@ -28,7 +28,7 @@ def planted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_each_has_its_place_size_and_colour(planted: Path) -> None:
+def test_each_plant_has_its_position_size_and_colour(planted: Path) -> None:
     shape = textured_mesh.read(planted)
     assert shape is not None and len(shape) < 400
     seen = renderer.Renderer([renderer.textured(planted)]).above((-4, -4, 0), (12, 6, 10), width=320)

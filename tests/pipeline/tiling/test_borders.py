@@ -63,7 +63,7 @@ def sheet(u: np.ndarray, v: np.ndarray, place: Any, hole: Any = None) -> tuple[n
 
 
 def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Of the ground, metres."""
+    """Height of the ground, metres."""
     return 0.4 * np.sin(x / 2) * np.cos(y / 3)
 
 
@@ -170,7 +170,7 @@ def test_the_owner_stays_and_the_other_is_sound(two: Any) -> None:
     assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)
 
 
-def test_the_surface_behind_the_border_goes_along(tmp_path: Path) -> None:
+def test_surface_beyond_the_border_follows_it(tmp_path: Path) -> None:
     """A border that lay 10 cm lower is met by a ramp of half a metre, not a step."""
     flat = {
         name: scene(frame, 0.1, 0, noise=0.0).keep(np.arange(len(scene(frame, 0.1, 0))) < 2 * 60 * 80)
@@ -221,7 +221,7 @@ def test_a_missing_neighbour_leaves_the_border_as_cut(two: Any) -> None:
     assert np.array_equal(alone.mesh.vertices, clips["west"].mesh.vertices) and alone.metrics == {}
 
 
-def test_nothing_meets_nothing(two: Any) -> None:
+def test_empty_meshes_are_clipped_and_joined(two: Any) -> None:
     meshes, clips, _ = two
     empty = Mesh(EAST, np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty(0, np.float32))
     cell = cells(SEEDS)["east"]
@@ -238,7 +238,7 @@ def test_nothing_meets_nothing(two: Any) -> None:
     assert len(away.mesh) == 0
 
 
-def test_the_steps_pass_it_on(two: Any, tmp_path: Path) -> None:
+def test_clip_and_join_steps_pass_the_border(two: Any, tmp_path: Path) -> None:
     meshes, _, joined = two
     clips: dict[str, Path] = {}
     for name, mesh in meshes.items():
@@ -259,7 +259,7 @@ def test_the_steps_pass_it_on(two: Any, tmp_path: Path) -> None:
     assert thin.metrics["border_kept"] and not thin.warnings
 
 
-def test_what_is_touched_meets_at_the_border_and_is_thinned_at_all_other_rims(two: Any, tmp_path: Path) -> None:
+def test_joined_borders_meet_and_other_open_edges_are_decimated(two: Any, tmp_path: Path) -> None:
     _, _, joined = two
     solid = {}
     for name, mesh in joined.items():
@@ -283,7 +283,7 @@ def test_what_is_touched_meets_at_the_border_and_is_thinned_at_all_other_rims(tw
     )
 
 
-def test_a_border_that_needs_more_than_the_budget_is_kept_and_said(two: Any, tmp_path: Path) -> None:
+def test_border_exceeding_the_target_is_kept_with_a_warning(two: Any, tmp_path: Path) -> None:
     _, _, joined = two
     cell = cells(SEEDS)["west"]
     joined["west"].save(tmp_path / "terrain.npz")
@@ -300,7 +300,7 @@ def rim_edges(mesh: Mesh, cell: Cell) -> int:
     return int((~on_border(mesh, cell)[opened].all(axis=1)).sum())
 
 
-def test_decimate_may_be_told_to_keep_the_border(tmp_path: Path) -> None:
+def test_decimate_keeps_the_border_on_request(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     corners = random.uniform(0, 50, (12_000, 1, 3)) + random.uniform(-0.1, 0.1, (12_000, 3, 3))
     faces = np.arange(36_000, dtype=np.int32).reshape(-1, 3)
@@ -372,7 +372,7 @@ def test_overlap_loses_no_point_and_doubles_none(count: int, tmp_path: Path) -> 
     assert np.array_equal(np.sort(np.concatenate(taken)), times(whole)), "every point is one tile's own"
 
 
-def test_overlap_leaves_what_a_missing_neighbour_would_give(tmp_path: Path) -> None:
+def test_overlap_skips_missing_neighbours(tmp_path: Path) -> None:
     seeds = {"a": (X - 4.0, Y), "b": (X + 4.0, Y), "c": (X, Y + 6.0)}
     found = overlapped(seeds, tmp_path, missing="c")["a"]
     assert sorted(set(present(found.classification).tolist())) == [2, 3]
@@ -409,7 +409,7 @@ def test_voxels_of_two_tiles_are_the_same_where_they_overlap(tmp_path: Path) -> 
     assert np.array_equal(rows["a"], rows["b"])
 
 
-def test_plants_are_listed_by_the_tile_that_they_stand_in(tmp_path: Path) -> None:
+def test_plants_are_listed_by_the_tile_that_contains_them(tmp_path: Path) -> None:
     seeds = {"a": (X - 5.0, Y), "b": (X + 5.0, Y)}
     random = np.random.default_rng(0)
     balls = [random.normal(size=(3000, 3)) for _ in range(5)]
@@ -429,7 +429,7 @@ def test_plants_are_listed_by_the_tile_that_they_stand_in(tmp_path: Path) -> Non
     assert sum(map(len, rows)) == 5
 
 
-def test_geometry_asks_the_cells_own_points_alone(two: Any, tmp_path: Path) -> None:
+def test_geometry_uses_only_points_of_the_own_cell(two: Any, tmp_path: Path) -> None:
     _, _, joined = two
     joined["west"].save(tmp_path / "mesh.npz")
     cloud(WEST).save(tmp_path / "cloud.npz")

@@ -199,7 +199,7 @@ def test_a_town_has_seeds_about_a_length_apart_everywhere() -> None:
     assert np.linalg.norm(path.positions[:, None, :2] - made, axis=2).min(axis=1).max() <= 100
 
 
-def test_a_gap_ends_a_stretch_and_is_told() -> None:
+def test_gap_in_the_path_is_reported() -> None:
     first, second = path_of((0, 0), (300, 0)), path_of((400, 0), (700, 0))
     path = Trajectory(
         np.concatenate([first.times, 60 + second.times]), np.concatenate([first.positions, second.positions])
@@ -233,7 +233,7 @@ def test_without_a_path_seeds_are_on_a_grid() -> None:
         seeds("s", Frame(), 100.0, (0, 0), (1e6, 1e6))
 
 
-def test_seeds_are_what_a_tile_file_can_hold() -> None:
+def test_seeds_are_rounded_to_thousandths_of_the_unit() -> None:
     path = replace(path_of((0.1234567, 0.7), (333.3, 71.1)))
     for x, y in seeds("s", FEET, 100.0, (0, 0), (1, 1), path).values():
         assert (round(x / 0.3048, 3) * 0.3048, round(y / 0.3048, 3) * 0.3048) == (x, y)
@@ -281,7 +281,7 @@ def test_every_tile_holds_exactly_its_points_and_they_are_the_same_in_all(bend: 
     assert len(union) == total
 
 
-def test_tiles_say_what_is_their_own(cut: Path) -> None:
+def test_tiles_contain_their_cells(cut: Path) -> None:
     made = tiles(cut)
     survey = read_survey(cut.parent)
     assert survey == Survey(cut, "bend", {name: cut.parent / name / "tile.toml" for name in made}, 100.0, 5.0)
@@ -428,7 +428,7 @@ def test_an_interruption_leaves_nothing(tmp_path: Path) -> None:
     assert left(tmp_path) == []
 
 
-def test_only_a_survey_is_overwritten_and_only_when_told(tmp_path: Path) -> None:
+def test_only_a_survey_is_overwritten_and_only_on_request(tmp_path: Path) -> None:
     folder = corridor(tmp_path / "corridor", n=20_000)
     cut_survey(folder, tmp_path / "out", CUT)
     with pytest.raises(SettingError, match="exists and is not empty"):
@@ -455,7 +455,7 @@ def test_options_out_of_range_are_refused(tmp_path: Path, options: dict[str, flo
         cut_survey(tmp_path, tmp_path / "out", CutParams.of("", options))
 
 
-def test_tiles_with_few_points_go_to_their_neighbours(tmp_path: Path) -> None:
+def test_tiles_with_few_points_are_merged_into_neighbours(tmp_path: Path) -> None:
     xy = street(np.arange(0, 500, 0.5), np.zeros(1000))  # drives on where there are no clouds
     path = np.column_stack([np.arange(1000) / 20, xy, np.full(1000, 2.0)])
     folder = corridor(tmp_path / "corridor", n=20_000, path=path)
@@ -468,7 +468,7 @@ def test_tiles_with_few_points_go_to_their_neighbours(tmp_path: Path) -> None:
     assert all(name in made for tile in made.values() for name in (tile.cell.neighbours if tile.cell else ()))
 
 
-def test_a_trajectory_elsewhere_is_told(tmp_path: Path) -> None:
+def test_trajectory_far_from_the_points_is_an_error(tmp_path: Path) -> None:
     path = drive()
     path[:, 1] += 5000
     folder = corridor(tmp_path / "corridor", n=20_000, path=path)

@@ -1,4 +1,4 @@
-"""Street furniture at the borders of tiles: found once, one mesh in one tile, taken out of both tiles alike."""
+"""Street furniture at the borders of tiles: found once, one mesh in one tile, removed from both tiles alike."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def tiles(clouds: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> 
     return {name: furnish(clouds, found, name, folder / name) for name in FRAMES}
 
 
-def test_what_stands_at_a_border_is_listed_once_where_it_stands(tiles: dict[str, Tile]) -> None:
+def test_furniture_at_a_border_is_listed_once_at_its_position(tiles: dict[str, Tile]) -> None:
     places = {"sign": SIGN, "lamp": LAMP, "trunk": TRUNK, "pole": BEHIND}
     rows = {name: tile.rows for name, tile in tiles.items()}
     assert sorted(row["kind"] for name in rows for row in rows[name]) == sorted(places)
@@ -165,7 +165,7 @@ def test_what_stands_at_a_border_is_listed_once_where_it_stands(tiles: dict[str,
                 assert name == ("east" if place[0] > 0 else "west")
 
 
-def test_each_is_whole_in_one_tile(tiles: dict[str, Tile]) -> None:
+def test_furniture_mesh_is_complete_in_one_tile(tiles: dict[str, Tile]) -> None:
     corners = {name: world(tile.mesh("building")) - (X, Y, Z) for name, tile in tiles.items()}
     codes = {name: present(tile.mesh("building").classification) for name, tile in tiles.items()}
     (owner,) = [name for name in codes if (codes[name] == CODE["road_sign"]).any()]
@@ -178,7 +178,7 @@ def test_each_is_whole_in_one_tile(tiles: dict[str, Tile]) -> None:
     assert sorted(len(tile.mesh("vegetation")) > 0 for tile in tiles.values()) == [False, True]
 
 
-def test_nothing_of_it_stays_with_the_surfaces(tiles: dict[str, Tile]) -> None:
+def test_furniture_points_are_removed_from_surfaces(tiles: dict[str, Tile]) -> None:
     for tile in tiles.values():
         left = PointCloud.load(tile.split.files["building"])
         xyz = left.xyz + np.asarray(tile.cloud.frame.origin) - (X, Y, Z)
@@ -186,10 +186,10 @@ def test_nothing_of_it_stays_with_the_surfaces(tiles: dict[str, Tile]) -> None:
         assert len(beside) < 0.01 * len(tile.taken)
 
 
-def test_both_take_the_same_points(tiles: dict[str, Tile]) -> None:
+def test_both_tiles_remove_the_same_points(tiles: dict[str, Tile]) -> None:
     east, west = ({tuple(p) for p in tile.taken.tolist() if abs(p[0] - X) <= BUFFER} for tile in tiles.values())
     assert east == west and len(east) > 5000
-    for tile in tiles.values():  # what is the neighbour's hides, and lends no colour
+    for tile in tiles.values():  # the neighbour's furniture occludes, and gives no colour
         own = np.load(tile.furniture.files["furniture_points"])["own"]
         assert len(PointCloud.load(tile.split.files["furniture"])) == own.sum() > 0
         assert len(PointCloud.load(tile.split.files["rest"])) == (~own).sum() > 0
@@ -233,7 +233,7 @@ def test_surfaces_meet_vertex_for_vertex(tiles: dict[str, Tile], clouds: dict[st
 
 
 @pytest.mark.parametrize("silent_one", ["east", "west"])
-def test_what_one_tile_alone_finds_goes_from_both(
+def test_furniture_detected_by_one_tile_is_removed_from_both(
     silent_one: str, tiles: dict[str, Tile], clouds: dict[str, Path], tmp_path: Path
 ) -> None:
     nothing = go(
@@ -244,11 +244,11 @@ def test_what_one_tile_alone_finds_goes_from_both(
     east, west = ({tuple(p) for p in tile.taken.tolist() if abs(p[0] - X) <= BUFFER} for tile in made.values())
     assert east == west
     kinds = {row["kind"] for tile in made.values() for row in tile.rows}
-    assert kinds == {"sign", "trunk", "pole" if silent_one == "west" else "lamp"}  # others are the other's to tell
+    assert kinds == {"sign", "trunk", "pole" if silent_one == "west" else "lamp"}  # the other tile lists the others
     assert sum(len(tile.rows) for tile in made.values()) == 3
 
 
-def test_a_tile_whose_neighbour_is_not_made_shows_its_own(
+def test_tile_with_a_missing_neighbour_keeps_its_detections(
     tiles: dict[str, Tile], clouds: dict[str, Path], tmp_path: Path
 ) -> None:
     for name, tile in tiles.items():
@@ -256,7 +256,7 @@ def test_a_tile_whose_neighbour_is_not_made_shows_its_own(
         assert [row["kind"] for row in alone.rows] == [row["kind"] for row in tile.rows]
 
 
-def test_all_agree_in_whatever_order_they_ask(tiles: dict[str, Tile]) -> None:
+def test_merge_is_independent_of_tile_order(tiles: dict[str, Tile]) -> None:
     finds = {
         name: [Detection.from_json(row) for row in json.loads(tile.found.read_text(encoding="utf-8"))]
         for name, tile in tiles.items()
@@ -272,8 +272,8 @@ def test_all_agree_in_whatever_order_they_ask(tiles: dict[str, Tile]) -> None:
 
 
 def test_two_poles_side_by_side_on_a_border_stay_two(tiles: dict[str, Tile]) -> None:
-    told = [Detection.from_json(row) for row in json.loads(tiles["west"].found.read_text(encoding="utf-8"))]
-    (sign,) = [thing for thing in told if thing.kind == "sign"]
+    detections = [Detection.from_json(row) for row in json.loads(tiles["west"].found.read_text(encoding="utf-8"))]
+    (sign,) = [thing for thing in detections if thing.kind == "sign"]
     beside = sign.moved(np.array([-0.3, 0.0, 0.0]))
     jitter = np.array([0.02, -0.01, 0.0])
     both = {"west": [sign, beside], "east": [sign.moved(jitter), beside.moved(jitter)]}

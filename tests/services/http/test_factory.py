@@ -13,6 +13,7 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.error import HTTPError
 
 import pytest
 
@@ -25,9 +26,10 @@ from fastapi.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 from websockets.sync.client import connect
 
-from scan2sim.services.http import factory, limits
+from scan2sim.services.http import bodies, factory, limits
 
 TOKEN = "0123456789abcdef"
+ERROR_FIELDS = {"where", "cause", "remedy", "error"}
 
 
 class Worker:
@@ -94,13 +96,14 @@ def test_health_reflects_the_workers() -> None:
 def test_errors_have_the_http_status_of_their_class(kind: type[ScanError]) -> None:
     answer = client_of(app_of()).get(f"/fail/{kind.__name__}")
     assert answer.status_code == EXIT_CODES[kind][1]
-    assert answer.json() == {"where": "tile.toml", "cause": "is wrong", "remedy": "Fix it"}
+    message = {"where": "tile.toml", "cause": "is wrong", "remedy": "Fix it"}
+    assert answer.json() == {**message, "error": "tile.toml: is wrong. Fix it"}
 
 
 @pytest.mark.parametrize(("path", "status"), [("/nix", 404), ("/number?value=x", 422), ("/fail/other", 500)])
-def test_error_responses_have_only_where_cause_and_remedy(path: str, status: int) -> None:
+def test_error_responses_have_no_details_of_the_program(path: str, status: int) -> None:
     answer = client_of(app_of()).get(path)
-    assert answer.status_code == status and set(answer.json()) == {"where", "cause", "remedy"}
+    assert answer.status_code == status and set(answer.json()) == ERROR_FIELDS
     assert "secret" not in answer.text
 
 
@@ -127,7 +130,7 @@ def test_dns_rebinding_is_rejected() -> None:
         assert client_of(app_of(), host).get("/number").status_code == 200, host
     for host in ("evil.example", "localhost.evil.example", "127.0.0.1.evil.example:8080"):
         answer = client_of(app_of(), host).get("/number")
-        assert answer.status_code == 421 and set(answer.json()) == {"where", "cause", "remedy"}, host
+        assert answer.status_code == 421 and set(answer.json()) == ERROR_FIELDS, host
 
 
 @pytest.mark.parametrize("text", ["", "short", "two words that are long", "ümläutümläutümläut"])
@@ -223,7 +226,7 @@ def test_tls_without_a_token_logs_a_warning(
 def plain(monkeypatch: pytest.MonkeyPatch) -> int:
     """Port of a running service with short timeouts."""
     monkeypatch.setattr(limits, "REQUEST_TIMEOUT_S", 1.0)
-    monkeypatch.setattr(factory, "BODY_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(bodies, "BODY_TIMEOUT_S", 0.5)
     addresses: list[str] = []
     params = ServerParams(port=0)
     app = app_of(params)
@@ -304,6 +307,61 @@ def test_missing_body_times_out(plain: int) -> None:
     with socket.create_connection(("127.0.0.1", plain), timeout=20) as half:
         half.sendall(b"POST /length HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10\r\n\r\nabc")
         assert b"408" in half.recv(100)
+
+
+def half_post(port: int, sent: int = 3, size: int = 10) -> socket.socket:
+    half = socket.create_connection(("127.0.0.1", port), timeout=20)
+    half.sendall(f"POST /length HTTP/1.1\r\nHost: localhost\r\nContent-Length: {size}\r\n\r\n".encode() + b"x" * sent)
+    return half
+
+
+def test_body_that_arrives_in_parts_has_a_deadline_in_total(plain: int) -> None:
+    with half_post(plain, size=100) as slow:
+        for _ in range(20):
+            with contextlib.suppress(OSError):
+                slow.send(b"x")
+            time.sleep(0.1)
+        assert b"408" in slow.recv(100)
+
+
+def test_body_that_has_been_arriving_longest_is_given_up_for_others(
+    plain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bodies, "BODY_TIMEOUT_S", 60.0)
+    monkeypatch.setattr(bodies, "MAX_ARRIVING", 3)
+    slow = []
+    for _ in range(5):
+        slow.append(half_post(plain))
+        time.sleep(0.2)
+    assert [b"408" in one.recv(100) for one in slow[:2]] == [True, True]
+    for one in slow[2:]:
+        one.sendall(b"y" * 7)
+        assert b"200" in one.recv(100)
+        one.close()
+
+
+def test_memory_for_bodies_is_limited(monkeypatch: pytest.MonkeyPatch, plain: int) -> None:
+    monkeypatch.setattr(bodies, "BODY_TIMEOUT_S", 60.0)
+    size = factory.MAX_BODY_BYTES
+    slow = [half_post(plain, size - 1, size) for _ in range(bodies.MAX_MEMORY_BODIES)]
+    time.sleep(0.5)
+    with half_post(plain, size, size) as complete:
+        assert b"200" in complete.recv(100)
+    assert b"408" in slow[0].recv(100), "the oldest was given up"
+    for one in slow:
+        one.close()
+
+
+def test_health_is_served_whatever_the_number_of_requests(plain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(factory, "MAX_CONCURRENT_REQUESTS", 1)
+    waiting = socket.create_connection(("127.0.0.1", plain), timeout=20)
+    waiting.sendall(b"GET /slow?seconds=3 HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    time.sleep(0.5)
+    with pytest.raises(HTTPError) as caught:
+        urllib.request.urlopen(f"http://127.0.0.1:{plain}/number", timeout=10)
+    assert caught.value.code == 503 and caught.value.headers["Retry-After"] == "1"
+    urllib.request.urlopen(f"http://127.0.0.1:{plain}/health/live", timeout=10).close()
+    waiting.close()
 
 
 def test_cross_origin_requests_are_rejected() -> None:

@@ -92,7 +92,7 @@ def test_empty_and_damaged_archives_are_reported(tmp_path: Path) -> None:
 def test_records_from_kafka_are_archived_and_queried(tmp_path: Path, broker: Broker) -> None:
     records = [record(number, NOON + number) for number in range(1, 6)]
     bodies = [OutboxRecord(number, one.id, one.json_line().encode()) for number, one in enumerate(records)]
-    kafka.TopicProducer(broker.servers, "records").send([*bodies, OutboxRecord(9, "other:1", b"no record"), *bodies])
+    kafka.TopicProducer(broker.cluster, "records").send([*bodies, OutboxRecord(9, "other:1", b"no record"), *bodies])
     stop, warnings = threading.Event(), list[str]()
     params = ArchiveParams(archive=tmp_path / "kept", kafka_bootstrap_servers=broker.servers, topic="records")
     archiver = threading.Thread(target=archive_records, args=(params, stop, warnings.append))

@@ -120,8 +120,8 @@ def test_clock_jump_is_reported_and_latencies_recover(tmp_path: Path, start: Sta
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 0, errors
     found = records(tmp_path / "log")
-    jumps = [number for number, one in enumerate(found) if any("clock was set" in text for text in one["remarks"])]
-    assert ["+3600" in found[jumps[0]]["remarks"][0], "-10800" in found[jumps[-1]]["remarks"][0]] == [True, True]
+    jumps = [number for number, one in enumerate(found) if any("clock was set" in text for text in one["warnings"])]
+    assert ["+3600" in found[jumps[0]]["warnings"][0], "-10800" in found[jumps[-1]]["warnings"][0]] == [True, True]
     wrong = {number + after for number in jumps for after in (0, 1)}
     latencies = [
         one["latency (nanoseconds)"] for number, one in enumerate(found) if one["messages"] and number not in wrong
@@ -161,7 +161,7 @@ def test_malformed_messages_are_counted_and_harmless(transport: str, tmp_path: P
     if transport == "cyclone":  # rclpy passes them on as empty messages
         unreadable = sum(one["flows"][0]["unreadable messages"] for one in found)
         assert 10 < unreadable < sum(one["messages"] for one in found) - 10
-        assert any("messages are not valid std_msgs/msg/String" in text for one in found for text in one["remarks"])
+        assert any("messages are not valid std_msgs/msg/String" in text for one in found for text in one["warnings"])
 
 
 def test_topic_of_an_unknown_type_is_monitored(tmp_path: Path, start: Start) -> None:
@@ -188,7 +188,7 @@ def test_topic_of_an_unknown_type_is_monitored(tmp_path: Path, start: Start) -> 
     flow = found[-1]["flows"][0]
     assert (flow["type"], flow["lost messages"]) == ("my_msgs/msg/Own", 0)
     assert 24 < flow["message size mean"] < 50
-    assert [text for text in found[-1]["remarks"] if "exceeds the limit 1" in text] == found[-1]["remarks"]
+    assert [text for text in found[-1]["warnings"] if "exceeds the limit 1" in text] == found[-1]["warnings"]
 
 
 def test_unknown_type_with_rclpy_suggests_the_other_transport(tmp_path: Path, start: Start) -> None:
@@ -226,7 +226,7 @@ def test_connection_errors_name_their_cause(no_kafka: str, monkeypatch: pytest.M
         ("nowhere.invalid:9092", "Name or service not known|Temporary failure"),
     ):
         with pytest.raises(ConnectionError, match=rf"no Kafka at {servers} \(({cause})\); check the address"):
-            kafka.TopicProducer(servers, "monitor_data").send([OutboxRecord(1, "a:1", b"body")])
+            kafka.TopicProducer(kafka.Cluster(servers), "monitor_data").send([OutboxRecord(1, "a:1", b"body")])
 
 
 @pytest.mark.parametrize("servers", ["", "a b:9092", "http://127.0.0.1:9092", "127.0.0.1:port", "a:1,,b:2", "größe:1"])

@@ -21,16 +21,17 @@ pytest.importorskip("fastapi", reason="the extra bus isn't installed")
 
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.http import factory
-from scan2sim.services.kafka import TopicProducer
+from scan2sim.services.kafka import TopicProducer, read
 from scan2sim.services.monitoring.dashboard.app import Sources, application
 from scan2sim.services.monitoring.dashboard.history import History
-from scan2sim.services.monitoring.events.schema import Event
+from scan2sim.services.monitoring.events.schema import AlarmCommand, Event
+from scan2sim.services.monitoring.record import TopicFlow
 from scan2sim.services.monitoring.settings.dashboard import PageParams
 from scan2sim.services.monitoring.settings.limits import Limits
 from scan2sim.services.outbox import OutboxRecord
 from tests.fakes.broker import Broker
 from tests.fakes.browser import Page, chromium
-from tests.services.monitoring.sample_records import record
+from tests.fakes.sample_records import record
 from tests.waiting import until
 
 HOSTILE = "<img src=x onerror=document.title='hacked'>"
@@ -107,7 +108,7 @@ def event(kind: str, **body: Any) -> bytes:
 
 def a_run(run: str, **changed: Any) -> bytes:
     fields = {"command": "survey", "source": "drive", "host": "edge", "state": "running", "steps": 100, "running": 1,
-              "done": 40, "kept": 10, "failed": 1, "seconds": 3725.0}  # fmt: skip
+              "done": 40, "cached": 10, "failed": 1, "seconds": 3725.0}  # fmt: skip
     return event("run", run=run, **fields | changed)
 
 
@@ -115,8 +116,8 @@ def a_step(run: str, step: str, state: str, **more: Any) -> bytes:
     return event("step", **{"run": run, "tile": "street_1", "step": step, "state": state} | more)
 
 
-def an_alarm(state: str, rule: str, since: float, subject: str = "/camera") -> bytes:
-    return event("alarm", state=state, rule=rule, subject=subject, value=0.31, since=since)
+def an_alarm(state: str, rule: str, since: float, subject: str = "/camera", **more: Any) -> bytes:
+    return event("alarm", state=state, rule=rule, subject=subject, value=0.31, since=since, **more)
 
 
 def a_queue(name: str) -> bytes:
@@ -139,7 +140,7 @@ def figure_of(page: Page, title: str) -> np.ndarray:
 
 def test_records_from_kafka_appear_once_on_the_page(broker: Broker, page: Page) -> None:
     params = PageParams(kafka_bootstrap_servers=broker.servers, port=0)
-    topic = TopicProducer(broker.servers, params.topic)
+    topic = TopicProducer(broker.cluster, params.topic)
     topic.send(records(["early"], 30))  # before the page was started
     with serve_page(params) as served:
         until(lambda: len(served.history.state()["nodes"]) == 1)
@@ -148,12 +149,12 @@ def test_records_from_kafka_appear_once_on_the_page(broker: Broker, page: Page) 
         twice = records(["camera", "lidar"], 20, latency=150_000_000)
         topic.send(twice)
         topic.send(twice)
-        page.until("document.querySelectorAll('#nodes tbody tr').length === 3")
+        page.until("document.querySelectorAll('#nodes tbody tr, #gone tbody tr').length === 3")
         assert page.value("[...document.querySelectorAll('figcaption b')].map(b => b.textContent)") == [
             "Bandwidth by node", "Latency", "Total bandwidth", "Lost messages per period", "Messages per period",
             "Mean message size",
         ]  # fmt: skip
-        assert "150 ms" in page.value("document.querySelector('#nodes tbody').textContent")
+        assert "150 ms" in page.value("document.getElementById('nodes').closest('section').textContent")
         page.until("document.getElementById('counts').textContent.startsWith('70 records')")
         broker.kill()
         until(lambda: not served.sources.is_connected())
@@ -162,8 +163,8 @@ def test_records_from_kafka_appear_once_on_the_page(broker: Broker, page: Page) 
         assert served.get("health/live") == {"failing": []}
         page.until("document.getElementById('status').textContent === 'Kafka is unreachable'")
         broker.start()  # it has lost all records
-        TopicProducer(broker.servers, params.topic).send(records(["late"], 5))
-        page.until("document.querySelectorAll('#nodes tbody tr').length === 4")
+        TopicProducer(broker.cluster, params.topic).send(records(["late"], 5))
+        page.until("document.querySelectorAll('#nodes tbody tr, #gone tbody tr').length === 4")
         page.until("document.getElementById('status').textContent === 'live'")
 
 
@@ -173,14 +174,14 @@ def filled() -> Iterator[ServedPage]:
     with serve_page(PageParams(port=0, limit=Limits(lost=4)), reading=False) as served:
         fill(served.history, [f"node_{i:02d}" for i in range(18)], lost=4)
         fill(served.history, ["lossy"], lost=5)
-        fill(served.history, [HOSTILE], hostname=HOSTILE, remarks=[HOSTILE], topics=[HOSTILE])
+        fill(served.history, [HOSTILE], hostname=HOSTILE, warnings=[HOSTILE], topics=[HOSTILE])
         served.history.add(json.dumps({"schema": HOSTILE}).encode())
         yield served
 
 
 def test_values_above_a_limit_are_red_dots(filled: ServedPage, page: Page) -> None:
     open_page(page, filled.url)
-    page.until("document.querySelectorAll('#nodes tbody tr').length === 20")
+    page.until("document.querySelectorAll('#nodes tbody tr, #gone tbody tr').length === 20")
     assert count_red_pixels(figure_of(page, "Lost messages per period")) > 300
     for title in ("Mean message size", "Latency"):
         assert count_red_pixels(figure_of(page, title)) == 0
@@ -191,7 +192,7 @@ def test_values_above_a_limit_are_red_dots(filled: ServedPage, page: Page) -> No
 @pytest.mark.parametrize("phone", [False, True], ids=["desk", "phone"])
 def test_page_fits_the_screen_in_both_themes(dark: bool, phone: bool, filled: ServedPage, page: Page) -> None:
     open_page(page, filled.url, phone=phone, dark=dark)
-    page.until("document.querySelectorAll('#nodes tbody tr').length === 20")
+    page.until("document.querySelectorAll('#nodes tbody tr, #gone tbody tr').length === 20")
     assert page.value("document.documentElement.scrollWidth <= innerWidth"), "no sideways scroll"
     widths = page.value("[...document.querySelectorAll('.uplot canvas')].map(c => c.getBoundingClientRect().right)")
     assert len(widths) == 6 and max(widths) <= page.value("innerWidth")
@@ -206,10 +207,11 @@ def test_page_fits_the_screen_in_both_themes(dark: bool, phone: bool, filled: Se
 
 def test_names_are_escaped(filled: ServedPage, page: Page) -> None:
     open_page(page, filled.url)
-    page.until("document.getElementById('remarks').textContent.includes('onerror')")
+    page.until("document.getElementById('warnings').textContent.includes('onerror')")
     assert page.value("document.querySelectorAll('img').length") == 0
     assert page.value("document.title").startswith("Event bus")
-    for place in ("chips", "nodes", "remarks", "counts"):
+    assert HOSTILE in page.value("document.getElementById('nodes').closest('section').textContent")
+    for place in ("chips", "warnings", "counts"):
         assert HOSTILE in page.value(f"document.getElementById({place!r}).textContent"), place
     assert page.value("fetch('https://example.org/').then(() => 'sent', () => 'refused')") == "refused"
 
@@ -224,7 +226,9 @@ def test_user_selects_a_node_and_a_time_range(filled: ServedPage, page: Page) ->
         "(b => [b.x, b.y, b.width, b.height])(document.querySelector('.u-over').getBoundingClientRect())"
     )
     page.do("Input.dispatchMouseEvent", type="mouseMoved", x=x + 0.9 * width, y=y + 0.1 * height)
-    page.until("document.querySelector('figcaption output').textContent.includes('/lossy · 3 kB/s')", 20)
+    page.until(
+        "document.querySelector('.values:not([hidden])')?.innerText.split('\\n').join(' ') === '/lossy 3 kB/s'", 20
+    )
     page.value("[...document.querySelectorAll('#chips button')].find(b => b.textContent === '/lossy').click()")
     page.until("shownWindow && shownWindow.nodes.length === 20")
     x, y, width = page.value(
@@ -268,7 +272,7 @@ def text(page: Page, place: str) -> str:
 
 def test_runs_and_alarms_from_kafka_appear_on_the_page(broker: Broker, page: Page) -> None:
     params = PageParams(kafka_bootstrap_servers=broker.servers, port=0, events_topic="happenings")
-    topic = TopicProducer(broker.servers, params.events_topic)
+    topic = TopicProducer(broker.cluster, params.events_topic)
 
     def send(*bodies: bytes) -> None:
         topic.send([OutboxRecord(0, f"test:{next(NUMBERS)}", body) for body in bodies])
@@ -295,10 +299,12 @@ def test_runs_and_alarms_from_kafka_appear_on_the_page(broker: Broker, page: Pag
         send(a_queue("detect"))
         page.until("!document.getElementById('queues').hidden")
         assert text(page, "#queues tbody").split() == ["detect", "live", "5/s", "3/s", "1.5/s", "4", "200", "ms", "1"]
+        send(an_alarm("raised", "images come late", time.time() - 5, acknowledged_by="Ada"))
+        page.until("document.getElementById('alarm').hidden")
+        assert "acknowledged by Ada" in text(page, "#alarms")
         send(an_alarm("cleared", "images come late", time.time()),
              a_run("r1", state="failed", message="1 of 7 tiles failed"))  # fmt: skip
-        page.until("document.getElementById('alarm').hidden")
-        assert "cleared" in text(page, "#alarms")
+        page.until("document.getElementById('alarms').innerText.includes('cleared')")
         page.until("document.querySelector('.run .failure').innerText === '1 of 7 tiles failed'")
 
 
@@ -327,6 +333,126 @@ def test_runs_and_alarms_are_escaped_and_fit_a_phone(page: Page) -> None:
         assert not page.value("document.querySelector('.run').open"), "it stays folded"
 
 
+def a_flow(topic: str, messages: int) -> TopicFlow:
+    kind = "sensor_msgs/msg/Image"
+    return TopicFlow(
+        topic=topic, direction="outgoing", type=kind, bandwidth=1e3 * messages, messages=messages, size=1e3
+    )
+
+
+def test_topics_are_sorted_by_the_chosen_column_and_past_nodes_fold_away(page: Page) -> None:
+    first = "document.querySelector('#topics tbody td').innerText"
+    with serve_page(PageParams(port=0), reading=False) as served:
+        fill(served.history, ["camera"], period=60.0, flows=[a_flow("/a", 1), a_flow("/b", 9), a_flow("/c", 5)])
+        served.history.add(record("past", time.time() - 100).json_line().encode())
+        open_page(page, served.url)
+        page.until(f"{first} === '/b'")
+        for column, topic in (("topic", "/a"), ("topic", "/c"), ("published", "/b"), ("published", "/a")):
+            page.click(f"#topics th[data-key='{column}'] button")
+            page.until(f"{first} === {topic!r}")
+        assert page.value("document.querySelectorAll('#nodes tbody tr').length") == 1
+        page.until("document.querySelector('#gone summary').innerText === '1 gone'")
+        assert page.value("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_crosshair_lists_all_values_at_a_time(filled: ServedPage, page: Page) -> None:
+    open_page(page, filled.url)
+    page.until("shownWindow && shownWindow.nodes.length >= 20")
+    x, y, width, height = page.value(
+        "(b => [b.x, b.y, b.width, b.height])(document.querySelectorAll('.u-over')[3].getBoundingClientRect())"
+    )
+    page.do("Input.dispatchMouseEvent", type="mouseMoved", x=x + 0.9 * width, y=y + 0.2 * height)
+    lists = "[...document.querySelectorAll('.values')].map(one => one.hidden ? '' : one.innerText)"
+    page.until(f"{lists}.every(text => text)")
+    values = page.value(lists)
+    assert values[3].split("\n")[:2] == ["/lossy", "5"] and values[3].count("node_") == 18, "the largest first"
+    assert "difference" in values[2] and "lower ones" in values[0], "the others at the same time, shorter"
+    right = page.value(
+        "Math.max(...[...document.querySelectorAll('.values')].map(v => v.getBoundingClientRect().right))"
+    )
+    assert right <= page.value("innerWidth")
+    page.do("Input.dispatchMouseEvent", type="mouseMoved", x=2, y=2)
+    page.until(f"{lists}.every(text => !text)")
+
+
+def test_user_plots_by_topic(page: Page) -> None:
+    titles = "[...document.querySelectorAll('figcaption b')].map(b => b.textContent).join()"
+    with serve_page(PageParams(port=0, limit=Limits(bandwidth=10)), reading=False) as served:
+        fill(served.history, ["camera"], flows=[a_flow(HOSTILE, 1), a_flow("/b", 9), a_flow("/c", 5)])
+        served.history.add(record("past", time.time() - 100).json_line().encode())
+        open_page(page, served.url)
+        page.until("shownWindow?.nodes.length === 2")
+        page.until("document.querySelector('#chips summary').innerText === '1 gone'")
+        page.click("[data-by='topic']")
+        page.until("shownWindow?.topics?.length === 3")
+        assert "Bandwidth by topic" in page.value(titles) and "Messages per second" in page.value(titles)
+        assert count_red_pixels(figure_of(page, "Bandwidth by topic")) == 0, "limits are those of nodes"
+        assert HOSTILE in text(page, "#chips") and page.value("document.querySelectorAll('img').length") == 0
+        page.value("[...document.querySelectorAll('#chips button')].find(b => b.textContent === '/b').click()")
+        page.until("shownWindow?.topics.length === 1")
+        assert {one for one in page.value("shownWindow.topics[0].messages.mean") if one is not None} == {9}
+        page.click("[data-by='node']")
+        page.until("shownWindow?.nodes.length === 2 && !shownWindow.topics")
+        assert "Bandwidth by node" in page.value(titles)
+
+
+def test_alarms_are_acknowledged_and_muted_on_the_page(broker: Broker, page: Page) -> None:
+    params = PageParams(kafka_bootstrap_servers=broker.servers, port=0, events_topic="handled")
+    topic = TopicProducer(broker.cluster, params.events_topic)
+    alarm = "raised", "images come late", time.time() - 5, "/camera/image at /fusion"
+
+    def send(**more: Any) -> None:
+        topic.send([OutboxRecord(0, f"test:{next(NUMBERS)}", an_alarm(*alarm, **more))])
+
+    def commands() -> list[AlarmCommand]:
+        bodies = read(broker.cluster, params.events_topic, group=f"test{next(NUMBERS)}", since=0, wait=2.0)
+        bodies = itertools.takewhile(bool, itertools.dropwhile(lambda body: not body, bodies))
+        events = [Event.model_validate_json(body or b"") for body in bodies]
+        events.sort(key=lambda one: one.time)  # they are in different partitions
+        return [AlarmCommand.model_validate(one.body) for one in events if one.kind == "alarm_command"]
+
+    def press(name: str) -> None:
+        page.value(f"[...document.querySelectorAll('#alarms button')].find(b => b.innerText === {name!r}).click()")
+
+    with serve_page(params) as served:
+        page.do("Page.navigate", url=served.url)
+        page.until("document.readyState === 'complete' && byId('status').textContent === 'live'")
+        send()
+        page.until("document.querySelectorAll('#alarms button').length === 2")
+        page.value("localStorage.clear()")
+        assert page.value("[...document.querySelectorAll('#alarms button')].every(b => b.disabled)"), "no name yet"
+        page.value("handling.by.value = 'Ada'; handling.by.dispatchEvent(new Event('input'))")
+        page.until("!document.querySelector('#alarms button').disabled")
+        press("Acknowledge")
+        page.until("document.getElementById('answer').innerText.startsWith('Sent')")
+        page.value("handling.seconds.value = '900'")
+        press("Mute")
+        page.until("document.getElementById('answer').innerText.startsWith('Sent to the alarm node: mute')")
+        acknowledged, muted = commands()
+        assert (acknowledged.action, acknowledged.rule, acknowledged.subject) == ("acknowledge", alarm[1], alarm[3])
+        assert (muted.action, muted.by) == ("mute", "Ada") and 800 < muted.until - time.time() < 900
+        send(acknowledged_by="Ada", muted_until=time.time() + 900)
+        page.until("document.querySelector('#alarms button')?.disabled && document.getElementById('alarm').hidden")
+        assert "Unmute" in text(page, "#alarms")
+        for origin, status in (("https://evil.example", "403"), (served.url.rstrip("/"), "422")):
+            headers = {"Origin": origin, "Content-Type": "application/json"}
+            request = urllib.request.Request(f"{served.url}api/alarms/mute", b"{}", headers)
+            with pytest.raises(urllib.error.HTTPError, match=status):
+                urllib.request.urlopen(request, timeout=60)
+        page.value("localStorage.clear()")
+
+
+def test_alarms_are_not_handled_by_strangers(tmp_path: Path) -> None:
+    from starlette.testclient import TestClient
+
+    for name in ("certificate", "key"):
+        (tmp_path / name).touch()
+    params = PageParams(port=0, host="0.0.0.0", certificate=tmp_path / "certificate", key=tmp_path / "key")
+    client = TestClient(application(params, Sources.of(params)))
+    answer = client.post("/api/alarms/mute", json={"rule": "*", "subject": "/camera", "by": "stranger"})
+    assert answer.status_code == 403 and "--token" in answer.json()["cause"]
+
+
 def test_details_of_unchanged_runs_are_not_resent() -> None:
     with serve_page(PageParams(port=0), reading=False) as served:
         served.sources.bus_state.add(a_run("r1"))
@@ -347,7 +473,7 @@ def test_details_of_unchanged_runs_are_not_resent() -> None:
 def test_invalid_ranges_are_rejected(query: str, filled: ServedPage) -> None:
     with pytest.raises(urllib.error.HTTPError, match="422") as caught:
         filled.get(f"api/history?{query}")
-    assert set(json.load(caught.value)) == {"where", "cause", "remedy"}
+    assert set(json.load(caught.value)) == {"where", "cause", "remedy", "error"}
 
 
 def test_page_prompts_for_the_token(tmp_path: Path, page: Page) -> None:

@@ -20,7 +20,7 @@ NOW = 1e9
 
 
 def run(name: str, state: Any = "running", **more: Any) -> RunState:
-    counts = dict.fromkeys(("steps", "running", "done", "kept", "failed"), 0)
+    counts = dict.fromkeys(("steps", "running", "done", "cached", "failed"), 0)
     return RunState(run=name, command="run", source="tile", host="edge", state=state, seconds=1, **counts | more)
 
 
@@ -86,10 +86,10 @@ def test_running_and_failed_tasks_are_listed_first_and_the_rest_is_counted() -> 
     names = [one["step"] for one in shown(known)["details"]["steps"]]
     assert names[:4] == ["s3", "broken", "s99", "s98"] and len(names) == runs.MAX_LISTED_STEPS
     known.add(step("later", "waiting"), NOW)
-    known.add(step("before", "kept"), NOW)
+    known.add(step("before", "cached"), NOW)
     details = shown(known)["details"]
     assert details["known"] == 103
-    assert details["others"] == {"done": 100 - 1 - (runs.MAX_LISTED_STEPS - 2), "waiting": 1, "kept": 1}
+    assert details["others"] == {"done": 100 - 1 - (runs.MAX_LISTED_STEPS - 2), "waiting": 1, "cached": 1}
 
 
 def test_late_running_event_of_a_worker_does_not_undo_a_final_state() -> None:
@@ -184,7 +184,7 @@ def body(**changed: Any) -> bytes:
 def test_invalid_events_are_counted_by_reason(message: bytes, reason: str) -> None:
     bus_state = BusState(NOW)
     bus_state.add(message)
-    assert bus_state.counts == {reason: 1} and bus_state.last_refused.startswith(reason)
+    assert bus_state.counts == {reason: 1} and bus_state.last_rejected.startswith(reason)
     bus_state.add(body())
     state = bus_state.state(time.time())
     assert len(state["runs"]) == 1

@@ -19,7 +19,8 @@ from scan2sim.services.monitoring.dashboard.history import (
     bucket_edges,
     buckets,
 )
-from tests.services.monitoring.sample_records import body, record
+from scan2sim.services.monitoring.record import TopicFlow
+from tests.fakes.sample_records import body, record
 
 START = 1_700_000_000.0
 
@@ -62,6 +63,12 @@ def test_unknown_values_are_null() -> None:
     assert node["latency"]["mean"] == node["lost"]["mean"] == [None]
 
 
+def test_warnings_under_their_earlier_name_are_read() -> None:
+    earlier = body("a", START, warnings=["limit exceeded"]).replace(b'"warnings"', b'"remarks"')
+    (node,) = history_of(earlier).state()["nodes"]
+    assert node["warnings"] == ["limit exceeded"]
+
+
 def test_record_covers_its_period_and_no_longer() -> None:
     found = window(history_of(body("a", START + 4.5, period=3.0), body("a", START + 20.5, period=3.0)), 21)
     known = [value is not None for value in found["nodes"][0]["bandwidth"]["mean"]]
@@ -85,9 +92,9 @@ def test_sums_hold_the_last_value_of_nodes_whose_record_is_due() -> None:
 
 def test_sums_include_only_selected_nodes() -> None:
     of = history_of(*(body(name, START + 0.5) for name in "abc"))
-    found = window(of, 1, nodes=["/a", "/c", "/unknown"])
+    found = window(of, 1, names=["/a", "/c", "/unknown"])
     assert found["sums"]["in"] == [4000] and [node["name"] for node in found["nodes"]] == ["/a", "/c"]
-    empty = window(of, 1, nodes=["/unknown"])
+    empty = window(of, 1, names=["/unknown"])
     assert empty["nodes"] == [] and empty["sums"]["difference"] == [None]
 
 
@@ -143,7 +150,7 @@ def test_buckets_match_a_slow_reference_on_random_records() -> None:
 def test_invalid_records_are_counted_by_reason(bad: bytes, reason: str) -> None:
     of = history_of(body("a", START + 0.5), bad, body("a", START + 1.5))
     state = of.state()
-    assert state["counts"] == {"shown": 2, reason: 1} and state["last_refused"].startswith(reason)
+    assert state["counts"] == {"shown": 2, reason: 1} and state["last_rejected"].startswith(reason)
     assert window(of, 2)["nodes"][0]["messages"]["mean"] == [3, 3]
     json.dumps(state, allow_nan=False)
 
@@ -172,8 +179,8 @@ def test_records_of_a_node_with_clock_skew_are_shown_at_their_arrival(
     assert off["bandwidth"] == good["bandwidth"] == {"mean": [3000.0] * 20}
     by_name = {node["name"]: node for node in of.state()["nodes"]}
     way = "behind" if behind > 0 else "ahead of"
-    assert f"its clock is {abs(behind):.0f} s {way} this machine's" in by_name["/off"]["remarks"][0]
-    assert not by_name["/good"]["remarks"] and not by_name["/off"]["gone"]
+    assert f"its clock is {abs(behind):.0f} s {way} this machine's" in by_name["/off"]["warnings"][0]
+    assert not by_name["/good"]["warnings"] and not by_name["/off"]["gone"]
 
 
 def test_node_that_ended_before_the_start_is_gone() -> None:
@@ -192,7 +199,7 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     for i in range(5000):
         of.add(record("a", START + i, messages=i))  # type: ignore[arg-type]
     (kept,) = of._nodes.values()
-    assert len(kept.times) == 1250 and 1000 <= kept.count <= 1250
+    assert len(kept.series.times) == 1250 and 1000 <= kept.series.count <= 1250
     messages = of.window(bucket_edges(START + 4000, START + 5000))["nodes"][0]["messages"]
     assert (messages["min"][1], messages["max"][1]) == (4005, 4009)
     for name in "bcdef":
@@ -201,3 +208,72 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 2000.0
     of.add(record("g", START))  # type: ignore[arg-type]
     assert set(of._nodes) == {"/b", "/c", "/g"}, "the node that has been gone for the longest is dropped"
+
+
+def flow(direction: str, messages: int, **changed: Any) -> TopicFlow:
+    values = {"topic": "/camera", "direction": direction, "type": "std_msgs/msg/String", "bandwidth": 100.0 * messages}
+    return TopicFlow(**values | {"messages": messages, "size": 100.0} | changed)
+
+
+def test_topics_are_summed_over_the_nodes_that_are_alive(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    of = history_of(body("gone", START, flows=[flow("outgoing", 99)]))
+    now += 10
+    of.add(body("camera", START + 10, flows=[flow("outgoing", 10)]))
+    of.add(body("near", START + 10, flows=[flow("incoming", 10, latency=1_000_000, lost=0)]))
+    of.add(body("far", START + 10, flows=[flow("incoming", 5, latency=4_000_000, lost=5)]))
+    (found,) = of.state()["topics"]
+    assert found == {
+        "topic": "/camera", "type": "std_msgs/msg/String", "publishers": 1, "subscribers": 2, "published": 10.0,
+        "received": 15.0, "bandwidth": 1000.0, "latency": 0.002, "lost": 5.0, "size": 100.0, "number": 0,
+    }  # fmt: skip
+
+
+def test_window_by_topic_combines_publishers_and_subscribers() -> None:
+    of = History(START)
+    for i in range(4):
+        at = START + i + 0.5
+        of.add(body("camera", at, flows=[flow("outgoing", 10), flow("outgoing", 1, topic="/log")]))
+        of.add(body("near", at, flows=[flow("incoming", 10, latency=1_000_000, lost=0)]))
+        of.add(body("far", at, flows=[flow("incoming", 5, latency=4_000_000, lost=5)]))
+        of.add(body("other", at, flows=[flow("incoming", 6, topic="/tf", latency=None, lost=None)]))
+    found = window(of, 4, by="topic")
+    by_name = {one.pop("name"): one for one in found["topics"]}
+    assert [one.pop("number") for one in by_name.values()] == [0, 1, 2], "a colour for each topic"
+    means = {name: {metric: set(one[metric]["mean"]) for metric in one} for name, one in by_name.items()}
+    camera = {"bandwidth": {1000.0}, "latency": {0.002}, "lost": {5.0}, "messages": {10.0}, "size": {100.0}}
+    assert means["/camera"] == camera, "sent once, though two nodes receive it"
+    assert means["/tf"] == {"bandwidth": {600.0}, "latency": {None}, "lost": {None}, "messages": {6.0}, "size": {100.0}}
+    assert set(found["sums"]["out"]) == {1100.0} and set(found["sums"]["in"]) == {2100.0}
+    (chosen,) = window(of, 4, names=["/log"], by="topic")["topics"]
+    assert chosen["name"] == "/log" and set(chosen["latency"]["mean"]) == {None}
+
+
+def test_topics_that_ended_make_room_for_new_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_FLOWS", 3)
+    of = history_of(body("a", START, flows=[flow("outgoing", 1, topic=f"/{i}") for i in range(5)]))
+    names = [one["name"] for one in window(of, 100, by="topic")["topics"]]
+    assert names == ["/0", "/1", "/2"], "no more than the limit"
+    of.add(body("a", START + 2, flows=[flow("outgoing", 1, topic="/2"), flow("outgoing", 1, topic="/8")]))
+    assert [one["name"] for one in window(of, 100, by="topic")["topics"]] == names, "they may continue"
+    of.add(body("a", START + 4, flows=[flow("outgoing", 1, topic="/8")]))
+    assert [one["name"] for one in window(of, 100, by="topic")["topics"]] == ["/2", "/8"]
+
+
+def test_two_nodes_of_one_name_are_reported_but_no_restart(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    of = History(0.0)
+
+    def warnings(*starts: str) -> list[str]:
+        nonlocal now
+        for start in starts:
+            now += 0.5
+            of.add(body("camera", START + now, node_id=start, id=f"{start}:{int(now * 10)}"))
+        (node,) = of.state()["nodes"]
+        return [text for text in node["warnings"] if "name" in text]
+
+    assert warnings("one", "one", "two", "two") == []
+    assert warnings("one", "two") == ["2 nodes have this name, and their records are mixed: rename all but one"]
+    assert warnings(*["two"] * 8) == []

@@ -36,7 +36,7 @@ class Listener(Monitor):
         self.create_subscription(String, "chatter", lambda message: None, QoS())
 
 role, log, seconds = sys.argv[1], sys.argv[2], float(sys.argv[3])
-settings = {"period": 0.5, "log_file": log} | ({"kafka_bootstrap_servers": sys.argv[4], "spool": log + ".spool"}
+settings = {"period": 0.5, "log_file": log} | ({"kafka_bootstrap_servers": sys.argv[4], "outbox": log + ".outbox"}
                                                if len(sys.argv) > 4 else {})
 ros.init()
 node = {"talker": Talker, "listener": Listener}[role](**settings)
@@ -124,7 +124,7 @@ def test_records_reach_kafka_once_across_a_broker_restart(tmp_path: Path, start:
 
     def receive(enough: int, seconds: float = 30) -> None:
         until = time.monotonic() + seconds
-        for body in kafka.read(broker.servers, "monitor_data", group="test", from_start=True, wait=0.2):
+        for body in kafka.read(broker.cluster, "monitor_data", group="test", from_start=True, wait=0.2):
             if body:
                 received.append(json.loads(body)["record id"])
             if len(set(received)) >= enough or time.monotonic() > until:
@@ -148,7 +148,7 @@ def test_unreachable_broker_does_not_delay_a_node(tmp_path: Path, start: Start) 
     logged = records(tmp_path / "log")
     assert sum(one["outgoing messages"] for one in logged) > 100
 
-    assert len(Outbox(tmp_path / "log.spool")) == len(logged)  # unsent records are buffered
+    assert len(Outbox(tmp_path / "log.outbox")) == len(logged)  # unsent records are buffered
 
 
 def test_topic_of_another_node_is_monitored_and_exported_to_prometheus(tmp_path: Path, start: Start) -> None:
@@ -198,7 +198,7 @@ def test_records_left_by_killed_nodes_are_sent_by_the_next_of_the_same_name(tmp_
         start(*talker, logs[2])
         left = {one["record id"] for log in logs[:2] for one in records(log)}
         received: list[str] = []
-        for body in kafka.read(broker.servers, "monitor_data", group="test", from_start=True, wait=0.2):
+        for body in kafka.read(broker.cluster, "monitor_data", group="test", from_start=True, wait=0.2):
             received += [json.loads(body)["record id"]] if body else []
             if left <= set(received) or time.monotonic() > until:
                 break

@@ -61,7 +61,8 @@ def sent(fake: FakeOsm) -> list[tuple[str, Any]]:
     for one in fake.state.operations.values():
         params = one["operationParams"]
         charts = [chart for vnf in params.get("additionalParamsForVnf", ()) for chart in vnf["additionalParamsForKdu"]]
-        found.append((one["lcmOperationType"], params.get("primitive_params") or charts[0]["additionalParams"]))
+        upgrade = {k: v for k, v in params.get("primitive_params", {}).items() if k != "kdu_reset_values"}
+        found.append((one["lcmOperationType"], upgrade or charts[0]["additionalParams"]))
     return found
 
 
@@ -124,7 +125,8 @@ def test_unreadable_parameters_are_an_error_and_the_instance_can_be_deleted(
 def test_the_fake_returns_parameters_like_each_release(fake: FakeOsm, start: Callable[[], str]) -> None:
     start()
     with Osm(Connection(osm=fake.address)) as osm:
-        (operation,) = osm.operations(str(osm.instances()[0]["_id"]))
-    returned: Any = operation["operationParams"]["additionalParamsForVnf"]
+        (operation,) = osm.operations(osm.instances()[0].record)
+    assert operation.params
+    returned: Any = operation.params.functions
     (function,) = json.loads(returned) if fake.state.as_json else returned
     assert function["additionalParamsForKdu"] == [{"kdu_name": "detect", "additionalParams": VALUES}]

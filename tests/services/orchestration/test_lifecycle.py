@@ -4,23 +4,29 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 import random
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import httpx
 import pytest
 
 from scan2sim.pipeline.core.errors import InputError, ScanError, SettingError, StepError, UnavailableError
 from scan2sim.services.orchestration import apply, deployment, operations
+from scan2sim.services.orchestration import osm as osm_client
 from scan2sim.services.orchestration.apply import ApplyResult, Change
 from scan2sim.services.orchestration.instance import Action, DesiredInstance, Instance, next_action
 from scan2sim.services.orchestration.lifecycle import WaitPolicy
-from scan2sim.services.orchestration.osm import HTTP_ERRORS, Osm
+from scan2sim.services.orchestration.osm import HTTP_ERRORS, Osm, OsmError
 from scan2sim.services.orchestration.package import Packages, build
+from scan2sim.services.orchestration.records import OperationRecord
 from scan2sim.services.orchestration.settings import ApplyParams, Connection
 from scan2sim.services.qos.requirements import Environment
+from tests.fakes import odd_answers
 from tests.fakes.osm import CUT_AFTER, CUT_BEFORE, FakeOsm, OsmState
 from tests.services.orchestration.conftest import TOWN
 
@@ -46,13 +52,18 @@ def states(fake: FakeOsm) -> dict[str, str]:
 DESIRED = DesiredInstance("a", "town", "detect", "container", "nsd", "vim")
 
 
-def observed(state: str = "READY", instantiated: bool = True, tag: str = DESIRED.tag, **operation: str) -> Instance:
-    started = {
-        "lcmOperationType": "instantiate",
-        "operationState": "COMPLETED",
-        "operationParams": DESIRED.request("record"),
-    }
-    return Instance("1", "a", "nsd", tag, state, instantiated, (started, operation) if operation else (started,))
+def operation(kind: str = "action", state: str = "COMPLETED", **params: Any) -> OperationRecord:
+    """Record of an operation with its parameters."""
+    return OperationRecord.model_validate(
+        {"_id": "1", "lcmOperationType": kind, "operationState": state, "operationParams": params}
+    )
+
+
+def observed(
+    state: str = "READY", instantiated: bool = True, tag: str = DESIRED.tag, *operations: OperationRecord
+) -> Instance:
+    started = operation("instantiate", **DESIRED.request("record"))
+    return Instance("1", "a", "nsd", tag, state, instantiated, (started, *operations))
 
 
 @pytest.mark.parametrize(
@@ -62,8 +73,8 @@ def observed(state: str = "READY", instantiated: bool = True, tag: str = DESIRED
         (DESIRED, None, Action.CREATE),
         (DESIRED, observed(), None),
         (DESIRED, observed("NOT_INSTANTIATED", False), Action.INSTANTIATE),
-        (DESIRED, observed("BUILDING", False, operationState="PROCESSING"), Action.WAIT),
-        (None, observed("BUILDING", False, operationState="PROCESSING"), Action.WAIT),
+        (DESIRED, observed("BUILDING", False, DESIRED.tag, operation(state="PROCESSING")), Action.WAIT),
+        (None, observed("BUILDING", False, DESIRED.tag, operation(state="PROCESSING")), Action.WAIT),
         (DESIRED, observed("BROKEN"), Action.TERMINATE),
         (None, observed(), Action.TERMINATE),
         (None, observed("NOT_INSTANTIATED", False), Action.DELETE),
@@ -288,3 +299,115 @@ def test_addresses_without_tls_are_rejected() -> None:
     assert Connection(osm="osm.example.org").northbound_url() == "https://osm.example.org:9999"
     with Osm(Connection(osm="http://127.0.0.1:9")) as osm, pytest.raises(UnavailableError, match="can't connect"):
         osm.instances()
+
+
+def test_values_that_are_removed_from_the_file_leave_the_cluster(fake: FakeOsm, town: Path) -> None:
+    """OSM merges values unless a request resets them; the plan compares with what runs."""
+    gpu = 'values = { variables = { LEVEL = "debug", EXTRA = "1" }, resources = { limits = { "nvidia.com/gpu" = 1 } } }'
+    values = {"variables": {"LEVEL": "debug", "EXTRA": "1"}, "resources": {"limits": {"nvidia.com/gpu": 1}}}
+    town.write_text(TOWN.replace('cluster = "edge-cluster"', f'cluster = "edge-cluster"\n{gpu}'), encoding="utf-8")
+    assert not apply_file(fake, town).failed
+    (key,) = (one["_id"] for one in fake.state.instances.values() if one["name"] == "detect-north")
+    assert fake.state.releases[key] == values | {"replicaCount": 2}
+    merging = {"member_vnf_index": "1", "kdu_name": "detect", "primitive": "upgrade", "primitive_params": {"x": 1}}
+    with Osm(Connection(osm=fake.address)) as osm:  # an upgrade by somebody else, without a reset
+        osm.start_operation(key, "action", merging)
+    fake.state.complete_due(at=math.inf)
+    town.write_text(TOWN, encoding="utf-8")
+    assert [(one.name, one.action) for one in plan_changes(fake, town)][-1] == ("detect-north", "upgrade")
+    assert not apply_file(fake, town).failed
+    assert fake.state.releases[key] == {"replicaCount": 2} and plan_changes(fake, town) == []
+
+
+def test_values_follow_the_merges_of_upgrades() -> None:
+    chart = {"additionalParams": {"a": {"b": 1, "c": 2}}}
+    first: dict[str, Any] = {"additionalParamsForVnf": [{"additionalParamsForKdu": [chart]}]}
+    started = operation("instantiate", **first)
+    merged = operation("action", primitive="upgrade", primitive_params='{"a": {"b": 3}, "d": 4, "kdu_model": "x"}')
+    removed = operation("action", primitive="upgrade", primitive_params={"d": None})
+    reset = operation("action", primitive="upgrade", primitive_params={"e": 5, "kdu_reset_values": "True"})
+    failed = operation("action", "FAILED", primitive="upgrade", primitive_params={"f": 6})
+
+    def values(*operations: OperationRecord) -> dict[str, object]:
+        return Instance("1", "a", "nsd", "", "READY", True, operations).values
+
+    assert values(started, merged) == {"a": {"b": 3, "c": 2}, "d": 4}
+    assert values(started, merged, removed) == {"a": {"b": 1, "c": 2}}
+    assert values(started, merged, reset, failed) == {"e": 5}
+    assert values(started, reset, started) == {"a": {"b": 1, "c": 2}}
+
+
+def test_machines_are_counted_since_the_last_instantiation() -> None:
+    out = operation("scale", scaleVnfData={"scaleVnfType": "SCALE_OUT"})
+    again = operation("instantiate")
+    assert Instance("1", "a", "nsd", "", "READY", True, (again, out, out)).machine_count == 3
+    assert Instance("1", "a", "nsd", "", "READY", True, (again, out, out, again, out)).machine_count == 2
+
+
+def test_a_refused_package_leaves_no_record(fake: FakeOsm, town: Path) -> None:
+    for status in (400, 409, 413, 422):
+        fake.state.faults = lambda method, path: status if path.endswith("package_content") else None  # noqa: B023
+        assert apply_file(fake, town).failed
+        assert fake.state.functions == {} and fake.state.instances == {}
+    fake.state.faults = lambda method, path: None
+
+
+def test_an_old_osm_is_recognized(fake: FakeOsm, town: Path) -> None:
+    fake.state.sol006 = False
+    with pytest.raises(StepError, match="older than Release 9") as caught:
+        raise apply.failure(apply_file(fake, town)) or AssertionError
+    assert "docs/orchestration.md" in caught.value.remedy and fake.state.functions == {}
+
+
+def test_an_unknown_project_is_named(fake: FakeOsm) -> None:
+    with Osm(Connection(osm=fake.address, project="tow")) as osm, pytest.raises(OsmError, match="project tow"):
+        osm.instances()
+
+
+def test_refused_connections_are_retried_after_osm_has_answered(
+    fake: FakeOsm, town: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """OSM is down at every fourth request: nothing is done twice."""
+    count, params = itertools.count(), ApplyParams(osm=fake.address, wait=True, timeout=20)
+    with Osm(params) as osm:
+        transport = osm._client._transport
+        send = transport.handle_request
+
+        def flaky(request: httpx.Request) -> httpx.Response:
+            if next(count) % 4 == 3:
+                raise httpx.ConnectError("Connection refused")
+            return send(request)
+
+        monkeypatch.setattr(transport, "handle_request", flaky)
+        deployed = apply.load_state(osm, deployment.read(town), town.parent)
+        result = apply.apply(osm, deployed, params, lambda fraction, message="": None)
+    assert not result.failed, result.failed
+    assert set(states(fake).values()) == {"READY"} and len(states(fake)) == 2 and fake.state.orphans() == []
+    assert len(fake.state.operations) == 3  # two instantiations and a scaling
+
+
+def test_a_redirect_is_explained(fake: FakeOsm) -> None:
+    fake.state.answer = odd_answers.KINDS["a redirect to another server"]
+    with Osm(Connection(osm=fake.address)) as osm, pytest.raises(OsmError, match=r"redirects to .*elsewhere") as caught:
+        osm.instances()
+    assert "--osm" in caught.value.remedy and len(fake.state.requests) == 2
+
+
+def test_a_slow_server_is_reported_and_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(osm_client, "SLOW_RESPONSE_S", 0.1)
+    monkeypatch.setattr(osm_client, "RESPONSE_TIMEOUT_S", 0.4)
+    messages: list[str] = []
+    slow = lambda method, path: time.sleep(0.8) if "ns_instances" in path else None  # noqa: E731
+    with FakeOsm(OsmState(faults=slow)) as fake, Osm(Connection(osm=fake.address), on_slow=messages.append) as osm:
+        begun = time.monotonic()
+        with pytest.raises(StepError, match=r"didn't answer within 0\.4 s"):
+            osm.instances()
+        assert time.monotonic() - begun < 5 and len(messages) == 1 and "ns_instances" in messages[0]
+
+
+def test_an_answer_that_drips_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each byte comes in time, but the answer never ends."""
+    monkeypatch.setattr(osm_client, "RESPONSE_TIMEOUT_S", 0.5)
+    response = httpx.Response(200, content=(time.sleep(0.1) or b" " for _ in itertools.count()))  # type: ignore[func-returns-value]
+    with pytest.raises(StepError, match="didn't answer"):
+        osm_client._read_bounded(response, "GET /")

@@ -103,14 +103,14 @@ def test_a_chart_is_valid_once_helm_has_inserted_the_values(which: str) -> None:
 
     made = {}
     for path, text in files.items():
-        filled = re.sub(r"\{\{ toJson \.Values\.(\w+) \}\}", insert, text)
+        filled = re.sub(r"\{\{ toJson \.Values\.(\w+) \}\}", insert, re.sub(r"\{\{ range .*?\{\{ end \}\}", "", text))
         made[path] = json.loads(re.sub(r"\{\{ .*? \}\}", "x", filled))
     spec = made["templates/deployment.yaml"]["spec"]
     pod = spec["template"]["spec"]
     container = pod["containers"][0]
     assert spec["replicas"] == 1 and spec["selector"]["matchLabels"] == spec["template"]["metadata"]["labels"]
     assert made["templates/variables.yaml"]["data"] == service.variables
-    assert bool(service.token) == ("volumeMounts" in container) == bool(pod["volumes"])
+    assert bool(service.token) == bool(container["volumeMounts"]) == bool(pod["volumes"])
     if service.token:
         (mounted,), (volume,) = container["volumeMounts"], pod["volumes"]
         (item,) = volume["secret"]["items"]

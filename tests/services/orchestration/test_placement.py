@@ -38,6 +38,15 @@ def test_sites_are_ordered_by_distance_and_list_unmet_requirements(tmp_path: Pat
     )
 
 
+def test_metrics_that_were_not_measured_are_named(tmp_path: Path) -> None:
+    path = measured(tmp_path, "edge")
+    site = json.loads(path.read_text(encoding="utf-8"))
+    site["rows"].append({"metric": "gpu_memory", "required": "at least 2048", "measured": None, "passed": None})
+    path.write_text(json.dumps(site), encoding="utf-8")
+    (found,) = placement.place("detect", [placement.read(path)])
+    assert found.fits and found.unknown == ("gpu memory",)
+
+
 def test_measurements_of_another_service_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="measured with segment"):
         placement.place("detect", [placement.read(measured(tmp_path, "edge", "segment"))])

@@ -13,9 +13,10 @@ import pytest
 
 from tests.fakes.osm import FakeOsm
 
-TESTED_PATHS = r"^/(vnfpkgm/v1/vnf_packages|nsd/v1/ns_descriptors|nslcm/v1/ns_(instances|lcm_op_occs)|admin/v1/(tokens|vim_accounts|k8sclusters))(/|$)"  # noqa: E501
-UPLOAD_PATHS = r"(package|nsd)_content$"  # schemathesis can't generate packages
-CHECKS = "not_a_server_error,status_code_conformance,content_type_conformance,response_headers_conformance,response_schema_conformance"  # noqa: E501
+TESTED_PATHS = r"^/(vnfpkgm/v1/vnf_packages|nsd/v1/ns_descriptors|nslcm/v1/ns_(instances|lcm_op_occs)|nst/v1/netslice_templates|nsilcm/v1/(netslice_instances|nsi_lcm_op_occs)|admin/v1/(tokens|vim_accounts|k8sclusters))(/|$)"  # noqa: E501
+UPLOAD_PATHS = r"(package|nsd|nst)_content$"  # schemathesis can't generate packages
+# not response_headers_conformance: OSM itself returns relative locations, although its file says URI
+CHECKS = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance"
 
 
 @pytest.mark.parametrize("phases", ["fuzzing", pytest.param("coverage,fuzzing", marks=pytest.mark.slow)])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from itertools import pairwise
 from pathlib import Path
 
@@ -22,8 +24,10 @@ from scan2sim.services.qos.encoding import (
     jpeg,
     scaled,
 )
+from tests.conftest import ROOT
 
 RATE = 10.0
+SAMPLE_IMAGES = ROOT / "data_samples" / "tile"
 
 
 @pytest.fixture(scope="module")
@@ -93,3 +97,22 @@ def test_the_command_prints_both_choices(images: list[U8], tmp_path: Path) -> No
     assert run.exit_code == 0, run.output
     chosen = choose_jpeg(images, RATE, 1.0)
     assert f"quality {chosen.quality}" in run.output and "Mbit/s for the encoder" in run.output
+    assert run.output.count("; agreement ") == 2
+
+
+def test_the_command_shows_what_accuracy_an_encoding_costs(tmp_path: Path) -> None:
+    pytest.importorskip("av", reason="the extra slam isn't installed")
+    shutil.copytree(SAMPLE_IMAGES, tmp_path / "tile")
+    photos = sorted((tmp_path / "tile").rglob("*.jpg"))
+    kept = []
+    for name, budget in (("rich", 40.0), ("poor", 0.7)):
+        folder = tmp_path / name
+        folder.mkdir()
+        for photo in photos:
+            shutil.copy(photo, folder)
+        arguments = ["qos", "choose", str(folder), "--rate", "2", "--budget", str(budget), "--json"]
+        run = CliRunner().invoke(app, arguments)
+        assert run.exit_code == 0, run.output
+        kept.append(json.loads(run.output))
+    assert kept[0]["detector"] == "vehicles"
+    assert 0.7 < kept[0]["jpeg"]["agreement"] <= 1 and kept[1]["jpeg"]["agreement"] < kept[0]["jpeg"]["agreement"]

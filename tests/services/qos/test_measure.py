@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+import json
 import math
 import os
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -13,17 +16,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from scan2sim.flows.commands import qos_table
 from scan2sim.pipeline.core.errors import InputError, UnavailableError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.services.qos import deployment, environments, robot
-from scan2sim.services.qos.compare import compare_metrics, passed, resource_needs
+from scan2sim.services.qos.compare import compare_metrics, passed, resource_needs, summary
 from scan2sim.services.qos.encoding import Jpeg
 from scan2sim.services.qos.environments import Network, network
 from scan2sim.services.qos.host_load import Machine, Usage
 from scan2sim.services.qos.link_profile import LinkProfile
 from scan2sim.services.qos.measure import MAX_LINK_UTILIZATION, Measurement, MeasureParams, encoding_of, measure
 from scan2sim.services.qos.probe import ProbeResult
-from scan2sim.services.qos.requirements import NETWORK_METRICS, Environment, Requirements, read
+from scan2sim.services.qos.requirements import MACHINE_METRICS, NETWORK_METRICS, Environment, Requirements, read
 from scan2sim.services.qos.robot import RequestStats
 
 
@@ -31,12 +35,12 @@ class _Toolbox(BaseHTTPRequestHandler):
     """Responds that every third image was dropped."""
 
     protocol_version = "HTTP/1.1"
-    count = 0
+    numbers = itertools.count(1)
 
     def do_POST(self) -> None:
-        type(self).count += 1
+        number = next(self.numbers)
         self.rfile.read(int(self.headers["Content-Length"]))
-        body = b'{"state": "dropped"}' if type(self).count % 3 == 0 else b'{"state": "done"}'
+        body = b'{"state": "dropped"}' if number % 3 == 0 else b'{"state": "done"}'
         self.send_response(200)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
@@ -71,6 +75,26 @@ def measurement(probe: ProbeResult | None, response: float = 100.0) -> Measureme
     return Measurement(requests, probe, usage, Machine(2, 3000, None, None, None), 1_375_000, Jpeg(90, 1.0, 1.2))
 
 
+def test_what_cannot_be_measured_or_decided_neither_passes_nor_fails() -> None:
+    required = Requirements.model_validate({"gpu_memory": 2048, "loss_rate": "< 0.003", "error_rate": "< 0.01"})
+    found = {row.metric: row for row in compare_metrics(required, measurement(PROBE))}
+    assert (found["gpu_memory"].passed, found["gpu_memory"].note) == (None, "not measured")
+    low, high = found["loss_rate"].bounds or (1, 0)
+    assert low < 0.002 < 0.003 < high and (found["loss_rate"].passed, found["loss_rate"].note) == (None, "not decided")
+    assert found["error_rate"].passed, "none of 1000 packets was corrupted"
+    rows = list(found.values())
+    assert summary(rows, NETWORK_METRICS) == "passed; not decided: loss rate"
+    assert summary(rows, MACHINE_METRICS) == "passed; not measured: gpu memory"
+    lossy = replace(PROBE, loss_rate=0.02)
+    assert summary(compare_metrics(required, measurement(lossy)), NETWORK_METRICS) == "FAILED"
+
+
+def test_json_has_null_where_numbers_are_not_finite() -> None:
+    found = qos_table.document(compare_metrics(Requirements(), measurement(PROBE, response=math.inf)), worst=math.inf)
+    text = json.dumps(found, allow_nan=False)
+    assert json.loads(text)["worst"] is None and not json.loads(text)["passed"]
+
+
 PROBE = ProbeResult(sent=1000, loss_rate=0.002, error_rate=0, delay=20, jitter=3, bytes=0)
 
 
@@ -103,7 +127,7 @@ def test_measured_metrics_are_compared_with_requirements() -> None:
 def test_the_encoding_fits_budget_requirements_and_link(given: dict[str, Any], budget: float) -> None:
     """Detection requires 5 Mbit/s in the cloud, whose uplink has 20 Mbit/s, and 60 Mbit/s at the edge."""
     noise = np.random.default_rng(0).integers(0, 255, (640, 640, 3), np.uint8)  # the worst case for compression
-    params = MeasureParams(**{"toolbox": "detect", "environment": Environment.CLOUD, "rate": 10, **given})
+    params = MeasureParams(**{"service": "detect", "environment": Environment.CLOUD, "rate": 10, **given})
     required, link = read("detect").of(params.environment), network(params.environment)
     chosen = encoding_of([noise], params, required, link)
     assert 0.4 * min(budget, 30) < chosen.megabits <= budget
@@ -144,9 +168,25 @@ def test_the_probe_measures_delay_and_loss_of_the_link() -> None:
 
 
 @requires_root
+def test_the_event_bus_is_measured_over_a_link() -> None:
+    pytest.importorskip("cyclonedds", reason="the extra bus isn't installed")
+    from scan2sim.services.monitoring.qos import measure as bus
+
+    try:
+        found = bus.measure(Environment.CLOUD, None, 5, 5000, 4, silent)
+    except UnavailableError as error:
+        pytest.skip(str(error))
+    assert (found.events.sent, found.events.received, found.events.corrupted) == (20, 20, 0)
+    values = found.values()
+    assert 25 < (values["delay"] or 0) < 2000 and values["data_rate"] == pytest.approx(0.2, rel=0.3)
+    assert found.wire_bytes and found.wire_bytes > found.events.bytes and values["response_time"] is None
+    assert found.bounds()["loss_rate"][1] == pytest.approx(3 / 20, rel=0.1)
+
+
+@requires_root
 def test_a_toolbox_is_measured_over_a_link() -> None:
     pytest.importorskip("fastapi", reason="the extra bus isn't installed")
-    params = MeasureParams(toolbox="segment", environment=Environment.CLOUD, rate=1, seconds=4)
+    params = MeasureParams(service="segment", environment=Environment.CLOUD, rate=1, seconds=4)
     service = read("segment").model_copy(update={"image": (320, 180)})
     try:
         found = measure(params, service, silent)

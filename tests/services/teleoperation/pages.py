@@ -13,6 +13,7 @@ from typing import Any
 
 from scan2sim.services.http import factory
 from scan2sim.services.http.settings import ServerParams
+from scan2sim.services.teleoperation.station.drivers import Drivers
 from scan2sim.services.teleoperation.station.web import PageHub, application
 from tests.fakes.ports import free_port
 from tests.services.teleoperation.street import HERE, Desk, Street
@@ -35,12 +36,12 @@ class Cockpit:
 
 
 @contextmanager
-def served(tmp_path: Path, params: ServerParams) -> Iterator[Cockpit]:
+def served(tmp_path: Path, params: ServerParams, drivers: Drivers | None = None) -> Iterator[Cockpit]:
     """Serve the page of a street's station."""
     street = Street(tmp_path)
     urls: list[str] = []
     try:
-        cockpit = page_of(street, params)
+        cockpit = page_of(street, params, drivers)
         threading.Thread(target=factory.run, args=(cockpit.app, params, urls.append), daemon=True).start()
         until(lambda: urls)
         cockpit.url = urls[0]
@@ -49,11 +50,12 @@ def served(tmp_path: Path, params: ServerParams) -> Iterator[Cockpit]:
         street.close()
 
 
-def page_of(street: Street, params: ServerParams) -> Cockpit:
+def page_of(street: Street, params: ServerParams, drivers: Drivers | None = None) -> Cockpit:
     desk = street.desk()
     hub = PageHub(lambda frame: joined.age(frame.captured) if (joined := desk.station.joined()) else 0.0)
     desk.show = hub.show
-    app = application(params, desk.station, hub, lambda what, vehicle: True)
+    desk.station.report_event = desk.gateway_connection.report_event
+    app = application(params, desk.station, hub, lambda what, vehicle, driver: True, drivers)
     return Cockpit(street, desk, app, hub)
 
 

@@ -31,7 +31,7 @@ from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardUnit
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame
 from scan2sim.services.teleoperation.video.rate_control import BitrateBounds
 from tests.fakes.relay import Relay
-from tests.fakes.vehicle import RecordingVehicle
+from tests.fakes.vehicle import RecordingVehicle, adapter_key_file
 from tests.waiting import until
 
 HERE = "127.0.0.1"
@@ -123,11 +123,11 @@ class Street:
         self._state = folder / "state"
         self.gateway, self.fleet = self._start(0)
         self.car, self._ended = RecordingVehicle(), threading.Event()
-        adapter_server = AdapterServer(self.car, AdapterParams(port=0, limit=LIMIT))
+        adapter_server = AdapterServer(self.car, AdapterParams(port=0, limit=LIMIT, key=adapter_key_file()))
         self._adapter_thread = threading.Thread(target=adapter_server.run, args=(self._ended,), daemon=True)
         self._adapter_thread.start()
         address = f"{HERE}:{adapter_server.address[1]}"
-        unit = OnboardUnit(OnboardParams(translator=address, limit=LIMIT))
+        unit = OnboardUnit(OnboardParams(adapter=address, limit=LIMIT, key=adapter_key_file()))
         self.size = 160, 120
         front = Camera("front", self._frames)
         links = [Link("one", HERE), Link("two", HERE)]
@@ -159,6 +159,11 @@ class Street:
     def _start(self, port: int) -> tuple[Gateway, Fleet]:
         fleet = Fleet(self._state)
         return Gateway(Identity.read(self.parties / "gateway"), HERE, port, fleet, lambda _: None), fleet
+
+    def stop_adapter(self) -> None:
+        """End the vehicle adapter, which no longer answers."""
+        self._ended.set()
+        self._adapter_thread.join()
 
     def close(self) -> None:
         for desk in self.desks:

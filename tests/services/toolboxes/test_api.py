@@ -17,8 +17,9 @@ pytest.importorskip("fastapi", reason="the extra bus isn't installed")
 from fastapi.testclient import TestClient
 
 from scan2sim.services.http.settings import ServerParams
-from scan2sim.services.toolboxes.api import MAX_REQUEST_BYTES, application
+from scan2sim.services.toolboxes.api import application
 from scan2sim.services.toolboxes.engine import Engine
+from scan2sim.services.toolboxes.inference.tensors import MAX_REQUEST_BYTES
 from scan2sim.services.toolboxes.settings import ToolboxParams
 from tests.services.toolboxes import shaky
 from tests.services.toolboxes.shaky import FAILS, image
@@ -42,6 +43,12 @@ def client(engine: Engine) -> TestClient:
 def jpeg(level: int) -> bytes:
     out = io.BytesIO()
     Image.fromarray(image(level, (16, 16))).save(out, "JPEG")
+    return out.getvalue()
+
+
+def png(width: int, height: int) -> bytes:
+    out = io.BytesIO()
+    Image.new("L", (width, height)).save(out, "PNG")
     return out.getvalue()
 
 
@@ -78,7 +85,8 @@ def test_images_are_posted_as_json_of_the_protocol(client: TestClient) -> None:
 
 def test_model_metadata_and_health(client: TestClient) -> None:
     metadata = client.get(f"/v2/models/{TASK}").json()
-    assert metadata["parameters"]["licence"] == "none" and metadata["inputs"][0]["datatype"] == "BYTES"
+    assert metadata["parameters"]["licence"] == "none"
+    assert [one["datatype"] for one in metadata["inputs"]] == ["BYTES", "UINT8"]
     for path in ("/v2/health/live", "/v2/health/ready", f"/v2/models/{TASK}/ready", "/health/ready"):
         assert client.get(path).status_code == 200
     assert client.get("/v2").json()["name"] == "scan2sim"
@@ -107,6 +115,10 @@ def test_model_metadata_and_health(client: TestClient) -> None:
         (json.dumps(request({"name": "i", "datatype": "UINT8", "shape": [1, 1, 3], "data": [1, 2, 999]})).encode(),
          "application/json", 422),
         (bytes(MAX_REQUEST_BYTES + 1), "image/jpeg", 413),
+        (png(1_000_000, 1), "image/png", 422),
+        (png(1, 1_000_000), "image/png", 422),
+        (json.dumps(request({"name": "i", "datatype": "UINT8", "shape": [1, 101, 3], "data": [1] * 303})).encode(),
+         "application/json", 422),
     ],
 )  # fmt: skip
 def test_invalid_requests_are_rejected(client: TestClient, content: bytes, kind: str, status: int) -> None:

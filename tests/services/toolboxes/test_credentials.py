@@ -25,7 +25,7 @@ from scan2sim.services.toolboxes.api import application
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.frames import Frame
 from scan2sim.services.toolboxes.per_source_worker import SourceWorker
-from scan2sim.services.toolboxes.results import Body, Result
+from scan2sim.services.toolboxes.results import SCHEMA, Body, Result
 from scan2sim.services.toolboxes.settings import ToolboxParams
 from scan2sim.services.toolboxes.sources import Cameras
 from tests.fakes.ports import free_port
@@ -108,6 +108,7 @@ def test_status_and_detections_name_a_camera_without_its_credentials(
             and status.json()["cameras"][redacted_url(port)]["there"]
         )
         assert [one["source"] for one in detections.json()] == [redacted_url(port)]
+        assert detections.json()[0]["schema"] == SCHEMA, "spelled as in all other results"
         label = detections.json()[0]["body"]["classes"][0]["label"]
         assert 49 <= int(label) <= 51, "the reader uses the original address"
         for source in (redacted_url(port), url(port)):

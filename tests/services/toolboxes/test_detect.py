@@ -11,7 +11,7 @@ import pytest
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.pipeline.core.errors import InputError, SettingError, UnavailableError
 from scan2sim.services.toolboxes import coco, models
-from scan2sim.services.toolboxes.tasks import detect
+from scan2sim.services.toolboxes.tasks import detect, movement
 from scan2sim.services.toolboxes.tasks.detect import Params
 
 
@@ -29,6 +29,39 @@ def test_coco_network_detects_cars_in_a_real_photo(real_data: Path) -> None:
     (body,) = detect.load(Params(network="coco", labels="car", threshold=0.5))([np.ascontiguousarray(photo)])
     found = body.detections or ()
     assert {one.label for one in found} == {"car"} and any(one.box[0] > 700 and one.score > 0.8 for one in found)
+
+
+def test_own_network_has_thresholds_by_class_which_results_state() -> None:
+    image = np.zeros((90, 160, 3), np.uint8)
+    (body,) = detect.load(Params())([image])
+    assert isinstance(body.threshold, dict)
+    assert body.threshold["person"] == body.threshold["cyclist"] == 0.5
+    assert body.threshold["car"] == 0.4
+    (same,) = detect.load(Params(threshold=0.3))([image])
+    assert same.threshold == pytest.approx(0.3)
+    assert movement.Params().threshold == 0.25
+
+
+def test_threshold_of_a_class_applies_to_its_detections_only(tmp_path: Path) -> None:
+    import onnx
+
+    from scan2sim.services.toolboxes.detector.export import write_thresholds
+    from tests.services.toolboxes.test_detector_formats import BOX, SCORE, write, yolov8
+
+    path = write(tmp_path / "mine.onnx", {"output0": yolov8()})
+    assert onnx.load(path)
+    for least, count in ((SCORE - 0.01, 1), (SCORE + 0.01, 0)):
+        write_thresholds(path, {"car": least})
+        (body,) = detect.load(Params(weights=path))([np.zeros((100, 200, 3), np.uint8)])
+        assert len(body.detections or ()) == count
+        assert isinstance(body.threshold, dict) and body.threshold["bus"] == detect.DEFAULT_THRESHOLD
+        assert not count or (body.detections and body.detections[0].box == pytest.approx(BOX, abs=0.11))
+
+
+def test_own_network_does_not_enlarge_small_images() -> None:
+    model = detect.Detector(Params())
+    small, large = (model.prepared(np.zeros(shape, np.uint8))[0] for shape in ((120, 200, 3), (900, 1600, 3)))
+    assert small.shape == (3, 128, 256) and large.shape == (3, 576, 960)
 
 
 def test_images_of_different_sizes_form_one_batch() -> None:
@@ -62,5 +95,5 @@ def test_invalid_weights_are_rejected(tmp_path: Path, name: str, content: bytes 
 
 def test_network_of_another_kind_is_rejected() -> None:
     street = Path(detect.__file__).parents[3] / "segmentation" / "weights" / "street.onnx"
-    with pytest.raises(InputError, match=r"export\.py"):
+    with pytest.raises(InputError, match="Export one of: YOLOv5"):
         detect.load(Params(weights=street))

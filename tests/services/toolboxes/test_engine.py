@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ class Client:
         self._changed = threading.Condition()
         self._sent = 0
 
-    def send(self, picture: U8 | bytes | Raw, source: str = "camera", **more: float) -> None:
+    def send(self, picture: U8 | bytes | Raw, source: str = "camera", **more: Any) -> None:
         self._sent += 1
         self.engine.submit(Frame(str(self._sent), source, self._sent, picture, self._take, **more))
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from scan2sim.data_samples import boxes
+from scan2sim.pipeline.core.errors import DataError
 from scan2sim.services.toolboxes import yolo
 from scan2sim.services.toolboxes.detector import dataset
 from scan2sim.services.toolboxes.detector.metrics import GroundTruth, Predictions, average_precision
@@ -124,6 +125,112 @@ def test_exported_onnx_matches_torch_for_any_batch_and_size(tmp_path: Path) -> N
         (got,) = session.run(None, {"images": images})
         assert got.shape == (shape[0], sum(shape[2] * shape[3] // s**2 for s in (8, 16, 32, 64)), 8)
         np.testing.assert_allclose(got, want, atol=2e-3)
+
+
+def small_dataset(folder: Path, seed: int = 0) -> Path:
+    """Two photos of noise with a box each."""
+    from scan2sim.pipeline.io.images import image
+
+    (folder / "images").mkdir(parents=True)
+    lines = []
+    for i in range(2):
+        rgb = np.random.default_rng([seed, i]).integers(0, 255, (96, 160, 3), np.uint8)
+        image.write(folder / "images" / f"{i}.png", rgb)
+        objects = [{"class": "car", "box": [30, 20, 110, 80], "visible": 1.0}]
+        lines.append(json.dumps({"image": f"{i}.png", "objects": objects}) + "\n")
+    (folder / "boxes.jsonl").write_text("".join(lines), encoding="utf-8")
+    (folder / "classes.json").write_text('["car", "van"]', encoding="utf-8")
+    return folder
+
+
+def test_interrupted_training_resumes_with_the_same_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from scan2sim.services.toolboxes.detector import train
+
+    monkeypatch.setattr(train, "CHECKPOINT_INTERVAL_S", 0.0)
+    folders = [small_dataset(tmp_path / "a"), small_dataset(tmp_path / "b", 1)]
+    settings = train.TrainingSettings(steps=4, crops=((64, 128),), pixels=16_384, seed=3)
+    checkpoint = tmp_path / "vehicles.checkpoint"
+    whole = train.train(folders, settings, train.OWN_WEIGHTS, checkpoint=checkpoint)
+    assert not checkpoint.exists()
+
+    def interrupt(fraction: float, message: str = "") -> None:
+        if message.startswith("step 3"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train.train(folders, settings, train.OWN_WEIGHTS, interrupt, checkpoint)
+    assert checkpoint.is_file()
+    steps: list[str] = []
+    resumed = train.train(
+        folders,
+        settings,
+        train.OWN_WEIGHTS,
+        lambda fraction, message="": steps.append(message.split(",")[0]),
+        checkpoint,
+    )
+    assert steps[0] == "step 3"
+    for name, value in whole.state_dict().items():
+        torch.testing.assert_close(resumed.state_dict()[name], value, msg=name)
+
+
+def test_checkpoint_of_another_training_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from scan2sim.services.toolboxes.detector import train
+
+    monkeypatch.setattr(train, "CHECKPOINT_INTERVAL_S", 0.0)
+    folder, checkpoint = small_dataset(tmp_path / "a"), tmp_path / "vehicles.checkpoint"
+
+    def interrupt(fraction: float, message: str = "") -> None:
+        if message.startswith("step 2"):
+            raise KeyboardInterrupt
+
+    settings = train.TrainingSettings(steps=3, crops=((64, 64),), pixels=8192)
+    with pytest.raises(KeyboardInterrupt):
+        train.train([folder], settings, train.OWN_WEIGHTS, interrupt, checkpoint)
+    steps: list[str] = []
+    other = train.TrainingSettings(steps=3, crops=((64, 64),), pixels=8192, seed=1)
+    train.train([folder], other, train.OWN_WEIGHTS, lambda fraction, message="": steps.append(message), checkpoint)
+    assert steps[0].startswith("step 1")
+
+
+def test_datasets_with_different_classes_are_rejected(tmp_path: Path) -> None:
+    from scan2sim.services.toolboxes.detector import train
+
+    folders = [small_dataset(tmp_path / "a"), small_dataset(tmp_path / "b")]
+    (folders[1] / "classes.json").write_text('["car", "van", "bus"]', encoding="utf-8")
+    with pytest.raises(DataError, match="same classes"):
+        train.train(folders, train.TrainingSettings(steps=1))
+
+
+def test_network_gives_the_same_boxes_for_a_mirrored_image() -> None:
+    from scan2sim.services.toolboxes.detector.network import VehicleNet, cells
+
+    torch.manual_seed(0)
+    network = VehicleNet(2).eval()
+    image = torch.rand(1, 3, 64, 128)
+    with torch.inference_mode():
+        plain, mirrored = network(image), network(image.flip(3))
+    centres, _ = cells(64, 128)
+    other = (
+        torch.cdist(torch.stack([128 - centres[:, 0], centres[:, 1]], dim=1), centres).topk(4, largest=False).indices
+    )
+    stride = cells(64, 128)[1][:, 0]
+    same = torch.stack([other[i][stride[other[i]] == stride[i]][0] for i in range(len(centres))])
+    back = mirrored[:, same]
+    back[..., 0] = 128 - back[..., 0]
+    torch.testing.assert_close(back, plain, atol=1e-3, rtol=1e-3)
+
+
+def test_threshold_for_a_precision_ignores_detections_in_ignored_regions() -> None:
+    from scan2sim.services.toolboxes.detector.evaluate import at_precision
+
+    corners = np.array([[0, 0, 10, 10], [20, 0, 30, 10], [40, 0, 50, 10], [60, 0, 70, 10]], np.float32)
+    ignored = np.array([[40, 0, 44, 12], [44, 0, 47, 12]], np.float32)
+    truth = GroundTruth(np.concatenate([corners[:2], ignored]), np.zeros(4, np.int32), np.arange(4) >= 2)
+    found = Predictions(corners, np.array([0.9, 0.6, 0.8, 0.5], np.float32), np.zeros(4, np.int32))
+    figures = at_precision([found], [truth])
+    assert (figures.recall, figures.precision, figures.vehicles) == (1, 1, 2)
+    assert figures.threshold == pytest.approx(0.6)
+    assert at_precision([found], [truth], 0.6).threshold == pytest.approx(0.5)
 
 
 def test_average_precision_matches_a_manual_calculation() -> None:

@@ -148,7 +148,7 @@ def test_association_by_time_leaves_out_what_the_truth_does_not_span() -> None:
     assert evaluate(truth, replace(truth, times=truth.times + 1e9), by="index").global_mean < 1e-9
 
 
-def test_gps_as_truth_tells_no_rotation_but_its_noise() -> None:
+def test_rotation_error_against_gps_is_only_noise() -> None:
     path = winding()
     scatter = np.random.default_rng(0).normal(0, 0.8, path.positions.shape)
     near = np.arange(len(path)) % 3 == 0  # 3.3 fixes a second
@@ -210,7 +210,7 @@ def test_kitti_errors_are_those_of_its_tool() -> None:
     assert result.rotation_deg_per_m == pytest.approx(degrees, rel=2e-3)
 
 
-def test_a_picture(tmp_path: Path) -> None:
+def test_plot_is_written(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     truth = winding()
     found = replace(truth, positions=truth.positions * [1.02, 0.98, 1])

@@ -18,11 +18,8 @@ from scan2sim.slam.geometry import inverse
 from scan2sim.slam.lidar_odometry import MatchedSweeps
 from scan2sim.slam.steps.fuse import FuseParams, fuse_path
 from scan2sim.slam.trajectory.fusion import (
-    STATE_SIZE,
     Fused,
     RelativeMotions,
-    _marginals,
-    _solved,
     camera_motions,
     fuse,
     lidar_motions,
@@ -39,7 +36,7 @@ def off(fused: Fused, drive: Simulated) -> float:
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
-def test_all_together_are_no_worse_than_the_best_alone(seed: int) -> None:
+def test_fusion_of_all_sources_is_as_good_as_the_best_one(seed: int) -> None:
     whole = simulated(seed, tunnel=(0, 0), dark=(0, 0), outliers=0)
     alone = whole.measure()
     assert alone["fused"] < 1.1 * min(alone["lidar"], alone["visual"], alone["gps"])
@@ -54,7 +51,7 @@ def test_all_together_are_no_worse_than_the_best_alone(seed: int) -> None:
     assert (squared < 7.81).mean() > 0.9  # of 95 % ellipsoids
 
 
-def test_a_tunnel_and_the_dark_are_bridged_by_the_other() -> None:
+def test_other_sources_cover_gps_gaps_and_dark_video() -> None:
     drive = simulated(1)
     assert off(drive.fused("lidar"), drive) > 5
     both = drive.fused("lidar", "camera")
@@ -63,14 +60,14 @@ def test_a_tunnel_and_the_dark_are_bridged_by_the_other() -> None:
     assert scale == pytest.approx(np.median(np.linalg.norm(np.diff(drive.camera.positions, axis=0), axis=1)), rel=0.1)
 
 
-def test_where_all_fail_it_is_said() -> None:
+def test_failure_of_all_sources_is_reported() -> None:
     drive = simulated(2, tunnel=(150, 190), dark=(140, 200))
     blind = drive.fused("lidar", "camera")
     unsure = present(blind.trajectory.unsure)
     assert unsure[151:191].all() and not unsure[:150].any() and unsure[191:].all()
     seen = drive.fused(*ALL)
     unsure = present(seen.trajectory.unsure)
-    assert unsure[151:191].all() and not unsure[:150].any() and not unsure[195:].any()  # GPS tells how far it was
+    assert unsure[151:191].all() and not unsure[:150].any() and not unsure[195:].any()  # GPS gives the distance
 
 
 def test_outliers_of_gps_move_nothing() -> None:
@@ -81,7 +78,7 @@ def test_outliers_of_gps_move_nothing() -> None:
     assert np.abs(jumping.gps - clean.gps).max() > 30
 
 
-def test_a_sensor_that_is_sure_and_wrong_is_doubted() -> None:
+def test_overconfident_wrong_source_is_down_weighted() -> None:
     drive = simulated(4, tunnel=(0, 0), dark=(0, 0), outliers=0)
     lidar = drive.lidar.T.copy()
     lidar[200:210, 0, 3] = 0.0  # it slipped, and says nothing of it
@@ -91,7 +88,7 @@ def test_a_sensor_that_is_sure_and_wrong_is_doubted() -> None:
     assert off(found, wrong) < 1.0 < off(wrong.fused("lidar"), wrong)
 
 
-def test_a_bridged_pose_of_the_camera_counts_by_its_covariance() -> None:
+def test_dead_reckoned_camera_poses_are_weighted_by_covariance() -> None:
     drive = simulated(5)
     n = len(drive.times)
     known = np.tile(np.diag([1e-4] * 3 + [1e-8] * 3), (n, 1, 1))
@@ -111,23 +108,6 @@ def test_errors_of_a_tunnel_are_one() -> None:
     steps = lidar_motions(MatchedSweeps(np.arange(6.0), poses, covariance, np.ones(5)))
     assert list(steps.sure) == [True, False, False, False, True]
     assert steps.covariance[:, 0, 0] == pytest.approx([1e-4, 3, 3, 3, 1e-4])
-
-
-def test_the_banded_system_is_the_dense_one() -> None:
-    rng, n = np.random.default_rng(0), 5
-    dense = rng.normal(size=(n * STATE_SIZE, n * STATE_SIZE))
-    dense = dense @ dense.T + 50 * np.eye(n * STATE_SIZE)
-    for i in range(n):
-        for j in range(n):
-            if abs(i - j) > 1:
-                dense[i * STATE_SIZE : (i + 1) * STATE_SIZE, j * STATE_SIZE : (j + 1) * STATE_SIZE] = 0
-    dense += 200 * np.eye(n * STATE_SIZE)
-    blocks = dense.reshape(n, STATE_SIZE, n, STATE_SIZE).transpose(0, 2, 1, 3)
-    D, above = blocks[np.arange(n), np.arange(n)], blocks[np.arange(n - 1), np.arange(1, n)]
-    b = rng.normal(size=(n, STATE_SIZE))
-    np.testing.assert_allclose(_solved(D, above, b).ravel(), np.linalg.solve(dense, b.ravel()), rtol=1e-9)
-    inverted = np.linalg.inv(dense).reshape(n, STATE_SIZE, n, STATE_SIZE).transpose(0, 2, 1, 3)
-    np.testing.assert_allclose(_marginals(D, above), inverted[np.arange(n), np.arange(n)], rtol=1e-9, atol=1e-15)
 
 
 # --- as files
@@ -158,28 +138,28 @@ def placed(files: dict[str, Path], out: Path, *names: str, **how: float | str) -
     return trajectory_io.read(done.files["trajectory"]), done.metrics["summary"]
 
 
-def test_what_is_given_is_fused_and_told(tmp_path: Path) -> None:
+def test_given_sources_are_fused_and_reported(tmp_path: Path) -> None:
     drive = simulated(6, outliers=0)
     files, truth = recorded(tmp_path, drive), drive.truth[:, :3, 3]
 
     def error(path: Trajectory) -> F64:
         return np.linalg.norm(path.positions - truth, axis=1)
 
-    alone, told = placed(files, tmp_path / "out", "matched")
-    assert told == "placed by sweeps (85 % of the motions)" and present(alone.unsure).mean() > 0.5
-    path, told = placed(files, tmp_path / "out", "matched", "poses", "extrinsics")
-    assert told == "placed by sweeps (85 % of the motions), trajectory (87 % of the motions)"
+    alone, summary = placed(files, tmp_path / "out", "matched")
+    assert summary == "placed by sweeps (85 % of the motions)" and present(alone.unsure).mean() > 0.5
+    path, summary = placed(files, tmp_path / "out", "matched", "poses", "extrinsics")
+    assert summary == "placed by sweeps (85 % of the motions), trajectory (87 % of the motions)"
     assert error(path).max() < 5 and ate(path.positions, truth, scaled=False) < 1
     everything = ("matched", "poses", "extrinsics", "gps")
-    path, told = placed(files, tmp_path / "out", *everything, gps_offset=-100.0)
-    places = re.search(r"GPS \((\d+) of 400 positions\)", told)
+    path, summary = placed(files, tmp_path / "out", *everything, gps_offset=-100.0)
+    places = re.search(r"GPS \((\d+) of 400 positions\)", summary)
     assert places and int(places[1]) > 300 and ate(path.positions, truth, scaled=False) < 0.8 and error(path).max() < 6
     assert path.times == pytest.approx(drive.times)
     late, _ = placed(files, tmp_path / "late", *everything, gps_offset=-80.0, time_offset=20.0)
     assert late.times == pytest.approx(drive.times)  # in the sweeps' own clock
 
 
-def test_sensors_of_other_times_are_told(tmp_path: Path) -> None:
+def test_sources_without_common_times_are_reported(tmp_path: Path) -> None:
     files = recorded(tmp_path, simulated(7, outliers=0))
     with pytest.raises(InputError, match=r"gps\.csv: spans 100\.00 to 139\.90 s, the sweeps 0\.00 to 39\.90 s.*offset"):
         placed(files, tmp_path / "a", "matched", "gps")
@@ -187,7 +167,7 @@ def test_sensors_of_other_times_are_told(tmp_path: Path) -> None:
         placed(files, tmp_path / "b", "matched", "poses", time_offset=500.0)
 
 
-def test_a_camera_the_wrong_way_round_is_noticed(tmp_path: Path) -> None:
+def test_reversed_camera_is_detected(tmp_path: Path) -> None:
     files = recorded(tmp_path, simulated(8, outliers=0))
     np.savetxt(files["extrinsics"], inverse(simulated(8).T_camera_scanner)[:3])
     (tmp_path / "out").mkdir()

@@ -1,4 +1,4 @@
-"""GPS tracks: what is smoothed, and how much noise is told."""
+"""GPS tracks: smoothing, and the estimated noise."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def drive(error: float) -> tuple[GpsTrack, np.ndarray]:
     return GpsTrack(times, truth + np.random.default_rng(3).normal(0, error, truth.shape)), truth
 
 
-def test_smoothing_takes_noise_and_strays_but_cuts_no_corner() -> None:
+def test_smoothing_removes_noise_and_outliers_and_keeps_corners() -> None:
     track, truth = drive(0.5)
     track.positions[[200, 500, 501, 900], 0] += 15
     off = np.linalg.norm((smooth(track).positions - truth)[:, :2], axis=1)

@@ -79,7 +79,7 @@ def test_colmap_agrees_with_the_model(tmp_path: Path, model: str) -> None:
     assert sparse.rgb is not None and (found.points3D[7].color == sparse.rgb[6]).all()
 
 
-def test_errors_in_the_model_are_the_points_own(tmp_path: Path) -> None:
+def test_model_contains_reprojection_errors_per_point(tmp_path: Path) -> None:
     camera = CAMERAS["EQUIRECTANGULAR"]
     path, names, sparse = drive(camera)
     sparse.uv[:, 0] = (sparse.uv[:, 0] + 3) % camera.width  # over the seam, too
@@ -88,7 +88,7 @@ def test_errors_in_the_model_are_the_points_own(tmp_path: Path) -> None:
     assert np.allclose([point.error for point in found.points3D.values()], 3, atol=1e-3)
 
 
-def test_a_folder_with_everything(tmp_path: Path) -> None:
+def test_output_folder_contains_all_files(tmp_path: Path) -> None:
     path, names, sparse = drive(CAMERAS["PINHOLE"])
     files = write(tmp_path / "out", path, UTM, camera=CAMERAS["PINHOLE"], names=names, sparse=sparse)
     assert [f.relative_to(tmp_path / "out").as_posix() for f in files] == [
@@ -100,7 +100,7 @@ def test_a_folder_with_everything(tmp_path: Path) -> None:
     assert "500000 5400000 200 in EPSG:32633" in files[4].read_text(encoding="utf-8")
 
 
-def test_what_is_not_known_is_not_written(tmp_path: Path) -> None:
+def test_unknown_values_are_not_written(tmp_path: Path) -> None:
     path, names, _ = drive(CAMERAS["PINHOLE"])
     assert [f.name for f in write(tmp_path / "a", path)] == [f"trajectory{s}" for s in (".csv", ".tum", ".kitti")]
     bare = Trajectory(path.times, path.positions)

@@ -20,7 +20,7 @@ def test_gps_of_ten_centimetres_halves_a_turns_error(seed: int) -> None:
     assert ate(scale.apply(found, factor), truth) < 0.5 * ate(found, truth)
 
 
-def test_a_consumers_receiver_does_no_harm_to_a_360_camera() -> None:
+def test_consumer_gps_noise_does_not_degrade_360_scale() -> None:
     times = np.arange(0, 60, 0.1)
     heading = 0.5 * np.sin(times / 9)
     truth = np.cumsum(np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=1), axis=0)

@@ -43,7 +43,7 @@ def pixels(path: Path, grey: bool = False, box: Box | None = None) -> npt.NDArra
         raise InputError(path, "can't be read (unknown image format, or damaged)", COPY_AGAIN)
     x0, y0, x1, y1 = box or (0, 0, found.shape[1], found.shape[0])
     part = found[y0:y1, x0:x1]
-    return np.ascontiguousarray(part if grey else part[..., ::-1])
+    return np.ascontiguousarray(part) if grey else np.asarray(cv2.cvtColor(part, cv2.COLOR_BGR2RGB))
 
 
 @contextmanager

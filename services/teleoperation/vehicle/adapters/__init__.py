@@ -11,6 +11,10 @@ from typing import Any, Protocol
 from scan2sim.pipeline.core import plugins, step
 from scan2sim.services.teleoperation.control.controls import Controls, VehicleState
 
+STATE_MAX_AGE_S = 0.2
+"""Age above which a measured speed is unknown, seconds: the driver page covers what is older than 0.3 s, and the state
+takes up to 0.1 s from here to the page."""
+
 
 class VehicleUnreachable(Exception):
     """The vehicle can't be controlled now; the adapter's stop holds until the driver confirms."""
@@ -27,7 +31,7 @@ class Vehicle(Protocol):
         """
 
     def state(self) -> VehicleState:
-        """Last known state; returns at once."""
+        """Last known state; returns at once. A speed measured longer than `STATE_MAX_AGE_S` ago is None."""
 
     def close(self) -> None:
         """Disconnect; the vehicle was stopped before."""

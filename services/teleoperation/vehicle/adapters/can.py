@@ -7,6 +7,7 @@ module of their own.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,14 +20,14 @@ from scan2sim.pipeline.core import step
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.parameters import File
 from scan2sim.services.teleoperation.control.controls import STOP, Controls, Gear, VehicleState
-from scan2sim.services.teleoperation.vehicle.adapters import Vehicle, VehicleUnreachable
+from scan2sim.services.teleoperation.vehicle.adapters import STATE_MAX_AGE_S, Vehicle, VehicleUnreachable
 
 NEEDS = ("can", "cantools")
 EXAMPLE_DBC = Path(__file__).parents[1] / "examples" / "example.dbc"
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "kph": 1 / 3.6, "kmh": 1 / 3.6, "mph": 0.44704, "": 1.0}
 """Units of speed signals, in m/s."""
 REOPEN_DELAY_S, SILENCE_MAX_S = 1.0, 1.0
-"""Delay before a bus is opened again; silence of the vehicle after which it is reported as a fault."""
+"""Delay before a bus is opened again; silence of the vehicle after which it is reported as a fault, seconds."""
 MESSAGES_PER_READ_MAX = 200
 """Maximum number of messages read at once: more than any bus carries in ten milliseconds."""
 FULL_CONTROLS = Controls(1.0, 1.0, 1.0, Gear.FORWARD, horn=True, lights=True)
@@ -82,6 +83,7 @@ class CanVehicle:
         self._bus: Any = None
         self._last_attempt, self._count = 0.0, 0
         self._speed, self._gear, self._last_received = 0.0, Gear.NEUTRAL, time.monotonic()
+        self._speed_received = -math.inf
         self._open()
 
     def obey(self, controls: Controls) -> None:
@@ -105,11 +107,13 @@ class CanVehicle:
 
     def state(self) -> VehicleState:
         """Reported speed and gear, if the vehicle has signals for them."""
-        silent = self._signals.reported and time.monotonic() - self._last_received > SILENCE_MAX_S
+        now = time.monotonic()
+        silent = self._signals.reported and now - self._last_received > SILENCE_MAX_S
         faults = (f"no messages from the vehicle on {self._params.channel}",) if silent else ()
         if self._bus is None:
             faults = (self._unavailable(),)
-        return VehicleState(self._speed, gear=self._gear, faults=faults)
+        speed = self._speed if now - self._speed_received <= STATE_MAX_AGE_S else None
+        return VehicleState(speed, gear=self._gear, faults=faults)
 
     def close(self) -> None:
         """Close the bus."""
@@ -146,7 +150,8 @@ class CanVehicle:
             values = self._signals.read(message)
             if values:
                 self._last_received = time.monotonic()
-            self._speed = values.get("speed", self._speed)
+            if "speed" in values:
+                self._speed, self._speed_received = values["speed"], self._last_received
             self._gear = Gear(int(values.get("gear_in", self._gear)))
 
 

@@ -6,7 +6,12 @@ import pytest
 
 from scan2sim.pipeline.core.errors import BusyError
 from scan2sim.services.teleoperation.control.controls import Controls
-from scan2sim.services.teleoperation.control.driver_session import COMMAND_TIMEOUT_S, LOCK_TIMEOUT_S, DriverSession
+from scan2sim.services.teleoperation.control.driver_session import (
+    COMMAND_TIMEOUT_S,
+    EMERGENCY,
+    LOCK_TIMEOUT_S,
+    DriverSession,
+)
 from scan2sim.services.teleoperation.control.messages import Command
 
 AHEAD = Command(Controls(throttle=0.5))
@@ -45,3 +50,22 @@ def test_only_one_driver_holds_the_lock() -> None:
         and session.release_reason == "the page was closed"
         and session.command(LOCK_TIMEOUT_S + 0.2) is None
     )
+
+
+def test_emergency_stop_replaces_commands_until_its_driver_ends_it() -> None:
+    session = DriverSession()
+    session.acquire("page 1", 0.0)
+    session.update("page 1", AHEAD, 0.0)
+    session.latch("page 2")
+    assert session.command(0.0) == session.command(99.0) == EMERGENCY, "also after the driver's page has gone silent"
+    session.update("page 1", AHEAD, 0.1)
+    assert session.command(0.1) == EMERGENCY
+    with pytest.raises(BusyError, match="by the driver only"):
+        session.unlatch("page 2")
+    session.unlatch("page 1")
+    assert session.command(0.1) == AHEAD
+    session.latch("page 1")
+    session.release("page 1", "left")
+    assert session.latched, "leaving does not end it"
+    session.unlatch("page 2")
+    assert not session.latched, "with no driver any page may end it"

@@ -21,9 +21,10 @@ from scan2sim.services.teleoperation.control.messages import (
 STATE = VehicleState(1.5, (2.0, -3.0), 0.5, Gear.FORWARD, ("a tyre is flat",))
 BODIES = [
     Command(Controls(-0.5, 0.25, 1.0, Gear.REVERSE, horn=True, lights=True), stop=7, agree=True),
+    Command(Controls(brake=1.0), emergency=True),
     VideoKey(3, bytes(range(44))),
     KeyFrameRequest(2),
-    Telemetry(STATE, 4, True, "both links", 12, 31.5, {"old": 3}),
+    Telemetry(STATE, 4, True, "both links", 12, 31.5, {"old": 3}, 12.5),
     VideoReport(1, 100, 2, 41.0, {"lte": 1e6, "wifi": 2e6}),
     VideoStreams((VideoStream(0, "front", 640, 480, 30.0),)),
 ]

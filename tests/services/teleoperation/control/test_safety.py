@@ -15,6 +15,7 @@ from scan2sim.services.teleoperation.control.safety import (
     DROP_OTHER_SESSION,
     DROP_OUT_OF_ORDER,
     DROP_TOO_OLD,
+    EMERGENCY_STOP,
     NS_PER_MS,
     SafetyMonitor,
 )
@@ -223,3 +224,20 @@ def test_stop_keeps_steering_and_lights() -> None:
     drive.send(20, Command(Controls(0.7, 1.0, 0.0, Gear.FORWARD, horn=True, lights=True)))
     controls = drive.safety.check(1000 * NS_PER_MS)
     assert controls == Controls(0.7, 0.0, 1.0, Gear.NEUTRAL, horn=False, lights=True)
+
+
+def test_emergency_command_stops_until_confirmed() -> None:
+    monitor = SafetyMonitor(200)
+    monitor.begin("s")
+    drive = Controls(throttle=0.5, gear=Gear.FORWARD)
+    monitor.receive("s", 1, Command(Controls(), monitor.stop), 0, 0)
+    monitor.receive("s", 2, Command(Controls(), monitor.stop, agree=True), 0, 0)
+    monitor.receive("s", 3, Command(drive), 0, 0)
+    assert not monitor.standing and monitor.check(0) == drive
+    monitor.receive("s", 4, Command(drive, monitor.stop, agree=True, emergency=True), 0, 0)
+    assert monitor.standing and monitor.reason == EMERGENCY_STOP and monitor.check(0).brake == 1
+    monitor.receive("s", 5, Command(drive, monitor.stop), 0, 0)
+    monitor.receive("s", 6, Command(Controls(), monitor.stop, agree=True, emergency=True), 0, 0)
+    assert monitor.standing, "no emergency command confirms"
+    monitor.receive("s", 7, Command(Controls(), monitor.stop, agree=True), 0, 0)
+    assert not monitor.standing

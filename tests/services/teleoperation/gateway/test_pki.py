@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
 from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.services.teleoperation import adapter_key
 from scan2sim.services.teleoperation.gateway import pki
 from scan2sim.services.teleoperation.gateway.pki import certify
 from scan2sim.services.teleoperation.identity import Identity, Role
@@ -43,6 +44,15 @@ def test_keys_are_readable_by_their_user_only(parties: Path) -> None:
     key.chmod(0o640)
     with pytest.raises(InputError, match="accessible to other users"):
         Identity.read(key.parent)
+
+
+def test_each_vehicle_has_a_key_for_its_adapter_that_renewal_keeps(tmp_path: Path) -> None:
+    certify(tmp_path, vehicles=["car", "van"])
+    files = [tmp_path / f"vehicle-{name}" / "adapter.key" for name in ("car", "van")]
+    keys = [adapter_key.read(path) for path in files]
+    assert len(set(keys)) == 2 and all(stat.S_IMODE(path.stat().st_mode) == 0o600 for path in files)
+    certify(tmp_path, vehicles=["car", "van"], renew=True)
+    assert [adapter_key.read(path) for path in files] == keys
 
 
 def test_valid_certificates_are_kept_others_are_renewed(parties: Path, tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def test_pair_survives_a_restart_of_the_gateway(parties: Path, gateway: Callable
         assert isinstance(order, Join) and order.listening == listening
         assert order.other.fingerprint == desk.identity.me.fingerprint
         until(lambda: fleet.snapshot()["vehicles"][0]["links"], 5)
-        assert fleet.snapshot()["vehicles"][0]["speed"] == 1.5
+        assert fleet.speeds()["car"]["speed"] == 1.5
         before = len(car.orders)
         _, again = gateway(first.port)
         until(lambda: len(car.orders) > before and car.gateway_connection.connected())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from scan2sim.services.teleoperation.gateway.web import application
 from scan2sim.services.teleoperation.gateway_protocol import Hello, LinkStatus, Status
 from scan2sim.services.teleoperation.identity import Peer, Role
 from tests.fakes.browser import chromium
+from tests.waiting import until
 
 HOSTILE = "<img src=x onerror=document.title='hacked'>"
 
@@ -35,9 +35,12 @@ def fleet_with_parties(tmp_path: Path) -> Fleet:
         orders: list[Order] = []
         fleet.connected(Peer(role, name, "0" * 64), Hello(cameras=("front",)), "10.0.0.1:5", orders.append)
     links = (LinkStatus(name="lte", up=True, round_trip=84.0, loss=0.01, rate=3.2), LinkStatus(name="wifi", up=False))
-    status = Status(links=links, speed=2.5, age=48.0, told=HOSTILE)
-    fleet.update_status(Peer(Role.VEHICLE, "car", "0" * 64), status)
+    report(fleet, Status(links=links, age=48.0, message=HOSTILE))
     return fleet
+
+
+def report(fleet: Fleet, status: Status) -> None:
+    fleet.update_status(Peer(Role.VEHICLE, "car", "0" * 64), status)
 
 
 def app(fleet: Fleet, served: ServerParams | None = None) -> Any:
@@ -61,15 +64,36 @@ def test_page_lists_parties_and_joins_them(tmp_path: Path) -> None:
     fleet, urls = fleet_with_parties(tmp_path), list[str]()
     served = ServerParams(port=0)
     threading.Thread(target=factory.run, args=(app(fleet, served), served, urls.append), daemon=True).start()
-    end = time.monotonic() + 20
-    while not urls and time.monotonic() < end:
-        time.sleep(0.02)
+    until(lambda: urls)
     with chromium(tmp_path) as page:
         page.do("Page.navigate", url=urls[0])
         page.until("document.querySelectorAll('#vehicles .run').length === 2")
         page.click("#vehicles .run button")
         page.until("document.querySelector('#vehicles').textContent.includes('driven from desk')")
         text = page.value("document.body.innerText")
-        assert "84 ms 1.0 % lost" in text and "wifi down" in text and HOSTILE in text and "9.0 km/h" in text
+        assert "84 ms 1.0 % lost" in text and "wifi down" in text and HOSTILE in text
         assert page.value("document.title") == "Fleet · scan2sim" and not page.errors
     assert fleet.snapshot()["vehicles"][0]["other"] == "desk"
+
+
+def test_speeds_disappear_when_a_vehicle_falls_silent(tmp_path: Path) -> None:
+    fleet, urls, silent = fleet_with_parties(tmp_path), list[str](), threading.Event()
+    served = ServerParams(port=0)
+    threading.Thread(target=factory.run, args=(app(fleet, served), served, urls.append), daemon=True).start()
+
+    def send_status() -> None:
+        while not silent.wait(0.1):
+            report(fleet, Status(speed=2.5))
+
+    sender = threading.Thread(target=send_status)
+    sender.start()
+    until(lambda: urls)
+    with chromium(tmp_path) as page:
+        page.do("Page.navigate", url=urls[0])
+        page.until("document.querySelector('[data-vehicle=car]')?.textContent === '9.0 km/h'")
+        silent.set()
+        sender.join()
+        page.until("document.querySelector('[data-vehicle=car]').textContent === ''")
+        assert (fleet.speeds()["car"]["reported_ms"] or 0) < 2000  # 0.3 s on a quiet machine
+        report(fleet, Status())
+        assert fleet.speeds() == {} and not page.errors

@@ -76,7 +76,8 @@ def test_page_covers_video_while_its_station_is_stopped(tmp_path: Path) -> None:
             page.until(BLANK, SOON)
             since = seconds_without_video(page)
             page.until(f"Number({STATUS}.match(/since ([0-9.]+) s/)[1]) > {since + 1}")
-            assert page.value(BLANK) and page.value("socket.readyState === WebSocket.OPEN")
+            assert page.value(BLANK) and page.worker_value("socket.readyState === WebSocket.OPEN")
+            assert _black(page), "the picture itself is covered"
             assert "Nothing from the station since" in page.value("document.getElementById('standing').textContent")
             station.send_signal(signal.SIGCONT)
             page.until(LIVE)
@@ -111,12 +112,14 @@ def test_delayed_video_stays_covered(cockpit: Cockpit, tmp_path: Path) -> None:
         assert page.value(NO_PICTURE), "frames are drawn, but old"
         cockpit.desk.show = cockpit.hub.show
         page.until(LIVE)
-        page.value("received_now = socket.onmessage; socket.onmessage = (one) => setTimeout(received_now, 600, one); 0")
+        page.worker_value(
+            "received_now = socket.onmessage; socket.onmessage = (one) => setTimeout(received_now, 600, one); 0"
+        )
         page.until(BLANK, SOON)
         before = page.value(shown)
         page.until(f"{shown} > {before + 10}")
         assert page.value(BLANK), "frames and state arrive, but are old"
-        page.value("socket.onmessage = received_now; 0")
+        page.worker_value("socket.onmessage = received_now; 0")
         page.until(LIVE)
         assert not page.errors
 
@@ -125,11 +128,33 @@ def test_slow_page_continues_at_the_next_key_frame(cockpit: Cockpit, tmp_path: P
     decoder = "[...cameras.values()][0].decoder"
     with chromium(tmp_path) as page:
         open_page(page, cockpit.url)
-        page.value(f"slow = {decoder}; Object.defineProperty(slow, 'decodeQueueSize', {{value: 100}}); 0")
-        page.until(f"{decoder} !== slow")
+        page.worker_value(f"slow = {decoder}; Object.defineProperty(slow, 'decodeQueueSize', {{value: 100}}); 0")
+        until(lambda: page.worker_value(f"{decoder} !== slow"))
         before = page.value("document.querySelector('figure').dataset.shown")
         page.until(f"document.querySelector('figure').dataset.shown > {before} + 3 && {LIVE}")
-        assert page.value("slow.state") == "closed" and not page.errors
+        assert page.worker_value("slow.state") == "closed" and not page.errors
+
+
+def test_hanging_worker_is_covered(cockpit: Cockpit, tmp_path: Path) -> None:
+    with chromium(tmp_path) as page:
+        open_page(page, cockpit.url)
+        page.worker_value(
+            "setTimeout(() => { for (const end = performance.now() + 4000; performance.now() < end; ) ; }, 100)"
+        )
+        page.until(BLANK, SOON)
+        page.until(LIVE)
+        assert not page.errors
+
+
+def test_silent_adapter_and_vehicle_leave_no_old_speed(cockpit: Cockpit, tmp_path: Path) -> None:
+    with chromium(tmp_path) as page:
+        open_page(page, cockpit.url)
+        cockpit.street.stop_adapter()
+        page.until(f"{SPEED} === '-' && {STATUS}.includes('the vehicle does not respond')", SOON)
+        assert page.value(f"!({COVERED}) && {LINKS} === 2"), "video and links continue"
+        cockpit.street.vehicle.close()
+        page.until(BLANK, SOON)
+        assert not page.errors
 
 
 def test_hanging_page_is_covered(cockpit: Cockpit, tmp_path: Path) -> None:
@@ -143,6 +168,18 @@ def test_hanging_page_is_covered(cockpit: Cockpit, tmp_path: Path) -> None:
         end = time.monotonic() + 10
         while not _dark(page):
             assert time.monotonic() < end, "the page isn't covered"
+
+
+def _black(page: Page) -> bool:
+    """Whether the picture that is on screen, below the page's own cover, is black but for its text."""
+    page.value("for (const one of document.querySelectorAll('figure .cover')) one.style.visibility = 'hidden'; 0")
+    shown = page.screenshot()
+    x, y, width, height = page.value(
+        "(b => [b.x, b.y, b.width, b.height])(document.querySelector('canvas').getBoundingClientRect())"
+    )
+    page.value("for (const one of document.querySelectorAll('figure .cover')) one.style.visibility = ''; 0")
+    inside = shown[round(y) : round(y + height), round(x) : round(x + width)]
+    return bool(np.percentile(inside, 90) < 20 and inside.max() > 100)
 
 
 def _dark(page: Page) -> bool:

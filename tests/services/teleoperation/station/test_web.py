@@ -23,6 +23,7 @@ from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.control.controls import Controls, Gear
 from scan2sim.services.teleoperation.control.messages import Command
 from tests.fakes.browser import Page, chromium
+from tests.fakes.driver_controls import hold
 from tests.services.teleoperation.pages import Cockpit, served
 from tests.waiting import until
 
@@ -56,25 +57,8 @@ navigator.getGamepads = () => [0, 1].map((index) => (
 0
 """
 """Two gamepads at rest."""
-KEYS = {"up": "ArrowUp", "down": "ArrowDown", "S": "KeyS", "space": "Space"}
-TRIGGERS = {"right trigger": (0, 7), "left trigger": (0, 6), "other gamepad's left trigger": (1, 6)}
-
-
-def hold(page: Page, control: str, down: bool) -> None:
-    """Press or release a control of keyboard, gamepad or page (its button, by mouse or finger)."""
-    if control in KEYS:
-        page.do("Input.dispatchKeyEvent", type="rawKeyDown" if down else "keyUp", code=KEYS[control], key=control)
-    elif control in TRIGGERS:
-        gamepad, button = TRIGGERS[control]
-        page.value(f"Object.assign(buttons[{gamepad}][{button}], {{value: {int(down)}, pressed: {int(down)} > 0}}); 0")
-    else:
-        x, y = page.value("(b => [b.x + b.width / 2, b.y + b.height / 2])(byId('brake').getBoundingClientRect())")
-        if control == "mouse":
-            kind = "mousePressed" if down else "mouseReleased"
-            page.do("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-        else:
-            points = [{"x": x, "y": y}] if down else []
-            page.do("Input.dispatchTouchEvent", type="touchStart" if down else "touchEnd", touchPoints=points)
+BRAKES = ("space", "down", "S", "mouse on brake", "finger on brake", "left trigger", "other gamepad's left trigger")
+STOPS = ("escape", "backspace", "mouse on stop", "finger on stop", "button B", "other gamepad's button B")
 
 
 def press(page: Page, button: str, done: Callable[[], bool]) -> None:
@@ -108,14 +92,13 @@ def test_driver_sees_the_video_age_confirms_and_drives_by_keyboard(cockpit: Cock
 def test_any_brake_overrides_any_throttle(cockpit: Cockpit, tmp_path: Path) -> None:
     """Full throttle and a brake on the same device or another: at the vehicle, and in all that the page sends."""
     throttles = ("up", "right trigger")
-    brakes = ("space", "down", "S", "mouse", "finger", "left trigger", "other gamepad's left trigger")
     car = cockpit.street.car
     with chromium(tmp_path) as page:
         start_driving(page, cockpit)
         page.value(GAMEPADS)
         page.do("Emulation.setTouchEmulationEnabled", enabled=True)
         page.value("sent = []; sending = send; send = (one) => { sent.push(one); sending(one); }; 0")
-        for throttle, brake in itertools.product(throttles, brakes):
+        for throttle, brake in itertools.product(throttles, BRAKES):
             press(page, "#agree", lambda: not cockpit.desk.standing())
             page.value("gamepad = null; 0")  # the next gamepad with a pressed button is used
             hold(page, throttle, True)
@@ -130,6 +113,86 @@ def test_any_brake_overrides_any_throttle(cockpit: Cockpit, tmp_path: Path) -> N
         braked = "sent.filter((one) => one.do === 'turn' && one.brake > 0)"
         assert page.value(f"{braked}.length") > 0 and page.value(f"{braked}.every((one) => one.throttle === 0)")
         assert not page.errors
+
+
+def test_brake_holds_until_the_last_of_two_inputs_is_released(cockpit: Cockpit, tmp_path: Path) -> None:
+    car = cockpit.street.car
+    with chromium(tmp_path) as page:
+        start_driving(page, cockpit)
+        page.value(GAMEPADS)
+        page.do("Emulation.setTouchEmulationEnabled", enabled=True)
+        for first, last in itertools.permutations(BRAKES, 2):
+            if {first, last} == {"mouse on brake", "finger on brake"}:
+                continue  # both press the same button
+            press(page, "#agree", lambda: not cockpit.desk.standing())
+            hold(page, first, True)
+            hold(page, last, True)
+            until(lambda: car.controls.brake == 1)
+            time.sleep(0.25)  # keys brake fully within 0.2 s
+            hold(page, first, False)
+            time.sleep(0.1)
+            assert car.controls.brake == 1 and car.controls.throttle == 0, f"{first}, then {last}"
+            hold(page, last, False)
+            until(lambda: car.controls.brake == 0)
+        assert not page.errors
+
+
+def test_emergency_stop_latches_until_it_is_released_deliberately(cockpit: Cockpit, tmp_path: Path) -> None:
+    """From every device, while the throttle of another is held."""
+    car, session = cockpit.street.car, cockpit.desk.station.driver_session
+    with chromium(tmp_path) as page:
+        start_driving(page, cockpit)
+        page.value(GAMEPADS)
+        page.do("Emulation.setTouchEmulationEnabled", enabled=True)
+        for throttle, stop in itertools.product(("up", "right trigger"), STOPS):
+            press(page, "#agree", lambda: not cockpit.desk.standing())
+            page.value("gamepad = null; 0")
+            hold(page, throttle, True)
+            until(lambda: car.controls.throttle > 0.9)
+            hold(page, stop, True)
+            until(lambda: car.controls.brake == 1)
+            hold(page, stop, False)
+            hold(page, throttle, False)
+            page.until("!byId('latched').hidden && byId('agree').disabled")
+            page.touch("#unlatch", 0.2)  # touched by accident
+            time.sleep(0.3)
+            assert session.latched and cockpit.desk.standing() and car.controls.brake == 1, stop
+            page.touch("#unlatch", 1.5)
+            until(lambda: not session.latched)
+            assert cockpit.desk.standing(), "the driver has to confirm"
+        assert not page.errors
+
+
+def test_any_page_can_stop_but_only_the_driver_ends_the_stop(cockpit: Cockpit, tmp_path: Path) -> None:
+    session = cockpit.desk.station.driver_session
+    with chromium(tmp_path) as page, live(cockpit) as watcher:
+        start_driving(page, cockpit)
+        watcher.send('{"do": "stop"}')
+        until(cockpit.desk.standing)
+        until(lambda: "emergency stop" in page.value("byId('standing').textContent"))
+        watcher.send('{"do": "unlatch"}')
+        until(lambda: "ended by the driver only" in str(watcher.recv()))
+        assert session.latched
+        page.value("byId('unlatch').focus()")
+        page.key("Enter", "Enter", 1.5)
+        until(lambda: not session.latched)
+        press(page, "#agree", lambda: not cockpit.desk.standing())
+
+
+def test_leaving_full_screen_by_the_browser_is_an_emergency_stop(cockpit: Cockpit, tmp_path: Path) -> None:
+    """Escape leaves full screen before the page sees the key, in browsers that can't lock it."""
+    with chromium(tmp_path) as page:
+        start_driving(page, cockpit)
+        page.click("#full")
+        page.until("document.fullscreenElement !== null")
+        page.click("#full")
+        page.until("document.fullscreenElement === null")
+        time.sleep(0.3)
+        assert not cockpit.desk.station.driver_session.latched, "left by the page's button"
+        page.click("#full")
+        page.until("document.fullscreenElement !== null")
+        page.value("document.exitFullscreen(); 0")
+        until(lambda: cockpit.desk.station.driver_session.latched)
 
 
 def test_brake_key_works_with_modifiers_and_presses_no_button(cockpit: Cockpit, tmp_path: Path) -> None:

@@ -72,6 +72,8 @@ def test_packets_survive_encoding_with_and_without_key() -> None:
     for key in (bytes(32), KEY[:-1]):
         with pytest.raises(Malformed):
             Order.unpack(ORDER.pack(key), KEY)
+    unknown = Answer(1, 1, True, "no order", VehicleState(None))
+    assert Answer.unpack(unknown.pack()) == unknown
     long = Answer(1, 1, True, "no order", VehicleState(faults=("ä" * 5000,)))
     assert len(long.pack(KEY)) <= PACKET_MAX_BYTES and Answer.unpack(long.pack(KEY), KEY).reason == "no order"
 

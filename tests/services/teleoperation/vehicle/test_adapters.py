@@ -7,7 +7,6 @@ import math
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -19,56 +18,24 @@ from typing import Any
 import can
 import cantools
 import pytest
+import yaml
 
 from scan2sim.pipeline.core.errors import InputError, ScanError, SettingError
 from scan2sim.services import transport
+from scan2sim.services.teleoperation import adapter_key
 from scan2sim.services.teleoperation.control.controls import STOP, Controls, Gear, VehicleState
 from scan2sim.services.teleoperation.vehicle import adapters
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
-from scan2sim.services.teleoperation.vehicle.adapter_protocol import Answer, OnboardEndpoint
 from scan2sim.services.teleoperation.vehicle.adapters import VehicleUnreachable
+from scan2sim.services.teleoperation.vehicle.adapters import ros as ros_adapter
 from scan2sim.services.teleoperation.vehicle.adapters.can import EXAMPLE_DBC
 from scan2sim.services.teleoperation.vehicle.adapters.ros import MESSAGE_TYPES, ODOMETRY_TYPE
 from tests.conftest import ROOT
-from tests.fakes.vehicle import RecordingVehicle
+from tests.fakes.nav2_nodes import Nodes
+from tests.fakes.vehicle import GO, OnboardPeer, RecordingVehicle, adapter_key_file
 from tests.waiting import until
 
-GO = Controls(0.5, throttle=1.0, gear=Gear.FORWARD, lights=True)
 LIMIT = 200
-
-
-class OnboardPeer:
-    """A running onboard endpoint, driven by the test."""
-
-    def __init__(self, address: tuple[str, int], key: bytes = b"") -> None:
-        self.end, self.key, self.driven = OnboardEndpoint(LIMIT), key, False
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.connect(address)
-        self.socket.settimeout(0.01)
-
-    def exchange(self, controls: Controls = GO) -> None:
-        order = self.end.order(controls if self.driven else STOP, 0.0, self.driven, time.monotonic_ns())
-        self.socket.send(order.pack(self.key))
-        try:
-            while True:
-                answer = Answer.unpack(self.socket.recv(2000), self.key)
-                if self.end.receive(answer, time.monotonic_ns()):
-                    self.driven = False
-        except (TimeoutError, ConnectionRefusedError):
-            pass
-
-    def until(self, what: Callable[[], bool], controls: Controls = GO, seconds: float = 20.0) -> None:
-        end = time.monotonic() + seconds
-        while not what():
-            assert time.monotonic() < end, self.end.answer
-            self.exchange(controls)
-
-    def start(self) -> None:
-        self.until(lambda: self.end.answer is not None)
-        for _ in range(5):
-            self.exchange()
-        self.driven = True
-        self.until(lambda: self.end.answer is not None and not self.end.answer.standing)
 
 
 Start = Callable[..., tuple[AdapterServer, OnboardPeer]]
@@ -80,11 +47,10 @@ def start_adapter() -> Iterator[Start]:
     ended, threads = threading.Event(), []
 
     def started(vehicle: Any, **params: Any) -> tuple[AdapterServer, OnboardPeer]:
-        one = AdapterServer(vehicle, AdapterParams(port=0, limit=LIMIT, **params))
+        one = AdapterServer(vehicle, AdapterParams(port=0, limit=LIMIT, key=adapter_key_file(), **params))
         threads.append(threading.Thread(target=one.run, args=(ended,)))
         threads[-1].start()
-        key = params["key"].read_bytes() if "key" in params else b""
-        return one, OnboardPeer(one.address, key)
+        return one, OnboardPeer(one.address, adapter_key.read(adapter_key_file()))
 
     yield started
     ended.set()
@@ -132,12 +98,11 @@ def test_unreachable_vehicle_is_a_stop_that_the_driver_confirms(start_adapter: S
     peer.until(vehicle.moves)
 
 
-def test_malformed_and_foreign_packets_are_not_obeyed(start_adapter: Start, tmp_path: Path) -> None:
-    key = tmp_path / "key"
-    key.write_bytes(b"k" * 32)
+@pytest.mark.parametrize("key", [b"x" * 32, b""], ids=["another key", "no key"])
+def test_malformed_and_foreign_packets_are_not_obeyed(start_adapter: Start, key: bytes) -> None:
     vehicle = RecordingVehicle()
-    adapter_server, peer = start_adapter(vehicle, key=key, host="0.0.0.0")
-    stranger = OnboardPeer(("127.0.0.1", adapter_server.address[1]), b"x" * 32)
+    adapter_server, peer = start_adapter(vehicle, host="0.0.0.0")
+    stranger = OnboardPeer(("127.0.0.1", adapter_server.address[1]), key)
     peer.socket.connect(("127.0.0.1", adapter_server.address[1]))
     peer.start()
     for _ in range(20):
@@ -148,18 +113,22 @@ def test_malformed_and_foreign_packets_are_not_obeyed(start_adapter: Start, tmp_
     assert vehicle.moves() and stranger.end.answer is None and adapter_server.malformed == 40
 
 
-def test_listening_beyond_loopback_requires_a_key(tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match="--key"):
-        AdapterServer(RecordingVehicle(), AdapterParams(host="0.0.0.0", port=0))
-    (tmp_path / "short").write_text("abc\n", encoding="utf-8")
-    with pytest.raises(InputError, match="3 bytes"):
-        AdapterServer(RecordingVehicle(), AdapterParams(port=0, key=tmp_path / "short"))
+def test_adapter_refuses_keys_that_are_missing_short_or_readable_by_others(tmp_path: Path) -> None:
+    key = tmp_path / "key"
+    for mode, text, reason in ((0o600, "abc\n", "3 bytes"), (0o644, "k" * 32, "accessible to other users")):
+        key.write_text(text, encoding="utf-8")
+        key.chmod(mode)
+        with pytest.raises(InputError, match=reason):
+            AdapterServer(RecordingVehicle(), AdapterParams(port=0, key=key))
+    key.unlink()
+    with pytest.raises(InputError, match="teleop certificates"):
+        AdapterServer(RecordingVehicle(), AdapterParams(port=0, key=key))
 
 
 def test_vehicle_is_stopped_when_its_adapter_ends() -> None:
     vehicle, ended = RecordingVehicle(), threading.Event()
     ended.set()
-    AdapterServer(vehicle, AdapterParams(port=0)).run(ended)
+    AdapterServer(vehicle, AdapterParams(port=0, key=adapter_key_file())).run(ended)
     assert vehicle.received[-1][1] == STOP and vehicle.closed
 
 
@@ -198,7 +167,8 @@ from scan2sim.services.teleoperation.vehicle import adapters
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
 adapters.__path__.append({str(tmp_path / "more")!r})
 found = adapters.find("boat")
-one = AdapterServer(found.connect(found.Params(file={str(tmp_path / "log")!r})), AdapterParams(port=0))
+params = AdapterParams(port=0, key={str(adapter_key_file())!r})
+one = AdapterServer(found.connect(found.Params(file={str(tmp_path / "log")!r})), params)
 print(one.address[1], flush=True)
 one.run(threading.Event())
 """
@@ -222,7 +192,8 @@ def test_new_vehicle_is_one_module_and_stops_when_its_onboard_unit_hangs(
 from scan2sim.services.teleoperation.settings import OnboardParams
 from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardUnit
 from tests.fakes.driver import FakeConnection, ScriptedDriver
-unit, connection, stations = OnboardUnit(OnboardParams(translator="127.0.0.1:{port}")), FakeConnection(), []
+params = OnboardParams(adapter="127.0.0.1:{port}", key={str(adapter_key_file())!r})
+unit, connection, stations = OnboardUnit(params), FakeConnection(), []
 unit.join(lambda received, restarted: stations.append(ScriptedDriver(connection, received)) or connection)
 stations[0].start()
 print("drives", flush=True)
@@ -312,8 +283,17 @@ def test_vehicle_reports_speed_and_gear_or_its_silence(vehicle: Any, monkeypatch
     one.obey(STOP)
     assert one.state() == VehicleState(-5.0, gear=Gear.REVERSE)
     now = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now + 0.3)
+    assert (one.state().speed, one.state().faults) == (None, ())
     monkeypatch.setattr(time, "monotonic", lambda: now + 2)
     assert one.state().faults == ("no messages from the vehicle on teleoperation",)
+    one.close()
+
+
+def test_vehicle_without_a_speed_signal_has_an_unknown_speed(vehicle: Any) -> None:
+    one = connect(speed="", gear_in="")
+    one.obey(STOP)
+    assert one.state() == VehicleState(None)
     one.close()
 
 
@@ -460,3 +440,97 @@ def test_missing_odometry_is_reported(network: None, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(time, "monotonic", lambda: now + 2)
     assert one.state().faults == ("no odometry on /odom",)
     one.close()
+
+
+def nodes(pythons: dict[str, str]) -> Nodes:
+    """Nodes between adapter and vehicle, and the vehicle, which has ROS 2's own client library if it is installed."""
+    other = "rclpy" if "rclpy" in pythons else "cyclone"
+    return Nodes({"smoother": "cyclone", "monitor": other, "base": other}, pythons)
+
+
+@pytest.mark.parametrize("hung", ["smoother", "monitor"])
+def test_vehicle_stops_when_a_node_between_hangs(
+    network: None, pythons: dict[str, str], start_adapter: Start, hung: str
+) -> None:
+    with nodes(pythons) as chain:  # a vehicle without a timeout of its own
+        one = ros_vehicle(topic="cmd_vel_teleop", output="cmd_vel", odometry="odom")
+        _, peer = start_adapter(one)
+        peer.until(lambda: math.isfinite(one._output._received))  # all are connected
+        peer.start()
+        peer.until(lambda: chain.moves and (one.state().speed or 0) > 0.9)
+        began = chain.hang(hung)
+        peer.until(lambda: not chain.moves)
+        assert 0 < chain.since - began < 1.5  # 0.3 s on a quiet machine
+        peer.until(lambda: not peer.driven)
+        answer = peer.end.answer
+        assert answer is not None and answer.reason == "nothing is published on /cmd_vel: check the nodes before it"
+        chain.wake(hung)
+        for _ in range(100):
+            peer.exchange()
+        assert not chain.moves  # it drives again only when the driver confirms
+        peer.start()
+        peer.until(lambda: chain.moves)
+
+
+def test_stop_passes_through_the_nodes_between(network: None, pythons: dict[str, str], start_adapter: Start) -> None:
+    with nodes(pythons) as chain:
+        one = ros_vehicle(topic="cmd_vel_teleop", output="cmd_vel", joint_states="joint_states", odometry="")
+        _, peer = start_adapter(one)
+        peer.until(lambda: math.isfinite(one._output._received))  # all are connected
+        peer.start()
+        peer.until(lambda: (one.state().speed or 0) == pytest.approx(1.0))  # measured by the wheels
+        peer.until(lambda: not chain.moves, STOP)
+        peer.until(lambda: one.state().speed == 0.0, STOP)
+        time.sleep(2.0)  # the monitor ceases to publish
+        peer.start()
+        peer.until(lambda: chain.moves)
+
+
+def twist(speed: float) -> Any:
+    message = transport.load("cyclone").message("geometry_msgs/msg/Twist")
+    message.linear.x = speed
+    return message
+
+
+def test_nodes_that_ignore_a_stop_are_overridden() -> None:
+    sent: list[Any] = []
+
+    class Publisher:
+        def publish(self, message: Any) -> None:
+            sent.append(message)
+
+    params = ros_adapter.Params(topic="a", output="b", stop_within=0.5)
+    output, now = ros_adapter.Output(params, Publisher()), time.monotonic()
+    output.receive(twist(1.0))
+    output.enforce(twist(1.0), now)
+    output.enforce(twist(0.0), now + 0.1)
+    output.receive(twist(0.9))
+    output.enforce(twist(0.0), now + 0.2)
+    assert not sent  # it may decelerate
+    output.enforce(twist(0.0), now + 0.7)
+    output.receive(sent[-1])
+    output.enforce(twist(0.0), now + 0.71)
+    assert [message.linear.x for message in sent] == [0.0, 0.0]  # until something else is commanded
+    output.enforce(twist(1.0), now + 0.72)
+    output.receive(twist(0.0))
+    assert output.holds(now + 2) and len(sent) == 2  # a collision monitor's stop is reported
+
+
+def test_commands_and_output_need_different_topics() -> None:
+    with pytest.raises(SettingError, match="topic of the commands as well"):
+        adapters.find("ros").Params.of("", {"topic": "cmd_vel", "output": "/cmd_vel"})
+
+
+def test_documented_parameters_of_nav2_connect_adapter_and_vehicle() -> None:
+    text = (EXAMPLE_DBC.parent / "nav2.yaml").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "teleoperation-ros.md").read_text(encoding="utf-8")
+    assert f"```yaml\n{text}```" in page
+    nodes = {name: one["ros__parameters"] for name, one in yaml.safe_load(text).items()}
+    monitor, smoother = nodes["collision_monitor"], nodes["velocity_smoother"]
+    assert "-r cmd_vel:=cmd_vel_teleop" in page and "--set topic=cmd_vel_teleop --set output=cmd_vel" in page
+    assert (monitor["cmd_vel_in_topic"], monitor["cmd_vel_out_topic"]) == ("cmd_vel_smoothed", "cmd_vel")
+    assert nodes["lifecycle_manager_teleoperation"]["node_names"] == ["velocity_smoother", "collision_monitor"]
+    assert f"`velocity_timeout` | {smoother['velocity_timeout']} s" in page
+    assert f"`source_timeout` | {monitor['source_timeout']} s" in page
+    full = ros_adapter.Params()
+    assert full.speed / -smoother["max_decel"][0] < full.stop_within  # a normal stop isn't overridden

@@ -14,6 +14,7 @@ from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.teleoperation.control.controls import VehicleState
 from scan2sim.services.teleoperation.control.messages import (
     Command,
+    CongestionReport,
     KeyFrameRequest,
     Kind,
     Message,
@@ -39,7 +40,7 @@ from scan2sim.services.teleoperation.vehicle.onboard_unit import (
     pack_fitting,
 )
 from tests.fakes.driver import GO, REST, FakeClocks, FakeConnection, ScriptedDriver
-from tests.fakes.vehicle import RecordingVehicle
+from tests.fakes.vehicle import RecordingVehicle, adapter_key_file
 
 LIMIT = 200
 
@@ -60,6 +61,9 @@ class FakeCamera:
 
     def adapt(self, report: VideoReport) -> None:
         self.reports.append(report)
+
+    def relieve(self, report: CongestionReport) -> None:
+        raise AssertionError("no congestion was reported")
 
 
 class Desk:
@@ -246,18 +250,20 @@ def test_telemetry_fits_into_a_packet_with_any_number_of_faults() -> None:
 
 def test_invalid_adapter_address_is_reported() -> None:
     for wrong in ("localhost", "localhost:", ":x", "host:70000"):
-        with pytest.raises(SettingError, match="translator"):
-            OnboardParams(translator=wrong).address()
+        with pytest.raises(SettingError, match="adapter"):
+            OnboardParams(adapter=wrong).address()
 
 
 @pytest.fixture
 def running() -> Iterator[tuple[RecordingVehicle, OnboardUnit, ScriptedDriver, FakeConnection, threading.Event]]:
     """A vehicle, its adapter, its onboard unit, and a station."""
     vehicle, ended, connection = RecordingVehicle(VehicleState(3.0)), threading.Event(), FakeConnection()
-    adapter_server = AdapterServer(vehicle, AdapterParams(port=0, limit=LIMIT))
+    adapter_server = AdapterServer(vehicle, AdapterParams(port=0, limit=LIMIT, key=adapter_key_file()))
     adapter = threading.Thread(target=adapter_server.run, args=(ended,))
     adapter.start()
-    unit = OnboardUnit(OnboardParams(translator=f"127.0.0.1:{adapter_server.address[1]}", limit=LIMIT))
+    unit = OnboardUnit(
+        OnboardParams(adapter=f"127.0.0.1:{adapter_server.address[1]}", limit=LIMIT, key=adapter_key_file())
+    )
     stations: list[ScriptedDriver] = []
 
     def connect(received: Callable[[Message], None], restarted: Callable[[], None]) -> FakeConnection:

@@ -118,7 +118,7 @@ def test_station_keeps_a_limited_number_of_keys() -> None:
         station.add_key(key)
     for key in keys:
         session = Session(srtp_session._policy(key, Policy.SSRC_ANY_OUTBOUND))
-        packet = session.protect(rtp_packets.packetize(b"\x01data", key.generation << 8, 0, 0, 0)[0])
+        packet = session.protect(rtp_packets.packetize(b"\x01data", key.generation << 8, 0, 0, 0, 0)[0])
         assert bool(station.decrypt(packet, 0.0)) == (key.generation >= 10 - KEYS_MAX)
 
 

@@ -1,7 +1,7 @@
 """Google's Draco codec (`KHR_draco_mesh_compression`): slow to decode; for browsers, Cesium, Blender, Unreal, Unity.
 
 Positions are quantized to 2^-10 m on a grid common to all tiles, so that tiles meet within a millimetre; texture
-coordinates to 2^-16 of a page, normals to 10 bits. Vertices and triangles are reordered.
+coordinates to 2^-16 of a page, normals to 10 bits, reflectance to 8 bits. Vertices and triangles are reordered.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ COMPRESSION_LEVEL = 7
 """0 to 10 (smallest)."""
 TYPED_ATTRIBUTES = ("POSITION", "TEXCOORD_0", "NORMAL")
 """Attributes that have a type of their own in Draco; all others are generic."""
+NORMALIZED = ("_REFLECTANCE",)
+"""Attributes from 0 to 1 that are written as normalized bytes: Draco doesn't compress generic floats well."""
 ATTRIBUTE_TYPES = {0: "POSITION", 1: "NORMAL", 3: "TEXCOORD_0"}
 """Draco's attribute types."""
 
@@ -30,17 +32,23 @@ def primitive(builder: Builder, part: Part) -> dict[str, Any]:
     import DracoPy
 
     builder.use(EXTENSION, required=True)
-    generic = [name for name in part.attributes if name not in TYPED_ATTRIBUTES]
-    data = _encode(part, generic)
+    attributes = {
+        name: np.rint(255 * values).astype(np.uint8) if name in NORMALIZED else values
+        for name, values in part.attributes.items()
+    }
+    generic = [name for name in attributes if name not in TYPED_ATTRIBUTES]
+    data = _encode(Part(part.faces, attributes), generic)
     read = DracoPy.decode(data)  # accessors describe the decoded data: vertex order and quantized positions
     found = {ATTRIBUTE_TYPES.get(a["attribute_type"]) or generic[a["unique_id"]]: a for a in read.attributes}
     accessors = {
-        name: builder.accessor(_rows(found[name]["data"], values), None, bounds=name == "POSITION")
-        for name, values in part.attributes.items()
+        name: builder.accessor(
+            _rows(found[name]["data"], values), None, bounds=name == "POSITION", normalized=name in NORMALIZED
+        )
+        for name, values in attributes.items()
     }
     compressed = {
         "bufferView": builder.view(data),
-        "attributes": {name: found[name]["unique_id"] for name in part.attributes},
+        "attributes": {name: found[name]["unique_id"] for name in attributes},
     }
     index = read.faces.ravel().astype(np.uint32)
     return {"attributes": accessors, "indices": builder.accessor(index, None), "extensions": {EXTENSION: compressed}}

@@ -1,7 +1,7 @@
 """meshoptimizer's codec (`EXT_meshopt_compression`): very fast to decode; read by browsers, Cesium, Babylon.
 
 Positions are quantized to 2^-10 m on a grid common to all tiles, so that tiles meet within a millimetre; texture
-coordinates to 2^-16 of a page, distances to 2^-7 m, normals to 8 bits (`KHR_mesh_quantization`).
+coordinates to 2^-16 of a page, distances to 2^-7 m, reflectance to 2^-8, normals to 8 bits (`KHR_mesh_quantization`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from scan2sim.pipeline.io.worlds.gltf.geometry import Part
 
 NEEDS = ("meshopt",)
 EXTENSION = "EXT_meshopt_compression"
-STEP_EXPONENT = {"POSITION": -10, "_DISTANCE": -7}
-"""Quantization step of attributes: exponent of two, metres."""
+STEP_EXPONENT = {"POSITION": -10, "_DISTANCE": -7, "_REFLECTANCE": -8}
+"""Quantization step of attributes: exponent of two; metres, reflectance."""
 MAX_STEPS = 1 << 23
 """Range of the 24-bit mantissa."""
 

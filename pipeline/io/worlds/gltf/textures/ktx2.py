@@ -30,7 +30,7 @@ def encode(page: U8, quality: int) -> bytes:
     """
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "page.png", Path(folder) / "page.ktx2"
-        image.write(source, _multiple_of_four(page), compression=1)
+        image.write(source, _multiple_of_four(page))
         quality_255 = str(max(1, round(quality * 2.55)))
         if shutil.which("basisu"):
             command = [

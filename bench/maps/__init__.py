@@ -1,0 +1,1 @@
+"""Worlds made from robots' maps, measured against ground truth."""

@@ -1,0 +1,5 @@
+"""`python -m bench.maps`."""
+
+from bench.maps.run import main
+
+main()

@@ -1,0 +1,5 @@
+"""`python -m bench.recordings`."""
+
+from bench.recordings.run import main
+
+main()

@@ -1,0 +1,5 @@
+"""`python -m bench.scenario`."""
+
+from bench.scenario.run import main
+
+main()

@@ -1,0 +1,107 @@
+"""`scan2sim orchestrate slice`: network slices and their templates in OSM."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from scan2sim.flows.commands.app import App
+from scan2sim.flows.commands.display import console
+from scan2sim.flows.commands.options import options
+from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, say
+from scan2sim.flows.commands.orchestrate_sites import REQUIREMENT
+from scan2sim.services.orchestration.settings import Connection, OperationParams
+
+NameOrId = Annotated[str, typer.Argument(metavar="NAME", help="Name or id in OSM.")]
+
+app = App("Network slices: services that are instantiated together, from a template.", requirement=REQUIREMENT)
+
+
+@app.command("templates")
+@options(Connection)
+def templates(params: Connection) -> None:
+    """List network slice templates (NST) and their network services."""
+    with osm_client(params) as osm:
+        found = osm.templates()
+    table = Table("name", "id", "network services")
+    for one in found:
+        table.add_row(*map(escape, (one.name, one.id, ", ".join(subnet.service for subnet in one.subnets))))
+    console.print(table)
+
+
+@app.command("add-template")
+@options(Connection)
+def add_template(
+    params: Connection,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Template: a YAML file, or a .tar.gz package.")],
+) -> None:
+    """Onboard a network slice template (NST); its network services must be in OSM."""
+    from scan2sim.services.orchestration import slices
+
+    with osm_client(params) as osm:
+        name = slices.add_template(osm, file)
+    say(f"{name} is in OSM")
+
+
+@app.command("remove-template")
+@options(Connection)
+def remove_template(params: Connection, name: NameOrId) -> None:
+    """Remove a template from OSM, which refuses it while a slice uses it."""
+    from scan2sim.services.orchestration import slices
+
+    with osm_client(params) as osm:
+        slices.remove_template(osm, name)
+    say(f"{name} is removed")
+
+
+@app.command("list")
+@options(Connection)
+def list_(params: Connection) -> None:
+    """List network slices (NSI) with their templates and states."""
+    with osm_client(params) as osm:
+        found = osm.slices()
+    table = Table("name", "template", "state")
+    for one in found:
+        reason = f": {one.detail[:200]}" if one.status == "failed" and one.detail else ""
+        table.add_row(*map(escape, (one.name, one.template, one.state + reason)))
+    console.print(table)
+
+
+@app.command("create")
+@options(OperationParams)
+def create(
+    params: OperationParams,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the new slice.")],
+    template: Annotated[str, typer.Argument(metavar="TEMPLATE", help="Name or id of its template in OSM.")],
+    vim: Annotated[str | None, typer.Option(help="Name or id of the VIM account for its services.")] = None,
+    cluster: Annotated[str | None, typer.Option(help="Kubernetes cluster whose VIM account is used instead.")] = None,
+) -> None:
+    """Create a network slice from a template and instantiate its services."""
+    from scan2sim.pipeline.core.errors import SettingError
+    from scan2sim.services.orchestration import slices
+
+    with operation(params, name) as (osm, wait_policy, notify):
+        if cluster and not vim:
+            site = osm.cluster(cluster)
+        elif vim and not cluster:
+            site = osm.vim(vim)
+        else:
+            raise SettingError("--vim", "give either --vim or --cluster", "It sets where services are instantiated")
+        new = slices.create(osm, name, template, site, wait_policy, notify)
+    state = ("is running" if params.wait else "is being instantiated") if new else "is already in OSM, and unchanged"
+    say(f"{name} {state}")
+
+
+@app.command("remove")
+@options(OperationParams)
+def remove(params: OperationParams, name: NameOrId) -> None:
+    """Terminate a network slice with its services, and remove it; waits until it is gone."""
+    from scan2sim.services.orchestration import slices
+
+    with operation(params, name) as (osm, wait_policy, notify):
+        slices.remove(osm, name, wait_policy, notify)
+    say(f"{name} is removed")

@@ -1,0 +1,197 @@
+"""Frames of `/tf_static` and `/tf`: fixed transforms between frames, and poses of a frame over time."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.poses import interpolate
+from scan2sim.pipeline.core.types import F64
+from scan2sim.pipeline.importers.bag.reader import plain
+
+WORLD_FRAMES = ("map", "world", "odom", "earth")
+"""Names of frames that don't move with the vehicle (REP 105), the preferred one first."""
+CONSTANT = 1e-6
+"""Largest change of a transform that never changes: metres, and elements of the rotation matrix."""
+MAX_LISTED = 20
+"""Links that an error lists."""
+GIVE_LINK = "Give the transform with --transform 'PARENT CHILD x y z qx qy qz qw', or the robot's --urdf"
+
+
+def matrix(position: Any, quaternion: Any) -> F64:
+    """(4, 4) of position (x, y, z) in metres and quaternion (x, y, z, w).
+
+    Raises:
+        ValueError: the quaternion has no length, or a number isn't finite.
+    """
+    from scipy.spatial.transform import Rotation
+
+    values = np.array([*position, *quaternion], np.float64)
+    if not np.isfinite(values).all() or not np.linalg.norm(values[3:]) > 1e-6:
+        raise ValueError("invalid pose")
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
+    return T
+
+
+def pose_matrix(pose: Any) -> F64:
+    """(4, 4) of a `geometry_msgs/Pose`. Raises ValueError as `matrix`."""
+    p, q = pose.position, pose.orientation
+    return matrix((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+
+
+def transform_matrix(transform: Any) -> F64:
+    """(4, 4) of a `geometry_msgs/Transform`: child to parent axes. Raises ValueError as `matrix`."""
+    p, q = transform.translation, transform.rotation
+    return matrix((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+
+
+class Series:
+    """Poses over time, gathered in any order: 104 bytes each, as recordings of hours have millions."""
+
+    def __init__(self) -> None:
+        self._times, self._rows = array("d"), array("d")
+
+    def add(self, time: float, pose: F64) -> None:
+        """Add a pose (4, 4)."""
+        self._times.append(time)
+        self._rows.extend(pose[:3].ravel().tolist())
+
+    def poses(self) -> F64:
+        """Poses (T, 4, 4) in the order in which they were added."""
+        T = np.tile(np.eye(4), (len(self._times), 1, 1))
+        T[:, :3] = np.array(self._rows).reshape(-1, 3, 4)
+        return T
+
+    def sorted(self) -> tuple[F64, F64]:
+        """Times (T,), ascending, each once (the last pose of a time counts), and poses (T, 4, 4)."""
+        times = np.array(self._times, np.float64)
+        order = np.argsort(times, kind="stable")
+        last = np.append(np.diff(times[order]) > 0, True)[: len(order)]
+        keep = order[last]
+        return times[keep], self.poses()[keep]
+
+
+@dataclass
+class Frames:
+    """Links between frames: `static` and `moving` by (parent, child)."""
+
+    path: Path
+    static: dict[tuple[str, str], F64] = field(default_factory=dict)
+    moving: dict[tuple[str, str], Series] = field(default_factory=dict)
+
+    def add_given(self, links: Iterable[str]) -> None:
+        """Add static links of the user: "PARENT CHILD x y z qx qy qz qw".
+
+        Raises:
+            SettingError: a text has another form.
+        """
+        for text in links:
+            words = text.split()
+            try:
+                parent, child, *numbers = words
+                x, y, z, *quaternion = map(float, numbers)
+                if len(quaternion) != 4:
+                    raise ValueError
+                self.static[plain(parent), plain(child)] = matrix((x, y, z), quaternion)
+            except ValueError:
+                remedy = "Write 'PARENT CHILD x y z qx qy qz qw': metres, and a unit quaternion"
+                raise SettingError("--transform", f"{text!r} is not a transform", remedy) from None
+
+    def fix_constant(self) -> None:
+        """Make moving links static that have the same transform at all times."""
+        for link, series in list(self.moving.items()):
+            poses = series.poses()
+            if len(poses) > 1 and np.ptp(poses, axis=0).max() < CONSTANT:
+                del self.moving[link]
+                self.static[link] = poses[0]
+
+    def between(self, target: str, source: str) -> F64:
+        """T_target_source (4, 4) by static links.
+
+        Raises:
+            InputError: no chain of static links connects them; names the frames that there are.
+        """
+        T = self._static_chain(target, source)
+        if T is None:
+            cause = f"has no static transform between the frames {target!r} and {source!r}; {self.listed()}"
+            raise InputError(self.path, cause, f"{GIVE_LINK}, or leave out the topic in that frame")
+        return T
+
+    def connected(self, target: str, source: str) -> bool:
+        """Whether static links connect two frames."""
+        return self._static_chain(target, source) is not None
+
+    def _static_chain(self, target: str, source: str) -> F64 | None:
+        reached, queue = {source: np.eye(4)}, [source]
+        while queue:
+            frame = queue.pop(0)
+            for (parent, child), T in self.static.items():
+                for here, other, step in ((child, parent, T), (parent, child, np.linalg.inv(T))):
+                    if here == frame and other not in reached:
+                        reached[other] = step @ reached[frame]
+                        queue.append(other)
+        return reached.get(target)
+
+    def ancestors(self, frame: str) -> list[tuple[str, str]]:
+        """Links from a frame up to the root of its tree, the nearest first."""
+        parents = {child: parent for parent, child in [*self.static, *self.moving]}
+        chain: list[tuple[str, str]] = []
+        while frame in parents and len(chain) <= len(parents):
+            chain.append((parents[frame], frame))
+            frame = parents[frame]
+        return chain
+
+    def world_frame(self, frame: str, given: str | None = None) -> str | None:
+        """Frame above `frame` that it moves in: the given one, else one of `WORLD_FRAMES`, else the root; or None.
+
+        Raises:
+            InputError: the given one isn't above `frame`, or nothing moves between them.
+        """
+        above, moves = [], False
+        for link in self.ancestors(frame):
+            moves = moves or link in self.moving
+            if moves:
+                above.append(link[0])
+        if given is not None and plain(given) not in above:
+            cause = f"has no moving transform from {given!r} to {frame!r}; {self.listed()}"
+            raise InputError(self.path, cause, "Give another --world-frame, or other --poses")
+        if given is not None:
+            return plain(given)
+        return next((name for name in WORLD_FRAMES if name in above), above[-1] if above else None)
+
+    def poses_of(self, frame: str, world: str) -> tuple[F64, F64]:
+        """Times (T,) and poses (T, 4, 4) of a frame in a frame above it, at the times of its most frequent link."""
+        links = []
+        for link in self.ancestors(frame):
+            links.append(link)
+            if link[0] == world:
+                break
+        series = {link: self.moving[link].sorted() for link in links if link in self.moving}
+        times = max((times for times, _ in series.values()), key=len)
+        T = np.tile(np.eye(4), (len(times), 1, 1))
+        for link in reversed(links):
+            if link in series:
+                at, poses = series[link]
+                T = T @ interpolate(poses, at, np.clip(times, at[0], at[-1]))
+            else:
+                T = T @ self.static[link]
+        return times, T
+
+    def listed(self) -> str:
+        """The links as text, for errors."""
+        links = [f"{p} > {c}" for p, c in sorted(self.static)] + [f"{p} > {c} (moving)" for p, c in sorted(self.moving)]
+        if not links:
+            return "it has no transforms at all"
+        return f"its transforms: {_some(links)}"
+
+
+def _some(texts: Sequence[str]) -> str:
+    more = len(texts) - MAX_LISTED
+    return ", ".join(texts[:MAX_LISTED]) + (f" and {more} more" if more > 0 else "")

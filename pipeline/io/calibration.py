@@ -1,0 +1,165 @@
+"""Calibration files: extrinsics of a scanner and a camera, camera of a folder of photos."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from pydantic import ValidationError
+
+from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.poses import nearest_rotation
+from scan2sim.pipeline.core.types import F64, Camera
+from scan2sim.pipeline.io import file_checks, toml
+from scan2sim.pipeline.io.images.image import SUFFIXES, size_of
+from scan2sim.pipeline.io.sweep_files import list_files
+from scan2sim.pipeline.io.tile import DISTORTION_LENGTHS, CameraEntry
+
+MAX_VALUE = 1e8
+"""Plausibility limit of calibration values."""
+
+
+def read_extrinsics(path: Path) -> F64:
+    """Read T_camera_scanner (4, 4) from a text file: three or four rows of four numbers, or a calibration of KITTI.
+
+    Supported KITTI files: `calib_velo_to_cam.txt` (R: and T:), and `calib.txt` of the odometry data set (Tr:).
+
+    Raises:
+        InputError: another format, or not a rigid transform.
+    """
+    remedy = "Write T_camera_scanner: three rows of four numbers, scanner axes to camera axes"
+    lines = [line.partition("#")[0].strip() for line in file_checks.lines(path)]
+    entries = _entries(lines)
+    try:
+        if "Tr" in entries:
+            rows = _numbers(entries["Tr"]).reshape(3, 4)
+        elif {"R", "T"} <= set(entries):
+            rows = np.column_stack([_numbers(entries["R"]).reshape(3, 3), _numbers(entries["T"]).reshape(3)])
+        else:
+            rows = np.array([_numbers(line) for line in lines if line])
+            if rows.shape not in ((3, 4), (4, 4)) or (len(rows) == 4 and not np.allclose(rows[3], [0, 0, 0, 1])):
+                raise ValueError(f"{len(rows)} rows")
+    except ValueError as error:
+        raise InputError(path, f"contains no 3x4 or 4x4 matrix ({error})", remedy) from None
+    R = rows[:3, :3]
+    if not np.isfinite(rows).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        raise InputError(path, "its left 3x3 is not a rotation matrix", remedy)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = nearest_rotation(R), rows[:3, 3]
+    return T
+
+
+def photo_extrinsics(path: Path, photos: Path) -> F64 | None:
+    """T_camera_scanner (4, 4) of the camera of a photo folder, from `calib.txt` of KITTI odometry.
+
+    `Tr` belongs to camera 0, whose poses that data set gives; the camera of `image_2` is 6 cm beside it (see P2).
+
+    Returns:
+        None if the file isn't KITTI's, or the folder isn't named like one of its cameras: the extrinsics of
+        `read_extrinsics` then also apply to the photos.
+
+    Raises:
+        InputError: as `read_extrinsics`, or the file has no valid P of that camera.
+    """
+    name = re.fullmatch(r"image_0?(\d)", photos.resolve().name)
+    entries = _entries(file_checks.lines(path))
+    if name is None or "Tr" not in entries:
+        return None
+    T, key = read_extrinsics(path), f"P{name[1]}"
+    try:
+        P = _numbers(entries[key]).reshape(3, 4)
+        T[:3, 3] += np.linalg.solve(P[:, :3], P[:, 3])
+        if not np.isfinite(T).all():
+            raise ValueError("not finite")
+    except (KeyError, ValueError, np.linalg.LinAlgError) as error:
+        remedy = "Unpack the calibration again, or give T_camera_scanner of the photos' camera"
+        raise InputError(path, f"has no valid `{key}` ({error})", remedy) from None
+    return T
+
+
+def read_camera(path: Path, width: int, height: int) -> Camera:
+    """The camera for photos of a size, from the `[[cameras]]` of a tile.toml, or of a file with only these.
+
+    Raises:
+        InputError: no camera of that size, or it is invalid.
+    """
+    path = path / "tile.toml" if path.is_dir() else path
+    remedy = "Write [[cameras]] with id, model, size, focal, centre as in a tile.toml (docs/reference/formats.md)"
+    try:
+        cameras = [CameraEntry.model_validate(entry) for entry in toml.table(path).get("cameras", [])]
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(path, f"field `cameras.{where}`: {first['msg']}", remedy) from None
+    except TypeError:
+        raise InputError(path, "its `cameras` are not tables", remedy) from None
+    for c in cameras:
+        if c.size == (width, height):
+            if c.model != "equirectangular" and not min(c.focal) > 0:
+                raise InputError(path, f"camera `{c.id}`: focal {c.focal} is not positive", remedy)
+            if len(c.distortion) not in DISTORTION_LENGTHS[c.model]:
+                lengths = " or ".join(map(str, DISTORTION_LENGTHS[c.model]))
+                raise InputError(path, f"camera `{c.id}`: {len(c.distortion)} coefficients, expected {lengths}", remedy)
+            return Camera(c.model, *c.size, *c.focal, *c.centre, c.distortion)
+    found = ", ".join(f"{c.size[0]}x{c.size[1]}" for c in cameras) or "none"
+    raise InputError(path, f"has no camera of {width}x{height} (it has {found})", remedy)
+
+
+def camera_of_photos(
+    photos: Path,
+    *,
+    model: str = "auto",
+    focal: float | None = None,
+    centre: tuple[float, float] | None = None,
+    file: Path | None = None,
+) -> Camera:
+    """The camera of a folder of photos, from `file` (`read_camera`) or the given parameters.
+
+    Args:
+        photos: folder of the photos.
+        model: "auto" (a photo with aspect ratio 2:1 and no focal length is equirectangular), "pinhole" or
+            "equirectangular".
+        focal, centre: pixels; default centre: the middle of the photo.
+        file: file with cameras.
+
+    Raises:
+        InputError: no photos, or no focal length. SettingError: unknown model.
+    """
+    if model not in ("auto", "pinhole", "equirectangular"):
+        raise SettingError("camera", f"unknown model {model!r}", "Use auto, pinhole, equirectangular, or a file")
+    first = list_files(photos, SUFFIXES, "photos")[0]
+    width, height = size_of(first)
+    if file is not None:
+        return read_camera(file, width, height)
+    if model == "equirectangular" or (model == "auto" and focal is None and width == 2 * height):
+        return Camera("equirectangular", width, height)
+    if focal is None or not focal > 0:
+        raise InputError(photos, "have no camera", "Give --focal (pixels), or a file with the camera")
+    cx, cy = centre or ((width - 1) / 2, (height - 1) / 2)
+    return Camera("pinhole", width, height, focal, focal, cx, cy)
+
+
+def read_entry(path: Path, key: str, size: int, remedy: str) -> F64:
+    """The `size` numbers after `key:` in a calibration file.
+
+    Raises:
+        InputError: the file is missing, or has no such entry.
+    """
+    try:
+        values = _numbers(_entries(file_checks.lines(path, remedy)).get(key, ""))
+    except ValueError:
+        values = np.zeros(0)
+    if values.size != size or not (np.abs(values) < MAX_VALUE).all():
+        raise InputError(path, f"has no `{key}` with {size} numbers", "Unpack the calibration again")
+    return values
+
+
+def _entries(lines: Iterable[str]) -> dict[str, str]:
+    """Texts after `key:` by key."""
+    return {key.strip(): rest for key, colon, rest in (line.partition(":") for line in lines) if colon}
+
+
+def _numbers(text: str) -> F64:
+    return np.array(text.replace(",", " ").split(), np.float64)

@@ -1,0 +1,123 @@
+"""What a map shows of itself: point spacing, noise, scene (indoor or outdoor)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from scan2sim.pipeline.core.types import F32, F64
+from scan2sim.pipeline.geometry.height_map import exact_point_spacing
+
+Scene = Literal["indoor", "outdoor"]
+SAMPLES = 20_000
+"""Points at which spacing and noise are measured."""
+MILLIMETRE_MIN_SPACING = 3.0
+MILLIMETRE_MIN_HEIGHT = 500.0
+"""Spacing and smallest extent from which coordinates are millimetres: no map in metres is so thin and so high."""
+PLANE_NEIGHBOURS = 12
+PLAN_CELL_M = 0.5
+"""Cell of the raster in plan view in which heights are compared."""
+CEILING_HEIGHT_M = (1.8, 6.0)
+"""Heights above the lowest points of a column at which level points are a ceiling."""
+LEVEL_MIN_NORMAL_Z, UPRIGHT_MAX_NORMAL_Z = 0.9, 0.2
+INDOOR_MIN_CEILING_SHARE = 0.2
+MIN_COLUMNS_SHARE = 0.05
+"""Share of the columns with enough points below which their heights say nothing: on a grid of 50 cm, hardly one has."""
+WALL_RANGE_M = (0.5, 15.0)
+WALL_HEIGHT_M = (0.5, 3.0)
+"""Heights above the sensor's start at which points within that range are walls around it."""
+SECTORS, SECTOR_MIN_POINTS = 36, 10
+INDOOR_MIN_ENCLOSED_SHARE = 0.85
+"""Share of the directions from the start that a wall closes: streets are open at both ends."""
+
+
+@dataclass(frozen=True)
+class MapDescription:
+    """Properties of a levelled map, in metres.
+
+    Attributes:
+        spacing: median over points of the mean distance to six neighbours, on the scale of a square lattice.
+        noise: median distance of points from the plane through their neighbours.
+        level_share, upright_share: shares of points whose normals are vertical and horizontal.
+        ceiling_share: share of the columns in plan view with a ceiling.
+        enclosed_share: share of the directions around the sensor's start that a wall closes.
+        scene: indoor or outdoor.
+    """
+
+    spacing: float
+    noise: float
+    level_share: float
+    upright_share: float
+    ceiling_share: float
+    enclosed_share: float
+    scene: Scene
+
+
+def guess_unit(xyz: F32) -> Literal["m", "mm"]:
+    """Unit of the coordinates of a map (N, 3): metres, unless its spacing and extent can only be millimetres."""
+    extent = np.ptp(np.percentile(xyz, (1, 99), axis=0), axis=0)
+    thin = exact_point_spacing(xyz) > MILLIMETRE_MIN_SPACING
+    return "mm" if thin and extent.min() > MILLIMETRE_MIN_HEIGHT else "m"
+
+
+def describe(xyz: F32, start: F64) -> MapDescription:
+    """Describe a map.
+
+    Args:
+        xyz: (N, 3) metres, z up, without outliers.
+        start: (3,) position of the sensor at its start, in the same axes.
+    """
+    normal_z, noise = _normals(xyz)
+    level, upright = float((normal_z > LEVEL_MIN_NORMAL_Z).mean()), float((normal_z < UPRIGHT_MAX_NORMAL_Z).mean())
+    ceiling, enclosed = _ceiling_share(xyz), _enclosed_share(xyz, start)
+    indoor = ceiling > INDOOR_MIN_CEILING_SHARE or enclosed > INDOOR_MIN_ENCLOSED_SHARE
+    scene: Scene = "indoor" if indoor else "outdoor"
+    return MapDescription(exact_point_spacing(xyz), noise, level, upright, ceiling, enclosed, scene)
+
+
+def _enclosed_share(xyz: F32, start: F64) -> float:
+    """Share of the directions in plan view in which there are points above the sensor, within `WALL_RANGE_M`."""
+    away = xyz.astype(np.float64) - start
+    distance = np.hypot(away[:, 0], away[:, 1])
+    near = (distance > WALL_RANGE_M[0]) & (distance < WALL_RANGE_M[1])
+    near &= (away[:, 2] > WALL_HEIGHT_M[0]) & (away[:, 2] < WALL_HEIGHT_M[1])
+    turn = np.arctan2(away[near, 1], away[near, 0]) / (2 * np.pi) + 0.5
+    count = np.bincount((turn * SECTORS).astype(np.int64) % SECTORS, minlength=SECTORS)
+    return float((count > SECTOR_MIN_POINTS).mean())
+
+
+def _normals(xyz: F32) -> tuple[F32, float]:
+    """|z| of the normal of sampled points, and their median distance from the plane through their neighbours."""
+    from scipy.spatial import cKDTree
+
+    some = xyz[:: max(1, len(xyz) // SAMPLES)]
+    index = cKDTree(xyz).query(some, min(PLANE_NEIGHBOURS, len(xyz)), workers=-1)[1]
+    around = xyz[index].astype(np.float64)
+    around -= around.mean(axis=1, keepdims=True)
+    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / around.shape[1])
+    flat = values[:, 0] < 0.1 * values[:, 1]
+    noise = float(np.median(np.sqrt(np.maximum(values[flat, 0], 0)))) if flat.any() else 0.0
+    return np.abs(vectors[:, 2, 0]).astype(np.float32), noise
+
+
+def _ceiling_share(xyz: F32) -> float:
+    """Share of the columns in plan view with many points at the height of a ceiling, and few above it."""
+    cell = np.floor(xyz[:, :2] / PLAN_CELL_M).astype(np.int64)
+    cell -= cell.min(axis=0)
+    key = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
+    order = np.lexsort((xyz[:, 2], key))
+    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+    z = xyz[order, 2]
+    ends = np.append(starts[1:], len(order)) - 1
+    low = z[(starts + 0.1 * (ends - starts)).astype(np.int64)]
+    high = z[(ends - 0.02 * (ends - starts)).astype(np.int64)]
+    enough = ends - starts >= 10
+    if enough.mean() < MIN_COLUMNS_SHARE:
+        return 0.0
+    # under a ceiling many points are at the top; a wall's are spread over its height
+    top = np.array([np.mean(z[a : b + 1] > h - 0.15) for a, b, h in zip(starts, ends, high, strict=True)])
+    rise = high - low
+    ceiling = (rise > CEILING_HEIGHT_M[0]) & (rise < CEILING_HEIGHT_M[1]) & (top > 0.25)
+    return float(ceiling[enough].mean())

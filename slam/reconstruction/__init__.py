@@ -1,0 +1,1 @@
+"""Structure from motion of unposed photos by COLMAP, and its registration to a point cloud."""

@@ -1,0 +1,70 @@
+"""Step `adjust_cloud`: checks a trajectory against the cloud that was assembled by it, and corrects it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.types import Frame
+from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io import trajectory_check
+from scan2sim.slam.steps.strip_adjustment import PoseSourceParams, write_check
+from scan2sim.slam.trajectory import cloud_sections
+from scan2sim.slam.trajectory.cloud_sections import UncheckableError
+from scan2sim.slam.trajectory.strip_adjustment import adjust
+
+CUT = 0.5
+"""Progress when the cloud is cut into sections."""
+
+
+class AdjustCloudParams(PoseSourceParams):
+    """Settings of the check of a cloud's trajectory.
+
+    Attributes:
+        unit: metres per unit of the coordinates.
+    """
+
+    unit: float = Field(1.0, gt=0, description="Metres per unit of the coordinates.")
+
+
+def adjust_cloud(inputs: Inputs, params: AdjustCloudParams, out: Path, report: Report) -> Done:
+    """Check the `trajectory` of clouds (`cloud.0`, `cloud.1`, ...) against the surfaces in them.
+
+    Returns:
+        `check`: folder with the files of `pipeline.io.trajectory_check`.
+
+    Raises:
+        ScanError: a file can't be read.
+    """
+    clouds = [path for name, path in sorted(inputs.items()) if name.startswith("cloud.")]
+    frame = Frame(unit=params.unit)
+    path = trajectory_io.read(inputs["trajectory"], frame, ordered=False, timed=True)
+    path = replace(path, unsure=None, covariance=None)
+    try:
+        if len(path) < 2:
+            raise UncheckableError("the trajectory has only one position")
+        offset = cloud_sections.clock_offset(clouds, path, frame)
+        path = replace(path, times=path.times + offset)
+        sections = cloud_sections.read(clouds, path, frame, lambda part, text="": report(CUT * part, text))
+    except UncheckableError as error:
+        figures: dict[str, Any] = {"pose_source": "given", "summary": f"poses as given, not checked: {error}"}
+        return Done({"check": trajectory_check.write(out / "check", figures | {"warnings": []}, None)}, figures)
+    adjusted = replace(
+        adjust(
+            sections.times, sections.poses, sections.at, params.pose_source, after_gap=sections.after_gap,
+            report=lambda part, text="": report(CUT + (1 - CUT) * part, text),
+        ),
+        data="sections",
+    )  # fmt: skip
+    notes = dict[str, Any]()
+    if offset:
+        notes = {"clock_offset_s": offset}
+    check = write_check(out / "check", sections.times, sections.poses, adjusted, notes)
+    return Done({"check": check}, adjusted.figures(sections.times) | notes, adjusted.warnings())
+
+
+ADJUST_CLOUD = Step("adjust_cloud", 1, adjust_cloud, AdjustCloudParams, memory=(1.0, 0))

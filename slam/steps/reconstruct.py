@@ -1,0 +1,251 @@
+"""Step `reconstruct`: poses and lenses of unposed photos, or of a video's frames, by structure from motion (COLMAP)."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from scan2sim.pipeline.core import sandbox
+from scan2sim.pipeline.core.errors import DataError, SettingError, StepError
+from scan2sim.pipeline.core.optional_deps import require
+from scan2sim.pipeline.core.parameters import Focal, Pixels, Rate
+from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.io.photogrammetry import colmap as model_io
+from scan2sim.slam.reconstruction import colmap
+from scan2sim.slam.reconstruction import photos as photos_io
+from scan2sim.slam.reconstruction.photos import Photo
+from scan2sim.slam.video import open_video
+
+EXHAUSTIVE_MAX = 40
+"""Photos up to which all pairs are matched by default; more are assumed to be in the order in which they were taken."""
+EXTRACT_CHUNK, MATCH_CHUNK = 16, 200
+"""Photos, and pairs, per child process: progress is reported and kept in between."""
+STATIC_MAX = 0.01
+"""Displacement of features, relative to the photo's width, up to which a camera is static; in 90 % of the pairs. More
+than a mast shakes in the wind, less than distant photos of a camera that moves."""
+CALL = "scan2sim.slam.reconstruction.colmap:"
+
+
+class Reconstructed(Params):
+    """Lens, matching and limits of a reconstruction: the options of `scan2sim import images`."""
+
+    focal: Focal | None = Field(
+        None, description="Focal length in pixels, which is kept; default: from EXIF and refined, or solved."
+    )
+    centre: tuple[Pixels, Pixels] | None = Field(
+        None, description="Principal point in pixels; default: the image centre."
+    )
+    k1: Annotated[float, Field(ge=-1, le=1)] | None = Field(
+        None, description="Radial distortion k1 (OpenCV model); default: solved, or 0 if --focal is given."
+    )
+    refine_lens: bool = Field(False, description="Refine the given focal length and k1.")
+    matching: Literal["auto", "sequential", "exhaustive"] = Field(
+        "auto",
+        description="Photos to match: with the following ones (sequential: videos, photos in order), or all pairs "
+        f"(exhaustive); auto: exhaustive up to {EXHAUSTIVE_MAX} photos.",
+    )
+    fps: Rate = Field(5.0, description="Frames per second to take from a video.")
+    until: Annotated[float, Field(ge=0, le=1e7)] = Field(
+        0.0, description="Use only this many seconds of a video; 0: all of it."
+    )
+    features: Annotated[int, Field(ge=100, le=100_000)] = Field(
+        8192, description="Greatest number of features per photo."
+    )
+    time_limit: Annotated[float, Field(ge=0.01, le=1000)] = Field(
+        12.0, description="Hours after which COLMAP's mapping ends with an error."
+    )
+
+
+def reconstruct(inputs: Inputs, params: Reconstructed, out: Path, report: Report, checkpoint: Path) -> Done:
+    """Reconstruct the photos in `photos`, a folder or a video, with optional `times` (seconds, one per line).
+
+    Files: `model` (COLMAP's binary format; its unit is arbitrary), `photos` and `summary` (JSON), `frames` of a video.
+
+    Raises:
+        InputError: there are no photos. DataError: they can't be reconstructed.
+        StepError: COLMAP crashed, or took longer than the limit.
+    """
+    source, is_video = inputs["photos"], inputs["photos"].is_file()
+    warnings: list[str] = []
+    if is_video:
+        focal_35mm = open_video(source).focal_35mm
+        images = out / "frames"
+        photos = photos_io.extract_frames(
+            source, images, params.fps, params.until, focal_35mm, part(report, 0, 0.1), warnings.append
+        )
+    else:
+        images = source
+        photos, warnings = photos_io.read_photos(source, part(report, 0, 0.1))
+        if "times" in inputs:
+            photos = photos_io.with_times(photos, photos_io.list_photos(source), inputs["times"])
+    database, staged = checkpoint / "database.db", checkpoint / "images"
+    names = photos_io.stage(photos, images, staged)
+    fixed = _extract(database, staged, photos, names, params, part(report, 0.1, 0.4))
+    exhaustive = params.matching == "exhaustive" or (
+        params.matching == "auto" and not is_video and len(photos) <= EXHAUSTIVE_MAX
+    )
+    pairs = [(names[a], names[b]) for a, b in (all_pairs(photos) if exhaustive else following_pairs(photos))]
+    for at in range(0, len(pairs), MATCH_CHUNK):
+        part(report, 0.4, 0.7)(at / len(pairs), f"matching pair {at + 1} of {len(pairs)}")
+        _call("match", database, pairs[at : at + MATCH_CHUNK], hours=params.time_limit)
+    _check_motion(source, _call("displacements", database, hours=params.time_limit))
+    report(0.7, f"mapping {len(photos)} photos")
+    models = checkpoint / "models"
+    shutil.rmtree(models, ignore_errors=True)
+    models.mkdir()
+    found: list[colmap.Component] = _call(
+        "reconstruct", database, staged, models, fixed, {new: old for old, new in names.items()},
+        hours=params.time_limit,
+    )  # fmt: skip
+    if not found:
+        raise _no_model(source, exhaustive)
+    best = found[0]
+    shutil.copytree(best.folder, out / "model")
+    left_out = [photo.name for photo in photos if photo.name not in best.names]
+    metrics = {
+        "summary": f"COLMAP: {len(best.names)} of {len(photos)} photos, {best.points:,} points, {best.error:.2f} px",
+        "photos": len(photos), "posed": len(best.names), "points": best.points,
+        "reprojection_error_px": round(best.error, 3), "left_out": left_out,
+        "models": [{"photos": len(one.names), "first": one.names[0], "last": one.names[-1]} for one in found],
+        "lenses": _lenses(out / "model", images),
+    }  # fmt: skip
+    if left_out:
+        warnings.append(_left_out(found, left_out, photos))
+    summary = out / "reconstruction.json"
+    summary.write_text(json.dumps(metrics, indent=1), encoding="utf-8")
+    files = {"model": out / "model", "summary": summary, "photos": photos_io.write(out / "photos.json", photos)}
+    return Done(files | ({"frames": images} if is_video else {}), metrics, warnings)
+
+
+def part(report: Report, start: float, end: float) -> Report:
+    """Progress of a part of a step."""
+
+    def within(fraction: float, message: str = "") -> None:
+        report(start + (end - start) * fraction, message)
+
+    return within
+
+
+def all_pairs(photos: Sequence[Photo]) -> Iterator[tuple[str, str]]:
+    """Names of all pairs of photos."""
+    for i, one in enumerate(photos):
+        for other in photos[i + 1 :]:
+            yield one.name, other.name
+
+
+def following_pairs(photos: Sequence[Photo]) -> Iterator[tuple[str, str]]:
+    """Names of pairs of photos that follow each other, by time if known; cameras, by folder, run in parallel."""
+    groups: dict[str, list[Photo]] = defaultdict(list)
+    for photo in photos:
+        groups[photo.name.rpartition("/")[0]].append(photo)
+    timed = all(photo.time is not None for photo in photos)
+    runs = [sorted(group, key=lambda photo: photo.time or 0.0) if timed else group for group in groups.values()]
+    for k, run in enumerate(runs):
+        yield from colmap.sequential_pairs([photo.name for photo in run])
+        for i, photo in enumerate(run):
+            for other in runs[k + 1 :]:
+                yield from ((photo.name, other[j].name) for j in range(max(0, i - 2), min(len(other), i + 3)))
+
+
+def _extract(
+    database: Path,
+    images: Path,
+    photos: Sequence[Photo],
+    names: Mapping[str, str],
+    params: Reconstructed,
+    report: Report,
+) -> list[int]:
+    """Extract the features of all photos, files `names` in `images`; returns the ids of cameras with fixed lenses."""
+    groups: dict[Any, list[Photo]] = defaultdict(list)
+    for photo in photos:
+        groups[photo.camera].append(photo)
+    fixed, done = [], 0
+    for group in groups.values():
+        files, lens = [names[photo.name] for photo in group], lens_of(group[0], params)
+        camera: int = _call("add_photos", database, images, files, lens, hours=params.time_limit)
+        if lens.fixed:
+            fixed.append(camera)
+        for at in range(0, len(group), EXTRACT_CHUNK):
+            report(done / len(photos), f"features of {group[at].name} ({done} of {len(photos)})")
+            _call("extract", database, images, files[at : at + EXTRACT_CHUNK], params.features, hours=params.time_limit)
+            done += len(files[at : at + EXTRACT_CHUNK])
+    return fixed
+
+
+def lens_of(photo: Photo, params: Reconstructed) -> colmap.Lens:
+    """Lens of a photo by the options, or by EXIF."""
+    centre = params.centre or ((photo.width - 1) / 2, (photo.height - 1) / 2)
+    if params.focal is None:
+        return colmap.Lens(photo.focal, centre, (params.k1 or 0.0,))
+    return colmap.Lens(params.focal, centre, (params.k1 or 0.0,), fixed=not params.refine_lens)
+
+
+def _call(function: str, *arguments: Any, hours: float) -> Any:
+    """Run a function of `slam.reconstruction.colmap` in a child process."""
+    try:
+        return sandbox.call(f"{CALL}{function}", *arguments, timeout=hours * 3600)
+    except StepError as error:
+        raise StepError(
+            f"COLMAP ({function})", error.cause,
+            "Run again to resume, with fewer photos (every second one), less --features, or a longer --time-limit",
+        ) from None  # fmt: skip
+
+
+def _check_motion(source: Path, moved: np.ndarray) -> None:
+    """Raise a DataError if the photos don't overlap, or the camera is static."""
+    if not len(moved):
+        raise DataError(
+            source, "no two of its photos show the same surfaces",
+            "Take photos that overlap by two thirds; textureless or blurred ones can't be matched",
+        )  # fmt: skip
+    if np.quantile(moved, 0.9) < STATIC_MAX:
+        raise DataError(
+            source, "the camera doesn't move: features stay at the same pixels in all photos",
+            "Give photos or a video of a moving camera",
+        )  # fmt: skip
+
+
+def _no_model(source: Path, exhaustive: bool) -> DataError:
+    more = "" if exhaustive else ", --matching exhaustive if they are not in order"
+    return DataError(
+        source, "its photos can't be reconstructed: too few overlap, or the camera turns without moving",
+        f"Take photos from positions a few metres apart that overlap by two thirds; try --focal (pixels){more}",
+    )  # fmt: skip
+
+
+def _left_out(found: Sequence[colmap.Component], left_out: Sequence[str], photos: Sequence[Photo]) -> str:
+    """Warning about photos without a pose."""
+    others = "; ".join(f"{one.names[0]} to {one.names[-1]} ({len(one.names)})" for one in found[1:])
+    parts = f", in {len(found) - 1} separate parts among others: {others}" if others else ""
+    names = ", ".join(left_out[:10]) + (", ..." if len(left_out) > 10 else "")
+    return f"{len(left_out)} of {len(photos)} photos don't connect to the others and are left out{parts}: {names}"
+
+
+def _lenses(model: Path, images: Path) -> dict[str, Any]:
+    """Focal length and distortion of each camera."""
+    from scan2sim.pipeline.io.photogrammetry import Photos
+
+    cameras = model_io.read(model, Photos(images)).cameras
+    return {
+        name: {"focal": round(one.fx, 2), "k1": round(one.distortion[0], 5) if one.distortion else 0.0}
+        for name, one in cameras.items()
+    }
+
+
+def can_reconstruct(params: Reconstructed) -> None:
+    """Raise an UnavailableError where pycolmap isn't installed, a SettingError if options contradict each other."""
+    require("import images", "pycolmap")
+    if params.refine_lens and params.focal is None:
+        raise SettingError("--refine-lens", "there is no lens to refine", "Give --focal, or leave it out")
+
+
+RECONSTRUCT = Step(
+    "reconstruct", 1, reconstruct, Reconstructed, check=can_reconstruct, resumes=True, memory=(1.5, 0)
+)  # fmt: skip

@@ -1,0 +1,59 @@
+"""Parts of results: reused for the same inputs, never when damaged, and swept when no longer used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from scan2sim.pipeline.core.parts import Parts
+
+
+class Work:
+    """Writes `number.txt`, and counts how often."""
+
+    def __init__(self) -> None:
+        self.times = 0
+
+    def __call__(self, out: Path) -> list[Path]:
+        self.times += 1
+        (out / "number.txt").write_text("17", encoding="utf-8")
+        return [out / "number.txt"]
+
+
+@pytest.fixture
+def work() -> Work:
+    return Work()
+
+
+def provide(tmp_path: Path, work: Work, run: str, *made_from: object, version: int = 1) -> Path:
+    parts, out = Parts(tmp_path / "parts", "step", version), tmp_path / run
+    out.mkdir()
+    parts.provide(out, made_from, lambda: work(out))
+    parts.sweep()
+    return out / "number.txt"
+
+
+def test_part_is_reused_without_space_of_its_own(tmp_path: Path, work: Work) -> None:
+    first, second = provide(tmp_path, work, "1", "photo"), provide(tmp_path, work, "2", "photo")
+    assert work.times == 1
+    assert second.read_text(encoding="utf-8") == "17" and first.stat().st_ino == second.stat().st_ino
+
+
+def test_other_inputs_or_another_version_are_computed(tmp_path: Path, work: Work) -> None:
+    provide(tmp_path, work, "1", "photo")
+    provide(tmp_path, work, "2", "other photo")
+    provide(tmp_path, work, "3", "other photo", version=2)
+    assert work.times == 3
+
+
+def test_damaged_part_is_computed_again(tmp_path: Path, work: Work) -> None:
+    provide(tmp_path, work, "1", "photo").write_text("18", encoding="utf-8")
+    assert provide(tmp_path, work, "2", "photo").read_text(encoding="utf-8") == "17"
+    assert work.times == 2
+
+
+def test_unused_parts_are_removed(tmp_path: Path, work: Work) -> None:
+    provide(tmp_path, work, "1", "photo")
+    provide(tmp_path, work, "2", "other photo")
+    assert len(list((tmp_path / "parts").iterdir())) == 1

@@ -1,0 +1,141 @@
+"""Images of all encodings, and cameras of all distortion models."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from scan2sim.pipeline.camera.models import project
+from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of
+from scan2sim.pipeline.importers.bag.images import InvalidImage, compressed_file, raw_file
+
+RGB = np.zeros((16, 24, 3), np.uint8)
+RGB[:8, :, 0], RGB[8:, :, 1], RGB[:, 12:, 2] = 200, 120, 90
+
+
+def image(pixels: Any, encoding: str, pad: int = 0, **more: Any) -> Any:
+    """An Image of pixels (H, W[, C]), with `pad` bytes after each row."""
+    height, width = pixels.shape[:2]
+    rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(height, -1)
+    data = np.pad(rows, ((0, 0), (0, pad)), constant_values=77).ravel()
+    message = {"height": height, "width": width, "encoding": encoding, "step": rows.shape[1] + pad, "data": data}
+    return SimpleNamespace(**({"is_bigendian": 0} | message | more))
+
+
+def pixels_of(message: Any) -> Any:
+    """The pixels of the file of an image, BGR."""
+    suffix, content = raw_file(message)
+    assert suffix == ".png"
+    return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+@pytest.mark.parametrize("pad", [0, 8])
+def test_colours_arrive_in_any_order_of_channels(pad: int) -> None:
+    bgr, alpha = RGB[..., ::-1], np.full((16, 24, 1), 255, np.uint8)
+    for encoding, pixels in (
+        ("rgb8", RGB), ("bgr8", bgr), ("8UC3", bgr), ("rgba8", np.dstack([RGB, alpha])),
+        ("bgra8", np.dstack([bgr, alpha])),
+    ):  # fmt: skip
+        assert np.array_equal(pixels_of(image(pixels, encoding, pad)), bgr), encoding
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_bayer_patterns_give_the_colours(pattern: str) -> None:
+    channels = ["rgb".index(c) for c in pattern]
+    mosaic = np.zeros((16, 24), np.uint8)
+    for k, channel in enumerate(channels):
+        mosaic[k // 2 :: 2, k % 2 :: 2] = RGB[k // 2 :: 2, k % 2 :: 2, channel]
+    found = pixels_of(image(mosaic, f"bayer_{pattern}8"))[..., ::-1]
+    assert np.array_equal(found[3, 4], RGB[3, 4]) and np.array_equal(found[12, 20], RGB[12, 20])
+
+
+def test_grey_deep_and_yuv_images() -> None:
+    grey = np.arange(16 * 24, dtype=np.uint16).reshape(16, 24)
+    assert np.array_equal(pixels_of(image(grey.astype(np.uint8), "mono8")), grey.astype(np.uint8))
+    assert np.array_equal(pixels_of(image(grey * 100, "mono16")), grey * 100)
+    swapped = (grey * 100).astype(">u2")
+    assert np.array_equal(pixels_of(image(swapped, "16UC1", is_bigendian=1)), grey * 100)
+    yuyv = np.zeros((16, 24, 2), np.uint8)
+    yuyv[..., 0], yuyv[..., 1] = 120, 128
+    assert np.ptp(pixels_of(image(yuyv, "yuv422_yuy2"))) <= 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"data": np.zeros(0, np.uint8)}, "has no data"),
+        ({"data": np.zeros(100, np.uint8)}, "has 100 bytes for 24x16"),
+        ({"encoding": "32FC1"}, "unsupported encoding '32FC1'"), ({"height": 0}, "has no data"),
+    ],
+)  # fmt: skip
+def test_damaged_images_are_named(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(InvalidImage, match=message):
+        raw_file(image(RGB, **({"encoding": "rgb8"} | change)))
+
+
+def test_compressed_images_are_kept_as_they_are() -> None:
+    for suffix in (".jpg", ".png"):
+        content = cv2.imencode(suffix, RGB)[1].tobytes()
+        assert compressed_file(SimpleNamespace(data=content, format="")) == (suffix, content)
+        with pytest.raises(InvalidImage, match="truncated"):
+            compressed_file(SimpleNamespace(data=content[:-20], format=""))
+    for content, message in ((b"", "has no data"), (b"GIF89a", "neither JPEG nor PNG")):
+        with pytest.raises(InvalidImage, match=message):
+            compressed_file(SimpleNamespace(data=content, format="gif"))
+
+
+def info(model: str, D: list[float], **more: Any) -> Any:
+    """A CameraInfo of ROS 2."""
+    roi = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0)
+    P = [350.0, 0, 330, 0, 0, 350, 250, 0, 0, 0, 1, 0]
+    body = {"d": D, "k": [400.0, 0, 320, 0, 410, 240, 0, 0, 1], "p": P, "distortion_model": model, "roi": roi}
+    return SimpleNamespace(**({"width": 640, "height": 480, "binning_x": 0, "binning_y": 0} | body | more))
+
+
+@pytest.mark.parametrize(
+    ("model", "D"),
+    [
+        ("plumb_bob", [-0.2, 0.05, 1e-3, -2e-3, 0.01]),
+        ("rational_polynomial", [0.3, -0.1, 1e-3, 2e-3, 0.01, 0.5, -0.05, 0.02]),
+        ("equidistant", [0.02, -0.01, 3e-3, -1e-3]),
+    ],
+)
+def test_distortion_models_project_like_opencv(model: str, D: list[float]) -> None:
+    points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (50, 3))
+    K = np.array([[400.0, 0, 320], [0, 410, 240], [0, 0, 1]])
+    if model == "equidistant":
+        expected = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), K, np.array(D))[0]
+    else:
+        expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(D))[0]
+    uv, valid = project(camera_of(info(model, D), rectified=False), points)
+    assert valid.all() and np.allclose(uv, expected.reshape(-1, 2), atol=1e-3)
+
+
+def test_rectified_images_have_the_intrinsics_of_p() -> None:
+    camera = camera_of(info("plumb_bob", [-0.2, 0.05, 0, 0, 0]), rectified=True)
+    assert (camera.model, camera.fx, camera.cx, camera.distortion) == ("pinhole", 350, 330, ())
+    plain = camera_of(info("plumb_bob", [0.0] * 5), rectified=False)
+    assert (plain.model, plain.fx, plain.cy) == ("pinhole", 400, 240)
+
+
+def test_binned_images_of_a_region() -> None:
+    roi = SimpleNamespace(x_offset=100, y_offset=60, width=400, height=300)
+    camera = camera_of(info("plumb_bob", [0.0] * 5, roi=roi, binning_x=2, binning_y=2), rectified=False)
+    assert (camera.width, camera.height, camera.fx, camera.cx) == (200, 150, 200, (220 + 0.5) / 2 - 0.5)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (info("plumb_bob", [], k=[0.0] * 9, p=[0.0] * 12), "is not calibrated"),
+        (info("thin_prism", [0.1]), "unknown distortion model 'thin_prism'"),
+        (info("plumb_bob", [0.1] * 12), "has 12 coefficients"),
+    ],
+)
+def test_cameras_that_cannot_be_used_are_named(bad: Any, message: str) -> None:
+    with pytest.raises(InvalidCamera, match=message):
+        camera_of(bad, rectified=False)

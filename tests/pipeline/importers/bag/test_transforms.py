@@ -1,0 +1,65 @@
+"""Chains of frames, static and moving, and errors that name the frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.types import F64
+from scan2sim.pipeline.importers.bag.transforms import Frames, Series
+
+
+def pose(x: float, degrees: float = 0.0) -> F64:
+    T = np.eye(4)
+    T[:3, :3], T[0, 3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix(), x
+    return T
+
+
+def moving(*samples: tuple[float, float]) -> Series:
+    series = Series()
+    for time, x in samples:
+        series.add(time, pose(x))
+    return series
+
+
+def test_static_chain_through_common_ancestors() -> None:
+    frames = Frames(Path("drive.mcap"), {("base", "a"): pose(1, 90), ("a", "lidar"): pose(2), ("base", "cam"): pose(5)})
+    T = frames.between("cam", "lidar")
+    assert np.allclose(T, np.linalg.inv(pose(5)) @ pose(1, 90) @ pose(2))
+    assert np.allclose(frames.between("lidar", "cam"), np.linalg.inv(T))
+
+
+def test_missing_link_names_the_frames_and_can_be_given() -> None:
+    frames = Frames(Path("drive.mcap"), {("base", "lidar"): pose(1)}, {("odom", "base"): moving((0, 0))})
+    with pytest.raises(InputError, match=r"'cam' and 'lidar'.*base > lidar, odom > base \(moving\).*--transform"):
+        frames.between("cam", "lidar")
+    frames.add_given(["base cam 5 0 0 0 0 0 1"])
+    assert np.allclose(frames.between("cam", "lidar"), pose(-4))
+    for text in ("base cam 1 2 3", "base cam 1 2 3 0 0 0 0", "base cam 1 2 3 a b c d"):
+        with pytest.raises(SettingError, match="is not a transform"):
+            frames.add_given([text])
+
+
+def test_poses_by_a_chain_of_moving_links() -> None:
+    frames = Frames(Path("drive.mcap"), {("base", "lidar"): pose(0.5)})
+    frames.moving["map", "odom"] = moving((1.0, 100.0), (3.0, 102.0))  # rare corrections, constant before and after
+    frames.moving["odom", "base"] = moving((3.5, 35.0), (0.5, 5.0), (1.0, 10.0), (2.0, 20.0), (2.0, 21.0))
+    assert frames.world_frame("lidar") == "map" and frames.world_frame("lidar", "/odom") == "odom"
+    times, T = frames.poses_of("lidar", "map")
+    assert times.tolist() == [0.5, 1.0, 2.0, 3.5]
+    assert np.allclose(T[:, 0, 3], [105.5, 110.5, 122.5, 137.5])  # the last of two poses at 2.0 s counts
+    assert np.allclose(frames.poses_of("lidar", "odom")[1][:, 0, 3], [5.5, 10.5, 21.5, 35.5])
+
+
+def test_world_frame_needs_something_that_moves() -> None:
+    frames = Frames(Path("drive.mcap"), {("map", "base"): pose(0), ("base", "lidar"): pose(1)})
+    assert frames.world_frame("lidar") is None
+    with pytest.raises(InputError, match="no moving transform from 'map' to 'lidar'"):
+        frames.world_frame("lidar", "map")
+    frames.moving["rig", "map"] = moving((0, 0))
+    frames.static["base", "rig"] = pose(0)  # a loop: ends, instead of running for ever
+    assert frames.world_frame("lidar") is not None

@@ -1,0 +1,141 @@
+"""Import of robots' maps: up axis, tilt, units, outliers, frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from scan2sim.pipeline.core.types import F32, F64, Frame, PointCloud
+from scan2sim.pipeline.geometry.upright import find_up, rotation_to_z
+from scan2sim.pipeline.importers.robot_map import MapParams, import_map, map_files
+from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.tile import read_tile
+from tests.present import present
+
+SENSOR_HEIGHT_M = 0.6
+
+
+def room(seed: int = 0, noise: float = 0.02, ceiling: bool = True, floor: bool = True) -> F32:
+    """Points of a furnished room of 8 x 6 x 2.8 m in the axes of a sensor that starts level in it."""
+    rng = np.random.default_rng(seed)
+
+    def sheet(low: tuple[float, ...], high: tuple[float, ...], count: int) -> F64:
+        return rng.uniform(low, high, (count, 3))
+
+    parts = [sheet((-3, y, 0), (5, y, 2.8), 4000) for y in (-2.0, 4.0)]
+    parts += [sheet((x, -2, 0), (x, 4, 2.8), 3000) for x in (-3.0, 5.0)]
+    parts += [sheet((-3, -2, 0), (5, 4, 0), 8000)] if floor else []
+    parts += [sheet((-3, -2, 2.8), (5, 4, 2.8), 5000)] if ceiling else []
+    parts += [sheet((2, 1, 0.7), (3.5, 2, 0.7), 600), sheet((-3, 2, 0), (-2.6, 2, 1.8), 500)]
+    xyz = np.concatenate(parts) + rng.normal(0, noise, (sum(map(len, parts)), 3))
+    return (xyz - [0, 0, SENSOR_HEIGHT_M]).astype(np.float32)
+
+
+def save(path: Path, xyz: F32) -> Path:
+    las.write(path, PointCloud(Frame(), xyz))
+    return path
+
+
+def imported(path: Path, out: Path, **options: str) -> tuple[F64, F64, list[str]]:
+    """World points, T_world_map and warnings of an imported map."""
+    warnings: list[str] = []
+    tile = read_tile(import_map([path], out, MapParams.of("", options), warn=warnings.append))
+    cloud = clouds.read(tile.clouds[0], Frame())
+    return cloud.xyz.astype(np.float64), present(tile.robot_map).T_world_map, warnings
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_up_axis_of_a_map_in_any_orientation(seed: int) -> None:
+    turn = Rotation.random(random_state=seed).as_matrix()
+    found = present(find_up((room(seed) @ turn.T).astype(np.float32)))
+    assert np.degrees(np.arccos(found.up @ turn[:, 2])) < 0.5
+
+
+@pytest.mark.parametrize("parts", [{"ceiling": False}, {"floor": False, "ceiling": False}])
+def test_up_axis_without_ceiling_or_floor(parts: dict[str, bool]) -> None:
+    turn = Rotation.random(random_state=3).as_matrix()
+    found = present(find_up((room(1, **parts) @ turn.T).astype(np.float32)))
+    assert np.degrees(np.arccos(found.up @ turn[:, 2])) < 0.5
+
+
+def test_tilted_map_becomes_level_and_its_transform_maps_it_to_the_world(tmp_path: Path) -> None:
+    xyz = room()
+    tilt = Rotation.from_euler("xyz", [7, -6, 20], degrees=True).as_matrix()
+    world, T, warnings = imported(save(tmp_path / "map.las", (xyz @ tilt.T).astype(np.float32)), tmp_path / "tile")
+    floor = world[world[:, 2] < -SENSOR_HEIGHT_M + 0.1]
+    assert np.ptp(np.percentile(floor[:, 2], (2, 98))) < 0.15
+    mapped = (xyz @ tilt.T) @ T[:3, :3].T
+    from scipy.spatial import cKDTree
+
+    assert cKDTree(mapped).query(world)[0].max() < 0.005
+    assert any("tilted by" in text for text in warnings)
+
+
+def test_level_map_keeps_its_coordinates(tmp_path: Path) -> None:
+    xyz = room()
+    world, T, _ = imported(save(tmp_path / "map.las", xyz), tmp_path / "tile")
+    assert np.array_equal(T, np.eye(4))
+    assert set(map(tuple, world.round(3).tolist())) <= set(map(tuple, xyz.astype(np.float64).round(3).tolist()))
+
+
+def test_millimetres_are_recognized(tmp_path: Path) -> None:
+    xyz = 1000 * (room() + np.array([40, 0, 0], np.float32))  # so far from the start that it gets an origin of its own
+    world, _, warnings = imported(save(tmp_path / "map.las", xyz), tmp_path / "tile")
+    assert world.min(axis=0) == pytest.approx([37, -2, -SENSOR_HEIGHT_M], abs=0.2)
+    assert np.ptp(world[:, 0]) == pytest.approx(8, abs=0.2)
+    assert any("coordinates are in mm" in text for text in warnings)
+
+
+def test_cloud_with_a_crs_in_feet_keeps_its_coordinates(tmp_path: Path) -> None:
+    """EPSG:2992 is in international feet; a georeferenced cloud is level, whatever it looks like."""
+    frame = Frame("EPSG:2992", (200_000.0, 300_000.0, 0.0), 0.3048)
+    las.write(tmp_path / "map.laz", PointCloud(frame, room()))
+    tile = read_tile(import_map([tmp_path / "map.laz"], tmp_path / "tile", MapParams()))
+    cloud = clouds.read(tile.clouds[0], tile.frame)
+    assert tile.frame.unit == pytest.approx(0.3048) and np.ptp(cloud.xyz[:, 0]) == pytest.approx(8, abs=0.2)
+    assert np.median(cloud.xyz[:, 0]) + tile.frame.origin[0] == pytest.approx(200_001, abs=1)
+
+
+def test_far_returns_and_reflections_below_the_floor_are_removed(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    far = rng.uniform(-60, 60, (60, 3)) + [0, 0, 80]
+    mirrored = np.column_stack([rng.uniform(-2, 4, 300), rng.uniform(-1, 3, 300), rng.uniform(-2.5, -1.1, 300)])
+    xyz = np.concatenate([room(), far, mirrored]).astype(np.float32)
+    world, _, warnings = imported(save(tmp_path / "map.las", xyz), tmp_path / "tile", scene="indoor")
+    assert np.ptp(world, axis=0) == pytest.approx([8, 6, 2.8], abs=0.35)
+    assert sum("removed" in text for text in warnings) == 2
+
+
+def test_named_axis_is_up_even_if_the_map_looks_otherwise(tmp_path: Path) -> None:
+    world, T, _ = imported(save(tmp_path / "map.las", room()), tmp_path / "tile", up="-z")
+    assert T[2, 2] == pytest.approx(-1, abs=0.01)
+    assert world[:, 2].max() == pytest.approx(SENSOR_HEIGHT_M, abs=0.1)
+
+
+def test_scene_is_found(tmp_path: Path) -> None:
+    imported(save(tmp_path / "map.las", room()), tmp_path / "tile")
+    assert present(read_tile(tmp_path / "tile").robot_map).scene == "indoor"
+
+
+def test_folder_without_clouds_is_an_error(tmp_path: Path) -> None:
+    from scan2sim.pipeline.core.errors import InputError
+
+    with pytest.raises(InputError, match="neither a tile.toml nor point clouds"):
+        map_files(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "up"), [("hdl501", (0.13, -0.10, 0.99)), ("lobby", (0, 0, 1)), ("dddmr", (0, 1, 0))])
+def test_real_maps_become_upright(real_data: Path, name: str, up: tuple[float, ...]) -> None:
+    cloud = clouds.read(real_data / "slam_maps" / f"{name}.pcd", Frame())
+    found = present(find_up(cloud.xyz))
+    assert np.degrees(np.arccos(np.clip(found.up @ up / np.linalg.norm(up), -1, 1))) < 2.5
+
+
+def test_rotation_to_z_is_a_rotation() -> None:
+    for up in (np.array([0, 0, -1.0]), np.array([0, 0, 1.0]), np.array([0.6, 0, -0.8])):
+        R = rotation_to_z(up)
+        assert np.allclose(R @ up, [0, 0, 1]) and np.linalg.det(R) == pytest.approx(1)

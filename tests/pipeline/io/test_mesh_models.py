@@ -1,0 +1,181 @@
+"""Reading of textured meshes: materials, colours, node transforms, and files in any state of damage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from scan2sim.data_samples.building import Style
+from scan2sim.data_samples.mesh_model import write
+from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.types import F64
+from scan2sim.pipeline.io.mesh_files import companions, find_mesh, is_mesh
+from scan2sim.pipeline.io.mesh_models import read
+from scan2sim.pipeline.io.source_mesh import SourceMesh, Texels
+
+SMALL = Style(rooms=1, furniture=0.1)
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+FACES = "f 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
+RED = np.full((8, 8, 3), (0, 0, 200), np.uint8)
+"""OpenCV's order: blue, green, red."""
+
+
+def obj(folder: Path, body: str = SQUARE + "usemtl a\n" + FACES, material: str = "map_Kd red.png") -> Path:
+    """An OBJ of a square with a red texture."""
+    cv2.imwrite(str(folder / "red.png"), RED)
+    (folder / "m.mtl").write_text(f"newmtl a\nKd 0.2 0.2 0.2\n{material}\n", encoding="utf-8")
+    (folder / "m.obj").write_text("mtllib m.mtl\n" + body, encoding="utf-8")
+    return folder / "m.obj"
+
+
+def centres(mesh: SourceMesh) -> F64:
+    """(F, 3) colours at the centres of the faces."""
+    third = np.full(len(mesh), 1 / 3, np.float32)
+    return mesh.colours(np.arange(len(mesh), dtype=np.int32), third, third).astype(np.float64)
+
+
+@pytest.mark.parametrize("file_format", ["obj", "glb", "ply"])
+def test_colours_are_those_of_the_file(tmp_path: Path, file_format: str) -> None:
+    path, made, paint = write(tmp_path, file_format=file_format, edge=0.4, style=SMALL)  # type: ignore[arg-type]
+    mesh, notes = read(path)
+    assert not notes
+    assert len(mesh) == len(made.faces)
+    assert len(mesh.mesh.vertices) == len(np.unique(made.vertices.astype(np.float32), axis=0))  # seams are welded
+    assert mesh.coloured.all()
+    corners = mesh.mesh.corners.astype(np.float64)
+    if file_format == "glb":
+        corners = corners @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # file axes to world axes
+    axis = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])).argmax(axis=1)
+    if file_format != "ply":  # colours of vertices are coarse
+        assert np.abs(centres(mesh) - paint.at(corners.mean(axis=1), axis)).mean() < 2.5
+    mesh.save(tmp_path / "m.npz")
+    again = SourceMesh.load(tmp_path / "m.npz")
+    assert np.array_equal(centres(again), centres(mesh))
+
+
+def test_texels_larger_than_the_image_average_it(tmp_path: Path) -> None:
+    path = obj(tmp_path)
+    checks = np.zeros((64, 64, 3), np.uint8)
+    checks[::2, ::2] = checks[1::2, 1::2] = 200
+    cv2.imwrite(str(tmp_path / "red.png"), checks)
+    mesh, _ = read(path)
+    texels = Texels(np.zeros(1, np.int32), np.array([[1 / 8, 0, 0]], np.float32), np.array([[0, 1 / 8, 0]], np.float32))
+    at = np.full(1, 0.3, np.float32)
+    colour = mesh.colours(np.zeros(1, np.int32), at, at, texels)
+    assert np.abs(colour.astype(int) - 100).max() <= 4
+
+
+def test_image_replaces_the_diffuse_factor_of_an_obj(tmp_path: Path) -> None:
+    assert centres(read(obj(tmp_path))[0])[0].tolist() == [200, 0, 0]
+
+
+@pytest.mark.parametrize("name", ["C:\\scans\\RED.png", "../textures/red.png", "./red.png"])
+def test_images_are_found_by_their_name(tmp_path: Path, name: str) -> None:
+    path = obj(tmp_path, material=f"map_Kd {name}")
+    assert centres(read(path)[0])[0].tolist() == [200, 0, 0]
+    assert {file.name for file in companions(path)} == {"m.mtl", "red.png"}
+
+
+def test_missing_image_is_reported_and_leaves_its_faces_uncoloured(tmp_path: Path) -> None:
+    mesh, notes = read(obj(tmp_path, material="map_Kd other.png"))
+    assert "other.png" in notes[0]
+    assert "not found" in notes[0]
+    assert not mesh.coloured.any() or centres(mesh)[0].tolist() == [51, 51, 51]
+
+
+def test_missing_material_file_is_reported(tmp_path: Path) -> None:
+    path = obj(tmp_path)
+    (tmp_path / "m.mtl").unlink()
+    _, notes = read(path)
+    assert "m.mtl" in notes[0]
+
+
+def test_damaged_image_is_reported(tmp_path: Path) -> None:
+    path = obj(tmp_path)
+    content = (tmp_path / "red.png").read_bytes()
+    (tmp_path / "red.png").write_bytes(content[: len(content) // 2])
+    mesh, notes = read(path)
+    assert notes
+    assert not mesh.coloured.all() or not mesh.images
+
+
+@pytest.mark.parametrize(
+    ("body", "note", "faces"),
+    [
+        (SQUARE + "usemtl a\n" + FACES + "f 1/1 1/1 2/2\n", "1 degenerate", 2),
+        (SQUARE + "v nan 0 0\nusemtl a\n" + FACES + "f 1/1 2/2 5/1\n", "1 degenerate", 2),
+        (SQUARE + "v 2 0 0\nusemtl a\n" + FACES + "f 1/1 2/2 5/1\n", "1 degenerate", 2),  # no area
+        (SQUARE + "usemtl a\nf 1 2 3\nf 1 3 4\n", "", 2),
+        (SQUARE + "usemtl a\nf 1/1 2/2 3/3 4/4\n", "", 2),  # a quad
+        (SQUARE + "usemtl a\n" + FACES + "f 2/1 1/1 3/1\nf 1/1 2/2 4/1\n", "", 4),  # not manifold
+    ],
+)
+def test_bad_faces_are_removed_and_reported(tmp_path: Path, body: str, note: str, faces: int) -> None:
+    mesh, notes = read(obj(tmp_path, body))
+    assert len(mesh) == faces
+    assert note in " ".join(notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "cause"),
+    [
+        ("a.obj", b"", "no faces"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "mesh|face"),
+        ("a.obj", b"v nan nan nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "finite"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "area"),
+        ("a.glb", b"glTF but not really", "can't be read"),
+        ("a.glb", b"", "can't be read"),
+        ("a.gltf", b'{"asset": {}}', "mesh|face"),
+        ("a.gltf", b'{"asset": {"version": "2.0"}, "buffers": [{"uri": "away.bin", "byteLength": 12}]}', "mesh|face"),
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\nelement face 3\nend_header\n",
+            "mesh|face",
+        ),
+        ("a.stl", b"solid", "is not a mesh"),
+    ],
+)
+def test_unusable_files_are_errors_that_name_the_cause(tmp_path: Path, name: str, content: bytes, cause: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=cause) as raised:
+        read(tmp_path / name)
+    assert name in str(raised.value)
+
+
+def test_utm_coordinates_keep_millimetres(tmp_path: Path) -> None:
+    body = "\n".join(
+        f"v {x} {y} {z}" for x, y, z in [(500000.123, 5400000.456, 310.5), (500001.123, 5400000.456, 310.5),
+                                         (500001.123, 5400001.456, 310.5)]
+    )  # fmt: skip
+    mesh, _ = read(obj(tmp_path, body + "\nf 1 2 3\n"))
+    world = mesh.mesh.vertices.astype(np.float64) + mesh.mesh.frame.origin
+    assert np.abs(world.min(axis=0) - (500000.123, 5400000.456, 310.5)).max() < 1e-3
+
+
+def test_mirrored_node_keeps_the_front_side(tmp_path: Path) -> None:
+    square = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 1, 2]], process=False)
+    scene = trimesh.Scene()
+    scene.add_geometry(square, transform=np.diag([-1.0, 1, 1, 1]))
+    scene.export(tmp_path / "m.glb")
+    mesh, _ = read(tmp_path / "m.glb")
+    assert mesh.mesh.face_normal[0, 2] > 0.9
+
+
+def test_ply_is_a_mesh_only_if_it_has_faces(tmp_path: Path) -> None:
+    trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 1, 2]], process=False).export(tmp_path / "mesh.ply")
+    trimesh.PointCloud(np.zeros((3, 3))).export(tmp_path / "cloud.ply")
+    assert is_mesh(tmp_path / "mesh.ply")
+    assert not is_mesh(tmp_path / "cloud.ply")
+    assert find_mesh(tmp_path) == tmp_path / "mesh.ply"
+
+
+def test_folder_with_two_meshes_names_them(tmp_path: Path) -> None:
+    obj(tmp_path)
+    (tmp_path / "n.obj").write_bytes((tmp_path / "m.obj").read_bytes())
+    with pytest.raises(InputError, match=r"m\.obj, n\.obj"):
+        find_mesh(tmp_path)

@@ -1,0 +1,71 @@
+"""Approximate positions of photos, from clocks that differ."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scan2sim.pipeline.core.errors import DataError, InputError
+from scan2sim.pipeline.core.types import GpsTrack
+from scan2sim.slam.reconstruction.photos import Photo
+from scan2sim.slam.reconstruction.positions import by_list, by_track, shifted
+
+NOON = 1_700_000_000.0
+TRACK = GpsTrack(NOON + np.arange(60.0), np.column_stack([np.arange(60.0), np.zeros(60), np.zeros(60)]))
+
+
+def photos(times: list[float | None], zoned: bool = True) -> list[Photo]:
+    return [Photo(f"{i}.jpg", 640, 480, time=time, zoned=zoned) for i, time in enumerate(times)]
+
+
+def write(path: Path) -> Path:
+    path.write_text("time,x,y,z\n" + "".join(f"{NOON + i},{i},0,0\n" for i in range(60)), encoding="utf-8")
+    return path
+
+
+def test_photos_are_found_in_a_track_by_their_time(tmp_path: Path) -> None:
+    found = by_track(write(tmp_path / "gps.csv"), photos([NOON + 10, NOON + 20.5, NOON + 30]), None, None, None)
+    assert np.allclose(found.xyz[:, 0], [10, 20.5, 30], atol=0.05) and found.crs == "local" and not found.notes
+
+
+def test_time_zone_of_a_camera_is_the_one_by_which_its_photos_are_within_the_track() -> None:
+    notes: list[str] = []
+    times = NOON + 2 * 3600 + np.array([5.0, 25.0, 50.0])
+    moved = shifted(TRACK, times, Path("gps.gpx"), None, None, False, notes.append)
+    assert np.allclose(moved.at(times)[:, 0], [5, 25, 50]) and "+2 h from UTC" in notes[0]
+
+
+def test_video_times_count_from_its_start_or_the_first_fix() -> None:
+    notes: list[str] = []
+    times = np.array([0.0, 1.0, 2.0])
+    known = shifted(TRACK, times, Path("gps.gpx"), NOON + 7, None, True, notes.append)
+    assert np.allclose(known.at(times)[:, 0], [7, 8, 9]) and not notes
+    guessed = shifted(TRACK, times, Path("gps.gpx"), None, None, True, notes.append)
+    assert np.allclose(guessed.at(times)[:, 0], [0, 1, 2]) and "--gps-offset" in notes[0]
+    given = shifted(TRACK, times, Path("gps.gpx"), None, -NOON - 3, True, notes.append)
+    assert np.allclose(given.at(times)[:, 0], [3, 4, 5])
+
+
+@pytest.mark.parametrize(
+    ("times", "cause"),
+    [
+        ([NOON, None, NOON + 1], "1.jpg has no time"),
+        ([NOON + 1e5, NOON + 2e5, NOON + 3e5], "covers the times of 0 of 3"),
+    ],
+)
+def test_photos_that_a_track_cannot_locate(times: list[float | None], cause: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=cause):
+        by_track(write(tmp_path / "gps.csv"), photos(times), None, None, None)
+
+
+def test_list_of_rough_positions(tmp_path: Path) -> None:
+    path = tmp_path / "rough.csv"
+    path.write_text("file,x,y,z\n2.jpg, 1, 2, 3\n0.jpg,4,5,6\n", encoding="utf-8")
+    found = by_list(path, photos([None, None, None]), "local")
+    assert np.allclose(found.xyz[[0, 2]], [[4, 5, 6], [1, 2, 3]]) and np.isnan(found.xyz[1]).all()
+    for text, cause in (("file,x,y,z\n9.jpg,1,2,3\n", "9.jpg"), ("name,x\n1,2\n", "not a list")):
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(InputError, match=cause):
+            by_list(path, photos([None, None, None]), "local")

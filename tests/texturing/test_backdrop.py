@@ -1,0 +1,202 @@
+"""Step `backdrop` on a street whose houses the scan reached only up to 3 m, with a facade across its far end."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_erosion
+
+from scan2sim.pipeline.camera.depth_map import depth_map, scene
+from scan2sim.pipeline.camera.renderer import Body, Renderer, look_at, pinhole, textured
+from scan2sim.pipeline.core.classes import PHOTO_CLASSES
+from scan2sim.pipeline.core.step import Done, silent
+from scan2sim.pipeline.core.tile_cell import TileCell
+from scan2sim.pipeline.core.types import F64, U8, Camera, Mesh, View
+from scan2sim.pipeline.io import views as views_io
+from scan2sim.pipeline.io.images import image
+from scan2sim.pipeline.io.worlds.scene import BACKDROP_PARTS
+from scan2sim.texturing.backdrop.dome import DOME_FILE, Dome
+from scan2sim.texturing.backdrop.step import BackdropContext, BackdropParams, backdrop
+from scan2sim.texturing.evaluate import psnr
+from scan2sim.texturing.photo_cache import Exposures
+from tests.texturing.corner import grid, join
+
+SKY = (110, 160, 230)
+CAMERA = pinhole(360, 180, field=80)
+NUMBER, HELD_OUT, FAR_M, SIDE_M, SCANNED_M = 7, 3, 60.0, 12.0, 3.0
+LAYERS, DOME = range(len(BACKDROP_PARTS))
+
+
+def painted(mesh: Mesh, seed: int, base: tuple[int, int, int]) -> Body:
+    """The mesh with random colours, a different one for each pair of triangles."""
+    shade = np.random.default_rng(seed).uniform(0.4, 1.3, len(mesh) // 2)
+    return Body(mesh, colour=np.clip(np.outer(np.tile(shade, 2), base), 0, 255).astype(np.uint8))
+
+
+def wall(y: float, low: float, high: float, cells: int) -> Mesh:
+    """A wall along the street that faces its middle."""
+    up, along = (0, 0, high - low), (FAR_M + 10, 0, 0)
+    return join(grid((-10, y, low), up, along, cells) if y < 0 else grid((-10, y, low), along, up, cells))
+
+
+GROUND = painted(join(grid((-10, -SIDE_M, 0), (45, 0, 0), (0, 2 * SIDE_M, 0), 40)), 0, (120, 120, 115))
+SCANNED = [GROUND, *(painted(wall(y, 0, SCANNED_M, 12), 1, (170, 120, 90)) for y in (-SIDE_M, SIDE_M))]
+UPPER = [painted(wall(y, SCANNED_M, 9, 24), 2, (180, 130, 100)) for y in (-SIDE_M, SIDE_M)]
+END = painted(join(grid((FAR_M, -30, 0), (0, 0, 14), (0, 60, 0), 24)), 3, (90, 150, 110))
+
+
+@dataclass
+class Drive:
+    """A drive along the street, photographed, and the backdrop from its photos."""
+
+    folder: Path
+    params: BackdropParams = field(default_factory=BackdropParams)
+    vehicle: bool = False
+    number: int = NUMBER
+    noise: float = 0.0
+
+    @cached_property
+    def views(self) -> list[View]:
+        """Photos, each a metre after the last; with their classes."""
+        (self.folder / "labels").mkdir()
+        found = []
+        for i in range(self.number):
+            pose = look_at((float(i), 0.3, 1.7), (float(i) + 10, 0, 1.9))
+            street = Renderer([*SCANNED, *UPPER, END]).view(CAMERA, pose, background=SKY, samples=2)
+            rgb, labels = street.rgb.copy(), np.zeros((*street.hit.shape, len(PHOTO_CLASSES)), np.uint8)
+            labels[..., PHOTO_CLASSES.index("building")] = 255 * street.hit
+            labels[..., PHOTO_CLASSES.index("sky")] = 255 * ~street.hit
+            if self.vehicle:  # drives ahead, always at the same place in the image
+                rgb[75:94, 172:195] = (250, 10, 10)
+                labels[75:94, 172:195] = 0
+                labels[75:94, 172:195, PHOTO_CLASSES.index("vehicle")] = 255
+            noise = np.random.default_rng(i).normal(0, self.noise, rgb.shape)
+            image.write(self.folder / f"{i}.png", np.clip(rgb + noise, 0, 255).astype(np.uint8))
+            np.save(self.folder / "labels" / f"{i}.npy", labels)
+            found.append(View(str(i), CAMERA, pose, self.folder / f"{i}.png"))
+        return found
+
+    @cached_property
+    def done(self) -> Done:
+        """Result of the step."""
+        inputs = {name: self.folder / name for name in ("views", "depth", "labels", "exposures")}
+        views_io.save(inputs["views"], self.views, [i == HELD_OUT for i in range(self.number)])
+        Exposures().save(inputs["exposures"])
+        inputs["depth"].mkdir()
+        occluders = scene([body.mesh for body in SCANNED])
+        for i, view in enumerate(self.views):
+            np.save(inputs["depth"] / f"{i}.npy", depth_map(view.camera, view.T_world_cam, occluders).range)
+        for i, body in enumerate(SCANNED):
+            body.mesh.save(self.folder / f"mesh{i}.npz")
+            inputs[f"mesh.{i}"] = self.folder / f"mesh{i}.npz"
+        (self.folder / "out").mkdir()
+        return backdrop(inputs, self.params, self.folder / "out", silent)
+
+    @property
+    def body(self) -> Body:
+        """The textured backdrop."""
+        return textured(self.done.files["backdrop"])
+
+    def layers(self) -> Mesh:
+        """The layers without the dome."""
+        mesh = self.body.mesh
+        assert mesh.page is not None
+        return mesh.keep(mesh.page == LAYERS)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    return Drive(tmp_path_factory.mktemp("drive"))
+
+
+def frame_psnr(bodies: list[Body], camera: Camera, pose: F64, photo: U8) -> float:
+    shown = Renderer(bodies).view(camera, pose, background=(200, 214, 230), samples=2).rgb
+    return psnr(float(((shown.astype(float) - photo) ** 2).mean()))
+
+
+def test_whole_frame_of_a_held_out_photo_gains(drive: Drive) -> None:
+    view = drive.views[HELD_OUT]
+    photo = image.read_rgb(view.photo)
+    without = frame_psnr(SCANNED, view.camera, view.T_world_cam, photo)
+    assert frame_psnr([*SCANNED, drive.body], view.camera, view.T_world_cam, photo) > without + 6
+
+
+def test_parallax_is_right_beside_and_above_the_drive(drive: Drive) -> None:
+    pose = look_at((4.0, 1.3, 3.7), (14.0, 1.0, 3.9))
+    photo = Renderer([*SCANNED, *UPPER, END]).view(CAMERA, pose, background=SKY, samples=2).rgb
+    assert frame_psnr([*SCANNED, drive.body], CAMERA, pose, photo) > frame_psnr(SCANNED, CAMERA, pose, photo) + 4
+
+
+def test_depth_of_facades_within_ten_percent(drive: Drive) -> None:
+    view = drive.views[HELD_OUT]
+    truth = Renderer([*UPPER, END]).view(view.camera, view.T_world_cam)
+    found = Renderer([Body(drive.layers())]).view(view.camera, view.T_world_cam)
+    hidden = Renderer(SCANNED).view(view.camera, view.T_world_cam).hit
+    for facade in (truth.body < 2, truth.body == 2):
+        every = facade & truth.hit & ~hidden
+        error = np.abs(found.range[every] / truth.range[every] - 1)  # inf where there is no layer
+        assert np.median(error) < 0.07 and np.mean(error < 0.1) > 0.6
+
+
+def test_layers_dont_hide_surfaces_nor_the_sky(drive: Drive) -> None:
+    for i in (0, HELD_OUT, NUMBER - 1):
+        view = drive.views[i]
+        layers = Renderer([Body(drive.layers())]).view(view.camera, view.T_world_cam)
+        surfaces = Renderer(SCANNED).view(view.camera, view.T_world_cam)
+        assert np.mean(layers.range < 0.97 * surfaces.range, where=surfaces.hit) < 0.01
+        sky = ~Renderer([*SCANNED, *UPPER, END]).view(view.camera, view.T_world_cam).hit
+        sky = binary_erosion(sky, np.ones((3, 3)))  # without the pixels at outlines
+        sky[CAMERA.height // 2 :] = False
+        shown = Renderer([*SCANNED, drive.body]).view(view.camera, view.T_world_cam).rgb[sky]
+        assert np.mean(np.abs(shown.astype(float) - SKY).max(axis=1) < 12) > 0.99
+
+
+def test_no_gaps_where_photos_show_scenery(drive: Drive) -> None:
+    for i in (1, HELD_OUT, NUMBER - 1):
+        view = drive.views[i]
+        truth = Renderer([*SCANNED, *UPPER, END]).view(view.camera, view.T_world_cam)
+        shown = Renderer([*SCANNED, Body(drive.layers())]).view(view.camera, view.T_world_cam)
+        assert np.mean(shown.hit[truth.hit]) > 0.98
+
+
+def test_sky_extends_behind_the_camera(drive: Drive) -> None:
+    behind = look_at((4.0, 0.0, 1.7), (-6.0, 0.0, 6.0))
+    shown = Renderer([drive.body]).view(CAMERA, behind)
+    assert shown.hit.all() and np.abs(shown.rgb.astype(float) - SKY).max() < 12
+
+
+def test_layers_are_the_mean_of_photos_so_noise_is_reduced(tmp_path: Path) -> None:
+    noisy = Drive(tmp_path, noise=15.0)
+    view = noisy.views[HELD_OUT]
+    clean = Renderer([*SCANNED, *UPPER, END]).view(view.camera, view.T_world_cam, background=SKY, samples=2)
+    shown = Renderer([Body(noisy.layers()), *SCANNED]).view(view.camera, view.T_world_cam)
+    end = (clean.body == 4) & (shown.body == 0)
+    rgb = Renderer([noisy.body]).view(view.camera, view.T_world_cam).rgb
+    apart = (rgb.astype(float) - clean.rgb)[end]
+    assert end.sum() > 1000 and np.median(np.abs(apart)) < 0.5 * 0.6745 * 15.0
+
+
+def test_moving_vehicles_are_left_out(tmp_path: Path) -> None:
+    red = Drive(tmp_path, vehicle=True)
+    view = red.views[HELD_OUT]
+    rgb = Renderer([*SCANNED, red.body]).view(view.camera, view.T_world_cam).rgb.astype(int)
+    assert np.mean((rgb[..., 0] > 220) & (rgb[..., 1] < 60)) < 0.0005
+
+
+def test_in_a_survey_layers_end_at_the_cell_and_the_dome_is_left_to_the_surveys_world(
+    drive: Drive, tmp_path: Path
+) -> None:  # fmt: skip
+    cell = TileCell(name="a", seed=(0.0, 0.0), neighbours={"b": (40.0, 0.0)})
+    tile = Drive(tmp_path, BackdropParams(context=BackdropContext(cell=cell)))
+    mesh, alone = tile.body.mesh, drive.done.files["backdrop"]
+    assert (Dome.load(tile.done.files["backdrop"]).colour == image.read_rgb(alone / "page_1.png")).all()
+    assert not (alone / DOME_FILE).exists()
+    assert len(mesh) and mesh.page is not None and (mesh.page == LAYERS).all()
+    assert mesh.corners.mean(axis=1)[:, 0].max() < 20.5
+
+
+def test_single_photo_has_no_backdrop(tmp_path: Path) -> None:
+    one = Drive(tmp_path, number=1)
+    assert len(one.body.mesh) == 0 and one.done.metrics["photos"] == 1
