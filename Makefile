@@ -13,9 +13,9 @@ OUT ?= demo-out
 demo: .venv/.installed
 	$(BIN)/scan2sim run $(TILE) --out $(OUT) --hold-out 8 --set segment.overwrite=true
 
-# without reordering, as the longest files, which have few tests, would run last
+# in parallel, then those in real time one at a time, then those that failed once more
 test: .venv/.installed-dev .venv-ros .venv-triton
-	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile --no-loadscope-reorder $(PYTEST)
+	$(BIN)/python -m tests.suite $(PYTEST)
 
 test-all: .venv/.installed-dev .venv-ros .venv-triton
 	$(BIN)/python -m pytest

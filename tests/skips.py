@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 
 EXPECTED_SKIPS = Path(__file__).with_name("expected_skips.toml")
+UNEXPECTED_SKIPS_STATUS = 8
+"""Exit status of a run in which only unexpected skips are wrong."""
 
 
 def skip_reasons(reporter: pytest.TerminalReporter) -> Counter[str]:
@@ -46,7 +48,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         and on_ci()
         and unexpected_reasons(skip_reasons(reporter))
     ):
-        session.exitstatus = max(session.exitstatus, pytest.ExitCode.TESTS_FAILED)
+        session.exitstatus = UNEXPECTED_SKIPS_STATUS if session.exitstatus in (0, 1) else session.exitstatus
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
