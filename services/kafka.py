@@ -318,17 +318,18 @@ def read(
 class _Probe:
     """When an idle broker is to be asked whether it is there: at every poll, and less often while it answers."""
 
-    def __init__(self, max_pause: float) -> None:
+    def __init__(self, max_pause: float, clock: Callable[[], float] = time.monotonic) -> None:
         """`max_pause`: seconds."""
         self._max_pause, self._pause, self._due = max_pause, FIRST_PROBE_PAUSE_S, 0.0
+        self._clock = clock
 
     def is_due(self) -> bool:
         """Whether to ask now."""
-        return time.monotonic() >= self._due
+        return self._clock() >= self._due
 
     def succeeded(self) -> None:
         """It has answered."""
-        self._due = time.monotonic() + self._pause
+        self._due = self._clock() + self._pause
         self._pause = min(self._max_pause, 2 * self._pause)
 
     def failed(self) -> None:
