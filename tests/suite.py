@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,8 @@ PASSED_ALONE_MAX = 3
 """Maximum number of tests that failed under load and passed alone in a run that passes."""
 RETRIED_MAX = 30
 """With more failures than this, the cause isn't chance, and none runs again."""
+SLOWEST_FILES = 10
+"""Number of files in the list of the slowest."""
 STOPPED = (pytest.ExitCode.INTERRUPTED, pytest.ExitCode.INTERNAL_ERROR, pytest.ExitCode.USAGE_ERROR)
 COMPLETE = (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED, pytest.ExitCode.NO_TESTS_COLLECTED)
 
@@ -40,6 +43,7 @@ class Run:
         status: pytest's exit status.
         tests: number of tests that ran.
         failures: message of the first failure by test ID.
+        seconds: wall time by test file, set-up included.
     """
 
     name: str
@@ -47,6 +51,7 @@ class Run:
     minutes: float
     tests: int
     failures: dict[str, str]
+    seconds: Counter[str]
 
 
 def main() -> int:
@@ -69,6 +74,7 @@ def main() -> int:
             "failed_alone": sorted(again.failures) if again else [],
             "minutes": {run.name: run.minutes for run in runs},
             "tests": {run.name: run.tests for run in runs},
+            "seconds": {run.name: dict(run.seconds.most_common()) for run in runs},
         }
         known.report.write_text(json.dumps(report, indent=2), encoding="utf-8")
     return status
@@ -82,11 +88,13 @@ def run_pytest(name: str, *options: str) -> Run:
         status = subprocess.run([sys.executable, "-m", "pytest", f"--report-log={log}", *options]).returncode
         reports = list(read_reports(log))
     failures: dict[str, str] = {}
+    seconds: Counter[str] = Counter()
     for report in reports:
+        seconds[report["nodeid"].split("::")[0]] += report.get("duration", 0.0)
         if report["outcome"] == "failed":
             failures.setdefault(report["nodeid"], failure_message(report["longrepr"]))
     tests = sum(report.get("when") == "call" for report in reports)
-    return Run(name, status, (time.monotonic() - began) / 60, tests, failures)
+    return Run(name, status, (time.monotonic() - began) / 60, tests, failures, seconds)
 
 
 def read_reports(log: Path) -> Iterator[dict[str, Any]]:
@@ -129,7 +137,10 @@ def print_summary(runs: list[Run], failures: dict[str, str], again: Run | None, 
             print(f"\n{f' {title} ':=^100}")
         for test in tests:
             print(f"{test}\n    " + failures[test].strip().replace("\n", "\n    "))
-    print("\n" + "; ".join(f"{run.name}: {run.tests} tests in {run.minutes:.1f} minutes" for run in runs))
+    print()
+    for run in runs:
+        slowest = ", ".join(f"{file} {seconds:.0f} s" for file, seconds in run.seconds.most_common(SLOWEST_FILES))
+        print(f"{run.name}: {run.tests} tests in {run.minutes:.1f} minutes; longest: {slowest}")
     if status == 0 and failures:
         print(f"passed; {len(failures)} of at most {PASSED_ALONE_MAX} tests failed under load and passed alone")
     elif again and again.status == 0 and len(failures) > PASSED_ALONE_MAX:
