@@ -1,4 +1,4 @@
-"""Native code in a child process: its result, its crash, its hanging."""
+"""Native code in a child process: result, crash, exception, timeout."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_result_is_returned() -> None:
     assert sandbox.call(f"{HERE}:double", 21, timeout=60) == 42
 
 
-def test_a_crash_becomes_an_error() -> None:
+def test_crash_is_reported_as_an_error() -> None:
     with pytest.raises(StepError, match="crashed"):
         sandbox.call(f"{HERE}:crash", timeout=60)
 
@@ -44,7 +44,7 @@ def test_exception_is_reported() -> None:
         sandbox.call(f"{HERE}:refuse", timeout=60)
 
 
-def test_hanging_ends() -> None:
+def test_hanging_child_is_stopped_at_the_timeout() -> None:
     start = time.monotonic()
     with pytest.raises(StepError, match="did not finish"):
         sandbox.call(f"{HERE}:hang", timeout=3)
