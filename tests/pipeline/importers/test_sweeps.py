@@ -1,4 +1,4 @@
-"""Sweeps of a made-up hall, taken on a known way: its walls come out sharp, and coloured as they are."""
+"""Sweeps of a synthetic hall along a known path: accurate positions and colours of its walls."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ T_CAMERA_SCANNER[:3, 3] = [0.1, 0.4, -0.3]
 
 
 def way(times: F64) -> Trajectory:
-    """The scanner's: straight on, turning evenly to the left."""
+    """Path of the scanner: straight, with a constant rotation to the left."""
     heading = 0.3 + TURN * times
     positions = np.array([0.5, -1.0, 1.8]) + np.outer(times, [SPEED, 2.0, 0])
     return Trajectory(times, positions, Rotation.from_euler("z", heading[:, None]).as_matrix())
@@ -142,7 +142,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
 
 
 def imported(**arguments: Any) -> Path:
-    """`import_sweeps`, its parameters and all else by their names."""
+    """Call `import_sweeps` with parameters given by name."""
     own = {name: arguments.pop(name) for name in PlacementParams.model_fields.keys() & arguments.keys()}
     return import_sweeps(**arguments, placing=PlacementParams(**own))
 
@@ -154,7 +154,7 @@ def cloud_of(path: Path) -> tuple[Tile, PointCloud, np.ndarray]:
     return tile, cloud, tile.frame.to_crs(cloud.xyz)
 
 
-def test_a_turning_scanners_walls_come_out_sharp(tmp_path: Path) -> None:
+def test_sweeps_of_a_rotating_scanner_are_deskewed(tmp_path: Path) -> None:
     drive = make(tmp_path, turning=True)
     _, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", deskew="kitti"))
     assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() < 0.003
@@ -166,14 +166,14 @@ def test_a_turning_scanners_walls_come_out_sharp(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("write", [to_bin, to_laz, to_open3d(".pcd"), to_open3d(".ply")])
-def test_sweeps_of_all_formats(tmp_path: Path, write: Callable[[Path, F64], None]) -> None:
+def test_sweeps_of_all_formats_are_read(tmp_path: Path, write: Callable[[Path, F64], None]) -> None:
     drive = make(tmp_path, write=write)
     _, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile"))
     assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() < 0.003
     assert cloud.intensity is not None and np.abs(cloud.intensity.astype(int) - 32768).max() < 300
 
 
-def test_poses_may_be_the_scanners_own(drive: Drive, tmp_path: Path) -> None:
+def test_poses_of_the_scanner_are_accepted(drive: Drive, tmp_path: Path) -> None:
     given: dict[str, Any] = {"extrinsics": T_CAMERA_SCANNER, "scanner_poses": True}
     for extra in ({}, given):
         path = imported(
@@ -188,7 +188,7 @@ def test_poses_may_be_the_scanners_own(drive: Drive, tmp_path: Path) -> None:
         assert np.allclose(tile.frame.to_crs(tile.trajectory.positions), way(drive.times).positions, atol=1e-5)
 
 
-def test_points_take_the_colour_of_their_wall_and_photos_their_pose(drive: Drive, tmp_path: Path) -> None:
+def test_points_are_coloured_by_photos_and_photos_are_posed(drive: Drive, tmp_path: Path) -> None:
     tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", photos=drive.pictures, link=True))
     assert cloud.rgb is not None
     off = np.abs(np.concatenate([xyz - LOW, xyz - HIGH], axis=1))
@@ -232,7 +232,7 @@ def test_unsure_sections_are_removed_and_reported(drive: Drive, tmp_path: Path) 
         imported(**arguments, out=tmp_path / "none")
 
 
-def test_times_come_from_a_file_from_names_or_from_the_order(drive: Drive, tmp_path: Path) -> None:
+def test_times_are_read_from_a_file_or_from_names(drive: Drive, tmp_path: Path) -> None:
     few = tmp_path / "few"
     few.mkdir()
     source = sorted((drive.folder / "sweeps").iterdir())
@@ -248,7 +248,7 @@ def test_times_come_from_a_file_from_names_or_from_the_order(drive: Drive, tmp_p
     notes: list[str] = []
     (tmp_path / "times.txt").write_text("0.2\n0.4\n", encoding="utf-8")
     for names, extra in (
-        (["1.bin", "3.bin"], {}),  # frames' numbers
+        (["1.bin", "3.bin"], {}),  # numbers of frames
         (["0.2.bin", "0.4.bin"], {}),
         (["1700000000200000000.bin", "1700000000400000000.bin"], {"time_offset": -1700000000.0}),
         (["a.bin", "b.bin"], {"times": tmp_path / "times.txt"}),
@@ -281,24 +281,24 @@ def test_sweeps_in_trajectory_gaps_are_removed(drive: Drive, tmp_path: Path) -> 
     assert notes == ["1 of 6 sweeps are excluded: in gaps of the trajectory"]
 
 
-def test_a_projected_crs_keeps_its_large_coordinates(tmp_path: Path) -> None:
+def test_coordinates_of_a_projected_crs_keep_their_precision(tmp_path: Path) -> None:
     shift = np.array([500_000.0, 5_400_000.0, 200.0])
     drive = make(tmp_path, shift=shift)
     tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", crs="EPSG:32633"))
     assert tile.frame.crs == "EPSG:32633" and walls(xyz - shift)[0].max() < 0.003 and np.abs(cloud.xyz).max() < 100
 
 
-def test_thinning_keeps_a_point_a_voxel(drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_thinning_keeps_one_point_per_voxel(drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = cloud_of(imported(**drive.arguments, out=tmp_path / "whole"))[2]
     thin = cloud_of(imported(**drive.arguments, out=tmp_path / "thin", voxel=0.37))[2]
-    monkeypatch.setattr("scan2sim.pipeline.importers.place_sweeps.MAX_PENDING_POINTS", 20_000)  # the same on the way
+    monkeypatch.setattr("scan2sim.pipeline.importers.place_sweeps.MAX_PENDING_POINTS", 20_000)  # thins repeatedly
     often = cloud_of(imported(**drive.arguments, out=tmp_path / "often", voxel=0.37))[2]
     origin = np.floor(drive.camera.positions[0])
     cells = [np.unique(np.floor((xyz - origin) / 0.37), axis=0) for xyz in (whole, thin)]
     assert 0.97 * len(cells[0]) < len(thin) < 1.03 * len(cells[0]) < 0.2 * len(whole) and len(often) == len(thin)
 
 
-def test_range_is_bounded(drive: Drive, tmp_path: Path) -> None:
+def test_points_outside_the_range_limits_are_removed(drive: Drive, tmp_path: Path) -> None:
     arguments = drive.arguments | {"out": tmp_path / "tile", "overwrite": True}
     with pytest.raises(DataError, match="no points within range"):
         imported(**arguments, max_range=1.5)
@@ -307,7 +307,7 @@ def test_range_is_bounded(drive: Drive, tmp_path: Path) -> None:
     assert 2.99 < away.min(axis=1).max() < 6.01
 
 
-def test_extrinsics_the_wrong_way_round_are_noticed(drive: Drive, tmp_path: Path) -> None:
+def test_inverted_extrinsics_are_detected(drive: Drive, tmp_path: Path) -> None:
     notes: list[str] = []
     wrong = drive.arguments | {"extrinsics": np.linalg.inv(T_CAMERA_SCANNER)}
     imported(**wrong, out=tmp_path / "tile", warn=notes.append)
@@ -382,7 +382,7 @@ def garbage(drive: Drive, name: str) -> dict[str, Any]:
         ),
     ],
 )
-def test_bad_input_is_named_and_leaves_nothing(
+def test_invalid_input_is_reported_and_leaves_no_files(
     tmp_path: Path, change: Callable[[Drive], dict[str, Any]], kind: type[ScanError], message: str
 ) -> None:
     drive = make(tmp_path / "drive")
@@ -393,7 +393,7 @@ def test_bad_input_is_named_and_leaves_nothing(
     assert [p.name for p in tmp_path.iterdir()] == ["drive"]
 
 
-def test_a_sweeps_own_colours_are_kept_without_photos(tmp_path: Path) -> None:
+def test_colours_of_a_sweep_are_kept_without_photos(tmp_path: Path) -> None:
     xyz = np.random.default_rng(0).uniform(2, 5, (50, 3)).astype(np.float32)
     rgb = np.tile(np.array([10, 20, 30], np.uint8), (50, 1))
     las.write(tmp_path / "a.laz", PointCloud(Frame(), xyz, rgb))
@@ -403,7 +403,7 @@ def test_a_sweeps_own_colours_are_kept_without_photos(tmp_path: Path) -> None:
     assert cloud.rgb is not None and (cloud.rgb == [10, 20, 30]).all()
 
 
-def test_the_command(drive: Drive, tmp_path: Path) -> None:
+def test_command_imports_sweeps_and_reports_excluded_ones(drive: Drive, tmp_path: Path) -> None:
     folder, out = drive.folder, tmp_path / "tile"
     result = CliRunner().invoke(
         app,
@@ -415,7 +415,9 @@ def test_the_command(drive: Drive, tmp_path: Path) -> None:
     assert read_tile(out).name == "hall" and len(read_tile(out).views) == SWEEPS - 1
 
 
-def test_long_recordings_become_several_clouds(drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_recordings_are_split_into_several_clouds(
+    drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole = cloud_of(imported(**drive.arguments, out=tmp_path / "whole", photos=drive.pictures))[1]
     monkeypatch.setattr("scan2sim.pipeline.importers.place_sweeps.MAX_PENDING_POINTS", 20_000)
     tile = read_tile(imported(**drive.arguments, out=tmp_path / "blocks", photos=drive.pictures))
