@@ -1,4 +1,4 @@
-"""Orthophotos as views."""
+"""Orthophotos as orthographic views."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def pixel_of(view: View, xyz: npt.ArrayLike) -> F32:
 
 
 @pytest.mark.parametrize("suffix", [".wld", ".jgw", ".jpgw", ".JGW"])
-def test_a_world_file_in_feet(suffix: str, tmp_path: Path) -> None:
+def test_world_file_in_feet_gives_the_view(suffix: str, tmp_path: Path) -> None:
     file = picture(tmp_path / "map.jpg")
     (tmp_path / f"map{suffix}").write_text("2.0\n0\n0\n-2.0\n1000\n2000\n", encoding="utf-8")
     view = read_view(file, FEET, highest=50.0)
@@ -46,7 +46,7 @@ def test_a_world_file_in_feet(suffix: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("raster", "shift"), [(1, 0.5), (2, 0.0)])
-def test_a_geotiffs_tags(raster: int, shift: float, tmp_path: Path) -> None:
+def test_geotiff_tags_give_the_view(raster: int, shift: float, tmp_path: Path) -> None:
     tags = TiffImagePlugin.ImageFileDirectory_v2()
     tags[33550], tags.tagtype[33550] = (0.2, 0.2, 0.0), 12
     tags[33922], tags.tagtype[33922] = (0.0, 0.0, 0.0, 500000.0, 5400010.0, 0.0), 12
@@ -60,7 +60,7 @@ def test_a_geotiffs_tags(raster: int, shift: float, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["", "1 2 3", "a b c d e f", "0 0 0 0 1 2", "1 1 0 -1 5 5", "1 0 0 1 5 5",
                                   "nan 0 0 -1 0 0"])  # fmt: skip
-def test_invalid_world_files_are_named(text: str, tmp_path: Path) -> None:
+def test_invalid_world_files_are_rejected(text: str, tmp_path: Path) -> None:
     file = picture(tmp_path / "map.png")
     (tmp_path / "map.pgw").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match="map.pgw"):
@@ -75,9 +75,7 @@ def test_orthophoto_without_georeference_is_rejected(tmp_path: Path) -> None:
         read_view(tmp_path / "torn.tif", FEET, highest=1.0)
 
 
-def test_large_ones_are_measured_by_the_projects_limit_not_pillows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_image_size_limit_is_that_of_the_project_not_of_pillow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = picture(tmp_path / "map.png")
     (tmp_path / "map.pgw").write_text("1\n0\n0\n-1\n0\n0\n", encoding="utf-8")
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
