@@ -1,4 +1,4 @@
-"""Whether the global adjustment helps, and which path witnesses keep."""
+"""Global adjustment: kept only if held-out observations fit better."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytest.importorskip("pycolmap")
 
 @pytest.fixture(scope="module")
 def winding() -> tuple[MapCheckpoint, np.ndarray]:
-    """What a drive of a perspective camera has left, and the truth."""
+    """Map checkpoint of a drive with a perspective camera, and true positions."""
     times, poses = drive(6, turn=0.15)
     found = run(times, PerspectiveFollower(poses, scatter(poses, 12000, 1), seed=1), keep=True, parallax=1.0)
     return MapCheckpoint.of(found, []), poses[:, :3, 3]
@@ -30,7 +30,7 @@ def error(mapped: MapCheckpoint, truth: np.ndarray) -> float:
 
 
 def bend(mapped: MapCheckpoint) -> np.ndarray:
-    """The keyframes' poses, along a path that slowly turns."""
+    """Poses of the keyframes with a slowly increasing heading error."""
     poses = mapped.map.poses(list(range(len(mapped.map.keyframes))))
     for k, pose in enumerate(poses):
         pose[:3, :3] = exp_so3([0, 1e-4 * k, 0]) @ pose[:3, :3]
@@ -50,7 +50,7 @@ def test_held_out_observations_identify_the_better_path(
     assert compare_paths(mapped.map, good, bent).held_out > 20
 
 
-def test_a_path_that_drifted_is_adjusted(winding: tuple[MapCheckpoint, np.ndarray]) -> None:
+def test_drifted_path_is_adjusted(winding: tuple[MapCheckpoint, np.ndarray]) -> None:
     mapped, truth = winding
     straight = [keyframe.T_world_cam for keyframe in mapped.map.keyframes]
     for keyframe, pose in zip(mapped.map.keyframes, bend(mapped), strict=True):
