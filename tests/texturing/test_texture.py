@@ -210,7 +210,7 @@ def test_masked_pixels_are_not_used(street: Street) -> None:
     assert magenta.sum() == 0
 
 
-def test_unreadable_photos_are_skipped_and_named(street: Street) -> None:
+def test_unreadable_photos_are_skipped_and_reported(street: Street) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
     street.views[1].photo.write_bytes(b"broken")
