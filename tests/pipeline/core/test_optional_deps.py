@@ -190,8 +190,8 @@ def test_install_hints_work_without_a_checkout() -> None:
         tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     )
     pages = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
-    rooms = ("pipeline", "flows", "segmentation", "texturing", "slam", "services", "data_samples")
-    for file in [*pages, *(path for room in rooms for path in (ROOT / room).rglob("*.py"))]:
+    packages = ("pipeline", "flows", "segmentation", "texturing", "slam", "services", "data_samples")
+    for file in [*pages, *(path for package in packages for path in (ROOT / package).rglob("*.py"))]:
         for line in file.read_text("utf-8").splitlines():
             hint = re.search(r"pip install\b.*", line)
             assert hint is None or file.name == "CONTRIBUTING.md" or " -e " not in hint[0], (file, line)

@@ -70,7 +70,7 @@ def test_map_without_ground_warns_of_a_floor_from_walls(tmp_path: Path) -> None:
     assert done.metrics["ground_missing"] and "feet of the walls" in done.warnings[0]
 
 
-def test_map_without_ground_and_walls_is_no_error(tmp_path: Path) -> None:
+def test_map_without_ground_and_walls_is_accepted(tmp_path: Path) -> None:
     done = run(tmp_path, np.zeros((0, 3)), np.zeros((0, 3)))
     assert done.metrics["storeys"] == 0 and "no floor" in done.warnings[0]
 

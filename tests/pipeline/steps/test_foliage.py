@@ -142,7 +142,7 @@ def test_no_card_crosses_a_tile_border_where_the_surface_stays_closed(tmp_path: 
     assert len(cards) and (cards[:, 1] < 0.0).all()
 
 
-def test_without_times_or_path_the_surface_stays_closed_and_the_reason_is_named(tmp_path: Path) -> None:
+def test_surface_stays_closed_without_times_or_path_with_a_reason(tmp_path: Path) -> None:
     inputs = scan(tmp_path, crown(400), box_surface())
     made, done = run({name: path for name, path in inputs.items() if name != "path"})
     assert len(made) == len(box_surface()) and "no trajectory" in done.warnings[0]
