@@ -195,7 +195,7 @@ def test_end_of_a_trail_of_removed_points_becomes_vehicle(tmp_path: Path) -> Non
 
 
 def test_van_seen_only_by_the_last_sweeps_is_removed(tmp_path: Path) -> None:
-    """Rays of earlier sweeps passed its place; a hedge of the same size hides what is behind it in all sweeps."""
+    """Rays of earlier sweeps passed through its position; a hedge of this size blocks rays in most sweeps."""
     end, bush = shell((4.5, 2.0, 2.0), (-6, -3)), shell((4.5, 2.0, 2.0), (4, -1))
     scan = scan_of(end, bush)
     own = np.arange(len(scan.xyz)) >= len(scan.xyz) - len(end) - len(bush)

@@ -59,7 +59,7 @@ class Drive:
 
     @cached_property
     def views(self) -> list[View]:
-        """Photos, each a metre after the last; with their classes."""
+        """Photos one metre apart, with their classes."""
         (self.folder / "labels").mkdir()
         found = []
         for i in range(self.number):
@@ -68,7 +68,7 @@ class Drive:
             rgb, labels = street.rgb.copy(), np.zeros((*street.hit.shape, len(PHOTO_CLASSES)), np.uint8)
             labels[..., PHOTO_CLASSES.index("building")] = 255 * street.hit
             labels[..., PHOTO_CLASSES.index("sky")] = 255 * ~street.hit
-            if self.vehicle:  # drives ahead, always at the same place in the image
+            if self.vehicle:  # vehicle ahead, at a constant position in the image
                 rgb[75:94, 172:195] = (250, 10, 10)
                 labels[75:94, 172:195] = 0
                 labels[75:94, 172:195, PHOTO_CLASSES.index("vehicle")] = 255

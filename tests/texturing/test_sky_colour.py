@@ -61,7 +61,7 @@ def test_photo_of_another_exposure_counts_in_that_of_the_world(street: Street, t
 
 
 def test_classes_of_a_network_decide_what_is_sky(street: Street, tmp_path: Path) -> None:
-    """The left half of what is above the corner is a white wall, which looks like clouds."""
+    """The left half of the image above the corner is a white wall, which looks like clouds."""
     image = photo((110, 150, 230))
     is_sky = (image == [110, 150, 230]).all(axis=2)
     image[:, :320][is_sky[:, :320]] = 250

@@ -333,7 +333,7 @@ def test_photos_of_other_pixel_formats_are_read(street: Street, kind: str) -> No
 def test_orthophoto_textures_ground_and_roof_but_no_facade(street: Street) -> None:
     down = np.diag([1.0, -1, -1, 1])
     down[2, 3] = 30.0
-    camera = Camera("orthographic", 480, 480, 40.0, 40.0, 239.5, 239.5)  # 12 m, 2.5 cm a pixel
+    camera = Camera("orthographic", 480, 480, 40.0, 40.0, 239.5, 239.5)  # 12 m, 2.5 cm per pixel
     street.add(camera, down)
     folder, done = street.run()
     rgb, seen, truth, x, y = from_above(folder)

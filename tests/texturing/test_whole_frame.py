@@ -105,7 +105,7 @@ def excluded(depth: F32, labels: U8 | None, boxes: Mesh | None = None) -> Bools:
 
 
 def test_vehicle_is_excluded_as_a_whole_if_a_part_of_it_was_measured() -> None:
-    """The lidar sees its lower half."""
+    """The lidar measured only its lower half."""
     found = excluded(measured(slice(90, 110), slice(40, 80)), movable(slice(60, 110), slice(40, 80)))
     assert found[60:110, 40:80].all() and found.sum() == 50 * 40
 

@@ -141,7 +141,7 @@ def test_points_of_a_post_occlude_surfaces_clearly_behind_them() -> None:
     hides = replace(scene([WALL, own]), slim=post, slim_radius=0.05)
     depth = depth_map(camera, pose, hides)
     assert visible(depth, ON_WALL, FACING).tolist() == [False, True]
-    assert visible(depth, np.array([[5.1, 0.12, 0.5]]), FACING[:1]).all()  # its own mesh, beside its points
+    assert visible(depth, np.array([[5.1, 0.12, 0.5]]), FACING[:1]).all()  # mesh of the post, beside its points
     above = depth.range[: camera.height // 8]
     assert np.isinf(above).all()  # no surface behind the post: no range
 

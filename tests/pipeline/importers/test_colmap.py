@@ -181,9 +181,9 @@ def test_damaged_models_are_rejected_or_read_without_a_crash(tmp_path: Path, for
 
 
 def fused(folder: Path) -> Path:
-    """COLMAP's own stereo fusion of six photos of a wall 5 m away, red left of x = 0, green right of it.
+    """Stereo fusion by COLMAP of six photos of a wall 5 m away, red left of x = 0, green right of it.
 
-    Its depth maps, which need a GPU to be computed, are synthetic; what is fused and written is COLMAP's.
+    The depth maps, whose computation needs a GPU, are synthetic.
     """
     width, height, f, n = 64, 48, 60.0, 6
     for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps", "stereo/consistency_graphs"):

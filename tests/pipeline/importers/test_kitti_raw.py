@@ -113,7 +113,7 @@ def make_drive(tmp_path: Path) -> Drive:
         seen = np.empty_like(world)
         for k, point in enumerate(world):
             when = t
-            for _ in range(10):  # the beam's moment depends on its azimuth and the other way round
+            for _ in range(10):  # a beam's time depends on its azimuth, and vice versa
                 T = velo(when)
                 seen[k] = (point - T[:3, 3]) @ T[:3, :3]
                 when = t - PERIOD * np.arctan2(seen[k, 1], seen[k, 0]) / (2 * np.pi)

@@ -39,7 +39,7 @@ T_CAMERA_SCANNER[:3, :3] = Rotation.from_rotvec([0.02, -0.03, 0.01]).as_matrix()
 T_CAMERA_SCANNER[:3, 3] = [0.1, 0.4, -0.3]
 
 
-def way(times: F64) -> Trajectory:
+def scanner_path(times: F64) -> Trajectory:
     """Path of the scanner: straight, with a constant rotation to the left."""
     heading = 0.3 + TURN * times
     positions = np.array([0.5, -1.0, 1.8]) + np.outer(times, [SPEED, 2.0, 0])
@@ -62,7 +62,7 @@ def sweep(time: float, *, turning: bool) -> F64:
     flat = np.cos(elevation)
     ray = np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)], axis=1)
     when = time + (-azimuth / (2 * np.pi) * PERIOD if turning else np.zeros(len(ray)))
-    poses = way(when)
+    poses = scanner_path(when)
     assert poses.rotations is not None
     hits, _ = intersect(poses.positions, np.einsum("nij,nj->ni", poses.rotations, ray))
     return np.einsum("nji,nj->ni", poses.rotations, hits - poses.positions)
@@ -114,7 +114,7 @@ class Drive:
         return {"sweeps": self.folder / "sweeps", "poses": self.folder / "camera.csv", "extrinsics": T_CAMERA_SCANNER}
 
     @property
-    def pictures(self) -> list[PhotoInput]:
+    def photo_inputs(self) -> list[PhotoInput]:
         return [PhotoInput(self.folder / "photos", CAMERA)]
 
 
@@ -124,7 +124,7 @@ def make(
     times = 0.1 + PERIOD * np.arange(SWEEPS, dtype=float)
     for name in ("sweeps", "photos"):
         (folder / name).mkdir(parents=True)
-    scanner = way(times)
+    scanner = scanner_path(times)
     poses = scanner.poses @ np.linalg.inv(T_CAMERA_SCANNER)
     for i, time in enumerate(times):
         write(folder / "sweeps" / f"{i:06d}", sweep(float(time), turning=turning))
@@ -185,11 +185,13 @@ def test_poses_of_the_scanner_are_accepted(drive: Drive, tmp_path: Path) -> None
         )
         tile, _, xyz = cloud_of(path)
         assert walls(xyz)[0].max() < 0.003 and tile.trajectory is not None
-        assert np.allclose(tile.frame.to_crs(tile.trajectory.positions), way(drive.times).positions, atol=1e-5)
+        assert np.allclose(tile.frame.to_crs(tile.trajectory.positions), scanner_path(drive.times).positions, atol=1e-5)
 
 
 def test_points_are_coloured_by_photos_and_photos_are_posed(drive: Drive, tmp_path: Path) -> None:
-    tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", photos=drive.pictures, link=True))
+    tile, cloud, xyz = cloud_of(
+        imported(**drive.arguments, out=tmp_path / "tile", photos=drive.photo_inputs, link=True)
+    )
     assert cloud.rgb is not None
     off = np.abs(np.concatenate([xyz - LOW, xyz - HIGH], axis=1))
     inner = np.sort(off, axis=1)[:, 1] > 0.5  # away from the edges between walls
@@ -205,8 +207,8 @@ def test_mask_is_imported_and_masked_pixels_give_no_colour(drive: Drive, tmp_pat
     mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
     mask[128:] = 0
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
-    pictures = [PhotoInput(drive.folder / "photos", CAMERA, mask=tmp_path / "mask.png")]
-    tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", photos=pictures))
+    photo_inputs = [PhotoInput(drive.folder / "photos", CAMERA, mask=tmp_path / "mask.png")]
+    tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", photos=photo_inputs))
     assert cloud.rgb is not None and (cloud.rgb[xyz[:, 2] < 0.3] == 128).mean() > 0.8
     assert {view.mask for view in tile.views} == {tile.path.parent / "masks" / "mask.png"}
 
@@ -218,7 +220,7 @@ def test_unsure_sections_are_removed_and_reported(drive: Drive, tmp_path: Path) 
     rotations = drive.camera.rotations
     trajectory_io.write(tmp_path / "lost.csv", Trajectory(drive.times, positions, rotations, unsure))
     notes: list[str] = []
-    arguments = drive.arguments | {"poses": tmp_path / "lost.csv", "photos": drive.pictures, "warn": notes.append}
+    arguments = drive.arguments | {"poses": tmp_path / "lost.csv", "photos": drive.photo_inputs, "warn": notes.append}
     tile, _, xyz = cloud_of(imported(**arguments, out=tmp_path / "tile"))
     assert len(xyz) == (SWEEPS - 2) * 600 * 24 and walls(xyz)[0].max() < 0.003 and len(tile.views) == SWEEPS - 2
     assert [text.partition(":")[0] for text in notes] == [
@@ -303,7 +305,7 @@ def test_points_outside_the_range_limits_are_removed(drive: Drive, tmp_path: Pat
     with pytest.raises(DataError, match="no points within range"):
         imported(**arguments, max_range=1.5)
     xyz = cloud_of(imported(**arguments, min_range=3.0, max_range=6.0))[2]
-    away = np.linalg.norm(xyz[:, None] - way(drive.times).positions, axis=2)
+    away = np.linalg.norm(xyz[:, None] - scanner_path(drive.times).positions, axis=2)
     assert 2.99 < away.min(axis=1).max() < 6.01
 
 
@@ -335,8 +337,8 @@ def test_kitti_camera_2_is_offset_from_camera_0(drive: Drive, tmp_path: Path) ->
     beside = photo_extrinsics(calib, own)
     centres = []
     for i, extrinsics in enumerate((None, beside)):
-        pictures = [PhotoInput(own, CAMERA, extrinsics=extrinsics)]
-        tile = read_tile(imported(**drive.arguments, out=tmp_path / str(i), photos=pictures, link=True))
+        photo_inputs = [PhotoInput(own, CAMERA, extrinsics=extrinsics)]
+        tile = read_tile(imported(**drive.arguments, out=tmp_path / str(i), photos=photo_inputs, link=True))
         centres.append((tile.views[0].T_world_cam, tile.views[0].centre))
     moved = centres[0][0][:3, :3].T @ (centres[1][1] - centres[0][1])
     np.testing.assert_allclose(moved, -offset, atol=1e-6)
@@ -350,7 +352,7 @@ def test_kitti_camera_2_is_offset_from_camera_0(drive: Drive, tmp_path: Path) ->
 def garbage(drive: Drive, name: str) -> dict[str, Any]:
     """A drive's arguments with one of its files overwritten."""
     (drive.folder / name).write_bytes(b"nonsense!")
-    return drive.arguments | {"photos": drive.pictures}
+    return drive.arguments | {"photos": drive.photo_inputs}
 
 
 @pytest.mark.parametrize(
@@ -369,7 +371,7 @@ def garbage(drive: Drive, name: str) -> dict[str, Any]:
         (lambda d: d.arguments | {"sweeps": d.folder / "no"}, InputError, r"no: folder not found"),
         (lambda d: d.arguments | {"times": d.folder / "t7.txt"}, InputError, r"t7\.txt: has 7 times for 6 sweeps"),
         (
-            lambda d: d.arguments | {"extrinsics": None, "photos": d.pictures},
+            lambda d: d.arguments | {"extrinsics": None, "photos": d.photo_inputs},
             SettingError,
             "photos need the extrinsics",
         ),
@@ -418,9 +420,9 @@ def test_command_imports_sweeps_and_reports_excluded_ones(drive: Drive, tmp_path
 def test_long_recordings_are_split_into_several_clouds(
     drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = cloud_of(imported(**drive.arguments, out=tmp_path / "whole", photos=drive.pictures))[1]
+    whole = cloud_of(imported(**drive.arguments, out=tmp_path / "whole", photos=drive.photo_inputs))[1]
     monkeypatch.setattr("scan2sim.pipeline.importers.place_sweeps.MAX_PENDING_POINTS", 20_000)
-    tile = read_tile(imported(**drive.arguments, out=tmp_path / "blocks", photos=drive.pictures))
+    tile = read_tile(imported(**drive.arguments, out=tmp_path / "blocks", photos=drive.photo_inputs))
     parts = [clouds.read(path, tile.frame) for path in tile.clouds]
     assert len(parts) > 2 and max(map(len, parts)) < 40_000
     joined = PointCloud.join(parts)

@@ -261,7 +261,7 @@ def written(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Format, Pat
 
 
 def same(form: Format, read: PointCloud, cloud: PointCloud, precision: float) -> None:
-    """Points come in the order of writing, except in an octree, where times identify them."""
+    """Compare clouds: points in the order of writing, except in an octree, where times identify them."""
     assert len(read) == len(cloud)
     if not form.ordered:
         read, cloud = read.take(np.argsort(present(read.time))), cloud.take(np.argsort(present(cloud.time)))

@@ -83,7 +83,7 @@ def test_consecutive_paths_are_joined_in_either_direction() -> None:
     assert np.all(np.abs(np.diff(ways[1].way[:, 0])) < 3) and len(np.unique(np.sign(np.diff(ways[1].way[:, 0])))) == 1
     assert len(np.unique(ways[1].stroke)) == 3
     sides = {float(x): side for x, _, side, _ in ways[1].edge}
-    assert len(set(sides.values())) == 2  # one of the three was driven the other way
+    assert len(set(sides.values())) == 2  # one of the three was driven in the other direction
     assert join([]) == []
 
 

@@ -112,7 +112,7 @@ def clipped_and_joined(
 
 
 def crowded(mesh: Mesh) -> int:
-    """Number of edges with more than two faces, or with two that run the same way."""
+    """Number of edges with more than two faces, or with two in the same direction."""
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     _, ways = np.unique(edges, axis=0, return_counts=True)
     return int((ways > 1).sum())

@@ -308,7 +308,7 @@ def test_tiles_get_the_part_of_the_path_that_scanned_them(cut: Path) -> None:
 
 def test_photos_are_assigned_to_the_tiles_that_they_see(bend: Path, cut: Path) -> None:
     seen = {name: [view.photo.name for view in tile.views] for name, tile in tiles(cut).items()}
-    # at 95 m a camera is in the first tile and sees the second, at 200 m it stands on a border and turns its back to
+    # at 95 m a camera is in the first tile and sees the second, at 200 m it is on a border and faces away from
     # the second, and at 290 m it looks out of the last one
     assert seen == {"bend_0000": ["10.jpg", "95.jpg"], "bend_0001": ["95.jpg"], "bend_0002": ["290.jpg", "lost.jpg"]}
     view = tiles(cut)["bend_0001"].views[0]
@@ -517,5 +517,5 @@ def test_memory_is_independent_of_the_number_of_points(tmp_path: Path, monkeypat
         tracemalloc.stop()
         return most
 
-    peak(1)  # what is loaded once
+    peak(1)  # data that is loaded once
     assert peak(20) < 1.5 * peak(2)  # of each of three files

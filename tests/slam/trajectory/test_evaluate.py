@@ -77,7 +77,7 @@ def test_error_of_scale_drift_is_analytic() -> None:
     assert result.global_mean == pytest.approx(np.abs(line(u) - x).mean())
     slope = line.convert().coef[1]
     assert result.scale == pytest.approx(slope)
-    # middle of [a, a + 400] of x + x^2 / 1000: 200^2 / 1000 = 40 before its mean of ends, whatever a
+    # middle of [a, a + 400] of x + x^2 / 1000: 200^2 / 1000 = 40 before its mean of ends, for any a
     assert np.allclose(result.local_errors, 40 * slope) and result.local_at[[0, -1]].tolist() == [200, 800]
 
 
@@ -151,7 +151,7 @@ def test_association_by_time_omits_poses_outside_the_ground_truth() -> None:
 def test_rotation_error_against_gps_is_only_noise() -> None:
     path = winding()
     scatter = np.random.default_rng(0).normal(0, 0.8, path.positions.shape)
-    near = np.arange(len(path)) % 3 == 0  # 3.3 fixes a second
+    near = np.arange(len(path)) % 3 == 0  # 3.3 fixes per second
     gap = (path.times > 60) & (path.times < 70)
     track = GpsTrack(path.times[near & ~gap], (path.positions + scatter)[near & ~gap])
     result = evaluate(moved(path, yaw(50), SHIFT, 2.0), track)
