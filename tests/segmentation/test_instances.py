@@ -257,7 +257,7 @@ def test_cloud_is_unchanged_without_a_path(tmp_path: Path) -> None:
     assert done.metrics["vehicles"] == 0 and done.files["cloud"].stat().st_ino == inputs["cloud"].stat().st_ino
 
 
-def test_hardly_anything_static_is_lost_on_the_synthetic_street(tmp_path: Path) -> None:
+def test_static_points_of_the_synthetic_street_are_kept(tmp_path: Path) -> None:
     """Every other metre of the sample street that isn't a vehicle is classified as one; the truth is known."""
     path = ROOT / "data_samples" / "tile"
     las = laspy.read(path / "cloud.laz")

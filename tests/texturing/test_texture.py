@@ -262,7 +262,7 @@ def test_results_are_byte_identical_on_any_number_of_threads(street: Street) -> 
         assert (one / name).read_bytes() == (two / name).read_bytes()
 
 
-def test_pages_are_padded_in_parts_as_they_are_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_padding_in_parts_equals_padding_of_whole_pages(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     seen = np.where(rng.random((300, 200)) < 0.003, 255, 0).astype(np.uint8)
     seen[120:200] = 0

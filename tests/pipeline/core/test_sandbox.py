@@ -30,7 +30,7 @@ def hang() -> None:
     time.sleep(600)
 
 
-def test_result_is_returned() -> None:
+def test_result_of_the_child_is_returned() -> None:
     assert sandbox.call(f"{HERE}:double", 21, timeout=60) == 42
 
 
@@ -39,7 +39,7 @@ def test_crash_is_reported_as_an_error() -> None:
         sandbox.call(f"{HERE}:crash", timeout=60)
 
 
-def test_exception_is_reported() -> None:
+def test_exception_of_the_child_is_reported() -> None:
     with pytest.raises(StepError, match="no such luck"):
         sandbox.call(f"{HERE}:refuse", timeout=60)
 

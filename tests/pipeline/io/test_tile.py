@@ -154,7 +154,7 @@ def test_truncated_cloud_is_reported(tmp_path: Path, suffix: str, kept: float) -
         clouds.read(path, read_tile(tmp_path).frame)
 
 
-def test_feet_become_metres(tmp_path: Path) -> None:
+def test_coordinates_in_feet_are_converted_to_metres(tmp_path: Path) -> None:
     frame = Frame(FT_CRS, (200_000.0, 250_000.0, 100.0), 0.3048)
     xyz = np.array([[0, 0, 0], [30.48, 60.96, 3.048]], np.float32)
     las.write(tmp_path / "feet.laz", PointCloud(frame, xyz))

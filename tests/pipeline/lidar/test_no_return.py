@@ -78,7 +78,7 @@ def test_reflectance_of_a_window_is_0(tmp_path: Path) -> None:
     )  # 25 cm inside the gap in the returns
 
 
-def test_returns_of_another_sweep_give_the_window_a_reflectance(tmp_path: Path) -> None:
+def test_window_with_returns_of_another_sweep_has_a_reflectance(tmp_path: Path) -> None:
     sweeps, _ = sweep(lost=in_window())
     y, z = np.meshgrid(np.arange(-1, 1, 0.2), np.arange(1.8, 2.9, 0.2))
     others = np.stack([np.full(y.size, WALL_X), y.ravel(), z.ravel()], axis=1).astype(np.float32)

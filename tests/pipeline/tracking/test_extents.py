@@ -20,7 +20,7 @@ from scan2sim.pipeline.tracking.tracks import footprint
         ((2.1, 0.1), (0.7, 0.1), 1.4, 15.0, "motorcycle"),
     ],
 )
-def test_category_by_size_and_speed(
+def test_category_is_determined_by_size_and_speed(
     length: tuple[float, float], width: tuple[float, float], height: float, speed: float, category: str
 ) -> None:
     assert categorize(length, width, height, speed) == category

@@ -93,8 +93,8 @@ def test_error_of_heading_drift_is_analytic() -> None:
         assert error is not None and error.rotation_deg_per_m == pytest.approx(np.degrees(bend), rel=0.02)
 
 
-def test_a_step_in_the_middle_of_a_segment() -> None:
-    """A 2 m sideways excursion at 500 m is seen by segments whose middle it is, by no others."""
+def test_excursion_counts_in_segments_with_their_middle_there() -> None:
+    """A 2 m sideways excursion at 500 m is an error of segments whose middle is there, and of no others."""
     truth = straight()
     positions = truth.positions.copy()
     positions[495:506, 1] = 2
