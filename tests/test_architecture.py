@@ -1,4 +1,4 @@
-"""The shape of the house: imports run one way, the command starts light, the docs name what exists."""
+"""Architecture: directions of imports, start of the command without heavy packages, documented settings and files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from tests.conftest import ROOT
 
-ROOMS = {
+PACKAGES = {
     "pipeline": set(),
     "segmentation": {"pipeline"},
     "texturing": {"pipeline"},
@@ -37,14 +37,14 @@ def modules(file: Path) -> set[str]:
 
 
 def imported(file: Path) -> set[str]:
-    """What a file imports, anywhere in it: rooms by their own names, other modules by their first."""
+    """Top-level packages that a file imports anywhere; those of the project without `scan2sim`."""
     return {name.removeprefix("scan2sim.").split(".")[0] for name in modules(file)}
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_imports_run_one_way(room: str) -> None:
-    for file in (ROOT / room).rglob("*.py"):
-        foreign = (imported(file) & set(ROOMS)) - {room} - ROOMS[room]
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_import_only_permitted_packages(package: str) -> None:
+    for file in (ROOT / package).rglob("*.py"):
+        foreign = (imported(file) & set(PACKAGES)) - {package} - PACKAGES[package]
         assert not foreign, f"{file.relative_to(ROOT)} imports {foreign}"
 
 
@@ -60,13 +60,13 @@ def test_benchmarks_import_only_fakes_from_tests() -> None:
 
 
 def project_files() -> dict[str, Path]:
-    """Dotted names of the rooms' modules (`flows.engine.memory`) to their files."""
-    files = [file for room in ROOMS for file in (ROOT / room).rglob("*.py")]
+    """Files of the project's modules by dotted name (`flows.engine.memory`)."""
+    files = [file for package in PACKAGES for file in (ROOT / package).rglob("*.py")]
     return {".".join(f.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): f for f in files}
 
 
-def arrows() -> dict[str, set[str]]:
-    """Modules of the rooms to those that they import, anywhere in their files."""
+def import_graph() -> dict[str, set[str]]:
+    """Modules of the project that each module imports, anywhere in its file."""
     known = project_files()
 
     def wanted(file: Path) -> set[str]:
@@ -81,24 +81,24 @@ def arrows() -> dict[str, set[str]]:
     return {name: wanted(file) - {name} for name, file in known.items()}
 
 
-def test_no_files_import_each_other() -> None:
-    TopologicalSorter(arrows()).prepare()  # raises a CycleError that names them
+def test_imports_of_modules_have_no_cycles() -> None:
+    TopologicalSorter(import_graph()).prepare()  # raises a CycleError that names them
 
 
-def package_arrows(room: str, depth: int) -> dict[str, set[str]]:
-    """Packages and modules `depth` levels below the root to those of the same room that they import."""
+def package_import_graph(package: str, depth: int) -> dict[str, set[str]]:
+    """Imports between the packages and modules of one top-level package, `depth` levels below the root."""
     graph: dict[str, set[str]] = {}
-    for name, others in arrows().items():
-        if name.startswith(f"{room}."):
+    for name, others in import_graph().items():
+        if name.startswith(f"{package}."):
             own = ".".join(name.split(".")[:depth])
-            found = {".".join(other.split(".")[:depth]) for other in others if other.startswith(f"{room}.")}
+            found = {".".join(other.split(".")[:depth]) for other in others if other.startswith(f"{package}.")}
             graph[own] = graph.get(own, set()) | found - {own}
     return graph
 
 
-@pytest.mark.parametrize(("room", "depth"), [*((room, 2) for room in ROOMS), ("services", 3)])
-def test_no_packages_import_each_other(room: str, depth: int) -> None:
-    TopologicalSorter(package_arrows(room, depth)).prepare()  # raises a CycleError that names them
+@pytest.mark.parametrize(("package", "depth"), [*((package, 2) for package in PACKAGES), ("services", 3)])
+def test_imports_of_packages_have_no_cycles(package: str, depth: int) -> None:
+    TopologicalSorter(package_import_graph(package, depth)).prepare()  # raises a CycleError that names them
 
 
 def step_modules() -> set[str]:
@@ -115,20 +115,20 @@ def step_modules() -> set[str]:
     return {name for name, file in project_files().items() if "steps" in name.split(".") or defines_step(file)}
 
 
-def test_steps_are_imported_by_steps_of_their_package_and_by_flows_alone() -> None:
+def test_steps_are_imported_only_by_steps_of_their_package_and_by_flows() -> None:
     steps = step_modules()
     assert {"pipeline.steps.voxel", "texturing.unwrap", "slam.steps.track"} <= steps
-    for name, others in arrows().items():
+    for name, others in import_graph().items():
         if not name.startswith("flows."):
             own = {step for step in steps if name in steps and step.split(".")[0] == name.split(".")[0]}
             assert not others & steps - own, f"{name} imports {others & steps - own}"
 
 
-def test_imports_between_wings_run_one_way() -> None:
-    wings = ["pipelines", "engine", "reports", "commands", "deployed", "cli", "api"]  # each may import those before it
-    for name, others in arrows().items():
+def test_subpackages_of_flows_import_only_earlier_ones() -> None:
+    order = ["pipelines", "engine", "reports", "commands", "deployed", "cli", "api"]  # each may import those before it
+    for name, others in import_graph().items():
         if name.startswith("flows."):
-            later = wings[wings.index(name.split(".")[1]) + 1 :]
+            later = order[order.index(name.split(".")[1]) + 1 :]
             foreign = [other for other in others if other.startswith("flows.") and other.split(".")[1] in later]
             assert not foreign, f"{name} imports {foreign}"
 
@@ -138,9 +138,9 @@ def test_only_deployed_flows_import_prefect() -> None:
         assert "prefect" not in imported(file) or name.startswith("flows.deployed."), file.relative_to(ROOT)
 
 
-def test_hints_to_install_work_without_a_checkout() -> None:
-    for room in ROOMS:
-        for file in (ROOT / room).rglob("*.py"):
+def test_install_hints_work_without_a_checkout() -> None:
+    for package in PACKAGES:
+        for file in (ROOT / package).rglob("*.py"):
             assert not re.search(r"pip install[^\n]*(-e |constraints)", file.read_text(encoding="utf-8")), (
                 file.relative_to(ROOT)
             )
@@ -156,7 +156,7 @@ def loaded_by(code: str, names: tuple[str, ...] = HEAVY) -> set[str]:
     )
 
 
-def test_the_command_starts_without_anything_heavy() -> None:
+def test_command_starts_without_heavy_packages() -> None:
     assert loaded_by("import scan2sim.flows.cli") == set()
 
 
@@ -175,7 +175,7 @@ def test_command_summaries_equal_the_commands_own_help() -> None:
     assert {name: loaded(name).help for name in COMMANDS} == {name: about for name, (_, about) in COMMANDS.items()}
 
 
-def test_the_recipe_is_planned_without_anything_heavy() -> None:
+def test_pipeline_definition_imports_no_heavy_package() -> None:
     assert loaded_by("import scan2sim.flows.pipelines.tile") <= {"numpy"}
 
 
@@ -196,7 +196,7 @@ def test_every_exit_code_is_documented() -> None:
         assert f"| {code} |" in text and meaning in text
 
 
-def test_walks_in_the_docs_name_existing_files_once() -> None:
+def test_walkthroughs_in_the_docs_name_existing_files_once() -> None:
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split("## Three walks")[1].split("\n## ")[0]
     walks = [re.findall(r"`([\w/]+\.py)`", walk) for walk in text.split("\n\n")[2:] if walk.strip()]
     assert len(walks) == 3

@@ -38,7 +38,7 @@ print(json.dumps({
 
 
 def read(world: Path) -> dict[str, Any]:
-    """What the reader finds in a world, seen from 12 m south of its origin, 6 m above it, looking north."""
+    """Contents of a world by the reader, seen from 12 m south of its origin, 6 m above it, looking north."""
     pose = np.array([[1.0, 0, 0, 0], [0, 0, 1, -12], [0, -1, 0, 6], [0, 0, 0, 1]])
     command = [sys.executable, "-c", READ, str(world), json.dumps(pose.tolist())]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -64,7 +64,7 @@ def test_surfaces_are_read_without_collision_meshes(world: Path) -> None:
     assert found["sky"] == found["top"] == [120, 160, 220]
 
 
-def test_backdrop_is_seen_but_is_no_surface(world: Path) -> None:
+def test_backdrop_is_visible_but_not_a_surface(world: Path) -> None:
     """A green wall 60 m to the north."""
     bare = read(world)
     meshes = next((world / "models").iterdir()) / "meshes"
@@ -99,7 +99,7 @@ print(json.dumps({name: [row["share"], row["error_share"]] for name, row in fram
 """
 
 
-def test_error_of_a_frame_is_divided_by_what_it_shows() -> None:
+def test_frame_error_is_split_by_surface_layer_and_dome() -> None:
     """A third of the frame each: right surface, a layer 10 levels off, the dome 30 levels off."""
     done = subprocess.run([sys.executable, "-c", SHARES], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -126,8 +126,8 @@ print(json.dumps(openmvs.compare([(photo, seen, seen.hit)], other) | {"hit": flo
 """
 
 
-def test_fill_colour_of_openmvs_is_no_texture(world: Path, tmp_path: Path) -> None:
-    """Its result: the ground of the world, half of which no photo sees."""
+def test_fill_colour_of_openmvs_is_not_texture(world: Path, tmp_path: Path) -> None:
+    """Result of OpenMVS: the ground of the world, half of which is in no photo."""
     meshes = next((world / "models").iterdir()) / "meshes"
     folder = tmp_path / "mvs" / "street"
     folder.mkdir(parents=True)

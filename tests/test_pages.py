@@ -92,7 +92,7 @@ def accepted_options(line: str) -> tuple[str, set[str]]:
 
 
 @pytest.mark.parametrize("page", page_params(PAGES + MODULES))
-def test_options_exist(page: Path) -> None:
+def test_documented_options_exist(page: Path) -> None:
     text, option = text_of(page), re.compile(r"(?<![\w-])--[a-z][\w-]*")
     modules = "".join(source(module) for module in re.findall(r"python -m (\w+\.[\w.]+)", text))
     others = {found for line in code_lines(text) if OTHER_PROGRAMS.search(line) for found in option.findall(line)}
@@ -107,7 +107,7 @@ def test_options_exist(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", page_params(PAGES + MODULES))
-def test_settings_and_metrics_exist(page: Path) -> None:
+def test_documented_settings_and_metrics_exist(page: Path) -> None:
     names = "|".join(PARAMS)
     setting = re.compile(rf"(?<![\w/.-])({names})\.(?:(?:{'|'.join(SURFACES)})\.)?([a-z_0-9]+)")
     for step, name in setting.findall(" ".join(code_lines(text_of(page)))):
@@ -186,7 +186,7 @@ OTHERS_FILES = ("random.py", "navigation_launch.py")
 
 
 @pytest.mark.parametrize("page", page_params(PAGES + MODULES))
-def test_project_files_exist(page: Path) -> None:
+def test_documented_project_files_exist(page: Path) -> None:
     folders = {name.split("/")[0] for name in project_files() if "/" in name}
     for name in re.findall(r"(?<![\w/.-])(?:[\w.-]+/)*[\w-]+\.(?:py|md|txt|yaml|toml|j2)\b", text_of(page)):
         ours = name.split("/")[0] in folders if "/" in name else name.endswith(".py") and name not in OTHERS_FILES

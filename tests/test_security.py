@@ -20,7 +20,7 @@ EXEMPT = {"pipeline/core/sandbox.py"}
 """Exchanges pickles between a run and its own child processes."""
 
 
-def test_no_code_is_executed_from_files() -> None:
+def test_source_has_no_calls_that_execute_code_from_files() -> None:
     for package in PACKAGES:
         for path in (ROOT / package).rglob("*.py"):
             if path.relative_to(ROOT).as_posix() not in EXEMPT:

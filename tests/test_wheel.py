@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from tests.conftest import ROOT
-from tests.test_architecture import ROOMS as PACKAGES
+from tests.test_architecture import PACKAGES
 
 PYTHONS = ("3.11", "3.12", "3.13")
 HOME = Path(pwd.getpwuid(os.getuid()).pw_dir)

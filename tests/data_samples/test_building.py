@@ -108,7 +108,7 @@ def test_free_space_is_free_and_has_a_floor(house: Building, storey: int) -> Non
     assert np.isclose(down, 0.6, atol=1e-3).mean() > 0.98
 
 
-def test_what_stands_on_the_floor_is_not_free(house: Building) -> None:
+def test_objects_on_the_floor_are_not_free(house: Building) -> None:
     free = house.free_space(0, high=0.6)
     for item in house.items:
         solid = item.boxes[(item.boxes[:, 0, 2] < 0.6) & (item.boxes[:, 1, 2] > 0.05)]
@@ -140,7 +140,7 @@ def test_labels_of_points_agree_with_the_true_surface(house: Building, walked: R
     exact = o3d.core.Tensor(returns.exact[still].astype(np.float32))
     nearest = caster(house.mesh).compute_closest_points(exact)
     assert np.linalg.norm(nearest["points"].numpy() - returns.exact[still], axis=1).max() < 5e-3
-    assert (house.surface[nearest["primitive_ids"].numpy()] == returns.surface[still]).mean() > 0.998  # but for edges
+    assert (house.surface[nearest["primitive_ids"].numpy()] == returns.surface[still]).mean() > 0.998  # except at edges
     assert (house.surface[returns.face[still]] == returns.surface[still]).all()
     assert set(np.unique(returns.surface)) >= {Surface.FLOOR, Surface.WALL, Surface.CEILING, Surface.STAIRS}
     codes = present(house.mesh.classification)[returns.face[still]]
@@ -158,7 +158,7 @@ def test_range_noise_has_the_given_deviation_along_the_beam(walked: RobotMap) ->
     assert np.abs(off - along[:, None] * beam).max() < 1e-6
 
 
-def test_glass_returns_nothing_and_opaque_panes_do(walked: RobotMap) -> None:
+def test_only_opaque_panes_give_returns(walked: RobotMap) -> None:
     assert not np.isin(walked.surface, (Surface.GLASS, Surface.WINDOW)).any()
     opaque = record(build(3, Style(rooms=1)), COARSE, Mapping(voxel=0))
     assert (opaque.surface == Surface.WINDOW).mean() > 0.01

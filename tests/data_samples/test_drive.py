@@ -149,7 +149,7 @@ def render(town: Town, poses: F64, time: float, lens: float = 0.0) -> PanoramaIm
     return Panorama(town, None, H, seed=3, radius=90.0, lens=lens).render(poses, time)
 
 
-def test_hills_raise_everything_and_tilt_the_car(trajectory: Trajectory) -> None:
+def test_hills_raise_the_scene_and_tilt_the_car(trajectory: Trajectory) -> None:
     waves = hills.draw(PATH, 0.08, 3)
     driven = hills.lifted(trajectory, waves)
     assert driven.rotations is not None

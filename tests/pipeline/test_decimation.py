@@ -1,4 +1,4 @@
-"""Decimation: one contract for all libraries; what they are to keep, they keep."""
+"""Decimation: requirements on all backends."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SIDE = 120
 
 
 def hills() -> Mesh:
-    """Wavy ground of 12 x 12 m with a hole, 28 K triangles, all of which look up."""
+    """Wavy ground of 12 x 12 m with a hole, 28 K triangles with upward normals."""
     random = np.random.default_rng(0)
     i, j = np.meshgrid(np.arange(SIDE), np.arange(SIDE), indexing="ij")
     x, y = (0.1 * axis + random.uniform(-0.02, 0.02, axis.shape) for axis in (i, j))
@@ -33,14 +33,14 @@ def hills() -> Mesh:
 
 
 def border(mesh: Mesh) -> set[frozenset[tuple[float, ...]]]:
-    """The edges of one face alone, by their places."""
+    """Edges with only one face, by positions of their ends."""
     edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
     once, count = np.unique(edges, axis=0, return_counts=True)
     return {frozenset(map(tuple, ends)) for ends in mesh.vertices[once[count == 1]].tolist()}
 
 
-def off(small: Mesh) -> float:
-    """Metres that vertices are from the ground, 95 of 100 at most."""
+def height_error(small: Mesh) -> float:
+    """95th percentile of the distance of vertices from the ground, metres."""
     x, y, z = small.vertices.T
     return float(np.percentile(np.abs(z - 0.5 * np.sin(x) * np.cos(y)), 95))
 
@@ -53,28 +53,28 @@ def simplified(mesh: Mesh, name: str, target: int, *, keep_border: bool) -> Mesh
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("keep_border", [True, False])
-def test_the_surface_stays_with_fewer_triangles(name: str, keep_border: bool) -> None:
+def test_decimated_surface_keeps_its_shape(name: str, keep_border: bool) -> None:
     whole = hills()
     small = simplified(whole, name, 4000, keep_border=keep_border)
     assert 3800 <= len(small) <= 4010
     assert np.isfinite(small.vertices).all() and small.frame == whole.frame
     assert small.faces.max() + 1 == len(small.vertices) == len(np.unique(small.faces))
-    assert (small.face_normal[small.face_area > 1e-6, 2] > 0).all(), "no face is turned over"
-    assert off(small) < 0.005
+    assert (small.face_normal[small.face_area > 1e-6, 2] > 0).all(), "faces are flipped"
+    assert height_error(small) < 0.005
     assert abs(float(small.face_area.sum() / whole.face_area.sum()) - 1) < 0.01
     if keep_border:
         assert border(small) == border(whole)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_is_small_enough_stays(name: str) -> None:
+def test_small_mesh_is_unchanged(name: str) -> None:
     whole = hills()
     same = simplified(whole, name, len(whole), keep_border=False)
     assert np.array_equal(same.vertices, whole.vertices) and np.array_equal(same.faces, whole.faces)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_step_uses_the_library_that_is_set(tmp_path: Path, name: str) -> None:
+def test_step_uses_the_selected_backend(tmp_path: Path, name: str) -> None:
     if missing := plugins.missing(decimation.__name__, name):
         pytest.skip(f"needs {missing}")
     hills().save(tmp_path / "mesh.npz")
@@ -87,7 +87,7 @@ def test_the_step_uses_the_library_that_is_set(tmp_path: Path, name: str) -> Non
     assert done.metrics["border_kept"] and not done.warnings
 
 
-def test_unknown_library_lists_available_ones() -> None:
+def test_unknown_backend_lists_available_ones() -> None:
     assert DECIMATE.check is not None
     with pytest.raises(SettingError, match=r"decimate\.backend: unknown value 'pyfqmr'.*fast_simplification, py"):
         DECIMATE.check(DecimateParams(backend="pyfqmr"))

@@ -36,7 +36,7 @@ def test_colours_labels_and_channels_stay_aligned(size: tuple[int, int]) -> None
     assert np.mean(contrast) > 0.8 and np.mean(scan) > 0.8
 
 
-def test_no_channels_are_invented_where_there_is_no_scan() -> None:
+def test_channels_stay_empty_without_a_scan() -> None:
     rng = np.random.default_rng(1)
     _, classes, channels = scene(256, 256)
     channels[:20], coarse = 0, classes[2::4, 2::4]

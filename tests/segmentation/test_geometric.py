@@ -186,8 +186,8 @@ def test_sparse_and_noisy_maps_keep_ground_and_buildings(size: float, noise: flo
         assert recall["plant"] > 0.6
 
 
-def test_low_walls_of_a_map_without_ground_are_no_thick_ground() -> None:
-    """Ground points were removed from the map: its columns are walls from 20 cm to 1 m, not noisy ground."""
+def test_low_walls_of_a_map_without_ground_are_not_ground() -> None:
+    """A map without ground points, with walls from 20 cm to 1 m, which must not be classified as noisy ground."""
     rng = np.random.default_rng(0)
     walls = [plane(rng, 6000, [0, y, 0.2], [60, 0, 0], [0, 0, 0.8]) for y in (0.0, 8.0)]
     xyz = (np.concatenate(walls) + rng.normal(0, 0.05, (12_000, 3))).astype(np.float32)

@@ -43,7 +43,7 @@ def test_classes_agree_with_the_truth() -> None:
 
 
 @pytest.mark.parametrize("missing", ["floor", "ceiling"])
-def test_works_without_floor_or_ceiling(missing: str) -> None:
+def test_classification_works_without_floor_or_ceiling(missing: str) -> None:
     xyz, surface = scanned()
     keep: Bools = ~np.isin(surface, KINDS[missing])
     found = classify_indoor(xyz[keep], 0.08)

@@ -129,20 +129,20 @@ def relabelled(out: Path, labelled: float, alternative: str, xyz: F32) -> Done:
     return run(inputs, out)
 
 
-def test_shrub_of_which_most_is_labelled_vehicle_stays_a_shrub(tmp_path: Path) -> None:
+def test_mostly_mislabelled_shrub_stays_a_shrub(tmp_path: Path) -> None:
     shrub = shell((3.2, 2.6, 0.8), (-5, -5), 0.0, turn=0.5)
     done = relabelled(tmp_path, 0.67, "low_vegetation", shrub)
     assert (classified(done, shrub)["0"][shrub[:, 2] > 0.15] == HEDGE).mean() > 0.98
     assert {one["kind"] for one in done.metrics["removed"]} == {"car", "van"}
 
 
-def test_slab_labelled_vehicle_takes_the_next_class_that_photos_see(tmp_path: Path) -> None:
+def test_slab_labelled_vehicle_gets_the_second_class_of_photos(tmp_path: Path) -> None:
     slab = shell((3.0, 0.25, 1.9), (-5, -6), 0.0)
     done = relabelled(tmp_path, 1.0, "building", slab)
     assert (classified(done, slab)["0"][slab[:, 2] > 0.15] == BUILDING).mean() > 0.95
 
 
-def test_removed_objects_are_listed_with_place_size_and_reason(done: Done) -> None:
+def test_removed_objects_are_listed_with_position_size_and_reason(done: Done) -> None:
     car = next(one for one in done.metrics["removed"] if one["kind"] == "car")
     assert (car["x"], car["y"]) == pytest.approx((500_000, 5_400_004), abs=0.1)
     assert car["length_m"] == pytest.approx(4.4, abs=0.15) and not car["moved"]
@@ -172,7 +172,7 @@ def test_car_scanned_from_one_side_is_completed(tmp_path: Path) -> None:
     assert (after["car"] == VEHICLE).mean() > 0.98 and (after["hedge"] == HEDGE).mean() > 0.95
 
 
-def test_points_inside_a_carved_trail_become_vehicle(tmp_path: Path) -> None:
+def test_points_inside_a_trail_of_removed_points_become_vehicle(tmp_path: Path) -> None:
     rest = shell((3.0, 0.4, 1.2), (-6, -3))
     inputs = street(tmp_path, rest=rest)
     PointCloud(FRAME, rest[::2] + np.float32(0.1)).save(tmp_path / "moving.npz")
@@ -180,8 +180,8 @@ def test_points_inside_a_carved_trail_become_vehicle(tmp_path: Path) -> None:
     assert (classified(done, rest)["0"] == VEHICLE).mean() > 0.95
 
 
-def test_end_of_a_carved_trail_becomes_vehicle(tmp_path: Path) -> None:
-    """No ray passes through the last position of a van, so it isn't carved; unlike a bush, it is scanned briefly."""
+def test_end_of_a_trail_of_removed_points_becomes_vehicle(tmp_path: Path) -> None:
+    """No ray passes through the last position of a van, so it is not removed; unlike a bush, it is scanned briefly."""
     end, bush = shell((4.5, 2.0, 2.0), (-6, -3)), shell((4.5, 2.0, 2.0), (4, -1))
     inputs = street(tmp_path, end=end, bush=bush)
     cloud = PointCloud.load(inputs["cloud"])
@@ -194,8 +194,8 @@ def test_end_of_a_carved_trail_becomes_vehicle(tmp_path: Path) -> None:
     assert (after["0"] == VEHICLE).mean() > 0.97 and (after["1"] == HEDGE).all()
 
 
-def test_van_that_only_the_last_sweeps_saw_is_removed(tmp_path: Path) -> None:
-    """Rays of earlier sweeps passed its place; a hedge of the same size hides what is behind it in all sweeps."""
+def test_van_seen_only_by_the_last_sweeps_is_removed(tmp_path: Path) -> None:
+    """Rays of earlier sweeps passed through its position; a hedge of this size blocks rays in most sweeps."""
     end, bush = shell((4.5, 2.0, 2.0), (-6, -3)), shell((4.5, 2.0, 2.0), (4, -1))
     scan = scan_of(end, bush)
     own = np.arange(len(scan.xyz)) >= len(scan.xyz) - len(end) - len(bush)
@@ -257,7 +257,7 @@ def test_cloud_is_unchanged_without_a_path(tmp_path: Path) -> None:
     assert done.metrics["vehicles"] == 0 and done.files["cloud"].stat().st_ino == inputs["cloud"].stat().st_ino
 
 
-def test_hardly_anything_static_is_lost_on_the_synthetic_street(tmp_path: Path) -> None:
+def test_static_points_of_the_synthetic_street_are_kept(tmp_path: Path) -> None:
     """Every other metre of the sample street that isn't a vehicle is classified as one; the truth is known."""
     path = ROOT / "data_samples" / "tile"
     las = laspy.read(path / "cloud.laz")

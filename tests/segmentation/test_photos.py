@@ -75,7 +75,7 @@ def test_photos_are_resampled_to_the_networks_angular_resolution() -> None:
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, PANORAMA])
-def test_network_with_channels_gets_them_after_the_colours(camera: Camera) -> None:
+def test_lidar_channels_are_passed_after_the_colours(camera: Camera) -> None:
     class ByChannel(ByColour):
         def probabilities(self, seen: U8) -> F32:
             assert seen.shape[2] == 7

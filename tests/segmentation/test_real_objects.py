@@ -1,4 +1,4 @@
-"""Objects of real streets that photos take for vehicles, and traffic that is seen by a few sweeps."""
+"""Real streets: static objects misclassified as vehicles in photos, and traffic in few sweeps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 
 
 class Place(NamedTuple):
-    """Upright cylinder in the CRS: what is in it, centre and radius in metres, and lowest height above the ground."""
+    """Upright cylinder in the CRS: object in it, centre and radius in metres, and lowest height above the ground."""
 
     what: str
     x: float
@@ -47,7 +47,7 @@ STREETS: dict[str, tuple[tuple[str, ...], list[Place], list[Place]]] = {
 
 
 @pytest.mark.parametrize("name", STREETS)
-def test_what_stays_is_kept_and_what_passes_is_removed(real_data: Path, tmp_path: Path, name: str) -> None:
+def test_static_objects_are_kept_and_traffic_is_removed(real_data: Path, tmp_path: Path, name: str) -> None:
     importing, stays, passes = STREETS[name]
     stdout_of(scan2sim("import", *importing, real_data / name, "--out", tmp_path / "tile", timeout=900))
     stdout_of(scan2sim("segment", tmp_path / "tile", "--out", tmp_path / "out", timeout=900))

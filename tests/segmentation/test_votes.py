@@ -133,7 +133,7 @@ def test_ground_is_split_into_road_sidewalk_and_terrain(labelled: tuple[Path, U8
     assert {CODE[n] for n in ("road", "sidewalk", "terrain", "building", "high_vegetation")} <= set(predicted.tolist())
 
 
-def test_missing_weights_are_named(tmp_path: Path) -> None:
+def test_missing_weights_are_reported(tmp_path: Path) -> None:
     from scan2sim.segmentation.backends import load
 
     with pytest.raises(InputError, match=r"no\.safetensors"):

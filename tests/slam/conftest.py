@@ -1,4 +1,4 @@
-"""A tiny 360-degree drive, filmed once a session: down a corridor whose walls are painted at random."""
+"""Fixtures of the SLAM tests: a tiny 360-degree drive along a corridor with random textures, rendered once."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # camera to world: look
 
 @dataclass(frozen=True)
 class Drive:
-    """A folder with `video.mp4`, and the truth."""
+    """A folder with `video.mp4`, and ground truth."""
 
     folder: Path
     camera: Camera
@@ -42,7 +42,7 @@ def paint(seed: int) -> np.ndarray:
 
 
 def film(camera: Camera, truth: Trajectory) -> np.ndarray:
-    """(T, H, W) what the camera sees."""
+    """Grey images (T, H, W) of the camera."""
     rays = pixel_rays(camera.scaled(2)).astype(np.float64)
     walls = [paint(k) for k in range(5)]
     frames = []
@@ -65,7 +65,7 @@ def film(camera: Camera, truth: Trajectory) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def corridor(tmp_path_factory: pytest.TempPathFactory) -> Drive:
-    """20 m in a gentle bend."""
+    """A drive of 20 m in a gentle bend."""
     camera = Camera("equirectangular", 2 * HEIGHT, HEIGHT)
     times = np.arange(0, SECONDS, 1 / FPS)
     heading = 0.15 * np.sin(times)
@@ -83,7 +83,7 @@ def corridor(tmp_path_factory: pytest.TempPathFactory) -> Drive:
 
 @pytest.fixture(scope="session")
 def turn() -> tuple[Trajectory, np.ndarray]:
-    """A path of 16 m that turns by 60 degrees, and what a perspective camera sees of it."""
+    """A path of 16 m that turns by 60 degrees, and images of a perspective camera along it."""
     heading = np.radians(60) * np.clip((np.arange(40) - 5) / 30, 0, 1)
     steps = 0.4 * np.stack([np.cos(heading), 0.15 * np.sin(heading), 0 * heading], axis=1)
     rotations = exp_so3(np.stack([0 * heading, 0 * heading, heading], axis=1)) @ AHEAD

@@ -1,4 +1,4 @@
-"""A lens that isn't known, or not quite: found in what a turn shows, named by EXIF, and never guessed."""
+"""Unknown or inexact intrinsics: calibrated in a turn, read from EXIF, never guessed."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from tests.fakes.slam_drive import LENS, drive, scatter
 from tests.present import present
 
 
-def seen(camera: Camera, turn: float = 0.3) -> TrackLog:
-    """What a camera sees of a turn."""
+def tracks_in_a_turn(camera: Camera, turn: float = 0.3) -> TrackLog:
+    """Feature tracks of a camera in a turn."""
     times, poses = drive(7, turn=turn)
     rng, points = np.random.default_rng(0), scatter(poses, 3000)
     out = TrackLog((camera.width, camera.height))
@@ -38,19 +38,19 @@ def seen(camera: Camera, turn: float = 0.3) -> TrackLog:
 @pytest.mark.slow
 def test_unknown_intrinsics_are_calibrated_in_a_turn() -> None:
     cropped = changed_lens(LENS, np.array([0, 0.15, 0, 0, 0]))
-    known = present(calibrated_from_scratch(seen(cropped)))
+    known = present(calibrated_from_scratch(tracks_in_a_turn(cropped)))
     assert abs(known.camera.fx / LENS.fx - 1) < 0.02
     assert abs(known.camera.cx - cropped.cx) < 10
 
 
 def test_calibration_over_the_whole_drive_suggests_options() -> None:
-    known = present(calibrated(seen(LENS), changed_lens(LENS, np.array([-0.1, 0, 0, 0, 0]))))
+    known = present(calibrated(tracks_in_a_turn(LENS), changed_lens(LENS, np.array([-0.1, 0, 0, 0, 0]))))
     facts = EstimatedCamera.of(known, "self-calibration").metrics()["lens"]
     assert abs(facts["focal"] - LENS.fx) < 3 * facts["focal_sigma"] < 60
     assert facts["options"].startswith(f"--focal {facts['focal']:.2f} --centre ")
 
 
-def pictures(folder: Path, focal: int | None) -> Path:
+def write_images(folder: Path, focal: int | None) -> Path:
     folder.mkdir()
     for k in range(2):
         picture = Image.fromarray(np.random.default_rng(0).integers(0, 255, (120, 160), np.uint8))
@@ -61,14 +61,14 @@ def pictures(folder: Path, focal: int | None) -> Path:
     return folder
 
 
-def test_a_focal_length_is_taken_from_exif(tmp_path: Path) -> None:
-    video = open_video(pictures(tmp_path / "a", focal=28))
+def test_focal_length_is_read_from_exif(tmp_path: Path) -> None:
+    video = open_video(write_images(tmp_path / "a", focal=28))
     own = present(estimated_camera(video, None, lambda: pytest.fail("not needed"), calibrate=False))
     assert own.camera.fx == pytest.approx(28 / np.hypot(36, 24) * 200) and "EXIF" in own.message()
 
 
 @pytest.mark.parametrize("said", [None, LENS])
-def test_straight_ahead_no_lens_is_guessed(tmp_path: Path, said: Camera | None) -> None:
-    video = open_video(pictures(tmp_path / "a", focal=None))
+def test_calibration_without_a_turn_is_an_error(tmp_path: Path, said: Camera | None) -> None:
+    video = open_video(write_images(tmp_path / "a", focal=None))
     with pytest.raises(InputError, match="turns too little"):
-        estimated_camera(video, said, lambda: seen(LENS, turn=0.0).part(0, 25), calibrate=True)
+        estimated_camera(video, said, lambda: tracks_in_a_turn(LENS, turn=0.0).part(0, 25), calibrate=True)

@@ -1,4 +1,4 @@
-"""`scan2sim slam` as a user types it: what it writes, what it says, and bad input."""
+"""Command `scan2sim slam`: written files, output, and errors of invalid input."""
 
 import io
 import json
@@ -32,7 +32,7 @@ from tests.slam.conftest import Drive
 
 
 def command(*arguments: object) -> Result:
-    """Run it; errors are raised."""
+    """Run a command; errors are raised."""
     result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=True)
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
@@ -82,17 +82,17 @@ def test_changed_georeferencing_reuses_cached_tracking(corridor: Drive, tmp_path
     assert "1 of 2 results reused" in said.replace("\n", " ")
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("steps/track/*/*")} == first
     command(*options)
-    assert not (tmp_path / "view.mp4").exists(), "of an earlier run nothing stays"
+    assert not (tmp_path / "view.mp4").exists(), "files of an earlier run remain"
 
 
-def test_the_colmap_model_is_one(done: tuple[Path, str]) -> None:
+def test_colmap_model_has_small_reprojection_errors(done: tuple[Path, str]) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     model = pycolmap.Reconstruction(done[0] / "colmap")
     assert model.num_points3D() > 100
     assert model.compute_mean_reprojection_error() < 1.0
 
 
-def test_evaluate_prints_the_missions_errors(done: tuple[Path, str], corridor: Drive, tmp_path: Path) -> None:
+def test_evaluate_prints_drift_and_local_errors(done: tuple[Path, str], corridor: Drive, tmp_path: Path) -> None:
     trajectory_io.write(tmp_path / "truth.csv", corridor.truth)
     said = command("slam", "evaluate", done[0] / "trajectory.csv", tmp_path / "truth.csv", "--segment", "5").output
     figures = dict(line.split() for line in said.splitlines() if len(line.split()) == 2)
@@ -126,7 +126,7 @@ def test_resumed_run_has_the_same_result(
 
 
 class Trap:
-    """Makes a file when it is unpickled."""
+    """Creates a file when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -136,7 +136,7 @@ class Trap:
 
 
 def damages(path: Path) -> dict[str, bytes]:
-    """A state in all the ways in which it can't be one: by what was done to it."""
+    """Invalid checkpoints, by the kind of damage."""
     whole, trap = path.read_bytes(), path.with_name("trap")
     objects = io.BytesIO()
     np.savez(objects, tree=np.array([Trap(trap)], dtype=object), data=np.zeros(3, np.uint8))
@@ -180,7 +180,7 @@ def test_checkpoint_of_other_code_or_other_input_is_ignored(tmp_path: Path, monk
     (tmp_path / "moved").mkdir()
     assert mark(mask=Path(shutil.copy(mask, tmp_path / "moved"))) == before
     video.write_bytes(b"two")
-    os.utime(video, ns=(times.st_atime_ns, times.st_mtime_ns))  # a copy that keeps times, of the same length
+    os.utime(video, ns=(times.st_atime_ns, times.st_mtime_ns))  # a copy with equal times and size
     assert mark() != before
     video.write_bytes(b"one")
     assert mark() == before != mark(every=2)
@@ -201,7 +201,7 @@ def test_checkpoint_of_other_code_or_other_input_is_ignored(tmp_path: Path, monk
         (lambda p: (p / "g.csv").write_text("a,b\n1,2\n", encoding="utf-8"), ("VIDEO", "--gps", "g.csv"), "g.csv"),
     ],
 )
-def test_bad_input_is_named(
+def test_invalid_input_is_reported(
     corridor: Drive, tmp_path: Path, change: Callable[[Path], object], arguments: tuple[str, ...], text: str
 ) -> None:
     change(tmp_path)

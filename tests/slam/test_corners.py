@@ -1,4 +1,4 @@
-"""Corners on the sphere: seam and poles are no special places."""
+"""Corner tracking on the sphere, including seam and poles."""
 
 from collections.abc import Callable
 
@@ -17,7 +17,7 @@ CAMERA = Camera("equirectangular", 768, 384)
 
 
 def sphere(seed: int = 0) -> Callable[[F64], F32]:
-    """A function of directions with texture everywhere, alike in all of them."""
+    """Texture as a function of direction, with equal statistics in all directions."""
     import cv2
     from scipy.ndimage import map_coordinates
 
@@ -39,11 +39,11 @@ def sphere(seed: int = 0) -> Callable[[F64], F32]:
 
 
 def frame(world: Callable[[F64], F32], R: F64) -> U8:
-    """What an equirectangular camera with rotation R (camera to world) sees."""
+    """Image of an equirectangular camera with rotation R (camera to world)."""
     return world(pixel_rays(CAMERA).astype(np.float64) @ R.T).astype(np.uint8)
 
 
-def test_charts_and_sphere_agree_everywhere() -> None:
+def test_pixels_and_bearings_of_virtual_views_round_trip() -> None:
     views, rng = VirtualViews(CAMERA), np.random.default_rng(0)
     bearing = rng.normal(size=(3000, 3))
     bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
@@ -55,7 +55,7 @@ def test_charts_and_sphere_agree_everywhere() -> None:
 
 
 @pytest.mark.parametrize("axis", [[0, 1, 0], [1, 0, 0], [0, 0, 1]])
-def test_corners_are_followed_across_seam_and_poles(axis: list[int]) -> None:
+def test_corners_are_tracked_across_seam_and_poles(axis: list[int]) -> None:
     world, views = sphere(), VirtualViews(CAMERA)
     tracker = CornerTracker(views, None, 500)
     tracker.track(frame(world, np.eye(3)))
@@ -125,7 +125,7 @@ def test_no_features_on_the_masked_ego_vehicle() -> None:
     assert len(uv) > 100 and uv[:, 1].max() < 302
 
 
-def test_corners_are_shared_out_over_the_sphere() -> None:
+def test_corners_are_evenly_distributed_over_the_sphere() -> None:
     tracker = CornerTracker(VirtualViews(CAMERA), None, 400)
     tracker.track(frame(sphere(), np.eye(3)))
     tracker.refill()
@@ -134,7 +134,7 @@ def test_corners_are_shared_out_over_the_sphere() -> None:
     assert counts.min() > 0.4 * counts.mean()
 
 
-def test_a_relative_pose_is_found_among_outliers() -> None:
+def test_relative_pose_is_estimated_in_spite_of_outliers() -> None:
     rng = np.random.default_rng(0)
     T = rigid(exp_so3([0.02, 0.3, -0.05]), np.array([0.6, 0.0, 0.8]))
     xyz = rng.normal(0, 8, (300, 3))
@@ -148,7 +148,7 @@ def test_a_relative_pose_is_found_among_outliers() -> None:
 
 
 def test_corners_do_not_drift_in_rotating_images() -> None:
-    """Followed from each frame to the next alone, a cap's corners drift by .3 degrees while the car turns by 30."""
+    """Tracked only from frame to frame, corners near a pole drift by .3 degrees while the car turns by 30."""
     world, views = sphere(), VirtualViews(CAMERA)
     tracker = CornerTracker(views, None, 500)
     tracker.track(frame(world, np.eye(3)))

@@ -1,4 +1,4 @@
-"""How sure a trajectory is of itself."""
+"""Covariances of trajectories."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scan2sim.slam.mapping.marginalization import Information, MotionSigma
 from tests.fakes.slam_drive import Follower, drive, inside, position_errors, run, scatter
 
 
-def test_ellipsoids_hold_errors_and_none_is_a_point() -> None:
+def test_confidence_ellipsoids_contain_the_errors_and_are_not_degenerate() -> None:
     held = []
     for seed in range(4):
         times, poses = drive(12, turn=0.05 * (1 + seed))
@@ -23,14 +23,14 @@ def test_ellipsoids_hold_errors_and_none_is_a_point() -> None:
     assert np.degrees(odometry.map.information.noise(0.0)) == pytest.approx(0.03, rel=0.1)
 
 
-def test_a_gap_stays_uncertain_after_it() -> None:
+def test_poses_after_a_gap_stay_uncertain() -> None:
     times, poses = drive(20)
     black = (times >= 10) & (times < 12)
     hidden = Follower(poses, scatter(poses), hide=lambda frame, points: np.full(len(points), black[frame]))
     odometry = run(times, hidden)
     known = np.sqrt(np.trace(covariances(MapCheckpoint.of(odometry, ()), None)[:, :3, :3], axis1=1, axis2=2))
     assert known[-1] > 10 * known[np.flatnonzero(black)[0] - 1]
-    assert all(p.unsure for p in odometry.placed[100:])  # nothing ties what is seen afterwards to what was seen before
+    assert all(p.unsure for p in odometry.placed[100:])  # no constraints across the gap
 
 
 def test_band_inverse_equals_the_dense_inverse() -> None:

@@ -1,4 +1,4 @@
-"""Frames that are missing, and nothing says so: whatever is wrong after them is marked."""
+"""Missing frames with consecutive times: wrong poses after the gap are marked unsure."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def test_wrong_poses_after_missing_frames_are_marked_unsure(
 ) -> None:
     truth, greys = turn
     odometry = Odometry(PERSPECTIVE, OdometryParams())
-    for at, row in enumerate(rows):  # as if they followed each other
+    for at, row in enumerate(rows):  # times as if no frames were missing
         odometry.add(at / 10, greys[row])
     found = np.stack([odometry.pose_of(placed)[:3, 3] for placed in odometry.placed])
     there = truth.positions[rows] - truth.positions[0]
-    second = round(10 * odometry.map.keyframes[1].time)  # the unit of lengths is how far that is
+    second = round(10 * odometry.map.keyframes[1].time)  # its distance is the unit of length
     unit = np.linalg.norm(there[second]) / max(float(np.linalg.norm(found[second])), 1e-9)
     off = np.linalg.norm(unit * found @ odometry_axes(truth).T - there, axis=1)
     unsure = np.array([placed.unsure for placed in odometry.placed])
@@ -33,6 +33,6 @@ def test_wrong_poses_after_missing_frames_are_marked_unsure(
 
 
 def odometry_axes(truth: Trajectory) -> np.ndarray:
-    """(3, 3) of the odometry's world, the first camera's."""
+    """(3, 3) axes of the odometry's world, those of the first camera."""
     assert truth.rotations is not None
     return np.asarray(truth.rotations[0])

@@ -1,4 +1,4 @@
-"""Matching: identities stay, places are right on the whole sphere, seam and poles included."""
+"""Descriptor tracking: persistent ids, accurate bearings on the whole sphere, including seam and poles."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ SPHERE = Camera("equirectangular", 512, 256)
 NUMBER = 400
 
 
-def seen(camera: Camera, R: F64, seed: int = 0) -> U8:
-    """(H, W) what a camera, turned by R (3, 3) to the world, sees of noise that fills the world."""
+def noise_image(camera: Camera, R: F64, seed: int = 0) -> U8:
+    """Grey image (H, W) of a camera with rotation R (3, 3) to the world, which is filled with noise."""
     from scipy.ndimage import map_coordinates
 
     rays = pixel_rays(camera).reshape(-1, 3) @ R.T
@@ -62,8 +62,8 @@ def tracker(
     )
 
 
-def followed(track: DescriptorTracker, frames: list[U8], turns: list[F64]) -> tuple[F64, F64, F64]:
-    """Bearings at first and at last (N, 3) of features still followed, and degrees (N,) that they are wrong by."""
+def tracked_features(track: DescriptorTracker, frames: list[U8], turns: list[F64]) -> tuple[F64, F64, F64]:
+    """First and last bearings (N, 3) of features tracked to the end, and their errors (N,) in degrees."""
     track.track(frames[0])
     track.refill()
     ids, start = track.tracks.ids, track.tracks.bearing
@@ -84,13 +84,13 @@ def test_matching_by_aliked_is_as_good_at_poles_and_seam(real_data: Path) -> Non
 
 
 def check_poles_and_seam(name: str, axes: tuple[tuple[int, int, int], ...], weights: Path | None = None) -> None:
-    """Poles and seam are rotated to where the horizon was: the same number of matches, of the same accuracy."""
+    """Rotate poles and seam to the horizon: the number of matches and their accuracy must be equal."""
     counts, lasts, errors = [], [], []
     for axis in axes:
         base = exp_so3(np.multiply(axis, np.pi / 2))
         turns = [base, base @ exp_so3(np.radians([2.0, 4.0, 1.5]))]
         track = tracker(name, flow_unmatched=False, weights=weights)
-        _, last, error = followed(track, [seen(SPHERE, R) for R in turns], turns)
+        _, last, error = tracked_features(track, [noise_image(SPHERE, R) for R in turns], turns)
         assert np.median(error) < 0.1 and (error < 0.5).mean() > 0.97
         counts.append(len(last))
         lasts.append(last)
@@ -105,11 +105,11 @@ def check_poles_and_seam(name: str, axes: tuple[tuple[int, int, int], ...], weig
 
 @pytest.mark.parametrize(("axis", "step"), [((1.0, 0.0, 0.0), 1.0), ((0.0, 1.0, 0.0), 5.0)])
 def test_tracks_continue_across_seam_and_poles(axis: tuple[float, float, float], step: float) -> None:
-    """What was at the horizon comes into the views of the poles, what was at a pole passes it, or the seam."""
+    """Features move from the horizon into the views of the poles, and across a pole or the seam."""
     turns = [exp_so3(np.radians(step * i) * np.array(axis)) for i in range(6)]
     camera = Camera("equirectangular", 640, 320)
     track = tracker("orb", camera=camera, count=700)
-    first, last, error = followed(track, [seen(camera, R) for R in turns], turns)
+    first, last, error = tracked_features(track, [noise_image(camera, R) for R in turns], turns)
     assert len(first) > 500
     if axis[0]:  # the elevation changes, or the side of a pole
         moved = track.views.view_of(first) != track.views.view_of(last)
@@ -120,7 +120,7 @@ def test_tracks_continue_across_seam_and_poles(axis: tuple[float, float, float],
     assert moved.sum() >= 8 and np.median(error[moved]) < 0.1
 
 
-def test_real_panoramas_have_no_special_places(real_data: Path) -> None:
+def test_matching_of_real_panoramas_is_accurate_at_poles_and_horizon(real_data: Path) -> None:
     import cv2
 
     file = real_data / "pano360" / "R0010118_20180720134544.JPG"
@@ -134,19 +134,19 @@ def test_real_panoramas_have_no_special_places(real_data: Path) -> None:
             uv, _ = project(source, pixel_rays(camera).reshape(-1, 3) @ R.T)
             x, y = uv.reshape(400, 800, 2).transpose(2, 0, 1)
             frames.append(cv2.remap(large, np.ascontiguousarray(x), np.ascontiguousarray(y), 1, borderMode=3))
-        first, _, error = followed(tracker("rootsift", camera=camera, flow_unmatched=False), frames, turns)
+        first, _, error = tracked_features(tracker("rootsift", camera=camera, flow_unmatched=False), frames, turns)
         assert len(first) > 0.3 * NUMBER and np.median(error) < 0.1 and (error < 0.5).mean() > 0.9
 
 
-def test_leaps_that_lucas_kanade_cannot_follow_are_made() -> None:
+def test_displacements_too_large_for_lucas_kanade_are_matched() -> None:
     camera = Camera("pinhole", 480, 320, 400.0, 400.0, 239.5, 159.5)
     turns = [np.eye(3), exp_so3(np.radians([1.0, 12.0, 0.0]))]  # 85 pixels
     track = tracker("rootsift", camera=camera, flow_unmatched=False)
-    first, _, error = followed(track, [seen(camera, R) for R in turns], turns)
+    first, _, error = tracked_features(track, [noise_image(camera, R) for R in turns], turns)
     assert len(first) > 40 and np.median(error) < 0.1 and (error < 0.3).mean() > 0.9
 
 
-def test_wrong_matches_are_not_believed() -> None:
+def test_wrong_matches_are_rejected() -> None:
     class Wrong:
         name = "wrong"
         takes: str | None = None
@@ -161,24 +161,24 @@ def test_wrong_matches_are_not_believed() -> None:
             return "wrong"
 
     turns = [np.eye(3), exp_so3(np.radians([0.0, 1.0, 0.0]))]
-    frames = [seen(SPHERE, R) for R in turns]
+    frames = [noise_image(SPHERE, R) for R in turns]
     track = DescriptorTracker(VirtualViews(SPHERE), None, NUMBER, features.named("orb"), Wrong(), flow_unmatched=False)
-    assert len(followed(track, frames, turns)[0]) < 0.05 * NUMBER
+    assert len(tracked_features(track, frames, turns)[0]) < 0.05 * NUMBER
     track = DescriptorTracker(VirtualViews(SPHERE), None, NUMBER, features.named("orb"), Wrong())
-    first, _, error = followed(track, frames, turns)
+    first, _, error = tracked_features(track, frames, turns)
     assert len(first) > 0.5 * NUMBER and np.median(error) < 0.1
 
 
-def test_the_interface_of_a_tracker_whose_run_is_interrupted(tmp_path: Path) -> None:
+def test_interrupted_tracker_resumes_with_unique_ids(tmp_path: Path) -> None:
     mask = np.full((256, 512), 255, np.uint8)
     mask[180:] = 0
     track = tracker("orb", mask=mask)
-    assert track.track(seen(SPHERE, np.eye(3))) == 0.0 and len(track.tracks) == 0 and len(track.images) == 3
+    assert track.track(noise_image(SPHERE, np.eye(3))) == 0.0 and len(track.tracks) == 0 and len(track.images) == 3
     count = track.refill()
     ids = track.tracks.ids
     assert count == len(ids) == len(np.unique(ids)) > 0.5 * NUMBER and track.refill() < 0.2 * count
     below = np.degrees(np.arcsin(track.tracks.bearing[:, 1]))
-    assert (below < 38).mean() > 0.99, "features on the car"
+    assert (below < 38).mean() > 0.99, "features on the ego vehicle"
     assert np.allclose(np.linalg.norm(track.tracks.bearing, axis=1), 1)
     track.drop(ids[:50])
     assert not np.isin(ids[:50], track.tracks.ids).any()
@@ -187,23 +187,23 @@ def test_the_interface_of_a_tracker_whose_run_is_interrupted(tmp_path: Path) -> 
     load(tmp_path / "state.npz", track, VALUES)
     before = track.tracks
     turn = exp_so3(np.radians([0.0, 3.0, 0.0]))
-    share = track.track(seen(SPHERE, turn), before.bearing @ turn)
+    share = track.track(noise_image(SPHERE, turn), before.bearing @ turn)
     assert share == len(track.tracks) / len(before) > 0.6
     assert np.isin(track.tracks.ids, before.ids).all() and len(np.unique(track.tracks.ids)) == len(track.tracks)
     highest = max(ids.max(), track.tracks.ids.max())
     kept = set(track.tracks.ids.tolist())
     track.refill()
     fresh = set(track.tracks.ids.tolist()) - kept
-    assert fresh and min(fresh) > highest, "a number is never given twice"
-    track.tracks = type(track.tracks)()  # as odometry does when it is lost
+    assert fresh and min(fresh) > highest, "an id was reused"
+    track.tracks = type(track.tracks)()  # as odometry does after tracking loss
     assert track.refill() > 0.5 * NUMBER
     assert track.track(np.full((256, 512), 90, np.uint8)) == 0.0 and len(track.tracks) == 0
     assert track.refill() == 0
-    track.track(seen(SPHERE, turn))
+    track.track(noise_image(SPHERE, turn))
     assert track.refill() > 0.5 * NUMBER
 
 
-def test_a_matcher_made_for_other_features_is_refused() -> None:
+def test_matcher_for_other_features_is_rejected() -> None:
     class Glue:
         name, takes, dimension = "superglue", "superpoint", 256
 
@@ -221,5 +221,5 @@ def test_superpoint_and_superglue_run_together(tmp_path: Path) -> None:
     matcher = matchers.named("superglue", tmp_path / "superglue", device="cpu")
     track = DescriptorTracker(VirtualViews(SPHERE), None, NUMBER, found, matcher)
     turns = [np.eye(3), exp_so3(np.radians([0.0, 1.0, 0.0]))]
-    first, _, error = followed(track, [seen(SPHERE, R) for R in turns], turns)
+    first, _, error = tracked_features(track, [noise_image(SPHERE, R) for R in turns], turns)
     assert len(first) > 20 and np.median(error) < 0.1

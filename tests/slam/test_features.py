@@ -1,4 +1,4 @@
-"""Features, matchers and weights: one contract for all backends, files and folders of weights, bad files."""
+"""Features, matchers and weights: requirements on all backends, files and folders of weights, invalid files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SUPERPOINT: dict[str, weights.Shape] = {f"{layer}.weight": shape for layer, shap
 
 @pytest.fixture(autouse=True)
 def one_thread_and_seed() -> None:
-    """Tests run side by side; threads of torch that wait for each other would only slow them down."""
+    """Tests run in parallel: several torch threads would slow them down by waiting for each other."""
     if not missing(*weights.NEEDS):
         import torch
 
@@ -44,8 +44,8 @@ def one_thread_and_seed() -> None:
         torch.manual_seed(3)
 
 
-def picture(seed: int = 0, height: int = SIZE[0] + 32, width: int = SIZE[1] + 32) -> Any:
-    """(height, width) rectangles of all sizes, as of a street with many signs, a little blurred."""
+def sample_image(seed: int = 0, height: int = SIZE[0] + 32, width: int = SIZE[1] + 32) -> Any:
+    """Image (height, width) of rectangles of all sizes, as of a street with many signs, slightly blurred."""
     import cv2
 
     rng = np.random.default_rng(seed)
@@ -57,7 +57,7 @@ def picture(seed: int = 0, height: int = SIZE[0] + 32, width: int = SIZE[1] + 32
 
 
 def random_weights(shapes: dict[str, weights.Shape], seed: int = 0) -> dict[str, Any]:
-    """Tensors of these shapes, so that numbers neither vanish nor grow."""
+    """Random tensors of these shapes, scaled so that activations neither vanish nor grow."""
     import torch
 
     made = torch.Generator().manual_seed(seed)
@@ -77,7 +77,7 @@ def saved(path: Path, shapes: dict[str, weights.Shape]) -> Path:
 
 
 def with_random_weights(name: str, folder: Path) -> features.Features:
-    """A backend that can run here; networks get random weights, of which no behaviour can be expected."""
+    """A backend that can run here; networks get random weights, so that their results are arbitrary."""
     if missing_packages := plugins.missing(features.__name__, name):
         pytest.skip(f"{name} needs {missing_packages}")
     if name not in PUBLISHED_WEIGHTS:
@@ -100,7 +100,7 @@ def with_published_weights(name: str, real_data: Path) -> features.Features:
 
 def check_keypoints_follow_translation(backend: features.Features) -> None:
     """An image translated by (8, 16) px gives the same keypoints, translated."""
-    large = picture()
+    large = sample_image()
     a = np.ascontiguousarray(large[16 : 16 + SIZE[0], 16 : 16 + SIZE[1]])
     b = np.ascontiguousarray(large[: SIZE[0], 8 : 8 + SIZE[1]])  # right by 8, down by 16
     found, other = backend.detect(a), backend.detect(b)
@@ -118,7 +118,7 @@ def check_mask_and_flat_image(backend: features.Features) -> None:
     """No keypoints where the mask is 0, none on an image of one colour."""
     mask = np.full(SIZE, 255, np.uint8)
     mask[:, 160:] = 0
-    found = backend.detect(picture()[: SIZE[0], : SIZE[1]], mask)
+    found = backend.detect(sample_image()[: SIZE[0], : SIZE[1]], mask)
     assert len(found.uv) > 20 and found.uv[:, 0].max() < 161
     flat = backend.detect(np.full((40, 50), 90, np.uint8))
     assert flat.descriptors.shape == (0, backend.dimension)
@@ -126,10 +126,10 @@ def check_mask_and_flat_image(backend: features.Features) -> None:
 
 
 @pytest.mark.parametrize("name", plugins.names(features.__name__))
-def test_every_backend_keeps_the_contract(name: str, tmp_path: Path) -> None:
+def test_every_backend_meets_the_requirements(name: str, tmp_path: Path) -> None:
     """Shapes, types, bounds, order and determinism hold for any weights."""
     backend = with_random_weights(name, tmp_path)
-    image = np.ascontiguousarray(picture()[: SIZE[0], : SIZE[1]])
+    image = np.ascontiguousarray(sample_image()[: SIZE[0], : SIZE[1]])
     found = backend.detect(image)
     n = len(found.uv)
     assert 0 < n <= 500
@@ -149,27 +149,27 @@ def test_every_backend_keeps_the_contract(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", [n for n in plugins.names(features.__name__) if n not in PUBLISHED_WEIGHTS])
-def test_keypoints_follow_the_image(name: str) -> None:
+def test_keypoints_follow_translation(name: str) -> None:
     check_keypoints_follow_translation(features.named(name, count=500))
 
 
 @pytest.mark.parametrize("name", PUBLISHED_WEIGHTS)
-def test_keypoints_of_networks_follow_the_image(name: str, real_data: Path) -> None:
+def test_keypoints_of_networks_follow_translation(name: str, real_data: Path) -> None:
     check_keypoints_follow_translation(with_published_weights(name, real_data))
 
 
 @pytest.mark.parametrize("name", [n for n in plugins.names(features.__name__) if n not in PUBLISHED_WEIGHTS])
-def test_masks_and_flat_images(name: str) -> None:
+def test_masks_and_flat_images_have_no_keypoints(name: str) -> None:
     check_mask_and_flat_image(features.named(name, count=500))
 
 
 @pytest.mark.parametrize("name", PUBLISHED_WEIGHTS)
-def test_masks_and_flat_images_with_networks(name: str, real_data: Path) -> None:
+def test_networks_find_no_keypoints_in_masks_and_flat_images(name: str, real_data: Path) -> None:
     check_mask_and_flat_image(with_published_weights(name, real_data))
 
 
-def test_enlarging_does_not_move_features() -> None:
-    a = picture()
+def test_upsampling_does_not_shift_features() -> None:
+    a = sample_image()
     found, large = (features.named("rootsift", count=500, upsample=n).detect(a) for n in (1, 2))
     pairs = matchers.named("nearest").match(found, large, (SIZE, SIZE))
     moved = large.uv[pairs[:, 1]] - found.uv[pairs[:, 0]]
@@ -177,19 +177,19 @@ def test_enlarging_does_not_move_features() -> None:
     assert near.sum() > 50 and np.abs(np.median(moved[near], axis=0)).max() < 0.15
 
 
-def test_needless_weights() -> None:
+def test_weights_for_backends_without_a_network_are_rejected() -> None:
     with pytest.raises(SettingError, match="takes no weights"):
         features.named("orb", Path("superpoint_v1.pth"))
     with pytest.raises(SettingError, match="takes no weights"):
         matchers.named("nearest", Path("superglue_outdoor.pth"))
 
 
-def test_aliked_with_real_weights_sees_a_turned_picture(real_data: Path) -> None:
+def test_aliked_with_published_weights_matches_a_rotated_image(real_data: Path) -> None:
     import cv2
 
     pytest.importorskip("torch")
     folder = real_data / "weights" / "aliked"
-    a = picture(1)[: SIZE[0], : SIZE[1]]
+    a = sample_image(1)[: SIZE[0], : SIZE[1]]
     turn = cv2.getRotationMatrix2D((SIZE[1] / 2, SIZE[0] / 2), 25, 1.0)
     turned: Any = cv2.warpAffine(a, turn, SIZE[::-1])
     backend = features.named("aliked", folder / "aliked-n16rot.pth", count=400, device="cpu")
@@ -201,7 +201,7 @@ def test_aliked_with_real_weights_sees_a_turned_picture(real_data: Path) -> None
     assert right.sum() > 80 and right.mean() > 0.9
 
 
-def test_deformed_convolution_is_a_plain_one_without_shifts() -> None:
+def test_deformable_convolution_without_offsets_is_a_plain_one() -> None:
     torch = pytest.importorskip("torch")
     from scan2sim.slam.features.aliked import deformed
 
@@ -209,7 +209,7 @@ def test_deformed_convolution_is_a_plain_one_without_shifts() -> None:
     plain = torch.nn.functional.conv2d(x, kernel, padding=1)
     assert torch.allclose(deformed(x, torch.zeros(1, 18, 9, 13), kernel), plain, atol=1e-4)
     shifts = torch.zeros(1, 18, 9, 13)
-    shifts[:, 1::2] = 1  # all look one pixel further right
+    shifts[:, 1::2] = 1  # all samples one pixel to the right
     assert torch.allclose(deformed(x, shifts, kernel)[..., :-1], plain[..., 1:], atol=1e-4)
 
 
@@ -224,7 +224,7 @@ def test_superpoint_file_and_folder_give_the_same_features(tmp_path: Path) -> No
     network = hf.SuperPointForKeypointDetection(hf.SuperPointConfig(keypoint_threshold=0.5, max_keypoints=3)).eval()
     network.load_state_dict(weights.renamed(random_weights(SUPERPOINT), RENAMES))
     network.save_pretrained(tmp_path / "superpoint")
-    a = picture(2, 99, 128)
+    a = sample_image(2, 99, 128)
     found, same = (
         features.named("superpoint", path, count=10**6, device="cpu").detect(a)
         for path in (file, tmp_path / "superpoint")
@@ -247,7 +247,7 @@ def test_superpoint_file_and_folder_give_the_same_features(tmp_path: Path) -> No
 
 
 def two_views(dimension: int, n: int = 120) -> tuple[FeatureSet, FeatureSet]:
-    """The same features in two pictures of 640 x 480, in another order, a little changed; some only in the first."""
+    """The same features in two images of 640 x 480, in another order, slightly changed; some only in the first."""
     rng = np.random.default_rng(3)
     uv, what = rng.uniform((0, 0), (639, 479), (n, 2)), rng.normal(size=(n, dimension))
     order = rng.permutation(n)[: 3 * n // 4]
@@ -291,7 +291,7 @@ def expected_matches(network: Any, a: FeatureSet, b: FeatureSet, *scores: Any) -
     return np.stack([np.flatnonzero(partner >= 0), partner[partner >= 0]], axis=1)
 
 
-def test_superglue_matches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_superglue_matches_equal_transformers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     torch, hf = pytest.importorskip("torch"), pytest.importorskip("transformers")
     network = hf.SuperGlueForKeypointMatching(hf.SuperGlueConfig(matching_threshold=0.0)).eval()
     for value in network.state_dict().values():
@@ -332,7 +332,9 @@ def published_lightglue(state: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("detector", "dimension"), [("superpoint", 256), ("aliked", 128)])
-def test_lightglue_matches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, detector: str, dimension: int) -> None:
+def test_lightglue_matches_equal_transformers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, detector: str, dimension: int
+) -> None:
     torch, hf = pytest.importorskip("torch"), pytest.importorskip("transformers")
     point = hf.SuperPointConfig(descriptor_decoder_dim=dimension)
     thresholds = {"depth_confidence": -1.0, "width_confidence": -1.0, "filter_threshold": 0.0}
@@ -359,7 +361,7 @@ def test_lightglue_matches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dete
         matchers.check(features.named("orb"), matcher)
 
 
-# bad files
+# invalid files
 
 
 class Bomb:
@@ -400,7 +402,7 @@ def test_weights_of_the_wrong_model_name_both(tmp_path: Path) -> None:
         )
 
 
-def test_weights_of_another_shape_or_unknown(tmp_path: Path) -> None:
+def test_weights_of_another_shape_or_network_are_rejected(tmp_path: Path) -> None:
     torch, _ = pytest.importorskip("torch"), pytest.importorskip("transformers")
     file = tmp_path / "w.pth"
     tensors = random_weights(SUPERPOINT)
@@ -418,7 +420,7 @@ def test_weights_of_another_shape_or_unknown(tmp_path: Path) -> None:
         features.named("superpoint", file)
 
 
-def test_damaged_missing_and_dangerous_files(tmp_path: Path) -> None:
+def test_damaged_missing_and_dangerous_files_are_rejected(tmp_path: Path) -> None:
     torch, _ = pytest.importorskip("torch"), pytest.importorskip("transformers")
     from safetensors.torch import save_file
 
@@ -459,4 +461,4 @@ def test_description_names_the_weights_and_their_licence(tmp_path: Path) -> None
     )
     assert "Magic Leap" in description and "noncommercial" in description
     torch.save({name: value.half() for name, value in random_weights(SUPERPOINT, 1).items()}, file)
-    assert features.named("superpoint", file, device="cpu").detect(picture()).descriptors.dtype == np.float32
+    assert features.named("superpoint", file, device="cpu").detect(sample_image()).descriptors.dtype == np.float32

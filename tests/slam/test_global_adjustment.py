@@ -1,4 +1,4 @@
-"""Whether the global adjustment helps, and which path witnesses keep."""
+"""Global adjustment: kept only if held-out observations fit better."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ pytest.importorskip("pycolmap")
 
 
 @pytest.fixture(scope="module")
-def winding() -> tuple[MapCheckpoint, np.ndarray]:
-    """What a drive of a perspective camera has left, and the truth."""
+def winding_drive() -> tuple[MapCheckpoint, np.ndarray]:
+    """Map checkpoint of a drive with a perspective camera, and true positions."""
     times, poses = drive(6, turn=0.15)
     found = run(times, PerspectiveFollower(poses, scatter(poses, 12000, 1), seed=1), keep=True, parallax=1.0)
     return MapCheckpoint.of(found, []), poses[:, :3, 3]
@@ -30,7 +30,7 @@ def error(mapped: MapCheckpoint, truth: np.ndarray) -> float:
 
 
 def bend(mapped: MapCheckpoint) -> np.ndarray:
-    """The keyframes' poses, along a path that slowly turns."""
+    """Poses of the keyframes with a slowly increasing heading error."""
     poses = mapped.map.poses(list(range(len(mapped.map.keyframes))))
     for k, pose in enumerate(poses):
         pose[:3, :3] = exp_so3([0, 1e-4 * k, 0]) @ pose[:3, :3]
@@ -38,9 +38,9 @@ def bend(mapped: MapCheckpoint) -> np.ndarray:
 
 
 def test_held_out_observations_identify_the_better_path(
-    winding: tuple[MapCheckpoint, np.ndarray],
+    winding_drive: tuple[MapCheckpoint, np.ndarray],
 ) -> None:
-    mapped, _ = winding
+    mapped, _ = winding_drive
     good, bent = mapped.map.poses(list(range(len(mapped.map.keyframes)))), bend(mapped)
     assert (sparse_points(mapped).ids % HELD_OUT_EVERY > 0).all()
     assert (
@@ -50,8 +50,8 @@ def test_held_out_observations_identify_the_better_path(
     assert compare_paths(mapped.map, good, bent).held_out > 20
 
 
-def test_a_path_that_drifted_is_adjusted(winding: tuple[MapCheckpoint, np.ndarray]) -> None:
-    mapped, truth = winding
+def test_drifted_path_is_adjusted(winding_drive: tuple[MapCheckpoint, np.ndarray]) -> None:
+    mapped, truth = winding_drive
     straight = [keyframe.T_world_cam for keyframe in mapped.map.keyframes]
     for keyframe, pose in zip(mapped.map.keyframes, bend(mapped), strict=True):
         keyframe.T_world_cam = pose
@@ -65,9 +65,9 @@ def test_a_path_that_drifted_is_adjusted(winding: tuple[MapCheckpoint, np.ndarra
 
 
 def test_worse_adjustment_is_rejected(
-    winding: tuple[MapCheckpoint, np.ndarray], monkeypatch: pytest.MonkeyPatch
+    winding_drive: tuple[MapCheckpoint, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mapped, _ = winding
+    mapped, _ = winding_drive
     before, points = mapped.map.poses(list(range(len(mapped.map.keyframes)))), sparse_points(mapped)
     wrong = module.Adjusted(points, bend(mapped), points.xyz + 1, 0.2, 0.1)
     monkeypatch.setattr(module, "bundle_adjust", lambda _: wrong)

@@ -29,7 +29,7 @@ def test_wrong_intrinsics_are_detected_in_a_turn(off: tuple[float, ...], said: s
 
 
 def test_focal_length_centre_and_distortion_are_refined_together() -> None:
-    """As of a published calibration: each parameter is a little off, k1 and k2 are missing."""
+    """As with a published calibration: each parameter is slightly wrong, k1 and k2 are missing."""
     off = np.array([0.008, -0.005, 0.004, -0.015, 0.006])
     given = camera = changed_lens(LENS, off)
     for _ in range(2):

@@ -32,18 +32,18 @@ def tracked(frames: Path, out: Path, factor: float, *, fixed_lens: bool = False)
     return track_video({"video": frames}, params, out, silent, out)
 
 
-def test_a_wrong_lens_is_refined_and_reported(frames: Path, tmp_path: Path) -> None:
+def test_wrong_lens_is_refined_and_reported(frames: Path, tmp_path: Path) -> None:
     done = tracked(frames, tmp_path, WRONG)
     assert abs(done.metrics["lens"]["focal"] / PERSPECTIVE.fx - 1) < 0.5 * (WRONG - 1)
     assert any("refinement of the given lens" in text and "--fixed-lens" in text for text in done.warnings)
 
 
-def test_a_fixed_lens_is_kept_with_a_warning(frames: Path, tmp_path: Path) -> None:
+def test_fixed_lens_is_kept_with_a_warning(frames: Path, tmp_path: Path) -> None:
     done = tracked(frames, tmp_path, WRONG, fixed_lens=True)
     assert "lens" not in done.metrics
     assert any("the images fit" in text for text in done.warnings)
 
 
-def test_a_right_lens_is_neither_refined_nor_doubted(frames: Path, tmp_path: Path) -> None:
+def test_correct_lens_is_kept_without_a_warning(frames: Path, tmp_path: Path) -> None:
     done = tracked(frames, tmp_path, 1.0)
     assert "lens" not in done.metrics and not any("the images fit" in text for text in done.warnings)

@@ -1,4 +1,4 @@
-"""Sweeps without a trajectory: matched to each other, with what holds them and what doesn't."""
+"""Lidar odometry: sweeps without a trajectory are matched to each other, with covariances of their poses."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ AHEAD = np.radians(np.linspace(-24, 12, 32))
 
 
 def pose(time: float) -> F64:
-    """(4, 4) of the scanner: on a bend to the left."""
+    """Pose (4, 4) of the scanner on a bend to the left."""
     heading = TURN * time
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("z", heading).as_matrix()
@@ -38,7 +38,7 @@ def pose(time: float) -> F64:
 
 
 def street(origin: F64, ray: F64, *, tunnel: bool) -> F64:
-    """(N,) metres from places (N, 3) to what directions (N, 3) meet: ground and walls, those of a street with piers."""
+    """Ranges (N,) in metres along rays (N, 3) to ground and walls; the walls of a street have piers."""
     with np.errstate(divide="ignore", invalid="ignore"):
         far = [-origin[:, 2] / ray[:, 2]]
         for side in (-7.0, 9.0):
@@ -87,8 +87,8 @@ def write(folder: Path, count: int, **how: Any) -> Path:
     return folder
 
 
-def off(poses: F64, times: F64) -> F64:
-    """(N,) metres from the truth, in the first one's axes."""
+def position_errors(poses: F64, times: F64) -> F64:
+    """Position errors (N,) in metres, in the axes of the first pose."""
     truth = np.stack([pose(t) for t in times])
     return np.linalg.norm(poses[:, :3, 3] - (inverse(truth[0]) @ truth)[:, :3, 3], axis=1)
 
@@ -106,11 +106,11 @@ def matched(sweeps: Path, out: Path, **how: Any) -> MatchedSweeps:
 
 def test_registration_estimates_sweep_poses_and_covariances(sweeps: Path, tmp_path: Path) -> None:
     found = matched(sweeps, tmp_path, deskew="times")
-    assert off(found.poses, found.times).max() < 0.25 and found.sure.all() and found.overlap.min() > 0.6
+    assert position_errors(found.poses, found.times).max() < 0.25 and found.sure.all() and found.overlap.min() > 0.6
     kitti = matched(sweeps, tmp_path / "kitti", deskew="kitti")
     np.testing.assert_allclose(kitti.poses, found.poses, atol=0.03)
     rigid = matched(sweeps, tmp_path / "none")
-    assert off(rigid.poses, rigid.times).max() > off(found.poses, found.times).max()
+    assert position_errors(rigid.poses, rigid.times).max() > position_errors(found.poses, found.times).max()
 
 
 def test_interrupted_run_resumes(sweeps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,11 +134,11 @@ def test_interrupted_run_resumes(sweeps: Path, tmp_path: Path, monkeypatch: pyte
     np.testing.assert_allclose(MatchedSweeps.load(done.files["matched"]).poses, whole.poses, atol=1e-6)
 
 
-def test_along_a_tunnel_nothing_is_sure(tmp_path: Path) -> None:
+def test_poses_along_a_tunnel_are_unsure(tmp_path: Path) -> None:
     found = matched(write(tmp_path / "tunnel", 8, tunnel=True, straight=True), tmp_path, deskew="times")
     assert not found.sure.any() and (worst_sigma(found.covariance) > 0.5).all()
     steps = lidar_motions(found)
-    along = np.sqrt(steps.covariance[:, 0, 0].sum())  # of the whole way
+    along = np.sqrt(steps.covariance[:, 0, 0].sum())  # of the whole path
     assert along > 0.5 * SPEED * found.times[-1]
     across = np.sqrt(found.covariance[:, [1, 2], [1, 2]].max())
     assert across < 0.1
@@ -151,7 +151,7 @@ def test_sweeps_without_a_trajectory_become_a_tile(sweeps: Path, tmp_path: Path)
     tile = read_tile(tmp_path / "tile")
     assert tile.trajectory is not None
     found = trajectory_io.read(tmp_path / "tile-path" / "trajectory.csv")
-    assert off(found.poses, found.times).max() < 0.25 and len(tile.trajectory) == 25
+    assert position_errors(found.poses, found.times).max() < 0.25 and len(tile.trajectory) == 25
     again = CliRunner().invoke(app, f"import sweeps {sweeps} --deskew times --out {tmp_path}/b --voxel 0.2")
     assert again.exit_code == 0 and (tmp_path / "b-path").is_dir()
 
@@ -167,7 +167,7 @@ def test_unmatched_sweeps_are_reported(sweeps: Path, tmp_path: Path) -> None:
     apart = tmp_path / "apart"
     apart.mkdir()
     rng = np.random.default_rng(0)
-    for i in range(4):  # walls of other places, each
+    for i in range(4):  # each sweep from a different place
         xyz = rng.normal(0, 1.0, (2000, 3)) + 30 * np.array([np.cos(2 * i), np.sin(2 * i), 0])
         las.write(apart / f"{i}.laz", PointCloud(Frame(), xyz.astype(np.float32)))
     assert "overlap too little with each other" in run(apart)
@@ -196,10 +196,10 @@ def test_empty_sweep_is_skipped(sweeps: Path, tmp_path: Path) -> None:
             (folder / file.name).symlink_to(file)
     found = matched(folder, tmp_path, deskew="none")
     assert list(found.sure) == [True] * 3 + [False] * 2 + [True] * 2
-    assert off(found.poses, found.times).max() < 0.3
+    assert position_errors(found.poses, found.times).max() < 0.3
 
 
-def test_results_that_are_none_are_refused(tmp_path: Path) -> None:
+def test_invalid_result_file_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "matched.npz").write_bytes(b"nothing")
     with pytest.raises(InputError, match="is no file of matched sweeps"):
         MatchedSweeps.load(tmp_path / "matched.npz")

@@ -1,4 +1,4 @@
-"""The pose graph and what thumbnails are worth."""
+"""Loop closures in the pose graph, and place recognition by thumbnails."""
 
 import itertools
 

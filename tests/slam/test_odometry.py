@@ -1,4 +1,4 @@
-"""Frames to poses: on drives whose truth is known, and what goes wrong on the road."""
+"""Visual odometry on simulated drives: accuracy, GPS, tracking loss, moving objects."""
 
 import numpy as np
 import numpy.typing as npt
@@ -19,13 +19,13 @@ def positions(odometry: Odometry) -> F64:
 
 
 def error(found: F64, poses: F64, which: slice | npt.NDArray[np.bool_] = slice(None)) -> float:
-    """Root mean square metres after a similarity."""
+    """Root mean square error in metres after alignment by a similarity."""
     truth = poses[which, :3, 3]
     off = umeyama(found[which], truth, scaled=True).apply(found[which]) - truth
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
-def test_a_drive_is_found_up_to_scale_and_a_standing_car_stands() -> None:
+def test_path_is_accurate_up_to_scale_and_constant_while_standing() -> None:
     times, poses = drive(20)
     odometry = run(times, Follower(poses, scatter(poses)))
     found = positions(odometry)
@@ -47,7 +47,7 @@ def test_trajectory_starts_where_the_car_stood_before_driving(corridor: Drive) -
     assert off.max() < 0.1  # of 21 m
 
 
-def test_light_that_flickers_or_falls_costs_at_most_a_fifth(corridor: Drive) -> None:
+def test_brightness_changes_increase_the_error_by_at_most_a_fifth(corridor: Drive) -> None:
     every = np.ones(len(corridor.greys))
     flickers, falls = every.copy(), every.copy()
     flickers[2::2], falls[10:] = 0.45, 0.35
@@ -67,7 +67,7 @@ def test_odometry_works_with_a_perspective_camera() -> None:
     assert error(positions(odometry), poses) < 0.6
 
 
-def test_gps_ties_the_scale_and_places_the_path() -> None:
+def test_gps_determines_scale_and_position_of_the_path() -> None:
     times, poses = drive(30)
     gps = gps_of(times, poses, sigma=0.5)
     trajectory, _ = aligned_trajectory(MapCheckpoint.of(run(times, Follower(poses, scatter(poses)), gps=gps), ()), gps)
@@ -79,7 +79,7 @@ def test_gps_ties_the_scale_and_places_the_path() -> None:
     assert (up < -0.99).all()
 
 
-def test_adjacent_gps_distances_work_too() -> None:
+def test_path_is_accurate_with_adjacent_gps_distances() -> None:
     times, poses = drive(15)
     gps = gps_of(times, poses, sigma=0.3)
     odometry = run(times, Follower(poses, scatter(poses)), gps=gps, gps_distances="adjacent")
@@ -119,7 +119,7 @@ def test_gps_rejects_poses_that_follow_a_bus_covering_the_view() -> None:
     carried = 0.95 * (poses[:, :3, 3] - poses[times >= 10][0, :3, 3]) * covered[:, None]
 
     class Beside(Follower):
-        """For four seconds, all that is seen drives along, a little slower than the car: a bus that is overtaken."""
+        """For four seconds, all visible points move slightly slower than the car: a bus that is overtaken."""
 
         def _seen(self, points: F64) -> tuple[F64, npt.NDArray[np.bool_]]:
             return super()._seen(points + carried[self._frame])
@@ -133,10 +133,10 @@ def test_gps_rejects_poses_that_follow_a_bus_covering_the_view() -> None:
     assert loss.frame == round(10 * loss.time) and present(loss.resumed) > loss.time
     unsure = present(trajectory.unsure)
     assert unsure[(times >= 12) & (times < 14)].all() and not unsure[-1]
-    assert off.max() < 20  # of the 36 m that weren't seen
+    assert off.max() < 20  # of the 36 m without a view
 
 
-def test_moving_cars_are_left_out() -> None:
+def test_path_is_accurate_in_spite_of_moving_cars() -> None:
     times, poses = drive(15)
     rng, still = np.random.default_rng(3), scatter(poses)
     kinds = {tuple(p): i for i, p in enumerate(still)}

@@ -91,7 +91,7 @@ def test_images_are_tracked_once(
     assert done.metrics["frames"] == len(turn[1]) and done.metrics["losses"] == []
 
 
-def test_the_path_is_as_good_as_that_of_tracking_again(
+def test_replayed_path_is_as_accurate_as_tracking_again(
     frames: Path, turn: tuple[Trajectory, np.ndarray], whole: tuple[Path, Done], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
@@ -149,7 +149,7 @@ def test_the_video_of_the_tracks_shows_the_replay(
     assert np.allclose(positions(tmp_path), positions(whole[0]), atol=1e-9)
 
 
-def test_a_drive_that_the_replay_loses_is_tracked_again(
+def test_drive_is_tracked_again_if_the_replay_is_lost(
     frames: Path, turn: tuple[Trajectory, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     track = Replay.track
@@ -178,7 +178,7 @@ def test_a_damaged_log_is_not_replayed(frames: Path, whole: tuple[Path, Done], t
     assert TrackLog.read(copy) is None
 
 
-def test_a_long_log_stays_in_its_file(tmp_path: Path) -> None:
+def test_long_log_is_not_loaded_into_memory(tmp_path: Path) -> None:
     count, length = 500, 4000
     recorder = RecordingTracker(Moving(count), PERSPECTIVE, tmp_path / "tracks.bin")
     tracemalloc.start()

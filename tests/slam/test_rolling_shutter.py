@@ -1,4 +1,4 @@
-"""Rolling shutter and lens offset: estimated from bearings alone, against the truth, and what they cost unestimated."""
+"""Rolling shutter and lens offset: estimated from bearings alone, and the accuracy with and without estimation."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ READOUT, OFFSET = 0.03, 0.04
 """Seconds from the first row to the last; metres from the camera's place to either lens."""
 
 
-class Real(Follower):
-    """Sees each point from the lens that looks its way, at the moment when its row is read."""
+class RollingShutterFollower(Follower):
+    """Sees each point through the lens that faces it, at the time when its row is read."""
 
     def __init__(self, poses: F64, readout: float, offset: float, **more: Any) -> None:
         super().__init__(poses, scatter(poses, 8000), **more)
@@ -29,7 +29,7 @@ class Real(Follower):
         turning = log_so3(poses[i, :3, :3].T @ poses[i + 1, :3, :3]) / 0.1
         ideal, seen = super()._seen(points)
         noise, bearing = ideal - _unit((points - poses[self._frame, :3, 3]) @ R), ideal
-        for _ in range(2):  # in which row, by which lens: where it is seen says where it is seen from
+        for _ in range(2):  # row and lens depend on the image position: iterate
             late = (np.arcsin(np.clip(bearing[:, 1:2], -1, 1)) / np.pi) * self.readout
             local = (points - poses[self._frame, :3, 3] - late * rate) @ R
             local = local - late * np.cross(turning, local)
@@ -43,10 +43,14 @@ def _unit(vectors: F64) -> F64:
 
 
 @pytest.mark.parametrize(("readout", "offset"), [(READOUT, OFFSET), (0.0, 0.0)])
-def test_both_are_estimated(readout: float, offset: float) -> None:
+def test_readout_time_and_lens_offset_are_estimated(readout: float, offset: float) -> None:
     times, poses = drive(12, speed=12, turn=0.1)
     odometry = run(
-        times, Real(poses, readout, offset), gps=gps_of(times, poses), rolling_shutter=True, lens_offset=True
+        times,
+        RollingShutterFollower(poses, readout, offset),
+        gps=gps_of(times, poses),
+        rolling_shutter=True,
+        lens_offset=True,
     )
     assert odometry.map.names == ("readout", "lens_offset")
     assert odometry.map.shared[0] == pytest.approx(readout, abs=0.001)
@@ -57,7 +61,7 @@ def test_estimating_rolling_shutter_does_not_reduce_accuracy() -> None:
     times, poses = drive(12, speed=12, turn=0.1)
 
     def error(**wanted: Any) -> float:
-        odometry = run(times, Real(poses, READOUT, OFFSET), gps=gps_of(times, poses), **wanted)
+        odometry = run(times, RollingShutterFollower(poses, READOUT, OFFSET), gps=gps_of(times, poses), **wanted)
         return ate(np.stack([odometry.pose_of(p)[:3, 3] for p in odometry.placed]), poses[:, :3, 3])
 
     alone, both = error(), error(rolling_shutter=True, lens_offset=True)

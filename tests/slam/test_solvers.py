@@ -1,4 +1,4 @@
-"""The graph's solvers against a slow reference, each other, and constraints of a user's own."""
+"""Solvers of the graph compared with a slow reference and each other; custom constraints."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from scan2sim.slam.solvers import lm
 
 
 def street(cameras: int = 8, points: int = 120, noise: float = 5e-4, seed: int = 0) -> tuple[F64, Graph]:
-    """Poses, and a graph that starts off them."""
+    """True poses, and a graph with wrong initial values."""
     rng = np.random.default_rng(seed)
     poses = np.tile(np.eye(4), (cameras, 1, 1))
     poses[:, 2, 3] = 2.5 * np.arange(cameras)
@@ -38,7 +38,7 @@ def positions(solved: Solution) -> F64:
     return solved.poses[:, :3, 3]
 
 
-def test_levenberg_marquardt_ends_where_a_general_solver_does() -> None:
+def test_levenberg_marquardt_reaches_the_minimum_of_a_general_solver() -> None:
     from scipy.optimize import minimize
 
     _, graph = street(4, 12)
@@ -63,7 +63,7 @@ def test_levenberg_marquardt_ends_where_a_general_solver_does() -> None:
 
 
 @pytest.mark.parametrize("name", names(solvers.__name__))
-def test_every_backend_finds_the_cameras(name: str) -> None:
+def test_every_backend_estimates_the_poses(name: str) -> None:
     if name == "adam":
         pytest.importorskip("torch")
     poses, graph = street()
@@ -76,7 +76,7 @@ def test_every_backend_finds_the_cameras(name: str) -> None:
 
 @pytest.mark.parametrize("name", names(solvers.__name__))
 def test_custom_constraint_can_be_added(name: str) -> None:
-    """Wheel odometry: the second camera is where the wheels say, in the first's axes."""
+    """Wheel odometry measures the position of the second camera in the axes of the first."""
     if name == "adam":
         pytest.importorskip("torch")
     _, graph = street(noise=0.0)
@@ -85,11 +85,11 @@ def test_custom_constraint_can_be_added(name: str) -> None:
     solved = solvers.named(name).solve(graph, iterations=600 if name == "adam" else 30)
     step = solved.poses[0, :3, :3].T @ (solved.poses[1, :3, 3] - solved.poses[0, :3, 3])
     assert np.abs(step - [0, 0, 3.0]).max() < 0.02
-    if name == "lm":  # the whole path follows: 3 / 2.5 of what it was
+    if name == "lm":  # scales the whole path by 3 / 2.5
         assert np.linalg.norm(positions(solved)[-1]) == pytest.approx(7 * 3.0, rel=0.02)
 
 
-def test_outliers_and_points_behind_the_camera_dont_pull() -> None:
+def test_solver_is_robust_to_outliers_and_points_behind_the_camera() -> None:
     poses, graph = street()
     bearing = graph.bearing.copy()
     wrong = np.random.default_rng(1).random(len(bearing)) < 0.15
@@ -107,8 +107,8 @@ def test_distance_constraint_sets_the_scale() -> None:
     assert np.linalg.norm(positions(solved)[-1]) == pytest.approx(1.2 * length, rel=1e-3)
 
 
-def test_the_gradient_is_half_the_costs_slope() -> None:
-    """Of everything that a graph may hold, with no end of a chord or factor fixed."""
+def test_gradient_is_half_the_numerical_derivative_of_the_cost() -> None:
+    """For all kinds of constraints, between poses that are not fixed."""
     _, graph = street(5, 20)
     rng = np.random.default_rng(4)
     wheels = Factor((3, 1), lambda a, b, m: (a[:3, :3].T @ (b[:3, 3] - a[:3, 3]) - m) / 0.5, np.array([1.0, 0, -4]))
@@ -144,6 +144,6 @@ def test_covariances_match_the_scatter_of_poses() -> None:
             positions(lm.solve(replace(graph, bearing=bearing, sigma=1.0), iterations=30))[2:] - poses[2:, :3, 3]
         )
     solved = lm.solve(graph, iterations=30)
-    known = lm.information(replace(graph, poses=solved.poses, points=solved.points))[12:, 12:]  # two are held
+    known = lm.information(replace(graph, poses=solved.poses, points=solved.points))[12:, 12:]  # two are fixed
     sigma = np.radians(0.1) * np.sqrt(np.diag(np.linalg.inv(known)).reshape(3, 6)[:, :3])
     assert np.allclose(np.std(found, axis=0) / sigma, 1, atol=0.5)

@@ -1,4 +1,4 @@
-"""The study of compression, on a tiny corridor: cells, resuming, and what is N/A."""
+"""Compression study on a tiny corridor: cells, resuming, N/A."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tests.slam.conftest import Drive
 
 @pytest.fixture
 def drive(corridor: Drive, tmp_path: Path) -> Path:
-    """A drive's folder, as users have it: video, truth, and GPS by which the scale is tied."""
+    """Folder of a drive, as users have it: video, ground truth, and GPS for the scale."""
     folder = tmp_path / "drive"
     folder.mkdir()
     shutil.copy(corridor.folder / "video.mp4", folder)
@@ -42,7 +42,7 @@ def drive(corridor: Drive, tmp_path: Path) -> Path:
 
 
 def studied(drive: Path, out: Path, *arguments: object) -> str:
-    """Run it; errors are raised."""
+    """Run the study; errors are raised."""
     words = ["slam", "study", drive, "--out", out, *arguments]
     result = CliRunner().invoke(app, [str(word) for word in words])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
@@ -54,7 +54,7 @@ def rows_of(out: Path) -> dict[tuple[str, str], dict[str, str]]:
     return {(row["height"], row["bitrate_mbit_s"]): row for row in csv.DictReader((out / "table.csv").open())}
 
 
-def test_cells_are_measured_kept_and_not_run_again(corridor: Drive, drive: Path, tmp_path: Path) -> None:
+def test_cells_are_measured_and_cached(corridor: Drive, drive: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = ("--heights", "128,256", "--bitrates", "1,0.1", "--rates", "10", "--jobs", 2)
     said = studied(drive, out, *options)
@@ -174,7 +174,7 @@ def test_a_lower_rate_drops_frames_and_keeps_their_times(corridor: Drive, tmp_pa
 @pytest.mark.parametrize(
     ("fps", "rate", "kept"), [(29.97, 30.0, 60), (29.97, 15.0, 30), (25.0, 15.0, 36), (60.0, 15.0, 15)]
 )
-def test_frames_are_chosen_evenly(tmp_path: Path, fps: float, rate: float, kept: int) -> None:
+def test_frames_are_sampled_evenly(tmp_path: Path, fps: float, rate: float, kept: int) -> None:
     frames = tmp_path / "frames"
     frames.mkdir()
     for i in range(60):

@@ -1,4 +1,4 @@
-"""The video of what is tracked: what it shows, and that it is there whatever happens."""
+"""Video of tracked features: content, layout, interrupted recordings."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from tests.present import present
 from tests.slam.conftest import FPS, Drive
 
 
-def near(picture: np.ndarray, colour: tuple[int, int, int] | np.ndarray) -> int:
-    """How many pixels (BGR) are about of a colour."""
+def count_pixels(picture: np.ndarray, colour: tuple[int, int, int] | np.ndarray) -> int:
+    """Number of pixels (BGR) with approximately a colour."""
     return int((np.abs(picture.astype(int) - np.asarray(colour)).max(axis=-1) < 30).sum())
 
 
@@ -29,7 +29,7 @@ def frames_of(file: Path) -> list[np.ndarray]:
         return [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
 
 
-def test_a_drive_is_recorded(corridor: Drive, tmp_path: Path) -> None:
+def test_video_shows_features_and_path(corridor: Drive, tmp_path: Path) -> None:
     file, parts = tmp_path / "sub" / "view.mp4", []
     with Recorder(file, FPS) as recorder:
 
@@ -49,8 +49,8 @@ def test_a_drive_is_recorded(corridor: Drive, tmp_path: Path) -> None:
     height, width = shown[-1].shape[:2]
     assert width <= MAX_WIDTH_PX and height % 2 == 0 and width % 2 == 0
     frame, ground = shown[-1][: width // 2], shown[-1][width // 2 :]
-    assert near(frame, INLIER_BGR) > 100 and near(frame, (0, 230, 250)) > 30
-    assert near(ground, PATH_BGR) > 100 and near(ground, UNSURE_BGR) == 0
+    assert count_pixels(frame, INLIER_BGR) > 100 and count_pixels(frame, (0, 230, 250)) > 30
+    assert count_pixels(ground, PATH_BGR) > 100 and count_pixels(ground, UNSURE_BGR) == 0
     grey = shown[0][: width // 2].mean(axis=-1)[60:]
     assert (
         np.corrcoef(grey[::16, ::16].ravel(), enlarged(corridor.greys[0], width)[60:][::16, ::16].ravel())[0, 1] > 0.8
@@ -65,7 +65,7 @@ def enlarged(grey: np.ndarray, width: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def lost() -> tuple[Odometry, list[np.ndarray]]:
-    """A drive that was black for a while: odometry, and the pictures of a recorder at each second frame."""
+    """A drive with black frames: odometry, and images of the recorder at every second frame."""
     times, poses = drive(12)
 
     def black(frame: int, points: np.ndarray) -> np.ndarray:
@@ -82,26 +82,26 @@ def lost() -> tuple[Odometry, list[np.ndarray]]:
     return odometry, pictures
 
 
-def test_being_lost_is_shown_and_stays_on_the_map_in_red(lost: tuple[Odometry, list[np.ndarray]]) -> None:
+def test_tracking_loss_is_shown_over_the_frame_and_in_red_on_the_map(lost: tuple[Odometry, list[np.ndarray]]) -> None:
     _, pictures = lost
     top = pictures[0].shape[1] // 2
-    assert near(pictures[30][:top], UNSURE_BGR) == 0 and near(pictures[30][top:], UNSURE_BGR) == 0
-    assert near(pictures[38][:top], UNSURE_BGR) > 50  # it says so, over the frame
-    assert near(pictures[-1][:top], UNSURE_BGR) == 0 and near(pictures[-1][top:], UNSURE_BGR) > 20
+    assert count_pixels(pictures[30][:top], UNSURE_BGR) == 0 and count_pixels(pictures[30][top:], UNSURE_BGR) == 0
+    assert count_pixels(pictures[38][:top], UNSURE_BGR) > 50  # message over the frame
+    assert count_pixels(pictures[-1][:top], UNSURE_BGR) == 0 and count_pixels(pictures[-1][top:], UNSURE_BGR) > 20
 
 
 def test_recording_can_start_at_any_frame(lost: tuple[Odometry, list[np.ndarray]]) -> None:
     odometry, pictures = lost
     late = Recorder(Path("nowhere.mp4"), 10.0).draw(odometry, np.zeros((4, 8), np.uint8))
     top = late.shape[1] // 2
-    assert near(late[top:], PATH_BGR) > 0.8 * near(pictures[-1][top:], PATH_BGR)
-    assert near(late[top:], UNSURE_BGR) > 0.8 * near(pictures[-1][top:], UNSURE_BGR)
+    assert count_pixels(late[top:], PATH_BGR) > 0.8 * count_pixels(pictures[-1][top:], PATH_BGR)
+    assert count_pixels(late[top:], UNSURE_BGR) > 0.8 * count_pixels(pictures[-1][top:], UNSURE_BGR)
 
 
 @pytest.mark.parametrize(
     ("size", "beside"), [((640, 480), True), ((480, 640), True), ((1242, 375), False), ((1920, 1080), False)]
 )
-def test_the_layout_suits_the_frame(size: tuple[int, int], beside: bool) -> None:
+def test_layout_depends_on_the_aspect_ratio_of_the_frame(size: tuple[int, int], beside: bool) -> None:
     camera = Camera("pinhole", *size, 500.0, 500.0, size[0] / 2, size[1] / 2)
     odometry = Odometry(camera, OdometryParams())
     grey = np.random.default_rng(0).integers(0, 255, (size[1], size[0]), np.uint8)
@@ -116,7 +116,7 @@ def test_an_interrupted_recording_can_be_played(corridor: Drive, tmp_path: Path)
     odometry = Odometry(corridor.camera, OdometryParams())
     recorder = Recorder(tmp_path / "view.mp4", 5.0)
     odometry.add(0.0, corridor.greys[0])
-    for _ in range(70):  # some fragments long
+    for _ in range(70):  # several fragments
         recorder(odometry, corridor.greys[0])
     assert len(frames_of(tmp_path / "view.part.mp4")) > 30
     recorder.close()
@@ -124,6 +124,6 @@ def test_an_interrupted_recording_can_be_played(corridor: Drive, tmp_path: Path)
     assert len(frames_of(tmp_path / "view.mp4")) == 70
 
 
-def test_closing_what_never_began_leaves_nothing(tmp_path: Path) -> None:
+def test_closing_an_unused_recorder_leaves_no_files(tmp_path: Path) -> None:
     Recorder(tmp_path / "view.mp4", 10.0).close()
     assert not list(tmp_path.iterdir())

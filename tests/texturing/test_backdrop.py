@@ -59,7 +59,7 @@ class Drive:
 
     @cached_property
     def views(self) -> list[View]:
-        """Photos, each a metre after the last; with their classes."""
+        """Photos one metre apart, with their classes."""
         (self.folder / "labels").mkdir()
         found = []
         for i in range(self.number):
@@ -68,7 +68,7 @@ class Drive:
             rgb, labels = street.rgb.copy(), np.zeros((*street.hit.shape, len(PHOTO_CLASSES)), np.uint8)
             labels[..., PHOTO_CLASSES.index("building")] = 255 * street.hit
             labels[..., PHOTO_CLASSES.index("sky")] = 255 * ~street.hit
-            if self.vehicle:  # drives ahead, always at the same place in the image
+            if self.vehicle:  # vehicle ahead, at a constant position in the image
                 rgb[75:94, 172:195] = (250, 10, 10)
                 labels[75:94, 172:195] = 0
                 labels[75:94, 172:195, PHOTO_CLASSES.index("vehicle")] = 255
@@ -116,7 +116,7 @@ def frame_psnr(bodies: list[Body], camera: Camera, pose: F64, photo: U8) -> floa
     return psnr(float(((shown.astype(float) - photo) ** 2).mean()))
 
 
-def test_whole_frame_of_a_held_out_photo_gains(drive: Drive) -> None:
+def test_backdrop_improves_the_whole_frame_of_a_held_out_photo(drive: Drive) -> None:
     view = drive.views[HELD_OUT]
     photo = image.read_rgb(view.photo)
     without = frame_psnr(SCANNED, view.camera, view.T_world_cam, photo)
@@ -140,7 +140,7 @@ def test_depth_of_facades_within_ten_percent(drive: Drive) -> None:
         assert np.median(error) < 0.07 and np.mean(error < 0.1) > 0.6
 
 
-def test_layers_dont_hide_surfaces_nor_the_sky(drive: Drive) -> None:
+def test_layers_hide_neither_surfaces_nor_the_sky(drive: Drive) -> None:
     for i in (0, HELD_OUT, NUMBER - 1):
         view = drive.views[i]
         layers = Renderer([Body(drive.layers())]).view(view.camera, view.T_world_cam)
@@ -185,7 +185,7 @@ def test_moving_vehicles_are_left_out(tmp_path: Path) -> None:
     assert np.mean((rgb[..., 0] > 220) & (rgb[..., 1] < 60)) < 0.0005
 
 
-def test_in_a_survey_layers_end_at_the_cell_and_the_dome_is_left_to_the_surveys_world(
+def test_layers_of_a_survey_tile_end_at_its_cell_without_a_dome(
     drive: Drive, tmp_path: Path
 ) -> None:  # fmt: skip
     cell = TileCell(name="a", seed=(0.0, 0.0), neighbours={"b": (40.0, 0.0)})

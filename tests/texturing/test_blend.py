@@ -86,6 +86,6 @@ def test_accumulate_equals_reference_implementation(name: str, band: int) -> Non
         texels = reference_blend.accumulate(reference, page_faces, faces, share, source, settings, camera)
         assert blend_numba.accumulate(kernel, page_faces, faces, share, *source, settings) == len(texels)
         seen += len(texels)
-    assert 0.1 < seen / (2 * (page_faces.owner >= 0).sum()) < 0.6  # many are seen, many are not
+    assert 0.1 < seen / (2 * (page_faces.owner >= 0).sum()) < 0.6  # many texels are seen, many are not
     for actual, expected in zip(kernel, reference, strict=True):
         np.testing.assert_allclose(actual, expected, rtol=1e-3, atol=1e-6 * np.abs(expected).max())

@@ -58,7 +58,7 @@ def test_torch_blends_equally(name: str, band: int) -> None:
     assert abs(pages[0] - pages[1]).max() <= 1
 
 
-def test_unavailable_device_is_named(street: Street) -> None:
+def test_unavailable_device_is_reported(street: Street) -> None:
     street.add(CAMERAS["pinhole"], POSES[0])
     with pytest.raises(SettingError, match="xpu:7"):
         street.run(device="xpu:7")

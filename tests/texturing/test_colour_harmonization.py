@@ -172,7 +172,7 @@ def test_colour_step_between_two_tiles_disappears(pair: tuple[Path, Path]) -> No
     assert facts["neighbours"]["two"]["border_m"] == facts["border_m"]
 
 
-def test_texels_beyond_reach_are_unchanged(pair: tuple[Path, Path]) -> None:
+def test_texels_beyond_the_fade_distance_are_unchanged(pair: tuple[Path, Path]) -> None:
     one, two = pair
     harmonized, _ = run(one, [two], fade_distance=1.5)
     added, points = change(one, harmonized)
@@ -261,7 +261,7 @@ def test_results_are_byte_identical_when_repeated(pair: tuple[Path, Path]) -> No
     assert same_bytes(run(pair[0], [pair[1]])[0], run(pair[0], [pair[1]])[0])
 
 
-def test_without_neighbours_nothing_changes(pair: tuple[Path, Path], tmp_path: Path) -> None:
+def test_tile_without_neighbours_is_unchanged(pair: tuple[Path, Path], tmp_path: Path) -> None:
     one, _ = pair
     empty, far = tmp_path / "empty", tile(tmp_path / "far", flat(50, 52, 0, 2), paint)
     empty.mkdir()
@@ -279,7 +279,7 @@ def test_inputs_are_not_modified(pair: tuple[Path, Path]) -> None:
     assert all(path.read_bytes() == content for path, content in before.items())
 
 
-def test_unreadable_page_of_a_neighbour_is_named(pair: tuple[Path, Path]) -> None:
+def test_unreadable_page_of_a_neighbour_is_reported(pair: tuple[Path, Path]) -> None:
     (pair[1] / "page_0.png").write_bytes(b"broken")
     with pytest.raises(InputError, match=r"two/page_0\.png"):
         run(pair[0], [pair[1]])

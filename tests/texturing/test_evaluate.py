@@ -89,7 +89,7 @@ def test_parts_of_one_photo_add_up_to_its_scores(photo: U8) -> None:
     )
 
 
-def test_bands_are_named_by_their_metres() -> None:
+def test_distance_bands_are_named_by_their_metres() -> None:
     names = [BAND_NAMES[i] for i in np.digitize([4.99, 5.0, 39.0, 41.0], BAND_EDGES_M)]
     assert names == ["0-5 m", "5-10 m", "20-40 m", "40+ m"]
 

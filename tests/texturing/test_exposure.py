@@ -73,7 +73,7 @@ def test_mean_brightness_is_unchanged(exposed_street: Street, tmp_path: Path) ->
     assert abs(stops_of(found, exposed_street).mean()) < 0.05
 
 
-def test_own_exposures_are_kept_as_far_as_wanted(exposed_street: Street, tmp_path: Path) -> None:
+def test_own_exposures_are_kept_to_the_given_share(exposed_street: Street, tmp_path: Path) -> None:
     shares = (0.0, 0.3, 10.0)
     found = [solved(exposed_street, tmp_path / str(share), own_exposure=share)[0] for share in shares]
     spread = [np.ptp(stops_of(one, exposed_street).mean(axis=1)) for one in found]
@@ -127,13 +127,13 @@ def test_equal_photos_are_unchanged(street: Street, tmp_path: Path) -> None:
     assert np.abs(stops_of(found, street)).max() < 0.02 and not found.vignetting
 
 
-def test_nothing_changes_if_disabled_or_with_one_photo(exposed_street: Street, tmp_path: Path) -> None:
+def test_exposures_are_unchanged_if_disabled_or_with_one_photo(exposed_street: Street, tmp_path: Path) -> None:
     assert not solved(exposed_street, tmp_path / "x", solve=False)[0].gain
     exposed_street.views = exposed_street.views[:1]
     assert not solved(exposed_street, tmp_path / "y")[0].gain
 
 
-def test_invalid_exposure_file_is_rejected_and_named(tmp_path: Path) -> None:
+def test_invalid_exposure_file_is_rejected_with_its_name(tmp_path: Path) -> None:
     (tmp_path / "prior.json").write_text('{"gain": {"a": [1, 1]}}', encoding="utf-8")
     with pytest.raises(InputError, match=r"prior\.json"):
         Exposures.load(tmp_path / "prior.json")

@@ -141,7 +141,7 @@ def test_inner_borders_of_merged_tiles_are_simplified(strip: Scene) -> None:
     assert inner.sum() < 40  # of 81
 
 
-def test_coarser_levels_look_as_the_finest(strip: Scene) -> None:
+def test_coarser_levels_look_like_the_finest(strip: Scene) -> None:
     images = []
     for level in [one for one in levels(strip) if covered(one) == {"tile1"}]:
         scene = renderer.Renderer([renderer.textured(level.tile.folder / "terrain")])

@@ -37,7 +37,7 @@ def test_values_are_those_of_pytorch_msssim(changed: U8, expected: float) -> Non
     assert ms_ssim(photo(), changed) == pytest.approx(expected, abs=1e-5)
 
 
-def test_constant_images_differ_by_the_luminance_term_alone() -> None:
+def test_constant_images_differ_only_by_the_luminance_term() -> None:
     a, b = (np.full((192, 192, 3), level, np.uint8) for level in (100, 150))
     c1 = (0.01 * 255) ** 2
     luminance = (2 * 100 * 150 + c1) / (100**2 + 150**2 + c1)

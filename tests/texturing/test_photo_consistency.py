@@ -59,8 +59,8 @@ def test_passing_car_is_masked_as_ghost(street: Street) -> None:
     assert magenta(agreement={"ghosts": False})[0] > 50
 
 
-def test_traffic_sign_is_no_ghost(street: Street, tmp_path: Path) -> None:
-    """A panel that the nearest photo shows, and others elsewhere, because it isn't quite where the surface is."""
+def test_traffic_sign_is_not_a_ghost(street: Street, tmp_path: Path) -> None:
+    """A panel slightly off the surface, which only the nearest photo shows at the correct position."""
     for i, pose in enumerate(POSES):
         image = photograph(CAMERA, pose)
         if i == 2:
@@ -80,7 +80,7 @@ def test_traffic_sign_is_no_ghost(street: Street, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("turn, shift", [(0.5, 0.0), (0.0, 0.2)])
-def test_photo_with_wrong_pose_is_excluded_and_named(street: Street, turn: float, shift: float) -> None:
+def test_photo_with_wrong_pose_is_excluded_and_reported(street: Street, turn: float, shift: float) -> None:
     for i, pose in enumerate(POSES):
         true = pose.copy()
         if i == 3:

@@ -134,7 +134,7 @@ def test_focal_length_and_distortion_are_estimated(tmp_path: Path) -> None:
     assert all(view.camera == given for view in kept)
 
 
-def test_implausible_lens_is_rejected_and_named(tmp_path: Path) -> None:
+def test_implausible_lens_is_rejected_and_reported(tmp_path: Path) -> None:
     given = changed_lens(CAMERAS["pinhole"], np.array([0.08, 0, 0, 0, 0]))
     views, done = run(tmp_path, step_inputs(tmp_path, CAMERAS["pinhole"], POSES, given=given))
     assert done.warnings and done.warnings[0].startswith("cam: estimated lens") and views[0].camera == given
@@ -160,7 +160,7 @@ def test_held_out_photo_does_not_contribute_and_is_interpolated(tmp_path: Path) 
     assert all((a.T_world_cam == b.T_world_cam).all() for a, b in zip(views, again, strict=True))
 
 
-def test_implausible_correction_is_rejected_and_named(tmp_path: Path) -> None:
+def test_implausible_correction_is_rejected_and_reported(tmp_path: Path) -> None:
     camera = CAMERAS["pinhole"]
     wrong = disturbed(np.random.default_rng(3))
     wrong[3] = turned(POSES[3], (0.0, 0.02, 0.0), (0, 0, 0))

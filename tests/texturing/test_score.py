@@ -76,7 +76,7 @@ def test_scores_are_none_without_held_out_photos(street: Street, tmp_path: Path)
     assert json.loads((done.files["error"] / "index.json").read_text(encoding="utf-8")) == []
 
 
-def test_photos_of_missing_surfaces_are_scored_and_unreadable_ones_are_named(street: Street, tmp_path: Path) -> None:
+def test_photos_of_missing_surfaces_are_scored_and_unreadable_ones_reported(street: Street, tmp_path: Path) -> None:
     away = look_at((-4, 0, 1.8), (-9, 0, 4))  # at the sky
     for pose in (POSES[0], POSES[1], away):
         street.add(CAMERAS["pinhole"], pose)
@@ -101,7 +101,7 @@ def test_cameras_near_a_surface_are_reported_with_distance(street: Street, tmp_p
     assert cameras == {"count": 2, "near_m": {"photo1": pytest.approx(0.4, abs=0.05)}}
 
 
-def test_surfaces_seen_from_near_are_compared_with_ground_truth_separately(
+def test_surfaces_near_cameras_are_compared_with_ground_truth_separately(
     textured: dict[str, Path], tmp_path: Path
 ) -> None:
     """Ground truth is wrong beyond 5 m from every photo that was not held out."""
@@ -115,7 +115,7 @@ def test_surfaces_seen_from_near_are_compared_with_ground_truth_separately(
     assert facts["truth_psnr_near_db"] > 28 > 20 > facts["truth_psnr_db"]
 
 
-def test_whole_frames_are_scored_by_what_the_world_shows(scored: Done) -> None:
+def test_whole_frames_are_scored_by_class_and_distance_of_the_surface_shown(scored: Done) -> None:
     facts = strict(scored.metrics)
     frame = facts["frame"]
     assert list(frame["by_class"]) == ["terrain", "no surface: sky", "no surface: other"]

@@ -1,4 +1,4 @@
-"""Simplified textured meshes look as before and keep their classes and borders."""
+"""Simplified textured meshes keep their appearance, classes and borders."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.fakes import synthetic
 TEXELS = 40_000
 
 
-def test_simplified_scene_meets_budget_and_looks_as_before(tmp_path: Path) -> None:
+def test_simplified_scene_meets_the_budget_and_keeps_its_appearance(tmp_path: Path) -> None:
     scene = synthetic.scene(tmp_path / "town", tiles=1)
     small = simplified_scene(scene, 120, TEXELS, tmp_path / "small", silent)
     old, new = (s.tiles[0] for s in (scene, small))

@@ -1,4 +1,4 @@
-"""Step `sky_colour`: the colour of what photos show where the world has nothing, in the exposure of the world."""
+"""Step `sky_colour`: colour of photos where the world has no surface, in the exposure of the world."""
 
 import json
 from pathlib import Path
@@ -61,7 +61,7 @@ def test_photo_of_another_exposure_counts_in_that_of_the_world(street: Street, t
 
 
 def test_classes_of_a_network_decide_what_is_sky(street: Street, tmp_path: Path) -> None:
-    """The left half of what is above the corner is a white wall, which looks like clouds."""
+    """The left half of the image above the corner is a white wall, which looks like clouds."""
     image = photo((110, 150, 230))
     is_sky = (image == [110, 150, 230]).all(axis=2)
     image[:, :320][is_sky[:, :320]] = 250
@@ -72,8 +72,8 @@ def test_classes_of_a_network_decide_what_is_sky(street: Street, tmp_path: Path)
     assert sky.read(found(street, tmp_path, _0=labels).files["sky"]) == (110, 150, 230)
 
 
-def test_mean_of_all_that_is_seen_where_the_world_has_nothing(street: Street, tmp_path: Path) -> None:
-    """Half of it is trees."""
+def test_mean_of_all_photo_pixels_without_a_surface(street: Street, tmp_path: Path) -> None:
+    """Half of these pixels show trees."""
     image = photo((100, 150, 200))
     empty = (image == [100, 150, 200]).all(axis=2)
     columns = np.flatnonzero(empty.any(axis=0))
@@ -85,7 +85,7 @@ def test_mean_of_all_that_is_seen_where_the_world_has_nothing(street: Street, tm
     assert colour == pytest.approx(share * np.array([40, 50, 20]) + (1 - share) * np.array([100, 150, 200]), abs=15)
 
 
-def test_no_photo_of_the_sky(street: Street, tmp_path: Path) -> None:
+def test_sky_colour_is_none_without_photos_of_the_sky(street: Street, tmp_path: Path) -> None:
     street.add(CAMERAS["pinhole"], POSES[0], photo((30, 40, 20)))  # trees
     done = found(street, tmp_path)
     assert sky.read(done.files["sky"]) is None and json.loads(json.dumps(done.metrics)) == {"rgb": None, "photos": 0}

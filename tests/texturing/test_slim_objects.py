@@ -1,4 +1,4 @@
-"""A thin post in front of a wall and grass: its colour is not printed on what is behind it."""
+"""A thin post in front of a wall and grass: its colour is not projected onto surfaces behind it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def front_of_the_box(folder: Path) -> U8:
     return Renderer([textured(folder)]).view(pinhole(200, 200, field=60), look_at((-3, 0, 1), (0, 0, 1))).rgb
 
 
-def test_post_beside_its_mesh_is_not_printed_on_ground_and_wall(street: Street) -> None:
+def test_colour_of_a_post_is_not_projected_onto_ground_and_wall(street: Street) -> None:
     for pose in POSES:
         image = photograph(CAMERAS["pinhole"], pose)
         view = Renderer([Body(GROUND), Body(BOX), Body(post(POSE_ERROR_M))]).view(CAMERAS["pinhole"], pose)
@@ -54,4 +54,4 @@ def test_post_beside_its_mesh_is_not_printed_on_ground_and_wall(street: Street) 
     assert ground > 20 and wall > 20
     street.slim = np.concatenate([points_on(0.0), points_on(POSE_ERROR_M)])  # the scan has the same error
     assert printed(BOX) == 0
-    assert printed(GROUND) < ground / 4  # what is left is at its foot
+    assert printed(GROUND) < ground / 4  # the rest is at the foot of the post

@@ -1,4 +1,4 @@
-"""The sky of a survey's world: one dome of all tiles, for cameras only, made again when a tile's sky changes."""
+"""The sky of a survey's world: one dome of all tiles, for cameras only, rebuilt when a tile's sky changes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ RISING = np.linspace(0.8, 1.1, HEIGHT_PX)[:, None, None]
 
 
 def sky_of(columns: slice, exposure: float = 1.0) -> Dome:
-    """A blue sky of which a tile saw some azimuths, up to 60 degrees high; houses stand in front of its lowest part."""
+    """A blue sky that a tile saw at some azimuths, up to an elevation of 60 degrees; houses hide its lowest part."""
     colour = np.clip(exposure * RISING * np.tile(np.array(BLUE, float), (HEIGHT_PX, WIDTH_PX, 1)), 0, 255)
     shows = np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8)
     shows[150:350, columns], shows[350:, columns] = SKY, SCENERY
@@ -56,7 +56,7 @@ def saved(folder: Path, domes: Sequence[Dome]) -> Mean:
     return Mean([folder / str(i) for i in range(len(domes))])
 
 
-def test_tiles_of_other_exposures_agree_and_no_seam_shows(tmp_path: Path) -> None:
+def test_tiles_of_different_exposures_give_a_dome_without_seams(tmp_path: Path) -> None:
     east, west, all_round = slice(900, 2048), slice(0, 1100), slice(0, 2048)
     mean = saved(tmp_path, [sky_of(east, 1.0), sky_of(west, 0.85), sky_of(all_round, 1.1)])
     ratio = mean.gains() ** (1 / dome.GAMMA) * np.array([[1.0], [0.85], [1.1]])
@@ -73,8 +73,8 @@ def test_directions_that_no_tile_saw_continue_the_sky(tmp_path: Path) -> None:
     assert np.abs(found[410:].astype(float) - 90).max() < 6
 
 
-def test_what_one_of_many_tiles_takes_for_sky_is_not_sky(tmp_path: Path) -> None:
-    """Houses aren't part of it either: they belong to the place that they were seen from."""
+def test_sky_of_only_one_of_many_tiles_is_rejected(tmp_path: Path) -> None:
+    """Houses are not part of the dome either, as they depend on the viewpoint."""
     houses, wall = (sky_of(slice(0, WIDTH_PX)) for _ in range(2))
     houses.shows[300:350, 1000:1200], houses.colour[300:350, 1000:1200] = SCENERY, 40
     wall.colour[300:350, 1000:1200] = 250
@@ -127,7 +127,7 @@ def test_cameras_see_the_same_sky_everywhere_along_the_survey(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("name", ["gazebo", "glb", "usd"])
-def test_exports_show_it(tmp_path: Path, name: str) -> None:
+def test_exports_contain_the_dome(tmp_path: Path, name: str) -> None:
     missing = plugins.missing(world_formats.PACKAGE, name)
     if missing:
         pytest.skip(f"{missing} is not installed")
@@ -141,13 +141,13 @@ def test_exports_show_it(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["mujoco", "urdf", "tiles3d"])
-def test_formats_whose_sensors_would_measure_it_leave_it_out(tmp_path: Path, name: str) -> None:
+def test_physics_and_tile_formats_omit_the_dome(tmp_path: Path, name: str) -> None:
     scene = town(tmp_path)
     world_formats.write(scene, [name], tmp_path / "out", SceneParams(), silent)
     assert not list((tmp_path / "out").rglob("*backdrop*")) and not list((tmp_path / "out").rglob("town_sky*"))
 
 
-def test_gazebo_shows_it_to_cameras_only_and_loads_it_everywhere(tmp_path: Path) -> None:
+def test_gazebo_shows_the_dome_to_cameras_only_and_outside_of_levels(tmp_path: Path) -> None:
     town(tmp_path)
     world = ElementTree.parse(tmp_path / "world" / "town.sdf").getroot()
     assert "model://town_sky" in {include.findtext("uri") for include in world.iter("include")}
@@ -161,7 +161,7 @@ def test_gazebo_shows_it_to_cameras_only_and_loads_it_everywhere(tmp_path: Path)
     )
 
 
-def test_viewer_has_it(tmp_path: Path) -> None:
+def test_viewer_loads_the_dome(tmp_path: Path) -> None:
     pages = Pages(town(tmp_path), tmp_path / "page", 4.0)
     assert "town_sky.js" in pages.scripts and "town_sky_collision.js" not in pages.scripts
     pages.write("town_sky.js")
@@ -174,7 +174,7 @@ def test_survey_without_backdrop_has_no_dome(tmp_path: Path) -> None:
     assert "camera_far_m" not in json.loads((tmp_path / "world" / "metadata.json").read_text(encoding="utf-8"))
 
 
-def test_it_is_made_again_when_the_sky_of_a_tile_changes_and_only_then(tmp_path: Path) -> None:
+def test_dome_is_rebuilt_only_when_the_sky_of_a_tile_changes(tmp_path: Path) -> None:
     tiles, made = survey(tmp_path, 2), list[int]()
 
     def make(scene: Scene, folder: Path) -> None:

@@ -210,7 +210,7 @@ def test_masked_pixels_are_not_used(street: Street) -> None:
     assert magenta.sum() == 0
 
 
-def test_unreadable_photos_are_skipped_and_named(street: Street) -> None:
+def test_unreadable_photos_are_skipped_and_reported(street: Street) -> None:
     for pose in POSES:
         street.add(CAMERAS["pinhole"], pose)
     street.views[1].photo.write_bytes(b"broken")
@@ -262,7 +262,7 @@ def test_results_are_byte_identical_on_any_number_of_threads(street: Street) -> 
         assert (one / name).read_bytes() == (two / name).read_bytes()
 
 
-def test_pages_are_padded_in_parts_as_they_are_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_padding_in_parts_equals_padding_of_whole_pages(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     seen = np.where(rng.random((300, 200)) < 0.003, 255, 0).astype(np.uint8)
     seen[120:200] = 0
@@ -333,7 +333,7 @@ def test_photos_of_other_pixel_formats_are_read(street: Street, kind: str) -> No
 def test_orthophoto_textures_ground_and_roof_but_no_facade(street: Street) -> None:
     down = np.diag([1.0, -1, -1, 1])
     down[2, 3] = 30.0
-    camera = Camera("orthographic", 480, 480, 40.0, 40.0, 239.5, 239.5)  # 12 m, 2.5 cm a pixel
+    camera = Camera("orthographic", 480, 480, 40.0, 40.0, 239.5, 239.5)  # 12 m, 2.5 cm per pixel
     street.add(camera, down)
     folder, done = street.run()
     rgb, seen, truth, x, y = from_above(folder)

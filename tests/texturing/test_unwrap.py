@@ -134,7 +134,7 @@ def test_texels_from_an_orthophoto_are_half_its_pixels(tmp_path: Path) -> None:
     mesh = hills()
     down = np.diag([1.0, -1, -1, 1])
     down[:3, 3] = 0, 6, 12
-    camera = Camera("orthographic", 30, 30, 5.0, 5.0, 0.0, 0.0)  # 20 cm a pixel
+    camera = Camera("orthographic", 30, 30, 5.0, 5.0, 0.0, 0.0)  # 20 cm per pixel
     views_io.save(tmp_path / "views.json", [View("map", camera, down, tmp_path / "map.png")])
     detail_view = np.zeros(len(mesh), np.int32)
     Choice(detail_view[:, None], np.ones((len(mesh), 1), np.float32), detail_view).save(tmp_path / "choice.npz")

@@ -1,4 +1,4 @@
-"""Whole frames: what is shown behind surfaces, and which pixels of vehicles are not counted."""
+"""Whole-frame score: backdrops behind surfaces, and excluded pixels of vehicles."""
 
 import json
 from pathlib import Path
@@ -47,7 +47,7 @@ GROUND = Body(ground(), colour=(90, 90, 90))
 NOTHING: F32 = np.full((192, 256), np.inf, np.float32)
 
 
-def test_world_like_the_street_has_no_error(photo: View) -> None:
+def test_world_equal_to_the_street_has_no_error(photo: View) -> None:
     wall = Body(plate(4, 0, 3), colour=(150, 90, 40))
     frame = whole_frame(scored(photo, [GROUND, wall]), 2, NOTHING)
     assert frame is not None and frame.mask.all() and frame.excluded == 0
@@ -75,7 +75,7 @@ def test_backdrop_in_front_of_a_surface_hides_it(photo: View) -> None:
     assert (frame.rgb[frame.by_class == 1] == 200).all()  # the colour of the plate
 
 
-def test_sky_is_told_from_missing_surface_by_the_classes_of_the_photo(photo: View) -> None:
+def test_sky_is_distinguished_from_missing_surfaces_by_photo_classes(photo: View) -> None:
     labels = np.zeros((48, 64, len(PHOTO_CLASSES)), np.uint8)
     labels[..., PHOTO_CLASSES.index("building")] = 100
     labels[:10, :, PHOTO_CLASSES.index("sky")] = 200
@@ -105,28 +105,28 @@ def excluded(depth: F32, labels: U8 | None, boxes: Mesh | None = None) -> Bools:
 
 
 def test_vehicle_is_excluded_as_a_whole_if_a_part_of_it_was_measured() -> None:
-    """The lidar sees its lower half."""
+    """The lidar measured only its lower half."""
     found = excluded(measured(slice(90, 110), slice(40, 80)), movable(slice(60, 110), slice(40, 80)))
     assert found[60:110, 40:80].all() and found.sum() == 50 * 40
 
 
-def test_what_the_network_takes_for_a_large_vehicle_is_counted_far_from_what_was_measured() -> None:
-    """Trees behind a car, which the network takes for one vehicle with it: 1.5 m at 3 m are 76 pixels."""
+def test_predicted_vehicle_is_counted_far_from_measured_points() -> None:
+    """Trees behind a car, predicted as one vehicle with it: 1.5 m at 3 m are 76 pixels."""
     found = excluded(measured(slice(90, 110), slice(40, 60)), movable(slice(0, 110), slice(40, 256)))
     assert found[90:110, 40:60].all() and found[100, 130] and not found[100, 142:].any() and not found[:10].any()
 
 
-def test_what_only_the_network_takes_for_a_vehicle_is_counted() -> None:
+def test_predicted_vehicle_without_measured_points_is_counted() -> None:
     assert not excluded(NOTHING, movable(slice(60, 110), slice(40, 80))).any()
 
 
-def test_measured_object_that_is_no_vehicle_is_counted() -> None:
-    """A shrub that the world lost."""
+def test_measured_object_that_is_not_a_vehicle_is_counted() -> None:
+    """A shrub that is missing in the world."""
     found = excluded(measured(slice(90, 110), slice(40, 80)), movable(slice(0, 20), slice(200, 220)))
     assert not found.any()
 
 
-def test_without_classes_everything_measured_in_front_is_excluded() -> None:
+def test_all_measured_objects_in_front_are_excluded_without_classes() -> None:
     found = excluded(measured(slice(90, 110), slice(40, 80)), None)
     assert found[90:110, 40:80].all() and found.sum() == 20 * 40
 

@@ -93,7 +93,7 @@ def turned(photo: Photo, degrees: float) -> Photo:
 
 @pytest.fixture(scope="module", autouse=True)
 def one_thread() -> Iterator[None]:
-    """As step `facades` does: for images as small as these, starting threads would dominate."""
+    """Use one thread, as step `facades` does: with images this small, starting threads would dominate the run time."""
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     yield
@@ -106,8 +106,8 @@ def seen() -> list[Photo]:
     return photos()
 
 
-def test_a_photo_is_rectified_to_the_pattern_of_the_wall(seen: list[Photo]) -> None:
-    """Within the noise of the photos and what sampling at their resolution (3 cm) blurs."""
+def test_rectified_photo_equals_the_pattern_of_the_wall(seen: list[Photo]) -> None:
+    """Tolerance: noise of the photos, and blur by sampling at their resolution (3 cm)."""
     patch = rectify(wall(), seen[3])
     rows, columns = np.mgrid[: patch.grey.shape[0], : patch.grey.shape[1]]
     true = texture((columns + 0.5) * CELL / 2, (rows + 0.5) * CELL / 2)
@@ -116,7 +116,7 @@ def test_a_photo_is_rectified_to_the_pattern_of_the_wall(seen: list[Photo]) -> N
     assert np.corrcoef(patch.grey[patch.seen], shifted[patch.seen])[0, 1] < 0.9
 
 
-def test_the_plane_of_the_wall_is_the_most_consistent_one(seen: list[Photo]) -> None:
+def test_photo_consistency_is_highest_on_the_plane_of_the_wall(seen: list[Photo]) -> None:
     """One texel of disparity between the outer cameras is 5 cm * 7 m / 5 m = 7 cm of depth."""
     offsets = np.arange(-0.4, 0.41, 0.1)
     found = wall(DISTANCE + 0.1)  # the true plane is 10 cm in front of it
@@ -130,25 +130,25 @@ def inner(photos: list[Photo]) -> F32:
     return evidence(wall(), photos)[0][INNER]
 
 
-def test_texture_on_the_wall_is_evidence_whatever_the_exposure(seen: list[Photo]) -> None:
+def test_texture_on_the_wall_is_evidence_at_any_exposure(seen: list[Photo]) -> None:
     gains = (0.5, 0.9, 0.7, 0.6, 1.0, 0.8, 0.55, 0.95)
     assert inner([photograph(x, gain=g) for x, g in zip(POSITIONS, gains, strict=True)]).min() > 0.4
 
 
 @pytest.mark.parametrize("surface", [6.3, 7.7, 9.0])
 def test_texture_on_another_plane_is_evidence_against_the_wall(surface: float) -> None:
-    """Which ends where scanned: what photos show above it is 70 cm before, or 70 cm or 2 m behind."""
+    """The wall ends where scanned; photos show a surface above it that is 70 cm in front, or 70 cm or 2 m behind."""
     assert inner(photos(surface, scanned=None)).max() < -0.4
 
 
 @pytest.mark.parametrize(("level", "low", "high"), [(120.0, 0.0, 0.1), (250.0, -0.2, 0.0)])
-def test_untextured_walls_are_hardly_evidence(level: float, low: float, high: float) -> None:
+def test_untextured_walls_give_weak_or_no_evidence(level: float, low: float, high: float) -> None:
     """With the colour of the scanned part: weak evidence; overexposed: none."""
     value = inner(photos(plain=level))
     assert low <= value.min() and value.max() <= high
 
 
-def test_another_plain_colour_than_that_of_the_scanned_part_is_evidence_against_the_wall() -> None:
+def test_plain_colour_unlike_the_scanned_part_is_evidence_against_the_wall() -> None:
     """The wall ends where scanned, in front of an evenly grey sky."""
     made = []
     for photo in photos(plain=100.0):
@@ -158,27 +158,27 @@ def test_another_plain_colour_than_that_of_the_scanned_part_is_evidence_against_
     assert inner(made).max() == pytest.approx(-0.4, abs=0.05)
     edge = evidence(wall(), made)[1]
     row = round(SCANNED / CELL)
-    assert edge[row - 2 : row + 1, 10:-10].max(axis=0).min() > 0.9  # its top is a sharp edge, there and nowhere else
+    assert edge[row - 2 : row + 1, 10:-10].max(axis=0).min() > 0.9  # a sharp edge at its top, and nowhere else
     assert edge[row + 2 :].max() < 0.2
 
 
-def test_what_scanned_objects_occlude_is_unknown(seen: list[Photo]) -> None:
+def test_cells_occluded_by_scanned_objects_are_unknown(seen: list[Photo]) -> None:
     assert inner(photos(5.0, scanned=5.0)) == pytest.approx(LIMITS.unseen_value)
     free = [p if k % 2 else photograph(POSITIONS[k], 5.0, scanned=5.0) for k, p in enumerate(seen)]
-    assert inner(free).min() > 0.4, "photos in which the wall is free are enough"
+    assert inner(free).min() > 0.4, "four photos without an occluder are sufficient"
 
 
-def test_an_occluder_that_was_not_scanned_is_no_wall() -> None:
+def test_unscanned_occluder_does_not_count_as_wall() -> None:
     assert inner(photos(5.0)).max() < -0.3
 
 
-def test_wrong_poses_give_no_evidence_but_some_among_right_ones_do_no_harm(seen: list[Photo]) -> None:
-    """Headings off by up to 6 degrees, each by 17 cm on the wall from the next."""
+def test_wrong_poses_give_no_evidence_and_two_of_eight_are_tolerated(seen: list[Photo]) -> None:
+    """Heading errors of up to 6 degrees; those of adjacent photos differ by 17 cm on the wall."""
     assert inner([turned(p, d) for p, d in zip(seen, np.linspace(-6, 6, 8), strict=True)]).max() < 0.05
     assert inner([turned(p, 5.0 * (k in (0, 4))) for k, p in enumerate(seen)]).min() > 0.4
 
 
-def test_masked_and_single_photos_are_not_compared(seen: list[Photo]) -> None:
+def test_cells_seen_by_one_photo_or_masked_give_no_evidence(seen: list[Photo]) -> None:
     nothing: U8 = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
     masked = [replace(p, usable=nothing) for p in seen[1:]]
     for given in (masked + seen[:1], seen[:1], []):
@@ -186,6 +186,6 @@ def test_masked_and_single_photos_are_not_compared(seen: list[Photo]) -> None:
         assert value == pytest.approx(LIMITS.unseen_value) and not edge.any()
 
 
-def test_sky_is_no_wall(seen: list[Photo]) -> None:
+def test_sky_is_evidence_against_the_wall(seen: list[Photo]) -> None:
     sky: U8 = np.full((45, 60), 255, np.uint8)
     assert inner([replace(p, sky=sky) for p in seen]).max() < -0.4

@@ -44,7 +44,7 @@ def farthest(found: F64, true: F64) -> float:
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.3, 0.78, -1.2])
-def test_outline_of_an_l_shaped_building(heading: float) -> None:
+def test_outline_of_an_l_shaped_building_has_its_six_corners(heading: float) -> None:
     true = turned(L_SHAPE, heading)
     (ring,) = rings(mask_of(true), RASTER, TOLERANCE, 4.0)
     assert len(ring) == 6 and farthest(ring, true) < 0.25
@@ -56,7 +56,7 @@ def test_outline_of_an_l_shaped_building(heading: float) -> None:
 
 @pytest.mark.parametrize("heading", [0.0, 0.3, 0.78, -1.2])
 @pytest.mark.parametrize("cut", [2.0, 4.0, 7.0])
-def test_an_oblique_side_does_not_turn_the_others(heading: float, cut: float) -> None:
+def test_oblique_side_does_not_rotate_the_other_sides(heading: float, cut: float) -> None:
     """A rectangle of 14 m by 8 m with a corner cut off at 30 degrees."""
     true = np.array([[0, 0], [14, 0], [14, 8 - cut / np.sqrt(3)], [14 - cut, 8], [0, 8]])
     (ring,) = rings(mask_of(turned(true, heading)), RASTER, TOLERANCE, 4.0)
@@ -77,7 +77,7 @@ def test_holes_run_clockwise_and_small_ones_are_closed() -> None:
     assert len(rings(mask, RASTER, TOLERANCE, 20.0)) == 1
 
 
-def test_rings_move_with_the_raster_and_turn_with_the_mask() -> None:
+def test_rings_are_equivariant_to_shifts_and_rotations() -> None:
     mask = mask_of(turned(L_SHAPE, 0.3))
     (ring,) = rings(mask, RASTER, TOLERANCE, 4.0)
     (moved,) = rings(mask, Raster(CELL, (-80 + 400, -60 - 200), RASTER.shape), TOLERANCE, 4.0)
@@ -88,7 +88,7 @@ def test_rings_move_with_the_raster_and_turn_with_the_mask() -> None:
     assert farthest(turn, turned(ring, np.pi / 2)) < 0.15
 
 
-def test_degenerate_masks_and_contours() -> None:
+def test_degenerate_masks_and_contours_give_valid_rings_or_none() -> None:
     assert rings(np.zeros(RASTER.shape, bool), RASTER, TOLERANCE, 4.0) == []
     one, line = np.zeros(RASTER.shape, bool), np.zeros(RASTER.shape, bool)
     one[50, 50] = line[50, 20:60] = True
@@ -133,7 +133,7 @@ def test_roofs_are_separated_at_height_steps() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_roofs_against_flood_fill(seed: int) -> None:
+def test_roofs_equal_flood_fill(seed: int) -> None:
     rng = np.random.default_rng(seed)
     top: F64 = np.kron(rng.uniform(0, 6, (8, 9)), np.ones((3, 3))).astype(np.float64)
     number = roofs(top, 1.0, 1.0, 1.0)
@@ -141,7 +141,7 @@ def test_roofs_against_flood_fill(seed: int) -> None:
     np.testing.assert_array_equal(roofs(top, 1.0, 1.0, 1.0), number)
 
 
-def test_nearest_value_against_exhaustive_search() -> None:
+def test_nearest_value_equals_exhaustive_search() -> None:
     rng = np.random.default_rng(0)
     values, known = rng.random((9, 11)), rng.random((9, 11)) < 0.2
     places = np.argwhere(known)
@@ -151,7 +151,7 @@ def test_nearest_value_against_exhaustive_search() -> None:
         assert filled[at] in values[tuple(places[away <= away.min() + 1e-9].T)]
 
 
-def test_points_along_rings() -> None:
+def test_points_along_rings_are_evenly_spaced_and_point_outwards() -> None:
     hole = COURTYARD[::-1]
     points = OutlinePoints.along([L_SHAPE, hole], 0.3)
     assert len(np.unique(points.side)) == 10 and len(points) == len(points.outward) == len(points.side)

@@ -28,7 +28,7 @@ def test_wide_openings_are_passages() -> None:
     assert one.kind == "passage"
 
 
-def test_flight_of_stairs() -> None:
+def test_flight_of_stairs_has_position_axis_and_size() -> None:
     rng = np.random.default_rng(0)
     along = rng.uniform(0, 2.7, 4000)
     z = 0.17 * np.floor(along / 0.27)

@@ -87,7 +87,7 @@ def test_person_in_a_door_does_not_close_it() -> None:
     assert sum(len(one.openings) for one in found) == 1
 
 
-def test_hidden_part_of_an_outer_wall_is_no_door() -> None:
+def test_hidden_part_of_an_outer_wall_is_not_a_door() -> None:
     points, floor = room()
     behind = (points[:, 1] < 0.2) & (points[:, 0] > 2) & (points[:, 0] < 3.2) & (points[:, 2] < 1.9)
     found = fit_walls(points[~behind], floor, NONE, 0.0, HEIGHT_M, 0.045)
@@ -105,7 +105,7 @@ def test_hidden_wall_is_not_an_opening() -> None:
     assert sum(len(one.openings) for one in found) == 1  # the door
 
 
-def test_corners_are_closed_and_few_triangles_are_needed(walls: list[Wall]) -> None:
+def test_corners_are_closed_with_few_triangles(walls: list[Wall]) -> None:
     vertices, faces = mesh_of(walls)
     assert len(faces) < 120
     corner = np.linalg.norm(vertices[:, :2], axis=1) < 0.1
@@ -123,7 +123,7 @@ def test_slab_faces_outwards() -> None:
     assert volume == pytest.approx(2 * one.run.half * one.run.length * HEIGHT_M, rel=1e-3)
 
 
-def test_walls_without_floor_and_ceiling_end_where_they_were_seen() -> None:
+def test_walls_without_floor_and_ceiling_end_at_their_outermost_points() -> None:
     points, _ = room()
     found = fit_walls(points, NONE, NONE, None, None, 0.045)
     assert len(found) == 5

@@ -1,4 +1,4 @@
-"""Range images against ray casting, and who sees what on a made-up street."""
+"""Range images compared with ray casting, and visibility of points on a synthetic street."""
 
 from dataclasses import replace
 
@@ -59,7 +59,7 @@ def cast(meshes: list[Mesh], camera: Camera, pose: F64) -> F32:
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_range_image_is_what_rays_meet(street: list[Mesh], name: str) -> None:
+def test_range_image_equals_ray_casting(street: list[Mesh], name: str) -> None:
     camera, pose = CAMERAS[name], forward_pose()
     depth = depth_map(camera, pose, scene(street))
     expected = cast(street, depth.camera, pose)
@@ -75,7 +75,7 @@ def test_large_cameras_are_scaled_down(street: list[Mesh]) -> None:
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_leak_and_false_hiding_on_the_ground_are_small_at_grazing_angles(street: list[Mesh], name: str) -> None:
+def test_visibility_errors_on_the_ground_are_small_at_grazing_angles(street: list[Mesh], name: str) -> None:
     camera, pose = CAMERAS[name], forward_pose()
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-25, 25, (40_000, 2)), np.zeros(40_000)])
@@ -88,7 +88,7 @@ def test_leak_and_false_hiding_on_the_ground_are_small_at_grazing_angles(street:
         casting.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
     rays = np.concatenate([points + [0, 0, 1e-3], pose[:3, 3] - points], axis=1).astype(np.float32)
     truly = ~casting.test_occlusions(o3d.core.Tensor(rays), tfar=1.0).numpy()
-    # inside the boxes' feet nothing is defined
+    # visibility is undefined below the boxes
     seen = visible(depth_map(camera, pose, scene(street)), points, np.tile([0.0, 0, 1], (len(points), 1)))
     assert (~truly).sum() > 200
     assert seen[~truly].mean() < 0.06  # of a camera of 0.08 MP: a pixel of the boxes' border
@@ -102,7 +102,7 @@ def side_of(x: float, y0: float, y1: float, z0: float, z1: float, step: float = 
 
 
 def cloud_of(*parts: F32, classification: U8 | None = None, time: F64 | None = None) -> PointCloud:
-    """Points that look towards the camera."""
+    """Points with normals towards the camera."""
     xyz = np.concatenate(parts)
     return PointCloud(
         Frame(),
@@ -125,7 +125,7 @@ FACING = np.tile([-1.0, 0, 0], (2, 1))
 def test_points_without_a_mesh_occlude() -> None:
     pose, camera = forward_pose(), CAMERAS["pinhole"]
     car = side_of(4.0, -1, 0.5, 0.5, 2.5)
-    before_wall = side_of(7.95, -2, 2.05, 0, 3.05)  # the mesh has it already
+    before_wall = side_of(7.95, -2, 2.05, 0, 3.05)  # covered by the mesh
     hides = scene([WALL], cloud_of(car, before_wall))
     assert len(hides.centres) == len(car)
     assert visible(depth_map(camera, pose, scene([WALL])), ON_WALL, FACING).tolist() == [True, True]
@@ -133,7 +133,7 @@ def test_points_without_a_mesh_occlude() -> None:
     assert visible(depth_map(camera, pose, hides), car, np.tile([-1.0, 0, 0], (len(car), 1))).all()
 
 
-def test_points_of_a_post_hide_what_is_clearly_behind_them() -> None:
+def test_points_of_a_post_occlude_surfaces_clearly_behind_them() -> None:
     pose, camera = forward_pose(), CAMERAS["pinhole"]
     post = side_of(5.0, -0.02, 0.03, 0.0, 4.0)
     corners = np.array([[5.1, 0.1, 0], [5.1, 0.2, 0], [5.1, 0.2, 4]], np.float32)
@@ -141,9 +141,9 @@ def test_points_of_a_post_hide_what_is_clearly_behind_them() -> None:
     hides = replace(scene([WALL, own]), slim=post, slim_radius=0.05)
     depth = depth_map(camera, pose, hides)
     assert visible(depth, ON_WALL, FACING).tolist() == [False, True]
-    assert visible(depth, np.array([[5.1, 0.12, 0.5]]), FACING[:1]).all()  # its own mesh, beside its points
+    assert visible(depth, np.array([[5.1, 0.12, 0.5]]), FACING[:1]).all()  # mesh of the post, beside its points
     above = depth.range[: camera.height // 8]
-    assert np.isinf(above).all()  # no surface is behind: nothing to hide
+    assert np.isinf(above).all()  # no surface behind the post: no range
 
 
 def test_trail_of_a_passing_object_occludes_only_at_its_time() -> None:
@@ -161,7 +161,7 @@ def test_trail_of_a_passing_object_occludes_only_at_its_time() -> None:
     assert not sees_wall(moving, 100.2)
     assert sees_wall(moving, 103.0)
     assert sees_wall(moving, 97.0)
-    assert not sees_wall(moving, None)  # when it was isn't known: better hidden
+    assert not sees_wall(moving, None)  # the photo's time is unknown: treated as occluded
     assert not sees_wall(parked, 110.0)
 
 
@@ -182,7 +182,7 @@ def test_surface_without_supporting_points_does_not_occlude() -> None:
     flat = grid(20, 11, 0.1, (0, 1.8, 0))
     bulge = Mesh(Frame(), np.roll(flat.vertices, 1, axis=1) + np.array([4, 0, 0], np.float32), flat.faces)
     depth = depth_map(CAMERAS["pinhole"], forward_pose(), scene([WALL, bulge], cloud_of(wall, sign)))
-    behind = np.array([[8.0, 0.0, 1.6], [8.0, 1.6, 1.6]])  # the sign, and what is left of it
+    behind = np.array([[8.0, 0.0, 1.6], [8.0, 1.6, 1.6]])  # the sign, and its remaining points
     assert visible(depth, behind, FACING).tolist() == [False, True]
 
 
@@ -204,7 +204,7 @@ def test_points_outside_the_image_are_not_visible(street: list[Mesh]) -> None:
     assert not visible(depth, [[-5.0, 0, 1], [5.0, 60, 1]]).any()
 
 
-def test_depth_is_the_same_whatever_the_number_of_threads(street: list[Mesh]) -> None:
+def test_depth_is_identical_with_any_number_of_threads(street: list[Mesh]) -> None:
     camera, pose = CAMERAS["equirectangular"], forward_pose()
     first = depth_map(camera, pose, scene(street)).range
     before = numba.get_num_threads()

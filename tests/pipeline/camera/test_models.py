@@ -1,4 +1,4 @@
-"""Camera models against OpenCV's own, there and back again, and at the edge of their validity."""
+"""Camera models compared with OpenCV's, round trips, and the limits of their validity."""
 
 import cv2
 import numpy as np
@@ -29,7 +29,7 @@ def points() -> F64:
 
 
 @pytest.mark.parametrize("name", ["pinhole", "opencv4", "opencv8"])
-def test_projects_as_opencv_does(name: str, points: F64) -> None:
+def test_projection_equals_opencv(name: str, points: F64) -> None:
     camera = CAMERAS[name]
     expected, _ = cv2.projectPoints(
         points, np.zeros(3), np.zeros(3), matrix(camera), np.array(camera.distortion or np.zeros(4))
@@ -39,7 +39,7 @@ def test_projects_as_opencv_does(name: str, points: F64) -> None:
     np.testing.assert_allclose(uv, expected[:, 0], atol=2e-3)
 
 
-def test_projects_as_opencvs_fisheye_does(points: F64) -> None:
+def test_fisheye_projection_equals_opencv(points: F64) -> None:
     camera = CAMERAS["fisheye"]
     expected, _ = cv2.fisheye.projectPoints(
         points[:, None], np.zeros(3), np.zeros(3), matrix(camera), np.array(camera.distortion)
@@ -47,7 +47,7 @@ def test_projects_as_opencvs_fisheye_does(points: F64) -> None:
     np.testing.assert_allclose(project(camera, points)[0], expected.reshape(-1, 2), atol=2e-3)
 
 
-def test_equirectangular_looks_along_z_at_its_centre_and_along_x_on_its_right() -> None:
+def test_equirectangular_centre_is_the_z_axis_and_its_right_the_x_axis() -> None:
     camera = CAMERAS["equirectangular"]
     uv, valid = project(camera, np.array([[0, 0, 5], [5, 0, 0], [0, 3, 0], [-1e-9, 0, -2]]))
     assert valid.all()
@@ -57,7 +57,7 @@ def test_equirectangular_looks_along_z_at_its_centre_and_along_x_on_its_right() 
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_pixels_survive_the_way_to_rays_and_back(name: str) -> None:
+def test_unproject_and_project_round_trip(name: str) -> None:
     camera = CAMERAS[name]
     rng = np.random.default_rng(1)
     uv = rng.uniform([0, 0], [camera.width - 1, camera.height - 1], (2000, 2))
@@ -76,10 +76,10 @@ def test_points_beyond_the_field_of_view_do_not_fold_back_into_the_image() -> No
     points = np.column_stack([np.sin(angles), np.zeros(500), np.cos(angles)])
     uv, valid = project(camera, points)
     assert valid[0] and not valid[-1]
-    assert (np.diff(uv[valid, 0]) > 0).all()  # farther out is always farther out in the image
+    assert (np.diff(uv[valid, 0]) > 0).all()  # image radius increases with the angle
     naive, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix(camera), np.array(camera.distortion))
     folded = (np.diff(naive[:, 0, 0]) < 0).any()
-    assert folded  # OpenCV alone would have put some of them back into view
+    assert folded  # OpenCV's projection folds some points back into the image
 
 
 def test_points_behind_are_invalid_except_for_wide_cameras() -> None:
@@ -90,7 +90,7 @@ def test_points_behind_are_invalid_except_for_wide_cameras() -> None:
     assert project(CAMERAS["equirectangular"], behind)[1][0]
 
 
-def test_pixel_rays_are_those_of_unproject() -> None:
+def test_pixel_rays_equal_unproject() -> None:
     camera = CAMERAS["fisheye"].scaled(0.1)
     rays = pixel_rays(camera)
     assert rays.shape == (camera.height, camera.width, 3)

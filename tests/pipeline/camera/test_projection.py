@@ -1,4 +1,4 @@
-"""Where photos show places, and how pictures of any size are read there."""
+"""Projection of points into photos, and sampling of images of any size at photo pixels."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ POSE = look_at((3.0, -2.0, 4.0), (8.0, 5.0, 3.0))
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_places_are_shown_where_the_camera_at_its_pose_has_them(name: str) -> None:
+def test_pixels_equal_project_of_points_in_camera_axes(name: str) -> None:
     camera, places = CAMERAS[name], np.random.default_rng(0).uniform(-20, 20, (5000, 3))
     uv, shown = pixels(camera, POSE, places)
     expected, ahead = project(camera, (places - POSE[:3, 3]) @ POSE[:3, :3])
@@ -37,8 +37,8 @@ def test_panorama_projects_points_behind_the_camera() -> None:
 
 
 @pytest.mark.parametrize("size", [(71, 97), (35, 48), (18, 24), (9, 200)])
-def test_pictures_of_any_size_cover_the_photo(size: tuple[int, int]) -> None:
-    """A ramp over the whole photo is the same ramp in whatever size the picture is kept, up to half its pixel."""
+def test_images_of_any_size_are_sampled_at_photo_pixels(size: tuple[int, int]) -> None:
+    """A ramp over the whole photo has the same values in an image of any size, within half a pixel of the image."""
     camera = CAMERAS["pinhole"]
     p, (height, width) = parameters(camera), size
     row, column = np.mgrid[:height, :width]
@@ -52,7 +52,7 @@ def test_pictures_of_any_size_cover_the_photo(size: tuple[int, int]) -> None:
             np.testing.assert_allclose(sampled, place, atol=1e-9)
 
 
-def test_masks_hold_up_to_the_photos_border() -> None:
+def test_masks_apply_up_to_the_border_of_the_photo() -> None:
     p = parameters(CAMERAS["pinhole"])
     mask = np.zeros((7, 9), np.uint8)
     mask[0, 0] = mask[6, 8] = 255

@@ -1,4 +1,4 @@
-"""Rendered pictures: known textures come back, maps are to scale, edges and light are drawn."""
+"""Renderer: known textures at the correct pixels, maps to scale, wireframe and shading."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def painted(tmp_path: Path) -> Body:
     return Body(square(), (tmp_path / "page_0.png",))
 
 
-def test_map_shows_the_texture_the_right_way_round(painted: Body) -> None:
+def test_map_from_above_is_north_up(painted: Body) -> None:
     image = Renderer([painted]).above((-4, -4, 0), (4, 4, 1), width=80)
     assert image.rgb.shape == (80, 80, 3)
     assert image.rgb[30, 30].tolist() == [255, 0, 0]
@@ -44,7 +44,7 @@ def test_map_shows_the_texture_the_right_way_round(painted: Body) -> None:
     assert image.seen[30, 30] == 128 and image.seen[50, 30] == 255 and image.seen[0, 0] == 0
 
 
-def test_pages_are_the_same_with_little_memory(painted: Body, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rendering_is_identical_with_little_memory(painted: Body, monkeypatch: pytest.MonkeyPatch) -> None:
     pages = [painted.pages[0]]
     for k in (1, 2):
         for end in ("", "_seen"):
@@ -66,7 +66,7 @@ def test_pages_are_the_same_with_little_memory(painted: Body, monkeypatch: pytes
 @pytest.mark.parametrize(
     "camera", [pinhole(160, 120), Camera("fisheye", 120, 120, 60, 60, 59.5, 59.5), Camera("equirectangular", 200, 100)]
 )
-def test_a_camera_sees_colours_where_it_projects_them(painted: Body, camera: Camera) -> None:
+def test_rendered_colours_are_at_their_projected_pixels(painted: Body, camera: Camera) -> None:
     pose = look_at((0, -3, 3), (0, 0, 0))
     image = Renderer([painted]).view(camera, pose, background=(1, 2, 3))
     points = np.array([[-1.0, 1, 0], [1, 1, 0], [-1, -1, 0], [1, -1, 0]])
@@ -88,7 +88,7 @@ def test_nearest_mesh_occludes_others_and_faces_are_numbered(painted: Body) -> N
     assert sorted(map(tuple, np.unique(image.rgb[image.body == 2], axis=0).tolist())) == [(10, 20, 30), (40, 50, 60)]
 
 
-def test_wireframe_and_light(painted: Body) -> None:
+def test_shading_and_wireframe_are_drawn(painted: Body) -> None:
     plain = Body(square(), colour=(200, 200, 200))
     camera, pose = pinhole(160, 120), look_at((0, -3, 3), (0, 0, 0))
     lit = Renderer([plain]).view(camera, pose, shaded=True)
@@ -98,19 +98,19 @@ def test_wireframe_and_light(painted: Body) -> None:
     assert 0 < (lines.rgb[lines.hit] < 100).all(axis=1).mean() < 0.2
 
 
-def test_nothing_to_render_is_background() -> None:
+def test_empty_scene_is_rendered_as_background() -> None:
     image = Renderer([]).view(pinhole(20, 10), np.eye(4), background=(9, 9, 9))
     assert (image.rgb == 9).all() and not image.hit.any()
 
 
-def test_an_unreadable_page_is_named(tmp_path: Path) -> None:
+def test_unreadable_texture_page_is_reported(tmp_path: Path) -> None:
     (tmp_path / "page_0.png").write_bytes(b"no image")
     with pytest.raises(InputError, match="page_0.png"):
         Renderer([Body(square(), (tmp_path / "page_0.png",))]).above((-1, -1, 0), (1, 1, 1), width=10)
 
 
 def checkered(folder: Path, texels: int = 256) -> Body:
-    """A square of 4 m with a black and white checkerboard, a texel a field."""
+    """A square of 4 m with a black and white checkerboard, one texel per field."""
     page = np.indices((texels, texels)).sum(axis=0) % 2 * 255
     cv2.imwrite(str(folder / "page_0.png"), np.repeat(page[..., None], 3, axis=2).astype(np.uint8))
     return Body(square(), (folder / "page_0.png",))
@@ -127,7 +127,7 @@ def test_supersampling_filters_detail_finer_than_a_pixel(tmp_path: Path) -> None
 
 
 def test_rendering_in_parts_is_identical(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    camera, pose = pinhole(60, 40, field=90), look_at((0, -6, 1), (0, 0, 1))  # its upper rows see nothing
+    camera, pose = pinhole(60, 40, field=90), look_at((0, -6, 1), (0, 0, 1))  # no ray of the upper rows hits a mesh
     whole = Renderer([checkered(tmp_path)]).view(camera, pose, samples=3)
     monkeypatch.setattr("scan2sim.pipeline.camera.renderer.RAY_CHUNK", 600)
     pieces = Renderer([checkered(tmp_path)]).view(camera, pose, samples=3)
@@ -136,7 +136,7 @@ def test_rendering_in_parts_is_identical(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("samples", [2, 3])
-def test_sub_rays_mix_no_sky_into_the_edge_of_a_mesh(samples: int) -> None:
+def test_supersampling_does_not_mix_background_into_edges(samples: int) -> None:
     plain = Body(square(), colour=(10, 20, 30))
     image = Renderer([plain]).view(
         pinhole(61, 41), look_at((0, -6, 5), (0, 0, 0)), background=(250, 0, 0), samples=samples
@@ -145,7 +145,7 @@ def test_sub_rays_mix_no_sky_into_the_edge_of_a_mesh(samples: int) -> None:
     assert image.hit.any() and not image.hit.all()
 
 
-def test_nearest_places_lie_on_the_mesh(painted: Body) -> None:
+def test_closest_points_and_their_colours_lie_on_the_mesh(painted: Body) -> None:
     points = np.array([[-1, 1, 0.3], [1, -1, -0.2]], np.float32)
     rgb, seen, distance = Renderer([painted]).nearest(points)
     assert rgb.tolist() == [[255, 0, 0], [255, 255, 255]] and seen.tolist() == [128, 255]

@@ -1,4 +1,4 @@
-"""Threads of OpenBLAS are limited within a context, and restored after it."""
+"""Number of OpenBLAS threads: limited within a context, and restored after it."""
 
 from __future__ import annotations
 
@@ -23,6 +23,6 @@ assert inside == [1] * len(before), inside
 """
 
 
-def test_one_thread_inside_and_as_many_as_before_after() -> None:
+def test_context_limits_blas_to_one_thread_and_restores_the_number() -> None:
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""Codes of other surveys: their classes here, and warnings about unknown ones."""
+"""Class codes of other surveys: mapping to the project's classes, and warnings about unknown codes."""
 
 from __future__ import annotations
 
@@ -45,28 +45,28 @@ def foreign(path: Path, software: str = "TerraScan", names: dict[int, str] | Non
     return path
 
 
-def taken(path: Path, given: dict[int, int] | None = None) -> list[int]:
-    """What 2, 1, 31, 65 and 200 of a file are here."""
+def mapped(path: Path, given: dict[int, int] | None = None) -> list[int]:
+    """The project's codes to which codes 2, 1, 31, 65 and 200 of a file are mapped."""
     return clouds.code_table(path, given or {})[[2, 1, 31, 65, 200]].tolist()
 
 
-def test_survey_codes_are_ours_only_if_the_file_declares_it(tmp_path: Path) -> None:
-    assert taken(foreign(tmp_path / "a.las")) == [2, 1, 31, 1, 1]
-    assert taken(foreign(tmp_path / "b.las", "made by SCAN2SIM 0.1")) == [2, 1, 31, 65, 1]
-    assert taken(foreign(tmp_path / "c.las", names={65: "Pole", 200: "Road sign", 31: "fence"})) == [2, 1, 68, 65, 64]
-    assert taken(foreign(tmp_path / "d.las", "scan2sim", {65: "something"})) == [2, 1, 31, 1, 1]
-    assert taken(foreign(tmp_path / "e.las"), {65: 7, 200: 5, 2: 11}) == [11, 1, 31, 7, 5]
+def test_project_codes_are_recognized_only_if_the_file_declares_them(tmp_path: Path) -> None:
+    assert mapped(foreign(tmp_path / "a.las")) == [2, 1, 31, 1, 1]
+    assert mapped(foreign(tmp_path / "b.las", "made by SCAN2SIM 0.1")) == [2, 1, 31, 65, 1]
+    assert mapped(foreign(tmp_path / "c.las", names={65: "Pole", 200: "Road sign", 31: "fence"})) == [2, 1, 68, 65, 64]
+    assert mapped(foreign(tmp_path / "d.las", "scan2sim", {65: "something"})) == [2, 1, 31, 1, 1]
+    assert mapped(foreign(tmp_path / "e.las"), {65: 7, 200: 5, 2: 11}) == [11, 1, 31, 7, 5]
 
 
-def test_written_codes_are_read_as_our_classes(tmp_path: Path) -> None:
+def test_written_codes_are_read_back_as_project_classes(tmp_path: Path) -> None:
     las.write(tmp_path / "own.laz", PointCloud(Frame(), np.zeros((5, 3), np.float32), classification=LABEL[:5]))
-    assert taken(tmp_path / "own.laz")[3] == 65
+    assert mapped(tmp_path / "own.laz")[3] == 65
     code = np.full(N, 65, np.uint8)
     write_classified(foreign(tmp_path / "a.las"), tmp_path / "classified.laz", code, code, code)
-    assert taken(tmp_path / "classified.laz")[3] == 65
+    assert mapped(tmp_path / "classified.laz")[3] == 65
 
 
-def test_classes_that_the_user_names(tmp_path: Path) -> None:
+def test_user_class_mapping_is_parsed_and_validated(tmp_path: Path) -> None:
     assert parse_mapping("65=noise, 200=5,31=Road sign") == {65: 7, 200: 5, 31: 64}
     assert code_of("ground") == CODE["terrain"]
     refused = {"65": "names no class", "5=noise,5=6": "5=6.*again", "65=x": "no class 'x'", "x=6": "no code"}
@@ -81,7 +81,7 @@ def test_classes_that_the_user_names(tmp_path: Path) -> None:
         read_tile(tmp_path)
 
 
-def test_points_that_vanish_are_named_with_their_share_and_what_to_do(tmp_path: Path) -> None:
+def test_warning_reports_uncodes_of_with_share_and_remedy(tmp_path: Path) -> None:
     tile = read_tile(import_las([foreign(tmp_path / "a.las")], tmp_path / "tile", crs="local", classes={200: 5}))
     assert tile.classes == {200: 5}
     params = step_params(IngestParams, origin=tile.frame.origin, classes=dict(tile.classes))
@@ -104,7 +104,7 @@ def test_conversion_to_laz_keeps_survey_codes(tmp_path: Path) -> None:
     rows = np.column_stack([np.random.default_rng(0).uniform(0, 30, (N, 3)), LABEL])
     np.savetxt(tmp_path / "a.csv", rows, "%.3f,%.3f,%.3f,%d", header="x,y,z,classification", comments="")
     tile = read_tile(import_las([tmp_path / "a.csv"], tmp_path / "tile", crs="local", classes={65: 64}))
-    assert taken(tile.clouds[0], dict(tile.classes)) == [2, 1, 31, 64, 1]
+    assert mapped(tile.clouds[0], dict(tile.classes)) == [2, 1, 31, 64, 1]
 
 
 def test_tiles_keep_the_class_mapping_of_the_corridor(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ TILE = ROOT / "data_samples" / "tile"
 
 
 def without(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
-    """As if these weren't installed."""
+    """Simulate that these packages are not installed."""
     real = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *more: None if name in packages else real(name, *more)
@@ -55,7 +55,9 @@ def test_invalid_setting_is_rejected_before_the_run(
         show_plan(TILE, tmp_path / "out", settings)
 
 
-def test_a_survey_is_refused_before_it_is_cut(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_survey_with_invalid_settings_is_rejected_before_it_is_cut(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     without(monkeypatch, "transformers")
     for setting, error in (("label.network=segformer", UnavailableError), ("lable.network=segformer", SettingError)):
         with pytest.raises(error):
@@ -127,7 +129,7 @@ USES = {
 
 
 @pytest.mark.parametrize(("package", "command"), [(name, command) for name in USES for command in USES[name]])
-def test_a_package_that_is_missing_ends_all_commands_alike(
+def test_missing_package_raises_the_same_error_in_every_command(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, package: str, command: str
 ) -> None:
     import cv2
@@ -150,7 +152,7 @@ def test_a_package_that_is_missing_ends_all_commands_alike(
     assert package in error.cause and f"pip install 'scan2sim[{EXTRA_OF[package]}" in error.remedy
 
 
-def test_error_names_the_right_extra_of_several(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_contains_the_matching_one_of_several_extras(monkeypatch: pytest.MonkeyPatch) -> None:
     without(monkeypatch, "av", "psutil")
     for words in (["teleop", "demo", "world"], ["teleop", "measure"], ["teleop", "vehicle", "car", "gate"]):
         error = CliRunner().invoke(app, words).exception
@@ -159,11 +161,11 @@ def test_error_names_the_right_extra_of_several(monkeypatch: pytest.MonkeyPatch)
         encoders.find("pyav")
 
 
-def test_every_package_that_is_optional_is_missed_by_a_command() -> None:
+def test_every_optional_package_is_tested_with_a_command() -> None:
     assert USES.keys() == EXTRA_OF.keys()
 
 
-def test_the_demo_needs_nothing_but_the_core(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_demo_needs_only_core_packages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     without(monkeypatch, *EXTRA_OF)
     show_plan(TILE, tmp_path, Settings.read(None, ["segment.overwrite=true"]))
 
@@ -183,13 +185,13 @@ def test_every_extra_exists_and_contains_its_package() -> None:
         assert named in brought and named not in core
 
 
-def test_hints_work_without_a_checkout() -> None:
+def test_install_hints_work_without_a_checkout() -> None:
     extras = set(
         tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     )
     pages = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
-    rooms = ("pipeline", "flows", "segmentation", "texturing", "slam", "services", "data_samples")
-    for file in [*pages, *(path for room in rooms for path in (ROOT / room).rglob("*.py"))]:
+    packages = ("pipeline", "flows", "segmentation", "texturing", "slam", "services", "data_samples")
+    for file in [*pages, *(path for package in packages for path in (ROOT / package).rglob("*.py"))]:
         for line in file.read_text("utf-8").splitlines():
             hint = re.search(r"pip install\b.*", line)
             assert hint is None or file.name == "CONTRIBUTING.md" or " -e " not in hint[0], (file, line)

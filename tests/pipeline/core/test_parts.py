@@ -1,4 +1,4 @@
-"""Parts of results: reused for the same inputs, never when damaged, and swept when no longer used."""
+"""Cached parts of results: reused for the same inputs, never when damaged, and removed when no longer used."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def provide(tmp_path: Path, work: Work, run: str, *made_from: object, version: i
     return out / "number.txt"
 
 
-def test_part_is_reused_without_space_of_its_own(tmp_path: Path, work: Work) -> None:
+def test_cached_part_is_hard_linked(tmp_path: Path, work: Work) -> None:
     first, second = provide(tmp_path, work, "1", "photo"), provide(tmp_path, work, "2", "photo")
     assert work.times == 1
     assert second.read_text(encoding="utf-8") == "17" and first.stat().st_ino == second.stat().st_ino
 
 
-def test_other_inputs_or_another_version_are_computed(tmp_path: Path, work: Work) -> None:
+def test_part_is_recomputed_for_other_inputs_or_another_version(tmp_path: Path, work: Work) -> None:
     provide(tmp_path, work, "1", "photo")
     provide(tmp_path, work, "2", "other photo")
     provide(tmp_path, work, "3", "other photo", version=2)

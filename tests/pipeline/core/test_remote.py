@@ -59,7 +59,7 @@ def test_another_machine_continues_the_run(s3: str, tmp_path: Path) -> None:
     assert sorted(log.read_text(encoding="utf-8").split()) == ["a", "b", "c"]
     assert machine("second") == {"a": 1, "b": 1, "c": 1, "d": 2}
     assert sorted(log.read_text(encoding="utf-8").split()) == ["a", "b", "c", "c", "d"]
-    assert machine("third") == {"a": 1, "b": 1, "c": 1, "d": 2}  # no file but manifests is fetched
+    assert machine("third") == {"a": 1, "b": 1, "c": 1, "d": 2}  # only manifests are fetched
     assert not list((tmp_path / "third").rglob("number.txt"))
 
 
@@ -109,8 +109,8 @@ def test_damaged_local_copy_is_fetched_and_damaged_remote_result_rebuilt(s3: str
     assert machine(b={"value": 6}) == ["a", "b", "d"] and number.read_text(encoding="utf-8") == "1"
 
 
-def test_a_key_that_leads_out_of_its_folder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """S3 allows such keys; fsspec's memory is a storage that does, too."""
+def test_key_with_path_traversal_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """S3 allows such keys, as does fsspec's memory storage."""
     files = pytest.importorskip("fsspec").filesystem("memory")
     here = Remote("memory://survey", tmp_path / "cache" / "here")
     files.pipe_file("/survey/tile.toml", b"a tile")

@@ -1,4 +1,4 @@
-"""Native code in a child process: its result, its crash, its hanging."""
+"""Native code in a child process: result, crash, exception, timeout."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ def hang() -> None:
     time.sleep(600)
 
 
-def test_result_is_returned() -> None:
+def test_result_of_the_child_is_returned() -> None:
     assert sandbox.call(f"{HERE}:double", 21, timeout=60) == 42
 
 
-def test_a_crash_becomes_an_error() -> None:
+def test_crash_is_reported_as_an_error() -> None:
     with pytest.raises(StepError, match="crashed"):
         sandbox.call(f"{HERE}:crash", timeout=60)
 
 
-def test_exception_is_reported() -> None:
+def test_exception_of_the_child_is_reported() -> None:
     with pytest.raises(StepError, match="no such luck"):
         sandbox.call(f"{HERE}:refuse", timeout=60)
 
 
-def test_hanging_ends() -> None:
+def test_hanging_child_is_stopped_at_the_timeout() -> None:
     with pytest.raises(StepError, match="did not finish"):  # it hangs for 10 minutes, longer than the limit of a test
         sandbox.call(f"{HERE}:hang", timeout=3)

@@ -1,4 +1,4 @@
-"""Values: what is saved comes back, and coordinates keep their millimetres."""
+"""Data types: lossless saving and loading, coordinates with a precision of millimetres."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scan2sim.pipeline.tiling.borders.clip import Clipped
 FRAME = Frame("EPSG:2154", (770500.0, 6277550.0, 20.0))
 
 
-def test_frame_there_and_back_in_feet() -> None:
+def test_frame_round_trip_in_feet() -> None:
     frame = Frame("local", (100.0, 200.0, 3.0), 0.3048)
     feet = np.array([[636001.76, 848935.20, 406.26]])
     assert np.abs(frame.to_crs(frame.to_local(feet)) - feet).max() < 1e-8
@@ -36,7 +36,7 @@ def test_save_and_load_round_trip(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.float32, np.int64])
-def test_numbers_of_numpy_are_saved_and_loaded(tmp_path: Path, kind: type) -> None:
+def test_numpy_scalars_are_saved_and_loaded(tmp_path: Path, kind: type) -> None:
     x, y, z = np.array([770500, 6277550, 20]).astype(kind)
     frame = Frame("EPSG:2154", (x, y, z), kind(1))
     assert frame == FRAME
@@ -64,7 +64,7 @@ def test_join_fills_missing_attributes() -> None:
     assert both.time is None
 
 
-def test_keep_drops_unused_vertices_and_follows_all_attributes() -> None:
+def test_keep_drops_unused_vertices_and_selects_all_attributes() -> None:
     vertices = np.arange(18, dtype=np.float32).reshape(6, 3) ** 1.5
     faces = np.array([[0, 1, 2], [3, 4, 5]], np.int32)
     mesh = Mesh(FRAME, vertices, faces, uv=np.zeros((2, 3, 2), np.float32), page=np.array([0, 1], np.int16))

@@ -1,4 +1,4 @@
-"""Cells: every position belongs to one tile, and neighbours compute the same border."""
+"""Voronoi cells of tiles: every position belongs to one tile, and neighbours compute the same border."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def test_squares_that_meet_in_a_corner_are_neighbours() -> None:
         assert list(cell.neighbours) == sorted(set(SQUARES) - {name})
 
 
-def test_neighbours_know_each_other() -> None:
+def test_neighbour_relation_is_symmetric() -> None:
     made = cells(scattered(), max_distance=1e4)
     for name, cell in made.items():
         for other, seed in cell.neighbours.items():
             assert made[other].seed == seed and made[other].neighbours[name] == cell.seed
 
 
-def test_every_place_is_in_the_cell_of_its_nearest_seed_and_in_no_other() -> None:
+def test_every_position_is_in_the_cell_of_its_nearest_seed_only() -> None:
     seeds = scattered()
     made = cells(seeds, max_distance=1e4)
     xy = np.random.default_rng(1).uniform(690_000, 690_500, (2000, 2))
@@ -52,11 +52,11 @@ def test_outlines_are_counter_clockwise_and_fill_the_plane() -> None:
     assert area == 25.0**2  # from -20 to the border at 5, both ways
 
 
-def test_a_lonely_tile_owns_everything() -> None:
+def test_single_tile_contains_every_position() -> None:
     (cell,) = cells({"a": (1.0, 2.0)}, max_distance=10.0).values()
     assert cell == Cell((1.0, 2.0)) and (cell.outside(np.zeros((3, 2))) == -np.inf).all()
     assert cells({}, max_distance=10.0) == {}
 
 
-def test_seeds_far_apart_are_no_neighbours() -> None:
+def test_seeds_far_apart_are_not_neighbours() -> None:
     assert not cells({"a": (0.0, 0.0), "b": (100.0, 0.0)}, max_distance=99.0)["a"].neighbours

@@ -52,7 +52,7 @@ def swept(points: F64, half_width: float, margin: float = 0.0) -> Bools:
 
 @pytest.mark.parametrize("heading", [0.0, 0.6, -2.3])
 @pytest.mark.parametrize(("speed", "half_width"), [(10.0, CAR_HALF_WIDTH_M)])
-def test_volume_of_a_car(heading: float, speed: float, half_width: float) -> None:
+def test_swept_volume_of_a_car_excludes_road_and_surroundings(heading: float, speed: float, half_width: float) -> None:
     points = around()
     xyz = (points @ axes(heading).T).astype(np.float32)
     volume = swept_volume(xyz, path(heading, speed))
@@ -64,7 +64,7 @@ def test_volume_of_a_car(heading: float, speed: float, half_width: float) -> Non
     assert not inside[:30_000].any(), "part of the road is removed"
 
 
-def test_the_ground_is_that_below_a_sloping_path() -> None:
+def test_ground_of_the_swept_volume_follows_a_sloping_path() -> None:
     points = around()
     xyz = (points @ axes(0.3, 0.12).T).astype(np.float32)
     volume = swept_volume(xyz, path(0.3, slope=0.12))
@@ -73,8 +73,8 @@ def test_the_ground_is_that_below_a_sloping_path() -> None:
     assert not inside[:30_000].any() and inside[swept(points, CAR_HALF_WIDTH_M, 0.25)].all()
 
 
-def test_nothing_is_removed_in_gaps_of_the_path() -> None:
-    """A tunnel without poses, for example: the way through it is unknown."""
+def test_no_points_are_in_the_volume_in_gaps_of_the_path() -> None:
+    """For example in a tunnel without poses, where the path is unknown."""
     way = path(0.0)
     shift = np.array([40.0, 0, 0])
     times = np.concatenate([way.times, way.times + 5])
@@ -88,13 +88,13 @@ def test_nothing_is_removed_in_gaps_of_the_path() -> None:
     assert inside[parts].all()
 
 
-def test_without_ground_below_nothing_is_removed() -> None:
+def test_no_points_are_in_the_volume_without_ground_below() -> None:
     xyz = (around() + (0, 0, 50)).astype(np.float32)
     volume = swept_volume(xyz, path(0.0))
     assert np.isnan(volume.ground).all() and not in_swept_volume(xyz, volume).any()
 
 
-def test_a_scanner_that_stands_still() -> None:
+def test_static_scanner_has_the_volume_of_a_person() -> None:
     xyz = (around() - (LENGTH / 2, 0, 0)).astype(np.float32)
     for times in ([0.0], [0.0, 1.0, 2.0]):
         still = Trajectory(np.array(times), np.tile([0.0, 0.0, SCANNER_HEIGHT], (len(times), 1)))
@@ -106,7 +106,7 @@ def test_a_scanner_that_stands_still() -> None:
         assert inside[(away < PERSON_HALF_WIDTH_M) & (xyz[:, 2] > 0.4) & (xyz[:, 2] < 2.0)].all()
 
 
-def test_points_near_cameras_against_exhaustive_search() -> None:
+def test_points_near_cameras_equal_exhaustive_search() -> None:
     rng = np.random.default_rng(2)
     cameras = rng.uniform((0, -2, 1), (12, 2, 3), (15, 3))
     xyz = around(20_000).astype(np.float32)
@@ -122,7 +122,7 @@ def test_points_near_cameras_against_exhaustive_search() -> None:
 
 
 @pytest.mark.parametrize("xyz", [np.zeros((0, 3), np.float32), np.array([[1, 0.1, 1]], np.float32)])
-def test_empty_cloud_and_one_point(xyz: F32) -> None:
+def test_empty_cloud_and_single_point_are_accepted(xyz: F32) -> None:
     volume = swept_volume(xyz, path(0.0))
     assert in_swept_volume(xyz, volume).tolist() == [False] * len(xyz)
     cameras = np.array([[1.0, 0.0, 1.0]])

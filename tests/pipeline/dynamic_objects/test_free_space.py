@@ -1,4 +1,4 @@
-"""Free space: a scanner drives through a small scene whose every point is known to stand or to move."""
+"""Dynamic object removal by free space: a scanner drives through a small scene with known static and moving points."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def box(low: tuple[float, ...], high: tuple[float, ...]) -> Any:
     return mesh.translate(low)
 
 
-def still() -> dict[int, list[Any]]:
-    """What stands, by kind: a street along x, whose lanes are at y = 0 and 3.5."""
+def static_objects() -> dict[int, list[Any]]:
+    """Meshes of static objects by kind: a street along x, whose lanes are at y = 0 and 3.5."""
     random = np.random.default_rng(1)
     leaves = []
     for x, y, z in random.normal((12, -5, 3.2), 0.7, (250, 3)):
@@ -45,8 +45,8 @@ def still() -> dict[int, list[Any]]:
     }
 
 
-def driving(time: float) -> dict[int, Any]:
-    """What moves, and where it is: a van ahead as fast as the scanner, a car that comes towards it, one who crosses."""
+def moving_objects(time: float) -> dict[int, Any]:
+    """Meshes of moving objects by kind: a van ahead at the scanner's speed, an oncoming car, a crossing pedestrian."""
     return {
         AHEAD: box((SPEED * time + 9, -1, 0.2), (SPEED * time + 13.5, 1, 2.1)),
         ONCOMING: box((30 - 13 * time, 2.6, 0.2), (34.5 - 13 * time, 4.4, 1.5)),
@@ -55,15 +55,15 @@ def driving(time: float) -> dict[int, Any]:
 
 
 def survey(seconds: float = SECONDS, *, off: float = 0.0, begin: float = 0.0, left: int = -1) -> PointCloud:
-    """Turns of 64 beams, 2 cm of range noise, poses off by `off` metres; `left` isn't there; labels are kinds."""
+    """Turns of 64 beams, 2 cm of range noise, poses off by `off` metres, without kind `left`; classes are kinds."""
     random = np.random.default_rng(2)
     elevation = np.radians(np.linspace(-25, 12, 64))
     parts = []
     for turn in range(round(seconds * TURNS)):
         time = turn / TURNS
         scene, kinds = o3d.t.geometry.RaycastingScene(), []
-        things = [(k, mesh) for k, meshes in still().items() for mesh in meshes if k != left]
-        for kind, mesh in things + list(driving(time).items()):
+        things = [(k, mesh) for k, meshes in static_objects().items() for mesh in meshes if k != left]
+        for kind, mesh in things + list(moving_objects(time).items()):
             scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
             kinds.append(kind)
         azimuth = np.linspace(-np.pi, np.pi, 900, endpoint=False)
@@ -91,7 +91,7 @@ def path(seconds: float = SECONDS, begin: float = 0.0) -> Trajectory:
     return Trajectory(begin + times, np.column_stack([SPEED * times, 0 * times, HEIGHT + 0 * times]))
 
 
-def carve(cloud: PointCloud, out: Path, way: Trajectory | None, **params: Any) -> Done:
+def run_step(cloud: PointCloud, out: Path, way: Trajectory | None, **params: Any) -> Done:
     out.mkdir(parents=True, exist_ok=True)
     cloud.save(out / "in.npz")
     inputs = {"cloud": out / "in.npz"}
@@ -101,8 +101,8 @@ def carve(cloud: PointCloud, out: Path, way: Trajectory | None, **params: Any) -
     return DYNAMIC_OBJECTS.run(inputs, step_params(DYNAMIC_OBJECTS.params, **params), out, silent)
 
 
-def lost(cloud: PointCloud, done: Done) -> dict[int, float]:
-    """Share of each kind's points that are gone."""
+def removed_share(cloud: PointCloud, done: Done) -> dict[int, float]:
+    """Share of removed points by kind."""
     kept = PointCloud.load(done.files["cloud"]).classification
     assert cloud.classification is not None and kept is not None
     before, after = np.bincount(cloud.classification, minlength=10), np.bincount(kept, minlength=10)
@@ -115,8 +115,8 @@ def street() -> PointCloud:
 
 
 def test_moving_objects_are_removed_and_static_ones_kept(street: PointCloud, tmp_path: Path) -> None:
-    done = carve(street, tmp_path, path())
-    gone = lost(street, done)
+    done = run_step(street, tmp_path, path())
+    gone = removed_share(street, done)
     assert all(gone[kind] > 0.65 for kind in MOVES)
     assert all(share < 0.01 for kind, share in gone.items() if kind not in MOVES)
     moving = PointCloud.load(done.files["moving"])
@@ -125,9 +125,9 @@ def test_moving_objects_are_removed_and_static_ones_kept(street: PointCloud, tmp
     np.testing.assert_array_equal(street.xyz[dropped == 0], PointCloud.load(done.files["cloud"]).xyz)
 
 
-def test_poses_may_be_off_by_centimetres(tmp_path: Path) -> None:
+def test_moving_objects_are_removed_in_spite_of_pose_errors(tmp_path: Path) -> None:
     cloud = survey(off=0.05)
-    gone = lost(cloud, carve(cloud, tmp_path, path()))
+    gone = removed_share(cloud, run_step(cloud, tmp_path, path()))
     assert all(gone[kind] > 0.5 for kind in MOVES)
     assert all(share < 0.02 for kind, share in gone.items() if kind not in MOVES)
 
@@ -139,43 +139,43 @@ def test_nothing_is_removed_without_path_times_or_second_view(street: PointCloud
         (street, path(begin=5000.0), "overlap in time"),
     )
     for i, (cloud, way, why) in enumerate(cases):
-        done = carve(cloud, tmp_path / str(i), way, positions=((0.0, 0.0, 30.0),))
+        done = run_step(cloud, tmp_path / str(i), way, positions=((0.0, 0.0, 30.0),))
         assert why in str(done.metrics["rays"]) and not len(PointCloud.load(done.files["moving"]))
         assert way is not None or len(PointCloud.load(done.files["cloud"])) == len(cloud)
     assert street.time is not None
-    once = carve(street.take(street.time == 0.5), tmp_path / "once", path())
+    once = run_step(street.take(street.time == 0.5), tmp_path / "once", path())
     assert once.metrics["moved"] == 0 and "observed only once" in str(once.metrics["rays"])
 
 
 def test_profile_scanner_removes_nothing_in_one_pass(tmp_path: Path) -> None:
-    """It sees each place once, beside itself; the car that it passes stays, and the metrics say why."""
+    """It scans each position once, beside itself; the car that it passes is kept, and the metrics report the reason."""
     random = np.random.default_rng(3)
     x = random.uniform(0, 20, 60_000)
     y = np.where((x > 8) & (x < 12), 3.0, 6.0)
     xyz = np.column_stack([x, y, random.uniform(0, 2, len(x))]).astype(np.float32)
-    done = carve(PointCloud(Frame(), xyz, time=x / SPEED), tmp_path, path())
+    done = run_step(PointCloud(Frame(), xyz, time=x / SPEED), tmp_path, path())
     assert done.metrics["moved"] == 0 and "observed only once" in str(done.metrics["rays"])
     assert len(PointCloud.load(done.files["cloud"])) == len(x)
 
 
-def test_the_recording_vehicle_and_cameras_have_room(street: PointCloud, tmp_path: Path) -> None:
-    """Returns of the car's own roof and mirrors, and of something before a lens, go; the road below stays."""
+def test_points_of_the_recording_vehicle_and_near_cameras_are_removed(street: PointCloud, tmp_path: Path) -> None:
+    """Returns from the car's roof and mirrors, and from an object close to a lens; the road below is kept."""
     places = np.array([[5.0, 0.8, 1.2], [6.0, -0.5, 1.7], [20.0, 0.0, 0.6], [9.0, 6.0, 8.3], [9.0, 6.0, 9.2]])
     extra = PointCloud(
         street.frame, places.astype(np.float32), classification=np.full(5, POLE, np.uint8), time=np.full(5, 1.0)
     )
     cloud = PointCloud.join([street, extra])
-    done = carve(cloud, tmp_path, path(), positions=((9.0, 6.0, 8.0),))
+    done = run_step(cloud, tmp_path, path(), positions=((9.0, 6.0, 8.0),))
     kept = np.load(done.files["dropped"]) == 0
     assert kept[-5:].tolist() == [False, False, False, False, True]
     assert cloud.classification is not None and kept[cloud.classification == GROUND].all()
 
 
 def test_objects_absent_in_a_later_pass_are_removed(tmp_path: Path) -> None:
-    """A survey of hours: the car that is parked in the first pass has left by the second."""
+    """A car that is parked during the first pass has left before the second one, two hours later."""
     cloud = PointCloud.join([survey(1.5), survey(1.5, begin=7200.0, left=PARKED)])
     both = path(1.5), path(1.5, begin=7200.0)
     way = Trajectory(*(np.concatenate([getattr(one, of) for one in both]) for of in ("times", "positions")))
-    gone = lost(cloud, carve(cloud, tmp_path, way))
+    gone = removed_share(cloud, run_step(cloud, tmp_path, way))
     assert gone[PARKED] > 0.8
     assert all(share < 0.01 for kind, share in gone.items() if kind not in (PARKED, *MOVES))

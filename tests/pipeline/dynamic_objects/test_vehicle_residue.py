@@ -1,4 +1,4 @@
-"""What is left of vehicles: a made-up body where a car stood, a wall beside it and the ground below it."""
+"""Vehicle residue: area of a synthetic shell where a car stood, beside a wall and above the ground."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def plate(corner: tuple[float, float, float], a: tuple[float, float, float], b: 
     return Mesh(FRAME, places, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
 
 
-def boxes(path: Path, *kinds: str, heading: float = 0.0) -> Path:
-    """A file of things of 4 x 2 x 1.5 m with a corner in the origin, turned by `heading` (radians)."""
+def write_instances(path: Path, *kinds: str, heading: float = 0.0) -> Path:
+    """Write a file of instances of 4 x 2 x 1.5 m with a corner at the origin, turned by `heading` (radians)."""
     c, s = np.cos(heading), np.sin(heading)
     ring = np.array([[0, 0], [4, 0], [4, 2], [0, 2], [0, 0]]) @ np.array([[c, s], [-s, c]]) + FRAME.origin[:2]
     properties = {"ground_z": FRAME.origin[2], "height_m": 1.5}
@@ -35,15 +35,15 @@ def boxes(path: Path, *kinds: str, heading: float = 0.0) -> Path:
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.6])
-def test_a_shell_where_a_car_stood_is_measured(tmp_path: Path, heading: float) -> None:
+def test_area_of_a_shell_where_a_car_stood_is_measured(tmp_path: Path, heading: float) -> None:
     c, s = np.cos(heading), np.sin(heading)
     side = plate((1 * c - 1 * s, 1 * s + 1 * c, 0.5), (2 * c, 2 * s, 0), (0, 0, 0.8))  # 2 x 0.8 m along its middle
-    (left,) = residue_areas([side], boxes(tmp_path / "instances.geojson", "car", heading=heading))
+    (left,) = residue_areas([side], write_instances(tmp_path / "instances.geojson", "car", heading=heading))
     assert left == pytest.approx(1.6, rel=0.05)
 
 
-def test_ground_walls_and_people_are_not_vehicle_residue(tmp_path: Path) -> None:
+def test_ground_walls_and_crowns_are_not_vehicle_residue(tmp_path: Path) -> None:
     ground = plate((-5, -5, 0.1), (20, 0, 0), (0, 20, 0))
     wall = plate((-5, 1.95, 0), (20, 0, 0), (0, 0, 4))
     crown = plate((-5, -5, 3), (20, 0, 0), (0, 20, 0))
-    assert residue_areas([ground, wall, crown], boxes(tmp_path / "instances.geojson", "car", "person")) == [0]
+    assert residue_areas([ground, wall, crown], write_instances(tmp_path / "instances.geojson", "car", "person")) == [0]

@@ -1,4 +1,4 @@
-"""Street furniture: all of a street's poles, signs and trunks, where they stand, and nothing else."""
+"""Detection of a street's poles, signs and trunks at their true positions, without false positives."""
 
 from __future__ import annotations
 
@@ -58,10 +58,10 @@ def test_street_furniture_is_detected_without_false_positives(street: tuple[Path
         near = np.hypot(*(at - place).T)
         thing = found[int(near.argmin())]
         assert near.min() < 0.05 and thing["kind"] in (kind, "lamp")
-    for thing, place in zip(found, at, strict=True):  # and each is something
+    for thing, place in zip(found, at, strict=True):  # each detection is a real object
         assert np.hypot(*(np.array([*places, *trees]) - place).T).min() < 0.3, thing
-    assert sum(thing["kind"] == "trunk" for thing in found) >= len(trees) - 1  # one is at the street's very end
-    # their points are no surface's any more, and their meshes are the classes' own
+    assert sum(thing["kind"] == "trunk" for thing in found) >= len(trees) - 1  # one is at the end of the street
+    # their points are removed from surfaces
     cloud = PointCloud.load(street[0])
     done = SPLIT.run(
         {"cloud": street[0], "furniture_points": done.files["furniture_points"]},
@@ -72,7 +72,7 @@ def test_street_furniture_is_detected_without_false_positives(street: tuple[Path
     left = PointCloud.load(done.files["building"]).classification
     assert cloud.classification is not None and left is not None
     for code in (CODE["road_sign"], CODE["pole"]):
-        assert (left == code).sum() < 0.25 * (cloud.classification == code).sum()  # the lamp's arm is left
+        assert (left == code).sum() < 0.25 * (cloud.classification == code).sum()  # points of the lamp's arm remain
 
 
 def test_signs_have_their_heading_and_size(street: tuple[Path, Path], tmp_path: Path) -> None:
@@ -108,7 +108,7 @@ def test_furniture_keeps_triangles_and_classes_in_decimation(tmp_path: Path) -> 
     assert len(kept) == len(codes) and kept.vertices[:, 2].max() == 3
 
 
-def test_a_fence_a_wall_and_a_bush_are_no_poles() -> None:
+def test_fences_walls_and_bushes_are_not_poles() -> None:
     rng = np.random.default_rng(0)
 
     def scattered(count: int, low: tuple[float, ...], high: tuple[float, ...]) -> np.ndarray:
@@ -125,7 +125,7 @@ def test_a_fence_a_wall_and_a_bush_are_no_poles() -> None:
 
 
 @pytest.mark.parametrize("shape", ["rectangle", "disc", "triangle_down"])
-def test_a_plate_is_outlined_by_its_points(shape: Shape) -> None:
+def test_panel_has_the_shape_size_and_normal_of_its_points(shape: Shape) -> None:
     rng = np.random.default_rng(0)
     flat = rng.uniform(-1, 1, (4000, 2))
     flat = flat[inside(flat, OUTLINES[shape], 0)] * 0.35

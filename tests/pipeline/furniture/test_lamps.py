@@ -70,7 +70,7 @@ def assert_path(arm: Arm, heading: float) -> None:
 
 @pytest.mark.parametrize("heading", [0.0, 0.7, 2.5, -1.9])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_arm_and_head_are_where_they_are(heading: float, seed: int) -> None:
+def test_arm_and_head_are_fitted_at_their_true_positions(heading: float, seed: int) -> None:
     arm = fit(lamp(heading, seed=seed))
     assert arm is not None and arm.box is not None
     assert arm.path[0] == pytest.approx(TOP)
@@ -86,7 +86,7 @@ def test_arm_and_head_are_where_they_are(heading: float, seed: int) -> None:
     assert arm.path[-1] == pytest.approx(centre)
 
 
-def test_an_arm_without_a_head_has_no_box() -> None:
+def test_arm_without_a_head_has_no_box() -> None:
     arm = fit(lamp(0.4, head=False))
     assert arm is not None and arm.box is None
     assert_path(arm, 0.4)
@@ -94,7 +94,7 @@ def test_an_arm_without_a_head_has_no_box() -> None:
     assert LENGTH - 0.2 < end < LENGTH
 
 
-def test_result_moves_and_turns_with_the_points() -> None:
+def test_fit_is_equivariant_to_rigid_motion() -> None:
     xyz = lamp(0.3)
     arm = fit(xyz)
     shift, turn = np.array([128.0, -64.0, 32.0]), axes(1.1).T
@@ -109,14 +109,14 @@ def test_result_moves_and_turns_with_the_points() -> None:
     assert arm.moved(shift).box[0] == pytest.approx(arm.box[0] + shift)  # type: ignore[index]
 
 
-def test_order_of_points_does_not_matter() -> None:
+def test_fit_is_independent_of_the_order_of_points() -> None:
     xyz = lamp(0.3)
     one, two = fit(xyz), fit(xyz[np.random.default_rng(5).permutation(len(xyz))])
     assert one is not None and two is not None and one.box is not None and two.box is not None
     assert two.path == pytest.approx(one.path, abs=1e-9) and two.box[0] == pytest.approx(one.box[0], abs=1e-9)
 
 
-def test_contains_the_lamp_and_nothing_beside_it() -> None:
+def test_arm_contains_only_points_of_the_lamp() -> None:
     xyz = lamp(0.7)
     arm = fit(xyz)
     assert arm is not None
@@ -163,14 +163,14 @@ def test_only_the_arm_of_a_tall_pole_is_a_lamp() -> None:
 
 
 @pytest.mark.parametrize(("length", "is_lamp"), [(3.2, True), (3.7, False), (6.0, False)])
-def test_an_arm_longer_than_the_maximum_is_no_lamp(length: float, is_lamp: bool) -> None:
+def test_arm_longer_than_the_maximum_is_not_a_lamp(length: float, is_lamp: bool) -> None:
     """A wire or a bridge that begins at a pole must not become an arm of the maximum length."""
     rng = np.random.default_rng(0)
     bar = TOP + rng.uniform((0, -0.04, -0.04), (length, 0.04, 0.04), (int(1000 * length), 3))
     assert (fit(np.concatenate([pole_points(rng), bar])) is not None) == is_lamp
 
 
-def test_too_few_or_degenerate_points_are_no_lamp() -> None:
+def test_too_few_or_degenerate_points_are_not_a_lamp() -> None:
     rng = np.random.default_rng(0)
     assert fit(np.zeros((0, 3))) is None
     assert fit(TOP + [[0.5, 0, 0]]) is None
@@ -178,7 +178,7 @@ def test_too_few_or_degenerate_points_are_no_lamp() -> None:
     assert fit(np.repeat(TOP[None] + (0.1, 0, 0), 100, axis=0)) is None
 
 
-def test_points_in_one_place_or_on_one_line_give_a_finite_arm() -> None:
+def test_coincident_or_collinear_points_give_a_finite_arm() -> None:
     line = TOP + np.column_stack([np.linspace(0.12, 1.5, 200), np.zeros((200, 2))])
     place = TOP + np.tile([0.41, 0.0, 0.1], (200, 1))
     near = TOP + np.column_stack([np.linspace(0.12, 0.41, 10), np.zeros(10), np.linspace(0, 0.1, 10)])
@@ -188,7 +188,7 @@ def test_points_in_one_place_or_on_one_line_give_a_finite_arm() -> None:
         assert all(np.isfinite(vertices).all() for vertices, _ in arm.meshes())
 
 
-def test_a_sparse_wire_with_points_behind_the_pole() -> None:
+def test_sparse_wire_with_points_behind_the_pole_is_not_a_lamp() -> None:
     """No section of the arm has enough points for a centre."""
     wire = np.column_stack([np.arange(0.15, 3.3, 0.19), np.zeros((17, 2))])
     behind = np.column_stack([np.full(16, -0.12), np.linspace(-0.02, 0.02, 16), np.zeros(16)])

@@ -1,4 +1,4 @@
-"""Radius and position of posts in sweeps of a scanner that drives past, with errors of its poses."""
+"""Radius and position of posts in sweeps of a passing scanner with pose errors."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Drive:
 
 @pytest.mark.parametrize("radius, height", [(0.03, 2.8), (0.07, 6.0), (0.2, 4.0), (0.05, 1.0), (0.1, 1.1)])
 @pytest.mark.parametrize("pose_error", [0.0, 0.05])
-def test_posts_are_as_slim_as_they_are(radius: float, height: float, pose_error: float) -> None:
+def test_posts_have_their_true_radius_and_position(radius: float, height: float, pose_error: float) -> None:
     drive = Drive(pose_error)
     drive.post(0.0, 6.0, radius, height)
     drive.wall((-8.0, 9.0), (8.0, 9.0))
@@ -87,7 +87,7 @@ def test_trunks_are_detected_in_spite_of_the_class_vehicle() -> None:
     assert trunk.stem.thickness == pytest.approx(0.15, abs=0.02)
 
 
-def test_low_parts_of_vehicles_and_pickets_are_no_posts() -> None:
+def test_low_parts_of_vehicles_and_pickets_are_not_posts() -> None:
     drive = Drive(0.0)
     drive.post(0.0, 6.0, 0.05, 1.0)
     assert len(drive.detect()) == 1 and not drive.detect("vehicle")
@@ -97,13 +97,13 @@ def test_low_parts_of_vehicles_and_pickets_are_no_posts() -> None:
     assert not fence.detect()
 
 
-def test_strip_of_a_wall_is_no_post() -> None:
+def test_strip_of_a_wall_is_not_a_post() -> None:
     drive = Drive(0.0, sweeps=10)  # seen from one side only, as between two parked cars
     drive.wall((0.0, 6.0), (0.0, 6.3))
     assert not drive.detect()
 
 
-def test_radius_without_times_comes_from_circles() -> None:
+def test_radius_without_timestamps_is_fitted_to_circles() -> None:
     drive = Drive(0.0)
     drive.post(0.0, 6.0, 0.1, 4.0)
     (post,) = drive.detect(timed=False)

@@ -52,7 +52,7 @@ def test_boxes_contain_a_wall_and_extend_beyond_it_by_at_most_a_cell(heading: fl
 
 @pytest.mark.parametrize("heading", [0.1, 0.6, np.pi / 4, 1.3])
 def test_nothing_passes_between_the_boxes_of_a_wall(heading: float) -> None:
-    """A sphere of 1 mm that crosses the wall anywhere meets a box."""
+    """A sphere of 1 mm that crosses the wall anywhere collides with a box."""
     low, high = boxes(wall(heading), CELL)
     along, across = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
     start = np.array([0.31, 0.17]) + np.linspace(0.1, 3.9, 381)[:, None] * along
@@ -75,14 +75,14 @@ def test_heights_at_multiples_of_the_step_are_kept(heading: float, bottom: float
     assert set(low[:, 2]) == {bottom} and set(high[:, 2]) == {top}
 
 
-def test_a_plate_is_one_box_as_thick_as_a_height_step() -> None:
+def test_level_plate_is_one_box_with_the_thickness_of_a_height_step() -> None:
     low, high = boxes(quad((0.1, 0.1, 0.6), (2.1, 0.1, 0.6), (2.1, 1.1, 0.6)), CELL)
     assert low == pytest.approx(np.array([[0.0, 0.0, 0.5]]))
     assert high == pytest.approx(np.array([[2.2, 1.2, 0.5 + HEIGHT_STEP_M]]))
 
 
 def test_parts_of_different_height_are_not_merged() -> None:
-    """A low wall that continues a high one must not be raised, nor the high one lowered."""
+    """A low wall next to a high one must not be raised, nor the high one lowered."""
     high_part = quad((0.1, 0.1, 0.1), (2.1, 0.1, 0.1), (2.1, 0.1, 2.9))
     low_part = quad((2.3, 0.1, 0.1), (4.1, 0.1, 0.1), (4.1, 0.1, 0.9))
     low, high = boxes(np.concatenate([high_part, low_part]), CELL)
@@ -99,7 +99,7 @@ def test_boxes_do_not_overlap() -> None:
     assert not (overlap > 1e-6).all(axis=2).any()
 
 
-def test_boxes_move_with_the_triangles_and_do_not_depend_on_their_order() -> None:
+def test_boxes_are_equivariant_to_shifts_and_independent_of_triangle_order() -> None:
     corners = np.concatenate([wall(0.4), wall(1.9)])
     low, high = boxes(corners, 0.25)
     shift = np.array([12.5, -7.25, 3.75], np.float32)  # whole cells and steps, exact in binary
@@ -121,7 +121,7 @@ def test_samples_are_dense_and_include_the_corners() -> None:
     assert distance.max() < 0.3 / np.sqrt(3) + 1e-6
 
 
-def test_degenerate_triangles() -> None:
+def test_degenerate_triangles_are_accepted() -> None:
     none = boxes(np.zeros((0, 3, 3), np.float32), CELL)
     assert none[0].shape == none[1].shape == (0, 3)
     point = boxes(np.full((1, 3, 3), 0.3, np.float32), CELL)

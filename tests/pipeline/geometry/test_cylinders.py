@@ -1,4 +1,4 @@
-"""Poles and trunks as cylinders, which physics engines take as they are."""
+"""Poles and trunks as cylinders, which physics engines support as primitives."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def mesh(parts: list[tuple[primitives.Triangles, str]]) -> Mesh:
     return Mesh(Frame(), vertices.astype(np.float32), faces, classification=codes)
 
 
-def test_a_leaning_trunk_is_where_its_tube_is() -> None:
+def test_leaning_trunk_becomes_a_cylinder_along_its_tube() -> None:
     (one,), rest = split_cylinders(mesh([(TRUNK, "high_vegetation")]))
     assert len(rest) == 0 and one.code == CODE["high_vegetation"]
     assert one.centre == pytest.approx((5.1, 5, 1), abs=0.01) and one.radius == pytest.approx(0.19, abs=0.005)
@@ -37,7 +37,7 @@ def test_angles_rotate_the_z_axis_onto_the_cylinder_axis() -> None:
     assert roll == 0 and turned == pytest.approx(one.axis)
 
 
-def test_bent_and_flat_shapes_and_walls_stay_meshes() -> None:
+def test_bent_and_flat_shapes_and_walls_remain_meshes() -> None:
     parts = [(POLE, "pole"), (ARM, "pole"), (PLATE, "road_sign"), (TRUNK, "building")]
     found, rest = split_cylinders(mesh(parts))
     assert len(found) <= 1 and len(rest) >= sum(len(part[1]) for part, _ in parts[1:])

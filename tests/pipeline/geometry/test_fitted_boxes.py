@@ -1,4 +1,4 @@
-"""Boxes around points: position, openings between things, tables, hidden parts, budget."""
+"""Boxes fitted to points: position, gaps between objects, tables, hidden parts, maximum number."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def box(low: tuple[float, float, float], high: tuple[float, float, float], seed:
     return (low + points * size).astype(np.float32)
 
 
-def test_one_box_is_one_box() -> None:
+def test_points_of_one_box_give_one_box() -> None:
     xyz = box((1, 2, 0), (2.2, 2.6, 0.8))
     (found,) = fit_boxes(xyz, 0.05)
     vertices, faces = mesh_of([found])
@@ -32,7 +32,7 @@ def test_one_box_is_one_box() -> None:
     assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() > 0  # faces point outwards
 
 
-def test_l_shape_does_not_close_its_corner() -> None:
+def test_boxes_of_an_l_shape_leave_its_corner_free() -> None:
     xyz = np.concatenate([box((0, 0, 0), (3, 0.5, 0.8)), box((0, 0.5, 0), (0.5, 3, 0.8), 1)])
     found = fit_boxes(xyz, 0.05)
     vertices, faces = mesh_of(found)
@@ -46,7 +46,7 @@ def test_l_shape_does_not_close_its_corner() -> None:
     assert not any(inside)
 
 
-def test_budget_and_scattered_points() -> None:
+def test_scattered_points_stay_within_the_maximum_number_of_boxes() -> None:
     xyz = np.random.default_rng(0).uniform(0, 2, (2000, 3)).astype(np.float32)
     assert len(fit_boxes(xyz, 0.1, max_boxes=3)) <= 3
     assert fit_boxes(np.zeros((0, 3), np.float32), 0.05) == []
@@ -93,7 +93,7 @@ def test_front_of_a_cupboard_becomes_a_solid_box() -> None:
     assert len(boxes) <= 6
 
 
-def test_sides_do_not_move_with_the_noise() -> None:
+def test_sides_of_a_box_are_unbiased_by_noise() -> None:
     rng = np.random.default_rng(0)
     xyz = box((0, 0, 0.1), (1.2, 0.6, 0.8))
     noisy = (xyz + rng.normal(0, 0.05, xyz.shape) * [1, 1, 0]).astype(np.float32)
@@ -102,7 +102,7 @@ def test_sides_do_not_move_with_the_noise() -> None:
     assert np.allclose(one.low[:2], 0, atol=0.06) and np.allclose(one.high[:2], (1.2, 0.6), atol=0.06)
 
 
-def test_heading_of_the_walls_is_kept_by_things_beside_each_other() -> None:
+def test_adjacent_objects_keep_the_heading_of_the_walls() -> None:
     xyz = np.concatenate([box((0, 0, 0.1), (1.5, 0.6, 0.8)), box((1.55, 0.3, 0.1), (2.1, 1.8, 0.8), 1)])
     boxes = fit_boxes(xyz, 0.05, around=Surroundings(floor((-2, -2), (4, 4)), 0.0))
     assert all(one.heading == 0 for one in boxes)

@@ -1,4 +1,4 @@
-"""Kernels of Gauss-Newton: sparse and banded systems equal dense ones."""
+"""Gauss-Newton kernels: sparse and banded systems equal dense ones."""
 
 from __future__ import annotations
 

@@ -118,7 +118,9 @@ def precision(length: float, density: float = DENSITY, noise: float = 0.0) -> fl
 @pytest.mark.parametrize(
     ("density", "gradient", "noise"), [(900.0, 1.0, 0.0), (900.0, 1.0, 0.01), (1600.0, 1.0, 0.0), (900.0, 4.0, 0.005)]
 )
-def test_outline_and_opening_are_where_they_are(density: float, gradient: float, noise: float) -> None:
+def test_sides_of_outline_and_opening_are_at_their_true_positions(
+    density: float, gradient: float, noise: float
+) -> None:
     xyz, own, planes = scene((FRONT, scan(opening=WINDOW, density=density, gradient=gradient, noise=noise)))
     found = sides(xyz, own, planes, VOXEL)
     assert len(found) == len(CORNERS) + len(WINDOW) and found.fitted.all() and found.hole.sum() == len(WINDOW)
@@ -134,7 +136,7 @@ def test_outline_and_opening_are_where_they_are(density: float, gradient: float,
             assert bool(found.hole[side]) == hole
 
 
-def test_an_obtuse_corner_stays() -> None:
+def test_obtuse_corner_is_kept() -> None:
     """The eaves of a wall turn by 12 degrees in the middle: the corner is 26 cm above the line through their ends."""
     bent = ((0, 0), (5, 0), (5, 2.5), (2.5, 2.5 + 2.5 * np.tan(np.radians(12))), (0, 2.5 + 2.5 * np.tan(np.radians(6))))
     xyz, own, planes = scene((FRONT, scan(bent)))
@@ -144,8 +146,8 @@ def test_an_obtuse_corner_stays() -> None:
         assert np.linalg.norm(found.start - corner, axis=1).min() < 0.04
 
 
-def test_gaps_that_surfaces_close_are_no_openings() -> None:
-    """Twice the closing radius: narrower gaps stay closed in the mesh, too."""
+def test_gaps_narrower_than_the_closing_width_are_not_openings() -> None:
+    """The closing width is twice the closing radius; the mesh closes narrower gaps, too."""
     width = 2 * LIMITS.closing_radius * VOXEL
     for factor, holes in ((0.8, 0), (1.4, 4)):
         gap = ((2, 1), (2 + factor * width, 1), (2 + factor * width, 2.5), (2, 2.5))
@@ -153,8 +155,8 @@ def test_gaps_that_surfaces_close_are_no_openings() -> None:
         assert sides(xyz, own, planes, VOXEL).hole.sum() == holes
 
 
-def test_a_ragged_side_is_not_fitted() -> None:
-    """A side whose points end anywhere within 30 cm has no straight boundary that they show."""
+def test_ragged_side_is_not_fitted() -> None:
+    """Points that end anywhere within 30 cm do not determine a straight boundary."""
     flat, random = scan(((0, 0), (6, 0), (6, 3), (0, 3))), np.random.default_rng(1)
     ragged = random.uniform(-0.3, 0, 60)[np.clip((flat[:, 0] / 0.1).astype(int), 0, 59)]
     xyz, own, planes = scene((FRONT, flat[flat[:, 1] < 3 + ragged]))
@@ -165,9 +167,9 @@ def test_a_ragged_side_is_not_fitted() -> None:
     assert found.fitted[~top].all() and length[~top].sum() > 6 + 2 * 2.5
 
 
-def test_points_get_the_plane_they_lie_on() -> None:
-    """Two walls that meet in a corner (within the tolerance of both, either will do), and a box 20 cm before one."""
-    other = Surface(FRONT.origin, (-0.6, 0.8, 0.0), (0.0, 0.0, -1.0))  # goes back from the front's left end
+def test_points_are_assigned_to_their_plane() -> None:
+    """Two walls that meet in a corner (within the tolerance of both, either is correct), and a box 20 cm in front."""
+    other = Surface(FRONT.origin, (-0.6, 0.8, 0.0), (0.0, 0.0, -1.0))  # backwards from the front's left end
     noise, flat = 0.01, scan(((0, 0), (4, 0), (4, 3), (0, 3)))
     xyz, true, planes = scene((FRONT, flat), (other, flat * (1, -1)))
     xyz += np.random.default_rng(2).normal(0, noise, xyz.shape).astype(np.float32)
@@ -184,7 +186,7 @@ def test_points_get_the_plane_they_lie_on() -> None:
 
 @pytest.mark.parametrize(("depth", "steps"), [(0.02, 0), (0.15, 4), (0.3, 4), (0.6, 0)])
 def test_steps_join_a_window_to_the_wall_around_it(depth: float, steps: int) -> None:
-    """Reveals have the pane's depth; a pane within twice the tolerance is the wall, one far behind another room."""
+    """Reveals have the pane's depth; there are none if it is within twice the tolerance, or far behind the wall."""
     pane = Surface(tuple(np.array(FRONT.origin) - depth * FRONT.normal), FRONT.along)
     xyz, own, planes = scene((FRONT, scan(((0, 0), (5, 0), (5, 4), (0, 4)), WINDOW)), (pane, scan(WINDOW, seed=1)))
     thin, which = thinned(xyz, own)
@@ -210,7 +212,7 @@ def ends_of(
     xyz, own, planes = scene(*parts)
     thin, which = thinned(xyz, own)
     found = sides(xyz, own, planes, VOXEL)
-    border = found.along(VOXEL)[0] + 0.25 * found.outward[found.along(VOXEL)[1]]  # what trim leaves of the surface
+    border = found.along(VOXEL)[0] + 0.25 * found.outward[found.along(VOXEL)[1]]  # surface after `trim`
     ends: F32 = border.astype(np.float32) if bordered else np.full((1, 3), 1e3, np.float32)
     places, of = open_boundaries(found, planes, thin, which, others, ends, VOXEL)
     return found, places, of, planes, thin
@@ -222,7 +224,7 @@ def test_walls_are_open_at_their_ends_but_not_at_corner_and_ground() -> None:
     x, y = np.meshgrid(np.arange(-6, 6, 0.1), np.arange(-6, 6, 0.1))
     ground = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) + FRONT.origin
     found, places, of, _, _ = ends_of([(FRONT, flat), (other, flat * (1, -1))], ground.astype(np.float32))
-    local = np.column_stack([FRONT.flat(places), (places - FRONT.origin) @ FRONT.normal])  # along, up, before the front
+    local = np.column_stack([FRONT.flat(places), (places - FRONT.origin) @ FRONT.normal])  # along, up, in front
     for along, before in ((4.0, 0.0), (0.0, -4.0)):  # the free ends, over most of their height
         near = (np.abs(local[:, 0] - along) < 0.02) & (np.abs(local[:, 2] - before) < 0.02)
         assert np.ptp(local[near, 1]) > 2.3 and local[near, 1].min() > 1.5 * VOXEL
@@ -232,7 +234,7 @@ def test_walls_are_open_at_their_ends_but_not_at_corner_and_ground() -> None:
     assert found.fitted[of].all()
 
 
-def test_nothing_is_open_away_from_the_border_of_the_mesh() -> None:
+def test_only_points_at_the_border_of_the_mesh_are_open() -> None:
     _, places, _, _, _ = ends_of([(FRONT, scan())], bordered=False)
     assert not len(places)
 

@@ -37,7 +37,7 @@ RIMS = [(0, 2), (0, 4), (4, 6), (2, 6), (0, 1), (2, 3), (4, 5), (6, 7), (1, 3), 
 
 
 def placed(xyz: F64) -> F64:
-    """Positions in the house's own axes, turned and shifted to where it stands."""
+    """Positions in the axes of the house, rotated and shifted to the world."""
     return xyz @ TURN.T + SHIFT
 
 
@@ -51,7 +51,7 @@ def house_planes() -> Planes:
 
 
 def house_grid() -> tuple[F64, I32]:
-    """The house's exact mesh in its own axes: grids on its faces, welded."""
+    """Exact mesh in the axes of the house: welded grids on its faces."""
     count = np.rint(np.array([SIZE, SIZE, RIDGE]) / SPACING).astype(int)
     corners = []
     for axis in range(3):
@@ -151,8 +151,8 @@ def points(house: House) -> tuple[F32, I32]:
     return house.xyz, house.which
 
 
-def test_other_parts_and_fixed_vertices_stay(house: House) -> None:
-    """A dome, which has no plane, and a border to another tile: moved by no more than the noise for decimation."""
+def test_vertices_without_a_plane_and_fixed_vertices_are_kept(house: House) -> None:
+    """A dome, which has no plane, and the border to another tile: moved by at most the noise added for decimation."""
     a, b = (k.ravel() for k in np.meshgrid(np.linspace(0, 1.4, 20), np.linspace(0, 6.2, 60)))
     dome = np.column_stack([np.cos(b) * np.cos(a), np.sin(b) * np.cos(a), np.sin(a)]) * 0.8 + SHIFT + [1.5, 1.5, 5.0]
     i = np.array([r * 20 + c for r in range(59) for c in range(19)])
@@ -170,7 +170,7 @@ def test_other_parts_and_fixed_vertices_stay(house: House) -> None:
 
 
 def test_relief_blends_into_its_plane() -> None:
-    """Flat up to the tolerance, untouched from 1.5 tolerances on, in between partly; near an edge, always."""
+    """Flat up to the tolerance, unchanged beyond 1.5 tolerances, blended in between; always flat near an edge."""
     x, y = (k.ravel() for k in np.meshgrid(np.arange(5.0), np.arange(5.0)))
     height = TOLERANCE * np.array([0.5, 1.0, 1.25, 1.5, 2.0])[x.astype(int)]
     i = np.array([r * 5 + c for r in range(4) for c in range(4)])
@@ -184,7 +184,7 @@ def test_relief_blends_into_its_plane() -> None:
         assert z == pytest.approx(TOLERANCE * np.array(left)[x.astype(int)], abs=EXACT)
 
 
-def test_a_surface_ends_in_a_straight_line_at_a_boundary_plane() -> None:
+def test_surface_ends_in_a_straight_line_at_a_boundary_plane() -> None:
     """Vertices of the last planes are beyond an end: their faces are removed up to it."""
     x, y = (k.ravel() for k in np.meshgrid(np.arange(0, 1.01, SPACING), np.arange(0, 1.01, SPACING)))
     n = round(len(x) ** 0.5)
@@ -201,7 +201,7 @@ def test_a_surface_ends_in_a_straight_line_at_a_boundary_plane() -> None:
 
 
 def test_faces_do_not_flip() -> None:
-    """A vertex that would cross the opposite side goes back, others stay where they were moved."""
+    """A vertex that would cross the opposite side is moved back, others keep their new positions."""
     first = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], float)
     last = first + [[0, 0, 0.1]]
     last[0] = 1.2, 1.2, 0.1

@@ -1,4 +1,4 @@
-"""Boxes of modelled solids: the same volume, at any heading; scanned surfaces are left as they are."""
+"""Boxes of modelled solids: the same volume at any heading; scanned surfaces are not split."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def within(boxes: list[Box], points: F64) -> F64:
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.4, 1.9])
-def test_a_wall_with_a_door_is_exactly_its_boxes(heading: float) -> None:
+def test_boxes_of_a_wall_with_a_door_have_its_exact_volume(heading: float) -> None:
     boxes, rest = split_boxes(wall_with_door(heading))
     assert not len(rest) and len(boxes) <= 3
     own = np.random.default_rng(0).uniform((-0.2, -0.2, -0.2), (4.2, 0.3, 2.7), (20_000, 3))
@@ -60,7 +60,7 @@ def test_a_wall_with_a_door_is_exactly_its_boxes(heading: float) -> None:
     assert (within(boxes, turned(own, heading)) == solid)[~near].all()
 
 
-def test_furniture_that_touches_stays_apart_by_its_heading() -> None:
+def test_furniture_of_different_heading_is_split_into_separate_boxes() -> None:
     made = [
         Box(0.3, np.array([0.0, 0, 0]), np.array([1.0, 0.6, 0.7])),
         Box(1.0, np.array([3.0, 0, 0]), np.array([4.0, 1, 1])),
@@ -72,7 +72,7 @@ def test_furniture_that_touches_stays_apart_by_its_heading() -> None:
     assert volumes == pytest.approx([0.42, 1.0], abs=1e-4)
 
 
-def test_open_and_slanted_surfaces_are_no_boxes() -> None:
+def test_open_and_slanted_surfaces_are_not_boxes() -> None:
     vertices, faces = mesh_of([Box(0.0, np.zeros(3), np.ones(3))])
     lid_off = Mesh(Frame(), vertices, faces[np.abs(faces // 4).min(axis=1) == 0])
     assert is_rectilinear(lid_off) and split_boxes(lid_off)[0] == []

@@ -1,4 +1,4 @@
-"""Plain clouds with a CSV of photos."""
+"""Import of clouds with a CSV table of photos."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def photos(folder: Path, heading: str, *rows: str) -> Path:
     return path
 
 
-def test_several_clouds_in_one_crs_make_a_tile(tmp_path: Path) -> None:
+def test_clouds_of_one_crs_become_one_tile(tmp_path: Path) -> None:
     files = [cloud(tmp_path / "a.laz"), cloud(tmp_path / "b.las", at=500_050.0)]
     tile = read_tile(import_las(files, tmp_path / "tile", name="two clouds"))
     assert (tile.name, tile.frame.crs, len(tile.views)) == ("two_clouds", "EPSG:32632", 0)
@@ -44,8 +44,8 @@ def test_several_clouds_in_one_crs_make_a_tile(tmp_path: Path) -> None:
     assert all(path.parent == tmp_path / "tile" and not path.is_symlink() for path in tile.clouds)
 
 
-def test_the_three_ways_to_give_a_rotation_agree(tmp_path: Path) -> None:
-    """A camera that looks north: x east, y down, z north; as omega = 90 degrees it is turned up from nadir."""
+def test_three_rotation_conventions_agree(tmp_path: Path) -> None:
+    """A camera that looks north: x east, y down, z north; omega = 90 degrees tilts it from nadir to the horizon."""
     where = "x,y,z"
     forms = {
         "r11,r12,r13,r21,r22,r23,r31,r32,r33": "1,0,0,0,0,1,0,-1,0",
@@ -65,14 +65,14 @@ def test_the_three_ways_to_give_a_rotation_agree(tmp_path: Path) -> None:
         assert (view.camera.fy, view.camera.distortion) == (50.0, (-0.1, 0.0, 0.0, 0.0))
 
 
-def test_a_nadir_photo_with_no_angles_has_north_up(tmp_path: Path) -> None:
+def test_photo_with_zero_angles_looks_down_with_north_up(tmp_path: Path) -> None:
     sheet = photos(tmp_path, f"file,x,y,z,omega,phi,kappa,{CAMERA}", f"1.png,500010,5400005,150,0,0,0,{VALUES}")
     tile = read_tile(import_las([cloud(tmp_path / "c.laz")], tmp_path / "tile", photos=sheet))
     assert np.allclose(tile.views[0].T_world_cam[:3, :3] @ [0, 0, 1], [0, 0, -1])  # it looks down
-    assert np.allclose(tile.views[0].T_world_cam[:3, :3] @ [0, -1, 0], [0, 1, 0])  # its top is north
+    assert np.allclose(tile.views[0].T_world_cam[:3, :3] @ [0, -1, 0], [0, 1, 0])  # image up is north
 
 
-def test_cameras_may_have_a_file_of_their_own_and_masks_come_along(tmp_path: Path) -> None:
+def test_cameras_are_read_from_a_separate_file_and_masks_are_imported(tmp_path: Path) -> None:
     sheet = photos(
         tmp_path,
         "file,x,y,z,qw,qx,qy,qz,camera,mask",
@@ -89,7 +89,7 @@ def test_cameras_may_have_a_file_of_their_own_and_masks_come_along(tmp_path: Pat
     assert tile.views[0].photo.is_symlink() and tile.clouds[0].is_symlink()
 
 
-def test_a_cloud_without_crs_needs_one(tmp_path: Path) -> None:
+def test_cloud_without_crs_needs_the_crs_option(tmp_path: Path) -> None:
     bare = cloud(tmp_path / "bare.las", crs="local")
     with pytest.raises(InputError, match=r"bare\.las: has no CRS.*--crs EPSG:32633.*--crs local"):
         import_las([bare], tmp_path / "tile")
@@ -115,14 +115,16 @@ ROW = "1.png,500010,5400005,102,1,0,0,0"
         ("file,x,y,z,qw,qx,qy,qz,width,height", f"{ROW},64,48", r"row 2: `fx` is ''.*Fix that cell"),
     ],
 )
-def test_mistakes_in_the_csv_are_named(tmp_path: Path, heading: str, row: str, message: str) -> None:
+def test_errors_in_the_csv_are_reported_with_row_and_remedy(
+    tmp_path: Path, heading: str, row: str, message: str
+) -> None:
     sheet = photos(tmp_path, heading, row)
     with pytest.raises(InputError, match=rf"photos\.csv: .*{message}"):
         import_las([cloud(tmp_path / "c.laz")], tmp_path / "tile", photos=sheet)
     assert not (tmp_path / "tile").exists() and not list(tmp_path.glob(".tile*"))
 
 
-def test_missing_photo_is_named_and_existing_tile_is_kept_without_overwrite(tmp_path: Path) -> None:
+def test_missing_photo_is_reported_and_existing_tile_kept_without_overwrite(tmp_path: Path) -> None:
     file = cloud(tmp_path / "c.laz")
     first = import_las([file], tmp_path / "tile", name="first")
     sheet = photos(tmp_path, f"file,x,y,z,qw,qx,qy,qz,{CAMERA}", f"{ROW},{VALUES}")
@@ -136,7 +138,7 @@ def test_missing_photo_is_named_and_existing_tile_is_kept_without_overwrite(tmp_
     assert read_tile(first).name == "second"
 
 
-def test_files_of_one_name_are_refused(tmp_path: Path) -> None:
+def test_files_of_equal_name_are_rejected(tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     with pytest.raises(InputError, match=r"other/c\.laz: is the second file with the name c\.laz.*Rename"):
         import_las([cloud(tmp_path / "c.laz"), cloud(tmp_path / "other" / "c.laz")], tmp_path / "tile")

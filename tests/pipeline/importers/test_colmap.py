@@ -1,4 +1,4 @@
-"""COLMAP models: text and binary give the same tile, and points land on their observations."""
+"""COLMAP models: text and binary give the same tile, and points project onto their observations."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_text_and_binary_give_the_same_tile(tmp_path: Path) -> None:
     assert np.array_equal(a.xyz, b.xyz) and np.array_equal(present(a.rgb), present(b.rgb))
 
 
-def test_sparse_points_keep_place_and_colour(tmp_path: Path) -> None:
+def test_sparse_points_keep_position_and_colour(tmp_path: Path) -> None:
     model, _ = make_model(tmp_path, ["PINHOLE"])
     tile = read_tile(import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "tile"))
     cloud = clouds.read(tile.clouds[0], tile.frame)
@@ -98,7 +98,7 @@ def test_sparse_points_keep_place_and_colour(tmp_path: Path) -> None:
     assert np.array_equal(present(cloud.rgb), [p.color for p in points])
 
 
-def test_up_and_scale_turn_photos_and_points_together(tmp_path: Path) -> None:
+def test_up_and_scale_transform_photos_and_points_alike(tmp_path: Path) -> None:
     make_model(tmp_path, ["PINHOLE"])
     plain = read_tile(import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "a"))
     turned = read_tile(
@@ -113,7 +113,7 @@ def test_up_and_scale_turn_photos_and_points_together(tmp_path: Path) -> None:
     assert np.allclose(2 * distances[0], distances[1], atol=5e-3)
 
 
-def test_a_cloud_of_its_own_is_taken(tmp_path: Path) -> None:
+def test_given_cloud_replaces_the_sparse_points(tmp_path: Path) -> None:
     make_model(tmp_path, ["PINHOLE"])
     first = import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "a")
     tile = read_tile(
@@ -122,7 +122,7 @@ def test_a_cloud_of_its_own_is_taken(tmp_path: Path) -> None:
     assert tile.clouds[0].read_bytes() == (first.parent / "cloud.laz").read_bytes()
 
 
-def test_a_cloud_moves_with_its_model_but_for_one_that_has_a_crs(tmp_path: Path) -> None:
+def test_cloud_is_transformed_with_its_model_unless_it_has_a_crs(tmp_path: Path) -> None:
     model, _ = make_model(tmp_path, ["PINHOLE"])
     points = np.array([point.xyz for _, point in sorted(model.points3D.items())])
     cloud = tmp_path / "dense.xyz"
@@ -138,13 +138,13 @@ def test_a_cloud_moves_with_its_model_but_for_one_that_has_a_crs(tmp_path: Path)
         import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "c", cloud=placed, scale=2.0)
 
 
-def test_an_unsupported_camera_model_is_named_with_a_remedy(tmp_path: Path) -> None:
+def test_unsupported_camera_model_is_rejected_with_a_remedy(tmp_path: Path) -> None:
     camera = pycolmap.Camera.create_from_model_name(3, "FOV", 500.0, 640, 480)
     with pytest.raises(InputError, match=r"model_folder: camera 3 has the model FOV.*image_undistorter"):
         camera_of(Path("model_folder"), camera)
 
 
-def test_no_model_a_damaged_one_and_a_missing_photo_leave_nothing(tmp_path: Path) -> None:
+def test_failed_import_leaves_no_files(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"empty: contains no COLMAP model.*sparse/0"):
         import_model("colmap", tmp_path / "empty", tmp_path, tmp_path / "tile")
@@ -160,7 +160,7 @@ def test_no_model_a_damaged_one_and_a_missing_photo_leave_nothing(tmp_path: Path
 
 
 @pytest.mark.parametrize("form", ["bin", "txt"])
-def test_damaged_models_are_refused_or_read(tmp_path: Path, form: str) -> None:
+def test_damaged_models_are_rejected_or_read_without_a_crash(tmp_path: Path, form: str) -> None:
     make_model(tmp_path, ["OPENCV", "PINHOLE"])
     rng = np.random.default_rng(0)
     refused = 0
@@ -181,9 +181,9 @@ def test_damaged_models_are_refused_or_read(tmp_path: Path, form: str) -> None:
 
 
 def fused(folder: Path) -> Path:
-    """COLMAP's own stereo fusion of six photos of a wall 5 m away, red left of x = 0, green right of it.
+    """Stereo fusion by COLMAP of six photos of a wall 5 m away, red left of x = 0, green right of it.
 
-    Its depth maps, which need a GPU to be computed, are synthetic; what is fused and written is COLMAP's.
+    The depth maps, whose computation needs a GPU, are synthetic.
     """
     width, height, f, n = 64, 48, 60.0, 6
     for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps", "stereo/consistency_graphs"):
@@ -220,7 +220,7 @@ def fused(folder: Path) -> Path:
     return folder / "fused.ply"
 
 
-def test_colmaps_own_dense_cloud(tmp_path: Path) -> None:
+def test_dense_cloud_fused_by_colmap_is_imported(tmp_path: Path) -> None:
     cloud = fused(tmp_path)
     assert b"property float nx" in cloud.read_bytes()[:300]
     path = import_model("colmap", tmp_path / "sparse", tmp_path / "images", tmp_path / "tile", cloud=cloud)
@@ -235,16 +235,16 @@ def test_colmaps_own_dense_cloud(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_real_photos_are_placed_by_their_gps(real_data: Path, tmp_path: Path) -> None:
-    """COLMAP's own reconstruction of a walk along a street, whose photos hold a phone's GPS."""
+    """Reconstruction by COLMAP of a walk along a street; the photos contain a phone's GPS positions."""
     images, database = real_data / "opensfm_lund" / "images", tmp_path / "database.db"
     extraction, mapping = pycolmap.FeatureExtractionOptions(), pycolmap.IncrementalPipelineOptions()
     extraction.num_threads = 1
     extraction.max_image_size, extraction.sift.max_num_features = 800, 2000
     mapping.mapper.init_min_num_inliers, mapping.mapper.abs_pose_min_num_inliers = 60, 15
     pycolmap.set_random_seed(0)
-    mapping.num_threads, mapping.random_seed = 1, 0  # on several threads no two maps are the same
+    mapping.num_threads, mapping.random_seed = 1, 0  # maps are not reproducible with several threads
     mapping.mapper.num_threads, mapping.mapper.random_seed = 1, 0
-    mapping.ba_refine_extra_params = False  # distortion isn't observable on a straight walk: the map would bend
+    mapping.ba_refine_extra_params = False  # not observable on a straight walk
     pycolmap.extract_features(database, images, camera_mode=pycolmap.CameraMode.SINGLE, extraction_options=extraction)
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = 1
@@ -260,6 +260,6 @@ def test_real_photos_are_placed_by_their_gps(real_data: Path, tmp_path: Path) ->
     )
     assert tile.frame.crs == "EPSG:32633" and "georeferenced by the GPS of" in warned[0]
     poses = np.array([view.T_world_cam for view in tile.views])
-    assert -poses[:, 2, 1].mean() > 0.9  # the phone was held upright, which GPS doesn't know
+    assert -poses[:, 2, 1].mean() > 0.9  # the phone was held upright, which GPS does not observe
     assert 50 < np.ptp(poses[:, 1, 3]) < 250 and np.ptp(poses[:, 2, 3]) < 15  # a level street of 170 m to the north
-    assert poses[:, 1, 2].mean() > 0.8  # along which the photos look
+    assert poses[:, 1, 2].mean() > 0.8  # the photos look along the street

@@ -1,4 +1,4 @@
-"""nuScenes and PandaSet: a drive with ground truth in both layouts; what is wrong with a copy is named."""
+"""nuScenes and PandaSet: a drive with ground truth in both layouts, and errors of damaged copies."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def check_photos(tile: Tile, names: dict[str, str], turned: Callable[[F64], F64]
             assert np.abs(found - ends).max() < tolerance
 
 
-def test_nuscenes_is_placed_by_the_poses_of_each_file(tmp_path: Path) -> None:
+def test_nuscenes_files_are_placed_by_their_own_poses(tmp_path: Path) -> None:
     folder = write_nuscenes(tmp_path / "nuscenes", DRIVE)
     tile, text = imported("nuscenes", folder, tmp_path / "tile", "--scene", "scene-0061", "--pose-source", "given")
     assert tile.frame.crs == "EPSG:32648"
@@ -101,14 +101,14 @@ def test_nuscenes_is_placed_by_the_poses_of_each_file(tmp_path: Path) -> None:
     check_photos(tile, {name: name for name in T_EGO_CAMERA}, on_grid, 2e-5)
     cloud = clouds.read(tile.clouds[0], tile.frame)
     assert cloud.rgb is not None and cloud.intensity is not None and set(cloud.intensity) == {51 * 257}
-    for name, rgb in COLOURS.items():  # what a camera sees has its colour
+    for name, rgb in COLOURS.items():  # points in front of a camera have the colour of its image
         view = next(view for view in tile.views if view.photo.parent.name == name)
         ahead = cloud.xyz[(cloud.xyz - view.centre) @ view.T_world_cam[:3, 2] > 5]
         seen = cloud.rgb[(cloud.xyz - view.centre) @ view.T_world_cam[:3, 2] > 5]
         assert len(ahead) > 50 and np.median(np.abs(seen.astype(int) - rgb), axis=0).max() < 12
 
 
-def test_local_coordinates_are_those_of_the_map(tmp_path: Path) -> None:
+def test_drive_on_an_unknown_map_stays_in_map_coordinates(tmp_path: Path) -> None:
     folder = write_nuscenes(tmp_path, DRIVE, location="somewhere else")
     words = ("--scene", "token scene-0061", "--camera", "CAM_BACK", "--photo-interval", 0.2, "--link")
     tile, _ = imported("nuscenes", folder / "v1.0-mini", tmp_path / "tile", *words)
@@ -121,7 +121,7 @@ def test_local_coordinates_are_those_of_the_map(tmp_path: Path) -> None:
     assert "the origin of the map 'somewhere else' isn't known" in str(refused.exception)
 
 
-def test_missing_parts_are_left_out_with_a_warning(tmp_path: Path) -> None:
+def test_missing_sweeps_are_reported_by_a_warning(tmp_path: Path) -> None:
     folder = write_nuscenes(tmp_path / "data", DRIVE)
     for path in (folder / "sweeps").rglob("*.*"):
         path.unlink()
@@ -188,7 +188,7 @@ def cut(name: str, size: int) -> Callable[[Path], None]:
         (change("calibrated_sensor", camera_intrinsic=[]), "has no camera_intrinsic"),
     ],
 )
-def test_damage_of_nuscenes_is_named(tmp_path: Path, damage: Callable[[Path], None], message: str) -> None:
+def test_damaged_nuscenes_files_are_reported(tmp_path: Path, damage: Callable[[Path], None], message: str) -> None:
     folder = write_nuscenes(tmp_path, DRIVE)
     read(folder)
     damage(folder)
@@ -196,7 +196,7 @@ def test_damage_of_nuscenes_is_named(tmp_path: Path, damage: Callable[[Path], No
         read(folder)
 
 
-def test_scenes_and_cameras_that_there_are_are_listed(tmp_path: Path) -> None:
+def test_unknown_scene_or_camera_lists_available_ones(tmp_path: Path) -> None:
     folder = write_nuscenes(tmp_path, DRIVE)
     with pytest.raises(SettingError, match=r"no scene 'scene-0001' in .*Give one of them: another, scene-0061"):
         read(folder, "scene-0001")
@@ -209,7 +209,7 @@ def test_scenes_and_cameras_that_there_are_are_listed(tmp_path: Path) -> None:
         read(folder)
 
 
-def test_tables_are_read_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tables_are_read_in_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_nuscenes(tmp_path, DRIVE)
     monkeypatch.setattr(nuscenes, "CHUNK", 700)
     read(folder)
@@ -230,7 +230,7 @@ def gps_of(truth: F64, heading: float) -> F64:
     return np.column_stack([lat, lon, truth[:, 2] + 30])
 
 
-def test_pandaset_is_placed_as_its_world_coordinates(tmp_path: Path) -> None:
+def test_pandaset_stays_in_its_world_coordinates(tmp_path: Path) -> None:
     folder = write_pandaset(tmp_path / "001", DRIVE)
     tile, text = imported("pandaset", tmp_path, tmp_path / "out" / "tile")
     assert "8 sweeps and 10 photos in 0.3 s of 001" in text and "the world stays local" in text
@@ -240,7 +240,7 @@ def test_pandaset_is_placed_as_its_world_coordinates(tmp_path: Path) -> None:
     assert not tile.views
 
 
-def test_pandaset_is_georeferenced_by_a_path_that_is_long_enough(tmp_path: Path) -> None:
+def test_pandaset_is_georeferenced_if_gps_determines_the_heading(tmp_path: Path) -> None:
     long = Drive(sweeps=80, world=PLACE + [20.0, 0.0, 1.0] + np.zeros((1, 3)))
     truth = np.array([long.scanner(t)[:3, 3] - PLACE for t in long.times])
     gps = gps_of(truth, 0.7) + np.random.default_rng(1).normal(0, 2e-6, (80, 3)) * [1, 1, 1e5]
@@ -272,7 +272,7 @@ def test_pandaset_is_georeferenced_by_a_path_that_is_long_enough(tmp_path: Path)
         (lambda f: (f / "lidar" / "00.pkl.gz").write_bytes(pickled_table({"x": np.zeros(3)})), "has no column y, z, i"),
     ],
 )
-def test_damage_of_pandaset_is_named(tmp_path: Path, damage: Callable[[Path], None], message: str) -> None:
+def test_damaged_pandaset_files_are_reported(tmp_path: Path, damage: Callable[[Path], None], message: str) -> None:
     folder = write_pandaset(tmp_path / "001", DRIVE)
     damage(folder)
     with pytest.raises(InputError, match=message):
@@ -281,7 +281,7 @@ def test_damage_of_pandaset_is_named(tmp_path: Path, damage: Callable[[Path], No
             reader(path, time)
 
 
-def test_sequences_that_there_are_are_listed(tmp_path: Path) -> None:
+def test_ambiguous_folder_lists_available_sequences(tmp_path: Path) -> None:
     for name in ("001", "002"):
         write_pandaset(tmp_path / name, DRIVE)
     with pytest.raises(InputError, match=r"contains 2 sequences\. Give the folder of one of them: 001, 002"):
@@ -300,7 +300,7 @@ class Harmful:
         return os.mkdir, (str(self.trace),)
 
 
-def test_pickles_run_no_code(tmp_path: Path) -> None:
+def test_code_in_pickles_is_not_run(tmp_path: Path) -> None:
     path, trace = tmp_path / "a.pkl.gz", tmp_path / "trace"
     path.write_bytes(gzip.compress(pickle.dumps(Harmful(trace))))
     with pytest.raises(InputError, match=r"names posix\.mkdir, which a table of numbers doesn't need"):
@@ -313,7 +313,7 @@ def test_pickles_run_no_code(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("protocol", [2, 4, 5])
-def test_tables_of_todays_pandas(tmp_path: Path, protocol: int) -> None:
+def test_tables_pickled_by_current_pandas_are_read(tmp_path: Path, protocol: int) -> None:
     pandas = pytest.importorskip("pandas")
     values = np.random.default_rng(0).normal(size=(50, 3))
     table = pandas.DataFrame(dict(zip("xyz", values.T, strict=True)) | {"d": np.arange(50, dtype=np.int32)})
@@ -325,7 +325,7 @@ def test_tables_of_todays_pandas(tmp_path: Path, protocol: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["nuscenes", "pandaset"])
-def test_drives_of_data_sets_become_surveys(tmp_path: Path, kind: str) -> None:
+def test_drives_of_datasets_become_surveys(tmp_path: Path, kind: str) -> None:
     long = Drive(sweeps=60)
     if kind == "nuscenes":
         write_nuscenes(tmp_path / "data", long)
@@ -346,6 +346,6 @@ def test_drives_of_data_sets_become_surveys(tmp_path: Path, kind: str) -> None:
         ('[nuscenes]\nfolder = "nothing"\n', "nothing: folder not found"),
     ],
 )
-def test_wrong_drives_are_named(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_drive_files_are_rejected(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         survey_of(drive_file(tmp_path, text), tmp_path / "out")

@@ -1,4 +1,4 @@
-"""Images inside E57 files: drawn by the equations of ASTM E2807, known points appear at their pixels in the tile."""
+"""Images in E57 files, drawn by the equations of ASTM E2807: known points project to their pixels in the tile."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def street(count: int = 4000) -> F64:
 
 
 def pixels(image: Image2D, xyz: F64) -> tuple[F64, np.ndarray]:
-    """Image coordinates (N, 2), (0, 0) at the corner, of points in the image's own axes, and whether it shows them.
+    """Image coordinates (N, 2), (0, 0) at the corner, of points in the image's axes, and whether they are visible.
 
     The equations 20 to 25 of the standard, literally.
     """
@@ -88,7 +88,7 @@ def drawn(image: Image2D, points: F64, encode: str = ".png") -> tuple[Image2D, F
 
 
 def errors(tile: Tile, view: View, points: F64) -> F64:
-    """Pixels (N,) between projected points (CRS), and the spots in the photo; NaN for those that the view misses."""
+    """Distance (N,) in pixels of projected points (CRS) from spots in the photo; NaN for points outside the view."""
     photo = read_photo(view)[..., 0].astype(np.float64) - 30
     local = (tile.frame.to_local(points) - view.T_world_cam[:3, 3]) @ view.T_world_cam[:3, :3]
     uv, valid = project(view.camera, local)
@@ -148,8 +148,8 @@ IMAGES = {
 
 
 @pytest.mark.parametrize("kind", IMAGES)
-def test_points_appear_where_the_standard_projects_them(tmp_path: Path, kind: str) -> None:
-    """Known points of the street, in every representation: to a twentieth of a pixel, to a tenth where resampled."""
+def test_points_project_as_defined_by_the_standard(tmp_path: Path, kind: str) -> None:
+    """Known points of the street in all representations: to 0.05 pixels, or 0.1 pixels if the image is resampled."""
     image, points = drawn(IMAGES[kind][0], street())
     tile, warned = imported(e57_files.write(tmp_path / "scan.e57", street(), [image]), tmp_path / "tile")
     (view,) = tile.views
@@ -167,7 +167,7 @@ def test_points_appear_where_the_standard_projects_them(tmp_path: Path, kind: st
         assert (mask[v, u] == 255).all() and 0.1 < (mask == 0).mean() < 0.9
 
 
-def test_pixels_of_a_part_of_a_sphere_are_copied(tmp_path: Path) -> None:
+def test_pixels_of_a_partial_sphere_are_copied_unchanged(tmp_path: Path) -> None:
     image, _ = drawn(ball((1200, 500), (270, 112.5)), street())
     tile, _ = imported(e57_files.write(tmp_path / "scan.e57", street(), [image]), tmp_path / "tile")
     photo, mask = read_photo(tile.views[0]), present(read_mask(tile.views[0]))
@@ -176,7 +176,7 @@ def test_pixels_of_a_part_of_a_sphere_are_copied(tmp_path: Path) -> None:
     assert (photo[150:650, 200:1400] == original).all() and (mask[150:650, 200:1400] == 255).all()
 
 
-def test_six_faces_of_a_cube_show_all_points(tmp_path: Path) -> None:
+def test_six_cube_faces_cover_all_points(tmp_path: Path) -> None:
     turns = [FORWARD * Rotation.from_euler("Y", 90 * i, degrees=True) for i in range(4)]
     turns += [FORWARD * Rotation.from_euler("X", angle, degrees=True) for angle in (90, -90)]
     cube = {"focalLength": 0.5, "pixelWidth": 1 / 512, "pixelHeight": 1 / 512}
@@ -207,7 +207,7 @@ def png(levels: U8) -> bytes:
     return cv2.imencode(".png", levels)[1].tobytes()
 
 
-def test_the_sample_streets_photos_survive_the_way_through_an_e57(tmp_path: Path) -> None:
+def test_sample_photos_round_trip_through_e57(tmp_path: Path) -> None:
     """Its panoramas and pinhole photos: same bytes, cameras, poses and times."""
     tile = read_tile(TILE)
     views = [view for view in tile.views if view.camera.model in ("pinhole", "equirectangular")]
@@ -215,7 +215,7 @@ def test_the_sample_streets_photos_survive_the_way_through_an_e57(tmp_path: Path
     for view in views:
         camera, R = view.camera, view.T_world_cam[:3, :3]
         around = camera.model == "equirectangular"
-        # columns: the image's axes, as of the standard, in ours
+        # columns: axes of the image by the standard, in camera axes
         R = R @ (np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]]) if around else np.diag([1, -1, -1]))
         numbers = {"pixelWidth": 2 * math.pi / camera.width, "pixelHeight": math.pi / camera.height}
         if not around:
@@ -244,7 +244,7 @@ def test_the_sample_streets_photos_survive_the_way_through_an_e57(tmp_path: Path
             assert getattr(new.camera, key) == pytest.approx(getattr(old.camera, key))
 
 
-def test_masks_come_along(tmp_path: Path) -> None:
+def test_masks_are_imported(tmp_path: Path) -> None:
     levels = np.zeros((400, 800), np.uint8)
     levels[:300] = 1  # "non-zero-valued pixels at locations where the image is valid"
     whole = ball((800, 400), (360, 180))
@@ -262,7 +262,7 @@ def test_masks_come_along(tmp_path: Path) -> None:
     assert "image small is used without its mask: it is 800 x 99 pixels" in warned[0]
 
 
-def test_a_panorama_without_a_pose_has_that_of_its_scan(tmp_path: Path) -> None:
+def test_panorama_without_a_pose_gets_that_of_its_scan(tmp_path: Path) -> None:
     points = street()
     image, marked = drawn(ball((1600, 800), (360, 180)), points)
     image = replace(image, rotation=None, associated=True, name="pano")
@@ -271,7 +271,7 @@ def test_a_panorama_without_a_pose_has_that_of_its_scan(tmp_path: Path) -> None:
     assert np.nanmax(errors(tile, tile.views[0], marked)) < 0.05
     assert "image pano has no pose: that of its scan is used" in warned[0]
     read = tile.frame.to_crs(clouds.read(tile.clouds[0], tile.frame).xyz)
-    assert np.abs(np.sort(read[:, 0]) - np.sort(points[:, 0])).max() < 0.02  # the scan itself is read as before
+    assert np.abs(np.sort(read[:, 0]) - np.sort(points[:, 0])).max() < 0.02  # the points are unchanged
 
 
 GOOD = replace(sized(PINHOLE, (80, 60), LENS, name="good"), blobs=flat(80, 60))
@@ -299,7 +299,7 @@ WHOLE = replace(ball((80, 40), (360, 180)), blobs=flat(80, 40))
         (replace(roll((80, 60), 500, 0.5), blobs=flat(80, 60)), "covers more than a full circle"),
     ],
 )  # fmt: skip
-def test_a_bad_image_is_named_and_left_out(tmp_path: Path, image: Image2D, cause: str) -> None:
+def test_invalid_image_is_reported_and_skipped(tmp_path: Path, image: Image2D, cause: str) -> None:
     path = e57_files.write(tmp_path / "scan.e57", street(50), [replace(image, name="bad.jpg"), GOOD])
     tile, (warning,) = imported(path, tmp_path / "tile")
     assert re.search(rf"scan\.e57: image bad(\.jpg)? is left out: it {cause}", warning), warning
@@ -316,8 +316,8 @@ def test_images_for_reference_only_are_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("pixel", [5e-6, 360 / 800])
-def test_a_full_sphere_with_an_impossible_pixel_size_is_used(tmp_path: Path, pixel: float) -> None:
-    """As ReCap and others accept them: 5e-6 in an example for manufacturers, or degrees."""
+def test_full_sphere_with_an_impossible_pixel_size_is_imported(tmp_path: Path, pixel: float) -> None:
+    """As ReCap and others accept: 5e-6 in an example for manufacturers, or degrees."""
     image, points = drawn(ball((800, 400), (360, 180)), street())
     image = replace(image, numbers={"pixelWidth": pixel, "pixelHeight": pixel}, name="pano")
     tile, warned = imported(e57_files.write(tmp_path / "scan.e57", street(), [image]), tmp_path / "tile")
@@ -325,7 +325,7 @@ def test_a_full_sphere_with_an_impossible_pixel_size_is_used(tmp_path: Path, pix
     assert "image pano has an impossible pixel size" in warned[0] and len(warned) == 1
 
 
-def test_images_of_one_name_are_kept_apart_and_odd_names_stay_in_the_tile(tmp_path: Path) -> None:
+def test_duplicate_image_names_get_suffixes_and_unsafe_names_are_sanitized(tmp_path: Path) -> None:
     names = ["a.jpg", "a", "../../a", "C:\\photos\\b.JPG", "", "ü x"]
     images = [replace(GOOD, name=name) for name in names]
     tile, _ = imported(e57_files.write(tmp_path / "scan.e57", street(50), images), tmp_path / "tile")
@@ -334,7 +334,7 @@ def test_images_of_one_name_are_kept_apart_and_odd_names_stay_in_the_tile(tmp_pa
 
 
 @pytest.mark.parametrize("options", [[], ["--no-images"]])
-def test_the_command_takes_or_leaves_them(tmp_path: Path, options: Sequence[str]) -> None:
+def test_command_imports_images_unless_disabled(tmp_path: Path, options: Sequence[str]) -> None:
     path = e57_files.write(tmp_path / "scan.e57", street(50), [GOOD])
     done = CliRunner().invoke(
         app, ["import", "clouds", str(path), "-o", str(tmp_path / "t"), "--crs", "local", *options]
@@ -344,7 +344,7 @@ def test_the_command_takes_or_leaves_them(tmp_path: Path, options: Sequence[str]
     assert (tmp_path / "t" / "photos").exists() is not bool(options)
 
 
-def test_other_photos_are_added(tmp_path: Path) -> None:
+def test_photos_of_a_table_are_added_to_those_of_the_e57(tmp_path: Path) -> None:
     (tmp_path / "1.jpg").write_bytes(flat(80, 60)["jpegImage"])
     table = tmp_path / "photos.csv"
     table.write_text("file,x,y,z,qw,qx,qy,qz,width,height,fx\n1.jpg,1,2,3,1,0,0,0,80,60,50\n", encoding="utf-8")
@@ -353,8 +353,8 @@ def test_other_photos_are_added(tmp_path: Path) -> None:
     assert [view.photo.name for view in tile.views] == ["1.jpg", "good.jpg"]
 
 
-def test_a_map_keeps_its_images_when_it_is_levelled(tmp_path: Path) -> None:
-    """`scan2sim run scan.e57`: axes are turned, images with them; the next run replaces them."""
+def test_images_are_rotated_with_a_levelled_map(tmp_path: Path) -> None:
+    """`scan2sim run scan.e57` rotates images with the axes of the map; the next run replaces them."""
     turn = Rotation.from_euler("XZ", [-90, 20], degrees=True)
     points = turn.apply(room().astype(np.float64))
     pose = (turn * TURN).as_quat(scalar_first=True).tolist()
@@ -364,7 +364,7 @@ def test_a_map_keeps_its_images_when_it_is_levelled(tmp_path: Path) -> None:
     for _ in range(2):
         tile = read_tile(tile_of_map(path, tmp_path / "out", MapParams()))
         T = present(tile.robot_map).T_world_map
-        assert T[2, 2] < 0.5  # it was not level
+        assert T[2, 2] < 0.5  # the map was not level
         off = errors(tile, tile.views[0], marked @ T[:3, :3].T + T[:3, 3])
         assert np.isfinite(off).all() and off.max() < 0.05
     assert not read_tile(tile_of_map(path, tmp_path / "out", MapParams(images=False))).views

@@ -1,4 +1,4 @@
-"""KITTI odometry: a made-up sequence whose geometry is known, and a real one where it is present."""
+"""KITTI odometry: a synthetic sequence with known geometry, and a real one if available."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def sequence(tmp_path: Path) -> Path:
 
 
 def make_sequence(tmp_path: Path) -> Path:
-    """A car that drives a curve past a wall of dots, each of another colour; as the data set is laid out."""
+    """A car drives a curve past a wall of dots of different colours; files in the layout of the data set."""
     folder = tmp_path / "sequences" / "31"
     for name in ("velodyne", "image_2"):
         (folder / name).mkdir(parents=True)
@@ -74,11 +74,11 @@ def make_sequence(tmp_path: Path) -> Path:
     return folder
 
 
-def test_sweeps_lie_on_each_other_and_photos_show_them(sequence: Path, tmp_path: Path) -> None:
+def test_sweeps_coincide_and_project_onto_their_pixels(sequence: Path, tmp_path: Path) -> None:
     tile = read_tile(import_kitti_odometry(sequence, tmp_path / "tile"))
     cloud = clouds.read(tile.clouds[0], tile.frame)
     wall, pixels = np.load(tmp_path / "wall.npy"), np.load(tmp_path / "pixels.npy")
-    xyz = tile.frame.to_crs(cloud.xyz).reshape(FRAMES, len(wall), 3)  # the car's own return is gone
+    xyz = tile.frame.to_crs(cloud.xyz).reshape(FRAMES, len(wall), 3)  # the return from the car itself is removed
     assert np.abs(xyz - wall).max() < 2e-3
     assert cloud.rgb is not None and (cloud.rgb.reshape(FRAMES, -1, 3)[..., 0] == 100).all() and GREY != 100
     assert [view.time for view in tile.views] == pytest.approx([0, 0.1, 0.2, 0.3])
@@ -103,7 +103,7 @@ def test_beam_angles_are_corrected(sequence: Path, tmp_path: Path) -> None:
     assert found["0"] > 0.1 and found["0.5"] < 2e-3
 
 
-def test_the_command_and_poses_of_ones_own(sequence: Path, tmp_path: Path) -> None:
+def test_command_accepts_a_pose_file(sequence: Path, tmp_path: Path) -> None:
     (tmp_path / "poses" / "31.txt").rename(tmp_path / "mine.txt")
     options = ["import", "kitti-odometry", str(sequence), "-o", str(tmp_path / "tile")]
     refused = CliRunner().invoke(app, options)
@@ -123,7 +123,7 @@ def test_the_command_and_poses_of_ones_own(sequence: Path, tmp_path: Path) -> No
         ("velodyne/000001.bin", "12345", "is not a Velodyne sweep"),
     ],
 )
-def test_a_damaged_sequence_is_refused(sequence: Path, tmp_path: Path, file: str, body: str, cause: str) -> None:
+def test_damaged_sequence_is_rejected(sequence: Path, tmp_path: Path, file: str, body: str, cause: str) -> None:
     (sequence / file).write_text(body, encoding="utf-8")
     with pytest.raises(InputError, match=cause):
         import_kitti_odometry(sequence, tmp_path / "tile")
@@ -136,15 +136,15 @@ def test_range_without_points_is_an_error(sequence: Path, tmp_path: Path) -> Non
     assert not (tmp_path / "tile").exists()
 
 
-def test_times_in_a_pipe_are_not_waited_for(sequence: Path, tmp_path: Path) -> None:
+def test_times_file_that_is_a_pipe_is_rejected(sequence: Path, tmp_path: Path) -> None:
     (sequence / "times.txt").unlink()
     os.mkfifo(sequence / "times.txt")
     with pytest.raises(InputError, match="is a pipe"):
         import_kitti_odometry(sequence, tmp_path / "tile")
 
 
-def test_a_real_sequences_sweeps_agree(real_data: Path, tmp_path: Path) -> None:
-    """What stands is hit by sweeps of different places at the same place: near a sweep's points lie the next one's."""
+def test_sweeps_of_a_real_sequence_coincide(real_data: Path, tmp_path: Path) -> None:
+    """Static surfaces are at the same positions in sweeps from different locations: the first and last one overlap."""
     source = real_data / "kitti_odo04_f00-24"
     tile = read_tile(import_kitti_odometry(source, tmp_path / "tile", frames=(0, 8), max_range=30.0))
     cloud = clouds.read(tile.clouds[0], tile.frame)

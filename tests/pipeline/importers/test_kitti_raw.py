@@ -1,4 +1,4 @@
-"""KITTI raw drives: a made-up drive whose geometry is known, and a real one where it is present."""
+"""KITTI raw drives: a synthetic drive with known geometry, and a real one if available."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ WIDTH, HEIGHT = 600, 300
 class Drive:
     folder: Path
     world: np.ndarray  # (N, 3) points, UTM
-    rgb: np.ndarray  # (N, 3) their colours
+    rgb: np.ndarray  # (N, 3) colours of the points
     T_velo: np.ndarray  # (F, 4, 4) scanner to UTM at each sweep's time stamp
     pixels: np.ndarray  # (N, 2) of the first sweep's points by KITTI's own formula
 
@@ -72,7 +72,7 @@ def make_drive(tmp_path: Path) -> Drive:
     def utm(seconds: float) -> np.ndarray:
         return np.array([*to_utm.transform(*place(seconds)), 114.0])
 
-    way = utm(1.0) - utm(0.0)  # the car drives where it looks: its heading on the grid, by the path alone
+    way = utm(1.0) - utm(0.0)  # grid heading along the path
     heading = Rotation.from_euler("z", np.arctan2(way[1], way[0]))
 
     def velo(seconds: float) -> np.ndarray:
@@ -113,7 +113,7 @@ def make_drive(tmp_path: Path) -> Drive:
         seen = np.empty_like(world)
         for k, point in enumerate(world):
             when = t
-            for _ in range(10):  # the beam's moment depends on its azimuth and the other way round
+            for _ in range(10):  # a beam's time depends on its azimuth, and vice versa
                 T = velo(when)
                 seen[k] = (point - T[:3, 3]) @ T[:3, :3]
                 when = t - PERIOD * np.arctan2(seen[k, 1], seen[k, 0]) / (2 * np.pi)
@@ -135,12 +135,12 @@ def make_drive(tmp_path: Path) -> Drive:
     return Drive(folder, world, rgb, T_velo, pixels)
 
 
-def test_points_and_photos_are_where_they_were_in_the_world(drive: Drive, tmp_path: Path) -> None:
+def test_points_and_photos_are_at_their_true_positions(drive: Drive, tmp_path: Path) -> None:
     tile = read_tile(import_kitti_raw(drive.folder, tmp_path / "tile"))
     assert tile.frame.crs == CRS
     cloud = clouds.read(tile.clouds[0], tile.frame)
     xyz = tile.frame.to_crs(cloud.xyz).reshape(FRAMES, -1, 3)
-    assert xyz.shape[1] == len(drive.world)  # the car's own returns are gone
+    assert xyz.shape[1] == len(drive.world)  # returns from the car itself are removed
     assert np.abs(xyz - drive.world).max() < 0.005
     assert tile.trajectory is not None
     assert np.abs(tile.frame.to_crs(tile.trajectory.positions) - drive.T_velo[:, :3, 3]).max() < 0.005
@@ -161,13 +161,13 @@ def test_points_get_the_colour_of_their_own_photo_and_others_are_grey(drive: Dri
     assert (cloud.rgb[45:] == GREY).all()
 
 
-def test_without_compensation_for_motion_points_smear(drive: Drive, tmp_path: Path) -> None:
+def test_points_are_smeared_without_motion_compensation(drive: Drive, tmp_path: Path) -> None:
     tile = read_tile(import_kitti_raw(drive.folder, tmp_path / "tile", deskew=False))
     xyz = tile.frame.to_crs(clouds.read(tile.clouds[0], tile.frame).xyz).reshape(FRAMES, -1, 3)
     assert np.abs(xyz - drive.world).max() > 0.3
 
 
-def test_a_pose_file_gives_the_same_world(drive: Drive, tmp_path: Path) -> None:
+def test_pose_file_gives_the_same_points(drive: Drive, tmp_path: Path) -> None:
     relative = np.linalg.inv(drive.T_velo[0]) @ drive.T_velo
     np.savetxt(tmp_path / "poses.txt", relative[:, :3].reshape(FRAMES, 12))
     tile = read_tile(import_kitti_raw(drive.folder.parent, tmp_path / "tile", poses=tmp_path / "poses.txt", link=True))
@@ -176,7 +176,7 @@ def test_a_pose_file_gives_the_same_world(drive: Drive, tmp_path: Path) -> None:
     assert tile.views[0].photo.is_symlink() and cv2.imread(str(tile.views[0].photo)) is not None
 
 
-def test_without_oxts_a_pose_file_makes_a_local_tile(drive: Drive, tmp_path: Path) -> None:
+def test_pose_file_without_oxts_gives_a_local_tile(drive: Drive, tmp_path: Path) -> None:
     (drive.folder / "oxts").rename(tmp_path / "away")
     with pytest.raises(InputError, match=r"oxts: folder not found, and no pose file is given.*give poses"):
         import_kitti_raw(drive.folder, tmp_path / "tile")
@@ -196,14 +196,14 @@ def test_without_oxts_a_pose_file_makes_a_local_tile(drive: Drive, tmp_path: Pat
         ("../calib_velo_to_cam.txt", r"calib_velo_to_cam\.txt: has no `R` with 9 numbers.*calibration again"),
     ],
 )
-def test_damaged_files_are_named_and_leave_nothing(drive: Drive, tmp_path: Path, harm: str, message: str) -> None:
+def test_damaged_files_are_reported_and_leave_no_tile(drive: Drive, tmp_path: Path, harm: str, message: str) -> None:
     (drive.folder / harm).write_bytes(b"x\ny")
     with pytest.raises(InputError, match=message):
         import_kitti_raw(drive.folder, tmp_path / "tile")
     assert not (tmp_path / "tile").exists() and not list(tmp_path.glob(".tile*"))
 
 
-def test_a_short_pose_file_no_drive_and_a_full_folder_are_refused(drive: Drive, tmp_path: Path) -> None:
+def test_short_pose_file_missing_drive_and_existing_output_are_rejected(drive: Drive, tmp_path: Path) -> None:
     (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"poses\.txt: has 1 poses, but sweep 3"):
         import_kitti_raw(drive.folder, tmp_path / "tile", poses=tmp_path / "poses.txt")
@@ -217,8 +217,8 @@ def test_a_short_pose_file_no_drive_and_a_full_folder_are_refused(drive: Drive, 
     assert (tmp_path / "tile" / "mine.txt").read_text(encoding="utf-8") == "keep"
 
 
-def test_cloud_and_photos_of_a_real_drive_agree(real_data: Path, tmp_path: Path) -> None:
-    """Where a near thing ends in a sweep, the photo of that moment has an edge; moving the camera blurs that."""
+def test_depth_discontinuities_project_onto_image_edges_of_a_real_drive(real_data: Path, tmp_path: Path) -> None:
+    """Depth discontinuities of a sweep project onto edges of its photo; moving the camera reduces the contrast."""
     source = real_data / "kitti_raw0009_f00-24"
     poses = source / "T_velo0_velo_icp_frames_0-24.txt"
     tile = read_tile(import_kitti_raw(source, tmp_path / "tile", poses=poses, frames=(8, 12)))
@@ -247,7 +247,7 @@ def test_cloud_and_photos_of_a_real_drive_agree(real_data: Path, tmp_path: Path)
     assert sharpness(0.0) > 1.15 * max(sharpness(-0.3), sharpness(0.3))
 
 
-def test_the_check_of_the_poses_is_cached_until_they_change(drive: Drive, tmp_path: Path) -> None:
+def test_pose_check_is_cached_until_the_poses_change(drive: Drive, tmp_path: Path) -> None:
     def imported() -> list[Path]:
         command = f"import kitti-raw {drive.folder.parent} --out {tmp_path}/tile --overwrite"
         result = CliRunner().invoke(app, command)

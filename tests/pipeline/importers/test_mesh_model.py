@@ -24,7 +24,7 @@ from tests.present import present
     ("file_format", "up", "unit"),
     [("obj", "z", "m"), ("obj", "y", "mm"), ("ply", "y", "m"), ("glb", "y", "m")],
 )
-def test_mesh_becomes_level_and_metric(tmp_path: Path, file_format: str, up: str, unit: str) -> None:
+def test_mesh_is_levelled_and_scaled_to_metres(tmp_path: Path, file_format: str, up: str, unit: str) -> None:
     path, made, paint = write(
         tmp_path / "in", file_format=file_format, up=up, unit=unit, edge=0.4, style=Style(rooms=1)  # type: ignore[arg-type]
     )  # fmt: skip
@@ -38,7 +38,7 @@ def test_mesh_becomes_level_and_metric(tmp_path: Path, file_format: str, up: str
     back = (in_file @ TO_FILE[up]).astype(np.float32)
     truth = Mesh(Frame(), made.vertices.astype(np.float32), made.faces.astype(np.int32))
     assert distances(back, truth).max() < 1e-3
-    assert np.allclose(about.T_world_map[:3, :3] @ TO_FILE[up][:, 2], (0, 0, 1), atol=2e-3)  # up is up
+    assert np.allclose(about.T_world_map[:3, :3] @ TO_FILE[up][:, 2], (0, 0, 1), atol=2e-3)  # the file's up axis is z
     cloud = clouds.read(tile.clouds[0], Frame())
     points = (cloud.xyz @ T[:3, :3].T.astype(np.float32)) @ TO_FILE[up].astype(np.float32)
     floor = np.abs(points[:, 2]) < 0.005
@@ -48,7 +48,7 @@ def test_mesh_becomes_level_and_metric(tmp_path: Path, file_format: str, up: str
     assert error < (40 if file_format == "ply" else 8)
 
 
-def test_samples_are_even() -> None:
+def test_samples_are_evenly_distributed() -> None:
     square = Mesh(
         Frame(), np.array([[0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]], np.float32),
         np.array([[0, 1, 2], [0, 2, 3]], np.int32),
@@ -59,7 +59,7 @@ def test_samples_are_even() -> None:
     assert (weights.sum(axis=1) <= 1 + 1e-6).all()
 
 
-def test_surface_that_faces_down_is_turned(tmp_path: Path) -> None:
+def test_surface_that_faces_down_is_flipped(tmp_path: Path) -> None:
     path = tmp_path / "ground.obj"
     n = 30
     x, y = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
@@ -76,7 +76,7 @@ def test_surface_that_faces_down_is_turned(tmp_path: Path) -> None:
     assert any("coloured by class" in text for text in warnings)
 
 
-def test_tiny_mesh_is_refused_with_its_unit(tmp_path: Path) -> None:
+def test_tiny_mesh_is_rejected_with_its_unit(tmp_path: Path) -> None:
     path = tmp_path / "a.obj"
     path.write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n", encoding="utf-8")
     with pytest.raises(DataError, match="--units"):

@@ -1,4 +1,4 @@
-"""nerfstudio's transforms.json: written by its conventions, points appear at their pixels, and depths give a cloud."""
+"""nerfstudio's transforms.json by its conventions: points project to their pixels, depth images give a cloud."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def plain(size: tuple[int, int] = (W, H)) -> dict[str, F64]:
 
 @pytest.mark.parametrize("per_frame", [False, True])
 @pytest.mark.parametrize("kind", CAMERAS)
-def test_nerfstudio_sees_the_same_pixels(tmp_path: Path, kind: str, per_frame: bool) -> None:
+def test_points_project_to_their_pixels(tmp_path: Path, kind: str, per_frame: bool) -> None:
     values, lens = CAMERAS[kind]
     size = (1024, 512) if kind == "EQUIRECTANGULAR" else (W, H)
     model = read("nerfstudio", write(tmp_path / "transforms.json", values, plain(size), per_frame), images(size))
@@ -101,7 +101,7 @@ def test_nerfstudio_sees_the_same_pixels(tmp_path: Path, kind: str, per_frame: b
     assert len(model.cameras) == 1 and model.up is None and not model.notes
 
 
-def test_the_centre_of_the_first_pixel_is_half_a_pixel_from_its_corner(tmp_path: Path) -> None:
+def test_centre_of_the_first_pixel_is_half_a_pixel_from_its_corner(tmp_path: Path) -> None:
     values = {"fl_x": 500.0, "cx": 400.0, "cy": 300.0}
     (camera,) = read("nerfstudio", write(tmp_path / "transforms.json", values, plain()), images()).cameras.values()
     assert camera == Camera("pinhole", W, H, 500.0, 500.0, 399.5, 299.5)
@@ -127,8 +127,8 @@ def copied(folder: Path) -> Path:
     return folder
 
 
-def test_what_was_applied_is_undone_and_up_stays_up(tmp_path: Path) -> None:
-    """From original coordinates with y down, as COLMAP's: z up, in the original's scale, cloud and photos agree."""
+def test_applied_transform_and_scale_are_undone_with_z_up(tmp_path: Path) -> None:
+    """Original coordinates with y down, as by COLMAP, become z up at the original scale, for cloud and photos alike."""
     original = np.eye(4)
     original[:3, :3] = COLMAP_UP[:, :3].T  # the street in axes with y down
     applied, scale = COLMAP_UP + [[0, 0, 0, 0.5], [0, 0, 0, -2], [0, 0, 0, 7]], 0.125
@@ -151,7 +151,7 @@ def test_what_was_applied_is_undone_and_up_stays_up(tmp_path: Path) -> None:
         assert np.allclose(tile.frame.to_crs(view.centre), pose[:3, 3], atol=1e-6)
 
 
-def test_original_coordinates_that_are_z_up_are_those_of_the_tile(tmp_path: Path) -> None:
+def test_original_coordinates_with_z_up_are_kept(tmp_path: Path) -> None:
     applied = np.column_stack([Rotation.from_euler("Z", 0.8).as_matrix(), [500.0, -90.0, 3.0]])
     files = {f"images/{name}": saved(pose, applied, 2.0) for name, pose in shots()}
     folder = copied(tmp_path / "data")
@@ -180,8 +180,8 @@ def depth_image(renderer: Renderer, camera: Camera, pose: F64, size: tuple[int, 
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.2])
-def test_depth_images_become_a_cloud(tmp_path: Path, scale: float) -> None:
-    """Depths of the true street for its photos of all kinds: a cloud within millimetres of it, in its colours."""
+def test_depth_images_are_converted_to_a_cloud(tmp_path: Path, scale: float) -> None:
+    """Depth images of the true street for all camera models give its points to millimetres, with its colours."""
     tile, renderer, frames, more = read_tile(TILE), street(), {}, {}
     folder = copied(tmp_path / "data")
     (folder / "depth").mkdir()
@@ -218,8 +218,8 @@ def test_depth_images_become_a_cloud(tmp_path: Path, scale: float) -> None:
     assert np.median(error) < 12
 
 
-def test_depth_discontinuities_are_left_out() -> None:
-    """A step of depth, and not a road seen at a low angle."""
+def test_pixels_at_depth_discontinuities_are_removed() -> None:
+    """At a step in depth, but not on a road at a grazing angle."""
     rows = np.arange(1, 120)[:, None] + 0.5
     road = np.repeat(1.5 * 200 / rows, 80, axis=1)  # 1.5 m above it, focal length 200 pixels
     assert not discontinuities(road).any()
@@ -229,7 +229,7 @@ def test_depth_discontinuities_are_left_out() -> None:
     assert not discontinuities(np.zeros((9, 9))).any()
 
 
-def test_masks_and_missing_files(tmp_path: Path) -> None:
+def test_missing_images_masks_and_clouds_are_reported(tmp_path: Path) -> None:
     folder = copied(tmp_path / "data")
     (folder / "masks").mkdir()
     names = [name for name, _ in shots()]
@@ -237,7 +237,7 @@ def test_masks_and_missing_files(tmp_path: Path) -> None:
     levels[400:] = 0
     cv2.imwrite(str(folder / "masks" / "shared.png"), levels)
     cv2.imwrite(str(folder / "masks" / "small.png"), levels[:100])
-    cv2.imwrite(str(folder / "masks" / f"{Path(names[4]).stem}.png"), levels)  # not a photo, though it has its name
+    cv2.imwrite(str(folder / "masks" / f"{Path(names[4]).stem}.png"), levels)  # has the name of a photo, but isn't one
     (folder / "images" / names[4]).unlink()
     masks = ["masks/shared.png", "masks/shared.png", "masks/small.png", "masks/lost.png"]
     more = {f"images/{name}": {"mask_path": mask} for name, mask in zip(names, masks, strict=False)}
@@ -262,7 +262,7 @@ def test_masks_and_missing_files(tmp_path: Path) -> None:
         assert any(text in line for line in warned), warned
 
 
-def test_no_points_no_depths_needs_a_cloud(tmp_path: Path) -> None:
+def test_model_without_points_and_depths_needs_a_cloud(tmp_path: Path) -> None:
     folder = copied(tmp_path / "data")
     write(folder / "transforms.json", BROWN, {f"images/{name}": pose for name, pose in shots()})
     with pytest.raises(InputError, match=r"has no 3D points.*Give a cloud"):
@@ -286,14 +286,14 @@ def test_no_points_no_depths_needs_a_cloud(tmp_path: Path) -> None:
         ({"applied_transform": np.diag([1.0, 1, 3, 1]).tolist()}, "applied_transform is not a rotation"),
     ],
 )
-def test_mistakes_are_named(tmp_path: Path, change: dict[str, Any], cause: str) -> None:
+def test_invalid_values_are_rejected(tmp_path: Path, change: dict[str, Any], cause: str) -> None:
     path = write(tmp_path / "transforms.json", BROWN, plain())
     path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | change), encoding="utf-8")
     with pytest.raises(InputError, match=f"transforms.json: .*{cause}"):
         read("nerfstudio", path, images())
 
 
-def test_a_frame_without_a_pose_is_named(tmp_path: Path) -> None:
+def test_frame_without_a_valid_pose_is_rejected(tmp_path: Path) -> None:
     path = write(tmp_path / "transforms.json", BROWN, plain())
     body = json.loads(path.read_text(encoding="utf-8"))
     body["frames"][2]["transform_matrix"][0][0] = 5.0
@@ -306,9 +306,9 @@ def test_a_frame_without_a_pose_is_named(tmp_path: Path) -> None:
         read("nerfstudio", path, images())
 
 
-def test_the_command_finds_the_photos_beside_the_file(tmp_path: Path) -> None:
+def test_command_finds_photos_beside_the_file(tmp_path: Path) -> None:
     folder = copied(tmp_path / "data")
-    files = {f"C:\\phone\\images\\{Path(name).stem}": pose for name, pose in shots()}  # no suffix, as instant-ngp
+    files = {f"C:\\phone\\images\\{Path(name).stem}": pose for name, pose in shots()}  # no suffix, as by instant-ngp
     write_ply(folder / "p.ply", np.random.default_rng(0).uniform(0, 9, (500, 3)))
     path = write(folder / "transforms.json", BROWN | {"ply_file_path": "p.ply"}, files)
     for given in (folder, path):

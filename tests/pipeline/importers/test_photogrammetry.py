@@ -1,4 +1,4 @@
-"""Posed photos of other programs: written by each format's own formulas, the same points fall on the same pixels."""
+"""Posed photos of other programs, written by the formulas of each format: points project to their true pixels."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def in_camera(points: F64, pose: F64) -> F64:
 
 
 def agrees(model: Model, lens: Lens, size: tuple[int, int] = (W, H), wide: float = 0.7) -> None:
-    """Every photo of the sample street has its pose and its pixels."""
+    """Compare the pose and projected pixels of every photo of the sample street."""
     poses = dict(shots(size))
     assert len(model.shots) == len(poses)
     for shot in model.shots:
@@ -68,7 +68,7 @@ def agrees(model: Model, lens: Lens, size: tuple[int, int] = (W, H), wide: float
 def brown(
     f: tuple[float, float], c: tuple[float, float], k: tuple[float, ...], p: tuple[float, float], skew: float = 0
 ) -> Lens:
-    """Brown's lens as photogrammetry writes it: k of r2, r4, ...; p[0] belongs to r2 + 2 x2 in x."""
+    """Brown's lens model as in photogrammetry: k of r2, r4, ...; p[0] is the factor of r2 + 2 x2 in x."""
 
     def lens(xyz: F64) -> F64:
         x, y = (xyz[:, :2] / xyz[:, 2:]).T
@@ -133,7 +133,7 @@ def opensfm(path: Path, kind: str, reference: dict[str, float] | None = None, tu
 
 
 @pytest.mark.parametrize("kind", OPENSFM)
-def test_opensfm_sees_the_same_pixels(tmp_path: Path, kind: str) -> None:
+def test_points_of_opensfm_project_to_their_pixels(tmp_path: Path, kind: str) -> None:
     size = (1024, 512) if kind == "spherical" else (W, H)
     model = read("opensfm", opensfm(tmp_path / "reconstruction.json", kind), images(size))
     agrees(model, OPENSFM[kind][1], size)
@@ -145,7 +145,7 @@ REFERENCE = {"latitude": 52.52, "longitude": 13.4, "altitude": 40.0}
 
 
 def on_earth(xyz: F64, crs: str = "EPSG:32633") -> F64:
-    """East, north, up of the reference to the CRS, by PROJ's own topocentric conversion."""
+    """East, north, up of the reference to the CRS, by PROJ's topocentric conversion."""
     steps = "+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lat_0=52.52 +lon_0=13.4 +h_0=40 "
     steps += "+step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
     x, y, z = xyz.T
@@ -220,7 +220,7 @@ METASHAPE: dict[str, tuple[str, dict[str, float], Lens]] = {
 
 
 @pytest.mark.parametrize("case", METASHAPE)
-def test_metashape_sees_the_same_pixels(tmp_path: Path, case: str) -> None:
+def test_points_of_metashape_project_to_their_pixels(tmp_path: Path, case: str) -> None:
     kind, values, lens = METASHAPE[case]
     size = (1024, 512) if kind == "spherical" else (W, H)
     model = read("metashape", metashape(tmp_path / "cameras.xml", kind, values), images(size))
@@ -237,7 +237,7 @@ def test_metashape_sees_the_same_pixels(tmp_path: Path, case: str) -> None:
         ("frame", {"f": -1.0}, "its focal length"),
     ],
 )
-def test_a_metashape_lens_without_a_counterpart_is_refused(
+def test_unsupported_metashape_lens_is_rejected(
     tmp_path: Path, kind: str, values: dict[str, float], cause: str
 ) -> None:
     with pytest.raises(InputError, match=cause):
@@ -262,8 +262,8 @@ def test_largest_metashape_component_is_imported(tmp_path: Path) -> None:
     assert np.allclose(model.centres, [3 * pose[:3, 3] + [1, 2, 3] for _, pose in shots()[1:]])
 
 
-def test_a_cloud_without_a_crs_is_where_the_photos_are(tmp_path: Path) -> None:
-    """Beside a georeferenced model it may be in the model's coordinates, or in the CRS; the note states which."""
+def test_cloud_without_a_crs_is_placed_near_the_photos(tmp_path: Path) -> None:
+    """With a georeferenced model, it is in model coordinates or in the CRS; the note reports which."""
     path = opensfm(tmp_path / "reconstruction.json", "brown", REFERENCE)
     near = np.array([pose[:3, 3] for _, pose in shots()]) + [1.0, 2.0, 0.0]
     for name, points, where in (("model", near, "model coordinates"), ("crs", on_earth(near), "the CRS already")):
@@ -345,7 +345,7 @@ def bundler(folder: Path, f: float, k1: float, k2: float) -> Path:
     return folder / "bundle.out"
 
 
-def test_bundler_sees_the_same_pixels(tmp_path: Path) -> None:
+def test_points_of_bundler_project_to_their_pixels(tmp_path: Path) -> None:
     model = read("bundler", bundler(tmp_path / "bundle", 500.0, -0.11, 0.02), images())
     agrees(model, brown((500, 500), (400, 300), (-0.11, 0.02), (0, 0)))
     assert model.xyz.tolist() == [[1.5, 2.5, 3.5], [4, 5, 6]] and model.notes == (
@@ -364,7 +364,7 @@ def nvm(path: Path, f: float, r: float, fixed: str = "") -> Path:
 
 
 @pytest.mark.parametrize("r", [0.0, 0.08, -0.15])
-def test_visualsfm_sees_the_same_pixels(tmp_path: Path, r: float) -> None:
+def test_points_of_visualsfm_project_to_their_pixels(tmp_path: Path, r: float) -> None:
     model = read("nvm", nvm(tmp_path / "m.nvm", 500.0, r), images())
 
     def lens(xyz: F64) -> F64:
@@ -403,7 +403,7 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_the_command_makes_a_tile(tmp_path: Path, kind: str) -> None:
+def test_command_creates_a_tile(tmp_path: Path, kind: str) -> None:
     model = WRITERS[kind](tmp_path)
     cloud = tmp_path / "dense.xyz"
     np.savetxt(cloud, np.random.default_rng(0).uniform(0, 9, (50, 3)), "%.3f")
@@ -428,7 +428,7 @@ def test_the_command_makes_a_tile(tmp_path: Path, kind: str) -> None:
         assert np.allclose(tile.frame.to_crs(view.centre), 2 * poses[view.photo.stem][:3, 3], atol=1e-6)
 
 
-def test_opensfm_numbers_beyond_all_bounds_are_refused(tmp_path: Path) -> None:
+def test_infinite_and_huge_numbers_of_opensfm_are_rejected(tmp_path: Path) -> None:
     path = WRITERS["opensfm"](tmp_path)
     for number in ("Infinity", "1" + 400 * "0"):
         path.write_text(
@@ -439,8 +439,8 @@ def test_opensfm_numbers_beyond_all_bounds_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_a_damaged_file_is_refused_and_leaves_nothing(tmp_path: Path, kind: str) -> None:
-    """Cut anywhere, or with bytes of it changed: a sentence, or a model that is complete."""
+def test_damaged_file_is_rejected_without_a_partial_model(tmp_path: Path, kind: str) -> None:
+    """Truncated, or with changed bytes: an error message, or a complete model."""
     path = WRITERS[kind](tmp_path)
     whole, random = path.read_bytes(), np.random.default_rng(1)
     damaged = [whole[: int(len(whole) * share)] for share in (0.0, 0.01, 0.3, 0.7, 0.95)]
@@ -461,12 +461,12 @@ def test_a_damaged_file_is_refused_and_leaves_nothing(tmp_path: Path, kind: str)
     assert refused >= 5
 
 
-def test_every_program_has_its_help() -> None:
+def test_every_program_has_a_help_page() -> None:
     for kind in plugins.names(photogrammetry.__name__):
         assert CliRunner().invoke(app, ["import", kind, "--help"]).exit_code == 0
 
 
-def test_a_missing_or_doubled_photo_is_named(tmp_path: Path) -> None:
+def test_missing_photo_is_reported(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"\.jpg: file not found"):
         import_model("opensfm", opensfm(tmp_path / "reconstruction.json", "brown"), tmp_path, tmp_path / "t")
     assert not (tmp_path / "t").exists()

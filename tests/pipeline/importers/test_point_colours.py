@@ -1,4 +1,4 @@
-"""Colours of points: occlusion in photos, and colours of points that no photo sees."""
+"""Colours of points: occlusion in photos, and colours of points that are in no photo."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Import of robots' maps: up axis, tilt, units, outliers, frames."""
+"""Import of robot maps: up axis, tilt, units, outliers, frames."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ def imported(path: Path, out: Path, **options: str) -> tuple[F64, F64, list[str]
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_up_axis_of_a_map_in_any_orientation(seed: int) -> None:
+def test_up_axis_is_found_in_any_orientation(seed: int) -> None:
     turn = Rotation.random(random_state=seed).as_matrix()
     found = present(find_up((room(seed) @ turn.T).astype(np.float32)))
     assert np.degrees(np.arccos(found.up @ turn[:, 2])) < 0.5
 
 
 @pytest.mark.parametrize("parts", [{"ceiling": False}, {"floor": False, "ceiling": False}])
-def test_up_axis_without_ceiling_or_floor(parts: dict[str, bool]) -> None:
+def test_up_axis_is_found_without_ceiling_or_floor(parts: dict[str, bool]) -> None:
     turn = Rotation.random(random_state=3).as_matrix()
     found = present(find_up((room(1, **parts) @ turn.T).astype(np.float32)))
     assert np.degrees(np.arccos(found.up @ turn[:, 2])) < 0.5
@@ -83,7 +83,7 @@ def test_level_map_keeps_its_coordinates(tmp_path: Path) -> None:
 
 
 def test_millimetres_are_recognized(tmp_path: Path) -> None:
-    xyz = 1000 * (room() + np.array([40, 0, 0], np.float32))  # so far from the start that it gets an origin of its own
+    xyz = 1000 * (room() + np.array([40, 0, 0], np.float32))  # so far from the start that its origin is shifted
     world, _, warnings = imported(save(tmp_path / "map.las", xyz), tmp_path / "tile")
     assert world.min(axis=0) == pytest.approx([37, -2, -SENSOR_HEIGHT_M], abs=0.2)
     assert np.ptp(world[:, 0]) == pytest.approx(8, abs=0.2)
@@ -91,7 +91,7 @@ def test_millimetres_are_recognized(tmp_path: Path) -> None:
 
 
 def test_cloud_with_a_crs_in_feet_keeps_its_coordinates(tmp_path: Path) -> None:
-    """EPSG:2992 is in international feet; a georeferenced cloud is level, whatever it looks like."""
+    """EPSG:2992 is in international feet; a georeferenced cloud is level by definition."""
     frame = Frame("EPSG:2992", (200_000.0, 300_000.0, 0.0), 0.3048)
     las.write(tmp_path / "map.laz", PointCloud(frame, room()))
     tile = read_tile(import_map([tmp_path / "map.laz"], tmp_path / "tile", MapParams()))
@@ -110,13 +110,13 @@ def test_far_returns_and_reflections_below_the_floor_are_removed(tmp_path: Path)
     assert sum("removed" in text for text in warnings) == 2
 
 
-def test_named_axis_is_up_even_if_the_map_looks_otherwise(tmp_path: Path) -> None:
+def test_given_up_axis_overrides_the_estimate(tmp_path: Path) -> None:
     world, T, _ = imported(save(tmp_path / "map.las", room()), tmp_path / "tile", up="-z")
     assert T[2, 2] == pytest.approx(-1, abs=0.01)
     assert world[:, 2].max() == pytest.approx(SENSOR_HEIGHT_M, abs=0.1)
 
 
-def test_scene_is_found(tmp_path: Path) -> None:
+def test_indoor_scene_is_recognized(tmp_path: Path) -> None:
     imported(save(tmp_path / "map.las", room()), tmp_path / "tile")
     assert present(read_tile(tmp_path / "tile").robot_map).scene == "indoor"
 
@@ -129,7 +129,7 @@ def test_folder_without_clouds_is_an_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "up"), [("hdl501", (0.13, -0.10, 0.99)), ("lobby", (0, 0, 1)), ("dddmr", (0, 1, 0))])
-def test_real_maps_become_upright(real_data: Path, name: str, up: tuple[float, ...]) -> None:
+def test_up_axis_of_real_maps_is_found(real_data: Path, name: str, up: tuple[float, ...]) -> None:
     cloud = clouds.read(real_data / "slam_maps" / f"{name}.pcd", Frame())
     found = present(find_up(cloud.xyz))
     assert np.degrees(np.arccos(np.clip(found.up @ up / np.linalg.norm(up), -1, 1))) < 2.5

@@ -1,4 +1,4 @@
-"""Sweeps of a made-up hall, taken on a known way: its walls come out sharp, and coloured as they are."""
+"""Sweeps of a synthetic hall along a known path: accurate positions and colours of its walls."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ T_CAMERA_SCANNER[:3, :3] = Rotation.from_rotvec([0.02, -0.03, 0.01]).as_matrix()
 T_CAMERA_SCANNER[:3, 3] = [0.1, 0.4, -0.3]
 
 
-def way(times: F64) -> Trajectory:
-    """The scanner's: straight on, turning evenly to the left."""
+def scanner_path(times: F64) -> Trajectory:
+    """Path of the scanner: straight, with a constant rotation to the left."""
     heading = 0.3 + TURN * times
     positions = np.array([0.5, -1.0, 1.8]) + np.outer(times, [SPEED, 2.0, 0])
     return Trajectory(times, positions, Rotation.from_euler("z", heading[:, None]).as_matrix())
@@ -62,7 +62,7 @@ def sweep(time: float, *, turning: bool) -> F64:
     flat = np.cos(elevation)
     ray = np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)], axis=1)
     when = time + (-azimuth / (2 * np.pi) * PERIOD if turning else np.zeros(len(ray)))
-    poses = way(when)
+    poses = scanner_path(when)
     assert poses.rotations is not None
     hits, _ = intersect(poses.positions, np.einsum("nij,nj->ni", poses.rotations, ray))
     return np.einsum("nji,nj->ni", poses.rotations, hits - poses.positions)
@@ -114,7 +114,7 @@ class Drive:
         return {"sweeps": self.folder / "sweeps", "poses": self.folder / "camera.csv", "extrinsics": T_CAMERA_SCANNER}
 
     @property
-    def pictures(self) -> list[PhotoInput]:
+    def photo_inputs(self) -> list[PhotoInput]:
         return [PhotoInput(self.folder / "photos", CAMERA)]
 
 
@@ -124,7 +124,7 @@ def make(
     times = 0.1 + PERIOD * np.arange(SWEEPS, dtype=float)
     for name in ("sweeps", "photos"):
         (folder / name).mkdir(parents=True)
-    scanner = way(times)
+    scanner = scanner_path(times)
     poses = scanner.poses @ np.linalg.inv(T_CAMERA_SCANNER)
     for i, time in enumerate(times):
         write(folder / "sweeps" / f"{i:06d}", sweep(float(time), turning=turning))
@@ -142,7 +142,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
 
 
 def imported(**arguments: Any) -> Path:
-    """`import_sweeps`, its parameters and all else by their names."""
+    """Call `import_sweeps` with parameters given by name."""
     own = {name: arguments.pop(name) for name in PlacementParams.model_fields.keys() & arguments.keys()}
     return import_sweeps(**arguments, placing=PlacementParams(**own))
 
@@ -154,7 +154,7 @@ def cloud_of(path: Path) -> tuple[Tile, PointCloud, np.ndarray]:
     return tile, cloud, tile.frame.to_crs(cloud.xyz)
 
 
-def test_a_turning_scanners_walls_come_out_sharp(tmp_path: Path) -> None:
+def test_sweeps_of_a_rotating_scanner_are_deskewed(tmp_path: Path) -> None:
     drive = make(tmp_path, turning=True)
     _, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", deskew="kitti"))
     assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() < 0.003
@@ -166,14 +166,14 @@ def test_a_turning_scanners_walls_come_out_sharp(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("write", [to_bin, to_laz, to_open3d(".pcd"), to_open3d(".ply")])
-def test_sweeps_of_all_formats(tmp_path: Path, write: Callable[[Path, F64], None]) -> None:
+def test_sweeps_of_all_formats_are_read(tmp_path: Path, write: Callable[[Path, F64], None]) -> None:
     drive = make(tmp_path, write=write)
     _, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile"))
     assert len(xyz) == SWEEPS * 600 * 24 and walls(xyz)[0].max() < 0.003
     assert cloud.intensity is not None and np.abs(cloud.intensity.astype(int) - 32768).max() < 300
 
 
-def test_poses_may_be_the_scanners_own(drive: Drive, tmp_path: Path) -> None:
+def test_poses_of_the_scanner_are_accepted(drive: Drive, tmp_path: Path) -> None:
     given: dict[str, Any] = {"extrinsics": T_CAMERA_SCANNER, "scanner_poses": True}
     for extra in ({}, given):
         path = imported(
@@ -185,11 +185,13 @@ def test_poses_may_be_the_scanners_own(drive: Drive, tmp_path: Path) -> None:
         )
         tile, _, xyz = cloud_of(path)
         assert walls(xyz)[0].max() < 0.003 and tile.trajectory is not None
-        assert np.allclose(tile.frame.to_crs(tile.trajectory.positions), way(drive.times).positions, atol=1e-5)
+        assert np.allclose(tile.frame.to_crs(tile.trajectory.positions), scanner_path(drive.times).positions, atol=1e-5)
 
 
-def test_points_take_the_colour_of_their_wall_and_photos_their_pose(drive: Drive, tmp_path: Path) -> None:
-    tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", photos=drive.pictures, link=True))
+def test_points_are_coloured_by_photos_and_photos_are_posed(drive: Drive, tmp_path: Path) -> None:
+    tile, cloud, xyz = cloud_of(
+        imported(**drive.arguments, out=tmp_path / "tile", photos=drive.photo_inputs, link=True)
+    )
     assert cloud.rgb is not None
     off = np.abs(np.concatenate([xyz - LOW, xyz - HIGH], axis=1))
     inner = np.sort(off, axis=1)[:, 1] > 0.5  # away from the edges between walls
@@ -205,8 +207,8 @@ def test_mask_is_imported_and_masked_pixels_give_no_colour(drive: Drive, tmp_pat
     mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
     mask[128:] = 0
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
-    pictures = [PhotoInput(drive.folder / "photos", CAMERA, mask=tmp_path / "mask.png")]
-    tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", photos=pictures))
+    photo_inputs = [PhotoInput(drive.folder / "photos", CAMERA, mask=tmp_path / "mask.png")]
+    tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", photos=photo_inputs))
     assert cloud.rgb is not None and (cloud.rgb[xyz[:, 2] < 0.3] == 128).mean() > 0.8
     assert {view.mask for view in tile.views} == {tile.path.parent / "masks" / "mask.png"}
 
@@ -218,7 +220,7 @@ def test_unsure_sections_are_removed_and_reported(drive: Drive, tmp_path: Path) 
     rotations = drive.camera.rotations
     trajectory_io.write(tmp_path / "lost.csv", Trajectory(drive.times, positions, rotations, unsure))
     notes: list[str] = []
-    arguments = drive.arguments | {"poses": tmp_path / "lost.csv", "photos": drive.pictures, "warn": notes.append}
+    arguments = drive.arguments | {"poses": tmp_path / "lost.csv", "photos": drive.photo_inputs, "warn": notes.append}
     tile, _, xyz = cloud_of(imported(**arguments, out=tmp_path / "tile"))
     assert len(xyz) == (SWEEPS - 2) * 600 * 24 and walls(xyz)[0].max() < 0.003 and len(tile.views) == SWEEPS - 2
     assert [text.partition(":")[0] for text in notes] == [
@@ -232,7 +234,7 @@ def test_unsure_sections_are_removed_and_reported(drive: Drive, tmp_path: Path) 
         imported(**arguments, out=tmp_path / "none")
 
 
-def test_times_come_from_a_file_from_names_or_from_the_order(drive: Drive, tmp_path: Path) -> None:
+def test_times_are_read_from_a_file_or_from_names(drive: Drive, tmp_path: Path) -> None:
     few = tmp_path / "few"
     few.mkdir()
     source = sorted((drive.folder / "sweeps").iterdir())
@@ -248,7 +250,7 @@ def test_times_come_from_a_file_from_names_or_from_the_order(drive: Drive, tmp_p
     notes: list[str] = []
     (tmp_path / "times.txt").write_text("0.2\n0.4\n", encoding="utf-8")
     for names, extra in (
-        (["1.bin", "3.bin"], {}),  # frames' numbers
+        (["1.bin", "3.bin"], {}),  # numbers of frames
         (["0.2.bin", "0.4.bin"], {}),
         (["1700000000200000000.bin", "1700000000400000000.bin"], {"time_offset": -1700000000.0}),
         (["a.bin", "b.bin"], {"times": tmp_path / "times.txt"}),
@@ -281,33 +283,33 @@ def test_sweeps_in_trajectory_gaps_are_removed(drive: Drive, tmp_path: Path) -> 
     assert notes == ["1 of 6 sweeps are excluded: in gaps of the trajectory"]
 
 
-def test_a_projected_crs_keeps_its_large_coordinates(tmp_path: Path) -> None:
+def test_coordinates_of_a_projected_crs_keep_their_precision(tmp_path: Path) -> None:
     shift = np.array([500_000.0, 5_400_000.0, 200.0])
     drive = make(tmp_path, shift=shift)
     tile, cloud, xyz = cloud_of(imported(**drive.arguments, out=tmp_path / "tile", crs="EPSG:32633"))
     assert tile.frame.crs == "EPSG:32633" and walls(xyz - shift)[0].max() < 0.003 and np.abs(cloud.xyz).max() < 100
 
 
-def test_thinning_keeps_a_point_a_voxel(drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_thinning_keeps_one_point_per_voxel(drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = cloud_of(imported(**drive.arguments, out=tmp_path / "whole"))[2]
     thin = cloud_of(imported(**drive.arguments, out=tmp_path / "thin", voxel=0.37))[2]
-    monkeypatch.setattr("scan2sim.pipeline.importers.place_sweeps.MAX_PENDING_POINTS", 20_000)  # the same on the way
+    monkeypatch.setattr("scan2sim.pipeline.importers.place_sweeps.MAX_PENDING_POINTS", 20_000)  # thins repeatedly
     often = cloud_of(imported(**drive.arguments, out=tmp_path / "often", voxel=0.37))[2]
     origin = np.floor(drive.camera.positions[0])
     cells = [np.unique(np.floor((xyz - origin) / 0.37), axis=0) for xyz in (whole, thin)]
     assert 0.97 * len(cells[0]) < len(thin) < 1.03 * len(cells[0]) < 0.2 * len(whole) and len(often) == len(thin)
 
 
-def test_range_is_bounded(drive: Drive, tmp_path: Path) -> None:
+def test_points_outside_the_range_limits_are_removed(drive: Drive, tmp_path: Path) -> None:
     arguments = drive.arguments | {"out": tmp_path / "tile", "overwrite": True}
     with pytest.raises(DataError, match="no points within range"):
         imported(**arguments, max_range=1.5)
     xyz = cloud_of(imported(**arguments, min_range=3.0, max_range=6.0))[2]
-    away = np.linalg.norm(xyz[:, None] - way(drive.times).positions, axis=2)
+    away = np.linalg.norm(xyz[:, None] - scanner_path(drive.times).positions, axis=2)
     assert 2.99 < away.min(axis=1).max() < 6.01
 
 
-def test_extrinsics_the_wrong_way_round_are_noticed(drive: Drive, tmp_path: Path) -> None:
+def test_inverted_extrinsics_are_detected(drive: Drive, tmp_path: Path) -> None:
     notes: list[str] = []
     wrong = drive.arguments | {"extrinsics": np.linalg.inv(T_CAMERA_SCANNER)}
     imported(**wrong, out=tmp_path / "tile", warn=notes.append)
@@ -335,8 +337,8 @@ def test_kitti_camera_2_is_offset_from_camera_0(drive: Drive, tmp_path: Path) ->
     beside = photo_extrinsics(calib, own)
     centres = []
     for i, extrinsics in enumerate((None, beside)):
-        pictures = [PhotoInput(own, CAMERA, extrinsics=extrinsics)]
-        tile = read_tile(imported(**drive.arguments, out=tmp_path / str(i), photos=pictures, link=True))
+        photo_inputs = [PhotoInput(own, CAMERA, extrinsics=extrinsics)]
+        tile = read_tile(imported(**drive.arguments, out=tmp_path / str(i), photos=photo_inputs, link=True))
         centres.append((tile.views[0].T_world_cam, tile.views[0].centre))
     moved = centres[0][0][:3, :3].T @ (centres[1][1] - centres[0][1])
     np.testing.assert_allclose(moved, -offset, atol=1e-6)
@@ -350,7 +352,7 @@ def test_kitti_camera_2_is_offset_from_camera_0(drive: Drive, tmp_path: Path) ->
 def garbage(drive: Drive, name: str) -> dict[str, Any]:
     """A drive's arguments with one of its files overwritten."""
     (drive.folder / name).write_bytes(b"nonsense!")
-    return drive.arguments | {"photos": drive.pictures}
+    return drive.arguments | {"photos": drive.photo_inputs}
 
 
 @pytest.mark.parametrize(
@@ -369,7 +371,7 @@ def garbage(drive: Drive, name: str) -> dict[str, Any]:
         (lambda d: d.arguments | {"sweeps": d.folder / "no"}, InputError, r"no: folder not found"),
         (lambda d: d.arguments | {"times": d.folder / "t7.txt"}, InputError, r"t7\.txt: has 7 times for 6 sweeps"),
         (
-            lambda d: d.arguments | {"extrinsics": None, "photos": d.pictures},
+            lambda d: d.arguments | {"extrinsics": None, "photos": d.photo_inputs},
             SettingError,
             "photos need the extrinsics",
         ),
@@ -382,7 +384,7 @@ def garbage(drive: Drive, name: str) -> dict[str, Any]:
         ),
     ],
 )
-def test_bad_input_is_named_and_leaves_nothing(
+def test_invalid_input_is_reported_and_leaves_no_files(
     tmp_path: Path, change: Callable[[Drive], dict[str, Any]], kind: type[ScanError], message: str
 ) -> None:
     drive = make(tmp_path / "drive")
@@ -393,7 +395,7 @@ def test_bad_input_is_named_and_leaves_nothing(
     assert [p.name for p in tmp_path.iterdir()] == ["drive"]
 
 
-def test_a_sweeps_own_colours_are_kept_without_photos(tmp_path: Path) -> None:
+def test_colours_of_a_sweep_are_kept_without_photos(tmp_path: Path) -> None:
     xyz = np.random.default_rng(0).uniform(2, 5, (50, 3)).astype(np.float32)
     rgb = np.tile(np.array([10, 20, 30], np.uint8), (50, 1))
     las.write(tmp_path / "a.laz", PointCloud(Frame(), xyz, rgb))
@@ -403,7 +405,7 @@ def test_a_sweeps_own_colours_are_kept_without_photos(tmp_path: Path) -> None:
     assert cloud.rgb is not None and (cloud.rgb == [10, 20, 30]).all()
 
 
-def test_the_command(drive: Drive, tmp_path: Path) -> None:
+def test_command_imports_sweeps_and_reports_excluded_ones(drive: Drive, tmp_path: Path) -> None:
     folder, out = drive.folder, tmp_path / "tile"
     result = CliRunner().invoke(
         app,
@@ -415,10 +417,12 @@ def test_the_command(drive: Drive, tmp_path: Path) -> None:
     assert read_tile(out).name == "hall" and len(read_tile(out).views) == SWEEPS - 1
 
 
-def test_long_recordings_become_several_clouds(drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = cloud_of(imported(**drive.arguments, out=tmp_path / "whole", photos=drive.pictures))[1]
+def test_long_recordings_are_split_into_several_clouds(
+    drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = cloud_of(imported(**drive.arguments, out=tmp_path / "whole", photos=drive.photo_inputs))[1]
     monkeypatch.setattr("scan2sim.pipeline.importers.place_sweeps.MAX_PENDING_POINTS", 20_000)
-    tile = read_tile(imported(**drive.arguments, out=tmp_path / "blocks", photos=drive.pictures))
+    tile = read_tile(imported(**drive.arguments, out=tmp_path / "blocks", photos=drive.photo_inputs))
     parts = [clouds.read(path, tile.frame) for path in tile.clouds]
     assert len(parts) > 2 and max(map(len, parts)) < 40_000
     joined = PointCloud.join(parts)

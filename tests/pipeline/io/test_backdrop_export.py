@@ -1,4 +1,4 @@
-"""Worlds with a backdrop: what only cameras see is exported, beside everything that a world without it has."""
+"""Export of worlds with a backdrop, which only cameras see; all other files are as without it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def exported(scene: Scene, name: str, folder: Path) -> Path:
     return folder
 
 
-def test_gazebo_shows_it_to_cameras_only(town: Scene, tmp_path: Path) -> None:
+def test_gazebo_shows_the_backdrop_to_cameras_only(town: Scene, tmp_path: Path) -> None:
     out = exported(town, "gazebo", tmp_path / "out")
     model = ElementTree.parse(out / "models" / "tile0" / "model.sdf").getroot()
     flags = {visual.get("name"): visual.findtext("visibility_flags") for visual in model.iter("visual")}
@@ -69,7 +69,7 @@ def test_gazebo_shows_it_to_cameras_only(town: Scene, tmp_path: Path) -> None:
     assert all(camera.find("visibility_mask") is None for camera in robot.iter("camera"))
 
 
-def test_everything_else_is_as_without_it(town: Scene, tmp_path: Path) -> None:
+def test_files_without_the_backdrop_are_unchanged(town: Scene, tmp_path: Path) -> None:
     plain = replace(town, tiles=tuple(replace(tile, folder=tile.folder) for tile in town.tiles))
     with_it = exported(town, "gazebo", tmp_path / "with")
     for path in (town.tiles[0].folder / BACKDROP).iterdir():
@@ -85,13 +85,13 @@ def test_everything_else_is_as_without_it(town: Scene, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["glb", "usd"])
-def test_other_formats_show_it(town: Scene, tmp_path: Path, name: str) -> None:
+def test_visual_formats_contain_the_backdrop(town: Scene, tmp_path: Path, name: str) -> None:
     out = exported(town, name, tmp_path / "out")
     far = [part.image[0, 0] for part in READERS[name](out, town) if np.abs(part.corners).max() > 55]
     np.testing.assert_allclose(sorted(far, key=list), sorted(COLOURS), atol=4)
 
 
 @pytest.mark.parametrize("name", ["mujoco", "urdf", "tiles3d"])
-def test_formats_whose_sensors_would_measure_it_leave_it_out(town: Scene, tmp_path: Path, name: str) -> None:
+def test_physics_and_tile_formats_omit_the_backdrop(town: Scene, tmp_path: Path, name: str) -> None:
     out = exported(town, name, tmp_path / "out")
     assert not list(out.rglob("backdrop*"))

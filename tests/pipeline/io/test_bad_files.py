@@ -1,4 +1,4 @@
-"""Files that lie: what is made of them, or said about them (docs/reference/formats.md, "What bad input gets")."""
+"""Files with wrong content: their handling and errors (docs/reference/formats.md, "What bad input gets")."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_valid_header_is_used(tmp_path: Path) -> None:
     ("field", "values"),
     [("count", [2**63]), ("count", [10**12]), ("vlrs", [2**32 - 1]), ("extended", [400, 2**31]), ("scale", [0.0])],
 )
-def test_a_las_header_must_fit_into_its_file(tmp_path: Path, suffix: str, field: str, values: list[float]) -> None:
+def test_las_header_must_fit_into_its_file(tmp_path: Path, suffix: str, field: str, values: list[float]) -> None:
     path = patch(made(tmp_path / f"c{suffix}"), field, *values)
     with pytest.raises(InputError, match=r"(truncated|not a readable LAS file).*again"):
         clouds.read_header(path)
@@ -79,7 +79,7 @@ def test_points_beyond_the_las_header_count_are_reported(tmp_path: Path) -> None
     assert "declares 12 points, but the file has 3,000" in clouds.read_header(path).notes[0]
 
 
-def test_points_over_a_thousand_kilometres_are_no_tile(tmp_path: Path) -> None:
+def test_points_over_a_thousand_kilometres_are_rejected(tmp_path: Path) -> None:
     path = made(tmp_path / "c.las", reach=1e6)
     with pytest.raises(DataError, match=r"999\.\d km apart.*limit of a tile is 5 km.*scan2sim tile"):
         ingest({"cloud.0000": path}, step_params(IngestParams, origin=FRAME.origin), tmp_path, silent)
@@ -87,13 +87,13 @@ def test_points_over_a_thousand_kilometres_are_no_tile(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
 @pytest.mark.parametrize("count", [10**15, 301, 299, -1])
-def test_a_ply_holds_what_its_header_says(tmp_path: Path, form: str, count: int) -> None:
+def test_ply_with_a_wrong_number_of_vertices_is_rejected(tmp_path: Path, form: str, count: int) -> None:
     with pytest.raises(InputError, match=r"(its header declares .* vertices, there are 300|negative).*again"):
         clouds.read_header(ply(tmp_path, form, count))
 
 
 @pytest.mark.parametrize("cut", np.linspace(0, 0.995, 40).tolist())
-def test_a_cut_ascii_ply_is_refused(tmp_path: Path, cut: float) -> None:
+def test_truncated_ascii_ply_is_rejected(tmp_path: Path, cut: float) -> None:
     path = ply(tmp_path, "ascii", 300)
     path.write_bytes(path.read_bytes()[: int(cut * path.stat().st_size)])
     with pytest.raises(InputError, match=r"c\.ply: is (not a readable PLY cloud|truncated)"):
@@ -113,7 +113,7 @@ def pipe(folder: Path, name: str) -> Path:
     return folder / name
 
 
-def test_pipes_and_folders_are_no_files(tmp_path: Path) -> None:
+def test_pipes_and_folders_are_rejected(tmp_path: Path) -> None:
     made(tmp_path / "c.las")
     with pytest.raises(InputError, match="pipe"):
         clouds.read_header(pipe(tmp_path, "p.laz"))
@@ -129,7 +129,7 @@ def test_pipes_and_folders_are_no_files(tmp_path: Path) -> None:
         image.read_rgb(pipe(tmp_path, "p.jpg"))
 
 
-def test_photos_that_are_pipes_or_folders_are_left_out_and_no_digest_waits_for_them(tmp_path: Path) -> None:
+def test_photos_that_are_pipes_or_folders_are_skipped_and_digests_do_not_block(tmp_path: Path) -> None:
     (tmp_path / "folder.jpg").mkdir()
     for path, cause in ((pipe(tmp_path, "pipe.jpg"), "pipe or device"), (tmp_path / "folder.jpg", "is a folder")):
         assert digest(path) == ("missing" if path.name == "pipe.jpg" else digest(tmp_path / "folder.jpg"))
@@ -145,19 +145,19 @@ def test_photos_that_are_pipes_or_folders_are_left_out_and_no_digest_waits_for_t
     ],
     ids=["nested", "digits", "large"],
 )
-def test_toml_that_would_exhaust_the_reader(tmp_path: Path, text: str) -> None:
+def test_toml_exceeding_the_limits_of_the_parser_is_rejected(tmp_path: Path, text: str) -> None:
     (tmp_path / "tile.toml").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=r"tile\.toml: is not valid TOML|has .* bytes"):
         read_tile(tmp_path)
 
 
-def test_a_byte_order_mark_is_no_part_of_a_tile(tmp_path: Path) -> None:
+def test_byte_order_mark_of_a_tile_is_ignored(tmp_path: Path) -> None:
     made(tmp_path / "c.las")
     (tmp_path / "tile.toml").write_text('\ufeffname = "t"\ncrs = "local"\nclouds = ["c.las"]\n', encoding="utf-8")
     assert read_tile(tmp_path).name == "t"
 
 
-def test_a_large_panorama_is_read_and_a_bomb_is_not(tmp_path: Path) -> None:
+def test_large_panorama_is_read_and_decompression_bomb_rejected(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "p.jpg"), np.zeros((9600, 19_200), np.uint8))
     assert image.size_of(tmp_path / "p.jpg") == (19_200, 9600)
     image.check_decodes(tmp_path / "p.jpg")

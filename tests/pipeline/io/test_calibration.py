@@ -1,4 +1,4 @@
-"""Files of extrinsics and cameras."""
+"""Reading of extrinsics and cameras."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ T_CAMERA_SCANNER[:3, 3] = [0.1, 0.4, -0.3]
 
 
 @pytest.mark.parametrize("form", ["rows", "three", "velo_to_cam", "odometry"])
-def test_extrinsics_of_all_kinds_of_files(tmp_path: Path, form: str) -> None:
+def test_extrinsics_are_read_from_all_file_formats(tmp_path: Path, form: str) -> None:
     T, file = T_CAMERA_SCANNER, tmp_path / "T.txt"
 
     def text(values: F64) -> str:
@@ -46,13 +46,13 @@ def test_extrinsics_of_all_kinds_of_files(tmp_path: Path, form: str) -> None:
         ("2 0 0 0\n0 2 0 0\n0 0 2 0", r"T\.txt: its left 3x3 is not a rotation matrix"),
     ],
 )
-def test_bad_extrinsics_are_named(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_extrinsics_are_rejected(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "T.txt").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=message):
         read_extrinsics(tmp_path / "T.txt")
 
 
-def test_a_camera_of_a_file_or_of_numbers(tmp_path: Path) -> None:
+def test_camera_is_read_from_a_file_or_given_by_numbers(tmp_path: Path) -> None:
     file, photos = tmp_path / "camera.toml", tmp_path / "photos"
     photos.mkdir()
     cv2.imwrite(str(photos / "0.png"), np.zeros((256, 512, 3), np.uint8))

@@ -1,4 +1,4 @@
-"""One contract for all cloud formats: what other programs would write is read back as it was."""
+"""Requirements on all cloud formats: files as other programs write them are read losslessly."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def write_las(path: Path, cloud: PointCloud) -> None:
 
 
 def write_copc(path: Path, cloud: PointCloud, levels: int = 2) -> None:
-    """An octree: each point in the node of its place on one of `levels`, the first points on the coarsest."""
+    """An octree: each point in the node of its position on one of `levels`, the first points on the coarsest."""
     copclib = pytest.importorskip("copclib", reason="COPC files are written by copclib")
     from pyproj import CRS
 
@@ -61,7 +61,7 @@ def write_copc(path: Path, cloud: PointCloud, levels: int = 2) -> None:
 
 
 def write_e57(path: Path, cloud: PointCloud) -> None:
-    """Two scans, each in axes of its own; single precision, as pye57 writes."""
+    """Two scans in different axes; single precision, as pye57 writes."""
     pye57 = pytest.importorskip("pye57", reason="E57 files are written by pye57")
     from scipy.spatial.transform import Rotation
 
@@ -221,7 +221,7 @@ def ept(kind: str) -> Callable[[Path, PointCloud], None]:
 
 @dataclass(frozen=True)
 class Format:
-    """A file, who writes it, and what it keeps: metres of precision, attributes, the CRS, the points' order."""
+    """A file, its writer, and what the format stores: precision in metres, attributes, CRS, order of points."""
 
     file: str
     write: Callable[[Path, PointCloud], None]
@@ -261,7 +261,7 @@ def written(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Format, Pat
 
 
 def same(form: Format, read: PointCloud, cloud: PointCloud, precision: float) -> None:
-    """Points come in the order of writing, except in an octree, where times identify them."""
+    """Compare clouds: points in the order of writing, except in an octree, where times identify them."""
     assert len(read) == len(cloud)
     if not form.ordered:
         read, cloud = read.take(np.argsort(present(read.time))), cloud.take(np.argsort(present(cloud.time)))
@@ -275,7 +275,7 @@ def same(form: Format, read: PointCloud, cloud: PointCloud, precision: float) ->
             assert values is None or not values.any(), f"{name} was not in the file"
 
 
-def test_a_cloud_comes_back(written: tuple[Format, Path, PointCloud]) -> None:
+def test_cloud_round_trip(written: tuple[Format, Path, PointCloud]) -> None:
     form, path, cloud = written
     header = clouds.read_header(path)
     assert header.count == N and (header.crs is not None) == form.crs
@@ -286,8 +286,8 @@ def test_a_cloud_comes_back(written: tuple[Format, Path, PointCloud]) -> None:
     same(form, clouds.read(path, FRAME), cloud, form.precision)
 
 
-def test_a_cloud_comes_back_in_parts(written: tuple[Format, Path, PointCloud]) -> None:
-    """As a survey is cut: each part in a frame near it, colours and intensities by one rule for all."""
+def test_cloud_is_read_in_chunks(written: tuple[Format, Path, PointCloud]) -> None:
+    """As when a survey is cut: each chunk in a nearby frame, with the same scaling of colours and intensities."""
     form, path, cloud = written
     parts = list(clouds.chunks(path, Frame(FRAME.crs), 128))
     assert len(parts) > 5 or form.file.endswith(".ply")
@@ -296,7 +296,7 @@ def test_a_cloud_comes_back_in_parts(written: tuple[Format, Path, PointCloud]) -
     assert all(np.abs(part.xyz).max() < 200 for part in parts)
 
 
-def test_a_cloud_is_inspected_and_imported(written: tuple[Format, Path, PointCloud]) -> None:
+def test_cloud_is_inspected_and_imported(written: tuple[Format, Path, PointCloud]) -> None:
     form, path, cloud = written
     shown = CliRunner().invoke(app, ["inspect", str(path)])
     assert shown.exit_code == 0 and "1,000" in shown.output
@@ -309,7 +309,7 @@ def test_a_cloud_is_inspected_and_imported(written: tuple[Format, Path, PointClo
     same(form, clouds.read(tile.clouds[0], tile.frame), cloud, form.precision + 6e-4)
 
 
-def test_a_tile_names_a_cloud(written: tuple[Format, Path, PointCloud]) -> None:
+def test_tile_refers_to_a_cloud(written: tuple[Format, Path, PointCloud]) -> None:
     form, path, cloud = written
     write_tile(path.parent, name="t", crs=FRAME.crs, clouds=[path.name], cameras={})
     if path.name == "ept.json":
@@ -320,8 +320,8 @@ def test_a_tile_names_a_cloud(written: tuple[Format, Path, PointCloud]) -> None:
         same(form, clouds.read(tile.clouds[0], tile.frame), cloud, form.precision)
 
 
-def test_a_cut_file_is_refused(written: tuple[Format, Path, PointCloud]) -> None:
-    """Whatever is missing at the end: never a traceback, never less than all points."""
+def test_truncated_file_is_rejected(written: tuple[Format, Path, PointCloud]) -> None:
+    """Truncated anywhere: an error with a remedy, or all points."""
     _, start, _ = written
     path = sorted((start.parent / "ept-data").iterdir())[1] if start.name == "ept.json" else start
     whole = path.read_bytes()
@@ -331,18 +331,18 @@ def test_a_cut_file_is_refused(written: tuple[Format, Path, PointCloud]) -> None
             read = clouds.read(start, FRAME)
         except ScanError as error:
             assert error.remedy
-        else:  # a text says nothing of its length; a COPC file's hierarchy stands behind all points
+        else:  # text has no length; the hierarchy of COPC follows all points
             assert len(read) == N or path.suffix in (".xyz", ".txt", ".csv")
 
 
-def test_a_file_whose_reader_is_missing_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_reader_is_reported_with_its_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("scan2sim.pipeline.core.optional_deps.importlib.util.find_spec", lambda name: None)
     (tmp_path / "c.e57").write_bytes(b"")
     with pytest.raises(UnavailableError, match=r"c\.e57: needs pye57.*pip install 'scan2sim\[e57\]'"):
         clouds.read_header(tmp_path / "c.e57")
 
 
-# --- what each has of its own
+# --- single formats
 
 
 @pytest.mark.parametrize("data", ["binary", "binary_compressed", "ascii"])
@@ -355,7 +355,7 @@ def test_pcd_with_a_wrong_header_is_rejected(tmp_path: Path, data: str, count: i
 
 
 def crc32c(data: bytes) -> int:
-    """Castagnoli's, of E57's pages."""
+    """Castagnoli checksum of E57 pages."""
     table = []
     for value in range(256):
         for _ in range(8):
@@ -368,7 +368,7 @@ def crc32c(data: bytes) -> int:
 
 
 def e57_changed(data: bytes, change: Callable[[bytes], bytes]) -> bytes:
-    """An E57 file with other content (of the same length) and right checksums: one stands behind every 1,020 bytes."""
+    """An E57 file with other content (of the same length) and valid checksums, one after every 1,020 bytes."""
     plain = change(b"".join(data[at : at + 1020] for at in range(0, len(data), 1024)))
     pages = [plain[at : at + 1020] for at in range(0, len(plain), 1020)]
     return b"".join(page + struct.pack(">I", crc32c(page)) for page in pages)
@@ -384,7 +384,7 @@ def test_e57_with_a_wrong_count_is_rejected(tmp_path: Path, count: bytes) -> Non
         clouds.read(tmp_path / "c.e57", FRAME)
 
 
-def test_beams_without_return_are_left_out(tmp_path: Path) -> None:
+def test_beams_without_return_are_not_counted(tmp_path: Path) -> None:
     rows = np.ones(1000, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
     rows["y"][:900] = np.nan
     write_pcd(tmp_path / "c.pcd", rows, "binary_compressed")
@@ -392,7 +392,7 @@ def test_beams_without_return_are_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-def test_pcd_files_of_open3d(tmp_path: Path, compressed: bool) -> None:
+def test_pcd_files_of_open3d_are_read(tmp_path: Path, compressed: bool) -> None:
     o3d = pytest.importorskip("open3d")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.random.default_rng(0).uniform(-9, 9, (500, 3))))
     cloud.colors = o3d.utility.Vector3dVector(np.random.default_rng(1).integers(0, 256, (500, 3)) / 255)
@@ -437,13 +437,13 @@ def test_columns_are_detected_and_assumptions_reported(tmp_path: Path, lines: st
         ("hello\nworld\n", "is not a cloud"),
     ],
 )
-def test_a_text_that_is_no_cloud_is_refused(tmp_path: Path, lines: str, cause: str) -> None:
+def test_text_that_is_not_a_cloud_is_rejected(tmp_path: Path, lines: str, cause: str) -> None:
     (tmp_path / "c.xyz").write_text(lines, encoding="utf-8")
     with pytest.raises(InputError, match=cause):
         clouds.read(tmp_path / "c.xyz", Frame())
 
 
-def test_a_line_that_never_ends_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_long_line_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scan2sim.pipeline.io.number_text.BLOCK_BYTES", 1 << 10)
     (tmp_path / "c.xyz").write_text("1 2 " + "3" * 5000, encoding="utf-8")
     with pytest.raises(InputError, match="line of more than|is not a cloud"):
@@ -469,7 +469,7 @@ BINARY = """{"dataType": "binary", "schema": [{"name": "X", "type": "signed", "s
         ("ept.json", BINARY % ("1e400", "1"), "its schema has no valid dimensions"),
     ],
 )
-def test_a_broken_ept_is_refused(tmp_path: Path, file: str, body: str, cause: str) -> None:
+def test_damaged_ept_is_rejected(tmp_path: Path, file: str, body: str, cause: str) -> None:
     ept("binary")(tmp_path / "ept.json", made(N))
     (tmp_path / file).write_text(body, encoding="utf-8")
     with pytest.raises(InputError, match=cause):
@@ -481,8 +481,8 @@ def test_the_old_name_of_the_command_still_works(tmp_path: Path) -> None:
     assert CliRunner().invoke(app, ["import", "las", str(tmp_path / "c.laz"), "-o", str(tmp_path / "t")]).exit_code == 0
 
 
-def test_a_real_tile_as_copc(real_data: Path, tmp_path: Path) -> None:
-    """An airborne tile as an octree of three levels, by another program's writer: no point is lost, none changes."""
+def test_real_tile_is_read_losslessly_from_copc(real_data: Path, tmp_path: Path) -> None:
+    """An airborne tile as an octree of three levels, by the writer of copclib; points are complete and unchanged."""
     pytest.importorskip("copclib", reason="COPC files are written by copclib")
     laspy = pytest.importorskip("laspy")
     source = sorted((real_data / "las").glob("ign_7705*.laz"))[0]
@@ -500,7 +500,7 @@ def test_a_real_tile_as_copc(real_data: Path, tmp_path: Path) -> None:
         intensity=np.array(some.intensity),
     )
     write_copc(tmp_path / "c.copc.laz", cloud, levels=3)
-    with laspy.CopcReader.open(tmp_path / "c.copc.laz") as reader:  # laspy's own octree reader agrees that it is one
+    with laspy.CopcReader.open(tmp_path / "c.copc.laz") as reader:  # valid for the octree reader of laspy
         assert len(reader.query()) == len(cloud) and reader.header.point_count == len(cloud)
     read = clouds.read(tmp_path / "c.copc.laz", frame)
     assert np.abs(np.sort(read.xyz, axis=0) - np.sort(cloud.xyz, axis=0)).max() < 1e-3

@@ -1,4 +1,4 @@
-"""Cloud files come back as they were written."""
+"""Cloud files: round trips, and errors of damaged files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def made(n: int = 1000) -> PointCloud:
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_las_keeps_places_classes_colours_times_and_crs(tmp_path: Path, suffix: str) -> None:
+def test_las_keeps_positions_classes_colours_times_and_crs(tmp_path: Path, suffix: str) -> None:
     cloud, path = made(), tmp_path / f"c{suffix}"
     las.write(path, cloud)
     read = clouds.read(path, FRAME)
@@ -47,7 +47,7 @@ def test_las_without_crs_and_colours_has_none(tmp_path: Path) -> None:
     assert clouds.read(tmp_path / "c.las", Frame()).rgb is None
 
 
-def test_an_empty_las_is_refused(tmp_path: Path) -> None:
+def test_empty_las_is_rejected(tmp_path: Path) -> None:
     las.write(tmp_path / "c.las", PointCloud(Frame(), np.empty((0, 3), np.float32)))
     with pytest.raises(InputError, match=r"c\.las: contains no points.*Remove it"):
         clouds.read_header(tmp_path / "c.las")
@@ -67,7 +67,7 @@ def test_ply_keeps_double_coordinates_colours_and_classes(tmp_path: Path, form: 
     assert np.allclose(header.low, FRAME.to_crs(cloud.xyz).min(axis=0))
 
 
-def test_a_ply_without_colours_and_classes(tmp_path: Path) -> None:
+def test_ply_without_colours_and_classes_has_none(tmp_path: Path) -> None:
     rows = "\n".join(f"{x} 0 0" for x in range(5))
     heading = "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n"
     (tmp_path / "c.ply").write_text(f"{heading}end_header\n{rows}\n", encoding="utf-8")
@@ -79,7 +79,7 @@ def test_a_ply_without_colours_and_classes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content", [b"", b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1\n"]
 )
-def test_a_damaged_ply_is_named(tmp_path: Path, content: bytes) -> None:
+def test_damaged_ply_is_rejected(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "c.ply").write_bytes(content)
     with pytest.raises(InputError, match=r"c\.ply: is not a readable PLY cloud.*Export it again"):
         clouds.read(tmp_path / "c.ply", Frame())

@@ -1,4 +1,4 @@
-"""Collada: what a reader gets is what was written, in the form that Gazebo reads whole."""
+"""Collada: a reader gets the written geometry, in the form that Gazebo reads completely."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.present import present
 
 
 @pytest.mark.parametrize("make", [synthetic.ground, synthetic.house])
-def test_triangles_uv_and_pages_survive(tmp_path: Path, make: Callable[[], Mesh]) -> None:
+def test_triangles_uv_and_pages_round_trip(tmp_path: Path, make: Callable[[], Mesh]) -> None:
     import collada
 
     mesh = make()

@@ -1,4 +1,4 @@
-"""GLB: y-up, matt, textures embedded and the right way up, however packed; where each face has its colour from."""
+"""GLB: y-up, matt, embedded textures with the correct orientation, all encodings, and the source photo of faces."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def written(folder: Path, **params: Any) -> Path:
 
 
 class File:
-    """What a reader of the specification sees."""
+    """Content of a GLB file, read by the specification."""
 
     def __init__(self, path: Path) -> None:
         data = path.read_bytes()
@@ -96,7 +96,7 @@ class File:
         return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
 
 
-def test_a_reader_gets_all_triangles_y_up(tmp_path: Path) -> None:
+def test_all_triangles_are_read_y_up(tmp_path: Path) -> None:
     import trimesh
 
     scene = trimesh.load_scene(written(tmp_path), process=False)
@@ -126,20 +126,20 @@ def test_packed_geometry_is_the_same_to_a_millimetre(tmp_path: Path, codec: str)
             y_up = np.stack([corners[..., 0], corners[..., 2], -corners[..., 1]], axis=-1)
             wanted = np.concatenate([y_up, uv[..., :1], 1 - uv[..., 1:]], axis=-1)
             got = np.concatenate([part["POSITION"], part["TEXCOORD_0"]], axis=-1)[part["faces"]]
-            assert furthest(got, wanted) < (0.0006 if codec != "plain" else 1e-6)
+            assert max_corner_distance(got, wanted) < (0.0006 if codec != "plain" else 1e-6)
             assert np.abs(np.linalg.norm(part["NORMAL"], axis=1) - 1).max() < 0.02
 
 
-def furthest(got: np.ndarray, wanted: np.ndarray) -> float:
-    """How far the corners of triangles (F, 3, k) are at most from those that are wanted, each of which is there."""
-    turns = np.concatenate([np.roll(wanted, turn, axis=1) for turn in range(3)])  # whichever corner comes first
+def max_corner_distance(got: np.ndarray, wanted: np.ndarray) -> float:
+    """Largest distance of corners of triangles (F, 3, k) from the expected ones, which must be matched one to one."""
+    turns = np.concatenate([np.roll(wanted, turn, axis=1) for turn in range(3)])  # with any corner first
     far, which = cKDTree(turns.reshape(len(turns), -1)).query(got.reshape(len(got), -1), p=np.inf)
     assert len(np.unique(which % len(wanted))) == len(wanted) == len(got)
     return float(far.max())
 
 
 @pytest.mark.parametrize("texture", ["jpeg", "webp"])
-def test_pictures_are_the_right_way_up_by_the_specification(tmp_path: Path, texture: str) -> None:
+def test_texture_orientation_follows_the_specification(tmp_path: Path, texture: str) -> None:
     file = File(written(tmp_path, glb_texture=texture))
     part, image = file.mesh("building_0"), file.page("building_0")
     xyz, uv, faces = part["POSITION"], part["TEXCOORD_0"], part["faces"]
@@ -147,9 +147,9 @@ def test_pictures_are_the_right_way_up_by_the_specification(tmp_path: Path, text
     high = uv[faces[1]].mean(axis=0), xyz[faces[1]].mean(axis=0)[1]
     assert low[1] < high[1]
     u, v = (low[0] * 256).astype(int)  # glTF: (0, 0) is the upper left
-    assert np.abs(image[v, u].astype(int) - (40, 40, 220)).max() < 20  # blue: the picture's lower left
+    assert np.abs(image[v, u].astype(int) - (40, 40, 220)).max() < 20  # blue: lower left of the image
     u, v = (high[0] * 256).astype(int)
-    assert np.abs(image[v, u].astype(int) - (220, 40, 40)).max() < 20  # red: its upper left
+    assert np.abs(image[v, u].astype(int) - (220, 40, 40)).max() < 20  # red: upper left
 
 
 def test_materials_are_unlit_by_default(tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_materials_are_unlit_by_default(tmp_path: Path) -> None:
 
 def test_each_face_has_its_photo_and_distance(tmp_path: Path) -> None:
     ground, house = surfaces(tmp_path)
-    photo = np.where(np.arange(len(ground.shape)) % 2, 0, -1).astype(np.int32)  # every other face was seen by the first
+    photo = np.where(np.arange(len(ground.shape)) % 2, 0, -1).astype(np.int32)  # photo of every other face
     ground = replace(ground, shape=replace(ground.shape, photo=photo))
     filled = np.full((256, 256), 64, np.uint8)
     cv2.imwrite(str(house.shape.seen[1]), filled)

@@ -1,4 +1,4 @@
-"""GPS tracks: every format, what is dropped, what stays a gap."""
+"""GPS tracks: all formats, rejected fixes, gaps."""
 
 from __future__ import annotations
 
@@ -100,14 +100,14 @@ def test_all_formats_give_the_same_track(tmp_path: Path, name: str, text: str, s
     assert track.sigma is None if sigma is None else np.allclose(present(track.sigma), sigma)
 
 
-def test_local_metres_are_left_where_they_are(tmp_path: Path) -> None:
+def test_local_metres_are_kept_unchanged(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("time,x,y\n1,10,20\n0,5,20\n1,99,99\n2,15,20\n", encoding="utf-8")
     track = gps.read(tmp_path / "a.csv")
     assert track.frame == Frame() and track.times.tolist() == [0, 1, 2]
     assert track.positions.tolist() == [[5, 20, 0], [10, 20, 0], [15, 20, 0]]
 
 
-def test_date_of_fixes_before_the_only_rmc(tmp_path: Path) -> None:
+def test_fixes_before_the_only_rmc_get_its_date(tmp_path: Path) -> None:
     (tmp_path / "a.nmea").write_text("\n".join([*(gga(*row) for row in points()), rmc(START + 8)]), encoding="utf-8")
     assert np.allclose(gps.read(tmp_path / "a.nmea").times, START + np.arange(8))
 
@@ -129,13 +129,13 @@ def test_date_of_fixes_before_the_only_rmc(tmp_path: Path) -> None:
         ("a.kml", "", r"unknown GPS format.*\.gpx"),
     ],
 )
-def test_bad_files_are_refused(tmp_path: Path, name: str, text: str, message: str) -> None:
+def test_invalid_files_are_rejected(tmp_path: Path, name: str, text: str, message: str) -> None:
     (tmp_path / name).write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=message):
         gps.read(tmp_path / name)
 
 
-def test_a_missing_file() -> None:
+def test_missing_file_is_reported() -> None:
     with pytest.raises(InputError, match=r"none\.gpx: file not found"):
         gps.read(Path("none.gpx"))
 
@@ -149,14 +149,14 @@ def straight(seconds: float, rate: float = 10.0, speed: float = 15.0) -> tuple[n
 
 
 @pytest.mark.parametrize("bad", [[0], [0, 1, 2], [50], [40, 41, 42, 43], [99], [10, 30, 31, 98]])
-def test_jumps_are_dropped_wherever_they_are(bad: list[int]) -> None:
+def test_jumps_are_rejected_at_any_position(bad: list[int]) -> None:
     times, positions = straight(10)
     positions[bad, 1] += 400
     assert reject_jumps(times, positions[:, :2]).tolist() == [i for i in range(100) if i not in bad]
     assert reject_jumps(times, positions[:, :2], lookback=2).tolist() == [i for i in range(100) if i not in bad]
 
 
-def test_gaps_stay_gaps() -> None:
+def test_gaps_are_not_interpolated() -> None:
     times, positions = straight(20, rate=1)
     keep = (times < 5) | (times > 9)
     track = GpsTrack(times[keep], positions[keep])
@@ -231,7 +231,7 @@ def film(path: Path, packets: list[bytes], starts: list[float]) -> Path:
     return path
 
 
-def test_telemetry_of_a_gopro(tmp_path: Path) -> None:
+def test_gopro_telemetry_is_read(tmp_path: Path) -> None:
     track = gps.read(film(tmp_path / "a.mp4", [gps5(i) for i in range(4)], [0.0, 1.0, 2.0, 3.0]))
     assert np.allclose(track.times, np.arange(40) / 10, atol=2e-3)
     assert np.allclose(np.diff(track.positions[:, 0]), 5.1, atol=0.02)
@@ -240,7 +240,7 @@ def test_telemetry_of_a_gopro(tmp_path: Path) -> None:
     assert track.shifted(10).epoch == pytest.approx(START - 10, abs=0.01)
 
 
-def test_telemetry_without_a_fix_is_dropped(tmp_path: Path) -> None:
+def test_gopro_telemetry_without_a_fix_is_dropped(tmp_path: Path) -> None:
     packets = [gps5(0, fix=0), gps5(1), gps5(2, dop=9999), gps5(3)]
     track = gps.read(film(tmp_path / "a.mp4", packets, [0.0, 1.0, 2.0, 3.0]))
     assert np.allclose(track.times, [*np.arange(1, 2, 0.1), *np.arange(3, 4, 0.1)], atol=2e-3)
@@ -249,7 +249,7 @@ def test_telemetry_without_a_fix_is_dropped(tmp_path: Path) -> None:
 
 
 def test_camera_timestamps_give_the_start_of_gps(tmp_path: Path) -> None:
-    """The accelerometer's first sample is at the video's start, the GPS's 0.2 s later."""
+    """The first sample of the accelerometer is at the start of the video, the first GPS fix 0.2 s later."""
     packets = [gps5(i, stamp=7.2 + i) for i in range(3)]
     track = gps.read(film(tmp_path / "a.mp4", packets, [0.0, 1.0, 2.1]))
     assert np.allclose(track.times, 0.2 + np.arange(30) / 10, atol=2e-3)
@@ -263,7 +263,7 @@ def test_gps9_dates_every_fix(tmp_path: Path) -> None:
     assert track.epoch == pytest.approx(START, abs=0.02)
 
 
-def test_damaged_telemetry_and_films_without_any(tmp_path: Path) -> None:
+def test_damaged_or_missing_telemetry_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"truncated"):
         gpmf_fixes(gps5(0)[:-40])
     with pytest.raises(InputError, match=r"a\.mp4: has damaged GoPro telemetry.*Copy it"):

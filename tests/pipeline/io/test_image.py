@@ -1,4 +1,4 @@
-"""Photos of every format against what was written, as 8-bit sRGB; and the errors of unreadable ones."""
+"""Photos of all formats are read as 8-bit sRGB; errors of unreadable ones."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def linear(rgb: U8) -> Any:
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.bmp", "a.webp", "a.JPG", "a.tif", "a.TIFF"])
-def test_8_bits_are_as_they_were_written(tmp_path: Path, rgb: U8, name: str) -> None:
+def test_8_bit_images_are_read_losslessly(tmp_path: Path, rgb: U8, name: str) -> None:
     options = {"a.webp": [cv2.IMWRITE_WEBP_QUALITY, 101], "a.JPG": [cv2.IMWRITE_JPEG_QUALITY, 100]}
     cv2.imwrite(str(tmp_path / name), rgb[..., ::-1], options.get(name, []))
     assert image.size_of(tmp_path / name) == (WIDTH, HEIGHT)
@@ -59,7 +59,7 @@ def test_8_bits_are_as_they_were_written(tmp_path: Path, rgb: U8, name: str) -> 
         ("a.hdr", "float", 0),
     ],
 )
-def test_16_bits_are_scaled_and_linear_light_gets_the_curve(
+def test_16_bit_images_are_scaled_and_linear_light_is_encoded(
     tmp_path: Path, rgb: U8, name: str, kind: str, tile: int
 ) -> None:
     pixels = linear(rgb) if kind != "uint16" else (rgb * 257.0 + 100).clip(0, 65535).astype(np.uint16)
@@ -72,13 +72,13 @@ def test_16_bits_are_scaled_and_linear_light_gets_the_curve(
         assert np.abs(image.read_levels(tmp_path / name) - rgb @ [0.299, 0.587, 0.114]).mean() <= 1
 
 
-def test_light_beyond_white_and_no_numbers_are_clipped(tmp_path: Path) -> None:
+def test_linear_light_out_of_range_or_not_finite_is_clipped(tmp_path: Path) -> None:
     light = np.array([[(-1, 0, 0.5), (1, 7, np.inf), (np.nan, -np.inf, 0.0031308)]], np.float32)
     write(tmp_path / "a.exr", light, "float")
     assert image.read_rgb(tmp_path / "a.exr").tolist() == [[[0, 0, 188], [255, 255, 255], [0, 0, 10]]]
 
 
-def test_exr_of_other_primaries_comes_in_srgb(tmp_path: Path, rgb: U8) -> None:
+def test_exr_with_other_primaries_is_converted_to_srgb(tmp_path: Path, rgb: U8) -> None:
     there = np.linalg.inv(to_xyz(P3)) @ to_xyz(SRGB)
     write(tmp_path / "a.exr", (linear(rgb) @ there.T).astype(np.float32), "float", oiio__ColorSpace="lin_p3d65_scene")
     assert np.abs(image.read_rgb(tmp_path / "a.exr").astype(int) - rgb).max() <= 1
@@ -94,7 +94,7 @@ def test_colour_profile_is_applied(tmp_path: Path, rgb: U8, name: str, primaries
     assert np.abs(image.read_rgb(tmp_path / name) - truth).max() <= 2
 
 
-def test_profiles_of_srgb_and_of_inks_change_no_byte(tmp_path: Path, rgb: U8) -> None:
+def test_profiles_of_srgb_and_cmyk_are_not_applied(tmp_path: Path, rgb: U8) -> None:
     Image.fromarray(rgb).save(tmp_path / "a.png", icc_profile=profile(SRGB, None))
     assert (image.read_rgb(tmp_path / "a.png") == rgb).all()
     inks = profile(SRGB, None).replace(b"RGB ", b"CMYK", 1)
@@ -108,7 +108,7 @@ def test_damaged_colour_profile_is_reported(tmp_path: Path, rgb: U8) -> None:
         image.read_rgb(tmp_path / "a.png")
 
 
-def test_orientation_is_ignored_and_inks_become_colours(tmp_path: Path, rgb: U8) -> None:
+def test_exif_orientation_is_ignored(tmp_path: Path, rgb: U8) -> None:
     turned = Image.Exif()
     turned[0x112] = 6
     Image.fromarray(rgb).save(tmp_path / "a.jpg", exif=turned, quality=100)
@@ -116,7 +116,7 @@ def test_orientation_is_ignored_and_inks_become_colours(tmp_path: Path, rgb: U8)
 
 
 @pytest.mark.parametrize("names", [("R", "G", "B", "A"), ("Y",)])
-def test_the_fourth_channel_darkens_nothing_and_grey_is_grey(tmp_path: Path, rgb: U8, names: tuple[str, ...]) -> None:
+def test_alpha_channel_is_ignored_and_grey_becomes_rgb(tmp_path: Path, rgb: U8, names: tuple[str, ...]) -> None:
     extra = np.concatenate([rgb, 255 - rgb[..., :1]], axis=2)[..., : len(names)]
     write(tmp_path / "a.tif", extra, "uint8", oiio__UnassociatedAlpha=1)
     assert (image.read_rgb(tmp_path / "a.tif") == (rgb if len(names) > 1 else rgb[..., :1])).all()
@@ -132,7 +132,7 @@ def test_cropped_reading_equals_the_full_image(tmp_path: Path, rgb: U8, tile: in
 
 
 def orthophoto(folder: Path, name: str, rgb: U8) -> tuple[View, Path]:
-    """Written there, and a cloud below a part of it."""
+    """Write an orthophoto; return its view, and a cloud below a part of it."""
 
     write(folder / name, rgb, "uint8", 16 if name.endswith("f") else 0)
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -184,7 +184,7 @@ def test_file_that_is_no_image_is_reported(tmp_path: Path, rgb: U8) -> None:
         image.read_rgb(tmp_path / "depth.exr")
 
 
-def test_a_library_that_is_missing_is_named(tmp_path: Path, rgb: U8, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_library_is_reported(tmp_path: Path, rgb: U8, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path / "a.exr", linear(rgb), "half")
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda n, *more: None if n == "OpenImageIO" else real(n, *more))

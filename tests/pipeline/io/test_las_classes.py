@@ -1,4 +1,4 @@
-"""A copy of a LAS file with new classes has everything else of it."""
+"""A copy of a LAS file with new classes keeps all other data."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def made(path: Path, point_format: int, crs: str | None = "EPSG:25832", extra: s
     return path
 
 
-def answers(n: int = N) -> tuple[U8, U8, U8]:
+def result_columns(n: int = N) -> tuple[U8, U8, U8]:
     rng = np.random.default_rng(8)
     code = rng.choice([c.code for c in CLASSES], n).astype(np.uint8)
     return code, rng.integers(0, 256, n).astype(np.uint8), rng.integers(1, 4, n).astype(np.uint8)
@@ -94,9 +94,9 @@ def check(source: Path, out: Path, columns: tuple[U8, U8, U8]) -> Any:
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 @pytest.mark.parametrize("point_format", range(11))
-def test_everything_but_the_classes_is_kept(tmp_path: Path, point_format: int, suffix: str) -> None:
+def test_all_data_except_classes_is_kept(tmp_path: Path, point_format: int, suffix: str) -> None:
     source, out = made(tmp_path / f"a{suffix}", point_format), tmp_path / "b.laz"
-    columns = answers()
+    columns = result_columns()
     write_classified(source, out, *columns)
     new = check(source, out, columns)
     assert {64, 69} <= set(np.unique(np.array(new.classification)).tolist())
@@ -110,9 +110,9 @@ def test_everything_but_the_classes_is_kept(tmp_path: Path, point_format: int, s
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted([source.name, "b.laz"])
 
 
-def test_the_classes_are_named(tmp_path: Path) -> None:
-    write_classified(made(tmp_path / "a.las", 3), tmp_path / "b.laz", *answers())
-    write_classified(tmp_path / "b.laz", tmp_path / "c.laz", *answers())  # one lookup, not two
+def test_class_names_are_in_one_lookup_record(tmp_path: Path) -> None:
+    write_classified(made(tmp_path / "a.las", 3), tmp_path / "b.laz", *result_columns())
+    write_classified(tmp_path / "b.laz", tmp_path / "c.laz", *result_columns())  # one lookup, not two
     (lookup,) = laspy.read(tmp_path / "c.laz").vlrs.get("ClassificationLookupVlr")
     assert len(lookup.lookups) == 256
     assert (lookup[64], lookup[69], lookup[90]) == ("roadsign", "sidewalk", "")  # laspy reads letters and digits only
@@ -121,8 +121,8 @@ def test_the_classes_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("point_format", [1, 7])
-def test_the_pipeline_reads_the_same_cloud(tmp_path: Path, point_format: int) -> None:
-    source, columns = made(tmp_path / "a.laz", point_format), answers()
+def test_classified_file_is_read_as_the_same_cloud(tmp_path: Path, point_format: int) -> None:
+    source, columns = made(tmp_path / "a.laz", point_format), result_columns()
     write_classified(source, tmp_path / "b.laz", *columns)
     old, new = las.read(source, FRAME), las.read(tmp_path / "b.laz", FRAME)
     assert (
@@ -136,20 +136,20 @@ def test_the_pipeline_reads_the_same_cloud(tmp_path: Path, point_format: int) ->
 
 
 def test_file_is_classified_in_chunks_and_in_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source, columns = made(tmp_path / "a.laz", 3), answers()
+    source, columns = made(tmp_path / "a.laz", 3), result_columns()
     before = tmp_path / "before.laz"
     before.write_bytes(source.read_bytes())
     monkeypatch.setattr(las_classes, "CHUNK_POINTS", 300)
     write_classified(source, source, *columns)
     check(before, source, columns)
-    write_classified(source, source, *answers())
+    write_classified(source, source, *result_columns())
     check(before, source, columns)
 
 
-def test_a_file_without_crs(tmp_path: Path) -> None:
+def test_file_without_crs_stays_without(tmp_path: Path) -> None:
     source = made(tmp_path / "a.las", 1, crs=None)
-    write_classified(source, tmp_path / "b.laz", *answers())
-    assert check(source, tmp_path / "b.laz", answers()).header.parse_crs() is None
+    write_classified(source, tmp_path / "b.laz", *result_columns())
+    assert check(source, tmp_path / "b.laz", result_columns()).header.parse_crs() is None
 
 
 def test_geotiff_keys_become_wkt_with_their_heights(tmp_path: Path) -> None:
@@ -159,7 +159,7 @@ def test_geotiff_keys_become_wkt_with_their_heights(tmp_path: Path) -> None:
         cloud = laspy.read(made(tmp_path / "a.las", 1, crs=None))
         cloud.header.vlrs.append(laspy.VLR("LASF_Projection", 34735, "", data))
         cloud.write(tmp_path / "a.las")
-        write_classified(tmp_path / "a.las", tmp_path / "b.laz", *answers())
+        write_classified(tmp_path / "a.las", tmp_path / "b.laz", *result_columns())
         return tmp_path / "b.laz"
 
     crs = laspy.open(geotiff((3072, 25832), (4096, 7837))).header.parse_crs()
@@ -173,17 +173,17 @@ def test_geotiff_keys_become_wkt_with_their_heights(tmp_path: Path) -> None:
 def test_earlier_results_are_replaced_and_clashing_names_are_changed(tmp_path: Path) -> None:
     for extra in ("confidence", "told_from", "gps_time"):
         source = made(tmp_path / f"{extra}.las", 2, extra=extra)
-        write_classified(source, tmp_path / "b.laz", *answers())
+        write_classified(source, tmp_path / "b.laz", *result_columns())
         new, old = laspy.read(tmp_path / "b.laz"), laspy.read(source)
         names = list(new.point_format.extra_dimension_names)
         assert names[-2:] == ["confidence", "class_source"] and len(names) == (3 if extra == "gps_time" else 2)
-        assert np.array_equal(np.array(new.confidence), answers()[1])
+        assert np.array_equal(np.array(new.confidence), result_columns()[1])
         if extra == "gps_time":
             assert np.array_equal(np.array(new[names[0]]), np.array(old["gps_time"]))
 
 
-def test_extra_bytes_of_two_records_and_of_none(tmp_path: Path) -> None:
-    """The second of two records is one that laspy overlooks, as it does bytes that none describes."""
+def test_undescribed_and_overlooked_extra_bytes_are_kept(tmp_path: Path) -> None:
+    """laspy overlooks the second of two records, and bytes that no record describes."""
     header = laspy.LasHeader(point_format=6, version="1.4")
     for name in ("first", "confidence", "third"):
         header.add_extra_dim(laspy.ExtraBytesParams(name, "uint8"))
@@ -197,12 +197,12 @@ def test_extra_bytes_of_two_records_and_of_none(tmp_path: Path) -> None:
         writer = laspy.LasWriter(file, cloud.header, closefd=False)
         writer.write_points(cloud.points)
         writer.close()
-    write_classified(tmp_path / "a.las", tmp_path / "b.laz", *answers())
+    write_classified(tmp_path / "a.las", tmp_path / "b.laz", *result_columns())
     new = laspy.read(tmp_path / "b.laz")
     assert list(new.point_format.extra_dimension_names) == ["first", "ExtraBytes", "confidence", "class_source"]
     assert np.array_equal(new["first"], cloud.points.array["first"])
     assert np.array_equal(new["ExtraBytes"], cloud.points.array["third"])
-    assert np.array_equal(new["confidence"], answers()[1])
+    assert np.array_equal(new["confidence"], result_columns()[1])
 
 
 def test_extra_bytes_descriptions_are_kept(tmp_path: Path) -> None:
@@ -214,11 +214,11 @@ def test_extra_bytes_descriptions_are_kept(tmp_path: Path) -> None:
     said.no_data = np.array([-1])
     np.frombuffer(said._min, np.int64)[0] = -12345
     source.write_bytes(source.read_bytes().replace(bytes(one), bytes(said)))
-    write_classified(source, tmp_path / "b.laz", *answers())
+    write_classified(source, tmp_path / "b.laz", *result_columns())
     assert bytes(said) in (tmp_path / "b.laz").read_bytes()
 
 
-def test_waveforms_come_along(tmp_path: Path) -> None:
+def test_waveforms_are_copied(tmp_path: Path) -> None:
     source = made(tmp_path / "a.las", 4)
     cloud = laspy.read(source)
     cloud.header.global_encoding.waveform_data_packets_internal = True
@@ -226,19 +226,19 @@ def test_waveforms_come_along(tmp_path: Path) -> None:
         [laspy.VLR("nobody", 5, "", b"abc"), laspy.VLR("LASF_Spec", 65535, "waveforms", b"wave" * 99)]
     )
     cloud.write(source)
-    write_classified(source, tmp_path / "b.laz", *answers())
-    new = check(source, tmp_path / "b.laz", answers())
+    write_classified(source, tmp_path / "b.laz", *result_columns())
+    new = check(source, tmp_path / "b.laz", result_columns())
     assert sorted((v.user_id, v.record_data) for v in new.evlrs) == [("LASF_Spec", b"wave" * 99), ("nobody", b"abc")]
     start = new.header.start_of_waveform_data_packet_record
     assert (tmp_path / "b.laz").read_bytes()[start + 60 :].startswith(b"wave")
 
 
-def test_waveforms_of_several_channels_are_refused(tmp_path: Path) -> None:
+def test_waveforms_of_several_channels_are_rejected(tmp_path: Path) -> None:
     cloud = laspy.read(made(tmp_path / "a.las", 9))
     cloud.scanner_channel[-1] = 1
     cloud.write(tmp_path / "a.las")
     with pytest.raises(UnavailableError, match=r"a\.las: has waveforms of several scanner channels.*Split it"):
-        write_classified(tmp_path / "a.las", tmp_path / "b.laz", *answers())
+        write_classified(tmp_path / "a.las", tmp_path / "b.laz", *result_columns())
     assert [p.name for p in tmp_path.iterdir()] == ["a.las"]
 
 
@@ -251,12 +251,12 @@ def test_full_disk_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     source = made(tmp_path / "a.las", 3)
     monkeypatch.setattr(laspy.LasWriter, "write_points", full)
     with pytest.raises(SpaceError, match=r"b\.laz: can't be written"):
-        write_classified(source, tmp_path / "b.laz", *answers())
+        write_classified(source, tmp_path / "b.laz", *result_columns())
     assert [p.name for p in tmp_path.iterdir()] == ["a.las"]
 
 
 def test_copc_becomes_laz(tmp_path: Path) -> None:
-    """A COPC file of one node; its octree is of no use in the copy, and gone."""
+    """A COPC file of one node; the octree is not valid for the copy, and is removed."""
     cloud = laspy.read(made(tmp_path / "a.las", 7))
     cloud.header.vlrs.insert(0, laspy.VLR("copc", 1, "", bytes(160)))
     cloud.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("copc", 1000, "", bytes(32)), laspy.VLR("nobody", 5, "", b"a")])
@@ -270,27 +270,27 @@ def test_copc_becomes_laz(tmp_path: Path) -> None:
     source.write_bytes(content)
     with laspy.CopcReader.open(source) as reader:
         assert len(reader.query()) == N
-    write_classified(source, tmp_path / "b.laz", *answers())
-    new = check(source, tmp_path / "b.laz", answers())
+    write_classified(source, tmp_path / "b.laz", *result_columns())
+    new = check(source, tmp_path / "b.laz", result_columns())
     assert [v.user_id for v in new.evlrs] == ["nobody"] and not new.vlrs.get_by_id("copc")
 
 
 @pytest.mark.parametrize(
     "name", ["ign_77055_627760.laz", "ign_77050_627760.laz", "ign_870000_6618000_rgb_50x100.laz", "sample_c.las"]
 )
-def test_real_files(real_data: Path, tmp_path: Path, name: str) -> None:
+def test_real_files_keep_their_data_and_crs(real_data: Path, tmp_path: Path, name: str) -> None:
     source = real_data / "las" / name
     with laspy.open(source) as reader:
         n, crs = reader.header.point_count, reader.header.parse_crs()
-    write_classified(source, tmp_path / "b.laz", *answers(n))
-    new = check(source, tmp_path / "b.laz", answers(n)).header.parse_crs()
+    write_classified(source, tmp_path / "b.laz", *result_columns(n))
+    new = check(source, tmp_path / "b.laz", result_columns(n)).header.parse_crs()
     assert (crs is None and new is None) or new == crs or new.to_epsg() == crs.to_epsg() is not None
 
 
 def test_failures_leave_an_earlier_copy_untouched(tmp_path: Path) -> None:
     source, out = made(tmp_path / "a.laz", 3), tmp_path / "b.laz"
     out.write_bytes(b"earlier")
-    code, confidence, class_source = answers()
+    code, confidence, class_source = result_columns()
     with pytest.raises(DataError, match=r"a\.laz: has 1,000 points, but confidence is uint8 of shape \(999,\)"):
         write_classified(source, out, code, confidence[:-1], class_source)
     for damaged in (source.read_bytes()[:-9000], source.read_bytes()[:100], b""):

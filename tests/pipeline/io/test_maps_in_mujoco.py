@@ -1,4 +1,4 @@
-"""Worlds of robots' maps in MuJoCo: what is solid there is exactly what the collision mesh is, on every storey."""
+"""Worlds of robot maps in MuJoCo: bodies collide exactly with the collision mesh, on every storey."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def heights_at_rest(scene: Scene, folder: Path, positions: list[tuple[float, flo
     return np.array([data.body(f"box{i}").xpos[2] - HALF_M for i in range(len(positions))])
 
 
-def test_free_space_beside_furniture_and_walls_is_free(tmp_path: Path) -> None:
+def test_bodies_fall_freely_below_and_beside_furniture_and_walls(tmp_path: Path) -> None:
     heading = 0.5
     c, s = np.cos(heading), np.sin(heading)
     table = box((0.0, 0.0, 0.68), (1.2, 0.7, 0.72), heading)
@@ -90,7 +90,7 @@ def test_bodies_rest_on_every_storey(tmp_path: Path) -> None:
     assert rest == pytest.approx([0, 0, 3, 3], abs=0.02)
 
 
-def test_a_ball_comes_to_rest_on_a_floor_that_slopes_by_a_degree(tmp_path: Path) -> None:
+def test_ball_comes_to_rest_on_a_floor_with_a_slope_of_one_degree(tmp_path: Path) -> None:
     mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed")
     vertices, faces = floor((-5, -5), (5, 5), 0.0)
     vertices[:, 2] = np.tan(np.radians(1)) * vertices[:, 0]

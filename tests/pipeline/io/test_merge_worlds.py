@@ -1,4 +1,4 @@
-"""A survey's world: every tile at its place, in a level of its own, and never half-made."""
+"""World of a survey: every tile at its position in a separate level; replaced only when complete."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EAST = 25.0  # metres from one tile to the next
 
 
 def tiles(folder: Path, count: int = 3) -> list[TileWorld]:
-    """Made-up tiles in a row, eastwards."""
+    """Synthetic tiles in a row, eastwards."""
     x, y, z = synthetic.UTM.origin
     made = []
     for i in range(count):
@@ -112,7 +112,7 @@ def test_editable_files_are_copied_and_others_linked(tmp_path: Path, row: Sequen
             assert path.read_bytes() == twin.read_bytes()
 
 
-def test_a_surveys_world_can_be_exported_whole(tmp_path: Path, row: Sequence[TileWorld]) -> None:
+def test_world_of_a_survey_can_be_exported(tmp_path: Path, row: Sequence[TileWorld]) -> None:
     folder = assemble(tmp_path, "town", row).parent
     scene = read_scene(tmp_path)
     assert (scene.name, [tile.offset for tile in scene.tiles]) == ("town", [(-25, 0, 1), (0, 0, 0), (25, 0, -1)])
@@ -132,7 +132,7 @@ def test_unchanged_world_is_not_merged_again(tmp_path: Path) -> None:
     before = _snapshot(folder)
     warned: list[str] = []
     assemble(tmp_path, "town", row, warn=warned.append)
-    assert _snapshot(folder) == before  # a user's edit stays
+    assert _snapshot(folder) == before  # an edit by the user is kept
     assert len(warned) == 1 and "tile0/model.sdf was changed since it was written" in warned[0]
     assemble(tmp_path, "town", row, buffer=5)
     assert _snapshot(folder) != before and _root(folder / "town.sdf").findtext(".//level/buffer") == "5"
@@ -142,12 +142,12 @@ def test_unchanged_world_is_not_merged_again(tmp_path: Path) -> None:
     damaged = folder / "models/tile1/meshes/collision_terrain.obj"
     whole = damaged.read_bytes()
     damaged.unlink()
-    damaged.write_bytes(b"x" * len(whole))  # as many bytes
+    damaged.write_bytes(b"x" * len(whole))  # of the same size
     assemble(tmp_path, "town", row, buffer=5)
     assert damaged.read_bytes() == whole
     source = row[0].model / "meshes/terrain.obj"
     text = source.read_text(encoding="utf-8")
-    source.unlink()  # as a rebuilt result is: a new file, not new bytes in the old one
+    source.unlink()  # a rebuilt result is a new file with a new inode
     source.write_text("# new\n" + text, encoding="utf-8")
     assemble(tmp_path, "town", row, buffer=5)
     assert (folder / "models/tile0/meshes/terrain.obj").read_text(encoding="utf-8").startswith("# new")
@@ -174,7 +174,7 @@ def test_earlier_world_is_replaced_only_when_the_new_one_is_complete(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["tile0", "tile1", "world"]
 
 
-def test_tiles_that_cannot_be_one_world_are_refused(tmp_path: Path, row: Sequence[TileWorld]) -> None:
+def test_incompatible_tiles_are_rejected(tmp_path: Path, row: Sequence[TileWorld]) -> None:
     one, other = row[:2]
     away = replace(other, frame=Frame("EPSG:32633", other.frame.origin))
     with pytest.raises(InputError, match="EPSG:32633.*but tile0 is in EPSG:32632"):
@@ -188,7 +188,7 @@ def test_tiles_that_cannot_be_one_world_are_refused(tmp_path: Path, row: Sequenc
     assert not list(tmp_path.iterdir())
 
 
-def test_a_crs_is_the_same_as_code_and_as_wkt(tmp_path: Path, row: Sequence[TileWorld]) -> None:
+def test_crs_as_code_and_as_wkt_are_equal(tmp_path: Path, row: Sequence[TileWorld]) -> None:
     from pyproj import CRS
 
     wkt = CRS.from_user_input("EPSG:32632").to_wkt("WKT1_GDAL")
@@ -196,7 +196,7 @@ def test_a_crs_is_the_same_as_code_and_as_wkt(tmp_path: Path, row: Sequence[Tile
     assert assemble(tmp_path, "town", [row[0], other]).is_file()
 
 
-def test_a_local_survey_has_no_georeference(tmp_path: Path) -> None:
+def test_local_survey_has_no_georeference(tmp_path: Path) -> None:
     frames = [Frame(origin=(20.0 * i, 0.0, 0.0)) for i in range(2)]
     made = [synthetic.world(tmp_path / f"t{i}", frame=f, name=f"t{i}").files["world"] for i, f in enumerate(frames)]
     path = assemble(tmp_path, "town", [TileWorld(f"t{i}", made[i], frames[i]) for i in range(2)])

@@ -63,7 +63,7 @@ def test_cells_of_an_asymmetrical_map_are_where_nav2_reads_them(tmp_path: Path) 
     assert (cells == occupancy).all() and resolution == 0.1 and origin == pytest.approx((9.0, 22.0))
 
 
-def test_points_are_read_back(tmp_path: Path) -> None:
+def test_pcd_round_trip_in_single_and_double_precision(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     xyz, intensity = rng.uniform(-50, 50, (500, 3)), rng.uniform(0, 255, 500).astype(np.float32)
     pcd.write(tmp_path / "a.pcd", xyz, intensity)
@@ -137,7 +137,7 @@ def test_height_band_must_not_be_empty(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def world(step: tuple[Path, Mesh], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A Gazebo world with the files of the step; its own meshes don't matter."""
+    """A Gazebo world with the files of the step and arbitrary meshes."""
     folder = tmp_path_factory.mktemp("world")
     frame = Frame(origin=ORIGIN)
     sources = {"terrain": synthetic.textured(folder / "terrain", synthetic.ground(10, frame))}
@@ -160,7 +160,7 @@ def test_world_has_the_files_and_frames(world: Path, step: tuple[Path, Mesh]) ->
     assert "model://robot" not in (world / "house.sdf").read_text(encoding="utf-8")  # the launch file spawns it
 
 
-def test_world_with_a_robot_of_its_own_starts_in_free_space(world: Path, tmp_path: Path) -> None:
+def test_robot_of_the_world_spawns_at_the_pose_in_free_space(world: Path, tmp_path: Path) -> None:
     scene = read_scene(world.parent)
     world_formats.write(scene, ["gazebo"], tmp_path, SceneParams(), silent, robot=True)
     about = json.loads((tmp_path / "metadata.json").read_text(encoding="utf-8"))

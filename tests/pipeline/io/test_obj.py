@@ -1,4 +1,4 @@
-"""OBJ: what a reader gets is what was written."""
+"""OBJ: a reader gets the written geometry."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NAMES = PageNames("a", ("m_0", "m_1"), ("m_0.png", "m_1.png"), (0, 1))
 
 
 @pytest.mark.parametrize("make", [synthetic.ground, synthetic.house])
-def test_triangles_uv_and_pages_survive(tmp_path: Path, make: Callable[[], Mesh]) -> None:
+def test_triangles_uv_and_pages_round_trip(tmp_path: Path, make: Callable[[], Mesh]) -> None:
     import trimesh
 
     mesh = make()
@@ -53,7 +53,7 @@ def test_normals_point_outwards(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.linalg.norm(surface.normal, axis=1), 1, atol=1e-5)
 
 
-def test_parts_are_small_and_lose_nothing(tmp_path: Path) -> None:
+def test_parts_are_compact_and_cover_the_mesh(tmp_path: Path) -> None:
     mesh = synthetic.ground()
     parts = present(textured_mesh.read(synthetic.textured(tmp_path / "in", mesh))).parts(1000)
     assert max(map(len, parts)) <= 1000

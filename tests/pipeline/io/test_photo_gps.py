@@ -1,4 +1,4 @@
-"""Models placed by the photos' GPS: synthetic EXIF on a path that is known, in arbitrary axes and scale."""
+"""Georeferencing of models by the GPS of photos: synthetic EXIF on a known path, model in arbitrary axes and scale."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from tests.present import present
 CRS = "EPSG:32633"
 AT = np.array([390_000.0, 5_820_000.0, 50.0])
 TURN = Rotation.from_rotvec([1.2, -0.7, 0.4])
-SCALE = 0.137  # model units a metre
+SCALE = 0.137  # model units per metre
 
 
 def photo(path: Path, place: F64 | None, altitude: bool = True) -> Path:
-    """A picture whose EXIF says that it was taken at a place in `CRS`, to a hundredth of a second of arc and a cm."""
+    """A photo with the EXIF of a position in `CRS`, to a hundredth of an arc second and a cm."""
     tags = Image.Exif()
     if place is not None:
         lon, lat = Transformer.from_crs(CRS, "EPSG:4326", always_xy=True).transform(*place[:2])
@@ -71,7 +71,7 @@ def photos(folder: Path, places: F64, altitude: bool = True) -> list[Path]:
     return [photo(folder / f"{i:03d}.jpg", place, altitude) for i, place in enumerate(places)]
 
 
-def test_exif_positions_and_missing_ones_are_read(tmp_path: Path) -> None:
+def test_exif_positions_are_read_and_missing_ones_are_none(tmp_path: Path) -> None:
     lat, lon, altitude = exif.gps_position(photo(tmp_path / "a.jpg", AT)) or (0, 0, 0)
     east, north = Transformer.from_crs("EPSG:4326", CRS, always_xy=True).transform(lon, lat)
     assert np.abs(np.array([east, north]) - AT[:2]).max() < 0.01 and altitude == 50
@@ -81,7 +81,7 @@ def test_exif_positions_and_missing_ones_are_read(tmp_path: Path) -> None:
     assert exif.gps_position(tmp_path / "d.jpg") is None
 
 
-def test_a_model_is_placed_in_spite_of_noise_and_wrong_fixes(tmp_path: Path) -> None:
+def test_model_is_georeferenced_in_spite_of_noise_and_outliers(tmp_path: Path) -> None:
     places, random = circle(40), np.random.default_rng(0)
     fixes = places + random.normal(0, 1.5, places.shape)
     fixes[[3, 17, 30]] += [120.0, -60.0, 10.0]
@@ -93,13 +93,13 @@ def test_a_model_is_placed_in_spite_of_noise_and_wrong_fixes(tmp_path: Path) -> 
     assert "37 of 40 photos" in fit.notes[0] and f"rms {fit.rms:.2f} m" in fit.notes[0] and len(fit.notes) == 1
 
 
-def test_exact_gps_places_exactly(tmp_path: Path) -> None:
+def test_exact_gps_gives_exact_positions(tmp_path: Path) -> None:
     fit = from_photo_gps(tmp_path, in_model(circle()), ups(16), photos(tmp_path, circle()), CRS)
     assert np.abs(fit.onto.apply(in_model(circle())) - circle()).max() < 0.02 and present(fit.rms) < 0.01
     assert np.allclose(fit.onto.rotation @ TURN.as_matrix(), np.eye(3), atol=1e-3)
 
 
-def test_a_crs_in_feet_is_placed_in_feet(tmp_path: Path) -> None:
+def test_model_is_georeferenced_in_a_crs_in_feet(tmp_path: Path) -> None:
     feet = "+proj=utm +zone=33 +datum=WGS84 +units=us-ft +type=crs"
     fixes = circle() + np.random.default_rng(0).normal(0, 1.5, (16, 3))
     fit = from_photo_gps(tmp_path, in_model(circle()), ups(16), photos(tmp_path, fixes), feet)
@@ -135,7 +135,7 @@ def test_photos_without_altitude_are_reported(tmp_path: Path) -> None:
     assert "no altitudes" in fit.notes[1] and np.abs(fit.onto.apply(in_model(flat)) - flat).max() < 0.02
 
 
-def test_the_command_places_model_and_cloud(tmp_path: Path) -> None:
+def test_command_georeferences_model_and_cloud(tmp_path: Path) -> None:
     places = circle()
     photos(tmp_path / "images", places)
     photo(tmp_path / "images" / "none.jpg", None)

@@ -1,4 +1,4 @@
-"""The robot: where it starts, and that it is the same, and drives, in every format that holds one."""
+"""The robot in all formats that support one: spawn pose, equal links, and driving."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def exported(town: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_every_robot_has_a_world() -> None:
+def test_every_robot_format_has_a_world_format() -> None:
     assert set(plugins.names(robot_formats.PACKAGE)) <= set(world_formats.format_names())
 
 
@@ -69,10 +69,10 @@ def test_robot_starts_clear_of_obstacles(tmp_path: Path) -> None:
     Trajectory(np.arange(33.0), np.column_stack([x, np.full(33, -5.3), np.full(33, 3.0)])).save(
         scene.tiles[0].folder / PATH_FILE
     )
-    assert find_spawn_pose(scene).position[0] > -5 + 0.5  # past the pole, which stands at (-5, -5)
+    assert find_spawn_pose(scene).position[0] > -5 + 0.5  # behind the pole at (-5, -5)
 
 
-def test_without_a_road_or_a_path_there_is_no_robot(tmp_path: Path) -> None:
+def test_robot_without_a_road_path_or_free_ground_is_an_error(tmp_path: Path) -> None:
     scene = synthetic.scene(tmp_path, tiles=1)
     with pytest.raises(DataError, match="neither a road nor"):
         world_formats.write(scene, ["mujoco"], tmp_path / "out", SceneParams(), silent, robot=True)
@@ -94,7 +94,7 @@ def test_formats_without_robots_are_reported(town: Scene, tmp_path: Path) -> Non
 
 
 def of_sdf(folder: Path) -> Iterator[tuple[str, float, Any]]:
-    """Name, mass and place of each link."""
+    """Name, mass and position of each link."""
     for link in ET.parse(folder / "models/robot/model.sdf").getroot().iter("link"):
         place = (link.findtext("pose") or "0 0 0").split()[:3]
         yield link.attrib["name"], float(link.findtext("inertial/mass", "")), np.array(place, float)
@@ -113,7 +113,7 @@ def of_urdf(folder: Path) -> Iterator[tuple[str, float, Any]]:
 
 
 @pytest.mark.parametrize("read", [of_sdf, of_urdf])
-def test_its_parts_are_the_same_everywhere(exported: Path, read: Any) -> None:
+def test_links_of_the_robot_are_equal_in_all_formats(exported: Path, read: Any) -> None:
     found = {name: (mass, place) for name, mass, place in read(exported)}
     assert found.keys() == {link.name for link in ROBOT.links}
     for link in ROBOT.attached:
@@ -121,7 +121,7 @@ def test_its_parts_are_the_same_everywhere(exported: Path, read: Any) -> None:
         np.testing.assert_allclose(found[link.name][1], link.place, atol=1e-6)
 
 
-def test_gazebos_world_has_the_systems_that_its_sensors_and_drive_need(exported: Path) -> None:
+def test_gazebo_world_loads_the_systems_for_sensors_and_drive(exported: Path) -> None:
     world = ET.parse(exported / "town.sdf").getroot()
     systems = {plugin.attrib["name"].split("::")[-1] for plugin in world.iter("plugin")}
     assert systems >= {"Physics", "Sensors", "SceneBroadcaster", "UserCommands", "Imu"}
@@ -129,7 +129,7 @@ def test_gazebos_world_has_the_systems_that_its_sensors_and_drive_need(exported:
     robot = json.loads((exported / "metadata.json").read_text(encoding="utf-8"))["robot"]
     pose = np.array(include.findtext("pose", "").split(), float)
     np.testing.assert_allclose(pose, [*robot["position_m"], *robot["angles_rad"]], atol=1e-6)
-    assert world.findtext(".//performer/ref") == "robot"  # levels load around it
+    assert world.findtext(".//performer/ref") == "robot"  # levels are loaded around it
     model = ET.parse(exported / "models/robot/model.sdf").getroot()
     assert {s.attrib["type"] for s in model.iter("sensor")} == {"camera", "segmentation", "gpu_lidar", "imu"}
     drive = next(plugin for plugin in model.iter("plugin") if plugin.attrib["name"] == "gz::sim::systems::DiffDrive")

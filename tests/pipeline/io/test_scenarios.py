@@ -1,4 +1,4 @@
-"""Files of recorded traffic: ASAM's schemas, scenariogeneration, esmini and Gazebo's own libraries read them."""
+"""Files of recorded traffic, read by ASAM's schemas, scenariogeneration, esmini and Gazebo's libraries."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def write(scenario: Scenario, folder: Path) -> Path:
     return path
 
 
-def test_files_are_valid_by_the_standard(
+def test_files_are_valid_by_the_asam_schemas(
     recorded: Scenario, tmp_path: Path, openscenario_schema: xmlschema.XMLSchema
 ) -> None:
     path = write(recorded, tmp_path)
@@ -72,10 +72,10 @@ def test_files_are_valid_by_the_standard(
     openscenario_schema.validate(str(tmp_path / "parked.xosc"))
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace("vehicleCategory", "category"), encoding="utf-8")
-    assert not openscenario_schema.is_valid(str(path))  # it does notice
+    assert not openscenario_schema.is_valid(str(path))  # the schema rejects an invalid file
 
 
-def test_another_program_reads_it(recorded: Scenario, tmp_path: Path) -> None:
+def test_scenariogeneration_reads_the_actors(recorded: Scenario, tmp_path: Path) -> None:
     from scenariogeneration import xosc
 
     read = xosc.ParseOpenScenario(str(write(recorded, tmp_path)))
@@ -129,7 +129,7 @@ def played(path: Path, *options: str) -> dict[str, list[dict[str, float]]]:
     return found
 
 
-def test_player_shows_everyone_where_and_when_they_were(recorded: Scenario, tmp_path: Path) -> None:
+def test_esmini_plays_actors_at_their_positions_and_times(recorded: Scenario, tmp_path: Path) -> None:
     states = played(write(recorded, tmp_path))
     assert set(states) == {actor.name for actor in recorded.everyone}
     for actor in recorded.everyone:
@@ -149,7 +149,7 @@ def test_player_shows_everyone_where_and_when_they_were(recorded: Scenario, tmp_
         assert max(abs(one["offset"]) for one in states[name]) < 0.05
 
 
-def test_ego_is_left_to_the_system_under_test(recorded: Scenario, tmp_path: Path) -> None:
+def test_ego_waits_for_the_system_under_test_on_request(recorded: Scenario, tmp_path: Path) -> None:
     path = write(recorded, tmp_path)
     text = path.read_text(encoding="utf-8")
     declared = 'name="replay_ego" parameterType="boolean" value="true"'
@@ -193,7 +193,7 @@ def test_gazebo_loads_the_traffic(town: Scene, tmp_path: Path) -> None:
     ]
     times = [time for time, _ in points]
     assert times == sorted(times) and times[0] == 0.0 and times[-1] == pytest.approx(5.0, abs=0.1)
-    assert all((pose[2] < -100) == (time < 1.0 - 1e-6) for time, pose in points[:-2])  # it comes after a second
+    assert all((pose[2] < -100) == (time < 1.0 - 1e-6) for time, pose in points[:-2])  # it appears after one second
     obj: Any = trimesh.load(out / "models" / "van_2" / "meshes" / "van_2.obj", force="mesh")
     assert obj.extents.tolist() == pytest.approx([5.2, 2.0, 2.3], abs=0.01)
 

@@ -1,4 +1,4 @@
-"""Simulators and validators take what is exported; each is skipped with a reason where it is not installed."""
+"""Exports in simulators and validators; each is skipped with a reason if it is not installed."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def export(scene: Scene, name: str, folder: Path, **params: Any) -> Path:
 
 
 def ground(x: float, y: float) -> float:
-    """Height of the made-up scene's ground, which is of squares of 2 m."""
+    """Ground height of the synthetic scene, whose mesh has cells of 2 m."""
     tile = 0 if x < 12.5 else 1
     return float(synthetic.height(np.array(x - 25 * tile), np.array(y - 3 * tile))) - tile
 
@@ -70,7 +70,7 @@ def test_walls_and_poles_are_solid_in_mujoco(town: Scene, tmp_path: Path) -> Non
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     hit = np.zeros(1, np.int32)
-    solid = np.array([0, 0, 0, 1, 0, 0], np.uint8)  # the geom group of what collides
+    solid = np.array([0, 0, 0, 1, 0, 0], np.uint8)  # geom group of collision shapes
 
     def reach(start: tuple[float, float, float], along: tuple[float, float, float]) -> float:
         return float(mujoco.mj_ray(model, data, np.array(start), np.array(along), solid, 1, -1, hit))
@@ -112,7 +112,7 @@ def test_ball_rests_and_camera_returns_classes_in_pybullet(town: Scene, tmp_path
         bullet.disconnect(client)
 
 
-def test_usd_has_no_fault(town: Scene, tmp_path: Path) -> None:
+def test_usd_is_valid_and_tiles_load_separately(town: Scene, tmp_path: Path) -> None:
     module("pxr")
     from pxr import Usd, UsdGeom, UsdPhysics
 
@@ -152,7 +152,7 @@ def test_usd_tiles_have_their_coarser_levels_as_variants(town: Scene, tmp_path: 
     assert 0 < triangles("Visual") < 0.5 * fine and triangles("Collision") == solid
 
 
-def test_omniverses_validator_finds_nothing_that_fails(town: Scene, tmp_path: Path) -> None:
+def test_omniverse_validator_reports_no_failures(town: Scene, tmp_path: Path) -> None:
     if why := omniverse.missing():
         pytest.skip(why)
     found = omniverse.found(export(town, "usd", tmp_path) / "town.usdc")
@@ -163,7 +163,7 @@ PACKED = [{}, {"glb_lit": True}, {"glb_texture": "webp"}, {"glb_mesh": "meshopt"
 
 
 @pytest.mark.parametrize("params", PACKED, ids=lambda params: "_".join(map(str, params.values())) or "plain")
-def test_khronos_validator_finds_nothing_in_glbs(town: Scene, tmp_path: Path, params: dict[str, Any]) -> None:
+def test_khronos_validator_reports_no_issues_in_glbs(town: Scene, tmp_path: Path, params: dict[str, Any]) -> None:
     why = gltf_validator.missing()
     missing = plugins.missing("scan2sim.pipeline.io.worlds.gltf.geometry", params.get("glb_mesh", "plain"))
     if why or missing:
@@ -173,7 +173,7 @@ def test_khronos_validator_finds_nothing_in_glbs(town: Scene, tmp_path: Path, pa
         assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
 
 
-def test_three_js_shows_all_tiles_as_the_projects_renderer_does(town: Scene, tmp_path: Path) -> None:
+def test_three_js_renders_all_tiles_like_the_project_renderer(town: Scene, tmp_path: Path) -> None:
     if why := threejs.missing():
         pytest.skip(why)
     folder = export(town, "glb", tmp_path / "out")
@@ -210,7 +210,7 @@ def test_three_js_reads_compressed_files(town: Scene, tmp_path: Path, params: di
     assert np.mean(apart > 40) < 0.01 and apart.mean() < 4
 
 
-def test_cesium_shows_all_tiles_where_they_are_on_the_earth(town: Scene, tmp_path: Path) -> None:
+def test_cesium_shows_all_tiles_at_their_positions_on_the_earth(town: Scene, tmp_path: Path) -> None:
     folder = export(town, "tiles3d", tmp_path / "out")
     with cesium.viewer(folder, tmp_path / "view", (320, 240)) as view:
         shown = view.look(*above(town, 60), focal=200)

@@ -1,4 +1,4 @@
-"""One contract over all formats of scenes: all that is there is shown, in its place, in its colours, with its label."""
+"""Requirements on all scene formats: all surfaces with their positions, colours and labels."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def written(scene: Scene, name: str, folder: Path, **params: Any) -> Path:
 
 
 def expected(scene: Scene) -> list[Shown]:
-    """What a scene shows, by its own files."""
+    """Surfaces of a scene, from its files."""
     shown = []
     for tile in scene.tiles:
         for surface in tile.surfaces():
@@ -80,7 +80,7 @@ def faces(shown: list[Shown]) -> np.ndarray:
 
 
 @each
-def test_everything_is_shown_in_its_place_and_colours(town: Scene, exported: dict[str, Path], name: str) -> None:
+def test_all_surfaces_have_their_positions_and_colours(town: Scene, exported: dict[str, Path], name: str) -> None:
     written(town, name, exported[name])
     for path in exported[name].rglob("*"):
         assert path.name.isascii() and " " not in path.name
@@ -110,7 +110,7 @@ def test_usd_has_the_reflectance_of_vertices(town: Scene, tmp_path: Path) -> Non
 
 
 @each
-def test_a_scene_without_a_crs_has_no_georeference(tmp_path: Path, name: str) -> None:
+def test_scene_without_a_crs_has_no_georeference(tmp_path: Path, name: str) -> None:
     scene = synthetic.scene(tmp_path, Frame(), tiles=1)
     written(scene, name, tmp_path / "out")
     assert faces(list(READERS[name](tmp_path / "out", scene))).shape == faces(expected(scene)).shape
@@ -130,14 +130,14 @@ def test_scene_without_ground_contains_the_other_surfaces(tmp_path: Path, name: 
 
 
 @each
-def test_surveyed_points_are_where_they_were_surveyed_5_km_away(tmp_path: Path, name: str) -> None:
+def test_surveyed_points_are_accurate_to_1_cm_at_5_km(tmp_path: Path, name: str) -> None:
     scene = synthetic.scene(tmp_path, tiles=2, apart=5000.0)
     folder = written(scene, name, tmp_path / "out")
     assert json.loads((folder / "metadata.json").read_text(encoding="utf-8"))["crs"] == "EPSG:32632"
     assert survey_error(folder, scene, name) < 0.01
 
 
-def test_a_scene_is_read_from_a_run_or_its_world(tmp_path: Path) -> None:
+def test_scene_is_read_from_a_run_or_its_world(tmp_path: Path) -> None:
     scene = synthetic.scene(tmp_path)
     assert read_scene(tmp_path) == read_scene(tmp_path / "world") == scene
     assert [tile.offset for tile in scene.tiles] == [(0, 0, 0), (25, 3, -1)]
@@ -174,7 +174,7 @@ def test_worlds_without_a_scene_are_rejected(tmp_path: Path) -> None:
         read_scene(world)
 
 
-def test_boxes_of_levels_hold_what_they_show_and_finer_ones(tmp_path: Path) -> None:
+def test_bounding_volumes_contain_their_level_and_finer_ones(tmp_path: Path) -> None:
     import trimesh
 
     town = synthetic.scene(tmp_path)
@@ -184,7 +184,7 @@ def test_boxes_of_levels_hold_what_they_show_and_finer_ones(tmp_path: Path) -> N
     assert root["geometricError"] == 1.6 and root["extras"] == {"error_m": 0.5, "texel_m": 0.1}  # 16 texels
 
     def check(node: dict[str, Any]) -> np.ndarray:
-        """Corners of all that is shown at and below a node, in its metres."""
+        """Vertices of the content at and below a node, in metres of the node."""
         read = trimesh.load_scene(tmp_path / "out" / node["content"]["uri"], process=False)
         shown = [v[:, [0, 2, 1]] * (1, -1, 1) for v in (mesh.vertices for mesh in read.geometry.values())]
         for child in node.get("children", ()):
@@ -215,7 +215,7 @@ def test_carla_names_carry_semantic_tags(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-def test_ground_too_long_for_a_carla_map_comes_in_squares_from_the_north_west(tmp_path: Path) -> None:
+def test_large_ground_is_split_into_carla_map_tiles_from_the_north_west(tmp_path: Path) -> None:
     town = synthetic.scene(tmp_path, apart=3000.0)
     written(town, "carla", tmp_path / "out")
     (about,) = json.loads((tmp_path / "out" / "carla" / "town.json").read_text(encoding="utf-8"))["maps"]

@@ -1,4 +1,4 @@
-"""SDF: the world stands where the CRS says."""
+"""SDF: georeference, tile offset and background of worlds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _world(
     return present(root.find("world"))
 
 
-def test_spherical_coordinates_are_those_of_the_origin(tmp_path: Path) -> None:
+def test_spherical_coordinates_equal_those_of_the_origin(tmp_path: Path) -> None:
     from pyproj import Transformer
 
     world = _world(tmp_path / "a.sdf", sdf.Georeference.of(synthetic.UTM))
@@ -45,19 +45,19 @@ def test_heading_is_minus_the_convergence(tmp_path: Path) -> None:
     assert present(sdf.Georeference.of(west)).heading == pytest.approx(1.90, abs=0.01)
 
 
-def test_feet_are_brought_to_metres() -> None:
+def test_feet_are_converted_to_metres() -> None:
     feet = Frame("EPSG:2263", (300_000.0, 60_000.0, 30.0), 1200 / 3937)  # New York, US survey feet
     place = present(sdf.Georeference.of(feet))
     assert (place.latitude, place.longitude) == pytest.approx((40.7, -74.0), abs=0.1)
     assert place.elevation == pytest.approx(30.0)
 
 
-def test_a_local_frame_has_no_georeference(tmp_path: Path) -> None:
+def test_local_frame_has_no_georeference(tmp_path: Path) -> None:
     assert sdf.Georeference.of(Frame()) is None
     assert _world(tmp_path / "a.sdf", None).find("spherical_coordinates") is None
 
 
-def test_the_offset_is_in_the_pose(tmp_path: Path) -> None:
+def test_offset_is_written_to_the_pose(tmp_path: Path) -> None:
     world = _world(tmp_path / "a.sdf", None, (100.25, -3.0, 1e-3))
     assert world.findtext("include/uri") == "model://street"
     assert world.findtext("include/pose") == "100.25 -3 0.001 0 0 0"

@@ -1,4 +1,4 @@
-"""The catalogue and the virtual point cloud say where tiles are, and find their files."""
+"""STAC catalogue and virtual point cloud: positions of tiles, and relative paths to their files."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def scanned(folder: Path, frame: Frame, name: str = "cloud.laz") -> Cloud:
 
 
 def item(out: Path, name: str, frame: Frame, **more: Any) -> TileItem:
-    """A made tile: its cloud, and files where a survey has them."""
+    """A finished tile: its cloud, and files at the paths of a survey."""
     folder = out / "tiles" / name
     cloud = scanned(folder, frame)
     for file in ("world.sdf", "world.glb", "report.html"):
@@ -55,7 +55,7 @@ def survey(out: Path, frame: Frame = synthetic.UTM) -> list[TileItem]:
 
 
 def check(thing: pystac.Item | pystac.Collection) -> None:
-    """Against STAC's own schema; those of its extensions would have to be fetched."""
+    """Validate by the STAC schema; those of extensions would need a download."""
     kind = pystac.STACObjectType.ITEM if isinstance(thing, pystac.Item) else pystac.STACObjectType.COLLECTION
     JsonSchemaSTACValidator().validate_core(thing.to_dict(), kind, "1.1.0")
 
@@ -69,7 +69,7 @@ def read(path: Path) -> tuple[pystac.Collection, list[pystac.Item]]:
     return collection, items
 
 
-def test_the_catalogue_is_read_back_and_finds_every_file(tmp_path: Path) -> None:
+def test_catalogue_is_readable_and_refers_to_existing_files(tmp_path: Path) -> None:
     path = stac.write(tmp_path / "out", "town", "A town.", survey(tmp_path / "out"))
     assert path == tmp_path / "out/stac/collection.json"
     moved = (tmp_path / "out").rename(tmp_path / "moved")  # paths are relative
@@ -125,7 +125,7 @@ def test_item_has_point_count_software_and_sizes(tmp_path: Path) -> None:
     assert one.assets["data"].media_type == "application/vnd.laszip"
 
 
-def test_an_item_names_the_rasters_that_were_made(tmp_path: Path) -> None:
+def test_item_lists_its_rasters(tmp_path: Path) -> None:
     out = tmp_path / "out"
     made = item(out, "tile0", synthetic.UTM)
     raster = out / "tiles" / "tile0" / "tile0_dsm.tif"
@@ -136,7 +136,7 @@ def test_an_item_names_the_rasters_that_were_made(tmp_path: Path) -> None:
     assert asset.title == "Heights of the highest surface" and asset.extra_fields["file:size"] == 7
 
 
-def test_times_are_of_the_points_or_the_given_date(tmp_path: Path) -> None:
+def test_times_are_those_of_the_points_or_the_given_date(tmp_path: Path) -> None:
     timed = item(tmp_path, "timed", synthetic.UTM, times=(ADJUSTED, ADJUSTED + 60))
     dated = item(tmp_path, "dated", synthetic.UTM, times=(1000.0, 1060.0))  # of an unknown week
     collection, items = read(stac.write(tmp_path, "town", "A town.", [timed, dated]))
@@ -149,7 +149,7 @@ def test_times_are_of_the_points_or_the_given_date(tmp_path: Path) -> None:
     assert collection.extent.temporal.intervals == [[DATE, end]]
 
 
-def test_gps_times() -> None:
+def test_gps_times_are_converted_to_utc() -> None:
     assert from_gps(211_846_418.0) == datetime(2018, 6, 1, tzinfo=UTC)  # GPS time 1211846418
     early = from_gps(-100_000_000.0)
     assert early is not None and abs((early - datetime(2008, 7, 13, 15, 59, 46, tzinfo=UTC)).total_seconds()) <= 4
@@ -164,7 +164,7 @@ def test_crs_without_a_code_is_written_as_wkt(tmp_path: Path) -> None:
     assert one.properties["proj:code"] is None and CRS.from_wkt(one.properties["proj:wkt2"]) == CRS.from_wkt(own)
 
 
-def test_feet(tmp_path: Path) -> None:
+def test_coordinates_in_feet_are_converted(tmp_path: Path) -> None:
     feet = Frame("EPSG:2263", (300_000.0, 60_000.0, 30.0), 1200 / 3937)  # New York, US survey feet
     one = read(stac.write(tmp_path, "town", "", [item(tmp_path, "a", feet)]))[1][0]
     assert one.bbox is not None and one.bbox[:2] == pytest.approx([-74.0, 40.7], abs=0.1)
@@ -179,7 +179,7 @@ def test_local_survey_has_no_geographic_position(tmp_path: Path) -> None:
     assert collection.extent.spatial.bboxes == [[-180, -90, 180, 90]]
 
 
-def test_an_earlier_catalogue_is_replaced_as_a_whole(tmp_path: Path) -> None:
+def test_earlier_catalogue_is_replaced_completely(tmp_path: Path) -> None:
     tiles = survey(tmp_path)
     stac.write(tmp_path, "town", "A town.", tiles)
     with pytest.raises(InputError, match=r"none\.sdf"):
@@ -191,7 +191,7 @@ def test_an_earlier_catalogue_is_replaced_as_a_whole(tmp_path: Path) -> None:
         stac.write(tmp_path, "town", "A town.", [])
 
 
-def test_the_virtual_point_cloud_has_what_its_readers_ask_for(tmp_path: Path) -> None:
+def test_virtual_point_cloud_has_the_fields_that_pdal_and_qgis_read(tmp_path: Path) -> None:
     tiles = survey(tmp_path)
     second = scanned(tmp_path / "tiles/tile0", tiles[0].frame, "second.las")
     tiles[0] = replace(tiles[0], clouds=(*tiles[0].clouds, second))
@@ -214,7 +214,7 @@ def test_the_virtual_point_cloud_has_what_its_readers_ask_for(tmp_path: Path) ->
     assert len({feature["properties"]["proj:wkt2"] for feature in features}) == 1
 
 
-def test_a_virtual_point_cloud_of_a_local_survey(tmp_path: Path) -> None:
+def test_virtual_point_cloud_of_a_local_survey_has_an_empty_crs(tmp_path: Path) -> None:
     path = stac.write_vpc(tmp_path / "town.vpc", survey(tmp_path, Frame()))
     feature = json.loads(path.read_text(encoding="utf-8"))["features"][0]
     assert feature["properties"]["proj:wkt2"] == ""  # a string, or wrench stops

@@ -26,7 +26,7 @@ def cloud(path: Path, crs: str = "EPSG:32632", unit: float = 1.0, n: int = 100) 
 
 
 def body(folder: Path, **changes: Any) -> dict[str, Any]:
-    """A tile that is right, but for `changes`; `photo` changes its photo, `camera` its camera."""
+    """A valid tile with `changes`; `photo` changes fields of its photo, `camera` those of its camera."""
     cloud(folder / "cloud.laz")
     camera: dict[str, Any] = {
         "id": "front",
@@ -116,7 +116,9 @@ def test_tile_round_trip(tmp_path: Path) -> None:
         ({"trajectory": "bad.csv"}, r"bad\.csv: is not a valid trajectory.*time,x,y,z"),
     ],
 )
-def test_bad_tiles_are_refused_by_name(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_invalid_tiles_are_rejected_with_cause_and_remedy(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
     cloud(tmp_path / "bare.laz", crs="local")
     cloud(tmp_path / "lambert.laz", crs="EPSG:2154")
     (tmp_path / "cloud.shp").write_text("0 0 0", encoding="utf-8")
@@ -126,14 +128,14 @@ def test_bad_tiles_are_refused_by_name(tmp_path: Path, changes: dict[str, Any], 
         read_tile(save(tmp_path, body(tmp_path, **changes)))
 
 
-def test_two_cameras_of_one_id_are_refused(tmp_path: Path) -> None:
+def test_duplicate_camera_ids_are_rejected(tmp_path: Path) -> None:
     content = body(tmp_path)
     content["cameras"] *= 2
     with pytest.raises(InputError, match=r"has two cameras `front`.*a unique id"):
         read_tile(save(tmp_path, content))
 
 
-def test_no_tile_and_bad_toml(tmp_path: Path) -> None:
+def test_missing_tile_and_invalid_toml_are_reported(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"tile\.toml: no tile found.*scan2sim import"):
         read_tile(tmp_path)
     (tmp_path / "tile.toml").write_text("name = \n", encoding="utf-8")
@@ -143,7 +145,7 @@ def test_no_tile_and_bad_toml(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kept", [0.3, 0.6, 0.95])
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_a_truncated_cloud_is_named_before_or_while_it_is_read(tmp_path: Path, suffix: str, kept: float) -> None:
+def test_truncated_cloud_is_reported(tmp_path: Path, suffix: str, kept: float) -> None:
     path = cloud(tmp_path / f"cloud{suffix}", n=20_000)
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * kept)])
@@ -152,7 +154,7 @@ def test_a_truncated_cloud_is_named_before_or_while_it_is_read(tmp_path: Path, s
         clouds.read(path, read_tile(tmp_path).frame)
 
 
-def test_feet_become_metres(tmp_path: Path) -> None:
+def test_coordinates_in_feet_are_converted_to_metres(tmp_path: Path) -> None:
     frame = Frame(FT_CRS, (200_000.0, 250_000.0, 100.0), 0.3048)
     xyz = np.array([[0, 0, 0], [30.48, 60.96, 3.048]], np.float32)
     las.write(tmp_path / "feet.laz", PointCloud(frame, xyz))
@@ -165,7 +167,7 @@ def test_feet_become_metres(tmp_path: Path) -> None:
     assert np.allclose(header.high - header.low, [100, 200, 10], atol=0.01)  # the file itself is in feet
 
 
-def test_a_local_tile_may_be_in_feet(tmp_path: Path) -> None:
+def test_local_tile_may_be_in_feet(tmp_path: Path) -> None:
     cloud(tmp_path / "bare.las", crs="local")
     (tmp_path / "tile.toml").write_text(
         'name = "t"\ncrs = "local"\nunits = "ft"\nclouds = ["bare.las"]\n', encoding="utf-8"
@@ -175,7 +177,7 @@ def test_a_local_tile_may_be_in_feet(tmp_path: Path) -> None:
     assert np.ptp(clouds.read(tile.clouds[0], tile.frame).xyz[:, 0]) < 20 * 0.31
 
 
-def test_a_real_survey_in_feet_has_metric_size(real_data: Path, tmp_path: Path) -> None:
+def test_real_survey_in_feet_has_metric_size(real_data: Path, tmp_path: Path) -> None:
     (tmp_path / "autzen.laz").write_bytes((real_data / "las" / "autzen_trim.laz").read_bytes())
     (tmp_path / "tile.toml").write_text('name = "autzen"\nclouds = ["autzen.laz"]\n', encoding="utf-8")
     tile = read_tile(tmp_path)

@@ -1,4 +1,4 @@
-"""Tracks for GIS."""
+"""GeoJSON of tracks."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Trajectory files: what is written comes back, and bad ones are refused by file and line."""
+"""Trajectory files: round trips, and errors of invalid files with file and line."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_trajectory_round_trip(tmp_path: Path, suffix: str, frame: Frame) -> Non
     assert [p.name for p in tmp_path.iterdir()] == [file.name]
 
 
-def test_files_hold_coordinates_of_the_crs(tmp_path: Path) -> None:
+def test_files_contain_coordinates_of_the_crs(tmp_path: Path) -> None:
     path = Trajectory(np.array([0.0, 1.0]), np.array([[1.0, 2.0, 3.0], [2.0, 2.0, 3.0]]))
     trajectory.write(tmp_path / "a.csv", path, UTM)
     assert (tmp_path / "a.csv").read_text(encoding="utf-8").splitlines()[:2] == [
@@ -60,7 +60,7 @@ def test_files_hold_coordinates_of_the_crs(tmp_path: Path) -> None:
     ]
 
 
-def test_kitti_has_ten_poses_a_second(tmp_path: Path) -> None:
+def test_kitti_has_ten_poses_per_second(tmp_path: Path) -> None:
     trajectory.write(tmp_path / "a.kitti", sample_trajectory())
     assert np.allclose(trajectory.read(tmp_path / "a.kitti").times, np.arange(12) / 10)
     with pytest.raises(InputError, match=r"has 12 poses for 3 times"):
@@ -77,7 +77,7 @@ def test_format_of_other_suffixes_is_detected_by_the_first_line(tmp_path: Path) 
         assert np.allclose(trajectory.read(text).positions, sample_trajectory().positions)
 
 
-def test_partial_columns_in_any_order(tmp_path: Path) -> None:
+def test_partial_columns_are_read_in_any_order(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("# Z, Y ,X,TIME,sx,sy,sz\n\n3,2,1,10,1,1,2\n6,5,4,11,1,1,2\n", encoding="utf-8")
     path = trajectory.read(tmp_path / "a.csv")
     assert path.positions.tolist() == [[1, 2, 3], [4, 5, 6]] and path.rotations is None
@@ -87,7 +87,7 @@ def test_partial_columns_in_any_order(tmp_path: Path) -> None:
     assert (tmp_path / "b.csv").read_text(encoding="utf-8").startswith("time,x,y,z,sx,sy,sz\n")
 
 
-def test_times_out_of_order_are_refused_or_sorted(tmp_path: Path) -> None:
+def test_times_out_of_order_are_rejected_or_sorted(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("t,e,n,h\n2,5,0,0\n1,4,0,0\n", encoding="utf-8")
     with pytest.raises(
         InputError, match=r"a\.csv: is not a valid trajectory \(line 3: its time is not after.*Sort by time"
@@ -114,13 +114,13 @@ def test_times_out_of_order_are_refused_or_sorted(tmp_path: Path) -> None:
         ("a.geojson", "{}", r"can only be written"),
     ],
 )
-def test_bad_files_are_refused_by_line(tmp_path: Path, name: str, text: str, message: str) -> None:
+def test_invalid_files_are_rejected_with_line_and_remedy(tmp_path: Path, name: str, text: str, message: str) -> None:
     (tmp_path / name).write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=message):
         trajectory.read(tmp_path / name)
 
 
-def test_unreadable_files(tmp_path: Path) -> None:
+def test_unreadable_files_are_rejected(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes(b"\xff\xfe\x00\x81")
     with pytest.raises(InputError, match=r"a\.csv: is not a trajectory \(not a text file\)"):
         trajectory.read(tmp_path / "a.csv")
@@ -160,7 +160,7 @@ def test_geojson_contains_the_path_with_unsure_sections(tmp_path: Path) -> None:
     assert stretches[0]["properties"]["end_s"] - stretches[0]["properties"]["start_s"] == pytest.approx(0.2, abs=1e-6)
 
 
-def test_poses_between_poses_turn_evenly_and_are_held_at_the_ends() -> None:
+def test_pose_at_interpolates_and_clamps_at_the_ends() -> None:
     path = sample_trajectory()
     assert path.rotations is not None
     times = np.linspace(path.times[0], path.times[-1], 40)

@@ -1,4 +1,4 @@
-"""Free space: surface that rays pass through is removed, surface that they end at is kept."""
+"""Free space: surfaces that rays pass through are removed, surfaces at which they end are kept."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def wall(x: float, width: float = 4.0) -> Mesh:
     return Mesh(Frame(), vertices, faces.astype(np.int32))
 
 
-def together(*meshes: Mesh) -> Mesh:
+def joined(*meshes: Mesh) -> Mesh:
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
     faces = [m.faces + start for m, start in zip(meshes, starts[:-1], strict=True)]
     return Mesh(Frame(), np.concatenate([m.vertices for m in meshes]), np.concatenate(faces).astype(np.int32))
@@ -39,29 +39,29 @@ def returns(x: float, half_width: float, seed: int = 0, n: int = 20_000) -> F64:
     return np.stack([x + random.normal(0, 0.01, n), y, z], axis=1)
 
 
-def passed(mesh: Mesh, points: F64, ratio: float = 0.5) -> np.ndarray:
+def faces_passed(mesh: Mesh, points: F64, ratio: float = 0.5) -> np.ndarray:
     return passed_faces(mesh, np.tile(SCANNER, (len(points), 1)), points, ratio)
 
 
-def test_a_bubble_in_front_of_the_wall_is_removed_and_the_wall_kept() -> None:
-    mesh = together(wall(6, 1.0), wall(10))  # the bubble lies between the scanner and the returns on the wall
-    free = passed(mesh, returns(10, 1.8))
+def test_bubble_in_front_of_a_wall_is_removed_and_the_wall_kept() -> None:
+    mesh = joined(wall(6, 1.0), wall(10))  # the bubble lies between the scanner and the returns on the wall
+    free = faces_passed(mesh, returns(10, 1.8))
     x = mesh.corners.mean(axis=1)[:, 0]
     z = mesh.corners.mean(axis=1)[:, 2]
-    assert free[(x < 7) & (z > 0.9)].all(), "all of the bubble that the rays reach"
+    assert free[(x < 7) & (z > 0.9)].all(), "all faces of the bubble that rays pass through"
     assert not free[x > 7].any()
 
 
-def test_surface_that_half_of_the_rays_pass_is_kept_by_the_ratio() -> None:
-    mesh = together(wall(6, 2.0), wall(10))
+def test_ratio_of_passing_rays_decides_on_removal() -> None:
+    mesh = joined(wall(6, 2.0), wall(10))
     points = np.concatenate([returns(10, 1.4, n=12_000), returns(6, 0.8, seed=1, n=12_000)])  # 50 % end at 6 m
     near = mesh.corners.mean(axis=1)[:, 0] < 7
     middle = near & (np.abs(mesh.corners.mean(axis=1)[:, 1:] - [0, 1.6]).max(axis=1) < 0.3)
-    assert not passed(mesh, points, 0.4)[middle].any()
-    assert passed(mesh, points, 0.7)[middle].all()
+    assert not faces_passed(mesh, points, 0.4)[middle].any()
+    assert faces_passed(mesh, points, 0.7)[middle].all()
 
 
-def test_ground_at_grazing_angles_is_kept_in_spite_of_small_height_errors() -> None:
+def test_ground_at_grazing_angles_is_robust_to_small_height_errors() -> None:
     x, y = np.meshgrid(np.arange(5, 40, 0.2), np.arange(-3, 3.2, 0.2), indexing="ij")
     n, m = x.shape
     vertices = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1).astype(np.float32)
@@ -69,24 +69,24 @@ def test_ground_at_grazing_angles_is_kept_in_spite_of_small_height_errors() -> N
     faces = np.concatenate([np.stack([a, a + m, a + m + 1], 1), np.stack([a, a + m + 1, a + 1], 1)]).astype(np.int32)
     random = np.random.default_rng(0)
     below = np.stack([random.uniform(6, 38, 50_000), random.uniform(-2.5, 2.5, 50_000), np.full(50_000, -0.05)], axis=1)
-    assert not passed(Mesh(Frame(), vertices, faces), below).any()  # 5 cm are up to 1 m along the ray
+    assert not faces_passed(Mesh(Frame(), vertices, faces), below).any()  # 5 cm are up to 1 m along the ray
 
 
-def test_few_rays_and_none_remove_nothing() -> None:
-    mesh = together(wall(6, 1.0), wall(10))
-    assert not passed(mesh, returns(10, 0.1, n=3)).any()
-    assert not passed(mesh, np.zeros((0, 3))).any()
-    assert passed(mesh.keep(np.zeros(len(mesh), bool)), returns(10, 1)).shape == (0,)
+def test_too_few_rays_remove_nothing() -> None:
+    mesh = joined(wall(6, 1.0), wall(10))
+    assert not faces_passed(mesh, returns(10, 0.1, n=3)).any()
+    assert not faces_passed(mesh, np.zeros((0, 3))).any()
+    assert faces_passed(mesh.keep(np.zeros(len(mesh), bool)), returns(10, 1)).shape == (0,)
 
 
 def _inputs(folder: Path, points: F32) -> dict[str, Path]:
-    together(wall(6, 1.0), wall(8, 1.0), wall(10)).save(folder / "mesh.npz")
+    joined(wall(6, 1.0), wall(8, 1.0), wall(10)).save(folder / "mesh.npz")
     PointCloud(Frame(), points, time=np.linspace(0, 1, len(points))).save(folder / "cloud.npz")
     Trajectory(np.array([0.0, 1.0]), np.tile(SCANNER, (2, 1))).save(folder / "path.npz")
     return {name: folder / f"{name}.npz" for name in ("mesh", "cloud", "path")}
 
 
-def test_step_removes_surface_behind_removed_surface_too(tmp_path: Path) -> None:
+def test_step_removes_surfaces_behind_removed_ones(tmp_path: Path) -> None:
     inputs = _inputs(tmp_path, returns(10, 1.8).astype(np.float32))
     (tmp_path / "out").mkdir()
     done = FREE_SPACE.run(inputs, step_params(FREE_SPACE.params), tmp_path / "out", silent)
@@ -109,7 +109,7 @@ def test_step_leaves_no_holes_in_the_ground(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     points = np.stack([random.uniform(5, 14, 40_000), random.uniform(-1.5, 1.5, 40_000), np.zeros(40_000)], axis=1)
     inputs = _inputs(tmp_path, points.astype(np.float32))
-    together(floor(0.4, (4, 12)), floor(0.9, (4, 6))).save(inputs["mesh"])
+    joined(floor(0.4, (4, 12)), floor(0.9, (4, 6))).save(inputs["mesh"])
     for keep, least in ((True, 0.99), (False, 0.0)):
         out = tmp_path / str(keep)
         out.mkdir()
@@ -121,7 +121,7 @@ def test_step_leaves_no_holes_in_the_ground(tmp_path: Path) -> None:
         assert not ((z > 0.8) & (abs(y) < 0.4)).any()
 
 
-def test_step_without_times_keeps_everything_and_says_why(tmp_path: Path) -> None:
+def test_step_without_times_keeps_all_faces_and_reports_the_reason(tmp_path: Path) -> None:
     inputs = _inputs(tmp_path, returns(10, 1.8).astype(np.float32))
     replace(PointCloud.load(inputs["cloud"]), time=None).save(inputs["cloud"])
     (tmp_path / "out").mkdir()

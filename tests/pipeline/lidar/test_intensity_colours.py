@@ -43,12 +43,12 @@ def test_markings_are_lighter_than_the_road_at_all_ranges(spacing: float, known_
     assert np.mean((light > threshold)[marking & far]) > 0.8
 
 
-def test_shades_do_not_depend_on_the_unit_of_the_intensity() -> None:
+def test_shades_are_independent_of_the_unit_of_the_intensity() -> None:
     low, high = (intensity_colours(road(0.2, scale=scale)[0]).mean(axis=1) for scale in (800, 60_000))
     assert np.median(np.abs(low - high)) < 8
 
 
-def test_classes_keep_their_tint() -> None:
+def test_vegetation_keeps_a_green_tint() -> None:
     cloud, _ = road(0.3)
     assert cloud.classification is not None
     cloud.classification[: len(cloud) // 2] = CODE["high_vegetation"]
@@ -56,7 +56,7 @@ def test_classes_keep_their_tint() -> None:
     assert (rgb[:, 1] > rgb[:, 0]).all() and (rgb[:, 1] > rgb[:, 2]).all()
 
 
-def test_map_without_intensity_is_left_to_the_class_colours(tmp_path: Path) -> None:
+def test_map_without_intensity_gets_class_colours(tmp_path: Path) -> None:
     cloud, _ = road(0.5)
     assert cloud.intensity is not None
     cloud.intensity[:] = 7
@@ -67,7 +67,7 @@ def test_map_without_intensity_is_left_to_the_class_colours(tmp_path: Path) -> N
     assert PointCloud.load(done.files["cloud"]).rgb is None
 
 
-def test_empty_and_tiny_clouds(tmp_path: Path) -> None:
+def test_empty_and_tiny_clouds_are_accepted(tmp_path: Path) -> None:
     cloud, _ = road(0.5)
     for n in (0, 1, 25):
         cloud.take(slice(n)).save(tmp_path / "in.npz")

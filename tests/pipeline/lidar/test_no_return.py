@@ -1,4 +1,4 @@
-"""Surface that gave no return to any sweep has reflectance 0 in the world's files: a window in a scanned wall."""
+"""Surfaces without any return have reflectance 0 in the files of the world: a window in a scanned wall."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HALF_WIDTH_M, LOW_M, HIGH_M = 0.96, 1.91, 2.79
 
 
 def in_window() -> Bools:
-    """Rays that meet the window: 5.5 degrees to both sides, and .5 degrees below to 4.5 above the horizon."""
+    """Rays that hit the window: 5.5 degrees to both sides, and .5 degrees below to 4.5 above the horizon."""
     way = rays()
     azimuth, elevation = np.degrees(np.arctan2(way[:, 1], way[:, 0])), np.degrees(np.arcsin(way[:, 2]))
     return np.asarray((np.abs(azimuth) < 5.5) & (np.abs(elevation - 2) < 2.5))
@@ -48,7 +48,7 @@ MESHES = {
 
 
 def run(tmp_path: Path, sweeps: Sweeps, others: F32) -> tuple[Done, dict[str, F32]]:
-    """The step with the returns of one sweep and of `others`; and the reflectance of the vertices by surface."""
+    """Run the step with the returns of one sweep and of `others`; also returns reflectances of vertices by surface."""
     xyz = np.concatenate([sweeps.xyz, others]).astype(np.float32)
     code = np.where(np.abs(xyz[:, 0] - WALL_X) < 0.01, CODE["building"], CODE["terrain"]).astype(np.uint8)
     intensity = np.random.default_rng(0).integers(100, 60_000, len(xyz)).astype(np.uint16)
@@ -64,21 +64,21 @@ def run(tmp_path: Path, sweeps: Sweeps, others: F32) -> tuple[Done, dict[str, F3
     return done, found
 
 
-def test_a_window_is_marked(tmp_path: Path) -> None:
+def test_reflectance_of_a_window_is_0(tmp_path: Path) -> None:
     sweeps, _ = sweep(lost=in_window())
     done, found = run(tmp_path, sweeps, np.zeros((0, 3), np.float32))
     _, y, z = MESHES["building"].vertices.T
-    depth = np.minimum(HALF_WIDTH_M - np.abs(y), np.minimum(z - LOW_M, HIGH_M - z))  # into the window
+    depth = np.minimum(HALF_WIDTH_M - np.abs(y), np.minimum(z - LOW_M, HIGH_M - z))  # distance from the window's edge
     assert (found["building"][depth > SUPPORT_M + 0.1] == 0).all() and (depth > SUPPORT_M + 0.1).sum() > 10
     assert (found["building"][depth < 0] > 0).all()
-    assert (found["terrain"] > 0).all()  # below the scanner, where its vehicle is, and where its rays are far apart
+    assert (found["terrain"] > 0).all()  # also near the vehicle, and where rays are sparse
     assert done.metrics["no_return_m2"]["terrain"] == 0
     assert done.metrics["no_return_m2"]["building"] == pytest.approx(
         1.0, abs=0.2
     )  # 25 cm inside the gap in the returns
 
 
-def test_returns_of_another_sweep_support_it(tmp_path: Path) -> None:
+def test_window_with_returns_of_another_sweep_has_a_reflectance(tmp_path: Path) -> None:
     sweeps, _ = sweep(lost=in_window())
     y, z = np.meshgrid(np.arange(-1, 1, 0.2), np.arange(1.8, 2.9, 0.2))
     others = np.stack([np.full(y.size, WALL_X), y.ravel(), z.ravel()], axis=1).astype(np.float32)
@@ -86,7 +86,7 @@ def test_returns_of_another_sweep_support_it(tmp_path: Path) -> None:
     assert done.metrics["no_return_m2"] == {"terrain": 0, "building": 0} and (found["building"] > 0).all()
 
 
-def test_without_rings_nothing_is_marked(tmp_path: Path) -> None:
+def test_reflectance_is_kept_without_rings(tmp_path: Path) -> None:
     sweeps, _ = sweep(lost=in_window())
     mixed = sweeps.take(np.random.default_rng(0).permutation(len(sweeps)))
     done, found = run(tmp_path, mixed, np.zeros((0, 3), np.float32))

@@ -1,4 +1,4 @@
-"""Reflectance from intensities: that of the material, at all ranges and angles; and what exports make of it."""
+"""Reflectance from intensities: that of the material at all ranges and angles; and its export."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def medians(value: F32, code: U8) -> dict[str, float]:
     return {name: float(np.median(value[code == CODE[name]])) for name in TRUE}
 
 
-def test_materials_have_their_reflectance_at_all_ranges() -> None:
+def test_reflectance_is_that_of_the_material_at_all_ranges() -> None:
     cloud, path, true = street()
     code = present(cloud.classification)
     value = reflectance(cloud, path)
@@ -78,7 +78,7 @@ def test_materials_have_their_reflectance_at_all_ranges() -> None:
     assert sorted(found, key=found.__getitem__) == sorted(TRUE, key=TRUE.__getitem__)
     for name in TRUE.keys() - {"road_sign"}:
         assert found[name] / found["building"] == pytest.approx(TRUE[name] / TRUE["building"], rel=0.05), name
-    assert found["road_sign"] > 0.9  # the brightest percent of the points is at the end of the scale
+    assert found["road_sign"] > 0.9  # the brightest percent of the points is saturated
     far = np.linalg.norm(path.at(present(cloud.time)) - cloud.xyz, axis=1)
     for name in ("road", "building"):
         own = code == CODE[name]
@@ -91,7 +91,7 @@ def test_materials_have_their_reflectance_at_all_ranges() -> None:
     assert np.corrcoef(value, true)[0, 1] > np.corrcoef(raw, true)[0, 1] + 0.2
 
 
-def test_ranges_without_intensities_are_not_dark() -> None:
+def test_points_without_intensity_have_no_reflectance() -> None:
     cloud, path, _ = street()
     far = np.linalg.norm(path.at(present(cloud.time)) - cloud.xyz, axis=1) > 25
     weak = replace(cloud, intensity=np.where(far, 0, present(cloud.intensity)).astype(np.uint16))
@@ -100,7 +100,7 @@ def test_ranges_without_intensities_are_not_dark() -> None:
     np.testing.assert_allclose(value[~far], reflectance(cloud, path)[~far], rtol=0.1)
 
 
-def test_synthetic_street_has_the_reflectivity_of_its_materials(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reflectance_of_the_synthetic_street_is_that_of_its_materials(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene(lay_out(12.0, 5))
     drive = scanner.plan_drive(scene.layout, 40_000)
     cloud = scanner.scan(scene, drive, 40_000)
@@ -121,7 +121,7 @@ def test_synthetic_street_has_the_reflectivity_of_its_materials(monkeypatch: pyt
         assert np.median(value[own]) / scale == pytest.approx(np.median(true[own]), rel=0.25), name
 
 
-def test_without_a_path_intensities_are_only_scaled() -> None:
+def test_intensities_are_only_scaled_without_a_path() -> None:
     cloud, _, _ = street()
     value, raw = reflectance(cloud, None), present(cloud.intensity)
     inner = value < 1
@@ -129,7 +129,7 @@ def test_without_a_path_intensities_are_only_scaled() -> None:
 
 
 def scanned() -> PointCloud:
-    """Points on the made-up tile: dark ground, a house that reflects three times as much."""
+    """Points on the synthetic tile: dark ground, and a house with three times its reflectance."""
     rng = np.random.default_rng(1)
     x, y = rng.uniform(-10, 10, (2, 20_000))
     ground = np.column_stack([x, y, synthetic.height(x, y)])
@@ -147,7 +147,7 @@ def scanned() -> PointCloud:
 
 
 def run(tmp_path: Path, cloud: PointCloud, with_path: bool = False) -> tuple[Done, dict[str, Path]]:
-    """The step on the made-up tile; and the inputs of the export."""
+    """Run the step on the synthetic tile; also returns the inputs of the export."""
     meshes = {"terrain": synthetic.ground(), "building": synthetic.house()}
     folders = {group: synthetic.textured(tmp_path / group, mesh) for group, mesh in meshes.items()}
     cloud.save(tmp_path / "cloud.npz")
@@ -198,7 +198,7 @@ def test_reflectance_can_be_omitted(tmp_path: Path) -> None:
         ("weak", "most intensities are 0"),
     ],
 )
-def test_clouds_without_intensities_give_none(tmp_path: Path, kind: str, reason: str) -> None:
+def test_clouds_without_usable_intensities_give_no_reflectance(tmp_path: Path, kind: str, reason: str) -> None:
     cloud = scanned()
     levels = {
         "constant": np.full(len(cloud), 7),

@@ -1,4 +1,4 @@
-"""Lidar score: analytic scenes with known ranges, a readable oracle for the distances, and sweeps found in clouds."""
+"""Lidar score: analytic scenes with known ranges, a simple reference for distances, and sweeps found in clouds."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def sweeps_of(origins: F64, returns: F64, number: int = 0) -> Sweeps:
     )
 
 
-def test_a_correct_world_has_no_error() -> None:
+def test_correct_world_has_no_error() -> None:
     origins, returns = ground_returns()
     rays = Scanner.of([ground()]).scan(origins, returns)
     assert np.allclose(rays.range, HEIGHT / -fan()[:, 2], rtol=1e-5) and (rays.surface == 0).all()
@@ -67,7 +67,7 @@ def test_a_correct_world_has_no_error() -> None:
 
 
 @pytest.mark.parametrize("shift", [-0.6, -0.3, 0.1, 0.7])
-def test_a_shifted_wall_gives_the_shift(shift: float) -> None:
+def test_error_of_a_shifted_wall_is_the_shift(shift: float) -> None:
     origins = np.zeros((100, 3))
     returns = np.column_stack([np.full(100, 10.0), np.zeros(100), np.zeros(100)])
     found = row(Scanner.of([wall(10 + shift)]).scan(origins, returns))
@@ -76,8 +76,8 @@ def test_a_shifted_wall_gives_the_shift(shift: float) -> None:
     assert found["late_50cm"] == (shift > 0.5) and found["near_surface"] == (abs(shift) < 0.22)
 
 
-def test_errors_are_charged_to_the_surface_that_is_hit_and_misses_to_the_recorded_one() -> None:
-    """A hedge 1 m before half of a wall 10 m away; behind the wall's end nothing stands for a tenth of the returns."""
+def test_errors_count_for_the_surface_hit_and_misses_for_the_recorded_one() -> None:
+    """A hedge 1 m in front of half of a wall 10 m away; a tenth of the returns lie beyond the end of the wall."""
     y = np.linspace(-9, 10.999, 200)
     returns = np.column_stack([np.full(200, 10.0), y, np.zeros(200)])
     hedge, house = rectangle((9, -9, -1), (9, 0, -1), (9, 0, 1)), rectangle((10, -9, -1), (10, 9, -1), (10, 9, 1))
@@ -90,7 +90,7 @@ def test_errors_are_charged_to_the_surface_that_is_hit_and_misses_to_the_recorde
     assert row(rays)["missing"] == rows["building"]["missing"]
 
 
-def test_distance_bands() -> None:
+def test_rays_are_counted_in_distance_bands() -> None:
     distance = np.array([5.0, 15, 30, 30, 60])
     returns = np.column_stack([distance, np.zeros(5), np.zeros(5)])
     bands = by_distance(Scanner.of([wall(30)]).scan(np.zeros((5, 3)), returns))
@@ -98,7 +98,7 @@ def test_distance_bands() -> None:
     assert [one["near_surface"] for one in bands.values()] == [0, 0, 1, 0]
 
 
-def test_an_empty_world_misses_everything() -> None:
+def test_every_ray_misses_an_empty_world() -> None:
     origins, returns = ground_returns()
     found = score(Scanner.of([]), sweeps_of(origins, returns), [], np.full(len(returns), -1))
     assert found.all["missing"] == 1 and found.all["near_surface"] == 0 and found.all["median_m"] is None
@@ -108,8 +108,8 @@ def test_an_empty_world_misses_everything() -> None:
     assert image["depth_median_m"] == pytest.approx(np.median(recorded), rel=0.1)
 
 
-def test_pixels_follow_the_published_convention() -> None:
-    """The loop of the convention, one point at a time."""
+def test_range_image_pixels_follow_the_published_convention() -> None:
+    """Reference: the published loop over single points."""
     points = np.random.default_rng(0).normal(0, (20, 20, 3), (500, 3))
     row_, column = pixels(points)
     for (x, y, z), r, c in zip(points, row_, column, strict=True):
@@ -117,7 +117,7 @@ def test_pixels_follow_the_published_convention() -> None:
         assert c == int(round(beta / (2 * np.pi / 1030))) and r == int(round(66 - alpha / (26.9 / 180 * np.pi / 66)))
 
 
-def test_range_image_keeps_the_nearest_return_of_a_pixel_and_ends_at_80_m() -> None:
+def test_range_image_keeps_the_nearest_return_up_to_80_m() -> None:
     points = np.array([[20.0, 0, -1], [10, 0, -0.5], [90, 1, -2], [10, 0, 9]])
     recorded = np.linalg.norm(points, axis=1).astype(np.float32)
     image = range_image(points, recorded, np.full(4, np.inf, np.float32), np.zeros((4, 3)), points)
@@ -126,7 +126,7 @@ def test_range_image_keeps_the_nearest_return_of_a_pixel_and_ends_at_80_m() -> N
     assert image.measures()["depth_rmse_m"] == pytest.approx(recorded[1])
 
 
-def test_chamfer_distance_and_f_score_agree_with_all_pairs() -> None:
+def test_chamfer_distance_and_f_score_equal_exhaustive_search() -> None:
     rng = np.random.default_rng(1)
     a, b = rng.uniform(0, 2, (80, 3)), rng.uniform(0, 2, (50, 3))
     squared = ((a[:, None] - b[None]) ** 2).sum(axis=2)
@@ -136,8 +136,8 @@ def test_chamfer_distance_and_f_score_agree_with_all_pairs() -> None:
     assert f_score == pytest.approx(2 * precision * recall / (precision + recall)) and 0 < f_score < 1
 
 
-def test_score_of_shifted_ground() -> None:
-    """Ground 10 cm too low: each ray ends 10 cm / sin(elevation) too late; the points are off by as much."""
+def test_score_of_shifted_ground_is_analytic() -> None:
+    """Ground 10 cm too low: the range of each ray is 10 cm / sin(elevation) too long, as is the distance of points."""
     origins, returns = ground_returns()
     sweeps = sweeps_of(origins, returns)
     found = score(Scanner.of([ground(-0.1)]), sweeps, ["terrain"], np.zeros(len(returns), int))
@@ -157,30 +157,30 @@ def test_returns_beyond_80_m_do_not_count() -> None:
     assert found.all["rays"] == 1
 
 
-def test_sweeps_of_one_time_each() -> None:
+def test_sweeps_with_one_time_each_are_numbered() -> None:
     times = np.repeat([7.0, 7.1, 7.2], 2000)
     assert sweep_numbers(times, np.array([7.0, 7.1, 7.2])).tolist() == np.repeat([0, 1, 2], 2000).tolist()
 
 
-def test_deskewed_sweeps_are_those_around_each_pose() -> None:
+def test_deskewed_sweeps_are_the_points_around_each_pose() -> None:
     poses = np.array([100, 100.104, 100.208, 100.312, 100.416])
     times = np.concatenate([pose + np.linspace(-0.05, 0.05, 50) for pose in poses])
     assert sweep_numbers(times, poses).tolist() == np.repeat(np.arange(5), 50).tolist()
 
 
-def test_other_clouds_are_cut_into_windows_of_a_tenth_of_a_second() -> None:
-    """A path of 200 poses a second; between two passes there are no sweeps."""
+def test_other_clouds_are_cut_into_windows_of_100_ms() -> None:
+    """A path of 200 poses per second; there are no sweeps between two passes."""
     times = np.concatenate([np.arange(30), np.arange(6000, 6020)]) / 100 + 0.001
     number = sweep_numbers(times, np.arange(0, 61, 0.005, dtype=np.float64))
     assert np.bincount(number).tolist() == [10, 10, 10, 10, 10]
 
 
 @pytest.mark.parametrize(("count", "every", "chosen"), [(25, 8, [4, 12, 20]), (3, 8, [1]), (1, 8, [0])])
-def test_chosen_sweeps(count: int, every: int, chosen: list[int]) -> None:
+def test_every_nth_sweep_is_chosen(count: int, every: int, chosen: list[int]) -> None:
     assert every_nth(count, every).tolist() == chosen
 
 
-def test_share_of_returns_that_other_sweeps_cover() -> None:
+def test_covered_share_is_that_of_returns_near_other_sweeps() -> None:
     grid = np.stack(np.meshgrid(np.arange(0, 5, 0.2), np.arange(0, 5, 0.2), [0.0]), axis=-1).reshape(-1, 3)
     others = grid.astype(np.float32)
     assert covered_share(others + np.float32(0.05), others) == 1
@@ -188,7 +188,7 @@ def test_share_of_returns_that_other_sweeps_cover() -> None:
 
 
 def test_origins_and_upright_axes_follow_the_path() -> None:
-    """The scanner drives along y; a return to its left lies at +y in its axes."""
+    """The scanner drives along y; a return to its left is at +y in its axes."""
     path = Trajectory(np.array([0.0, 1, 2]), np.array([[5.0, 0, 2], [5, 10, 2], [5, 20, 2]]))
     cloud = PointCloud(Frame(), np.array([[0, 5, 2], [5, 25, 2]], np.float32), time=np.array([0.5, 1.5]))
     origins, reason = scanner_origins(cloud, path)
@@ -198,7 +198,7 @@ def test_origins_and_upright_axes_follow_the_path() -> None:
     assert scanner_origins(PointCloud(Frame(), cloud.xyz), path)[1] == "the points have no times"
 
 
-def test_a_beam_returns_the_surface_that_most_of_it_hits() -> None:
+def test_beam_returns_the_surface_of_its_largest_part() -> None:
     """At 20 m, a beam of 2 mrad is 4 cm wide."""
     origins = np.zeros((3, 3))
     returns = np.array([[20.0, 0, 0]] * 3)
@@ -207,12 +207,12 @@ def test_a_beam_returns_the_surface_that_most_of_it_hits() -> None:
         beam = Scanner.of([wall(40), board], divergence_rad=0.002).scan(origins, returns)
         assert beam.range == pytest.approx(expected, abs=0.01) and (beam.surface == (expected < 30)).all()
     sky = Scanner.of([rectangle((20, -5, -5), (20, 5, -5), (20, 5, -0.008))], divergence_rad=0.002)
-    assert sky.scan(origins, returns).range == pytest.approx(20, abs=0.01)  # a third of the beam, and nothing behind
+    assert sky.scan(origins, returns).range == pytest.approx(20, abs=0.01)  # a third of the beam hits the only surface
     none = Scanner.of([rectangle((20, -5, -5), (20, 5, -5), (20, 5, -1))], divergence_rad=0.002).scan(origins, returns)
     assert np.isinf(none.range).all() and (none.surface == -1).all()
 
 
-def test_a_beam_on_the_ground_has_the_range_of_its_middle() -> None:
+def test_range_of_a_beam_on_the_ground_is_that_of_its_centre() -> None:
     origins, returns = ground_returns()
     beam = Scanner.of([ground()], divergence_rad=0.002).scan(origins, returns)
     assert np.abs(beam.range - beam.recorded).max() < 0.15 and np.median(np.abs(beam.range - beam.recorded)) < 0.01

@@ -1,4 +1,4 @@
-"""Sightings of points by the sweeps of a scanner that drives past a wall, while something comes and leaves."""
+"""Counts of sweeps that see points or pass through them, on a drive past a wall with a temporary object."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ def scan(there: set[int], screen: bool = False) -> tuple[F32, F64, Trajectory]:
 
 
 @pytest.mark.parametrize(("there", "seen"), [({8, 9}, 2), ({0}, 1), (set(range(SWEEPS)), SWEEPS)])
-def test_what_came_or_left_was_passed_by_the_other_sweeps(there: set[int], seen: int) -> None:
+def test_temporary_object_is_seen_by_its_sweeps_and_passed_by_the_others(there: set[int], seen: int) -> None:
     found = sightings(BOX[None].astype(np.float32), *scan(there))
     assert [int(count[0]) for count in found] == [seen, SWEEPS - seen]
 
 
-def test_a_wall_is_never_passed() -> None:
+def test_no_sweep_passes_through_a_wall() -> None:
     wall = np.array([[x, WALL_Y, 0.2] for x in (0.0, 4.0, 8.0)], np.float32)
     seen, passed = sightings(wall, *scan({3, 4}))
     assert (seen >= SWEEPS - 2).all() and not passed.any()
 
 
-def test_what_is_hidden_is_neither_seen_nor_passed() -> None:
+def test_occluded_object_is_neither_seen_nor_passed() -> None:
     seen, passed = sightings(BOX[None].astype(np.float32), *scan({8}, screen=True))
     assert not seen.any() and not passed.any()

@@ -1,4 +1,4 @@
-"""Rays without a return are found in the gaps of a scanner's rings; what they hit in a world may be a phantom."""
+"""Rays without a return, found in the gaps of scanner rings; surfaces that they hit in a world may be phantoms."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def rays(turn: int = 1) -> F64:
 
 
 def sweep(lost: Bools | bool = False, turn: int = 1, tilt_deg: float = 0.0) -> tuple[Sweeps, F64]:
-    """Returns of a scanner in front of a wall, without the lost ones; and the true rays that came back without any."""
+    """Returns of a scanner in front of a wall, without the lost ones; and the true rays without a return."""
     way, c, s = rays(turn), np.cos(np.radians(tilt_deg)), np.sin(np.radians(tilt_deg))
     local = way @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
     origins = np.tile([0.0, 0, HEIGHT], (len(way), 1))
@@ -68,7 +68,7 @@ def test_gaps_of_rings_are_rays_without_a_return(turn: int, tilt: float) -> None
     assert np.allclose(found.origins, [0, 0, HEIGHT])
 
 
-def test_returns_in_another_order_have_no_rings() -> None:
+def test_returns_not_in_ring_order_have_no_rings() -> None:
     sweeps, _ = sweep()
     found, reason = unreturned_rays(sweeps.take(np.random.default_rng(0).permutation(len(sweeps))))
     assert not len(found) and reason == NO_RINGS
@@ -77,7 +77,7 @@ def test_returns_in_another_order_have_no_rings() -> None:
 
 
 def test_surface_in_the_sky_is_a_phantom() -> None:
-    """A crown high above the ground behind the scanner, where all rays came back without a return."""
+    """A crown high above the ground behind the scanner, where no ray had a return."""
     sweeps, _ = sweep()
     assert scored(sweeps).phantoms["phantom"] == 0
     crown = rectangle((-20, -9, 2.1), (-20, 9, 2.1), (-20, 9, 9))
@@ -88,14 +88,14 @@ def test_surface_in_the_sky_is_a_phantom() -> None:
     assert scored(sweeps, crown, inside=-30.0).phantoms["phantom"] == 0  # in the box of an excluded object
 
 
-def test_surface_before_recorded_returns_is_a_phantom_too() -> None:
+def test_surface_in_front_of_recorded_returns_is_a_phantom() -> None:
     sweeps, _ = sweep()
     found = scored(sweeps, rectangle((5, -2, 0.5), (5, 2, 0.5), (5, 2, 2))).phantoms
     assert found["phantom"] > 0.01 and found["without_return"] == 0
 
 
-def test_glass_and_wet_ground_are_no_phantoms() -> None:
-    """Rays lost on a window and on the road hit surface in the world, as they did in the street."""
+def test_glass_and_wet_ground_are_not_phantoms() -> None:
+    """Rays lost on a window and on the road hit surfaces that exist in the street, too."""
     way = rays()
     azimuth, elevation = np.degrees(np.arctan2(way[:, 1], way[:, 0])), np.degrees(np.arcsin(way[:, 2]))
     window = (np.abs(azimuth) < 5.5) & (np.abs(elevation - 2) < 2.5)

@@ -1,4 +1,4 @@
-"""The check of photos against the cloud names usual mistakes, with the option that fixes them, and nothing else."""
+"""Check of photos against the cloud: detects common errors, with the option that fixes them, and no others."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def scaled_intrinsics(c: Camera) -> Camera:
     return replace(c, fx=2 * c.fx, fy=2 * c.fy, cx=2 * c.cx + 0.5, cy=2 * c.cy + 0.5)
 
 
-def test_nothing_is_named_in_correct_tiles(street: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_error_is_reported_for_correct_tiles(street: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert find_mistake(read_tile(street)) is None
     inspect_path(street)
     assert "--" not in capsys.readouterr().out
@@ -68,14 +68,16 @@ def test_nothing_is_named_in_correct_tiles(street: Path, capsys: pytest.CaptureF
         (for_images_of_another_size, "--intrinsics-size 720x540"),
     ],
 )
-def test_mistakes_in_poses_are_named(street: Path, change: Callable[[PosedPhotos], PosedPhotos], option: str) -> None:
+def test_pose_conventions_are_detected_with_their_option(
+    street: Path, change: Callable[[PosedPhotos], PosedPhotos], option: str
+) -> None:
     mistake = find_mistake(changed(street, change))
     assert mistake is not None and mistake.option == option
     assert f"with `{option}` the photos fit" in str(mistake)
 
 
 def on_path(street: Path) -> Tile:
-    """The tile with the front camera alone, posed by a scanner's path as `import sweeps` does it."""
+    """The tile with only the front camera, posed by a scanner path as by `import sweeps`."""
     tile = read_tile(street)
     views = [view for view in tile.views if view.camera is tile.views[0].camera]
     T = np.array([view.T_world_cam for view in views]) @ np.linalg.inv(scanner_camera())
@@ -91,7 +93,7 @@ def scanner_camera() -> np.ndarray:
     return T
 
 
-def test_wrong_times_and_inverted_extrinsics_are_named(street: Path) -> None:
+def test_wrong_times_and_inverted_extrinsics_are_detected(street: Path) -> None:
     tile = on_path(street)
     path = tile.trajectory
     assert path is not None and find_mistake(tile) is None

@@ -1,4 +1,4 @@
-"""Poses and cameras of photos in other conventions: the import with the option gives those of the correct files."""
+"""Poses and cameras of photos in other conventions: the import option converts them to the correct ones."""
 
 from __future__ import annotations
 
@@ -100,6 +100,6 @@ def test_import_with_the_option_gives_the_correct_poses(tmp_path: Path, name: st
     ("name", "value"),
     [("rotations", "both"), ("intrinsics_size", "1242"), ("pose_shift", 0.5), ("photos_crs", "EPSG:1")],
 )
-def test_invalid_option_is_rejected_by_its_name(tmp_path: Path, name: str, value: object) -> None:
+def test_invalid_option_is_rejected_with_its_name(tmp_path: Path, name: str, value: object) -> None:
     with pytest.raises(SettingError, match=name.replace("_", "-")):
         imported(tmp_path, correct(), PhotoConventions.of("", {name: value}), [])

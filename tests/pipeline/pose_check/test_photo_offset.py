@@ -38,7 +38,7 @@ def side(found: list[CameraOffset]) -> CameraOffset:
     return next(one for one in found if "left" in one.photo)
 
 
-def test_errors_of_the_mounting_are_measured(street: Path) -> None:
+def test_mounting_errors_of_a_camera_are_measured(street: Path) -> None:
     correct = measured_offsets(moved(street))
     assert len(correct) == 3 and not any(one.notable or one.warning() for one in correct)
     given = side(correct).right_px or 0.0
@@ -50,7 +50,7 @@ def test_errors_of_the_mounting_are_measured(street: Path) -> None:
         assert found.notable and found.constant and "px right" in str(found.warning())
 
 
-def test_photos_of_another_place_have_no_offset(street: Path) -> None:
+def test_no_offset_is_reported_for_photos_of_another_place(street: Path) -> None:
     tile = read_tile(street)
     away = np.eye(4)
     away[0, 3] = 12.0
@@ -60,7 +60,7 @@ def test_photos_of_another_place_have_no_offset(street: Path) -> None:
     assert any("no offset from the cloud is measurable" in one.text() for one in found)
 
 
-def test_the_result_is_written_beside_the_tile(street: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_result_is_written_next_to_the_tile(street: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         check, "measured_offsets", lambda _: [CameraOffset("a.jpg", 8, 1, 9.0, -2.0, 0.5, 9, 12, True, True)]
     )

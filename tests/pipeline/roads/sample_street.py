@@ -1,4 +1,4 @@
-"""A made-up road: ground in points of the classes, a texture with paint, a driven path."""
+"""A synthetic road: ground points with classes, a texture with lane markings, a driven path."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Street:
         return paint.reshape(x.shape)
 
     def textured(self, folder: Path, paint: bool = True) -> Path:
-        """A flat sheet with its picture, as the step `texture` writes it."""
+        """A flat textured mesh, as the step `texture` writes it."""
         rng = np.random.default_rng(3)
         folder.mkdir(parents=True)
         corners = self.place(np.linspace(-self.length / 2, self.length / 2, 50), np.repeat([-8.0, 8.0], 25))

@@ -1,4 +1,4 @@
-"""Chains of clothoids: arcs and corners are drawn, noise and outliers are not."""
+"""Chains of clothoids follow arcs and corners, and are robust to noise and outliers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def arc(radius: float, length: float, step: float = 0.5) -> np.ndarray:
 
 
 @pytest.mark.parametrize("radius", [60.0, -400.0])
-def test_an_arc_is_found_under_noise_and_outliers(radius: float) -> None:
+def test_arc_is_fitted_in_spite_of_noise_and_outliers(radius: float) -> None:
     rng = np.random.default_rng(0)
     true = arc(radius, 100.0)
     seen = true + rng.normal(0, 0.05, true.shape)
@@ -27,7 +27,7 @@ def test_an_arc_is_found_under_noise_and_outliers(radius: float) -> None:
     assert 1 / np.median(line.curvature) == pytest.approx(radius, rel=0.1)
 
 
-def test_a_corner_is_turned() -> None:
+def test_line_follows_a_corner() -> None:
     bend = arc(8.0, 4 * np.pi, 0.4)
     before, after = np.arange(-30.0, 0.0), np.arange(1.0, 31.0)
     way = np.concatenate([np.column_stack([before, 0 * before]), bend, np.column_stack([0 * after + 8, 8 + after])])
@@ -35,7 +35,7 @@ def test_a_corner_is_turned() -> None:
     assert np.abs(line.locate(way)[1]).max() < 0.3
 
 
-def test_places_are_located_again() -> None:
+def test_locate_inverts_points() -> None:
     line = clothoid.fit(clothoid.approximate(arc(50.0, 80.0)), arc(50.0, 80.0))
     s, t = np.array([-3.0, 0.5, 33.3, 79.0, 90.0]), np.array([1.0, -4.0, 8.0, 0.0, 2.0])
     np.testing.assert_allclose(line.locate(line.points(s, t)), (s, t), atol=1e-3)
@@ -83,11 +83,11 @@ def test_consecutive_paths_are_joined_in_either_direction() -> None:
     assert np.all(np.abs(np.diff(ways[1].way[:, 0])) < 3) and len(np.unique(np.sign(np.diff(ways[1].way[:, 0])))) == 1
     assert len(np.unique(ways[1].stroke)) == 3
     sides = {float(x): side for x, _, side, _ in ways[1].edge}
-    assert len(set(sides.values())) == 2  # one of the three was driven the other way
+    assert len(set(sides.values())) == 2  # one of the three was driven in the other direction
     assert join([]) == []
 
 
-def test_rings_are_opened_and_long_roads_split() -> None:
+def test_ring_roads_are_opened_and_long_roads_split() -> None:
     angle = np.linspace(0, 2 * np.pi, 200)
     ring = 30 * np.column_stack([np.cos(angle), np.sin(angle)])
     assert [len(way.way) for way in join([seen_along(ring[:100]), seen_along(ring[100:])])] == [200]

@@ -1,4 +1,4 @@
-"""Roads as data, against a made-up one that is known: curved, on a slope, painted, with kerbs."""
+"""Step `roads` on a synthetic road: curved, on a slope, with lane markings and kerbs."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
     return run(folder, STREET.inputs(folder))
 
 
-def drawn(done: Done, frame: Frame = STREET.frame) -> list[Road]:
+def built_roads(done: Done, frame: Frame = STREET.frame) -> list[Road]:
     ways = [way.moved(-np.asarray(frame.origin)) for way in observed.load(done.files["seen"])]
     return [road for road in map(model.build_road, observed.join(ways)) if road]
 
@@ -53,7 +53,7 @@ def features(done: Done) -> list[dict[str, Any]]:
     return list(json.loads(done.files["geojson"].read_text(encoding="utf-8"))["features"])
 
 
-def test_lines_lie_where_the_road_has_them(done: Done) -> None:
+def test_lines_are_at_their_true_positions(done: Done) -> None:
     true = {"marking": [STREET.lane, 0.0, -STREET.lane], "edge": [STREET.edge, -STREET.edge], "reference": [0.0]}
     count = dict.fromkeys(true, 0)
     for feature in features(done):
@@ -78,16 +78,16 @@ def test_lines_lie_where_the_road_has_them(done: Done) -> None:
     assert road["width_m"] == pytest.approx(2 * STREET.edge, abs=0.1) and road["notes"] == []
 
 
-def test_lanes_and_slopes_of_the_road(done: Done) -> None:
-    (road,) = drawn(done)
+def test_lanes_and_cross_slopes_are_those_of_the_road(done: Done) -> None:
+    (road,) = built_roads(done)
     assert road.keeps_right and road.reference == "marking"
     (section,) = sections(road)
     assert section.kinds == ("shoulder", "driving", "driving", "shoulder") and section.centre == 2
     assert np.abs([float(fall.at(25.0)) - FALL for fall in road.cross_slopes]).max() < 0.003
 
 
-def test_opendrive_is_whole(done: Done, tmp_path: Path) -> None:
-    roads = drawn(done)
+def test_opendrive_geometry_is_continuous_with_markings_and_lane_widths(done: Done, tmp_path: Path) -> None:
+    roads = built_roads(done)
     assert opendrive.write(tmp_path / "road.xodr", "road", STREET.frame, roads) == 1
     root = ET.parse(tmp_path / "road.xodr").getroot()
     pieces = root.findall("road/planView/geometry")
@@ -104,7 +104,7 @@ def test_opendrive_is_whole(done: Done, tmp_path: Path) -> None:
 
 def test_carla_drives_in_the_true_lanes(done: Done, tmp_path: Path) -> None:
     carla = pytest.importorskip("carla", reason="CARLA's library isn't here (pip install carla==0.9.16)")
-    opendrive.write(tmp_path / "road.xodr", "road", STREET.frame, drawn(done))
+    opendrive.write(tmp_path / "road.xodr", "road", STREET.frame, built_roads(done))
     points = carla.Map("road", (tmp_path / "road.xodr").read_text(encoding="utf-8")).generate_waypoints(1.0)
     places = np.array([(p.transform.location.x, -p.transform.location.y, p.transform.location.z) for p in points])
     s, t = STREET.locate(places[:, :2])
@@ -117,13 +117,13 @@ def test_carla_drives_in_the_true_lanes(done: Done, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:2154", "EPSG:6431"])
-def test_surveyed_points_come_back_from_its_georeference(done: Done, tmp_path: Path, crs: str) -> None:
+def test_georeference_of_opendrive_reproduces_surveyed_points(done: Done, tmp_path: Path, crs: str) -> None:
     from pyproj import CRS, Transformer
 
     unit = CRS(crs).axis_info[0].unit_conversion_factor
     origin = {"EPSG:6431": (950_000.0, 510_000.0, 1600.0)}.get(crs, (690_000.0, 5_335_000.0, 500.0))
     frame = Frame(crs, origin, unit)
-    opendrive.write(tmp_path / "road.xodr", "road", frame, drawn(done))
+    opendrive.write(tmp_path / "road.xodr", "road", frame, built_roads(done))
     header = ET.parse(tmp_path / "road.xodr").getroot().find("header")
     assert header is not None and header.find("offset") is not None
     offset = np.array([float(header.find("offset").attrib[k]) for k in "xyz"])  # type: ignore[union-attr]
@@ -137,7 +137,7 @@ def test_surveyed_points_come_back_from_its_georeference(done: Done, tmp_path: P
 
 def test_unpainted_roads_have_only_edges(tmp_path: Path) -> None:
     done = run(tmp_path, STREET.inputs(tmp_path, paint=False))
-    (road,) = drawn(done)
+    (road,) = built_roads(done)
     assert road.reference == "middle" and not road.markings
     assert [section.kinds for section in sections(road)] == [("bidirectional",)]
     assert {f["properties"]["kind"] for f in features(done)} == {"reference", "edge"}
@@ -147,12 +147,12 @@ def test_unpainted_roads_have_only_edges(tmp_path: Path) -> None:
 def test_edges_are_extracted_without_texture(tmp_path: Path) -> None:
     inputs = STREET.inputs(tmp_path)
     (inputs["textured"] / "mesh.npz").unlink()
-    (road,) = drawn(run(tmp_path, inputs))
+    (road,) = built_roads(run(tmp_path, inputs))
     s = np.linspace(0, road.line.length, 50)
     assert np.abs(STREET.locate(road.line.points(s))[1]).max() < 0.05
 
 
-def test_without_a_kerb_the_road_ends_where_other_ground_begins(tmp_path: Path) -> None:
+def test_edge_without_a_kerb_is_where_the_ground_class_changes(tmp_path: Path) -> None:
     cloud = STREET.cloud()
     _, t = STREET.locate(cloud.xyz[:, :2])
     flat = cloud.xyz.copy()
@@ -188,13 +188,13 @@ def test_missing_road_is_reported_with_its_reason(tmp_path: Path) -> None:
     assert nothing.metrics["none"] == "no point has a road class" and features(nothing) == []
     s, _ = STREET.locate(cloud.xyz[:, :2])
     short = run(tmp_path / "b", STREET.inputs(tmp_path / "b", cloud=cloud.take(np.abs(s) < 0.5)))
-    assert short.metrics["none"] == "no road line was detected" and drawn(short) == []
+    assert short.metrics["none"] == "no road line was detected" and built_roads(short) == []
     empty = run(tmp_path / "c", STREET.inputs(tmp_path / "c", cloud=cloud.take(np.zeros(len(cloud), bool))))
-    assert features(empty) == [] and opendrive.write(tmp_path / "x.xodr", "x", STREET.frame, drawn(empty)) == 0
+    assert features(empty) == [] and opendrive.write(tmp_path / "x.xodr", "x", STREET.frame, built_roads(empty)) == 0
     assert not (tmp_path / "x.xodr").exists()
 
 
-def test_a_road_without_points_of_its_surface_is_left_out_with_a_warning(tmp_path: Path) -> None:
+def test_road_without_surface_points_is_skipped_with_a_warning(tmp_path: Path) -> None:
     cloud = STREET.cloud()
     _, t = STREET.locate(cloud.xyz[:, :2])
     done = run(tmp_path, STREET.inputs(tmp_path, cloud=cloud.take(np.abs(t) > model.MAX_SURFACE_DISTANCE_M + 0.2)))
@@ -207,14 +207,14 @@ def test_a_road_without_points_of_its_surface_is_left_out_with_a_warning(tmp_pat
     assert opendrive_of_scenes.write_roads(scene, tmp_path) == 0
 
 
-def test_a_profile_through_no_points_is_refused() -> None:
+def test_profile_without_points_is_rejected() -> None:
     with pytest.raises(ValueError, match="at least one value"):
         profile.fit(np.linspace(0, 10, 2), np.zeros(0), np.zeros(0), 0.02, 0.05)
     flat = profile.fit(np.linspace(0, 10, 2), np.array([5.0]), np.array([1.5]), 0.02, 0.05)
     assert float(flat.at(5.0)) == pytest.approx(1.5, abs=1e-3)
 
 
-def test_a_tiles_opendrive_is_that_of_its_world(done: Done, tmp_path: Path) -> None:
+def test_opendrive_of_a_tile_equals_that_of_its_world(done: Done, tmp_path: Path) -> None:
     (file,) = done.files["opendrive"].iterdir()
     scene = worlds.scene(tmp_path, STREET.frame, tiles=1)
     (scene.tiles[0].folder / SEEN).write_bytes(done.files["seen"].read_bytes())
@@ -223,7 +223,7 @@ def test_a_tiles_opendrive_is_that_of_its_world(done: Done, tmp_path: Path) -> N
     assert [road.attrib for road in own] == [road.attrib for road in whole]
 
 
-def test_a_road_over_two_tiles_is_one(tmp_path: Path) -> None:
+def test_road_across_two_tiles_is_joined(tmp_path: Path) -> None:
     inputs = STREET.inputs(tmp_path)
     x, y, _ = STREET.frame.origin
     seeds = {"east": (x + 14.0, y), "west": (x - 14.0, y)}
@@ -246,20 +246,20 @@ def test_a_road_over_two_tiles_is_one(tmp_path: Path) -> None:
         assert np.ptp(t) < 0.1
 
 
-def test_a_world_without_lanes_has_no_opendrive(tmp_path: Path) -> None:
+def test_world_without_lanes_has_no_opendrive(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no road of town has detected lanes"):
         world_formats.write(worlds.scene(tmp_path), ["opendrive"], tmp_path / "export", SceneParams(), silent)
 
 
-def test_notes_name_what_is_missing(done: Done) -> None:
-    (road,) = drawn(done)
+def test_notes_report_missing_edges_and_lanes(done: Done) -> None:
+    (road,) = built_roads(done)
     assert "left edge isn't detected" in " ".join(road_geojson.notes(replace(road, left=None)))
     bare = replace(road, left=None, right=None, markings=(), reference="way")
     assert "no lanes" in " ".join(road_geojson.notes(bare)) and sections(bare) == []
 
 
-def test_driving_path_is_the_centre_of_the_own_lane(done: Done) -> None:
-    (road,) = drawn(done)
+def test_driving_path_is_the_centre_of_the_ego_lane(done: Done) -> None:
+    (road,) = built_roads(done)
     for keeps_right, side in ((True, -1), (False, 1)):
         way = course(replace(road, keeps_right=keeps_right))
         s, t = STREET.locate(way.places[:, :2])

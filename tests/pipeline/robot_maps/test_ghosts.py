@@ -32,7 +32,7 @@ VEHICLE = np.concatenate([_box((1 + i, 6, 0.2), (2 + i, 7.7, 1.5), 60) for i in 
 
 
 def _scene(*clusters: F64) -> tuple[F32, Bools, Bools]:
-    """Points, and which of them are floor and wall."""
+    """Points, and masks of floor and wall points."""
     floor = FLOOR[~((FLOOR[:, 0] > 15) & (FLOOR[:, 0] < 19) & (FLOOR[:, 1] > 2) & (FLOOR[:, 1] < 2.8))]
     xyz = np.concatenate([floor, WALL, *clusters]).astype(np.float32)
     index = np.arange(len(xyz))
@@ -52,7 +52,7 @@ def test_trails_are_found_and_standing_clusters_are_not() -> None:
     assert np.isin(true, person.points).mean() > 0.95 and np.isin(person.points, true).mean() > 0.95
 
 
-def test_parked_vehicle_is_no_ghost() -> None:
+def test_parked_vehicle_is_not_a_ghost() -> None:
     xyz, floor, wall = _scene(_box((3, 6, 0.2), (7.5, 7.7, 1.5), 60))  # driven away later: the floor was seen
     assert find_ghosts(xyz, floor, wall, np.zeros(len(xyz), bool), 0.1) == []
 
@@ -74,7 +74,7 @@ def test_maps_without_floor_or_points_have_none(count: int) -> None:
     assert find_ghosts(xyz, ~none, none, none, 0.1) == []
 
 
-def test_step_lists_all_and_removes_the_chosen(tmp_path: Path) -> None:
+def test_step_lists_all_ghosts_and_removes_the_selected_ones(tmp_path: Path) -> None:
     xyz, floor, wall = _scene(PERSON, VEHICLE)
     code = np.full(len(xyz), CODE["furniture"], np.uint8)
     code[floor], code[wall] = CODE["floor"], CODE["wall"]

@@ -54,7 +54,7 @@ def test_semantic_kitti_colours_in_either_channel_order(bgr: bool) -> None:
     assert np.mean(code == truth) > 0.97  # voxels with two classes have either
 
 
-def test_photo_heights_and_grey_levels_are_no_labels() -> None:
+def test_photos_height_ramps_and_grey_levels_are_not_labels() -> None:
     rng = np.random.default_rng(0)
     photo = rng.normal((110, 100, 90), 25, (5000, 3)).clip(0, 255).astype(np.uint8)
     grey = np.repeat(rng.choice([20, 90, 200, 255], 5000)[:, None], 3, axis=1).astype(np.uint8)
@@ -89,7 +89,7 @@ def write_ply(path: Path, xyz: F32, rgb: U8) -> None:
     path.write_bytes(header.encode() + rows.tobytes())
 
 
-def test_legend_of_a_file(tmp_path: Path) -> None:
+def test_legend_is_read_from_a_file(tmp_path: Path) -> None:
     file = tmp_path / "legend.txt"
     file.write_text("# colours of my network\n255,0,0 = road\n0, 255, 0 = vegetation  # trees\n", encoding="utf-8")
     assert parse_legend(read_legend(str(file))) == {(255, 0, 0): CODE["road"], (0, 255, 0): CODE["high_vegetation"]}

@@ -19,7 +19,7 @@ SIZES = {
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
-def test_fills_its_box_and_stands_on_the_ground(category: str) -> None:
+def test_shape_fills_its_box_and_stands_on_the_ground(category: str) -> None:
     size = SIZES[category]
     track = traffic.drive(1, category, size, (0.0, 1.0), 0.0, 0.0, 1.0)  # type: ignore[arg-type]
     found = parts(Actor("one", track).track)

@@ -1,4 +1,4 @@
-"""Scenarios of tracks, what is impossible in them, and their variations."""
+"""Scenarios from tracks, impossible motions in them, and their variations."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ def test_possible_motions_are_not_reported(recorded: Scenario) -> None:
 @pytest.mark.parametrize(
     ("change", "kind"),
     [
-        (lambda poses: poses + (0.0, 3.5 - 0.2, 0.0, 0.0), "overlap"),  # of the car ahead, into the way of the van
+        (lambda poses: poses + (0.0, 3.5 - 0.2, 0.0, 0.0), "overlap"),  # of the car ahead, into the path of the van
         (lambda poses: poses + (0.0, 0.0, 0.15, 0.0), "off the ground"),
         (lambda poses: np.where(np.arange(len(poses))[:, None] > 20, poses + (0.0, -0.4, 0.0, 0.0), poses), "jump"),
     ],
 )
-def test_impossible_motions_are_found(recorded: Scenario, change: object, kind: str) -> None:
+def test_impossible_motions_are_detected(recorded: Scenario, change: object, kind: str) -> None:
     assert callable(change)
     car = recorded.actors[0]
     wrong = replace(car, track=replace(car.track, poses=change(car.track.poses)))
@@ -60,13 +60,13 @@ def test_impossible_motions_are_found(recorded: Scenario, change: object, kind: 
     assert kind in str(found[0])
 
 
-def test_ego_is_in_the_way_at_both_ends(recorded: Scenario) -> None:
+def test_overlap_with_the_ego_waiting_at_its_end_is_detected(recorded: Scenario) -> None:
     behind = traffic.drive(9, "car", (4.2, 1.8, 1.5), (5.0, 100.0), -1.75, 20.0, 15.0)
     found = impossible_motions(from_tracks("street", [*traffic.tracks(), behind]))
     assert [one.actors for one in found if one.kind == "overlap"] == [("ego", "car_9")]
 
 
-def test_room_in_the_lane() -> None:
+def test_lane_room_is_measured_on_both_sides() -> None:
     road = traffic.road()
     van = traffic.tracks()[2]
     room = lane_room([road], van)
@@ -76,7 +76,7 @@ def test_room_in_the_lane() -> None:
     assert lane_room([road], across) is None
 
 
-def test_variations_are_possible_stay_in_their_lanes_and_differ(recorded: Scenario) -> None:
+def test_variations_are_possible_in_their_lanes_and_different(recorded: Scenario) -> None:
     roads = [traffic.road()]
     made = [vary(recorded, roads, 7, number) for number in range(1, 41)]
     in_lane = {
@@ -106,7 +106,7 @@ def test_variations_are_possible_stay_in_their_lanes_and_differ(recorded: Scenar
     assert len({str(one.changes) for one in made}) > 30
 
 
-def test_the_same_seed_gives_the_same_variation(recorded: Scenario) -> None:
+def test_variation_is_reproducible_by_seed(recorded: Scenario) -> None:
     first, again = (vary(recorded, [traffic.road()], 3, 5) for _ in range(2))
     assert first.changes == again.changes
     assert all(

@@ -1,4 +1,4 @@
-"""What bodies collide with, by class."""
+"""Collision shapes by class."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_each_class_has_its_mesh_and_friction_and_trunks_are_cylinders() -> None
     assert sum(map(len, shapes)) == len(ground)
 
 
-def test_a_mesh_without_classes_is_paved_ground() -> None:
+def test_mesh_without_classes_is_paved_ground() -> None:
     (one,) = solids(replace(synthetic.ground(4), uv=None, page=None), 0.8)
     assert one.name == "ground" and one.friction == 0.8
     assert solids(synthetic.ground(4).keep(np.zeros(32, bool)), 0.8) == []

@@ -1,4 +1,4 @@
-"""Friction by the ground's class."""
+"""Friction by class of the ground."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def test_soil_is_slipperier_than_asphalt() -> None:
     assert coefficient(CODE["terrain"], GROUND) == 0.68
 
 
-def test_a_wet_road_scales_all() -> None:
+def test_wetness_scales_all_frictions() -> None:
     assert coefficient(CODE["road"], GROUND, 0.45) == 0.45
     assert coefficient(CODE["terrain"], GROUND, 0.45) == 0.34
 

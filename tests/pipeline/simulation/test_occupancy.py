@@ -32,7 +32,7 @@ def joined(*meshes: Mesh) -> Mesh:
 
 
 def agreement(storey: Storey, building: Building, k: int) -> tuple[float, float]:
-    """IoU of the free space with the true one of storey `k`, and the share of it that isn't truly free."""
+    """IoU of the free space with the true one of storey `k`, and its share of falsely free cells."""
     truth = building.free_space(k, low=0.1, high=0.6)
     true = truth.at(storey.grid.centres(np.arange(storey.occupancy.size)))
     found = storey.free.ravel()
@@ -41,7 +41,7 @@ def agreement(storey: Storey, building: Building, k: int) -> tuple[float, float]
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("with_path", [True, False])
-def test_free_space_of_a_building(seed: int, with_path: bool) -> None:
+def test_free_space_of_a_building_is_correct(seed: int, with_path: bool) -> None:
     building = build(seed, Style(rooms=3))
     path = building.routes[0] + (0, 0, 0.5) if with_path else NOWHERE
     (storey,) = storeys(building.mesh, path)
@@ -57,7 +57,7 @@ def test_orientation_of_the_faces_does_not_matter() -> None:
     assert agreement(storey, building, 0)[0] > 0.9
 
 
-def test_each_storey_has_a_map_that_of_the_start_first() -> None:
+def test_each_storey_has_a_map_with_that_of_the_start_first() -> None:
     building = build(2, Style(storeys=2, stairs=True))
     upper = building.routes[0][building.routes[0][:, 2] > building.floors[1] - 0.01] + (0, 0, 0.5)
     found = storeys(building.mesh, upper)
@@ -66,7 +66,7 @@ def test_each_storey_has_a_map_that_of_the_start_first() -> None:
         assert agreement(one, building, k)[0] > 0.92
 
 
-def test_what_is_outside_the_height_band_is_no_obstacle() -> None:
+def test_surfaces_outside_the_height_band_are_not_obstacles() -> None:
     floor = box((0, 0, -0.1), (6, 4, 0))
     low, beam, post = box((1, 1, 0), (1.5, 1.5, 0.05)), box((2, 0, 1), (2.2, 4, 1.2)), box((3.98, 2, 0), (4.2, 2.2, 1))
     (storey,) = storeys(joined(floor, low, beam, post), np.array([[0.5, 0.5, 0.5]]))
@@ -106,7 +106,7 @@ def test_sloping_ground_is_floor_and_its_walls_are_obstacles() -> None:
     assert np.hypot(*start.angles[:2]) == pytest.approx(np.arctan(0.1), abs=0.01)
 
 
-def test_where_the_floor_ends_without_a_wall_it_is_not_free() -> None:
+def test_cells_near_a_floor_edge_without_a_wall_are_not_free() -> None:
     floor, wall = box((0.02, 0.02, -0.1), (3.98, 2.98, 0)), box((0.02, 0.02, 0), (0.1, 2.98, 1))
     (storey,) = storeys(joined(floor, wall), np.array([[1.0, 1.0, 0.5]]))
     centre = storey.grid.centres(np.flatnonzero(storey.free))
@@ -133,7 +133,7 @@ def test_only_ground_is_floor_if_it_is_known() -> None:
     assert np.nanmax(storeys(mesh, NOWHERE)[0].floor) == pytest.approx(0.05)
 
 
-def test_walls_alone_have_no_floor() -> None:
+def test_walls_without_a_floor_are_an_error() -> None:
     building = build(0, Style(rooms=2))
     with pytest.raises(DataError, match="floor"):
         storeys(building.only(Surface.WALL).keep(np.abs(building.only(Surface.WALL).face_normal[:, 2]) < 0.5), NOWHERE)

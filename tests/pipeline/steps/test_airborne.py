@@ -51,7 +51,7 @@ def within(xy: np.ndarray, box: tuple[float, ...]) -> np.ndarray:
 
 
 def scanned(name: str, rgb: tuple[int, int, int], seed: int = 0) -> PointCloud:
-    """What of the class is seen from above: about 16 points a square metre, with 2 cm of noise."""
+    """Points of a class seen from above: about 16 per square metre, with 2 cm of noise."""
     random = np.random.default_rng(seed)
     xy = random.uniform(-15, 15, (16 * 900, 2))
     z = floor(xy)
@@ -66,7 +66,7 @@ def scanned(name: str, rgb: tuple[int, int, int], seed: int = 0) -> PointCloud:
 
 @pytest.fixture(scope="module")
 def house(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Voxels of ground and roofs, and what is synthesized from both."""
+    """Voxels of ground and roofs, and the ground and walls synthesized from them."""
     out = tmp_path_factory.mktemp("house")
     files: dict[str, Path] = {}
     for part in ("terrain", "building"):
@@ -117,7 +117,7 @@ def test_walls_are_at_their_true_positions(house: dict[str, Path]) -> None:
     assert (outward[~between] > 0).all() and (made.normal[between][:, 0] > 0.9).all()
 
 
-def test_the_house_is_closed_and_the_roof_stays(house: dict[str, Path], tmp_path: Path) -> None:
+def test_surface_of_the_house_is_closed_and_keeps_its_roof(house: dict[str, Path], tmp_path: Path) -> None:
     borne = {"cloud": house["building"], "synthesized": house["walls"]}
     raw = go(POISSON, tmp_path / "poisson", borne).files["mesh"]
 
@@ -132,7 +132,7 @@ def test_the_house_is_closed_and_the_roof_stays(house: dict[str, Path], tmp_path
     assert distances(np.array(inside, np.float32), mesh).min() > 1.0
 
 
-def test_walls_that_were_seen_are_left_alone(house: dict[str, Path], tmp_path: Path) -> None:
+def test_scanned_walls_are_not_synthesized(house: dict[str, Path], tmp_path: Path) -> None:
     building = PointCloud.load(house["building"])
     y, z = (a.ravel() for a in np.meshgrid(np.arange(-4, 4, 0.25), np.arange(-0.2, 6, 0.25)))
     seen = np.column_stack([np.full(len(y), -6.0), y, z]).astype(np.float32)
@@ -185,7 +185,7 @@ def geopackage(path: Path, ring: np.ndarray, code: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["degrees", "geojson", "gpkg", "gpkg of degrees"])
-def test_footprints_come_to_the_tiles_coordinates(kind: str, tmp_path: Path) -> None:
+def test_footprints_are_converted_to_tile_coordinates(kind: str, tmp_path: Path) -> None:
     from pyproj import Transformer
 
     ring = np.array([(0.0, 0.0), (0.0, 8.0), (12.0, 8.0), (12.0, 0.0), (0.0, 0.0)]) + FRAME.origin[:2]  # clockwise
@@ -208,14 +208,14 @@ def test_footprints_come_to_the_tiles_coordinates(kind: str, tmp_path: Path) -> 
      ("a.shp", b""), ("a.geojson", b'{"type": "Polygon", "coordinates": [[[1, "x"]]]}'),
      ("a.geojson", b'{"type": "Polygon", "coordinates": [[[1' + 400 * b"0" + b", 2]]]}")],
 )  # fmt: skip
-def test_bad_footprints_are_named(name: str, content: bytes, tmp_path: Path) -> None:
+def test_invalid_footprints_are_rejected(name: str, content: bytes, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=name):
         footprints.read(tmp_path / name, FRAME)
 
 
-def test_neighbours_fill_a_hole_on_their_border_alike(house: dict[str, Path], tmp_path: Path) -> None:
-    """The house stands on the border; each tile's cloud reaches 2 m beyond it only."""
+def test_neighbours_fill_a_hole_on_their_border_identically(house: dict[str, Path], tmp_path: Path) -> None:
+    """The house stands on the border; the cloud of each tile extends only 2 m beyond it."""
     seeds = {"a": (499_990.0, 5_400_000.0), "b": (500_010.0, 5_400_000.0)}
     made = {}
     for own, other in (("a", "b"), ("b", "a")):
@@ -238,7 +238,7 @@ def test_neighbours_fill_a_hole_on_their_border_alike(house: dict[str, Path], tm
 def test_only_airborne_clouds_are_completed(tmp_path: Path) -> None:
     tile = read_tile(SAMPLE)
     tasks = {task.step.name: task for task in build_graph(tile, Settings())}
-    assert "walls" not in tasks and "instances" in tasks["ground"].inputs  # a street's: what vehicles hid
+    assert "walls" not in tasks and "instances" in tasks["ground"].inputs  # of a street with vehicles
 
     bare = replace(tile, views=(), trajectory=None)
     assert {"ground", "walls"} <= {task.step.name for task in build_graph(bare, Settings())}

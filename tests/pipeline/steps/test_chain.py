@@ -1,4 +1,4 @@
-"""The geometry steps, each against what is known of a made-up cloud."""
+"""Geometry steps on synthetic clouds."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def go(step: Step, out: Path, inputs: dict[str, Path], **params: Any) -> Done:
 
 
 def bumpy(n: int = 120_000, size: float = 12.0, seed: int = 0) -> PointCloud:
-    """A gently waving ground of `size` metres square, scanned with 5 mm of noise."""
+    """A gently undulating ground of `size` metres square, scanned with 5 mm of noise."""
     random = np.random.default_rng(seed)
     xy = random.uniform(-size / 2, size / 2, (n, 2))
     z = 0.3 * np.sin(xy[:, 0]) * np.cos(xy[:, 1]) + random.normal(0, 0.005, n)
@@ -48,7 +48,7 @@ def bumpy(n: int = 120_000, size: float = 12.0, seed: int = 0) -> PointCloud:
 
 @pytest.fixture(scope="module")
 def ground(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Voxels and Poisson's mesh of the bumpy ground."""
+    """Voxels and Poisson mesh of the bumpy ground."""
     out = tmp_path_factory.mktemp("ground")
     bumpy().save(out / "cloud.npz")
     cloud = go(VOXEL, out / "voxel", {"cloud": out / "cloud.npz"}).files["cloud"]
@@ -74,13 +74,13 @@ def test_ingest_keeps_millimetres_at_utm_coordinates(tmp_path: Path) -> None:
     assert read.rgb is not None and cloud.rgb is not None and (read.rgb == cloud.rgb).all()
 
 
-def test_ingest_refuses_fifty_points(tmp_path: Path) -> None:
+def test_ingest_rejects_too_few_points(tmp_path: Path) -> None:
     las.write(tmp_path / "few.laz", bumpy(50))
     with pytest.raises(DataError, match=r"few\.laz: only 50 points"):
         go(INGEST, tmp_path / "out", {"cloud.0": tmp_path / "few.laz"}, crs=FRAME.crs, origin=FRAME.origin)
 
 
-def test_split_puts_signs_with_buildings_and_leaves_vehicles_out(tmp_path: Path) -> None:
+def test_split_groups_signs_with_buildings_and_omits_vehicles(tmp_path: Path) -> None:
     cloud = bumpy(700)
     names = ("road", "terrain", "building", "road_sign", "high_vegetation", "vehicle", "unclassified")
     classification = np.repeat([CODE[n] for n in names], 100).astype(np.uint8)
@@ -89,7 +89,7 @@ def test_split_puts_signs_with_buildings_and_leaves_vehicles_out(tmp_path: Path)
     assert done.metrics["points"] == {"terrain": 200, "building": 200, "vegetation": 100, "rest": 200}
 
 
-def test_split_warns_of_an_empty_class_and_refuses_when_all_are(tmp_path: Path) -> None:
+def test_split_warns_of_empty_classes_and_rejects_a_cloud_without_any(tmp_path: Path) -> None:
     bumpy(300).save(tmp_path / "cloud.npz")
     done = go(SPLIT, tmp_path / "out", {"cloud": tmp_path / "cloud.npz"})
     assert any("building" in w for w in done.warnings)
@@ -98,7 +98,7 @@ def test_split_warns_of_an_empty_class_and_refuses_when_all_are(tmp_path: Path) 
         go(SPLIT, tmp_path / "out2", {"cloud": tmp_path / "cars.npz"})
 
 
-def test_voxel_matches_a_plain_implementation() -> None:
+def test_voxel_equals_a_reference_implementation() -> None:
     cloud = bumpy(3000)
     thin = sample(cloud, 0.5)
     cells: dict[tuple[int, ...], list[int]] = {}
@@ -109,7 +109,7 @@ def test_voxel_matches_a_plain_implementation() -> None:
     assert np.abs(thin.xyz - expected).max() < 1e-3
 
 
-def test_normals_point_to_the_scanner_even_under_a_bridge(tmp_path: Path) -> None:
+def test_normals_point_to_the_scanner_also_under_a_bridge(tmp_path: Path) -> None:
     floor = bumpy(20_000)
     ceiling = replace(floor, xyz=floor.xyz + np.array([0, 0, 4], np.float32))
     PointCloud.join([floor, ceiling]).save(tmp_path / "cloud.npz")
@@ -136,7 +136,7 @@ def test_normals_of_an_airborne_cloud_point_up_and_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("length", [30.0, 100.0, 330.0, 1000.0])
-def test_octree_cell_is_the_same_at_any_length(length: float) -> None:
+def test_octree_cell_size_is_independent_of_the_extent(length: float) -> None:
     depth, scale = octree(length, 0.05)
     assert scale >= 1.02
     assert scale * length / 2**depth == pytest.approx(0.05)
@@ -148,13 +148,13 @@ def test_poisson_follows_the_ground(ground: dict[str, Path]) -> None:
     assert distances(cloud.xyz, mesh).mean() < 0.01
 
 
-def test_poisson_repeats_bit_for_bit(ground: dict[str, Path], tmp_path: Path) -> None:
+def test_poisson_is_deterministic(ground: dict[str, Path], tmp_path: Path) -> None:
     again = Mesh.load(go(POISSON, tmp_path, {"cloud": ground["cloud"]}).files["mesh"])
     once = Mesh.load(ground["mesh"])
     assert (again.vertices == once.vertices).all() and (again.faces == once.faces).all()
 
 
-def test_poisson_falls_back_when_the_child_dies(
+def test_poisson_falls_back_to_a_lower_depth_after_crashes(
     ground: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = []
@@ -172,14 +172,14 @@ def test_poisson_falls_back_when_the_child_dies(
     assert done.metrics["depth"] == 7 and len(done.warnings) == 2
 
 
-def test_trim_removes_what_no_point_bears_out(ground: dict[str, Path], tmp_path: Path) -> None:
+def test_trim_removes_faces_without_supporting_points(ground: dict[str, Path], tmp_path: Path) -> None:
     done = go(TRIM, tmp_path, ground, max_edge=0.25)
     mesh, cloud = Mesh.load(done.files["mesh"]), PointCloud.load(ground["cloud"])
     side = np.linalg.norm(mesh.corners - np.roll(mesh.corners, 1, axis=1), axis=2)
     assert side.max() <= 0.25 * done.metrics["widened"] + 1e-6
     low, high = cloud.xyz.min(axis=0) - 0.3, cloud.xyz.max(axis=0) + 0.3
     assert ((mesh.vertices >= low) & (mesh.vertices <= high)).all()
-    assert 12**2 <= mesh.face_area.sum() <= 12.5**2 * 1.03  # waves make it 2 to 3 % larger than its plan
+    assert 12**2 <= mesh.face_area.sum() <= 12.5**2 * 1.03  # undulation increases the area by 2 to 3 %
 
 
 def test_small_islands_are_removed(tmp_path: Path) -> None:
@@ -192,23 +192,23 @@ def test_small_islands_are_removed(tmp_path: Path) -> None:
     assert done.metrics["islands_removed"] == 1
 
 
-def test_decimate_keeps_the_border_and_turns_no_face_over(ground: dict[str, Path], tmp_path: Path) -> None:
+def test_decimate_keeps_the_border_and_flips_no_face(ground: dict[str, Path], tmp_path: Path) -> None:
     trimmed = go(TRIM, tmp_path / "trim", ground, max_edge=0.5)
     full = Mesh.load(trimmed.files["mesh"])
     done = go(DECIMATE, tmp_path / "out", {"mesh": trimmed.files["mesh"]}, target=10_000)
     small = Mesh.load(done.files["mesh"])
     assert len(small) <= 10_000 and done.metrics["border_kept"]
-    assert edges(small)[0] == edges(full)[0], "border edges are kept, and no new ones torn"
+    assert edges(small)[0] == edges(full)[0], "border edges are kept, and no new ones created"
     assert edges(small)[1] == 0
     assert (small.face_normal[small.face_area > 1e-6, 2] > -0.01).all()
     assert distances(full.vertices, small).mean() < 0.01
 
 
-def test_decimate_reaches_its_target_even_where_borders_are_long() -> None:
+def test_faces_with_only_border_edges_are_not_decimated() -> None:
     random = np.random.default_rng(0)
     corners = random.uniform(0, 50, (30_000, 1, 3)) + random.uniform(-0.1, 0.1, (30_000, 3, 3))
     mesh = Mesh(FRAME, corners.reshape(-1, 3).astype(np.float32), np.arange(90_000, dtype=np.int32).reshape(-1, 3))
-    assert len(simplify(mesh, 10_000)) == 30_000  # nothing but borders
+    assert len(simplify(mesh, 10_000)) == 30_000  # all edges are borders
 
 
 def test_plants_are_detected_at_their_positions(tmp_path: Path) -> None:

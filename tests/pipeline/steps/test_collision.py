@@ -1,4 +1,4 @@
-"""Collision: light, close to what is seen, and honest about it."""
+"""Collision meshes: triangle limit, deviation from the visual surface, solid classes."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ def test_triangle_limit_is_met_and_deviation_reported(tmp_path: Path) -> None:
     assert len(mesh) <= 1000 and mesh.uv is None and mesh.frame == synthetic.UTM
     deviation = done.metrics["deviation_m"]
     assert 0 < deviation["mean"] <= deviation["p95"] <= deviation["max"] < 0.05
-    # the reported figure bears a check by the surface's formula
+    # the reported deviation agrees with the formula of the surface
     gap = np.abs(mesh.vertices[:, 2] - synthetic.height(mesh.vertices[:, 0], mesh.vertices[:, 1]))
     on_ground = (mesh.vertices[:, 2] < 0.4) & ~_in_house(mesh.vertices)
     assert np.percentile(gap[on_ground], 95) < 0.03
 
 
-def test_the_house_keeps_its_shape(tmp_path: Path) -> None:
+def test_collision_mesh_of_the_house_keeps_its_height(tmp_path: Path) -> None:
     mesh, _ = _run(tmp_path, {"terrain": synthetic.ground(100), "building": synthetic.house()}, triangles=500)
     inside = _in_house(mesh.vertices)
     assert mesh.vertices[inside, 2].max() == pytest.approx(4.5, abs=0.01)
 
 
 def test_modelled_boxes_are_not_simplified(tmp_path: Path) -> None:
-    """Simplified, small furniture would no longer be what occupancy maps and simulators take it for."""
+    """Simplification would change the shape of small furniture in occupancy maps and simulators."""
     made = [Box(0.3 * i, np.array([i, 0, 0.0]), np.array([i + 0.2, 0.2, 0.3])) for i in range(40)]
     vertices, faces = mesh_of(made)
     furniture = Mesh(synthetic.UTM, vertices, faces)
@@ -55,20 +55,20 @@ def test_modelled_boxes_are_not_simplified(tmp_path: Path) -> None:
     assert np.count_nonzero(mesh.classification == CODE["furniture"]) == len(furniture)
 
 
-def test_a_surface_in_crumbs_keeps_to_the_budget_too(tmp_path: Path) -> None:
+def test_fragmented_surface_meets_the_triangle_limit(tmp_path: Path) -> None:
     ground = synthetic.ground(40)
     patches = ground.keep(np.arange(len(ground)) % 3 == 0)  # nearly all of its edges are open
     mesh, done = _run(tmp_path, {"terrain": patches}, triangles=300)
     assert 100 < len(mesh) <= 300 and not done.warnings
 
 
-def test_plants_are_solid_only_when_asked(tmp_path: Path) -> None:
+def test_plants_are_solid_only_on_request(tmp_path: Path) -> None:
     meshes = {"terrain": synthetic.ground(10), "vegetation": synthetic.house()}
     assert _run(tmp_path, meshes)[0].vertices[:, 2].max() < 1
     assert _run(tmp_path, meshes, vegetation=True)[0].vertices[:, 2].max() > 4
 
 
-def test_plants_are_solid_where_nothing_else_is(tmp_path: Path) -> None:
+def test_plants_are_solid_without_other_surfaces(tmp_path: Path) -> None:
     mesh, done = _run(tmp_path, {"terrain": NONE, "building": NONE, "vegetation": synthetic.house()})
     assert mesh.vertices[:, 2].max() > 4 and "plants are solid" in done.warnings[0]
     assert mesh.classification is not None and set(mesh.classification.tolist()) == {CODE["high_vegetation"]}
@@ -79,7 +79,7 @@ def test_world_without_solid_surfaces_is_rejected(tmp_path: Path) -> None:
         _run(tmp_path, {"terrain": NONE, "vegetation": NONE})
 
 
-def test_points_of_the_ground_that_make_no_surface_do_no_harm(tmp_path: Path) -> None:
+def test_ground_points_without_a_surface_are_accepted(tmp_path: Path) -> None:
     few = synthetic.ground(3).vertices
     PointCloud(synthetic.UTM, few, classification=np.full(len(few), CODE["road"], np.uint8)).save(
         tmp_path / "cloud.npz"

@@ -1,4 +1,4 @@
-"""Export: a world's folder that a user can open, move and trust."""
+"""Export: files and metadata of a world's folder."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _inputs(folder: Path, **meshes: Mesh) -> dict[str, Path]:
     return {group: synthetic.textured(folder / group, mesh) for group, mesh in meshes.items()} | {"collision": solid}
 
 
-def test_layout(tmp_path: Path) -> None:
+def test_world_folder_contains_the_documented_files(tmp_path: Path) -> None:
     world = synthetic.world(tmp_path).files["world"]
     meshes = "models/street/meshes"
     groups = {
@@ -53,7 +53,7 @@ def test_layout(tmp_path: Path) -> None:
     }
 
 
-def test_model_names_files_that_exist(tmp_path: Path) -> None:
+def test_model_refers_to_existing_files(tmp_path: Path) -> None:
     world = synthetic.world(tmp_path, friction=0.7).files["world"]
     model = present(ET.parse(world / "models/street/model.sdf").getroot().find("model"))
     assert model.findtext("static") == "true"
@@ -69,7 +69,7 @@ def test_model_names_files_that_exist(tmp_path: Path) -> None:
     assert config.findtext("name") == "street" and config.findtext("sdf") == "model.sdf"
 
 
-def test_a_large_group_is_split_and_nothing_is_lost(tmp_path: Path) -> None:
+def test_large_group_is_split_without_losing_triangles(tmp_path: Path) -> None:
     world = synthetic.world(tmp_path, max_visual_triangles=1000).files["world"]
     counts = json.loads((world / "metadata.json").read_text(encoding="utf-8"))["triangles_by_file"]
     for suffix in (".obj", ".dae"):
@@ -81,7 +81,7 @@ def test_a_large_group_is_split_and_nothing_is_lost(tmp_path: Path) -> None:
     assert len(list(world.rglob("terrain_*.png"))) == 2  # pages are shared by the parts
 
 
-def test_metadata_puts_the_tile_on_the_map(tmp_path: Path) -> None:
+def test_metadata_contains_the_georeference(tmp_path: Path) -> None:
     world = synthetic.world(tmp_path).files["world"]
     metadata = json.loads((world / "metadata.json").read_text(encoding="utf-8"))
     assert metadata["crs"] == "EPSG:32632" and metadata["unit_m"] == 1.0
@@ -92,7 +92,7 @@ def test_metadata_puts_the_tile_on_the_map(tmp_path: Path) -> None:
     assert metadata["groups"]["building"]["high_m"] == [7.0, 4.0, 4.5]
 
 
-def test_tiles_share_a_georeference_through_the_pose_alone(tmp_path: Path) -> None:
+def test_tiles_share_a_georeference_by_the_model_pose_alone(tmp_path: Path) -> None:
     x, y, z = synthetic.UTM.origin
     alone = synthetic.world(tmp_path / "a").files["world"]
     placed = synthetic.world(tmp_path / "b", world_origin=(x - 100, y + 50, z)).files["world"]
@@ -106,14 +106,14 @@ def test_tiles_share_a_georeference_through_the_pose_alone(tmp_path: Path) -> No
     assert latitude[1] > latitude[0]
 
 
-def test_a_local_tile_has_no_georeference(tmp_path: Path) -> None:
+def test_local_tile_has_no_georeference(tmp_path: Path) -> None:
     world = synthetic.world(tmp_path, frame=Frame()).files["world"]
     assert "spherical_coordinates" not in (world / "street.sdf").read_text(encoding="utf-8")
     metadata = json.loads((world / "metadata.json").read_text(encoding="utf-8"))
     assert metadata["crs"] == "local" and metadata["wgs84"] is None
 
 
-def test_formats_are_chosen(tmp_path: Path) -> None:
+def test_only_selected_formats_are_written(tmp_path: Path) -> None:
     world = synthetic.world(tmp_path, formats=("gazebo",), meshes=("collada",)).files["world"]
     assert not list(world.rglob("*.glb")) and all(p.name.startswith("collision_") for p in world.rglob("*.obj"))
     assert "terrain.dae" in (world / "models/street/model.sdf").read_text(encoding="utf-8")
@@ -121,7 +121,7 @@ def test_formats_are_chosen(tmp_path: Path) -> None:
         EXPORT.run({}, ExportParams(meshes=()), tmp_path, silent)
 
 
-def test_an_empty_group_is_left_out_and_nothing_at_all_is_refused(tmp_path: Path) -> None:
+def test_empty_group_is_omitted_and_empty_world_rejected(tmp_path: Path) -> None:
     house = synthetic.house()
     none = replace(house, faces=house.faces[:0], uv=None, page=None)
     inputs = _inputs(tmp_path, terrain=none, building=house)
@@ -132,7 +132,7 @@ def test_an_empty_group_is_left_out_and_nothing_at_all_is_refused(tmp_path: Path
         EXPORT.run(inputs, ExportParams(), tmp_path / "none", silent)
 
 
-def test_lists_of_plants_are_put_beside_the_world(tmp_path: Path) -> None:
+def test_lists_of_plants_are_copied_to_the_world(tmp_path: Path) -> None:
     inputs = _inputs(tmp_path, building=synthetic.house())
     for key, file in {"plants": "a.geojson", "plants_csv": "b.csv"}.items():
         inputs[key] = tmp_path / file
@@ -156,13 +156,13 @@ def test_inconsistent_inputs_are_rejected(tmp_path: Path) -> None:
         EXPORT.run(inputs, ExportParams(), tmp_path / "c", silent)
 
 
-def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
+def test_export_is_deterministic(tmp_path: Path) -> None:
     a, b = (synthetic.world(tmp_path / name).files["world"] for name in "ab")
-    for file in _files(a) - {f for f in _files(a) if f.endswith(".dae")}:  # Collada says when it was written
+    for file in _files(a) - {f for f in _files(a) if f.endswith(".dae")}:  # Collada contains the time of writing
         assert (a / file).read_bytes() == (b / file).read_bytes(), file
 
 
-def test_pictures_are_copied_as_they_are(tmp_path: Path) -> None:
+def test_texture_pages_are_copied_unchanged(tmp_path: Path) -> None:
     world = synthetic.world(tmp_path).files["world"]
     for page in (0, 1):
         copy = world / f"models/street/meshes/terrain_{page}.png"
@@ -170,7 +170,7 @@ def test_pictures_are_copied_as_they_are(tmp_path: Path) -> None:
         assert copy.stat().st_ino != (tmp_path / f"terrain/page_{page}.png").stat().st_ino  # may be edited freely
 
 
-def test_pages_as_jpeg(tmp_path: Path) -> None:
+def test_texture_pages_are_converted_to_jpeg(tmp_path: Path) -> None:
     world = synthetic.world(tmp_path, pages="jpeg").files["world"]
     meshes = world / "models/street/meshes"
     assert not list(meshes.glob("*.png"))

@@ -1,4 +1,4 @@
-"""Facades: a wall of which the scanner saw the lower part, against the wall that photos show."""
+"""Facades: a wall whose lower part was scanned is extended to the height that photos show."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from scan2sim.pipeline.steps.voxel import VOXEL
 
 SAMPLE = Path(__file__).resolve().parents[3] / "data_samples" / "tile"
 FRAME = Frame("local", (100.0, 200.0, 30.0))
-WALL, LONG, BEHIND = 7.0, 12.0, 16.0  # metres: where the wall stands (y), how long it is (x from 0), another behind it
-EYE, LOW = 1.7, np.radians(2.0)  # height of scanner and cameras, and the elevation that the scanner's rays end at
+WALL, LONG, BEHIND = 7.0, 12.0, 16.0  # metres: y of the wall, its length (x from 0), y of another wall behind it
+EYE, LOW = 1.7, np.radians(2.0)  # height of scanner and cameras, and maximum elevation of the scanner's rays
 CAMERA = Camera("pinhole", 480, 360, 240.0, 240.0, 239.5, 259.5)
 PATH = Trajectory(np.array([0.0, 10.0]), np.array([[-6.0, 0.0, EYE], [18.0, 0.0, EYE]]))
 
@@ -39,14 +39,14 @@ class Scene:
 
 
 def pattern(x: F64, z: F64, seed: int) -> F64:
-    """Grey levels at places of a wall: noise of 8 cm, smoothed."""
+    """Grey levels at positions on a wall: smoothed noise of 8 cm."""
     noise = cv2.GaussianBlur(np.random.default_rng(seed).uniform(0, 255, (400, 800)), (0, 0), 1.0)
     row, column = np.floor(z / 0.04).astype(int) % 400, np.floor(x / 0.04).astype(int) % 800
     return 128 + 2.5 * (noise[row, column] - 128)
 
 
 def photo(place: F64, scene: Scene) -> np.ndarray:
-    """What a camera at a place sees, looking along y: the wall, the other behind it, sky or ground."""
+    """Image of a camera at a position, looking along y: the wall, the other one behind it, sky, ground."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     ray = unproject(CAMERA, np.column_stack([u.ravel(), v.ravel()]))[:, [0, 2, 1]] * (1, 1, -1)
     grey = np.where(ray[:, 2] > 0, 235 - 60 * ray[:, 2], 90.0)
@@ -61,7 +61,7 @@ def photo(place: F64, scene: Scene) -> np.ndarray:
 
 
 def scanned(x: F64, y: float, z: F64, turns: int = 30) -> tuple[F64, F64]:
-    """Points of places that the scanner's rays reach, and when."""
+    """Positions within the elevation limit of the scanner's rays, and their times."""
     times = np.random.default_rng(4).integers(0, turns, len(x)) / turns * 10
     away = np.hypot(x - PATH.at(times)[:, 0], y)
     seen = z < EYE + away * np.tan(LOW)
@@ -79,7 +79,7 @@ def wall(height: float, hole: tuple[float, float, float, float] | None = None, d
     return scanned(x, WALL, z)
 
 
-def built(
+def run_step(
     folder: Path, points: tuple[F64, F64], scene: Scene, others: tuple[F64, F64] | None = None
 ) -> tuple[PointCloud, Done]:
     """Points that the step synthesizes from a scan and photos."""
@@ -87,7 +87,7 @@ def built(
     random, files = np.random.default_rng(6), {}
     x, y = (random.uniform(-15, 25, 60_000), random.uniform(-5, 6, 60_000))
     ground = np.column_stack([x, y, np.zeros(len(x))]), random.uniform(0, 10, len(x))
-    trees = [scanned(random.uniform(-40, 50, 60_000), -15.0, random.uniform(0, 8, 60_000))]  # show how high rays go
+    trees = [scanned(random.uniform(-40, 50, 60_000), -15.0, random.uniform(0, 8, 60_000))]  # give the elevation limit
     trees += [scanned(random.uniform(x, x + 40, 40_000), 8.0, random.uniform(0, 8, 40_000)) for x in (-60, 32)]
     across = np.concatenate([xyz for xyz, _ in trees]), np.concatenate([time for _, time in trees])
     parts = {"building": points, "terrain": ground, "vegetation": across}
@@ -123,56 +123,56 @@ def tops(made: PointCloud) -> F64:
 @pytest.mark.parametrize("height", [3.4, 5.0])
 @pytest.mark.parametrize("behind", [0.0, 9.0])
 def test_wall_is_extended_to_its_top_in_photos(tmp_path: Path, height: float, behind: float) -> None:
-    made, done = built(tmp_path, wall(height), Scene(height, behind))
+    made, done = run_step(tmp_path, wall(height), Scene(height, behind))
     assert np.abs(tops(made)[1:-1] - height).max() < 0.3
     assert np.ptp(tops(made)[1:-1]) < 0.25, "its top is no straight line"
     assert np.abs(made.xyz[:, 1] - WALL).max() < 0.03
-    assert made.xyz[:, 0].min() > -0.1 and made.xyz[:, 0].max() < LONG + 0.1, "it extends beyond its ends"
+    assert made.xyz[:, 0].min() > -0.1 and made.xyz[:, 0].max() < LONG + 0.1, "it extends beyond the ends of the wall"
     assert done.metrics["above_m2"] > 0.5 * LONG * (height - 2.0)
 
 
 def test_plain_wall_is_extended_while_its_appearance_continues(tmp_path: Path) -> None:
-    made, _ = built(tmp_path, wall(4.0), Scene(4.0, plain=True))
+    made, _ = run_step(tmp_path, wall(4.0), Scene(4.0, plain=True))
     assert np.median(tops(made)) == pytest.approx(4.0, abs=0.2) and tops(made).max() < 4.3
 
 
 @pytest.mark.parametrize("behind", [0.0, 9.0])
-def test_walls_are_not_extended_into_sky_or_other_walls(tmp_path: Path, behind: float) -> None:
-    made, _ = built(tmp_path, wall(1.9), Scene(1.9, behind))
+def test_walls_are_not_extended_over_sky_or_other_walls(tmp_path: Path, behind: float) -> None:
+    made, _ = run_step(tmp_path, wall(1.9), Scene(1.9, behind))
     assert tops(made).max() < 2.25
 
 
-def test_a_wall_ends_where_rays_pass_above_it(tmp_path: Path) -> None:
-    """Though photos agree that something with a pattern is there: what rays passed isn't."""
-    made, _ = built(tmp_path, wall(1.2), Scene(5.0))
+def test_wall_is_not_extended_where_rays_pass_above_it(tmp_path: Path) -> None:
+    """Rays outweigh photos that consistently show a pattern there."""
+    made, _ = run_step(tmp_path, wall(1.2), Scene(5.0))
     assert tops(made).max() < 1.2 + 0.6
 
 
-def test_a_gap_is_closed_where_no_ray_went_through(tmp_path: Path) -> None:
+def test_gap_without_passing_rays_is_closed(tmp_path: Path) -> None:
     hole = (5.0, 0.5, 5.6, 1.1)
-    made, done = built(tmp_path, wall(1.9, hole), Scene(1.9))
+    made, done = run_step(tmp_path, wall(1.9, hole), Scene(1.9))
     inside = (made.xyz[:, 0] > 5.1) & (made.xyz[:, 0] < 5.5) & (made.xyz[:, 2] > 0.6) & (made.xyz[:, 2] < 1.0)
     assert inside.sum() >= 40 and done.metrics["gaps_m2"] > 0.05
 
 
-def test_a_window_that_rays_went_through_stays_open(tmp_path: Path) -> None:
+def test_window_with_passing_rays_stays_open(tmp_path: Path) -> None:
     hole, random = (5.0, 0.5, 5.6, 1.1), np.random.default_rng(7)
     x, z = random.uniform(-5, 17, 400_000), random.uniform(0, 2, 400_000)
-    xyz, time = scanned(x, 9.0, z)  # a room's back wall: what of it is seen through the window
+    xyz, time = scanned(x, 9.0, z)  # back wall of a room, seen through the window
     from_ = PATH.at(time)
     share = (WALL - from_[:, 1]) / (xyz[:, 1] - from_[:, 1])
     hit = from_ + share[:, None] * (xyz - from_)
     seen = (hit[:, 0] > hole[0]) & (hit[:, 0] < hole[2]) & (hit[:, 2] > hole[1]) & (hit[:, 2] < hole[3])
-    made, _ = built(tmp_path, wall(1.9, hole), Scene(1.9), (xyz[seen], time[seen]))
+    made, _ = run_step(tmp_path, wall(1.9, hole), Scene(1.9), (xyz[seen], time[seen]))
     inside = (made.xyz[:, 0] > 5.15) & (made.xyz[:, 0] < 5.45) & (made.xyz[:, 2] > 0.65) & (made.xyz[:, 2] < 0.95)
     assert not inside.any()
 
 
-def test_the_uppermost_rays_of_a_tilted_scanner_are_found() -> None:
+def test_elevation_limits_of_a_tilted_scanner_are_estimated() -> None:
     random = np.random.default_rng(8)
     azimuth = random.uniform(-np.pi, np.pi, 40_000)
     limit = np.radians(2.0) + np.radians(3.0) * np.cos(azimuth - 1.0)
-    limit = np.where(np.abs(azimuth + 2) < 0.6, -0.1, limit)  # an open field: nothing is high there
+    limit = np.where(np.abs(azimuth + 2) < 0.6, -0.1, limit)  # an open field without high objects
     elevation = limit - random.exponential(0.05, len(azimuth))
     level = random.uniform(5, 30, len(azimuth))
     ends = np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), level * np.tan(elevation)])
@@ -180,7 +180,7 @@ def test_the_uppermost_rays_of_a_tilted_scanner_are_found() -> None:
     assert limits == pytest.approx([2.0, 3 * np.cos(1.0), 3 * np.sin(1.0)], abs=0.35)
 
 
-def test_only_streets_with_rays_and_photos_have_the_step() -> None:
+def test_task_exists_only_with_trajectory_and_photos() -> None:
     tile, never = read_tile(SAMPLE / "tile.toml"), Settings({"facades": {"when": "never"}})
 
     def has(one: Tile, settings: Settings) -> bool:

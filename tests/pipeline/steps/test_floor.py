@@ -1,4 +1,4 @@
-"""The floor of a robot's map as a step: its place in the task graph, what it reports, and bodies dropped on it."""
+"""Step for the floor of a robot map: task graph, metrics and warnings, and bodies dropped on the floor."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def run(folder: Path, ground: np.ndarray, others: np.ndarray) -> Done:
     return floor({name: folder / f"{name}.npz" for name in parts}, FloorParams(), folder, silent)
 
 
-def test_only_maps_of_robots_get_a_floor() -> None:
+def test_only_robot_maps_have_the_floor_task() -> None:
     tile = read_tile(SAMPLE)
     plain = {task.id.name for task in build_graph(tile, Settings())}
     assert not {"floor"} & plain
@@ -50,7 +50,7 @@ def test_bodies_in_a_mesh_of_rooms_collide_with_a_floor_without_holes(scene: Lit
     source = tasks["collision"].inputs["terrain"]
     assert isinstance(source, Output)
     assert (source.task.name == "floor") == (scene == "indoor") and ("floor" in tasks) == (scene == "indoor")
-    assert {"unwrap.terrain", "split_mesh"} <= set(tasks)  # what is seen remains the mesh
+    assert {"unwrap.terrain", "split_mesh"} <= set(tasks)  # the visual mesh is unchanged
 
 
 def test_assumed_floor_is_marked_in_metrics_warnings_points_and_mask(tmp_path: Path) -> None:
@@ -65,12 +65,12 @@ def test_assumed_floor_is_marked_in_metrics_warnings_points_and_mask(tmp_path: P
         assert np.isfinite(mask["height_0"][mask["assumed_0"]]).all()
 
 
-def test_map_without_ground_warns_where_its_floor_is_from(tmp_path: Path) -> None:
+def test_map_without_ground_warns_of_a_floor_from_walls(tmp_path: Path) -> None:
     done = run(tmp_path, np.zeros((0, 3)), noisy(walls()))
     assert done.metrics["ground_missing"] and "feet of the walls" in done.warnings[0]
 
 
-def test_map_without_ground_and_walls_is_no_error(tmp_path: Path) -> None:
+def test_map_without_ground_and_walls_is_accepted(tmp_path: Path) -> None:
     done = run(tmp_path, np.zeros((0, 3)), np.zeros((0, 3)))
     assert done.metrics["storeys"] == 0 and "no floor" in done.warnings[0]
 

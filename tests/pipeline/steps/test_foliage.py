@@ -1,4 +1,4 @@
-"""Foliage: leaf cards let as many rays through as the foliage did, dense foliage stays closed, collision is closed."""
+"""Foliage: leaf cards as transparent to rays as the plant, closed surfaces of dense plants and for collision."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def crown(leaves: int, seed: int = 0) -> Mesh:
     return squares(random.uniform(LOW, HIGH, (leaves, 3)), normal / np.linalg.norm(normal, axis=1, keepdims=True), 0.08)
 
 
-def skin() -> Mesh:
+def box_surface() -> Mesh:
     """The box's closed surface, of small triangles."""
     box = o3d.geometry.TriangleMesh.create_box(*(HIGH - LOW)).translate(LOW).subdivide_midpoint(4)
     return Mesh(Frame(), np.asarray(box.vertices, np.float32), np.asarray(box.triangles, np.int32))
@@ -94,12 +94,12 @@ def stopped(mesh: Mesh) -> Bools:
     return cast(mesh, start, end) < np.linalg.norm(end - start, axis=1)
 
 
-def test_cards_let_as_many_rays_through_as_the_crown(tmp_path: Path) -> None:
+def test_cards_are_as_transparent_to_rays_as_the_crown(tmp_path: Path) -> None:
     for leaves in (400, 1_600):
         (tmp_path / str(leaves)).mkdir()
         true = crown(leaves)
-        made, done = run(scan(tmp_path / str(leaves), true, skin()))
-        assert stopped(skin()).all(), "the closed surface stops every ray"
+        made, done = run(scan(tmp_path / str(leaves), true, box_surface()))
+        assert stopped(box_surface()).all(), "the closed surface stops every ray"
         assert abs(stopped(made).mean() - stopped(true).mean()) < 0.1
         assert done.metrics["cards"] > 0 and done.metrics["removed"] > 0
         assert len(made) <= done.metrics["faces_in"] + 80_000
@@ -108,19 +108,19 @@ def test_cards_let_as_many_rays_through_as_the_crown(tmp_path: Path) -> None:
         assert agree.mean() > chance + 0.1, "cards are where the leaves are"
 
 
-def test_a_hedge_that_no_ray_passes_stays_closed(tmp_path: Path) -> None:
-    made, done = run(scan(tmp_path, skin(), skin()))
+def test_hedge_without_passing_rays_stays_closed(tmp_path: Path) -> None:
+    made, done = run(scan(tmp_path, box_surface(), box_surface()))
     assert done.metrics["removed"] == done.metrics["cards"] == 0
-    np.testing.assert_array_equal(made.corners, skin().corners)
+    np.testing.assert_array_equal(made.corners, box_surface().corners)
 
 
 def test_modelled_trunks_are_kept_and_get_no_cards(tmp_path: Path) -> None:
     trunk = squares(np.array([[8.0, 0.0, 1.5]]), np.array([[1.0, 0.0, 0.0]]), 0.6)
     closed = Mesh(
         Frame(),
-        np.concatenate([skin().vertices, trunk.vertices]),
-        np.concatenate([skin().faces, trunk.faces + len(skin().vertices)]).astype(np.int32),
-        classification=np.repeat([0, CODE["pole"]], [len(skin()), 2]).astype(np.uint8),
+        np.concatenate([box_surface().vertices, trunk.vertices]),
+        np.concatenate([box_surface().faces, trunk.faces + len(box_surface().vertices)]).astype(np.int32),
+        classification=np.repeat([0, CODE["pole"]], [len(box_surface()), 2]).astype(np.uint8),
     )
     made, _ = run(scan(tmp_path, crown(400), closed))
     assert made.classification is not None and (made.classification > 0).sum() == 2
@@ -130,28 +130,28 @@ def test_modelled_trunks_are_kept_and_get_no_cards(tmp_path: Path) -> None:
 
 
 def test_no_card_crosses_a_tile_border_where_the_surface_stays_closed(tmp_path: Path) -> None:
-    inputs = scan(tmp_path, crown(400), skin())
+    inputs = scan(tmp_path, crown(400), box_surface())
     # the border lies at y = 0.5, the neighbour beyond it
     made, _ = run(inputs, seed=(0.0, -9.5), neighbours={"next": (0.0, 10.5)})
-    middle = skin().corners.mean(axis=1)[:, 1]
+    middle = box_surface().corners.mean(axis=1)[:, 1]
     kept = {tuple(corners) for corners in made.corners.reshape(-1, 9).tolist()}
-    closed = {tuple(corners) for corners in skin().corners[middle > -0.5].reshape(-1, 9).tolist()}
+    closed = {tuple(corners) for corners in box_surface().corners[middle > -0.5].reshape(-1, 9).tolist()}
     assert closed <= kept, "within 1 m of the border, and beyond it"
-    every = {tuple(corners) for corners in skin().corners.reshape(-1, 9).tolist()}
+    every = {tuple(corners) for corners in box_surface().corners.reshape(-1, 9).tolist()}
     cards = np.array(sorted(kept - every)).reshape(-1, 3)
     assert len(cards) and (cards[:, 1] < 0.0).all()
 
 
-def test_without_times_or_path_the_surface_stays_closed_and_the_reason_is_named(tmp_path: Path) -> None:
-    inputs = scan(tmp_path, crown(400), skin())
+def test_surface_stays_closed_without_times_or_path_with_a_reason(tmp_path: Path) -> None:
+    inputs = scan(tmp_path, crown(400), box_surface())
     made, done = run({name: path for name, path in inputs.items() if name != "path"})
-    assert len(made) == len(skin()) and "no trajectory" in done.warnings[0]
+    assert len(made) == len(box_surface()) and "no trajectory" in done.warnings[0]
     replace(PointCloud.load(inputs["cloud"]), time=None).save(inputs["cloud"])
     made, done = run(inputs)
-    assert len(made) == len(skin()) and "no times" in done.metrics["reason"] and "no times" in done.warnings[0]
+    assert len(made) == len(box_surface()) and "no times" in done.metrics["reason"] and "no times" in done.warnings[0]
 
 
-def test_rays_reach_the_cells_that_a_dense_sampling_finds() -> None:
+def test_ray_cells_equal_those_of_dense_sampling() -> None:
     random = np.random.default_rng(0)
     cells = Cells.of(random.uniform(-2, 2, (300, 3)), 0.25)
     start, end = random.uniform(-4, 4, (200, 3)), random.uniform(-4, 4, (200, 3))
@@ -166,7 +166,7 @@ def test_rays_reach_the_cells_that_a_dense_sampling_finds() -> None:
     assert sampled <= found and len(found - sampled) < 0.02 * len(found), "corners may be missed by the samples"
 
 
-def test_collision_reads_the_closed_surface_and_all_else_the_cards() -> None:
+def test_only_collision_uses_the_closed_surface() -> None:
     tile = replace(read_tile(SAMPLE), trajectory=None)
     tasks = {task.id.name: task for task in build_graph(tile, Settings({"foliage": {"when": "auto"}}))}
     cards = Output(TaskId("foliage"), "mesh")
@@ -177,7 +177,7 @@ def test_collision_reads_the_closed_surface_and_all_else_the_cards() -> None:
     assert "foliage" not in {task.step.name for task in build_graph(tile, Settings({"foliage": {"when": "never"}}))}
 
 
-def test_tile_without_photos_and_trajectory_runs_the_step_which_names_the_reason() -> None:
+def test_step_reports_its_reason_for_tiles_without_photos_and_trajectory() -> None:
     tile = replace(read_tile(SAMPLE), trajectory=None, views=())
     tasks = {task.id.name: task for task in build_graph(tile, Settings({"foliage": {"when": "auto"}}))}
     cloud = tasks["foliage"].inputs["cloud"]

@@ -1,4 +1,4 @@
-"""Sweeps held out of a cloud, and a world scored by them: a small scene, and the synthetic street's own scanner."""
+"""Held-out sweeps of a cloud, and the score of a world by them: a small scene, and a scan of the synthetic street."""
 
 from __future__ import annotations
 
@@ -80,10 +80,10 @@ def test_every_8th_sweep_is_held_out(drive: tuple[PointCloud, dict[str, Path]], 
     assert np.unique(sweeps.number).tolist() == [4, 12] and len(kept) + len(sweeps) == len(cloud)
     assert not np.isin(np.round(present(kept.time), 3), [50.4, 51.2]).any()
     assert np.unique(sweeps.origins[:, 0]).tolist() == [4, 12]
-    assert np.allclose(sweeps.scanned, sweeps.xyz - sweeps.origins, atol=1e-4)  # it drives along x
+    assert np.allclose(sweeps.scanned, sweeps.xyz - sweeps.origins, atol=1e-4)  # along x
 
 
-def test_without_hold_out_sweeps_of_the_cloud_are_scored(
+def test_sweeps_of_the_cloud_are_scored_without_held_out_ones(
     drive: tuple[PointCloud, dict[str, Path]], tmp_path: Path
 ) -> None:
     done, kept, sweeps = run_sweeps(drive[1], tmp_path)
@@ -120,8 +120,8 @@ def test_holding_out_every_sweep_is_rejected() -> None:
         SWEEPS.params.of("sweeps", {"hold_out": 1})
 
 
-def test_a_removed_car_does_not_count(drive: tuple[PointCloud, dict[str, Path]], tmp_path: Path) -> None:
-    """Its returns are excluded by its box even where no point nearby is of its class; a kept one counts as missing."""
+def test_returns_from_a_removed_car_do_not_count(drive: tuple[PointCloud, dict[str, Path]], tmp_path: Path) -> None:
+    """Returns in its box are excluded even if no nearby point has its class; those of a kept car count as missing."""
     done, kept, _ = run_sweeps(drive[1], tmp_path, hold_out=8)
     ground().save(tmp_path / "mesh.npz")
     (x0, x1, y0, y1), car = CAR, {"kind": "car", "moved": False, "height_m": 1.5, "ground_z": 0.0}
@@ -179,7 +179,7 @@ def test_only_rays_inside_the_cell_count(drive: tuple[PointCloud, dict[str, Path
     assert 0.9 * inside.sum() < scored["rays"] <= inside.sum() and list(scored["sweeps"]) == ["Sweep 4."]
 
 
-def test_a_synthetic_streets_true_surface_agrees_with_its_scan(small_street: Path, tmp_path: Path) -> None:
+def test_true_surface_of_a_synthetic_street_agrees_with_its_scan(small_street: Path, tmp_path: Path) -> None:
     """Range noise has a standard deviation of 1 cm: the median absolute error is .67 cm on every surface."""
     from scan2sim.pipeline.core.classes import GROUPS, group_of
     from scan2sim.pipeline.io.clouds import las

@@ -1,4 +1,4 @@
-"""What of a street is worth a surface: seen on a made-up one, where a camera drives and looks ahead."""
+"""Photo coverage selects the points that get a surface: a synthetic street with a camera that drives ahead."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ CAMERA = Camera("pinhole", 1200, 400, 700.0, 700.0, 600.0, 200.0)
 
 
 def plane(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> F32:
-    """Points every decimetre of a rectangle that is flat along one axis."""
+    """Points on an axis-parallel rectangle, a decimetre apart."""
     axes = [np.arange(low, high, 0.1) if high > low else np.array([low]) for low, high in (x, y, z)]
     return np.stack([a.ravel() for a in np.meshgrid(*axes, indexing="ij")], axis=1).astype(np.float32)
 
 
 GROUND = plane((-30, 60), (-20, 20), (0, 0))
 WALL = plane((0, 40), (8, 8), (0, 3))  # along the street
-SCREEN = plane((12, 12), (-7, -6), (0, 1.2))  # small, across it: the ground behind is hidden
+SCREEN = plane((12, 12), (-7, -6), (0, 1.2))  # small, across the street: occludes the ground behind
 PARTS = {"road": GROUND, "building": WALL, "wall_or_fence": SCREEN}
 
 
@@ -66,9 +66,9 @@ def test_covered_points_and_the_lane_are_kept_and_others_removed(street: dict[st
     assert ((x > 15) & (x < 25) & (abs(y) < 5) & ground).sum() > 0.97 * 100 * 100, "ahead"
     behind = ground & (x < -1)
     assert behind.any() and np.hypot(x[behind], y[behind]).max() < ROADSIDE_M + 1.5 * CLOSING_CELL_M, (
-        "behind the first photo the lane alone"
+        "only the lane behind the first photo"
     )
-    assert not (y > 9).any(), "no photo sees through the wall"
+    assert not (y > 9).any(), "points behind the wall"
     assert ((x > 10) & (x < 25) & (y > 7.9) & (y < 8.1) & (z > 0.2)).sum() > 0.95 * 150 * 28, "the wall itself"
     assert done.metrics["left_out"] == done.metrics["points_in"] - len(cloud) > 0
     lost = len(np.concatenate(list(PARTS.values()))) - len(cloud)
@@ -112,14 +112,14 @@ def test_uncovered_points_without_colours_get_those_of_their_class(street: dict[
         np.testing.assert_allclose(np.median(behind, axis=0), [90, 100, 110], atol=15)
 
 
-def test_ground_hidden_behind_something_small_is_kept(street: dict[str, Path], tmp_path: Path) -> None:
+def test_ground_occluded_by_a_small_object_is_kept(street: dict[str, Path], tmp_path: Path) -> None:
     cloud = left(go(street, tmp_path))
     x, y, _ = cloud.xyz.T
     shadow = (x > 12.1) & (x < 13.5) & (y > -7) & (y < -6) & (cloud.classification == CODE["road"])
     assert shadow.sum() > 0.95 * 13 * 9
 
 
-def test_metres_from_the_path(street: dict[str, Path], tmp_path: Path) -> None:
+def test_limit_is_the_distance_from_the_path(street: dict[str, Path], tmp_path: Path) -> None:
     done = go(street, tmp_path, limit=6.0)
     assert len(PointCloud.load(done.files["uncovered"])) == 0
     x, y, _ = left(done).xyz.T
@@ -127,7 +127,7 @@ def test_metres_from_the_path(street: dict[str, Path], tmp_path: Path) -> None:
     assert 5.5 < away.max() < 6.6 and done.metrics["far_m"] < 6.6
 
 
-def test_held_out_photos_dont_count(street: dict[str, Path], tmp_path: Path) -> None:
+def test_held_out_photos_are_ignored(street: dict[str, Path], tmp_path: Path) -> None:
     views_io.save(tmp_path / "views.json", views_io.load(street["views"]), [True] * 6)
     x, y, _ = left(go(street | {"views": tmp_path / "views.json"}, tmp_path)).xyz.T
     assert np.hypot(x - x.clip(0, 10), y).max() < ROADSIDE_M + 1.5 * CLOSING_CELL_M
@@ -152,7 +152,7 @@ def test_step_exists_only_with_photos_along_a_path() -> None:
     assert "photo_coverage" in steps["s"] and "photo_coverage" not in steps["b"]
     off = {task.step.name for task in build_graph(street, Settings({"photo_coverage": {"limit": "off"}}))}
     assert "photo_coverage" not in off
-    # a survey's tiles meet: what is beyond the border is kept or left out as the neighbour decides, photos or none
+    # neighbouring tiles select equal points at their border, with or without photos
     tiles = [
         replace(street, name="a", cell=Cell((0, 0), {"b": (10, 0)})),
         replace(bare, name="b", cell=Cell((10, 0), {"a": (0, 0)})),

@@ -1,4 +1,4 @@
-"""Planes: a wall's corner and end are straight where Poisson has rounded them, and what is round stays so."""
+"""Step `planes`: corners and ends of walls rounded by Poisson become straight, round surfaces are unchanged."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def go(step: Step, folder: Path, inputs: dict[str, Path], **given: Any) -> Done:
     return step.run(inputs, step_params(step.params, **given), out, silent)
 
 
-def laid(
+def run_step(
     xyz: F64, folder: Path, *, others: F64 | None = None, noise: float = NOISE, **given: Any
 ) -> tuple[Mesh, Mesh, dict[str, Any]]:
-    """The mesh of points, what the step makes of it, and its metrics."""
+    """Meshes of points before and after the step, and its metrics."""
     noisy = (xyz + np.random.default_rng(1).normal(0, noise, xyz.shape)).astype(np.float32)
     points, path, other = (folder / f"{name}.npz" for name in ("points", "path", "other"))
     PointCloud(Frame(), noisy).save(points)
@@ -52,40 +52,40 @@ def wall(start: tuple[float, float], end: tuple[float, float], height: float = 3
     return np.column_stack([a + u * (b - a), random.uniform(0, height, len(u))])
 
 
-def reach(mesh: Mesh, way: tuple[float, float, float], low: float, high: float) -> F64:
-    """Per 10 cm of height between two heights, how far the mesh reaches in a direction."""
+def extents(mesh: Mesh, way: tuple[float, float, float], low: float, high: float) -> F64:
+    """Maximum coordinate of the mesh along a direction, for each 10 cm of height between two heights."""
     far = mesh.vertices @ np.array(way)
     level = np.floor(mesh.vertices[:, 2] / 0.1).astype(int)
     return np.array([far[level == k].max() for k in range(int(low / 0.1), int(high / 0.1))])
 
 
-def test_a_corner_is_sharp(tmp_path: Path) -> None:
-    before, after, metrics = laid(np.concatenate([wall((0, 0), (0, 4)), wall((0, 0), (4, 0))]), tmp_path)
-    corner = np.array([-1.0, -1.0, 0.0]) / np.sqrt(2)  # it reaches to 0 in this direction
+def test_corner_of_two_walls_is_sharp(tmp_path: Path) -> None:
+    before, after, metrics = run_step(np.concatenate([wall((0, 0), (0, 4)), wall((0, 0), (4, 0))]), tmp_path)
+    corner = np.array([-1.0, -1.0, 0.0]) / np.sqrt(2)  # the true corner is at 0
     assert metrics["planes"] == 2
-    assert np.median(reach(before, tuple(corner), 0.5, 2.5)) < -0.02
-    assert np.abs(reach(after, tuple(corner), 0.5, 2.5)).max() < 0.01
+    assert np.median(extents(before, tuple(corner), 0.5, 2.5)) < -0.02
+    assert np.abs(extents(after, tuple(corner), 0.5, 2.5)).max() < 0.01
 
 
 def test_wall_ends_with_its_points_and_extends_into_the_ground(tmp_path: Path) -> None:
     x, y = np.meshgrid(np.arange(-1, 5, 0.1), np.arange(-2, 2, 0.1))
     ground = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    before, after, _ = laid(wall((0, 0), (4, 0)), tmp_path, others=ground)
-    assert np.median(reach(before, (1, 0, 0), 0.5, 2.5)) > 4.1  # what trim leaves
-    assert np.abs(reach(after, (1, 0, 0), 0.5, 2.5) - 4).max() < 0.02
-    assert np.abs(reach(after, (-1, 0, 0), 0.5, 2.5)).max() < 0.02
+    before, after, _ = run_step(wall((0, 0), (4, 0)), tmp_path, others=ground)
+    assert np.median(extents(before, (1, 0, 0), 0.5, 2.5)) > 4.1  # after `trim`
+    assert np.abs(extents(after, (1, 0, 0), 0.5, 2.5) - 4).max() < 0.02
+    assert np.abs(extents(after, (-1, 0, 0), 0.5, 2.5)).max() < 0.02
     assert after.vertices[:, 2].min() < -0.05
     assert np.quantile(np.abs(after.vertices[:, 1]), 0.99) < 0.005
 
 
-def test_a_wall_with_noise_and_boards_is_flat(tmp_path: Path) -> None:
-    """As a lidar on a car sees it: 3 cm of noise, boards of 30 cm by turns 3 cm before and behind."""
+def test_wall_with_noise_and_boards_is_flat(tmp_path: Path) -> None:
+    """As scanned by a lidar on a car: 3 cm of noise, boards of 30 cm, alternately 3 cm in front and behind."""
     boards = wall((0, 0), (5, 0), density=400)
     boards[:, 1] += np.where(boards[:, 0] % 0.6 < 0.3, 0.015, -0.015)
-    before, after, metrics = laid(boards, tmp_path, noise=0.03)
+    before, after, metrics = run_step(boards, tmp_path, noise=0.03)
 
     def tilted(mesh: Mesh) -> float:
-        """Share of the wall's area that looks away from its front by more than 20 degrees."""
+        """Share of the wall's area whose normal deviates from the wall's by more than 20 degrees."""
         middle = mesh.vertices[mesh.faces].mean(axis=1)
         inside = (np.abs(middle[:, 0] - 2.5) < 2.0) & (np.abs(middle[:, 2] - 1.5) < 1.0)
         away = np.abs(mesh.face_normal[:, 1]) < np.cos(np.radians(20))
@@ -96,9 +96,9 @@ def test_a_wall_with_noise_and_boards_is_flat(tmp_path: Path) -> None:
 
 
 def test_tile_borders_are_not_moved(tmp_path: Path) -> None:
-    """The neighbour's planes aren't the same, what both made of the points is."""
+    """Planes of neighbouring tiles differ, but their meshes agree at the border."""
     corner = np.concatenate([wall((0, 0), (0, 4)), wall((0, 0), (4, 0))])
-    before, after, _ = laid(corner, tmp_path, seed=(-1.0, 1.0), neighbours={"east": (5.0, 1.0)})
+    before, after, _ = run_step(corner, tmp_path, seed=(-1.0, 1.0), neighbours={"east": (5.0, 1.0)})
     was, now = (mesh.vertices[np.abs(mesh.vertices[:, 0] - 2) < 0.25] for mesh in (before, after))
     assert len(was) == len(now) > 100
     assert cKDTree(now).query(was)[0].max() < 0.003  # noise for decimation
@@ -106,11 +106,11 @@ def test_tile_borders_are_not_moved(tmp_path: Path) -> None:
     assert np.quantile(np.abs(after.vertices[inner, 1]), 0.99) < 0.005
 
 
-def test_a_window_has_reveals(tmp_path: Path) -> None:
+def test_window_gets_reveals(tmp_path: Path) -> None:
     front = wall((0, 0), (4, 0))
     hole = (front[:, 0] > 1.5) & (front[:, 0] < 2.7) & (front[:, 2] > 0.8) & (front[:, 2] < 2.2)
     pane = front[hole] + [0, 0.15, 0]
-    _, after, metrics = laid(np.concatenate([front[~hole], pane]), tmp_path)
+    _, after, metrics = run_step(np.concatenate([front[~hole], pane]), tmp_path)
     middle = (np.abs(after.vertices[:, 2] - 1.5) < 0.4) & (np.abs(after.vertices[:, 0] - 2.1) < 0.8)
     between = after.vertices[middle & (after.vertices[:, 1] > 0.01) & (after.vertices[:, 1] < 0.14)]
     assert metrics["steps"] >= 4
@@ -120,6 +120,6 @@ def test_a_window_has_reveals(tmp_path: Path) -> None:
 def test_round_surfaces_are_unchanged(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     angle, z = random.uniform(0, 2 * np.pi, 12_000), random.uniform(0, 3, 12_000)
-    before, after, metrics = laid(np.column_stack([0.6 * np.cos(angle), 0.6 * np.sin(angle), z]), tmp_path)
+    before, after, metrics = run_step(np.column_stack([0.6 * np.cos(angle), 0.6 * np.sin(angle), z]), tmp_path)
     assert metrics["planes"] == 0
     assert np.array_equal(before.vertices, after.vertices) and np.array_equal(before.faces, after.faces)

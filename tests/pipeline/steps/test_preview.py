@@ -1,4 +1,4 @@
-"""Preview: the report's copy of the world is the world, within bounds."""
+"""Preview: the copy of the world in the report, within size limits."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.fakes import synthetic
 
 @pytest.fixture
 def made(tmp_path: Path) -> Any:
-    """Make the preview of the made-up tile, whose four pages are of 256 x 256 texels."""
+    """Make the preview of the synthetic tile, which has four pages of 256 x 256 texels."""
     meshes = {"terrain": synthetic.ground(), "building": synthetic.house()}
     inputs = {group: synthetic.textured(tmp_path / group, mesh) for group, mesh in meshes.items()}
 
@@ -31,7 +31,7 @@ def made(tmp_path: Path) -> Any:
 
 
 def scene(done: Done) -> trimesh.Scene:
-    """What is inside the script."""
+    """Scene in the script."""
     script = (done.files["preview"] / "world.js").read_bytes()
     assert script.startswith(CALLBACK + b'("') and script.endswith(b'");\n')
     return trimesh.load_scene(io.BytesIO(base64.b64decode(script[len(CALLBACK) + 2 : -4])), file_type="glb")
@@ -54,9 +54,9 @@ def test_preview_camera_starts_on_the_ground(made: Any) -> None:
     (x, y, z), target = metrics["walk"]
     assert z - synthetic.height(np.array(x), np.array(y)) == pytest.approx(1.6, abs=0.3)
     assert np.linalg.norm(np.subtract(target, (x, y, z))) > 5 and metrics["turn"][0][2] > 5
-    assert metrics["start"] == "turn"  # nobody drove there
+    assert metrics["start"] == "turn"  # without a trajectory
 
 
-def test_a_world_of_too_many_triangles_has_none(made: Any) -> None:
+def test_world_with_too_many_triangles_has_no_preview(made: Any) -> None:
     done = made(triangles=1000)
     assert done.files == {} and done.metrics == {"triangles": 3210}

@@ -1,4 +1,4 @@
-"""Rasters: pixels are where the CRS says, heights are the mesh's, and GDAL reads them as cloud-optimised."""
+"""Rasters: georeference, heights and colours of the mesh, and cloud-optimised GeoTIFFs by GDAL."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FEET = Frame("EPSG:2263", (300_000.0, 60_000.0, 10.0), 1200 / 3937)
 
 
 def made(folder: Path, frame: Frame = synthetic.UTM, **params: object) -> Done:
-    """Rasters of the made-up tile."""
+    """Rasters of the synthetic tile."""
     meshes = {"terrain": synthetic.ground(frame=frame), "building": synthetic.house(frame)}
     inputs = {group: synthetic.textured(folder / group, mesh) for group, mesh in meshes.items()}
     (folder / "out").mkdir()
@@ -28,14 +28,14 @@ def made(folder: Path, frame: Frame = synthetic.UTM, **params: object) -> Done:
 
 
 def at(file: Path, frame: Frame, x: float, y: float) -> np.ndarray:
-    """What a raster shows at a local place, as any reader finds it: by the file's own geotransform."""
+    """Values of a raster at a local position, by the geotransform of the file."""
     with rasterio.open(file) as raster:
         e, n, _ = frame.to_crs([x, y, 0.0])
         return next(iter(raster.sample([(e, n)], masked=True)))
 
 
 @pytest.mark.parametrize("frame", [synthetic.UTM, FEET, Frame("local", (5.0, 6.0, 7.0))])
-def test_heights_and_places_are_the_meshs_own(tmp_path: Path, frame: Frame) -> None:
+def test_heights_and_colours_equal_the_mesh_at_their_positions(tmp_path: Path, frame: Frame) -> None:
     done = made(tmp_path, frame)
     files = geotiff.find(done.files["rasters"], "street")
     assert set(files) == set(geotiff.KINDS)
@@ -45,7 +45,7 @@ def test_heights_and_places_are_the_meshs_own(tmp_path: Path, frame: Frame) -> N
         ground = (float(synthetic.height(np.array(x), np.array(y))) + frame.origin[2]) / frame.unit
         for kind in ("dsm", "dtm"):
             assert abs(float(at(files[kind], frame, x, y)[0]) - ground) < 0.02 / frame.unit
-    inside, outside = (x0 + 0.06, y0 + 0.06), (x0 - 0.06, y0 - 0.06)  # of the roof's corner, by half a pixel
+    inside, outside = (x0 + 0.06, y0 + 0.06), (x0 - 0.06, y0 - 0.06)  # half a pixel from the roof's corner
     assert abs(float(at(files["dsm"], frame, *inside)[0]) - roof) < 0.001 / frame.unit
     assert float(at(files["dsm"], frame, *outside)[0]) < roof - 3 / frame.unit
     assert float(at(files["dtm"], frame, *inside)[0]) < roof - 3 / frame.unit
@@ -78,8 +78,8 @@ def test_rasters_have_nodata_without_points(tmp_path: Path) -> None:
         assert valid.mean() == pytest.approx(1 - 64 / 400, abs=0.02) and not valid[80:120, 80:120].any()
 
 
-def test_neighbours_fit_together_in_one_virtual_raster(tmp_path: Path) -> None:
-    east = Frame(synthetic.UTM.crs, (690_019.97, 5_335_000.0, 510.0))  # its westernmost pixels are the other's, too
+def test_neighbouring_rasters_join_in_a_virtual_raster(tmp_path: Path) -> None:
+    east = Frame(synthetic.UTM.crs, (690_019.97, 5_335_000.0, 510.0))  # its westernmost pixels overlap the other's
     one, two = made(tmp_path / "one"), made(tmp_path / "two", east)
     for kind in geotiff.KINDS:
         files = [geotiff.find(done.files["rasters"], "street")[kind] for done in (one, two)]
@@ -93,7 +93,7 @@ def test_neighbours_fit_together_in_one_virtual_raster(tmp_path: Path) -> None:
                 np.testing.assert_array_equal(whole, at(file, frame, 3.33, 4.44))
 
 
-def test_a_raster_beyond_bounds_is_refused_with_the_size_that_fits(tmp_path: Path) -> None:
+def test_too_large_raster_is_rejected_with_a_pixel_size_that_fits(tmp_path: Path) -> None:
     corners = np.array([[0, 0, 0], [9e4, 0, 0], [0, 9e4, 0]], np.float32)
     uv, page = np.zeros((1, 3, 2), np.float32), np.zeros(1, np.int16)
     far = Mesh(synthetic.UTM, corners, np.array([[0, 1, 2]], np.int32), uv=uv, page=page)

@@ -1,4 +1,4 @@
-"""A street's ground where cars hid it, and behind low walls, against the ground that is known."""
+"""Ground synthesized where cars or low walls occluded it, compared with the true ground of a street."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def scanned(holes: tuple[tuple[float, ...], ...]) -> PointCloud:
     )  # fmt: skip
 
 
-def things(path: Path, *, moved: bool = False) -> Path:
+def write_instances(path: Path, *, moved: bool = False) -> Path:
     x0, y0, x1, y1 = CAR
     ring = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]) + FRAME.origin[:2]
     feature = {"type": "Feature", "properties": {"kind": "car", "moved": moved}}
@@ -51,31 +51,33 @@ def things(path: Path, *, moved: bool = False) -> Path:
     return path
 
 
-def closed(folder: Path, holes: tuple[tuple[float, ...], ...], *, moved: bool = False, gap: float = 1.5) -> PointCloud:
+def synthesized_ground(
+    folder: Path, holes: tuple[tuple[float, ...], ...], *, moved: bool = False, gap: float = 1.5
+) -> PointCloud:
     cloud, nothing = scanned(holes), scanned(((-30, -30, 30, 30),))
     files = {"terrain": cloud, "building": nothing, "vegetation": nothing, "rest": nothing}
     inputs = {name: folder / f"{name}.npz" for name in files}
     for name, part in files.items():
         part.save(inputs[name])
-    inputs["instances"] = things(folder / "instances.geojson", moved=moved)
+    inputs["instances"] = write_instances(folder / "instances.geojson", moved=moved)
     done = GROUND.run(inputs, GroundParams(gap=gap), folder, silent)
     return PointCloud.load(done.files["synthesized"])
 
 
 def test_ground_is_extended_below_cars_and_behind_walls(tmp_path: Path) -> None:
-    made = closed(tmp_path, (CAR, SHADOW))
+    made = synthesized_ground(tmp_path, (CAR, SHADOW))
     for hole in (CAR, SHADOW):
         there = within(made.xyz[:, :2], hole)
         area = (hole[2] - hole[0]) * (hole[3] - hole[1])
         assert there.sum() * 0.01 == pytest.approx(area, rel=0.15)
     assert np.abs(made.xyz[:, 2] - true(made.xyz[:, :2])).max() < 0.02
     assert within(made.xyz[:, :2], CAR, 0.2).sum() + within(made.xyz[:, :2], SHADOW, 0.2).sum() == len(made)
-    assert made.rgb is not None and (made.rgb == UNCOLOURED).all()  # the texture knows better
+    assert made.rgb is not None and (made.rgb == UNCOLOURED).all()  # texturing decides on the colour
 
 
-def test_courtyards_and_what_lies_beyond_the_scan_stay_open(tmp_path: Path) -> None:
-    made = closed(tmp_path, (COURT, EDGE)).xyz[:, :2]
-    assert within(made, COURT, -1.0).sum() == 0 and within(made, EDGE, -1.0).sum() == 0  # corners alone are rounded
+def test_courtyards_and_areas_beyond_the_scan_stay_open(tmp_path: Path) -> None:
+    made = synthesized_ground(tmp_path, (COURT, EDGE)).xyz[:, :2]
+    assert within(made, COURT, -1.0).sum() == 0 and within(made, EDGE, -1.0).sum() == 0  # only corners are rounded
 
 
 def test_no_ground_is_synthesized_where_vehicles_drove(tmp_path: Path) -> None:
@@ -85,16 +87,16 @@ def test_no_ground_is_synthesized_where_vehicles_drove(tmp_path: Path) -> None:
         CAR[2] + 20,
         CAR[3] + 3,
     )  # a street's width that is missing in the scan, through the tile
-    assert len(closed(tmp_path, (wide,), moved=True)) == 0
+    assert len(synthesized_ground(tmp_path, (wide,), moved=True)) == 0
 
 
-def test_gaps_wider_than_asked_for_stay(tmp_path: Path) -> None:
+def test_gaps_wider_than_the_setting_stay_open(tmp_path: Path) -> None:
     through = (-30, -2, 30, 1)
-    assert len(closed(tmp_path, (through,), moved=True, gap=1.0)) == 0
-    assert len(closed(tmp_path, (through,), moved=True, gap=2.0)) > 10_000
+    assert len(synthesized_ground(tmp_path, (through,), moved=True, gap=1.0)) == 0
+    assert len(synthesized_ground(tmp_path, (through,), moved=True, gap=2.0)) > 10_000
 
 
-def test_the_step_is_left_out_where_asked() -> None:
+def test_ground_task_can_be_disabled() -> None:
     tile = read_tile(SAMPLE)
     assert "ground" in {task.full_name for task in build_graph(tile, Settings())}
     assert "ground" not in {task.full_name for task in build_graph(tile, Settings({"ground": {"when": "never"}}))}

@@ -1,4 +1,4 @@
-"""Trim: what goes, and what stays, triangle by triangle."""
+"""Trim: removed and kept triangles, one by one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CORNERS = np.array([[0, 0, 0], [0.15, 0, 0], [0, 0.15, 0]], np.float32)
 def trimmed(
     folder: Path, triangles: list[F32], density: list[list[float]], points: F32
 ) -> tuple[list[int], dict[str, Any]]:
-    """Which triangles are kept, and the metrics."""
+    """Indices of kept triangles, and metrics."""
     vertices = np.concatenate(triangles).astype(np.float32)
     faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
     classification = np.arange(len(faces), dtype=np.uint8)
@@ -45,7 +45,7 @@ def test_long_edges_sparse_samples_and_surface_far_from_points_are_removed(tmp_p
     assert [metrics[name] for name in ("long_edges", "sparse", "far_from_points", "widened")] == [1, 1, 1, 1.0]
 
 
-def test_near_uncovered_points_limits_follow_their_spacing(tmp_path: Path) -> None:
+def test_limits_near_uncovered_points_follow_their_spacing(tmp_path: Path) -> None:
     x, y = np.mgrid[0:80, 0:12]
     covered = np.stack([x.ravel() * 0.1, y.ravel() * 0.1, 0.0 * x.ravel()], axis=1).astype(np.float32)
     x, y = np.mgrid[0:20, 0:4]

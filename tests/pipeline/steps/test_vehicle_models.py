@@ -1,4 +1,4 @@
-"""Models of parked vehicles: whole, in their place, in their colour."""
+"""Models of parked vehicles: complete, with their position and colour."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def made(tmp_path: Path, **params: object) -> tuple[Path, Mesh]:
     return done.files["textured"], Mesh.load(done.files["mesh"])
 
 
-def test_each_parked_vehicle_is_whole_and_in_its_place(tmp_path: Path) -> None:
+def test_each_parked_vehicle_is_complete_at_its_position(tmp_path: Path) -> None:
     folder, mesh = made(tmp_path)
     car, van = mesh.keep(mesh.corners[:, :, 1].mean(axis=1) < -2), mesh.keep(mesh.corners[:, :, 1].mean(axis=1) > -2)
     for one, size, middle in ((car, (4.4, 1.8, 1.5), (60.0, -5.0)), (van, (2.0, 5.0, 2.2), (60.0, 3.0))):
@@ -56,7 +56,7 @@ def test_colours_are_those_of_the_tracks(tmp_path: Path) -> None:
     assert 140 <= red <= 200 and max(green, blue) <= 20
 
 
-def test_vehicles_of_neighbouring_tiles_are_left_to_them(tmp_path: Path) -> None:
+def test_vehicles_of_neighbouring_tiles_are_omitted(tmp_path: Path) -> None:
     x, y, _ = synthetic.UTM.origin
     cell = TileCell(name="here", seed=(x + 60.0, y + 10.0), neighbours={"there": (x + 60.0, y - 10.0)})
     _, mesh = made(tmp_path, context=cell)

@@ -1,4 +1,4 @@
-"""Floor maps against the truth of synthetic rooms."""
+"""Floor maps compared with the true floors of synthetic rooms."""
 
 from __future__ import annotations
 
@@ -68,15 +68,15 @@ def test_floor_ends_at_the_walls() -> None:
     assert found.area < (SIZE + 0.6) ** 2
 
 
-def test_map_without_ground_gets_a_floor_at_the_feet_of_its_walls() -> None:
+def test_map_without_ground_gets_a_floor_at_the_bottom_of_its_walls() -> None:
     found = find(np.zeros((0, 3)), noisy(walls()))
     assert found.filtered and found.assumed_share == 1
     assert np.abs(heights(found, inside())).max() < 0.1
     assert (SIZE - 0.2) ** 2 < found.area < (SIZE + 0.8) ** 2
 
 
-def test_feet_of_walls_that_pass_for_ground_extend_the_floor_of_a_map_without_ground() -> None:
-    """Half of the walls are known to be walls; what is below 70 cm of the others was classified as ground."""
+def test_wall_bottoms_classified_as_ground_do_not_prevent_a_floor_from_walls() -> None:
+    """Half of the walls are classified as walls; the lowest 70 cm of the others as ground."""
     all_walls = noisy(walls())
     feet = (all_walls[:, 0] > SIZE / 2) & (all_walls[:, 2] < 0.7)
     found = find(all_walls[feet], all_walls[all_walls[:, 0] < SIZE / 2])
@@ -107,7 +107,7 @@ def test_spikes_pits_and_furniture_do_not_change_the_floor() -> None:
     assert np.abs(heights(found, inside())).max() < 0.04
 
 
-def test_kerb_stays() -> None:
+def test_kerb_is_kept() -> None:
     ground = np.concatenate([level((0, 0), (3, SIZE)), level((3, 0), (SIZE, SIZE), 0.15)])
     found = find(noisy(ground), np.zeros((0, 3)), level=False)
     xy = inside()
@@ -151,7 +151,7 @@ def test_one_ring_of_points_gets_a_floor() -> None:
 
 
 @pytest.mark.parametrize("ground", [np.zeros((0, 3)), [[0.0, 0, 0]], [[0.0, 0, 0], [5, 5, 1], [0, 0, 3]]])
-def test_few_points_are_no_error(ground: Any) -> None:
+def test_too_few_points_are_accepted(ground: Any) -> None:
     found = find(ground, [[0.0, 0, 2], [1, 1, 1]])
     for k in range(len(found.storeys)):
         mesh_of(found, k)

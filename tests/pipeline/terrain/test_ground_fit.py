@@ -1,4 +1,4 @@
-"""Ground fitted to its points: nearer to the true surface than the noisy mesh, and level where nothing was seen."""
+"""Ground fitted to its points: closer to the true surface than the noisy mesh, and smooth without points."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def truth(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def bumpy() -> Mesh:
-    """The road as a mesh that is 3 cm off here and there."""
+    """The road as a mesh with local errors of 3 cm."""
     flat = synthetic.ground(50)
     z = truth(*flat.vertices[:, :2].T) + np.random.default_rng(0).normal(0, 0.03, len(flat.vertices))
     return Mesh(flat.frame, np.column_stack([flat.vertices[:, :2], z]).astype(np.float32), flat.faces)
@@ -34,7 +34,7 @@ def points(n: int = 100_000, noise: float = 0.02) -> np.ndarray:
 
 
 def error(mesh: Mesh) -> np.ndarray:
-    """Of vertices that are not at the kerb."""
+    """Height error of vertices that are not at the kerb."""
     x, y, z = mesh.vertices[abs(mesh.vertices[:, 0] - 5) > 0.5].T
     return np.asarray(np.abs(z - truth(x, y)))
 
@@ -45,7 +45,7 @@ def test_fitted_ground_is_closer_to_the_truth_than_the_points(bumpy: Mesh) -> No
     assert np.array_equal(smooth.vertices[:, :2], bumpy.vertices[:, :2]) and smooth.faces is bumpy.faces
 
 
-def test_a_kerb_keeps_its_height(bumpy: Mesh) -> None:
+def test_kerb_keeps_its_height(bumpy: Mesh) -> None:
     smooth = fit_heights(bumpy, points(), np.zeros(len(bumpy.vertices), bool))
     x, y, z = smooth.vertices.T
     level = z - 0.02 * y
@@ -59,7 +59,7 @@ def test_ground_fit_is_robust_to_outliers(bumpy: Mesh) -> None:
     assert np.percentile(error(smooth), 95) < 0.012
 
 
-def test_vertices_of_a_border_stay(bumpy: Mesh) -> None:
+def test_border_vertices_are_fixed(bumpy: Mesh) -> None:
     fixed = bumpy.vertices[:, 0] < -9.9
     smooth = fit_heights(bumpy, points(), fixed)
     assert np.array_equal(smooth.vertices[fixed], bumpy.vertices[fixed])
@@ -75,14 +75,14 @@ def test_ground_without_points_is_smoother(bumpy: Mesh) -> None:
     assert np.std(off[1]) < np.std(off[0]) / 2
 
 
-def test_no_points_no_change(bumpy: Mesh) -> None:
+def test_mesh_without_points_is_unchanged(bumpy: Mesh) -> None:
     fixed = np.zeros(len(bumpy.vertices), bool)
     assert fit_heights(bumpy, np.zeros((0, 3), np.float32), fixed) is bumpy
     assert fit_heights(bumpy, points(100) + np.float32(50), fixed).vertices.shape == bumpy.vertices.shape
     assert fit_heights(bumpy, points(100), ~fixed) is bumpy
 
 
-def test_heights_above_a_slope_are_upright_ones() -> None:
+def test_height_above_a_slope_is_measured_vertically() -> None:
     slope = synthetic.ground(4)
     vertices = slope.vertices.copy()
     vertices[:, 2] = vertices[:, 0] * 0.5

@@ -1,4 +1,4 @@
-"""Low-poly plants stand where they are listed, in the size and colour of the real ones, with trunks to run into."""
+"""Low-poly plants at the listed positions, with size and colour of the scanned ones; trees have solid trunks."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_each_plant_has_its_position_size_and_colour(planted: Path) -> None:
         assert (np.abs(near.mean(axis=0) / near.mean() - colour / colour.mean()) < 0.15).all()
 
 
-def test_trees_have_trunks_that_bodies_run_into_and_bushes_none(planted: Path) -> None:
+def test_only_trees_have_solid_trunks(planted: Path) -> None:
     shape = textured_mesh.read(planted)
     assert shape is not None
     names = [surface.name for surface in by_class("vegetation", shape)]
@@ -51,12 +51,12 @@ def test_trees_have_trunks_that_bodies_run_into_and_bushes_none(planted: Path) -
     assert trunk.centre[:2] == pytest.approx((0, 0), abs=0.01) and trunk.length > 4
 
 
-def test_no_plants_make_an_empty_mesh(tmp_path: Path) -> None:
+def test_no_plants_give_an_empty_mesh(tmp_path: Path) -> None:
     low_poly_plants.plant(np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 3), np.uint8), Frame(), tmp_path)
     assert textured_mesh.read(tmp_path) is None
 
 
-def test_the_models_are_those_of_the_generator(tmp_path: Path) -> None:
+def test_stored_models_equal_those_of_the_generator(tmp_path: Path) -> None:
     with np.load(make(tmp_path / "plants.npz")) as made, np.load(low_poly_plants.MODELS) as kept:
         assert made.files == kept.files
         for name in made.files:

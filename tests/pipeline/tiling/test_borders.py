@@ -1,4 +1,4 @@
-"""Where tiles meet: made apart, they share their border vertex for vertex."""
+"""Borders of tiles: meshes made separately are joined to share their border vertices exactly."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ from tests.conftest import ROOT
 from tests.fakes.steps import step_params
 from tests.present import present
 
-X, Y, Z = 500_000.0, 5_400_000.0, 200.0  # the middle of the made-up scenes
+X, Y, Z = 500_000.0, 5_400_000.0, 200.0  # centre of the synthetic scenes
 WEST = Frame("EPSG:32633", (X - 12, Y + 1, Z))
 EAST = Frame("EPSG:32633", (X + 9, Y - 3, Z + 2))
 SEEDS = {"east": (X + 5.0, Y + 2.0), "west": (X - 5.0, Y - 2.0)}  # an oblique border; "east" owns it
 
 
 def cells(seeds: Mapping[str, tuple[float, float]]) -> dict[str, Cell]:
-    """Each a neighbour of all others."""
+    """Voronoi cells, each a neighbour of all others."""
     return {name: Cell(seeds[name], {k: v for k, v in seeds.items() if k != name}) for name in seeds}
 
 
@@ -94,7 +94,7 @@ def scene(frame: Frame, spacing: float, seed: int, noise: float = 0.02) -> Mesh:
 
 
 def outward(mesh: Mesh) -> np.ndarray:
-    """(F,) positive for faces of the scene that look up, to the wall's front, or out of the box."""
+    """(F,) positive for faces of the scene that face up, to the wall's front, or out of the box."""
     middle = world(mesh)[mesh.faces].mean(axis=1) - (X, Y, Z)
     y = middle[:, 1]
     out = np.tile([0.0, 0.0, 1.0], (len(mesh), 1))
@@ -106,13 +106,13 @@ def outward(mesh: Mesh) -> np.ndarray:
 def clipped_and_joined(
     meshes: Mapping[str, Mesh], where: Mapping[str, Cell]
 ) -> tuple[dict[str, Clipped], dict[str, Mesh]]:
-    """All clipped, and all joined."""
+    """All meshes clipped, and all joined."""
     clips = {name: clip(mesh, where[name]) for name, mesh in meshes.items()}
     return clips, {name: join(name, clips, 0.3, 0.5).mesh for name in meshes}
 
 
 def crowded(mesh: Mesh) -> int:
-    """Number of edges with more than two faces, or with two that run the same way."""
+    """Number of edges with more than two faces, or with two in the same direction."""
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     _, ways = np.unique(edges, axis=0, return_counts=True)
     return int((ways > 1).sum())
@@ -125,12 +125,12 @@ def go(step: Step, out: Path, inputs: Mapping[str, Path], **params: Any) -> Done
 
 @pytest.fixture(scope="module")
 def two() -> tuple[dict[str, Mesh], dict[str, Clipped], dict[str, Mesh]]:
-    """The scene as two tiles have it: meshes, clipped, joined."""
+    """The scene in two tiles: meshes, clipped meshes, joined meshes."""
     meshes = {"east": scene(EAST, 0.08, 1), "west": scene(WEST, 0.1, 2)}
     return meshes, *clipped_and_joined(meshes, cells(SEEDS))
 
 
-def test_clip_keeps_the_own_side_and_the_surface(two: Any) -> None:
+def test_clip_keeps_the_own_side_unchanged(two: Any) -> None:
     meshes, clips, _ = two
     area = sum(float(clip.mesh.face_area.sum()) for clip in clips.values())
     assert area == pytest.approx(float(meshes["east"].face_area.sum()), rel=0.1)
@@ -145,7 +145,7 @@ def test_clip_keeps_the_own_side_and_the_surface(two: Any) -> None:
         assert cut.mesh.face_area.min() > 1e-7, "no degenerate faces"
 
 
-def test_the_border_is_the_very_same(two: Any) -> None:
+def test_joined_meshes_have_identical_borders(two: Any) -> None:
     _, clips, joined = two
     cell = cells(SEEDS)["east"]
     before = gap(clips["east"].mesh, clips["west"].mesh, cell, "west")
@@ -160,18 +160,18 @@ def test_the_border_is_the_very_same(two: Any) -> None:
     assert replace(thin, overlap_m=0) == replace(after, overlap_m=0) and thin.overlap_m < 0.005
 
 
-def test_the_owner_stays_and_the_other_is_sound(two: Any) -> None:
+def test_owner_mesh_is_unchanged_and_the_other_one_valid(two: Any) -> None:
     _, clips, joined = two
     assert np.array_equal(joined["east"].vertices, clips["east"].mesh.vertices)
     assert np.array_equal(joined["east"].faces, clips["east"].mesh.faces)
     mesh = joined["west"]
     assert crowded(mesh) == 0
-    assert outward(mesh).min() > 0, "no face is turned over"
+    assert outward(mesh).min() > 0, "a face is flipped"
     assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)
 
 
-def test_surface_beyond_the_border_follows_it(tmp_path: Path) -> None:
-    """A border that lay 10 cm lower is met by a ramp of half a metre, not a step."""
+def test_joined_surface_ramps_to_the_border(tmp_path: Path) -> None:
+    """A border 10 cm below the surface is joined by a ramp of half a metre, not by a step."""
     flat = {
         name: scene(frame, 0.1, 0, noise=0.0).keep(np.arange(len(scene(frame, 0.1, 0))) < 2 * 60 * 80)
         for name, frame in (("east", EAST), ("west", WEST))
@@ -215,7 +215,7 @@ def test_three_tiles_meet_where_the_first_has_a_hole() -> None:
     assert between.shared == 1 and between.max_m == 0
 
 
-def test_a_missing_neighbour_leaves_the_border_as_cut(two: Any) -> None:
+def test_border_to_a_missing_neighbour_stays_as_clipped(two: Any) -> None:
     _, clips, _ = two
     alone = join("west", {"west": clips["west"]}, 0.3, 0.5)
     assert np.array_equal(alone.mesh.vertices, clips["west"].mesh.vertices) and alone.metrics == {}
@@ -269,7 +269,7 @@ def test_joined_borders_meet_and_other_open_edges_are_decimated(two: Any, tmp_pa
         around = cloud(mesh.frame, seed=3)
         replace(around, xyz=around.xyz + np.array([0, 0, 0.05], np.float32)).save(
             out / "cloud.npz"
-        )  # it is fitted to that
+        )  # which is fitted to the border
         inputs = {"terrain": out / "terrain.npz", "cloud": out / "cloud.npz"}
         tile_cell = {"name": "a", "seed": cell.seed, "neighbours": cell.neighbours}
         done = go(COLLISION, out, inputs, triangles=1000, context=tile_cell)
@@ -295,7 +295,7 @@ def test_border_exceeding_the_target_is_kept_with_a_warning(two: Any, tmp_path: 
 
 
 def rim_edges(mesh: Mesh, cell: Cell) -> int:
-    """Open edges that are on no border."""
+    """Open edges that are not on a border."""
     opened = curve(mesh.faces, np.ones(len(mesh.vertices), bool)).edges
     return int((~on_border(mesh, cell)[opened].all(axis=1)).sum())
 
@@ -313,7 +313,7 @@ def test_decimate_keeps_the_border_on_request(tmp_path: Path) -> None:
 
 
 def cloud(frame: Frame, seed: int = 0, n: int = 60_000) -> PointCloud:
-    """Points of the ground around the middle as LAS holds them, to the millimetre; the same for every frame."""
+    """Ground points around the centre, to the millimetre as in LAS; equal for every frame."""
     random = np.random.default_rng(seed)
     xy = random.uniform(-8, 8, (n, 2))
     xyz = np.column_stack([xy, height(*xy.T)]).round(3) + (X, Y, Z)
@@ -328,7 +328,7 @@ def cloud(frame: Frame, seed: int = 0, n: int = 60_000) -> PointCloud:
 
 
 def overlapped(seeds: Mapping[str, tuple[float, float]], out: Path, missing: str = "") -> dict[str, PointCloud]:
-    """What each tile has after `overlap`, of clouds that reach 2 m beyond its cell; tiles' classes differ."""
+    """Cloud of each tile after `overlap`, from clouds that extend 2 m beyond the cells, with different classes."""
     where, found = cells(seeds), {}
     for k, (name, cell) in enumerate(where.items()):
         frame = Frame("EPSG:32633", (X + 30.0 * k - 50, Y - 20.0 * k, Z))
@@ -354,22 +354,22 @@ def everywhere(points: PointCloud) -> np.ndarray:
 
 
 @pytest.mark.parametrize("count", [2, 4])
-def test_overlap_loses_no_point_and_doubles_none(count: int, tmp_path: Path) -> None:
+def test_overlap_neither_loses_nor_duplicates_points(count: int, tmp_path: Path) -> None:
     seeds = dict(list({"a": (X - 4.0, Y), "b": (X + 4.0, Y), "c": (X, Y + 6.0), "d": (X, Y - 6.0)}.items())[:count])
     where, found = cells(seeds), overlapped(seeds, tmp_path)
     labels = {name: 2 + k for k, name in enumerate(seeds)}
     whole = cloud(WEST)
     for name, points in found.items():
         outside = where[name].outside(everywhere(whole)[:, :2])
-        sure = np.abs(outside - 2) > 0.001  # of points at the rim either way is right
+        sure = np.abs(outside - 2) > 0.001  # points at the rim may be in either
         inside = np.isin(times(whole), times(points))
         assert (inside == (outside <= 2))[sure].all()
-        assert len(np.unique(times(points))) == len(points), "none twice"
+        assert len(np.unique(times(points))) == len(points), "duplicate points"
         own = where[name].outside(everywhere(points)[:, :2]) <= -0.001
         classification = present(points.classification)
         assert (classification[own] == labels[name]).all() and len(set(classification.tolist())) > 1
     taken = [times(found[name], present(found[name].classification) == labels[name]) for name in seeds]
-    assert np.array_equal(np.sort(np.concatenate(taken)), times(whole)), "every point is one tile's own"
+    assert np.array_equal(np.sort(np.concatenate(taken)), times(whole)), "each point belongs to one tile"
 
 
 def test_overlap_skips_missing_neighbours(tmp_path: Path) -> None:
@@ -379,7 +379,7 @@ def test_overlap_skips_missing_neighbours(tmp_path: Path) -> None:
     assert np.array_equal(times(found), times(PointCloud.load(tmp_path / "a.npz")))
 
 
-def test_points_on_a_border_are_the_first_tiles(tmp_path: Path) -> None:
+def test_points_on_a_border_belong_to_the_first_tile(tmp_path: Path) -> None:
     seeds = {"a": (X - 4.0, Y), "b": (X + 4.0, Y)}
     for k, name in enumerate(seeds):
         frame = Frame("EPSG:32633", (X - k, Y, Z))
@@ -395,7 +395,7 @@ def test_points_on_a_border_are_the_first_tiles(tmp_path: Path) -> None:
         }
 
 
-def test_voxels_of_two_tiles_are_the_same_where_they_overlap(tmp_path: Path) -> None:
+def test_voxels_of_two_tiles_are_identical_in_their_overlap(tmp_path: Path) -> None:
     seeds = {"a": (X - 4.0, Y + 1), "b": (X + 4.0, Y - 1)}
     where = cells(seeds)
     rows = {}
@@ -440,15 +440,15 @@ def test_geometry_uses_only_points_of_the_own_cell(two: Any, tmp_path: Path) -> 
     assert whole.metrics["terrain"]["cloud_to_mesh_p95_m"] > 5 > own.metrics["terrain"]["cloud_to_mesh_p95_m"]
 
 
-# --- all of it ---
+# --- complete reconstruction ---
 
 
-def test_a_real_reconstruction_cut_in_two_meets_again(tmp_path: Path) -> None:
+def test_reconstruction_of_a_street_in_two_tiles_is_joined(tmp_path: Path) -> None:
     frame = Frame("EPSG:32633", (391_204.0, 5_820_376.0, 33.0))
     whole = las.read(ROOT / "data_samples" / "tile" / "cloud.laz", frame)
     assert whole.classification is not None
     whole = whole.take(np.flatnonzero(group_of()[whole.classification] == GROUPS.index("terrain")))
-    along = np.array([-0.6, 0.8])  # the street
+    along = np.array([-0.6, 0.8])  # along the street
     middle = np.array(frame.origin[:2])
     seeds = {name: tuple((middle + way * along).tolist()) for name, way in (("a", -10), ("b", 10))}
     where, raw = cells(seeds), {}

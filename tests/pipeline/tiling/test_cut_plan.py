@@ -1,4 +1,4 @@
-"""A corridor cut into tiles: nothing is lost, neighbours hold the same points, and memory doesn't grow."""
+"""A corridor cut into tiles: no point is lost, neighbours have identical points, and memory is constant."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from tests.present import present
 
 UTM = Frame("EPSG:32632", (690_000.0, 5_335_000.0, 500.0))
 FEET = Frame("EPSG:2994", (200_000.0, 300_000.0, 30.0), 0.3048)
-RADIUS, ANGLE = 200.0, 1.5  # of the street, which bends to the left: 300 m of it
+RADIUS, ANGLE = 200.0, 1.5  # of the street, which bends to the left, 300 m long
 CUT = CutParams(length=100, buffer=5, max_distance=20)
 CAMERA = Camera("pinhole", 64, 48, 32.0, 32.0, 31.5, 23.5)
 
 
 def street(along: np.ndarray, aside: np.ndarray) -> np.ndarray:
-    """(N, 2) local places, metres along the street and to the right of its middle."""
+    """(N, 2) local positions, from metres along the street and to the right of its middle."""
     a = along / RADIUS
     return np.column_stack([(RADIUS + aside) * np.sin(a), RADIUS - (RADIUS + aside) * np.cos(a)])
 
@@ -49,7 +49,7 @@ def drive(*, back: bool = True) -> np.ndarray:
 
 
 def points(n: int = 200_000, seed: int = 0, frame: Frame = UTM) -> PointCloud:
-    """A street with all attributes, wider than the path's reach."""
+    """Points of a street with all attributes, beyond the maximum distance from the path."""
     rng = np.random.default_rng(seed)
     along = np.sort(rng.uniform(0, RADIUS * ANGLE, n))
     xy = street(along, rng.uniform(-26, 26, n))
@@ -74,7 +74,7 @@ def facing(along: float, aside: float = 0.0) -> dict[str, Any]:
 def corridor(
     folder: Path, frame: Frame = UTM, n: int = 200_000, path: np.ndarray | None = None, **more: object
 ) -> Path:
-    """The street's folder, its cloud in three files."""
+    """Write the street's tile folder, with its cloud in three files."""
     folder.mkdir(parents=True)
     cloud = points(n, frame=frame)
     for i, part in enumerate(np.array_split(np.arange(n), 3)):
@@ -134,7 +134,7 @@ def rows(files: Iterator[Path] | list[Path], frame: Frame) -> np.ndarray:
 
 
 def shares(source: np.ndarray, places: np.ndarray, unit: float, buffer: float) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) the own tile and (N, S) which tiles hold each point, asking every pair of seeds."""
+    """Own tile (N,) of each point, and mask (N, S) of tiles that contain it, by exhaustive search over seeds."""
     xy = source["place"][:, :2] / 1000 * unit
     squared = ((xy[:, None] - places) ** 2).sum(axis=2)
     apart = np.linalg.norm(places[:, None] - places, axis=2)
@@ -150,8 +150,8 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def left(folder: Path) -> list[str]:
-    """What a failed run left beside the corridor."""
+def leftovers(folder: Path) -> list[str]:
+    """Names of files that a failed run left next to the corridor."""
     return sorted(p.name for p in folder.iterdir() if p.name != "corridor")
 
 
@@ -172,20 +172,20 @@ def placed(path: Trajectory, length: float = 100.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("metres", [1000, 1030, 960])
-def test_a_straight_path_is_cut_evenly(metres: int) -> None:
+def test_straight_path_is_cut_evenly(metres: int) -> None:
     made = seeds("s", Frame(), 100.0, (0, 0), (1, 1), path_of((0, 0), (metres, 0)))
     assert list(made) == [f"s_{i:04d}" for i in range(10)]
     assert np.allclose(list(made.values()), [((i + 0.5) * metres / 10, 0) for i in range(10)], atol=0.001)
 
 
-def test_the_other_lane_and_a_second_drive_make_no_new_seeds() -> None:
+def test_repeated_passes_and_the_other_lane_add_no_seeds() -> None:
     once = placed(path_of((0, 0), (1000, 0)))
     over_and_back = [(0.0, 0.0), (1000.0, 0.0), (1000.0, 5.0), (0.0, 5.0)]
     again = placed(path_of(*over_and_back, *over_and_back))
     assert again.shape == once.shape and np.abs(again - once).max() < 10
 
 
-def test_a_town_has_seeds_about_a_length_apart_everywhere() -> None:
+def test_seeds_in_a_town_are_about_a_tile_length_apart() -> None:
     rng = np.random.default_rng(0)
     at, corners = np.zeros(2), [(0.0, 0.0)]
     for _ in range(300):
@@ -211,11 +211,11 @@ def test_gap_in_the_path_is_reported() -> None:
 
 
 @pytest.mark.parametrize("path", [path_of((0, 0), (30, 0)), path_of((15, 0), (15, 0))])
-def test_a_short_path_is_one_tile(path: Trajectory) -> None:
+def test_short_path_is_one_tile(path: Trajectory) -> None:
     assert np.allclose(placed(path), [(15, 0)])
 
 
-def test_standing_still_makes_no_way() -> None:
+def test_standing_still_does_not_lengthen_the_path() -> None:
     rng = np.random.default_rng(0)
     path = path_of((0, 0), (300, 0))
     still = path.positions[150] + np.column_stack([rng.normal(0, 0.05, (5000, 2)), np.zeros(5000)])
@@ -223,7 +223,7 @@ def test_standing_still_makes_no_way() -> None:
     assert np.allclose(placed(Trajectory(np.arange(len(xyz), dtype=float) * 0.1, xyz)), placed(path), atol=0.5)
 
 
-def test_without_a_path_seeds_are_on_a_grid() -> None:
+def test_seeds_without_a_path_are_on_a_grid() -> None:
     made = seeds("s", Frame(), 50.0, (0, 0), (110, 95))
     assert list(made.values()) == [(30, 22.5), (80, 22.5), (30, 72.5), (80, 72.5)]
     assert list(seeds("s", Frame(), 500.0, (0, 0), (110, 95)).values()) == [(55, 47.5)]
@@ -240,7 +240,7 @@ def test_seeds_are_rounded_to_thousandths_of_the_unit() -> None:
 
 
 @pytest.mark.parametrize("buffer", [0.0, 3.0, 20.0])
-def test_members_are_those_of_every_pair_of_seeds(buffer: float) -> None:
+def test_tile_membership_equals_exhaustive_search(buffer: float) -> None:
     rng = np.random.default_rng(4)
     places, xy = rng.uniform(0, 300, (40, 2)), rng.uniform(-50, 350, (3000, 2))
     source = np.zeros(len(xy), [("place", "f8", 3)])
@@ -258,7 +258,7 @@ def test_members_are_those_of_every_pair_of_seeds(buffer: float) -> None:
 # points
 
 
-def test_every_tile_holds_exactly_its_points_and_they_are_the_same_in_all(bend: Path, cut: Path) -> None:
+def test_tiles_contain_exactly_their_points_without_changes(bend: Path, cut: Path) -> None:
     made = tiles(cut)
     assert list(made) == ["bend_0000", "bend_0001", "bend_0002"]
     source = rows([bend / f"{i}.laz" for i in range(3)], UTM)
@@ -271,12 +271,12 @@ def test_every_tile_holds_exactly_its_points_and_they_are_the_same_in_all(bend: 
         got = rows(list(tile.clouds), UTM)
         wanted = source[holds[:, j]]
         kept = np.isin(wanted["place"] @ [1, 10**9, 7], got["place"] @ [1, 10**9, 7])
-        assert np.array_equal(got, wanted[kept])  # same points, attributes and order
+        assert np.array_equal(got, wanted[kept])  # equal points, attributes and order
         total += int(np.count_nonzero(kept & (own[holds[:, j]] == j)))
         some = np.flatnonzero(holds[::40, j])
         near = np.isin(source["place"][::40][some] @ [1, 10**9, 7], got["place"] @ [1, 10**9, 7])
         assert near[distance[some] < 19.5].all() and not near[distance[some] > 20.1].any()
-    assert 0.7 * len(source) < total < 0.9 * len(source)  # own parts: every point once
+    assert 0.7 * len(source) < total < 0.9 * len(source)  # each point is in the own part of one tile
     union = np.unique(np.concatenate([rows(list(tile.clouds), UTM) for tile in made.values()]))
     assert len(union) == total
 
@@ -292,7 +292,9 @@ def test_tiles_contain_their_cells(cut: Path) -> None:
             assert cell is not None and cell.seed == seed and cell.neighbours[name] == tile.cell.seed
         xyz = clouds.read(tile.clouds[0], tile.frame).xyz.astype(np.float64) + tile.frame.origin
         assert 4.9 < tile.cell.outside(xyz[:, :2]).max() <= 5 + 1e-3
-        assert tile.cell.buffer == 5.0 and set(tile.cell.neighbours) == set(made) - {name}  # they meet in the bend
+        assert tile.cell.buffer == 5.0 and set(tile.cell.neighbours) == set(made) - {
+            name
+        }  # all neighbours, in the bend
 
 
 def test_tiles_get_the_part_of_the_path_that_scanned_them(cut: Path) -> None:
@@ -304,9 +306,9 @@ def test_tiles_get_the_part_of_the_path_that_scanned_them(cut: Path) -> None:
         assert (near >= xyz[:, :2].min(axis=0) - 20.01).all() and (near <= xyz[:, :2].max(axis=0) + 20.01).all()
 
 
-def test_photos_go_to_the_tiles_that_they_see(bend: Path, cut: Path) -> None:
+def test_photos_are_assigned_to_the_tiles_that_they_see(bend: Path, cut: Path) -> None:
     seen = {name: [view.photo.name for view in tile.views] for name, tile in tiles(cut).items()}
-    # at 95 m a camera is in the first tile and sees the second, at 200 m it stands on a border and turns its back to
+    # at 95 m a camera is in the first tile and sees the second, at 200 m it is on a border and faces away from
     # the second, and at 290 m it looks out of the last one
     assert seen == {"bend_0000": ["10.jpg", "95.jpg"], "bend_0001": ["95.jpg"], "bend_0002": ["290.jpg", "lost.jpg"]}
     view = tiles(cut)["bend_0001"].views[0]
@@ -318,7 +320,7 @@ def test_photos_go_to_the_tiles_that_they_see(bend: Path, cut: Path) -> None:
     assert np.allclose(frame.to_crs(view.centre), source.frame.to_crs(source.views[1].centre), atol=1e-6)
 
 
-def test_photos_are_copied_where_asked_for(bend: Path, tmp_path: Path) -> None:
+def test_photos_are_copied_on_request(bend: Path, tmp_path: Path) -> None:
     warned: list[str] = []
     survey = cut_survey(bend, tmp_path / "out", CUT.model_copy(update={"copy_photos": True}), warn=warned.append)
     view = tiles(survey)["bend_0001"].views[0]
@@ -327,14 +329,14 @@ def test_photos_are_copied_where_asked_for(bend: Path, tmp_path: Path) -> None:
     assert any("1 of 4 photos are missing" in text and "lost.jpg" in text for text in warned)
 
 
-def test_two_cuts_write_the_same_bytes(bend: Path, cut: Path) -> None:
+def test_cut_is_deterministic(bend: Path, cut: Path) -> None:
     assert contents(cut_survey(bend, bend.parent / "again", CUT).parent) == contents(cut.parent)
     with laspy.open(cut.parent / "bend_0000/cloud.laz") as reader:
         assert reader.header.creation_date == las.CREATION_DATE == date(2000, 1, 1)
 
 
 @pytest.mark.parametrize("frame", [FEET, Frame("local", (50.0, 60.0, 7.0)), Frame("local", (0.0, 0.0, 0.0), 0.3048)])
-def test_feet_and_local_coordinates(tmp_path: Path, frame: Frame) -> None:
+def test_surveys_in_feet_and_local_coordinates_are_cut(tmp_path: Path, frame: Frame) -> None:
     units = "ft" if frame.crs == "local" and frame.unit != 1 else None
     source = corridor(tmp_path / "corridor", frame, 20_000, units=units)
     made = tiles(cut_survey(source, tmp_path / "out", CUT))
@@ -350,7 +352,7 @@ def test_feet_and_local_coordinates(tmp_path: Path, frame: Frame) -> None:
         assert sum(place in index for place in wanted) == len(got)
 
 
-def test_without_a_trajectory_squares_meet_in_a_corner(tmp_path: Path) -> None:
+def test_tiles_without_a_trajectory_are_squares_with_common_corners(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     xyz = np.column_stack([rng.uniform(0, 100, (20_000, 2)), rng.uniform(0, 5, 20_000)]).astype(np.float32)
     las.write(tmp_path / "a.laz", PointCloud(UTM, xyz))
@@ -362,7 +364,7 @@ def test_without_a_trajectory_squares_meet_in_a_corner(tmp_path: Path) -> None:
         assert tile.trajectory is None and 5500 < len(clouds.read(tile.clouds[0], tile.frame)) < 6600  # 55 m square
 
 
-def test_clouds_of_all_kinds_join_as_in_a_tile(tmp_path: Path) -> None:
+def test_clouds_with_different_attributes_are_joined(tmp_path: Path) -> None:
     cloud = points(30_000)
     folder = corridor(tmp_path / "corridor", n=30_000)
     las.write(folder / "1.laz", replace(cloud.take(slice(10_000, 20_000)), rgb=None))
@@ -383,7 +385,7 @@ def test_clouds_of_all_kinds_join_as_in_a_tile(tmp_path: Path) -> None:
     assert set(np.unique(present(last.classification))) == {1, 2, 6, 69}
 
 
-def test_chunks_are_what_reading_at_once_gives(tmp_path: Path) -> None:
+def test_chunks_equal_the_whole_cloud(tmp_path: Path) -> None:
     cloud = points(30_000)
     dark = np.where(np.arange(30_000)[:, None] < 25_000, 0, present(cloud.rgb))
     for rgb in (cloud.rgb, dark.astype(np.uint8), np.zeros_like(dark, np.uint8), None):
@@ -398,34 +400,34 @@ def test_chunks_are_what_reading_at_once_gives(tmp_path: Path) -> None:
             assert np.array_equal(getattr(joined, name), getattr(whole, name)), name
 
 
-# what goes wrong
+# errors
 
 
-def test_clouds_in_two_crs_are_refused(tmp_path: Path) -> None:
+def test_clouds_in_different_crs_are_rejected(tmp_path: Path) -> None:
     folder = corridor(tmp_path / "corridor", n=3_000)
     las.write(folder / "1.laz", replace(points(1_000), frame=replace(UTM, crs="EPSG:2154")))
     with pytest.raises(InputError, match=r"1\.laz: is in EPSG:2154, but 0\.laz is in EPSG:32632"):
         cut_survey(folder, tmp_path / "out", CUT)
-    assert left(tmp_path) == []
+    assert leftovers(tmp_path) == []
 
 
-def test_a_truncated_cloud_is_named_and_nothing_is_left(tmp_path: Path) -> None:
+def test_truncated_cloud_is_reported_and_leaves_no_files(tmp_path: Path) -> None:
     folder = corridor(tmp_path / "corridor", n=30_000)
     whole = (folder / "1.laz").read_bytes()
     (folder / "1.laz").write_bytes(whole[: len(whole) * 2 // 3])
     with pytest.raises(InputError, match=r"1\.laz.*Copy"):
         cut_survey(folder, tmp_path / "out", CUT)
-    assert left(tmp_path) == []
+    assert leftovers(tmp_path) == []
 
 
-def test_an_interruption_leaves_nothing(tmp_path: Path) -> None:
+def test_interruption_leaves_no_files(tmp_path: Path) -> None:
     def stop(fraction: float, message: str = "") -> None:
         if fraction > 0.7:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         cut_survey(corridor(tmp_path / "corridor", n=20_000), tmp_path / "out", CUT, report=stop)
-    assert left(tmp_path) == []
+    assert leftovers(tmp_path) == []
 
 
 def test_only_a_survey_is_overwritten_and_only_on_request(tmp_path: Path) -> None:
@@ -450,13 +452,13 @@ def test_only_a_survey_is_overwritten_and_only_on_request(tmp_path: Path) -> Non
     [({"length": 0}, "length"), ({"buffer": -1}, "buffer"), ({"length": 10, "buffer": 6}, "buffer"),
      ({"max_distance": float("nan")}, "max-distance"), ({"photo_distance": -1}, "photo-distance")],
 )  # fmt: skip
-def test_options_out_of_range_are_refused(tmp_path: Path, options: dict[str, float], field: str) -> None:
+def test_options_out_of_range_are_rejected(tmp_path: Path, options: dict[str, float], field: str) -> None:
     with pytest.raises(SettingError, match=field):
         cut_survey(tmp_path, tmp_path / "out", CutParams.of("", options))
 
 
 def test_tiles_with_few_points_are_merged_into_neighbours(tmp_path: Path) -> None:
-    xy = street(np.arange(0, 500, 0.5), np.zeros(1000))  # drives on where there are no clouds
+    xy = street(np.arange(0, 500, 0.5), np.zeros(1000))  # the path continues where there are no clouds
     path = np.column_stack([np.arange(1000) / 20, xy, np.full(1000, 2.0)])
     folder = corridor(tmp_path / "corridor", n=20_000, path=path)
     warned: list[str] = []
@@ -474,10 +476,10 @@ def test_trajectory_far_from_the_points_is_an_error(tmp_path: Path) -> None:
     folder = corridor(tmp_path / "corridor", n=20_000, path=path)
     with pytest.raises(DataError, match=r"only 0 points, and 20,000 farther than 20 m.*CRS of clouds and trajectory"):
         cut_survey(folder, tmp_path / "out", CUT)
-    assert left(tmp_path) == []
+    assert leftovers(tmp_path) == []
 
 
-def test_surveys_that_are_wrong_are_named(tmp_path: Path) -> None:
+def test_invalid_surveys_are_rejected_with_their_cause(tmp_path: Path) -> None:
     out = cut_survey(corridor(tmp_path / "corridor", n=20_000), tmp_path / "out", CUT)
     text = out.read_text(encoding="utf-8")
     with pytest.raises(InputError, match="no survey found"):
@@ -502,7 +504,7 @@ def test_surveys_that_are_wrong_are_named(tmp_path: Path) -> None:
 # memory
 
 
-def test_memory_does_not_grow_with_the_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_independent_of_the_number_of_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = corridor(tmp_path / "corridor", n=6_000)
     part = points(20_000)
     monkeypatch.setattr("scan2sim.pipeline.tiling.point_spool.CHUNK_POINTS", 20_000)
@@ -515,5 +517,5 @@ def test_memory_does_not_grow_with_the_points(tmp_path: Path, monkeypatch: pytes
         tracemalloc.stop()
         return most
 
-    peak(1)  # what is loaded once
+    peak(1)  # data that is loaded once
     assert peak(20) < 1.5 * peak(2)  # of each of three files

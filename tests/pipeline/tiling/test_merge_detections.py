@@ -1,4 +1,4 @@
-"""Street furniture at the borders of tiles: found once, one mesh in one tile, removed from both tiles alike."""
+"""Street furniture at tile borders: listed once, with one mesh in one tile, and removed from both tiles identically."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def cell(name: str) -> Cell:
 
 
 def street() -> tuple[F64, Any]:
-    """World places (N, 3) and classes (N,) of points of a street."""
+    """World positions (N, 3) and classes (N,) of points of a street."""
     random = np.random.default_rng(0)
 
     def box(count: int, low: Any, high: Any) -> F64:
@@ -90,7 +90,7 @@ def known(name: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Tile:
-    """What was made of a tile."""
+    """Results of a tile."""
 
     cloud: PointCloud
     found: Path
@@ -99,24 +99,24 @@ class Tile:
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """What is listed, with the place `at` beside the middle."""
+        """Listed furniture, with position `at` relative to the centre."""
         features = json.loads(self.furniture.files["geojson"].read_text(encoding="utf-8"))["features"]
         return [f["properties"] | {"at": np.array(f["geometry"]["coordinates"]) - (X, Y, Z)} for f in features]
 
     @property
-    def taken(self) -> F64:
-        """(N, 3) world places of points that are furniture's."""
+    def furniture_xyz(self) -> F64:
+        """(N, 3) world positions of points that belong to furniture."""
         index = np.load(self.furniture.files["furniture_points"])["index"]
         return self.cloud.xyz[index].astype(np.float64) + self.cloud.frame.origin
 
     def mesh(self, group: str) -> Mesh:
-        """The things' own."""
+        """Furniture mesh of a group."""
         return Mesh.load(self.furniture.files[group])
 
 
 @pytest.fixture(scope="module")
 def clouds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The tiles' clouds, as both know them."""
+    """Clouds of the tiles, with their overlap."""
     folder = tmp_path_factory.mktemp("clouds")
     xyz, codes = street()
     for name, frame in FRAMES.items():
@@ -134,7 +134,7 @@ def clouds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def furnish(clouds: Mapping[str, Path], found: Mapping[str, Path], name: str, out: Path) -> Tile:
-    """A tile with the detections of some tiles."""
+    """Results of a tile with the detections of the given tiles."""
     detections = {"detections" if tile == name else f"detections.{tile}": path for tile, path in found.items()}
     done = go(FURNITURE, out / "furniture", {"cloud": clouds[name], **detections}, name=name, **known(name))
     split = go(SPLIT, out / "split", {"cloud": clouds[name], "furniture_points": done.files["furniture_points"]})
@@ -143,7 +143,7 @@ def furnish(clouds: Mapping[str, Path], found: Mapping[str, Path], name: str, ou
 
 @pytest.fixture(scope="module")
 def tiles(clouds: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Tile]:
-    """Both."""
+    """Results of both tiles."""
     folder = tmp_path_factory.mktemp("tiles")
     found = {}
     for name in FRAMES:
@@ -170,7 +170,7 @@ def test_furniture_mesh_is_complete_in_one_tile(tiles: dict[str, Tile]) -> None:
     codes = {name: present(tile.mesh("building").classification) for name, tile in tiles.items()}
     (owner,) = [name for name in codes if (codes[name] == CODE["road_sign"]).any()]
     plate = world(tiles[owner].mesh("building").keep(codes[owner] == CODE["road_sign"])) - (X, Y, Z)
-    assert plate[:, 0].min() == pytest.approx(SIGN[0] - 0.3, abs=0.04)  # beyond the border, too
+    assert plate[:, 0].min() == pytest.approx(SIGN[0] - 0.3, abs=0.04)  # also beyond the border
     assert plate[:, 0].max() == pytest.approx(SIGN[0] + 0.3, abs=0.04)
     lamp = corners["west"][np.abs(corners["west"][:, 1] - LAMP[1]) < 0.5]
     assert lamp[:, 0].max() > 1.0 and lamp[:, 2].max() > 4.9
@@ -183,13 +183,13 @@ def test_furniture_points_are_removed_from_surfaces(tiles: dict[str, Tile]) -> N
         left = PointCloud.load(tile.split.files["building"])
         xyz = left.xyz + np.asarray(tile.cloud.frame.origin) - (X, Y, Z)
         beside = xyz[xyz[:, 1] < WALL - 0.1]
-        assert len(beside) < 0.01 * len(tile.taken)
+        assert len(beside) < 0.01 * len(tile.furniture_xyz)
 
 
 def test_both_tiles_remove_the_same_points(tiles: dict[str, Tile]) -> None:
-    east, west = ({tuple(p) for p in tile.taken.tolist() if abs(p[0] - X) <= BUFFER} for tile in tiles.values())
+    east, west = ({tuple(p) for p in tile.furniture_xyz.tolist() if abs(p[0] - X) <= BUFFER} for tile in tiles.values())
     assert east == west and len(east) > 5000
-    for tile in tiles.values():  # the neighbour's furniture occludes, and gives no colour
+    for tile in tiles.values():  # furniture of the neighbour occludes, but gives no colour
         own = np.load(tile.furniture.files["furniture_points"])["own"]
         assert len(PointCloud.load(tile.split.files["furniture"])) == own.sum() > 0
         assert len(PointCloud.load(tile.split.files["rest"])) == (~own).sum() > 0
@@ -216,9 +216,9 @@ def test_surfaces_meet_vertex_for_vertex(tiles: dict[str, Tile], clouds: dict[st
     free = {name: mesh.keep(present(mesh.classification) == 0) for name, mesh in surfaces.items()}
     between = gap(free["west"], free["east"], cell("west"), "east")
     assert between.length_m > 3 and between.shared == 1 and between.one_sided_m == 0 and between.overlap_m < 1e-3
-    for mesh in free.values():  # no blob
+    for mesh in free.values():  # no surface of furniture
         assert (np.abs(world(mesh)[:, 1] - (Y + WALL)) < 0.15).all()
-    # bodies touch the sign on both sides of the border, in the tile that has it
+    # the collision mesh of the sign extends across the border, in the tile that lists it
     (owner,) = [n for n, mesh in surfaces.items() if (present(mesh.classification) == CODE["road_sign"]).any()]
     file = tmp_path / owner / "7" / "mesh.npz"
     done = go(
@@ -238,13 +238,13 @@ def test_furniture_detected_by_one_tile_is_removed_from_both(
 ) -> None:
     nothing = go(
         DETECT_FURNITURE, tmp_path / "nothing", {"cloud": clouds[silent_one]}, **known(silent_one)
-    )  # it has no path
+    )  # this tile has no path
     found = {name: tile.found for name, tile in tiles.items()} | {silent_one: nothing.files["detections"]}
     made = {name: furnish(clouds, found, name, tmp_path / name) for name in FRAMES}
-    east, west = ({tuple(p) for p in tile.taken.tolist() if abs(p[0] - X) <= BUFFER} for tile in made.values())
+    east, west = ({tuple(p) for p in tile.furniture_xyz.tolist() if abs(p[0] - X) <= BUFFER} for tile in made.values())
     assert east == west
     kinds = {row["kind"] for tile in made.values() for row in tile.rows}
-    assert kinds == {"sign", "trunk", "pole" if silent_one == "west" else "lamp"}  # the other tile lists the others
+    assert kinds == {"sign", "trunk", "pole" if silent_one == "west" else "lamp"}  # the other tile lists the rest
     assert sum(len(tile.rows) for tile in made.values()) == 3
 
 
@@ -271,7 +271,7 @@ def test_merge_is_independent_of_tile_order(tiles: dict[str, Tile]) -> None:
     assert [(name, t.to_json()) for name, t in one] == [(name, t.to_json()) for name, t in other]
 
 
-def test_two_poles_side_by_side_on_a_border_stay_two(tiles: dict[str, Tile]) -> None:
+def test_adjacent_poles_on_a_border_are_not_merged(tiles: dict[str, Tile]) -> None:
     detections = [Detection.from_json(row) for row in json.loads(tiles["west"].found.read_text(encoding="utf-8"))]
     (sign,) = [thing for thing in detections if thing.kind == "sign"]
     beside = sign.moved(np.array([-0.3, 0.0, 0.0]))

@@ -1,4 +1,4 @@
-"""Poisson in blocks: a partition of the points, and one surface without cracks, the same on any number of cores."""
+"""Poisson in blocks: partition of points, and one surface without cracks, identical on any number of cores."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def height(xy: F64) -> F64:
 
 @pytest.fixture(scope="module")
 def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A waving ground of 30 m with a point in every voxel, 5 mm of noise, and true normals."""
+    """An undulating ground of 30 m with one point per voxel, 5 mm of noise, and true normals."""
     random = np.random.default_rng(0)
     steps = np.arange(-SIZE / 2, SIZE / 2, VOXEL) + VOXEL / 2
     xy = np.stack(np.meshgrid(steps, steps), axis=2).reshape(-1, 2)
@@ -68,7 +68,7 @@ def on_ground(mesh: Mesh) -> F64:
 
 
 @pytest.mark.parametrize("threads", [1, 8])
-def test_any_number_of_threads_gives_the_same_bytes(
+def test_result_is_byte_identical_on_any_number_of_threads(
     cloud: Path, in_blocks: tuple[Done, Mesh], tmp_path: Path, threads: int
 ) -> None:
     done, _ = reconstruct(cloud, tmp_path, block_points=30_000, threads=threads)
@@ -81,7 +81,9 @@ def test_blocks_meet_without_cracks(in_blocks: tuple[Done, Mesh]) -> None:
     assert not ((np.abs(cracks[:, :2]) < CRACK_FREE_M).all(axis=1) & (np.abs(cracks[:, 2]) < 1)).any()
 
 
-def test_surface_is_as_accurate_in_blocks_as_whole(cloud: Path, in_blocks: tuple[Done, Mesh], tmp_path: Path) -> None:
+def test_surface_in_blocks_is_as_accurate_as_in_one_piece(
+    cloud: Path, in_blocks: tuple[Done, Mesh], tmp_path: Path
+) -> None:
     done, whole = reconstruct(cloud, tmp_path)
     assert done.metrics["blocks"] == 1
     error = [np.abs(v[:, 2] - height(v)).mean() for v in (on_ground(whole), on_ground(in_blocks[1]))]
@@ -89,15 +91,15 @@ def test_surface_is_as_accurate_in_blocks_as_whole(cloud: Path, in_blocks: tuple
     assert error[1] < 1.02 * error[0]
 
 
-def test_walls_between_blocks_do_not_show(cloud: Path, in_blocks: tuple[Done, Mesh]) -> None:
-    """Vertices next to walls, which are multiples of 6.4 m in the world, are as accurate as all others."""
+def test_accuracy_is_not_reduced_at_block_boundaries(cloud: Path, in_blocks: tuple[Done, Mesh]) -> None:
+    """Vertices next to boundaries, at multiples of 6.4 m in the world, are as accurate as all others."""
     vertices = on_ground(in_blocks[1])
     error = np.abs(vertices[:, 2] - height(vertices))
     to_wall = np.abs(np.mod(vertices[:, :2] + FRAME.origin[:2] + 3.2, 6.4) - 3.2).min(axis=1)
     assert error[to_wall < VOXEL].mean() < 1.1 * error.mean()
 
 
-def test_partition_depends_on_the_world_and_covers_every_point_once() -> None:
+def test_partition_is_on_a_world_grid_and_covers_every_point_once() -> None:
     random = np.random.default_rng(1)
     xy = random.uniform((0, 0), (100, 60), (50_000, 2))
     blocks = partition(xy, 6.4, np.zeros(2), 2.4, 10_000)
@@ -109,12 +111,12 @@ def test_partition_depends_on_the_world_and_covers_every_point_once() -> None:
     assert partition(xy[:10_000], 6.4, np.zeros(2), 2.4, 10_000) == [Block()]
 
 
-def test_small_clouds_are_not_divided_however_dense() -> None:
+def test_small_clouds_are_not_divided_at_any_density() -> None:
     xy = np.random.default_rng(2).uniform(0, 20, (50_000, 2))
     assert partition(xy, 6.4, np.zeros(2), 2.4, 1_000) == [Block()]
 
 
-def test_borders_that_differ_are_closed() -> None:
+def test_stitching_closes_different_borders() -> None:
     """The second border has a vertex more than the first, and a step that is too high to be welded."""
     left = np.array([[-1, 0, 0], [-1, 2, 0], [-1, 4, 0], [0, 0, 0], [0, 2, 0], [0, 4, 0]], np.float32)
     right = np.array([[0, 0, 0.001], [0, 1, 0], [0, 2, 0], [0, 4, 0.3], [1, 0, 0], [1, 2, 0], [1, 4, 0]], np.float32)
@@ -134,7 +136,7 @@ def test_borders_that_differ_are_closed() -> None:
     assert np.abs(on_wall - (0, 4, 0.15)).max() < 1e-6  # only the height of the step, at the end of the wall, is open
 
 
-def test_block_that_crashes_is_repeated_and_then_made_coarser(
+def test_crashed_block_is_retried_and_then_coarsened(
     cloud: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[tuple[int, int]] = []

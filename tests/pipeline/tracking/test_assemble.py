@@ -1,4 +1,4 @@
-"""Tracks of simulated sweeps: cars, a cyclist and a pedestrian on a plane, of which the scanner sees the near sides."""
+"""Tracks in simulated sweeps: cars, a cyclist and a pedestrian on a plane; the scanner sees their near sides."""
 
 from dataclasses import replace
 from functools import cache
@@ -83,7 +83,7 @@ def cloud_of(rows: F64, classes: np.ndarray) -> PointCloud:
 
 
 @pytest.mark.parametrize("name", list(ACTORS))
-def test_road_users_are_followed(name: str) -> None:
+def test_road_users_are_tracked(name: str) -> None:
     category, size, *_ = ACTORS[name]
     middle = SWEEPS * PERIOD_S / 2
     (track,) = (
@@ -103,7 +103,7 @@ def test_road_users_are_followed(name: str) -> None:
     assert track.colour == (200, 20, 30)
 
 
-def test_nothing_else_moves_and_the_parked_car_has_one_box() -> None:
+def test_only_actors_move_and_the_parked_car_has_one_box() -> None:
     tracks = tracked()
     assert sum(track.moving for track in tracks) == 1 + len(ACTORS)
     (still,) = (track for track in tracks if not track.moving)

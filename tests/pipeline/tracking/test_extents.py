@@ -1,4 +1,4 @@
-"""Completion of boxes, and categories."""
+"""Completion of vehicle boxes, and categories by size and speed."""
 
 import numpy as np
 import pytest
@@ -20,13 +20,13 @@ from scan2sim.pipeline.tracking.tracks import footprint
         ((2.1, 0.1), (0.7, 0.1), 1.4, 15.0, "motorcycle"),
     ],
 )
-def test_category_by_size_and_speed(
+def test_category_is_determined_by_size_and_speed(
     length: tuple[float, float], width: tuple[float, float], height: float, speed: float, category: str
 ) -> None:
     assert categorize(length, width, height, speed) == category
 
 
-def test_unseen_length_is_typical_and_a_side_seen_in_full_is_measured() -> None:
+def test_unseen_length_is_typical_and_fully_seen_side_measured() -> None:
     typical, largest = TYPICAL["car"].length, 5.3
     mean, sigma, _ = extents.completed(0.5, 10.0, 0, typical, largest)
     assert mean == pytest.approx(typical, abs=0.1) and sigma > 0.3
@@ -66,7 +66,7 @@ def test_parked_car_of_which_the_rear_was_seen_is_completed_away_from_the_scanne
     assert box.sigma[0] > 0.15
 
 
-def test_hedge_below_a_post_has_no_body() -> None:
+def test_hedge_below_a_post_is_not_a_vehicle_body() -> None:
     rng = np.random.default_rng(0)
     hedge = rng.uniform([-2, -0.7, 0.1], [2, 0.7, 0.55], (600, 3))
     post = rng.uniform([-0.1, -0.1, 0.1], [0.1, 0.1, 1.5], (80, 3))

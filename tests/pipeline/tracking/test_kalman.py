@@ -20,7 +20,7 @@ def test_smoothed_path_is_closer_than_the_measurements_and_within_its_uncertaint
     np.testing.assert_allclose(means[20, 2:4], [8, 0.8 * times[20]], atol=0.5)
 
 
-def test_gaps_are_bridged_with_more_uncertainty() -> None:
+def test_uncertainty_increases_in_gaps() -> None:
     times = np.arange(10, dtype=np.float64) / 10
     measured = [
         [kalman.Measurement(np.eye(4)[0], 5.0 * t, 0.01)] if not 3 <= k < 7 else [] for k, t in enumerate(times)

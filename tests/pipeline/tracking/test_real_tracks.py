@@ -1,4 +1,4 @@
-"""Road users of real streets."""
+"""Tracks of road users in real recordings."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def check_odometry_04(tracks: list[Track]) -> None:
     (van,) = (t for t in moving if towards[t.id] > 0.9 and gap[t.id].min() > 0)
     assert van.category in ("van", "truck") and np.ptp(gap[van.id]) < 3
     assert 10 < np.median(van.speeds()) < 15
-    assert any(towards[t.id] > 0.9 and gap[t.id].max() < 0 for t in moving), "the car that follows"
+    assert any(towards[t.id] > 0.9 and gap[t.id].max() < 0 for t in moving), "the following car"
     oncoming = [t for t in moving if towards[t.id] < -0.9]
     assert len(oncoming) >= 2 and all(t.category == "car" for t in oncoming)
     assert not impossible_motions(from_tracks("odo04", tracks))
 
 
 def check_raw_0009(tracks: list[Track], labels: Path, kitti: Path) -> None:
-    """Every parked car that KITTI labels within 25 m has a box near it, in that photo; nobody moves."""
+    """Each parked car labelled by KITTI within 25 m has a box near it in that photo; no track is moving."""
     assert [track.category for track in tracks if track.moving] == ["ego"]
     found: dict[int, list[np.ndarray]] = {}
     for row in _rows(kitti):
@@ -71,11 +71,11 @@ def _rows(path: Path) -> list[list[str]]:
     return [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
 
 
-def test_van_ahead_and_oncoming_cars_are_followed(real_data: Path, tmp_path: Path) -> None:
+def test_van_ahead_and_oncoming_cars_are_tracked(real_data: Path, tmp_path: Path) -> None:
     check_odometry_04(follow(tmp_path, "kitti-odometry", real_data / "kitti_odo04_f00-24", "--max-range", 80))
 
 
-def test_parked_cars_have_the_boxes_that_kitti_drew(real_data: Path, tmp_path: Path) -> None:
+def test_parked_cars_have_the_boxes_of_the_kitti_labels(real_data: Path, tmp_path: Path) -> None:
     source = real_data / "kitti_raw0009_f00-24"
     poses = source / "T_velo0_velo_icp_frames_0-24.txt"
     tracks = follow(tmp_path, "kitti-raw", source, "--poses", poses, "--max-range", 80)

@@ -1,4 +1,4 @@
-"""KITTI's and nuScenes' formats."""
+"""Formats of KITTI and nuScenes for scoring tracks."""
 
 import json
 from pathlib import Path
@@ -40,7 +40,7 @@ def test_kitti_labels_are_boxes_in_the_axes_of_the_camera(tmp_path: Path) -> Non
     assert right == pytest.approx(610 - 720 * 1.1 / 22, abs=1)
 
 
-def test_kitti_labels_leave_out_what_is_behind_or_was_not_there(tmp_path: Path) -> None:
+def test_kitti_labels_omit_objects_behind_the_camera_or_absent(tmp_path: Path) -> None:
     write_kitti(tmp_path / "k.txt", [car(-20, 2, 0.0), car(20, 2, 0.0)], [view(3.0)])
     assert (tmp_path / "k.txt").read_text() == ""
 

@@ -47,7 +47,7 @@ def test_yaw_is_interpolated_the_short_way() -> None:
 
 
 @pytest.mark.parametrize("content", ["no JSON", '{"version": 99, "tracks": []}', "[]"])
-def test_other_files_are_rejected_with_their_name(tmp_path: Path, content: str) -> None:
+def test_invalid_track_files_are_rejected_with_their_name(tmp_path: Path, content: str) -> None:
     (tmp_path / "tracks.json").write_text(content)
     with pytest.raises(InputError, match=r"tracks\.json"):
         read_tracks(tmp_path / "tracks.json")

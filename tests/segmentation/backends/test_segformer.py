@@ -220,7 +220,7 @@ def test_pickle_of_other_objects_is_rejected(folder: Path, content: object) -> N
         ({"architectures": None, "model_type": None}, "another network"),
     ],
 )
-def test_another_architecture_is_named(folder: Path, changes: dict[str, object], expected: str) -> None:
+def test_another_architecture_is_rejected(folder: Path, changes: dict[str, object], expected: str) -> None:
     change(folder / "config.json", **changes)
     error = error_of(folder)
     assert error.where == str(folder / "config.json")

@@ -78,19 +78,19 @@ def test_classes_do_not_depend_on_the_number_of_cores(monkeypatch: pytest.Monkey
     np.testing.assert_array_equal(predicted[0], predicted[2])
 
 
-def test_damaged_onnx_file_is_named(weights: Path, tmp_path: Path) -> None:
+def test_damaged_onnx_file_is_rejected(weights: Path, tmp_path: Path) -> None:
     (tmp_path / "cut.onnx").write_bytes(DEFAULT_WEIGHTS.read_bytes()[:-1000])
     with pytest.raises(InputError, match=r"cut\.onnx"):
         load("street", tmp_path / "cut.onnx", "cpu")
 
 
-def test_truncated_weights_are_named(weights: Path, tmp_path: Path) -> None:
+def test_truncated_weights_are_rejected(weights: Path, tmp_path: Path) -> None:
     (tmp_path / "cut.safetensors").write_bytes(weights.read_bytes()[:-1000])
     with pytest.raises(InputError, match=r"cut\.safetensors"):
         load("street", tmp_path / "cut.safetensors", "cpu")
 
 
-def test_weights_of_another_network_are_named(tmp_path: Path) -> None:
+def test_weights_of_another_network_are_rejected(tmp_path: Path) -> None:
     safetensors.save_file({"x": torch.zeros(3)}, tmp_path / "a.safetensors", {"network": "UNet", "labels": "[]"})
     with pytest.raises(InputError, match=r"UNet, not StreetNet"):
         load("street", tmp_path / "a.safetensors", "cpu")
@@ -153,7 +153,7 @@ def test_training_continues_from_weights_without_lidar_channels(tmp_path: Path, 
     assert torch.allclose(first[:, :3], state["stem.0.weight"].float()) and not first[:, 3:].any()
 
 
-def test_folder_without_labels_is_named(tmp_path: Path) -> None:
+def test_folder_without_labels_is_rejected(tmp_path: Path) -> None:
     from scan2sim.segmentation.training.train import TrainingSettings, train
 
     with pytest.raises(DataError, match="images"):

@@ -1,4 +1,4 @@
-"""Dense stereo: where its cloud is placed, and its errors; COLMAP itself needs CUDA and is replaced."""
+"""Dense stereo: position of its cloud, and errors; COLMAP itself needs CUDA and is replaced by a fake."""
 
 from __future__ import annotations
 

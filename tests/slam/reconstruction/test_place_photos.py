@@ -1,4 +1,4 @@
-"""Points of the cloud that photos are aligned with."""
+"""Alignment of photos with a cloud."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.fakes import textured_street
 FRAME = Frame("EPSG:32633", (391000.0, 5820000.0, 40.0))
 
 
-def test_only_points_near_the_photos_are_read_and_another_place_is_an_error(
+def test_only_points_near_the_photos_are_read_and_distant_clouds_rejected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     xyz = np.random.default_rng(0).uniform(-300, 300, (200_000, 3)).astype(np.float32)
@@ -33,7 +33,7 @@ def test_only_points_near_the_photos_are_read_and_another_place_is_an_error(
         place_photos.points_near(tmp_path / "cloud.laz", other, np.array([[5000.0, 0, 0]]))
 
 
-def test_a_reconstruction_is_aligned_with_the_cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reconstruction_is_aligned_with_the_cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pycolmap")
     few = place_photos.AlignmentModel(sample_max=(5000, 15_000), climbed=1, groups=2, fine_steps_m=(0.12, 0.06))
     monkeypatch.setattr(place_photos, "MODEL", few)

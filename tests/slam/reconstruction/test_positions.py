@@ -1,4 +1,4 @@
-"""Approximate positions of photos, from clocks that differ."""
+"""Approximate positions of photos from tracks with another clock, and from lists."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def write(path: Path) -> Path:
     return path
 
 
-def test_photos_are_found_in_a_track_by_their_time(tmp_path: Path) -> None:
+def test_photos_are_located_on_a_track_by_time(tmp_path: Path) -> None:
     found = by_track(write(tmp_path / "gps.csv"), photos([NOON + 10, NOON + 20.5, NOON + 30]), None, None, None)
     assert np.allclose(found.xyz[:, 0], [10, 20.5, 30], atol=0.05) and found.crs == "local" and not found.notes
 
 
-def test_time_zone_of_a_camera_is_the_one_by_which_its_photos_are_within_the_track() -> None:
+def test_time_zone_is_chosen_so_that_photos_are_within_the_track() -> None:
     notes: list[str] = []
     times = NOON + 2 * 3600 + np.array([5.0, 25.0, 50.0])
     moved = shifted(TRACK, times, Path("gps.gpx"), None, None, False, notes.append)
@@ -55,12 +55,12 @@ def test_video_times_count_from_its_start_or_the_first_fix() -> None:
         ([NOON + 1e5, NOON + 2e5, NOON + 3e5], "covers the times of 0 of 3"),
     ],
 )
-def test_photos_that_a_track_cannot_locate(times: list[float | None], cause: str, tmp_path: Path) -> None:
+def test_photos_that_a_track_cannot_locate_are_an_error(times: list[float | None], cause: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=cause):
         by_track(write(tmp_path / "gps.csv"), photos(times), None, None, None)
 
 
-def test_list_of_rough_positions(tmp_path: Path) -> None:
+def test_rough_positions_are_read_from_a_list(tmp_path: Path) -> None:
     path = tmp_path / "rough.csv"
     path.write_text("file,x,y,z\n2.jpg, 1, 2, 3\n0.jpg,4,5,6\n", encoding="utf-8")
     found = by_list(path, photos([None, None, None]), "local")

@@ -106,7 +106,7 @@ def test_reasons_why_a_cloud_is_not_checked_are_reported(drive: Passes, tmp_path
 
 @pytest.mark.parametrize("other", ["adjusted", "gps", "week", "day", "unix"])
 @pytest.mark.parametrize("own", ["adjusted", "gps", "week", "day", "unix"])
-def test_offsets_between_the_usual_clocks(own: str, other: str) -> None:
+def test_offsets_between_common_clocks_are_candidates(own: str, other: str) -> None:
     gps = 1.4e9 + 1234.5
     clocks = {"adjusted": gps - 1e9, "gps": gps, "week": gps % 604_800, "day": gps % 86_400, "unix": gps + 315_964_782}
     offsets = [0.0, *clock_offsets(clocks[own], clocks[other] + 40)]

@@ -1,4 +1,4 @@
-"""The errors of a trajectory against cases that can be worked out by hand, and KITTI's own tool."""
+"""Trajectory errors compared with analytic cases and KITTI's devkit."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def yaw(degrees: float | F64) -> F64:
 
 
 def straight(metres: int = 1000) -> Trajectory:
-    """East, a metre a pose, ten poses a second."""
+    """Path to the east, one metre per pose, ten poses per second."""
     x = np.arange(metres + 1.0)
     return Trajectory(x / 10, np.column_stack([x, 0 * x, 0 * x]), np.tile(np.eye(3), (len(x), 1, 1)))
 
 
 def winding(metres: int = 1500) -> Trajectory:
-    """Bends and hills, a metre a pose, the sensor looking along the way."""
+    """Path with bends and hills, one metre per pose, with the sensor facing along it."""
     s = np.arange(metres + 1.0)
     heading = 1.5 * np.sin(s / 90) + s / 700
     positions = np.column_stack([np.cumsum(np.cos(heading)), np.cumsum(np.sin(heading)), 5 * np.sin(s / 200)])
@@ -43,7 +43,7 @@ def moved(t: Trajectory, rotation: F64, shift: F64, scale: float = 1.0) -> Traje
 SHIFT = np.array([300.0, -70.0, 12.0])
 
 
-def test_a_moved_turned_and_scaled_copy_is_perfect() -> None:
+def test_transformed_copy_has_no_error() -> None:
     result = evaluate(moved(winding(), yaw(130), SHIFT, 0.7), winding())
     assert result.global_mean < 1e-9 and result.local_median is not None and result.local_median < 1e-9
     assert result.scale == pytest.approx(1 / 0.7) and result.ate_similarity < 1e-9 < 1 < result.ate_rigid
@@ -53,8 +53,8 @@ def test_a_moved_turned_and_scaled_copy_is_perfect() -> None:
     assert result.coverage == 1 and result.truth_noise is None
 
 
-def test_a_wrong_scale_without_scaling() -> None:
-    """5 % too long on a straight of 1000 m: errors are 5 % of |x - 500|, on average half of the 25 m at the ends."""
+def test_error_of_a_wrong_scale_without_scaling_is_analytic() -> None:
+    """A straight of 1000 m, 5 % too long: errors are 5 % of |x - 500|, on average half of the 25 m at the ends."""
     result = evaluate(moved(straight(), np.eye(3), SHIFT, 1.05), straight(), alignment="rigid2d")
     assert result.global_mean == pytest.approx(12.5, rel=2e-3) and result.scale == 1
     assert result.drift_percent == pytest.approx(1.25, rel=2e-3)
@@ -65,8 +65,8 @@ def test_a_wrong_scale_without_scaling() -> None:
     assert result.rpe_frame is not None and result.rpe_frame.translation == pytest.approx(0.05)
 
 
-def test_scale_that_drifts() -> None:
-    """x (1 + x / L) / 2 x 2: the best straight fit leaves the parabola's residual, the middle of 400 m is 40 m off."""
+def test_error_of_scale_drift_is_analytic() -> None:
+    """x (1 + x / L): residual of the best linear fit to a parabola; the middle of 400 m has an error of 40 m."""
     truth = straight()
     x = truth.positions[:, 0]
     bent = replace(truth, positions=np.column_stack([x + x**2 / 1000, 0 * x, 0 * x]))
@@ -77,12 +77,12 @@ def test_scale_that_drifts() -> None:
     assert result.global_mean == pytest.approx(np.abs(line(u) - x).mean())
     slope = line.convert().coef[1]
     assert result.scale == pytest.approx(slope)
-    # middle of [a, a + 400] of x + x^2 / 1000: 200^2 / 1000 = 40 before its mean of ends, whatever a
+    # middle of [a, a + 400] of x + x^2 / 1000: 200^2 / 1000 = 40 before its mean of ends, for any a
     assert np.allclose(result.local_errors, 40 * slope) and result.local_at[[0, -1]].tolist() == [200, 800]
 
 
-def test_heading_that_drifts() -> None:
-    """The estimate of a straight is an arc: its sagitta over 400 m, and degrees by metre, are known."""
+def test_error_of_heading_drift_is_analytic() -> None:
+    """The estimate of a straight is an arc with known sagitta over 400 m, and degrees per metre."""
     truth = straight()
     bend = 1e-4  # rad/m
     s = truth.positions[:, 0]
@@ -93,8 +93,8 @@ def test_heading_that_drifts() -> None:
         assert error is not None and error.rotation_deg_per_m == pytest.approx(np.degrees(bend), rel=0.02)
 
 
-def test_a_step_in_the_middle_of_a_segment() -> None:
-    """A 2 m sideways excursion at 500 m is seen by segments whose middle it is, by no others."""
+def test_excursion_counts_in_segments_with_their_middle_there() -> None:
+    """A 2 m sideways excursion at 500 m is an error of segments whose middle is there, and of no others."""
     truth = straight()
     positions = truth.positions.copy()
     positions[495:506, 1] = 2
@@ -133,7 +133,7 @@ def test_an_estimate_in_another_orientation_is_levelled_by_similarity3d() -> Non
     assert evaluate(tilted, winding()).global_mean > 10
 
 
-def test_association_by_time_leaves_out_what_the_truth_does_not_span() -> None:
+def test_association_by_time_omits_poses_outside_the_ground_truth() -> None:
     truth = winding()
     times = np.arange(20.02, 200, 0.31)
     found = truth.pose_at(times)
@@ -151,7 +151,7 @@ def test_association_by_time_leaves_out_what_the_truth_does_not_span() -> None:
 def test_rotation_error_against_gps_is_only_noise() -> None:
     path = winding()
     scatter = np.random.default_rng(0).normal(0, 0.8, path.positions.shape)
-    near = np.arange(len(path)) % 3 == 0  # 3.3 fixes a second
+    near = np.arange(len(path)) % 3 == 0  # 3.3 fixes per second
     gap = (path.times > 60) & (path.times < 70)
     track = GpsTrack(path.times[near & ~gap], (path.positions + scatter)[near & ~gap])
     result = evaluate(moved(path, yaw(50), SHIFT, 2.0), track)
@@ -163,13 +163,13 @@ def test_rotation_error_against_gps_is_only_noise() -> None:
     assert evaluate(path, track, truth_noise=0.1).truth_noise == 0.1
 
 
-def test_a_standing_receiver_does_not_travel() -> None:
+def test_distance_of_a_standing_receiver_is_small() -> None:
     jitter = np.random.default_rng(0).normal(0, 0.1, (2000, 2))
     assert distance_along(jitter)[-1] < 1
     assert distance_along(winding().positions[:, :2])[-1] == pytest.approx(1500, rel=1e-9)
 
 
-def test_short_and_broken_paths() -> None:
+def test_short_paths_have_no_segment_errors_and_invalid_ones_are_rejected() -> None:
     result = evaluate(straight(30), straight(30))
     assert result.local_median is None and result.kitti is None and result.rpe is not None
     assert result.figures()["kitti_percent"] is None
@@ -180,7 +180,7 @@ def test_short_and_broken_paths() -> None:
 
 
 def kitti_reference(truth: F64, found: F64) -> tuple[float, float]:
-    """Per cent and degrees by metre as KITTI's devkit computes them, pose by pose ((T, 4, 4), z forward)."""
+    """Per cent and degrees per metre as computed by KITTI's devkit for poses (T, 4, 4), z forward."""
     way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1))])
     shares, turns = [], []
     for first in range(0, len(truth), 10):
@@ -196,10 +196,10 @@ def kitti_reference(truth: F64, found: F64) -> tuple[float, float]:
     return float(np.mean(shares)), float(np.mean(turns))
 
 
-def test_kitti_errors_are_those_of_its_tool() -> None:
+def test_kitti_errors_equal_those_of_the_devkit() -> None:
     truth = winding(700)
     assert truth.rotations is not None
-    truth = replace(truth, positions=truth.positions * [1, 1, 0])  # its way is 3D, ours in the plane
+    truth = replace(truth, positions=truth.positions * [1, 1, 0])  # the devkit's distance is 3D, ours in the plane
     random = np.random.default_rng(2)
     drift = Rotation.from_rotvec(np.cumsum(random.normal(0, 2e-4, (701, 3)), axis=0)).as_matrix()
     found = Trajectory(truth.times, truth.positions * 1.01 + random.normal(0, 0.05, (701, 3)), drift @ truth.rotations)

@@ -1,4 +1,4 @@
-"""The errors of a trajectory agree with those of `evo` (under the GPL: for tests alone)."""
+"""Trajectory errors agree with those of `evo` (GPL: only used in tests)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def truth() -> Trajectory:
 
 @pytest.fixture(scope="module")
 def estimate(truth: Trajectory) -> Trajectory:
-    """The same with a drifting scale, noise in all six, elsewhere, and 7 % too small."""
+    """The same path with scale drift, noise in all six degrees of freedom, moved, and 7 % too small."""
     rng, n = np.random.default_rng(0), len(truth)
     drift = np.cumsum(rng.normal(0, 0.01, (n, 3)), axis=0) + rng.normal(0, 0.02, (n, 3))
     turn = Rotation.from_euler("xyz", [0.02, -0.03, 0.9])
@@ -42,7 +42,7 @@ def estimate(truth: Trajectory) -> Trajectory:
 
 
 def paths(truth: Trajectory, estimate: Trajectory, *, scaled: bool) -> PathPair:
-    """Both as evo has them, the estimate brought onto the truth."""
+    """Both as evo trajectories, the estimate aligned with the truth."""
     reference, found = (PosePath3D(poses_se3=list(t.poses)) for t in (truth, estimate))
     found.align(reference, correct_scale=scaled)
     return reference, found
@@ -55,7 +55,7 @@ def ape(pair: PathPair) -> float:
 
 
 def rpe(pair: PathPair, delta: float, unit: Unit) -> tuple[float, float]:
-    """Root mean square metres, and degrees by metre of the truth's way, over all pairs."""
+    """RMS translation error in metres, mean rotation error in degrees per metre of the true path, for all pairs."""
     found = []
     for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg):
         metric = RPE(relation, delta, unit, rel_delta_tol=0.05, all_pairs=True, pairs_from_reference=True)
@@ -67,7 +67,7 @@ def rpe(pair: PathPair, delta: float, unit: Unit) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("scaled", [True, False], ids=["similarity", "rigid"])
-def test_ate_and_rpe_are_those_of_evo(truth: Trajectory, estimate: Trajectory, scaled: bool) -> None:
+def test_ate_and_rpe_equal_those_of_evo(truth: Trajectory, estimate: Trajectory, scaled: bool) -> None:
     found: Evaluation = evaluate(estimate, truth, alignment="similarity3d" if scaled else "rigid2d")
     pair = paths(truth, estimate, scaled=scaled)
     assert (found.ate_similarity if scaled else found.ate_rigid) == pytest.approx(ape(pair), rel=1e-9)
@@ -77,5 +77,5 @@ def test_ate_and_rpe_are_those_of_evo(truth: Trajectory, estimate: Trajectory, s
         (found.rpe, rpe(pair, 10.0, Unit.meters)),
     ):
         assert ours.translation == pytest.approx(theirs[0], rel=1e-9)
-        assert ours.rotation_deg_per_m == pytest.approx(theirs[1], rel=1e-3)  # a stride's chord is a little shorter
+        assert ours.rotation_deg_per_m == pytest.approx(theirs[1], rel=1e-3)  # distance < path length
     assert ape(pair) > 0.1

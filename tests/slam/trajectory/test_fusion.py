@@ -1,4 +1,4 @@
-"""Lidar, camera and GPS in one graph: no worse than the best of them, and none spoils the others."""
+"""Lidar, camera and GPS in one graph: as accurate as the best source, robust to errors of each."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.present import present
 ALL = ("lidar", "camera", "gps")
 
 
-def off(fused: Fused, drive: Simulated) -> float:
+def fused_error(fused: Fused, drive: Simulated) -> float:
     return ate(fused.trajectory.positions, drive.truth[:, :3, 3], scaled=False)
 
 
@@ -53,9 +53,9 @@ def test_fusion_of_all_sources_is_as_good_as_the_best_one(seed: int) -> None:
 
 def test_other_sources_cover_gps_gaps_and_dark_video() -> None:
     drive = simulated(1)
-    assert off(drive.fused("lidar"), drive) > 5
+    assert fused_error(drive.fused("lidar"), drive) > 5
     both = drive.fused("lidar", "camera")
-    assert off(both, drive) < 1.0 and not present(both.trajectory.unsure).any()
+    assert fused_error(both, drive) < 1.0 and not present(both.trajectory.unsure).any()
     scale = 1 / np.median(both.scale)
     assert scale == pytest.approx(np.median(np.linalg.norm(np.diff(drive.camera.positions, axis=0), axis=1)), rel=0.1)
 
@@ -70,7 +70,7 @@ def test_failure_of_all_sources_is_reported() -> None:
     assert unsure[151:191].all() and not unsure[:150].any() and not unsure[195:].any()  # GPS gives the distance
 
 
-def test_outliers_of_gps_move_nothing() -> None:
+def test_path_is_robust_to_gps_outliers() -> None:
     clean, jumping = simulated(3, outliers=0), simulated(3)
     assert np.array_equal(clean.lidar.T, jumping.lidar.T)
     a, b = (drive.fused(*ALL).trajectory.positions for drive in (clean, replace(clean, gps=jumping.gps)))
@@ -81,11 +81,11 @@ def test_outliers_of_gps_move_nothing() -> None:
 def test_overconfident_wrong_source_is_down_weighted() -> None:
     drive = simulated(4, tunnel=(0, 0), dark=(0, 0), outliers=0)
     lidar = drive.lidar.T.copy()
-    lidar[200:210, 0, 3] = 0.0  # it slipped, and says nothing of it
+    lidar[200:210, 0, 3] = 0.0  # slipped, with an overconfident covariance
     wrong = replace(drive, lidar=drive.lidar._replace(T=lidar))
     found = wrong.fused(*ALL)
     assert found.trust["lidar"][200:210].max() < 0.2 < found.trust["camera"][200:210].min()
-    assert off(found, wrong) < 1.0 < off(wrong.fused("lidar"), wrong)
+    assert fused_error(found, wrong) < 1.0 < fused_error(wrong.fused("lidar"), wrong)
 
 
 def test_dead_reckoned_camera_poses_are_weighted_by_covariance() -> None:
@@ -101,7 +101,7 @@ def test_dead_reckoned_camera_poses_are_weighted_by_covariance() -> None:
     assert not late.sure[:50].any() and late.sure[60:200].all()
 
 
-def test_errors_of_a_tunnel_are_one() -> None:
+def test_errors_within_a_tunnel_are_fully_correlated() -> None:
     poses = np.tile(np.eye(4), (6, 1, 1))
     covariance = np.tile(np.diag([1e-4] * 6), (5, 1, 1))
     covariance[1:4, 0, 0] = 1.0
@@ -114,7 +114,7 @@ def test_errors_of_a_tunnel_are_one() -> None:
 
 
 def recorded(folder: Path, drive: Simulated) -> dict[str, Path]:
-    """A drive's sensors as the step reads them."""
+    """Write the sensor data of a drive as inputs of the step."""
     (folder / "sweeps").mkdir(parents=True)
     for time in drive.times:
         las.write(folder / "sweeps" / f"{time:.3f}.laz", PointCloud(Frame(), np.ones((1, 3), np.float32)))
@@ -156,7 +156,7 @@ def test_given_sources_are_fused_and_reported(tmp_path: Path) -> None:
     assert places and int(places[1]) > 300 and ate(path.positions, truth, scaled=False) < 0.8 and error(path).max() < 6
     assert path.times == pytest.approx(drive.times)
     late, _ = placed(files, tmp_path / "late", *everything, gps_offset=-80.0, time_offset=20.0)
-    assert late.times == pytest.approx(drive.times)  # in the sweeps' own clock
+    assert late.times == pytest.approx(drive.times)  # in the clock of the sweeps
 
 
 def test_sources_without_common_times_are_reported(tmp_path: Path) -> None:
@@ -175,7 +175,7 @@ def test_reversed_camera_is_detected(tmp_path: Path) -> None:
     assert any("contradict each other" in text for text in done.warnings)
 
 
-def test_steps_alone_come_out_as_they_are() -> None:
+def test_exact_relative_motions_alone_give_the_exact_path() -> None:
     drive = simulated(9, tunnel=(0, 0))
     exact = RelativeMotions(inverse(drive.truth[:-1]) @ drive.truth[1:], drive.lidar.covariance, drive.lidar.sure)
     found = fuse(drive.times, lidar=exact).trajectory.poses

@@ -35,7 +35,7 @@ def test_smoothing_does_not_reach_across_a_gap() -> None:
 
 
 @pytest.mark.parametrize("error", [0.2, 1.5])
-def test_noise_is_measured(error: float) -> None:
+def test_noise_is_estimated(error: float) -> None:
     assert noise(drive(error)[0]) == pytest.approx(error, rel=0.3)
 
 

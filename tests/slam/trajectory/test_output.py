@@ -1,4 +1,4 @@
-"""What SLAM writes: every trajectory file, and a COLMAP model that pycolmap reads and agrees with."""
+"""Output of SLAM: all trajectory files, and a COLMAP model that agrees with pycolmap."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CAMERAS = {
 
 
 def drive(camera: Camera) -> tuple[Trajectory, list[str], SparseMap]:
-    """Five poses that look north, and what they see of 60 points around them."""
+    """Five poses that look north, and their observations of 60 points around them."""
     random = np.random.default_rng(4)
     north = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     rotations = Rotation.from_rotvec(random.normal(0, 0.1, (5, 3))).as_matrix() @ north
@@ -39,7 +39,7 @@ def drive(camera: Camera) -> tuple[Trajectory, list[str], SparseMap]:
     for f, pose in enumerate(path.poses):
         ahead = (xyz - pose[:3, 3]) @ pose[:3, :3]
         uv, valid = project(camera, ahead)
-        valid &= (ahead[:, 2] > 0.1) | (camera.model == "equirectangular")  # COLMAP's fisheye sees no more
+        valid &= (ahead[:, 2] > 0.1) | (camera.model == "equirectangular")  # limit of COLMAP's fisheye model
         seen = np.flatnonzero(valid & inside(camera, uv))
         points.append(seen)
         frames.append(np.full(len(seen), f))
@@ -109,7 +109,7 @@ def test_unknown_values_are_not_written(tmp_path: Path) -> None:
     assert pycolmap.Reconstruction(tmp_path / "c" / "colmap").num_images() == 5
 
 
-def test_parts_that_do_not_belong_together(tmp_path: Path) -> None:
+def test_inconsistent_parts_are_rejected(tmp_path: Path) -> None:
     camera = CAMERAS["PINHOLE"]
     path, names, sparse = drive(camera)
     sparse.point[0] = 60

@@ -1,4 +1,4 @@
-"""Scale tied by GPS: as far as the camera drifts, and as the receiver can be believed."""
+"""Rescaling to GPS, weighted by the drift of the camera and the noise of the receiver."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.fakes.slam_drive import ate, drifting_turn
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_gps_of_ten_centimetres_halves_a_turns_error(seed: int) -> None:
+def test_gps_with_10_cm_noise_halves_the_error_of_a_turn(seed: int) -> None:
     times, truth, found = drifting_turn()
     gps = smooth(GpsTrack(times, truth + np.random.default_rng(seed).normal(0, 0.1, truth.shape)))
     factor = scale.factors(times, found, np.zeros(51, bool), gps, scale.DRIFT_PERSPECTIVE)

@@ -83,7 +83,7 @@ def test_poses_of_another_convention_are_reported_and_not_corrected(drive: Passe
 
 
 @pytest.mark.parametrize(("turn", "named"), [(0.0, "points upwards"), (1.7, "sweeps disagree by")])
-def test_another_order_of_the_quaternions_is_named(drive: Passes, tmp_path: Path, turn: float, named: str) -> None:
+def test_another_quaternion_order_is_detected(drive: Passes, tmp_path: Path, turn: float, named: str) -> None:
     world = np.eye(4)
     world[:3, :3] = exp_so3([0, 0, turn])
     truth = world @ drive.truth
@@ -122,7 +122,7 @@ def test_poses_that_still_disagree_are_reported(drive: Passes) -> None:
     assert corrected_partly.figures(drive.times[:14])["unsure_s"] == [[0.4, 0.7]]
 
 
-def test_registration_keeps_what_surfaces_do_not_constrain() -> None:
+def test_registration_keeps_unconstrained_directions() -> None:
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(-15, 15, (8000, 2)), rng.normal(-1.8, 0.005, 8000)])
     start = np.eye(4)
@@ -134,7 +134,7 @@ def test_registration_keeps_what_surfaces_do_not_constrain() -> None:
     assert register(ground + [100, 0, 0], surface_of(ground), np.eye(4)) is None
 
 
-def test_pairs_are_neighbours_and_passes() -> None:
+def test_selected_pairs_are_neighbours_and_other_passes() -> None:
     out = np.column_stack([np.arange(0, 40.0), np.zeros(40), np.zeros(40)])
     first, second, far = select(np.concatenate([out, out[::-1] + [0, 3.0, 0]]))
     assert far.any() and (second > first).all()

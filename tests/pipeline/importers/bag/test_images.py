@@ -34,7 +34,7 @@ def pixels_of(message: Any) -> Any:
 
 
 @pytest.mark.parametrize("pad", [0, 8])
-def test_colours_arrive_in_any_order_of_channels(pad: int) -> None:
+def test_colours_are_read_in_any_channel_order(pad: int) -> None:
     bgr, alpha = RGB[..., ::-1], np.full((16, 24, 1), 255, np.uint8)
     for encoding, pixels in (
         ("rgb8", RGB), ("bgr8", bgr), ("8UC3", bgr), ("rgba8", np.dstack([RGB, alpha])),
@@ -44,7 +44,7 @@ def test_colours_arrive_in_any_order_of_channels(pad: int) -> None:
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_bayer_patterns_give_the_colours(pattern: str) -> None:
+def test_bayer_patterns_are_demosaiced(pattern: str) -> None:
     channels = ["rgb".index(c) for c in pattern]
     mosaic = np.zeros((16, 24), np.uint8)
     for k, channel in enumerate(channels):
@@ -53,7 +53,7 @@ def test_bayer_patterns_give_the_colours(pattern: str) -> None:
     assert np.array_equal(found[3, 4], RGB[3, 4]) and np.array_equal(found[12, 20], RGB[12, 20])
 
 
-def test_grey_deep_and_yuv_images() -> None:
+def test_grey_16_bit_and_yuv_images_are_converted() -> None:
     grey = np.arange(16 * 24, dtype=np.uint16).reshape(16, 24)
     assert np.array_equal(pixels_of(image(grey.astype(np.uint8), "mono8")), grey.astype(np.uint8))
     assert np.array_equal(pixels_of(image(grey * 100, "mono16")), grey * 100)
@@ -72,12 +72,12 @@ def test_grey_deep_and_yuv_images() -> None:
         ({"encoding": "32FC1"}, "unsupported encoding '32FC1'"), ({"height": 0}, "has no data"),
     ],
 )  # fmt: skip
-def test_damaged_images_are_named(change: dict[str, Any], message: str) -> None:
+def test_damaged_images_are_rejected(change: dict[str, Any], message: str) -> None:
     with pytest.raises(InvalidImage, match=message):
         raw_file(image(RGB, **({"encoding": "rgb8"} | change)))
 
 
-def test_compressed_images_are_kept_as_they_are() -> None:
+def test_compressed_images_are_copied_unchanged() -> None:
     for suffix in (".jpg", ".png"):
         content = cv2.imencode(suffix, RGB)[1].tobytes()
         assert compressed_file(SimpleNamespace(data=content, format="")) == (suffix, content)
@@ -122,7 +122,7 @@ def test_rectified_images_have_the_intrinsics_of_p() -> None:
     assert (plain.model, plain.fx, plain.cy) == ("pinhole", 400, 240)
 
 
-def test_binned_images_of_a_region() -> None:
+def test_intrinsics_follow_binning_and_region_of_interest() -> None:
     roi = SimpleNamespace(x_offset=100, y_offset=60, width=400, height=300)
     camera = camera_of(info("plumb_bob", [0.0] * 5, roi=roi, binning_x=2, binning_y=2), rectified=False)
     assert (camera.width, camera.height, camera.fx, camera.cx) == (200, 150, 200, (220 + 0.5) / 2 - 0.5)
@@ -136,6 +136,6 @@ def test_binned_images_of_a_region() -> None:
         (info("plumb_bob", [0.1] * 12), "has 12 coefficients"),
     ],
 )
-def test_cameras_that_cannot_be_used_are_named(bad: Any, message: str) -> None:
+def test_unusable_cameras_are_rejected(bad: Any, message: str) -> None:
     with pytest.raises(InvalidCamera, match=message):
         camera_of(bad, rectified=False)

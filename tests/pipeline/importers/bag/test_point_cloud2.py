@@ -1,4 +1,4 @@
-"""PointCloud2 in the layouts of scanners' drivers, and what is wrong with it."""
+"""PointCloud2 messages in the layouts of scanner drivers, and invalid ones."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def cloud(
 
 
 @pytest.mark.parametrize("xyz", ["<f4", ">f4", "<f8", ">f8"])
-def test_any_byte_order_and_type_and_points_without_echo_are_dropped(xyz: str) -> None:
+def test_any_byte_order_and_type_is_read_without_points_without_return(xyz: str) -> None:
     sweep = decode(cloud(xyz))
     assert sweep.xyz.dtype == np.float32 and np.array_equal(sweep.xyz, XYZ[[0, 3, 4]].astype(np.float32))
     assert sweep.intensity is not None and np.allclose(sweep.intensity, [0, 0.3, 0.4]) and sweep.time is None
@@ -67,7 +67,7 @@ SPELLINGS: dict[str, tuple[tuple[str, str], npt.NDArray[Any]]] = {
 
 
 @pytest.mark.parametrize("name", SPELLINGS)
-def test_times_of_points_are_recognized(name: str) -> None:
+def test_unit_of_point_times_is_recognized(name: str) -> None:
     spelling, values = SPELLINGS[name]
     sweep = decode(cloud(time=spelling, values=values))
     assert sweep.time is not None
@@ -84,14 +84,14 @@ def test_absolute_integer_nanoseconds_keep_their_precision() -> None:
     assert unit is not None and unit.absolute and unit.offsets(time, STAMP_NS)[0] == pytest.approx(37e-9, abs=2e-9)
 
 
-def test_times_of_another_clock_count_from_the_first_point_and_senseless_ones_are_not_used() -> None:
+def test_times_of_another_clock_start_at_the_first_point_and_constant_ones_are_ignored() -> None:
     unit = time_unit(5000.0 + OFFSETS, STAMP_NS)
     assert unit is not None and unit.other_clock
     assert np.allclose(unit.offsets(5000.0 + OFFSETS, STAMP_NS), OFFSETS)
     assert time_unit(np.zeros(5), STAMP_NS) is None
 
 
-def test_rows_with_padding_and_colours() -> None:
+def test_padded_rows_and_packed_colours_are_read() -> None:
     packed = np.array([0x00FF8001, 0x00010203], np.uint32)
     rows = np.zeros((2, 1), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<f4")])
     rows["x"], rows["rgb"] = 1.0, packed.view(np.float32)[:, None]
@@ -113,12 +113,12 @@ def test_rows_with_padding_and_colours() -> None:
         ({"fields": [SimpleNamespace(name="x", offset=0, datatype=77, count=1)]}, "unknown data type 77"),
     ],
 )
-def test_inconsistent_clouds_are_named(change: dict[str, Any], message: str) -> None:
+def test_inconsistent_clouds_are_rejected(change: dict[str, Any], message: str) -> None:
     with pytest.raises(InvalidCloud, match=message):
         decode(cloud(**change))
 
 
-def test_intensities_scale_by_their_type() -> None:
+def test_intensities_are_scaled_by_their_type() -> None:
     assert (
         intensity_scale(np.array([3], np.uint8)) == 1 / 255 and intensity_scale(np.array([3], np.uint16)) == 1 / 65535
     )
@@ -126,7 +126,7 @@ def test_intensities_scale_by_their_type() -> None:
 
 
 @pytest.mark.parametrize(("ros2", "frame"), [(True, "a"), (True, "livox_frame"), (False, "livox")])
-def test_livox_messages_are_read_from_their_bytes(ros2: bool, frame: str) -> None:
+def test_livox_messages_are_decoded(ros2: bool, frame: str) -> None:
     name = frame.encode() + (b"\0" if ros2 else b"")
     raw = (b"\0\1\0\0" if ros2 else b"\0\0\0\0") + struct.pack("<iII", 5, 6, len(name)) + name
     raw += b"\0" * (-(len(raw) - 4) % 8 if ros2 else 0)

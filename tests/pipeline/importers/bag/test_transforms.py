@@ -26,14 +26,14 @@ def moving(*samples: tuple[float, float]) -> Series:
     return series
 
 
-def test_static_chain_through_common_ancestors() -> None:
+def test_static_transforms_are_chained_through_common_ancestors() -> None:
     frames = Frames(Path("drive.mcap"), {("base", "a"): pose(1, 90), ("a", "lidar"): pose(2), ("base", "cam"): pose(5)})
     T = frames.between("cam", "lidar")
     assert np.allclose(T, np.linalg.inv(pose(5)) @ pose(1, 90) @ pose(2))
     assert np.allclose(frames.between("lidar", "cam"), np.linalg.inv(T))
 
 
-def test_missing_link_names_the_frames_and_can_be_given() -> None:
+def test_missing_transform_is_reported_with_its_frames_and_can_be_given() -> None:
     frames = Frames(Path("drive.mcap"), {("base", "lidar"): pose(1)}, {("odom", "base"): moving((0, 0))})
     with pytest.raises(InputError, match=r"'cam' and 'lidar'.*base > lidar, odom > base \(moving\).*--transform"):
         frames.between("cam", "lidar")
@@ -44,7 +44,7 @@ def test_missing_link_names_the_frames_and_can_be_given() -> None:
             frames.add_given([text])
 
 
-def test_poses_by_a_chain_of_moving_links() -> None:
+def test_poses_are_chained_from_moving_transforms() -> None:
     frames = Frames(Path("drive.mcap"), {("base", "lidar"): pose(0.5)})
     frames.moving["map", "odom"] = moving((1.0, 100.0), (3.0, 102.0))  # rare corrections, constant before and after
     frames.moving["odom", "base"] = moving((3.5, 35.0), (0.5, 5.0), (1.0, 10.0), (2.0, 20.0), (2.0, 21.0))
@@ -55,11 +55,11 @@ def test_poses_by_a_chain_of_moving_links() -> None:
     assert np.allclose(frames.poses_of("lidar", "odom")[1][:, 0, 3], [5.5, 10.5, 21.5, 35.5])
 
 
-def test_world_frame_needs_something_that_moves() -> None:
+def test_world_frame_needs_a_moving_transform() -> None:
     frames = Frames(Path("drive.mcap"), {("map", "base"): pose(0), ("base", "lidar"): pose(1)})
     assert frames.world_frame("lidar") is None
     with pytest.raises(InputError, match="no moving transform from 'map' to 'lidar'"):
         frames.world_frame("lidar", "map")
     frames.moving["rig", "map"] = moving((0, 0))
-    frames.static["base", "rig"] = pose(0)  # a loop: ends, instead of running for ever
+    frames.static["base", "rig"] = pose(0)  # a loop of transforms must not cause an endless loop
     assert frames.world_frame("lidar") is not None

@@ -1,4 +1,4 @@
-"""Bags in all formats: sweeps, photos, calibration and poses arrive as they were written; what is wrong is named."""
+"""Bags in all formats: sweeps, photos, calibration and poses are unpacked losslessly; errors name their cause."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def unpacked(path: Path, out: Path, **params: Any) -> tuple[Unpacked, list[str]]
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_everything_arrives_as_it_was_written(tmp_path: Path, form: str) -> None:
+def test_sweeps_photos_calibration_and_poses_are_unpacked_losslessly(tmp_path: Path, form: str) -> None:
     found, notes = unpacked(write(bag_path(tmp_path, form), form), tmp_path / "out")
     files = list_files(found.sweeps)
     assert notes == [] and [file.stem for file in files] == [
@@ -111,7 +111,7 @@ def test_everything_arrives_as_it_was_written(tmp_path: Path, form: str) -> None
     assert np.allclose(path.poses, [base(k) @ T_BASE_LIDAR for k in range(SWEEPS)], atol=1e-6)
 
 
-def test_odometry_gives_the_same_poses(tmp_path: Path) -> None:
+def test_odometry_messages_give_the_same_poses(tmp_path: Path) -> None:
     found, _ = unpacked(write(tmp_path / "bag", "mcap", odometry, points), tmp_path / "out")
     assert found.poses is not None and found.photos is None
     poses = trajectory_io.read(found.poses).poses
@@ -135,7 +135,7 @@ def stamped(kind: str) -> Callable[[BagFile, int, float], None]:
 
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("kind", ["PoseStamped", "PoseWithCovarianceStamped"])
-def test_topics_of_poses_are_used_if_they_are_named(tmp_path: Path, kind: str, form: str) -> None:
+def test_pose_topics_are_used_only_if_chosen(tmp_path: Path, kind: str, form: str) -> None:
     path = write(bag_path(tmp_path, form), form, stamped(kind), points)
     with opened(path) as bag:
         uses, _ = described(inspected(bag), BagParams())
@@ -151,7 +151,7 @@ def test_topics_of_poses_are_used_if_they_are_named(tmp_path: Path, kind: str, f
 
 
 def urdf(T_lidar_camera: F64, path: Path) -> Path:
-    """A robot whose camera is on the lidar, by an extra link, beside a wheel that turns."""
+    """A robot whose camera is fixed to the lidar by an extra link, and which has a revolute wheel joint."""
     rpy = Rotation.from_matrix(T_lidar_camera[:3, :3]).as_euler("xyz")
     origin = f'xyz="{" ".join(map(str, T_lidar_camera[:3, 3]))}" rpy="{" ".join(map(str, rpy))}"'
     path.write_text(
@@ -184,7 +184,7 @@ def test_fixed_joints_of_a_urdf_complete_the_transforms(tmp_path: Path) -> None:
     assert error is None and uses["/front/image_raw"].startswith("photos")
 
 
-def test_transforms_of_the_bag_outweigh_those_of_a_urdf(tmp_path: Path) -> None:
+def test_transforms_of_the_bag_override_those_of_a_urdf(tmp_path: Path) -> None:
     robot = tmp_path / "robot.urdf"
     joint = '<joint name="a" type="fixed"><parent link="lidar"/><child link="camera"/><origin xyz="1 0 0"/></joint>'
     robot.write_text(f'<robot name="r">{joint}</robot>', encoding="utf-8")
@@ -209,7 +209,7 @@ def test_transforms_of_the_bag_outweigh_those_of_a_urdf(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_wrong_urdf_is_named(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_urdf_is_rejected_with_its_cause(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "r.urdf").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=message):
         read_fixed_joints(tmp_path / "r.urdf")
@@ -231,7 +231,7 @@ def gnss(bag: BagFile, k: int, time: float) -> None:
         bag.transforms("/tf_static", time, [("base", "antenna", T, time)])
 
 
-def test_satellites_and_imu_give_poses_in_utm(tmp_path: Path) -> None:
+def test_gnss_and_imu_give_poses_in_utm(tmp_path: Path) -> None:
     path = write(tmp_path / "bag", "mcap", gnss, points)
     found, notes = unpacked(path, tmp_path / "out")
     assert found.metrics["poses"] == "gnss" and found.poses is not None and notes == []
@@ -298,7 +298,7 @@ def test_recording_times_replace_those_of_headers(tmp_path: Path) -> None:
     assert list_files(found.sweeps)[2].stem == "1700000000.200000000"
 
 
-def test_static_transforms_that_ros_1_repeats(tmp_path: Path) -> None:
+def test_transforms_repeated_by_ros_1_are_static(tmp_path: Path) -> None:
     def repeated(bag: BagFile, k: int, time: float) -> None:
         links = [("base", "lidar", T_BASE_LIDAR, time), ("lidar", "camera", T_LIDAR_CAMERA, time)]
         bag.transforms("/tf", time, links)
@@ -312,7 +312,7 @@ def test_static_transforms_that_ros_1_repeats(tmp_path: Path) -> None:
     assert unpacked(only, tmp_path / "b")[0].metrics["poses"] == "sweeps"
 
 
-def test_sqlite_bags_of_older_ros_without_definitions(tmp_path: Path) -> None:
+def test_sqlite_bags_without_message_definitions_are_read(tmp_path: Path) -> None:
     path = write(tmp_path / "bag", "sqlite3")
     database = sqlite3.connect(next(path.glob("*.db3")))
     database.execute("update schema set schema_version = 3")
@@ -322,12 +322,12 @@ def test_sqlite_bags_of_older_ros_without_definitions(tmp_path: Path) -> None:
     assert unpacked(path, tmp_path / "out")[0].metrics["photos"] == SWEEPS
 
 
-def test_photo_interval(tmp_path: Path) -> None:
+def test_photo_interval_drops_photos_in_between(tmp_path: Path) -> None:
     found, _ = unpacked(write(tmp_path / "bag"), tmp_path / "out", photo_interval=0.25)
     assert found.photos is not None and len(list((found.photos / "front").iterdir())) == 3
 
 
-def test_defaults_leave_out_what_is_no_sensor_and_say_why(tmp_path: Path) -> None:
+def test_defaults_skip_non_sensor_topics_with_a_reason(tmp_path: Path) -> None:
     def others(bag: BagFile, k: int, time: float) -> None:
         bag.cloud("/cloud_map", time, "map", records(XYZ))
         bag.cloud("/points_filtered", time, "lidar", records(XYZ[:20]))
@@ -353,7 +353,7 @@ def test_defaults_leave_out_what_is_no_sensor_and_say_why(tmp_path: Path) -> Non
         assert text in uses[topic], (topic, uses[topic])
 
 
-def test_damaged_messages_are_left_out_and_counted(tmp_path: Path) -> None:
+def test_damaged_messages_are_skipped_and_counted(tmp_path: Path) -> None:
     def damaged(bag: BagFile, k: int, time: float) -> None:
         if k in (2, 5):
             bag.cloud("/points", time, "lidar", records(XYZ), data=np.zeros(7, np.uint8))
@@ -372,7 +372,7 @@ def test_damaged_messages_are_left_out_and_counted(tmp_path: Path) -> None:
     assert any("at 0.300 s, has no data" in note for note in notes)
 
 
-def test_times_of_points_far_from_the_message_and_a_first_sweep_without_a_span(tmp_path: Path) -> None:
+def test_sweep_without_a_time_span_is_dropped_and_distant_point_times_reported(tmp_path: Path) -> None:
     def odd(bag: BagFile, k: int, time: float) -> None:
         offsets = OFFSETS * 0 if k == 0 else OFFSETS + np.float32(3.0 if k == 4 else 0.0)
         bag.cloud("/points", time, "lidar", records(XYZ, time=offsets))
@@ -428,7 +428,7 @@ def jump(seconds: float) -> Writer:
         ((lambda b, k, t: b.cloud("/points", t, "lidar", records(XYZ * np.nan)), tf), {}, DataError, "has points"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_named(
+def test_errors_name_topic_cause_and_remedy(
     tmp_path: Path, writers: tuple[Writer, ...], params: dict[str, Any], kind: type[ScanError], message: str
 ) -> None:
     path = write(tmp_path / "bag", "mcap", *writers)
@@ -437,7 +437,7 @@ def test_what_is_wrong_is_named(
     assert type(caught.value) is kind
 
 
-def test_camera_without_a_link_names_the_frames_and_takes_a_given_one(tmp_path: Path) -> None:
+def test_missing_camera_transform_is_reported_and_can_be_given(tmp_path: Path) -> None:
     path = write(tmp_path / "bag", "mcap", tf, camera, points, static=False)
     with pytest.raises(InputError, match=r"'camera' and 'lidar'; its transforms: map > base \(moving\)"):
         unpacked(path, tmp_path / "a", poses="sweeps")
@@ -459,7 +459,7 @@ def overwritten(path: Path) -> None:
 
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("damage", [lambda p: truncated(p, 0.6), lambda p: truncated(p, 0.01), overwritten])
-def test_damaged_bags_are_named_with_a_remedy(tmp_path: Path, form: str, damage: Callable[[Path], None]) -> None:
+def test_damaged_bags_are_rejected_with_a_remedy(tmp_path: Path, form: str, damage: Callable[[Path], None]) -> None:
     path = write(bag_path(tmp_path, form), form)
     file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix in (".mcap", ".db3"))
     damage(file)
@@ -472,7 +472,7 @@ def test_damaged_bags_are_named_with_a_remedy(tmp_path: Path, form: str, damage:
             assert error.remedy
 
 
-def test_empty_and_wrong_files(tmp_path: Path) -> None:
+def test_empty_and_invalid_files_are_rejected(tmp_path: Path) -> None:
     with bag_file(tmp_path / "empty", "mcap"):
         pass
     (tmp_path / "zero.bag").touch()
@@ -493,13 +493,13 @@ def test_empty_and_wrong_files(tmp_path: Path) -> None:
     assert is_bag(tmp_path / "empty") and not is_bag(tmp_path / "folder") and not is_bag(tmp_path / "cloud.ply")
 
 
-def test_folder_without_metadata_is_read_by_its_files(tmp_path: Path) -> None:
+def test_folder_without_metadata_is_read(tmp_path: Path) -> None:
     path = write(tmp_path / "bag")
     (path / "metadata.yaml").unlink()
     assert unpacked(path, tmp_path / "out")[0].metrics["sweeps"] == SWEEPS
 
 
-def test_missing_package_is_named_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_is_reported_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "bag")
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(UnavailableError, match=r"rosbags.*pip install 'scan2sim\[bag\]'"):
