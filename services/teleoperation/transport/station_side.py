@@ -61,7 +61,7 @@ class TokenBucket:
 
 @dataclass
 class _RemoteSession:
-    """DTLS session with a remote address: a handshake, then a link session of a connection."""
+    """DTLS session with a remote address: a handshake, then a link session of a connection, named by its first ping."""
 
     sock: UdpSocket
     address: Address
@@ -69,6 +69,11 @@ class _RemoteSession:
     connection: MultipathConnection | None = None
     link_session: LinkSession | None = None
     until: float = float("inf")
+
+    @property
+    def attached(self) -> bool:
+        """Whether the name of its link is known, so that messages are sent over it."""
+        return self.link_session is not None and self.link_session.name != ""
 
 
 class Listener:
@@ -167,11 +172,11 @@ class Listener:
         if entry is None:
             self._receive_hello(key, sock, data, address)
         elif data and 128 <= data[0] < 192:
-            if entry.connection is not None and entry.link_session is not None:
+            if entry.connection is not None and entry.link_session is not None and entry.attached:
                 entry.connection.receive_media(entry.link_session, data)
         else:
             for part in entry.dtls.receive(data, self._clock()):
-                self._receive_message(key, entry, part)
+                self._receive_message(entry, part)
             if key in self._pending:
                 self._check_handshake(key, entry)
 
@@ -186,34 +191,26 @@ class Listener:
             entry.connection = self._expected.get(one.peer)
             mine = [each for each in self._sessions.items() if each[1].connection is entry.connection]
             if entry.connection is None:
-                self._drop(key, entry)
-            elif len(mine) > SESSIONS_PER_PEER_MAX:
+                return self._drop(key, entry)
+            send, local = self._sender(entry.sock, entry.address), format_address(entry.sock.getsockname())
+            entry.link_session = LinkSession("", one, send, local, format_address(entry.address))
+            if len(mine) > SESSIONS_PER_PEER_MAX:
                 self._drop(*min(mine, key=lambda each: each[1].dtls.last_received))
 
-    def _receive_message(self, key: tuple[int, Address], entry: _RemoteSession, part: bytes) -> None:
-        """Process a message of a peer; the first ping of a session names its link."""
-        if entry.connection is None:
+    def _receive_message(self, entry: _RemoteSession, part: bytes) -> None:
+        """Process a message of a peer; the first ping, which names the link, may arrive after others, or get lost."""
+        if entry.connection is None or entry.link_session is None:
             return
-        if entry.link_session is None:
-            try:
-                ping = Message.unpack(part[SESSION_BYTES:])
-                name = ping.body.decode() if ping.kind == Kind.PING else ""
-            except (Malformed, UnicodeDecodeError):
-                name = ""
-            if not name or len(name) > 60 or entry.connection.is_full(name):
+        if not entry.attached and (name := _link_name(part)) is not None:
+            if not 0 < len(name) <= 60 or entry.connection.is_full(name):
                 self._counts["unnamed"] += 1
                 return
-            self._attach_link(entry, name)
-        assert entry.link_session is not None
+            self._attach_link(entry.connection, entry.link_session, name)
         entry.connection.receive_message(entry.link_session, part)
 
-    def _attach_link(self, entry: _RemoteSession, name: str) -> None:
-        send = self._sender(entry.sock, entry.address)
-        assert entry.connection is not None
-        local = format_address(entry.sock.getsockname())
-        entry.link_session = LinkSession(name, entry.dtls, send, local, format_address(entry.address))
-        entry.dtls.counts = entry.connection.counter
-        before = entry.connection.attach(entry.link_session)
+    def _attach_link(self, connection: MultipathConnection, link_session: LinkSession, name: str) -> None:
+        link_session.name, link_session.dtls.counts = name, connection.counter
+        before = connection.attach(link_session)
         for other in self._sessions.values():
             if other.link_session is before and before is not None:
                 other.until = self._clock() + REPLACED_SESSION_LIFETIME_S
@@ -263,7 +260,7 @@ class Listener:
                 one.tick(now)
             timed_out = (
                 now - one.started > HANDSHAKE_TIMEOUT_S
-                if entry.link_session is None
+                if not entry.attached
                 else now - one.last_received > SESSION_TIMEOUT_S
             )
             if one.ended or timed_out or now > entry.until:
@@ -303,3 +300,14 @@ def _host_and_port(sock: UdpSocket) -> tuple[str, int]:
     host, port, *_ = sock.getsockname()
     assert isinstance(host, str) and isinstance(port, int)
     return host, port
+
+
+def _link_name(part: bytes) -> str | None:
+    """Name of the link in a ping, empty if malformed; None: the message is of another kind, or malformed."""
+    try:
+        message = Message.unpack(part[SESSION_BYTES:])
+        return message.body.decode() if message.kind == Kind.PING else None
+    except UnicodeDecodeError:
+        return ""
+    except Malformed:
+        return None
