@@ -82,7 +82,8 @@ class Bodies:
                     body.size = len(data)
                     if body.size > self._max_bytes:
                         data.clear()
-                        await _discard(receive)
+                        if not complete:
+                            await _discard(receive)
                         raise self._too_large()
                     self._give_up_oldest(body)
         except TimeoutError:

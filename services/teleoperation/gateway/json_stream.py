@@ -48,9 +48,12 @@ class Connection:
         address: HOST:PORT of the remote party.
     """
 
-    def __init__(self, sock: socket.socket, channel: Channel, wake: Callable[[], None]) -> None:
+    def __init__(
+        self, sock: socket.socket, channel: Channel, wake: Callable[[], None], clock: Callable[[], float]
+    ) -> None:
         self.address = channel.address
-        self.since = self.last_received = self.last_sent = time.monotonic()
+        self.since = self.last_received = self.last_sent = clock()
+        self._clock = clock
         self.opened = False
         self._sock, self._channel, self._wake = sock, channel, wake
         self._lock = threading.Lock()
@@ -88,7 +91,7 @@ class Connection:
                 self._closing = str(error)
             else:
                 self._out += self._channel.take()
-                self.last_sent = time.monotonic()
+                self.last_sent = self._clock()
                 if len(self._out) > SEND_QUEUE_MAX_BYTES:
                     self._out.clear()
                     self._closing = "the remote end reads too slowly"
@@ -113,7 +116,7 @@ class Connection:
             raise TlsError(f"received a line longer than {LINE_MAX_BYTES} bytes")
         self._in = rest
         if lines:
-            self.last_received = time.monotonic()
+            self.last_received = self._clock()
         return [bytes(line) for line in lines]
 
     def _start_handshake(self) -> None:
@@ -146,8 +149,10 @@ class _Connections(threading.Thread):
         opened: Callable[[Connection], None],
         received: Callable[[Connection, JsonObject], None],
         closed: Callable[[Connection, str], None],
+        clock: Callable[[], float],
     ) -> None:
         super().__init__(name=name, daemon=True)
+        self._clock = clock
         self._callbacks = (opened, received, closed)
         self._selector = selectors.DefaultSelector()
         self._connections: dict[socket.socket, Connection] = {}
@@ -184,7 +189,7 @@ class _Connections(threading.Thread):
                         self._accept()
                     elif events & selectors.EVENT_READ:
                         self._read(connection)
-                self._maintain(time.monotonic())
+                self._maintain(self._clock())
         finally:
             for connection in list(self._connections.values()):
                 self._drop(connection, "closed here")
@@ -201,7 +206,7 @@ class _Connections(threading.Thread):
     def _add(self, sock: socket.socket, channel: Channel) -> Connection:
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection = self._connections[sock] = Connection(sock, channel, self.wake)
+        connection = self._connections[sock] = Connection(sock, channel, self.wake, self._clock)
         self._selector.register(sock, selectors.EVENT_READ)
         return connection
 
@@ -263,6 +268,7 @@ class Server(_Connections):
         port: TCP port; 0: any free one.
         accepts: whether to accept a party with a valid certificate; a party with the gateway role never is.
         opened, received, closed: callbacks; `closed` is also called for connections that were never `opened`.
+        clock: current time, seconds.
 
     Raises:
         SettingError: it can't listen on this address.
@@ -279,8 +285,9 @@ class Server(_Connections):
         received: Callable[[Connection, JsonObject], None],
         closed: Callable[[Connection, str], None],
         accepts: Callable[[Peer], bool] = lambda peer: True,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        super().__init__("teleop-server", opened, received, closed)
+        super().__init__("teleop-server", opened, received, closed, clock)
         self._context = tls.context(identity, datagrams=False)
         self._accepts = accepts
         try:
@@ -328,6 +335,7 @@ class Client(_Connections):
 
     Args:
         closed: called with the reason, also after failed attempts; the client then retries by itself.
+        clock: current time, seconds.
     """
 
     def __init__(
@@ -339,11 +347,12 @@ class Client(_Connections):
         opened: Callable[[Connection], None],
         received: Callable[[Connection, JsonObject], None],
         closed: Callable[[str], None],
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        super().__init__("teleop-client", opened, received, lambda connection, reason: self._lost(reason))
+        super().__init__("teleop-client", opened, received, lambda connection, reason: self._lost(reason), clock)
         self._context = tls.context(identity, datagrams=False)
         self._gateway, self._closed = (host, port), closed
-        self._next, self._wait = 0.0, RECONNECT_DELAYS_S[0]
+        self._next, self._wait = float("-inf"), RECONNECT_DELAYS_S[0]
         self.start()
 
     def send(self, message: Mapping[str, Any]) -> bool:
@@ -357,7 +366,7 @@ class Client(_Connections):
         return any(one.opened for one in list(self._connections.values()))
 
     def _pause(self) -> float:
-        return 0.5 if self._connections else max(0.0, min(0.5, self._next - time.monotonic()))
+        return 0.5 if self._connections else max(0.0, min(0.5, self._next - self._clock()))
 
     def _maintain(self, now: float) -> None:
         super()._maintain(now)
@@ -366,7 +375,7 @@ class Client(_Connections):
 
     def _connect(self) -> None:
         host, port = self._gateway
-        self._next = time.monotonic() + self._wait
+        self._next = self._clock() + self._wait
         try:
             sock = socket.create_connection((host, port), timeout=HANDSHAKE_TIMEOUT_S)
         except OSError as error:
@@ -386,7 +395,7 @@ class Client(_Connections):
         return bool(lines)
 
     def _lost(self, reason: str) -> None:
-        self._next = time.monotonic() + self._wait
+        self._next = self._clock() + self._wait
         self._wait = min(2 * self._wait, RECONNECT_DELAYS_S[1])
         self._closed(reason)
 

@@ -125,6 +125,7 @@ class MultipathConnection:
         media: called likewise for each video packet, with the name of its link.
         restarted: called likewise when the peer has started or restarted: its message numbers begin at 0.
         on_close: called by `close`.
+        clock: current time, seconds; the same as that of the times passed to `tick` and to sessions.
 
     Attributes:
         clocks: offset of the peer's clocks.
@@ -139,7 +140,9 @@ class MultipathConnection:
         *,
         clocks: ClockSync | None = None,
         on_close: Callable[[], None] = lambda: None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._clock = clock
         self.clocks = clocks or ClockSync()
         self.counter: Counter[str] = Counter()
         self._received, self._media, self._restarted, self._on_close = received, media, restarted, on_close
@@ -164,7 +167,7 @@ class MultipathConnection:
     @property
     def round_trip(self) -> float:
         """Round-trip time of the fastest link that is up, seconds; NaN: unknown."""
-        now = time.monotonic()
+        now = self._clock()
         return min(
             (one.round_trip for one in self._sending if one.up(now) and one.round_trip == one.round_trip),
             default=float("nan"),
@@ -190,7 +193,7 @@ class MultipathConnection:
 
     def send_media(self, packet: bytes, policy: Policy = Policy.COPY) -> None:
         """Send a video packet over links that are up; never blocks."""
-        now = time.monotonic()
+        now = self._clock()
         sessions = [one for one in self._sending if one.up(now)]
         if policy == Policy.SHARE and sessions:
             sessions = [min(sessions, key=lambda one: one.weighted_bytes)]
@@ -272,7 +275,7 @@ class MultipathConnection:
         one, why = link.session, link.why
         if one is None:
             return LinkState(name, bytes_in=link.bytes_in, bytes_out=link.bytes_out, why=why)
-        now = time.monotonic()
+        now = self._clock()
         up = one.up(now)
         handshake = (one.dtls.established or one.dtls.started) - one.dtls.started
         return LinkState(
@@ -334,7 +337,7 @@ class MultipathConnection:
         except struct.error as error:
             raise Malformed(str(error)) from None
         self.clocks.add_exchange(ping_sent, ping_received, pong.sent, pong_received, wall)
-        session.last_pong = time.monotonic()
+        session.last_pong = self._clock()
         round_trip = ((pong_received - ping_sent) - (pong.sent - ping_received)) / 1e9
         session.round_trip = (
             round_trip if session.round_trip != session.round_trip else 0.8 * session.round_trip + 0.2 * round_trip

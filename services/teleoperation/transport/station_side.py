@@ -7,7 +7,7 @@ for each host and in total, so that a flood of them costs only bounded time.
 
 from __future__ import annotations
 
-import socket
+import errno
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +21,14 @@ from scan2sim.services.teleoperation.transport.clock_sync import ClockSync
 from scan2sim.services.teleoperation.transport.dtls_session import DtlsSession, is_hello
 from scan2sim.services.teleoperation.transport.multipath import SESSION_BYTES, LinkSession, MultipathConnection
 from scan2sim.services.teleoperation.transport.tls import Channel, TlsError
-from scan2sim.services.teleoperation.transport.udp_reactor import UdpReactor, format_address, udp_socket
+from scan2sim.services.teleoperation.transport.udp_reactor import (
+    Address,
+    OpenReactor,
+    Reactor,
+    UdpReactor,
+    UdpSocket,
+    format_address,
+)
 
 HANDSHAKES_MAX, HANDSHAKES_PER_HOST_MAX, HANDSHAKE_TIMEOUT_S = 64, 16, 5.0
 """Maximum number of concurrent handshakes, of those from one host, and duration of one."""
@@ -33,8 +40,6 @@ SESSIONS_PER_PEER_MAX = 32
 """Maximum number of DTLS sessions of one peer."""
 REPLACED_SESSION_LIFETIME_S, SESSION_TIMEOUT_S = 3.0, 30.0
 """Time for which a replaced session is still read; silence after which a session is dropped."""
-
-Address = tuple[object, ...]
 
 
 class TokenBucket:
@@ -56,14 +61,19 @@ class TokenBucket:
 
 @dataclass
 class _RemoteSession:
-    """DTLS session with a remote address: a handshake, then a link session of a connection."""
+    """DTLS session with a remote address: a handshake, then a link session of a connection, named by its first ping."""
 
-    sock: socket.socket
+    sock: UdpSocket
     address: Address
     dtls: DtlsSession
     connection: MultipathConnection | None = None
     link_session: LinkSession | None = None
     until: float = float("inf")
+
+    @property
+    def attached(self) -> bool:
+        """Whether the name of its link is known, so that messages are sent over it."""
+        return self.link_session is not None and self.link_session.name != ""
 
 
 class Listener:
@@ -71,6 +81,8 @@ class Listener:
 
     Args:
         addresses: (host, port) to listen on; port 0: any free one. List the addresses of a multihomed machine.
+        clock: current time, seconds.
+        reactor: opens sockets, and reads them.
 
     Attributes:
         addresses: where it listens.
@@ -80,7 +92,15 @@ class Listener:
         BusyError: a port is in use.
     """
 
-    def __init__(self, identity: Identity, addresses: Sequence[tuple[str, int]]) -> None:
+    def __init__(
+        self,
+        identity: Identity,
+        addresses: Sequence[tuple[str, int]],
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        reactor: OpenReactor = UdpReactor,
+    ) -> None:
+        self._clock = clock
         self._context = tls.context(identity, datagrams=True)
         self._expected: dict[Peer, MultipathConnection] = {}
         self._sessions: dict[tuple[int, Address], _RemoteSession] = {}
@@ -89,11 +109,9 @@ class Listener:
         self._hellos = TokenBucket(HELLO_RATE_MAX)
         self._hosts: OrderedDict[object, TokenBucket] = OrderedDict()
         self._next_channel = self._new_channel()
-        self._reactor = UdpReactor(self._receive, self._tick)
-        sockets = [_bind(*address) for address in addresses]
-        for sock in sockets:
-            self._reactor.add(sock)
-        self.addresses: tuple[tuple[str, int], ...] = tuple(sock.getsockname()[:2] for sock in sockets)
+        self._reactor = reactor(self._receive, self._tick, clock)
+        sockets = [_bind(self._reactor, *address) for address in addresses]
+        self.addresses: tuple[tuple[str, int], ...] = tuple(_host_and_port(sock) for sock in sockets)
         self._reactor.start()
 
     @property
@@ -118,8 +136,9 @@ class Listener:
         """Accept a peer, named by the gateway; its links are added to the connection as they come up."""
         self.forget(peer)
         connection = MultipathConnection(
-            received, media, restarted, clocks=clocks, on_close=lambda: self._forget(peer, connection)
-        )
+            received, media, restarted,
+            clocks=clocks, on_close=lambda: self._forget(peer, connection), clock=self._clock,
+        )  # fmt: skip
         self._expected[peer] = connection
         return connection
 
@@ -147,17 +166,17 @@ class Listener:
     def _new_channel(self) -> Channel:
         return Channel(self._context, client=False, accepts=lambda peer: peer in self._expected)
 
-    def _receive(self, sock: socket.socket, data: bytes, address: Address) -> None:
+    def _receive(self, sock: UdpSocket, data: bytes, address: Address) -> None:
         key = (sock.fileno(), address)
         entry = self._sessions.get(key)
         if entry is None:
             self._receive_hello(key, sock, data, address)
         elif data and 128 <= data[0] < 192:
-            if entry.connection is not None and entry.link_session is not None:
+            if entry.connection is not None and entry.link_session is not None and entry.attached:
                 entry.connection.receive_media(entry.link_session, data)
         else:
-            for part in entry.dtls.receive(data, time.monotonic()):
-                self._receive_message(key, entry, part)
+            for part in entry.dtls.receive(data, self._clock()):
+                self._receive_message(entry, part)
             if key in self._pending:
                 self._check_handshake(key, entry)
 
@@ -172,43 +191,35 @@ class Listener:
             entry.connection = self._expected.get(one.peer)
             mine = [each for each in self._sessions.items() if each[1].connection is entry.connection]
             if entry.connection is None:
-                self._drop(key, entry)
-            elif len(mine) > SESSIONS_PER_PEER_MAX:
+                return self._drop(key, entry)
+            send, local = self._sender(entry.sock, entry.address), format_address(entry.sock.getsockname())
+            entry.link_session = LinkSession("", one, send, local, format_address(entry.address))
+            if len(mine) > SESSIONS_PER_PEER_MAX:
                 self._drop(*min(mine, key=lambda each: each[1].dtls.last_received))
 
-    def _receive_message(self, key: tuple[int, Address], entry: _RemoteSession, part: bytes) -> None:
-        """Process a message of a peer; the first ping of a session names its link."""
-        if entry.connection is None:
+    def _receive_message(self, entry: _RemoteSession, part: bytes) -> None:
+        """Process a message of a peer; the first ping, which names the link, may arrive after others, or get lost."""
+        if entry.connection is None or entry.link_session is None:
             return
-        if entry.link_session is None:
-            try:
-                ping = Message.unpack(part[SESSION_BYTES:])
-                name = ping.body.decode() if ping.kind == Kind.PING else ""
-            except (Malformed, UnicodeDecodeError):
-                name = ""
-            if not name or len(name) > 60 or entry.connection.is_full(name):
+        if not entry.attached and (name := _link_name(part)) is not None:
+            if not 0 < len(name) <= 60 or entry.connection.is_full(name):
                 self._counts["unnamed"] += 1
                 return
-            self._attach_link(entry, name)
-        assert entry.link_session is not None
+            self._attach_link(entry.connection, entry.link_session, name)
         entry.connection.receive_message(entry.link_session, part)
 
-    def _attach_link(self, entry: _RemoteSession, name: str) -> None:
-        send = self._sender(entry.sock, entry.address)
-        assert entry.connection is not None
-        local = format_address(entry.sock.getsockname())
-        entry.link_session = LinkSession(name, entry.dtls, send, local, format_address(entry.address))
-        entry.dtls.counts = entry.connection.counter
-        before = entry.connection.attach(entry.link_session)
+    def _attach_link(self, connection: MultipathConnection, link_session: LinkSession, name: str) -> None:
+        link_session.name, link_session.dtls.counts = name, connection.counter
+        before = connection.attach(link_session)
         for other in self._sessions.values():
             if other.link_session is before and before is not None:
-                other.until = time.monotonic() + REPLACED_SESSION_LIFETIME_S
+                other.until = self._clock() + REPLACED_SESSION_LIFETIME_S
 
-    def _receive_hello(self, key: tuple[int, Address], sock: socket.socket, data: bytes, address: Address) -> None:
+    def _receive_hello(self, key: tuple[int, Address], sock: UdpSocket, data: bytes, address: Address) -> None:
         if not is_hello(data):
             self._counts["strangers"] += 1
             return
-        now = time.monotonic()
+        now = self._clock()
         if not self._is_within_rate(address[0], now):
             self._counts["flooded"] += 1
             return
@@ -249,7 +260,7 @@ class Listener:
                 one.tick(now)
             timed_out = (
                 now - one.started > HANDSHAKE_TIMEOUT_S
-                if entry.link_session is None
+                if not entry.attached
                 else now - one.last_received > SESSION_TIMEOUT_S
             )
             if one.ended or timed_out or now > entry.until:
@@ -265,7 +276,7 @@ class Listener:
         if entry.connection is not None and entry.link_session is not None:
             entry.connection.detach(entry.link_session)
 
-    def _sender(self, sock: socket.socket, address: Address) -> Callable[[bytes], None]:
+    def _sender(self, sock: UdpSocket, address: Address) -> Callable[[bytes], None]:
         def send(data: bytes) -> None:
             try:
                 sock.sendto(data, address)
@@ -275,14 +286,28 @@ class Listener:
         return send
 
 
-def _bind(host: str, port: int) -> socket.socket:
-    sock = udp_socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+def _bind(reactor: Reactor, host: str, port: int) -> UdpSocket:
     try:
-        sock.bind((host, port))
+        return reactor.bind(host, port)
     except OSError as error:
-        sock.close()
-        if error.errno == 98:
+        if error.errno == errno.EADDRINUSE:
             remedy = "End that program, or choose another port"
             raise BusyError(f"{host}:{port}", "is in use by another program", remedy) from None
         raise SettingError(f"{host}:{port}", str(error.strerror), "Give an address of this machine") from None
-    return sock
+
+
+def _host_and_port(sock: UdpSocket) -> tuple[str, int]:
+    host, port, *_ = sock.getsockname()
+    assert isinstance(host, str) and isinstance(port, int)
+    return host, port
+
+
+def _link_name(part: bytes) -> str | None:
+    """Name of the link in a ping, empty if malformed; None: the message is of another kind, or malformed."""
+    try:
+        message = Message.unpack(part[SESSION_BYTES:])
+        return message.body.decode() if message.kind == Kind.PING else None
+    except UnicodeDecodeError:
+        return ""
+    except Malformed:
+        return None

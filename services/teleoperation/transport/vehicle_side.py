@@ -6,9 +6,7 @@ whatever local address it has by then, while the old one continues; the first ha
 
 from __future__ import annotations
 
-import ipaddress
 import os
-import socket
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -21,7 +19,14 @@ from scan2sim.services.teleoperation.transport.clock_sync import ClockSync
 from scan2sim.services.teleoperation.transport.dtls_session import DtlsSession
 from scan2sim.services.teleoperation.transport.multipath import LINKS_MAX, LinkSession, MultipathConnection
 from scan2sim.services.teleoperation.transport.tls import Channel
-from scan2sim.services.teleoperation.transport.udp_reactor import UdpReactor, format_address, udp_socket
+from scan2sim.services.teleoperation.transport.udp_reactor import (
+    Address,
+    OpenReactor,
+    UdpReactor,
+    UdpSocket,
+    format_address,
+    is_address,
+)
 
 REKEY_PERIOD_S = 600.0
 """Age of a session after which its keys are renewed."""
@@ -42,24 +47,6 @@ class Link:
     name: str
     local: str = ""
 
-    def socket(self, remote: tuple[str, int]) -> socket.socket:
-        """Create a socket connected to a remote address.
-
-        Raises:
-            OSError: there is no such route now.
-        """
-        sock = udp_socket(socket.AF_INET6 if ":" in remote[0] else socket.AF_INET)
-        try:
-            if self.local and _is_address(self.local):
-                sock.bind((self.local, 0))
-            elif self.local:
-                sock.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, self.local.encode())
-            sock.connect(remote)
-        except OSError:
-            sock.close()
-            raise
-        return sock
-
 
 @dataclass
 class _Path:
@@ -69,9 +56,9 @@ class _Path:
     link: Link
     remote: tuple[str, int]
     session: LinkSession | None = None
-    attempts: dict[socket.socket, LinkSession] = field(default_factory=dict)
-    replaced: dict[socket.socket, tuple[LinkSession, float]] = field(default_factory=dict)
-    sock: socket.socket | None = None
+    attempts: dict[UdpSocket, LinkSession] = field(default_factory=dict)
+    replaced: dict[UdpSocket, tuple[LinkSession, float]] = field(default_factory=dict)
+    sock: UdpSocket | None = None
     last_attempt: float = float("-inf")
 
 
@@ -86,12 +73,16 @@ def connect_station(
     restarted: Callable[[], None] = lambda: None,
     renew: float = REKEY_PERIOD_S,
     clocks: ClockSync | None = None,
+    clock: Callable[[], float] = time.monotonic,
+    reactor: OpenReactor = UdpReactor,
 ) -> MultipathConnection:
     """Connect to a station until the connection is closed.
 
     Args:
         peer: the station, named by the gateway.
         addresses: of the station; IP addresses, to avoid name resolution.
+        clock: current time, seconds.
+        reactor: opens sockets, and reads them.
 
     Raises:
         SettingError: no links or addresses, too many of them, or a host that isn't an IP address.
@@ -100,9 +91,13 @@ def connect_station(
         combinations = f"{len(links)} links to {len(addresses)} addresses"
         cause = f"{combinations} are no paths, or more than {LINKS_MAX}"
         raise SettingError("links", cause, "Give fewer links or addresses, but at least one of each")
-    if wrong := next((host for host, _ in addresses if not _is_address(host)), ""):
+    if wrong := next((host for host, _ in addresses if not is_address(host)), ""):
         raise SettingError("addresses", f"{wrong!r} is not an IP address", "Give the station's IP addresses")
-    return _Connector(identity, peer, links, addresses, received, media, restarted, renew, clocks).connection
+    connection = MultipathConnection(
+        received, media, restarted, clocks=clocks, on_close=lambda: connector.close(), clock=clock
+    )
+    connector = _Connector(identity, peer, links, addresses, connection, renew, clock, reactor)
+    return connection
 
 
 class _Connector:
@@ -114,28 +109,27 @@ class _Connector:
         peer: Peer,
         links: Sequence[Link],
         addresses: Sequence[tuple[str, int]],
-        received: Callable[[Message], None],
-        media: Callable[[bytes, str], None],
-        restarted: Callable[[], None],
+        connection: MultipathConnection,
         renew: float,
-        clocks: ClockSync | None,
+        clock: Callable[[], float],
+        reactor: OpenReactor,
     ) -> None:
         self._context = tls.context(identity, datagrams=True)
-        self._peer, self._renew = peer, renew
+        self._peer, self._renew, self._clock = peer, renew, clock
         multiple_addresses = len(addresses) > 1
         self._paths = [
             _Path(f"{link.name}>{format_address(remote)}" if multiple_addresses else link.name, link, remote)
             for link in links
             for remote in addresses
         ]
-        self._path_of: dict[socket.socket, _Path] = {}
-        self.connection = MultipathConnection(received, media, restarted, clocks=clocks, on_close=self._close)
+        self._path_of: dict[UdpSocket, _Path] = {}
+        self.connection = connection
         for path in self._paths:
             self.connection.report_down(path.name, "connecting")
-        self._reactor = UdpReactor(self._receive, self._tick)
+        self._reactor = reactor(self._receive, self._tick, clock)
         self._reactor.start()
 
-    def _receive(self, sock: socket.socket, data: bytes, address: tuple[object, ...]) -> None:
+    def _receive(self, sock: UdpSocket, data: bytes, address: Address) -> None:
         path = self._path_of[sock]
         attempt = path.attempts.get(sock)
         session = attempt or (path.session if sock is path.sock else path.replaced[sock][0])
@@ -144,16 +138,16 @@ class _Connector:
             if attempt is None:
                 self.connection.receive_media(session, data)
             return
-        for part in session.dtls.receive(data, time.monotonic()):
+        for part in session.dtls.receive(data, self._clock()):
             self.connection.receive_message(session, part)
         if attempt is not None and session.dtls.established is not None:
             self._use_session(path, sock, session)
         elif attempt is not None and session.dtls.ended:
             self._abandon(path, sock, session.dtls.ended)
 
-    def _use_session(self, path: _Path, sock: socket.socket, session: LinkSession) -> None:
+    def _use_session(self, path: _Path, sock: UdpSocket, session: LinkSession) -> None:
         """Use a session whose handshake is complete."""
-        now = time.monotonic()
+        now = self._clock()
         del path.attempts[sock]
         if path.sock is not None and path.session is not None:
             path.replaced[path.sock] = (path.session, now + REPLACED_SESSION_LIFETIME_S)
@@ -163,12 +157,12 @@ class _Connector:
         for other in list(path.attempts):
             self._close_session(path, other, path.attempts.pop(other))
 
-    def _abandon(self, path: _Path, sock: socket.socket, reason: str) -> None:
+    def _abandon(self, path: _Path, sock: UdpSocket, reason: str) -> None:
         self._close_session(path, sock, path.attempts.pop(sock))
         if path.session is None:
             self.connection.report_down(path.name, reason)
 
-    def _close_session(self, path: _Path, sock: socket.socket, session: LinkSession) -> None:
+    def _close_session(self, path: _Path, sock: UdpSocket, session: LinkSession) -> None:
         session.dtls.close()
         del self._path_of[sock]
         self._reactor.remove(sock)
@@ -201,7 +195,7 @@ class _Connector:
     def _start_attempt(self, path: _Path, now: float) -> None:
         path.last_attempt = now
         try:
-            sock = path.link.socket(path.remote)
+            sock = self._reactor.connect(path.link.local, path.remote)
         except OSError as error:
             if path.session is None:
                 reason = f"{path.link.local}: {os.strerror(error.errno or 0)}".removeprefix(": ")
@@ -212,10 +206,11 @@ class _Connector:
         dtls = DtlsSession(channel, send, self.connection.counter, now)
         session = LinkSession(path.name, dtls, send, format_address(sock.getsockname()), format_address(path.remote))
         self._path_of[sock], path.attempts[sock] = path, session
-        self._reactor.add(sock)
         dtls.start_handshake(now)
 
-    def _close(self) -> None:
+    def close(self) -> None:
+        """Close all sessions and sockets."""
+
         def close_all() -> None:
             for path in self._paths:
                 for session in (path.session, *path.attempts.values(), *(one for one, _ in path.replaced.values())):
@@ -227,7 +222,7 @@ class _Connector:
         self._reactor.end()
 
 
-def _sender(sock: socket.socket, connection: MultipathConnection) -> Callable[[bytes], None]:
+def _sender(sock: UdpSocket, connection: MultipathConnection) -> Callable[[bytes], None]:
     def send(data: bytes) -> None:
         try:
             sock.send(data)
@@ -235,11 +230,3 @@ def _sender(sock: socket.socket, connection: MultipathConnection) -> Callable[[b
             connection.counter["unsent"] += 1
 
     return send
-
-
-def _is_address(text: str) -> bool:
-    try:
-        ipaddress.ip_address(text)
-    except ValueError:
-        return False
-    return True

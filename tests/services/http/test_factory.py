@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
-import itertools
+import select
 import socket
 import ssl
 import subprocess
 import threading
-import time
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,6 +27,7 @@ from starlette.websockets import WebSocketDisconnect
 from websockets.sync.client import connect
 
 from scan2sim.services.http import bodies, factory, limits
+from tests.waiting import until
 
 TOKEN = "0123456789abcdef"
 ERROR_FIELDS = {"where", "cause", "remedy", "error"}
@@ -177,17 +178,13 @@ def certificate(tmp_path: Path) -> tuple[Path, Path]:
 
 
 @pytest.fixture
-def https_url(certificate: tuple[Path, Path]) -> Iterator[str]:
+def https_url(certificate: tuple[Path, Path]) -> str:
     """URL of a running HTTPS service."""
     addresses: list[str] = []
     params = ServerParams(port=0, host="localhost", certificate=certificate[0], key=certificate[1])
     thread = threading.Thread(target=factory.run, args=(app_of(params), params, addresses.append), daemon=True)
     thread.start()
-    for _ in range(600):
-        if addresses:
-            break
-        time.sleep(0.05)
-    yield addresses[0]
+    return until(lambda: addresses and addresses[0])
 
 
 def test_service_uses_tls(https_url: str, certificate: tuple[Path, Path]) -> None:
@@ -222,60 +219,119 @@ def test_tls_without_a_token_logs_a_warning(
     assert ("--token FILE" in caplog.text) == (host == "0.0.0.0" and not by_token)
 
 
+class Service:
+    """A running service, whose clock stands still unless the test sets it, so that nothing times out by chance.
+
+    Attributes:
+        port: its TCP port.
+        bodies: bodies of its requests.
+        entered: whether a request has reached `/wait`, which answers once `released`.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.entered, self.released = threading.Event(), threading.Event()
+        self._now, self._loop = 1000.0, list[asyncio.AbstractEventLoop]()
+        monkeypatch.setattr(limits.LimitedEventLoop, "time", self._time)
+        created: list[bodies.Bodies] = []
+
+        def create(max_bytes: int) -> bodies.Bodies:
+            created.append(bodies.Bodies(max_bytes))
+            return created[-1]
+
+        monkeypatch.setattr(factory, "Bodies", create)
+        addresses: list[str] = []
+        params = ServerParams(port=0)
+        app = app_of(params)
+
+        @app.get("/wait")
+        def wait() -> float:
+            self.entered.set()
+            self.released.wait()
+            return 2.0
+
+        @app.websocket("/echo")
+        async def echo(socket: WebSocket) -> None:
+            await socket.accept()
+            await socket.send_text(await socket.receive_text())
+
+        threading.Thread(target=factory.run, args=(app, params, addresses.append), daemon=True).start()
+        address = until(lambda: addresses and addresses[0])
+        self.port = int(address.rsplit(":")[-1].strip("/"))
+        assert self.get() == b"2.0"
+        self.bodies = created[0]
+
+    def get(self, path: str = "number?value=2") -> bytes:
+        """Content of a response."""
+        with urllib.request.urlopen(f"http://127.0.0.1:{self.port}/{path}", timeout=60) as answer:
+            return bytes(answer.read())
+
+    def connect(self, sent: bytes = b"") -> socket.socket:
+        """Open a connection, and send something."""
+        sock = socket.create_connection(("127.0.0.1", self.port), timeout=60)
+        sock.sendall(sent)
+        return sock
+
+    def advance(self, seconds: float) -> None:
+        """Let the service handle what was sent, then let time pass."""
+        self._settle()
+        self._now += seconds
+        self._settle()
+
+    def _settle(self) -> None:
+        async def turns() -> None:
+            for _ in range(50):
+                await asyncio.sleep(0)
+
+        asyncio.run_coroutine_threadsafe(turns(), self._loop[0]).result(60)
+
+    def _time(self) -> float:
+        if not self._loop:
+            self._loop.append(asyncio.get_running_loop())
+        return self._now
+
+
 @pytest.fixture
-def plain(monkeypatch: pytest.MonkeyPatch) -> int:
-    """Port of a running service with short timeouts."""
-    monkeypatch.setattr(limits, "REQUEST_TIMEOUT_S", 1.0)
-    monkeypatch.setattr(bodies, "BODY_TIMEOUT_S", 0.5)
-    addresses: list[str] = []
-    params = ServerParams(port=0)
-    app = app_of(params)
-
-    @app.get("/slow")
-    def slow(seconds: float) -> float:
-        time.sleep(seconds)
-        return seconds
-
-    @app.websocket("/echo")
-    async def echo(socket: WebSocket) -> None:
-        await socket.accept()
-        await socket.send_text(await socket.receive_text())
-
-    threading.Thread(target=factory.run, args=(app, params, addresses.append), daemon=True).start()
-    while not addresses:
-        time.sleep(0.05)
-    return int(addresses[0].rsplit(":")[-1].strip("/"))
+def plain(monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
+    """A running service."""
+    service = Service(monkeypatch)
+    yield service
+    service.released.set()
 
 
-def test_a_thousand_idle_connections_do_not_block_others_and_are_closed(plain: int) -> None:
-    idle = [socket.create_connection(("127.0.0.1", plain)) for _ in range(1000)]
-    with urllib.request.urlopen(f"http://127.0.0.1:{plain}/number?value=2", timeout=10) as answer:
-        assert answer.read() == b"2.0"
+def is_open(sock: socket.socket) -> bool:
+    """Whether a connection is open, and nothing was received."""
+    poll = select.poll()
+    poll.register(sock, select.POLLIN)
+    return not poll.poll(0)
+
+
+def test_a_thousand_idle_connections_do_not_block_others_and_are_closed(plain: Service) -> None:
+    idle = [plain.connect() for _ in range(1000)]
+    assert plain.get() == b"2.0"
+    plain.advance(limits.REQUEST_TIMEOUT_S - 0.1)
+    assert all(map(is_open, idle))
+    plain.advance(0.2)
     for one in idle:
-        one.settimeout(20)
         assert one.recv(1) == b""
         one.close()
 
 
-def test_further_connections_are_closed_at_once(plain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_further_connections_are_closed_at_once(plain: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "MAX_CONNECTIONS", 3)
-    monkeypatch.setattr(limits, "REQUEST_TIMEOUT_S", 60.0)
-    idle = [socket.create_connection(("127.0.0.1", plain), timeout=20) for _ in range(3)]
-    with socket.create_connection(("127.0.0.1", plain), timeout=20) as further:
+    plain.advance(0)
+    idle = [plain.connect() for _ in range(3)]
+    with plain.connect() as further:
         assert further.recv(1) == b""
     idle.pop().close()
-    wait_until_served(plain)
+    until(lambda: is_served(plain))
     for one in idle:
         one.close()
 
 
-def wait_until_served(port: int) -> None:
-    for _ in range(200):
-        with contextlib.suppress(OSError):
-            urllib.request.urlopen(f"http://127.0.0.1:{port}/health/live", timeout=10).close()
-            return
-        time.sleep(0.05)
-    raise AssertionError("requests are rejected")
+def is_served(service: Service) -> bool:
+    with contextlib.suppress(OSError):
+        return bool(service.get("health/live"))
+    return False
 
 
 GET = b"GET /number?value=2 HTTP/1.1\r\nHost: localhost\r\n"
@@ -283,56 +339,81 @@ POST = b"POST /nix HTTP/1.1\r\nHost: localhost\r\nContent-Length: 999\r\n"
 
 
 @pytest.mark.parametrize("first", [b"", GET + b"\r\n", POST + b"\r\n"], ids=["first", "second", "rejected body"])
-def test_slow_headers_time_out(plain: int, first: bytes) -> None:
+def test_slow_headers_time_out(plain: Service, first: bytes) -> None:
     """Slowloris: in the first header, in a later one, or in the body of a request that has been answered."""
-    with socket.create_connection(("127.0.0.1", plain), timeout=20) as slow:
-        if first:
-            slow.sendall(first)
-            assert slow.recv(2**16)
-        with pytest.raises(OSError):
-            for byte in itertools.islice(itertools.chain(GET, itertools.cycle(b"X-More: 1\r\n")), 100):
-                slow.sendall(bytes([byte]))
-                time.sleep(0.1)
+    with plain.connect(first) as slow:
+        if first.startswith(b"POST"):
+            until(lambda: plain.bodies._arriving)
+            plain.advance(bodies.BODY_TIMEOUT_S + 0.1)
+        answer = b""
+        while first and not answer.endswith((b"2.0", b"}")):
+            answer += slow.recv(2**16)
+        for byte in GET[:9]:
+            slow.sendall(bytes([byte]))
+            plain.advance(limits.REQUEST_TIMEOUT_S / 10)
+        assert is_open(slow)
+        slow.sendall(GET[9:10])
+        plain.advance(limits.REQUEST_TIMEOUT_S / 9)
+        with contextlib.suppress(ConnectionResetError):
+            assert slow.recv(1) == b""
 
 
-def test_slow_responses_and_silent_websockets_are_not_cut_off(plain: int) -> None:
-    with connect(f"ws://127.0.0.1:{plain}/echo") as silent:
-        with urllib.request.urlopen(f"http://127.0.0.1:{plain}/slow?seconds=2", timeout=20) as answer:
-            assert answer.read() == b"2.0"
+def test_slow_responses_and_silent_websockets_are_not_cut_off(plain: Service) -> None:
+    with connect(f"ws://127.0.0.1:{plain.port}/echo", open_timeout=60) as silent:
+        with plain.connect(b"GET /wait HTTP/1.1\r\nHost: localhost\r\n\r\n") as slow:
+            assert plain.entered.wait(60)
+            plain.advance(1.5 * limits.REQUEST_TIMEOUT_S)
+            assert is_open(slow)
+            plain.released.set()
+            assert slow.recv(100).startswith(b"HTTP/1.1 200")
         silent.send("still here")
-        assert silent.recv(20) == "still here"
+        assert silent.recv(60) == "still here"
 
 
-def test_missing_body_times_out(plain: int) -> None:
-    with socket.create_connection(("127.0.0.1", plain), timeout=20) as half:
-        half.sendall(b"POST /length HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10\r\n\r\nabc")
+def half_post(service: Service, sent: int = 3, size: int = 10) -> socket.socket:
+    head = f"POST /length HTTP/1.1\r\nHost: localhost\r\nContent-Length: {size}\r\n\r\n"
+    return service.connect(head.encode() + b"x" * sent)
+
+
+def test_missing_body_times_out(plain: Service) -> None:
+    with half_post(plain) as half:
+        until(lambda: plain.bodies._total == 3)
+        plain.advance(bodies.BODY_TIMEOUT_S - 0.1)
+        assert is_open(half)
+        plain.advance(0.2)
         assert b"408" in half.recv(100)
 
 
-def half_post(port: int, sent: int = 3, size: int = 10) -> socket.socket:
-    half = socket.create_connection(("127.0.0.1", port), timeout=20)
-    half.sendall(f"POST /length HTTP/1.1\r\nHost: localhost\r\nContent-Length: {size}\r\n\r\n".encode() + b"x" * sent)
-    return half
+def test_complete_body_that_is_too_large_is_rejected_at_once(plain: Service) -> None:
+    size = factory.MAX_BODY_BYTES
+    head = b"POST /length HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n%x\r\n" % size
+    with plain.connect(head + b"x" * size) as whole:
+        until(lambda: plain.bodies._total == size)
+        whole.sendall(b"\r\n1\r\nx\r\n0\r\n\r\n")
+        assert b"413" in whole.recv(100)
 
 
-def test_body_that_arrives_in_parts_has_a_deadline_in_total(plain: int) -> None:
+def test_body_that_arrives_in_parts_has_a_deadline_in_total(plain: Service) -> None:
     with half_post(plain, size=100) as slow:
-        for _ in range(20):
-            with contextlib.suppress(OSError):
-                slow.send(b"x")
-            time.sleep(0.1)
+        until(lambda: plain.bodies._total == 3)
+        for _ in range(9):
+            slow.send(b"x")
+            plain.advance(bodies.BODY_TIMEOUT_S / 10)
+        assert is_open(slow)
+        plain.advance(bodies.BODY_TIMEOUT_S / 9)
         assert b"408" in slow.recv(100)
 
 
 def test_body_that_has_been_arriving_longest_is_given_up_for_others(
-    plain: int, monkeypatch: pytest.MonkeyPatch
+    plain: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bodies, "BODY_TIMEOUT_S", 60.0)
     monkeypatch.setattr(bodies, "MAX_ARRIVING", 3)
-    slow = []
-    for _ in range(5):
+    slow: list[socket.socket] = []
+    for count in (1, 2, 3, 3, 3):
         slow.append(half_post(plain))
-        time.sleep(0.2)
+        until(lambda: plain.bodies._total == 3 * count)  # noqa: B023
+        plain.advance(0)
+        assert len(plain.bodies._arriving) == count
     assert [b"408" in one.recv(100) for one in slow[:2]] == [True, True]
     for one in slow[2:]:
         one.sendall(b"y" * 7)
@@ -340,28 +421,28 @@ def test_body_that_has_been_arriving_longest_is_given_up_for_others(
         one.close()
 
 
-def test_memory_for_bodies_is_limited(monkeypatch: pytest.MonkeyPatch, plain: int) -> None:
-    monkeypatch.setattr(bodies, "BODY_TIMEOUT_S", 60.0)
-    size = factory.MAX_BODY_BYTES
-    slow = [half_post(plain, size - 1, size) for _ in range(bodies.MAX_MEMORY_BODIES)]
-    time.sleep(0.5)
+def test_memory_for_bodies_is_limited(plain: Service) -> None:
+    size, count = factory.MAX_BODY_BYTES, bodies.MAX_MEMORY_BODIES
+    slow = []
+    for number in range(1, count + 1):
+        slow.append(half_post(plain, size - 1, size))
+        until(lambda: plain.bodies._total == number * (size - 1))  # noqa: B023
     with half_post(plain, size, size) as complete:
         assert b"200" in complete.recv(100)
     assert b"408" in slow[0].recv(100), "the oldest was given up"
+    assert all(map(is_open, slow[1:]))
     for one in slow:
         one.close()
 
 
-def test_health_is_served_whatever_the_number_of_requests(plain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_health_is_served_whatever_the_number_of_requests(plain: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(factory, "MAX_CONCURRENT_REQUESTS", 1)
-    waiting = socket.create_connection(("127.0.0.1", plain), timeout=20)
-    waiting.sendall(b"GET /slow?seconds=3 HTTP/1.1\r\nHost: localhost\r\n\r\n")
-    time.sleep(0.5)
-    with pytest.raises(HTTPError) as caught:
-        urllib.request.urlopen(f"http://127.0.0.1:{plain}/number", timeout=10)
-    assert caught.value.code == 503 and caught.value.headers["Retry-After"] == "1"
-    urllib.request.urlopen(f"http://127.0.0.1:{plain}/health/live", timeout=10).close()
-    waiting.close()
+    with plain.connect(b"GET /wait HTTP/1.1\r\nHost: localhost\r\n\r\n"):
+        assert plain.entered.wait(60)
+        with pytest.raises(HTTPError) as caught:
+            plain.get()
+        assert caught.value.code == 503 and caught.value.headers["Retry-After"] == "1"
+        assert plain.get("health/live")
 
 
 def test_cross_origin_requests_are_rejected() -> None:

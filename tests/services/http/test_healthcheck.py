@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -14,6 +13,7 @@ pytest.importorskip("fastapi", reason="the extra bus isn't installed")
 
 from scan2sim.services.http import factory, healthcheck
 from scan2sim.services.http.settings import ServerParams
+from tests.waiting import until
 
 
 def start_service(states: list[bool], params: ServerParams) -> str:
@@ -21,13 +21,11 @@ def start_service(states: list[bool], params: ServerParams) -> str:
     addresses: list[str] = []
     app = factory.application("a test", params, alive={}, ready={"model": lambda: states[-1]})
     threading.Thread(target=factory.run, args=(app, params, addresses.append), daemon=True).start()
-    deadline = time.monotonic() + 10
-    while not addresses and time.monotonic() < deadline:
-        time.sleep(0.01)
-    return addresses[0]
+    return until(lambda: addresses and addresses[0])
 
 
 def exit_code(address: str, monkeypatch: pytest.MonkeyPatch) -> object:
+    monkeypatch.setattr(healthcheck, "TIMEOUT_S", 60.0)  # the service of a test may be slow
     monkeypatch.setattr(sys, "argv", ["ready", address])
     try:
         healthcheck.main()

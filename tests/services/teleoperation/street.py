@@ -43,17 +43,21 @@ REST = Controls(gear=Gear.FORWARD)
 
 
 class Desk:
-    """A station, set up as by `teleop station`; `frames` are the frames it received."""
+    """A station, set up as by `teleop station`; `frames` are the frames it received.
 
-    def __init__(self, folder: Path, gateway: int, port: int = 0, loss: float = 0.0) -> None:
+    Attributes:
+        shape: properties of its links, if `relayed`.
+    """
+
+    def __init__(self, folder: Path, gateway: int, port: int = 0, relayed: bool = False) -> None:
         self.frames: list[Frame] = []
         self.show: Callable[[Frame], None] = self.frames.append
         identity = Identity.read(folder)
         self._listener = Listener(identity, [(HERE, port)])
         self.port = self._listener.port
         self._relay = Relay((HERE, self.port))
-        self._relay.shapes[HERE].loss = loss
-        reached = [Address(host=HERE, port=self._relay.address[1] if loss else self.port)]
+        self.shape = self._relay.shapes[HERE]
+        reached = [Address(host=HERE, port=self._relay.address[1] if relayed else self.port)]
         self.station = Station(identity, self._listener, reached, lambda frame: self.show(frame))
         self.gateway_connection = GatewayConnection(
             identity, Address(host=HERE, port=gateway), self.station, lambda _: None
@@ -143,9 +147,9 @@ class Street:
         for one in cameras.frames("pattern", View(width=160, height=120, fps=10)):
             yield CameraFrame(np.ascontiguousarray(cv2.resize(one.image, self.size), np.uint8), one.captured)
 
-    def desk(self, name: str = "desk", port: int = 0, loss: float = 0.0) -> Desk:
-        """Start a station and wait for it; `loss`: packet loss in both directions."""
-        desk = Desk(self.parties / f"station-{name}", self.gateway.port, port, loss)
+    def desk(self, name: str = "desk", port: int = 0, relayed: bool = False) -> Desk:
+        """Start a station and wait for it; `relayed`: the test sets the properties of its links."""
+        desk = Desk(self.parties / f"station-{name}", self.gateway.port, port, relayed)
         self.desks.append(desk)
         until(lambda: any(one["name"] == name and one["there"] for one in self.fleet.snapshot()["stations"]))
         until(lambda: any(one["there"] for one in self.fleet.snapshot()["vehicles"]))

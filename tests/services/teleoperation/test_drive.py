@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +13,8 @@ pytest.importorskip("OpenSSL", reason="the extra teleop isn't installed")
 from scan2sim.services.teleoperation.control.controls import Controls
 from tests.services.teleoperation.street import AHEAD, REST, Street
 from tests.waiting import until
+
+pytestmark = pytest.mark.realtime
 
 
 @pytest.fixture
@@ -27,6 +28,19 @@ def stopped(controls: Controls) -> bool:
     return controls.throttle == 0 and controls.brake == 1
 
 
+def wait_for_commands(street: Street, count: int = 20) -> None:
+    """Wait until the vehicle has received further commands of the joined station."""
+    safety = street.vehicle._unit.car.safety
+    for _ in range(count):
+        last = safety._newest
+        until(lambda: safety._newest != last)  # noqa: B023
+
+
+def controls_since(street: Street, first: int) -> list[Controls]:
+    """All controls that the vehicle has received, from this one on."""
+    return [controls for _, controls in street.car.received[first:]]
+
+
 def test_driver_sees_video_confirms_and_drives(street: Street) -> None:
     desk = street.desk()
     assert stopped(street.car.controls) or street.car.controls == Controls()
@@ -34,16 +48,18 @@ def test_driver_sees_video_confirms_and_drives(street: Street) -> None:
     until(lambda: len(desk.frames) > 10)
     assert desk.frames[0].key and (desk.frames[0].width, desk.frames[0].height) == (160, 120)
     desk.drive(AHEAD)
-    time.sleep(1.0)
-    assert desk.standing() and street.car.controls.throttle == 0, "nobody has confirmed"
+    wait_for_commands(street)
+    assert desk.standing() and all(map(stopped, controls_since(street, 0))), "nobody has confirmed"
     desk.start()
     until(lambda: street.car.controls.throttle == AHEAD.throttle)
     until(lambda: any(link["up"] for link in street.fleet.snapshot()["vehicles"][0]["links"]))
     desk.drive(None)
     until(lambda: stopped(street.car.controls))
+    count = len(street.car.received)
     desk.drive(AHEAD)
-    time.sleep(1.0)
-    assert stopped(street.car.controls), "it stopped by itself, and starts only after a confirmation"
+    wait_for_commands(street)
+    confirm = "it stopped by itself, and starts only after a confirmation"
+    assert all(map(stopped, controls_since(street, count))), confirm
     desk.start()
     until(lambda: street.car.controls.throttle == AHEAD.throttle)
     street.fleet.release("car", "operator")
@@ -51,9 +67,10 @@ def test_driver_sees_video_confirms_and_drives(street: Street) -> None:
 
 
 def test_packets_lost_on_both_links_are_retransmitted(street: Street) -> None:
-    desk = street.desk(loss=0.2)
+    desk = street.desk(relayed=True)
     street.fleet.join("car", "desk", "operator")
     until(lambda: desk.frames)
+    desk.shape.loss = 0.4
 
     def frames() -> Counter[str]:
         joined = desk.station.joined()
@@ -85,10 +102,17 @@ def test_pair_keeps_driving_while_its_gateway_restarts(street: Street) -> None:
     desk.start()
     until(lambda: street.car.controls.throttle == AHEAD.throttle)
     stop = desk.stop()
+    count = len(street.car.received)
     street.restart_gateway()
-    until(lambda: [one["there"] for kind in street.fleet.snapshot().values() for one in kind] == [True, True])
-    assert desk.stop() == stop and street.car.controls.throttle == AHEAD.throttle
-    assert street.fleet.snapshot()["vehicles"][0]["other"] == "desk"
+
+    def is_known() -> bool:
+        fleet = street.fleet.snapshot()
+        there = [one["there"] for kind in fleet.values() for one in kind]
+        return there == [True, True] and fleet["vehicles"][0]["other"] == "desk"
+
+    until(is_known)
+    wait_for_commands(street)
+    assert desk.stop() == stop and {one.throttle for one in controls_since(street, count)} == {AHEAD.throttle}
 
 
 def test_handover_ends_the_first_drive_and_requires_a_confirmation(street: Street) -> None:
@@ -99,10 +123,11 @@ def test_handover_ends_the_first_drive_and_requires_a_confirmation(street: Stree
     street.fleet.hand_over("car", "other", "operator")
     until(lambda: stopped(street.car.controls))
     until(lambda: other.telemetry() is not None)
+    count = len(street.car.received)
     desk.drive(AHEAD)
     other.drive(AHEAD)
-    time.sleep(1.0)
-    assert stopped(street.car.controls) and desk.station.joined() is None
+    wait_for_commands(street)
+    assert all(map(stopped, controls_since(street, count))) and desk.station.joined() is None
     other.start()
     until(lambda: street.car.controls.throttle == AHEAD.throttle)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import socket
 import threading
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -21,13 +20,24 @@ from tests.fakes.certificates import OTHER, OWN, identity
 from tests.waiting import until
 
 
+class Clock:
+    """A clock that the test sets; it stands still otherwise, so that nothing times out on a slow machine."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
 class Side:
-    """Records the callbacks of one side."""
+    """Records the callbacks of one side, and has its clock."""
 
     def __init__(self) -> None:
         self.connections: list[Connection] = []
         self.lines: list[Any] = []
         self.ends: list[str] = []
+        self.clock = Clock()
 
     def opened(self, connection: Connection) -> None:
         self.connections.append(connection)
@@ -40,7 +50,12 @@ class Side:
 
     @property
     def callbacks(self) -> dict[str, Any]:
-        return {"opened": self.opened, "received": self.received, "closed": self.closed}
+        return {"opened": self.opened, "received": self.received, "closed": self.closed, "clock": self.clock}
+
+    def advance(self, thread: Client | Server, seconds: float) -> None:
+        """Let time pass for this side."""
+        self.clock.now += seconds
+        thread.wake()
 
 
 @pytest.fixture
@@ -55,8 +70,9 @@ def gateway() -> Iterator[tuple[Server, Side]]:
 def connect(gateway: tuple[Server, Side]) -> Iterator[Callable[..., tuple[Client, Side]]]:
     clients: list[Client] = []
 
-    def client(party: Identity, host: str = "127.0.0.1") -> tuple[Client, Side]:
+    def client(party: Identity, host: str = "127.0.0.1", clock: Clock | None = None) -> tuple[Client, Side]:
         side = Side()
+        side.clock = clock or side.clock
         clients.append(Client(party, host, gateway[0].port, **side.callbacks))
         return clients[-1], side
 
@@ -157,17 +173,15 @@ def test_malformed_lines_end_the_connection(gateway: Any, sent: bytes) -> None:
     assert gateway[1].ends[0].startswith("received a line") and not gateway[1].lines
 
 
-def test_only_a_slow_reader_is_disconnected(gateway: Any, connect: Any) -> None:
+def test_only_a_slow_reader_is_disconnected(gateway: Any, connect: Any, request: pytest.FixtureRequest) -> None:
     gate, (server, theirs) = threading.Event(), gateway
 
     def busy(*arguments: Any) -> None:
-        gate.wait(20)
+        gate.wait()
 
-    slow = Side()
-    client = Client(
-        identity(Role.STATION), "127.0.0.1", server.port,
-        opened=slow.opened, received=busy, closed=slow.closed,
-    )  # fmt: skip
+    slow = Client(identity(Role.STATION), "127.0.0.1", server.port, **(Side().callbacks | {"received": busy}))
+    request.addfinalizer(slow.close)
+    request.addfinalizer(gate.set)
     until(lambda: theirs.connections)
     _, mine = connect(identity(Role.VEHICLE))
     until(lambda: len(theirs.connections) == 2)
@@ -178,8 +192,6 @@ def test_only_a_slow_reader_is_disconnected(gateway: Any, connect: Any) -> None:
     until(lambda: mine.lines)
     until(lambda: theirs.ends)
     assert "too slowly" in theirs.ends[0]
-    gate.set()
-    client.close()
 
 
 def test_client_reconnects_after_a_restart_of_the_gateway(gateway: Any, connect: Any) -> None:
@@ -191,32 +203,44 @@ def test_client_reconnects_after_a_restart_of_the_gateway(gateway: Any, connect:
     assert not client.connected and not client.send({})
     again = Side()
     second = Server(identity(Role.GATEWAY), "127.0.0.1", server.port, **again.callbacks)
+    mine.advance(client, json_stream.RECONNECT_DELAYS_S[1])
     until(lambda: again.connections and client.send({"back": 1}))
     until(lambda: again.lines)
     second.close()
 
 
-def test_silent_connections_do_not_block_others_for_long(
-    gateway: Any, connect: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(json_stream, "HANDSHAKE_TIMEOUT_S", 0.5)
-    idle = [socket.create_connection(("127.0.0.1", gateway[0].port)) for _ in range(json_stream.HANDSHAKES_MAX + 20)]
-    client, _ = connect(identity(Role.VEHICLE))
+def test_silent_connections_do_not_block_others_for_long(gateway: Any, connect: Any) -> None:
+    server, theirs = gateway
+    count = json_stream.HANDSHAKES_MAX
+    idle = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(count)]
+    until(lambda: len(server._connections) == count)
+    client, mine = connect(identity(Role.VEHICLE))
+    until(lambda: mine.ends)
+    assert not client.connected
+    theirs.advance(server, json_stream.HANDSHAKE_TIMEOUT_S + 0.1)
+    until(lambda: len(theirs.ends) == count)
+    assert set(theirs.ends) == {"timed out"}
+    mine.advance(client, json_stream.RECONNECT_DELAYS_S[1])
     until(lambda: client.connected)
     for sock in idle:
         sock.close()
-    assert len(gateway[1].connections) == 1
+    assert len(theirs.connections) == 1
 
 
 def test_lost_peer_is_detected(gateway: Any, connect: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(json_stream, "HEARTBEAT_S", 0.1)
-    monkeypatch.setattr(json_stream, "IDLE_TIMEOUT_S", 0.6)
-    client, mine = connect(identity(Role.VEHICLE))
-    until(lambda: client.connected)
-    time.sleep(1)
-    assert client.connected and not mine.ends  # kept open by heartbeats alone
+    server, theirs = gateway
+    client, mine = connect(identity(Role.VEHICLE), clock=theirs.clock)
+    until(lambda: client.connected and theirs.connections)
+    ends = theirs.connections[0], mine.connections[0]
+    for _ in range(10):  # kept open by heartbeats alone
+        theirs.advance(server, json_stream.HEARTBEAT_S + 0.01)
+        client.wake()
+        until(lambda: ends[0].last_received == ends[1].last_received == theirs.clock.now)
+    assert client.connected and not mine.ends and not theirs.ends
     monkeypatch.setattr(Connection, "_send", lambda self, line: True)
-    until(lambda: "timed out" in gateway[1].ends)
+    theirs.advance(server, json_stream.IDLE_TIMEOUT_S + 0.01)
+    until(lambda: theirs.ends and mine.ends)
+    assert "timed out" in {theirs.ends[0], mine.ends[0]}  # the first to notice closes the connection
 
 
 def test_invalid_input_raises_tls_error() -> None:
