@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import os
@@ -29,16 +28,33 @@ from scan2sim.services.qos.measure import MAX_LINK_UTILIZATION, Measurement, Mea
 from scan2sim.services.qos.probe import ProbeResult
 from scan2sim.services.qos.requirements import MACHINE_METRICS, NETWORK_METRICS, Environment, Requirements, read
 from scan2sim.services.qos.robot import RequestStats
+from tests.fakes.virtual_clock import VirtualClock
+
+
+class _Server(ThreadingHTTPServer):
+    """Counts its requests."""
+
+    request_queue_size = 64  # the robot opens all its connections at once
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), _Toolbox)
+        self._requests, self._lock = 0, threading.Lock()
+
+    def next_number(self) -> int:
+        """Number of the next request, from 1."""
+        with self._lock:
+            self._requests += 1
+            return self._requests
 
 
 class _Toolbox(BaseHTTPRequestHandler):
     """Responds that every third image was dropped."""
 
     protocol_version = "HTTP/1.1"
-    numbers = itertools.count(1)
+    server: _Server
 
     def do_POST(self) -> None:
-        number = next(self.numbers)
+        number = self.server.next_number()
         self.rfile.read(int(self.headers["Content-Length"]))
         body = b'{"state": "dropped"}' if number % 3 == 0 else b'{"state": "done"}'
         self.send_response(200)
@@ -52,16 +68,19 @@ class _Toolbox(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def address() -> Iterator[str]:
-    server = ThreadingHTTPServer(("127.0.0.1", 0), _Toolbox)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_port}"
-    server.shutdown()
+    with _Server() as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
 
 
 def test_requests_without_a_result_count_as_infinite_response_times(address: str) -> None:
-    stats = robot.send_images(address, "any", [b"abc", b"defgh"], rate=100, seconds=0.3)
+    time = VirtualClock()
+    images = [b"abc", b"defgh"]
+    stats = robot.send_images(address, "any", images, rate=100, seconds=0.3, clock=time, sleep=time.sleep)
     assert stats.sent == 30 and stats.states == {"done": 20, "dropped": 10}
-    assert 0 < stats.response_p50 < 1000 and stats.response_p95 == float("inf") and stats.image_bytes == 4
+    assert 0 <= stats.response_p50 <= 300 and stats.response_p95 == float("inf") and stats.image_bytes == 4
+    assert stats.seconds == pytest.approx(0.29)  # from the first image to the last
 
 
 def test_an_unreachable_service_is_counted_as_errors() -> None:
