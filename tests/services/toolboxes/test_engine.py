@@ -8,7 +8,6 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,10 @@ from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.frames import MAX_PIXELS, Frame, Raw
 from scan2sim.services.toolboxes.results import Result, State
 from scan2sim.services.toolboxes.settings import ToolboxParams
-from scan2sim.services.toolboxes.worker import LOAD_TIMEOUT_S, ModelProcess, ModelProcessDied
+from scan2sim.services.toolboxes.worker import ModelProcess, ModelProcessDied
 from tests.fakes.virtual_clock import VirtualClock
 from tests.services.toolboxes import shaky
+from tests.services.toolboxes.model_wait import ModelWait
 from tests.services.toolboxes.shaky import DIES, FAILS, HANGS, RAISES, SLOW, image, level_of
 from tests.waiting import until
 
@@ -33,32 +33,6 @@ TASK = shaky.__name__
 
 
 NO_DEADLINE_S = 600.0
-
-
-class ModelWait:
-    """Waits for a model's responses in virtual time: only a model that hangs (`HANGS`) exceeds its limit.
-
-    Attributes:
-        gate: while it is clear, no response arrives, and no model finishes loading.
-        took: virtual durations of the next batches, seconds; of further ones: 0.
-        limits: exceeded limits, seconds.
-    """
-
-    def __init__(self, clock: VirtualClock, hangs: Path) -> None:
-        self.gate, self.took, self.limits = threading.Event(), list[float](), list[float]()
-        self._clock, self._hangs = clock, hangs
-        self.gate.set()
-
-    def __call__(self, connection: Connection, seconds: float) -> bool:
-        while not (self.gate.wait() and connection.poll(0.02)):
-            if self._hangs.exists():
-                self._hangs.unlink()
-                self.limits.append(seconds)
-                self._clock.sleep(seconds)
-                return False
-        if seconds < LOAD_TIMEOUT_S and self.took:
-            self._clock.sleep(self.took.pop(0))
-        return True
 
 
 class Client:
@@ -162,13 +136,13 @@ def test_damaged_images_are_rejected_and_the_next_is_processed(client: Client) -
 
 
 def test_overload_drops_the_oldest_frames_of_that_source_only(client: Client, wait: ModelWait) -> None:
-    wait.gate.clear()
+    wait.hold()
     client.send(image(2), "flooding")
     until(lambda: client.engine.waiting()[0] == 0)  # the model processes it
     for _ in range(20):
         client.send(image(2), "flooding")
     client.send(image(3), "quiet")
-    wait.gate.set()
+    wait.release()
     states = [one.state for one in client.wait()]
     assert states == [State.DONE, *[State.DROPPED] * 16, *[State.DONE] * 4, State.DONE]
 
@@ -212,12 +186,12 @@ def test_killed_model_is_not_ready_until_restarted_and_no_frame_is_lost(client: 
     assert client.one(image(1)).state == State.DONE
     pid = client.engine.pid()
     assert pid
-    wait.gate.clear()
+    wait.hold()
     for _ in range(3):
         client.send(image(1))
     os.kill(pid, signal.SIGKILL)
     until(lambda: not client.engine.is_ready())
-    wait.gate.set()
+    wait.release()
     assert [one.state for one in client.wait()] == [State.DONE] * 4 and client.engine.is_ready()
 
 
