@@ -174,6 +174,7 @@ requires_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root may crea
 
 
 @requires_root
+@pytest.mark.realtime
 def test_the_probe_measures_delay_and_loss_of_the_link() -> None:
     there = LinkProfile(delay=0.03, loss=0.1)
     try:
@@ -187,6 +188,7 @@ def test_the_probe_measures_delay_and_loss_of_the_link() -> None:
 
 
 @requires_root
+@pytest.mark.realtime
 def test_the_event_bus_is_measured_over_a_link() -> None:
     pytest.importorskip("cyclonedds", reason="the extra bus isn't installed")
     from scan2sim.services.monitoring.qos import measure as bus
@@ -203,6 +205,7 @@ def test_the_event_bus_is_measured_over_a_link() -> None:
 
 
 @requires_root
+@pytest.mark.realtime
 def test_a_toolbox_is_measured_over_a_link() -> None:
     pytest.importorskip("fastapi", reason="the extra bus isn't installed")
     params = MeasureParams(service="segment", environment=Environment.CLOUD, rate=1, seconds=4)
