@@ -60,16 +60,26 @@ class ProbeResult:
 HEADER_BYTES = 14 + 20 + 8
 
 
+def packet(number: int, now: int) -> bytes:
+    """Datagram sent at time `now` (ns)."""
+    return PACKET_FORMAT.pack(number, now, zlib.crc32(PAYLOAD)) + PAYLOAD
+
+
+def end_packet(count: int) -> bytes:
+    """Datagram sent after `count` others, at the end of the probe."""
+    return PACKET_FORMAT.pack(END_NUMBER, count, 0)
+
+
 def send(host: str, port: int, rate: float, seconds: float) -> None:
     """Send `rate` datagrams per second for `seconds`."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         began, count = time.monotonic(), round(rate * seconds)
         for number in range(count):
             time.sleep(max(0.0, began + number / rate - time.monotonic()))
-            out.sendto(PACKET_FORMAT.pack(number, time.monotonic_ns(), zlib.crc32(PAYLOAD)) + PAYLOAD, (host, port))
+            out.sendto(packet(number, time.monotonic_ns()), (host, port))
         time.sleep(1.0)
         for _ in range(END_REPEATS):
-            out.sendto(PACKET_FORMAT.pack(END_NUMBER, count, 0), (host, port))
+            out.sendto(end_packet(count), (host, port))
             time.sleep(0.02)
 
 
@@ -79,20 +89,32 @@ def receive(port: int) -> ProbeResult:
     Raises:
         TimeoutError: no datagram was received for `RECEIVE_TIMEOUT_S`.
     """
-    delays: dict[int, int] = {}
-    corrupted = 0
+    statistics = ProbeStatistics()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as incoming:
         incoming.bind(("", port))
         incoming.settimeout(RECEIVE_TIMEOUT_S)
         print("ready", flush=True)
         while True:
             data = incoming.recv(2048)
-            now = time.monotonic_ns()
-            number, sent, checksum = PACKET_FORMAT.unpack_from(data)
-            if number == END_NUMBER:
-                return _result(delays, sent, corrupted)
-            delays[number] = now - sent
-            corrupted += zlib.crc32(data[PACKET_FORMAT.size :]) != checksum
+            if result := statistics.receive(data, time.monotonic_ns()):
+                return result
+
+
+class ProbeStatistics:
+    """Statistics of received datagrams."""
+
+    def __init__(self) -> None:
+        self._delays: dict[int, int] = {}
+        self._corrupted = 0
+
+    def receive(self, data: bytes, now: int) -> ProbeResult | None:
+        """Process a datagram received at time `now` (ns); returns the result at the end of the probe."""
+        number, sent, checksum = PACKET_FORMAT.unpack_from(data)
+        if number == END_NUMBER:
+            return _result(self._delays, sent, self._corrupted)
+        self._delays[number] = now - sent
+        self._corrupted += zlib.crc32(data[PACKET_FORMAT.size :]) != checksum
+        return None
 
 
 def _result(delays: dict[int, int], sent: int, corrupted: int) -> ProbeResult:

@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -49,7 +50,15 @@ class RequestStats:
 
 
 def send_images(
-    address: str, toolbox: str, images: list[bytes], rate: float, seconds: float, token: str = ""
+    address: str,
+    toolbox: str,
+    images: list[bytes],
+    rate: float,
+    seconds: float,
+    token: str = "",
+    *,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
 ) -> RequestStats:
     """Send `rate` images per second for `seconds`; images queue while all connections are busy."""
     pending: queue.Queue[tuple[float, bytes] | None] = queue.Queue()
@@ -71,15 +80,15 @@ def send_images(
                 state = type(error).__name__
             with lock:
                 states[state] += 1
-                responses.append(1000 * (time.monotonic() - due) if state == "done" else float("inf"))
+                responses.append(1000 * (clock() - due) if state == "done" else float("inf"))
 
     workers = [threading.Thread(target=work, daemon=True) for _ in range(MAX_CONNECTIONS)]
     for worker in workers:
         worker.start()
-    began, count = time.monotonic(), max(1, round(rate * seconds))
+    began, count = clock(), max(1, round(rate * seconds))
     for number in range(count):
         due = began + number / rate
-        time.sleep(max(0.0, due - time.monotonic()))
+        sleep(max(0.0, due - clock()))
         pending.put((due, images[number % len(images)]))
     for _ in workers:
         pending.put(None)
@@ -91,7 +100,7 @@ def send_images(
         response_p50=float(np.percentile(responses, 50, method="higher")),
         response_p95=float(np.percentile(responses, 95, method="higher")),
         image_bytes=float(np.mean([len(image) for image in images])),
-        seconds=time.monotonic() - began,
+        seconds=clock() - began,
     )
 
 

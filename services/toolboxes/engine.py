@@ -13,8 +13,9 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 
 from scan2sim.pipeline.core.errors import ScanError, UnavailableError
 from scan2sim.pipeline.core.types import U8
@@ -63,8 +64,21 @@ class Engine:
         seconds: total times of the frames with results: "waited", "worked".
     """
 
-    def __init__(self, task: str, params: ToolboxParams) -> None:
+    def __init__(
+        self,
+        task: str,
+        params: ToolboxParams,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        wait: Callable[[Connection, float], bool] = Connection.poll,
+    ) -> None:
         """Load the model and start the dispatcher.
+
+        Args:
+            task: name of the toolbox.
+            params: its settings.
+            clock: clock of `Frame.received`.
+            wait: waits for a response of the model's process for some seconds at most; returns whether there is one.
 
         Raises:
             ScanError: the model can't be loaded.
@@ -74,13 +88,14 @@ class Engine:
         self.deadline = params.deadline
         self.counts: Counter[str] = Counter()
         self.seconds: dict[str, float] = {"waited": 0.0, "worked": 0.0}
-        self._last_done = time.monotonic()
+        self._clock, self._wait = clock, wait
+        self._last_done = clock()
         self._counts_lock, self._closed = threading.Lock(), threading.Event()
-        self._queue = FrameQueue(params.waiting)
+        self._queue = FrameQueue(params.waiting, clock=clock)
         self._source_workers: dict[str, SourceWorker] = {}
         self._mean_batch_s = self._batch_deviation_s = 0.0
         try:
-            self._model: ModelProcess | None = ModelProcess(task, params)
+            self._model: ModelProcess | None = ModelProcess(task, params, wait=wait)
         except ModelProcessDied as error:
             raise UnavailableError(task, str(error), "The model may need more memory than is available") from None
         self.info: ModelInfo = self._model.info
@@ -113,7 +128,7 @@ class Engine:
 
     def idle_s(self) -> float:
         """Seconds since the last frame was processed."""
-        return time.monotonic() - self._last_done
+        return self._clock() - self._last_done
 
     def is_alive(self) -> bool:
         """Whether frames are processed, now or after a restart of the model."""
@@ -168,13 +183,14 @@ class Engine:
             return None
         deadline = self._params.deadline if frame.deadline is None else frame.deadline
         predicted_s = self._mean_batch_s + DEVIATION_FACTOR * self._batch_deviation_s
-        if frame.age() + predicted_s > deadline:
+        age = self._clock() - frame.received
+        if age + predicted_s > deadline:
             self._mean_batch_s *= 1 - SMOOTHING  # decay, so that the model is tried again soon
             self._batch_deviation_s *= 1 - SMOOTHING
-            cause = f"waited {frame.age():.2f} s, the deadline is {deadline:g} s"
+            cause = f"waited {age:.2f} s, the deadline is {deadline:g} s"
             self._answer(frame, State.LATE, cause)
             return None
-        begun = time.monotonic()
+        begun = self._clock()
         try:
             return _DecodedFrame(frame, frames.rgb(frame), begun)
         except ScanError as error:
@@ -206,10 +222,10 @@ class Engine:
     def _infer(self, batch: list[_DecodedFrame]) -> list[Body]:
         if self._model is None:
             raise ModelProcessDied("the model is not running")
-        begun = time.monotonic()
+        begun = self._clock()
         bodies = self._model.infer([one.image for one in batch])
         self._count("executions")
-        took, mean = time.monotonic() - begun, self._mean_batch_s
+        took, mean = self._clock() - begun, self._mean_batch_s
         if mean:
             self._batch_deviation_s += SMOOTHING * (abs(took - mean) - self._batch_deviation_s)
         self._mean_batch_s += (SMOOTHING if mean else 1.0) * (took - mean)
@@ -225,7 +241,7 @@ class Engine:
         while not self._closed.is_set():
             self._count("restarts")
             try:
-                self._model = ModelProcess(self.name, self._params)
+                self._model = ModelProcess(self.name, self._params, wait=self._wait)
                 return
             except (ScanError, ModelProcessDied) as error:
                 log.error("%s: %s", self.name, error)
@@ -267,9 +283,9 @@ class Engine:
     ) -> None:
         times = None
         if decoded:
-            times = Times(waited=decoded.begun - frame.received, worked=time.monotonic() - decoded.begun)
+            times = Times(waited=decoded.begun - frame.received, worked=self._clock() - decoded.begun)
         if times and state == State.DONE:
-            self._last_done = time.monotonic()
+            self._last_done = self._clock()
             with self._counts_lock:
                 self.seconds["waited"] += times.waited
                 self.seconds["worked"] += times.worked

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from scan2sim.services.toolboxes.frames import Frame
 
@@ -22,9 +22,9 @@ class FrameQueue:
     Queues are served in turn, and in each queue its requests: neither a client nor a large request delays others.
     """
 
-    def __init__(self, per_source: int) -> None:
-        """`per_source`: maximum of waiting frames of one source."""
-        self._per_source = per_source
+    def __init__(self, per_source: int, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """`per_source`: maximum of waiting frames of one source; `clock`: of `Frame.received`."""
+        self._per_source, self._clock = per_source, clock
         self._queues: OrderedDict[str, _Requests] = OrderedDict()
         self._changed = threading.Condition()
         self._closed = False
@@ -106,7 +106,7 @@ class FrameQueue:
     def oldest(self) -> float:
         """Waiting time of the oldest frame in seconds; 0 without frames."""
         with self._changed:
-            return max((time.monotonic() - one.received for one in self._waiting()), default=0.0)
+            return max((self._clock() - one.received for one in self._waiting()), default=0.0)
 
     def close(self) -> list[Frame]:
         """Reject further frames and return the waiting ones."""

@@ -77,10 +77,6 @@ class Frame:
     is_wanted: Callable[[], bool] = lambda: True
     received: float = field(default_factory=time.monotonic)
 
-    def age(self) -> float:
-        """Seconds since its arrival."""
-        return time.monotonic() - self.received
-
 
 def rgb(frame: Frame) -> U8:
     """Decode the image of a frame to (H, W, 3) uint8 RGB.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections import Counter
@@ -179,10 +180,27 @@ class CameraReader:
         count: number of received images.
     """
 
-    def __init__(self, address: str, callback: Callable[[U8], None], name: str = "") -> None:
-        """`address` as OpenCV accepts it; `callback` is called with each image (H, W, 3) RGB in the reader's thread."""
+    def __init__(
+        self,
+        address: str,
+        callback: Callable[[U8], None],
+        name: str = "",
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        wait: Callable[[threading.Event, float], bool] = threading.Event.wait,
+    ) -> None:
+        """Create a reader that is started by `start`.
+
+        Args:
+            address: as OpenCV accepts it.
+            callback: called with each image (H, W, 3) RGB in the reader's thread.
+            name: name of the camera; default: address without credentials.
+            clock: monotonic clock, seconds.
+            wait: waits until the reader is stopped, at most for some seconds; returns whether it is.
+        """
         self._address, self._callback, self.name = address, callback, name or redacted(address)
-        self.count, self._last_image_at = 0, 0.0
+        self._clock, self._wait = clock, wait
+        self.count, self._last_image_at = 0, -math.inf
         self._stopped, self._thread = threading.Event(), threading.Thread()
 
     def start(self) -> None:
@@ -204,19 +222,19 @@ class CameraReader:
 
     def is_available(self) -> bool:
         """Whether the camera delivers images."""
-        return self.running() and time.monotonic() - self._last_image_at < CAMERA_TIMEOUT_S
+        return self.running() and self._clock() - self._last_image_at < CAMERA_TIMEOUT_S
 
     def _run(self, stopped: threading.Event) -> None:
         import cv2
 
         pause, warned = 0.0, False
-        while not stopped.wait(pause):
+        while not self._wait(stopped, pause):
             before = self.count
             video = cv2.VideoCapture(int(self._address) if self._address.isdecimal() else self._address)
             while not stopped.is_set() and (image := _read(video)) is not None:
                 pause = 0.0
                 self.count += 1
-                self._last_image_at = time.monotonic()
+                self._last_image_at = self._clock()
                 self._callback(image)
             video.release()
             if self.count == before and not warned and not stopped.is_set():

@@ -6,7 +6,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -34,8 +34,15 @@ class ModelProcessDied(Exception):
 class ModelProcess:
     """Process that runs a model; not thread-safe."""
 
-    def __init__(self, task: str, params: ToolboxParams) -> None:
+    def __init__(
+        self, task: str, params: ToolboxParams, *, wait: Callable[[Connection, float], bool] = Connection.poll
+    ) -> None:
         """Start the process and wait until the model is ready.
+
+        Args:
+            task: name of the toolbox.
+            params: its settings.
+            wait: waits for a response for some seconds at most; returns whether there is one.
 
         Raises:
             ScanError: raised by `tasks.Toolbox.load`.
@@ -46,7 +53,7 @@ class ModelProcess:
         self._process = context.Process(target=_serve, args=(child_end, task, params), name=task, daemon=True)
         self._process.start()
         child_end.close()
-        self._hangs = params.hangs
+        self._hangs, self._wait = params.hangs, wait
         try:
             self.info: ModelInfo = self._receive(LOAD_TIMEOUT_S)
         except BaseException:
@@ -78,7 +85,7 @@ class ModelProcess:
 
     def _receive(self, timeout: float) -> Any:
         try:
-            if not self._connection.poll(timeout):
+            if not self._wait(self._connection, timeout):
                 self._process.kill()
                 raise ModelProcessDied(f"the model didn't respond within {timeout:g} s")
             response = self._connection.recv()

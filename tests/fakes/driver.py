@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from scan2sim.services.teleoperation.control.controls import Controls, Gear
 from scan2sim.services.teleoperation.control.messages import Command, Kind, Message, Telemetry
@@ -15,6 +15,9 @@ from tests.waiting import until
 
 GO = Controls(0.5, throttle=1.0, gear=Gear.FORWARD)
 REST = Controls(gear=Gear.FORWARD)
+COMMAND_PERIOD_S = 0.02
+SIGHTINGS = 8
+"""Commands that name a stop before the driver agrees."""
 
 
 @dataclass
@@ -48,33 +51,59 @@ class FakeConnection:
         self.closed = True
 
     def telemetry(self) -> Telemetry:
+        """The latest."""
         return next(Telemetry.unpack(body) for kind, body in reversed(self.sent) if kind == Kind.TELEMETRY)
+
+    def has_telemetry(self) -> bool:
+        return any(kind == Kind.TELEMETRY for kind, _ in self.sent)
 
 
 class ScriptedDriver:
-    """A running driver, who sends fifty commands per second."""
+    """A driver, who holds the throttle; `step` sends a command.
+
+    Attributes:
+        confirms: whether the driver confirms stops, with the throttle released; else it is held while standing, too.
+    """
+
+    def __init__(
+        self,
+        connection: FakeConnection,
+        received: Callable[[Message], None],
+        *,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self.connection, self.received, self.confirms = connection, received, True
+        self._clock, self._number, self._stop, self._sightings = clock, 0, 0, 0
+
+    def step(self) -> None:
+        telemetry = self.connection.telemetry() if self.connection.has_telemetry() else None
+        command = Command(GO, telemetry.stop if telemetry else 0)
+        if self.confirms and (telemetry is None or telemetry.standing):
+            if self._stop != command.stop:
+                self._stop, self._sightings = command.stop, 0
+            # sees the stop, then agrees; again and again, since commands may arrive too late
+            command = replace(command, controls=REST, agree=self._sightings % (2 * SIGHTINGS) >= SIGHTINGS)
+            self._sightings += 1
+        self._number += 1
+        self.received(Message(Kind.COMMAND, self._number, self._clock(), command.pack()))
+
+
+class RunningDriver(ScriptedDriver):
+    """A driver in a thread, who sends fifty commands per second until `end`."""
 
     def __init__(self, connection: FakeConnection, received: Callable[[Message], None]) -> None:
-        self.connection, self.received = connection, received
-        self.controls, self.agree, self.number, self.ended = REST, False, 0, threading.Event()
-        self.thread = threading.Thread(target=self.run)
-        self.thread.start()
+        super().__init__(connection, received)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
 
-    def run(self) -> None:
-        while not self.ended.wait(0.02):
-            sent = any(kind == Kind.TELEMETRY for kind, _ in self.connection.sent)
-            telemetry = self.connection.telemetry() if sent else None
-            self.number += 1
-            command = Command(self.controls, telemetry.stop if telemetry else 0, self.agree)
-            self.received(Message(Kind.COMMAND, self.number, time.monotonic_ns(), command.pack()))
+    def end(self) -> None:
+        self._ended.set()
+        self._thread.join()
 
     def until(self, condition: Callable[[], bool]) -> None:
-        until(condition, 20, state=self.connection.telemetry)
+        until(condition, state=self.connection.telemetry)
 
-    def start(self) -> None:
-        """Release the throttle, press the confirm button until the vehicle drives, press the throttle."""
-        self.controls, self.agree = REST, False
-        time.sleep(0.15)
-        self.agree = True
-        self.until(lambda: not self.connection.telemetry().standing)
-        self.controls, self.agree = GO, False
+    def _run(self) -> None:
+        while not self._ended.wait(COMMAND_PERIOD_S):
+            self.step()

@@ -104,12 +104,26 @@ class Camera:
         count: frames received so far.
     """
 
-    def __init__(self, name: str, open_: Callable[[], Iterator[CameraFrame]]) -> None:
-        """Start reading at once; `open_` opens the camera and returns its frames (`frames`)."""
+    def __init__(
+        self,
+        name: str,
+        open_: Callable[[], Iterator[CameraFrame]],
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        wait: Callable[[threading.Event, float], bool] = threading.Event.wait,
+    ) -> None:
+        """Start reading at once.
+
+        Args:
+            name: shown to drivers.
+            open_: opens the camera and returns its frames (`frames`).
+            clock: monotonic clock, seconds.
+            wait: waits until the camera is closed, at most for some seconds; returns whether it is.
+        """
         self.name, self.fault, self.count = name, "", 0
-        self._open = open_
+        self._open, self._clock, self._wait = open_, clock, wait
         self._newest: CameraFrame | None = None
-        self._last_frame = time.monotonic()
+        self._last_frame = clock()
         self._frame_available = threading.Condition()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"camera {name}", daemon=True)
@@ -125,7 +139,7 @@ class Camera:
     @property
     def offline(self) -> bool:
         """Whether no frame has arrived within `CAMERA_TIMEOUT_S`."""
-        return time.monotonic() > self._last_frame + CAMERA_TIMEOUT_S
+        return self._clock() > self._last_frame + CAMERA_TIMEOUT_S
 
     def close(self) -> None:
         """Stop reading."""
@@ -144,7 +158,7 @@ class Camera:
             except Exception as error:  # of any library: reported as the fault, then the camera is reopened
                 self.fault = redacted(str(error))
             pause = 0.1 if self.count > count else min(REOPEN_DELAY_MAX_S, 2 * pause)
-            self._closed.wait(pause)
+            self._wait(self._closed, pause)
 
     def _read_frames(self, frames: Iterator[CameraFrame]) -> None:
         for frame in frames:
@@ -152,18 +166,23 @@ class Camera:
                 return
             self.fault = ""
             with self._frame_available:
-                self._newest, self._last_frame = frame, time.monotonic()
+                self._newest, self._last_frame = frame, self._clock()
                 self.count += 1
                 self._frame_available.notify_all()
 
 
-def frame_times(fps: float) -> Iterator[int]:
-    """Yield capture times, nanoseconds of the monotonic clock, at a frame rate; missed frames are skipped."""
+def frame_times(
+    fps: float,
+    *,
+    clock: Callable[[], int] = time.monotonic_ns,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Iterator[int]:
+    """Yield capture times, nanoseconds of a monotonic clock, at a frame rate; missed frames are skipped."""
     step = 1e9 / fps
-    due = float(time.monotonic_ns())
+    due = float(clock())
     while True:
-        now = time.monotonic_ns()
+        now = clock()
         if now < due:
-            time.sleep((due - now) / 1e9)
-        yield time.monotonic_ns()
-        due = max(due + step, time.monotonic_ns() - step)
+            sleep((due - now) / 1e9)
+        yield clock()
+        due = max(due + step, clock() - step)

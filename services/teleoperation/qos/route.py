@@ -6,7 +6,8 @@ lookahead point on the path, from the vehicle state as it arrives over the links
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from math import atan, cos, hypot, sin, tau
 
 import numpy as np
@@ -78,8 +79,8 @@ class LoopingVehicle(SimulatedVehicle):
         positions: number of the drive, x and y, every 0.1 m; runs: number of completed drives.
     """
 
-    def __init__(self, ground: Ground, points: F64) -> None:
-        super().__init__(SimulatedCar(ground))
+    def __init__(self, ground: Ground, points: F64, *, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(SimulatedCar(ground), clock=clock)
         self.positions: list[tuple[int, float, float]] = []
         self.runs = 0
         self._ground, self._end = ground, points[-1]

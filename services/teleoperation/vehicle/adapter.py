@@ -71,6 +71,8 @@ class AdapterParams(Params):
 class AdapterServer:
     """Receives orders of an onboard unit, and controls a vehicle.
 
+    `run` has the loop and the network around `answer` and `control`.
+
     Attributes:
         endpoint: decides which orders are obeyed; address: where it listens.
         malformed: number of packets that were not orders.
@@ -80,8 +82,11 @@ class AdapterServer:
         InputError: the key can't be read.
     """
 
-    def __init__(self, vehicle: Vehicle, params: AdapterParams) -> None:
-        self.endpoint = AdapterEndpoint(params.limit)
+    def __init__(
+        self, vehicle: Vehicle, params: AdapterParams, *, clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        """`clock`: monotonic clock, nanoseconds."""
+        self.endpoint, self._clock = AdapterEndpoint(params.limit), clock
         self.malformed = 0
         self._vehicle, self._period, self._key = vehicle, params.period / 1000, adapter_key.read(params.key)
         family = socket.AF_INET6 if ":" in params.host else socket.AF_INET
@@ -105,7 +110,7 @@ class AdapterServer:
             while not ended.is_set():
                 due = max(due + self._period, time.monotonic())
                 self._listen(due)
-                self._control()
+                self.control()
                 safety = self.endpoint.safety
                 state = f"is stopped: {safety.reason}" if safety.standing else "drives"
                 if state != reported:
@@ -115,6 +120,27 @@ class AdapterServer:
                 self._vehicle.obey(STOP)
             self._vehicle.close()
             self._socket.close()
+
+    def answer(self, packet: bytes) -> bytes | None:
+        """Process a received packet; returns the answer, None if it is not an order."""
+        try:
+            order = Order.unpack(packet, self._key)
+        except Malformed:
+            self.malformed += 1
+            return None
+        self.endpoint.receive(order, self._clock())
+        return self.endpoint.answer(self._vehicle.state(), self._clock()).pack(self._key)
+
+    def control(self) -> None:
+        """Send controls to the vehicle; if it is unreachable this is a stop, which the answers report."""
+        safety = self.endpoint.safety
+        try:
+            self._vehicle.obey(self.endpoint.check(self._clock()))
+        except VehicleUnreachable as error:
+            safety.blocked_by = str(error)
+            safety.halt(str(error))
+        else:
+            safety.blocked_by = ""
 
     def _listen(self, until: float) -> None:
         """Receive orders and answer them until the next period begins."""
@@ -126,24 +152,7 @@ class AdapterServer:
                 return
             except OSError:  # ICMP error after an earlier answer
                 continue
-            try:
-                order = Order.unpack(packet, self._key)
-            except Malformed:
-                self.malformed += 1
-                continue
-            self.endpoint.receive(order, time.monotonic_ns())
-            answer = self.endpoint.answer(self._vehicle.state(), time.monotonic_ns())
-            with contextlib.suppress(OSError):  # the onboard unit is gone; its orders time out
-                self._socket.sendto(answer.pack(self._key), peer)
+            if answer := self.answer(packet):
+                with contextlib.suppress(OSError):  # the onboard unit is gone; its orders time out
+                    self._socket.sendto(answer, peer)
         time.sleep(max(until - time.monotonic(), 0))
-
-    def _control(self) -> None:
-        """Send controls to the vehicle; if it is unreachable this is a stop, which the answers report."""
-        safety = self.endpoint.safety
-        try:
-            self._vehicle.obey(self.endpoint.check(time.monotonic_ns()))
-        except VehicleUnreachable as error:
-            safety.blocked_by = str(error)
-            safety.halt(str(error))
-        else:
-            safety.blocked_by = ""

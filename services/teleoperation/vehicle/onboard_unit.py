@@ -270,6 +270,55 @@ Connect = Callable[[Callable[[Message], None], Callable[[], None]], StationConne
 """Connects to a station; calls the first argument with each message, and the second when the station has restarted."""
 
 
+class OnboardJobs:
+    """Jobs of an onboard unit's threads, each called once per period; no thread, no network."""
+
+    def __init__(
+        self,
+        car: OnboardController,
+        key: bytes,
+        send: Callable[[bytes], object],
+        *,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """Prepare the jobs.
+
+        Args:
+            car: state and decisions.
+            key: key shared with the vehicle adapter.
+            send: sends a packet to the vehicle adapter.
+            clock: monotonic clock, nanoseconds.
+        """
+        self._car, self._key, self._send, self._clock = car, key, send, clock
+        self._last_command: Command | None = None
+        self._order_due = self._streams_due = 0
+        self._streams = VideoStreams(())
+
+    def watch(self) -> None:
+        """Run the watchdog, and send its order when the command has changed or the adapter's period has passed."""
+        now = self._clock()
+        order = self._car.watchdog_order(now)
+        if order.command != self._last_command or now >= self._order_due:
+            self._last_command, self._order_due = order.command, now + round(ADAPTER_PERIOD_MS * NS_PER_MS)
+            self._send(order.pack(self._key))
+
+    def receive_answer(self, packet: bytes) -> None:
+        """Process a packet of the vehicle adapter."""
+        with contextlib.suppress(Malformed):
+            self._car.receive_answer(Answer.unpack(packet, self._key), self._clock())
+
+    def send_telemetry(self, connection: StationConnection | None) -> None:
+        """Check the clocks, and send telemetry and the list of cameras to the joined station, if any."""
+        self._car.check_clocks()
+        if connection is None:
+            return
+        now = self._clock()
+        connection.send(Kind.TELEMETRY, pack_fitting(self._car.telemetry(now)))
+        if (streams := self._car.streams()) != self._streams or now > self._streams_due:
+            self._streams, self._streams_due = streams, now + round(STREAMS_PERIOD_S * 1e9)
+            connection.send(Kind.STREAMS, streams.pack())
+
+
 class OnboardUnit:
     """A running onboard unit, with the threads `watchdog`, `adapter` (its answers) and `telemetry`.
 
@@ -281,7 +330,7 @@ class OnboardUnit:
     def __init__(self, params: OnboardParams) -> None:
         self.car = OnboardController(params.limit)
         self.failed: BaseException | None = None
-        self._key = adapter_key.read(params.key)
+        self._jobs = OnboardJobs(self.car, adapter_key.read(params.key), self._send)
         host, port = params.address()
         self._socket = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -320,10 +369,11 @@ class OnboardUnit:
     def close(self) -> None:
         """Stop the vehicle, and end all threads."""
         self.release("the onboard unit ends")
-        time.sleep(4 * WATCHDOG_PERIOD_S)  # time to send the stop to the adapter
         self._ended.set()
         for thread in self._threads:
             thread.join()
+        if self.failed is None:
+            self._jobs.watch()  # the stop
         self._socket.close()
 
     def _receive(self, session: object, message: Message) -> None:
@@ -338,38 +388,28 @@ class OnboardUnit:
             self._ended.set()
             raise
 
+    def _send(self, packet: bytes) -> None:
+        with contextlib.suppress(OSError):  # nobody listens there: reported since no answer arrives
+            self._socket.send(packet)
+
     def _watch(self) -> None:
-        last_command, due = None, 0
         while not self._ended.wait(WATCHDOG_PERIOD_S):
-            now = time.monotonic_ns()
-            order = self.car.watchdog_order(now)
-            if order.command != last_command or now >= due:
-                last_command, due = order.command, now + round(ADAPTER_PERIOD_MS * NS_PER_MS)
-                with contextlib.suppress(OSError):  # nobody listens there: reported since no answer arrives
-                    self._socket.send(order.pack(self._key))
+            self._jobs.watch()
 
     def _receive_answers(self) -> None:
         while not self._ended.is_set():
             try:
-                answer = Answer.unpack(self._socket.recv(ANSWER_MAX_BYTES + 1), self._key)
-            except (TimeoutError, Malformed):
+                packet = self._socket.recv(ANSWER_MAX_BYTES + 1)
+            except TimeoutError:
                 continue
             except OSError:  # nobody listens there
                 self._ended.wait(WATCHDOG_PERIOD_S)
                 continue
-            self.car.receive_answer(answer, time.monotonic_ns())
+            self._jobs.receive_answer(packet)
 
     def _send_telemetry(self) -> None:
-        streams, due = VideoStreams(()), 0.0
         while not self._ended.wait(TELEMETRY_PERIOD_S):
-            self.car.check_clocks()
-            connection = self._connection
-            if connection is None:
-                continue
-            connection.send(Kind.TELEMETRY, pack_fitting(self.car.telemetry(time.monotonic_ns())))
-            if (now := self.car.streams()) != streams or time.monotonic() > due:
-                streams, due = now, time.monotonic() + STREAMS_PERIOD_S
-                connection.send(Kind.STREAMS, streams.pack())
+            self._jobs.send_telemetry(self._connection)
 
 
 def pack_fitting(telemetry: Telemetry) -> bytes:

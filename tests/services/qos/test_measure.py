@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import os
@@ -19,7 +18,7 @@ import pytest
 from scan2sim.flows.commands import qos_table
 from scan2sim.pipeline.core.errors import InputError, UnavailableError
 from scan2sim.pipeline.core.step import silent
-from scan2sim.services.qos import deployment, environments, robot
+from scan2sim.services.qos import deployment, environments, probe, robot
 from scan2sim.services.qos.compare import compare_metrics, passed, resource_needs, summary
 from scan2sim.services.qos.encoding import Jpeg
 from scan2sim.services.qos.environments import Network, network
@@ -29,16 +28,33 @@ from scan2sim.services.qos.measure import MAX_LINK_UTILIZATION, Measurement, Mea
 from scan2sim.services.qos.probe import ProbeResult
 from scan2sim.services.qos.requirements import MACHINE_METRICS, NETWORK_METRICS, Environment, Requirements, read
 from scan2sim.services.qos.robot import RequestStats
+from tests.fakes.virtual_clock import VirtualClock
+
+
+class _Server(ThreadingHTTPServer):
+    """Counts its requests."""
+
+    request_queue_size = 64  # the robot opens all its connections at once
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), _Toolbox)
+        self._requests, self._lock = 0, threading.Lock()
+
+    def next_number(self) -> int:
+        """Number of the next request, from 1."""
+        with self._lock:
+            self._requests += 1
+            return self._requests
 
 
 class _Toolbox(BaseHTTPRequestHandler):
     """Responds that every third image was dropped."""
 
     protocol_version = "HTTP/1.1"
-    numbers = itertools.count(1)
+    server: _Server
 
     def do_POST(self) -> None:
-        number = next(self.numbers)
+        number = self.server.next_number()
         self.rfile.read(int(self.headers["Content-Length"]))
         body = b'{"state": "dropped"}' if number % 3 == 0 else b'{"state": "done"}'
         self.send_response(200)
@@ -52,16 +68,19 @@ class _Toolbox(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def address() -> Iterator[str]:
-    server = ThreadingHTTPServer(("127.0.0.1", 0), _Toolbox)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_port}"
-    server.shutdown()
+    with _Server() as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
 
 
 def test_requests_without_a_result_count_as_infinite_response_times(address: str) -> None:
-    stats = robot.send_images(address, "any", [b"abc", b"defgh"], rate=100, seconds=0.3)
+    time = VirtualClock()
+    images = [b"abc", b"defgh"]
+    stats = robot.send_images(address, "any", images, rate=100, seconds=0.3, clock=time, sleep=time.sleep)
     assert stats.sent == 30 and stats.states == {"done": 20, "dropped": 10}
-    assert 0 < stats.response_p50 < 1000 and stats.response_p95 == float("inf") and stats.image_bytes == 4
+    assert 0 <= stats.response_p50 <= 300 and stats.response_p95 == float("inf") and stats.image_bytes == 4
+    assert stats.seconds == pytest.approx(0.29)  # from the first image to the last
 
 
 def test_an_unreachable_service_is_counted_as_errors() -> None:
@@ -151,10 +170,28 @@ def test_networks_are_read_from_files(tmp_path: Path) -> None:
     assert {path.stem for path in environments.FOLDER.glob("*.toml")} == {"edge", "cloud"}
 
 
+def test_the_probe_measures_delay_jitter_loss_and_errors_exactly() -> None:
+    statistics, sent = probe.ProbeStatistics(), 1000
+    for number in range(sent):
+        at = 5_000_000 * number
+        data = probe.packet(number, at)
+        if number % 10 == 9:
+            continue  # lost
+        if number % 100 == 50:
+            data = data[:-1] + b"!"
+        delay = 28 if number % 2 else 32  # ms
+        assert statistics.receive(data, at + delay * 10**6) is None
+    found = statistics.receive(probe.end_packet(sent), 0)
+    assert found is not None and (found.sent, found.loss_rate) == (1000, pytest.approx(0.1))
+    assert found.error_rate == pytest.approx(10 / 900) and found.jitter == pytest.approx(4)
+    assert found.delay == pytest.approx((500 * 32 + 400 * 28) / 900)
+
+
 requires_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root may create network namespaces")
 
 
 @requires_root
+@pytest.mark.realtime
 def test_the_probe_measures_delay_and_loss_of_the_link() -> None:
     there = LinkProfile(delay=0.03, loss=0.1)
     try:
@@ -163,11 +200,12 @@ def test_the_probe_measures_delay_and_loss_of_the_link() -> None:
     except UnavailableError as error:
         pytest.skip(str(error))
     assert found and found.sent == 1000 and found.error_rate == 0
-    assert found.delay == pytest.approx(30, abs=5)
+    assert 29.5 < found.delay < 1000  # longer while a program stalls; exactly in virtual time above
     assert found.loss_rate == pytest.approx(0.1, abs=4 * np.sqrt(0.09 / 1000))
 
 
 @requires_root
+@pytest.mark.realtime
 def test_the_event_bus_is_measured_over_a_link() -> None:
     pytest.importorskip("cyclonedds", reason="the extra bus isn't installed")
     from scan2sim.services.monitoring.qos import measure as bus
@@ -184,6 +222,7 @@ def test_the_event_bus_is_measured_over_a_link() -> None:
 
 
 @requires_root
+@pytest.mark.realtime
 def test_a_toolbox_is_measured_over_a_link() -> None:
     pytest.importorskip("fastapi", reason="the extra bus isn't installed")
     params = MeasureParams(service="segment", environment=Environment.CLOUD, rate=1, seconds=4)

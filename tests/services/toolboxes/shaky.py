@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -16,7 +17,9 @@ from scan2sim.services.toolboxes.settings import ToolboxParams as Params
 from scan2sim.services.toolboxes.tasks import PostProcessor
 
 NEEDS = ()
-DIES, HANGS, FAILS, RAISES, SLOW, SLOWER = 201, 202, 203, 204, 205, 206
+DIES, HANGS, FAILS, RAISES, SLOW = 201, 202, 203, 204, 205
+HANGS_FILE = "SHAKY_HANGS_FILE"
+"""Environment variable with the path of a file that is created when the model begins to hang."""
 
 __all__ = ["NEEDS", "Params", "check", "draw", "image", "level_of", "load", "post_processor"]
 
@@ -41,15 +44,15 @@ class _Model:
         if level == DIES:
             os._exit(3)
         if level == HANGS:
-            time.sleep(60)
+            if HANGS_FILE in os.environ:
+                Path(os.environ[HANGS_FILE]).touch()
+            time.sleep(3600)
         if level == FAILS:
             raise StepError("shaky", "can't", "Don't")
         if level == RAISES:
             raise RuntimeError("oh")
         if level == SLOW:
             time.sleep(0.1)
-        if level == SLOWER:
-            time.sleep(2)
         return Body(classes=(Class(label=str(level), score=1),))
 
 

@@ -30,7 +30,7 @@ INFER = f"/v2/models/{TASK}/infer"
 
 @pytest.fixture(scope="module")
 def engine() -> Iterator[Engine]:
-    made = Engine(TASK, ToolboxParams(waiting=100, deadline=10))
+    made = Engine(TASK, ToolboxParams(waiting=100, deadline=600))
     yield made
     made.close()
 

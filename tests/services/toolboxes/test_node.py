@@ -12,6 +12,7 @@ pytest.importorskip("cyclonedds", reason="the extra bus isn't installed")
 
 from tests.services.conftest import Start
 from tests.services.toolboxes import camera, shaky
+from tests.waiting import until
 
 TASK = shaky.__name__
 
@@ -26,7 +27,7 @@ def test_node_publishes_results_for_images_of_a_topic(
     command = ["-m", "scan2sim.flows.cli", "toolbox", "node", TASK, "--images", "/front", "--results", "/seen"]
     start("cyclone", *command, *(["--compressed"] if compressed else []))
     sender = start(transport, Path(camera.__file__), "/front", "/seen", "3", *([picture] if compressed else []))
-    lines, errors = sender.communicate(timeout=90)
+    lines, errors = sender.communicate(timeout=240)
     results = [json.loads(line) for line in lines.splitlines()]
     assert len(results) >= 3, errors
     for one in results:
@@ -40,8 +41,12 @@ def test_node_is_monitored(start: Start, tmp_path: Path) -> None:
     command = ["-m", "scan2sim.flows.cli", "toolbox", "node", TASK, "--images", "/a", "--results", "/b"]
     start("cyclone", *command, "--log", log, "--period", "0.5")
     sender = start("cyclone", Path(camera.__file__), "/a", "/b", "20")
-    sender.communicate(timeout=90)
-    flows = [flow for line in log.open() for flow in json.loads(line)["flows"]]
-    assert {("/a", "incoming"), ("/b", "outgoing")} <= {
-        (one["topic"], one["direction"]) for one in flows if one["messages"]
-    }
+    sender.communicate(timeout=240)
+
+    def flows() -> set[tuple[str, str]]:
+        """Topics and directions of the messages in the log, which its process still writes."""
+        text = log.read_text(encoding="utf-8")
+        records = map(json.loads, text[: text.rfind("\n") + 1].splitlines())
+        return {(one["topic"], one["direction"]) for record in records for one in record["flows"] if one["messages"]}
+
+    until(lambda: {("/a", "incoming"), ("/b", "outgoing")} <= flows())

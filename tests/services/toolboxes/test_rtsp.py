@@ -12,7 +12,7 @@ import pytest
 from scan2sim.services.toolboxes import offline
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.settings import ToolboxParams
-from scan2sim.services.toolboxes.sources import CAMERA_TIMEOUT_S, Cameras
+from scan2sim.services.toolboxes.sources import Cameras
 from tests.fakes.ports import free_port
 from tests.services.toolboxes import shaky
 from tests.waiting import until
@@ -47,11 +47,11 @@ def test_rtsp_camera_is_read_and_reconnected() -> None:
     try:
         with camera(port, 120):
             cameras.start()
-            until(lambda: abs(grey() - 120) < 5, 30)
+            until(lambda: abs(grey() - 120) < 5)
             assert cameras.states()[address]["there"]
-        until(lambda: not cameras.states()[address]["there"], CAMERA_TIMEOUT_S + 10)
+        until(lambda: not cameras.states()[address]["there"])
         with camera(port, 60):
-            until(lambda: abs(grey() - 60) < 5, 30)
+            until(lambda: abs(grey() - 60) < 5)
             assert cameras.states()[address]["there"]
     finally:
         cameras.stop()

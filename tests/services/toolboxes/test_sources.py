@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import time
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,8 +16,10 @@ from scan2sim.pipeline.core.step import silent
 from scan2sim.services.toolboxes import offline, sources
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.settings import ToolboxParams
-from scan2sim.services.toolboxes.sources import Cameras
+from scan2sim.services.toolboxes.sources import CameraReader, Cameras
+from tests.fakes.virtual_clock import VirtualClock
 from tests.services.toolboxes import shaky
+from tests.waiting import until
 
 TASK = shaky.__name__
 
@@ -74,30 +76,62 @@ def test_sources_without_images_are_rejected(engine: Engine, tmp_path: Path, nam
         offline.process_files(engine, tmp_path / name, tmp_path / "out", silent)
 
 
-def test_camera_is_reconnected_and_not_read_in_standby(engine: Engine, tmp_path: Path) -> None:
+def test_camera_is_reconnected_and_not_read_in_standby(
+    engine: Engine, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = tmp_path / "camera.avi"
     cameras = Cameras(engine, [str(path)])
+
+    def images() -> int:
+        return int(cameras.states()[str(path)]["images"])
+
+    def is_available() -> bool:
+        return bool(cameras.states()[str(path)]["there"])
+
+    def is_read() -> bool:
+        return any(thread.name == str(path) for thread in threading.enumerate())
+
     cameras.start()
     try:
-        time.sleep(0.5)
-        assert cameras.running() and not cameras.states()[str(path)]["there"]
-        film(path, [50] * 5)  # the end of the file acts as a lost camera, reading it again as a reconnection
-
-        def images() -> int:
-            return int(cameras.states()[str(path)]["images"])
-
-        deadline = time.monotonic() + 20
-        while images() < 11 and time.monotonic() < deadline:
-            time.sleep(0.05)
-        assert images() >= 11 and cameras.states()[str(path)]["there"]
+        until(lambda: "delivers no images" in caplog.text)
+        assert cameras.running() and not is_available()
+        # the end of the file acts as a lost camera, reading it again as a reconnection
+        film(tmp_path / "new.avi", [50] * 5).rename(path)
+        until(lambda: images() >= 11 and is_available())
+        until(cameras.last)
         assert abs(shaky.level_of(cameras.last()[0].body) - 50) < 3 and cameras.last("other") == []
         cameras.stop()
+        assert not cameras.running() and cameras.last() == []
+        until(lambda: not is_read())
         count = images()
-        time.sleep(0.3)
-        assert images() == count and not cameras.running() and cameras.last() == []
         cameras.start()
-        while images() == count and time.monotonic() < deadline:
-            time.sleep(0.05)
-        assert images() > count
+        until(lambda: images() > count)
     finally:
         cameras.stop()
+
+
+def test_camera_is_retried_after_growing_pauses_and_unavailable_after_a_timeout(tmp_path: Path) -> None:
+    path, clock = tmp_path / "camera.avi", VirtualClock()
+    attempts: list[tuple[float, bool]] = []
+
+    def wait(stopped: threading.Event, pause: float) -> bool:
+        attempts.append((pause, reader.is_available()))
+        clock.sleep(pause)
+        if len(attempts) == 8:
+            film(path, [50] * 3)
+        if len(attempts) == 10:
+            path.unlink()
+        if len(attempts) == 17:
+            stopped.set()
+        return stopped.is_set()
+
+    images: list[object] = []
+    reader = CameraReader(str(path), images.append, clock=clock, wait=wait)
+    reader.start()
+    until(lambda: len(attempts) == 17 and not reader.running())
+    reader.stop()
+    pauses = [pause for pause, _ in attempts]
+    assert pauses == pytest.approx([0, 0.2, 0.4, 0.8, 1.6, 3.2, 5, 5, 0.2, 0.2, 0.4, 0.8, 1.6, 3.2, 5, 5, 5])
+    # its last image, at the 10th attempt, is 5 s old during the 14th pause
+    assert [available for _, available in attempts] == [False] * 8 + [True] * 6 + [False] * 3
+    assert len(images) == reader.count == 6

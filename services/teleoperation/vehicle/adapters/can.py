@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -77,12 +77,12 @@ class CanVehicle:
         SettingError: python-can doesn't have this interface.
     """
 
-    def __init__(self, params: Params) -> None:
-        self._params = params
+    def __init__(self, params: Params, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._params, self._clock = params, clock
         self._signals = Signals(params)
         self._bus: Any = None
         self._last_attempt, self._count = 0.0, 0
-        self._speed, self._gear, self._last_received = 0.0, Gear.NEUTRAL, time.monotonic()
+        self._speed, self._gear, self._last_received = 0.0, Gear.NEUTRAL, clock()
         self._speed_received = -math.inf
         self._open()
 
@@ -90,7 +90,7 @@ class CanVehicle:
         """Send all messages, and read those of the vehicle."""
         import can
 
-        if self._bus is None and (time.monotonic() - self._last_attempt < REOPEN_DELAY_S or not self._open()):
+        if self._bus is None and (self._clock() - self._last_attempt < REOPEN_DELAY_S or not self._open()):
             raise VehicleUnreachable(self._unavailable())
         self._count += 1
         try:
@@ -107,7 +107,7 @@ class CanVehicle:
 
     def state(self) -> VehicleState:
         """Reported speed and gear, if the vehicle has signals for them."""
-        now = time.monotonic()
+        now = self._clock()
         silent = self._signals.reported and now - self._last_received > SILENCE_MAX_S
         faults = (f"no messages from the vehicle on {self._params.channel}",) if silent else ()
         if self._bus is None:
@@ -125,7 +125,7 @@ class CanVehicle:
     def _open(self) -> bool:
         import can
 
-        self._last_attempt = time.monotonic()
+        self._last_attempt = self._clock()
         options: dict[str, Any] = {"bitrate": self._params.bitrate} if self._params.bitrate else {}
         try:
             self._bus = can.Bus(self._params.channel, interface=self._params.interface, **options)
@@ -149,7 +149,7 @@ class CanVehicle:
                 return
             values = self._signals.read(message)
             if values:
-                self._last_received = time.monotonic()
+                self._last_received = self._clock()
             if "speed" in values:
                 self._speed, self._speed_received = values["speed"], self._last_received
             self._gear = Gear(int(values.get("gear_in", self._gear)))

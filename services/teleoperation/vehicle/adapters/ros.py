@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
@@ -98,17 +99,17 @@ class RosVehicle:
         UnavailableError: there is no transport.
     """
 
-    def __init__(self, params: Params) -> None:
-        self._params, self._ros = params, load()
+    def __init__(self, params: Params, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._params, self._ros, self._clock = params, load(), clock
         self._ros.init()
         self._node = self._ros.Node("teleoperation")
         self._topic = qualified(params.topic)
         self._type = MESSAGE_TYPES[params.message]
         self._publisher = self._publisher_of(params.topic)
         self._pose = VehicleState()
-        self._speed, self._speed_measured, self._gear = 0.0, time.monotonic(), Gear.NEUTRAL
+        self._speed, self._speed_measured, self._gear = 0.0, clock(), Gear.NEUTRAL
         self._speed_known, self._subscriptions = False, 0
-        self._output = Output(params, self._publisher_of(params.output)) if params.output else None
+        self._output = Output(params, self._publisher_of(params.output), clock=clock) if params.output else None
         if params.odometry:
             self._subscribe(ODOMETRY_TYPE, params.odometry, self._receive_odometry)
         if params.joint_states:
@@ -124,17 +125,18 @@ class RosVehicle:
         for _ in range(self._subscriptions):  # rclpy processes one message at a time
             self._ros.spin_once(self._node, 0.0)
         if self._output:
-            self._output.enforce(message, time.monotonic())
+            self._output.enforce(message, self._clock())
         if self._publisher.get_subscription_count() == 0:
             raise VehicleUnreachable(f"nothing subscribes to {self._topic}")
 
     def state(self) -> VehicleState:
         """Measured speed, and the last pose from odometry."""
         topic = self._params.joint_states or self._params.odometry
-        age = time.monotonic() - self._speed_measured
+        now = self._clock()
+        age = now - self._speed_measured
         kind = "joint states" if self._params.joint_states else "odometry"
         faults = [f"no {kind} on {qualified(topic)}"] if topic and age > MEASUREMENT_TIMEOUT_S else []
-        if self._output and self._output.holds(time.monotonic()):
+        if self._output and self._output.holds(now):
             faults.append(
                 f"a node before {qualified(self._params.output)} holds the vehicle, such as a collision monitor"
             )
@@ -184,7 +186,7 @@ class RosVehicle:
 
     def _measure(self, speed: float) -> None:
         self._speed_known = math.isfinite(speed)
-        self._speed, self._speed_measured = speed, time.monotonic()
+        self._speed, self._speed_measured = speed, self._clock()
 
 
 class Output:
@@ -193,15 +195,15 @@ class Output:
     Silence during a standstill is normal: Nav2's collision monitor ceases to publish zeros after `stop_pub_timeout`.
     """
 
-    def __init__(self, params: Params, publisher: Any) -> None:
-        self._params, self._publisher = params, publisher
-        self._moves, self._since = False, time.monotonic()  # what is commanded, and since when
+    def __init__(self, params: Params, publisher: Any, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._params, self._publisher, self._clock = params, publisher, clock
+        self._moves, self._since = False, clock()  # what is commanded, and since when
         self._passed, self._received = False, -math.inf  # whether the last command there is a motion, and its arrival
         self._overrides = False
 
     def receive(self, message: Any) -> None:
         """Process a command behind the other nodes, or one of `enforce`."""
-        self._passed, self._received = self._is_motion(message), time.monotonic()
+        self._passed, self._received = self._is_motion(message), self._clock()
 
     def enforce(self, command: Any, now: float) -> None:
         """Compare what is commanded, at time `now`, with what arrives; publish a stop that doesn't.

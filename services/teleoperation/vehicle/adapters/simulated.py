@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Annotated
 
 from pydantic import Field
@@ -29,13 +30,13 @@ def connect(params: Params) -> Vehicle:
 class SimulatedVehicle:
     """See `adapters.Vehicle`; simulated time follows real time between calls."""
 
-    def __init__(self, car: SimulatedCar) -> None:
-        self.car = car
-        self._last = time.monotonic()
+    def __init__(self, car: SimulatedCar, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self.car, self._clock = car, clock
+        self._last = clock()
 
     def obey(self, controls: Controls) -> None:
         """Apply the controls up to the present time."""
-        now = time.monotonic()
+        now = self._clock()
         self.car.advance(controls, min(now - self._last, 1.0))
         self._last = now
 

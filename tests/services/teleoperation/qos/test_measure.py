@@ -91,12 +91,14 @@ def test_test_images_show_the_street(tmp_path: Path) -> None:
     assert one.shape == (480, 640, 3) and (one != other).mean() > 0.5
 
 
+@pytest.mark.realtime
 def test_drive_on_this_machine_meets_the_requirements_of_the_robot() -> None:
-    params = MeasureParams(environment=Environment.ROBOT, seconds=2, warm=0, cameras=1)
+    params = MeasureParams(environment=Environment.ROBOT, seconds=4, warm=0, cameras=1, bitrate=0.5)
     required = SERVICE.of(Environment.ROBOT)
     measured = measure(params, required, ignore_progress)
     values = measured.values()
     assert values["bandwidth"] is None and passed(compare_metrics(required, measured), NETWORK_METRICS)
-    assert len(delays(measured.vehicle["messages"], Kind.COMMAND)) > 50 and measured.command_gap < 1000
+    assert len(delays(measured.vehicle["messages"], Kind.COMMAND)) > 50
+    assert measured.command_gap < 1000 * measured.seconds
     assert len(measured.glass_to_glass) > 20 and min(measured.glass_to_glass) > 0
     assert values["loss_rate"] == 0 and values["error_rate"] == 0 and 0 < measured.lost_frames + 1 < 1.2

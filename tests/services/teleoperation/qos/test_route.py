@@ -19,6 +19,7 @@ from scan2sim.services.teleoperation.qos.route import LoopingVehicle, PurePursui
 from scan2sim.services.teleoperation.qos.scripted_drive import ScriptedCommands
 from scan2sim.services.teleoperation.sim.bicycle import Bicycle, Ground
 from tests.fakes import synthetic
+from tests.fakes.virtual_clock import VirtualClock
 
 STEP = 0.02
 
@@ -67,15 +68,14 @@ def test_car_drives_along_the_reference_path_repeatedly(street: Scene, monkeypat
     monkeypatch.setattr(route, "LANE_OFFSET_M", 1.0)
     path = route.reference_path(street, ground)
     assert path[0] == pytest.approx(ground.start[:2]) and len(path) > 10
-    now = [0.0]
-    monkeypatch.setattr("scan2sim.services.teleoperation.vehicle.adapters.simulated.time.monotonic", lambda: now[0])
+    clock = VirtualClock(0.0)
     vehicle, script = (
-        LoopingVehicle(ground, path),
+        LoopingVehicle(ground, path, clock=clock),
         ScriptedCommands(lambda vehicle, _: PurePursuit(path).steering(vehicle)),
     )
-    while vehicle.runs < 2 and now[0] < 60:
-        now[0] += STEP
-        vehicle.obey(script.command(telemetry(vehicle.state()), now[0]).controls)
+    while vehicle.runs < 2 and clock() < 60:
+        clock.sleep(STEP)
+        vehicle.obey(script.command(telemetry(vehicle.state()), clock()).controls)
     assert vehicle.runs == 2 and not vehicle.state().faults
     assert {run for run, _, _ in vehicle.positions} == {0, 1}
     assert np.abs(route.cross_track_error(path, vehicle.positions)).max() < 0.4

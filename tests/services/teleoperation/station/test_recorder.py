@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +63,7 @@ def recorded(tmp_path: Path) -> tuple[Path, list[Frame], list[Command]]:
         desk.start()
         until(lambda: len(frames) > 20)
         station.driver_session.latch("the test")
-        time.sleep(0.2)
+        until(lambda: commands and commands[-1].emergency)
         desk.drive(None)
         station.driver_session.release("script", "the end")
     finally:
@@ -134,7 +133,7 @@ def test_oldest_drives_are_deleted_beyond_the_limit(tmp_path: Path) -> None:
     for number in range(120):
         recorder.frame("front", Frame(0, number, number == 0, bytes(100_000), 640, 480), 10.0)
         recorder.command(Command(Controls(number / 200, gear=Gear.FORWARD), number))
-        time.sleep(0.005)
+        until(recorder._queue.empty)
     recorder.close()
     assert sum(file.stat().st_size for file in tmp_path.rglob("*.mcap")) < 1.2 * limit
     stops = [one.content.stop for one in read(tmp_path) if one.topic == "/command"]

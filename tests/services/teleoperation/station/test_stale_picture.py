@@ -34,7 +34,7 @@ from tests.services.teleoperation.pages import Cockpit, served, station_process
 from tests.services.teleoperation.street import Street
 from tests.waiting import until
 
-SOON = 5.0
+SOON = 30.0
 """Seconds within which the page must cover old video; the limit is 0.3 s, but a machine that runs tests is busy."""
 STATUS = "document.getElementById('status').textContent"
 SPEED = "document.getElementById('speed').textContent"
@@ -65,6 +65,7 @@ def seconds_without_video(page: Page) -> float:
     return float(page.value(f"{STATUS}.match(/since ([0-9.]+) s/)[1]"))
 
 
+@pytest.mark.realtime
 def test_page_covers_video_while_its_station_is_stopped(tmp_path: Path) -> None:
     street = Street(tmp_path)
     try:
@@ -89,6 +90,7 @@ def test_page_covers_video_while_its_station_is_stopped(tmp_path: Path) -> None:
         street.close()
 
 
+@pytest.mark.realtime
 def test_stopped_video_is_covered_while_telemetry_continues(cockpit: Cockpit, tmp_path: Path) -> None:
     with chromium(tmp_path) as page:
         open_page(page, cockpit.url)
@@ -100,6 +102,7 @@ def test_stopped_video_is_covered_while_telemetry_continues(cockpit: Cockpit, tm
         assert not page.errors
 
 
+@pytest.mark.realtime
 def test_delayed_video_stays_covered(cockpit: Cockpit, tmp_path: Path) -> None:
     """Delayed in the station, as after it was stopped; then on the way to the page."""
     shown = "Number(document.querySelector('figure').dataset.shown)"
@@ -124,6 +127,7 @@ def test_delayed_video_stays_covered(cockpit: Cockpit, tmp_path: Path) -> None:
         assert not page.errors
 
 
+@pytest.mark.realtime
 def test_slow_page_continues_at_the_next_key_frame(cockpit: Cockpit, tmp_path: Path) -> None:
     decoder = "[...cameras.values()][0].decoder"
     with chromium(tmp_path) as page:
@@ -135,39 +139,41 @@ def test_slow_page_continues_at_the_next_key_frame(cockpit: Cockpit, tmp_path: P
         assert page.worker_value("slow.state") == "closed" and not page.errors
 
 
+@pytest.mark.realtime
 def test_hanging_worker_is_covered(cockpit: Cockpit, tmp_path: Path) -> None:
     with chromium(tmp_path) as page:
         open_page(page, cockpit.url)
+        page.value(f"blank = false; setInterval(() => {{ blank = blank || ({BLANK}); }}, 20); 0")
         page.worker_value(
             "setTimeout(() => { for (const end = performance.now() + 4000; performance.now() < end; ) ; }, 100)"
         )
-        page.until(BLANK, SOON)
+        page.until("blank", SOON)
         page.until(LIVE)
         assert not page.errors
 
 
+@pytest.mark.realtime
 def test_silent_adapter_and_vehicle_leave_no_old_speed(cockpit: Cockpit, tmp_path: Path) -> None:
     with chromium(tmp_path) as page:
         open_page(page, cockpit.url)
         cockpit.street.stop_adapter()
-        page.until(f"{SPEED} === '-' && {STATUS}.includes('the vehicle does not respond')", SOON)
-        assert page.value(f"!({COVERED}) && {LINKS} === 2"), "video and links continue"
+        silent = f"{SPEED} === '-' && {STATUS}.includes('the vehicle does not respond')"
+        page.until(f"{silent} && !({COVERED}) && {LINKS} === 2", SOON)  # video and links continue
         cockpit.street.vehicle.close()
         page.until(BLANK, SOON)
         assert not page.errors
 
 
+@pytest.mark.realtime
 def test_hanging_page_is_covered(cockpit: Cockpit, tmp_path: Path) -> None:
     """Covered by the browser's compositor, since no script runs."""
     with chromium(tmp_path) as page:
         open_page(page, cockpit.url)
         page.do("Page.startScreencast", format="png")
         page.value(
-            "setTimeout(() => { for (const end = performance.now() + 20000; performance.now() < end; ) ; }, 100)"
+            "setTimeout(() => { for (const end = performance.now() + 120000; performance.now() < end; ) ; }, 100)"
         )
-        end = time.monotonic() + 10
-        while not _dark(page):
-            assert time.monotonic() < end, "the page isn't covered"
+        until(lambda: _dark(page), what="a covered page")
 
 
 def _black(page: Page) -> bool:
@@ -184,7 +190,7 @@ def _black(page: Page) -> bool:
 
 def _dark(page: Page) -> bool:
     """Whether the next frame of the screencast is dark at its edges, where the page has no text or video."""
-    while (message := json.loads(page._socket.recv(timeout=10))).get("method") != "Page.screencastFrame":
+    while (message := json.loads(page._socket.recv(timeout=60))).get("method") != "Page.screencastFrame":
         pass
     page._socket.send(
         json.dumps(
@@ -215,5 +221,7 @@ def test_queued_telemetry_is_old() -> None:
     telemetry = Telemetry(VehicleState(speed=5.0), 1, False, "", 0, 0.0, {})
     joined._received(Message(Kind.TELEMETRY, 1, now - 10**9, telemetry.pack()))
     assert (joined.telemetry_age_ms() or 0) >= 1000
-    joined._received(Message(Kind.TELEMETRY, 2, time.monotonic_ns(), telemetry.pack()))
-    assert (joined.telemetry_age_ms() or 1000) < 1000
+    sent = time.monotonic_ns()
+    joined._received(Message(Kind.TELEMETRY, 2, sent, telemetry.pack()))
+    age = joined.telemetry_age_ms()
+    assert age is not None and age <= (time.monotonic_ns() - sent) / 1e6 + 0.1

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import can
@@ -28,11 +29,12 @@ from scan2sim.services.teleoperation.vehicle import adapters
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
 from scan2sim.services.teleoperation.vehicle.adapters import VehicleUnreachable
 from scan2sim.services.teleoperation.vehicle.adapters import ros as ros_adapter
-from scan2sim.services.teleoperation.vehicle.adapters.can import EXAMPLE_DBC
+from scan2sim.services.teleoperation.vehicle.adapters.can import EXAMPLE_DBC, REOPEN_DELAY_S, CanVehicle
 from scan2sim.services.teleoperation.vehicle.adapters.ros import MESSAGE_TYPES, ODOMETRY_TYPE
 from tests.conftest import ROOT
 from tests.fakes.nav2_nodes import Nodes
-from tests.fakes.vehicle import GO, OnboardPeer, RecordingVehicle, adapter_key_file
+from tests.fakes.vehicle import GO, LockstepPeer, OnboardPeer, RecordingVehicle, adapter_key_file
+from tests.fakes.virtual_clock import VirtualClock
 from tests.waiting import until
 
 LIMIT = 200
@@ -43,14 +45,14 @@ Start = Callable[..., tuple[AdapterServer, OnboardPeer]]
 
 @pytest.fixture
 def start_adapter() -> Iterator[Start]:
-    """Starts an adapter of a vehicle, and an onboard endpoint that talks to it."""
+    """Starts an adapter of a vehicle, and an onboard endpoint that talks to it over the network."""
     ended, threads = threading.Event(), []
 
     def started(vehicle: Any, **params: Any) -> tuple[AdapterServer, OnboardPeer]:
         one = AdapterServer(vehicle, AdapterParams(port=0, limit=LIMIT, key=adapter_key_file(), **params))
         threads.append(threading.Thread(target=one.run, args=(ended,)))
         threads[-1].start()
-        return one, OnboardPeer(one.address, adapter_key.read(adapter_key_file()))
+        return one, OnboardPeer(("127.0.0.1", one.address[1]), adapter_key.read(adapter_key_file()))
 
     yield started
     ended.set()
@@ -58,30 +60,70 @@ def start_adapter() -> Iterator[Start]:
         thread.join()
 
 
-def test_vehicle_stops_when_the_onboard_unit_falls_silent(start_adapter: Start) -> None:
-    vehicle = RecordingVehicle()
-    _, peer = start_adapter(vehicle)
+@pytest.fixture
+def clock() -> VirtualClock:
+    return VirtualClock()
+
+
+@pytest.fixture
+def lockstep(clock: VirtualClock) -> Iterator[Callable[[Any], LockstepPeer]]:
+    """An onboard endpoint in lockstep with the adapter of a given vehicle, in virtual time."""
+    servers: list[AdapterServer] = []
+
+    def connected(vehicle: Any) -> LockstepPeer:
+        params = AdapterParams(port=0, limit=LIMIT, key=adapter_key_file())
+        servers.append(AdapterServer(vehicle, params, clock=clock.ns))
+        return LockstepPeer(servers[-1], adapter_key.read(adapter_key_file()), clock)
+
+    yield connected
+    ended = threading.Event()
+    ended.set()
+    for server in servers:
+        server.run(ended)
+
+
+Lockstep = Callable[[Any], LockstepPeer]
+
+
+def test_vehicle_stops_when_the_onboard_unit_falls_silent(lockstep: Lockstep, clock: VirtualClock) -> None:
+    vehicle = RecordingVehicle(clock=clock)
+    peer = lockstep(vehicle)
     peer.until(lambda: len(vehicle.received) > 10)
     assert all(controls.brake == 1 for _, controls in vehicle.received)
     peer.start()
     peer.until(vehicle.moves)
     assert vehicle.received[-1][1] == GO
-    silent = time.monotonic()
-    time.sleep(2 * LIMIT / 1000)
+    silent = clock()
+    peer.hang(2 * LIMIT / 1000)
     stopped = next(at for at, controls in vehicle.received if at > silent and controls.brake == 1)
-    slowest = max(later - at for (at, _), (later, _) in zip(vehicle.received, vehicle.received[1:], strict=False))
-    assert stopped - silent < LIMIT / 1000 + slowest + 0.02  # this machine may be busy
+    assert LIMIT / 1000 - 0.02 <= stopped - silent <= LIMIT / 1000 + 0.011  # the last order was up to 20 ms old
     peer.until(lambda: not peer.driven)  # the onboard unit is notified, and requires a confirmation
-    for _ in range(20):
+    for _ in range(200):
         peer.exchange()
     assert not vehicle.moves()
     peer.start()
     peer.until(vehicle.moves)
 
 
-def test_unreachable_vehicle_is_a_stop_that_the_driver_confirms(start_adapter: Start) -> None:
-    vehicle = RecordingVehicle()
-    _, peer = start_adapter(vehicle)
+@pytest.mark.parametrize("seconds", [0.1, 1.0])
+def test_stalled_adapter_obeys_no_old_order(lockstep: Lockstep, clock: VirtualClock, seconds: float) -> None:
+    vehicle = RecordingVehicle(clock=clock)
+    peer = lockstep(vehicle)
+    peer.start()
+    peer.until(vehicle.moves)
+    waiting = []
+    for _ in range(round(seconds * 100)):  # its onboard unit continues
+        clock.sleep(0.01)
+        waiting.append(peer.order(GO))
+    for packet in waiting:
+        assert peer.server.answer(packet) is not None
+    peer.server.control()
+    assert vehicle.moves() == (seconds * 1000 < LIMIT)
+
+
+def test_unreachable_vehicle_is_a_stop_that_the_driver_confirms(lockstep: Lockstep, clock: VirtualClock) -> None:
+    vehicle = RecordingVehicle(clock=clock)
+    peer = lockstep(vehicle)
     peer.start()
     vehicle.unreachable = "the plug is out"
     peer.until(lambda: not peer.driven)
@@ -98,19 +140,35 @@ def test_unreachable_vehicle_is_a_stop_that_the_driver_confirms(start_adapter: S
     peer.until(vehicle.moves)
 
 
-@pytest.mark.parametrize("key", [b"x" * 32, b""], ids=["another key", "no key"])
-def test_malformed_and_foreign_packets_are_not_obeyed(start_adapter: Start, key: bytes) -> None:
-    vehicle = RecordingVehicle()
-    adapter_server, peer = start_adapter(vehicle, host="0.0.0.0")
-    stranger = OnboardPeer(("127.0.0.1", adapter_server.address[1]), key)
-    peer.socket.connect(("127.0.0.1", adapter_server.address[1]))
+FOREIGN_KEYS = pytest.mark.parametrize("key", [b"x" * 32, b""], ids=["another key", "no key"])
+
+
+@FOREIGN_KEYS
+def test_malformed_and_foreign_packets_are_not_obeyed(lockstep: Lockstep, clock: VirtualClock, key: bytes) -> None:
+    vehicle = RecordingVehicle(clock=clock)
+    peer = lockstep(vehicle)
+    stranger = LockstepPeer(peer.server, key, clock)
     peer.start()
+    stranger.driven = True
     for _ in range(20):
-        stranger.driven = True
+        stranger.exchange(STOP)
+        assert peer.server.answer(os.urandom(40)) is None
+        peer.exchange()
+    assert vehicle.moves() and stranger.end.answer is None and peer.server.malformed == 40
+
+
+@FOREIGN_KEYS
+def test_adapter_answers_its_onboard_unit_on_the_network_and_no_stranger(start_adapter: Start, key: bytes) -> None:
+    vehicle = RecordingVehicle()
+    server, peer = start_adapter(vehicle, host="0.0.0.0")
+    stranger = OnboardPeer(("127.0.0.1", server.address[1]), key)
+    peer.drive_until(vehicle.moves)
+    for _ in range(20):
         stranger.exchange()
         stranger.socket.send(os.urandom(40))
-        peer.exchange()
-    assert vehicle.moves() and stranger.end.answer is None and adapter_server.malformed == 40
+    peer.until(lambda: server.malformed == 40)
+    assert stranger.end.answer is None
+    peer.drive_until(vehicle.moves)
 
 
 def test_adapter_refuses_keys_that_are_missing_short_or_readable_by_others(tmp_path: Path) -> None:
@@ -167,7 +225,7 @@ from scan2sim.services.teleoperation.vehicle import adapters
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
 adapters.__path__.append({str(tmp_path / "more")!r})
 found = adapters.find("boat")
-params = AdapterParams(port=0, key={str(adapter_key_file())!r})
+params = AdapterParams(port=0, limit=5000, key={str(adapter_key_file())!r})
 one = AdapterServer(found.connect(found.Params(file={str(tmp_path / "log")!r})), params)
 print(one.address[1], flush=True)
 one.run(threading.Event())
@@ -189,28 +247,39 @@ def test_new_vehicle_is_one_module_and_stops_when_its_onboard_unit_hangs(
     assert boat.stdout is not None
     port = int(boat.stdout.readline())
     hanging = f"""
+import time
 from scan2sim.services.teleoperation.settings import OnboardParams
 from scan2sim.services.teleoperation.vehicle.onboard_unit import OnboardUnit
-from tests.fakes.driver import FakeConnection, ScriptedDriver
-params = OnboardParams(adapter="127.0.0.1:{port}", key={str(adapter_key_file())!r})
-unit, connection, stations = OnboardUnit(params), FakeConnection(), []
-unit.join(lambda received, restarted: stations.append(ScriptedDriver(connection, received)) or connection)
-stations[0].start()
+from tests.fakes.driver import FakeConnection, RunningDriver
+params = OnboardParams(adapter="127.0.0.1:{port}", limit=5000, key={str(adapter_key_file())!r})
+unit, connection, drivers = OnboardUnit(params), FakeConnection(), []
+unit.join(lambda received, restarted: drivers.append(RunningDriver(connection, received)) or connection)
+drivers[0].until(lambda: connection.has_telemetry() and not connection.telemetry().standing)
+drivers[0].confirms = False
 print("drives", flush=True)
+drivers[0].until(lambda: connection.telemetry().standing)
+print("stands", flush=True)
+time.sleep(600)
 """
     unit = subprocess.Popen(
         [sys.executable, "-c", hanging], stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)}
     )
+    log = tmp_path / "log"
+
+    def lines() -> list[str]:
+        return log.read_text(encoding="utf-8").splitlines()
+
     try:
         assert unit.stdout is not None and unit.stdout.readline() == "drives\n"
-        log = tmp_path / "log"
-        until(lambda: log.read_text(encoding="utf-8").endswith("1.0 0.0\n"))
+        until(lambda: lines()[-1:] == ["1.0 0.0"])
         unit.send_signal(signal.SIGSTOP)
-        until(lambda: log.read_text(encoding="utf-8").endswith("0.0 1.0\n"))
+        until(lambda: lines()[-1:] == ["0.0 1.0"])
+        stopped = len(lines())
         unit.send_signal(signal.SIGCONT)  # it continues, with the throttle still pressed
-        end = time.monotonic() + 0.5
-        while time.monotonic() < end:
-            assert log.read_text(encoding="utf-8").splitlines()[-1] == "0.0 1.0"
+        assert unit.stdout.readline() == "stands\n"
+        noticed = len(lines())
+        until(lambda: len(lines()) > noticed + 50)
+        assert set(lines()[stopped:-1]) == {"0.0 1.0"}
     finally:
         unit.kill()
         unit.communicate()
@@ -232,9 +301,10 @@ def vehicle() -> Iterator[Any]:
         yield bus
 
 
-def connect(**params: Any) -> Any:
+def connect(clock: Callable[[], float] = time.monotonic, **params: Any) -> Any:
     found = adapters.find("can")
-    return found.connect(found.Params.of("", {"interface": "virtual", "channel": "teleoperation"} | params))
+    settings = {"interface": "virtual", "channel": "teleoperation"} | params
+    return CanVehicle(found.Params.of("", settings), clock=clock)  # type: ignore[arg-type]
 
 
 def newest_signals(bus: Any, dbc: Path = EXAMPLE_DBC) -> dict[str, Any]:
@@ -273,8 +343,8 @@ def test_controls_are_encoded_as_signals_of_the_dbc_file(
     one.close()
 
 
-def test_vehicle_reports_speed_and_gear_or_its_silence(vehicle: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = connect()
+def test_vehicle_reports_speed_and_gear_or_its_silence(vehicle: Any, clock: VirtualClock) -> None:
+    one = connect(clock)
     described: Any = cantools.database.load_file(EXAMPLE_DBC)
     vehicle.send(can.Message(arbitration_id=99, data=b"123", is_extended_id=False))
     vehicle.send(can.Message(arbitration_id=512, data=b"1", is_extended_id=False))
@@ -282,10 +352,9 @@ def test_vehicle_reports_speed_and_gear_or_its_silence(vehicle: Any, monkeypatch
     vehicle.send(can.Message(arbitration_id=512, data=data, is_extended_id=False))
     one.obey(STOP)
     assert one.state() == VehicleState(-5.0, gear=Gear.REVERSE)
-    now = time.monotonic()
-    monkeypatch.setattr(time, "monotonic", lambda: now + 0.3)
+    clock.sleep(0.3)
     assert (one.state().speed, one.state().faults) == (None, ())
-    monkeypatch.setattr(time, "monotonic", lambda: now + 2)
+    clock.sleep(1.7)
     assert one.state().faults == ("no messages from the vehicle on teleoperation",)
     one.close()
 
@@ -297,8 +366,10 @@ def test_vehicle_without_a_speed_signal_has_an_unknown_speed(vehicle: Any) -> No
     one.close()
 
 
-def test_lost_bus_is_reported_and_opened_again(vehicle: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = connect()
+def test_lost_bus_is_reported_and_opened_again(
+    vehicle: Any, clock: VirtualClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = connect(clock)
     one.obey(GO)
     newest_signals(vehicle)
     one._bus.shutdown()
@@ -312,18 +383,21 @@ def test_lost_bus_is_reported_and_opened_again(vehicle: Any, monkeypatch: pytest
             with pytest.raises(VehicleUnreachable, match="teleoperation is not available"):
                 one.obey(GO)
         assert one.state().faults == ("the CAN bus teleoperation is not available",)
-    now = time.monotonic()
-    monkeypatch.setattr(time, "monotonic", lambda: now + 2)
+    with pytest.raises(VehicleUnreachable):
+        one.obey(STOP)  # it is opened again only after a pause
+    clock.sleep(REOPEN_DELAY_S)
     one.obey(STOP)
     assert newest_signals(vehicle)["Brake"] == 100
     one.close()
 
 
-def test_stop_reaches_the_bus_when_the_onboard_unit_falls_silent(vehicle: Any, start_adapter: Start) -> None:
-    _, peer = start_adapter(connect())
+def test_stop_reaches_the_bus_when_the_onboard_unit_falls_silent(
+    vehicle: Any, lockstep: Lockstep, clock: VirtualClock
+) -> None:
+    peer = lockstep(connect(clock))
     peer.start()
     peer.until(lambda: newest_signals(vehicle).get("Throttle") == 100)
-    time.sleep(2 * LIMIT / 1000)
+    peer.hang(2 * LIMIT / 1000)
     last = newest_signals(vehicle)
     assert (last["Throttle"], last["Brake"]) == (0, 100)
 
@@ -383,9 +457,8 @@ def network(monkeypatch: pytest.MonkeyPatch, domain: str) -> None:
     monkeypatch.setenv("SCAN2SIM_TRANSPORT", "cyclone")
 
 
-def ros_vehicle(**params: Any) -> Any:
-    found = adapters.find("ros")
-    return found.connect(found.Params.of("", params))
+def ros_vehicle(clock: Callable[[], float] = time.monotonic, **params: Any) -> Any:
+    return ros_adapter.RosVehicle(ros_adapter.Params.of("", params), clock=clock)
 
 
 @pytest.mark.parametrize(
@@ -397,36 +470,37 @@ def ros_vehicle(**params: Any) -> Any:
     ],
 )
 def test_controls_are_published_as_ros_messages(
-    network: None, message: str, read_command: Callable[[Any], tuple[float, float]]
+    network: None, clock: VirtualClock, message: str, read_command: Callable[[Any], tuple[float, float]]
 ) -> None:
-    one = ros_vehicle(message=message, speed=2.0, angle=0.5, wheelbase=1.0)
+    one = ros_vehicle(clock, message=message, speed=2.0, angle=0.5, wheelbase=1.0)
     with pytest.raises(VehicleUnreachable, match="nothing subscribes to /cmd_vel"):
         one.obey(STOP)
     ros = transport.load()
     robot = ros.Node("robot")
-    newest_signals: list[Any] = []
-    robot.create_subscription(ros.message_type(MESSAGE_TYPES[message]), "cmd_vel", newest_signals.append, 10)
+    newest: list[tuple[float, float]] = []
+    robot.create_subscription(
+        ros.message_type(MESSAGE_TYPES[message]), "cmd_vel", lambda m: newest.append(read_command(m)), 10
+    )
     odometry = robot.create_publisher(ros.message_type(ODOMETRY_TYPE), "odom", 10)
     expected = ros.message(ODOMETRY_TYPE)
     expected.pose.pose.position.x, expected.pose.pose.orientation.z, expected.pose.pose.orientation.w = 3.0, 1.0, 0.0
     expected.twist.twist.linear.x = -1.5
 
-    def received(controls: Controls) -> tuple[float, float]:
-        newest_signals.clear()
-        end = time.monotonic() + 20
-        while not newest_signals or one.state().position is None:
-            assert time.monotonic() < end
-            odometry.publish(expected)
-            with contextlib.suppress(VehicleUnreachable):
-                one.obey(controls)
-            ros.spin_once(robot, 0.01)
-        return read_command(newest_signals[-1])
+    def receives(controls: Controls, command: tuple[float, float]) -> bool:
+        odometry.publish(expected)
+        with contextlib.suppress(VehicleUnreachable):
+            one.obey(controls)
+        ros.spin_once(robot, 0.01)
+        return newest[-1:] == [pytest.approx(command)] and one.state().position is not None
 
     turn = 0.25 if message == "ackermann" else math.tan(0.25) * -1.0
-    reverse = Controls(0.5, 0.5, 0.0, Gear.REVERSE)
-    assert received(reverse) == pytest.approx((-1.0, turn))
-    assert received(Controls(0.5, 0.5, 0.5, Gear.REVERSE))[0] == pytest.approx(-0.5)
-    assert received(STOP)[0] == 0.0
+    braked_turn = 0.25 if message == "ackermann" else math.tan(0.25) * -0.5
+    for controls, command in (
+        (Controls(0.5, 0.5, 0.0, Gear.REVERSE), (-1.0, turn)),
+        (Controls(0.5, 0.5, 0.5, Gear.REVERSE), (-0.5, braked_turn)),
+        (STOP, (0.0, 0.0)),
+    ):
+        until(lambda: receives(controls, command), what=f"{command}", state=lambda: newest[-1:])  # noqa: B023
     state = one.state()
     assert (state.speed, state.position, state.faults) == (-1.5, (3.0, 0.0), ())
     assert state.heading is not None and abs(state.heading) == pytest.approx(math.pi)
@@ -434,10 +508,10 @@ def test_controls_are_published_as_ros_messages(
     one.close()
 
 
-def test_missing_odometry_is_reported(network: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = ros_vehicle()
-    now = time.monotonic()
-    monkeypatch.setattr(time, "monotonic", lambda: now + 2)
+def test_missing_odometry_is_reported(network: None, clock: VirtualClock) -> None:
+    one = ros_vehicle(clock)
+    assert one.state().faults == ()
+    clock.sleep(2)
     assert one.state().faults == ("no odometry on /odom",)
     one.close()
 
@@ -448,6 +522,7 @@ def nodes(pythons: dict[str, str]) -> Nodes:
     return Nodes({"smoother": "cyclone", "monitor": other, "base": other}, pythons)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("hung", ["smoother", "monitor"])
 def test_vehicle_stops_when_a_node_between_hangs(
     network: None, pythons: dict[str, str], start_adapter: Start, hung: str
@@ -456,34 +531,33 @@ def test_vehicle_stops_when_a_node_between_hangs(
         one = ros_vehicle(topic="cmd_vel_teleop", output="cmd_vel", odometry="odom")
         _, peer = start_adapter(one)
         peer.until(lambda: math.isfinite(one._output._received))  # all are connected
-        peer.start()
-        peer.until(lambda: chain.moves and (one.state().speed or 0) > 0.9)
-        began = chain.hang(hung)
-        peer.until(lambda: not chain.moves)
-        assert 0 < chain.since - began < 1.5  # 0.3 s on a quiet machine
-        peer.until(lambda: not peer.driven)
-        answer = peer.end.answer
-        assert answer is not None and answer.reason == "nothing is published on /cmd_vel: check the nodes before it"
+        peer.drive_until(lambda: chain.moves and (one.state().speed or 0) > 0.9)
+        chain.hang(hung)
+        peer.drive_until(lambda: not chain.moves)
+        silent = "nothing is published on /cmd_vel: check the nodes before it"
+        peer.drive_until(lambda: peer.end.answer is not None and peer.end.answer.reason == silent)
+        peer.until(lambda: not peer.driven and not one._output._moves)
         chain.wake(hung)
-        for _ in range(100):
+        for _ in range(50):
+            peer.exchange()
+        peer.until(lambda: not chain.moves)  # it may receive what it missed
+        for _ in range(50):
             peer.exchange()
         assert not chain.moves  # it drives again only when the driver confirms
-        peer.start()
-        peer.until(lambda: chain.moves)
+        peer.drive_until(lambda: chain.moves)
 
 
+@pytest.mark.realtime
 def test_stop_passes_through_the_nodes_between(network: None, pythons: dict[str, str], start_adapter: Start) -> None:
     with nodes(pythons) as chain:
         one = ros_vehicle(topic="cmd_vel_teleop", output="cmd_vel", joint_states="joint_states", odometry="")
         _, peer = start_adapter(one)
         peer.until(lambda: math.isfinite(one._output._received))  # all are connected
-        peer.start()
-        peer.until(lambda: (one.state().speed or 0) == pytest.approx(1.0))  # measured by the wheels
+        peer.drive_until(lambda: (one.state().speed or 0) == pytest.approx(1.0))  # measured by the wheels
         peer.until(lambda: not chain.moves, STOP)
         peer.until(lambda: one.state().speed == 0.0, STOP)
-        time.sleep(2.0)  # the monitor ceases to publish
-        peer.start()
-        peer.until(lambda: chain.moves)
+        peer.until(lambda: time.monotonic() - one._output._received > 0.5, STOP)  # the monitor ceases to publish
+        peer.drive_until(lambda: chain.moves)
 
 
 def twist(speed: float) -> Any:
@@ -492,7 +566,7 @@ def twist(speed: float) -> Any:
     return message
 
 
-def test_nodes_that_ignore_a_stop_are_overridden() -> None:
+def test_nodes_that_ignore_a_stop_are_overridden(clock: VirtualClock) -> None:
     sent: list[Any] = []
 
     class Publisher:
@@ -500,20 +574,43 @@ def test_nodes_that_ignore_a_stop_are_overridden() -> None:
             sent.append(message)
 
     params = ros_adapter.Params(topic="a", output="b", stop_within=0.5)
-    output, now = ros_adapter.Output(params, Publisher()), time.monotonic()
+    output = ros_adapter.Output(params, Publisher(), clock=clock)
     output.receive(twist(1.0))
-    output.enforce(twist(1.0), now)
-    output.enforce(twist(0.0), now + 0.1)
+    output.enforce(twist(1.0), clock())
+    clock.sleep(0.1)
+    output.enforce(twist(0.0), clock())
     output.receive(twist(0.9))
-    output.enforce(twist(0.0), now + 0.2)
+    clock.sleep(0.1)
+    output.enforce(twist(0.0), clock())
     assert not sent  # it may decelerate
-    output.enforce(twist(0.0), now + 0.7)
+    clock.sleep(0.5)
+    output.enforce(twist(0.0), clock())
     output.receive(sent[-1])
-    output.enforce(twist(0.0), now + 0.71)
+    clock.sleep(0.01)
+    output.enforce(twist(0.0), clock())
     assert [message.linear.x for message in sent] == [0.0, 0.0]  # until something else is commanded
-    output.enforce(twist(1.0), now + 0.72)
+    clock.sleep(0.01)
+    output.enforce(twist(1.0), clock())
     output.receive(twist(0.0))
-    assert output.holds(now + 2) and len(sent) == 2  # a collision monitor's stop is reported
+    assert output.holds(clock() + 2) and len(sent) == 2  # a collision monitor's stop is reported
+
+
+def test_nodes_that_fall_silent_stop_the_vehicle(clock: VirtualClock) -> None:
+    sent: list[Any] = []
+    publisher: Any = SimpleNamespace(publish=sent.append)
+    output = ros_adapter.Output(ros_adapter.Params(topic="a", output="b"), publisher, clock=clock)
+    for _ in range(100):
+        output.receive(twist(1.0))
+        clock.sleep(0.01)
+        output.enforce(twist(1.0), clock())
+    clock.sleep(ros_adapter.OUTPUT_TIMEOUT_S - 0.02)
+    output.enforce(twist(1.0), clock())
+    clock.sleep(0.02)
+    with pytest.raises(VehicleUnreachable, match="nothing is published on /b"):
+        output.enforce(twist(1.0), clock())
+    assert not sent
+    output.enforce(twist(0.0), clock())  # the adapter's stop
+    assert [message.linear.x for message in sent] == [0.0]
 
 
 def test_commands_and_output_need_different_topics() -> None:

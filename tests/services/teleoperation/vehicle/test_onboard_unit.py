@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import pytest
 
 from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.services.teleoperation import adapter_key
 from scan2sim.services.teleoperation.control.controls import VehicleState
 from scan2sim.services.teleoperation.control.messages import (
     Command,
@@ -35,12 +35,15 @@ from scan2sim.services.teleoperation.vehicle.onboard_unit import (
     DROP_CLOCKS_UNKNOWN,
     MALFORMED,
     NO_STATION,
+    WATCHDOG_PERIOD_S,
     OnboardController,
+    OnboardJobs,
     OnboardUnit,
     pack_fitting,
 )
-from tests.fakes.driver import GO, REST, FakeClocks, FakeConnection, ScriptedDriver
+from tests.fakes.driver import GO, REST, FakeClocks, FakeConnection, RunningDriver, ScriptedDriver
 from tests.fakes.vehicle import RecordingVehicle, adapter_key_file
+from tests.fakes.virtual_clock import VirtualClock
 
 LIMIT = 200
 
@@ -254,97 +257,209 @@ def test_invalid_adapter_address_is_reported() -> None:
             OnboardParams(adapter=wrong).address()
 
 
+class Drive:
+    """Driver, onboard unit, adapter and vehicle in lockstep, in virtual time.
+
+    Attributes:
+        hanging: those of "driver", "unit" and "adapter" that do nothing; their packets wait.
+    """
+
+    def __init__(self) -> None:
+        self.clock, self.hanging = VirtualClock(), set[str]()
+        key = adapter_key_file()
+        self.vehicle = RecordingVehicle(VehicleState(3.0), clock=self.clock)
+        params = AdapterParams(port=0, limit=LIMIT, key=key)
+        self.server = AdapterServer(self.vehicle, params, clock=self.clock.ns)
+        self.car, self.connection = OnboardController(LIMIT), FakeConnection(FakeClocks(now=self.clock.ns))
+        self.orders, self.answers = list[bytes](), list[bytes]()
+        self.jobs = OnboardJobs(self.car, adapter_key.read(key), self.orders.append, clock=self.clock.ns)
+        self.session, self.steps = object(), 0
+        self.driver = ScriptedDriver(self.connection, self._receive, clock=self.clock.ns)
+        self.car.join(self.session, self.connection, ())
+
+    def _receive(self, message: Message) -> None:
+        self.car.receive(self.session, message, self.clock.ns())
+
+    def step(self) -> None:
+        """A period of the watchdog, 5 ms."""
+        self.clock.sleep(WATCHDOG_PERIOD_S)
+        self.steps += 1
+        if "driver" not in self.hanging and self.steps % 4 == 0:
+            self.driver.step()
+        if "unit" not in self.hanging:
+            for packet in _taken(self.answers):
+                self.jobs.receive_answer(packet)
+            self.jobs.watch()
+            if self.steps % 4 == 0:
+                self.jobs.send_telemetry(self.connection)
+        if "adapter" not in self.hanging:
+            self.answers += filter(None, map(self.server.answer, _taken(self.orders)))
+            if self.steps % 2 == 0:
+                self.server.control()
+
+    def pass_time(self, seconds: float) -> None:
+        for _ in range(round(seconds / WATCHDOG_PERIOD_S)):
+            self.step()
+
+    def until(self, condition: Callable[[], bool]) -> float:
+        """Let time pass until a condition is true; returns how long that took, milliseconds."""
+        began = self.clock()
+        while not condition():
+            assert self.clock() < began + 20, self.connection.telemetry()
+            self.step()
+        return 1e3 * (self.clock() - began)
+
+    def drives(self) -> bool:
+        return self.vehicle.controls == GO
+
+    def brakes(self) -> bool:
+        return self.vehicle.controls.brake == 1
+
+    def close(self) -> None:
+        ended = threading.Event()
+        ended.set()
+        self.server.run(ended)
+
+
+def _taken(packets: list[bytes]) -> list[bytes]:
+    taken = packets[:]
+    packets.clear()
+    return taken
+
+
 @pytest.fixture
-def running() -> Iterator[tuple[RecordingVehicle, OnboardUnit, ScriptedDriver, FakeConnection, threading.Event]]:
-    """A vehicle, its adapter, its onboard unit, and a station."""
+def drive() -> Iterator[Drive]:
+    """A vehicle that drives."""
+    made = Drive()
+    made.until(made.drives)
+    yield made
+    made.close()
+
+
+def test_driver_who_falls_silent_stops_the_vehicle_until_they_confirm(drive: Drive) -> None:
+    drive.pass_time(2)
+    assert drive.drives() and drive.connection.telemetry().vehicle.speed == 3.0
+    assert sum(kind == Kind.STREAMS for kind, _ in drive.connection.sent) == 3  # once per second
+    drive.hanging = {"driver"}  # the links are cut
+    assert LIMIT - 20 <= drive.until(drive.brakes) <= LIMIT + 15  # the last command was up to 20 ms old
+    drive.until(lambda: drive.connection.telemetry().standing)
+    drive.hanging, drive.driver.confirms = set(), False
+    drive.pass_time(2)
+    assert drive.brakes(), "the driver has not confirmed"
+    drive.driver.confirms = True
+    drive.until(drive.drives)
+
+
+def test_unreachable_vehicle_needs_a_confirmation(drive: Drive) -> None:
+    drive.vehicle.unreachable, drive.driver.confirms = "the plug is out", False
+    drive.until(lambda: "the plug is out" in drive.connection.telemetry().reason)
+    drive.vehicle.unreachable = ""
+    drive.pass_time(2)
+    assert drive.brakes()
+    drive.driver.confirms = True
+    drive.until(drive.drives)
+
+
+@pytest.mark.parametrize("seconds", [0.1, 0.18, 0.25, 1.0, 10.0])
+def test_stalled_onboard_unit_is_a_stop_if_it_exceeds_the_limit(drive: Drive, seconds: float) -> None:
+    drive.hanging, drive.driver.confirms = {"unit"}, False
+    if seconds * 1e3 > LIMIT:
+        assert drive.until(drive.brakes) <= LIMIT + 25, "the adapter stops the vehicle by itself"
+    drive.pass_time(seconds)
+    drive.hanging = set()
+    drive.pass_time(2)
+    assert drive.brakes() if seconds * 1e3 > LIMIT else drive.drives()
+    drive.driver.confirms = True
+    drive.until(drive.drives)
+
+
+def test_adapter_that_ends_or_stalls_is_reported_and_stops_the_vehicle(drive: Drive) -> None:
+    drive.hanging, drive.driver.confirms = {"adapter"}, False
+    took = drive.until(lambda: drive.connection.telemetry().reason == ADAPTER_SILENT)
+    assert LIMIT - 15 <= took <= LIMIT + 30
+    drive.pass_time(1)
+    drive.hanging = set()  # with all packets that waited
+    drive.until(drive.brakes)
+    drive.pass_time(2)
+    assert drive.brakes()
+    drive.driver.confirms = True
+    drive.until(drive.drives)
+
+
+def test_released_station_stops_the_vehicle_at_once_and_for_good(drive: Drive) -> None:
+    drive.car.release("taken back")
+    assert drive.until(drive.brakes) <= 15
+    drive.pass_time(2)  # its driver confirms
+    assert drive.brakes()
+
+
+Running = tuple[RecordingVehicle, OnboardUnit, RunningDriver, FakeConnection, Callable[[], None]]
+
+
+@pytest.fixture
+def running() -> Iterator[Running]:
+    """A vehicle, its onboard unit, a station and its driver, and what ends the adapter, all running."""
     vehicle, ended, connection = RecordingVehicle(VehicleState(3.0)), threading.Event(), FakeConnection()
-    adapter_server = AdapterServer(vehicle, AdapterParams(port=0, limit=LIMIT, key=adapter_key_file()))
-    adapter = threading.Thread(target=adapter_server.run, args=(ended,))
+    server = AdapterServer(vehicle, AdapterParams(port=0, limit=LIMIT, key=adapter_key_file()))
+    adapter = threading.Thread(target=server.run, args=(ended,))
     adapter.start()
-    unit = OnboardUnit(
-        OnboardParams(adapter=f"127.0.0.1:{adapter_server.address[1]}", limit=LIMIT, key=adapter_key_file())
-    )
-    stations: list[ScriptedDriver] = []
+    unit = OnboardUnit(OnboardParams(adapter=f"127.0.0.1:{server.address[1]}", limit=LIMIT, key=adapter_key_file()))
+    drivers: list[RunningDriver] = []
 
     def connect(received: Callable[[Message], None], restarted: Callable[[], None]) -> FakeConnection:
         restarted()
-        stations.append(ScriptedDriver(connection, received))
+        drivers.append(RunningDriver(connection, received))
         return connection
 
+    def end_adapter() -> None:
+        ended.set()
+        adapter.join()
+
     unit.join(connect)
-    yield vehicle, unit, stations[0], connection, ended
-    stations[0].ended.set()
-    stations[0].thread.join()
+    yield vehicle, unit, drivers[0], connection, end_adapter
+    drivers[0].end()
     unit.close()
-    ended.set()
-    adapter.join()
+    end_adapter()
     assert unit.failed is None and connection.closed
 
 
-def test_drive_from_the_driver_to_the_vehicle_and_back(
-    running: tuple[RecordingVehicle, OnboardUnit, ScriptedDriver, FakeConnection, threading.Event],
-) -> None:
-    vehicle, _, station, connection, ended = running
-    station.start()
-    station.until(lambda: vehicle.controls == GO)
-    assert connection.telemetry().vehicle.speed == 3.0 and any(kind == Kind.STREAMS for kind, _ in connection.sent)
-
-    station.ended.set()  # the links are cut
-    station.thread.join()
-    cut = time.monotonic()
-    station.until(lambda: vehicle.controls.brake == 1)
-    assert time.monotonic() - cut < LIMIT / 1000 + 0.1
-    station.until(lambda: connection.telemetry().standing)
-
-    again = ScriptedDriver(connection, station.received)
-    again.number, again.controls = station.number, GO
-    time.sleep(0.2)
-    assert vehicle.controls.brake == 1  # not before the driver confirms
-    again.start()
-    again.until(lambda: vehicle.controls == GO)
-
-    vehicle.unreachable = "the plug is out"
-    again.until(lambda: "the plug is out" in connection.telemetry().reason)
-    vehicle.unreachable = ""
-    time.sleep(0.1)
+def test_drive_from_the_driver_to_the_vehicle_and_back(running: Running) -> None:
+    vehicle, _, driver, connection, end_adapter = running
+    driver.until(lambda: vehicle.controls == GO)
+    driver.until(lambda: any(kind == Kind.STREAMS for kind, _ in connection.sent))
+    assert connection.telemetry().vehicle.speed == 3.0
+    driver.end()  # the links are cut
+    driver.until(lambda: vehicle.controls.brake == 1 and connection.telemetry().standing)
+    end_adapter()
+    driver.until(lambda: connection.telemetry().reason == ADAPTER_SILENT)
     assert vehicle.controls.brake == 1
-    again.start()
-    again.until(lambda: vehicle.controls == GO)
-
-    ended.set()  # the adapter ends
-    again.until(lambda: connection.telemetry().reason == ADAPTER_SILENT)
-    assert vehicle.controls.brake == 1
-    again.ended.set()
-    again.thread.join()
 
 
-def test_release_stops_the_vehicle_at_once(
-    running: tuple[RecordingVehicle, OnboardUnit, ScriptedDriver, FakeConnection, threading.Event],
-) -> None:
-    vehicle, unit, station, connection, _ = running
-    station.start()
-    station.until(lambda: vehicle.controls == GO)
+def test_release_disconnects_and_stops_the_vehicle(running: Running) -> None:
+    vehicle, unit, driver, connection, _ = running
+    driver.until(lambda: vehicle.controls == GO)
     unit.release("taken back")
     assert connection.closed
-    station.until(lambda: vehicle.controls.brake == 1)
-    station.agree = True
-    time.sleep(0.2)
-    assert vehicle.controls.brake == 1
+    driver.until(lambda: vehicle.controls.brake == 1)
 
 
-def test_failed_watchdog_is_detected_and_the_vehicle_stops(
-    running: tuple[RecordingVehicle, OnboardUnit, ScriptedDriver, FakeConnection, threading.Event],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    vehicle, unit, station, _, _ = running
-    station.start()
-    station.until(lambda: vehicle.controls == GO)
+def test_onboard_unit_that_ends_stops_the_vehicle(running: Running) -> None:
+    vehicle, unit, driver, _, _ = running
+    driver.until(lambda: vehicle.controls == GO)
+    unit.close()
+    driver.until(lambda: vehicle.controls.brake == 1)
+
+
+def test_failed_watchdog_is_detected_and_the_vehicle_stops(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    vehicle, unit, driver, _, _ = running
+    driver.until(lambda: vehicle.controls == GO)
     monkeypatch.setattr(threading, "excepthook", lambda _: None)
 
     def failing(now: int) -> Any:
         raise RuntimeError("a bug")
 
     monkeypatch.setattr(unit.car, "watchdog_order", failing)
-    station.until(lambda: vehicle.controls.brake == 1)
+    driver.until(lambda: vehicle.controls.brake == 1 and unit.failed is not None)
     assert isinstance(unit.failed, RuntimeError)
     unit.failed = None
+    monkeypatch.undo()
