@@ -64,8 +64,8 @@ def end_well(*processes: subprocess.Popen[str]) -> list[str]:
 
 def json_lines(path: Path) -> list[dict[str, Any]]:
     """Complete lines of a log, which its program may still be writing or not have created yet."""
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
-    return [json.loads(line) for line in lines if line.endswith("\n")]
+    lines = path.read_text(encoding="utf-8").split("\n") if path.exists() else [""]
+    return [json.loads(line) for line in lines[:-1]]
 
 
 def flows(path: Path, topic: str, direction: str = "incoming") -> list[dict[str, Any]]:
