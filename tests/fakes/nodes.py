@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import select
 import subprocess
 import sys
@@ -13,6 +14,8 @@ from typing import Any
 
 READY = "ready"
 """Line that a program prints when its nodes are complete."""
+RUNNING = r".* is running \(stop with Ctrl-C\)"
+"""Pattern of the line that commands print instead."""
 END_S = 90.0
 """Time for a program to end."""
 
@@ -29,8 +32,14 @@ def spin_until_closed(ros: Any, *nodes: Any, each: Callable[[], None] = lambda: 
 def wait_until_ready(process: subprocess.Popen[str]) -> None:
     """Wait until a program prints that it is ready."""
     assert process.stdout
-    while (line := process.stdout.readline().strip()) != READY:
-        assert line, f"the program ended before it was ready: {end(process)[1]}"
+    wait_for_line(process, f"{READY}|{RUNNING}")
+
+
+def wait_for_line(process: subprocess.Popen[str], pattern: str) -> None:
+    """Wait until a program prints a line that is a regular expression's match as a whole."""
+    assert process.stdout
+    while not re.fullmatch(pattern, (line := process.stdout.readline()).rstrip()):
+        assert line, f"the program ended before it printed {pattern}: {end(process)[1]}"
 
 
 def end(process: subprocess.Popen[str]) -> tuple[str, str]:
