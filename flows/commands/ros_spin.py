@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
+from scan2sim.flows.commands.display import console
 from scan2sim.services import transport
 
 
 def spin(create: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: False) -> None:
-    """Create a ROS 2 node and spin it until it has `finished`, or until Ctrl-C or SIGTERM."""
+    """Create a ROS 2 node, report that it runs, and spin it until it has `finished`, or until Ctrl-C or SIGTERM."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # service managers stop services by SIGTERM
     ros = transport.load()
     ros.init()
@@ -20,6 +21,8 @@ def spin(create: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: 
         node = create()
         try:
             with suppress(KeyboardInterrupt):
+                name = f"{node.get_namespace().rstrip('/')}/{node.get_name()}"
+                console.print(f"{name} is running (stop with Ctrl-C)", highlight=False, markup=False, soft_wrap=True)
                 while not finished(node):
                     ros.spin_once(node, 0.2)
         finally:

@@ -28,6 +28,9 @@ class Publisher(Protocol):
     def get_subscription_count(self) -> int:
         """Number of currently matched subscriptions."""
 
+    def wait_for_all_acked(self, timeout_sec: float) -> bool:
+        """Whether all matched reliable subscriptions have acknowledged all messages within `timeout_sec`."""
+
 
 class Node(Protocol):
     """A ROS 2 node; methods and arguments are those of rclpy.

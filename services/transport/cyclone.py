@@ -86,6 +86,10 @@ class Publisher:
         """Number of currently matched subscriptions."""
         return len(self._writer.get_matched_subscriptions())
 
+    def wait_for_all_acked(self, timeout_sec: float) -> bool:
+        """Whether all matched reliable subscriptions have acknowledged all messages within `timeout_sec`."""
+        return self._writer.wait_for_acks(int(timeout_sec * 1e9))
+
 
 class Subscription:
     """Passes the messages of one topic to a callback."""

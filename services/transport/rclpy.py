@@ -41,6 +41,10 @@ class _Publisher(RosPublisher):  # type: ignore[misc]
         super().publish(msg)
         self.node.published(self.topic_name, len(msg) if isinstance(msg, bytes) else serialized_size(msg))
 
+    def wait_for_all_acked(self, timeout_sec: float) -> bool:
+        """Whether all matched reliable subscriptions have acknowledged all messages within `timeout_sec`."""
+        return bool(super().wait_for_all_acked(Duration(seconds=timeout_sec)))
+
 
 class Node(rclpy.node.Node):  # type: ignore[misc]
     """An rclpy node that reports every message (`services.transport.Node`)."""

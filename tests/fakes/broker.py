@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import socket
 import subprocess
-import time
 from pathlib import Path
 
 from scan2sim.services.kafka import Cluster
 from tests.fakes.ports import free_port
+from tests.waiting import until
 
 
 class Broker:
@@ -39,12 +39,13 @@ class Broker:
             [self._program, "broker", *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         host, port = self.servers.split(":")
-        for _ in range(200):
+
+        def is_listening() -> bool:
+            assert self._process.poll() is None, "the broker has ended"
             with socket.socket() as probe:
-                if probe.connect_ex((host, int(port))) == 0:
-                    return
-            time.sleep(0.05)
-        raise ConnectionError(f"the broker does not answer at {self.servers}")
+                return probe.connect_ex((host, int(port))) == 0
+
+        until(is_listening, what=f"a broker at {self.servers}")
 
     def kill(self) -> None:
         """Kill the broker with SIGKILL."""

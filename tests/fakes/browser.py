@@ -140,11 +140,11 @@ def chromium(folder: Path, *flags: str) -> Iterator[Page]:
     ) as process:
         try:
             end = time.monotonic() + 60
-            while not (profile / "DevToolsActivePort").is_file():
+            active = profile / "DevToolsActivePort"
+            while not active.is_file() or len(address := active.read_text(encoding="utf-8").split()) < 2:
                 assert process.poll() is None and time.monotonic() < end, "Chromium doesn't start"
                 time.sleep(0.05)
-            time.sleep(0.1)
-            port, path = (profile / "DevToolsActivePort").read_text(encoding="utf-8").split()
+            port, path = address
             with connect(f"ws://127.0.0.1:{port}{path}", max_size=None) as browser_socket:
                 browser = Page(browser_socket)
                 while not (targets := browser.do("Target.getTargets", filter=[{"type": "page"}])["targetInfos"]):

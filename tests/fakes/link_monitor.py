@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +14,8 @@ from scan2sim.services.qos.emulated_link import Link
 from scan2sim.services.qos.namespaces import Namespace
 from tests.conftest import ROOT
 from tests.fakes.interpreters import PYTHONS
+from tests.fakes.nodes import json_lines
+from tests.waiting import until
 
 MESSAGE_CHARS = 1000
 """Characters of a message, which fits into one packet."""
@@ -25,10 +25,10 @@ PACKET_BYTES = (MESSAGE_CHARS, MESSAGE_CHARS + 400)
 """Minimum and maximum size of a packet with a message, including UDP and RTPS headers; other packets are smaller."""
 CLOCK_OFFSET_S = {"cyclone": 0.5, "rclpy": 0.0}
 """Clock offset of the other machine; none for rclpy, which stamps messages in C++ code that can't be patched."""
-NODE_PRIORITY = 10
-"""Real-time priority of the nodes, so that other load doesn't affect them; below the link's own priority."""
-DISCOVERY_TIMEOUT_S = 60.0
-"""Seconds within which nodes must discover each other."""
+TIMEOUT_S = 60.0
+"""Seconds within which nodes must discover each other, write the records that are awaited, and end."""
+QUIET_RECORDS = 2
+"""Records without messages in a row after which the link has delivered everything."""
 
 
 class MonitorLog:
@@ -40,20 +40,43 @@ class MonitorLog:
 
     def read(self) -> None:
         """Read all flows written so far, with the `time` and `period` of their records."""
-        lines = self._log.read_text(encoding="utf-8").splitlines(keepends=True) if self._log.exists() else []
-        records = [json.loads(line) for line in lines if line.endswith("\n")]
+        records = json_lines(self._log)
         self.flows = [flow | {key: one[key] for key in ("time", "period")} for one in records for flow in one["flows"]]
+
+    def wait_for_records(self, count: int) -> float:
+        """Wait for further records with messages; returns the time of the last one."""
+        self.read()
+        known = len(self.flows)
+
+        def further() -> list[float]:
+            return [flow["time"] for flow in self.flows[known:] if flow["messages"]]
+
+        self._wait(lambda: len(further()) >= count)
+        return further()[count - 1]
+
+    def wait_until_quiet(self) -> None:
+        """Wait until no messages arrive any more."""
+        self.read()
+        known = len(self.flows)
+        self._wait(
+            lambda: (
+                len(self.flows) >= known + QUIET_RECORDS
+                and not any(flow["messages"] for flow in self.flows[-QUIET_RECORDS:])
+            )
+        )
 
     def wait_for(self, condition: Callable[[dict[str, Any]], Any]) -> None:
         """Wait until some flow meets a condition."""
-        end = time.monotonic() + DISCOVERY_TIMEOUT_S
-        while not any(map(condition, self.flows)):
+        self._wait(lambda: any(map(condition, self.flows)))
+
+    def _wait(self, condition: Callable[[], bool]) -> None:
+        def is_met() -> bool:
             if self._process.poll() is not None:
                 raise RuntimeError("the monitor has ended")
-            if time.monotonic() > end:
-                raise RuntimeError(f"nodes or clocks weren't synchronized within {DISCOVERY_TIMEOUT_S:g} s")
-            time.sleep(0.1)
             self.read()
+            return condition()
+
+        until(is_met, TIMEOUT_S, what="records of the monitor", state=lambda: self.flows[-3:])
 
 
 @contextmanager
@@ -68,10 +91,11 @@ def monitored(link: Link, transport: str, interval: float, machines: bool = Fals
         log = MonitorLog(path, monitor)
         log.wait_for(lambda flow: flow["messages"])
         yield log
-        for process, pause in ((talker, 1.5), (monitor, 0.0)):
-            process.terminate()
-            process.wait(DISCOVERY_TIMEOUT_S)
-            time.sleep(pause)
+        talker.terminate()
+        talker.wait(TIMEOUT_S)
+        log.wait_until_quiet()
+        monitor.terminate()
+        monitor.wait(TIMEOUT_S)
         log.read()
 
 
@@ -79,4 +103,4 @@ def _start(side: Namespace, transport: str, *arguments: object) -> subprocess.Po
     variables = {"SCAN2SIM_TRANSPORT": transport, "PYTHONPATH": str(ROOT)}
     variables |= {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}  # both ends could use this machine's shared memory
     command = (PYTHONS[transport], "-m", "tests.fakes.link_node", *arguments)
-    return side.popen(*command, priority=NODE_PRIORITY, env=os.environ | variables, cwd=ROOT)
+    return side.popen(*command, env=os.environ | variables, cwd=ROOT)

@@ -16,6 +16,9 @@ TOPIC = "/link"
 WINDOW_SIZE = 100_000
 """Number of latencies averaged by a record: all of them."""
 
+DEPTH = 1000
+"""Messages that wait for the monitor; it may stall."""
+
 
 def main() -> None:
     """Run the node."""
@@ -51,7 +54,9 @@ def _spin(given: argparse.Namespace) -> None:
         node = Talker(TalkerParams(topic=TOPIC, size=given.size, interval=given.interval, log_file=given.log))
     else:
         node = TopicMonitor(
-            TopicParams(topics=[TOPIC], type=STRING, best_effort=True, window_size=WINDOW_SIZE, log_file=given.log)
+            TopicParams(
+                topics=[TOPIC], type=STRING, best_effort=True, depth=DEPTH, window_size=WINDOW_SIZE, log_file=given.log
+            )
         )
     while not signals:
         ros.spin_once(node, 0.1)

@@ -47,6 +47,7 @@ def start(domain: str, pythons: dict[str, str], tmp_path: Path) -> Iterator[Star
         process = subprocess.Popen(
             [pythons[transport], *map(str, arguments)],
             env=os.environ | settings,
+            stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -57,4 +58,6 @@ def start(domain: str, pythons: dict[str, str], tmp_path: Path) -> Iterator[Star
     yield started
     for process in running:
         process.kill()
-        process.communicate()
+    for process in running:
+        with process:  # closes its pipes and waits
+            pass

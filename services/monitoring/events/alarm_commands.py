@@ -19,8 +19,6 @@ from scan2sim.services.outbox import Outbox
 
 TIMEOUT_S = 10.0
 """Time to reach the alarm node on ROS 2, or Kafka."""
-DELIVERY_S = 0.5
-"""Time for ROS 2 to deliver a message before its publisher ends."""
 
 
 def command_of(params: AlarmCommandParams) -> AlarmCommand:
@@ -70,13 +68,13 @@ def _send_by_ros(params: AlarmCommandParams) -> bool:
     node = ros.Node("_alarm_command", hidden=True)
     outlet, events = RosOutlet(node, params.events_topic), Events("alarm_command")
     events.outlets.append(outlet)
-    heard = _wait(outlet.is_heard)
-    if heard:
+    taken = _wait(outlet.is_heard)
+    if taken:
         events.send("alarm_command", command_of(params))
-        time.sleep(DELIVERY_S)
+        taken = outlet.is_delivered(TIMEOUT_S)
     node.destroy_node()
     ros.shutdown()
-    return heard
+    return taken
 
 
 def _wait(is_done: Callable[[], bool]) -> bool:

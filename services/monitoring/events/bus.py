@@ -96,5 +96,9 @@ class RosOutlet:
         """Whether another node subscribes to the topic."""
         return bool(self._publisher.get_subscription_count())
 
+    def is_delivered(self, seconds: float) -> bool:
+        """Whether all subscribed nodes receive all events within some seconds."""
+        return bool(self._publisher.wait_for_all_acked(seconds))
+
     def close(self) -> None:
         """Nothing to release: the node destroys its publishers."""

@@ -57,7 +57,7 @@ class ClockSync:
         self._id = uuid.uuid4().hex
         self._own: bytes | None = None
         self._peers: dict[bytes, _Peer] = {}
-        self._wall_minus_monotonic = time.time_ns() - time.monotonic_ns()
+        self._wall_minus_monotonic = _wall_minus_monotonic()
 
     def hello(self) -> dict[str, Any] | None:
         """Message by whose arrival this process learns its own GID prefix; None: already known."""
@@ -110,7 +110,7 @@ class ClockSync:
 
     def detect_jump(self) -> float:
         """Seconds by which this machine's clock was set since the last call; a jump discards all known offsets."""
-        difference = time.time_ns() - time.monotonic_ns()
+        difference = _wall_minus_monotonic()
         jump_ns, self._wall_minus_monotonic = difference - self._wall_minus_monotonic, difference
         if abs(jump_ns) < CLOCK_JUMP_NS:
             return 0.0
@@ -123,6 +123,14 @@ class ClockSync:
         peer.host, peer.unanswered = str(message["host"]), 0
         if exchange is not None:
             peer.exchanges.add(exchange)
+
+
+def _wall_minus_monotonic() -> int:
+    """Difference of both clocks in nanoseconds; they are read again if the thread was interrupted in between."""
+    while True:
+        before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        if after - before < CLOCK_JUMP_NS // 2:
+            return wall - before
 
 
 @cache

@@ -1,13 +1,16 @@
-"""Instrumented node that publishes or subscribes: streams.py talk|hear SECONDS LOG TOPIC:BYTES:RATE ..."""
+"""Instrumented node that publishes or subscribes until its input is closed.
+
+streams.py talk|hear LOG TOPIC:BYTES:RATE ...
+"""
 
 from __future__ import annotations
 
 import sys
-import time
 from typing import Any
 
 from scan2sim.services.monitoring.node.monitor import Monitor, ros
 from scan2sim.services.transport import QoS
+from tests.fakes.nodes import spin_until_closed
 
 MAX_TEXT_BYTES = 100_000
 """Larger messages are images."""
@@ -27,7 +30,7 @@ def message(size: int) -> Any:
 
 
 def main() -> None:
-    role, seconds, log, *streams = sys.argv[1:]
+    role, log, *streams = sys.argv[1:]
     ros.init()
     node = Monitor(role, period=0.5, log_file=log)
     for stream in streams:
@@ -38,9 +41,7 @@ def main() -> None:
             node.create_timer(1 / float(rate), lambda publisher=publisher, sent=sent: publisher.publish(sent))
         else:
             node.create_subscription(ros.message_type(kind), topic, lambda _: None, qos)
-    end = time.monotonic() + float(seconds)
-    while time.monotonic() < end:
-        ros.spin_once(node, 0.1)
+    spin_until_closed(ros, node)
     node.destroy_node()
     ros.shutdown()
 

@@ -17,15 +17,17 @@ from aiosmtpd.controller import Controller
 
 from scan2sim.services import kafka
 from tests.fakes.broker import Broker
+from tests.fakes.nodes import end, wait_until_ready
 from tests.fakes.ports import free_dds_domain, free_port
 from tests.services.conftest import Start
+from tests.waiting import until
 
 CLI = ("cyclone", "-m", "scan2sim.flows.cli", "monitor")
 RULES = """
 [[rules]]
 name = "silent"
 metric = "silence"
-above = 3
+above = 6
 
 [notify]
 webhook = "http://127.0.0.1:{http}/alarms?token=secret"
@@ -66,14 +68,14 @@ class Mailbox:
     """Handler of a real SMTP server (aiosmtpd)."""
 
     def __init__(self) -> None:
-        self.subjects: queue.Queue[str] = queue.Queue()
+        self.subjects: list[str] = []
 
     async def handle_DATA(self, server: Any, session: Any, envelope: Any) -> str:
         from email import message_from_bytes, policy
 
         mail = message_from_bytes(envelope.content, policy=policy.default)
         assert isinstance(mail, EmailMessage) and envelope.rcpt_tos == ["operator@example.com"]
-        self.subjects.put(str(mail["Subject"]))
+        self.subjects.append(str(mail["Subject"]))
         return "250 OK"
 
 
@@ -87,7 +89,7 @@ def webhook() -> Iterator[Webhook]:
 @pytest.fixture
 def mailbox() -> Iterator[tuple[Mailbox, int]]:
     handler, port = Mailbox(), free_port()
-    controller = Controller(handler, hostname="127.0.0.1", port=port)
+    controller = Controller(handler, hostname="127.0.0.1", port=port, ready_timeout=WAIT_S)
     controller.start()
     yield handler, port
     controller.stop()
@@ -97,6 +99,7 @@ def next_of(received: queue.Queue[Any]) -> Any:
     return received.get(timeout=WAIT_S)
 
 
+@pytest.mark.realtime
 def test_alarms_survive_outage_kill_and_restart_once(
     start: Start, broker: Broker, webhook: Webhook, mailbox: tuple[Mailbox, int], tmp_path: Path
 ) -> None:
@@ -112,9 +115,8 @@ def test_alarms_survive_outage_kill_and_restart_once(
         return start(*CLI, "talker", f"/{name}", "--name", name, "--kafka", broker.servers)
 
     alarms, stays, _ = alarm_node(), talker("stays"), talker("leaves")
+    wait_until_ready(alarms)
     _wait_for_records(broker, {"stays", "leaves"})
-    time.sleep(1.0)
-
     broker.kill()
     outage = next_of(webhook.received)
     assert (outage["state"], outage["rule"], outage["subject"]) == ("raised", "Kafka is unreachable", "Kafka")
@@ -131,7 +133,7 @@ def test_alarms_survive_outage_kill_and_restart_once(
     acknowledged: dict[str, Any] = {}
     while acknowledged.get("subject") != "/stays":  # until the restarted node listens; it may find Kafka slow at first
         command = start(*CLI, "acknowledge", "silent", "/stays", "--by", "Ada", "--kafka", broker.servers)
-        output, errors = command.communicate(timeout=WAIT_S)
+        output, errors = end(command)
         assert command.returncode == 0 and output == "sent to the alarm node\n", errors
         try:
             acknowledged = webhook.received.get(timeout=5.0)
@@ -146,26 +148,27 @@ def test_alarms_survive_outage_kill_and_restart_once(
     time.sleep(3.0)
     later = [webhook.received.get_nowait() for _ in range(webhook.received.qsize())]
     assert [one for one in later if one["subject"] == "/stays"] == []
-    subjects = [mails.subjects.get_nowait() for _ in range(mails.subjects.qsize())]
-    assert subjects[0].startswith("[scan2sim] raised Kafka is unreachable") and len(subjects) >= 5
-    assert sum("raised silent: /stays" in one and "Ada" not in one for one in subjects) == 1
+    until(lambda: any("cleared silent: /stays" in one for one in mails.subjects), state=lambda: mails.subjects)
+    assert mails.subjects[0].startswith("[scan2sim] raised Kafka is unreachable") and len(mails.subjects) >= 5
+    assert sum("raised silent: /stays" in one and "Ada" not in one for one in mails.subjects) == 1
     alarms.terminate()
-    _, errors = alarms.communicate(timeout=WAIT_S)
+    _, errors = end(alarms)
     assert "secret" not in errors and "Traceback" not in errors
 
 
 def _wait_for_records(broker: Broker, names: set[str]) -> None:
     """Wait until new records of all nodes are in Kafka."""
-    end, waiting = time.monotonic() + WAIT_S, set(names)
-    for body in kafka.read(broker.cluster, "monitor_data", group=f"wait{time.monotonic()}", wait=0.2):
-        assert time.monotonic() < end
-        if body:
+    bodies, waiting = kafka.read(broker.cluster, "monitor_data", group=f"wait{time.monotonic()}", wait=0.2), set(names)
+
+    def have_arrived() -> bool:
+        if body := next(bodies):
             waiting.discard(json.loads(body)["node name"])
-        if not waiting:
-            return
+        return not waiting
+
+    until(have_arrived, what="records", state=lambda: waiting)
 
 
 def test_command_that_nobody_takes_is_an_error(start: Start) -> None:
     command = start(*CLI, "retire", "/camera", ROS_DOMAIN_ID=str(free_dds_domain()))
-    _, errors = command.communicate(timeout=WAIT_S)
+    _, errors = end(command)
     assert command.returncode == 7 and "no program on ROS 2 takes the command" in errors

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-
 from tests.fakes.broker import Broker
+from tests.fakes.nodes import READY, end_well, wait_until_ready
 from tests.fakes.ports import free_dds_domain
 from tests.services.conftest import Start
 
@@ -15,6 +13,7 @@ from scan2sim.services.monitoring.events.bus import Bus
 from scan2sim.services.monitoring.events.schema import Body
 from scan2sim.services.monitoring.settings.bus import BusParams
 from scan2sim.services.monitoring.node.monitor import ros
+from tests.fakes.nodes import spin_until_closed
 
 class Count(Body):
     vehicles: int
@@ -23,31 +22,33 @@ ros.init()
 node = ros.Node(sys.argv[1])
 bus = Bus(node, BusParams(kafka_bootstrap_servers=sys.argv[2]))
 bus.events.define("count", Count)
-received = []
-bus.events.on("count", lambda count: received.append(count.vehicles))
-end, sent = time.monotonic() + 16, 0
-while time.monotonic() < end:
-    ros.spin_once(node, 0.1)
-    if sys.argv[1] == "counts" and time.monotonic() > end - 16 + 0.2 * sent:
-        bus.events.send("count", Count(vehicles=sent))
-        sent += 1
+bus.events.on("count", lambda count: print(count.vehicles, flush=True))
+sent = 0
+def send():
+    global sent
+    bus.events.send("count", Count(vehicles=sent))
+    sent += 1
+if sys.argv[1] == "counts":
+    node.create_timer(0.2, send)
+spin_until_closed(ros, node)
 bus.close()
 node.destroy_node()
 ros.shutdown()
-print(received)
 """
+"""Node that prints the counts it receives; the node "counts" also sends them."""
+ENOUGH = 6
 
 
 def test_events_over_kafka_and_ros_are_processed_once(start: Start, broker: Broker) -> None:
-    counts = start("cyclone", "-c", PROGRAM, "counts", broker.servers)
     near = start("cyclone", "-c", PROGRAM, "near", broker.servers)
     far = start("cyclone", "-c", PROGRAM, "far", broker.servers, ROS_DOMAIN_ID=str(free_dds_domain()))
-
-    def received_by(process: subprocess.Popen[str]) -> list[int]:
-        output, errors = process.communicate(timeout=90)
-        assert process.returncode == 0, errors
-        return json.loads(output)
-
-    sent = received_by(counts)
-    for received in (received_by(near), received_by(far)):  # programs that start late miss earlier events
-        assert len(received) > 5 and len(set(received)) == len(received) and set(received) <= set(sent)
+    counts = start("cyclone", "-c", PROGRAM, "counts", broker.servers)
+    received: dict[str, list[int]] = {}
+    for name, process in {"near": near, "far": far}.items():
+        wait_until_ready(process)
+        assert process.stdout
+        received[name] = [int(process.stdout.readline()) for _ in range(ENOUGH)]
+    (sent,) = end_well(counts)
+    for found, rest in zip(received.values(), end_well(near, far), strict=True):
+        found += map(int, rest.split())  # programs that start late miss earlier events
+        assert len(set(found)) == len(found) and set(found) <= {int(one) for one in sent.split() if one != READY}

@@ -28,8 +28,11 @@ class FakeTime:
 
     now: int = 10**18
     ahead: int = 0
+    stall: int = 0
+    """Time for which the next reader of `time_ns` is interrupted before."""
 
     def time_ns(self) -> int:
+        self.now, self.stall = self.now + self.stall, 0
         return self.now + self.ahead
 
     def monotonic(self) -> float:
@@ -117,6 +120,14 @@ def test_jump_of_the_own_clock_is_detected_and_discards_offsets(times: FakeTime)
     assert here.detect_jump() == -3
     assert here.offset(THERE) is None
     assert here.detect_jump() == 0
+
+
+def test_interruption_between_reading_two_clocks_is_no_jump(times: FakeTime) -> None:
+    here = ClockSync("one")
+    times.now, times.stall = times.now + 10**9, 3 * 10**9
+    assert here.detect_jump() == 0
+    times.stall, times.ahead = 3 * 10**9, 5 * 10**9
+    assert here.detect_jump() == 5
 
 
 @pytest.mark.parametrize("message", [{}, {"to": 1}, {"to": "x", "from": "y"}, {"host": "h"}, {"host": "h", "to": None}])

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import shutil
 import subprocess
 import sys
-import time
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -24,11 +24,11 @@ from scan2sim.services.monitoring.record import TopicFlow
 from tests.conftest import ROOT
 from tests.fakes.ports import free_port
 from tests.fakes.sample_records import record
+from tests.waiting import until
 
 DASHBOARD = json.loads((ROOT / "deploy/grafana/event-bus.json").read_text(encoding="utf-8"))
 VARIABLES = {"$node": ".*", "$topic": ".*", "$__rate_interval": "20s", "$__range": "60s"}
 PAGE_METRICS = "# TYPE scan2sim_page_alarms gauge\nscan2sim_page_alarms 2.0\n"
-WAIT_S = 60.0
 
 
 def queries() -> Iterator[tuple[str, str]]:
@@ -108,15 +108,16 @@ def test_prometheus_finds_data_for_every_query(sink: PrometheusSink, tmp_path: P
                          stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as prometheus,
     ):  # fmt: skip
         try:
-            missing, end, number = dict(queries()), time.monotonic() + WAIT_S, 0
-            while missing and time.monotonic() < end:
-                number += 1
-                send(sink, number)
-                time.sleep(1.0)
-                missing = {title: text for title, text in missing.items() if not result(port, text)}
-            assert not missing
-            text = dict(queries())["Bandwidth that subscribers don't receive"]
-            assert float(result(port, text)[0]["value"][1]) == pytest.approx(0.5, abs=0.1)
+            missing, numbers = dict(queries()), itertools.count(1)
+            text = missing["Bandwidth that subscribers don't receive"]
+
+            def is_complete() -> bool:
+                send(sink, next(numbers))
+                for title in [title for title, text in missing.items() if result(port, text)]:
+                    del missing[title]
+                return not missing and float(result(port, text)[0]["value"][1]) == pytest.approx(0.5, abs=0.1)
+
+            until(is_complete, what="data for all queries", state=lambda: (missing, result(port, text)))
         finally:
             prometheus.kill()
             server.kill()

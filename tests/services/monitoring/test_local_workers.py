@@ -46,17 +46,20 @@ def test_workers_scale_and_process_all_events() -> None:
     assert running(WORKER) == []
 
 
-def test_killed_worker_is_replaced_and_its_event_retried() -> None:
-    queue = EventQueue("events")
-    slow = worker.command(0.5)
-    pool = LocalWorkers(queue, slow)
+def test_killed_worker_is_replaced_and_its_event_retried(tmp_path: Path) -> None:
+    queue, taken = EventQueue("events"), tmp_path / "taken"
+    # the first worker hangs at its first event, the next one replies
+    program = f'read -r line; if [ -e "{taken}" ]; then echo done; else echo "$line" > "{taken}"; fi; read -r line'
+    command = ["sh", "-c", program]
+    pool = LocalWorkers(queue, command)
     pool.scale(1)
     queue.put("a", time.time())
-    until(lambda: queue.state(1.0, 0).waiting == 1 and len(running(slow)) == 1)
-    time.sleep(0.2)
-    running(slow)[0].kill()
+    until(taken.exists)
+    assert queue.state(1.0, 0).waiting == 1
+    running(command)[0].kill()
     until(lambda: len(queue) == 0)
-    assert queue.state(1.0, 0).refused == 0
+    state = queue.state(1.0, 0)
+    assert (state.done, state.refused) == (1, 0)
     pool.close()
 
 
@@ -69,7 +72,7 @@ def test_hanging_worker_is_killed_and_its_event_dropped_after_retries() -> None:
     until(lambda: len(queue) == 0)
     assert queue.state(1.0, 0).refused == 1
     pool.close()
-    assert running(hanging) == []
+    until(lambda: running(hanging) == [])
 
 
 def test_full_queue_drops_and_counts_events() -> None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import signal
-import time
 
 import pytest
 
+from tests.fakes.nodes import end, wait_until_ready
 from tests.fakes.ports import free_dds_domain
 from tests.services.conftest import Start
 
@@ -25,16 +25,15 @@ CLI = ("cyclone", "-m", "scan2sim.flows.cli", "monitor")
 )
 def test_wrong_input_is_named_once(arguments: tuple[str, ...], code: int, cause: str, start: Start) -> None:
     process = start(*CLI, *arguments, ROS_DOMAIN_ID=str(free_dds_domain()))
-    _, errors = process.communicate(timeout=60)
+    _, errors = end(process)
     assert process.returncode == code
     assert errors.startswith(f"error: {cause}") and errors.count("error:") == 1 and "Traceback" not in errors
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopped_node_ends_silently(number: signal.Signals, start: Start) -> None:
-    process = start(*CLI, "talker", "/chatter", "--console", ROS_DOMAIN_ID=str(free_dds_domain()))
-    assert process.stderr and process.stderr.readline()  # its first record
-    time.sleep(0.2)
+    process = start(*CLI, "talker", "/chatter", ROS_DOMAIN_ID=str(free_dds_domain()))
+    wait_until_ready(process)
     process.send_signal(number)
-    _, errors = process.communicate(timeout=60)
+    _, errors = end(process)
     assert process.returncode == 0 and "kept" not in errors and "Traceback" not in errors

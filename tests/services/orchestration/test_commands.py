@@ -114,7 +114,7 @@ def test_unreadable_parameters_are_an_error_and_the_instance_can_be_deleted(
     with Osm(Connection(osm=fake.address)) as osm:
         for act in (operations.heal, lambda *given: operations.scale(given[0], given[1], 3, *given[2:])):
             with pytest.raises(StepError, match=r"one: .*additionalParamsForVnf.* can't be read") as caught:
-                act(osm, "one", WaitPolicy(10), lambda _: None)
+                act(osm, "one", WaitPolicy(60), lambda _: None)
             assert "scan2sim orchestrate delete" in caught.value.remedy and "hush" not in str(caught.value)
     monkeypatch.undo()
     monkeypatch.setenv("OSM_PASSWORD", "admin")

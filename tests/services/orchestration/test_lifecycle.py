@@ -7,9 +7,9 @@ import logging
 import math
 import random
 import threading
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -33,7 +33,7 @@ from tests.services.orchestration.conftest import TOWN
 QUIET: Callable[[str], None] = lambda text: None  # noqa: E731
 
 
-def apply_file(fake: FakeOsm, path: Path, *, timeout: float = 20.0, wait: bool = True) -> ApplyResult:
+def apply_file(fake: FakeOsm, path: Path, *, timeout: float = 60.0, wait: bool = True) -> ApplyResult:
     params = ApplyParams(osm=fake.address, wait=wait, timeout=timeout)
     with Osm(params) as osm:
         state = apply.load_state(osm, deployment.read(path), path.parent)
@@ -112,7 +112,7 @@ def test_apply_creates_updates_and_removes_instances(fake: FakeOsm, town: Path) 
 def test_instances_of_other_owners_are_not_touched(fake: FakeOsm, osm: Osm, town: Path) -> None:
     made = build_detector("mine")
     operations.onboard(osm, [made.function, made.service])
-    policy, nsd = WaitPolicy(10), made.service.descriptor.id
+    policy, nsd = WaitPolicy(60), made.service.descriptor.id
     operations.instantiate(osm, "by-hand", nsd, osm.vim("edge-site"), wait_policy=policy, notify=QUIET)
     apply_file(fake, town)
     town.write_text('deployment = "town"', encoding="utf-8")
@@ -152,9 +152,8 @@ def test_the_next_run_waits_for_an_operation_that_timed_out(fake: FakeOsm, town:
 
 def test_apply_without_wait_only_starts_operations(fake: FakeOsm, town: Path) -> None:
     fake.state.seconds = 3600
-    begun = time.monotonic()
     assert not apply_file(fake, town, wait=False).failed
-    assert time.monotonic() - begun < 10 and set(states(fake).values()) == {"BUILDING"}
+    assert set(states(fake).values()) == {"BUILDING"}
 
 
 @pytest.mark.parametrize("status", sorted(HTTP_ERRORS))
@@ -219,7 +218,7 @@ def test_an_interrupted_run_can_be_completed(town: Path) -> None:
 
 
 def test_scale_heal_terminate_and_delete(fake: FakeOsm, osm: Osm) -> None:
-    wait_policy, made = WaitPolicy(10), build_detector("mine")
+    wait_policy, made = WaitPolicy(60), build_detector("mine")
     nsd = made.service.descriptor.id
     with pytest.raises(InputError, match="neither given nor in OSM"):
         operations.onboard(osm, [made.service])
@@ -249,7 +248,7 @@ def test_an_instance_is_deleted_only_after_its_operation_has_ended(fake: FakeOsm
     nsd = made.service.descriptor.id
     fake.state.seconds = 0.5
     operations.instantiate(osm, "one", nsd, osm.vim("edge-site"), wait_policy=WaitPolicy(wait=False), notify=QUIET)
-    operations.delete_instance(osm, "one", WaitPolicy(10), QUIET)
+    operations.delete_instance(osm, "one", WaitPolicy(60), QUIET)
     assert not fake.state.resources and fake.state.orphans() == []
 
 
@@ -368,7 +367,7 @@ def test_refused_connections_are_retried_after_osm_has_answered(
     fake: FakeOsm, town: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """OSM is down at every fourth request: nothing is done twice."""
-    count, params = itertools.count(), ApplyParams(osm=fake.address, wait=True, timeout=20)
+    count, params = itertools.count(), ApplyParams(osm=fake.address, wait=True, timeout=60)
     with Osm(params) as osm:
         transport = osm._client._transport
         send = transport.handle_request
@@ -393,21 +392,41 @@ def test_a_redirect_is_explained(fake: FakeOsm) -> None:
     assert "--osm" in caught.value.remedy and len(fake.state.requests) == 2
 
 
-def test_a_slow_server_is_reported_and_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(osm_client, "SLOW_RESPONSE_S", 0.1)
+def test_a_slow_server_is_reported(fake: FakeOsm, monkeypatch: pytest.MonkeyPatch) -> None:
+    messages, reported = list[str](), threading.Event()
+
+    def on_slow(text: str) -> None:
+        messages.append(text)
+        reported.set()
+
+    with Osm(Connection(osm=fake.address), on_slow=on_slow) as osm:
+        osm.instances()  # logs in
+        monkeypatch.setattr(osm_client, "SLOW_RESPONSE_S", 0.1)
+        fake.state.faults = lambda method, path: None if reported.wait(60) else 500
+        assert osm.instances() == []
+    assert len(messages) == 1 and "ns_instances" in messages[0]
+
+
+def test_a_server_that_never_answers_is_given_up(fake: FakeOsm, monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = threading.Event()
     monkeypatch.setattr(osm_client, "RESPONSE_TIMEOUT_S", 0.4)
-    messages: list[str] = []
-    slow = lambda method, path: time.sleep(0.8) if "ns_instances" in path else None  # noqa: E731
-    with FakeOsm(OsmState(faults=slow)) as fake, Osm(Connection(osm=fake.address), on_slow=messages.append) as osm:
-        begun = time.monotonic()
-        with pytest.raises(StepError, match=r"didn't answer within 0\.4 s"):
-            osm.instances()
-        assert time.monotonic() - begun < 5 and len(messages) == 1 and "ns_instances" in messages[0]
+    fake.state.faults = lambda method, path: None if ended.wait(60) else 500
+    with Osm(Connection(osm=fake.address)) as osm, pytest.raises(StepError, match=r"didn't answer within 0\.4 s"):
+        osm.instances()
+    ended.set()
 
 
 def test_an_answer_that_drips_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each byte comes in time, but the answer never ends."""
-    monkeypatch.setattr(osm_client, "RESPONSE_TIMEOUT_S", 0.5)
-    response = httpx.Response(200, content=(time.sleep(0.1) or b" " for _ in itertools.count()))  # type: ignore[func-returns-value]
+    now = 0.0
+
+    def drip() -> Iterator[bytes]:
+        nonlocal now
+        while True:
+            now += osm_client.RESPONSE_TIMEOUT_S / 10
+            yield b" "
+
+    monkeypatch.setattr(osm_client, "time", SimpleNamespace(monotonic=lambda: now))
     with pytest.raises(StepError, match="didn't answer"):
-        osm_client._read_bounded(response, "GET /")
+        osm_client._read_bounded(httpx.Response(200, content=drip()), "GET /")
+    assert now == pytest.approx(1.1 * osm_client.RESPONSE_TIMEOUT_S)

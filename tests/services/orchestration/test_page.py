@@ -69,8 +69,7 @@ def served(fake: FakeOsm, osm: Osm, tmp_path: Path) -> Iterator[Served]:
 
 def press_button(page: Page, name: str) -> None:
     button = f"[...document.querySelectorAll('#services button')].find(b => b.textContent === '{name}')"
-    page.until(f"{button} && !{button}.disabled")
-    page.value(f"{button}.click()")
+    page.until(f"(b => b && !b.disabled && (b.click(), true))({button})")  # at once: the page replaces its buttons
 
 
 def test_a_service_can_be_uploaded_onboarded_started_and_removed(

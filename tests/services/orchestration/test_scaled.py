@@ -16,7 +16,7 @@ from tests.waiting import until
 def test_replicas_are_scaled_to_the_last_requested_count(fake: FakeOsm, osm: Osm) -> None:
     made = build(description.read("worker"), Environment.EDGE, "container")
     operations.onboard(osm, [made.function, made.service])
-    site, wait_policy = osm.cluster("edge-cluster"), WaitPolicy(10)
+    site, wait_policy = osm.cluster("edge-cluster"), WaitPolicy(60)
     nsd = made.service.descriptor.id
     operations.instantiate(osm, "workers", nsd, site, wait_policy=wait_policy, notify=lambda text: None)
     workers = OsmReplicas(Connection(osm=fake.address), "workers")

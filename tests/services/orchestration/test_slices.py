@@ -24,7 +24,7 @@ nst:
   netslice-subnet:
   - {{id: detection, nsd-ref: {service}, is-shared-nss: false}}
 """
-NOT_WAITING = WaitPolicy(5.0, wait=False)
+NOT_WAITING = WaitPolicy(60.0, wait=False)
 
 
 def run(fake: FakeOsm, *words: object) -> str:
@@ -69,15 +69,15 @@ def test_a_failed_slice_is_reported_and_can_be_removed(fake: FakeOsm, osm: Osm, 
     slices.add_template(osm, template)
     fake.state.outcome = lambda kind, name: "FAILED" if kind == "instantiate" else "COMPLETED"
     with pytest.raises(ScanError, match="instantiate failed .*no quota"):
-        slices.create(osm, "north", "video-slice", osm.vim("edge-site"), WaitPolicy(5.0))
+        slices.create(osm, "north", "video-slice", osm.vim("edge-site"), WaitPolicy(60.0))
     assert "failed: no quota" in run(fake, "slice", "list")
-    slices.remove(osm, "north", WaitPolicy(5.0))
+    slices.remove(osm, "north", WaitPolicy(60.0))
     assert not fake.state.slices
 
 
 def test_a_slice_that_is_not_removed_is_reported(fake: FakeOsm, osm: Osm, template: Path) -> None:
     slices.add_template(osm, template)
-    slices.create(osm, "north", "video-slice", osm.vim("edge-site"), WaitPolicy(5.0))
+    slices.create(osm, "north", "video-slice", osm.vim("edge-site"), WaitPolicy(60.0))
     fake.state.outcome = lambda kind, name: "never"
     with pytest.raises(ScanError, match=r"hasn't removed the slice within 0.05 s"):
         slices.remove(osm, "north", WaitPolicy(0.05))

@@ -1,13 +1,16 @@
-"""Node that publishes messages of several types and counts those it receives: crossing.py NAME OTHER SECONDS."""
+"""Node that publishes messages of several types and counts those it receives: crossing.py NAME OTHER.
+
+It prints what it has received so far, a line of JSON twice a second, until its input is closed.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
-import time
 from typing import Any
 
 from scan2sim.services.transport import Arrival, QoS, load
+from tests.fakes.nodes import spin_until_closed
 
 TYPES = ["std_msgs/msg/String", "std_msgs/msg/Bool", "sensor_msgs/msg/Image", "sensor_msgs/msg/Imu",
          "sensor_msgs/msg/PointCloud2", "std_msgs/msg/Float64MultiArray"]  # fmt: skip
@@ -19,7 +22,7 @@ FIELDS: dict[str, dict[str, Any]] = {
 
 def main() -> None:
     ros = load()
-    name, other, seconds = sys.argv[1], sys.argv[2], float(sys.argv[3])
+    name, other = sys.argv[1:]
     ros.init()
     heard: dict[str, dict[str, Any]] = {}
 
@@ -33,7 +36,6 @@ def main() -> None:
 
     node = Node(f"node_{name}")
     latest: dict[str, Any] = {}
-    endpoints: list[dict[str, str]] = []
     publishers = {}
     for kind in TYPES:
         leaf = kind.split("/")[-1]
@@ -41,16 +43,20 @@ def main() -> None:
         node.create_subscription(
             ros.message_type(kind), f"{other}/{leaf}", lambda message, leaf=leaf: latest.update({leaf: message}), QoS()
         )
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        began = time.monotonic()
-        while time.monotonic() - began < 0.1:
-            ros.spin_once(node, 0.05)
-        if found := [one for one in node.endpoints(f"{other}/String") if one.kind == "PUBLISHER"]:
-            endpoints = [{"node": one.node_name, "type": one.type_name} for one in found]
+
+    def publish() -> None:
         for kind, publisher in publishers.items():
             publisher.publish(ros.message(kind, **FIELDS.get(kind, {})))
-    print(json.dumps({"heard": heard, "text": getattr(latest.get("String"), "data", None), "endpoints": endpoints}))
+
+    def report() -> None:
+        found = [one for one in node.endpoints(f"{other}/String") if one.kind == "PUBLISHER"]
+        endpoints = [{"node": one.node_name, "type": one.type_name} for one in found]
+        text = getattr(latest.get("String"), "data", None)
+        print(json.dumps({"heard": heard, "text": text, "endpoints": endpoints}), flush=True)
+
+    node.create_timer(0.1, publish)
+    node.create_timer(0.5, report)
+    spin_until_closed(ros, node)
     node.destroy_node()
     ros.shutdown()
 

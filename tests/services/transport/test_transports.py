@@ -6,29 +6,57 @@ import json
 import os
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.transport import load
+from tests.fakes.nodes import end_well, wait_until_ready
 from tests.services.conftest import Start
+from tests.waiting import until
 
 CROSSING = Path(__file__).with_name("crossing.py")
-SECONDS = "8"
+KINDS = {"String", "Bool", "Image", "Imu", "PointCloud2", "Float64MultiArray"}
+ENOUGH = 11
+"""Messages of each type after which a node has received enough."""
+
+
+def report(process: subprocess.Popen[str], is_complete: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    """The first report of a node, a line of JSON, that is complete."""
+    wait_until_ready(process)
+    latest: dict[str, Any] = {}
+
+    def is_found() -> bool:
+        nonlocal latest
+        assert process.stdout
+        latest = json.loads(process.stdout.readline())
+        return is_complete(latest)
+
+    until(is_found, what="messages", state=lambda: latest)
+    return latest
 
 
 @pytest.mark.parametrize(("first", "second"), [("cyclone", "cyclone"), ("rclpy", "cyclone"), ("rclpy", "rclpy")])
 def test_messages_of_all_types_are_exchanged_between_transports(first: str, second: str, start: Start) -> None:
-    running = [start(first, CROSSING, "one", "two", SECONDS), start(second, CROSSING, "two", "one", SECONDS)]
+    running = [start(first, CROSSING, "one", "two"), start(second, CROSSING, "two", "one")]
+    transports = [(first, second), (second, first)]
     results = []
-    for process in running:
-        out, errors = process.communicate(timeout=60)
-        assert process.returncode == 0, errors
-        results.append(json.loads(out.splitlines()[-1]))
-    for (me, other), found in zip([(first, second), (second, first)], results, strict=True):
-        assert set(found["heard"]) == {"String", "Bool", "Image", "Imu", "PointCloud2", "Float64MultiArray"}
-        assert min(one["count"] for one in found["heard"].values()) > 10
+    for (me, other), process, name in zip(transports, running, ("node_two", "node_one"), strict=True):
+        has_names = not (me == "rclpy" and other == "cyclone")  # there, rclpy doesn't find the name of the node
+        publisher = {"node": name} if has_names else {}
+
+        def is_complete(found: dict[str, Any], publisher: dict[str, str] = publisher) -> bool:
+            counts = [one["count"] for one in found["heard"].values()]
+            are_known = [one | publisher == one for one in found["endpoints"]]
+            return len(counts) == len(KINDS) and min(counts) >= ENOUGH and are_known == [True]
+
+        results.append(report(process, is_complete))
+    end_well(*running)
+    for (me, other), found in zip(transports, results, strict=True):
+        assert set(found["heard"]) == KINDS
         assert found["text"] == "Straße, 画像"
         assert all(abs(one["latency"]) < 5 for one in found["heard"].values())  # the source timestamp is valid
         # rclpy numbers all messages for rclpy; cyclonedds those of unbounded types, for both
@@ -37,10 +65,7 @@ def test_messages_of_all_types_are_exchanged_between_transports(first: str, seco
             assert numbered == set(found["heard"])
         elif other == "cyclone":
             assert numbered == {"String", "Image", "Imu", "PointCloud2", "Float64MultiArray"}
-        publishers = found["endpoints"]
-        assert [one["type"] for one in publishers] == ["std_msgs/msg/String"]
-        if not (me == "rclpy" and other == "cyclone"):  # there, rclpy doesn't find the name of the node
-            assert publishers[0]["node"] == ("node_two" if found is results[0] else "node_one")
+        assert [one["type"] for one in found["endpoints"]] == ["std_msgs/msg/String"]
 
 
 @pytest.fixture(scope="module")
@@ -56,16 +81,18 @@ def peer(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("transport", ["cyclone", "rclpy"])
 def test_messages_are_exchanged_with_another_dds_vendor(transport: str, start: Start, peer: Path, domain: str) -> None:
-    node = start(transport, CROSSING, "one", "two", SECONDS)
-    other = subprocess.run(
-        [peer, "two", "one", SECONDS], env=os.environ | {"ROS_DOMAIN_ID": domain}, capture_output=True, timeout=60
-    )
-    theirs = json.loads(other.stdout)
-    out, errors = node.communicate(timeout=60)
-    assert node.returncode == 0, errors
-    mine = json.loads(out.splitlines()[-1])
+    node = start(transport, CROSSING, "one", "two")
+    with subprocess.Popen(
+        [peer, "two", "one"], env=os.environ | {"ROS_DOMAIN_ID": domain}, text=True,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    ) as other:  # fmt: skip
+        try:
+            theirs = report(other, lambda found: found["count"] >= ENOUGH)
+            mine = report(node, lambda found: found["heard"].get("String", {"count": 0})["count"] >= ENOUGH)
+            end_well(node, other)
+        finally:
+            other.kill()
     assert theirs["text"] == mine["text"] == "Straße, 画像"
-    assert theirs["count"] > 10 and mine["heard"]["String"]["count"] > 10
     assert abs(mine["heard"]["String"]["latency"]) < 5  # the source timestamp is valid
 
 
