@@ -150,8 +150,9 @@ class UdpReactor(threading.Thread):
 
         return self._open(remote[0], prepare)
 
-    def remove(self, sock: socket.socket) -> None:
+    def remove(self, sock: UdpSocket) -> None:
         """Stop reading a socket, and close it; in the reactor's thread."""
+        assert isinstance(sock, socket.socket)
         self._selector.unregister(sock)
         sock.close()
 

@@ -184,7 +184,8 @@ def https_url(certificate: tuple[Path, Path]) -> str:
     params = ServerParams(port=0, host="localhost", certificate=certificate[0], key=certificate[1])
     thread = threading.Thread(target=factory.run, args=(app_of(params), params, addresses.append), daemon=True)
     thread.start()
-    return until(lambda: addresses and addresses[0])
+    until(lambda: addresses)
+    return addresses[0]
 
 
 def test_service_uses_tls(https_url: str, certificate: tuple[Path, Path]) -> None:
@@ -230,8 +231,8 @@ class Service:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.entered, self.released = threading.Event(), threading.Event()
-        self._now, self._loop = 1000.0, list[asyncio.AbstractEventLoop]()
-        monkeypatch.setattr(limits.LimitedEventLoop, "time", self._time)
+        self._now, loops = 1000.0, list[asyncio.AbstractEventLoop]()
+        monkeypatch.setattr(limits.LimitedEventLoop, "time", lambda loop: self._now)
         created: list[bodies.Bodies] = []
 
         def create(max_bytes: int) -> bodies.Bodies:
@@ -242,6 +243,10 @@ class Service:
         addresses: list[str] = []
         params = ServerParams(port=0)
         app = app_of(params)
+
+        @app.get("/loop")
+        async def loop() -> None:
+            loops.append(asyncio.get_running_loop())
 
         @app.get("/wait")
         def wait() -> float:
@@ -255,10 +260,10 @@ class Service:
             await socket.send_text(await socket.receive_text())
 
         threading.Thread(target=factory.run, args=(app, params, addresses.append), daemon=True).start()
-        address = until(lambda: addresses and addresses[0])
-        self.port = int(address.rsplit(":")[-1].strip("/"))
-        assert self.get() == b"2.0"
-        self.bodies = created[0]
+        until(lambda: addresses)
+        self.port = int(addresses[0].rsplit(":")[-1].strip("/"))
+        self.get("loop")
+        self.bodies, self._loop = created[0], loops[0]
 
     def get(self, path: str = "number?value=2") -> bytes:
         """Content of a response."""
@@ -282,12 +287,7 @@ class Service:
             for _ in range(50):
                 await asyncio.sleep(0)
 
-        asyncio.run_coroutine_threadsafe(turns(), self._loop[0]).result(60)
-
-    def _time(self) -> float:
-        if not self._loop:
-            self._loop.append(asyncio.get_running_loop())
-        return self._now
+        asyncio.run_coroutine_threadsafe(turns(), self._loop).result(60)
 
 
 @pytest.fixture

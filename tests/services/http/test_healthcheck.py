@@ -21,7 +21,8 @@ def start_service(states: list[bool], params: ServerParams) -> str:
     addresses: list[str] = []
     app = factory.application("a test", params, alive={}, ready={"model": lambda: states[-1]})
     threading.Thread(target=factory.run, args=(app, params, addresses.append), daemon=True).start()
-    return until(lambda: addresses and addresses[0])
+    until(lambda: addresses)
+    return addresses[0]
 
 
 def exit_code(address: str, monkeypatch: pytest.MonkeyPatch) -> object:

@@ -90,7 +90,7 @@ def test_pair_survives_a_restart_of_the_gateway(parties: Path, gateway: Callable
         order = car.orders[-1]
         assert isinstance(order, Join) and order.listening == listening
         assert order.other.fingerprint == desk.identity.me.fingerprint
-        until(lambda: fleet.snapshot()["vehicles"][0]["links"], 5)
+        until(lambda: fleet.snapshot()["vehicles"][0]["links"])
         assert fleet.speeds()["car"]["speed"] == 1.5
         before = len(car.orders)
         _, again = gateway(first.port)
