@@ -392,8 +392,10 @@ server = forkserver._forkserver._forkserver_pid
 
 def is_ready():
     lines = Path(f"/proc/{server}/status").read_text().splitlines()
-    ignored = next(line.split()[1] for line in lines if line.startswith("SigIgn"))
-    return int(ignored, 16) & 1 << signal.SIGINT - 1
+    status = dict(line.split(":", 1) for line in lines)
+    if "zombie" in status["State"]:
+        sys.exit("the server has died")
+    return int(status["SigIgn"], 16) & 1 << signal.SIGINT - 1
 
 while not is_ready():
     os.kill(server, signal.SIGINT)
