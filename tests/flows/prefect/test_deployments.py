@@ -17,8 +17,9 @@ from scan2sim.flows.engine.versions import check_version, versions
 from scan2sim.pipeline.core.errors import UnavailableError, exit_code
 from tests.conftest import ROOT
 from tests.fakes.ports import free_port
-from tests.flows.prefect.conftest import Server, kill, on, processes, serving
+from tests.flows.prefect.conftest import Server, kill, on, serving
 from tests.flows.prefect.toy_steps import planned
+from tests.flows.processes import processes
 from tests.waiting import until
 
 DEPLOYED = ["reprocess", "survey", "tile"]

@@ -23,8 +23,9 @@ from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.pipelines.graph import TaskId
 from scan2sim.pipeline.core.cache import Store
 from tests.conftest import ROOT
-from tests.flows.prefect.conftest import Server, environment, kill, on, processes
+from tests.flows.prefect.conftest import Server, environment, kill, on
 from tests.flows.prefect.toy_steps import STEPS, planned
+from tests.flows.processes import processes
 from tests.waiting import until
 
 SCRIPT = "from tests.flows.prefect.toy_flow import main; main()"

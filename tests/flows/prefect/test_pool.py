@@ -8,7 +8,8 @@ import sys
 import pytest
 
 from tests.conftest import ROOT
-from tests.flows.prefect.conftest import Server, on, processes
+from tests.flows.prefect.conftest import Server, on
+from tests.flows.processes import processes
 from tests.waiting import until
 
 MARK = "SCAN2SIM_TEST_POOL"
