@@ -33,7 +33,8 @@ from tests.flows.processes import processes
 from tests.waiting import until
 
 NEXT_FRAME_DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
-SMALL = ["--set", "unwrap.texel=0.05", "--set", "decimate.target=10000"]
+SMALL = ["--set", "unwrap.texel=0.05", "--set", "decimate.target=10000", "--set", "pictures.width=160"]
+pytestmark = pytest.mark.timeout(900)  # on a busy machine, the first test waits minutes for its world
 
 
 def scan2sim(*arguments: object, timeout: float = 600) -> subprocess.CompletedProcess[str]:

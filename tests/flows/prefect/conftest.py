@@ -133,8 +133,7 @@ class Server:
     def script(self, *command: str, **env: str) -> subprocess.CompletedProcess[str]:
         """Run a command in the repository."""
         return subprocess.run(
-            command, env=self.env | env, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            timeout=180,
+            command, env=self.env | env, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
         )  # fmt: skip
 
     def spawn(self, *args: str, log: Path, **env: str) -> subprocess.Popen[Any]:
@@ -181,6 +180,12 @@ class Server:
             yield
         finally:
             self.api("DELETE", f"{path}/{made[0]['id']}")
+
+    def heartbeats(self, run: str) -> list[dict[str, Any]]:
+        """Heartbeats of a run."""
+        names = {"event": {"name": ["prefect.flow-run.heartbeat"]}}
+        body = {"filter": names | {"resource": {"id": [f"prefect.flow-run.{run}"]}}}
+        return self.api("POST", "/events/filter", body)["events"]
 
     def ended(self, run: str, seconds: float = 200) -> dict[str, Any]:
         """Wait for the end of a run; returns its state."""
