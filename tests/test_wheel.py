@@ -36,6 +36,12 @@ def run(*command: object, cwd: Path, code: int = 0, **env: str) -> str:
     return result.stdout
 
 
+def tracked(*paths: str) -> set[str]:
+    """Files of the repository that git knows, below these folders."""
+    listed = run("git", "-c", "safe.directory=*", "ls-files", "-z", "--", *paths, cwd=ROOT).split("\0")
+    return {name for name in listed if name and os.path.lexists(ROOT / name)}
+
+
 def build(source: Path, kind: str, out: Path) -> Path:
     """Build the sdist or wheel of a source folder."""
     run(sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", out, cwd=source)
@@ -48,9 +54,12 @@ SAFE_EXTRACTION: dict[str, Any] = {"filter": "data"} if hasattr(tarfile, "data_f
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Wheel built from the sdist, as installers do without a wheel for their platform."""
+    """Wheel built from the sdist, as installers do without a wheel for their platform; without stray files."""
     folder = tmp_path_factory.mktemp("wheel")
-    with tarfile.open(build(ROOT, "sdist", folder / "sdist")) as sdist:
+    for name in tracked():
+        (folder / "checkout" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(ROOT / name, folder / "checkout" / name, follow_symlinks=False)
+    with tarfile.open(build(folder / "checkout", "sdist", folder / "sdist")) as sdist:
         sdist.extractall(folder / "source", **SAFE_EXTRACTION)
     return build(next((folder / "source").iterdir()), "wheel", folder / "wheel")
 
@@ -100,13 +109,8 @@ def test_the_wheel_contains_exactly_the_packages_and_pages(wheel: Path) -> None:
         names = set(archive.namelist())
         metadata = archive.read(next(name for name in names if name.endswith("/METADATA"))).decode()
     inside = {name for name in names if not name.split("/")[0].endswith(".dist-info")}
-    files = {
-        f"scan2sim/{path.relative_to(ROOT).as_posix()}"
-        for package in PACKAGES
-        for path in (ROOT / package).rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
-    }
-    pages = {f"scan2sim/docs/{path.relative_to(ROOT / 'docs').as_posix()}" for path in (ROOT / "docs").rglob("*.md")}
+    files = {f"scan2sim/{name}" for name in tracked(*PACKAGES)}
+    pages = {f"scan2sim/{name}" for name in tracked("docs") if name.endswith(".md")}
     assert inside == files - {"scan2sim/data_samples/README.md"} | pages | {"scan2sim/__init__.py"}
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
     assert "License-Expression: Apache-2.0 AND MIT\n" in metadata and "Author: scan2sim contributors\n" in metadata

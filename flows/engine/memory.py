@@ -7,7 +7,7 @@ import os
 import re
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -54,7 +54,9 @@ def parse_memory(text: str | None) -> float | None:
 
 
 @contextmanager
-def reserve_memory(total: float | None, gigabytes: float) -> Iterator[None]:
+def reserve_memory(
+    total: float | None, gigabytes: float, *, sleep: Callable[[float], None] = time.sleep
+) -> Iterator[None]:  # fmt: skip
     """Reserve `gigabytes` of the `total` memory of this machine; waits until that much is free.
 
     All processes of a user share one budget, across surveys and runners. Slots are file locks, which the kernel
@@ -63,6 +65,7 @@ def reserve_memory(total: float | None, gigabytes: float) -> Iterator[None]:
     Args:
         total: GB that all tasks may use together; None: no limit.
         gigabytes: GB to reserve.
+        sleep: pauses for some seconds between two attempts.
     """
     if total is None:
         yield
@@ -77,7 +80,7 @@ def reserve_memory(total: float | None, gigabytes: float) -> Iterator[None]:
                 queue = _open_file(place, "queue", stack)  # held while waiting, so that smaller tasks don't overtake
                 fcntl.flock(queue, fcntl.LOCK_EX)
                 while not _lock_slots(place, slots, wanted, held):
-                    time.sleep(POLL_INTERVAL_S)
+                    sleep(POLL_INTERVAL_S)
         except OSError as error:
             raise from_os_error(error, folder) from error
         yield

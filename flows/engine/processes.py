@@ -9,7 +9,7 @@ import sys
 import tempfile
 import threading
 import traceback
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -34,7 +34,9 @@ def _fork_server() -> Any:
         sys.warnoptions.append(TRACKER_WARNING_FILTER)
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["scan2sim.flows.engine.forkserver_preload"])
-    # Ctrl-C in a terminal also reaches the server, which would die with a traceback until it is ready
+    # Ctrl-C in a terminal also reaches the server and new children, which would die with a traceback until they are
+    # ready: they inherit the blocked signal. Starting the resource tracker, which the server needs, unblocks it.
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         forkserver.ensure_running()

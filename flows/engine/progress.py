@@ -63,14 +63,14 @@ class Channel:
 
 @dataclass
 class _Step:
-    """State of a step; times are those of `time.monotonic`."""
+    """State of a step; times are those of the publisher's clock."""
 
     item: PlannedTask
     manifest: Path
     state: State = "waiting"
     progress: float = 0.0
     message: str = ""
-    began: float = 0.0
+    began: float | None = None
     ended: float | None = None
     published_at: float | None = None
     """None: the current state is not published yet."""
@@ -85,6 +85,9 @@ class Publisher:
         open_outlets: Callable[[], Sequence[Outlet]],
         about: Callable[[Counter[State], bool], RunState] | None = None,
         host: str | None = None,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        wait: Callable[[threading.Event, float], bool] = threading.Event.wait,
     ) -> None:
         """Start the background thread.
 
@@ -94,7 +97,10 @@ class Publisher:
             about: makes the state of the run from the number of its steps in each state and whether the run has ended;
                 None: another process publishes it.
             host: name of the machine that runs the steps, if known.
+            clock: time in seconds.
+            wait: waits until an event is set, at most for some seconds; returns whether it is set.
         """
+        self._clock, self._wait = clock, wait
         self._run, self._open_outlets, self._run_state, self._host = run, open_outlets, about, host
         self._steps: dict[TaskId, _Step] = {}
         self._lock, self._ended = threading.Lock(), threading.Event()
@@ -112,7 +118,7 @@ class Publisher:
 
     def on_event(self, task: Task, event: Event, fraction: float, message: str) -> None:
         """Record an event: an `EventCallback` of `execution.execute`."""
-        now = time.monotonic()
+        now = self._clock()
         with self._lock:
             step = self._steps[task.id]
             if event == "cached" and step.state == "done":
@@ -134,8 +140,8 @@ class Publisher:
             events.outlets.extend(outlets)
             ended = False
             while not ended:
-                ended = self._ended.wait(PUBLISH_INTERVAL_S)
-                changed, now = self._take_changed(), time.monotonic()
+                ended = self._wait(self._ended, PUBLISH_INTERVAL_S)
+                changed, now = self._take_changed(), self._clock()
                 for step in changed:
                     events.send("step", self._state_of(step))
                 if self._run_state and (ended or changed or now - self._run_published >= HEARTBEAT_INTERVAL_S):
@@ -148,7 +154,7 @@ class Publisher:
 
     def _take_changed(self) -> list[_Step]:
         """Copies of the steps whose state is to be published now; marks them as published."""
-        now, changed = time.monotonic(), []
+        now, changed = self._clock(), []
         with self._lock:
             for step in self._steps.values():
                 if step.published_at is None or (
@@ -164,7 +170,8 @@ class Publisher:
 
     def _state_of(self, step: _Step) -> StepState:
         task = step.item.task.id
-        seconds = None if not step.began else (step.ended or time.monotonic()) - step.began
+        now = self._clock() if step.ended is None else step.ended
+        seconds = None if step.began is None else now - step.began
         manifest = read_manifest(step.manifest) if step.state == "done" else None
         return StepState(
             run=self._run,

@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 import tomllib
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -33,6 +32,7 @@ from scan2sim.pipeline.core.optional_deps import EXTRA_OF
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from tests.conftest import ROOT
 from tests.flows.toy import chain
+from tests.waiting import until
 
 Run = Callable[..., dict[str, Manifest]]
 
@@ -373,25 +373,44 @@ def test_failed_or_interrupted_run_prints_only_its_message(tmp_path: Path, sourc
         start_new_session=True,
     )  # fmt: skip
     if how == "SIGINT":
-        while child.poll() is None and not (tmp_path / "pid_b").exists():
-            time.sleep(0.05)
+        until(lambda: child.poll() is not None or (tmp_path / "pid_b").exists(), what="a running task")
         os.killpg(child.pid, signal.SIGINT)  # as a terminal does
-    printed = "".join(child.communicate(timeout=120))
+    printed = "".join(child.communicate())
     assert len(printed.splitlines()) == 1 and "Traceback" not in printed, printed
     message = {"litter": "was killed", "bug": "failed unexpectedly", "SIGINT": "interrupted"}[how]
     assert message in printed
 
 
-def test_ctrl_c_before_the_first_task_prints_no_traceback(tmp_path: Path, source: Path) -> None:
-    script = (
-        "import os, signal, sys; from scan2sim.flows.engine import processes\n"
-        "try:\n"
-        "    processes._fork_server(); os.killpg(0, signal.SIGINT); import time; time.sleep(20)\n"
-        "except KeyboardInterrupt: sys.exit('interrupted')\n"
-    )
-    child = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60, start_new_session=True
-    )
+CTRL_C_WHILE_THE_SERVER_STARTS = """
+import os, signal, sys, time
+from multiprocessing import forkserver
+from pathlib import Path
+from scan2sim.flows.engine import processes
+
+processes._fork_server()
+server = forkserver._forkserver._forkserver_pid
+
+def is_ready():
+    lines = Path(f"/proc/{server}/status").read_text().splitlines()
+    status = dict(line.split(":", 1) for line in lines)
+    if "zombie" in status["State"]:
+        sys.exit("the server has died")
+    return int(status["SigIgn"], 16) & 1 << signal.SIGINT - 1
+
+while not is_ready():
+    os.kill(server, signal.SIGINT)
+    time.sleep(0.001)
+try:
+    os.killpg(0, signal.SIGINT)
+    time.sleep(60)
+except KeyboardInterrupt:
+    sys.exit("interrupted")
+"""
+
+
+def test_ctrl_c_before_the_first_task_prints_no_traceback() -> None:
+    command = [sys.executable, "-c", CTRL_C_WHILE_THE_SERVER_STARTS]
+    child = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, start_new_session=True)
     assert (child.stdout + child.stderr).strip() == "interrupted"
 
 
@@ -438,21 +457,16 @@ def test_sigkill_leaves_no_partial_result_and_no_process(tmp_path: Path, source:
     )
     child = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
     log = tmp_path / "log"
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline and not (tmp_path / "pid_b").exists():
-        time.sleep(0.05)
-    hanging = (tmp_path / "pid_b").read_text(encoding="utf-8")
+    file = tmp_path / "pid_b"
+    hanging = until(lambda: file.exists() and file.read_text(encoding="utf-8"), what="a running task")
     child.send_signal(signal.SIGKILL)
     child.wait()
     store = Store(tmp_path / "store")
     kept = {p.task.full_name: p.reason for p in plan(chain(source, log), store)}
     assert kept["a"] is None and kept["b"] is not None
     assert run()["d"].metrics == {"total": 2}
-    pid = (tmp_path / "pid_b").read_text(encoding="utf-8")  # of the second run, which has ended
-    assert hanging != pid
-    while time.monotonic() < deadline and Path(f"/proc/{hanging}").exists():
-        time.sleep(0.1)
-    assert not Path(f"/proc/{hanging}").exists()
+    assert hanging != file.read_text(encoding="utf-8"), "the second run is another process"
+    until(lambda: not Path(f"/proc/{hanging}").exists(), what="the end of the hanging task")
 
 
 def test_versions_include_all_packages_that_steps_use(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
-import signal
 import subprocess
 import sys
 import threading
-import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -38,50 +39,84 @@ def test_amounts_of_memory_are_parsed() -> None:
             parse_memory(wrong)
 
 
-def test_reservations_beyond_the_total_wait() -> None:
-    inside, most = [], []
+def test_reservation_beyond_the_total_waits_until_enough_is_released() -> None:
+    held, attempts = ExitStack(), 0
 
-    def work() -> None:
+    def release_after_three_attempts(_: float) -> None:
+        nonlocal attempts
+        attempts += 1
+        if attempts == 3:
+            held.close()
+
+    with reserve_memory(4.0, 1.5):
+        held.enter_context(reserve_memory(4.0, 1.5))
+        with reserve_memory(4.0, 1.5, sleep=release_after_three_attempts):
+            assert attempts == 3
+        with reserve_memory(4.0, 1.5, sleep=release_after_three_attempts):
+            assert attempts == 3, "there is enough for two"
+
+
+def test_threads_share_the_total() -> None:
+    """Of four threads that reserve more than a third, always two are inside together, and never more."""
+    inside, most, pair = set[int](), [], threading.Barrier(2, timeout=60)
+
+    def work(number: int) -> None:
         with reserve_memory(4.0, 1.5):
-            inside.append(1)
+            inside.add(number)
             most.append(len(inside))
-            time.sleep(0.2)
-            inside.pop()
+            pair.wait()
+            inside.remove(number)
 
-    threads = [threading.Thread(target=work) for _ in range(5)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert max(most) == 2 and len(most) == 5
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(work, range(4)))
+    assert max(most) == 2 and len(most) == 4
 
 
 def test_reservation_larger_than_the_total_runs_alone() -> None:
-    with reserve_memory(1.0, 50.0):
-        waited = threading.Event()
+    held, attempts = ExitStack(), 0
 
-        def wait() -> None:
-            with reserve_memory(1.0, 0.25):
-                waited.set()
+    def release(_: float) -> None:
+        nonlocal attempts
+        attempts += 1
+        held.close()
 
-        thread = threading.Thread(target=wait)
-        thread.start()
-        assert not waited.wait(0.5)
-    assert waited.wait(5)
-    thread.join()
+    held.enter_context(reserve_memory(1.0, 50.0))
+    with reserve_memory(1.0, 0.25, sleep=release):
+        assert attempts == 1
+    held.enter_context(reserve_memory(1.0, 0.25))
+    with reserve_memory(1.0, 50.0, sleep=release):
+        assert attempts == 2
+
+
+def test_waiting_reservation_is_not_overtaken_by_a_smaller_one(tmp_path: Path) -> None:
+    held = ExitStack()
+
+    def try_the_queue(_: float) -> None:
+        (folder,) = tmp_path.glob("scan2sim-memory-*")
+        with open(folder / "queue", "rb") as queue, pytest.raises(BlockingIOError):
+            fcntl.flock(queue, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        held.close()
+
+    held.enter_context(reserve_memory(1.0, 0.5))
+    with reserve_memory(1.0, 1.0, sleep=try_the_queue):
+        pass
 
 
 def test_killed_process_releases_its_memory(tmp_path: Path) -> None:
     script = (
-        f"import tempfile, time; tempfile.tempdir = {str(tmp_path)!r}\n"
+        f"import sys, tempfile; tempfile.tempdir = {str(tmp_path)!r}\n"
         "from scan2sim.flows.engine.memory import reserve_memory\n"
-        "with reserve_memory(1.0, 1.0): print('held', flush=True); time.sleep(60)"
+        "with reserve_memory(1.0, 1.0): print('held', flush=True); sys.stdin.read()"
     )
-    child = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE)
-    assert child.stdout and child.stdout.readline()
-    child.send_signal(signal.SIGKILL)
-    child.wait()
-    with reserve_memory(1.0, 1.0):
+    command = [sys.executable, "-c", script]
+    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout and child.stdout.readline() == b"held\n"
+        child.kill()
+
+    def fail(_: float) -> None:
+        raise AssertionError("it waits")
+
+    with reserve_memory(1.0, 1.0, sleep=fail):
         pass
 
 

@@ -20,6 +20,9 @@ from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
 from tests.fakes.gazebo.checker import check_world
 from tests.flows.test_cli import SMALL, assert_fails, scan2sim, stdout_of
 
+pytestmark = pytest.mark.timeout(900)  # on a busy machine, the first test waits minutes for its survey
+FAST = [*SMALL, "--set", "pictures.compared=1", "--set", "backdrop.when=never"]
+
 
 @pytest.fixture(scope="module")
 def survey(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -38,7 +41,7 @@ def failed(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     cloud = sorted(survey.glob("*/cloud.laz"))[1]
     whole = cloud.read_bytes()
     cloud.write_bytes(whole[: len(whole) // 2])
-    assert_fails(scan2sim("survey", survey, "--out", out, *SMALL), 5, "1 of 2 tiles failed", "truncated or damaged")
+    assert_fails(scan2sim("survey", survey, "--out", out, *FAST), 5, "1 of 2 tiles failed", "truncated or damaged")
     shutil.copyfile(out / "survey.json", out.parent / "failed.json")
     cloud.write_bytes(whole)
     return out
@@ -47,7 +50,7 @@ def failed(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def made(survey: Path, failed: Path) -> Path:
     """Output folder of the next run, with the cloud repaired."""
-    stdout_of(scan2sim("survey", survey, "--out", failed, *SMALL))
+    stdout_of(scan2sim("survey", survey, "--out", failed, *FAST))
     return failed
 
 
@@ -120,7 +123,7 @@ def test_gazebo_loads_all_tiles_as_one_world(made: Path) -> None:
 
 def test_unchanged_survey_is_not_rebuilt(survey: Path, made: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in (made / "steps").rglob("manifest.json")}
-    printed = stdout_of(scan2sim("survey", survey, "--out", made, *SMALL))
+    printed = stdout_of(scan2sim("survey", survey, "--out", made, *FAST))
     assert (
         "nothing to do" in printed
         and f"World:  {made / 'world'}" in printed
@@ -128,7 +131,7 @@ def test_unchanged_survey_is_not_rebuilt(survey: Path, made: Path) -> None:
     )
     assert {path: path.stat().st_mtime_ns for path in (made / "steps").rglob("manifest.json")} == before
     (made / "steps" / "unchanged.json").unlink()  # compare all cache keys
-    assert "nothing to do" in stdout_of(scan2sim("survey", survey, "--out", made, *SMALL))
+    assert "nothing to do" in stdout_of(scan2sim("survey", survey, "--out", made, *FAST))
     assert {path: path.stat().st_mtime_ns for path in (made / "steps").rglob("manifest.json")} == before
     assert {tile["state"] for tile in report_of(made)["tiles"].values()} == {"cached"}
 
@@ -150,7 +153,7 @@ def test_results_depend_neither_on_earlier_failures_nor_on_folder_names(
         tile.write_text(
             tile.read_text(encoding="utf-8").replace('"../../corridor', f'"{survey.parent}/corridor'), encoding="utf-8"
         )
-    stdout_of(scan2sim("survey", other, "--out", tmp_path / "out", *SMALL))
+    stdout_of(scan2sim("survey", other, "--out", tmp_path / "out", *FAST))
     assert contents(tmp_path / "out") == contents(made)
 
 
@@ -176,7 +179,7 @@ def test_second_run_of_a_survey_is_a_busy_error(survey: Path, made: Path) -> Non
     from scan2sim.flows.engine.lock import locked
 
     with locked(made):
-        assert_fails(scan2sim("survey", survey, "--out", made, *SMALL), 8, "another run")
+        assert_fails(scan2sim("survey", survey, "--out", made, *FAST), 8, "another run")
 
 
 def test_folder_without_survey_is_an_input_error(tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ def toy(inputs: Inputs, params: ToyParams, out: Path, report: Report) -> Done:
         print(f"{len(locks)} locks are never released", file=sys.stderr, flush=True)
         os.write(2, b"a library says this\n")
         os.kill(os.getpid(), signal.SIGKILL)
-    if params.does == "hang":
+    while params.does == "hang":
         time.sleep(60)
     report(1.0, "done")
     part_fails = params.does == "part" and params.log.with_name("broken").exists()

@@ -25,7 +25,7 @@ def main() -> None:
             seeds = range(arguments.first, arguments.first + arguments.cases)
             tally = fuzz(kind, seeds, Path(folder) / "x", child)
         summary = ", ".join(f"{code}: {n}" for code, n in sorted(tally.codes.items(), key=str))
-        print(f"{kind:24s} {summary}; {tally.seconds:.1f} s, {tally.mb:.0f} MB at most", flush=True)
+        print(f"{kind:24s} {summary}; {tally.seconds:.1f} s of processor time, {tally.mb:.0f} MB at most", flush=True)
         for failure in tally.failures:
             print("  " + failure.replace("\n", "\n    "), flush=True)
         codes.update({str(code): n for code, n in tally.codes.items()})

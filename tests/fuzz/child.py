@@ -7,6 +7,7 @@ import os
 import re
 import resource
 import sys
+import time
 import traceback
 from pathlib import Path
 
@@ -15,7 +16,7 @@ MAX_DATA_BYTES = 6 << 30
 
 
 def main() -> None:
-    """Read cases (one JSON object per line: `kind`, `folder`), and print an outcome each: `code`, `message`, `mb`."""
+    """Read cases (one JSON object per line: `kind`, `folder`), and print an outcome each."""
     output = os.fdopen(os.dup(1), "w")
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)
@@ -29,12 +30,14 @@ def main() -> None:
     for line in sys.stdin:
         case = json.loads(line)
         _reset_peak_memory()
-        message, code = "", 0
+        message, code, began = "", 0, time.process_time()
         try:
             KINDS[case["kind"]].read(Path(case["folder"]))
         except BaseException as error:  # panics of native code aren't Exceptions
             code, message = _outcome(error)
-        print(json.dumps({"code": code, "message": message, "mb": _peak_memory_mb()}), file=output, flush=True)
+        seconds = time.process_time() - began
+        outcome = {"code": code, "message": message, "seconds": seconds, "mb": _peak_memory_mb()}
+        print(json.dumps(outcome), file=output, flush=True)
 
 
 def _outcome(error: BaseException) -> tuple[int, str]:

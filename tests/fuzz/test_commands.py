@@ -33,7 +33,7 @@ COMMANDS = {
 def scan2sim(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """Run the command in a process."""
     command = [sys.executable, "-m", "scan2sim.flows.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+    return subprocess.run(command, capture_output=True, text=True)
 
 
 def contents(folder: Path) -> dict[str, str]:

@@ -23,6 +23,7 @@ from _pytest.mark import ParameterSet
 
 from tests.conftest import ROOT
 from tests.fakes.ports import free_port
+from tests.flows.processes import processes
 from tests.waiting import until
 
 pytest.importorskip("prefect")
@@ -55,18 +56,6 @@ def kill(process: subprocess.Popen[Any]) -> None:
     except ProcessLookupError:
         pass
     process.wait()
-
-
-def processes(name: str, value: str) -> list[int]:
-    """Ids of the processes with this environment variable, including indirect children."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/environ"):
-        try:
-            if f"{name}={value}" in path.read_bytes().decode(errors="replace").split("\0"):
-                found.append(int(path.parent.name))
-        except OSError:
-            continue  # the process has ended
-    return found
 
 
 class Server:
@@ -144,8 +133,7 @@ class Server:
     def script(self, *command: str, **env: str) -> subprocess.CompletedProcess[str]:
         """Run a command in the repository."""
         return subprocess.run(
-            command, env=self.env | env, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            timeout=180,
+            command, env=self.env | env, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
         )  # fmt: skip
 
     def spawn(self, *args: str, log: Path, **env: str) -> subprocess.Popen[Any]:
@@ -193,7 +181,13 @@ class Server:
         finally:
             self.api("DELETE", f"{path}/{made[0]['id']}")
 
-    def ended(self, run: str, seconds: float = 90.0) -> dict[str, Any]:
+    def heartbeats(self, run: str) -> list[dict[str, Any]]:
+        """Heartbeats of a run."""
+        names = {"event": {"name": ["prefect.flow-run.heartbeat"]}}
+        body = {"filter": names | {"resource": {"id": [f"prefect.flow-run.{run}"]}}}
+        return self.api("POST", "/events/filter", body)["events"]
+
+    def ended(self, run: str, seconds: float = 200) -> dict[str, Any]:
         """Wait for the end of a run; returns its state."""
 
         def state() -> dict[str, Any] | None:

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -17,8 +16,9 @@ from scan2sim.flows.engine.versions import check_version, versions
 from scan2sim.pipeline.core.errors import UnavailableError, exit_code
 from tests.conftest import ROOT
 from tests.fakes.ports import free_port
-from tests.flows.prefect.conftest import Server, kill, on, processes, serving
+from tests.flows.prefect.conftest import Server, kill, on, serving
 from tests.flows.prefect.toy_steps import planned
+from tests.flows.processes import processes
 from tests.waiting import until
 
 DEPLOYED = ["reprocess", "survey", "tile"]
@@ -81,11 +81,11 @@ def test_scheduled_run_is_executed_without_overlap(toys: Server, folder: Path) -
     nightly, other = toys.deployment("toy", "one-at-a-time"), toys.deployment("toy", "any")
     parameters = {"folder": str(folder), "gate": str(folder / "gate")}
     with toys.scheduled(nightly, parameters, interval=5.0):
-        until((folder / "started").exists, what="its first step")
+        until((folder / "started").exists, 200, what="its first step")
         (first,) = toys.runs(nightly, "RUNNING")
         state = toys.ended(toys.run(other, **parameters))
         assert state["name"] == "Skipped" and "another run is using this folder" in state["message"]
-        until(lambda: toys.runs(nightly, "CANCELLED"), what="a cancelled run")
+        until(lambda: toys.runs(nightly, "CANCELLED"), 200, what="a cancelled run")
     (folder / "gate").touch()
     state = toys.ended(first["id"])
     assert (state["type"], state["message"]) == ("COMPLETED", "total 4")
@@ -124,6 +124,7 @@ def test_worker_with_another_version_fails_the_run(toys: Server, folder: Path) -
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_run_of_a_killed_worker_is_detected_and_rescheduled(tmp_path: Path, folder: Path) -> None:
     text = (ROOT / "deploy" / "automations.yaml").read_text(encoding="utf-8").replace("name: reprocess", "name: toy")
     (tmp_path / "automations.yaml").write_text(text, encoding="utf-8")
@@ -135,13 +136,13 @@ def test_run_of_a_killed_worker_is_detected_and_rescheduled(tmp_path: Path, fold
         deployment = server.deployment("toy", "one-at-a-time")
         with server.worker("toys") as worker:
             run = server.run(deployment, folder=str(folder), gate=str(folder / "gate"))
-            until((folder / "started").exists, what="its first step")
-            time.sleep(3)  # until its first heartbeat is sent
+            until((folder / "started").exists, 200, what="its first step")
+            until(lambda: server.heartbeats(run), what="its first heartbeat")
             kill(worker)
         for pid in processes("PREFECT__FLOW_RUN_ID", run):
             os.kill(pid, signal.SIGKILL)
         assert server.api("GET", f"/flow_runs/{run}")["state"]["type"] == "RUNNING"
-        assert server.ended(run, 180)["type"] == "CRASHED"
+        assert server.ended(run)["type"] == "CRASHED"
         (again,) = until(lambda: server.runs(deployment, "SCHEDULED"), 30, what="a run in ten minutes")
         ahead = datetime.fromisoformat(again["expected_start_time"]) - datetime.now().astimezone()
         assert timedelta(minutes=8) < ahead < timedelta(minutes=11)

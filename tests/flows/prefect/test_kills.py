@@ -23,8 +23,9 @@ from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.pipelines.graph import TaskId
 from scan2sim.pipeline.core.cache import Store
 from tests.conftest import ROOT
-from tests.flows.prefect.conftest import Server, environment, kill, on, processes
+from tests.flows.prefect.conftest import Server, environment, kill, on
 from tests.flows.prefect.toy_steps import STEPS, planned
+from tests.flows.processes import processes
 from tests.waiting import until
 
 SCRIPT = "from tests.flows.prefect.toy_flow import main; main()"
@@ -33,16 +34,16 @@ ALL = {f"{tile}-{step}" for tile in range(TILES) for step in STEPS}
 
 
 class Survey:
-    """The toy survey of `toy_flow.main`, run as a script."""
+    """The toy survey of `toy_flow.main`, run as a script; its last steps wait until `gate` exists."""
 
     def __init__(self, server: Server, folder: Path, runner: str) -> None:
-        self.folder, self._server, self._runner = folder, server, runner
+        self.folder, self._server, self._runner, self.gate = folder, server, runner, folder / "gate"
         self._outputs: list[Path] = []
 
     def start(self) -> subprocess.Popen[bytes]:
         """Start the script (again), in a process group of its own."""
         self._outputs.append(self.folder / f"output{len(self._outputs)}")
-        arguments = ("-c", SCRIPT, str(self.folder), self._runner)
+        arguments = ("-c", SCRIPT, str(self.folder), self._runner, str(self.gate))
         return self._server.spawn(*arguments, log=self._outputs[-1], SURVEY=str(self.folder))
 
     def processes(self) -> list[int]:
@@ -50,17 +51,25 @@ class Survey:
         return processes("SURVEY", str(self.folder))
 
     def wait_until_running(self) -> dict[str, int]:
-        """Wait until some steps are done and others are running; returns the running ones."""
+        """Wait until some steps are done and both workers run last steps, which wait; returns these."""
+
+        def waiting() -> dict[str, int] | None:
+            running = self.running_steps()
+            return running if len(running) == 2 and all(name.endswith(STEPS[-1]) for name in running) else None
+
         try:
-            until(lambda: len(self.done()) >= 4, 120, what="some steps")
-            return until(self.running_steps, 30, what="one more")
+            return until(waiting, 200, what="two last steps")
         except TimeoutError as error:
             raise AssertionError(f"{error}; {len(self.done())} are done\n{self.output()}") from None
+
+    def planned(self) -> list[PlannedTask]:
+        """Its tasks, with the reasons why they run."""
+        return planned(self.folder, TILES, self.gate)
 
     def done(self) -> dict[str, int]:
         """Time in ns when each step with a cached result was finished."""
         store = Store(self.folder / "steps")
-        kept = [p for p in planned(self.folder, TILES) if store.find(p.task.full_name, p.key)]
+        kept = [p for p in self.planned() if store.find(p.task.full_name, p.key)]
         return {
             p.task.full_name: (store.folder(p.task.full_name, p.key) / "manifest.json").stat().st_mtime_ns for p in kept
         }
@@ -78,8 +87,9 @@ class Survey:
         return Counter((self.folder / "log").read_text(encoding="utf-8").split())
 
     def finish(self, process: subprocess.Popen[bytes]) -> str:
-        """Wait for the end of the process; returns its output."""
-        process.wait(150)
+        """Let the last steps run, and wait for the end of the process; returns its output."""
+        self.gate.touch()
+        process.wait()
         return self.output()
 
     def output(self) -> str:
@@ -112,7 +122,7 @@ def test_killed_flow_resumes_with_finished_steps(survey: Survey) -> None:
     survey.wait_until_running()
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    until(lambda: not survey.processes(), 30, what="the end of all its processes")
+    until(lambda: not survey.processes(), what="the end of all its processes")
     before, lost = survey.done(), set(survey.running_steps())
     assert 4 <= len(before) < len(ALL)
 
@@ -121,7 +131,7 @@ def test_killed_flow_resumes_with_finished_steps(survey: Survey) -> None:
     assert before.items() <= survey.done().items()
     assert set(survey.runs()) == ALL
     assert {name for name, count in survey.runs().items() if count > 1} <= lost
-    assert all(item.reason is None for item in planned(survey.folder, TILES))
+    assert all(item.reason is None for item in survey.planned())
 
 
 @on("sqlite")
@@ -157,10 +167,10 @@ def test_ctrl_c_stops_the_run_and_its_temporary_server(tmp_path: Path) -> None:
             command, env=environment(tmp_path), cwd=ROOT, stdout=file, stderr=file, start_new_session=True
         )
     try:
-        until(lambda: list(out.glob("steps/*/*/*/manifest.json")), 150, what="a finished step")
+        until(lambda: list(out.glob("steps/*/*/*/manifest.json")), 250, what="a finished step")
         os.killpg(process.pid, signal.SIGINT)
-        assert process.wait(20) == 130
-        until(lambda: not processes("PREFECT_HOME", str(tmp_path)), 30, what="the end of all its processes")
+        assert process.wait() == 130
+        until(lambda: not processes("PREFECT_HOME", str(tmp_path)), what="the end of all its processes")
     finally:
         kill(process)
     assert "the same command resumes from there" in log.read_text(encoding="utf-8")
@@ -175,10 +185,10 @@ def test_temporary_server_ends_with_a_killed_command(tmp_path: Path) -> None:
             start_new_session=True,
         )  # fmt: skip
     try:
-        server = until(lambda: temporary_servers(tmp_path), 150, what="its server")
-        until(lambda: list(out.glob("steps/*/*/*/manifest.json")), 150, what="a finished step")
+        server = until(lambda: temporary_servers(tmp_path), 250, what="its server")
+        until(lambda: list(out.glob("steps/*/*/*/manifest.json")), 250, what="a finished step")
         process.kill()  # only the command
-        until(lambda: not processes("PREFECT_HOME", str(tmp_path)), 30, what="the end of all its processes")
+        until(lambda: not processes("PREFECT_HOME", str(tmp_path)), what="the end of all its processes")
     finally:
         kill(process)
     assert not any(answers(port) for port in server)
@@ -187,9 +197,9 @@ def test_temporary_server_ends_with_a_killed_command(tmp_path: Path) -> None:
 def test_temporary_server_ends_with_its_context(tmp_path: Path) -> None:
     """Even if the command fails; and another one may be started afterwards."""
     script = (
+        "from scan2sim.flows.deployed.prefect_server import prefect_server\n"  # sets its start-up timeout
         "from prefect.settings import PREFECT_API_URL\n"
         "from tests.flows.prefect.test_kills import answers\n"
-        "from scan2sim.flows.deployed.prefect_server import prefect_server\n"
         "for _ in range(2):\n"
         "    try:\n"
         "        with prefect_server():\n"
@@ -200,7 +210,7 @@ def test_temporary_server_ends_with_its_context(tmp_path: Path) -> None:
         "        assert not answers(port) and PREFECT_API_URL.value() is None\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", script], env=environment(tmp_path), cwd=ROOT, capture_output=True, text=True, timeout=200
+        [sys.executable, "-c", script], env=environment(tmp_path), cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
 
@@ -218,7 +228,7 @@ def temporary_servers(home: Path) -> list[int]:
 def answers(port: int) -> bool:
     """Whether a Prefect server answers on this port."""
     try:
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/api/health", timeout=10) as answer:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/api/health", timeout=60) as answer:
             return bool(answer.status == 200)
     except (OSError, HTTPException):
         return False

@@ -48,6 +48,6 @@ def toy_survey(
 
 
 def main() -> None:
-    """FOLDER RUNNER [BUS]: six tiles."""
-    bus = sys.argv[3] if len(sys.argv) > 3 else None
-    print("total", toy_survey(sys.argv[1], tiles=6, runner=sys.argv[2], bus=bus))
+    """FOLDER RUNNER GATE [BUS]: six tiles."""
+    folder, runner, gate, bus = (*sys.argv[1:], None)[:4]
+    print("total", toy_survey(folder, tiles=6, gate=gate, runner=runner, bus=bus))

@@ -17,7 +17,7 @@ STEPS = ("first", "second", "third")
 
 
 class SlowParams(ToyParams):
-    """A toy step that takes `seconds` and waits until the file `gate` exists before it logs its run."""
+    """A toy step that takes `seconds` and then waits until the file `gate` exists before it logs its run."""
 
     seconds: float = 0.3
     gate: Path | None = None
@@ -36,12 +36,14 @@ def slow(inputs: Inputs, params: SlowParams, out: Path, report: Report) -> Done:
 
 
 def planned(folder: Path, tiles: int, gate: Path | None = None) -> list[PlannedTask]:
-    """The plan in `folder`: a chain of three steps for each tile."""
+    """The plan in `folder`: a chain of three steps for each tile, of which the last waits for the file `gate`."""
     tasks = []
     for tile in range(tiles):
         before: Path | Output = folder / "source.txt"
         for name in STEPS:
-            params = SlowParams(log=folder / "log", name=f"{tile}-{name}", value=1, gate=gate)
+            params = SlowParams(
+                log=folder / "log", name=f"{tile}-{name}", value=1, gate=gate if name == STEPS[-1] else None
+            )
             tasks.append(Task(Step(name, 1, slow, SlowParams), params, {"before": before}, tile=str(tile)))
             before = Output(tasks[-1].id, "number")
     return plan(tasks, Store(folder / "steps"))

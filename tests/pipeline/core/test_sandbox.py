@@ -6,6 +6,7 @@ import os
 import signal
 import time
 
+import psutil
 import pytest
 
 from scan2sim.pipeline.core import sandbox
@@ -45,5 +46,7 @@ def test_exception_of_the_child_is_reported() -> None:
 
 
 def test_hanging_child_is_stopped_at_the_timeout() -> None:
-    with pytest.raises(StepError, match="did not finish"):  # it hangs for 10 minutes, longer than the limit of a test
+    with pytest.raises(StepError, match="did not finish"):
         sandbox.call(f"{HERE}:hang", timeout=3)
+    ours = [child.cmdline() for child in psutil.Process().children()]
+    assert not [command for command in ours if "scan2sim.pipeline.core.sandbox" in command], "it is killed"
