@@ -97,13 +97,14 @@ def busy_loop() -> Iterator[None]:
 
 @contextmanager
 def random_stalls(root: int, chance: random.Random) -> Iterator[None]:
-    """Stop a random descendant of a process for `STALL_S` every `STALL_PERIOD_S`."""
+    """Stop a random descendant of a process for `STALL_S` every `STALL_PERIOD_S`; not one that a test has stopped."""
     ended = threading.Event()
 
     def stall() -> None:
         while not ended.wait(STALL_PERIOD_S - STALL_S):
             try:
-                victim = chance.choice(psutil.Process(root).children(recursive=True))
+                running = psutil.Process(root).children(recursive=True)
+                victim = chance.choice([one for one in running if one.status() != psutil.STATUS_STOPPED])
                 victim.suspend()
             except (psutil.Error, IndexError):  # it has ended
                 continue
