@@ -146,7 +146,7 @@ class VirtualTime:
     def clock(self) -> float:
         return self._ms / 1000
 
-    def wait(self, _: threading.Event, seconds: float) -> bool:
+    def wait(self, ended: threading.Event, seconds: float) -> bool:
         seconds += self._stall.get(self._ms // 1000, 0)
         for _ in range(min(round(1000 * seconds), self._end_ms - self._ms)):
             self._ms += 1

@@ -49,5 +49,6 @@ def toy_survey(
 
 def main() -> None:
     """FOLDER RUNNER GATE [BUS]: six tiles."""
-    folder, runner, gate, bus = (*sys.argv[1:], None)[:4]
+    folder, runner, gate = sys.argv[1:4]
+    bus = sys.argv[4] if len(sys.argv) > 4 else None
     print("total", toy_survey(folder, tiles=6, gate=gate, runner=runner, bus=bus))
