@@ -101,6 +101,7 @@ def in_gazebo(world: Path) -> Iterator[None]:
             one.wait()
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("simulator", [in_physics_library, in_gazebo])
 def test_robot_is_driven_remotely_and_stops_without_commands(
     world: Path, simulator: Callable[[Path], Any], monkeypatch: pytest.MonkeyPatch

@@ -83,7 +83,7 @@ class ReceivedBytes(NamedTuple):
     """Bytes received by the far side at a time between `earliest` and `latest`."""
 
     earliest: float
-    count: int
+    total: int
     latest: float
 
     @staticmethod
@@ -106,7 +106,7 @@ def test_the_rate_is_limited(backend: str) -> None:
             time.sleep(1.5)
             after = ReceivedBytes.read(link)
             assert flood.poll() is None
-            bits = 8 * (after.count - before.count)
+            bits = 8 * (after.total - before.total)
             assert bits / (after.latest - before.earliest) < 1.05 * rate
             return bits / (after.latest - before.earliest) > 0.95 * rate
 
