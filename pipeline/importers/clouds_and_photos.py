@@ -123,7 +123,7 @@ def import_las(
     headers = [cloud_io.read_header(Path(cloud)) for cloud in clouds]
     known, unit = _common_crs(clouds, headers, crs, units)
     for cloud, header in zip(clouds, headers, strict=True):
-        for note in header.notes:
+        for note in (*header.notes, *cloud_io.flag_notes(Path(cloud))):
             warn(f"{cloud}: {note}")
     shots, rigs = read_photos(photos, cameras) if photos else ([], {})
     if shots and conventions is not None:

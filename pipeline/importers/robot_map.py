@@ -207,7 +207,7 @@ def _read(clouds: Sequence[Path], warn: Callable[[str], None]) -> tuple[PointClo
     """All points with finite coordinates, once each, in the unit of the map (with a CRS in metres); and the CRS."""
     headers = [cloud_io.read_header(path) for path in clouds]
     for path, header in zip(clouds, headers, strict=True):
-        for note in header.notes:
+        for note in (*header.notes, *cloud_io.flag_notes(path)):
             warn(f"{path.name}: {note}")
     ends = np.array([(header.low, header.high) for header in headers])
     ends = np.where(np.isfinite(ends), ends, 0.0)

@@ -115,8 +115,8 @@ def read_bin(path: Path) -> tuple[F32, F32]:
 
 def _intensities(levels: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:
     """Scale intensities of 0..1, 0..255 or more to 0..65535; zeros if there are none."""
-    scaled = to_uint16(levels, float(np.nan_to_num(levels).max(initial=0)))
-    return np.zeros(len(levels), np.uint16) if scaled is None else scaled
+    known = np.nan_to_num(levels)
+    return to_uint16(known, float(known.min(initial=0)), float(known.max(initial=0)))
 
 
 def read_times(path: Path) -> F64:

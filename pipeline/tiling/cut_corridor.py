@@ -217,15 +217,16 @@ def _distribute(
 def _assign(
     corridor: Corridor, seed_xy: F64, options: CutParams, spool: Spool, report: Report
 ) -> tuple[int, list[str]]:
-    """Assign all points to tiles; returns the number of points too far from the trajectory, and class code warnings."""
+    """Assign all points to tiles; returns the number of points too far from the trajectory, and warnings on points."""
     from scipy.spatial import cKDTree
 
     tile = corridor.tile
     path = None
     if tile.trajectory is not None:
         path = cKDTree(resample_path((tile.trajectory.positions + np.asarray(tile.frame.origin))[:, :2]))
-    total, done, far, code_warnings = sum(corridor.counts), 0, 0, list[str]()
-    for cloud in tile.clouds:
+    total, done, far, warnings = sum(corridor.counts), 0, 0, list[str]()
+    for cloud, declared in zip(tile.clouds, corridor.counts, strict=True):
+        before = done
         table, count = clouds.code_table(cloud, tile.classes), np.zeros(256, np.int64)
         for part in clouds.chunks(cloud, tile.frame, CHUNK_POINTS):
             report(READING_PROGRESS * done / total, f"reading {cloud.name}")
@@ -248,9 +249,9 @@ def _assign(
                     chosen = rows[points[in_tile]]
                     chosen["own"] = in_tile < len(xy)
                     spool.add(int(tiles[in_tile[0]]), chosen, part)
-        warning = unmapped_codes_warning(count, table)
-        code_warnings += [f"{cloud.name}: {warning}"] if warning else []
-    return far, code_warnings
+        notes = unmapped_codes_warning(count, table), clouds.left_out(declared, done - before)
+        warnings += [f"{cloud.name}: {note}" for note in notes if note]
+    return far, warnings
 
 
 class _Writer:

@@ -1,7 +1,8 @@
 """Point cloud readers: one module per format (`pipeline.core.plugins`), selected by the file's suffix.
 
 A format's module has `SUFFIXES`, `read_header(path) -> (count, low, high, crs[, notes])`, `read(path, frame)` and
-`chunks(path, frame, size)`, and, if its files name classes, `class_names(path) -> (ours, names)`.
+`chunks(path, frame, size)`; if its files name classes, `class_names(path) -> (ours, names)`; and if its points
+have flags that the header doesn't count, `flags(path) -> (withheld, overlap)`.
 """
 
 from __future__ import annotations
@@ -99,6 +100,30 @@ def read(path: Path, frame: Frame) -> PointCloud:
     """
     cloud: PointCloud = _reader(path).read(path, frame)
     return cloud
+
+
+def left_out(declared: int, read: int) -> str:
+    """Note on points that `read` leaves out though the header counts them; empty if there are none.
+
+    Args:
+        declared: number of points by the header.
+        read: number of points that were read.
+    """
+    return f"{declared - read:,} withheld points are not used" if read < declared else ""
+
+
+def flag_notes(path: Path) -> tuple[str, ...]:
+    """Notes on points with the withheld or overlap flag of LAS; a header doesn't count them, all points are read.
+
+    Raises:
+        InputError: as `read`.
+    """
+    reader = _reader(path)
+    if not hasattr(reader, "flags"):
+        return ()
+    withheld, overlap = reader.flags(path)
+    second_line = f"{overlap:,} points have the overlap flag (a second flight line); they are used"
+    return tuple(note for note in (left_out(withheld, 0), second_line if overlap else "") if note)
 
 
 def code_table(path: Path, given: Mapping[int, int]) -> U8:

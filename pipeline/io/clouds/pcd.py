@@ -44,10 +44,10 @@ class _Header:
     start: int  # byte offset of the points
 
 
-def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
-    """Number of finite points, low and high corner; PCD has no CRS."""
+def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
+    """Number of finite points, low and high corner, no CRS (PCD has none), and notes."""
     found = point_chunks.summary(path, _parts(path))
-    return found.count, found.low, found.high, None
+    return found.count, found.low, found.high, None, found.notes
 
 
 def read(path: Path, frame: Frame) -> PointCloud:

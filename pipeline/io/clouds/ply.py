@@ -59,7 +59,7 @@ def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]
     found = point_chunks.summary(path, _parts(path))
     removed = layout(path).count - found.count
     notes = (f"{removed:,} points with NaN coordinates removed",) if removed else ()
-    return found.count, found.low, found.high, None, notes
+    return found.count, found.low, found.high, None, (*notes, *found.notes)
 
 
 def read(path: Path, frame: Frame) -> PointCloud:

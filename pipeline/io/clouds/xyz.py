@@ -65,7 +65,7 @@ class _Form:
 def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
     """Number of points, low and high corner, no CRS, and how the columns were interpreted."""
     found = point_chunks.summary(path, _parts(path))
-    return found.count, found.low, found.high, None, (_form(path).note,)
+    return found.count, found.low, found.high, None, (_form(path).note, *found.notes)
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
