@@ -16,11 +16,19 @@ from scan2sim.pipeline.core import classes, plugins
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import F64, U8, Frame, PointCloud
-from scan2sim.pipeline.io import file_checks
+from scan2sim.pipeline.io import file_checks, mesh_files
 
 CHUNK_POINTS = 2_000_000
 COPIED_SUFFIXES = (".las", ".laz", ".ply")
 """Files that are copied into a tile unchanged; other formats are converted to LAZ (`scan2sim import clouds`)."""
+SIGNATURES = {
+    b"LASF": (".las", "las"),
+    b"ply\n": (".ply", "ply"),
+    b"ply\r": (".ply", "ply"),
+    b"# .PCD": (".pcd", "pcd"),
+    b"ASTM-E57": (".e57", "e57"),
+}
+"""First bytes of cloud files: suffix and format."""
 SUPPORTED_FORMATS = "LAS, LAZ, COPC, PLY, E57, PCD, XYZ (.xyz .csv .txt .asc) or EPT (its ept.json)"
 
 
@@ -74,13 +82,26 @@ def is_cloud(path: Path) -> bool:
 def _reader(path: Path) -> Any:
     found = formats()
     name = found.get(path.name) or found.get(path.suffix.lower())
+    if name is None and path.suffix.lower() in mesh_files.SUFFIXES:
+        raise InputError(path, "is a mesh, not a point cloud", f"Import the mesh: scan2sim import map {path.name}")
     if name is None:
         cause = f"has an unknown cloud format ({path.suffix or 'no suffix'})"
         raise InputError(path, cause, f"Use {SUPPORTED_FORMATS}")
-    file_checks.check(path)
+    file_checks.check_data(path)
+    _check_suffix(path, name)
     reader = plugins.module(__name__, name)
     require(str(path), *plugins.needs(reader))
     return reader
+
+
+def _check_suffix(path: Path, name: str) -> None:
+    """Raise an error if a file's content is of another format than its suffix says."""
+    with path.open("rb") as file:
+        head = file.read(max(map(len, SIGNATURES)))
+    for signature, (suffix, found) in SIGNATURES.items():
+        if head.startswith(signature) and found != name:
+            cause = f"is a {suffix[1:].upper()} file by its content, though its name ends in {path.suffix}"
+            raise InputError(path, cause, f"Rename it to {path.stem}{suffix}")
 
 
 def read_header(path: Path) -> Header:

@@ -337,7 +337,7 @@ def test_a_cut_file_is_refused(written: tuple[Format, Path, PointCloud]) -> None
 
 def test_a_file_whose_reader_is_missing_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("scan2sim.pipeline.core.optional_deps.importlib.util.find_spec", lambda name: None)
-    (tmp_path / "c.e57").write_bytes(b"")
+    (tmp_path / "c.e57").write_bytes(b"ASTM-E57")
     with pytest.raises(UnavailableError, match=r"c\.e57: needs pye57.*pip install 'scan2sim\[e57\]'"):
         clouds.read_header(tmp_path / "c.e57")
 
@@ -424,7 +424,8 @@ def test_columns_are_detected_and_assumptions_reported(tmp_path: Path, lines: st
 @pytest.mark.parametrize(
     ("lines", "cause"),
     [
-        ("", "contains no points"),
+        ("", "is empty"),
+        ("# no points\n", "contains no points"),
         ("1 2\n", "2 columns and no header line"),
         ("1 2 3 4 5 6 7 8 9 10\n", "10 columns and no header line"),
         ("x y z\n", "is not a cloud: its first line is 'x y z'"),

@@ -150,3 +150,83 @@ def test_a_tile_has_the_attributes_of_all_clouds(tmp_path: Path) -> None:
     assert any("b.laz: no colours" in w for w in warnings)
     assert any("c.ply: no intensities" in w for w in warnings)
     assert any("c.ply: no times" in w for w in warnings)
+
+
+def box(path: Path, edge: float) -> Path:
+    """A room of 10 x 8 x 3 m as a mesh whose edges are at most `edge` metres."""
+    import trimesh
+
+    trimesh.creation.box((10, 8, 3)).subdivide_to_size(edge).export(path)
+    return path
+
+
+def test_a_mesh_whose_vertices_cover_its_surface_is_read_with_a_note(tmp_path: Path) -> None:
+    header = clouds.read_header(box(tmp_path / "c.ply", 0.3))
+    assert any("is a mesh" in note and "import map" in note for note in header.notes)
+
+
+def test_a_mesh_of_large_triangles_is_no_cloud(tmp_path: Path) -> None:
+    import trimesh
+
+    fine, walls = trimesh.creation.icosphere(4), trimesh.creation.box((10, 8, 3))
+    trimesh.util.concatenate([fine, walls]).export(tmp_path / "c.ply")
+    with pytest.raises(InputError, match=r"is a mesh of 5,132 faces, not a point cloud.*import map c\.ply"):
+        clouds.read_header(tmp_path / "c.ply")
+    with pytest.raises(InputError, match=r"is a mesh, not a point cloud.*import map c\.obj"):
+        clouds.read_header(box(tmp_path / "c.obj", 1.0))
+
+
+def test_a_ply_of_faces_only_says_so(tmp_path: Path) -> None:
+    head = (
+        "ply\nformat ascii 1.0\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n3 0 1 2\n3 1 2 3\n"
+    )
+    (tmp_path / "c.ply").write_text(head, encoding="utf-8")
+    with pytest.raises(InputError, match="it has 2 faces, but no vertices"):
+        clouds.read_header(tmp_path / "c.ply")
+
+
+@pytest.mark.parametrize("names", ["x y z f_dc_0 f_dc_1 f_dc_2 opacity", "packed_position packed_color"])
+def test_gaussian_splats_are_no_cloud(tmp_path: Path, names: str) -> None:
+    columns = "".join(f"property float {name}\n" for name in names.split())
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex 2000\n{columns}end_header\n"
+    (tmp_path / "c.ply").write_bytes(head.encode() + bytes(4 * 2000 * len(names.split())))
+    with pytest.raises(InputError, match="contains Gaussian splats"):
+        clouds.read_header(tmp_path / "c.ply")
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz", ".ply", ".pcd", ".e57", ".xyz", ".csv"])
+@pytest.mark.parametrize(
+    ("content", "cause"),
+    [
+        (b"", r"is empty \(0 bytes\)"),
+        (b"\n<!DOCTYPE HTML><html><title>404 Not Found</title></html>", "is a web page"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 12\n", "is a Git LFS pointer.*git lfs pull"),
+        (b"<?xml version='1.0'?><Error><Code>AccessDenied</Code></Error>", "is an XML document"),
+        (b"PK\x03\x04....", "is a ZIP archive"),
+        (bytes(5000), "contains only zeros"),
+    ],
+)
+def test_what_is_no_cloud_is_named(tmp_path: Path, suffix: str, content: bytes, cause: str) -> None:
+    (tmp_path / f"c{suffix}").write_bytes(content)
+    with pytest.raises(InputError, match=cause):
+        clouds.read_header(tmp_path / f"c{suffix}")
+
+
+def test_a_wrong_suffix_is_named(tmp_path: Path) -> None:
+    las.write(tmp_path / "c.las", made(N))
+    (tmp_path / "c.las").rename(tmp_path / "c.ply")
+    with pytest.raises(InputError, match=r"is a LAS file by its content.*Rename it to c\.las"):
+        clouds.read_header(tmp_path / "c.ply")
+
+
+def test_links_that_lead_nowhere_and_missing_permissions_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, target in (("loop.laz", "loop.laz"), ("gone.laz", "/nowhere/gone.laz")):
+        (tmp_path / name).symlink_to(target)
+        with pytest.raises(InputError, match=f"is a link that leads nowhere .to {target}"):
+            clouds.read_header(tmp_path / name)
+    las.write(tmp_path / "c.las", made(N))
+    monkeypatch.setattr("os.access", lambda *_: False)  # tests may run as root, who may read everything
+    with pytest.raises(InputError, match="can't be read: no permission. Change its permissions"):
+        clouds.read_header(tmp_path / "c.las")
