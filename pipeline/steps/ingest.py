@@ -45,6 +45,7 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
         DataError: fewer than 1000 points in total, or an extent above 5 km.
     """
     from scan2sim.pipeline.io import clouds
+    from scan2sim.pipeline.io.geodata import area_of_use, crs
 
     frame = Frame(params.context.crs, params.context.origin, params.context.unit)
     parts: list[PointCloud] = []
@@ -53,7 +54,7 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
         report(i / len(inputs), f"reading {inputs[name].name}")
         header = clouds.read_header(inputs[name])
         cloud = clouds.read(inputs[name], frame)
-        notes = (*header.notes, clouds.left_out(header.count, len(cloud)))
+        notes = (*header.notes, clouds.left_out(header.count, len(cloud)), crs.contradiction(header.crs, frame.crs))
         warnings += [f"{inputs[name].name}: {note}" for note in notes if note]
         if cloud.classification is not None and len(cloud):
             table = clouds.code_table(inputs[name], params.context.classes)
@@ -84,6 +85,8 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
             f"the limit of a tile is {MAX_EXTENT_M / 1000:g} km",
             "Remove outliers and check the unit of the CRS, or cut the cloud into tiles with `scan2sim tile`",
         )
+    wrong = area_of_use.misfit(frame.crs, frame.to_crs(low), frame.to_crs(high))
+    warnings += [] if wrong is None else [str(wrong)]
     report(0.9, "writing")
     cloud.save(out / "cloud.npz")
     metrics = {

@@ -26,6 +26,7 @@ from scan2sim.pipeline.geometry.path_sampling import resample_path
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.geodata import orthophoto
 from scan2sim.pipeline.io.survey import read_survey, write_survey
 from scan2sim.pipeline.io.tile import MIN_POINTS, TileFile, read_spec, read_tile, tile_name, write_tile
@@ -95,7 +96,12 @@ class Corridor:
         tile = replace(tile, views=tile.views[: len(spec.photos)])  # without the orthophoto, which all tiles share
         headers = [clouds.read_header(cloud) for cloud in tile.clouds]
         low, high = np.min([h.low for h in headers], axis=0), np.max([h.high for h in headers], axis=0)
-        notes = tuple(f"{c.name}: {note}" for c, h in zip(tile.clouds, headers, strict=True) for note in h.notes)
+        notes = tuple(
+            f"{cloud.name}: {note}"
+            for cloud, header in zip(tile.clouds, headers, strict=True)
+            for note in (*header.notes, crs_io.contradiction(header.crs, tile.frame.crs))
+            if note
+        )
         return cls(tile, spec, low, high, tuple(h.count for h in headers), notes)
 
 

@@ -31,6 +31,9 @@ SIGNATURES = {
 """First bytes of cloud files: suffix and format."""
 SUPPORTED_FORMATS = "LAS, LAZ, COPC, PLY, E57, PCD, XYZ (.xyz .csv .txt .asc) or EPT (its ept.json)"
 
+UNREADABLE_CRS = "its CRS can't be read"
+"""Beginning of the note on a CRS that counts as none."""
+
 
 @dataclass(frozen=True)
 class Header:

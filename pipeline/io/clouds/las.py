@@ -67,7 +67,8 @@ def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]
         header = reader.header
         if header.point_count == 0:
             raise InputError(path, "contains no points", "Remove it from the tile")
-        notes, crs = las_header.check(path), _crs(path, header)
+        crs, crs_notes = _crs(header)
+        notes = (*las_header.check(path), *crs_notes)
         low, high = np.array(header.mins), np.array(header.maxs)
     if not _bounds_plausible(path, low, high):
         declared = low, high
@@ -392,11 +393,10 @@ def _to_uint8(rgb: Any) -> Any:
     return (rgb >> 8).astype(np.uint8) if rgb.max() > 255 else rgb.astype(np.uint8)
 
 
-def _crs(path: Path, header: Any) -> str | None:
+def _crs(header: Any) -> tuple[str | None, tuple[str, ...]]:
+    """CRS as WKT, or None; and a note if there is one that can't be read."""
     try:
         crs = las_header.parsed_crs(header)
     except ValueError as error:
-        raise InputError(
-            path, f"its CRS can't be read ({error})", "Fix the CRS in its header, or export it again"
-        ) from None
-    return crs.to_wkt() if crs is not None else None
+        return None, (f"its CRS can't be read, so it counts as none ({error})",)
+    return None if crs is None else crs.to_wkt(), ()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,12 +11,16 @@ from typing import Any
 import laspy
 import numpy as np
 import pytest
+from pyproj import Transformer
 
-from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.types import UNCOLOURED, Frame, PointCloud
 from scan2sim.pipeline.importers.clouds_and_photos import import_las
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.geodata import crs as crs_io
+from scan2sim.pipeline.io.geodata import geokeys
+from scan2sim.pipeline.io.geodata.area_of_use import misfit
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.ingest import IngestParams, TileFrame, ingest
 from tests.pipeline.io.test_cloud_formats import ept
@@ -230,3 +236,120 @@ def test_links_that_lead_nowhere_and_missing_permissions_are_named(
     monkeypatch.setattr("os.access", lambda *_: False)  # tests may run as root, who may read everything
     with pytest.raises(InputError, match="can't be read: no permission. Change its permissions"):
         clouds.read_header(tmp_path / "c.las")
+
+
+PLACE = np.array([389_000.0, 5_820_000.0, 35.0])
+"""A street in Berlin, EPSG:32633."""
+TACOMA = np.array([1_160_000.0, 700_000.0, 300.0])
+"""US survey feet in EPSG:2927, metres after scaling in EPSG:32149 (Washington South)."""
+
+
+def georeferenced(path: Path, middle: np.ndarray, keys: dict[int, int] | None = None, wkt: bytes | None = None) -> Path:
+    """A LAS of 2000 points around a position, with GeoTIFF keys or the content of a WKT record."""
+    header = laspy.LasHeader(version="1.4" if wkt is not None else "1.2", point_format=6 if wkt is not None else 3)
+    header.scales, header.offsets = np.full(3, 0.001), np.floor(middle)
+    entries = sorted((keys or {}).items())
+    if entries:
+        directory = struct.pack("<4H", 1, 1, 0, len(entries))
+        directory += b"".join(struct.pack("<4H", key, 0, 1, value) for key, value in entries)
+        header.vlrs.append(laspy.VLR("LASF_Projection", 34735, "", directory))
+    if wkt is not None:
+        header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "", wkt))
+    data = laspy.LasData(header)
+    data.x, data.y, data.z = (np.random.default_rng(2).uniform(-20, 20, (2000, 3)) + middle).T
+    data.write(path)
+    return path
+
+
+def imported(tmp_path: Path, cloud: Path, **options: Any) -> tuple[Frame, np.ndarray, list[str]]:
+    """Frame of the imported tile, middle of its points in the CRS, and warnings."""
+    notes: list[str] = []
+    import_las([cloud], tmp_path / "tile", warn=notes.append, **options)
+    tile = read_tile(tmp_path / "tile")
+    points = clouds.read(tile.clouds[0], tile.frame).xyz
+    return tile.frame, tile.frame.to_crs(points.mean(axis=0)), notes
+
+
+def test_units_in_geotiff_keys_override_those_of_the_code(tmp_path: Path) -> None:
+    cloud = georeferenced(tmp_path / "c.las", TACOMA, {1024: 1, 3072: 32149, 3076: 9003, 4099: 9003})
+    frame, middle, notes = imported(tmp_path, cloud)
+    assert frame.unit == pytest.approx(1200 / 3937) and not notes
+    latitude, longitude, _ = present(crs_io.to_wgs84(frame))
+    expected = Transformer.from_crs(2927, 4326, always_xy=True).transform(*TACOMA[:2])
+    assert (longitude, latitude) == pytest.approx(expected, abs=0.01)
+    assert np.abs(middle - TACOMA).max() < 3
+
+
+def test_heights_in_another_unit_are_refused_with_the_reason(tmp_path: Path) -> None:
+    cloud = georeferenced(tmp_path / "c.las", PLACE, {1024: 1, 3072: 32633, 4099: 9003})
+    with pytest.raises(InputError, match=r"heights in units of 0\.3048\d* m, but horizontal units of 1 m"):
+        imported(tmp_path, cloud)
+
+
+def test_a_projection_given_by_parameters_is_read(tmp_path: Path) -> None:
+    pytest.importorskip("rasterio", reason="GDAL reads projections without a code")
+    doubles = (-120.5, 45.333333333333336, 47.333333333333336, 45.833333333333336, 500_000.0 * 3937 / 1200, 0.0)
+    numbers = {1024: 1, 2048: 4269, 3072: 32767, 3074: 32767, 3075: 8, 3076: 9003}
+    entries = [(key, 0, 1, value) for key, value in numbers.items()]
+    entries += [(key, 34736, 1, i) for key, i in ((3084, 0), (3085, 1), (3078, 3), (3079, 2), (3086, 4), (3087, 5))]
+    directory = struct.pack("<4H", 1, 1, 0, len(entries)) + b"".join(struct.pack("<4H", *e) for e in sorted(entries))
+    crs = present(geokeys.crs_of_records(directory, struct.pack("<6d", *doubles)))
+    place = Transformer.from_crs(crs, 4326, always_xy=True).transform(*TACOMA[:2])
+    assert place == pytest.approx(Transformer.from_crs(2927, 4326, always_xy=True).transform(*TACOMA[:2]), abs=1e-4)
+
+
+@pytest.mark.parametrize("wkt", [b"''\0", b'PROJCS["unfinished', b"see the readme", b"\xff\xfe\0"])
+def test_a_crs_that_cannot_be_read_counts_as_none(tmp_path: Path, wkt: bytes) -> None:
+    cloud = georeferenced(tmp_path / "c.las", PLACE, wkt=wkt)
+    with pytest.raises(InputError, match=r"(has no CRS|its CRS can't be read).*--crs EPSG:32633"):
+        imported(tmp_path, cloud)
+    frame, middle, _ = imported(tmp_path, cloud, crs="EPSG:32633")
+    assert frame.crs == "EPSG:32633" and np.abs(middle - PLACE).max() < 2
+
+
+def test_given_crs_and_units_win_over_the_header_with_a_warning(tmp_path: Path) -> None:
+    degrees = georeferenced(tmp_path / "c.las", PLACE, {1024: 2, 2048: 4326})
+    with pytest.raises(InputError, match=r"EPSG:4326 has degrees, but its coordinates.*are lengths.*--crs"):
+        imported(tmp_path, degrees)
+    frame, _, notes = imported(tmp_path, degrees, crs="EPSG:32633")
+    assert frame.crs == "EPSG:32633" and any("its header says EPSG:4326; EPSG:32633 is used" in n for n in notes)
+    feet = georeferenced(tmp_path / "f.las", TACOMA, {1024: 1, 3072: 32149})
+    with pytest.raises(InputError, match=r"outside of the area of use.*another unit.*--units us-ft"):
+        imported(tmp_path, feet)
+    frame, middle, notes = imported(tmp_path / "b", feet, units="us-ft")
+    assert frame.unit == pytest.approx(1200 / 3937) and any("read in us-ft, as given" in n for n in notes)
+    assert np.abs(middle - TACOMA).max() < 3
+
+
+def test_northing_before_easting_is_refused_or_converted(tmp_path: Path) -> None:
+    cloud = georeferenced(tmp_path / "c.las", PLACE[[1, 0, 2]], {1024: 1, 3072: 32633})
+    with pytest.raises(InputError, match="northing comes before easting.*--axes neh"):
+        imported(tmp_path, cloud)
+    _, middle, notes = imported(tmp_path, cloud, axes="neh")
+    assert np.abs(middle - PLACE).max() < 2 and not notes
+    _, _, notes = imported(tmp_path / "b", cloud, crs="local")
+    assert any("northing before easting, which mirrors the world" in note for note in notes)
+    with pytest.raises(SettingError, match="no order of axes"):
+        imported(tmp_path / "c", cloud, axes="xyz")
+
+
+@pytest.mark.parametrize(
+    ("crs", "middle", "reading"),
+    [
+        ("EPSG:32633", PLACE, None),
+        ("EPSG:25832", [800_000, 5_820_000, 0], None),  # Berlin in the zone of western Germany, as is usual
+        ("EPSG:2154", [870_000, 6_618_000, 0], None),
+        ("EPSG:2056", [2_600_000, 1_200_000, 0], None),
+        ("EPSG:2927", TACOMA, None),
+        ("EPSG:3857", [1_490_000, 6_890_000, 0], None),
+        ("EPSG:28355", [320_000, 5_812_000, 0], None),
+        ("EPSG:32633", [33_389_000, 5_820_000, 0], "begin with the zone number 33"),
+        ("EPSG:32633", [12.0, -40.0, 0], "seem to be local.*--crs local"),
+        ("EPSG:32632", [1_900_000, 5_820_000, 0], "Check the CRS"),
+        ("EPSG:2927", TACOMA * 0.3048, "--units m"),
+    ],
+)
+def test_coordinates_are_held_against_the_area_of_use(crs: str, middle: Any, reading: str | None) -> None:
+    low, high = np.asarray(middle, float) - 20, np.asarray(middle, float) + 20
+    found = misfit(crs, low, high)
+    assert (found is None) if reading is None else re.search(reading, str(found))

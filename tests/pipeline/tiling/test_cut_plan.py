@@ -401,12 +401,17 @@ def test_chunks_are_what_reading_at_once_gives(tmp_path: Path) -> None:
 # what goes wrong
 
 
-def test_clouds_in_two_crs_are_refused(tmp_path: Path) -> None:
+def test_clouds_in_two_crs_are_refused_unless_the_tile_names_one(tmp_path: Path) -> None:
     folder = corridor(tmp_path / "corridor", n=3_000)
     las.write(folder / "1.laz", replace(points(1_000), frame=replace(UTM, crs="EPSG:2154")))
+    notes: list[str] = []
+    cut_survey(folder, tmp_path / "named", CUT, warn=notes.append)
+    assert any("1.laz: its header says EPSG:2154; EPSG:32632 is used" in note for note in notes)
+    text = (folder / "tile.toml").read_text(encoding="utf-8")
+    (folder / "tile.toml").write_text(text.replace('crs = "EPSG:32632"', ""), encoding="utf-8")
     with pytest.raises(InputError, match=r"1\.laz: is in EPSG:2154, but 0\.laz is in EPSG:32632"):
         cut_survey(folder, tmp_path / "out", CUT)
-    assert left(tmp_path) == []
+    assert left(tmp_path) == ["named"]
 
 
 def test_a_truncated_cloud_is_named_and_nothing_is_left(tmp_path: Path) -> None:
