@@ -23,7 +23,7 @@ from scan2sim.pipeline.io.geodata import geokeys
 from scan2sim.pipeline.io.geodata.area_of_use import misfit
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.ingest import IngestParams, TileFrame, ingest
-from tests.pipeline.io.test_cloud_formats import ept
+from tests.pipeline.io.test_cloud_formats import ept, write_pcd
 from tests.pipeline.io.test_clouds import FRAME, made, write_ply
 from tests.present import present
 
@@ -353,3 +353,93 @@ def test_coordinates_are_held_against_the_area_of_use(crs: str, middle: Any, rea
     low, high = np.asarray(middle, float) - 20, np.asarray(middle, float) + 20
     found = misfit(crs, low, high)
     assert (found is None) if reading is None else re.search(reading, str(found))
+
+
+def table(order: str, seed: int = 4) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Rows of a text cloud with columns x y z r g b i (intensity of PTS) j (of 0..255) n (number) N (normal) c (class)."""
+    rng = np.random.default_rng(seed)
+    n = 500
+    xyz = PLACE + rng.uniform(-20, 20, (n, 3))
+    grey = rng.integers(20, 230, n)
+    rgb = np.clip(grey[:, None] + rng.integers(-15, 15, (n, 3)), 0, 255)
+    normal = rng.normal(size=(n, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    columns = dict(zip("xyz", xyz.T, strict=True)) | dict(zip("rgb", rgb.T, strict=True))
+    columns |= {"i": rng.integers(-2048, 2047, n), "j": rng.integers(0, 256, n), "n": np.arange(1, n + 1)}
+    columns["c"] = rng.choice([2, 6, 11], n)
+    texts = {key: [f"{v:.3f}" if key in "xyz" else str(v) for v in values] for key, values in columns.items()}
+    texts["N"] = [" ".join(f"{v:.5f}" for v in row) for row in normal]
+    return [" ".join(cells) for cells in zip(*(texts[key] for key in order), strict=True)], xyz, rgb
+
+
+@pytest.mark.parametrize(
+    "order",
+    ["xyzrgb", "xyzrgbi", "xyzirgb", "xyzrgbj", "xyzjrgb", "nxyz", "nxyzrgb", "nxyzirgb", "xyzN", "xyzrgbN", "xyzNrgb",
+     "xyzirgbN", "xyzrgbjc", "xyzjrgbc"],
+)  # fmt: skip
+@pytest.mark.parametrize("count_line", [True, False])
+def test_columns_without_names_are_found_by_their_values(tmp_path: Path, order: str, count_line: bool) -> None:
+    lines, xyz, rgb = table(order)
+    (tmp_path / "c.pts").write_text("\n".join([*([str(len(lines))] if count_line else []), *lines]), encoding="utf-8")
+    cloud = clouds.read(tmp_path / "c.pts", Frame(origin=tuple(PLACE)))
+    assert np.abs(cloud.xyz + PLACE - xyz).max() < 2e-3
+    assert (cloud.rgb is None) == ("r" not in order)
+    if cloud.rgb is not None:
+        assert np.array_equal(cloud.rgb, rgb)
+
+
+def test_values_that_fit_no_order_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "c.txt").write_text("1 2 3 -0.5 70000 9\n4 5 6 1 2 3\n", encoding="utf-8")
+    with pytest.raises(InputError, match="6 columns and no header line, and their values fit no known order.*Name the"):
+        clouds.read_header(tmp_path / "c.txt")
+
+
+HEADINGS = ["x;y;z;r;g;b", "Rechtswert;Hochwert;Höhe;Rot;Grün;Blau", "E;N;H;R;G;B", "X [m];Y [m];Z [m];Red;Green;Blue",
+            "Est;Nord;Hauteur;Rouge;Vert;Bleu", "ESTE;NORTE;ALTURA;ROJO;VERDE;AZUL"]  # fmt: skip
+
+
+@pytest.mark.parametrize("heading", HEADINGS)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252", "utf-16", "utf-16-le", "utf-16-be"])
+@pytest.mark.parametrize("commas", [True, False])
+def test_text_of_other_languages_and_encodings(tmp_path: Path, heading: str, encoding: str, commas: bool) -> None:
+    lines, xyz, rgb = table("xyzrgb")
+    rows = [line.replace(" ", ";").replace(".", "," if commas else ".") for line in lines]
+    (tmp_path / "c.csv").write_bytes("\r\n".join([heading, *rows, ""]).encode(encoding))
+    cloud = clouds.read(tmp_path / "c.csv", Frame(origin=tuple(PLACE)))
+    assert np.abs(cloud.xyz + PLACE - xyz).max() < 2e-3 and np.array_equal(present(cloud.rgb), rgb)
+
+
+def test_decimal_commas_between_blanks(tmp_path: Path) -> None:
+    (tmp_path / "c.xyz").write_text("389000,5 5820000,25 35,125\n389001,5 5820000,25 35,125\n", encoding="utf-8")
+    assert clouds.read_header(tmp_path / "c.xyz").low.tolist() == [389000.5, 5820000.25, 35.125]
+    (tmp_path / "c.xyz").write_text("1, 2, 3\n4, 5, 6\n", encoding="utf-8")
+    assert clouds.read_header(tmp_path / "c.xyz").high.tolist() == [4, 5, 6]
+
+
+@pytest.mark.parametrize("data", ["ascii", "binary", "binary_compressed"])
+def test_pcd_with_padding_without_bytes_capitals_and_zeros(tmp_path: Path, data: str) -> None:
+    rows = np.ones(1024, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
+    rows["y"] = np.arange(1024)
+    for name in ("x", "y", "z"):
+        rows[name][::4] = 0
+    write_pcd(tmp_path / "c.pcd", rows, data)
+    text = (tmp_path / "c.pcd").read_bytes()
+    for old, new in (
+        (b"FIELDS x y z intensity", b"FIELDS X Y _ Z intensity _"), (b"SIZE 4 4 4 4", b"SIZE 4 4 1 4 4 2"),
+        (b"TYPE F F F F", b"TYPE F F U F F U"), (b"COUNT 1 1 1 1", b"COUNT 1 1 0 1 1 0"),
+        (b"WIDTH 1024\nHEIGHT 1", b"WIDTH 256\nHEIGHT 4"),
+    ):  # fmt: skip
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "c.pcd").write_bytes(text)
+    cloud = clouds.read(tmp_path / "c.pcd", Frame())
+    assert len(cloud) == 768 and set(cloud.xyz[:, 0]) == {1} and cloud.xyz[-1, 1] == 1023
+
+
+def test_pcd_with_data_that_lzf_could_not_compress(tmp_path: Path) -> None:
+    xyz = np.random.default_rng(0).uniform(-9, 9, (300, 3)).astype("<f4")
+    head = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 300\nHEIGHT 1\nPOINTS 300\n"
+    body = xyz.T.tobytes()
+    whole = head.encode() + b"DATA binary_compressed\n" + struct.pack("<II", len(body), len(body)) + body
+    (tmp_path / "c.pcd").write_bytes(whole)
+    assert np.array_equal(clouds.read(tmp_path / "c.pcd", Frame()).xyz, xyz)
