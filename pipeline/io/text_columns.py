@@ -88,7 +88,7 @@ def _is_numbering(column: F64) -> bool:
 
 
 def _fits(order: tuple[str, ...], values: F64) -> bool:
-    """Whether columns have the values of an order: colours of 8 or 16 bits or fractions, unit normals, integer classes."""
+    """Whether columns have the values of an order: whole or fractional colours, unit normals, integer classes."""
     for at, name in enumerate(order):
         if name == "r" and not _are_colours(values[:, at : at + 3]):
             return False

@@ -120,7 +120,7 @@ def test_the_command_and_poses_of_ones_own(sequence: Path, tmp_path: Path) -> No
         ("times.txt", "0\n1\n1\n2\n", "are not ascending"),
         ("times.txt", "none\n", "is not a list of times"),
         ("poses.txt", "1 2 3\n", "is not a pose file"),
-        ("velodyne/000001.bin", "12345", "is not a Velodyne sweep"),
+        ("velodyne/000001.bin", "12345", "is not a sweep"),
     ],
 )
 def test_a_damaged_sequence_is_refused(sequence: Path, tmp_path: Path, file: str, body: str, cause: str) -> None:

@@ -16,7 +16,7 @@ from pyproj import Transformer
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.types import UNCOLOURED, Frame, PointCloud
 from scan2sim.pipeline.importers.clouds_and_photos import import_las
-from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io import clouds, sweep_files
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.geodata import geokeys
@@ -356,7 +356,7 @@ def test_coordinates_are_held_against_the_area_of_use(crs: str, middle: Any, rea
 
 
 def table(order: str, seed: int = 4) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Rows of a text cloud with columns x y z r g b i (intensity of PTS) j (of 0..255) n (number) N (normal) c (class)."""
+    """Rows with columns x y z r g b i (intensity of PTS) j (intensity of 0..255) n (number) N (normal) c (class)."""
     rng = np.random.default_rng(seed)
     n = 500
     xyz = PLACE + rng.uniform(-20, 20, (n, 3))
@@ -443,3 +443,32 @@ def test_pcd_with_data_that_lzf_could_not_compress(tmp_path: Path) -> None:
     whole = head.encode() + b"DATA binary_compressed\n" + struct.pack("<II", len(body), len(body)) + body
     (tmp_path / "c.pcd").write_bytes(whole)
     assert np.array_equal(clouds.read(tmp_path / "c.pcd", Frame()).xyz, xyz)
+
+
+@pytest.mark.parametrize(
+    ("columns", "top", "layout"),
+    [
+        (("xyz", "i"), 1, None),
+        (("xyz", "i"), 255, None),
+        (("xyz", "i", "ring"), 255, "nuScenes"),
+        (("xyz", "i", "time", "ring"), 255, "x y z intensity time ring"),
+    ],
+)
+def test_bin_sweeps_are_read_by_their_values(tmp_path: Path, columns: tuple[str, ...], top: int, layout: Any) -> None:
+    rng, n = np.random.default_rng(0), 1200  # points whose bytes are divisible by every layout
+    parts = {"xyz": rng.uniform(-40, 40, (n, 3)), "i": rng.integers(0, top + 1, n), "ring": np.arange(n) % 32}
+    parts["i"][0] = top
+    parts["time"] = np.linspace(0, 0.1, n)
+    rows = np.column_stack([parts[name] for name in columns]).astype(np.float32)
+    rows.tofile(tmp_path / "c.bin")
+    sweep = sweep_files.read_sweep(tmp_path / "c.bin")
+    assert np.array_equal(sweep.xyz, rows[:, :3])
+    assert np.abs(sweep.intensity - np.rint(rows[:, 3] / top * 65535)).max() <= 1
+    note = sweep_files.reading(tmp_path / "c.bin")
+    assert (note is None) if layout is None else layout in present(note)
+
+
+def test_a_bin_of_other_values_is_refused(tmp_path: Path) -> None:
+    np.random.default_rng(0).normal(size=1200).astype(np.float32).tofile(tmp_path / "c.bin")
+    with pytest.raises(InputError, match="is not a sweep: its values are not those of"):
+        sweep_files.read_sweep(tmp_path / "c.bin")
