@@ -78,6 +78,7 @@ class Summary:
         scans: range of colours and intensities of each scan.
         having: number of points that have an intensity, a class, a time.
         timed: whether a time isn't 0.
+        no_codes: number of points whose class is no LAS code, and an example.
     """
 
     count: int = 0
@@ -87,6 +88,7 @@ class Summary:
     scans: dict[int, _Scan] = field(default_factory=dict)
     having: dict[str, int] = field(default_factory=dict)
     timed: bool = False
+    no_codes: tuple[int, float] = (0, 0.0)
 
     def add(self, part: Points) -> Points:
         """Add a chunk; returns its points that are used."""
@@ -106,6 +108,8 @@ class Summary:
         if part.intensity is not None:
             low, high = _extremes(part.intensity)
             scan.low, scan.high = min(scan.low, low), max(scan.high, high)
+        if part.classification is not None and (wrong := ~_are_codes(part.classification)).any():
+            self.no_codes = self.no_codes[0] + int(wrong.sum()), float(part.classification[wrong][0])
         if part.time is not None:
             self.timed |= bool(part.time.any())
         for name in ("intensity", "classification", "time"):
@@ -141,6 +145,9 @@ class Summary:
         if self.timed and self.having["time"] < self.count:
             missing = self.count - self.having["time"]
             found.append(f"{missing:,} of {self.count:,} points have no time: the times of the others are not used")
+        if self.no_codes[0]:
+            number, example = self.no_codes
+            found.append(f"{number:,} points have classes that are no LAS codes, such as {example:.0f}: unclassified")
         low = min((scan.low for scan in self.scans.values()), default=0.0)
         if self.has("intensity") and low < -1:
             high = max(scan.high for scan in self.scans.values())
@@ -164,14 +171,14 @@ def read_all(path: Path, parts: Iterable[Points], frame: Frame) -> PointCloud:
     """All points in `frame`'s local coordinates.
 
     Raises:
-        InputError: no point has finite coordinates, or a class is not a LAS code.
+        InputError: no point can be used.
     """
     found, kept = Summary(), list[Points]()
     for part in parts:
         used = found.add(part)
         kept.append(replace(used, xyz=frame.to_local(used.xyz).astype(np.float32)))  # half the memory
     _checked(path, found)
-    columns = [_columns(path, part, found) for part in kept]
+    columns = [_columns(part, found) for part in kept]
     joined = {
         name: None if columns[0][name] is None else np.concatenate([one[name] for one in columns])
         for name in columns[0]
@@ -179,7 +186,7 @@ def read_all(path: Path, parts: Iterable[Points], frame: Frame) -> PointCloud:
     return PointCloud(frame, np.concatenate([part.xyz for part in kept]).astype(np.float32, copy=False), **joined)
 
 
-def read_chunks(path: Path, parts: Iterable[Points], found: Summary, frame: Frame, size: int) -> Iterator[PointCloud]:
+def read_chunks(parts: Iterable[Points], found: Summary, frame: Frame, size: int) -> Iterator[PointCloud]:
     """The points in file order, at most `size` per chunk, each chunk in a frame with its origin near its points."""
     again = Summary()
     for part in map(again.add, parts):
@@ -187,7 +194,7 @@ def read_chunks(path: Path, parts: Iterable[Points], found: Summary, frame: Fram
             chunk = part.take(slice(at, at + size))
             x, y, z = np.floor(chunk.xyz.mean(axis=0) * frame.unit).tolist()
             near = replace(frame, origin=(x, y, z))
-            yield PointCloud(near, near.to_local(chunk.xyz).astype(np.float32), **_columns(path, chunk, found))
+            yield PointCloud(near, near.to_local(chunk.xyz).astype(np.float32), **_columns(chunk, found))
 
 
 def to_uint16(levels: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np.uint16]:
@@ -208,7 +215,7 @@ def to_uint16(levels: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[
     return np.clip(np.rint(np.nan_to_num(values) * factor), 0, 65535).astype(np.uint16)
 
 
-def _columns(path: Path, part: Points, found: Summary) -> dict[str, Any]:
+def _columns(part: Points, found: Summary) -> dict[str, Any]:
     """Attributes of a chunk as `PointCloud` has them: those that the cloud has, filled where the chunk has none."""
     n, scan = len(part), found.scans.get(part.scan, _Scan())
     columns: dict[str, Any] = dict.fromkeys(("rgb", "classification", "time", "intensity"))
@@ -217,7 +224,7 @@ def _columns(path: Path, part: Points, found: Summary) -> dict[str, Any]:
         columns["rgb"] = np.full((n, 3), UNCOLOURED, np.uint8) if missing else _to_uint8(part.rgb, scan.rgb)
     if found.has("classification"):
         missing = part.classification is None
-        columns["classification"] = np.full(n, UNCLASSIFIED, np.uint8) if missing else _codes(path, part.classification)
+        columns["classification"] = np.full(n, UNCLASSIFIED, np.uint8) if missing else _codes(part.classification)
     if found.has("time"):
         columns["time"] = np.asarray(part.time, np.float64)
     if found.has("intensity"):
@@ -236,13 +243,16 @@ def _to_uint8(rgb: Any, largest: float) -> U8:
     return levels
 
 
-def _codes(path: Path, classification: Any) -> U8:
-    codes = np.nan_to_num(classification, nan=-1)
-    wrong = (codes < 0) | (codes > 255) | (codes != np.rint(codes))
-    if wrong.any():
-        cause = f"contains class {codes[wrong][0]:g}, which is not a LAS code (0 to 255)"
-        raise InputError(path, cause, "Map it to one")
-    return codes.astype(np.uint8)
+def _codes(classification: Any) -> U8:
+    """LAS codes (N,); other numbers are unclassified."""
+    return np.where(_are_codes(classification), np.nan_to_num(classification), UNCLASSIFIED).astype(np.uint8)
+
+
+def _are_codes(classification: Any) -> Bools:
+    with np.errstate(invalid="ignore"):
+        return np.asarray(
+            (classification >= 0) & (classification <= 255) & (classification == np.rint(classification)), bool
+        )
 
 
 def _checked(path: Path, found: Summary) -> Summary:

@@ -45,7 +45,7 @@ def read(path: Path, frame: Frame) -> PointCloud:
 
 def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
     """The points in file order, at most `size` per chunk."""
-    return point_chunks.read_chunks(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
+    return point_chunks.read_chunks(_parts(path), point_chunks.summary(path, _parts(path)), frame, size)
 
 
 def _parts(path: Path) -> Iterator[Points]:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Frame, PointCloud
-from scan2sim.pipeline.io import file_checks, number_text, point_chunks
+from scan2sim.pipeline.io import file_checks, label_sets, number_text, point_chunks
 from scan2sim.pipeline.io.point_chunks import READ_POINTS, Points
 
 SUFFIXES = (".ply",)
@@ -29,7 +29,7 @@ TYPES = {
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 CLASSES = ("classification", "class", "label", "scalar_classification", "scalar_label")
-INTENSITIES = ("intensity", "intensities", "reflectivity", "scalar_intensity")
+INTENSITIES = ("intensity", "intensities", "reflectivity", "scalar_intensity", "reflectance")
 TIMES = ("gps_time", "time", "timestamp", "scalar_gpstime")
 SPLATS = ("f_dc_0", "packed_position")
 """Properties of Gaussian splats: colour (3DGS), and the position in compressed files (PlayCanvas)."""
@@ -74,7 +74,7 @@ def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]
     found = point_chunks.summary(path, _parts(path))
     removed = header.count - found.count
     notes = (f"{removed:,} points with NaN coordinates removed",) if removed else ()
-    return found.count, found.low, found.high, None, (*faces, *notes, *found.notes)
+    return found.count, found.low, found.high, None, (*faces, *notes, *_label_notes(header), *found.notes)
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
@@ -84,7 +84,12 @@ def read(path: Path, frame: Frame) -> PointCloud:
 
 def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
     """The points in file order, at most `size` per chunk, each chunk in a frame with its origin near its points."""
-    return point_chunks.read_chunks(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
+    return point_chunks.read_chunks(_parts(path), point_chunks.summary(path, _parts(path)), frame, size)
+
+
+def class_names(path: Path) -> tuple[bool, dict[int, str]]:
+    """Whether classes are our own codes, as those of recognized data sets are; and no names."""
+    return label_sets.matching(layout(path).row.names or ()) is not None, {}
 
 
 def layout(path: Path) -> Layout:
@@ -150,6 +155,17 @@ def _faces_note(path: Path, faces: int) -> tuple[str, ...]:
     )
 
 
+def _label_notes(header: Layout) -> tuple[str, ...]:
+    """Note on how a field of labels that isn't named as LAS's classes is read."""
+    names = header.row.names or ()
+    known, field = label_sets.matching(names), next((name for name in CLASSES if name in names), None)
+    if known is not None:
+        return (f"labels are read as those of {known.name}",)
+    if field is None or field.endswith("classification"):
+        return ()
+    return (f"field `{field}` is read as LAS classes (2 ground, 6 building, ...); map others with --classes",)
+
+
 def _elements(path: Path, lines: list[list[str]]) -> list[tuple[str, int, list[tuple[str, str]]]]:
     """Name, count and properties (type, name; type "list" for lists) of each element."""
     found: list[tuple[str, int, list[tuple[str, str]]]] = []
@@ -179,11 +195,12 @@ def _parts(path: Path) -> Iterator[Points]:
         def first(wanted: Sequence[str], rows: Any = rows, names: Sequence[str] = names) -> Any:
             return next((rows[name] for name in wanted if name in names), None)
 
+        known = label_sets.matching(names)
         rgb_names = next((three for three in COLOURS if set(three) <= set(names)), None)
         yield Points(
             np.column_stack([rows[axis].astype(np.float64) for axis in "xyz"]),
             None if rgb_names is None else np.column_stack([rows[name] for name in rgb_names]),
-            classification=first(CLASSES),
+            classification=first(CLASSES) if known is None else known.codes(rows[known.label]),
             time=first(TIMES),
             intensity=first(INTENSITIES),
         )

@@ -433,7 +433,6 @@ def test_columns_are_detected_and_assumptions_reported(tmp_path: Path, lines: st
         ("1 2 3\n4 5\n", "is not a cloud with 3 columns"),
         ("1 2 3\n4 five 6\n", "is not a cloud with 3 columns"),
         ("x,y,height,z\n1,2,3,4\n", "has two columns z"),
-        ("1 2 3 1 300\n", "class 300, which is not a LAS code"),
         ("nan nan nan\n", "no points with finite coordinates"),
         ("hello\nworld\n", "is not a cloud"),
     ],

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
+from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.types import UNCOLOURED, Frame, PointCloud
 from scan2sim.pipeline.importers.clouds_and_photos import import_las
@@ -472,3 +473,41 @@ def test_a_bin_of_other_values_is_refused(tmp_path: Path) -> None:
     np.random.default_rng(0).normal(size=1200).astype(np.float32).tofile(tmp_path / "c.bin")
     with pytest.raises(InputError, match="is not a sweep: its values are not those of"):
         sweep_files.read_sweep(tmp_path / "c.bin")
+
+
+def labelled(path: Path, fields: str, label: str, labels: np.ndarray) -> Path:
+    """A PLY with coordinates, further float fields, and labels."""
+    names = ["x", "y", "z", *fields.split(), label]
+    rows = np.random.default_rng(0).uniform(0, 50, (len(labels), len(names))).astype("<f4")
+    rows[:, -1] = labels
+    head = "".join(f"property float {name}\n" for name in names)
+    text = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{head}end_header\n"
+    path.write_bytes(text.encode() + rows.tobytes())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("fields", "label", "name", "expected"),
+    [
+        ("scalar_Intensity scalar_GPSTime scalar_ScanAngleRank", "scalar_Label", "Toronto-3D",
+         {0: "unclassified", 1: "road", 4: "building", 6: "pole", 7: "vehicle"}),
+        ("x_origin y_origin z_origin reflectance", "class", "Paris-Lille-3D",
+         {0: "unclassified", 1: "terrain", 2: "building", 8: "vehicle", 9: "high_vegetation"}),
+    ],
+)  # fmt: skip
+def test_labels_of_data_sets_are_mapped(
+    tmp_path: Path, fields: str, label: str, name: str, expected: dict[int, str]
+) -> None:
+    labels = np.resize(list(expected), N)
+    path = labelled(tmp_path / "c.ply", fields, label, labels)
+    assert any(name in note for note in clouds.read_header(path).notes)
+    whole, _ = ingested(tmp_path / "out", [path], Frame())
+    assert whole.classification.tolist() == [CODE[expected[label]] for label in labels.tolist()]
+
+
+def test_labels_that_are_no_las_codes_are_unclassified_and_counted(tmp_path: Path) -> None:
+    path = labelled(tmp_path / "c.ply", "a", "label", np.resize([2, 6, -1, 300], N))
+    notes = clouds.read_header(path).notes
+    assert any("field `label` is read as LAS classes" in note for note in notes)
+    assert any("1,500 points have classes that are no LAS codes" in note for note in notes)
+    assert present(clouds.read(path, Frame()).classification)[:4].tolist() == [2, 6, 1, 1]
