@@ -228,8 +228,8 @@ def _columns(part: Points, found: Summary) -> dict[str, Any]:
     if found.has("time"):
         columns["time"] = np.asarray(part.time, np.float64)
     if found.has("intensity"):
-        missing = part.intensity is None
-        columns["intensity"] = np.zeros(n, np.uint16) if missing else to_uint16(part.intensity, scan.low, scan.high)
+        levels = np.zeros(n, np.uint16) if part.intensity is None else to_uint16(part.intensity, scan.low, scan.high)
+        columns["intensity"] = levels
     return columns
 
 

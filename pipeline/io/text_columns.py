@@ -116,5 +116,5 @@ def _intensity_first(values: F64) -> bool:
     """Whether the last three of four columns are more like each other than the first three: colours are alike."""
     if len(values) < MIN_NUMBERED_ROWS or (values[:, :4].std(axis=0) == 0).any():
         return False
-    like = np.corrcoef(values[:, :4].T)
+    like = np.asarray(np.corrcoef(values[:, :4].T))
     return bool(like[2, 3] > like[0, 1] + CORRELATION_MARGIN)
