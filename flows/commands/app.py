@@ -114,7 +114,9 @@ Name = Annotated[
 TileOut = Annotated[Path, typer.Option("--out", "-o", help="Folder of the tile to create.")]
 Crs = Annotated[
     str | None,
-    typer.Option(help='CRS of the coordinates, if the files don\'t give one: "EPSG:32633", or "local" for none.'),
+    typer.Option(
+        help='CRS of the coordinates: "EPSG:32633", or "local" for none; wins over the files\' own, the default.'
+    ),
 ]
 Classes = Annotated[
     str,

@@ -203,7 +203,15 @@ def import_plain_clouds(
     no_images: NoImages = False,
     crs: Crs = None,
     units: Annotated[
-        str | None, typer.Option(help="Unit of the coordinates: m, ft or us-ft; default: that of the CRS.")
+        str | None,
+        typer.Option(help="Unit of the coordinates: m, ft or us-ft; wins over that of the CRS, the default."),
+    ] = None,
+    axes: Annotated[
+        str | None,
+        typer.Option(
+            metavar="enh|neh|...",
+            help="Order of the clouds' coordinates: easting, northing, height (default: enh); neh: northing first.",
+        ),
     ] = None,
     trajectory: Annotated[
         Path | None,
@@ -225,13 +233,13 @@ def import_plain_clouds(
     """Point clouds (LAS, PLY, E57, ...), optionally with posed photos: listed in a CSV file, or inside an E57."""
     source, warnings = PoseSourceParams.of("", {"pose_source": pose_source}).pose_source, list[str]()
     check = None
-    if trajectory is not None and source != "given":
+    if trajectory is not None and source != "given" and axes is None:
         check_target(out, overwrite)
         check = cached_check(assembled.check(clouds, trajectory, source, crs=crs, units=units), out)
     with progress("import") as report:
         path = import_las(
             clouds, out, photos=photos, cameras=cameras, images=images, embedded_images=not no_images, crs=crs,
-            units=units, trajectory=trajectory, trajectory_check=check, classes=parse_mapping(classes),
+            units=units, axes=axes, trajectory=trajectory, trajectory_check=check, classes=parse_mapping(classes),
             orthophoto=orthophoto, footprints=footprints, conventions=conventions, name=name, link=link,
             overwrite=overwrite, warn=warnings.append, report=report,
         )  # fmt: skip

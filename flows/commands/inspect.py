@@ -106,7 +106,7 @@ def _cloud(path: Path) -> tuple[str, Facts]:
         ("extent", _bounds(header.low, header.high)),
         ("density", f"{header.count / area:,.1f} per square unit of its bounding box"),
         ("colours", "yes" if cloud.rgb is not None else "intensity" if cloud.intensity is not None else "no"),
-        *(("warning", note) for note in header.notes),
+        *(("warning", note) for note in (*header.notes, *clouds.flag_notes(path))),
     ]
     if header.crs is None and len(cloud) >= MIN_POINTS:
         facts += _map_facts(cloud)

@@ -156,18 +156,24 @@ def _with_dropped(dropped: U8, own: U8 | None, predicted: U8, confidence: U8, so
 
 
 def _write_clouds(tile: Tile, out: Path, code: np.ndarray, confidence: np.ndarray, source: np.ndarray) -> None:
-    """Write every cloud of the tile with the classes of its points."""
+    """Write every cloud of the tile with the classes of its points; withheld points keep those of the file."""
     out.mkdir(parents=True, exist_ok=True)
-    counts = [las.read_header(path)[0] if path.suffix.lower() in LAS_SUFFIXES else 0 for path in tile.clouds]
-    if 0 in counts or sum(counts) != len(code):
+    is_las = all(path.suffix.lower() in LAS_SUFFIXES for path in tile.clouds)
+    files = [las.used_and_classes(path) for path in tile.clouds] if is_las else []
+    if sum(int(used.sum()) for used, _ in files) != len(code):
         raise DataError(
             tile.path,
             "has clouds that aren't LAS, or points with non-finite coordinates",
             "Convert the clouds to LAZ first",
         )
-    for path, n, start in zip(tile.clouds, counts, np.cumsum([0, *counts]), strict=False):
-        part = slice(int(start), int(start) + n)
-        write_classified(path, out / f"{path.stem}.laz", code[part], confidence[part], source[part])
+    at = 0
+    for path, (used, own) in zip(tile.clouds, files, strict=True):
+        part = slice(at, at + int(used.sum()))
+        at = part.stop
+        columns = own, np.full(len(own), 255, np.uint8), np.full(len(own), SOURCE_CLOUD, np.uint8)
+        for whole, given in zip(columns, (code, confidence, source), strict=True):
+            whole[used] = given[part]
+        write_classified(path, out / f"{path.stem}.laz", *columns)
 
 
 def _write_label_images(views: Path, probabilities: Path, out: Path) -> None:

@@ -30,15 +30,16 @@ from typing import Any, get_args
 
 import numpy as np
 
-from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.step import Report, silent
-from scan2sim.pipeline.core.types import F64, Camera, CameraModel, Frame, Trajectory
+from scan2sim.pipeline.core.types import F64, Camera, CameraModel, Frame, PointCloud, Trajectory
 from scan2sim.pipeline.importers.path_correction import PathCorrection, read_correction, write_corrected
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io import trajectory_check as check_io
 from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.geodata import area_of_use
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.geodata import orthophoto as orthophoto_io
 from scan2sim.pipeline.io.images import e57 as e57_images
@@ -76,6 +77,7 @@ def import_las(
     embedded_images: bool = True,
     crs: str | None = None,
     units: str | None = None,
+    axes: str | None = None,
     trajectory: Path | None = None,
     trajectory_check: Path | None = None,
     orthophoto: Path | None = None,
@@ -98,8 +100,10 @@ def import_las(
         cameras: CSV of cameras, if the photos' rows don't contain them.
         images: folder of the photos; default: that of the CSV.
         embedded_images: whether images with poses inside E57 files become photos of the tile.
-        crs: code or WKT, "local" without georeference; default: the clouds' own.
-        units: "m", "ft" or "us-ft", for local coordinates.
+        crs: code or WKT, "local" without georeference; takes precedence over the clouds' own, the default.
+        units: "m", "ft" or "us-ft"; takes precedence over the unit of the CRS, the default.
+        axes: order of the clouds' coordinates, a permutation of "enh" (easting, northing, height), the default; clouds
+            in another order are converted.
         trajectory: the scanner's path: .csv (a header line, then time,x,y,z per line) or .tum.
         trajectory_check: folder of a check of the trajectory (`pipeline.io.trajectory_check`); if it has a correction,
             points, photos and trajectory are corrected.
@@ -117,13 +121,16 @@ def import_las(
         Path of the `tile.toml`.
 
     Raises:
-        InputError: a file is missing or wrong, or there is no CRS. SettingError: `out` is not empty.
-        UnavailableError: a format's library isn't installed.
+        InputError: a file is missing or wrong, there is no CRS, or the coordinates contradict it.
+        SettingError: `out` is not empty, or `axes` can't be used. UnavailableError: a format's library isn't installed.
     """
+    order = axes_order(axes)
+    if axes is not None and trajectory_check is not None:
+        raise SettingError("axes", "a trajectory can't be checked against clouds with other axes", "Convert them first")
     headers = [cloud_io.read_header(Path(cloud)) for cloud in clouds]
-    known, unit = _common_crs(clouds, headers, crs, units)
+    known, unit = _common_crs(clouds, headers, crs, units, axes, warn)
     for cloud, header in zip(clouds, headers, strict=True):
-        for note in header.notes:
+        for note in (*header.notes, *cloud_io.flag_notes(Path(cloud))):
             warn(f"{cloud}: {note}")
     shots, rigs = read_photos(photos, cameras) if photos else ([], {})
     if shots and conventions is not None:
@@ -134,13 +141,13 @@ def import_las(
         cloud_names = []
         for i, cloud in enumerate(clouds):
             report(0.5 * i / len(clouds), f"cloud {Path(cloud).name}")
-            cloud_names.append(_add_cloud(Path(cloud), folder, Frame(known, unit=unit), link, correction))
+            cloud_names.append(_add_cloud(Path(cloud), folder, Frame(known, unit=unit), order, link, correction))
         for i, shot in enumerate(shots):
             report(0.5 + 0.5 * i / len(shots), f"photo {shot['file']}")
             for key, subfolder in (("file", "photos"), ("mask", "masks")):
                 if shot.get(key):
                     shot[key] = add_file(base / shot[key], folder, f"{subfolder}/{without_parents(shot[key])}", link)
-        if embedded_images:
+        if embedded_images and order == axes_order(None):
             embedded, lenses = e57_images.extract_all(map(Path, clouds), folder, warn, report)
             shots, rigs = shots + embedded, rigs | lenses
         if correction is not None:
@@ -167,18 +174,46 @@ def import_las(
 
 def common_crs(clouds: Sequence[Path], crs: str | None, units: str | None) -> tuple[str, float]:
     """CRS of clouds and metres per unit; arguments and errors as `import_las`."""
-    return _common_crs(clouds, [cloud_io.read_header(Path(cloud)) for cloud in clouds], crs, units)
+    headers = [cloud_io.read_header(Path(cloud)) for cloud in clouds]
+    return _common_crs(clouds, headers, crs, units, None, lambda _: None)
+
+
+def axes_order(axes: str | None) -> tuple[int, int, int]:
+    """Columns of easting, northing and height in coordinates whose order is `axes`, such as "neh"; default: "enh".
+
+    Raises:
+        SettingError: it isn't an order of these three.
+    """
+    text = (axes or "enh").lower()
+    if sorted(text) != sorted("enh"):
+        remedy = "Give the letters e (easting), n (northing) and h (height) in the order of the columns: neh"
+        raise SettingError("axes", f"{text[:20]!r} is no order of axes", remedy)
+    return text.index("e"), text.index("n"), text.index("h")
 
 
 def _common_crs(
-    clouds: Sequence[Path], headers: Sequence[cloud_io.Header], crs: str | None, units: str | None
+    clouds: Sequence[Path],
+    headers: Sequence[cloud_io.Header],
+    crs: str | None,
+    units: str | None,
+    axes: str | None,
+    warn: Callable[[str], None],
 ) -> tuple[str, float]:
-    if crs is None and any(h.crs is None for h in headers):
-        without_crs = next(cloud for cloud, h in zip(clouds, headers, strict=True) if h.crs is None)
-        raise InputError(
-            without_crs, "has no CRS", "Give it, for example --crs EPSG:32633, or --crs local without georeference"
-        )
-    return crs_io.common(Path("tile.toml"), crs, units, clouds, headers)
+    """CRS and metres per unit; coordinates that don't fit them are an error, or a warning if unit or axes are given."""
+    order = list(axes_order(axes))
+    for cloud, header in zip(clouds, headers, strict=True):
+        named = crs or header.crs
+        if named is None:
+            cause = next((note for note in header.notes if note.startswith(cloud_io.UNREADABLE_CRS)), "has no CRS")
+            remedy = "Give it, for example --crs EPSG:32633, or --crs local without georeference"
+            raise InputError(cloud, cause, remedy)
+        named = named if named == crs_io.LOCAL or units is None else crs_io.with_units(named, units)
+        wrong = area_of_use.misfit(named, header.low[order], header.high[order])
+        if wrong is not None and wrong.severe and axes is None and units is None:
+            raise InputError(cloud, wrong.cause, wrong.remedy)
+        if wrong is not None:
+            warn(f"{cloud}: {wrong}")
+    return crs_io.common(Path(clouds[0]), crs, units, clouds, headers, warn)
 
 
 def _converted(
@@ -251,7 +286,14 @@ def _corrected_photos(
     ]
 
 
-def _add_cloud(cloud: Path, folder: Path, frame: Frame, link: bool, correction: PathCorrection | None) -> str:
+def _add_cloud(
+    cloud: Path,
+    folder: Path,
+    frame: Frame,
+    order: tuple[int, int, int],
+    link: bool,
+    correction: PathCorrection | None,
+) -> str:
     """Copy, link, correct or convert (to LAZ) a cloud into the tile's folder; returns its name there."""
     if correction is not None:
         name = cloud.name if cloud.suffix.lower() in las.SUFFIXES else f"{cloud.stem}.laz"
@@ -260,13 +302,20 @@ def _add_cloud(cloud: Path, folder: Path, frame: Frame, link: bool, correction: 
             raise InputError(cloud, f"is the second cloud with the name {name} in the tile", "Rename one of them")
         write_corrected(cloud, folder / name, correction, frame)
         return name
-    if cloud.suffix.lower() in cloud_io.COPIED_SUFFIXES:
+    if cloud.suffix.lower() in cloud_io.COPIED_SUFFIXES and order == axes_order(None):
         return add_file(cloud, folder, cloud.name, link)
     name = f"{cloud.resolve().parent.name if cloud.name == 'ept.json' else cloud.stem}.laz"
     if (folder / name).exists():
         raise InputError(cloud, f"is the second cloud with the name {name} in the tile", "Rename one of them")
-    las.write_parts(folder / name, cloud_io.chunks(cloud, frame), software="")  # class codes stay those of the survey
+    parts = (_reordered(part, order) for part in cloud_io.chunks(cloud, frame))
+    las.write_parts(folder / name, parts, software="")  # class codes stay those of the survey
     return name
+
+
+def _reordered(cloud: PointCloud, order: tuple[int, int, int]) -> PointCloud:
+    """The cloud with the coordinates at the columns `order` as easting, northing and height."""
+    x, y, z = (cloud.frame.origin[column] for column in order)
+    return replace(cloud, frame=replace(cloud.frame, origin=(x, y, z)), xyz=cloud.xyz[:, list(order)], normal=None)
 
 
 def read_photos(photos: Path, cameras: Path | None = None) -> tuple[list[dict[str, Any]], dict[str, Camera]]:

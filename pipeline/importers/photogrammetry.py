@@ -74,6 +74,8 @@ def import_model(
         DataError: the GPS is insufficient to georeference the model.
     """
     header = None if cloud is None else cloud_io.read_header(cloud)  # fails early if it isn't a cloud
+    for note in (*header.notes, *cloud_io.flag_notes(cloud)) if cloud is not None and header is not None else ():
+        warn(f"{cloud}: {note}")
     images = images or (model if model.is_dir() else model.parent)
     found = read(kind, model, images)
     for note in found.notes:

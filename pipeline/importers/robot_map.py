@@ -21,6 +21,7 @@ from scan2sim.pipeline.core.types import F32, F64, Bools, Camera, Frame, PointCl
 from scan2sim.pipeline.geometry.height_map import exact_point_spacing
 from scan2sim.pipeline.geometry.upright import Upright, find_up, rotation_to_z
 from scan2sim.pipeline.io import clouds as cloud_io
+from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import crs as crs_io
@@ -83,7 +84,7 @@ def map_files(path: Path) -> list[Path]:
     """
     if not path.is_dir():
         return [path]
-    found = sorted(file for file in path.iterdir() if file.is_file() and cloud_io.is_cloud(file))
+    found = [file for file in file_checks.files(path) if cloud_io.is_cloud(file)]
     if not found:
         raise InputError(path, "contains neither a tile.toml nor point clouds", f"Use {cloud_io.SUPPORTED_FORMATS}")
     return found
@@ -207,7 +208,7 @@ def _read(clouds: Sequence[Path], warn: Callable[[str], None]) -> tuple[PointClo
     """All points with finite coordinates, once each, in the unit of the map (with a CRS in metres); and the CRS."""
     headers = [cloud_io.read_header(path) for path in clouds]
     for path, header in zip(clouds, headers, strict=True):
-        for note in header.notes:
+        for note in (*header.notes, *cloud_io.flag_notes(path)):
             warn(f"{path.name}: {note}")
     ends = np.array([(header.low, header.high) for header in headers])
     ends = np.where(np.isfinite(ends), ends, 0.0)

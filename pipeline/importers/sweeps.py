@@ -27,7 +27,7 @@ from scan2sim.pipeline.importers.place_sweeps import PLACED, PlacedPoints, merge
 from scan2sim.pipeline.importers.scanner_path import ScannerPath
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.images.image import SUFFIXES, read_rgb
-from scan2sim.pipeline.io.sweep_files import SWEEP_SUFFIXES, Sweep, list_files, read_sweep, timestamps
+from scan2sim.pipeline.io.sweep_files import SWEEP_SUFFIXES, Sweep, list_files, read_sweep, reading, timestamps
 from scan2sim.pipeline.io.trajectory import QUATERNIONS_HELP, QuaternionOrder
 from scan2sim.pipeline.pose_check.conventions import AXES, CameraAxes
 
@@ -194,6 +194,8 @@ def import_sweeps(
     if placing.invert_extrinsics:
         T_camera_scanner = np.asarray(np.linalg.inv(T_camera_scanner), np.float64)
     T = path.poses if placing.scanner_poses else path.poses @ T_camera_scanner  # scanner to world
+    if (layout := reading(files[0])) is not None:
+        warn(f"{files[0].name}: {layout}")
     if not checked and (tilt := tilt_warning(path, T_camera_scanner, placing)):
         warn(tilt)
     scanner_path = ScannerPath(path.times, T, None if placing.keep_unsure else path.unsure)

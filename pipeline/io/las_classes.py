@@ -14,6 +14,7 @@ from scan2sim.pipeline.core.errors import DataError, SpaceError, UnavailableErro
 from scan2sim.pipeline.core.types import U8
 from scan2sim.pipeline.io import las_header
 from scan2sim.pipeline.io.clouds.las import CHUNK_POINTS, open_las, read_parts
+from scan2sim.pipeline.io.las_header import GEOTIFF_RECORDS, PROJECTION_USER, WKT_RECORD
 
 EXTRA_DIMENSIONS = {"confidence": "255: sure", "class_source": "1 photos 2 shape 3 own"}
 """Extra-byte dimensions that are added (uint8 each): name and description, as written into the file."""
@@ -28,10 +29,8 @@ LEGACY_FLAGS = (
 LEGACY_OVERLAP_CLASS = 12
 SCAN_ANGLE_STEP_DEG = 0.006
 
-SPEC_USER, PROJECTION_USER = "LASF_Spec", "LASF_Projection"  # user ids of variable length records (VLR)
+SPEC_USER = "LASF_Spec"  # user id of variable length records (VLR)
 LOOKUP_RECORD, EXTRA_BYTES_RECORD, WAVEFORM_RECORD = 0, 4, 65535  # record ids of SPEC_USER
-WKT_RECORD, GEOTIFF_RECORDS = 2112, (34735, 34736, 34737)  # record ids of PROJECTION_USER
-PROJECTED_KEY, VERTICAL_KEY = 3072, 4096  # GeoTIFF keys
 
 
 def write_classified(source: Path, out: Path, code: U8, confidence: U8, class_source: U8) -> None:
@@ -246,25 +245,15 @@ def _is_waveforms(record: Any) -> bool:
 
 
 def _wkt_of_geotiff(header: Any) -> str | None:
-    """WKT of a CRS given as GeoTIFF keys, vertical CRS included; None if they name none, or one without EPSG codes."""
-    from pyproj import CRS
-    from pyproj.crs import CompoundCRS
+    """WKT of a CRS given as GeoTIFF keys, vertical CRS included; None if they name none, or one that can't be read."""
     from pyproj.exceptions import CRSError
 
-    keys = {k.id: k.value_offset for r in header.vlrs.get("GeoKeyDirectoryVlr") for k in r.geo_keys}
     try:
         crs = las_header.parsed_crs(header)
     except ValueError:
         return None
-    # keys of a user-defined projection are parsed to the CRS of its datum only
-    if crs is None or (PROJECTED_KEY in keys and not crs.is_projected):
+    if crs is None:
         return None
-    try:
-        vertical = CRS.from_epsg(keys[VERTICAL_KEY])
-        if vertical.is_vertical:
-            crs = CompoundCRS(f"{crs.name} + {vertical.name}", [crs, vertical])
-    except (KeyError, CRSError):  # no vertical CRS, or one of an ellipsoid
-        pass
     try:
         return str(crs.to_wkt("WKT1_GDAL"))  # LAS requires WKT 1
     except CRSError:

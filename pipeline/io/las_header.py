@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.io.geodata import geokeys
 
 COPY_AGAIN = "Copy or export the file again"
 HEADER_BYTES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
@@ -23,6 +24,8 @@ COMPRESSED_BITS = 0xC0
 """Bits of the point format that LAZ sets."""
 LAYERED_COMPRESSOR, ITEM_LAYERS = b"\3", {10: 9, 11: 1, 12: 2, 13: 1}
 """LAZ's compressor of point formats from 6 on, and the number of layers of each item type; extra bytes: one each."""
+PROJECTION_USER, WKT_RECORD, GEOTIFF_RECORDS = "LASF_Projection", 2112, (34735, 34736, 34737)
+"""User id of the records of a CRS, and their record ids."""
 VARIABLE_CHUNKS = 0xFFFFFFFF
 """Chunk size that means: the chunk table lists the points of each chunk, as in COPC files."""
 
@@ -154,14 +157,36 @@ def _check_layers(path: Path, file: BinaryIO, at: int, lengths: list[int], laszi
 
 
 def parsed_crs(header: Any) -> Any:
-    """The CRS (pyproj) in a laspy header; None if it has none.
+    """The CRS (pyproj) in a laspy header: of its WKT, else of its GeoTIFF keys with their units; None if it has none.
 
     Raises:
         ValueError: it can't be parsed.
     """
+    records = {r.record_id: r for r in (*header.vlrs, *(header.evlrs or ())) if r.user_id == PROJECTION_USER}
+    content = {key: record.record_data_bytes() for key, record in records.items()}
+    problems = []
+    for read, ids in ((_crs_of_wkt, (WKT_RECORD,)), (geokeys.crs_of_records, GEOTIFF_RECORDS)):
+        if ids[0] in content:
+            try:
+                crs = read(*(content.get(key, b"") for key in ids))
+            except ValueError as error:
+                problems.append(str(error))
+                continue
+            if crs is not None:
+                return crs
+    if problems:
+        raise ValueError("; ".join(problems))
+    return None
+
+
+def _crs_of_wkt(record: bytes) -> Any:
+    """The CRS of a WKT record; None if it is empty, or a local one of its own."""
+    from pyproj import CRS
     from pyproj.exceptions import CRSError
 
+    text = record.decode("utf-8", "replace").strip("\0 \t\r\n'\"")
     try:
-        return header.parse_crs()
-    except (CRSError, NotImplementedError) as error:  # laspy raises NotImplementedError for keys that it can't parse
-        raise ValueError(str(error)) from error
+        crs = CRS.from_user_input(text) if text else None
+    except CRSError:
+        raise ValueError(f"its WKT is no CRS: {text[:60]!r}") from None
+    return None if crs is None or crs.is_engineering else crs

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -15,31 +16,42 @@ BLOCK_BYTES = 1 << 24
 """Bytes that are parsed at a time; also the maximum length of a line."""
 
 
-def blocks(path: Path, file: BinaryIO) -> Iterator[list[str]]:
+def encoding_of(head: bytes) -> str:
+    """Encoding of a text by its first bytes: UTF-16 (with or without a mark), UTF-8, else that of Western Windows."""
+    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return "utf-16"
+    if len(head) > 3 and head[1::2].count(0) > 0.4 * len(head):
+        return "utf-16-le"
+    if len(head) > 3 and head[::2].count(0) > 0.4 * len(head):
+        return "utf-16-be"
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(head)  # a cut character at the end is no error
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8-sig"
+
+
+def blocks(path: Path, file: BinaryIO, encoding: str = "utf-8-sig") -> Iterator[list[str]]:
     """The lines of an open file from its current position, block by block, without empty ones.
 
     Raises:
         InputError: it is not text, or has a line longer than `BLOCK_BYTES`.
     """
-    rest = b""
-    while data := file.read(BLOCK_BYTES):
-        head, newline, tail = (rest + data).rpartition(b"\n")
-        if not newline and len(tail) >= BLOCK_BYTES:
+    rest, decoder = "", codecs.getincrementaldecoder(encoding)()
+    while True:
+        data = file.read(BLOCK_BYTES)
+        try:
+            text = rest + decoder.decode(data, final=not data)
+        except UnicodeDecodeError as error:
+            raise InputError(path, f"is not text ({error})", "Export it again, as UTF-8") from None
+        head, newline, rest = text.rpartition("\n") if data else (text, "", "")
+        if data and not newline and len(rest) >= BLOCK_BYTES:
             cause = f"has a line of more than {BLOCK_BYTES >> 20} MB"
             raise InputError(path, cause, "Export it again, one point per line")
-        rest = tail
-        if lines := _lines(path, head):
+        if lines := [line for line in head.splitlines() if line.strip()]:
             yield lines
-    if lines := _lines(path, rest):
-        yield lines
-
-
-def _lines(path: Path, data: bytes) -> list[str]:
-    try:
-        lines = data.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError(path, f"is not text ({error})", "Export it again, as UTF-8") from None
-    return [line for line in lines if line.strip()]
+        if not data:
+            return
 
 
 def numbers(lines: list[str], delimiter: str | None, width: int) -> F64:

@@ -1,6 +1,6 @@
 """Files of lidar sweeps: points in scanner axes, and their times.
 
-A sweep is a file of points: .bin (float32 x, y, z, reflectance, as in KITTI), .pcd, .ply, .las or .laz.
+A sweep is a file of points: .bin (float32 values, as in KITTI or nuScenes), .pcd, .ply, .las or .laz.
 """
 
 from __future__ import annotations
@@ -20,6 +20,11 @@ from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.point_chunks import to_uint16
 
 SWEEP_SUFFIXES = (".bin", ".pcd", ".ply", ".las", ".laz")
+BIN_LAYOUTS = {4: "x y z reflectance (KITTI)", 5: "x y z intensity ring (nuScenes)", 6: "x y z intensity time ring"}
+"""Layouts of .bin files by their number of float32 values per point."""
+MAX_COORDINATE = 10_000.0
+"""Coordinates in scanner axes are below this, metres."""
+MAX_RINGS = 1024
 DEFAULT_RATE_HZ = 10.0
 """Sweep rate that is assumed if there are no times."""
 MIN_NANOSECONDS = 1e17
@@ -100,23 +105,58 @@ def write_sweep(path: Path, sweep: Sweep) -> None:
 
 
 def read_bin(path: Path) -> tuple[F32, F32]:
-    """Points (N, 3) in scanner axes and reflectance (N,) of a KITTI sweep: float32 x, y, z, reflectance.
+    """Points (N, 3) in scanner axes and reflectance (N,), 0 to 1, of a sweep of float32 values (`BIN_LAYOUTS`).
 
     Raises:
         InputError: not such a file.
     """
+    data = _bin_rows(path)[0]
+    data = data[np.isfinite(data[:, :4]).all(axis=1)]
+    reflectance = data[:, 3]
+    largest = float(reflectance.max(initial=0))
+    if largest > 1:  # of 8 or 16 bits
+        reflectance = reflectance / np.float32(255 if largest <= 255 else 65535)
+    return data[:, :3], np.clip(reflectance, 0, 1)
+
+
+def reading(path: Path) -> str | None:
+    """Note on the layout of a .bin sweep that isn't KITTI's; errors as `read_bin`."""
+    layout = _bin_rows(path)[1] if path.suffix.lower() == ".bin" else BIN_LAYOUTS[4]
+    return None if layout == BIN_LAYOUTS[4] else f"read as {layout}, by its values"
+
+
+def _bin_rows(path: Path) -> tuple[F32, str]:
+    """All values of a .bin sweep, a row for each point, and their layout: the first one that the values fit."""
+    size = file_checks.check_data(path).stat().st_size
+    fitting = [width for width in BIN_LAYOUTS if size % (4 * width) == 0]
+    if not fitting:
+        raise InputError(
+            path, f"is not a sweep: {size:,} bytes are no whole number of points of 4 to 6 floats", "Copy it again"
+        )
     data = np.fromfile(path, np.float32)
-    if data.size == 0 or data.size % 4:
-        raise InputError(path, f"is not a Velodyne sweep ({data.size * 4} bytes)", "Copy it again")
-    data = data.reshape(-1, 4)
-    data = data[np.isfinite(data).all(axis=1)]
-    return data[:, :3], np.clip(data[:, 3], 0, 1)
+    for width in fitting:
+        rows = data.reshape(-1, width)
+        if _fits_bin(rows):
+            return rows, BIN_LAYOUTS[width]
+    texts = "; ".join(BIN_LAYOUTS[width] for width in fitting)
+    raise InputError(path, f"is not a sweep: its values are not those of {texts}", "Convert it to PCD or PLY")
+
+
+def _fits_bin(rows: F32) -> bool:
+    """Whether rows are points: intensities aren't negative, rings are small integers, times are finite."""
+    known = rows[np.isfinite(rows[:, :4]).all(axis=1)]
+    if not len(known):
+        return True
+    intensity, last = known[:, 3], known[:, -1]
+    in_range = np.abs(known[:, :3]).max() < MAX_COORDINATE and intensity.min() >= -1 and intensity.max() <= 65535
+    rings = known.shape[1] == 4 or ((last >= -1).all() and last.max() < MAX_RINGS and (last == np.rint(last)).all())
+    return bool(in_range and rings)
 
 
 def _intensities(levels: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:
     """Scale intensities of 0..1, 0..255 or more to 0..65535; zeros if there are none."""
-    scaled = to_uint16(levels, float(np.nan_to_num(levels).max(initial=0)))
-    return np.zeros(len(levels), np.uint16) if scaled is None else scaled
+    known = np.nan_to_num(levels)
+    return to_uint16(known, float(known.min(initial=0)), float(known.max(initial=0)))
 
 
 def read_times(path: Path) -> F64:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,21 +38,24 @@ class IngestParams(Params):
 def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> Done:
     """Read all clouds (`inputs` in order of name), remove points with non-finite coordinates, and join them.
 
-    Attributes that only some of the clouds have are dropped, except for colours and classes, which become grey and
-    "unclassified" where they are missing.
+    The result has the colours, classes and intensities that any of the clouds has: grey, "unclassified" and 0 where
+    they are missing. Times are dropped unless all clouds have them.
 
     Raises:
         DataError: fewer than 1000 points in total, or an extent above 5 km.
     """
     from scan2sim.pipeline.io import clouds
+    from scan2sim.pipeline.io.geodata import area_of_use, crs
 
     frame = Frame(params.context.crs, params.context.origin, params.context.unit)
     parts: list[PointCloud] = []
     warnings = []
     for i, name in enumerate(sorted(inputs)):
         report(i / len(inputs), f"reading {inputs[name].name}")
-        warnings += [f"{inputs[name].name}: {note}" for note in clouds.read_header(inputs[name]).notes]
+        header = clouds.read_header(inputs[name])
         cloud = clouds.read(inputs[name], frame)
+        notes = (*header.notes, clouds.left_out(header.count, len(cloud)), crs.contradiction(header.crs, frame.crs))
+        warnings += [f"{inputs[name].name}: {note}" for note in notes if note]
         if cloud.classification is not None and len(cloud):
             table = clouds.code_table(inputs[name], params.context.classes)
             unmapped = classes.unmapped_codes_warning(np.bincount(cloud.classification, minlength=256), table)
@@ -62,6 +66,12 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
             warnings.append(f"{inputs[name].name}: {np.count_nonzero(~finite):,} points with NaN coordinates removed")
             cloud = cloud.take(finite)
         parts.append(cloud)
+    warnings += _missing_attributes(parts, [path.name for _, path in sorted(inputs.items())])
+    if any(part.intensity is not None for part in parts):
+        parts = [
+            part if part.intensity is not None else replace(part, intensity=np.zeros(len(part), np.uint16))
+            for part in parts
+        ]
     cloud = PointCloud.join(parts)
     if len(cloud) < MIN_POINTS:
         names = ", ".join(str(path) for path in inputs.values())
@@ -75,6 +85,8 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
             f"the limit of a tile is {MAX_EXTENT_M / 1000:g} km",
             "Remove outliers and check the unit of the CRS, or cut the cloud into tiles with `scan2sim tile`",
         )
+    wrong = area_of_use.misfit(frame.crs, frame.to_crs(low), frame.to_crs(high))
+    warnings += [] if wrong is None else [str(wrong)]
     report(0.9, "writing")
     cloud.save(out / "cloud.npz")
     metrics = {
@@ -87,4 +99,20 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
     return Done({"cloud": out / "cloud.npz"}, metrics, warnings)
 
 
-INGEST = Step("ingest", 2, ingest, IngestParams, memory=(0.4, 12))
+def _missing_attributes(parts: Sequence[PointCloud], names: Sequence[str]) -> list[str]:
+    """Warnings about attributes that only some of the clouds have."""
+    effects = {
+        "rgb": ("colours", "its points are grey until photos or neighbours colour them"),
+        "classification": ("classes", "its points are unclassified"),
+        "intensity": ("intensities", "they are taken as 0"),
+        "time": ("times", "the times of the other clouds are not used"),
+    }
+    found = []
+    for attribute, (what, effect) in effects.items():
+        lacking = [i for i, part in enumerate(parts) if getattr(part, attribute) is None]
+        if 0 < len(lacking) < len(parts):
+            found += [f"{names[i]}: no {what}, unlike others ({len(parts[i]):,} points): {effect}" for i in lacking]
+    return found
+
+
+INGEST = Step("ingest", 3, ingest, IngestParams, memory=(0.4, 12))

@@ -26,6 +26,7 @@ from scan2sim.pipeline.geometry.path_sampling import resample_path
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.geodata import orthophoto
 from scan2sim.pipeline.io.survey import read_survey, write_survey
 from scan2sim.pipeline.io.tile import MIN_POINTS, TileFile, read_spec, read_tile, tile_name, write_tile
@@ -95,7 +96,12 @@ class Corridor:
         tile = replace(tile, views=tile.views[: len(spec.photos)])  # without the orthophoto, which all tiles share
         headers = [clouds.read_header(cloud) for cloud in tile.clouds]
         low, high = np.min([h.low for h in headers], axis=0), np.max([h.high for h in headers], axis=0)
-        notes = tuple(f"{c.name}: {note}" for c, h in zip(tile.clouds, headers, strict=True) for note in h.notes)
+        notes = tuple(
+            f"{cloud.name}: {note}"
+            for cloud, header in zip(tile.clouds, headers, strict=True)
+            for note in (*header.notes, crs_io.contradiction(header.crs, tile.frame.crs))
+            if note
+        )
         return cls(tile, spec, low, high, tuple(h.count for h in headers), notes)
 
 
@@ -217,15 +223,16 @@ def _distribute(
 def _assign(
     corridor: Corridor, seed_xy: F64, options: CutParams, spool: Spool, report: Report
 ) -> tuple[int, list[str]]:
-    """Assign all points to tiles; returns the number of points too far from the trajectory, and class code warnings."""
+    """Assign all points to tiles; returns the number of points too far from the trajectory, and warnings on points."""
     from scipy.spatial import cKDTree
 
     tile = corridor.tile
     path = None
     if tile.trajectory is not None:
         path = cKDTree(resample_path((tile.trajectory.positions + np.asarray(tile.frame.origin))[:, :2]))
-    total, done, far, code_warnings = sum(corridor.counts), 0, 0, list[str]()
-    for cloud in tile.clouds:
+    total, done, far, warnings = sum(corridor.counts), 0, 0, list[str]()
+    for cloud, declared in zip(tile.clouds, corridor.counts, strict=True):
+        before = done
         table, count = clouds.code_table(cloud, tile.classes), np.zeros(256, np.int64)
         for part in clouds.chunks(cloud, tile.frame, CHUNK_POINTS):
             report(READING_PROGRESS * done / total, f"reading {cloud.name}")
@@ -248,9 +255,9 @@ def _assign(
                     chosen = rows[points[in_tile]]
                     chosen["own"] = in_tile < len(xy)
                     spool.add(int(tiles[in_tile[0]]), chosen, part)
-        warning = unmapped_codes_warning(count, table)
-        code_warnings += [f"{cloud.name}: {warning}"] if warning else []
-    return far, code_warnings
+        notes = unmapped_codes_warning(count, table), clouds.left_out(declared, done - before)
+        warnings += [f"{cloud.name}: {note}" for note in notes if note]
+    return far, warnings
 
 
 class _Writer:

@@ -104,14 +104,14 @@ class Spool:
     def parts(self, tile: int, crs: str) -> Iterator[PointCloud]:
         """A tile's points in order, in chunks, in a frame with its origin in the middle of them.
 
-        If only some points have colours or classes, the others are grey or unclassified; other attributes that not all
-        points have are omitted (as in `PointCloud.join`).
+        If only some points have colours, classes or intensities, the others are grey, unclassified or of intensity 0;
+        times are omitted unless all points have them (as in step `ingest`).
         """
         points = self.tiles[tile]
         middle = np.floor(self.base + (points.low.astype(np.float64) + points.high) / 2 * COORDINATE_STEP)
         x, y, z = (middle * self.unit).tolist()
         frame = Frame(crs, (x, y, z), self.unit)
-        kept = (points.present & {"rgb", "classification"}) | (points.present - points.missing)
+        kept = (points.present & {"rgb", "classification", "intensity"}) | (points.present - points.missing)
         with open(self._file(tile), "rb") as file:
             while len(rows := np.fromfile(file, POINT_DTYPE, CHUNK_POINTS)):
                 local = (rows["xyz"] * COORDINATE_STEP - (middle - self.base)) * self.unit

@@ -6,9 +6,12 @@ import pickle
 from pathlib import Path
 
 import cv2
+import laspy
 import numpy as np
 import pytest
 
+from scan2sim.flows.commands.segment import _write_clouds
+from scan2sim.pipeline.core.types import Frame, PointCloud, Tile
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.segmentation.metrics import confusion
@@ -82,3 +85,18 @@ def test_evaluate_compares_pixels_with_labels(small_street: Path, tmp_path: Path
     printed = stdout_of(scan2sim("segment", "evaluate", tmp_path / "set"))
     values = {line.split()[0]: float(line.split()[1]) for line in printed.splitlines() if len(line.split()) == 2}
     assert values["road"] > 0.6 and values["building"] > 0.6 and 0 < values["mean"] < 1
+
+
+def test_withheld_points_keep_the_class_of_the_file(tmp_path: Path) -> None:
+    cloud = tmp_path / "c.laz"
+    las.write(
+        cloud, PointCloud(Frame(), np.zeros((5, 3), np.float32), classification=np.array([2, 6, 2, 6, 2], np.uint8))
+    )
+    data = laspy.read(cloud)
+    data.withheld = np.array([0, 1, 0, 0, 1])
+    data.write(cloud)
+    columns = (np.array(values, np.uint8) for values in ((5, 11, 66), (7, 8, 9), (1, 1, 2)))
+    _write_clouds(Tile(tmp_path / "tile.toml", "t", Frame(), (cloud,)), tmp_path / "out", *columns)
+    done = laspy.read(tmp_path / "out" / "c.laz")
+    assert np.array_equal(done.classification, [5, 6, 11, 66, 2])
+    assert np.array_equal(done.confidence, [7, 255, 8, 9, 255])

@@ -1,7 +1,8 @@
 """Point cloud readers: one module per format (`pipeline.core.plugins`), selected by the file's suffix.
 
 A format's module has `SUFFIXES`, `read_header(path) -> (count, low, high, crs[, notes])`, `read(path, frame)` and
-`chunks(path, frame, size)`, and, if its files name classes, `class_names(path) -> (ours, names)`.
+`chunks(path, frame, size)`; if its files name classes, `class_names(path) -> (ours, names)`; and if its points
+have flags that the header doesn't count, `flags(path) -> (withheld, overlap)`.
 """
 
 from __future__ import annotations
@@ -15,12 +16,23 @@ from scan2sim.pipeline.core import classes, plugins
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import F64, U8, Frame, PointCloud
-from scan2sim.pipeline.io import file_checks
+from scan2sim.pipeline.io import file_checks, mesh_files
 
 CHUNK_POINTS = 2_000_000
 COPIED_SUFFIXES = (".las", ".laz", ".ply")
 """Files that are copied into a tile unchanged; other formats are converted to LAZ (`scan2sim import clouds`)."""
+SIGNATURES = {
+    b"LASF": (".las", "las"),
+    b"ply\n": (".ply", "ply"),
+    b"ply\r": (".ply", "ply"),
+    b"# .PCD": (".pcd", "pcd"),
+    b"ASTM-E57": (".e57", "e57"),
+}
+"""First bytes of cloud files: suffix and format."""
 SUPPORTED_FORMATS = "LAS, LAZ, COPC, PLY, E57, PCD, XYZ (.xyz .csv .txt .asc) or EPT (its ept.json)"
+
+UNREADABLE_CRS = "its CRS can't be read"
+"""Beginning of the note on a CRS that counts as none."""
 
 
 @dataclass(frozen=True)
@@ -73,13 +85,26 @@ def is_cloud(path: Path) -> bool:
 def _reader(path: Path) -> Any:
     found = formats()
     name = found.get(path.name) or found.get(path.suffix.lower())
+    if name is None and path.suffix.lower() in mesh_files.SUFFIXES:
+        raise InputError(path, "is a mesh, not a point cloud", f"Import the mesh: scan2sim import map {path.name}")
     if name is None:
         cause = f"has an unknown cloud format ({path.suffix or 'no suffix'})"
         raise InputError(path, cause, f"Use {SUPPORTED_FORMATS}")
-    file_checks.check(path)
+    file_checks.check_data(path)
+    _check_suffix(path, name)
     reader = plugins.module(__name__, name)
     require(str(path), *plugins.needs(reader))
     return reader
+
+
+def _check_suffix(path: Path, name: str) -> None:
+    """Raise an error if a file's content is of another format than its suffix says."""
+    with path.open("rb") as file:
+        head = file.read(max(map(len, SIGNATURES)))
+    for signature, (suffix, found) in SIGNATURES.items():
+        if head.startswith(signature) and found != name:
+            cause = f"is a {suffix[1:].upper()} file by its content, though its name ends in {path.suffix}"
+            raise InputError(path, cause, f"Rename it to {path.stem}{suffix}")
 
 
 def read_header(path: Path) -> Header:
@@ -99,6 +124,30 @@ def read(path: Path, frame: Frame) -> PointCloud:
     """
     cloud: PointCloud = _reader(path).read(path, frame)
     return cloud
+
+
+def left_out(declared: int, read: int) -> str:
+    """Note on points that `read` leaves out though the header counts them; empty if there are none.
+
+    Args:
+        declared: number of points by the header.
+        read: number of points that were read.
+    """
+    return f"{declared - read:,} withheld points are not used" if read < declared else ""
+
+
+def flag_notes(path: Path) -> tuple[str, ...]:
+    """Notes on points with the withheld or overlap flag of LAS; a header doesn't count them, all points are read.
+
+    Raises:
+        InputError: as `read`.
+    """
+    reader = _reader(path)
+    if not hasattr(reader, "flags"):
+        return ()
+    withheld, overlap = reader.flags(path)
+    second_line = f"{overlap:,} points have the overlap flag (a second flight line); they are used"
+    return tuple(note for note in (left_out(withheld, 0), second_line if overlap else "") if note)
 
 
 def code_table(path: Path, given: Mapping[int, int]) -> U8:

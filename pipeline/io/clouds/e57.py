@@ -1,8 +1,8 @@
 """E57 clouds (ASTM E2807), read with pye57: all scans of a file, each transformed by its own pose.
 
-Supported: Cartesian and spherical coordinates; colours and intensities, scaled by the scan's limits; times relative to
+Supported: Cartesian and spherical coordinates; colours and intensities, scaled by each scan's limits; times relative to
 `acquisitionStart`; a field `classification`, which some writers add. The CRS is read from `coordinateMetadata` if that
-contains one. Points that a scan marks as invalid are removed.
+contains one. Points that a scan marks as invalid are removed, colours that it marks as invalid are unknown.
 
 Source: ASTM E2807-11, tables 1 to 20 (as in libE57Format's documentation, https://github.com/asmaloney/libE57Format).
 """
@@ -28,13 +28,14 @@ CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 COLOURS = ("colorRed", "colorGreen", "colorBlue")
 INVALID = ("cartesianInvalidState", "sphericalInvalidState")
-OPTIONAL_FIELDS = ("intensity", "timeStamp", "classification")
+COLOUR_INVALID = "isColorInvalid"
+OPTIONAL_FIELDS = ("intensity", "timeStamp", "classification", COLOUR_INVALID)
 
 
-def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
-    """Number of valid points of all scans, low and high corner, CRS as WKT or None."""
+def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
+    """Number of valid points of all scans, low and high corner, CRS as WKT or None, and notes."""
     found = point_chunks.summary(path, _parts(path))
-    return found.count, found.low, found.high, _crs(path)
+    return found.count, found.low, found.high, _crs(path), found.notes
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
@@ -44,7 +45,7 @@ def read(path: Path, frame: Frame) -> PointCloud:
 
 def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
     """The points in file order, at most `size` per chunk."""
-    return point_chunks.read_chunks(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
+    return point_chunks.read_chunks(_parts(path), point_chunks.summary(path, _parts(path)), frame, size)
 
 
 def _parts(path: Path) -> Iterator[Points]:
@@ -52,7 +53,7 @@ def _parts(path: Path) -> Iterator[Points]:
         try:
             scans = file.root()["data3D"]
             for i in range(len(scans)):
-                yield from _scan(file, scans[i])
+                yield from _scan(file, scans[i], i)
         except InputError:
             raise
         except Exception as error:  # pye57's own type, or any other that its bindings raise for damaged files
@@ -74,7 +75,7 @@ def open_file(path: Path) -> Any:
         raise _unreadable(path, error) from None
 
 
-def _scan(file: Any, node: Any) -> Iterator[Points]:
+def _scan(file: Any, node: Any, number: int) -> Iterator[Points]:
     from pye57 import libe57
     from pye57.scan_header import ScanHeader
 
@@ -93,12 +94,12 @@ def _scan(file: Any, node: Any) -> Iterator[Points]:
     with closing(header.points.reader(buffers)) as reader:
         while n := reader.read():
             done += n
-            yield _points({name: array[:n].copy() for name, array in values.items()}, coordinates, pose, node)
+            yield _points({name: array[:n].copy() for name, array in values.items()}, coordinates, pose, node, number)
     if done != header.point_count:
         raise ValueError(f"{done:,} of {header.point_count:,} points of a scan can be read")
 
 
-def _points(values: dict[str, F64], coordinates: tuple[str, ...], pose: F64, node: Any) -> Points:
+def _points(values: dict[str, F64], coordinates: tuple[str, ...], pose: F64, node: Any, number: int) -> Points:
     xyz = np.column_stack([values[name] for name in coordinates])
     if coordinates is SPHERICAL:
         distance, azimuth, elevation = xyz.T
@@ -110,6 +111,8 @@ def _points(values: dict[str, F64], coordinates: tuple[str, ...], pose: F64, nod
     rgb: npt.NDArray[Any] | None = None
     if set(COLOURS) <= set(values):
         rgb = np.column_stack([_fraction(values[name], node, "colorLimits", name) for name in COLOURS])
+        if COLOUR_INVALID in values:
+            rgb[values[COLOUR_INVALID] != 0] = np.nan
     intensity = values.get("intensity")
     if intensity is not None:
         intensity = _fraction(intensity, node, "intensityLimits", "intensity")
@@ -122,6 +125,7 @@ def _points(values: dict[str, F64], coordinates: tuple[str, ...], pose: F64, nod
         classification=values.get("classification"),
         time=time,
         intensity=intensity,
+        scan=number,
     )
 
 

@@ -1,5 +1,7 @@
 """EPT clouds (Entwine Point Tiles 1.1) in a local folder: `ept.json`, `ept-hierarchy/`, `ept-data/`.
 
+Points with the withheld flag of LAS are left out: dimension `Withheld`, or its bit in `ClassFlags`.
+
 The nodes of the octree are read one after another, coarse ones first. Supported data types: laszip, binary (the
 schema's dimensions, packed) and zstandard (the same, compressed). A cloud is many files, so a tile can't use it
 directly: `scan2sim import clouds` converts it to one LAZ file.
@@ -20,7 +22,7 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.optional_deps import require
-from scan2sim.pipeline.core.types import F64, Frame, PointCloud
+from scan2sim.pipeline.core.types import F64, Bools, Frame, PointCloud
 from scan2sim.pipeline.io import file_checks, point_chunks
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.point_chunks import READ_POINTS, Points
@@ -33,14 +35,16 @@ NODE_SUFFIXES = {"laszip": ".laz", "binary": ".bin", "zstandard": ".zst"}
 DTYPE_KINDS = {"signed": "i", "unsigned": "u", "float": "f"}
 MAX_JSON_BYTES = 100 << 20
 """Maximum size of a JSON file; Entwine splits its hierarchy into far smaller ones."""
+WITHHELD_BIT = 4
+"""Bit of the dimension ClassFlags (LAS 1.4 R15, table 16)."""
 NODE_KEY = re.compile(r"\d{1,3}-\d{1,10}-\d{1,10}-\d{1,10}")
 """Depth, x, y, z."""
 
 
-def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
-    """Number of points, low and high corner of the points (not of the octree), CRS as WKT or None."""
+def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
+    """Number of points, low and high corner of the points (not of the octree), CRS as WKT or None, and notes."""
     found = point_chunks.summary(path, _parts(path))
-    return found.count, found.low, found.high, _crs(path, _json(path))
+    return found.count, found.low, found.high, _crs(path, _json(path)), found.notes
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
@@ -50,7 +54,7 @@ def read(path: Path, frame: Frame) -> PointCloud:
 
 def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
     """The points, coarse nodes first, at most `size` per chunk."""
-    return point_chunks.read_chunks(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
+    return point_chunks.read_chunks(_parts(path), point_chunks.summary(path, _parts(path)), frame, size)
 
 
 def _parts(path: Path) -> Iterator[Points]:
@@ -104,6 +108,7 @@ def _laszip(tile: Path) -> Iterator[Points]:
             classification=np.array(part.classification),
             time=np.array(part.gps_time) if "gps_time" in names else None,
             intensity=np.array(part.intensity),
+            withheld=~las.in_use(part),
         )
 
 
@@ -126,7 +131,15 @@ def _packed(tile: Path, schema: Schema, count: int) -> Iterator[Points]:
             classification=column(rows, "Classification"),
             time=column(rows, "GpsTime"),
             intensity=column(rows, "Intensity"),
+            withheld=_withheld(rows),
         )
+
+
+def _withheld(rows: npt.NDArray[Any]) -> Bools | None:
+    names = rows.dtype.names or ()
+    if "Withheld" in names:
+        return np.asarray(rows["Withheld"] != 0)
+    return np.asarray(rows["ClassFlags"] & WITHHELD_BIT != 0) if "ClassFlags" in names else None
 
 
 def _records(tile: Path, row: np.dtype[Any]) -> Iterator[npt.NDArray[Any]]:

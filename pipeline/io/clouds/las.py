@@ -1,4 +1,7 @@
-"""LAS, LAZ and COPC clouds, read and written with laspy."""
+"""LAS, LAZ and COPC clouds, read and written with laspy.
+
+Points with the withheld flag are not read: they "should not be included in processing" (LAS 1.4 R15, table 9).
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,12 @@ from dataclasses import replace
 from datetime import date
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from scan2sim.pipeline.core.errors import DataError, InputError
-from scan2sim.pipeline.core.types import F64, Frame, PointCloud
+from scan2sim.pipeline.core.types import F64, U8, Bools, Frame, PointCloud
 from scan2sim.pipeline.io import file_checks, las_header
 from scan2sim.pipeline.io.las_header import truncated
 
@@ -31,6 +34,13 @@ BOUNDS_MARGIN = 100.0
 """CRS units by which the header's bounds may exceed twice the extent of the sampled points."""
 SOFTWARE = "scan2sim"
 """Generating software in the header of files of this project: codes from 64 on are `pipeline.core.classes` then."""
+
+
+class Flags(NamedTuple):
+    """Number of points with the withheld flag (not read), and of others with the overlap flag (read)."""
+
+    withheld: int
+    overlap: int
 
 
 def open_las(path: Path, **options: Any) -> Any:
@@ -57,7 +67,8 @@ def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]
         header = reader.header
         if header.point_count == 0:
             raise InputError(path, "contains no points", "Remove it from the tile")
-        notes, crs = las_header.check(path), _crs(path, header)
+        crs, crs_notes = _crs(header)
+        notes = (*las_header.check(path), *crs_notes)
         low, high = np.array(header.mins), np.array(header.maxs)
     if not _bounds_plausible(path, low, high):
         declared = low, high
@@ -108,7 +119,7 @@ def _bounds(path: Path, size: int, modified_ns: int) -> tuple[F64, F64]:
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
-    """Read all points into local coordinates, chunk by chunk; 16-bit colours become 8-bit ones."""
+    """Read all points but withheld ones into local coordinates, chunk by chunk; 16-bit colours become 8-bit ones."""
     with open_las(path) as reader:
         n = reader.header.point_count
         names = set(reader.header.point_format.dimension_names)
@@ -122,7 +133,7 @@ def read(path: Path, frame: Frame) -> PointCloud:
             cause = f"declares {n:,} points, which don't fit into memory"
             raise InputError(path, cause, "Cut it into smaller files first") from None
         at = 0
-        for part in read_parts(path, reader, CHUNK_POINTS):
+        for part in _used_parts(path, reader, CHUNK_POINTS):
             rows = slice(at, at + len(part))
             xyz[rows] = frame.to_local(_coordinates(part))
             classification[rows] = part.classification
@@ -132,9 +143,56 @@ def read(path: Path, frame: Frame) -> PointCloud:
             if rgb is not None:
                 rgb[rows] = _colours(part)
             at += len(part)
-    if time is not None and not time.any():  # time fields that were never filled
-        time = None
-    return PointCloud(frame, xyz, _to_uint8(rgb), classification=classification, time=time, intensity=intensity)
+    cloud = PointCloud(
+        frame,
+        xyz[:at],
+        None if rgb is None else _to_uint8(rgb[:at]),
+        classification=classification[:at],
+        time=None if time is None or not time[:at].any() else time[:at],  # None: time fields that were never filled
+        intensity=intensity[:at],
+    )
+    return cloud
+
+
+def flags(path: Path) -> Flags:
+    """Count the points that have flags; decompresses the file's flags.
+
+    Raises:
+        InputError: missing, truncated or damaged.
+    """
+    stat = path.stat()
+    return _count_flags(path, stat.st_size, stat.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=256)
+def _count_flags(path: Path, size: int, modified_ns: int) -> Flags:
+    """`flags` of a file; size and modification time are the cache key."""
+    from laspy import DecompressionSelection
+
+    wanted = DecompressionSelection.XY_RETURNS_CHANNEL | DecompressionSelection.FLAGS
+    withheld = overlap = 0
+    with open_las(path, decompression_selection=wanted) as reader:
+        has_overlap = "overlap" in set(reader.header.point_format.dimension_names)
+        for part in read_parts(path, reader, CHUNK_POINTS):
+            used = in_use(part)
+            withheld += int(np.count_nonzero(~used))
+            overlap += int(np.count_nonzero(np.asarray(part.overlap)[used])) if has_overlap else 0
+    return Flags(withheld, overlap)
+
+
+def used_and_classes(path: Path) -> tuple[Bools, U8]:
+    """Whether each of a file's points is used (not withheld), (N,) bool, and its class code, (N,) uint8.
+
+    Raises:
+        InputError: missing, truncated or damaged.
+    """
+    parts = [(in_use(part), np.array(part.classification, np.uint8)) for part in records(path)]
+    return np.concatenate([used for used, _ in parts]), np.concatenate([codes for _, codes in parts])
+
+
+def in_use(part: Any) -> Bools:
+    """(N,) whether the points of a record don't have the withheld flag."""
+    return np.asarray(part.withheld) == 0
 
 
 def class_names(path: Path) -> tuple[bool, dict[int, str]]:
@@ -157,7 +215,7 @@ def records(path: Path, size: int = CHUNK_POINTS) -> Iterator[Any]:
 
 
 def chunks(path: Path, frame: Frame, size: int = CHUNK_POINTS) -> Iterator[PointCloud]:
-    """The points in file order, `size` at a time, converted as by `read`.
+    """The points but withheld ones in file order, at most `size` at a time, converted as by `read`.
 
     Each chunk is in a frame of its own, with its origin near its points: over kilometres float32 would lose
     millimetres.
@@ -165,7 +223,7 @@ def chunks(path: Path, frame: Frame, size: int = CHUNK_POINTS) -> Iterator[Point
     shift = _colour_shift(path)
     with open_las(path) as reader:
         timed = "gps_time" in set(reader.header.point_format.dimension_names)
-        for part in read_parts(path, reader, size):
+        for part in _used_parts(path, reader, size):
             xyz = _coordinates(part)
             x, y, z = np.floor(xyz.mean(axis=0) * frame.unit).tolist()
             near = replace(frame, origin=(x, y, z))
@@ -288,6 +346,23 @@ def read_parts(path: Path, reader: Any, size: int) -> Iterator[Any]:
         raise truncated(path, at, n, "end of file")
 
 
+def _used_parts(path: Path, reader: Any, size: int) -> Iterator[Any]:
+    """The points of an open file that aren't withheld, at most `size` at a time, as laspy records.
+
+    Raises:
+        InputError: as `read_parts`, or all points are withheld.
+    """
+    found = False
+    for part in read_parts(path, reader, size):
+        used = in_use(part)
+        if used.any():
+            found = True
+            yield part if used.all() else part[used]
+    if not found:
+        cause = f"all of its {reader.header.point_count:,} points have the withheld flag (not to be used)"
+        raise InputError(path, cause, "Clear the flag in the program that set it, or leave the file out")
+
+
 def _coordinates(part: Any) -> F64:
     """CRS coordinates (N, 3) of a record."""
     return np.column_stack([part.x, part.y, part.z])
@@ -318,11 +393,10 @@ def _to_uint8(rgb: Any) -> Any:
     return (rgb >> 8).astype(np.uint8) if rgb.max() > 255 else rgb.astype(np.uint8)
 
 
-def _crs(path: Path, header: Any) -> str | None:
+def _crs(header: Any) -> tuple[str | None, tuple[str, ...]]:
+    """CRS as WKT, or None; and a note if there is one that can't be read."""
     try:
         crs = las_header.parsed_crs(header)
     except ValueError as error:
-        raise InputError(
-            path, f"its CRS can't be read ({error})", "Fix the CRS in its header, or export it again"
-        ) from None
-    return crs.to_wkt() if crs is not None else None
+        return None, (f"its CRS can't be read, so it counts as none ({error})",)
+    return None if crs is None else crs.to_wkt(), ()

@@ -4,6 +4,9 @@ A header of lines (VERSION, FIELDS, SIZE, TYPE, COUNT, WIDTH, HEIGHT, VIEWPOINT,
 `binary_compressed` data is two sizes (uint32) and LZF data, in which the values of each field are contiguous.
 VIEWPOINT, the pose of the scanner, is not applied to the points; PCL's readers don't apply it either.
 
+Other writers' habits: padding with COUNT 0 (no bytes), field names in capitals, `binary_compressed` data that LZF
+couldn't compress and that is stored as it is, and zeros for beams without a return in organized clouds (HEIGHT over 1).
+
 Source: https://pointclouds.org/documentation/tutorials/pcd_file_format.html; `rgb` is 0x00RRGGBB, in the bits of a
 float32 or as uint32.
 """
@@ -42,12 +45,13 @@ class _Header:
     count: int
     data: str
     start: int  # byte offset of the points
+    organized: bool  # rows of a scanner, in which beams without a return are zeros
 
 
-def read_header(path: Path) -> tuple[int, F64, F64, str | None]:
-    """Number of finite points, low and high corner; PCD has no CRS."""
+def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
+    """Number of finite points, low and high corner, no CRS (PCD has none), and notes."""
     found = point_chunks.summary(path, _parts(path))
-    return found.count, found.low, found.high, None
+    return found.count, found.low, found.high, None, found.notes
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
@@ -57,30 +61,31 @@ def read(path: Path, frame: Frame) -> PointCloud:
 
 def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
     """The points in file order, at most `size` per chunk."""
-    return point_chunks.read_chunks(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
+    return point_chunks.read_chunks(_parts(path), point_chunks.summary(path, _parts(path)), frame, size)
 
 
 def _parts(path: Path) -> Iterator[Points]:
-    for rows in _rows(path):
-        yield _points(path, rows)
+    for header, rows in _rows(path):
+        yield _points(header, rows)
 
 
-def _rows(path: Path) -> Iterator[npt.NDArray[Any]]:
+def _rows(path: Path) -> Iterator[tuple[_Header, npt.NDArray[Any]]]:
     """All points as structured arrays; fewer than declared is an error, and sizes are checked before allocation."""
     try:
         with open(path, "rb") as file:
             header = _header(path, file)
             left = path.stat().st_size - header.start
             if header.data == "ascii":
-                yield from _ascii(path, file, header)
+                for rows in _ascii(path, file, header):
+                    yield header, rows
             elif header.data == "binary":
                 if left < header.count * header.row.itemsize:
                     raise _truncated(path, left // header.row.itemsize, header.count)
                 for at in range(0, header.count, READ_POINTS):
                     n = min(READ_POINTS, header.count - at)
-                    yield np.frombuffer(file.read(n * header.row.itemsize), header.row, n)
+                    yield header, np.frombuffer(file.read(n * header.row.itemsize), header.row, n)
             else:
-                yield _compressed(path, file, header, left)
+                yield header, _compressed(path, file, header, left)
     except FileNotFoundError:
         raise InputError(path, file_checks.NOT_FOUND, file_checks.CHECK_PATH) from None
     except (OSError, ValueError) as error:
@@ -97,7 +102,7 @@ def _header(path: Path, file: BinaryIO) -> _Header:
         if key:
             entries[key.upper()] = values
     try:
-        names, kinds = entries["FIELDS"], entries["TYPE"]
+        names, kinds = [name.lower() for name in entries["FIELDS"]], entries["TYPE"]
         sizes = [int(value) for value in entries["SIZE"]]
         counts = [int(value) for value in entries.get("COUNT", ["1"] * len(names))]
         width, height = int(entries["WIDTH"][0]), int(entries["HEIGHT"][0])
@@ -107,17 +112,18 @@ def _header(path: Path, file: BinaryIO) -> _Header:
             # PCL names all padding "_", but names in a dtype must be unique
             (f"_{i}" if name == "_" else name, f"<{DTYPE_KINDS[kind]}{size}", (n,) if n != 1 else ())
             for i, (name, kind, size, n) in enumerate(zip(names, kinds, sizes, counts, strict=True))
+            if n != 0
         ]
         row = np.dtype(shaped)
     except (KeyError, IndexError, TypeError) as error:
         raise ValueError(f"its header has no valid {error}") from None
-    if min(counts) < 1 or count < 1 or row.itemsize > MAX_LINE_BYTES:
+    if min(counts) < 0 or count < 1 or row.itemsize > MAX_LINE_BYTES:
         raise ValueError(f"its header declares {count} points of {row.itemsize} bytes")
     if data not in ("ascii", "binary", "binary_compressed"):
         raise ValueError(f"its DATA is the unknown {data[:40]!r}")
-    if not {"x", "y", "z"} <= set(names):
+    if not {"x", "y", "z"} <= set(row.names or ()):
         raise ValueError(f"it has no x, y, z (its fields are {', '.join(names)})")
-    return _Header(row, count, data, file.tell())
+    return _Header(row, count, data, file.tell(), height > 1)
 
 
 def _ascii(path: Path, file: BinaryIO, header: _Header) -> Iterator[npt.NDArray[Any]]:
@@ -154,8 +160,10 @@ def _compressed(path: Path, file: BinaryIO, header: _Header, left: int) -> npt.N
         raise InputError(path, f"is truncated: it has {left - 8:,} of {packed:,} bytes", REMEDY)
     if size > packed * MAX_LZF_RATIO:
         raise ValueError(f"it declares {packed:,} packed bytes that unpack to {size:,}, which LZF can't do")
-    plain = np.empty(size, np.uint8)
-    if _unpack(np.frombuffer(file.read(packed), np.uint8), plain) != size:
+    data, plain = np.frombuffer(file.read(packed), np.uint8), np.empty(size, np.uint8)
+    if packed == size:  # stored as it is: LZF couldn't compress it
+        plain = data
+    elif _unpack(data, plain) != size:
         raise ValueError("its packed data is damaged")
     rows, at = np.empty(header.count, header.row), 0
     for name in header.row.names or ():
@@ -202,13 +210,15 @@ def _unpack(packed: U8, plain: U8) -> int:
     return o
 
 
-def _points(path: Path, rows: npt.NDArray[Any]) -> Points:
+def _points(header: _Header, rows: npt.NDArray[Any]) -> Points:
     names = rows.dtype.names or ()
 
     def first(wanted: tuple[str, ...]) -> Any:
         return next((rows[name] for name in wanted if name in names and rows[name].ndim == 1), None)
 
     xyz = np.column_stack([np.asarray(rows[axis], np.float64) for axis in "xyz"])
+    if header.organized:
+        xyz[(xyz == 0).all(axis=1)] = np.nan
     rgb = first(("rgb", "rgba"))
     if rgb is not None and rgb.dtype.itemsize == 4:
         bits = np.ascontiguousarray(rgb).view(np.uint32)

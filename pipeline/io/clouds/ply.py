@@ -1,6 +1,7 @@
 """PLY clouds (Turk 1994): the vertices of an ASCII or binary file, with float64 coordinates.
 
-A file must have exactly the number of vertices that its header declares, otherwise it is refused as truncated.
+A file must have exactly the number of vertices that its header declares, otherwise it is refused as truncated. So are
+Gaussian splats, whose centres are not on surfaces, and meshes whose vertices don't cover their surface.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Frame, PointCloud
-from scan2sim.pipeline.io import file_checks, number_text, point_chunks
+from scan2sim.pipeline.io import file_checks, label_sets, number_text, point_chunks
 from scan2sim.pipeline.io.point_chunks import READ_POINTS, Points
 
 SUFFIXES = (".ply",)
@@ -28,9 +29,15 @@ TYPES = {
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 CLASSES = ("classification", "class", "label", "scalar_classification", "scalar_label")
-INTENSITIES = ("intensity", "intensities", "reflectivity", "scalar_intensity")
+INTENSITIES = ("intensity", "intensities", "reflectivity", "scalar_intensity", "reflectance")
 TIMES = ("gps_time", "time", "timestamp", "scalar_gpstime")
+SPLATS = ("f_dc_0", "packed_position")
+"""Properties of Gaussian splats: colour (3DGS), and the position in compressed files (PlayCanvas)."""
 MAX_HEADER_BYTES = 100_000
+LARGE_FACE_EDGES = 5.0
+"""Longest edge of a face, in medians of all faces, from which its inside has no vertices nearby."""
+MAX_LARGE_FACE_SHARE = 0.2
+"""Share of a mesh's surface in large faces, from which its vertices are no cloud of the surface."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +51,7 @@ class Layout:
         start: byte offset of the first element after the header.
         before: size of the elements before the vertices: lines (ASCII) or bytes.
         last: whether the vertices are the last element.
+        faces: number of faces that the header declares.
     """
 
     form: str
@@ -52,14 +60,21 @@ class Layout:
     start: int
     before: int
     last: bool
+    faces: int = 0
 
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
-    """Number of finite points, low and high corner (CRS units), no CRS, and a note on points that aren't finite."""
+    """Number of finite points, low and high corner (CRS units), no CRS, and notes on faces and points that aren't used.
+
+    Raises:
+        InputError: as `layout`, or a mesh whose vertices don't cover its surface.
+    """
+    header = layout(path)
+    faces = _faces_note(path, header.faces) if header.faces else ()
     found = point_chunks.summary(path, _parts(path))
-    removed = layout(path).count - found.count
+    removed = header.count - found.count
     notes = (f"{removed:,} points with NaN coordinates removed",) if removed else ()
-    return found.count, found.low, found.high, None, notes
+    return found.count, found.low, found.high, None, (*faces, *notes, *_label_notes(header), *found.notes)
 
 
 def read(path: Path, frame: Frame) -> PointCloud:
@@ -69,14 +84,19 @@ def read(path: Path, frame: Frame) -> PointCloud:
 
 def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
     """The points in file order, at most `size` per chunk, each chunk in a frame with its origin near its points."""
-    return point_chunks.read_chunks(path, _parts(path), point_chunks.summary(path, _parts(path)), frame, size)
+    return point_chunks.read_chunks(_parts(path), point_chunks.summary(path, _parts(path)), frame, size)
+
+
+def class_names(path: Path) -> tuple[bool, dict[int, str]]:
+    """Whether classes are our own codes, as those of recognized data sets are; and no names."""
+    return label_sets.matching(layout(path).row.names or ()) is not None, {}
 
 
 def layout(path: Path) -> Layout:
     """Parse the header.
 
     Raises:
-        InputError: not a PLY header, no vertices with x, y and z, or vertices with list properties.
+        InputError: not a PLY header, Gaussian splats, no vertices with x, y and z, or vertices with list properties.
     """
     with file_checks.check(path).open("rb") as file:
         head, found, _ = file.read(MAX_HEADER_BYTES).partition(b"end_header")
@@ -89,6 +109,11 @@ def layout(path: Path) -> Layout:
     if form not in BYTE_ORDERS:
         raise _bad(path, f"its format is the unknown {form[:40]!r}")
     before, elements = 0, _elements(path, lines)
+    faces = sum(count for name, count, _ in elements if name in ("face", "tristrips"))
+    splats = [name for _, _, properties in elements for _, name in properties if name in SPLATS]
+    if splats:
+        cause = f"contains Gaussian splats (property {splats[0]}), whose centres are not points on surfaces"
+        raise InputError(path, cause, "Give a point cloud or mesh of the scene, such as the dense cloud of its photos")
     for i, (name, count, properties) in enumerate(elements):
         fixed = all(kind in TYPES for kind, _ in properties)
         if name != "vertex" and (fixed or form == "ascii"):
@@ -102,8 +127,43 @@ def layout(path: Path) -> Layout:
         row = np.dtype([(n, BYTE_ORDERS[form] + TYPES[kind]) for (kind, _), n in zip(properties, names, strict=True)])
         if count == 0:
             raise InputError(path, "contains no points", "Remove it from the tile")
-        return Layout(form, count, row, start, before, i == len(elements) - 1)
-    raise _bad(path, "it has no vertices")
+        return Layout(form, count, row, start, before, i == len(elements) - 1, faces)
+    raise _bad(path, f"it has {faces:,} faces, but no vertices" if faces else "it has no vertices")
+
+
+def _faces_note(path: Path, faces: int) -> tuple[str, ...]:
+    """Note on the faces of a mesh, of which only the vertices are used.
+
+    Raises:
+        InputError: its vertices don't cover its surface.
+    """
+    import trimesh
+
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+        corners = np.asarray(mesh.vertices, np.float64)[np.asarray(mesh.faces)]
+    except Exception as error:  # trimesh's parsers raise any exception on damaged files
+        raise _bad(path, f"it is a mesh whose {faces:,} faces can't be read: {error}") from None
+    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    large = edge > LARGE_FACE_EDGES * np.median(edge) if len(edge) else np.zeros(0, bool)
+    if area[large].sum() > MAX_LARGE_FACE_SHARE * area.sum():
+        cause = f"is a mesh of {faces:,} faces, not a point cloud: its large faces have no points inside"
+        raise InputError(path, cause, f"Import the mesh: scan2sim import map {path.name}")
+    return (
+        f"is a mesh: its vertices are the points, its {faces:,} faces are ignored (`scan2sim import map` uses them)",
+    )
+
+
+def _label_notes(header: Layout) -> tuple[str, ...]:
+    """Note on how a field of labels that isn't named as LAS's classes is read."""
+    names = header.row.names or ()
+    known, field = label_sets.matching(names), next((name for name in CLASSES if name in names), None)
+    if known is not None:
+        return (f"labels are read as those of {known.name}",)
+    if field is None or field.endswith("classification"):
+        return ()
+    return (f"field `{field}` is read as LAS classes (2 ground, 6 building, ...); map others with --classes",)
 
 
 def _elements(path: Path, lines: list[list[str]]) -> list[tuple[str, int, list[tuple[str, str]]]]:
@@ -135,11 +195,12 @@ def _parts(path: Path) -> Iterator[Points]:
         def first(wanted: Sequence[str], rows: Any = rows, names: Sequence[str] = names) -> Any:
             return next((rows[name] for name in wanted if name in names), None)
 
+        known = label_sets.matching(names)
         rgb_names = next((three for three in COLOURS if set(three) <= set(names)), None)
         yield Points(
             np.column_stack([rows[axis].astype(np.float64) for axis in "xyz"]),
             None if rgb_names is None else np.column_stack([rows[name] for name in rgb_names]),
-            classification=first(CLASSES),
+            classification=first(CLASSES) if known is None else known.codes(rows[known.label]),
             time=first(TIMES),
             intensity=first(INTENSITIES),
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,34 +11,49 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Frame
+from scan2sim.pipeline.io.geodata import units as units_io
+from scan2sim.pipeline.io.geodata.units import with_unit
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
     from scan2sim.pipeline.io.clouds import Header
 
-UNITS = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}
+UNITS = {key: unit.metres for key, unit in units_io.UNITS.items()}
+"""Metres per unit of the option `--units`."""
 LOCAL = "local"
 
 
 def common(
-    tile: Path, crs: str | None, units: str | None, clouds: Sequence[Path], headers: Sequence[Header]
+    tile: Path,
+    crs: str | None,
+    units: str | None,
+    clouds: Sequence[Path],
+    headers: Sequence[Header],
+    warn: Callable[[str], None] = lambda _: None,
 ) -> tuple[str, float]:
-    """The CRS of a tile and metres per unit: the CRS given in `tile.toml`, else the common CRS of its clouds.
+    """The CRS of a tile and metres per unit: the given CRS and unit, else those that its clouds have in common.
+
+    Args:
+        tile: named in errors.
+        crs: code or WKT, "local" without georeference, or None: that of the clouds.
+        units: key of `units.UNITS`, or None: that of the CRS.
+        clouds, headers: files, and their headers.
+        warn: receives what differs from the given CRS and unit.
 
     Raises:
         InputError: no CRS is known, the clouds have different ones, or the CRS isn't projected.
     """
     cloud_crs = [(path, h.crs) for path, h in zip(clouds, headers, strict=True)]
     known = [(path, c) for path, c in cloud_crs if c]
-    for path, other in known[1:]:
-        if not same(known[0][1], other):
-            raise InputError(
-                path,
-                f"is in {name(other)}, but {known[0][0].name} is in {name(known[0][1])}",
-                "Reproject all clouds of a tile to one CRS first",
-            )
     if crs is None:
+        for path, other in known[1:]:
+            if not same(known[0][1], other):
+                raise InputError(
+                    path,
+                    f"is in {name(other)}, but {known[0][0].name} is in {name(known[0][1])}",
+                    "Reproject all clouds of a tile to one CRS first, or name the right one with --crs",
+                )
         unknown = [path for path, c in cloud_crs if not c]
         if unknown:
             raise InputError(
@@ -47,22 +62,36 @@ def common(
                 'Add crs = "EPSG:..." to tile.toml, or crs = "local" for metres without georeference',
             )
         crs = known[0][1] or LOCAL
-    elif crs != LOCAL and known and not same(crs, known[0][1]):
-        raise InputError(
-            known[0][0],
-            f"is in {name(known[0][1])}, but {tile.name} says {name(crs)}",
-            "Fix `crs` in tile.toml, or remove it to use the cloud's",
-        )
+    elif crs != LOCAL:
+        for path, other in known:
+            if note := contradiction(other, crs):
+                warn(f"{path}: {note}")
     if crs == LOCAL:
         return LOCAL, UNITS[units or "m"]
-    unit = _metres_per_unit(tile, crs)
-    if units and abs(UNITS[units] / unit - 1) > 1e-5:
-        raise InputError(
-            tile,
-            f"says units = {units!r}, but the axes of {name(crs)} have a unit of {unit:g} m",
-            "Remove `units`: a CRS defines its own; the field is for clouds without a CRS",
-        )
-    return crs, unit
+    if units is None:
+        return crs, _metres_per_unit(tile, crs)
+    given = with_units(crs, units)
+    if given != crs:
+        warn(f"the coordinates are read in {units}, as given, though {name(crs)} has another unit")
+    return given, _metres_per_unit(tile, given)
+
+
+def contradiction(own: str | None, used: str) -> str:
+    """Note on the CRS in a cloud's header, if another one is used; empty otherwise."""
+    if own is None or used == LOCAL or same(own, used):
+        return ""
+    return f"its header says {name(own)}; {name(used)} is used, as given"
+
+
+def with_units(crs: str, units: str) -> str:
+    """The CRS with its lengths in `units` (a key of `units.UNITS`); unchanged if that is its unit.
+
+    Raises:
+        InputError: the CRS is invalid.
+    """
+    parsed = _parsed(crs)
+    changed = with_unit(parsed, units_io.UNITS[units])
+    return crs if changed is parsed else str(changed.to_wkt())
 
 
 def utm(latitude: float, longitude: float) -> str:

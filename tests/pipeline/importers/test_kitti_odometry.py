@@ -120,7 +120,7 @@ def test_command_accepts_a_pose_file(sequence: Path, tmp_path: Path) -> None:
         ("times.txt", "0\n1\n1\n2\n", "are not ascending"),
         ("times.txt", "none\n", "is not a list of times"),
         ("poses.txt", "1 2 3\n", "is not a pose file"),
-        ("velodyne/000001.bin", "12345", "is not a Velodyne sweep"),
+        ("velodyne/000001.bin", "12345", "is not a sweep"),
     ],
 )
 def test_damaged_sequence_is_rejected(sequence: Path, tmp_path: Path, file: str, body: str, cause: str) -> None:

@@ -189,7 +189,7 @@ def test_pose_file_without_oxts_gives_a_local_tile(drive: Drive, tmp_path: Path)
 @pytest.mark.parametrize(
     ("harm", "message"),
     [
-        ("velodyne_points/data/0000000001.bin", r"0000000001\.bin: is not a Velodyne sweep.*Copy it again"),
+        ("velodyne_points/data/0000000001.bin", r"0000000001\.bin: is not a sweep.*Copy it again"),
         ("image_02/data/0000000002.png", r"0000000002\.png: can't be read.*Copy it again"),
         ("oxts/data/0000000003.txt", r"0000000003\.txt: is not an OXTS record.*or give poses"),
         ("velodyne_points/timestamps.txt", r"timestamps\.txt: line 1 is not a time stamp.*exclude that frame"),

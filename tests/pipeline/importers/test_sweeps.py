@@ -358,7 +358,7 @@ def garbage(drive: Drive, name: str) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("change", "kind", "message"),
     [
-        (lambda d: garbage(d, "sweeps/000002.bin"), InputError, r"000002\.bin: is not a Velodyne sweep"),
+        (lambda d: garbage(d, "sweeps/000002.bin"), InputError, r"000002\.bin: is not a sweep"),
         (
             lambda d: garbage(d, "sweeps/000009.pcd") | {"times": d.folder / "t7.txt"},
             InputError,

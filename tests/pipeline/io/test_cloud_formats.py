@@ -337,7 +337,7 @@ def test_truncated_file_is_rejected(written: tuple[Format, Path, PointCloud]) ->
 
 def test_missing_reader_is_reported_with_its_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("scan2sim.pipeline.core.optional_deps.importlib.util.find_spec", lambda name: None)
-    (tmp_path / "c.e57").write_bytes(b"")
+    (tmp_path / "c.e57").write_bytes(b"ASTM-E57")
     with pytest.raises(UnavailableError, match=r"c\.e57: needs pye57.*pip install 'scan2sim\[e57\]'"):
         clouds.read_header(tmp_path / "c.e57")
 
@@ -409,6 +409,7 @@ def test_pcd_files_of_open3d_are_read(tmp_path: Path, compressed: bool) -> None:
         ("# a remark\n1,2,3,0.5\n4,5,6,0.25", "4 columns interpreted as x y z intensity"),
         ("1;2;3;0.5;6\n4;5;6;0.25;2", "5 columns interpreted as x y z intensity class"),
         ("z,y,x,range\n3,2,1,9\n6,5,4,9", "z y x; not read: range"),
+        ("1,0;2,0;3,0;\n4,0;5,0;6,0;", "3 columns interpreted as x y z"),
         ("\ufeffX Y Z Scalar_Intensity\n1 2 3 7\n4 5 6 8", "x y z intensity"),
     ],
 )
@@ -418,21 +419,20 @@ def test_columns_are_detected_and_assumptions_reported(tmp_path: Path, lines: st
     assert clouds.read(tmp_path / "c.txt", Frame()).xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
     warned: list[str] = []
     import_las([tmp_path / "c.txt"], tmp_path / "tile", crs="local", warn=warned.append)
-    assert len(warned) == 1 and note in warned[0]
+    assert note in warned[0] and all("decimal commas" in other for other in warned[1:])
 
 
 @pytest.mark.parametrize(
     ("lines", "cause"),
     [
-        ("", "contains no points"),
+        ("", "is empty"),
+        ("# no points\n", "contains no points"),
         ("1 2\n", "2 columns and no header line"),
         ("1 2 3 4 5 6 7 8 9 10\n", "10 columns and no header line"),
         ("x y z\n", "is not a cloud: its first line is 'x y z'"),
-        ("1,5;2,5;3,5\n", "has numbers with decimal commas"),
         ("1 2 3\n4 5\n", "is not a cloud with 3 columns"),
         ("1 2 3\n4 five 6\n", "is not a cloud with 3 columns"),
         ("x,y,height,z\n1,2,3,4\n", "has two columns z"),
-        ("1 2 3 1 300\n", "class 300, which is not a LAS code"),
         ("nan nan nan\n", "no points with finite coordinates"),
         ("hello\nworld\n", "is not a cloud"),
     ],

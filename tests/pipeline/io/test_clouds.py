@@ -77,7 +77,7 @@ def test_ply_without_colours_and_classes_has_none(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1\n"]
+    "content", [b"ply\n", b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1\n"]
 )
 def test_damaged_ply_is_rejected(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "c.ply").write_bytes(content)
