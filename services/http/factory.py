@@ -35,6 +35,7 @@ from scan2sim.pipeline.core.errors import ScanError, http_status, printable
 from scan2sim.services.http.bodies import Bodies, Receive
 from scan2sim.services.http.limits import LimitedEventLoop, raise_file_limit, request_in_progress
 from scan2sim.services.http.settings import ServerParams
+from scan2sim.services.supervision import end_process_with_threads
 
 log = logging.getLogger(__name__)
 
@@ -117,6 +118,7 @@ def run(app: FastAPI, params: ServerParams, listening: Callable[[str], None]) ->
     Raises:
         SettingError: it can't listen on the address or port.
         InputError: the certificate or key is invalid.
+        StepError: a thread of this process has died.
     """
     params.check_tls()
     raise_file_limit()
@@ -135,7 +137,8 @@ def run(app: FastAPI, params: ServerParams, listening: Callable[[str], None]) ->
             loop=f"{LimitedEventLoop.__module__}:{LimitedEventLoop.__name__}",
             timeout_graceful_shutdown=1,  # event streams of live pages never end by themselves
         )
-        uvicorn.Server(config).run(sockets=[listener])
+        with end_process_with_threads():
+            uvicorn.Server(config).run(sockets=[listener])
 
 
 def _add_health(app: FastAPI, alive: Mapping[str, Check], ready: Mapping[str, Check]) -> None:
