@@ -10,11 +10,11 @@ import pytest
 
 from scan2sim.services.monitoring.dashboard import alarms, queues, runs
 from scan2sim.services.monitoring.dashboard.alarms import AlarmStates
-from scan2sim.services.monitoring.messages import RejectedError
 from scan2sim.services.monitoring.dashboard.queues import Queues
 from scan2sim.services.monitoring.dashboard.runs import Runs
 from scan2sim.services.monitoring.dashboard.state import BusState
 from scan2sim.services.monitoring.events.schema import Alarm, Event, QueueState, RunState, StepState
+from scan2sim.services.monitoring.messages import RejectedError
 
 NOW = 1e9
 

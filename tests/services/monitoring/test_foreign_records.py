@@ -82,7 +82,7 @@ def test_the_page_shows_records_after_foreign_ones_and_counts_those(broker: Brok
             application(params, sources), base_url="http://localhost"
         )
         assert client.get("/health/ready").status_code == 200
-        assert f"scan2sim_page_records{{shown=\"no\"}} {number}.0" in client.get("/metrics").text
+        assert f'scan2sim_page_records{{shown="no"}} {number}.0' in client.get("/metrics").text
     finally:
         sources.close()
 
@@ -155,8 +155,9 @@ def test_mutated_events_never_raise() -> None:
     chosen, values = random.Random(2), [None, -1, 10**40, 1e300, float("inf"), float("nan"), "", "\ud800", [], {}]
     bus_state, events = BusState(0.0), Events("alarms")
     for number in range(2000):
+        kind = chosen.choice(["alarm", "queue", "run", "step", "x"])
         fields: dict[str, Any] = {"schema": "scan2sim-event-1", "record id": f"p:{number}", "time": NOW, "sender": "s",
-                                  "kind": chosen.choice(["alarm", "queue", "run", "step", "x"]), "body": dict(alarm)}  # fmt: skip
+                                  "kind": kind, "body": dict(alarm)}  # fmt: skip
         inside = fields if chosen.random() < 0.5 else fields["body"]
         inside[chosen.choice(list(inside))] = chosen.choice(values)
         text = json.dumps(fields).encode()
