@@ -211,7 +211,7 @@ class _BoundedReader(io.RawIOBase):
 
 
 def _check_sums(text: str, folder: PurePosixPath, files: dict[PurePosixPath, bytes], where: str | Path) -> None:
-    """Check the sums: SUM NAME per line, the name inside the package's folder or, as OSM's own tools write it, with it."""
+    """Check the sums: SUM NAME per line, the name with the folder (as OSM's tools write it) or without."""
     for line in filter(str.strip, text.splitlines()):
         expected, _, rest = line.strip().partition("\t" if "\t" in line else " ")
         name = PurePosixPath(rest.strip().removeprefix("*"))

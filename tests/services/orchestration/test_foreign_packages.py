@@ -1,4 +1,4 @@
-"""Packages as OSM's own examples and tools make them: links in charms, checksums with the folder's name, no provider."""
+"""Packages as OSM's examples and tools make them: links in charms, checksums with the folder, no provider."""
 
 from __future__ import annotations
 
