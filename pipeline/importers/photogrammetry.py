@@ -155,9 +155,10 @@ def _model_to_tile(
         for line in fit.notes:
             warn(f"{model}: {line}")
         return fit.onto, fit.crs
-    if up is None and (crs or cloud_crs or crs_io.LOCAL) == crs_io.LOCAL:
+    known = crs or cloud_crs or found.crs or crs_io.LOCAL
+    if up is None and known == crs_io.LOCAL:
         up = found.up
-    return Similarity(scale, _upright(_ups(found), up), np.zeros(3)), crs or cloud_crs or crs_io.LOCAL
+    return Similarity(scale, _upright(_ups(found), up), np.zeros(3)), known
 
 
 def _in_model_coordinates(
