@@ -110,8 +110,8 @@ class Photos:
         known = self._by_name()
         parts = _key(name).split("/")
         found = known.get(parts[-1]) or known.get(_key(Path(name).stem)) or known.get(_key(name)) or []
-        agreeing = [_common_end(parts, _key(file.relative_to(self.folder).as_posix()).split("/")) for file in found]
-        best = [file for file, count in zip(found, agreeing, strict=True) if count == max(agreeing)]
+        agreeing = [_agreement(parts, _key(file.relative_to(self.folder).as_posix()).split("/")) for file in found]
+        best = [file for file, agreement in zip(found, agreeing, strict=True) if agreement == max(agreeing)]
         if len(best) == 1:
             return best[0]
         if best:
@@ -136,9 +136,11 @@ def _key(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
 
 
-def _common_end(one: Sequence[str], other: Sequence[str]) -> int:
-    """Number of equal parts at the end of two paths."""
-    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(reversed(one), reversed(other), strict=False)))
+def _agreement(given: Sequence[str], path: Sequence[str]) -> tuple[int, int]:
+    """Number of equal parts at the end of two paths, and that of further parts of `path`, negative: few are better."""
+    ends = zip(reversed(given), reversed(path), strict=False)
+    equal = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], ends))
+    return equal, equal - len(path)
 
 
 class Program(Protocol):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import unicodedata
 from collections.abc import Callable
 from pathlib import Path
@@ -117,6 +118,8 @@ def test_photos_of_the_same_name_are_told_apart_by_their_folders(tmp_path: Path)
         Image.new("RGB", (8, 8)).save(tmp_path / folder / "1.jpg")
     found = Photos(tmp_path).find("E:\\job\\LEFT\\1.JPG")
     assert found == tmp_path / "left" / "1.jpg"
+    shutil.copytree(tmp_path / "left", tmp_path / "tile" / "photos" / "left")  # an earlier import beside them
+    assert Photos(tmp_path).find("E:\\job\\LEFT\\1.JPG") == found
     with pytest.raises(InputError, match="2 photos named"):
         Photos(tmp_path).find("E:\\job\\middle\\1.jpg")
 
