@@ -131,8 +131,8 @@ def orchestrate_onboard(
                 errors.append(outcome)
             else:
                 say(f"{outcome} is onboarded")
-    for error in errors[:-1]:
-        warn(str(error))
+    for one in errors[:-1]:
+        warn(str(one))
     if errors:
         raise errors[-1]
 

@@ -95,7 +95,10 @@ def read(model: Path, photos: Photos) -> Model:
         raise InputError(names[1], "refers to a camera that is missing in cameras.*", "Export the model again")
     return Model(
         {f"camera_{key}": camera_of(model, cameras[key]) for key in used},
-        tuple(Shot(image.name, f"camera_{image.camera_id}", np.linalg.inv(image.pose)) for image in images),
+        tuple(
+            Shot(image.name, f"camera_{image.camera_id}", np.asarray(np.linalg.inv(image.pose), np.float64))
+            for image in images
+        ),
         np.array([xyz for _, xyz, _ in points], np.float64).reshape(-1, 3),
         np.array([rgb for _, _, rgb in points], np.uint8).reshape(-1, 3),
         notes=notes,

@@ -13,11 +13,11 @@ import pytest
 from PIL import Image
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.types import Camera
+from scan2sim.pipeline.core.types import Camera, Tile
 from scan2sim.pipeline.importers.clouds_and_photos import import_las
 from scan2sim.pipeline.importers.photo_fit import scaled_to
 from scan2sim.pipeline.io.photogrammetry import Photos
-from scan2sim.pipeline.io.tile import Tile, read_tile
+from scan2sim.pipeline.io.tile import read_tile
 
 HEAD = "file,x,y,z,qw,qx,qy,qz,model,width,height,fx,cx,cy,k1"
 NAMES = ("Straße_1.jpg", "Straße_2.jpg")

@@ -14,7 +14,8 @@ pytest.importorskip("fastapi", reason="the extra toolboxes isn't installed")
 from fastapi.testclient import TestClient
 
 from scan2sim.services.toolboxes.inference.metadata import VERSION
-from tests.services.toolboxes.test_api import INFER, TASK, client, engine, image, jpeg, level
+from tests.services.toolboxes.shaky import image
+from tests.services.toolboxes.test_api import INFER, TASK, client, engine, jpeg, level
 
 __all__ = ["client", "engine"]
 
