@@ -15,7 +15,7 @@ from pydantic import Field
 
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.services.outbox import Deduplicator, OutboxRecord
+from scan2sim.services.outbox import Deduplicator, OutboxRecord, is_record_id
 
 log = logging.getLogger(__name__)
 
@@ -223,12 +223,14 @@ def read(
     connected: Callable[[bool], None] = lambda _: None,
     reached: Callable[[], None] = lambda: None,
     dropped: Callable[[str], None] = lambda _: None,
+    rejected: Callable[[str], None] = lambda _: None,
     max_probe_pause: float = MAX_PROBE_PAUSE_S,
     wait: float = 1.0,
 ) -> Iterator[bytes | None]:
     """Iterate over the bodies of a topic's records without duplicates, forever; None after `wait` seconds without one.
 
-    Messages without a record id (of other programs) are not deduplicated.
+    Messages without a record id (of other programs) are not deduplicated; those without a body, or with a record id
+    that this program doesn't write, are skipped.
 
     Args:
         cluster: need not be reachable yet.
@@ -242,6 +244,7 @@ def read(
         max_probe_pause: longest pause in seconds between two probes of an idle broker, which take `PROBE_TIMEOUT_S` if
             it hangs.
         dropped: called with the id of each duplicate.
+        rejected: called with the reason for each message that is skipped.
         wait: seconds per poll.
 
     Raises:
@@ -306,13 +309,33 @@ def read(
                 continue
             reached()
             connected(True)
-            record_id = dict(message.headers() or ()).get(RECORD_ID_HEADER)
-            if not isinstance(record_id, bytes) or deduplicator.is_new(record_id.decode()):
-                yield message.value()
+            header, body = dict(message.headers() or ()).get(RECORD_ID_HEADER), message.value()
+            record_id = None if header is None else _record_id(header)
+            if not body:
+                rejected("a message without a body")
+            elif header is not None and record_id is None:
+                rejected(f"a header {RECORD_ID_HEADER!r} of another program")
+            elif record_id is None or deduplicator.is_new(record_id):
+                yield body
             else:
-                dropped(record_id.decode())
+                dropped(record_id)
     finally:
         consumer.close()
+
+
+def _record_id(header: bytes) -> str | None:
+    """Record id of a message's header; None: it isn't one."""
+    text = header.decode("ascii", "replace")
+    return text if is_record_id(text) else None
+
+
+def process(body: bytes, callback: Callable[[bytes], None], rejected: Callable[[str], None]) -> None:
+    """Call `callback` with a record's body; one that it fails on is rejected, so that it doesn't stop the reader."""
+    try:
+        callback(body)
+    except Exception as error:
+        log.exception("a record could not be processed: %.200r", body)
+        rejected(f"could not be processed: {error!r:.200}")
 
 
 class _Probe:

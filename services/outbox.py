@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import re
 import sqlite3
 import threading
 import time
@@ -18,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scan2sim.pipeline.core.errors import BusyError, InputError
+from scan2sim.services.supervision import SupervisedThread
 
 log = logging.getLogger(__name__)
 
@@ -58,6 +60,11 @@ def new_ids() -> Callable[[], str]:
         return f"{identity}:{number}"
 
     return next_id
+
+
+def is_record_id(text: str) -> bool:
+    """Whether a text is a record id: PRODUCER:NUMBER in ASCII."""
+    return re.fullmatch(r"[ -~]{1,300}:[0-9]{1,18}", text) is not None
 
 
 _TABLE = "CREATE TABLE IF NOT EXISTS records (number INTEGER PRIMARY KEY, id TEXT, share TEXT, body BLOB, sent REAL)"
@@ -190,7 +197,7 @@ class Sender:
         """
         self._outbox, self._send = outbox, send
         self._wake, self._stop = threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=self._run, name="records", daemon=True)
+        self._thread = SupervisedThread(self._run, "records")
         self._thread.start()
 
     def wake(self) -> None:

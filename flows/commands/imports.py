@@ -176,6 +176,7 @@ def _import_model(kind: str, about: str) -> None:
 _import_model("colmap", "COLMAP: the folder of cameras, images and points3D, .txt or .bin (often sparse/0).")
 _import_model("opensfm", "OpenSfM or OpenDroneMap: a reconstruction.json, or the folder of the project.")
 _import_model("metashape", "Agisoft Metashape: a cameras.xml (Export Cameras, Agisoft XML); needs a --cloud.")
+_import_model("pix4d", "Pix4D: a PROJECT_calibrated_camera_parameters.txt, with its offset.xyz; needs a --cloud.")
 _import_model("bundler", "Bundler: a bundle.out with list.txt in the same folder.")
 _import_model("nvm", "VisualSFM: a .nvm file (NVM_V3).")
 _import_model("nerfstudio", "nerfstudio, Polycam, Record3D, KIRI Engine: a transforms.json, or the folder of one.")

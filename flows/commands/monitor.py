@@ -13,7 +13,7 @@ import typer
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.options import options
-from scan2sim.flows.commands.ros_spin import spin
+from scan2sim.flows.commands.ros_spin import spin, stop_on_signal
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.services.monitoring.autoscale.traffic_model import TrafficParams
 from scan2sim.services.monitoring.embedded_broker import BrokerParams
@@ -208,9 +208,8 @@ def monitor_archive(params: ArchiveParams) -> None:
     from scan2sim.services.monitoring.export.archive import archive_records
 
     stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
-    archive_records(params, stop, warn)
+    with stop_on_signal(stop):
+        archive_records(params, stop, warn)
 
 
 @app.command("query")

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from scan2sim.flows.commands.app import App
-from scan2sim.flows.commands.display import console
+from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, progress_lines, say
 from scan2sim.flows.commands.orchestrate_sites import cluster as cluster_commands
@@ -116,13 +116,25 @@ def orchestrate_onboard(
     params: Connection,
     files: Annotated[list[Path], typer.Argument(metavar="PACKAGE...", help="Package files (.tar.gz), in any order.")],
 ) -> None:
-    """Upload packages to OSM; those that it has already stay unchanged."""
+    """Upload packages to OSM; those that it has already stay unchanged, and a bad one doesn't stop the others."""
     from scan2sim.services.orchestration import operations, package
 
-    packages = [package.read(path) for path in files]
+    packages, errors = [], list[ScanError]()
+    for path in files:
+        try:
+            packages.append(package.read(path))
+        except ScanError as error:
+            errors.append(error)
     with osm_client(params) as osm:
-        for name in operations.onboard(osm, packages):
-            say(f"{name} is onboarded")
+        for outcome in operations.onboard_each(osm, packages):
+            if isinstance(outcome, ScanError):
+                errors.append(outcome)
+            else:
+                say(f"{outcome} is onboarded")
+    for one in errors[:-1]:
+        warn(str(one))
+    if errors:
+        raise errors[-1]
 
 
 @app.command("instantiate")

@@ -10,6 +10,7 @@ from typing import Any
 
 from scan2sim.flows.commands.display import console
 from scan2sim.services import transport
+from scan2sim.services.supervision import end_process_with_threads
 
 
 def spin(create: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: False) -> None:
@@ -20,7 +21,7 @@ def spin(create: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: 
     try:
         node = create()
         try:
-            with suppress(KeyboardInterrupt):
+            with end_process_with_threads(), suppress(KeyboardInterrupt):
                 name = f"{node.get_namespace().rstrip('/')}/{node.get_name()}"
                 console.print(f"{name} is running (stop with Ctrl-C)", highlight=False, markup=False, soft_wrap=True)
                 while not finished(node):
@@ -36,7 +37,8 @@ def stop_on_signal(stop: threading.Event) -> Iterator[None]:
     """Set `stop` on Ctrl-C or SIGTERM instead of interrupting, so that work in progress ends in a clean state."""
     before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield
+        with end_process_with_threads():
+            yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

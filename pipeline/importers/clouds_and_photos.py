@@ -1,6 +1,8 @@
 """Importer of point clouds (in any format of `pipeline.io.clouds`) with a CSV of posed photos, or those inside an E57.
 
-The photos' CSV has a header line, one row per photo, columns in any order, separated by commas:
+The photos' CSV has a header line, one row per photo, columns in any order and case, separated by commas, semicolons or
+tabs (`pipeline.io.tables`); columns that aren't listed here are ignored with a note. Files are found by path or, if
+another computer wrote it, by the end of the path, in any case:
 
 | columns | meaning |
 | --- | --- |
@@ -22,7 +24,7 @@ pixel is (0, 0). Other conventions are converted as named (`pipeline.pose_check.
 
 from __future__ import annotations
 
-import csv
+import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -34,8 +36,9 @@ from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F64, Camera, CameraModel, Frame, PointCloud, Trajectory
 from scan2sim.pipeline.importers.path_correction import PathCorrection, read_correction, write_corrected
+from scan2sim.pipeline.importers.photo_fit import fitted_cameras
 from scan2sim.pipeline.io import clouds as cloud_io
-from scan2sim.pipeline.io import file_checks
+from scan2sim.pipeline.io import tables
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io import trajectory_check as check_io
 from scan2sim.pipeline.io.clouds import las
@@ -43,11 +46,22 @@ from scan2sim.pipeline.io.geodata import area_of_use
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.geodata import orthophoto as orthophoto_io
 from scan2sim.pipeline.io.images import e57 as e57_images
+from scan2sim.pipeline.io.photogrammetry import Photos
 from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
-from scan2sim.pipeline.io.tile_folder import add_file, tile_folder, without_parents
+from scan2sim.pipeline.io.tile_folder import add_file, names_in, tile_folder
 from scan2sim.pipeline.pose_check.conventions import PhotoConventions, PosedPhotos, converted
 
 Row = Mapping[str, str]
+ALIKE = 0.8
+"""Similarity of names (`difflib`) from which one is a mistake for the other."""
+ALIASES = {
+    "file": ("filename", "file name", "image", "photo", "label", "datei", "dateiname", "bild", "foto"),
+    "x": ("easting", "east", "rechtswert", "ostwert", "x[m]", "x (m)"),
+    "y": ("northing", "north", "hochwert", "nordwert", "y[m]", "y (m)"),
+    "z": ("altitude", "höhe", "hoehe", "z[m]", "z (m)"),
+    "camera": ("kamera",),
+}
+"""Column names of other programs and languages."""
 MATRIX_COLUMNS = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))
 QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
 ANGLE_COLUMNS = ("omega", "phi", "kappa")
@@ -132,7 +146,7 @@ def import_las(
     for cloud, header in zip(clouds, headers, strict=True):
         for note in (*header.notes, *cloud_io.flag_notes(Path(cloud))):
             warn(f"{cloud}: {note}")
-    shots, rigs = read_photos(photos, cameras) if photos else ([], {})
+    shots, rigs = read_photos(photos, cameras, warn) if photos else ([], {})
     if shots and conventions is not None:
         shots, rigs = _converted(shots, rigs, conventions, Frame(known, unit=unit), warn)
     base = images or (photos.parent if photos else Path())
@@ -142,11 +156,14 @@ def import_las(
         for i, cloud in enumerate(clouds):
             report(0.5 * i / len(clouds), f"cloud {Path(cloud).name}")
             cloud_names.append(_add_cloud(Path(cloud), folder, Frame(known, unit=unit), order, link, correction))
+        files = _files(shots, base)
+        sources = [source for photo in files for source, _, key in photo if key == "file"]
+        names, rigs = fitted_cameras(sources, [shot["camera"] for shot in shots], rigs, warn)
+        shots = [shot | {"camera": name} for shot, name in zip(shots, names, strict=True)]
         for i, shot in enumerate(shots):
             report(0.5 + 0.5 * i / len(shots), f"photo {shot['file']}")
-            for key, subfolder in (("file", "photos"), ("mask", "masks")):
-                if shot.get(key):
-                    shot[key] = add_file(base / shot[key], folder, f"{subfolder}/{without_parents(shot[key])}", link)
+            for source, name, key in files[i]:
+                shot[key] = add_file(source, folder, name, link)
         if embedded_images and order == axes_order(None):
             embedded, lenses = e57_images.extract_all(map(Path, clouds), folder, warn, report)
             shots, rigs = shots + embedded, rigs | lenses
@@ -318,16 +335,40 @@ def _reordered(cloud: PointCloud, order: tuple[int, int, int]) -> PointCloud:
     return replace(cloud, frame=replace(cloud.frame, origin=(x, y, z)), xyz=cloud.xyz[:, list(order)], normal=None)
 
 
-def read_photos(photos: Path, cameras: Path | None = None) -> tuple[list[dict[str, Any]], dict[str, Camera]]:
+def _files(shots: Sequence[Mapping[str, Any]], base: Path) -> list[list[tuple[Path, str, str]]]:
+    """Files of each photo: where it is, its name in the tile, and its key in the photo's entry.
+
+    Raises:
+        InputError: one isn't there.
+    """
+    found: list[list[tuple[Path, str, str]]] = [[] for _ in shots]
+    files = Photos(base)
+    for key, subfolder in (("file", "photos"), ("mask", "masks")):
+        given = [(i, str(shot[key])) for i, shot in enumerate(shots) if shot.get(key)]
+        sources = [base / name if (base / name).is_file() else files.find(name) for _, name in given]
+        for (i, _), source, name in zip(given, sources, names_in(subfolder, sources, base), strict=True):
+            found[i].append((source, name, key))
+    return found
+
+
+def read_photos(
+    photos: Path, cameras: Path | None = None, warn: Callable[[str], None] = lambda _: None
+) -> tuple[list[dict[str, Any]], dict[str, Camera]]:
     """Photos (entries of `pipeline.io.tile.write_tile`, file names as in the CSV) and their cameras by name.
+
+    Args:
+        photos, cameras: tables, see the module's docstring.
+        warn: receives the names of columns that are ignored.
 
     Raises:
         InputError: names the CSV, the row and the column.
     """
-    given = {row["camera"]: row for row in _rows(cameras, ("camera", *CAMERA_COLUMNS), ("camera",))} if cameras else {}
+    given = {}
+    if cameras:
+        given = {row["camera"]: row for _, row in _rows(cameras, ("camera", *CAMERA_COLUMNS), ("camera",), warn)}
     rigs: dict[str, Camera] = {}
     shots: list[dict[str, Any]] = []
-    for i, row in enumerate(_rows(photos, PHOTO_COLUMNS, ("file", "x", "y", "z")), start=2):
+    for i, row in _rows(photos, PHOTO_COLUMNS, ("file", "x", "y", "z"), warn):
         key = row.get("camera", "")
         if cameras is not None and key not in given:
             raise InputError(
@@ -354,25 +395,24 @@ def read_photos(photos: Path, cameras: Path | None = None) -> tuple[list[dict[st
     return shots, rigs
 
 
-def _rows(path: Path, known: Sequence[str], needed: Sequence[str]) -> list[Row]:
-    file_checks.check(path)
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, skipinitialspace=True, restval="")
-            names = [name.strip() for name in reader.fieldnames or ()]
-            reader.fieldnames = names
-            rows: list[Row] = [{k: v.strip() for k, v in row.items() if isinstance(v, str)} for row in reader]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, f"is not a CSV ({error})", "Export it again, as UTF-8 with commas") from None
-    for name in needed:
-        if name not in names:
-            raise InputError(path, f"has no column `{name}` (it has {', '.join(names)})", "Add it to the header line")
-    for name in names:
-        if name not in known:
-            raise InputError(path, f"has an unknown column `{name}`", f"Known columns are {', '.join(known)}")
-    if not rows:
-        raise InputError(path, "has no rows", "Add them, or leave the file out")
-    return rows
+def _rows(
+    path: Path, known: Sequence[str], needed: Sequence[str], warn: Callable[[str], None]
+) -> list[tuple[int, Row]]:
+    """Line numbers and rows of a table, with decimal points."""
+    table = tables.read(path, ALIASES)
+    table.require(needed)
+    for name in set(table.columns) - set(known):
+        if alike := difflib.get_close_matches(name, known, 1, ALIKE):
+            raise InputError(path, f"has an unknown column `{name}`", f"Name it `{alike[0]}`, or leave it out")
+    if ignored := [name for name in table.columns if name not in known]:
+        warn(f"{path}: columns that aren't known are ignored: {', '.join(ignored)}; known are {', '.join(known)}")
+    if not table.decimal_comma:
+        return list(table.rows)
+    texts = ("file", "mask", "camera", "model")
+    return [
+        (number, {name: cell if name in texts else cell.replace(",", ".") for name, cell in row.items()})
+        for number, row in table.rows
+    ]
 
 
 def _number(row: Row, column: str, path: Path, where: str, default: float | None = None) -> float:

@@ -14,12 +14,13 @@ from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F64, Frame, PointCloud
 from scan2sim.pipeline.geometry.similarity import Similarity
 from scan2sim.pipeline.importers import depth_images, georeference
+from scan2sim.pipeline.importers.photo_fit import fitted_cameras
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.photogrammetry import Model, Photos, read
 from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
-from scan2sim.pipeline.io.tile_folder import add_file, tile_folder
+from scan2sim.pipeline.io.tile_folder import add_file, names_in, tile_folder
 
 MAX_CLOUD_DISTANCE = 500.0
 """CRS units between cloud and photos above which a warning suggests that their coordinates differ."""
@@ -104,22 +105,23 @@ def import_model(
             file = _add_cloud(cloud, folder, onto if in_model else None, tile_crs, link)
         entries: list[dict[str, Any]] = []
         masks: dict[Path, str] = {}
-        for i, shot in enumerate(placed.shots):
+        sources = [photos.find(shot.file) for shot in placed.shots]
+        names = names_in("photos", sources, images)
+        camera_names, cameras = fitted_cameras(sources, [shot.camera for shot in placed.shots], placed.cameras, warn)
+        for i, (shot, source, photo_name) in enumerate(zip(placed.shots, sources, names, strict=True)):
             report(i / len(placed.shots), shot.file)
-            source = photos.find(shot.file)
             if shot.mask is not None and shot.mask not in masks:  # several photos may share one
                 masks[shot.mask] = add_file(shot.mask, folder, f"masks/{len(masks)}/{shot.mask.name}", link)
             entries.append(
                 {
-                    "file": add_file(source, folder, f"photos/{source.relative_to(images).as_posix()}", link),
-                    "camera": shot.camera,
+                    "file": add_file(source, folder, photo_name, link),
+                    "camera": camera_names[i],
                     "position": shot.pose[:3, 3],
                     "rotation": shot.pose[:3, :3],
                     "mask": masks[shot.mask] if shot.mask is not None else None,
                 }
             )
-        used = {shot.camera for shot in placed.shots}
-        cameras = {key: camera for key, camera in placed.cameras.items() if key in used}
+        cameras = {key: camera for key, camera in cameras.items() if key in camera_names}
         write_tile(
             folder, name=tile_name(name or Path(out).name), crs=tile_crs, clouds=[file], cameras=cameras,
             photos=entries, classes=classes,
@@ -155,9 +157,10 @@ def _model_to_tile(
         for line in fit.notes:
             warn(f"{model}: {line}")
         return fit.onto, fit.crs
-    if up is None and (crs or cloud_crs or crs_io.LOCAL) == crs_io.LOCAL:
+    known = crs or cloud_crs or found.crs or crs_io.LOCAL
+    if up is None and known == crs_io.LOCAL:
         up = found.up
-    return Similarity(scale, _upright(_ups(found), up), np.zeros(3)), crs or cloud_crs or crs_io.LOCAL
+    return Similarity(scale, _upright(_ups(found), up), np.zeros(3)), known
 
 
 def _in_model_coordinates(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
@@ -86,6 +86,14 @@ def add_file(source: Path, folder: Path, name: str, link: bool = False) -> str:
     else:
         shutil.copyfile(source, target)
     return name
+
+
+def names_in(subfolder: str, files: Sequence[Path], base: Path) -> list[str]:
+    """Names in a subfolder of the tile of files below `base`; not `photos/photos/` if all are in one of its name."""
+    names = [without_parents(str(file.relative_to(base) if file.is_relative_to(base) else file)) for file in files]
+    if all(name.startswith(f"{subfolder}/") for name in names):
+        return names
+    return [f"{subfolder}/{name}" for name in names]
 
 
 def without_parents(name: str) -> str:

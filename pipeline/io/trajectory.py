@@ -2,14 +2,15 @@
 
 | suffix | content |
 | --- | --- |
-| .csv | a header line, then time,x,y,z[,qx,qy,qz,qw][,unsure][,sx,sy,sz[,srx,sry,srz]]: all but correlations |
+| .csv | a header line, then time,x,y,z[,qx,qy,qz,qw][,unsure][,sx,sy,sz[,srx,sry,srz]]: all but correlations; tables of other programs, with or without a header line (`trajectory_columns`) |
 | .tum | time x y z qx qy qz qw per line, the format of the TUM benchmark and evo |
 | .kitti | 12 numbers per line, row-major 3x4; ten poses per second unless times are given |
 | .geojson | the path in WGS84, and a point for each unsure section; write-only |
 
 Quaternions rotate sensor axes to world axes, scalar last. `sx` to `sz` are standard deviations in the CRS's unit,
-`srx` to `srz` in radians. The format of files with other suffixes is detected from their first line.
-"""
+`srx` to `srz` in radians. The format of files with other suffixes is detected from their first line. Times since the
+epoch in milli-, micro- or nanoseconds become seconds; lines that repeat the previous one are left out.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -26,8 +27,9 @@ import numpy as np
 from scan2sim.pipeline.core.errors import DataError, InputError, SettingError, from_os_error
 from scan2sim.pipeline.core.poses import nearest_rotation
 from scan2sim.pipeline.core.types import F64, Frame, Trajectory
-from scan2sim.pipeline.io import file_checks
+from scan2sim.pipeline.io import file_checks, tables
 from scan2sim.pipeline.io.geodata import crs as crs_io
+from scan2sim.pipeline.io.trajectory_columns import MATRIX, is_number, named, seconds, unnamed
 
 POSITION_COLUMNS = ("time", "x", "y", "z")
 QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
@@ -70,7 +72,9 @@ def read(
         columns: tuple[str, ...] = POSITION_COLUMNS + QUATERNION_COLUMNS
         if kind == ".csv":
             columns, lines = _header_line(path, lines)
-        trajectory = _from_columns(path, kind, columns, lines, frame)
+        if {"time", "sec"} & set(columns):  # without times, repeated lines are those of a vehicle that stands
+            lines = [one for one, before in zip(lines, [(0, [""]), *lines], strict=False) if one[1] != before[1]]
+        trajectory = _from_columns(path, kind, columns, lines, frame, times, timed)
     far = np.flatnonzero(~(np.abs(trajectory.positions) < MAX_COORDINATE_M).all(axis=1))
     if len(far):
         raise _bad(path, kind, lines[far[0]][0], "its position is out of range", "Remove lines without a pose")
@@ -159,37 +163,41 @@ def _bad(path: Path, kind: str, line: int, cause: str, remedy: str | None = None
 
 
 def _lines(path: Path) -> tuple[str, Lines]:
-    """Format of a file and its lines, without blank ones and comments (except a CSV's header line)."""
-    file_checks.check(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise from_os_error(error, path) from error
-    except UnicodeDecodeError:
-        raise InputError(path, "is not a trajectory (not a text file)", REMEDIES[".csv"]) from None
-    filled = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
-    plain = [(i, line) for i, line in filled if not line.lstrip().startswith("#")]
+    """Format of a file and its lines, without blank ones, comments (except a header line) and repeated ones."""
     kind = path.suffix.lower()
     if kind == ".geojson":
         raise InputError(path, "is GeoJSON, which can only be written", "Give the .csv beside it")
-    if kind not in REMEDIES:
-        first = plain[0][1] if plain else ","
-        kind = ".csv" if "," in first else {8: ".tum", 12: ".kitti"}.get(len(first.split()), ".csv")
+    filled = [(i, line) for i, line in enumerate(tables.read_text(path).splitlines(), 1) if line.strip()]
+    plain = [(i, line) for i, line in filled if not line.lstrip().startswith("#")]
+    if not plain:
+        raise InputError(path, "is not a trajectory (it contains no poses)", REMEDIES.get(kind, REMEDIES[".csv"]))
+    delimiter = next((one for one in ",;" if one in plain[-1][1]), None)
+    if kind not in REMEDIES or delimiter is not None:
+        width = len(plain[0][1].split())
+        kind = ".csv" if delimiter else {8: ".tum", 12: ".kitti"}.get(width, ".csv")
+    if kind != ".csv" and not is_number(plain[0][1].split()[0]):
+        kind = ".csv"  # a header line without #
     if kind == ".csv":
         plain = filled[:1] + [line for line in plain if line not in filled[:1]]
-    lines = [(i, line.split("," if kind == ".csv" else None)) for i, line in plain]
-    if len(lines) <= (kind == ".csv"):
-        raise InputError(path, "is not a trajectory (it contains no poses)", REMEDIES[kind])
-    return kind, lines
+    return kind, [(i, line.split(delimiter)) for i, line in plain]
 
 
 def _header_line(path: Path, lines: Lines) -> tuple[tuple[str, ...], Lines]:
-    """Column names of a CSV, and the lines after them; four columns with other names are taken as time,x,y,z."""
+    """Our names of the columns of a table, empty for those that aren't read; and the lines after its header line."""
     number, cells = lines[0]
-    names = tuple(cell.strip(" #\t\"'").lower() for cell in cells)
-    if all(_is_number(cell) for cell in cells):
-        raise _bad(path, ".csv", number, "it has no header line with column names")
-    if set(POSITION_COLUMNS) <= set(names):
+    first = cells[0].lstrip()
+    if not first.startswith(("#", "%")) and (found := unnamed(cells)) is not None:
+        return found, lines
+    if all(is_number(cell) for cell in cells):
+        raise _bad(path, ".csv", number, f"it has {len(cells)} columns and no header line with their names")
+    names = named(cells)
+    if len(lines) < 2:
+        raise InputError(path, "is not a trajectory (it contains no poses)", REMEDIES[".csv"])
+    doubled = next((name for name in names if name and names.count(name) > 1), None)
+    if doubled is not None:
+        raise _bad(path, ".csv", number, f"two columns are named `{doubled}`")
+    timed = "time" in names or {"sec", "nanosec"} <= set(names)
+    if timed and set("xyz") <= set(names):
         partial = {
             "rotation": QUATERNION_COLUMNS,
             "position deviation": SIGMA_COLUMNS[:3],
@@ -199,27 +207,22 @@ def _header_line(path: Path, lines: Lines) -> tuple[tuple[str, ...], Lines]:
             if 0 < len(set(columns) & set(names)) < len(columns):
                 raise _bad(path, ".csv", number, f"its {what} needs all of {','.join(columns)}")
         return names, lines[1:]
-    if len(names) == 4:
+    if len(cells) == 4:
         return POSITION_COLUMNS, lines[1:]
-    raise _bad(path, ".csv", number, f"columns are {','.join(names)[:80]}")
+    if first.startswith("#") and (found := unnamed(lines[1][1])) is not None:
+        return found, lines[1:]  # the first line is a comment
+    raise _bad(path, ".csv", number, f"columns are {','.join(cell.strip() for cell in cells)[:80]}")
 
 
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _numbers(path: Path, kind: str, lines: Lines, width: int) -> F64:
-    """Parse the cells of all lines: (T, width)."""
-    rows = np.empty((len(lines), width))
+def _numbers(path: Path, kind: str, lines: Lines, width: int, used: Sequence[int] | None = None) -> F64:
+    """Parse the cells of all lines, of `width` cells each, in the columns `used` (default: all): (T, len(used))."""
+    columns = range(width) if used is None else used
+    rows = np.empty((len(lines), len(columns)))
     for i, (number, cells) in enumerate(lines):
         if len(cells) != width:
             raise _bad(path, kind, number, f"{len(cells)} columns, expected {width}")
         try:
-            rows[i] = [float(cell) for cell in cells]
+            rows[i] = [float(cells[k]) for k in columns]
         except ValueError as error:
             raise _bad(path, kind, number, str(error)) from None
     odd = np.flatnonzero(~np.isfinite(rows).all(axis=1))
@@ -228,15 +231,26 @@ def _numbers(path: Path, kind: str, lines: Lines, width: int) -> F64:
     return rows
 
 
-def _from_columns(path: Path, kind: str, names: tuple[str, ...], lines: Lines, frame: Frame) -> Trajectory:
+def _from_columns(
+    path: Path, kind: str, names: tuple[str, ...], lines: Lines, frame: Frame, times: F64 | None, timed: bool
+) -> Trajectory:
     from scipy.spatial.transform import Rotation
 
-    rows = _numbers(path, kind, lines, len(names))
-    column = {name: rows[:, k] for k, name in enumerate(names)}
+    used = [k for k, name in enumerate(names) if name]
+    rows = _numbers(path, kind, lines, len(names), used)
+    column = {names[k]: rows[:, i] for i, k in enumerate(used)}
+    if "sec" in column and "nanosec" in column:
+        column["time"] = column["sec"] + 1e-9 * column["nanosec"]
 
     def block(columns: Sequence[str]) -> F64 | None:
         return np.stack([column[name] for name in columns], axis=1) if set(columns) <= set(column) else None
 
+    if (matrices := block(MATRIX)) is not None:
+        if "time" in column:
+            times = seconds(column["time"])
+        elif timed and times is None:
+            raise InputError(path, "has no times", REMEDIES[".csv"])
+        return _from_matrices(path, matrices, lines, frame, times)
     quaternions = block(QUATERNION_COLUMNS)
     if quaternions is not None:
         odd = np.flatnonzero(np.abs(np.linalg.norm(quaternions, axis=1) - 1) > 0.01)
@@ -253,8 +267,8 @@ def _from_columns(path: Path, kind: str, names: tuple[str, ...], lines: Lines, f
         covariance = np.zeros((len(rows), 6, 6))
         covariance[:, np.arange(6), np.arange(6)] = deviation**2
     return Trajectory(
-        column["time"],
-        frame.to_local(rows[:, [names.index(name) for name in POSITION_COLUMNS[1:]]]),
+        seconds(column["time"]),
+        frame.to_local(np.stack([column[name] for name in POSITION_COLUMNS[1:]], axis=1)),
         None if quaternions is None else Rotation.from_quat(quaternions).as_matrix(),
         column["unsure"] != 0 if "unsure" in column else None,
         covariance,
@@ -262,7 +276,12 @@ def _from_columns(path: Path, kind: str, names: tuple[str, ...], lines: Lines, f
 
 
 def _from_kitti(path: Path, lines: Lines, frame: Frame, times: F64 | None) -> Trajectory:
-    matrices = _numbers(path, ".kitti", lines, 12).reshape(-1, 3, 4)
+    return _from_matrices(path, _numbers(path, ".kitti", lines, 12), lines, frame, times)
+
+
+def _from_matrices(path: Path, rows: F64, lines: Lines, frame: Frame, times: F64 | None) -> Trajectory:
+    """Trajectory of (T, 12) row-major 3x4 poses."""
+    matrices = rows.reshape(-1, 3, 4)
     rotations = matrices[:, :, :3]
     skew = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     odd = np.flatnonzero((skew > 1e-3) | (np.linalg.det(rotations) < 0))

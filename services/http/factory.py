@@ -8,7 +8,7 @@
 
 `/health/live` and `/health/ready` are liveness and readiness probes, `/metrics` exports `app.state.registry` to
 Prometheus. Errors are JSON, {where, cause, remedy, error}, with the status of `pipeline.core.errors.EXIT_CODES`;
-`error` is the whole message, for clients of the Open Inference Protocol.
+`error` is the whole message. On paths of the Open Inference Protocol it is alone, as the protocol defines errors.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from scan2sim.pipeline.core.errors import ScanError, http_status, printable
 from scan2sim.services.http.bodies import Bodies, Receive
 from scan2sim.services.http.limits import LimitedEventLoop, raise_file_limit, request_in_progress
 from scan2sim.services.http.settings import ServerParams
+from scan2sim.services.supervision import end_process_with_threads
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +47,8 @@ MAX_BODY_BYTES = 2**20
 """Default limit of the size of a request's body."""
 MAX_CONCURRENT_REQUESTS = 256
 """Requests whose bodies are complete; further ones are rejected with status 503."""
+INFERENCE_PATHS = "/v2"
+"""Prefix of the paths of the Open Inference Protocol."""
 HEALTH_PATHS = ("/health/",)
 """Prefixes of the paths that are always served, whatever the number of requests."""
 PROTOCOL, TOKEN_PROTOCOL = "scan2sim", "token."
@@ -117,6 +120,7 @@ def run(app: FastAPI, params: ServerParams, listening: Callable[[str], None]) ->
     Raises:
         SettingError: it can't listen on the address or port.
         InputError: the certificate or key is invalid.
+        StepError: a thread of this process has died.
     """
     params.check_tls()
     raise_file_limit()
@@ -135,7 +139,8 @@ def run(app: FastAPI, params: ServerParams, listening: Callable[[str], None]) ->
             loop=f"{LimitedEventLoop.__module__}:{LimitedEventLoop.__name__}",
             timeout_graceful_shutdown=1,  # event streams of live pages never end by themselves
         )
-        uvicorn.Server(config).run(sockets=[listener])
+        with end_process_with_threads():
+            uvicorn.Server(config).run(sockets=[listener])
 
 
 def _add_health(app: FastAPI, alive: Mapping[str, Check], ready: Mapping[str, Check]) -> None:
@@ -202,19 +207,19 @@ class _Guard:
         path, headers = scope["path"], dict(scope["headers"])
         if _is_cross_origin(scope.get("method", "POST"), headers):  # a WebSocket has no method and may change state
             cause = "cross-origin request: the page is on another site"
-            return _error_response(403, path, cause, "Use the service's own page, or a program")
+            return _error_response(path, 403, cause, "Use the service's own page, or a program")
         if path in self._public or path.startswith(PUBLIC_PATHS):
             return None
         if self._accepts is not None:
             if (token := sent_token(scope)) is not None and self._accepts(token):
                 return None
-            response = _error_response(401, path, "requires a token", "Send the header Authorization: Bearer TOKEN")
+            response = _error_response(path, 401, "requires a token", "Send the header Authorization: Bearer TOKEN")
             response.headers["WWW-Authenticate"] = "Bearer"
             return response
         host = headers.get(b"host", b"").decode("latin-1")
         if self._local and not LOOPBACK_HOST.fullmatch(host):
             cause = "the Host header isn't a loopback name of this machine"
-            return _error_response(421, path, cause, "Use http://localhost as the address")
+            return _error_response(path, 421, cause, "Use http://localhost as the address")
         return None
 
     async def _reject(self, rejection: Response, scope: Message, receive: Receive, send: Send) -> None:
@@ -236,7 +241,7 @@ class _Guard:
                 finally:
                     self._requests -= 1
         except HTTPException as error:
-            response = _error_response(error.status_code, where, str(error.detail), "Retry, or send less at once")
+            response = _error_response(where, error.status_code, str(error.detail), "Retry, or send less at once")
             response.headers.update(error.headers or {})
             await response(scope, receive, send)
         except ClientDisconnect:
@@ -258,7 +263,7 @@ class _Guard:
             log.exception("%s %s", scope["method"], printable(scope["path"]))
             if begun:
                 raise
-            response = _error_response(500, scope["path"], "internal error", "See the service's log")
+            response = _error_response(scope["path"], 500, "internal error", "See the service's log")
             await response(scope, receive, send)
 
 
@@ -312,26 +317,32 @@ def _with_headers(send: Send) -> Send:
     return send_with_headers
 
 
-def _error_response(status: int, where: str, cause: str, remedy: str) -> JSONResponse:
-    message = {"where": where, "cause": cause, "remedy": remedy, "error": f"{where}: {cause}. {remedy}"}
+def _error_response(path: str, status: int, cause: str, remedy: str, where: str = "") -> JSONResponse:
+    """Response to a request; without `where`, the error is in its path."""
+    where = where or printable(path)
+    message = {"error": f"{where}: {cause}. {remedy}"}
+    if not path.startswith(INFERENCE_PATHS):
+        message = {"where": where, "cause": cause, "remedy": remedy, **message}
     return JSONResponse(message, status)
 
 
-def _scan_error_response(_: Request, error: Exception) -> Response:
+def _scan_error_response(request: Request, error: Exception) -> Response:
     assert isinstance(error, ScanError)
-    return _error_response(http_status(error), error.where, error.cause, error.remedy)
+    return _error_response(request.url.path, http_status(error), error.cause, error.remedy, str(error.where))
 
 
 def _http_error_response(request: Request, error: Exception) -> Response:
     assert isinstance(error, StarletteHTTPException)
     remedy = "/openapi.json lists the paths of this service"
-    response = _error_response(error.status_code, printable(request.url.path), str(error.detail), remedy)
+    response = _error_response(request.url.path, error.status_code, str(error.detail), remedy)
     response.headers.update(error.headers or {})
     return response
 
 
-def _validation_error_response(_: Request, error: Exception) -> Response:
+def _validation_error_response(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     first = error.errors()[0]
     where = printable(".".join(map(str, first["loc"][1:])) or "body")
-    return _error_response(422, where[:200], str(first["msg"]), "/openapi.json describes the valid values")
+    return _error_response(
+        request.url.path, 422, str(first["msg"]), "/openapi.json describes the valid values", where[:200]
+    )

@@ -1,6 +1,6 @@
 """Parser of descriptors: safe against malicious YAML, validated against JSON Schemas before anything is sent to OSM.
 
-SOL006's YANG modules aren't part of this project, so `schemas/` covers the subset that is used here;
+SOL006's YANG modules aren't part of this project: `schemas/` has what is read here, and OSM checks the rest;
 `tests/services/orchestration/test_yang.py` validates packages by the modules themselves.
 """
 
@@ -22,6 +22,8 @@ MAX_NESTING = 50
 """Maximum nesting depth of its YAML."""
 PRE_SOL006_KEYS = ("vnfd:vnfd-catalog", "vnfd-catalog", "nsd:nsd-catalog", "nsd-catalog")
 """Top-level keys of descriptors of the older information model, which OSM rejects since Release 9."""
+PRE_SOL006_FIELDS = ("mgmt-interface", "connection-point", "internal-vld", "constituent-vnfd", "vld")
+"""Fields of the same model."""
 MIGRATION_HINT = (
     "Convert it to SOL006: `vnfd-catalog.vnfd[0]` becomes `vnfd`, `connection-point` becomes `ext-cpd`,"
     " `mgmt-interface` becomes `mgmt-cp`, a vdu's `image` and `vm-flavor` become `sw-image-desc` and"
@@ -74,9 +76,10 @@ def validate(body: Any, where: str | Path) -> Descriptor:
 
     if not isinstance(body, dict):
         raise InputError(where, "not a descriptor", "A descriptor begins with `vnfd:` or `nsd:`")
-    old = next((key for key in PRE_SOL006_KEYS if key in body), None)
+    inside = [key for part in body.values() if isinstance(part, dict) for key in part]
+    old = [key for key in PRE_SOL006_KEYS if key in body] + [key for key in PRE_SOL006_FIELDS if key in inside]
     if old:
-        cause = f"uses the model before SOL006 (`{old}`), which OSM rejects since Release 9"
+        cause = f"uses the model before SOL006 (`{old[0]}`), which OSM rejects since Release 9"
         raise InputError(where, cause, MIGRATION_HINT)
     type_: DescriptorType | None = "vnfd" if "vnfd" in body else "nsd" if "nsd" in body else None
     if type_ is None:
@@ -85,18 +88,18 @@ def validate(body: Any, where: str | Path) -> Descriptor:
     error = jsonschema.exceptions.best_match(validator.iter_errors(body))
     if error is not None:
         path = ".".join(str(part) for part in error.absolute_path) or type_
-        raise InputError(where, f"{path}: {error.message:.200}", "Fix it: OSM would reject it")
+        raise InputError(where, f"{path}: {error.message:.200}", "Write it as SOL006 defines it")
     if type_ == "vnfd":
         return Descriptor(type_, body["vnfd"]["id"], (), body)
     one = body["nsd"]["nsd"][0]
     _check_profiles(one, where)
-    return Descriptor(type_, one["id"], tuple(one["vnfd-id"]), body)
+    return Descriptor(type_, one["id"], tuple(one.get("vnfd-id", ())), body)
 
 
 def _check_profiles(nsd: dict[str, Any], where: str | Path) -> None:
     links = {link["id"] for link in nsd.get("virtual-link-desc", ())}
-    for profile in (profile for flavour in nsd["df"] for profile in flavour["vnf-profile"]):
-        if profile["vnfd-id"] not in nsd["vnfd-id"]:
+    for profile in (profile for flavour in nsd["df"] for profile in flavour.get("vnf-profile", ())):
+        if profile["vnfd-id"] not in nsd.get("vnfd-id", ()):
             cause = f"vnf-profile {profile['id']} refers to {profile['vnfd-id']}, which is missing in `vnfd-id`"
             raise InputError(where, cause, "Add it to `vnfd-id`")
         for connection in profile.get("virtual-link-connectivity", ()):

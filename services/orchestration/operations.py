@@ -5,12 +5,12 @@ All operations are idempotent.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.errors import InputError, ScanError, SettingError, UnavailableError
 from scan2sim.services.orchestration import onboarding
 from scan2sim.services.orchestration.chart import REPLICA_COUNT_KEY
 from scan2sim.services.orchestration.descriptor import Descriptor
@@ -49,13 +49,10 @@ def onboard(osm: Osm, packages: Sequence[Package]) -> dict[str, str]:
     """Onboard a service's packages, functions first; returns record ids by descriptor type and id.
 
     Raises:
-        InputError: a network service refers to a function that is neither among the packages nor in OSM.
+        InputError: a network service refers to a function that is neither among the packages nor in OSM, or two
+            packages have the same id.
     """
-    ordered = sorted(packages, key=lambda one: one.descriptor.type, reverse=True)
-    ids = [(one.descriptor.type, one.descriptor.id) for one in packages]
-    duplicate = next((one for one in ids if ids.count(one) > 1), None)
-    if duplicate is not None:
-        raise InputError(duplicate[1], f"two packages ({duplicate[0]}) have this id", "Give each descriptor its own id")
+    ordered = _functions_first(packages)
     known = {one.id for one in osm.packages(FUNCTIONS)} | {
         one.descriptor.id for one in packages if one.descriptor.type == "vnfd"
     }
@@ -64,6 +61,30 @@ def onboard(osm: Osm, packages: Sequence[Package]) -> dict[str, str]:
     return {
         f"{one.descriptor.type} {one.descriptor.id}": onboarding.onboard(osm, one, NO_DEPLOYMENT) for one in ordered
     }
+
+
+def onboard_each(osm: Osm, packages: Sequence[Package]) -> Iterator[str | ScanError]:
+    """Onboard packages, functions first; yields the type and id of each, or why it isn't onboarded.
+
+    Raises:
+        InputError: two packages have the same id.
+        UnavailableError: OSM can't be reached.
+    """
+    for package in _functions_first(packages):
+        try:
+            yield from onboard(osm, [package])
+        except UnavailableError:
+            raise
+        except ScanError as error:
+            yield error
+
+
+def _functions_first(packages: Sequence[Package]) -> list[Package]:
+    ids = [(one.descriptor.type, one.descriptor.id) for one in packages]
+    duplicate = next((one for one in ids if ids.count(one) > 1), None)
+    if duplicate is not None:
+        raise InputError(duplicate[1], f"two packages ({duplicate[0]}) have this id", "Give each descriptor its own id")
+    return sorted(packages, key=lambda one: one.descriptor.type, reverse=True)
 
 
 def _check_functions(descriptor: Descriptor, known: set[str], where: str) -> None:

@@ -26,7 +26,7 @@ MAX_BYTES = 64 * 2**20
 """Maximum size of a package, compressed and unpacked."""
 MAX_FILES = 1000
 """Maximum number of files in a package."""
-REMEDY = "Build it again: scan2sim orchestrate package"
+REMEDY = "Build it again (`scan2sim orchestrate package`, or `osm package-build`)"
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,10 @@ def parse(data: bytes, where: str | Path) -> Package:
 
 
 def _files(data: bytes, where: str | Path) -> Iterator[tuple[PurePosixPath, bytes]]:
-    """Files of an archive; each entry is checked before its content is read."""
+    """Files of an archive; each entry is checked before its content is read.
+
+    Links, such as those of charms to their code, are left to OSM if they stay inside the archive.
+    """
     count = 0
     try:
         with tarfile.open(fileobj=_BoundedReader(data, where), mode="r|") as archive:
@@ -167,8 +170,12 @@ def _files(data: bytes, where: str | Path) -> Iterator[tuple[PurePosixPath, byte
                 path = PurePosixPath(member.name)
                 if path.is_absolute() or ".." in path.parts or "\0" in member.name:
                     raise InputError(where, f"path traversal: {member.name!r:.100} is outside of the archive", REMEDY)
-                if not (member.isreg() or member.isdir()):
-                    raise InputError(where, f"contains {member.name!r:.100}, a link or a device", REMEDY)
+                if member.issym() or member.islnk():
+                    if not _stays_inside(path, member):
+                        cause = f"contains {member.name!r:.100}, a link that leaves the archive"
+                        raise InputError(where, cause, "Replace the link by what it leads to")
+                elif not (member.isreg() or member.isdir()):
+                    raise InputError(where, f"contains {member.name!r:.100}, a device or pipe", "Remove it")
                 if count > MAX_FILES:
                     raise InputError(where, f"contains more than {MAX_FILES:,} files", "Give an OSM package")
                 if member.isreg():
@@ -176,6 +183,17 @@ def _files(data: bytes, where: str | Path) -> Iterator[tuple[PurePosixPath, byte
                     yield path, content.read() if content else b""
     except (tarfile.TarError, EOFError, OSError, zlib.error, UnicodeError) as error:
         raise InputError(where, f"not a readable .tar.gz ({error})", REMEDY) from None
+
+
+def _stays_inside(path: PurePosixPath, link: tarfile.TarInfo) -> bool:
+    """Whether a link leads to a path inside the top folder of its archive."""
+    target = PurePosixPath(link.linkname) if link.islnk() else path.parent / link.linkname
+    depth = 0
+    for part in target.parts:
+        depth += -1 if part == ".." else 1
+        if depth < 1:
+            return False
+    return not target.is_absolute()
 
 
 class _BoundedReader(io.RawIOBase):
@@ -193,13 +211,15 @@ class _BoundedReader(io.RawIOBase):
 
 
 def _check_sums(text: str, folder: PurePosixPath, files: dict[PurePosixPath, bytes], where: str | Path) -> None:
-    for line in text.splitlines():
-        expected, _, name = line.strip().partition("\t" if "\t" in line else " ")
-        content = files.get(folder / name.strip())
+    """Check the sums: SUM NAME per line, the name with the folder (as OSM's tools write it) or without."""
+    for line in filter(str.strip, text.splitlines()):
+        expected, _, rest = line.strip().partition("\t" if "\t" in line else " ")
+        name = PurePosixPath(rest.strip().removeprefix("*"))
+        content = files.get(folder / name, files.get(name))
         if content is None:
-            raise InputError(where, f"{name.strip():.100}, listed in {CHECKSUMS}, is missing", REMEDY)
-        if _md5(content) != expected:
-            raise InputError(where, f"{name.strip():.100} doesn't match its checksum in {CHECKSUMS}", REMEDY)
+            raise InputError(where, f"{name!s:.100}, listed in {CHECKSUMS}, is missing", REMEDY)
+        if _md5(content) != expected.lower():
+            raise InputError(where, f"{name!s:.100} doesn't match its checksum in {CHECKSUMS}", REMEDY)
 
 
 def _md5(content: bytes) -> str:

@@ -153,7 +153,7 @@ def _add_inference(app: FastAPI, engine: Engine) -> None:
             source = str(parsed.parameters.get("source", source))[:200]
             timeout = requests.timeout_s(parsed.parameters)
             return _protocol_response(
-                engine, parsed, await results(request, source, requests.named(parsed.id, images), timeout)
+                engine, parsed, await results(request, source, requests.named(parsed.id or "", images), timeout)
             )
         if media_type and media_type not in IMAGE_TYPES:
             cause = f"Content-Type is {printable(media_type)[:40]}; send JSON or {', '.join(IMAGE_TYPES)}"
@@ -175,18 +175,15 @@ def _add_inference(app: FastAPI, engine: Engine) -> None:
 
 
 def _protocol_response(engine: Engine, request: tensors.InferRequest, results: list[Result]) -> Response:
-    output: dict[str, Any] = {"name": tensors.OUTPUT, "datatype": "BYTES", "shape": [len(results)]}
-    message: dict[str, Any] = {
-        "model_name": engine.name,
-        "model_version": metadata.VERSION,
-        "id": request.id,
-        "outputs": [output],
-    }
     worst = max(results, key=lambda one: HTTP_STATUS[one.state])
     status = HTTP_STATUS[worst.state]
     if worst.error:
-        message["error"] = f"{worst.id}: {worst.error}"
-    if not request.wants_binary() or worst.error:  # clients expect errors in JSON
+        return JSONResponse({"error": f"{worst.id}: {worst.error}"}, status)
+    output: dict[str, Any] = {"name": tensors.OUTPUT, "datatype": "BYTES", "shape": [len(results)]}
+    message: dict[str, Any] = {"model_name": engine.name, "model_version": metadata.VERSION, "outputs": [output]}
+    if request.id is not None:
+        message["id"] = request.id
+    if not request.wants_binary():
         output["data"] = [one.json_line() for one in results]
         return JSONResponse(message, status)
     data = tensors.binary(results)

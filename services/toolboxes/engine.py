@@ -20,6 +20,7 @@ from multiprocessing.connection import Connection
 from scan2sim.pipeline.core.errors import ScanError, UnavailableError
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.credentials import redacted
+from scan2sim.services.supervision import SupervisedThread
 from scan2sim.services.toolboxes import frames, tasks
 from scan2sim.services.toolboxes.frame_queue import MAX_SOURCES, FrameQueue
 from scan2sim.services.toolboxes.frames import Frame
@@ -99,7 +100,7 @@ class Engine:
         except ModelProcessDied as error:
             raise UnavailableError(task, str(error), "The model may need more memory than is available") from None
         self.info: ModelInfo = self._model.info
-        self._dispatcher = threading.Thread(target=self._dispatch, name=f"{task} dispatcher", daemon=True)
+        self._dispatcher = SupervisedThread(self._dispatch, f"{task} dispatcher")
         self._dispatcher.start()
 
     def submit(self, frame: Frame) -> None:

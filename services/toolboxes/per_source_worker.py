@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 import queue
-import threading
 import time
 from collections.abc import Callable
 
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.credentials import redacted
+from scan2sim.services.supervision import SupervisedThread
 from scan2sim.services.toolboxes.frames import Frame
 from scan2sim.services.toolboxes.results import Body
 from scan2sim.services.toolboxes.tasks import PostProcessor
@@ -30,7 +30,7 @@ class SourceWorker:
         self._source, self._post_processor = redacted(source), post_processor
         self._queue: queue.Queue[tuple[Frame, U8, Body, Outcome] | None] = queue.Queue(MAX_WAITING)
         self._last = time.monotonic()
-        self._thread = threading.Thread(target=self._run, name=f"worker of {self._source}", daemon=True)
+        self._thread = SupervisedThread(self._run, f"worker of {self._source}")
         self._thread.start()
 
     def put(self, frame: Frame, image: U8, body: Body, outcome: Outcome) -> None:

@@ -8,15 +8,19 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.errors import InputError, ScanError
 from scan2sim.pipeline.core.types import U8
+from scan2sim.pipeline.io.images import image as photos
 from scan2sim.services.credentials import redacted
+from scan2sim.services.supervision import SupervisedThread
 from scan2sim.services.toolboxes import frames
 from scan2sim.services.toolboxes.engine import Engine
 from scan2sim.services.toolboxes.frames import Frame
@@ -24,8 +28,8 @@ from scan2sim.services.toolboxes.results import Result
 
 log = logging.getLogger(__name__)
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
-"""File names with these suffixes are read from a folder."""
+ENCODED_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
+"""Files with these suffixes are passed on as they are; other images are decoded here."""
 REMEDY = "Give a folder of images, an image or a video"
 MAX_RETRY_PAUSE_S = 5.0
 """Upper bound of the exponential backoff between attempts to connect to a camera."""
@@ -81,7 +85,7 @@ def stored_images(path: Path) -> Iterator[StoredImage]:
     """
     if _holds_images(path):
         for file in _image_files(path):
-            yield StoredImage(file.name, None, file.read_bytes())
+            yield StoredImage(file.name, None, _content(file))
         return
     import cv2
 
@@ -108,16 +112,27 @@ def _holds_images(path: Path) -> bool:
     """Whether a path is a folder or an image, not a video."""
     if not path.exists():
         raise InputError(redacted(str(path)), "not found", REMEDY)
-    return path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES
+    return path.is_dir() or path.suffix.lower() in photos.SUFFIXES
 
 
 def _image_files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
-    found = sorted(one for one in path.iterdir() if one.suffix.lower() in IMAGE_SUFFIXES)
+    files = sorted(one for one in path.iterdir() if one.is_file())
+    found = [one for one in files if one.suffix.lower() in photos.SUFFIXES]
     if not found:
-        raise InputError(path, f"contains no {', '.join(IMAGE_SUFFIXES)} files", REMEDY)
+        raise InputError(path, f"contains no {', '.join(photos.SUFFIXES)} files", REMEDY)
+    if others := sorted({one.suffix.lower() or one.name for one in files if one not in found}):
+        log.warning("%s: %d files are skipped (%s)", path, len(files) - len(found), ", ".join(others)[:200])
     return found
+
+
+def _content(file: Path) -> bytes | U8:
+    """An image as the toolbox takes it: encoded, or (H, W, 3) RGB if its format is one that only photos have."""
+    if file.suffix.lower() not in ENCODED_SUFFIXES:
+        with suppress(ScanError):  # reported when it is decoded
+            return photos.read_rgb(file)
+    return file.read_bytes()
 
 
 def _read(video: Any) -> U8 | None:
@@ -207,7 +222,7 @@ class CameraReader:
         """Start reading."""
         if not self.running():
             self._stopped = threading.Event()
-            self._thread = threading.Thread(target=self._run, args=(self._stopped,), name=self.name, daemon=True)
+            self._thread = SupervisedThread(partial(self._run, self._stopped), self.name)
             self._thread.start()
 
     def stop(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from scan2sim.pipeline.core.errors import DataError, InputError
 from scan2sim.pipeline.core.types import F64, GpsTrack
 from scan2sim.pipeline.importers import georeference
-from scan2sim.pipeline.io import file_checks
+from scan2sim.pipeline.io import file_checks, tables
 from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.images import exif
@@ -102,20 +101,19 @@ def by_list(path: Path, photos: Sequence[Photo], crs: str) -> Positions:
     Raises:
         InputError: it can't be read, or names unknown photos.
     """
-    file_checks.check(path)
     _, unit = crs_io.common(path, crs, None, (), ())
     xyz = np.full((len(photos), 3), np.nan)
     rows = {photo.name: i for i, photo in enumerate(photos)}
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            for line in csv.DictReader(file, skipinitialspace=True):
-                name = line["file"].strip()
-                if name not in rows:
-                    raise InputError(path, f"names {name}, which has no pose", "Name other photos, as in the folder")
-                xyz[rows[name]] = [float(line[axis]) for axis in "xyz"]
-    except (KeyError, TypeError, ValueError, AttributeError, csv.Error) as error:
-        remedy = "Write a header line file,x,y,z, then a photo per line"
-        raise InputError(path, f"is not a list of positions ({type(error).__name__}: {error})", remedy) from None
+    table = tables.read(path)
+    table.require(("file", *"xyz"))
+    for number, line in table.rows:
+        name = line["file"].replace("\\", "/")
+        if name not in rows:
+            raise InputError(path, f"names {name}, which has no pose", "Name other photos, as in the folder")
+        try:
+            xyz[rows[name]] = [float(line[axis].replace(",", ".")) for axis in "xyz"]
+        except ValueError as error:
+            raise InputError(path, f"row {number}: {error}", "Write a header line file,x,y,z") from None
     return Positions(xyz * unit, crs, unit)
 
 

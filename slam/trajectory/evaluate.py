@@ -33,6 +33,8 @@ KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 KITTI_POSE_STEP = 10  # poses between the starts of KITTI's segments
 LENGTH_SMOOTHING_S = 2.0  # smoothing of a GPS track before its length is measured
 STRIDE_M = 1.0  # shorter moves don't count as distance; otherwise the noise of a standing receiver would add up
+STRIDES_PER_EXTENT = 50  # of a path within a room, such as a hand-held one, whose truth has no such noise
+MIN_CHORD_M, CHORD_SHARE = 1.0, 0.1  # segments whose truth returns to its start have no direction
 
 
 @dataclass(frozen=True)
@@ -194,6 +196,12 @@ def evaluate(
     )
 
 
+def stride_of(ground: F64) -> float:
+    """Stride in metres for the length of a path (N, 2): `STRIDE_M`, or less if the whole path is within a room."""
+    extent = float(np.linalg.norm(np.ptp(ground, axis=0)))
+    return min(STRIDE_M, extent / STRIDES_PER_EXTENT)
+
+
 def distance_along(ground: F64, stride: float = STRIDE_M) -> F64:
     """(N,) metres travelled along positions (N, 2), measured in strides of `stride` metres: jitter doesn't add up."""
     kept = [0]
@@ -215,7 +223,8 @@ def segment_errors(
     """Errors at the midpoints of segments whose end points are aligned with the truth's.
 
     Rotation and translation bring a segment's two ends nearest to the truth's: the chords' midpoints and directions
-    coincide. Segments whose truth ends within 1 m of its start have no direction and are excluded.
+    coincide. Segments whose truth ends within 1 m (or a tenth of a shorter segment) of its start have no direction and
+    are excluded.
 
     Args:
         path, truth: (N, 2) metres, ground plane.
@@ -233,7 +242,7 @@ def segment_errors(
         chords.append(end - start)
         midpoints.append(middle - (start + end) / 2)
     turn = chords[1] * np.conj(chords[0])
-    valid = (np.abs(chords[1]) > 1.0) & (np.abs(turn) > 0)
+    valid = (np.abs(chords[1]) > min(MIN_CHORD_M, CHORD_SHARE * segment)) & (np.abs(turn) > 0)
     turned = midpoints[0][valid] * turn[valid] / np.abs(turn[valid])
     return starts[valid] + segment / 2, np.abs(turned - midpoints[1][valid])
 
@@ -310,8 +319,10 @@ def _truth_lengths(truth: Trajectory | GpsTrack, ground: F64, times: F64) -> tup
     """Length of the whole truth, and (N,) distance along it at `times`, metres; a GPS track is smoothed first."""
     if isinstance(truth, GpsTrack):
         truth = smooth(truth, LENGTH_SMOOTHING_S)
-        ground = truth.at(times)[:, :2]
-    return float(distance_along(truth.positions[:, :2])[-1]), distance_along(ground)
+        ground, stride = truth.at(times)[:, :2], STRIDE_M
+    else:
+        stride = stride_of(truth.positions[:, :2])
+    return float(distance_along(truth.positions[:, :2], stride)[-1]), distance_along(ground, stride)
 
 
 def _rotations(

@@ -11,6 +11,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import Frame, GpsTrack
+from scan2sim.pipeline.io import tables
 from scan2sim.pipeline.io.gps_fixes import clean_track, sigma_from_dop, to_float, to_seconds, track_from_wgs84
 
 SUFFIXES = (".csv",)
@@ -26,10 +27,7 @@ def read(path: Path) -> GpsTrack:
 
 def _read_table(path: Path) -> GpsTrack:
     """Columns by name: time, latitude, longitude[, altitude][, hdop or accuracy]; or time, x, y, z in local metres."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(path, "is not text", "Write a CSV with a header line") from None
+    text = tables.read_text(path)
     first = text.lstrip("\n").partition("\n")[0]
     delimiter = max(",;\t", key=first.count)
     table = csv.DictReader((line for line in text.splitlines() if line.strip()), delimiter=delimiter)

@@ -1,4 +1,4 @@
-"""EXIF metadata of photos: GPS position, focal length and time."""
+"""EXIF metadata of photos: GPS position, focal length, time and orientation."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 GPS, EXIF = 0x8825, 0x8769  # tags of the two sub-directories (IFD)
 LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE = 1, 2, 3, 4, 5, 6
 FOCAL, FOCAL_35MM, ORIGINAL_WIDTH, FOCAL_PLANE_X, FOCAL_PLANE_UNIT = 37386, 41989, 40962, 41486, 41488
+ORIENTATION = 274
 TAKEN, OFFSET, FRACTION = 36867, 36881, 37521  # DateTimeOriginal, OffsetTimeOriginal, SubSecTimeOriginal
 UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0}
 """Millimetres of the units in which EXIF gives the resolution of the focal plane."""
@@ -64,6 +65,18 @@ def time_taken(photo: Path) -> tuple[float, bool] | None:
         return moment.timestamp() + (float(f"0.{digits}") if digits.isdigit() else 0.0), bool(zone)
     except Exception:  # as above
         return None
+
+
+def orientation(photo: Path) -> int:
+    """How a photo is turned when displayed, EXIF's 1 to 8; 1: as stored, or unknown."""
+    from PIL import Image
+
+    try:
+        with Image.open(photo) as image:
+            value = int(image.getexif().get(ORIENTATION, 1))
+    except Exception:  # as above
+        return 1
+    return value if 1 <= value <= 8 else 1
 
 
 def _degrees(value: Any) -> float:

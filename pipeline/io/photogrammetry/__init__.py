@@ -8,8 +8,11 @@ as in `pipeline.core.types`, poses camera to model with OpenCV's axes. The geore
 
 from __future__ import annotations
 
+import unicodedata
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Protocol
 
@@ -85,7 +88,10 @@ class Model:
 
 
 class Photos:
-    """Photos in a folder, looked up by the names that programs store: path, file name, or name without suffix."""
+    """Photos in a folder, looked up by the names that programs store: path, file name, or name without suffix.
+
+    Names may be of another computer: with backslashes, a drive's letter, in other case or Unicode form.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -102,13 +108,14 @@ class Photos:
         if name and path.is_file():
             return path
         known = self._by_name()
-        found = (
-            known.get(Path(name).name.lower()) or known.get(Path(name).stem.lower()) or known.get(name.lower()) or []
-        )
-        if len(found) == 1:
-            return found[0]
-        if found:
-            raise InputError(self.folder, f"has {len(found)} photos named {Path(name).name}", "Give a narrower folder")
+        parts = _key(name).split("/")
+        found = known.get(parts[-1]) or known.get(_key(Path(name).stem)) or known.get(_key(name)) or []
+        agreeing = [_agreement(parts, _key(file.relative_to(self.folder).as_posix()).split("/")) for file in found]
+        best = [file for file, agreement in zip(found, agreeing, strict=True) if agreement == max(agreeing)]
+        if len(best) == 1:
+            return best[0]
+        if best:
+            raise InputError(self.folder, f"has {len(best)} photos named {Path(name).name}", "Give a narrower folder")
         raise InputError(path, "file not found", "Check the path, or give the folder of the photos")
 
     def size(self, name: str) -> tuple[int, int]:
@@ -119,9 +126,21 @@ class Photos:
         if self._names is None:
             self._names = defaultdict(list)
             for path in sorted(p for p in self.folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file()):
-                self._names[path.name.lower()].append(path)
-                self._names[path.stem.lower()].append(path)
+                self._names[_key(path.name)].append(path)
+                self._names[_key(path.stem)].append(path)
         return self._names
+
+
+def _key(name: str) -> str:
+    """A name without its case and Unicode form."""
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def _agreement(given: Sequence[str], path: Sequence[str]) -> tuple[int, int]:
+    """Number of equal parts at the end of two paths, and that of further parts of `path`, negative: few are better."""
+    ends = zip(reversed(given), reversed(path), strict=False)
+    equal = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], ends))
+    return equal, equal - len(path)
 
 
 class Program(Protocol):

@@ -1,7 +1,8 @@
 """COLMAP models (text or binary): cameras, images, points3D.
 
 COLMAP stores world-to-camera poses with OpenCV's axes, and the centre of its top left pixel is (0.5, 0.5): the reader
-inverts poses and shifts principal points by half a pixel.
+inverts poses and shifts principal points by half a pixel. Models with `rigs` and `frames` have their poses there
+(`pipeline.io.colmap_rigs`).
 
 Source: https://colmap.github.io/format.html, https://colmap.github.io/cameras.html
 """
@@ -18,7 +19,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Camera, CameraModel
-from scan2sim.pipeline.io import file_checks
+from scan2sim.pipeline.io import colmap_rigs, file_checks
 from scan2sim.pipeline.io.photogrammetry import Model, Photos, Shot
 
 # COLMAP's camera model: ours, number of focal lengths, indices of COLMAP's coefficients among ours
@@ -57,19 +58,22 @@ class ColmapCamera(NamedTuple):
 
 
 class ColmapImage(NamedTuple):
-    """A photo: its camera, and its pose, world to camera: quaternion (w first) and translation."""
+    """A photo: its id, its camera, and its pose (4, 4) world to camera."""
 
+    image_id: int
     camera_id: int
     name: str
-    pose: tuple[float, ...]
+    pose: F64
 
 
+MAX_POSE_DIFFERENCE = 1e-4
+"""Distance of the poses of `images` from those of frames, as a share of the extent, that is no difference."""
 Point = tuple[int, tuple[float, ...], tuple[int, ...]]
 """Id, coordinates, colour."""
 
 
 def read(model: Path, photos: Photos) -> Model:
-    """Read a folder with cameras, images and points3D, .bin or .txt (often `sparse/0`).
+    """Read a folder with cameras, images, points3D and, if it has them, rigs and frames: .bin or .txt (`sparse/0`).
 
     Raises:
         InputError: a file is missing or damaged, or a camera model isn't supported.
@@ -83,6 +87,7 @@ def read(model: Path, photos: Photos) -> Model:
     names = [model / f"{name}{suffix}" for name in ("cameras", "images", "points3D")]
     colmap_cameras, images, points = (_parsed(file, parse) for file, parse in zip(names, parsers, strict=True))
     cameras = {camera.camera_id: camera for camera in colmap_cameras}
+    images, notes = _with_poses_of_frames(model, suffix, images)
     images.sort(key=lambda image: image.name)
     points.sort()
     used = sorted({image.camera_id for image in images})
@@ -90,10 +95,39 @@ def read(model: Path, photos: Photos) -> Model:
         raise InputError(names[1], "refers to a camera that is missing in cameras.*", "Export the model again")
     return Model(
         {f"camera_{key}": camera_of(model, cameras[key]) for key in used},
-        tuple(Shot(image.name, f"camera_{image.camera_id}", _camera_to_world(image.pose)) for image in images),
+        tuple(
+            Shot(image.name, f"camera_{image.camera_id}", np.asarray(np.linalg.inv(image.pose), np.float64))
+            for image in images
+        ),
         np.array([xyz for _, xyz, _ in points], np.float64).reshape(-1, 3),
         np.array([rgb for _, _, rgb in points], np.uint8).reshape(-1, 3),
+        notes=notes,
     )
+
+
+def _with_poses_of_frames(
+    model: Path, suffix: str, images: list[ColmapImage]
+) -> tuple[list[ColmapImage], tuple[str, ...]]:
+    """Images with the poses of the model's rigs and frames, if it has them; and a note if those of `images` differ."""
+    files = [model / f"{name}{suffix}" for name in ("rigs", "frames")]
+    if not any(file.exists() for file in files):
+        return images, ()
+    binary = suffix == ".bin"
+    rigs = _parsed(files[0], colmap_rigs.rigs if binary else lambda lines: colmap_rigs.rig_lines(_rows(lines)))
+    frames = _parsed(files[1], colmap_rigs.frames if binary else lambda lines: colmap_rigs.frame_lines(_rows(lines)))
+    try:
+        poses = colmap_rigs.world_to_camera(rigs, frames)
+    except ValueError as error:
+        raise InputError(files[1], f"doesn't fit {files[0].name} ({error})", "Export the model again") from None
+    placed = [image._replace(pose=poses.get(image.image_id, image.pose)) for image in images]
+    centres = [np.linalg.inv([one.pose for one in part])[:, :3, 3] for part in (images, placed) if part]
+    apart = float(np.linalg.norm(centres[0] - centres[1], axis=1).max()) if centres else 0.0
+    if apart < MAX_POSE_DIFFERENCE * (1 + float(np.ptp(centres[1], axis=0).max() if centres else 0)):
+        return placed, ()
+    note = (
+        f"the poses of {files[0].name} and {files[1].name} are used; images{suffix} has others, up to {apart:.3g} off"
+    )
+    return placed, (note,)
 
 
 def camera_of(model: Path, camera: ColmapCamera) -> Camera:
@@ -146,9 +180,9 @@ def _cameras(data: bytes) -> Iterator[ColmapCamera]:
 def _images(data: bytes) -> Iterator[ColmapImage]:
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
-        _, *pose, camera = struct.unpack_from("<I7dI", data, at)
+        key, *pose, camera = struct.unpack_from("<I7dI", data, at)
         end = data.index(0, at + 64)
-        yield _posed(camera, data[at + 64 : end].decode(), tuple(pose))
+        yield _posed(key, camera, data[at + 64 : end].decode(), tuple(pose))
         (seen,) = struct.unpack_from("<Q", data, end + 1)  # observations: x, y, point
         at = end + 9 + 24 * seen
     if at > len(data):
@@ -177,7 +211,7 @@ def _image_lines(lines: list[str]) -> Iterator[ColmapImage]:
     rest = iter(lines)
     for line in _rows(rest):
         words = line.split(maxsplit=9)
-        yield _posed(int(words[8]), words[9].strip(), tuple(map(float, words[1:8])))
+        yield _posed(int(words[0]), int(words[8]), words[9].strip(), tuple(map(float, words[1:8])))
         next(rest, None)  # its observations, which may be an empty line
 
 
@@ -187,20 +221,11 @@ def _point_lines(lines: list[str]) -> Iterator[Point]:
         yield int(key), (float(x), float(y), float(z)), tuple(bytes((int(r), int(g), int(b))))
 
 
-def _posed(camera: int, name: str, pose: tuple[float, ...]) -> ColmapImage:
+def _posed(key: int, camera: int, name: str, pose: tuple[float, ...]) -> ColmapImage:
     if not 1e-6 < math.hypot(*pose[:4]) < 1e6:
         raise ValueError(f"{name} has no rotation")
-    return ColmapImage(camera, name, pose)
+    return ColmapImage(key, camera, name, colmap_rigs.transform(pose))
 
 
 def _rows(lines: Iterable[str]) -> Iterator[str]:
     return (line for line in lines if line.strip() and not line.startswith("#"))
-
-
-def _camera_to_world(pose: tuple[float, ...]) -> F64:
-    from scipy.spatial.transform import Rotation
-
-    out = np.eye(4)
-    out[:3, :3] = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix().T
-    out[:3, 3] = -out[:3, :3] @ pose[4:]
-    return out

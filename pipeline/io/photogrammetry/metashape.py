@@ -2,8 +2,10 @@
 
 A camera's `transform` is camera to chunk, row-major, with OpenCV's axes. Its component's `transform` (rotation, scale,
 translation), or the chunk's if it has none, maps to geocentric coordinates if the chunk's `reference` is a CRS of the
-Earth, and to the reference's own coordinates if that is local. Only the largest of several components is read. The
-camera model:
+Earth, and to the reference's own coordinates if that is local. Only the largest of several components is read.
+
+In a multi-camera system only the master camera has a `transform`; the others name it (`master_id`), and their sensor
+has `rotation` and `translation`, from its own axes to those of the master's, in the chunk's units. The camera model:
 
     u = w/2 + cx + x' f + x' b1 + y' b2,  v = h/2 + cy + y' f
     x' = x (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p1 (r2 + 2 x2) + 2 p2 x y
@@ -19,6 +21,7 @@ Source: Metashape Professional user manual 2.1, appendix D, Camera models.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -44,12 +47,16 @@ def read(model: Path, photos: Photos) -> Model:
         enabled = [
             camera for camera in chunk.iterfind("cameras//camera") if camera.get("enabled", "1") in ("1", "true")
         ]
-        aligned = [camera for camera in enabled if camera.find("transform") is not None]
+        by_id = {str(camera.get("id")): camera for camera in chunk.iterfind("cameras//camera")}
+        poses = {id(camera): _pose(camera, by_id, sensors) for camera in enabled}
+        aligned = [camera for camera in enabled if poses[id(camera)] is not None]
+        composed = sum(camera.find("transform") is None for camera in aligned)
         components = {c.get("id"): _similarity(c.find("transform")) for c in chunk.iterfind("components/component")}
-        component_sizes = Counter(camera.get("component_id") for camera in aligned)
+        component = {id(camera): _component(camera, by_id) for camera in aligned}
+        component_sizes = Counter(component.values())
         largest = component_sizes.most_common(1)[0][0] if component_sizes else None
-        in_smaller = [camera for camera in aligned if camera.get("component_id") != largest]
-        aligned = [camera for camera in aligned if camera.get("component_id") == largest]
+        in_smaller = [camera for camera in aligned if component[id(camera)] != largest]
+        aligned = [camera for camera in aligned if component[id(camera)] == largest]
         cameras, shots = {}, []
         for camera in aligned:
             key = str(camera.get("sensor_id"))
@@ -57,7 +64,8 @@ def read(model: Path, photos: Photos) -> Model:
                 raise ValueError(f"camera {camera.get('label')}: its sensor {key} is missing")
             if f"sensor_{key}" not in cameras:
                 cameras[f"sensor_{key}"] = _camera(model, sensors[key])
-            pose = np.array(_numbers(camera.find("transform"), 16)).reshape(4, 4)
+            pose = poses[id(camera)]
+            assert pose is not None
             _check_rotation(pose[:3, :3], str(camera.get("label")))
             shots.append(Shot(str(camera.get("label")), f"sensor_{key}", pose))
         onto = components.get(largest) or _similarity(chunk.find("transform"))
@@ -65,6 +73,8 @@ def read(model: Path, photos: Photos) -> Model:
     except (TypeError, ValueError, KeyError) as error:
         raise InputError(model, f"has missing or invalid values: {str(error)[:120]}", REMEDY) from None
     notes = []
+    if composed:
+        notes.append(f"{composed} photos of multi-camera systems are placed by their master's pose and sensor's offset")
     if in_smaller:
         notes.append(f"{len(in_smaller)} photos of {len(component_sizes) - 1} smaller components are left out")
     if len(enabled) > len(aligned) + len(in_smaller):
@@ -77,6 +87,24 @@ def read(model: Path, photos: Photos) -> Model:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = onto.scale * onto.rotation, onto.translation
     return Model(cameras, found.shots, found.xyz, None, T, _projected(model, reference), found.notes)
+
+
+def _pose(camera: Element, cameras: Mapping[str, Element], sensors: Mapping[str, Element]) -> F64 | None:
+    """Pose (4, 4) of a camera to the chunk: its own, or its master's with the offset of its sensor; None: unknown."""
+    if camera.find("transform") is not None:
+        return np.array(_numbers(camera.find("transform"), 16)).reshape(4, 4)
+    master, sensor = cameras.get(str(camera.get("master_id"))), sensors.get(str(camera.get("sensor_id")))
+    if master is None or master.find("transform") is None or sensor is None or sensor.find("translation") is None:
+        return None
+    offset = np.eye(4)
+    offset[:3, :3] = np.array(_numbers(sensor.find("rotation"), 9)).reshape(3, 3)
+    offset[:3, 3] = _numbers(sensor.find("translation"), 3)
+    return np.array(_numbers(master.find("transform"), 16)).reshape(4, 4) @ offset
+
+
+def _component(camera: Element, cameras: Mapping[str, Element]) -> str | None:
+    """Component of a camera: its own, or its master's."""
+    return camera.get("component_id", cameras.get(str(camera.get("master_id")), camera).get("component_id"))
 
 
 def _chunk(model: Path) -> Element:

@@ -10,8 +10,9 @@ from collections import deque
 from typing import Any
 
 from scan2sim.pipeline.core.errors import printable
-from scan2sim.services.monitoring.dashboard.history import MAX_NAME_CHARS, RejectedError
+from scan2sim.services.monitoring.dashboard.history import MAX_NAME_CHARS
 from scan2sim.services.monitoring.events.schema import Alarm
+from scan2sim.services.monitoring.messages import RejectedError
 
 MAX_RAISED, MAX_CLEARED = 256, 32
 

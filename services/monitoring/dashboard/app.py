@@ -26,8 +26,10 @@ from scan2sim.services.monitoring.dashboard.history import By, History, bucket_e
 from scan2sim.services.monitoring.dashboard.state import BusState
 from scan2sim.services.monitoring.events import alarm_commands
 from scan2sim.services.monitoring.events.schema import AlarmCommand, Body
+from scan2sim.services.monitoring.messages import Rejections
 from scan2sim.services.monitoring.settings.bus import RuleName, Subject
 from scan2sim.services.monitoring.settings.dashboard import PageParams
+from scan2sim.services.supervision import SupervisedThread
 
 log = logging.getLogger(__name__)
 
@@ -57,10 +59,21 @@ class AlarmTarget(Body):
 class TopicReader:
     """Reads a Kafka topic in a background thread."""
 
-    def __init__(self, cluster: kafka.Cluster, topic: str, history_s: float, callback: Callable[[bytes], None]) -> None:
-        """`callback` is called with every message, beginning with those of the last `history_s` seconds."""
-        self._cluster, self._topic, self._history_s, self._callback = cluster, topic, history_s, callback
-        self._thread = threading.Thread(target=self._read, name=f"{topic} for the page", daemon=True)
+    def __init__(
+        self, cluster: kafka.Cluster, topic: str, history_s: float, callback: Callable[[bytes], None],
+        rejections: Rejections,
+    ) -> None:  # fmt: skip
+        """Create it; `start` starts the thread.
+
+        Args:
+            cluster, topic: what to read.
+            history_s: begin with the messages of the last `history_s` seconds.
+            callback: called with every message.
+            rejections: counts the messages that are skipped.
+        """
+        self._cluster, self._topic, self._callback, self._rejections = cluster, topic, callback, rejections
+        self._since = time.time() - history_s
+        self._thread = SupervisedThread(self._read, f"{topic} for the page")
         self._ended = threading.Event()
         self._connected = False
 
@@ -82,16 +95,17 @@ class TopicReader:
         return self._connected
 
     def _read(self) -> None:
-        since = time.time() - self._history_s
         group = f"scan2sim-page-{uuid.uuid4().hex}"  # its own consumer group, so that every dashboard gets all messages
         bodies = kafka.read(
-            self._cluster, self._topic, group=group, since=since, connected=self._set_connected, wait=0.5
-        )
+            self._cluster, self._topic, group=group, since=self._since, connected=self._set_connected, wait=0.5,
+            rejected=self._rejections.add,
+        )  # fmt: skip
         for body in bodies:
             if self._ended.is_set():
                 return
+            self._since = time.time()  # a restarted thread continues here
             if body is not None:
-                self._callback(body)
+                kafka.process(body, self._callback, self._rejections.add)
 
     def _set_connected(self, connected: bool) -> None:
         if connected != self._connected:
@@ -114,8 +128,10 @@ class Sources:
         """Create them empty; `start` starts the readers."""
         now, cluster = time.time(), kafka.Cluster.read(params.kafka_bootstrap_servers, params.kafka_config)
         history, bus_state = History(now), BusState(now)
-        events = TopicReader(cluster, params.events_topic, max(MIN_EVENT_HISTORY_S, params.back), bus_state.add)
-        return cls(history, bus_state, TopicReader(cluster, params.topic, params.back, history.add), events)
+        back, events_back = params.back, max(MIN_EVENT_HISTORY_S, params.back)
+        records = TopicReader(cluster, params.topic, back, history.add, history.rejections)
+        events = TopicReader(cluster, params.events_topic, events_back, bus_state.add, bus_state.rejections)
+        return cls(history, bus_state, records, events)
 
     def start(self) -> None:
         """Start both readers."""
@@ -233,10 +249,10 @@ def _register_metrics(app: FastAPI, sources: Sources) -> None:
     nodes = Gauge("scan2sim_page_nodes", "Nodes on the dashboard", registry=registry)
     nodes.set_function(lambda: len(history.state()["nodes"]))
     records = Gauge("scan2sim_page_records", "Records received since the start", ("shown",), registry=registry)
-    records.labels("yes").set_function(lambda: history.counts["shown"])
-    records.labels("no").set_function(lambda: history.counts.total() - history.counts["shown"])
+    records.labels("yes").set_function(lambda: history.shown)
+    records.labels("no").set_function(history.rejections.counts.total)
     rejected = Gauge("scan2sim_page_events_rejected", "Events rejected since the start", registry=registry)
-    rejected.set_function(sources.bus_state.counts.total)
+    rejected.set_function(sources.bus_state.rejections.counts.total)
     alarms = Gauge("scan2sim_page_alarms", "Raised alarms", registry=registry)
     alarms.set_function(lambda: len(sources.bus_state.alarms.state()["raised"]))
 

@@ -7,22 +7,20 @@ each topic at a node `MAX_RECORDS_PER_FLOW`, of `MAX_FLOWS` in total: 46 MB.
 
 from __future__ import annotations
 
-import json
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from scan2sim.pipeline.core.errors import printable
 from scan2sim.services.monitoring.dashboard.clock_skew import ClockSkew
 from scan2sim.services.monitoring.dashboard.topics import topics
-from scan2sim.services.monitoring.record import SCHEMA, Record, TopicFlow
+from scan2sim.services.monitoring.messages import RejectedError, Rejections, parse_record
+from scan2sim.services.monitoring.record import Record, TopicFlow
 
 MAX_RECORDS_PER_NODE = 21_600
 """Records of a node that are kept; up to a quarter more before the oldest are dropped."""
@@ -35,9 +33,6 @@ GONE_AFTER_PERIODS = 3.0
 """Periods without a record after which a node counts as gone."""
 HOLD_PERIODS = 1.5
 """Periods before its time that a record covers, so that a late record leaves no gap."""
-MAX_TIME_S = 1e11
-"""Upper bound of a record's time, seconds since the epoch."""
-MAX_RECORD_BYTES = 4 * 2**20
 MAX_WARNINGS, MAX_WARNING_CHARS = 32, 400
 """Warnings of a node that are kept, and the characters of each."""
 MAX_NAME_CHARS = 256
@@ -55,10 +50,6 @@ By = Literal["node", "topic"]
 """What a line of a plot stands for."""
 
 Floats = NDArray[np.float64]
-
-
-class RejectedError(ValueError):
-    """A record or event that can't be displayed. The message is "REASON: DETAIL"; rejections are counted by reason."""
 
 
 @dataclass
@@ -142,8 +133,7 @@ class History:
         self._nodes: dict[str, _Node] = {}
         self._flows: dict[tuple[str, str, str], _Series] = {}
         self._numbered, self._topics_numbered = 0, 0
-        self.counts: Counter[str] = Counter()
-        self.last_rejected = ""
+        self.shown, self.rejections = 0, Rejections("records")
 
     def add(self, body: bytes) -> None:
         """Store a record; invalid ones are counted by reason and otherwise ignored."""
@@ -160,11 +150,9 @@ class History:
                 node.series.add(at, row)
                 self._add_flows(name, at, flows)
         except RejectedError as error:
-            reason, _, detail = str(error).partition(": ")
-            self.counts[reason] += 1
-            self.last_rejected = printable(f"{reason}: {detail}"[:MAX_WARNING_CHARS])
+            self.rejections.add(error)
         else:
-            self.counts["shown"] += 1
+            self.shown += 1
 
     def _node(self, record: Record) -> _Node:
         name, now = full_name(record), time.monotonic()
@@ -255,7 +243,7 @@ class History:
             nodes = [_state(name, node, now) for name, node in self._nodes.items()]
             alive = [node.last for node in self._nodes.values() if not node.is_gone(now)]
             numbers = {printable(key[1])[:MAX_NAME_CHARS]: flow.number for key, flow in self._flows.items()}
-        counts = {"counts": dict(self.counts), "last_rejected": self.last_rejected}
+        counts = {"counts": {"shown": self.shown, **self.rejections.counts}, "last_rejected": self.rejections.last}
         return {
             "nodes": nodes,
             "topics": [one | {"number": numbers.get(one["topic"])} for one in topics(alive)],
@@ -332,33 +320,6 @@ def buckets(times: Floats, rows: NDArray[np.float32], edges: Floats) -> Buckets:
     return Buckets(
         mean[:, by_node], minimum[:, by_node], maximum[:, by_node], mean[:, len(METRICS) :], bool((lengths > 1).any())
     )
-
-
-def parse_record(body: bytes) -> Record:
-    """Parse and validate a record.
-
-    Raises:
-        RejectedError: it isn't a record, or a value is out of range.
-    """
-    if len(body) > MAX_RECORD_BYTES:
-        raise RejectedError(f"too large: {len(body)} bytes")
-    try:
-        fields = json.loads(body)
-    except (ValueError, RecursionError) as error:
-        raise RejectedError(f"invalid JSON: {error}") from None
-    schema = fields.get("schema") if isinstance(fields, dict) else None
-    if schema != SCHEMA:
-        raise RejectedError(f"unknown schema: {str(schema)[:MAX_NAME_CHARS]}")
-    try:
-        record = Record.model_validate(fields)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise RejectedError(f"malformed: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
-    if not 0 < record.period <= 86_400:
-        raise RejectedError(f"malformed: a period of {record.period} s")
-    if not 0 <= record.time < MAX_TIME_S:
-        raise RejectedError(f"malformed: a time of {record.time} s")
-    return record
 
 
 def full_name(record: Record) -> str:

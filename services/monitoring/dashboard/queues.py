@@ -9,8 +9,9 @@ import threading
 from typing import Any
 
 from scan2sim.pipeline.core.errors import printable
-from scan2sim.services.monitoring.dashboard.history import MAX_NAME_CHARS, RejectedError
+from scan2sim.services.monitoring.dashboard.history import MAX_NAME_CHARS
 from scan2sim.services.monitoring.events.schema import QueueState
+from scan2sim.services.monitoring.messages import RejectedError
 
 MAX_QUEUES = 128
 SILENT_AFTER_S = 20.0

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from scan2sim.pipeline.core.errors import printable
-from scan2sim.services.monitoring.dashboard.history import RejectedError
 from scan2sim.services.monitoring.events.schema import RunState, StepState
+from scan2sim.services.monitoring.messages import RejectedError
 
 MAX_RUNS, MAX_STEPS = 32, 5000
 """Runs, and tasks of one run, that are stored."""

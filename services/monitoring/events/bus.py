@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from scan2sim.services import default_outbox, kafka
@@ -11,6 +12,7 @@ from scan2sim.services.monitoring.events.schema import Event, Events
 from scan2sim.services.monitoring.export.sinks import KafkaSink
 from scan2sim.services.monitoring.node.monitor import RECORDS_QOS, STRING, ros
 from scan2sim.services.monitoring.settings.bus import BusParams
+from scan2sim.services.supervision import SupervisedThread
 
 REACHED_INTERVAL_S = 1.0
 """Longest pause between two probes of an idle broker, if the caller waits for its signs."""
@@ -43,7 +45,7 @@ class Bus:
         for topic in topics:
             node.create_subscription(ros.message_type(STRING), topic, self._on_ros_message, RECORDS_QOS)
         self._closed = threading.Event()
-        self._readers: list[threading.Thread] = []
+        self._readers: list[SupervisedThread] = []
         self._kafka: KafkaSink | None = None
         if servers := params.kafka_bootstrap_servers:
             outbox = default_outbox.open_outbox(f"{node.get_namespace()}/{name}", params.events_topic)
@@ -51,8 +53,9 @@ class Bus:
             self._kafka = KafkaSink(cluster, params.events_topic, outbox)
             self.events.outlets.append(self._kafka)
             for topic in topics:
-                arguments = (cluster, topic, f"scan2sim-{name}")
-                reader = threading.Thread(target=self._read_kafka, args=arguments, daemon=True)
+                reader = SupervisedThread(
+                    partial(self._read_kafka, cluster, topic, f"scan2sim-{name}"), f"{topic} for {name}"
+                )
                 reader.start()
                 self._readers.append(reader)
 
@@ -61,12 +64,15 @@ class Bus:
 
     def _read_kafka(self, cluster: kafka.Cluster, topic: str, group: str) -> None:
         pause = self._probe_pause
-        bodies = kafka.read(cluster, topic, group=group, wait=0.5, reached=self._reached, max_probe_pause=pause)
+        bodies = kafka.read(
+            cluster, topic, group=group, wait=0.5, reached=self._reached, max_probe_pause=pause,
+            rejected=self.events.rejections.add,
+        )  # fmt: skip
         for body in bodies:
             if self._closed.is_set():
                 return
             if body is not None:
-                self.events.receive(body)
+                kafka.process(body, self.events.receive, self.events.rejections.add)
 
     def dropped(self) -> Mapping[str, int]:
         """Number of events that were dropped because the outbox was full, by kind."""

@@ -22,7 +22,15 @@ from typing import Annotated, Any, Literal, Protocol
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from scan2sim.pipeline.core.errors import SettingError
-from scan2sim.services.monitoring import record
+from scan2sim.services.monitoring.messages import (
+    RejectedError,
+    Rejections,
+    check_record_id,
+    first_error,
+    load_json,
+    validated_record,
+)
+from scan2sim.services.monitoring.record import SCHEMA
 from scan2sim.services.outbox import Deduplicator, new_ids
 
 log = logging.getLogger(__name__)
@@ -224,7 +232,7 @@ class Events:
 
     Attributes:
         deduplicator: of what is received.
-        malformed: number of received messages that were not valid events.
+        rejections: received messages that were not valid events, by reason.
     """
 
     def __init__(self, sender: str) -> None:
@@ -232,7 +240,7 @@ class Events:
         self._kinds, self._callbacks = dict(KINDS), defaultdict[str, list[Callback]](list)
         self._lock = threading.RLock()
         self.outlets: list[Outlet] = []
-        self.malformed = 0
+        self.rejections = Rejections(f"the event bus of {sender}")
 
     def define(self, kind: str, schema: type[BaseModel]) -> None:
         """Define the body of a kind of events.
@@ -271,22 +279,24 @@ class Events:
     def receive(self, line: str | bytes) -> None:
         """Call the callbacks for a message from the bus; duplicates and undefined kinds are ignored."""
         try:
-            fields = json.loads(line)
-            if fields.get("schema") == record.SCHEMA:
-                kind, body, record_id = RECORD, fields, fields["record id"]
+            fields = load_json(line)
+            kind: str
+            body: Any
+            if isinstance(fields, dict) and fields.get("schema") == SCHEMA:
+                kind, body, record_id = RECORD, fields, validated_record(fields).id
             else:
                 event = Event.model_validate(fields)
+                check_record_id(event.id)
                 if event.kind not in self._kinds:
                     return
                 kind, record_id, body = event.kind, event.id, self._kinds[event.kind].model_validate(event.body)
             with self._lock:
                 if self.deduplicator.is_new(record_id):
                     self._dispatch(kind, body)
-        except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:  # incl. pydantic's
-            self.malformed += 1
-            if str(self.malformed).strip("0") == "1":  # log only the 1st, 10th, 100th, ...
-                cause = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
-                log.warning("ignored malformed event number %d: %s (%.100r)", self.malformed, cause, line)
+        except ValidationError as error:
+            self.rejections.add(f"invalid event: {first_error(error)}")
+        except RejectedError as error:
+            self.rejections.add(error)
 
     def _schema(self, kind: str) -> type[BaseModel]:
         if kind not in self._kinds:

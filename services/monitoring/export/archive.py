@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.services import kafka
+from scan2sim.services.monitoring.messages import RejectedError, Rejections, parse_record
 from scan2sim.services.monitoring.record import Record
 from scan2sim.services.monitoring.settings.archive import ArchiveParams, QueryParams
 
@@ -111,19 +112,23 @@ def rows(record: Record) -> list[dict[str, Any]]:
 
 
 def archive_records(params: ArchiveParams, stop: threading.Event, warn: Callable[[str], None]) -> None:
-    """Archive all records from Kafka until `stop` is set; `warn` is called with a message for each invalid one."""
+    """Archive all records from Kafka until `stop` is set; `warn` is called with messages on what is skipped."""
     archive = Archive(params.archive)
     written = max((file.stat().st_mtime for file in archive.files()), default=None)
     since = None if written is None else written - WRITE_INTERVAL_S - LATE_RECORDS_S
     group = f"scan2sim-archive-{uuid.uuid4().hex}"
     due = time.monotonic() + WRITE_INTERVAL_S
     cluster = kafka.Cluster.read(params.kafka_bootstrap_servers, params.kafka_config)
-    for body in kafka.read(cluster, params.topic, group=group, from_start=True, since=since, wait=0.5):
+    rejections = Rejections(f"the archive of {params.topic}", warn)
+    bodies = kafka.read(
+        cluster, params.topic, group=group, from_start=True, since=since, wait=0.5, rejected=rejections.add
+    )
+    for body in bodies:
         if body is not None:
             try:
-                archive.add(Record.model_validate_json(body))
-            except ValueError as error:
-                warn(f"skipped a message that is not a record ({str(error).splitlines()[0]})")
+                archive.add(parse_record(body))
+            except RejectedError as error:
+                rejections.add(error)
         if time.monotonic() >= due or stop.is_set():
             archive.write()
             archive.compact(time.time())

@@ -18,6 +18,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 from scan2sim.services import transport
@@ -35,6 +36,7 @@ from scan2sim.services.monitoring.record import (
 )
 from scan2sim.services.monitoring.settings.monitor import MonitorParams
 from scan2sim.services.outbox import new_ids
+from scan2sim.services.supervision import SupervisedThread
 from scan2sim.services.transport import Arrival, QoS
 
 log = logging.getLogger(__name__)
@@ -120,9 +122,7 @@ class Monitor(ros.Node):  # type: ignore[misc]
         super().__init__(node_name, namespace=namespace, **settings)
         self._companion = _Companion(node_name, namespace, params.publisher_topic)
         self._sinks = sinks.open_sinks(params, f"{self.get_namespace()}/{node_name}")
-        self._reporting = threading.Thread(
-            target=self._report_periodically, args=(params.period,), name=f"{node_name} monitor", daemon=True
-        )
+        self._reporting = SupervisedThread(partial(self._report_periodically, params.period), f"{node_name} monitor")
         self._reporting.start()
 
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **others: Any) -> Any:

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Sequence
 
 from scan2sim.services.monitoring.work.queue import EventQueue, QueuedEvent
+from scan2sim.services.supervision import SupervisedThread
 
 STOP_TIMEOUT_S = 5.0
 """Time that a worker has to exit after its input has ended."""
@@ -59,7 +60,7 @@ class _Worker:
         self._queue, self._command, self._deadline = queue, command, deadline
         self._stopped = threading.Event()
         self.alive = False
-        self.thread = threading.Thread(target=self._run, name="worker", daemon=True)
+        self.thread = SupervisedThread(self._run, "worker")
         self.thread.start()
 
     def stop(self) -> None:

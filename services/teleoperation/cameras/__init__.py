@@ -12,6 +12,7 @@ import numpy as np
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.types import F64, U8
 from scan2sim.services.credentials import redacted
+from scan2sim.services.supervision import SupervisedThread
 from scan2sim.services.teleoperation import timecode
 
 CAMERA_TIMEOUT_S = 1.0
@@ -126,7 +127,7 @@ class Camera:
         self._last_frame = clock()
         self._frame_available = threading.Condition()
         self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"camera {name}", daemon=True)
+        self._thread = SupervisedThread(self._run, f"camera {name}")
         self._thread.start()
 
     def read(self, timeout_s: float) -> CameraFrame | None:

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
+from scan2sim.services.supervision import SupervisedThread
 from scan2sim.services.teleoperation.control.messages import Malformed
 from scan2sim.services.teleoperation.gateway.json_stream import Client, Connection, JsonObject
 from scan2sim.services.teleoperation.gateway_protocol import (
@@ -59,7 +60,7 @@ class GatewayConnection:
             identity, gateway.host, gateway.port,
             opened=self._opened, received=self._received, closed=self._closed,
         )  # fmt: skip
-        self._status_thread = threading.Thread(target=self._send_status, name="status for the gateway", daemon=True)
+        self._status_thread = SupervisedThread(self._send_status, "status for the gateway")
         self._status_thread.start()
 
     def connected(self) -> bool:

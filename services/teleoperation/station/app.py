@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
+from scan2sim.services.supervision import SupervisedThread
 from scan2sim.services.teleoperation.control.driver_session import DriverSession
 from scan2sim.services.teleoperation.control.messages import (
     Command,
@@ -183,8 +184,8 @@ class Station:
         self._why = "no vehicle is joined"
         self._ended = threading.Event()
         self._threads = [
-            threading.Thread(target=self._drive, name="commands", daemon=True),
-            threading.Thread(target=self._report, name="video reports", daemon=True),
+            SupervisedThread(self._drive, "commands"),
+            SupervisedThread(self._report, "video reports"),
         ]
         for thread in self._threads:
             thread.start()

@@ -30,6 +30,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from scan2sim.pipeline.core.errors import InputError, from_os_error
+from scan2sim.services.supervision import SupervisedThread
 from scan2sim.services.teleoperation.control.controls import Controls, Gear
 from scan2sim.services.teleoperation.control.messages import Command
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame
@@ -104,7 +105,7 @@ class Recorder:
         self._store = typestore()
         self._queue: queue.Queue[tuple[str, str, int, Any]] = queue.Queue(QUEUE_MAX)
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread = SupervisedThread(self._run, "recorder")
         self._thread.start()
 
     def frame(self, name: str, frame: Frame, age_ms: float) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from scan2sim.pipeline.core.errors import SettingError, StepError
 from scan2sim.pipeline.io.worlds.scene import read_scene
 from scan2sim.services.credentials import redacted
+from scan2sim.services.supervision import SupervisedThread
 from scan2sim.services.teleoperation import cameras, encoders
 from scan2sim.services.teleoperation.adapter_key import ADAPTER_KEY_FILE
 from scan2sim.services.teleoperation.cameras import Camera, Mount, View
@@ -133,7 +134,7 @@ class Vehicle:
         self._keys: KeySchedule | None = None
         self._rates = LinkRates()
         self._ended = threading.Event()
-        self._key_thread = threading.Thread(target=self._send_keys, name="video keys", daemon=True)
+        self._key_thread = SupervisedThread(self._send_keys, "video keys")
         self._key_thread.start()
 
     def hello(self) -> Hello:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from scan2sim.pipeline.core.types import U8
+from scan2sim.services.supervision import SupervisedThread
 from scan2sim.services.teleoperation import encoders
 from scan2sim.services.teleoperation.cameras import Camera, CameraFrame
 from scan2sim.services.teleoperation.control.messages import VideoStream
@@ -136,7 +137,7 @@ class CameraStreamer:
         self.number, self.camera, self.encoder, self.plan, self.fault = number, camera, encoder, plan, ""
         self._send, self._paused_until = send, -PAUSE_INTERVAL_MIN_S
         self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"video {camera.name}", daemon=True)
+        self._thread = SupervisedThread(self._run, f"video {camera.name}")
         self._thread.start()
 
     @property

@@ -1,8 +1,9 @@
 """Tensors of the Open Inference Protocol: the images of a request, and the results of a response.
 
 An input of datatype BYTES holds encoded images (JPEG, PNG, WebP), one of UINT8 RGB images of shape [N, height, width,
-3] or [height, width, 3]. Values are JSON (BYTES in base64), or binary: each element of BYTES behind its length in four
-bytes, little-endian (Triton's extension for binary tensor data, and gRPC's `raw_input_contents`).
+3] or [height, width, 3]. Values are JSON, flat or nested by shape (BYTES in base64), or binary: each element of BYTES
+behind its length in four bytes, little-endian (Triton's extension for binary tensor data, and gRPC's
+`raw_input_contents`).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import base64
 import binascii
 import struct
 from collections.abc import Sequence
+from itertools import chain, dropwhile
 from math import prod
 from typing import Annotated, Any
 
@@ -44,7 +46,8 @@ class InputTensor(BaseModel):
     shape: Annotated[list[Annotated[int, Field(ge=1, le=MAX_REQUEST_BYTES)]], Field(min_length=1, max_length=4)]
     datatype: Text
     parameters: dict[str, Any] = {}
-    data: list[Any] | None = None
+    data: list[Any] | str | None = None
+    """A text alone is the only element, as KServe's clients send it."""
 
 
 class RequestedOutput(BaseModel):
@@ -57,7 +60,7 @@ class RequestedOutput(BaseModel):
 class InferRequest(BaseModel):
     """Inference request in JSON; further fields are ignored."""
 
-    id: Text = ""
+    id: Text | None = None
     parameters: dict[str, Any] = {}
     inputs: Annotated[list[InputTensor], Field(min_length=1, max_length=MAX_IMAGES)]
     outputs: list[RequestedOutput] = []
@@ -123,13 +126,14 @@ def check_outputs(names: Sequence[str]) -> None:
 
 
 def images(
-    name: str, datatype: str, shape: Sequence[int], values: Sequence[Any] | None, raw: memoryview | None
+    name: str, datatype: str, shape: Sequence[int], values: Sequence[Any] | str | None, raw: memoryview | None
 ) -> list[Image]:
     """Images of an input tensor.
 
     Args:
         name, datatype, shape: as in the request.
-        values: its values: of BYTES bytes, or text in base64; of UINT8 integers, flat or nested.
+        values: its values, flat or nested by shape: of BYTES bytes, text in base64, or {"b64": TEXT} as TensorFlow
+            Serving's clients write it; of UINT8 integers. A text alone is the only value.
         raw: its binary data instead.
 
     Raises:
@@ -139,19 +143,19 @@ def images(
         if min(shape, default=0) < 1:
             raise ValueError(f"shape {list(shape)}")
         if datatype == "BYTES":
-            encoded = _elements(raw) if raw is not None else [_decoded(one) for one in values or ()]
+            encoded = _elements(raw) if raw is not None else [_decoded(one) for one in _flat(values, shape)]
             if len(encoded) != prod(shape):
                 raise ValueError(f"{len(encoded)} values for shape {list(shape)}")
             check_count(len(encoded))
             return list(encoded)
         if datatype != "UINT8":
-            raise ValueError(f"datatype {printable(datatype)[:40]!r}")
+            raise ValueError(f"datatype {printable(datatype)[:40]!r}, which the model doesn't take")
         count, height, width, channels = shape if len(shape) == 4 else (1, *shape)
         check_count(count)
         frames.check_size(printable(name), width, height)
         if channels != 3:
-            raise ValueError(f"{channels} channels instead of 3")
-        pixels = np.frombuffer(raw, np.uint8) if raw is not None else _integers(values or ())
+            raise ValueError(f"shape {list(shape)} has {channels} channels instead of 3 as its last dimension")
+        pixels = np.frombuffer(raw if raw is not None else bytes(_flat(values, shape)), np.uint8)
         return list(pixels.reshape(count, height, width, 3))
     except (ValueError, TypeError, OverflowError, binascii.Error) as error:
         raise InputError(printable(name), f"not an image ({error})", REMEDY) from None
@@ -168,14 +172,35 @@ def check_count(count: int) -> None:
 
 
 def _decoded(value: Any) -> bytes:
-    return value if isinstance(value, bytes) else base64.b64decode(value, validate=True)
+    if isinstance(value, bytes):
+        return value
+    text = value.get("b64") if isinstance(value, dict) else value
+    if not isinstance(text, str):
+        raise ValueError(f"a value is {type(text).__name__} instead of text in base64")
+    return base64.b64decode(text, validate=True)
 
 
-def _integers(values: Sequence[Any]) -> U8:
-    """Array of integers from 0 to 255, given flat or nested."""
-    if values and isinstance(values[0], list):
-        return np.array(values, np.uint8)
-    return np.frombuffer(bytes(values), np.uint8)
+def _flat(values: Sequence[Any] | str | None, shape: Sequence[int]) -> Sequence[Any]:
+    """Values in one sequence; nested ones must have the shape, apart from leading dimensions of 1.
+
+    Raises:
+        ValueError: they have another shape.
+    """
+    flat: Sequence[Any] = [values] if isinstance(values, str) else values or ()
+    sizes = [len(flat)]
+    while flat and isinstance(flat[0], list):
+        lengths = {len(one) if isinstance(one, list) else None for one in flat}
+        if len(lengths) > 1:
+            raise ValueError("nested lists of different lengths")
+        sizes.append(len(flat[0]))
+        flat = list(chain.from_iterable(flat))
+    if len(sizes) > 1 and _without_leading_ones(sizes) != _without_leading_ones(shape):
+        raise ValueError(f"nested lists of shape {sizes} for shape {list(shape)}")
+    return flat
+
+
+def _without_leading_ones(shape: Sequence[int]) -> list[int]:
+    return list(dropwhile(lambda size: size == 1, shape))
 
 
 def _elements(raw: memoryview) -> list[bytes]:

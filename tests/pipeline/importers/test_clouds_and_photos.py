@@ -105,7 +105,7 @@ ROW = "1.png,500010,5400005,102,1,0,0,0"
     ("heading", "row", "message"),
     [
         (f"file,x,y,qw,qx,qy,qz,{CAMERA}", f"1.png,1,2,1,0,0,0,{VALUES}", r"no column `z`.*Add it to the header line"),
-        (f"file,x,y,z,roll,{CAMERA}", f"1.png,1,2,3,0,{VALUES}", r"unknown column `roll`.*Known columns are file"),
+        (f"file,x,y,z,roll,{CAMERA}", f"1.png,1,2,3,0,{VALUES}", r"row 2: no rotation.*omega,phi,kappa"),
         (f"file,x,y,z,{CAMERA}", f"1.png,1,2,3,{VALUES}", r"row 2: no rotation.*omega,phi,kappa"),
         (f"file,x,y,z,qw,qx,qy,qz,{CAMERA}", f"1.png,1,2,up,1,0,0,0,{VALUES}", r"row 2: `z` is 'up'.*Fix that cell"),
         (f"file,x,y,z,qw,qx,qy,qz,{CAMERA}", f"1.png,1,2,3,2,0,0,0,{VALUES}", r"quaternion is not normalized"),

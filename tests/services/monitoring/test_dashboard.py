@@ -324,7 +324,7 @@ def test_runs_and_alarms_from_kafka_appear_on_the_page(broker: Broker, page: Pag
         send(an_alarm("raised", "images come late", time.time() - 5), b"not an event")
         page.until("!document.getElementById('alarm').hidden")
         assert "Alarm: images come late, /camera, since" in text(page, "#alarm")
-        page.until("document.getElementById('counts').innerText.includes('1 invalid event')")
+        page.until("document.getElementById('counts').innerText.includes('rejected events: 1 invalid JSON')")
         assert page.value("document.getElementById('queues').hidden")
         send(a_queue("detect"))
         page.until("!document.getElementById('queues').hidden")

@@ -10,11 +10,11 @@ import pytest
 
 from scan2sim.services.monitoring.dashboard import alarms, queues, runs
 from scan2sim.services.monitoring.dashboard.alarms import AlarmStates
-from scan2sim.services.monitoring.dashboard.history import RejectedError
 from scan2sim.services.monitoring.dashboard.queues import Queues
 from scan2sim.services.monitoring.dashboard.runs import Runs
 from scan2sim.services.monitoring.dashboard.state import BusState
 from scan2sim.services.monitoring.events.schema import Alarm, Event, QueueState, RunState, StepState
+from scan2sim.services.monitoring.messages import RejectedError
 
 NOW = 1e9
 
@@ -167,15 +167,15 @@ def body(**changed: Any) -> bytes:
 @pytest.mark.parametrize(
     ("message", "reason"),
     [
-        (b"", "invalid event"),
-        (b"\xff\xfe", "invalid event"),
+        (b"", "invalid JSON"),
+        (b"\xff\xfe", "invalid JSON"),
         (b"[1, 2]", "invalid event"),
-        (b"[" * 100_000, "invalid event"),
+        (b"[" * 100_000, "invalid JSON"),
         (body(schema="other"), "invalid event"),
         (body(body={}), "invalid event"),
         (body(body=run("r").model_dump() | {"seconds": -1}), "invalid event"),
         (body(body=run("r").model_dump() | {"more": 1}), "invalid event"),
-        (body(time=float("nan")), "invalid event"),
+        (body(time=float("nan")), "malformed"),
         (body(time=-5), "invalid event"),
         (body(time=1e300), "invalid event"),
         (body(more=4 * 2**20 * "x"), "too large"),
@@ -184,7 +184,7 @@ def body(**changed: Any) -> bytes:
 def test_invalid_events_are_counted_by_reason(message: bytes, reason: str) -> None:
     bus_state = BusState(NOW)
     bus_state.add(message)
-    assert bus_state.counts == {reason: 1} and bus_state.last_rejected.startswith(reason)
+    assert bus_state.rejections.counts == {reason: 1} and bus_state.rejections.last.startswith(reason)
     bus_state.add(body())
     state = bus_state.state(time.time())
     assert len(state["runs"]) == 1
@@ -194,7 +194,7 @@ def test_invalid_events_are_counted_by_reason(message: bytes, reason: str) -> No
 def test_events_of_unknown_kinds_are_ignored() -> None:
     bus_state = BusState(NOW)
     bus_state.add(body(kind="count", body={"vehicles": 3}))
-    assert not bus_state.counts and not bus_state.state(NOW)["runs"]
+    assert not bus_state.rejections.counts and not bus_state.state(NOW)["runs"]
 
 
 def test_events_before_the_start_keep_their_own_time() -> None:

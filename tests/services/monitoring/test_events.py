@@ -60,9 +60,9 @@ def test_events_that_violate_their_schema_are_ignored(caplog: pytest.LogCaptureF
     wrong = (outlet.lines[0].replace('"vehicles":3', '"vehicles":"many"'), "{", "3", '{"schema": "scan2sim-event-1"}')
     for line in wrong:
         other.receive(line)
-    assert got == [] and other.malformed == len(wrong) and len(caplog.records) == 1
+    assert got == [] and other.rejections.counts.total() == len(wrong) and len(caplog.records) == 1
     other.receive(outlet.lines[0].replace('"count"', '"unheard of"'))
-    assert other.malformed == len(wrong)  # a kind of another program isn't malformed
+    assert other.rejections.counts.total() == len(wrong)  # a kind of another program isn't malformed
 
 
 def test_failing_callback_does_not_prevent_others() -> None:

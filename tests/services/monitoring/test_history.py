@@ -19,6 +19,7 @@ from scan2sim.services.monitoring.dashboard.history import (
     bucket_edges,
     buckets,
 )
+from scan2sim.services.monitoring.messages import MAX_RECORD_BYTES
 from scan2sim.services.monitoring.record import TopicFlow
 from tests.fakes.sample_records import body, record
 
@@ -132,11 +133,11 @@ def test_buckets_match_a_slow_reference_on_random_records() -> None:
         (b"", "invalid JSON"),
         (b"\xff\xfe", "invalid JSON"),
         (b"[" * 100_000, "invalid JSON"),
-        (b"9" * 10_000, "invalid JSON"),
+        (b"9" * 10_000, "malformed"),
         (b"[]", "unknown schema"),
         (b'{"schema": "other-1"}', "unknown schema"),
         (b'{"schema": "scan2sim-monitor-1"}', "malformed"),
-        (b" " * (module.MAX_RECORD_BYTES + 1), "too large"),
+        (b" " * (MAX_RECORD_BYTES + 1), "too large"),
         (body("a", START, period=0.0), "malformed"),
         (body("a", START, messages=10**30), "malformed"),
         (body("a", START).replace(b"3000.0", b"1e999"), "malformed"),
@@ -206,7 +207,7 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (messages["min"][1], messages["max"][1]) == (4005, 4009)
     for name in "bcdef":
         of.add(record(name, START))  # type: ignore[arg-type]
-    assert set(of._nodes) == {"/a", "/b", "/c"} and of.counts["over the limit of 3 nodes"] == 3
+    assert set(of._nodes) == {"/a", "/b", "/c"} and of.rejections.counts["over the limit of 3 nodes"] == 3
     now = 2000.0
     of.add(record("g", START))  # type: ignore[arg-type]
     assert set(of._nodes) == {"/b", "/c", "/g"}, "the node that has been gone for the longest is dropped"

@@ -65,7 +65,7 @@ def test_rough_positions_are_read_from_a_list(tmp_path: Path) -> None:
     path.write_text("file,x,y,z\n2.jpg, 1, 2, 3\n0.jpg,4,5,6\n", encoding="utf-8")
     found = by_list(path, photos([None, None, None]), "local")
     assert np.allclose(found.xyz[[0, 2]], [[4, 5, 6], [1, 2, 3]]) and np.isnan(found.xyz[1]).all()
-    for text, cause in (("file,x,y,z\n9.jpg,1,2,3\n", "9.jpg"), ("name,x\n1,2\n", "not a list")):
+    for text, cause in (("file,x,y,z\n9.jpg,1,2,3\n", "9.jpg"), ("name,x\n1,2\n", "no column `file`")):
         path.write_text(text, encoding="utf-8")
         with pytest.raises(InputError, match=cause):
             by_list(path, photos([None, None, None]), "local")

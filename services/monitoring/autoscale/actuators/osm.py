@@ -10,6 +10,7 @@ from scan2sim.services.orchestration import operations
 from scan2sim.services.orchestration.lifecycle import WaitPolicy
 from scan2sim.services.orchestration.osm import Osm
 from scan2sim.services.orchestration.settings import Connection
+from scan2sim.services.supervision import SupervisedThread
 
 log = logging.getLogger(__name__)
 
@@ -25,7 +26,7 @@ class OsmReplicas:
         self._osm, self._instance = Osm(connection), instance
         self._desired, self._current = 0, 0
         self._changed, self._ended = threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=self._keep, name=f"replicas of {instance}", daemon=True)
+        self._thread = SupervisedThread(self._keep, f"replicas of {instance}")
         self._thread.start()
 
     def scale(self, count: int) -> None:

@@ -8,6 +8,7 @@ import time
 from dataclasses import dataclass
 
 from scan2sim.services.monitoring.autoscale.actuators import supervise
+from scan2sim.services.supervision import SupervisedThread
 
 CHECK_INTERVAL_S = 0.5
 """Pause between two checks whether all replicas are running."""
@@ -32,7 +33,7 @@ class ProgramReplicas:
         self._running: list[_Replica] = []
         self._ending: list[subprocess.Popen[bytes]] = []
         self._closed = threading.Event()
-        self._supervisor = threading.Thread(target=self._supervise, name="programs", daemon=True)
+        self._supervisor = SupervisedThread(self._supervise, "programs")
         self._supervisor.start()
 
     def scale(self, count: int) -> None:
