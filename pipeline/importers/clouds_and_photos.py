@@ -167,6 +167,8 @@ def import_las(
         if embedded_images and order == axes_order(None):
             embedded, lenses = e57_images.extract_all(map(Path, clouds), folder, warn, report)
             shots, rigs = shots + embedded, rigs | lenses
+        elif embedded_images and any(Path(cloud).suffix.lower() == ".e57" for cloud in clouds):
+            warn("images inside E57 files aren't used with other axes: their poses have those of the file")
         if correction is not None:
             shots = _corrected_photos(shots, correction, unit, warn)
         write_tile(
