@@ -20,7 +20,6 @@ from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
 from tests.fakes.gazebo.checker import check_world
 from tests.flows.test_cli import SMALL, assert_fails, scan2sim, stdout_of
 
-pytestmark = pytest.mark.timeout(900)  # on a busy machine, the first test waits minutes for its survey
 FAST = [*SMALL, "--set", "pictures.compared=1", "--set", "backdrop.when=never"]
 
 

@@ -124,7 +124,6 @@ def test_worker_with_another_version_fails_the_run(toys: Server, folder: Path) -
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_run_of_a_killed_worker_is_detected_and_rescheduled(tmp_path: Path, folder: Path) -> None:
     text = (ROOT / "deploy" / "automations.yaml").read_text(encoding="utf-8").replace("name: reprocess", "name: toy")
     (tmp_path / "automations.yaml").write_text(text, encoding="utf-8")
