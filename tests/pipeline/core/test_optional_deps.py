@@ -139,8 +139,8 @@ def test_missing_package_raises_the_same_error_in_every_command(
         cv2.imwrite(str(tmp_path / "frames" / f"{number}.png"), np.zeros((8, 16), np.uint8))
     (tmp_path / "truth.csv").write_text("time,x,y,z\n0,0,0,0\n1,1,0,0\n2,2,1,0\n3,3,1,0\n", encoding="utf-8")
     (tmp_path / "ept.json").write_text('{"dataType": "zstandard"}', encoding="utf-8")
-    for name in ("video.mp4", "cloud.e57"):
-        (tmp_path / name).touch()
+    (tmp_path / "video.mp4").touch()
+    (tmp_path / "cloud.e57").write_bytes(b"ASTM-E57" + bytes(40))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, package, None)
     words = [{"TILE": str(TILE), "FRAMES": "frames"}.get(word, word) for word in command.split()]
