@@ -18,8 +18,9 @@ ROOT = Path(__file__).resolve().parent.parent
 DATA_VARIABLE = "SCAN2SIM_REAL_DATA"
 """Environment variable with the folder of real recordings; if unset, `../shared/data` is used if it exists."""
 
-WORLD_TESTS, WORLD_TIMEOUT_S = ("tests/flows", "tests/data_samples"), 900
-"""Folders of tests that make whole worlds, and their time limit: the first of a checkout also compile the kernels."""
+WORLD_TESTS, LONG_TIMEOUT_S = ("tests/flows", "tests/data_samples", "tests/pipeline/importers"), 900
+"""Folders of tests that make whole worlds (the first of a checkout also compile the kernels), and the time limit of
+these and of tests with real recordings."""
 
 # a shell that runs the tests in the background makes them, and all their children, ignore Ctrl-C
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -35,12 +36,12 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests that need real recordings, so that `-m real_data` selects them; those that make worlds may be slow."""
+    """Mark tests that need real recordings, so that `-m real_data` selects them, and tests that take long."""
     for item in items:
-        if "real_data" in getattr(item, "fixturenames", ()):
+        if needs_recordings := "real_data" in getattr(item, "fixturenames", ()):
             item.add_marker("real_data")
-        if any(item.path.is_relative_to(ROOT / folder) for folder in WORLD_TESTS):
-            item.add_marker(pytest.mark.timeout(WORLD_TIMEOUT_S))
+        if needs_recordings or any(item.path.is_relative_to(ROOT / folder) for folder in WORLD_TESTS):
+            item.add_marker(pytest.mark.timeout(LONG_TIMEOUT_S))
 
 
 @pytest.fixture(scope="session")
