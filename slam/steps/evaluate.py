@@ -51,4 +51,4 @@ def lost_share(estimate: Trajectory, truth: Trajectory | GpsTrack) -> float:
     return float(steps[estimate.unsure[known][1:]].sum()) / whole if whole > 0 else 1.0
 
 
-EVALUATE = Step("evaluate", 2, evaluate_path, EvaluateParams)
+EVALUATE = Step("evaluate", 3, evaluate_path, EvaluateParams)
