@@ -109,9 +109,9 @@ def _missing_attributes(parts: Sequence[PointCloud], names: Sequence[str]) -> li
     }
     found = []
     for attribute, (what, effect) in effects.items():
-        lacking = [i for i, part in enumerate(parts) if getattr(part, attribute) is None]
-        if 0 < len(lacking) < len(parts):
-            found += [f"{names[i]}: no {what}, unlike others ({len(parts[i]):,} points): {effect}" for i in lacking]
+        missing = [i for i, part in enumerate(parts) if getattr(part, attribute) is None]
+        if 0 < len(missing) < len(parts):
+            found += [f"{names[i]}: no {what}, unlike others ({len(parts[i]):,} points): {effect}" for i in missing]
     return found
 
 

@@ -1,4 +1,4 @@
-"""What other programs leave on the bus' topics is skipped and counted by reason; page, alarms and archive go on."""
+"""What other programs leave on the bus' topics is skipped and counted by reason; page, alarms and archive continue."""
 
 from __future__ import annotations
 
