@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -50,6 +51,8 @@ PROBE_TIMEOUT_S = 1.0
 """Time for an idle broker to answer; after that it counts as unreachable."""
 FIRST_PROBE_PAUSE_S, MAX_PROBE_PAUSE_S = 0.5, 5.0
 """Pause until an idle broker is probed again; doubled each time that it answers, up to a maximum."""
+CLOSE_TIMEOUT_S = 10.0
+"""Time for a consumer to leave its group and to close."""
 
 
 @dataclass(frozen=True)
@@ -320,7 +323,22 @@ def read(
             else:
                 dropped(record_id)
     finally:
-        consumer.close()
+        _close(consumer)
+
+
+def _close(consumer: Any, timeout: float = CLOSE_TIMEOUT_S) -> None:
+    """Leave the group and free the consumer; one that librdkafka doesn't close in time is left to the process's end.
+
+    librdkafka can wait forever in it, for example if the broker went away (its issue 4519); no signal interrupts it.
+    """
+    closing = threading.Thread(target=consumer.close, name="close Kafka consumer", daemon=True)
+    try:
+        closing.start()
+    except RuntimeError:  # Python is ending
+        return
+    closing.join(timeout)
+    if closing.is_alive():
+        log.warning("Kafka: the consumer did not close within %g s; its group notices that after some seconds", timeout)
 
 
 def _record_id(header: bytes) -> str | None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import threading
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import pytest
 
@@ -70,3 +72,10 @@ def test_end_and_restart_of_a_broker_are_noticed(broker: Broker) -> None:
     read_until(False)
     broker.start()
     read_until(True)
+
+
+def test_consumer_that_does_not_close_does_not_stop_the_program(caplog: pytest.LogCaptureFixture) -> None:
+    never = threading.Event()
+    kafka._close(SimpleNamespace(close=never.wait), timeout=0.1)
+    never.set()
+    assert "did not close" in caplog.text
