@@ -2,9 +2,10 @@
 
     python -m tests.suite [-m MARKERS] [--report FILE] [options of pytest]
 
-Tests with the marker `realtime` depend on a real clock (limits of seconds, DDS, Chromium, several programs): others at
-the same time would slow them down. Tests that failed run once more, alone. The run passes if at most `PASSED_ALONE_MAX`
-failed and all of these pass alone; they are listed with their first failure, to be fixed.
+The kernels of a fresh checkout are compiled first. Tests with the marker `realtime` depend on a real clock (limits of
+seconds, DDS, Chromium, several programs): others at the same time would slow them down. Tests that failed run once
+more, alone. The run passes if at most `PASSED_ALONE_MAX` failed and all of these pass alone; they are listed with their
+first failure, to be fixed.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests import kernels
 
 # without reordering, as the longest files, which have few tests, would run last
 PARALLEL = ("-n", "3", "--dist", "loadfile", "--no-loadscope-reorder")
@@ -60,6 +63,9 @@ def main() -> int:
     parser.add_argument("-m", dest="markers", default="not slow")
     parser.add_argument("--report", type=Path)
     known, options = parser.parse_known_args()
+    if not kernels.are_compiled():
+        print("compiling kernels ...", flush=True)
+        subprocess.run([sys.executable, "-m", "tests.kernels"])
     runs = [run_pytest("parallel", "-m", f"({known.markers}) and not realtime", *PARALLEL, *options)]
     if runs[0].status not in STOPPED:
         runs.append(run_pytest("real time", "-m", f"({known.markers}) and realtime", *options))

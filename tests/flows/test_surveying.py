@@ -20,7 +20,7 @@ from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
 from tests.fakes.gazebo.checker import check_world
 from tests.flows.test_cli import SMALL, assert_fails, scan2sim, stdout_of
 
-FAST = [*SMALL, "--set", "pictures.compared=1", "--set", "backdrop.when=never"]
+FAST = [*SMALL, "--set", "backdrop.when=never"]
 
 
 @pytest.fixture(scope="module")

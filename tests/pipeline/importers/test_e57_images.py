@@ -74,11 +74,10 @@ def drawn(image: Image2D, points: F64, encode: str = ".png") -> tuple[Image2D, F
     seen &= ((at > 8) & (at < np.array([width, height]) - 8)).all(axis=1)
     canvas, kept = np.full((height, width), 30.0), list[int]()
     for i in np.flatnonzero(seen).tolist():
-        if all(np.abs(at[i] - at[j]).max() > 14 for j in kept):
+        if not kept or np.abs(at[kept] - at[i]).max(axis=1).min() > 14:
             kept.append(i)
-            v, u = np.mgrid[:height, :width][
-                :, int(at[i, 1]) - 7 : int(at[i, 1]) + 8, int(at[i, 0]) - 7 : int(at[i, 0]) + 8
-            ]
+            column, row = at[i].astype(int)
+            v, u = np.mgrid[row - 7 : row + 8, column - 7 : column + 8]
             spot = np.exp(-((u + 0.5 - at[i, 0]) ** 2 + (v + 0.5 - at[i, 1]) ** 2) / (2 * 1.5**2))
             canvas[v, u] += 200 * spot
     assert len(kept) > 10
