@@ -1,6 +1,6 @@
-"""Compile numba's kernels once, by making a tiny world: processes of tests would each compile them, for minutes.
+"""`python -m tests.kernels`: compile numba's kernels once, by making a tiny world.
 
-    python -m tests.kernels
+Otherwise several processes of tests would each compile them, for minutes.
 """
 
 from __future__ import annotations
