@@ -8,9 +8,6 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from scan2sim.data_samples.street import generate
-from tests.flows.tiny import COARSE, scan2sim, tiny
-
 ROOT = Path(__file__).resolve().parent.parent
 COMPILED = "*/*/__pycache__/*.nbi"
 """Index files of compiled kernels."""
@@ -23,6 +20,9 @@ def are_compiled() -> bool:
 
 def main() -> None:
     """Make the world of a tiny street."""
+    from scan2sim.data_samples.street import generate
+    from tests.flows.tiny import COARSE, scan2sim, tiny
+
     with tempfile.TemporaryDirectory(prefix="scan2sim-kernels-") as folder:
         street, tile = Path(folder) / "street", Path(folder) / "tile"
         generate(street, length=12.0, points=150_000, photos=8, seed=5, photo_width=480)
