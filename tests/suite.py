@@ -63,7 +63,7 @@ def main() -> int:
     parser.add_argument("-m", dest="markers", default="not slow")
     parser.add_argument("--report", type=Path)
     known, options = parser.parse_known_args()
-    if not kernels.are_compiled():
+    if Path.cwd() == kernels.ROOT and not kernels.are_compiled():
         print("compiling kernels ...", flush=True)
         subprocess.run([sys.executable, "-m", "tests.kernels"])
     runs = [run_pytest("parallel", "-m", f"({known.markers}) and not realtime", *PARALLEL, *options)]

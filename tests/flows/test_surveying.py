@@ -18,9 +18,11 @@ from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
 from tests.fakes.gazebo.checker import check_world
-from tests.flows.test_cli import SMALL, assert_fails, scan2sim, stdout_of
+from tests.flows.test_cli import assert_fails, scan2sim, stdout_of
 
-FAST = [*SMALL, "--set", "backdrop.when=never"]
+FAST = [f"--set={name}" for name in (
+    "unwrap.texel=0.05", "decimate.target=10000", "pictures.width=160", "pictures.compared=1", "backdrop.when=never")
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
