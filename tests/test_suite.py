@@ -19,7 +19,13 @@ FAILS_ONCE = """
         mark.touch()
         raise TimeoutError("a thread was late")
 """
-MARKERS = "[pytest]\nmarkers =\n    slow\n    realtime\n"
+MARKERS = """[pytest]
+addopts = -p no:dash -p no:schemathesis -p no:hypothesispytest -p no:anyio
+markers =
+    slow
+    realtime
+"""
+"""Without the plugins of installed packages, which take seconds to import."""
 
 
 def make_tests(folder: Path, **bodies: str) -> None:
