@@ -107,6 +107,11 @@ class Namespace:
         stats = json.loads(ip("-j", "-s", "-n", self.name, "link", "show", "dev", self.interface(wire)))[0]["stats64"]
         return Counts(stats["rx"]["packets"], stats["rx"]["bytes"], stats["tx"]["packets"], stats["tx"]["bytes"])
 
+    def kill_started(self) -> None:
+        """Kill the processes started here: one that hasn't entered the namespace yet isn't found there."""
+        for process in self._started:
+            process.kill()
+
     def wait_for_processes(self) -> None:
         """Wait until all processes started here have ended."""
         for process in self._started:
@@ -135,6 +140,8 @@ def pair() -> Iterator[tuple[Namespace, Namespace, Path]]:
             made.append(Namespace(side, number))
         yield made[0], made[1], folder
     finally:
+        for one in made:
+            one.kill_started()
         cleanup.communicate(b"\n")  # closing alone isn't enough: a forked child may still hold the pipe
         for one in made:
             one.wait_for_processes()

@@ -3,19 +3,21 @@
 `python -m tests.fakes.nav2_nodes smoother|monitor|base`: topics `cmd_vel_teleop` -> `cmd_vel_smoothed` -> `cmd_vel`,
 type `Twist`. As in Nav2's sources the smoother publishes 20 times per second, limits acceleration, decelerates to 0
 after `velocity_timeout` (1 s) without commands, then is silent; the monitor publishes only when it receives a command,
-and ceases to publish zeros 1 s after a stop. The base drives at the last command for ever, and prints a line with the
-time and the commanded speed, m/s, when that changes between motion and standstill.
+and ceases to publish zeros 1 s after a stop. The base drives at the last command for ever.
+The smoother numbers its messages in `linear.z`. Smoother and base print a line for each message that they send or
+receive: time, commanded speed (m/s), number (0: not from the smoother).
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import signal
 import subprocess
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,22 +36,24 @@ def smoother(ros: Any, node: Any) -> None:
     """Limit the acceleration of `cmd_vel_teleop`."""
     publisher = node.create_publisher(ros.message_type(TWIST), "cmd_vel_smoothed", QoS(depth=1))
     target = passed = 0.0
-    received = time.monotonic()
+    received, number = time.monotonic(), 0
 
     def receive(message: Any) -> None:
         nonlocal target, received
         target, received = float(message.linear.x), time.monotonic()
 
     def smooth() -> None:
-        nonlocal target, passed
+        nonlocal target, passed, number
         if time.monotonic() - received > VELOCITY_TIMEOUT_S:
             if passed == 0.0:
                 return
             target = 0.0
         step = ACCELERATION / SMOOTHING_HZ
         passed += min(max(target - passed, -step), step)
+        number += 1
         message = ros.message(TWIST)
-        message.linear.x = passed
+        message.linear.x, message.linear.z = passed, float(number)
+        print_command(message)
         publisher.publish(message)
 
     node.create_subscription(ros.message_type(TWIST), "cmd_vel_teleop", receive, QoS(depth=1))
@@ -79,10 +83,8 @@ def base(ros: Any, node: Any) -> None:
 
     def receive(message: Any) -> None:
         nonlocal speed
-        value = float(message.linear.x)
-        if (value == 0) != (speed == 0):
-            print(time.monotonic(), value, flush=True)
-        speed = value
+        print_command(message)
+        speed = float(message.linear.x)
 
     def measure() -> None:
         message = ros.message(ODOMETRY)
@@ -92,6 +94,11 @@ def base(ros: Any, node: Any) -> None:
 
     node.create_subscription(ros.message_type(TWIST), "cmd_vel", receive, QoS(depth=1))
     node.create_timer(0.02, measure)
+
+
+def print_command(message: Any) -> None:
+    """Print time, speed and number of a command."""
+    print(time.monotonic(), float(message.linear.x), round(message.linear.z), flush=True)
 
 
 def joint_state(ros: Any, speed: float) -> Any:
@@ -115,6 +122,7 @@ class Nodes:
     def __init__(self, transports: dict[str, str], pythons: Mapping[str, str | Path]) -> None:
         """Start them; `transports`: transport of each role; `pythons`: interpreter of each transport."""
         self.moves, self.since = False, 0.0
+        self._stop, self._arrived = math.inf, 0  # number of the smoother's first stop of this standstill; at the base
         self.processes = {
             role: subprocess.Popen(
                 [pythons[name], "-m", "tests.fakes.nav2_nodes", role],
@@ -124,7 +132,8 @@ class Nodes:
             )
             for role, name in transports.items()
         }
-        threading.Thread(target=self._read, daemon=True).start()
+        for read in (self._read_smoother, self._read_base):
+            threading.Thread(target=read, daemon=True).start()
 
     def __enter__(self) -> Nodes:
         return self
@@ -143,12 +152,27 @@ class Nodes:
         """Let it continue."""
         self.processes[role].send_signal(signal.SIGCONT)
 
-    def _read(self) -> None:
-        stdout = self.processes["base"].stdout
+    def stop_has_passed(self) -> bool:
+        """Whether the smoother publishes stops, and the base has received the first of them or a later one."""
+        return self._arrived >= self._stop
+
+    def _read_smoother(self) -> None:
+        for _, speed, number in self._commands("smoother"):
+            self._stop = math.inf if speed else min(self._stop, number)
+
+    def _read_base(self) -> None:
+        for at, speed, number in self._commands("base"):
+            if (speed != 0) != self.moves:
+                self.moves, self.since = speed != 0, at
+            self._arrived = number or self._arrived
+
+    def _commands(self, role: str) -> Iterator[tuple[float, float, int]]:
+        """Time, speed and number of each command that a node has printed."""
+        stdout = self.processes[role].stdout
         assert stdout is not None
         for line in stdout:
-            since, speed = map(float, line.split())
-            self.moves, self.since = speed != 0, since
+            at, speed, number = line.split()
+            yield float(at), float(speed), int(number)
 
 
 def main() -> None:

@@ -1,5 +1,7 @@
 """Drake's SDF parser in strict mode: unknown elements and missing files are errors.
 
+Shapes of actors, which only Gazebo's worlds name, have no `model.sdf` and aren't parsed.
+
 Elements used only by Gazebo (`GAZEBO_ELEMENTS`) are removed from a copy first; they are valid SDF that Drake ignores.
 """
 
@@ -36,12 +38,13 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
         plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.001)
         parser = Parser(plant)
         parser.SetStrictParsing()
-        for model in sorted(models.iterdir()):
-            parser.package_map().Add(model.name, model)
-            _strip(model / "model.sdf")
+        described = sorted(models.glob("*/model.sdf"))
+        for model in described:
+            parser.package_map().Add(model.parent.name, model.parent)
+            _strip(model)
         try:
-            for model in sorted(models.iterdir()):
-                parser.AddModels(model / "model.sdf")
+            for model in described:
+                parser.AddModels(model)
         except RuntimeError as why:
             raise Fault(str(why)) from None
         return {"models": plant.num_model_instances() - 2, "bodies": plant.num_bodies() - 1}

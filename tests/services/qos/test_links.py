@@ -146,6 +146,14 @@ def test_an_error_inside_the_context_leaves_nothing_behind() -> None:
     assert name not in namespaces.ip("netns", "list")
 
 
+def test_a_program_that_has_not_entered_its_namespace_yet_ends_with_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    need_link()
+    with Link(LinkProfile()) as link:
+        monkeypatch.setattr(namespaces.Namespace, "command_inside", lambda _, *command: [*command])
+        started = link.near.popen("sleep", "600")
+    assert started.poll() == -signal.SIGKILL
+
+
 def test_missing_requirements_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     with (
