@@ -9,12 +9,13 @@ import shutil
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from PIL import Image
 
@@ -157,4 +158,16 @@ def chromium(folder: Path, *flags: str) -> Iterator[Page]:
                 page.do("Runtime.enable")
                 yield page
         finally:
-            process.terminate()
+            _end(process)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End the browser and its processes, some of which go on writing into its profile when it has ended."""
+    with suppress(psutil.NoSuchProcess):
+        others = psutil.Process(process.pid).children(recursive=True)
+        process.terminate()
+        process.wait()
+        for one in others:
+            with suppress(psutil.NoSuchProcess):
+                one.kill()
+        psutil.wait_procs(others, timeout=10)

@@ -44,7 +44,10 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
     photo = renderings.photo(reference)
     focal, centre = photo.camera.fx, (photo.camera.cx, photo.camera.cy)
     size = photo.camera.width, photo.camera.height
-    with tempfile.TemporaryDirectory() as work, cesium.viewer(export, Path(work), size) as view:
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as work,
+        cesium.viewer(export, Path(work), size) as view,
+    ):
         view.look(*_onto_earth(frame, photo.pose), focal=focal, centre=centre, pixels=FINEST_ERROR_PX)
         finest = view.screenshot()
         near = view.look(*_onto_earth(frame, photo.pose), focal=focal, centre=centre)

@@ -24,7 +24,10 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
     expected = json.loads((export / "metadata.json").read_text(encoding="utf-8"))["triangles_by_file"]
     photo = renderings.photo(reference)
     size = photo.camera.width, photo.camera.height
-    with tempfile.TemporaryDirectory() as work, threejs.viewer(export, list(expected), Path(work), size) as view:
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as work,
+        threejs.viewer(export, list(expected), Path(work), size) as view,
+    ):
         rendering = view.render(photo.camera, photo.pose)
     if view.statistics["triangles"] != sum(expected.values()):
         raise Fault(f"{view.statistics['triangles']} of {sum(expected.values())} triangles are loaded", view.statistics)
