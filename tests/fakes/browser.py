@@ -162,7 +162,7 @@ def chromium(folder: Path, *flags: str) -> Iterator[Page]:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End the browser and its processes, some of which go on writing into its profile when it has ended."""
+    """End the browser and its processes, some of which still write into its profile when it has ended."""
     with suppress(psutil.NoSuchProcess):
         others = psutil.Process(process.pid).children(recursive=True)
         process.terminate()
