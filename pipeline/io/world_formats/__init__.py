@@ -23,6 +23,7 @@ from scan2sim.pipeline.core.errors import DataError, ScanError, SettingError, Sp
 from scan2sim.pipeline.core.plugins import find, module, names
 from scan2sim.pipeline.core.step import Report
 from scan2sim.pipeline.core.types import Mesh
+from scan2sim.pipeline.geometry.open_backs import open_backs
 from scan2sim.pipeline.io import robot_formats
 from scan2sim.pipeline.io.file_checks import make_folder
 from scan2sim.pipeline.io.images import image
@@ -333,9 +334,22 @@ class SingleMaterialMesh:
     triangles: int
 
 
+def shown(tile: SceneTile, params: SceneParams) -> dict[str, Textured]:
+    """Surfaces of a tile by group, with the backs of upright faces that have none, if `params.double_sided`.
+
+    For simulators that don't draw the back of a face, and have no flag that all of their sensors regard: Gazebo's lidar
+    and segmentation camera replace materials by their own.
+    """
+    shapes = tile.textured()
+    if not params.double_sided:
+        return shapes
+    meshes = [shape.mesh for shape in shapes.values()]
+    return {group: shape.with_backs(open_backs(shape.mesh, meshes)) for group, shape in shapes.items()}
+
+
 def write_single_material(folder: Path, tile: SceneTile, params: SceneParams) -> Iterator[SingleMaterialMesh]:
     """Write an OBJ for each class and texture page of a tile, and the pages, below `folder`."""
-    for group, shape in tile.textured().items():
+    for group, shape in shown(tile, params).items():
         pages = write_pages(folder, group, shape, params)
         for surface in by_class(group, shape):
             for page in surface.shape.used_pages:

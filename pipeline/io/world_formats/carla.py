@@ -70,7 +70,7 @@ class _Package:
 
     def add(self, tile: SceneTile) -> None:
         """Add a tile's ground to the map, and write its other surfaces as props."""
-        for group, shape in tile.textured().items():
+        for group, shape in world_formats.shown(tile, self._params).items():
             placed = _placed(shape, np.asarray(tile.offset))
             if group == "terrain":
                 self._add_ground(tile, placed)

@@ -88,7 +88,7 @@ def _ceiling_name(tile: SceneTile) -> str:
 
 def _models(models: Path, tile: SceneTile, params: SceneParams) -> dict[str, int]:
     """Write a tile's models; returns the number of triangles of their mesh files, by path below `models`."""
-    shapes = tile.textured()
+    shapes = world_formats.shown(tile, params)
     parts = {tile.name: shapes}
     if _has_ceiling(tile):
         parts = {

@@ -107,7 +107,7 @@ def _write_tile(path: Path, tile: SceneTile, source: SceneTile, params: ScenePar
         }
         for surface in surfaces:
             for part in surface.parts(params.max_visual_triangles):
-                _add_visual(stage, root, part, materials, views, params.reflectance)
+                _add_visual(stage, root, part, materials, views, params)
                 triangles += len(part.shape)
     for solid in solids(source.solid(), source.friction):
         _add_collision(stage, root, solid)
@@ -116,7 +116,7 @@ def _write_tile(path: Path, tile: SceneTile, source: SceneTile, params: ScenePar
 
 
 def _add_visual(
-    stage: Any, root: Any, surface: Surface, materials: dict[int, Any], views: Sequence[View], reflectance: bool
+    stage: Any, root: Any, surface: Surface, materials: dict[int, Any], views: Sequence[View], params: SceneParams
 ) -> None:
     """Add a surface with its labels, its `reflectance` if known, and one subset of faces per texture page."""
     from pxr import Sdf, UsdGeom, UsdSemantics, UsdShade, Vt
@@ -130,7 +130,8 @@ def _add_visual(
     st.Set(Vt.Vec2fArray.FromNumpy(uv))
     st.SetIndices(Vt.IntArray.FromNumpy(corner_uv.ravel()))
     _add_provenance(primvars, surface, views)
-    if reflectance and shape.reflectance is not None:
+    mesh.CreateDoubleSidedAttr(params.double_sided and surface.group != BACKDROP)
+    if params.reflectance and shape.reflectance is not None:
         primvar = primvars.CreatePrimvar("reflectance", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex)
         primvar.Set(Vt.FloatArray.FromNumpy(shape.reflectance))
     prim = mesh.GetPrim()

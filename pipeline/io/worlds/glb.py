@@ -19,7 +19,7 @@ from scan2sim.pipeline.io.worlds.gltf import geometry, metadata, textures
 from scan2sim.pipeline.io.worlds.gltf.builder import Array, Builder
 from scan2sim.pipeline.io.worlds.gltf.geometry import Codec, Part, plain
 from scan2sim.pipeline.io.worlds.gltf.textures import Texture
-from scan2sim.pipeline.io.worlds.scene import Surface, Vector
+from scan2sim.pipeline.io.worlds.scene import BACKDROP, Surface, Vector
 from scan2sim.pipeline.io.worlds.textured_mesh import unique_uv
 
 UNLIT = "KHR_materials_unlit"
@@ -39,6 +39,8 @@ class GlbParams(Params):
         glb_bare: omit the provenance of each face's colour.
         reflectance: write the relative reflectance of surfaces for lidar, if the cloud has intensities: Gazebo's
             `laser_retro`, the attribute `_REFLECTANCE` in GLBs, the primvar `reflectance` in USD.
+        double_sided: what was scanned from one side is seen from both: a flag in GLB, 3D Tiles and USD, further faces
+            where there is none (`world_formats.shown`). The backdrop is seen from inside only.
     """
 
     jpeg_quality: int = Field(90, ge=1, le=100, description="JPEG quality of GLB textures and of JPEG texture pages.")
@@ -57,6 +59,7 @@ class GlbParams(Params):
         True,
         description="Write the reflectance of surfaces for lidar (Gazebo, GLB, USD), if the cloud has intensities.",
     )
+    double_sided: bool = Field(True, description="Show walls that were scanned from one side from both sides.")
 
 
 def find_encoders(params: GlbParams) -> tuple[Texture, Codec]:
@@ -82,7 +85,7 @@ def write(
     """Write surfaces into one file, with one mesh per surface and texture page; its class is in its `extras`.
 
     Local metres, rotated from z up to glTF's y up: (x, y, z) becomes (x, z, -y). Materials are matt
-    (metallic 0, roughness 1) and single-sided. Pages are read and encoded one at a time. Vertices have
+    (metallic 0, roughness 1). Pages are read and encoded one at a time. Vertices have
     `_REFLECTANCE` (0 to 1) if it is known.
 
     Args:
@@ -110,7 +113,8 @@ def write(
             if material not in materials:
                 pixels = _scaled(image.read_rgb(surface.shape.pages[page]), scale)
                 packed = texture.encode(pixels, params.jpeg_quality)
-                materials[material] = _material(builder, material, packed, texture, params.glb_lit)
+                both_sides = params.double_sided and surface.group != BACKDROP
+                materials[material] = _material(builder, material, packed, texture, params.glb_lit, both_sides)
             part, extensions = _part(surface.on_page(page), params, views, len(rows))
             primitive = codec.primitive(builder, part)
             mesh = {
@@ -170,7 +174,7 @@ def _part(surface: Surface, params: GlbParams, views: Sequence[View], features: 
     return Part(faces.reshape(-1, 3), attributes), {} if row is None else metadata.of_primitive(features)
 
 
-def _material(builder: Builder, name: str, packed: bytes, texture: Texture, lit: bool) -> int:
+def _material(builder: Builder, name: str, packed: bytes, texture: Texture, lit: bool, both_sides: bool) -> int:
     """Add a matt material with a page as texture; returns its index."""
     if not builder.tree["samplers"]:
         builder.add("samplers", {"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMP, "wrapT": CLAMP})
@@ -182,6 +186,8 @@ def _material(builder: Builder, name: str, packed: bytes, texture: Texture, lit:
     colour = {"index": builder.add("textures", texture_entry)}
     matt = {"baseColorTexture": colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
     material: dict[str, Any] = {"name": name, "pbrMetallicRoughness": matt}
+    if both_sides:
+        material["doubleSided"] = True
     if not lit:
         builder.use(UNLIT)
         material["extensions"] = {UNLIT: {}}

@@ -60,6 +60,32 @@ class Textured:
         reflectance = None if self.reflectance is None else self.reflectance[used]
         return replace(self, mesh=self.mesh.keep(mask), normal=self.normal[used], photo=photo, reflectance=reflectance)
 
+    def with_backs(self, mask: Bools) -> Textured:
+        """The faces, and those selected by `mask` (F,) again with their other side as front."""
+        if not mask.any():
+            return self
+        backs, mesh = self.keep(mask), self.mesh
+        assert mesh.uv is not None and backs.mesh.uv is not None
+
+        def both(front: npt.NDArray[Any] | None, back: npt.NDArray[Any] | None) -> Any:
+            return None if front is None or back is None else np.concatenate([front, back])
+
+        return Textured(
+            replace(
+                mesh,
+                vertices=both(mesh.vertices, backs.mesh.vertices),
+                faces=both(mesh.faces, backs.mesh.faces[:, ::-1] + np.int32(len(mesh.vertices))),
+                density=both(mesh.density, backs.mesh.density),
+                uv=both(mesh.uv, backs.mesh.uv[:, ::-1]),
+                page=both(mesh.page, backs.mesh.page),
+                classification=both(mesh.classification, backs.mesh.classification),
+            ),
+            both(self.normal, -backs.normal),
+            self.pages,
+            both(self.photo, backs.photo),
+            both(self.reflectance, backs.reflectance),
+        )
+
     def median_reflectance(self) -> float | None:
         """Median reflectance of the surface, each face by its area; None: not known."""
         if self.reflectance is None:

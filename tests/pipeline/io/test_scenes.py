@@ -14,7 +14,7 @@ from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.step import silent
-from scan2sim.pipeline.core.types import Frame
+from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.scene import Level, Scene, read_scene
@@ -89,6 +89,55 @@ def test_all_surfaces_have_their_positions_and_colours(town: Scene, exported: di
     np.testing.assert_array_equal(seen[:, 0], own[:, 0])
     np.testing.assert_allclose(seen[:, 1:10], own[:, 1:10], atol=1e-3)
     assert np.abs(seen[:, 10:] - own[:, 10:]).mean() < 3 and np.percentile(np.abs(seen[:, 10:] - own[:, 10:]), 95) < 20
+
+
+FLAGGED = ("glb", "tiles3d", "usd")
+"""Formats with a flag for surfaces that are seen from both sides."""
+
+
+@pytest.fixture
+def facade(tmp_path: Path) -> Scene:
+    """The town's first tile, whose house is a facade: what a car sees of it."""
+    scene = synthetic.scene(tmp_path, tiles=1)
+    folder = scene.tiles[0].folder / "building"
+    house = Mesh.load(folder / "mesh.npz")
+    front = house.face_normal[:, 1] < -0.9
+    house.keep(front).save(folder / "mesh.npz")
+    np.save(folder / "photo.npy", np.load(folder / "photo.npy")[front])
+    np.save(folder / "reflectance.npy", np.load(folder / "reflectance.npy")[np.unique(house.faces[front])])
+    return read_scene(tmp_path / "world")
+
+
+@each
+@pytest.mark.parametrize("both", [True, False])
+def test_a_wall_scanned_from_one_side_is_seen_from_both(facade: Scene, tmp_path: Path, name: str, both: bool) -> None:
+    seen = [
+        (corners, uv)
+        for one in READERS[name](written(facade, name, tmp_path / "out", double_sided=both), facade)
+        if one.label in (CODE["building"], "building")
+        for corners, uv in zip(np.round(one.corners, 3).tolist(), np.round(one.uv, 4).tolist(), strict=True)
+    ]
+    assert len(seen) == (4 if both and name not in FLAGGED else 2)
+    if len(seen) == 4:  # each triangle and its reverse, with the same place in the texture
+        turned = [{*map(str, zip(*face, strict=True))} for face in seen]
+        assert all(turned.count(corners) == 2 for corners in turned)
+        normals = [np.cross(np.subtract(b, a), np.subtract(c, a)) for (a, b, c), _ in seen]
+        assert sorted(np.sign(normal[1]) for normal in normals) == [-1, -1, 1, 1]
+
+
+@pytest.mark.parametrize("both", [True, False])
+def test_formats_with_a_flag_use_it_for_all_but_the_backdrop(facade: Scene, tmp_path: Path, both: bool) -> None:
+    import trimesh
+
+    for name, file in (("glb", "tile0.glb"), ("tiles3d", "tiles3d/tile0.glb")):
+        folder = written(facade, name, tmp_path / name, double_sided=both)
+        shapes = trimesh.load_scene(folder / file, process=False).geometry.values()
+        assert {bool(shape.visual.material.doubleSided) for shape in shapes} == {both}
+    folder = written(facade, "usd", tmp_path / "usd", double_sided=both)
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(folder / "usd" / "tile0.usdc"))
+    assert UsdGeom.Mesh(stage.GetPrimAtPath("/tile0/Visual/building")).GetDoubleSidedAttr().Get() == both
 
 
 def test_usd_has_the_reflectance_of_vertices(town: Scene, tmp_path: Path) -> None:
