@@ -37,6 +37,7 @@ from scan2sim.pipeline.steps.join import JOIN
 from scan2sim.pipeline.steps.lidar_score import LIDAR_SCORE
 from scan2sim.pipeline.steps.map_colours import MAP_COLOURS
 from scan2sim.pipeline.steps.navigation import NAVIGATION
+from scan2sim.pipeline.steps.origin import ORIGIN
 from scan2sim.pipeline.steps.overlap import OVERLAP
 from scan2sim.pipeline.steps.path import PATH
 from scan2sim.pipeline.steps.photo_coverage import PHOTO_COVERAGE
@@ -81,7 +82,7 @@ STEPS: tuple[Step, ...] = (
     GHOSTS, MAP_COLOURS, OVERLAP, DETECT_FURNITURE, FURNITURE, SPLIT, SPLIT_MESH, VOXEL, FLOOR, GROUND, WALLS, FACADES,
     ROOMS, POISSON, TRIM, FREE_SPACE, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, POSE_REFINEMENT, SIGNS,
     FOLIAGE, VISIBILITY, EXPOSURE, PHOTO_CONSISTENCY, VIEW_SELECTION, TEXTURE, COLOUR_HARMONIZATION, ROADS,
-    SKY_COLOUR, BACKDROP, COLLISION, NAVIGATION, REFLECTANCE, EXPORT, RASTERS, GEOMETRY, SCORE, LIDAR_SCORE,
+    SKY_COLOUR, BACKDROP, COLLISION, ORIGIN, NAVIGATION, REFLECTANCE, EXPORT, RASTERS, GEOMETRY, SCORE, LIDAR_SCORE,
     PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 SIDE_PRODUCTS: tuple[Step, ...] = (
@@ -179,10 +180,12 @@ def build_graph(
     lists = _list_objects(graph, scan, parts) | tracks
     closed, surfaces, photos, lists = _analyse_photos(graph, scan, parts, lists)
     textured = _texture(graph, parts, surfaces, photos, synthesized, source)
-    roads = _add_roads(graph, scan, textured)
+    solid, origin = _add_solid(graph, closed, parked)
+    roads = _add_roads(graph, scan, textured, origin)
     sky = _add_sky(graph, scan, photos)
     backdrop = _add_backdrop(graph, scan, surfaces, photos)
-    _export(graph, scan, parts, closed, textured, photos, parked, lists | roads | sky | backdrop)
+    more = lists | roads | sky | backdrop | solid | origin
+    _export(graph, scan, parts, closed, textured, photos, parked["textured"], more)
     _measure(graph, scan, parts, surfaces, textured, photos, synthesized, sky | backdrop)
     _show(graph, scan, parts, textured, photos, sky)
     return graph.tasks
@@ -577,13 +580,28 @@ def _add_backdrop(graph: TileGraph, scan: Scan, surfaces: Sources, photos: Sourc
     return {"backdrop": graph.output(BACKDROP, "backdrop")} if graph.is_enabled(BACKDROP) else {}
 
 
-def _add_roads(graph: TileGraph, scan: Scan, textured: Sources) -> Sources:
+def _add_solid(graph: TileGraph, surfaces: Sources, parked: Mapping[str, Sources]) -> tuple[Sources, Sources]:
+    """The collision mesh, and the world's origin unless it is chosen or that of a robot's map; as inputs of steps."""
+    # the floor of a robot's map is denoised already, and its assumed part must not follow points nearby
+    terrain: Sources = {} if _has_floor(graph) else {"cloud": graph.output(SPLIT, "terrain")}
+    ground = {"terrain": graph.output(FLOOR, "mesh")} if _has_floor(graph) and _is_mesh(graph) else {}
+    meshes = {**surfaces, **ground, **_plant_models(graph, "mesh"), **parked["mesh"]}
+    graph.add(COLLISION, meshes | terrain, **graph.cell)
+    solid: Sources = {"collision": graph.output(COLLISION, "mesh")}
+    if world_origin(graph.tile, graph.settings) is not None:
+        return solid, {}
+    graph.add(ORIGIN, solid)
+    return solid, {"origin": graph.output(ORIGIN, "origin")}
+
+
+def _add_roads(graph: TileGraph, scan: Scan, textured: Sources, origin: Sources) -> Sources:
     """Extract the roads; returns them and the path as inputs of the export."""
     if not scan.path or graph.params(ROADS).when == "never" or not graph.is_enabled(ROADS):
         return scan.path
     ground = {"cloud": graph.output(SPLIT, "terrain"), "textured": textured["terrain"]}
-    origin = world_origin(graph.tile, graph.settings)
-    graph.add(ROADS, ground | scan.path, name=graph.tile.name, world_origin=origin, cell=graph.cell or None)
+    chosen = world_origin(graph.tile, graph.settings)
+    inputs = ground | scan.path | origin
+    graph.add(ROADS, inputs, name=graph.tile.name, world_origin=chosen, cell=graph.cell or None)
     outputs = {"roads": "geojson", "roads_seen": "seen", "opendrive": "opendrive"}
     return scan.path | {name: graph.output(ROADS, output) for name, output in outputs.items()}
 
@@ -595,23 +613,19 @@ def _export(
     surfaces: Sources,
     textured: Sources,
     photos: Sources,
-    parked: Mapping[str, Sources],
-    lists: Sources,
+    parked: Sources,
+    more: Sources,
 ) -> None:
-    """The collision mesh, the world, and rasters."""
+    """The world, with what else was made for it (`more`), and rasters."""
     output, add, name = graph.output, graph.add, graph.tile.name
-    # the floor of a robot's map is denoised already, and its assumed part must not follow points nearby
-    terrain: Sources = {} if _has_floor(graph) else {"cloud": output(SPLIT, "terrain")}
-    ground = {"terrain": output(FLOOR, "mesh")} if _has_floor(graph) and _is_mesh(graph) else {}
-    add(COLLISION, {**surfaces, **ground, **_plant_models(graph, "mesh"), **parked["mesh"], **terrain}, **graph.cell)
-    planted = textured | _plant_models(graph, "textured") | parked["textured"]
+    planted = textured | _plant_models(graph, "textured") | parked
     choice = {f"choice.{group}": output(VIEW_SELECTION, "choice", group) for group in parts.groups}
-    views = {"views": photos["cameras"], "collision": output(COLLISION, "mesh")}
     floor = {"floor": output(FLOOR, "mask")} if _has_floor(graph) else {}
     frames = _frames(graph.tile, graph.settings)
-    maps = _add_navigation(graph, scan, surfaces, frames)
-    more = maps | _add_reflectance(graph, scan, textured)
-    add(EXPORT, planted | choice | lists | parts.instances | views | floor | more, **_export_context(graph, frames))
+    placed: Sources = {str(name): more[name] for name in ("collision", "origin") if name in more}
+    found = _add_navigation(graph, scan, surfaces, placed, frames) | _add_reflectance(graph, scan, textured)
+    inputs = planted | choice | parts.instances | {"views": photos["cameras"]} | floor | more | found
+    add(EXPORT, inputs, **_export_context(graph, frames))
     if graph.params(EXPORT).rasters:
         add(RASTERS, textured, name=name, **_raster_context(graph.settings))
 
@@ -626,14 +640,19 @@ def _add_reflectance(graph: TileGraph, scan: Scan, textured: Sources) -> Sources
     return {"reflectance": graph.output(REFLECTANCE, "reflectance")}
 
 
-def _add_navigation(graph: TileGraph, scan: Scan, surfaces: Sources, frames: Mapping[str, Any]) -> Sources:
-    """Occupancy maps and points for localization; returns them as an input of the export."""
+def _add_navigation(
+    graph: TileGraph, scan: Scan, surfaces: Sources, placed: Sources, frames: Mapping[str, Any]
+) -> Sources:
+    """Occupancy maps and points for localization; returns them as an input of the export.
+
+    `placed` are the collision mesh and the world's origin.
+    """
     when, robot_map = graph.params(NAVIGATION).when, graph.tile.robot_map
     wanted = when == "always" or (when == "auto" and robot_map is not None)
     if graph.cell or not wanted or not graph.is_enabled(NAVIGATION):
         return {}
     cloud = {"cloud": graph.output(DYNAMIC_OBJECTS, "cloud")} if robot_map else {}
-    meshes = {"collision": graph.output(COLLISION, "mesh")} | _mesh_inputs(surfaces)
+    meshes = placed | _mesh_inputs(surfaces)
     context = dict(frames) | ({"spacing": robot_map.spacing, "has_floor": _has_floor(graph)} if robot_map else {})
     graph.add(NAVIGATION, meshes | cloud | scan.path, **context)
     return {"navigation": graph.output(NAVIGATION, "navigation")}

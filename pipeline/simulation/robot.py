@@ -195,7 +195,7 @@ class Start:
     Attributes:
         position: position of its frame, world metres.
         angles: roll, pitch and yaw (fixed axes x, y, z), radians.
-        by: what its heading follows: "lane", "road" or "path"; "floor": it is in free space.
+        by: what its heading follows: "lane", "road" or "path"; "floor", "ground": it is in free space.
     """
 
     position: Vector

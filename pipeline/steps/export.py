@@ -19,6 +19,7 @@ from scan2sim.pipeline.io import sky, world_formats
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.scene import PATH_FILE, ROADS_FILE, TRACKS_FILE, RobotMapFrame, save_tile
+from scan2sim.pipeline.simulation import ground_origin
 
 LISTS = {
     "plants": "plants.geojson", "plants_csv": "plants.csv",
@@ -43,7 +44,7 @@ class ExportContext(Context):
 
     Attributes:
         name: name of the tile, its world and its model.
-        world_origin: origin of the world in the CRS, metres; None: the tile's own.
+        world_origin: origin of the world in the CRS, metres; None: that of the input `origin`, or else the tile's own.
         T_world_map: rigid transform from the robot's map, in metres, to the CRS; None: not made from a robot's map.
         unit: metres per unit of the robot's map.
         indoor: whether it shows rooms: the ground is floor, buildings are walls.
@@ -63,7 +64,7 @@ class ExportParams(SceneParams):
         formats: modules of `pipeline/io/world_formats`; `scan2sim export` writes further formats later.
         friction: Coulomb friction coefficient of roads; 0.9 is rubber on dry asphalt. Other classes scale with it.
         world_origin: origin of the world in the CRS, metres; tiles with the same origin share their georeference.
-            Default: the tile's own origin; the world of a local robot's map keeps the map's coordinates.
+            Default: the ground in the middle of the tile; the world of a local robot's map keeps the map's coordinates.
         rasters: pixel size in metres of an orthophoto, a DSM and a DTM as cloud-optimized GeoTIFF (step `rasters`);
             true: texel size of the ground's texture.
     """
@@ -112,7 +113,7 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
         inputs["collision"],
         lists,
         params.friction,
-        params.world_origin or context.world_origin,
+        params.world_origin or context.world_origin or ground_origin.read(inputs),
         views,
         photos,
         robot_map,

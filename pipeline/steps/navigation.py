@@ -15,6 +15,7 @@ from scan2sim.pipeline.core.errors import DataError, SettingError
 from scan2sim.pipeline.core.parameters import Coordinate
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, F64, Bools, Mesh, PointCloud, Trajectory
+from scan2sim.pipeline.simulation import ground_origin
 
 MAX_CLOUD_POINTS = 10_000_000
 BLOCK_M = 0.5
@@ -33,7 +34,8 @@ class NavigationContext(Context):
     """The tile.
 
     Attributes:
-        world_origin: origin of the simulator's world in the CRS, metres; None: the tile's own.
+        world_origin: origin of the simulator's world in the CRS, metres; None: that of the input `origin`, or else the
+            tile's own.
         T_world_map: rigid transform from the robot's map, in metres, to the CRS; None: not made from a robot's map.
         unit: metres per unit of the robot's map.
         spacing: distance of the points of the PCD, metres.
@@ -110,7 +112,8 @@ def _write_maps(
     from scan2sim.pipeline.simulation.occupancy import Band, storeys
 
     mesh, ground = _surfaces(inputs, params.context)
-    offset = np.asarray(mesh.frame.origin) - np.asarray(params.context.world_origin or mesh.frame.origin)
+    origin = params.context.world_origin or ground_origin.read(inputs) or mesh.frame.origin
+    offset = np.asarray(mesh.frame.origin) - np.asarray(origin)
     starts = _starts(inputs, params.context, mesh)
     report(0.1, "occupancy")
     band = Band(params.low, params.high, params.max_step, params.max_slope, params.radius)

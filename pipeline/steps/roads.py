@@ -13,6 +13,7 @@ from scan2sim.pipeline.core.parameters import Coordinate, Name
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.tile_cell import TileCell
 from scan2sim.pipeline.core.types import F64, Bools, Frame, PointCloud, Trajectory
+from scan2sim.pipeline.simulation import ground_origin
 
 ROAD_CLASSES = ("road", "bridge_deck")
 MAX_ROAD_DISTANCE_M = 3.0
@@ -24,7 +25,8 @@ class RoadsContext(Context):
 
     Attributes:
         name: name of the tile.
-        world_origin: origin of the OpenDRIVE file in the CRS, metres (`export.world_origin`); None: the tile's own.
+        world_origin: origin of the OpenDRIVE file in the CRS, metres (`export.world_origin`); None: that of the input
+            `origin`, or else the tile's own.
         cell: the tile's cell, if it has neighbours; observations outside it belong to them.
     """
 
@@ -76,7 +78,8 @@ def roads(inputs: Inputs, params: RoadsParams, out: Path, report: Report) -> Don
     road_geojson.write(out / "roads.geojson", cloud.frame, drawn)
     observed.save(out / "seen.npz", seen, cloud.frame)
     (out / "opendrive").mkdir()
-    world = Frame(cloud.frame.crs, params.context.world_origin or cloud.frame.origin, cloud.frame.unit)
+    origin_of_world = params.context.world_origin or ground_origin.read(inputs) or cloud.frame.origin
+    world = Frame(cloud.frame.crs, origin_of_world, cloud.frame.unit)
     network = model.network([one.moved(origin) for one in seen], world.origin)
     opendrive.write(out / "opendrive" / f"{params.context.name}.xodr", params.context.name, world, network)
     metrics = {"points": int(on.sum()), "driven": len(ways), "roads": [road_geojson.facts(road) for road in drawn]}

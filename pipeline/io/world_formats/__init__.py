@@ -29,13 +29,13 @@ from scan2sim.pipeline.io.file_checks import make_folder
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.mesh_formats import PageNames, obj
 from scan2sim.pipeline.io.navigation import ros_launch
-from scan2sim.pipeline.io.worlds import sdf
+from scan2sim.pipeline.io.worlds import readme, sdf
 from scan2sim.pipeline.io.worlds.glb import GlbParams, find_encoders
 from scan2sim.pipeline.io.worlds.scene import BACKDROP, Scene, SceneTile, by_class
-from scan2sim.pipeline.io.worlds.spawn import find_spawn_pose, free_space_pose
+from scan2sim.pipeline.io.worlds.spawn import default_pose, find_spawn_pose, free_space_pose
 from scan2sim.pipeline.io.worlds.textured_mesh import Textured
 from scan2sim.pipeline.simulation.collision_shapes import Solid, solids
-from scan2sim.pipeline.simulation.robot import ROBOT, Robot
+from scan2sim.pipeline.simulation.robot import ROBOT, Robot, Start
 
 PACKAGE = "scan2sim.pipeline.io.world_formats"
 GAZEBO_VISUAL_FORMATS = ("obj", "collada")
@@ -124,7 +124,7 @@ def write(
     robot: bool = False,
     failed: dict[str, ScanError] | None = None,
 ) -> None:
-    """Write a scene in the given formats below `folder`, with its lists and `metadata.json`.
+    """Write a scene in the given formats below `folder`, with its lists, `metadata.json` and `README.md`.
 
     Args:
         scene: the scene.
@@ -145,6 +145,7 @@ def write(
     if robot:
         _check_names(scene)
         scene = replace(scene, start=find_spawn_pose(scene))
+    scene = replace(scene, spawn=scene.start or default_pose(scene))
     make_folder(folder)
     triangles: dict[str, int] = {}
     main = "gazebo" if "gazebo" in formats else next(iter(formats), "")
@@ -165,6 +166,7 @@ def write(
             navigation = _write_navigation(scene, place, formats)
     text = json.dumps(metadata(scene, triangles) | navigation, indent=2)
     (folder / "metadata.json").write_text(text + "\n", encoding="utf-8")
+    readme.write(folder, scene, formats)
 
 
 @contextmanager
@@ -259,9 +261,9 @@ def metadata(scene: Scene, triangles: dict[str, int]) -> dict[str, Any]:
         "triangles_by_file": triangles,
     }
     rest |= sky_metadata(scene)
+    rest |= spawn_metadata(scene)
     if scene.start:
-        start = {"position_m": list(scene.start.position), "angles_rad": list(scene.start.angles), "on": scene.start.by}
-        rest["robot"] = {"name": ROBOT.name, **start}
+        rest["robot"] = {"name": ROBOT.name, **_pose(scene.start)}
     if scene.robot_map:
         rest |= {"T_world_map": scene.robot_map.T_world_map.tolist(), "map_unit_m": scene.robot_map.unit}
     if len(scene.tiles) == 1:
@@ -281,6 +283,15 @@ def metadata(scene: Scene, triangles: dict[str, int]) -> dict[str, Any]:
     }
     to_crs = "crs = (world + world_origin_m) / unit_m; world = local + offset_m, local as in a tile's meshes"
     return {**common, "to_crs": to_crs, "tiles": tiles, **rest}
+
+
+def spawn_metadata(scene: Scene) -> dict[str, Any]:
+    """Entry of metadata.json: a pose on free ground for the user's robots."""
+    return {"spawn": _pose(scene.spawn)} if scene.spawn else {}
+
+
+def _pose(start: Start) -> dict[str, Any]:
+    return {"position_m": list(start.position), "angles_rad": list(start.angles), "on": start.by}
 
 
 def sky_metadata(scene: Scene) -> dict[str, Any]:

@@ -62,12 +62,12 @@ def _write_world(path: Path, scene: Scene, actors: str = "") -> None:
     if len(scene.tiles) == 1:
         tile = scene.tiles[0]
         names = (tile.name, _ceiling_name(tile)) if _has_ceiling(tile) else (tile.name,)
-        sdf.write_world(path, names, georeference, tile.offset, scene.start, scene.sky, actors)
+        sdf.write_world(path, names, georeference, tile.offset, scene.start, scene.sky, actors, scene.spawn)
     else:
         placed = [sdf.PlacedModel(tile.name, tile.offset, tile.low, tile.high) for tile in scene.tiles]
         sdf.write_levels(
             path, scene.name, georeference, placed, sdf.LEVEL_BUFFER_M, sdf.PERFORMER_NAME, scene.start, scene.sky,
-            {scene.dome.name: scene.dome.offset} if scene.dome else {}, actors,
+            {scene.dome.name: scene.dome.offset} if scene.dome else {}, actors, scene.spawn,
         )  # fmt: skip
 
 

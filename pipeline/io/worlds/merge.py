@@ -10,8 +10,8 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +22,16 @@ from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.geodata import crs
 from scan2sim.pipeline.io.world_formats import SceneParams, gazebo, opendrive
-from scan2sim.pipeline.io.worlds import scene, sdf
+from scan2sim.pipeline.io.worlds import readme, scene, sdf
 from scan2sim.pipeline.io.worlds.scene_traffic import scenario_of
+from scan2sim.pipeline.io.worlds.spawn import default_pose
 
-USER_EDITABLE_SUFFIXES = (".sdf", ".world", ".config", ".json", ".mtl", ".geojson", ".csv", ".xodr", ".yaml", ".py")
+USER_EDITABLE_SUFFIXES = (
+    ".sdf", ".world", ".config", ".json", ".mtl", ".geojson", ".csv", ".xodr", ".yaml", ".py", ".md",
+)  # fmt: skip
 """Suffixes of files that users edit by hand: copied, never linked."""
 STAMP_FILE, ROADS_STAMP_FILE, DOME_STAMP_FILE = ".result", ".roads", ".dome"
-VERSION = 5
+VERSION = 6
 """Version of the layout: when it changes, worlds are rebuilt."""
 
 
@@ -246,20 +249,24 @@ def _edited(world: Path) -> list[Path]:
 
 
 def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, performer: str, dome: MakeDome) -> None:
-    origin = _origin(tiles)
+    metadata = {tile.name: _metadata(tile.world / "metadata.json") for tile in tiles}
+    origin = _origin(tiles, metadata)
     first = tiles[0].frame
     georeference = sdf.Georeference.of(Frame(first.crs, origin, first.unit))
-    metadata = {tile.name: _metadata(tile.world / "metadata.json") for tile in tiles}
     placed = [_place(tile, metadata[tile.name], origin) for tile in tiles]
     for tile in tiles:
         for subfolder in (Path("models") / tile.name, Path(scene.SCENE_FOLDER) / tile.name):
             shutil.copytree(tile.world / subfolder, folder / subfolder, copy_function=link)
     scene.write_scene_file(folder, name, Frame(first.crs, origin, first.unit), [tile.name for tile in tiles])
     whole = scene.add_dome(scene.read_scene(folder), folder, dome)
+    whole = replace(whole, spawn=default_pose(whole))
     sky = gazebo.write_dome(folder, whole, SceneParams())
     _stamp_dome(folder, whole.dome)
     shown = {whole.dome.name: whole.dome.offset} if whole.dome else {}
-    sdf.write_levels(folder / f"{name}.sdf", name, georeference, placed, buffer, performer, None, whole.sky, shown)
+    sdf.write_levels(
+        folder / f"{name}.sdf", name, georeference, placed, buffer, performer, None, whole.sky, shown,
+        spawn=whole.spawn,
+    )  # fmt: skip
     gazebo.write_traffic(whole, scenario_of(whole), folder)
     body = {
         "name": name,
@@ -271,6 +278,7 @@ def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, p
         "buffer_m": buffer,
         "performer": performer,
         **world_formats.sky_metadata(whole),
+        **world_formats.spawn_metadata(whole),
         "tiles": {
             tile.name: {
                 "origin_m": list(tile.frame.origin),
@@ -283,6 +291,7 @@ def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, p
         "triangles_by_file": {file: n for one in metadata.values() for file, n in _model_triangles(one).items()} | sky,
     }
     (folder / "metadata.json").write_text(json.dumps(body, indent=2) + "\n", encoding="utf-8")
+    readme.write(folder, whole, ["gazebo"])
 
 
 def _metadata(path: Path) -> dict[str, Any]:
@@ -297,12 +306,13 @@ def _model_triangles(metadata: dict[str, Any]) -> dict[str, int]:
     return {file: n for file, n in metadata["triangles_by_file"].items() if file.startswith("models/")}
 
 
-def _origin(tiles: Sequence[TileWorld]) -> sdf.Vector:
-    """Origin, in whole metres, of the tile nearest to the middle of the survey, so that coordinates are small."""
+def _origin(tiles: Sequence[TileWorld], metadata: Mapping[str, Mapping[str, Any]]) -> sdf.Vector:
+    """Origin of the tile nearest to the middle of the survey, so that coordinates are small: on its ground."""
     origins = np.array([tile.frame.origin for tile in tiles])
     middle = (origins.min(axis=0) + origins.max(axis=0)) / 2
-    x, y, z = np.round(origins[np.argmin(np.linalg.norm(origins - middle, axis=1))]).tolist()
-    return x, y, z
+    nearest = int(np.argmin(np.linalg.norm(origins - middle, axis=1)))
+    x, y, _ = np.round(origins[nearest]).tolist()
+    return x, y, float(metadata[tiles[nearest].name]["world_origin_m"][2])
 
 
 def _place(tile: TileWorld, metadata: dict[str, Any], origin: sdf.Vector) -> sdf.PlacedModel:

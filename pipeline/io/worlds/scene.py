@@ -250,6 +250,7 @@ class Scene:
         tiles: ordered by name.
         coarse: root of the levels of detail of all tiles, or None.
         start: start pose of the robot, if it is exported.
+        spawn: pose for the user's robots, if one was found.
         robot_map: frame of the robot's map that it was made from, or None.
         dome: sky of a survey's world, a tile with nothing but a backdrop; None: tiles have their own, or none.
     """
@@ -259,6 +260,7 @@ class Scene:
     tiles: tuple[SceneTile, ...]
     coarse: Level | None = None
     start: Start | None = None
+    spawn: Start | None = None
     robot_map: RobotMapFrame | None = None
     dome: SceneTile | None = None
 

@@ -47,6 +47,8 @@ LASER_RETRO_FULL = 255
 """`<laser_retro>` of reflectance 1."""
 LEVEL_BUFFER_M = 20.0
 """Distance from a tile at which a performer loads it."""
+SPAWN_FRAME = "spawn_pose"
+"""Frame on free ground where robots can be placed."""
 PERFORMER_NAME = ROBOT.name
 """Name of the model for which levels are loaded."""
 BACKGROUND_RGB = (179, 204, 230)
@@ -110,6 +112,7 @@ def write_world(
     start: Start | None = None,
     sky: Colour | None = None,
     actors: str = "",
+    spawn: Start | None = None,
 ) -> None:
     """Write a world that includes `model://<name>` for each name.
 
@@ -121,9 +124,11 @@ def write_world(
         start: start pose of the robot, `model://robot`; None: without a robot.
         sky: colour of the background, sRGB 0 to 255; None: `BACKGROUND_RGB`.
         actors: further elements of the world.
+        spawn: pose on free ground for the user's robots, the frame `SPAWN_FRAME`, or None.
     """
     included = "".join(_include(name, offset) for name in names)
-    path.write_text(_world(path, names[0], georeference, included + _robot(start) + actors, sky), encoding="utf-8")
+    content = included + _spawn(spawn) + _robot(start) + actors
+    path.write_text(_world(path, names[0], georeference, content, sky, _spawn_note(spawn)), encoding="utf-8")
 
 
 def write_levels(
@@ -137,6 +142,7 @@ def write_levels(
     sky: Colour | None = None,
     everywhere: Mapping[str, Vector] = MappingProxyType({}),
     actors: str = "",
+    spawn: Start | None = None,
 ) -> None:
     """Write a world of many models, each in its own level, so that Gazebo can load only those near a robot.
 
@@ -153,6 +159,7 @@ def write_levels(
         sky: as in `write_world`.
         everywhere: models that are loaded wherever the performer is: metres from the world's origin, by name.
         actors: further elements of the world.
+        spawn: as in `write_world`.
     """
     path.write_text(
         _world(
@@ -161,11 +168,12 @@ def write_levels(
             georeference,
             "".join(_include(tile.name, tile.offset) for tile in tiles)
             + "".join(_include(*model) for model in everywhere.items())
+            + _spawn(spawn)
             + _robot(start)
             + actors
             + _levels(tiles, buffer, performer),
             sky,
-            f"""
+            f"""{_spawn_note(spawn)}
      All tiles are loaded then. With the option "levels" (two dashes before it, which XML forbids here) only those
      near a performer are: the model that <performer> names below, if it is in this file when Gazebo starts, and
      any model that is named to the service /world/{name}/level/set_performer later.
@@ -280,6 +288,25 @@ def _include(name: str, offset: Vector, angles: Vector = (0.0, 0.0, 0.0)) -> str
       <pose>{numbers(offset)} {numbers(angles)}</pose>
     </include>
 """
+
+
+def _spawn(spawn: Start | None) -> str:
+    if spawn is None:
+        return ""
+    return f"""    <frame name="{SPAWN_FRAME}">
+      <pose>{numbers(spawn.position)} {numbers(spawn.angles)}</pose>
+    </frame>
+"""
+
+
+def spawn_command(spawn: Start) -> str:
+    """Command that places a robot in the running world; `ROBOT.sdf` stands for the user's model."""
+    (x, y, z), yaw = spawn.position, spawn.angles[2]
+    return f"ros2 run ros_gz_sim create -file ROBOT.sdf -x {x:.2f} -y {y:.2f} -z {z:.2f} -Y {yaw:.3f}"
+
+
+def _spawn_note(spawn: Start | None) -> str:
+    return f"\n     To add a robot: {spawn_command(spawn)}" if spawn else ""
 
 
 def _robot(start: Start | None) -> str:

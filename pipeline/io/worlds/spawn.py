@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +29,10 @@ SEARCH_HEIGHT_M = 2.0
 """Height above a road's surface from which the ground is searched downwards: below bridges and crowns."""
 DROP_HEIGHT_M = 0.02
 """Initial height above the ground."""
+MAX_TILES = 8
+"""Number of tiles around the origin in which a pose is searched."""
+SEARCH_RADIUS_M, GROUND_STEP_M = 20.0, 1.0
+"""Half the side of the square in which free ground is searched, and the spacing of the places there."""
 
 
 def courses(scene: Scene) -> list[Course]:
@@ -66,6 +72,33 @@ def find_spawn_pose(scene: Scene) -> Start:
             "Check the collision mesh, or export without the robot",
         )
     return best[1]
+
+
+def default_pose(scene: Scene) -> Start | None:
+    """Pose for any robot, as `find_spawn_pose`, in the tile nearest to the world's origin that has one.
+
+    Where no road and no path is known it is the free ground nearest to the origin; None: there is none.
+    """
+    nearest = sorted(scene.tiles, key=lambda tile: float(np.linalg.norm(tile.offset[:2])))[:MAX_TILES]
+    alone = [replace(scene, tiles=(tile,)) for tile in nearest]
+    for one in alone:
+        with suppress(DataError):
+            return find_spawn_pose(one)
+    return next((pose for one in alone if (pose := _ground_pose(one)) is not None), None)
+
+
+def _ground_pose(scene: Scene) -> Start | None:
+    """The free ground nearest to the origin of a scene with one tile, heading along the x axis."""
+    (tile,) = scene.tiles
+    steps = np.arange(-SEARCH_RADIUS_M, SEARCH_RADIUS_M + GROUND_STEP_M / 2, GROUND_STEP_M)
+    places = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    top = tile.high[2] + tile.offset[2]
+    ground, others = bodies(scene)
+    for place in places[np.argsort(np.linalg.norm(places, axis=1), kind="stable")]:
+        way = Course(np.array([[*place, top], [place[0] + 1, place[1], top]]), "ground")
+        if (pose := _poses_along(way, ground, others)[0]) is not None:
+            return pose
+    return None
 
 
 def free_space_pose(scene: Scene) -> Start | None:

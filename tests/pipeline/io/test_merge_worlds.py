@@ -98,6 +98,8 @@ def test_metadata_lists_all_files_and_positions(tmp_path: Path, row: Sequence[Ti
     assert metadata["world_origin_m"] == list(row[1].frame.origin) and metadata["crs"] == "EPSG:32632"
     assert metadata["wgs84"]["latitude_deg"] == pytest.approx(48.1399, abs=1e-4)
     assert metadata["tiles"]["tile2"]["origin_m"] == list(row[2].frame.origin)
+    x, y, _ = metadata["spawn"]["position_m"]
+    assert max(abs(x), abs(y)) <= 1  # on the ground of the tile in the middle
     counted = metadata["triangles_by_file"]
     assert set(counted) == {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.suffix in (".obj", ".dae")}
     assert counted["models/tile2/meshes/terrain.obj"] == 3200
@@ -160,7 +162,7 @@ def test_earlier_world_is_replaced_only_when_the_new_one_is_complete(
     folder = assemble(tmp_path, "town", row).parent
     before = _snapshot(folder)
 
-    def full(*_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device", str(tmp_path))
 
     with monkeypatch.context() as broken:

@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.core import plugins
+from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.errors import DataError, SettingError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Trajectory
 from scan2sim.pipeline.io import robot_formats, world_formats
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.scene import PATH_FILE, Scene
-from scan2sim.pipeline.io.worlds.spawn import find_spawn_pose
+from scan2sim.pipeline.io.worlds.spawn import default_pose, find_spawn_pose
 from scan2sim.pipeline.simulation.robot import ROBOT
 from tests.fakes import synthetic
 
@@ -82,6 +83,37 @@ def test_robot_without_a_road_path_or_free_ground_is_an_error(tmp_path: Path) ->
     with pytest.raises(DataError, match="no free ground"):
         find_spawn_pose(scene)
     assert not (tmp_path / "out").exists()
+
+
+def test_every_world_names_a_free_place_for_a_robot(town: Scene, tmp_path: Path) -> None:
+    scene = synthetic.scene(tmp_path)  # no road and no path
+    pose = default_pose(scene)
+    assert pose is not None and pose.by == "ground"
+    x, y, z = pose.position
+    assert max(abs(x), abs(y)) <= 1 and z == pytest.approx(float(synthetic.height(np.array(x), np.array(y))), abs=0.08)
+    assert default_pose(town) == find_spawn_pose(town)
+    for one in (scene, replace(scene, tiles=scene.tiles[:1])):  # with levels, and without
+        world_formats.write(one, ["gazebo"], tmp_path / f"out{len(one.tiles)}", SceneParams(), silent)
+        folder = tmp_path / f"out{len(one.tiles)}"
+        spawn = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))["spawn"]
+        assert spawn == {"position_m": [x, y, z], "angles_rad": list(pose.angles), "on": "ground"}
+        frame = ET.parse(folder / f"{one.name}.sdf").getroot().find("world/frame[@name='spawn_pose']")
+        assert frame is not None
+        assert [*map(float, frame.findtext("pose", "").split())] == pytest.approx([x, y, z, *pose.angles], abs=1e-5)
+        command = f"ros2 run ros_gz_sim create -file ROBOT.sdf -x {x:.2f} -y {y:.2f} -z {z:.2f} -Y {pose.angles[2]:.3f}"
+        for file in ("README.md", f"{one.name}.sdf"):
+            assert command in (folder / file).read_text(encoding="utf-8")
+
+
+def test_a_world_without_free_ground_says_so(tmp_path: Path) -> None:
+    scene = synthetic.scene(tmp_path, tiles=1)
+    (tile,) = scene.tiles
+    solid = tile.solid()
+    assert solid.classification is not None
+    solid.keep(solid.classification != CODE["terrain"]).save(tile.folder / "collision.npz")
+    world_formats.write(scene, ["glb"], tmp_path / "out", SceneParams(), silent)
+    assert "spawn" not in json.loads((tmp_path / "out" / "metadata.json").read_text(encoding="utf-8"))
+    assert "No free ground" in (tmp_path / "out" / "README.md").read_text(encoding="utf-8")
 
 
 def test_formats_without_robots_are_reported(town: Scene, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from PIL import Image
 from scan2sim.pipeline.core.errors import DataError, InputError, SettingError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Frame, Mesh
+from scan2sim.pipeline.simulation import ground_origin
 from scan2sim.pipeline.steps.export import EXPORT, ExportParams
 from tests.fakes import synthetic
 from tests.present import present
@@ -46,6 +47,7 @@ def test_world_folder_contains_the_documented_files(tmp_path: Path) -> None:
         "scene/street/collision.npz",
         *(f"scene/street/{group}/{file}" for group in ("terrain", "building") for file in kept),
         "metadata.json",
+        "README.md",
         "models/street/model.sdf",
         "models/street/model.config",
         f"{meshes}/collision_terrain.obj",
@@ -90,6 +92,22 @@ def test_metadata_contains_the_georeference(tmp_path: Path) -> None:
     assert metadata["wgs84"]["longitude_deg"] == pytest.approx(11.55407, abs=1e-5)
     assert metadata["groups"]["terrain"]["triangles"] == 3200
     assert metadata["groups"]["building"]["high_m"] == [7.0, 4.0, 4.5]
+
+
+def test_world_is_placed_with_the_ground_of_its_origin_at_zero(tmp_path: Path) -> None:
+    x, y, z = synthetic.UTM.origin
+    house = synthetic.house()
+    inputs = _inputs(tmp_path, terrain=synthetic.ground(), building=house)
+    ground_origin.save(tmp_path / "origin.json", (x, y, z + 0.75))
+    done = EXPORT.run({**inputs, "origin": tmp_path / "origin.json"}, ExportParams(), tmp_path / "out", silent)
+    world = done.files["world"]
+    metadata = json.loads((world / "metadata.json").read_text(encoding="utf-8"))
+    assert metadata["world_origin_m"] == [x, y, z + 0.75] and metadata["origin_m"] == [x, y, z]
+    assert ET.parse(next(world.glob("*.sdf"))).getroot().findtext("world/include/pose") == "0 0 -0.75 0 0 0"
+    chosen = EXPORT.run(
+        {**inputs, "origin": tmp_path / "origin.json"}, ExportParams(world_origin=(x, y, z)), tmp_path / "b", silent
+    )
+    assert json.loads((chosen.files["world"] / "metadata.json").read_text("utf-8"))["world_origin_m"] == [x, y, z]
 
 
 def test_tiles_share_a_georeference_by_the_model_pose_alone(tmp_path: Path) -> None:
