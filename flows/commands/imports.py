@@ -23,6 +23,7 @@ from scan2sim.pipeline.importers.robot_map import MapParams, import_map, map_fil
 from scan2sim.pipeline.io import trajectory_check
 from scan2sim.pipeline.io.mesh_files import find_mesh
 from scan2sim.pipeline.io.tile_folder import check_target
+from scan2sim.pipeline.plausibility.check import check_tile
 from scan2sim.pipeline.pose_check.check import check_photos, read_check
 from scan2sim.pipeline.pose_check.conventions import PhotoConventions
 from scan2sim.pipeline.steps import import_photos
@@ -382,7 +383,7 @@ def _import_sweeps(tasks: list[Task], out: Path, suffix: str, **options: Any) ->
 
 
 def _print_imported(path: Path, warnings: Sequence[str] = ()) -> None:
-    for warning in warnings:
+    for warning in (*warnings, *check_tile(path)):
         typer.secho(f"warning: {warning}", fg="yellow", err=True)
     check = trajectory_check.read(path.parent)
     if check is not None:

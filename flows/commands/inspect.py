@@ -22,6 +22,7 @@ from scan2sim.pipeline.importers.bag.reader import is_bag
 from scan2sim.pipeline.io import clouds, file_checks, xml
 from scan2sim.pipeline.io.geodata.crs import name as crs_name
 from scan2sim.pipeline.io.tile import MIN_POINTS, read_tile
+from scan2sim.pipeline.plausibility.check import find_implausible
 from scan2sim.pipeline.pose_check.check import find_mistake
 
 Facts = list[tuple[str, str]]
@@ -180,6 +181,7 @@ def _tile(path: Path) -> tuple[str, Facts]:
         ("trajectory", f"{len(tile.trajectory.times):,} positions" if tile.trajectory else "none"),
         ("ground truth", "yes" if tile.truth_mesh else "no"),
         *([("warning", f"{mistake}: import it again with this option")] if mistake else []),
+        *(("warning", text) for text in find_implausible(tile)),
     ]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from scan2sim.pipeline.core.errors import UnavailableError
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.importers.clouds_and_photos import import_las
+from scan2sim.pipeline.plausibility.check import check_tile
 from scan2sim.pipeline.pose_check.check import check_photos
 
 
@@ -62,7 +63,10 @@ def build_tile(
         overwrite=overwrite, name=name, classes=classes, warn=warn, report=report,
     )  # fmt: skip
     report(1.0, "checking the photos against the cloud")
-    for warning in check_photos(tile, conventions=False):  # poses are COLMAP's: no option to change
+    for warning in (
+        *check_photos(tile, conventions=False),
+        *check_tile(tile),
+    ):  # poses are COLMAP's: no option to change
         warn(warning)
     return tile
 
