@@ -1,0 +1,1 @@
+"""Inputs as other programs write them; see `bench.foreign.run`."""

@@ -1,0 +1,100 @@
+"""A foreign input: how it is made, the command that reads it, and what is right."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+LIMIT_S = 300
+"""Time limit of a command."""
+
+Expected = Literal["read", "named", "refused"]
+Verdict = Literal["right", "silent", "crashed", "rejected_valid"]
+
+
+def nothing_wrong(_: Path) -> str:
+    """A result that isn't looked at."""
+    return ""
+
+
+@dataclass(frozen=True)
+class Case:
+    """An input.
+
+    Attributes:
+        name: unique.
+        kind: number of its kind in `KINDS`.
+        make: writes the files into a folder, and returns the arguments of `scan2sim`.
+        expected: "read": right; "named": read, with a warning that `says` matches; "refused": with an error that it
+            matches.
+        says: regular expression.
+        check: says what is wrong with the result in the folder; "" if it is right.
+    """
+
+    name: str
+    kind: int
+    make: Callable[[Path], Sequence[object]]
+    expected: Expected = "read"
+    says: str = ""
+    check: Callable[[Path], str] = nothing_wrong
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a case.
+
+    Attributes:
+        verdict: whether the case went right, or how it went wrong.
+        why: what went wrong.
+        messages: errors and warnings that were printed, without figures and paths, as `general`.
+    """
+
+    verdict: Verdict
+    why: str
+    messages: tuple[str, ...]
+
+
+def run(case: Case, folder: Path) -> Outcome:
+    """Make the input below an empty folder, run the command, and judge the outcome."""
+    command = [sys.executable, "-m", "scan2sim.flows.cli", *map(str, case.make(folder))]
+    try:
+        done = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, timeout=LIMIT_S, env=os.environ | {"COLUMNS": "500"}
+        )
+    except subprocess.TimeoutExpired:
+        return Outcome("crashed", f"not ended after {LIMIT_S} s", ())
+    output = done.stdout + done.stderr
+    messages = tuple(dict.fromkeys(general(text, folder) for text in told(output)))
+    if done.returncode < 0 or "Traceback (most recent call last)" in output:
+        return Outcome("crashed", f"exit status {done.returncode}: {output[-300:]}", messages)
+    said = bool(case.says) and re.search(case.says, " ".join(output.split())) is not None
+    if done.returncode:
+        refused = case.expected == "refused"
+        why = "" if refused and said else f"exit status {done.returncode}: {' '.join(output.split())[-300:]}"
+        return Outcome("right" if refused else "rejected_valid", why, messages)
+    wrong = case.check(folder)
+    if said or (case.expected == "read" and not wrong):
+        return Outcome("right", "", messages)
+    return Outcome("silent", wrong or f"nothing says {case.says!r}", messages)
+
+
+def told(output: str) -> list[str]:
+    """Errors, with their remedies, and warnings in the output of a command."""
+    found: list[str] = []
+    for line in output.splitlines():
+        if re.match(r"(error|warning): ", line):
+            found.append(line)
+        elif found and line.startswith("  "):
+            found[-1] += " " + line.strip()
+    return found
+
+
+def general(text: str, folder: Path) -> str:
+    """A message without what differs between runs: the folder, and all numbers."""
+    return re.sub(r"\d[\d,]*(\.\d+)?", "#", text.replace(str(folder), "…"))

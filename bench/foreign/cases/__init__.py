@@ -1,0 +1,1 @@
+"""Foreign inputs: one module per sort of file, each with `cases() -> Iterator[Case]`."""
