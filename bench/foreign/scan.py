@@ -45,9 +45,23 @@ def scan(count: int = 3000, seed: int = 1) -> Scan:
 
 
 def points_are(
-    xyz: F64, rgb: U8 | None = None, code: U8 | None = None, *, coloured: bool | None = None
+    xyz: F64,
+    rgb: U8 | None = None,
+    code: U8 | None = None,
+    *,
+    coloured: bool | None = None,
+    place: F64 = PLACE,
+    among: bool = False,
 ) -> Callable[[Path], str]:
-    """A check: the tile `tile` has these points, in any order; with these colours and classes, if they are given."""
+    """A check: the tile `tile` has these points.
+
+    Args:
+        xyz: (N, 3) the points in the units of the CRS.
+        rgb, code: their colours and classes; None: not checked.
+        coloured: whether the tile has colours; None: not checked.
+        place: a position near them.
+        among: there may be others: those that steps leave out later.
+    """
 
     def check(folder: Path) -> str:
         from scipy.spatial import cKDTree
@@ -58,9 +72,9 @@ def points_are(
 
         tile = read_tile(folder / "tile")
         cloud = PointCloud.join([clouds.read(path, tile.frame) for path in tile.clouds])
-        if len(cloud) != len(xyz):
+        if len(cloud) != len(xyz) and not among:
             return f"{len(cloud)} points instead of {len(xyz)}"
-        off, at = cKDTree(tile.frame.to_crs(cloud.xyz) - PLACE).query(xyz - PLACE)
+        off, at = cKDTree(tile.frame.to_crs(cloud.xyz) - place).query(xyz - place)
         if off.max() > TOLERANCE_M:
             return f"coordinates are off by up to {off.max():.3g}"
         if rgb is not None and (cloud.rgb is None or not np.array_equal(cloud.rgb[at], rgb)):
