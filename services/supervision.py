@@ -63,9 +63,15 @@ class SupervisedThread(threading.Thread):
 def end_process_with_threads() -> Iterator[None]:
     """End this process as by SIGTERM if a thread dies of an exception while the context is active.
 
+    In a thread other than the main thread this does nothing: the process isn't the caller's to end there, and the
+    signal would not reach it.
+
     Raises:
         StepError: a thread has died; the exit status shows that the service has failed.
     """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
     dead: list[str] = []
     report = threading.excepthook
 

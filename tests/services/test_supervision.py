@@ -82,3 +82,17 @@ def test_the_hook_is_restored() -> None:
     with supervision.end_process_with_threads():
         assert threading.excepthook is not before[0]
     assert (threading.excepthook, signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_a_server_in_a_thread_leaves_the_process_alone() -> None:
+    hooks = list[object]()
+
+    def serve() -> None:
+        with supervision.end_process_with_threads():
+            hooks.append(threading.excepthook)
+
+    before = threading.excepthook
+    thread = threading.Thread(target=serve)
+    thread.start()
+    thread.join(30)
+    assert hooks == [before]
