@@ -19,8 +19,12 @@ from pydantic import BaseModel, ValidationError
 from scan2sim.flows.cli import COMMANDS, app, loaded
 from scan2sim.flows.pipelines.drive import Drive
 from scan2sim.flows.pipelines.steps import STEPS
+from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.step import Params
+from scan2sim.pipeline.importers.bag import reader
+from scan2sim.pipeline.io import clouds, gps, mesh_files, sweep_files
+from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.survey import SurveyFile
 from scan2sim.pipeline.io.tile import TileFile
 from scan2sim.services.monitoring.events.notify import NotifyParams
@@ -208,3 +212,31 @@ def headings(page: Path) -> set[str]:
     """Anchors of headings, as created by GitHub."""
     found = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in found}
+
+
+def rows_of(page: str) -> dict[str, list[str]]:
+    """Rows of the first table of a page, by their first cell."""
+    first = (ROOT / page).read_text(encoding="utf-8").split("| --- |", 1)[1].split("\n\n", 1)[0]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in first.splitlines()[1:]]
+    return {name: rest for name, *rest in cells}
+
+
+@pytest.mark.parametrize(
+    ("row", "read"),
+    [
+        ("a point cloud of a street, a yard, a building", set(clouds.formats())),
+        ("photos with known poses", set(image.SUFFIXES)),
+        ("a ROS 1 or ROS 2 bag", set(reader.SUFFIXES)),
+        ("lidar sweeps, one file each", set(sweep_files.SWEEP_SUFFIXES)),
+        ("a GPS track", set(plugins.by_suffix(gps.__name__))),
+        ("a textured mesh", set(mesh_files.SUFFIXES)),
+    ],
+)
+def test_the_page_of_inputs_lists_what_the_readers_read(row: str, read: set[str]) -> None:
+    assert set(re.findall(r"`([\w.]*\.\w+)`", rows_of("docs/inputs.md")[row][0])) == read
+
+
+def test_the_page_of_inputs_lists_every_import() -> None:
+    text = (ROOT / "docs/inputs.md").read_text(encoding="utf-8")
+    imports = {word for word, command in loaded("import").commands.items() if not command.hidden}
+    assert set(re.findall(r"scan2sim import ([\w-]+)", text)) == imports
