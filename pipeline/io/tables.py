@@ -112,3 +112,14 @@ def is_decimal_comma(text: str) -> bool:
     whole, comma, fraction = text.lstrip("+-").partition(",")
     mantissa = fraction.lower().partition("e")[0]
     return bool(comma) and (whole or "0").isdigit() and mantissa.isdigit() and "." not in text
+
+
+def separators(row: str) -> tuple[str | None, bool]:
+    """Delimiter of a row of numbers (None: white space), and whether numbers have decimal commas."""
+    for mark in ";\t":
+        if mark in row:
+            return mark, any(is_decimal_comma(cell.strip()) for cell in row.split(mark))
+    cells = row.split()
+    if len(cells) >= 3 and "," in row and not any(cell.endswith(",") for cell in cells):
+        return None, all(is_decimal_comma(cell) or "," not in cell for cell in cells)
+    return ("," if "," in row else None), False

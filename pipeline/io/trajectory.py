@@ -39,6 +39,7 @@ REMEDIES = {
     ".tum": "Write time x y z qx qy qz qw per line",
     ".kitti": "Write 12 numbers per line, row-major 3x4",
 }
+GPS_REMEDY = "Project it to the clouds' CRS (time,x,y,z); `import sweeps` and `import images` take it by --gps"
 KITTI_RATE_HZ = 10.0  # KITTI's cameras: 10 poses per second
 MAX_COORDINATE_M = 1e9
 """Plausibility limit: no position is farther from the origin of a CRS."""
@@ -171,14 +172,16 @@ def _lines(path: Path) -> tuple[str, Lines]:
     plain = [(i, line) for i, line in filled if not line.lstrip().startswith("#")]
     if not plain:
         raise InputError(path, "is not a trajectory (it contains no poses)", REMEDIES.get(kind, REMEDIES[".csv"]))
-    delimiter = next((one for one in ",;" if one in plain[-1][1]), None)
-    if kind not in REMEDIES or delimiter is not None:
+    delimiter, decimal_commas = tables.separators(plain[-1][1])
+    if kind not in REMEDIES or delimiter in (",", ";"):
         width = len(plain[0][1].split())
-        kind = ".csv" if delimiter else {8: ".tum", 12: ".kitti"}.get(width, ".csv")
+        kind = ".csv" if delimiter in (",", ";") else {8: ".tum", 12: ".kitti"}.get(width, ".csv")
     if kind != ".csv" and not is_number(plain[0][1].split()[0]):
         kind = ".csv"  # a header line without #
     if kind == ".csv":
         plain = filled[:1] + [line for line in plain if line not in filled[:1]]
+    if decimal_commas:
+        plain = [(i, line.replace(",", ".")) for i, line in plain]
     return kind, [(i, line.split(delimiter)) for i, line in plain]
 
 
@@ -207,11 +210,12 @@ def _header_line(path: Path, lines: Lines) -> tuple[tuple[str, ...], Lines]:
             if 0 < len(set(columns) & set(names)) < len(columns):
                 raise _bad(path, ".csv", number, f"its {what} needs all of {','.join(columns)}")
         return names, lines[1:]
-    if len(cells) == 4:
-        return POSITION_COLUMNS, lines[1:]
     if first.startswith("#") and (found := unnamed(lines[1][1])) is not None:
         return found, lines[1:]  # the first line is a comment
-    raise _bad(path, ".csv", number, f"columns are {','.join(cell.strip() for cell in cells)[:80]}")
+    columns = f"columns are {','.join(cell.strip() for cell in cells)[:80]}"
+    if any(cell.strip(" #").lower().startswith("lat") for cell in cells):
+        raise InputError(path, f"is a GPS track, not a trajectory ({columns})", GPS_REMEDY)
+    raise _bad(path, ".csv", number, columns)
 
 
 def _numbers(path: Path, kind: str, lines: Lines, width: int, used: Sequence[int] | None = None) -> F64:

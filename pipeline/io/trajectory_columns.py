@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from scan2sim.pipeline.core.types import F64
+from scan2sim.pipeline.io import text_columns
 
 TIME, SECONDS, NANOSECONDS = "time", "sec", "nanosec"
 """Names of times: one column in any unit, or two."""
@@ -46,6 +47,12 @@ def named(cells: Sequence[str]) -> tuple[str, ...]:
     stamp = next((k for k, cell in enumerate(cells) if cell.strip().endswith("header.stamp")), None)
     if stamp is not None:
         names = ["" if name == TIME and k != stamp else name for k, name in enumerate(names)]
+    if not {*POSITION} & {*names}:
+        meanings = [text_columns.meaning(cell.strip(" #%")) for cell in cells]
+        names = [
+            meaning if not name and meaning in (TIME, *POSITION) else name
+            for name, meaning in zip(names, meanings, strict=True)
+        ]
     return tuple(names)
 
 

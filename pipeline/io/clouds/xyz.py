@@ -9,7 +9,6 @@ interpretation is reported to the user (`clouds.Header.notes`).
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,14 +17,13 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Frame, PointCloud
-from scan2sim.pipeline.io import file_checks, number_text, point_chunks, text_columns
+from scan2sim.pipeline.io import file_checks, number_text, point_chunks, tables, text_columns
 from scan2sim.pipeline.io.point_chunks import Points
 
 SUFFIXES = (".xyz", ".csv", ".txt", ".asc", ".pts")
 COMMENTS = ("#", "//")
 HEAD_BYTES = 1 << 18
 """Bytes that are read to detect encoding, delimiter and columns."""
-DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,7 @@ def _form(path: Path) -> _Form:
     has_header_line = text_columns.is_heading(rows[0])
     heading = rows[0] if has_header_line else None
     rows = rows[1:] if has_header_line and len(rows) > 1 else rows
-    delimiter, decimal_commas = _delimiter(rows[0])
+    delimiter, decimal_commas = tables.separators(rows[0])
     cells = _cells(rows[0], delimiter)
     try:
         [float(cell.replace(",", ".") if decimal_commas else cell) for cell in cells]
@@ -135,17 +133,6 @@ def _form(path: Path) -> _Form:
         *(["decimal commas"] if decimal_commas else []),
     ]
     return _Form(columns, delimiter, has_header_line, encoding, decimal_commas, (note, *habits))
-
-
-def _delimiter(row: str) -> tuple[str | None, bool]:
-    """Delimiter of a row of numbers (None: white space), and whether numbers have decimal commas."""
-    for mark in ";\t":
-        if mark in row:
-            return mark, any(DECIMAL_COMMA.fullmatch(cell.strip()) for cell in row.split(mark))
-    cells = row.split()
-    if len(cells) >= 3 and "," in row and not any(cell.endswith(",") for cell in cells):
-        return None, all(DECIMAL_COMMA.fullmatch(cell) or "," not in cell for cell in cells)
-    return ("," if "," in row else None), False
 
 
 def _named(path: Path, heading: str, delimiter: str | None, width: int) -> tuple[tuple[str, ...], str]:

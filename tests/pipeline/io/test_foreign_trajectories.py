@@ -113,3 +113,23 @@ def test_a_matrix_that_is_no_rotation_is_refused(tmp_path: Path) -> None:
     path.write_text(lines(ns, MATRICES + 1), encoding="utf-8")
     with pytest.raises(InputError, match="not a rotation matrix"):
         trajectory.read(path)
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["time;x;y;z", "Zeit;Rechtswert;Hochwert;Höhe", "GPS_Time [s];Easting [m];Northing [m];Elevation [m]"],
+)
+@pytest.mark.parametrize("comma", [False, True])
+def test_tables_of_spreadsheets_in_other_languages(tmp_path: Path, header: str, comma: bool) -> None:
+    text = lines(seconds, POSITIONS, separator=";")
+    path = tmp_path / "a.csv"
+    path.write_text(f"{header}\n{text.replace('.', ',') if comma else text}", encoding="cp1252")
+    found = trajectory.read(path, timed=True)
+    assert np.allclose(found.positions, POSITIONS) and found.times == pytest.approx(NS / 1e9, abs=1e-6)
+
+
+def test_four_columns_with_other_names_are_not_taken_for_positions(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("time,latitude,longitude,altitude\n" + lines(seconds, POSITIONS), encoding="utf-8")
+    with pytest.raises(InputError, match=r"is a GPS track.*--gps"):
+        trajectory.read(path)
