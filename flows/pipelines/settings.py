@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -139,11 +140,12 @@ def _assign(tables: dict[str, Any], path: str, value: object, where: str) -> Non
 
 
 def parsed(text: str) -> Any:
-    """The text as a TOML value if it is one, else as it is."""
+    """The text as a TOML value or list of words if it is one, else as it is; shells remove the quotes of words."""
     try:
         return toml.parse(f"value = {text}")["value"]
     except ValueError:
-        return text
+        words = re.fullmatch(r"\[([\w.:/-]+(?:\s*,\s*[\w.:/-]+)*)\]", text.strip())
+        return re.split(r"\s*,\s*", words[1]) if words else text
 
 
 def _paths(step: str, table: object) -> list[str]:

@@ -25,6 +25,7 @@ from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.pose_check.conventions import PhotoConventions
 from scan2sim.pipeline.steps.decimate import DECIMATE
+from scan2sim.pipeline.steps.export import EXPORT
 from scan2sim.pipeline.steps.import_sweeps import SweepsParams
 from scan2sim.pipeline.steps.split import SPLIT
 from scan2sim.pipeline.steps.trim import TRIM
@@ -132,6 +133,12 @@ def test_every_current_name_of_the_table_exists() -> None:
             assert set(names.values()) <= set(fields[renamed.STEPS[step]])
             continue
         assert set(names.values()) <= set(fields[step]) and not set(names) & set(fields[step])
+
+
+@pytest.mark.parametrize("text", ['["gazebo", "mujoco"]', "[gazebo,mujoco]", "[gazebo, mujoco]", "['gazebo','mujoco']"])
+def test_a_list_of_words_needs_no_quotes(text: str) -> None:
+    settings = Settings.read(None, [f"export.formats={text}"])
+    assert list(settings.params(EXPORT).formats) == ["gazebo", "mujoco"]
 
 
 def test_what_the_pipeline_passes_is_no_setting() -> None:
