@@ -6,6 +6,7 @@ import ast
 import re
 import subprocess
 import sys
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -25,6 +26,7 @@ PACKAGES = {
 HEAVY = ("open3d", "torch", "prefect", "numba", "cv2", "scipy", "trimesh", "pyproj", "pycolmap", "pymeshlab", "numpy")
 
 
+@cache
 def modules(file: Path) -> set[str]:
     """Full names of the modules, or of objects in modules, that a file imports anywhere."""
     names = set()
@@ -65,6 +67,7 @@ def project_files() -> dict[str, Path]:
     return {".".join(f.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): f for f in files}
 
 
+@cache
 def import_graph() -> dict[str, set[str]]:
     """Modules of the project that each module imports, anywhere in its file."""
     known = project_files()
