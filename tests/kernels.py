@@ -1,10 +1,11 @@
-"""`python -m tests.kernels`: compile numba's kernels once, by making a tiny world.
+"""`python -m tests.kernels`: compile numba's kernels once, by making a tiny world and a panorama of a synthetic drive.
 
 Otherwise several processes of tests would each compile them, for minutes.
 """
 
 from __future__ import annotations
 
+import multiprocessing
 import tempfile
 from pathlib import Path
 
@@ -19,6 +20,27 @@ def are_compiled() -> bool:
 
 
 def main() -> None:
+    """Make the world of a tiny street, and at the same time render a panorama."""
+    panorama = multiprocessing.get_context("spawn").Process(target=render_panorama)
+    panorama.start()
+    make_world()
+    panorama.join()
+
+
+def render_panorama() -> None:
+    """Render one frame of a synthetic drive, whose kernels no step of a world uses."""
+    from scan2sim.data_samples import paths
+    from scan2sim.data_samples.panorama import Panorama
+    from scan2sim.data_samples.town import build
+    from scan2sim.data_samples.traffic import Traffic
+
+    path = paths.loop_path(width=70.0, depth=60.0, laps=1.2)
+    drive = paths.drive(path, 10.0, 15.0, seed=3)
+    panorama = Panorama(build(path, seed=3), Traffic(path, drive, 3), 16, seed=3, radius=90.0)
+    panorama.render(drive.poses[20], float(drive.times[20]))
+
+
+def make_world() -> None:
     """Make the world of a tiny street."""
     from scan2sim.data_samples.street import generate
     from tests.flows.tiny import COARSE, scan2sim, tiny

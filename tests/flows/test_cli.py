@@ -218,7 +218,8 @@ def test_run_builds_world_and_report(world: Path) -> None:
 def test_gazebo_loads_the_world_and_a_box_rests_on_the_road(street: Path, world: Path) -> None:
     tile = read_tile(street)
     assert tile.trajectory is not None
-    x, y, z = tile.trajectory.positions[len(tile.trajectory.times) // 4]
+    origin = json.loads((world / "world" / "metadata.json").read_text(encoding="utf-8"))["world_origin_m"]
+    x, y, z = tile.frame.to_crs(tile.trajectory.positions)[len(tile.trajectory.times) // 4] - origin
     seen = check_world(next((world / "world").glob("*.sdf")), ("box", (float(x), float(y), float(z))))
     (box,) = seen["bodies"]
     assert box["speed"] < 0.1
