@@ -262,7 +262,7 @@ def import_robot_map(
         ),
     ],
     trajectory: Annotated[
-        Path | None, typer.Option(help="Path of the sensor in the map's frame (.csv, .tum, .kitti).")
+        Path | None, typer.Option(help="Path of the sensor in the map's frame (.csv or .tum, with times).")
     ] = None,
     *,
     out: TileOut,
@@ -383,7 +383,7 @@ def _import_sweeps(tasks: list[Task], out: Path, suffix: str, **options: Any) ->
 
 
 def _print_imported(path: Path, warnings: Sequence[str] = ()) -> None:
-    for warning in (*warnings, *check_tile(path)):
+    for warning in dict.fromkeys((*warnings, *check_tile(path))):
         typer.secho(f"warning: {warning}", fg="yellow", err=True)
     check = trajectory_check.read(path.parent)
     if check is not None:

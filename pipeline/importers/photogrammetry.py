@@ -15,6 +15,7 @@ from scan2sim.pipeline.core.types import F64, Frame, PointCloud
 from scan2sim.pipeline.geometry.similarity import Similarity
 from scan2sim.pipeline.importers import depth_images, georeference
 from scan2sim.pipeline.importers.photo_fit import fitted_cameras
+from scan2sim.pipeline.importers.photo_up import up_of_photos
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import crs as crs_io
@@ -24,6 +25,8 @@ from scan2sim.pipeline.io.tile_folder import add_file, names_in, tile_folder
 
 MAX_CLOUD_DISTANCE = 500.0
 """CRS units between cloud and photos above which a warning suggests that their coordinates differ."""
+ARBITRARY_AXES = ("colmap", "bundler", "nvm")
+"""Programs whose models have any axes and unit, unless they were aligned."""
 Up = tuple[float, float, float] | Literal["photos"]
 
 
@@ -56,8 +59,8 @@ def import_model(
             model's coordinates and is transformed with it; a cloud with a CRS stays, and the model must fit it.
         crs: target CRS of a georeferenced model (default: the cloud's, the program's, or UTM); for other models, the
             CRS of their coordinates (default: "local").
-        up: direction of the model that becomes +z, or "photos" for the mean up direction of the photos; default: the
-            model's own, if its CRS isn't known.
+        up: direction of the model that becomes +z, or "photos" for that by which the photos were held (`photo_up`);
+            default: the model's own, if its CRS isn't known.
         scale: metres per unit of the model.
         gps: georeference the model by the GPS positions in the photos' EXIF.
         link: symlink photos and cloud instead of copying them.
@@ -91,6 +94,9 @@ def import_model(
     files = [photos.find(shot.file) for shot in found.shots] if gps else []
     cloud_crs = crs_io.short(header.crs) if header is not None and header.crs else None
     onto, tile_crs = _model_to_tile(model, found, cloud_crs, files, crs, up, scale, gps, warn)
+    if kind in ARBITRARY_AXES and tile_crs == crs_io.LOCAL and crs is None:
+        for unknown in _unknown(up, scale):
+            warn(f"{model}: {unknown}; --crs local confirms it")
     if cloud is None and not len(found.xyz) and any(shot.depth for shot in found.shots):
         xyz, rgb = depth_images.fuse(found, photos, warn, report)
         found = replace(found, xyz=xyz, rgb=rgb)
@@ -160,7 +166,15 @@ def _model_to_tile(
     known = crs or cloud_crs or found.crs or crs_io.LOCAL
     if up is None and known == crs_io.LOCAL:
         up = found.up
-    return Similarity(scale, _upright(_ups(found), up), np.zeros(3)), known
+    return Similarity(scale, _upright(found, up), np.zeros(3)), known
+
+
+def _unknown(up: Up | None, scale: float) -> Iterator[str]:
+    """What is assumed of a model without a georeference."""
+    if up is None:
+        yield "doesn't say which axis is up: z is assumed (--upright finds it from the photos)"
+    if scale == 1.0:
+        yield "doesn't say its unit: metres are assumed (--scale, or --gps, determines it)"
 
 
 def _in_model_coordinates(
@@ -190,13 +204,14 @@ def _ups(found: Model) -> F64:
     return np.array([-shot.pose[:3, 1] for shot in found.shots])
 
 
-def _upright(ups: F64, up: Up | None) -> F64:
+def _upright(found: Model, up: Up | None) -> F64:
     """Smallest rotation (3, 3) that maps `up` to +z."""
     from scipy.spatial.transform import Rotation
 
     if up is None:
         return np.eye(3)
-    direction = ups.mean(axis=0) if up == "photos" else np.array(up, np.float64)
+    rotations = np.array([shot.pose[:3, :3] for shot in found.shots])
+    direction = up_of_photos(rotations) if up == "photos" else np.array(up, np.float64)
     length = np.linalg.norm(direction)
     if not length > 1e-6:
         raise SettingError("up", f"{up} is not a direction", "Give three numbers that are not all zero")

@@ -46,8 +46,8 @@ def coordinate_steps(cloud: PointCloud, unit: float = 1.0) -> Finding | None:
     of_float = np.spacing(at.astype(np.float32)) * unit
     if any(abs(step - own) < STEP_TOLERANCE * own for step, own in zip(found, of_float, strict=True) if own >= 0.01):
         cause = "they were stored as 32-bit floats, which have no more digits so far from the origin"
-        remedy = "export the cloud again in double precision (LAS, E57), or with a local origin"
-        return Finding(3, f"coordinates are in steps, {steps}: {cause}. {remedy.capitalize()}")
+        remedy = "Export the cloud again in double precision (LAS, E57), or with a local origin"
+        return Finding(3, f"coordinates are in steps, {steps}: {cause}. {remedy}")
     if max(step for _, step in coarse) < MIN_GRID_M:
         return None
     return Finding(

@@ -63,10 +63,8 @@ def build_tile(
         overwrite=overwrite, name=name, classes=classes, warn=warn, report=report,
     )  # fmt: skip
     report(1.0, "checking the photos against the cloud")
-    for warning in (
-        *check_photos(tile, conventions=False),
-        *check_tile(tile),
-    ):  # poses are COLMAP's: no option to change
+    # poses are COLMAP's: no option to change
+    for warning in (*check_photos(tile, conventions=False), *check_tile(tile)):
         warn(warning)
     return tile
 
