@@ -19,7 +19,7 @@ Verdict = Literal["right", "silent", "crashed", "rejected_valid"]
 
 
 def nothing_wrong(_: Path) -> str:
-    """A result that isn't looked at."""
+    """A result that isn't checked."""
     return ""
 
 
@@ -70,7 +70,7 @@ def run(case: Case, folder: Path) -> Outcome:
     except subprocess.TimeoutExpired:
         return Outcome("crashed", f"not ended after {LIMIT_S} s", ())
     output = done.stdout + done.stderr
-    messages = tuple(dict.fromkeys(general(text, folder) for text in told(output)))
+    messages = tuple(dict.fromkeys(general(text, folder) for text in messages_in(output)))
     if done.returncode < 0 or "Traceback (most recent call last)" in output:
         return Outcome("crashed", f"exit status {done.returncode}: {output[-300:]}", messages)
     said = bool(case.says) and re.search(case.says, " ".join(output.split())) is not None
@@ -84,7 +84,7 @@ def run(case: Case, folder: Path) -> Outcome:
     return Outcome("silent", wrong or f"nothing says {case.says!r}", messages)
 
 
-def told(output: str) -> list[str]:
+def messages_in(output: str) -> list[str]:
     """Errors, with their remedies, and warnings in the output of a command."""
     found: list[str] = []
     for line in output.splitlines():

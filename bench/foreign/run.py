@@ -3,7 +3,7 @@
 `python -m bench.foreign [--kinds 2 3] [--cases NAME] [--out bench-out/foreign]`
 
 Each case (`bench/foreign/cases`) writes files with known content, and runs a command on them in a process of its own.
-- `inputs`: number of cases. `silent`: wrong results, or results that need a warning, without a word. `crashed`: a
+- `inputs`: number of cases. `silent`: wrong results, or results that need a warning, without one. `crashed`: a
   traceback, a signal, or no end. `rejected_valid`: refused, though valid.
 - `untrue`: errors and warnings of which no reader has judged that cause and remedy are true (`judged.json`: the message
   without figures and paths, and true or false). `--out` gets `messages.json`, with those that aren't judged.
@@ -51,7 +51,7 @@ def main() -> None:
     shutil.rmtree(arguments.out, ignore_errors=True)
     with ThreadPoolExecutor(WORKERS) as pool:
         outcomes = list(pool.map(lambda one: _run(one, arguments.out), chosen))
-    counts = Counter(outcome.verdict for outcome in outcomes)
+    counts = Counter[str](outcome.verdict for outcome in outcomes)
     messages = sorted({text for outcome in outcomes for text in outcome.messages})
     judged = json.loads(JUDGED.read_text(encoding="utf-8"))
     untrue = [text for text in messages if not judged.get(text)]

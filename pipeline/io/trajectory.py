@@ -212,10 +212,10 @@ def _header_line(path: Path, lines: Lines) -> tuple[tuple[str, ...], Lines]:
         return names, lines[1:]
     if first.startswith("#") and (found := unnamed(lines[1][1])) is not None:
         return found, lines[1:]  # the first line is a comment
-    columns = f"columns are {','.join(cell.strip() for cell in cells)[:80]}"
+    listed = f"columns are {','.join(cell.strip() for cell in cells)[:80]}"
     if any(cell.strip(" #").lower().startswith("lat") for cell in cells):
-        raise InputError(path, f"is a GPS track, not a trajectory ({columns})", GPS_REMEDY)
-    raise _bad(path, ".csv", number, columns)
+        raise InputError(path, f"is a GPS track, not a trajectory ({listed})", GPS_REMEDY)
+    raise _bad(path, ".csv", number, listed)
 
 
 def _numbers(path: Path, kind: str, lines: Lines, width: int, used: Sequence[int] | None = None) -> F64:
