@@ -1,0 +1,145 @@
+"""Alpha blending of splats within tiles, nearest first, and its gradient.
+
+Loops run over whole rows of a tile, with unsigned indices and constants of 32 bits, so that LLVM vectorizes them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from scan2sim.texturing.splats.tiles import PIXELS, SIZE
+
+RED, GREEN, BLUE, DEPTH, TRANSMITTANCE = range(5)
+"""Channels of a blended tile (5, 256): colours and depth times alpha, and what is left of the background."""
+MAX_ALPHA = np.float32(0.99)
+OPAQUE = np.float32(0.003)
+"""Greatest transmittance at which nothing behind matters."""
+CHECKED_EVERY = 8
+"""Splats between tests whether a tile is opaque."""
+X = (np.arange(PIXELS) % SIZE).astype(np.float32)
+Y = (np.arange(PIXELS) // SIZE).astype(np.float32)
+# exp(-q / 2) = exp(-q / 32)^16, the latter as its minimax polynomial where it matters (q < 11.1): within 1e-4
+E0, E1, E2, E3 = np.float32(0.99999529), np.float32(-0.99959058), np.float32(0.49423736), np.float32(-0.13991767)
+FARTHEST = np.float32(32)
+"""Squared distance in standard deviations at which the polynomial ends, at 1e-8."""
+
+
+@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+def blend(parameters, projected, columns, start, splat, tiles, last):  # type: ignore[no-untyped-def]
+    """Blend the splats of each tile.
+
+    Args:
+        parameters: (N, 14); projected: (N, 9).
+        columns, start, splat: of the tiles' `Assignment`.
+        tiles: (T, 5, 256), written.
+        last: (T,) number of the splats that were blended, written.
+    """
+    for tile in prange(len(tiles)):
+        image = tiles[tile]
+        left, top = np.float32(tile % columns * SIZE), np.float32(tile // columns * SIZE)
+        image[:TRANSMITTANCE] = 0
+        image[TRANSMITTANCE] = 1
+        number = 0
+        for entry in range(start[tile], start[tile + 1]):
+            i = splat[entry]
+            number += 1
+            u, v = projected[i, 0] - left, projected[i, 1] - top
+            a, b, c = projected[i, 2], 2 * projected[i, 3], projected[i, 4]
+            opacity, z = projected[i, 5], projected[i, 8]
+            red, green, blue = parameters[i, 11], parameters[i, 12], parameters[i, 13]
+            first = max(int(v - projected[i, 7]), 0)
+            end = min(int(v + projected[i, 7]) + 2, SIZE)
+            for p in range(np.uint64(first * SIZE), np.uint64(end * SIZE)):
+                dx, dy = X[p] - u, Y[p] - v
+                q = min(a * dx * dx + b * dx * dy + c * dy * dy, FARTHEST) * np.float32(1 / 32)
+                k = E0 + q * (E1 + q * (E2 + q * E3))
+                k = k * k
+                k = k * k
+                k = k * k
+                k = k * k
+                weight = min(opacity * k, MAX_ALPHA) * image[TRANSMITTANCE, p]
+                image[RED, p] += weight * red
+                image[GREEN, p] += weight * green
+                image[BLUE, p] += weight * blue
+                image[DEPTH, p] += weight * z
+                image[TRANSMITTANCE, p] -= weight
+            if number % CHECKED_EVERY == 0:
+                most = np.float32(0)
+                for p in range(np.uint64(PIXELS)):
+                    most = max(most, image[TRANSMITTANCE, p])
+                if most < OPAQUE:
+                    break
+        last[tile] = number
+
+
+@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+def blend_gradients(  # type: ignore[no-untyped-def]
+    parameters, projected, columns, start, splat, slot, tiles, last, background, gradient, entries
+):
+    """Gradients of the entries (`projection.GRADIENT`) by those of the image.
+
+    Args:
+        parameters, projected, columns, start, splat, slot: as in `blend`.
+        tiles, last: results of `blend`.
+        background: (T, 3, 256) colour behind the splats.
+        gradient: (T, 5, 256) derivatives of the loss by colour (with the background), depth times alpha, and alpha.
+        entries: (E, 10), written; those that weren't blended are 0.
+    """
+    for tile in prange(len(tiles)):
+        if start[tile] == start[tile + 1]:
+            continue
+        image, g, behind = tiles[tile], gradient[tile], background[tile]
+        left, top = np.float32(tile % columns * SIZE), np.float32(tile // columns * SIZE)
+        T, rest = np.ones(PIXELS, np.float32), np.empty(PIXELS, np.float32)
+        for p in range(np.uint64(PIXELS)):
+            through = image[TRANSMITTANCE, p]
+            rest[p] = (
+                g[RED, p] * (image[RED, p] + through * behind[RED, p])
+                + g[GREEN, p] * (image[GREEN, p] + through * behind[GREEN, p])
+                + g[BLUE, p] * (image[BLUE, p] + through * behind[BLUE, p])
+                + g[DEPTH, p] * image[DEPTH, p]
+                + g[TRANSMITTANCE, p] * (np.float32(1) - through)
+            )
+        for entry in range(start[tile], start[tile] + last[tile]):
+            i = splat[entry]
+            u, v = projected[i, 0] - left, projected[i, 1] - top
+            a, b, c = projected[i, 2], projected[i, 3], projected[i, 4]
+            opacity, z = projected[i, 5], projected[i, 8]
+            red, green, blue = parameters[i, 11], parameters[i, 12], parameters[i, 13]
+            first = max(int(v - projected[i, 7]), 0)
+            end = min(int(v + projected[i, 7]) + 2, SIZE)
+            s0, s1, s2, s3, s4 = np.float32(0), np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+            s5, s6, s7, s8, s9 = np.float32(0), np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+            for p in range(np.uint64(first * SIZE), np.uint64(end * SIZE)):
+                dx, dy = X[p] - u, Y[p] - v
+                square = a * dx * dx + 2 * b * dx * dy + c * dy * dy
+                q = min(square, FARTHEST) * np.float32(1 / 32)
+                k = E0 + q * (E1 + q * (E2 + q * E3))
+                k = k * k
+                k = k * k
+                k = k * k
+                k = k * k
+                alpha = min(opacity * k, MAX_ALPHA)
+                weight = alpha * T[p]
+                value = (
+                    g[RED, p] * red + g[GREEN, p] * green + g[BLUE, p] * blue + g[DEPTH, p] * z + g[TRANSMITTANCE, p]
+                )
+                rest[p] -= weight * value
+                by_alpha = T[p] * value - rest[p] / (np.float32(1) - alpha)
+                by_alpha = by_alpha if opacity * k < MAX_ALPHA else np.float32(0)
+                T[p] -= weight
+                by_square = np.float32(-0.5) * opacity * k * by_alpha
+                s0 += weight * g[RED, p]
+                s1 += weight * g[GREEN, p]
+                s2 += weight * g[BLUE, p]
+                s3 += weight * g[DEPTH, p]
+                s4 += by_alpha * k
+                s5 += by_square * (a * dx + b * dy)
+                s6 += by_square * (b * dx + c * dy)
+                s7 += by_square * dx * dx
+                s8 += by_square * dx * dy
+                s9 += by_square * dy * dy
+            e = entries[slot[entry]]
+            e[0], e[1], e[2], e[3], e[4] = s0, s1, s2, s3, s4
+            e[5], e[6], e[7], e[8], e[9] = -2 * s5, -2 * s6, s7, 2 * s8, s9

@@ -1,0 +1,101 @@
+"""Assignment of projected splats to the tiles of an image, nearest first, and images in the order of tiles."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from scan2sim.pipeline.core.types import F32, I32, Bools
+from scan2sim.texturing.splats.projection import DEPTH
+
+SIZE = 16
+"""Width and height of a tile in pixels."""
+PIXELS = SIZE * SIZE
+DEPTH_LEVELS = 2**16 - 1
+"""Depths are sorted by their logarithm in so many levels: to a thousandth of the depth or better."""
+
+
+class Assignment(NamedTuple):
+    """Which splats each tile shows.
+
+    Attributes:
+        columns: number of tiles in a row of the image.
+        start: (T + 1,) first entry of each tile.
+        splat: (E,) splat of each entry, nearest first within a tile.
+        index: (M,) the visible splats, nearest first.
+        first: (M + 1,) first place in `entries` of each of them.
+        slot: (E,) place of each entry in the order of `index`, in which the entries of a splat are in sequence.
+    """
+
+    columns: int
+    start: I32
+    splat: I32
+    index: I32
+    first: I32
+    slot: I32
+
+
+def assign(projected: F32, visible: Bools, width: int, height: int) -> Assignment:
+    """Assign visible splats (of N, (N, 9)) to the tiles that they overlap."""
+    columns, rows = -(-width // SIZE), -(-height // SIZE)
+    index = np.flatnonzero(visible)
+    depth = np.log(projected[index, DEPTH])
+    low, high = (float(depth.min()), float(depth.max())) if len(depth) else (0.0, 1.0)
+    level = ((depth - low) * (DEPTH_LEVELS / max(high - low, 1e-6))).astype(np.uint16)
+    index = index[np.argsort(level, kind="stable")].astype(np.int32)  # a radix sort for 16 bits
+    return Assignment(columns, *_assign(projected, index, columns, rows))
+
+
+def to_tiles(image: F32) -> F32:
+    """An image (H, W, C) as (T, C, 256), row by row of tiles, filled up with zeros."""
+    height, width, channels = image.shape
+    rows, columns = -(-height // SIZE), -(-width // SIZE)
+    padded = np.zeros((rows * SIZE, columns * SIZE, channels), np.float32)
+    padded[:height, :width] = image
+    tiles = padded.reshape(rows, SIZE, columns, SIZE, channels).transpose(0, 2, 4, 1, 3)
+    return np.ascontiguousarray(tiles).reshape(rows * columns, channels, PIXELS)
+
+
+def from_tiles(tiles: F32, width: int, height: int) -> F32:
+    """The image (H, W, C) of tiles (T, C, 256)."""
+    rows, columns = -(-height // SIZE), -(-width // SIZE)
+    image = tiles.reshape(rows, columns, -1, SIZE, SIZE).transpose(0, 3, 1, 4, 2)
+    return np.ascontiguousarray(image.reshape(rows * SIZE, columns * SIZE, -1)[:height, :width])
+
+
+@njit(cache=True, inline="always")
+def _overlap(projected, i, columns, rows):  # type: ignore[no-untyped-def]
+    """First and last column and row of the tiles that a splat overlaps."""
+    u, v, x, y = projected[i, 0], projected[i, 1], projected[i, 6], projected[i, 7]
+    return (
+        max(int((u - x) // SIZE), 0), min(int((u + x) // SIZE), columns - 1),
+        max(int((v - y) // SIZE), 0), min(int((v + y) // SIZE), rows - 1),
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def _assign(projected, index, columns, rows):  # type: ignore[no-untyped-def]
+    start = np.zeros(columns * rows + 1, np.int32)
+    first = np.zeros(len(index) + 1, np.int32)
+    for m in range(len(index)):
+        left, right, top, bottom = _overlap(projected, index[m], columns, rows)
+        first[m + 1] = first[m] + (right - left + 1) * (bottom - top + 1)
+        for y in range(top, bottom + 1):
+            for x in range(left, right + 1):
+                start[y * columns + x + 1] += 1
+    for tile in range(columns * rows):
+        start[tile + 1] += start[tile]
+    free = start[:-1].copy()
+    splat, slot = np.empty(first[-1], np.int32), np.empty(first[-1], np.int32)
+    for m in range(len(index)):
+        left, right, top, bottom = _overlap(projected, index[m], columns, rows)
+        place = first[m]
+        for y in range(top, bottom + 1):
+            for x in range(left, right + 1):
+                tile = y * columns + x
+                splat[free[tile]], slot[free[tile]] = index[m], place
+                free[tile] += 1
+                place += 1
+    return start, splat, index, first, slot
