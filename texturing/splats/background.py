@@ -1,0 +1,64 @@
+"""Background at infinity: a texture of all directions, equirectangular, with its gradient."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scan2sim.pipeline.core.types import F32, F64
+
+WIDTH_PX, HEIGHT_PX = 1024, 512
+"""Size of the texture: .35 degrees per texel. Column 0 is azimuth -180 degrees (from x to y), row 0 is the zenith."""
+FIRST_MOMENT, SECOND_MOMENT = 0.8, 0.95
+MIN_RATE = 1e-8
+
+
+class Background:
+    """Colours of all directions.
+
+    Attributes:
+        texture: (`HEIGHT_PX`, `WIDTH_PX`, 3) sRGB 0 to 1.
+    """
+
+    def __init__(self, texture: F32) -> None:
+        self.texture = np.asarray(texture, np.float32).copy()
+        self._first, self._second = np.zeros_like(self.texture), np.zeros_like(self.texture)
+
+    def seen(self, texels: F32) -> F32:
+        """(H, W, 3) colours at texels (H, W, 2), see `texels`."""
+        import cv2
+
+        padded = np.concatenate([self.texture[:, -1:], self.texture, self.texture[:, :1]], axis=1)
+        colours = cv2.remap(
+            padded, texels[..., 0] + 1, texels[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        return np.asarray(colours, np.float32)
+
+    def descend(self, texels: F32, gradient: F32, rate: float) -> None:
+        """Take a step (Adam, of the texels that are seen) against derivatives (H, W, 3) of a loss by `seen`."""
+        column = np.rint(texels[..., 0]).astype(np.int64) % WIDTH_PX
+        row = np.clip(np.rint(texels[..., 1]).astype(np.int64), 0, HEIGHT_PX - 1)
+        index = (row * WIDTH_PX + column).ravel()
+        total = np.stack(
+            [np.bincount(index, gradient[..., k].ravel(), WIDTH_PX * HEIGHT_PX) for k in range(3)], axis=-1
+        ).reshape(self.texture.shape)
+        at = total.any(axis=-1)
+        step = total[at].astype(np.float32)
+        self._first[at] = FIRST_MOMENT * self._first[at] + (1 - FIRST_MOMENT) * step
+        self._second[at] = SECOND_MOMENT * self._second[at] + (1 - SECOND_MOMENT) * step**2
+        self.texture[at] -= rate * self._first[at] / (np.sqrt(self._second[at]) + MIN_RATE)
+
+
+def texels(directions: F64 | F32) -> F32:
+    """Column and row (..., 2) of directions (..., 3) in the texture; any length."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    azimuth, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+    column = (azimuth / (2 * np.pi) + 0.5) * WIDTH_PX - 0.5
+    return np.stack([column, (0.5 - elevation / np.pi) * HEIGHT_PX - 0.5], axis=-1).astype(np.float32)
+
+
+def directions() -> F64:
+    """(`HEIGHT_PX`, `WIDTH_PX`, 3) unit directions of the texels."""
+    azimuth = ((np.arange(WIDTH_PX) + 0.5) / WIDTH_PX - 0.5) * 2 * np.pi
+    elevation = (0.5 - (np.arange(HEIGHT_PX) + 0.5) / HEIGHT_PX)[:, None] * np.pi
+    flat = np.cos(elevation)
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation) + 0 * azimuth], axis=-1)
