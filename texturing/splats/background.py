@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64
@@ -46,6 +48,17 @@ class Background:
         self._first[at] = FIRST_MOMENT * self._first[at] + (1 - FIRST_MOMENT) * step
         self._second[at] = SECOND_MOMENT * self._second[at] + (1 - SECOND_MOMENT) * step**2
         self.texture[at] -= rate * self._first[at] / (np.sqrt(self._second[at]) + MIN_RATE)
+
+    def save(self) -> dict[str, F32]:
+        """State, for `load`."""
+        return {"background": self.texture, "background_first": self._first, "background_second": self._second}
+
+    @classmethod
+    def load(cls, state: Mapping[str, F32]) -> Background:
+        """The background that `save` describes."""
+        loaded = cls(state["background"])
+        loaded._first, loaded._second = state["background_first"].copy(), state["background_second"].copy()
+        return loaded
 
 
 def texels(directions: F64 | F32) -> F32:

@@ -1,0 +1,135 @@
+"""Training: splats and background descend the difference between their renderings and the photos, coarse to fine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from scan2sim.pipeline.core.types import F32
+from scan2sim.texturing.splats import loss, rasterizer
+from scan2sim.texturing.splats.background import Background
+from scan2sim.texturing.splats.descent import Descent, rates
+from scan2sim.texturing.splats.exposure import Gains
+from scan2sim.texturing.splats.model import LOGIT, Splats
+from scan2sim.texturing.splats.shots import SCALES, Level, Shot
+
+BACKGROUND_RATE = 0.01
+CONSTANT_SHARE = 0.3
+"""Share of the epochs after which rates fall, to a tenth at the end."""
+GAIN_RATE = 0.2
+"""Share by which a photo's gain moves to the solution at every visit but the first."""
+MIN_OPACITY = 0.02
+"""Splats that end below it are removed."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Visits and rates.
+
+    Attributes:
+        epochs: visits of every photo in a quarter, half and full size.
+        position, scale, rotation, opacity, colour: first step of each parameter; positions in sizes of the splat.
+        cover: weight of the loss that covers what isn't sky, and uncovers what is.
+        seed: of the order of the photos.
+    """
+
+    epochs: tuple[int, int, int] = (5, 12, 14)
+    position: float = 0.05
+    scale: float = 0.02
+    rotation: float = 0.01
+    opacity: float = 0.05
+    colour: float = 0.015
+    cover: float = 0.017
+    seed: int = 0
+
+
+@dataclass
+class Training:
+    """State of a training, which can be saved and continued.
+
+    Attributes:
+        descent: the splats.
+        background: what is behind them.
+        gains: exposure of the shots.
+        epoch: number of finished epochs.
+    """
+
+    descent: Descent
+    background: Background
+    gains: Gains
+    epoch: int = 0
+
+    @classmethod
+    def of(cls, splats: Splats, size: F32, background: Background, shots: int) -> Training:
+        """A training that begins with these splats."""
+        return cls(Descent(splats.parameters.copy(), size), background, Gains(shots))
+
+    def run(self, shots: Sequence[Shot], schedule: Schedule, report: Callable[[float, str], None]) -> None:
+        """Train to the end of the schedule, from the epoch where it is.
+
+        Args:
+            shots: photos of training.
+            schedule: visits and rates.
+            report: is called after every epoch with the share that is done and the mean PSNR.
+        """
+        stages = [stage for stage, count in enumerate(schedule.epochs) for _ in range(count)]
+        for epoch in range(self.epoch, len(stages)):
+            done = epoch / len(stages)
+            decay = 0.1 ** max(0.0, (done - CONSTANT_SHARE) / (1 - CONSTANT_SHARE))
+            order = np.random.default_rng((schedule.seed, epoch)).permutation(len(shots))
+            psnr = [self._visit(k, shots[k].levels[stages[epoch]], schedule, decay) for k in order.tolist()]
+            self.gains.centre()
+            self.epoch = epoch + 1
+            report(self.epoch / len(stages), f"1/{SCALES[stages[epoch]]} size, {np.mean(psnr):.1f} dB")
+
+    def rendered(self, level: Level) -> tuple[rasterizer.Rendered, F32]:
+        """The splats in a photo, and the background there."""
+        return rasterizer.render(self.descent.parameters, level.camera), self.background.seen(level.texels)
+
+    def _visit(self, k: int, level: Level, schedule: Schedule, decay: float) -> float:
+        """Take a step towards a photo; returns the PSNR before it."""
+        drawn, behind = self.rendered(level)
+        image = drawn.over(behind)
+        self.gains.solve(k, image, level.rgb, level.weight, 1.0 if self.epoch == 0 else GAIN_RATE)
+        shown = self.gains.applied(k, image)
+        _, gradient = loss.photometric(shown, level.rgb, level.weight)
+        gradient = np.where(level.clipped & (shown > level.rgb), np.float32(0), gradient) * self.gains.gain[k]
+        cover = np.float32(schedule.cover) * level.weight * np.where(level.sky, np.float32(1), np.float32(-1))
+        found = drawn.gradients(behind, gradient, by_alpha=cover)
+        first = rates(schedule.position, schedule.scale, schedule.rotation, schedule.opacity, schedule.colour)
+        self.descent.step(drawn.seen, found, first * np.float32(decay))
+        self.background.descend(level.texels, gradient * drawn.transmittance[..., None], BACKGROUND_RATE * decay)
+        return _psnr(shown, level)
+
+    def result(self) -> Splats:
+        """The splats that are visible."""
+        logit = math.log(MIN_OPACITY / (1 - MIN_OPACITY))
+        parameters = self.descent.parameters
+        return Splats(parameters[(parameters[:, LOGIT] > logit) & np.isfinite(parameters).all(axis=1)])
+
+    def save(self, path: Path) -> None:
+        """Write the state, replacing the file at once."""
+        temporary = path.with_suffix(".partial.npz")
+        state = {f"descent_{name}": value for name, value in self.descent.save().items()}
+        gains = {"gain": self.gains.gain, "offset": self.gains.offset}
+        np.savez(temporary, epoch=self.epoch, **gains, **state, **self.background.save())
+        temporary.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> Training:
+        """Read what `save` wrote."""
+        with np.load(path) as state:
+            descent = {name.removeprefix("descent_"): state[name] for name in state if name.startswith("descent_")}
+            gains = Gains(len(state["gain"]))
+            gains.gain, gains.offset = state["gain"], state["offset"]
+            return cls(Descent.load(descent), Background.load(dict(state)), gains, int(state["epoch"]))
+
+
+def _psnr(shown: F32, level: Level) -> float:
+    used = level.weight > 0
+    error = (np.clip(shown, 0, 1) - np.clip(level.rgb, 0, 1))[used]
+    return float(-10 * np.log10(max(np.square(error).mean(dtype=np.float64), 1e-10))) if used.any() else math.nan
