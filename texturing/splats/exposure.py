@@ -8,7 +8,7 @@ from scan2sim.pipeline.core.types import F32
 
 MIN_GAIN, MAX_GAIN, MAX_OFFSET = 0.5, 2.0, 0.15
 PRIOR, PRIOR_VARIANCE = 0.02, 0.05
-"""Weight of a gain of 1 and an offset of 0, relative to the number of pixels, and the variance of colours that it has."""
+"""Weight of a gain of 1, relative to the number of pixels, and the variance of colours that it counts as."""
 DARK, BRIGHT = 0.02, 0.97
 """Levels of a photo outside of which pixels don't count: clipped."""
 EVERY_PX = 3

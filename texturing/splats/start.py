@@ -21,6 +21,8 @@ SCALE, FLATNESS = 0.55, 0.25
 OPACITY = 0.73
 MAX_STEP = 0.1
 """Relative change of depth between neighbouring pixels up to which they are of one surface."""
+MIN_SKY_SHARE = 0.2
+"""Share of the photos of a direction that must show sky there: a white wall that passes isn't sky."""
 DARK_SIGMA_PX = 12.0
 """Blur of the background behind what is not sky: a gap between leaves shows a dark colour."""
 
@@ -61,7 +63,7 @@ def first_background(shots: Sequence[Shot]) -> Background:
     shape = (HEIGHT_PX, WIDTH_PX)
     colour = (total / np.maximum(count, 1)[..., None]).astype(np.float32).reshape(2, *shape, 3)
     votes = count.reshape(2, *shape)
-    is_sky = votes[0] > votes[1]
+    is_sky = votes[0] > MIN_SKY_SHARE * votes.sum(axis=0)
     scenery = cv2.GaussianBlur(fill(colour[1], votes[1] > 0), (0, 0), DARK_SIGMA_PX)
     known = votes.sum(axis=0) > 0
     return Background(np.clip(fill(np.where(is_sky[..., None], colour[0], scenery), known), 0, 1))
