@@ -12,6 +12,7 @@ from pydantic import Field
 
 from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.parameters import Distance
+from scan2sim.pipeline.core.splats import SplatLayer
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, I64, U8, Bools, View
 from scan2sim.pipeline.io import sky
@@ -24,7 +25,8 @@ if TYPE_CHECKING:
 
 SCORE_KEYS = ("psnr_db", "psnr_gain_db", "ssim", "sharpness")
 FRAME_KEYS = ("psnr_db", "psnr_gain_db", "ssim", "ms_ssim", "excluded")
-"""Figures of whole frames: each photo's, with `frame_` before them, and their means in `frame`."""
+"""Figures of whole frames: each photo's, with `frame_` or `splat_frame_` before them, and their means in `frame` and
+`splat_frame`."""
 CAMERA_CLEARANCE_M = 1.0
 """Metres around a camera in which there can't have been a surface."""
 
@@ -55,7 +57,7 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     nothing is) are shown, and `labels` (classes of the photos) distinguish sky from missing surface.
 
     Files: `error`, a folder with an image of photo, rendering and difference for every held-out photo, and an
-    `index.json` of them; `frames`, the same with photo and whole frame.
+    `index.json` of them; `frames`, the same with photo and whole frame; `splat_frames`, the same of `splats`, if given.
 
     Metrics (None if no pixel is counted):
         held_out: number of photos.
@@ -63,7 +65,7 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
         photos: the same for each photo; `coverage`, 0 if no other photo saw what it shows; `frame_...`, as in `frame`.
         by_class, by_distance: the same over their pixels, without sharpness.
         frame: `psnr_db`, `psnr_gain_db`, `ssim` and `ms_ssim` of whole frames, means over the photos; `excluded`, the
-            share of pixels that don't count; `by_class` and `by_distance`.
+            share of pixels that don't count; `by_class` and `by_distance`. `splat_frame`: the same of the splats.
         truth_psnr_db, truth_psnr_near_db: for generated tiles.
         cameras: `count`, their number, and `near_m`, the distance in metres to the nearest surface of those within
             `CAMERA_CLEARANCE_M` of one.
@@ -73,6 +75,7 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     from scan2sim.pipeline.camera.renderer import Body, Renderer, textured
     from scan2sim.pipeline.dynamic_objects.vehicle_residue import residue_areas
     from scan2sim.texturing import evaluate
+    from scan2sim.texturing.splats.view import SplatRenderer
     from scan2sim.texturing.whole_frame import box_mesh, whole_frame
 
     groups, colour = [g for g in SURFACES if g in inputs], sky.read(inputs.get("sky"))
@@ -85,9 +88,12 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     views, held = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
     index = [i for i, out_ in enumerate(held) if out_]
     depths = [inputs["depth"] / f"{i}.npy" for i in index]
-    album, frames = Album(out / "error"), Frames(Album(out / "frames"), groups)
-    album.folder.mkdir()
-    frames.album.folder.mkdir()
+    layer = SplatLayer.load(inputs["splats"]) if "splats" in inputs else SplatLayer.nothing()
+    splats = SplatRenderer(layer) if len(layer.splats) else None
+    album, frames = Album(out / "error"), Frames("frame", Album(out / "frames"), groups)
+    splat_frames = Frames("splat_frame", Album(out / "splat_frames"), groups)
+    for one in (album, frames.album, *([splat_frames.album] if splats else [])):
+        one.folder.mkdir()
     photos: dict[str, dict[str, float | None]] = {}
     unread = {views[i].name: views[i].photo for i in index}
     index_of = {views[i].name: i for i in index}
@@ -112,8 +118,13 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
         whole = whole_frame(result, len(groups), np.load(depth_of[name]), known, boxes, backdrop)
         if whole is not None:
             photos[name] |= frames.add(f"{i:03d}_{Path(name).name}", name, result.photo, whole)
-    album.save()
-    frames.album.save()
+        if splats is not None and whole is not None:
+            shown = splats.view(result.view.camera, result.view.T_world_cam).rgb
+            of_splats = whole_frame(result, len(groups), np.load(depth_of[name]), known, boxes, shown=shown)
+            assert of_splats is not None
+            photos[name] |= splat_frames.add(f"{i:03d}_{Path(name).name}", name, result.photo, of_splats)
+    for one in (album, frames.album, *([splat_frames.album] if splats else [])):
+        one.save()
     warnings += [f"{file}: held out, but not scored: the photo or its mask can't be read" for file in unread.values()]
     metrics: dict[str, Any] = {"held_out": len(photos)}
     metrics |= {key: _mean([figures[key] for figures in photos.values()]) for key in SCORE_KEYS}
@@ -123,6 +134,8 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
         band: _rounded(evaluate.figures(sums)) for band, sums in zip(evaluate.BAND_NAMES, by_distance, strict=True)
     }
     metrics["frame"] = frames.metrics(photos)
+    if splats is not None:
+        metrics["splat_frame"] = splat_frames.metrics(photos)
     if "truth.points" in inputs:
         report(0.9, "comparing with ground-truth colours")
         metrics |= _truth(inputs, world, params)
@@ -131,22 +144,25 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
         others = [body.mesh for group, body in zip(groups, world.bodies, strict=True) if group != "vehicle"]
         left = residue_areas(others, inputs["instances"])
         metrics["residue_m2"] = [round(area, 2) for area in left]
-    return Done({"error": album.folder, "frames": frames.album.folder}, metrics, warnings)
+    files = {"error": album.folder, "frames": frames.album.folder}
+    files |= {"splat_frames": splat_frames.album.folder} if splats is not None else {}
+    return Done(files, metrics, warnings)
 
 
 class Frames:
     """Whole frames of the held-out photos: their figures, and an album.
 
     Args:
+        kind: what they are called in the figures of a photo.
         album: receives an image of each.
         groups: names of the world's bodies.
     """
 
-    def __init__(self, album: Album, groups: Sequence[str]) -> None:
+    def __init__(self, kind: str, album: Album, groups: Sequence[str]) -> None:
         from scan2sim.texturing.evaluate import BAND_NAMES
         from scan2sim.texturing.whole_frame import NO_SURFACE
 
-        self.album = album
+        self.album, self._kind = album, kind
         self._names = {"by_class": [*groups, *NO_SURFACE], "by_distance": [*BAND_NAMES, "no surface"]}
         self._sums = {kind: np.zeros((len(names), 5)) for kind, names in self._names.items()}
 
@@ -159,15 +175,15 @@ class Frames:
         whole = evaluate.figures(evaluate.tally(frame.errors, np.zeros(frame.mask.shape, np.int64), 1)[0])
         own = {key: whole[key] for key in ("psnr_db", "psnr_gain_db", "ssim")}
         own |= {"ms_ssim": frame.ms_ssim, "excluded": frame.excluded}
-        figures = _rounded({f"frame_{key}": value for key, value in own.items()})
-        self.album.add(file, whole_frame.picture(photo, frame), "frame", name, whole_frame.caption(figures))
-        return figures
+        figures = _rounded(own)
+        self.album.add(file, whole_frame.picture(photo, frame), self._kind, name, whole_frame.caption(figures))
+        return {f"{self._kind}_{key}": value for key, value in figures.items()}
 
     def metrics(self, photos: Mapping[str, Mapping[str, float | None]]) -> dict[str, Any]:
         """Means over the photos, and figures by class and by distance."""
         from scan2sim.texturing import evaluate
 
-        means = {key: _mean([one.get(f"frame_{key}") for one in photos.values()]) for key in FRAME_KEYS}
+        means = {key: _mean([one.get(f"{self._kind}_{key}") for one in photos.values()]) for key in FRAME_KEYS}
         return means | {
             kind: {name: _rounded(evaluate.figures(row)) for name, row in zip(names, self._sums[kind], strict=True)}
             for kind, names in self._names.items()

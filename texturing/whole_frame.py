@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -67,6 +68,7 @@ def whole_frame(
     labels: U8 | None = None,
     boxes: Renderer | None = None,
     backdrop: Renderer | None = None,
+    shown: U8 | None = None,
 ) -> WholeFrame | None:
     """Score the whole frame of a held-out photo; None if all of it is masked out.
 
@@ -77,12 +79,13 @@ def whole_frame(
         labels: (h, w, C) probabilities of the photo's classes, if known.
         boxes: boxes of the vehicles and people that the world leaves out (`box_mesh`).
         backdrop: what is behind the surfaces; its `sky` is the colour where nothing is.
+        shown: (H, W, 3) another image of the world to score, such as that of its splats; the gain is solved on all.
     """
     from scan2sim.pipeline.camera.models import pixel_angle
 
     view, render = result.view, result.render
-    rgb = render.rgb
-    if backdrop is not None:
+    rgb = render.rgb if shown is None else shown
+    if backdrop is not None and shown is None:
         behind = backdrop.view(view.camera, view.T_world_cam, samples=evaluate.RAYS_PER_PIXEL_SIDE)
         rgb = np.where((behind.range < render.range)[..., None], behind.rgb, rgb)
     behind_boxes = None if boxes is None else boxes.view(view.camera, view.T_world_cam)
@@ -91,7 +94,10 @@ def whole_frame(
     mask = ~excluded if allowed is None else ~excluded & (allowed > 0)
     if not mask.any():
         return None
-    gain = evaluate.solve_gain(result.photo, render.rgb, result.mask & mask)
+    if shown is None:
+        gain = evaluate.solve_gain(result.photo, render.rgb, result.mask & mask)
+    else:
+        gain = evaluate.solve_gain(result.photo, shown, mask)
     is_sky = np.zeros(mask.shape, bool) if labels is None else _full_size(labels.argmax(axis=2) == SKY, mask)
     return WholeFrame(
         rgb,
@@ -188,9 +194,9 @@ def picture(photo: U8, frame: WholeFrame) -> U8:
     return np.hstack([small[0], np.full((size[1], evaluate.ERROR_IMAGE_GAP_PX, 3), 255, np.uint8), small[1]])
 
 
-def caption(figures: dict[str, float | None]) -> str:
+def caption(figures: Mapping[str, float | None]) -> str:
     """One sentence about a photo's figures."""
-    parts = [f"{figures['frame_psnr_gain_db']:.1f} dB after a gain per channel", f"SSIM {figures['frame_ssim']:.2f}"]
-    multi = figures["frame_ms_ssim"]
+    parts = [f"{figures['psnr_gain_db']:.1f} dB after a gain per channel", f"SSIM {figures['ssim']:.2f}"]
+    multi = figures["ms_ssim"]
     parts += [] if multi is None or math.isnan(multi) else [f"MS-SSIM {multi:.2f}"]
     return ", ".join(parts) + "."

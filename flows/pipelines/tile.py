@@ -73,6 +73,7 @@ from scan2sim.texturing.photo_consistency import PHOTO_CONSISTENCY
 from scan2sim.texturing.pose_refinement.step import POSE_REFINEMENT
 from scan2sim.texturing.score import SCORE
 from scan2sim.texturing.sky_colour import SKY_COLOUR
+from scan2sim.texturing.splats.step import SPLATS
 from scan2sim.texturing.texture import TEXTURE
 from scan2sim.texturing.unwrap import UNWRAP
 from scan2sim.texturing.view_selection.step import VIEW_SELECTION
@@ -82,12 +83,12 @@ STEPS: tuple[Step, ...] = (
     GHOSTS, MAP_COLOURS, OVERLAP, DETECT_FURNITURE, FURNITURE, SPLIT, SPLIT_MESH, VOXEL, FLOOR, GROUND, WALLS, FACADES,
     ROOMS, POISSON, TRIM, FREE_SPACE, PLANES, ISLANDS, CLIP, JOIN, DECIMATE, PLANTS, UNWRAP, POSE_REFINEMENT, SIGNS,
     FOLIAGE, VISIBILITY, EXPOSURE, PHOTO_CONSISTENCY, VIEW_SELECTION, TEXTURE, COLOUR_HARMONIZATION, ROADS,
-    SKY_COLOUR, BACKDROP, COLLISION, ORIGIN, NAVIGATION, REFLECTANCE, EXPORT, RASTERS, GEOMETRY, SCORE, LIDAR_SCORE,
-    PICTURES, PREVIEW, BORDERS,
+    SKY_COLOUR, BACKDROP, SPLATS, COLLISION, ORIGIN, NAVIGATION, REFLECTANCE, EXPORT, RASTERS, GEOMETRY, SCORE,
+    LIDAR_SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 SIDE_PRODUCTS: tuple[Step, ...] = (
     TRACKS, VEHICLE_MODELS,
-    GHOSTS, DETECT_FURNITURE, FURNITURE, SIGNS, PLANTS, ROADS, SKY_COLOUR, BACKDROP, NAVIGATION, REFLECTANCE,
+    GHOSTS, DETECT_FURNITURE, FURNITURE, SIGNS, PLANTS, ROADS, SKY_COLOUR, BACKDROP, SPLATS, NAVIGATION, REFLECTANCE,
     RASTERS, GEOMETRY, SCORE, LIDAR_SCORE, PICTURES, PREVIEW, BORDERS,
 )  # fmt: skip
 """Steps without which the world is finished if they fail, in tiles and in surveys. Optional parts of the step `export`
@@ -184,9 +185,10 @@ def build_graph(
     roads = _add_roads(graph, scan, textured, origin)
     sky = _add_sky(graph, scan, photos)
     backdrop = _add_backdrop(graph, scan, surfaces, photos)
-    more = lists | roads | sky | backdrop | solid | origin
+    splats = _add_splats(graph, scan, surfaces, photos)
+    more = lists | roads | sky | backdrop | splats | solid | origin
     _export(graph, scan, parts, closed, textured, photos, parked["textured"], more)
-    _measure(graph, scan, parts, surfaces, textured, photos, synthesized, sky | backdrop)
+    _measure(graph, scan, parts, surfaces, textured, photos, synthesized, sky | backdrop | splats)
     _show(graph, scan, parts, textured, photos, sky)
     return graph.tasks
 
@@ -578,6 +580,15 @@ def _add_backdrop(graph: TileGraph, scan: Scan, surfaces: Sources, photos: Sourc
     meshes = _mesh_inputs(surfaces | _plant_models(graph, "mesh"))
     graph.add(BACKDROP, known | meshes, cell=graph.cell or None)
     return {"backdrop": graph.output(BACKDROP, "backdrop")} if graph.is_enabled(BACKDROP) else {}
+
+
+def _add_splats(graph: TileGraph, scan: Scan, surfaces: Sources, photos: Sources) -> Sources:
+    """Splats, which show cameras what photos show; returns them as an input of the export and the score."""
+    if not scan.has_ground_photos or _is_indoor(graph) or graph.params(SPLATS).when == "never":
+        return {}
+    known = {name: photos[name] for name in ("views", "depth", "exposures")} | scan.labels
+    graph.add(SPLATS, known | _mesh_inputs(surfaces | _plant_models(graph, "mesh")))
+    return {"splats": graph.output(SPLATS, "splats")} if graph.is_enabled(SPLATS) else {}
 
 
 def _add_solid(graph: TileGraph, surfaces: Sources, parked: Mapping[str, Sources]) -> tuple[Sources, Sources]:

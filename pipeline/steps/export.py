@@ -18,7 +18,7 @@ from scan2sim.pipeline.core.types import I32
 from scan2sim.pipeline.io import sky, world_formats
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.world_formats import SceneParams
-from scan2sim.pipeline.io.worlds.scene import PATH_FILE, ROADS_FILE, TRACKS_FILE, RobotMapFrame, save_tile
+from scan2sim.pipeline.io.worlds.scene import PATH_FILE, ROADS_FILE, SPLATS_FILE, TRACKS_FILE, RobotMapFrame, save_tile
 from scan2sim.pipeline.simulation import ground_origin
 
 LISTS = {
@@ -26,7 +26,7 @@ LISTS = {
     "furniture_geojson": "furniture.geojson", "furniture_csv": "furniture.csv", "instances": "instances.geojson",
     "ghosts": "ghosts.geojson", "roads": "roads.geojson", "roads_seen": ROADS_FILE, "path": PATH_FILE,
     "tracks": TRACKS_FILE, "tracks_geojson": "tracks.geojson", "tracks_kitti": "tracks_kitti.txt",
-    "tracks_nuscenes": "tracks_nuscenes.json", "floor": "floor.npz", "rooms": "rooms.geojson",
+    "tracks_nuscenes": "tracks_nuscenes.json", "floor": "floor.npz", "rooms": "rooms.geojson", "splats": SPLATS_FILE,
 }  # fmt: skip  # input to file in the world's folder
 
 

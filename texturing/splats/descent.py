@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from scan2sim.pipeline.core.splats import WIDTH
 from scan2sim.pipeline.core.types import F32, I32
-from scan2sim.texturing.splats.model import WIDTH
 
 FIRST_MOMENT, SECOND_MOMENT, MIN_ROOT = 0.9, 0.99, 1e-12
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from scan2sim.pipeline.camera.models import pixel_angle
+from scan2sim.pipeline.core.splats import Splats
 from scan2sim.pipeline.core.types import F32, F64, I64, Bools
 from scan2sim.texturing.backdrop.photos import FARTHEST_M, Photo, fill
 from scan2sim.texturing.splats.background import HEIGHT_PX, WIDTH_PX, Background
-from scan2sim.texturing.splats.model import Splats
 from scan2sim.texturing.splats.shots import Shot
 
 STRIDE_PX = 2

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from scan2sim.pipeline.core.splats import LOGIT, Splats
 from scan2sim.pipeline.core.types import F32
 from scan2sim.texturing.splats import loss, rasterizer
 from scan2sim.texturing.splats.background import Background
 from scan2sim.texturing.splats.descent import Descent, rates
 from scan2sim.texturing.splats.exposure import Gains
-from scan2sim.texturing.splats.model import LOGIT, Splats
 from scan2sim.texturing.splats.shots import SCALES, Level, Shot
 
 BACKGROUND_RATE = 0.01

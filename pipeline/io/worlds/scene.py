@@ -17,6 +17,7 @@ in `scene/` of the world's folder (files of earlier steps as hard links, so that
     scene/<tile>/roads.npz          observed roads (`pipeline.roads.observed`), if the step `roads` was run
     scene/<tile>/path.npz           trajectory of the recording device, local metres, if known
     scene/<tile>/tracks.json        tracks of road users in local metres (`pipeline.tracking.tracks`), if there are any
+    scene/<tile>/splats.npz         what cameras see (step `splats`)
     scene/<tile>/navigation.json    spawn pose and storeys (step `navigation`), and its files map*.yaml, .pgm, .pcd
 """
 
@@ -32,6 +33,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.classes import CODE_OF_SURFACE, SURFACES, name_of
 from scan2sim.pipeline.core.errors import DataError, InputError
+from scan2sim.pipeline.core.splats import SplatLayer
 from scan2sim.pipeline.core.types import F64, I32, U8, Colour, Frame, Mesh, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.file_checks import link_or_copy, make_folder
@@ -42,6 +44,7 @@ from scan2sim.pipeline.simulation.robot import Start
 
 SCENE_FOLDER, SCENE_FILE, TILE_FILE, COLLISION_FILE = "scene", "scene.json", "tile.json", "collision.npz"
 ROADS_FILE, PATH_FILE, VIEWS_FILE, TRACKS_FILE = "roads.npz", "path.npz", "views.json", "tracks.json"
+SPLATS_FILE = "splats.npz"
 LIST_SUFFIXES, TRACK_FILES = (".geojson", ".csv"), (TRACKS_FILE, "tracks_kitti.txt", "tracks_nuscenes.json")
 NAVIGATION_FILE, NAVIGATION_SUFFIXES = "navigation.json", (".yaml", ".pgm", ".pcd")
 BACKDROP, BACKDROP_PARTS = "backdrop", ("backdrop", "backdrop_sky")
@@ -151,6 +154,12 @@ class SceneTile:
         pages = shape.used_pages if shape else []
         return [Surface(BACKDROP_PARTS[k], BACKDROP, BACKDROP_CODE, shape.on_page(k)) for k in pages if shape]
 
+    def splats(self) -> SplatLayer | None:
+        """What cameras see of it; None: it was built without."""
+        path = self.folder / SPLATS_FILE
+        layer = SplatLayer.load(path) if path.is_file() else None
+        return layer if layer is not None and len(layer.splats) else None
+
     def solid(self) -> Mesh:
         """The collision mesh."""
         mesh = Mesh.load(self.folder / COLLISION_FILE)
@@ -181,7 +190,7 @@ class SceneTile:
     @property
     def extra_files(self) -> dict[str, Path]:
         """All files besides its meshes, by file name: lists, roads, the path, files for navigation."""
-        names = (ROADS_FILE, PATH_FILE, NAVIGATION_FILE, TRACKS_FILE)
+        names = (ROADS_FILE, PATH_FILE, NAVIGATION_FILE, TRACKS_FILE, SPLATS_FILE)
         others = {name: self.folder / name for name in names if (self.folder / name).is_file()}
         return self.lists | self.navigation_files | others
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -61,3 +62,33 @@ class Splats:
     def rgb(self) -> F32:
         """(N, 3) colours, sRGB 0 to 1."""
         return self.parameters[:, RGB]
+
+
+@dataclass(frozen=True)
+class SplatLayer:
+    """What cameras see of a tile: splats before a background at infinity.
+
+    Attributes:
+        splats: positions in the tile's local metres.
+        background: (H, W, 3) sRGB 0 to 1, equirectangular: column 0 is azimuth -180 degrees, from x (east) to y
+            (north); row 0 is the zenith.
+    """
+
+    splats: Splats
+    background: F32
+
+    @classmethod
+    def nothing(cls) -> SplatLayer:
+        """A layer without splats."""
+        return cls(Splats(np.zeros((0, WIDTH), np.float32)), np.full((1, 2, 3), 0.5, np.float32))
+
+    def save(self, path: Path) -> None:
+        """Write it as .npz: parameters with 32 bits, the background with 8 bits a channel."""
+        levels = np.clip(np.rint(self.background * 255), 0, 255).astype(np.uint8)
+        np.savez_compressed(path, parameters=self.splats.parameters, background=levels)
+
+    @classmethod
+    def load(cls, path: Path) -> SplatLayer:
+        """Read what `save` wrote."""
+        with np.load(path) as saved:
+            return cls(Splats(saved["parameters"]), saved["background"].astype(np.float32) / 255)

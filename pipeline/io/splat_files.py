@@ -1,0 +1,76 @@
+"""Files of 3D Gaussian splats: PLY of the literature, and SPZ, which is a tenth as large (package `gsply`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.splats import LOGIT, Splats
+from scan2sim.pipeline.core.types import F64
+
+if TYPE_CHECKING:
+    from gsply import GSData
+
+NEEDS = ("gsply",)
+SH_C0 = 0.28209479177387814
+"""Value of the spherical harmonic of degree 0: a colour c is stored as (c - 1/2) / SH_C0."""
+SPZ_FRACTION_BITS = 12
+"""Binary digits of positions after the point: a quarter of a millimetre, up to 2 km from the origin."""
+SPZ_FARTHEST_M = 2.0 ** (23 - SPZ_FRACTION_BITS)
+
+
+def write(path: Path, splats: Splats, offset: F64) -> None:
+    """Write splats in the format of the path's suffix, .ply or .spz.
+
+    Args:
+        path: file to write.
+        splats: N splats.
+        offset: (3,) metres that are added to their positions.
+
+    Raises:
+        SettingError: unknown suffix; positions that SPZ can't store.
+    """
+    import gsply
+
+    data = _data(splats, offset)
+    if path.suffix == ".ply":
+        gsply.plywrite(path, data)
+    elif path.suffix == ".spz":
+        farthest = float(np.abs(data.means).max(initial=0))
+        if farthest >= SPZ_FARTHEST_M:
+            raise SettingError(
+                path,
+                f"has splats {farthest:,.0f} m from the origin, but SPZ ends at {SPZ_FARTHEST_M:,.0f} m",
+                "Write PLY",
+            )
+        gsply.write_spz(path, data, fractional_bits=SPZ_FRACTION_BITS)
+    else:
+        raise SettingError(path, "has an unknown suffix", "Use .ply or .spz")
+
+
+def read(path: Path) -> Splats:
+    """Read splats without view-dependent colour from a .ply or .spz file."""
+    import gsply
+
+    data = gsply.plyread(str(path)) if path.suffix == ".ply" else gsply.read_spz(path)
+    rgb = np.asarray(data.sh0) * SH_C0 + 0.5
+    made = np.column_stack([data.means, data.scales, data.quats, data.opacities, rgb])
+    return Splats(np.ascontiguousarray(made, np.float32))
+
+
+def _data(splats: Splats, offset: F64) -> GSData:
+    """The splats as gsply holds them: logarithms of scales, logits of opacities, unit quaternions w x y z."""
+    from gsply import GSData, create_ply_format
+
+    parameters = splats.parameters
+    columns: dict[str, Any] = {
+        "means": (splats.xyz + offset).astype(np.float32),
+        "scales": np.ascontiguousarray(parameters[:, 3:6]),
+        "quats": np.ascontiguousarray(splats.quaternion),
+        "opacities": np.ascontiguousarray(parameters[:, LOGIT]),
+        "sh0": ((splats.rgb - 0.5) / SH_C0).astype(np.float32),
+    }
+    return GSData(**columns, shN=np.zeros((len(splats), 0, 3), np.float32), _format=create_ply_format(sh_degree=0))

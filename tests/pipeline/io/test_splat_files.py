@@ -1,0 +1,108 @@
+"""Splats as other programs read them: PLY and SPZ by gsply, glTF by its own accessors."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("gsply", reason="the extra splats isn't installed")
+
+from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.splats import SplatLayer, Splats
+from scan2sim.pipeline.io import splat_files
+from scan2sim.pipeline.io.worlds.gltf import splats as gltf
+
+OFFSET = np.array([100.0, -50.0, 3.0])
+
+
+def some(number: int = 500, seed: int = 1) -> Splats:
+    random = np.random.default_rng(seed)
+    return Splats.of(
+        random.uniform(-30, 30, (number, 3)), np.exp(random.uniform(-5, 0, (number, 3))),
+        random.normal(size=(number, 4)), random.uniform(0.05, 0.95, number), random.uniform(0.02, 0.98, (number, 3)),
+    )  # fmt: skip
+
+
+def shape(splats: Splats) -> np.ndarray:
+    """(N, 3, 3) covariances."""
+    w, x, y, z = splats.quaternion.T.astype(float)
+    axes = Rotation.from_quat(np.column_stack([x, y, z, w])).as_matrix() * splats.scale[:, None, :]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "metres", "relative", "level"), [(".ply", 1e-5, 1e-5, 1e-5), (".spz", 5e-4, 0.08, 0.02)]
+)
+def test_files_hold_the_splats_in_world_metres(
+    tmp_path: Path, suffix: str, metres: float, relative: float, level: float
+) -> None:
+    given = some()
+    splat_files.write(tmp_path / f"a{suffix}", given, OFFSET)
+    found = splat_files.read(tmp_path / f"a{suffix}")
+    assert len(found) == len(given)
+    assert np.abs(found.xyz - (given.xyz + OFFSET)).max() < metres
+    assert np.abs(found.rgb - given.rgb).max() < level and np.abs(found.opacity - given.opacity).max() < level
+    size = np.linalg.norm(shape(given), axis=(1, 2))
+    assert (np.linalg.norm(shape(found) - shape(given), axis=(1, 2)) / size).max() < 2 * relative + 1e-4
+
+
+def test_spz_is_small(tmp_path: Path) -> None:
+    for suffix in (".ply", ".spz"):
+        splat_files.write(tmp_path / f"a{suffix}", some(20_000), np.zeros(3))
+    assert (tmp_path / "a.spz").stat().st_size < 0.35 * (tmp_path / "a.ply").stat().st_size
+
+
+def test_positions_beyond_spz_are_rejected(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="Write PLY"):
+        splat_files.write(tmp_path / "a.spz", some(), np.array([5000.0, 0, 0]))
+    assert not (tmp_path / "a.spz").exists()
+
+
+def accessors(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The JSON of a GLB, and the attributes of its only primitive."""
+    data = path.read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    tree = json.loads(data[20 : 20 + length])
+    binary = data[28 + length :]
+    found = {}
+    (primitive,) = tree["meshes"][0]["primitives"]
+    for name, index in primitive["attributes"].items():
+        accessor = tree["accessors"][index]
+        view = tree["bufferViews"][accessor["bufferView"]]
+        columns = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        kind = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+        values = np.frombuffer(binary, kind, accessor["count"] * columns, view["byteOffset"])
+        found[name] = values.reshape(-1, columns)
+    return tree, found
+
+
+def test_gltf_has_the_same_ellipsoids_with_y_up(tmp_path: Path) -> None:
+    given = some()
+    gltf.write(tmp_path / "a.glb", given, OFFSET)
+    tree, found = accessors(tmp_path / "a.glb")
+    assert tree["extensionsUsed"] == ["KHR_gaussian_splatting"] and "extensionsRequired" not in tree
+    assert tree["nodes"][0]["translation"] == [100.0, 3.0, 50.0]
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    assert np.allclose(found["POSITION"], given.xyz @ turn.T, atol=1e-5)
+    axes = Rotation.from_quat(found["KHR_gaussian_splatting:ROTATION"]).as_matrix()
+    scaled = axes * found["KHR_gaussian_splatting:SCALE"][:, None, :]
+    assert np.allclose(scaled @ scaled.transpose(0, 2, 1), turn @ shape(given) @ turn.T, rtol=1e-3, atol=1e-6)
+    assert np.allclose(found["KHR_gaussian_splatting:OPACITY"][:, 0], given.opacity, atol=1e-6)
+    colour = found["KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"] * splat_files.SH_C0 + 0.5
+    assert np.allclose(colour, given.rgb, atol=1e-5) and np.allclose(
+        found["COLOR_0"][:, :3] / 255, given.rgb, atol=3e-3
+    )
+
+
+def test_a_layer_is_stored_and_read(tmp_path: Path) -> None:
+    background = np.random.default_rng(1).uniform(size=(8, 16, 3)).astype(np.float32)
+    SplatLayer(some(), background).save(tmp_path / "a.npz")
+    read = SplatLayer.load(tmp_path / "a.npz")
+    assert np.array_equal(read.splats.parameters, some().parameters)
+    assert np.abs(read.background - background).max() < 0.002
