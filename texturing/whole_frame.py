@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -158,10 +158,20 @@ def box_mesh(geojson: Path, frame: Frame, *, keep_vehicles: bool) -> Mesh:
         frame: frame of the mesh.
         keep_vehicles: whether parked vehicles are in the world.
     """
+    return _boxes(geojson, frame, lambda about: about["kind"] == "person" or about["moved"] or not keep_vehicles)
+
+
+def parked_mesh(geojson: Path, frame: Frame) -> Mesh:
+    """Boxes of the vehicles that stand still, from the step `instances`."""
+    return _boxes(geojson, frame, lambda about: about["kind"] != "person" and not about["moved"])
+
+
+def _boxes(geojson: Path, frame: Frame, wanted: Callable[[Mapping[str, Any]], bool]) -> Mesh:
+    """Boxes of the instances whose properties are `wanted`."""
     vertices: list[F32] = [np.zeros((0, 3), np.float32)]
     for feature in json.loads(geojson.read_text(encoding="utf-8"))["features"]:
         about = feature["properties"]
-        if keep_vehicles and about["kind"] != "person" and not about["moved"]:
+        if not wanted(about):
             continue
         ring = np.array(feature["geometry"]["coordinates"][0][:4], np.float64)
         low = frame.to_local(np.column_stack([ring, np.full(4, about["ground_z"])])).astype(np.float32)

@@ -185,7 +185,7 @@ def build_graph(
     roads = _add_roads(graph, scan, textured, origin)
     sky = _add_sky(graph, scan, photos)
     backdrop = _add_backdrop(graph, scan, surfaces, photos)
-    splats = _add_splats(graph, scan, surfaces, photos)
+    splats = _add_splats(graph, scan, parts, surfaces, photos)
     more = lists | roads | sky | backdrop | splats | solid | origin
     _export(graph, scan, parts, closed, textured, photos, parked["textured"], more)
     _measure(graph, scan, parts, surfaces, textured, photos, synthesized, sky | backdrop | splats)
@@ -582,12 +582,12 @@ def _add_backdrop(graph: TileGraph, scan: Scan, surfaces: Sources, photos: Sourc
     return {"backdrop": graph.output(BACKDROP, "backdrop")} if graph.is_enabled(BACKDROP) else {}
 
 
-def _add_splats(graph: TileGraph, scan: Scan, surfaces: Sources, photos: Sources) -> Sources:
+def _add_splats(graph: TileGraph, scan: Scan, parts: Parts, surfaces: Sources, photos: Sources) -> Sources:
     """Splats, which show cameras what photos show; returns them as an input of the export and the score."""
     if not scan.has_ground_photos or _is_indoor(graph) or graph.params(SPLATS).when == "never":
         return {}
     known = {name: photos[name] for name in ("views", "depth", "exposures")} | scan.labels
-    graph.add(SPLATS, known | _mesh_inputs(surfaces | _plant_models(graph, "mesh")))
+    graph.add(SPLATS, known | parts.instances | _mesh_inputs(surfaces | _plant_models(graph, "mesh")))
     return {"splats": graph.output(SPLATS, "splats")} if graph.is_enabled(SPLATS) else {}
 
 

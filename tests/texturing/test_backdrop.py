@@ -8,89 +8,39 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
-from scan2sim.pipeline.camera.depth_map import depth_map, scene
-from scan2sim.pipeline.camera.renderer import Body, Renderer, look_at, pinhole, textured
-from scan2sim.pipeline.core.classes import PHOTO_CLASSES
+from scan2sim.pipeline.camera.renderer import Body, Renderer, look_at, textured
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.tile_cell import TileCell
-from scan2sim.pipeline.core.types import F64, U8, Camera, Mesh, View
-from scan2sim.pipeline.io import views as views_io
+from scan2sim.pipeline.core.types import F64, U8, Camera, Mesh
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.worlds.scene import BACKDROP_PARTS
 from scan2sim.texturing.backdrop.dome import DOME_FILE, Dome
 from scan2sim.texturing.backdrop.step import BackdropContext, BackdropParams, backdrop
 from scan2sim.texturing.evaluate import psnr
-from scan2sim.texturing.photo_cache import Exposures
-from tests.texturing.corner import grid, join
+from tests.texturing.facade_street import (
+    CAMERA,
+    END,
+    HELD_OUT,
+    NUMBER,
+    SCANNED,
+    SKY,
+    UPPER,
+    FacadeDrive,
+)  # fmt: skip
 
-SKY = (110, 160, 230)
-CAMERA = pinhole(360, 180, field=80)
-NUMBER, HELD_OUT, FAR_M, SIDE_M, SCANNED_M = 7, 3, 60.0, 12.0, 3.0
 LAYERS, DOME = range(len(BACKDROP_PARTS))
 
 
-def painted(mesh: Mesh, seed: int, base: tuple[int, int, int]) -> Body:
-    """The mesh with random colours, a different one for each pair of triangles."""
-    shade = np.random.default_rng(seed).uniform(0.4, 1.3, len(mesh) // 2)
-    return Body(mesh, colour=np.clip(np.outer(np.tile(shade, 2), base), 0, 255).astype(np.uint8))
-
-
-def wall(y: float, low: float, high: float, cells: int) -> Mesh:
-    """A wall along the street that faces its middle."""
-    up, along = (0, 0, high - low), (FAR_M + 10, 0, 0)
-    return join(grid((-10, y, low), up, along, cells) if y < 0 else grid((-10, y, low), along, up, cells))
-
-
-GROUND = painted(join(grid((-10, -SIDE_M, 0), (45, 0, 0), (0, 2 * SIDE_M, 0), 40)), 0, (120, 120, 115))
-SCANNED = [GROUND, *(painted(wall(y, 0, SCANNED_M, 12), 1, (170, 120, 90)) for y in (-SIDE_M, SIDE_M))]
-UPPER = [painted(wall(y, SCANNED_M, 9, 24), 2, (180, 130, 100)) for y in (-SIDE_M, SIDE_M)]
-END = painted(join(grid((FAR_M, -30, 0), (0, 0, 14), (0, 60, 0), 24)), 3, (90, 150, 110))
-
-
 @dataclass
-class Drive:
-    """A drive along the street, photographed, and the backdrop from its photos."""
+class Drive(FacadeDrive):
+    """The drive, and the backdrop from its photos."""
 
-    folder: Path
     params: BackdropParams = field(default_factory=BackdropParams)
-    vehicle: bool = False
-    number: int = NUMBER
-    noise: float = 0.0
-
-    @cached_property
-    def views(self) -> list[View]:
-        """Photos one metre apart, with their classes."""
-        (self.folder / "labels").mkdir()
-        found = []
-        for i in range(self.number):
-            pose = look_at((float(i), 0.3, 1.7), (float(i) + 10, 0, 1.9))
-            street = Renderer([*SCANNED, *UPPER, END]).view(CAMERA, pose, background=SKY, samples=2)
-            rgb, labels = street.rgb.copy(), np.zeros((*street.hit.shape, len(PHOTO_CLASSES)), np.uint8)
-            labels[..., PHOTO_CLASSES.index("building")] = 255 * street.hit
-            labels[..., PHOTO_CLASSES.index("sky")] = 255 * ~street.hit
-            if self.vehicle:  # vehicle ahead, at a constant position in the image
-                rgb[75:94, 172:195] = (250, 10, 10)
-                labels[75:94, 172:195] = 0
-                labels[75:94, 172:195, PHOTO_CLASSES.index("vehicle")] = 255
-            noise = np.random.default_rng(i).normal(0, self.noise, rgb.shape)
-            image.write(self.folder / f"{i}.png", np.clip(rgb + noise, 0, 255).astype(np.uint8))
-            np.save(self.folder / "labels" / f"{i}.npy", labels)
-            found.append(View(str(i), CAMERA, pose, self.folder / f"{i}.png"))
-        return found
 
     @cached_property
     def done(self) -> Done:
         """Result of the step."""
-        inputs = {name: self.folder / name for name in ("views", "depth", "labels", "exposures")}
-        views_io.save(inputs["views"], self.views, [i == HELD_OUT for i in range(self.number)])
-        Exposures().save(inputs["exposures"])
-        inputs["depth"].mkdir()
-        occluders = scene([body.mesh for body in SCANNED])
-        for i, view in enumerate(self.views):
-            np.save(inputs["depth"] / f"{i}.npy", depth_map(view.camera, view.T_world_cam, occluders).range)
-        for i, body in enumerate(SCANNED):
-            body.mesh.save(self.folder / f"mesh{i}.npz")
-            inputs[f"mesh.{i}"] = self.folder / f"mesh{i}.npz"
+        inputs = self.inputs
         (self.folder / "out").mkdir()
         return backdrop(inputs, self.params, self.folder / "out", silent)
 
@@ -189,7 +139,7 @@ def test_layers_of_a_survey_tile_end_at_its_cell_without_a_dome(
     drive: Drive, tmp_path: Path
 ) -> None:  # fmt: skip
     cell = TileCell(name="a", seed=(0.0, 0.0), neighbours={"b": (40.0, 0.0)})
-    tile = Drive(tmp_path, BackdropParams(context=BackdropContext(cell=cell)))
+    tile = Drive(tmp_path, params=BackdropParams(context=BackdropContext(cell=cell)))
     mesh, alone = tile.body.mesh, drive.done.files["backdrop"]
     assert (Dome.load(tile.done.files["backdrop"]).colour == image.read_rgb(alone / "page_1.png")).all()
     assert not (alone / DOME_FILE).exists()

@@ -35,12 +35,14 @@ class SplatsParams(Params):
     Attributes:
         when: never: no splats; auto: if there are photos taken from the street.
         epochs: visits of every photo in a quarter, half and full size.
+        parked: show vehicles that stand still, although the mesh may leave them out; those that moved are never shown.
         cover: weight of the loss that covers what isn't sky and uncovers what is.
         seed: of the order in which photos are visited.
     """
 
     when: Literal["never", "auto"] = "never"
     epochs: tuple[int, int, int] = Field((5, 12, 14), json_schema_extra={"range": "3 numbers, 0 to 1,000"})
+    parked: bool = True
     cover: float = Field(0.017, ge=0, le=1)
     seed: Seed = 0
 
@@ -48,12 +50,14 @@ class SplatsParams(Params):
 def splats(inputs: Inputs, params: SplatsParams, out: Path, report: Report, checkpoint: Path) -> Done:
     """Train splats on the photos `views` that aren't held out.
 
-    Inputs: `views`, their `depth` maps and `exposures`; `labels` (optional), class probabilities of photos; `mesh.*`.
+    Inputs: `views`, their `depth` maps and `exposures`; `mesh.*`; optionally `labels`, class probabilities of photos, and
+    `instances`, boxes of vehicles and people.
+
     File: `splats`, a `SplatLayer`, without any splats if fewer than two photos can be used.
     """
     from scan2sim.texturing.splats.training import Schedule
 
-    used = _prepared(inputs, report)
+    used = _prepared(inputs, params, report)
     if len(used) < 2:
         SplatLayer.nothing().save(out / SPLATS_FILE)
         return Done({"splats": out / SPLATS_FILE}, {"photos": len(used), "splats": 0})
@@ -66,16 +70,20 @@ def splats(inputs: Inputs, params: SplatsParams, out: Path, report: Report, chec
     return Done({"splats": out / SPLATS_FILE}, {"photos": len(used), "first": first, "splats": len(result)})
 
 
-def _prepared(inputs: Inputs, report: Report) -> list[Photo]:
+def _prepared(inputs: Inputs, params: SplatsParams, report: Report) -> list[Photo]:
     """The photos of training, with depth."""
     from scan2sim.pipeline.camera.renderer import Body, Renderer
     from scan2sim.texturing.backdrop import photos as prepared
     from scan2sim.texturing.backdrop import plane_sweep
     from scan2sim.texturing.photo_cache import Exposures
+    from scan2sim.texturing.whole_frame import parked_mesh
 
     meshes = [Mesh.load(path) for name, path in inputs.items() if name.startswith("mesh.")]
     world, exposures = Renderer([Body(mesh) for mesh in meshes]), Exposures.load(inputs["exposures"])
     views, held_out = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
+    parked = None
+    if params.parked and "instances" in inputs:
+        parked = Renderer([Body(parked_mesh(inputs["instances"], meshes[0].frame))])
     used = []
     for k, view in enumerate(views):
         if held_out[k] or view.camera.model == "orthographic":
@@ -84,6 +92,8 @@ def _prepared(inputs: Inputs, report: Report) -> list[Photo]:
         labels = inputs["labels"] / f"{k}.npy" if "labels" in inputs else None
         photo = prepared.prepare(view, inputs["depth"] / f"{k}.npy", labels, world, exposures)
         if photo is not None:
+            if parked is not None:
+                photo.movable &= ~parked.view(photo.camera, view.T_world_cam).hit
             used.append(photo)
     for i, photo in enumerate(used):
         report(DEPTH_SHARE + (TRAINING_SHARE - DEPTH_SHARE) * i / len(used), f"depth of {photo.view.name}")

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.camera.renderer import look_at
+from scan2sim.pipeline.core.splats import Splats
 from scan2sim.pipeline.core.types import F32, F64, Camera
 from scan2sim.texturing.splats import rasterizer, tiles
-from scan2sim.pipeline.core.splats import Splats
 from scan2sim.texturing.splats.projection import Pinhole
 from tests.texturing.splats import reference
 
