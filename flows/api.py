@@ -1,4 +1,4 @@
-"""The public Python API: `scan2sim.run`, `survey`, `read_world` and the importers, for notebooks and scripts.
+"""The public Python API: `scan2sim.run`, `survey`, `read_world`, `camera` and the importers, for notebooks and scripts.
 
 The commands of the same names call the same functions. Everything else may change between minor versions.
 """
@@ -21,10 +21,12 @@ from scan2sim.pipeline.importers.photogrammetry import import_model as import_ph
 if TYPE_CHECKING:
     from scan2sim.flows.pipelines.settings import Settings
     from scan2sim.pipeline.io.worlds.scene import Scene
+    from scan2sim.texturing.world_camera import WorldCamera
 
 __all__ = [
     "ScanError",
     "World",
+    "camera",
     "import_clouds",
     "import_kitti_odometry",
     "import_kitti_raw",
@@ -149,6 +151,27 @@ def survey(
     with _shown(progress):
         run_source(str(source), str(out), _settings(settings, hold_out), length=length, buffer=buffer, jobs=jobs)
     return read_world(out)
+
+
+def camera(world: World | str | Path) -> WorldCamera:
+    """A camera in a finished world, without a simulator: colour, depth and classes from any pose.
+
+    Colours are those of the world's splats, if it has some, otherwise of its textured surfaces.
+
+    Args:
+        world: the world, or the output folder of `run`, `survey` or `export`.
+
+    Example:
+        `image = scan2sim.camera("my_world").render(T_world_cam, camera)`, with a pose (4, 4) in world metres (camera
+        axes x right, y down, z ahead) and a `scan2sim.pipeline.core.types.Camera`; `image.rgb`, `image.depth(camera)`,
+        `image.code`.
+
+    Raises:
+        InputError: the folder contains no world.
+    """
+    from scan2sim.texturing.world_camera import WorldCamera
+
+    return WorldCamera(world.scene if isinstance(world, World) else World(Path(world)).scene)
 
 
 def read_world(folder: str | Path) -> World:

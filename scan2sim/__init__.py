@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from scan2sim.flows.api import (
         ScanError,
         World,
+        camera,
         import_clouds,
         import_kitti_odometry,
         import_kitti_raw,
@@ -25,6 +26,7 @@ __all__ = [
     "ScanError",
     "World",
     "__version__",
+    "camera",
     "import_clouds",
     "import_kitti_odometry",
     "import_kitti_raw",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.flows.reports.film import SAMPLES_PER_AXIS, placed
+from scan2sim.flows.reports.film import SAMPLES_PER_AXIS
 from scan2sim.pipeline.camera import renderer
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.step import Report
@@ -54,10 +54,14 @@ def comparison_film(scene: Scene, photos: Mapping[str, Path], file: Path, width:
         )
     traffic = scenario_of(scene)
     world = renderer.Renderer(
-        [placed(tile.folder / group, tile.offset) for tile in scene.tiles for group in tile.groups], scene.sky
+        [renderer.placed(tile.folder / group, tile.offset) for tile in scene.tiles for group in tile.groups], scene.sky
     )
     behind = renderer.Renderer(
-        [placed(tile.folder / BACKDROP, tile.offset) for tile in scene.with_dome if (tile.folder / BACKDROP).is_dir()],
+        [
+            renderer.placed(tile.folder / BACKDROP, tile.offset)
+            for tile in scene.with_dome
+            if (tile.folder / BACKDROP).is_dir()
+        ],
         scene.sky,
     )
     wide = views[0].camera.width > views[0].camera.height

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from scan2sim.pipeline.camera import renderer
 from scan2sim.pipeline.core.step import Report
-from scan2sim.pipeline.core.types import F64, Mesh
+from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.io.images.video import Encoder
 from scan2sim.pipeline.io.trajectory import atomic_write
 from scan2sim.pipeline.io.worlds.scene import Scene
@@ -68,7 +68,7 @@ def film(scene: Scene, file: Path, seconds: float, width: int, report: Report) -
     size = width // 2 * 2, width * 9 // 32 * 2
     camera = renderer.pinhole(*size)
     world = renderer.Renderer(
-        [placed(tile.folder / group, tile.offset) for tile in scene.tiles for group in tile.groups],
+        [renderer.placed(tile.folder / group, tile.offset) for tile in scene.tiles for group in tile.groups],
         scene.sky,
     )
     poses = flight(scene, round(seconds * FPS))
@@ -102,13 +102,6 @@ def flight(scene: Scene, count: int) -> list[F64]:
 
     lines = interpolated(eye), interpolated(target)
     return [renderer.look_at(e + (0, 0, up), t) for e, t, up in zip(*lines, rise, strict=True)]
-
-
-def placed(folder: Path, offset: tuple[float, float, float]) -> renderer.Body:
-    """A textured mesh of a tile, moved by the tile's offset in the world."""
-    body = renderer.textured(folder)
-    mesh: Mesh = body.mesh
-    return replace(body, mesh=replace(mesh, vertices=(mesh.vertices + np.asarray(offset)).astype(np.float32)))
 
 
 def _circle(scene: Scene, count: int) -> list[F64]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -66,6 +66,13 @@ class Image:
     body: npt.NDArray[np.int16]
     range: F32
     barycentric: F32
+
+
+def placed(folder: Path, offset: tuple[float, float, float]) -> Body:
+    """A textured mesh of a tile, moved by the tile's offset in the world."""
+    body = textured(folder)
+    mesh: Mesh = body.mesh
+    return replace(body, mesh=replace(mesh, vertices=(mesh.vertices + np.asarray(offset)).astype(np.float32)))
 
 
 def textured(folder: Path) -> Body:

@@ -50,8 +50,8 @@ class SplatsParams(Params):
 def splats(inputs: Inputs, params: SplatsParams, out: Path, report: Report, checkpoint: Path) -> Done:
     """Train splats on the photos `views` that aren't held out.
 
-    Inputs: `views`, their `depth` maps and `exposures`; `mesh.*`; optionally `labels`, class probabilities of photos, and
-    `instances`, boxes of vehicles and people.
+    Inputs: `views`, their `depth` maps and `exposures`; `mesh.*`; optionally `labels`, class probabilities of photos,
+    and `instances`, boxes of vehicles and people.
 
     File: `splats`, a `SplatLayer`, without any splats if fewer than two photos can be used.
     """

@@ -1,0 +1,79 @@
+"""A camera in a finished world: colour of splats or surfaces, distance and class of the first surface."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import scan2sim
+from scan2sim.pipeline.camera.renderer import look_at, pinhole
+from scan2sim.pipeline.core.splats import SplatLayer, Splats
+from scan2sim.pipeline.core.types import Camera
+from scan2sim.pipeline.io.worlds.scene import SPLATS_FILE, Scene
+from tests.fakes import synthetic
+
+CAMERA = pinhole(160, 120, field=80)
+POSE = look_at((-4.0, -4.0, 3.0), (0.0, 0.0, 0.5))
+GREEN = (0.1, 0.8, 0.2)
+
+
+@pytest.fixture
+def town(tmp_path: Path) -> Scene:
+    return synthetic.scene(tmp_path)
+
+
+def green_ground(seed: int = 1) -> SplatLayer:
+    """A layer of green splats over the ground of a tile, before a white background."""
+    random = np.random.default_rng(seed)
+    xyz = np.column_stack([random.uniform(-6, 6, (20_000, 2)), np.zeros(20_000)])
+    splats = Splats.of(
+        xyz, np.full((20_000, 3), 0.08), np.tile([1.0, 0, 0, 0], (20_000, 1)), np.full(20_000, 0.9),
+        np.tile(GREEN, (20_000, 1)),
+    )  # fmt: skip
+    return SplatLayer(splats, np.ones((512, 1024, 3), np.float32))
+
+
+def test_surfaces_are_shown_with_distance_and_class(town: Scene, tmp_path: Path) -> None:
+    image = scan2sim.camera(tmp_path / "world").render(POSE, CAMERA)
+    hit = np.isfinite(image.range)
+    assert 0.3 < hit.mean() <= 1 and set(np.unique(image.code[hit])) <= {2, 6, 64} and not image.code[~hit].any()
+    assert {2, 6} <= set(np.unique(image.code))
+    depth = image.depth(CAMERA)
+    assert (depth[hit] <= image.range[hit] + 1e-4).all() and depth[60, 80] == pytest.approx(
+        image.range[60, 80], rel=1e-3
+    )
+
+
+def test_splats_give_the_colour_and_surfaces_the_distance(town: Scene) -> None:
+    without = scan2sim.camera(scan2sim.World(town.tiles[0].folder.parent.parent)).render(POSE, CAMERA)
+    green_ground().save(town.tiles[0].folder / SPLATS_FILE)
+    image = scan2sim.camera(town.tiles[0].folder.parent.parent).render(POSE, CAMERA)
+    assert np.array_equal(image.code, without.code)
+    hit = np.isfinite(without.range)
+    assert np.array_equal(image.range[hit], without.range[hit])
+    middle = image.rgb[90:, 40:120].reshape(-1, 3).mean(axis=0) / 255
+    assert np.abs(middle - GREEN).max() < 0.1
+    assert image.rgb[0].min() > 240, "above the horizon is the background"
+
+
+@pytest.mark.parametrize(
+    "camera", [Camera("equirectangular", 256, 128), Camera("fisheye", 128, 128, 45, 45, 63.5, 63.5)]
+)
+def test_other_cameras_see_the_same(town: Scene, camera: Camera) -> None:
+    green_ground().save(town.tiles[0].folder / SPLATS_FILE)
+    world = scan2sim.camera(town.tiles[0].folder.parent.parent)
+    narrow, wide = world.render(POSE, CAMERA), world.render(POSE, camera)
+    ahead = wide.rgb[camera.height // 2, camera.width // 2].astype(int)
+    assert np.abs(ahead - narrow.rgb[60, 80]).max() < 25
+
+
+def test_tiles_of_a_survey_are_in_place(town: Scene) -> None:
+    """The second tile's splats are 25 m from the first's, and a little lower."""
+    folder = town.tiles[0].folder.parent.parent
+    green_ground().save(town.tiles[1].folder / SPLATS_FILE)
+    x, y, z = town.tiles[1].offset
+    there = look_at((x - 4.0, y - 4.0, z + 3.0), (x, y, z + 0.5))
+    shown = scan2sim.camera(folder).render(there, CAMERA).rgb[90:, 40:120].reshape(-1, 3).mean(axis=0) / 255
+    assert np.abs(shown - GREEN).max() < 0.1
