@@ -22,7 +22,7 @@ from scan2sim.pipeline.geometry.cylinders import Cylinder
 from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.file_checks import make_folder
 from scan2sim.pipeline.io.world_formats import SceneParams
-from scan2sim.pipeline.io.worlds import provenance, sdf
+from scan2sim.pipeline.io.worlds import provenance, sdf, usd_splats
 from scan2sim.pipeline.io.worlds.scene import BACKDROP, Scene, SceneTile, Surface, by_class
 from scan2sim.pipeline.io.worlds.textured_mesh import unique_uv, vertex_normals
 from scan2sim.pipeline.simulation.collision_shapes import Solid, solids
@@ -109,6 +109,9 @@ def _write_tile(path: Path, tile: SceneTile, source: SceneTile, params: ScenePar
             for part in surface.parts(params.max_visual_triangles):
                 _add_visual(stage, root, part, materials, views, params)
                 triangles += len(part.shape)
+    layer = source.splats()
+    if layer is not None:
+        usd_splats.add(stage, root, layer.splats, ("Visual", "Backdrop"))
     for solid in solids(source.solid(), source.friction):
         _add_collision(stage, root, solid)
     stage.GetRootLayer().Save()
