@@ -158,16 +158,13 @@ def box_mesh(geojson: Path, frame: Frame, *, keep_vehicles: bool) -> Mesh:
         frame: frame of the mesh.
         keep_vehicles: whether parked vehicles are in the world.
     """
-    return _boxes(geojson, frame, lambda about: about["kind"] == "person" or about["moved"] or not keep_vehicles)
+    return instance_boxes(
+        geojson, frame, lambda about: about["kind"] == "person" or about["moved"] or not keep_vehicles
+    )
 
 
-def parked_mesh(geojson: Path, frame: Frame) -> Mesh:
-    """Boxes of the vehicles that stand still, from the step `instances`."""
-    return _boxes(geojson, frame, lambda about: about["kind"] != "person" and not about["moved"])
-
-
-def _boxes(geojson: Path, frame: Frame, wanted: Callable[[Mapping[str, Any]], bool]) -> Mesh:
-    """Boxes of the instances whose properties are `wanted`."""
+def instance_boxes(geojson: Path, frame: Frame, wanted: Callable[[Mapping[str, Any]], bool]) -> Mesh:
+    """Boxes of the instances whose properties are `wanted`, in local metres."""
     vertices: list[F32] = [np.zeros((0, 3), np.float32)]
     for feature in json.loads(geojson.read_text(encoding="utf-8"))["features"]:
         about = feature["properties"]

@@ -587,7 +587,8 @@ def _add_splats(graph: TileGraph, scan: Scan, parts: Parts, surfaces: Sources, p
     if not scan.has_ground_photos or _is_indoor(graph) or graph.params(SPLATS).when == "never":
         return {}
     known = {name: photos[name] for name in ("views", "depth", "exposures")} | scan.labels
-    graph.add(SPLATS, known | parts.instances | _mesh_inputs(surfaces | _plant_models(graph, "mesh")))
+    meshes = _mesh_inputs(surfaces | _plant_models(graph, "mesh"))
+    graph.add(SPLATS, known | parts.instances | meshes, cell=graph.cell or None, origin=graph.tile.frame.origin)
     return {"splats": graph.output(SPLATS, "splats")} if graph.is_enabled(SPLATS) else {}
 
 

@@ -13,6 +13,11 @@ XYZ, LOG_SCALE, QUATERNION, LOGIT, RGB = slice(0, 3), slice(3, 6), slice(6, 10),
 """Columns of the parameters."""
 WIDTH = 14
 """Number of parameters of a splat."""
+SHELL_RADIUS_M, SHELL_STEP_DEG, SHELL_LOWEST_DEG = 400.0, 1.5, -20.0
+"""Radius of the background as splats, the angle between them, and the elevation of the lowest; beyond all others
+(`FARTHEST_M` of the photos' depth is 250 m), and within the usual far clipping distance of cameras."""
+SHELL_OVERLAP = 0.6
+"""Standard deviation of its splats, relative to their distance from each other."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,15 @@ class Splats:
         """(N,) opacities in their centre, 0 to 1."""
         return 1 / (1 + np.exp(-self.parameters[:, LOGIT]))
 
+    def y_up(self) -> Splats:
+        """The splats in axes with y up: (x, y, z) becomes (x, z, -y)."""
+        turned = self.parameters.copy()
+        turned[:, XYZ] = self.parameters[:, [0, 2, 1]] * np.array([1, 1, -1], np.float32)
+        w, x, y, z = self.quaternion.T
+        half = np.float32(np.sqrt(0.5))  # times (half, -half, 0, 0) from the left
+        turned[:, QUATERNION] = half * np.column_stack([w + x, x - w, y + z, z - y])
+        return Splats(turned)
+
     @property
     def rgb(self) -> F32:
         """(N, 3) colours, sRGB 0 to 1."""
@@ -77,6 +91,10 @@ class SplatLayer:
     splats: Splats
     background: F32
 
+    def with_shell(self) -> Splats:
+        """The splats, and the background as large splats on a sphere: for programs that know no background."""
+        return Splats(np.concatenate([self.splats.parameters, _shell(self.background, self.splats).parameters]))
+
     @classmethod
     def nothing(cls) -> SplatLayer:
         """A layer without splats."""
@@ -92,3 +110,31 @@ class SplatLayer:
         """Read what `save` wrote."""
         with np.load(path) as saved:
             return cls(Splats(saved["parameters"]), saved["background"].astype(np.float32) / 255)
+
+
+def _shell(background: F32, around: Splats) -> Splats:
+    """Splats that show the background, evenly distributed over a sphere around the middle of others."""
+    count = int(4 * np.pi / np.radians(SHELL_STEP_DEG) ** 2)
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count  # a Fibonacci sphere
+    azimuth = np.pi * (1 + 5**0.5) * k
+    kept = np.degrees(np.arcsin(z)) > SHELL_LOWEST_DEG
+    z, azimuth = z[kept], (azimuth[kept] + np.pi) % (2 * np.pi) - np.pi
+    flat = np.sqrt(1 - z**2)
+    direction = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z])
+    height, width = background.shape[:2]
+    row = np.clip(((0.5 - np.arcsin(z) / np.pi) * height).astype(int), 0, height - 1)
+    column = ((azimuth / (2 * np.pi) + 0.5) * width).astype(int) % width
+    rgb = _box_mean(background, max(1, round(SHELL_STEP_DEG * width / 360)))[row, column]
+    centre = np.median(around.xyz, axis=0) if len(around) else np.zeros(3)
+    scale = np.full((len(z), 3), SHELL_OVERLAP * np.radians(SHELL_STEP_DEG) * SHELL_RADIUS_M)
+    scale[:, 2] *= 0.05
+    half = np.column_stack([1 + direction[:, 2], -direction[:, 1], direction[:, 0], np.zeros(len(z))])
+    return Splats.of(centre + SHELL_RADIUS_M * direction, scale, half, np.full(len(z), 0.99), np.clip(rgb, 0, 1))
+
+
+def _box_mean(image: F32, size: int) -> F32:
+    """An image averaged over squares of `size` pixels."""
+    import cv2
+
+    return np.asarray(cv2.blur(image, (size, size), borderType=cv2.BORDER_REPLICATE), np.float32)

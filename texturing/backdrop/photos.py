@@ -43,7 +43,9 @@ class Photo:
         movable: vehicles and people.
         levels: (H, W, 3) grey levels after the exposure correction.
         clipped: (H, W, 3) whether a channel was overexposed.
-        texture, texture_sky: (h, w, 3) corrected grey levels and (h, w) sky in the size that texture is read from.
+        texture, texture_sky, texture_clipped: (h, w, 3) corrected grey levels, (h, w) sky, and (h, w, 3) whether a
+            channel was overexposed, in the size that texture is read from.
+        masked: what the photo's mask excludes; part of `movable`.
         inverse: inverse distance along the rays, 1/metres; set by `plane_sweep`.
         wanted: neither surface, nor sky, nor movable, nor scanned: pixels whose depth is to be estimated.
     """
@@ -59,6 +61,8 @@ class Photo:
     clipped: Bools
     texture: U8
     texture_sky: Bools
+    texture_clipped: Bools
+    masked: Bools
     inverse: F32 = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     @property
@@ -90,7 +94,14 @@ FARTHEST_M = 250.0
 """Depth of what is farther: parallax of a metre is less than a pixel there. Cameras must show as much (`clip`)."""
 
 
-def prepare(view: View, depth: Path, labels: Path | None, world: Renderer, exposures: Exposures) -> Photo | None:
+def prepare(
+    view: View,
+    depth: Path,
+    labels: Path | None,
+    world: Renderer,
+    exposures: Exposures,
+    matching_pixels: int = MATCHING_PIXELS,
+) -> Photo | None:
     """Prepare a photo; None if it can't be read.
 
     Args:
@@ -99,6 +110,7 @@ def prepare(view: View, depth: Path, labels: Path | None, world: Renderer, expos
         labels: its class probabilities (step `label`), or None: without them vehicles count as scenery.
         world: the world's surfaces.
         exposures: exposure corrections.
+        matching_pixels: size of the images in which depth is estimated.
     """
     import cv2
 
@@ -110,7 +122,7 @@ def prepare(view: View, depth: Path, labels: Path | None, world: Renderer, expos
         return None
     full = view.camera.width * view.camera.height
     large = view.camera.scaled(min(1.0, (TEXTURE_PIXELS / full) ** 0.5))
-    small = view.camera.scaled(min(1.0, (MATCHING_PIXELS / full) ** 0.5))
+    small = view.camera.scaled(min(1.0, (matching_pixels / full) ** 0.5))
     size = (small.width, small.height)
     if large.width != view.camera.width:
         rgb = np.asarray(cv2.resize(rgb, (large.width, large.height), interpolation=cv2.INTER_AREA), np.uint8)
@@ -133,8 +145,10 @@ def prepare(view: View, depth: Path, labels: Path | None, world: Renderer, expos
         is_sky = (is_sky & (sky_level > SKY_MIN_LEVEL)) | (sky_level > SKY_SURE_LEVEL)
         movable = np.asarray(level("vehicle", "person") > MOVABLE_MIN_LEVEL)
     allowed = image.read_mask(view)
+    masked: Bools = np.zeros(rgb.shape[:2], bool)
     if allowed is not None:
-        movable |= cv2.resize(allowed, (rgb.shape[1], rgb.shape[0]), interpolation=cv2.INTER_NEAREST) == 0
+        masked = np.asarray(cv2.resize(allowed, (rgb.shape[1], rgb.shape[0]), interpolation=cv2.INTER_NEAREST) == 0)
+    movable |= masked
     movable = np.asarray(cv2.dilate(movable.astype(np.uint8), np.ones((9, 9))) > 0)
     known = np.asarray(cv2.resize(scanned, size, interpolation=cv2.INTER_NEAREST), np.float32)
     known = np.where(rendered.hit, np.minimum(known, rendered.range), known)
@@ -146,7 +160,7 @@ def prepare(view: View, depth: Path, labels: Path | None, world: Renderer, expos
     return Photo(
         view, small, rays, known, rendered.hit, reduced(is_sky) & ~np.isfinite(known), reduced(movable),
         np.asarray(cv2.resize(corrected, size, interpolation=cv2.INTER_AREA), np.float32), seen >= CLIPPED_LEVEL,
-        np.clip(corrected, 0, 255).astype(np.uint8), is_sky,
+        np.clip(corrected, 0, 255).astype(np.uint8), is_sky, rgb >= CLIPPED_LEVEL, reduced(masked),
     )  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from scan2sim.texturing.backdrop.photos import Photo
 CHANNELS = 4
 """Number of channels of `Photo.features`."""
 HYPOTHESES = 64
-"""Number of hypotheses, equally spaced in inverse depth from infinity to `NEAREST_M`."""
+"""Default number of hypotheses, equally spaced in inverse depth from infinity to `NEAREST_M`."""
 NEAREST_M = 4.5
 WINDOW_PX = 5
 """Window over which costs are averaged."""
@@ -33,20 +33,22 @@ SMALL_STEP_COST, LARGE_STEP_COST = 2.0, 30.0
 EDGE_LEVELS = 12.0
 """Brightness step between neighbours at which a change of depth costs half."""
 DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
-INVERSE_DEPTH_STEP = 1 / NEAREST_M / (HYPOTHESES - 1)
 
 
-def inverse_depth(photo: Photo, others: Sequence[Photo]) -> F32:
+def inverse_depth(photo: Photo, others: Sequence[Photo], hypotheses: int = HYPOTHESES) -> F32:
     """(H, W) inverse distance along the rays of a photo's pixels, 1/metres; 0 is infinity.
 
     Args:
         photo: reference photo.
         others: photos to compare it with; without any, depth comes from the scan's pixels alone.
+        hypotheses: number of inverse depths that are compared.
     """
     import cv2
 
     height, width = photo.wanted.shape
-    cost = np.zeros((height, width, HYPOTHESES), np.float32)
+    step = 1 / NEAREST_M / (hypotheses - 1)
+    per_hypothesis = KNOWN_COST_PER_HYPOTHESIS * (HYPOTHESES - 1) / (hypotheses - 1)
+    cost = np.zeros((height, width, hypotheses), np.float32)
     if others:
         kernel = np.ones((WINDOW_PX + 2, WINDOW_PX + 2))
         compared: Bools = np.asarray(cv2.dilate(photo.wanted.astype(np.uint8), kernel) > 0)
@@ -57,21 +59,21 @@ def inverse_depth(photo: Photo, others: Sequence[Photo]) -> F32:
         half, each = (len(others) + 1) // 2, np.full((len(others), height, width), MAX_COST, np.float32)
         window = np.empty_like(each)
         rays, centre = photo.rays, np.asarray(photo.view.centre, np.float64)
-        for d in range(HYPOTHESES):
-            inverse = d * INVERSE_DEPTH_STEP
+        for d in range(hypotheses):
+            inverse = d * step
             _compare(photo.features, rays, centre, compared, inverse, features, sizes, models, cameras, poses, each)
             for one, smooth in zip(each, window, strict=True):
                 cv2.blur(one, (WINDOW_PX, WINDOW_PX), smooth)
             _mean_of_best(window, half, photo.wanted, cost[..., d])
-    index = np.arange(HYPOTHESES)
+    index = np.arange(hypotheses)
     known = np.isfinite(photo.known)
-    hypothesis = np.minimum(1 / np.maximum(photo.known[known], 1e-3) / INVERSE_DEPTH_STEP, HYPOTHESES - 1)
-    cost[known] = np.minimum(np.abs(index - hypothesis[:, None]) * KNOWN_COST_PER_HYPOTHESIS, KNOWN_MAX_COST)
+    hypothesis = np.minimum(1 / np.maximum(photo.known[known], 1e-3) / step, hypotheses - 1)
+    cost[known] = np.minimum(np.abs(index - hypothesis[:, None]) * per_hypothesis, KNOWN_MAX_COST)
     cost[photo.sky] = np.where(index == 0, 0, KNOWN_MAX_COST)
     grey = photo.grey
-    step = np.abs(np.gradient(grey, axis=0)) + np.abs(np.gradient(grey, axis=1))
-    total = _semi_global(cost, (LARGE_STEP_COST / (1 + step / EDGE_LEVELS)).astype(np.float32))
-    return _minimum(total)
+    contrast = np.abs(np.gradient(grey, axis=0)) + np.abs(np.gradient(grey, axis=1))
+    total = _semi_global(cost, (LARGE_STEP_COST / (1 + contrast / EDGE_LEVELS)).astype(np.float32))
+    return _minimum(total, step)
 
 
 def _padded(images: Sequence[F32]) -> tuple[F32, I64]:
@@ -83,14 +85,14 @@ def _padded(images: Sequence[F32]) -> tuple[F32, I64]:
     return padded, sizes
 
 
-def _minimum(total: F32) -> F32:
-    """Position of the minimum along the last axis, refined by a parabola, as inverse depth."""
+def _minimum(total: F32, step: float) -> F32:
+    """Position of the minimum along the last axis, refined by a parabola, as inverse depth in steps of `step`."""
     best = total.argmin(axis=2)
-    inner = np.clip(best, 1, HYPOTHESES - 2)
+    inner = np.clip(best, 1, total.shape[2] - 2)
     left, middle, right = (np.take_along_axis(total, (inner + k)[..., None], 2)[..., 0] for k in (-1, 0, 1))
     curvature = left - 2 * middle + right
     offset = np.clip(0.5 * (left - right) / np.maximum(curvature, 1e-6), -0.5, 0.5)
-    return ((best + np.where((best == inner) & (curvature > 1e-6), offset, 0)) * INVERSE_DEPTH_STEP).astype(np.float32)
+    return ((best + np.where((best == inner) & (curvature > 1e-6), offset, 0)) * step).astype(np.float32)
 
 
 def _semi_global(cost: F32, large_step: F32) -> F32:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from numba import njit
 
 from scan2sim.pipeline.core.types import F32, F64
 
-WIDTH_PX, HEIGHT_PX = 1024, 512
-"""Size of the texture: .35 degrees per texel. Column 0 is azimuth -180 degrees (from x to y), row 0 is the zenith."""
-FIRST_MOMENT, SECOND_MOMENT = 0.8, 0.95
-MIN_RATE = 1e-8
+WIDTH_PX, HEIGHT_PX = 2560, 1280
+"""Size of the texture: .14 degrees per texel. Column 0 is azimuth -180 degrees (from x to y), row 0 is the zenith."""
+FIRST_MOMENT, SECOND_MOMENT, MIN_ROOT = 0.8, 0.95, 1e-3
+"""Of Adam; texels whose gradients are smaller than the last hardly change."""
 
 
 class Background:
@@ -37,17 +38,18 @@ class Background:
 
     def descend(self, texels: F32, gradient: F32, rate: float) -> None:
         """Take a step (Adam, of the texels that are seen) against derivatives (H, W, 3) of a loss by `seen`."""
-        column = np.rint(texels[..., 0]).astype(np.int64) % WIDTH_PX
-        row = np.clip(np.rint(texels[..., 1]).astype(np.int64), 0, HEIGHT_PX - 1)
-        index = (row * WIDTH_PX + column).ravel()
-        total = np.stack(
-            [np.bincount(index, gradient[..., k].ravel(), WIDTH_PX * HEIGHT_PX) for k in range(3)], axis=-1
-        ).reshape(self.texture.shape)
+        total = np.zeros_like(self.texture)
+        scatter(texels.reshape(-1, 2), gradient.reshape(-1, 3), total)
         at = total.any(axis=-1)
-        step = total[at].astype(np.float32)
+        step = total[at]
         self._first[at] = FIRST_MOMENT * self._first[at] + (1 - FIRST_MOMENT) * step
         self._second[at] = SECOND_MOMENT * self._second[at] + (1 - SECOND_MOMENT) * step**2
-        self.texture[at] -= rate * self._first[at] / (np.sqrt(self._second[at]) + MIN_RATE)
+        self.texture[at] -= rate * self._first[at] / (np.sqrt(self._second[at]) + MIN_ROOT)
+
+    def recolour(self, factor: F32, offset: F32) -> None:
+        """Multiply all colours by (3,) factors, and add (3,) offsets."""
+        self.texture *= factor
+        self.texture += offset
 
     def save(self) -> dict[str, F32]:
         """State, for `load`."""
@@ -75,3 +77,21 @@ def directions() -> F64:
     elevation = (0.5 - (np.arange(HEIGHT_PX) + 0.5) / HEIGHT_PX)[:, None] * np.pi
     flat = np.cos(elevation)
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation) + 0 * azimuth], axis=-1)
+
+
+@njit(cache=True)
+def scatter(texels, values, total):  # type: ignore[no-untyped-def]
+    """Add values (N, 3) at texels (N, 2) to `total` (H, W, 3): the adjoint of the bilinear lookup `Background.seen`."""
+    height, width = total.shape[:2]
+    for i in range(len(texels)):
+        if values[i, 0] == 0 and values[i, 1] == 0 and values[i, 2] == 0:
+            continue
+        x, y = texels[i, 0], min(max(texels[i, 1], np.float32(0)), np.float32(height - 1))
+        left, top = int(np.floor(x)), min(int(y), height - 2)
+        s, t = x - left, y - top
+        for row, column, weight in (
+            (top, left, (1 - s) * (1 - t)), (top, left + 1, s * (1 - t)),
+            (top + 1, left, (1 - s) * t), (top + 1, left + 1, s * t),
+        ):  # fmt: skip
+            for channel in range(3):
+                total[row, column % width, channel] += np.float32(weight) * values[i, channel]

@@ -8,11 +8,15 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from scan2sim.texturing.splats import projection
 from scan2sim.texturing.splats.tiles import PIXELS, SIZE
 
 RED, GREEN, BLUE, DEPTH, TRANSMITTANCE = range(5)
 """Channels of a blended tile (5, 256): colours and depth times alpha, and what is left of the background."""
 MAX_ALPHA = np.float32(0.99)
+MIN_ALPHA = np.float32(projection.MIN_ALPHA)
+TWO = np.float32(2)
+"""In numba the product of an integer and a float of 32 bits has 64 bits, which halves the speed of the loops."""
 OPAQUE = np.float32(0.003)
 """Greatest transmittance at which nothing behind matters."""
 CHECKED_EVERY = 8
@@ -45,7 +49,7 @@ def blend(parameters, projected, columns, start, splat, tiles, last):  # type: i
             i = splat[entry]
             number += 1
             u, v = projected[i, 0] - left, projected[i, 1] - top
-            a, b, c = projected[i, 2], 2 * projected[i, 3], projected[i, 4]
+            a, b, c = projected[i, 2], TWO * projected[i, 3], projected[i, 4]
             opacity, z = projected[i, 5], projected[i, 8]
             red, green, blue = parameters[i, 11], parameters[i, 12], parameters[i, 13]
             first = max(int(v - projected[i, 7]), 0)
@@ -58,7 +62,9 @@ def blend(parameters, projected, columns, start, splat, tiles, last):  # type: i
                 k = k * k
                 k = k * k
                 k = k * k
-                weight = min(opacity * k, MAX_ALPHA) * image[TRANSMITTANCE, p]
+                alpha = min(opacity * k, MAX_ALPHA)
+                alpha = alpha if alpha >= MIN_ALPHA else np.float32(0)
+                weight = alpha * image[TRANSMITTANCE, p]
                 image[RED, p] += weight * red
                 image[GREEN, p] += weight * green
                 image[BLUE, p] += weight * blue
@@ -113,7 +119,7 @@ def blend_gradients(  # type: ignore[no-untyped-def]
             s5, s6, s7, s8, s9 = np.float32(0), np.float32(0), np.float32(0), np.float32(0), np.float32(0)
             for p in range(np.uint64(first * SIZE), np.uint64(end * SIZE)):
                 dx, dy = X[p] - u, Y[p] - v
-                square = a * dx * dx + 2 * b * dx * dy + c * dy * dy
+                square = a * dx * dx + TWO * b * dx * dy + c * dy * dy
                 q = min(square, FARTHEST) * np.float32(1 / 32)
                 k = E0 + q * (E1 + q * (E2 + q * E3))
                 k = k * k
@@ -121,13 +127,14 @@ def blend_gradients(  # type: ignore[no-untyped-def]
                 k = k * k
                 k = k * k
                 alpha = min(opacity * k, MAX_ALPHA)
+                alpha = alpha if alpha >= MIN_ALPHA else np.float32(0)
                 weight = alpha * T[p]
                 value = (
                     g[RED, p] * red + g[GREEN, p] * green + g[BLUE, p] * blue + g[DEPTH, p] * z + g[TRANSMITTANCE, p]
                 )
                 rest[p] -= weight * value
                 by_alpha = T[p] * value - rest[p] / (np.float32(1) - alpha)
-                by_alpha = by_alpha if opacity * k < MAX_ALPHA else np.float32(0)
+                by_alpha = by_alpha if MIN_ALPHA <= opacity * k < MAX_ALPHA else np.float32(0)
                 T[p] -= weight
                 by_square = np.float32(-0.5) * opacity * k * by_alpha
                 s0 += weight * g[RED, p]

@@ -9,6 +9,8 @@ from scan2sim.pipeline.core.splats import WIDTH
 from scan2sim.pipeline.core.types import F32, I32
 
 FIRST_MOMENT, SECOND_MOMENT, MIN_ROOT = 0.9, 0.99, 1e-12
+FIRST_COLOUR = 11
+"""First column of the colour."""
 
 
 class Descent:
@@ -69,3 +71,5 @@ def _step(parameters, size, first, second, visits, index, gradients, rates):  # 
             root = np.sqrt(second[i, k] / unbiased_second) + np.float32(MIN_ROOT)
             step = rates[k] * first[i, k] / unbiased_first / root
             parameters[i, k] -= step * (size[i] if k < 3 else np.float32(1))
+        for k in range(FIRST_COLOUR, WIDTH):  # programs that draw splats clip colours
+            parameters[i, k] = min(max(parameters[i, k], np.float32(0)), np.float32(1))

@@ -39,10 +39,17 @@ class Gains:
         self.gain[photo] += (rate * (gain - self.gain[photo])).astype(np.float32)
         self.offset[photo] += (rate * (offset - self.offset[photo])).astype(np.float32)
 
-    def centre(self) -> None:
-        """Make the mean gain 1 and the mean offset 0: the world has the exposure of the photos' mean."""
-        self.gain /= np.exp(np.log(self.gain).mean(axis=0))
-        self.offset -= self.offset.mean(axis=0)
+    def centre(self) -> tuple[F32, F32]:
+        """Make the geometric mean of the gains 1 and the mean offset 0: the world has the exposure of the photos' mean.
+
+        Returns:
+            (3,) factor and offset by which the world's colours must change, so that all renderings stay as they are.
+        """
+        factor = np.exp(np.log(self.gain).mean(axis=0))
+        gain = self.gain / factor
+        shift = self.offset.mean(axis=0) / gain.mean(axis=0)
+        self.gain, self.offset = gain, self.offset - gain * shift
+        return factor, shift
 
     def applied(self, photo: int, rendered: F32) -> F32:
         """(H, W, 3) a rendering as the photo shows it."""

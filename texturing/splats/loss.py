@@ -24,12 +24,14 @@ def photometric(rendered: F32, photo: F32, weight: F32) -> tuple[float, F32]:
         photo: (H, W, 3) sRGB 0 to 1.
         weight: (H, W) weights of the pixels, 0 to 1.
     """
-    shown = np.clip(rendered, 0, 1)
+    # what isn't used is equal in both, so that it has no effect on windows across the mask's border
+    shown = np.where(weight[..., None] > 0, np.clip(rendered, 0, 1), photo)
     difference = shown - photo
     root = np.sqrt(difference * difference + np.float32(CHARBONNIER**2))
     similarity, by_luminance = ssim(shown @ LUMINANCE, photo @ LUMINANCE, weight)
-    gradient = np.float32((1 - SSIM_SHARE) / 3) * (difference / root) * weight[..., None]
+    gradient = np.float32((1 - SSIM_SHARE) / 3) * (difference / root)
     gradient -= np.float32(SSIM_SHARE / 2) * by_luminance[..., None] * LUMINANCE
+    gradient *= weight[..., None]
     free = ((rendered > 1) & (photo > CLIPPED_HIGH)) | ((rendered < 0) & (photo < CLIPPED_LOW))
     total = float(weight.sum()) or 1.0
     charbonnier = float(((root.mean(axis=-1) - CHARBONNIER) * weight).sum()) / total

@@ -1,4 +1,4 @@
-"""Photos as training needs them: pinhole images of linear projection, in three sizes, with weights, sky and depth."""
+"""Photos as training needs them: images of pinhole cameras, in three sizes, with weights and sky."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Level:
 
     Attributes:
         camera: for the rasterizer.
-        rgb: (H, W, 3) sRGB 0 to 1 after the exposure correction, which may exceed 1.
+        rgb: (H, W, 3) sRGB 0 to 1 after the exposure correction.
         clipped: (H, W, 3) overexposed channels: the scene is at least as bright.
         weight: (H, W) 1 where the photo is used, else 0.
         sky: (H, W) sky.
@@ -92,14 +92,19 @@ class Shot:
             reduced(self.rgb),
             reduced(self.clipped.astype(np.float32)) > 0.5,
             (reduced(self.usable.astype(np.float32)) > WHOLE).astype(np.float32),
-            reduced(self.sky.astype(np.float32)) > 0,
+            reduced(self.sky.astype(np.float32)) > 0.5,
             texels(rays),
         )
 
 
-def shots(photo: Photo) -> Iterator[Shot]:
-    """A prepared photo as shots: one, or the faces of a cube for panoramas and wide lenses."""
-    whole = _whole(photo)
+def shots(photo: Photo, excluded: Bools) -> Iterator[Shot]:
+    """A prepared photo as shots: one, or the faces of a cube for panoramas and wide lenses.
+
+    Args:
+        photo: the photo.
+        excluded: (H, W) its pixels that aren't used, at the size of `photo.camera`.
+    """
+    whole = _whole(photo, excluded)
     if photo.view.camera.model == "pinhole":
         yield whole
         return
@@ -109,15 +114,16 @@ def shots(photo: Photo) -> Iterator[Shot]:
             continue
         pose = whole.T_world_cam.copy()
         pose[:3, :3] = pose[:3, :3] @ rotation
-        colour = _sampled(whole.rgb, x, y)
-        masks = [_sampled(one.astype(np.float32), x, y) for one in (whole.clipped, whole.usable, whole.sky)]
+        wrap = whole.camera.model == "equirectangular"
+        colour = _sampled(whole.rgb, x, y, wrap)
+        masks = [_sampled(one.astype(np.float32), x, y, wrap) for one in (whole.clipped, whole.usable, whole.sky)]
         yield replace(
             whole, camera=camera, T_world_cam=pose, rgb=colour, clipped=masks[0] > 0.5,
-            usable=(masks[1] > WHOLE) & inside, sky=(masks[2] > 0) & inside,
+            usable=(masks[1] > WHOLE) & inside, sky=(masks[2] > 0.5) & inside,
         )  # fmt: skip
 
 
-def _whole(photo: Photo) -> Shot:
+def _whole(photo: Photo, excluded: Bools) -> Shot:
     """The photo in its own projection, at the size of its texture."""
     import cv2
 
@@ -131,7 +137,7 @@ def _whole(photo: Photo) -> Shot:
     rgb = photo.texture.astype(np.float32) / 255
     return Shot(
         photo.view.name, camera, np.asarray(photo.view.T_world_cam, np.float64), rgb,
-        photo.texture >= CLIPPED_LEVEL, ~enlarged(photo.movable), photo.texture_sky,
+        photo.texture_clipped | (photo.texture >= CLIPPED_LEVEL), ~enlarged(excluded), photo.texture_sky,
     )  # fmt: skip
 
 
@@ -156,7 +162,8 @@ def _lookup(camera: Camera, pinhole: Camera, rotation: F64) -> tuple[F32, F32, B
     return uv[:, 0].reshape(x.shape), uv[:, 1].reshape(x.shape), inside.reshape(x.shape)
 
 
-def _sampled(image: F32, x: F32, y: F32) -> F32:
+def _sampled(image: F32, x: F32, y: F32, wrap: bool) -> F32:
     import cv2
 
-    return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), np.float32)
+    border = cv2.BORDER_WRAP if wrap else cv2.BORDER_REPLICATE
+    return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=border), np.float32)

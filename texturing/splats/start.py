@@ -7,34 +7,39 @@ from collections.abc import Sequence
 import numpy as np
 
 from scan2sim.pipeline.camera.models import pixel_angle
-from scan2sim.pipeline.core.splats import Splats
+from scan2sim.pipeline.core.splats import SplatLayer, Splats
 from scan2sim.pipeline.core.types import F32, F64, I64, Bools
 from scan2sim.texturing.backdrop.photos import FARTHEST_M, Photo, fill
 from scan2sim.texturing.splats.background import HEIGHT_PX, WIDTH_PX, Background
 from scan2sim.texturing.splats.shots import Shot
 
-STRIDE_PX = 2
-"""Pixels of a prepared photo between samples: of four, one becomes a splat."""
+STRIDE_PX = 4.5
+"""Pixels of a photo, as it is trained on, between samples that become splats."""
 NEAREST_M = 1.0
-SCALE, FLATNESS = 0.55, 0.25
+SCALE, FLATNESS = 0.51, 0.25
 """Standard deviation of a splat relative to the distance of samples, and that along its normal relative to it."""
 OPACITY = 0.73
-MAX_STEP = 0.1
-"""Relative change of depth between neighbouring pixels up to which they are of one surface."""
+MAX_BEND = 0.02
+"""Second difference of the inverse depth of neighbouring pixels, relative to it, up to which they are of one surface:
+inverse depth is linear over a plane."""
 MIN_SKY_SHARE = 0.2
 """Share of the photos of a direction that must show sky there: a white wall that passes isn't sky."""
-DARK_SIGMA_PX = 12.0
+DARK_SIGMA_DEG = 1.7
 """Blur of the background behind what is not sky: a gap between leaves shows a dark colour."""
 
 
-def first_splats(photos: Sequence[Photo]) -> tuple[Splats, F32]:
+def first_splats(photos: Sequence[Photo], inverse: Sequence[F32], excluded: Sequence[Bools]) -> tuple[Splats, F32]:
     """Splats at the surfaces that photos show, of several at a place the finest; and their sizes (N,) in metres.
 
     Args:
-        photos: with known depth, or inverse depth by `plane_sweep`.
+        photos: prepared photos.
+        inverse: (H, W) inverse distances along their rays (`depth.inverse_depths`).
+        excluded: (H, W) their pixels that aren't used.
     """
-    parts = [_samples(photo) for photo in photos]
+    parts = [_samples(*one) for one in zip(photos, inverse, excluded, strict=True)]
     xyz, normal, rgb, size, scanned = (np.concatenate(column) for column in zip(*parts, strict=True))
+    if not len(xyz):
+        return SplatLayer.nothing().splats, np.zeros(0, np.float32)
     kept = _finest(xyz, size)
     xyz, normal, rgb, size, scanned = xyz[kept], normal[kept], rgb[kept], size[kept], scanned[kept]
     scale = np.repeat(SCALE * size[:, None], 3, axis=1)
@@ -64,32 +69,33 @@ def first_background(shots: Sequence[Shot]) -> Background:
     colour = (total / np.maximum(count, 1)[..., None]).astype(np.float32).reshape(2, *shape, 3)
     votes = count.reshape(2, *shape)
     is_sky = votes[0] > MIN_SKY_SHARE * votes.sum(axis=0)
-    scenery = cv2.GaussianBlur(fill(colour[1], votes[1] > 0), (0, 0), DARK_SIGMA_PX)
+    scenery = cv2.GaussianBlur(fill(colour[1], votes[1] > 0), (0, 0), DARK_SIGMA_DEG * WIDTH_PX / 360)
     known = votes.sum(axis=0) > 0
     return Background(np.clip(fill(np.where(is_sky[..., None], colour[0], scenery), known), 0, 1))
 
 
-def _samples(photo: Photo) -> tuple[F64, F64, F32, F64, Bools]:
-    """Positions, normals, colours, sizes and whether they were scanned, of every `STRIDE_PX`th pixel of a photo."""
-    distance = np.where(np.isfinite(photo.known), photo.known, 1 / np.maximum(photo.inverse, 1 / FARTHEST_M))
+def _samples(photo: Photo, inverse: F32, excluded: Bools) -> tuple[F64, F64, F32, F64, Bools]:
+    """Positions, normals, colours, sizes and whether they were scanned, of pixels of a photo on a grid."""
+    distance = 1 / np.maximum(inverse, 1e-6).astype(np.float64)
     points = photo.view.centre + photo.rays * distance[..., None]
-    normal, is_surface = _normals(points, distance, photo.view.centre)
-    usable = ~photo.sky & ~photo.movable & (distance > NEAREST_M) & (distance < FARTHEST_M)
+    normal, is_surface = _normals(points, inverse, photo.view.centre)
+    usable = ~photo.sky & ~excluded & (distance > NEAREST_M) & (inverse > 1 / FARTHEST_M)
+    stride = max(1, round(STRIDE_PX * photo.camera.width / photo.texture.shape[1]))
     at = np.zeros(usable.shape, bool)
-    at[STRIDE_PX // 2 :: STRIDE_PX, STRIDE_PX // 2 :: STRIDE_PX] = True
+    at[stride // 2 :: stride, stride // 2 :: stride] = True
     at &= usable & np.isfinite(points).all(axis=-1)
-    size = distance * pixel_angle(photo.camera) * STRIDE_PX
+    size = distance * pixel_angle(photo.camera) * stride
     scanned = np.isfinite(photo.known) & is_surface
     return points[at], normal[at], (photo.levels[at] / 255).astype(np.float32), size[at], scanned[at]
 
 
-def _normals(points: F64, distance: F64, centre: F64) -> tuple[F64, Bools]:
+def _normals(points: F64, inverse: F32, centre: F64) -> tuple[F64, Bools]:
     """Unit normals (H, W, 3) towards the camera, from neighbouring pixels; and where these are of one surface."""
     across, down = np.gradient(points, axis=1), np.gradient(points, axis=0)
     normal = np.cross(across, down)
     length = np.linalg.norm(normal, axis=-1)
-    step = np.maximum(*(np.abs(np.gradient(distance, axis=k)) for k in (0, 1))) / distance
-    smooth = (step < MAX_STEP) & (length > 1e-9)
+    bends = [np.abs(np.gradient(np.gradient(inverse, axis=k), axis=k)) for k in (0, 1)]
+    smooth = (np.maximum(*bends) < MAX_BEND * inverse) & (length > 1e-9)
     towards = centre - points
     towards = towards / np.maximum(np.linalg.norm(towards, axis=-1, keepdims=True), 1e-9)
     normal = np.where(smooth[..., None], normal / np.maximum(length, 1e-9)[..., None], towards)

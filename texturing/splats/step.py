@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.parameters import Seed
-from scan2sim.pipeline.core.splats import SplatLayer
-from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.core.types import Mesh
+from scan2sim.pipeline.core.splats import SplatLayer, Splats
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import TileCell
+from scan2sim.pipeline.core.types import Bools, Mesh
 from scan2sim.pipeline.io import views as views_io
 
 if TYPE_CHECKING:
@@ -24,9 +26,24 @@ MIN_BASELINE_M = 0.5
 """Photos closer to each other than this are not compared for depth."""
 CHECKPOINT_S = 60.0
 """Seconds between checkpoints."""
+MATCHING_PIXELS, HYPOTHESES, NEIGHBOURS = 113_000, 128, 4
+"""Size of the images in which depth is estimated, number of inverse depths, and of photos to compare with."""
+UNMASKED = "vehicles and people are not recognized, so that moving ones may leave traces: run it with the step `label`"
 STATE_FILE, SPLATS_FILE = "training.npz", "splats.npz"
 DEPTH_SHARE, TRAINING_SHARE = 0.05, 0.2
 """Progress at which depth is estimated, and at which the training begins."""
+
+
+class SplatsContext(Context):
+    """The tile.
+
+    Attributes:
+        cell: the tile's cell within a survey, to which its splats are cut; None: the tile is built alone.
+        origin: origin of local coordinates, metres.
+    """
+
+    cell: TileCell | None = None
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class SplatsParams(Params):
@@ -45,6 +62,7 @@ class SplatsParams(Params):
     parked: bool = True
     cover: float = Field(0.017, ge=0, le=1)
     seed: Seed = 0
+    context: SplatsContext = SplatsContext()
 
 
 def splats(inputs: Inputs, params: SplatsParams, out: Path, report: Report, checkpoint: Path) -> Done:
@@ -57,62 +75,82 @@ def splats(inputs: Inputs, params: SplatsParams, out: Path, report: Report, chec
     """
     from scan2sim.texturing.splats.training import Schedule
 
-    used = _prepared(inputs, params, report)
-    if len(used) < 2:
+    used, excluded = _prepared(inputs, params, report)
+    seen = [shot for photo, mask in zip(used, excluded, strict=True) for shot in _shots(photo, mask)]
+    state = checkpoint / STATE_FILE
+    training = _begun(used, excluded, seen, params, state, report)
+    if training is None:
         SplatLayer.nothing().save(out / SPLATS_FILE)
         return Done({"splats": out / SPLATS_FILE}, {"photos": len(used), "splats": 0})
-    schedule = Schedule(params.epochs, cover=params.cover, seed=params.seed)
-    training, seen = _begun(used, checkpoint / STATE_FILE)
     first = len(training.descent.parameters)
-    _train(training, seen, schedule, checkpoint / STATE_FILE, report)
-    result = training.result()
+    used.clear()  # training needs the shots only
+    _train(training, seen, Schedule(params.epochs, cover=params.cover, seed=params.seed), state, report)
+    result = _within_cell(training.result(), params.context)
     SplatLayer(result, training.background.texture).save(out / SPLATS_FILE)
-    return Done({"splats": out / SPLATS_FILE}, {"photos": len(used), "first": first, "splats": len(result)})
+    metrics = {"photos": len(excluded), "first": first, "splats": len(result)}
+    warnings = [] if "labels" in inputs or "instances" in inputs else [UNMASKED]
+    return Done({"splats": out / SPLATS_FILE}, metrics, warnings)
 
 
-def _prepared(inputs: Inputs, params: SplatsParams, report: Report) -> list[Photo]:
-    """The photos of training, with depth."""
+def _prepared(inputs: Inputs, params: SplatsParams, report: Report) -> tuple[list[Photo], list[Bools]]:
+    """The photos of training, and their pixels that aren't used."""
     from scan2sim.pipeline.camera.renderer import Body, Renderer
     from scan2sim.texturing.backdrop import photos as prepared
-    from scan2sim.texturing.backdrop import plane_sweep
     from scan2sim.texturing.photo_cache import Exposures
-    from scan2sim.texturing.whole_frame import parked_mesh
+    from scan2sim.texturing.splats.moving import MovingMask
 
     meshes = [Mesh.load(path) for name, path in inputs.items() if name.startswith("mesh.")]
     world, exposures = Renderer([Body(mesh) for mesh in meshes]), Exposures.load(inputs["exposures"])
+    moving = MovingMask(inputs.get("instances"), meshes[0].frame, params.parked)
     views, held_out = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
-    parked = None
-    if params.parked and "instances" in inputs:
-        parked = Renderer([Body(parked_mesh(inputs["instances"], meshes[0].frame))])
-    used = []
+    used, excluded = [], []
     for k, view in enumerate(views):
         if held_out[k] or view.camera.model == "orthographic":
             continue
         report(DEPTH_SHARE * k / len(views), view.name)
         labels = inputs["labels"] / f"{k}.npy" if "labels" in inputs else None
-        photo = prepared.prepare(view, inputs["depth"] / f"{k}.npy", labels, world, exposures)
+        depth = inputs["depth"] / f"{k}.npy"
+        photo = prepared.prepare(view, depth, labels, world, exposures, MATCHING_PIXELS)
         if photo is not None:
-            if parked is not None:
-                photo.movable &= ~parked.view(photo.camera, view.T_world_cam).hit
             used.append(photo)
-    for i, photo in enumerate(used):
-        report(DEPTH_SHARE + (TRAINING_SHARE - DEPTH_SHARE) * i / len(used), f"depth of {photo.view.name}")
-        others = plane_sweep.neighbours(used, i, MIN_BASELINE_M)
-        photo.inverse = plane_sweep.inverse_depth(photo, [used[j] for j in others])
-    return used
+            excluded.append(moving.of(photo))
+    return used, excluded
 
 
-def _begun(used: Sequence[Photo], state: Path) -> tuple[Training, list[Shot]]:
-    """The training that was interrupted, or a new one; and its shots."""
+def _shots(photo: Photo, excluded: Bools) -> Iterator[Shot]:
     from scan2sim.texturing.splats.shots import shots
+
+    return shots(photo, excluded)
+
+
+def _begun(
+    used: Sequence[Photo], excluded: Sequence[Bools], seen: Sequence[Shot], params: SplatsParams, state: Path,
+    report: Report,
+) -> Training | None:  # fmt: skip
+    """The training that was interrupted, or a new one; None if there is nothing to train."""
+    from scan2sim.texturing.backdrop import plane_sweep
+    from scan2sim.texturing.splats.depth import inverse_depths
     from scan2sim.texturing.splats.start import first_background, first_splats
     from scan2sim.texturing.splats.training import Training
 
-    seen = [shot for photo in used for shot in shots(photo)]
+    if len(used) < 2:
+        return None
     if state.is_file():
-        return Training.load(state), seen
-    first, size = first_splats(used)
-    return Training.of(first, size, first_background(seen), len(seen)), seen
+        return Training.load(state)
+    near = [plane_sweep.neighbours(used, i, MIN_BASELINE_M)[:NEIGHBOURS] for i in range(len(used))]
+    for i, photo in enumerate(used):
+        report(DEPTH_SHARE + (TRAINING_SHARE - DEPTH_SHARE) * i / len(used), f"depth of {photo.view.name}")
+        photo.inverse = plane_sweep.inverse_depth(photo, [used[j] for j in near[i]], HYPOTHESES)
+    first, size = first_splats(used, inverse_depths(used, near, params.seed), excluded)
+    return Training.of(first, size, first_background(seen), len(used)) if len(first) else None
+
+
+def _within_cell(found: Splats, context: SplatsContext) -> Splats:
+    """The splats within a tile's cell; all of a tile that is built alone."""
+    if context.cell is None:
+        return found
+    inside = context.cell.cell.outside(found.xyz[:, :2] + np.asarray(context.origin)[:2]) <= 0
+    return Splats(found.parameters[inside])
 
 
 def _train(training: Training, seen: Sequence[Shot], schedule: Schedule, state: Path, report: Report) -> None:

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.core.splats import LOGIT, Splats
+from scan2sim.pipeline.core.errors import StepError
+from scan2sim.pipeline.core.splats import LOGIT, RGB, Splats
 from scan2sim.pipeline.core.types import F32
 from scan2sim.texturing.splats import loss, rasterizer
 from scan2sim.texturing.splats.background import Background
@@ -18,6 +19,8 @@ from scan2sim.texturing.splats.exposure import Gains
 from scan2sim.texturing.splats.shots import SCALES, Level, Shot
 
 BACKGROUND_RATE = 0.01
+MIN_BACKGROUND = 0.02
+"""Transmittance from which a pixel changes the background behind it."""
 CONSTANT_SHARE = 0.3
 """Share of the epochs after which rates fall, to a tenth at the end."""
 GAIN_RATE = 0.2
@@ -54,7 +57,7 @@ class Training:
     Attributes:
         descent: the splats.
         background: what is behind them.
-        gains: exposure of the shots.
+        gains: exposure of the photos, in the order of their first shots.
         epoch: number of finished epochs.
     """
 
@@ -64,9 +67,9 @@ class Training:
     epoch: int = 0
 
     @classmethod
-    def of(cls, splats: Splats, size: F32, background: Background, shots: int) -> Training:
+    def of(cls, splats: Splats, size: F32, background: Background, photos: int) -> Training:
         """A training that begins with these splats."""
-        return cls(Descent(splats.parameters.copy(), size), background, Gains(shots))
+        return cls(Descent(splats.parameters.copy(), size), background, Gains(photos))
 
     def run(self, shots: Sequence[Shot], schedule: Schedule, report: Callable[[float, str], None]) -> None:
         """Train to the end of the schedule, from the epoch where it is.
@@ -76,15 +79,25 @@ class Training:
             schedule: visits and rates.
             report: is called after every epoch with the share that is done and the mean PSNR.
         """
+        photos = {name: k for k, name in enumerate(dict.fromkeys(shot.name for shot in shots))}
         stages = [stage for stage, count in enumerate(schedule.epochs) for _ in range(count)]
         for epoch in range(self.epoch, len(stages)):
             done = epoch / len(stages)
             decay = 0.1 ** max(0.0, (done - CONSTANT_SHARE) / (1 - CONSTANT_SHARE))
             order = np.random.default_rng((schedule.seed, epoch)).permutation(len(shots))
-            psnr = [self._visit(k, shots[k].levels[stages[epoch]], schedule, decay) for k in order.tolist()]
-            self.gains.centre()
+            psnr = [
+                self._visit(photos[shots[k].name], shots[k].levels[stages[epoch]], schedule, decay)
+                for k in order.tolist()
+            ]
+            self._recolour(*self.gains.centre())
             self.epoch = epoch + 1
-            report(self.epoch / len(stages), f"1/{SCALES[stages[epoch]]} size, {np.mean(psnr):.1f} dB")
+            known = [one for one in psnr if not math.isnan(one)] or [math.nan]
+            report(self.epoch / len(stages), f"1/{SCALES[stages[epoch]]} size, {np.mean(known):.1f} dB")
+
+    def _recolour(self, factor: F32, offset: F32) -> None:
+        """Change all colours of the world."""
+        self.descent.parameters[:, RGB] = np.clip(self.descent.parameters[:, RGB] * factor + offset, 0, 1)
+        self.background.recolour(factor, offset)
 
     def rendered(self, level: Level) -> tuple[rasterizer.Rendered, F32]:
         """The splats in a photo, and the background there."""
@@ -102,14 +115,23 @@ class Training:
         found = drawn.gradients(behind, gradient, by_alpha=cover)
         first = rates(schedule.position, schedule.scale, schedule.rotation, schedule.opacity, schedule.colour)
         self.descent.step(drawn.seen, found, first * np.float32(decay))
-        self.background.descend(level.texels, gradient * drawn.transmittance[..., None], BACKGROUND_RATE * decay)
+        through = np.where(drawn.transmittance > MIN_BACKGROUND, drawn.transmittance, np.float32(0))
+        self.background.descend(level.texels, gradient * through[..., None], BACKGROUND_RATE * decay)
         return _psnr(shown, level)
 
     def result(self) -> Splats:
-        """The splats that are visible."""
-        logit = math.log(MIN_OPACITY / (1 - MIN_OPACITY))
+        """The splats that are visible.
+
+        Raises:
+            StepError: the training has diverged.
+        """
         parameters = self.descent.parameters
-        return Splats(parameters[(parameters[:, LOGIT] > logit) & np.isfinite(parameters).all(axis=1)])
+        broken = int((~np.isfinite(parameters).all(axis=1)).sum())
+        if broken:
+            raise StepError(
+                "splats", f"the training diverged: {broken} splats aren't finite", "Report it with the tile"
+            )
+        return Splats(parameters[parameters[:, LOGIT] > math.log(MIN_OPACITY / (1 - MIN_OPACITY))])
 
     def save(self, path: Path) -> None:
         """Write the state, replacing the file at once."""

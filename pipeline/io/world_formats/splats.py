@@ -1,6 +1,7 @@
 """3D Gaussian splats: for each tile `<tile>.ply`, `<tile>.spz` (a tenth of its size) and `<tile>_splats.glb`.
 
-PLY and SPZ are in world metres, z up; the GLB is y up, as that of the mesh, and has `KHR_gaussian_splatting`.
+PLY is in world metres, z up; SPZ and the GLB, which has `KHR_gaussian_splatting`, are y up, as the GLB of the mesh. The
+background is a shell of large splats (`SplatLayer.with_shell`).
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
         if layer is None:
             continue
         offset = np.asarray(tile.offset, float)
-        for suffix in (".ply", ".spz"):
-            splat_files.write(folder / f"{tile.name}{suffix}", layer.splats, offset)
-        gltf.write(folder / f"{tile.name}_splats.glb", layer.splats, offset)
+        whole = layer.with_shell()
+        splat_files.write(folder / f"{tile.name}.ply", whole, offset)
+        splat_files.write(folder / f"{tile.name}.spz", whole.y_up(), offset[[0, 2, 1]] * (1, 1, -1))
+        gltf.write(folder / f"{tile.name}_splats.glb", whole, offset)
         written += 1
     if not written:
         raise DataError(

@@ -111,7 +111,7 @@ def _write_tile(path: Path, tile: SceneTile, source: SceneTile, params: ScenePar
                 triangles += len(part.shape)
     layer = source.splats()
     if layer is not None:
-        usd_splats.add(stage, root, layer.splats, ("Visual", "Backdrop"))
+        usd_splats.add(stage, root, layer.with_shell(), ("Visual", "Backdrop"))
     for solid in solids(source.solid(), source.friction):
         _add_collision(stage, root, solid)
     stage.GetRootLayer().Save()

@@ -1,4 +1,4 @@
-"""3D Gaussian splats in OpenUSD (`UsdVol.ParticleField3DGaussianSplat`), an alternative to a tile's textured surfaces."""
+"""3D Gaussian splats in OpenUSD (`UsdVol.ParticleField3DGaussianSplat`), beside a tile's textured surfaces."""
 
 from __future__ import annotations
 

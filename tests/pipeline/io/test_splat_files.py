@@ -106,3 +106,19 @@ def test_a_layer_is_stored_and_read(tmp_path: Path) -> None:
     read = SplatLayer.load(tmp_path / "a.npz")
     assert np.array_equal(read.splats.parameters, some().parameters)
     assert np.abs(read.background - background).max() < 0.002
+
+
+def test_the_background_becomes_a_shell_of_its_colours() -> None:
+    background = np.zeros((64, 128, 3), np.float32)
+    background[:, 64:] = (0.2, 0.4, 0.9)  # directions with positive y
+    layer = SplatLayer(some(), background)
+    whole = layer.with_shell()
+    assert np.array_equal(whole.parameters[:500], some().parameters)
+    shell = Splats(whole.parameters[500:])
+    away = shell.xyz - np.median(some().xyz, axis=0)
+    assert np.allclose(np.linalg.norm(away, axis=1), 400, rtol=1e-3) and 5_000 < len(shell) < 20_000
+    blue = (away[:, 1] > 20) & (np.abs(away[:, 0]) < 380)
+    assert np.abs(shell.rgb[blue] - (0.2, 0.4, 0.9)).max() < 0.02
+    thin = shell.scale[0]
+    axes = Rotation.from_quat(shell.quaternion[:1][:, [1, 2, 3, 0]]).as_matrix()[0]
+    assert thin[2] < 0.1 * thin[0] and abs(axes[:, 2] @ away[0]) == pytest.approx(400, rel=1e-2)

@@ -33,3 +33,15 @@ def test_a_rendering_beyond_white_is_as_good_as_white() -> None:
     photo = np.full((24, 30, 3), 1.0, np.float32)
     _, gradient = loss.photometric(photo + np.float32(0.3), photo, np.ones((24, 30), np.float32))
     assert not gradient.any()
+
+
+def test_what_is_masked_has_no_effect_on_the_pixels_around() -> None:
+    random = np.random.default_rng(1)
+    photo = random.uniform(0.1, 0.9, (24, 30, 3)).astype(np.float32)
+    rendered = np.clip(photo + random.normal(0, 0.05, photo.shape), 0, 1).astype(np.float32)
+    weight = np.ones((24, 30), np.float32)
+    weight[8:16, 10:20] = 0
+    other = rendered.copy()
+    other[8:16, 10:20] = (1.0, 0.0, 0.0)
+    gradients = [loss.photometric(one, photo, weight)[1] for one in (rendered, other)]
+    assert np.array_equal(*gradients) and not gradients[0][8:16, 10:20].any()

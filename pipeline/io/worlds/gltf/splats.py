@@ -14,8 +14,7 @@ from scan2sim.pipeline.io.worlds.gltf.builder import VERTICES, Builder
 EXTENSION = "KHR_gaussian_splatting"
 POINTS = 0
 PROPERTIES = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-TO_Y_UP = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0])
-"""Quaternion w x y z of the rotation from z up to y up: (x, y, z) becomes (x, z, -y)."""
+SRGB_OFFSET, SRGB_GAMMA, SRGB_LINEAR_MAX = 0.055, 2.4, 0.04045
 
 
 def write(path: Path, splats: Splats, offset: F64) -> None:
@@ -31,16 +30,16 @@ def write(path: Path, splats: Splats, offset: F64) -> None:
     """
     builder = Builder()
     builder.use(EXTENSION)
-    xyz = np.column_stack([splats.xyz[:, 0], splats.xyz[:, 2], -splats.xyz[:, 1]]).astype(np.float32)
-    alpha = splats.opacity[:, None]
-    colours = np.clip(np.rint(np.hstack([splats.rgb, alpha]) * 255), 0, 255).astype(np.uint8)
-    rotation = _product(TO_Y_UP, splats.quaternion.astype(np.float64))[:, [1, 2, 3, 0]]
+    turned = splats.y_up()
+    xyz = np.ascontiguousarray(turned.xyz)
+    fallback = np.hstack([_linear(splats.rgb), splats.opacity[:, None]])
+    colours = np.clip(np.rint(fallback * 255), 0, 255).astype(np.uint8)
     attributes = {
         "POSITION": builder.accessor(xyz, builder.view(xyz.tobytes(), target=VERTICES), bounds=True),
         "COLOR_0": builder.accessor(colours, builder.view(colours.tobytes(), target=VERTICES), normalized=True),
     }
     values: dict[str, F32] = {
-        "ROTATION": rotation.astype(np.float32), "SCALE": splats.scale, "OPACITY": splats.opacity,
+        "ROTATION": turned.quaternion[:, [1, 2, 3, 0]], "SCALE": splats.scale, "OPACITY": splats.opacity,
         "SH_DEGREE_0_COEF_0": ((splats.rgb - 0.5) / SH_C0).astype(np.float32),
     }  # fmt: skip
     for name, column in values.items():
@@ -53,13 +52,7 @@ def write(path: Path, splats: Splats, offset: F64) -> None:
     builder.save(path)
 
 
-def _product(first: F64, second: F64) -> F64:
-    """Products (N, 4) of a quaternion w x y z with quaternions (N, 4)."""
-    w, x, y, z = first
-    a, b, c, d = second.T
-    return np.column_stack(
-        [
-            w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c, w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ]
-    )  # fmt: skip
+def _linear(rgb: F32) -> F32:
+    """Linear light of sRGB colours 0 to 1: glTF's vertex colours are linear, those of splats are not."""
+    curve = ((rgb + SRGB_OFFSET) / (1 + SRGB_OFFSET)) ** SRGB_GAMMA
+    return np.where(rgb <= SRGB_LINEAR_MAX, rgb / 12.92, curve).astype(np.float32)
