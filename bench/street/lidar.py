@@ -62,8 +62,8 @@ def metrics(
     names = [name for name in SURFACES if name in GROUPS or name in world.surfaces]
     surfaces = [list[str](names).index(name) for name in world.surfaces]
     scanner = Scanner(world.casting, surfaces)
-    sweeps, views = _held_out(data, tile, world.origin, vertical_angle_offset)
-    held_out = np.unique(sweeps.number).tolist()
+    sweeps, views = held_out(data, tile, world.origin, vertical_angle_offset)
+    numbers = np.unique(sweeps.number).tolist()
     unreturned, unknown = unreturned_rays(sweeps)
     others = _moved(PointCloud.load(newest(run, "instances", "cloud.npz")), world.origin)  # without held-out sweeps
     code = nearest_class(sweeps.xyz, others)
@@ -72,7 +72,7 @@ def metrics(
     moving = moving_returns(sweeps, _moved(PointCloud.load(newest(run, "dynamic_objects", "moving.npz")), world.origin))
     excluded = in_boxes(sweeps.xyz, local, instances, lambda _: True) | near_moving(sweeps, moving)
     if labels:
-        for number in held_out:
+        for number in numbers:
             own = sweeps.number == number
             excluded[own] |= _in_tracked(sweeps.xyz[own], boxes.in_frame(labels, number, views[number]))
     kept = ~excluded
@@ -119,7 +119,7 @@ def wrongly_removed(
     from scipy.ndimage import binary_dilation
 
     origin = np.array(json.loads((run / "world" / "metadata.json").read_text(encoding="utf-8"))["origin_m"])
-    sweeps, views = _held_out(data, tile, origin, vertical_angle_offset)
+    sweeps, views = held_out(data, tile, origin, vertical_angle_offset)
     static = np.zeros(len(sweeps), bool)
     for number in np.unique(sweeps.number).tolist():
         photo, own = views[number], np.flatnonzero(sweeps.number == number)
@@ -138,7 +138,7 @@ def wrongly_removed(
     return float(removed.mean())
 
 
-def _held_out(
+def held_out(
     data: Path, tile: Path, origin: F64, vertical_angle_offset: float = 0.0
 ) -> tuple[Sweeps, dict[int, Photo]]:
     """The held-out sweeps of a recording, and all photos, at the poses of the import, not those that a run refined."""

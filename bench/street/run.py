@@ -50,7 +50,7 @@ import numpy as np
 
 from bench.measure import measure
 from bench.paths import DATA, ROOT
-from bench.street import boxes, frame, lidar, openmvs, score
+from bench.street import boxes, frame, lidar, openmvs, score, splats
 from bench.street import synthetic as street_synthetic
 from bench.street.world import BACKGROUND, Photo, Rendering, World, photos
 from scan2sim.pipeline.core.types import F64, I64, U8, Bools
@@ -200,6 +200,15 @@ def score_world(
     }
 
 
+def splats_of(street: Street, tile: Path, run: Path, pictures: Path) -> dict[str, Any] | None:
+    """Metrics of the splats of a street's world; None without any."""
+    world = World(run / "world")
+    views = photos(tile, run, world.origin)
+    held_out = {sorted(views)[i]: views[sorted(views)[i]] for i in every_nth(len(views), HOLD_OUT).tolist()}
+    hits = {number: world.render(photo).hit for number, photo in held_out.items()}
+    return splats.metrics(street.data, tile, run, held_out, hits, partial(vehicles, street), pictures)
+
+
 def vehicles(street: Street, number: int, photo: Photo) -> Bools:
     """(H, W) pixels of a held-out photo that show a vehicle or a person, by hand and from KITTI's tracking boxes."""
     drawn = score.truth()[street.name][str(number)]["vehicles"]
@@ -314,6 +323,8 @@ def table(figures: Mapping[str, Mapping[str, Any]]) -> None:
             print(f"  surface remaining of vehicles, m2 by track: {left}")
         if "wrongly_removed" in one:
             frame.table(one)
+        if one.get("splats"):
+            splats.table(one["splats"])
         if "openmvs" in one:
             mvs = one["openmvs"]
             print(
@@ -365,6 +376,9 @@ def result(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         "openmvs_gain_db": worst(street["openmvs"]["gain_db"] for street in streets if "openmvs" in street),
         "openmvs_nogain_db": worst(street["openmvs"]["nogain_db"] for street in streets if "openmvs" in street),
         **lidar.result([street["lidar"] for street in streets]),
+        **splats.result(
+            {name: part["splats"] for name in STREETS if (part := figures.get(name)) and part.get("splats")}
+        ),
     }
     return {k: round(v, 4) if isinstance(v, float) else v for k, v in found.items()}
 
@@ -410,6 +424,7 @@ def main() -> None:
             if part in STREETS:
                 offset = street.vertical_angle_offset
                 found["lidar"] = lidar.metrics(street.data, tile, run, pictures, street.labels, offset)
+                found["splats"] = splats_of(street, tile, run, pictures)
                 found["wrongly_removed"] = lidar.wrongly_removed(
                     street.data, tile, run, partial(vehicles, street), offset
                 )

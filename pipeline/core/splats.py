@@ -56,12 +56,12 @@ class Splats:
     def quaternion(self) -> F32:
         """(N, 4) unit quaternions w x y z, from the axes to the world."""
         given = self.parameters[:, QUATERNION]
-        return given / np.linalg.norm(given, axis=1, keepdims=True)
+        return (given / np.linalg.norm(given, axis=1, keepdims=True)).astype(np.float32)
 
     @property
     def opacity(self) -> F32:
         """(N,) opacities in their centre, 0 to 1."""
-        return 1 / (1 + np.exp(-self.parameters[:, LOGIT]))
+        return np.asarray(1 / (1 + np.exp(-self.parameters[:, LOGIT])), np.float32)
 
     def y_up(self) -> Splats:
         """The splats in axes with y up: (x, y, z) becomes (x, z, -y)."""

@@ -35,7 +35,7 @@ class Rendered:
     @property
     def seen(self) -> I32:
         """(M,) indices of the splats that may be in the image."""
-        return self._assignment.index
+        return self._assignment.visible
 
     def over(self, background: F32) -> F32:
         """(H, W, 3) the colour over a background (H, W, 3)."""
@@ -62,12 +62,12 @@ class Rendered:
             self._tiles, self._last, tiles.to_tiles(background), gradient, entries,
         )  # fmt: skip
         return projection.parameter_gradients(
-            self._parameters, self._camera, self._projected, found.index, found.first, entries
+            self._parameters, self._camera, self._projected, found.visible, found.first, entries
         )
 
 
 def render(parameters: F32, camera: Pinhole) -> Rendered:
-    """Render splats (N, 14), as of `model.Splats`, into the image of a camera."""
+    """Render splats (N, 14) (`Splats.parameters`) into the image of a camera."""
     projected, visible = projection.project(parameters, camera)
     found = tiles.assign(projected, visible, camera.width, camera.height)
     blended = np.empty((len(found.start) - 1, 5, tiles.PIXELS), np.float32)

@@ -134,7 +134,7 @@ def _whole(photo: Photo, excluded: Bools) -> Shot:
         return np.asarray(cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
 
     camera = photo.view.camera.resized(width, height)
-    rgb = photo.texture.astype(np.float32) / 255
+    rgb = (photo.texture / 255).astype(np.float32)
     return Shot(
         photo.view.name, camera, np.asarray(photo.view.T_world_cam, np.float64), rgb,
         photo.texture_clipped | (photo.texture >= CLIPPED_LEVEL), ~enlarged(excluded), photo.texture_sky,

@@ -24,15 +24,15 @@ class Assignment(NamedTuple):
         columns: number of tiles in a row of the image.
         start: (T + 1,) first entry of each tile.
         splat: (E,) splat of each entry, nearest first within a tile.
-        index: (M,) the visible splats, nearest first.
+        visible: (M,) the visible splats, nearest first.
         first: (M + 1,) first place in `entries` of each of them.
-        slot: (E,) place of each entry in the order of `index`, in which the entries of a splat are in sequence.
+        slot: (E,) place of each entry in the order of `visible`, in which the entries of a splat are in sequence.
     """
 
     columns: int
     start: I32
     splat: I32
-    index: I32
+    visible: I32
     first: I32
     slot: I32
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -136,9 +137,9 @@ class Training:
     def save(self, path: Path) -> None:
         """Write the state, replacing the file at once."""
         temporary = path.with_suffix(".partial.npz")
-        state = {f"descent_{name}": value for name, value in self.descent.save().items()}
-        gains = {"gain": self.gains.gain, "offset": self.gains.offset}
-        np.savez(temporary, epoch=self.epoch, **gains, **state, **self.background.save())
+        state: dict[str, Any] = {f"descent_{name}": value for name, value in self.descent.save().items()}
+        state |= {"epoch": self.epoch, "gain": self.gains.gain, "offset": self.gains.offset}
+        np.savez(temporary, **(state | self.background.save()))
         temporary.replace(path)
 
     @classmethod

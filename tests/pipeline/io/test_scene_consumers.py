@@ -182,7 +182,7 @@ def test_three_js_renders_all_tiles_like_the_project_renderer(town: Scene, tmp_p
         picture = page.render(view.camera, view.T_world_cam)
     triangles = sum(len(surface.shape) for tile in town.tiles for surface in tile.surfaces())
     assert page.statistics == {"triangles": triangles, "textures": 8, "features": 8}
-    bodies = [film.placed(tile.folder / group, tile.offset) for tile in town.tiles for group in tile.groups]
+    bodies = [renderer.placed(tile.folder / group, tile.offset) for tile in town.tiles for group in tile.groups]
     own = renderer.Renderer(bodies).view(view.camera, view.T_world_cam, background=threejs.SKY, samples=2)
     both = own.hit & (picture != threejs.SKY).any(axis=2)
     assert both.sum() > 0.98 * own.hit.sum() > 0.3 * own.hit.size

@@ -75,9 +75,11 @@ def test_a_training_that_was_interrupted_continues_to_the_same_splats(
     with pytest.raises(Interrupted):
         splats(drive.inputs, params, tmp_path / "out", interrupt, tmp_path / "checkpoint")
     visits: list[float] = []
-    done = splats(
-        drive.inputs, params, tmp_path / "out", lambda share, message="": visits.append(share), tmp_path / "checkpoint"
-    )
+
+    def visit(share: float, message: str = "") -> None:
+        visits.append(share)
+
+    done = splats(drive.inputs, params, tmp_path / "out", visit, tmp_path / "checkpoint")
     assert sum(share > splats_step.TRAINING_SHARE for share in visits) < 4, "finished epochs are not repeated"
     assert done.files["splats"].read_bytes() == whole.files["splats"].read_bytes()
 
