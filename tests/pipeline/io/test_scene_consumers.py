@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scan2sim.flows.reports import film
 from scan2sim.pipeline.camera import renderer
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.errors import UnavailableError

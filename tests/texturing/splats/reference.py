@@ -18,8 +18,8 @@ def render(
     A splat has no effect on pixels where its alpha is below `least`, with the parameters `cut_by`, if given.
     """
     T = np.asarray(np.linalg.inv(T_world_cam), np.float64)
-    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    colour, depth, through = np.zeros((*x.shape, 3)), np.zeros(x.shape), np.ones(x.shape)
+    shape = camera.height, camera.width
+    colour, depth, through = np.zeros((*shape, 3)), np.zeros(shape), np.ones(shape)
     distance = (parameters[:, :3] @ T[:3, :3].T + T[:3, 3])[:, 2]
     for i in np.argsort(distance, kind="stable"):
         if distance[i] < 0.2:

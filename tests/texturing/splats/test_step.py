@@ -66,8 +66,8 @@ def test_a_training_that_was_interrupted_continues_to_the_same_splats(
     class Interrupted(Exception):
         pass
 
-    def interrupt(share: float, message: str = "") -> None:
-        if share > 0.6:
+    def interrupt(fraction: float, message: str = "") -> None:
+        if fraction > 0.6:
             raise Interrupted
 
     (tmp_path / "out").mkdir()
@@ -76,8 +76,8 @@ def test_a_training_that_was_interrupted_continues_to_the_same_splats(
         splats(drive.inputs, params, tmp_path / "out", interrupt, tmp_path / "checkpoint")
     visits: list[float] = []
 
-    def visit(share: float, message: str = "") -> None:
-        visits.append(share)
+    def visit(fraction: float, message: str = "") -> None:
+        visits.append(fraction)
 
     done = splats(drive.inputs, params, tmp_path / "out", visit, tmp_path / "checkpoint")
     assert sum(share > splats_step.TRAINING_SHARE for share in visits) < 4, "finished epochs are not repeated"
