@@ -53,7 +53,9 @@ from bench.paths import DATA, ROOT
 from bench.street import boxes, frame, lidar, openmvs, score, splats
 from bench.street import synthetic as street_synthetic
 from bench.street.world import BACKGROUND, Photo, Rendering, World, photos
+from scan2sim.pipeline.core.splats import SplatLayer
 from scan2sim.pipeline.core.types import F64, I64, U8, Bools
+from scan2sim.pipeline.io.worlds.scene import read_scene
 from scan2sim.pipeline.lidar.sweeps import every_nth
 
 HOLD_OUT = 8
@@ -200,13 +202,15 @@ def score_world(
     }
 
 
-def splats_of(street: Street, tile: Path, run: Path, pictures: Path) -> dict[str, Any] | None:
-    """Metrics of the splats of a street's world; None without any."""
+def splats_of(
+    street: Street, tile: Path, run: Path, pictures: Path, layer: SplatLayer, used: Mapping[str, float]
+) -> dict[str, Any]:
+    """Metrics of a street's splats, in the local metres of its run; `used` is what the training used."""
     world = World(run / "world")
     views = photos(tile, run, world.origin)
     held_out = {sorted(views)[i]: views[sorted(views)[i]] for i in every_nth(len(views), HOLD_OUT).tolist()}
     hits = {number: world.render(photo).hit for number, photo in held_out.items()}
-    return splats.metrics(street.data, tile, run, held_out, hits, partial(vehicles, street), pictures)
+    return splats.metrics(layer, used, street.data, tile, run, held_out, hits, partial(vehicles, street), pictures)
 
 
 def vehicles(street: Street, number: int, photo: Photo) -> Bools:
@@ -424,7 +428,8 @@ def main() -> None:
             if part in STREETS:
                 offset = street.vertical_angle_offset
                 found["lidar"] = lidar.metrics(street.data, tile, run, pictures, street.labels, offset)
-                found["splats"] = splats_of(street, tile, run, pictures)
+                if layer := read_scene(run).tiles[0].splats():
+                    found["splats"] = splats_of(street, tile, run, pictures, layer, splats.resources_of(run))
                 found["wrongly_removed"] = lidar.wrongly_removed(
                     street.data, tile, run, partial(vehicles, street), offset
                 )

@@ -25,6 +25,7 @@ class Background:
     def __init__(self, texture: F32) -> None:
         self.texture = np.asarray(texture, np.float32).copy()
         self._first, self._second = np.zeros_like(self.texture), np.zeros_like(self.texture)
+        self._total = np.zeros_like(self.texture)  # of a step; zero between steps
 
     def seen(self, texels: F32) -> F32:
         """(H, W, 3) colours at texels (H, W, 2), see `texels`."""
@@ -38,13 +39,9 @@ class Background:
 
     def descend(self, texels: F32, gradient: F32, rate: float) -> None:
         """Take a step (Adam, of the texels that are seen) against derivatives (H, W, 3) of a loss by `seen`."""
-        total = np.zeros_like(self.texture)
-        scatter(texels.reshape(-1, 2), gradient.reshape(-1, 3), total)
-        at = total.any(axis=-1)
-        step = total[at]
-        self._first[at] = FIRST_MOMENT * self._first[at] + (1 - FIRST_MOMENT) * step
-        self._second[at] = SECOND_MOMENT * self._second[at] + (1 - SECOND_MOMENT) * step**2
-        self.texture[at] -= rate * self._first[at] / (np.sqrt(self._second[at]) + MIN_ROOT)
+        touched = np.empty(4 * texels.shape[0] * texels.shape[1], np.int32)
+        count = _scatter(texels.reshape(-1, 2), gradient.reshape(-1, 3), self._total, touched)
+        _step(self.texture, self._first, self._second, self._total, touched[:count], np.float32(rate))
 
     def recolour(self, factor: F32, offset: F32) -> None:
         """Multiply all colours by (3,) factors, and add (3,) offsets."""
@@ -80,9 +77,16 @@ def directions() -> F64:
 
 
 @njit(cache=True)
-def scatter(texels, values, total):  # type: ignore[no-untyped-def]
-    """Add values (N, 3) at texels (N, 2) to `total` (H, W, 3): the adjoint of the bilinear lookup `Background.seen`."""
+def _scatter(texels, values, total, touched):  # type: ignore[no-untyped-def]
+    """Add values (N, 3) at texels (N, 2) to `total` (H, W, 3), which is zero before.
+
+    It is the adjoint of the bilinear lookup `Background.seen`.
+
+    Returns:
+        the number of texels that changed; their indices are written to `touched`.
+    """
     height, width = total.shape[:2]
+    count = 0
     for i in range(len(texels)):
         if values[i, 0] == 0 and values[i, 1] == 0 and values[i, 2] == 0:
             continue
@@ -93,5 +97,28 @@ def scatter(texels, values, total):  # type: ignore[no-untyped-def]
             (top, left, (1 - s) * (1 - t)), (top, left + 1, s * (1 - t)),
             (top + 1, left, (1 - s) * t), (top + 1, left + 1, s * t),
         ):  # fmt: skip
+            if weight == 0:
+                continue
+            column %= width
+            texel = total[row, column]
+            if texel[0] == 0 and texel[1] == 0 and texel[2] == 0:
+                touched[count] = row * width + column
+                count += 1
             for channel in range(3):
-                total[row, column % width, channel] += np.float32(weight) * values[i, channel]
+                texel[channel] += np.float32(weight) * values[i, channel]
+    return count
+
+
+@njit(cache=True)
+def _step(texture, first, second, total, touched, rate):  # type: ignore[no-untyped-def]
+    """A step of Adam against the derivatives `total` of the texels `touched`, which become zero."""
+    width = texture.shape[1]
+    for index in touched:
+        row, column = index // width, index % width
+        for channel in range(3):
+            g = total[row, column, channel]
+            total[row, column, channel] = 0
+            m = np.float32(FIRST_MOMENT) * first[row, column, channel] + np.float32(1 - FIRST_MOMENT) * g
+            v = np.float32(SECOND_MOMENT) * second[row, column, channel] + np.float32(1 - SECOND_MOMENT) * g * g
+            first[row, column, channel], second[row, column, channel] = m, v
+            texture[row, column, channel] -= rate * m / (np.sqrt(v) + np.float32(MIN_ROOT))

@@ -105,8 +105,10 @@ def _project(parameters, R, t, intrinsics, width, height, projected, visible):  
     for i in prange(len(parameters)):
         px, py, pz = parameters[i, 0], parameters[i, 1], parameters[i, 2]
         z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + t[2]
+        if z < np.float32(NEAR_M):
+            continue
         opacity = 1 / (1 + np.exp(-parameters[i, 10]))
-        if z < np.float32(NEAR_M) or opacity <= np.float32(MIN_ALPHA):
+        if opacity <= np.float32(MIN_ALPHA):
             continue
         x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + t[0]
         y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + t[1]

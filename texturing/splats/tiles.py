@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from scan2sim.pipeline.core.types import F32, I32, Bools
-from scan2sim.texturing.splats.projection import DEPTH
+from scan2sim.texturing.splats.projection import DEPTH, MIN_ALPHA
 
 SIZE = 16
 """Width and height of a tile in pixels."""
@@ -38,7 +38,7 @@ class Assignment(NamedTuple):
 
 
 def assign(projected: F32, visible: Bools, width: int, height: int) -> Assignment:
-    """Assign visible splats (of N, (N, 9)) to the tiles that they overlap."""
+    """Assign visible splats (of N, (N, 9)) to the tiles that they reach."""
     columns, rows = -(-width // SIZE), -(-height // SIZE)
     index = np.flatnonzero(visible)
     depth = np.log(projected[index, DEPTH])
@@ -75,27 +75,61 @@ def _overlap(projected, i, columns, rows):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
+@njit(cache=True, inline="always")
+def _reaches(projected, i, x, y, farthest):  # type: ignore[no-untyped-def]
+    """Whether the ellipse of a splat at the squared distance `farthest` reaches the tile in column x and row y."""
+    left, top = np.float32(x * SIZE) - projected[i, 0], np.float32(y * SIZE) - projected[i, 1]
+    right, bottom = left + np.float32(SIZE - 1), top + np.float32(SIZE - 1)
+    dx, dy = min(max(np.float32(0), left), right), min(max(np.float32(0), top), bottom)
+    if dx == 0 and dy == 0:
+        return True
+    a, b, c = projected[i, 2], projected[i, 3], projected[i, 4]
+    # the nearest pixel is on one of the sides that face the centre
+    if dx != 0:
+        at = min(max(-b * dx / c, top), bottom)
+        if a * dx * dx + 2 * b * dx * at + c * at * at <= farthest:
+            return True
+    if dy != 0:
+        at = min(max(-b * dy / a, left), right)
+        if a * at * at + 2 * b * at * dy + c * dy * dy <= farthest:
+            return True
+    return False
+
+
 @njit(cache=True)
 def _assign(projected, index, columns, rows):  # type: ignore[no-untyped-def]
     start = np.zeros(columns * rows + 1, np.int32)
     first = np.zeros(len(index) + 1, np.int32)
     for m in range(len(index)):
-        left, right, top, bottom = _overlap(projected, index[m], columns, rows)
-        first[m + 1] = first[m] + (right - left + 1) * (bottom - top + 1)
+        i = index[m]
+        left, right, top, bottom = _overlap(projected, i, columns, rows)
+        farthest = _farthest(projected, i)
+        first[m + 1] = first[m]
         for y in range(top, bottom + 1):
             for x in range(left, right + 1):
-                start[y * columns + x + 1] += 1
+                if _reaches(projected, i, x, y, farthest):
+                    start[y * columns + x + 1] += 1
+                    first[m + 1] += 1
     for tile in range(columns * rows):
         start[tile + 1] += start[tile]
     free = start[:-1].copy()
     splat, slot = np.empty(first[-1], np.int32), np.empty(first[-1], np.int32)
     for m in range(len(index)):
-        left, right, top, bottom = _overlap(projected, index[m], columns, rows)
+        i = index[m]
+        left, right, top, bottom = _overlap(projected, i, columns, rows)
+        farthest = _farthest(projected, i)
         place = first[m]
         for y in range(top, bottom + 1):
             for x in range(left, right + 1):
-                tile = y * columns + x
-                splat[free[tile]], slot[free[tile]] = index[m], place
-                free[tile] += 1
-                place += 1
+                if _reaches(projected, i, x, y, farthest):
+                    tile = y * columns + x
+                    splat[free[tile]], slot[free[tile]] = i, place
+                    free[tile] += 1
+                    place += 1
     return start, splat, index, first, slot
+
+
+@njit(cache=True, inline="always")
+def _farthest(projected, i):  # type: ignore[no-untyped-def]
+    """Squared distance in standard deviations at which a splat's alpha is `MIN_ALPHA`, and a little more."""
+    return np.float32(2.01) * np.log(projected[i, 5] / np.float32(MIN_ALPHA)) + np.float32(0.01)

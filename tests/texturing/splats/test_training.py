@@ -12,7 +12,6 @@ from scan2sim.pipeline.camera.renderer import Body, Renderer, look_at, pinhole
 from scan2sim.pipeline.core.types import Camera, View
 from scan2sim.texturing.backdrop.photos import Photo
 from scan2sim.texturing.splats import rasterizer
-from scan2sim.texturing.splats.background import HEIGHT_PX, WIDTH_PX, Background, scatter
 from scan2sim.texturing.splats.exposure import Gains
 from scan2sim.texturing.splats.projection import Pinhole
 from scan2sim.texturing.splats.shots import Shot, shots
@@ -135,14 +134,3 @@ def test_the_exposure_of_the_world_changes_without_changing_renderings(corner: T
     assert np.allclose(before, after, atol=1e-5)
     assert np.allclose(np.log(gains.gain).mean(axis=0), 0, atol=1e-5)
     assert np.allclose(gains.offset.mean(axis=0), 0, atol=1e-5)
-
-
-def test_the_background_descends_by_the_adjoint_of_its_lookup() -> None:
-    random = np.random.default_rng(1)
-    texture, values = (random.uniform(size=shape).astype(np.float32) for shape in ((HEIGHT_PX, WIDTH_PX, 3), (9, 7, 3)))
-    at = random.uniform((-0.5, 0), (WIDTH_PX - 0.5, HEIGHT_PX - 1), (9, 7, 2)).astype(np.float32)
-    at[0, 0] = -0.3, 10.5  # across the seam
-    total = np.zeros_like(texture)
-    scatter(at.reshape(-1, 2), values.reshape(-1, 3), total)
-    looked_up = (Background(texture).seen(at) * values).sum()
-    assert float((total * texture).sum(dtype=np.float64)) == pytest.approx(float(looked_up), rel=5e-3)

@@ -1,0 +1,132 @@
+"""Ablation of the splats on the real streets: trained without one part, or with another value, and scored.
+
+`python -m bench.street.splat_ablation [--parts ...] [--streets odo04 raw0009 raw0013] [--worlds bench-out/street]
+[--out bench-out/street_splats] [--change NAME=VALUE ...]`
+
+A part is a line of `CHANGES`: values of constants of the modules of `scan2sim.texturing.splats`, or of the step's
+settings. `--change` adds one from the command line. The step's inputs are those of the street's run in `--worlds`, made
+there by `python -m bench.street --set splats.when=auto`. Rows are stored in `rows.json` below `--out`; rows that are
+stored already aren't measured again. Ends with `RESULT {json}`: by part and street.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+
+from bench.paths import ROOT
+from bench.street import lidar, splats
+from bench.street.run import STREETS, splats_of
+from scan2sim.pipeline.core.splats import SplatLayer
+from scan2sim.texturing.splats import step
+
+PACKAGE = "scan2sim.texturing.splats"
+CHANGES: dict[str, dict[str, Any]] = {
+    "nothing": {},
+    "cover": {"step.cover": 0.0},
+    "ssim": {"loss.SSIM_SHARE": 0.0},
+    "stereo": {"step.NEIGHBOURS": 0},
+    "normals": {"start.FLATNESS": 1.0},
+    "dark_fill": {"start.DARK_SIGMA_DEG": 0.01},
+    "coarse_to_fine": {"step.epochs": (0, 0, 20)},
+    "finer": {"start.STRIDE_PX": 3.5},
+    "coarser": {"start.STRIDE_PX": 6.0},
+}
+"""By part: the names of constants (module.NAME) or settings (step.name), and their values."""
+METRICS = (
+    "psnr_db", "nogain_psnr_db", "ssim", "msssim", "surface_psnr_db", "elsewhere_psnr_db", "right_gap_db",
+    "depth_median_cm", "depth_near_share", "splats", "mb", "cpu_minutes", "memory_gb",
+)  # fmt: skip
+
+
+@contextlib.contextmanager
+def changed(change: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Constants with other values; gives the settings of the step."""
+    settings = {}
+    with contextlib.ExitStack() as stack:
+        for name, value in change.items():
+            module, attribute = name.split(".")
+            if module == "step" and attribute in step.SplatsParams.model_fields:
+                settings[attribute] = value
+                continue
+            owner = importlib.import_module(f"{PACKAGE}.{module}")
+            stack.enter_context(mock.patch.object(owner, attribute, value))
+        yield settings
+
+
+def row(name: str, worlds: Path, folder: Path, change: Mapping[str, Any]) -> dict[str, Any]:
+    """Train the splats of a street with a change, and score them."""
+    tile, run = worlds / name / "tile", worlds / name / "run"
+    inputs, params = _inputs(run)
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "checkpoint").mkdir(parents=True)
+    with changed(change) as settings:
+        about = step.SplatsParams.model_validate({**params, **settings})
+        with splats.resources() as used:
+            done = step.splats(inputs, about, folder, _report, folder / "checkpoint")
+    shutil.rmtree(folder / "checkpoint")
+    layer = SplatLayer.load(done.files["splats"])
+    found = splats_of(STREETS[name], tile, run, folder / "pictures", layer, used)
+    splats.table(found)
+    return {key: found[key] for key in METRICS} | {
+        str(n): {"psnr_db": one["psnr_db"], "ssim": one["ssim"]} for n, one in found["photos"].items()
+    }
+
+
+def _inputs(run: Path) -> tuple[dict[str, Path], dict[str, Any]]:
+    """Inputs and settings of the newest splats of a run."""
+    about = json.loads(lidar.newest(run, "splats", "manifest.json").read_text(encoding="utf-8"))
+    inputs = {}
+    for name, source in about["inputs"].items():
+        key, output = source.split("/", 1)
+        (folder,) = (run / "steps").glob(f"*/{key}")
+        files = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["files"]
+        inputs[name] = folder / files[output]
+    return inputs, about["params"]
+
+
+def _report(fraction: float, message: str = "") -> None:
+    print(f"\r{fraction:5.0%} {message:60}", end="", flush=True)
+
+
+def main() -> None:
+    """Measure the rows that are missing, and print all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", nargs="*", choices=[*CHANGES], default=["nothing"])
+    parser.add_argument("--streets", nargs="*", choices=[*STREETS], default=[*STREETS])
+    parser.add_argument("--worlds", type=Path, default=ROOT / "bench-out" / "street")
+    parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "street_splats")
+    parser.add_argument("--change", action="append", default=[], metavar="NAME=VALUE", help="one row more, of these")
+    arguments = parser.parse_args()
+    rows_file: Path = arguments.out / "rows.json"
+    rows = json.loads(rows_file.read_text(encoding="utf-8")) if rows_file.is_file() else {}
+    parts = {part: CHANGES[part] for part in arguments.parts}
+    if arguments.change:
+        given = dict(text.split("=", 1) for text in arguments.change)
+        parts = {" ".join(arguments.change): {name: json.loads(value) for name, value in given.items()}}
+    for part, change in parts.items():
+        for name in arguments.streets:
+            if name in rows.setdefault(part, {}):
+                continue
+            print(f"\n{part}, {name}")
+            rows[part][name] = row(name, arguments.worlds, arguments.out / part.replace(" ", "_") / name, change)
+            rows_file.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    for part, streets in rows.items():
+        for name, found in streets.items():
+            print(
+                f"{part:24} {name:8}"
+                + "".join(f"  {key} {found[key]:.3g}" for key in METRICS if found[key] is not None)
+            )
+    print("RESULT " + json.dumps(rows))
+
+
+if __name__ == "__main__":
+    main()
