@@ -147,7 +147,7 @@ def _right(
             continue
         reach = int(np.ceil(photo.K[0, 0] * np.linalg.norm(offset) / NEAREST_M))
         excluded = vehicles(number, photo)
-        excluded = binary_dilation(excluded, np.ones((1, 2 * reach + 1)), origin=(0, -reach))  # towards the left
+        excluded = binary_dilation(excluded, np.ones((1, 2 * reach + 1)), origin=(0, reach))  # towards the left
         rgb = np.asarray(Image.open(files[0]).convert("RGB"), np.uint8)
         T = photo.T.copy()
         T[:3, 3] += T[:3, :3] @ offset

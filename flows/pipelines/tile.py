@@ -588,7 +588,8 @@ def _add_splats(graph: TileGraph, scan: Scan, parts: Parts, surfaces: Sources, p
         return {}
     known = {name: photos[name] for name in ("views", "depth", "exposures")} | scan.labels
     meshes = _mesh_inputs(surfaces | _plant_models(graph, "mesh"))
-    graph.add(SPLATS, known | parts.instances | meshes, cell=graph.cell or None, origin=graph.tile.frame.origin)
+    known |= parts.instances | scan.moving
+    graph.add(SPLATS, known | meshes, cell=graph.cell or None, origin=graph.tile.frame.origin)
     return {"splats": graph.output(SPLATS, "splats")} if graph.is_enabled(SPLATS) else {}
 
 

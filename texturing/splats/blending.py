@@ -12,11 +12,14 @@ from scan2sim.texturing.splats import projection
 from scan2sim.texturing.splats.tiles import PIXELS, SIZE
 
 RED, GREEN, BLUE, DEPTH, TRANSMITTANCE = range(5)
-"""Channels of a blended tile (5, 256): colours and depth times alpha, and what is left of the background."""
+"""Channels of a blended tile (5, 256): colours and depth (or its deviation) times alpha, and what is left of the
+background."""
 MAX_ALPHA = np.float32(0.99)
 MIN_ALPHA = np.float32(projection.MIN_ALPHA)
-TWO = np.float32(2)
+TWO, NEAREST = np.float32(2), np.float32(projection.NEAR_M)
 """In numba the product of an integer and a float of 32 bits has 64 bits, which halves the speed of the loops."""
+MAX_DEVIATION = np.float32(0.2)
+"""Greatest deviation of a depth, relative to the known one: what is farther away is as wrong."""
 OPAQUE = np.float32(0.003)
 """Greatest transmittance at which nothing behind matters."""
 CHECKED_EVERY = 8
@@ -30,17 +33,18 @@ FARTHEST = np.float32(32)
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
-def blend(parameters, projected, columns, start, splat, tiles, last):  # type: ignore[no-untyped-def]
+def blend(parameters, projected, columns, start, splat, known, tiles, last):  # type: ignore[no-untyped-def]
     """Blend the splats of each tile.
 
     Args:
-        parameters: (N, 14); projected: (N, 9).
+        parameters: (N, 14); projected: (N, 11).
         columns, start, splat: of the tiles' `Assignment`.
+        known: (T, 256) known depths, metres, 0 where there is none; the channel `DEPTH` has deviations from these.
         tiles: (T, 5, 256), written.
         last: (T,) number of the splats that were blended, written.
     """
     for tile in prange(len(tiles)):
-        image = tiles[tile]
+        image, expected = tiles[tile], known[tile]
         left, top = np.float32(tile % columns * SIZE), np.float32(tile // columns * SIZE)
         image[:TRANSMITTANCE] = 0
         image[TRANSMITTANCE] = 1
@@ -50,7 +54,7 @@ def blend(parameters, projected, columns, start, splat, tiles, last):  # type: i
             number += 1
             u, v = projected[i, 0] - left, projected[i, 1] - top
             a, b, c = projected[i, 2], TWO * projected[i, 3], projected[i, 4]
-            opacity, z = projected[i, 5], projected[i, 8]
+            opacity, z, slope_x, slope_y = projected[i, 5], projected[i, 8], projected[i, 9], projected[i, 10]
             red, green, blue = parameters[i, 11], parameters[i, 12], parameters[i, 13]
             first = max(int(v - projected[i, 7]), 0)
             end = min(int(v + projected[i, 7]) + 2, SIZE)
@@ -68,7 +72,9 @@ def blend(parameters, projected, columns, start, splat, tiles, last):  # type: i
                 image[RED, p] += weight * red
                 image[GREEN, p] += weight * green
                 image[BLUE, p] += weight * blue
-                image[DEPTH, p] += weight * z
+                depth = z + slope_x * dx + slope_y * dy
+                deviation = min(abs(depth - expected[p]) / max(expected[p], NEAREST), MAX_DEVIATION)
+                image[DEPTH, p] += weight * (deviation if expected[p] > 0 else depth)
                 image[TRANSMITTANCE, p] -= weight
             if number % CHECKED_EVERY == 0:
                 most = np.float32(0)
@@ -81,21 +87,22 @@ def blend(parameters, projected, columns, start, splat, tiles, last):  # type: i
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def blend_gradients(  # type: ignore[no-untyped-def]
-    parameters, projected, columns, start, splat, slot, tiles, last, background, gradient, entries
+    parameters, projected, columns, start, splat, slot, known, tiles, last, background, gradient, entries
 ):
     """Gradients of the entries (`projection.GRADIENT`) by those of the image.
 
     Args:
-        parameters, projected, columns, start, splat, slot: as in `blend`.
+        parameters, projected, columns, start, splat, slot, known: as in `blend`. The slope of a splat's depth counts as
+            constant.
         tiles, last: results of `blend`.
         background: (T, 3, 256) colour behind the splats.
-        gradient: (T, 5, 256) derivatives of the loss by colour (with the background), depth times alpha, and alpha.
+        gradient: (T, 5, 256) derivatives of the loss by colour (with the background), the channel `DEPTH`, and alpha.
         entries: (E, 10), written; those that weren't blended are 0.
     """
     for tile in prange(len(tiles)):
         if start[tile] == start[tile + 1]:
             continue
-        image, g, behind = tiles[tile], gradient[tile], background[tile]
+        image, g, behind, expected = tiles[tile], gradient[tile], background[tile], known[tile]
         left, top = np.float32(tile % columns * SIZE), np.float32(tile // columns * SIZE)
         T, rest = np.ones(PIXELS, np.float32), np.empty(PIXELS, np.float32)
         for p in range(np.uint64(PIXELS)):
@@ -111,7 +118,7 @@ def blend_gradients(  # type: ignore[no-untyped-def]
             i = splat[entry]
             u, v = projected[i, 0] - left, projected[i, 1] - top
             a, b, c = projected[i, 2], projected[i, 3], projected[i, 4]
-            opacity, z = projected[i, 5], projected[i, 8]
+            opacity, z, slope_x, slope_y = projected[i, 5], projected[i, 8], projected[i, 9], projected[i, 10]
             red, green, blue = parameters[i, 11], parameters[i, 12], parameters[i, 13]
             first = max(int(v - projected[i, 7]), 0)
             end = min(int(v + projected[i, 7]) + 2, SIZE)
@@ -129,9 +136,12 @@ def blend_gradients(  # type: ignore[no-untyped-def]
                 alpha = min(opacity * k, MAX_ALPHA)
                 alpha = alpha if alpha >= MIN_ALPHA else np.float32(0)
                 weight = alpha * T[p]
-                value = (
-                    g[RED, p] * red + g[GREEN, p] * green + g[BLUE, p] * blue + g[DEPTH, p] * z + g[TRANSMITTANCE, p]
-                )
+                depth = z + slope_x * dx + slope_y * dy
+                inverse = np.float32(1) / max(expected[p], NEAREST)
+                deviation = (depth - expected[p]) * inverse
+                shown = min(abs(deviation), MAX_DEVIATION) if expected[p] > 0 else depth
+                value = g[RED, p] * red + g[GREEN, p] * green + g[BLUE, p] * blue
+                value += g[DEPTH, p] * shown + g[TRANSMITTANCE, p]
                 rest[p] -= weight * value
                 by_alpha = T[p] * value - rest[p] / (np.float32(1) - alpha)
                 by_alpha = by_alpha if MIN_ALPHA <= opacity * k < MAX_ALPHA else np.float32(0)
@@ -140,7 +150,9 @@ def blend_gradients(  # type: ignore[no-untyped-def]
                 s0 += weight * g[RED, p]
                 s1 += weight * g[GREEN, p]
                 s2 += weight * g[BLUE, p]
-                s3 += weight * g[DEPTH, p]
+                by_depth = inverse if deviation > 0 else -inverse
+                by_depth = by_depth if abs(deviation) < MAX_DEVIATION else np.float32(0)
+                s3 += weight * g[DEPTH, p] * (by_depth if expected[p] > 0 else np.float32(1))
                 s4 += by_alpha * k
                 s5 += by_square * (a * dx + b * dy)
                 s6 += by_square * (b * dx + c * dy)

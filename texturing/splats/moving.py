@@ -1,4 +1,4 @@
-"""Pixels of photos that show what moved: vehicles and people, but not vehicles that stand still."""
+"""Pixels of photos that show what moved: vehicles, people and scanned points that moved, not vehicles at rest."""
 
 from __future__ import annotations
 
@@ -6,14 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
+from scan2sim.pipeline.camera import depth_map
 from scan2sim.pipeline.camera.models import pixel_angle
 from scan2sim.pipeline.camera.renderer import Body, Renderer
-from scan2sim.pipeline.core.types import Bools, Frame
+from scan2sim.pipeline.core.types import Bools, Frame, PointCloud
 from scan2sim.texturing.backdrop.photos import Photo
 from scan2sim.texturing.whole_frame import BEYOND_MEASURED_M, BOX_BEHIND_M, instance_boxes
 
 MARGIN_PX = 3
 """Width of the seam around what moved that isn't used either."""
+SCANNED_MARGIN_M = 0.3
+"""Metres around points that moved that isn't used either: their object is larger than what was scanned of it."""
 
 
 class MovingMask:
@@ -23,9 +26,11 @@ class MovingMask:
         instances: boxes on the ground, from the step `instances`; None: all vehicles and people count as moving.
         frame: the tile's frame.
         parked: vehicles that stand still are shown.
+        points: points that moved, with normals and times; None: none.
     """
 
-    def __init__(self, instances: Path | None, frame: Frame, parked: bool) -> None:
+    def __init__(self, instances: Path | None, frame: Frame, parked: bool, points: PointCloud | None = None) -> None:
+        self._points = None if points is None or not len(points) else depth_map.scene([], moving=points)
         self._still: Renderer | None = None
         self._moved: Renderer | None = None
         if instances is not None and parked:
@@ -39,6 +44,10 @@ class MovingMask:
         A pixel of the class vehicle or person belongs to the nearest instance whose box it is in, or near which it is;
         those of instances that stand still are used. Without boxes, all of them moved.
         """
+        return self._of_instances(photo) | self._scanned(photo)
+
+    def _of_instances(self, photo: Photo) -> Bools:
+        """(H, W) pixels of vehicles and people that moved, and of the photo's mask."""
         import cv2
 
         if self._still is None or self._moved is None:
@@ -62,3 +71,23 @@ class MovingMask:
         excluded = (photo.movable & ~kept) | in_moved
         excluded = np.asarray(cv2.dilate(excluded.astype(np.uint8), np.ones((MARGIN_PX, MARGIN_PX))) > 0)
         return np.asarray(excluded | photo.masked)
+
+    def _scanned(self, photo: Photo) -> Bools:
+        """(H, W) pixels of points that moved and were scanned at about the time of the photo."""
+        import cv2
+
+        shape = photo.movable.shape
+        if self._points is None or photo.view.time is None:
+            return np.zeros(shape, bool)
+        view, pixels = photo.view, shape[0] * shape[1]
+        seen = depth_map.depth_map(view.camera, view.T_world_cam, self._points, time=view.time, pixels=pixels)
+        range_ = np.asarray(cv2.resize(seen.range, shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
+        found: Bools = np.isfinite(range_) & (range_ < photo.known + BOX_BEHIND_M)
+        if not found.any():
+            return found
+        away, nearest = cv2.distanceTransformWithLabels(
+            (~found).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        distance = np.zeros(int(nearest.max()) + 1, np.float32)
+        distance[nearest[found]] = range_[found]
+        return np.asarray(away * pixel_angle(photo.camera) * distance[nearest] < SCANNED_MARGIN_M)

@@ -9,10 +9,10 @@ from numba import njit, prange
 
 from scan2sim.pipeline.core.types import F32, F64, I32, Bools, Camera
 
-U, V, CONIC_A, CONIC_B, CONIC_C, OPACITY, EXTENT_X, EXTENT_Y, DEPTH = range(9)
+U, V, CONIC_A, CONIC_B, CONIC_C, OPACITY, EXTENT_X, EXTENT_Y, DEPTH, SLOPE_X, SLOPE_Y = range(11)
 """Columns of projected splats: centre in pixels; inverse covariance [[A, B], [B, C]]; opacity; half width and height
-in pixels beyond which it is invisible; depth along the optical axis."""
-PROJECTED = 9
+in pixels beyond which it is invisible; depth along the optical axis, of the centre and its change per pixel."""
+PROJECTED = 11
 LOW_PASS = 0.3
 """Variance in square pixels that is added to the projected covariance, as all viewers do."""
 MIN_ALPHA = 1 / 255
@@ -50,7 +50,7 @@ class Pinhole(NamedTuple):
 
 
 def project(parameters: F32, camera: Pinhole) -> tuple[F32, Bools]:
-    """Splats (N, 14) as the camera sees them: (N, 9) with the columns above, and (N,) whether they are visible."""
+    """Splats (N, 14) as the camera sees them: (N, 11) with the columns above, and (N,) whether they are visible."""
     projected, visible = np.zeros((len(parameters), PROJECTED), np.float32), np.zeros(len(parameters), np.bool_)
     _project(parameters, *camera, projected, visible)
     return projected, visible
@@ -62,7 +62,7 @@ def parameter_gradients(parameters: F32, camera: Pinhole, projected: F32, index:
     Args:
         parameters: (N, 14) of all splats.
         camera: the camera.
-        projected: (N, 9).
+        projected: (N, 11).
         index: (M,) the visible splats.
         first: (M + 1,) first entry of each of them.
         entries: (E, 10) gradients of the entries, those of a splat in sequence.
@@ -119,6 +119,7 @@ def _project(parameters, R, t, intrinsics, width, height, projected, visible):  
         Q = np.empty((3, 3), np.float32)
         _rotation(parameters, i, Q)
         a, b, c = np.float32(LOW_PASS), np.float32(0), np.float32(LOW_PASS)
+        along_x, along_y = np.float32(0), np.float32(0)  # covariances of the depth with the place in the image
         for k in range(3):
             scale = np.exp(parameters[i, 3 + k])
             q0 = R[0, 0] * Q[0, k] + R[0, 1] * Q[1, k] + R[0, 2] * Q[2, k]
@@ -126,6 +127,7 @@ def _project(parameters, R, t, intrinsics, width, height, projected, visible):  
             q2 = R[2, 0] * Q[0, k] + R[2, 1] * Q[1, k] + R[2, 2] * Q[2, k]
             m0, m1 = scale * (j00 * q0 + j02 * q2), scale * (j11 * q1 + j12 * q2)
             a, b, c = a + m0 * m0, b + m0 * m1, c + m1 * m1
+            along_x, along_y = along_x + m0 * scale * q2, along_y + m1 * scale * q2
         determinant = a * c - b * b
         if not determinant > 0:
             continue
@@ -136,6 +138,8 @@ def _project(parameters, R, t, intrinsics, width, height, projected, visible):  
         projected[i, 0], projected[i, 1] = u, v
         projected[i, 2], projected[i, 3], projected[i, 4] = c / determinant, -b / determinant, a / determinant
         projected[i, 5], projected[i, 6], projected[i, 7], projected[i, 8] = opacity, extent_x, extent_y, z
+        projected[i, 9] = (c * along_x - b * along_y) / determinant
+        projected[i, 10] = (a * along_y - b * along_x) / determinant
         visible[i] = True
 
 

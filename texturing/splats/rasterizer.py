@@ -18,7 +18,8 @@ class Rendered:
 
     Attributes:
         colour: (H, W, 3) sRGB 0 to 1, times alpha: the background isn't added.
-        depth: (H, W) along the optical axis in metres, times alpha.
+        depth: (H, W) along the optical axis in metres, times alpha; where a depth was known, the deviation from it,
+            relative to it and at most `blending.MAX_DEVIATION`, times alpha.
         transmittance: (H, W) share of the background that is seen.
     """
 
@@ -29,6 +30,7 @@ class Rendered:
     _camera: Pinhole
     _projected: F32
     _assignment: Assignment
+    _known: F32
     _tiles: F32
     _last: I32
 
@@ -59,21 +61,31 @@ class Rendered:
         entries = np.zeros((len(found.splat), projection.GRADIENT), np.float32)
         blending.blend_gradients(
             self._parameters, self._projected, found.columns, found.start, found.splat, found.slot,
-            self._tiles, self._last, tiles.to_tiles(background), gradient, entries,
+            self._known, self._tiles, self._last, tiles.to_tiles(background), gradient, entries,
         )  # fmt: skip
         return projection.parameter_gradients(
             self._parameters, self._camera, self._projected, found.visible, found.first, entries
         )
 
 
-def render(parameters: F32, camera: Pinhole) -> Rendered:
-    """Render splats (N, 14) (`Splats.parameters`) into the image of a camera."""
+def render(parameters: F32, camera: Pinhole, known: F32 | None = None) -> Rendered:
+    """Render splats (N, 14) (`Splats.parameters`) into the image of a camera.
+
+    Args:
+        parameters: of the splats.
+        camera: the camera.
+        known: (H, W) depths along the optical axis that are known, metres, 0 where none is; None: none.
+    """
     projected, visible = projection.project(parameters, camera)
     found = tiles.assign(projected, visible, camera.width, camera.height)
     blended = np.empty((len(found.start) - 1, 5, tiles.PIXELS), np.float32)
     last = np.zeros(len(blended), np.int32)
-    blending.blend(parameters, projected, found.columns, found.start, found.splat, blended, last)
+    if known is None:
+        expected = np.zeros((len(blended), tiles.PIXELS), np.float32)
+    else:
+        expected = tiles.to_tiles(known[..., None])[:, 0]
+    blending.blend(parameters, projected, found.columns, found.start, found.splat, expected, blended, last)
     image = tiles.from_tiles(blended, camera.width, camera.height)
     return Rendered(
-        image[..., :3], image[..., 3], image[..., 4], parameters, camera, projected, found, blended, last
+        image[..., :3], image[..., 3], image[..., 4], parameters, camera, projected, found, expected, blended, last
     )  # fmt: skip

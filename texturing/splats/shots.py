@@ -26,6 +26,8 @@ FACE_ROTATIONS = tuple(
     )
 )  # fmt: skip
 """Rotations from the axes of the six faces of a cube (front, right, back, left, up, down) to the camera's."""
+MAX_STEP = 1.1
+"""Ratio of the distances of neighbouring pixels from which these are at an edge, where distances are uncertain."""
 MIN_FACE_SHARE = 0.05
 """Faces of which the photo shows less are left out."""
 
@@ -40,6 +42,7 @@ class Level:
         clipped: (H, W, 3) overexposed channels: the scene is at least as bright.
         weight: (H, W) 1 where the photo is used, else 0.
         sky: (H, W) sky.
+        known: (H, W) depth along the optical axis in metres, where scan or surface give it, else 0.
         texels: (H, W, 2) texels of the background.
     """
 
@@ -48,6 +51,7 @@ class Level:
     clipped: Bools
     weight: F32
     sky: Bools
+    known: F32
     texels: F32
 
 
@@ -60,6 +64,7 @@ class Shot:
         camera: its model is "pinhole".
         T_world_cam: (4, 4) its pose.
         rgb, clipped, usable, sky: as in `Level`, in full size; `usable` (H, W) excludes vehicles, people, masks.
+        distance: (H, W) metres along the ray, where scan or surface give it, else 0.
     """
 
     name: str
@@ -69,6 +74,7 @@ class Shot:
     clipped: Bools
     usable: Bools
     sky: Bools
+    distance: F32
 
     @cached_property
     def levels(self) -> tuple[Level, ...]:
@@ -86,14 +92,16 @@ class Shot:
 
         x, y = np.meshgrid((np.arange(camera.width) - camera.cx) / camera.fx,
                            (np.arange(camera.height) - camera.cy) / camera.fy)  # fmt: skip
-        rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ self.T_world_cam[:3, :3].T
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+        distance = cv2.resize(self.distance, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
         return Level(
             Pinhole.of(camera, self.T_world_cam),
             reduced(self.rgb),
             reduced(self.clipped.astype(np.float32)) > 0.5,
             (reduced(self.usable.astype(np.float32)) > WHOLE).astype(np.float32),
             reduced(self.sky.astype(np.float32)) > 0.5,
-            texels(rays),
+            (distance / np.linalg.norm(rays, axis=-1)).astype(np.float32),
+            texels(rays @ self.T_world_cam[:3, :3].T),
         )
 
 
@@ -120,6 +128,7 @@ def shots(photo: Photo, excluded: Bools) -> Iterator[Shot]:
         yield replace(
             whole, camera=camera, T_world_cam=pose, rgb=colour, clipped=masks[0] > 0.5,
             usable=(masks[1] > WHOLE) & inside, sky=(masks[2] > 0.5) & inside,
+            distance=_nearest(whole.distance, x, y, wrap) * inside,
         )  # fmt: skip
 
 
@@ -138,7 +147,17 @@ def _whole(photo: Photo, excluded: Bools) -> Shot:
     return Shot(
         photo.view.name, camera, np.asarray(photo.view.T_world_cam, np.float64), rgb,
         photo.texture_clipped | (photo.texture >= CLIPPED_LEVEL), ~enlarged(excluded), photo.texture_sky,
+        np.asarray(cv2.resize(known_distance(photo), size, interpolation=cv2.INTER_NEAREST)),
     )  # fmt: skip
+
+
+def known_distance(photo: Photo) -> F32:
+    """(H, W) metres along the rays of a prepared photo, where scan or surface give them, 0 elsewhere and at edges."""
+    import cv2
+
+    around = np.ones((3, 3), np.uint8)
+    least, most = cv2.erode(photo.known, around), cv2.dilate(photo.known, around)
+    return np.where(np.isfinite(most) & (most < MAX_STEP * least), photo.known, 0).astype(np.float32)
 
 
 def _pinholes(camera: Camera) -> list[tuple[Camera, F64]]:
@@ -167,3 +186,10 @@ def _sampled(image: F32, x: F32, y: F32, wrap: bool) -> F32:
 
     border = cv2.BORDER_WRAP if wrap else cv2.BORDER_REPLICATE
     return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=border), np.float32)
+
+
+def _nearest(image: F32, x: F32, y: F32, wrap: bool) -> F32:
+    import cv2
+
+    border = cv2.BORDER_WRAP if wrap else cv2.BORDER_REPLICATE
+    return np.asarray(cv2.remap(image, x, y, cv2.INTER_NEAREST, borderMode=border), np.float32)

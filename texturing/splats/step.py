@@ -14,7 +14,7 @@ from scan2sim.pipeline.core.parameters import Seed
 from scan2sim.pipeline.core.splats import SplatLayer, Splats
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.tile_cell import TileCell
-from scan2sim.pipeline.core.types import Bools, Mesh
+from scan2sim.pipeline.core.types import Bools, Mesh, PointCloud
 from scan2sim.pipeline.io import views as views_io
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ class SplatsParams(Params):
         epochs: visits of every photo in a quarter, half and full size.
         parked: show vehicles that stand still, although the mesh may leave them out; those that moved are never shown.
         cover: weight of the loss that covers what isn't sky and uncovers what is.
+        depth: weight of the loss that holds splats to the depth of the scan, along each photo's rays.
         seed: of the order in which photos are visited.
     """
 
@@ -61,6 +62,7 @@ class SplatsParams(Params):
     epochs: tuple[int, int, int] = Field((5, 12, 14), json_schema_extra={"range": "3 numbers, 0 to 1,000"})
     parked: bool = True
     cover: float = Field(0.017, ge=0, le=1)
+    depth: float = Field(0.1, ge=0, le=10)
     seed: Seed = 0
     context: SplatsContext = SplatsContext()
 
@@ -69,7 +71,7 @@ def splats(inputs: Inputs, params: SplatsParams, out: Path, report: Report, chec
     """Train splats on the photos `views` that aren't held out.
 
     Inputs: `views`, their `depth` maps and `exposures`; `mesh.*`; optionally `labels`, class probabilities of photos,
-    and `instances`, boxes of vehicles and people.
+    `instances`, boxes of vehicles and people, and `moving`, points of what moved.
 
     File: `splats`, a `SplatLayer`, without any splats if fewer than two photos can be used.
     """
@@ -84,7 +86,9 @@ def splats(inputs: Inputs, params: SplatsParams, out: Path, report: Report, chec
         return Done({"splats": out / SPLATS_FILE}, {"photos": len(used), "splats": 0})
     first = len(training.descent.parameters)
     used.clear()  # training needs the shots only
-    _train(training, seen, Schedule(params.epochs, cover=params.cover, seed=params.seed), state, report)
+    _train(
+        training, seen, Schedule(params.epochs, cover=params.cover, depth=params.depth, seed=params.seed), state, report
+    )
     result = _within_cell(training.result(), params.context)
     SplatLayer(result, training.background.texture).save(out / SPLATS_FILE)
     metrics = {"photos": len(excluded), "first": first, "splats": len(result)}
@@ -101,7 +105,8 @@ def _prepared(inputs: Inputs, params: SplatsParams, report: Report) -> tuple[lis
 
     meshes = [Mesh.load(path) for name, path in inputs.items() if name.startswith("mesh.")]
     world, exposures = Renderer([Body(mesh) for mesh in meshes]), Exposures.load(inputs["exposures"])
-    moving = MovingMask(inputs.get("instances"), meshes[0].frame, params.parked)
+    points = PointCloud.load(inputs["moving"]) if "moving" in inputs else None
+    moving = MovingMask(inputs.get("instances"), meshes[0].frame, params.parked, points)
     views, held_out = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
     used, excluded = [], []
     for k, view in enumerate(views):

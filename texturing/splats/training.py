@@ -38,6 +38,7 @@ class Schedule:
         epochs: visits of every photo in a quarter, half and full size.
         position, scale, rotation, opacity, colour: first step of each parameter; positions in sizes of the splat.
         cover: weight of the loss that covers what isn't sky, and uncovers what is.
+        depth: weight of the deviation from known depths, relative to these.
         seed: of the order of the photos.
     """
 
@@ -48,6 +49,7 @@ class Schedule:
     opacity: float = 0.05
     colour: float = 0.015
     cover: float = 0.017
+    depth: float = 0.1
     seed: int = 0
 
 
@@ -102,7 +104,8 @@ class Training:
 
     def rendered(self, level: Level) -> tuple[rasterizer.Rendered, F32]:
         """The splats in a photo, and the background there."""
-        return rasterizer.render(self.descent.parameters, level.camera), self.background.seen(level.texels)
+        drawn = rasterizer.render(self.descent.parameters, level.camera, level.known)
+        return drawn, self.background.seen(level.texels)
 
     def _visit(self, k: int, level: Level, schedule: Schedule, decay: float) -> float:
         """Take a step towards a photo; returns the PSNR before it."""
@@ -113,7 +116,8 @@ class Training:
         _, gradient = loss.photometric(shown, level.rgb, level.weight)
         gradient = np.where(level.clipped & (shown > level.rgb), np.float32(0), gradient) * self.gains.gain[k]
         cover = np.float32(schedule.cover) * level.weight * np.where(level.sky, np.float32(1), np.float32(-1))
-        found = drawn.gradients(behind, gradient, by_alpha=cover)
+        by_depth = np.float32(schedule.depth) * level.weight * (level.known > 0)
+        found = drawn.gradients(behind, gradient, by_depth, cover)
         first = rates(schedule.position, schedule.scale, schedule.rotation, schedule.opacity, schedule.colour)
         self.descent.step(drawn.seen, found, first * np.float32(decay))
         through = np.where(drawn.transmittance > MIN_BACKGROUND, drawn.transmittance, np.float32(0))

@@ -14,7 +14,9 @@ from scan2sim.texturing.splats.projection import Pinhole
 from scan2sim.texturing.splats.shots import FACE_ROTATIONS
 
 FACE_DENSITY = 1.1
-"""Pixels of a cube's faces per pixel in the middle of a wide lens, along a line."""
+"""Pixels of the pinhole images per pixel in the middle of another lens, along a line."""
+WIDEST = 1.5
+"""Slope of rays up to which one pinhole image is used for a lens."""
 SOLID = 0.5
 """Least cover of a pixel that has a depth."""
 
@@ -61,7 +63,7 @@ class SplatRenderer:
         return colour, (depth * np.linalg.norm(rays, axis=-1)).astype(np.float32), cover
 
     def _resampled(self, camera: Camera, T_world_cam: F64) -> tuple[F32, F32, F32]:
-        """The same of other cameras: each pixel from the face of a cube that its ray passes."""
+        """The same of other cameras: each pixel from the pinhole image that its ray passes."""
         import cv2
 
         from scan2sim.pipeline.camera.models import pixel_angle, pixel_rays
@@ -69,21 +71,36 @@ class SplatRenderer:
         rays = pixel_rays(camera).astype(np.float64)
         seen = np.isfinite(rays).all(axis=-1)
         rays = np.nan_to_num(rays)
-        side = max(16, round(2 * FACE_DENSITY / pixel_angle(camera)))
-        face = Camera("pinhole", side, side, side / 2, side / 2, (side - 1) / 2, (side - 1) / 2)
         found = np.zeros((*rays.shape[:2], 5), np.float32)
-        for rotation in FACE_ROTATIONS:
+        for pinhole, rotation in _pinholes(rays[seen], FACE_DENSITY / pixel_angle(camera)):
             own = rays @ rotation
-            through = seen & (own[..., 2] >= np.abs(own[..., :2]).max(axis=-1)) & (own[..., 2] > 0)
+            x, y = (own[..., k] / np.maximum(own[..., 2], 1e-9) for k in (0, 1))
+            x, y = x * pinhole.fx + pinhole.cx, y * pinhole.fy + pinhole.cy
+            through = seen & (own[..., 2] > 0) & (np.abs(x - (pinhole.width - 1) / 2) <= pinhole.width / 2)
+            through &= np.abs(y - (pinhole.height - 1) / 2) <= pinhole.height / 2
             if not through.any():
                 continue
             pose = np.asarray(T_world_cam, np.float64).copy()
             pose[:3, :3] = pose[:3, :3] @ rotation
-            colour, distance, cover = self._pinhole(face, pose)
-            image = np.dstack([colour, distance, cover])
-            x, y = (own[..., k] / np.maximum(own[..., 2], 1e-9) * face.fx + face.cx for k in (0, 1))
+            image = np.dstack(self._pinhole(pinhole, pose))
             sampled = cv2.remap(
                 image, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
             )
             found[through] = sampled[through]
         return found[..., :3], found[..., 3], found[..., 4]
+
+
+def _pinholes(rays: F64, focal: float) -> list[tuple[Camera, F64]]:
+    """Pinhole cameras that together see rays (N, 3), and their rotations to the rays' axes.
+
+    One, as wide as the rays, if none is farther than `atan(WIDEST)` from the optical axis, else the faces of a cube.
+    """
+    ahead = rays[:, 2] > 0
+    slope = rays[:, :2] / np.where(ahead, rays[:, 2], 1)[:, None]
+    if len(rays) and ahead.all() and np.abs(slope).max() < WIDEST:
+        low, high = np.floor(slope.min(axis=0) * focal), np.ceil(slope.max(axis=0) * focal)
+        width, height = (high - low + 1).astype(int).tolist()
+        return [(Camera("pinhole", width, height, focal, focal, -float(low[0]), -float(low[1])), np.eye(3))]
+    side = max(16, round(2 * focal))
+    face = Camera("pinhole", side, side, side / 2, side / 2, (side - 1) / 2, (side - 1) / 2)
+    return [(face, rotation) for rotation in FACE_ROTATIONS]

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 import pytest
 
+from scan2sim.pipeline.camera.models import pixel_rays
 from scan2sim.pipeline.camera.renderer import look_at
 from scan2sim.pipeline.core.splats import Splats
 from scan2sim.pipeline.core.types import F32, F64, Camera
@@ -56,9 +57,9 @@ def test_a_splat_beside_the_image_does_not_explode() -> None:
     assert (drawn.transmittance[:, : CAMERA.width // 2] > 0.99).all()
 
 
-def loss_of(parameters: F64, cut_by: F64, weights: tuple[F64, F64, F64], background: F64) -> float:
+def loss_of(parameters: F64, base: F64, weights: tuple[F64, F64, F64], background: F64, known: F64) -> float:
     """A linear function of the image that the reference draws."""
-    colour, depth, through = reference.render(parameters, CAMERA, POSE, 1 / 255, cut_by)
+    colour, depth, through = reference.render(parameters, CAMERA, POSE, 1 / 255, base, known)
     over = colour + through[..., None] * background
     return float((weights[0] * over).sum() + (weights[1] * depth).sum() + (weights[2] * (1 - through)).sum())
 
@@ -71,23 +72,44 @@ def test_gradients_are_those_of_finite_differences(seed: int) -> None:
     by_colour = np.stack(smooth[:3], axis=-1)[None] * np.ones((CAMERA.height, 1, 1))
     by_depth, by_alpha = 0.1 * smooth[3][None] * np.ones((CAMERA.height, 1)), smooth[4] * np.ones((CAMERA.height, 1))
     background = random.uniform(0, 1, (CAMERA.height, CAMERA.width, 3))
-    drawn = rasterizer.render(parameters, Pinhole.of(CAMERA, POSE))
+    known = np.zeros((CAMERA.height, CAMERA.width))
+    known[:20] = 4.5  # some splats are nearer, some farther, some more than the greatest deviation away
+    drawn = rasterizer.render(parameters, Pinhole.of(CAMERA, POSE), known.astype(np.float32))
     found = np.zeros(parameters.shape)
     found[drawn.seen] = drawn.gradients(
         *(one.astype(np.float32) for one in (background, by_colour, by_depth, by_alpha))
     )
-    expected, step = np.zeros(parameters.shape), 1e-4
+    base, expected, step = parameters.astype(float), np.zeros(parameters.shape), 1e-4
     for i in range(len(parameters)):
         for k in range(parameters.shape[1]):
             values = []
             for sign in (1, -1):
-                moved = parameters.astype(float)
+                moved = base.copy()
                 moved[i, k] += sign * step
-                values.append(loss_of(moved, parameters.astype(float), (by_colour, by_depth, by_alpha), background))
+                values.append(loss_of(moved, base, (by_colour, by_depth, by_alpha), background, known))
             expected[i, k] = (values[0] - values[1]) / (2 * step)
     for k in range(parameters.shape[1]):
         scale = np.abs(expected[:, k]).max()
         assert np.abs(found[:, k] - expected[:, k]).max() < 0.03 * scale, f"parameter {k}"
+
+
+def test_depth_is_that_of_the_plane_in_which_flat_splats_lie() -> None:
+    """Not that of their centres: one splat covers depths of a metre and more here."""
+    floor = Splats.of(
+        np.array([[0, 0, 0.0]]), np.array([[0.5, 0.5, 0.001]]), np.array([[1.0, 0, 0, 0]]), np.array([0.99]),
+        np.ones((1, 3)),
+    )  # fmt: skip
+    drawn = rasterizer.render(floor.parameters, Pinhole.of(CAMERA, POSE))
+    rays = pixel_rays(CAMERA).astype(np.float64)
+    rays /= rays[..., 2:]
+    truth = -POSE[2, 3] / (rays @ POSE[:3, :3].T)[..., 2]
+    cover = 1 - drawn.transmittance
+    sure = cover > 0.3
+    found = (drawn.depth / np.maximum(cover, 1e-6))[sure]
+    assert np.ptp(truth[sure]) > 1
+    # the projection is linearized in the centre
+    assert np.abs(found - truth[sure]).max() < 0.25 * np.ptp(truth[sure])
+    assert np.median(np.abs(found - truth[sure])) < 0.1 * np.ptp(truth[sure])
 
 
 def test_images_and_gradients_do_not_depend_on_the_number_of_threads() -> None:
