@@ -31,11 +31,8 @@ class Background:
         """(H, W, 3) colours at texels (H, W, 2), see `texels`."""
         import cv2
 
-        padded = np.concatenate([self.texture[:, -1:], self.texture, self.texture[:, :1]], axis=1)
-        colours = cv2.remap(
-            padded, texels[..., 0] + 1, texels[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-        return np.asarray(colours, np.float32)
+        found = cv2.remap(self.texture, texels[..., 0], texels[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        return np.asarray(found, np.float32)
 
     def descend(self, texels: F32, gradient: F32, rate: float) -> None:
         """Take a step (Adam, of the texels that are seen) against derivatives (H, W, 3) of a loss by `seen`."""
@@ -61,11 +58,12 @@ class Background:
 
 
 def texels(directions: F64 | F32) -> F32:
-    """Column and row (..., 2) of directions (..., 3) in the texture; any length."""
+    """Column and row (..., 2) of directions (..., 3) in the texture; any length. Columns are periodic, rows are not."""
     x, y, z = np.moveaxis(directions, -1, 0)
     azimuth, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
     column = (azimuth / (2 * np.pi) + 0.5) * WIDTH_PX - 0.5
-    return np.stack([column, (0.5 - elevation / np.pi) * HEIGHT_PX - 0.5], axis=-1).astype(np.float32)
+    row = np.clip((0.5 - elevation / np.pi) * HEIGHT_PX - 0.5, 0, HEIGHT_PX - 1)
+    return np.stack([column, row], axis=-1).astype(np.float32)
 
 
 def directions() -> F64:

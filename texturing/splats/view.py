@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from scan2sim.pipeline.core.splats import SplatLayer
-from scan2sim.pipeline.core.types import F32, F64, U8, Camera
+from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Camera
 from scan2sim.texturing.splats import rasterizer
 from scan2sim.texturing.splats.background import Background, texels
 from scan2sim.texturing.splats.projection import Pinhole
@@ -15,6 +16,8 @@ from scan2sim.texturing.splats.shots import FACE_ROTATIONS
 
 FACE_DENSITY = 1.1
 """Pixels of the pinhole images per pixel in the middle of another lens, along a line."""
+KEPT_CAMERAS = 16
+"""Cameras of which rays are kept between views."""
 WIDEST = 1.5
 """Slope of rays up to which one pinhole image is used for a lens."""
 SOLID = 0.5
@@ -53,41 +56,57 @@ class SplatRenderer:
 
     def _pinhole(self, camera: Camera, T_world_cam: F64) -> tuple[F32, F32, F32]:
         """Colour, range and cover of a pinhole view."""
-        x, y = np.meshgrid((np.arange(camera.width) - camera.cx) / camera.fx,
-                           (np.arange(camera.height) - camera.cy) / camera.fy)  # fmt: skip
-        rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+        rays, length = _rays(camera)
         drawn = rasterizer.render(self._parameters, Pinhole.of(camera, T_world_cam))
-        colour = drawn.over(self._background.seen(texels(rays @ T_world_cam[:3, :3].T)))
+        colour = drawn.over(self._background.seen(texels(rays @ T_world_cam[:3, :3].T.astype(np.float32))))
         cover = 1 - drawn.transmittance
-        depth = drawn.depth / np.maximum(cover, 1e-6)
-        return colour, (depth * np.linalg.norm(rays, axis=-1)).astype(np.float32), cover
+        return colour, drawn.depth / np.maximum(cover, np.float32(1e-6)) * length, cover
 
     def _resampled(self, camera: Camera, T_world_cam: F64) -> tuple[F32, F32, F32]:
         """The same of other cameras: each pixel from the pinhole image that its ray passes."""
         import cv2
 
-        from scan2sim.pipeline.camera.models import pixel_angle, pixel_rays
-
-        rays = pixel_rays(camera).astype(np.float64)
-        seen = np.isfinite(rays).all(axis=-1)
-        rays = np.nan_to_num(rays)
-        found = np.zeros((*rays.shape[:2], 5), np.float32)
-        for pinhole, rotation in _pinholes(rays[seen], FACE_DENSITY / pixel_angle(camera)):
-            own = rays @ rotation
-            x, y = (own[..., k] / np.maximum(own[..., 2], 1e-9) for k in (0, 1))
-            x, y = x * pinhole.fx + pinhole.cx, y * pinhole.fy + pinhole.cy
-            through = seen & (own[..., 2] > 0) & (np.abs(x - (pinhole.width - 1) / 2) <= pinhole.width / 2)
-            through &= np.abs(y - (pinhole.height - 1) / 2) <= pinhole.height / 2
-            if not through.any():
-                continue
+        found = np.zeros((camera.height, camera.width, 5), np.float32)
+        for pinhole, rotation, x, y, through in _parts(camera):
             pose = np.asarray(T_world_cam, np.float64).copy()
             pose[:3, :3] = pose[:3, :3] @ rotation
             image = np.dstack(self._pinhole(pinhole, pose))
-            sampled = cv2.remap(
-                image, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-            )
+            sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             found[through] = sampled[through]
         return found[..., :3], found[..., 3], found[..., 4]
+
+
+@lru_cache(KEPT_CAMERAS)
+def _rays(camera: Camera) -> tuple[F32, F32]:
+    """(H, W, 3) rays of a pinhole camera, 1 m ahead, and their lengths (H, W)."""
+    x, y = np.meshgrid((np.arange(camera.width) - camera.cx) / camera.fx,
+                       (np.arange(camera.height) - camera.cy) / camera.fy)  # fmt: skip
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).astype(np.float32)
+    return rays, np.asarray(np.linalg.norm(rays, axis=-1), np.float32)
+
+
+@lru_cache(KEPT_CAMERAS)
+def _parts(camera: Camera) -> list[tuple[Camera, F64, F32, F32, Bools]]:
+    """Pinhole cameras that together see what a camera sees.
+
+    Returns:
+        for each its rotation to the camera's axes, its pixels (H, W) of the camera's rays, and where they are inside.
+    """
+    from scan2sim.pipeline.camera.models import pixel_angle, pixel_rays
+
+    rays = pixel_rays(camera).astype(np.float64)
+    seen = np.isfinite(rays).all(axis=-1)
+    rays = np.nan_to_num(rays)
+    parts = []
+    for pinhole, rotation in _pinholes(rays[seen], FACE_DENSITY / pixel_angle(camera)):
+        own = rays @ rotation
+        x, y = (own[..., k] / np.maximum(own[..., 2], 1e-9) for k in (0, 1))
+        x, y = x * pinhole.fx + pinhole.cx, y * pinhole.fy + pinhole.cy
+        inside = seen & (own[..., 2] > 0) & (np.abs(x - (pinhole.width - 1) / 2) <= pinhole.width / 2)
+        inside &= np.abs(y - (pinhole.height - 1) / 2) <= pinhole.height / 2
+        if inside.any():
+            parts.append((pinhole, rotation, x.astype(np.float32), y.astype(np.float32), inside))
+    return parts
 
 
 def _pinholes(rays: F64, focal: float) -> list[tuple[Camera, F64]]:
