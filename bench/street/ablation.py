@@ -9,7 +9,7 @@ steps that its settings affect. Its metrics are stored in `rows.json` below `--o
 eye in `eye/PART/STREET`; rows that are stored already aren't measured again, so an interrupted ablation continues.
 
 raw 0013 is scored by its sweeps only; the other streets by photos and sweeps. Vehicles are excluded from the metrics as
-in `bench.street`; `outline_px` is the median over all outlines, `remains_m2` the maximum over parked vehicles (only
+in `bench.street`; `outline_px` is the median over all outlines, `residue_m2` the maximum over parked vehicles (only
 raw 0009 has their boxes). `pictures/STREET.png` below `--out` shows the worlds from the driver's eye, a column for each
 part. Ends with `RESULT {json}`: by part and street.
 """
@@ -51,7 +51,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
 """Settings that switch off a part; `foliage_added` switches on leaf cards, which are off by default."""
 METRICS = (
     "psnr_db", "ssim", "nogain_psnr_db", "sharpness", "frame_psnr_db", "frame_msssim", "outline_px", "inside_mesh",
-    "corridor_m2", "remains_m2", "seen_share",
+    "corridor_m2", "residue_m2", "seen_share",
 )  # fmt: skip
 """By photos."""
 LIDAR_METRICS = (
@@ -79,7 +79,7 @@ def metrics(street: Street, folder: Path, pictures: Path, settings: tuple[str, .
         found |= score_world(street, tile, run, pictures)
         displacements = found["displacements_px"]
         found["outline_px"] = float(np.median(displacements)) if displacements else None
-        found["remains_m2"] = max(found["remains_m2"].values(), default=0.0)
+        found["residue_m2"] = max(found["residue_m2"].values(), default=0.0)
     known = {name: found[name] for name in (*METRICS, *LIDAR_METRICS) if name in found}
     return {name: None if value is None else round(float(value), 3) for name, value in known.items()}
 

@@ -193,7 +193,7 @@ def score_world(
         "inside_mesh": int((world.distance(path) < 1.0).sum()),
         "nearest_m": float(world.distance(path).min()),
         "corridor_m2": boxes.corridor(world, path),
-        "remains_m2": left,
+        "residue_m2": left,
         "outlines": {name: float(np.median(s)) for name, s in shifts if len(s)},
         "displacements_px": together.tolist(),
         "displacements_scanned_px": together[np.concatenate([np.zeros(0, bool), *scanned])].tolist(),
@@ -322,8 +322,8 @@ def table(figures: Mapping[str, Mapping[str, Any]]) -> None:
         print(
             f" surface where the car drove: {one['corridor_m2']:.1f} m2; textured from photos {one['seen_share']:.0%}"
         )
-        if one["remains_m2"]:
-            left = {track: round(area, 2) for track, area in one["remains_m2"].items()}
+        if one["residue_m2"]:
+            left = {track: round(area, 2) for track, area in one["residue_m2"].items()}
             print(f"  surface remaining of vehicles, m2 by track: {left}")
         if "wrongly_removed" in one:
             frame.table(one)
@@ -364,7 +364,7 @@ def result(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         "raw0009_keep_psnr_db": keep.get("psnr_db"),
         "sharpness_min": min((part["sharpness"] for part in both), default=None),
         "inside_mesh": sum(part["inside_mesh"] for part in both) if both else None,
-        "remains_m2": max(raw["remains_m2"].values()) if raw.get("remains_m2") else None,
+        "residue_m2": max(raw["residue_m2"].values()) if raw.get("residue_m2") else None,
         "static_lost": synthetic_part.get("static_lost"),
         "pole_recall": synthetic_part.get("pole_recall"),
         "seen_share_min": min((part["seen_share"] for part in both), default=None),

@@ -31,11 +31,13 @@ AREAS = ("area_m2", "seen_m2", "coloured_m2", "filled_m2")
 ALBUMS = (
     ("pictures", "pictures", "", ""),
     ("score", "frames", "", ""),
+    ("score", "splat_frames", "", ""),
     ("score", "error", "photos", "psnr_gain_db"),
     ("lidar_score", "images", "sweeps", "f_score"),
 )
 """Steps with images: step, output, and, if only the worst, median and best image is shown, the metric with the figures
 of each image, and the figure by which they are ordered."""
+WHOLE_FRAMES = ("frames", "splat_frames")
 FRAMES_MAX = 24
 """Whole frames that the page shows, evenly over the held-out photos; all are in the results of the step `score`."""
 REMOVED_MAX = 40
@@ -70,11 +72,11 @@ def write_report(
     keys = {p.task.id.name: p.key for p in planned}
     pictures: list[Picture] = []
     for task, name, scores, key in ALBUMS:
-        if task in done:
+        if task in done and name in done[task].files:
             folder = store.folder(task, keys[task]) / done[task].files[name]
             entries = json.loads((folder / "index.json").read_text(encoding="utf-8"))
             shown = representative(entries, done[task].metrics[scores], key) if scores else entries
-            shown = evenly(shown, FRAMES_MAX) if name == "frames" else shown
+            shown = evenly(shown, FRAMES_MAX) if name in WHOLE_FRAMES else shown
             pictures += [_with_pixels(entry, folder) for entry in shown]
     page = out / PAGE
     view = done["preview"].metrics if "preview" in done and done["preview"].files else None
