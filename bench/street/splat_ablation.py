@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-
 from bench.paths import ROOT
 from bench.street import lidar, splats
 from bench.street.run import STREETS, splats_of

@@ -30,7 +30,7 @@ NEAREST_M = 5.0
 NEAR_SHARE_M = 0.22
 """Range error of returns that count as near."""
 HIDDEN_PX, HIDDEN_SHARE = 3, 0.95
-"""Returns are compared where none within so many pixels is nearer than this share of their range: the camera is beside
+"""Returns are compared where none within this number of pixels is nearer than this share of their range: the camera is beside
 the scanner and doesn't see all that it sees."""
 
 
@@ -70,6 +70,7 @@ def metrics(
         megabytes = spz.stat().st_size / 1e6
     started = time.process_time()
     rendered(renderer, next(iter(photos.values())))
+    render_ms = 1000 * (time.process_time() - started)
     return {
         "photos": rows,
         **{key: float(np.mean([row[key] for row in rows.values()])) for key in next(iter(rows.values()))},
@@ -77,7 +78,7 @@ def metrics(
         **_depth(data, tile, run, renderer, photos, vehicles),
         "splats": len(layer.splats),
         "mb": megabytes,
-        "render_ms": 1000 * (time.process_time() - started),
+        "render_ms": render_ms,
         **used,
     }
 

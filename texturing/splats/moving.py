@@ -25,7 +25,7 @@ class MovingMask:
     Args:
         instances: boxes on the ground, from the step `instances`; None: all vehicles and people count as moving.
         frame: the tile's frame.
-        parked: vehicles that stand still are shown.
+        parked: parked vehicles are shown.
         points: points that moved, with normals and times; None: none.
     """
 

@@ -62,7 +62,7 @@ class SplatsParams(Params):
     epochs: tuple[int, int, int] = Field((5, 12, 14), json_schema_extra={"range": "3 numbers, 0 to 1,000"})
     parked: bool = True
     cover: float = Field(0.017, ge=0, le=1)
-    depth: float = Field(0.1, ge=0, le=10)
+    depth: float = Field(0.3, ge=0, le=10)
     seed: Seed = 0
     context: SplatsContext = SplatsContext()
 

@@ -14,7 +14,7 @@ SIZE = 16
 """Width and height of a tile in pixels."""
 PIXELS = SIZE * SIZE
 DEPTH_LEVELS = 2**16 - 1
-"""Depths are sorted by their logarithm in so many levels: to a thousandth of the depth or better."""
+"""Number of levels of the logarithm of depths, by which splats are sorted: a thousandth of the depth or better."""
 
 
 class Assignment(NamedTuple):

@@ -49,7 +49,7 @@ class Schedule:
     opacity: float = 0.05
     colour: float = 0.015
     cover: float = 0.017
-    depth: float = 0.1
+    depth: float = 0.3
     seed: int = 0
 
 

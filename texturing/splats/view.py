@@ -60,7 +60,7 @@ class SplatRenderer:
         drawn = rasterizer.render(self._parameters, Pinhole.of(camera, T_world_cam))
         colour = drawn.over(self._background.seen(texels(rays @ T_world_cam[:3, :3].T.astype(np.float32))))
         cover = 1 - drawn.transmittance
-        return colour, drawn.depth / np.maximum(cover, np.float32(1e-6)) * length, cover
+        return colour, np.asarray(drawn.depth / np.maximum(cover, np.float32(1e-6)) * length, np.float32), cover
 
     def _resampled(self, camera: Camera, T_world_cam: F64) -> tuple[F32, F32, F32]:
         """The same of other cameras: each pixel from the pinhole image that its ray passes."""
