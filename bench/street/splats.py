@@ -30,8 +30,8 @@ NEAREST_M = 5.0
 NEAR_SHARE_M = 0.22
 """Range error of returns that count as near."""
 HIDDEN_PX, HIDDEN_SHARE = 3, 0.95
-"""Returns are compared where none within this number of pixels is nearer than this share of their range: the camera is beside
-the scanner and doesn't see all that it sees."""
+"""Returns are compared where none within this number of pixels is nearer than this share of their range: the camera is
+beside the scanner and doesn't see all that it sees."""
 
 
 def metrics(
