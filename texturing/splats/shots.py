@@ -157,7 +157,7 @@ def known_distance(photo: Photo) -> F32:
 
     around = np.ones((3, 3), np.uint8)
     least, most = cv2.erode(photo.known, around), cv2.dilate(photo.known, around)
-    return np.where(np.isfinite(most) & (most < MAX_STEP * least), photo.known, 0).astype(np.float32)
+    return np.where(np.isfinite(most) & (most / MAX_STEP < least), photo.known, 0).astype(np.float32)
 
 
 def _pinholes(camera: Camera) -> list[tuple[Camera, F64]]:
