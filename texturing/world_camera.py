@@ -23,8 +23,8 @@ class CameraImage:
 
     Attributes:
         rgb: (H, W, 3) uint8.
-        range: metres along the ray to the first surface, inf where there is none.
-        code: uint8 LAS code of that surface, 0 where there is none.
+        range: metres along the ray to the first surface; where there is none, to the splats, or inf.
+        code: uint8 LAS code of the first surface, 0 where there is none.
     """
 
     rgb: U8
@@ -32,7 +32,10 @@ class CameraImage:
     code: U8
 
     def depth(self, camera: Camera) -> F32:
-        """(H, W) metres along the optical axis, as depth cameras of ROS give it; inf where there is nothing."""
+        """(H, W) metres along the optical axis, as depth cameras give it; inf where there is nothing.
+
+        It is negative behind a panorama's camera: use `range` there.
+        """
         from scan2sim.pipeline.camera.models import pixel_rays
 
         return np.asarray(self.range * pixel_rays(camera)[..., 2], np.float32)

@@ -25,6 +25,7 @@ EXTRA_OF = {
     "rasterio": "rasters",
     "pxr": "usd",
     "meshopt": "gltf",
+    "gsply": "splats",
     "DracoPy": "gltf",
     "cyclonedds": "bus",
     "rosbags": "bus",

@@ -1,4 +1,4 @@
-"""Files of 3D Gaussian splats: PLY of the literature, and SPZ, which is a tenth as large (package `gsply`)."""
+"""Files of 3D Gaussian splats: PLY of the literature, and SPZ, which is a seventh as large (package `gsply`)."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -162,6 +163,27 @@ def prepare(
         np.asarray(cv2.resize(corrected, size, interpolation=cv2.INTER_AREA), np.float32), seen >= CLIPPED_LEVEL,
         np.clip(corrected, 0, 255).astype(np.uint8), is_sky, rgb >= CLIPPED_LEVEL, reduced(masked),
     )  # fmt: skip
+
+
+def choose(views: Sequence[View], usable: Sequence[int], spacing: float, max_photos: int) -> list[int]:
+    """Indices of `usable` photos at least `spacing` metres apart (unless they look elsewhere), at most `max_photos`.
+
+    With more, the spacing is larger. Orthophotos aren't chosen.
+    """
+    candidates = [k for k in usable if views[k].camera.model != "orthographic"]
+    while True:
+        chosen: list[int] = []
+        for k in candidates:
+            near = (
+                np.linalg.norm(views[k].centre - views[c].centre) < 0.95 * spacing
+                and views[k].T_world_cam[:3, 2] @ views[c].T_world_cam[:3, 2] > 0.9
+                for c in chosen
+            )
+            if not any(near):
+                chosen.append(k)
+        if len(chosen) <= max_photos:
+            return chosen
+        spacing *= 1.25
 
 
 def _corrected(rgb: U8, exposure: F64) -> F32:

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.tile_cell import TileCell
-from scan2sim.pipeline.core.types import F32, I32, Frame, Mesh, View
+from scan2sim.pipeline.core.types import F32, I32, Frame, Mesh
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.worlds.scene import LAYERS_PAGE, SKY_PAGE
@@ -63,7 +63,8 @@ def backdrop(inputs: Inputs, params: BackdropParams, out: Path, report: Report) 
     meshes = [Mesh.load(path) for name, path in inputs.items() if name.startswith("mesh.")]
     world, exposures = Renderer([Body(mesh) for mesh in meshes]), Exposures.load(inputs["exposures"])
     views, held_out = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
-    chosen = _choose(views, [k for k, held in enumerate(held_out) if not held], params)
+    free = [k for k, held in enumerate(held_out) if not held]
+    chosen = prepared.choose(views, free, params.spacing, params.max_photos)
     used = []
     for done, k in enumerate(chosen):
         report(0.3 * done / len(chosen), views[k].name)
@@ -121,25 +122,6 @@ def _joined(frame: Frame, parts: Sequence[tuple[int, F32, I32, F32]]) -> Mesh:
         uv=np.concatenate(uv),
         page=np.concatenate([np.full(len(face), page, np.int16) for page, face in zip(pages, faces, strict=True)]),
     )
-
-
-def _choose(views: Sequence[View], usable: Sequence[int], params: BackdropParams) -> list[int]:
-    """Indices of photos at least `spacing` apart (unless they look elsewhere), at most `max_photos`."""
-    candidates = [k for k in usable if views[k].camera.model != "orthographic"]
-    spacing = params.spacing
-    while True:
-        chosen: list[int] = []
-        for k in candidates:
-            near = (
-                np.linalg.norm(views[k].centre - views[c].centre) < 0.95 * spacing
-                and views[k].T_world_cam[:3, 2] @ views[c].T_world_cam[:3, 2] > 0.9
-                for c in chosen
-            )
-            if not any(near):
-                chosen.append(k)
-        if len(chosen) <= params.max_photos:
-            return chosen
-        spacing *= 1.25
 
 
 BACKDROP = Step("backdrop", 4, backdrop, BackdropParams, memory=(1.5, 3))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -29,6 +29,7 @@ CHECKPOINT_S = 60.0
 MATCHING_PIXELS, HYPOTHESES, NEIGHBOURS = 113_000, 128, 4
 """Size of the images in which depth is estimated, number of inverse depths, and of photos to compare with."""
 UNMASKED = "vehicles and people are not recognized, so that moving ones may leave traces: run it with the step `label`"
+TOO_FEW = "there are no splats: at least two photos that show something are needed"
 STATE_FILE, SPLATS_FILE = "training.npz", "splats.npz"
 DEPTH_SHARE, TRAINING_SHARE = 0.05, 0.2
 """Progress at which depth is estimated, and at which the training begins."""
@@ -46,20 +47,29 @@ class SplatsContext(Context):
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
+Epochs = Annotated[int, Field(ge=0, le=1000)]
+
+
 class SplatsParams(Params):
     """Splats: what cameras see, beside the mesh, which is for physics and lidars.
 
     Attributes:
-        when: never: no splats; auto: if there are photos taken from the street.
-        epochs: visits of every photo in a quarter, half and full size.
-        parked: show vehicles that stand still, although the mesh may leave them out; those that moved are never shown.
-        cover: weight of the loss that covers what isn't sky and uncovers what is.
-        depth: weight of the loss that holds splats to the depth of the scan, along each photo's rays.
-        seed: of the order in which photos are visited.
+        when: never: no splats; auto: outdoors, if there are photos other than orthophotos.
+        spacing: distance in metres between the photos that are used; photos in between are left out.
+        max_photos: maximum number of photos; with more, the distance between them is larger. One of a megapixel needs
+            about 60 MB of memory.
+        epochs: visits of every photo in a quarter, half and full size; full size is at most a megapixel.
+        parked: show parked vehicles, although the mesh may leave them out, if the step `instances` found them; people
+            and what moved are never shown.
+        cover: weight of the opacity loss: higher opacity where a photo doesn't show sky, lower where it does.
+        depth: weight of the depth loss: relative error against scan and surfaces, along each photo's rays.
+        seed: of the order in which photos are visited, and of the jitter of estimated depths.
     """
 
     when: Literal["never", "auto"] = "never"
-    epochs: tuple[int, int, int] = Field((5, 12, 14), json_schema_extra={"range": "3 numbers, 0 to 1,000"})
+    spacing: float = Field(0.5, ge=0, le=100)
+    max_photos: int = Field(100, ge=2, le=1000)
+    epochs: tuple[Epochs, Epochs, Epochs] = Field((5, 12, 14), json_schema_extra={"range": "3 numbers, 0 to 1,000"})
     parked: bool = True
     cover: float = Field(0.017, ge=0, le=1)
     depth: float = Field(0.3, ge=0, le=10)
@@ -83,7 +93,7 @@ def splats(inputs: Inputs, params: SplatsParams, out: Path, report: Report, chec
     training = _begun(used, excluded, seen, params, state, report)
     if training is None:
         SplatLayer.nothing().save(out / SPLATS_FILE)
-        return Done({"splats": out / SPLATS_FILE}, {"photos": len(used), "splats": 0})
+        return Done({"splats": out / SPLATS_FILE}, {"photos": len(used), "splats": 0}, [TOO_FEW])
     first = len(training.descent.parameters)
     used.clear()  # training needs the shots only
     _train(
@@ -109,9 +119,10 @@ def _prepared(inputs: Inputs, params: SplatsParams, report: Report) -> tuple[lis
     moving = MovingMask(inputs.get("instances"), meshes[0].frame, params.parked, points)
     views, held_out = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
     used, excluded = [], []
-    for k, view in enumerate(views):
-        if held_out[k] or view.camera.model == "orthographic":
-            continue
+    free = [k for k, held in enumerate(held_out) if not held]
+    chosen = prepared.choose(views, free, params.spacing, params.max_photos)
+    for k in chosen:
+        view = views[k]
         report(DEPTH_SHARE * k / len(views), view.name)
         labels = inputs["labels"] / f"{k}.npy" if "labels" in inputs else None
         depth = inputs["depth"] / f"{k}.npy"

@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.splats import SplatLayer
 from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Camera
 from scan2sim.texturing.splats import rasterizer
@@ -46,7 +47,13 @@ class SplatRenderer:
         self._parameters, self._background = layer.splats.parameters, Background(layer.background)
 
     def view(self, camera: Camera, T_world_cam: F64) -> SplatImage:
-        """Render the view of a camera with the pose `T_world_cam` (4, 4)."""
+        """Render the view of a camera with the pose `T_world_cam` (4, 4).
+
+        Raises:
+            SettingError: the camera is orthographic.
+        """
+        if camera.model == "orthographic":
+            raise SettingError("camera", "splats have no orthographic views", "Use a perspective camera, or surfaces")
         if camera.model == "pinhole":
             colour, distance, cover = self._pinhole(camera, T_world_cam)
         else:

@@ -1,7 +1,8 @@
-"""3D Gaussian splats: for each tile `<tile>.ply`, `<tile>.spz` (a tenth of its size) and `<tile>_splats.glb`.
+"""3D Gaussian splats: for each tile `<tile>.ply`, `<tile>.spz` (a seventh of its size) and `<tile>_splats.glb`.
 
 PLY is in world metres, z up; SPZ and the GLB, which has `KHR_gaussian_splatting`, are y up, as the GLB of the mesh. The
-background is a shell of large splats (`SplatLayer.with_shell`).
+background is a shell of large splats (`SplatLayer.with_shell`), unless there are several tiles: their shells would hide
+each other's streets.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
         if layer is None:
             continue
         offset = np.asarray(tile.offset, float)
-        whole = layer.with_shell()
+        whole = layer.with_shell() if len(scene.tiles) == 1 else layer.splats
         splat_files.write(folder / f"{tile.name}.ply", whole, offset)
         splat_files.write(folder / f"{tile.name}.spz", whole.y_up(), offset[[0, 2, 1]] * (1, 1, -1))
         gltf.write(folder / f"{tile.name}_splats.glb", whole, offset)
@@ -42,6 +43,6 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
         raise DataError(
             "splats",
             f"{scene.name} has no splats",
-            "Build it with photos from the ground, and without splats.when=never",
+            "Run it again with --set splats.when=auto; this needs at least two photos other than orthophotos",
         )
     return {}

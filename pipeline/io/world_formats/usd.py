@@ -57,7 +57,7 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
         for level in scene.levels(tile):
             file = f"{FOLDER}/{f'level{level.height}/' if level.height else ''}{tile.name}.usdc"
             make_folder((folder / file).parent)
-            triangles[file] = _write_tile(folder / file, level.tile, tile, params)
+            triangles[file] = _write_tile(folder / file, level.tile, tile, params, len(scene.tiles) == 1)
             files[f"level{level.height}" if level.height else FINEST_VARIANT] = f"./{file}"
         _add_payloads(placed.GetPrim(), files)
     stage.GetRootLayer().Save()
@@ -78,7 +78,7 @@ def _add_payloads(prim: Any, files: dict[str, str]) -> None:
     variants.SetVariantSelection(next(iter(files)))
 
 
-def _write_tile(path: Path, tile: SceneTile, source: SceneTile, params: SceneParams) -> int:
+def _write_tile(path: Path, tile: SceneTile, source: SceneTile, params: SceneParams, alone: bool) -> int:
     """Write a tile's layer in local metres; returns its number of visual triangles.
 
     Args:
@@ -86,6 +86,7 @@ def _write_tile(path: Path, tile: SceneTile, source: SceneTile, params: ScenePar
         tile: the tile at one of its levels of detail, for the visuals.
         source: the scene's own tile, for the collision shapes.
         params: settings.
+        alone: it is the only tile; splats of several have no background, which would hide each other's streets.
     """
     from pxr import Kind, Usd, UsdGeom
 
@@ -111,7 +112,7 @@ def _write_tile(path: Path, tile: SceneTile, source: SceneTile, params: ScenePar
                 triangles += len(part.shape)
     layer = source.splats()
     if layer is not None:
-        usd_splats.add(stage, root, layer.with_shell(), ("Visual", "Backdrop"))
+        usd_splats.add(stage, root, layer.with_shell() if alone else layer.splats, ("Visual", "Backdrop"))
     for solid in solids(source.solid(), source.friction):
         _add_collision(stage, root, solid)
     stage.GetRootLayer().Save()

@@ -16,7 +16,9 @@ EXTENT_DEVIATIONS = 3.0
 
 
 def add(stage: Any, root: Any, splats: Splats, scopes: tuple[str, ...]) -> None:
-    """Add splats to a tile, and the variants that show either them (the default) or its surfaces.
+    """Add splats to a tile, and the variants that show either them or its surfaces, the default.
+
+    Surfaces are the default as they have the classes, and programs that don't draw splats would show nothing else.
 
     Args:
         stage: the tile's layer.
@@ -47,7 +49,7 @@ def add(stage: Any, root: Any, splats: Splats, scopes: tuple[str, ...]) -> None:
         with variants.GetVariantEditContext():
             for name in hidden:
                 stage.GetPrimAtPath(root.GetPath().AppendChild(name)).GetAttribute("visibility").Set("invisible")
-    variants.SetVariantSelection(SPLATS)
+    variants.SetVariantSelection(SURFACES)
 
 
 def _quaternions(splats: Splats) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -58,7 +60,7 @@ def test_the_schema_has_the_splats(stage: Usd.Stage) -> None:
 def test_either_splats_or_surfaces_are_visible_and_collision_stays(stage: Usd.Stage) -> None:
     holder = only(stage, "ParticleField3DGaussianSplat").GetParent()
     variants = holder.GetVariantSet("appearance")
-    assert variants.GetVariantSelection() == "splats"
+    assert variants.GetVariantSelection() == "surfaces", "they have the classes, and every program draws them"
 
     def visible() -> tuple[bool, bool, int]:
         splats = UsdGeom.Imageable(only(stage, "ParticleField3DGaussianSplat")).ComputeVisibility() != "invisible"
@@ -68,6 +70,16 @@ def test_either_splats_or_surfaces_are_visible_and_collision_stays(stage: Usd.St
         return splats, any(UsdGeom.Imageable(one).ComputeVisibility() != "invisible" for one in shown), len(solid)
 
     before = visible()
-    variants.SetVariantSelection("surfaces")
+    variants.SetVariantSelection("splats")
     after = visible()
-    assert before[:2] == (True, False) and after[:2] == (False, True) and before[2] == after[2] > 0
+    assert before[:2] == (False, True) and after[:2] == (True, False) and before[2] == after[2] > 0
+
+
+def test_tiles_of_a_survey_have_no_shell_that_hides_the_next(tmp_path: Path) -> None:
+    town = synthetic.scene(tmp_path, tiles=2)
+    for tile in town.tiles:
+        SplatLayer(some(), np.ones((4, 8, 3), np.float32)).save(tile.folder / SPLATS_FILE)
+    world_formats.write(town, ["usd"], tmp_path / "usd", SceneParams(), silent)
+    for file in (tmp_path / "usd").rglob("tile*.usdc"):
+        prim = only(Usd.Stage.Open(str(file)), "ParticleField3DGaussianSplat")
+        assert len(prim.GetAttribute("positions").Get()) == len(some())

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.camera.renderer import Renderer
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.splats import SplatLayer
 from scan2sim.pipeline.core.step import Done, silent
+from scan2sim.pipeline.core.types import Camera
 from scan2sim.pipeline.io.images import image
 from scan2sim.texturing.evaluate import psnr
 from scan2sim.texturing.splats import step as splats_step
@@ -46,6 +48,12 @@ def test_the_whole_frame_of_a_held_out_photo_is_shown(drive: FacadeDrive, layer:
     scanned = Renderer(SCANNED).view(view.camera, view.T_world_cam, background=(200, 214, 230), samples=2).rgb
     shown = SplatRenderer(layer).view(view.camera, view.T_world_cam).rgb
     assert error_db(shown, photo) > max(22, error_db(scanned, photo) + 8)
+
+
+def test_an_orthographic_view_is_rejected(layer: SplatLayer) -> None:
+    camera = Camera("orthographic", 20, 10, 5.0, 5.0, 10.0, 5.0)
+    with pytest.raises(SettingError, match="orthographic"):
+        SplatRenderer(layer).view(camera, np.eye(4))
 
 
 def test_depth_of_what_was_scanned(drive: FacadeDrive, layer: SplatLayer) -> None:
@@ -97,3 +105,14 @@ def test_fewer_than_two_photos_give_no_splats(tmp_path: Path) -> None:
     (tmp_path / "one").mkdir()
     done = run(FacadeDrive(tmp_path / "one", number=1), tmp_path)
     assert done.metrics["splats"] == 0 and not len(SplatLayer.load(done.files["splats"]).splats)
+    assert "at least two photos" in done.warnings[0]
+
+
+def test_photos_next_to_each_other_are_left_out(drive: FacadeDrive, tmp_path: Path) -> None:
+    done = run(drive, tmp_path, SplatsParams(epochs=(1, 0, 0), max_photos=3))
+    assert 2 <= done.metrics["photos"] <= 3
+
+
+def test_epochs_out_of_range_are_rejected() -> None:
+    with pytest.raises(ValueError, match="epochs"):
+        SplatsParams(epochs=(1, -1, 0))
