@@ -30,6 +30,7 @@ from tests.flows.tiny import scan2sim as run_scan2sim
 
 SETTINGS = COARSE | {
     "navigation": {"when": "always"}, "split": {"vegetation": "locations", "vehicles": "assets"},
+    "splats": {"when": "auto", "epochs": [1, 0, 0]},
 }  # fmt: skip
 scan2sim = partial(run_scan2sim, settings=SETTINGS)
 SIDE_PRODUCTS = tuple(step.name for step in tile_pipeline.SIDE_PRODUCTS)

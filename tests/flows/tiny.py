@@ -58,7 +58,7 @@ def keep_points(tile: Path, kept: Bools) -> None:
     las.write(tile / "cloud.laz", points(tile).take(np.flatnonzero(kept)))
 
 
-def broken(inputs: Inputs, params: Params, out: Path, report: Report) -> Done:
+def broken(inputs: Inputs, params: Params, out: Path, report: Report, *_: object, **__: object) -> Done:
     """A step with a programming error, raised after half of its result is written."""
     (out / "half.txt").write_text("half", encoding="utf-8")
     raise ZeroDivisionError("a bug")
