@@ -81,5 +81,6 @@ def test_tiles_of_a_survey_have_no_shell_that_hides_the_next(tmp_path: Path) -> 
         SplatLayer(some(), np.ones((4, 8, 3), np.float32)).save(tile.folder / SPLATS_FILE)
     world_formats.write(town, ["usd"], tmp_path / "usd", SceneParams(), silent)
     for file in (tmp_path / "usd").rglob("tile*.usdc"):
-        prim = only(Usd.Stage.Open(str(file)), "ParticleField3DGaussianSplat")
-        assert len(prim.GetAttribute("positions").Get()) == len(some())
+        stage = Usd.Stage.Open(str(file))
+        positions = only(stage, "ParticleField3DGaussianSplat").GetAttribute("positions").Get()
+        assert len(positions) == len(some())
