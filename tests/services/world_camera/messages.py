@@ -55,11 +55,11 @@ def camera_info(**changed: Any) -> Any:
     return SimpleNamespace(**fields | changed)
 
 
-def image(pixels: np.ndarray, encoding: str, seconds: float = 0.0, **changed: Any) -> Any:
-    """A `sensor_msgs/Image` of pixels (H, W) or (H, W, C)."""
+def image(pixels: np.ndarray, kind: str, seconds: float = 0.0, **changed: Any) -> Any:
+    """A `sensor_msgs/Image` of pixels (H, W) or (H, W, C) in the encoding `kind`."""
     height, width = pixels.shape[:2]
     fields = {
-        "header": header(seconds), "height": height, "width": width, "encoding": encoding, "is_bigendian": 0,
+        "header": header(seconds), "height": height, "width": width, "encoding": kind, "is_bigendian": 0,
         "step": pixels.nbytes // max(1, height), "data": np.ascontiguousarray(pixels).reshape(-1).view(np.uint8),
     }  # fmt: skip
     return SimpleNamespace(**fields | changed)
