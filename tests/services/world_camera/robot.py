@@ -62,12 +62,8 @@ class Robot:
         self.odom, self.info = self.publisher(ODOMETRY, "/odom"), self.publisher(INFO, "/front/camera_info")
         self.image, self.depth = self.publisher(IMAGE, "/front/image"), self.publisher(IMAGE, "/front/depth_image")
         for name, kind in OUTPUTS.items():
-            self.node.create_subscription(
-                self.ros.message_type(kind),
-                f"/world_camera/{name}",
-                lambda m, name=name: self.save(name, m),
-                QoS(depth=5),
-            )
+            topic, save = f"/world_camera/{name}", partial(self.save, name)
+            self.node.create_subscription(self.ros.message_type(kind), topic, save, QoS(depth=5))
 
     def publisher(self, kind: str, topic: str, durability: Any = "VOLATILE") -> Any:
         return self.node.create_publisher(self.ros.message_type(kind), topic, QoS(depth=50, durability=durability))
