@@ -66,7 +66,7 @@ class _Moving:
         del self.times[:first], self.poses[:first]
 
     def _is_restart(self, time: int, pose: F64) -> bool:
-        """Note a late transform; whether so many have come one after the other that the simulation began again."""
+        """Note a late transform; whether it is the last of `RESTART_COUNT`: the simulation began again."""
         if self._late and time <= self._late[-1][0]:
             self._late.clear()
         self._late.append((time, pose))

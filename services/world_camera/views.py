@@ -81,7 +81,7 @@ def _arrays(view: View) -> tuple[U8, F32, U8]:
 
 
 def _band_count(camera: Camera, poses: F64) -> int:
-    """Number of bands of rows: so many that the image moves by about `BAND_PX` from one to the next."""
+    """Number of bands of rows, from each of which to the next the image moves by about `BAND_PX`."""
     first, last = poses[0], poses[-1]
     cosine = (np.trace(first[:3, :3].T @ last[:3, :3]) - 1) / 2
     turn = np.arccos(np.clip(cosine, -1, 1)) + np.linalg.norm(last[:3, 3] - first[:3, 3]) / NEAR_M

@@ -11,11 +11,11 @@ from tests.waiting import until
 
 
 def test_items_that_wait_are_replaced_by_newer_ones() -> None:
-    begun, go_on, done = threading.Event(), threading.Event(), list[int]()
+    begun, released, done = threading.Event(), threading.Event(), list[int]()
 
     def job(item: int) -> None:
         begun.set()
-        assert go_on.wait(60)
+        assert released.wait(60)
         done.append(item)
 
     worker = LatestWorker(job, "test")
@@ -23,7 +23,7 @@ def test_items_that_wait_are_replaced_by_newer_ones() -> None:
     assert begun.wait(60)
     for item in (2, 3, 4):
         worker.put(item)
-    go_on.set()
+    released.set()
     until(lambda: done == [1, 4])
     assert worker.replaced == 2
     worker.close()
