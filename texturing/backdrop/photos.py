@@ -168,9 +168,11 @@ def prepare(
 def choose(views: Sequence[View], usable: Sequence[int], spacing: float, max_photos: int) -> list[int]:
     """Indices of `usable` photos at least `spacing` metres apart (unless they look elsewhere), at most `max_photos`.
 
-    With more, the spacing is larger. Orthophotos aren't chosen.
+    With more, the spacing is larger; if all look elsewhere, they are taken at equal steps. Orthophotos aren't chosen.
     """
     candidates = [k for k in usable if views[k].camera.model != "orthographic"]
+    centres = np.array([views[k].centre for k in candidates])
+    extent = float(np.linalg.norm(np.ptp(centres, axis=0))) if len(centres) else 0.0
     while True:
         chosen: list[int] = []
         for k in candidates:
@@ -183,7 +185,9 @@ def choose(views: Sequence[View], usable: Sequence[int], spacing: float, max_pho
                 chosen.append(k)
         if len(chosen) <= max_photos:
             return chosen
-        spacing *= 1.25
+        if 0.95 * spacing >= extent:
+            return [chosen[n * len(chosen) // max_photos] for n in range(max_photos)]
+        spacing = max(1.25 * spacing, extent / 1000)
 
 
 def _corrected(rgb: U8, exposure: F64) -> F32:
