@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from time import monotonic_ns
 
 import numpy as np
 
@@ -14,8 +16,9 @@ HISTORY_NS = 10 * 10**9
 """Age, relative to the newest, up to which transforms are kept, as in tf2."""
 MAX_LINKS, MAX_POSES = 10_000, 20_000
 """Frames, and transforms of a frame, that are kept at most."""
-RESTART_COUNT = 5
-"""Successive transforms older than the newest, in ascending order, after which the clock counts as set back."""
+RESTART_COUNT, RESTART_NS = 3, 10**9
+"""Number of transforms older than the newest, and the time in which nothing else arrives, after which the simulation
+counts as begun again: late transforms come in bursts, or between others."""
 
 
 @dataclass
@@ -24,7 +27,6 @@ class _Fixed:
 
     parent: str
     pose: F64
-
     newest: int | None = None
 
     def at(self, _: int) -> F64 | None:
@@ -40,17 +42,21 @@ class _Moving:
     times: list[int] = field(default_factory=list)
     poses: list[F64] = field(default_factory=list)
     _late: list[tuple[int, F64]] = field(default_factory=list)
+    _late_since: int = 0
 
     @property
     def newest(self) -> int:
         """Time of the newest transform."""
         return self.times[-1]
 
-    def add(self, time: int, pose: F64) -> None:
-        """Add a transform; late ones are sorted in, and those that are too old are ignored."""
+    def add(self, time: int, pose: F64, arrived: int) -> None:
+        """Add a transform that arrived at a time of this machine's clock, nanoseconds.
+
+        Late ones are sorted in, and those that are too old are ignored.
+        """
         if not self.times or time >= self.newest:
             self._late.clear()
-        elif self._is_restart(time, pose):
+        elif self._is_restart(time, pose, arrived):
             self.times, self.poses = [one for one, _ in self._late], [one for _, one in self._late]
             self._late.clear()
             return
@@ -65,12 +71,14 @@ class _Moving:
         first = max(bisect_left(self.times, self.newest - HISTORY_NS), len(self.times) - MAX_POSES)
         del self.times[:first], self.poses[:first]
 
-    def _is_restart(self, time: int, pose: F64) -> bool:
-        """Note a late transform; whether it is the last of `RESTART_COUNT`: the simulation began again."""
-        if self._late and time <= self._late[-1][0]:
-            self._late.clear()
-        self._late.append((time, pose))
-        return len(self._late) >= RESTART_COUNT
+    def _is_restart(self, time: int, pose: F64, arrived: int) -> bool:
+        """Note a late transform; whether only such have arrived for some time, in ascending order."""
+        if not self._late or time < self._late[-1][0]:
+            self._late, self._late_since = [], arrived
+        if not self._late or time > self._late[-1][0]:
+            self._late.append((time, pose))
+        del self._late[:-MAX_POSES]
+        return len(self._late) >= RESTART_COUNT and arrived - self._late_since >= RESTART_NS
 
     def at(self, time: int) -> F64 | None:
         """The transform at a time; None before the oldest and after the newest."""
@@ -87,7 +95,9 @@ class _Moving:
 class Transforms:
     """Trees of frames; a transform takes coordinates of a frame to those of its parent. Times are nanoseconds."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], int] = monotonic_ns) -> None:
+        """`clock`: this machine's, nanoseconds."""
+        self._clock = clock
         self._links: dict[str, _Fixed | _Moving] = {}
 
     def add(self, parent: str, child: str, time: int, pose: F64) -> None:
@@ -95,7 +105,7 @@ class Transforms:
         link = self._links.get(child)
         if not isinstance(link, _Moving) or link.parent != parent:
             link = _Moving(parent)
-        link.add(time, pose)
+        link.add(time, pose, self._clock())
         self._set(child, link)
 
     def add_static(self, parent: str, child: str, pose: F64) -> None:
