@@ -53,7 +53,7 @@ COMMANDS = {
     ),
     "camera": (
         "camera",
-        "Show a finished world to a robot's camera: a ROS 2 node that publishes colour, depth and classes.",
+        "Simulate a robot's camera in a finished world: a ROS 2 node that publishes images, depth and classes.",
     ),
     "monitor": ("monitor", "Monitor ROS 2 topics and publish their statistics; alarms, archive, autoscaling."),
     "toolbox": ("toolbox", "Run ML toolboxes on images: detection, movement, classification, segmentation."),

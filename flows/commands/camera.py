@@ -1,4 +1,4 @@
-"""`scan2sim camera`: shows a finished world to a robot's camera, as a ROS 2 node (services/world_camera)."""
+"""`scan2sim camera`: simulates a robot's camera in a finished world, as a ROS 2 node (services/world_camera)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ app = App(requirement=("the camera", "psutil"))
 @app.command()
 @options(WorldCameraParams, **NODE_OPTIONS)
 def camera(params: WorldCameraParams, limit: Limits = None) -> None:
-    """Show a finished world to a robot's camera: a ROS 2 node that publishes colour, depth and classes."""
+    """Simulate a robot's camera in a finished world: a ROS 2 node that publishes images, depth and classes."""
     from scan2sim.services.world_camera.node import WorldCameraNode
     from scan2sim.texturing.world_camera import WorldCamera
 

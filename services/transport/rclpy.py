@@ -31,6 +31,9 @@ from scan2sim.services.transport.cdr import serialized_size
 from scan2sim.services.transport.names import checked_type
 from scan2sim.services.transport.types import INFINITE, Arrival, Endpoint, Kind, QoS
 
+BYTES = "sequence<uint8>"
+"""Type of fields with the content of images."""
+
 
 class _Publisher(RosPublisher):  # type: ignore[misc]
     """Publisher that reports each message to its node."""
@@ -142,12 +145,8 @@ def message(name: str, **fields: Any) -> Any:
     return kind(**{field: _bytes(value) if kinds.get(field) == BYTES else value for field, value in fields.items()})
 
 
-BYTES = "sequence<uint8>"
-"""Type of fields with the content of images."""
-
-
 def _bytes(value: Any) -> array.array[int]:
-    """Values of a field of type `BYTES`, at once: rclpy copies other sequences than arrays value by value."""
+    """Array of a field of type `BYTES`: rclpy copies arrays at once, and other sequences value by value."""
     return value if isinstance(value, array.array) else array.array("B", bytes(value))
 
 

@@ -151,7 +151,7 @@ class WorldCameraNode(Monitor):
     @property
     def _frame(self) -> str:
         """Frame of the camera: that given, that of the CameraInfo, or the name of the node."""
-        return self._params.frame or self._intrinsics.frame or self._params.name
+        return self._params.frame.lstrip("/") or self._intrinsics.frame or self._params.name
 
     def _request_newest(self) -> None:
         """Render the time of the newest pose, unless that was done a short time ago."""

@@ -45,17 +45,18 @@ def default_origin(world: Path, fixed_frame: str) -> F64:
     Args:
         world: folder with `metadata.json`.
         fixed_frame: "map": by `T_world_map`; one of `START_FRAMES`: by the pose of the robot, or the spawn pose; others
-            are the world's own.
+            are the world's own. A leading slash (ROS 1) has no meaning.
 
     Raises:
         InputError: the file can't be read, or has no pose where the robot starts.
     """
-    if fixed_frame not in (MAP_FRAME, *START_FRAMES):
+    frame = _plain(fixed_frame)
+    if frame not in (MAP_FRAME, *START_FRAMES):
         return np.eye(4)
     path = world / "metadata.json"
     try:
         metadata = json.loads(path.read_text(encoding="utf-8"))
-        if fixed_frame == MAP_FRAME:
+        if frame == MAP_FRAME:
             return np.array(metadata.get("T_world_map", np.eye(4)), np.float64).reshape(4, 4)
         start = metadata.get("robot") or metadata["spawn"]
         return pose_of((*start["position_m"], *np.degrees(start["angles_rad"]).tolist()))
@@ -75,7 +76,7 @@ class PoseSource:
         Args:
             fixed_frame: frame that doesn't move in the world; "": that of an odometry topic.
             origin: (4, 4) its pose in the world.
-            mount: (4, 4) pose of the camera in its frame, or on the robot.
+            mount: (4, 4) pose of the camera in its frame, along the frame's axes, or on the robot.
             axes: of the camera's frame.
             warn: gets problems with messages.
             clock: nanoseconds since the epoch, the time of messages without one.

@@ -50,7 +50,13 @@ class WorldCameraParams(MonitorParams):
     field: Annotated[
         float, Field(ge=1, le=170, description="Horizontal field of view in degrees, without --camera-info.")
     ] = 80.0
-    frame: Annotated[FrameName, Field(description="Frame of the camera in /tf; default: that of the CameraInfo.")] = ""
+    frame: Annotated[
+        FrameName,
+        Field(
+            description="Frame of the camera in /tf, and in the headers of the images; default: that of the "
+            "CameraInfo; with --odometry alone the name of the node."
+        ),
+    ] = ""
     fixed_frame: Annotated[
         FrameName, Field(min_length=1, description="Frame in /tf that doesn't move in the world: world, map or odom.")
     ] = "world"
@@ -70,15 +76,16 @@ class WorldCameraParams(MonitorParams):
     mount: Annotated[
         Pose,
         Field(
-            description="Pose of the camera on the robot (--odometry), or in its frame in /tf: X Y Z in metres, ROLL "
-            "PITCH YAW in degrees; x ahead, y left, z up."
+            description="Pose of the camera on the robot (--odometry; x ahead, y left, z up), or in its frame in /tf "
+            "(along the axes of this frame): X Y Z in metres, ROLL PITCH YAW in degrees."
         ),
     ] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     axes: Annotated[
         Axes,
         Field(
             description="Axes of the camera's frame: optical (x right, y down, z ahead) or body (x ahead, y left, z "
-            "up). Default auto: optical if the name of the frame ends in optical, optical_frame or optical_link."
+            "up). Default auto: optical in /tf if the name of the frame ends in optical, optical_frame or "
+            "optical_link."
         ),
     ] = "auto"
     rate: Annotated[
@@ -96,7 +103,7 @@ class WorldCameraParams(MonitorParams):
         TopicName | None,
         Field(
             description="Topic of the simulator's image of the same camera, shown where it is nearer than the world; "
-            "needs --depth-image."
+            "needs --depth-image. The published images have their time stamps."
         ),
     ] = None
     depth_image: Annotated[

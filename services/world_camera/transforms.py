@@ -72,7 +72,7 @@ class _Moving:
         del self.times[:first], self.poses[:first]
 
     def _is_restart(self, time: int, pose: F64, arrived: int) -> bool:
-        """Note a late transform; whether only such have arrived for some time, in ascending order."""
+        """Store a late transform; whether only late ones have arrived for some time, in ascending order."""
         if not self._late or time < self._late[-1][0]:
             self._late, self._late_since = [], arrived
         if not self._late or time > self._late[-1][0]:

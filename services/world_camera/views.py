@@ -34,7 +34,7 @@ class CameraImage(Protocol):
 
 
 class World(Protocol):
-    """A world to look at (`texturing.world_camera.WorldCamera`)."""
+    """A world to render (`texturing.world_camera.WorldCamera`)."""
 
     def render(self, T_world_cam: F64, camera: Camera) -> CameraImage:
         """Render the view of a camera with a pose (4, 4), optical axes."""
@@ -46,7 +46,8 @@ class View:
 
     Attributes:
         rgb: (H, W, 3) uint8.
-        depth: metres along the optical axis, inf where there is nothing, NaN where the lens sees nothing.
+        depth: metres along the optical axis, inf where there is nothing, NaN where the lens sees nothing, or more than
+            90 degrees from the axis.
         code: uint8 LAS codes, 0 where there is no surface, 1 (unclassified) on what a simulator shows.
     """
 
@@ -70,14 +71,13 @@ def rendered(world: World, camera: Camera, poses: F64) -> View:
         band = replace(camera, height=end - first, cy=camera.cy - first)
         share = (first + end - 1) / 2 / max(1, camera.height - 1)
         image = world.render(interpolate(poses, times, np.array([share]))[0], band)
-        parts.append(View(image.rgb, image.depth(band), image.code))
-    return (
-        parts[0] if len(parts) == 1 else View(*(np.concatenate(one) for one in zip(*map(_arrays, parts), strict=True)))
+        depth = image.depth(band)
+        parts.append(View(image.rgb, np.where(depth < 0, np.float32(np.nan), depth), image.code))
+    return View(
+        np.concatenate([part.rgb for part in parts]),
+        np.concatenate([part.depth for part in parts]),
+        np.concatenate([part.code for part in parts]),
     )
-
-
-def _arrays(view: View) -> tuple[U8, F32, U8]:
-    return view.rgb, view.depth, view.code
 
 
 def _band_count(camera: Camera, poses: F64) -> int:

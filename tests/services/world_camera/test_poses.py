@@ -178,7 +178,7 @@ def write_metadata(folder: Path, **content: Any) -> Path:
 def test_default_origin_is_where_the_robot_starts(tmp_path: Path) -> None:
     start = {"position_m": [1.0, 2.0, 0.5], "angles_rad": [0.0, 0.0, math.pi / 2], "on": "road"}
     world = write_metadata(tmp_path, spawn=start)
-    for frame in ("odom", ""):
+    for frame in ("odom", "/odom", ""):
         T = default_origin(world, frame)
         assert position(T) == [1, 2, 0.5] and np.allclose(T[:3, 0], [0, 1, 0])
     assert np.array_equal(default_origin(world, "world"), np.eye(4))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -62,9 +62,14 @@ def test_rows_of_a_rolling_shutter_are_seen_one_after_the_other() -> None:
     assert np.abs(shade - 200 * np.arange(30) / 29).max() <= 200 / MAX_BANDS
     world = World()
     rendered(world, CAMERA, np.stack([np.eye(4)] * 9))
-    assert len(world.asked) == 1, "a camera that stands still needs one view"
+    assert len(world.asked) == 1, "a camera that doesn't move needs one view"
     rendered(world := World(), CAMERA, np.stack([pose_of((0, 0, 0, 0, 0, yaw)) for yaw in (0, 5)]))
     assert len(world.asked) == math.ceil(CAMERA.fx * math.radians(5))
+
+
+def test_depth_beside_and_behind_a_wide_lens_is_unknown() -> None:
+    view = rendered(World(), replace(CAMERA, cy=CAMERA.cy + 2), along(0.0))
+    assert np.array_equal(view.depth[:, 0], [math.nan, math.nan, *range(28)], equal_nan=True)
 
 
 def grey(depth: F32) -> View:
