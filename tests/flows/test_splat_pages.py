@@ -25,6 +25,7 @@ ALL_LOADED = (
     "window.world && world.loaded.size >= world.about.tiles.length"
     " && world.about.tiles.every(({name, splats}) => !splats || world.splats.shows(name))"
 )
+NEXT_FRAME_DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
 AGREEMENT_DB = 35
 
 
@@ -69,7 +70,6 @@ def test_the_page_draws_splats_as_the_camera_in_python(tmp_path: Path) -> None:
     scene = synthetic.scene(tmp_path)
     for seed, tile in enumerate(scene.tiles, start=1):
         splat_scenes.add(tile, seed)
-    world = scan2sim.camera(tmp_path / "world")
     with chromium(tmp_path) as page:
         open_page(page, scene, tmp_path / "page")
         page.click("[data-photo='1']")
@@ -99,6 +99,20 @@ def test_a_phone_shows_splats(tmp_path: Path) -> None:
         pose, camera = camera_of(page)
         expected = scan2sim.camera(tmp_path / "world").render(pose, camera, samples=1).rgb
         assert agreement_db(shown, expected) > AGREEMENT_DB and page.errors == []
+
+
+def test_splats_return_after_the_browser_took_the_graphics_memory(tmp_path: Path) -> None:
+    scene = synthetic.scene(tmp_path, tiles=1)
+    splat_scenes.add(scene.tiles[0], count=500)
+    with chromium(tmp_path) as page:
+        open_page(page, scene, tmp_path / "page")
+        shown = drawn(page)
+        page.value("void (window.lost = world.renderer.getContext().getExtension('WEBGL_lose_context')).loseContext()")
+        page.until("world.renderer.getContext().isContextLost()")
+        page.value(NEXT_FRAME_DRAWN)
+        page.value("lost.restoreContext()")
+        page.until(f"!world.renderer.getContext().isContextLost() && {ALL_LOADED}")
+        assert agreement_db(drawn(page), shown) > AGREEMENT_DB and page.errors == []
 
 
 def test_a_tile_without_splats_shows_its_surfaces(tmp_path: Path) -> None:

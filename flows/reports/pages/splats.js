@@ -172,19 +172,30 @@
       this.changed = changed;
       this.tiles = new Map(); // name to the splats' words and the background as a Blob
       this.version = 0; // of the tiles
-      this.next = null; // of the newest tiles: version, names, words; until they are sorted
-      this.shown = null; // version and names of the tiles in the texture
+      this.next = null; // of the newest tiles: names, words, rows of the texture; until they are sorted
+      this.shown = new Set(); // names of the tiles in the texture
       this.sorted = { version: 0, row: [] }; // of the last request
       this.waiting = false; // for an order
       this.source = this.blob = null; // background that is drawn, and that is to be drawn, as Blobs
-      this.size = [0, 0];
+      this.count = 0; // of the splats that are drawn
+      this.size = [0, 0]; // of the image in which they are blended
       this.worker = new Worker(URL.createObjectURL(new Blob([`(${sorter})()`])));
-      this.worker.onmessage = ({ data }) => this.take(data);
-      this.own((gl) => this.prepare(gl));
+      this.worker.onmessage = ({ data }) => this.take_order(data);
+      this.use_webgl((gl) => this.prepare(gl));
+      renderer.domElement.addEventListener("webglcontextrestored", () => this.restore()); // phones lose it in the background
+    }
+
+    // Make again what was lost with the WebGL context.
+    restore() {
+      this.shown = new Set();
+      this.source = this.blob = null;
+      this.size = [0, 0];
+      this.use_webgl((gl) => this.prepare(gl));
+      this.join_tiles();
     }
 
     // Use WebGL: three.js, which remembers the state, finds and leaves the default state.
-    own(work) {
+    use_webgl(work) {
       this.renderer.resetState();
       work(this.gl);
       this.gl.bindVertexArray(null);
@@ -214,11 +225,11 @@
       const words = new Uint32Array(packed.buffer), xyz = new Float32Array(packed.buffer);
       for (let i = 0; i < xyz.length; i += WORDS) for (let k = 0; k < 3; k++) xyz[i + k] += offset[k];
       this.tiles.set(name, { words, background: new Blob([jpeg], { type: "image/jpeg" }) });
-      this.renew();
+      this.join_tiles();
     }
 
     drop(name) {
-      if (this.tiles.delete(name)) this.renew();
+      if (this.tiles.delete(name)) this.join_tiles();
     }
 
     // Whether a tile was added, and whether it is drawn already.
@@ -227,7 +238,7 @@
     }
 
     shows(name) {
-      return this.shown?.names.has(name) ?? false;
+      return this.shown.has(name);
     }
 
     // Whether the last image is final: nothing is loaded or sorted any more.
@@ -236,7 +247,7 @@
     }
 
     // Join all tiles; they are drawn as soon as they are sorted.
-    renew() {
+    join_tiles() {
       const all = [...this.tiles.values()], count = all.reduce((sum, { words }) => sum + words.length / WORDS, 0);
       const rows = Math.max(1, Math.ceil(count / SPLATS_IN_ROW)), words = new Uint32Array(rows * SPLATS_IN_ROW * WORDS);
       let at = 0;
@@ -246,7 +257,8 @@
       }
       const places = new Float32Array(words.buffer), xyz = new Float32Array(3 * count);
       for (let i = 0; i < count; i++) for (let k = 0; k < 3; k++) xyz[3 * i + k] = places[WORDS * i + k];
-      this.next = { version: ++this.version, names: new Set(this.tiles.keys()), words, rows };
+      this.version++;
+      this.next = { names: new Set(this.tiles.keys()), words, rows };
       this.worker.postMessage({ xyz }, [xyz.buffer]);
       this.changed();
     }
@@ -261,10 +273,10 @@
     }
 
     // Take an order from the worker, with the tiles that it is of.
-    take({ order, version }) {
+    take_order({ order, version }) {
       this.waiting = false;
       if (version === this.version) {
-        this.own((gl) => {
+        this.use_webgl((gl) => {
           if (this.next) {
             gl.bindTexture(gl.TEXTURE_2D, this.texture);
             gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32UI, 2 * SPLATS_IN_ROW, this.next.rows, 0, gl.RGBA_INTEGER, gl.UNSIGNED_INT, this.next.words);
@@ -273,19 +285,19 @@
           gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
         });
         this.count = order.length;
-        if (this.next) this.shown = { names: this.next.names };
+        if (this.next) this.shown = this.next.names;
         this.next = null;
       }
       this.changed();
     }
 
     // Load the background of a tile, unless it is loaded or being loaded.
-    async lean(blob) {
+    async load_background(blob) {
       if (!blob || blob === this.blob) return;
       this.blob = blob;
       const image = await createImageBitmap(blob, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
       if (blob === this.blob) {
-        this.own((gl) => {
+        this.use_webgl((gl) => {
           gl.bindTexture(gl.TEXTURE_2D, this.background);
           gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
         });
@@ -299,9 +311,9 @@
     draw(camera, name) {
       const { rows, eye, slope } = seen(camera);
       this.sort([...rows[2], -rows[2].reduce((sum, value, k) => sum + value * eye[k], 0)]);
-      this.lean(this.tiles.get(name)?.background);
-      if (!this.shown?.names.size || !this.source) return false;
-      this.own((gl) => {
+      this.load_background(this.tiles.get(name)?.background);
+      if (!this.shown.size || !this.source) return false;
+      this.use_webgl((gl) => {
         this.fit(gl);
         gl.activeTexture(gl.TEXTURE0);
         this.blend(gl, rows, eye, slope);
