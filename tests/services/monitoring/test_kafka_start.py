@@ -23,7 +23,10 @@ from tests.fakes.broker import Broker
 
 NO_LATER_RECORD = {"Kafka": OFFSET_END, "Tansu": 0}
 """Offset that brokers answer if a partition has no record since a time."""
-ERRORS = [KafkaException(KafkaError(KafkaError._TIMED_OUT)), KafkaError(KafkaError.NOT_LEADER_FOR_PARTITION)]
+ERRORS: list[KafkaException | KafkaError] = [
+    KafkaException(KafkaError(KafkaError._TIMED_OUT)),
+    KafkaError(KafkaError.NOT_LEADER_FOR_PARTITION),
+]
 """Failures of a request: of all of it, and of its partition."""
 
 
