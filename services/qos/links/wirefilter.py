@@ -19,6 +19,8 @@ from scan2sim.services.qos.namespaces import FEATURE, Namespace
 
 RANK = 2
 PROMPT = b"VDEwf$ "
+OFF = "0", "0+0U"
+"""Values of settings that are switched off."""
 START_TIMEOUT_S = 5.0
 """Seconds to wait for its start and for responses."""
 REALTIME_PRIORITY = 20
@@ -78,9 +80,12 @@ class Wire:
         self._response()
 
     def shape(self, there: LinkProfile, back: LinkProfile) -> None:
-        """Send one command per setting and direction."""
+        """Send one command per setting and direction; what is switched off comes last.
+
+        While there is neither a delay nor a bandwidth, packets overtake those that wait.
+        """
         for way, profile in (("LR", there), ("RL", back)):
-            for name, value in _settings(profile).items():
+            for name, value in sorted(_settings(profile).items(), key=lambda setting: setting[1] in OFF):
                 self._socket.sendall(f"{name} {way}{value}\n".encode())
                 response = self._response()
                 if "1000 Success" not in response:
