@@ -153,13 +153,14 @@ def survey(
     return read_world(out)
 
 
-def camera(world: World | str | Path) -> WorldCamera:
+def camera(world: World | str | Path, *, farthest: float = 300.0) -> WorldCamera:
     """A camera in a finished world, without a simulator: colour, depth and classes from any pose.
 
-    Colours are those of the world's splats, if it has some, otherwise of its textured surfaces.
+    Colours are those of the world's splats; tiles without splats show their textured surfaces.
 
     Args:
-        world: the world, or the output folder of `run`, `survey` or `export`.
+        world: the world, or the output folder of `run` or `survey`.
+        farthest: distance from the camera in metres beyond which tiles aren't drawn; the nearest one always is.
 
     Example:
         `image = scan2sim.camera("my_world").render(T_world_cam, camera)`, with a pose (4, 4) in world metres (camera
@@ -171,7 +172,8 @@ def camera(world: World | str | Path) -> WorldCamera:
     """
     from scan2sim.texturing.world_camera import WorldCamera
 
-    return WorldCamera(world.scene if isinstance(world, World) else World(Path(world)).scene)
+    scene = world.scene if isinstance(world, World) else World(Path(world)).scene
+    return WorldCamera(scene, farthest=farthest)
 
 
 def read_world(folder: str | Path) -> World:

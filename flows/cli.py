@@ -51,6 +51,10 @@ COMMANDS = {
         "survey",
         "Build the worlds of all tiles of a survey, with matching borders, and one world of them all.",
     ),
+    "camera": (
+        "camera",
+        "Simulate a robot's camera in a finished world: a ROS 2 node that publishes images, depth and classes.",
+    ),
     "monitor": ("monitor", "Monitor ROS 2 topics and publish their statistics; alarms, archive, autoscaling."),
     "toolbox": ("toolbox", "Run ML toolboxes on images: detection, movement, classification, segmentation."),
     "qos": ("qos", "Quality of service: requirements, measurement, choice of the image encoding."),
@@ -62,7 +66,7 @@ PANELS = {
     "Worlds": ("run", "plan", "export", "view", "verify", "inspect", "scenario"),
     "Recordings": ("import", "sample", "segment", "slam"),
     "Surveys": ("tile", "survey"),
-    "Services": ("monitor", "toolbox", "qos", "orchestrate", "teleop"),
+    "Services": ("camera", "monitor", "toolbox", "qos", "orchestrate", "teleop"),
 }
 """Panels of `scan2sim --help` and the commands in them."""
 

@@ -6,15 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scan2sim.pipeline.camera.renderer import Renderer, placed
+from scan2sim.pipeline.camera.renderer import SKY_RGB, Image, Renderer, placed
 from scan2sim.pipeline.core.classes import CODE_OF_SURFACE
 from scan2sim.pipeline.core.splats import XYZ, SplatLayer, Splats
-from scan2sim.pipeline.core.types import F32, F64, U8, Camera
+from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Camera, Colour
 from scan2sim.pipeline.io.worlds.scene import BACKDROP, Scene, SceneTile
 from scan2sim.texturing.splats.view import SplatRenderer
 
 FARTHEST_M = 300.0
-"""Tiles farther from the camera than this aren't drawn."""
+"""Default distance beyond which tiles aren't drawn."""
+BLACK = np.zeros((1, 2, 3), np.float32)
+"""Background of splats over which another one is laid."""
 
 
 @dataclass(frozen=True)
@@ -42,78 +44,148 @@ class CameraImage:
 
 
 class WorldCamera:
-    """Renders a world: splats where it has some, otherwise its textured surfaces before their backdrop."""
+    """Renders a world: splats where tiles have some, their textured surfaces before their backdrop elsewhere."""
 
-    def __init__(self, scene: Scene) -> None:
-        self._scene = scene
-        self._near: tuple[str, ...] = ()
-        self._surfaces: Renderer | None = None
-        self._codes: list[U8] = []
-        self._behind: Renderer | None = None
+    def __init__(self, scene: Scene, *, farthest: float = FARTHEST_M) -> None:
+        """`farthest`: distance in metres beyond which tiles aren't drawn; the nearest one always is."""
+        self._scene, self._farthest = scene, farthest
+        self._layout = _Layout.of(scene.tiles)
+        self._near: list[int] = []
+        self._nearest = -1
+        self._layers: dict[int, SplatLayer | None] = {}
+        self._surfaces: _Surfaces
         self._splats: SplatRenderer | None = None
+        self._behind: Renderer | None = None
 
     def render(self, T_world_cam: F64, camera: Camera, *, samples: int = 2) -> CameraImage:
         """Render a view.
 
         Args:
             T_world_cam: (4, 4) pose in world metres; camera axes x right, y down, z ahead.
-            camera: any model.
+            camera: any perspective model.
             samples: rays per pixel along each axis, of surfaces.
         """
         self._load(T_world_cam[:3, 3])
-        assert self._surfaces is not None
-        seen = self._surfaces.view(camera, T_world_cam, samples=samples)
-        code = np.zeros(seen.hit.shape, np.uint8)
-        for body, codes in enumerate(self._codes):
-            at = seen.hit & (seen.body == body)
-            code[at] = codes[seen.face[at]]
-        if self._splats is not None:
-            drawn = self._splats.view(camera, T_world_cam)
-            return CameraImage(drawn.rgb, np.where(seen.hit, seen.range, drawn.range), code)
-        rgb = seen.rgb
-        if self._behind is not None:
-            behind = self._behind.view(camera, T_world_cam, samples=samples)
-            rgb = np.where((behind.range < seen.range)[..., None], behind.rgb, rgb)
-        return CameraImage(np.asarray(rgb, np.uint8), seen.range, code)
+        seen = self._surfaces.view(camera, T_world_cam, samples=samples if self._surfaces.are_shown else 1)
+        code = self._surfaces.codes(seen)
+        if self._splats is None:
+            rgb = self._before_backdrop(seen.rgb, seen.range, camera, T_world_cam, samples)
+            return CameraImage(rgb, seen.range, code)
+        drawn = self._splats.view(camera, T_world_cam)
+        rgb, shown = drawn.rgb, self._surfaces.shown(seen)
+        if self._layers[self._nearest] is None:
+            sky = np.broadcast_to(np.asarray(self._scene.sky or SKY_RGB, np.uint8), rgb.shape)
+            behind = self._before_backdrop(sky, np.full(shown.shape, np.inf), camera, T_world_cam, samples)
+            rgb = np.clip(np.rint(rgb + behind * (1 - drawn.cover[..., None])), 0, 255).astype(np.uint8)
+        in_front = shown & (seen.range < drawn.range)
+        rgb = np.where(in_front[..., None], seen.rgb, rgb)
+        return CameraImage(rgb, np.where(seen.hit, seen.range, drawn.range), code)
+
+    def _before_backdrop(self, rgb: U8, distance: F32, camera: Camera, T_world_cam: F64, samples: int) -> U8:
+        """Colours (H, W, 3) of a view with ranges (H, W), and those of backdrop and sky dome where these are nearer."""
+        if self._behind is None:
+            return rgb
+        behind = self._behind.view(camera, T_world_cam, samples=samples)
+        return np.where((behind.range < distance)[..., None], behind.rgb, rgb)
 
     def _load(self, position: F64) -> None:
-        """Prepare the tiles near a position, unless they are prepared."""
-        near = [tile for tile in self._scene.tiles if _distance(tile, position) < FARTHEST_M] or [*self._scene.tiles]
-        if tuple(tile.name for tile in near) == self._near:
+        """Prepare the tiles near a position, and the background of the nearest, unless they are prepared."""
+        order, distance = self._layout.by_distance(position)
+        near = sorted(order[: max(1, np.count_nonzero(distance <= self._farthest))])
+        if near == self._near and order[0] == self._nearest:
             return
-        self._near = tuple(tile.name for tile in near)
-        bodies, self._codes = [], []
-        for tile in near:
+        if near != self._near:
+            self._layers = {k: self._layers[k] if k in self._layers else _placed(self._scene.tiles[k]) for k in near}
+            tiles, shown = [self._scene.tiles[k] for k in near], [self._layers[k] is None for k in near]
+            self._surfaces = _Surfaces(tiles, shown, self._scene.sky)
+            plain = [tile for tile, is_shown in zip(tiles, shown, strict=True) if is_shown]
+            self._behind = _backdrops([*plain, *([self._scene.dome] if self._scene.dome else [])], self._scene.sky)
+        self._near, self._nearest = near, order[0]
+        self._splats = _splats([self._layers[k] for k in near], self._layers[self._nearest])
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Horizontal bounding boxes of tiles in world metres: corners (T, 2)."""
+
+    low: F64
+    high: F64
+
+    @classmethod
+    def of(cls, tiles: tuple[SceneTile, ...]) -> _Layout:
+        offset = np.array([tile.offset for tile in tiles])[:, :2]
+        low, high = (np.array([getattr(tile, end) for tile in tiles])[:, :2] + offset for end in ("low", "high"))
+        return cls(low, high)
+
+    def by_distance(self, position: F64) -> tuple[list[int], F64]:
+        """Tiles by their distance from a position, and their distances in metres (0 inside), in this order.
+
+        Of several that contain it, the one comes first whose middle is nearest.
+        """
+        xy = position[:2]
+        distance = np.linalg.norm(np.maximum(0, np.maximum(self.low - xy, xy - self.high)), axis=1)
+        order = np.lexsort((np.linalg.norm((self.low + self.high) / 2 - xy, axis=1), distance))
+        return order.tolist(), distance[order]
+
+
+class _Surfaces:
+    """Textured surfaces of tiles: distance and class of all, colour of those without splats.
+
+    Attributes:
+        are_shown: whether any are seen, not only measured.
+    """
+
+    def __init__(self, tiles: list[SceneTile], shown: list[bool], sky: Colour | None) -> None:
+        """`shown`: whether the colours of a tile's surfaces are seen; those of tiles with splats aren't."""
+        self._codes: list[U8] = []
+        bodies, is_shown = [], list[bool]()
+        for tile, its_colours in zip(tiles, shown, strict=True):
             for group in tile.groups:
                 body = placed(tile.folder / group, tile.offset)
-                bodies.append(body)
-                codes = body.mesh.classification
-                own = tile.codes.get(group, CODE_OF_SURFACE[group])
+                own, codes = tile.codes.get(group, CODE_OF_SURFACE[group]), body.mesh.classification
                 self._codes.append(
                     np.full(len(body.mesh), own, np.uint8) if codes is None else np.where(codes == 0, own, codes)
                 )
-        self._surfaces = Renderer(bodies, self._scene.sky)
-        backdrops = [placed(tile.folder / BACKDROP, tile.offset) for tile in near if (tile.folder / BACKDROP).is_dir()]
-        self._behind = Renderer(backdrops, self._scene.sky) if backdrops else None
-        self._splats = _splats(near, position)
+                bodies.append(body)
+                is_shown.append(its_colours)
+        self._renderer, self._is_shown, self.are_shown = Renderer(bodies, sky), np.array(is_shown, bool), any(shown)
+
+    def view(self, camera: Camera, T_world_cam: F64, *, samples: int) -> Image:
+        """The view of a camera."""
+        return self._renderer.view(camera, T_world_cam, samples=samples)
+
+    def shown(self, seen: Image) -> Bools:
+        """(H, W) whether a pixel's first surface is that of a tile without splats."""
+        return seen.hit & self._is_shown[seen.body]
+
+    def codes(self, seen: Image) -> U8:
+        """(H, W) LAS code of each pixel's first surface, 0 where there is none."""
+        found = np.zeros(seen.hit.shape, np.uint8)
+        for body, codes in enumerate(self._codes):
+            at = seen.hit & (seen.body == body)
+            found[at] = codes[seen.face[at]]
+        return found
 
 
-def _splats(tiles: list[SceneTile], position: F64) -> SplatRenderer | None:
-    """The splats of tiles in world metres, before the background of the nearest; None: they have none."""
-    layers = [(tile, layer) for tile in tiles if (layer := tile.splats()) is not None]
-    if not layers:
+def _backdrops(tiles: list[SceneTile], sky: Colour | None) -> Renderer | None:
+    """Backdrops of tiles and of the dome; None: they have none."""
+    bodies = [placed(tile.folder / BACKDROP, tile.offset) for tile in tiles if (tile.folder / BACKDROP).is_dir()]
+    return Renderer(bodies, sky) if bodies else None
+
+
+def _placed(tile: SceneTile) -> SplatLayer | None:
+    """The splats of a tile in world metres; None: it has none."""
+    layer = tile.splats()
+    if layer is None:
         return None
-    parts = []
-    for tile, layer in layers:
-        parameters = layer.splats.parameters.copy()
-        parameters[:, XYZ] += np.asarray(tile.offset, np.float32)
-        parts.append(parameters)
-    nearest = min(layers, key=lambda one: _distance(one[0], position))[1]
-    return SplatRenderer(SplatLayer(Splats(np.concatenate(parts)), nearest.background))
+    layer.splats.parameters[:, XYZ] += np.asarray(tile.offset, np.float32)
+    return layer
 
 
-def _distance(tile: SceneTile, position: F64) -> float:
-    """Horizontal distance of a position from a tile's bounding box, metres."""
-    low, high = (np.add(corner, tile.offset)[:2] for corner in (tile.low, tile.high))
-    outside = np.maximum(0, np.maximum(low - position[:2], position[:2] - high))
-    return float(np.linalg.norm(outside))
+def _splats(layers: list[SplatLayer | None], nearest: SplatLayer | None) -> SplatRenderer | None:
+    """All splats before the background of the nearest tile, black if that has none; None: there are no splats."""
+    parts = [layer.splats.parameters for layer in layers if layer is not None]
+    if not parts:
+        return None
+    every = Splats(parts[0] if len(parts) == 1 else np.concatenate(parts))
+    return SplatRenderer(SplatLayer(every, BLACK if nearest is None else nearest.background))

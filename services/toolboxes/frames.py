@@ -48,6 +48,19 @@ class Raw:
     step: int
     big_endian: bool = False
 
+    @classmethod
+    def of(cls, message: Any) -> Raw:
+        """The image of a `sensor_msgs/msg/Image`, whose data it shares."""
+        data = memoryview(message.data)
+        return cls(
+            data=data.cast("B") if data.nbytes else b"",
+            height=message.height,
+            width=message.width,
+            encoding=message.encoding,
+            step=message.step,
+            big_endian=bool(message.is_bigendian),
+        )
+
 
 @dataclass(frozen=True)
 class Frame:

@@ -87,11 +87,4 @@ class ToolboxNode(Monitor):
 def _image(message: Any, compressed: bool) -> Raw | bytes:
     if compressed:
         return bytes(message.data)
-    return Raw(
-        data=memoryview(message.data).cast("B"),
-        height=message.height,
-        width=message.width,
-        encoding=message.encoding,
-        step=message.step,
-        big_endian=bool(message.is_bigendian),
-    )
+    return Raw.of(message)

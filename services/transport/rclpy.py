@@ -6,6 +6,7 @@ the source timestamp (DDSI-RTPS 2.5, sections 8.3.8.2 and 8.3.8.9), so messages 
 
 from __future__ import annotations
 
+import array
 import importlib
 import time
 from collections.abc import Callable
@@ -29,6 +30,9 @@ from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.transport.cdr import serialized_size
 from scan2sim.services.transport.names import checked_type
 from scan2sim.services.transport.types import INFINITE, Arrival, Endpoint, Kind, QoS
+
+BYTES = "sequence<uint8>"
+"""Type of fields with the content of images."""
 
 
 class _Publisher(RosPublisher):  # type: ignore[misc]
@@ -136,7 +140,14 @@ def message_type(name: str) -> Any:
 
 def message(name: str, **fields: Any) -> Any:
     """Create a message with the given fields."""
-    return message_type(name)(**fields)
+    kind = message_type(name)
+    kinds = kind.get_fields_and_field_types()
+    return kind(**{field: _bytes(value) if kinds.get(field) == BYTES else value for field, value in fields.items()})
+
+
+def _bytes(value: Any) -> array.array[int]:
+    """Array of a field of type `BYTES`: rclpy copies arrays at once, and other sequences value by value."""
+    return value if isinstance(value, array.array) else array.array("B", bytes(value))
 
 
 def type_name(msg_type: Any) -> str:

@@ -49,6 +49,7 @@ from scan2sim.services.teleoperation.settings import MeasureParams as DrivenPara
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams
 from scan2sim.services.toolboxes.settings import CameraParams, NodeParams, ServeParams
 from scan2sim.services.toolboxes.tasks import classify, detect, movement, segment
+from scan2sim.services.world_camera.settings import WorldCameraParams
 from scan2sim.slam.steps.track import Filmed
 from scan2sim.texturing.texture_layout import UnwrapParams, check_size
 from tests.conftest import ROOT
@@ -210,7 +211,7 @@ def leaves(command: Any) -> Iterator[Any]:
 
 def test_every_numeric_option_has_a_range() -> None:
     hints = [get_type_hints(one.callback) for name in COMMANDS for one in leaves(loaded(name))]
-    shown = (SceneParams, ViewParams, PhotoConventions)
+    shown = (SceneParams, ViewParams, PhotoConventions, WorldCameraParams)
     boxes = (detect.Params, movement.Params, classify.Params, segment.Params, ServeParams, NodeParams, CameraParams)
     nodes = (TopicParams, TalkerParams, DatasetParams, WorkParams, ScaleParams, MuteParams, BrokerParams)
     bus = (QueryParams, TrafficParams, PageParams, *nodes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ import scan2sim
 from scan2sim.pipeline.camera.renderer import look_at, pinhole
 from scan2sim.pipeline.core.splats import SplatLayer, Splats
 from scan2sim.pipeline.core.types import Camera
-from scan2sim.pipeline.io.worlds.scene import SPLATS_FILE, Scene
+from scan2sim.pipeline.io.worlds.scene import SPLATS_FILE, Scene, add_dome
+from scan2sim.texturing.world_camera import WorldCamera
 from tests.fakes import synthetic
 
 CAMERA = pinhole(160, 120, field=80)
@@ -24,15 +26,15 @@ def town(tmp_path: Path) -> Scene:
     return synthetic.scene(tmp_path)
 
 
-def green_ground(seed: int = 1) -> SplatLayer:
-    """A layer of green splats over the ground of a tile, before a white background."""
+def green_ground(seed: int = 1, background: float = 1.0) -> SplatLayer:
+    """A layer of green splats over the ground of a tile, before a white (1) or darker background."""
     random = np.random.default_rng(seed)
     xyz = np.column_stack([random.uniform(-6, 6, (20_000, 2)), np.zeros(20_000)])
     splats = Splats.of(
         xyz, np.full((20_000, 3), 0.08), np.tile([1.0, 0, 0, 0], (20_000, 1)), np.full(20_000, 0.9),
         np.tile(GREEN, (20_000, 1)),
     )  # fmt: skip
-    return SplatLayer(splats, np.ones((512, 1024, 3), np.float32))
+    return SplatLayer(splats, np.full((512, 1024, 3), background, np.float32))
 
 
 def test_surfaces_are_shown_with_distance_and_class(town: Scene, tmp_path: Path) -> None:
@@ -77,3 +79,56 @@ def test_tiles_of_a_survey_are_in_place(town: Scene) -> None:
     there = look_at((x - 4.0, y - 4.0, z + 3.0), (x, y, z + 0.5))
     shown = scan2sim.camera(folder).render(there, CAMERA).rgb[90:, 40:120].reshape(-1, 3).mean(axis=0) / 255
     assert np.abs(shown - GREEN).max() < 0.1
+
+
+def view_of_tile(town: Scene, k: int) -> np.ndarray:
+    """Pose of a camera beside a tile's house, looking at its ground."""
+    x, y, z = town.tiles[k].offset
+    return look_at((x - 4.0, y - 4.0, z + 3.0), (x, y, z + 0.5))
+
+
+def test_tiles_without_splats_show_their_surfaces_beside_others(town: Scene) -> None:
+    surfaces = WorldCamera(town).render(view_of_tile(town, 1), CAMERA)
+    green_ground().save(town.tiles[0].folder / SPLATS_FILE)
+    image = WorldCamera(town).render(view_of_tile(town, 1), CAMERA)
+    near = np.isfinite(surfaces.range) & (surfaces.range < 8)
+    assert near.mean() > 0.2 and np.array_equal(image.rgb[near], surfaces.rgb[near])
+    sky = ~np.isfinite(image.range)
+    assert sky.any() and np.abs(image.rgb[sky].astype(int) - surfaces.rgb[sky]).max() <= 1
+
+
+def test_background_is_that_of_the_nearest_tile_whatever_was_seen_before(town: Scene) -> None:
+    for tile, background in zip(town.tiles, (1.0, 0.2), strict=True):
+        green_ground(background=background).save(tile.folder / SPLATS_FILE)
+    there_and_back = WorldCamera(town)
+    for k, level in ((0, 255), (1, 51), (0, 255)):
+        image = there_and_back.render(view_of_tile(town, k), CAMERA)
+        assert np.array_equal(image.rgb, WorldCamera(town).render(view_of_tile(town, k), CAMERA).rgb)
+        assert np.abs(image.rgb[0].astype(int) - level).max() <= 2
+
+
+def test_sky_dome_of_a_survey_is_behind_surfaces_and_splats(town: Scene, tmp_path: Path) -> None:
+    def sphere(scene: Scene, folder: Path) -> None:
+        """A large box around the town; its walls have the colours of `synthetic.picture`."""
+        house = synthetic.house(scene.frame)
+        synthetic.textured(folder, replace(house, vertices=(house.vertices - (5.5, 3.0, 0.0)) * np.float32(60)))
+
+    without = WorldCamera(town).render(view_of_tile(town, 1), CAMERA)
+    domed = add_dome(town, tmp_path / "world", sphere)
+    shown = WorldCamera(domed).render(view_of_tile(town, 1), CAMERA)
+    sky = ~np.isfinite(without.range)
+    assert np.array_equal(shown.rgb[~sky], without.rgb[~sky]) and np.array_equal(shown.range, without.range)
+    assert (shown.rgb[sky] != without.rgb[sky]).any(axis=1).mean() > 0.9
+    green_ground().save(town.tiles[0].folder / SPLATS_FILE)
+    beside = WorldCamera(domed).render(view_of_tile(town, 1), CAMERA)
+    assert np.abs(beside.rgb[0].astype(int) - shown.rgb[0]).max() <= 1
+
+
+def test_tiles_beyond_the_distance_limit_are_not_drawn(town: Scene) -> None:
+    x, y, z = town.tiles[1].offset
+    across = look_at((0.0, -4.0, 3.0), (x, y, z))
+    far = WorldCamera(town).render(across, CAMERA).range
+    near = WorldCamera(town, farthest=5.0).render(across, CAMERA).range
+    assert np.isfinite(far[np.isinf(near)]).any() and np.array_equal(near[np.isfinite(near)], far[np.isfinite(near)])
+    lost = WorldCamera(town, farthest=5.0).render(look_at((x + 40.0, y, z + 2), (x, y, z)), CAMERA)
+    assert np.isfinite(lost.range).any(), "the nearest tile is always drawn"

@@ -20,6 +20,7 @@ BRIDGED = (
     "/clock@rosgraph_msgs/msg/Clock[gz.msgs.Clock",
     "/cmd_vel@geometry_msgs/msg/Twist]gz.msgs.Twist",
     "/odom@nav_msgs/msg/Odometry[gz.msgs.Odometry",
+    "/ground_truth@nav_msgs/msg/Odometry[gz.msgs.Odometry",
     "/tf@tf2_msgs/msg/TFMessage[gz.msgs.Pose_V",
     "/joint_states@sensor_msgs/msg/JointState[gz.msgs.Model",
     "/lidar@sensor_msgs/msg/LaserScan[gz.msgs.LaserScan",

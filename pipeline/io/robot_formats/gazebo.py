@@ -1,6 +1,7 @@
 """Robot for Gazebo: `models/robot/`, a model with its drive and sensors, which the world includes.
 
-It subscribes to `/cmd_vel` and publishes `/odom`, `/tf`, `/joint_states`, `/camera`, `/labels`, `/lidar`, `/imu`.
+It subscribes to `/cmd_vel` and publishes `/odom`, `/tf`, `/joint_states`, `/camera`, `/labels`, `/lidar`, `/imu`, and
+`/ground_truth`, its pose in the world, for nodes that simulate its sensors (docs/camera.md).
 `/labels` is a segmentation camera with the pose of the camera; its pixels are the labels of the world.
 """
 
@@ -159,6 +160,12 @@ def _drive(robot: Robot) -> str:
       <tf_topic>tf</tf_topic>
       <frame_id>odom</frame_id>
       <child_frame_id>{robot.base.name}</child_frame_id>
+    </plugin>
+    <plugin filename="gz-sim-odometry-publisher-system" name="gz::sim::systems::OdometryPublisher">
+      <dimensions>3</dimensions>
+      <odom_topic>ground_truth</odom_topic>
+      <odom_frame>world</odom_frame>
+      <robot_base_frame>{robot.base.name}</robot_base_frame>
     </plugin>
     <plugin filename="gz-sim-joint-state-publisher-system" name="gz::sim::systems::JointStatePublisher">
       <topic>joint_states</topic>

@@ -105,7 +105,7 @@ USES = {
     "gsply": ["export world --to splats", "run TILE --set export.formats=[\"splats\"]"],
     "cyclonedds": ["monitor talker chatter"],
     "rosbags": ["monitor listener chatter"],
-    "psutil": ["monitor topic chatter"],
+    "psutil": ["monitor topic chatter", "camera world --frame eye"],
     "confluent_kafka": ["monitor talker chatter --kafka localhost:9", "monitor page --kafka localhost:9"],
     "prometheus_client": ["monitor talker chatter --metrics 0"],
     "fastapi": ["monitor page --kafka localhost:9"],
@@ -147,7 +147,7 @@ def test_missing_package_raises_the_same_error_in_every_command(
     words = [{"TILE": str(TILE), "FRAMES": "frames"}.get(word, word) for word in command.split()]
     out = "weights.onnx" if "train" in words else "plot.png" if "evaluate" in words else "out"
     monkeypatch.setenv("SCAN2SIM_TRANSPORT", "cyclone")
-    writes = words[0] not in ("monitor", "teleop", "orchestrate") and "serve" not in words
+    writes = words[0] not in ("camera", "monitor", "teleop", "orchestrate") and "serve" not in words
     error = CliRunner().invoke(app, [*words, *(["--out", out] if writes else [])]).exception
     assert isinstance(error, UnavailableError) and exit_code(error) == 7
     assert package in error.cause and f"pip install 'scan2sim[{EXTRA_OF[package]}" in error.remedy

@@ -168,6 +168,10 @@ def test_gazebo_world_loads_the_systems_for_sensors_and_drive(exported: Path) ->
     joints = {joint.attrib["name"] for joint in model.iter("joint") if joint.attrib["type"] == "revolute"}
     assert {drive.findtext("left_joint"), drive.findtext("right_joint")} == joints
     assert float(drive.findtext("wheel_separation", "")) == pytest.approx(ROBOT.track)
+    (true,) = (one for one in model.iter("plugin") if one.attrib["name"] == "gz::sim::systems::OdometryPublisher")
+    assert (true.findtext("odom_topic"), true.findtext("odom_frame"), true.findtext("dimensions")) == (
+        "ground_truth", "world", "3",
+    )  # fmt: skip
 
 
 def test_robot_drives_ahead_in_mujoco(exported: Path) -> None:
