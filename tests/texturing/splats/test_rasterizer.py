@@ -42,7 +42,7 @@ def test_splats_are_drawn_as_the_formulas_say() -> None:
     assert np.array_equal(np.isfinite(drawn.depth)[sure], np.isfinite(truth.depth)[sure])
     both = np.isfinite(drawn.depth) & np.isfinite(truth.depth)
     # where a splat leaves about a half, the next may be the one
-    assert both.mean() > 0.3 and (np.abs(drawn.depth - truth.depth)[both] < 0.01).mean() > 0.99
+    assert both.mean() > 0.3 and (np.abs(drawn.depth[both] - truth.depth[both]) < 0.01).mean() > 0.99
 
 
 def test_what_is_behind_or_beside_the_camera_is_not_drawn() -> None:
@@ -119,14 +119,14 @@ def true_depth(camera: Camera, pose: F64, height: float) -> F64:
 
 
 def test_depth_is_that_of_the_plane_in_which_flat_splats_lie() -> None:
-    """Not that of their centres: one splat covers depths of a metre and more here."""
+    """Not that of their centres: one splat covers depths of a metre here."""
     floor = Splats.of(
         np.array([[0, 0, 0.0]]), np.array([[0.5, 0.5, 0.001]]), np.array([[1.0, 0, 0, 0]]), np.array([0.99]),
         np.ones((1, 3)),
     )  # fmt: skip
     drawn = rasterizer.render(floor.parameters, Pinhole.of(CAMERA, POSE))
     truth, seen = true_depth(CAMERA, POSE, 0.0), np.isfinite(drawn.depth)
-    assert np.ptp(truth[seen]) > 1
+    assert np.ptp(truth[seen]) > 0.9
     assert np.abs(drawn.depth - truth)[seen].max() < 0.01
 
 
