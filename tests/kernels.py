@@ -1,4 +1,4 @@
-"""`python -m tests.kernels`: compile numba's kernels once, by making a tiny world and a panorama of a synthetic drive.
+"""`python -m tests.kernels`: compile numba's kernels once, by making tiny worlds and a panorama of a synthetic drive.
 
 Otherwise several processes of tests would each compile them, for minutes.
 """
@@ -20,10 +20,10 @@ def are_compiled() -> bool:
 
 
 def main() -> None:
-    """Make the world of a tiny street, and at the same time render a panorama."""
+    """Make the world of a tiny street and that of its two tiles, and at the same time render a panorama."""
     panorama = multiprocessing.get_context("spawn").Process(target=render_panorama)
     panorama.start()
-    make_world()
+    make_worlds()
     panorama.join()
 
 
@@ -40,19 +40,26 @@ def render_panorama() -> None:
     panorama.render(drive.poses[20], float(drive.times[20]))
 
 
-def make_world() -> None:
-    """Make the world of a tiny street."""
+def make_worlds() -> None:
+    """Make the world of a tiny street with everything that is optional, then that of a survey, which has borders."""
     from scan2sim.data_samples.street import generate
+    from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
     from tests.flows.tiny import COARSE, scan2sim, tiny
 
     with tempfile.TemporaryDirectory(prefix="scan2sim-kernels-") as folder:
-        street, tile = Path(folder) / "street", Path(folder) / "tile"
+        street, tile, survey = (Path(folder) / name for name in ("street", "tile", "survey"))
         generate(street, length=12.0, points=150_000, photos=8, seed=5, photo_width=480)
         tiny(street, tile, photos=4)
         settings = COARSE | {"split": {"vegetation": "both"}}
-        code, printed = scan2sim("run", tile, "--out", Path(folder) / "out", "--hold-out", 4, settings=settings)
-        if code:
-            raise SystemExit(printed)
+        optional = settings | {"navigation": {"when": "always"}, "splats": {"when": "auto", "epochs": [1, 0, 0]}}
+        cut_survey(tile, survey, CutParams(length=6.0, buffer=3.0))
+        for command, settings in (
+            (("run", tile, "--out", Path(folder) / "out", "--hold-out", 4), optional),
+            (("survey", survey, "--out", Path(folder) / "survey_out"), settings),
+        ):
+            code, printed = scan2sim(*command, settings=settings)
+            if code:
+                raise SystemExit(printed)
 
 
 if __name__ == "__main__":

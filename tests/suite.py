@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -59,6 +60,8 @@ class Run:
 
 def main() -> int:
     """Run the tests; returns the exit status."""
+    # where it is set, as in many containers, each of about a thousand processes would compile all modules again
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     parser = argparse.ArgumentParser(prog="python -m tests.suite", description=__doc__, add_help=False)
     parser.add_argument("-m", dest="markers", default="not slow")
     parser.add_argument("--report", type=Path)

@@ -4,11 +4,12 @@ Steps and Numba's type tables are included: the demo's 59 processes take 52 s wi
 (`python -m bench.profile`).
 """
 
+from importlib import import_module
+
 import cv2  # noqa: F401
 import laspy  # noqa: F401
 import numba.core.boxing  # noqa: F401
 import numpy  # noqa: F401
-import open3d  # noqa: F401
 import PIL.Image  # noqa: F401
 import pyproj  # noqa: F401
 import scipy.ndimage
@@ -17,6 +18,10 @@ import typer  # noqa: F401 (each process imports the main module of its parent: 
 from numba.core.registry import cpu_target
 
 import scan2sim.flows.pipelines.steps  # noqa: F401
+from scan2sim.pipeline.core.open3d_import import leave_out_plots
+
+leave_out_plots()
+import_module("open3d")
 
 cpu_target.typing_context.refresh()
 cpu_target.target_context.refresh()

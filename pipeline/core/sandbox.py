@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from scan2sim.pipeline.core.errors import StepError
+from scan2sim.pipeline.core.open3d_import import leave_out_plots
 
 
 def call(target: str, *args: Any, timeout: float, threads: int | None = None) -> Any:
@@ -65,6 +66,7 @@ def die_with_parent() -> None:
 
 def _main(folder: Path) -> None:
     die_with_parent()
+    leave_out_plots()
     target, args = pickle.loads((folder / "in").read_bytes())
     module, function = target.split(":")
     result = getattr(importlib.import_module(module), function)(*args)

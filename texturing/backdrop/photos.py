@@ -28,8 +28,6 @@ SKY_MIN_LEVEL, SKY_SURE_LEVEL, MOVABLE_MIN_LEVEL = 100, 200, 90
 vehicles and people."""
 CLIPPED_LEVEL = 250
 """Grey level from which a channel is overexposed: the scene is at least as bright."""
-MIN_SPACING_M = 0.1
-"""Least distance by which photos are thinned out if there are too many."""
 
 
 @dataclass
@@ -177,11 +175,10 @@ def prepare(
 def choose(views: Sequence[View], usable: Sequence[int], spacing: float, max_photos: int) -> list[int]:
     """Indices of `usable` photos at least `spacing` metres apart (unless they look elsewhere), at most `max_photos`.
 
-    With more, the spacing is larger; where that doesn't help, as they look in many directions, they are chosen evenly.
-    Orthophotos aren't chosen.
+    With more, the spacing is larger; if all look elsewhere, they are taken at equal steps. Orthophotos aren't chosen.
     """
     candidates = [k for k in usable if views[k].camera.model != "orthographic"]
-    centres = np.array([views[k].centre for k in candidates]).reshape(-1, 3)
+    centres = np.array([views[k].centre for k in candidates])
     extent = float(np.linalg.norm(np.ptp(centres, axis=0))) if len(centres) else 0.0
     while True:
         chosen: list[int] = []
@@ -195,9 +192,9 @@ def choose(views: Sequence[View], usable: Sequence[int], spacing: float, max_pho
                 chosen.append(k)
         if len(chosen) <= max_photos:
             return chosen
-        if 0.95 * spacing > extent:
-            return [chosen[i] for i in np.linspace(0, len(chosen) - 1, max_photos).round().astype(int)]
-        spacing = max(1.25 * spacing, MIN_SPACING_M)
+        if 0.95 * spacing >= extent:
+            return [chosen[n * len(chosen) // max_photos] for n in range(max_photos)]
+        spacing = max(1.25 * spacing, extent / 1000)
 
 
 def _corrected(rgb: U8, exposure: F64) -> F32:
