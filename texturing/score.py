@@ -55,6 +55,7 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     Whole frames are scored beside (`texturing.whole_frame`): all pixels of the held-out photos count except vehicles
     and people that the world leaves out, `backdrop` (a textured mesh behind the surfaces) and `sky` (colour where
     nothing is) are shown, and `labels` (classes of the photos) distinguish sky from missing surface.
+    Splats are shown with the exposure of the nearest photos that aren't held out.
 
     Files: `error`, a folder with an image of photo, rendering and difference for every held-out photo, and an
     `index.json` of them; `frames`, the same with photo and whole frame; `splat_frames`, the same of `splats`, if given.
@@ -119,7 +120,7 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
         if whole is not None:
             photos[name] |= frames.add(f"{i:03d}_{Path(name).name}", name, result.photo, whole)
         if splats is not None and whole is not None:
-            shown = splats.view(result.view.camera, result.view.T_world_cam).rgb
+            shown = splats.view(result.view.camera, result.view.T_world_cam, as_photo=True).rgb
             of_splats = whole_frame(result, len(groups), np.load(depth_of[name]), known, boxes, shown=shown)
             assert of_splats is not None
             photos[name] |= splat_frames.add(f"{i:03d}_{Path(name).name}", name, result.photo, of_splats)
@@ -263,4 +264,4 @@ def _seen_from_near(inputs: Inputs, points: F32, normals: F32, near: float) -> B
     return seen
 
 
-SCORE = Step("score", 5, score, ScoreParams, memory=(1.3, 3))
+SCORE = Step("score", 6, score, ScoreParams, memory=(1.3, 3))

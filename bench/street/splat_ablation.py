@@ -4,7 +4,8 @@
 [--out bench-out/street_splats] [--change NAME=VALUE ...]`
 
 A part is a line of `CHANGES`: values of constants of the modules of `scan2sim.texturing.splats`, or of the step's
-settings. `--change` adds one from the command line. The step's inputs are those of the street's run in `--worlds`, made
+settings. `--change` adds one from the command line. Constants that compiled kernels or other constants hold copies of
+are rejected: changing them would have no effect. The step's inputs are those of the street's run in `--worlds`, made
 there by `python -m bench.street --set splats.when=auto`. Rows are stored in `rows.json` below `--out`; rows that are
 stored already aren't measured again. Ends with `RESULT {json}`: by part and street.
 """
@@ -12,6 +13,7 @@ stored already aren't measured again. Ends with `RESULT {json}`: by part and str
 from __future__ import annotations
 
 import argparse
+import ast
 import contextlib
 import importlib
 import json
@@ -56,9 +58,47 @@ def changed(change: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
             if module == "step" and attribute in step.SplatsParams.model_fields:
                 settings[attribute] = value
                 continue
+            if copies := copied(module, attribute):
+                raise SystemExit(f"{name} can't be changed here, as there are copies of it: {'; '.join(copies)}")
             owner = importlib.import_module(f"{PACKAGE}.{module}")
             stack.enter_context(mock.patch.object(owner, attribute, value))
         yield settings
+
+
+def copied(module: str, constant: str) -> list[str]:
+    """Places that hold a copy of a constant: compiled kernels, and what is computed when a module is loaded.
+
+    Args:
+        module: name of the constant's module within `PACKAGE`.
+        constant: its name.
+    """
+    found = []
+    for path in sorted(Path(importlib.import_module(PACKAGE).__path__[0]).glob("*.py")):
+        for statement in ast.parse(path.read_text(encoding="utf-8")).body:
+            if any(_reads(node, path.stem == module, module, constant) for node in _evaluated_once(statement)):
+                found.append(f"{path.name}, line {statement.lineno}")
+    return found
+
+
+def _evaluated_once(statement: ast.stmt) -> Iterator[ast.AST]:
+    """Nodes of a statement that are evaluated when its module is loaded, or compiled by numba."""
+    if isinstance(statement, ast.ClassDef):
+        for one in statement.body:
+            yield from _evaluated_once(one)
+    elif isinstance(statement, ast.FunctionDef):
+        compiled = any("njit" in ast.unparse(decorator) for decorator in statement.decorator_list)
+        yield from ast.walk(statement if compiled else statement.args)
+    else:
+        yield from ast.walk(statement)
+
+
+def _reads(node: ast.AST, own: bool, module: str, constant: str) -> bool:
+    """Whether a node reads a constant; `own`: it is in the constant's module."""
+    if isinstance(node, ast.ImportFrom):
+        return node.module == f"{PACKAGE}.{module}" and constant in [name.name for name in node.names]
+    if isinstance(node, ast.Attribute):
+        return node.attr == constant and isinstance(node.value, ast.Name) and node.value.id == module
+    return own and isinstance(node, ast.Name) and node.id == constant and isinstance(node.ctx, ast.Load)
 
 
 def row(name: str, worlds: Path, folder: Path, change: Mapping[str, Any]) -> dict[str, Any]:

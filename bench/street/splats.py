@@ -1,7 +1,8 @@
 """Splats of a street's world: held-out photos, the right-hand camera that was never trained on, and held-out sweeps.
 
-Whole frames are compared; pixels of vehicles and people don't count. A gain per channel is solved for each photo over
-all pixels that count; without one, photos are compared as they are.
+Whole frames are compared; pixels of vehicles and people don't count. Splats are shown with the exposure of the nearest
+photos of the training. A gain per channel is solved for each photo over all pixels that count; without one, photos are
+compared as they are.
 """
 
 from __future__ import annotations
@@ -100,8 +101,8 @@ def resources() -> Iterator[dict[str, float]]:
 
 
 def rendered(renderer: SplatRenderer, photo: Photo) -> SplatImage:
-    """The splats from a photo's pose."""
-    return renderer.view(_camera(photo), photo.T)
+    """The splats from a photo's pose, with the exposure of the nearest photos of the training."""
+    return renderer.view(_camera(photo), photo.T, as_photo=True)
 
 
 def _camera(photo: Photo) -> Camera:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,14 @@ XYZ, LOG_SCALE, QUATERNION, LOGIT, RGB = slice(0, 3), slice(3, 6), slice(6, 10),
 """Columns of the parameters."""
 WIDTH = 14
 """Number of parameters of a splat."""
+MAX_COLOUR = 2.0
+"""Brightest colour of the world: photos that are darker than it show what is brighter than 1 in it."""
+BACKGROUND_LEVELS = 1020
+"""Steps of the background's colours from 0 to 1 in files."""
+POSITION, AXIS, GAIN, OFFSET, VIGNETTING = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 14)
+"""Columns of the photos of a layer."""
+PHOTO_WIDTH = 14
+"""Number of a photo's columns."""
 SHELL_RADIUS_M, SHELL_STEP_DEG, SHELL_LOWEST_DEG = 400.0, 1.5, -20.0
 """Radius of the background as splats, the angle between them, and the elevation of the lowest; beyond all others
 (`FARTHEST_M` of the photos' depth is 250 m), and within the usual far clipping distance of cameras."""
@@ -26,7 +34,8 @@ class Splats:
 
     Attributes:
         parameters: (N, 14) position in metres; logarithms of the standard deviations along the axes, metres; rotation
-            from these axes to the world, a quaternion w x y z of any length; logit of the opacity; colour, sRGB 0 to 1.
+            from these axes to the world, a quaternion w x y z of any length; logit of the opacity; colour, sRGB, 0 to
+            `MAX_COLOUR`, of which 1 is white.
     """
 
     parameters: F32
@@ -74,8 +83,13 @@ class Splats:
 
     @property
     def rgb(self) -> F32:
-        """(N, 3) colours, sRGB 0 to 1."""
+        """(N, 3) colours, sRGB, 0 to `MAX_COLOUR`."""
         return self.parameters[:, RGB]
+
+    @property
+    def display_rgb(self) -> F32:
+        """(N, 3) colours, sRGB 0 to 1, as programs draw them that know no brighter ones."""
+        return np.clip(self.rgb, 0, 1)
 
 
 @dataclass(frozen=True)
@@ -84,12 +98,16 @@ class SplatLayer:
 
     Attributes:
         splats: positions in the tile's local metres.
-        background: (H, W, 3) sRGB 0 to 1, equirectangular: column 0 is azimuth -180 degrees, from x (east) to y
-            (north); row 0 is the zenith.
+        background: (H, W, 3) sRGB, 0 to `MAX_COLOUR`, equirectangular: column 0 is azimuth -180 degrees, from x (east)
+            to y (north); row 0 is the zenith.
+        photos: (P, 14) how the photos of the training show the world: position in local metres, optical axis, and
+            gain, offset and vignetting coefficients a, b of `v * (gain * colour + offset) - 0.055` with
+            `v = exp(-a q - b q^2)`, where q is the squared distance from the image centre, 1 in the corners.
     """
 
     splats: Splats
     background: F32
+    photos: F32 = field(default_factory=lambda: np.zeros((0, PHOTO_WIDTH), np.float32))
 
     def with_shell(self) -> Splats:
         """The splats, and the background as large splats on a sphere: for programs that know no background."""
@@ -101,15 +119,20 @@ class SplatLayer:
         return cls(Splats(np.zeros((0, WIDTH), np.float32)), np.full((1, 2, 3), 0.5, np.float32))
 
     def save(self, path: Path) -> None:
-        """Write it as .npz: parameters with 32 bits, the background with 8 bits a channel."""
-        levels = np.clip(np.rint(self.background * 255), 0, 255).astype(np.uint8)
-        np.savez_compressed(path, parameters=self.splats.parameters, background=levels)
+        """Write it as .npz: parameters with 32 bits, the background in steps of a quarter of a grey level."""
+        brightest = round(MAX_COLOUR * BACKGROUND_LEVELS)
+        levels = np.clip(np.rint(self.background * BACKGROUND_LEVELS), 0, brightest).astype(np.uint16)
+        np.savez_compressed(path, parameters=self.splats.parameters, background=levels, photos=self.photos)
 
     @classmethod
     def load(cls, path: Path) -> SplatLayer:
-        """Read what `save` wrote."""
+        """Read what `save` wrote, also before it wrote photos and colours that are brighter than 1."""
         with np.load(path) as saved:
-            return cls(Splats(saved["parameters"]), saved["background"].astype(np.float32) / 255)
+            levels = saved["background"]
+            splats = Splats(saved["parameters"])
+            if "photos" not in saved:
+                return cls(splats, levels.astype(np.float32) / 255)
+            return cls(splats, levels.astype(np.float32) / BACKGROUND_LEVELS, saved["photos"])
 
 
 def _shell(background: F32, around: Splats) -> Splats:

@@ -1,11 +1,11 @@
-"""Gradient descent of splats: Adam (Kingma and Ba, 2015) of those that a photo sees."""
+"""Gradient descent of splats: Adam (Kingma and Ba, 2015) of those that pixels of a photo show."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit, prange
 
-from scan2sim.pipeline.core.splats import WIDTH
+from scan2sim.pipeline.core.splats import MAX_COLOUR, WIDTH
 from scan2sim.pipeline.core.types import F32, I32
 
 FIRST_MOMENT, SECOND_MOMENT, MIN_ROOT = 0.9, 0.99, 1e-12
@@ -27,7 +27,7 @@ class Descent:
         self._visits = np.zeros(len(parameters), np.float32)
 
     def step(self, index: I32, gradients: F32, rates: F32) -> None:
-        """Take a step.
+        """Take a step. Splats without any gradient, as they are hidden or masked, stay as they are.
 
         Args:
             index: (M,) splats.
@@ -61,6 +61,11 @@ def rates(position: float, scale: float, rotation: float, opacity: float, colour
 def _step(parameters, size, first, second, visits, index, gradients, rates):  # type: ignore[no-untyped-def]
     for m in prange(len(index)):
         i = index[m]
+        shown = False
+        for k in range(WIDTH):
+            shown |= gradients[m, k] != 0
+        if not shown:
+            continue
         visits[i] += 1
         unbiased_first = 1 - np.float32(FIRST_MOMENT) ** visits[i]
         unbiased_second = 1 - np.float32(SECOND_MOMENT) ** visits[i]
@@ -71,5 +76,5 @@ def _step(parameters, size, first, second, visits, index, gradients, rates):  # 
             root = np.sqrt(second[i, k] / unbiased_second) + np.float32(MIN_ROOT)
             step = rates[k] * first[i, k] / unbiased_first / root
             parameters[i, k] -= step * (size[i] if k < 3 else np.float32(1))
-        for k in range(FIRST_COLOUR, WIDTH):  # programs that draw splats clip colours
-            parameters[i, k] = min(max(parameters[i, k], np.float32(0)), np.float32(1))
+        for k in range(FIRST_COLOUR, WIDTH):
+            parameters[i, k] = min(max(parameters[i, k], np.float32(0)), np.float32(MAX_COLOUR))

@@ -10,9 +10,9 @@ from numba import njit
 from scan2sim.pipeline.core.types import F32, I32, Bools
 from scan2sim.texturing.splats.projection import DEPTH, MIN_ALPHA
 
-SIZE = 16
-"""Width and height of a tile in pixels."""
-PIXELS = SIZE * SIZE
+WIDTH, HEIGHT = 8, 32
+"""Size of a tile in pixels: narrow, as only the rows that a splat overlaps are drawn, but over the whole width."""
+PIXELS = WIDTH * HEIGHT
 DEPTH_LEVELS = 2**16 - 1
 """Number of levels of the logarithm of depths, by which splats are sorted: a thousandth of the depth or better."""
 
@@ -38,8 +38,8 @@ class Assignment(NamedTuple):
 
 
 def assign(projected: F32, visible: Bools, width: int, height: int) -> Assignment:
-    """Assign visible splats (of N, (N, 9)) to the tiles that they reach."""
-    columns, rows = -(-width // SIZE), -(-height // SIZE)
+    """Assign visible splats (of N, (N, 11)) to the tiles that they reach."""
+    columns, rows = -(-width // WIDTH), -(-height // HEIGHT)
     index = np.flatnonzero(visible)
     depth = np.log(projected[index, DEPTH])
     low, high = (float(depth.min()), float(depth.max())) if len(depth) else (0.0, 1.0)
@@ -51,18 +51,18 @@ def assign(projected: F32, visible: Bools, width: int, height: int) -> Assignmen
 def to_tiles(image: F32) -> F32:
     """An image (H, W, C) as (T, C, 256), row by row of tiles, filled up with zeros."""
     height, width, channels = image.shape
-    rows, columns = -(-height // SIZE), -(-width // SIZE)
-    padded = np.zeros((rows * SIZE, columns * SIZE, channels), np.float32)
+    rows, columns = -(-height // HEIGHT), -(-width // WIDTH)
+    padded = np.zeros((rows * HEIGHT, columns * WIDTH, channels), np.float32)
     padded[:height, :width] = image
-    tiles = padded.reshape(rows, SIZE, columns, SIZE, channels).transpose(0, 2, 4, 1, 3)
+    tiles = padded.reshape(rows, HEIGHT, columns, WIDTH, channels).transpose(0, 2, 4, 1, 3)
     return np.ascontiguousarray(tiles).reshape(rows * columns, channels, PIXELS)
 
 
 def from_tiles(tiles: F32, width: int, height: int) -> F32:
     """The image (H, W, C) of tiles (T, C, 256)."""
-    rows, columns = -(-height // SIZE), -(-width // SIZE)
-    image = tiles.reshape(rows, columns, -1, SIZE, SIZE).transpose(0, 3, 1, 4, 2)
-    return np.ascontiguousarray(image.reshape(rows * SIZE, columns * SIZE, -1)[:height, :width])
+    rows, columns = -(-height // HEIGHT), -(-width // WIDTH)
+    image = tiles.reshape(rows, columns, -1, HEIGHT, WIDTH).transpose(0, 3, 1, 4, 2)
+    return np.ascontiguousarray(image.reshape(rows * HEIGHT, columns * WIDTH, -1)[:height, :width])
 
 
 @njit(cache=True, inline="always")
@@ -70,16 +70,16 @@ def _overlap(projected, i, columns, rows):  # type: ignore[no-untyped-def]
     """First and last column and row of the tiles that a splat overlaps."""
     u, v, x, y = projected[i, 0], projected[i, 1], projected[i, 6], projected[i, 7]
     return (
-        max(int((u - x) // SIZE), 0), min(int((u + x) // SIZE), columns - 1),
-        max(int((v - y) // SIZE), 0), min(int((v + y) // SIZE), rows - 1),
+        max(int((u - x) // WIDTH), 0), min(int((u + x) // WIDTH), columns - 1),
+        max(int((v - y) // HEIGHT), 0), min(int((v + y) // HEIGHT), rows - 1),
     )  # fmt: skip
 
 
 @njit(cache=True, inline="always")
 def _reaches(projected, i, x, y, farthest):  # type: ignore[no-untyped-def]
     """Whether the ellipse of a splat at the squared distance `farthest` reaches the tile in column x and row y."""
-    left, top = np.float32(x * SIZE) - projected[i, 0], np.float32(y * SIZE) - projected[i, 1]
-    right, bottom = left + np.float32(SIZE - 1), top + np.float32(SIZE - 1)
+    left, top = np.float32(x * WIDTH) - projected[i, 0], np.float32(y * HEIGHT) - projected[i, 1]
+    right, bottom = left + np.float32(WIDTH - 1), top + np.float32(HEIGHT - 1)
     dx, dy = min(max(np.float32(0), left), right), min(max(np.float32(0), top), bottom)
     if dx == 0 and dy == 0:
         return True

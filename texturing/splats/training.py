@@ -11,12 +11,23 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.core.errors import StepError
-from scan2sim.pipeline.core.splats import LOGIT, RGB, Splats
+from scan2sim.pipeline.core.splats import (
+    AXIS,
+    GAIN,
+    LOGIT,
+    MAX_COLOUR,
+    OFFSET,
+    PHOTO_WIDTH,
+    POSITION,
+    RGB,
+    VIGNETTING,
+    Splats,
+)
 from scan2sim.pipeline.core.types import F32
 from scan2sim.texturing.splats import loss, rasterizer
 from scan2sim.texturing.splats.background import Background
 from scan2sim.texturing.splats.descent import Descent, rates
-from scan2sim.texturing.splats.exposure import Gains
+from scan2sim.texturing.splats.exposure import Gains, Response
 from scan2sim.texturing.splats.shots import SCALES, Level, Shot
 
 BACKGROUND_RATE = 0.01
@@ -38,7 +49,7 @@ class Schedule:
         epochs: visits of every photo in a quarter, half and full size.
         position, scale, rotation, opacity, colour: first step of each parameter; positions in sizes of the splat.
         cover: weight of the loss that covers what isn't sky, and uncovers what is.
-        depth: weight of the deviation from known depths, relative to these.
+        depth: weight of the deviation from known inverse depths, relative to these.
         seed: of the order of the photos.
     """
 
@@ -82,7 +93,7 @@ class Training:
             schedule: visits and rates.
             report: is called after every epoch with the share that is done and the mean PSNR.
         """
-        photos = {name: k for k, name in enumerate(dict.fromkeys(shot.name for shot in shots))}
+        photos = _numbers(shots)
         stages = [stage for stage, count in enumerate(schedule.epochs) for _ in range(count)]
         for epoch in range(self.epoch, len(stages)):
             done = epoch / len(stages)
@@ -99,7 +110,7 @@ class Training:
 
     def _recolour(self, factor: F32, offset: F32) -> None:
         """Change all colours of the world."""
-        self.descent.parameters[:, RGB] = np.clip(self.descent.parameters[:, RGB] * factor + offset, 0, 1)
+        self.descent.parameters[:, RGB] = np.clip(self.descent.parameters[:, RGB] * factor + offset, 0, MAX_COLOUR)
         self.background.recolour(factor, offset)
 
     def rendered(self, level: Level) -> tuple[rasterizer.Rendered, F32]:
@@ -111,18 +122,27 @@ class Training:
         """Take a step towards a photo; returns the PSNR before it."""
         drawn, behind = self.rendered(level)
         image = drawn.over(behind)
-        self.gains.solve(k, image, level.rgb, level.weight, 1.0 if self.epoch == 0 else GAIN_RATE)
-        shown = self.gains.applied(k, image)
-        _, gradient = loss.photometric(shown, level.rgb, level.weight)
-        gradient = np.where(level.clipped & (shown > level.rgb), np.float32(0), gradient) * self.gains.gain[k]
-        cover = np.float32(schedule.cover) * level.weight * np.where(level.sky, np.float32(1), np.float32(-1))
-        by_depth = np.float32(schedule.depth) * level.weight * (level.known > 0)
-        found = drawn.gradients(behind, gradient, by_depth, cover)
+        self.gains.solve(k, image, level.rgb, level.used, level.exposed, 1.0 if self.epoch == 0 else GAIN_RATE)
+        found = loss.photometric(image, level.rgb, level.used, self.gains.response(k, level.exposed))
+        used = level.used.astype(np.float32)
+        cover = np.float32(schedule.cover) * used * np.where(level.sky, np.float32(1), np.float32(-1))
+        by_parameters = drawn.gradients(behind, found.gradient, np.float32(schedule.depth) * used, cover)
         first = rates(schedule.position, schedule.scale, schedule.rotation, schedule.opacity, schedule.colour)
-        self.descent.step(drawn.seen, found, first * np.float32(decay))
+        self.descent.step(drawn.seen, by_parameters, first * np.float32(decay))
         through = np.where(drawn.transmittance > MIN_BACKGROUND, drawn.transmittance, np.float32(0))
-        self.background.descend(level.texels, gradient * through[..., None], BACKGROUND_RATE * decay)
-        return _psnr(shown, level)
+        self.background.descend(level.texels, found.gradient * through[..., None], BACKGROUND_RATE * decay)
+        return found.psnr
+
+    def photos(self, shots: Sequence[Shot]) -> F32:
+        """(P, 14) how the photos show the world (`SplatLayer.photos`)."""
+        numbers = _numbers(shots)
+        rows = np.zeros((len(numbers), PHOTO_WIDTH), np.float32)
+        for shot in reversed(shots):  # of several of a photo, the first counts
+            row, exposed = rows[numbers[shot.name]], Response.of(shot.exposure, shot.vignetting)
+            response = self.gains.response(numbers[shot.name], exposed)
+            row[POSITION], row[AXIS] = shot.T_world_cam[:3, 3], shot.T_world_cam[:3, 2]
+            row[GAIN], row[OFFSET], row[VIGNETTING] = response.gain, response.offset, shot.exposure[3:]
+        return rows
 
     def result(self) -> Splats:
         """The splats that are visible.
@@ -156,7 +176,6 @@ class Training:
             return cls(Descent.load(descent), Background.load(dict(state)), gains, int(state["epoch"]))
 
 
-def _psnr(shown: F32, level: Level) -> float:
-    used = level.weight > 0
-    error = (np.clip(shown, 0, 1) - np.clip(level.rgb, 0, 1))[used]
-    return float(-10 * np.log10(max(np.square(error).mean(dtype=np.float64), 1e-10))) if used.any() else math.nan
+def _numbers(shots: Sequence[Shot]) -> dict[str, int]:
+    """Numbers of the photos, in the order of their first shots."""
+    return {name: k for k, name in enumerate(dict.fromkeys(shot.name for shot in shots))}

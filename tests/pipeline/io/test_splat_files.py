@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("gsply", reason="the extra splats isn't installed")
 
 from scan2sim.pipeline.core.errors import SettingError
-from scan2sim.pipeline.core.splats import SplatLayer, Splats
+from scan2sim.pipeline.core.splats import MAX_COLOUR, PHOTO_WIDTH, RGB, SplatLayer, Splats
 from scan2sim.pipeline.io import splat_files
 from scan2sim.pipeline.io.worlds.gltf import splats as gltf
 
@@ -58,10 +58,32 @@ def test_spz_is_small(tmp_path: Path) -> None:
     assert (tmp_path / "a.spz").stat().st_size < 0.35 * (tmp_path / "a.ply").stat().st_size
 
 
+@pytest.mark.parametrize(("away", "metres"), [(2040.0, 6e-4), (3000.0, 1e-3), (20_000.0, 5e-3)])
+def test_spz_holds_positions_far_from_the_origin(tmp_path: Path, away: float, metres: float) -> None:
+    """As finely as it can: half a step, and that of the 32-bit floats which are written and read."""
+    given, offset = some(), np.array([away, 0, 0])
+    splat_files.write(tmp_path / "a.spz", given, offset)
+    assert np.abs(splat_files.read(tmp_path / "a.spz").xyz - (given.xyz + offset)).max() < metres
+
+
 def test_positions_beyond_spz_are_rejected(tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match="Write PLY"):
-        splat_files.write(tmp_path / "a.spz", some(), np.array([5000.0, 0, 0]))
+    with pytest.raises(SettingError, match=r"32,768 m.*Write PLY"):
+        splat_files.write(tmp_path / "a.spz", some(), np.array([32_760.0, 0, 0]))
     assert not (tmp_path / "a.spz").exists()
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".glb"])
+def test_what_is_brighter_than_white_is_white_in_files(tmp_path: Path, suffix: str) -> None:
+    given = some()
+    given.parameters[:, RGB] *= 2
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".glb":
+        gltf.write(path, given, OFFSET)
+        rgb = accessors(path)[1]["KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"] * splat_files.SH_C0 + 0.5
+    else:
+        splat_files.write(path, given, OFFSET)
+        rgb = splat_files.read(path).rgb
+    assert (given.rgb > 1.2).any() and np.abs(rgb - np.minimum(given.rgb, 1)).max() < 0.02
 
 
 def accessors(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -101,11 +123,20 @@ def test_gltf_has_the_same_ellipsoids_with_y_up(tmp_path: Path) -> None:
 
 
 def test_a_layer_is_stored_and_read(tmp_path: Path) -> None:
-    background = np.random.default_rng(1).uniform(size=(8, 16, 3)).astype(np.float32)
-    SplatLayer(some(), background).save(tmp_path / "a.npz")
+    random = np.random.default_rng(1)
+    background = random.uniform(0, MAX_COLOUR, size=(8, 16, 3)).astype(np.float32)
+    photos = random.uniform(size=(3, PHOTO_WIDTH)).astype(np.float32)
+    SplatLayer(some(), background, photos).save(tmp_path / "a.npz")
     read = SplatLayer.load(tmp_path / "a.npz")
     assert np.array_equal(read.splats.parameters, some().parameters)
-    assert np.abs(read.background - background).max() < 0.002
+    assert np.abs(read.background - background).max() < 0.001 and np.array_equal(read.photos, photos)
+
+
+def test_a_layer_of_an_earlier_version_is_read(tmp_path: Path) -> None:
+    background = np.random.default_rng(1).integers(0, 256, (8, 16, 3)).astype(np.uint8)
+    np.savez_compressed(tmp_path / "a.npz", parameters=some().parameters, background=background)
+    read = SplatLayer.load(tmp_path / "a.npz")
+    assert np.allclose(read.background * 255, background, atol=1e-3) and not len(read.photos)
 
 
 def test_the_background_becomes_a_shell_of_its_colours() -> None:
