@@ -189,7 +189,7 @@ def build_graph(
     more = lists | roads | sky | backdrop | splats | solid | origin
     _export(graph, scan, parts, closed, textured, photos, parked["textured"], more)
     _measure(graph, scan, parts, surfaces, textured, photos, synthesized, sky | backdrop | splats)
-    _show(graph, scan, parts, textured, photos, sky)
+    _show(graph, scan, parts, textured, photos, sky, splats)
     return graph.tasks
 
 
@@ -732,9 +732,11 @@ def _measure(
         add(BORDERS, own | others, **graph.cell)
 
 
-def _show(graph: TileGraph, scan: Scan, parts: Parts, textured: Sources, photos: Sources, sky: Sources) -> None:
+def _show(
+    graph: TileGraph, scan: Scan, parts: Parts, textured: Sources, photos: Sources, sky: Sources, splats: Sources
+) -> None:
     """The walkable preview and the pictures of the report."""
-    graph.add(PREVIEW, textured | _plant_models(graph, "textured") | scan.path)
+    graph.add(PREVIEW, textured | _plant_models(graph, "textured") | scan.path | splats)
     stages = {f"decimate.{group}": graph.output(DECIMATE, "mesh", group) for group in parts.groups}
     graph.add(PICTURES, textured | stages | parts.clouds | {"views": photos["views"]} | sky | scan.path)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -11,7 +11,7 @@ import numpy as np
 
 from scan2sim.pipeline.camera import renderer
 from scan2sim.pipeline.core.step import Report
-from scan2sim.pipeline.core.types import F64
+from scan2sim.pipeline.core.types import F64, U8, Camera
 from scan2sim.pipeline.io.images.video import Encoder
 from scan2sim.pipeline.io.trajectory import atomic_write
 from scan2sim.pipeline.io.worlds.scene import Scene
@@ -66,17 +66,24 @@ def film(scene: Scene, file: Path, seconds: float, width: int, report: Report) -
     import cv2
 
     size = width // 2 * 2, width * 9 // 32 * 2
-    camera = renderer.pinhole(*size)
-    world = renderer.Renderer(
-        [renderer.placed(tile.folder / group, tile.offset) for tile in scene.tiles for group in tile.groups],
-        scene.sky,
-    )
+    view = _view(scene, renderer.pinhole(*size))
     poses = flight(scene, round(seconds * FPS))
     with atomic_write(file) as fresh, Encoder(fresh, size, FPS, preset="medium", crf="20") as encoder:
         for i, pose in enumerate(poses):
             report(i / len(poses), f"{i / FPS:.1f} s")
-            picture = world.view(camera, pose, samples=SAMPLES_PER_AXIS).rgb
-            encoder.add(np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2YUV_I420), np.uint8), i / FPS)
+            encoder.add(np.asarray(cv2.cvtColor(view(pose), cv2.COLOR_RGB2YUV_I420), np.uint8), i / FPS)
+
+
+def _view(scene: Scene, camera: Camera) -> Callable[[F64], U8]:
+    """Function from poses (4, 4) in world metres to images (H, W, 3) of the splats or, without any, the surfaces."""
+    if any(tile.splat_count for tile in scene.tiles):
+        from scan2sim.texturing.world_camera import WorldCamera  # loads numba
+
+        world = WorldCamera(scene)
+        return lambda pose: world.render(pose, camera, samples=SAMPLES_PER_AXIS).rgb
+    bodies = [renderer.placed(tile.folder / group, tile.offset) for tile in scene.tiles for group in tile.groups]
+    surfaces = renderer.Renderer(bodies, scene.sky)
+    return lambda pose: surfaces.view(camera, pose, samples=SAMPLES_PER_AXIS).rgb
 
 
 def flight(scene: Scene, count: int) -> list[F64]:

@@ -24,7 +24,8 @@ from scan2sim.pipeline.io.worlds.merge import (
     swap,
 )
 
-THREE_JS = "three.js"
+PAGE_SCRIPTS = ("three.js", "splats.js")
+"""Scripts of the report's 3D view, beside its data."""
 PUBLISHED_OUTPUTS = {"export": ("world", "world"), "rasters": ("rasters", "rasters"), "preview": ("preview", SCRIPTS)}
 """Task to the output that is published, and its folder in the output folder."""
 REPORTED_TASKS = ("exposure", "pictures", "score")
@@ -70,7 +71,8 @@ def publish(
             shutil.rmtree(out / name)
     if (out / SCRIPTS).is_dir():
         with side.attempt(f"{prefix}preview"):
-            shutil.copyfile(PAGES / THREE_JS, out / SCRIPTS / THREE_JS)
+            for script in PAGE_SCRIPTS:
+                shutil.copyfile(PAGES / script, out / SCRIPTS / script)
     with side.attempt(f"{prefix}exposure.json", out / "exposure.json"):
         solved = store.folder("exposure", keys["exposure"]) / done["exposure"].files["exposures"]
         shutil.copyfile(solved, out / "exposure.json")  # for setting `exposure.prior` of other tiles

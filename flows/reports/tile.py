@@ -199,7 +199,7 @@ def _render(
         and {
             **view,
             "folder": SCRIPTS,
-            "about": {name: view[name] for name in ("start", "walk", "turn")} | {"sky": sky},
+            "about": {name: view[name] for name in ("start", "walk", "turn", "splats")} | {"sky": sky},
         },
         script=Markup((PAGES / "walk.js").read_text(encoding="utf-8")),
     )

@@ -22,15 +22,18 @@ from scan2sim.pipeline.io.file_checks import make_folder
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.worlds import glb
 from scan2sim.pipeline.io.worlds.glb import GlbParams
+from scan2sim.pipeline.io.worlds.packed_splats import script_arguments
 from scan2sim.pipeline.io.worlds.provenance import SOURCES
 from scan2sim.pipeline.io.worlds.scene import Scene, SceneTile
 from scan2sim.pipeline.io.worlds.spawn import courses
 from scan2sim.pipeline.steps.pictures import DRIVER_EYE_HEIGHT_M, SEEN_RGB, bird_pose
 
-TEMPLATE, INDEX, TILES, COLLISION = "view.html.j2", "index.html", "tiles", "_collision"
-SCRIPTS = ("three.js", "walk.js", "view.js")
+TEMPLATE, INDEX, TILES = "view.html.j2", "index.html", "tiles"
+COLLISION, SPLATS = "_collision", "_splats"
+"""After a tile's name: the scripts of its collision mesh and its splats."""
+SCRIPTS = ("three.js", "walk.js", "splats.js", "view.js")
 CALL = "scan2simTile"
-"""JavaScript function of the page that the script of each tile calls."""
+"""JavaScript function of the page that the scripts of each tile call."""
 SOURCE_RGB = {name: SEEN_RGB[level] for name, level in zip(SOURCES, (64, 128, 255), strict=True)}
 LOOPBACK_HOSTS = ("localhost", "127.0.0.1", "[::1]")
 """Accepted Host headers; others are rejected, as protection against DNS rebinding."""
@@ -84,8 +87,8 @@ class Pages:
         return [
             f"{name}{kind}.js"
             for name, tile in self._tiles.items()
-            for kind in ("", COLLISION)
-            if tile.groups or not kind
+            for kind, exists in (("", True), (COLLISION, tile.groups), (SPLATS, tile.splat_count))
+            if exists
         ]
 
     def write(self, script: str) -> None:
@@ -96,17 +99,24 @@ class Pages:
             path = self.folder / TILES / script
             if path.is_file():
                 return
-            packed = path.with_suffix(".glb")
-            stem = path.stem
-            if stem in self._tiles:
-                _write_shown(packed, self._tiles[stem], self._megapixels)
-            else:
-                glb.write_solid(packed, self._tiles[stem.removesuffix(COLLISION)].solid())
-            text = base64.b64encode(packed.read_bytes()).decode()
             fresh = path.with_suffix(".part")
-            fresh.write_text(f'{CALL}("{stem}", "{text}");\n', encoding="ascii")
+            fresh.write_text(f'{CALL}("{path.stem}", {self._arguments(path.stem)});\n', encoding="ascii")
             fresh.replace(path)
-            packed.unlink()
+
+    def _arguments(self, name: str) -> str:
+        """What a script passes to the page, in base64: a GLB, or splats and their background."""
+        if name not in self._tiles and name.endswith(SPLATS):
+            layer = self._tiles[name.removesuffix(SPLATS)].splats()
+            assert layer is not None
+            return script_arguments(layer)
+        packed = self.folder / TILES / f"{name}.glb"
+        if name in self._tiles:
+            _write_shown(packed, self._tiles[name], self._megapixels)
+        else:
+            glb.write_solid(packed, self._tiles[name.removesuffix(COLLISION)].solid())
+        text = base64.b64encode(packed.read_bytes()).decode()
+        packed.unlink()
+        return f'"{text}"'
 
 
 def server(pages: Pages, port: int) -> ThreadingHTTPServer:
@@ -171,10 +181,11 @@ def _about(scene: Scene) -> dict[str, Any]:
     codes = colour_of()
     return {
         "tiles": [
-            {"name": tile.name, "offset": tile.offset, "low": tile.low, "high": tile.high,
+            {"name": tile.name, "offset": tile.offset, "low": tile.low, "high": tile.high, "splats": tile.splat_count,
              "triangles": sum(group["triangles"] for group in tile.groups.values())}
             for tile in scene.tiles
         ],
+        "splats": any(tile.splat_count for tile in scene.tiles),
         "dome": scene.dome and {"name": scene.dome.name, "offset": scene.dome.offset, "far": scene.far},
         "photos": photos,
         "colours": {name_of(code): codes[code].tolist() for code in sorted(set(CODE_OF_SURFACE.values()) | {64, 65})},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -133,6 +134,14 @@ class SplatLayer:
             if "photos" not in saved:
                 return cls(splats, levels.astype(np.float32) / 255)
             return cls(splats, levels.astype(np.float32) / BACKGROUND_LEVELS, saved["photos"])
+
+    @staticmethod
+    def count(path: Path) -> int:
+        """Number of splats in a file that `save` wrote, from its header."""
+        with zipfile.ZipFile(path) as archive, archive.open("parameters.npy") as header:
+            np.lib.format.read_magic(header)
+            shape, _, _ = np.lib.format.read_array_header_1_0(header)
+        return int(shape[0])
 
 
 def _shell(background: F32, around: Splats) -> Splats:

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core.classes import SURFACES
+from scan2sim.pipeline.core.splats import SplatLayer
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, Trajectory
 from scan2sim.pipeline.steps.pictures import bird_pose, bounds, driver_pose, whole_pose
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from scan2sim.pipeline.io.worlds.textured_mesh import Textured
 
 CALLBACK = b"scan2simWorld"  # JavaScript function of the report's viewer that receives the GLB
+SPLATS_CALLBACK, SPLATS_SCRIPT = "scan2simSplats", "splats_data.js"  # and the function and script of the splats
 
 
 class PreviewParams(Params):
@@ -27,19 +29,21 @@ class PreviewParams(Params):
         megapixels: maximum size of all texture pages together; larger ones are scaled down.
         triangles: maximum number of triangles; larger worlds get no preview.
         jpeg_quality: JPEG quality of the texture pages.
+        splats: maximum number of splats; if there are more, the preview shows surfaces only.
     """
 
     megapixels: float = Field(32.0, ge=0.1, le=1000)
     triangles: int = Field(2_000_000, ge=0, le=20_000_000)
     jpeg_quality: int = Field(85, ge=1, le=100)
+    splats: int = Field(1_000_000, ge=0, le=3_000_000)
 
 
 def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) -> Done:
-    """Pack the textured groups as a GLB inside a script, `preview/world.js`.
+    """Pack the textured groups as a GLB inside a script, `preview/world.js`, and splats in `preview/splats_data.js`.
 
     A page opened from the file system can load scripts, but no other files. Metrics: `scale` of the texture pages,
-    `bytes`, and the initial camera poses `walk` and `turn` as [position, target], local metres; `start` names the one
-    to begin with, as in the report's first image.
+    number of `splats`, `bytes`, and the initial camera poses `walk` and `turn` as [position, target], local metres;
+    `start` names the one to begin with, as in the report's first image.
     """
     from scan2sim.pipeline.camera import renderer
     from scan2sim.pipeline.io.worlds import glb, textured_mesh
@@ -61,6 +65,7 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     script = folder / "world.js"
     script.write_bytes(CALLBACK + b'("' + base64.b64encode(packed.read_bytes()) + b'");\n')
     packed.unlink()
+    splats = _pack_splats(inputs["splats"], params.splats, folder) if "splats" in inputs else 0
     path = Trajectory.load(inputs["path"]).positions if "path" in inputs else np.zeros((0, 3))
     driven = len(path) > 1
     points = np.concatenate([surface.mesh.vertices for surface in surfaces.values()])
@@ -70,12 +75,25 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     metrics: dict[str, Any] = {
         "triangles": triangles,
         "scale": round(scale, 4),
-        "bytes": script.stat().st_size,
+        "splats": splats,
+        "bytes": sum(file.stat().st_size for file in folder.iterdir()),
         "start": "walk" if driven else "turn",
         "walk": _position_and_target(driver_pose(path if driven else None, low, high, shapes), low),
         "turn": _position_and_target(air, low),
     }
     return Done({"preview": folder}, metrics)
+
+
+def _pack_splats(source: Path, most: int, folder: Path) -> int:
+    """Write the script of a layer of splats; returns their number, 0 if there are none or more than `most`."""
+    from scan2sim.pipeline.io.worlds.packed_splats import script_arguments
+
+    count = SplatLayer.count(source)
+    if not 0 < count <= most:
+        return 0
+    text = f"{SPLATS_CALLBACK}({script_arguments(SplatLayer.load(source))});\n"
+    (folder / SPLATS_SCRIPT).write_text(text, encoding="ascii")
+    return count
 
 
 def _texels(surfaces: dict[str, Textured]) -> int:
@@ -97,4 +115,4 @@ def _position_and_target(pose: F64, low: F64) -> list[list[float]]:
     return [position.round(3).tolist(), (position + ahead * distance).round(3).tolist()]
 
 
-PREVIEW = Step("preview", 3, preview, PreviewParams)
+PREVIEW = Step("preview", 4, preview, PreviewParams)

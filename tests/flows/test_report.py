@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,16 @@ import pytest
 
 from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.pipelines.graph import Task
-from scan2sim.flows.reports.tile import representative, write_report
+from scan2sim.flows.reports.publish import PAGE_SCRIPTS
+from scan2sim.flows.reports.tile import PAGES, SCRIPTS, representative, write_report
 from scan2sim.pipeline.core.cache import Manifest, Store
-from scan2sim.pipeline.core.step import Done, Params, Step
+from scan2sim.pipeline.core.step import Done, Params, Step, silent
 from scan2sim.pipeline.core.types import Frame, Tile
 from scan2sim.pipeline.io.images import image
+from scan2sim.pipeline.steps.preview import PREVIEW, PreviewParams
+from tests.fakes import splat_scenes, synthetic
+from tests.fakes.browser import Page, chromium
+from tests.waiting import until
 
 PART = {"psnr_db": 20.12, "psnr_gain_db": 23.4, "ssim": 0.71, "pixels": 300}
 NOTHING = {"psnr_db": None, "psnr_gain_db": None, "ssim": None, "pixels": 0}
@@ -75,13 +81,17 @@ LIDAR: dict[str, Any] = {
 def report(tmp_path: Path) -> Any:
     """Write a report of synthetic results; returns the content of report.json and the page."""
 
-    def write(scored: dict[str, Any], more: Mapping[str, dict[str, Any]] = {}) -> tuple[dict[str, Any], str]:
+    def write(
+        scored: dict[str, Any], more: Mapping[str, dict[str, Any]] = {}, preview: Path | None = None
+    ) -> tuple[dict[str, Any], str]:
         store, done, planned = Store(tmp_path / "steps"), dict[str, Manifest](), []
         for task, metrics in {**FACTS, "score": scored, **more}.items():
             folder = store.begin(task)
             photos = list(scored["photos"])
             files = {name: album(folder, name, photos) for name in ("error", "frames")} if task == "score" else {}
             files |= {"images": album(folder, "images", list(metrics["sweeps"]))} if task == "lidar_score" else {}
+            if task == "preview" and preview is not None:
+                files |= {"preview": Path(shutil.copytree(preview, folder / "preview"))}
             about = {"version": 1, "params": {}, "inputs": {}, "inputs_digest": "", "seconds": 1.0, "peak_mb": 100.0}
             done[task] = store.commit(task, "key", folder, Done(files, metrics), about)
             planned.append(PlannedTask(Task(Step(task, 1, no_step), Params(), {}), "key", {}, None))
@@ -205,3 +215,53 @@ def test_representative_images_are_worst_median_and_best() -> None:
     scores = {str(i): {"psnr_gain_db": float(value)} for i, value in enumerate([3, 1, 4, 5, 2])}
     assert [entry["title"] for entry in representative(entries, scores)] == ["1", "0", "3"]
     assert [entry["title"] for entry in representative(entries[:2], scores)] == ["1", "0"]
+
+
+NEXT_FRAME_DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
+
+
+def published_preview(folder: Path, *, splats: bool) -> Done:
+    """The preview of the synthetic tile, with the page's scripts beside its data in `folder`/`SCRIPTS`."""
+    meshes = {"terrain": synthetic.ground(), "building": synthetic.house()}
+    inputs = {group: synthetic.textured(folder / group, mesh) for group, mesh in meshes.items()}
+    if splats:
+        inputs["splats"] = folder / "splats.npz"
+        splat_scenes.layer().save(inputs["splats"])
+    (folder / "made").mkdir()
+    done = PREVIEW.run(inputs, PreviewParams(), folder / "made", silent)
+    published = Path(shutil.copytree(done.files["preview"], folder / SCRIPTS))
+    for script in PAGE_SCRIPTS:
+        shutil.copyfile(PAGES / script, published / script)
+    return done
+
+
+def header(page: Page) -> np.ndarray:
+    page.until(NEXT_FRAME_DRAWN)
+    return page.screenshot()[:400].astype(int)
+
+
+def test_page_walks_through_splats_and_surfaces(report: Any, tmp_path: Path) -> None:
+    done = published_preview(tmp_path, splats=True)
+    report(UNSCORED, {"preview": done.metrics}, done.files["preview"])
+    with chromium(tmp_path) as page:
+        page.open(tmp_path / "report.html")
+        page.click("[data-open]")
+        page.until("document.querySelector('header').dataset.splats === 'loaded'")
+        page.click("[data-show=surfaces]")
+        surfaces = header(page)
+        page.click("[data-show=splats]")
+        page.until("document.querySelector('[data-show=splats]').ariaPressed === 'true'")
+        until(lambda: np.abs(header(page) - surfaces).mean() > 20, what="the splats")
+        page.click("[data-show=surfaces]")
+        until(lambda: np.array_equal(header(page), surfaces), what="the surfaces")
+        (tmp_path / SCRIPTS / "splats_data.js").unlink()
+        page.open(tmp_path / "report.html")
+        page.click("[data-open]")
+        page.until("document.querySelector('[role=status]').textContent.includes(\"splats can't be shown\")")
+        assert page.value("document.querySelector('header').dataset.state") == "open" and page.errors == []
+
+
+def test_page_without_splats_has_no_buttons_for_them(report: Any, tmp_path: Path) -> None:
+    done = published_preview(tmp_path, splats=False)
+    page = report(UNSCORED, {"preview": done.metrics}, done.files["preview"])[1]
+    assert "data-open" in page and "data-show=" not in page.split("<main>")[0].split("</style>")[1]

@@ -252,7 +252,7 @@ def test_failing_copies_and_damaged_reports_affect_only_themselves(
     copy = publish._publish
     with monkeypatch.context() as patch:
         patch.setattr(publish, "_publish", lambda *args: raising() if args[1].name == "rasters" else copy(*args))
-        patch.setattr(publish, "THREE_JS", "missing.js")
+        patch.setattr(publish, "PAGE_SCRIPTS", ("missing.js",))
         patch.setattr(publish, "versions", raising)
         code, printed = scan2sim("run", street, "--out", out)
     assert code == INCOMPLETE and "Traceback" not in printed

@@ -1,13 +1,16 @@
-// Viewer of a world: loads tiles by distance, coloured by photo, class, source or photo distance. Classic scripts, so that
-// the page can also be opened from a file: each tile is a script that calls scan2simTile with a GLB as base64.
+// Viewer of a world: loads tiles by distance, shows their splats, or their surfaces coloured by photo, class, source or
+// photo distance. Classic scripts, so that the page can also be opened from a file: each tile is a script that calls
+// scan2simTile with a GLB as base64, and another one that calls it with splats and their background.
 "use strict";
 
 (() => {
   const MAX_TEXELS = 320e6; // texture memory of all loaded tiles; above it the farthest are unloaded
+  const MAX_SPLATS = 3e6; // of all loaded tiles, likewise
   const DISTANCE_COLOURS = [[0, "#30123b"], [5, "#4686fb"], [10, "#1ae4b6"], [20, "#a4fc3c"], [35, "#fb7e21"], [60, "#7a0403"]]; // metres
   const NO_PHOTO_COLOUR = "#8a8f96";
+  const SPLATS = "_splats", COLLISION = "_collision"; // after a tile's name: its scripts
   const FIRST_PHOTO_ROW = 3; // row of the first photo in a GLB's table; rows 0 to 2: inpainted, point cloud, unknown photo
-  const { View, load, meshes } = window.scan2sim;
+  const { Splats, View, bytes, load, meshes } = window.scan2sim;
 
   // Patch a material: where `tinted` is 1, each vertex has a colour that is modulated by the texture's brightness.
   function tintable(material, tinted) {
@@ -44,6 +47,7 @@
       this.colours = "photo";
       this.shown = { wireframe: false, collision: false };
       this.loaded = new Map(); // script name to the meshes and state of what it loaded
+      if (about.splats) this.splats = new Splats(this.renderer, () => (this.stale = true));
       this.wires = new THREE.MeshBasicMaterial({ color: 0x0a1018, wireframe: true, transparent: true, opacity: 0.45, depthWrite: false });
       this.loop();
     }
@@ -64,15 +68,20 @@
       }
     }
 
-    // Tile and name of the script to load next: visible meshes first, then collision meshes if they are shown.
+    // Tile and name of the script to load next: visible meshes first, then splats and collision meshes if they are shown.
     next() {
-      let budget = MAX_TEXELS;
+      let texels = MAX_TEXELS, splats = MAX_SPLATS;
       for (const tile of this.nearest()) {
         const held = this.loaded.get(tile.name);
-        budget -= held?.texels ?? 0;
-        if (budget < 0) { this.drop(tile.name); continue; }
+        texels -= held?.texels ?? 0;
+        if (texels < 0) { this.drop(tile.name); continue; }
         if (!held) return [tile, tile.name];
-        if (this.shown.collision && tile !== this.about.dome && !this.loaded.has(`${tile.name}_collision`)) return [tile, `${tile.name}_collision`];
+        if (this.splatted && tile.splats) {
+          splats -= tile.splats;
+          if (splats < 0) this.splats.drop(tile.name);
+          else if (!this.splats.has(tile.name)) return [tile, `${tile.name}${SPLATS}`];
+        }
+        if (this.shown.collision && tile !== this.about.dome && !this.loaded.has(`${tile.name}${COLLISION}`)) return [tile, `${tile.name}${COLLISION}`];
       }
       this.say(this.loaded.size ? "" : "Loading …");
       return null;
@@ -80,20 +89,22 @@
 
     async fetch(tile, name) {
       this.say(`Loading ${name} …`);
-      const got = new Promise((done) => (window.scan2simTile = (of, base64) => of === name && done(base64)));
+      const got = new Promise((done) => (window.scan2simTile = (of, ...parts) => of === name && done(parts)));
       try {
         await load("tiles", [`${name}.js`]);
       } catch (error) {
         this.failed = true;
         throw error;
       }
-      const found = await meshes(await got, tile.offset);
+      const parts = await got;
+      if (name === `${tile.name}${SPLATS}`) return this.splats.put(tile.name, ...parts.map(bytes), tile.offset);
+      const found = await meshes(parts[0], tile.offset);
       const solid = name !== tile.name;
       const texels = found.reduce((sum, { material }) => sum + (material.map ? material.map.image.width * material.map.image.height : 0), 0);
       for (const mesh of found) this.prepare_mesh(mesh, solid);
       this.loaded.set(name, { tile, solid, texels, meshes: found });
-      if (solid || tile === this.about.dome) this.scene.add(...found);
-      else this.put(name, found);
+      if (solid) this.scene.add(...found);
+      else this.put(name, found, tile !== this.about.dome);
       this.update_tile(name);
       if (this.walking && !this.about.photos.length) this.stand();
     }
@@ -112,7 +123,7 @@
     }
 
     drop(name) {
-      for (const of of [name, `${name}_collision`]) {
+      for (const of of [name, `${name}${COLLISION}`]) {
         const held = this.loaded.get(of);
         if (!held) continue;
         for (const mesh of held.meshes) {
@@ -121,10 +132,12 @@
           mesh.material.map?.dispose();
           mesh.material.dispose();
         }
+        this.tiles.delete(of);
         this.grounds.delete(of);
         this.loaded.delete(of);
         this.stale = true;
       }
+      this.splats?.drop(name);
     }
 
     // Update visibility and colours of a tile from the buttons.
@@ -151,9 +164,11 @@
       tint.needsUpdate = true;
     }
 
+    // Show splats, and textures where a tile has none, or surfaces in one of their colours.
     colour(kind) {
-      this.colours = kind;
-      this.tinted.value = kind === "photo" ? 0 : 1;
+      this.splatted = kind === "splats";
+      this.colours = this.splatted ? "photo" : kind;
+      this.tinted.value = this.colours === "photo" ? 0 : 1;
       for (const name of this.loaded.keys()) this.update_tile(name);
     }
 
@@ -189,6 +204,15 @@
       this.stale = true;
     }
 
+    // The nearest tile whose splats are loaded.
+    behind() {
+      return this.nearest().find(({ name }) => this.splats.has(name))?.name;
+    }
+
+    covers(name) {
+      return name === this.about.dome?.name || super.covers(name);
+    }
+
     say(text) {
       document.querySelector("[role=status]").textContent = text;
     }
@@ -199,9 +223,10 @@
     const key = (colour, text) => `<span><i style="background:${colour}"></i>${text}</span>`;
     const css = (rgb) => `rgb(${rgb.join(",")})`;
     const last = DISTANCE_COLOURS[DISTANCE_COLOURS.length - 1][0];
-    box.hidden = kind === "photo";
+    box.hidden = kind === "photo" || kind === "splats";
     box.innerHTML = {
       photo: () => "",
+      splats: () => "",
       class: () => Object.entries(about.colours).map(([name, rgb]) => key(css(rgb), name.replace("_", " "))).join(""),
       source: () => ["inpainted", "from the point cloud", "from a photo"].map((text, i) => key(css(about.sources[i]), text)).reverse().join(""),
       distance: () => `<b style="background:linear-gradient(90deg, ${DISTANCE_COLOURS.map(([at, colour]) => `${colour} ${(100 * at) / last}%`)})"></b><span>0 to ${last} m to the photo</span>${key(NO_PHOTO_COLOUR, "no photo")}`,
@@ -238,7 +263,7 @@
     select.addEventListener("change", () => stand(0));
     all("[data-photo]").forEach((button) => button.addEventListener("click", () => stand(Number(button.dataset.photo))));
     world.pads(document);
-    colour("photo");
+    colour(about.splats ? "splats" : "photo");
     mode();
     world.canvas.focus();
   }

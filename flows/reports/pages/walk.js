@@ -1,6 +1,6 @@
 // 3D view of a world: orbit from above, or walk at eye height. Classic scripts, because a page opened from a file (file://)
-// can't load modules or fetch data: world.js calls scan2simWorld with the GLB as base64. Other pages build on
-// window.scan2sim.
+// can't load modules or fetch data: world.js calls scan2simWorld with the GLB as base64, splats_data.js scan2simSplats with
+// splats and their background. Other pages build on window.scan2sim.
 "use strict";
 
 (() => {
@@ -27,10 +27,11 @@
     }
   }
 
+  const bytes = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+
   // Unlit meshes of a GLB, converted to z up as in the simulator and moved by an offset in metres.
   async function meshes(base64, offset = [0, 0, 0]) {
-    const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
-    const { scene } = await new THREE.GLTFLoader().parseAsync(bytes.buffer, "");
+    const { scene } = await new THREE.GLTFLoader().parseAsync(bytes(base64).buffer, "");
     scene.rotation.x = Math.PI / 2;
     scene.position.set(...offset);
     scene.updateMatrixWorld();
@@ -99,8 +100,11 @@
       this.canvas.setAttribute("aria-label", "3D view of the world; W A S D or arrow keys walk, dragging looks around");
       box.prepend(this.canvas);
       this.scene = new THREE.Scene();
-      this.scene.background = new THREE.Color(about.sky ? `rgb(${about.sky.join(",")})` : SKY_COLOUR);
+      this.sky = new THREE.Color(about.sky ? `rgb(${about.sky.join(",")})` : SKY_COLOUR);
+      this.tiles = new Map(); // name to the meshes
       this.grounds = new Map();
+      this.splats = null; // Splats (splats.js), drawn instead of the surfaces of their tiles if `splatted`
+      this.splatted = false;
       if (all.length) this.put("world", all);
       this.camera = new THREE.PerspectiveCamera(65, 1, 0.05, 5000);
       this.camera.up.set(0, 0, 1);
@@ -123,10 +127,11 @@
       requestAnimationFrame(frame);
     }
 
-    // Add meshes to the scene and to the ground.
-    put(name, found) {
+    // Add the meshes of a tile to the scene, and to the ground if they are `solid`.
+    put(name, found, solid = true) {
       this.scene.add(...found);
-      this.grounds.set(name, new Ground(found));
+      this.tiles.set(name, found);
+      if (solid) this.grounds.set(name, new Ground(found));
       this.stale = true;
     }
 
@@ -229,11 +234,46 @@
       this.stale = true;
     }
 
+    // Name of the tile whose background is behind the splats.
+    behind() {
+      return "world";
+    }
+
+    // Whether splats are drawn in place of a tile's surfaces.
+    covers(name) {
+      return this.splats.shows(name);
+    }
+
+    // Draw the sky or, if they are shown, splats, and then the meshes. Surfaces that splats cover only hide what is behind.
     draw() {
       this.stale = false;
+      const splats = this.splatted && this.splats.draw(this.camera, this.behind());
+      for (const [name, found] of this.tiles) for (const { material } of found) material.colorWrite = !(splats && this.covers(name));
+      this.scene.background = splats ? null : this.sky;
+      this.renderer.autoClear = !splats;
+      if (splats) this.renderer.clearDepth();
       this.renderer.render(this.scene, this.camera);
       this.output.value = this.camera.position.toArray().map((v) => v.toFixed(2)).join("  ");
     }
+  }
+
+  // Load the splats, show them, and connect the buttons that choose between them and the surfaces.
+  async function add_splats(box, view) {
+    const [packed, jpeg] = await new Promise((got, fail) => {
+      window.scan2simSplats = (...parts) => got(parts.map(bytes));
+      load(box.dataset.folder, ["splats.js", "splats_data.js"]).catch(fail);
+    });
+    view.splats = new window.scan2sim.Splats(view.renderer, () => (view.stale = true));
+    view.splats.put("world", packed, jpeg);
+    const buttons = box.querySelectorAll("[data-show]");
+    const show = (what) => {
+      view.splatted = what === "splats";
+      view.stale = true;
+      buttons.forEach((button) => button.setAttribute("aria-pressed", String(button.dataset.show === what)));
+    };
+    buttons.forEach((button) => button.addEventListener("click", () => show(button.dataset.show)));
+    show("splats");
+    box.dataset.splats = "loaded";
   }
 
   // Load the world and open the view in `box`, with attributes `data-folder` (of the scripts) and `data-about` (see View).
@@ -246,7 +286,7 @@
         window.scan2simWorld = got;
         load(box.dataset.folder, ["three.js", "world.js"]).catch(fail);
       });
-      const view = new View(box, await meshes(base64), JSON.parse(box.dataset.about));
+      const about = JSON.parse(box.dataset.about), view = new View(box, await meshes(base64), about);
       box.querySelectorAll("[data-to]").forEach((button) => button.addEventListener("click", () => view.mode(button.dataset.to)));
       view.pads(box);
       const full = box.querySelector("[data-full]");
@@ -255,12 +295,13 @@
       say("");
       box.dataset.state = "open";
       view.canvas.focus({ preventScroll: true });
+      if (about.splats) add_splats(box, view).catch((error) => say(`The splats can't be shown: ${error.message}.`));
     } catch (error) {
       box.dataset.state = "failed";
       say(/webgl/i.test(error.message) ? "This browser has no WebGL, which the 3D view needs; the image shows the world." : `The world can't be shown: ${error.message}.`);
     }
   }
 
-  window.scan2sim = { View, load, meshes };
+  window.scan2sim = { View, bytes, load, meshes };
   for (const box of document.querySelectorAll("header[data-about]")) box.querySelector("[data-open]").addEventListener("click", () => open(box));
 })();

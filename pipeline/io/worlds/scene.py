@@ -156,9 +156,13 @@ class SceneTile:
 
     def splats(self) -> SplatLayer | None:
         """What cameras see of it; None: it was built without."""
+        return SplatLayer.load(self.folder / SPLATS_FILE) if self.splat_count else None
+
+    @property
+    def splat_count(self) -> int:
+        """Number of its splats; 0: it was built without."""
         path = self.folder / SPLATS_FILE
-        layer = SplatLayer.load(path) if path.is_file() else None
-        return layer if layer is not None and len(layer.splats) else None
+        return SplatLayer.count(path) if path.is_file() else 0
 
     def solid(self) -> Mesh:
         """The collision mesh."""

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from scan2sim.pipeline.core.splats import SplatLayer
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.steps.preview import CALLBACK, PREVIEW, PreviewParams
-from tests.fakes import synthetic
+from tests.fakes import splat_scenes, synthetic
 
 
 @pytest.fixture
@@ -22,7 +23,10 @@ def made(tmp_path: Path) -> Any:
     meshes = {"terrain": synthetic.ground(), "building": synthetic.house()}
     inputs = {group: synthetic.textured(tmp_path / group, mesh) for group, mesh in meshes.items()}
 
-    def make(**params: Any) -> Done:
+    def make(layer: SplatLayer | None = None, **params: Any) -> Done:
+        if layer is not None:
+            inputs["splats"] = tmp_path / "splats.npz"
+            layer.save(inputs["splats"])
         out = tmp_path / "out"
         out.mkdir()
         return PREVIEW.run(inputs, PreviewParams(**params), out, silent)
@@ -60,3 +64,17 @@ def test_preview_camera_starts_on_the_ground(made: Any) -> None:
 def test_world_with_too_many_triangles_has_no_preview(made: Any) -> None:
     done = made(triangles=1000)
     assert done.files == {} and done.metrics == {"triangles": 3210}
+
+
+def test_preview_contains_splats_unless_there_are_too_many(made: Any) -> None:
+    layer = splat_scenes.layer(count=50)
+    done = made(layer)
+    script = (done.files["preview"] / "splats_data.js").read_text(encoding="ascii")
+    assert script.startswith('scan2simSplats("') and done.metrics["splats"] == 50
+    assert done.metrics["bytes"] == sum(file.stat().st_size for file in done.files["preview"].iterdir())
+
+
+@pytest.mark.parametrize("layer", [splat_scenes.layer(count=50), SplatLayer.nothing()])
+def test_preview_without_splats(made: Any, layer: SplatLayer) -> None:
+    done = made(layer, splats=49)
+    assert [file.name for file in done.files["preview"].iterdir()] == ["world.js"] and done.metrics["splats"] == 0
