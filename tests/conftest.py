@@ -43,6 +43,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("real_data")
         if needs_recordings or any(item.path.is_relative_to(ROOT / folder) for folder in WORLD_TESTS):
             item.add_marker(pytest.mark.timeout(LONG_TIMEOUT_S))
+        if item.get_closest_marker("realtime") and "realtime" not in item.path.read_text(encoding="utf-8"):
+            raise pytest.UsageError(f"{item.path}: `make test` finds tests in real time by the name of their marker")
 
 
 @pytest.fixture(scope="session")

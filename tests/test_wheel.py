@@ -29,7 +29,8 @@ COARSE_SETTINGS = ["--set", "unwrap.texel=0.1", "--set", "decimate.target=10000"
 def run(*command: object, cwd: Path, code: int = 0, **env: str) -> str:
     """Run a command that must end with exit status `code`; returns its output, including standard error."""
     result = subprocess.run(
-        [str(part) for part in command], cwd=cwd, env=os.environ | {"PYTHONPATH": "", "COLUMNS": "200"} | env,
+        [str(part) for part in command], cwd=cwd,
+        env=os.environ | {"PYTHONPATH": "", "PYTHONSAFEPATH": "", "COLUMNS": "200"} | env,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     )  # fmt: skip
     assert result.returncode == code, result.stdout

@@ -100,7 +100,7 @@ def receive(
     try:
         kind, value, message = connection.recv()
     except EOFError:
-        process.join()
+        process.join(10)
         cause = "was killed, probably because memory ran out" if process.exitcode == -signal.SIGKILL else "crashed"
         raise StepError(
             item.task.full_name,
@@ -126,3 +126,4 @@ def stop(process: ForkServerProcess) -> None:
         os.killpg(process.pid, signal.SIGKILL)
     except (ProcessLookupError, PermissionError):
         process.kill()
+    process.join(10)

@@ -24,7 +24,7 @@ from scan2sim.pipeline.core import sandbox
 from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.core.errors import DamagedError, ScanError, StepError
 
-_one_at_a_time = threading.Lock()
+_one_at_a_time = threading.RLock()
 """Native code that has a process of its own elsewhere may not be safe in several threads."""
 
 

@@ -384,7 +384,7 @@ def test_failed_or_interrupted_runs_print_only_their_messages(tmp_path: Path, so
         [sys.executable, "-c", FAILED_AND_INTERRUPTED_RUNS, str(source)], cwd=ROOT, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
-    until(lambda: child.poll() is not None or (tmp_path / "hang" / "pid_b").exists(), what="a running task")
+    until(lambda: child.poll() is not None or (tmp_path / "hang" / "pid_b").exists(), 180, what="a running task")
     os.killpg(child.pid, signal.SIGINT)  # as a terminal does
     printed = "".join(child.communicate())
     lines, messages = printed.splitlines(), ("was killed", "failed unexpectedly", "interrupted")

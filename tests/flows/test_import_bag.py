@@ -42,7 +42,7 @@ from tests.pipeline.importers.bag.test_unpack import (
 
 @pytest.fixture(autouse=True)
 def _wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(display.console, "width", 200)
+    monkeypatch.setattr(display.console, "_width", 200)  # undoing `width` would fix it at its present value
 
 
 @pytest.fixture(autouse=True)

@@ -30,7 +30,7 @@ GEOID_M = 45.0
 
 @pytest.fixture(autouse=True)
 def _wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(display.console, "width", 200)
+    monkeypatch.setattr(display.console, "_width", 200)  # undoing `width` would fix it at its present value
 
 
 @pytest.fixture(scope="module")

@@ -98,7 +98,7 @@ def test_full_disk_is_a_space_error(small_street: Path, tmp_path: Path, megabyte
             in_process("run", small_street, "--out", mount / "out", *FAST), 6, "no space left", "Free some space"
         )
     finally:
-        subprocess.run(["umount", str(mount)], check=True)
+        subprocess.run(["umount", "--lazy", str(mount)], check=True)
 
 
 def test_ctrl_c_prints_a_message_and_releases_the_lock(street: Path, tmp_path: Path) -> None:

@@ -5,14 +5,11 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from contextlib import redirect_stderr
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from scan2sim.flows import cli
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.loopback import is_loopback, require_protection
@@ -22,6 +19,7 @@ from scan2sim.services.teleoperation.settings import GatewayParams, StationParam
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams
 from scan2sim.services.toolboxes.settings import ServeParams
 from tests.conftest import ROOT
+from tests.flows.command import in_process
 
 LOOPBACK = ("127.0.0.1", "127.1.2.3", "::1", "[::1]", "localhost", "LOCALHOST")
 NOT_LOOPBACK = ("0.0.0.0", "::", "", "192.0.2.1", "10.0.0.1", "::ffff:192.0.2.1", "robot.example", "127.robot.example")
@@ -76,11 +74,8 @@ def test_adapter_requires_its_key_everywhere(host: str) -> None:
 
 def command(*words: object) -> tuple[int, str]:
     """Run `scan2sim` in this process; returns its exit code and its errors."""
-    errors = StringIO()
-    with pytest.MonkeyPatch.context() as patch, redirect_stderr(errors), pytest.raises(SystemExit) as ended:
-        patch.setattr(sys, "argv", ["scan2sim", *map(str, words)])
-        cli.main()
-    return int(ended.value.code or 0), errors.getvalue()
+    done = in_process(*words)
+    return done.returncode, done.stderr
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ SPHERE = Geod(a=6_378_137.0, b=6_378_137.0)
 
 @pytest.fixture(autouse=True)
 def _wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(display.console, "width", 200)
+    monkeypatch.setattr(display.console, "_width", 200)  # undoing `width` would fix it at its present value
 
 
 def command(*words: object) -> Result:
