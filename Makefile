@@ -23,7 +23,7 @@ test-all: .venv/.installed-dev .venv-ros .venv-triton
 lint: .venv/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(BIN)/mypy --num-workers 2
 
 # builds the documentation into site/; broken links are errors
 docs: .venv/.installed-dev

@@ -239,8 +239,10 @@ def read(
         cluster: need not be reachable yet.
         topic: its name; created if it doesn't exist.
         group: consumer group, whose members share the topic's records.
-        from_start: start with the oldest stored record if the group is new, else with new records only.
-        since: start with the records that reached Kafka at or after this time, in seconds since the epoch.
+        from_start: start with the oldest stored record where the group has read nothing, unless `since` is given.
+        since: start with the records that reached Kafka at or after this time, in seconds since the epoch, where the
+            group has read nothing; default, without `from_start`: the time of the first poll. So no record is skipped
+            while the group assigns the partitions, also after an outage in which the broker lost its records.
         connected: called with True while the broker has assigned the topic and answers, otherwise with False; at once
             if connections break, otherwise at the next probe.
         reached: called at each sign that a broker is there: a message, or an answer while there are none.
@@ -257,6 +259,7 @@ def read(
     from confluent_kafka import Consumer, KafkaError, KafkaException
 
     cause, warned, probe = "", False, _Probe(max_probe_pause)
+    start = None if from_start and since is None else _Start(time.time() if since is None else since)
 
     def on_error(error: Any) -> None:
         nonlocal cause, warned
@@ -272,14 +275,12 @@ def read(
     def on_assign(consumer: Any, partitions: list[Any]) -> None:
         nonlocal warned
         warned = True
-        connected(True)
-        if since is not None:
-            for partition in partitions:
-                partition.offset = int(1000 * since)
+        if start is not None:
             try:
-                consumer.assign(consumer.offsets_for_times(partitions, ACKNOWLEDGE_TIMEOUT_S))
+                start.assign(consumer, partitions)
             except KafkaException as error:
                 log.warning("%s: earlier records are unavailable, only new ones are read (%s)", topic, error)
+        connected(True)
 
     consumer = cluster.configured(
         Consumer,
@@ -288,6 +289,7 @@ def read(
             "auto.offset.reset": "earliest" if from_start else "latest",
             "session.timeout.ms": 6000,
             "fetch.wait.max.ms": 10,
+            "enable.partition.eof": True,
             "allow.auto.create.topics": True,
             "topic.metadata.refresh.interval.ms": 1000,  # the topic may be created later
             "logger": _silent_logger(),
@@ -299,6 +301,10 @@ def read(
     try:
         while True:
             message = consumer.poll(wait)
+            if message is not None and message.error() and message.error().code() == KafkaError._PARTITION_EOF:
+                if start is not None:
+                    start.at_end(message.partition())
+                continue
             if message is None or message.error():
                 if probe.is_due():
                     answers = _answers(consumer, topic_name(topic))
@@ -312,6 +318,8 @@ def read(
                 continue
             reached()
             connected(True)
+            if start is not None and start.is_earlier(message):
+                continue
             header, body = dict(message.headers() or ()).get(RECORD_ID_HEADER), message.value()
             record_id = None if header is None else _record_id(header)
             if not body:
@@ -324,6 +332,55 @@ def read(
                 dropped(record_id)
     finally:
         _close(consumer)
+
+
+class _Start:
+    """Where a consumer starts: partitions of which its group has read nothing with the first record since a time."""
+
+    def __init__(self, seconds: float) -> None:
+        """`seconds`: since the epoch."""
+        self._since_ms = int(1000 * seconds)
+        self._unverified = set[int]()
+
+    def assign(self, consumer: Any, partitions: Sequence[Any]) -> None:
+        """Assign partitions at their starting offsets.
+
+        Raises:
+            KafkaException: the broker doesn't answer.
+        """
+        from confluent_kafka import OFFSET_END, TopicPartition
+
+        def offsets_at(time_ms: int) -> list[Any]:
+            asked = [TopicPartition(one.topic, one.partition, time_ms) for one in unread]
+            found: list[Any] = consumer.offsets_for_times(asked, ACKNOWLEDGE_TIMEOUT_S) if asked else []
+            return found
+
+        committed = consumer.committed(partitions, ACKNOWLEDGE_TIMEOUT_S)
+        unread = [one for one in committed if one.offset < 0]
+        ends = {one.partition: one.offset for one in offsets_at(OFFSET_END)}
+        starts = offsets_at(self._since_ms)  # after the ends, so that what arrives in between is read
+        self._unverified = {one.partition for one in starts if one.offset != OFFSET_END}
+        for one in starts:
+            if one.offset == OFFSET_END:  # no record since that time
+                one.offset = ends[one.partition]
+        consumer.assign([*(one for one in committed if one.offset >= 0), *starts])
+
+    def is_earlier(self, message: Any) -> bool:
+        """Whether a message is from before the start: some brokers (Tansu) answer offset 0 if there is no later one.
+
+        Only the first messages of a partition can be: a time is that of the sender's clock, which may be slow.
+        """
+        if message.partition() not in self._unverified:
+            return False
+        kind, time_ms = message.timestamp()
+        if kind and time_ms < self._since_ms:  # kind 0: the message has no time
+            return True
+        self._unverified.remove(message.partition())
+        return False
+
+    def at_end(self, partition: int) -> None:
+        """All messages that a partition had have been read: those that follow are later."""
+        self._unverified.discard(partition)
 
 
 def _close(consumer: Any, timeout: float = CLOSE_TIMEOUT_S) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import signal
@@ -57,13 +58,23 @@ def real_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def small_street(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A synthetic street small enough for tests: 12 m, 150,000 points, 8 photos."""
+def small_street(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A synthetic street small enough for tests: 12 m, 150,000 points, 8 photos.
+
+    All workers of a parallel run share its folder, which the first one generates: tests only read or copy it.
+    """
     from scan2sim.data_samples.street import generate
 
-    out = tmp_path_factory.mktemp("street") / "tile"
-    generate(out, length=12.0, points=150_000, photos=8, seed=5, photo_width=480)
-    return out
+    own = tmp_path_factory.getbasetemp()
+    folder = (own.parent if hasattr(request.config, "workerinput") else own) / "small_street"
+    folder.mkdir(exist_ok=True)
+    with open(folder / "lock", "w", encoding="utf-8") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "tile").is_dir():
+            shutil.rmtree(folder / "unfinished", ignore_errors=True)
+            generate(folder / "unfinished", length=12.0, points=150_000, photos=8, seed=5, photo_width=480)
+            (folder / "unfinished").rename(folder / "tile")
+    return folder / "tile"
 
 
 @pytest.fixture

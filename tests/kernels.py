@@ -50,12 +50,12 @@ def make_worlds() -> None:
         street, tile, survey = (Path(folder) / name for name in ("street", "tile", "survey"))
         generate(street, length=12.0, points=150_000, photos=8, seed=5, photo_width=480)
         tiny(street, tile, photos=4)
-        settings = COARSE | {"split": {"vegetation": "both"}}
-        optional = settings | {"navigation": {"when": "always"}, "splats": {"when": "auto", "epochs": [1, 0, 0]}}
+        plain = COARSE | {"split": {"vegetation": "both"}}
+        optional = plain | {"navigation": {"when": "always"}, "splats": {"when": "auto", "epochs": [1, 0, 0]}}
         cut_survey(tile, survey, CutParams(length=6.0, buffer=3.0))
         for command, settings in (
             (("run", tile, "--out", Path(folder) / "out", "--hold-out", 4), optional),
-            (("survey", survey, "--out", Path(folder) / "survey_out"), settings),
+            (("survey", survey, "--out", Path(folder) / "survey_out"), plain),
         ):
             code, printed = scan2sim(*command, settings=settings)
             if code:

@@ -71,7 +71,8 @@ def main() -> int:
         subprocess.run([sys.executable, "-m", "tests.kernels"])
     runs = [run_pytest("parallel", "-m", f"({known.markers}) and not realtime", *PARALLEL, *options)]
     if runs[0].status not in STOPPED:
-        runs.append(run_pytest("real time", "-m", f"({known.markers}) and realtime", *options))
+        files = () if any(Path(option.split("::")[0]).exists() for option in options) else files_in_real_time()
+        runs.append(run_pytest("real time", "-m", f"({known.markers}) and realtime", *files, *options))
     failures = {test: message for run in runs for test, message in run.failures.items()}
     again = run_pytest("failed, alone", *failures) if 0 < len(failures) <= RETRIED_MAX else None
     status = exit_status(runs, failures, again)
@@ -87,6 +88,12 @@ def main() -> int:
         }
         known.report.write_text(json.dumps(report, indent=2), encoding="utf-8")
     return status
+
+
+def files_in_real_time() -> list[str]:
+    """Test files that name the marker `realtime`: collecting all the others takes a minute."""
+    folder = Path("tests") if Path("tests").is_dir() else Path()
+    return sorted(str(file) for file in folder.rglob("test_*.py") if "realtime" in file.read_text(encoding="utf-8"))
 
 
 def run_pytest(name: str, *options: str) -> Run:

@@ -20,7 +20,7 @@ FAILS_ONCE = """
         raise TimeoutError("a thread was late")
 """
 MARKERS = """[pytest]
-addopts = -p no:dash -p no:schemathesis -p no:hypothesispytest -p no:anyio
+addopts = -p xdist.plugin -p pytest_reportlog.plugin
 markers =
     slow
     realtime
@@ -41,7 +41,8 @@ def run_suite(folder: Path, *options: str) -> tuple[int, str, dict[str, object]]
     env = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
     done = subprocess.run(
         [sys.executable, "-m", "tests.suite", "--report", "report.json", *options],
-        cwd=folder, capture_output=True, text=True, env=env | {"PYTHONPATH": str(ROOT)},
+        cwd=folder, capture_output=True, text=True,
+        env=env | {"PYTHONPATH": str(ROOT), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"},
     )  # fmt: skip
     report = folder / "report.json"
     return done.returncode, done.stdout + done.stderr, json.loads(report.read_text()) if report.exists() else {}

@@ -1,4 +1,4 @@
-"""Import Open3D without its plots for notebooks: these import dash and plotly, which takes as long as the rest of it."""
+"""Import Open3D without its plots for notebooks, which import dash and plotly: these take as long as all the rest."""
 
 from __future__ import annotations
 

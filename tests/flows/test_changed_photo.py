@@ -8,9 +8,17 @@ import cv2
 import numpy as np
 
 from scan2sim.pipeline.core.cache import Manifest, read_manifest
+from tests.flows.inline_steps import inline_steps
 from tests.flows.tiny import COARSE, scan2sim, tiny
 
 SETTINGS = COARSE | {"backdrop": {"when": "never"}}
+
+
+def run(tile: Path, out: Path) -> None:
+    """Build the world of a tile, with all steps in this process."""
+    with inline_steps():
+        code, printed = scan2sim("run", tile, "--out", out, settings=SETTINGS)
+    assert code == 0, printed
 
 
 def change(photo: Path) -> None:
@@ -35,11 +43,11 @@ def test_result_equals_a_run_from_scratch_and_geometry_is_not_computed_again(
     small_street: Path, tmp_path: Path
 ) -> None:
     tile = tiny(small_street, tmp_path / "tile", photos=4)
-    assert scan2sim("run", tile, "--out", tmp_path / "out", settings=SETTINGS)[0] == 0
+    run(tile, tmp_path / "out")
     before = results(tmp_path / "out")
     change(sorted((tile / "photos").glob("*.jpg"))[0])
-    assert scan2sim("run", tile, "--out", tmp_path / "out", settings=SETTINGS)[0] == 0
-    assert scan2sim("run", tile, "--out", tmp_path / "scratch", settings=SETTINGS)[0] == 0
+    run(tile, tmp_path / "out")
+    run(tile, tmp_path / "scratch")
     after, scratch = results(tmp_path / "out"), results(tmp_path / "scratch")
     assert {task: content for task, (content, _) in after.items()} == {
         task: content for task, (content, _) in scratch.items()

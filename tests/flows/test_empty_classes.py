@@ -12,7 +12,9 @@ from scan2sim.pipeline.core.classes import CODE, GROUPS, group_of
 from scan2sim.pipeline.core.types import Bools
 from scan2sim.pipeline.io.survey import read_survey
 from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
-from tests.flows.tiny import COARSE, keep_points, loaded, points, scan2sim, tiny
+from tests.flows.inline_steps import inline_steps
+from tests.flows.tiny import COARSE, keep_points, loaded, points, tiny
+from tests.flows.tiny import scan2sim as run_scan2sim
 
 ALL_SURFACES = COARSE | {"split": {"vegetation": "both", "vehicles": "keep"}}
 CLASSES: dict[str, np.ndarray] = {name: np.flatnonzero(group_of() == number) for number, name in enumerate(GROUPS)}
@@ -22,6 +24,12 @@ FEW_POINTS = 34
 DATA_ERROR = 4
 """Exit code if no world can be built."""
 FAST_CASES = {("without", "terrain", "street"), ("alone", "vegetation", "map"), ("few", "terrain", "map")}
+
+
+def scan2sim(*arguments: object, settings: object) -> tuple[int, str]:
+    """Run the command and its steps in this process; returns its exit code and output."""
+    with inline_steps():
+        return run_scan2sim(*arguments, settings=settings)
 
 
 @pytest.fixture(scope="module", params=["street", "map"])

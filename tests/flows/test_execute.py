@@ -355,30 +355,41 @@ def test_exceptions_and_killed_processes_become_step_errors(run: Run) -> None:
         run(b={"does": "die"})
 
 
-@pytest.mark.parametrize("how", ["litter", "bug", "SIGINT"])
-def test_failed_or_interrupted_run_prints_only_its_message(tmp_path: Path, source: Path, how: str) -> None:
-    script = (
-        "import sys; from pathlib import Path; from scan2sim.flows.engine.execution import *\n"
-        "from scan2sim.flows.engine.planning import *; from scan2sim.pipeline.core.errors import *\n"
-        "from tests.flows.toy import chain\n"
-        f"p, does = Path({str(tmp_path)!r}), {'hang' if how == 'SIGINT' else how!r}\n"
-        "store = Store(p / 'store')\n"
-        "tasks = chain(p / 'source.txt', p / 'log', b={'does': does}, c={'does': 'hang'})\n"
-        "try: execute(plan(tasks, store), store, jobs=2, on_event=lambda *_: None).check()\n"
-        "except ScanError as error: sys.exit(str(error))\n"
-        "except KeyboardInterrupt: sys.exit('interrupted')\n"
-    )
+FAILED_AND_INTERRUPTED_RUNS = """
+import sys
+from pathlib import Path
+from scan2sim.flows.engine.execution import *
+from scan2sim.flows.engine.planning import *
+from scan2sim.pipeline.core.errors import *
+from tests.flows.toy import chain
+
+source = Path(sys.argv[1])
+for does in ("litter", "bug", "hang"):
+    folder = source.with_name(does)
+    folder.mkdir()
+    store = Store(folder / "store")
+    tasks = chain(source, folder / "log", b={"does": does}, c={"does": "hang"})
+    try:
+        execute(plan(tasks, store), store, jobs=2, on_event=lambda *_: None).check()
+    except ScanError as error:
+        print(error, file=sys.stderr, flush=True)
+    except KeyboardInterrupt:
+        sys.exit("interrupted")
+"""
+
+
+def test_failed_or_interrupted_runs_print_only_their_messages(tmp_path: Path, source: Path) -> None:
+    """One after the other in one process: a step is killed and leaves locks, one has a bug, Ctrl-C interrupts one."""
     child = subprocess.Popen(
-        [sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        start_new_session=True,
+        [sys.executable, "-c", FAILED_AND_INTERRUPTED_RUNS, str(source)], cwd=ROOT, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
-    if how == "SIGINT":
-        until(lambda: child.poll() is not None or (tmp_path / "pid_b").exists(), what="a running task")
-        os.killpg(child.pid, signal.SIGINT)  # as a terminal does
+    until(lambda: child.poll() is not None or (tmp_path / "hang" / "pid_b").exists(), what="a running task")
+    os.killpg(child.pid, signal.SIGINT)  # as a terminal does
     printed = "".join(child.communicate())
-    assert len(printed.splitlines()) == 1 and "Traceback" not in printed, printed
-    message = {"litter": "was killed", "bug": "failed unexpectedly", "SIGINT": "interrupted"}[how]
-    assert message in printed
+    lines, messages = printed.splitlines(), ("was killed", "failed unexpectedly", "interrupted")
+    assert len(lines) == len(messages) and "Traceback" not in printed, printed
+    assert all(message in line for line, message in zip(lines, messages, strict=True)), printed
 
 
 CTRL_C_WHILE_THE_SERVER_STARTS = """
@@ -451,6 +462,7 @@ def test_sigkill_leaves_no_partial_result_and_no_process(tmp_path: Path, source:
     script = (
         "from pathlib import Path; from scan2sim.flows.engine.execution import *\n"
         "from scan2sim.flows.engine.planning import plan; from tests.flows.toy import chain\n"
+        "from tests.flows.fork_server import load_only; load_only('tests.flows.toy')\n"
         f"p = Path({str(tmp_path)!r}); s = Store(p / 'store')\n"
         "planned = plan(chain(p / 'source.txt', p / 'log', b={'does': 'hang'}), s)\n"
         "execute(planned, s, jobs=1, on_event=lambda *_: None)\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.pose_check.conventions import AXES
 from tests.fakes.bags import BagFile, bag_file, records
+from tests.flows.inline_steps import inline_steps
 from tests.flows.test_prepare import drive, survey_of
 from tests.pipeline.importers.bag.test_unpack import (
     CAMERA,
@@ -41,6 +43,12 @@ from tests.pipeline.importers.bag.test_unpack import (
 @pytest.fixture(autouse=True)
 def _wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(display.console, "width", 200)
+
+
+@pytest.fixture(autouse=True)
+def _inline_steps() -> Iterator[None]:
+    with inline_steps():
+        yield
 
 
 def command(*words: object) -> Result:

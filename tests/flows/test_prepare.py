@@ -16,19 +16,17 @@ from typer.testing import CliRunner
 from scan2sim.flows.cli import app
 from scan2sim.flows.commands.drive import PREPARED, plan_drive
 from scan2sim.flows.commands.drive import survey_of as prepare_survey
-from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.pipelines.drive import Drive
 from scan2sim.pipeline.core.errors import BusyError, InputError, LowConfidenceError
 from scan2sim.pipeline.io.survey import read_survey
 from scan2sim.pipeline.steps.cut import CUT
 from scan2sim.pipeline.steps.import_sweeps import IMPORT_SWEEPS
+from tests.flows.inline_steps import execute
 
 
 def survey_of(place: Path | str, out: Path, **how: Any) -> str:
-    return prepare_survey(
-        place, out, lambda planned, store: execute(planned, store, jobs=1, on_event=lambda *_: None), **how
-    )
+    return prepare_survey(place, out, lambda planned, store: execute(planned, store, on_event=lambda *_: None), **how)
 
 
 @pytest.fixture

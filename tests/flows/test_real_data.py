@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.fakes.gazebo.checker import check_world
-from tests.flows.test_cli import scan2sim, stdout_of
+from tests.flows.command import scan2sim, stdout_of
 
 pytestmark = pytest.mark.slow
 

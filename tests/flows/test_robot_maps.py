@@ -14,10 +14,17 @@ from scan2sim.pipeline.geometry.surface_distance import distances
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.worlds.scene import read_scene
-from tests.flows.tiny import scan2sim
+from tests.flows.inline_steps import inline_steps
+from tests.flows.tiny import scan2sim as run_scan2sim
 
 FAST = ("--set", "pictures.width=160", "--set", "unwrap.texel=0.2")
 DATA_ERROR = 4
+
+
+def scan2sim(*arguments: object) -> tuple[int, str]:
+    """Run the command and its steps in this process; returns its exit code and output."""
+    with inline_steps():
+        return run_scan2sim(*arguments)
 
 
 def room(points: int = 12_000, seed: int = 0) -> F32:
@@ -111,7 +118,9 @@ def test_folder_of_clouds_and_a_repeated_run(tmp_path: Path) -> None:
     rgb: U8 = np.full((len(xyz), 3), 90, np.uint8)
     for i in range(2):
         las.write(folder / f"part{i}.laz", PointCloud(Frame(), xyz[i::2], rgb[i::2]))
-    assert scan2sim("run", folder, "--out", tmp_path / "out", *FAST)[0] == 0
+    code, printed = scan2sim("run", folder, "--out", tmp_path / "out", *FAST)
+    assert code == 0 and "Traceback" not in printed, printed
+    assert json.loads((tmp_path / "out" / "world" / "metadata.json").read_text(encoding="utf-8"))["groups"]
     code, printed = scan2sim("run", folder, "--out", tmp_path / "out", *FAST)
     assert code == 0 and "nothing to do" in printed
 

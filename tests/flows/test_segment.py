@@ -15,14 +15,15 @@ from scan2sim.pipeline.core.types import Frame, PointCloud, Tile
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.segmentation.metrics import confusion
-from tests.flows.test_cli import assert_fails, scan2sim, stdout_of
+from tests.flows.command import assert_fails, in_process, stdout_of
+from tests.flows.tiny import tiny
 
 
 @pytest.fixture(scope="module")
 def segmented(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Output folder of the small street, classified with --overwrite, and the printed text."""
     out = tmp_path_factory.mktemp("segmented")
-    return out, stdout_of(scan2sim("segment", small_street, "--out", out, "--overwrite"))
+    return out, stdout_of(in_process("segment", small_street, "--out", out, "--overwrite"))
 
 
 def test_points_are_classified_from_the_photos(small_street: Path, segmented: tuple[Path, str]) -> None:
@@ -49,19 +50,20 @@ def test_label_images_and_masks_are_written(small_street: Path, segmented: tuple
 
 def test_run_reuses_the_segmentation(small_street: Path, segmented: tuple[Path, str]) -> None:
     out, _ = segmented
-    plan = stdout_of(scan2sim("plan", small_street, "--out", out, "--set", "segment.overwrite=true"))
+    plan = stdout_of(in_process("plan", small_street, "--out", out, "--set", "segment.overwrite=true"))
     again = {line.split()[0] for line in plan.splitlines() if " yes " in line}
     assert "split" in again and not again & {"label", "segment", "ingest"}
 
 
 def test_existing_classes_are_kept(small_street: Path, tmp_path: Path) -> None:
-    stdout_of(scan2sim("segment", small_street, "--out", tmp_path))
-    tile = read_tile(small_street)
+    street = tiny(small_street, tmp_path / "street")
+    stdout_of(in_process("segment", street, "--out", tmp_path / "out"))
+    tile = read_tile(street)
     before = las.read(tile.clouds[0], tile.frame)
-    after = las.read(tmp_path / "classified" / "cloud.laz", tile.frame)
+    after = las.read(tmp_path / "out" / "classified" / "cloud.laz", tile.frame)
     assert before.classification is not None and after.classification is not None
     np.testing.assert_array_equal(before.classification, after.classification)
-    assert not list((tmp_path / "labels").glob("*.png"))
+    assert not list((tmp_path / "out" / "labels").glob("*.png"))
 
 
 def test_bad_weights_keep_earlier_results(small_street: Path, segmented: tuple[Path, str], tmp_path: Path) -> None:
@@ -69,9 +71,9 @@ def test_bad_weights_keep_earlier_results(small_street: Path, segmented: tuple[P
     before = (out / "classified" / "cloud.laz").read_bytes()
     (tmp_path / "w.pt").write_bytes(pickle.dumps({"x": 1}))
     command = ("segment", small_street, "--out", out, "--overwrite", "--set")
-    assert_fails(scan2sim(*command, f"label.weights={tmp_path / 'w.pt'}"), 3, "w.pt", "safetensors")
-    assert_fails(scan2sim(*command, f"label.weights={tmp_path / 'no.safetensors'}"), 3, "no.safetensors")
-    assert_fails(scan2sim(*command, "label.network=deeplab"), 2, "deeplab", "segformer")
+    assert_fails(in_process(*command, f"label.weights={tmp_path / 'w.pt'}"), 3, "w.pt", "safetensors")
+    assert_fails(in_process(*command, f"label.weights={tmp_path / 'no.safetensors'}"), 3, "no.safetensors")
+    assert_fails(in_process(*command, "label.network=deeplab"), 2, "deeplab", "segformer")
     assert (out / "classified" / "cloud.laz").read_bytes() == before
 
 
@@ -82,7 +84,7 @@ def test_evaluate_compares_pixels_with_labels(small_street: Path, tmp_path: Path
     (tmp_path / "set").mkdir()
     (tmp_path / "set" / "images").symlink_to(tmp_path / "tile" / "photos")
     (tmp_path / "set" / "labels").symlink_to(tmp_path / "tile" / "truth" / "labels")
-    printed = stdout_of(scan2sim("segment", "evaluate", tmp_path / "set"))
+    printed = stdout_of(in_process("segment", "evaluate", tmp_path / "set"))
     values = {line.split()[0]: float(line.split()[1]) for line in printed.splitlines() if len(line.split()) == 2}
     assert values["road"] > 0.6 and values["building"] > 0.6 and 0 < values["mean"] < 1
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Collection
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from scan2sim.pipeline.io.survey import read_survey
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.io.worlds import merge
 from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
+from tests.flows.inline_steps import inline_steps
 from tests.flows.tiny import COARSE, loaded, tiny
 from tests.flows.tiny import scan2sim as run_scan2sim
 
@@ -32,7 +33,6 @@ SETTINGS = COARSE | {
     "navigation": {"when": "always"}, "split": {"vegetation": "locations", "vehicles": "assets"},
     "splats": {"when": "auto", "epochs": [1, 0, 0]},
 }  # fmt: skip
-scan2sim = partial(run_scan2sim, settings=SETTINGS)
 SIDE_PRODUCTS = tuple(step.name for step in tile_pipeline.SIDE_PRODUCTS)
 BORDER_SIDE_PRODUCT = "borders"
 """Runs only for tiles with neighbours."""
@@ -44,8 +44,17 @@ SURVEY_SIDE_PRODUCTS = tuple(name for name in SIDE_PRODUCTS if name not in ("nav
 EXPORT_PARTS = ("export.glb", "export.lists", "export.navigation")
 """Optional parts of the step `export`."""
 ALL = (*SIDE_PRODUCTS, *EXPORT_PARTS)
-EARLY_SIDE_PRODUCTS = ("detect_furniture", "furniture", "signs")
-"""Side products that most other steps depend on: without them nearly all steps run again."""
+DEPENDENTS = {
+    "tracks": {"vehicle_models"}, "detect_furniture": {"furniture", "signs"}, "furniture": {"signs"},
+}  # fmt: skip
+"""Side products that can't be made without another one."""
+INDEPENDENT = (
+    ("tracks", "plants", "sky_colour", "reflectance", "rasters", "geometry"),
+    ("vehicle_models", "backdrop", "splats", "pictures", "preview"),
+    ("roads", "navigation", "score", "lidar_score"),
+)
+"""Side products that don't depend on each other, not even by way of other steps. Most steps depend on the others
+(furniture and signs), and nearly all would run again without them."""
 SURVEY_PRODUCTS: dict[str, tuple[Any, str]] = {
     "report": (finish, "write_survey_report"),
     "TILE/report": (finish, "write_report"),
@@ -57,13 +66,17 @@ INCOMPLETE = 10
 """Exit code of a run with a finished world and failed side products."""
 FAILED_TEXT = "failed; the world is made without it"
 
-for_each_side_product = pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow) if name in EARLY_SIDE_PRODUCTS else name
-        for name in TILE_SIDE_PRODUCTS
-    ],
+for_groups_and_single_side_products = pytest.mark.parametrize(
+    "failing",
+    [*INDEPENDENT, *(pytest.param((name,), marks=pytest.mark.slow) for name in TILE_SIDE_PRODUCTS)],
+    ids=",".join,
 )
+
+
+def scan2sim(*arguments: object, failing: Collection[str] = ()) -> tuple[int, str]:
+    """Run the command and its steps in this process; returns its exit code and output."""
+    with inline_steps():
+        return run_scan2sim(*arguments, failing=failing, settings=SETTINGS)
 
 
 @pytest.fixture(scope="module")
@@ -80,9 +93,9 @@ def survey(street: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def failing_run(street: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, str]:
-    """A first run in which all side products fail: its folder, exit code and output."""
+    """A first run, with steps in processes, in which all side products fail: its folder, exit code and output."""
     out = tmp_path_factory.mktemp("failing_run") / "out"
-    return out, *scan2sim("run", street, "--out", out, failing=ALL)
+    return out, *run_scan2sim("run", street, "--out", out, failing=ALL, settings=SETTINGS)
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +154,8 @@ def test_graph_without_a_side_product_has_all_main_steps(street: Path, survey: P
     rest = build_graph(tile, settings, without=[TaskId(name)])
     lost = names(whole) - names(rest)
     assert is_topologically_sorted(rest) and names(rest) <= names(whole) and TaskId(name) not in names(rest)
-    assert {task.step for task in lost} <= set(SIDE_PRODUCTS)
+    made = {task.step for task in names(whole)}
+    assert {task.step for task in lost} == {name, *DEPENDENTS.get(name, ())} & made <= set(SIDE_PRODUCTS)
 
     tiles = [read_tile(path) for path in read_survey(survey / "survey.toml").tiles.values()]
     first, second = (one.name for one in tiles)
@@ -190,18 +204,25 @@ def test_next_run_retries_failed_side_products(completed_run: Path) -> None:
     assert (completed_run / "report_files" / "world.js").is_file() and list((completed_run / "world").glob("*.glb"))
 
 
-@for_each_side_product
-def test_failing_side_product_affects_only_itself(street: Path, completed_run: Path, tmp_path: Path, name: str) -> None:
+@for_groups_and_single_side_products
+def test_failing_side_product_affects_only_itself(
+    street: Path, completed_run: Path, tmp_path: Path, failing: tuple[str, ...]
+) -> None:
     out = shutil.copytree(completed_run, tmp_path / "out")
-    shutil.rmtree(out / "steps" / name)
-    code, printed = scan2sim("run", street, "--out", out, failing=[name])
-    assert code == INCOMPLETE and f"a side product failed: {name}" in printed
+    for name in failing:
+        shutil.rmtree(out / "steps" / name)
+    code, printed = scan2sim("run", street, "--out", out, failing=failing)
+    what = "a side product failed" if len(failing) == 1 else f"{len(failing)} side products failed"
+    listed = printed.partition(f"the world is finished, but {what}: ")[2].replace(",", "").split()
+    assert code == INCOMPLETE and {*listed[: len(failing)]} == {*failing}
     loaded(out)
     report = read(out / "report.json")
-    assert report["failed"].keys() == {name} and "a bug" in report["failed"][name]["cause"]
+    assert report["failed"].keys() == {*failing}
+    assert all("a bug" in report["failed"][name]["cause"] for name in failing)
+    missing = {*failing}.union(*(DEPENDENTS.get(name, ()) for name in failing))
+    assert {name for name in TILE_SIDE_PRODUCTS if not list((out / "steps").glob(f"{name}/*"))} == missing
     products = {"roads": "world/roads.geojson", "preview": "report_files/world.js", "plants": "world/plants.csv"}
     products |= {"furniture": "world/furniture.csv", "rasters": "rasters/street_dsm.tif"}
-    missing = {"furniture"} if name in ("detect_furniture", "furniture") else {name}
     assert {one for one, file in products.items() if not (out / file).is_file()} == missing & products.keys()
 
 

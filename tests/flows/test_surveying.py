@@ -4,25 +4,35 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from subprocess import CompletedProcess
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from scan2sim.flows.commands import unchanged
 from scan2sim.pipeline.core.classes import GROUPS, group_of
 from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
 from tests.fakes.gazebo.checker import check_world
-from tests.flows.test_cli import assert_fails, scan2sim, stdout_of
+from tests.flows.command import assert_fails, in_process, stdout_of
+from tests.flows.inline_steps import inline_steps
 
 FAST = [f"--set={name}" for name in (
     "unwrap.texel=0.05", "decimate.target=10000", "pictures.width=160", "pictures.compared=1", "backdrop.when=never")
 ]  # fmt: skip
+
+
+def survey_command(*arguments: object) -> CompletedProcess[str]:
+    """Run `scan2sim survey` and its steps in this process."""
+    with inline_steps():
+        return in_process("survey", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -42,16 +52,18 @@ def failed(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     cloud = sorted(survey.glob("*/cloud.laz"))[1]
     whole = cloud.read_bytes()
     cloud.write_bytes(whole[: len(whole) // 2])
-    assert_fails(scan2sim("survey", survey, "--out", out, *FAST), 5, "1 of 2 tiles failed", "truncated or damaged")
+    assert_fails(survey_command(survey, "--out", out, *FAST), 5, "1 of 2 tiles failed", "truncated or damaged")
     shutil.copyfile(out / "survey.json", out.parent / "failed.json")
     cloud.write_bytes(whole)
+    time.sleep(unchanged.SETTLED_NS / 1e9)  # the next run would not record the status of newer files
     return out
 
 
 @pytest.fixture(scope="module")
 def made(survey: Path, failed: Path) -> Path:
     """Output folder of the next run, with the cloud repaired."""
-    stdout_of(scan2sim("survey", survey, "--out", failed, *FAST))
+    stdout_of(survey_command(survey, "--out", failed, *FAST))
+    assert (failed / unchanged.RECORD).is_file()
     return failed
 
 
@@ -124,7 +136,7 @@ def test_gazebo_loads_all_tiles_as_one_world(made: Path) -> None:
 
 def test_unchanged_survey_is_not_rebuilt(survey: Path, made: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in (made / "steps").rglob("manifest.json")}
-    printed = stdout_of(scan2sim("survey", survey, "--out", made, *FAST))
+    printed = stdout_of(survey_command(survey, "--out", made, *FAST))
     assert (
         "nothing to do" in printed
         and f"World:  {made / 'world'}" in printed
@@ -132,7 +144,7 @@ def test_unchanged_survey_is_not_rebuilt(survey: Path, made: Path) -> None:
     )
     assert {path: path.stat().st_mtime_ns for path in (made / "steps").rglob("manifest.json")} == before
     (made / "steps" / "unchanged.json").unlink()  # compare all cache keys
-    assert "nothing to do" in stdout_of(scan2sim("survey", survey, "--out", made, *FAST))
+    assert "nothing to do" in stdout_of(survey_command(survey, "--out", made, *FAST))
     assert {path: path.stat().st_mtime_ns for path in (made / "steps").rglob("manifest.json")} == before
     assert {tile["state"] for tile in report_of(made)["tiles"].values()} == {"cached"}
 
@@ -154,7 +166,7 @@ def test_results_depend_neither_on_earlier_failures_nor_on_folder_names(
         tile.write_text(
             tile.read_text(encoding="utf-8").replace('"../../corridor', f'"{survey.parent}/corridor'), encoding="utf-8"
         )
-    stdout_of(scan2sim("survey", other, "--out", tmp_path / "out", *FAST))
+    stdout_of(survey_command(other, "--out", tmp_path / "out", *FAST))
     assert contents(tmp_path / "out") == contents(made)
 
 
@@ -180,14 +192,12 @@ def test_second_run_of_a_survey_is_a_busy_error(survey: Path, made: Path) -> Non
     from scan2sim.flows.engine.lock import locked
 
     with locked(made):
-        assert_fails(scan2sim("survey", survey, "--out", made, *FAST), 8, "another run")
+        assert_fails(survey_command(survey, "--out", made, *FAST), 8, "another run")
 
 
 def test_folder_without_survey_is_an_input_error(tmp_path: Path) -> None:
-    assert_fails(scan2sim("survey", tmp_path, "--out", tmp_path / "out"), 3, "no survey found", "survey.toml")
+    assert_fails(survey_command(tmp_path, "--out", tmp_path / "out"), 3, "no survey found", "survey.toml")
 
 
 def test_invalid_memory_is_a_setting_error(survey: Path, tmp_path: Path) -> None:
-    assert_fails(
-        scan2sim("survey", survey, "--out", tmp_path, "--memory", "lots"), 2, "--memory", "Write for example 20GB"
-    )
+    assert_fails(survey_command(survey, "--out", tmp_path, "--memory", "lots"), 2, "--memory", "Write for example 20GB")

@@ -11,7 +11,7 @@ import pytest
 from scan2sim.services.toolboxes.detector import dataset
 from scan2sim.services.toolboxes.tasks import detect
 from tests.conftest import ROOT
-from tests.flows.test_cli import assert_fails, scan2sim, stdout_of
+from tests.flows.command import assert_fails, scan2sim, stdout_of
 
 pytest.importorskip("torch")
 TILE = ROOT / "data_samples" / "tile"

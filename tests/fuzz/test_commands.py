@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import subprocess
-import sys
 from pathlib import Path
 from random import Random
 
 import pytest
 
+from tests.flows.command import in_process
 from tests.fuzz.damage import damaged
 from tests.fuzz.harness import VALID_CODES
 from tests.fuzz.kinds import KINDS
@@ -28,12 +27,6 @@ COMMANDS = {
     "survey.toml": ["survey", "{x}"],
     "tile.toml": ["run", "{x}"],
 }  # fmt: skip
-
-
-def scan2sim(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run the command in a process."""
-    command = [sys.executable, "-m", "scan2sim.flows.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True)
 
 
 def contents(folder: Path) -> dict[str, str]:
@@ -69,7 +62,7 @@ def test_a_damaged_file_is_reported_and_existing_results_are_kept(kind: str, tmp
         except Exception:
             arguments = [argument.format(x=x) for argument in COMMANDS[kind]]
             overwrite = ["--overwrite"] if "import" in arguments else []
-            done = scan2sim(*arguments, "--out", out, *overwrite)
+            done = in_process(*arguments, "--out", out, *overwrite)
             assert done.returncode in VALID_CODES - {0}, done.stderr
             assert "error: " in done.stderr and "Traceback" not in done.stderr
             assert contents(out) | before == contents(out), f"seed {seed}"
@@ -87,6 +80,6 @@ def test_a_run_that_fails_midway_keeps_the_earlier_world(tmp_path: Path) -> None
     (tmp_path / "tile").mkdir()
     save(tmp_path / "tile", body(tmp_path / "tile", photos=[], cameras=[]))
     cloud(tmp_path / "tile" / "cloud.laz", n=500)
-    done = scan2sim("run", tmp_path / "tile", "--out", out)
+    done = in_process("run", tmp_path / "tile", "--out", out)
     assert done.returncode == 4 and "only 500 points" in done.stderr and "Traceback" not in done.stderr
     assert contents(out) | before == contents(out)

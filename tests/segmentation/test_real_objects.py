@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.core.classes import CODE
-from tests.flows.test_cli import scan2sim, stdout_of
+from tests.flows.command import scan2sim, stdout_of
 
 pytestmark = pytest.mark.slow
 

@@ -154,7 +154,10 @@ def test_options_by_the_environment(certificates: Path, secured: str, monkeypatc
 
 
 @pytest.mark.parametrize("mechanism", MECHANISMS)
-def test_refused_password_is_said(mechanism: str, certificates: Path, secured: str) -> None:
+def test_refused_password_is_said(
+    mechanism: str, certificates: Path, secured: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kafka, "ACKNOWLEDGE_TIMEOUT_S", 5.0)
     text = OPTIONS.format(folder=certificates, password="guess", mechanism=mechanism)
     with pytest.raises(ConnectionError, match="wrong user or password") as caught:
         _send(_cluster(certificates, secured, text))
@@ -168,7 +171,8 @@ def test_tokens_of_an_identity_provider(certificates: Path, secured: str, issuer
     assert next(body for body in bodies if body) == b"body"
 
 
-def test_refused_token_is_said(certificates: Path, secured: str, issuer: str) -> None:
+def test_refused_token_is_said(certificates: Path, secured: str, issuer: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kafka, "ACKNOWLEDGE_TIMEOUT_S", 5.0)
     with pytest.raises(ConnectionError, match="token endpoint answers .*invalid_client") as caught:
         _send(_cluster(certificates, secured, OIDC.format(folder=certificates, secret="guess", url=issuer)))
     assert "guess" not in str(caught.value)

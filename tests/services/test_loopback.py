@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from contextlib import redirect_stderr
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from scan2sim.flows import cli
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.loopback import is_loopback, require_protection
@@ -71,9 +74,13 @@ def test_adapter_requires_its_key_everywhere(host: str) -> None:
     assert AdapterParams(host=host, key=SOME_FILE).host == host
 
 
-def command(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    program = [sys.executable, "-m", "scan2sim.flows.cli", *map(str, words)]
-    return subprocess.run(program, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, timeout=120)
+def command(*words: object) -> tuple[int, str]:
+    """Run `scan2sim` in this process; returns its exit code and its errors."""
+    errors = StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stderr(errors), pytest.raises(SystemExit) as ended:
+        patch.setattr(sys, "argv", ["scan2sim", *map(str, words)])
+        cli.main()
+    return int(ended.value.code or 0), errors.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -88,16 +95,16 @@ def command(*words: object, **environment: str) -> subprocess.CompletedProcess[s
     ids=lambda words: " ".join(words[:2]),
 )
 def test_commands_refuse_unprotected_hosts_before_starting(words: tuple[str, ...]) -> None:
-    done = command(*words, "--host", "0.0.0.0")
-    assert done.returncode == 2, done.stderr
-    assert "other machines can reach 0.0.0.0" in done.stderr
-    assert "Give --token FILE" in done.stderr
-    assert "Traceback" not in done.stderr
+    code, errors = command(*words, "--host", "0.0.0.0")
+    assert code == 2, errors
+    assert "other machines can reach 0.0.0.0" in errors
+    assert "Give --token FILE" in errors
+    assert "Traceback" not in errors
 
 
 def test_adapter_command_refuses_to_start_without_key() -> None:
-    done = command("teleop", "translate", "ros")
-    assert done.returncode == 2 and "--key: is missing" in done.stderr and "Traceback" not in done.stderr
+    code, errors = command("teleop", "translate", "ros")
+    assert code == 2 and "--key: is missing" in errors and "Traceback" not in errors
 
 
 @pytest.mark.parametrize("words", [("gateway",), ("station", "gate.example")], ids=lambda words: words[0])
@@ -105,8 +112,8 @@ def test_gateway_and_station_listen_only_with_a_certificate(words: tuple[str, ..
     """`--listening` defaults to all addresses; TLS and DTLS there require a certificate on both ends."""
     pytest.importorskip("OpenSSL", reason="the extra teleop isn't installed")
     role, *rest = words
-    done = command("teleop", role, tmp_path / "none", *rest, "--port", "0")
-    assert done.returncode == 3 and "certificate.pem" in done.stderr and "Traceback" not in done.stderr
+    code, errors = command("teleop", role, tmp_path / "none", *rest, "--port", "0")
+    assert code == 3 and "certificate.pem" in errors and "Traceback" not in errors
 
 
 def test_prometheus_metrics_listen_on_loopback_only() -> None:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
 
 from scan2sim.pipeline.camera.depth_map import depth_map, scene
-from scan2sim.pipeline.camera.renderer import Body, Renderer, look_at, pinhole
+from scan2sim.pipeline.camera.renderer import Body, Image, Renderer, look_at, pinhole
 from scan2sim.pipeline.core.classes import PHOTO_CLASSES
-from scan2sim.pipeline.core.types import Mesh, View
+from scan2sim.pipeline.core.types import F64, Mesh, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
 from scan2sim.texturing.photo_cache import Exposures
@@ -40,6 +40,16 @@ UPPER = [painted(wall(y, SCANNED_M, 9, 24), 2, (180, 130, 100)) for y in (-SIDE_
 END = painted(join(grid((FAR_M, -30, 0), (0, 0, 14), (0, 60, 0), 24)), 3, (90, 150, 110))
 
 
+def pose_of(number: int) -> F64:
+    return look_at((float(number), 0.3, 1.7), (float(number) + 10, 0, 1.9))
+
+
+@cache
+def photographed(number: int) -> Image:
+    """The street from a pose, rendered once for all drives."""
+    return Renderer([*SCANNED, *UPPER, END]).view(CAMERA, pose_of(number), background=SKY, samples=2)
+
+
 @dataclass
 class FacadeDrive:
     """A drive along the street, photographed.
@@ -62,8 +72,7 @@ class FacadeDrive:
         (self.folder / "labels").mkdir()
         found = []
         for i in range(self.number):
-            pose = look_at((float(i), 0.3, 1.7), (float(i) + 10, 0, 1.9))
-            street = Renderer([*SCANNED, *UPPER, END]).view(CAMERA, pose, background=SKY, samples=2)
+            pose, street = pose_of(i), photographed(i)
             rgb, labels = street.rgb.copy(), np.zeros((*street.hit.shape, len(PHOTO_CLASSES)), np.uint8)
             labels[..., PHOTO_CLASSES.index("building")] = 255 * street.hit
             labels[..., PHOTO_CLASSES.index("sky")] = 255 * ~street.hit

@@ -139,9 +139,10 @@ def test_layers_of_a_survey_tile_end_at_its_cell_without_a_dome(
     drive: Drive, tmp_path: Path
 ) -> None:  # fmt: skip
     cell = TileCell(name="a", seed=(0.0, 0.0), neighbours={"b": (40.0, 0.0)})
-    tile = Drive(tmp_path, params=BackdropParams(context=BackdropContext(cell=cell)))
-    mesh, alone = tile.body.mesh, drive.done.files["backdrop"]
-    assert (Dome.load(tile.done.files["backdrop"]).colour == image.read_rgb(alone / "page_1.png")).all()
+    params = BackdropParams(context=BackdropContext(cell=cell))
+    tile, alone = backdrop(drive.inputs, params, tmp_path, silent).files["backdrop"], drive.done.files["backdrop"]
+    mesh = textured(tile).mesh
+    assert (Dome.load(tile).colour == image.read_rgb(alone / "page_1.png")).all()
     assert not (alone / DOME_FILE).exists()
     assert len(mesh) and mesh.page is not None and (mesh.page == LAYERS).all()
     assert mesh.corners.mean(axis=1)[:, 0].max() < 20.5

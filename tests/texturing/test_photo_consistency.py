@@ -1,6 +1,7 @@
 """Photos that are inconsistent with the others: ghosts, wrong poses, blur, overexposure."""
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,15 @@ POSES = [look_at((-4, y, 1.8), (0, y / 2, 0.6)) for y in (-3.0, -1.5, 0.0, 1.5, 
 
 def grainy(pose: F64) -> U8:
     """A photo of the corner with a fine pattern on the ground, to measure sharpness and displacement."""
+    return _grainy(pose.astype(float).tobytes()).copy()
+
+
+@cache
+def _grainy(values: bytes) -> U8:
+    """Rendered once for all tests."""
     from scan2sim.pipeline.camera.models import pixel_rays
 
+    pose = np.frombuffer(values).reshape(4, 4)
     image = Renderer([Body(GROUND), Body(BOX)]).view(CAMERA, pose)
     at = pose[:3, 3] + (pixel_rays(CAMERA) @ pose[:3, :3].T) * np.where(image.hit, image.range, 0)[..., None]
     grain = 35 * np.sign(np.sin(9 * at[..., 0] + 2 * at[..., 1]) * np.sin(8 * at[..., 1]))

@@ -39,10 +39,15 @@ class AlarmsNode(ros.Node):  # type: ignore[misc]
         self._evaluator = RuleEvaluator(known, self._contact)
         self._state = params.state or default_outbox.state_folder("alarms") / f"{params.rules.resolve().stem}.json"
         seen = _restore(self._evaluator, self._state)
-        self._saved, self._lock = 0.0, threading.Lock()  # records arrive in other threads than timers
+        self._saved = 0.0
+        self._lock, self._file_lock = threading.Lock(), threading.Lock()  # records arrive in other threads than timers
         super().__init__(node_name)
         self._notify, self._notifier = notify, Notifier(notified, f"{self.get_namespace()}/{node_name}")
-        self._bus = Bus(self, params, records=True, reached=lambda: self._contact.reached(time.time()), seen=seen)
+        self._bus = Bus(
+            self, params, records=True, seen=seen,
+            reached=lambda: self._contact.reached(time.time()),
+            assigned=lambda: self._contact.assigned(time.time()),
+        )  # fmt: skip
         self._bus.events.on(RECORD, self._check_record)
         self._bus.events.on("queue", self._check_queue)
         self._bus.events.on("alarm_command", self._command)
@@ -79,10 +84,11 @@ class AlarmsNode(ros.Node):  # type: ignore[misc]
         self._saved = time.monotonic()
         temporary = self._state.with_suffix(".tmp")
         try:
-            with self._lock:
-                text = json.dumps(self._evaluator.saved() | {"seen": self._bus.events.deduplicator.saved()})
-            temporary.write_text(text, encoding="utf-8")
-            temporary.replace(self._state)
+            with self._file_lock:
+                with self._lock:
+                    text = json.dumps(self._evaluator.saved() | {"seen": self._bus.events.deduplicator.saved()})
+                temporary.write_text(text, encoding="utf-8")
+                temporary.replace(self._state)
         except OSError as error:
             log.warning("the state of the alarms can't be saved: %s", error)
 

@@ -13,17 +13,30 @@ TOLERANCE_S = 0.5
 
 
 class BrokerContact:
-    """Last sign of the brokers, and since when there have been signs without an outage; seconds since the epoch."""
+    """Last signs of the brokers and of the topic of records, and since when there have been such without an outage.
+
+    All times are seconds since the epoch.
+    """
 
     def __init__(self, started: float) -> None:
         """`started`: when this program started; what was before is unknown."""
-        self._last = self._began = started
+        self._last = self._began = self._last_assigned = started
+        self._was_assigned = False
 
     def reached(self, now: float) -> None:
         """The brokers have given a sign of life: a message, or an answer."""
         if now - self._last > OUTAGE_S:
-            self._began = now + RESEND_S
+            self._began = max(self._began, now + RESEND_S)
         self._last = now
+
+    def assigned(self, now: float) -> None:
+        """The brokers answer and have assigned the topic of records to this program: records can arrive.
+
+        Brokers that answer may need several seconds to assign a topic, for example after a kill of this program.
+        """
+        if not self._was_assigned or now - self._last_assigned > OUTAGE_S:
+            self._began = max(self._began, now)
+        self._was_assigned, self._last_assigned = True, now
 
     def outage(self, now: float) -> float:
         """Seconds since the last sign; 0 while the brokers count as reachable."""
@@ -34,11 +47,11 @@ class BrokerContact:
         """Seconds for which a node has been silent, as far as that is known.
 
         Args:
-            arrived: when its last record arrived. A node that was heard after the last sign of the brokers is heard on
-                another way (ROS 2): its silence lasts until `now`.
+            arrived: when its last record arrived. A node that was heard after the topic of records was last known to be
+                assigned is heard on another way (ROS 2): its silence lasts until `now`.
             now: seconds since the epoch.
         """
-        until = now if arrived > self._last + TOLERANCE_S else self._last
+        until = now if arrived > self._last_assigned + TOLERANCE_S else self._last_assigned
         return max(0.0, until - max(arrived, self._began))
 
 

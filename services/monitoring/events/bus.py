@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -23,9 +24,9 @@ class Bus:
 
     def __init__(
         self, node: Any, params: BusParams, *, records: bool = False, reached: Callable[[], None] | None = None,
-        seen: Mapping[str, int] | None = None,
+        assigned: Callable[[], None] = lambda: None, seen: Mapping[str, int] | None = None,
     ) -> None:  # fmt: skip
-        """Connect the node.
+        """Connect the node; no event that reaches Kafka from now on is missed.
 
         Args:
             node: a node of the transport.
@@ -33,11 +34,12 @@ class Bus:
             records: whether to receive monitoring records as well as events.
             reached: called at each sign that Kafka is there (`kafka.read`), at least every `REACHED_INTERVAL_S`, in a
                 thread.
+            assigned: called at each sign that Kafka is there and has assigned the topic of records, likewise.
             seen: state of the deduplicator of an earlier process, so that what Kafka delivers again is ignored.
         """
-        self._reached = reached or (lambda: None)
+        self._reached, self._since = reached or (lambda: None), time.time()
         self._probe_pause = REACHED_INTERVAL_S if reached else kafka.MAX_PROBE_PAUSE_S
-        name = node.get_name()
+        self._name = name = node.get_name()
         self.events = Events(name)
         self.events.deduplicator.restore(seen or {})
         self.events.outlets.append(RosOutlet(node, params.events_topic))
@@ -53,20 +55,20 @@ class Bus:
             self._kafka = KafkaSink(cluster, params.events_topic, outbox)
             self.events.outlets.append(self._kafka)
             for topic in topics:
-                reader = SupervisedThread(
-                    partial(self._read_kafka, cluster, topic, f"scan2sim-{name}"), f"{topic} for {name}"
-                )
+                on_assigned = assigned if topic == params.records_topic else lambda: None
+                reader = SupervisedThread(partial(self._read_kafka, cluster, topic, on_assigned), f"{topic} for {name}")
                 reader.start()
                 self._readers.append(reader)
 
     def _on_ros_message(self, message: Any) -> None:
         self.events.receive(message.data)
 
-    def _read_kafka(self, cluster: kafka.Cluster, topic: str, group: str) -> None:
-        pause = self._probe_pause
+    def _read_kafka(self, cluster: kafka.Cluster, topic: str, assigned: Callable[[], None]) -> None:
+        # a group of its own for each topic: a member that joins interrupts all others of its group for seconds
         bodies = kafka.read(
-            cluster, topic, group=group, wait=0.5, reached=self._reached, max_probe_pause=pause,
-            rejected=self.events.rejections.add,
+            cluster, topic, group=f"scan2sim-{self._name}-{kafka.topic_name(topic)}", since=self._since, wait=0.5,
+            reached=self._reached, connected=lambda is_connected: assigned() if is_connected else None,
+            max_probe_pause=self._probe_pause, rejected=self.events.rejections.add,
         )  # fmt: skip
         for body in bodies:
             if self._closed.is_set():

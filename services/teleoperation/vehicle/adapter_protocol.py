@@ -223,7 +223,7 @@ class OnboardEndpoint:
         if self.answer.standing:  # no throttle before the adapter has left its stop
             controls = replace(controls, throttle=0.0)
         agree = driven and self.answer.standing
-        held = (now - self._last_received) // 1000
+        held = max(0, now - self._last_received) // 1000  # an answer may arrive after a waiting caller took its time
         return Order(self._session, self._number, self.answer.stamp, held, age, Command(controls, self._stop, agree))
 
 

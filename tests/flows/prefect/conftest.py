@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import shlex
 import shutil
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -14,7 +17,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +26,7 @@ from _pytest.mark import ParameterSet
 
 from tests.conftest import ROOT
 from tests.fakes.ports import free_port
+from tests.flows.prefect.toy_steps import TOYS
 from tests.flows.processes import processes
 from tests.waiting import until
 
@@ -38,8 +42,27 @@ QUIET = {
     "PYTHONUTF8": "1",  # its command prints characters that other encodings can't represent
     # by default, runs of a new schedule are created once per minute, except for new deployments
     "PREFECT_SERVER_SERVICES_SCHEDULER_LOOP_SECONDS": "2",
+    # what no test looks at: late, paused and cancelling runs, states of tasks, types of blocks
+    "PREFECT_SERVER_SERVICES_LATE_RUNS_ENABLED": "false",
+    "PREFECT_SERVER_SERVICES_PAUSE_EXPIRATIONS_ENABLED": "false",
+    "PREFECT_SERVER_SERVICES_CANCELLATION_CLEANUP_ENABLED": "false",
+    "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_ENABLED": "false",
+    "PREFECT_SERVER_REGISTER_BLOCKS_ON_START": "false",
     "RAY_USAGE_STATS_ENABLED": "0",
 }
+COMMANDS = """
+import json, runpy, sys
+for command in json.loads(sys.argv[1]):
+    sys.argv = ["prefect", *command]
+    try:
+        runpy.run_module("prefect", run_name="__main__")
+    except SystemExit as ended:
+        if ended.code:
+            raise
+"""
+"""Script that runs several commands of `prefect`, which takes seconds to import, until one fails."""
+DATABASE = "prefect.db"
+"""Name of Prefect's SQLite database in its home folder."""
 ENDED = ("COMPLETED", "FAILED", "CRASHED", "CANCELLED")
 
 
@@ -69,7 +92,7 @@ class Server:
     def __init__(self, home: Path, database: str | None = None) -> None:
         self.home, self.port = home, free_port()
         self.url = f"http://127.0.0.1:{self.port}/api"
-        self.env = environment(home) | {"PREFECT_API_URL": self.url}
+        self.env = environment(home) | {"PREFECT_API_URL": self.url, TOYS: "1"}
         self.env["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
         if database:
             self.env["PREFECT_SERVER_DATABASE_CONNECTION_URL"] = database
@@ -126,9 +149,10 @@ class Server:
                     raise
         raise TimeoutError(f"{path}: the database stays locked")
 
-    def cli(self, *args: str, **env: str) -> subprocess.CompletedProcess[str]:
-        """Run `prefect ARGS` in the repository."""
-        return self.script(sys.executable, "-m", "prefect", *args, **env)
+    def cli(self, *commands: str, **env: str) -> subprocess.CompletedProcess[str]:
+        """Run `prefect COMMAND` for each of the commands in the repository, until one fails."""
+        split = [shlex.split(command) for command in commands]
+        return self.script(sys.executable, "-c", COMMANDS, json.dumps(split), **env)
 
     def script(self, *command: str, **env: str) -> subprocess.CompletedProcess[str]:
         """Run a command in the repository."""
@@ -148,7 +172,7 @@ class Server:
         """A worker that polls a process pool."""
         process = self.spawn(
             "-m", "prefect", "worker", "start", "--pool", pool, "--no-create-pool-if-not-found",
-            log=self.home / f"{pool}.log", PREFECT_WORKER_QUERY_SECONDS="1",
+            log=self.home / f"{pool}.log", PREFECT_WORKER_QUERY_SECONDS="1", PREFECT_WORKER_HEARTBEAT_SECONDS="5",
         )  # fmt: skip
         try:
             yield process
@@ -236,26 +260,67 @@ def _listens(port: int) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
+class NewDatabase:
+    """Copy of the SQLite database that the first server creates, for later ones: to create one takes ten seconds."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def copy_to(self, home: Path) -> bool:
+        """Copy it to the folder of a server that starts; returns whether there is one yet."""
+        if made := self._path.exists():
+            shutil.copyfile(self._path, home / DATABASE)
+        return made
+
+    def start(self, server: Server) -> None:
+        """Start a server with it; if several start at once without one, the first creates it."""
+        with open(self._path.with_suffix(".lock"), "w", encoding="utf-8") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not self.copy_to(server.home):
+                server.start()
+                part = self._path.with_suffix(".part")
+                with closing(sqlite3.connect(server.home / DATABASE)) as made, closing(sqlite3.connect(part)) as copy:
+                    made.backup(copy)
+                part.rename(self._path)
+                return
+        server.start()
+
+
+@pytest.fixture(scope="session")
+def new_database(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> NewDatabase:
+    """The database of a new server, which all workers of a parallel run share."""
+    own = tmp_path_factory.getbasetemp()
+    return NewDatabase((own.parent if hasattr(request.config, "workerinput") else own) / "prefect_new.db")
+
+
 @contextmanager
-def serving(database: str, home: Path) -> Iterator[Server]:
+def serving(database: str, home: Path, new_database: NewDatabase) -> Iterator[Server]:
     """A running Prefect server with a database: "sqlite" or "postgres"."""
     with ExitStack() as stack:
         server = Server(home, stack.enter_context(postgres()) if database == "postgres" else None)
         stack.callback(server.close)
-        server.start()
+        if database == "sqlite":
+            new_database.start(server)
+        else:
+            server.start()
         yield server
 
 
-@pytest.fixture(scope="session")
-def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """A running server with the database selected by `on`; pytest groups tests by it, so one server runs at a time."""
-    with serving(request.param, tmp_path_factory.mktemp(request.param)) as server:
+@pytest.fixture(scope="module")
+def server(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, new_database: NewDatabase
+) -> Iterator[Server]:
+    """A running server with the database selected by `on`, until the last test of the file that uses it.
+
+    pytest groups the tests of a file by database, so that one server runs at a time.
+    """
+    with serving(request.param, tmp_path_factory.mktemp(request.param), new_database) as server:
         yield server
 
 
 def on(*databases: str | ParameterSet) -> pytest.MarkDecorator:
     """Mark a test to run with these databases."""
-    return pytest.mark.parametrize("server", databases, indirect=True, scope="session")
+    return pytest.mark.parametrize("server", databases, indirect=True, scope="module")
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Runs the flows and the command with failing side products; executed as a script by `test_incomplete.py`."""
+"""Runs the flows and the command with failing side products; executed as a script by `test_deployments.py`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Deployments on a real server with a real worker and schedule; messages when something is missing."""
+"""Deployments on a real server with a real worker and schedule; messages when something is missing or has failed."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from scan2sim.flows.engine.versions import check_version, versions
-from scan2sim.pipeline.core.errors import UnavailableError, exit_code
+from scan2sim.pipeline.core.errors import IncompleteError, UnavailableError, exit_code
 from tests.conftest import ROOT
 from tests.fakes.ports import free_port
-from tests.flows.prefect.conftest import Server, kill, on, serving
+from tests.flows.prefect.conftest import NewDatabase, Server, kill, on, serving
 from tests.flows.prefect.toy_steps import planned
 from tests.flows.processes import processes
 from tests.waiting import until
@@ -24,38 +24,41 @@ from tests.waiting import until
 DEPLOYED = ["reprocess", "survey", "tile"]
 
 
-@pytest.fixture(scope="session")
-def toys(server: Server) -> Iterator[Server]:
-    """A server with the toy deployments and a worker."""
-    assert server.cli("work-pool", "create", "toys", "--type", "process").returncode == 0
-    deployed = server.cli("deploy", "--prefect-file", "tests/flows/prefect/toy.yaml", "--all")
-    assert deployed.returncode == 0, deployed.stdout
+@pytest.fixture(scope="module")
+def worker(server: Server) -> Iterator[Path]:
+    """Log of a worker of the toys, which starts before there is their pool."""
     with server.worker("toys"):
-        yield server
+        yield server.home / "toys.log"
+
+
+@pytest.fixture(scope="module")
+def toys(server: Server, worker: Path) -> Server:
+    """A server with a worker, the toy deployments, and those for containers."""
+    commands = server.cli(
+        "work-pool create toys --type process",
+        "deploy --prefect-file tests/flows/prefect/toy.yaml --all",
+        "work-pool create scan2sim-docker --type docker",
+        "work-pool create scan2sim-kubernetes --type kubernetes --base-job-template deploy/kubernetes.json",
+        "deploy -n *-docker -n *-kubernetes",
+    )
+    assert commands.returncode == 0, commands.stdout
+    return server
 
 
 @on("sqlite")
-def test_missing_work_pool_is_named(server: Server) -> None:
-    """Must be the first test: there is no pool yet."""
-    deployed = server.cli("deploy", "-n", "tile")
+def test_missing_work_pool_is_named(server: Server, worker: Path) -> None:
+    """Must be the first test: there is no pool yet. The next tests use the same worker."""
+    deployed = server.cli("deploy -n tile")
     assert deployed.returncode != 0
     assert "work pool 'scan2sim-process' which does not exist" in deployed.stdout
-    with server.worker("scan2sim-process"):
-        log = server.home / "scan2sim-process.log"
-        until(lambda: "Work pool 'scan2sim-process' not found!" in log.read_text(encoding="utf-8"), what="a warning")
+    until(lambda: "Work pool 'toys' not found!" in worker.read_text(encoding="utf-8"), what="a warning")
 
 
 @on("sqlite")
-def test_server_accepts_all_deployments_and_automations(server: Server) -> None:
-    pools = {kind: f"scan2sim-{kind}" for kind in ("process", "docker", "kubernetes")}
-    template = ["--base-job-template", "deploy/kubernetes.json"]
-    for command in (
-        server.script("deploy/setup", SCAN2SIM_SOURCE="/data/drive", SCAN2SIM_OUT="/data/worlds"),
-        server.cli("work-pool", "create", pools["docker"], "--type", "docker"),
-        server.cli("work-pool", "create", pools["kubernetes"], "--type", "kubernetes", *template),
-        server.cli("deploy", "-n", "*-docker", "-n", "*-kubernetes"),
-    ):
-        assert command.returncode == 0, command.stdout
+def test_server_accepts_all_deployments_and_automations(toys: Server) -> None:
+    server, pools = toys, {kind: f"scan2sim-{kind}" for kind in ("process", "docker", "kubernetes")}
+    setup = server.script("deploy/setup", SCAN2SIM_SOURCE="/data/drive", SCAN2SIM_OUT="/data/worlds")
+    assert setup.returncode == 0, setup.stdout
 
     for kind, pool in pools.items():
         known = server.api("GET", f"/work_pools/{pool}")["base_job_template"]["variables"]["properties"]
@@ -97,6 +100,17 @@ def test_scheduled_run_is_executed_without_overlap(toys: Server, folder: Path) -
         until(lambda: toys.runs(nightly, "SCHEDULED"), what="a run at two")
 
 
+@on("sqlite")
+def test_incomplete_world_ends_with_a_warning_state_and_exit_code(server: Server, tmp_path: Path) -> None:
+    done = server.script(sys.executable, "-m", "tests.flows.prefect.incomplete", str(tmp_path))
+    assert done.returncode == exit_code(IncompleteError("", "")), done.stdout
+    cause = "the world is finished, but a side product failed: roads"
+    for flow, page in (("tile", "report"), ("survey", "survey"), ("reprocess", "survey")):
+        assert f"{flow}: COMPLETED CompletedWithWarnings: {cause} {tmp_path / page}.html\n" in done.stdout
+    assert f"warning: {tmp_path / 'world'}: {cause}\n" in done.stdout
+    assert "Run again to retry what failed" in done.stdout and "Traceback" not in done.stdout
+
+
 def test_unreachable_server_is_named(tmp_path: Path) -> None:
     url = f"http://127.0.0.1:{free_port()}/api"
     command = ["survey", "data_samples/tile", "--out", str(tmp_path / "out"), "--runner", "dask"]
@@ -124,14 +138,19 @@ def test_worker_with_another_version_fails_the_run(toys: Server, folder: Path) -
 
 
 @pytest.mark.slow
-def test_run_of_a_killed_worker_is_detected_and_rescheduled(tmp_path: Path, folder: Path) -> None:
+def test_run_of_a_killed_worker_is_detected_and_rescheduled(
+    tmp_path: Path, folder: Path, new_database: NewDatabase
+) -> None:
     text = (ROOT / "deploy" / "automations.yaml").read_text(encoding="utf-8").replace("name: reprocess", "name: toy")
     (tmp_path / "automations.yaml").write_text(text, encoding="utf-8")
-    with serving("sqlite", tmp_path) as server:
+    with serving("sqlite", tmp_path, new_database) as server:
         server.env |= {"PREFECT_FLOWS_HEARTBEAT_FREQUENCY": "30", "TOY_FOLDER": str(folder)}
-        assert server.cli("work-pool", "create", "toys", "--type", "process").returncode == 0
-        assert server.cli("deploy", "--prefect-file", "tests/flows/prefect/toy.yaml", "--all").returncode == 0
-        assert server.cli("automation", "create", "--from-file", str(tmp_path / "automations.yaml")).returncode == 0
+        commands = server.cli(
+            "work-pool create toys --type process",
+            "deploy --prefect-file tests/flows/prefect/toy.yaml --all",
+            f"automation create --from-file '{tmp_path / 'automations.yaml'}'",
+        )
+        assert commands.returncode == 0, commands.stdout
         deployment = server.deployment("toy", "one-at-a-time")
         with server.worker("toys") as worker:
             run = server.run(deployment, folder=str(folder), gate=str(folder / "gate"))

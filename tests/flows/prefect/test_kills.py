@@ -1,4 +1,7 @@
-"""Surveys on a cluster whose workers, flow or server are killed: they finish, and finished steps don't run twice."""
+"""Surveys on a cluster whose workers, flow or server are killed: they finish, and finished steps don't run twice.
+
+Also what flows and workers publish on the event bus: one server serves all tests of this file.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import urllib.request
 from collections import Counter
 from collections.abc import Callable
@@ -18,18 +22,22 @@ import psutil
 import pytest
 
 from scan2sim.flows.engine.dispatch import dispatch
-from scan2sim.flows.engine.execution import run_in_subprocess
 from scan2sim.flows.engine.planning import PlannedTask
+from scan2sim.flows.engine.run_task import run_task
 from scan2sim.flows.pipelines.graph import TaskId
 from scan2sim.pipeline.core.cache import Store
+from scan2sim.services.monitoring.dashboard.state import BusState
+from scan2sim.services.monitoring.events.schema import Event
 from tests.conftest import ROOT
-from tests.flows.prefect.conftest import Server, environment, kill, on
+from tests.fakes.broker import Broker
+from tests.flows.bus_events import read_events
+from tests.flows.prefect.conftest import NewDatabase, Server, environment, kill, on
 from tests.flows.prefect.toy_steps import STEPS, planned
 from tests.flows.processes import processes
 from tests.waiting import until
 
 SCRIPT = "from tests.flows.prefect.toy_flow import main; main()"
-TILES = 6
+TILES = 5
 ALL = {f"{tile}-{step}" for tile in range(TILES) for step in STEPS}
 
 
@@ -43,7 +51,7 @@ class Survey:
     def start(self) -> subprocess.Popen[bytes]:
         """Start the script (again), in a process group of its own."""
         self._outputs.append(self.folder / f"output{len(self._outputs)}")
-        arguments = ("-c", SCRIPT, str(self.folder), self._runner, str(self.gate))
+        arguments = ("-c", SCRIPT, str(self.folder), str(TILES), self._runner, str(self.gate))
         return self._server.spawn(*arguments, log=self._outputs[-1], SURVEY=str(self.folder))
 
     def processes(self) -> list[int]:
@@ -148,8 +156,40 @@ def test_survey_resumes_after_the_server_is_killed(survey: Survey, server: Serve
     assert survey.runs() == Counter(ALL)
 
 
-def test_ctrl_c_stops_the_run_and_its_temporary_server(tmp_path: Path) -> None:
+@on("sqlite")
+@pytest.mark.parametrize("runner", ["dask", pytest.param("threads", marks=pytest.mark.slow)])
+def test_flow_and_workers_publish_the_same_run(
+    runner: str, server: Server, folder: Path, broker: Broker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(folder / "state"))
+    (folder / "gate").touch()
+    tiles = 2
+    arguments = ("-c", SCRIPT, str(folder), str(tiles), runner, str(folder / "gate"), broker.servers)
+    process = server.spawn(*arguments, log=folder / "output", XDG_STATE_HOME=str(folder / "state"))
+    assert process.wait() == 0, (folder / "output").read_text(encoding="utf-8")
+
+    def hosts(events: list[Event]) -> set[tuple[str, str]]:
+        done = [event.body for event in events if event.kind == "step" and event.body["state"] == "done"]
+        return {(body["tile"], body["step"]) for body in done if body["host"]}
+
+    def complete(events: list[Event]) -> bool:
+        ended = any(event.kind == "run" and event.body["state"] != "running" for event in events)
+        return ended and len(hosts(events)) == tiles * len(STEPS)
+
+    bus_state = BusState(time.time())
+    for event in (events := read_events(broker, complete)):
+        bus_state.add(event.model_dump_json().encode())
+    (run,) = bus_state.state(time.time())["runs"]
+    last = run["details"]["last"]
+    assert (last["command"], last["source"], last["state"]) == ("survey", str(folder), "done")
+    assert last["done"] == last["steps"] == len(hosts(events)) == tiles * len(STEPS)
+    assert all(step["state"] == "done" and step["seconds"] and step["memory"] for step in run["details"]["steps"])
+    assert not bus_state.rejections.counts
+
+
+def test_ctrl_c_stops_the_run_and_its_temporary_server(tmp_path: Path, new_database: NewDatabase) -> None:
     """The terminal also interrupts the server, so Prefect can't be notified."""
+    new_database.copy_to(tmp_path)
     out, log = tmp_path / "out", tmp_path / "log"
     command = [
         sys.executable,
@@ -161,6 +201,8 @@ def test_ctrl_c_stops_the_run_and_its_temporary_server(tmp_path: Path) -> None:
         str(out),
         "--runner",
         "dask",
+        "--jobs",
+        "1",
     ]
     with open(log, "w", encoding="utf-8") as file:
         process = subprocess.Popen(
@@ -176,7 +218,8 @@ def test_ctrl_c_stops_the_run_and_its_temporary_server(tmp_path: Path) -> None:
     assert "the same command resumes from there" in log.read_text(encoding="utf-8")
 
 
-def test_temporary_server_ends_with_a_killed_command(tmp_path: Path) -> None:
+def test_temporary_server_ends_with_a_killed_command(tmp_path: Path, new_database: NewDatabase) -> None:
+    new_database.copy_to(tmp_path)
     out, log = tmp_path / "out", tmp_path / "log"
     command = [sys.executable, "-m", "scan2sim.flows.cli", "survey", "data_samples/tile", "--out", str(out)]
     with open(log, "w", encoding="utf-8") as file:
@@ -195,7 +238,7 @@ def test_temporary_server_ends_with_a_killed_command(tmp_path: Path) -> None:
 
 
 def test_temporary_server_ends_with_its_context(tmp_path: Path) -> None:
-    """Even if the command fails; and another one may be started afterwards."""
+    """Even if the command fails; and another one may be started afterwards. The first one creates the database."""
     script = (
         "from scan2sim.flows.deployed.prefect_server import prefect_server\n"  # sets its start-up timeout
         "from prefect.settings import PREFECT_API_URL\n"
@@ -245,10 +288,10 @@ class FailedFuture:
 
 
 class FinishedFuture(FailedFuture):
-    """A future of a step that has run synchronously."""
+    """A future of a step that has run in this process."""
 
     def __init__(self, item: PlannedTask, store: Store) -> None:
-        run_in_subprocess(item, store, lambda *_: None)
+        run_task(item, store, item.inputs(store))
 
     def result(self, *, raise_on_failure: bool) -> Any:
         return "its manifest's path"

@@ -48,7 +48,7 @@ def toy_survey(
 
 
 def main() -> None:
-    """FOLDER RUNNER GATE [BUS]: six tiles."""
-    folder, runner, gate = sys.argv[1:4]
-    bus = sys.argv[4] if len(sys.argv) > 4 else None
-    print("total", toy_survey(folder, tiles=6, gate=gate, runner=runner, bus=bus))
+    """FOLDER TILES RUNNER GATE [BUS]."""
+    folder, tiles, runner, gate = sys.argv[1:5]
+    bus = sys.argv[5] if len(sys.argv) > 5 else None
+    print("total", toy_survey(folder, tiles=int(tiles), gate=gate, runner=runner, bus=bus))

@@ -11,9 +11,15 @@ from scan2sim.flows.engine.planning import PlannedTask, plan
 from scan2sim.flows.pipelines.graph import Output, Task
 from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
+from tests.flows.fork_server import load_only
 from tests.flows.toy import ToyParams, toy
 
 STEPS = ("first", "second", "third")
+TOYS = "SCAN2SIM_TEST_TOYS"
+"""Environment variable of processes that run toy steps only; their fork servers load nothing else."""
+
+if TOYS in os.environ:
+    load_only(__name__)
 
 
 class SlowParams(ToyParams):

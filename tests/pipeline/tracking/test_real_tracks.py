@@ -13,7 +13,7 @@ from scan2sim.pipeline.scenario.scenario import from_tracks
 from scan2sim.pipeline.steps.tracks import TracksParams
 from scan2sim.pipeline.steps.tracks import tracks as tracks_step
 from scan2sim.pipeline.tracking.tracks import Track, read_tracks
-from tests.flows.test_cli import scan2sim, stdout_of
+from tests.flows.command import scan2sim, stdout_of
 
 pytestmark = pytest.mark.slow
 INPUTS = {

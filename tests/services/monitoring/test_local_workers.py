@@ -11,6 +11,7 @@ from pathlib import Path
 
 import psutil
 
+from scan2sim.services.monitoring.autoscale.actuators import supervise
 from scan2sim.services.monitoring.autoscale.actuators.replicas import ProgramReplicas
 from scan2sim.services.monitoring.example_nodes import worker
 from scan2sim.services.monitoring.work.local_workers import LocalWorkers
@@ -110,9 +111,16 @@ def test_replicas_scale_and_are_restarted() -> None:
     assert programs.workers() == 0 and running(["sleep", "1234"]) == []
 
 
-def test_replicas_end_when_their_parent_is_killed() -> None:
+def test_replicas_end_when_their_parent_is_killed(tmp_path: Path) -> None:
+    """Also those that ignore SIGTERM, after a timeout, which is shorter here."""
+    source, timeout = Path(supervise.__file__).read_text(encoding="utf-8"), f" = {supervise.STOP_TIMEOUT_S}"
+    assert source.count(timeout) == 1
+    hasty = tmp_path / "supervise.py"
+    hasty.write_text(source.replace(timeout, " = 1.0"), encoding="utf-8")
     code = (
-        "import time\nfrom scan2sim.services.monitoring.autoscale.actuators.replicas import ProgramReplicas\n"
+        "import time\nfrom scan2sim.services.monitoring.autoscale.actuators import supervise\n"
+        "from scan2sim.services.monitoring.autoscale.actuators.replicas import ProgramReplicas\n"
+        f"supervise.__file__ = {str(hasty)!r}\n"
         "programs = ProgramReplicas(['sh', '-c', 'trap \"\" TERM; sleep 4321'])\nprograms.scale(2)\ntime.sleep(60)"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)

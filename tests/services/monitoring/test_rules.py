@@ -99,6 +99,12 @@ def test_bandwidths_of_publishers_and_subscribers_are_compared(arrives: float | 
 SILENT = Rule(name="silent", metric="silence", above=3)
 
 
+def reach(contact: BrokerContact, now: float) -> None:
+    """The brokers give a sign, and have assigned the topic of records."""
+    contact.reached(now)
+    contact.assigned(now)
+
+
 def states(alarms: list[Alarm]) -> list[tuple[str, str, str]]:
     return [(one.state, one.rule, one.subject) for one in alarms]
 
@@ -119,7 +125,7 @@ def test_outage_of_kafka_is_one_alarm_and_no_silence_of_the_nodes() -> None:
 
     def second(t: int, *, kafka: bool, nodes: int) -> None:
         if kafka:
-            contact.reached(float(t))
+            reach(contact, float(t))
             for number in range(nodes):
                 found.extend(check(evaluator, record(f"node{number}", t)))
         found.extend(evaluator.check_silence(t + 0.9))
@@ -142,15 +148,36 @@ def test_outage_of_kafka_is_one_alarm_and_no_silence_of_the_nodes() -> None:
 def test_node_that_stays_away_after_an_outage_of_kafka_is_silent() -> None:
     contact = BrokerContact(0.0)
     evaluator = RuleEvaluator([SILENT], contact)
-    contact.reached(1.0)
+    reach(contact, 1.0)
     check(evaluator, record("camera", 1.0))
-    contact.reached(61.0)
+    reach(contact, 61.0)
     found = []
     for t in range(62, 80):
-        contact.reached(float(t))
+        reach(contact, float(t))
         found += [(t, one.subject) for one in evaluator.check_silence(float(t))]
     ((raised, subject),) = found
     assert subject == "/camera" and 61 + RESEND_S + 3 <= raised <= 61 + RESEND_S + 5
+
+
+@pytest.mark.parametrize("began", [0.0, 100.0], ids=["restarted", "after an outage"])
+def test_silence_is_not_counted_before_kafka_assigns_the_topic_of_records(began: float) -> None:
+    contact = BrokerContact(0.0)
+    evaluator = RuleEvaluator([SILENT], contact)
+    if began:
+        reach(contact, 1.0)
+        check(evaluator, record("camera", 1.0))
+        check(evaluator, record("lidar", 1.0))
+    else:
+        evaluator.restore({"alarms": [], "nodes": {"/camera": -1.0, "/lidar": -1.0}, "muted": []})
+    found, assigned = [], int(began + RESEND_S + 20)  # another member of the group delays the assignment
+    for t in range(int(began), assigned + 20):
+        contact.reached(float(t))
+        if t >= assigned:
+            contact.assigned(float(t))
+            found += check(evaluator, record("camera", float(t)))
+        found += [one for one in evaluator.check_silence(t + 0.1) if one.rule == "silent"]
+    assert states(found) == [("raised", "silent", "/lidar")]
+    assert assigned + 3 < found[0].since <= assigned + 5
 
 
 def test_node_heard_by_ros_is_watched_during_an_outage_of_kafka() -> None:

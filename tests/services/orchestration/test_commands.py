@@ -110,14 +110,12 @@ def test_unreadable_parameters_are_an_error_and_the_instance_can_be_deleted(
     start()
     operation = next(iter(fake.state.operations.values()))
     broken = operation | {"operationParams": {"additionalParamsForVnf": returned, "secret": "hush"}}
-    monkeypatch.setattr(fake.state, "returned_operations", lambda: {operation["_id"]: broken})
-    with Osm(Connection(osm=fake.address)) as osm:
+    with monkeypatch.context() as patched, Osm(Connection(osm=fake.address)) as osm:
+        patched.setattr(fake.state, "returned_operations", lambda: {operation["_id"]: broken})
         for act in (operations.heal, lambda *given: operations.scale(given[0], given[1], 3, *given[2:])):
             with pytest.raises(StepError, match=r"one: .*additionalParamsForVnf.* can't be read") as caught:
                 act(osm, "one", WaitPolicy(60), lambda _: None)
             assert "scan2sim orchestrate delete" in caught.value.remedy and "hush" not in str(caught.value)
-    monkeypatch.undo()
-    monkeypatch.setenv("OSM_PASSWORD", "admin")
     command("delete", "one")
     assert not fake.state.instances
 

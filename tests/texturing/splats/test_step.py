@@ -66,10 +66,11 @@ def test_depth_of_what_was_scanned(drive: FacadeDrive, layer: SplatLayer) -> Non
 
 
 def test_a_training_that_was_interrupted_continues_to_the_same_splats(
-    drive: FacadeDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(splats_step, "CHECKPOINT_S", 0.0)
-    params = SplatsParams(epochs=(4, 0, 0))
+    (tmp_path / "drive").mkdir()
+    drive, params = FacadeDrive(tmp_path / "drive", number=4), SplatsParams(epochs=(3, 0, 0))
     whole = run(drive, tmp_path / "whole", params)
 
     class Interrupted(Exception):
@@ -89,7 +90,7 @@ def test_a_training_that_was_interrupted_continues_to_the_same_splats(
         visits.append(fraction)
 
     done = splats(drive.inputs, params, tmp_path / "out", visit, tmp_path / "checkpoint")
-    assert sum(share > splats_step.TRAINING_SHARE for share in visits) < 4, "finished epochs are not repeated"
+    assert sum(share > splats_step.TRAINING_SHARE for share in visits) < 3, "finished epochs are not repeated"
     assert done.files["splats"].read_bytes() == whole.files["splats"].read_bytes()
 
 
@@ -110,7 +111,7 @@ def test_fewer_than_two_photos_give_no_splats(tmp_path: Path) -> None:
 
 
 def test_photos_next_to_each_other_are_left_out(drive: FacadeDrive, tmp_path: Path) -> None:
-    done = run(drive, tmp_path, SplatsParams(epochs=(1, 0, 0), max_photos=3))
+    done = run(drive, tmp_path, SplatsParams(epochs=(0, 0, 0), max_photos=3))
     assert 2 <= done.metrics["photos"] <= 3
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from scan2sim.services.teleoperation.gateway.fleet import Fleet, Order
 from scan2sim.services.teleoperation.gateway.web import application
 from scan2sim.services.teleoperation.gateway_protocol import Hello, LinkStatus, Status
 from scan2sim.services.teleoperation.identity import Peer, Role
-from tests.fakes.browser import chromium
+from tests.fakes.browser import Page, chromium
 from tests.waiting import until
 
 HOSTILE = "<img src=x onerror=document.title='hacked'>"
@@ -47,6 +48,13 @@ def app(fleet: Fleet, served: ServerParams | None = None) -> Any:
     return application(served or ServerParams(), fleet, FakeGateway())  # type: ignore[arg-type]
 
 
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with chromium(tmp_path_factory.mktemp("browser")) as opened:
+        yield opened
+        assert opened.errors == []
+
+
 def test_operator_joins_hands_over_takes_back_and_releases(tmp_path: Path) -> None:
     client = TestClient(app(fleet_with_parties(tmp_path)), base_url="http://localhost")
     assert client.post("/api/vehicles/car/join", json={"station": "desk"}).json() == {"pair": 1}
@@ -60,23 +68,22 @@ def test_operator_joins_hands_over_takes_back_and_releases(tmp_path: Path) -> No
     assert client.get("/api/fleet").json()["vehicles"][0]["pair"] is None
 
 
-def test_page_lists_parties_and_joins_them(tmp_path: Path) -> None:
+def test_page_lists_parties_and_joins_them(tmp_path: Path, page: Page) -> None:
     fleet, urls = fleet_with_parties(tmp_path), list[str]()
     served = ServerParams(port=0)
     threading.Thread(target=factory.run, args=(app(fleet, served), served, urls.append), daemon=True).start()
     until(lambda: urls)
-    with chromium(tmp_path) as page:
-        page.do("Page.navigate", url=urls[0])
-        page.until("document.querySelectorAll('#vehicles .run').length === 2")
-        page.click("#vehicles .run button")
-        page.until("document.querySelector('#vehicles').textContent.includes('driven from desk')")
-        text = page.value("document.body.innerText")
-        assert "84 ms 1.0 % lost" in text and "wifi down" in text and HOSTILE in text
-        assert page.value("document.title") == "Fleet · scan2sim" and not page.errors
+    page.do("Page.navigate", url=urls[0])
+    page.until("document.querySelectorAll('#vehicles .run').length === 2")
+    page.click("#vehicles .run button")
+    page.until("document.querySelector('#vehicles').textContent.includes('driven from desk')")
+    text = page.value("document.body.innerText")
+    assert "84 ms 1.0 % lost" in text and "wifi down" in text and HOSTILE in text
+    assert page.value("document.title") == "Fleet · scan2sim" and not page.errors
     assert fleet.snapshot()["vehicles"][0]["other"] == "desk"
 
 
-def test_speeds_disappear_when_a_vehicle_falls_silent(tmp_path: Path) -> None:
+def test_speeds_disappear_when_a_vehicle_falls_silent(tmp_path: Path, page: Page) -> None:
     fleet, urls, silent = fleet_with_parties(tmp_path), list[str](), threading.Event()
     served = ServerParams(port=0)
     threading.Thread(target=factory.run, args=(app(fleet, served), served, urls.append), daemon=True).start()
@@ -88,12 +95,11 @@ def test_speeds_disappear_when_a_vehicle_falls_silent(tmp_path: Path) -> None:
     sender = threading.Thread(target=send_status)
     sender.start()
     until(lambda: urls)
-    with chromium(tmp_path) as page:
-        page.do("Page.navigate", url=urls[0])
-        page.until("document.querySelector('[data-vehicle=car]')?.textContent === '9.0 km/h'")
-        silent.set()
-        sender.join()
-        page.until("document.querySelector('[data-vehicle=car]').textContent === ''")
-        assert (fleet.speeds()["car"]["reported_ms"] or 0) < 2000  # 0.3 s on a quiet machine
-        report(fleet, Status())
-        assert fleet.speeds() == {} and not page.errors
+    page.do("Page.navigate", url=urls[0])
+    page.until("document.querySelector('[data-vehicle=car]')?.textContent === '9.0 km/h'")
+    silent.set()
+    sender.join()
+    page.until("document.querySelector('[data-vehicle=car]').textContent === ''")
+    assert (fleet.speeds()["car"]["reported_ms"] or 0) < 2000  # 0.3 s on a quiet machine
+    report(fleet, Status())
+    assert fleet.speeds() == {} and not page.errors

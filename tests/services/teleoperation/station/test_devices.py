@@ -7,7 +7,6 @@ import http.server
 import json
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -45,12 +44,26 @@ class _Quiet(http.server.SimpleHTTPRequestHandler):
         """Log nothing."""
 
 
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with chromium(tmp_path_factory.mktemp("browser")) as opened:
+        yield opened
+
+
 @pytest.fixture
-def page(pages: str, tmp_path: Path) -> Iterator[Page]:
+def browser(opened: Page, pages: str) -> Page:
+    """The page of the module's browser, which has stored no devices."""
+    opened.do("Page.navigate", url="about:blank")
+    opened.do("Storage.clearDataForOrigin", origin=pages.removesuffix("/pages/"), storageTypes="local_storage")
+    opened.errors.clear()
+    return opened
+
+
+@pytest.fixture
+def page(browser: Page, pages: str) -> Page:
     """The driver page, without a station, and emulated devices."""
-    with chromium(tmp_path) as page:
-        open_page(page, f"{pages}cockpit.html", "typeof controls === 'function' && document.readyState === 'complete'")
-        yield page
+    open_page(browser, f"{pages}cockpit.html", "typeof controls === 'function' && document.readyState === 'complete'")
+    return browser
 
 
 def open_page(page: Page, url: str, ready: str) -> None:
@@ -139,51 +152,51 @@ def test_dead_zone_and_curve(page: Page) -> None:
     assert shares == [0, 0, 0.25, 1]
 
 
-def test_calibration_finds_axes_and_is_used_by_the_driver_page(pages: str, tmp_path: Path) -> None:
+def test_calibration_finds_axes_and_is_used_by_the_driver_page(pages: str, browser: Page) -> None:
     """An unknown wheel: steering on axis 3 (reversed), throttle on axis 1 (inverted), brake on axis 0, button 9."""
     rest = {"3": 0, "1": 1, "0": -1}
-    with chromium(tmp_path) as page:
-        open_page(page, f"{pages}devices.html", "typeof devices === 'object' && document.readyState === 'complete'")
-        page.value("plug('Odd Box', '', 4, 12)")
-        page.until("document.querySelector('#devices button') !== null")
-        button = "document.querySelector('#devices button').click(), 0"
+    page = browser
+    open_page(page, f"{pages}devices.html", "typeof devices === 'object' && document.readyState === 'complete'")
+    page.value("plug('Odd Box', '', 4, 12)")
+    page.until("document.querySelector('#devices button') !== null")
+    button = "document.querySelector('#devices button').click(), 0"
+    page.value(button)
+    for step in ({}, {"3": 1}, {"3": -1}, {"1": -1}, {"0": 1}, None):
+        page.value(f"Object.entries({json.dumps(rest | (step or {}))}).forEach(([i, v]) => pads[0].axes[i] = v); 0")
+        page.value(f"hold(0, 9, {int(step is None)}); 0")
         page.value(button)
-        for step in ({}, {"3": 1}, {"3": -1}, {"1": -1}, {"0": 1}, None):
-            page.value(f"Object.entries({json.dumps(rest | (step or {}))}).forEach(([i, v]) => pads[0].axes[i] = v); 0")
-            page.value(f"hold(0, 9, {int(step is None)}); 0")
-            page.value(button)
-        assert page.value("document.querySelector('#devices .failure').textContent") == ""
-        stored = page.value("JSON.parse(localStorage.getItem('device Odd Box'))")
-        assert stored["steering"] | {"dead": 0, "curve": 0} == {
-            "axis": 3,
-            "left": 1,
-            "right": -1,
-            "dead": 0,
-            "curve": 0,
-        }
-        assert (stored["throttle"]["axis"], stored["throttle"]["rest"], stored["throttle"]["full"]) == (1, 1, -1)
-        assert (stored["brake"]["axis"], stored["brake"]["rest"], stored["brake"]["full"]) == (0, -1, 1)
-        assert stored["emergency"] == 9
-        page.value(
-            "(one => { one.value = 0.1; one.dispatchEvent(new Event('change')); })"
-            "(document.querySelector('[data-setting=\"brake dead\"]')), 0"
-        )
-        assert page.value("JSON.parse(localStorage.getItem('device Odd Box')).brake.dead") == 0.1
-        open_page(page, f"{pages}cockpit.html", "typeof controls === 'function' && document.readyState === 'complete'")
-        page.value("plug('Odd Box', '', 4, 12); pads[0].axes.splice(0, 4, -1, 1, 0, 0); hold(0, 2, 1)")
-        controls(page)
-        page.value("pads[0].axes[1] = -1; pads[0].axes[3] = -1; 0")
-        found = controls(page)
-        assert found == {"steering": -1, "throttle": 1, "brake": 0}, "the wheel is at the right"
-        assert not page.errors
+    assert page.value("document.querySelector('#devices .failure').textContent") == ""
+    stored = page.value("JSON.parse(localStorage.getItem('device Odd Box'))")
+    assert stored["steering"] | {"dead": 0, "curve": 0} == {
+        "axis": 3,
+        "left": 1,
+        "right": -1,
+        "dead": 0,
+        "curve": 0,
+    }
+    assert (stored["throttle"]["axis"], stored["throttle"]["rest"], stored["throttle"]["full"]) == (1, 1, -1)
+    assert (stored["brake"]["axis"], stored["brake"]["rest"], stored["brake"]["full"]) == (0, -1, 1)
+    assert stored["emergency"] == 9
+    page.value(
+        "(one => { one.value = 0.1; one.dispatchEvent(new Event('change')); })"
+        "(document.querySelector('[data-setting=\"brake dead\"]')), 0"
+    )
+    assert page.value("JSON.parse(localStorage.getItem('device Odd Box')).brake.dead") == 0.1
+    open_page(page, f"{pages}cockpit.html", "typeof controls === 'function' && document.readyState === 'complete'")
+    page.value("plug('Odd Box', '', 4, 12); pads[0].axes.splice(0, 4, -1, 1, 0, 0); hold(0, 2, 1)")
+    controls(page)
+    page.value("pads[0].axes[1] = -1; pads[0].axes[3] = -1; 0")
+    found = controls(page)
+    assert found == {"steering": -1, "throttle": 1, "brake": 0}, "the wheel is at the right"
+    assert not page.errors
 
 
-def test_calibration_reports_what_was_not_moved(pages: str, tmp_path: Path) -> None:
-    with chromium(tmp_path) as page:
-        open_page(page, f"{pages}devices.html", "typeof devices === 'object' && document.readyState === 'complete'")
-        page.value("plug('Odd Box', '', 4, 12)")
-        page.until("document.querySelector('#devices button') !== null")
-        for _ in range(7):
-            page.value("document.querySelector('#devices button').click(), 0")
-        assert "The wheel did not move" in page.value("document.querySelector('#devices .failure').textContent")
-        assert page.value("localStorage.getItem('device Odd Box')") is None
+def test_calibration_reports_what_was_not_moved(pages: str, browser: Page) -> None:
+    page = browser
+    open_page(page, f"{pages}devices.html", "typeof devices === 'object' && document.readyState === 'complete'")
+    page.value("plug('Odd Box', '', 4, 12)")
+    page.until("document.querySelector('#devices button') !== null")
+    for _ in range(7):
+        page.value("document.querySelector('#devices button').click(), 0")
+    assert "The wheel did not move" in page.value("document.querySelector('#devices .failure').textContent")
+    assert page.value("localStorage.getItem('device Odd Box')") is None

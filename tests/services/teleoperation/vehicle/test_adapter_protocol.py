@@ -121,6 +121,15 @@ def test_queued_order_is_old() -> None:
     assert pair.controls_now().brake == 1
 
 
+def test_order_of_a_caller_that_took_its_time_before_an_answer_arrived_is_sent() -> None:
+    pair = Pair()
+    pair.start()
+    pair.now += 10
+    pair.deliver(pair.send(), late=3)  # a thread that took its time 3 ms earlier waits meanwhile
+    order = pair.send()
+    assert order.held == 0 and Order.unpack(order.pack()).held == 0
+
+
 def test_recorded_orders_do_not_move_a_restarted_adapter() -> None:
     pair = Pair()
     pair.start()
