@@ -23,6 +23,7 @@
 
     const float NEAR = .2; // metres
     const float MIN_ALPHA = 1. / 255.;
+    const float MAX_COLOUR = 2.; // 1 is white
     const float LOW_PASS = .3; // variance in square pixels
     const float MARGIN = .15; // of the image on either side, at which the projection is linearized at most
 
@@ -42,7 +43,7 @@
       vec3 centre = rotation * (uintBitsToFloat(first.xyz) - eye);
       float opacity = float(second.y >> 16) / 65535.;
       if (centre.z < NEAR || opacity <= MIN_ALPHA) return;
-      colour = vec4(vec3(uvec3(first.w, first.w >> 10, first.w >> 20) & 1023u) / 1023., opacity);
+      colour = vec4(vec3(uvec3(first.w, first.w >> 10, first.w >> 20) & 1023u) * (MAX_COLOUR / 1023.), opacity);
       vec3 scale = vec3(unpackHalf2x16(second.x), unpackHalf2x16(second.y & 65535u).x);
       mat3 turned = rotation * axes(normalize(vec4(unpackSnorm2x16(second.z), unpackSnorm2x16(second.w))));
 
