@@ -49,6 +49,8 @@ CONFIG_VARIABLE = "SCAN2SIM_KAFKA_CONFIG"
 """Environment variable with the default of settings of type `ClientConfig`."""
 PROBE_TIMEOUT_S = 1.0
 """Time for an idle broker to answer; after that it counts as unreachable."""
+FIRST_ANSWER_TIMEOUT_S = 3.0
+"""Time for the broker to answer a reader that starts; after that the reader starts without its answer."""
 FIRST_PROBE_PAUSE_S, MAX_PROBE_PAUSE_S = 0.5, 5.0
 """Pause until an idle broker is probed again; doubled each time that it answers, up to a maximum."""
 CLOSE_TIMEOUT_S = 10.0
@@ -235,15 +237,17 @@ def read(
     Messages without a record id (of other programs) are not deduplicated; those without a body, or with a record id
     that this program doesn't write, are skipped.
 
+    The first item is None: from then on no record is missed, unless the broker hasn't answered yet.
+
     Args:
         cluster: need not be reachable yet.
         topic: its name; created if it doesn't exist.
         group: consumer group, whose members share the topic's records.
         from_start: start with the oldest stored record where the group has read nothing, unless `since` is given.
-        since: start with the records that reached Kafka at or after this time, in seconds since the epoch, where the
-            group has read nothing; default, without `from_start`: the time of the first poll. So no record is skipped
-            while the group assigns the partitions, also after an outage in which the broker lost its records.
-        connected: called with True while the broker has assigned the topic and answers, otherwise with False; at once
+        since: start with the records that reached Kafka at or after this time, in seconds since the epoch and by the
+            senders' clocks, where the group has read nothing; default, without `from_start`: with those that reach
+            Kafka after its first answer to this reader (`_Start`).
+        connected: called with True while the broker has assigned partitions and answers, otherwise with False; at once
             if connections break, otherwise at the next probe.
         reached: called at each sign that a broker is there: a message, or an answer while there are none.
         max_probe_pause: longest pause in seconds between two probes of an idle broker, which take `PROBE_TIMEOUT_S` if
@@ -258,8 +262,8 @@ def read(
     optional_deps.require("Kafka", "confluent_kafka")
     from confluent_kafka import Consumer, KafkaError, KafkaException
 
-    cause, warned, probe = "", False, _Probe(max_probe_pause)
-    start = None if from_start and since is None else _Start(time.time() if since is None else since)
+    name, start, probe = topic_name(topic), _Start(since, from_start=from_start), _Probe(max_probe_pause)
+    cause, warned, failure, subscribed, unassigned = "", False, "", False, list[Any]()
 
     def on_error(error: Any) -> None:
         nonlocal cause, warned
@@ -272,115 +276,184 @@ def read(
         else:
             cause = _cause(error)
 
-    def on_assign(consumer: Any, partitions: list[Any]) -> None:
+    def on_assign(_: Any, partitions: list[Any]) -> None:
         nonlocal warned
-        warned = True
-        if start is not None:
-            try:
-                start.assign(consumer, partitions)
-            except KafkaException as error:
-                log.warning("%s: earlier records are unavailable, only new ones are read (%s)", topic, error)
-        connected(True)
+        warned, unassigned[:] = True, partitions
+        proceed()
+        connected(bool(partitions) and not unassigned)
+
+    def proceed() -> None:
+        """Subscribe to the topic, or assign its partitions; what fails is retried at the next probe."""
+        nonlocal subscribed, failure
+        try:
+            if not subscribed:
+                start.begin(consumer, name)
+                consumer.subscribe([name], on_assign=on_assign, on_revoke=lambda *_: unassigned.clear())
+                subscribed = True
+            elif unassigned:
+                start.assign(consumer, unassigned)
+                unassigned.clear()
+        except KafkaException as error:
+            probe.failed()
+            if subscribed:
+                consumer.assign([])  # otherwise librdkafka starts where it likes
+            if failure != (failure := _cause(error.args[0])):
+                log.warning("%s can't be read yet (%s); this is retried", topic, failure)
+
+    def contact(timeout: float = PROBE_TIMEOUT_S) -> None:
+        """Ask the broker whether it is there."""
+        if answers := _answers(consumer, name, timeout):
+            reached()
+            probe.succeeded()
+            proceed()
+        else:
+            probe.failed()
+        connected(answers and bool(consumer.assignment()))
 
     consumer = cluster.configured(
         Consumer,
         {
             "group.id": group,
-            "auto.offset.reset": "earliest" if from_start else "latest",
+            "auto.offset.reset": "earliest",  # if the broker no longer has the record at an offset of `_Start`
             "session.timeout.ms": 6000,
             "fetch.wait.max.ms": 10,
-            "enable.partition.eof": True,
             "allow.auto.create.topics": True,
             "topic.metadata.refresh.interval.ms": 1000,  # the topic may be created later
             "logger": _silent_logger(),
             "error_cb": on_error,
         },
     )
-    consumer.subscribe([topic_name(topic)], on_assign=on_assign)
     deduplicator = Deduplicator()
     try:
+        contact(FIRST_ANSWER_TIMEOUT_S)
+        yield None
         while True:
             message = consumer.poll(wait)
-            if message is not None and message.error() and message.error().code() == KafkaError._PARTITION_EOF:
-                if start is not None:
-                    start.at_end(message.partition())
-                continue
             if message is None or message.error():
                 if probe.is_due():
-                    answers = _answers(consumer, topic_name(topic))
-                    if answers:
-                        reached()
-                        probe.succeeded()
-                    else:
-                        probe.failed()
-                    connected(answers and bool(consumer.assignment()))
+                    contact()
                 yield None
                 continue
             reached()
             connected(True)
-            if start is not None and start.is_earlier(message):
-                continue
             header, body = dict(message.headers() or ()).get(RECORD_ID_HEADER), message.value()
             record_id = None if header is None else _record_id(header)
-            if not body:
+            if start.skips(message):
+                body = None
+            elif not body:
                 rejected("a message without a body")
             elif header is not None and record_id is None:
                 rejected(f"a header {RECORD_ID_HEADER!r} of another program")
-            elif record_id is None or deduplicator.is_new(record_id):
-                yield body
-            else:
+                body = None
+            elif record_id is not None and not deduplicator.is_new(record_id):
                 dropped(record_id)
+                body = None
+            yield body or None  # None for what is skipped, too: the caller may want to stop
     finally:
         _close(consumer)
 
 
 class _Start:
-    """Where a consumer starts: partitions of which its group has read nothing with the first record since a time."""
+    """Where a consumer starts in partitions of which its group has read nothing: where it was, else where it began.
 
-    def __init__(self, seconds: float) -> None:
-        """`seconds`: since the epoch."""
-        self._since_ms = int(1000 * seconds)
-        self._unverified = set[int]()
+    Unless it began at the oldest record or at a given time, it began at the ends that the partitions had when the
+    broker first answered. A time wouldn't do, as messages have those of their senders' clocks: old commands by a fast
+    clock would be executed again, and new ones by a slow clock missed. Records that reached Kafka before that answer
+    aren't read, even if this program was already running: they can't be distinguished from older ones.
+    """
 
-    def assign(self, consumer: Any, partitions: Sequence[Any]) -> None:
-        """Assign partitions at their starting offsets.
+    def __init__(self, since: float | None, *, from_start: bool) -> None:
+        """`since`: seconds since the epoch; None: from the start or the ends."""
+        self._since_ms = None if since is None else int(1000 * since)
+        self._from_end = since is None and not from_start
+        self._next = dict[int, int]()  # offset of the next message, by partition; others start at their first
+        self._unverified = dict[int, int]()  # end of the partition when it was assigned
+
+    def begin(self, consumer: Any, topic: str) -> None:
+        """Note the ends of the partitions that a topic has, if any, before it is subscribed to.
 
         Raises:
-            KafkaException: the broker doesn't answer.
+            KafkaException: the broker doesn't answer, or refuses.
         """
-        from confluent_kafka import OFFSET_END, TopicPartition
+        from confluent_kafka import OFFSET_END, KafkaError, KafkaException, TopicPartition
 
-        def offsets_at(time_ms: int) -> list[Any]:
-            asked = [TopicPartition(one.topic, one.partition, time_ms) for one in unread]
-            found: list[Any] = consumer.offsets_for_times(asked, ACKNOWLEDGE_TIMEOUT_S) if asked else []
-            return found
+        if not self._from_end:
+            return
+        found = consumer.list_topics(topic, timeout=PROBE_TIMEOUT_S).topics.get(topic)
+        if found is None:
+            return
+        # the second is the answer of some versions of Kafka while they create the topic
+        is_new = (KafkaError.UNKNOWN_TOPIC_OR_PART, KafkaError.LEADER_NOT_AVAILABLE)
+        if found.error is not None and found.error.code() not in is_new:
+            raise KafkaException(found.error)
+        self._next = _offsets_at(consumer, [TopicPartition(topic, number) for number in found.partitions], OFFSET_END)
 
-        committed = consumer.committed(partitions, ACKNOWLEDGE_TIMEOUT_S)
+    def assign(self, consumer: Any, partitions: Sequence[Any]) -> None:
+        """Assign partitions at their starting offsets; takes at most 3 `PROBE_TIMEOUT_S`.
+
+        Raises:
+            KafkaException: the broker doesn't answer, or refuses.
+        """
+        from confluent_kafka import OFFSET_BEGINNING, OFFSET_END
+
+        self._unverified.clear()
+        committed = _without_errors(consumer.committed(partitions, PROBE_TIMEOUT_S))
         unread = [one for one in committed if one.offset < 0]
-        ends = {one.partition: one.offset for one in offsets_at(OFFSET_END)}
-        starts = offsets_at(self._since_ms)  # after the ends, so that what arrives in between is read
-        self._unverified = {one.partition for one in starts if one.offset != OFFSET_END}
-        for one in starts:
-            if one.offset == OFFSET_END:  # no record since that time
-                one.offset = ends[one.partition]
-        consumer.assign([*(one for one in committed if one.offset >= 0), *starts])
+        ends = _offsets_at(consumer, unread, OFFSET_END)
+        times = dict[int, int]()
+        if self._since_ms is not None:  # after the ends, so that what arrives in between is read
+            new = [one for one in unread if one.partition not in self._next]
+            times = _offsets_at(consumer, new, self._since_ms)
+        for one in unread:
+            number, end = one.partition, ends[one.partition]
+            if number in times:
+                one.offset = end if times[number] == OFFSET_END else times[number]  # OFFSET_END: no record since then
+                self._unverified[number] = end
+            elif self._next.get(number, 0) > end:  # the broker has lost its records, and others have come
+                one.offset = self._next[number] = 0
+            else:
+                one.offset = self._next.get(number, OFFSET_BEGINNING)
+        consumer.assign(committed)
 
-    def is_earlier(self, message: Any) -> bool:
-        """Whether a message is from before the start: some brokers (Tansu) answer offset 0 if there is no later one.
+    def skips(self, message: Any) -> bool:
+        """Whether the next message is from before the start: some brokers (Tansu) answer offset 0 if none is later.
 
         Only the first messages of a partition can be: a time is that of the sender's clock, which may be slow.
         """
-        if message.partition() not in self._unverified:
-            return False
-        kind, time_ms = message.timestamp()
-        if kind and time_ms < self._since_ms:  # kind 0: the message has no time
+        number, offset, (kind, time_ms) = message.partition(), message.offset(), message.timestamp()
+        is_old = offset < self._unverified.get(number, 0)
+        if is_old and kind and time_ms < (self._since_ms or 0):  # kind 0: the message has no time
             return True
-        self._unverified.remove(message.partition())
+        self._unverified.pop(number, None)
+        self._next[number] = offset + 1
         return False
 
-    def at_end(self, partition: int) -> None:
-        """All messages that a partition had have been read: those that follow are later."""
-        self._unverified.discard(partition)
+
+def _offsets_at(consumer: Any, partitions: Sequence[Any], time_ms: int) -> dict[int, int]:
+    """Offset of the first record since a time, in each partition.
+
+    Raises:
+        KafkaException: the broker doesn't answer, or refuses.
+    """
+    from confluent_kafka import TopicPartition
+
+    asked = [TopicPartition(one.topic, one.partition, time_ms) for one in partitions]
+    found = consumer.offsets_for_times(asked, PROBE_TIMEOUT_S) if asked else []
+    return {one.partition: one.offset for one in _without_errors(found)}
+
+
+def _without_errors(partitions: list[Any]) -> list[Any]:
+    """Partitions of an answer.
+
+    Raises:
+        KafkaException: the answer is an error for one of them.
+    """
+    from confluent_kafka import KafkaException
+
+    for one in partitions:
+        if one.error is not None:
+            raise KafkaException(one.error)
+    return partitions
 
 
 def _close(consumer: Any, timeout: float = CLOSE_TIMEOUT_S) -> None:
@@ -435,12 +508,12 @@ class _Probe:
         self._pause, self._due = FIRST_PROBE_PAUSE_S, 0.0
 
 
-def _answers(consumer: Any, topic: str) -> bool:
-    """Whether the broker of an idle consumer answers."""
+def _answers(consumer: Any, topic: str, timeout: float) -> bool:
+    """Whether the broker of an idle consumer answers within some seconds."""
     from confluent_kafka import KafkaException
 
     try:
-        consumer.list_topics(topic, timeout=PROBE_TIMEOUT_S)
+        consumer.list_topics(topic, timeout=timeout)
     except KafkaException:
         return False
     return True

@@ -29,6 +29,7 @@ class ScalerNode(ros.Node):  # type: ignore[misc]
         self._log = params.log_file.open("a", buffering=1) if params.log_file else None
         self._bus = Bus(self, params)
         self._bus.events.on("queue", self._decide)
+        self._bus.start()
 
     def _new_scaler(self) -> Scaler:
         return Scaler(self._params, ScaledProfile(self._params.window, self._usual) if self._usual else None)

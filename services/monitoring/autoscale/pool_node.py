@@ -33,6 +33,7 @@ class PoolNode(ros.Node):  # type: ignore[misc]
         super().__init__(node_name)
         self._bus = Bus(self, params)
         self._bus.events.on("workers", self._scale)
+        self._bus.start()
 
     def _scale(self, wanted: WorkersWanted) -> None:
         if wanted.queue == self._queue:

@@ -35,7 +35,8 @@ class AlarmsNode(ros.Node):  # type: ignore[misc]
     def __init__(self, params: AlarmsParams, notify: Callable[[Alarm], None], node_name: str = "alarms") -> None:
         """`notify` is called with every alarm that isn't muted, in addition to its publication on the bus."""
         known, notified = rules.read(params.rules)
-        self._contact = (BrokerContact if params.kafka_bootstrap_servers else NoBroker)(time.time())
+        contact = BrokerContact if params.kafka_bootstrap_servers else NoBroker
+        self._contact = contact(time.time(), params.records_topic, params.events_topic)
         self._evaluator = RuleEvaluator(known, self._contact)
         self._state = params.state or default_outbox.state_folder("alarms") / f"{params.rules.resolve().stem}.json"
         seen = _restore(self._evaluator, self._state)
@@ -46,11 +47,12 @@ class AlarmsNode(ros.Node):  # type: ignore[misc]
         self._bus = Bus(
             self, params, records=True, seen=seen,
             reached=lambda: self._contact.reached(time.time()),
-            assigned=lambda: self._contact.assigned(time.time()),
+            assigned=lambda topic: self._contact.assigned(topic, time.time()),
         )  # fmt: skip
         self._bus.events.on(RECORD, self._check_record)
         self._bus.events.on("queue", self._check_queue)
         self._bus.events.on("alarm_command", self._command)
+        self._bus.start()
         self.create_timer(1.0, self._check_silence)
 
     def _check_record(self, record: Mapping[str, Any]) -> None:

@@ -13,30 +13,46 @@ TOLERANCE_S = 0.5
 
 
 class BrokerContact:
-    """Last signs of the brokers and of the topic of records, and since when there have been such without an outage.
+    """Last signs of the brokers and of their topics, and since when there have been such without an outage.
 
     All times are seconds since the epoch.
     """
 
-    def __init__(self, started: float) -> None:
-        """`started`: when this program started; what was before is unknown."""
-        self._last = self._began = self._last_assigned = started
-        self._was_assigned = False
+    def __init__(self, started: float, records_topic: str, *topics: str) -> None:
+        """Nothing is known yet.
+
+        Args:
+            started: when this program started; what was before is unknown.
+            records_topic: on which records arrive.
+            topics: others that this program reads.
+        """
+        self._last = self._began = self._reachable_since = started
+        self._records_topic, self._was_assigned = records_topic, False
+        self._last_assigned = dict.fromkeys((records_topic, *topics), started)
 
     def reached(self, now: float) -> None:
         """The brokers have given a sign of life: a message, or an answer."""
         if now - self._last > OUTAGE_S:
-            self._began = max(self._began, now + RESEND_S)
+            self._began, self._reachable_since = max(self._began, now + RESEND_S), now
         self._last = now
 
-    def assigned(self, now: float) -> None:
-        """The brokers answer and have assigned the topic of records to this program: records can arrive.
+    def assigned(self, topic: str, now: float) -> None:
+        """The brokers answer and have assigned a topic to this program: its messages can arrive.
 
         Brokers that answer may need several seconds to assign a topic, for example after a kill of this program.
         """
-        if not self._was_assigned or now - self._last_assigned > OUTAGE_S:
-            self._began = max(self._began, now)
-        self._was_assigned, self._last_assigned = True, now
+        if topic == self._records_topic:
+            if not self._was_assigned or now - self._last_assigned[topic] > OUTAGE_S:
+                self._began = max(self._began, now)
+            self._was_assigned = True
+        self._last_assigned[topic] = now
+
+    def unassigned(self) -> dict[str, float]:
+        """Seconds for which the brokers have been answering without assigning a topic, for each topic."""
+        return {
+            topic: max(0.0, self._last - max(assigned, self._reachable_since))
+            for topic, assigned in self._last_assigned.items()
+        }
 
     def outage(self, now: float) -> float:
         """Seconds since the last sign; 0 while the brokers count as reachable."""
@@ -51,12 +67,17 @@ class BrokerContact:
                 assigned is heard on another way (ROS 2): its silence lasts until `now`.
             now: seconds since the epoch.
         """
-        until = now if arrived > self._last_assigned + TOLERANCE_S else self._last_assigned
+        assigned = self._last_assigned[self._records_topic]
+        until = now if arrived > assigned + TOLERANCE_S else assigned
         return max(0.0, until - max(arrived, self._began))
 
 
 class NoBroker(BrokerContact):
     """Contact of a program that doesn't use Kafka: records arrive by ROS 2 alone."""
+
+    def unassigned(self) -> dict[str, float]:
+        """No topics."""
+        return {}
 
     def outage(self, now: float) -> float:
         """No outage."""

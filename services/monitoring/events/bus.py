@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -17,6 +16,8 @@ from scan2sim.services.supervision import SupervisedThread
 
 REACHED_INTERVAL_S = 1.0
 """Longest pause between two probes of an idle broker, if the caller waits for its signs."""
+START_TIMEOUT_S = 5.0
+"""Longest wait for the readers to start; they take less unless the machine is busy."""
 
 
 class Bus:
@@ -24,9 +25,9 @@ class Bus:
 
     def __init__(
         self, node: Any, params: BusParams, *, records: bool = False, reached: Callable[[], None] | None = None,
-        assigned: Callable[[], None] = lambda: None, seen: Mapping[str, int] | None = None,
+        assigned: Callable[[str], None] = lambda _: None, seen: Mapping[str, int] | None = None,
     ) -> None:  # fmt: skip
-        """Connect the node; no event that reaches Kafka from now on is missed.
+        """Connect the node; it receives from `start` on.
 
         Args:
             node: a node of the transport.
@@ -34,10 +35,10 @@ class Bus:
             records: whether to receive monitoring records as well as events.
             reached: called at each sign that Kafka is there (`kafka.read`), at least every `REACHED_INTERVAL_S`, in a
                 thread.
-            assigned: called at each sign that Kafka is there and has assigned the topic of records, likewise.
+            assigned: called with a topic at each sign that Kafka is there and has assigned it, likewise.
             seen: state of the deduplicator of an earlier process, so that what Kafka delivers again is ignored.
         """
-        self._reached, self._since = reached or (lambda: None), time.time()
+        self._reached, self._assigned = reached or (lambda: None), assigned
         self._probe_pause = REACHED_INTERVAL_S if reached else kafka.MAX_PROBE_PAUSE_S
         self._name = name = node.get_name()
         self.events = Events(name)
@@ -47,7 +48,7 @@ class Bus:
         for topic in topics:
             node.create_subscription(ros.message_type(STRING), topic, self._on_ros_message, RECORDS_QOS)
         self._closed = threading.Event()
-        self._readers: list[SupervisedThread] = []
+        self._readers: list[tuple[SupervisedThread, threading.Event]] = []
         self._kafka: KafkaSink | None = None
         if servers := params.kafka_bootstrap_servers:
             outbox = default_outbox.open_outbox(f"{node.get_namespace()}/{name}", params.events_topic)
@@ -55,22 +56,32 @@ class Bus:
             self._kafka = KafkaSink(cluster, params.events_topic, outbox)
             self.events.outlets.append(self._kafka)
             for topic in topics:
-                on_assigned = assigned if topic == params.records_topic else lambda: None
-                reader = SupervisedThread(partial(self._read_kafka, cluster, topic, on_assigned), f"{topic} for {name}")
-                reader.start()
-                self._readers.append(reader)
+                begun = threading.Event()
+                job = partial(self._read_kafka, cluster, topic, begun)
+                self._readers.append((SupervisedThread(job, f"{topic} for {name}"), begun))
+
+    def start(self) -> None:
+        """Start to receive by Kafka, after the calls of `events.on`: no event that reaches it from now on is missed.
+
+        While no broker answers this takes some seconds, and such events are missed until one does.
+        """
+        for reader, _ in self._readers:
+            reader.start()
+        for _, begun in self._readers:
+            begun.wait(START_TIMEOUT_S)
 
     def _on_ros_message(self, message: Any) -> None:
         self.events.receive(message.data)
 
-    def _read_kafka(self, cluster: kafka.Cluster, topic: str, assigned: Callable[[], None]) -> None:
+    def _read_kafka(self, cluster: kafka.Cluster, topic: str, begun: threading.Event) -> None:
         # a group of its own for each topic: a member that joins interrupts all others of its group for seconds
         bodies = kafka.read(
-            cluster, topic, group=f"scan2sim-{self._name}-{kafka.topic_name(topic)}", since=self._since, wait=0.5,
-            reached=self._reached, connected=lambda is_connected: assigned() if is_connected else None,
+            cluster, topic, group=f"scan2sim-{self._name}-{kafka.topic_name(topic)}", wait=0.5,
+            reached=self._reached, connected=lambda is_connected: self._assigned(topic) if is_connected else None,
             max_probe_pause=self._probe_pause, rejected=self.events.rejections.add,
         )  # fmt: skip
         for body in bodies:
+            begun.set()
             if self._closed.is_set():
                 return
             if body is not None:
@@ -85,8 +96,9 @@ class Bus:
         self._closed.set()
         for outlet in self.events.outlets:
             outlet.close()
-        for reader in self._readers:
-            reader.join(5.0)
+        for reader, _ in self._readers:
+            if reader.ident:
+                reader.join(5.0)
 
 
 class RosOutlet:

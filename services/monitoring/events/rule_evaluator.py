@@ -9,7 +9,7 @@ from fnmatch import fnmatchcase
 from typing import Any, Literal
 
 from scan2sim.services.monitoring.events.broker_contact import BrokerContact
-from scan2sim.services.monitoring.events.rules import OUTAGE_RULE, Metric, Rule
+from scan2sim.services.monitoring.events.rules import DEFAULT_RULES, Metric, Rule
 from scan2sim.services.monitoring.events.schema import Alarm, AlarmCommand, QueueState
 
 BANDWIDTH_WINDOW_S = 5.0
@@ -48,7 +48,8 @@ class RuleEvaluator:
     def __init__(self, rules: Sequence[Rule], contact: BrokerContact) -> None:
         """`contact`: with the brokers that deliver the records."""
         self._contact = contact
-        self._rules = (*rules, *(() if any(rule.metric == "outage" for rule in rules) else (OUTAGE_RULE,)))
+        used = {rule.metric for rule in rules}
+        self._rules = (*rules, *(rule for rule in DEFAULT_RULES if rule.metric not in used))
         self._states: dict[tuple[str, str], _AlarmState] = {}
         self._byte_counts: dict[tuple[str, str, str], deque[_ByteCount]] = {}
         self._last_arrival: dict[str, float] = {}
@@ -97,6 +98,8 @@ class RuleEvaluator:
             key: counts for key, counts in self._byte_counts.items() if now - counts[-1].time < NODE_EXPIRY_S
         }
         found = list(self._observe("outage", "Kafka", "", self._contact.outage(now), now))
+        for topic, seconds in self._contact.unassigned().items():
+            found += self._observe("unassigned", topic, "", seconds, now)
         for node, arrived in self._last_arrival.items():
             silence = self._contact.silence(arrived, now)
             found += self._observe("silence", node, "", silence, now, may_clear=False)  # only a record clears it

@@ -23,11 +23,14 @@ from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.io import toml
 from scan2sim.services.monitoring.events.notify import NotifyParams
 
-Metric = Literal["bandwidth_difference", "latency", "lost", "rate", "silence", "outage", "queue_length", "queue_age"]
+Metric = Literal[
+    "bandwidth_difference", "latency", "lost", "rate", "silence", "outage", "unassigned", "queue_length", "queue_age"
+]  # fmt: skip
 """bandwidth_difference: fraction of a topic's published bandwidth that a subscriber doesn't receive; latency: seconds,
 mean of a record; lost: messages lost in a record's period; rate: messages per second; silence: seconds without a record
-of a node while Kafka was there; outage: seconds since the last sign of Kafka, from 5 s on; queue_length: waiting
-events; queue_age: seconds since the oldest waiting event was sent."""
+of a node while Kafka was there; outage: seconds since the last sign of Kafka, from 5 s on; unassigned: seconds for
+which Kafka has been answering without assigning a topic to the alarm node; queue_length: waiting events; queue_age:
+seconds since the oldest waiting event was sent."""
 Bound = Annotated[float, Field(ge=-1e9, le=1e9)]
 Hold = Annotated[float, Field(ge=0, le=86_400)]
 DOCS = "docs/monitoring.md lists the settings of rules"
@@ -57,8 +60,11 @@ class Rule(Params):
         return value <= self.clear if self.above is not None else value >= self.clear
 
 
-OUTAGE_RULE = Rule(name="Kafka is unreachable", metric="outage", above=0.0)
-"""Used if no other rule has the metric: an outage of the brokers is one alarm, not one of each node."""
+DEFAULT_RULES = (
+    Rule(name="Kafka is unreachable", metric="outage", above=0.0),
+    Rule(name="Kafka doesn't assign the topic", metric="unassigned", above=60.0),
+)
+"""Used if no other rule has their metric: if the alarm node can't receive, that is one alarm, not one of each node."""
 
 
 def read(path: Path) -> tuple[tuple[Rule, ...], NotifyParams]:

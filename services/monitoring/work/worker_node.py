@@ -51,6 +51,7 @@ class WorkerNode(Monitor):
         )
         self.drops.append(self._bus.dropped)
         self._bus.events.on("workers", self._scale)
+        self._bus.start()
         self.create_subscription(ros.message_type(STRING), params.topic, self._enqueue, EVENTS_QOS)
         self._reported = time.monotonic()
         self._workers.scale(1)

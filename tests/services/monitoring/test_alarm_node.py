@@ -162,11 +162,14 @@ def test_alarms_survive_outage_kill_and_restart_once(
 def _wait_until_heard(state: Path, nodes: set[str]) -> None:
     """Wait until an alarm node has heard nodes, and found Kafka reachable, by its state file (saved every 10 s)."""
 
-    def has_heard() -> bool:
-        saved = json.loads(state.read_text(encoding="utf-8")) if state.exists() else {"nodes": {}, "alarms": []}
-        return nodes <= set(saved["nodes"]) and not saved["alarms"]
+    def saved() -> dict[str, Any]:
+        content = json.loads(state.read_text(encoding="utf-8")) if state.exists() else {}
+        return {"nodes": {}, "alarms": []} | content
 
-    until(has_heard, what=f"{nodes} in {state}")
+    def has_heard() -> bool:
+        return nodes <= set(saved()["nodes"]) and not saved()["alarms"]
+
+    until(has_heard, 150, what=f"{nodes} in {state}", state=saved)
 
 
 def _wait_for_records(broker: Broker, names: set[str]) -> None:

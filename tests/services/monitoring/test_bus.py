@@ -23,6 +23,7 @@ node = ros.Node(sys.argv[1])
 bus = Bus(node, BusParams(kafka_bootstrap_servers=sys.argv[2]))
 bus.events.define("count", Count)
 bus.events.on("count", lambda count: print(count.vehicles, flush=True))
+bus.start()
 sent = 0
 def send():
     global sent

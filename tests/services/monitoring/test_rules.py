@@ -25,7 +25,7 @@ def record(node: str, time: float, *flows: dict[str, Any], subscribes: tuple[str
 
 
 def evaluator_of(*rules: Rule) -> RuleEvaluator:
-    return RuleEvaluator(rules, NoBroker(0.0))
+    return RuleEvaluator(rules, NoBroker(0.0, "records"))
 
 
 def check(evaluator: RuleEvaluator, content: dict[str, Any], arrived: float | None = None) -> list[Alarm]:
@@ -100,9 +100,10 @@ SILENT = Rule(name="silent", metric="silence", above=3)
 
 
 def reach(contact: BrokerContact, now: float) -> None:
-    """The brokers give a sign, and have assigned the topic of records."""
+    """The brokers give a sign, and have assigned the topics."""
     contact.reached(now)
-    contact.assigned(now)
+    contact.assigned("records", now)
+    contact.assigned("events", now)
 
 
 def states(alarms: list[Alarm]) -> list[tuple[str, str, str]]:
@@ -120,7 +121,7 @@ def test_silence_is_measured_by_arrival_not_by_the_clock_of_the_node() -> None:
 
 
 def test_outage_of_kafka_is_one_alarm_and_no_silence_of_the_nodes() -> None:
-    contact = BrokerContact(0.0)
+    contact = BrokerContact(0.0, "records", "events")
     evaluator, found = RuleEvaluator([SILENT], contact), []
 
     def second(t: int, *, kafka: bool, nodes: int) -> None:
@@ -146,7 +147,7 @@ def test_outage_of_kafka_is_one_alarm_and_no_silence_of_the_nodes() -> None:
 
 
 def test_node_that_stays_away_after_an_outage_of_kafka_is_silent() -> None:
-    contact = BrokerContact(0.0)
+    contact = BrokerContact(0.0, "records", "events")
     evaluator = RuleEvaluator([SILENT], contact)
     reach(contact, 1.0)
     check(evaluator, record("camera", 1.0))
@@ -161,7 +162,7 @@ def test_node_that_stays_away_after_an_outage_of_kafka_is_silent() -> None:
 
 @pytest.mark.parametrize("began", [0.0, 100.0], ids=["restarted", "after an outage"])
 def test_silence_is_not_counted_before_kafka_assigns_the_topic_of_records(began: float) -> None:
-    contact = BrokerContact(0.0)
+    contact = BrokerContact(0.0, "records", "events")
     evaluator = RuleEvaluator([SILENT], contact)
     if began:
         reach(contact, 1.0)
@@ -173,15 +174,42 @@ def test_silence_is_not_counted_before_kafka_assigns_the_topic_of_records(began:
     for t in range(int(began), assigned + 20):
         contact.reached(float(t))
         if t >= assigned:
-            contact.assigned(float(t))
+            contact.assigned("records", float(t))
             found += check(evaluator, record("camera", float(t)))
         found += [one for one in evaluator.check_silence(t + 0.1) if one.rule == "silent"]
     assert states(found) == [("raised", "silent", "/lidar")]
     assert assigned + 3 < found[0].since <= assigned + 5
 
 
+def test_topic_that_reachable_brokers_do_not_assign_raises_an_alarm() -> None:
+    contact = BrokerContact(0.0, "records", "events")
+    evaluator, found = RuleEvaluator([SILENT], contact), []
+    for t in range(300):
+        if not 50 <= t < 150:  # an outage, which doesn't count
+            contact.reached(float(t))
+            contact.assigned("records", float(t))
+        if t >= 230:
+            contact.assigned("events", float(t))
+        found += [(t, *state) for state in states(evaluator.check_silence(t + 0.1))]
+    outage, unassigned = "Kafka is unreachable", "Kafka doesn't assign the topic"
+    assert found == [
+        (54, "raised", outage, "Kafka"), (150, "cleared", outage, "Kafka"),
+        (211, "raised", unassigned, "events"), (230, "cleared", unassigned, "events"),
+    ]  # fmt: skip
+
+
+def test_slow_assignment_raises_no_alarm() -> None:
+    contact = BrokerContact(0.0, "records", "events")
+    evaluator = RuleEvaluator([SILENT], contact)
+    for t in range(200):
+        contact.reached(float(t))
+        if t > 50:  # another member of the group delays it
+            reach(contact, float(t))
+        assert evaluator.check_silence(t + 0.1) == []
+
+
 def test_node_heard_by_ros_is_watched_during_an_outage_of_kafka() -> None:
-    contact = BrokerContact(0.0)
+    contact = BrokerContact(0.0, "records", "events")
     evaluator = RuleEvaluator([SILENT], contact)
     for t in range(30):
         check(evaluator, record("near", t))
@@ -193,7 +221,7 @@ def test_restarted_evaluator_continues_without_raising_or_clearing_twice() -> No
     check(first, record("camera", 0))
     check(first, record("hears", 0, flow("incoming", lost=9)))
     assert len(first.check_silence(10.0)) == 2
-    second = RuleEvaluator([SILENT, Rule(name="lost", metric="lost", above=4)], NoBroker(100.0))
+    second = RuleEvaluator([SILENT, Rule(name="lost", metric="lost", above=4)], NoBroker(100.0, "records"))
     second.restore(json.loads(json.dumps(first.saved())))
     assert [second.check_silence(100.0 + t) for t in range(1, 20)] == [[]] * 19
     assert states(check(second, record("camera", 121))) == [("cleared", "silent", "/camera")]
