@@ -91,7 +91,7 @@ class WorldCamera:
     def _load(self, position: F64) -> None:
         """Prepare the tiles near a position, and the background of the nearest, unless they are prepared."""
         order, distance = self._layout.by_distance(position)
-        near = sorted(order[: max(1, np.count_nonzero(distance <= self._farthest))])
+        near = sorted(order[: max(1, int(np.count_nonzero(distance <= self._farthest)))])
         if near == self._near and order[0] == self._nearest:
             return
         if near != self._near:

@@ -96,7 +96,7 @@ def render(parameters: F32, camera: Pinhole, known: F32 | None = None) -> Render
     image = tiles.from_tiles(blended, camera.width, camera.height)
     deviation = np.zeros(image.shape[:2], np.float32) if known is None else image[..., blending.DEVIATION] * (known > 0)
     with np.errstate(divide="ignore"):
-        depth = 1 / image[..., blending.MEDIAN]
+        depth = np.float32(1) / image[..., blending.MEDIAN]
     return Rendered(
         image[..., :3], depth, deviation, image[..., blending.TRANSMITTANCE], parameters, camera, projected, found,
         expected, blended, last,

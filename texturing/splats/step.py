@@ -119,7 +119,9 @@ def _prepared(inputs: Inputs, params: SplatsParams, report: Report) -> tuple[lis
     points = PointCloud.load(inputs["moving"]) if "moving" in inputs else None
     moving = MovingMask(inputs.get("instances"), meshes[0].frame, params.parked, points)
     views, held_out = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
-    used, excluded, seen = [], [], []
+    used: list[Photo] = []
+    excluded: list[Bools] = []
+    seen: list[Shot] = []
     free = [k for k, held in enumerate(held_out) if not held]
     chosen = prepared.choose(views, free, params.spacing, params.max_photos)
     for k in chosen:

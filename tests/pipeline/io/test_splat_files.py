@@ -79,7 +79,8 @@ def test_what_is_brighter_than_white_is_white_in_files(tmp_path: Path, suffix: s
     path = tmp_path / f"a{suffix}"
     if suffix == ".glb":
         gltf.write(path, given, OFFSET)
-        rgb = accessors(path)[1]["KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"] * splat_files.SH_C0 + 0.5
+        harmonic = accessors(path)[1]["KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"]
+        rgb = np.asarray(harmonic * splat_files.SH_C0 + 0.5, np.float32)
     else:
         splat_files.write(path, given, OFFSET)
         rgb = splat_files.read(path).rgb

@@ -23,7 +23,10 @@ from tests.fakes.broker import Broker
 
 NO_LATER_RECORD = {"Kafka": OFFSET_END, "Tansu": 0}
 """Offset that brokers answer if a partition has no record since a time."""
-ERRORS = [KafkaException(KafkaError(KafkaError._TIMED_OUT)), KafkaError(KafkaError.NOT_LEADER_FOR_PARTITION)]
+ERRORS: list[KafkaException | KafkaError] = [
+    KafkaException(KafkaError(KafkaError._TIMED_OUT)),
+    KafkaError(KafkaError.NOT_LEADER_FOR_PARTITION),
+]
 """Failures of a request: of all of it, and of its partition."""
 
 
@@ -213,15 +216,15 @@ def test_failed_assignment_is_retried(cluster: OnePartition, refused: str, error
     bodies = reader_of(cluster, connected=states.append)
     cluster.append(1, b"new")
     cluster.assign_next()
-    attempt = [error] if refused == "committed offsets" else [None, error]
-    cluster.refusals = 2 * attempt
+    attempt: list[KafkaException | KafkaError | None] = [None] if refused == "ends" else []
+    cluster.refusals = [*attempt, error, *attempt, error]
     assert next(bodies) is None and not cluster.assignment() and True not in states
     assert bodies_now(bodies) == [b"new"] and states[-1] and not cluster.refusals
 
 
 def test_partition_that_is_revoked_is_not_assigned_again(cluster: OnePartition) -> None:
     bodies = reader_of(cluster)
-    cluster.refusals = 2 * [ERRORS[1]]
+    cluster.refusals = [ERRORS[1], ERRORS[1]]
     cluster.assign_next()
     assert next(bodies) is None and not cluster.assignment()
     cluster.revoke()

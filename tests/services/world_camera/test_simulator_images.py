@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -52,12 +54,12 @@ def test_colours_and_depths_are_decoded() -> None:
         {"data": np.zeros(0, np.uint8)}, {"width": 0},
     ],
 )  # fmt: skip
-def test_malformed_depth_images_are_rejected(changed: dict[str, object]) -> None:
+def test_malformed_depth_images_are_rejected(changed: dict[str, Any]) -> None:
     with pytest.raises(InputError, match="depth image"):
         depth_of(image(DEPTH, "32FC1", **changed))
 
 
 @pytest.mark.parametrize("changed", [{"encoding": "wild"}, {"data": np.zeros(0, np.uint8)}, {"step": 2}])
-def test_malformed_colour_images_are_rejected(changed: dict[str, object]) -> None:
+def test_malformed_colour_images_are_rejected(changed: dict[str, Any]) -> None:
     with pytest.raises(InputError, match="colour image"):
         colour_of(image(RGB, "rgb8", **changed))

@@ -17,7 +17,7 @@ LEVELS = np.random.default_rng(1).integers(0, 256, (*SHAPE, 3)).astype(np.uint8)
 
 
 def test_colours_of_the_world_are_those_after_the_correction_of_the_photo() -> None:
-    response = Response.of(EXPOSURE, falloff(*EXPOSURE[3:].tolist(), *SHAPE))
+    response = Response.of(EXPOSURE, falloff(EXPOSURE[3], EXPOSURE[4], *SHAPE))
     world = response.world(LEVELS)
     assert np.abs(255 * world - photos._corrected(LEVELS, EXPOSURE)).max() < 0.01
     assert world.max() > 1, "what is brighter than white isn't cut"
@@ -25,7 +25,7 @@ def test_colours_of_the_world_are_those_after_the_correction_of_the_photo() -> N
 
 
 def test_a_part_of_the_pixels_has_its_part_of_the_vignetting() -> None:
-    response = Response.of(EXPOSURE, falloff(*EXPOSURE[3:].tolist(), *SHAPE))
+    response = Response.of(EXPOSURE, falloff(EXPOSURE[3], EXPOSURE[4], *SHAPE))
     part = slice(1, None, 3)
     assert np.allclose(response.sampled(part, part).world(LEVELS[part, part]), response.world(LEVELS)[part, part])
 
