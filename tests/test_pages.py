@@ -44,7 +44,7 @@ PARAMS: dict[str, type[Params]] = {step.name: step.params for step in STEPS}
 OTHER_PROGRAMS = re.compile(r"\b(prefect|docker|dask|ray|gz|pip|aws|curl|kubectl|trtexec|esmini|ros2|export.py)\b")
 """Other programs, whose options a page may mention if it also shows them in a command."""
 IMAGES, ARRAYS, MESHES = {"png", "jpg"}, {"npz", "npy", "laz", "csv"}, {"obj", "mtl", "dae", "glb", "sdf"}
-SUFFIXES = {"py", "json", "geojson", "toml", *IMAGES, *ARRAYS, *MESHES}
+SUFFIXES = {"py", "js", "json", "geojson", "toml", *IMAGES, *ARRAYS, *MESHES}
 
 
 def text_of(page: Path) -> str:
