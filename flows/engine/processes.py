@@ -100,7 +100,7 @@ def receive(
     try:
         kind, value, message = connection.recv()
     except EOFError:
-        process.join(10)
+        process.join()
         cause = "was killed, probably because memory ran out" if process.exitcode == -signal.SIGKILL else "crashed"
         raise StepError(
             item.task.full_name,
