@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("gsply", reason="the extra splats isn't installed")
 
-from scan2sim.pipeline.core.errors import SettingError
-from scan2sim.pipeline.core.splats import MAX_COLOUR, PHOTO_WIDTH, RGB, SplatLayer, Splats
+from scan2sim.pipeline.core import splats as layers
+from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.splats import MAX_COLOUR, MIN_COLOUR, PHOTO_WIDTH, RGB, SplatLayer, Splats
 from scan2sim.pipeline.io import splat_files
 from scan2sim.pipeline.io.worlds.gltf import splats as gltf
 
@@ -76,6 +77,7 @@ def test_positions_beyond_spz_are_rejected(tmp_path: Path) -> None:
 def test_what_is_brighter_than_white_is_white_in_files(tmp_path: Path, suffix: str) -> None:
     given = some()
     given.parameters[:, RGB] *= 2
+    given.parameters[:5, RGB] = MIN_COLOUR
     path = tmp_path / f"a{suffix}"
     if suffix == ".glb":
         gltf.write(path, given, OFFSET)
@@ -84,7 +86,7 @@ def test_what_is_brighter_than_white_is_white_in_files(tmp_path: Path, suffix: s
     else:
         splat_files.write(path, given, OFFSET)
         rgb = splat_files.read(path).rgb
-    assert (given.rgb > 1.2).any() and np.abs(rgb - np.minimum(given.rgb, 1)).max() < 0.02
+    assert (given.rgb > 1.2).any() and np.abs(rgb - np.clip(given.rgb, 0, 1)).max() < 0.02
 
 
 def accessors(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -125,19 +127,31 @@ def test_gltf_has_the_same_ellipsoids_with_y_up(tmp_path: Path) -> None:
 
 def test_a_layer_is_stored_and_read(tmp_path: Path) -> None:
     random = np.random.default_rng(1)
-    background = random.uniform(0, MAX_COLOUR, size=(8, 16, 3)).astype(np.float32)
+    background = random.uniform(MIN_COLOUR, MAX_COLOUR, size=(8, 16, 3)).astype(np.float32)
     photos = random.uniform(size=(3, PHOTO_WIDTH)).astype(np.float32)
-    SplatLayer(some(), background, photos).save(tmp_path / "a.npz")
+    SplatLayer(some(), background, photos, ("left_1242x375", "rück_640x480")).save(tmp_path / "a.npz")
     read = SplatLayer.load(tmp_path / "a.npz")
     assert np.array_equal(read.splats.parameters, some().parameters)
     assert np.abs(read.background - background).max() < 0.001 and np.array_equal(read.photos, photos)
+    assert read.cameras == ("left_1242x375", "rück_640x480") and SplatLayer.count(tmp_path / "a.npz") == len(some())
 
 
 def test_a_layer_of_an_earlier_version_is_read(tmp_path: Path) -> None:
     background = np.random.default_rng(1).integers(0, 256, (8, 16, 3)).astype(np.uint8)
     np.savez_compressed(tmp_path / "a.npz", parameters=some().parameters, background=background)
     read = SplatLayer.load(tmp_path / "a.npz")
-    assert np.allclose(read.background * 255, background, atol=1e-3) and not len(read.photos)
+    assert np.allclose(read.background * 255, background, atol=1e-3) and not len(read.photos) and not read.cameras
+
+
+@pytest.mark.parametrize(("version", "remedy"), [(2, "Run again"), (layers.VERSION + 1, "Update scan2sim")])
+def test_a_layer_of_an_unknown_version_is_rejected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: int, remedy: str
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(layers, "VERSION", version)
+        SplatLayer.nothing().save(tmp_path / "a.npz")
+    with pytest.raises(InputError, match=f"version {version}.*{remedy}"):
+        SplatLayer.load(tmp_path / "a.npz")
 
 
 def test_the_background_becomes_a_shell_of_its_colours() -> None:
