@@ -1,6 +1,9 @@
 """Alpha blending of splats within tiles, nearest first, and its gradient.
 
 Loops run over whole rows of a tile, with unsigned indices and constants of 32 bits, so that LLVM vectorizes them.
+
+Kernels of this package use constants of their own module only, and get others as arguments: numba compiles a cached
+kernel again if its own file changes, but not if another does.
 """
 
 from __future__ import annotations
@@ -8,16 +11,17 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from scan2sim.texturing.splats import projection
-from scan2sim.texturing.splats.tiles import HEIGHT, PIXELS, WIDTH
-
+WIDTH, HEIGHT = 8, 32
+"""Size of a tile in pixels: narrow, as only the rows that a splat overlaps are drawn, but over the whole width."""
+PIXELS = WIDTH * HEIGHT
 RED, GREEN, BLUE, DEVIATION, TRANSMITTANCE, MEDIAN = range(6)
 """Channels of a blended tile (6, 256): colours and deviation of the inverse depth from the known one, times alpha; what
 is left of the background; inverse depth at which `HALF` is left, 1/metres, 0 where more is left."""
 CHANNELS = 6
 MAX_ALPHA = np.float32(0.99)
-MIN_ALPHA = np.float32(projection.MIN_ALPHA)
-ONE, TWO = np.float32(1), np.float32(2)
+MIN_ALPHA = np.float32(1 / 255)
+"""Splats are drawn where their alpha is at least this."""
+ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 """In numba the product of an integer and a float of 32 bits has 64 bits, which halves the speed of the loops."""
 HALF = np.float32(0.5)
 MAX_DEVIATION = np.float32(0.2)
@@ -34,16 +38,21 @@ Y = (np.arange(PIXELS) // WIDTH).astype(np.float32)
 E0, E1, E2, E3 = np.float32(0.99999529), np.float32(-0.99959058), np.float32(0.49423736), np.float32(-0.13991767)
 FARTHEST = np.float32(32)
 """Squared distance in standard deviations at which the polynomial ends, at 1e-8."""
+FASTMATH = {"reassoc", "contract", "nsz", "arcp", "afn"}
+"""Without "nnan" and "ninf", with which the limits of values that aren't finite would be undefined."""
 
 
-@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
-def blend(parameters, projected, columns, start, splat, known, tiles, last):  # type: ignore[no-untyped-def]
+@njit(cache=True, parallel=True, fastmath=FASTMATH, error_model="numpy")
+def blend(  # type: ignore[no-untyped-def]
+    parameters, projected, columns, start, splat, known, width, height, tiles, last
+):
     """Blend the splats of each tile.
 
     Args:
         parameters: (N, 14); projected: (N, 11).
         columns, start, splat: of the tiles' `Assignment`.
         known: (T, 256) known depths, metres; where it is 0, the channel `DEVIATION` means nothing.
+        width, height: of the image in pixels; a tile's pixels outside are opaque from the start.
         tiles: (T, 6, 256), written.
         last: (T,) number of the splats that were blended, written.
     """
@@ -51,7 +60,9 @@ def blend(parameters, projected, columns, start, splat, known, tiles, last):  # 
         image, expected = tiles[tile], known[tile]
         left, top = np.float32(tile % columns * WIDTH), np.float32(tile // columns * HEIGHT)
         image[:] = 0
-        image[TRANSMITTANCE] = 1
+        for p in range(np.uint64(PIXELS)):
+            inside = (X[p] + left < np.float32(width)) & (Y[p] + top < np.float32(height))
+            image[TRANSMITTANCE, p] = ONE if inside else ZERO
         number = 0
         for entry in range(start[tile], start[tile + 1]):
             i = splat[entry]
@@ -66,14 +77,15 @@ def blend(parameters, projected, columns, start, splat, known, tiles, last):  # 
             end = min(int(v + projected[i, 7]) + 2, HEIGHT)
             for p in range(np.uint64(first * WIDTH), np.uint64(end * WIDTH)):
                 dx, dy = X[p] - u, Y[p] - v
-                q = min(a * dx * dx + b * dx * dy + c * dy * dy, FARTHEST) * np.float32(1 / 32)
+                square = max(a * dx * dx + b * dx * dy + c * dy * dy, ZERO)  # rounding can make it negative
+                q = min(square, FARTHEST) * np.float32(1 / 32)
                 k = E0 + q * (E1 + q * (E2 + q * E3))
                 k = k * k
                 k = k * k
                 k = k * k
                 k = k * k
                 alpha = min(opacity * k, MAX_ALPHA)
-                alpha = alpha if alpha >= MIN_ALPHA else np.float32(0)
+                alpha = alpha if alpha >= MIN_ALPHA else ZERO
                 before = image[TRANSMITTANCE, p]
                 weight = alpha * before
                 after = before - weight
@@ -93,7 +105,7 @@ def blend(parameters, projected, columns, start, splat, known, tiles, last):  # 
         last[tile] = number
 
 
-@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+@njit(cache=True, parallel=True, fastmath=FASTMATH, error_model="numpy")
 def blend_gradients(  # type: ignore[no-untyped-def]
     parameters, projected, columns, start, splat, slot, known, tiles, last, background, gradient, entries
 ):
@@ -137,7 +149,7 @@ def blend_gradients(  # type: ignore[no-untyped-def]
             s5, s6, s7, s8, s9 = np.float32(0), np.float32(0), np.float32(0), np.float32(0), np.float32(0)
             for p in range(np.uint64(first * WIDTH), np.uint64(end * WIDTH)):
                 dx, dy = X[p] - u, Y[p] - v
-                square = a * dx * dx + TWO * b * dx * dy + c * dy * dy
+                square = max(a * dx * dx + TWO * b * dx * dy + c * dy * dy, ZERO)
                 q = min(square, FARTHEST) * np.float32(1 / 32)
                 k = E0 + q * (E1 + q * (E2 + q * E3))
                 k = k * k

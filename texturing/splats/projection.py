@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit, prange
 
 from scan2sim.pipeline.core.types import F32, F64, I32, Bools, Camera
+from scan2sim.texturing.splats.blending import MIN_ALPHA
 
 U, V, CONIC_A, CONIC_B, CONIC_C, OPACITY, EXTENT_X, EXTENT_Y, DEPTH, SLOPE_X, SLOPE_Y = range(11)
 """Columns of projected splats: centre in pixels; inverse covariance [[A, B], [B, C]]; opacity; half width and height
@@ -16,8 +17,6 @@ pixel, which is constant over a plane."""
 PROJECTED = 11
 LOW_PASS = 0.3
 """Variance in square pixels that is added to the projected covariance, as all viewers do."""
-MIN_ALPHA = 1 / 255
-"""Splats are drawn where their alpha is at least this."""
 FIELD_MARGIN = 1.3
 """The projection is linearized at most at this multiple of the field of view: beyond it shapes explode."""
 MIN_SLOPE_COS = 0.01
@@ -25,6 +24,8 @@ MIN_SLOPE_COS = 0.01
 inverse depth is reduced: splats that are seen from their edge have hardly a plane."""
 NEAR_M = 0.2
 """Splats nearer to the camera aren't drawn."""
+FASTMATH = {"reassoc", "contract", "nsz", "arcp", "afn"}
+"""Without "nnan" and "ninf": splats whose projection isn't finite are left out."""
 GRADIENT = 10
 """Image gradients of a splat: red, green, blue, inverse depth, opacity, U, V, CONIC_A, CONIC_B, CONIC_C."""
 
@@ -56,7 +57,7 @@ class Pinhole(NamedTuple):
 def project(parameters: F32, camera: Pinhole) -> tuple[F32, Bools]:
     """Splats (N, 14) as the camera sees them: (N, 11) with the columns above, and (N,) whether they are visible."""
     projected, visible = np.zeros((len(parameters), PROJECTED), np.float32), np.zeros(len(parameters), np.bool_)
-    _project(parameters, *camera, projected, visible)
+    _project(parameters, *camera, MIN_ALPHA, projected, visible)
     return projected, visible
 
 
@@ -126,8 +127,10 @@ def _limits(intrinsics, width, height):  # type: ignore[no-untyped-def]
     return left, right, top, bottom
 
 
-@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
-def _project(parameters, R, t, intrinsics, width, height, projected, visible):  # type: ignore[no-untyped-def]
+@njit(cache=True, parallel=True, fastmath=FASTMATH, error_model="numpy")
+def _project(  # type: ignore[no-untyped-def]
+    parameters, R, t, intrinsics, width, height, min_alpha, projected, visible
+):
     left, right, top, bottom = _limits(intrinsics, width, height)
     fx, fy = intrinsics[0], intrinsics[1]
     for i in prange(len(parameters)):
@@ -136,7 +139,7 @@ def _project(parameters, R, t, intrinsics, width, height, projected, visible):  
         if z < np.float32(NEAR_M):
             continue
         opacity = 1 / (1 + np.exp(-parameters[i, 10]))
-        if opacity <= np.float32(MIN_ALPHA):
+        if opacity <= min_alpha:
             continue
         x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + t[0]
         y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + t[1]
@@ -155,10 +158,17 @@ def _project(parameters, R, t, intrinsics, width, height, projected, visible):  
             m0, m1 = scale * (j00 * q0 + j02 * q2), scale * (j11 * q1 + j12 * q2)
             a, b, c = a + m0 * m0, b + m0 * m1, c + m1 * m1
             axes[0, k], axes[1, k], axes[2, k] = q0, q1, q2
-        determinant = a * c - b * b
-        if not determinant > 0:
+            Q[0, k], Q[1, k] = m0, m1  # of its column no other axis depends
+        # a c - b b as a sum of squares (Lagrange's identity): the difference of long and narrow splats would be rounded
+        determinant = np.float32(LOW_PASS) * (a + c - np.float32(LOW_PASS))
+        for k in range(3):
+            m0, m1 = Q[0, k], Q[1, k]
+            for other in range(k):
+                minor = m0 * Q[1, other] - m1 * Q[0, other]
+                determinant += minor * minor
+        if not (0 < determinant < np.inf):
             continue
-        farthest = 2 * np.log(opacity / np.float32(MIN_ALPHA))
+        farthest = 2 * np.log(opacity / min_alpha)
         extent_x, extent_y = np.sqrt(farthest * a), np.sqrt(farthest * c)
         if u + extent_x < 0 or u - extent_x > width - 1 or v + extent_y < 0 or v - extent_y > height - 1:
             continue
@@ -170,7 +180,7 @@ def _project(parameters, R, t, intrinsics, width, height, projected, visible):  
         visible[i] = True
 
 
-@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+@njit(cache=True, parallel=True, fastmath=FASTMATH, error_model="numpy")
 def _parameter_gradients(  # type: ignore[no-untyped-def]
     parameters, R, t, intrinsics, width, height, projected, index, first, entries, gradients
 ):

@@ -86,13 +86,16 @@ def render(parameters: F32, camera: Pinhole, known: F32 | None = None) -> Render
     """
     projected, visible = projection.project(parameters, camera)
     found = tiles.assign(projected, visible, camera.width, camera.height)
-    blended = np.empty((len(found.start) - 1, blending.CHANNELS, tiles.PIXELS), np.float32)
+    blended = np.empty((len(found.start) - 1, blending.CHANNELS, blending.PIXELS), np.float32)
     last = np.zeros(len(blended), np.int32)
     if known is None:
-        expected = np.zeros((len(blended), tiles.PIXELS), np.float32)
+        expected = np.zeros((len(blended), blending.PIXELS), np.float32)
     else:
         expected = tiles.to_tiles(known[..., None])[:, 0]
-    blending.blend(parameters, projected, found.columns, found.start, found.splat, expected, blended, last)
+    blending.blend(
+        parameters, projected, found.columns, found.start, found.splat, expected, camera.width, camera.height, blended,
+        last,
+    )  # fmt: skip
     image = tiles.from_tiles(blended, camera.width, camera.height)
     deviation = np.zeros(image.shape[:2], np.float32) if known is None else image[..., blending.DEVIATION] * (known > 0)
     with np.errstate(divide="ignore"):

@@ -10,7 +10,7 @@ from scan2sim.pipeline.camera.models import pixel_rays
 from scan2sim.pipeline.camera.renderer import look_at
 from scan2sim.pipeline.core.splats import Splats
 from scan2sim.pipeline.core.types import F32, F64, Camera
-from scan2sim.texturing.splats import rasterizer, tiles
+from scan2sim.texturing.splats import blending, rasterizer, tiles
 from scan2sim.texturing.splats.projection import Pinhole
 from tests.texturing.splats import reference
 
@@ -60,6 +60,34 @@ def test_a_splat_beside_the_image_does_not_explode() -> None:
     )
     drawn = rasterizer.render(near.parameters, Pinhole.of(CAMERA, POSE))
     assert (drawn.transmittance[:, : CAMERA.width // 2] > 0.99).all()
+
+
+def test_a_splat_that_is_long_and_narrow_is_drawn_as_the_formulas_say() -> None:
+    """A wire of 300 m: with 32 bits, its determinant mustn't be a difference of large numbers."""
+    half = np.pi / 8
+    wire = Splats.of(
+        np.array([[0.1, 0.0, 1.1]]), np.array([[300.0, 0.01, 0.01]]),
+        np.array([[np.cos(half), 0, np.sin(half), 0]]), np.array([0.9]), np.array([[1.0, 0.5, 0.2]]),
+    )  # fmt: skip
+    drawn = rasterizer.render(wire.parameters, Pinhole.of(CAMERA, POSE))
+    truth = reference.render(wire.parameters.astype(float), CAMERA, POSE, least=1 / 255)
+    assert (truth.transmittance < 0.2).any() and (truth.transmittance > 0.99).mean() > 0.5
+    assert np.abs(drawn.transmittance - truth.transmittance).max() < 0.01
+    assert np.abs(drawn.colour - truth.colour).max() < 0.01
+
+
+def test_splats_behind_opaque_ones_are_not_blended_in_tiles_at_the_border_either() -> None:
+    """The walls end below the image, within the lowest tiles, of which only five rows are in the image."""
+    facing, number, distance = np.array([0.70710678, 0.70710678, 0, 0]), 40, np.linspace(4, 4.4, 40)
+    walls = Splats.of(
+        np.column_stack([0 * distance, distance, (CAMERA.cy - 34) / CAMERA.fy * distance]),
+        np.tile([4, 7 / CAMERA.fy * 4, 0.001], (number, 1)), np.tile(facing, (number, 1)), np.full(number, 0.98),
+        np.ones((number, 3)),
+    )  # fmt: skip
+    drawn = rasterizer.render(walls.parameters, Pinhole.of(CAMERA, look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))))
+    lowest = slice(-(-CAMERA.width // blending.WIDTH), None)
+    assert CAMERA.height - blending.HEIGHT == 5 and (np.diff(drawn._assignment.start)[lowest] == number).all()
+    assert (drawn.transmittance[blending.HEIGHT :] < 0.003).all() and (drawn._last[lowest] <= 16).all()
 
 
 def loss_of(parameters: F64, base: F64, weights: tuple[F64, F64, F64], background: F64, known: F64) -> float:
