@@ -59,8 +59,8 @@ def photometric(rendered: F32, photo: U8, used: Bools, response: Response) -> Lo
     x, y = np.empty((2, height, width), np.float32)
     moments = np.empty((3, height, width), np.float32)
     sums = np.zeros((height, 3))
-    _differences(rendered, photo, used, *response, np.float32(CHARBONNIER**2), difference, x, y, sums)
-    _similarity(x, y, used, moments, sums)
+    _differences(rendered, photo, used, *response, CURVE_OFFSET, np.float32(CHARBONNIER**2), difference, x, y, sums)
+    _similarity(x, y, used, _window_factors(height), _window_factors(width), moments, sums)
     _gradient(difference, x, y, used, response.gain, response.vignetting, moments, np.float32(SSIM_SHARE),
               np.float32(CHARBONNIER**2))  # fmt: skip
     squared, charbonnier, similarity = sums.sum(axis=0).tolist()
@@ -71,14 +71,23 @@ def photometric(rendered: F32, photo: U8, used: Bools, response: Response) -> Lo
     return Loss(value, difference, -10 * math.log10(max(squared / (3 * count), 1e-10)))
 
 
+def _window_factors(length: int) -> F32:
+    """(N,) inverse of the weight of `WINDOW` that is inside an image of N pixels, around each of them."""
+    up_to = np.concatenate([[0], np.cumsum(WINDOW, dtype=np.float64)])
+    at = np.arange(length)
+    first, end = np.maximum(BESIDE - at, 0), np.minimum(BESIDE + length - at, len(WINDOW))
+    return (1 / (up_to[end] - up_to[first])).astype(np.float32)
+
+
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def _differences(  # type: ignore[no-untyped-def]
-    rendered, photo, used, gain, offset, vignetting, charbonnier, difference, x, y, sums
+    rendered, photo, used, gain, offset, vignetting, curve_offset, charbonnier, difference, x, y, sums
 ):
     """Rendering as the photo shows it less the photo, 0 where nothing counts; luminances of both.
 
     Args:
         rendered, photo, used, gain, offset, vignetting: as in `photometric`.
+        curve_offset: `CURVE_OFFSET`.
         charbonnier: `CHARBONNIER` squared.
         difference: (H, W, 3), written.
         x, y: (H, W) luminances of rendering and photo, written.
@@ -92,7 +101,7 @@ def _differences(  # type: ignore[no-untyped-def]
             share = vignetting[0, 0] if same else vignetting[row, column]
             for k in range(3):
                 level = photo[row, column, k]
-                apart = share * (gain[k] * rendered[row, column, k] + offset[k]) - CURVE_OFFSET - LEVEL * level
+                apart = share * (gain[k] * rendered[row, column, k] + offset[k]) - curve_offset - LEVEL * level
                 as_good = (level >= CLIPPED_HIGH and apart > 0) or (level <= CLIPPED_LOW and apart < 0)
                 if as_good or not used[row, column]:
                     apart = ZERO
@@ -108,13 +117,14 @@ def _differences(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
-def _similarity(x, y, used, moments, sums):  # type: ignore[no-untyped-def]
-    """SSIM (Wang et al. 2004) of images (H, W) 0 to 1, beyond whose borders are zeros.
+def _similarity(x, y, used, down, across, moments, sums):  # type: ignore[no-untyped-def]
+    """SSIM (Wang et al. 2004) of images (H, W) 0 to 1; at their borders, of the part of the window that is inside.
 
     Args:
         x, y: (H, W) the images.
         used: (H, W) pixels whose windows count.
-        moments: (3, H, W) derivatives of the sum of the SSIM by the windows' means of x, x * x, x * y; written.
+        down, across: (H,) and (W,) factors of the windows' sums that make them means (`_window_factors`).
+        moments: (3, H, W) derivatives of the sum of the SSIM by the windows' sums of x, x * x, x * y; written.
         sums: (H, 3), SSIM of rows is added to column 2.
     """
     height, width = x.shape
@@ -131,14 +141,17 @@ def _similarity(x, y, used, moments, sums):  # type: ignore[no-untyped-def]
         total = 0.0
         for column in range(width):
             counts = ONE if used[row, column] else ZERO
-            mx, my = mean[0, column], mean[1, column]
-            sxx, syy, sxy = mean[2, column] - mx * mx, mean[3, column] - my * my, mean[4, column] - mx * my
+            factor = down[row] * across[column]
+            mx, my = factor * mean[0, column], factor * mean[1, column]
+            sxx, syy = factor * mean[2, column] - mx * mx, factor * mean[3, column] - my * my
+            sxy = factor * mean[4, column] - mx * my
             a1, a2 = TWO * mx * my + C1, TWO * sxy + C2
             b1, b2 = mx * mx + my * my + C1, sxx + syy + C2
             similarity = counts * a1 * a2 / (b1 * b2)
             by_xx, by_xy = -similarity / b2, counts * TWO * a1 / (b1 * b2)
             by_x = counts * TWO * my * a2 / (b1 * b2) - TWO * mx * similarity / b1 - TWO * mx * by_xx - my * by_xy
-            moments[0, row, column], moments[1, row, column], moments[2, row, column] = by_x, by_xx, by_xy
+            moments[0, row, column], moments[1, row, column] = factor * by_x, factor * by_xx
+            moments[2, row, column] = factor * by_xy
             total += similarity
         sums[row, 2] = total
 

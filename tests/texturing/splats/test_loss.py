@@ -34,7 +34,9 @@ def value(rendered: F64, photo: U8, used: Bools, response: Response) -> float:
     x, y = shown @ (0.299, 0.587, 0.114), level @ (0.299, 0.587, 0.114)
 
     def blurred(image: F64) -> F64:
-        return np.asarray(cv2.GaussianBlur(image, (11, 11), 1.5, borderType=cv2.BORDER_CONSTANT))
+        """Means over the part of the window that is inside the image."""
+        sums = [cv2.GaussianBlur(one, (11, 11), 1.5, borderType=cv2.BORDER_CONSTANT) for one in (image, 1 + 0 * image)]
+        return np.asarray(sums[0] / sums[1])
 
     mx, my = blurred(x), blurred(y)
     sxx, syy, sxy = blurred(x * x) - mx * mx, blurred(y * y) - my * my, blurred(x * y) - mx * my
@@ -58,6 +60,31 @@ def test_the_derivative_is_that_of_finite_differences(response: Response) -> Non
         measured = (ahead - back) / 2e-5 * used.sum()
         scale = np.linalg.norm(found.gradient) * np.linalg.norm(direction) / np.sqrt(direction.size)
         assert abs(measured - float((found.gradient * direction).sum())) < 0.01 * scale
+
+
+@pytest.mark.parametrize("shape", [SHAPE, (24, 7), (6, 30), (3, 4)], ids=str)
+def test_the_derivative_at_the_borders_is_that_of_finite_differences(shape: tuple[int, int]) -> None:
+    """Only the outermost two pixels count; images may be smaller than the windows."""
+    random = np.random.default_rng(1)
+    rendered, photo = (one[: shape[0], : shape[1]].copy() for one in pair(2))
+    used = np.zeros(shape, bool)
+    used[:2], used[-2:], used[:, :2], used[:, -2:] = True, True, True, True
+    found = loss.photometric(rendered, photo, used, PLAIN)
+    assert found.value == pytest.approx(value(rendered.astype(np.float64), photo, used, PLAIN), abs=1e-5)
+    for _ in range(5):
+        direction = random.normal(size=photo.shape)
+        ahead, back = (value(rendered + sign * 1e-5 * direction, photo, used, PLAIN) for sign in (1, -1))
+        measured = (ahead - back) / 2e-5 * used.sum()
+        scale = np.linalg.norm(found.gradient) * np.linalg.norm(direction) / np.sqrt(direction.size)
+        assert abs(measured - float((found.gradient * direction).sum())) < 0.01 * scale
+
+
+def test_similarity_at_the_borders_is_that_of_the_middle() -> None:
+    """Zeros beyond the borders would make the windows there more alike, as they are in both images."""
+    photo = np.full((*SHAPE, 3), 102, np.uint8)
+    found = loss.photometric(np.full(photo.shape, 0.6, np.float32), photo, np.ones(SHAPE, bool), PLAIN)
+    ssim = (2 * 0.6 * 0.4 + 1e-4) / (0.6**2 + 0.4**2 + 1e-4)
+    assert found.value == pytest.approx(0.8 * (np.hypot(0.2, 0.04) - 0.04) + 0.1 * (1 - ssim), abs=1e-4)
 
 
 def test_equal_images_have_no_loss() -> None:
