@@ -36,9 +36,14 @@ def pack(splats: Splats) -> bytes:
 
 
 def script_arguments(layer: SplatLayer) -> str:
-    """Arguments of a call in JavaScript: the records and the JPEG, both as strings in base64."""
+    """Arguments of a call in JavaScript: records and background, with the colours of their highest levels.
+
+    The records and the JPEG of the background are strings in base64; `MAX_COLOUR` and the background's brightest colour
+    are numbers, of which 1 is white.
+    """
     from scan2sim.pipeline.io.worlds.gltf.textures import jpeg
 
-    levels = np.clip(np.rint(layer.background * 255), 0, 255).astype(np.uint8)
+    brightest = max(1.0, float(layer.background.max()))
+    levels = np.clip(np.rint(layer.background / brightest * 255), 0, 255).astype(np.uint8)
     parts = pack(layer.splats), jpeg.encode(levels, BACKGROUND_QUALITY)
-    return ", ".join(f'"{base64.b64encode(part).decode()}"' for part in parts)
+    return ", ".join([*(f'"{base64.b64encode(part).decode()}"' for part in parts), str(MAX_COLOUR), str(brightest)])
