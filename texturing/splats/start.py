@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from scan2sim.pipeline.camera.models import pixel_angle
-from scan2sim.pipeline.core.splats import MAX_COLOUR, SplatLayer, Splats
+from scan2sim.pipeline.core.splats import MAX_COLOUR, MIN_COLOUR, SplatLayer, Splats
 from scan2sim.pipeline.core.types import F32, F64, I64, Bools
 from scan2sim.texturing.backdrop.photos import FARTHEST_M, Photo, fill
 from scan2sim.texturing.splats.background import HEIGHT_PX, WIDTH_PX, Background
@@ -44,7 +44,8 @@ def first_splats(photos: Sequence[Photo], inverse: Sequence[F32], excluded: Sequ
     xyz, normal, rgb, size, scanned = xyz[kept], normal[kept], rgb[kept], size[kept], scanned[kept]
     scale = np.repeat(SCALE * size[:, None], 3, axis=1)
     scale[scanned, 2] *= FLATNESS
-    made = Splats.of(xyz, scale, _turning_z_to(normal), np.full(len(xyz), OPACITY), np.clip(rgb, 0, MAX_COLOUR))
+    rgb = np.clip(rgb, MIN_COLOUR, MAX_COLOUR)
+    made = Splats.of(xyz, scale, _turning_z_to(normal), np.full(len(xyz), OPACITY), rgb)
     return made, size.astype(np.float32)
 
 
@@ -71,7 +72,7 @@ def first_background(shots: Sequence[Shot]) -> Background:
     is_sky = votes[0] > MIN_SKY_SHARE * votes.sum(axis=0)
     scenery = cv2.GaussianBlur(fill(colour[1], votes[1] > 0), (0, 0), DARK_SIGMA_DEG * WIDTH_PX / 360)
     known = votes.sum(axis=0) > 0
-    return Background(np.clip(fill(np.where(is_sky[..., None], colour[0], scenery), known), 0, MAX_COLOUR))
+    return Background(np.clip(fill(np.where(is_sky[..., None], colour[0], scenery), known), MIN_COLOUR, MAX_COLOUR))
 
 
 def _samples(photo: Photo, inverse: F32, excluded: Bools) -> tuple[F64, F64, F32, F64, Bools]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.core.splats import MAX_COLOUR, RGB, WIDTH
+from scan2sim.pipeline.core.splats import MAX_COLOUR, MIN_COLOUR, RGB, WIDTH
 from scan2sim.texturing.splats.descent import Descent, rates
 
 RATES = rates(0.05, 0.02, 0.01, 0.05, 0.015)
@@ -35,10 +35,10 @@ def test_the_first_step_is_the_rate_and_positions_are_in_sizes_of_the_splat() ->
     assert moved[0, 3:] == pytest.approx(RATES[3:], rel=1e-3)
 
 
-def test_colours_end_at_black_and_at_the_brightest() -> None:
+def test_colours_end_at_the_darkest_and_at_the_brightest() -> None:
     descent = Descent(np.full((2, WIDTH), 0.01, np.float32), np.ones(2, np.float32))
-    descent.parameters[1, RGB] = MAX_COLOUR - 0.01
+    descent.parameters[:, RGB] = [[MIN_COLOUR + 0.01], [MAX_COLOUR - 0.01]]
     gradients = np.ones((2, WIDTH), np.float32)
     gradients[1] = -1
     descent.step(np.arange(2, dtype=np.int32), gradients, RATES)
-    assert (descent.parameters[0, RGB] == 0).all() and (descent.parameters[1, RGB] == np.float32(MAX_COLOUR)).all()
+    assert (descent.parameters[:, RGB] == np.array([[MIN_COLOUR], [MAX_COLOUR]], np.float32)).all()
