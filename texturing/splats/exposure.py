@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from scan2sim.pipeline.core.splats import AXIS, GAIN, OFFSET, POSITION, VIGNETTING
-from scan2sim.pipeline.core.types import F32, F64, U8, Bools
+from scan2sim.pipeline.core.splats import AXIS, CAMERA, GAIN, OFFSET, POSITION, VIGNETTING
+from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools
 from scan2sim.texturing.photo_cache import SRGB_OFFSET, squared_radius
 
 MIN_GAIN, MAX_GAIN, MAX_OFFSET = 0.5, 2.0, 0.15
@@ -71,42 +72,60 @@ def falloff(a: float, b: float, height: int, width: int) -> F32:
     return np.exp(-(np.float32(a) * q + np.float32(b) * q * q))
 
 
-def of_nearest(photos: F32, T_world_cam: F64, height: int, width: int) -> Response:
+def of_nearest(photos: F32, T_world_cam: F64, height: int, width: int, camera: int | None) -> Response:
     """Response of a photo that would be taken at a pose (4, 4): that of the nearest photos, weighted by nearness.
 
     Args:
-        photos: (P, 14) photos of a layer (`SplatLayer.photos`); without any, the photo shows the world's colours.
+        photos: (P, 15) photos of a layer (`SplatLayer.photos`); without any, the photo shows the world's colours.
         T_world_cam: pose in the layer's metres.
         height, width: of the photo, pixels.
+        camera: index of the camera in the layer, of which photos are used; None, or one without photos: photos of all
+            cameras are used, without their vignetting, which is another lens's.
     """
     if not len(photos):
         return Response.of(np.zeros(5), falloff(0, 0, 1, 1))
+    own = photos[photos[:, CAMERA] == (-1 if camera is None else camera)]
+    known = len(own) > 0
+    photos = own if known else photos
     away = np.linalg.norm(photos[:, POSITION] - T_world_cam[:3, 3], axis=1)
     away = away + METRES_PER_TURN * (1 - photos[:, AXIS] @ T_world_cam[:3, 2])
     nearest = np.argsort(away, kind="stable")[:NEAREST]
     weight = 1 / np.maximum(away[nearest], MIN_DISTANCE_M)
     mean = (weight[:, None] * photos[nearest]).sum(axis=0) / weight.sum()
-    a, b = mean[VIGNETTING].tolist()
+    a, b = mean[VIGNETTING].tolist() if known else (0.0, 0.0)
     return Response(mean[GAIN].astype(np.float32), mean[OFFSET].astype(np.float32), falloff(a, b, height, width))
 
 
 class Gains:
     """Gain and offset of the photos beside their exposure: what training finds, held to those of the world.
 
+    A photo may consist of several shots (the faces of a panorama), which are visited one after the other: its gain is
+    solved over the latest visit of each.
+
+    Args:
+        photo_of: (S,) number of the photo of each shot.
+
     Attributes:
+        photo_of: see above.
         gain, offset: (P, 3): a photo shows gain * colour + offset as others show the colour, at the same exposure.
+        sums: (S, 5, 3) of the latest visit of each shot, per channel: number of pixels, and the sums of x, y, x x, x y,
+            where x are the world's colours and y the photo's; relative to the number of pixels of the shot, as it is
+            visited in several sizes.
     """
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, photo_of: I32) -> None:
+        count = int(photo_of.max(initial=-1)) + 1
+        self.photo_of = photo_of
         self.gain, self.offset = np.ones((count, 3), np.float32), np.zeros((count, 3), np.float32)
+        self.sums = np.zeros((len(photo_of), 5, 3))
 
-    def solve(self, photo: int, rendered: F32, rgb: U8, used: Bools, exposed: Response, rate: float) -> None:
-        """Move a photo's towards the least-squares solution by `rate` (1: replace it).
+    def solve(self, shot: int, rendered: F32, rgb: U8, used: Bools, exposed: Response, rate: float) -> None:
+        """Move the gain and offset of a shot's photo towards the least-squares solution by `rate` (1: replace them).
 
         Args:
-            photo: its number.
+            shot: its number.
             rendered: (H, W, 3) colours of the world.
-            rgb, used: (H, W, 3) grey levels of the photo, and (H, W) pixels that count.
+            rgb, used: (H, W, 3) grey levels of the shot, and (H, W) pixels that count.
             exposed: response by its exposure alone.
             rate: share of the way.
         """
@@ -114,12 +133,16 @@ class Gains:
         rendered, rgb, used = rendered[part, part], rgb[part, part], used[part, part]
         brightest = rgb.max(axis=-1)
         used = used & (brightest < BRIGHT) & (brightest > DARK)
-        if not used.any():
-            return
         x, y = (one[used].astype(np.float64) for one in (rendered, exposed.sampled(part, part).world(rgb)))
-        mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
-        prior = PRIOR * len(x) * PRIOR_VARIANCE
-        gain = (((x - mean_x) * (y - mean_y)).sum(axis=0) + prior) / (((x - mean_x) ** 2).sum(axis=0) + prior)
+        found = [np.full(3, len(x)), x.sum(axis=0), y.sum(axis=0), (x * x).sum(axis=0), (x * y).sum(axis=0)]
+        self.sums[shot] = np.array(found) / max(used.size, 1)
+        photo = self.photo_of[shot]
+        total = self.sums[self.photo_of == photo].sum(axis=0)
+        if not total[0].all():
+            return
+        mean_x, mean_y, mean_xx, mean_xy = total[1:] / total[0]
+        prior = PRIOR * PRIOR_VARIANCE
+        gain = (mean_xy - mean_x * mean_y + prior) / (np.maximum(mean_xx - mean_x**2, 0) + prior)
         gain = np.clip(gain, MIN_GAIN, MAX_GAIN)
         offset = np.clip(mean_y - gain * mean_x, -MAX_OFFSET, MAX_OFFSET)
         self.gain[photo] += (rate * (gain - self.gain[photo])).astype(np.float32)
@@ -135,9 +158,23 @@ class Gains:
         gain = self.gain / factor
         shift = self.offset.mean(axis=0) / gain.mean(axis=0)
         self.gain, self.offset = gain, self.offset - gain * shift
+        n, x, y, xx, xy = np.moveaxis(self.sums, 1, 0).copy()
+        self.sums[:, 1], self.sums[:, 4] = factor * x + shift * n, factor * xy + shift * y
+        self.sums[:, 3] = factor**2 * xx + 2 * factor * shift * x + shift**2 * n
         return factor, shift
 
     def response(self, photo: int, exposed: Response) -> Response:
         """How a photo shows colours of the world; `exposed` is its response by its exposure alone."""
         gain, offset = exposed.gain * self.gain[photo], exposed.gain * self.offset[photo] + exposed.offset
         return Response(gain, offset, exposed.vignetting)
+
+    def save(self) -> dict[str, Any]:
+        """State, for `load`."""
+        return {name: getattr(self, name) for name in ("photo_of", "gain", "offset", "sums")}
+
+    @classmethod
+    def load(cls, state: Mapping[str, Any]) -> Gains:
+        """The gains that `save` describes."""
+        loaded = cls(state["photo_of"].copy())
+        loaded.gain, loaded.offset, loaded.sums = (state[name].copy() for name in ("gain", "offset", "sums"))
+        return loaded

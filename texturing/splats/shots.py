@@ -12,14 +12,18 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Camera
 from scan2sim.texturing.backdrop.photos import Photo
+from scan2sim.texturing.photo_cache import camera_of
 from scan2sim.texturing.splats.background import texels
 from scan2sim.texturing.splats.exposure import Response, falloff
+from scan2sim.texturing.splats.loss import CLIPPED_HIGH
 from scan2sim.texturing.splats.projection import Pinhole
 
 SCALES = (4, 2, 1)
 """Divisors of the photo's size, coarse to fine."""
 WHOLE = 0.99
 """Least share of a reduced pixel that must be usable."""
+MOST = 0.5
+"""Share of a reduced pixel above which it is sky, or clipped."""
 WIDE_MODELS = ("equirectangular", "fisheye")
 FACE_ROTATIONS = tuple(
     np.array(rows, float).T
@@ -41,7 +45,8 @@ class Level:
 
     Attributes:
         camera: for the rasterizer.
-        rgb: (H, W, 3) grey levels as the photo has them.
+        rgb: (H, W, 3) grey levels as the photo has them; 255 in a reduced size where most of them are clipped, as
+            their mean would look like a colour.
         exposed: how it shows colours of the world by its exposure.
         used: (H, W) pixels that are compared.
         sky: (H, W) sky.
@@ -70,6 +75,8 @@ class Shot:
         exposure: (5,) correction of the photo (`photo_cache.Exposures.of`).
         vignetting: (H, W) or (1, 1) of the pixels (`exposure.Response`).
         inverse: (H, W) inverse distance along the ray, 1/metres, where scan or surface give it, else 0.
+        axis: (3,) optical axis of the whole photo; 0 for panoramas, which have none.
+        taken_by: name of the camera of the whole photo (`photo_cache.camera_of`).
     """
 
     name: str
@@ -81,6 +88,8 @@ class Shot:
     exposure: F64
     vignetting: F32
     inverse: F32
+    axis: F64
+    taken_by: str
 
     @cached_property
     def levels(self) -> tuple[Level, ...]:
@@ -106,13 +115,16 @@ class Shot:
         known = whole(self.inverse > 0, WHOLE)
         along = reduced(self.inverse) * np.linalg.norm(rays, axis=-1)
         same = self.vignetting.shape == (1, 1)
-        rgb = self.rgb if scale == 1 else np.asarray(cv2.resize(self.rgb, size, interpolation=cv2.INTER_AREA))
+        rgb = self.rgb
+        if scale > 1:
+            rgb = np.asarray(cv2.resize(self.rgb, size, interpolation=cv2.INTER_AREA))
+            rgb[reduced((self.rgb >= CLIPPED_HIGH).astype(np.float32)) > MOST] = 255
         return Level(
             Pinhole.of(camera, self.T_world_cam),
             rgb,
             Response.of(self.exposure, self.vignetting if same else reduced(self.vignetting)),
             whole(self.used, WHOLE),
-            whole(self.sky, 0.5),
+            whole(self.sky, MOST),
             np.where(known, 1 / np.maximum(along, 1e-6), 0).astype(np.float32),
             texels(rays @ self.T_world_cam[:3, :3].T),
         )
@@ -160,9 +172,11 @@ def _whole(photo: Photo, excluded: Bools, scanned: F32) -> Shot:
     camera = photo.view.camera.resized(width, height)
     a, b = photo.exposure[3:].tolist()
     raw = np.require(photo.raw, np.uint8, ["C", "W"])  # otherwise numba would compile kernels for arrays of its kind
+    pose = np.asarray(photo.view.T_world_cam, np.float64)
     return Shot(
-        photo.view.name, camera, np.asarray(photo.view.T_world_cam, np.float64), raw, ~enlarged(excluded),
-        photo.texture_sky, photo.exposure, falloff(a, b, height, width), known_inverse(photo, scanned),
+        photo.view.name, camera, pose, raw, ~enlarged(excluded), photo.texture_sky, photo.exposure,
+        falloff(a, b, height, width), known_inverse(photo, scanned),
+        np.zeros(3) if camera.model == "equirectangular" else pose[:3, 2], camera_of(photo.view),
     )  # fmt: skip
 
 

@@ -100,7 +100,7 @@ def splats(inputs: Inputs, params: SplatsParams, out: Path, report: Report, chec
         training, seen, Schedule(params.epochs, cover=params.cover, depth=params.depth, seed=params.seed), state, report
     )
     result = _within_cell(training.result(), params.context)
-    SplatLayer(result, training.background.texture, training.photos(seen)).save(out / SPLATS_FILE)
+    SplatLayer(result, training.background.texture, *training.photos(seen)).save(out / SPLATS_FILE)
     metrics = {"photos": len(excluded), "first": first, "splats": len(result)}
     warnings = [] if "labels" in inputs or "instances" in inputs else [UNMASKED]
     return Done({"splats": out / SPLATS_FILE}, metrics, warnings)
@@ -156,7 +156,7 @@ def _begun(
         report(DEPTH_SHARE + (TRAINING_SHARE - DEPTH_SHARE) * i / len(used), f"depth of {photo.view.name}")
         photo.inverse = plane_sweep.inverse_depth(photo, [used[j] for j in near[i]], HYPOTHESES)
     first, size = first_splats(used, inverse_depths(used, near, params.seed), excluded)
-    return Training.of(first, size, first_background(seen), len(used)) if len(first) else None
+    return Training.of(first, size, first_background(seen), seen) if len(first) else None
 
 
 def _within_cell(found: Splats, context: SplatsContext) -> Splats:
@@ -181,4 +181,5 @@ def _train(training: Training, seen: Sequence[Shot], schedule: Schedule, state: 
     training.run(seen, schedule, after_epoch)
 
 
-SPLATS = Step("splats", 2, splats, SplatsParams, resumes=True, memory=(1.5, 3))
+# photos take 30 MB for each megapixel, whatever the size of their files, and are 100 at most by default
+SPLATS = Step("splats", 3, splats, SplatsParams, resumes=True, memory=(4.5, 3))

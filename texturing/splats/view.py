@@ -45,15 +45,16 @@ class SplatRenderer:
 
     def __init__(self, layer: SplatLayer) -> None:
         self._parameters, self._background = layer.splats.parameters, Background(layer.background)
-        self._photos = layer.photos
+        self._photos, self._cameras = layer.photos, layer.cameras
 
-    def view(self, camera: Camera, T_world_cam: F64, *, as_photo: bool = False) -> SplatImage:
+    def view(self, camera: Camera, T_world_cam: F64, *, as_photo: str | None = None) -> SplatImage:
         """Render the view of a camera with the pose `T_world_cam` (4, 4).
 
         Args:
             camera: any perspective camera.
             T_world_cam: its pose.
-            as_photo: with the exposure and vignetting of the nearest photos of the training, instead of the world's.
+            as_photo: name of a camera (`photo_cache.camera_of`): with the exposure and vignetting of its nearest photos
+                in the training, or, if it took none, with the exposure of the nearest photos; None: with the world's.
 
         Raises:
             SettingError: the camera is orthographic.
@@ -64,8 +65,9 @@ class SplatRenderer:
             colour, distance, cover = self._pinhole(camera, T_world_cam)
         else:
             colour, distance, cover = self._resampled(camera, T_world_cam)
-        if as_photo:
-            colour = of_nearest(self._photos, T_world_cam, camera.height, camera.width).shown(colour)
+        if as_photo is not None:
+            index = self._cameras.index(as_photo) if as_photo in self._cameras else None
+            colour = of_nearest(self._photos, T_world_cam, camera.height, camera.width, index).shown(colour)
         levels = np.clip(np.rint(colour * 255), 0, 255).astype(np.uint8)
         return SplatImage(levels, distance, cover)
 

@@ -9,9 +9,11 @@ import pytest
 
 from scan2sim.pipeline.camera.models import pixel_rays
 from scan2sim.pipeline.camera.renderer import Body, Renderer, look_at, pinhole
-from scan2sim.pipeline.core.splats import GAIN, SplatLayer
+from scan2sim.pipeline.core.errors import StepError
+from scan2sim.pipeline.core.splats import AXIS, GAIN, SplatLayer
 from scan2sim.pipeline.core.types import Camera, View
 from scan2sim.texturing.backdrop.photos import Photo
+from scan2sim.texturing.photo_cache import camera_of
 from scan2sim.texturing.splats import rasterizer
 from scan2sim.texturing.splats.exposure import Gains, Response, falloff
 from scan2sim.texturing.splats.projection import Pinhole
@@ -57,7 +59,7 @@ def begun(photos: list[Photo]) -> tuple[Training, list[Shot]]:
     seen = [shot for one in photos for shot in shots(one, one.movable, one.known)]
     inverse = [np.where(np.isfinite(one.known), 1 / one.known, 0).astype(np.float32) for one in photos]
     first, size = first_splats(photos, inverse, [one.movable for one in photos])
-    return Training.of(first, size, first_background(seen), len(photos)), seen
+    return Training.of(first, size, first_background(seen), seen), seen
 
 
 def trained(photos: list[Photo], schedule: Schedule = SCHEDULE) -> tuple[Training, list[Shot]]:
@@ -94,17 +96,29 @@ def test_a_darker_photo_gets_a_gain_and_does_not_darken_the_world() -> None:
     assert relative[[1, 4]].max() < 0.8 * relative[[0, 2, 3, 5]].min()
 
 
+def test_a_darker_panorama_gets_one_gain_of_all_of_its_faces() -> None:
+    """Faces that show nothing but sky don't decide."""
+    camera, gains = Camera("equirectangular", 240, 120), [1.0, 0.7, 1.0, 1.0]
+    training, seen = trained([photo(pose, camera, gains[i], str(i)) for i, pose in enumerate(PATH[:4])])
+    assert len(seen) >= 4 * 5 and len(training.gains.gain) == 4
+    relative = training.gains.gain.mean(axis=1)
+    assert relative[1] < 0.8 * relative[[0, 2, 3]].min() and np.ptp(relative[[0, 2, 3]]) < 0.15
+    rows, cameras = training.photos(seen)
+    assert cameras == ("_240x120",) and not rows[:, AXIS].any()
+    assert rows[:, GAIN].mean(axis=1) == pytest.approx(relative)
+
+
 def test_photos_of_other_exposures_are_shown_by_their_corrections() -> None:
     """Little of it remains for the gains, and each photo is shown as it was taken."""
     taken = [photo(pose, name=str(i), exposure=0.25 * (i % 2)) for i, pose in enumerate(PATH)]
     training, seen = trained(taken)
     bright, dark = (training.gains.gain[first::2].mean() for first in (0, 1))
     assert dark / bright == pytest.approx(1, abs=0.05)
-    layer = SplatLayer(training.result(), training.background.texture, training.photos(seen))
+    layer = SplatLayer(training.result(), training.background.texture, *training.photos(seen))
     bright, dark = (layer.photos[first::2, GAIN].mean() for first in (0, 1))
     assert dark / bright == pytest.approx(np.exp(-0.25), abs=0.05)
     errors = []
-    for as_photo in (True, False):
+    for as_photo in (camera_of(taken[3].view), None):
         shown = SplatRenderer(layer).view(CAMERA, PATH[3], as_photo=as_photo).rgb
         errors.append(np.abs(shown.astype(float) - taken[3].raw).mean())
     assert errors[0] < 0.5 * errors[1]
@@ -156,8 +170,34 @@ def test_shots_of_other_cameras_are_pinhole_images_of_the_same_scene(camera: Cam
     assert len(taken) == 1 if camera.model == "opencv" else len(taken) >= 3
     for shot in taken:
         truth = photograph(shot.camera, shot.T_world_cam)
+        assert np.array_equal(shot.axis, [0, 0, 0] if camera.model == "equirectangular" else pose[:3, 2])
         error = np.abs(shot.rgb - truth).mean(axis=-1)[shot.used]
         assert shot.used.mean() > 0.05 and np.median(error) < 5
+
+
+def test_pixels_are_clipped_in_reduced_sizes_where_most_of_them_are() -> None:
+    """Their mean would be a colour that the scene hasn't."""
+    one = photo(BETWEEN)
+    one.raw[:2, :4, 0] = [[255, 251, 255, 250], [40, 250, 40, 40]]
+    one.raw[:2, :4, 1] = 100
+    (shot,) = shots_of(one)
+    half = shot.levels[1].rgb
+    assert SCALES[1] == 2 and half[0, :2, 0].tolist() == [255, 146] and (half[0, :2, 1] == 100).all()
+    assert np.array_equal(shot.levels[2].rgb, one.raw)
+
+
+def test_a_training_that_diverged_stops_and_is_not_saved(tmp_path: Path) -> None:
+    file = tmp_path / "state.npz"
+    training, seen = begun([photo(pose, name=str(i)) for i, pose in enumerate(PATH[:2])])
+    training.descent.parameters[0, 0] = np.nan
+    reports: list[float] = []
+    with pytest.raises(StepError, match=r"diverged: 1 splats aren't finite"):
+        training.run(seen, Schedule(epochs=(2, 0, 0)), lambda share, text: reports.append(share))
+    assert not reports
+    training.descent.parameters[0, 0], training.gains.offset[1] = 0, np.inf
+    with pytest.raises(StepError, match="1 offsets of photos"):
+        training.save(file)
+    assert not file.exists()
 
 
 def test_a_training_continues_where_it_was_saved(tmp_path: Path) -> None:
@@ -190,7 +230,7 @@ def test_surfaces_are_covered_from_the_side(corner: Training) -> None:
 
 def test_the_exposure_of_the_world_changes_without_changing_renderings(corner: Training) -> None:
     random = np.random.default_rng(1)
-    gains = Gains(4)
+    gains = Gains(np.arange(4, dtype=np.int32))
     gains.gain, gains.offset = (random.uniform(*span, (4, 3)).astype(np.float32) for span in ((0.6, 1.5), (-0.1, 0.1)))
     world = random.uniform(0.2, 0.8, (5, 6, 3)).astype(np.float32)
     exposed = [Response.of(np.array([0.1 * k, 0, -0.1 * k, 0, 0]), falloff(0.2, 0.1, 5, 6)) for k in range(4)]
