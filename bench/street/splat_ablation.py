@@ -4,10 +4,11 @@
 [--out bench-out/street_splats] [--change NAME=VALUE ...]`
 
 A part is a line of `CHANGES`: values of constants of the modules of `scan2sim.texturing.splats`, or of the step's
-settings. `--change` adds one from the command line. Constants that compiled kernels or other constants hold copies of
-are rejected: changing them would have no effect. The step's inputs are those of the street's run in `--worlds`, made
-there by `python -m bench.street --set splats.when=auto`. Rows are stored in `rows.json` below `--out`; rows that are
-stored already aren't measured again. Ends with `RESULT {json}`: by part and street.
+settings; modules may have their full names. `--change` adds one from the command line. Constants that compiled kernels
+or other constants hold copies of are rejected: changing them would have no effect. The step's inputs are those of the
+street's run in `--worlds`, made there by `python -m bench.street --set splats.when=auto`. Rows are stored in
+`rows.json` below `--out`; rows that are stored already aren't measured again. Ends with `RESULT {json}`: by part and
+street.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ CHANGES: dict[str, dict[str, Any]] = {
 }
 """By part: the names of constants (module.NAME) or settings (step.name), and their values."""
 METRICS = (
-    "psnr_db", "nogain_psnr_db", "ssim", "msssim", "surface_psnr_db", "elsewhere_psnr_db", "right_gap_db",
-    "depth_median_cm", "depth_near_share", "splats", "mb", "cpu_minutes", "memory_gb",
+    "psnr_db", "nogain_psnr_db", "exposed_psnr_db", "ssim", "msssim", "surface_psnr_db", "elsewhere_psnr_db",
+    "right_gap_db", "depth_median_cm", "depth_near_share", "splats", "mb", "cpu_minutes", "memory_gb",
 )  # fmt: skip
 
 
@@ -54,7 +55,7 @@ def changed(change: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     settings = {}
     with contextlib.ExitStack() as stack:
         for name, value in change.items():
-            module, attribute = name.split(".")
+            module, attribute = name.removeprefix(f"{PACKAGE}.").split(".")
             if module == "step" and attribute in step.SplatsParams.model_fields:
                 settings[attribute] = value
                 continue
@@ -83,11 +84,14 @@ def copied(module: str, constant: str) -> list[str]:
 def _evaluated_once(statement: ast.stmt) -> Iterator[ast.AST]:
     """Nodes of a statement that are evaluated when its module is loaded, or compiled by numba."""
     if isinstance(statement, ast.ClassDef):
-        for one in statement.body:
-            yield from _evaluated_once(one)
+        for one in (*statement.decorator_list, *statement.bases, *statement.keywords):
+            yield from ast.walk(one)
+        for inner in statement.body:
+            yield from _evaluated_once(inner)
     elif isinstance(statement, ast.FunctionDef):
         compiled = any("njit" in ast.unparse(decorator) for decorator in statement.decorator_list)
-        yield from ast.walk(statement if compiled else statement.args)
+        for one in (statement,) if compiled else (statement.args, *statement.decorator_list):
+            yield from ast.walk(one)
     else:
         yield from ast.walk(statement)
 
@@ -97,7 +101,7 @@ def _reads(node: ast.AST, own: bool, module: str, constant: str) -> bool:
     if isinstance(node, ast.ImportFrom):
         return node.module == f"{PACKAGE}.{module}" and constant in [name.name for name in node.names]
     if isinstance(node, ast.Attribute):
-        return node.attr == constant and isinstance(node.value, ast.Name) and node.value.id == module
+        return node.attr == constant and ast.unparse(node.value) in (module, f"{PACKAGE}.{module}")
     return own and isinstance(node, ast.Name) and node.id == constant and isinstance(node.ctx, ast.Load)
 
 
@@ -162,7 +166,7 @@ def main() -> None:
         for name, found in streets.items():
             print(
                 f"{part:24} {name:8}"
-                + "".join(f"  {key} {found[key]:.3g}" for key in METRICS if found[key] is not None)
+                + "".join(f"  {key} {found[key]:.3g}" for key in METRICS if found.get(key) is not None)
             )
     print("RESULT " + json.dumps(rows))
 
