@@ -83,17 +83,17 @@ def copied(module: str, constant: str) -> list[str]:
 
 def _evaluated_once(statement: ast.stmt) -> Iterator[ast.AST]:
     """Nodes of a statement that are evaluated when its module is loaded, or compiled by numba."""
+    parts: list[ast.AST] = [statement]
     if isinstance(statement, ast.ClassDef):
-        for one in (*statement.decorator_list, *statement.bases, *statement.keywords):
-            yield from ast.walk(one)
+        parts = [*statement.decorator_list, *statement.bases, *statement.keywords]
         for inner in statement.body:
             yield from _evaluated_once(inner)
     elif isinstance(statement, ast.FunctionDef):
         compiled = any("njit" in ast.unparse(decorator) for decorator in statement.decorator_list)
-        for one in (statement,) if compiled else (statement.args, *statement.decorator_list):
-            yield from ast.walk(one)
-    else:
-        yield from ast.walk(statement)
+        if not compiled:
+            parts = [statement.args, *statement.decorator_list]
+    for part in parts:
+        yield from ast.walk(part)
 
 
 def _reads(node: ast.AST, own: bool, module: str, constant: str) -> bool:

@@ -84,6 +84,11 @@ def faces() -> tuple[list[F32], list[U8]]:
     return list(world), [np.rint(255 * (0.8 * one + 0.02)).astype(np.uint8) for one in world]
 
 
+def enlarged(image: np.ndarray, times: int) -> np.ndarray:
+    """An image (H, W, ...) with each pixel repeated."""
+    return np.repeat(np.repeat(image, times, axis=0), times, axis=1)
+
+
 @pytest.mark.parametrize("order", [(1, 2), (2, 1)])
 def test_gain_of_a_photo_is_solved_over_all_of_its_shots(order: tuple[int, int]) -> None:
     world, levels = faces()
@@ -91,8 +96,7 @@ def test_gain_of_a_photo_is_solved_over_all_of_its_shots(order: tuple[int, int])
     for shot in order:
         gains.solve(shot, world[shot - 1], levels[shot - 1], EVERY, PLAIN, 1.0)
     together = Gains(np.zeros(1, np.int32))
-    whole = (np.concatenate(one) for one in (world, levels, [EVERY, EVERY]))
-    together.solve(0, *whole, PLAIN, 1.0)
+    together.solve(0, np.concatenate(world), np.concatenate(levels), np.concatenate([EVERY] * 2), PLAIN, 1.0)
     assert np.allclose(gains.gain[1], together.gain[0]) and np.allclose(gains.offset[1], together.offset[0])
     assert gains.gain[1] == pytest.approx([0.8] * 3, abs=0.02) and (gains.gain[0] == 1).all()
 
@@ -103,9 +107,9 @@ def test_shots_in_other_sizes_count_by_what_they_show() -> None:
     gains, equal = (Gains(np.zeros(2, np.int32)) for _ in range(2))
     for shot in (1, 0):
         equal.solve(shot, world[shot], levels[shot], EVERY, PLAIN, 1.0)
-        doubled = [np.kron(one[shot], np.ones((6, 6, 1), one[shot].dtype)) for one in (world, levels)]
-        size = (np.s_[::2, ::2], np.s_[:, :])[shot]
-        gains.solve(shot, *(one[size] for one in doubled), np.kron(EVERY, np.ones((6, 6), bool))[size], PLAIN, 1.0)
+        times = (3, 6)[shot]
+        rendered, rgb, used = (enlarged(one, times) for one in (world[shot], levels[shot], EVERY))
+        gains.solve(shot, rendered, rgb, used, PLAIN, 1.0)
     assert np.allclose(gains.sums[:, 0], equal.sums[:, 0])
     assert np.allclose(gains.gain, equal.gain, atol=0.01)
 
