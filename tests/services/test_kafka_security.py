@@ -154,7 +154,7 @@ def test_options_by_the_environment(certificates: Path, secured: str, monkeypatc
 
 
 @pytest.mark.parametrize("mechanism", MECHANISMS)
-def test_refused_password_is_said(
+def test_refused_password_is_reported(
     mechanism: str, certificates: Path, secured: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(kafka, "ACKNOWLEDGE_TIMEOUT_S", 5.0)
@@ -171,7 +171,9 @@ def test_tokens_of_an_identity_provider(certificates: Path, secured: str, issuer
     assert next(body for body in bodies if body) == b"body"
 
 
-def test_refused_token_is_said(certificates: Path, secured: str, issuer: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refused_token_is_reported(
+    certificates: Path, secured: str, issuer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(kafka, "ACKNOWLEDGE_TIMEOUT_S", 5.0)
     with pytest.raises(ConnectionError, match="token endpoint answers .*invalid_client") as caught:
         _send(_cluster(certificates, secured, OIDC.format(folder=certificates, secret="guess", url=issuer)))
