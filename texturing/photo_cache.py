@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.types import F64, U8, View
+from scan2sim.pipeline.core.types import F32, F64, U8, View
 from scan2sim.pipeline.io.images import image
 from scan2sim.texturing.consistency_result import PhotoConsistency
 
@@ -73,6 +73,12 @@ class Exposures:
                 path, f"not an exposure file ({error})", "Pass the `exposure.json` of another tile's run"
             ) from None
         return cls(gain, vignetting)
+
+
+def squared_radius(height: int, width: int) -> F32:
+    """(H, W) squared distance of the pixels from the image centre, 1 in the corners."""
+    y, x = ((np.arange(n, dtype=np.float32) - (n - 1) / 2) for n in (height, width))
+    return np.asarray(((x**2)[None, :] + (y**2)[:, None]) / float(x[0] ** 2 + y[0] ** 2), np.float32)
 
 
 def camera_of(view: View) -> str:

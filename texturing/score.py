@@ -27,6 +27,8 @@ SCORE_KEYS = ("psnr_db", "psnr_gain_db", "ssim", "sharpness")
 FRAME_KEYS = ("psnr_db", "psnr_gain_db", "ssim", "ms_ssim", "excluded")
 """Figures of whole frames: each photo's, with `frame_` or `splat_frame_` before them, and their means in `frame` and
 `splat_frame`."""
+EXPOSED_KEY = "psnr_exposed_db"
+"""The same, of splats only: PSNR with the exposure of the nearest photos."""
 CAMERA_CLEARANCE_M = 1.0
 """Metres around a camera in which there can't have been a surface."""
 
@@ -55,6 +57,8 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     Whole frames are scored beside (`texturing.whole_frame`): all pixels of the held-out photos count except vehicles
     and people that the world leaves out, `backdrop` (a textured mesh behind the surfaces) and `sky` (colour where
     nothing is) are shown, and `labels` (classes of the photos) distinguish sky from missing surface.
+    Splats are shown as simulators show them, with the exposure of the world, and once more with that of the nearest
+    photos that aren't held out.
 
     Files: `error`, a folder with an image of photo, rendering and difference for every held-out photo, and an
     `index.json` of them; `frames`, the same with photo and whole frame; `splat_frames`, the same of `splats`, if given.
@@ -65,7 +69,8 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
         photos: the same for each photo; `coverage`, 0 if no other photo saw what it shows; `frame_...`, as in `frame`.
         by_class, by_distance: the same over their pixels, without sharpness.
         frame: `psnr_db`, `psnr_gain_db`, `ssim` and `ms_ssim` of whole frames, means over the photos; `excluded`, the
-            share of pixels that don't count; `by_class` and `by_distance`. `splat_frame`: the same of the splats.
+            share of pixels that don't count; `by_class` and `by_distance`. `splat_frame`: the same of the splats,
+            and `psnr_exposed_db`, with the exposure of the nearest photos.
         truth_psnr_db, truth_psnr_near_db: for generated tiles.
         cameras: `count`, their number, and `near_m`, the distance in metres to the nearest surface of those within
             `CAMERA_CLEARANCE_M` of one.
@@ -75,6 +80,7 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     from scan2sim.pipeline.camera.renderer import Body, Renderer, textured
     from scan2sim.pipeline.dynamic_objects.vehicle_residue import residue_areas
     from scan2sim.texturing import evaluate
+    from scan2sim.texturing.photo_cache import camera_of
     from scan2sim.texturing.splats.view import SplatRenderer
     from scan2sim.texturing.whole_frame import box_mesh, whole_frame
 
@@ -119,10 +125,14 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
         if whole is not None:
             photos[name] |= frames.add(f"{i:03d}_{Path(name).name}", name, result.photo, whole)
         if splats is not None and whole is not None:
-            shown = splats.view(result.view.camera, result.view.T_world_cam).rgb
+            camera, pose = result.view.camera, result.view.T_world_cam
+            shown = splats.view(camera, pose).rgb
             of_splats = whole_frame(result, len(groups), np.load(depth_of[name]), known, boxes, shown=shown)
             assert of_splats is not None
             photos[name] |= splat_frames.add(f"{i:03d}_{Path(name).name}", name, result.photo, of_splats)
+            exposed = splats.view(camera, pose, as_photo=camera_of(result.view)).rgb
+            squared = np.square(result.photo.astype(np.float64) - exposed)[of_splats.mask].mean()
+            photos[name] |= _rounded({f"splat_frame_{EXPOSED_KEY}": evaluate.psnr(float(squared))})
     for one in (album, frames.album, *([splat_frames.album] if splats else [])):
         one.save()
     warnings += [f"{file}: held out, but not scored: the photo or its mask can't be read" for file in unread.values()]
@@ -135,7 +145,8 @@ def score(inputs: Inputs, params: ScoreParams, out: Path, report: Report) -> Don
     }
     metrics["frame"] = frames.metrics(photos)
     if splats is not None:
-        metrics["splat_frame"] = splat_frames.metrics(photos)
+        exposed_db = _mean([figures.get(f"splat_frame_{EXPOSED_KEY}") for figures in photos.values()])
+        metrics["splat_frame"] = {EXPOSED_KEY: exposed_db} | splat_frames.metrics(photos)
     if "truth.points" in inputs:
         report(0.9, "comparing with ground-truth colours")
         metrics |= _truth(inputs, world, params)
@@ -263,4 +274,4 @@ def _seen_from_near(inputs: Inputs, points: F32, normals: F32, near: float) -> B
     return seen
 
 
-SCORE = Step("score", 5, score, ScoreParams, memory=(1.3, 3))
+SCORE = Step("score", 7, score, ScoreParams, memory=(1.3, 3))

@@ -4,14 +4,17 @@
 [--out bench-out/street_splats] [--change NAME=VALUE ...]`
 
 A part is a line of `CHANGES`: values of constants of the modules of `scan2sim.texturing.splats`, or of the step's
-settings. `--change` adds one from the command line. The step's inputs are those of the street's run in `--worlds`, made
-there by `python -m bench.street --set splats.when=auto`. Rows are stored in `rows.json` below `--out`; rows that are
-stored already aren't measured again. Ends with `RESULT {json}`: by part and street.
+settings; modules may have their full names. `--change` adds one from the command line. Constants that compiled kernels
+or other constants hold copies of are rejected: changing them would have no effect. The step's inputs are those of the
+street's run in `--worlds`, made there by `python -m bench.street --set splats.when=auto`. Rows are stored in
+`rows.json` below `--out`; rows that are stored already aren't measured again. Ends with `RESULT {json}`: by part and
+street.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import contextlib
 import importlib
 import json
@@ -41,8 +44,8 @@ CHANGES: dict[str, dict[str, Any]] = {
 }
 """By part: the names of constants (module.NAME) or settings (step.name), and their values."""
 METRICS = (
-    "psnr_db", "nogain_psnr_db", "ssim", "msssim", "surface_psnr_db", "elsewhere_psnr_db", "right_gap_db",
-    "depth_median_cm", "depth_near_share", "splats", "mb", "cpu_minutes", "memory_gb",
+    "psnr_db", "nogain_psnr_db", "exposed_psnr_db", "ssim", "msssim", "surface_psnr_db", "elsewhere_psnr_db",
+    "right_gap_db", "depth_median_cm", "depth_near_share", "splats", "mb", "cpu_minutes", "memory_gb",
 )  # fmt: skip
 
 
@@ -52,13 +55,54 @@ def changed(change: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     settings = {}
     with contextlib.ExitStack() as stack:
         for name, value in change.items():
-            module, attribute = name.split(".")
+            module, attribute = name.removeprefix(f"{PACKAGE}.").split(".")
             if module == "step" and attribute in step.SplatsParams.model_fields:
                 settings[attribute] = value
                 continue
+            if copies := copied(module, attribute):
+                raise SystemExit(f"{name} can't be changed here, as there are copies of it: {'; '.join(copies)}")
             owner = importlib.import_module(f"{PACKAGE}.{module}")
             stack.enter_context(mock.patch.object(owner, attribute, value))
         yield settings
+
+
+def copied(module: str, constant: str) -> list[str]:
+    """Places that hold a copy of a constant: compiled kernels, and what is computed when a module is loaded.
+
+    Args:
+        module: name of the constant's module within `PACKAGE`.
+        constant: its name.
+    """
+    found = []
+    for path in sorted(Path(importlib.import_module(PACKAGE).__path__[0]).glob("*.py")):
+        for statement in ast.parse(path.read_text(encoding="utf-8")).body:
+            if any(_reads(node, path.stem == module, module, constant) for node in _evaluated_once(statement)):
+                found.append(f"{path.name}, line {statement.lineno}")
+    return found
+
+
+def _evaluated_once(statement: ast.stmt) -> Iterator[ast.AST]:
+    """Nodes of a statement that are evaluated when its module is loaded, or compiled by numba."""
+    parts: list[ast.AST] = [statement]
+    if isinstance(statement, ast.ClassDef):
+        parts = [*statement.decorator_list, *statement.bases, *statement.keywords]
+        for inner in statement.body:
+            yield from _evaluated_once(inner)
+    elif isinstance(statement, ast.FunctionDef):
+        compiled = any("njit" in ast.unparse(decorator) for decorator in statement.decorator_list)
+        if not compiled:
+            parts = [statement.args, *statement.decorator_list]
+    for part in parts:
+        yield from ast.walk(part)
+
+
+def _reads(node: ast.AST, own: bool, module: str, constant: str) -> bool:
+    """Whether a node reads a constant; `own`: it is in the constant's module."""
+    if isinstance(node, ast.ImportFrom):
+        return node.module == f"{PACKAGE}.{module}" and constant in [name.name for name in node.names]
+    if isinstance(node, ast.Attribute):
+        return node.attr == constant and ast.unparse(node.value) in (module, f"{PACKAGE}.{module}")
+    return own and isinstance(node, ast.Name) and node.id == constant and isinstance(node.ctx, ast.Load)
 
 
 def row(name: str, worlds: Path, folder: Path, change: Mapping[str, Any]) -> dict[str, Any]:
@@ -122,7 +166,7 @@ def main() -> None:
         for name, found in streets.items():
             print(
                 f"{part:24} {name:8}"
-                + "".join(f"  {key} {found[key]:.3g}" for key in METRICS if found[key] is not None)
+                + "".join(f"  {key} {found[key]:.3g}" for key in METRICS if found.get(key) is not None)
             )
     print("RESULT " + json.dumps(rows))
 

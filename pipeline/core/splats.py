@@ -3,17 +3,31 @@
 from __future__ import annotations
 
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F32, F64
 
 XYZ, LOG_SCALE, QUATERNION, LOGIT, RGB = slice(0, 3), slice(3, 6), slice(6, 10), 10, slice(11, 14)
 """Columns of the parameters."""
 WIDTH = 14
 """Number of parameters of a splat."""
+MIN_COLOUR, MAX_COLOUR = -0.055, 4.0
+"""Darkest and brightest colour of the world: photos that are darker than it show what is brighter than 1 in it, and
+brighter ones what is below black. Exposure is a factor of the colour plus .055: no light is -.055."""
+BACKGROUND_LEVELS = 1000
+"""Steps of the background's colours from 0 to 1 in files, which begin at `MIN_COLOUR`."""
+VERSION = 3
+"""Version of files. Version 1 has neither this number, nor photos, nor colours brighter than 1: its background has 8
+bits. Version 2 was never released."""
+POSITION, AXIS, GAIN, OFFSET, VIGNETTING = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 14)
+CAMERA = 14
+"""Columns of the photos of a layer."""
+PHOTO_WIDTH = 15
+"""Number of a photo's columns."""
 SHELL_RADIUS_M, SHELL_STEP_DEG, SHELL_LOWEST_DEG = 400.0, 1.5, -20.0
 """Radius of the background as splats, the angle between them, and the elevation of the lowest; beyond all others
 (`FARTHEST_M` of the photos' depth is 250 m), and within the usual far clipping distance of cameras."""
@@ -27,7 +41,8 @@ class Splats:
 
     Attributes:
         parameters: (N, 14) position in metres; logarithms of the standard deviations along the axes, metres; rotation
-            from these axes to the world, a quaternion w x y z of any length; logit of the opacity; colour, sRGB 0 to 1.
+            from these axes to the world, a quaternion w x y z of any length; logit of the opacity; colour, sRGB,
+            `MIN_COLOUR` to `MAX_COLOUR`, of which 0 is black and 1 is white.
     """
 
     parameters: F32
@@ -75,8 +90,13 @@ class Splats:
 
     @property
     def rgb(self) -> F32:
-        """(N, 3) colours, sRGB 0 to 1."""
+        """(N, 3) colours, sRGB, `MIN_COLOUR` to `MAX_COLOUR`."""
         return self.parameters[:, RGB]
+
+    @property
+    def display_rgb(self) -> F32:
+        """(N, 3) colours, sRGB 0 to 1, as programs draw them that know neither darker nor brighter ones."""
+        return np.clip(self.rgb, 0, 1)
 
 
 @dataclass(frozen=True)
@@ -85,12 +105,19 @@ class SplatLayer:
 
     Attributes:
         splats: positions in the tile's local metres.
-        background: (H, W, 3) sRGB 0 to 1, equirectangular: column 0 is azimuth -180 degrees, from x (east) to y
-            (north); row 0 is the zenith.
+        background: (H, W, 3) sRGB, `MIN_COLOUR` to `MAX_COLOUR`, equirectangular: column 0 is azimuth -180 degrees,
+            from x (east) to y (north); row 0 is the zenith.
+        photos: (P, 15) how the photos of the training show the world: position in local metres; optical axis, 0 for
+            panoramas; gain, offset and vignetting coefficients a, b of `v * (gain * colour + offset) - 0.055` with
+            `v = exp(-a q - b q^2)`, where q is the squared distance from the image centre, 1 in the corners; index of
+            the camera in `cameras`.
+        cameras: names of the cameras that took the photos (`texturing.photo_cache.camera_of`).
     """
 
     splats: Splats
     background: F32
+    photos: F32 = field(default_factory=lambda: np.zeros((0, PHOTO_WIDTH), np.float32))
+    cameras: tuple[str, ...] = ()
 
     def with_shell(self) -> Splats:
         """The splats, and the background as large splats on a sphere: for programs that know no background."""
@@ -102,15 +129,35 @@ class SplatLayer:
         return cls(Splats(np.zeros((0, WIDTH), np.float32)), np.full((1, 2, 3), 0.5, np.float32))
 
     def save(self, path: Path) -> None:
-        """Write it as .npz: parameters with 32 bits, the background with 8 bits a channel."""
-        levels = np.clip(np.rint(self.background * 255), 0, 255).astype(np.uint8)
-        np.savez_compressed(path, parameters=self.splats.parameters, background=levels)
+        """Write it as .npz: parameters with 32 bits, the background in steps of a quarter of a grey level."""
+        colours = np.clip(self.background, MIN_COLOUR, MAX_COLOUR) - np.float32(MIN_COLOUR)
+        levels = np.rint(colours * BACKGROUND_LEVELS).astype(np.uint16)
+        np.savez_compressed(
+            path, version=VERSION, parameters=self.splats.parameters, background=levels, photos=self.photos,
+            cameras=np.array(self.cameras, np.str_),
+        )  # fmt: skip
 
     @classmethod
     def load(cls, path: Path) -> SplatLayer:
-        """Read what `save` wrote."""
+        """Read what `save` wrote, also in version 1 (`VERSION`).
+
+        Raises:
+            InputError: the file has another version.
+        """
         with np.load(path) as saved:
-            return cls(Splats(saved["parameters"]), saved["background"].astype(np.float32) / 255)
+            levels = saved["background"]
+            splats = Splats(saved["parameters"])
+            if "version" not in saved and levels.dtype == np.uint8:
+                return cls(splats, levels.astype(np.float32) / 255)
+            version = int(saved["version"]) if "version" in saved else 2
+            if version != VERSION:
+                raise InputError(
+                    path,
+                    f"it has version {version} of files with splats; this scan2sim reads versions 1 and {VERSION}",
+                    "Run again to train its splats again" if version < VERSION else "Update scan2sim",
+                )
+            background = levels.astype(np.float32) / BACKGROUND_LEVELS + np.float32(MIN_COLOUR)
+            return cls(splats, background, saved["photos"], tuple(saved["cameras"].tolist()))
 
     @staticmethod
     def count(path: Path) -> int:

@@ -17,9 +17,11 @@ if TYPE_CHECKING:
 NEEDS = ("gsply",)
 SH_C0 = 0.28209479177387814
 """Value of the spherical harmonic of degree 0: a colour c is stored as (c - 1/2) / SH_C0."""
-SPZ_FRACTION_BITS = 12
-"""Binary digits of positions after the point: a quarter of a millimetre, up to 2 km from the origin."""
-SPZ_FARTHEST_M = 2.0 ** (23 - SPZ_FRACTION_BITS)
+SPZ_FRACTION_BITS = range(12, 7, -1)
+"""Binary digits of positions after the point, finest first: a quarter of a millimetre up to 2 km from the origin, half
+a millimetre up to 4 km, and so on to 4 mm up to 32 km."""
+SPZ_BITS = 23
+"""Binary digits of a position, without its sign."""
 
 
 def write(path: Path, splats: Splats, offset: F64) -> None:
@@ -39,14 +41,7 @@ def write(path: Path, splats: Splats, offset: F64) -> None:
     if path.suffix == ".ply":
         gsply.plywrite(path, data)
     elif path.suffix == ".spz":
-        farthest = float(np.abs(data.means).max(initial=0))
-        if farthest >= SPZ_FARTHEST_M:
-            raise SettingError(
-                path,
-                f"has splats {farthest:,.0f} m from the origin, but SPZ ends at {SPZ_FARTHEST_M:,.0f} m",
-                "Write PLY",
-            )
-        gsply.write_spz(path, data, fractional_bits=SPZ_FRACTION_BITS)
+        gsply.write_spz(path, data, fractional_bits=_fraction_bits(path, float(np.abs(data.means).max(initial=0))))
     else:
         raise SettingError(path, "has an unknown suffix", "Use .ply or .spz")
 
@@ -61,6 +56,15 @@ def read(path: Path) -> Splats:
     return Splats(np.ascontiguousarray(made, np.float32))
 
 
+def _fraction_bits(path: Path, farthest: float) -> int:
+    """Binary digits after the point of positions up to `farthest` metres from the origin."""
+    for bits in SPZ_FRACTION_BITS:
+        if np.rint(farthest * 2.0**bits) < 2.0**SPZ_BITS:
+            return bits
+    limit = 2 ** (SPZ_BITS - SPZ_FRACTION_BITS[-1])
+    raise SettingError(path, f"has splats {farthest:,.0f} m from the origin, but SPZ ends at {limit:,} m", "Write PLY")
+
+
 def _data(splats: Splats, offset: F64) -> GSData:
     """The splats as gsply holds them: logarithms of scales, logits of opacities, unit quaternions w x y z."""
     from gsply import GSData, create_ply_format
@@ -71,6 +75,6 @@ def _data(splats: Splats, offset: F64) -> GSData:
         "scales": np.ascontiguousarray(parameters[:, 3:6]),
         "quats": np.ascontiguousarray(splats.quaternion),
         "opacities": np.ascontiguousarray(parameters[:, LOGIT]),
-        "sh0": ((splats.rgb - 0.5) / SH_C0).astype(np.float32),
+        "sh0": ((splats.display_rgb - 0.5) / SH_C0).astype(np.float32),
     }
     return GSData(**columns, shN=np.zeros((len(splats), 0, 3), np.float32), _format=create_ply_format(sh_degree=0))

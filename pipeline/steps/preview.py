@@ -115,4 +115,4 @@ def _position_and_target(pose: F64, low: F64) -> list[list[float]]:
     return [position.round(3).tolist(), (position + ahead * distance).round(3).tolist()]
 
 
-PREVIEW = Step("preview", 4, preview, PreviewParams)
+PREVIEW = Step("preview", 5, preview, PreviewParams)

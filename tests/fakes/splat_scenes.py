@@ -24,10 +24,10 @@ def layer(seed: int = 1, count: int = 3000, height: int = 64) -> SplatLayer:
 
 
 def background(seed: int, height: int) -> F32:
-    """(H, 2 H, 3) a smooth sky whose colour depends on the azimuth and the elevation, and on the seed."""
+    """(H, 2 H, 3) a smooth sky, 0.1 to 1.3 (1 is white), that depends on the azimuth, the elevation and the seed."""
     azimuth, elevation = np.meshgrid(np.linspace(-np.pi, np.pi, 2 * height, endpoint=False), np.linspace(1, -1, height))
     waves = [np.sin(azimuth + seed), np.cos(azimuth + 2 * seed), elevation]
-    return np.stack([0.5 + 0.4 * wave for wave in waves], axis=-1).astype(np.float32)
+    return np.stack([0.7 + 0.6 * wave for wave in waves], axis=-1).astype(np.float32)
 
 
 def add(tile: SceneTile, seed: int = 1, count: int = 3000) -> None:

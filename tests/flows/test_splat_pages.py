@@ -26,6 +26,10 @@ ALL_LOADED = (
     " && world.about.tiles.every(({name, splats}) => !splats || world.splats.shows(name))"
 )
 NEXT_FRAME_DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
+COUNT_SCRIPTS = (
+    "world.fetch = (...given) => (world.scripts.push(given[1]), Object.getPrototypeOf(world).fetch.apply(world, given))"
+)
+LOADING_ENDED = "new Promise(done => setTimeout(() => done(true), 1000))"  # more than three turns of the loop
 AGREEMENT_DB = 35
 
 
@@ -113,6 +117,53 @@ def test_splats_return_after_the_browser_took_the_graphics_memory(tmp_path: Path
         page.value("lost.restoreContext()")
         page.until(f"!world.renderer.getContext().isContextLost() && {ALL_LOADED}")
         assert agreement_db(drawn(page), shown) > AGREEMENT_DB and page.errors == []
+
+
+def test_tiles_beyond_the_limits_are_dropped_once_and_return(tmp_path: Path) -> None:
+    scene = synthetic.scene(tmp_path)
+    for seed, tile in enumerate(scene.tiles, start=1):
+        splat_scenes.add(tile, seed, count=2500)
+    with chromium(tmp_path) as page:
+        open_page(page, scene, tmp_path / "page")
+        page.click("[data-photo='1']")
+        look(page, (5, -6, 3), (25, 3, 0))
+        both = drawn(page)
+        near, far = page.value("world.nearest().map(({name}) => name)")
+        shows = f"world.splats.shows('{near}') && !world.splats.has('{far}')"
+
+        page.value("world.splats.rows = 3")
+        page.until(shows)
+        assert agreement_db(drawn(page), both) < AGREEMENT_DB
+        look(page, (30, -6, 3), (5, 0, 0))
+        page.until(f"world.splats.shows('{far}') && !world.splats.has('{near}')")
+        look(page, (5, -6, 3), (25, 3, 0))
+        page.until(shows)
+        page.value("world.splats.rows = 6")
+        page.until(ALL_LOADED)
+        assert agreement_db(drawn(page), both) > AGREEMENT_DB, "each tile has its own rows of the texture"
+
+        page.value(f"void (world.scripts = [], {COUNT_SCRIPTS}, world.texels.set('{far}', 1e9))")
+        page.until(f"!world.loaded.has('{far}')")
+        page.value(LOADING_ENDED)
+        assert page.value("world.scripts") == [] and page.value("document.head.querySelectorAll('script').length") == 0
+        page.value(f"world.texels.delete('{far}')")
+        page.until(ALL_LOADED)
+        assert page.value("world.scripts") == [far, f"{far}_splats"]
+        assert agreement_db(drawn(page), both) > AGREEMENT_DB and page.errors == []
+
+
+def test_a_background_that_cannot_be_decoded_is_grey(tmp_path: Path) -> None:
+    scene = synthetic.scene(tmp_path, tiles=1)
+    splat_scenes.add(scene.tiles[0], count=500)
+    with chromium(tmp_path) as page:
+        open_page(page, scene, tmp_path / "page")
+        page.click("[data-photo='1']")
+        look(page, (-30, -30, 2), (-60, -60, 30))
+        assert drawn(page).std() > 5
+        page.value("void (window.createImageBitmap = () => Promise.reject(new Error('no decoder')))")
+        page.value("world.splats.restore()")
+        page.until(ALL_LOADED)
+        assert (drawn(page) == 128).all() and page.errors == []
 
 
 def test_a_tile_without_splats_shows_its_surfaces(tmp_path: Path) -> None:

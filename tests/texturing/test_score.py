@@ -9,12 +9,17 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.camera.renderer import look_at
+from scan2sim.pipeline.core.splats import GAIN, OFFSET, PHOTO_WIDTH, SplatLayer
 from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import Frame, PointCloud
 from scan2sim.pipeline.io import sky
+from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.images import image
+from scan2sim.texturing.photo_cache import camera_of
 from scan2sim.texturing.score import ScoreParams, score
+from scan2sim.texturing.splats.background import HEIGHT_PX
+from tests.fakes import splat_scenes
 from tests.texturing.corner import CAMERAS, POSES, Street, paint, points
 
 
@@ -137,3 +142,23 @@ def test_wrong_sky_costs_the_whole_frame_but_not_the_surfaces(
     facts = strict(score({**textured, "sky": tmp_path / "sky.json"}, ScoreParams(), tmp_path, silent).metrics)
     assert facts["frame"]["psnr_db"] < scored.metrics["frame"]["psnr_db"] - 5
     assert facts["psnr_db"] == scored.metrics["psnr_db"] and facts["ssim"] == scored.metrics["ssim"]
+
+
+def test_splats_are_scored_in_the_exposure_of_the_world_and_in_that_of_the_nearest_photos(
+    textured: dict[str, Path], tmp_path: Path
+) -> None:
+    """As simulators show them, and as the camera would have shown them."""
+    plain, row = splat_scenes.layer(count=50, height=HEIGHT_PX), np.zeros((1, PHOTO_WIDTH), np.float32)
+    row[0, GAIN], row[0, OFFSET] = 0.5, 0.0275
+    dark = SplatLayer(plain.splats, plain.background, row, (camera_of(views_io.load(textured["views"])[1]),))
+    found = []
+    for name, layer in (("plain", plain), ("dark", dark)):
+        (tmp_path / name).mkdir()
+        layer.save(tmp_path / f"{name}.npz")
+        inputs = {**textured, "splats": tmp_path / f"{name}.npz"}
+        facts = strict(score(inputs, ScoreParams(), tmp_path / name, silent).metrics)
+        found.append(facts["splat_frame"])
+        assert facts["photos"]["photo1"]["splat_frame_psnr_exposed_db"] == facts["splat_frame"]["psnr_exposed_db"]
+    assert found[0]["psnr_exposed_db"] == pytest.approx(found[0]["psnr_db"], abs=0.01)
+    assert found[1]["psnr_db"] == found[0]["psnr_db"]
+    assert abs(found[1]["psnr_exposed_db"] - found[1]["psnr_db"]) > 0.3

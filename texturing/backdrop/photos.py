@@ -13,7 +13,7 @@ import numpy as np
 from scan2sim.pipeline.core.classes import PHOTO_CLASSES
 from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Camera, View
 from scan2sim.pipeline.io.images import image
-from scan2sim.texturing.photo_cache import SRGB_OFFSET, Exposures
+from scan2sim.texturing.photo_cache import SRGB_OFFSET, Exposures, squared_radius
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.camera.renderer import Renderer
@@ -44,8 +44,9 @@ class Photo:
         movable: vehicles and people.
         levels: (H, W, 3) grey levels after the exposure correction.
         clipped: (H, W, 3) whether a channel was overexposed.
-        texture, texture_sky, texture_clipped: (h, w, 3) corrected grey levels, (h, w) sky, and (h, w, 3) whether a
-            channel was overexposed, in the size that texture is read from.
+        raw, texture_sky: (h, w, 3) grey levels as the photo has them, and (h, w) sky, in the size that texture is read
+            from.
+        exposure: (5,) correction of the photo (`Exposures.of`).
         masked: what the photo's mask excludes; part of `movable`.
         inverse: inverse distance along the rays, 1/metres; set by `plane_sweep`.
         wanted: neither surface, nor sky, nor movable, nor scanned: pixels whose depth is to be estimated.
@@ -60,9 +61,9 @@ class Photo:
     movable: Bools
     levels: F32
     clipped: Bools
-    texture: U8
+    raw: U8
     texture_sky: Bools
-    texture_clipped: Bools
+    exposure: F64
     masked: Bools
     inverse: F32 = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
@@ -70,6 +71,11 @@ class Photo:
     def wanted(self) -> Bools:
         """See the class."""
         return ~np.isfinite(self.known) & ~self.sky & ~self.movable
+
+    @cached_property
+    def texture(self) -> U8:
+        """(h, w, 3) grey levels after the exposure correction; what is brighter than white is cut."""
+        return np.clip(_corrected(self.raw, self.exposure), 0, 255).astype(np.uint8)
 
     @property
     def grey(self) -> F32:
@@ -127,7 +133,8 @@ def prepare(
     size = (small.width, small.height)
     if large.width != view.camera.width:
         rgb = np.asarray(cv2.resize(rgb, (large.width, large.height), interpolation=cv2.INTER_AREA), np.uint8)
-    corrected = _corrected(rgb, exposures.of(view))
+    exposure = exposures.of(view)
+    corrected = _corrected(rgb, exposure)
     rotation = view.T_world_cam[:3, :3]
     rays = np.nan_to_num(pixel_rays(small).astype(np.float64)) @ rotation.T
     rendered = world.view(small, view.T_world_cam)
@@ -161,7 +168,7 @@ def prepare(
     return Photo(
         view, small, rays, known, rendered.hit, reduced(is_sky) & ~np.isfinite(known), reduced(movable),
         np.asarray(cv2.resize(corrected, size, interpolation=cv2.INTER_AREA), np.float32), seen >= CLIPPED_LEVEL,
-        np.clip(corrected, 0, 255).astype(np.uint8), is_sky, rgb >= CLIPPED_LEVEL, reduced(masked),
+        rgb, is_sky, exposure, reduced(masked),
     )  # fmt: skip
 
 
@@ -194,9 +201,7 @@ def _corrected(rgb: U8, exposure: F64) -> F32:
     """Grey levels (H, W, 3) after the correction of exposure and vignetting (`texturing.exposure_model`)."""
     factor = exposure[:3].astype(np.float32)
     if exposure[3:].any():
-        height, width = rgb.shape[:2]
-        y, x = ((np.arange(n, dtype=np.float32) - (n - 1) / 2) for n in (height, width))
-        q = ((x**2)[None, :] + (y**2)[:, None]) / float(x[0] ** 2 + y[0] ** 2)
+        q = squared_radius(*rgb.shape[:2])
         factor = factor + (exposure[3] * q + exposure[4] * q * q)[..., None]
     return np.asarray((rgb + np.float32(SRGB_OFFSET)) * np.exp(factor) - np.float32(SRGB_OFFSET), np.float32)
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numba import njit
 
+from scan2sim.pipeline.core.splats import MAX_COLOUR, MIN_COLOUR
 from scan2sim.pipeline.core.types import F32, F64
 
 WIDTH_PX, HEIGHT_PX = 2560, 1280
@@ -19,7 +20,7 @@ class Background:
     """Colours of all directions.
 
     Attributes:
-        texture: (`HEIGHT_PX`, `WIDTH_PX`, 3) sRGB 0 to 1.
+        texture: (`HEIGHT_PX`, `WIDTH_PX`, 3) sRGB, `MIN_COLOUR` to `MAX_COLOUR`, as those of splats.
     """
 
     def __init__(self, texture: F32) -> None:
@@ -38,12 +39,14 @@ class Background:
         """Take a step (Adam, of the texels that are seen) against derivatives (H, W, 3) of a loss by `seen`."""
         touched = np.empty(4 * texels.shape[0] * texels.shape[1], np.int32)
         count = _scatter(texels.reshape(-1, 2), gradient.reshape(-1, 3), self._total, touched)
-        _step(self.texture, self._first, self._second, self._total, touched[:count], np.float32(rate))
+        limits = np.float32(MIN_COLOUR), np.float32(MAX_COLOUR)
+        _step(self.texture, self._first, self._second, self._total, touched[:count], np.float32(rate), *limits)
 
     def recolour(self, factor: F32, offset: F32) -> None:
         """Multiply all colours by (3,) factors, and add (3,) offsets."""
         self.texture *= factor
         self.texture += offset
+        np.clip(self.texture, MIN_COLOUR, MAX_COLOUR, out=self.texture)
 
     def save(self) -> dict[str, F32]:
         """State, for `load`."""
@@ -108,8 +111,8 @@ def _scatter(texels, values, total, touched):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _step(texture, first, second, total, touched, rate):  # type: ignore[no-untyped-def]
-    """A step of Adam against the derivatives `total` of the texels `touched`, which become zero."""
+def _step(texture, first, second, total, touched, rate, low, high):  # type: ignore[no-untyped-def]
+    """A step of Adam, within low and high, against the derivatives `total` of texels `touched`, which become zero."""
     width = texture.shape[1]
     for index in touched:
         row, column = index // width, index % width
@@ -119,4 +122,5 @@ def _step(texture, first, second, total, touched, rate):  # type: ignore[no-unty
             m = np.float32(FIRST_MOMENT) * first[row, column, channel] + np.float32(1 - FIRST_MOMENT) * g
             v = np.float32(SECOND_MOMENT) * second[row, column, channel] + np.float32(1 - SECOND_MOMENT) * g * g
             first[row, column, channel], second[row, column, channel] = m, v
-            texture[row, column, channel] -= rate * m / (np.sqrt(v) + np.float32(MIN_ROOT))
+            value = texture[row, column, channel] - rate * m / (np.sqrt(v) + np.float32(MIN_ROOT))
+            texture[row, column, channel] = min(max(value, low), high)

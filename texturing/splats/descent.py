@@ -1,16 +1,18 @@
-"""Gradient descent of splats: Adam (Kingma and Ba, 2015) of those that a photo sees."""
+"""Gradient descent of splats: Adam (Kingma and Ba, 2015) of those that pixels of a photo show."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit, prange
 
-from scan2sim.pipeline.core.splats import WIDTH
+from scan2sim.pipeline.core.splats import MAX_COLOUR, MIN_COLOUR, WIDTH
 from scan2sim.pipeline.core.types import F32, I32
 
 FIRST_MOMENT, SECOND_MOMENT, MIN_ROOT = 0.9, 0.99, 1e-12
 FIRST_COLOUR = 11
 """First column of the colour."""
+FASTMATH = {"reassoc", "contract", "nsz", "arcp", "afn"}
+"""Without "nnan" and "ninf": what isn't finite stays so, and is found."""
 
 
 class Descent:
@@ -27,14 +29,15 @@ class Descent:
         self._visits = np.zeros(len(parameters), np.float32)
 
     def step(self, index: I32, gradients: F32, rates: F32) -> None:
-        """Take a step.
+        """Take a step. Splats without any gradient, as they are hidden or masked, stay as they are.
 
         Args:
             index: (M,) splats.
             gradients: (M, 14) of their parameters.
             rates: (14,) step per parameter; of positions in units of `size`.
         """
-        _step(self.parameters, self.size, self._first, self._second, self._visits, index, gradients, rates)
+        limits = np.float32(MIN_COLOUR), np.float32(MAX_COLOUR)
+        _step(self.parameters, self.size, self._first, self._second, self._visits, index, gradients, rates, *limits)
 
     def save(self) -> dict[str, F32]:
         """State, for `load`."""
@@ -57,19 +60,27 @@ def rates(position: float, scale: float, rotation: float, opacity: float, colour
     return made
 
 
-@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
-def _step(parameters, size, first, second, visits, index, gradients, rates):  # type: ignore[no-untyped-def]
+@njit(cache=True, parallel=True, fastmath=FASTMATH, error_model="numpy")
+def _step(  # type: ignore[no-untyped-def]
+    parameters, size, first, second, visits, index, gradients, rates, darkest, brightest
+):
+    columns = parameters.shape[1]
     for m in prange(len(index)):
         i = index[m]
+        shown = False
+        for k in range(columns):
+            shown |= gradients[m, k] != 0
+        if not shown:
+            continue
         visits[i] += 1
         unbiased_first = 1 - np.float32(FIRST_MOMENT) ** visits[i]
         unbiased_second = 1 - np.float32(SECOND_MOMENT) ** visits[i]
-        for k in range(WIDTH):
+        for k in range(columns):
             g = gradients[m, k] * (size[i] if k < 3 else np.float32(1))
             first[i, k] += np.float32(1 - FIRST_MOMENT) * (g - first[i, k])
             second[i, k] += np.float32(1 - SECOND_MOMENT) * (g * g - second[i, k])
             root = np.sqrt(second[i, k] / unbiased_second) + np.float32(MIN_ROOT)
             step = rates[k] * first[i, k] / unbiased_first / root
             parameters[i, k] -= step * (size[i] if k < 3 else np.float32(1))
-        for k in range(FIRST_COLOUR, WIDTH):  # programs that draw splats clip colours
-            parameters[i, k] = min(max(parameters[i, k], np.float32(0)), np.float32(1))
+        for k in range(FIRST_COLOUR, columns):
+            parameters[i, k] = min(max(parameters[i, k], darkest), brightest)

@@ -8,21 +8,26 @@ import numpy as np
 from numba import njit, prange
 
 from scan2sim.pipeline.core.types import F32, F64, I32, Bools, Camera
+from scan2sim.texturing.splats.blending import MIN_ALPHA
 
 U, V, CONIC_A, CONIC_B, CONIC_C, OPACITY, EXTENT_X, EXTENT_Y, DEPTH, SLOPE_X, SLOPE_Y = range(11)
 """Columns of projected splats: centre in pixels; inverse covariance [[A, B], [B, C]]; opacity; half width and height
-in pixels beyond which it is invisible; depth along the optical axis, of the centre and its change per pixel."""
+in pixels beyond which it is invisible; depth of the centre along the optical axis; change of the inverse depth per
+pixel, which is constant over a plane."""
 PROJECTED = 11
 LOW_PASS = 0.3
 """Variance in square pixels that is added to the projected covariance, as all viewers do."""
-MIN_ALPHA = 1 / 255
-"""Splats are drawn where their alpha is at least this."""
 FIELD_MARGIN = 1.3
 """The projection is linearized at most at this multiple of the field of view: beyond it shapes explode."""
+MIN_SLOPE_COS = 0.01
+"""Cosine of the angle between the normal of a flat splat and the ray through its centre around which the slope of its
+inverse depth is reduced: splats that are seen from their edge have hardly a plane."""
 NEAR_M = 0.2
 """Splats nearer to the camera aren't drawn."""
+FASTMATH = {"reassoc", "contract", "nsz", "arcp", "afn"}
+"""Without "nnan" and "ninf": splats whose projection isn't finite are left out."""
 GRADIENT = 10
-"""Image gradients of a splat: red, green, blue, depth, opacity, U, V, CONIC_A, CONIC_B, CONIC_C."""
+"""Image gradients of a splat: red, green, blue, inverse depth, opacity, U, V, CONIC_A, CONIC_B, CONIC_C."""
 
 
 class Pinhole(NamedTuple):
@@ -52,7 +57,7 @@ class Pinhole(NamedTuple):
 def project(parameters: F32, camera: Pinhole) -> tuple[F32, Bools]:
     """Splats (N, 14) as the camera sees them: (N, 11) with the columns above, and (N,) whether they are visible."""
     projected, visible = np.zeros((len(parameters), PROJECTED), np.float32), np.zeros(len(parameters), np.bool_)
-    _project(parameters, *camera, projected, visible)
+    _project(parameters, *camera, MIN_ALPHA, projected, visible)
     return projected, visible
 
 
@@ -88,6 +93,30 @@ def _rotation(parameters, i, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
+def _slopes(parameters, i, normals, x, y, z):  # type: ignore[no-untyped-def]
+    """Change of a splat's inverse depth per unit of x / z and y / z: that of the plane through its two longer axes.
+
+    The rounder a splat is, the smaller is the slope; that of a ball is 0.
+
+    Args:
+        parameters, i: the splat.
+        normals: (3, 3) its axes in columns, in camera axes.
+        x, y, z: its centre in camera axes.
+    """
+    thin = 0
+    for k in range(1, 3):
+        if parameters[i, 3 + k] < parameters[i, 3 + thin]:
+            thin = k
+    middle = min(parameters[i, 3 + (thin + 1) % 3], parameters[i, 3 + (thin + 2) % 3])
+    roundness = np.exp(4 * (parameters[i, 3 + thin] - middle))
+    n0, n1, n2 = normals[0, thin], normals[1, thin], normals[2, thin]
+    along = n0 * x + n1 * y + n2 * z
+    share = np.float32(MIN_SLOPE_COS) ** 2 * (x * x + y * y + z * z)
+    factor = (1 - roundness) * along / (along * along + share)
+    return factor * n0, factor * n1
+
+
+@njit(cache=True, inline="always")
 def _limits(intrinsics, width, height):  # type: ignore[no-untyped-def]
     """Bounds of x / z and y / z at which the projection is linearized."""
     margin = np.float32(FIELD_MARGIN - 1) / 2
@@ -98,8 +127,10 @@ def _limits(intrinsics, width, height):  # type: ignore[no-untyped-def]
     return left, right, top, bottom
 
 
-@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
-def _project(parameters, R, t, intrinsics, width, height, projected, visible):  # type: ignore[no-untyped-def]
+@njit(cache=True, parallel=True, fastmath=FASTMATH, error_model="numpy")
+def _project(  # type: ignore[no-untyped-def]
+    parameters, R, t, intrinsics, width, height, min_alpha, projected, visible
+):
     left, right, top, bottom = _limits(intrinsics, width, height)
     fx, fy = intrinsics[0], intrinsics[1]
     for i in prange(len(parameters)):
@@ -108,7 +139,7 @@ def _project(parameters, R, t, intrinsics, width, height, projected, visible):  
         if z < np.float32(NEAR_M):
             continue
         opacity = 1 / (1 + np.exp(-parameters[i, 10]))
-        if opacity <= np.float32(MIN_ALPHA):
+        if opacity <= min_alpha:
             continue
         x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + t[0]
         y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + t[1]
@@ -116,10 +147,9 @@ def _project(parameters, R, t, intrinsics, width, height, projected, visible):  
         j00, j11 = fx / z, fy / z
         j02 = -j00 * min(max(x / z, left), right)
         j12 = -j11 * min(max(y / z, top), bottom)
-        Q = np.empty((3, 3), np.float32)
+        Q, axes = np.empty((3, 3), np.float32), np.empty((3, 3), np.float32)
         _rotation(parameters, i, Q)
         a, b, c = np.float32(LOW_PASS), np.float32(0), np.float32(LOW_PASS)
-        along_x, along_y = np.float32(0), np.float32(0)  # covariances of the depth with the place in the image
         for k in range(3):
             scale = np.exp(parameters[i, 3 + k])
             q0 = R[0, 0] * Q[0, k] + R[0, 1] * Q[1, k] + R[0, 2] * Q[2, k]
@@ -127,23 +157,30 @@ def _project(parameters, R, t, intrinsics, width, height, projected, visible):  
             q2 = R[2, 0] * Q[0, k] + R[2, 1] * Q[1, k] + R[2, 2] * Q[2, k]
             m0, m1 = scale * (j00 * q0 + j02 * q2), scale * (j11 * q1 + j12 * q2)
             a, b, c = a + m0 * m0, b + m0 * m1, c + m1 * m1
-            along_x, along_y = along_x + m0 * scale * q2, along_y + m1 * scale * q2
-        determinant = a * c - b * b
-        if not determinant > 0:
+            axes[0, k], axes[1, k], axes[2, k] = q0, q1, q2
+            Q[0, k], Q[1, k] = m0, m1  # of its column no other axis depends
+        # a c - b b as a sum of squares (Lagrange's identity): the difference of long and narrow splats would be rounded
+        determinant = np.float32(LOW_PASS) * (a + c - np.float32(LOW_PASS))
+        for k in range(3):
+            m0, m1 = Q[0, k], Q[1, k]
+            for other in range(k):
+                minor = m0 * Q[1, other] - m1 * Q[0, other]
+                determinant += minor * minor
+        if not (0 < determinant < np.inf):
             continue
-        farthest = 2 * np.log(opacity / np.float32(MIN_ALPHA))
+        farthest = 2 * np.log(opacity / min_alpha)
         extent_x, extent_y = np.sqrt(farthest * a), np.sqrt(farthest * c)
         if u + extent_x < 0 or u - extent_x > width - 1 or v + extent_y < 0 or v - extent_y > height - 1:
             continue
         projected[i, 0], projected[i, 1] = u, v
         projected[i, 2], projected[i, 3], projected[i, 4] = c / determinant, -b / determinant, a / determinant
         projected[i, 5], projected[i, 6], projected[i, 7], projected[i, 8] = opacity, extent_x, extent_y, z
-        projected[i, 9] = (c * along_x - b * along_y) / determinant
-        projected[i, 10] = (a * along_y - b * along_x) / determinant
+        slope_x, slope_y = _slopes(parameters, i, axes, x, y, z)
+        projected[i, 9], projected[i, 10] = slope_x / fx, slope_y / fy
         visible[i] = True
 
 
-@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+@njit(cache=True, parallel=True, fastmath=FASTMATH, error_model="numpy")
 def _parameter_gradients(  # type: ignore[no-untyped-def]
     parameters, R, t, intrinsics, width, height, projected, index, first, entries, gradients
 ):
@@ -183,9 +220,11 @@ def _parameter_gradients(  # type: ignore[no-untyped-def]
             d00, d02, d11, d12 = d00 + h0 * q0, d02 + h0 * q2, d11 + h1 * q1, d12 + h1 * q2
             for row in range(3):
                 W[row, k] = h0 * (j00 * R[0, row] + j02 * R[2, row]) + h1 * (j11 * R[1, row] + j12 * R[2, row])
-        # position in the camera, by the centre in the image and by the linearization there
-        dx, dy = g[5] * fx / z, g[6] * fy / z
-        dz = g[3] - (g[5] * fx * x + g[6] * fy * y) / (z * z)
+        # position in the camera, by the centre in the image, from which the inverse depth changes with its slope, and
+        # by the linearization there
+        by_u, by_v = g[5] - g[3] * projected[i, 9], g[6] - g[3] * projected[i, 10]
+        dx, dy = by_u * fx / z, by_v * fy / z
+        dz = -(g[3] + by_u * fx * x + by_v * fy * y) / (z * z)
         dz += (-d00 * j00 - d11 * j11 - d02 * j02 - d12 * j12) / z
         if left < x / z < right:
             dx -= d02 * fx / (z * z)

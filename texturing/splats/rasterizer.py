@@ -18,13 +18,16 @@ class Rendered:
 
     Attributes:
         colour: (H, W, 3) sRGB 0 to 1, times alpha: the background isn't added.
-        depth: (H, W) along the optical axis in metres, times alpha; where a depth was known, the deviation from it,
-            relative to it and at most `blending.MAX_DEVIATION`, times alpha.
+        depth: (H, W) metres along the optical axis to where half of the light is stopped (median), inf where more than
+            half of it is the background's.
+        deviation: (H, W) of the inverse depth from the known one, relative to it and at most `blending.MAX_DEVIATION`,
+            times alpha; 0 where none is known.
         transmittance: (H, W) share of the background that is seen.
     """
 
     colour: F32
     depth: F32
+    deviation: F32
     transmittance: F32
     _parameters: F32
     _camera: Pinhole
@@ -44,19 +47,24 @@ class Rendered:
         return self.colour + self.transmittance[..., None] * background
 
     def gradients(
-        self, background: F32, by_colour: F32, by_depth: F32 | None = None, by_alpha: F32 | None = None
+        self, background: F32, by_colour: F32, by_deviation: F32 | None = None, by_alpha: F32 | None = None
     ) -> F32:
         """Gradients (M, 14) of the parameters of the splats `seen`.
 
         Args:
             background: (H, W, 3) the background.
             by_colour: (H, W, 3) derivatives of the loss by `over(background)`.
-            by_depth: (H, W) by `depth`; None: 0.
+            by_deviation: (H, W) by `deviation`; None: 0.
             by_alpha: (H, W) by 1 - `transmittance`, apart from the effect on the colour; None: 0.
         """
-        nothing = np.zeros(by_colour.shape[:2], np.float32)
-        more = [nothing if one is None else one for one in (by_depth, by_alpha)]
-        gradient = tiles.to_tiles(np.concatenate([by_colour, np.stack(more, axis=-1)], axis=-1))
+        every = np.zeros((*by_colour.shape[:2], 5), np.float32)
+        every[..., :3] = by_colour
+        if by_deviation is not None:
+            every[..., 3] = by_deviation
+        if by_alpha is not None:
+            every[..., 4] = by_alpha
+        gradient = tiles.to_tiles(every)
+        gradient[:, blending.DEVIATION][self._known == 0] = 0
         found = self._assignment
         entries = np.zeros((len(found.splat), projection.GRADIENT), np.float32)
         blending.blend_gradients(
@@ -78,14 +86,21 @@ def render(parameters: F32, camera: Pinhole, known: F32 | None = None) -> Render
     """
     projected, visible = projection.project(parameters, camera)
     found = tiles.assign(projected, visible, camera.width, camera.height)
-    blended = np.empty((len(found.start) - 1, 5, tiles.PIXELS), np.float32)
+    blended = np.empty((len(found.start) - 1, blending.CHANNELS, blending.PIXELS), np.float32)
     last = np.zeros(len(blended), np.int32)
     if known is None:
-        expected = np.zeros((len(blended), tiles.PIXELS), np.float32)
+        expected = np.zeros((len(blended), blending.PIXELS), np.float32)
     else:
         expected = tiles.to_tiles(known[..., None])[:, 0]
-    blending.blend(parameters, projected, found.columns, found.start, found.splat, expected, blended, last)
+    blending.blend(
+        parameters, projected, found.columns, found.start, found.splat, expected, camera.width, camera.height, blended,
+        last,
+    )  # fmt: skip
     image = tiles.from_tiles(blended, camera.width, camera.height)
+    deviation = np.zeros(image.shape[:2], np.float32) if known is None else image[..., blending.DEVIATION] * (known > 0)
+    with np.errstate(divide="ignore"):
+        depth = np.float32(1) / image[..., blending.MEDIAN]
     return Rendered(
-        image[..., :3], image[..., 3], image[..., 4], parameters, camera, projected, found, expected, blended, last
+        image[..., :3], depth, deviation, image[..., blending.TRANSMITTANCE], parameters, camera, projected, found,
+        expected, blended, last,
     )  # fmt: skip

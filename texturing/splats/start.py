@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from scan2sim.pipeline.camera.models import pixel_angle
-from scan2sim.pipeline.core.splats import SplatLayer, Splats
+from scan2sim.pipeline.core.splats import MAX_COLOUR, MIN_COLOUR, SplatLayer, Splats
 from scan2sim.pipeline.core.types import F32, F64, I64, Bools
 from scan2sim.texturing.backdrop.photos import FARTHEST_M, Photo, fill
 from scan2sim.texturing.splats.background import HEIGHT_PX, WIDTH_PX, Background
@@ -44,7 +44,8 @@ def first_splats(photos: Sequence[Photo], inverse: Sequence[F32], excluded: Sequ
     xyz, normal, rgb, size, scanned = xyz[kept], normal[kept], rgb[kept], size[kept], scanned[kept]
     scale = np.repeat(SCALE * size[:, None], 3, axis=1)
     scale[scanned, 2] *= FLATNESS
-    made = Splats.of(xyz, scale, _turning_z_to(normal), np.full(len(xyz), OPACITY), np.clip(rgb, 0, 1))
+    rgb = np.clip(rgb, MIN_COLOUR, MAX_COLOUR)
+    made = Splats.of(xyz, scale, _turning_z_to(normal), np.full(len(xyz), OPACITY), rgb)
     return made, size.astype(np.float32)
 
 
@@ -58,12 +59,12 @@ def first_background(shots: Sequence[Shot]) -> Background:
         column = np.rint(level.texels[..., 0]).astype(np.int64) % WIDTH_PX
         row = np.clip(np.rint(level.texels[..., 1]).astype(np.int64), 0, HEIGHT_PX - 1)
         index = row * WIDTH_PX + column
-        used = level.weight > 0
-        for k, chosen in enumerate((used & level.sky, used & ~level.sky)):
+        colours = level.exposed.world(level.rgb)
+        for k, chosen in enumerate((level.used & level.sky, level.used & ~level.sky)):
             at = index[chosen]
             count[k] += np.bincount(at, minlength=HEIGHT_PX * WIDTH_PX)
             for channel in range(3):
-                weights = level.rgb[chosen][:, channel]
+                weights = colours[chosen][:, channel]
                 total[k, :, channel] += np.bincount(at, weights, HEIGHT_PX * WIDTH_PX)
     shape = (HEIGHT_PX, WIDTH_PX)
     colour = (total / np.maximum(count, 1)[..., None]).astype(np.float32).reshape(2, *shape, 3)
@@ -71,7 +72,7 @@ def first_background(shots: Sequence[Shot]) -> Background:
     is_sky = votes[0] > MIN_SKY_SHARE * votes.sum(axis=0)
     scenery = cv2.GaussianBlur(fill(colour[1], votes[1] > 0), (0, 0), DARK_SIGMA_DEG * WIDTH_PX / 360)
     known = votes.sum(axis=0) > 0
-    return Background(np.clip(fill(np.where(is_sky[..., None], colour[0], scenery), known), 0, 1))
+    return Background(np.clip(fill(np.where(is_sky[..., None], colour[0], scenery), known), MIN_COLOUR, MAX_COLOUR))
 
 
 def _samples(photo: Photo, inverse: F32, excluded: Bools) -> tuple[F64, F64, F32, F64, Bools]:
@@ -80,7 +81,7 @@ def _samples(photo: Photo, inverse: F32, excluded: Bools) -> tuple[F64, F64, F32
     points = photo.view.centre + photo.rays * distance[..., None]
     normal, is_surface = _normals(points, inverse, photo.view.centre)
     usable = ~photo.sky & ~excluded & (distance > NEAREST_M) & (inverse > 1 / FARTHEST_M)
-    stride = max(1, round(STRIDE_PX * photo.camera.width / photo.texture.shape[1]))
+    stride = max(1, round(STRIDE_PX * photo.camera.width / photo.raw.shape[1]))
     at = np.zeros(usable.shape, bool)
     at[stride // 2 :: stride, stride // 2 :: stride] = True
     at &= usable & np.isfinite(points).all(axis=-1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -57,12 +57,13 @@ class SplatsParams(Params):
         when: never: no splats; auto: outdoors, if there are photos other than orthophotos.
         spacing: distance in metres between the photos that are used; photos in between are left out.
         max_photos: maximum number of photos; with more, the distance between them is larger. One of a megapixel needs
-            about 60 MB of memory.
+            about 30 MB of memory.
         epochs: visits of every photo in a quarter, half and full size; full size is at most a megapixel.
         parked: show parked vehicles, although the mesh may leave them out, if the step `instances` found them; people
             and what moved are never shown.
         cover: weight of the opacity loss: higher opacity where a photo doesn't show sky, lower where it does.
-        depth: weight of the depth loss: relative error against scan and surfaces, along each photo's rays.
+        depth: weight of the depth loss: relative error of inverse depths against scan and surfaces, along each photo's
+            rays.
         seed: of the order in which photos are visited, and of the jitter of estimated depths.
     """
 
@@ -87,8 +88,7 @@ def splats(inputs: Inputs, params: SplatsParams, out: Path, report: Report, chec
     """
     from scan2sim.texturing.splats.training import Schedule
 
-    used, excluded = _prepared(inputs, params, report)
-    seen = [shot for photo, mask in zip(used, excluded, strict=True) for shot in _shots(photo, mask)]
+    used, excluded, seen = _prepared(inputs, params, report)
     state = checkpoint / STATE_FILE
     training = _begun(used, excluded, seen, params, state, report)
     if training is None:
@@ -100,25 +100,28 @@ def splats(inputs: Inputs, params: SplatsParams, out: Path, report: Report, chec
         training, seen, Schedule(params.epochs, cover=params.cover, depth=params.depth, seed=params.seed), state, report
     )
     result = _within_cell(training.result(), params.context)
-    SplatLayer(result, training.background.texture).save(out / SPLATS_FILE)
+    SplatLayer(result, training.background.texture, *training.photos(seen)).save(out / SPLATS_FILE)
     metrics = {"photos": len(excluded), "first": first, "splats": len(result)}
     warnings = [] if "labels" in inputs or "instances" in inputs else [UNMASKED]
     return Done({"splats": out / SPLATS_FILE}, metrics, warnings)
 
 
-def _prepared(inputs: Inputs, params: SplatsParams, report: Report) -> tuple[list[Photo], list[Bools]]:
-    """The photos of training, and their pixels that aren't used."""
+def _prepared(inputs: Inputs, params: SplatsParams, report: Report) -> tuple[list[Photo], list[Bools], list[Shot]]:
+    """The photos of training, their pixels that aren't used, and their shots."""
     from scan2sim.pipeline.camera.renderer import Body, Renderer
     from scan2sim.texturing.backdrop import photos as prepared
     from scan2sim.texturing.photo_cache import Exposures
     from scan2sim.texturing.splats.moving import MovingMask
+    from scan2sim.texturing.splats.shots import shots
 
     meshes = [Mesh.load(path) for name, path in inputs.items() if name.startswith("mesh.")]
     world, exposures = Renderer([Body(mesh) for mesh in meshes]), Exposures.load(inputs["exposures"])
     points = PointCloud.load(inputs["moving"]) if "moving" in inputs else None
     moving = MovingMask(inputs.get("instances"), meshes[0].frame, params.parked, points)
     views, held_out = views_io.load(inputs["views"]), views_io.load_held_out(inputs["views"])
-    used, excluded = [], []
+    used: list[Photo] = []
+    excluded: list[Bools] = []
+    seen: list[Shot] = []
     free = [k for k, held in enumerate(held_out) if not held]
     chosen = prepared.choose(views, free, params.spacing, params.max_photos)
     for k in chosen:
@@ -130,13 +133,8 @@ def _prepared(inputs: Inputs, params: SplatsParams, report: Report) -> tuple[lis
         if photo is not None:
             used.append(photo)
             excluded.append(moving.of(photo))
-    return used, excluded
-
-
-def _shots(photo: Photo, excluded: Bools) -> Iterator[Shot]:
-    from scan2sim.texturing.splats.shots import shots
-
-    return shots(photo, excluded)
+            seen.extend(shots(photo, excluded[-1], np.load(depth)))
+    return used, excluded, seen
 
 
 def _begun(
@@ -158,7 +156,7 @@ def _begun(
         report(DEPTH_SHARE + (TRAINING_SHARE - DEPTH_SHARE) * i / len(used), f"depth of {photo.view.name}")
         photo.inverse = plane_sweep.inverse_depth(photo, [used[j] for j in near[i]], HYPOTHESES)
     first, size = first_splats(used, inverse_depths(used, near, params.seed), excluded)
-    return Training.of(first, size, first_background(seen), len(used)) if len(first) else None
+    return Training.of(first, size, first_background(seen), seen) if len(first) else None
 
 
 def _within_cell(found: Splats, context: SplatsContext) -> Splats:
@@ -183,4 +181,5 @@ def _train(training: Training, seen: Sequence[Shot], schedule: Schedule, state: 
     training.run(seen, schedule, after_epoch)
 
 
-SPLATS = Step("splats", 1, splats, SplatsParams, resumes=True, memory=(1.5, 3))
+# photos take 30 MB for each megapixel, whatever the size of their files, and are 100 at most by default
+SPLATS = Step("splats", 3, splats, SplatsParams, resumes=True, memory=(4.5, 3))

@@ -8,11 +8,9 @@ import numpy as np
 from numba import njit
 
 from scan2sim.pipeline.core.types import F32, I32, Bools
-from scan2sim.texturing.splats.projection import DEPTH, MIN_ALPHA
+from scan2sim.texturing.splats.blending import HEIGHT, MIN_ALPHA, PIXELS, WIDTH
+from scan2sim.texturing.splats.projection import DEPTH
 
-SIZE = 16
-"""Width and height of a tile in pixels."""
-PIXELS = SIZE * SIZE
 DEPTH_LEVELS = 2**16 - 1
 """Number of levels of the logarithm of depths, by which splats are sorted: a thousandth of the depth or better."""
 
@@ -38,48 +36,48 @@ class Assignment(NamedTuple):
 
 
 def assign(projected: F32, visible: Bools, width: int, height: int) -> Assignment:
-    """Assign visible splats (of N, (N, 9)) to the tiles that they reach."""
-    columns, rows = -(-width // SIZE), -(-height // SIZE)
+    """Assign visible splats (of N, (N, 11)) to the tiles that they reach."""
+    columns, rows = -(-width // WIDTH), -(-height // HEIGHT)
     index = np.flatnonzero(visible)
     depth = np.log(projected[index, DEPTH])
     low, high = (float(depth.min()), float(depth.max())) if len(depth) else (0.0, 1.0)
     level = ((depth - low) * (DEPTH_LEVELS / max(high - low, 1e-6))).astype(np.uint16)
     index = index[np.argsort(level, kind="stable")].astype(np.int32)  # a radix sort for 16 bits
-    return Assignment(columns, *_assign(projected, index, columns, rows))
+    return Assignment(columns, *_assign(projected, index, columns, rows, WIDTH, HEIGHT, MIN_ALPHA))
 
 
 def to_tiles(image: F32) -> F32:
     """An image (H, W, C) as (T, C, 256), row by row of tiles, filled up with zeros."""
     height, width, channels = image.shape
-    rows, columns = -(-height // SIZE), -(-width // SIZE)
-    padded = np.zeros((rows * SIZE, columns * SIZE, channels), np.float32)
+    rows, columns = -(-height // HEIGHT), -(-width // WIDTH)
+    padded = np.zeros((rows * HEIGHT, columns * WIDTH, channels), np.float32)
     padded[:height, :width] = image
-    tiles = padded.reshape(rows, SIZE, columns, SIZE, channels).transpose(0, 2, 4, 1, 3)
+    tiles = padded.reshape(rows, HEIGHT, columns, WIDTH, channels).transpose(0, 2, 4, 1, 3)
     return np.ascontiguousarray(tiles).reshape(rows * columns, channels, PIXELS)
 
 
 def from_tiles(tiles: F32, width: int, height: int) -> F32:
     """The image (H, W, C) of tiles (T, C, 256)."""
-    rows, columns = -(-height // SIZE), -(-width // SIZE)
-    image = tiles.reshape(rows, columns, -1, SIZE, SIZE).transpose(0, 3, 1, 4, 2)
-    return np.ascontiguousarray(image.reshape(rows * SIZE, columns * SIZE, -1)[:height, :width])
+    rows, columns = -(-height // HEIGHT), -(-width // WIDTH)
+    image = tiles.reshape(rows, columns, -1, HEIGHT, WIDTH).transpose(0, 3, 1, 4, 2)
+    return np.ascontiguousarray(image.reshape(rows * HEIGHT, columns * WIDTH, -1)[:height, :width])
 
 
 @njit(cache=True, inline="always")
-def _overlap(projected, i, columns, rows):  # type: ignore[no-untyped-def]
-    """First and last column and row of the tiles that a splat overlaps."""
+def _overlap(projected, i, columns, rows, width, height):  # type: ignore[no-untyped-def]
+    """First and last column and row of the tiles, of width x height pixels, that a splat overlaps."""
     u, v, x, y = projected[i, 0], projected[i, 1], projected[i, 6], projected[i, 7]
     return (
-        max(int((u - x) // SIZE), 0), min(int((u + x) // SIZE), columns - 1),
-        max(int((v - y) // SIZE), 0), min(int((v + y) // SIZE), rows - 1),
+        max(int((u - x) // width), 0), min(int((u + x) // width), columns - 1),
+        max(int((v - y) // height), 0), min(int((v + y) // height), rows - 1),
     )  # fmt: skip
 
 
 @njit(cache=True, inline="always")
-def _reaches(projected, i, x, y, farthest):  # type: ignore[no-untyped-def]
+def _reaches(projected, i, x, y, width, height, farthest):  # type: ignore[no-untyped-def]
     """Whether the ellipse of a splat at the squared distance `farthest` reaches the tile in column x and row y."""
-    left, top = np.float32(x * SIZE) - projected[i, 0], np.float32(y * SIZE) - projected[i, 1]
-    right, bottom = left + np.float32(SIZE - 1), top + np.float32(SIZE - 1)
+    left, top = np.float32(x * width) - projected[i, 0], np.float32(y * height) - projected[i, 1]
+    right, bottom = left + np.float32(width - 1), top + np.float32(height - 1)
     dx, dy = min(max(np.float32(0), left), right), min(max(np.float32(0), top), bottom)
     if dx == 0 and dy == 0:
         return True
@@ -97,17 +95,18 @@ def _reaches(projected, i, x, y, farthest):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _assign(projected, index, columns, rows):  # type: ignore[no-untyped-def]
+def _assign(projected, index, columns, rows, width, height, min_alpha):  # type: ignore[no-untyped-def]
+    """Entries of the tiles (`Assignment`): rows x columns of width x height pixels."""
     start = np.zeros(columns * rows + 1, np.int32)
     first = np.zeros(len(index) + 1, np.int32)
     for m in range(len(index)):
         i = index[m]
-        left, right, top, bottom = _overlap(projected, i, columns, rows)
-        farthest = _farthest(projected, i)
+        left, right, top, bottom = _overlap(projected, i, columns, rows, width, height)
+        farthest = _farthest(projected, i, min_alpha)
         first[m + 1] = first[m]
         for y in range(top, bottom + 1):
             for x in range(left, right + 1):
-                if _reaches(projected, i, x, y, farthest):
+                if _reaches(projected, i, x, y, width, height, farthest):
                     start[y * columns + x + 1] += 1
                     first[m + 1] += 1
     for tile in range(columns * rows):
@@ -116,12 +115,12 @@ def _assign(projected, index, columns, rows):  # type: ignore[no-untyped-def]
     splat, slot = np.empty(first[-1], np.int32), np.empty(first[-1], np.int32)
     for m in range(len(index)):
         i = index[m]
-        left, right, top, bottom = _overlap(projected, i, columns, rows)
-        farthest = _farthest(projected, i)
+        left, right, top, bottom = _overlap(projected, i, columns, rows, width, height)
+        farthest = _farthest(projected, i, min_alpha)
         place = first[m]
         for y in range(top, bottom + 1):
             for x in range(left, right + 1):
-                if _reaches(projected, i, x, y, farthest):
+                if _reaches(projected, i, x, y, width, height, farthest):
                     tile = y * columns + x
                     splat[free[tile]], slot[free[tile]] = i, place
                     free[tile] += 1
@@ -130,6 +129,6 @@ def _assign(projected, index, columns, rows):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def _farthest(projected, i):  # type: ignore[no-untyped-def]
-    """Squared distance in standard deviations at which a splat's alpha is `MIN_ALPHA`, and a little more."""
-    return np.float32(2.01) * np.log(projected[i, 5] / np.float32(MIN_ALPHA)) + np.float32(0.01)
+def _farthest(projected, i, min_alpha):  # type: ignore[no-untyped-def]
+    """Squared distance in standard deviations at which a splat's alpha is `min_alpha`, and a little more."""
+    return np.float32(2.01) * np.log(projected[i, 5] / min_alpha) + np.float32(0.01)

@@ -11,12 +11,25 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.core.errors import StepError
-from scan2sim.pipeline.core.splats import LOGIT, RGB, Splats
+from scan2sim.pipeline.core.splats import (
+    AXIS,
+    CAMERA,
+    GAIN,
+    LOGIT,
+    MAX_COLOUR,
+    MIN_COLOUR,
+    OFFSET,
+    PHOTO_WIDTH,
+    POSITION,
+    RGB,
+    VIGNETTING,
+    Splats,
+)
 from scan2sim.pipeline.core.types import F32
 from scan2sim.texturing.splats import loss, rasterizer
 from scan2sim.texturing.splats.background import Background
 from scan2sim.texturing.splats.descent import Descent, rates
-from scan2sim.texturing.splats.exposure import Gains
+from scan2sim.texturing.splats.exposure import Gains, Response
 from scan2sim.texturing.splats.shots import SCALES, Level, Shot
 
 BACKGROUND_RATE = 0.01
@@ -38,7 +51,7 @@ class Schedule:
         epochs: visits of every photo in a quarter, half and full size.
         position, scale, rotation, opacity, colour: first step of each parameter; positions in sizes of the splat.
         cover: weight of the loss that covers what isn't sky, and uncovers what is.
-        depth: weight of the deviation from known depths, relative to these.
+        depth: weight of the deviation from known inverse depths, relative to these.
         seed: of the order of the photos.
     """
 
@@ -60,7 +73,7 @@ class Training:
     Attributes:
         descent: the splats.
         background: what is behind them.
-        gains: exposure of the photos, in the order of their first shots.
+        gains: exposure of the photos, which are numbered in the order of their first shots.
         epoch: number of finished epochs.
     """
 
@@ -70,36 +83,39 @@ class Training:
     epoch: int = 0
 
     @classmethod
-    def of(cls, splats: Splats, size: F32, background: Background, photos: int) -> Training:
-        """A training that begins with these splats."""
-        return cls(Descent(splats.parameters.copy(), size), background, Gains(photos))
+    def of(cls, splats: Splats, size: F32, background: Background, shots: Sequence[Shot]) -> Training:
+        """A training on shots that begins with these splats."""
+        names = list(dict.fromkeys(shot.name for shot in shots))
+        photo_of = np.array([names.index(shot.name) for shot in shots], np.int32)
+        return cls(Descent(splats.parameters.copy(), size), background, Gains(photo_of))
 
     def run(self, shots: Sequence[Shot], schedule: Schedule, report: Callable[[float, str], None]) -> None:
         """Train to the end of the schedule, from the epoch where it is.
 
         Args:
-            shots: photos of training.
+            shots: those that the training was made for.
             schedule: visits and rates.
             report: is called after every epoch with the share that is done and the mean PSNR.
+
+        Raises:
+            StepError: the training has diverged.
         """
-        photos = {name: k for k, name in enumerate(dict.fromkeys(shot.name for shot in shots))}
         stages = [stage for stage, count in enumerate(schedule.epochs) for _ in range(count)]
         for epoch in range(self.epoch, len(stages)):
             done = epoch / len(stages)
             decay = 0.1 ** max(0.0, (done - CONSTANT_SHARE) / (1 - CONSTANT_SHARE))
             order = np.random.default_rng((schedule.seed, epoch)).permutation(len(shots))
-            psnr = [
-                self._visit(photos[shots[k].name], shots[k].levels[stages[epoch]], schedule, decay)
-                for k in order.tolist()
-            ]
+            psnr = [self._visit(k, shots[k].levels[stages[epoch]], schedule, decay) for k in order.tolist()]
             self._recolour(*self.gains.centre())
+            self._check()
             self.epoch = epoch + 1
             known = [one for one in psnr if not math.isnan(one)] or [math.nan]
             report(self.epoch / len(stages), f"1/{SCALES[stages[epoch]]} size, {np.mean(known):.1f} dB")
 
     def _recolour(self, factor: F32, offset: F32) -> None:
         """Change all colours of the world."""
-        self.descent.parameters[:, RGB] = np.clip(self.descent.parameters[:, RGB] * factor + offset, 0, 1)
+        colours = self.descent.parameters[:, RGB]
+        colours[:] = np.clip(colours * factor + offset, MIN_COLOUR, MAX_COLOUR)
         self.background.recolour(factor, offset)
 
     def rendered(self, level: Level) -> tuple[rasterizer.Rendered, F32]:
@@ -108,55 +124,72 @@ class Training:
         return drawn, self.background.seen(level.texels)
 
     def _visit(self, k: int, level: Level, schedule: Schedule, decay: float) -> float:
-        """Take a step towards a photo; returns the PSNR before it."""
+        """Take a step towards a shot; returns the PSNR before it."""
         drawn, behind = self.rendered(level)
         image = drawn.over(behind)
-        self.gains.solve(k, image, level.rgb, level.weight, 1.0 if self.epoch == 0 else GAIN_RATE)
-        shown = self.gains.applied(k, image)
-        _, gradient = loss.photometric(shown, level.rgb, level.weight)
-        gradient = np.where(level.clipped & (shown > level.rgb), np.float32(0), gradient) * self.gains.gain[k]
-        cover = np.float32(schedule.cover) * level.weight * np.where(level.sky, np.float32(1), np.float32(-1))
-        by_depth = np.float32(schedule.depth) * level.weight * (level.known > 0)
-        found = drawn.gradients(behind, gradient, by_depth, cover)
+        self.gains.solve(k, image, level.rgb, level.used, level.exposed, 1.0 if self.epoch == 0 else GAIN_RATE)
+        response = self.gains.response(self.gains.photo_of[k], level.exposed)
+        found = loss.photometric(image, level.rgb, level.used, response)
+        used = level.used.astype(np.float32)
+        cover = np.float32(schedule.cover) * used * np.where(level.sky, np.float32(1), np.float32(-1))
+        by_parameters = drawn.gradients(behind, found.gradient, np.float32(schedule.depth) * used, cover)
         first = rates(schedule.position, schedule.scale, schedule.rotation, schedule.opacity, schedule.colour)
-        self.descent.step(drawn.seen, found, first * np.float32(decay))
+        self.descent.step(drawn.seen, by_parameters, first * np.float32(decay))
         through = np.where(drawn.transmittance > MIN_BACKGROUND, drawn.transmittance, np.float32(0))
-        self.background.descend(level.texels, gradient * through[..., None], BACKGROUND_RATE * decay)
-        return _psnr(shown, level)
+        self.background.descend(level.texels, found.gradient * through[..., None], BACKGROUND_RATE * decay)
+        return found.psnr
+
+    def photos(self, shots: Sequence[Shot]) -> tuple[F32, tuple[str, ...]]:
+        """(P, 15) how the photos show the world, and the names of their cameras (`SplatLayer`)."""
+        cameras = tuple(dict.fromkeys(shot.taken_by for shot in shots))
+        rows = np.zeros((len(self.gains.gain), PHOTO_WIDTH), np.float32)
+        for photo, shot in zip(self.gains.photo_of, shots, strict=True):  # several of a photo give the same row
+            row, response = rows[photo], self.gains.response(photo, Response.of(shot.exposure, shot.vignetting))
+            row[POSITION], row[AXIS], row[CAMERA] = shot.T_world_cam[:3, 3], shot.axis, cameras.index(shot.taken_by)
+            row[GAIN], row[OFFSET], row[VIGNETTING] = response.gain, response.offset, shot.exposure[3:]
+        return rows, cameras
 
     def result(self) -> Splats:
-        """The splats that are visible.
-
-        Raises:
-            StepError: the training has diverged.
-        """
+        """The splats that are visible."""
         parameters = self.descent.parameters
-        broken = int((~np.isfinite(parameters).all(axis=1)).sum())
-        if broken:
-            raise StepError(
-                "splats", f"the training diverged: {broken} splats aren't finite", "Report it with the tile"
-            )
         return Splats(parameters[parameters[:, LOGIT] > math.log(MIN_OPACITY / (1 - MIN_OPACITY))])
 
+    def _check(self) -> None:
+        """Check that all parameters are finite.
+
+        Raises:
+            StepError: some aren't: the training has diverged.
+        """
+        parts = {
+            "splats": self.descent.parameters,
+            "gains of photos": self.gains.gain,
+            "offsets of photos": self.gains.offset,
+            "texels of the background": self.background.texture.reshape(-1, 3),
+        }
+        broken = {name: int((~np.isfinite(rows).all(axis=1)).sum()) for name, rows in parts.items()}
+        if any(broken.values()):
+            counts = ", ".join(f"{count:,} {name}" for name, count in broken.items() if count)
+            raise StepError("splats", f"the training diverged: {counts} aren't finite", "Report it with the tile")
+
     def save(self, path: Path) -> None:
-        """Write the state, replacing the file at once."""
+        """Write the state, replacing the file at once.
+
+        Raises:
+            StepError: the training has diverged; the file stays as it is.
+        """
+        self._check()
         temporary = path.with_suffix(".partial.npz")
         state: dict[str, Any] = {f"descent_{name}": value for name, value in self.descent.save().items()}
-        state |= {"epoch": self.epoch, "gain": self.gains.gain, "offset": self.gains.offset}
-        np.savez(temporary, **(state | self.background.save()))
+        state |= {f"gains_{name}": value for name, value in self.gains.save().items()}
+        np.savez(temporary, epoch=self.epoch, **(state | self.background.save()))
         temporary.replace(path)
 
     @classmethod
     def load(cls, path: Path) -> Training:
         """Read what `save` wrote."""
         with np.load(path) as state:
-            descent = {name.removeprefix("descent_"): state[name] for name in state if name.startswith("descent_")}
-            gains = Gains(len(state["gain"]))
-            gains.gain, gains.offset = state["gain"], state["offset"]
-            return cls(Descent.load(descent), Background.load(dict(state)), gains, int(state["epoch"]))
-
-
-def _psnr(shown: F32, level: Level) -> float:
-    used = level.weight > 0
-    error = (np.clip(shown, 0, 1) - np.clip(level.rgb, 0, 1))[used]
-    return float(-10 * np.log10(max(np.square(error).mean(dtype=np.float64), 1e-10))) if used.any() else math.nan
+            descent, gains = (
+                {name.removeprefix(prefix): state[name] for name in state if name.startswith(prefix)}
+                for prefix in ("descent_", "gains_")
+            )
+            return cls(Descent.load(descent), Background.load(dict(state)), Gains.load(gains), int(state["epoch"]))

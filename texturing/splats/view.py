@@ -12,6 +12,7 @@ from scan2sim.pipeline.core.splats import SplatLayer
 from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Camera
 from scan2sim.texturing.splats import rasterizer
 from scan2sim.texturing.splats.background import Background, texels
+from scan2sim.texturing.splats.exposure import of_nearest
 from scan2sim.texturing.splats.projection import Pinhole
 from scan2sim.texturing.splats.shots import FACE_ROTATIONS
 
@@ -21,8 +22,6 @@ KEPT_CAMERAS = 16
 """Cameras of which rays are kept between views."""
 WIDEST = 1.5
 """Slope of rays up to which one pinhole image is used for a lens."""
-SOLID = 0.5
-"""Least cover of a pixel that has a depth."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,8 @@ class SplatImage:
 
     Attributes:
         rgb: (H, W, 3) uint8.
-        range: metres along the ray to what covers the pixel (mean, by alpha), inf where it is mostly background.
+        range: metres along the ray to where half of the light is stopped (median), inf where more than half is the
+            background's.
         cover: 0 to 1, 1 less the share of the background.
     """
 
@@ -45,9 +45,16 @@ class SplatRenderer:
 
     def __init__(self, layer: SplatLayer) -> None:
         self._parameters, self._background = layer.splats.parameters, Background(layer.background)
+        self._photos, self._cameras = layer.photos, layer.cameras
 
-    def view(self, camera: Camera, T_world_cam: F64) -> SplatImage:
+    def view(self, camera: Camera, T_world_cam: F64, *, as_photo: str | None = None) -> SplatImage:
         """Render the view of a camera with the pose `T_world_cam` (4, 4).
+
+        Args:
+            camera: any perspective camera.
+            T_world_cam: its pose.
+            as_photo: name of a camera (`photo_cache.camera_of`): with the exposure and vignetting of its nearest photos
+                in the training, or, if it took none, with the exposure of the nearest photos; None: with the world's.
 
         Raises:
             SettingError: the camera is orthographic.
@@ -58,29 +65,34 @@ class SplatRenderer:
             colour, distance, cover = self._pinhole(camera, T_world_cam)
         else:
             colour, distance, cover = self._resampled(camera, T_world_cam)
+        if as_photo is not None:
+            index = self._cameras.index(as_photo) if as_photo in self._cameras else None
+            colour = of_nearest(self._photos, T_world_cam, camera.height, camera.width, index).shown(colour)
         levels = np.clip(np.rint(colour * 255), 0, 255).astype(np.uint8)
-        return SplatImage(levels, np.where(cover > SOLID, distance, np.float32(np.inf)), cover)
+        return SplatImage(levels, distance, cover)
 
     def _pinhole(self, camera: Camera, T_world_cam: F64) -> tuple[F32, F32, F32]:
         """Colour, range and cover of a pinhole view."""
         rays, length = _rays(camera)
         drawn = rasterizer.render(self._parameters, Pinhole.of(camera, T_world_cam))
         colour = drawn.over(self._background.seen(texels(rays @ T_world_cam[:3, :3].T.astype(np.float32))))
-        cover = 1 - drawn.transmittance
-        return colour, np.asarray(drawn.depth / np.maximum(cover, np.float32(1e-6)) * length, np.float32), cover
+        return colour, np.asarray(drawn.depth * length, np.float32), 1 - drawn.transmittance
 
     def _resampled(self, camera: Camera, T_world_cam: F64) -> tuple[F32, F32, F32]:
         """The same of other cameras: each pixel from the pinhole image that its ray passes."""
         import cv2
 
         found = np.zeros((camera.height, camera.width, 5), np.float32)
+        found[..., 4] = np.inf
         for pinhole, rotation, x, y, through in _parts(camera):
             pose = np.asarray(T_world_cam, np.float64).copy()
             pose[:3, :3] = pose[:3, :3] @ rotation
-            image = np.dstack(self._pinhole(pinhole, pose))
-            sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            found[through] = sampled[through]
-        return found[..., :3], found[..., 3], found[..., 4]
+            colour, distance, cover = self._pinhole(pinhole, pose)
+            smooth = cv2.remap(np.dstack([colour, cover]), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            # nothing is at the mean distance of what is before and behind an edge
+            nearest = cv2.remap(distance, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+            found[through] = np.dstack([smooth, nearest])[through]
+        return found[..., :3], found[..., 4], found[..., 3]
 
 
 @lru_cache(KEPT_CAMERAS)

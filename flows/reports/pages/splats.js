@@ -4,8 +4,13 @@
 "use strict";
 
 (() => {
+  const { bytes } = window.scan2sim;
   const WORDS = 8; // 32-bit words of a splat: pipeline/io/worlds/packed_splats.py
   const SPLATS_IN_ROW = 1024; // of the texture, two texels each
+  const SMALL_DEVICE = (navigator.deviceMemory ?? Infinity) <= 4 || matchMedia("(pointer: coarse)").matches; // GB of memory
+  const MAX_SPLATS = SMALL_DEVICE ? 1e6 : 3e6; // of all loaded tiles
+  const MIN_TEXTURE_SIZE = 2048; // texels in each direction that every WebGL 2 has
+  const GREY = new Uint8Array([128, 128, 128, 255]); // background that can't be decoded
   const MAX_PIXELS = 2.1e6; // of the image in which splats are blended; larger canvases show it enlarged
 
   const PROJECT = `#version 300 es
@@ -16,6 +21,7 @@
     uniform mat3 rotation; // from the world to the camera: x right, y down, z ahead
     uniform vec3 eye;
     uniform vec2 focal, size; // pixels
+    uniform float max_colour; // of the largest level; 1 is white
     layout(location = 0) in uint index;
     out vec2 from_centre; // 1 where alpha is MIN_ALPHA
     flat out vec4 colour; // with opacity
@@ -42,7 +48,7 @@
       vec3 centre = rotation * (uintBitsToFloat(first.xyz) - eye);
       float opacity = float(second.y >> 16) / 65535.;
       if (centre.z < NEAR || opacity <= MIN_ALPHA) return;
-      colour = vec4(vec3(uvec3(first.w, first.w >> 10, first.w >> 20) & 1023u) / 1023., opacity);
+      colour = vec4(vec3(uvec3(first.w, first.w >> 10, first.w >> 20) & 1023u) * (max_colour / 1023.), opacity);
       vec3 scale = vec3(unpackHalf2x16(second.x), unpackHalf2x16(second.y & 65535u).x);
       mat3 turned = rotation * axes(normalize(vec4(unpackSnorm2x16(second.z), unpackSnorm2x16(second.w))));
 
@@ -96,6 +102,7 @@
     precision highp float;
     precision highp sampler2D;
     uniform sampler2D image, background; // transmittance is the image's alpha
+    uniform float background_scale; // colour of the background's level 1
     in vec2 at;
     in vec3 ray;
     out vec4 drawn;
@@ -105,29 +112,47 @@
     void main() {
       vec4 splats = texture(image, at);
       vec2 direction = vec2(atan(ray.y, ray.x) / (2. * PI) + .5, .5 - atan(ray.z, length(ray.xy)) / PI);
-      drawn = vec4(splats.rgb + splats.a * texture(background, direction).rgb, 1.);
+      drawn = vec4(splats.rgb + splats.a * background_scale * texture(background, direction).rgb, 1.);
     }`;
 
-  // A worker: receives positions (x, y, z of each splat), then rows [x, y, z, 1] of depth; returns the order by depth.
-  function sorter() {
+  // A worker. It receives tiles: name, positions (x, y, z of each splat) and rows of the texture; names of tiles to drop;
+  // and rows [x, y, z, 1] of depth, to which it returns the splats' indices in the texture, sorted by depth.
+  function sorter(splats_in_row) {
     const LEVELS = 65536; // 4096 an octave, from 1/8 m
     const FIRST = (127 - 3) * 4096; // level of 1/8 m: a float's upper bits are a logarithm
-    let xyz = new Float32Array(0), depth = new Float32Array(1), bits = new Int32Array(depth.buffer), levels = new Uint16Array(0);
-    self.onmessage = ({ data }) => {
-      if (data.xyz) {
-        xyz = data.xyz;
-        levels = new Uint16Array(xyz.length / 3);
-        return;
-      }
-      const [a, b, c, d] = data.row, next = new Uint32Array(LEVELS + 1), order = new Uint32Array(levels.length);
-      for (let i = 0; i < levels.length; i++) {
-        depth[0] = a * xyz[3 * i] + b * xyz[3 * i + 1] + c * xyz[3 * i + 2] + d;
-        levels[i] = Math.min(LEVELS - 1, Math.max(0, (bits[0] >> 11) - FIRST));
-        next[levels[i] + 1]++;
+    const tiles = new Map(), depth = new Float32Array(1), bits = new Int32Array(depth.buffer);
+    let levels = new Uint16Array(0); // of all splats, tile by tile
+
+    function sort([a, b, c, d]) {
+      const next = new Uint32Array(LEVELS + 1), order = new Uint32Array(levels.length);
+      let at = 0;
+      for (const { xyz } of tiles.values()) {
+        for (let i = 0; i < xyz.length; i += 3) {
+          depth[0] = a * xyz[i] + b * xyz[i + 1] + c * xyz[i + 2] + d;
+          const level = Math.min(LEVELS - 1, Math.max(0, (bits[0] >> 11) - FIRST));
+          levels[at++] = level;
+          next[level + 1]++;
+        }
       }
       for (let k = 0; k < LEVELS; k++) next[k + 1] += next[k];
-      for (let i = 0; i < levels.length; i++) order[next[levels[i]]++] = i;
-      self.postMessage({ order, version: data.version }, [order.buffer]);
+      at = 0;
+      for (const { xyz, rows } of tiles.values()) {
+        for (let i = 0; i < xyz.length / 3; i++) {
+          order[next[levels[at++]]++] = rows[Math.floor(i / splats_in_row)] * splats_in_row + (i % splats_in_row);
+        }
+      }
+      return order;
+    }
+
+    self.onmessage = ({ data }) => {
+      if (data.row) {
+        const order = sort(data.row);
+        self.postMessage({ order, version: data.version }, [order.buffer]);
+        return;
+      }
+      if (data.xyz) tiles.set(data.name, data);
+      else tiles.delete(data.name);
+      levels = new Uint16Array([...tiles.values()].reduce((sum, { xyz }) => sum + xyz.length / 3, 0));
     };
   }
 
@@ -155,6 +180,18 @@
     return made;
   }
 
+  // Decode an image without colour management, or as the browser can; null if it can't.
+  async function decode(blob) {
+    for (const options of [[{ colorSpaceConversion: "none", premultiplyAlpha: "none" }], []]) {
+      try {
+        return await createImageBitmap(blob, ...options);
+      } catch (error) {
+        console.warn(`background of the splats: ${error.message}`);
+      }
+    }
+    return null;
+  }
+
   // A camera of three.js: rotation (rows) from the world to x right, y down, z ahead; eye; slopes of the image's edges.
   function seen(camera) {
     camera.updateMatrixWorld();
@@ -163,24 +200,37 @@
     return { rows, eye: [m[12], m[13], m[14]], slope: [1 / p[0], 1 / p[5]] };
   }
 
-  // All splats that are loaded, of one tile or several. Sorting takes a while: an order is used until the next one is there.
+  // All splats that are loaded, of one tile or several, in rows of a texture. Sorting takes a while: an order, and the rows
+  // that it refers to, are used until the next one is there.
   class Splats {
-    // renderer: of three.js; changed: called when there is something new to draw
-    constructor(renderer, changed) {
+    // Number of rows of the texture that a tile needs.
+    static rows_of(splats) {
+      return Math.ceil(splats / SPLATS_IN_ROW);
+    }
+
+    // renderer: of three.js; counts: numbers of splats of all tiles; changed: called when there is something new to draw
+    constructor(renderer, counts, changed) {
       this.renderer = renderer;
       this.gl = renderer.getContext();
       this.changed = changed;
-      this.tiles = new Map(); // name to the splats' words and the background as a Blob
+      const all = counts.reduce((sum, count) => sum + Splats.rows_of(count), 0);
+      this.rows = Math.min(all, Splats.rows_of(MAX_SPLATS), this.gl.getParameter(this.gl.MAX_TEXTURE_SIZE) || MIN_TEXTURE_SIZE);
+      this.free = Array.from({ length: this.rows }, (_, k) => this.rows - 1 - k); // rows that no tile has
+      this.tiles = new Map(); // name to the splats' words, their rows and the background
       this.version = 0; // of the tiles
-      this.next = null; // of the newest tiles: names, words, rows of the texture; until they are sorted
-      this.shown = new Set(); // names of the tiles in the texture
+      this.pending = new Set(); // names of the tiles to upload with the next order: until then, their rows may be in use
+      this.shown = new Set(); // names of the tiles in the order that is drawn
+      this.row = []; // of depth, as drawn last
       this.sorted = { version: 0, row: [] }; // of the last request
       this.waiting = false; // for an order
-      this.source = this.blob = null; // background that is drawn, and that is to be drawn, as Blobs
+      this.source = this.wanted = null; // background that is drawn, and that is to be drawn
+      this.background_scale = this.max_colour = 1;
       this.count = 0; // of the splats that are drawn
       this.size = [0, 0]; // of the image in which they are blended
-      this.worker = new Worker(URL.createObjectURL(new Blob([`(${sorter})()`])));
-      this.worker.onmessage = ({ data }) => this.take_order(data);
+      const url = URL.createObjectURL(new Blob([`(${sorter})(${SPLATS_IN_ROW})`]));
+      this.worker = new Worker(url);
+      this.worker.addEventListener("message", () => URL.revokeObjectURL(url), { once: true });
+      this.worker.addEventListener("message", ({ data }) => this.take_order(data));
       this.use_webgl((gl) => this.prepare(gl));
       renderer.domElement.addEventListener("webglcontextrestored", () => this.restore()); // phones lose it in the background
     }
@@ -188,10 +238,12 @@
     // Make again what was lost with the WebGL context.
     restore() {
       this.shown = new Set();
-      this.source = this.blob = null;
+      this.pending = new Set(this.tiles.keys());
+      this.source = this.wanted = null;
       this.size = [0, 0];
       this.use_webgl((gl) => this.prepare(gl));
-      this.join_tiles();
+      this.version++;
+      this.changed();
     }
 
     // Use WebGL: three.js, which remembers the state, finds and leaves the default state.
@@ -208,6 +260,7 @@
       this.blending = program(gl, PROJECT, KERNEL);
       this.covering = program(gl, COVER, OVER);
       this.texture = texture(gl, gl.NEAREST, gl.CLAMP_TO_EDGE);
+      gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, 2 * SPLATS_IN_ROW, this.rows);
       this.background = texture(gl, gl.LINEAR, gl.REPEAT);
       this.image = texture(gl, gl.LINEAR, gl.CLAMP_TO_EDGE);
       this.frame = gl.createFramebuffer();
@@ -220,16 +273,33 @@
       gl.vertexAttribDivisor(0, 1);
     }
 
-    // Add a tile: bytes of its splats and of the JPEG of its background, and its offset in metres.
-    put(name, packed, jpeg, offset = [0, 0, 0]) {
-      const words = new Uint32Array(packed.buffer), xyz = new Float32Array(packed.buffer);
-      for (let i = 0; i < xyz.length; i += WORDS) for (let k = 0; k < 3; k++) xyz[i + k] += offset[k];
-      this.tiles.set(name, { words, background: new Blob([jpeg], { type: "image/jpeg" }) });
-      this.join_tiles();
+    // Add a tile: what its script passes (pipeline/io/worlds/packed_splats.py), and its offset in metres. It is drawn as soon
+    // as it is sorted.
+    put(name, [packed, jpeg, max_colour, background_scale], offset = [0, 0, 0]) {
+      this.drop(name);
+      const { buffer } = bytes(packed), words = new Uint32Array(buffer), floats = new Float32Array(buffer);
+      const count = words.length / WORDS, needed = Splats.rows_of(count), xyz = new Float32Array(3 * count);
+      if (needed > this.free.length) throw new Error(`${count} splats are too many for this device`);
+      for (let i = 0; i < count; i++) for (let k = 0; k < 3; k++) xyz[3 * i + k] = floats[WORDS * i + k] += offset[k];
+      const rows = Array.from({ length: needed }, () => this.free.pop());
+      this.tiles.set(name, { words, rows, background: { blob: new Blob([bytes(jpeg)], { type: "image/jpeg" }), scale: background_scale } });
+      this.max_colour = max_colour; // the same of all tiles
+      this.pending.add(name);
+      this.worker.postMessage({ name, xyz, rows }, [xyz.buffer]);
+      this.version++;
+      this.changed();
     }
 
+    // Remove a tile, if it was added.
     drop(name) {
-      if (this.tiles.delete(name)) this.join_tiles();
+      const tile = this.tiles.get(name);
+      if (!tile) return;
+      this.tiles.delete(name);
+      this.pending.delete(name);
+      this.free.push(...tile.rows);
+      this.worker.postMessage({ name });
+      this.version++;
+      this.changed();
     }
 
     // Whether a tile was added, and whether it is drawn already.
@@ -241,70 +311,66 @@
       return this.shown.has(name);
     }
 
-    // Whether the last image is final: nothing is loaded or sorted any more.
-    get settled() {
-      return !this.waiting && !this.next && this.source !== null && this.source === this.blob;
+    // Whether the order of the last row of depth and the newest tiles was requested.
+    get requested() {
+      return this.sorted.version === this.version && this.row.every((value, k) => value === this.sorted.row[k]);
     }
 
-    // Join all tiles; they are drawn as soon as they are sorted.
-    join_tiles() {
-      const all = [...this.tiles.values()], count = all.reduce((sum, { words }) => sum + words.length / WORDS, 0);
-      const rows = Math.max(1, Math.ceil(count / SPLATS_IN_ROW)), words = new Uint32Array(rows * SPLATS_IN_ROW * WORDS);
-      let at = 0;
-      for (const tile of all) {
-        words.set(tile.words, at);
-        at += tile.words.length;
-      }
-      const places = new Float32Array(words.buffer), xyz = new Float32Array(3 * count);
-      for (let i = 0; i < count; i++) for (let k = 0; k < 3; k++) xyz[3 * i + k] = places[WORDS * i + k];
-      this.version++;
-      this.next = { names: new Set(this.tiles.keys()), words, rows };
-      this.worker.postMessage({ xyz }, [xyz.buffer]);
-      this.changed();
+    // Whether the last image is final: nothing is loaded or sorted any more.
+    get settled() {
+      return !this.waiting && this.requested && this.source !== null && this.source === this.wanted;
     }
 
     // Have the splats sorted by a row of depth, unless they are, or are being sorted.
     sort(row) {
-      const same = this.sorted.version === this.version && row.every((value, k) => value === this.sorted.row[k]);
-      if (same || this.waiting || !this.version) return;
+      this.row = row;
+      if (this.waiting || this.requested || !this.version) return;
       this.waiting = true;
       this.sorted = { version: this.version, row };
       this.worker.postMessage(this.sorted);
     }
 
-    // Take an order from the worker, with the tiles that it is of.
+    // Copy a tile's splats into its rows of the texture.
+    upload(gl, { words, rows }) {
+      gl.bindTexture(gl.TEXTURE_2D, this.texture);
+      rows.forEach((row, k) => {
+        const first = k * SPLATS_IN_ROW * WORDS, width = Math.min(2 * SPLATS_IN_ROW, (words.length - first) / 4);
+        gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, width, 1, gl.RGBA_INTEGER, gl.UNSIGNED_INT, words, first);
+      });
+    }
+
+    // Take an order from the worker, and upload the tiles that are new in it.
     take_order({ order, version }) {
       this.waiting = false;
       if (version === this.version) {
         this.use_webgl((gl) => {
-          if (this.next) {
-            gl.bindTexture(gl.TEXTURE_2D, this.texture);
-            gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32UI, 2 * SPLATS_IN_ROW, this.next.rows, 0, gl.RGBA_INTEGER, gl.UNSIGNED_INT, this.next.words);
-          }
+          for (const name of this.pending) this.upload(gl, this.tiles.get(name));
           gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
           gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
         });
         this.count = order.length;
-        if (this.next) this.shown = this.next.names;
-        this.next = null;
+        this.shown = new Set(this.tiles.keys());
+        this.pending.clear();
       }
       this.changed();
     }
 
-    // Load the background of a tile, unless it is loaded or being loaded.
-    async load_background(blob) {
-      if (!blob || blob === this.blob) return;
-      this.blob = blob;
-      const image = await createImageBitmap(blob, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
-      if (blob === this.blob) {
+    // Load the background of a tile, unless it is loaded or being loaded; grey if it can't be decoded.
+    async load_background(background) {
+      if (!background || background === this.wanted) return;
+      this.wanted = background;
+      const image = await decode(background.blob);
+      if (background === this.wanted) {
         this.use_webgl((gl) => {
           gl.bindTexture(gl.TEXTURE_2D, this.background);
-          gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
+          if (image) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
+          else gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, GREY);
         });
-        this.source = blob;
+        this.background_scale = image ? background.scale : 1;
+        this.source = background;
         this.changed();
       }
-      image.close();
+      image?.close();
     }
 
     // Fill the canvas with what a camera sees, before the background of a tile; false: nothing can be drawn yet.
@@ -347,6 +413,7 @@
       gl.uniform3fv(at("eye"), eye);
       gl.uniform2f(at("focal"), width / 2 / slope[0], height / 2 / slope[1]);
       gl.uniform2f(at("size"), width, height);
+      gl.uniform1f(at("max_colour"), this.max_colour);
       gl.bindTexture(gl.TEXTURE_2D, this.texture);
       gl.bindVertexArray(this.vertices);
       gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
@@ -364,6 +431,7 @@
       gl.uniform2fv(at("slope"), slope);
       gl.uniform1i(at("image"), 0);
       gl.uniform1i(at("background"), 1);
+      gl.uniform1f(at("background_scale"), this.background_scale);
       gl.bindTexture(gl.TEXTURE_2D, this.image);
       gl.activeTexture(gl.TEXTURE1);
       gl.bindTexture(gl.TEXTURE_2D, this.background);

@@ -5,12 +5,11 @@
 
 (() => {
   const MAX_TEXELS = 320e6; // texture memory of all loaded tiles; above it the farthest are unloaded
-  const MAX_SPLATS = 3e6; // of all loaded tiles, likewise
   const DISTANCE_COLOURS = [[0, "#30123b"], [5, "#4686fb"], [10, "#1ae4b6"], [20, "#a4fc3c"], [35, "#fb7e21"], [60, "#7a0403"]]; // metres
   const NO_PHOTO_COLOUR = "#8a8f96";
   const SPLATS = "_splats", COLLISION = "_collision"; // after a tile's name: its scripts
   const FIRST_PHOTO_ROW = 3; // row of the first photo in a GLB's table; rows 0 to 2: inpainted, point cloud, unknown photo
-  const { Splats, View, bytes, load, meshes } = window.scan2sim;
+  const { Splats, View, load, meshes } = window.scan2sim;
 
   // Patch a material: where `tinted` is 1, each vertex has a colour that is modulated by the texture's brightness.
   function tintable(material, tinted) {
@@ -47,7 +46,8 @@
       this.colours = "photo";
       this.shown = { wireframe: false, collision: false };
       this.loaded = new Map(); // script name to the meshes and state of what it loaded
-      if (about.splats) this.splats = new Splats(this.renderer, () => (this.stale = true));
+      this.texels = new Map(); // tile name to its texels, once they are known; also of dropped tiles
+      if (about.splats) this.splats = new Splats(this.renderer, about.tiles.map(({ splats }) => splats), () => (this.stale = true));
       this.wires = new THREE.MeshBasicMaterial({ color: 0x0a1018, wireframe: true, transparent: true, opacity: 0.45, depthWrite: false });
       this.loop();
     }
@@ -60,27 +60,38 @@
     }
 
     async loop() {
-      for (;;) {
-        const next = this.next();
-        if (next) await this.fetch(...next).catch((error) => this.say(error.message));
-        else await new Promise((done) => setTimeout(done, 300));
-        if (this.failed) return;
+      try {
+        for (;;) {
+          const next = this.next();
+          if (next) await this.fetch(...next);
+          else await new Promise((done) => setTimeout(done, 300));
+        }
+      } catch (error) {
+        this.say(error.message);
       }
+    }
+
+    // The nearest tiles that fit into memory, and whether their splats do, if splats are shown; drops the others.
+    fitting() {
+      let texels = MAX_TEXELS, rows = this.splats?.rows ?? 0;
+      const kept = [];
+      for (const tile of this.nearest()) {
+        texels -= this.texels.get(tile.name) ?? 0;
+        if (texels < 0) { this.drop(tile.name); continue; }
+        const needed = this.splatted && tile.splats ? Splats.rows_of(tile.splats) : 0;
+        const possible = needed > 0 && needed <= this.splats.rows; // else the tile shows its surfaces
+        if (possible) rows -= needed;
+        if (possible && rows < 0) this.splats.drop(tile.name);
+        kept.push({ tile, splats: possible && rows >= 0 });
+      }
+      return kept;
     }
 
     // Tile and name of the script to load next: visible meshes first, then splats and collision meshes if they are shown.
     next() {
-      let texels = MAX_TEXELS, splats = MAX_SPLATS;
-      for (const tile of this.nearest()) {
-        const held = this.loaded.get(tile.name);
-        texels -= held?.texels ?? 0;
-        if (texels < 0) { this.drop(tile.name); continue; }
-        if (!held) return [tile, tile.name];
-        if (this.splatted && tile.splats) {
-          splats -= tile.splats;
-          if (splats < 0) this.splats.drop(tile.name);
-          else if (!this.splats.has(tile.name)) return [tile, `${tile.name}${SPLATS}`];
-        }
+      for (const { tile, splats } of this.fitting()) {
+        if (!this.loaded.has(tile.name)) return [tile, tile.name];
+        if (splats && !this.splats.has(tile.name)) return [tile, `${tile.name}${SPLATS}`];
         if (this.shown.collision && tile !== this.about.dome && !this.loaded.has(`${tile.name}${COLLISION}`)) return [tile, `${tile.name}${COLLISION}`];
       }
       this.say(this.loaded.size ? "" : "Loading …");
@@ -90,19 +101,16 @@
     async fetch(tile, name) {
       this.say(`Loading ${name} …`);
       const got = new Promise((done) => (window.scan2simTile = (of, ...parts) => of === name && done(parts)));
-      try {
-        await load("tiles", [`${name}.js`]);
-      } catch (error) {
-        this.failed = true;
-        throw error;
-      }
+      await load("tiles", [`${name}.js`]);
       const parts = await got;
-      if (name === `${tile.name}${SPLATS}`) return this.splats.put(tile.name, ...parts.map(bytes), tile.offset);
+      window.scan2simTile = null; // it holds the parts
+      if (name === `${tile.name}${SPLATS}`) return this.splats.put(tile.name, parts, tile.offset);
       const found = await meshes(parts[0], tile.offset);
       const solid = name !== tile.name;
       const texels = found.reduce((sum, { material }) => sum + (material.map ? material.map.image.width * material.map.image.height : 0), 0);
       for (const mesh of found) this.prepare_mesh(mesh, solid);
-      this.loaded.set(name, { tile, solid, texels, meshes: found });
+      if (!solid) this.texels.set(name, texels);
+      this.loaded.set(name, { tile, solid, meshes: found });
       if (solid) this.scene.add(...found);
       else this.put(name, found, tile !== this.about.dome);
       this.update_tile(name);

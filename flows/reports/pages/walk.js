@@ -20,14 +20,24 @@
       await new Promise((done, fail) => {
         const script = document.createElement("script");
         script.src = `${folder}/${name}`;
-        script.onload = done;
-        script.onerror = () => fail(new Error(`${folder}/${name} isn't beside this page`));
+        const end = (then) => () => {
+          script.remove(); // frees the data in it
+          then();
+        };
+        script.onload = end(done);
+        script.onerror = end(() => fail(new Error(`${folder}/${name} isn't beside this page`)));
         document.head.append(script);
       });
     }
   }
 
-  const bytes = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+  // Bytes of a base64 string; Uint8Array.from would need many times their memory.
+  function bytes(base64) {
+    if (Uint8Array.fromBase64) return Uint8Array.fromBase64(base64);
+    const letters = atob(base64), decoded = new Uint8Array(letters.length);
+    for (let i = 0; i < decoded.length; i++) decoded[i] = letters.charCodeAt(i);
+    return decoded;
+  }
 
   // Unlit meshes of a GLB, converted to z up as in the simulator and moved by an offset in metres.
   async function meshes(base64, offset = [0, 0, 0]) {
@@ -259,12 +269,13 @@
 
   // Load the splats, show them, and connect the buttons that choose between them and the surfaces.
   async function add_splats(box, view) {
-    const [packed, jpeg] = await new Promise((got, fail) => {
-      window.scan2simSplats = (...parts) => got(parts.map(bytes));
+    const parts = await new Promise((got, fail) => {
+      window.scan2simSplats = (...given) => got(given);
       load(box.dataset.folder, ["splats.js", "splats_data.js"]).catch(fail);
     });
-    view.splats = new window.scan2sim.Splats(view.renderer, () => (view.stale = true));
-    view.splats.put("world", packed, jpeg);
+    window.scan2simSplats = null; // it holds the parts
+    view.splats = new window.scan2sim.Splats(view.renderer, [view.about.splats], () => (view.stale = true));
+    view.splats.put("world", parts);
     const buttons = box.querySelectorAll("[data-show]");
     const show = (what) => {
       view.splatted = what === "splats";

@@ -35,7 +35,7 @@ def add(stage: Any, root: Any, splats: Splats, scopes: tuple[str, ...]) -> None:
         "orientations": _quaternions(splats),
         "opacities": Vt.FloatArray.FromNumpy(np.ascontiguousarray(splats.opacity)),
         "radiance:sphericalHarmonicsCoefficients": Vt.Vec3fArray.FromNumpy(
-            ((splats.rgb - 0.5) / SH_C0).astype(np.float32)
+            ((splats.display_rgb - 0.5) / SH_C0).astype(np.float32)
         ),
         "radiance:sphericalHarmonicsDegree": 0,
         "extent": Vt.Vec3fArray.FromNumpy(_extent(splats)),

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("gsply", reason="the extra splats isn't installed")
 
-from scan2sim.pipeline.core.errors import SettingError
-from scan2sim.pipeline.core.splats import SplatLayer, Splats
+from scan2sim.pipeline.core import splats as layers
+from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.splats import MAX_COLOUR, MIN_COLOUR, PHOTO_WIDTH, RGB, SplatLayer, Splats
 from scan2sim.pipeline.io import splat_files
 from scan2sim.pipeline.io.worlds.gltf import splats as gltf
 
@@ -58,10 +59,34 @@ def test_spz_is_small(tmp_path: Path) -> None:
     assert (tmp_path / "a.spz").stat().st_size < 0.35 * (tmp_path / "a.ply").stat().st_size
 
 
+@pytest.mark.parametrize(("away", "metres"), [(2040.0, 6e-4), (3000.0, 1e-3), (20_000.0, 5e-3)])
+def test_spz_holds_positions_far_from_the_origin(tmp_path: Path, away: float, metres: float) -> None:
+    """As finely as it can: half a step, and that of the 32-bit floats which are written and read."""
+    given, offset = some(), np.array([away, 0, 0])
+    splat_files.write(tmp_path / "a.spz", given, offset)
+    assert np.abs(splat_files.read(tmp_path / "a.spz").xyz - (given.xyz + offset)).max() < metres
+
+
 def test_positions_beyond_spz_are_rejected(tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match="Write PLY"):
-        splat_files.write(tmp_path / "a.spz", some(), np.array([5000.0, 0, 0]))
+    with pytest.raises(SettingError, match=r"32,768 m.*Write PLY"):
+        splat_files.write(tmp_path / "a.spz", some(), np.array([32_760.0, 0, 0]))
     assert not (tmp_path / "a.spz").exists()
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".glb"])
+def test_what_is_brighter_than_white_is_white_in_files(tmp_path: Path, suffix: str) -> None:
+    given = some()
+    given.parameters[:, RGB] *= 2
+    given.parameters[:5, RGB] = MIN_COLOUR
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".glb":
+        gltf.write(path, given, OFFSET)
+        harmonic = accessors(path)[1]["KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"]
+        rgb = np.asarray(harmonic * splat_files.SH_C0 + 0.5, np.float32)
+    else:
+        splat_files.write(path, given, OFFSET)
+        rgb = splat_files.read(path).rgb
+    assert (given.rgb > 1.2).any() and np.abs(rgb - np.clip(given.rgb, 0, 1)).max() < 0.02
 
 
 def accessors(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -101,11 +126,32 @@ def test_gltf_has_the_same_ellipsoids_with_y_up(tmp_path: Path) -> None:
 
 
 def test_a_layer_is_stored_and_read(tmp_path: Path) -> None:
-    background = np.random.default_rng(1).uniform(size=(8, 16, 3)).astype(np.float32)
-    SplatLayer(some(), background).save(tmp_path / "a.npz")
+    random = np.random.default_rng(1)
+    background = random.uniform(MIN_COLOUR, MAX_COLOUR, size=(8, 16, 3)).astype(np.float32)
+    photos = random.uniform(size=(3, PHOTO_WIDTH)).astype(np.float32)
+    SplatLayer(some(), background, photos, ("left_1242x375", "rück_640x480")).save(tmp_path / "a.npz")
     read = SplatLayer.load(tmp_path / "a.npz")
     assert np.array_equal(read.splats.parameters, some().parameters)
-    assert np.abs(read.background - background).max() < 0.002
+    assert np.abs(read.background - background).max() < 0.001 and np.array_equal(read.photos, photos)
+    assert read.cameras == ("left_1242x375", "rück_640x480") and SplatLayer.count(tmp_path / "a.npz") == len(some())
+
+
+def test_a_layer_of_an_earlier_version_is_read(tmp_path: Path) -> None:
+    background = np.random.default_rng(1).integers(0, 256, (8, 16, 3)).astype(np.uint8)
+    np.savez_compressed(tmp_path / "a.npz", parameters=some().parameters, background=background)
+    read = SplatLayer.load(tmp_path / "a.npz")
+    assert np.allclose(read.background * 255, background, atol=1e-3) and not len(read.photos) and not read.cameras
+
+
+@pytest.mark.parametrize(("version", "remedy"), [(2, "Run again"), (layers.VERSION + 1, "Update scan2sim")])
+def test_a_layer_of_an_unknown_version_is_rejected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: int, remedy: str
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(layers, "VERSION", version)
+        SplatLayer.nothing().save(tmp_path / "a.npz")
+    with pytest.raises(InputError, match=f"version {version}.*{remedy}"):
+        SplatLayer.load(tmp_path / "a.npz")
 
 
 def test_the_background_becomes_a_shell_of_its_colours() -> None:

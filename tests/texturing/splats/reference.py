@@ -2,56 +2,99 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scan2sim.pipeline.core.types import F64, Camera
 
-LOW_PASS, MAX_ALPHA, MAX_DEVIATION = 0.3, 0.99, 0.2
+LOW_PASS, MAX_ALPHA, MAX_DEVIATION, MIN_COS, HALF = 0.3, 0.99, 0.2, 0.01, 0.5
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Images (H, W).
+
+    Attributes:
+        colour: (H, W, 3) times alpha.
+        deviation: relative deviation of the inverse depth from the known one, times alpha; 0 where none is known.
+        depth: metres to where half of the light is stopped, inf where more is left.
+        transmittance: what is left.
+    """
+
+    colour: F64
+    deviation: F64
+    depth: F64
+    transmittance: F64
 
 
 def render(
     parameters: F64, camera: Camera, T_world_cam: F64, least: float = 0, base: F64 | None = None,
     known: F64 | None = None,
-) -> tuple[F64, F64, F64]:  # fmt: skip
-    """Colour times alpha (H, W, 3), depth times alpha (H, W) and transmittance (H, W) of splats (N, 14).
+) -> Drawn:  # fmt: skip
+    """Render splats (N, 14).
 
-    A splat has no effect on pixels where its alpha is below `least`. Where `known` (H, W) is more than 0, the depth is
-    its relative deviation from that. With `base`, the parameters (N, 14) without a small change, these pixels, and how
-    the depth changes within a splat, are those of `base`: gradients don't contain their changes.
+    A splat has no effect on pixels where its alpha is below `least`. `known` (H, W) are known depths, metres, or 0.
+    With `base`, the parameters (N, 14) without a small change, these pixels, and the slope of the inverse depth within
+    a splat, and its limits, are those of `base`: gradients don't contain their changes.
     """
     T = np.asarray(np.linalg.inv(T_world_cam), np.float64)
     shape = camera.height, camera.width
-    colour, depth, through = np.zeros((*shape, 3)), np.zeros(shape), np.ones(shape)
+    colour, deviation, through = np.zeros((*shape, 3)), np.zeros(shape), np.ones(shape)
+    depth = np.full(shape, np.inf)
     expected = np.zeros(shape) if known is None else known
     distance = (parameters[:, :3] @ T[:3, :3].T + T[:3, 3])[:, 2]
     for i in np.argsort(distance, kind="stable"):
         if distance[i] < 0.2:
             continue
-        alpha, before = _alpha(parameters[i], camera, T)
-        same, nearer = (alpha, before) if base is None else _alpha(base[i], camera, T)
-        alpha = np.where(same < least, 0, alpha)
-        z = distance[i] + nearer
-        deviation = np.minimum(np.abs(z - expected) / np.maximum(expected, 0.2), MAX_DEVIATION)
+        same = parameters[i] if base is None else base[i]
+        alpha = np.where(_alpha(same, camera, T) < least, 0, _alpha(parameters[i], camera, T))
+        inverse = _inverse_depth(parameters[i], same, camera, T)
         weight = alpha * through
         colour += weight[..., None] * parameters[i, 11:14]
-        depth += weight * np.where(expected > 0, deviation, z)
+        deviation += weight * np.minimum(np.abs(inverse * expected - 1), MAX_DEVIATION) * (expected > 0)
+        crossed = (through > HALF) & (through - weight <= HALF)
+        depth[crossed] = 1 / inverse[crossed]
         through = through - weight
-    return colour, depth, through
+    return Drawn(colour, deviation, depth, through)
 
 
-def _alpha(parameters: F64, camera: Camera, T_cam_world: F64) -> tuple[F64, F64]:
-    """(H, W) alpha of a splat (14,), and by how much its depth there is more than in its centre, metres.
+def _offsets(parameters: F64, camera: Camera, T_cam_world: F64) -> F64:
+    """(H, W, 2) pixels from a splat's centre in the image."""
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    x, y, z = T_cam_world[:3, :3] @ parameters[:3] + T_cam_world[:3, 3]
+    return np.stack([u - (camera.fx * x / z + camera.cx), v - (camera.fy * y / z + camera.cy)], axis=-1)
 
-    The latter is the mean of the splat's depth along the pixel's ray: a Gaussian's conditional expectation.
-    """
-    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+
+def _axes(parameters: F64, T_cam_world: F64) -> F64:
+    """(3, 3) axes of a splat in columns, in camera axes."""
+    return np.asarray(T_cam_world[:3, :3] @ Rotation.from_quat(parameters[[7, 8, 9, 6]]).as_matrix())
+
+
+def _alpha(parameters: F64, camera: Camera, T_cam_world: F64) -> F64:
+    """(H, W) alpha of a splat (14,)."""
     cx, cy, z = T_cam_world[:3, :3] @ parameters[:3] + T_cam_world[:3, 3]
-    axes = T_cam_world[:3, :3] @ Rotation.from_quat(parameters[[7, 8, 9, 6]]).as_matrix() * np.exp(parameters[3:6])
     J = np.array([[camera.fx / z, 0, -camera.fx * cx / z**2], [0, camera.fy / z, -camera.fy * cy / z**2]])
-    M = J @ axes
+    M = J @ (_axes(parameters, T_cam_world) * np.exp(parameters[3:6]))
     inverse = np.linalg.inv(M @ M.T + LOW_PASS * np.eye(2))
-    d = np.stack([x - (camera.fx * cx / z + camera.cx), y - (camera.fy * cy / z + camera.cy)], axis=-1)
+    d = _offsets(parameters, camera, T_cam_world)
     square = np.einsum("hwi,ij,hwj->hw", d, inverse, d)
-    alpha = np.asarray(np.minimum(np.exp(-square / 2) / (1 + np.exp(-parameters[10])), MAX_ALPHA))
-    return alpha, np.asarray(d @ (inverse @ M @ axes[2]))
+    return np.asarray(np.minimum(np.exp(-square / 2) / (1 + np.exp(-parameters[10])), MAX_ALPHA))
+
+
+def _inverse_depth(parameters: F64, base: F64, camera: Camera, T_cam_world: F64) -> F64:
+    """(H, W) inverse depth of a splat (14,): that of the plane n r = n c through its centre c, where it is flat.
+
+    n is its shortest axis; the ray through a pixel is r = (x / z, y / z, 1). Slope and limits are those of `base`.
+    """
+    centre = T_cam_world[:3, :3] @ base[:3] + T_cam_world[:3, 3]
+    shortest, middle, _ = np.argsort(base[3:6])
+    normal = _axes(base, T_cam_world)[:, shortest]
+    roundness = np.exp(base[3 + shortest] - base[3 + middle]) ** 4
+    along = normal @ centre
+    factor = (1 - roundness) * along / (along**2 + MIN_COS**2 * (centre @ centre))
+    slope = factor * normal[:2] / (camera.fx, camera.fy)
+    z = (T_cam_world[:3, :3] @ parameters[:3] + T_cam_world[:3, 3])[2]
+    here = 1 / z + _offsets(parameters, camera, T_cam_world) @ slope
+    return np.clip(here, 0.5 / centre[2], 1.5 / centre[2])

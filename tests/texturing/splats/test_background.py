@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from scan2sim.pipeline.core.splats import MAX_COLOUR, MIN_COLOUR
 from scan2sim.texturing.splats import background
 from scan2sim.texturing.splats.background import HEIGHT_PX, WIDTH_PX, Background, texels
 
@@ -43,6 +44,21 @@ def test_a_step_goes_against_the_derivative_and_leaves_what_was_not_seen() -> No
         sky.descend(at, sky.seen(at) - np.array([0.7, 0.5, 0.1], np.float32), 0.02)
     assert np.allclose(sky.seen(at), [0.7, 0.5, 0.1], atol=0.02)
     assert (sky.texture != texture).any(axis=-1).sum() < 4 * at.shape[0] * at.shape[1]
+
+
+def test_colours_end_where_those_of_splats_do() -> None:
+    """Files hold no others: what is shown would differ from what was trained."""
+    sky = Background(np.full((HEIGHT_PX, WIDTH_PX, 3), 0.5, np.float32))
+    at = texels(directions(1))
+    away = np.broadcast_to(np.array([1, -1, 0], np.float32), (*at.shape[:2], 3))
+    for _ in range(4):
+        sky.descend(at, away, 2.0)
+    limits = np.array([MIN_COLOUR, MAX_COLOUR], np.float32)
+    assert sky.texture[..., 0].min() == limits[0] and sky.texture[..., 1].max() == limits[1]
+    assert np.allclose(sky.seen(at), [*limits, 0.5], atol=0.2)
+    sky.recolour(np.full(3, 2, np.float32), np.full(3, -0.1, np.float32))
+    assert sky.texture.min() == limits[0] and sky.texture.max() == limits[1]
+    assert np.allclose(sky.texture[..., 2], 0.9)
 
 
 def test_a_saved_background_continues_as_it_would_have() -> None:

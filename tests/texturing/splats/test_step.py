@@ -17,7 +17,7 @@ from scan2sim.texturing.evaluate import psnr
 from scan2sim.texturing.splats import step as splats_step
 from scan2sim.texturing.splats.step import SplatsParams, splats
 from scan2sim.texturing.splats.view import SplatRenderer
-from tests.texturing.facade_street import HELD_OUT, SCANNED, FacadeDrive
+from tests.texturing.facade_street import HELD_OUT, NUMBER, SCANNED, FacadeDrive
 
 PARAMS = SplatsParams(epochs=(4, 6, 0))
 
@@ -47,6 +47,7 @@ def test_the_whole_frame_of_a_held_out_photo_is_shown(drive: FacadeDrive, layer:
     photo = image.read_rgb(view.photo)
     scanned = Renderer(SCANNED).view(view.camera, view.T_world_cam, background=(200, 214, 230), samples=2).rgb
     shown = SplatRenderer(layer).view(view.camera, view.T_world_cam).rgb
+    assert len(layer.photos) == NUMBER - 1, "the response of each photo of the training is stored"
     assert error_db(shown, photo) > max(22, error_db(scanned, photo) + 8)
 
 

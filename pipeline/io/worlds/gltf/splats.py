@@ -32,7 +32,8 @@ def write(path: Path, splats: Splats, offset: F64) -> None:
     builder.use(EXTENSION)
     turned = splats.y_up()
     xyz = np.ascontiguousarray(turned.xyz)
-    fallback = np.hstack([_linear(splats.rgb), splats.opacity[:, None]])
+    rgb = splats.display_rgb
+    fallback = np.hstack([_linear(rgb), splats.opacity[:, None]])
     colours = np.clip(np.rint(fallback * 255), 0, 255).astype(np.uint8)
     attributes = {
         "POSITION": builder.accessor(xyz, builder.view(xyz.tobytes(), target=VERTICES), bounds=True),
@@ -40,7 +41,7 @@ def write(path: Path, splats: Splats, offset: F64) -> None:
     }
     values: dict[str, F32] = {
         "ROTATION": turned.quaternion[:, [1, 2, 3, 0]], "SCALE": splats.scale, "OPACITY": splats.opacity,
-        "SH_DEGREE_0_COEF_0": ((splats.rgb - 0.5) / SH_C0).astype(np.float32),
+        "SH_DEGREE_0_COEF_0": ((rgb - 0.5) / SH_C0).astype(np.float32),
     }  # fmt: skip
     for name, column in values.items():
         packed = np.ascontiguousarray(column, np.float32)
