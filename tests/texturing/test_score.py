@@ -149,7 +149,7 @@ def test_splats_are_scored_in_the_exposure_of_the_world_and_in_that_of_the_neare
 ) -> None:
     """As simulators show them, and as the camera would have shown them."""
     plain, row = splat_scenes.layer(count=50, height=HEIGHT_PX), np.zeros((1, PHOTO_WIDTH), np.float32)
-    row[0, GAIN], row[0, OFFSET] = 0.5, 0.0275
+    row[0, GAIN], row[0, OFFSET] = 0.2, 0.011
     dark = SplatLayer(plain.splats, plain.background, row, (camera_of(views_io.load(textured["views"])[1]),))
     found = []
     for name, layer in (("plain", plain), ("dark", dark)):

@@ -66,7 +66,8 @@ def test_the_derivative_is_that_of_finite_differences(response: Response) -> Non
 def test_the_derivative_at_the_borders_is_that_of_finite_differences(shape: tuple[int, int]) -> None:
     """Only the outermost two pixels count; images may be smaller than the windows."""
     random = np.random.default_rng(1)
-    rendered, photo = (one[: shape[0], : shape[1]].copy() for one in pair(2))
+    rendered, photo = pair(2)
+    rendered, photo = rendered[: shape[0], : shape[1]].copy(), photo[: shape[0], : shape[1]].copy()
     used = np.zeros(shape, bool)
     used[:2], used[-2:], used[:, :2], used[:, -2:] = True, True, True, True
     found = loss.photometric(rendered, photo, used, PLAIN)
