@@ -51,9 +51,10 @@ class WorldUnavailable(Exception):
 
 
 def demo(folder: Path) -> GateWorld:
-    """The demo tile of this repository."""
+    """The demo tile of this repository, with splats."""
     tile = ROOT / "data_samples" / "tile"
-    scan2sim("run", tile, "--out", folder / "run", "--hold-out", 8, "--set", "segment.overwrite=true")
+    settings = ("--set", "segment.overwrite=true", "--set", "splats.when=auto")
+    scan2sim("run", tile, "--out", folder / "run", "--hold-out", 8, *settings)
     return GateWorld("demo", folder / "run", (tile,), layout=lay_out(make_tile.STREET_LENGTH_M, make_tile.SEED))
 
 

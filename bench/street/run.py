@@ -20,8 +20,8 @@ of the held-out frame's own returns within 30 m that fall on such pixels, so tha
 is compared with the first surface along its ray (`bench/street/lidar.py`); the `lidar_*` and `returns_*` results are
 those of the worst street.
 
-- odo04, raw0009, raw0013: the streets with default settings. keep: raw 0009 with `split.vehicles=keep`, counting all
-  pixels.
+- odo04, raw0009, raw0013: the streets with default settings and splats. keep: raw 0009 with `split.vehicles=keep`,
+  counting all pixels.
 - synthetic: metrics with ground truth on a synthetic street (`bench/street/synthetic.py`), and straightness of edges
   (`bench.edges`).
 - time: the street of nine million points with this checkout and with an older one (`--old FOLDER`).
@@ -420,7 +420,7 @@ def main() -> None:
             continue
         if street:
             street = replace(street, vertical_angle_offset=arguments.vertical_angle_offset)
-            settings = (*arguments.set, *(("split.vehicles=keep",) if part == "keep" else ()))
+            settings = ("split.vehicles=keep" if part == "keep" else "splats.when=auto", *arguments.set)
             tile, run = build_world(street, folder, settings, run=not arguments.score_only)
             pictures = out / "pictures" / part
             mvs = arguments.openmvs.resolve() if arguments.openmvs and part in STREETS else None

@@ -6,7 +6,7 @@
 A part is a line of `CHANGES`: values of constants of the modules of `scan2sim.texturing.splats`, or of the step's
 settings; modules may have their full names. `--change` adds one from the command line. Constants that compiled kernels
 or other constants hold copies of are rejected: changing them would have no effect. The step's inputs are those of the
-street's run in `--worlds`, made there by `python -m bench.street --set splats.when=auto`. Rows are stored in
+street's run in `--worlds`, made there by `python -m bench.street`. Rows are stored in
 `rows.json` below `--out`; rows that are stored already aren't measured again. Ends with `RESULT {json}`: by part and
 street.
 """
