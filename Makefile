@@ -11,7 +11,7 @@ OUT ?= demo-out
 
 # the sample's points have their true classes, which are ignored to show the network's
 demo: .venv/.installed
-	$(BIN)/scan2sim run $(TILE) --out $(OUT) --hold-out 8 --set segment.overwrite=true
+	$(BIN)/scan2sim run $(TILE) --out $(OUT) --hold-out 8 --set segment.overwrite=true --set splats.when=auto
 
 # in parallel, then those in real time one at a time, then those that failed once more
 test: .venv/.installed-dev .venv-ros .venv-triton
