@@ -14,6 +14,23 @@ from typing import Literal
 LIMIT_S = 300
 """Time limit of a command."""
 
+KINDS = {
+    1: "foreign records on the event bus",
+    2: "georeference, units and axes: header, coordinates and options",
+    3: "meaning of columns and fields",
+    4: "what a file says: flags, labels, EXIF, faces, splats",
+    5: "attributes of some scans only",
+    6: "plausibility of what was imported",
+    7: "worlds in the programs that load them",
+    8: "walls on the borders of voxels",
+    9: "which axis is up",
+    10: "files that aren't what their name says",
+    11: "separators, encodings, headings and paths of tables, images and trajectories",
+    12: "requests of the Open Inference Protocol",
+    13: "evaluation of trajectories",
+}
+"""Kinds of inputs by number."""
+
 Expected = Literal["read", "named", "refused"]
 Verdict = Literal["right", "silent", "crashed", "rejected_valid"]
 
@@ -30,11 +47,12 @@ class Case:
     Attributes:
         name: unique.
         kind: number of its kind in `KINDS`.
-        make: writes the files into a folder, and returns the arguments of `scan2sim`.
+        make: writes the files into a folder, and returns the arguments of the command.
         expected: "read": right; "named": read, with a warning that `says` matches; "refused": with an error that it
             matches.
         says: regular expression.
         check: says what is wrong with the result in the folder; "" if it is right.
+        module: Python module that is the command: `scan2sim`, or a client of its services.
     """
 
     name: str
@@ -43,6 +61,7 @@ class Case:
     expected: Expected = "read"
     says: str = ""
     check: Callable[[Path], str] = nothing_wrong
+    module: str = "scan2sim.flows.cli"
 
 
 @dataclass(frozen=True)
@@ -62,7 +81,7 @@ class Outcome:
 
 def run(case: Case, folder: Path) -> Outcome:
     """Make the input below an empty folder, run the command, and judge the outcome."""
-    command = [sys.executable, "-m", "scan2sim.flows.cli", *map(str, case.make(folder))]
+    command = [sys.executable, "-m", case.module, *map(str, case.make(folder))]
     try:
         done = subprocess.run(
             command, cwd=folder, capture_output=True, text=True, timeout=LIMIT_S, env=os.environ | {"COLUMNS": "500"}
