@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from bench.paths import ROOT
+
 LIMIT_S = 300
 """Time limit of a command."""
 
@@ -82,10 +84,9 @@ class Outcome:
 def run(case: Case, folder: Path) -> Outcome:
     """Make the input below an empty folder, run the command, and judge the outcome."""
     command = [sys.executable, "-m", case.module, *map(str, case.make(folder))]
+    environment = os.environ | {"COLUMNS": "500", "PYTHONPATH": str(ROOT)}
     try:
-        done = subprocess.run(
-            command, cwd=folder, capture_output=True, text=True, timeout=LIMIT_S, env=os.environ | {"COLUMNS": "500"}
-        )
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=LIMIT_S, env=environment)
     except subprocess.TimeoutExpired:
         return Outcome("crashed", f"not ended after {LIMIT_S} s", ())
     output = done.stdout + done.stderr

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,7 +79,11 @@ RECORDS: dict[str, Foreign] = {
 def cases() -> Iterator[Case]:
     """Cases of kind 1."""
     for name, record in RECORDS.items():
-        yield Case(f"kafka-{name}", 1, lambda _, name=name: (name,), "named", record.says, module=__name__)
+        yield Case(f"kafka-{name}", 1, _arguments(name), "named", record.says, module=__name__)
+
+
+def _arguments(name: str) -> Callable[[Path], Sequence[object]]:
+    return lambda _: (name,)
 
 
 def main() -> None:
