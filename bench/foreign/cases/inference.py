@@ -64,7 +64,7 @@ def cases() -> Iterator[Case]:
     for path in ("", "/ready", "/versions/1", "/versions/1/ready"):
         yield _case(f"get{path.replace('/', '-')}", _get(path))
     wrong: dict[str, tuple[dict[str, Any], str]] = {
-        "channels-first": (_tensor([0] * 36, 1, 3, 4, 3, datatype="UINT8"), "422.*channels"),
+        "channels-first": (_tensor([0] * 72, 1, 3, 6, 4, datatype="UINT8"), "422.*channels"),
         "floats": (_tensor([0.5] * 36, 1, 3, 4, 3, datatype="FP32"), "422.*FP32"),
         "ragged": (_tensor([[[1, 2, 3]], [[1, 2]]], 2, 1, 3, datatype="UINT8"), "422.*different lengths"),
         "other-shape": (_tensor(photo.transpose(1, 0, 2).tolist(), *photo.shape, datatype="UINT8"), "422.*shape"),
