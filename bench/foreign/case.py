@@ -93,10 +93,11 @@ def run(case: Case, folder: Path) -> Outcome:
     messages = tuple(dict.fromkeys(general(text, folder) for text in messages_in(output)))
     if done.returncode < 0 or "Traceback (most recent call last)" in output:
         return Outcome("crashed", f"exit status {done.returncode}: {output[-300:]}", messages)
-    said = bool(case.says) and re.search(case.says, " ".join(output.split())) is not None
+    text = " ".join(output.replace(str(folder), "…").split())
+    said = bool(case.says) and re.search(case.says, text) is not None
     if done.returncode:
         refused = case.expected == "refused"
-        why = "" if refused and said else f"exit status {done.returncode}: {' '.join(output.split())[-300:]}"
+        why = "" if refused and said else f"exit status {done.returncode}: {text[-300:]}"
         return Outcome("right" if refused else "rejected_valid", why, messages)
     wrong = case.check(folder)
     if said or (case.expected == "read" and not wrong):
