@@ -13,7 +13,7 @@ from bench.foreign.scan import PLACE, scan
 
 COUNT = 100_000
 SETTINGS = (
-    "export.formats=[gazebo,mujoco,glb]", "voxel.size=0.2", "collision.triangles=2000", "geometry.samples=1000",
+    "export.formats=[gazebo,mujoco,glb]", "voxel.size=0.2", "geometry.samples=1000",
     "pictures.compared=0", "pictures.width=160", "preview.triangles=0",
 )  # fmt: skip
 """Settings of a small world, built quickly."""
