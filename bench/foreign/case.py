@@ -51,7 +51,7 @@ class Case:
         kind: number of its kind in `KINDS`.
         make: writes the files into a folder, and returns the arguments of the command.
         expected: "read": right; "named": read, with a warning that `says` matches; "refused": with an error that it
-            matches.
+            matches; a warning that it matches is right, too.
         says: regular expression.
         check: says what is wrong with the result in the folder; "" if it is right.
         module: Python module that is the command: `scan2sim`, or a client of its services.
@@ -100,7 +100,7 @@ def run(case: Case, folder: Path) -> Outcome:
         why = "" if refused and said else f"exit status {done.returncode}: {text[-300:]}"
         return Outcome("right" if refused else "rejected_valid", why, messages)
     wrong = case.check(folder)
-    if said or (case.expected == "read" and not wrong):
+    if not wrong and (said or case.expected == "read"):
         return Outcome("right", "", messages)
     return Outcome("silent", wrong or f"nothing says {case.says!r}", messages)
 
