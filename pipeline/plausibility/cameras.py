@@ -63,7 +63,8 @@ def distance(views: Sequence[View], cloud: PointCloud) -> Finding | None:
     return Finding(
         3,
         f"half of the cameras are more than {middle:,.0f} m from any point: the photos are of another place, or their "
-        "coordinates are of another CRS, unit or order of the axes than the cloud's",
+        "coordinates are of another CRS, unit or order of the axes than the cloud's. Give the photos of this place, or "
+        "name theirs (`import clouds` has --photos-crs, --photos-units, --position-axes)",
     )
 
 

@@ -51,7 +51,9 @@ def coordinate_steps(cloud: PointCloud, unit: float = 1.0) -> Finding | None:
     if max(step for _, step in coarse) < MIN_GRID_M:
         return None
     return Finding(
-        1, f"coordinates are in steps, {steps}: the cloud was rounded or thinned to a grid, smaller shapes are lost"
+        1,
+        f"coordinates are in steps, {steps}: the cloud was rounded or thinned to a grid, so smaller shapes are lost, "
+        "or its unit isn't the metre. Export it again unthinned, in metres with millimetres",
     )
 
 
@@ -96,7 +98,8 @@ def density(cloud: PointCloud, count: int) -> Finding | None:
     return Finding(
         2,
         f"neighbouring points are {spacing:.1f} m apart: too far for the surfaces of a street (0.1 m). The cloud is "
-        "sparse (a reconstruction's sparse points?) or its unit isn't the metre",
+        "sparse (a reconstruction's sparse points?) or its unit isn't the metre. Give the dense cloud, or the unit by "
+        "the import's --units (m, ft, us-ft); convert others, such as millimetres, to metres first",
     )
 
 

@@ -87,7 +87,8 @@ def _reader(path: Path) -> Any:
     found = formats()
     name = found.get(path.name) or found.get(path.suffix.lower())
     if name is None and file_checks.check(path).suffix.lower() in mesh_files.SUFFIXES:
-        raise InputError(path, "is a mesh, not a point cloud", f"Import the mesh: scan2sim import map {path.name}")
+        remedy = f"Import the mesh: scan2sim import map {path} --out TILE"
+        raise InputError(path, "is a mesh, not a point cloud", remedy)
     if name is None:
         cause = f"has an unknown cloud format ({path.suffix or 'no suffix'})"
         raise InputError(path, cause, f"Use {SUPPORTED_FORMATS}")

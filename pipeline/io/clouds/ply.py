@@ -152,7 +152,7 @@ def _faces_note(path: Path, faces: int) -> tuple[str, ...]:
     large = edge > min(LARGE_FACE_EDGES * float(np.median(edge)), MAX_EDGE_SHARE * diagonal) if len(edge) else edge > 0
     if area[large].sum() > MAX_LARGE_FACE_SHARE * area.sum():
         cause = f"is a mesh of {faces:,} faces, not a point cloud: its large faces have no points inside"
-        raise InputError(path, cause, f"Import the mesh: scan2sim import map {path.name}")
+        raise InputError(path, cause, f"Import the mesh: scan2sim import map {path} --out TILE")
     return (
         f"is a mesh: its vertices are the points, its {faces:,} faces are ignored (`scan2sim import map` uses them)",
     )
