@@ -27,7 +27,7 @@ from typing import Any
 
 from bench.foreign import cases
 from bench.foreign.alarms import false_alarms
-from bench.foreign.case import Case, Outcome, run
+from bench.foreign.case import KINDS, Case, Outcome, run
 from bench.paths import ROOT
 from scan2sim.pipeline.core import plugins
 
@@ -39,7 +39,7 @@ BAD = ("silent", "crashed", "rejected_valid")
 def main() -> None:
     """Run the cases and print what went wrong."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kinds", nargs="+", type=int, help="only cases of these kinds")
+    parser.add_argument("--kinds", nargs="+", type=int, choices=KINDS, metavar="N", help=f"only these: {KINDS}")
     parser.add_argument("--cases", nargs="+", help="only cases with these names")
     parser.add_argument("--out", type=Path, default=ROOT / "bench-out" / "foreign")
     arguments = parser.parse_args()

@@ -27,7 +27,11 @@ IMPOSTORS: tuple[tuple[tuple[bytes, ...], str, str], ...] = (
         "is a web page, not the file",
         "Download it from the file's own address",
     ),
-    ((b"<?xml", b"<error"), "is an XML document, perhaps the error message of a server", "Download it again"),
+    (
+        (b"<?xml", b"<error"),
+        "is an XML document, perhaps the error message of a server",
+        "Read the reason in it (no access, an expired link), then download the file by an address that works",
+    ),
     ((b"PK\x03\x04",), "is a ZIP archive", "Unpack it first"),
     ((b"\x1f\x8b",), "is compressed by gzip", "Unpack it first"),
     ((b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07"), "is an archive", "Unpack it first"),

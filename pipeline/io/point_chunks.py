@@ -255,12 +255,17 @@ def _are_codes(classification: Any) -> Bools:
         )
 
 
+def all_withheld(path: Path, count: int) -> InputError:
+    """Error for a file of which no point may be used."""
+    remedy = "Clear the flag in the program that set it, or leave the file out"
+    return InputError(path, f"all of its {count:,} points have the withheld flag (not to be used)", remedy)
+
+
 def _checked(path: Path, found: Summary) -> Summary:
     if found.count:
         return found
     if found.withheld:
-        remedy = "Clear the flag in the program that set it, or leave the file out"
-        raise InputError(path, f"all of its {found.withheld:,} points have the withheld flag (not to be used)", remedy)
+        raise all_withheld(path, found.withheld)
     raise InputError(path, "contains no points with finite coordinates", "Export it again, or leave it out")
 
 

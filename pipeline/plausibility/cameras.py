@@ -40,12 +40,12 @@ def heights(views: Sequence[View], cloud: PointCloud) -> Finding | None:
         return None
     where = f"{middle:.1f} m above" if middle > 0 else f"{-middle:.1f} m below"
     shift = middle - USUAL_M
+    change = f"subtract {shift:.1f} m from" if shift > 0 else f"add {-shift:.1f} m to"
     return Finding(
         3,
         f"the cameras are {where} the ground under them, though they look level. Heights of photos and cloud are "
         "probably of different kinds: above the ellipsoid (GNSS) and above the sea (the geoid, which is up to 85 m "
-        f"above and 107 m below it). For cameras {USUAL_M:g} m above the ground, subtract {shift:.1f} m from the "
-        "photos' heights",
+        f"above and 107 m below it). For cameras {USUAL_M:g} m above the ground, {change} the photos' heights",
     )
 
 
@@ -63,7 +63,8 @@ def distance(views: Sequence[View], cloud: PointCloud) -> Finding | None:
     return Finding(
         3,
         f"half of the cameras are more than {middle:,.0f} m from any point: the photos are of another place, or their "
-        "coordinates are of another CRS, unit or order of the axes than the cloud's",
+        "coordinates are of another CRS, unit or order of the axes than the cloud's. Give the photos of this place, or "
+        "name theirs (`import clouds` has --photos-crs, --photos-units, --position-axes)",
     )
 
 

@@ -51,7 +51,9 @@ def coordinate_steps(cloud: PointCloud, unit: float = 1.0) -> Finding | None:
     if max(step for _, step in coarse) < MIN_GRID_M:
         return None
     return Finding(
-        1, f"coordinates are in steps, {steps}: the cloud was rounded or thinned to a grid, smaller shapes are lost"
+        1,
+        f"coordinates are in steps, {steps}: the cloud was rounded or thinned to a grid, so smaller shapes are lost, "
+        "or its unit isn't the metre. Export it again unthinned, in metres with millimetres",
     )
 
 
@@ -76,9 +78,9 @@ def far_points(cloud: PointCloud) -> Finding | None:
     outside = np.any((cloud.xyz < low - margin) | (cloud.xyz > high + margin), axis=1)
     return Finding(
         2,
-        f"{outside.mean():.2g} of the points are far from the rest: all extend over {whole:,.0f} m, all but "
-        f"{2 * CORE_PERCENT / 100:.1%} over {core:,.0f} m. They are outliers, or several "
-        "places in one file: remove them",
+        f"{outside.sum():,} of {len(cloud):,} sampled points are far from the rest: all extend over {whole:,.0f} m, "
+        f"all but {2 * CORE_PERCENT / 100:.1%} over {core:,.0f} m. They are outliers, or several places in one file: "
+        "remove them",
     )
 
 
@@ -96,7 +98,8 @@ def density(cloud: PointCloud, count: int) -> Finding | None:
     return Finding(
         2,
         f"neighbouring points are {spacing:.1f} m apart: too far for the surfaces of a street (0.1 m). The cloud is "
-        "sparse (a reconstruction's sparse points?) or its unit isn't the metre",
+        "sparse (a reconstruction's sparse points?) or its unit isn't the metre. Give the dense cloud, or the unit by "
+        "the import's --units (m, ft, us-ft); convert others, such as millimetres, to metres first",
     )
 
 
@@ -111,8 +114,9 @@ def level_ground(cloud: PointCloud) -> Finding | None:
     if tilt < MAX_TILT_DEGREES:
         return None
     axis = "xyz"[int(np.abs(found.up).argmax())]
+    other = "" if axis == "z" else f": up seems to be {axis} (or -{axis}), not z"
     return Finding(
         3,
-        f"the ground and the walls are tilted by {tilt:.0f} degrees: up seems to be {axis} (or -{axis}), not z. Name "
-        "the order of the coordinates with --axes, or import it as a robot's map (`import map --up`)",
+        f"the ground and the walls are tilted by {tilt:.0f} degrees{other}. Export the cloud with z up, or import it "
+        "as a robot's map (`import map` finds up). If columns were only exchanged, name their order with --axes",
     )

@@ -65,7 +65,11 @@ def load_json(body: str | bytes) -> Any:
         json.dumps(fields, ensure_ascii=False).encode()  # fails for half of a surrogate pair
     except RejectedError:
         raise
-    except (ValueError, RecursionError) as error:  # of text that isn't UTF-8 as well
+    except UnicodeError:
+        raise RejectedError("invalid JSON: not Unicode text") from None
+    except RecursionError:
+        raise RejectedError("invalid JSON: nested too deeply") from None
+    except ValueError as error:
         raise RejectedError(f"invalid JSON: {error}") from None
     return fields
 
@@ -87,7 +91,7 @@ def validated_record(fields: Any) -> Record:
     """
     schema = fields.get("schema") if isinstance(fields, dict) else None
     if schema != SCHEMA:
-        raise RejectedError(f"unknown schema: {str(schema)[:MAX_DETAIL_CHARS]}")
+        raise RejectedError(f"unknown schema: {'none' if schema is None else str(schema)[:MAX_DETAIL_CHARS]}")
     try:
         record = Record.model_validate(fields)
     except ValidationError as error:
@@ -129,4 +133,4 @@ def _finite(text: str) -> float:
 
 
 def _reject_constant(text: str) -> NoReturn:
-    raise RejectedError(f"malformed: {text} is not a number")
+    raise RejectedError(f"malformed: {text} is no number of JSON")

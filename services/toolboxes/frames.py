@@ -114,7 +114,7 @@ def check_size(where: str, width: int, height: int) -> None:
 
 
 def _decoded(where: str, data: bytes) -> U8:
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     try:
         with Image.open(io.BytesIO(data), formats=FORMATS) as opened:
@@ -124,8 +124,11 @@ def _decoded(where: str, data: bytes) -> U8:
             return np.asarray(opened.convert("RGB"))
     except InputError:
         raise
+    except UnidentifiedImageError:
+        raise InputError(where, "can't be decoded (the format is unknown)", REMEDY) from None
     except Exception as error:  # damaged files raise errors of many types
-        raise InputError(where, f"can't be decoded ({str(error).splitlines()[0][:100]})", REMEDY) from None
+        cause = (str(error) or type(error).__name__).splitlines()[0][:100]
+        raise InputError(where, f"can't be decoded ({cause})", REMEDY) from None
 
 
 def _grey_to_rgb(grey: U8) -> U8:

@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.foreign.case import Case
 from bench.foreign.scan import PLACE, points_are, scan
-from scan2sim.pipeline.core.types import U8
+from scan2sim.pipeline.core.types import U8, UNCOLOURED
 
 Make = Callable[[Path], Sequence[object]]
 TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int", "u2": "ushort"}
@@ -53,9 +53,11 @@ def cases() -> Iterator[Case]:
             for padded in (False, True):
                 name = f"pcd-{data}-{names[0]}{'-padded' * padded}"
                 yield Case(name, 11, _pcd(local.astype("<f4"), names, data, padded), check=points_are(local))
+    some_grey = made.rgb.copy()
+    some_grey[len(some_grey) // 2 :] = UNCOLOURED
     for grey_first in (True, False):
         name = f"e57-mixed-{'grey' if grey_first else 'colour'}-first"
-        yield Case(name, 5, _e57(local, made.rgb, grey_first), "named", "have no colour", points_are(local))
+        yield Case(name, 5, _e57(local, made.rgb, grey_first), "named", "have no colour", points_are(local, some_grey))
 
 
 def _import(path: Path) -> Sequence[object]:

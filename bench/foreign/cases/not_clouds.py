@@ -30,6 +30,7 @@ def cases() -> Iterator[Case]:
     yield Case("file-link-nowhere", 10, _link("/nowhere/cloud.laz"), "refused", "is a link that leads nowhere")
     yield Case("file-link-loop", 10, _link("cloud.laz"), "refused", "is a link that leads nowhere")
     yield Case("file-missing", 10, lambda folder: _import(folder / "gone.laz"), "refused", "not found|doesn't exist")
+    yield Case("file-missing-mesh", 10, lambda folder: _import(folder / "gone.obj"), "refused", "not found")
     yield Case("file-folder", 10, _folder, "refused", "folder")
     yield Case(
         "ply-named-las", 10, _file("cloud.las", _ply(scan().xyz[:100])), "refused", "is a PLY file by its content"

@@ -120,6 +120,8 @@ def _photos_are(scale: float) -> Callable[[Path], str]:
         tile = read_tile(folder / "tile")
         if [view.photo.name for view in tile.views] != list(NAMES):
             return f"other photos: {[view.photo.name for view in tile.views]}"
+        if any(view.photo.parent != folder / "tile" / "photos" for view in tile.views):
+            return f"photos in {tile.views[0].photo.parent}"
         for view, position in zip(tile.views, _positions(), strict=True):
             centre = tile.frame.to_crs(view.T_world_cam[None, :3, 3])[0]
             if np.abs(centre - position).max() > 2e-3 or abs(view.T_world_cam[0, 2] - 1) > 1e-6:

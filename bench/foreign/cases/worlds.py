@@ -11,7 +11,12 @@ import numpy as np
 from bench.foreign.case import Case
 from bench.foreign.scan import PLACE, scan
 
-COUNT = 400_000
+COUNT = 100_000
+SETTINGS = (
+    "export.formats=[gazebo,mujoco,glb]", "voxel.size=0.2", "geometry.samples=1000",
+    "pictures.compared=0", "pictures.width=160", "preview.triangles=0",
+)  # fmt: skip
+"""Settings of a small world, built quickly."""
 GROUND_M = 0.05
 """Largest height of the ground above or below 0, and of the spawn pose above it."""
 FACING = 0.95
@@ -37,7 +42,7 @@ def _world(*settings: str) -> Callable[[Path], Sequence[object]]:
         form = ["%.3f"] * 3 + ["%d"] * 4
         np.savetxt(tile / "cloud.csv", rows, form, delimiter=",", header=header, comments="")
         (tile / "tile.toml").write_text('name = "yard"\ncrs = "local"\nclouds = ["cloud.csv"]\n', encoding="utf-8")
-        options = [word for one in ("export.formats=[gazebo,mujoco,glb]", *settings) for word in ("--set", one)]
+        options = [word for one in (*SETTINGS, *settings) for word in ("--set", one)]
         return ("run", tile, "--out", folder / "out", *options)
 
     return make

@@ -17,6 +17,7 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import F64, U8, Frame, PointCloud
 from scan2sim.pipeline.io import file_checks, mesh_files
+from scan2sim.pipeline.io.point_chunks import all_withheld
 
 CHUNK_POINTS = 2_000_000
 COPIED_SUFFIXES = (".las", ".laz", ".ply")
@@ -85,8 +86,9 @@ def is_cloud(path: Path) -> bool:
 def _reader(path: Path) -> Any:
     found = formats()
     name = found.get(path.name) or found.get(path.suffix.lower())
-    if name is None and path.suffix.lower() in mesh_files.SUFFIXES:
-        raise InputError(path, "is a mesh, not a point cloud", f"Import the mesh: scan2sim import map {path.name}")
+    if name is None and file_checks.check(path).suffix.lower() in mesh_files.SUFFIXES:
+        remedy = f"Import the mesh: scan2sim import map {path} --out TILE"
+        raise InputError(path, "is a mesh, not a point cloud", remedy)
     if name is None:
         cause = f"has an unknown cloud format ({path.suffix or 'no suffix'})"
         raise InputError(path, cause, f"Use {SUPPORTED_FORMATS}")
@@ -140,12 +142,14 @@ def flag_notes(path: Path) -> tuple[str, ...]:
     """Notes on points with the withheld or overlap flag of LAS; a header doesn't count them, all points are read.
 
     Raises:
-        InputError: as `read`.
+        InputError: as `read`, or all points are withheld.
     """
     reader = _reader(path)
     if not hasattr(reader, "flags"):
         return ()
     withheld, overlap = reader.flags(path)
+    if withheld == reader.read_header(path)[0]:
+        raise all_withheld(path, withheld)
     second_line = f"{overlap:,} points have the overlap flag (a second flight line); they are used"
     return tuple(note for note in (left_out(withheld, 0), second_line if overlap else "") if note)
 

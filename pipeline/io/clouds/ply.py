@@ -36,6 +36,8 @@ SPLATS = ("f_dc_0", "packed_position")
 MAX_HEADER_BYTES = 100_000
 LARGE_FACE_EDGES = 5.0
 """Longest edge of a face, in medians of all faces, from which its inside has no vertices nearby."""
+MAX_EDGE_SHARE = 0.1
+"""The same in diagonals of the mesh: all faces of a box are large."""
 MAX_LARGE_FACE_SHARE = 0.2
 """Share of a mesh's surface in large faces, from which its vertices are no cloud of the surface."""
 
@@ -146,10 +148,11 @@ def _faces_note(path: Path, faces: int) -> tuple[str, ...]:
         raise _bad(path, f"it is a mesh whose {faces:,} faces can't be read: {error}") from None
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    large = edge > LARGE_FACE_EDGES * np.median(edge) if len(edge) else np.zeros(0, bool)
+    diagonal = float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0))) if len(edge) else 0.0
+    large = edge > min(LARGE_FACE_EDGES * float(np.median(edge)), MAX_EDGE_SHARE * diagonal) if len(edge) else edge > 0
     if area[large].sum() > MAX_LARGE_FACE_SHARE * area.sum():
         cause = f"is a mesh of {faces:,} faces, not a point cloud: its large faces have no points inside"
-        raise InputError(path, cause, f"Import the mesh: scan2sim import map {path.name}")
+        raise InputError(path, cause, f"Import the mesh: scan2sim import map {path} --out TILE")
     return (
         f"is a mesh: its vertices are the points, its {faces:,} faces are ignored (`scan2sim import map` uses them)",
     )

@@ -98,7 +98,10 @@ def _other_reading(given: CRS, called: str, area: _Area, middle: F64, extent: F6
         return None
     zone = re.search(r"zone (\d+)", given.name)
     if zone and area.contains(middle - [int(zone[1]) * 1e6, 0], MARGIN_SHARE):
-        remedy = "Name a CRS of such coordinates with --crs (EPSG:4647 for zone 32), or subtract the number"
+        remedy = (
+            "Name a CRS of such coordinates with --crs (EPSG:5649 for zone 31, 4647 for 32, 5650 for 33), or subtract "
+            f"{zone[1]}000000 from the eastings"
+        )
         return Misfit(f"{outside}: the eastings begin with the zone number {zone[1]}", remedy, False)
     return Misfit(outside, "Check the CRS, or name another with --crs: the world has the wrong position", False)
 

@@ -74,6 +74,13 @@ def test_withheld_points_are_not_used_and_counted(tmp_path: Path, suffix: str, p
     assert np.array_equal(used, ~withheld) and len(codes) == N
 
 
+def test_a_file_of_withheld_points_only_is_refused_by_the_import(tmp_path: Path) -> None:
+    flagged(tmp_path / "c.laz", count=N)
+    with pytest.raises(InputError, match="all of its .* points have the withheld flag"):
+        import_las([tmp_path / "c.laz"], tmp_path / "tile", crs="EPSG:32632")
+    assert not (tmp_path / "tile").exists()
+
+
 def test_an_import_names_flags(tmp_path: Path) -> None:
     flagged(tmp_path / "c.laz", overlap=50)
     notes: list[str] = []
@@ -179,8 +186,12 @@ def test_a_mesh_of_large_triangles_is_no_cloud(tmp_path: Path) -> None:
     trimesh.util.concatenate([fine, walls]).export(tmp_path / "c.ply")
     with pytest.raises(InputError, match=r"is a mesh of 5,132 faces, not a point cloud.*import map c\.ply"):
         clouds.read_header(tmp_path / "c.ply")
+    with pytest.raises(InputError, match=r"is a mesh of 12 faces, not a point cloud"):
+        clouds.read_header(box(tmp_path / "c.ply", 20.0))
     with pytest.raises(InputError, match=r"is a mesh, not a point cloud.*import map c\.obj"):
         clouds.read_header(box(tmp_path / "c.obj", 1.0))
+    with pytest.raises(InputError, match="not found"):
+        clouds.read_header(tmp_path / "gone.obj")
 
 
 def test_a_ply_of_faces_only_says_so(tmp_path: Path) -> None:

@@ -115,6 +115,19 @@ def test_a_record_that_a_callback_fails_on_does_not_stop_the_reader(caplog: pyte
     assert reasons == {"could not be processed": 1} and "ZeroDivisionError" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("text", "invalid JSON: Expecting value"), ("avro", "invalid JSON: not Unicode text"),
+        ("deep", "invalid JSON: nested too deeply"), ("list", "unknown schema: none"),
+        ("nan", "malformed: NaN is no number of JSON"), ("huge integer", "malformed: an integer of 401 digits"),
+    ],
+)  # fmt: skip
+def test_rejections_name_the_cause(name: str, why: str) -> None:
+    with pytest.raises(RejectedError, match=f"^{why}"):
+        parse_record(BODIES[name] or b"")
+
+
 def mutations(seed: int, number: int) -> list[bytes]:
     """Records with one value replaced by one of another type or range."""
     chosen = random.Random(seed)

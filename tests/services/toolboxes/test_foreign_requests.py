@@ -90,6 +90,7 @@ def test_errors_of_paths_models_and_images_have_the_same_form(client: TestClient
         415: client.post(INFER, content=b"x", headers={"Content-Type": "text/plain"}),
         422: client.post(INFER, json={"inputs": [no_image]}),
     }
+    assert "the format is unknown" in answers[422].json()["error"]
     for status, answer in answers.items():
         assert answer.status_code == status and list(answer.json()) == ["error"], answer.text
     assert client.get(f"/v2/models/{TASK}/versions/7").status_code == 404
