@@ -14,6 +14,11 @@ from scan2sim.pipeline.core.types import F32, F64, PointCloud, Trajectory
 STEEP_MAX_NORMAL_Z = 0.3  # |nz| below which "up" doesn't define the outside of a surface
 QUERY_CHUNK = 20_000  # points per neighbour query
 BUILDING_RADIUS_M = 3.0  # radius around a wall point in which the mass of its building is measured
+BUILDING_CELL_M = 0.5  # cells of equal mass
+MIN_MASS_DISTANCE_M = 0.05  # of a wall from the mass around it; a free-standing one has no outside
+FREE_STANDING_SIDE = np.array(
+    [0.924, 0.383, 0.0]
+)  # towards which such walls face: not along, nor diagonal to, the axes
 
 
 def oriented_normals(cloud: PointCloud, neighbours: int, path: Trajectory | None) -> PointCloud:
@@ -50,16 +55,20 @@ def scanner_positions(cloud: PointCloud, path: Trajectory) -> F64:
 
 def _away_from_mass(xyz: F32, normal: F32) -> npt.NDArray[np.floating]:
     """Directions (N, 3) to the outside for airborne clouds: up, and for steep surfaces away from the points around."""
+    from scan2sim.pipeline.geometry.voxel_grid import voxel_groups
+
     toward = np.tile(np.array([0.0, 0.0, 1.0]), (len(xyz), 1))
     steep = np.flatnonzero(np.abs(normal[:, 2]) < STEEP_MAX_NORMAL_Z)
     if len(steep):
-        coarse = np.unique(np.round(xyz / 0.5).astype(np.int32), axis=0).astype(np.float32) * 0.5
+        order, starts = voxel_groups(xyz, BUILDING_CELL_M)
+        count = np.diff(np.append(starts, len(order)))[:, None]
+        coarse = np.add.reduceat(xyz[order].astype(np.float64), starts, axis=0) / count
         tree = cKDTree(coarse)
         for at in range(0, len(steep), QUERY_CHUNK):  # in chunks: lists of neighbours are large
             here = steep[at : at + QUERY_CHUNK]
             near = tree.query_ball_point(xyz[here], BUILDING_RADIUS_M, workers=-1)
-            toward[here] = [
-                xyz[i] - coarse[j].mean(axis=0) if j else (0, 0, 1) for i, j in zip(here, near, strict=True)
-            ]
+            toward[here] = [xyz[i] - coarse[j].mean(axis=0) for i, j in zip(here, near, strict=True)]
         toward[steep, 2] = 0
+        distance = np.einsum("ij,ij->i", toward, normal)
+        toward[steep[np.abs(distance[steep]) < MIN_MASS_DISTANCE_M]] = FREE_STANDING_SIDE
     return toward
