@@ -16,9 +16,7 @@ QUERY_CHUNK = 20_000  # points per neighbour query
 BUILDING_RADIUS_M = 3.0  # radius around a wall point in which the mass of its building is measured
 BUILDING_CELL_M = 0.5  # cells of equal mass
 MIN_MASS_DISTANCE_M = 0.05  # of a wall from the mass around it; a free-standing one has no outside
-FREE_STANDING_SIDE = np.array(
-    [0.924, 0.383, 0.0]
-)  # towards which such walls face: not along, nor diagonal to, the axes
+FREE_STANDING_SIDE = (0.924, 0.383, 0.0)  # towards which those face: neither along nor diagonal to the axes
 
 
 def oriented_normals(cloud: PointCloud, neighbours: int, path: Trajectory | None) -> PointCloud:

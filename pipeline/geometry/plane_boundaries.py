@@ -116,11 +116,9 @@ def assign_points(xyz: F32, planes: Planes, thin: F32, which: I32, voxel: float,
     if not len(on):
         return np.full(len(xyz), -1, np.int32)
     order, starts = voxel_groups(np.concatenate([thin, xyz]), voxel)
-    first = order[starts]  # a thinned point, if the voxel has one
+    first = np.minimum(order[starts], len(thin))  # a thinned point, if the voxel has one
     own = np.empty(len(order), np.int32)
-    own[order] = np.repeat(
-        np.append(which, np.int32(-1))[np.minimum(first, len(thin))], np.diff(np.append(starts, len(order)))
-    )
+    own[order] = np.repeat(np.append(which, np.int32(-1))[first], np.diff(np.append(starts, len(order))))
     own = own[len(thin) :]
     own[(own >= 0) & (np.abs(planes.signed_distance(xyz, own)) > tolerance)] = -1
     rest = np.flatnonzero(own < 0)

@@ -13,9 +13,9 @@ Groups = tuple[I64, I64]
 
 MAX_SHEET_SEPARATION = 0.5
 """Distance in voxels of the means of adjacent voxels, across their shared face, up to which they may hold one sheet."""
-MAX_SHEET_FLATNESS = 0.7
-"""Standard deviation of a sheet's points across the face over that along it: a slope of 35 degrees, or noise of a fifth
-of a voxel."""
+MAX_SHEET_FLATNESS = 0.5
+"""Standard deviation of a sheet's points across the face over that along it: a slope of 27 degrees, or noise of a
+seventh of a voxel."""
 
 
 def sample(cloud: PointCloud, size: float, groups: Groups | None = None) -> PointCloud:
@@ -63,8 +63,8 @@ def sheet_groups(xyz: F32, size: float) -> Groups:
     """Points grouped by voxel like `voxel_groups`; two voxels with a thin sheet in their shared face are one group.
 
     A flat wall in the face between two layers of voxels thus gets one layer of samples, as it does anywhere else. Of
-    the pairs of a voxel, the flattest is joined if it is the flattest of the other one, too: only the points in the
-    next three voxels matter, so that tiles with the same points around their border get the same groups there.
+    the pairs of a voxel, the flattest is joined if it is the flattest of the other voxel, too: only points up to two
+    voxels away matter, so that tiles with the same points around their border get the same groups there.
     """
     if len(xyz) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
