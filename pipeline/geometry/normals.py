@@ -24,7 +24,7 @@ def oriented_normals(cloud: PointCloud, neighbours: int, path: Trajectory | None
 
     With a path and GPS times that overlap, each normal is oriented to the scanner's position at the point's time;
     without times, to the nearest point of the path; without a path, upwards and, if steep, away from the mass around
-    the point.
+    the point, or, without such mass (a free-standing wall), to the same side everywhere.
     """
     if len(cloud) < 3:
         return replace(cloud, normal=np.tile(np.array([0, 0, 1], np.float32), (len(cloud), 1)))
@@ -52,7 +52,10 @@ def scanner_positions(cloud: PointCloud, path: Trajectory) -> F64:
 
 
 def _away_from_mass(xyz: F32, normal: F32) -> npt.NDArray[np.floating]:
-    """Directions (N, 3) to the outside for airborne clouds: up, and for steep surfaces away from the points around."""
+    """Directions (N, 3) to the outside for airborne clouds: up, and for steep surfaces away from the points around.
+
+    The mass is measured from means of points, not centres of cells, whose side of a wall depends on where it stands.
+    """
     from scan2sim.pipeline.geometry.voxel_grid import voxel_groups
 
     toward = np.tile(np.array([0.0, 0.0, 1.0]), (len(xyz), 1))

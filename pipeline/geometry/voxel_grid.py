@@ -75,12 +75,17 @@ def sheet_groups(xyz: F32, size: float) -> Groups:
     for axis, stride in enumerate(strides):
         upper = np.minimum(np.searchsorted(code, code + stride), len(code) - 1)
         a = np.flatnonzero(code[upper] == code + stride)
+        a = a[_separation(first[axis], mean[axis], a, upper[a]) < MAX_SHEET_SEPARATION * size]
         b = upper[a]
-        apart = first[b] - first[a] + (mean[b] - mean[a])
-        share = (count[b] / (count[a] + count[b]))[:, None]
-        spread = (1 - share) * variance[a] + share * variance[b] + share * (1 - share) * apart**2
-        across, along = spread[:, axis], np.delete(spread, axis, axis=1).max(axis=1)
-        sheet = (apart[:, axis] < MAX_SHEET_SEPARATION * size) & (across < MAX_SHEET_FLATNESS**2 * along)
+        share = count[b] / (count[a] + count[b])
+        spread = np.stack(
+            [
+                (1 - share) * v[a] + share * v[b] + share * (1 - share) * _separation(f, m, a, b) ** 2
+                for f, m, v in zip(first, mean, variance, strict=True)
+            ]
+        )
+        across, along = spread[axis], np.delete(spread, axis, axis=0).max(axis=0)
+        sheet = across < MAX_SHEET_FLATNESS**2 * along
         pairs.append(np.column_stack([a, b])[sheet])
         flatness.append(across[sheet] / along[sheet])
     pair = np.concatenate(pairs)[np.argsort(np.concatenate(flatness), kind="stable")]
@@ -90,18 +95,23 @@ def sheet_groups(xyz: F32, size: float) -> Groups:
 
 
 def _moments(xyz: F32, order: I64, starts: I64, count: I64) -> tuple[F64, F64, F64]:
-    """First point (V, 3) of each group, and mean (V, 3), relative to it, and variance (V, 3) of its points.
+    """First point (3, V) of each group, and mean (3, V), relative to it, and variance (3, V) of its points.
 
     Relative to a point of the group, the sums of rounded coordinates (`overlap`) are exact, hence equal in all tiles.
     """
-    first, mean, square = np.empty((3, len(starts), 3))
+    first, mean, square = np.empty((3, 3, len(starts)))
     for axis in range(3):
         column = xyz[order, axis].astype(np.float64)
-        first[:, axis] = column[starts]
-        column -= np.repeat(first[:, axis], count)
-        mean[:, axis] = np.add.reduceat(column, starts) / count
-        square[:, axis] = np.add.reduceat(column**2, starts) / count
+        first[axis] = column[starts]
+        column -= np.repeat(first[axis], count)
+        mean[axis] = np.add.reduceat(column, starts) / count
+        square[axis] = np.add.reduceat(column**2, starts) / count
     return first, mean, square - mean**2
+
+
+def _separation(first: F64, mean: F64, a: I64, b: I64) -> F64:
+    """Coordinate (P,) of the means of groups b minus that of groups a, from those (V,) of `_moments` on one axis."""
+    return np.asarray(first[b] - first[a] + (mean[b] - mean[a]))
 
 
 def _joined(order: I64, starts: I64, count: I64, pairs: I64) -> Groups:
