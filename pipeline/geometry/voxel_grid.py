@@ -11,7 +11,7 @@ from scan2sim.pipeline.core.types import F32, F64, I64, PointCloud
 
 Groups = tuple[I64, I64]
 
-MAX_SHEET_SEPARATION = 0.5
+MAX_SHEET_SEPARATION = 0.3
 """Distance in voxels of the means of adjacent voxels, across their shared face, up to which they may hold one sheet."""
 MAX_SHEET_FLATNESS = 0.5
 """Standard deviation of a sheet's points across the face over that along it: a slope of 27 degrees, or noise of a
