@@ -184,11 +184,11 @@ def test_a_mesh_of_large_triangles_is_no_cloud(tmp_path: Path) -> None:
 
     fine, walls = trimesh.creation.icosphere(4), trimesh.creation.box((10, 8, 3))
     trimesh.util.concatenate([fine, walls]).export(tmp_path / "c.ply")
-    with pytest.raises(InputError, match=r"is a mesh of 5,132 faces, not a point cloud.*import map c\.ply"):
+    with pytest.raises(InputError, match=r"is a mesh of 5,132 faces, not a point cloud.*import map .*c\.ply --out TILE"):
         clouds.read_header(tmp_path / "c.ply")
     with pytest.raises(InputError, match=r"is a mesh of 12 faces, not a point cloud"):
         clouds.read_header(box(tmp_path / "c.ply", 20.0))
-    with pytest.raises(InputError, match=r"is a mesh, not a point cloud.*import map c\.obj"):
+    with pytest.raises(InputError, match=r"is a mesh, not a point cloud.*import map .*c\.obj --out TILE"):
         clouds.read_header(box(tmp_path / "c.obj", 1.0))
     with pytest.raises(InputError, match="not found"):
         clouds.read_header(tmp_path / "gone.obj")
