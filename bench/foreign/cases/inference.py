@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from bench.foreign.case import Case
+from bench.waiting import until
 from tests.fakes.ports import free_port
-from tests.waiting import until
 
 WIDTH, HEIGHT, START_S, DEADLINE_S = 64, 48, 200.0, 60
 JSON_HEADER = "Content-Type=application/json"

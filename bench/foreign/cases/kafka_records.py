@@ -20,12 +20,12 @@ from pathlib import Path
 from typing import Any
 
 from bench.foreign.case import Case
+from bench.waiting import until
 from scan2sim.services.monitoring.export.archive import Archive
 from scan2sim.services.monitoring.record import TopicFlow
 from tests.fakes.broker import Broker
 from tests.fakes.ports import free_dds_domain, free_port
 from tests.fakes.sample_records import body
-from tests.waiting import until
 
 TOPIC, NODE, RULE = "monitor_data", "camera", "late"
 RULES = f'[[rules]]\nname = "{RULE}"\nmetric = "latency"\nabove = 0.001\n'
