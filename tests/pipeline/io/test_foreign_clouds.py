@@ -184,7 +184,7 @@ def test_a_mesh_of_large_triangles_is_no_cloud(tmp_path: Path) -> None:
 
     fine, walls = trimesh.creation.icosphere(4), trimesh.creation.box((10, 8, 3))
     trimesh.util.concatenate([fine, walls]).export(tmp_path / "c.ply")
-    with pytest.raises(InputError, match=r"is a mesh of 5,132 faces, not a point cloud.*import map .*c\.ply --out TILE"):
+    with pytest.raises(InputError, match=r"is a mesh of 5,132 faces, not a point cloud.*map .*c\.ply --out TILE"):
         clouds.read_header(tmp_path / "c.ply")
     with pytest.raises(InputError, match=r"is a mesh of 12 faces, not a point cloud"):
         clouds.read_header(box(tmp_path / "c.ply", 20.0))
