@@ -22,7 +22,7 @@ def missing() -> str:
 
 
 def check(export: Path, reference: WorldReference) -> dict[str, Any]:
-    """Read all files, compare SPZ with PLY, and render both from a photo's pose.
+    """Read all files, compare SPZ with PLY, and render PLY from a photo's pose.
 
     Raises:
         Fault: files differ from each other, or the image from the photo.
