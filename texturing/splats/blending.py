@@ -94,7 +94,7 @@ def blend(  # type: ignore[no-untyped-def]
                 image[BLUE, p] += weight * blue
                 here = min(max(inverse + slope_x * dx + slope_y * dy, lowest), highest)
                 image[DEVIATION, p] += weight * min(abs(here * expected[p] - ONE), MAX_DEVIATION)
-                image[MEDIAN, p] = here if (before > HALF) & (after <= HALF) else image[MEDIAN, p]
+                image[MEDIAN, p] += here if (before > HALF) & (after <= HALF) else ZERO  # a masked store is slow
                 image[TRANSMITTANCE, p] = after
             if number % CHECKED_EVERY == 0:
                 most = np.float32(0)

@@ -68,8 +68,8 @@ def _overlap(projected, i, columns, rows, width, height):  # type: ignore[no-unt
     """First and last column and row of the tiles, of width x height pixels, that a splat overlaps."""
     u, v, x, y = projected[i, 0], projected[i, 1], projected[i, 6], projected[i, 7]
     return (
-        max(int((u - x) // width), 0), min(int((u + x) // width), columns - 1),
-        max(int((v - y) // height), 0), min(int((v + y) // height), rows - 1),
+        int(max(u - x, np.float32(0)) / width), min(int((u + x) / width), columns - 1),
+        int(max(v - y, np.float32(0)) / height), min(int((v + y) / height), rows - 1),
     )  # fmt: skip
 
 
@@ -97,34 +97,34 @@ def _reaches(projected, i, x, y, width, height, farthest):  # type: ignore[no-un
 @njit(cache=True)
 def _assign(projected, index, columns, rows, width, height, min_alpha):  # type: ignore[no-untyped-def]
     """Entries of the tiles (`Assignment`): rows x columns of width x height pixels."""
+    most = 0
+    for m in range(len(index)):
+        left, right, top, bottom = _overlap(projected, index[m], columns, rows, width, height)
+        most += (right - left + 1) * (bottom - top + 1)
+    tile_of = np.empty(most, np.int32)  # of the entries, those of a splat in sequence
     start = np.zeros(columns * rows + 1, np.int32)
     first = np.zeros(len(index) + 1, np.int32)
+    count = 0
     for m in range(len(index)):
         i = index[m]
         left, right, top, bottom = _overlap(projected, i, columns, rows, width, height)
         farthest = _farthest(projected, i, min_alpha)
-        first[m + 1] = first[m]
         for y in range(top, bottom + 1):
             for x in range(left, right + 1):
                 if _reaches(projected, i, x, y, width, height, farthest):
-                    start[y * columns + x + 1] += 1
-                    first[m + 1] += 1
+                    tile_of[count] = y * columns + x
+                    start[tile_of[count] + 1] += 1
+                    count += 1
+        first[m + 1] = count
     for tile in range(columns * rows):
         start[tile + 1] += start[tile]
     free = start[:-1].copy()
-    splat, slot = np.empty(first[-1], np.int32), np.empty(first[-1], np.int32)
+    splat, slot = np.empty(count, np.int32), np.empty(count, np.int32)
     for m in range(len(index)):
-        i = index[m]
-        left, right, top, bottom = _overlap(projected, i, columns, rows, width, height)
-        farthest = _farthest(projected, i, min_alpha)
-        place = first[m]
-        for y in range(top, bottom + 1):
-            for x in range(left, right + 1):
-                if _reaches(projected, i, x, y, width, height, farthest):
-                    tile = y * columns + x
-                    splat[free[tile]], slot[free[tile]] = i, place
-                    free[tile] += 1
-                    place += 1
+        for place in range(first[m], first[m + 1]):
+            tile = tile_of[place]
+            splat[free[tile]], slot[free[tile]] = index[m], place
+            free[tile] += 1
     return start, splat, index, first, slot
 
 
