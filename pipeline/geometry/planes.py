@@ -234,7 +234,7 @@ def _remove_curved(xyz: F64, near: I32, which: I32, planes: Planes, voxel: float
         width = np.sqrt(12) * np.array([u.std(), v.std()])
         flat[p], narrow[p] = (2 * np.abs(bend) * width).max() < MAX_BEND_RAD, width.min() < NARROW_VOXELS * voxel
     plane = np.append(which, -1)  # the last entry is that of missing neighbours
-    for p in np.flatnonzero(flat & narrow):
+    for p in np.flatnonzero(flat & narrow).tolist():
         beside = plane[near[order[first[p] : first[p + 1]]]]
         beside = beside[(beside >= 0) & (beside != p)]
         flat[p] = flat[beside].sum() * 2 >= len(beside)

@@ -111,7 +111,7 @@ def test_tiles_get_equal_samples_around_their_border() -> None:
         near = np.abs(place[:, 0] - 391_206.0) < 0.5
         samples.append(place[near][np.lexsort(place[near].T)])
     assert len(samples[0]) > 500
-    assert np.array_equal(*samples)
+    assert np.array_equal(samples[0], samples[1])
 
 
 def go(step: Step, folder: Path, inputs: dict[str, Path]) -> Done:

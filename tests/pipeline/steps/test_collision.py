@@ -75,10 +75,10 @@ def test_parked_vehicles_are_boxes(clockwise: bool, tmp_path: Path) -> None:
     ]
     (tmp_path / "instances.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
     mesh, done = _run(tmp_path, {"terrain": synthetic.ground(10)}, also={"instances": tmp_path / "instances.geojson"})
-    box = mesh.keep(mesh.classification == CODE["vehicle"])
+    box = mesh.keep(np.asarray(mesh.classification) == CODE["vehicle"])
     solid = trimesh.Trimesh(box.vertices, box.faces)
     assert solid.is_watertight and solid.volume == pytest.approx(4.5 * 2 * 1.5, rel=1e-3)
-    np.testing.assert_allclose(solid.bounds, [[0, 0, 1], [4.5, 2, 2.5]], atol=0.01)
+    np.testing.assert_allclose(np.asarray(solid.bounds), [[0.0, 0.0, 1.0], [4.5, 2.0, 2.5]], atol=0.01)
     assert done.metrics["deviation_m"]["max"] < 0.1
 
 
