@@ -1,0 +1,145 @@
+"""3D Tiles of splats: structure of the tileset, its boxes, its contents, and its image in Cesium."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gsply", reason="the extra splats isn't installed")
+
+from scan2sim.pipeline.core.errors import DataError
+from scan2sim.pipeline.core.splats import Splats
+from scan2sim.pipeline.core.step import silent
+from scan2sim.pipeline.io import splat_files, world_formats
+from scan2sim.pipeline.io.geodata import crs
+from scan2sim.pipeline.io.world_formats import SceneParams, splats_tiles3d
+from scan2sim.pipeline.io.worlds import splat_levels
+from scan2sim.pipeline.io.worlds.scene import Scene
+from tests.fakes import splat_scenes, synthetic
+
+COUNT = 3000
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """Two tiles with splats."""
+    made = synthetic.scene(tmp_path_factory.mktemp("town"))
+    for seed, tile in enumerate(made.tiles, start=1):
+        splat_scenes.add(tile, seed, COUNT)
+    return made
+
+
+@pytest.fixture(scope="module")
+def export(town: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("export")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(splat_levels.levels, "__defaults__", (500,))
+        world_formats.write(town, ["splats_tiles3d"], folder, SceneParams(), silent)
+    return folder
+
+
+def tileset(export: Path) -> dict[str, Any]:
+    return dict(json.loads((export / splats_tiles3d.FILE).read_text(encoding="utf-8")))
+
+
+def nodes(node: dict[str, Any], above: np.ndarray) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """A node of the tileset and all below it, with their transforms to the earth."""
+    matrix = above @ np.array(node.get("transform", np.eye(4).ravel())).reshape(4, 4).T
+    yield node, matrix
+    for child in node.get("children", ()):
+        yield from nodes(child, matrix)
+
+
+def content(path: Path, work: Path) -> tuple[dict[str, Any], Splats]:
+    """The JSON of a GLB, and its splats with y up."""
+    data = path.read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    tree = json.loads(data[20 : 20 + length])
+    view = tree["bufferViews"][0]
+    (work / "a.spz").write_bytes(data[28 + length :][view.get("byteOffset", 0) :][: view["byteLength"]])
+    return tree, splat_files.read(work / "a.spz")
+
+
+def z_up(splats: Splats) -> np.ndarray:
+    """(N, 3) positions with z up."""
+    return splats.xyz.astype(float)[:, [0, 2, 1]] * (1, -1, 1)
+
+
+def test_leaves_hold_all_splats_at_their_place_on_the_earth(town: Scene, export: Path, tmp_path: Path) -> None:
+    found = []
+    for node, matrix in nodes(tileset(export)["root"], np.eye(4)):
+        if "content" in node and "children" not in node:
+            local = z_up(content(export / node["content"]["uri"], tmp_path)[1])
+            found.append(local @ matrix[:3, :3].T + matrix[:3, 3])
+            assert node["geometricError"] == 0
+    expected = []
+    for tile in town.tiles:
+        layer = tile.splats()
+        assert layer is not None
+        expected.append(crs.to_ecef(tile.frame, layer.splats.xyz))
+    own, seen = np.concatenate(expected), np.concatenate(found)
+    assert len(seen) == len(own) == 2 * COUNT
+    from scipy.spatial import cKDTree
+
+    distance, nearest = cKDTree(seen).query(own)
+    assert distance.max() < 1e-3 and len(np.unique(nearest)) == len(own)
+
+
+def test_levels_are_smaller_than_their_children_and_boxes_contain_them(export: Path, tmp_path: Path) -> None:
+    parents = 0
+    for node, _ in nodes(tileset(export)["root"], np.eye(4)):
+        if "content" not in node:
+            continue
+        tree, splats = content(export / node["content"]["uri"], tmp_path)
+        box = np.array(node["boundingVolume"]["box"])
+        half = np.diag(box[3:].reshape(3, 3))
+        reach = 2.8 * np.sqrt(np.diagonal(splats.covariance, axis1=1, axis2=2))[:, [0, 2, 1]]  # SPZ rounds sizes
+        assert (np.abs(z_up(splats) - box[:3]) + reach <= half + 2e-3).all()
+        assert tree["accessors"][0]["count"] == len(splats) and tree["meshes"][0]["primitives"][0]["mode"] == 0
+        if "children" in node:
+            parents += 1
+            assert node["refine"] == "REPLACE"
+            below = [content(export / one["content"]["uri"], tmp_path)[1] for one in node["children"]]
+            assert len(splats) < sum(map(len, below))
+            assert node["geometricError"] > max(one["geometricError"] for one in node["children"])
+    assert parents > 2
+
+
+def test_contents_and_tileset_declare_the_extensions_by_which_cesium_recognizes_splats(
+    export: Path, tmp_path: Path
+) -> None:
+    given = tileset(export)
+    declared = given["extensions"]["3DTILES_content_gltf"]
+    assert given["extensionsUsed"] == ["3DTILES_content_gltf"] and given["asset"] == {"version": "1.1"}
+    for path in export.rglob("*.glb"):
+        tree, _ = content(path, tmp_path)
+        assert tree["extensionsRequired"] == declared["extensionsRequired"] == splats_tiles3d.EXTENSIONS
+        extension = tree["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
+        assert extension["extensions"]["KHR_gaussian_splatting_compression_spz_2"] == {"bufferView": 0}
+    assert not list(export.rglob("*.spz"))
+
+
+def test_tiles_without_splats_are_left_out(town: Scene, tmp_path: Path) -> None:
+    made = synthetic.scene(tmp_path / "town")
+    splat_scenes.add(made.tiles[1], 1, 50)
+    world_formats.write(made, ["splats_tiles3d"], tmp_path / "export", SceneParams(), silent)
+    (child,) = tileset(tmp_path / "export")["root"]["children"]
+    assert child["content"]["uri"] == f"splats3d/{made.tiles[1].name}/level.glb"
+
+
+def test_a_world_without_splats_is_rejected_as_by_the_format_splats(tmp_path: Path) -> None:
+    bare = synthetic.scene(tmp_path / "town")
+    for name in ("splats", "splats_tiles3d"):
+        with pytest.raises(DataError, match=r"has no splats.*splats\.when=auto"):
+            world_formats.write(bare, [name], tmp_path / name, SceneParams(), silent)
+
+
+def test_both_tilesets_can_be_in_one_folder(town: Scene, tmp_path: Path) -> None:
+    world_formats.write(town, ["tiles3d", "splats_tiles3d"], tmp_path, SceneParams(), silent)
+    assert (tmp_path / "tileset.json").is_file() and (tmp_path / splats_tiles3d.FILE).is_file()
