@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import struct
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,14 +10,16 @@ import pytest
 pytest.importorskip("gsply", reason="the extra splats isn't installed")
 
 from scan2sim.pipeline.core.errors import DataError
-from scan2sim.pipeline.core.splats import Splats
 from scan2sim.pipeline.core.step import silent
-from scan2sim.pipeline.io import splat_files, world_formats
+from scan2sim.pipeline.core.types import Camera
+from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.geodata import crs
 from scan2sim.pipeline.io.world_formats import SceneParams, splats_tiles3d
 from scan2sim.pipeline.io.worlds import splat_levels
 from scan2sim.pipeline.io.worlds.scene import Scene
-from tests.fakes import splat_scenes, synthetic
+from tests.fakes import cesium, splat_scenes, synthetic
+from tests.fakes.consumers import cesium_splats, gltf_validator
+from tests.fakes.splat_tiles import content, leaves, nodes, tileset
 
 COUNT = 3000
 
@@ -44,40 +42,8 @@ def export(town: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def tileset(export: Path) -> dict[str, Any]:
-    return dict(json.loads((export / splats_tiles3d.FILE).read_text(encoding="utf-8")))
-
-
-def nodes(node: dict[str, Any], above: np.ndarray) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """A node of the tileset and all below it, with their transforms to the earth."""
-    matrix = above @ np.array(node.get("transform", np.eye(4).ravel())).reshape(4, 4).T
-    yield node, matrix
-    for child in node.get("children", ()):
-        yield from nodes(child, matrix)
-
-
-def content(path: Path, work: Path) -> tuple[dict[str, Any], Splats]:
-    """The JSON of a GLB, and its splats with y up."""
-    data = path.read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    tree = json.loads(data[20 : 20 + length])
-    view = tree["bufferViews"][0]
-    (work / "a.spz").write_bytes(data[28 + length :][view.get("byteOffset", 0) :][: view["byteLength"]])
-    return tree, splat_files.read(work / "a.spz")
-
-
-def z_up(splats: Splats) -> np.ndarray:
-    """(N, 3) positions with z up."""
-    return splats.xyz.astype(float)[:, [0, 2, 1]] * (1, -1, 1)
-
-
-def test_leaves_hold_all_splats_at_their_place_on_the_earth(town: Scene, export: Path, tmp_path: Path) -> None:
-    found = []
-    for node, matrix in nodes(tileset(export)["root"], np.eye(4)):
-        if "content" in node and "children" not in node:
-            local = z_up(content(export / node["content"]["uri"], tmp_path)[1])
-            found.append(local @ matrix[:3, :3].T + matrix[:3, 3])
-            assert node["geometricError"] == 0
+def test_leaves_hold_all_splats_at_their_place_on_the_earth(town: Scene, export: Path) -> None:
+    found = [splats.xyz @ matrix[:3, :3].T + matrix[:3, 3] for splats, matrix in leaves(export)]
     expected = []
     for tile in town.tiles:
         layer = tile.splats()
@@ -91,34 +57,34 @@ def test_leaves_hold_all_splats_at_their_place_on_the_earth(town: Scene, export:
     assert distance.max() < 1e-3 and len(np.unique(nearest)) == len(own)
 
 
-def test_levels_are_smaller_than_their_children_and_boxes_contain_them(export: Path, tmp_path: Path) -> None:
+def test_levels_are_smaller_than_their_children_and_boxes_contain_them(export: Path) -> None:
     parents = 0
-    for node, _ in nodes(tileset(export)["root"], np.eye(4)):
+    for node, _ in nodes(tileset(export)["root"]):
         if "content" not in node:
             continue
-        tree, splats = content(export / node["content"]["uri"], tmp_path)
+        tree, splats = content(export / node["content"]["uri"])
         box = np.array(node["boundingVolume"]["box"])
         half = np.diag(box[3:].reshape(3, 3))
-        reach = 2.8 * np.sqrt(np.diagonal(splats.covariance, axis1=1, axis2=2))[:, [0, 2, 1]]  # SPZ rounds sizes
-        assert (np.abs(z_up(splats) - box[:3]) + reach <= half + 2e-3).all()
+        reach = 2.8 * np.sqrt(np.diagonal(splats.covariance, axis1=1, axis2=2))  # SPZ rounds sizes
+        assert (np.abs(splats.xyz - box[:3]) + reach <= half + 2e-3).all()
         assert tree["accessors"][0]["count"] == len(splats) and tree["meshes"][0]["primitives"][0]["mode"] == 0
         if "children" in node:
             parents += 1
-            assert node["refine"] == "REPLACE"
-            below = [content(export / one["content"]["uri"], tmp_path)[1] for one in node["children"]]
+            assert node["refine"] == "REPLACE" and node["extras"]["spacing_m"] > 0
+            below = [content(export / one["content"]["uri"])[1] for one in node["children"]]
             assert len(splats) < sum(map(len, below))
             assert node["geometricError"] > max(one["geometricError"] for one in node["children"])
+        else:
+            assert node["geometricError"] == 0
     assert parents > 2
 
 
-def test_contents_and_tileset_declare_the_extensions_by_which_cesium_recognizes_splats(
-    export: Path, tmp_path: Path
-) -> None:
+def test_contents_and_tileset_declare_the_extensions_of_splats(export: Path) -> None:
     given = tileset(export)
     declared = given["extensions"]["3DTILES_content_gltf"]
     assert given["extensionsUsed"] == ["3DTILES_content_gltf"] and given["asset"] == {"version": "1.1"}
     for path in export.rglob("*.glb"):
-        tree, _ = content(path, tmp_path)
+        tree, _ = content(path)
         assert tree["extensionsRequired"] == declared["extensionsRequired"] == splats_tiles3d.EXTENSIONS
         extension = tree["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
         assert extension["extensions"]["KHR_gaussian_splatting_compression_spz_2"] == {"bufferView": 0}
@@ -143,3 +109,29 @@ def test_a_world_without_splats_is_rejected_as_by_the_format_splats(tmp_path: Pa
 def test_both_tilesets_can_be_in_one_folder(town: Scene, tmp_path: Path) -> None:
     world_formats.write(town, ["tiles3d", "splats_tiles3d"], tmp_path, SceneParams(), silent)
     assert (tmp_path / "tileset.json").is_file() and (tmp_path / splats_tiles3d.FILE).is_file()
+
+
+def test_khronos_validator_finds_nothing_but_unknown_extensions(export: Path) -> None:
+    if reason := gltf_validator.missing():
+        pytest.skip(reason)
+    path = next(export.rglob("*.glb"))
+    found = [one for one in gltf_validator.issues(path)["messages"] if one["severity"] <= 1]
+    assert not [one for one in found if "KHR_gaussian_splatting" not in one["pointer"]], found
+
+
+def test_cesium_draws_the_splats_as_the_camera_in_python(town: Scene, export: Path, tmp_path: Path) -> None:
+    """All of both tiles near by; from far away, fewer splats."""
+    if reason := cesium.missing():
+        pytest.skip(reason)
+    ahead = np.eye(4)
+    ahead[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    ahead[:3, 3] = (-25, 0, 2.5)
+    camera = Camera("pinhole", 480, 360, 300.0, 300.0, 239.5, 179.5)
+    with cesium_splats.viewer(export, tmp_path, camera) as view:
+        seen = view.drawn(ahead, whole=True)
+        assert view.count() == 2 * COUNT
+        own = cesium_splats.drawn_in_python(export, camera, ahead)
+        assert (own != cesium.SKY).any(axis=2).mean() > 0.1 and cesium_splats.psnr(own, seen) > 35
+        ahead[0, 3] = -500
+        far = view.drawn(ahead)
+        assert (far != cesium.SKY).any() and view.count() < COUNT
