@@ -43,8 +43,10 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
         Fault: splats are missing in Cesium, or its image differs.
     """
     photo = renderings.photo(reference)
-    own = drawn_in_python(export, photo.camera, photo.pose)
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as work, viewer(export, Path(work), photo.camera) as v:
+    width, height, focal = photo.camera.width, photo.camera.height, photo.camera.fx
+    camera = Camera("pinhole", width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    own = drawn_in_python(export, camera, photo.pose)
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as work, viewer(export, Path(work), camera) as v:
         levels = v.drawn(photo.pose)
         shown = v.count()
         whole = v.drawn(photo.pose, whole=True)
@@ -62,7 +64,10 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
 
 
 class SplatViewer:
-    """Cesium showing splats to a pinhole camera; poses are those of the world."""
+    """Cesium showing splats to a pinhole camera; poses are those of the world.
+
+    Its principal point is the image centre: where Cesium moves the near plane of its frustum, offsets aren't to scale.
+    """
 
     def __init__(self, view: cesium.Viewer, frame: Frame, camera: Camera) -> None:
         self._view, self._frame, self._camera = view, frame, camera
@@ -70,8 +75,7 @@ class SplatViewer:
     def drawn(self, pose: F64, *, whole: bool = False) -> U8:
         """(H, W, 3) image from a pose (4, 4), with Cesium's default levels, or with the finest ones."""
         pixels = FINEST_ERROR_PX if whole else DEFAULT_ERROR_PX
-        centre = self._camera.cx, self._camera.cy
-        self._view.look(*onto_earth(self._frame, pose), focal=self._camera.fx, centre=centre, pixels=pixels)
+        self._view.look(*onto_earth(self._frame, pose), focal=self._camera.fx, pixels=pixels)
         return self._view.screenshot()
 
     def count(self) -> int:
