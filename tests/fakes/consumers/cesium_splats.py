@@ -2,8 +2,8 @@
 
 With splats of several pixels the images agree (41 dB, `tests/pipeline/io/test_splat_tiles.py`). Cesium widens splats by
 less than a seventh of a pixel, not by half a one as in training, and leaves out those smaller than a third of a pixel:
-on the street of KITTI odometry 04 (400 x 180 pixels in the middle of a photo's view) they agree by 29.3 dB, with gaps in
-the ground that show the background. So the check requires `MIN_PSNR_DB`.
+on the street of KITTI odometry 04 (400 x 180 pixels in the middle of a photo's view) they agree by 29.3 dB, with gaps
+in the ground that show the background. So the check requires `MIN_PSNR_DB`.
 """
 
 from __future__ import annotations
