@@ -6,17 +6,17 @@ is. Only vehicles and people that the world leaves out are not counted, instance
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from scan2sim.pipeline.core.classes import PHOTO_CLASSES
-from scan2sim.pipeline.core.types import F32, I32, I64, U8, Bools, Frame, Mesh
+from scan2sim.pipeline.core.types import F32, I64, U8, Bools, Frame, Mesh
+from scan2sim.pipeline.dynamic_objects.instance_boxes import boxes, is_parked
 from scan2sim.pipeline.io.images import image
 from scan2sim.texturing import evaluate
 from scan2sim.texturing.ms_ssim import ms_ssim
@@ -158,32 +158,7 @@ def box_mesh(geojson: Path, frame: Frame, *, keep_vehicles: bool) -> Mesh:
         frame: frame of the mesh.
         keep_vehicles: whether parked vehicles are in the world.
     """
-    return instance_boxes(
-        geojson, frame, lambda about: about["kind"] == "person" or about["moved"] or not keep_vehicles
-    )
-
-
-def instance_boxes(geojson: Path, frame: Frame, wanted: Callable[[Mapping[str, Any]], bool]) -> Mesh:
-    """Boxes of the instances whose properties are `wanted`, in local metres."""
-    vertices: list[F32] = [np.zeros((0, 3), np.float32)]
-    for feature in json.loads(geojson.read_text(encoding="utf-8"))["features"]:
-        about = feature["properties"]
-        if not wanted(about):
-            continue
-        ring = np.array(feature["geometry"]["coordinates"][0][:4], np.float64)
-        low = frame.to_local(np.column_stack([ring, np.full(4, about["ground_z"])])).astype(np.float32)
-        vertices.append(np.concatenate([low, low + np.array([0, 0, about["height_m"]], np.float32)]))
-    corners = np.concatenate(vertices)
-    first = np.arange(0, len(corners), 8, dtype=np.int32)
-    return Mesh(frame, corners, (first[:, None, None] + BOX_FACES).reshape(-1, 3).astype(np.int32))
-
-
-BOX_FACES: I32 = np.array(
-    [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7], *(
-        face for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)) for face in ([a, b, b + 4], [a, b + 4, a + 4])
-    )], np.int32,
-)  # fmt: skip
-"""(12, 3) triangles of a box of corners 0-3 around its bottom and 4-7 above them; orientation doesn't matter."""
+    return boxes(geojson, frame, lambda about: not is_parked(about) or not keep_vehicles)
 
 
 def picture(photo: U8, frame: WholeFrame) -> U8:

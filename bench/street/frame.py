@@ -46,8 +46,11 @@ def metrics(
         gain: (3,) gain of the photo, solved on the surfaces (`score.solve_gain`).
         sky: (H, W) pixels that show the sky.
     """
-    like = score.apply_gain(rendering.whole, gain)
+    like, whole = (
+        score.apply_gain(rendering.whole, g) for g in (gain, score.solve_gain(photo.rgb, rendering.whole, counts))
+    )
     found = {
+        "shell_frame_psnr_db": score.psnr(score.squared_error(photo.rgb, whole, counts)),
         "frame_psnr_db": score.psnr(score.squared_error(photo.rgb, like, counts)),
         "frame_nogain_psnr_db": score.psnr(score.squared_error(photo.rgb, rendering.whole, counts)),
         "frame_ssim": score.ssim(photo.rgb, like, counts),

@@ -9,7 +9,8 @@ every 8th sweep is held out. The world is read from its exported files (OBJ and 
 pixel. A gain per channel is solved for each photo; metrics are means over the three photos, all of which count.
 
 **Whole frames** (`bench/street/frame.py`): every pixel that shows neither a vehicle nor a person, sky, backdrop and
-missing surface, too, after the gain that was solved on the surfaces.
+missing surface, too, after the gain that was solved on the surfaces; `shell_frame_psnr_db` after one that was solved on
+all of these pixels, as for the splats.
 
 **Which pixels count** otherwise: those whose central ray hits the world, whether the surface is textured by a photo or
 not; not those that show moving objects or, if vehicles are removed, any vehicle: from KITTI's tracking boxes on raw
@@ -69,7 +70,7 @@ EDGES = "bench.edges"
 """Module that measures `edge_cm`."""
 MEANS = (
     "psnr_db", "nogain_psnr_db", "ssim", "sharpness", "counted", "frame_psnr_db", "frame_nogain_psnr_db", "frame_ssim",
-    "frame_msssim", "no_surface", "clipped_photo", "clipped_rendered",
+    "frame_msssim", "shell_frame_psnr_db", "no_surface", "clipped_photo", "clipped_rendered",
 )  # fmt: skip
 """Metrics of a street that are means over its held-out photos."""
 MIN_SIGN_PX = 12.0
@@ -372,6 +373,7 @@ def result(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         "time_ratio": time.get("time_ratio"),
         "frame_psnr_db": worst(street["frame_psnr_db"] for street in streets),
         "frame_msssim": worst(street["frame_msssim"] for street in streets),
+        "shell_frame_psnr_db": worst(street.get("shell_frame_psnr_db") for street in streets),
         "nogain_psnr_db": worst(street["nogain_psnr_db"] for street in streets),
         "clipped_share": worst((frame.clipped_share(street["photos"].values()) for street in streets), -1),
         "outline_px": worst((_median(street["displacements_px"]) for street in streets), -1),

@@ -163,7 +163,7 @@ def build_graph(
         SettingError: a setting that doesn't exist or is out of range.
     """
     settings.check(STEPS)
-    settings = settings.with_defaults(map_defaults(tile.robot_map))
+    settings = settings.with_defaults({**map_defaults(tile.robot_map), **_splats_defaults(settings)})
     graph = TileGraph(tile, settings, survey_tiles, SIDE_PRODUCTS, without)
     scan = _classify(graph)
     instances, cloud, uncovered = _select_points(graph, scan)
@@ -181,11 +181,11 @@ def build_graph(
     lists = _list_objects(graph, scan, parts) | tracks
     closed, surfaces, photos, lists = _analyse_photos(graph, scan, parts, lists)
     textured = _texture(graph, parts, surfaces, photos, synthesized, source)
-    solid, origin = _add_solid(graph, closed, parked)
+    splats = _add_splats(graph, scan, parts, surfaces, photos)
+    solid, origin = _add_solid(graph, closed, parked, _only_splats_show(graph, parts) if splats else {})
     roads = _add_roads(graph, scan, textured, origin)
     sky = _add_sky(graph, scan, photos)
     backdrop = _add_backdrop(graph, scan, surfaces, photos)
-    splats = _add_splats(graph, scan, parts, surfaces, photos)
     more = lists | roads | sky | backdrop | splats | solid | origin
     _export(graph, scan, parts, closed, textured, photos, parked["textured"], more)
     _measure(graph, scan, parts, surfaces, textured, photos, synthesized, sky | backdrop | splats)
@@ -593,13 +593,32 @@ def _add_splats(graph: TileGraph, scan: Scan, parts: Parts, surfaces: Sources, p
     return {"splats": graph.output(SPLATS, "splats")} if graph.is_enabled(SPLATS) else {}
 
 
-def _add_solid(graph: TileGraph, surfaces: Sources, parked: Mapping[str, Sources]) -> tuple[Sources, Sources]:
-    """The collision mesh, and the world's origin unless it is chosen or that of a robot's map; as inputs of steps."""
+def _splats_defaults(settings: Settings) -> Mapping[str, Mapping[str, Any]]:
+    """Splats show no parked vehicles either if the user has removed these; by default they do."""
+    return {"splats": {"parked": False}} if settings.values.get("split", {}).get("vehicles") == "remove" else {}
+
+
+def _only_splats_show(graph: TileGraph, parts: Parts) -> Sources:
+    """Instances, as an input, if splats show parked vehicles that have neither a surface nor a model."""
+    return parts.instances if graph.params(SPLATS).parked and graph.params(SPLIT).vehicles == "remove" else {}
+
+
+def _add_solid(
+    graph: TileGraph, surfaces: Sources, parked: Mapping[str, Sources], boxes: Sources
+) -> tuple[Sources, Sources]:
+    """The collision mesh, and the world's origin unless it is chosen or that of a robot's map; as inputs of steps.
+
+    Args:
+        graph: the graph.
+        surfaces: closed meshes by class.
+        parked: models of parked vehicles.
+        boxes: instances, of which parked vehicles become boxes.
+    """
     # the floor of a robot's map is denoised already, and its assumed part must not follow points nearby
     terrain: Sources = {} if _has_floor(graph) else {"cloud": graph.output(SPLIT, "terrain")}
     ground = {"terrain": graph.output(FLOOR, "mesh")} if _has_floor(graph) and _is_mesh(graph) else {}
     meshes = {**surfaces, **ground, **_plant_models(graph, "mesh"), **parked["mesh"]}
-    graph.add(COLLISION, meshes | terrain, **graph.cell)
+    graph.add(COLLISION, meshes | terrain | boxes, **graph.cell)
     solid: Sources = {"collision": graph.output(COLLISION, "mesh")}
     if world_origin(graph.tile, graph.settings) is not None:
         return solid, {}

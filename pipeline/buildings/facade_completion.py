@@ -114,10 +114,11 @@ def walls(xyz: F32, which: I32, planes: Planes, cell: float, rise: float) -> Ite
         up = np.cross(normal, along)
         up *= np.sign(up[2])
         s, t = points @ along / cell, points @ up / cell
-        row, column = np.rint(t - t.min()).astype(int), np.rint(s - s.min()).astype(int)
+        lowest = np.rint(t.min())  # rows coincide with layers of voxels, wherever the lowest sample is
+        row, column = (np.rint(t) - lowest).astype(int), np.rint(s - s.min()).astype(int)
         known = np.zeros((row.max() + 1 + round(rise / cell), column.max() + 1), bool)
         known[row, column] = True
-        corner = planes.offset[p] * normal + s.min() * cell * along + t.min() * cell * up
+        corner = planes.offset[p] * normal + s.min() * cell * along + lowest * cell * up
         yield Wall(int(p), corner, along, up, normal, cell, known)
 
 

@@ -9,10 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.core.types import F32, Bools, Frame
+from scan2sim.pipeline.core.types import F32, I32, Bools, Frame, Mesh
 
 BOX_MARGIN_M = 0.4
 """Margin around a box: mirrors, antennas."""
+FACES: I32 = np.array(
+    [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], *(
+        face for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)) for face in ([a, b, b + 4], [a, b + 4, a + 4])
+    )], np.int32,
+)  # fmt: skip
+"""(12, 3) triangles of a box, to the outside: corners 0-3 are around its bottom, counterclockwise, 4-7 above them."""
+
+
+def is_parked(properties: Mapping[str, Any]) -> bool:
+    """Whether an instance with these properties is a vehicle that stood still."""
+    return properties["kind"] != "person" and not properties["moved"]
 
 
 def in_boxes(xyz: F32, frame: Frame, geojson: Path, chosen: Callable[[Mapping[str, Any]], bool]) -> Bools:
@@ -38,3 +49,20 @@ def in_boxes(xyz: F32, frame: Frame, geojson: Path, chosen: Callable[[Mapping[st
             own &= np.abs(offset @ side) < length * (length / 2 + BOX_MARGIN_M)
         inside |= own
     return inside
+
+
+def boxes(geojson: Path, frame: Frame, chosen: Callable[[Mapping[str, Any]], bool]) -> Mesh:
+    """Boxes of the chosen instances, in local metres; arguments as of `in_boxes`."""
+    vertices: list[F32] = [np.zeros((0, 3), np.float32)]
+    for feature in json.loads(geojson.read_text(encoding="utf-8"))["features"]:
+        properties = feature["properties"]
+        if not chosen(properties):
+            continue
+        ring = np.array(feature["geometry"]["coordinates"][0][:4], np.float64)
+        low = frame.to_local(np.column_stack([ring, np.full(4, properties["ground_z"])])).astype(np.float32)
+        (ax, ay), (bx, by) = low[1, :2] - low[0, :2], low[2, :2] - low[1, :2]
+        low = low if ax * by > ay * bx else low[::-1]
+        vertices.append(np.concatenate([low, low + np.array([0, 0, properties["height_m"]], np.float32)]))
+    corners = np.concatenate(vertices)
+    first = np.arange(0, len(corners), 8, dtype=np.int32)
+    return Mesh(frame, corners, (first[:, None, None] + FACES).reshape(-1, 3).astype(np.int32))

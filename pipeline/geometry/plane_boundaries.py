@@ -106,18 +106,20 @@ def assign_points(xyz: F32, planes: Planes, thin: F32, which: I32, voxel: float,
     Args:
         xyz: (N, 3) local metres.
         planes: planes of the thinned points.
-        thin: (M, 3) one point per voxel, in the order of `voxel_groups`.
+        thin: (M, 3) at most one point per voxel.
         which: (M,) their planes.
         voxel: voxel size, metres.
         tolerance: largest distance of a thinned point from its plane, metres; at least `point_tolerance` is used.
     """
     tolerance = max(tolerance, LIMITS.point_tolerance * voxel)
-    own = np.full(len(xyz), -1, np.int32)
     on = np.flatnonzero(which >= 0)
     if not len(on):
-        return own
-    order, starts = voxel_groups(xyz, voxel)
-    own[order] = np.repeat(which, np.diff(np.append(starts, len(order))))
+        return np.full(len(xyz), -1, np.int32)
+    order, starts = voxel_groups(np.concatenate([thin, xyz]), voxel)
+    first = np.minimum(order[starts], len(thin))  # a thinned point, if the voxel has one
+    own = np.empty(len(order), np.int32)
+    own[order] = np.repeat(np.append(which, np.int32(-1))[first], np.diff(np.append(starts, len(order))))
+    own = own[len(thin) :]
     own[(own >= 0) & (np.abs(planes.signed_distance(xyz, own)) > tolerance)] = -1
     rest = np.flatnonzero(own < 0)
     _, at = cKDTree(thin[on]).query(xyz[rest], 4, distance_upper_bound=2 * voxel, workers=-1)

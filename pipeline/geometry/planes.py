@@ -29,6 +29,8 @@ MIN_PLANE_POINTS = 40
 """0.4 m2 at voxels of 10 cm."""
 MAX_BEND_RAD = float(np.radians(10.0))
 """Largest change of the normal from end to end, by a parabola through the points; above it, the surface is curved."""
+NARROW_VOXELS = 4.0
+"""Width below which a plane beside curved surfaces counts as curved, too: a strip of a column may seem flat."""
 BEND_SAMPLES = 2000
 """Maximum number of points for that fit."""
 OFFSET_SCALE_M = 100.0
@@ -102,7 +104,7 @@ def detect(xyz: F32, normal: F32, voxel: float) -> tuple[Planes, I32, float]:
     which = _grow(
         points, normals, near, order[residual[order] <= tolerance], tolerance, MIN_NORMAL_COS, MIN_PLANE_POINTS
     )
-    which = _remove_curved(points, which, _fit_planes(points, normals, which, tolerance))
+    which = _remove_curved(points, near, which, _fit_planes(points, normals, which, tolerance), voxel)
     planes = _fit_planes(points, normals, which, tolerance)
     for _ in range(GROWTH_ROUNDS):
         which = _absorb_neighbours(points, near, which, np.ascontiguousarray(planes.normal), planes.offset, tolerance)
@@ -218,19 +220,24 @@ def _fit_planes(xyz: F64, normal: F64, which: I32, tolerance: float) -> Planes:
     return planes
 
 
-def _remove_curved(xyz: F64, which: I32, planes: Planes) -> I32:
+def _remove_curved(xyz: F64, near: I32, which: I32, planes: Planes, voxel: float) -> I32:
     """Remove planes that are strips of a curved surface, and renumber the planes of the points."""
     order = np.argsort(which, kind="stable")
     first = np.searchsorted(which[order], np.arange(len(planes) + 1))
-    flat = np.ones(len(planes) + 1, bool)
+    flat, narrow = np.zeros((2, len(planes) + 1), bool)  # the last entry is that of points without a plane
     for p in range(len(planes)):
-        members = order[first[p] : first[p + 1]][:: max(1, (first[p + 1] - first[p]) // BEND_SAMPLES)]
-        apart = xyz[members] - xyz[members].mean(axis=0)
+        members = order[first[p] : first[p + 1]]
+        apart = xyz[members[:: len(members) // BEND_SAMPLES + 1]] - xyz[members].mean(axis=0)
         u, v = (apart @ np.linalg.svd(apart, full_matrices=False)[2][:2].T).T
         columns = np.column_stack([u * u, v * v, u * v, u, v, np.ones(len(u))])
         bend = np.linalg.lstsq(columns, apart @ planes.normal[p], rcond=None)[0][:2]
-        flat[p] = (2 * np.abs(bend) * np.sqrt(12) * [u.std(), v.std()]).max() < MAX_BEND_RAD
-    flat[-1] = False  # entry of points without a plane
+        width = np.sqrt(12) * np.array([u.std(), v.std()])
+        flat[p], narrow[p] = (2 * np.abs(bend) * width).max() < MAX_BEND_RAD, width.min() < NARROW_VOXELS * voxel
+    plane = np.append(which, -1)  # the last entry is that of missing neighbours
+    for p in np.flatnonzero(flat & narrow).tolist():
+        beside = plane[near[order[first[p] : first[p + 1]]]]
+        beside = beside[(beside >= 0) & (beside != p)]
+        flat[p] = flat[beside].sum() * 2 >= len(beside)
     return np.where(flat, np.cumsum(flat) - 1, -1)[which].astype(np.int32)
 
 

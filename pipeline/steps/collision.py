@@ -56,6 +56,7 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
     `vegetation`, if enabled) share the remaining triangles. Open edges on borders with other tiles are kept vertex for
     vertex; all others are simplified. Ceilings don't collide. Street furniture is not simplified, so that its poles
     and trunks can be replaced by cylinders (`pipeline.geometry.cylinders`), unless it takes more than half the budget.
+    With `instances` (GeoJSON), parked vehicles without a surface, which splats show, are boxes.
     If neither ground nor building has a face, plants collide, with a warning.
 
     File: `mesh`, with a class code per face (ground: class of the nearest points). Metrics in metres: `ground_m`,
@@ -88,11 +89,12 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
             "there is no surface to collide with (terrain, building and vegetation are empty)",
             "Check the cloud's classes, and the settings of voxel, poisson, trim and islands",
         )
+    parked = _parked(inputs, frame, cell)
     report(0.1, f"{len(visual):,} triangles")
     ground = _ground(terrain, points, params, cell)
     report(0.5, "walls")
     collision_mesh = _joined(
-        frame, [ground, *_walls(surfaces, params.triangles - len(ground) - len(furniture), cell), furniture]
+        frame, [ground, *_walls(surfaces, params.triangles - len(ground) - len(furniture), cell), furniture, parked]
     )
     if len(collision_mesh) > MAX_TRIANGLES:
         raise StepError(
@@ -123,6 +125,17 @@ def collision(inputs: Inputs, params: CollisionParams, out: Path, report: Report
             f"{len(collision_mesh):,} triangles instead of {params.triangles:,}: tile borders can't be simplified"
         )
     return Done({"mesh": out / "collision.npz"}, metrics, warnings)
+
+
+def _parked(inputs: Inputs, frame: Frame, cell: Cell | None) -> Mesh:
+    """Boxes of the parked vehicles among `instances` whose middle is in the tile's cell."""
+    from scan2sim.pipeline.dynamic_objects.instance_boxes import boxes, is_parked
+
+    found = boxes(inputs["instances"], frame, is_parked) if "instances" in inputs else _joined(frame, [])
+    if cell is not None and len(found):
+        middles = found.vertices.reshape(-1, 8, 3)[..., :2].mean(axis=1) + np.asarray(frame.origin[:2])
+        found = found.keep(np.repeat(cell.outside(middles) <= 0, len(found) // len(middles)))
+    return _of_class(found, CODE["vehicle"])
 
 
 def _ground_points(inputs: Inputs, seed: int) -> PointCloud | None:

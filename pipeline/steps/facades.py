@@ -174,4 +174,4 @@ def away_from_borders(xyz: F64, origin: tuple[float, ...], tile: TileCell | None
     return np.asarray(tile.cell.outside(xyz[:, :2] + np.asarray(origin[:2])) < -BORDER_MARGIN_M)
 
 
-FACADES = Step("facades", 2, facades, FacadesParams)
+FACADES = Step("facades", 3, facades, FacadesParams)

@@ -109,4 +109,4 @@ def snap_weights(mesh: Mesh, params: PlanesParams) -> F64:
     return weight
 
 
-PLANES = Step("planes", 3, planes, PlanesParams)
+PLANES = Step("planes", 4, planes, PlanesParams)

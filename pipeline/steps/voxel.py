@@ -10,7 +10,7 @@ from pydantic import Field
 from scan2sim.pipeline.core.parameters import Voxel
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import PointCloud, Trajectory
-from scan2sim.pipeline.geometry.voxel_grid import sample
+from scan2sim.pipeline.geometry.voxel_grid import sample, sheet_groups
 
 
 class VoxelParams(Params):
@@ -35,7 +35,7 @@ def voxel(inputs: Inputs, params: VoxelParams, out: Path, report: Report) -> Don
     cloud = PointCloud.load(inputs["cloud"])
     n = len(cloud)
     report(0.1, "thinning")
-    thin = sample(cloud, params.size)
+    thin = sample(cloud, params.size, sheet_groups(cloud.xyz, params.size))
     report(0.4, "normals")
     path = Trajectory.load(inputs["path"]) if "path" in inputs else None
     thin = oriented_normals(thin, params.neighbours, path)
@@ -45,4 +45,4 @@ def voxel(inputs: Inputs, params: VoxelParams, out: Path, report: Report) -> Don
     return Done({"cloud": out / "cloud.npz"}, metrics)
 
 
-VOXEL = Step("voxel", 3, voxel, VoxelParams, per_class=True)
+VOXEL = Step("voxel", 4, voxel, VoxelParams, per_class=True)

@@ -79,10 +79,10 @@ def missing() -> str:
 
 
 class Viewer:
-    """three.js showing GLBs.
+    """three.js showing a world.
 
     Attributes:
-        statistics: number of `triangles`, of meshes with a texture (`textures`) and of those with `features`.
+        statistics: of GLBs, number of `triangles`, of meshes with a texture (`textures`) and of those with `features`.
     """
 
     def __init__(self, page: Page, statistics: dict[str, Any]) -> None:
@@ -102,9 +102,14 @@ class Viewer:
 
 @contextmanager
 def viewer(
-    world: Path, files: Sequence[str], work: Path, size: tuple[int, int], package: Path | None = None
+    world: Path,
+    files: Sequence[str],
+    work: Path,
+    size: tuple[int, int],
+    package: Path | None = None,
+    source: str = PAGE,
 ) -> Iterator[Viewer]:
-    """Open GLBs in three.js; skips the test if Chromium isn't installed.
+    """Open files in three.js, by default GLBs; skips the test if Chromium isn't installed.
 
     Args:
         world: folder of the files.
@@ -113,13 +118,15 @@ def viewer(
         size: width and height of the canvas in pixels.
         package: folder of the npm package three, which has decoders of compressed geometry and textures; default: the
             project's three.js.
+        source: HTML of the page, which defines `THREE`, `open` and `look`; `HEAD` is replaced by the scripts of
+            three.js.
     """
     work.mkdir(exist_ok=True)
     (work / "world").symlink_to(world.resolve())
     shutil.copyfile(PAGES / "three.js", work / "three.js")
     if package is not None:
         (work / "npm").symlink_to(package)
-    (work / "page.html").write_text(PAGE.replace("HEAD", NPM_SCRIPT if package else BUNDLED_SCRIPT), encoding="utf-8")
+    (work / "page.html").write_text(source.replace("HEAD", NPM_SCRIPT if package else BUNDLED_SCRIPT), encoding="utf-8")
     handler = functools.partial(_QuietHandler, directory=str(work))
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, browser.chromium(work) as page:
         threading.Thread(target=server.serve_forever, daemon=True).start()

@@ -14,6 +14,7 @@ from scan2sim.data_samples.layout import FRAME, lay_out
 from scan2sim.data_samples.scene import build
 from scan2sim.data_samples.street import generate
 from scan2sim.flows.cli import app
+from scan2sim.flows.pipelines.graph import Task
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.pipelines.tile import build_graph
 from scan2sim.pipeline.core.classes import CODE
@@ -36,6 +37,24 @@ def test_vehicle_tasks_exist_only_if_vehicles_are_kept() -> None:
     assert kept["decimate.vehicle"].params.target == 50_000  # type: ignore[attr-defined]
     airborne = {task.full_name for task in build_graph(replace(tile, views=(), trajectory=None), KEEP)}
     assert not any(label.endswith(".vehicle") for label in airborne)
+
+
+def test_parked_vehicles_that_only_splats_show_are_solid() -> None:
+    tile = read_tile(STREET)
+
+    def tasks(vehicles: dict[str, str], splats: dict[str, object]) -> dict[str, Task]:
+        settings = Settings({"split": vehicles, "splats": splats})
+        return {task.full_name: task for task in build_graph(tile, settings)}
+
+    def solid(vehicles: dict[str, str], **splats: object) -> bool:
+        return "instances" in tasks(vehicles, splats)["collision"].inputs
+
+    assert solid({}, when="auto")
+    assert not solid({}, when="never") and not solid({}, when="auto", parked=False)
+    assert not solid({"vehicles": "keep"}, when="auto")  # they have a surface
+    removed = {"vehicles": "remove"}
+    assert not solid(removed, when="auto") and solid(removed, when="auto", parked=True)
+    assert not tasks(removed, {"when": "auto"})["splats"].params.parked  # type: ignore[attr-defined]
 
 
 def test_parked_vehicles_are_kept_and_moving_ones_removed(tmp_path: Path) -> None:
@@ -81,7 +100,7 @@ def test_world_with_parked_cars(tmp_path: Path) -> None:
         result = CliRunner().invoke(app, ["run", str(tile), "--out", str(out), "--set", f"split.vehicles={name}"])
         assert result.exit_code == 0, result.output
     assert not list((tmp_path / "remove").rglob("vehicle.*"))
-    meshes = next((tmp_path / "keep" / "world" / "models").rglob("meshes"))
+    (meshes,) = (file.parent for file in (tmp_path / "keep" / "world" / "models").rglob("vehicle.obj"))
     assert {"vehicle.obj", "vehicle.dae", "vehicle.mtl", "vehicle_0.png"} <= {f.name for f in meshes.iterdir()}
     assert "vehicle.obj" in (meshes.parent / "model.sdf").read_text(encoding="utf-8")
     report = json.loads((tmp_path / "keep" / "report.json").read_text(encoding="utf-8"))

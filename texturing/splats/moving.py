@@ -10,8 +10,9 @@ from scan2sim.pipeline.camera import depth_map
 from scan2sim.pipeline.camera.models import pixel_angle
 from scan2sim.pipeline.camera.renderer import Body, Renderer
 from scan2sim.pipeline.core.types import Bools, Frame, PointCloud
+from scan2sim.pipeline.dynamic_objects.instance_boxes import boxes, is_parked
 from scan2sim.texturing.backdrop.photos import Photo
-from scan2sim.texturing.whole_frame import BEYOND_MEASURED_M, BOX_BEHIND_M, instance_boxes
+from scan2sim.texturing.whole_frame import BEYOND_MEASURED_M, BOX_BEHIND_M
 
 MARGIN_PX = 3
 """Width of the seam around what moved that isn't used either."""
@@ -34,8 +35,8 @@ class MovingMask:
         self._still: Renderer | None = None
         self._moved: Renderer | None = None
         if instances is not None and parked:
-            still = instance_boxes(instances, frame, lambda about: about["kind"] != "person" and not about["moved"])
-            moved = instance_boxes(instances, frame, lambda about: about["kind"] == "person" or about["moved"])
+            still = boxes(instances, frame, is_parked)
+            moved = boxes(instances, frame, lambda about: not is_parked(about))
             self._still, self._moved = Renderer([Body(still)]), Renderer([Body(moved)])
 
     def of(self, photo: Photo) -> Bools:

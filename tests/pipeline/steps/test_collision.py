@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
+import trimesh
 
 from scan2sim.pipeline.core.classes import CODE
 from scan2sim.pipeline.core.errors import DataError
@@ -19,8 +23,10 @@ from tests.fakes.steps import step_params
 NONE = Mesh(synthetic.UTM, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
 
 
-def _run(folder: Path, meshes: dict[str, Mesh], **params: object) -> tuple[Mesh, Done]:
-    inputs = {}
+def _run(
+    folder: Path, meshes: dict[str, Mesh], also: Mapping[str, Path] = MappingProxyType({}), **params: object
+) -> tuple[Mesh, Done]:
+    inputs = dict(also)
     for group, mesh in meshes.items():
         inputs[group] = folder / f"{group}.npz"
         mesh.save(inputs[group])
@@ -53,6 +59,27 @@ def test_modelled_boxes_are_not_simplified(tmp_path: Path) -> None:
     furniture = Mesh(synthetic.UTM, vertices, faces)
     mesh, _ = _run(tmp_path, {"terrain": synthetic.ground(10), "furniture": furniture})
     assert np.count_nonzero(mesh.classification == CODE["furniture"]) == len(furniture)
+
+
+@pytest.mark.parametrize("clockwise", [False, True])
+def test_parked_vehicles_are_boxes(clockwise: bool, tmp_path: Path) -> None:
+    """Those of `instances`, with 4.5 x 2 x 1.5 m; not what moved, and not people."""
+    ring = synthetic.UTM.to_crs(np.array([[0, 0, 1], [4.5, 0, 1], [4.5, 2, 1], [0, 2, 1], [0, 0, 1]], float))
+    features = [
+        {
+            "type": "Feature",
+            "geometry": {"type": "Polygon", "coordinates": [ring[:: -1 if clockwise else 1, :2].tolist()]},
+            "properties": {"kind": kind, "moved": moved, "height_m": 1.5, "ground_z": ring[0, 2]},
+        }
+        for kind, moved in (("car", False), ("car", True), ("person", False))
+    ]
+    (tmp_path / "instances.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    mesh, done = _run(tmp_path, {"terrain": synthetic.ground(10)}, also={"instances": tmp_path / "instances.geojson"})
+    box = mesh.keep(np.asarray(mesh.classification) == CODE["vehicle"])
+    solid = trimesh.Trimesh(box.vertices, box.faces)
+    assert solid.is_watertight and solid.volume == pytest.approx(4.5 * 2 * 1.5, rel=1e-3)
+    np.testing.assert_allclose(np.asarray(solid.bounds), [[0.0, 0.0, 1.0], [4.5, 2.0, 2.5]], atol=0.01)
+    assert done.metrics["deviation_m"]["max"] < 0.1
 
 
 def test_fragmented_surface_meets_the_triangle_limit(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from tests.flows.command import scan2sim, stdout_of
 pytestmark = pytest.mark.slow
 INPUTS = {
     "cloud": "instances/*/cloud.npz", "instances": "instances/*/instances.geojson", "path": "path/*/path.npz",
-    "moving": "dynamic_objects/*/moving.npz", "views": "views/*/views.json",
+    "moving": "dynamic_objects/*/moving.npz", "views": "views/*/views/views.json",
 }  # fmt: skip
 
 
