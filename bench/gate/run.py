@@ -81,7 +81,7 @@ def _check_world(subject: GateWorld, available: dict[str, Any], result: dict[str
     scene = read_scene(subject.run)
     reference = find(scene, subject.run, subject.tiles)
     if not any(tile.splat_count for tile in scene.tiles):
-        available = {name: module for name, module in available.items() if module.FORMAT != "splats"}
+        available = {name: module for name, module in available.items() if not module.FORMAT.startswith("splats")}
     formats = sorted({module.FORMAT for module in available.values()})
     for form in formats:
         folder = subject.run.parent / "exports" / form

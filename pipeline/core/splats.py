@@ -75,6 +75,18 @@ class Splats:
         return (given / np.linalg.norm(given, axis=1, keepdims=True)).astype(np.float32)
 
     @property
+    def covariance(self) -> F64:
+        """(N, 3, 3) covariances, square metres."""
+        w, x, y, z = self.quaternion.astype(np.float64).T
+        rotation = np.array([
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ])  # fmt: skip
+        axes = rotation.transpose(2, 0, 1) * self.scale[:, None, :]
+        return np.asarray(axes @ axes.transpose(0, 2, 1))
+
+    @property
     def opacity(self) -> F32:
         """(N,) opacities in their centre, 0 to 1."""
         return np.asarray(1 / (1 + np.exp(-self.parameters[:, LOGIT])), np.float32)

@@ -46,6 +46,20 @@ def write(path: Path, splats: Splats, offset: F64) -> None:
         raise SettingError(path, "has an unknown suffix", "Use .ply or .spz")
 
 
+def spz(path: Path, splats: Splats) -> bytes:
+    """Splats as the content of an SPZ file; gsply writes it beside the file `path` that is going to contain it.
+
+    Raises:
+        SettingError: positions that SPZ can't store.
+    """
+    temporary = path.with_suffix(".spz")
+    try:
+        write(temporary, splats, np.zeros(3))
+        return temporary.read_bytes()
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
 def read(path: Path) -> Splats:
     """Read splats without view-dependent colour from a .ply or .spz file."""
     import gsply

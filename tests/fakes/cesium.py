@@ -30,16 +30,22 @@ PAGE = """<!DOCTYPE html><meta charset="utf-8"><body style="margin: 0"><div id="
 <script>window.CESIUM_BASE_URL = "cesium/Build/Cesium/"</script><script src="cesium/Build/Cesium/Cesium.js"></script>
 <script>
 const visible = new Set(), wait = (ms) => new Promise((done) => setTimeout(done, ms));
-async function open(width, height) {
+async function open(tileset, width, height) {
   Object.assign(document.getElementById("view").style, {width: width + "px", height: height + "px"});
   window.widget = new Cesium.CesiumWidget("view", {baseLayer: false, globe: false, skyBox: false, skyAtmosphere: false,
     useDefaultRenderLoop: false, msaaSamples: 1, contextOptions: {webgl: {preserveDrawingBuffer: true}}});
   widget.scene.backgroundColor = Cesium.Color.MAGENTA;
   widget.scene.highDynamicRange = false;
-  window.tiles = await Cesium.Cesium3DTileset.fromUrl("world/tileset.json", {foveatedScreenSpaceError: false});
+  window.tiles = await Cesium.Cesium3DTileset.fromUrl("world/" + tileset, {foveatedScreenSpaceError: false});
   tiles.tileVisible.addEventListener((tile) => visible.add(tile.content.url.split("/world/")[1]));
   tiles.tileFailed.addEventListener((failure) => { throw new Error(failure.message) });
   widget.scene.primitives.add(tiles);
+}
+function drawn() {
+  const splats = tiles.gaussianSplatPrimitive;
+  if (!tiles.tilesLoaded || splats === undefined) return tiles.tilesLoaded;
+  const pending = splats._pendingSnapshot ?? splats._sorterPromise;
+  return pending === undefined && !splats._needsSnapshotRebuild && splats._drawCommand !== undefined;
 }
 async function look(position, direction, up, frustum) {
   const camera = widget.camera, vector = (v) => Cesium.Cartesian3.fromArray(v);
@@ -49,7 +55,7 @@ async function look(position, direction, up, frustum) {
   camera.right = Cesium.Cartesian3.cross(camera.direction, vector(up), new Cesium.Cartesian3());
   Cesium.Cartesian3.normalize(camera.right, camera.right);
   camera.up = Cesium.Cartesian3.cross(camera.right, camera.direction, new Cesium.Cartesian3());
-  for (let still = 0; still < 10; still = tiles.tilesLoaded ? still + 1 : 0) {
+  for (let still = 0; still < 10; still = drawn() ? still + 1 : 0) {
     visible.clear();
     widget.resize();
     widget.render();
@@ -77,13 +83,14 @@ def node_module(name: str) -> Path | None:
 
 
 @contextmanager
-def viewer(world: Path, work: Path, size: tuple[int, int]) -> Iterator[Viewer]:
+def viewer(world: Path, work: Path, size: tuple[int, int], tileset: str = "tileset.json") -> Iterator[Viewer]:
     """Open a tileset in Cesium; skips the test if Cesium isn't installed.
 
     Args:
-        world: folder with `tileset.json`.
+        world: folder with the tileset.
         work: working folder, empty or new.
         size: width and height of the canvas in pixels.
+        tileset: file of the tileset.
     """
     package = node_module(NPM_PACKAGE)
     if package is None:
@@ -98,7 +105,7 @@ def viewer(world: Path, work: Path, size: tuple[int, int]) -> Iterator[Viewer]:
         try:
             page.do("Page.navigate", url=f"http://127.0.0.1:{server.server_port}/page.html")
             page.until("document.readyState === 'complete' && window.Cesium !== undefined")
-            page.value(f"open({size[0]}, {size[1]})")
+            page.value(f"open({json.dumps(tileset)}, {size[0]}, {size[1]})")
             yield Viewer(page, size)
         finally:
             server.shutdown()

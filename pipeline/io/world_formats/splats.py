@@ -40,9 +40,14 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
         gltf.write(folder / f"{tile.name}_splats.glb", whole, offset)
         written += 1
     if not written:
-        raise DataError(
-            "splats",
-            f"{scene.name} has no splats",
-            "Run it again with --set splats.when=auto; this needs at least two photos other than orthophotos",
-        )
+        raise without_splats(scene)
     return {}
+
+
+def without_splats(scene: Scene) -> DataError:
+    """The error of a scene none of whose tiles has splats."""
+    return DataError(
+        "splats",
+        f"{scene.name} has no splats",
+        "Run it again with --set splats.when=auto; this needs at least two photos other than orthophotos",
+    )

@@ -48,11 +48,11 @@ def check(export: Path, reference: WorldReference) -> dict[str, Any]:
         tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as work,
         cesium.viewer(export, Path(work), size) as view,
     ):
-        view.look(*_onto_earth(frame, photo.pose), focal=focal, centre=centre, pixels=FINEST_ERROR_PX)
+        view.look(*onto_earth(frame, photo.pose), focal=focal, centre=centre, pixels=FINEST_ERROR_PX)
         finest = view.screenshot()
-        near = view.look(*_onto_earth(frame, photo.pose), focal=focal, centre=centre)
+        near = view.look(*onto_earth(frame, photo.pose), focal=focal, centre=centre)
         rendering = view.screenshot()
-        far = view.look(*_onto_earth(frame, _above(tileset, reference, focal)), focal=focal, centre=centre)
+        far = view.look(*onto_earth(frame, _above(tileset, reference, focal)), focal=focal, centre=centre)
     if not any(COARSE_CONTENT not in content for content in near):
         raise Fault(f"near the ground, Cesium doesn't show the finest level, but {near}")
     if far != [tileset["root"]["content"]["uri"]]:
@@ -70,7 +70,7 @@ def _above(tileset: dict[str, Any], reference: WorldReference, focal: float) -> 
     return pose
 
 
-def _onto_earth(frame: Frame, pose: F64) -> tuple[list[float], list[float], list[float]]:
+def onto_earth(frame: Frame, pose: F64) -> tuple[list[float], list[float], list[float]]:
     """Position, viewing direction and up direction of a camera, earth-centred."""
     offsets = np.array([(0, 0, 0), (0, 0, DIRECTION_DISTANCE_M), (0, -DIRECTION_DISTANCE_M, 0)])
     at, ahead, up = crs.to_ecef(frame, offsets @ pose[:3, :3].T + pose[:3, 3])

@@ -21,7 +21,7 @@ from scan2sim.pipeline.io.worlds.scene import Level, Scene, read_scene
 from tests.fakes import synthetic
 from tests.fakes.scene_readers import READERS, Shown, fbx, image, survey_error
 
-WITHOUT_MESHES = {"opendrive", "openscenario", "splats"}
+WITHOUT_MESHES = {"opendrive", "openscenario", "splats", "splats_tiles3d"}
 each = pytest.mark.parametrize("name", READERS)
 LABELS = {"terrain": 2, "building": 6, "road_sign": 64}
 

@@ -1,4 +1,8 @@
-"""3D Gaussian splats in glTF: `KHR_gaussian_splatting`; readers without it show coloured points."""
+"""3D Gaussian splats in glTF: `KHR_gaussian_splatting`; readers without it show coloured points.
+
+Compressed as SPZ (`KHR_gaussian_splatting_compression_spz_2`, a draft) they have the attributes that CesiumJS reads:
+`COLOR_0` holds colour and opacity, as this draft has it.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +12,12 @@ import numpy as np
 
 from scan2sim.pipeline.core.splats import Splats
 from scan2sim.pipeline.core.types import F32, F64
+from scan2sim.pipeline.io import splat_files
 from scan2sim.pipeline.io.splat_files import SH_C0
 from scan2sim.pipeline.io.worlds.gltf.builder import VERTICES, Builder
 
 EXTENSION = "KHR_gaussian_splatting"
+SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
 POINTS = 0
 PROPERTIES = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
 SRGB_OFFSET, SRGB_GAMMA, SRGB_LINEAR_MAX = 0.055, 2.4, 0.04045
@@ -50,6 +56,36 @@ def write(path: Path, splats: Splats, offset: F64) -> None:
     mesh = builder.add("meshes", {"name": path.stem, "primitives": [primitive]})
     x, y, z = np.asarray(offset, float).tolist()
     builder.add("nodes", {"name": path.stem, "mesh": mesh, "translation": [x, z, -y]})
+    builder.save(path)
+
+
+def write_spz(path: Path, splats: Splats) -> None:
+    """Write splats as a GLB, y up, that holds nothing but them, compressed as SPZ.
+
+    Args:
+        path: file to write.
+        splats: N splats, local metres, z up.
+
+    Raises:
+        SettingError: positions that SPZ can't store.
+        SpaceError: it can't be written.
+    """
+    builder = Builder()
+    for extension in (EXTENSION, SPZ_EXTENSION):
+        builder.use(extension, required=True)
+    turned = splats.y_up()
+    payload = builder.view(splat_files.spz(path, turned))
+    count = len(splats)
+    attributes = {
+        "POSITION": builder.accessor(turned.xyz, None, bounds=True),
+        "COLOR_0": builder.accessor(np.empty((count, 4), np.uint8), None, normalized=True),
+        f"{EXTENSION}:SCALE": builder.accessor(np.empty((count, 3), np.float32), None),
+        f"{EXTENSION}:ROTATION": builder.accessor(np.empty((count, 4), np.float32), None),
+    }
+    properties = PROPERTIES | {"extensions": {SPZ_EXTENSION: {"bufferView": payload}}}
+    primitive = {"attributes": attributes, "mode": POINTS, "extensions": {EXTENSION: properties}}
+    mesh = builder.add("meshes", {"name": path.stem, "primitives": [primitive]})
+    builder.add("nodes", {"name": path.stem, "mesh": mesh})
     builder.save(path)
 
 
