@@ -405,7 +405,8 @@ def _rows(
     table.require(needed)
     for name in set(table.columns) - set(known):
         if alike := difflib.get_close_matches(name, known, 1, ALIKE):
-            raise InputError(path, f"has an unknown column `{name}`", f"Name it `{alike[0]}`, or leave it out")
+            remedy = f"Name it `{alike[0]}`; if it is something else, give it a different name"
+            raise InputError(path, f"has an unknown column `{name}`", remedy)
     if ignored := [name for name in table.columns if name not in known]:
         warn(f"{path}: columns that aren't known are ignored: {', '.join(ignored)}; known are {', '.join(known)}")
     if not table.decimal_comma:

@@ -147,7 +147,10 @@ class Summary:
             found.append(f"{missing:,} of {self.count:,} points have no time: the times of the others are not used")
         if self.no_codes[0]:
             number, example = self.no_codes
-            found.append(f"{number:,} points have classes that are no LAS codes, such as {example:.0f}: unclassified")
+            found.append(
+                f"{number:,} points have classes that are no LAS codes, such as {example:.0f}: unclassified; renumber "
+                "them to 0 to 255 to use --classes"
+            )
         low = min((scan.low for scan in self.scans.values()), default=0.0)
         if self.has("intensity") and low < -1:
             high = max(scan.high for scan in self.scans.values())

@@ -91,15 +91,19 @@ def density(cloud: PointCloud, count: int) -> Finding | None:
         cloud: a sample of the points.
         count: number of all points.
     """
+    from scipy.spatial import cKDTree
+
     cells = np.unique(np.floor(cloud.xyz[:, :2].astype(np.float64) / OCCUPIED_CELL_M).astype(np.int64), axis=0)
     spacing = float(np.sqrt(len(cells) * OCCUPIED_CELL_M**2 / max(1, count)))
-    if spacing < MAX_SPACING_M:
+    if spacing < MAX_SPACING_M or len(cloud) < 2:
         return None
+    nearest = float(cKDTree(cloud.xyz).query(cloud.xyz, 2)[0][:, 1].mean())
+    apart = 2 * nearest * (len(cloud) / count) ** 0.5  # on a grid; points at random have the nearest at half of it
     return Finding(
         2,
-        f"neighbouring points are {spacing:.1f} m apart: too far for the surfaces of a street (0.1 m). The cloud is "
-        "sparse (a reconstruction's sparse points?) or its unit isn't the metre. Give the dense cloud, or the unit by "
-        "the import's --units (m, ft, us-ft); convert others, such as millimetres, to metres first",
+        f"neighbouring points are about {apart:.1f} m apart: too far for the surfaces of a street (0.1 m). The cloud "
+        "is sparse (a reconstruction's sparse points?) or its unit isn't the metre. Give the dense cloud, or the unit "
+        "by the import's --units (m, ft, us-ft); convert others, such as millimetres, to metres first",
     )
 
 
@@ -118,5 +122,6 @@ def level_ground(cloud: PointCloud) -> Finding | None:
     return Finding(
         3,
         f"the ground and the walls are tilted by {tilt:.0f} degrees{other}. Export the cloud with z up, or import it "
-        "as a robot's map (`import map` finds up). If columns were only exchanged, name their order with --axes",
+        "as a robot's map (`import map` finds up of clouds without a CRS). If columns were only exchanged, name their "
+        "order with --axes",
     )

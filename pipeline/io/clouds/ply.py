@@ -166,7 +166,8 @@ def _label_notes(header: Layout) -> tuple[str, ...]:
         return (f"labels are read as those of {known.name}",)
     if field is None or field.endswith("classification"):
         return ()
-    return (f"field `{field}` is read as LAS classes (2 ground, 6 building, ...); map others with --classes",)
+    how = "LAS classes (2 ground, 6 building, ...); map other codes from 0 to 255 with --classes"
+    return (f"field `{field}` is read as {how}",)
 
 
 def _elements(path: Path, lines: list[list[str]]) -> list[tuple[str, int, list[tuple[str, str]]]]:
