@@ -27,7 +27,7 @@ NEEDS = splat_files.NEEDS
 FILE, FOLDER = "splats_tileset.json", "splats3d"
 MERGED_PX = 2.0
 """Size in the image of the cells within which splats were merged, at which viewers load finer levels: smaller splats
-than half a pixel are left out by Cesium, which draws them without a low-pass filter."""
+than a third of a pixel are left out by Cesium, which widens them less than the camera in Python does."""
 EXTENSIONS = [gltf.EXTENSION, gltf.SPZ_EXTENSION]
 
 
