@@ -402,7 +402,7 @@ def _add_surface(graph: TileGraph, scan: Scan, parts: Parts, group: str, synthes
         surface = output(JOIN, "mesh", group)
     furniture = {"furniture": parts.furniture[group]} if group in parts.furniture else {}
     coarse = uncovered | ({"cloud": points["cloud"]} if uncovered else {})
-    add(DECIMATE, {"mesh": surface} | coarse | furniture, group, keep_border=bool(cell))
+    add(DECIMATE, {"mesh": surface} | coarse | furniture, group, keep_border=bool(cell), cell=cell or None)
 
 
 def _has_floor(graph: TileGraph) -> bool:

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from scan2sim.pipeline.core.parameters import Name
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.tile_cell import TileCell
 from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.geometry.coarse_surface import coarse_faces
 
@@ -17,9 +18,15 @@ COARSE_SHARE_MAX = 0.2
 
 
 class TileBorder(Context):
-    """Whether open borders must not be simplified, even if that exceeds the target: where tiles or classes meet."""
+    """Borders of the mesh.
+
+    Attributes:
+        keep_border: open borders must not be simplified, even if that exceeds the target: where tiles or classes meet.
+        cell: the tile's cell, if it has neighbours; the mesh stays within it.
+    """
 
     keep_border: bool = False
+    cell: TileCell | None = None
 
 
 class DecimateParams(Params):
@@ -48,6 +55,7 @@ def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) 
         SettingError, UnavailableError: as `can_decimate`.
     """
     from scan2sim.pipeline.decimation import simplify
+    from scan2sim.pipeline.tiling.borders.open_edges import pulled_inside
 
     mesh = Mesh.load(inputs["mesh"])
     furniture = Mesh.load(inputs["furniture"]) if "furniture" in inputs else None
@@ -61,6 +69,8 @@ def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) 
     elif len(small) > target * 1.05:
         warnings.append(f"the border alone needs {len(small):,} triangles: it was simplified too, to {params.target:,}")
         small, border_kept = simplify(small, target, keep_border=False, backend=params.backend), False
+    if params.context.cell is not None:
+        small = pulled_inside(small, params.context.cell.cell)
     if furniture is not None and len(furniture):
         small = with_furniture(small, furniture)
     small.save(out / "mesh.npz")
@@ -93,7 +103,7 @@ def can_decimate(params: DecimateParams) -> None:
 
 DECIMATE = Step(
     "decimate",
-    3,
+    4,
     decimate,
     DecimateParams,
     class_defaults={"vegetation": {"target": 300_000}, "vehicle": {"target": 50_000}},

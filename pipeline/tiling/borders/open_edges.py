@@ -8,6 +8,7 @@ boundary, like the constraint planes of Garland and Heckbert (1997, section 6).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -21,6 +22,8 @@ from scan2sim.pipeline.geometry.coordinate_grid import world
 
 BORDER_TOLERANCE_M = 2e-3
 """Distance from a border up to which a vertex counts as lying on it."""
+ROUNDING_M = 5e-4
+"""Distance beyond a border that rounding of coordinates explains."""
 CONE_HEIGHT_M = 1e4
 """Distance of a cone's tip from its base; far more than the size of a tile (below 2 km)."""
 MIN_TARGET_SHARE, MAX_RETRIES = 0.85, 5
@@ -64,6 +67,18 @@ def decimate_keeping_borders(mesh: Mesh, target: int, on: Bools) -> Mesh:
     if len(best) < target / 2:  # many small fragments, for which cones take most faces
         return simplify(mesh, target, keep_border=bool(on.any()))
     return best
+
+
+def pulled_inside(mesh: Mesh, cell: Cell) -> Mesh:
+    """A mesh whose vertices beyond a border of the cell, where decimation has put them, are moved onto the border."""
+    xy, moved = world(mesh)[:, :2], np.zeros((len(mesh.vertices), 2))
+    for name, seed in cell.neighbours.items():
+        distance = cell.beyond(name, xy + moved)
+        normal = np.subtract(seed, cell.seed) / np.linalg.norm(np.subtract(seed, cell.seed))
+        moved -= np.where(distance > ROUNDING_M, distance, 0)[:, None] * normal
+    vertices = mesh.vertices.copy()
+    vertices[:, :2] += moved.astype(np.float32)
+    return replace(mesh, vertices=vertices)
 
 
 def _without_cones(mesh: Mesh) -> Mesh:

@@ -33,7 +33,7 @@ from scan2sim.pipeline.steps.voxel import VOXEL
 from scan2sim.pipeline.tiling.borders.clip import Clipped, clip
 from scan2sim.pipeline.tiling.borders.gap import Gap, gap
 from scan2sim.pipeline.tiling.borders.join import join
-from scan2sim.pipeline.tiling.borders.open_edges import on_border
+from scan2sim.pipeline.tiling.borders.open_edges import on_border, pulled_inside
 from tests.conftest import ROOT
 from tests.fakes.steps import step_params
 from tests.present import present
@@ -183,6 +183,19 @@ def test_joined_surface_ramps_to_the_border(tmp_path: Path) -> None:
     lift = xyz[:, 2] - Z - height(xyz[:, 0] - X, xyz[:, 1] - Y) + 0.1
     assert np.abs(lift[behind < 0.001] - 0.1).max() < 0.005 and np.abs(lift[behind > 0.51]).max() < 1e-4
     assert np.corrcoef(behind[behind < 0.5], lift[behind < 0.5])[0, 1] < -0.97
+
+
+def test_vertices_that_decimation_puts_beyond_a_border_are_moved_onto_it() -> None:
+    """In a cell with two oblique borders; what is inside, or on a border but for rounding, stays."""
+    frame = Frame("EPSG:32633", (500_000.0, 5_400_000.0, 200.0))
+    cell = Cell((500_000.0, 5_400_000.0), {"a": (500_008.0, 5_400_006.0), "b": (500_000.0, 5_400_012.0)})
+    ahead = np.array([0.8, 0.6])  # the border with "a" is 5 m away
+    plan = np.stack([5.004 * ahead, 5.0002 * ahead, 3 * ahead, (-2.0, 6.01)])
+    mesh = Mesh(frame, np.column_stack([plan, [1, 2, 3, 4]]).astype(np.float32), np.array([[0, 1, 2]], np.int32))
+    moved = pulled_inside(mesh, cell).vertices
+    np.testing.assert_allclose(moved[0], [4, 3, 1], atol=1e-5)
+    np.testing.assert_array_equal(moved[1:3], mesh.vertices[1:3])
+    np.testing.assert_allclose(moved[3], [-2, 6, 4], atol=1e-5)
 
 
 def test_four_tiles_meet_in_one_vertex() -> None:
