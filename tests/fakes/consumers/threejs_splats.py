@@ -31,7 +31,7 @@ from tests.fakes.world_checks.reference import Photo, WorldReference
 FORMAT = "splats"
 NPM_PACKAGE, NPM_VERSION = "three", "0.187"
 SPLAT_SCRIPT = "examples/jsm/objects/GaussianSplat.js"
-"""File of the package that earlier versions lack."""
+"""File of the package, from version 0.187."""
 MIN_PSNR_DB = 30.0
 """Least PSNR between three.js' image of the PLY and ours; see above why it isn't higher."""
 MIN_PSNR_FILES_DB = 35.0
