@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field
 
 from scan2sim.pipeline.core.errors import DataError, InputError
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.core.types import F32, PointCloud, View
+from scan2sim.pipeline.core.types import F32, F64, PointCloud, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
 
@@ -20,6 +20,10 @@ MAX_PHOTO_DISTANCE_M = 100.0  # a photo farther than this from every point sees 
 ORTHOPHOTO_MARGIN_PX = 8  # around the points
 NOT_USED = "not used; its area is textured from other photos that see it"
 MAX_SAMPLED_POINTS = 500_000  # points that are projected into the photos
+SAME_MOMENT_S = 0.005
+"""Cameras of a rig are triggered together within this time."""
+RIG_M = 2.0
+"""Largest distance of the cameras of a rig."""
 
 
 def _not_all(every: int) -> int:
@@ -38,7 +42,8 @@ class ViewsParams(Params):
     """The photos.
 
     Attributes:
-        hold_out: hold every Nth photo (of all cameras in turn) out of texturing, to score the texture; 0: none.
+        hold_out: hold every Nth photo out of texturing (of all cameras in turn), with those that a rig took with it, to
+            score the texture; 0: none.
     """
 
     hold_out: Annotated[int, AfterValidator(_not_all)] = Field(
@@ -119,14 +124,45 @@ def _crop(view: View, points: F32, folder: Path, index: int) -> View:
 
 
 def held_out(views: Sequence[View], every: int) -> list[bool]:
-    """(N,) bool, True for held-out views: every Nth, counted camera by camera, so that every camera is included."""
-    held = [False] * len(views)
+    """(N,) bool, True for held-out views: every Nth, with those that other cameras took at the same moment.
+
+    They are counted camera by camera, so that every camera is included. What a rig's other cameras took at that moment
+    shows nearly the same: with it, the world would be measured by what it was made of.
+    """
+    moment = _moments(views)
     cameras = list(dict.fromkeys(view.camera for view in views))
     photos = [i for i, view in enumerate(views) if view.camera.model != "orthographic"]
-    in_turn = sorted(photos, key=lambda i: cameras.index(views[i].camera))
-    for i in in_turn[every // 2 :: every] if every else ():
-        held[i] = True
-    return held
+    in_turn = list(dict.fromkeys(moment[i] for i in sorted(photos, key=lambda i: cameras.index(views[i].camera))))
+    chosen = set(in_turn[every // 2 :: every] if every else ())
+    return [view.camera.model != "orthographic" and one in chosen for view, one in zip(views, moment, strict=True)]
+
+
+def _moments(views: Sequence[View]) -> list[float | tuple[str, int]]:
+    """The same value for views (N,) that a rig took together.
+
+    They have the same time, or without times the same file name, in folders of the cameras, and are near each other.
+    """
+    start: dict[float, float] = {}
+    before = first = -np.inf
+    for time in sorted({view.time for view in views if view.time is not None}):
+        first = first if time - before < SAME_MOMENT_S else time
+        start[time], before = first, time
+    places: dict[str, list[F64]] = {}
+    return [
+        start[view.time]
+        if view.time is not None
+        else (view.photo.stem, _place(places.setdefault(view.photo.stem, []), view))
+        for view in views
+    ]
+
+
+def _place(places: list[F64], view: View) -> int:
+    """Index of the first of the places within `RIG_M` of a view, which is added if there is none."""
+    for i, place in enumerate(places):
+        if np.linalg.norm(place - view.centre) < RIG_M:
+            return i
+    places.append(view.centre)
+    return len(places) - 1
 
 
 def _problem(view: View) -> str | None:
@@ -165,4 +201,4 @@ def _sees(view: View, points: F32) -> bool:
     return bool(shown.any())
 
 
-VIEWS = Step("views", 3, views, ViewsParams)
+VIEWS = Step("views", 4, views, ViewsParams)
