@@ -42,7 +42,7 @@ class ViewsParams(Params):
     """The photos.
 
     Attributes:
-        hold_out: hold every Nth photo, with those a rig took beside it, out of texturing, to score the texture; 0: none.
+        hold_out: hold every Nth photo, with those a rig took beside it, out of texturing, to score it; 0: none.
     """
 
     hold_out: Annotated[int, AfterValidator(_not_all)] = Field(
