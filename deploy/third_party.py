@@ -120,15 +120,16 @@ ATTENTION = (
      "changes to their own files stay under the MPL"),
     ("text-unidecode", "Artistic License or GPL-2.0-or-later, at your choice", "`flows` (by prefect)",
      "those of the Artistic License"),
-    ("CUDA (nvidia-* packages)", "NVIDIA's, proprietary", "`segmentation`: torch's default wheel",
+    ("CUDA (nvidia-* packages)", "NVIDIA's, proprietary", "`segmentation`, `splats-gpu`: torch's default wheel",
      "see NVIDIA's licence; the CPU-only build of torch doesn't contain it"),
 )  # fmt: skip
 
 
 NO_LICENCE = "UNKNOWN"
 """What setuptools wrote as the licence where there was none."""
-NOT_HERE = ("dev", "meshlab")
-"""Extras that the page has no table of: its environment has none of MeshLab, which wants libraries of a desktop."""
+NOT_HERE = ("dev", "meshlab", "splats-gpu")
+"""Extras that the page has no table of: its environment has neither MeshLab, which needs libraries of a desktop, nor
+gsplat, which needs CUDA's compiler."""
 
 
 def project() -> dict[str, list[str]]:

@@ -29,6 +29,7 @@ from scan2sim.services.qos import links
 from scan2sim.services.teleoperation import cameras, encoders
 from scan2sim.services.teleoperation.vehicle import adapters
 from scan2sim.slam import features, matchers, solvers, trackers
+from scan2sim.texturing.splats import backends as rasterizers
 from tests.conftest import ROOT
 from tests.fakes import synthetic
 
@@ -52,6 +53,7 @@ PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
     encoders: (encoders.Backend,),
     cameras: (cameras.Backend,),
     adapters: (adapters.VehicleAdapter,),
+    rasterizers: (rasterizers.Backend,),
 }
 """Packages of backends, and protocols of which their modules implement one."""
 ALL_BACKENDS = [(package, name) for package in PROTOCOLS for name in plugins.names(package.__name__)]

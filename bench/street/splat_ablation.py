@@ -41,6 +41,8 @@ CHANGES: dict[str, dict[str, Any]] = {
     "coarse_to_fine": {"step.epochs": (0, 0, 20)},
     "finer": {"start.STRIDE_PX": 3.5},
     "coarser": {"start.STRIDE_PX": 6.0},
+    "cpu": {"step.backend": "cpu"},
+    "gpu": {"step.backend": "gpu"},  # needs an NVIDIA GPU and gsplat
 }
 """By part: the names of constants (module.NAME) or settings (step.name), and their values."""
 METRICS = (

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.paths import ROOT
 from bench.street import frame, lidar, score
 from bench.street.world import Photo
 from scan2sim.pipeline.core.splats import SplatLayer
@@ -26,6 +27,8 @@ from scan2sim.pipeline.io import splat_files
 from scan2sim.texturing.ms_ssim import ms_ssim
 from scan2sim.texturing.splats.view import SplatImage, SplatRenderer
 
+ABLATION = ROOT / "bench-out" / "street_splats" / "rows.json"
+"""Rows of `splat_ablation`."""
 NEAREST_M = 5.0
 """Distance of what is nearest to the right-hand camera: gives the largest shift between the two images."""
 NEAR_SHARE_M = 0.22
@@ -237,6 +240,20 @@ def table(found: Mapping[str, Any]) -> None:
     )
 
 
+def gsplat_gap_db(rows: Path) -> float | None:
+    """Greatest difference in PSNR of splats trained on the CPU and on a GPU.
+
+    Args:
+        rows: rows of `bench.street.splat_ablation --parts cpu gpu`.
+
+    Returns:
+        dB, over the streets that have both; None: they weren't measured, as without a GPU.
+    """
+    found = json.loads(rows.read_text(encoding="utf-8")) if rows.is_file() else {}
+    cpu, gpu = found.get("cpu", {}), found.get("gpu", {})
+    return max((abs(cpu[name]["psnr_db"] - gpu[name]["psnr_db"]) for name in cpu.keys() & gpu.keys()), default=None)
+
+
 def result(streets: Mapping[str, Mapping[str, Any]]) -> dict[str, float | None]:
     """Results that have targets: of the worst street, unless a name says otherwise.
 
@@ -265,4 +282,5 @@ def result(streets: Mapping[str, Mapping[str, Any]]) -> dict[str, float | None]:
         "splat_render_ms": worst("render_ms", -1),
         "splat_mb": worst("mb", -1),
         "splat_memory_gb": worst("memory_gb", -1),
+        "gsplat_gap_db": gsplat_gap_db(ABLATION),
     }

@@ -26,6 +26,7 @@ EXTRA_OF = {
     "pxr": "usd",
     "meshopt": "gltf",
     "gsply": "splats",
+    "gsplat": "splats-gpu",
     "DracoPy": "gltf",
     "cyclonedds": "bus",
     "rosbags": "bus",

@@ -64,6 +64,8 @@ class SplatsParams(Params):
         cover: weight of the opacity loss: higher opacity where a photo doesn't show sky, lower where it does.
         depth: weight of the depth loss: relative error of inverse depths against scan and surfaces, along each photo's
             rays.
+        backend: what renders and computes gradients: "cpu"; "gpu": gsplat's CUDA kernels, whose results may differ by
+            rounding from run to run; "auto": "gpu" if gsplat, torch and an NVIDIA GPU are available.
         seed: of the order in which photos are visited, and of the jitter of estimated depths.
     """
 
@@ -74,6 +76,7 @@ class SplatsParams(Params):
     parked: bool = True
     cover: float = Field(0.017, ge=0, le=1)
     depth: float = Field(0.3, ge=0, le=10)
+    backend: Literal["auto", "cpu", "gpu"] = "auto"
     seed: Seed = 0
     context: SplatsContext = SplatsContext()
 
@@ -86,8 +89,10 @@ def splats(inputs: Inputs, params: SplatsParams, out: Path, report: Report, chec
 
     File: `splats`, a `SplatLayer`, without any splats if fewer than two photos can be used.
     """
+    from scan2sim.texturing.splats import backends
     from scan2sim.texturing.splats.training import Schedule
 
+    backend = backends.choose(params.backend)
     used, excluded, seen = _prepared(inputs, params, report)
     state = checkpoint / STATE_FILE
     training = _begun(used, excluded, seen, params, state, report)
@@ -96,13 +101,19 @@ def splats(inputs: Inputs, params: SplatsParams, out: Path, report: Report, chec
         return Done({"splats": out / SPLATS_FILE}, {"photos": len(used), "splats": 0}, [TOO_FEW])
     first = len(training.descent.parameters)
     used.clear()  # training needs the shots only
+    training.backend = backend
+    report(TRAINING_SHARE, f"training {backend.description()}")
     _train(
         training, seen, Schedule(params.epochs, cover=params.cover, depth=params.depth, seed=params.seed), state, report
     )
     result = _within_cell(training.result(), params.context)
     SplatLayer(result, training.background.texture, *training.photos(seen)).save(out / SPLATS_FILE)
-    metrics = {"photos": len(excluded), "first": first, "splats": len(result)}
+    metrics = {
+        "photos": len(excluded), "first": first, "splats": len(result), "rendered": backend.description()
+    }  # fmt: skip
     warnings = [] if "labels" in inputs or "instances" in inputs else [UNMASKED]
+    rejected = backends.rejected(params.backend, backend)
+    warnings += [rejected] if rejected else []
     return Done({"splats": out / SPLATS_FILE}, metrics, warnings)
 
 
@@ -181,5 +192,17 @@ def _train(training: Training, seen: Sequence[Shot], schedule: Schedule, state: 
     training.run(seen, schedule, after_epoch)
 
 
+def can_train(params: SplatsParams) -> None:
+    """Check that the packages of the backend are installed.
+
+    Raises:
+        UnavailableError: packages are missing.
+    """
+    if params.when != "never" and params.backend == "gpu":
+        from scan2sim.texturing.splats import backends
+
+        backends.require(params.backend)
+
+
 # photos take 30 MB for each megapixel, whatever the size of their files, and are 100 at most by default
-SPLATS = Step("splats", 3, splats, SplatsParams, resumes=True, memory=(4.5, 3))
+SPLATS = Step("splats", 3, splats, SplatsParams, check=can_train, resumes=True, memory=(4.5, 3))

@@ -26,7 +26,8 @@ from scan2sim.pipeline.core.splats import (
     Splats,
 )
 from scan2sim.pipeline.core.types import F32
-from scan2sim.texturing.splats import loss, rasterizer
+from scan2sim.texturing.splats import loss
+from scan2sim.texturing.splats.backends import Backend, Rendered, cpu
 from scan2sim.texturing.splats.background import Background
 from scan2sim.texturing.splats.descent import Descent, rates
 from scan2sim.texturing.splats.exposure import Gains, Response
@@ -75,12 +76,14 @@ class Training:
         background: what is behind them.
         gains: exposure of the photos, which are numbered in the order of their first shots.
         epoch: number of finished epochs.
+        backend: what renders, not a part of what is saved.
     """
 
     descent: Descent
     background: Background
     gains: Gains
     epoch: int = 0
+    backend: Backend = cpu
 
     @classmethod
     def of(cls, splats: Splats, size: F32, background: Background, shots: Sequence[Shot]) -> Training:
@@ -118,9 +121,9 @@ class Training:
         colours[:] = np.clip(colours * factor + offset, MIN_COLOUR, MAX_COLOUR)
         self.background.recolour(factor, offset)
 
-    def rendered(self, level: Level) -> tuple[rasterizer.Rendered, F32]:
+    def rendered(self, level: Level) -> tuple[Rendered, F32]:
         """The splats in a photo, and the background there."""
-        drawn = rasterizer.render(self.descent.parameters, level.camera, level.known)
+        drawn = self.backend.scene(self.descent.parameters).render(level.camera, level.known)
         return drawn, self.background.seen(level.texels)
 
     def _visit(self, k: int, level: Level, schedule: Schedule, decay: float) -> float:

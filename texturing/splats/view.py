@@ -10,7 +10,7 @@ import numpy as np
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.splats import SplatLayer
 from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Camera
-from scan2sim.texturing.splats import rasterizer
+from scan2sim.texturing.splats import backends
 from scan2sim.texturing.splats.background import Background, texels
 from scan2sim.texturing.splats.exposure import of_nearest
 from scan2sim.texturing.splats.projection import Pinhole
@@ -41,10 +41,19 @@ class SplatImage:
 
 
 class SplatRenderer:
-    """Renders a layer of splats."""
+    """Renders a layer of splats.
 
-    def __init__(self, layer: SplatLayer) -> None:
-        self._parameters, self._background = layer.splats.parameters, Background(layer.background)
+    Args:
+        layer: the splats.
+        backend: what renders (`backends.choose`).
+
+    Raises:
+        SettingError, UnavailableError: there is no such backend, or it can't run here.
+    """
+
+    def __init__(self, layer: SplatLayer, backend: str = backends.AUTO) -> None:
+        self._scene = backends.choose(backend).scene(layer.splats.parameters)
+        self._background = Background(layer.background)
         self._photos, self._cameras = layer.photos, layer.cameras
 
     def view(self, camera: Camera, T_world_cam: F64, *, as_photo: str | None = None) -> SplatImage:
@@ -74,7 +83,7 @@ class SplatRenderer:
     def _pinhole(self, camera: Camera, T_world_cam: F64) -> tuple[F32, F32, F32]:
         """Colour, range and cover of a pinhole view."""
         rays, length = _rays(camera)
-        drawn = rasterizer.render(self._parameters, Pinhole.of(camera, T_world_cam))
+        drawn = self._scene.render(Pinhole.of(camera, T_world_cam))
         colour = drawn.over(self._background.seen(texels(rays @ T_world_cam[:3, :3].T.astype(np.float32))))
         return colour, np.asarray(drawn.depth * length, np.float32), 1 - drawn.transmittance
 
