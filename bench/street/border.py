@@ -1,15 +1,17 @@
 """Splats across the border of two tiles of a survey: a street that is cut in two, each half trained on its own photos.
 
-`border_grey_levels` is the jump that a camera sees when it crosses the border: the mean difference, in grey levels, of
-what `scan2sim.camera` and `scan2sim view` show there of both tiles on this side of it and on the other; at the photos
-within `NEAR_M` of the border, and the worst of them. `border_step_grey_levels` is the step within a picture: how much
-brighter one tile is than the other, within `NEAR_M` of the border, than the photos that show both.
+`border_grey_levels` is the jump that a camera sees when it crosses the border (`scan2sim.camera`): the largest mean
+difference, in grey levels, between a frame and the next one, `FRAME_M` further, within `NEAR_M` of the border, less the
+median of these differences, which is motion. `background_grey_levels` is what it would be if the background changed at
+once. `border_step_grey_levels` is the step within a picture: by how much one tile's splats are brighter than the
+other's within `NEAR_M` of the border, relative to the photos that show both.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +26,15 @@ from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.io.worlds.scene import SceneTile, read_scene
 from scan2sim.texturing.splats.view import SplatRenderer
+from scan2sim.texturing.world_camera import WorldCamera
 
 LENGTH_M, PHOTO_DISTANCE_M = 14.0, 10.0
 """Length of the tiles, and distance beyond a border from which photos are used (40 m of a tile of 100 m)."""
 SETTINGS = ("splats.when=auto", "voxel.size=0.2", "unwrap.texel=0.04", "pictures.width=640")
 """Settings of the survey: meshes are coarser than by default, splats are not."""
 NEAR_M = 5.0
+FRAME_M, FRAME_SCALE = 0.05, 0.25
+"""Distance between frames, and their size relative to the photos'."""
 MIN_SHARE = 0.02
 """Share of a photo that each tile must cover near the border."""
 
@@ -54,19 +59,31 @@ def metrics(corridor: Path, tiles: Path, made: Path, pictures: Path) -> dict[str
         """(N,) metres by which positions (N, 3) in the world are in the second tile."""
         return cell.beyond(second.name, xyz[:, :2] + origin[:2])
 
-    views = list(photos(corridor, made / "none", origin).values())
-    near = [photo for photo in views if abs(beyond(photo.T[None, :3, 3])[0]) < NEAR_M]
+    views = photos(corridor, made / "none", origin)
+    near = [photo for photo in views.values() if abs(beyond(photo.T[None, :3, 3])[0]) < NEAR_M]
     every = Splats(np.concatenate([layer.splats.parameters for layer in layers]))
     sides = [SplatRenderer(replace(layer, splats=every)) for layer in layers]
-    jumps = [_jump(sides, photo, pictures / f"border_{k}.png") for k, photo in enumerate(near)]
+    apart = [_difference(sides, photo, pictures / f"border_{k}.png") for k, photo in enumerate(near)]
     steps = [step for photo in near if (step := _step(sides[0], photo, beyond)) is not None]
+    differences = _frames(WorldCamera(scene), min(near, key=lambda photo: abs(beyond(photo.T[None, :3, 3])[0])))
     return {
-        "jumps": jumps,
-        "steps": [step.tolist() for step in steps],
-        "border_grey_levels": max(jumps),
-        "border_step_grey_levels": float(np.abs(np.mean(steps, axis=0)).mean()),
         "photos": [len(layer.photos) for layer in layers],
+        "differences": differences.tolist(),
+        "steps": [step.tolist() for step in steps],
+        "border_grey_levels": float(differences.max() - np.median(differences)),
+        "background_grey_levels": max(apart),
+        "border_step_grey_levels": float(np.abs(np.mean(steps, axis=0)).mean()),
     }
+
+
+def _frames(world: WorldCamera, photo: Photo) -> F64:
+    """(N,) mean differences in grey levels between frames and the next ones, on a straight way through a photo."""
+    camera, images = camera_of(photo).scaled(FRAME_SCALE), []
+    for ahead in np.arange(-NEAR_M, NEAR_M, FRAME_M):
+        pose = photo.T.copy()
+        pose[:3, 3] += ahead * pose[:3, 2]
+        images.append(world.render(pose, camera).rgb.astype(float))
+    return np.array([np.abs(image - before).mean() for before, image in pairwise(images)])
 
 
 def _in_world(tile: SceneTile) -> SplatLayer:
@@ -76,8 +93,8 @@ def _in_world(tile: SceneTile) -> SplatLayer:
     return layer
 
 
-def _jump(sides: Sequence[SplatRenderer], photo: Photo, picture: Path) -> float:
-    """Mean difference of both sides' images in grey levels; writes them, one below the other."""
+def _difference(sides: Sequence[SplatRenderer], photo: Photo, picture: Path) -> float:
+    """Mean difference in grey levels with the background of either tile; writes photo and images below each other."""
     from PIL import Image
 
     images = [side.view(camera_of(photo), photo.T).rgb for side in sides]
@@ -105,6 +122,6 @@ def _step(renderer: SplatRenderer, photo: Photo, beyond: Callable[[F64], F64]) -
 def table(found: Mapping[str, Any]) -> None:
     """Print jump and step."""
     print(
-        f"\nborder of two tiles: jump {found['border_grey_levels']:.2f} grey levels at the worst of "
-        f"{len(found['jumps'])} photos, step within the picture {found['border_step_grey_levels']:.2f}"
+        f"\nborder of two tiles: jump {found['border_grey_levels']:.2f} grey levels (backgrounds differ by "
+        f"{found['background_grey_levels']:.2f}), step within the picture {found['border_step_grey_levels']:.2f}"
     )
