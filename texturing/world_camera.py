@@ -11,12 +11,15 @@ from scan2sim.pipeline.core.classes import CODE_OF_SURFACE
 from scan2sim.pipeline.core.splats import XYZ, SplatLayer, Splats
 from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Camera, Colour
 from scan2sim.pipeline.io.worlds.scene import BACKDROP, Scene, SceneTile
+from scan2sim.texturing.splats.background import Background
 from scan2sim.texturing.splats.view import SplatRenderer
 
 FARTHEST_M = 300.0
 """Default distance beyond which tiles aren't drawn."""
 BLACK = np.zeros((1, 2, 3), np.float32)
 """Background of splats over which another one is laid."""
+BLEND_M = 10.0
+"""Distance over which the background changes from a tile's to the next one's."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,7 @@ class WorldCamera:
         self._layers: dict[int, SplatLayer | None] = {}
         self._surfaces: _Surfaces
         self._splats: SplatRenderer | None = None
+        self._backgrounds: dict[int, Background] = {}
         self._behind: Renderer | None = None
 
     def render(self, T_world_cam: F64, camera: Camera, *, samples: int = 2) -> CameraImage:
@@ -89,19 +93,25 @@ class WorldCamera:
         return np.where((behind.range < distance)[..., None], behind.rgb, rgb)
 
     def _load(self, position: F64) -> None:
-        """Prepare the tiles near a position, and the background of the nearest, unless they are prepared."""
+        """Prepare the tiles near a position, and the background there, unless they are prepared."""
         order, distance = self._layout.by_distance(position)
         near = sorted(order[: max(1, int(np.count_nonzero(distance <= self._farthest)))])
-        if near == self._near and order[0] == self._nearest:
-            return
         if near != self._near:
             self._layers = {k: self._layers[k] if k in self._layers else _placed(self._scene.tiles[k]) for k in near}
             tiles, shown = [self._scene.tiles[k] for k in near], [self._layers[k] is None for k in near]
             self._surfaces = _Surfaces(tiles, shown, self._scene.sky)
             plain = [tile for tile, is_shown in zip(tiles, shown, strict=True) if is_shown]
             self._behind = _backdrops([*plain, *([self._scene.dome] if self._scene.dome else [])], self._scene.sky)
+            layers = {k: layer for k, layer in self._layers.items() if layer is not None}
+            self._splats = _splats(list(layers.values()))
+            self._backgrounds = {k: Background(layer.background) for k, layer in layers.items()}
         self._near, self._nearest = near, order[0]
-        self._splats = _splats([self._layers[k] for k in near], self._layers[self._nearest])
+        if self._splats is not None:
+            shares = self._layout.shares(position, list(self._backgrounds))
+            black = self._layers[self._nearest] is None
+            self._splats.behind = (
+                [(Background(BLACK), 1.0)] if black else [(self._backgrounds[k], share) for k, share in shares.items()]
+            )
 
 
 @dataclass(frozen=True)
@@ -126,6 +136,15 @@ class _Layout:
         distance = np.linalg.norm(np.maximum(0, np.maximum(self.low - xy, xy - self.high)), axis=1)
         order = np.lexsort((np.linalg.norm((self.low + self.high) / 2 - xy, axis=1), distance))
         return order.tolist(), distance[order]
+
+    def shares(self, position: F64, of: list[int]) -> dict[int, float]:
+        """Shares of the backgrounds of some tiles at a position: from one to the next over `BLEND_M`; sum is 1."""
+        xy = position[:2]
+        past = np.maximum(self.low[of] - xy, xy - self.high[of])  # of each side, negative inside
+        signed = np.linalg.norm(np.maximum(0, past), axis=1) + np.minimum(0, past.max(axis=1))
+        weight = np.maximum(0, 1 - (signed - signed.min()) / BLEND_M)
+        weight = weight / weight.sum()
+        return {k: share for k, share in zip(of, weight.tolist(), strict=True) if share > 0}
 
 
 class _Surfaces:
@@ -182,10 +201,9 @@ def _placed(tile: SceneTile) -> SplatLayer | None:
     return layer
 
 
-def _splats(layers: list[SplatLayer | None], nearest: SplatLayer | None) -> SplatRenderer | None:
-    """All splats before the background of the nearest tile, black if that has none; None: there are no splats."""
-    parts = [layer.splats.parameters for layer in layers if layer is not None]
-    if not parts:
+def _splats(layers: list[SplatLayer]) -> SplatRenderer | None:
+    """The splats of all tiles; None: there are none."""
+    if not layers:
         return None
-    every = Splats(parts[0] if len(parts) == 1 else np.concatenate(parts))
-    return SplatRenderer(SplatLayer(every, BLACK if nearest is None else nearest.background))
+    parts = [layer.splats.parameters for layer in layers]
+    return SplatRenderer(SplatLayer(Splats(parts[0] if len(parts) == 1 else np.concatenate(parts)), BLACK))

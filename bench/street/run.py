@@ -1,7 +1,7 @@
 """Real streets from raw data to a scored world, with an independent renderer; OpenMVS beside (`openmvs.py`).
 
-`python -m bench.street [--parts odo04 raw0009 raw0013 keep synthetic time] [--out bench-out/street] [--score-only]
-[--set KEY=VALUE ...] [--openmvs FOLDER] [--vertical-angle-offset DEGREES]`
+`python -m bench.street [--parts odo04 raw0009 raw0013 keep few border demo synthetic time] [--out bench-out/street]
+[--score-only] [--set KEY=VALUE ...] [--openmvs FOLDER] [--vertical-angle-offset DEGREES]`
 
 The streets are 25 frames each of KITTI odometry 04 (traffic) and of KITTI raw drive 0009 (parked cars), and 22 frames
 of KITTI raw drive 0013 (verges, fences, trees; no outlines and signs are drawn on its photos); every 8th photo and
@@ -23,6 +23,9 @@ those of the worst street.
 
 - odo04, raw0009, raw0013: the streets with default settings and splats. keep: raw 0009 with `split.vehicles=keep`,
   counting all pixels.
+- few: splats of odo04 trained with eleven photos held out (`bench/street/few.py`). border: raw 0009 as a survey of two
+  tiles, and what splats show on both sides of their border (`bench/street/border.py`). demo: time that splats add to
+  `make demo`, of two runs from scratch.
 - synthetic: metrics with ground truth on a synthetic street (`bench/street/synthetic.py`), and straightness of edges
   (`bench.edges`).
 - time: the street of nine million points with this checkout and with an older one (`--old FOLDER`).
@@ -51,7 +54,7 @@ import numpy as np
 
 from bench.measure import measure
 from bench.paths import DATA, ROOT
-from bench.street import boxes, frame, lidar, openmvs, score, splats
+from bench.street import border, boxes, few, frame, lidar, openmvs, score, splats
 from bench.street import synthetic as street_synthetic
 from bench.street.world import BACKGROUND, Photo, Rendering, World, photos
 from scan2sim.pipeline.core.splats import SplatLayer
@@ -65,7 +68,7 @@ MAX_RANGE_M, SWEEP_WINDOW_S = 30.0, 0.05
 """Range within which returns must be covered, and maximum time from the photo to the returns of its own sweep."""
 RETURN_RADIUS_PX = 3
 """Radius around a return that counts as reached by the lidar."""
-PARTS = ("odo04", "raw0009", "raw0013", "keep", "synthetic", "time")
+PARTS = ("odo04", "raw0009", "raw0013", "keep", "few", "border", "demo", "synthetic", "time")
 EDGES = "bench.edges"
 """Module that measures `edge_cm`."""
 MEANS = (
@@ -75,6 +78,8 @@ MEANS = (
 """Metrics of a street that are means over its held-out photos."""
 MIN_SIGN_PX = 12.0
 """Minimum size of a sign in which it must be readable."""
+DEMO = (ROOT / "data_samples" / "tile", "--hold-out", 8, "--set", "segment.overwrite=true")
+"""Arguments of `make demo`, without splats."""
 NOTHING: dict[str, Any] = {}
 
 
@@ -301,8 +306,63 @@ def times(folder: Path, old: Path | None) -> dict[str, Any]:
     return {"time_ratio": seconds["new"] / seconds["old"], "seconds": seconds}
 
 
+def few_photos(street: Street, out: Path, pictures: Path, *, run: bool) -> dict[str, Any]:
+    """Score of the splats of odometry 04, trained with eleven photos held out (`few.metrics`)."""
+    tile, world = build_world(street, out / street.name, ("splats.when=auto",), run=run)
+    views = photos(tile, world, World(world / "world").origin)
+    return few.metrics(world, views, partial(vehicles, street), out / "few", pictures)
+
+
+def survey(street: Street, folder: Path, pictures: Path, *, run: bool) -> dict[str, Any]:
+    """Splats on both sides of the border of a survey's tiles (`border.metrics`)."""
+    tile, _ = build_world(street, folder, run=False)
+    tiles, made = folder / "tiles", folder / "made"
+    if run:
+        border.build(tile, tiles, made, scan2sim)
+    return border.metrics(tile, tiles, made, pictures)
+
+
+def demo(folder: Path) -> dict[str, float]:
+    """Seconds of the demo from scratch, without splats and with them, after a run that compiles the kernels."""
+    seconds = {}
+    for name, when in (("warm", "auto"), ("without", "never"), ("with", "auto")):
+        shutil.rmtree(folder / name, ignore_errors=True)
+        seconds[name] = scan2sim("run", *DEMO, "--set", f"splats.when={when}", "--out", folder / name)
+    return {**seconds, "added_seconds": seconds["with"] - seconds["without"]}
+
+
+def measured(part: str, street: Street | None, out: Path, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Results of a part; `street` is the one that it needs, if any."""
+    folder, pictures, run = out / part, out / "pictures" / part, not arguments.score_only
+    if part == "synthetic":
+        return synthetic(folder)
+    if part == "time":
+        return times(folder, arguments.old)
+    if street is None:
+        return demo(folder)
+    if part == "few":
+        return few_photos(street, out, pictures, run=run)
+    if part == "border":
+        return survey(street, folder, pictures, run=run)
+    settings = ("split.vehicles=keep" if part == "keep" else "splats.when=auto", *arguments.set)
+    tile, world = build_world(street, folder, settings, run=run)
+    mvs = arguments.openmvs.resolve() if arguments.openmvs and part in STREETS else None
+    found = score_world(street, tile, world, pictures, keep=part == "keep", mvs=mvs)
+    if part in STREETS:
+        offset = street.vertical_angle_offset
+        found["lidar"] = lidar.metrics(street.data, tile, world, pictures, street.labels, offset)
+        if layer := read_scene(world).tiles[0].splats():
+            found["splats"] = splats_of(street, tile, world, pictures, layer, splats.resources_of(world))
+        found["wrongly_removed"] = lidar.wrongly_removed(street.data, tile, world, partial(vehicles, street), offset)
+    return found
+
+
 def table(figures: Mapping[str, Mapping[str, Any]]) -> None:
     """Print the results."""
+    if "few" in figures:
+        few.table(figures["few"])
+    if "border" in figures:
+        border.table(figures["border"])
     for name in ("odo04", "raw0009", "raw0013", "keep"):
         one = figures.get(name)
         if one and "lidar" in one:
@@ -349,7 +409,9 @@ def table(figures: Mapping[str, Mapping[str, Any]]) -> None:
 
 def result(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Results that have targets."""
-    odo, raw, keep, synthetic_part, time = (figures.get(name, NOTHING) for name in ("odo04", "raw0009", *PARTS[3:]))
+    odo, raw, keep, few_part, border_part, demo_part, synthetic_part, time = (
+        figures.get(name, NOTHING) for name in ("odo04", "raw0009", *PARTS[3:])
+    )
     both = [part for part in (odo, raw) if part]
     streets = [figures[name] for name in STREETS if "frame_psnr_db" in figures.get(name, NOTHING)]
 
@@ -385,6 +447,10 @@ def result(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         **splats.result(
             {name: part["splats"] for name in STREETS if (part := figures.get(name)) and part.get("splats")}
         ),
+        "few_photos_gap_db": odo["splats"]["psnr_db"] - few_part["psnr_db"] if few_part and odo.get("splats") else None,
+        "border_grey_levels": border_part.get("border_grey_levels"),
+        "border_step_grey_levels": border_part.get("border_step_grey_levels"),
+        "demo_added_seconds": demo_part.get("added_seconds"),
     }
     return {k: round(v, 4) if isinstance(v, float) else v for k, v in found.items()}
 
@@ -413,7 +479,7 @@ def main() -> None:
     for part in arguments.parts:
         folder = out / part
         folder.mkdir(parents=True, exist_ok=True)
-        street = STREETS.get("raw0009" if part == "keep" else part)
+        street = STREETS.get({"keep": "raw0009", "few": "odo04", "border": "raw0009"}.get(part, part))
         if street and not street.data.is_dir():
             print(f"{part}: skipped, {street.data} doesn't exist")
             continue
@@ -422,21 +488,7 @@ def main() -> None:
             continue
         if street:
             street = replace(street, vertical_angle_offset=arguments.vertical_angle_offset)
-            settings = ("split.vehicles=keep" if part == "keep" else "splats.when=auto", *arguments.set)
-            tile, run = build_world(street, folder, settings, run=not arguments.score_only)
-            pictures = out / "pictures" / part
-            mvs = arguments.openmvs.resolve() if arguments.openmvs and part in STREETS else None
-            found = score_world(street, tile, run, pictures, keep=part == "keep", mvs=mvs)
-            if part in STREETS:
-                offset = street.vertical_angle_offset
-                found["lidar"] = lidar.metrics(street.data, tile, run, pictures, street.labels, offset)
-                if layer := read_scene(run).tiles[0].splats():
-                    found["splats"] = splats_of(street, tile, run, pictures, layer, splats.resources_of(run))
-                found["wrongly_removed"] = lidar.wrongly_removed(
-                    street.data, tile, run, partial(vehicles, street), offset
-                )
-        else:
-            found = synthetic(folder) if part == "synthetic" else times(folder, arguments.old)
+        found = measured(part, street, out, arguments)
         (folder / "figures.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
     files = {part: out / part / "figures.json" for part in PARTS}
     figures = {part: json.loads(f.read_text(encoding="utf-8")) for part, f in files.items() if f.is_file()}

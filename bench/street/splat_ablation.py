@@ -18,16 +18,14 @@ import ast
 import contextlib
 import importlib
 import json
-import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
 from bench.paths import ROOT
-from bench.street import lidar, splats
+from bench.street import splats, training
 from bench.street.run import STREETS, splats_of
-from scan2sim.pipeline.core.splats import SplatLayer
 from scan2sim.texturing.splats import step
 
 PACKAGE = "scan2sim.texturing.splats"
@@ -110,36 +108,14 @@ def _reads(node: ast.AST, own: bool, module: str, constant: str) -> bool:
 def row(name: str, worlds: Path, folder: Path, change: Mapping[str, Any]) -> dict[str, Any]:
     """Train the splats of a street with a change, and score them."""
     tile, run = worlds / name / "tile", worlds / name / "run"
-    inputs, params = _inputs(run)
-    shutil.rmtree(folder, ignore_errors=True)
-    (folder / "checkpoint").mkdir(parents=True)
+    inputs, params = training.of_run(run)
     with changed(change) as settings:
-        about = step.SplatsParams.model_validate({**params, **settings})
-        with splats.resources() as used:
-            done = step.splats(inputs, about, folder, _report, folder / "checkpoint")
-    shutil.rmtree(folder / "checkpoint")
-    layer = SplatLayer.load(done.files["splats"])
+        layer, used = training.train(inputs, {**params, **settings}, folder)
     found = splats_of(STREETS[name], tile, run, folder / "pictures", layer, used)
     splats.table(found)
     return {key: found[key] for key in METRICS} | {
         str(n): {"psnr_db": one["psnr_db"], "ssim": one["ssim"]} for n, one in found["photos"].items()
     }
-
-
-def _inputs(run: Path) -> tuple[dict[str, Path], dict[str, Any]]:
-    """Inputs and settings of the newest splats of a run."""
-    about = json.loads(lidar.newest(run, "splats", "manifest.json").read_text(encoding="utf-8"))
-    inputs = {}
-    for name, source in about["inputs"].items():
-        key, output = source.split("/", 1)
-        (folder,) = (run / "steps").glob(f"*/{key}")
-        files = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["files"]
-        inputs[name] = folder / files[output]
-    return inputs, about["params"]
-
-
-def _report(fraction: float, message: str = "") -> None:
-    print(f"\r{fraction:5.0%} {message:60}", end="", flush=True)
 
 
 def main() -> None:

@@ -66,7 +66,7 @@ def metrics(
         counts = ~vehicles(number, photo)
         rgb = rendered(renderer, photo).rgb
         # one camera takes the photos of these streets
-        exposed = renderer.view(_camera(photo), photo.T, as_photo=next(iter(layer.cameras), "")).rgb
+        exposed = renderer.view(camera_of(photo), photo.T, as_photo=next(iter(layer.cameras), "")).rgb
         rows[number] = _similarity(photo.rgb, rgb, counts, hits[number])
         rows[number]["exposed_psnr_db"] = score.psnr(score.squared_error(photo.rgb, exposed, counts))
         frame.picture(pictures / f"splats_{number:02d}.png", photo.rgb, rgb, counts)
@@ -108,10 +108,11 @@ def resources() -> Iterator[dict[str, float]]:
 
 def rendered(renderer: SplatRenderer, photo: Photo) -> SplatImage:
     """The splats from a photo's pose, with the exposure of the world."""
-    return renderer.view(_camera(photo), photo.T)
+    return renderer.view(camera_of(photo), photo.T)
 
 
-def _camera(photo: Photo) -> Camera:
+def camera_of(photo: Photo) -> Camera:
+    """The camera of a photo."""
     height, width = photo.rgb.shape[:2]
     distorted = any(photo.distortion)
     return Camera(

@@ -107,6 +107,18 @@ def test_background_is_that_of_the_nearest_tile_whatever_was_seen_before(town: S
         assert np.abs(image.rgb[0].astype(int) - level).max() <= 2
 
 
+def test_background_changes_gradually_from_tile_to_tile(town: Scene) -> None:
+    for tile, background in zip(town.tiles, (1.0, 0.2), strict=True):
+        green_ground(background=background).save(tile.folder / SPLATS_FILE)
+    world, first, last, levels = WorldCamera(town), view_of_tile(town, 0), view_of_tile(town, 1), []
+    for share in np.linspace(0, 1, 26):  # a metre each
+        pose = first.copy()
+        pose[:3, 3] += share * (last - first)[:3, 3]
+        levels.append(float(world.render(pose, CAMERA).rgb[0].mean()))
+    steps = np.diff(levels)
+    assert levels[0] - levels[-1] > 200 and steps.max() <= 0 and steps.min() > -40
+
+
 def test_sky_dome_of_a_survey_is_behind_surfaces_and_splats(town: Scene, tmp_path: Path) -> None:
     def sphere(scene: Scene, folder: Path) -> None:
         """A large box around the town; its walls have the colours of `synthetic.picture`."""

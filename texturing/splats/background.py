@@ -26,10 +26,12 @@ class Background:
         texture: (`HEIGHT_PX`, `WIDTH_PX`, 3) sRGB, `MIN_COLOUR` to `MAX_COLOUR`, as those of splats.
     """
 
+    # _first, _second: moments of Adam; _total: gradient of a step, zero between steps
+
     def __init__(self, texture: F32) -> None:
         self.texture = np.asarray(texture, np.float32).copy()
-        self._first, self._second = np.zeros_like(self.texture), np.zeros_like(self.texture)
-        self._total = np.zeros_like(self.texture)  # of a step; zero between steps
+        # `zeros` takes no memory before training writes to it
+        self._first, self._second, self._total = (np.zeros(self.texture.shape, np.float32) for _ in range(3))
 
     def seen(self, texels: F32) -> F32:
         """(H, W, 3) colours at texels (H, W, 2), see `texels`."""

@@ -49,11 +49,14 @@ class SplatRenderer:
 
     Raises:
         SettingError, UnavailableError: there is no such backend, or it can't run here.
+
+    Attributes:
+        behind: backgrounds and their shares, which add up to 1; at first that of the layer.
     """
 
     def __init__(self, layer: SplatLayer, backend: str = backends.AUTO) -> None:
         self._scene = backends.choose(backend).scene(layer.splats.parameters)
-        self._background = Background(layer.background)
+        self.behind = [(Background(layer.background), 1.0)]
         self._photos, self._cameras = layer.photos, layer.cameras
 
     def view(self, camera: Camera, T_world_cam: F64, *, as_photo: str | None = None) -> SplatImage:
@@ -84,7 +87,9 @@ class SplatRenderer:
         """Colour, range and cover of a pinhole view."""
         rays, length = _rays(camera)
         drawn = self._scene.render(Pinhole.of(camera, T_world_cam))
-        colour = drawn.over(self._background.seen(texels(rays @ T_world_cam[:3, :3].T.astype(np.float32))))
+        at = texels(rays @ T_world_cam[:3, :3].T.astype(np.float32))
+        behind = [np.float32(share) * background.seen(at) for background, share in self.behind]
+        colour = drawn.over(np.asarray(sum(behind[1:], start=behind[0]), np.float32))
         return colour, np.asarray(drawn.depth * length, np.float32), 1 - drawn.transmittance
 
     def _resampled(self, camera: Camera, T_world_cam: F64) -> tuple[F32, F32, F32]:
