@@ -83,6 +83,15 @@ def test_tiles_of_a_survey_are_in_place(town: Scene) -> None:
     assert np.abs(shown - GREEN).max() < 0.1
 
 
+@pytest.mark.parametrize("tiles", [(), (0,), (0, 1)])
+def test_colours_alone_are_those_of_the_image(town: Scene, tiles: tuple[int, ...]) -> None:
+    for k in tiles:
+        green_ground().save(town.tiles[k].folder / SPLATS_FILE)
+    for k in (0, 1):
+        image = WorldCamera(town).render(view_of_tile(town, k), CAMERA)
+        assert np.array_equal(WorldCamera(town).colours(view_of_tile(town, k), CAMERA), image.rgb)
+
+
 def view_of_tile(town: Scene, k: int) -> np.ndarray:
     """Pose of a camera beside a tile's house, looking at its ground."""
     x, y, z = town.tiles[k].offset
