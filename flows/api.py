@@ -154,7 +154,7 @@ def survey(
 
 
 def camera(world: World | str | Path, *, farthest: float = 300.0) -> WorldCamera:
-    """A camera in a finished world, without a simulator: colour, depth and classes from any pose.
+    """A camera in a finished world, without a simulator: colour, depth, classes and instances from any pose.
 
     Colours are those of the world's splats; tiles without splats show their textured surfaces.
 
@@ -165,7 +165,7 @@ def camera(world: World | str | Path, *, farthest: float = 300.0) -> WorldCamera
     Example:
         `image = scan2sim.camera("my_world").render(T_world_cam, camera)`, with a pose (4, 4) in world metres (camera
         axes x right, y down, z ahead) and a `scan2sim.pipeline.core.types.Camera`; `image.rgb`, `image.depth(camera)`,
-        `image.code`.
+        `image.code`, `image.instance` (ids of `camera.instances`).
 
     Raises:
         InputError: the folder contains no world.

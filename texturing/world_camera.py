@@ -1,4 +1,4 @@
-"""A camera in a finished world: colour as photographs show it, depth and classes, without a simulator."""
+"""A camera in a finished world: colour as photographs show it, depth, classes and instances, without a simulator."""
 
 from __future__ import annotations
 
@@ -6,16 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scan2sim.pipeline.camera.renderer import SKY_RGB, Image, Renderer, placed
-from scan2sim.pipeline.core.classes import CODE_OF_SURFACE
+from scan2sim.pipeline.camera.renderer import SKY_RGB, Body, Image, Renderer, placed
+from scan2sim.pipeline.core.classes import CODE, CODE_OF_SURFACE
 from scan2sim.pipeline.core.splats import XYZ, SplatLayer, Splats
-from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Camera, Colour
+from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools, Camera, Colour
+from scan2sim.pipeline.io.worlds.instances import Instance, TileInstances, box_ids, instances_of
 from scan2sim.pipeline.io.worlds.scene import BACKDROP, Scene, SceneTile
 from scan2sim.texturing.splats.background import Background
 from scan2sim.texturing.splats.view import SplatRenderer
 
 FARTHEST_M = 300.0
 """Default distance beyond which tiles aren't drawn."""
+IN_FRONT_M = 0.3
+"""Distance from the surfaces from which on splats in a vehicle's box are the vehicle."""
 BLACK = np.zeros((1, 2, 3), np.float32)
 """Background of splats over which another one is laid."""
 BLEND_M = 10.0
@@ -28,13 +31,16 @@ class CameraImage:
 
     Attributes:
         rgb: (H, W, 3) uint8.
-        range: metres along the ray to the first surface; where there is none, to the splats, or inf.
-        code: uint8 LAS code of the first surface, 0 where there is none.
+        range: metres along the ray to the first surface; where there is none, and where parked vehicles are in front
+            that only splats show, to the splats, or inf.
+        code: uint8 LAS code of the first surface, or of such a vehicle, 0 where there is none.
+        instance: int32 id of what is seen (`WorldCamera.instances`), 0 where it has none.
     """
 
     rgb: U8
     range: F32
     code: U8
+    instance: I32
 
     def depth(self, camera: Camera) -> F32:
         """(H, W) metres along the optical axis, as depth cameras give it; inf where there is nothing.
@@ -60,6 +66,13 @@ class WorldCamera:
         self._splats: SplatRenderer | None = None
         self._backgrounds: dict[int, Background] = {}
         self._behind: Renderer | None = None
+        self._instances: dict[int, TileInstances] = {}
+
+    @property
+    def instances(self) -> dict[int, Instance]:
+        """Instances of the tiles that have been drawn so far, by id; ids don't depend on which these are."""
+        tables = (self._instances[k].table for k in sorted(self._instances))
+        return {one.id: one for table in tables for one in table}
 
     def render(self, T_world_cam: F64, camera: Camera, *, samples: int = 2) -> CameraImage:
         """Render a view.
@@ -71,10 +84,10 @@ class WorldCamera:
         """
         self._load(T_world_cam[:3, 3])
         seen = self._surfaces.view(camera, T_world_cam, samples=samples if self._surfaces.are_shown else 1)
-        code = self._surfaces.codes(seen)
+        code, instance = self._surfaces.codes(seen), self._surfaces.instances(seen)
         if self._splats is None:
             rgb = self._before_backdrop(seen.rgb, seen.range, camera, T_world_cam, samples)
-            return CameraImage(rgb, seen.range, code)
+            return CameraImage(rgb, seen.range, code, instance)
         drawn = self._splats.view(camera, T_world_cam)
         rgb, shown = drawn.rgb, self._surfaces.shown(seen)
         if self._layers[self._nearest] is None:
@@ -83,7 +96,34 @@ class WorldCamera:
             rgb = np.clip(np.rint(rgb + behind * (1 - drawn.cover[..., None])), 0, 255).astype(np.uint8)
         in_front = shown & (seen.range < drawn.range)
         rgb = np.where(in_front[..., None], seen.rgb, rgb)
-        return CameraImage(rgb, np.where(seen.hit, seen.range, drawn.range), code)
+        distance = np.where(seen.hit, seen.range, drawn.range)
+        vehicle = self._vehicles(drawn.range, seen.range, camera, T_world_cam)
+        is_vehicle = (vehicle > 0) & ~in_front
+        return CameraImage(
+            rgb,
+            np.where(is_vehicle, drawn.range, distance),
+            np.where(is_vehicle, np.uint8(CODE["vehicle"]), code),
+            np.where(is_vehicle, vehicle, instance),
+        )
+
+    def colours(self, T_world_cam: F64, camera: Camera, *, samples: int = 2) -> U8:
+        """Colours (H, W, 3) of a view, as `render` gives them; faster where all tiles have splats."""
+        self._load(T_world_cam[:3, 3])
+        if self._splats is None or self._surfaces.are_shown:
+            return self.render(T_world_cam, camera, samples=samples).rgb
+        return self._splats.view(camera, T_world_cam).rgb
+
+    def _vehicles(self, shown: F32, surfaces: F32, camera: Camera, T_world_cam: F64) -> I32:
+        """Ids (H, W) of the vehicles in whose boxes splats are shown before the surfaces, by the ranges of both."""
+        from scan2sim.pipeline.camera.models import pixel_rays
+
+        found = np.zeros(shown.shape, np.int32)
+        boxes = [box for k in self._near for box in self._instances[k].boxes]
+        chosen = np.isfinite(shown) & (shown < surfaces - IN_FRONT_M)
+        if boxes and chosen.any():
+            rays = pixel_rays(camera)[chosen].astype(np.float64) @ T_world_cam[:3, :3].T
+            found[chosen] = box_ids(T_world_cam[:3, 3] + rays * shown[chosen, None], boxes)
+        return found
 
     def _before_backdrop(self, rgb: U8, distance: F32, camera: Camera, T_world_cam: F64, samples: int) -> U8:
         """Colours (H, W, 3) of a view with ranges (H, W), and those of backdrop and sky dome where these are nearer."""
@@ -99,7 +139,12 @@ class WorldCamera:
         if near != self._near:
             self._layers = {k: self._layers[k] if k in self._layers else _placed(self._scene.tiles[k]) for k in near}
             tiles, shown = [self._scene.tiles[k] for k in near], [self._layers[k] is None for k in near]
-            self._surfaces = _Surfaces(tiles, shown, self._scene.sky)
+            bodies = [_bodies(tile) for tile in tiles]
+            for k, own in zip(near, bodies, strict=True):
+                if k not in self._instances:
+                    meshes = {group: (body.mesh, codes) for group, (body, codes) in own.items()}
+                    self._instances[k] = instances_of(self._scene.tiles[k], k, meshes)
+            self._surfaces = _Surfaces(bodies, [self._instances[k] for k in near], shown, self._scene.sky)
             plain = [tile for tile, is_shown in zip(tiles, shown, strict=True) if is_shown]
             self._behind = _backdrops([*plain, *([self._scene.dome] if self._scene.dome else [])], self._scene.sky)
             layers = {k: layer for k, layer in self._layers.items() if layer is not None}
@@ -147,26 +192,35 @@ class _Layout:
         return {k: share for k, share in zip(of, weight.tolist(), strict=True) if share > 0}
 
 
+_Bodies = dict[str, tuple[Body, U8]]
+"""Textured surfaces of a tile in world metres, and the LAS codes of their faces, by group."""
+
+
+def _bodies(tile: SceneTile) -> _Bodies:
+    found: _Bodies = {}
+    for group in tile.groups:
+        body = placed(tile.folder / group, tile.offset)
+        own, codes = tile.codes.get(group, CODE_OF_SURFACE[group]), body.mesh.classification
+        whole = np.full(len(body.mesh), own, np.uint8)
+        found[group] = body, whole if codes is None else np.where(codes == 0, whole, codes)
+    return found
+
+
 class _Surfaces:
-    """Textured surfaces of tiles: distance and class of all, colour of those without splats.
+    """Textured surfaces of tiles: distance, class and instance of all, colour of those without splats.
 
     Attributes:
         are_shown: whether any are seen, not only measured.
     """
 
-    def __init__(self, tiles: list[SceneTile], shown: list[bool], sky: Colour | None) -> None:
+    def __init__(
+        self, tiles: list[_Bodies], instances: list[TileInstances], shown: list[bool], sky: Colour | None
+    ) -> None:
         """`shown`: whether the colours of a tile's surfaces are seen; those of tiles with splats aren't."""
-        self._codes: list[U8] = []
-        bodies, is_shown = [], list[bool]()
-        for tile, its_colours in zip(tiles, shown, strict=True):
-            for group in tile.groups:
-                body = placed(tile.folder / group, tile.offset)
-                own, codes = tile.codes.get(group, CODE_OF_SURFACE[group]), body.mesh.classification
-                self._codes.append(
-                    np.full(len(body.mesh), own, np.uint8) if codes is None else np.where(codes == 0, own, codes)
-                )
-                bodies.append(body)
-                is_shown.append(its_colours)
+        self._codes = [codes for own in tiles for _, codes in own.values()]
+        self._ids = [known.faces[group] for own, known in zip(tiles, instances, strict=True) for group in own]
+        is_shown = [its_colours for own, its_colours in zip(tiles, shown, strict=True) for _ in own]
+        bodies = [body for own in tiles for body, _ in own.values()]
         self._renderer, self._is_shown, self.are_shown = Renderer(bodies, sky), np.array(is_shown, bool), any(shown)
 
     def view(self, camera: Camera, T_world_cam: F64, *, samples: int) -> Image:
@@ -183,6 +237,14 @@ class _Surfaces:
         for body, codes in enumerate(self._codes):
             at = seen.hit & (seen.body == body)
             found[at] = codes[seen.face[at]]
+        return found
+
+    def instances(self, seen: Image) -> I32:
+        """(H, W) id of each pixel's first surface, 0 where it has none."""
+        found = np.zeros(seen.hit.shape, np.int32)
+        for body, ids in enumerate(self._ids):
+            at = seen.hit & (seen.body == body)
+            found[at] = ids[seen.face[at]]
         return found
 
 

@@ -23,7 +23,6 @@ from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.io.worlds.scene import PATH_FILE, read_scene
 from scan2sim.services.teleoperation import encoders, timecode
 from scan2sim.services.teleoperation.cameras import CameraFrame, Mount
-from scan2sim.services.teleoperation.cameras.world import mount_pose
 from scan2sim.services.teleoperation.sim.world_renderer import WorldRenderer, build_world
 from scan2sim.services.teleoperation.video.capture import CameraEncoder
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame, VideoReceiver
@@ -89,7 +88,7 @@ def main() -> None:
         captured = round(i * 1e9 / FPS)
         for camera, yaw in enumerate(YAWS):
             with cpu_times.of("render"):
-                image = renderer.view(pose @ mount_pose(Mount(yaw=yaw)))
+                image = renderer.view(pose @ Mount(yaw=yaw).pose())
             timecode.draw(image, captured)
             with cpu_times.of("encode and encrypt"):
                 packets = coders[camera].encode(CameraFrame(image, captured), plan, captured / 1e9)

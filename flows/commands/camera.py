@@ -16,7 +16,7 @@ app = App(requirement=("the camera", "psutil"))
 @app.command()
 @options(WorldCameraParams, **NODE_OPTIONS)
 def camera(params: WorldCameraParams, limit: Limits = None) -> None:
-    """Simulate a robot's camera in a finished world: a ROS 2 node that publishes images, depth and classes."""
+    """Simulate a robot's camera in a finished world: a ROS 2 node that publishes images, depth, classes, instances."""
     from scan2sim.services.world_camera.node import WorldCameraNode
     from scan2sim.texturing.world_camera import WorldCamera
 

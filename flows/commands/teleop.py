@@ -7,7 +7,7 @@ import webbrowser
 from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -20,6 +20,7 @@ from scan2sim.flows.commands.options import assigned, options
 from scan2sim.flows.commands.ros_spin import stop_on_signal
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.pipeline.core.errors import DataError, SettingError
+from scan2sim.pipeline.io.worlds.scene import read_scene
 from scan2sim.services.teleoperation.settings import (
     DemoParams,
     ExportParams,
@@ -32,6 +33,9 @@ from scan2sim.services.teleoperation.settings import (
 from scan2sim.services.teleoperation.station.drivers import DriverRole
 from scan2sim.services.teleoperation.vehicle import adapters
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
+
+if TYPE_CHECKING:
+    from scan2sim.texturing.world_camera import WorldCamera
 
 app = App("Drive vehicles remotely, over several network links at once.")
 PACKAGES = ("OpenSSL", "pylibsrtp", "websockets")
@@ -203,7 +207,14 @@ def teleop_vehicle(params: VehicleParams) -> None:
 
     stop = threading.Event()
     with stop_on_signal(stop):
-        serve(params, stop, _say)
+        serve(params, stop, _say, _open_world)
+
+
+def _open_world(folder: Path) -> WorldCamera:
+    """Opens a world that cameras of a simulated vehicle render from splats."""
+    from scan2sim.texturing.world_camera import WorldCamera
+
+    return WorldCamera(read_scene(folder))
 
 
 @app.command("demo")

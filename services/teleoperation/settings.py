@@ -164,7 +164,8 @@ class VehicleParams(OnboardParams):
         tuple[str, ...],
         Field(
             description="Camera as NAME=KIND:WHERE, such as front=device:/dev/video0; repeat for several cameras. "
-            "KIND is device, replay, pattern or world; after the folder of a world, @DEGREES turns the camera left."
+            "KIND is device, replay, pattern, world (its splats, if it has any) or surfaces (of a world); after the "
+            "folder of a world, @DEGREES turns the camera left."
         ),
     ] = ()
     share: Annotated[
@@ -195,8 +196,17 @@ class DemoParams(Params):
         int, Field(ge=1024, le=65534, description="Port of the driver page; the fleet page uses port + 1.")
     ] = 8080
     cameras: Annotated[
-        int, Field(ge=1, le=4, description="Number of cameras: front, left, right, rear, in this order.")
-    ] = 4
+        int | None,
+        Field(
+            ge=1,
+            le=4,
+            description="Number of cameras: front, left, right, rear, in this order. Default: 4; 1 in a world with "
+            "splats, which take longer to render.",
+        ),
+    ] = None
+    surfaces: Annotated[
+        bool, Field(description="Show textured surfaces although the world has splats: more frames/s.")
+    ] = False
     rate: Annotated[
         float,
         Field(ge=1, le=30, description="Maximum frame rate of each camera, frames/s; limited by rendering speed."),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import time
 from collections import deque
@@ -26,15 +27,19 @@ log = logging.getLogger(__name__)
 
 HEADER, TIME, TF = "std_msgs/msg/Header", "builtin_interfaces/msg/Time", "tf2_msgs/msg/TFMessage"
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-CAMERA_INFO, ODOMETRY = "sensor_msgs/msg/CameraInfo", "nav_msgs/msg/Odometry"
-COLOUR, JPEG, DEPTH, CLASSES, INFO = OUTPUTS
-TYPES = {COLOUR: IMAGE, JPEG: COMPRESSED, DEPTH: IMAGE, CLASSES: IMAGE, INFO: CAMERA_INFO}
+CAMERA_INFO, ODOMETRY, STRING = "sensor_msgs/msg/CameraInfo", "nav_msgs/msg/Odometry", "std_msgs/msg/String"
+COLOUR, JPEG, DEPTH, CLASSES, INSTANCES, TABLE, INFO = OUTPUTS
+TYPES = {
+    COLOUR: IMAGE, JPEG: COMPRESSED, DEPTH: IMAGE, CLASSES: IMAGE, INSTANCES: IMAGE, TABLE: STRING, INFO: CAMERA_INFO,
+}  # fmt: skip
 POSES_QOS = QoS(reliability="BEST_EFFORT", depth=100)
 """Compatible with every publisher; /tf has many messages."""
 STATIC_QOS = QoS(durability="TRANSIENT_LOCAL", depth=100)
 SENSOR_QOS = QoS(reliability="BEST_EFFORT", depth=5)
 IMAGES_QOS = QoS(depth=5)
 """Reliable, which is compatible with both reliable and best-effort subscriptions."""
+TABLE_QOS = QoS(durability="TRANSIENT_LOCAL", depth=1)
+"""Whoever subscribes later gets the last table, too."""
 READOUT_POSES = 9
 """Poses during the readout of a rolling shutter."""
 REPEAT_S = 1.0
@@ -86,9 +91,12 @@ class WorldCameraNode(Monitor):
         given = None if params.camera_info else pinhole(params.width, params.height, field=params.field)
         self._intrinsics = Intrinsics(given, rectified=params.rectified)
         self._pairs, self._pending = ImagePairs(), deque[tuple[float, Pair]](maxlen=PENDING_MAX)
+        self._known_instances = -1  # number of instances in the last table
         self._rendered, self._last_s = -1, 0.0  # time stamp of the last image, and when it was requested
         self._outputs = {
-            name: self.create_publisher(ros.message_type(kind), f"{params.topic}/{name}", IMAGES_QOS)
+            name: self.create_publisher(
+                ros.message_type(kind), f"{params.topic}/{name}", TABLE_QOS if name == TABLE else IMAGES_QOS
+            )
             for name, kind in TYPES.items()
         }
         self._worker = LatestWorker(self._render, f"{params.name} renderer")
@@ -137,7 +145,7 @@ class WorldCameraNode(Monitor):
     def _wanted(self) -> frozenset[str]:
         """Topics that somebody subscribes to, if images are among them and camera and pose are known."""
         found = frozenset(name for name, publisher in self._outputs.items() if publisher.get_subscription_count())
-        if not found - {INFO}:
+        if not found - {INFO, TABLE}:
             return frozenset()
         if self._intrinsics.camera is None:
             self._warn("waiting", f"waiting for a valid CameraInfo on {self._params.camera_info}")
@@ -226,11 +234,21 @@ class WorldCameraNode(Monitor):
             JPEG: lambda: _jpeg(header, jpeg(rgb, self._params.quality)),
             DEPTH: lambda: _image(header, "32FC1", view.depth),
             CLASSES: lambda: _image(header, "mono8", view.code),
+            INSTANCES: lambda: _image(header, "32SC1", view.instance),
             INFO: lambda: ros.message(CAMERA_INFO, header=header, **request.info),
         }
-        for name in TYPES:
+        self._publish_table()
+        for name, make in content.items():
             if name in request.outputs:
-                self._outputs[name].publish(content[name]())
+                self._outputs[name].publish(make())
+
+    def _publish_table(self) -> None:
+        """Publish the table of instances if tiles were read since the last one."""
+        known = self._world.instances
+        if len(known) != self._known_instances:
+            self._known_instances = len(known)
+            text = json.dumps({"instances": [one.to_json() for one in known.values()]})
+            self._outputs[TABLE].publish(ros.message(STRING, data=text))
 
     def destroy_node(self) -> Any:
         """Stop rendering and destroy the node."""

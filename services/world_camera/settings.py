@@ -16,7 +16,7 @@ PosePart = Annotated[float, Field(ge=-1e6, le=1e6)]
 Pose = tuple[PosePart, PosePart, PosePart, PosePart, PosePart, PosePart]
 """x, y, z in metres; roll, pitch, yaw in degrees about the fixed axes x, y, z."""
 FrameName = Annotated[str, Field(max_length=256)]
-OUTPUTS = ("image_raw", "image_raw/compressed", "depth", "classes", "camera_info")
+OUTPUTS = ("image_raw", "image_raw/compressed", "depth", "classes", "instances", "instance_table", "camera_info")
 """Topics below `topic`."""
 
 
@@ -32,7 +32,7 @@ class WorldCameraParams(MonitorParams):
         TopicName,
         Field(
             description="Prefix of the published topics: TOPIC/image_raw, TOPIC/image_raw/compressed, TOPIC/depth, "
-            "TOPIC/classes, TOPIC/camera_info."
+            "TOPIC/classes, TOPIC/instances, TOPIC/instance_table, TOPIC/camera_info."
         ),
     ] = "world_camera"
     name: NodeName = "world_camera"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Protocol
@@ -10,7 +11,8 @@ import numpy as np
 
 from scan2sim.pipeline.core.classes import UNCLASSIFIED
 from scan2sim.pipeline.core.poses import interpolate
-from scan2sim.pipeline.core.types import F32, F64, U8, Camera
+from scan2sim.pipeline.core.types import F32, F64, I32, U8, Camera
+from scan2sim.pipeline.io.worlds.instances import Instance
 
 MAX_BANDS, BAND_PX = 16, 1.0
 """Bands of rows that an image with rolling shutter is rendered in, and the motion in pixels from band to band."""
@@ -29,12 +31,20 @@ class CameraImage(Protocol):
     def code(self) -> U8:
         """(H, W) LAS codes."""
 
+    @property
+    def instance(self) -> I32:
+        """(H, W) ids of instances."""
+
     def depth(self, camera: Camera) -> F32:
         """(H, W) metres along the optical axis."""
 
 
 class World(Protocol):
     """A world to render (`texturing.world_camera.WorldCamera`)."""
+
+    @property
+    def instances(self) -> Mapping[int, Instance]:
+        """Instances of what has been rendered so far, by id."""
 
     def render(self, T_world_cam: F64, camera: Camera) -> CameraImage:
         """Render the view of a camera with a pose (4, 4), optical axes."""
@@ -49,11 +59,13 @@ class View:
         depth: metres along the optical axis, inf where there is nothing, NaN where the lens sees nothing, or more than
             90 degrees from the axis.
         code: uint8 LAS codes, 0 where there is no surface, 1 (unclassified) on what a simulator shows.
+        instance: int32 ids of instances, 0 where there is none, and on what a simulator shows.
     """
 
     rgb: U8
     depth: F32
     code: U8
+    instance: I32
 
 
 def rendered(world: World, camera: Camera, poses: F64) -> View:
@@ -72,11 +84,12 @@ def rendered(world: World, camera: Camera, poses: F64) -> View:
         share = (first + end - 1) / 2 / max(1, camera.height - 1)
         image = world.render(interpolate(poses, times, np.array([share]))[0], band)
         depth = image.depth(band)
-        parts.append(View(image.rgb, np.where(depth < 0, np.float32(np.nan), depth), image.code))
+        parts.append(View(image.rgb, np.where(depth < 0, np.float32(np.nan), depth), image.code, image.instance))
     return View(
         np.concatenate([part.rgb for part in parts]),
         np.concatenate([part.depth for part in parts]),
         np.concatenate([part.code for part in parts]),
+        np.concatenate([part.instance for part in parts]),
     )
 
 
@@ -107,6 +120,7 @@ def composed(view: View, rgb: U8, depth: F32, tolerance: float) -> View:
         np.where(front[..., None], rgb, view.rgb),
         np.where(front, own, view.depth).astype(np.float32),
         np.where(front, np.uint8(UNCLASSIFIED), view.code),
+        np.where(front, np.int32(0), view.instance),
     )
 
 

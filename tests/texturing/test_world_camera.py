@@ -12,6 +12,8 @@ import scan2sim
 from scan2sim.pipeline.camera.renderer import look_at, pinhole
 from scan2sim.pipeline.core.splats import SplatLayer, Splats
 from scan2sim.pipeline.core.types import Camera
+from scan2sim.pipeline.io.geodata import geojson
+from scan2sim.pipeline.io.worlds.instances import TILE_IDS
 from scan2sim.pipeline.io.worlds.scene import SPLATS_FILE, Scene, add_dome
 from scan2sim.texturing.world_camera import WorldCamera
 from tests.fakes import synthetic
@@ -81,6 +83,15 @@ def test_tiles_of_a_survey_are_in_place(town: Scene) -> None:
     assert np.abs(shown - GREEN).max() < 0.1
 
 
+@pytest.mark.parametrize("tiles", [(), (0,), (0, 1)])
+def test_colours_alone_are_those_of_the_image(town: Scene, tiles: tuple[int, ...]) -> None:
+    for k in tiles:
+        green_ground().save(town.tiles[k].folder / SPLATS_FILE)
+    for k in (0, 1):
+        image = WorldCamera(town).render(view_of_tile(town, k), CAMERA)
+        assert np.array_equal(WorldCamera(town).colours(view_of_tile(town, k), CAMERA), image.rgb)
+
+
 def view_of_tile(town: Scene, k: int) -> np.ndarray:
     """Pose of a camera beside a tile's house, looking at its ground."""
     x, y, z = town.tiles[k].offset
@@ -144,3 +155,59 @@ def test_tiles_beyond_the_distance_limit_are_not_drawn(town: Scene) -> None:
     assert np.isfinite(far[np.isinf(near)]).any() and np.array_equal(near[np.isfinite(near)], far[np.isfinite(near)])
     lost = WorldCamera(town, farthest=5.0).render(look_at((x + 40.0, y, z + 2), (x, y, z)), CAMERA)
     assert np.isfinite(lost.range).any(), "the nearest tile is always drawn"
+
+
+def test_instances_are_those_of_the_table_whatever_was_seen_before(town: Scene) -> None:
+    world = WorldCamera(town)
+    for k in (1, 0):
+        image = world.render(view_of_tile(town, k), CAMERA)
+        (house,) = np.unique(image.instance[(image.code == 6) & (image.range < 15)]).tolist()
+        assert k * TILE_IDS < house <= (k + 1) * TILE_IDS
+        shown = world.instances[house]
+        assert (shown.kind, shown.code, shown.tile) == ("building", 6, f"tile{k}")
+        offset = np.subtract(shown.position_m, town.tiles[k].offset)[:2]
+        assert np.abs(offset - np.add(synthetic.HOUSE, (1.5, 1.0))).max() < 0.01
+        assert not image.instance[np.isin(image.code, (0, 2))].any(), "neither sky nor ground is an instance"
+        again = WorldCamera(town).render(view_of_tile(town, k), CAMERA)
+        assert np.array_equal(again.instance, image.instance)
+
+
+def parked_car(town: Scene, *, moved: bool = False) -> None:
+    """A car that only the splats of the first tile show: green, 2 m long, 1 m wide and 1 m high, before the camera."""
+    tile = town.tiles[0]
+    ground_z = synthetic.height(np.array([-1.5]), np.array([-1.5]))[0]
+    xyz = np.random.default_rng(3).uniform((-2.5, -2.0, 0.0), (-0.5, -1.0, 1.0), (20_000, 3)) + (0, 0, ground_z)
+    splats = Splats.of(
+        xyz, np.full((20_000, 3), 0.05), np.tile([1.0, 0, 0, 0], (20_000, 1)), np.full(20_000, 0.9),
+        np.tile(GREEN, (20_000, 1)),
+    )  # fmt: skip
+    SplatLayer(splats, np.ones((512, 1024, 3), np.float32)).save(tile.folder / SPLATS_FILE)
+    corners = tile.frame.to_crs(
+        [(-2.5, -2, ground_z), (-0.5, -2, ground_z), (-0.5, -1, ground_z), (-2.5, -1, ground_z)]
+    )
+    ring = np.concatenate([corners, corners[:1]])
+    properties = {"kind": "car", "height_m": 1.0, "ground_z": float(corners[0, 2]), "moved": moved}
+    geojson.write_polygons(tile.folder / "instances.geojson", tile.frame.crs, [(ring[:, :2].tolist(), properties)])
+
+
+def test_vehicles_that_only_splats_show_have_distance_class_and_instance(town: Scene) -> None:
+    surfaces = WorldCamera(town).render(POSE, CAMERA)
+    parked_car(town)
+    world = WorldCamera(town)
+    image = world.render(POSE, CAMERA)
+    (car,) = (one for one in world.instances.values() if one.kind == "car")
+    own = image.instance == car.id
+    assert own.mean() > 0.01 and (image.code[own] == 66).all() and car.code == 66
+    assert (image.range[own] < surfaces.range[own]).all(), "a robot behind it is hidden"
+    assert np.abs(image.rgb[own].mean(axis=0) / 255 - GREEN).max() < 0.1
+    assert np.array_equal(image.code[~own], surfaces.code[~own])
+    hit = np.isfinite(surfaces.range) & ~own
+    assert np.array_equal(image.range[hit], surfaces.range[hit])
+    assert np.abs(np.subtract(car.position_m[:2], (-1.5, -1.5))).max() < 0.01
+
+
+def test_vehicles_that_moved_are_no_instances(town: Scene) -> None:
+    parked_car(town, moved=True)
+    world = WorldCamera(town)
+    image = world.render(POSE, CAMERA)
+    assert "car" not in {one.kind for one in world.instances.values()} and not (image.code == 66).any()

@@ -5,12 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.types import F64, U8
+from scan2sim.pipeline.core.types import Camera as PinholeCamera
 from scan2sim.services.credentials import redacted
 from scan2sim.services.supervision import SupervisedThread
 from scan2sim.services.teleoperation import timecode
@@ -49,6 +51,27 @@ class Mount(NamedTuple):
     pitch: float = -8.0
     field: float = 80.0
 
+    def pose(self) -> F64:
+        """Transform (4, 4) from the camera (x right, y down, z ahead) to the vehicle (x ahead, y left, z up)."""
+        from scipy.spatial.transform import Rotation
+
+        pose = np.eye(4)
+        rotation = Rotation.from_euler("ZY", [self.yaw, -self.pitch], degrees=True).as_matrix()
+        pose[:3, :3] = rotation @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+        pose[:3, 3] = self[:3]
+        return pose
+
+
+class SplatWorld(Protocol):
+    """A world that is rendered from splats (`texturing.world_camera.WorldCamera`)."""
+
+    def colours(self, T_world_cam: F64, camera: PinholeCamera) -> U8:
+        """Image (H, W, 3), RGB, from a camera pose (4, 4)."""
+
+
+OpenWorld = Callable[[Path], SplatWorld]
+"""Opens the world in a folder."""
+
 
 class View(NamedTuple):
     """Requested view of a camera; a real camera may deliver another frame size or rate.
@@ -60,6 +83,7 @@ class View(NamedTuple):
         draw_timecode: draw the capture time into each frame (`timecode`).
         mount: of a simulated camera.
         pose: returns the simulated vehicle's current pose (4, 4) in the world: x ahead, y left, z up.
+        open_world: opens worlds with splats; None: can't.
     """
 
     location: str = ""
@@ -69,6 +93,7 @@ class View(NamedTuple):
     draw_timecode: bool = False
     mount: Mount = Mount()
     pose: Callable[[], F64] = lambda: np.eye(4)
+    open_world: OpenWorld | None = None
 
 
 class Backend(Protocol):

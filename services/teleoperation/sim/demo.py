@@ -25,6 +25,7 @@ from pathlib import Path
 
 from scan2sim.pipeline.core.errors import StepError
 from scan2sim.services.teleoperation.adapter_key import ADAPTER_KEY_FILE
+from scan2sim.services.teleoperation.cameras.world import has_splats
 from scan2sim.services.teleoperation.gateway.pki import certify
 from scan2sim.services.teleoperation.settings import ADAPTER_PORT, GATEWAY_PORT, STATION_PORT, DemoParams
 
@@ -88,8 +89,7 @@ class Demo:
         )  # fmt: skip
         car = parties / f"vehicle-{VEHICLE_NAME}"
         self._run("translate", "simulated", "--set", f"world={params.world}", "--key", car / ADAPTER_KEY_FILE)
-        views = [("front", 0), ("left", 90), ("right", -90), ("rear", 180)][: params.cameras]
-        cameras = [part for name, turn in views for part in ("--camera", f"{name}=world:{params.world}@{turn}")]
+        cameras = [part for one in camera_options(params) for part in ("--camera", one)]
         self._run(
             "vehicle", car, gateway,
             "--link", f"one={LOCALHOST}", "--link", f"two={LOCALHOST}",
@@ -169,6 +169,18 @@ class Demo:
                 return dict(json.load(answer))
         except (urllib.error.URLError, ValueError, OSError):
             return None
+
+
+def camera_options(params: DemoParams) -> list[str]:
+    """The car's cameras as options of the command `vehicle`: splats, if the world has any, or surfaces.
+
+    Raises:
+        InputError: the folder contains no world.
+    """
+    splats = not params.surfaces and has_splats(params.world)
+    views = [("front", 0), ("left", 90), ("right", -90), ("rear", 180)][: params.cameras or (1 if splats else 4)]
+    kind = "surfaces" if params.surfaces else "world"
+    return [f"{name}={kind}:{params.world}@{turn}" for name, turn in views]
 
 
 def delete_abandoned_folders(parent: Path) -> int:

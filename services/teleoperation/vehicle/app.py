@@ -14,7 +14,7 @@ from scan2sim.services.credentials import redacted
 from scan2sim.services.supervision import SupervisedThread
 from scan2sim.services.teleoperation import cameras, encoders
 from scan2sim.services.teleoperation.adapter_key import ADAPTER_KEY_FILE
-from scan2sim.services.teleoperation.cameras import Camera, Mount, View
+from scan2sim.services.teleoperation.cameras import Camera, Mount, OpenWorld, View
 from scan2sim.services.teleoperation.control.messages import CongestionReport, Kind, Message, VideoReport, VideoStream
 from scan2sim.services.teleoperation.gateway.client import GatewayConnection
 from scan2sim.services.teleoperation.gateway_protocol import CurrentPair, Hello, Join, Release, RequestRefused, Status
@@ -215,8 +215,15 @@ class Vehicle:
                     connection.send(Kind.VIDEO_KEY, key.pack())
 
 
-def serve(params: VehicleParams, ended: threading.Event, notify: Callable[[str], None]) -> None:
+def serve(
+    params: VehicleParams,
+    ended: threading.Event,
+    notify: Callable[[str], None],
+    open_world: OpenWorld | None = None,
+) -> None:
     """Run a vehicle until `ended` is set; `notify` is called with progress messages.
+
+    `open_world` opens worlds with splats for the cameras of a simulated vehicle; without it, they have none.
 
     Raises:
         ScanError: the certificate can't be read, a link or camera is not valid, or a thread has failed.
@@ -226,7 +233,7 @@ def serve(params: VehicleParams, ended: threading.Event, notify: Callable[[str],
     links = [Link(*_parse_named("--link", text)) for text in params.link] or [Link("one")]
     key = params.key or params.certificates / ADAPTER_KEY_FILE
     unit = OnboardUnit(OnboardParams(adapter=params.adapter, key=key, limit=params.limit))
-    cameras_by_name = {name: _camera(name, source, params, unit) for name, source in _cameras(params)}
+    cameras_by_name = {name: _camera(name, source, params, unit, open_world) for name, source in _cameras(params)}
     bounds = BitrateBounds(highest=round(params.bitrate * 1e6))
     policy = Policy.SHARE if params.share else Policy.COPY
     vehicle = Vehicle(identity, unit, links, cameras_by_name, policy, bounds)
@@ -255,11 +262,11 @@ def _cameras(params: VehicleParams) -> list[tuple[str, str]]:
     return named
 
 
-def _camera(name: str, source: str, params: VehicleParams, unit: OnboardUnit) -> Camera:
+def _camera(name: str, source: str, params: VehicleParams, unit: OnboardUnit, open_world: OpenWorld | None) -> Camera:
     """Camera from KIND:WHERE."""
     kind, _, location = source.partition(":")
     view = View(location, *params.size, params.rate)
-    if kind == "world":
+    if kind in ("world", "surfaces"):
         location, _, yaw = location.rpartition("@") if "@" in location else (location, "", "0")
         try:
             mount = Mount(yaw=float(yaw))
@@ -268,4 +275,5 @@ def _camera(name: str, source: str, params: VehicleParams, unit: OnboardUnit) ->
             raise SettingError("--camera", cause, "Write it as left=world:DIR@90") from None
         pose_tracker = PoseTracker(Ground(read_scene(Path(location))))
         view = view._replace(location=location, mount=mount, pose=lambda: pose_tracker(unit.car.vehicle()))
+        view = view._replace(open_world=open_world)
     return Camera(name, lambda: cameras.frames(kind, view))

@@ -1,7 +1,8 @@
 """A robot with a camera for tests: publishes poses, CameraInfo and a simulator's images, and saves what it sees.
 
 Arguments: FOLDER tf|odometry. It drives along x and ends when it has received an image of each output; FOLDER then
-contains an .npz of each: `time` in seconds, `frame`, and `data`, or fields of the CameraInfo.
+contains an .npz of each: `time` in seconds, `frame`, and `data`, or fields of the CameraInfo; of the table of instances
+its `text`.
 """
 
 from __future__ import annotations
@@ -33,12 +34,15 @@ OBJECT_M, OBJECT_RGB = 1.5, (250, 20, 30)
 """Distance and colour of what the simulator shows in the left half of its image."""
 HEADER, TIME = "std_msgs/msg/Header", "builtin_interfaces/msg/Time"
 IMAGE, COMPRESSED, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
+STRING = "std_msgs/msg/String"
 TF, ODOMETRY = "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Odometry"
 OUTPUTS = {
     "image_raw": IMAGE,
     "image_raw/compressed": COMPRESSED,
     "depth": IMAGE,
     "classes": IMAGE,
+    "instances": IMAGE,
+    "instance_table": STRING,
     "camera_info": INFO,
 }
 OPTICAL = look_at((0, 0, 2), (4, 4, 0.5))[:3, :3]
@@ -63,7 +67,8 @@ class Robot:
         self.image, self.depth = self.publisher(IMAGE, "/front/image"), self.publisher(IMAGE, "/front/depth_image")
         for name, kind in OUTPUTS.items():
             topic, save = f"/world_camera/{name}", partial(self.save, name)
-            self.node.create_subscription(self.ros.message_type(kind), topic, save, QoS(depth=5))
+            qos = QoS(depth=5, durability="TRANSIENT_LOCAL" if kind == STRING else "VOLATILE")
+            self.node.create_subscription(self.ros.message_type(kind), topic, save, qos)
 
     def publisher(self, kind: str, topic: str, durability: Any = "VOLATILE") -> Any:
         return self.node.create_publisher(self.ros.message_type(kind), topic, QoS(depth=50, durability=durability))
@@ -139,6 +144,10 @@ class Robot:
 
     def save(self, name: str, message: Any) -> None:
         """Save the latest message of an output."""
+        self.received.add(name)
+        if name == "instance_table":
+            np.savez(self.folder / f"{name}.npz", text=message.data)
+            return
         stamp = message.header.stamp
         fields = {"time": stamp.sec + 1e-9 * stamp.nanosec, "frame": message.header.frame_id}
         if name == "camera_info":
@@ -146,7 +155,6 @@ class Robot:
         else:
             fields |= {"data": np.frombuffer(bytes(message.data), np.uint8)}
         np.savez(self.folder / f"{name.replace('/', '_')}.npz", **fields)
-        self.received.add(name)
 
 
 if __name__ == "__main__":

@@ -47,11 +47,12 @@ def pixels(received: dict[str, Any], name: str, kind: type, *channels: int) -> n
 def test_images_are_those_of_the_pose_by_tf(start: Start, tmp_path: Path) -> None:
     scene = synthetic.scene(tmp_path)
     received = seen(start, scene, tmp_path, "tf")
+    table = json.loads(received.pop("instance_table")["text"].item())
     assert {one["frame"].item() for one in received.values()} == {"eye_optical_frame"}
     assert np.array_equal(received["camera_info"]["d"], CAMERA.distortion)
     assert received["camera_info"]["k"][0] == CAMERA.fx
     world = WorldCamera(scene)
-    for name in ("image_raw", "depth", "image_raw_compressed"):
+    for name in ("image_raw", "depth", "image_raw_compressed", "instances"):
         T = np.eye(4)
         T[:3, :3] = robot.OPTICAL
         T[:3, 3] = robot.position(float(received[name]["time"])) + (0, 0, 2)
@@ -59,6 +60,10 @@ def test_images_are_those_of_the_pose_by_tf(start: Start, tmp_path: Path) -> Non
         if name == "depth":
             depth, own = pixels(received, "depth", np.float32), expected.depth(CAMERA)
             assert np.isclose(depth, own, rtol=0.01).mean() > 0.98
+        elif name == "instances":
+            ids = pixels(received, "instances", np.int32)
+            assert (ids == expected.instance).mean() > 0.98 and ids.any()
+            assert set(np.unique(ids)) - {0} <= {one["id"] for one in table["instances"]}
         elif name == "image_raw":
             shown = pixels(received, "image_raw", np.uint8, 3).astype(int)
             assert (np.abs(shown - expected.rgb).max(axis=2) <= 3).mean() > 0.98
@@ -80,3 +85,4 @@ def test_images_by_odometry_begin_at_the_spawn_pose_with_the_simulators_in_front
     beside = np.abs(shown[:, half:].astype(int) - expected.rgb[:, half:]).max(axis=2)
     assert (beside <= 3).mean() > 0.98
     assert set(np.unique(pixels(received, "classes", np.uint8)[:, :half])) == {1}
+    assert not pixels(received, "instances", np.int32)[:, :half].any()

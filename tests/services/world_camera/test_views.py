@@ -9,19 +9,22 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.camera.renderer import pinhole
-from scan2sim.pipeline.core.types import F32, F64, U8, Camera
+from scan2sim.pipeline.core.types import F32, F64, I32, U8, Camera
+from scan2sim.pipeline.io.worlds.instances import Instance
 from scan2sim.services.world_camera.pose_source import pose_of
 from scan2sim.services.world_camera.views import MAX_BANDS, View, composed, exposed, rendered
 
 CAMERA = pinhole(40, 30, field=80)
 GREY, RED = (90, 90, 90), (200, 10, 10)
 VEHICLE, ROAD = 1, 11
+HOUSE_ID = 70_000
 
 
 @dataclass
 class Image:
     rgb: U8
     code: U8
+    instance: I32
     distance: F32
 
     def depth(self, camera: Camera) -> F32:
@@ -33,6 +36,7 @@ class World:
     """A world whose brightness is its camera's position x, and whose depth is the row in the whole image."""
 
     asked: list[tuple[float, int]] = field(default_factory=list)
+    instances: dict[int, Instance] = field(default_factory=dict)
 
     def render(self, T_world_cam: F64, camera: Camera) -> Image:
         x = float(T_world_cam[0, 3])
@@ -40,7 +44,8 @@ class World:
         shape = camera.height, camera.width
         rows = np.arange(camera.height) - camera.cy + CAMERA.cy
         depth = np.repeat(rows[:, None], camera.width, axis=1).astype(np.float32)
-        return Image(np.full((*shape, 3), round(10 * x), np.uint8), np.full(shape, ROAD, np.uint8), depth)
+        ids = np.full(shape, HOUSE_ID, np.int32)
+        return Image(np.full((*shape, 3), round(10 * x), np.uint8), np.full(shape, ROAD, np.uint8), ids, depth)
 
 
 def along(*xs: float) -> F64:
@@ -51,6 +56,7 @@ def test_one_pose_is_one_view_of_the_whole_image() -> None:
     world = World()
     view = rendered(world, CAMERA, along(15.0))
     assert world.asked == [(15.0, 30)] and (view.rgb == 150).all() and (view.code == ROAD).all()
+    assert view.instance.shape == (30, 40) and (view.instance == HOUSE_ID).all()
 
 
 def test_rows_of_a_rolling_shutter_are_seen_one_after_the_other() -> None:
@@ -73,7 +79,8 @@ def test_depth_beside_and_behind_a_wide_lens_is_unknown() -> None:
 
 
 def grey(depth: F32) -> View:
-    return View(np.full((*depth.shape, 3), GREY, np.uint8), depth, np.full(depth.shape, ROAD, np.uint8))
+    ids = np.full(depth.shape, HOUSE_ID, np.int32)
+    return View(np.full((*depth.shape, 3), GREY, np.uint8), depth, np.full(depth.shape, ROAD, np.uint8), ids)
 
 
 def red(depth: F32) -> U8:
@@ -89,6 +96,8 @@ def test_what_is_nearer_in_the_simulator_is_in_front() -> None:
     assert (view.rgb[front] == RED).all() and (view.rgb[~front] == GREY).all()
     assert (view.depth[front] == 4).all() and (view.depth[~front] == 10).all()
     assert (view.code[front] == VEHICLE).all() and (view.code[~front] == ROAD).all()
+    assert (view.instance[front] == 0).all() and (view.instance[~front] == HOUSE_ID).all()
+    assert view.instance.dtype == np.int32
     assert view.rgb.dtype == np.uint8 and view.depth.dtype == np.float32 and view.code.dtype == np.uint8
 
 

@@ -9,14 +9,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("OpenSSL", reason="the extra teleop isn't installed")
 
+from scan2sim.pipeline.core.splats import SplatLayer, Splats
+from scan2sim.pipeline.io.worlds.scene import SPLATS_FILE
 from scan2sim.services.teleoperation.settings import DemoParams
 from scan2sim.services.teleoperation.sim import demo as demo_module
 from scan2sim.services.teleoperation.sim.demo import FOLDER_PREFIX, LOCK_FILE, Demo, delete_abandoned_folders
 from tests.conftest import ROOT
+from tests.fakes import synthetic
 from tests.waiting import until
 
 
@@ -47,6 +51,22 @@ def test_any_process_that_ends_is_started_again_and_reported(demo: Demo) -> None
     finally:
         demo.close()
     assert all(part.process.poll() is not None for part in demo._parts.values())
+
+
+def test_car_shows_splats_with_one_camera_or_surfaces_with_four(tmp_path: Path) -> None:
+    tile = synthetic.scene(tmp_path, tiles=1).tiles[0]
+    world = tile.folder.parents[1]
+    four = [("front", 0), ("left", 90), ("right", -90), ("rear", 180)]
+
+    def chosen(**settings: object) -> list[str]:
+        return demo_module.camera_options(DemoParams.model_validate({"world": world, **settings}))
+
+    assert chosen() == [f"{name}=world:{world}@{turn}" for name, turn in four]
+    splats = Splats.of(np.zeros((1, 3)), np.ones((1, 3)), np.eye(1, 4), np.full(1, 0.9), np.ones((1, 3)))
+    SplatLayer(splats, np.ones((2, 4, 3), np.float32)).save(tile.folder / SPLATS_FILE)
+    assert chosen() == [f"front=world:{world}@0"]
+    assert chosen(cameras=2) == [f"{name}=world:{world}@{turn}" for name, turn in four[:2]]
+    assert chosen(surfaces=True) == [f"{name}=surfaces:{world}@{turn}" for name, turn in four]
 
 
 def test_failure_is_reported_with_its_log(demo: Demo, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from scan2sim.services.teleoperation.cameras import Mount
-from scan2sim.services.teleoperation.cameras.world import mount_pose
 from scan2sim.services.teleoperation.control.controls import Controls, Gear
 from scan2sim.services.teleoperation.sim.bicycle import STEP_MAX_S, Bicycle, Car
 from tests.conftest import ROOT
@@ -53,7 +52,7 @@ def test_standing_vehicle_shows_the_present_steering_and_reverse_goes_back(page:
 
 
 def test_points_are_projected_as_by_the_simulated_camera(page: Page) -> None:
-    world, focal = np.linalg.inv(mount_pose(Mount())), 320 / math.tan(math.radians(Mount().field / 2))
+    world, focal = np.linalg.inv(Mount().pose()), 320 / math.tan(math.radians(Mount().field / 2))
     for x, y in ((4, 0), (10, 1.5), (30, -5)):
         point = world @ (x, y, 0, 1)
         pixel = page.value(f"project([{x}, {y}], PATH, 640, 480)")

@@ -11,11 +11,14 @@ import cv2
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.errors import InputError, SettingError, UnavailableError
+from scan2sim.pipeline.core.splats import SplatLayer, Splats
 from scan2sim.pipeline.core.types import U8
+from scan2sim.pipeline.io.worlds.scene import SPLATS_FILE, read_scene
 from scan2sim.services.teleoperation import cameras, timecode
-from scan2sim.services.teleoperation.cameras import Mount, View, pattern, world
+from scan2sim.services.teleoperation.cameras import Mount, View, pattern
 from scan2sim.services.teleoperation.settings import VehicleParams
+from scan2sim.texturing.world_camera import WorldCamera
 from tests.fakes import synthetic
 from tests.fakes.ports import free_port
 from tests.fakes.virtual_clock import VirtualClock
@@ -178,6 +181,34 @@ def test_simulated_camera_renders_the_world_from_its_vehicle(tmp_path: Path) -> 
     assert (up == up[0, 0]).all() and not (down == up[0, 0]).all(axis=-1).all()
 
 
+def test_simulated_camera_shows_splats_unless_surfaces_are_given(tmp_path: Path) -> None:
+    scene = synthetic.scene(tmp_path, tiles=1)
+    folder = scene.tiles[0].folder.parents[1]
+    view = View(str(folder), 160, 120, pose=lambda: np.eye(4))
+    plain = next(cameras.frames("world", view)).image
+    xyz = np.random.default_rng(1).uniform((2, -6, -1), (6, 6, 6), (3000, 3))  # a green wall before the camera
+    splats = Splats.of(
+        xyz, np.full((3000, 3), 0.3), np.tile([1.0, 0, 0, 0], (3000, 1)), np.full(3000, 0.9),
+        np.tile((0.1, 0.8, 0.2), (3000, 1)),
+    )  # fmt: skip
+    SplatLayer(splats, np.ones((512, 1024, 3), np.float32)).save(scene.tiles[0].folder / SPLATS_FILE)
+    with pytest.raises(UnavailableError, match="surfaces:"):
+        next(cameras.frames("world", view))
+    opened: list[Path] = []
+
+    def open_world(folder: Path) -> WorldCamera:
+        opened.append(folder)
+        return WorldCamera(read_scene(folder))
+
+    able = view._replace(open_world=open_world)
+    for mount in (Mount(), Mount(yaw=10)):  # two cameras of one world
+        frame = next(cameras.frames("world", able._replace(mount=mount)))
+        assert frame.image.shape == (120, 160, 3)
+        assert np.abs(frame.image[40:80, 60:100].mean(axis=(0, 1)) / 255 - (0.1, 0.8, 0.2)).max() < 0.1
+    assert opened == [folder.resolve()], "cameras share the world"
+    assert np.array_equal(next(cameras.frames("surfaces", able)).image, plain)
+
+
 def test_mount_pose_has_the_given_angles() -> None:
     for yaw, pitch, ahead in (
         (0, 0, (1, 0, 0)),
@@ -186,7 +217,7 @@ def test_mount_pose_has_the_given_angles() -> None:
         (0, 90, (0, 0, 1)),
         (-90, 0, (0, -1, 0)),
     ):
-        pose = world.mount_pose(Mount(1.0, 0.5, 1.5, yaw, pitch))
+        pose = Mount(1.0, 0.5, 1.5, yaw, pitch).pose()
         assert np.allclose(pose[:3, 2], ahead, atol=1e-9) and np.allclose(pose[:3, 3], (1.0, 0.5, 1.5))
         assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
-    assert world.mount_pose(Mount())[2, 1] < 0  # down in the image is down in the world
+    assert Mount().pose()[2, 1] < 0  # down in the image is down in the world
