@@ -115,7 +115,12 @@ def test_wrong_times_and_inverted_extrinsics_are_detected(street: Path) -> None:
         assert mistake is not None and mistake.option == f"--camera-axes {axes}"
 
 
-def test_failing_check_is_a_warning(street: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failing_check_is_a_warning(
+    street: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(check, "fit", lambda *_: 1 / 0)
     (warning,) = check_photos(street)
     assert "couldn't be checked" in warning and "ZeroDivisionError" in warning
+    inspect_path(street)
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "couldn't be checked" in shown and "40 positions" in shown
