@@ -17,7 +17,7 @@ from scan2sim.flows.commands.display import console
 from scan2sim.flows.commands.inspect_bag import show_bag
 from scan2sim.pipeline.core.classes import name_of
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.types import Frame, PointCloud
+from scan2sim.pipeline.core.types import Frame, PointCloud, Tile
 from scan2sim.pipeline.importers.bag.reader import is_bag
 from scan2sim.pipeline.io import clouds, file_checks, xml
 from scan2sim.pipeline.io.geodata.crs import name as crs_name
@@ -164,11 +164,20 @@ def _map_facts(cloud: PointCloud) -> Facts:
     ]
 
 
+def _mistake(tile: Tile) -> str | None:
+    """Warning of a usual mistake in the poses of a tile's photos, or that they couldn't be checked."""
+    try:
+        mistake = find_mistake(tile)
+    except Exception as error:  # the check must not cost the summary
+        return f"the photos couldn't be checked against the cloud ({type(error).__name__}: {error})"
+    return f"{mistake}: import it again with this option" if mistake else None
+
+
 def _tile(path: Path) -> tuple[str, Facts]:
     tile = read_tile(path)
     count = sum(clouds.read_header(p).count for p in tile.clouds)
     missing = sum(not view.photo.is_file() for view in tile.views)
-    mistake = find_mistake(tile) if tile.views and not missing and tile.robot_map is None else None
+    warning = _mistake(tile) if tile.views and not missing and tile.robot_map is None else None
     cameras = sorted({f"{v.camera.model} {v.camera.width}x{v.camera.height}" for v in tile.views})
     return "tile", [
         ("name", tile.name),
@@ -180,7 +189,7 @@ def _tile(path: Path) -> tuple[str, Facts]:
         ("masks", str(sum(v.mask is not None for v in tile.views))),
         ("trajectory", f"{len(tile.trajectory.times):,} positions" if tile.trajectory else "none"),
         ("ground truth", "yes" if tile.truth_mesh else "no"),
-        *([("warning", f"{mistake}: import it again with this option")] if mistake else []),
+        *([("warning", warning)] if warning else []),
         *(("warning", text) for text in find_implausible(tile)),
     ]
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from pydantic import Field
 
+from scan2sim.pipeline.core.errors import ScanError
 from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.io import trajectory as trajectory_io
@@ -51,8 +52,16 @@ def adjust_cloud(inputs: Inputs, params: AdjustCloudParams, out: Path, report: R
         path = replace(path, times=path.times + offset)
         sections = cloud_sections.read(clouds, path, frame, lambda part, text="": report(CUT * part, text))
     except UncheckableError as error:
-        figures: dict[str, Any] = {"pose_source": "given", "summary": f"poses as given, not checked: {error}"}
-        return Done({"check": trajectory_check.write(out / "check", figures | {"warnings": []}, None)}, figures)
+        return _unchecked(out, str(error), [])
+    except ScanError:
+        raise
+    except Exception as error:  # the check must not cost the import
+        if params.pose_source == "fused":
+            raise
+        why = f"{type(error).__name__}: {error}"
+        return _unchecked(
+            out, why, [f"the poses couldn't be checked against the cloud ({why}): they are used as given"]
+        )
     adjusted = replace(
         adjust(
             sections.times, sections.poses, sections.at, params.pose_source, after_gap=sections.after_gap,
@@ -65,6 +74,13 @@ def adjust_cloud(inputs: Inputs, params: AdjustCloudParams, out: Path, report: R
         notes = {"clock_offset_s": offset}
     check = write_check(out / "check", sections.times, sections.poses, adjusted, notes)
     return Done({"check": check}, adjusted.figures(sections.times) | notes, adjusted.warnings())
+
+
+def _unchecked(out: Path, why: str, warnings: list[str]) -> Done:
+    """The result of a check that wasn't possible."""
+    figures: dict[str, Any] = {"pose_source": "given", "summary": f"poses as given, not checked: {why}"}
+    check = trajectory_check.write(out / "check", figures | {"warnings": warnings}, None)
+    return Done({"check": check}, figures, warnings)
 
 
 ADJUST_CLOUD = Step("adjust_cloud", 1, adjust_cloud, AdjustCloudParams, memory=(1.0, 0))

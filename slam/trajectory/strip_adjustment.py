@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from scan2sim.pipeline.core.errors import ScanError
 from scan2sim.pipeline.core.step import Report
 from scan2sim.pipeline.core.types import F64, Bools
 from scan2sim.pipeline.importers.scanner_path import ScannerPath
@@ -122,6 +123,7 @@ class Adjusted:
         before, after: agreement of the given poses, and of the fused ones (None if they weren't estimated).
         unsure: (N,) whether sweeps near a pose still disagree.
         shift_m: median length of the correction, metres; 0 if there is none.
+        failure: why the check failed unexpectedly; "" if it didn't.
         data: what is compared: "sweeps", or "sections" of an assembled cloud.
     """
 
@@ -131,6 +133,7 @@ class Adjusted:
     after: Agreement | None
     unsure: Bools
     shift_m: float = 0.0
+    failure: str = ""
     data: Literal["sweeps", "sections"] = "sweeps"
 
     def figures(self, times: F64) -> dict[str, Any]:
@@ -149,6 +152,8 @@ class Adjusted:
 
     def warnings(self) -> list[str]:
         """What a user should know about the poses."""
+        if self.failure:
+            return [f"the poses couldn't be checked against the {self._whole} ({self.failure}): they are used as given"]
         if not self.before.known:
             return []
         if self.source == "given" and not self.before.within(MODEL.tolerance_m):
@@ -168,6 +173,8 @@ class Adjusted:
 
     def summary(self) -> str:
         """A sentence for the report."""
+        if self.failure:
+            return f"poses as given, not checked: {self.failure}"
         if not self.before.known:
             return f"poses as given: the {self.data} overlap too little to check them, or their poses are implausible"
         if self.after is None:
@@ -202,6 +209,9 @@ def adjust(
 ) -> Adjusted:
     """Check the poses of sweeps against their surfaces, and correct them where the surfaces allow.
 
+    An unexpected failure of the check costs nothing else: unless a correction was asked for ("fused"), the given poses
+    are kept, with a warning.
+
     Args:
         times: (N,) seconds of the sweeps.
         poses: (N, 4, 4) scanner to world, local coordinates.
@@ -211,7 +221,29 @@ def adjust(
         sigma: standard deviation of the positions, metres.
         after_gap: (N,) whether the path has a gap between a sweep and the previous one: the motion is unknown.
         report: receives progress.
+
+    Raises:
+        ScanError: a sweep can't be read.
     """
+    try:
+        return _adjusted(times, poses, sweep, source, sigma, after_gap, report)
+    except ScanError:
+        raise
+    except Exception as error:  # the check must not cost the import
+        if source == "fused":
+            raise
+        return unchecked(poses, f"{type(error).__name__}: {error}")
+
+
+def _adjusted(
+    times: F64,
+    poses: F64,
+    sweep: Callable[[int, ScannerPath], F64],
+    source: PoseSource,
+    sigma: float,
+    after_gap: Bools | None,
+    report: Report,
+) -> Adjusted:
     none = np.zeros(len(times), bool)
     travelled = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
     all_keys = scan_pairs.MODEL.key_spacing_m
@@ -255,10 +287,10 @@ def disagreement(times: F64, poses: F64, sweep: Callable[[int, ScannerPath], F64
     return float(np.median(np.concatenate([pairs.displacement, np.ones(len(some) - len(pairs))])))
 
 
-def unchecked(poses: F64) -> Adjusted:
-    """Given poses (N, 4, 4) that can't be checked."""
+def unchecked(poses: F64, failure: str = "") -> Adjusted:
+    """Given poses (N, 4, 4) that can't be checked, or whose check failed unexpectedly."""
     none = np.zeros(len(poses), bool)
-    return Adjusted(poses, "given", Agreement(None, None, 0, 0), None, none)
+    return Adjusted(poses, "given", Agreement(None, None, 0, 0), None, none, failure=failure)
 
 
 def _compare(times: F64, poses: F64, sweep: Callable[[int, ScannerPath], F64], every_m: float, report: Report) -> Pairs:

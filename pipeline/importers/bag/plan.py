@@ -31,6 +31,13 @@ NAMES_OF_IMAGES = ("image", "image_raw", "image_rect", "image_color", "image_rec
 URDF_TOLERANCE = 0.005
 """Difference between a link of a URDF and that of the bag that is worth a warning: metres, and rotation elements."""
 LIST_TOPICS = "`scan2sim inspect` lists its topics"
+LIDAR_PACKETS = (
+    "VelodyneScan", "VelodynePacket", "PacketMsg", "PandarScan", "PandarPacket", "UdpFrame", "UdpPacket",
+    "NebulaPackets", "RslidarPacket", "RslidarScan", "LslidarPacket", "LslidarScan",
+)  # fmt: skip
+"""Types, without their package, of a lidar's raw packets, which only its driver can decode."""
+VIDEOS = ("CompressedVideo", "FFMPEGPacket", "theora_image_transport/msg/Packet")
+"""Ends of the types of compressed videos."""
 
 
 class BagParams(Params):
@@ -196,7 +203,14 @@ class _Planner:
         topics = [self._known(name, "--lidar", "lidar") for name in self.params.lidar] or self._default_lidars()
         if not topics:
             cause = f"contains no sweeps (PointCloud2 or Livox CustomMsg); its topics: {self._listed()}"
-            raise DataError(self.path, cause, "Record the lidar's topic, or name one with --lidar")
+            packets = [topic for topic in self.found.bag.topics if _is_packets(self.found, topic)]
+            remedy = "Record the lidar's topic, or name one with --lidar"
+            if packets:
+                remedy = (
+                    f"{', '.join(packets)} has the lidar's raw packets: play the bag while the lidar's driver runs, "
+                    "and record the PointCloud2 that it publishes together with the other topics"
+                )
+            raise DataError(self.path, cause, remedy)
         lidars: list[Lidar] = []
         for topic in topics:
             sweep, frame = self.found.first[topic], self.found.frame(topic)
@@ -523,8 +537,17 @@ def _unused(found: Contents, topic: str) -> str:
     """Text about a topic that isn't used."""
     if found.kind(topic) == "tf" and contents.is_static(topic):
         return "transforms between frames"
+    if _is_packets(found, topic):
+        return "not used: raw packets of a lidar, whose driver makes PointCloud2 of them"
+    if found.bag.topics[topic].type.endswith(VIDEOS):
+        return "not used: compressed video (republish it as CompressedImage)"
     reasons = {"info": ": its images aren't", "": ": of no kind that the import reads", "pose": " (--poses uses it)"}
     return f"not used{reasons.get(found.kind(topic), '')}"
+
+
+def _is_packets(found: Contents, topic: str) -> bool:
+    """Whether a topic has the raw packets of a lidar."""
+    return found.bag.topics[topic].type.rpartition("/")[2] in LIDAR_PACKETS
 
 
 def _base(topic: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +19,12 @@ TIME_FIELDS = (
 )  # fmt: skip
 """Names of the field with the time of a point: Velodyne `time`, Ouster `t`, Hesai and Robosense `timestamp`, Livox
 `offset_time` or `timestamp`, Seyond and Luminar `time_offset`."""
+TIME_WORDS = re.compile("time|stamp")
+"""Part of other names of that field, such as Blickfeld's `point_time_offset`, Aeva's `time_offset_ns`."""
+SECONDS = re.compile("(?<!n)(?<!u)(?<!nano)(?<!micro)(?<!milli)(_s|_?secs?|_?seconds?)$")
+"""End of the name of a field with whole seconds; another field may have the rest."""
+SECOND_PARTS = (("_?(ns|nsecs?|nanosecs?|nanoseconds?)", 1), ("_?(us|usecs?|microsecs?|microseconds?)", 1000))
+"""End of the name of the field with the rest of a second, and its unit in nanoseconds."""
 INTENSITY_FIELDS = ("intensity", "reflectivity", "i", "signal", "intensities")
 COLOUR_FIELDS = ("rgb", "rgba")
 MIN_SPAN_S, MAX_OFFSET_S = 1e-3, 0.99
@@ -75,16 +82,6 @@ class TimeUnit:
         return time.astype(np.float64) * self.seconds - stamp_ns * 1e-9
 
 
-def fields_of(cloud: Any) -> tuple[str, ...]:
-    """Names of the fields in lower case."""
-    return tuple(field.name.lower() for field in cloud.fields)
-
-
-def has_times(cloud: Any) -> bool:
-    """Whether the points have times."""
-    return not set(fields_of(cloud)).isdisjoint(TIME_FIELDS)
-
-
 def decode(cloud: Any) -> RawSweep:
     """The points of a message.
 
@@ -99,12 +96,29 @@ def decode(cloud: Any) -> RawSweep:
     for k, axis in enumerate("xyz"):
         xyz[:, k] = rows[axis]
     keep = np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1)
-    time = _first(rows, TIME_FIELDS)
+    time = _times(rows)
     if time is not None and time.dtype.kind == "f":
         keep &= np.isfinite(time)
     rows, xyz = rows[keep], xyz[keep]
-    time, intensity, colour = (_first(rows, names) for names in (TIME_FIELDS, INTENSITY_FIELDS, COLOUR_FIELDS))
-    return RawSweep(xyz, intensity, None if colour is None else _rgb(colour), time)
+    intensity, colour = (_first(rows, names) for names in (INTENSITY_FIELDS, COLOUR_FIELDS))
+    return RawSweep(xyz, intensity, None if colour is None else _rgb(colour), None if time is None else time[keep])
+
+
+def _times(rows: npt.NDArray[Any]) -> npt.NDArray[Any] | None:
+    """Times (N,) of points as the sensor gives them: one field, or whole seconds and the rest (as nanoseconds)."""
+    known = _first(rows, TIME_FIELDS)
+    if known is not None:
+        return known
+    fields = [name for name in rows.dtype.names or () if TIME_WORDS.search(name) and rows.dtype[name].ndim == 0]
+    for name in fields:
+        seconds = SECONDS.search(name)
+        if rows.dtype[name].kind not in "iu" or not seconds:
+            continue
+        for end, nanoseconds in SECOND_PARTS:
+            for other in fields:
+                if re.fullmatch(re.escape(name[: seconds.start()]) + end, other):
+                    return rows[name].astype(np.int64) * 10**9 + rows[other].astype(np.int64) * nanoseconds
+    return _first(rows, [name for name in fields if rows.dtype[name].kind == "f" or not SECONDS.search(name)])
 
 
 def _rows(cloud: Any) -> npt.NDArray[Any]:

@@ -48,6 +48,12 @@ def for_images_of_another_size(photos: PosedPhotos) -> PosedPhotos:
     return replace(photos, cameras=tuple(larger[id(camera)] for camera in photos.cameras))
 
 
+def latitude_as_longitude(photos: PosedPhotos) -> PosedPhotos:
+    """Positions in degrees, latitude first, that were read as longitude first."""
+    degrees = conventions.swapped_axes(conventions.to_crs(photos, "EPSG:4326"))
+    return conventions.from_crs(degrees, "EPSG:4326")
+
+
 def scaled_intrinsics(c: Camera) -> Camera:
     return replace(c, fx=2 * c.fx, fy=2 * c.fy, cx=2 * c.cx + 0.5, cy=2 * c.cy + 0.5)
 
@@ -66,6 +72,9 @@ def test_no_error_is_reported_for_correct_tiles(street: Path, capsys: pytest.Cap
         (lambda photos: conventions.to_crs(photos, "EPSG:32632"), "--photos-crs EPSG:32632"),
         (lambda photos: conventions.shifted(photos, 1)[0], "--pose-shift -1"),
         (for_images_of_another_size, "--intrinsics-size 720x540"),
+        (lambda photos: conventions.reordered_quaternions(photos, -1), "--quaternions xyzw"),
+        (lambda photos: photos.at(photos.positions / 0.3048), "--photos-units ft"),
+        (latitude_as_longitude, "--position-axes yx"),
     ],
 )
 def test_pose_conventions_are_detected_with_their_option(
@@ -115,7 +124,12 @@ def test_wrong_times_and_inverted_extrinsics_are_detected(street: Path) -> None:
         assert mistake is not None and mistake.option == f"--camera-axes {axes}"
 
 
-def test_failing_check_is_a_warning(street: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failing_check_is_a_warning(
+    street: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(check, "fit", lambda *_: 1 / 0)
     (warning,) = check_photos(street)
     assert "couldn't be checked" in warning and "ZeroDivisionError" in warning
+    inspect_path(street)
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "couldn't be checked" in shown and "40 positions" in shown

@@ -17,7 +17,9 @@ from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.gps_time import clock_offsets
 from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.slam.trajectory import cloud_sections
 from tests.fakes.two_passes import Passes, passes
+from tests.flows.inline_steps import inline_steps
 from tests.present import present
 
 
@@ -102,6 +104,23 @@ def test_reasons_why_a_cloud_is_not_checked_are_reported(drive: Passes, tmp_path
     table = np.loadtxt(tmp_path / "path.csv", delimiter=",", skiprows=1)
     np.savetxt(tmp_path / "path.csv", table + [0, 0, 0, 800], "%.3f", ",", header="time,x,y,z", comments="")
     assert "airborne cloud, or clocks that differ" in " ".join(imported(tmp_path)[0].split())
+
+
+def test_failing_check_of_a_cloud_costs_only_itself(
+    drive: Passes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drive.assemble(tmp_path, drive.ins)
+    monkeypatch.setattr(cloud_sections, "read", lambda *_: 1 / 0)
+    with inline_steps():
+        output, check = imported(tmp_path)
+        required = CliRunner().invoke(
+            app, f"import clouds {tmp_path}/cloud.laz --trajectory {tmp_path}/path.csv --crs local --pose-source fused "
+            f"--out {tmp_path}/fused",
+        )  # fmt: skip
+    assert "warning: the poses couldn't be checked against the cloud (ZeroDivisionError" in " ".join(output.split())
+    assert check["pose_source"] == "given"
+    assert (tmp_path / "tile" / "cloud.laz").read_bytes() == (tmp_path / "cloud.laz").read_bytes()
+    assert required.exit_code != 0 and not (tmp_path / "fused").exists()
 
 
 @pytest.mark.parametrize("other", ["adjusted", "gps", "week", "day", "unix"])

@@ -13,15 +13,18 @@ from typer.testing import CliRunner
 
 from scan2sim.flows.cli import app
 from scan2sim.flows.pipelines.kitti import import_kitti_odometry, import_kitti_raw
+from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.importers.kitti_raw import read_poses
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.slam import scan_pairs
 from scan2sim.slam.geometry import exp_so3, inverse
 from scan2sim.slam.scan_pairs import register, select, surface_of
 from scan2sim.slam.trajectory.strip_adjustment import PoseSource, adjust, corrected
 from tests.fakes.two_passes import Passes, passes
+from tests.flows.inline_steps import inline_steps
 from tests.present import present
 
 
@@ -110,6 +113,34 @@ def test_sweeps_without_common_surfaces_keep_their_poses(drive: Passes) -> None:
     assert "overlap too little" in kept.summary()
     still = np.repeat(drive.ins[:1], 5, axis=0)
     assert adjust(drive.times[:5], still, lambda i, _: drive.sweep(0), report=silent).source == "given"
+
+
+def test_failing_check_is_a_warning_and_costs_only_itself(
+    drive: Passes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drive.write(tmp_path, drive.ins, 6)
+    monkeypatch.setattr(scan_pairs, "compare", lambda *_, **__: 1 / 0)
+    command = f"import sweeps {tmp_path}/sweeps {tmp_path}/poses.csv --out {tmp_path}/tile"
+    with inline_steps():
+        result = CliRunner().invoke(app, command)
+        required = CliRunner().invoke(app, f"{command}_2 --pose-source fused")
+    assert result.exit_code == 0, result.exception
+    output = " ".join(result.output.split())
+    assert "warning: the poses couldn't be checked against the sweeps (ZeroDivisionError: division by zero)" in output
+    tile = read_tile(tmp_path / "tile")
+    positions = present(tile.trajectory).positions + np.asarray(tile.frame.origin)
+    assert np.abs(positions - drive.ins[:6, :3, 3]).max() < 1e-5 and tile.clouds
+    check = json.loads((tmp_path / "tile" / "trajectory_check.json").read_text(encoding="utf-8"))
+    assert check["pose_source"] == "given" and "not checked: ZeroDivisionError" in check["summary"]
+    assert required.exit_code != 0 and not (tmp_path / "tile_2").exists()
+
+
+def test_unreadable_sweeps_are_no_failure_of_the_check(drive: Passes) -> None:
+    def damaged(i: int, path: object) -> F64:
+        raise InputError(Path("000001.ply"), "is damaged", "Copy it again")
+
+    with pytest.raises(InputError, match="is damaged"):
+        adjust(drive.times[:8], drive.ins[:8], damaged, report=silent)
 
 
 def test_poses_that_still_disagree_are_reported(drive: Passes) -> None:

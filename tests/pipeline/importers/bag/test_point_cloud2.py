@@ -63,6 +63,9 @@ SPELLINGS: dict[str, tuple[tuple[str, str], npt.NDArray[Any]]] = {
     "livox absolute": (("timestamp", "<f8"), STAMP_NS + OFFSETS * 1e9),
     "microseconds": (("time_offset", "<u4"), OFFSETS * 1e6),
     "float microseconds": (("t", "<f4"), OFFSETS * 1e6),
+    "blickfeld": (("point_time_offset", "<u4"), OFFSETS * 1e9),
+    "aeva": (("time_offset_ns", "<i4"), OFFSETS * 1e9),
+    "float seconds": (("Relative_Time_Sec", "<f4"), OFFSETS),
 }
 
 
@@ -82,6 +85,35 @@ def test_absolute_integer_nanoseconds_keep_their_precision() -> None:
     time[0] = STAMP_NS + 37
     unit = time_unit(time, STAMP_NS)
     assert unit is not None and unit.absolute and unit.offsets(time, STAMP_NS)[0] == pytest.approx(37e-9, abs=2e-9)
+
+
+@pytest.mark.parametrize(
+    ("names", "unit"),
+    [(("timestamp_s", "timestamp_us"), 1000), (("timeSecond", "timeNanosecond"), 1), (("stamp_sec", "stamp_nsec"), 1)],
+)
+def test_seconds_and_their_rest_in_two_fields_are_one_time(names: tuple[str, str], unit: int) -> None:
+    nanoseconds = np.array([0, 20, 40, 60, 100]) * 10**6 + 950 * 10**6  # across the end of a second
+    second = STAMP_NS // 10**9
+    rows = np.zeros(len(XYZ), [*((axis, "<f4") for axis in "xyz"), (names[0], "<u4"), (names[1], "<u4")])
+    for k, axis in enumerate("xyz"):
+        rows[axis] = XYZ[:, k]
+    rows[names[0]] = second + nanoseconds // 10**9
+    rows[names[1]] = nanoseconds % 10**9 // unit
+    fields = [
+        SimpleNamespace(name=name, offset=4 * k, datatype=KINDS["f4" if k < 3 else "u4"], count=1)
+        for k, name in enumerate(("x", "y", "z", *names))
+    ]
+    data, size = np.frombuffer(rows.tobytes(), np.uint8), rows.dtype.itemsize
+    sweep = decode(cloud(fields=fields, point_step=size, row_step=size * len(rows), data=data))
+    stamp = second * 10**9 + 950 * 10**6
+    assert sweep.time is not None
+    found = time_unit(sweep.time, stamp)
+    assert found is not None and found.absolute
+    assert np.allclose(found.offsets(sweep.time, stamp), OFFSETS[[0, 3, 4]], atol=1e-6)
+
+
+def test_whole_seconds_alone_are_no_times_of_points() -> None:
+    assert decode(cloud(time=("stamp_sec", "<u4"), values=1_700_000_000)).time is None
 
 
 def test_times_of_another_clock_start_at_the_first_point_and_constant_ones_are_ignored() -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
 from scan2sim.pipeline.core.errors import DataError, InputError, ScanError, SettingError, UnavailableError
@@ -351,6 +352,29 @@ def test_defaults_skip_non_sensor_topics_with_a_reason(tmp_path: Path) -> None:
         "/front/camera_info": "calibration of /front/image_raw", "/tf": "poses of lidar in map", "/chatter": "not used",
     }.items():  # fmt: skip
         assert text in uses[topic], (topic, uses[topic])
+
+
+def raw(topic: str, kind: str) -> Writer:
+    """Writer of messages with a header and bytes, of a type that the import doesn't know."""
+
+    def write_raw(bag: BagFile, k: int, time: float) -> None:
+        if kind not in bag.store.types:
+            bag.store.register(get_types_from_msg("std_msgs/Header header\nuint8[] data\n", kind))
+        bag.write(topic, kind, time, header=bag.header(time, "lidar"), data=np.zeros(9, np.uint8))
+
+    return write_raw
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_packets_and_videos_are_named_with_what_to_do(tmp_path: Path, form: str) -> None:
+    packets = raw("/velodyne_packets", "velodyne_msgs/msg/VelodyneScan")
+    video = raw("/front/video", "foxglove_msgs/msg/CompressedVideo")
+    path = write(bag_path(tmp_path, form), form, tf, packets, video)
+    with opened(path) as bag:
+        uses, error = described(inspected(bag), BagParams())
+    assert "raw packets of a lidar, whose driver makes PointCloud2" in uses["/velodyne_packets"]
+    assert "republish it as CompressedImage" in uses["/front/video"]
+    assert error is not None and "/velodyne_packets has the lidar's raw packets: play the bag" in str(error)
 
 
 def test_damaged_messages_are_skipped_and_counted(tmp_path: Path) -> None:
