@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field
 
+from scan2sim.pipeline.core.classes import Group
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.parameters import Cosine, Depth, Device
-from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, I64, U8, Bools, Mesh, PointCloud
 from scan2sim.pipeline.geometry.coarse_surface import coarse_faces
 from scan2sim.pipeline.io import views as views_io
@@ -37,6 +38,12 @@ if TYPE_CHECKING:
 
 SEEN_TEXEL_STRIDE = 8
 """Where the points have no colours, every Nth seen texel (in both directions) is a colour sample for unseen texels."""
+
+
+class TextureContext(Context):
+    """The surface that the mesh is; None: unknown."""
+
+    surface: Group | None = None
 
 
 class TextureParams(Params):
@@ -55,6 +62,7 @@ class TextureParams(Params):
             them; for flat surfaces such as the ground.
         device: "numba": CPU; "cuda" or another torch device: GPU, equal to the CPU within one grey level; "auto": GPU
             if torch and a GPU are available.
+        context: the mesh.
     """
 
     power: float = Field(1.5, ge=0.01, le=20)
@@ -66,6 +74,7 @@ class TextureParams(Params):
     padding: int = Field(16, ge=2, le=256)
     inpaint: bool = False
     device: Device = "auto"
+    context: TextureContext = TextureContext()
 
 
 def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) -> Done:
@@ -95,7 +104,8 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     baker = _baker(mesh, inputs, params)
     source = _source_texture(mesh, inputs)
     ground = _ground_orthophoto(mesh, sizes, inputs) if params.inpaint else None
-    (colours, measured), synthesized = point_colours(inputs, ground), synthesized_colours(inputs)
+    colours, measured = point_colours(inputs, ground, params.context.surface)
+    synthesized = synthesized_colours(inputs)
     counts = np.zeros((len(mesh), 4), np.int64)
     pages = Pages(folder, out / ".unfinished", params.padding)
     for k, size in enumerate(sizes):
@@ -300,7 +310,7 @@ def can_texture(params: TextureParams) -> None:
 
 TEXTURE = Step(
     "texture",
-    10,
+    11,
     texture,
     TextureParams,
     class_defaults={"terrain": {"inpaint": True}},

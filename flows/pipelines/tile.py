@@ -562,7 +562,8 @@ def _texture(
         add(UNWRAP, mesh | by_photo | source | coarse, group)
         unwrapped = {name: output(UNWRAP, name, group) for name in ("mesh", "pages")}
         removed = parts.instances if group == "terrain" and not parts.keep_vehicles else {}
-        add(TEXTURE, {**unwrapped, **choice, **points, **corrected, **removed, **source, **uncovered}, group)
+        known = {**choice, **points, **corrected, **removed, **source, **uncovered}
+        add(TEXTURE, unwrapped | known, group, surface=group)
     last = TEXTURE
     if graph.neighbours:
         last = COLOUR_HARMONIZATION

@@ -113,7 +113,8 @@ def exact_point_spacing(xyz: F32) -> float:
 
     if len(xyz) < 7:
         return 0.0
-    distance, _ = cKDTree(xyz).query(xyz[:: max(1, len(xyz) // SPACING_SAMPLES)], k=7, workers=-1)
+    tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)  # several times faster to build
+    distance, _ = tree.query(xyz[:: max(1, len(xyz) // SPACING_SAMPLES)], k=7, workers=-1)
     return float(np.median(distance[:, 1:].mean(axis=1))) / LATTICE_SPACING_CELLS
 
 

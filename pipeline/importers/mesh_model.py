@@ -16,6 +16,7 @@ import numpy as np
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F32, F64, I32, Frame, Mesh, PointCloud
+from scan2sim.pipeline.geometry.height_map import exact_point_spacing
 from scan2sim.pipeline.geometry.upright import rotation_to_z
 from scan2sim.pipeline.importers.robot_map import (
     AXES,
@@ -83,7 +84,8 @@ def import_mesh(
     is_gltf = path.suffix.lower() in (".glb", ".gltf")
     if is_gltf and params.units == "auto":
         params = params.model_copy(update={"units": "m"})
-    unit = unit_of(_positions(source.mesh, *sample(source.mesh, UNIT_SAMPLES)), params, warn)
+    some = _positions(source.mesh, *sample(source.mesh, UNIT_SAMPLES))
+    unit = unit_of(some, exact_point_spacing(some), params, warn)
     origin = unit * np.asarray(source.mesh.frame.origin)
     mesh = replace(source.mesh, vertices=source.mesh.vertices * np.float32(unit))
     area = float(mesh.face_area.sum(dtype=np.float64))

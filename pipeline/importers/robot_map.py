@@ -122,13 +122,14 @@ def import_map(
     """
     report(0.0, "reading")
     cloud, crs = _read(clouds, warn)
-    unit = 1.0 if crs else unit_of(cloud.xyz, params, warn)
+    spacing = exact_point_spacing(cloud.xyz)
+    unit = 1.0 if crs else unit_of(cloud.xyz, spacing, params, warn)
     origin = np.asarray(cloud.frame.origin) * unit
     x, y, z = origin.tolist()
     cloud = replace(cloud, xyz=cloud.xyz * np.float32(unit), frame=replace(cloud.frame, origin=(x, y, z)))
     cloud = _with_classes(cloud, params, warn)
     report(0.2, "outliers")
-    cloud = _without(cloud, far_outliers(cloud.xyz, exact_point_spacing(cloud.xyz)), "isolated or far points", warn)
+    cloud = _without(cloud, far_outliers(cloud.xyz, unit * spacing), "isolated or far points", warn)
     if np.sqrt(max(0.0, float(np.linalg.eigvalsh(np.cov(cloud.xyz.T))[1]))) < MIN_WIDTH_M:
         raise DataError(clouds[0], "its points lie on a line", "A map needs surfaces: check the file, and --units")
     report(0.5, "up axis")
@@ -196,9 +197,9 @@ def write_map(
     read_tile(folder)  # an invalid tile is an error here, before its folder appears
 
 
-def unit_of(xyz: F32, params: MapParams, warn: Callable[[str], None]) -> float:
-    """Metres per unit of a map's points (N, 3); reports it unless it is 1."""
-    name = guess_unit(xyz) if params.units == "auto" else params.units
+def unit_of(xyz: F32, spacing: float, params: MapParams, warn: Callable[[str], None]) -> float:
+    """Metres per unit of a map's points (N, 3) with a spacing in this unit; reports it unless it is 1."""
+    name = guess_unit(xyz, spacing) if params.units == "auto" else params.units
     if name != "m":
         warn(f"coordinates are in {name}: converted to metres (--units)")
     return UNIT_M[name]
@@ -224,14 +225,21 @@ def _read(clouds: Sequence[Path], warn: Callable[[str], None]) -> tuple[PointClo
     finite = np.asarray(np.isfinite(cloud.xyz).all(axis=1))
     cloud = _without(cloud, ~finite, "points with NaN coordinates", warn)
     if len(cloud):
-        order = np.lexsort(cloud.xyz.T)
-        same = np.zeros(len(cloud), bool)
-        same[order[1:]] = (cloud.xyz[order[1:]] == cloud.xyz[order[:-1]]).all(axis=1)
-        cloud = _without(cloud, same, "duplicates", warn)
+        cloud = _without(cloud, _repeated(cloud.xyz), "duplicates", warn)
     if len(cloud) < MIN_POINTS:
         cause = f"has only {len(cloud):,} usable points"
         raise DataError(clouds[0], cause, f"A map needs at least {MIN_POINTS:,} points")
     return cloud, crs
+
+
+def _repeated(xyz: F32) -> Bools:
+    """Whether each point (N, 3) equals an earlier one."""
+    x, y, z = (np.ascontiguousarray(column + np.float32(0)).view(np.uint32).astype(np.uint64) for column in xyz.T)
+    mixed = (x << np.uint64(32) | y) * np.uint64(0x9E3779B97F4A7C15)  # equal points have equal hashes
+    order = np.argsort((mixed ^ mixed >> np.uint64(29)) + z * np.uint64(0xBF58476D1CE4E5B9), kind="stable")
+    same = np.zeros(len(xyz), bool)
+    same[order[1:]] = (xyz[order[1:]] == xyz[order[:-1]]).all(axis=1)
+    return same
 
 
 def _with_classes(cloud: PointCloud, params: MapParams, warn: Callable[[str], None]) -> PointCloud:

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64
-from scan2sim.pipeline.geometry.height_map import exact_point_spacing
+from scan2sim.pipeline.geometry.height_map import LATTICE_SPACING_CELLS
 
 Scene = Literal["indoor", "outdoor"]
 SAMPLES = 20_000
@@ -55,11 +55,10 @@ class MapDescription:
     scene: Scene
 
 
-def guess_unit(xyz: F32) -> Literal["m", "mm"]:
+def guess_unit(xyz: F32, spacing: float) -> Literal["m", "mm"]:
     """Unit of the coordinates of a map (N, 3): metres, unless its spacing and extent can only be millimetres."""
     extent = np.ptp(np.percentile(xyz, (1, 99), axis=0), axis=0)
-    thin = exact_point_spacing(xyz) > MILLIMETRE_MIN_SPACING
-    return "mm" if thin and extent.min() > MILLIMETRE_MIN_HEIGHT else "m"
+    return "mm" if spacing > MILLIMETRE_MIN_SPACING and extent.min() > MILLIMETRE_MIN_HEIGHT else "m"
 
 
 def describe(xyz: F32, start: F64) -> MapDescription:
@@ -69,12 +68,12 @@ def describe(xyz: F32, start: F64) -> MapDescription:
         xyz: (N, 3) metres, z up, without outliers.
         start: (3,) position of the sensor at its start, in the same axes.
     """
-    normal_z, noise = _normals(xyz)
+    normal_z, noise, spacing = _surfaces(xyz)
     level, upright = float((normal_z > LEVEL_MIN_NORMAL_Z).mean()), float((normal_z < UPRIGHT_MAX_NORMAL_Z).mean())
     ceiling, enclosed = _ceiling_share(xyz), _enclosed_share(xyz, start)
     indoor = ceiling > INDOOR_MIN_CEILING_SHARE or enclosed > INDOOR_MIN_ENCLOSED_SHARE
     scene: Scene = "indoor" if indoor else "outdoor"
-    return MapDescription(exact_point_spacing(xyz), noise, level, upright, ceiling, enclosed, scene)
+    return MapDescription(spacing, noise, level, upright, ceiling, enclosed, scene)
 
 
 def _enclosed_share(xyz: F32, start: F64) -> float:
@@ -88,18 +87,20 @@ def _enclosed_share(xyz: F32, start: F64) -> float:
     return float((count > SECTOR_MIN_POINTS).mean())
 
 
-def _normals(xyz: F32) -> tuple[F32, float]:
-    """|z| of the normal of sampled points, and their median distance from the plane through their neighbours."""
+def _surfaces(xyz: F32) -> tuple[F32, float, float]:
+    """|z| of the normals of sampled points, their median distance from the plane through their neighbours; spacing."""
     from scipy.spatial import cKDTree
 
     some = xyz[:: max(1, len(xyz) // SAMPLES)]
-    index = cKDTree(xyz).query(some, min(PLANE_NEIGHBOURS, len(xyz)), workers=-1)[1]
+    tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)  # several times faster to build
+    distance, index = tree.query(some, min(PLANE_NEIGHBOURS, len(xyz)), workers=-1)
+    spacing = float(np.median(distance[:, 1:7].mean(axis=1))) / LATTICE_SPACING_CELLS
     around = xyz[index].astype(np.float64)
     around -= around.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / around.shape[1])
     flat = values[:, 0] < 0.1 * values[:, 1]
     noise = float(np.median(np.sqrt(np.maximum(values[flat, 0], 0)))) if flat.any() else 0.0
-    return np.abs(vectors[:, 2, 0]).astype(np.float32), noise
+    return np.abs(vectors[:, 2, 0]).astype(np.float32), noise, spacing
 
 
 def _ceiling_share(xyz: F32) -> float:

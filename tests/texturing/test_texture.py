@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from scan2sim.pipeline.camera.renderer import Renderer, look_at, textured
+from scan2sim.pipeline.core.classes import CODE, colour_of
 from scan2sim.pipeline.core.types import F64, U8, Camera, Frame, Mesh
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.texturing.inpainting import hole_filling
@@ -181,6 +182,18 @@ def test_points_without_colours_give_class_colours(street: Street) -> None:
         [110, 110, 118], abs=4
     )
     assert done.metrics["filled_m2"] == pytest.approx(100, rel=0.02)
+
+
+def test_class_colours_of_the_ground_are_those_of_ground_points(street: Street) -> None:
+    furniture = points(colour=False)
+    furniture.xyz[:, 2] = 0.01
+    present(furniture.classification)[:] = CODE["furniture"]
+    street.clouds["terrain"], street.clouds["furniture"] = points(colour=False, n=4_000), furniture
+    rgb, *_ = from_above(street.run(context={"surface": "terrain"})[0])
+    assert len(np.unique(rgb.reshape(-1, 3), axis=0)) == 1
+    street.clouds["terrain"] = points(colour=False, n=0)
+    rgb, *_ = from_above(street.run(context={"surface": "terrain"})[0])
+    assert abs(rgb[0, 0] - colour_of()[CODE["furniture"]]).max() < 6  # better than grey
 
 
 def test_without_point_colours_unseen_texels_take_colours_of_seen_neighbours(street: Street) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from scan2sim.pipeline.core.classes import Group, surface_of
 from scan2sim.pipeline.core.step import Inputs
 from scan2sim.pipeline.core.types import F32, U8, PointCloud
 from scan2sim.pipeline.geometry.height_map import exact_point_spacing
@@ -12,9 +13,12 @@ from scan2sim.texturing.inpainting.hole_filling import PointColours, shaded
 from scan2sim.texturing.texture_page import FILLED, FROM_POINTS
 
 
-def point_colours(inputs: Inputs, ground: GroundOrthophoto | None) -> tuple[PointColours | None, bool]:
+def point_colours(
+    inputs: Inputs, ground: GroundOrthophoto | None, surface: Group | None = None
+) -> tuple[PointColours | None, bool]:
     """Colours of the points, and whether they were measured (else they are class colours); None if there are no points.
 
+    Class colours are those of the points of `surface`, if it has any: a floor isn't stained by the furniture on it.
     Points of `uncovered` are sparser than others. Texels coloured by synthesized points (`synthesized.*`) are marked as
     filled. Points at and beside removed vehicles
     and people of the `ground` orthophoto are not used: they have the colour of the object or of its shadow.
@@ -27,6 +31,7 @@ def point_colours(inputs: Inputs, ground: GroundOrthophoto | None) -> tuple[Poin
         return None, False
     cloud = PointCloud.join(clouds)
     if cloud.rgb is None:
+        cloud = _of_surface(cloud, surface)
         return PointColours(cloud.xyz, shaded(classes_of(cloud), cloud.normal), FILLED), False
     measured = np.arange(len(cloud)) < len(cloud) - sum(len(PointCloud.load(inputs[name])) for name in synthesized)
     usable = cloud.coloured
@@ -40,6 +45,14 @@ def point_colours(inputs: Inputs, ground: GroundOrthophoto | None) -> tuple[Poin
         start = int(measured.sum()) - n
         spacing[start : start + n] = exact_point_spacing(uncovered.xyz)
     return PointColours(cloud.xyz[usable], cloud.rgb[usable], mark, spacing[usable]), True
+
+
+def _of_surface(cloud: PointCloud, surface: Group | None) -> PointCloud:
+    """The points whose classes have this surface; all of them if none has."""
+    if surface is None:
+        return cloud
+    own = surface_of([surface])[classes_of(cloud)] == 0
+    return cloud.take(own) if own.any() else cloud
 
 
 def _finest(inputs: Inputs, name: str) -> PointCloud:

@@ -230,6 +230,6 @@ def test_launch_file_is_valid_for_ros(world: Path) -> None:
     assert ran.returncode == 0, ran.stderr
     nodes, conditions = ran.stdout.splitlines()
     assert nodes.split() == sorted(
-        ["create", "lifecycle_manager", "map_server", "parameter_bridge", *["static_transform_publisher"] * 4]
+        ["create", "lifecycle_manager", "map_server", "parameter_bridge", *["static_transform_publisher"] * 5]
     )
     assert conditions == "True True"  # the robot is spawned, and odom is static
