@@ -20,6 +20,8 @@ from scan2sim.pipeline.io.tile import read_tile
 from tests.fakes.two_passes import Passes, passes
 from tests.present import present
 
+pytestmark = pytest.mark.usefixtures("steps_in_process")
+
 
 @pytest.fixture(scope="module")
 def drive() -> Passes:

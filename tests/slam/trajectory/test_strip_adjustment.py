@@ -24,6 +24,8 @@ from scan2sim.slam.trajectory.strip_adjustment import PoseSource, adjust, correc
 from tests.fakes.two_passes import Passes, passes
 from tests.present import present
 
+pytestmark = pytest.mark.usefixtures("steps_in_process")
+
 
 @pytest.fixture(scope="module")
 def drive() -> Passes:
