@@ -79,6 +79,15 @@ def small_street(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPa
     return folder / "tile"
 
 
+@pytest.fixture(scope="module")
+def steps_in_process() -> Iterator[None]:
+    """Commands in this process run their steps in it, too: for tests whose subject isn't the processes of steps."""
+    from tests.flows.inline_steps import inline_steps
+
+    with inline_steps():
+        yield
+
+
 @pytest.fixture
 def broker() -> Iterator[Broker]:
     """A running Kafka broker."""

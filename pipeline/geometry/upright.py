@@ -15,10 +15,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scan2sim.pipeline.core.types import F32, F64, Bools
+from scan2sim.pipeline.core.types import F32, F64, I64, Bools
 
 MIN_FLAT_POINTS = 200
 """Voxels on flat surfaces below which no direction can be found."""
+DIRECTIONS_AT_ONCE = 16
+"""Directions that are rated at once, so that their cosines (1 MB) stay in the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -187,12 +189,12 @@ def _candidates(flat: _Flat) -> list[F64]:
     """Directions with the most level and upright surfaces, each well separated from the others."""
     grid = _directions()
     normal = flat.normal[:: max(1, len(flat.normal) // 8_000)]
-    cos = np.abs(grid @ normal.T)
     # what directions without any relation to the surfaces would have
     tolerance = math.radians(MODEL.tolerance_deg)
     by_chance = 1 - math.cos(tolerance) + math.sin(tolerance)
-    score = (_level(cos, MODEL.tolerance_deg) | _upright(cos, MODEL.tolerance_deg)).mean(axis=1) - by_chance
-    level = _level(cos, MODEL.tolerance_deg).mean(axis=1)
+    blocks = np.array_split(grid, math.ceil(len(grid) / DIRECTIONS_AT_ONCE))
+    level, either = np.concatenate([_level_and_either(block, normal) for block in blocks]).T / len(normal)
+    score = either - by_chance
     found: list[F64] = []
     for by in (score, level):
         order = np.argsort(-by)
@@ -209,6 +211,14 @@ def _candidates(flat: _Flat) -> list[F64]:
         if all(abs(u @ other) < math.cos(math.radians(MODEL.separation_deg / 2)) for other in refined):
             refined.append(u)
     return refined
+
+
+def _level_and_either(directions: F64, normal: F64) -> I64:
+    """(D, 2) numbers of normals (N, 3) of level surfaces, and of level or upright ones, by direction (D, 3)."""
+    cos = np.abs(directions @ normal.T)
+    level = _level(cos, MODEL.tolerance_deg)
+    masks = (level, level | _upright(cos, MODEL.tolerance_deg))
+    return np.stack([np.count_nonzero(mask, axis=1) for mask in masks], axis=1)
 
 
 def _directions() -> F64:

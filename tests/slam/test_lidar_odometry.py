@@ -23,6 +23,8 @@ from scan2sim.slam.steps import lidar as step
 from scan2sim.slam.steps.lidar import LidarParams, lidar
 from scan2sim.slam.trajectory.fusion import lidar_motions
 
+pytestmark = pytest.mark.usefixtures("steps_in_process")
+
 pytest.importorskip("kiss_icp")
 SPEED, TURN, PERIOD = 8.0, 0.15, 0.1
 AHEAD = np.radians(np.linspace(-24, 12, 32))

@@ -22,6 +22,8 @@ from tests.fakes.two_passes import Passes, passes
 from tests.flows.inline_steps import inline_steps
 from tests.present import present
 
+pytestmark = pytest.mark.usefixtures("steps_in_process")
+
 
 @pytest.fixture(scope="module")
 def drive() -> Passes:
