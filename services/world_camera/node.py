@@ -6,6 +6,7 @@ import json
 import logging
 import time
 from collections import deque
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -229,7 +230,7 @@ class WorldCameraNode(Monitor):
         seconds, rest = divmod(request.time, 10**9)
         header = ros.message(HEADER, stamp=ros.message(TIME, sec=seconds, nanosec=rest), frame_id=request.frame)
         rgb = views.exposed(view.rgb, self._params.exposure)
-        content = {
+        content: dict[str, Callable[[], Any]] = {
             COLOUR: lambda: _image(header, "rgb8", rgb),
             JPEG: lambda: _jpeg(header, jpeg(rgb, self._params.quality)),
             DEPTH: lambda: _image(header, "32FC1", view.depth),

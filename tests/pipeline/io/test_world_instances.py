@@ -78,7 +78,7 @@ def test_crowns_that_grow_together_are_divided_between_their_trunks(tile: SceneT
     rows = [(tile.frame.to_crs(np.subtract((x, 0.5, 0), tile.offset)).tolist(), {"kind": "trunk"}) for x in (1, 9)]
     geojson.write_points(tile.folder / "furniture.geojson", tile.frame.crs, rows)
     crown = synthetic.ground(10)
-    mesh = Mesh(crown.frame, crown.vertices + np.float32((5, 0, 4)), crown.faces)
+    mesh = Mesh(crown.frame, crown.vertices + np.array((5, 0, 4), np.float32), crown.faces)
     hedge, low = boxes((30, 0, 0, 34, 1, 2, "mid_vegetation"), (40, 0, 0, 44, 1, 0.3, "low_vegetation"))
     codes = np.full(len(mesh), CODE["high_vegetation"], np.uint8)
     made = instances_of(tile, 1, {"vegetation": (mesh, codes), "building": (hedge, low)})
