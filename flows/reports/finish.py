@@ -128,7 +128,9 @@ def _assemble(
 ) -> None:
     """Write the common world of all tiles with their roads, the STAC catalogue, the virtual point cloud and rasters."""
     tiles = [merge.TileWorld(one.name, out / TILES / one.name / "world", one.tile.frame) for one in done if one.tile]
-    merge.assemble(out, survey.name, tiles, dome=dome.of_survey, warn=warn)
+    failed = dict[str, ScanError]()
+    merge.assemble(out, survey.name, tiles, dome=dome.of_survey, warn=warn, failed=failed)
+    side.failed |= failed
     with side.attempt("roads"):
         merge.add_roads(out)
     with side.attempt("catalogue"):

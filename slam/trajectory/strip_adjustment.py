@@ -209,7 +209,7 @@ def adjust(
 ) -> Adjusted:
     """Check the poses of sweeps against their surfaces, and correct them where the surfaces allow.
 
-    An unexpected failure of the check costs nothing else: unless a correction was asked for ("fused"), the given poses
+    An unexpected failure of the check costs nothing else: unless a correction is required ("fused"), the given poses
     are kept, with a warning.
 
     Args:

@@ -23,8 +23,10 @@ from scan2sim.pipeline.core.types import RobotMap
 from scan2sim.pipeline.io.geodata import stac
 from scan2sim.pipeline.io.survey import read_survey
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.io.worlds import merge
+from scan2sim.pipeline.io.world_formats import gazebo
+from scan2sim.pipeline.io.worlds import merge, readme
 from scan2sim.pipeline.tiling.cut_corridor import CutParams, cut_survey
+from scan2sim.texturing.backdrop import dome
 from tests.flows.inline_steps import inline_steps
 from tests.flows.tiny import COARSE, loaded, tiny
 from tests.flows.tiny import scan2sim as run_scan2sim
@@ -41,7 +43,7 @@ MAP_SIDE_PRODUCT = "ghosts"
 TILE_SIDE_PRODUCTS = tuple(name for name in SIDE_PRODUCTS if name not in (BORDER_SIDE_PRODUCT, MAP_SIDE_PRODUCT))
 SURVEY_SIDE_PRODUCTS = tuple(name for name in SIDE_PRODUCTS if name not in ("navigation", MAP_SIDE_PRODUCT))
 """Those of tiles of a survey."""
-EXPORT_PARTS = ("export.glb", "export.lists", "export.navigation")
+EXPORT_PARTS = ("export.glb", "export.lists", "export.navigation", "export.spawn", "export.traffic", "export.readme")
 """Optional parts of the step `export`."""
 ALL = (*SIDE_PRODUCTS, *EXPORT_PARTS)
 DEPENDENTS = {
@@ -58,6 +60,10 @@ INDEPENDENT = (
 SURVEY_PRODUCTS: dict[str, tuple[Any, str]] = {
     "report": (finish, "write_survey_report"),
     "TILE/report": (finish, "write_report"),
+    "sky_dome": (dome, "of_survey"),
+    "spawn": (merge, "default_pose"),
+    "traffic": (gazebo, "write_traffic"),
+    "readme": (readme, "write"),
     "roads": (merge, "add_roads"),
     "catalogue": (stac, "write"),
 }
@@ -325,7 +331,7 @@ def test_failing_survey_product_affects_only_itself(
     assert {name for name, file in reports.items() if not file.is_file()} == {*names} & reports.keys()
     loaded(out)
     if "report" not in names:
-        assert read(out / "survey.json")["failed"].keys() == {*names} & {"roads", "catalogue"}
+        assert read(out / "survey.json")["failed"].keys() == {*names} - reports.keys()
     code, printed = scan2sim("survey", survey, "--out", out, failing=ALL)
     assert code == INCOMPLETE, "steps still fail"
     assert not any(f"warning: {name.replace('TILE', tile)}: failed" in printed for name in names), "it is retried"

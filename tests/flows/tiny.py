@@ -25,6 +25,8 @@ from scan2sim.pipeline.core.types import Bools, PointCloud
 from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.io.world_formats import gazebo
+from scan2sim.pipeline.io.worlds import readme
 from scan2sim.pipeline.io.worlds.scene import Scene, read_scene
 from scan2sim.pipeline.steps.export import EXPORT, export
 from tests.fakes.gazebo.checker import build, check_world
@@ -64,19 +66,28 @@ def broken(inputs: Inputs, params: Params, out: Path, report: Report, *_: object
     raise ZeroDivisionError("a bug")
 
 
-def broken_part(scene: Scene, folder: Path, *_: object) -> dict[str, int]:
-    """A part of the export with a programming error, raised after half of it is written."""
-    (folder / "half.txt").write_text("half", encoding="utf-8")
+def broken_part(*arguments: object) -> None:
+    """A part of the export with a programming error, raised after half of it is written into its folder, if any."""
+    for folder in arguments:
+        if isinstance(folder, Path):
+            (folder / "half.txt").write_text("half", encoding="utf-8")
     raise ZeroDivisionError("a bug")
 
 
+PARTS_OF_WORLDS = {
+    "lists": (world_formats, "_write_lists"), "navigation": (world_formats, "_write_navigation"),
+    "spawn": (world_formats, "default_pose"), "traffic": (gazebo, "write_traffic"), "readme": (readme, "write"),
+}  # fmt: skip
+"""Optional parts of the export that aren't formats: module and function that write them."""
+
+
 def export_without(parts: Collection[str], inputs: Inputs, params: Any, out: Path, report: Report) -> Done:
-    """The step `export` with failing parts: formats, "lists", "navigation"."""
+    """The step `export` with failing parts: formats, or of `PARTS_OF_WORLDS`."""
     with pytest.MonkeyPatch.context() as patch:
         for name in parts:
-            own = name in ("lists", "navigation")
-            module = world_formats if own else find(world_formats.PACKAGE, name, "")
-            patch.setattr(module, f"_write_{name}" if own else "write", broken_part)
+            own = PARTS_OF_WORLDS.get(name)
+            module, function = own or (find(world_formats.PACKAGE, name, ""), "write")
+            patch.setattr(module, function, broken_part)
         return export(inputs, params, out, report)
 
 

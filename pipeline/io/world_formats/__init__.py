@@ -134,7 +134,8 @@ def write(
         report: receives the progress.
         robot: formats that support it get a small robot (`pipeline.simulation.robot`) on the road.
         failed: receives the errors of optional parts by name, and nothing of them is written: formats other than the
-            world's own (Gazebo, or else the first one), lists, files for navigation. None: their errors are raised.
+            world's own (Gazebo, or else the first one), lists, files for navigation, the pose for robots ("spawn"),
+            recorded traffic of Gazebo's world, the README ("readme"). None: their errors are raised.
 
     Raises:
         ScanError: as `check`, or there is no start pose for the robot; raised before anything is written.
@@ -145,8 +146,9 @@ def write(
     if robot:
         _check_names(scene)
         scene = replace(scene, start=find_spawn_pose(scene))
-    scene = replace(scene, spawn=scene.start or default_pose(scene))
     make_folder(folder)
+    with optional_part("spawn", folder, failed):
+        scene = replace(scene, spawn=scene.start or default_pose(scene))
     triangles: dict[str, int] = {}
     main = "gazebo" if "gazebo" in formats else next(iter(formats), "")
     for i, name in enumerate(formats):
@@ -154,23 +156,27 @@ def write(
         def report_format(fraction: float, message: str = "", finished: int = i, format_name: str = name) -> None:
             report((finished + fraction) / len(formats), f"{format_name} {message}".strip())
 
-        with _part(name, folder, None if name == main else failed) as place:
+        with optional_part(name, folder, None if name == main else failed) as place:
             triangles |= find(PACKAGE, name, "export.formats").write(scene, place, params, report_format)
             if scene.start and name in names(robot_formats.PACKAGE):
                 module(robot_formats.PACKAGE, name).write(_robot_for(scene), scene.start, place)
-    with _part("lists", folder, failed) as place:
+    if "gazebo" in formats:
+        with optional_part("traffic", folder, failed) as place:
+            find(PACKAGE, "gazebo", "export.formats").write_traffic(scene, place)
+    with optional_part("lists", folder, failed) as place:
         _write_lists(scene, place)
     navigation: dict[str, Any] = {}
     if len(scene.tiles) == 1:
-        with _part("navigation", folder, failed) as place:
+        with optional_part("navigation", folder, failed) as place:
             navigation = _write_navigation(scene, place, formats)
     text = json.dumps(metadata(scene, triangles) | navigation, indent=2)
     (folder / "metadata.json").write_text(text + "\n", encoding="utf-8")
-    readme.write(folder, scene, formats)
+    with optional_part("readme", folder, failed) as place:
+        readme.write(place, scene, formats)
 
 
 @contextmanager
-def _part(name: str, folder: Path, failed: dict[str, ScanError] | None) -> Iterator[Path]:
+def optional_part(name: str, folder: Path, failed: dict[str, ScanError] | None) -> Iterator[Path]:
     """A folder to write a part of the world into, moved to `folder` when complete; its error is added to `failed`.
 
     Without `failed` it is `folder` itself, and errors are raised; so are those about a full disk.

@@ -25,7 +25,6 @@ from scan2sim.pipeline.io.worlds import sdf
 from scan2sim.pipeline.io.worlds.scene import BACKDROP, Scene, SceneTile, by_class
 from scan2sim.pipeline.io.worlds.scene_traffic import scenario_of
 from scan2sim.pipeline.io.worlds.textured_mesh import Textured
-from scan2sim.pipeline.scenario.scenario import Scenario
 
 
 def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> dict[str, int]:
@@ -37,16 +36,16 @@ def write(scene: Scene, folder: Path, params: SceneParams, report: Report) -> di
         triangles |= {f"models/{file}": count for file, count in written.items()}
     triangles |= write_dome(folder, scene, params)
     _write_world(folder / f"{scene.name}.sdf", scene)
-    write_traffic(scene, scenario_of(scene), folder)
     return triangles
 
 
-def write_traffic(scene: Scene, scenario: Scenario, folder: Path) -> None:
-    """Write the world with a scenario's actors as `<scenario>_traffic.world`, and their models; nothing if none moves.
+def write_traffic(scene: Scene, folder: Path) -> None:
+    """Write the world with recorded traffic as `<name>_traffic.world`, and the actors' models; nothing if none moves.
 
     Raises:
         SpaceError: the disk is full or not writable.
     """
+    scenario = scenario_of(scene)
     for actor in scenario.moving:
         meshes = folder / "models" / actor.name / "meshes"
         make_folder(meshes)

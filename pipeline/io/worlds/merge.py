@@ -17,13 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from scan2sim.pipeline.core.errors import DataError, InputError, from_os_error
+from scan2sim.pipeline.core.errors import DataError, InputError, ScanError, from_os_error
 from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.geodata import crs
-from scan2sim.pipeline.io.world_formats import SceneParams, gazebo, opendrive
+from scan2sim.pipeline.io.world_formats import SceneParams, gazebo, opendrive, optional_part
 from scan2sim.pipeline.io.worlds import readme, scene, sdf
-from scan2sim.pipeline.io.worlds.scene_traffic import scenario_of
 from scan2sim.pipeline.io.worlds.spawn import default_pose
 
 USER_EDITABLE_SUFFIXES = (
@@ -73,6 +72,7 @@ def assemble(
     performer: str = sdf.PERFORMER_NAME,
     dome: MakeDome = lambda scene, folder: None,
     warn: Callable[[str], None] = lambda _: None,
+    failed: dict[str, ScanError] | None = None,
 ) -> Path:
     """Combine the worlds of all tiles into `out/world/`, unless it exists and nothing has changed.
 
@@ -87,6 +87,8 @@ def assemble(
         performer: name of the robot's model, for which levels are loaded.
         dome: writes the sky dome of all tiles, as of `scene.add_dome`; the same for the same tiles.
         warn: receives a warning for each file that has changed since the world was written, by hand or by damage.
+        failed: receives the errors of optional parts by name: "sky_dome", "spawn", "traffic", "readme"; the world is
+            written without them, and written again by the next call. None: their errors are raised.
 
     Returns:
         Path of the world's .sdf.
@@ -106,7 +108,7 @@ def assemble(
         temporary = out / ".world"
         try:
             shutil.rmtree(temporary, ignore_errors=True)
-            _write(temporary, name, tiles, buffer, performer, dome)
+            _write(temporary, name, tiles, buffer, performer, dome, failed)
             (temporary / STAMP_FILE).write_text(stamp, encoding="utf-8")
             swap(temporary, world)
         except OSError as error:
@@ -248,7 +250,15 @@ def _edited(world: Path) -> list[Path]:
     ]
 
 
-def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, performer: str, dome: MakeDome) -> None:
+def _write(
+    folder: Path,
+    name: str,
+    tiles: Sequence[TileWorld],
+    buffer: float,
+    performer: str,
+    dome: MakeDome,
+    failed: dict[str, ScanError] | None,
+) -> None:
     metadata = {tile.name: _metadata(tile.world / "metadata.json") for tile in tiles}
     origin = _origin(tiles, metadata)
     first = tiles[0].frame
@@ -258,16 +268,18 @@ def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, p
         for subfolder in (Path("models") / tile.name, Path(scene.SCENE_FOLDER) / tile.name):
             shutil.copytree(tile.world / subfolder, folder / subfolder, copy_function=link)
     scene.write_scene_file(folder, name, Frame(first.crs, origin, first.unit), [tile.name for tile in tiles])
-    whole = scene.add_dome(scene.read_scene(folder), folder, dome)
-    whole = replace(whole, spawn=default_pose(whole))
-    sky = gazebo.write_dome(folder, whole, SceneParams())
-    _stamp_dome(folder, whole.dome)
+    whole, sky = scene.read_scene(folder), dict[str, int]()
+    with optional_part("sky_dome", folder, failed):
+        whole, sky = _add_dome(folder, whole, dome)
+    with optional_part("spawn", folder, failed):
+        whole = replace(whole, spawn=default_pose(whole))
     shown = {whole.dome.name: whole.dome.offset} if whole.dome else {}
     sdf.write_levels(
         folder / f"{name}.sdf", name, georeference, placed, buffer, performer, None, whole.sky, shown,
         spawn=whole.spawn,
     )  # fmt: skip
-    gazebo.write_traffic(whole, scenario_of(whole), folder)
+    with optional_part("traffic", folder, failed) as place:
+        gazebo.write_traffic(whole, place)
     body = {
         "name": name,
         "crs": first.crs,
@@ -291,7 +303,24 @@ def _write(folder: Path, name: str, tiles: Sequence[TileWorld], buffer: float, p
         "triangles_by_file": {file: n for one in metadata.values() for file, n in _model_triangles(one).items()} | sky,
     }
     (folder / "metadata.json").write_text(json.dumps(body, indent=2) + "\n", encoding="utf-8")
-    readme.write(folder, whole, ["gazebo"])
+    with optional_part("readme", folder, failed) as place:
+        readme.write(place, whole, ["gazebo"])
+    if not failed:  # otherwise the next call writes the world again
+        _stamp_dome(folder, whole.dome)
+
+
+def _add_dome(folder: Path, whole: scene.Scene, dome: MakeDome) -> tuple[scene.Scene, dict[str, int]]:
+    """Write the sky dome below `folder`, or nothing on errors; returns the scene with it, and triangles by file."""
+    made = [folder / scene.SCENE_FOLDER / scene.DOME_FOLDER]
+    try:
+        domed = scene.add_dome(whole, folder, dome)
+        if domed.dome is not None:
+            made.append(folder / "models" / domed.dome.name)
+        return domed, gazebo.write_dome(folder, domed, SceneParams())
+    except Exception:
+        for path in made:
+            shutil.rmtree(path, ignore_errors=True)
+        raise
 
 
 def _metadata(path: Path) -> dict[str, Any]:

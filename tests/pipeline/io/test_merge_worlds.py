@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.core.errors import DataError, InputError
+from scan2sim.pipeline.core.errors import DataError, InputError, ScanError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.io import world_formats
-from scan2sim.pipeline.io.world_formats import SceneParams
-from scan2sim.pipeline.io.worlds import merge, sdf
+from scan2sim.pipeline.io.world_formats import SceneParams, gazebo
+from scan2sim.pipeline.io.worlds import merge, readme, sdf
 from scan2sim.pipeline.io.worlds.merge import TileWorld, assemble
 from scan2sim.pipeline.io.worlds.scene import read_scene
 from tests.fakes import synthetic
@@ -204,3 +204,38 @@ def test_local_survey_has_no_georeference(tmp_path: Path) -> None:
     path = assemble(tmp_path, "town", [TileWorld(f"t{i}", made[i], frames[i]) for i in range(2)])
     assert _root(path).find("spherical_coordinates") is None
     assert json.loads((path.parent / "metadata.json").read_text(encoding="utf-8"))["wgs84"] is None
+
+
+def test_failing_parts_cost_only_themselves_and_are_retried(
+    tmp_path: Path, row: Sequence[TileWorld], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def half(*arguments: object) -> None:
+        for folder in arguments:
+            if isinstance(folder, Path):
+                folder.mkdir(parents=True, exist_ok=True)
+                (folder / "half.txt").touch()
+        raise ZeroDivisionError("a bug")
+
+    whole = _snapshot(assemble(tmp_path / "whole", "town", row).parent).keys()
+    failed: dict[str, ScanError] = {}
+    with monkeypatch.context() as patch:
+        patch.setattr(merge, "default_pose", half)
+        patch.setattr(gazebo, "write_traffic", half)
+        patch.setattr(readme, "write", half)
+        path = assemble(tmp_path / "part", "town", row, dome=half, failed=failed)
+        with pytest.raises(ZeroDivisionError):
+            assemble(tmp_path / "strict", "town", row, dome=half)
+    assert failed.keys() == {"sky_dome", "spawn", "traffic", "readme"}
+    assert all("a bug" in error.cause and "half" in "".join(error.__notes__) for error in failed.values())
+    assert not list((tmp_path / "part").rglob("half.txt")) and not (tmp_path / "strict" / "world").exists()
+    assert [i.findtext("uri") for i in _root(path).iter("include")] == [f"model://{tile.name}" for tile in row]
+    assert "spawn" not in json.loads((path.parent / "metadata.json").read_text(encoding="utf-8"))
+    assert whole - _snapshot(path.parent).keys() == {"README.md", ".dome"}
+
+    failed.clear()
+    assemble(tmp_path / "part", "town", row, failed=failed)
+    assert not failed and _snapshot(path.parent).keys() == whole
+    assert "spawn" in json.loads((path.parent / "metadata.json").read_text(encoding="utf-8"))
+    written = _snapshot(path.parent)
+    assemble(tmp_path / "part", "town", row, failed=failed)
+    assert _snapshot(path.parent) == written
