@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
-
 from scan2sim.pipeline.core.plugins import Unavailable
 from scan2sim.pipeline.core.types import F32
 from scan2sim.texturing.splats import rasterizer
@@ -32,7 +30,7 @@ def unavailable() -> Unavailable | None:
 
 def description() -> str:
     """What renders, for the log."""
-    return f"on the CPU, {numba.get_num_threads()} threads"
+    return "on the CPU"
 
 
 def scene(parameters: F32) -> CpuScene:
