@@ -1,4 +1,4 @@
-"""`scan2sim inspect`: prints a summary of a point cloud, a tile, a mesh, a world or a ROS bag."""
+"""`scan2sim inspect`: prints a summary of a point cloud, a folder of clouds, a tile, a mesh, a world or a ROS bag."""
 
 from __future__ import annotations
 
@@ -15,32 +15,31 @@ from rich.table import Table
 from scan2sim.flows.commands.app import App
 from scan2sim.flows.commands.display import console
 from scan2sim.flows.commands.inspect_bag import show_bag
+from scan2sim.flows.commands.inspect_map import Facts, colour_fact, folder_of_clouds, map_facts, mesh_facts
 from scan2sim.pipeline.core.classes import name_of
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.types import Frame, PointCloud, Tile
+from scan2sim.pipeline.core.types import Frame, Tile
 from scan2sim.pipeline.importers.bag.reader import is_bag
 from scan2sim.pipeline.io import clouds, file_checks, xml
 from scan2sim.pipeline.io.geodata.crs import name as crs_name
-from scan2sim.pipeline.io.tile import MIN_POINTS, read_tile
+from scan2sim.pipeline.io.mesh_files import find_mesh, is_mesh
+from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.plausibility.check import find_implausible
 from scan2sim.pipeline.pose_check.check import find_mistake
-
-Facts = list[tuple[str, str]]
-MAP_SAMPLES = 300_000
-"""Points of a robot's map that are inspected."""
-
 
 app = App()
 
 
 @app.command()
 def inspect(
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="A point cloud, tile, mesh, world or ROS bag.")],
+    path: Annotated[
+        Path, typer.Argument(metavar="PATH", help="A point cloud, folder of clouds, tile, mesh, world or ROS bag.")
+    ],
     urdf: Annotated[
         Path | None, typer.Option(help="URDF file of the robot, whose fixed joints the import of a ROS bag would use.")
     ] = None,
 ) -> None:
-    """Show a summary of a point cloud, a tile, a mesh, a world or a ROS bag."""
+    """Show a summary of a point cloud, a folder of clouds, a tile, a mesh, a world or a ROS bag."""
     inspect_path(path, urdf)
 
 
@@ -72,15 +71,19 @@ def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
             return lambda p: _world(_sdf(p / "world"))
         if any(path.glob("*.sdf")):
             return lambda p: _world(_sdf(p))
+        if (mesh := find_mesh(path)) is not None:
+            return lambda _: _mesh(mesh)
+        if any(clouds.is_cloud(file) for file in file_checks.files(path)):
+            return folder_of_clouds
         raise InputError(
             path,
-            "contains neither a tile.toml nor a world",
+            "contains neither a tile.toml, nor a world, a mesh or clouds",
             "Name a cloud, a tile (or one of a survey), a mesh, a world or a ROS bag",
         )
     file_checks.check(path, "Check the path")
     readers = {
         **dict.fromkeys(clouds.formats(), _cloud), ".toml": _tile, ".sdf": _world, ".npz": _result,
-        ".obj": _mesh, ".dae": _mesh, ".glb": _mesh, ".ply": _ply,
+        ".obj": _mesh, ".dae": _mesh, ".glb": _mesh, ".gltf": _mesh, ".ply": _ply,
     }  # fmt: skip
     if path.name in readers:
         return readers[path.name]
@@ -106,11 +109,11 @@ def _cloud(path: Path) -> tuple[str, Facts]:
         ("CRS", crs_name(header.crs)),
         ("extent", _bounds(header.low, header.high)),
         ("density", f"{header.count / area:,.1f} per square unit of its bounding box"),
-        ("colours", "yes" if cloud.rgb is not None else "intensity" if cloud.intensity is not None else "no"),
+        ("colours", colour_fact(cloud)),
         *(("warning", note) for note in (*header.notes, *clouds.flag_notes(path))),
     ]
-    if header.crs is None and len(cloud) >= MIN_POINTS:
-        facts += _map_facts(cloud)
+    if header.crs is None:
+        facts += map_facts(cloud)
     if cloud.time is not None and len(cloud):
         facts.append(("GPS time", f"{cloud.time.min():.3f} to {cloud.time.max():.3f} s"))
     if cloud.classification is not None:
@@ -124,44 +127,6 @@ def _cloud(path: Path) -> tuple[str, Facts]:
             for i, (code, count) in enumerate(zip(codes.tolist(), counts.tolist(), strict=True))
         ]
     return "cloud", facts
-
-
-def _map_facts(cloud: PointCloud) -> Facts:
-    """What `scan2sim run` finds in a robot's map: unit, up axis and tilt, spacing, noise, scene."""
-    from scan2sim.pipeline.geometry.height_map import exact_point_spacing
-    from scan2sim.pipeline.geometry.upright import find_up, rotation_to_z
-    from scan2sim.pipeline.importers.robot_map import UNIT_M
-    from scan2sim.pipeline.robot_maps.describe import describe, guess_unit
-    from scan2sim.pipeline.robot_maps.outliers import far_outliers
-
-    some = cloud.take(np.arange(0, len(cloud), max(1, len(cloud) // MAP_SAMPLES)))
-    xyz = some.xyz[np.isfinite(some.xyz).all(axis=1)]
-    unit = guess_unit(xyz)
-    xyz, start = xyz * np.float32(UNIT_M[unit]), -np.asarray(cloud.frame.origin) * UNIT_M[unit]
-    outliers = far_outliers(xyz, exact_point_spacing(xyz))
-    xyz = xyz[~outliers]
-    facts = [("units", f"{unit} (assumed)"), ("outliers", f"{outliers.mean():.1%} isolated or far points")]
-    up = find_up(xyz, start)
-    if up is None:
-        return [*facts, ("up axis", "not found: no flat surfaces; name it with --up")]
-    axis = int(np.abs(up.up).argmax())
-    tilt = np.degrees(np.arccos(min(1.0, abs(float(up.up[axis])))))
-    doubt = ", ambiguous: check it, or name it with --up" if up.ambiguous else ""
-    sign = "-" if up.up[axis] < 0 else ""
-    R = rotation_to_z(up.up)
-    found = describe(xyz @ R.T.astype(np.float32), R @ start)
-    return [
-        *facts,
-        ("up axis", f"{sign}{'xyz'[axis]}, tilted by {tilt:.1f} degrees{doubt}"),
-        ("spacing", f"{100 * found.spacing:.1f} cm between neighbouring points"),
-        ("noise", f"{100 * found.noise:.1f} cm around planes"),
-        ("surfaces", f"{found.level_share:.0%} level (ground, floors), {found.upright_share:.0%} upright (walls)"),
-        (
-            "scene",
-            f"{found.scene} (walls in {found.enclosed_share:.0%} of the directions from the start, "
-            f"a ceiling above {found.ceiling_share:.0%} of the floor)",
-        ),
-    ]
 
 
 def _mistake(tile: Tile) -> str | None:
@@ -210,6 +175,7 @@ def _mesh(path: Path) -> tuple[str, Facts]:
         ("vertices", f"{sum(len(m.vertices) for m in meshes):,}"),
         ("extent", _bounds(*bounds) if bounds is not None else "empty"),
         ("materials", ", ".join(sorted(map(str, textures))) or "none"),
+        *(mesh_facts(path) if is_mesh(path) else []),
     ]
 
 

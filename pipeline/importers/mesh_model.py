@@ -38,7 +38,7 @@ POINTS = (20_000, 2_000_000)
 """... if their number is in this range."""
 MIN_AREA_M2 = 0.5
 UNIT_SAMPLES = 200_000
-"""Points from which the unit is guessed."""
+"""Points from which the unit is guessed, and that are inspected."""
 OPEN_SURFACE_SHARE = 0.2
 """Net share of level surface that faces down from which the surface is inside out."""
 SOURCE = "source_mesh.npz"
@@ -84,7 +84,7 @@ def import_mesh(
     is_gltf = path.suffix.lower() in (".glb", ".gltf")
     if is_gltf and params.units == "auto":
         params = params.model_copy(update={"units": "m"})
-    some = _positions(source.mesh, *sample(source.mesh, UNIT_SAMPLES))
+    some = surface_points(source.mesh).xyz
     unit = unit_of(some, exact_point_spacing(some), params, warn)
     origin = unit * np.asarray(source.mesh.frame.origin)
     mesh = replace(source.mesh, vertices=source.mesh.vertices * np.float32(unit))
@@ -130,6 +130,11 @@ def sample(mesh: Mesh, count: int, seed: int = 0) -> tuple[I32, F32]:
     face = np.searchsorted(area, at, side="right").clip(max=len(mesh) - 1).astype(np.int32)
     u, v = np.sqrt(random.uniform(size=count)), random.uniform(size=count)
     return face, np.column_stack([u * (1 - v), u * v]).astype(np.float32)
+
+
+def surface_points(mesh: Mesh) -> PointCloud:
+    """`UNIT_SAMPLES` points of a mesh's surface, in its own unit."""
+    return PointCloud(mesh.frame, _positions(mesh, *sample(mesh, UNIT_SAMPLES)))
 
 
 def _positions(mesh: Mesh, face: I32, weights: F32) -> F32:

@@ -1,0 +1,105 @@
+"""What `scan2sim inspect` prints of a robot's map or a mesh: what `scan2sim run` would find in it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from scan2sim.pipeline.core.types import F32, F64, Frame, PointCloud
+from scan2sim.pipeline.importers.robot_map import UNIT_M, map_files
+from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.tile import MIN_POINTS
+
+Facts = list[tuple[str, str]]
+MAX_POINTS = 2_000_000
+"""Points of a map that are inspected; the spacing is measured on all."""
+
+
+def map_facts(cloud: PointCloud) -> Facts:
+    """Unit, outliers, up axis and tilt, spacing, noise, surfaces and scene; empty for fewer points than a map has."""
+    from scan2sim.pipeline.geometry.height_map import exact_point_spacing
+
+    xyz = cloud.xyz[np.isfinite(cloud.xyz).all(axis=1)]
+    if len(xyz) < MIN_POINTS:
+        return []
+    return _facts(xyz[:: max(1, len(xyz) // MAX_POINTS)], exact_point_spacing(xyz), -np.asarray(cloud.frame.origin))
+
+
+def _facts(xyz: F32, spacing: float, start: F64) -> Facts:
+    """Facts of points (N, 3) from a map with a spacing; `start`: of the sensor, in the same axes and unit."""
+    from scan2sim.pipeline.geometry.height_map import exact_point_spacing
+    from scan2sim.pipeline.geometry.upright import find_up, rotation_to_z
+    from scan2sim.pipeline.robot_maps.describe import describe, guess_unit
+    from scan2sim.pipeline.robot_maps.outliers import far_outliers
+
+    unit = guess_unit(xyz, spacing)
+    xyz, start, spacing = xyz * np.float32(UNIT_M[unit]), start * UNIT_M[unit], spacing * UNIT_M[unit]
+    outliers = far_outliers(xyz, exact_point_spacing(xyz))
+    xyz = xyz[~outliers]
+    facts = [("units", f"{unit} (assumed)"), ("outliers", f"{outliers.mean():.1%} isolated or far points")]
+    up = find_up(xyz, start)
+    if up is None:
+        return [*facts, ("up axis", "not found: no flat surfaces; name it with --up")]
+    axis = int(np.abs(up.up).argmax())
+    tilt = np.degrees(np.arccos(min(1.0, abs(float(up.up[axis])))))
+    doubt = ", ambiguous: check it, or name it with --up" if up.ambiguous else ""
+    sign = "-" if up.up[axis] < 0 else ""
+    R = rotation_to_z(up.up)
+    found = describe(xyz @ R.T.astype(np.float32), R @ start)
+    return [
+        *facts,
+        ("up axis", f"{sign}{'xyz'[axis]}, tilted by {tilt:.1f} degrees{doubt}"),
+        ("spacing", f"{100 * spacing:.1f} cm between neighbouring points"),
+        ("noise", f"{100 * found.noise:.1f} cm around planes"),
+        ("surfaces", f"{found.level_share:.0%} level (ground, floors), {found.upright_share:.0%} upright (walls)"),
+        (
+            "scene",
+            f"{found.scene} (walls in {found.enclosed_share:.0%} of the directions from the start, "
+            f"a ceiling above {found.ceiling_share:.0%} of the floor)",
+        ),
+    ]
+
+
+def colour_fact(cloud: PointCloud) -> str:
+    """Which colours the points have, and whether they look like semantic labels."""
+    from scan2sim.pipeline.robot_maps.label_colours import are_labels, matching_legend
+
+    if cloud.rgb is None:
+        return "intensity" if cloud.intensity is not None else "no"
+    if not are_labels(cloud.rgb):
+        return "yes"
+    legend = matching_legend(cloud.rgb)
+    of = f"those of {legend}" if legend else "of an unknown legend"
+    return f"yes, like semantic labels ({of}): classes with --classes-from-colours {legend or 'LEGEND'}"
+
+
+def folder_of_clouds(folder: Path) -> tuple[str, Facts]:
+    """Facts of a map that consists of several clouds in one frame."""
+    files = map_files(folder)
+    headers = [clouds.read_header(file) for file in files]
+    low = np.min([header.low for header in headers], axis=0)
+    high = np.max([header.high for header in headers], axis=0)
+    x, y, z = np.floor(low).tolist()
+    cloud = PointCloud.join([clouds.read(file, Frame(origin=(x, y, z))) for file in files])
+    size = " x ".join(f"{v:,.2f}" for v in high - low)
+    facts = [
+        ("files", f"{len(files)}"),
+        ("points", f"{len(cloud):,}"),
+        ("extent", f"{size}   from " + ", ".join(f"{v:,.2f}" for v in low)),
+        ("colours", colour_fact(cloud)),
+    ]
+    has_crs = any(header.crs is not None for header in headers)
+    return "map", facts if has_crs else facts + map_facts(cloud)
+
+
+def mesh_facts(path: Path) -> Facts:
+    """Facts of points sampled from a mesh."""
+    from scan2sim.pipeline.importers.mesh_model import surface_points
+    from scan2sim.pipeline.io.mesh_models import read
+
+    source, notes = read(path)
+    facts = map_facts(surface_points(source.mesh))
+    if path.suffix.lower() in (".glb", ".gltf"):
+        facts = [fact for fact in facts if fact[0] != "units"]
+    return [*(("warning", note) for note in notes), *(f for f in facts if f[0] not in ("outliers", "spacing", "noise"))]
