@@ -11,7 +11,9 @@ import pytest
 from scan2sim.services.toolboxes.detector import dataset
 from scan2sim.services.toolboxes.tasks import detect
 from tests.conftest import ROOT
-from tests.flows.command import assert_fails, scan2sim, stdout_of
+from tests.flows.command import assert_fails, in_process, stdout_of
+
+pytestmark = pytest.mark.usefixtures("steps_in_process")
 
 pytest.importorskip("torch")
 TILE = ROOT / "data_samples" / "tile"
@@ -19,7 +21,7 @@ TILE = ROOT / "data_samples" / "tile"
 
 def test_detector_is_trained_on_a_drive_and_evaluated_on_another(tmp_path: Path) -> None:
     options = ("--steps", 1, "--synthetic", 0, "--out", tmp_path)
-    printed = stdout_of(scan2sim("toolbox", "train", "--drives", TILE, "--held-out", TILE, *options))
+    printed = stdout_of(in_process("toolbox", "train", "--drives", TILE, "--held-out", TILE, *options))
     assert "vehicles.onnx" in printed
     images, names = dataset.read(tmp_path / "labels")
     learned = sum(int((one.visible > dataset.MIN_VISIBLE_SHARE).sum()) for one in images)
@@ -36,4 +38,4 @@ def test_drive_without_photos_is_refused(tmp_path: Path) -> None:
     (tmp_path / "cloud.laz").symlink_to(TILE / "cloud.laz")
     (tmp_path / "trajectory.csv").symlink_to(TILE / "trajectory.csv")
     (tmp_path / "tile.toml").write_text(text[: text.index("[truth]")], encoding="utf-8")
-    assert_fails(scan2sim("toolbox", "train", "--drives", tmp_path, "--out", tmp_path / "out"), 3, "has no photos")
+    assert_fails(in_process("toolbox", "train", "--drives", tmp_path, "--out", tmp_path / "out"), 3, "has no photos")

@@ -30,8 +30,6 @@ from scan2sim.slam.steps.track import TRACK, TrackParams, tracker_of
 from scan2sim.slam.video import open_video
 from tests.slam.conftest import Drive
 
-pytestmark = pytest.mark.usefixtures("steps_in_process")
-
 
 def command(*arguments: object) -> Result:
     """Run a command; errors are raised."""

@@ -40,6 +40,8 @@ from tests.fakes.datasets import (
 from tests.flows.test_prepare import drive as drive_file
 from tests.flows.test_prepare import survey_of
 
+pytestmark = pytest.mark.usefixtures("steps_in_process")
+
 DRIVE = Drive()
 ONENORTH = (1.2882100868743724, 103.78475189208984)
 SPHERE = Geod(a=6_378_137.0, b=6_378_137.0)

@@ -21,6 +21,8 @@ from scan2sim.pipeline.importers.kitti_raw import raise_beams
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.tile import read_tile
 
+pytestmark = pytest.mark.usefixtures("steps_in_process")
+
 FRAMES, WIDTH, HEIGHT = 4, 600, 300
 AXES = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])  # scanner to camera
 P2 = np.array([[400, 0, 300.5, 24.0], [0, 400, 150.5, 0.2], [0, 0, 1, 0.003]])

@@ -20,6 +20,8 @@ from scan2sim.pipeline.core.types import UNCOLOURED as GREY
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.tile import read_tile
 
+pytestmark = pytest.mark.usefixtures("steps_in_process")
+
 FRAMES, PERIOD, SPEED, LATE = 4, 0.1, 11.0, 0.01
 YAW = 0.4  # against true east
 CRS = "EPSG:32632"

@@ -30,6 +30,8 @@ from scan2sim.pipeline.io.sweep_files import read_sweep
 from scan2sim.pipeline.io.tile import read_tile
 from tests.present import present
 
+pytestmark = pytest.mark.usefixtures("steps_in_process")
+
 LOW, HIGH = np.array([-8.0, -6.0, 0.0]), np.array([30.0, 6.0, 5.0])  # the hall
 PAINT = np.array([[250, 30, 30], [30, 250, 30], [30, 30, 250], [250, 250, 30], [30, 250, 250], [250, 30, 250]])
 PERIOD, SWEEPS, SPEED, TURN = 0.1, 6, 9.0, 0.4
