@@ -12,11 +12,12 @@ import pytest
 
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.classes import CODE
-from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.errors import InputError, ScanError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.io import world_formats
-from scan2sim.pipeline.io.world_formats import SceneParams
+from scan2sim.pipeline.io.world_formats import SceneParams, gazebo
+from scan2sim.pipeline.io.worlds import readme
 from scan2sim.pipeline.io.worlds.scene import Level, Scene, read_scene
 from tests.fakes import synthetic
 from tests.fakes.scene_readers import READERS, Shown, fbx, image, survey_error
@@ -301,3 +302,19 @@ def test_any_folder_name_and_tiles_without_a_class_are_exported(tmp_path: Path, 
     np.testing.assert_array_equal(seen[:, 0], own[:, 0])
     for path in (tmp_path / "out").rglob("*"):
         assert path.name.isascii() and " " not in path.name
+
+
+def test_failing_parts_of_a_world_cost_only_themselves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    scene, failed = synthetic.scene(tmp_path, tiles=1), dict[str, ScanError]()
+    monkeypatch.setattr(world_formats, "default_pose", broken)
+    monkeypatch.setattr(gazebo, "write_traffic", broken)
+    monkeypatch.setattr(readme, "write", broken)
+    world_formats.write(scene, ["gazebo"], tmp_path / "out", SceneParams(), silent, failed=failed)
+    assert failed.keys() == {"spawn", "traffic", "readme"} and all("a bug" in one.cause for one in failed.values())
+    assert (tmp_path / "out" / f"{scene.name}.sdf").is_file() and not (tmp_path / "out" / "README.md").exists()
+    assert "spawn" not in json.loads((tmp_path / "out" / "metadata.json").read_text(encoding="utf-8"))
+    with pytest.raises(ZeroDivisionError):
+        world_formats.write(scene, ["gazebo"], tmp_path / "strict", SceneParams(), silent)
