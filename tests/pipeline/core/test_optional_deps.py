@@ -101,7 +101,7 @@ USES = {
     "pxr": ["export world --to usd", "run TILE --set export.formats=[\"usd\"]"],
     "meshopt": ["export world --to glb --glb-mesh meshopt", "run TILE --set export.glb_mesh=meshopt"],
     "DracoPy": ["export world --to glb --glb-mesh draco"],
-    "gsplat": "run TILE --set splats.when=auto --set splats.backend=gpu",
+    "gsplat": ["run TILE --set splats.when=auto --set splats.backend=gpu"],
     "gsply": ["export world --to splats", "run TILE --set export.formats=[\"splats\"]"],
     "cyclonedds": ["monitor talker chatter"],
     "rosbags": ["monitor listener chatter"],
