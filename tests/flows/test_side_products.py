@@ -35,6 +35,8 @@ SETTINGS = COARSE | {
     "navigation": {"when": "always"}, "split": {"vegetation": "locations", "vehicles": "assets"},
     "splats": {"when": "auto", "epochs": [1, 0, 0]},
 }  # fmt: skip
+FINE = SETTINGS | {"unwrap": {"texel": 0.05}}
+"""With texels that show lane markings, which a survey's road network needs."""
 SIDE_PRODUCTS = tuple(step.name for step in tile_pipeline.SIDE_PRODUCTS)
 BORDER_SIDE_PRODUCT = "borders"
 """Runs only for tiles with neighbours."""
@@ -79,10 +81,12 @@ for_groups_and_single_side_products = pytest.mark.parametrize(
 )
 
 
-def scan2sim(*arguments: object, failing: Collection[str] = ()) -> tuple[int, str]:
+def scan2sim(
+    *arguments: object, failing: Collection[str] = (), settings: dict[str, dict[str, Any]] = SETTINGS
+) -> tuple[int, str]:
     """Run the command and its steps in this process; returns its exit code and output."""
     with inline_steps():
-        return run_scan2sim(*arguments, failing=failing, settings=SETTINGS)
+        return run_scan2sim(*arguments, failing=failing, settings=settings)
 
 
 @pytest.fixture(scope="module")
@@ -124,9 +128,9 @@ def failing_survey(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> tu
 def completed_survey(
     survey: Path, failing_survey: tuple[Path, int, str], tmp_path_factory: pytest.TempPathFactory
 ) -> Path:  # fmt: skip
-    """Like `completed_run`, for the survey."""
+    """Like `completed_run`, for the survey, with fine texels."""
     out = shutil.copytree(failing_survey[0], tmp_path_factory.mktemp("completed_run") / "out")
-    code, printed = scan2sim("survey", survey, "--out", out)
+    code, printed = scan2sim("survey", survey, "--out", out, settings=FINE)
     assert code == 0 and "failed" not in printed
     return out
 
@@ -346,13 +350,13 @@ def test_failing_side_product_of_a_survey_tile_affects_only_itself(
     out = shutil.copytree(completed_survey, tmp_path / "out")
     second = sorted(read(out / "survey.json")["tiles"])[1]
     shutil.rmtree(out / "steps" / second / name)
-    code, printed = scan2sim("survey", survey, "--out", out, failing=[name])
+    code, printed = scan2sim("survey", survey, "--out", out, failing=[name], settings=FINE)
     assert code == INCOMPLETE and f"a side product failed: {second}/{name}" in printed
     assert len(loaded(out).tiles) == 2
     tiles = read(out / "survey.json")["tiles"]
     assert [any(": failed" in text for text in tile["warnings"]) for tile in tiles.values()] == [False, True]
     assert read(out / "tiles" / second / "report.json")["failed"].keys() == {name}
-    assert scan2sim("survey", survey, "--out", out)[0] == 0
+    assert scan2sim("survey", survey, "--out", out, settings=FINE)[0] == 0
     tiles = read(out / "survey.json")["tiles"]
     assert not any(": failed" in text for tile in tiles.values() for text in tile["warnings"])
 
