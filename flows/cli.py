@@ -16,12 +16,10 @@ from typer.core import TyperCommand, TyperGroup
 
 from scan2sim import __version__
 from scan2sim.flows.commands import unchanged
-from scan2sim.flows.pipelines.renamed import OPTIONS
 from scan2sim.pipeline.core.errors import (
     INTERRUPTED,
     IncompleteError,
     ScanError,
-    SettingError,
     exit_code,
     from_os_error,
 )
@@ -89,15 +87,6 @@ class _LazyGroup(TyperGroup):
             return None
         panel = next(name for name, commands in PANELS.items() if cmd_name in commands)
         return _LazyCommand(cmd_name, help=COMMANDS[cmd_name][1], rich_help_panel=panel)
-
-    def invoke(self, ctx: Any) -> Any:
-        try:
-            return super().invoke(ctx)
-        except Exception as error:  # typer doesn't export NoSuchOption
-            option = getattr(error, "option_name", "")
-            if new := OPTIONS.get(ctx.invoked_subcommand, {}).get(option):
-                raise SettingError(option, "this option was renamed", f"Write `{new}`") from None
-            raise
 
 
 def loaded(name: str) -> Any:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import Field
 
 from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.parameters import Distance
@@ -31,19 +30,19 @@ EXPOSED_KEY = "psnr_exposed_db"
 """The same, of splats only: PSNR with the exposure of the nearest photos."""
 CAMERA_CLEARANCE_M = 1.0
 """Metres around a camera in which there can't have been a surface."""
+TRUTH_MAX_DISTANCE_M = 0.1
+"""Largest distance between a ground-truth sample and the mesh for it to be compared."""
+TRUTH_SAMPLES_MAX = 500_000
+"""Maximum number of ground-truth samples that are compared."""
 
 
 class ScoreParams(Params):
     """Settings of the evaluation.
 
     Attributes:
-        truth_max_distance: largest distance in metres between a ground-truth sample and the mesh for it to be compared.
-        truth_samples: maximum number of ground-truth samples that are compared.
         near: largest distance in metres between a ground-truth sample and a photo for `truth_psnr_near_db`.
     """
 
-    truth_max_distance: Distance = 0.1
-    truth_samples: int = Field(500_000, ge=1000, le=20_000_000)
     near: Distance = 15.0
 
 
@@ -245,11 +244,11 @@ def _truth(inputs: Inputs, world: Renderer, params: ScoreParams) -> dict[str, fl
     from scan2sim.texturing.evaluate import psnr
 
     truth = las.read(inputs["truth.points"], world.bodies[0].mesh.frame)
-    truth = truth.take(slice(None, None, max(1, len(truth) // params.truth_samples)))
+    truth = truth.take(slice(None, None, max(1, len(truth) // TRUTH_SAMPLES_MAX)))
     assert truth.rgb is not None
     rgb, seen, distance = world.nearest(truth.xyz)
     squared = ((rgb.astype(np.float64) - truth.rgb) ** 2).mean(axis=1)
-    counted = (seen == 255) & (distance < params.truth_max_distance)
+    counted = (seen == 255) & (distance < TRUTH_MAX_DISTANCE_M)
     near = counted.copy()
     near[counted] = _seen_from_near(inputs, *world.closest_points(truth.xyz[counted]), params.near)
 

@@ -59,20 +59,18 @@ class RunDisplay:
 
     Args:
         task_count: tasks of the run, cached ones included.
-        title: label of the whole run's bar.
-        lines: whether to print a line for each finished task; failed ones always have one.
     """
 
-    def __init__(self, task_count: int, title: str = "tile", lines: bool = True) -> None:
+    def __init__(self, task_count: int) -> None:
         self._bars = _progress()
-        self._task_count, self._title, self._lines = task_count, title, lines
+        self._task_count = task_count
         self._bar_ids: dict[str, TaskID] = {}
         self._started: dict[str, float] = {}
         self._done = self._cached = 0
 
     def __enter__(self) -> RunDisplay:
         self._bars.start()
-        self._whole = self._bars.add_task(f"[bold]{self._title}", total=self._task_count, message="")
+        self._whole = self._bars.add_task("[bold]tile", total=self._task_count, message="")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -101,12 +99,7 @@ class RunDisplay:
                 seconds = time.perf_counter() - self._started[task.full_name]
                 failed = "[yellow]✗[/]" if task.side_product else "[red]✗[/]"
                 mark = "[green]✓[/]" if event == "done" else failed
-                if self._lines or event == "failed":
-                    console.print(f"{mark} {task.full_name:<22}[dim]{seconds:7.1f} s  {self._done}/{self._task_count}")
-
-    def status(self, text: str) -> None:
-        """Set the message behind the whole run's bar."""
-        self._bars.update(self._whole, message=escape(text))
+                console.print(f"{mark} {task.full_name:<22}[dim]{seconds:7.1f} s  {self._done}/{self._task_count}")
 
 
 def log_unexpected(error: BaseException) -> Path:

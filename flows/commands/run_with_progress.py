@@ -30,11 +30,10 @@ def execute_with_progress(
     keep_going: bool = False,
     memory: float | None = None,
     bus: PublishedRun | None = None,
-    display: RunDisplay | None = None,
 ) -> Outcome:
-    """Run a plan by `execute`, with progress bars (or another `display`) and log entries; published by the `bus`."""
+    """Run a plan by `execute`, with progress bars and log entries; published by the `bus`."""
     publish_event = bus.steps.track(planned, store) if bus else ignore_event
-    with display or RunDisplay(len(planned)) as shown:
+    with RunDisplay(len(planned)) as shown:
 
         def on_event(task: Task, event: Event, fraction: float, message: str) -> None:
             shown.on_event(task, event, fraction, message)

@@ -1,4 +1,4 @@
-"""`scan2sim slam`: trajectory of a video, its evaluation against ground truth, and the compression study."""
+"""`scan2sim slam`: trajectory of a video, and its evaluation against ground truth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.commands.run_with_progress import plan_and_run
-from scan2sim.flows.commands.study import study_compression
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import STORE, PlannedTask
 from scan2sim.flows.engine.progress import PublishedRun, published
@@ -34,7 +33,6 @@ OUTPUTS = (
     "trajectory.kitti",
     "trajectory.geojson",
     "odometry.csv",
-    "view.mp4",
     "colmap",
 )
 """Files and folders that a run may write next to `slam.json`."""
@@ -90,55 +88,6 @@ def slam_evaluate(
     evaluate_trajectory(trajectory, truth, segment=segment, alignment=alignment, out=out)
 
 
-@app.command("study")
-def slam_study(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="DRIVE",
-            help="Folder of a drive (video.mp4, truth.csv, ...), a 360-degree video, or a folder of its frames.",
-        ),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out",
-            "-o",
-            help="Output folder: tables, plot, cached results; with the same folder, an interrupted study resumes.",
-        ),
-    ],
-    truth: Annotated[
-        Path | None, typer.Option(help="Ground truth: a trajectory or GPS track; default: truth.csv of the drive.")
-    ] = None,
-    gps: Annotated[
-        Path | None, typer.Option(help="GPS track that gives the scale; default: gps.csv of the drive, if it has one.")
-    ] = None,
-    mask: Annotated[
-        Path | None,
-        typer.Option(help="Ego-vehicle mask: an image, 0 on the car; default: mask.png of the drive, if it has one."),
-    ] = None,
-    heights: Annotated[str, typer.Option(help="Image heights to test in pixels.")] = "512,768,1024,1536",
-    bitrates: Annotated[str, typer.Option(help="Bit rates to test in Mbit/s.")] = "1,2,5,10,20,40",
-    rates: Annotated[str, typer.Option(help="Frame rates to test in frames per second.")] = "30,15",
-    jobs: Annotated[int, typer.Option(min=1, help="Settings (cells of the table) tested at the same time.")] = 1,
-    backend: Annotated[
-        str | None,
-        typer.Option(
-            help="Solver: lm (Levenberg-Marquardt), or adam (gradient descent by torch, slower); default: setting "
-            "track.backend."
-        ),
-    ] = None,
-    set_: Sets = None,
-    config: Config = None,
-    bus: Bus = None,
-) -> None:
-    """Error of the path by resolution, bit rate and frame rate of a 360-degree video (5G-ERA D3.2, tables 4, 5)."""
-    study_compression(
-        source, out, truth=truth, gps=gps, mask=mask, heights=heights, bitrates=bitrates, rates=rates, jobs=jobs,
-        settings=settings_of([*(set_ or []), *([f"track.backend={backend}"] if backend else [])], config), bus=bus,
-    )  # fmt: skip
-
-
 def slam_video(video: Video, out: Path, settings: Settings, bus: PublishedRun | None = None) -> dict[str, Manifest]:
     """Estimate the trajectory of a video's camera; write it in all formats, and `slam.json`.
 
@@ -169,8 +118,6 @@ def publish_path(planned: Iterable[PlannedTask], done: Mapping[str, Manifest], s
     sources = {path.name: path for path in (folder["georeference"] / "path").iterdir()}
     if f"georeference.{ODOMETRY_GROUP}" in folder:
         sources["odometry.csv"] = folder[f"georeference.{ODOMETRY_GROUP}"] / "path" / "trajectory.csv"
-    if "view" in done["track"].files:
-        sources["view.mp4"] = folder["track"] / "view.mp4"
     for name in OUTPUTS:
         place, source = out / name, sources.get(name)
         shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)

@@ -13,7 +13,6 @@ from typing import Any, Self
 from scan2sim.flows.pipelines import bag, dataset, sweeps, video
 from scan2sim.flows.pipelines.bag import BagSource
 from scan2sim.flows.pipelines.graph import Output, Task, TaskId
-from scan2sim.flows.pipelines.renamed import DRIVE_FIELDS
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.pipelines.sweeps import Sweeps
 from scan2sim.pipeline.core.errors import InputError
@@ -54,7 +53,7 @@ class Drive(Params):
             InputError: naming the field.
         """
         absent = ("file not found", "Name a drive.toml")
-        drive = toml.read(path, cls, absent=absent, fields="docs/surveys.md lists the fields", renamed=DRIVE_FIELDS)
+        drive = toml.read(path, cls, absent=absent, fields="docs/surveys.md lists the fields")
         sources = (drive.corridor, drive.sweeps, drive.bag, drive.nuscenes, drive.pandaset)
         with_poses = drive.bag or drive.nuscenes or drive.pandaset
         if sum(source is not None for source in sources) != 1 or (with_poses is not None and drive.slam is not None):

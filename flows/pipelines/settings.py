@@ -13,7 +13,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from scan2sim.flows.pipelines.renamed import current_name
 from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.step import Params, Step
@@ -80,9 +79,6 @@ class Settings:
         known = {step.name: step for step in steps}
         for name, table in self.values.items():
             if name not in known:
-                renamed = next((new for path in _paths(name, table) if (new := current_name(path))), None)
-                if renamed:
-                    raise SettingError(name, "this step was renamed", f"Write `{renamed}`")
                 raise SettingError(name, "there is no such step", _nearest(name, known))
             if not isinstance(table, Mapping):
                 raise SettingError(name, "must be a table of parameters", f"Write [{name}] or --set {name}.param=value")
@@ -93,8 +89,6 @@ class Settings:
                     raise SettingError(f"{name}.{key}", "this step is not run per class", f"Set {name}.param instead")
                 for param in value if special else (key,):
                     if param not in fields:
-                        if new := current_name(f"{name}.{param}"):
-                            raise SettingError(f"{name}.{param}", "this setting was renamed", f"Write `{new}`")
                         classes = SURFACES if known[name].per_class else ()
                         remedy = _nearest(param, [*fields, *classes])
                         raise SettingError(f"{name}.{param}", "there is no such parameter", remedy)
@@ -146,11 +140,6 @@ def parsed(text: str) -> Any:
     except ValueError:
         words = re.fullmatch(r"\[([\w.:/-]+(?:\s*,\s*[\w.:/-]+)*)\]", text.strip())
         return re.split(r"\s*,\s*", words[1]) if words else text
-
-
-def _paths(step: str, table: object) -> list[str]:
-    """`step.param` for every parameter in a step's table, or `step` if it has none."""
-    return [f"{step}.{param}" for param in table] if isinstance(table, Mapping) and table else [step]
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:

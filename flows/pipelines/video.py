@@ -48,7 +48,6 @@ class Video(Filmed):
     colmap: bool = Field(False, description="Write the map also as a COLMAP model.")
     loops: bool = Field(False, description="Detect loop closures: places that the video passes more than once.")
     adjust: bool = Field(False, description="Run a global bundle adjustment of all keyframes at the end.")
-    view: bool = Field(False, description="Record a video of the tracked features and the trajectory: view.mp4.")
 
 
 def build_graph(video: Video, settings: Settings) -> list[Task]:
@@ -84,10 +83,9 @@ def build_graph(video: Video, settings: Settings) -> list[Task]:
     files: dict[str, Path | Output] = {name: path for name in beside if (path := getattr(video, name)) is not None}
     keep = video.colmap or video.loops or video.adjust or settings.params(GEOREFERENCE).colmap
     local: dict[str, Any] = {"georeference": False} if video.local else {}
-    film: dict[str, Any] = {"view": True} if video.view else {}
     points: dict[str, Any] = {"colmap": True} if video.colmap else {}
     context = {"keep": keep, "cameras": _cameras(video.tile)}
-    mapped = add(TRACK, frames | files, context=context, **filmed, **film)
+    mapped = add(TRACK, frames | files, context=context, **filmed)
     if video.loops or video.adjust:
         add(GEOREFERENCE, {"map": mapped}, ODOMETRY_GROUP, **local)
     if video.loops:

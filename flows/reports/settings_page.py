@@ -10,7 +10,7 @@ import inspect
 import re
 from collections.abc import Iterator
 
-from scan2sim.flows.pipelines import drive, images, study, tile, video
+from scan2sim.flows.pipelines import drive, images, tile, video
 from scan2sim.pipeline.core.parameters import described
 from scan2sim.pipeline.core.step import Params, Step
 
@@ -38,7 +38,6 @@ PARTS = (
      "options of `scan2sim import sweeps` and `scan2sim tile`, or fields of `drive.toml`.", drive.STEPS),
     ("Photos without poses", "Steps of `scan2sim import images` ([images.md](../images.md)); settings are options "
      "of that command.", images.STEPS),
-    ("The study of compression", "Steps of `scan2sim slam study`, for each cell of its tables.", study.STEPS),
 )  # fmt: skip
 ATTRIBUTE_LINE = re.compile(r"^([a-z_0-9]+(?:, [a-z_0-9]+)*): (.*)$")
 

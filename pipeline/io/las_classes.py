@@ -18,8 +18,6 @@ from scan2sim.pipeline.io.las_header import GEOTIFF_RECORDS, PROJECTION_USER, WK
 
 EXTRA_DIMENSIONS = {"confidence": "255: sure", "class_source": "1 photos 2 shape 3 own"}
 """Extra-byte dimensions that are added (uint8 each): name and description, as written into the file."""
-RENAMED_DIMENSIONS = ("told_from",)
-"""Earlier names of these dimensions; a copy of a file that has one doesn't keep it."""
 MODERN_FORMAT = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10}
 """Legacy point format (5-bit classes) to the format with 8-bit classes and the same fields."""
 LEGACY_FLAGS = (
@@ -182,7 +180,7 @@ def _extra_bytes(header: Any) -> tuple[list[tuple[int, int]], list[Any]]:
             described, size = [], 1
             described_byte = ExtraBytesStruct(b"ExtraBytes", 1)
             described_byte.options = 0
-        if described_byte.name.decode() not in (*EXTRA_DIMENSIONS, *RENAMED_DIMENSIONS):
+        if described_byte.name.decode() not in EXTRA_DIMENSIONS:
             stem, i = described_byte.name[:27], 1
             while described_byte.name in taken:
                 described_byte.name, i = stem + b"_%d" % i, i + 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,9 +16,7 @@ MAX_BYTES = 64_000_000
 """Maximum file size; enough for a tile of a hundred thousand photos."""
 
 
-def read(
-    path: Path, model: type[M], *, absent: tuple[str, str], fields: str, renamed: Mapping[str, str] | None = None
-) -> M:
+def read(path: Path, model: type[M], *, absent: tuple[str, str], fields: str) -> M:
     """Read and validate a file.
 
     Args:
@@ -27,7 +24,6 @@ def read(
         model: its schema.
         absent: cause and remedy of the error if the file doesn't exist.
         fields: the document that lists the fields, as remedy of a validation error.
-        renamed: earlier name of a field, such as `tiles.reach`: its name.
 
     Raises:
         InputError: it doesn't exist, is not TOML, or doesn't fit the model.
@@ -37,8 +33,6 @@ def read(
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        if renamed and where in renamed:
-            raise InputError(path, f"field `{where}` was renamed", f"Write `{renamed[where]}`") from None
         raise InputError(path, f"field `{where}`: {first['msg']}", fields) from None
 
 

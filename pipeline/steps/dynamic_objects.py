@@ -21,6 +21,8 @@ MIN_REVISITED_FRACTION = 0.1
 """Minimum fraction of points whose voxel was crossed by rays at `votes` moments; below, rays decide almost nothing."""
 MOVING_FRACTION_WARNING = 0.2
 """Fraction of moving points above which the step warns."""
+CAMERA_RADIUS_M = 1.0
+"""Radius around every camera in which points are removed."""
 
 
 class Cameras(Context):
@@ -38,14 +40,12 @@ class DynamicObjectsParams(Params):
             within one voxel of a static surface are kept, and poses may be wrong by one voxel.
         max_range: maximum length of rays in metres; at 20 m, half a degree is one voxel.
         votes: number of moments (of 0.1 s; for a profile scanner, passes) at which rays must have crossed a voxel.
-        camera_radius: radius in metres around every camera in which points are removed; 0: off.
     """
 
     when: Literal["auto", "never"] = "auto"
     voxel: float = Field(0.2, ge=0.02, le=5)
     max_range: float = Field(20.0, ge=1, le=500)
     votes: int = Field(3, ge=1, le=1000)
-    camera_radius: float = Field(1.0, ge=0, le=10)
     context: Cameras = Cameras()
 
 
@@ -78,7 +78,7 @@ def dynamic_objects(inputs: Inputs, params: DynamicObjectsParams, out: Path, rep
         moved, seen_again = _moved(cloud, origins, path, params)
         why = "" if seen_again > MIN_REVISITED_FRACTION else "nearly all voxels were observed only once"
     near = near_cameras(
-        cloud.xyz, np.array(params.context.positions, np.float64).reshape(-1, 3), params.camera_radius, volume
+        cloud.xyz, np.array(params.context.positions, np.float64).reshape(-1, 3), CAMERA_RADIUS_M, volume
     )
     own = np.zeros(len(cloud), bool) if own is None else own & ~moved
     near &= ~moved & ~own

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 ROOF_MIN_NORMAL_Z = 0.5  # |nz| of a roof
 COVER_GAP_CELLS = 3  # largest gap between points of one roof or crown, in cells of the point spacing
+COVER_GAP_M = 10.0  # gaps between ground, roofs and crowns narrower than twice this are closed as well
 VEHICLE_MARGIN_M = 0.5  # around a vehicle's box, for its shadow in the scan
 MAX_HOLE_M2 = 25.0  # larger holes surrounded by ground, such as courtyards, are not closed
 
@@ -43,12 +44,10 @@ class GroundParams(CompletionParams):
     """Which holes are closed; other settings as of `walls`, but "auto" also closes the holes of streets.
 
     Attributes:
-        cover_gap: metres; gaps between ground, roofs and crowns narrower than twice this are closed as well.
         gap: metres; with a scanner's path, gaps in the ground narrower than twice this are closed, as are holes up to
             25 m2 that are surrounded by ground, and the ground under removed vehicles.
     """
 
-    cover_gap: float = Field(10.0, ge=0, le=50)
     gap: float = Field(1.5, ge=0, le=50)
 
 
@@ -83,7 +82,7 @@ def ground(inputs: Inputs, params: GroundParams, out: Path, report: Report) -> D
             wanted = street_ground(has, vehicle_cells(inputs, raster, terrain.frame), raster.cell, params.gap)
         else:
             cover = np.any([close_gaps(raster.covered(cloud.xyz), COVER_GAP_CELLS) for cloud in above], axis=0)
-            wanted = ndimage.binary_fill_holes(close_gaps(has | cover, params.cover_gap / raster.cell))
+            wanted = ndimage.binary_fill_holes(close_gaps(has | cover, COVER_GAP_M / raster.cell))
         report(0.3, "membrane")
         field = fill_membrane(known, np.asarray(wanted))
         new = np.isfinite(field[..., 0]) & ~dilate(has, 1.5)

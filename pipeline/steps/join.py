@@ -9,17 +9,18 @@ from pydantic import Field
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.tile_cell import TileCell
 
+BLEND_DISTANCE_M = 0.5
+"""Distance from the border over which the surface is blended to the new height."""
+
 
 class JoinParams(Params):
     """How far a border may be moved to meet the neighbour's; of two tiles, the first by name keeps its border.
 
     Attributes:
         tolerance: maximum displacement of a vertex in metres; if the neighbour's border is farther away, it is kept.
-        blend_distance: distance from the border in metres over which the surface is blended to the new height.
     """
 
     tolerance: float = Field(0.3, ge=0.001, le=10)
-    blend_distance: float = Field(0.5, ge=0.001, le=100)
     context: TileCell
 
 
@@ -35,7 +36,7 @@ def join(inputs: Inputs, params: JoinParams, out: Path, report: Report) -> Done:
     for name in sorted(params.context.neighbours):
         if f"mesh.{name}" in inputs:
             clips[name] = Clipped.load(inputs[f"mesh.{name}"], inputs[f"on.{name}"])
-    joined = join_mesh(params.context.name, clips, params.tolerance, params.blend_distance)
+    joined = join_mesh(params.context.name, clips, params.tolerance, BLEND_DISTANCE_M)
     joined.mesh.save(out / "mesh.npz")
     facts = {"faces_in": len(clips[params.context.name].mesh), "faces": len(joined.mesh), "turned": joined.turned}
     missing = sorted(name for name in params.context.neighbours if name < params.context.name and name not in clips)

@@ -6,28 +6,27 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
 
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.tile_cell import TileCell
 from scan2sim.pipeline.core.types import F32, F64, U8, PointCloud
 
 CANOPY_CELL_M = 0.25
+MIN_HEIGHT_M = 0.4
+"""Minimum height of a plant above the ground."""
+MIN_TOP_DISTANCE_M = 1.5
+"""Minimum distance between the tops of two plants."""
 
 
 class PlantsParams(Params):
     """Detection of plants.
 
     Attributes:
-        min_height: minimum height above the ground in metres.
-        min_distance: minimum distance between the tops of two plants in metres.
         models: whether the world shows low-poly trees and bushes if vegetation is only listed (`split.vegetation` is
             "locations").
         context: the tile's cell, if it has neighbours; plants outside it belong to them.
     """
 
-    min_height: float = Field(0.4, ge=0.01, le=100)
-    min_distance: float = Field(1.5, ge=0.1, le=1000)
     models: bool = True
     context: TileCell | None = None
 
@@ -44,7 +43,7 @@ def plants(inputs: Inputs, params: PlantsParams, out: Path, report: Report) -> D
     from scan2sim.pipeline.terrain import low_poly_plants
 
     cloud, ground = PointCloud.load(inputs["vegetation"]), PointCloud.load(inputs["terrain"])
-    found, crown = crowns(cloud.xyz, ground.xyz, params) if len(cloud) else (np.empty((0, 5)), np.empty(0, int))
+    found, crown = crowns(cloud.xyz, ground.xyz) if len(cloud) else (np.empty((0, 5)), np.empty(0, int))
     colour = _colours(cloud, crown, len(found))
     if params.context:
         cell = params.context.cell
@@ -85,7 +84,7 @@ def _colours(cloud: PointCloud, crown: npt.NDArray[np.int_], count: int) -> U8:
     return np.rint(colour).astype(np.uint8)
 
 
-def crowns(xyz: F32, ground: F32, params: PlantsParams) -> tuple[F64, npt.NDArray[np.int_]]:
+def crowns(xyz: F32, ground: F32) -> tuple[F64, npt.NDArray[np.int_]]:
     """Plants (P, 5): x, y, z of the base, height, crown radius, local metres; and (N,) plant of each point, or -1."""
     from scipy import ndimage
     from scipy.spatial import cKDTree
@@ -105,9 +104,9 @@ def crowns(xyz: F32, ground: F32, params: PlantsParams) -> tuple[F64, npt.NDArra
     else:
         base[filled] = xyz[:, 2].min()
     height = np.where(filled, canopy - base, 0.0)
-    smooth = ndimage.gaussian_filter(height, params.min_distance / CANOPY_CELL_M / 4)
-    size = max(3, round(params.min_distance / CANOPY_CELL_M) | 1)
-    top = (smooth == ndimage.maximum_filter(smooth, size)) & (height > params.min_height)
+    smooth = ndimage.gaussian_filter(height, MIN_TOP_DISTANCE_M / CANOPY_CELL_M / 4)
+    size = max(3, round(MIN_TOP_DISTANCE_M / CANOPY_CELL_M) | 1)
+    top = (smooth == ndimage.maximum_filter(smooth, size)) & (height > MIN_HEIGHT_M)
     markers, count = ndimage.label(top)
     levels = np.clip((smooth.max() - smooth) / max(smooth.max(), 1e-6) * 65535, 0, 65535).astype(np.uint16)
     background = ~filled

@@ -23,6 +23,7 @@ CUBE_SCALE = 1.02  # the octree's cube must be a little larger than the cloud
 MAX_DEPTH = 16
 ALIGNMENT_CELLS = 128  # octrees aligned to multiples of this many finest cells agree where tiles and blocks overlap
 MARGIN_CELLS = 48  # by which a block's points extend beyond it: 2.4 m at a voxel of 10 cm
+POINT_WEIGHT = 4.0  # of the positions (screening); 0 would be the unscreened method
 
 
 class PoissonParams(Params):
@@ -33,7 +34,6 @@ class PoissonParams(Params):
             voxel than with the half voxels of D3.2, in half the time.
         depth: depth of the octree; unset: chosen so that the finest cell has the size `cell` for any length of the tile
             (11, as in D3.2, at 100 m and 5 cm).
-        point_weight: weight of the points' positions (screening); 0 is the unscreened method.
         block_points: number of points up to which the surface is reconstructed as a whole, by default any; larger
             clouds are divided into blocks that don't have more points, if they extend far enough.
         threads: number of blocks that are solved at the same time, each on one thread; 0: one per core. The result is
@@ -44,7 +44,6 @@ class PoissonParams(Params):
 
     cell: float = Field(0.5, ge=0.1, le=10)
     depth: int | None = Field(None, ge=4, le=MAX_DEPTH)
-    point_weight: float = Field(4.0, ge=0, le=1000)
     block_points: int = Field(1_000_000_000, ge=1000, le=1_000_000_000)
     threads: int = Field(0, ge=0, le=256)
     timeout: Seconds = 3600.0
@@ -151,7 +150,7 @@ def _solve(
         chosen = [problems[i]._replace(depth=problems[i].depth - coarser) for i in numbers]
         try:
             target = "scan2sim.pipeline.steps.poisson:reconstruct"
-            found: list[Surface] = sandbox.call(target, chosen, params.point_weight, timeout=params.timeout, threads=1)
+            found: list[Surface] = sandbox.call(target, chosen, timeout=params.timeout, threads=1)
         except StepError as error:
             return error
         return found
@@ -205,7 +204,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def reconstruct(problems: list[Problem], point_weight: float) -> list[Surface]:
+def reconstruct(problems: list[Problem]) -> list[Surface]:
     """Screened Poisson surface of each block by Open3D, on one thread: several threads give results that vary."""
     import open3d as o3d
 
@@ -214,7 +213,7 @@ def reconstruct(problems: list[Problem], point_weight: float) -> list[Surface]:
         points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(problem.xyz.astype(np.float64)))
         points.normals = o3d.utility.Vector3dVector(problem.normal.astype(np.float64))
         mesh, density = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
-            points, depth=problem.depth, scale=problem.scale, point_weight=point_weight, n_threads=1
+            points, depth=problem.depth, scale=problem.scale, point_weight=POINT_WEIGHT, n_threads=1
         )
         vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.triangles, np.int32)
         surface = Surface(vertices, faces, np.asarray(density, np.float32) + problem.finer)

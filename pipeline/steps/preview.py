@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 CALLBACK = b"scan2simWorld"  # JavaScript function of the report's viewer that receives the GLB
 SPLATS_CALLBACK, SPLATS_SCRIPT = "scan2simSplats", "splats_data.js"  # and the function and script of the splats
+JPEG_QUALITY = 85  # of the texture pages
 
 
 class PreviewParams(Params):
@@ -28,13 +29,11 @@ class PreviewParams(Params):
     Attributes:
         megapixels: maximum size of all texture pages together; larger ones are scaled down.
         triangles: maximum number of triangles; larger worlds get no preview.
-        jpeg_quality: JPEG quality of the texture pages.
         splats: maximum number of splats; if there are more, the preview shows surfaces only.
     """
 
     megapixels: float = Field(32.0, ge=0.1, le=1000)
     triangles: int = Field(2_000_000, ge=0, le=20_000_000)
-    jpeg_quality: int = Field(85, ge=1, le=100)
     splats: int = Field(1_000_000, ge=0, le=3_000_000)
 
 
@@ -60,7 +59,7 @@ def preview(inputs: Inputs, params: PreviewParams, out: Path, report: Report) ->
     folder.mkdir()
     packed = out / "world.glb"
     shown = [group_surface(group, surface) for group, surface in surfaces.items()]
-    glb.write(packed, shown, GlbParams(jpeg_quality=params.jpeg_quality, glb_bare=True, reflectance=False), scale=scale)
+    glb.write(packed, shown, GlbParams(jpeg_quality=JPEG_QUALITY, glb_bare=True, reflectance=False), scale=scale)
     report(0.7, "camera poses")
     script = folder / "world.js"
     script.write_bytes(CALLBACK + b'("' + base64.b64encode(packed.read_bytes()) + b'");\n')

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from scan2sim.pipeline.geometry.height_map import Raster
 
 POINT_SPACING_M = 0.2  # of synthesized walls
+MIN_HEIGHT_M = 0.5  # of a wall; lower steps are left open
 FOUNDATION_M = 0.3  # depth to which walls extend into the ground
 NEIGHBOUR_ROOF_CELLS = (1.5, 2.5, 3.5)  # distances from a roof's side at which a lower roof is searched
 SCANNED_WALL_SPACINGS = 1.5  # no point is synthesized within this many point spacings of a scanned one
@@ -30,14 +31,12 @@ class WallsParams(CompletionParams):
     """Which walls are synthesized; other settings as of `ground`.
 
     Attributes:
-        min_height: minimum height of a wall in metres; lower steps are left open.
         min_area: minimum area of a roof in m2; smaller ones (chimneys) belong to the roof around them.
         step: height difference between neighbouring cells in metres above which they belong to different roofs.
         tolerance: maximum distance in metres between a straight side and the roof's outline (at least one cell of the
             point spacing).
     """
 
-    min_height: float = Field(0.5, ge=0.01, le=100)
     min_area: float = Field(4.0, ge=0.01, le=10_000)
     step: float = Field(1.0, ge=0.01, le=100)
     tolerance: float = Field(0.5, ge=0.01, le=10)
@@ -74,7 +73,7 @@ def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Don
         given = _footprints(inputs, building)
         if given:
             places = OutlinePoints.along(given, POINT_SPACING_M)
-            parts.append(heights.columns(places, 0, params.min_height))
+            parts.append(heights.columns(places, 0))
         count = 0
         for k in range(1, int(component.max()) + 1):
             report(0.2 + 0.6 * k / component.max(), f"roof {k} of {component.max()}")
@@ -83,7 +82,7 @@ def walls(inputs: Inputs, params: WallsParams, out: Path, report: Report) -> Don
             if given:
                 places = _without_footprint(places, OutlinePoints.along(given, POINT_SPACING_M).xy)
             count += sum(map(len, found))
-            parts.append(heights.columns(places, k, params.min_height))
+            parts.append(heights.columns(places, k))
         xyz = np.concatenate([np.zeros((0, 3)), *(part[0] for part in parts)])
         normal = np.concatenate([np.zeros((0, 3)), *(part[1] for part in parts)])
         made = _cloud(xyz, normal, building, params)
@@ -113,7 +112,7 @@ class WallHeights:
         self._places = raster.centres(self._known)
         self._floor, self._floor_z = cKDTree(floor[:, :2]), floor[:, 2].astype(np.float64)
 
-    def columns(self, places: OutlinePoints, roof: int, min_height: float) -> tuple[F64, F64]:
+    def columns(self, places: OutlinePoints, roof: int) -> tuple[F64, F64]:
         """Points (N, 3) and normals of the walls at outline points `places`; `roof`: number of the roof, 0: any."""
         from scipy import ndimage
         from scipy.spatial import cKDTree
@@ -139,7 +138,7 @@ class WallHeights:
             at = places.side == side
             if at.sum() > 4 and np.isfinite(high[at]).all():
                 high[at] = ndimage.median_filter(high[at], size=5, mode="nearest")
-        rises = np.flatnonzero(np.isfinite(high) & (high - low >= min_height + FOUNDATION_M))
+        rises = np.flatnonzero(np.isfinite(high) & (high - low >= MIN_HEIGHT_M + FOUNDATION_M))
         count = np.ceil((high[rises] - low[rises]) / POINT_SPACING_M).astype(np.int64)
         which = np.repeat(rises, count)
         level = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)

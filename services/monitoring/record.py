@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from scan2sim.services.monitoring.meter import Flow, Reading
 from scan2sim.services.transport.types import Endpoint
@@ -128,7 +128,7 @@ class Record(_Model):
     cpu_percent: float = Field(alias="cpu percent")
     virtual_memory: dict[str, float] = Field(alias="virtual memory")
     disk_usage: list[float] = Field(alias="disk usage")
-    warnings: list[str] = Field([], validation_alias=AliasChoices("warnings", "remarks"))  # earlier name
+    warnings: list[str] = []
     dropped: int = Field(0, alias="dropped records")
     dropped_by: dict[str, int] = Field({}, alias="dropped by kind")
 

@@ -37,10 +37,6 @@ class QoS:
     lease: int = INFINITE
 
 
-SENSOR_DATA = QoS(reliability="BEST_EFFORT", depth=5)
-"""ROS 2's profile for sensor data: best effort, small depth."""
-
-
 def as_qos(qos: QoS | int) -> QoS:
     """Convert a history depth to the default profile with that depth, as in rclpy."""
     return QoS(depth=qos) if isinstance(qos, int) else qos

@@ -34,7 +34,7 @@ class Information:
         freedom: degrees of freedom of these errors.
     """
 
-    STATE = ("blocks", "squares", "freedom", "_told", "_until")
+    STATE = ("blocks", "squares", "freedom", "_added", "_until")
 
     def __init__(self, width: int) -> None:
         """`width`: number of consecutive keyframes that may observe a common point."""
@@ -42,11 +42,11 @@ class Information:
         self.blocks: list[F64] = []
         self.squares, self.freedom = 0.0, 0
         # ids of added points, and for each the last keyframe whose observation was included
-        self._told, self._until = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        self._added, self._until = np.zeros(0, np.int64), np.zeros(0, np.int64)
 
     def not_added(self, ids: I64, keyframe: int) -> I64:
         """Those of the points (N,) whose observation by a keyframe isn't included yet."""
-        return ids[~np.isin(ids, self._told[self._until >= keyframe])]
+        return ids[~np.isin(ids, self._added[self._until >= keyframe])]
 
     def add(self, which: Sequence[int], ids: I64, reduced: F64, errors: F64) -> None:
         """Add the information of marginalized points.
@@ -65,7 +65,7 @@ class Information:
         self.squares += float((errors**2).sum())
         self.freedom += max(2 * len(errors) - 3 * len(ids), 0)
         alive = self._until > which[0]
-        self._told = np.concatenate([self._told[alive], ids])
+        self._added = np.concatenate([self._added[alive], ids])
         self._until = np.concatenate([self._until[alive], np.full(len(ids), which[-1])])
 
     def rescale(self, first: int, factor: float) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.step import Report, silent
-from scan2sim.pipeline.core.types import U8
 from scan2sim.slam.features import FeatureSet
 from scan2sim.slam.mapping.local_map import Keyframe, Landmarks
 from scan2sim.slam.odometry.checkpoint import InvalidCheckpoint, load, save
@@ -85,7 +84,6 @@ def track(
     until: float | None = None,
     log: TrackLog | None = None,
     state: Path | None = None,
-    watch: Callable[[Odometry, U8], None] | None = None,
     report: Report = silent,
 ) -> Run:
     """Run odometry over a video.
@@ -95,9 +93,8 @@ def track(
         start: creates the odometry; its argument receives warnings.
         every: process every Nth frame.
         until: seconds of the video after which to stop.
-        log: frames whose features were tracked before, and are replayed: images are only read for `watch`.
+        log: frames whose features were tracked before, and are replayed, without reading images.
         state: checkpoint file, written every minute; if it exists, the run resumes from it.
-        watch: called with odometry and image after each frame.
         report: receives progress.
 
     Raises:
@@ -109,15 +106,13 @@ def track(
     if log is not None:
         run.warnings.extend(log.warnings)
     read = video.frames(every=every, warn=run.warnings.append)
-    for frame in read if log is None or watch is not None else log.frames():
+    for frame in read if log is None else log.frames():
         if frame.time <= last:
             continue
         if until is not None and frame.time > until:
             break
         run.odometry.add(frame.time, frame.grey)
         run.names.append(frame.name)
-        if watch is not None:
-            watch(run.odometry, frame.grey)
         if video.count:
             report(min(1.0, frame.number / video.count), f"{len(run.names)} frames")
         if state is not None and clock.perf_counter() - saved > CHECKPOINT_INTERVAL_S:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,7 +12,6 @@ from scan2sim.pipeline.camera.lens import GIVEN_SIGMA, LENS_MODELS
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.blas_threads import one_blas_thread
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.parameters import Focal, Pixels, Rate, Shift
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import U8, Camera, GpsTrack
@@ -27,7 +25,6 @@ from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 from scan2sim.slam.odometry.track_log import RecordingTracker, Replay, TrackLog, record_tracks
 from scan2sim.slam.odometry.video_odometry import VERSION, Run, track
 from scan2sim.slam.trackers import Tracker
-from scan2sim.slam.tracking_video import Recorder
 from scan2sim.slam.trajectory.gps import smooth
 from scan2sim.slam.video import Video, open_video
 from scan2sim.slam.virtual_cameras import VirtualViews
@@ -91,13 +88,8 @@ class TrackContext(Context):
 
 
 class TrackParams(OdometryParams, Filmed):
-    """Settings of the step, besides those of `Filmed` and `OdometryParams`.
+    """Settings of the step: those of `Filmed` and `OdometryParams`."""
 
-    Attributes:
-        view: record a video of the tracked features and the path.
-    """
-
-    view: bool = False
     context: TrackContext = TrackContext()
 
 
@@ -118,7 +110,7 @@ def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, 
     camera, estimated = video_camera(video, params, track_log, checkpoint / "lens.json")
     warnings: list[str] = []
     gps = read_gps(video, inputs.get("gps"), params.gps_offset, warnings.append)
-    description, view = "", out / "view.mp4"
+    description = ""
 
     log_file, refinement = checkpoint / "tracks.bin", checkpoint / "refined.json"
     refine = camera.model in LENS_MODELS and not params.fixed_lens and (estimated is None or not estimated.final)
@@ -136,11 +128,10 @@ def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, 
                 keep=params.context.keep, warn=warn, tracker=recorder or tracker,
             )  # fmt: skip
 
-        with Recorder(view, fps=video.fps / params.every) if params.view else nullcontext() as film:
-            run = track(
-                video, start, every=params.every, until=params.until or None, log=log, state=checkpoint / "state.npz",
-                watch=film, report=report,
-            )  # fmt: skip
+        run = track(
+            video, start, every=params.every, until=params.until or None, log=log, state=checkpoint / "state.npz",
+            report=report,
+        )  # fmt: skip
         if recorder is not None and not run.odometry.losses:  # tracks end where tracking is lost
             recorder.finish([p.time for p in run.odometry.placed], run.names, run.warnings)
         return run
@@ -171,11 +162,8 @@ def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, 
     wrong_lens = None if params.calibrate else _lens_warning(estimated, run.odometry, track_log)
     warnings = [*([estimated.message()] if estimated else []), *warnings, *([wrong_lens] if wrong_lens else [])]
     files = {"map": MapCheckpoint.of(run.odometry, run.names).write(out / "map.npz")}
-    views = {"view": view} if params.view else {}
     metrics = run.metrics() | ({"summary": description} if description else {})
-    return Done(
-        files | views, metrics | (estimated.metrics() if estimated else {}), [*warnings, *dict.fromkeys(run.warnings)]
-    )
+    return Done(files, metrics | (estimated.metrics() if estimated else {}), [*warnings, *dict.fromkeys(run.warnings)])
 
 
 def refined_camera(camera: Camera, given: EstimatedCamera | None, odometry: Odometry) -> EstimatedCamera | None:
@@ -216,8 +204,6 @@ def can_track(params: TrackParams) -> None:
     if params.features != "corners":
         plugins.find(features.__name__, params.features, "track.features")
         plugins.find(matchers.__name__, params.matcher, "track.matcher")
-    if params.view:
-        require("--view", "av")
 
 
 def video_camera(

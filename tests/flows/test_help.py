@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from scan2sim.flows.cli import COMMANDS, PANELS, loaded, main
-from scan2sim.flows.pipelines.renamed import OPTIONS
+from scan2sim.flows.cli import COMMANDS, PANELS, loaded
 from tests.conftest import ROOT
 
 HELP_WITHOUT_EXTRAS = """
@@ -55,26 +54,6 @@ def test_every_command_and_option_has_help(name: str) -> None:
         assert command.help, full_name
         for parameter in command.params:
             assert parameter.help, f"{full_name}: {parameter.name}"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "option"), [("tile x --out y --reach=20", "--reach"), ("monitor topic /a --spool b", "--spool")]
-)
-def test_earlier_name_of_an_option_is_rejected_with_the_new_one(
-    arguments: str, option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["scan2sim", *arguments.split()])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
-    assert f"{option}: this option was renamed" in (printed := capsys.readouterr().err)
-    assert f"Write `{OPTIONS[arguments.split()[0]][option]}`" in printed
-
-
-def test_every_current_option_of_the_table_exists() -> None:
-    for name, options in OPTIONS.items():
-        known = {o for _, command in all_commands(name, loaded(name)) for p in command.params for o in p.opts}
-        assert set(options.values()) <= known and not set(options) & known
 
 
 def test_help_needs_no_optional_package() -> None:

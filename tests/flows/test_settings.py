@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 from scan2sim.flows.cli import COMMANDS, app, loaded
 from scan2sim.flows.commands.option_ranges import NumericOptions
-from scan2sim.flows.pipelines import renamed
 from scan2sim.flows.pipelines.bag import BagSource
 from scan2sim.flows.pipelines.images import Images
 from scan2sim.flows.pipelines.settings import Settings
@@ -103,37 +102,6 @@ def test_values_out_of_range_are_rejected(text: str) -> None:
     step = next(s for s in STEPS if s.name == text.split(".")[0])
     with pytest.raises(SettingError, match=text.split("=")[0]):
         settings.params(step, "terrain")
-
-
-@pytest.mark.parametrize(
-    ("text", "name"),
-    [
-        ("carve.reach=20", "dynamic_objects.max_range"),
-        ("agreement.sky=false", "photo_consistency.sky"),
-        ("visibility.lacking=0.3", "visibility.mesh_distance"),
-        ("choose.building.max_distance=20", "view_selection.building"),
-        ("slam.features=300", "track.count"),
-        ("slam.gps_chords='none'", "track.gps_distances"),
-    ],
-)
-def test_an_earlier_name_is_rejected_with_the_new_one(text: str, name: str, tmp_path: Path) -> None:
-    path, value = text.split("=")
-    step, param = path.rsplit(".", 1)
-    (tmp_path / "s.toml").write_text(f"[{step}]\n{param} = {value}\n", encoding="utf-8")
-    for settings in (Settings.read(None, [text]), Settings.read(tmp_path / "s.toml")):
-        with pytest.raises(SettingError, match="was renamed") as caught:
-            settings.check(STEPS)
-        assert f"Write `{name}" in str(caught.value)
-
-
-def test_every_current_name_of_the_table_exists() -> None:
-    fields = {step.name: step.params.settings() for step in STEPS}
-    assert set(renamed.STEPS.values()) <= set(fields) and not set(renamed.STEPS) & set(fields)
-    for step, names in renamed.SETTINGS.items():
-        if step in renamed.STEPS:
-            assert set(names.values()) <= set(fields[renamed.STEPS[step]])
-            continue
-        assert set(names.values()) <= set(fields[step]) and not set(names) & set(fields[step])
 
 
 @pytest.mark.parametrize("text", ['["gazebo", "mujoco"]', "[gazebo,mujoco]", "[gazebo, mujoco]", "['gazebo','mujoco']"])

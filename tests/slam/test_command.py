@@ -22,7 +22,6 @@ from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.pipelines.video import Video, build_graph
 from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.core.errors import InputError, LowConfidenceError, ScanError, exit_code
-from scan2sim.pipeline.core.types import U8
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 from scan2sim.slam.odometry.video_odometry import VERSION, track
@@ -75,14 +74,13 @@ def test_mostly_unsure_path_has_its_own_exit_code(corridor: Drive, tmp_path: Pat
 
 def test_changed_georeferencing_reuses_cached_tracking(corridor: Drive, tmp_path: Path) -> None:
     options = ("slam", corridor.folder / "video.mp4", "--out", tmp_path, "--set", "track.count=300", "--until", "0.5")
-    command(*options, "--view")
-    first = {path: path.stat().st_mtime_ns for path in tmp_path.glob("steps/track/*/*")}
-    assert first and (tmp_path / "view.mp4").is_file()
-    said = command(*options, "--view", "--local").output
-    assert "1 of 2 results reused" in said.replace("\n", " ")
-    assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("steps/track/*/*")} == first
     command(*options)
-    assert not (tmp_path / "view.mp4").exists(), "files of an earlier run remain"
+    first = {path: path.stat().st_mtime_ns for path in tmp_path.glob("steps/track/*/*")}
+    (tmp_path / "odometry.csv").write_text("of a run with --loops", encoding="utf-8")
+    said = command(*options, "--local").output
+    assert first and "1 of 2 results reused" in said.replace("\n", " ")
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("steps/track/*/*")} == first
+    assert not (tmp_path / "odometry.csv").exists(), "files of an earlier run remain"
 
 
 def test_colmap_model_has_small_reprojection_errors(done: tuple[Path, str]) -> None:
@@ -112,12 +110,12 @@ def test_resumed_run_has_the_same_result(
         tracker, _ = tracker_of(corridor.camera, None, params, {})
         return Odometry(corridor.camera, params, tracker=tracker, keep=True, warn=warn)
 
-    def interrupt(odometry: Odometry, grey: U8) -> None:
-        if len(odometry.placed) == 20:
+    def interrupt(fraction: float, message: str = "") -> None:
+        if message == "20 frames":
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        track(video, start, state=state, watch=interrupt)
+        track(video, start, state=state, report=interrupt)
     resumed = track(video, start, state=state)
     whole = track(video, start)
     assert resumed.names == whole.names

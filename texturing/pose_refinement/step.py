@@ -49,6 +49,8 @@ DEPTH_MAP_SCALE = 0.5
 MOVABLE_MARGIN_PX, MOVABLE_DEPTH_TOLERANCE_M = 3, 0.5
 """Pixels of the depth map around movable objects that are not used, and metres that an object may lie behind the
 surface and still count as visible."""
+MIN_GAIN_PX = 0.1
+"""Smallest decrease of the median displacement, in pixels of photos scaled to 0.5 MP, for poses to be changed."""
 
 
 class PoseRefinementParams(Params):
@@ -56,8 +58,6 @@ class PoseRefinementParams(Params):
 
     Attributes:
         when: "auto": if there are photos taken from the ground; "never": keep the given poses.
-        min_gain_px: smallest decrease of the photos' median displacement, in pixels of photos scaled to 0.5 MP, for
-            poses to be changed.
         shift: expected error of a photo's position in metres.
         rotation: expected error of a photo's rotation in milliradians.
         camera_shift: expected error of a camera's position on the vehicle in metres.
@@ -69,7 +69,6 @@ class PoseRefinementParams(Params):
     """
 
     when: Literal["auto", "never"] = "auto"
-    min_gain_px: float = Field(0.1, ge=0, le=100)
     shift: Distance = 0.05
     rotation: float = Field(3.0, gt=0, le=200)
     camera_shift: Distance = 0.05
@@ -107,9 +106,7 @@ def pose_refinement(inputs: Inputs, params: PoseRefinementParams, out: Path, rep
     at = now.apply(poses, camera)
     after = bundle_adjustment.displacement(found, now.lenses(cameras, camera), at)
     moved = (
-        len(after) >= MIN_MATCHES
-        and bool(np.any(at != poses))
-        and _median(first[1]) - _median(after) >= params.min_gain_px
+        len(after) >= MIN_MATCHES and bool(np.any(at != poses)) and _median(first[1]) - _median(after) >= MIN_GAIN_PX
     )
     if moved:
         lenses = now.lenses([view.camera for view in photos], camera)
@@ -150,7 +147,7 @@ def _refined(
         found = _matched(posed, lenses, grey_photos, surface, movable, params)
         before = bundle_adjustment.displacement(found, lenses, at)
         first = first or (found, before)
-        if len(before) < MIN_MATCHES or _median(before) <= params.min_gain_px:
+        if len(before) < MIN_MATCHES or _median(before) <= MIN_GAIN_PX:
             break
         report((turn + 0.8) / MAX_ROUNDS, "solving")
         now = bundle_adjustment.solve(found, given, poses, now, camera, order, priors)

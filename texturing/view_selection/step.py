@@ -29,20 +29,20 @@ PANEL_SIDE_MIN_COS = 0.99
 """Cosine of the angle between neighbouring faces on one side of a sign panel."""
 PIXEL_COUNT_RATIO_MIN = 0.16
 """Smallest number of pixels that a photo has on a sign panel, relative to the photo with most pixels, to be used."""
+VIEWS_PER_FACE_MAX = 8
+"""Number of photos from which the low frequencies of a triangle are blended."""
 
 
 class ViewSelectionParams(Params):
     """Settings of the view selection.
 
     Attributes:
-        views_per_face: maximum number of photos from which the low frequencies of a triangle are blended.
         smoothness: cost of a seam relative to a photo's quality; 0: each triangle uses its own best photo.
         max_distance: metres from the camera beyond which a photo is not used.
         min_cos: cosine of the angle between surface normal and viewing ray below which a photo is not used.
         bias: metres that a surface may lie behind the depth map and still count as visible.
     """
 
-    views_per_face: int = Field(8, ge=1, le=32)
     smoothness: float = Field(0.3, ge=0, le=1000)
     max_distance: Distance = 100.0
     min_cos: Cosine = 0.02
@@ -87,7 +87,7 @@ def choose_views(
     from scan2sim.texturing.view_selection.candidates import Candidates
     from scan2sim.texturing.view_selection.mrf import detail_views
 
-    best = Candidates(mesh.corners, mesh.face_normal, params.views_per_face)
+    best = Candidates(mesh.corners, mesh.face_normal, VIEWS_PER_FACE_MAX)
     for done, i in enumerate(usable):
         report(0.7 * done / len(usable), views[i].name)
         best.add_view(

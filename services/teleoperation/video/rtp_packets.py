@@ -14,8 +14,6 @@ HEADER = struct.Struct(">BBHII HHBqBH BBH")
 """RTP header (12 bytes), header extension with capture time and encoding delay (16), VP8 payload descriptor (4)."""
 PAYLOAD_MAX_BYTES = 1150
 """Maximum payload: with headers, SRTP, UDP and IP below 1280 bytes, the minimum MTU of IPv6."""
-RTP_CLOCK_HZ = 90_000
-"""Clock rate of RTP timestamps of video."""
 _VERSION, _TYPE, _LAST = 0x90, 96, 0x80
 _PROFILE, _EXTENSION_WORDS, _CAPTURE_ID, _DELAY_ID = 0xBEDE, 3, 0x17, 0x21
 _DELAY_UNIT_NS = 100_000

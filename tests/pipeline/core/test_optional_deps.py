@@ -78,7 +78,6 @@ USES = {
         "run TILE --set texture.device=cuda", "run TILE --set label.network=segformer", "segment train .",
         "slam FRAMES --backend adam", "slam FRAMES --features superpoint", "slam FRAMES --features aliked",
         "slam FRAMES --features orb --matcher superglue", "slam FRAMES --features orb --matcher lightglue",
-        "slam study FRAMES --truth truth.csv --backend adam",
     ],
     "safetensors": ["segment train .", "slam FRAMES --features superpoint", "run TILE --set label.network=segformer"],
     "transformers": [
@@ -87,8 +86,8 @@ USES = {
         "slam FRAMES --features orb --matcher lightglue",
     ],
     "onnx": ["segment train ."],
-    "av": ["slam video.mp4", "slam FRAMES --view", "slam FRAMES --gps video.mp4", "view world --film flight.mp4"],
-    "matplotlib": ["slam evaluate truth.csv truth.csv", "slam study FRAMES --truth truth.csv"],
+    "av": ["slam video.mp4", "slam FRAMES --gps video.mp4", "view world --film flight.mp4"],
+    "matplotlib": ["slam evaluate truth.csv truth.csv"],
     "pycolmap": ["slam FRAMES --adjust", "import images FRAMES"],
     "kiss_icp": ["import sweeps FRAMES"],
     "pymeshlab": ["run TILE --set decimate.backend=pymeshlab"],

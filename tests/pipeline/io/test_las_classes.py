@@ -171,7 +171,7 @@ def test_geotiff_keys_become_wkt_with_their_heights(tmp_path: Path) -> None:
 
 
 def test_earlier_results_are_replaced_and_clashing_names_are_changed(tmp_path: Path) -> None:
-    for extra in ("confidence", "told_from", "gps_time"):
+    for extra in ("confidence", "gps_time"):
         source = made(tmp_path / f"{extra}.las", 2, extra=extra)
         write_classified(source, tmp_path / "b.laz", *result_columns())
         new, old = laspy.read(tmp_path / "b.laz"), laspy.read(source)

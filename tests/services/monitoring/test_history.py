@@ -64,12 +64,6 @@ def test_unknown_values_are_null() -> None:
     assert node["latency"]["mean"] == node["lost"]["mean"] == [None]
 
 
-def test_warnings_under_their_earlier_name_are_read() -> None:
-    earlier = body("a", START, warnings=["limit exceeded"]).replace(b'"warnings"', b'"remarks"')
-    (node,) = history_of(earlier).state()["nodes"]
-    assert node["warnings"] == ["limit exceeded"]
-
-
 def test_record_covers_its_period_and_no_longer() -> None:
     found = window(history_of(body("a", START + 4.5, period=3.0), body("a", START + 20.5, period=3.0)), 21)
     known = [value is not None for value in found["nodes"][0]["bandwidth"]["mean"]]

@@ -79,7 +79,7 @@ def test_available_encoder_of_lowest_rank_is_chosen(monkeypatch: pytest.MonkeyPa
 def test_unknown_encoder_lists_available_ones(name: str) -> None:
     with pytest.raises(SettingError, match="unknown value") as caught:
         encoders.find(name)
-    assert caught.value.remedy == "Choose one of: gstreamer, pyav"
+    assert caught.value.remedy == "Choose one of: pyav"
 
 
 def test_invalid_data_decodes_to_none() -> None:

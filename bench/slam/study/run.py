@@ -1,4 +1,4 @@
-"""`scan2sim slam study`: influence of resolution, bit rate and frame rate on the error (D3.2, tables 4 and 5)."""
+"""Runs the compression study: the cells of its tables, of which finished ones are cached, and writes the tables."""
 
 from __future__ import annotations
 
@@ -8,62 +8,27 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
-from scan2sim.flows.commands.display import RunDisplay, console, warn
-from scan2sim.flows.commands.log import Log
-from scan2sim.flows.commands.run_with_progress import execute_with_progress
-from scan2sim.flows.engine.execution import limit_cores
+from bench.slam.study.cells import Cell, Study, build_graph, cells, rejection, segments_of, truth_length
+from bench.slam.study.encode import can_encode
+from bench.slam.study.evaluate import EVALUATE
+from bench.slam.study.tables import Result, Tables, missing_segments, summary, write
+from scan2sim.flows.engine.execution import execute, limit_cores
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import STORE, PlannedTask, plan
-from scan2sim.flows.engine.progress import PublishedRun, published
 from scan2sim.flows.engine.ready_queue import Event
 from scan2sim.flows.pipelines.graph import Task
 from scan2sim.flows.pipelines.settings import Settings
-from scan2sim.flows.pipelines.study import Cell, Study, build_graph, cells, rejection, segments_of, truth_length
-from scan2sim.flows.reports.study import Result, Tables, missing_segments, summary, write
 from scan2sim.pipeline.core.cache import Digests, Store
-from scan2sim.pipeline.core.errors import SettingError, SpaceError
-from scan2sim.slam.steps.encode import can_encode
-from scan2sim.slam.steps.evaluate import EVALUATE
+from scan2sim.pipeline.core.errors import SpaceError
 from scan2sim.slam.steps.track import TRACK, can_track
 from scan2sim.slam.trajectory.evaluate import read_truth
 
-T = TypeVar("T", int, float)
 WRITE_INTERVAL_S = 20.0
 """Minimum time between two updates of the tables while cells are computed; their plot takes a second."""
 
 
-def study_compression(
-    source: Path, out: Path, *, truth: Path | None, gps: Path | None, mask: Path | None, heights: str, bitrates: str,
-    rates: str, jobs: int, settings: Settings, bus: str | None = None,
-) -> Path:  # fmt: skip
-    """Run the study and print its table; truth, GPS and mask default to files of the drive's folder.
-
-    Raises:
-        ScanError: see `pipeline.core.errors`.
-    """
-
-    def found(given: Path | None, name: str) -> Path | None:
-        default = source / name
-        return given or (default if source.is_dir() and default.is_file() else None)
-
-    known = found(truth, "truth.csv")
-    if known is None:
-        raise SettingError("--truth", "is missing", "Give a trajectory or a GPS track to compare with")
-    requested = Study.of("", {
-        "source": source, "truth": known, "gps": found(gps, "gps.csv"), "mask": found(mask, "mask.png"),
-        "heights": _numbers("--heights", heights, int), "bitrates": _numbers("--bitrates", bitrates, float),
-        "rates": _numbers("--rates", rates, float),
-    }, remedy="Change the option")  # fmt: skip
-    with published(bus, "slam study", str(source)) as on_bus:
-        table = study(requested, out, settings, jobs, on_bus)
-    console.print(table.read_text(encoding="utf-8"), highlight=False, markup=False, soft_wrap=True)
-    console.print(f"Table: {table}", highlight=False, soft_wrap=True, markup=False)
-    return table
-
-
-def study(requested: Study, out: Path, settings: Settings, jobs: int = 1, bus: PublishedRun | None = None) -> Path:
+def study(requested: Study, out: Path, settings: Settings, jobs: int = 1) -> Path:
     """Run the cells that no earlier run has finished; returns the path of the table of all cells, `out/table.md`.
 
     A cell whose tracking is lost is a result; one that fails is N/A in the table, with its reason. The tables are
@@ -82,17 +47,15 @@ def study(requested: Study, out: Path, settings: Settings, jobs: int = 1, bus: P
         store = Store(out / STORE)
         digests = Digests(store.root / "digests.json")
         planned = plan(tasks, store, digest=digests)
-        log = Log(out / "run.log")
         limit_cores(max(1, len(os.sched_getaffinity(0)) // jobs))
         backend = settings.params(TRACK).backend
         tables = Tables(video, requested.gps is not None, backend, length, segments, cells(requested), {})
         if note := missing_segments(tables):
-            warn(note)
-        progress = _Progress(out, tables, planned, store)
+            print(f"warning: {note}", flush=True)
+        progress = Progress(out, tables, planned, store)
         try:
-            with log.errors(out):
-                outcome = execute_with_progress(planned, store, log, jobs, keep_going=True, bus=bus, display=progress)
-                progress.failed |= {task.group: f"{e.where}: {e.cause}" for task, e in outcome.failed.items()}
+            outcome = execute(planned, store, jobs=jobs, on_event=progress.on_event, keep_going=True)
+            progress.failed |= {task.group: f"{e.where}: {e.cause}" for task, e in outcome.failed.items()}
         finally:
             table = progress.write()
             digests.save()
@@ -100,43 +63,41 @@ def study(requested: Study, out: Path, settings: Settings, jobs: int = 1, bus: P
             if isinstance(error, SpaceError):  # not the fault of a single cell
                 raise error
         store.sweep({item.task.full_name: item.key for item in planned})
+    print(f"{progress.cached} of {len(planned)} results reused from earlier runs", flush=True)
     return table
 
 
-class _Progress(RunDisplay):
+class Progress:
     """Progress of the study by cells, with the time left; writes the tables while it runs.
 
     Attributes:
         failed: why cells failed, by their names.
+        cached: number of results of earlier runs that were reused.
     """
 
     def __init__(self, out: Path, tables: Tables, planned: Sequence[PlannedTask], store: Store) -> None:
-        super().__init__(len(planned), "study", lines=False)
         self.failed: dict[str, str] = {}
+        self.cached = 0
         self._out, self._tables, self._planned, self._store = out, tables, planned, store
         self._left = {cell.name: cell for cell in tables.cells if rejection(cell, tables.video) is None}
         self._total, self._computed = len(self._left), 0.0
         self._began, self._written = time.monotonic(), -math.inf
 
     def on_event(self, task: Task, event: Event, fraction: float, message: str) -> None:
-        """Show an event; print a line for each cell that this run finishes."""
-        super().on_event(task, event, fraction, message)
+        """Count an event; print a line for each cell that this run finishes."""
+        self.cached += (event == "cached") - (event == "again")
         if event == "failed":
             self.failed[task.group] = message
         elif event not in ("done", "cached") or task.step is not EVALUATE:
             return
         cell = self._left.pop(task.group, None)
-        if cell is None:
+        if cell is None or event == "cached":
             return
-        done = f"{self._total - len(self._left)} of {self._total} cells"
-        if event != "cached":
-            self._computed += cell.cost
-            done += self._time_left()
-            result = summary(self._result(cell), self._tables.segments)
-            console.print(f"{cell.label}: {result}; {done}", highlight=False, soft_wrap=True, markup=False)
-            if time.monotonic() - self._written > WRITE_INTERVAL_S:
-                self.write()
-        self.status(done)
+        self._computed += cell.cost
+        done = f"{self._total - len(self._left)} of {self._total} cells{self._time_left()}"
+        print(f"{cell.label}: {summary(self._result(cell), self._tables.segments)}; {done}", flush=True)
+        if time.monotonic() - self._written > WRITE_INTERVAL_S:
+            self.write()
 
     def write(self) -> Path:
         """Write the tables and the plot of the cells that are finished, failed or impossible."""
@@ -165,10 +126,3 @@ class _Progress(RunDisplay):
             return None
         reason = figures.pop("reason", None)
         return Result(figures | {"seconds": round(sum(one.seconds for one in done), 1)}, reason)
-
-
-def _numbers(option: str, text: str, kind: type[T]) -> list[T]:
-    try:
-        return [kind(part) for part in text.split(",")]
-    except ValueError:
-        raise SettingError(option, f"`{text}` isn't a list of numbers", "Write for example 512,1024") from None

@@ -11,6 +11,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, Field
 
+from bench.slam.study.encode import ENCODE
+from bench.slam.study.evaluate import EVALUATE
+from bench.slam.study.video_degradation import scaled
 from scan2sim.flows.pipelines.graph import Output, Task, TaskId
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.pipelines.video import STEPS as VIDEO
@@ -18,14 +21,11 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.step import Params, Step
 from scan2sim.pipeline.core.types import GpsTrack, Trajectory
 from scan2sim.slam.calibration.camera import camera_of
-from scan2sim.slam.steps.encode import ENCODE
-from scan2sim.slam.steps.evaluate import EVALUATE
 from scan2sim.slam.steps.georeference import GEOREFERENCE
 from scan2sim.slam.steps.track import TRACK
 from scan2sim.slam.trajectory.evaluate import distance_along
 from scan2sim.slam.trajectory.gps import smooth
 from scan2sim.slam.video import Video, open_video
-from scan2sim.slam.video_degradation import scaled
 
 STEPS: tuple[Step, ...] = (ENCODE, EVALUATE)
 SEGMENTS_M = (200.0, 400.0)

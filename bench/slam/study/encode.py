@@ -7,12 +7,12 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from bench.slam.study.video_degradation import encode
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.parameters import Rate
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.io.images.video import check_encoder
 from scan2sim.slam.video import open_video
-from scan2sim.slam.video_degradation import encode
 
 Pixels = Annotated[int, Field(ge=2, le=100_000, multiple_of=2)]
 
@@ -51,8 +51,8 @@ def encode_video(inputs: Inputs, params: EncodeParams, out: Path, report: Report
 
 def can_encode(params: Any) -> None:
     """Raise UnavailableError if PyAV or matplotlib isn't installed, or H.264 can't be encoded."""
-    require("slam study", "av", "matplotlib")
-    check_encoder("slam study")
+    require("bench.slam.study", "av", "matplotlib")
+    check_encoder("bench.slam.study")
 
 
 ENCODE = Step("encode", 1, encode_video, EncodeParams, check=can_encode)

@@ -16,9 +16,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from scan2sim.flows.pipelines.study import MIN_TRUTH_SEGMENTS, SEGMENTS_M, Cell
+from bench.slam.study.cells import MIN_TRUTH_SEGMENTS, SEGMENTS_M, Cell
+from bench.slam.study.evaluate import LOST_SHARE_MAX
 from scan2sim.pipeline.io.trajectory import atomic_write
-from scan2sim.slam.steps.evaluate import LOST_SHARE_MAX
 from scan2sim.slam.video import Video
 
 WHOLE_SHARE = 0.995
