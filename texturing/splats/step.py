@@ -14,7 +14,7 @@ from scan2sim.pipeline.core.parameters import Seed
 from scan2sim.pipeline.core.splats import SplatLayer, Splats
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.tile_cell import TileCell
-from scan2sim.pipeline.core.types import Bools, Mesh, PointCloud
+from scan2sim.pipeline.core.types import F32, Bools, Mesh, PointCloud
 from scan2sim.pipeline.io import views as views_io
 
 if TYPE_CHECKING:
@@ -99,8 +99,9 @@ def splats(inputs: Inputs, params: SplatsParams, out: Path, report: Report, chec
     _train(
         training, seen, Schedule(params.epochs, cover=params.cover, depth=params.depth, seed=params.seed), state, report
     )
-    result = _within_cell(training.result(), params.context)
-    SplatLayer(result, training.background.texture, *training.photos(seen)).save(out / SPLATS_FILE)
+    shown, cameras = training.photos(seen)
+    result, shown = _within_cell(training.result(), shown, params.context)
+    SplatLayer(result, training.background.texture, shown, cameras).save(out / SPLATS_FILE)
     metrics = {"photos": len(excluded), "first": first, "splats": len(result)}
     warnings = [] if "labels" in inputs or "instances" in inputs else [UNMASKED]
     return Done({"splats": out / SPLATS_FILE}, metrics, warnings)
@@ -159,12 +160,15 @@ def _begun(
     return Training.of(first, size, first_background(seen), seen) if len(first) else None
 
 
-def _within_cell(found: Splats, context: SplatsContext) -> Splats:
-    """The splats within a tile's cell; all of a tile that is built alone."""
+def _within_cell(found: Splats, photos: F32, context: SplatsContext) -> tuple[Splats, F32]:
+    """The splats within a tile's cell, in the exposure of its borders, and its photos; all of a tile built alone."""
+    from scan2sim.texturing.splats.border_exposure import with_border_exposure
+
     if context.cell is None:
-        return found
-    inside = context.cell.cell.outside(found.xyz[:, :2] + np.asarray(context.origin)[:2]) <= 0
-    return Splats(found.parameters[inside])
+        return found, photos
+    cell, origin = context.cell.cell, np.asarray(context.origin)
+    inside = cell.outside(found.xyz[:, :2] + origin[:2]) <= 0
+    return with_border_exposure(Splats(found.parameters[inside]), photos, cell, origin)
 
 
 def _train(training: Training, seen: Sequence[Shot], schedule: Schedule, state: Path, report: Report) -> None:
@@ -182,4 +186,4 @@ def _train(training: Training, seen: Sequence[Shot], schedule: Schedule, state: 
 
 
 # photos take 30 MB for each megapixel, whatever the size of their files, and are 100 at most by default
-SPLATS = Step("splats", 3, splats, SplatsParams, resumes=True, memory=(4.5, 3))
+SPLATS = Step("splats", 4, splats, SplatsParams, resumes=True, memory=(4.5, 3))
