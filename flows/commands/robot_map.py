@@ -46,7 +46,7 @@ ClassesFromColours = Annotated[
 ]
 SensorPath = Annotated[
     Path | None,
-    typer.Option("--trajectory", help="Robots' maps: path of the sensor in the map's frame (.tum, .csv, .kitti)."),
+    typer.Option("--trajectory", help="Robots' maps: path of the sensor in the map's frame and unit (.tum, .csv)."),
 ]
 
 

@@ -1,7 +1,7 @@
 """Importer of a robot's map: a cloud (or several) in the axes of the sensor at its start, with photos if it is an E57.
 
 The map becomes level, z up and in metres (`pipeline.geometry.upright`); outliers and reflections below the floor are
-removed. A map that is level already keeps its coordinates. `tile.toml` gets the table `[map]` with the transform from
+removed. A map that is level already keeps its coordinates. `tile.toml` gets the table `[robot_map]` with the transform from
 the map to the world, so that poses in the map's frame stay valid.
 """
 
@@ -107,7 +107,7 @@ def import_map(
         clouds: files in one frame; of a map with a CRS the axes are not changed.
         out: folder of the tile to create.
         params: settings.
-        trajectory: path of the sensor in the map's frame and unit (.csv, .tum, .kitti), or None.
+        trajectory: path of the sensor in the map's frame and unit (.csv or .tum, with times), or None.
         name: name of the tile; default: that of its folder.
         overwrite: replace an existing tile.
         warn: receives what was assumed, found and removed.
