@@ -11,6 +11,7 @@
   const MAX_SPLATS = SMALL_DEVICE ? 1e6 : 3e6; // of all loaded tiles
   const MIN_TEXTURE_SIZE = 2048; // texels in each direction that every WebGL 2 has
   const GREY = new Uint8Array([128, 128, 128, 255]); // background that can't be decoded
+  const BACKGROUNDS = 3; // that are drawn at once, those with the largest shares (also in OVER)
   const MAX_PIXELS = 2.1e6; // of the image in which splats are blended; larger canvases show it enlarged
 
   const PROJECT = `#version 300 es
@@ -101,8 +102,8 @@
   const OVER = `#version 300 es
     precision highp float;
     precision highp sampler2D;
-    uniform sampler2D image, background; // transmittance is the image's alpha
-    uniform float background_scale; // colour of the background's level 1
+    uniform sampler2D image, backgrounds[3]; // transmittance is the image's alpha
+    uniform float weights[3]; // share of each background, times the colour of its level 1
     in vec2 at;
     in vec3 ray;
     out vec4 drawn;
@@ -112,7 +113,9 @@
     void main() {
       vec4 splats = texture(image, at);
       vec2 direction = vec2(atan(ray.y, ray.x) / (2. * PI) + .5, .5 - atan(ray.z, length(ray.xy)) / PI);
-      drawn = vec4(splats.rgb + splats.a * background_scale * texture(background, direction).rgb, 1.);
+      vec3 behind = weights[0] * texture(backgrounds[0], direction).rgb + weights[1] * texture(backgrounds[1], direction).rgb
+        + weights[2] * texture(backgrounds[2], direction).rgb;
+      drawn = vec4(splats.rgb + splats.a * behind, 1.);
     }`;
 
   // A worker. It receives tiles: name, positions (x, y, z of each splat) and rows of the texture; names of tiles to drop;
@@ -180,6 +183,13 @@
     return made;
   }
 
+  // A texture for a background; the background that it holds, and the one that is to be loaded; its share of what is drawn.
+  function slot(gl) {
+    const made = { texture: texture(gl, gl.LINEAR, gl.REPEAT), source: null, wanted: null, share: 0, scale: 1 };
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, GREY);
+    return made;
+  }
+
   // Decode an image without colour management, or as the browser can; null if it can't.
   async function decode(blob) {
     for (const options of [[{ colorSpaceConversion: "none", premultiplyAlpha: "none" }], []]) {
@@ -223,8 +233,8 @@
       this.row = []; // of depth, as drawn last
       this.sorted = { version: 0, row: [] }; // of the last request
       this.waiting = false; // for an order
-      this.source = this.wanted = null; // background that is drawn, and that is to be drawn
-      this.background_scale = this.max_colour = 1;
+      this.slots = []; // textures of backgrounds, of which some are drawn
+      this.max_colour = 1;
       this.count = 0; // of the splats that are drawn
       this.size = [0, 0]; // of the image in which they are blended
       const url = URL.createObjectURL(new Blob([`(${sorter})(${SPLATS_IN_ROW})`]));
@@ -239,7 +249,6 @@
     restore() {
       this.shown = new Set();
       this.pending = new Set(this.tiles.keys());
-      this.source = this.wanted = null;
       this.size = [0, 0];
       this.use_webgl((gl) => this.prepare(gl));
       this.version++;
@@ -261,7 +270,7 @@
       this.covering = program(gl, COVER, OVER);
       this.texture = texture(gl, gl.NEAREST, gl.CLAMP_TO_EDGE);
       gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, 2 * SPLATS_IN_ROW, this.rows);
-      this.background = texture(gl, gl.LINEAR, gl.REPEAT);
+      this.slots = Array.from({ length: BACKGROUNDS }, () => slot(gl));
       this.image = texture(gl, gl.LINEAR, gl.CLAMP_TO_EDGE);
       this.frame = gl.createFramebuffer();
       this.order = gl.createBuffer();
@@ -318,7 +327,7 @@
 
     // Whether the last image is final: nothing is loaded or sorted any more.
     get settled() {
-      return !this.waiting && this.requested && this.source !== null && this.source === this.wanted;
+      return !this.waiting && this.requested && this.slots.some(({ source }) => source) && this.slots.every(({ source, wanted }) => source === wanted);
     }
 
     // Have the splats sorted by a row of depth, unless they are, or are being sorted.
@@ -355,30 +364,44 @@
       this.changed();
     }
 
-    // Load the background of a tile, unless it is loaded or being loaded; grey if it can't be decoded.
-    async load_background(background) {
-      if (!background || background === this.wanted) return;
-      this.wanted = background;
+    // Load a background into a slot, unless it is there or being loaded; grey if it can't be decoded.
+    async load_background(slot, background) {
+      if (background === slot.wanted) return;
+      slot.wanted = background;
       const image = await decode(background.blob);
-      if (background === this.wanted) {
+      if (background === slot.wanted && this.slots.includes(slot)) {
         this.use_webgl((gl) => {
-          gl.bindTexture(gl.TEXTURE_2D, this.background);
+          gl.bindTexture(gl.TEXTURE_2D, slot.texture);
           if (image) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
           else gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, GREY);
         });
-        this.background_scale = image ? background.scale : 1;
-        this.source = background;
+        slot.scale = image ? background.scale : 1;
+        slot.source = background;
         this.changed();
       }
       image?.close();
     }
 
-    // Fill the canvas with what a camera sees, before the background of a tile; false: nothing can be drawn yet.
-    draw(camera, name) {
+    // Distribute the backgrounds of tiles [name, share] to the slots; what a slot holds is drawn until the new one is loaded.
+    arrange(behind) {
+      const shares = behind.map(([name, share]) => [this.tiles.get(name)?.background, share]).filter(([background]) => background);
+      const wanted = new Map(shares.sort((a, b) => b[1] - a[1]).slice(0, BACKGROUNDS));
+      if (!wanted.size) return;
+      const free = this.slots.filter((one) => !wanted.has(one.wanted)).sort((a, b) => !!b.source - !!a.source);
+      for (const one of free) one.share = 0;
+      for (const [background, share] of wanted) {
+        const slot = this.slots.find((one) => one.wanted === background) ?? free.shift();
+        slot.share = share;
+        this.load_background(slot, background);
+      }
+    }
+
+    // Fill the canvas with what a camera sees, before the backgrounds of tiles [name, share]; false: nothing can be drawn yet.
+    draw(camera, behind) {
       const { rows, eye, slope } = seen(camera);
       this.sort([...rows[2], -rows[2].reduce((sum, value, k) => sum + value * eye[k], 0)]);
-      this.load_background(this.tiles.get(name)?.background);
-      if (!this.shown.size || !this.source) return false;
+      this.arrange(behind);
+      if (!this.shown.size || !this.slots.some(({ source, share }) => source && share)) return false;
       this.use_webgl((gl) => {
         this.fit(gl);
         gl.activeTexture(gl.TEXTURE0);
@@ -421,20 +444,23 @@
       gl.disable(gl.BLEND);
     }
 
-    // Copy them into the canvas, before the background.
+    // Copy them into the canvas, before the backgrounds.
     cover(gl, rows, slope) {
       const at = (name) => gl.getUniformLocation(this.covering, name);
+      const shares = this.slots.map(({ source, share }) => (source ? share : 0)), sum = shares.reduce((a, b) => a + b);
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
       gl.viewport(0, 0, gl.drawingBufferWidth, gl.drawingBufferHeight);
       gl.useProgram(this.covering);
       gl.uniformMatrix3fv(at("towards"), false, rows.flat());
       gl.uniform2fv(at("slope"), slope);
       gl.uniform1i(at("image"), 0);
-      gl.uniform1i(at("background"), 1);
-      gl.uniform1f(at("background_scale"), this.background_scale);
+      gl.uniform1iv(at("backgrounds"), this.slots.map((_, k) => k + 1));
+      gl.uniform1fv(at("weights"), this.slots.map(({ scale }, k) => (scale * shares[k]) / sum));
       gl.bindTexture(gl.TEXTURE_2D, this.image);
-      gl.activeTexture(gl.TEXTURE1);
-      gl.bindTexture(gl.TEXTURE_2D, this.background);
+      for (const [k, { texture }] of this.slots.entries()) {
+        gl.activeTexture(gl.TEXTURE1 + k);
+        gl.bindTexture(gl.TEXTURE_2D, texture);
+      }
       gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
     }
   }

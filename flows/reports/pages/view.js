@@ -8,6 +8,7 @@
   const DISTANCE_COLOURS = [[0, "#30123b"], [5, "#4686fb"], [10, "#1ae4b6"], [20, "#a4fc3c"], [35, "#fb7e21"], [60, "#7a0403"]]; // metres
   const NO_PHOTO_COLOUR = "#8a8f96";
   const SPLATS = "_splats", COLLISION = "_collision"; // after a tile's name: its scripts
+  const BLEND_M = 10; // over which the background changes from a tile's to the next one's
   const FIRST_PHOTO_ROW = 3; // row of the first photo in a GLB's table; rows 0 to 2: inpainted, point cloud, unknown photo
   const { Splats, View, load, meshes } = window.scan2sim;
 
@@ -52,10 +53,15 @@
       this.loop();
     }
 
+    // By how many metres the viewer, or the orbit's centre, is beyond the sides of a tile along x and y; negative inside.
+    past({ offset, low, high }) {
+      const eye = this.walking ? this.camera.position : this.orbit.target;
+      return [0, 1].map((k) => Math.max(offset[k] + low[k] - eye.getComponent(k), eye.getComponent(k) - offset[k] - high[k]));
+    }
+
     // A survey's sky, and the tiles sorted by distance to the viewer, or to the orbit's centre.
     nearest() {
-      const eye = this.walking ? this.camera.position : this.orbit.target;
-      const away = ({ offset, low, high }) => Math.hypot(...[0, 1].map((k) => Math.max(0, offset[k] + low[k] - eye.getComponent(k), eye.getComponent(k) - offset[k] - high[k])));
+      const away = (tile) => Math.hypot(...this.past(tile).map((side) => Math.max(0, side)));
       return [...(this.about.dome ? [this.about.dome] : []), ...[...this.about.tiles].sort((a, b) => away(a) - away(b))];
     }
 
@@ -212,9 +218,12 @@
       this.stale = true;
     }
 
-    // The nearest tile whose splats are loaded.
+    // Tiles whose splats are loaded, and the shares of their backgrounds: as of the camera in Python (texturing/world_camera.py).
     behind() {
-      return this.nearest().find(({ name }) => this.splats.has(name))?.name;
+      const signed = (past) => Math.hypot(...past.map((side) => Math.max(0, side))) + Math.min(0, Math.max(...past));
+      const tiles = this.about.tiles.filter(({ name }) => this.splats.has(name)).map((tile) => [tile.name, signed(this.past(tile))]);
+      const nearest = Math.min(...tiles.map(([, distance]) => distance));
+      return tiles.map(([name, distance]) => [name, 1 - (distance - nearest) / BLEND_M]).filter(([, share]) => share > 0);
     }
 
     covers(name) {

@@ -244,9 +244,9 @@
       this.stale = true;
     }
 
-    // Name of the tile whose background is behind the splats.
+    // Names of the tiles whose backgrounds are behind the splats, and their shares.
     behind() {
-      return "world";
+      return [["world", 1]];
     }
 
     // Whether splats are drawn in place of a tile's surfaces.
