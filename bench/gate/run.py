@@ -80,7 +80,7 @@ def _check_world(subject: GateWorld, available: dict[str, Any], result: dict[str
     """Export a world, run all consumers on it, and add their metrics to `result`."""
     scene = read_scene(subject.run)
     reference = find(scene, subject.run, subject.tiles)
-    if not any(tile.splat_count for tile in scene.tiles):
+    if not scene.has_splats:
         available = {name: module for name, module in available.items() if not module.FORMAT.startswith("splats")}
     formats = sorted({module.FORMAT for module in available.values()})
     for form in formats:

@@ -76,7 +76,7 @@ def film(scene: Scene, file: Path, seconds: float, width: int, report: Report) -
 
 def _view(scene: Scene, camera: Camera) -> Callable[[F64], U8]:
     """Function from poses (4, 4) in world metres to images (H, W, 3) of the splats or, without any, the surfaces."""
-    if any(tile.splat_count for tile in scene.tiles):
+    if scene.has_splats:
         from scan2sim.texturing.world_camera import WorldCamera  # loads numba
 
         world = WorldCamera(scene)

@@ -185,7 +185,7 @@ def _about(scene: Scene) -> dict[str, Any]:
              "triangles": sum(group["triangles"] for group in tile.groups.values())}
             for tile in scene.tiles
         ],
-        "splats": any(tile.splat_count for tile in scene.tiles),
+        "splats": scene.has_splats,
         "dome": scene.dome and {"name": scene.dome.name, "offset": scene.dome.offset, "far": scene.far},
         "photos": photos,
         "colours": {name_of(code): codes[code].tolist() for code in sorted(set(CODE_OF_SURFACE.values()) | {64, 65})},

@@ -288,6 +288,11 @@ class Scene:
         return found
 
     @property
+    def has_splats(self) -> bool:
+        """Whether a tile has splats."""
+        return any(tile.splat_count for tile in self.tiles)
+
+    @property
     def with_dome(self) -> tuple[SceneTile, ...]:
         """All tiles, and the dome, if there is one: what cameras see."""
         return self.tiles if self.dome is None else (*self.tiles, self.dome)

@@ -32,11 +32,6 @@ class SharedWorld:
             return self._world.colours(T_world_cam, camera)
 
 
-def has_splats(folder: Path) -> bool:
-    """Whether a world shows splats."""
-    return any(tile.splat_count for tile in read_scene(folder).tiles)
-
-
 def frames(view: View) -> Iterator[CameraFrame]:
     """Yield frames without end; capture times are those of the vehicle's pose.
 
@@ -44,7 +39,7 @@ def frames(view: View) -> Iterator[CameraFrame]:
         UnavailableError: the world has splats, and this program has no renderer for them.
     """
     folder = Path(view.location).resolve()
-    if not has_splats(folder):
+    if not read_scene(folder).has_splats:
         yield from surfaces.frames(view)
         return
     if view.open_world is None:

@@ -24,8 +24,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scan2sim.pipeline.core.errors import StepError
+from scan2sim.pipeline.io.worlds.scene import read_scene
 from scan2sim.services.teleoperation.adapter_key import ADAPTER_KEY_FILE
-from scan2sim.services.teleoperation.cameras.world import has_splats
 from scan2sim.services.teleoperation.gateway.pki import certify
 from scan2sim.services.teleoperation.settings import ADAPTER_PORT, GATEWAY_PORT, STATION_PORT, DemoParams
 
@@ -177,7 +177,7 @@ def camera_options(params: DemoParams) -> list[str]:
     Raises:
         InputError: the folder contains no world.
     """
-    splats = not params.surfaces and has_splats(params.world)
+    splats = not params.surfaces and read_scene(params.world).has_splats
     views = [("front", 0), ("left", 90), ("right", -90), ("rear", 180)][: params.cameras or (1 if splats else 4)]
     kind = "surfaces" if params.surfaces else "world"
     return [f"{name}={kind}:{params.world}@{turn}" for name, turn in views]
