@@ -38,7 +38,10 @@ COMMANDS = {
     "export": ("export", "Convert a finished world to other formats, for other simulators."),
     "view": ("view", "Open a finished world in the browser, or render a flight through it as a video."),
     "verify": ("verify", "Check all results against their checksums; the next run rebuilds the damaged ones."),
-    "inspect": ("inspect", "Show a summary of a point cloud, a folder of clouds, a tile, a mesh, a world or a ROS bag."),
+    "inspect": (
+        "inspect",
+        "Show a summary of a point cloud, a folder of clouds, a tile, a mesh, a world or a ROS bag.",
+    ),
     "scenario": ("scenario", "List and vary the recorded traffic of a finished world."),
     "import": ("imports", "Import recordings: create a tile from point clouds, photos, sweeps, ROS bags or data sets."),
     "sample": ("sample", "Generate a synthetic street recording with ground truth, to try the program."),

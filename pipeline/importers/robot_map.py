@@ -1,8 +1,8 @@
 """Importer of a robot's map: a cloud (or several) in the axes of the sensor at its start, with photos if it is an E57.
 
 The map becomes level, z up and in metres (`pipeline.geometry.upright`); outliers and reflections below the floor are
-removed. A map that is level already keeps its coordinates. `tile.toml` gets the table `[robot_map]` with the transform from
-the map to the world, so that poses in the map's frame stay valid.
+removed. A map that is level already keeps its coordinates. `tile.toml` gets the table `[robot_map]` with the transform
+from the map to the world, so that poses in the map's frame stay valid.
 """
 
 from __future__ import annotations
