@@ -41,7 +41,9 @@ PAGES = [
 ]
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 PARAMS: dict[str, type[Params]] = {step.name: step.params for step in STEPS}
-OTHER_PROGRAMS = re.compile(r"\b(prefect|docker|dask|ray|gz|pip|aws|curl|kubectl|trtexec|esmini|ros2|export.py)\b")
+OTHER_PROGRAMS = re.compile(
+    r"\b(prefect|docker|dask|ray|gz|gz_args|pip|aws|curl|kubectl|trtexec|esmini|ros2|export.py)\b"
+)
 """Other programs, whose options a page may mention if it also shows them in a command."""
 IMAGES, ARRAYS, MESHES = {"png", "jpg"}, {"npz", "npy", "laz", "csv"}, {"obj", "mtl", "dae", "glb", "sdf"}
 SUFFIXES = {"py", "js", "json", "geojson", "toml", *IMAGES, *ARRAYS, *MESHES}
@@ -185,7 +187,7 @@ def project_files() -> tuple[str, ...]:
     return tuple(listed.stdout.split())
 
 
-OTHERS_FILES = ("random.py", "navigation_launch.py")
+OTHERS_FILES = ("random.py", "navigation_launch.py", "localization_launch.py")
 """Files of Python and of Nav2 that pages name."""
 
 
