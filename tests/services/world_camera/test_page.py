@@ -21,6 +21,7 @@ from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.sdf import WITHOUT_BACKDROP
 from scan2sim.pipeline.simulation.robot import ROBOT
 from tests.fakes import synthetic
+from tests.fakes.consumers import mujoco as consumer
 from tests.present import present
 
 ROOT = Path(__file__).parents[3]
@@ -98,3 +99,27 @@ def test_example_in_python_looks_along_the_road_from_the_spawn_pose(tmp_path: Pa
         if seen:
             assert depth[360, 640] == pytest.approx(6.0, abs=0.05)
     assert Image.open(tmp_path / "view.png").size == (1280, 720)
+
+
+def test_example_in_mujoco_shows_the_street_ahead_of_the_robot(tmp_path: Path) -> None:
+    if why := consumer.missing():
+        pytest.skip(why)
+    (code,) = re.findall(r"## In Python, without ROS\n.*?```python\n(.*?)```", PAGE, re.DOTALL)
+    scene = synthetic.driven(tmp_path / "my_world")
+    world_formats.write(scene, ["mujoco"], tmp_path / "town", SceneParams(), silent, robot=True)
+    model = tmp_path / "town" / f"{scene.name}.xml"
+    # a magenta post that only MuJoCo knows, two metres ahead of the robot
+    robot = json.loads((tmp_path / "town/metadata.json").read_text(encoding="utf-8"))["robot"]
+    (x, y, z), yaw = robot["position_m"], robot["angles_rad"][2]
+    at = f"{x + 2 * math.cos(yaw)} {y + 2 * math.sin(yaw)} {z + 0.5}"
+    geom = f'<geom type="box" size=".1 .1 .5" pos="{at}" rgba="1 0 1 1" group="0" contype="0" conaffinity="0"/>'
+    xml = model.read_text(encoding="utf-8")
+    model.write_text(xml.replace("<worldbody>", "<worldbody>" + geom, 1), encoding="utf-8")
+    code = code.replace("NAME", scene.name).replace("range(20)", "range(4)")
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)
+    first, last = (np.array(Image.open(tmp_path / f"frame_{k:02d}.png")).astype(int) for k in (0, 3))
+    post = np.minimum(last[..., 0], last[..., 2]) > 2 * last[..., 1] + 20
+    assert 0.002 < post.mean() < 0.2, "MuJoCo's post is in front of the street"
+    assert abs(np.argwhere(post)[:, 1].mean() - last.shape[1] / 2) < 0.05 * last.shape[1], "it is straight ahead"
+    assert last[~post].std() > 10 and np.abs(last - first).mean() > 0.1, "the street is there, and the robot moves"
