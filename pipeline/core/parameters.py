@@ -53,7 +53,8 @@ Device = Annotated[
     ),
 ]
 """Compute device: "numba" only in the step `texture`, the others are names of torch and onnxruntime devices."""
-NAME = r"^[A-Za-z0-9_]{1,100}$"
+MAX_NAME = 100
+NAME = rf"^[A-Za-z0-9_]{{1,{MAX_NAME}}}$"
 """Names of tiles and surveys, which become names of folders, files and SDF elements."""
 Name = Annotated[str, Field(pattern=NAME)]
 

@@ -162,8 +162,8 @@ def import_las(
         shots = [shot | {"camera": name} for shot, name in zip(shots, names, strict=True)]
         for i, shot in enumerate(shots):
             report(0.5 + 0.5 * i / len(shots), f"photo {shot['file']}")
-            for source, name, key in files[i]:
-                shot[key] = add_file(source, folder, name, link)
+            for source, stored, key in files[i]:
+                shot[key] = add_file(source, folder, stored, link)
         if embedded_images and order == axes_order(None):
             embedded, lenses = e57_images.extract_all(map(Path, clouds), folder, warn, report)
             shots, rigs = shots + embedded, rigs | lenses

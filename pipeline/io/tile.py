@@ -48,7 +48,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from scan2sim.pipeline.core.classes import mapping, name_of
 from scan2sim.pipeline.core.errors import InputError, SettingError
-from scan2sim.pipeline.core.parameters import Name
+from scan2sim.pipeline.core.parameters import MAX_NAME, Name
 from scan2sim.pipeline.core.poses import nearest_rotation
 from scan2sim.pipeline.core.types import Camera, CameraModel, Frame, RobotMap, Tile, Trajectory, View
 from scan2sim.pipeline.core.voronoi_cell import Cell
@@ -245,8 +245,8 @@ def source_files(path: Path) -> list[Path]:
 
 
 def tile_name(text: str) -> str:
-    """Turn `text` into a valid tile name (letters, digits, underscores)."""
-    return "".join(c if c.isascii() and c.isalnum() else "_" for c in text).strip("_") or "tile"
+    """Turn `text` into a valid tile name: letters, digits and underscores, at most `MAX_NAME`."""
+    return "".join(c if c.isascii() and c.isalnum() else "_" for c in text).strip("_")[:MAX_NAME] or "tile"
 
 
 def read_spec(path: Path) -> TileFile:

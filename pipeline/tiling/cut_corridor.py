@@ -18,7 +18,7 @@ from pydantic import Field
 
 from scan2sim.pipeline.core.classes import unmapped_codes_warning
 from scan2sim.pipeline.core.errors import DataError, InputError, SettingError
-from scan2sim.pipeline.core.parameters import Buffer, Length, Metres, Stretch
+from scan2sim.pipeline.core.parameters import MAX_NAME, Buffer, Length, Metres, Stretch
 from scan2sim.pipeline.core.step import Params, Report, silent
 from scan2sim.pipeline.core.types import F64, Tile, Trajectory
 from scan2sim.pipeline.core.voronoi_cell import Cell, Seed, cells
@@ -44,6 +44,8 @@ MAX_NEIGHBOUR_LENGTHS = 3.0
 """Tiles whose seeds are farther apart than this many tile lengths are not neighbours."""
 READING_PROGRESS = 0.6
 """Share of the progress bar for reading."""
+NUMBER_WIDTH = 10
+"""Characters of a tile's name that are left for its number."""
 
 Warn = Callable[[str], None]
 
@@ -139,7 +141,7 @@ def cut_survey(
     options.check()
     corridor = Corridor.read(path)
     tile, spec = corridor.tile, corridor.spec
-    name = tile_name(name or spec.name)
+    name = tile_name(name or spec.name)[: MAX_NAME - NUMBER_WIDTH]
     final = (Path.cwd() / out).parent.resolve() / out.name
     if any(source.resolve().is_relative_to(final) for source in (tile.path, *tile.clouds)):
         raise SettingError(out, f"contains the corridor {tile.path}", "Choose another folder")

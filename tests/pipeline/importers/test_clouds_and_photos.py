@@ -44,6 +44,14 @@ def test_clouds_of_one_crs_become_one_tile(tmp_path: Path) -> None:
     assert all(path.parent == tmp_path / "tile" and not path.is_symlink() for path in tile.clouds)
 
 
+def test_tile_with_photos_has_the_name_of_its_folder(tmp_path: Path) -> None:
+    pose = "500010,5400005,102,1,0,0,0"
+    sheet = photos(tmp_path, f"file,x,y,z,qw,qx,qy,qz,{CAMERA}", f"{'deep/' * 20}1.png,{pose},{VALUES}")
+    for folder, name in (("main street", "main_street"), ("long" * 40, "long" * 25)):
+        tile = read_tile(import_las([cloud(tmp_path / "c.laz")], tmp_path / folder, photos=sheet))
+        assert (tile.name, len(tile.views)) == (name, 1)
+
+
 def test_three_rotation_conventions_agree(tmp_path: Path) -> None:
     """A camera that looks north: x east, y down, z north; omega = 90 degrees tilts it from nadir to the horizon."""
     where = "x,y,z"

@@ -357,9 +357,9 @@ def test_tiles_without_a_trajectory_are_squares_with_common_corners(tmp_path: Pa
     rng = np.random.default_rng(0)
     xyz = np.column_stack([rng.uniform(0, 100, (20_000, 2)), rng.uniform(0, 5, 20_000)]).astype(np.float32)
     las.write(tmp_path / "a.laz", PointCloud(UTM, xyz))
-    write_tile(tmp_path / "corridor", name="field", crs=UTM.crs, clouds=["../a.laz"], cameras={})
+    write_tile(tmp_path / "corridor", name="field" * 20, crs=UTM.crs, clouds=["../a.laz"], cameras={})
     made = tiles(cut_survey(tmp_path / "corridor", tmp_path / "out", CutParams(length=50)))
-    assert len(made) == 4
+    assert len(made) == 4 and all(name.startswith("field" * 17) for name in made), "names have room for a number"
     for name, tile in made.items():
         assert tile.cell is not None and list(tile.cell.neighbours) == sorted(set(made) - {name})
         assert tile.trajectory is None and 5500 < len(clouds.read(tile.clouds[0], tile.frame)) < 6600  # 55 m square
