@@ -10,12 +10,10 @@ import numpy as np
 
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.tile_cell import TileCell
-from scan2sim.pipeline.core.types import F32, Bools, PointCloud, Trajectory
+from scan2sim.pipeline.core.types import F32, PointCloud, Trajectory
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.furniture.classify import Detection
-
-    Bools = Bools
 
 GROUND_CELL_M = 0.5  # cell of the ground height raster
 MIN_HEIGHT_M, MAX_HEIGHT_M = 0.2, 14.0  # height range above the ground of points used for detection

@@ -18,8 +18,6 @@ from scan2sim.pipeline.steps.detect_furniture import KINDS
 if TYPE_CHECKING:
     from scan2sim.pipeline.furniture.classify import Detection
 
-    Bools = Bools
-
 SEARCH_RADIUS_M = 4.0  # around the middle of a stem; contains all points of the object
 
 

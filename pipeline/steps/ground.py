@@ -18,8 +18,6 @@ from scan2sim.pipeline.core.voronoi_cell import nearest
 if TYPE_CHECKING:
     from scan2sim.pipeline.geometry.height_map import Raster
 
-    Bools = Bools
-
 ROOF_MIN_NORMAL_Z = 0.5  # |nz| of a roof
 COVER_GAP_CELLS = 3  # largest gap between points of one roof or crown, in cells of the point spacing
 COVER_GAP_M = 10.0  # gaps between ground, roofs and crowns narrower than twice this are closed as well

@@ -12,7 +12,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.tile_cell import TileCell
-from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Frame, Mesh, View
+from scan2sim.pipeline.core.types import F32, F64, U8, Frame, Mesh, View
 from scan2sim.pipeline.core.voronoi_cell import Cell
 from scan2sim.pipeline.furniture.object_lists import sign_panel_columns, write_lists
 from scan2sim.pipeline.io import views as views_io
@@ -20,8 +20,6 @@ from scan2sim.pipeline.io.images import image
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.furniture.sign_panels import SignPanel
-
-    Bools = Bools
 
 SEARCH_RADIUS_M = 0.4
 """Largest error of the position of a panel from points or from a network's classes."""
