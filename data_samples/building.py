@@ -139,6 +139,19 @@ class FreeSpace(NamedTuple):
         i = np.where(inside[:, None], i, 0)
         return inside & self.free[i[:, 1], i[:, 0]]
 
+    def swept(self, start: npt.ArrayLike, radius: float) -> FreeSpace:
+        """The part that a disc of this radius sweeps from where it fits nearest to `start` (2,)."""
+        from scipy.ndimage import distance_transform_edt, label
+
+        fits = distance_transform_edt(np.pad(self.free, 1))[1:-1, 1:-1] * self.cell >= radius
+        parts, count = label(fits, np.ones((3, 3)))
+        if not count:
+            return self._replace(free=fits)
+        at = np.argwhere(fits)
+        row, column = at[np.linalg.norm(self.origin + (at[:, ::-1] + 0.5) * self.cell - start, axis=1).argmin()]
+        away = distance_transform_edt(parts != parts[row, column]) * self.cell
+        return self._replace(free=self.free & (away <= radius))
+
 
 @dataclass(frozen=True)
 class Building:

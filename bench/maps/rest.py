@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,11 +37,20 @@ GRID_M = 0.05
 """Distance between positions at which free space is compared."""
 
 
-def drop(one: BenchMap, world: World, folder: Path) -> tuple[Bools, F64]:
-    """Drop robots at random positions of the free space of all storeys.
+class Drop(NamedTuple):
+    """Robots that were dropped.
 
-    Returns:
-        (N,) whether a robot rests within `MAX_FLOOR_DISTANCE_M` of the floor, and (N, 3) the start positions.
+    Attributes:
+        at_rest: (N,) whether a robot rests within `MAX_FLOOR_DISTANCE_M` of the floor.
+        room: (N,) whether its box was clear of all cells that aren't free; others may start inside an obstacle.
+    """
+
+    at_rest: Bools
+    room: Bools
+
+
+def drop(one: BenchMap, world: World, folder: Path) -> Drop:
+    """Drop robots at random positions of the free space of all storeys.
 
     Raises:
         Missing: the world has no occupancy map or no free cell, the export failed, or MuJoCo isn't installed.
@@ -49,7 +59,7 @@ def drop(one: BenchMap, world: World, folder: Path) -> tuple[Bools, F64]:
         import mujoco
     except ImportError:
         raise Missing("mujoco isn't installed (pip install mujoco)") from None
-    xy, storey = free_positions(world.maps(), ROBOTS)
+    xy, storey, clearance = free_positions(world.maps(), ROBOTS)
     half = np.array(ROBOT_SIZE_M) / 2
     start = np.column_stack([xy, floor_heights(one, world, xy, storey) + DROP_HEIGHT_M + half[2]])
     shutil.rmtree(folder, ignore_errors=True)
@@ -68,7 +78,7 @@ def drop(one: BenchMap, world: World, folder: Path) -> tuple[Bools, F64]:
     end = np.array([data.body(f"robot{i}").xpos for i in range(len(start))])
     speed = np.array([np.linalg.norm(data.body(f"robot{i}").cvel[3:]) for i in range(len(start))])
     gap = end[:, 2] - half[2] - floor_heights(one, world, end[:, :2], storey)
-    return (np.abs(gap) < MAX_FLOOR_DISTANCE_M) & (speed < MAX_SPEED_M_S), start
+    return Drop((np.abs(gap) < MAX_FLOOR_DISTANCE_M) & (speed < MAX_SPEED_M_S), clearance > np.hypot(*half[:2]))
 
 
 def floor_errors(one: BenchMap, world: World) -> F64:
@@ -78,7 +88,7 @@ def floor_errors(one: BenchMap, world: World) -> F64:
     """
     from scipy.spatial import cKDTree
 
-    xy, storey = free_positions(world.maps(), ROBOTS)
+    xy, storey, _ = free_positions(world.maps(), ROBOTS)
     floor = world_floor(world, xy, storey)
     points = world.place(one.xyz)
     tree, errors = cKDTree(points[:, :2]), []
@@ -93,8 +103,13 @@ def floor_errors(one: BenchMap, world: World) -> F64:
     return np.array(errors)
 
 
-def free_positions(maps: list[FreeSpace], count: int, seed: int = 0) -> tuple[F64, F64]:
-    """(count, 2) random positions in free cells of all storeys' maps, and (count,) heights of these storeys' floors."""
+def free_positions(maps: list[FreeSpace], count: int, seed: int = 0) -> tuple[F64, F64, F64]:
+    """Random positions in free cells of all storeys' maps.
+
+    Returns:
+        (count, 2) positions, (count,) heights of these storeys' floors, and (count,) their smallest possible distances
+        from cells that aren't free.
+    """
     cells = [np.argwhere(free.free)[:, ::-1] for free in maps]
     if not sum(map(len, cells)):
         raise Missing("the world's occupancy maps have no free cell")
@@ -102,7 +117,16 @@ def free_positions(maps: list[FreeSpace], count: int, seed: int = 0) -> tuple[F6
     size, floor = (np.repeat([getattr(f, k) for f in maps], list(map(len, cells))) for k in ("cell", "floor"))
     rng = np.random.default_rng(seed)
     chosen = rng.integers(len(corner), size=count)
-    return corner[chosen] + rng.random((count, 2)) * size[chosen, None], floor[chosen]
+    clearance = np.concatenate([_clearance(free)[free.free] for free in maps])[chosen]
+    return corner[chosen] + rng.random((count, 2)) * size[chosen, None], floor[chosen], clearance
+
+
+def _clearance(free: FreeSpace) -> F64:
+    """(Y, X) distance that any position in a cell has at least from cells that aren't free, metres."""
+    from scipy.ndimage import distance_transform_edt
+
+    centres = distance_transform_edt(np.pad(free.free, 1))[1:-1, 1:-1]
+    return np.asarray((centres - 2**0.5) * free.cell)
 
 
 def floor_heights(one: BenchMap, world: World, xy: F64, storey: F64) -> F64:
@@ -141,9 +165,14 @@ def world_floor(world: World, xy: F64, storey: F64) -> F64:
 
 
 def free_agreement(one: BenchMap, world: World) -> float:
-    """Intersection over union of the world's free space and the true one, within the part that the robot saw."""
+    """Intersection over union of the world's free space and the true one, within the part that the robot saw.
+
+    The true one is what the robot for which the map is made reaches: other true free space may be in the map, or not.
+    """
     assert one.building is not None and one.truth is not None
-    truth, found = one.building.free_space(0, high=max(one.height, 0.3)), world.maps()[0]
+    found, band = world.maps()[0], (world.scene.tiles[0].navigation() or {})["band_m"]
+    truth = one.building.free_space(0, low=band["low"], high=band["high"])
+    reached = truth.swept(one.building.routes[0][0][:2], band["radius"])
     points = one.truth.world
     seen = points[(one.truth.surface == Surface.FLOOR) & (points[:, 2] < one.building.floors[0] + 0.5)]
     low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
@@ -152,5 +181,5 @@ def free_agreement(one: BenchMap, world: World) -> float:
     there = np.column_stack([xy, np.zeros(len(xy))])
     T = one.truth.T_map_world
     placed = world.place(there @ T[:3, :3].T + T[:3, 3])
-    a, b = truth.at(xy), found.at(placed[:, :2])
-    return float((a & b).sum() / max((a | b).sum(), 1))
+    a, b = reached.at(xy), found.at(placed[:, :2])
+    return float((a & b).sum() / max((a | b & ~truth.at(xy)).sum(), 1))

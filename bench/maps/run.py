@@ -11,9 +11,10 @@ and 50 cm, in the axes of the first sensor pose), and simulated buildings with g
 - runs: all maps, or those whose names begin with one of `--maps`; `maps_failed`: runs that fail, or aren't upright (the
   same limits); `lobby_triangles`. Writes <map>_above.png and <map>_inside.png.
 - rest: 200 robots (boxes) are dropped in each world's free space (Nav2 maps) in MuJoCo; `rest_share` of all comes to
-  rest within 10 cm of the floor, the true one if it is known, else the world's. `floor_p95_cm`: 95th percentile of the
-  distance between the world's floor and the map's lowest points, of the worst map. `free_iou`: the free space compared
-  with the true one.
+  rest within 10 cm of the floor, the true one if it is known, else the world's. `rest_share_with_room`: of those whose
+  box is clear of everything that isn't free; others, beside walls, may start inside one. `floor_p95_cm`: 95th
+  percentile of the distance between the world's floor and the map's lowest points, of the worst map. `free_iou`: the
+  free space compared with the true one that the robot reaches.
 - walls: `wall_median_cm` and `wall_p95_cm`, from the world's walls to the true ones, `wall_truth_*` from true walls
   that the robot saw to the world's; 16 lines, 5 cm of range noise.
 - ground: `ground_mislabelled`: share of true ground points that were labelled as something standing, on a grid of
@@ -133,15 +134,17 @@ class Bench:
         return result | {"maps_failed": len(failed), "maps": count, "failed_maps": failed}
 
     def rest(self) -> dict[str, Any]:
-        """`rest_share`, `floor_p95_cm` and `free_iou`."""
-        rests, agreements, errors = [], [], []
+        """`rest_share`, `rest_share_with_room`, `floor_p95_cm` and `free_iou`."""
+        rests, rooms, agreements, errors = [], [], [], []
         for name in REST_MAPS:
             one = self.map(name)
             world = self.world(one)
-            at_rest, _ = rest.drop(one, world, self.out / "mujoco" / name)
+            at_rest, room = rest.drop(one, world, self.out / "mujoco" / name)
             rests.append(at_rest)
+            rooms.append(room)
             off = 100 * rest.floor_errors(one, world)
             line = f"rest {name:16} {at_rest.mean():.3f} of {len(at_rest)} robots"
+            line += f", {at_rest[room].mean():.3f} of {room.sum()} with room"
             if len(off):
                 errors.append(float(np.percentile(off, 95)))
                 line += f", floor to points: median {np.median(off):.1f}, 95 % {errors[-1]:.1f} cm"
@@ -151,6 +154,7 @@ class Bench:
             print(line, flush=True)
         return {
             "rest_share": round(float(np.concatenate(rests).mean()), 4),
+            "rest_share_with_room": round(float(np.concatenate(rests)[np.concatenate(rooms)].mean()), 4),
             "rest_worst": round(float(min(r.mean() for r in rests)), 4),
             "floor_p95_cm": round(max(errors), 1) if errors else None,
             "free_iou": round(float(np.mean(agreements)), 4),

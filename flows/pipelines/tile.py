@@ -401,8 +401,10 @@ def _add_surface(graph: TileGraph, scan: Scan, parts: Parts, group: str, synthes
         add(JOIN, clipped | others, group, **cell)
         surface = output(JOIN, "mesh", group)
     furniture = {"furniture": parts.furniture[group]} if group in parts.furniture else {}
-    coarse = uncovered | ({"cloud": points["cloud"]} if uncovered else {})
-    add(DECIMATE, {"mesh": surface} | coarse | furniture, group, keep_border=bool(cell), cell=cell or None)
+    by_points = graph.tile.robot_map is not None
+    counted = uncovered | ({"cloud": points["cloud"]} if uncovered or by_points else {})
+    context = {"keep_border": bool(cell), "cell": cell or None, "by_points": by_points}
+    add(DECIMATE, {"mesh": surface} | counted | furniture, group, **context)
 
 
 def _has_floor(graph: TileGraph) -> bool:

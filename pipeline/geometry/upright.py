@@ -56,6 +56,8 @@ class UprightModel:
     floor_share: float = 0.01
     """Share of all points in a level layer from which it is a floor or ceiling."""
     around_start_m: float = 10.0
+    sensor_height_max_m: float = 1.9
+    """Height of the sensor above the floor up to which a single level layer is a floor without doubt."""
     refine_deg: tuple[float, ...] = (8.0, 4.0, 2.0, 1.0, 1.0)
     """Scales of the Cauchy weights in the rounds of the refinement."""
     ground_share: float = 0.1
@@ -125,11 +127,11 @@ def find_up(xyz: F32, origin: F64 | None = None) -> Upright | None:
     rated = sorted(((_rating(u, flat, points), tuple(u)) for u in _candidates(flat)), reverse=True)
     margin = rated[0][0] - rated[1][0] if len(rated) > 1 else 1.0
     up, sigma = _refine(np.array(rated[0][1]), flat)
-    evidence = _sign(up, flat, points, np.zeros(3) if origin is None else origin)
+    evidence, doubtful = _sign(up, flat, points, np.zeros(3) if origin is None else origin)
     up = up if evidence >= 0 else -up
     cos = np.abs(flat.normal @ up)
     level, upright = _level(cos, 2 * MODEL.tolerance_deg), _upright(cos, 2 * MODEL.tolerance_deg)
-    return Upright(up, float(level.mean()), float(upright.mean()), margin, abs(evidence), sigma)
+    return Upright(up, float(level.mean()), float(upright.mean()), margin, 0.0 if doubtful else abs(evidence), sigma)
 
 
 def rotation_to_z(up: F64) -> F64:
@@ -290,12 +292,13 @@ def _refine(up: F64, flat: _Flat) -> tuple[F64, float]:
     return up, sigma
 
 
-def _sign(up: F64, flat: _Flat, points: F64, origin: F64) -> float:
-    """Evidence that `up` points up, from -1 to 1: negative if down is up.
+def _sign(up: F64, flat: _Flat, points: F64, origin: F64) -> tuple[float, bool]:
+    """Evidence that `up` points up, from -1 to 1, negative if down is up; and whether parts of it contradict others.
 
     Outdoors, almost everything is above the ground. The sensor starts nearer to the floor than to the ceiling, or to
     the top of what is around it, and furniture stands on the floor. Without such evidence, the axes decide: z up, or
-    LOAM's y up.
+    LOAM's y up. They also decide if there is one level layer, further from the sensor than what ends the map at the
+    other side: it may be the ceiling of a map whose floor was removed.
     """
     height = points @ up
     level = flat.xyz[_level(np.abs(flat.normal @ up), 4 * MODEL.tolerance_deg)] @ up
@@ -314,12 +317,15 @@ def _sign(up: F64, flat: _Flat, points: F64, origin: F64) -> float:
         evidence += 0.5 * (below - above) / (below + above)  # a floor is seen better than a ceiling
         floor = float(edges[large[0]]) if below else floor
         ceiling = float(edges[large[-1] + 1]) if above else ceiling
+    start, layer = float(origin @ up), floor if evidence > 0 else ceiling
+    near = np.linalg.norm(points - origin, axis=1) < MODEL.around_start_m
+    if near.sum() > MIN_FLAT_POINTS:
+        floor, ceiling = (float(v) for v in np.percentile(height[near], (2, 98)))
+    by_start = 0.5 * (floor + ceiling - 2 * start) / max(ceiling - floor, 0.1) if floor < start < ceiling else 0.0
+    doubtful = one_end and evidence * by_start < 0
     if not one_end:  # otherwise what ends the map at the top is not a ceiling
-        start = float(origin @ up)
-        near = np.linalg.norm(points - origin, axis=1) < MODEL.around_start_m
-        if near.sum() > MIN_FLAT_POINTS:
-            floor, ceiling = (float(v) for v in np.percentile(height[near], (2, 98)))
-        if floor < start < ceiling:
-            evidence += 0.5 * (floor + ceiling - 2 * start) / max(ceiling - floor, 0.1)
+        evidence += by_start
+    elif doubtful and abs(layer - start) > MODEL.sensor_height_max_m:
+        evidence = 0.0
     z = up[2] if abs(up[2]) > 0.7 else 0.5 * up[1]
-    return float(np.clip(evidence + MODEL.axis_sign_weight * z, -1, 1))
+    return float(np.clip(evidence + MODEL.axis_sign_weight * z, -1, 1)), doubtful

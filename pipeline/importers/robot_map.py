@@ -37,7 +37,7 @@ from scan2sim.pipeline.robot_maps.label_colours import (
 )
 from scan2sim.pipeline.robot_maps.outliers import below_floor, far_outliers
 
-VERSION = 4
+VERSION = 5
 """Version of the importer: raised when the same input and options give another tile."""
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 MIN_TILT_DEG = 0.5
@@ -291,15 +291,15 @@ def level_rotation(xyz: F32, params: MapParams, origin: F64, warn: Callable[[str
         return coarse
     if params.up != "auto" and found.up[2] < np.cos(np.radians(45)):
         return coarse  # the user knows better
+    if params.up == "auto" and found.ambiguous:
+        warn(
+            "the up axis is ambiguous: check the world, and if it lies on its side or its head, name the axis with --up"
+        )
     tilt = found.tilt_deg()
     if tilt < MIN_TILT_DEG or (not found.has_walls and tilt < MAX_SLOPE_DEG):
         return coarse
     R = rotation_to_z(found.up) @ coarse
     warn(_tilt_text(found, R, tilt))
-    if params.up == "auto" and found.ambiguous:
-        warn(
-            "the up axis is ambiguous: check the world, and if it lies on its side or its head, name the axis with --up"
-        )
     return R
 
 

@@ -62,10 +62,10 @@ class Band:
     """
 
     low: float = 0.1
-    high: float = 0.6
+    high: float = 0.75
     step: float = 0.06
     slope: float = 30.0
-    radius: float = 0.25
+    radius: float = 0.3
 
 
 @dataclass(frozen=True)

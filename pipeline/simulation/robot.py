@@ -21,6 +21,11 @@ class Box:
 
     size: Vector
 
+    @property
+    def half(self) -> Vector:
+        """Half the sides of the box around it."""
+        return self.size[0] / 2, self.size[1] / 2, self.size[2] / 2
+
 
 @dataclass(frozen=True)
 class Cylinder:
@@ -30,12 +35,23 @@ class Cylinder:
     length: float
     axis: str
 
+    @property
+    def half(self) -> Vector:
+        """Half the sides of the box around it."""
+        along, across = self.length / 2, self.radius
+        return (across, along, across) if self.axis == "y" else (across, across, along)
+
 
 @dataclass(frozen=True)
 class Sphere:
     """A sphere around the link's origin."""
 
     radius: float
+
+    @property
+    def half(self) -> Vector:
+        """Half the sides of the box around it."""
+        return self.radius, self.radius, self.radius
 
 
 @dataclass(frozen=True)
@@ -162,6 +178,15 @@ class Robot:
     def centre_in_link(self, link: Link) -> Vector:
         """Centre of a link's shape in the link's own frame."""
         return link.place if link is self.base else (0.0, 0.0, 0.0)
+
+    @property
+    def extent(self) -> tuple[Vector, Vector]:
+        """Lowest and highest corner of the box around the robot, in its frame."""
+
+        def end(k: int, sign: int) -> float:
+            return sign * max(sign * link.place[k] + link.shape.half[k] for link in self.links)
+
+        return (end(0, -1), end(1, -1), end(2, -1)), (end(0, 1), end(1, 1), end(2, 1))
 
     @property
     def wheels(self) -> tuple[Link, Link]:

@@ -10,23 +10,27 @@ from pydantic import Field
 from scan2sim.pipeline.core.parameters import Name
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.tile_cell import TileCell
-from scan2sim.pipeline.core.types import Mesh
+from scan2sim.pipeline.core.types import Mesh, PointCloud
 from scan2sim.pipeline.geometry.coarse_surface import coarse_faces
 
 COARSE_SHARE_MAX = 0.2
 """Largest number of triangles of coarse surface over that of all others; they come in addition to the target."""
+TRIANGLES_PER_POINT = 3
+"""A closed surface has two triangles per vertex: more of them than this per point of a sparse map add no shape."""
 
 
-class TileBorder(Context):
-    """Borders of the mesh.
+class DecimateContext(Context):
+    """Borders and points of the mesh.
 
     Attributes:
         keep_border: open borders must not be simplified, even if that exceeds the target: where tiles or classes meet.
         cell: the tile's cell, if it has neighbours; the mesh stays within it.
+        by_points: the surface gets at most `TRIANGLES_PER_POINT` for each point of `cloud`.
     """
 
     keep_border: bool = False
     cell: TileCell | None = None
+    by_points: bool = False
 
 
 class DecimateParams(Params):
@@ -40,14 +44,15 @@ class DecimateParams(Params):
 
     target: int = Field(100_000, ge=10_000, le=1_000_000)
     backend: Name = "fast_simplification"
-    context: TileBorder = TileBorder()
+    context: DecimateContext = DecimateContext()
 
 
 def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) -> Done:
     """Simplify `mesh` by edge collapse to the target, preserving borders (of tiles and classes).
 
     `furniture` (optional) is added unsimplified, within the target; its faces keep their classes, all other faces then
-    get class 0. Points of `cloud` and `uncovered` (optional) show which part is coarse.
+    get class 0. Points of `cloud` and `uncovered` (optional) show which part is coarse; the number of those of `cloud`
+    limits the target if the context asks for it.
 
     If the border alone exceeds the target, it is simplified as well (unless `keep_border`), with a warning.
 
@@ -63,18 +68,25 @@ def decimate(inputs: Inputs, params: DecimateParams, out: Path, report: Report) 
     detailed = min(params.target, len(mesh) - coarse)
     allowed = detailed + min(coarse, round(COARSE_SHARE_MAX * detailed)) if coarse else params.target
     target = allowed - len(furniture or ())
+    if params.context.by_points:
+        target = min(target, TRIANGLES_PER_POINT * len(PointCloud.load(inputs["cloud"])))
     small, warnings, border_kept = simplify(mesh, target, backend=params.backend), [], True
     if len(small) > target * 1.05 and params.context.keep_border:
-        warnings.append(f"{len(small):,} triangles instead of {allowed:,}: common borders can't be simplified")
+        warnings.append(f"{len(small):,} triangles instead of {target:,}: common borders can't be simplified")
     elif len(small) > target * 1.05:
-        warnings.append(f"the border alone needs {len(small):,} triangles: it was simplified too, to {params.target:,}")
+        warnings.append(f"the border alone needs {len(small):,} triangles: it was simplified too, to {target:,}")
         small, border_kept = simplify(small, target, keep_border=False, backend=params.backend), False
     if params.context.cell is not None:
         small = pulled_inside(small, params.context.cell.cell)
     if furniture is not None and len(furniture):
         small = with_furniture(small, furniture)
     small.save(out / "mesh.npz")
-    metrics = {"faces_in": len(mesh), "faces": len(small), "target": allowed, "border_kept": border_kept}
+    metrics = {
+        "faces_in": len(mesh),
+        "faces": len(small),
+        "target": target + len(furniture or ()),
+        "border_kept": border_kept,
+    }
     return Done({"mesh": out / "mesh.npz"}, metrics, warnings)
 
 

@@ -57,9 +57,9 @@ class NavigationParams(Params):
         resolution: side of a cell of the occupancy maps, metres; large worlds get larger cells.
         low: lower limit of the heights above the floor at which surfaces are obstacles, metres; the robot drives over
             what is below.
-        high: upper limit of these heights, metres: the top of the robot.
+        high: upper limit of these heights, metres: the top of the robot; the supplied robot is 0.72 m high.
         radius: half the width of the narrowest passage that the robot drives through, metres; floor behind narrower
-            ones is unknown.
+            ones is unknown. The supplied robot is 0.58 m wide.
         max_step: largest height difference between neighbouring cells of the floor, metres.
         max_slope: steepest floor, degrees.
         context: the tile.
@@ -68,8 +68,8 @@ class NavigationParams(Params):
     when: Literal["auto", "always", "never"] = "auto"
     resolution: float = Field(0.05, ge=0.01, le=1)
     low: float = Field(0.1, ge=0.01, le=5)
-    high: float = Field(0.6, ge=0.02, le=20)
-    radius: float = Field(0.25, ge=0, le=10)
+    high: float = Field(0.75, ge=0.02, le=20)
+    radius: float = Field(0.3, ge=0, le=10)
     max_step: float = Field(0.06, ge=0.01, le=1)
     max_slope: float = Field(30.0, ge=1, le=60)
     context: NavigationContext = NavigationContext()
@@ -108,7 +108,7 @@ def _write_maps(
 ) -> dict[str, Any]:
     """Write the occupancy maps and `navigation.json`; returns metrics."""
     from scan2sim.pipeline.io.navigation import nav2_map
-    from scan2sim.pipeline.simulation.free_spawn import CLEARANCE_M, spawn_pose
+    from scan2sim.pipeline.simulation.free_spawn import spawn_pose
     from scan2sim.pipeline.simulation.occupancy import Band, storeys
 
     mesh, ground = _surfaces(inputs, params.context)
@@ -124,15 +124,19 @@ def _write_maps(
         note = f"frame: world; floor at z = {floor:.2f} m; obstacles {params.low:g} to {params.high:g} m above it"
         nav2_map.write(storey, file, (float(offset[0]), float(offset[1])), note)
         about.append({"map": file.name, "floor_m": round(floor, 3), "free_m2": round(storey.free_m2, 1)})
-    start, clearance = spawn_pose(found[0], starts[0] if len(starts) else None)
-    position = (np.asarray(start.position) + offset).round(4).tolist()
+    chosen = spawn_pose(found[0], starts[0] if len(starts) else None)
+    position = (np.asarray(chosen.start.position) + offset).round(4).tolist()
     spawn = {
         "position_m": position,
-        "angles_rad": np.round(start.angles, 6).tolist(),
-        "clearance_m": round(clearance, 2),
+        "angles_rad": np.round(chosen.start.angles, 6).tolist(),
+        "clearance_m": round(chosen.clearance, 2),
     }
-    if clearance < CLEARANCE_M:
-        warnings.append(f"the spawn pose is only {clearance:.2f} m from obstacles: small robots only")
+    if not chosen.fits:
+        warnings.append(
+            f"the spawn pose is only {chosen.clearance:.2f} m from obstacles: no room for the supplied robot"
+        )
+    elif not chosen.turns:
+        warnings.append(f"the supplied robot can't turn at its spawn pose, {chosen.clearance:.2f} m from obstacles")
     body = {"frame": "world", "spawn": spawn, "storeys": about, "band_m": asdict(band)}
     (folder / FOLDER_FILE).write_text(json.dumps(body, indent=2) + "\n", encoding="utf-8")
     return {"storeys": about, "spawn": spawn, "resolution_m": round(found[0].grid.cell, 4)}
@@ -200,4 +204,4 @@ def _intensity(inputs: Inputs, xyz: F32) -> F32 | None:
     return (cloud.intensity[nearest] / INTENSITY_SCALE).astype(np.float32)
 
 
-NAVIGATION = Step("navigation", 3, navigation, NavigationParams)
+NAVIGATION = Step("navigation", 4, navigation, NavigationParams)

@@ -27,6 +27,8 @@ REST, FURNITURE, VEHICLE, CEILING = -1, len(GROUPS) + 1, len(GROUPS) + 2, len(GR
 """Numbers of further parts beside those of the groups: no surface, furniture, parked vehicle, ceiling."""
 UNCLASSIFIED_FRACTION_WARNING = 0.01
 """Fraction of unclassified points above which the step warns."""
+LEFT_OUT_FRACTION_WARNING = 0.3
+"""Fraction of points of other classes without a surface, such as vehicles, above which the step warns."""
 
 
 class SplitContext(Context):
@@ -114,6 +116,13 @@ def split(inputs: Inputs, params: SplitParams, out: Path, report: Report) -> Don
             f"{sum(unmeshed.values()) / len(cloud):.1%} of the points have no known class ({which}): "
             f"the world has no surface there. {mapping if foreign else 'Classify'} the cloud "
             "again with --set segment.overwrite=true"
+        )
+    left_out = (group == REST) & classified_codes()[cloud.classification] & ~np.isin(cloud.classification, NOISE)
+    if left_out.mean() > LEFT_OUT_FRACTION_WARNING:
+        names = sorted({name_of(int(code)) for code in np.unique(cloud.classification[left_out])})
+        warnings.append(
+            f"{left_out.mean():.0%} of the points are of classes that get no surface ({', '.join(names)}): check the "
+            "classes, and of a robot's map --scene and --units"
         )
     return Done(files, {"points_in": len(cloud), "points": counts, "classes": classes}, warnings)
 

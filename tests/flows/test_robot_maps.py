@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from scan2sim.data_samples.building import Style, Surface, build
+from scan2sim.data_samples.robot_map import Lidar, Mapping, RobotMap, record
 from scan2sim.pipeline.core.types import F32, F64, U8, Frame, PointCloud
 from scan2sim.pipeline.geometry.surface_distance import distances
 from scan2sim.pipeline.io import clouds
@@ -110,6 +112,39 @@ def test_random_parts_of_a_map_end_in_a_world_or_a_reason(tmp_path: Path, seed: 
     intensity = rng.uniform(0, 255, len(kept)).astype(np.float32) if seed % 2 else None
     code, printed = scan2sim("run", pcd(tmp_path / "map.pcd", kept, intensity), "--out", tmp_path / "out", *FAST)
     assert "Traceback" not in printed and code in (0, DATA_ERROR), printed
+
+
+@pytest.fixture(scope="module")
+def office() -> RobotMap:
+    """Map of a corridor with two furnished rooms, with the kind of each point."""
+    building = build(3, Style(rooms=1, furniture=0.4))
+    lidar = Lidar(azimuth_step=1.0, elevation=(-25.0, 40.0))
+    return record(building, lidar, Mapping(voxel=0.1, people=1, reflections=0.05), 3)
+
+
+SUBSETS: dict[str, tuple[dict[Surface, float], str]] = {
+    "no floor": ({Surface.WALL: 0.5, Surface.CEILING: 1, Surface.FURNITURE: 0.5}, "the up axis is ambiguous"),
+    "no walls": ({Surface.FLOOR: 0.7, Surface.CEILING: 0.3, Surface.PERSON: 1}, "no walls found"),
+    "traces of the floor": ({Surface.WALL: 0.8, Surface.FLOOR: 0.003}, "is assumed from the feet"),
+    "a few of everything": (dict.fromkeys(Surface, 0.08), "of the floor"),
+}
+"""Share of the points of each kind that is kept, and what `run` says of the map."""
+SPAWN_TOLERANCE_M = 0.2
+
+
+@pytest.mark.parametrize("case", SUBSETS)
+def test_subsets_of_a_maps_classes_end_in_an_upright_world(tmp_path: Path, office: RobotMap, case: str) -> None:
+    shares, expected = SUBSETS[case]
+    share = np.array([shares.get(Surface(kind), 0) for kind in range(1, len(Surface) + 1)])
+    kept = np.random.default_rng(0).random(len(office.xyz)) < share[office.surface - 1]
+    source = pcd(tmp_path / "map.pcd", office.xyz[kept].astype(np.float32))
+    code, printed = scan2sim("run", source, "--out", tmp_path / "out", *FAST)
+    assert code == 0 and "Traceback" not in printed and expected in printed, printed
+    about = json.loads((tmp_path / "out" / "world" / "metadata.json").read_text(encoding="utf-8"))
+    T = np.array(about["T_world_map"])
+    assert np.degrees(np.arccos(T[:3, :3] @ office.up @ (0, 0, 1))) < 2
+    (x, y, z), to_building = about["navigation"]["spawn"]["position_m"], np.linalg.inv(T @ office.T_map_world)
+    assert abs((to_building @ (x, y, z, 1))[2]) < SPAWN_TOLERANCE_M  # its floor is at height 0
 
 
 def test_folder_of_clouds_and_a_repeated_run(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from scan2sim.pipeline import decimation
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.step import silent
-from scan2sim.pipeline.core.types import Frame, Mesh
+from scan2sim.pipeline.core.types import Frame, Mesh, PointCloud
 from scan2sim.pipeline.steps.decimate import DECIMATE, DecimateParams
 from tests.fakes.steps import step_params
 
@@ -91,3 +91,19 @@ def test_unknown_backend_lists_available_ones() -> None:
     assert DECIMATE.check is not None
     with pytest.raises(SettingError, match=r"decimate\.backend: unknown value 'pyfqmr'.*fast_simplification, py"):
         DECIMATE.check(DecimateParams(backend="pyfqmr"))
+
+
+def test_surface_of_a_sparse_map_gets_three_triangles_per_point(tmp_path: Path) -> None:
+    whole, rng = hills(), np.random.default_rng(0)
+    whole.save(tmp_path / "mesh.npz")
+    xy = rng.uniform(0.5, 11, (3000, 2))
+    xyz = np.column_stack([xy, 0.5 * np.sin(xy[:, 0]) * np.cos(xy[:, 1])]).astype(np.float32)
+    PointCloud(Frame(), xyz).save(tmp_path / "cloud.npz")
+    inputs = {"mesh": tmp_path / "mesh.npz", "cloud": tmp_path / "cloud.npz"}
+    sizes = {}
+    for by_points in (True, False):
+        (out := tmp_path / str(by_points)).mkdir()
+        done = DECIMATE.run(inputs, step_params(DecimateParams, by_points=by_points), out, silent)
+        sizes[by_points] = len(small := Mesh.load(done.files["mesh"]))
+        assert height_error(small) < 0.02
+    assert sizes[False] == len(whole) and sizes[True] == pytest.approx(9000, rel=0.05)

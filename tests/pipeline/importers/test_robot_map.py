@@ -62,6 +62,17 @@ def test_up_axis_is_found_without_ceiling_or_floor(parts: dict[str, bool]) -> No
     assert np.degrees(np.arccos(found.up @ turn[:, 2])) < 0.5
 
 
+@pytest.mark.parametrize("tilt_deg", [0.0, 5.0])
+def test_map_with_a_ceiling_whose_floor_was_removed_stays_upright(tmp_path: Path, tilt_deg: float) -> None:
+    """The ceiling alone could be a floor: the map's z axis decides, with a warning."""
+    turn = Rotation.from_euler("x", tilt_deg, degrees=True)
+    source = save(tmp_path / "map.las", turn.apply(room(2, floor=False)).astype(np.float32))
+    _, T, warnings = imported(source, tmp_path / "tile")
+    up = T[:3, :3] @ turn.as_matrix()[:, 2]
+    assert np.degrees(np.arccos(up[2])) < 0.5
+    assert any("ambiguous" in warning and "--up" in warning for warning in warnings)
+
+
 def test_tilted_map_becomes_level_and_its_transform_maps_it_to_the_world(tmp_path: Path) -> None:
     xyz = room()
     tilt = Rotation.from_euler("xyz", [7, -6, 20], degrees=True).as_matrix()

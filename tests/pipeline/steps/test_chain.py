@@ -98,6 +98,15 @@ def test_split_warns_of_empty_classes_and_rejects_a_cloud_without_any(tmp_path: 
         go(SPLIT, tmp_path / "out2", {"cloud": tmp_path / "cars.npz"})
 
 
+@pytest.mark.parametrize(("vehicles", "warned"), [(60, False), (120, True)])
+def test_split_warns_if_much_of_the_cloud_gets_no_surface(tmp_path: Path, vehicles: int, warned: bool) -> None:
+    codes = np.repeat([CODE["terrain"], CODE["building"], CODE["high_vegetation"]], 100)
+    codes = np.concatenate([codes[vehicles:], np.full(vehicles, CODE["vehicle"])]).astype(np.uint8)
+    replace(bumpy(300), classification=codes).save(tmp_path / "cloud.npz")
+    done = go(SPLIT, tmp_path / "out", {"cloud": tmp_path / "cloud.npz"})
+    assert any("40% of the points" in w and "vehicle" in w for w in done.warnings) == warned
+
+
 def test_voxel_equals_a_reference_implementation() -> None:
     cloud = bumpy(3000)
     thin = sample(cloud, 0.5)

@@ -9,7 +9,7 @@ import numpy as np
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import I32, Frame, Mesh, PointCloud
 from scan2sim.pipeline.io.source_mesh import SourceMesh
-from scan2sim.pipeline.steps.decimate import DecimateParams, TileBorder, decimate
+from scan2sim.pipeline.steps.decimate import DecimateContext, DecimateParams, decimate
 from scan2sim.pipeline.steps.split_mesh import SplitContext, SplitMeshParams, split_mesh
 
 GROUPS = ("terrain", "building", "vegetation")
@@ -64,7 +64,7 @@ def test_classes_share_their_border_after_decimation(tmp_path: Path) -> None:
     final = []
     for name in ("terrain", "building"):
         parts[name].save(tmp_path / f"{name}.npz")
-        params = DecimateParams(target=10_000, context=TileBorder(keep_border=True))
+        params = DecimateParams(target=10_000, context=DecimateContext(keep_border=True))
         folder = tmp_path / name
         folder.mkdir()
         final.append(Mesh.load(decimate({"mesh": tmp_path / f"{name}.npz"}, params, folder, silent).files["mesh"]))
