@@ -18,7 +18,7 @@ from scan2sim.services.teleoperation.gateway_protocol import (
     Hello,
     Join,
     Release,
-    RequestRefused,
+    RequestRejected,
     Status,
     from_gateway,
 )
@@ -41,7 +41,7 @@ class Party(Protocol):
     def status(self) -> Status:
         """Current status."""
 
-    def handle_order(self, order: Join | Release | RequestRefused) -> None:
+    def handle_order(self, order: Join | Release | RequestRejected) -> None:
         """Carry out an order of the gateway."""
 
 

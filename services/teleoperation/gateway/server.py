@@ -13,7 +13,7 @@ from scan2sim.services.teleoperation.gateway_protocol import (
     DriverEvent,
     DriverRequest,
     Hello,
-    RequestRefused,
+    RequestRejected,
     Status,
     to_gateway,
 )
@@ -84,17 +84,17 @@ class Gateway:
             try:
                 self._fleet.handle_request(connection.peer, message)
             except ScanError as error:
-                connection.send(RequestRefused(cause=str(error)[:REASON_MAX_CHARS]).wire())
+                connection.send(RequestRejected(cause=str(error)[:REASON_MAX_CHARS]).wire())
 
     def _refuse(self, connection: Connection, reason: str) -> None:
-        self._notify(f"{connection.peer} was refused: {reason}")
-        connection.send(RequestRefused(cause=reason[:REASON_MAX_CHARS]).wire())
+        self._notify(f"{connection.peer} was rejected: {reason}")
+        connection.send(RequestRejected(cause=reason[:REASON_MAX_CHARS]).wire())
         connection.close(reason)
 
     def _closed(self, connection: Connection, reason: str) -> None:
         send = self._senders.pop(connection, None)
         if send is None:
-            self._notify(f"{connection.address} was refused: {reason}")
+            self._notify(f"{connection.address} was rejected: {reason}")
         else:
             self._notify(f"{connection.peer} disconnected: {reason}")
             self._fleet.disconnected(connection.peer, send)

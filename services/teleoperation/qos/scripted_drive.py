@@ -415,7 +415,7 @@ class StationEnd:
 
     def _both_connected(self) -> bool:
         fleet = self._fleet.snapshot()
-        return all(any(one["there"] for one in fleet[kind]) for kind in ("vehicles", "stations"))
+        return all(any(one["connected"] for one in fleet[kind]) for kind in ("vehicles", "stations"))
 
     def _joined(self) -> JoinedVehicle:
         return _until(self._station.joined, "a vehicle")

@@ -158,7 +158,7 @@ class Demo:
 
     def _both_connected(self) -> bool:
         fleet = self._request("api/fleet") or {"vehicles": [], "stations": []}
-        return all(any(one["there"] for one in fleet[kind]) for kind in ("vehicles", "stations"))
+        return all(any(one["connected"] for one in fleet[kind]) for kind in ("vehicles", "stations"))
 
     def _request(self, path: str, body: dict[str, str] | None = None) -> dict[str, list[dict[str, object]]] | None:
         """Answer of the gateway's API; None: it doesn't answer."""

@@ -21,7 +21,7 @@ from scan2sim.services.teleoperation.gateway_protocol import (
     Join,
     LinkStatus,
     Release,
-    RequestRefused,
+    RequestRejected,
     Status,
 )
 from scan2sim.services.teleoperation.identity import Identity
@@ -32,7 +32,7 @@ class ObedientParty:
     """A party that follows its orders."""
 
     def __init__(self, folder: Path, port: int, listening: tuple[Address, ...] = ()) -> None:
-        self.orders: list[Join | Release | RequestRefused] = []
+        self.orders: list[Join | Release | RequestRejected] = []
         self.driving: CurrentPair | None = None
         self._listening = listening
         self.identity = Identity.read(folder)
@@ -46,7 +46,7 @@ class ObedientParty:
     def status(self) -> Status:
         return Status(links=(LinkStatus(name="lte", up=True, round_trip=41.0),), speed=1.5)
 
-    def handle_order(self, order: Join | Release | RequestRefused) -> None:
+    def handle_order(self, order: Join | Release | RequestRejected) -> None:
         self.orders.append(order)
         if isinstance(order, Join):
             self.driving = CurrentPair(pair=order.pair, other=order.other.name)
@@ -110,8 +110,8 @@ def test_refused_request_is_reported_to_its_sender(
     try:
         until(lambda: desk.orders)
         desk.gateway_connection.send_request(DriverRequest(what="join", vehicle="car"))
-        until(lambda: isinstance(desk.orders[-1], RequestRefused))
+        until(lambda: isinstance(desk.orders[-1], RequestRejected))
         refused = desk.orders[-1]
-        assert isinstance(refused, RequestRefused) and "not a connected vehicle" in refused.cause
+        assert isinstance(refused, RequestRejected) and "not a connected vehicle" in refused.cause
     finally:
         desk.gateway_connection.close()
