@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from scan2sim.services.teleoperation.control.messages import Malformed
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,59}")
 """Name of a vehicle, station or driver; it becomes part of paths, pages and logs."""
 T = TypeVar("T")

@@ -88,7 +88,7 @@ class Demo:
             "--port", params.port,
         )  # fmt: skip
         car = parties / f"vehicle-{VEHICLE_NAME}"
-        self._run("translate", "simulated", "--set", f"world={params.world}", "--key", car / ADAPTER_KEY_FILE)
+        self._run("adapter", "simulated", "--set", f"world={params.world}", "--key", car / ADAPTER_KEY_FILE)
         cameras = [part for one in camera_options(params) for part in ("--camera", one)]
         self._run(
             "vehicle", car, gateway,

@@ -1,4 +1,4 @@
-"""Vehicles and stations at a running gateway over TLS: joined, refused, and joined again after its restart."""
+"""Vehicles and stations at a running gateway over TLS: joined, rejected, and joined again after its restart."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from scan2sim.services.teleoperation.gateway.fleet import Fleet
 from scan2sim.services.teleoperation.gateway.pki import certify
 from scan2sim.services.teleoperation.gateway.server import Gateway
 from scan2sim.services.teleoperation.gateway_protocol import (
+    PROTOCOL_VERSION,
     Address,
     CurrentPair,
     DriverRequest,
@@ -102,7 +103,7 @@ def test_pair_survives_a_restart_of_the_gateway(parties: Path, gateway: Callable
         desk.gateway_connection.close()
 
 
-def test_refused_request_is_reported_to_its_sender(
+def test_rejected_request_is_reported_to_its_sender(
     parties: Path, gateway: Callable[[int], tuple[Gateway, Fleet]]
 ) -> None:
     started, _ = gateway(0)
@@ -111,7 +112,22 @@ def test_refused_request_is_reported_to_its_sender(
         until(lambda: desk.orders)
         desk.gateway_connection.send_request(DriverRequest(what="join", vehicle="car"))
         until(lambda: isinstance(desk.orders[-1], RequestRejected))
-        refused = desk.orders[-1]
-        assert isinstance(refused, RequestRejected) and "not a connected vehicle" in refused.cause
+        answer = desk.orders[-1]
+        assert isinstance(answer, RequestRejected) and "not a connected vehicle" in answer.cause
     finally:
         desk.gateway_connection.close()
+
+
+def test_party_with_another_protocol_version_is_rejected(
+    parties: Path, gateway: Callable[[int], tuple[Gateway, Fleet]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ObedientParty, "hello", lambda _: Hello(version=PROTOCOL_VERSION - 1))
+    started, fleet = gateway(0)
+    car = ObedientParty(parties / "vehicle-car", started.port)
+    try:
+        until(lambda: car.orders)
+        answer = car.orders[0]
+        assert isinstance(answer, RequestRejected) and f"protocol version {PROTOCOL_VERSION}" in answer.cause
+        assert not fleet.snapshot()["vehicles"]
+    finally:
+        car.gateway_connection.close()
