@@ -73,7 +73,7 @@ def read(
         columns: tuple[str, ...] = POSITION_COLUMNS + QUATERNION_COLUMNS
         if kind == ".csv":
             columns, lines = _header_line(path, lines)
-        if {"time", "sec"} & set(columns):  # without times, repeated lines are those of a vehicle that stands
+        if {"time", "sec"} & set(columns):  # without times, repeated lines are those of a stationary vehicle
             lines = [one for one, before in zip(lines, [(0, [""]), *lines], strict=False) if one[1] != before[1]]
         trajectory = _from_columns(path, kind, columns, lines, frame, times, timed)
     far = np.flatnonzero(~(np.abs(trajectory.positions) < MAX_COORDINATE_M).all(axis=1))
