@@ -196,9 +196,9 @@ def _header_line(path: Path, lines: Lines) -> tuple[tuple[str, ...], Lines]:
     names = named(cells)
     if len(lines) < 2:
         raise InputError(path, "is not a trajectory (it contains no poses)", REMEDIES[".csv"])
-    doubled = next((name for name in names if name and names.count(name) > 1), None)
-    if doubled is not None:
-        raise _bad(path, ".csv", number, f"two columns are named `{doubled}`")
+    duplicate = next((name for name in names if name and names.count(name) > 1), None)
+    if duplicate is not None:
+        raise _bad(path, ".csv", number, f"two columns are named `{duplicate}`")
     timed = "time" in names or {"sec", "nanosec"} <= set(names)
     if timed and set("xyz") <= set(names):
         partial = {

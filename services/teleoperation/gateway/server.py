@@ -61,11 +61,11 @@ class Gateway:
             else:
                 self._greet(connection, message)
         except Malformed as error:
-            self._refuse(connection, f"it sent a message that isn't understood ({error})")
+            self._reject(connection, f"it sent a message that isn't understood ({error})")
 
     def _greet(self, connection: Connection, message: Hello | Status | DriverRequest | DriverEvent) -> None:
         if not isinstance(message, Hello) or message.version != PROTOCOL_VERSION:
-            self._refuse(connection, f"it doesn't support protocol version {PROTOCOL_VERSION}")
+            self._reject(connection, f"it doesn't support protocol version {PROTOCOL_VERSION}")
             return
 
         def send(order: Order) -> None:
@@ -86,7 +86,7 @@ class Gateway:
             except ScanError as error:
                 connection.send(RequestRejected(cause=str(error)[:REASON_MAX_CHARS]).wire())
 
-    def _refuse(self, connection: Connection, reason: str) -> None:
+    def _reject(self, connection: Connection, reason: str) -> None:
         self._notify(f"{connection.peer} was rejected: {reason}")
         connection.send(RequestRejected(cause=reason[:REASON_MAX_CHARS]).wire())
         connection.close(reason)

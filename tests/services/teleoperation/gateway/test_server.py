@@ -35,10 +35,11 @@ class ObedientParty:
     def __init__(self, folder: Path, port: int, listening: tuple[Address, ...] = ()) -> None:
         self.orders: list[Join | Release | RequestRejected] = []
         self.driving: CurrentPair | None = None
+        self.messages: list[str] = []
         self._listening = listening
         self.identity = Identity.read(folder)
         self.gateway_connection = GatewayConnection(
-            self.identity, Address(host="127.0.0.1", port=port), self, lambda _: None
+            self.identity, Address(host="127.0.0.1", port=port), self, self.messages.append
         )
 
     def hello(self) -> Hello:
@@ -128,6 +129,7 @@ def test_party_with_another_protocol_version_is_rejected(
         until(lambda: car.orders)
         answer = car.orders[0]
         assert isinstance(answer, RequestRejected) and f"protocol version {PROTOCOL_VERSION}" in answer.cause
+        assert any(answer.cause in message for message in car.messages)
         assert not fleet.snapshot()["vehicles"]
     finally:
         car.gateway_connection.close()
