@@ -229,7 +229,7 @@ def colours(folder: Path, width: int, repeats: int) -> dict[str, Any]:
             return np.asarray(ImageCms.profileToProfile(Image.fromarray(rgb), own, srgb))
 
         space_name = open_image(path).spec().get_string_attribute("oiio:ColorSpace")
-        one: dict[str, Any] = {"openimageio_tells": space_name}
+        one: dict[str, Any] = {"openimageio_colour_space": space_name}
         for way, task in (("as decoded", lambda: rgb), ("openimageio, named", named), ("pillow", by_profile)):
             seconds, pixels = fastest(task, repeats)
             away = np.abs(pixels[::4] - truth)

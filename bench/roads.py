@@ -1,8 +1,7 @@
-"""Extracted roads line_errors with the truth of synthetic streets.
+"""Extracted roads compared with the truth of synthetic streets.
 
 `python -m bench.roads [--seeds 0 1] [--length 60 --points 3e6 --photos 24] [--tile 30] [--out bench-out/roads]
-[--pictures]`
-builds each street's world with `scan2sim run`, including photos, and reads its GeoJSON and OpenDRIVE.
+[--pictures]` builds each street's world with `scan2sim run`, including photos, and reads its GeoJSON and OpenDRIVE.
 
 - `road_centre_p95_m`: distance from points on the reference line to the street's axis, where the centre line is
   painted; `road_width_p95_m`: error of the width between the edges at each of these points.

@@ -309,9 +309,8 @@ def _pillars(xyz: F32, height: F64, floor: F32, layer: float, runs: list[Run], r
     layers = np.unique(flat * 64 + np.clip((height[rest] / 0.15).astype(np.int64), 0, 63)) // 64
     layers = np.bincount(layers, minlength=shape.prod()).reshape(shape)
     ground, body = (np.bincount(cells(part), minlength=shape.prod()).reshape(shape) for part in (floor, xyz))
-    ground = ground - layer * body / np.maximum(
-        high, max(2 * layer, 0.1)
-    )  # what stands there has points at the floor, too
+    # objects on the floor have points at its height, too
+    ground = ground - layer * body / np.maximum(high, max(2 * layer, 0.1))
     seen_floor = ground > MODEL.floor_density * (np.median(ground[ground > 0]) if (ground > 0).any() else np.inf)
     full = (layers >= 0.3 * MODEL.min_pillar / 0.15) & (high > 0.7 * MODEL.min_pillar)
     label, count = ndimage.label(full, np.ones((3, 3)))

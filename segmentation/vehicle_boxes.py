@@ -244,7 +244,7 @@ def passing_points(scan: Scan) -> list[I64]:
     """Clusters (indices) of any class that were there for a moment, though the free space of voxels kept them.
 
     These are clusters above the ground, no wider than a lane, that were scanned only for a moment, and either rays of
-    more sweeps passed their place than saw them, or they touch carved points: at the ends of a trail no ray passes. A
+    more sweeps passed their place than saw them, or they touch moving points: at the ends of a trail no ray passes. A
     garden seen through a gate is also scanned only for a moment, but it is wider; wires of a fence are passed by most
     rays, but they are thinner.
     """

@@ -15,17 +15,17 @@ MAX_NAME_CHARS = 200
 def open_outbox(node: str, topic: str) -> Outbox:
     """Open the outbox for a node's records on a topic, both given by their full names.
 
-    The first process of that name gets NAME.1.spool, a second one that runs at the same time NAME.2.spool, and so on.
+    The first process of that name gets NAME.1.outbox, a second one that runs at the same time NAME.2.outbox, and so on.
     Records left in files that no process has open are moved into the new outbox.
 
     Raises:
         SpaceError: the state folder can't be created or written.
     """
     name = f"{node}.{topic}".replace("/", ".").strip(".")[:MAX_NAME_CHARS]
-    folder, number = state_folder("spools"), 1
-    while (own := _open_if_free(folder / f"{name}.{number}.spool")) is None:
+    folder, number = state_folder("outboxes"), 1
+    while (own := _open_if_free(folder / f"{name}.{number}.outbox")) is None:
         number += 1
-    while (path := folder / f"{name}.{(number := number + 1)}.spool").exists():
+    while (path := folder / f"{name}.{(number := number + 1)}.outbox").exists():
         if (abandoned := _open_if_free(path)) is not None:
             own.take_over(abandoned)
             abandoned.close()

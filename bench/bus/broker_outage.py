@@ -26,8 +26,8 @@ def broker_down(before: float = UP_S, down: float = DOWN_S, after: float = RECOV
     """Kill and restart the broker while nodes publish records and a reader reads them.
 
     Returns:
-        broker_down_lost: records that were not read; broker_down_doubles: records that were read twice, by their ids;
-        records: number of records; doubles_sent: duplicates that were dropped.
+        broker_down_lost: records that were not read; broker_down_duplicates: records read twice, by their ids;
+        records: number of records; duplicates_sent: duplicates that were dropped.
     """
     broker = Broker()
     broker.start()
@@ -63,9 +63,9 @@ def broker_down(before: float = UP_S, down: float = DOWN_S, after: float = RECOV
     broker.kill()
     return {
         "broker_down_lost": len(set(published) - set(received)),
-        "broker_down_doubles": len(received) - len(set(received)),
+        "broker_down_duplicates": len(received) - len(set(received)),
         "records": len(published),
-        "doubles_sent": len(duplicates),
+        "duplicates_sent": len(duplicates),
     }
 
 

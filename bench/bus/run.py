@@ -68,7 +68,7 @@ PARTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "link": lambda _: link.link(),
 }
 KEYS = ("experiment", "overhead_p50_1kb", "overhead_throughput_1kb", "overhead_p50_6mb", "broker_down_lost",
-        "broker_down_doubles", "bandwidth_error", "loss_error", "latency_error", "nodes_watched", "false_alarms",
+        "broker_down_duplicates", "bandwidth_error", "loss_error", "latency_error", "nodes_watched", "false_alarms",
         "flaps")  # fmt: skip
 """Keys that the result always has."""
 FLAT = ("overhead", "broker", "alarms", "nodes", "link")

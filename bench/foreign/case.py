@@ -33,7 +33,7 @@ KINDS = {
 }
 """Kinds of inputs by number."""
 
-Expected = Literal["read", "named", "refused"]
+Expected = Literal["read", "named", "rejected"]
 Verdict = Literal["right", "silent", "crashed", "rejected_valid"]
 
 
@@ -50,7 +50,7 @@ class Case:
         name: unique.
         kind: number of its kind in `KINDS`.
         make: writes the files into a folder, and returns the arguments of the command.
-        expected: "read": right; "named": read, with a warning that `says` matches; "refused": with an error that it
+        expected: "read": right; "named": read, with a warning that `says` matches; "rejected": with an error that it
             matches; a warning that it matches is right, too.
         says: regular expression.
         check: says what is wrong with the result in the folder; "" if it is right.
@@ -96,9 +96,9 @@ def run(case: Case, folder: Path) -> Outcome:
     text = " ".join(output.replace(str(folder), "…").split())
     said = bool(case.says) and re.search(case.says, text) is not None
     if done.returncode:
-        refused = case.expected == "refused"
-        why = "" if refused and said else f"exit status {done.returncode}: {text[-300:]}"
-        return Outcome("right" if refused else "rejected_valid", why, messages)
+        rejected = case.expected == "rejected"
+        why = "" if rejected and said else f"exit status {done.returncode}: {text[-300:]}"
+        return Outcome("right" if rejected else "rejected_valid", why, messages)
     wrong = case.check(folder)
     if not wrong and (said or case.expected == "read"):
         return Outcome("right", "", messages)

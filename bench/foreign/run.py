@@ -1,10 +1,10 @@
-"""Inputs as other programs write them: read right, named in a warning, or refused with the true reason.
+"""Inputs as other programs write them: read right, named in a warning, or rejected with the true reason.
 
 `python -m bench.foreign [--kinds 2 3] [--cases NAME] [--out bench-out/foreign]`
 
 Each case (`bench/foreign/cases`) writes files with known content, and runs a command on them in a process of its own.
 - `inputs`: number of cases. `silent`: wrong results, or results that need a warning, without one. `crashed`: a
-  traceback, a signal, or no end. `rejected_valid`: refused, though valid.
+  traceback, a signal, or no end. `rejected_valid`: rejected, though valid.
 - `untrue`: errors and warnings of which no reader has judged that cause and remedy are true (`judged.json`: the message
   without figures and paths, and true or false). `--out` gets `messages.json`, with those that aren't judged.
 - `false_alarms`: findings about plausibility (`scan2sim inspect`) in the real recordings of SCAN2SIM_REAL_DATA and in

@@ -96,7 +96,7 @@ def streets(out: Path) -> dict[str, float]:
     for seed in STREETS:
         tile = street(out, seed)
         for kind, settings in (("photos", ()), ("shape", ("segment.photos=false",))):
-            found, seconds = segment_tile(tile, out / f"told_{seed}_{kind}", *settings)
+            found, seconds = segment_tile(tile, out / f"classified_{seed}_{kind}", *settings)
             rows[kind].append(found)
             sign = found.iou.get("road_sign", float("nan"))
             print(f"\nstreet {seed}, {kind}: mIoU {found.mean():.3f}, signs {sign:.3f}, {seconds:.0f} s")
@@ -113,7 +113,7 @@ def time_of_nine_million(out: Path) -> float:
     tile = out.parent / "street_100_9e+06_40"
     if not (tile / "tile.toml").is_file():
         scan2sim("sample", "--length=100", "--points=9e6", "--photos=40", "--seed=0", tile)
-    found, seconds = segment_tile(tile, out / "told_9m")
+    found, seconds = segment_tile(tile, out / "classified_9m")
     print(f"\n9 million points, 40 photos: {seconds:.0f} s, mIoU {found.mean():.3f}\n{found.table()}", flush=True)
     return seconds / 60
 

@@ -270,8 +270,8 @@ def open_starts(scale: float, report: Report) -> dict[str, Any]:
             "gateway without certificate": ("gateway", Path(name) / "none", "--state", name),
             "driver page without token": ("station", parties / "station-desk", gateway, *everywhere),
             "station without certificate": ("station", Path(name) / "none", gateway),
-            "adapter without key": ("translate", "ros", *everywhere),
-            "adapter without key, on loopback": ("translate", "ros", "--port", free_port()),
+            "adapter without key": ("adapter", "ros", *everywhere),
+            "adapter without key, on loopback": ("adapter", "ros", "--port", free_port()),
             "onboard unit without key": ("vehicle", parties / "vehicle-car", gateway),
         }
         opened = list[str]()

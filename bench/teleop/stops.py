@@ -60,7 +60,7 @@ class InterruptedPair:
     """A pair whose links are cut; `clock_errors`: errors of the vehicle's and the station's wall clocks, s."""
 
     def __init__(self, seed: int, clock_errors: tuple[float, float] = (0.0, 0.0)) -> None:
-        self._chance, self._ended, self._told = random.Random(seed), threading.Event(), list[Telemetry]()
+        self._chance, self._ended, self._telemetry = random.Random(seed), threading.Event(), list[Telemetry]()
         car, desk = identity(Role.VEHICLE, "car"), identity(Role.STATION, "desk")
         self._listener = Listener(desk, [(HOSTS[0], 0)])
         self._relay = Relay((HOSTS[0], self._listener.port), seed)
@@ -110,11 +110,11 @@ class InterruptedPair:
     def clock_warning(self) -> str:
         """Warning of vehicle and station about their clocks while a driver tries to drive; empty if one is missing."""
         wrong = self._connection.clocks
-        both = self._until(lambda: wrong.wall_wrong and bool(self._told) and "NTP" in self._told[0].reason)
+        both = self._until(lambda: wrong.wall_wrong and bool(self._telemetry) and "NTP" in self._telemetry[0].reason)
         end = time.monotonic() + DRIVE_ATTEMPT_S
         while time.monotonic() < end and not self._vehicle.drives:
             time.sleep(0.01)
-        return self._told[0].reason if both and not self._vehicle.drives else ""
+        return self._telemetry[0].reason if both and not self._vehicle.drives else ""
 
     def close(self) -> None:
         """Stop the pair."""
@@ -131,13 +131,13 @@ class InterruptedPair:
 
     def _received(self, message: Message) -> None:
         if message.kind == Kind.TELEMETRY:
-            self._told[:] = [Telemetry.unpack(message.body)]
+            self._telemetry[:] = [Telemetry.unpack(message.body)]
 
     def _drive(self) -> None:
         route = ScriptedCommands()
         while not self._ended.wait(COMMAND_PERIOD_S):
-            if self._told:
-                self._connection.send(Kind.COMMAND, route.command(self._told[0], time.monotonic()).pack())
+            if self._telemetry:
+                self._connection.send(Kind.COMMAND, route.command(self._telemetry[0], time.monotonic()).pack())
 
     @staticmethod
     def _until(true: Callable[[], bool]) -> bool:

@@ -106,7 +106,7 @@ def main() -> None:
     found = {box: measure_image(box, 18080 + i) for i, box in enumerate(tasks.names())}
     sizes = {box: round(size) for box, (size, _) in found.items()}
     missing = sorted({library for _, some in found.values() for library in some})
-    print("RESULT " + json.dumps({"images_mb": sizes, "limit_mb": MAX_IMAGE_MB, "libraries_lacking": missing}))
+    print("RESULT " + json.dumps({"images_mb": sizes, "limit_mb": MAX_IMAGE_MB, "missing_libraries": missing}))
     if missing or max(sizes.values()) > MAX_IMAGE_MB:
         sys.exit(1)
 

@@ -113,7 +113,7 @@ def plan_drive(
 
 
 def _link(folder: Path, place: Path) -> None:
-    """Create or update the symbolic link `georeference` to a result."""
+    """Create or update the symbolic link `place` to a result."""
     if place.is_symlink():
         place.unlink()
     if not place.exists():

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 app = App("Drive vehicles remotely, over several network links at once.")
 PACKAGES = ("OpenSSL", "pylibsrtp", "websockets")
-"""Packages that all of these commands need, except `translate`."""
+"""Packages that all of these commands need, except `adapter`."""
 WINDOW_HELP = "Show the driver page in a window of its own, without the controls of a browser."
 
 
@@ -83,9 +83,9 @@ def teleop_certificates(
     console.print(table)
 
 
-@app.command("translate")
+@app.command("adapter")
 @options(AdapterParams)
-def teleop_translate(
+def teleop_adapter(
     params: AdapterParams,
     name: Annotated[
         str,

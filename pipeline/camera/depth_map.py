@@ -53,7 +53,7 @@ SAME_PASS_MAX_S = 5.0
 """Points scanned further apart in time belong to different passes of the scanner."""
 MOVING_OCCLUSION_S = (-0.1, 0.4)
 """Time window around its scan in which a point of a moving object occludes: a car leaves its own length in 0.4 s."""
-CARVED_OCCLUSION_S = 0.1
+REMOVED_OCCLUSION_S = 0.1
 """Half of that window for points that step `dynamic_objects` classified as moving: the next turn has new points."""
 TIME_WEIGHT_M_PER_S = 20.0
 """Scale from time to distance in the neighbour search among moving points: only points of one moment are neighbours."""
@@ -172,7 +172,7 @@ def _with_moving(static: Scene, moving: PointCloud | None, radius: float) -> Sce
         centres=np.concatenate([static.centres, moving.xyz]),
         normals=np.concatenate([static.normals, moving.normal]),
         radii=np.concatenate([static.radii, radii]),
-        spans=np.concatenate([static.spans, moving.time[:, None] + (-CARVED_OCCLUSION_S, CARVED_OCCLUSION_S)]),
+        spans=np.concatenate([static.spans, moving.time[:, None] + (-REMOVED_OCCLUSION_S, REMOVED_OCCLUSION_S)]),
     )
 
 

@@ -150,7 +150,7 @@ class _Group(NamedTuple):
 
 
 def _groups(xyz: F32, spacing: float, around: Surroundings) -> Iterator[_Group]:
-    """Groups of points in touching columns: those that stand on the floor, and those above it."""
+    """Groups of points in touching columns: those on the floor, and those above it."""
     from scipy import ndimage
 
     cell = max(MODEL.column, MODEL.column_spacings * spacing)

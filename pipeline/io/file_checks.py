@@ -1,4 +1,4 @@
-"""Checks before a path is opened: folders, pipes and devices are refused (reading a pipe could block for ever).
+"""Checks before a path is opened: folders, pipes and devices are rejected (reading a pipe could block for ever).
 
 `check_data` also recognizes what is often found in place of a data file: nothing, a web page, an archive.
 """

@@ -13,7 +13,7 @@ LEAP_SECONDS = 18.0  # GPS time minus UTC since 2017
 def from_gps(seconds: float) -> datetime | None:
     """UTC of an "adjusted" GPS time (LAS: seconds since 1980 minus a billion); None where it can't be one.
 
-    Seconds of the week are refused, as the week is unknown. Exact since 2017; earlier dates are off by up to 18 s, as
+    Seconds of the week are rejected, as the week is unknown. Exact since 2017; earlier dates are off by up to 18 s, as
     the leap seconds of 2017 are applied.
     """
     if 0 <= seconds <= GPS_WEEK_S or not -ADJUSTED_OFFSET_S < seconds < ADJUSTED_OFFSET_S:

@@ -91,7 +91,7 @@ def _is_image(content: bytes) -> bool:
 
 
 def read(path: Path) -> tuple[SourceMesh, list[str]]:
-    """Read a mesh in its own axes and unit, and remarks for the user; `mesh.frame` has its origin, in that unit.
+    """Read a mesh in its own axes and unit, and notes for the user; `mesh.frame` has its origin, in that unit.
 
     Raises:
         InputError: it is missing, damaged, too large, or has no faces.

@@ -75,9 +75,9 @@ def read(path: Path, aliases: Mapping[str, Sequence[str]] | None = None) -> Tabl
         raise InputError(path, "is empty", REMEDY)
     header = [unicodedata.normalize("NFC", cell).strip(" #\"'").lower() for cell in filled[0][1]]
     columns = tuple(names.get(cell, cell) for cell in header)
-    doubled = next((name for name in columns if name and columns.count(name) > 1), None)
-    if doubled is not None:
-        raise InputError(path, f"has two columns `{doubled}`", "Rename one of them")
+    duplicate = next((name for name in columns if name and columns.count(name) > 1), None)
+    if duplicate is not None:
+        raise InputError(path, f"has two columns `{duplicate}`", "Rename one of them")
     rows = []
     for number, row in filled[1:]:
         if len(row) > len(columns) and any(row[len(columns) :]):

@@ -199,7 +199,8 @@ def write_tile(
     Args:
         folder: created if it doesn't exist; file names are relative to it.
         photos: dicts with the keys of a `[[photos]]` entry; `position` and `rotation` may be arrays.
-        others: as in `tile.toml`.
+        name, crs, clouds, cameras, trajectory, ortho, footprints, units, cell, truth, classes, robot_map: as in
+            `tile.toml` (`ortho` is its `orthophoto`).
     """
     import tomli_w
 

@@ -73,7 +73,7 @@ def read(
         columns: tuple[str, ...] = POSITION_COLUMNS + QUATERNION_COLUMNS
         if kind == ".csv":
             columns, lines = _header_line(path, lines)
-        if {"time", "sec"} & set(columns):  # without times, repeated lines are those of a vehicle that stands
+        if {"time", "sec"} & set(columns):  # without times, repeated lines are those of a stationary vehicle
             lines = [one for one, before in zip(lines, [(0, [""]), *lines], strict=False) if one[1] != before[1]]
         trajectory = _from_columns(path, kind, columns, lines, frame, times, timed)
     far = np.flatnonzero(~(np.abs(trajectory.positions) < MAX_COORDINATE_M).all(axis=1))
@@ -196,9 +196,9 @@ def _header_line(path: Path, lines: Lines) -> tuple[tuple[str, ...], Lines]:
     names = named(cells)
     if len(lines) < 2:
         raise InputError(path, "is not a trajectory (it contains no poses)", REMEDIES[".csv"])
-    doubled = next((name for name in names if name and names.count(name) > 1), None)
-    if doubled is not None:
-        raise _bad(path, ".csv", number, f"two columns are named `{doubled}`")
+    duplicate = next((name for name in names if name and names.count(name) > 1), None)
+    if duplicate is not None:
+        raise _bad(path, ".csv", number, f"two columns are named `{duplicate}`")
     timed = "time" in names or {"sec", "nanosec"} <= set(names)
     if timed and set("xyz") <= set(names):
         partial = {

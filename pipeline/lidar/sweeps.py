@@ -124,7 +124,7 @@ def every_nth(count: int, every: int) -> I64:
 def upright_axes(offsets: F64, path: Trajectory, times: F64) -> F32:
     """Offsets (N, 3) from the scanner to its returns in axes that are level and point in the direction of travel.
 
-    Paths have no rotations. Where the path stands still, x of the local axes is forward.
+    Paths have no rotations. Where the scanner is stationary, x of the local axes is forward.
 
     Args:
         offsets: (N, 3) local axes, metres.

@@ -90,7 +90,7 @@ class Corridor:
 
     @classmethod
     def read(cls, path: Path) -> Corridor:
-        """Read a tile; one that was itself cut from a survey is refused."""
+        """Read a tile; one that was itself cut from a survey is rejected."""
         tile = read_tile(path)
         spec = read_spec(tile.path)
         if spec.cell:

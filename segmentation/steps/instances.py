@@ -110,8 +110,8 @@ def detect(
     if cloud.time is not None:
         ordered = cloud.time[order]
         scan_times = np.minimum.reduceat(ordered, starts), np.maximum.reduceat(ordered, starts)
-    carved = np.zeros((0, 3), np.float32) if moving is None else moving.xyz
-    scan = voxel_scan(cloud.take(first), confidence[first], source[first], carved, scan_times, path.positions)
+    moving_xyz = np.zeros((0, 3), np.float32) if moving is None else moving.xyz
+    scan = voxel_scan(cloud.take(first), confidence[first], source[first], moving_xyz, scan_times, path.positions)
     report(0.4, "following rays")
     scan = with_sightings(scan, cloud, moving, path)
     report(0.5, "detecting vehicles and people")

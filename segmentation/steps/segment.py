@@ -174,7 +174,7 @@ def _from_photos(
     shape: U8,
     views: Any,
     probabilities: Path,
-    carved: PointCloud | None,
+    moving: PointCloud | None,
     params: SegmentParams,
     report: Report,
 ) -> tuple[U8, U8, U8, U8, dict[str, Any]]:
@@ -186,7 +186,7 @@ def _from_photos(
     from scan2sim.segmentation.votes import vote
 
     votes = vote(
-        thin, views, probabilities, radius=0.8 * params.size, moving=carved,
+        thin, views, probabilities, radius=0.8 * params.size, moving=moving,
         report=lambda f, m="": report(0.5 + 0.3 * f, m),
     )  # fmt: skip
     report(0.8, "smoothing")

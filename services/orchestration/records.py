@@ -1,4 +1,4 @@
-"""Records that OSM returns, validated before use: unknown fields are ignored, a missing or odd one is refused.
+"""Records that OSM returns, validated before use: unknown fields are ignored, a missing or odd one is rejected.
 
 Field names and optional fields are those that OSM's northbound interface returns (Release 8 and current), recorded from
 its own server; `tests/fakes/osm.py` returns the same.

@@ -227,7 +227,7 @@ function showQueues(queues) {
       element("td", one.silent ? "silent" : "live", one.silent ? "bad" : ""),
       element("td", perSecond(one.arrived), "n"),
       element("td", perSecond(one.done), "n"),
-      element("td", perSecond(one.refused), one.refused ? "n bad" : "n"),
+      element("td", perSecond(one.rejected), one.rejected ? "n bad" : "n"),
       element("td", one.waiting, "n"),
       element("td", one.done ? UNITS.seconds(one.oldest_done) : "–", "n"),
       element("td", one.workers, "n"),

@@ -41,7 +41,7 @@ function card(one, pairText) {
   const latency = one.age === null ? "" : `${Math.round(one.age)} ms`;
   line.append(
     element("b", one.name),
-    pill(one.there ? "connected" : `disconnected since ${time(one.since)}`, one.there),
+    pill(one.connected ? "connected" : `disconnected since ${time(one.since)}`, one.connected),
     element("span", one.address, "soft"),
     element("span", pairText, "soft"),
     element("span", latency),
@@ -57,12 +57,12 @@ function vehicle(one, stations) {
   const choice = element("span", undefined, "choice"),
     speed = element("output"),
     select = element("select");
-  const free = stations.filter((station) => station.there && station.pair === null);
+  const free = stations.filter((station) => station.connected && station.pair === null);
   select.ariaLabel = `station for ${one.name}`;
   select.append(...free.map((station) => element("option", station.name)));
   const selected = () => ({ station: select.value });
-  if (free.length && one.there) choice.append(select);
-  if (one.pair === null) choice.append(button("Join", !free.length || !one.there, () => act(one.name, "join", selected())));
+  if (free.length && one.connected) choice.append(select);
+  if (one.pair === null) choice.append(button("Join", !free.length || !one.connected, () => act(one.name, "join", selected())));
   else {
     choice.append(button("Hand over", !free.length, () => act(one.name, "hand-over", selected())));
     if (one.before) choice.append(button(`Back to ${one.before}`, false, () => act(one.name, "take-back")));

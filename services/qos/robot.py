@@ -118,7 +118,7 @@ def _state(connection: http.client.HTTPConnection, toolbox: str, image: bytes, h
 
 def _request(connection: http.client.HTTPConnection, toolbox: str, image: bytes, headers: dict[str, str]) -> str:
     connection.request("POST", f"/v2/models/{toolbox}/infer", image, headers)
-    return str(json.loads(connection.getresponse().read()).get("state", "refused"))
+    return str(json.loads(connection.getresponse().read()).get("state", "rejected"))
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """Messages between parties and gateway: JSON, one message per line (`json_stream`); driving doesn't depend on them.
 
 To the gateway: `Hello`, `Status` once a second, `DriverRequest`, `DriverEvent`. From it: `Join`, `Release`,
-`RequestRefused`.
+`RequestRejected`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from scan2sim.services.teleoperation.control.messages import Malformed
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,59}")
 """Name of a vehicle, station or driver; it becomes part of paths, pages and logs."""
 T = TypeVar("T")
@@ -109,7 +109,7 @@ class Status(_Message):
 class DriverRequest(_Message):
     """Request of a station's driver to join or to release a vehicle; `driver`: who, if the station knows."""
 
-    kind: Literal["ask"] = "ask"
+    kind: Literal["request"] = "request"
     what: Literal["join", "release"]
     vehicle: Name
     driver: Text = ""
@@ -140,18 +140,18 @@ class Release(_Message):
     why: Text = ""
 
 
-class RequestRefused(_Message):
-    """The request was refused, or the message was not accepted."""
+class RequestRejected(_Message):
+    """The request was rejected, or the message was not accepted."""
 
-    kind: Literal["refused"] = "refused"
+    kind: Literal["rejected"] = "rejected"
     cause: Text
 
 
 _ToGateway = Hello | Status | DriverRequest | DriverEvent
 ToGateway = Annotated[_ToGateway, Field(discriminator="kind")]
-FromGateway = Annotated[Join | Release | RequestRefused, Field(discriminator="kind")]
+FromGateway = Annotated[Join | Release | RequestRejected, Field(discriminator="kind")]
 _TO_GATEWAY: TypeAdapter[_ToGateway] = TypeAdapter(ToGateway)
-_FROM_GATEWAY: TypeAdapter[Join | Release | RequestRefused] = TypeAdapter(FromGateway)
+_FROM_GATEWAY: TypeAdapter[Join | Release | RequestRejected] = TypeAdapter(FromGateway)
 
 
 def to_gateway(data: Mapping[str, Any]) -> _ToGateway:
@@ -163,7 +163,7 @@ def to_gateway(data: Mapping[str, Any]) -> _ToGateway:
     return _read(_TO_GATEWAY, data)
 
 
-def from_gateway(data: Mapping[str, Any]) -> Join | Release | RequestRefused:
+def from_gateway(data: Mapping[str, Any]) -> Join | Release | RequestRejected:
     """Validate a message of the gateway.
 
     Raises:

@@ -119,7 +119,7 @@ class ExportParams(Params):
 class OnboardParams(Params):
     """Settings of an onboard unit's connection to its vehicle adapter."""
 
-    adapter: Annotated[str, Field(description="HOST:PORT (UDP) of the vehicle adapter (`teleop translate`).")] = (
+    adapter: Annotated[str, Field(description="HOST:PORT (UDP) of the vehicle adapter (`teleop adapter`).")] = (
         f"127.0.0.1:{ADAPTER_PORT}"
     )
     key: Annotated[

@@ -31,7 +31,7 @@ IMAGE_TYPES = ("image/jpeg", "image/png", "image/webp", "application/octet-strea
 JSON = "application/json"
 JSON_SIZE_HEADER = "Inference-Header-Content-Length"
 """Header with the size of the JSON in a body that has binary tensor data behind it."""
-HTTP_STATUS = {State.DONE: 200, State.DROPPED: 503, State.LATE: 504, State.REFUSED: 422, State.FAILED: 500}
+HTTP_STATUS = {State.DONE: 200, State.DROPPED: 503, State.LATE: 504, State.REJECTED: 422, State.FAILED: 500}
 
 T = TypeVar("T")
 
@@ -193,7 +193,7 @@ def _protocol_response(engine: Engine, request: tensors.InferRequest, results: l
 
 
 def _decompressed(body: bytes, encoding: str) -> bytes:
-    """Body of a request without its Content-Encoding; decompression bombs are refused.
+    """Body of a request without its Content-Encoding; decompression bombs are rejected.
 
     Raises:
         HTTPException: unknown encoding.

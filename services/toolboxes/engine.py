@@ -195,7 +195,7 @@ class Engine:
         try:
             return _DecodedFrame(frame, frames.rgb(frame), begun)
         except ScanError as error:
-            self._answer(frame, State.REFUSED, f"{error.cause}. {error.remedy}")
+            self._answer(frame, State.REJECTED, f"{error.cause}. {error.remedy}")
             return None
 
     def _process(self, batch: list[_DecodedFrame]) -> None:

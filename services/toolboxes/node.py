@@ -69,7 +69,7 @@ class ToolboxNode(Monitor):
             seconds=now - self._period_began,
             arrived=in_period["received"],
             done=in_period[State.DONE],
-            refused=sum(in_period[state] for state in State if state != State.DONE),
+            rejected=sum(in_period[state] for state in State if state != State.DONE),
             waiting=waiting,
             oldest=oldest,
             oldest_done=self._slowest,

@@ -20,7 +20,7 @@ class State(StrEnum):
     """Dropped because newer frames of its source were waiting."""
     LATE = "late"
     """Its deadline had passed, or would have passed before the result."""
-    REFUSED = "refused"
+    REJECTED = "rejected"
     """Its image could not be decoded."""
     FAILED = "failed"
     """The model failed."""

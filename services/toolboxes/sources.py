@@ -174,7 +174,7 @@ class Cameras:
 
     def states(self) -> dict[str, dict[str, Any]]:
         """State by camera name: `there`, whether it delivers images, and `images`, their number so far."""
-        return {one.name: {"there": one.is_available(), "images": one.count} for one in self._readers}
+        return {one.name: {"connected": one.is_available(), "images": one.count} for one in self._readers}
 
 
 def names(addresses: Sequence[str]) -> list[str]:

@@ -98,7 +98,7 @@ def test_without_a_cloud_or_cuda_the_model_is_written_and_a_cloud_asked_for(
     assert (beside / "colmap" / "points3D.bin").is_file() and not (tmp_path / "tile").exists()
 
 
-def test_what_is_missing_is_said_before_anything_is_computed(street: tuple[Path, F64], tmp_path: Path) -> None:
+def test_missing_inputs_are_reported_before_anything_is_computed(street: tuple[Path, F64], tmp_path: Path) -> None:
     folder, _ = street
     photos, out, cloud = folder / "photos", tmp_path / "tile", ("--cloud", folder / "cloud.laz")
     gps = ("--gps", folder / "gps.csv", "--times", folder / "times.txt")

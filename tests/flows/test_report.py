@@ -95,7 +95,7 @@ def report(tmp_path: Path) -> Any:
             about = {"version": 1, "params": {}, "inputs": {}, "inputs_digest": "", "seconds": 1.0, "peak_mb": 100.0}
             done[task] = store.commit(task, "key", folder, Done(files, metrics), about)
             planned.append(PlannedTask(Task(Step(task, 1, no_step), Params(), {}), "key", {}, None))
-        tile = Tile(tmp_path / "tile.toml", "made_up", Frame(), ())
+        tile = Tile(tmp_path / "tile.toml", "example", Frame(), ())
         page = write_report(tile, planned, done, store, tmp_path, seconds=1.0).read_text(encoding="utf-8")
         return json.loads((tmp_path / "report.json").read_text(encoding="utf-8")), page
 

@@ -58,7 +58,7 @@ def test_a_lidar_measures_the_distances_to_all_surfaces(scene: Scene, world: Pat
     assert {"terrain", "building"} <= {name for name, count in metrics["lidar_rays"].items() if count > 100}
 
 
-def test_a_surface_that_the_export_lacks_is_a_fault(scene: Scene, world: Path) -> None:
+def test_a_surface_missing_from_the_export_is_a_fault(scene: Scene, world: Path) -> None:
     up = np.array([0, 0, 2.5], np.float32)  # just above the lidar
     crown = [replace(one, mesh=replace(one.mesh, vertices=one.mesh.vertices + up)) for one in visible(scene)]
     with pytest.raises(Fault, match="lidar"):

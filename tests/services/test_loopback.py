@@ -98,7 +98,7 @@ def test_commands_refuse_unprotected_hosts_before_starting(words: tuple[str, ...
 
 
 def test_adapter_command_refuses_to_start_without_key() -> None:
-    code, errors = command("teleop", "translate", "ros")
+    code, errors = command("teleop", "adapter", "ros")
     assert code == 2 and "--key: is missing" in errors and "Traceback" not in errors
 
 

@@ -204,10 +204,10 @@ def test_processes_of_one_name_get_separate_outboxes_and_leftovers_are_taken_ove
         process = subprocess.Popen(program, stdout=subprocess.PIPE, text=True)
         assert process.stdout and process.stdout.readline() == "1\n"
         running.append(process)
-    folder = tmp_path / "scan2sim" / "spools"
+    folder = tmp_path / "scan2sim" / "outboxes"
     assert folder.stat().st_mode & 0o777 == 0o700
-    assert sorted(path.name for path in folder.glob("*.spool")) == [
-        "talker.monitor_data.1.spool", "talker.monitor_data.2.spool",
+    assert sorted(path.name for path in folder.glob("*.outbox")) == [
+        "talker.monitor_data.1.outbox", "talker.monitor_data.2.outbox",
     ]  # fmt: skip
     for process in running:
         process.kill()

@@ -100,7 +100,7 @@ def _nearest(tree: Changes, x: float, y: float, z: float, limit: float, stack: I
         if child < 0:
             for i in range(tree.first[node], tree.last[node]):
                 best = min(best, _distance2(tree.xyz[i], x, y, z))
-        else:  # the nearer child goes on top of the stack
+        else:  # the nearer child is pushed last
             swap = _distance2(tree.centre[child], x, y, z) < _distance2(tree.centre[child + 1], x, y, z)
             stack[top], stack[top + 1] = (child + 1, child) if swap else (child, child + 1)
             top += 2

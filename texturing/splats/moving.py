@@ -43,7 +43,7 @@ class MovingMask:
         """(H, W) pixels of a prepared photo that must not be used: what moved, and what the photo's mask excludes.
 
         A pixel of the class vehicle or person belongs to the nearest instance whose box it is in, or near which it is;
-        those of instances that stand still are used. Without boxes, all of them moved.
+        those of stationary instances are used. Without boxes, all of them moved.
         """
         return self._of_instances(photo) | self._scanned(photo)
 

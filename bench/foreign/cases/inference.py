@@ -74,12 +74,12 @@ def cases() -> Iterator[Case]:
         "not-an-image": (_tensor([base64.b64encode(b"hello").decode()], 1), "422.*image"),
     }
     for name, (tensor, says) in wrong.items():
-        yield _case(name, _post(tensor), "refused", says)
-    yield _case("other-version", _post(*right["bytes"], path="/versions/7/infer"), "refused", "404.*version")
-    yield _case("other-model", _get("", "other"), "refused", "404.*model")
-    yield _case("other-output", _post(_tensor([text], 1), {"outputs": [{"name": "boxes"}]}), "refused", "422.*results")
-    yield _case("other-content", _post({}, headers=("Content-Type=text/plain",)), "refused", "415")
-    yield _case("get-of-infer", _get("/infer"), "refused", "405")
+        yield _case(name, _post(tensor), "rejected", says)
+    yield _case("other-version", _post(*right["bytes"], path="/versions/7/infer"), "rejected", "404.*version")
+    yield _case("other-model", _get("", "other"), "rejected", "404.*model")
+    yield _case("other-output", _post(_tensor([text], 1), {"outputs": [{"name": "boxes"}]}), "rejected", "422.*results")
+    yield _case("other-content", _post({}, headers=("Content-Type=text/plain",)), "rejected", "415")
+    yield _case("get-of-infer", _get("/infer"), "rejected", "405")
 
 
 def _case(

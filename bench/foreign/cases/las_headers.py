@@ -27,10 +27,10 @@ def cases() -> Iterator[Case]:
     projected = {1024: 1, 3072: 32633}
     yield Case("las-keys", 2, _las(here, projected), check=right)
     yield Case("las-feet-keys", 2, _las(feet, {1024: 1, 3072: 32149, 3076: 9003, 4099: 9003}), check=right_feet)
-    yield Case("las-feet-no-keys", 2, _las(feet, {1024: 1, 3072: 32149}), "refused", "--units us-ft")
+    yield Case("las-feet-no-keys", 2, _las(feet, {1024: 1, 3072: 32149}), "rejected", "--units us-ft")
     yield Case("las-feet-given", 2, _las(feet, {1024: 1, 3072: 32149}, "--units", "us-ft"), check=right_feet)
-    yield Case("las-height-feet", 2, _las(here, projected | {4099: 9003}), "refused", "heights in units of")
-    yield Case("las-degrees-over-metres", 2, _las(here, {1024: 2, 2048: 4326}), "refused", "has degrees")
+    yield Case("las-height-feet", 2, _las(here, projected | {4099: 9003}), "rejected", "heights in units of")
+    yield Case("las-degrees-over-metres", 2, _las(here, {1024: 2, 2048: 4326}), "rejected", "has degrees")
     given = ("--crs", "EPSG:32633")
     yield Case("las-degrees-given", 2, _las(here, {1024: 2, 2048: 4326}, *given), "named", "EPSG:32633 is used")
     for name, wkt in (
@@ -39,15 +39,15 @@ def cases() -> Iterator[Case]:
         ("text", b"see the readme"),
         ("bytes", b"\xff\xfe\0"),
     ):
-        yield Case(f"las-wkt-{name}", 2, _las(here, wkt=wkt), "refused", "--crs")
+        yield Case(f"las-wkt-{name}", 2, _las(here, wkt=wkt), "rejected", "--crs")
         yield Case(f"las-wkt-{name}-given", 2, _las(here, None, *given, wkt=wkt), check=right)
-    yield Case("las-north-first", 2, _las(here[:, [1, 0, 2]], projected), "refused", "--axes neh")
+    yield Case("las-north-first", 2, _las(here[:, [1, 0, 2]], projected), "rejected", "--axes neh")
     yield Case("las-north-first-given", 2, _las(here[:, [1, 0, 2]], projected, "--axes", "neh"), check=right)
-    yield Case("las-zone-prefix", 2, _las(here + [33e6, 0, 0], projected), "refused", "zone number 33")
+    yield Case("las-zone-prefix", 2, _las(here + [33e6, 0, 0], projected), "rejected", "zone number 33")
     zone_4 = here - PLACE + (4_589_000.0, 5_820_000.0, 35.0)
-    yield Case("las-zone-off", 2, _las(zone_4, {1024: 1, 3072: 31467}), "refused", "area of use|zone")
-    yield Case("las-local", 2, _las(here - PLACE, projected), "refused", "--crs local")
-    yield Case("las-no-crs", 2, _las(here), "refused", "has no CRS")
+    yield Case("las-zone-off", 2, _las(zone_4, {1024: 1, 3072: 31467}), "rejected", "area of use|zone")
+    yield Case("las-local", 2, _las(here - PLACE, projected), "rejected", "--crs local")
+    yield Case("las-no-crs", 2, _las(here), "rejected", "has no CRS")
     yield Case("las-no-crs-local", 2, _las(here, None, "--crs", "local"), check=right)
     for version, suffix in ((3, ".las"), (3, ".laz"), (7, ".las"), (7, ".laz")):
         withheld = np.arange(len(here)) % 10 == 0
@@ -56,7 +56,7 @@ def cases() -> Iterator[Case]:
         check = points_are(here[~withheld], among=True)
         yield Case(f"las-withheld-{version}{suffix}", 4, make, "named", "withheld points are not used", check)
     every = np.ones(len(here), bool)
-    yield Case("las-all-withheld", 4, _las(here, projected, withheld=every), "refused", "withheld")
+    yield Case("las-all-withheld", 4, _las(here, projected, withheld=every), "rejected", "withheld")
 
 
 def _las(

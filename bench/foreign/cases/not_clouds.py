@@ -26,17 +26,17 @@ def cases() -> Iterator[Case]:
     """Cases of kinds 4 and 10."""
     for name, (content, says) in CONTENT.items():
         for suffix in SUFFIXES:
-            yield Case(f"file-{name}{suffix}", 10, _file(f"cloud{suffix}", content), "refused", says)
-    yield Case("file-link-nowhere", 10, _link("/nowhere/cloud.laz"), "refused", "is a link that leads nowhere")
-    yield Case("file-link-loop", 10, _link("cloud.laz"), "refused", "is a link that leads nowhere")
-    yield Case("file-missing", 10, lambda folder: _import(folder / "gone.laz"), "refused", "not found|doesn't exist")
-    yield Case("file-missing-mesh", 10, lambda folder: _import(folder / "gone.obj"), "refused", "not found")
-    yield Case("file-folder", 10, _folder, "refused", "folder")
+            yield Case(f"file-{name}{suffix}", 10, _file(f"cloud{suffix}", content), "rejected", says)
+    yield Case("file-link-nowhere", 10, _link("/nowhere/cloud.laz"), "rejected", "is a link that leads nowhere")
+    yield Case("file-link-loop", 10, _link("cloud.laz"), "rejected", "is a link that leads nowhere")
+    yield Case("file-missing", 10, lambda folder: _import(folder / "gone.laz"), "rejected", "not found|doesn't exist")
+    yield Case("file-missing-mesh", 10, lambda folder: _import(folder / "gone.obj"), "rejected", "not found")
+    yield Case("file-folder", 10, _folder, "rejected", "folder")
     yield Case(
-        "ply-named-las", 10, _file("cloud.las", _ply(scan().xyz[:100])), "refused", "is a PLY file by its content"
+        "ply-named-las", 10, _file("cloud.las", _ply(scan().xyz[:100])), "rejected", "is a PLY file by its content"
     )
-    yield Case("ply-mesh", 4, _file("cloud.ply", _mesh()), "refused", "mesh")
-    yield Case("ply-splats", 4, _file("cloud.ply", _splats()), "refused", "splat")
+    yield Case("ply-mesh", 4, _file("cloud.ply", _mesh()), "rejected", "mesh")
+    yield Case("ply-splats", 4, _file("cloud.ply", _splats()), "rejected", "splat")
 
 
 def _import(path: Path) -> Sequence[object]:

@@ -58,8 +58,8 @@ def cases() -> Iterator[Case]:
     for name, habit in HABITS.items():
         yield Case(f"photos-{name}", 11, _table(habit), check=_photos_are(habit.scale))
     yield Case("photos-extra-column", 11, _table(Habit(extra=True)), "named", "accuracy_m")
-    yield Case("photos-misspelled", 11, _table(Habit(head=HEAD.replace("width", "widht"))), "refused", "widht.*width")
-    yield Case("photos-commas-in-commas", 11, _table(Habit(comma=True)), "refused", "cells, but 15 columns")
+    yield Case("photos-misspelled", 11, _table(Habit(head=HEAD.replace("width", "widht"))), "rejected", "widht.*width")
+    yield Case("photos-commas-in-commas", 11, _table(Habit(comma=True)), "rejected", "cells, but 15 columns")
     for turn in (3, 6, 8):
         yield Case(f"photos-exif-{turn}", 4, _table(Habit(orientation=turn)), "named", "EXIF orientation")
 

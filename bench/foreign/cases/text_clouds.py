@@ -39,11 +39,11 @@ def cases() -> Iterator[Case]:
                 yield Case(name, 11, write, check=points_are(made.xyz, made.rgb))
     north = made.xyz[:, [1, 0, 2]]
     says = "northing"
-    yield Case("text-north-first", 2, _plain(north), "refused", f"{says} comes before easting")
+    yield Case("text-north-first", 2, _plain(north), "rejected", f"{says} comes before easting")
     yield Case("text-north-first-axes", 2, _plain(north, "--axes", "neh"), check=points_are(made.xyz))
     yield Case("text-north-first-local", 2, _plain(north, crs="local"), "named", f"{says} before easting")
     words = ["see the report"] * 3 + ["1 2"] * 3
-    yield Case("text-no-cloud", 10, _lines(words), "refused", "column|number|header")
+    yield Case("text-no-cloud", 10, _lines(words), "rejected", "column|number|header")
 
 
 def _writer(made: Scan, order: str, counted: bool) -> Callable[[Path], Sequence[object]]:

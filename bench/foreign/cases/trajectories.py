@@ -28,7 +28,7 @@ def cases() -> Iterator[Case]:
     for name, (suffix, text) in _files().items():
         yield Case(f"trajectory-{name}", 11, _imported(f"path{suffix}", text), check=_path_is)
     for name, text in _damaged().items():
-        yield Case(f"trajectory-{name}", 11, _imported("path.csv", text), "refused", "path.csv.*(column|line|time)")
+        yield Case(f"trajectory-{name}", 11, _imported("path.csv", text), "rejected", "path.csv.*(column|line|time)")
     yield Case("hand-held", 13, _evaluated, "named", rf"length_m +{HAND_HELD_M - 0.05:.1f}")
 
 

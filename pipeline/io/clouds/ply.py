@@ -1,6 +1,6 @@
 """PLY clouds (Turk 1994): the vertices of an ASCII or binary file, with float64 coordinates.
 
-A file must have exactly the number of vertices that its header declares, otherwise it is refused as truncated. So are
+A file must have exactly the number of vertices that its header declares, otherwise it is rejected as truncated. So are
 Gaussian splats, whose centres are not on surfaces, and meshes whose vertices don't cover their surface.
 """
 

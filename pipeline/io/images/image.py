@@ -22,7 +22,7 @@ from scan2sim.pipeline.io.images import colour, decoders
 from scan2sim.pipeline.io.images.decoders import Box, Decoder, Header
 
 MAX_PIXELS = 2**29
-"""Maximum number of pixels decoded at once: 32,768 x 16,384. Larger images are refused as decompression bombs."""
+"""Maximum number of pixels decoded at once: 32,768 x 16,384. Larger images are rejected as decompression bombs."""
 DECODERS = plugins.by_suffix(decoders.__name__)
 SUFFIXES = tuple(DECODERS)
 """Suffixes of photos. Files with other suffixes are decoded by OpenCV."""

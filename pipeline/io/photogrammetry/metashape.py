@@ -13,7 +13,7 @@ has `rotation` and `translation`, from its own axes to those of the master's, in
 
 so that its p1, p2 are OpenCV's p2, p1; the centre of the top left pixel is (0.5, 0.5). For `fisheye`, the length of
 (x, y) is the angle to the axis instead of its tangent. OpenCV has no such k4: if there is one, OpenCV's k1...k6 are
-fitted to the same distortion; the camera is refused if the fit error exceeds 0.05 pixels. b2 isn't supported.
+fitted to the same distortion; the camera is rejected if the fit error exceeds 0.05 pixels. b2 isn't supported.
 
 Source: Metashape Professional user manual 2.1, appendix D, Camera models.
 """

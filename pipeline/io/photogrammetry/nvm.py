@@ -2,8 +2,8 @@
 
 A camera is `name f qw qx qy qz cx cy cz r 0`: the rotation is world to camera with OpenCV's axes, c is the camera
 centre. The distortion model maps distorted to undistorted points: what is measured at m (in focal lengths from the
-image centre) is at m (1 + r |m|2) without distortion. OpenCV's k1...k6 are fitted to its inverse; the camera is refused
-if the fit error exceeds 0.05 pixels. Image sizes are read from the photos.
+image centre) is at m (1 + r |m|2) without distortion. OpenCV's k1...k6 are fitted to its inverse; the camera is
+rejected if the fit error exceeds 0.05 pixels. Image sizes are read from the photos.
 
 Source: http://ccwu.me/vsfm/doc.html#nvm, and `LoadNVM`, `SetNormalizedMeasurementDistortion` of Multicore Bundle
 Adjustment (pba/util.h, DataInterface.h) by the same author.

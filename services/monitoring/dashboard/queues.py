@@ -43,7 +43,7 @@ class Queues:
     def state(self, now: float) -> list[dict[str, Any]]:
         """JSON-serializable states of the queues, sorted by name.
 
-        Each has `queue`, `silent`, the rates per second `arrived`, `done` and `refused`, and as in `QueueState`
+        Each has `queue`, `silent`, the rates per second `arrived`, `done` and `rejected`, and as in `QueueState`
         `waiting`, `oldest_done` (seconds), `workers`.
         """
         with self._lock:
@@ -59,6 +59,6 @@ def _display(state: QueueState) -> dict[str, Any]:
     seconds = max(state.seconds, 1e-3)
     return {
         "queue": printable(state.queue)[:MAX_NAME_CHARS],
-        **{name: getattr(state, name) / seconds for name in ("arrived", "done", "refused")},
+        **{name: getattr(state, name) / seconds for name in ("arrived", "done", "rejected")},
         **{name: getattr(state, name) for name in ("waiting", "oldest_done", "workers")},
     }

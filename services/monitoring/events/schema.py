@@ -90,7 +90,7 @@ class QueueState(Body):
     Attributes:
         queue: name of the queue.
         seconds: length of the period.
-        arrived, done, refused: number of events that arrived, were processed, and were rejected in the period.
+        arrived, done, rejected: number of events that arrived, were processed, and were rejected in the period.
         waiting: events that wait or are being processed.
         oldest: age of the oldest waiting event, seconds since it was sent; 0 without any.
         oldest_done: largest age of an event at the time it was done in the period, seconds.
@@ -101,7 +101,7 @@ class QueueState(Body):
     seconds: float
     arrived: int
     done: int
-    refused: int
+    rejected: int
     waiting: int
     oldest: float
     oldest_done: float

@@ -11,9 +11,9 @@ from scan2sim.services.monitoring.events.schema import QueueState
 from scan2sim.services.monitoring.settings.monitor import WhenFull
 
 MAX_WAITING = 100_000
-"""Default capacity; dropped events are counted as refused."""
+"""Default capacity; dropped events are counted as rejected."""
 MAX_ATTEMPTS = 3
-"""An event at which this many workers died or hung is dropped and counted as refused."""
+"""An event at which this many workers died or hung is dropped and counted as rejected."""
 
 
 @dataclass
@@ -40,7 +40,7 @@ class EventQueue:
         self._waiting: deque[QueuedEvent] = deque()
         self._in_work: dict[int, QueuedEvent] = {}
         self._changed = threading.Condition()
-        self._arrived = self._done = self._refused = 0
+        self._arrived = self._done = self._rejected = 0
         self._oldest_done = 0.0
 
     def put(self, line: str, sent: float) -> bool:
@@ -48,7 +48,7 @@ class EventQueue:
         with self._changed:
             self._arrived += 1
             if len(self._waiting) >= self._capacity:
-                self._refused += 1
+                self._rejected += 1
                 if self._when_full == "newest":
                     return False
                 self._waiting.popleft()
@@ -80,7 +80,7 @@ class EventQueue:
             del self._in_work[id(event)]
             event.attempts += 1
             if event.attempts >= MAX_ATTEMPTS:
-                self._refused += 1
+                self._rejected += 1
                 return
             self._waiting.appendleft(event)
             self._changed.notify()
@@ -99,12 +99,12 @@ class EventQueue:
                 seconds=seconds,
                 arrived=self._arrived,
                 done=self._done,
-                refused=self._refused,
+                rejected=self._rejected,
                 waiting=len(self._waiting) + len(self._in_work),
                 oldest=max(0.0, time.time() - sent) if sent is not None else 0.0,
                 oldest_done=self._oldest_done,
                 workers=workers,
             )
-            self._arrived = self._done = self._refused = 0
+            self._arrived = self._done = self._rejected = 0
             self._oldest_done = 0.0
             return state

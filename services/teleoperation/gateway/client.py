@@ -18,7 +18,7 @@ from scan2sim.services.teleoperation.gateway_protocol import (
     Hello,
     Join,
     Release,
-    RequestRefused,
+    RequestRejected,
     Status,
     from_gateway,
 )
@@ -41,7 +41,7 @@ class Party(Protocol):
     def status(self) -> Status:
         """Current status."""
 
-    def handle_order(self, order: Join | Release | RequestRefused) -> None:
+    def handle_order(self, order: Join | Release | RequestRejected) -> None:
         """Carry out an order of the gateway."""
 
 
@@ -51,7 +51,7 @@ class GatewayConnection:
     def __init__(
         self, identity: Identity, gateway: Address, party: Party, notify: Callable[[str], None] = log.warning
     ) -> None:
-        """`notify` is called, once each, when the gateway is reached, and when and why it isn't."""
+        """`notify` is called when the gateway is reached, when and why it isn't, and with what it rejects."""
         self._party, self._notify, self._reported_loss = party, notify, ""
         self._where = f"the gateway {gateway.host}:{gateway.port}"
         self._ended = threading.Event()
@@ -96,6 +96,8 @@ class GatewayConnection:
         except Malformed as error:
             connection.close(f"sent a message that isn't understood ({error}); check that versions match")
         else:
+            if isinstance(order, RequestRejected):
+                self._notify(f"{self._where} rejected a message: {order.cause}")
             self._party.handle_order(order)
 
     def _closed(self, reason: str) -> None:

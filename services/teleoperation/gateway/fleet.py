@@ -27,12 +27,12 @@ from scan2sim.services.teleoperation.gateway_protocol import (
     Join,
     PairMember,
     Release,
-    RequestRefused,
+    RequestRejected,
     Status,
 )
 from scan2sim.services.teleoperation.identity import Peer, Role
 
-Order = Join | Release | RequestRefused
+Order = Join | Release | RequestRejected
 Send = Callable[[Order], None]
 GATEWAY_AUTHOR = "gateway"
 """Author of a change that nobody requested."""
@@ -215,7 +215,7 @@ class Fleet:
                 pair = pairs.get(one.peer.name)
                 result["vehicles" if one.peer.role == Role.VEHICLE else "stations"].append(
                     {
-                        "name": one.peer.name, "there": one.send is not None, "since": one.since,
+                        "name": one.peer.name, "connected": one.send is not None, "since": one.since,
                         "address": one.address, "cameras": one.hello.cameras,
                         "pair": None if pair is None else pair.number,
                         "other": None if pair is None else pair.station if pairs is self._pairs else pair.vehicle,

@@ -109,6 +109,8 @@ class Connection:
                 if self._channel.established or self._channel.handshake():
                     while (part := self._channel.read()) is not None:
                         self._in += part
+            except TlsClosed:  # closed once the lines before it are handled
+                self._closing = self._closing or "closed by the remote end"
             finally:
                 self._out += self._channel.take()
         *lines, rest = self._in.split(b"\n")

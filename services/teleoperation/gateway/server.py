@@ -13,7 +13,7 @@ from scan2sim.services.teleoperation.gateway_protocol import (
     DriverEvent,
     DriverRequest,
     Hello,
-    RequestRefused,
+    RequestRejected,
     Status,
     to_gateway,
 )
@@ -61,11 +61,11 @@ class Gateway:
             else:
                 self._greet(connection, message)
         except Malformed as error:
-            self._refuse(connection, f"it sent a message that isn't understood ({error})")
+            self._reject(connection, f"it sent a message that isn't understood ({error})")
 
     def _greet(self, connection: Connection, message: Hello | Status | DriverRequest | DriverEvent) -> None:
         if not isinstance(message, Hello) or message.version != PROTOCOL_VERSION:
-            self._refuse(connection, f"it doesn't support protocol version {PROTOCOL_VERSION}")
+            self._reject(connection, f"it doesn't support protocol version {PROTOCOL_VERSION}")
             return
 
         def send(order: Order) -> None:
@@ -84,17 +84,17 @@ class Gateway:
             try:
                 self._fleet.handle_request(connection.peer, message)
             except ScanError as error:
-                connection.send(RequestRefused(cause=str(error)[:REASON_MAX_CHARS]).wire())
+                connection.send(RequestRejected(cause=str(error)[:REASON_MAX_CHARS]).wire())
 
-    def _refuse(self, connection: Connection, reason: str) -> None:
-        self._notify(f"{connection.peer} was refused: {reason}")
-        connection.send(RequestRefused(cause=reason[:REASON_MAX_CHARS]).wire())
+    def _reject(self, connection: Connection, reason: str) -> None:
+        self._notify(f"{connection.peer} was rejected: {reason}")
+        connection.send(RequestRejected(cause=reason[:REASON_MAX_CHARS]).wire())
         connection.close(reason)
 
     def _closed(self, connection: Connection, reason: str) -> None:
         send = self._senders.pop(connection, None)
         if send is None:
-            self._notify(f"{connection.address} was refused: {reason}")
+            self._notify(f"{connection.address} was rejected: {reason}")
         else:
             self._notify(f"{connection.peer} disconnected: {reason}")
             self._fleet.disconnected(connection.peer, send)

@@ -294,7 +294,7 @@ class VehicleEnd:
         key = adapter_key.create(Path(setup.folder) / adapter_key.ADAPTER_KEY_FILE)
         params = AdapterParams(port=0, limit=setup.limit, key=key)
         adapter_server = AdapterServer(self._looping_vehicle or PlainCar(), params)
-        threading.Thread(target=adapter_server.run, args=(ended,), name="translating", daemon=True).start()
+        threading.Thread(target=adapter_server.run, args=(ended,), name="adapter", daemon=True).start()
         host, port = adapter_server.address
         self._unit = RecordingOnboardUnit(OnboardParams(adapter=f"{host}:{port}", limit=setup.limit, key=key), recorder)
         self._recorder = recorder
@@ -415,7 +415,7 @@ class StationEnd:
 
     def _both_connected(self) -> bool:
         fleet = self._fleet.snapshot()
-        return all(any(one["there"] for one in fleet[kind]) for kind in ("vehicles", "stations"))
+        return all(any(one["connected"] for one in fleet[kind]) for kind in ("vehicles", "stations"))
 
     def _joined(self) -> JoinedVehicle:
         return _until(self._station.joined, "a vehicle")

@@ -88,7 +88,7 @@ class Demo:
             "--port", params.port,
         )  # fmt: skip
         car = parties / f"vehicle-{VEHICLE_NAME}"
-        self._run("translate", "simulated", "--set", f"world={params.world}", "--key", car / ADAPTER_KEY_FILE)
+        self._run("adapter", "simulated", "--set", f"world={params.world}", "--key", car / ADAPTER_KEY_FILE)
         cameras = [part for one in camera_options(params) for part in ("--camera", one)]
         self._run(
             "vehicle", car, gateway,
@@ -158,7 +158,7 @@ class Demo:
 
     def _both_connected(self) -> bool:
         fleet = self._request("api/fleet") or {"vehicles": [], "stations": []}
-        return all(any(one["there"] for one in fleet[kind]) for kind in ("vehicles", "stations"))
+        return all(any(one["connected"] for one in fleet[kind]) for kind in ("vehicles", "stations"))
 
     def _request(self, path: str, body: dict[str, str] | None = None) -> dict[str, list[dict[str, object]]] | None:
         """Answer of the gateway's API; None: it doesn't answer."""

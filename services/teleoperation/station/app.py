@@ -37,7 +37,7 @@ from scan2sim.services.teleoperation.gateway_protocol import (
     Hello,
     Join,
     Release,
-    RequestRefused,
+    RequestRejected,
     Status,
 )
 from scan2sim.services.teleoperation.identity import Identity, Peer, Role
@@ -212,9 +212,9 @@ class Station:
             age=max(delays) if delays else None,
         )
 
-    def handle_order(self, order: Join | Release | RequestRefused) -> None:
+    def handle_order(self, order: Join | Release | RequestRejected) -> None:
         """See `Party`."""
-        if isinstance(order, RequestRefused):
+        if isinstance(order, RequestRejected):
             self._why = order.cause
             return
         vehicle = None

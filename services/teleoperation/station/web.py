@@ -275,7 +275,7 @@ async def _receive(
 def _handle(
     text: str, page: _Page, station: Station, request_pair: Callable[[str, str, str], bool]
 ) -> dict[str, Any] | None:
-    """Carry out a message of a page; returns the answer: a time, or why the request was refused."""
+    """Carry out a message of a page; returns the answer: a time, or why the request was rejected."""
     try:
         message = _PAGE_MESSAGE.validate_json(text)
     except ValidationError as error:

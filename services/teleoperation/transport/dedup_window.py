@@ -15,7 +15,7 @@ class DedupWindow:
         self._seen = 0  # bit k: whether number `_next` - 1 - k was received
 
     def add(self, number: int) -> str:
-        """Add a number; returns "" for its first copy, else why it is dropped: "doubles" or "late"."""
+        """Add a number; returns "" for its first copy, else why it is dropped: "duplicates" or "late"."""
         ahead = number - self._next
         if ahead >= 0:
             self._seen = ((self._seen << (ahead + 1)) | 1) & _MASK if ahead < WINDOW_SIZE else 1
@@ -25,6 +25,6 @@ class DedupWindow:
             return "late"
         bit = 1 << (-ahead - 1)
         if self._seen & bit:
-            return "doubles"
+            return "duplicates"
         self._seen |= bit
         return ""

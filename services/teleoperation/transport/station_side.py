@@ -1,7 +1,7 @@
 """The station's side of multipath connections: listens, and accepts the links of the vehicles that it expects.
 
 A client must first prove that it receives at its address (DTLS cookie); until then no state is kept for it. A vehicle
-that isn't expected, by role, name and certificate, is refused in the handshake. The number of handshakes is limited,
+that isn't expected, by role, name and certificate, is rejected in the handshake. The number of handshakes is limited,
 for each host and in total, so that a flood of them costs only bounded time.
 """
 
@@ -121,7 +121,7 @@ class Listener:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Number of dropped datagrams that belong to no connection, by reason: strangers, malformed, flooded, ..."""
+        """Number of dropped datagrams without a connection, by reason: unknown_senders, malformed, flooded, ..."""
         return dict(self._counts)
 
     def expect(
@@ -184,7 +184,7 @@ class Listener:
         """Check whether a handshake has completed or failed."""
         one = entry.dtls
         if one.ended:
-            self._counts["refused"] += 1
+            self._counts["rejected"] += 1
             self._drop(key, entry)
         elif one.established is not None and one.peer is not None:
             del self._pending[key]
@@ -217,7 +217,7 @@ class Listener:
 
     def _receive_hello(self, key: tuple[int, Address], sock: UdpSocket, data: bytes, address: Address) -> None:
         if not is_hello(data):
-            self._counts["strangers"] += 1
+            self._counts["unknown_senders"] += 1
             return
         now = self._clock()
         if not self._is_within_rate(address[0], now):
@@ -264,7 +264,7 @@ class Listener:
                 else now - one.last_received > SESSION_TIMEOUT_S
             )
             if one.ended or timed_out or now > entry.until:
-                self._counts["refused"] += key in self._pending
+                self._counts["rejected"] += key in self._pending
                 self._drop(key, entry)
         for connection in list(self._expected.values()):
             connection.tick(now)

@@ -91,7 +91,7 @@ class Channel:
 
     Attributes:
         peer: the remote party, once `established`.
-        why: reason for which the peer was refused.
+        why: reason for which the peer was rejected.
     """
 
     def __init__(

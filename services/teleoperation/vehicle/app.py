@@ -17,7 +17,7 @@ from scan2sim.services.teleoperation.adapter_key import ADAPTER_KEY_FILE
 from scan2sim.services.teleoperation.cameras import Camera, Mount, OpenWorld, View
 from scan2sim.services.teleoperation.control.messages import CongestionReport, Kind, Message, VideoReport, VideoStream
 from scan2sim.services.teleoperation.gateway.client import GatewayConnection
-from scan2sim.services.teleoperation.gateway_protocol import CurrentPair, Hello, Join, Release, RequestRefused, Status
+from scan2sim.services.teleoperation.gateway_protocol import CurrentPair, Hello, Join, Release, RequestRejected, Status
 from scan2sim.services.teleoperation.identity import Identity, Peer, Role
 from scan2sim.services.teleoperation.settings import GATEWAY_PORT, OnboardParams, VehicleParams, parse_address
 from scan2sim.services.teleoperation.sim.bicycle import Ground, PoseTracker
@@ -156,7 +156,7 @@ class Vehicle:
             message=reason[:200], speed=speed, age=telemetry.age,
         )  # fmt: skip
 
-    def handle_order(self, order: Join | Release | RequestRefused) -> None:
+    def handle_order(self, order: Join | Release | RequestRejected) -> None:
         """See `Party`."""
         if isinstance(order, Join):
             driving = CurrentPair(pair=order.pair, other=order.other.name)

@@ -48,7 +48,7 @@ SPEED_MAX_AGE_MS = 300.0
 ADAPTER_SILENT = "the vehicle adapter does not respond"
 NO_STATION, CLOCKS_UNKNOWN = "no station is joined", "the clocks are not synchronized yet"
 """Reasons for which driving can't begin."""
-DROP_CLOCKS_UNKNOWN, MALFORMED = "the clocks aren't tied yet", "malformed"
+DROP_CLOCKS_UNKNOWN, MALFORMED = "the clocks aren't synchronized yet", "malformed"
 """Further reasons for which messages are dropped; keys of `Telemetry.dropped`."""
 
 

@@ -127,7 +127,7 @@ class PacketDecryptor:
     """Decrypts a vehicle's packets at the station, each once; dropped packets are counted. Not thread-safe.
 
     Attributes:
-        counts: number of dropped packets, by reason: `doubled`, `late` (before the replay window), `forged`,
+        counts: number of dropped packets, by reason: `duplicates`, `late` (before the replay window), `forged`,
             `keyless` (key not yet received, or expired), `malformed`.
     """
 
@@ -180,7 +180,7 @@ def _is_newer(generation: int, other: int) -> bool:
 
 
 _DROP_REASONS = {
-    "replay check failed (bad index)": "doubled",
+    "replay check failed (bad index)": "duplicates",
     "replay check failed (index too old)": "late",
     "can't process as much data as requested": "malformed",
     "error parsing data": "malformed",

@@ -42,7 +42,7 @@ OPTIONS = [
 STATUS = {
     State.DROPPED: grpc.StatusCode.UNAVAILABLE,
     State.LATE: grpc.StatusCode.DEADLINE_EXCEEDED,
-    State.REFUSED: grpc.StatusCode.INVALID_ARGUMENT,
+    State.REJECTED: grpc.StatusCode.INVALID_ARGUMENT,
     State.FAILED: grpc.StatusCode.INTERNAL,
 }
 

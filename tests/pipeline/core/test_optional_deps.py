@@ -123,8 +123,8 @@ USES = {
     "OpenSSL": ["teleop certificates parties --vehicle car"],
     "pylibsrtp": ["teleop certificates parties --vehicle car"],
     "websockets": ["teleop certificates parties --vehicle car"],
-    "can": ["teleop translate can --key key"],
-    "cantools": ["teleop translate can --key key"],
+    "can": ["teleop adapter can --key key"],
+    "cantools": ["teleop adapter can --key key"],
 }  # fmt: skip
 """Commands by a package that they can't do without."""
 

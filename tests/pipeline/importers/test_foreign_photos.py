@@ -112,7 +112,7 @@ def test_what_is_no_table_is_named(tmp_path: Path, content: bytes, cause: str) -
         import_las([folder / "cloud.las"], folder / "tile", photos=folder / "photos.csv", crs="local")
 
 
-def test_photos_of_the_same_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+def test_photos_of_the_same_name_are_distinguished_by_their_folders(tmp_path: Path) -> None:
     for folder in ("left", "right"):
         (tmp_path / folder).mkdir()
         Image.new("RGB", (8, 8)).save(tmp_path / folder / "1.jpg")

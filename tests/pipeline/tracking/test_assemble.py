@@ -70,9 +70,9 @@ def tracked() -> list[Track]:
     vehicles = sum(len(part) for part in still)
     classes = np.where(np.arange(len(rows)) < vehicles, CODE["vehicle"], CODE["road"]).astype(np.uint8)
     cloud = cloud_of(rows, classes)
-    carved = np.concatenate(moving)
+    moved = np.concatenate(moving)
     found = Candidate(parked[:2], 0.03, 4.2, 1.7, "car", False)
-    tracks, _ = assemble(cloud, cloud_of(carved, np.full(len(carved), CODE["vehicle"], np.uint8)), path, [found])
+    tracks, _ = assemble(cloud, cloud_of(moved, np.full(len(moved), CODE["vehicle"], np.uint8)), path, [found])
     return tracks
 
 

@@ -221,7 +221,7 @@ def test_tls_without_a_token_logs_a_warning(
 
 
 class Service:
-    """A running service, whose clock stands still unless the test sets it, so that nothing times out by chance.
+    """A running service, whose clock is constant unless the test sets it, so that nothing times out by chance.
 
     Attributes:
         port: its TCP port.

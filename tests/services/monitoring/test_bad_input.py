@@ -123,7 +123,7 @@ for node in (talker, listener):
     node.destroy_node()
 ros.shutdown()
 """
-"""Program whose clock stands still, except that messages take 10 ms, and jumps; prints records of two messages each."""
+"""Program whose clock is constant, except that messages take 10 ms, and jumps; prints records of two messages each."""
 
 
 def test_clock_jump_is_reported_and_latencies_recover(start: Start) -> None:

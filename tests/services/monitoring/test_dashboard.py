@@ -147,7 +147,7 @@ def an_alarm(state: str, rule: str, since: float, subject: str = "/camera", **mo
 
 
 def a_queue(name: str) -> bytes:
-    counts = {"arrived": 10, "done": 6, "refused": 3, "waiting": 4, "workers": 1}
+    counts = {"arrived": 10, "done": 6, "rejected": 3, "waiting": 4, "workers": 1}
     return event("queue", queue=name, seconds=2.0, oldest=0.1, oldest_done=0.2, **counts)
 
 

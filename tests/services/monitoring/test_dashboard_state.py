@@ -52,7 +52,7 @@ def test_run_counts_as_silent_unless_it_ended() -> None:
 
 def queue(name: str, seconds: float = 2.0) -> QueueState:
     return QueueState(
-        queue=name, seconds=seconds, arrived=10, done=6, refused=3, waiting=4, oldest=0, oldest_done=0.2, workers=1
+        queue=name, seconds=seconds, arrived=10, done=6, rejected=3, waiting=4, oldest=0, oldest_done=0.2, workers=1
     )
 
 
@@ -60,7 +60,7 @@ def test_queue_has_rates_per_second_and_a_silent_flag() -> None:
     known = Queues()
     known.add(queue("detect"), NOW)
     (one,) = known.state(NOW + 3)
-    assert (one["arrived"], one["done"], one["refused"], one["waiting"]) == (5, 3, 1.5, 4) and not one["silent"]
+    assert (one["arrived"], one["done"], one["rejected"], one["waiting"]) == (5, 3, 1.5, 4) and not one["silent"]
     assert known.state(NOW + queues.SILENT_AFTER_S + 3)[0]["silent"]
 
 

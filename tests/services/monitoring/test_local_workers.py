@@ -42,7 +42,7 @@ def test_workers_scale_and_process_all_events() -> None:
     until(lambda: len(running(WORKER)) == 1)
     until(lambda: len(queue) == 0)
     state = queue.state(1.0, pool.workers())
-    assert (state.arrived, state.done, state.refused, state.workers) == (60, 60, 0, 1)
+    assert (state.arrived, state.done, state.rejected, state.workers) == (60, 60, 0, 1)
     pool.close()
     assert running(WORKER) == []
 
@@ -60,7 +60,7 @@ def test_killed_worker_is_replaced_and_its_event_retried(tmp_path: Path) -> None
     running(command)[0].kill()
     until(lambda: len(queue) == 0)
     state = queue.state(1.0, 0)
-    assert (state.done, state.refused) == (1, 0)
+    assert (state.done, state.rejected) == (1, 0)
     pool.close()
 
 
@@ -71,7 +71,7 @@ def test_hanging_worker_is_killed_and_its_event_dropped_after_retries() -> None:
     queue.put("hangs", time.time())
     pool.scale(1)
     until(lambda: len(queue) == 0)
-    assert queue.state(1.0, 0).refused == 1
+    assert queue.state(1.0, 0).rejected == 1
     pool.close()
     until(lambda: running(hanging) == [])
 
@@ -80,7 +80,7 @@ def test_full_queue_drops_and_counts_events() -> None:
     queue = EventQueue("events", capacity=2)
     assert [queue.put("x", 0.0) for _ in range(3)] == [True, True, False]
     state = queue.state(1.0, 0)
-    assert (state.refused, state.waiting) == (1, 2) and state.oldest > 1e9
+    assert (state.rejected, state.waiting) == (1, 2) and state.oldest > 1e9
 
 
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:

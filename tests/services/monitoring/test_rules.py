@@ -74,7 +74,7 @@ def test_rules_on_losses_queues_and_silence() -> None:
         Rule(name="silent", metric="silence", above=5),
     )  # fmt: skip
     assert [one.rule for one in check(evaluator, record("hears", 0, flow("incoming", lost=5)))] == ["lost"]
-    state = QueueState(queue="/cars", seconds=1, arrived=0, done=0, refused=0, waiting=101, oldest=0, oldest_done=0,
+    state = QueueState(queue="/cars", seconds=1, arrived=0, done=0, rejected=0, waiting=101, oldest=0, oldest_done=0,
                        workers=1)  # fmt: skip
     assert [(one.rule, one.subject) for one in evaluator.check_queue(state, 1.0)] == [("queue", "/cars")]
     assert evaluator.check_silence(4.0) == []

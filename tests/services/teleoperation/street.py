@@ -158,8 +158,8 @@ class Street:
         """Start a station and wait for it; `relayed`: the test sets the properties of its links."""
         desk = Desk(self.parties / f"station-{name}", self.gateway.port, port, relayed)
         self.desks.append(desk)
-        until(lambda: any(one["name"] == name and one["there"] for one in self.fleet.snapshot()["stations"]))
-        until(lambda: any(one["there"] for one in self.fleet.snapshot()["vehicles"]))
+        until(lambda: any(one["name"] == name and one["connected"] for one in self.fleet.snapshot()["stations"]))
+        until(lambda: any(one["connected"] for one in self.fleet.snapshot()["vehicles"]))
         return desk
 
     def restart_gateway(self) -> None:

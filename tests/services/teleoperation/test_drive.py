@@ -107,7 +107,7 @@ def test_pair_keeps_driving_while_its_gateway_restarts(street: Street) -> None:
 
     def is_known() -> bool:
         fleet = street.fleet.snapshot()
-        there = [one["there"] for kind in fleet.values() for one in kind]
+        there = [one["connected"] for kind in fleet.values() for one in kind]
         return there == [True, True] and fleet["vehicles"][0]["other"] == "desk"
 
     until(is_known)

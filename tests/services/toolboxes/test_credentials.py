@@ -105,7 +105,7 @@ def test_status_and_detections_name_a_camera_without_its_credentials(
         status, detections = client.get("/status"), client.get("/detections")
         assert (
             list(status.json()["cameras"]) == [redacted_url(port)]
-            and status.json()["cameras"][redacted_url(port)]["there"]
+            and status.json()["cameras"][redacted_url(port)]["connected"]
         )
         assert [one["source"] for one in detections.json()] == [redacted_url(port)]
         assert detections.json()[0]["schema"] == SCHEMA, "spelled as in all other results"
@@ -142,7 +142,7 @@ def test_unreachable_camera_is_logged_once_without_its_credentials(
     cameras.start()
     try:
         until(lambda: name in caplog.text and len(attempts) >= 3)  # it is retried
-        assert cameras.states() == {name: {"there": False, "images": 0}}
+        assert cameras.states() == {name: {"connected": False, "images": 0}}
     finally:
         cameras.stop()
     assert caplog.text.count("delivers no images") == 1

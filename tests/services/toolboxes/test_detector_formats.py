@@ -274,6 +274,6 @@ def test_class_names_of_a_text_file_are_used(tmp_path: Path) -> None:
     assert [one.label for one in body.detections or ()] == ["barrier"]
 
 
-def test_missing_class_names_are_asked_for(tmp_path: Path) -> None:
+def test_error_on_missing_class_names_names_their_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"labels\.txt"):
         detect.load(Params(weights=write(tmp_path / "mine.onnx", {"output0": yolov8(2, 1)})))

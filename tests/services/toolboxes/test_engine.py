@@ -131,7 +131,7 @@ def test_damaged_images_are_rejected_and_the_next_is_processed(client: Client) -
     ]  # fmt: skip
     for picture in bad:
         result = client.one(picture)
-        assert result.state == State.REFUSED and result.error
+        assert result.state == State.REJECTED and result.error
     assert client.one(image(5)).state == State.DONE
 
 

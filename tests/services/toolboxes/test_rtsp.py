@@ -48,11 +48,11 @@ def test_rtsp_camera_is_read_and_reconnected() -> None:
         with camera(port, 120):
             cameras.start()
             until(lambda: abs(grey() - 120) < 5)
-            assert cameras.states()[address]["there"]
-        until(lambda: not cameras.states()[address]["there"])
+            assert cameras.states()[address]["connected"]
+        until(lambda: not cameras.states()[address]["connected"])
         with camera(port, 60):
             until(lambda: abs(grey() - 60) < 5)
-            assert cameras.states()[address]["there"]
+            assert cameras.states()[address]["connected"]
     finally:
         cameras.stop()
         engine.close()

@@ -53,7 +53,7 @@ def test_images_of_a_folder_are_processed_in_order_and_drawn(engine: Engine, tmp
     (tmp_path / "notes.txt").write_text("no picture", encoding="utf-8")
     (tmp_path / "25.jpg").write_bytes(b"broken")
     ended = offline.process_files(engine, tmp_path, tmp_path / "out", silent)
-    assert ended == {"done": 3, "refused": 1} and levels(tmp_path / "out") == [10, 20, 30]
+    assert ended == {"done": 3, "rejected": 1} and levels(tmp_path / "out") == [10, 20, 30]
     drawn = sorted(one.name for one in (tmp_path / "out" / offline.IMAGES_FOLDER).iterdir())
     assert drawn == ["10.jpg", "20.jpg", "30.jpg"]
 
@@ -86,7 +86,7 @@ def test_camera_is_reconnected_and_not_read_in_standby(
         return int(cameras.states()[str(path)]["images"])
 
     def is_available() -> bool:
-        return bool(cameras.states()[str(path)]["there"])
+        return bool(cameras.states()[str(path)]["connected"])
 
     def is_read() -> bool:
         return any(thread.name == str(path) for thread in threading.enumerate())

@@ -160,7 +160,7 @@ def test_party_reconnects_while_its_old_connection_lingers(tmp_path: Path) -> No
     fleet.join("car", "desk", "operator")
     again = Party(Role.VEHICLE, "car").connect(fleet)
     fleet.disconnected(car.peer, car.send)
-    assert again.pair() == 1 and fleet.snapshot()["vehicles"][0]["there"]
+    assert again.pair() == 1 and fleet.snapshot()["vehicles"][0]["connected"]
     fleet.update_status(again.peer, Status(pair=1, speed=2.0))
     assert fleet.speeds()["car"]["speed"] == 2.0
 

@@ -21,7 +21,7 @@ from tests.waiting import until
 
 
 class Clock:
-    """A clock that the test sets; it stands still otherwise, so that nothing times out on a slow machine."""
+    """A clock that the test sets; it is constant otherwise, so that nothing times out on a slow machine."""
 
     def __init__(self) -> None:
         self.now = 1000.0

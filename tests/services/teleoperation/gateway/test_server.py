@@ -1,4 +1,4 @@
-"""Vehicles and stations at a running gateway over TLS: joined, refused, and joined again after its restart."""
+"""Vehicles and stations at a running gateway over TLS: joined, rejected, and joined again after its restart."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from scan2sim.services.teleoperation.gateway.fleet import Fleet
 from scan2sim.services.teleoperation.gateway.pki import certify
 from scan2sim.services.teleoperation.gateway.server import Gateway
 from scan2sim.services.teleoperation.gateway_protocol import (
+    PROTOCOL_VERSION,
     Address,
     CurrentPair,
     DriverRequest,
@@ -21,7 +22,7 @@ from scan2sim.services.teleoperation.gateway_protocol import (
     Join,
     LinkStatus,
     Release,
-    RequestRefused,
+    RequestRejected,
     Status,
 )
 from scan2sim.services.teleoperation.identity import Identity
@@ -32,12 +33,13 @@ class ObedientParty:
     """A party that follows its orders."""
 
     def __init__(self, folder: Path, port: int, listening: tuple[Address, ...] = ()) -> None:
-        self.orders: list[Join | Release | RequestRefused] = []
+        self.orders: list[Join | Release | RequestRejected] = []
         self.driving: CurrentPair | None = None
+        self.messages: list[str] = []
         self._listening = listening
         self.identity = Identity.read(folder)
         self.gateway_connection = GatewayConnection(
-            self.identity, Address(host="127.0.0.1", port=port), self, lambda _: None
+            self.identity, Address(host="127.0.0.1", port=port), self, self.messages.append
         )
 
     def hello(self) -> Hello:
@@ -46,7 +48,7 @@ class ObedientParty:
     def status(self) -> Status:
         return Status(links=(LinkStatus(name="lte", up=True, round_trip=41.0),), speed=1.5)
 
-    def handle_order(self, order: Join | Release | RequestRefused) -> None:
+    def handle_order(self, order: Join | Release | RequestRejected) -> None:
         self.orders.append(order)
         if isinstance(order, Join):
             self.driving = CurrentPair(pair=order.pair, other=order.other.name)
@@ -102,7 +104,7 @@ def test_pair_survives_a_restart_of_the_gateway(parties: Path, gateway: Callable
         desk.gateway_connection.close()
 
 
-def test_refused_request_is_reported_to_its_sender(
+def test_rejected_request_is_reported_to_its_sender(
     parties: Path, gateway: Callable[[int], tuple[Gateway, Fleet]]
 ) -> None:
     started, _ = gateway(0)
@@ -110,8 +112,24 @@ def test_refused_request_is_reported_to_its_sender(
     try:
         until(lambda: desk.orders)
         desk.gateway_connection.send_request(DriverRequest(what="join", vehicle="car"))
-        until(lambda: isinstance(desk.orders[-1], RequestRefused))
-        refused = desk.orders[-1]
-        assert isinstance(refused, RequestRefused) and "not a connected vehicle" in refused.cause
+        until(lambda: isinstance(desk.orders[-1], RequestRejected))
+        answer = desk.orders[-1]
+        assert isinstance(answer, RequestRejected) and "not a connected vehicle" in answer.cause
     finally:
         desk.gateway_connection.close()
+
+
+def test_party_with_another_protocol_version_is_rejected(
+    parties: Path, gateway: Callable[[int], tuple[Gateway, Fleet]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ObedientParty, "hello", lambda _: Hello(version=PROTOCOL_VERSION - 1))
+    started, fleet = gateway(0)
+    car = ObedientParty(parties / "vehicle-car", started.port)
+    try:
+        until(lambda: car.orders)
+        answer = car.orders[0]
+        assert isinstance(answer, RequestRejected) and f"protocol version {PROTOCOL_VERSION}" in answer.cause
+        assert any(answer.cause in message for message in car.messages)
+        assert not fleet.snapshot()["vehicles"]
+    finally:
+        car.gateway_connection.close()

@@ -30,7 +30,7 @@ def demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Demo:
     monkeypatch.setattr(demo_module, "RESTART_DELAY_MIN_S", 0.1)
     monkeypatch.setattr(demo_module, "CHILD", "import sys, time; time.sleep(600)")
     one = Demo(DemoParams(world=tmp_path), tmp_path)
-    for name in ("gateway", "station", "translate", "vehicle"):
+    for name in ("gateway", "station", "adapter", "vehicle"):
         one._run(name)
     return one
 
@@ -97,10 +97,10 @@ from pathlib import Path
 from scan2sim.services.teleoperation.settings import DemoParams
 from scan2sim.services.teleoperation.sim.demo import Demo
 demo = Demo(DemoParams(world=Path("w")), Path({str(tmp_path)!r}))
-demo._run("translate", "ros", "--port", "0", "--key", {str(key)!r})
-while "listens on" not in demo._log("translate").read_text():
+demo._run("adapter", "ros", "--port", "0", "--key", {str(key)!r})
+while "listens on" not in demo._log("adapter").read_text():
     time.sleep(0.1)
-print(demo.pids()["translate"], flush=True)
+print(demo.pids()["adapter"], flush=True)
 time.sleep(600)
 """
     environment = os.environ | {"PYTHONPATH": str(ROOT)}

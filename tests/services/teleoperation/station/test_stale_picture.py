@@ -70,7 +70,7 @@ def test_page_covers_video_while_its_station_is_stopped(tmp_path: Path) -> None:
     street = Street(tmp_path)
     try:
         with station_process(street) as (station, url), chromium(tmp_path) as page:
-            until(lambda: any(one["there"] for one in street.fleet.snapshot()["stations"]))
+            until(lambda: any(one["connected"] for one in street.fleet.snapshot()["stations"]))
             street.fleet.join("car", "desk", "operator")
             open_page(page, url)
             station.send_signal(signal.SIGSTOP)  # its connections stay open

@@ -100,4 +100,4 @@ def test_first_copy_of_each_number_is_accepted_in_any_order() -> None:
 def test_old_numbers_are_late_and_huge_ones_are_accepted() -> None:
     window = DedupWindow()
     assert [window.add(0), window.add(WINDOW_SIZE), window.add(0), window.add(1)] == ["", "", "late", ""]
-    assert [window.add(2**64 - 1), window.add(5), window.add(2**64 - 1)] == ["", "late", "doubles"]
+    assert [window.add(2**64 - 1), window.add(5), window.add(2**64 - 1)] == ["", "late", "duplicates"]

@@ -79,7 +79,7 @@ def test_messages_arrive_once_in_both_directions(world: World) -> None:
         world.relay.shapes[host].delay, world.relay.shapes[host].duplication = 0.01, 0.3
     station, vehicle = world.join()
     world.exchange(station, vehicle, 30)
-    until(lambda: station.counts.get("doubles") and vehicle.counts.get("doubles"))  # both links carry them
+    until(lambda: station.counts.get("duplicates") and vehicle.counts.get("duplicates"))  # both links carry them
     assert {link.name for link in station.links} == {link.name for link in vehicle.links} == {"a", "b"}
 
 
@@ -117,7 +117,7 @@ def test_hostile_datagrams_have_no_effect(world: World) -> None:
                 data = bytearray(chance.randbytes(chance.randrange(0, 2100)))
             sock = stranger if number % 2 else chance.choice(joined)
             sock.sendto(data, ("127.0.0.1", world.listener.port))
-        until(lambda: world.listener.counts.get("strangers", 0) > 0)
+        until(lambda: world.listener.counts.get("unknown_senders", 0) > 0)
     until(lambda: station.counts.get("replayed", 0) > 0 and station.counts.get("malformed", 0) > 0)
     world.exchange(station, vehicle, 3)
 

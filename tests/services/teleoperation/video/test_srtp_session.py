@@ -54,7 +54,7 @@ def test_forged_and_duplicate_packets_are_dropped_and_counted() -> None:
     assert station.counts == {"forged": 18}
     assert all(station.decrypt(packet, 0.0) for packet in encrypted)
     assert not any(station.decrypt(packet, 0.0) for packet in encrypted)
-    assert station.counts == {"forged": 18, "doubled": 3}
+    assert station.counts == {"forged": 18, "duplicates": 3}
     source = encrypted[0][8:12]
     for nothing in (b"", bytes(40), encrypted[0][:31], encrypted[0][:40], os.urandom(8) + source + os.urandom(5000)):
         assert station.decrypt(nothing, 0.0) is None
