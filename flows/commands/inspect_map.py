@@ -14,16 +14,23 @@ from scan2sim.pipeline.io.tile import MIN_POINTS
 Facts = list[tuple[str, str]]
 MAX_POINTS = 2_000_000
 """Points of a map that are inspected; the spacing is measured on all."""
+MESH_POINTS = 30_000
+"""Points of a mesh that are inspected: fewer, as they have no noise."""
 
 
-def map_facts(cloud: PointCloud) -> Facts:
-    """Unit, outliers, up axis and tilt, spacing, noise, surfaces and scene; empty for fewer points than a map has."""
+def map_facts(cloud: PointCloud, most: int = MAX_POINTS) -> Facts:
+    """Unit, outliers, up axis and tilt, spacing, noise, surfaces and scene; empty for fewer points than a map has.
+
+    Args:
+        cloud: the map.
+        most: number of points that are inspected.
+    """
     from scan2sim.pipeline.geometry.height_map import exact_point_spacing
 
     xyz = cloud.xyz[np.isfinite(cloud.xyz).all(axis=1)]
     if len(xyz) < MIN_POINTS:
         return []
-    return _facts(xyz[:: max(1, len(xyz) // MAX_POINTS)], exact_point_spacing(xyz), -np.asarray(cloud.frame.origin))
+    return _facts(xyz[:: max(1, len(xyz) // most)], exact_point_spacing(xyz), -np.asarray(cloud.frame.origin))
 
 
 def _facts(xyz: F32, spacing: float, start: F64) -> Facts:
@@ -99,7 +106,7 @@ def mesh_facts(path: Path) -> Facts:
     from scan2sim.pipeline.io.mesh_models import read
 
     source, notes = read(path)
-    facts = map_facts(surface_points(source.mesh))
+    facts = map_facts(surface_points(source.mesh), MESH_POINTS)
     if path.suffix.lower() in (".glb", ".gltf"):
         facts = [fact for fact in facts if fact[0] != "units"]
     return [*(("warning", note) for note in notes), *(f for f in facts if f[0] not in ("outliers", "spacing", "noise"))]

@@ -137,17 +137,21 @@ def result(folder: Path) -> list[Path]:
     return [folder / "r.npz"]
 
 
+SECOND = ("building.", "collision_terrain.")
+"""Meshes of which another one has the same format: they are written, but not read."""
+
+
 def world(folder: Path) -> list[Path]:
     """Write a world with its model, and a GLB."""
     synthetic.world(folder)
     kinds = (".sdf", ".obj", ".dae", ".glb", ".json")
-    return sorted(path for path in folder.rglob("*") if path.suffix in kinds)
+    return sorted(p for p in folder.rglob("*") if p.suffix in kinds and not p.name.startswith(SECOND))
 
 
 def read_world(folder: Path) -> None:
-    """Inspect all files."""
+    """Inspect all files that `world` returns."""
     for path in sorted(folder.rglob("*")):
-        if path.suffix in (".sdf", ".obj", ".dae", ".glb"):
+        if path.suffix in (".sdf", ".obj", ".dae", ".glb") and not path.name.startswith(SECOND):
             inspect_path(path)
 
 
