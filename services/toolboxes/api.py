@@ -271,12 +271,12 @@ class _EngineMetrics:
         outcomes = CounterMetricFamily("scan2sim_frames", "Frames by final state", labels=["state"])
         for state in State:
             outcomes.add_metric([state], self._engine.counts[state])
-        received, rejected = self._engine.counts["received"], self._engine.counts["rejected"]
+        received, beyond_queue = self._engine.counts["received"], self._engine.counts["beyond_queue"]
         waiting, oldest = self._engine.waiting()
         return [
             outcomes,
             CounterMetricFamily("scan2sim_frames_received", "Received frames", received),
-            CounterMetricFamily("scan2sim_frames_rejected", "Frames beyond a client's queue", rejected),
+            CounterMetricFamily("scan2sim_frames_rejected", "Frames beyond a client's queue", beyond_queue),
             CounterMetricFamily("scan2sim_model_restarts", "Restarts of the model", self._engine.counts["restarts"]),
             GaugeMetricFamily("scan2sim_frames_waiting", "Waiting frames", waiting),
             GaugeMetricFamily("scan2sim_oldest_waiting_seconds", "Waiting time of the oldest frame", oldest),

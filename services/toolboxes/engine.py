@@ -60,8 +60,8 @@ class Engine:
         name: name of the toolbox.
         info: description of its model.
         deadline: seconds from a frame's arrival to its result.
-        counts: frames by final `State`; "received": all frames; "rejected": frames of requests that found their queue
-            full; "executions": batches; "restarts": restarts of the model.
+        counts: frames by final `State`; "received": all frames; "beyond_queue": frames of requests that found their
+            queue full; "executions": batches; "restarts": restarts of the model.
         seconds: total times of the frames with results: "waited", "worked".
     """
 
@@ -120,7 +120,7 @@ class Engine:
     def submit_request(self, request: Sequence[Frame], maximum: int) -> bool:
         """Queue all frames of a request; False, and none is, if more than `maximum` would wait in its queue."""
         queued = self._queue.put_request(request, maximum)
-        self._count("received" if queued else "rejected", len(request))
+        self._count("received" if queued else "beyond_queue", len(request))
         return queued
 
     def predicted_wait_s(self) -> float:
