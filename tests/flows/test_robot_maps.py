@@ -128,7 +128,7 @@ SUBSETS: dict[str, tuple[dict[Surface, float], str]] = {
     "traces of the floor": ({Surface.WALL: 0.8, Surface.FLOOR: 0.003}, "is assumed from the feet"),
     "a few of everything": (dict.fromkeys(Surface, 0.08), "of the floor"),
 }
-"""Share of the points of each kind that is kept, and what `run` says of the map."""
+"""Share of the points of each kind that is kept, and the warning of `run` about the map."""
 SPAWN_TOLERANCE_M = 0.2
 
 
