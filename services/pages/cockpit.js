@@ -3,7 +3,9 @@
 "use strict";
 
 const WATCHDOG_PERIOD = 10, // interval of the watchdog, ms
-  AGES_PERIOD = 100; // interval at which displayed ages are updated, ms
+  AGES_PERIOD = 100, // interval at which displayed ages are updated, ms
+  STANDING = 0.3, // speed below which a vehicle stands, m/s
+  GEAR_KEPT_PERIOD = 3000; // time for which the reason is shown why the gear stays, ms
 const GEARS = { "-1": "reverse", 0: "neutral", 1: "forwards" };
 const COMMANDS_SEEN = 5, // commands that name a stop without agreeing, which the vehicle requires first
   COMMANDS_AGREED = 10; // commands that agree
@@ -13,6 +15,7 @@ let connection = "waiting", // why there is no connection; "": there is one
   state = {}, // last state from the station
   lights = false,
   gear = 1,
+  gearKept = null, // when the driver wanted to change the gear while the vehicle moved
   agreeing = 0,
   stood = true, // whether the vehicle was stopped at the last update
   stopping = false; // the driver has demanded an emergency stop that the station has not reported yet
@@ -139,12 +142,22 @@ addEventListener("keydown", (event) => {
 });
 
 function pressedOnce({ code, key }) {
-  if (code === "KeyR" && Math.abs(state.telemetry?.vehicle.speed ?? 0) < 0.3) gear = -gear;
+  if (code === "KeyR" && driving()) changeGear();
   if (code === "KeyL") lights = !lights;
   if (code === "KeyF") toggleFullScreen();
   if (code === "KeyN") toggleNight();
   if (code === "KeyP") geometry("shown").click();
   if (key === "?") toggleHelp();
+}
+
+// Changes between forwards and reverse if the vehicle is known to stand; if it doesn't report its speed, while the driver
+// brakes.
+function changeGear() {
+  const vehicle = freshVehicle(),
+    braking = [...pressed].some((code) => BRAKES.includes(code)),
+    standing = Number.isFinite(vehicle?.speed) ? Math.abs(vehicle.speed) < STANDING : vehicle !== undefined && braking;
+  gearKept = standing ? null : now();
+  if (standing) gear = -gear;
 }
 
 addEventListener("keyup", (event) => {
@@ -333,6 +346,10 @@ function* messages(station, telemetry) {
   if (station !== state) return yield `Nothing from the station${sinceText(sentAt.station)}`;
   if (!telemetry) yield `Nothing from the vehicle${sinceText(sentAt.vehicle)}`;
   if (telemetry?.standing) yield `The vehicle is stopped: ${telemetry.reason}`;
+  if (gearKept !== null && age(gearKept) < GEAR_KEPT_PERIOD)
+    yield Number.isFinite(freshVehicle()?.speed)
+      ? "The gear stays: the vehicle is moving"
+      : "The gear stays: the vehicle's speed is not known; brake while you press R";
   yield* telemetry?.vehicle.faults ?? [];
   if (station.driver === null && station.left) yield station.left;
   if (station.why) yield `Driving is not possible: ${station.why}`;

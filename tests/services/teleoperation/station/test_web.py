@@ -236,6 +236,27 @@ def test_any_page_can_stop_but_only_the_driver_ends_the_stop(cockpit: Cockpit, p
         press(page, "#agree", lambda: not cockpit.desk.standing())
 
 
+def test_gear_changes_only_if_the_vehicle_is_known_to_stand(cockpit: Cockpit, page: Page) -> None:
+    """A speed that is outdated or not reported isn't zero."""
+    start_driving(page, cockpit)
+
+    def press_r(vehicle: str) -> int:
+        page.value(f"freshVehicle = () => ({vehicle}); 0")
+        page.do("Input.dispatchKeyEvent", type="rawKeyDown", code="KeyR", key="r")
+        page.do("Input.dispatchKeyEvent", type="keyUp", code="KeyR", key="r")
+        return int(page.value("gear"))
+
+    assert press_r("{speed: 2, gear: 1}") == 1
+    until(lambda: "The gear stays: the vehicle is moving" in page.value("byId('standing').textContent"))
+    assert press_r("undefined") == 1 and press_r("{speed: null, gear: 1}") == 1
+    until(lambda: "brake while you press R" in page.value("byId('standing').textContent"))
+    page.do("Input.dispatchKeyEvent", type="rawKeyDown", code="Space", key=" ")
+    assert press_r("undefined") == 1 and press_r("{speed: null, gear: 1}") == -1
+    page.do("Input.dispatchKeyEvent", type="keyUp", code="Space", key=" ")
+    assert press_r("{speed: -2, gear: -1}") == -1 and press_r("{speed: 0.1, gear: -1}") == 1
+    until(lambda: "The gear stays" not in page.value("byId('standing').textContent"))
+
+
 def test_leaving_full_screen_by_the_browser_is_an_emergency_stop(cockpit: Cockpit, page: Page) -> None:
     """Escape leaves full screen before the page sees the key, in browsers that can't lock it."""
     start_driving(page, cockpit)
