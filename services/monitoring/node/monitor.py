@@ -3,7 +3,7 @@
     class Talker(Monitor):
         def __init__(self):
             super().__init__("talker", period=1.0, kafka_bootstrap_servers="localhost:9092")  # D3.2, code snippet 3
-            self.publisher = self.create_publisher(String, "chatter", 10)
+            self.publisher = self.create_publisher(ros.message_type(STRING), "chatter", 10)
 
 Once per period its traffic is published as a record (`services.monitoring.record`) on a ROS 2 topic and, if
 configured, to Kafka, a file, the console and Prometheus. It runs on either transport (`services.transport`).
