@@ -199,7 +199,7 @@ def result(streets: list[Found]) -> dict[str, float | None]:
         return None if value is None else 100 * value
 
     return {
-        "lidar_ground_cm": worst([centimetres(s["by_surface"]["terrain"]["median_m"]) for s in streets]),
+        "lidar_ground_cm": worst([centimetres(_worst_median(s["by_surface"])) for s in streets]),
         "lidar_early_share": worst([solid(s["by_surface"], "early_20cm") for s in streets]),
         "lidar_vegetation_early_share": worst([s["by_surface"]["vegetation"]["early_50cm"] for s in streets]),
         "lidar_phantom_share": worst([s["phantoms"]["phantom"] for s in streets]),
@@ -210,6 +210,12 @@ def result(streets: list[Found]) -> dict[str, float | None]:
         "returns_near_share": worst([s["all"]["near_surface"] for s in streets], -1),
         "returns_mid_share": worst([s["by_distance"]["20-40 m"]["near_surface"] for s in streets], -1),
     }
+
+
+def _worst_median(rows: Mapping[str, Any]) -> float | None:
+    """The largest median range error, metres, of ground, walls and furniture; None: no ray hit any."""
+    known = [one["median_m"] for name, one in rows.items() if name != "vegetation" and one["median_m"] is not None]
+    return max(known, default=None)
 
 
 def table(found: Found) -> None:

@@ -412,7 +412,6 @@ def result(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     odo, raw, keep, few_part, border_part, demo_part, synthetic_part, time = (
         figures.get(name, NOTHING) for name in ("odo04", "raw0009", *PARTS[3:])
     )
-    both = [part for part in (odo, raw) if part]
     streets = [figures[name] for name in STREETS if "frame_psnr_db" in figures.get(name, NOTHING)]
 
     def worst(values: Iterable[float | None], sign: int = 1) -> float | None:
@@ -425,12 +424,12 @@ def result(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         "raw0009_psnr_db": raw.get("psnr_db"),
         "raw0009_ssim": raw.get("ssim"),
         "raw0009_keep_psnr_db": keep.get("psnr_db"),
-        "sharpness_min": min((part["sharpness"] for part in both), default=None),
-        "inside_mesh": sum(part["inside_mesh"] for part in both) if both else None,
+        "sharpness_min": worst(street["sharpness"] for street in streets),
+        "inside_mesh": sum(street["inside_mesh"] for street in streets) if streets else None,
         "residue_m2": max(raw["residue_m2"].values()) if raw.get("residue_m2") else None,
         "static_lost": synthetic_part.get("static_lost"),
         "pole_recall": synthetic_part.get("pole_recall"),
-        "seen_share_min": min((part["seen_share"] for part in both), default=None),
+        "seen_share_min": worst(street["seen_share"] for street in streets),
         "edge_cm": synthetic_part.get("edge_cm"),
         "time_ratio": time.get("time_ratio"),
         "frame_psnr_db": worst(street["frame_psnr_db"] for street in streets),
@@ -441,8 +440,8 @@ def result(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         "outline_px": worst((_median(street["displacements_px"]) for street in streets), -1),
         "sign_psnr_db": worst(_mean(street["signs_db"].values()) for street in streets),
         "wrongly_removed": worst((street["wrongly_removed"] for street in streets), -1),
-        "openmvs_gain_db": worst(street["openmvs"]["gain_db"] for street in streets if "openmvs" in street),
-        "openmvs_nogain_db": worst(street["openmvs"]["nogain_db"] for street in streets if "openmvs" in street),
+        "openmvs_ahead_db": worst(street["openmvs"]["gain_db"] for street in streets if "openmvs" in street),
+        "openmvs_ahead_nogain_db": worst(street["openmvs"]["nogain_db"] for street in streets if "openmvs" in street),
         **lidar.result([street["lidar"] for street in streets]),
         **splats.result(
             {name: part["splats"] for name in STREETS if (part := figures.get(name)) and part.get("splats")}
