@@ -6,6 +6,7 @@ Services use no other ROS API. Both modules implement `Transport`; nodes of both
 from __future__ import annotations
 
 import importlib
+import logging
 import os
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -14,8 +15,10 @@ from scan2sim.pipeline.core import optional_deps
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.services.transport.types import Arrival, Endpoint, QoS
 
+log = logging.getLogger(__name__)
+
 TRANSPORT_VARIABLE = "SCAN2SIM_TRANSPORT"
-"""Environment variable that selects the transport; default: the first of `TRANSPORTS` that is installed."""
+"""Environment variable that selects the transport; default: the first of `TRANSPORTS` that can be imported."""
 TRANSPORTS = ("rclpy", "cyclone")
 
 
@@ -110,7 +113,7 @@ class Transport(Protocol):
 
 
 def load(name: str | None = None) -> Any:
-    """Load a `Transport`: by name, by the environment variable `TRANSPORT_VARIABLE`, or the first that is installed.
+    """Load a `Transport`: by name, by the environment variable `TRANSPORT_VARIABLE`, or the first that works.
 
     Raises:
         SettingError: unknown name.
@@ -120,10 +123,25 @@ def load(name: str | None = None) -> Any:
     if requested and requested not in TRANSPORTS:
         cause = f"unknown transport {requested!r}"
         raise SettingError(TRANSPORT_VARIABLE, cause, f"Choose one of: {', '.join(TRANSPORTS)}")
-    chosen = requested or ("rclpy" if optional_deps.missing("rclpy") is None else "cyclone")
+    chosen = requested or ("rclpy" if _has_rclpy() else "cyclone")
     packages = {"rclpy": ("rclpy",), "cyclone": ("cyclonedds", "rosbags")}[chosen]
     optional_deps.require(f"the transport {chosen}", *packages)
     return importlib.import_module(f"{__name__}.{chosen}")
+
+
+def _has_rclpy() -> bool:
+    """Whether rclpy can be imported: a sourced ROS 2 puts its own on the path, which may be of another Python."""
+    if optional_deps.missing("rclpy"):
+        return False
+    try:
+        importlib.import_module("rclpy")
+    except ImportError as error:
+        log.warning(
+            "ROS 2 is sourced, but its rclpy doesn't work with this Python: nodes use Cyclone DDS, and see those of "
+            "ROS 2 all the same (%s)", str(error).strip().partition("\n")[0],
+        )  # fmt: skip
+        return False
+    return True
 
 
 __all__ = ["Arrival", "Endpoint", "Node", "Publisher", "QoS", "Transport", "load"]
