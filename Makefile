@@ -14,7 +14,7 @@ demo: .venv/.installed
 	$(BIN)/scan2sim run $(TILE) --out $(OUT) --hold-out 8 --set segment.overwrite=true --set splats.when=auto
 
 # in parallel, then those in real time one at a time, then those that failed once more
-test: .venv/.installed-dev .venv-ros .venv-triton
+test: .venv/.installed-dev .venv-ros .venv-triton tests/fakes/gazebo/build/.built
 	$(BIN)/python -m tests.suite $(PYTEST)
 
 test-all: .venv/.installed-dev .venv-ros .venv-triton
@@ -54,6 +54,13 @@ sample-tile: .venv/.installed
 .venv-triton: tests/services/toolboxes/triton-requirements.txt
 	@$(PYTHON) -m venv $@ && $@/bin/python -m pip install --quiet --disable-pip-version-check -r $< \
 	  || echo "Triton's client can't be installed here: tests with it are skipped."
+	@touch $@
+
+# programs that check worlds with Gazebo's own libraries; their tests are skipped if these aren't installed
+tests/fakes/gazebo/build/.built: $(wildcard tests/fakes/gazebo/*.cpp tests/fakes/gazebo/*.hpp) tests/fakes/gazebo/CMakeLists.txt
+	@mkdir -p $(@D)
+	@cmake -S tests/fakes/gazebo -B $(@D) -DCMAKE_BUILD_TYPE=Release >/dev/null 2>&1 && cmake --build $(@D) >/dev/null \
+	  || echo "Gazebo's libraries aren't installed: tests with them are skipped."
 	@touch $@
 
 .venv/.installed-dev: .venv/.installed

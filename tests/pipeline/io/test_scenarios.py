@@ -7,6 +7,7 @@ import importlib.metadata
 import os
 import subprocess
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from scan2sim.pipeline.io.geodata import opendrive, track_geojson
 from scan2sim.pipeline.io.scenario_formats import openscenario
 from scan2sim.pipeline.io.world_formats import SceneParams
 from scan2sim.pipeline.io.worlds.scene import TRACKS_FILE, Scene, read_scene
+from scan2sim.pipeline.io.worlds.scene_traffic import scenario_of
+from scan2sim.pipeline.scenario.motion_check import impossible_motions
 from scan2sim.pipeline.scenario.scenario import Scenario, from_tracks
 from scan2sim.pipeline.tracking.tracks import write_tracks
 from tests.fakes import synthetic, traffic
@@ -196,6 +199,29 @@ def test_gazebo_loads_the_traffic(town: Scene, tmp_path: Path) -> None:
     assert all((pose[2] < -100) == (time < 1.0 - 1e-6) for time, pose in points[:-2])  # it appears after one second
     obj: Any = trimesh.load(out / "models" / "van_2" / "meshes" / "van_2.obj", force="mesh")
     assert obj.extents.tolist() == pytest.approx([5.2, 2.0, 2.3], abs=0.01)
+
+
+def test_a_car_that_two_tiles_saw_drives_on_across_their_border(tmp_path: Path) -> None:
+    """The second tile sees it from before the first one loses it, 30 cm to the side; another car is 8 m behind it."""
+    scene = synthetic.scene(tmp_path, tiles=2)
+    size = (4.2, 1.75, 1.5)
+    seen = [
+        [traffic.drive(1, "car", size, (0.0, 60.0), -1.75, 0.0, 12.0)],
+        [
+            traffic.drive(1, "van", size, (48.0, 100.0), -1.45, 4.0, 12.0),
+            traffic.drive(2, "car", size, (40.0, 90.0), -1.75, 4.0, 12.0),
+        ],
+    ]
+    for tile, tracks in zip(scene.tiles, seen, strict=True):
+        local = [replace(one, poses=one.poses - np.array([*tile.offset, 0.0])) for one in tracks]
+        write_tracks(tile.folder / TRACKS_FILE, local, tile.frame)
+    scenario = scenario_of(read_scene(tmp_path / "world"))
+    first, second = sorted(scenario.actors, key=lambda actor: actor.begin)
+    assert (first.begin, first.end) == pytest.approx((0.0, 4.0 + 52 / 12), abs=0.11)
+    assert (second.begin, second.end) == pytest.approx((4.0, 4.0 + 50 / 12), abs=0.11)
+    x, y = first.track.at([0.0, 4.5, first.end])[:, :2].T
+    assert x == pytest.approx([0, 54, 100], abs=1.3) and y[[0, 2]] == pytest.approx([-1.75, -1.45], abs=0.01)
+    assert -1.75 < y[1] < -1.45 and not impossible_motions(scenario)
 
 
 def test_world_without_traffic_has_none(tmp_path: Path) -> None:
