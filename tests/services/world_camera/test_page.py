@@ -106,10 +106,10 @@ def test_example_in_mujoco_shows_the_street_ahead_of_the_robot(tmp_path: Path) -
         pytest.skip(why)
     (code,) = re.findall(r"## In Python, without ROS\n.*?```python\n(.*?)```", PAGE, re.DOTALL)
     scene = synthetic.driven(tmp_path / "my_world")
-    world_formats.write(scene, ["mujoco"], tmp_path / "town", SceneParams(), silent, robot=True)
-    model = tmp_path / "town" / f"{scene.name}.xml"
+    world_formats.write(scene, ["mujoco"], tmp_path / "town_mujoco", SceneParams(), silent, robot=True)
+    model = tmp_path / "town_mujoco" / f"{scene.name}.xml"
     # a magenta post that only MuJoCo knows, two metres ahead of the robot
-    robot = json.loads((tmp_path / "town/metadata.json").read_text(encoding="utf-8"))["robot"]
+    robot = json.loads((tmp_path / "town_mujoco/metadata.json").read_text(encoding="utf-8"))["robot"]
     (x, y, z), yaw = robot["position_m"], robot["angles_rad"][2]
     at = f"{x + 2 * math.cos(yaw)} {y + 2 * math.sin(yaw)} {z + 0.5}"
     geom = f'<geom type="box" size=".1 .1 .5" pos="{at}" rgba="1 0 1 1" group="0" contype="0" conaffinity="0"/>'
