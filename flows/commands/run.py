@@ -62,7 +62,10 @@ def run(
     hold_out: HoldOut = None,
     force: Force = False,
     from_: From = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Steps that run at the same time; 0: 2, or 3 from 6 cores on.")] = 0,
+    jobs: Annotated[
+        int,
+        typer.Option(min=0, help="Steps that run at the same time; 0: 2, or 3 from 6 cores on, as free memory allows."),
+    ] = 0,
     bus: Bus = None,
     up: Up = "auto",
     units: Units = "auto",

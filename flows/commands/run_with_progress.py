@@ -9,6 +9,7 @@ from pathlib import Path
 from scan2sim.flows.commands.display import RunDisplay, console, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.engine.execution import execute
+from scan2sim.flows.engine.memory import free_memory
 from scan2sim.flows.engine.planning import PlannedTask, drop_damaged, plan
 from scan2sim.flows.engine.progress import PublishedRun
 from scan2sim.flows.engine.ready_queue import Event, Outcome, ignore_event
@@ -31,7 +32,17 @@ def execute_with_progress(
     memory: float | None = None,
     bus: PublishedRun | None = None,
 ) -> Outcome:
-    """Run a plan by `execute`, with progress bars and log entries; published by the `bus`."""
+    """Run a plan by `execute`, with progress bars and log entries; published by the `bus`.
+
+    Args:
+        planned: the plan.
+        store: cache of the results.
+        log: receives events, warnings and summaries.
+        jobs: steps at a time; 0: by the number of cores (`default_jobs`), as far as free memory allows.
+        keep_going: as for `execute`.
+        memory: GB that steps may use together; None: no limit, if `jobs` are given.
+        bus: where progress is published.
+    """
     publish_event = bus.steps.track(planned, store) if bus else ignore_event
     with RunDisplay(len(planned)) as shown:
 
@@ -41,7 +52,9 @@ def execute_with_progress(
             if event != "progress":
                 log.write(f"{task.full_name}: {event}{': ' if message else ''}{message}")
 
-        jobs = jobs or default_jobs()
+        if not jobs:
+            jobs = default_jobs(tiles=len({item.task.tile for item in planned}))
+            memory = memory or free_memory()
         outcome = execute(planned, store, jobs=jobs, on_event=on_event, keep_going=keep_going, memory=memory)
     for task, manifest in outcome.done.items():
         lines = [manifest.metrics["summary"]] if "summary" in manifest.metrics else []
@@ -118,6 +131,10 @@ def show_warnings(done: Mapping[str, Manifest]) -> None:
             warn(f"{task}: {warning}")
 
 
-def default_jobs() -> int:
-    """Default number of concurrent steps: 2, or 3 from six cores on (a surface is built for each of three classes)."""
-    return 3 if (os.cpu_count() or 1) >= 6 else 2
+def default_jobs(tiles: int = 1) -> int:
+    """Default number of concurrent steps: one for every two cores that this process may use.
+
+    At least 2, and at most 3 for each tile, as a surface is built for each of three classes.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(max(2, cores // 2), 3 * tiles)

@@ -68,7 +68,10 @@ def survey(
     set_: Sets = None,
     config: Config = None,
     hold_out: HoldOut = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Steps that run at the same time; 0: 2, or 3 from 6 cores on.")] = 0,
+    jobs: Annotated[
+        int,
+        typer.Option(min=0, help="Steps that run at the same time; 0: one for every two cores, as free memory allows."),
+    ] = 0,
     memory: Annotated[
         str | None, typer.Option(help="Memory that all running steps may use together, such as 20GB.")
     ] = None,
@@ -113,7 +116,7 @@ def run_source(
         target: output folder; source and target may be URLs of object storage.
         settings: of all steps.
         length, buffer: tile length and overlap in metres if the source is cut; default: of the drive, or 100 and 5.
-        jobs: steps at a time; 0: by the number of cores.
+        jobs: steps at a time; 0: one for every two cores, as free memory allows.
         memory: limit of the memory of all running steps, "20GB".
         cores: CPU cores per step.
         bus: where progress is published (`services.monitoring.events.event_publishers`).
@@ -125,7 +128,7 @@ def run_source(
         StepError: tiles failed; all others are finished.
         ScanError: see `pipeline.core.errors`; results of earlier runs stay.
     """
-    jobs, gigabytes = jobs or default_jobs(), parse_memory(memory)
+    gigabytes = parse_memory(memory)
     limit_cores(cores)
     system_libs.check()
     check_here(settings)

@@ -1,4 +1,4 @@
-"""Memory budget: expected memory of a task, and reservation among all tasks on a machine."""
+"""Memory budget: free memory, expected memory of a task, and reservation among all tasks on a machine."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 SLOT_GB = 0.25  # memory is reserved in slots of this size
 MAX_MEMORY_GB = 20_000  # largest budget that is accepted
+FREE_SHARE = 0.8  # of the free memory: estimates are rough, and other programs run
 POLL_INTERVAL_S = 0.2  # seconds between attempts to reserve memory
 
 
@@ -51,6 +52,28 @@ def parse_memory(text: str | None) -> float | None:
     if not 0 < size <= MAX_MEMORY_GB:
         raise SettingError("--memory", f"`{text[:40]}` is not an amount of memory", "Write for example 20GB, or 800MB")
     return size
+
+
+def free_memory(proc: Path = Path("/proc/meminfo"), cgroup: Path = Path("/sys/fs/cgroup")) -> float | None:
+    """GB that steps may use now: most of what the machine, and the container that this runs in, have left.
+
+    Args:
+        proc: the kernel's statistics.
+        cgroup: folder of the container's limit (`memory.max`), and what it uses (`memory.current`), of which files that
+            were read are released when needed (`inactive_file` of `memory.stat`).
+
+    Returns:
+        None if it is unknown.
+    """
+    found = []
+    with suppress(OSError):
+        available = re.search(r"^MemAvailable:\s+(\d+) kB", proc.read_text(), re.MULTILINE)
+        found += [int(available[1]) * 1024] if available else []
+    with suppress(OSError, ValueError):  # "max" is no limit
+        limit, used = (int((cgroup / name).read_text()) for name in ("memory.max", "memory.current"))
+        files = re.search(r"^inactive_file (\d+)", (cgroup / "memory.stat").read_text(), re.MULTILINE)
+        found.append(limit - used + (int(files[1]) if files else 0))
+    return max(FREE_SHARE * min(found) / 1e9, SLOT_GB) if found else None
 
 
 @contextmanager

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from scan2sim.flows.commands.run_with_progress import default_jobs
 from scan2sim.flows.engine.execution import execute
-from scan2sim.flows.engine.memory import parse_memory, reserve_memory
+from scan2sim.flows.engine.memory import free_memory, parse_memory, reserve_memory
 from scan2sim.flows.engine.planning import plan
 from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.core.errors import ScanError, SettingError
@@ -37,6 +38,26 @@ def test_amounts_of_memory_are_parsed() -> None:
     for wrong in ("lots", "0GB", "-3", "nan", "inf", "1e300GB", "9" * 400, "99999999999GB"):
         with pytest.raises(SettingError, match="not an amount"):
             parse_memory(wrong)
+
+
+def test_free_memory_is_that_of_the_machine_and_of_the_container(tmp_path: Path) -> None:
+    proc, limit = tmp_path / "meminfo", tmp_path / "memory.max"
+    proc.write_text("MemTotal: 64000000 kB\nMemAvailable: 20000000 kB\n")
+    limit.write_text("max\n")
+    (tmp_path / "memory.current").write_text("6000000000\n")
+    (tmp_path / "memory.stat").write_text("anon 2000000000\ninactive_file 4000000000\n")
+    assert free_memory(proc, tmp_path) == pytest.approx(0.8 * 20.48)
+    limit.write_text("10000000000\n")
+    assert free_memory(proc, tmp_path) == pytest.approx(0.8 * 8)
+    limit.write_text("1000000000\n")
+    assert free_memory(proc, tmp_path) == 0.25, "a step runs, alone"
+    assert free_memory(tmp_path / "none", tmp_path / "none") is None, "unknown: no limit"
+
+
+def test_more_cores_run_more_steps_of_a_survey(monkeypatch: pytest.MonkeyPatch) -> None:
+    for cores, of_one_tile, of_ten in ((1, 2, 2), (4, 2, 2), (6, 3, 3), (16, 3, 8), (64, 3, 30)):
+        monkeypatch.setattr("os.sched_getaffinity", lambda _, cores=cores: set(range(cores)))
+        assert (default_jobs(), default_jobs(tiles=10)) == (of_one_tile, of_ten)
 
 
 def test_reservation_beyond_the_total_waits_until_enough_is_released() -> None:
