@@ -1,6 +1,7 @@
 """Recordings: worlds' inputs made by importers, compared with references.
 
-`python -m bench.recordings [--parts bags mistakes ins passes strips photos long_bag] [--out bench-out/recordings]`
+`python -m bench.recordings [--parts bags mistakes ins passes strips photos surveys long_bag]
+[--out bench-out/recordings]`
 
 - bags: a KITTI raw drive (of the folder that SCAN2SIM_REAL_DATA gives) and a synthetic drive are written as MCAP,
   SQLite and ROS 1 bags, and imported; `bags_differ`: imports whose cloud, photos, cameras or poses differ from those of
@@ -14,6 +15,8 @@
 - strips: an assembled cloud of a synthetic street, two passes whose INS drifts; `strips_gap_cm`: largest distance
   between their surfaces after `import clouds --trajectory`.
 - photos: photos without poses and a cloud by `import images`: `photos_pose_m`, `photos_turn_deg` against truth.
+- surveys (only if selected): every real drive cut into tiles of 12 m; `surveys_failed`: surveys without a world of all
+  their tiles, of all `surveys`.
 - long_bag (only if selected): memory and time of imports of 24 million points with images, and of an hour without.
 
 To add a part, write a module with `measure(out: Path) -> dict`, and list it in `PARTS`. A part whose recording or
@@ -31,7 +34,7 @@ from typing import Any
 
 from bench.maps.command import Missing
 from bench.paths import ROOT
-from bench.recordings import bags, ins, long_bag, mistakes, passes, photos, strips
+from bench.recordings import bags, ins, long_bag, mistakes, passes, photos, strips, surveys
 
 PARTS: dict[str, tuple[Callable[[Path], dict[str, Any]], tuple[str, ...]]] = {
     "bags": (bags.measure, ("bags_differ", "bags")),
@@ -40,10 +43,11 @@ PARTS: dict[str, tuple[Callable[[Path], dict[str, Any]], tuple[str, ...]]] = {
     "passes": (passes.measure, ("passes_gap_cm",)),
     "strips": (strips.measure, ("strips_gap_cm", "strips_unchanged")),
     "photos": (photos.measure, ("photos_pose_m", "photos_turn_deg", "photos_mistakes")),
+    "surveys": (surveys.measure, ("surveys_failed", "surveys")),
     "long_bag": (long_bag.measure, ("long_bag_peak_gb",)),
 }
 """Part: its function, and the figures that are null if it fails or isn't run."""
-SELECTED_ONLY = ("long_bag",)
+SELECTED_ONLY = ("surveys", "long_bag")
 """Parts that run only if they are named."""
 
 
